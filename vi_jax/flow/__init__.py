@@ -1,0 +1,12 @@
+"""How a scene moves: methods, the hybrid step, the closed-form flight, `simulate`, results."""
+
+from .exact import ExactFlight as ExactFlight
+from .methods import AbstractMethod as AbstractMethod
+from .methods import Adaptive as Adaptive
+from .methods import FixedStep as FixedStep
+from .results import ImpactLog as ImpactLog
+from .results import RESULTS as RESULTS
+from .results import Run as Run
+from .results import Samples as Samples
+from .simulate import simulate as simulate
+from .unrolled import Unrolled as Unrolled

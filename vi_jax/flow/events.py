@@ -1,0 +1,99 @@
+"""Where in a step a stop is met or the motion turns.
+
+A step knows the position and its first two derivatives at both ends. The quintic through them says
+where to aim; the step taken to that place then meets the event with the solver's own accuracy, and
+Taylor's series about its end removes what is left.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..scene.trig import horner
+
+Scalar = Float[Array, ""]
+
+
+class Rates(NamedTuple):
+    """A coordinate and its first two derivatives by s."""
+
+    x: Scalar
+    v: Scalar
+    a: Scalar
+
+    def scaled(self, factor: Any, offset: Any) -> "Rates":
+        """Rates of factor·x - offset."""
+        return Rates(factor * self.x - offset, factor * self.v, factor * self.a)
+
+
+def rates(
+    field: Callable[[Scalar, Any], Any], coordinate: Callable[[Any], Scalar], s: Scalar, state: Any
+) -> Rates:
+    """Rates of `coordinate(state)` along the flow of `field`, by two forward derivatives."""
+    one = jnp.ones_like(s)
+
+    def first(s, state):
+        return jax.jvp(coordinate, (state,), (field(s, state),))
+
+    (x, v), (_, a) = jax.jvp(first, (s, state), (one, field(s, state)))
+    return Rates(x, v, a)
+
+
+def quintic(begin: Rates, end: Rates, h: Scalar) -> tuple[Scalar, ...]:
+    """Coefficients in θ ∈ [0, 1] of the quintic Hermite interpolant of a step of length h."""
+    v0, v1 = h * begin.v, h * end.v
+    a0, a1 = 0.5 * h * h * begin.a, 0.5 * h * h * end.a
+    rise = end.x - begin.x
+    p = rise - v0 - a0
+    q = v1 - v0 - 2 * a0
+    r = a1 - a0
+    return (
+        begin.x, v0, a0,
+        10 * p - 4 * q + r,
+        -15 * p + 7 * q - 2 * r,
+        6 * p - 3 * q + r,
+    )  # fmt: skip
+
+
+def slope(c: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
+    """Coefficients of the derivative, padded to the same length."""
+    return (*(n * c[n] for n in range(1, len(c))), jnp.zeros_like(c[0]))
+
+
+def rising_root(c: tuple[Scalar, ...], *, iterations: int = 4) -> Scalar:
+    """The θ in [0, 1] at which a polynomial that ends positive last rose through zero.
+
+    Newton's method kept inside a bracket; a place where the polynomial falls lies to the left of
+    the root (the body leaves the stop before it comes back).
+    """
+    derivative = slope(c)[:-1]
+    low, high = jnp.zeros_like(c[0]), jnp.ones_like(c[0])
+    end = sum(c[1:], c[0])
+    theta = jnp.where(c[0] < end, -c[0] / jnp.where(c[0] < end, end - c[0], 1.0), 0.5)
+    theta = jnp.clip(theta, 0.0, 1.0)
+    for _ in range(iterations):
+        value, rate = horner(c, theta), horner(derivative, theta)
+        left = (value < 0) | (rate <= 0)
+        low, high = jnp.where(left, theta, low), jnp.where(left, high, theta)
+        newton = theta - value / jnp.where(rate > 0, rate, 1.0)
+        inside = (rate > 0) & (newton >= low) & (newton <= high)
+        theta = jnp.where(inside, newton, 0.5 * (low + high))
+    return theta
+
+
+def landing(gap: Rates) -> tuple[Scalar, Scalar]:
+    """Offset δ at which gap + gap'·δ + ½ gap''·δ² rises through zero, and the slope there squared.
+
+    Where the square is negative the coordinate turns short of the stop, and δ is meaningless.
+    """
+    square = gap.v * gap.v - 2 * gap.x * gap.a
+    real = square > 0
+    root = jnp.sqrt(jnp.where(real, square, 1.0))
+    approaching = gap.v > 0
+    sum_ = jnp.where(approaching, gap.v + root, 1.0)
+    bend = jnp.where(approaching | (gap.a == 0), 1.0, gap.a)
+    delta = jnp.where(approaching, -2 * gap.x / sum_, (root - gap.v) / bend)
+    return jnp.where(real, delta, jnp.inf), square

@@ -1,0 +1,134 @@
+"""What the flat loop carries: one trajectory on its way, and what is asked of it."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..scene import AbstractScene
+from . import results
+from .events import rates
+from .methods import AbstractMethod
+
+Scalar = Float[Array, ""]
+
+# What the next step aims at: nothing, a turning point, the section, or 1 + i for stop number i.
+FREE, TURN, SECTION = 0.0, -1.0, -2.0
+
+
+class Record(eqx.Module):
+    """What is kept of an interval between two record points; `None` where it was not asked for."""
+
+    time: Scalar | None
+    y_max: Scalar | None
+    y_min: Scalar | None
+    impacts: Scalar
+    speed: Scalar | None
+    log: tuple[tuple[Scalar, Scalar, Scalar], ...]
+
+
+class Lane(eqx.Module):
+    """One trajectory on its way. All floats: other types would keep the loop from fusing."""
+
+    s: Scalar
+    state: Any
+    record: Record
+    direction: Scalar
+    """Sign of the velocity since the last turn or impact."""
+    length: Scalar
+    """Length proposed for an ordinary step."""
+    attempt: Scalar
+    """Length of the next step."""
+    target: Scalar
+    """What the next step aims at."""
+    aims: Scalar
+    """Times aimed since the last step taken."""
+    part: Scalar
+    """Index of the interval within its cycle."""
+    done: Scalar
+    """Number of completed intervals."""
+    fault: Scalar
+    """Reason why the lane ended before its time (see `results`), or 0."""
+    steps: Scalar
+    rejected: Scalar
+    kept_state: Any
+    kept: Record
+    """State at the end of the last completed interval, and its record, for the caller to store."""
+
+
+class Plan(eqx.Module):
+    """What is asked of the loop."""
+
+    scene: AbstractScene
+    method: AbstractMethod
+    cycles: int = eqx.field(static=True)
+    parts: int = eqx.field(static=True)
+    """Record points per cycle."""
+    motion: bool = eqx.field(static=True)
+    """Whether extremes, durations and impact speeds are recorded."""
+    log: int = eqx.field(static=True)
+    max_steps: float = eqx.field(static=True)
+    max_impacts: float = eqx.field(static=True)
+
+    @property
+    def intervals(self) -> int:
+        """Number of intervals to record."""
+        return self.cycles * self.parts
+
+    @property
+    def block(self) -> int:
+        """Iterations in which a lane completes at most one interval, its steps being so short."""
+        return max(1, self.method.steps_per_cycle // self.parts)
+
+    def ticks(self, state: Any) -> bool:
+        """Whether `s` itself counts the cycles."""
+        return self.scene.clock(state) is None
+
+    def timed(self, state: Any) -> bool:
+        """Whether the duration of a cycle is recorded, which only a fixed one need not be."""
+        paced = self.scene.pace(jnp.zeros_like(self.scene.position(state)), state) is not None
+        return self.motion and (paced or not self.ticks(state))
+
+    def fresh(self, state: Any) -> Record:
+        """The record of an interval that begins in `state`."""
+        Y = self.scene.position(state)
+        zero, nan = jnp.zeros_like(Y), jnp.full_like(Y, jnp.nan)
+        return Record(
+            time=zero if self.timed(state) else None,
+            y_max=Y if self.motion else None,
+            y_min=Y if self.motion else None,
+            impacts=zero,
+            speed=zero if self.motion else None,
+            log=((nan, nan, jnp.full_like(Y, -1.0)),) * self.log,
+        )
+
+    def launch(self, start: Any, bad: jax.Array) -> Lane:
+        """A lane on its first section; `bad` marks a start that cannot be run."""
+        scene = self.scene
+        Y = scene.position(start)
+        zero = jnp.zeros_like(Y)
+        here = rates(scene.field, scene.position, zero, start)
+        # At rest the acceleration says which way the motion goes.
+        direction = jnp.where(here.v == 0, jnp.sign(here.a), jnp.sign(here.v))
+        length = zero + jax.lax.stop_gradient(scene.cycle) / self.method.steps_per_cycle
+        if self.method.adaptive:
+            length = length / 8
+        return Lane(
+            s=zero,
+            state=start,
+            record=self.fresh(start),
+            direction=jax.lax.stop_gradient(direction),
+            length=length,
+            attempt=length,
+            target=zero,
+            aims=zero,
+            part=zero,
+            done=zero,
+            fault=jnp.where(bad, float(results.BAD_START), zero),
+            steps=zero,
+            rejected=zero,
+            kept_state=start,
+            kept=self.fresh(start),
+        )

@@ -1,0 +1,95 @@
+"""The loop around the hybrid step: forward, or so that it can be differentiated in reverse."""
+
+from typing import Any
+
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Bool
+
+from .hybrid import iterate
+from .lane import Lane, Plan, Record
+
+
+@jax.custom_batching.custom_vmap
+def any_lane(flag: Bool[Array, ""]) -> Bool[Array, ""]:
+    """Whether `flag` holds in any lane of any enclosing `vmap`: one number for all of them.
+
+    A loop condition that stays unbatched spares `while_loop` a `where` over everything it carries.
+    """
+    return flag
+
+
+@any_lane.def_vmap
+def _(axis_size, in_batched, flag):
+    return any_lane(jnp.any(flag)), False
+
+
+def _active(plan: Plan, lane: Lane) -> Bool[Array, ""]:
+    return (jax.lax.stop_gradient(lane.done) < plan.intervals) & (
+        jax.lax.stop_gradient(lane.fault) == 0
+    )
+
+
+def run_forward(plan: Plan, lane: Lane) -> tuple[Lane, Any, Record]:
+    """All lanes to their end, in one flat loop: no lane waits for another at a section.
+
+    Steps are taken in blocks in which a lane completes at most one interval, so that results are
+    stored once a block. Differentiable in forward mode.
+
+    **Returns:** the final lane, and the states and records of all intervals, with leading axis
+    `plan.intervals`.
+    """
+    leaves, treedef = jtu.tree_flatten((lane.kept_state, lane.kept))
+    store = jnp.full((plan.intervals, len(leaves)), jnp.nan, leaves[0].dtype)
+
+    def body(carry):
+        lane, store = carry
+        before = lane.done
+        lane = jax.lax.fori_loop(0, plan.block, lambda _, x: iterate(plan, x), lane)
+        kept = jnp.stack(jtu.tree_leaves((lane.kept_state, lane.kept)))
+        place = jnp.where(lane.done > before, lane.done - 1, float(plan.intervals))
+        index = jax.lax.stop_gradient(place).astype(jnp.int32)
+        return lane, store.at[index].set(kept, mode="drop")
+
+    def going(carry):
+        return any_lane(_active(plan, carry[0]))
+
+    lane, store = jax.lax.while_loop(going, body, (lane, store))
+    state, record = jtu.tree_unflatten(treedef, list(jnp.moveaxis(store, -1, 0)))
+    return lane, state, record
+
+
+def run_reverse(plan: Plan, lane: Lane) -> tuple[Lane, Any, Record]:
+    """As `run_forward`, by a scan over intervals with a checkpointed loop in each.
+
+    Differentiable in reverse mode, with memory that grows with the root of the number of steps.
+    """
+
+    def interval(lane, _):
+        goal = lane.done + 1
+
+        def going(lane):
+            return any_lane(_active(plan, lane) & (jax.lax.stop_gradient(lane.done - goal) < 0))
+
+        def body(lane):
+            return _held(plan, goal, lane)
+
+        lane = eqxi.while_loop(
+            going, body, lane, kind="checkpointed", max_steps=int(plan.max_steps)
+        )
+        return lane, (lane.kept_state, lane.kept, lane.done >= goal)
+
+    lane, (state, record, complete) = jax.lax.scan(interval, lane, None, length=plan.intervals)
+    state, record = jtu.tree_map(
+        lambda x: jax.vmap(jnp.where)(complete, x, jnp.full_like(x, jnp.nan)), (state, record)
+    )
+    return lane, state, record
+
+
+def _held(plan: Plan, goal, lane: Lane) -> Lane:
+    """One step of a lane that has not yet reached its goal."""
+    new = iterate(plan, lane)
+    waiting = lane.done >= goal
+    return jtu.tree_map(lambda a, b: jnp.where(waiting, a, b), lane, new)

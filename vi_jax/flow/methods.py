@@ -1,0 +1,145 @@
+"""Methods: how a scene is carried over one step. A method is an argument of every verb."""
+
+import abc
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Float
+
+from .._checks import count, require
+from ..scene import AbstractScene
+from .unrolled import Unrolled
+
+Scalar = Float[Array, ""]
+
+
+class AbstractMethod(eqx.Module):
+    """What the hybrid step asks of a method."""
+
+    @property
+    @abc.abstractmethod
+    def steps_per_cycle(self) -> int:
+        """The fewest ordinary steps in a cycle; static."""
+
+    @property
+    def adaptive(self) -> bool:
+        """Whether steps can be rejected and resized."""
+        return False
+
+    def check(self, scene: AbstractScene) -> None:
+        """Raise a `ValueError` if this method cannot move `scene`."""
+        return None
+
+    def limited(self, scene: AbstractScene, limit: Any) -> Any:
+        """The scene's `step_limit`, or less where this method needs it."""
+        return limit
+
+    @abc.abstractmethod
+    def step(
+        self, scene: AbstractScene, s0: Scalar, s1: Scalar, state: Any, time: Scalar | None
+    ) -> tuple[Any, Scalar | None, Scalar]:
+        """State and elapsed time at `s1` from those at `s0`, and the step's error.
+
+        The error is relative to the tolerance (a step is accepted up to 1); it is 0 for methods
+        that are not adaptive. `time` is `None` unless the scene has a pace that is asked for.
+        """
+
+    def resize(self, error: Scalar) -> Scalar:
+        """Factor from one step's length to the next one's."""
+        return jnp.ones_like(error)
+
+
+def _unrolled(solver: Any) -> Unrolled:
+    return solver if isinstance(solver, Unrolled) else Unrolled(solver)
+
+
+def _runge_kutta(solver: Unrolled, scene: AbstractScene, s0, s1, state, time):
+    def field(s, y, args):
+        state, time = y
+        return scene.field(s, state), None if time is None else scene.pace(s, state)
+
+    y1, error, *_ = solver.step(
+        diffrax.ODETerm(field), s0, s1, (state, time), None, None, made_jump=True
+    )
+    return *y1, error[0]
+
+
+class Adaptive(AbstractMethod):
+    """An explicit diffrax Runge–Kutta solver with steps sized by its error estimate.
+
+    **Arguments:** `solver` (default `diffrax.Tsit5()`); `rtol` and `atol`, tolerances relative to
+    each state component and absolute (in the scene's dimensionless units; `atol` defaults to
+    `rtol`).
+
+    **Raises:** `TypeError` if the solver is not explicit Runge–Kutta, `ValueError` for tolerances
+    out of (0, 1].
+    """
+
+    solver: Unrolled = eqx.field(default_factory=diffrax.Tsit5, converter=_unrolled)
+    rtol: float = eqx.field(kw_only=True, default=1e-9)
+    atol: float | None = eqx.field(kw_only=True, default=None)
+
+    def __check_init__(self):
+        require("rtol", self.rtol, low=0.0, high=1.0, open_low=True)
+        if self.atol is not None:
+            require("atol", self.atol, low=0.0, high=1.0, open_low=True)
+
+    @property
+    def steps_per_cycle(self) -> int:
+        """Eight: no step is longer than an eighth of a cycle, so that it holds one hump."""
+        return 8
+
+    @property
+    def adaptive(self) -> bool:
+        """True."""
+        return True
+
+    def step(self, scene, s0, s1, state, time):
+        """One Runge–Kutta step and its error norm (root mean square over the components)."""
+        new, time, error = _runge_kutta(self.solver, scene, s0, s1, state, time)
+        # Below the precision's own rounding a tolerance would only be rejected for ever.
+        floor = 8 * jnp.finfo(s0.dtype).eps
+        rtol = jnp.maximum(jnp.asarray(self.rtol, s0.dtype), floor)
+        atol = rtol if self.atol is None else jnp.maximum(jnp.asarray(self.atol, s0.dtype), floor)
+        scaled = jtu.tree_map(
+            lambda e, a, b: (e / (atol + rtol * jnp.maximum(jnp.abs(a), jnp.abs(b)))) ** 2,
+            error, state, new,
+        )  # fmt: skip
+        parts = jtu.tree_leaves(scaled)
+        return new, time, jnp.sqrt(jax.lax.stop_gradient(sum(parts) / len(parts)))
+
+    def resize(self, error):
+        """0.9 · error^(-1/order), between 0.2 and 5."""
+        # A step length needs no double precision, and single precision powers vectorise.
+        order = self.solver.order(None)
+        small = jnp.clip(error, 1e-20, 1e20).astype(jnp.float32)
+        factor = 0.9 * small ** (-1.0 / order)
+        return jnp.clip(factor, 0.2, 5.0).astype(error.dtype)
+
+
+class FixedStep(AbstractMethod):
+    """An explicit diffrax Runge–Kutta solver with a fixed number of steps in a cycle.
+
+    Under `vmap` this is the faster choice: no lane waits for another's rejected steps. A step that
+    meets a stop is split there. Steps are shortened where the scene's `step_limit` asks for it.
+
+    **Arguments:** `solver` (default `diffrax.Tsit5()`), `steps_per_cycle` (at least 8).
+
+    **Raises:** `TypeError` if the solver is not explicit Runge–Kutta; `ValueError` for fewer than
+    8 steps.
+    """
+
+    solver: Unrolled = eqx.field(default_factory=diffrax.Tsit5, converter=_unrolled)
+    steps_per_cycle: int = eqx.field(static=True, default=32)  # pyright: ignore
+
+    def __check_init__(self):
+        count("steps_per_cycle", self.steps_per_cycle, least=8)
+
+    def step(self, scene, s0, s1, state, time):
+        """One Runge–Kutta step; its error is not asked for."""
+        new, time, _ = _runge_kutta(self.solver, scene, s0, s1, state, time)
+        return new, time, jnp.zeros_like(s0)

@@ -1,0 +1,124 @@
+"""Why a simulation ended, and what it returns."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+
+class RESULTS(eqx.Enumeration):
+    """Why a lane ended; `simulate` gives one to each."""
+
+    successful = ""
+    bad_start = "The start is not finite or lies beyond a stop."
+    stalled = (
+        "The crank stopped turning forward, which the phase clock cannot follow. Simulate with "
+        '`clock="time"`.'
+    )
+    chatter = "The impacts within one cycle exceeded `max_impacts` (chatter)."
+    underflow = "The step size fell below what the precision resolves. Loosen the tolerance."
+    not_finite = "The state ceased to be finite."
+    max_steps = "The number of steps exceeded `max_steps` before the last cycle was complete."
+
+
+# The loop carries reasons as numbers; this is their order.
+REASONS = (
+    RESULTS.successful,
+    RESULTS.bad_start,
+    RESULTS.stalled,
+    RESULTS.chatter,
+    RESULTS.underflow,
+    RESULTS.not_finite,
+    RESULTS.max_steps,
+)
+(SUCCESSFUL, BAD_START, STALLED, CHATTER, UNDERFLOW, NOT_FINITE, MAX_STEPS) = range(7)
+
+
+def reason(code: Float[Array, ""]) -> RESULTS:
+    """The enumeration item for a reason carried as a number."""
+    result = REASONS[0]
+    for number, item in enumerate(REASONS[1:], start=1):
+        result = RESULTS.where(code == number, item, result)
+    return result
+
+
+class Samples(eqx.Module):
+    """Dense samples, evenly spaced in the cycle; arrays have shape (cycles · samples + 1,)."""
+
+    cycles: Float[Array, " points"]
+    """Place of the sample on the drive's clock, in cycles since the start."""
+    time: Float[Array, " points"]
+    """Time τ since the start (in units of `s` for scenes of your own)."""
+    state: Any
+    """The states, a pytree like the start."""
+
+
+class ImpactLog(eqx.Module):
+    """The first impacts of each cycle in their order; arrays have shape (cycles, size).
+
+    Unused places hold NaN, and -1 in `stop`.
+    """
+
+    phase: Float[Array, "cycles size"]
+    """Clock of the cycle at the impact: crank angle in [0, 2π] for a `Scene`."""
+    speed: Float[Array, "cycles size"]
+    """V⁻, speed of approach just before the impact (unit: a ω)."""
+    stop: Int[Array, "cycles size"]
+    """Index into `scene.stops`."""
+
+
+class Run(eqx.Module):
+    """What `simulate` returns, cycle by cycle. After a failure the rest is NaN (counts: 0).
+
+    Under `vmap` every array has the batch axes in front.
+    """
+
+    sections: Any
+    """States at the start and after each cycle, a pytree like the start; leaves (cycles + 1,)."""
+    y_max: Float[Array, " cycles"] | None
+    """Greatest Y of the motion in each cycle, not of sample points (unit: a)."""
+    y_min: Float[Array, " cycles"] | None
+    """Smallest Y of the motion in each cycle (unit: a)."""
+    impacts: Int[Array, " cycles"]
+    """Number of impacts in each cycle."""
+    impact_speed: Float[Array, " cycles"] | None
+    """Greatest V⁻ in each cycle (unit: a ω), 0 without impact."""
+    duration: Float[Array, " cycles"] | None
+    """Time τ that each cycle took."""
+    frequency_ratio: Float[Array, " cycles"] | None
+    """ζ: mean crank speed over each cycle (unit: ω)."""
+    samples: Samples | None
+    """Dense samples, if asked for."""
+    impact_log: ImpactLog | None
+    """The impacts, if asked for."""
+    result: RESULTS
+    """Why the run ended: `RESULTS.successful`, or what went wrong."""
+    steps: Int[Array, ""]
+    """Steps tried, those included that were rejected or shortened to meet an impact."""
+    rejected: Int[Array, ""]
+    """Steps rejected on their error estimate."""
+
+    @property
+    def successful(self) -> jax.Array:
+        """Whether the lane completed all its cycles."""
+        return self.result == RESULTS.successful
+
+    def __str__(self) -> str:
+        if isinstance(self.steps, jax.core.Tracer):
+            return repr(self)
+        if self.steps.ndim:
+            good = int(jnp.sum(self.successful))
+            return f"Run of {self.steps.size} lanes {self.steps.shape}, {good} successful"
+        cycles = self.impacts.shape[-1]
+        lines = [f"Run of {cycles} cycles, {int(jnp.sum(self.impacts))} impacts"]
+        last = ", ".join(
+            f"{name} = {float(value[-1]):.9g}" for name, value in vars(self.sections).items()
+        )
+        lines.append(f"  last section: {last}")
+        if self.y_min is not None and self.y_max is not None:
+            lines.append(f"  last cycle: Y in [{self.y_min[-1]:.6g}, {self.y_max[-1]:.6g}]")
+        lines.append(f"  steps: {int(self.steps)} tried, {int(self.rejected)} rejected")
+        ended = "completed" if bool(self.successful) else RESULTS[self.result]
+        return "\n".join([*lines, f"  ended: {ended}"])

@@ -1,0 +1,258 @@
+"""Every motion with one impact per n drive cycles of the ideal scene, from the closed form.
+
+The paper's analysis (Eq. 14 to 21), here for any damping ξ ≥ 0 and through resonance. Between
+impacts Y'' + 2ξY' + Y = cos φ with φ' = ζ is linear in (Y, V, cos φ, sin φ), so a flight over
+T = 2πn/ζ is a matrix, with blocks M (free motion) and G (response from rest). A motion with one
+impact leaves the stop as (d, -k v) at phase φ0 and returns as (d, v):
+
+    (d, v) = M (d, -k v) + G (cos φ0, sin φ0).
+
+This gives cos φ0 and sin φ0 as affine functions of v, and cos² + sin² = 1 makes a quadratic in v:
+at most two motions. With ξ = 0, A = 1/(1 - ζ²) and v0 = v/ζ (the velocity dY/dφ) it reads
+
+    sin φ0 = -(1 - k) v0/(2A),   cos φ0 = d/A + ζ (1 + k)/(2A) cot(nπ/ζ) v0;
+
+the printed Eq. 21 lacks the factor ζ of the cosine and so misses the boundary conditions (16) to
+(18).
+"""
+
+from math import pi
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.scipy.linalg import expm
+from jaxtyping import Array, Bool, Complex, Float
+
+from .._checks import count
+from ..scene import CosineCrank, IdealDrive, Scene
+
+Scalar = Float[Array, ""]
+
+# Grid points per drive cycle on which turning points are bracketed.
+_POINTS = 256
+
+
+class ClosedFormOrbits(eqx.Module):
+    """Motions with one impact per n cycles, two places long: admissible ones come first, then
+    faster impacts. Places without a motion hold NaN. Lengths in units of a, velocities of a ω.
+    """
+
+    Y: Float[Array, "... 2"]
+    """Position on the section φ = 0 mod 2π, at the first section after the impact."""
+    V: Float[Array, "... 2"]
+    """dY/dτ on that section."""
+    impact_phase: Float[Array, "... 2"]
+    """Crank angle of the impact (radians), counted from that section: in [2π(n - 1), 2πn)."""
+    impact_speed: Float[Array, "... 2"]
+    """dY/dτ just before the impact, positive."""
+    y_min: Float[Array, "... 2"]
+    """Smallest Y over the period."""
+    y_max: Float[Array, "... 2"]
+    """Largest Y over the period: the gap d, unless the motion leaves the gap."""
+    clearance: Float[Array, "... 2"]
+    """d - Y at the highest peak between impacts; +inf if there is no such peak."""
+    multipliers: Complex[Array, "... 2 2"]
+    """Floquet multipliers over the n cycles (last axis); their product is k² exp(-2ξT)."""
+    admissible: Bool[Array, "... 2"]
+    """The motion exists and stays inside the gap between impacts."""
+    exists: Bool[Array, "... 2"]
+    """The equations have this real solution and its body approaches the stop (v > 0)."""
+
+
+def closed_form_orbits(scene: Scene, *, cycles: int = 1) -> ClosedFormOrbits:
+    """All motions of an ideal scene with one impact per `cycles` drive cycles (Eq. 14 to 21).
+
+    **Arguments:** a `Scene` with an `IdealDrive`, a `CosineCrank` and one stop on the right,
+    whose numbers are scalars, traced or not (for arrays of numbers use `jax.vmap`); the period of
+    the motion in drive cycles.
+
+    **Returns:** `ClosedFormOrbits`, stable and unstable motions alike. Differentiable where a
+    motion exists; derivatives grow without bound towards a fold or a grazing. Resonance (ζ = 1,
+    ξ = 0) is not special. Where sin(nπ/ζ) = 0 with ξ = 0 the free motion is periodic itself and
+    every motion has shrunk to a grazing: nothing exists. Impacts slower than rounding can resolve
+    count as grazing too. Turning points are bracketed on 256 points per drive cycle and then
+    solved for, so ζ should be well above 1/256, or peaks between the points can be missed.
+
+    **Raises:** `ValueError` if the scene has no such closed form or `cycles` < 1.
+    """
+    if not isinstance(scene, Scene) or not isinstance(scene.drive, IdealDrive):
+        came = type(scene.drive if isinstance(scene, Scene) else scene).__name__
+        raise ValueError(
+            f"Argument `scene` must be a `Scene` with an `IdealDrive`, but got a `{came}`."
+        )
+    if not isinstance(scene.crank, CosineCrank):
+        raise ValueError(
+            f"Argument `scene` must have a `CosineCrank`, but has a `{type(scene.crank).__name__}`."
+        )
+    sides = [stop.side for stop in scene.stops]
+    if sides != ["right"]:
+        raise ValueError(
+            f"Argument `scene` must have exactly one stop, on the right, but has stops {sides}."
+        )
+    stop = scene.stops[0]
+    numbers = (scene.drive.frequency_ratio, scene.damping_ratio, stop.restitution, stop.gap)
+    shapes = [jnp.shape(number) for number in numbers]
+    if any(shapes):
+        raise ValueError(
+            "Argument `scene` must hold scalars (use `jax.vmap` for arrays), but its frequency "
+            f"ratio, damping ratio, restitution and gap have shapes {shapes}."
+        )
+    return one_impact_orbits(*numbers, count("cycles", cycles, least=1))
+
+
+def one_impact_orbits(zeta: Any, xi: Any, k: Any, d: Any, n: int) -> ClosedFormOrbits:
+    """`closed_form_orbits` on bare dimensionless scalars: ζ > 0, ξ ≥ 0, k in [0, 1], d, n ≥ 1."""
+    dtype = jnp.result_type(float, zeta, xi, k, d)
+    zeta, xi, k, d = (jnp.asarray(x, dtype) for x in (zeta, xi, k, d))
+    period = 2 * pi * n / zeta
+    rates = _rates(zeta, xi)
+    # Squarings of the flight over one grid step: over 1, 2, 4, … steps, and last over T. They
+    # hold through resonance and critical damping, where sines and a steady response do not.
+    doublings = (_POINTS * n - 1).bit_length()
+    flights = [expm(rates * (period / 2**doublings))]
+    for _ in range(doublings):
+        flights.append(_dot(flights[-1], flights[-1]))
+    v, phase, resolved = _impacts(flights[-1], k, d, period)
+
+    # Absent motions go on as a harmless one, so that their derivatives cannot be NaN.
+    exists = resolved & (v > 64 * jnp.finfo(dtype).eps * (1 + period) * (1 + jnp.abs(d)))
+    v, phase = jnp.where(exists, v, 1.0), jnp.where(exists, phase, 1.0)
+    follow = jax.vmap(lambda v, phase: _follow(rates, flights[:-1], period, k, d, v, phase))
+    y_min, y_max, clearance = follow(v, phase)
+    wait = (2 * pi - phase) / zeta
+    start = _after_impact(k, d, v, phase)
+    section = _dot(expm(rates * wait[:, None, None]), start[..., None])[..., 0]
+
+    M = flights[-1][:2, :2]
+    multipliers = _multipliers(M, xi, k, d, v, phase, period)
+    admissible = exists & (clearance >= 0)
+    order = jnp.lexsort((-v, ~exists, ~admissible))
+    Y, V, phase, v, y_min, y_max, clearance = (
+        jnp.where(exists, x, jnp.nan)[order]
+        for x in (
+            section[:, 0], section[:, 1], phase + 2 * pi * (n - 1), v, y_min, y_max, clearance,
+        )
+    )  # fmt: skip
+    multipliers = jnp.where(exists[:, None], multipliers, jnp.nan)[order]
+    return ClosedFormOrbits(
+        Y, V, phase, v, y_min, y_max, clearance, multipliers, admissible[order], exists[order]
+    )
+
+
+def _dot(a, b):
+    # Accelerators may round the factors of a float32 product to fewer bits unless told not to.
+    return jnp.matmul(a, b, precision=jax.lax.Precision.HIGHEST)
+
+
+def _rates(zeta: Scalar, xi: Scalar) -> Float[Array, "4 4"]:
+    """The matrix of d/dτ (Y, V, cos φ, sin φ)."""
+    one, none = jnp.ones_like(zeta), jnp.zeros_like(zeta)
+    return jnp.array(
+        [
+            [none, one, none, none],
+            [-one, -2 * xi, one, none],
+            [none, none, none, -zeta],
+            [none, none, zeta, none],
+        ]
+    )
+
+
+def _after_impact(k, d, v, phase) -> Float[Array, "... 4"]:
+    """(Y, V, cos φ, sin φ) just after the impact."""
+    parts = jnp.broadcast_arrays(d, -k * v, jnp.cos(phase), jnp.sin(phase))
+    return jnp.stack(parts, axis=-1)
+
+
+def _impacts(
+    flight: Float[Array, "4 4"], k: Scalar, d: Scalar, period: Scalar
+) -> tuple[Float[Array, "2"], Float[Array, "2"], Bool[Array, "2"]]:
+    """Impact speeds (unit: a ω), impact phases in [0, 2π), and whether they are real.
+
+    With r(v) = f + g v = (d, v) - M (d, -k v) and the adjugate G⁺ of G, the condition on the
+    phase is |G⁺ r(v)| = |det G|. Since det G⁺ = det G, the discriminant is det² (|G⁺ g|² -
+    (f × g)²): neither the speeds nor the test for real ones divide by det.
+    """
+    M, G = flight[:2, :2], flight[:2, 2:]
+    f = jnp.stack([d - M[0, 0] * d, -M[1, 0] * d])
+    g = jnp.stack([k * M[0, 1], 1 + k * M[1, 1]])
+    adjugate = jnp.stack([jnp.stack([G[1, 1], -G[0, 1]]), jnp.stack([-G[1, 0], G[0, 0]])])
+    det = G[0, 0] * G[1, 1] - G[0, 1] * G[1, 0]
+    p, q = _dot(adjugate, f), _dot(adjugate, g)
+    spread = jnp.sum(q * q) - (f[0] * g[1] - f[1] * g[0]) ** 2
+    # Guarded on both sides of `where`, so that no derivative is infinite at a fold or beyond it.
+    root = jnp.where(spread > 0, jnp.sqrt(jnp.where(spread > 0, spread, 1.0)), 0.0)
+    size = jnp.sum(q * q)
+    # A flight that is the identity to rounding (sin(nπ/ζ) = 0 with ξ = 0) decides nothing.
+    noise = 16 * jnp.finfo(flight.dtype).eps * (1 + period)
+    decided = size > noise**2
+    v = (jnp.array([1.0, -1.0], det.dtype) * det * root - jnp.sum(p * q)) / jnp.where(
+        decided, size, 1.0
+    )
+    resolved = (spread >= 0) & decided
+    direction = (p[:, None] + q[:, None] * v) * jnp.where(det < 0, -1.0, 1.0)
+    cosine = jnp.where(resolved, direction[0], 1.0)
+    phase = jnp.mod(jnp.arctan2(jnp.where(resolved, direction[1], 0.0), cosine), 2 * pi)
+    # A rounding error below zero comes back from `mod` as a full turn.
+    return v, jnp.where(phase >= 2 * pi, 0.0, phase), resolved
+
+
+def _follow(rates, flights, period, k, d, v, phase) -> tuple[Scalar, Scalar, Scalar]:
+    """Smallest and largest Y over the flight after the impact, and d - Y at its highest peak."""
+    states = _after_impact(k, d, v, phase)[None]
+    for flight in flights:  # over 1, 2, 4, … grid steps
+        states = jnp.concatenate([states, _dot(states, flight.T)])
+    end = jnp.stack([d, v, jnp.cos(phase), jnp.sin(phase)])  # what the flight was solved for
+    states = jnp.concatenate([states, end[None]])
+    y, w = states[:, 0], states[:, 1]
+    h = period / (y.size - 1)
+    # Where in its cell w = 0 (linearly) and how high Y is there (cubic Hermite, fourth order).
+    drop = w[:-1] - w[1:]
+    at = jnp.clip(w[:-1] / jnp.where(drop == 0, 1.0, drop), 0, 1)
+    rise, back = at * at * (3 - 2 * at), at * (1 - at)
+    height = y[:-1] + rise * (y[1:] - y[:-1]) + h * back * ((1 - at) * w[:-1] - at * w[1:])
+    has_peak, has_dip = (w[:-1] > 0) & (w[1:] <= 0), (w[:-1] < 0) & (w[1:] >= 0)
+
+    def turning(here, sign):
+        cell = jnp.argmax(jnp.where(here, sign * height, -jnp.inf))
+        return _turning_point(rates, states[cell], at[cell] * h, h), jnp.any(here)
+
+    peak, any_peak = turning(has_peak, 1.0)
+    dip, any_dip = turning(has_dip, -1.0)
+    y_min = jnp.where(any_dip, dip, jnp.min(y))
+    y_max = jnp.where(any_peak, jnp.maximum(peak, d), d)
+    return y_min, y_max, jnp.where(any_peak, d - peak, jnp.inf)
+
+
+def _turning_point(rates, state, guess, h) -> Scalar:
+    """Y where its velocity vanishes near the time `guess` after `state`, by Newton's method."""
+
+    def at(time, rates, state):
+        state = _dot(expm(rates * time), state)
+        pull = _dot(rates[1], state)
+        return state[0], state[1], jnp.where(jnp.abs(pull) > 0, pull, 1.0)
+
+    held = jax.lax.stop_gradient((rates, state))
+
+    def newton(_, time):
+        _, velocity, pull = at(time, *held)
+        return jnp.clip(time - velocity / pull, 0, jax.lax.stop_gradient(h))
+
+    time = jax.lax.fori_loop(0, 3, newton, jax.lax.stop_gradient(guess))
+    Y, velocity, pull = at(time, rates, state)
+    # To rounding this is Y; with the last term its first and second derivatives are right too.
+    return Y - 0.5 * velocity * velocity / pull
+
+
+def _multipliers(M, xi, k, d, v, phase, period) -> Complex[Array, "2 2"]:
+    """Eigenvalues of saltation times flight; [motion, multiplier].
+
+    The saltation (δ before to δ after, at fixed time) is [[-k, 0], [(k a⁻ + a⁺)/V⁻, -k]], where
+    damping drops out of k a⁻ + a⁺ = (1 + k)(cos φ0 - d).
+    """
+    kick = (1 + k) * (jnp.cos(phase) - d) / v
+    half = 0.5 * (kick * M[0, 1] - k * (M[0, 0] + M[1, 1]))
+    det = k * k * jnp.exp(-2 * xi * period)
+    root = jnp.sqrt((half * half - det).astype(jnp.result_type(half, jnp.complex64)))
+    return jnp.stack([half + root, half - root], axis=-1)

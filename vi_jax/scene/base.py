@@ -1,0 +1,79 @@
+"""What `simulate` asks of a scene. A class of your own with these few methods runs like ours."""
+
+import abc
+from typing import Any
+
+import equinox as eqx
+import jax
+from jaxtyping import Array, Float
+
+from .stop import RigidStop
+
+State = Any
+"""A pytree of scalars; the defaults below expect the fields `Y` and `V`."""
+
+
+class AbstractScene(eqx.Module):
+    """A mechanical system with one impacting coordinate, observed cycle by cycle.
+
+    Its independent variable is called `s`; `s` restarts from zero in each cycle.
+
+    To write a scene of your own, give it `stops`, `cycle` and `field`. The other methods have
+    defaults that suit a state with the fields `Y` and `V` whose independent variable is time.
+    """
+
+    stops: eqx.AbstractVar[tuple[RigidStop, ...]]
+
+    @property
+    @abc.abstractmethod
+    def cycle(self) -> Float[Array, ""] | float:
+        """Length of one cycle in `s` (or in `clock(state)`, where that is not `None`)."""
+
+    @abc.abstractmethod
+    def field(self, s: Float[Array, ""], state: State) -> State:
+        """d(state)/ds between impacts, a pytree like `state`."""
+
+    def position(self, state: State) -> Float[Array, ""]:
+        """The coordinate that stops limit."""
+        return state.Y
+
+    def velocity(self, state: State) -> Float[Array, ""]:
+        """The velocity that an impact reverses; of the sign of d(position)/ds."""
+        return state.V
+
+    def placed(self, state: State, Y: Float[Array, ""], V: Float[Array, ""]) -> State:
+        """`state` with this position and velocity: how a landing and a rebound are applied."""
+        return eqx.tree_at(lambda x: (x.Y, x.V), state, (Y, V))
+
+    def clock(self, state: State) -> Float[Array, ""] | None:
+        """The state component that counts cycles, or `None` where `s` itself does."""
+        return None
+
+    def rewound(self, state: State) -> State:
+        """`state` with its clock set back by one cycle (only asked where there is a clock)."""
+        return state
+
+    def pace(self, s: Float[Array, ""], state: State) -> Float[Array, ""] | None:
+        """d(time)/ds where it varies along the motion, or `None` where `s` measures time."""
+        return None
+
+    @property
+    def period(self) -> Float[Array, ""] | float:
+        """Duration of a cycle, where it is fixed."""
+        return self.cycle
+
+    def frequency_ratio(self, duration: Float[Array, "..."]) -> Float[Array, "..."] | None:
+        """Mean drive speed over cycles of these durations, or `None` where nothing is driven."""
+        return None
+
+    def step_limit(self, s: Float[Array, ""], state: State) -> Float[Array, ""] | float:
+        """The longest step that holds at most one extremum of the motion; at most `cycle`/8."""
+        return self.cycle / 8
+
+    def alive(self, state: State) -> jax.Array | None:
+        """False where the clock of this scene breaks down; `None` where it cannot."""
+        return None
+
+    def check_start(self, start: State) -> None:
+        """Raise a `ValueError` if the concrete `start` cannot be simulated (stops apart)."""
+        return None

@@ -1,0 +1,55 @@
+"""Cranks: how the slider moves with the crank angle."""
+
+import abc
+from typing import NamedTuple
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from .._checks import number, require
+from .trig import sincos
+
+
+class Slide(NamedTuple):
+    """The slider's displacement U and its first two derivatives by the crank angle (unit: a)."""
+
+    U: Float[Array, "..."]
+    U_phi: Float[Array, "..."]
+    U_phiphi: Float[Array, "..."]
+
+
+class AbstractCrank(eqx.Module):
+    """A crank asks for one method, `slide(phase)`."""
+
+    @abc.abstractmethod
+    def slide(self, phase: Float[Array, "..."]) -> Slide:
+        """The slider's displacement at crank angle `phase` (radians), in units of the crank a."""
+
+
+class CosineCrank(AbstractCrank):
+    """The first approximation of the paper (Eq. 4): U = cos φ."""
+
+    def slide(self, phase: Float[Array, "..."]) -> Slide:
+        """U = cos φ and its derivatives (dimensionless)."""
+        sine, cosine = sincos(phase)
+        return Slide(cosine, -sine, -cosine)
+
+
+class SliderCrank(AbstractCrank):
+    """The exact kinematics of crank a and rod l: U = cos φ + (√(1 - λ² sin² φ) - 1)/λ."""
+
+    ratio: Float[Array, "..."] = eqx.field(converter=lambda x: number("ratio", x))
+    """λ = a/l (dimensionless), in (0, 1)."""
+
+    def __check_init__(self):
+        require("ratio", self.ratio, low=0.0, high=1.0, open_low=True, open_high=True)
+
+    def slide(self, phase: Float[Array, "..."]) -> Slide:
+        """Exact U and its derivatives (dimensionless)."""
+        sine, cosine = sincos(phase)
+        inverse = 1 / (1 - (self.ratio * sine) ** 2) ** 0.5
+        # (r - 1)/λ as -λ sin²/(1 + r): no cancellation for a long rod.
+        lag = self.ratio * sine * sine * inverse / (1 + inverse)
+        slope = self.ratio * sine * cosine * inverse
+        bend = self.ratio * (cosine**2 - sine**2) * inverse + self.ratio * slope**2 * inverse
+        return Slide(cosine - lag, -sine - slope, -cosine - bend)

@@ -1,0 +1,115 @@
+"""Table 1 of the paper in SI units, and the way from there to a dimensionless scene and back."""
+
+from math import pi
+from typing import Any
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from .._checks import number, one_of, require
+from .crank import CosineCrank, SliderCrank
+from .drive import IdealDrive, Motor
+from .scene import Oscillator, Scene
+from .stop import RigidStop
+
+
+def _si(name: str, default: float) -> Any:
+    return eqx.field(default=default, converter=lambda x: number(name, x), kw_only=True)
+
+
+class Parameters(eqx.Module):
+    """The machine in SI units; the defaults are Table 1 of the paper (T0 = 10 N·m, κ = 0.9).
+
+    The dimensionless groups, with ω = √(k0/m_C): ξ = c/(2 m_C ω), d = Δ/a, μ = m_B a²/J,
+    ε = m_C a²/J, τ0 = T0/(J ω²), w0 = Ω0/ω, λ = a/l.
+    """
+
+    body_mass: Float[Array, "..."] = _si("body_mass", 0.35)
+    """m_C, mass of the impacting body, kg."""
+    slider_mass: Float[Array, "..."] = _si("slider_mass", 0.2)
+    """m_B, mass of the slider, kg."""
+    stiffness: Float[Array, "..."] = _si("stiffness", 9 * pi**2)
+    """k0, stiffness of the spring, N/m."""
+    damping: Float[Array, "..."] = _si("damping", 0.5)
+    """c, viscous damping of the body, N·s/m."""
+    crank_radius: Float[Array, "..."] = _si("crank_radius", 0.04)
+    """a, crank radius and unit of length, m."""
+    rod_length: Float[Array, "..."] = _si("rod_length", 0.12)
+    """l, length of the rod, m (exact kinematics only)."""
+    inertia: Float[Array, "..."] = _si("inertia", 0.06)
+    """J, moment of inertia of the disc, kg·m²."""
+    restitution: Float[Array, "..."] = _si("restitution", 0.5)
+    """k, coefficient of restitution, dimensionless."""
+    gap: Float[Array, "..."] = _si("gap", 0.08)
+    """Δ, distance of the stop from the unstretched position, m."""
+    torque: Float[Array, "..."] = _si("torque", 10.0)
+    """T0, stall torque of the motor at κ = 1, N·m."""
+    kappa: Float[Array, "..."] = _si("kappa", 0.9)
+    """κ, motor control, dimensionless; the frequency ratio ζ of an ideal drive."""
+    no_load_speed: Float[Array, "..."] | None = eqx.field(
+        default=None,
+        converter=lambda x: x if x is None else number("no_load_speed", x),
+        kw_only=True,
+    )
+    """Ω0, no-load speed of the motor at κ = 1, rad/s. `None` means ω, which makes the tabulated
+    κ = 0.5…1.9 the tabulated range of ζ; the paper does not give Ω0."""
+
+    def __check_init__(self):
+        for name in ("body_mass", "stiffness", "crank_radius", "rod_length", "inertia"):
+            require(name, getattr(self, name), low=0.0, open_low=True)
+        for name in ("slider_mass", "damping", "torque"):
+            require(name, getattr(self, name), low=0.0)
+        require("restitution", self.restitution, low=0.0, high=1.0)
+        require("gap", self.gap)
+        require("kappa", self.kappa)
+        if self.no_load_speed is not None:
+            require("no_load_speed", self.no_load_speed, low=0.0, open_low=True)
+
+    @property
+    def natural_frequency(self) -> Float[Array, "..."]:
+        """ω = √(k0/m_C), rad/s."""
+        return (self.stiffness / self.body_mass) ** 0.5
+
+    def scene(self, *, drive: str = "motor", crank: str = "cosine") -> Scene:
+        """The dimensionless scene.
+
+        **Arguments:** `drive` is `"motor"` or `"ideal"` (which turns at ζ = κ); `crank` is
+        `"cosine"` (first approximation) or `"slider"` (exact kinematics).
+        """
+        one_of("drive", drive, ("motor", "ideal"))
+        one_of("crank", crank, ("cosine", "slider"))
+        omega = self.natural_frequency
+        if drive == "ideal":
+            turning: IdealDrive | Motor = IdealDrive(self.kappa)
+        else:
+            per_inertia = self.crank_radius**2 / self.inertia
+            free = 1.0 if self.no_load_speed is None else self.no_load_speed / omega
+            turning = Motor(
+                strength=self.torque / (self.inertia * omega**2),
+                control=self.kappa,
+                coupling=self.body_mass * per_inertia,
+                slider_inertia=self.slider_mass * per_inertia,
+                no_load_speed=free,
+            )
+        return Scene(
+            Oscillator(self.damping / (2 * self.body_mass * omega)),
+            turning,
+            (RigidStop(self.gap / self.crank_radius, self.restitution),),
+            CosineCrank() if crank == "cosine" else SliderCrank(self.crank_radius / self.rod_length),
+        )
+
+    def metres(self, Y: Any) -> Any:
+        """A dimensionless position Y in m."""
+        return self.crank_radius * Y
+
+    def metres_per_second(self, V: Any) -> Any:
+        """A dimensionless velocity V = dY/dτ in m/s."""
+        return self.crank_radius * self.natural_frequency * V
+
+    def radians_per_second(self, W: Any) -> Any:
+        """A dimensionless crank speed W (or a frequency ratio ζ) in rad/s."""
+        return self.natural_frequency * W
+
+    def seconds(self, tau: Any) -> Any:
+        """A dimensionless time τ in s."""
+        return tau / self.natural_frequency

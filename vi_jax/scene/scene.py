@@ -1,0 +1,255 @@
+"""The scene of the paper: oscillator, crank, drive and stops, in the phase or the time clock."""
+
+from math import pi
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._checks import concrete, number, one_of, require
+from .base import AbstractScene
+from .crank import AbstractCrank, CosineCrank
+from .drive import IdealDrive, Motor
+from .stop import RigidStop
+
+
+class OscillatorState(eqx.Module):
+    """State of an ideally driven scene."""
+
+    Y: Float[Array, "..."]
+    """Position of the body (unit: a)."""
+    V: Float[Array, "..."]
+    """dY/dτ (unit: a ω)."""
+
+
+class MotorState(eqx.Module):
+    """State of a motor scene whose independent variable is the crank angle."""
+
+    Y: Float[Array, "..."]
+    """Position of the body (unit: a)."""
+    V: Float[Array, "..."]
+    """dY/dτ (unit: a ω)."""
+    W: Float[Array, "..."]
+    """Speed of the crank dφ/dτ (unit: ω)."""
+
+
+class TimedMotorState(eqx.Module):
+    """State of a motor scene whose independent variable is time."""
+
+    Y: Float[Array, "..."]
+    """Position of the body (unit: a)."""
+    V: Float[Array, "..."]
+    """dY/dτ (unit: a ω)."""
+    W: Float[Array, "..."]
+    """Speed of the crank dφ/dτ (unit: ω)."""
+    phase: Float[Array, "..."]
+    """Crank angle since the last section (radians)."""
+
+
+class Oscillator(eqx.Module):
+    """The body C on its spring, in units of its natural frequency."""
+
+    damping_ratio: Float[Array, "..."] = eqx.field(
+        default=0.0, converter=lambda x: number("damping_ratio", x)
+    )
+    """ξ = c/(2 m_C ω) (dimensionless), not negative."""
+
+    def __check_init__(self):
+        require("damping_ratio", self.damping_ratio, low=0.0)
+
+
+class Scene(AbstractScene):
+    """A body on a spring, shaken by a crank, with stops: Y'' + 2ξY' + Y = U(φ).
+
+    Every number is a leaf, so that any of them can be a `vmap` axis or be differentiated; what is
+    absent (a stop, the drive's equation, a clock component) is absent from the compiled program.
+
+    The clock is `"phase"` (crank angle as the independent variable: the drive cycle is exactly 2π
+    long, and the crank must keep turning forward) or `"time"` (anything, a start from rest
+    included). An ideal drive makes both the same up to the factor ζ.
+    """
+
+    oscillator: Oscillator
+    drive: IdealDrive | Motor
+    stops: tuple[RigidStop, ...] = eqx.field(default=(), converter=tuple)
+    crank: AbstractCrank = eqx.field(default_factory=CosineCrank)
+    clock_name: str = eqx.field(static=True, default="phase")
+
+    def __check_init__(self):
+        one_of("clock_name", self.clock_name, ("phase", "time"))
+        if not isinstance(self.drive, IdealDrive | Motor):
+            raise TypeError(
+                f"Argument `drive` must be an `IdealDrive` or a `Motor`, but got {self.drive!r}."
+            )
+        for stop in self.stops:
+            if not isinstance(stop, RigidStop):
+                raise TypeError(f"Argument `stops` must hold `RigidStop`s, but holds {stop!r}.")
+        _check_room(self.stops)
+
+    @classmethod
+    def ideal(
+        cls,
+        *,
+        frequency_ratio: Any,
+        restitution: Any = 0.5,
+        gap: Any = 2.0,
+        damping_ratio: Any = 0.0,
+        crank: AbstractCrank | None = None,
+    ) -> "Scene":
+        """An ideally driven scene with one stop on the right.
+
+        **Arguments:** ζ, k, d (unit: a) and ξ, scalars or arrays of one shape to `vmap` over;
+        `crank` defaults to `CosineCrank()`. `gap=None` leaves the stop out.
+
+        **Raises:** `ValueError` naming the argument that is out of range.
+        """
+        stops = () if gap is None else (RigidStop(gap, restitution),)
+        return cls(
+            Oscillator(damping_ratio), IdealDrive(frequency_ratio), stops, crank or CosineCrank()
+        )
+
+    @property
+    def damping_ratio(self) -> Float[Array, "..."]:
+        """ξ (dimensionless)."""
+        return self.oscillator.damping_ratio
+
+    @property
+    def cycle(self) -> Float[Array, ""] | float:
+        """2π of crank angle; in the time clock of an ideal drive 2π/ζ of time τ."""
+        if self.clock_name == "time" and isinstance(self.drive, IdealDrive):
+            return 2 * pi / self.drive.frequency_ratio
+        return 2 * pi
+
+    @property
+    def period(self) -> Float[Array, ""] | float:
+        """2π/ζ of time τ for an ideal drive."""
+        if isinstance(self.drive, IdealDrive):
+            return 2 * pi / self.drive.frequency_ratio
+        return 2 * pi
+
+    def in_clock(self, clock: str) -> "Scene":
+        """The same scene in the `"phase"` or the `"time"` clock."""
+        one_of("clock", clock, ("phase", "time"))
+        return Scene(self.oscillator, self.drive, self.stops, self.crank, clock)
+
+    def start(
+        self, *, Y: Any = 0.0, V: Any = 0.0, W: Any = None
+    ) -> OscillatorState | MotorState | TimedMotorState:
+        """A state on the section φ = 0: position (unit: a), velocity (a ω), crank speed (ω).
+
+        `W` belongs to motor scenes and defaults to the motor's no-load speed κ w0.
+
+        **Raises:** `ValueError` if a number is not finite or `W` is given to an ideal drive.
+        """
+        Y, V = number("Y", Y), number("V", V)
+        require("Y", Y)
+        require("V", V)
+        if isinstance(self.drive, IdealDrive):
+            if W is not None:
+                raise ValueError(
+                    "Argument `W` must be left out: an ideal drive turns at its frequency ratio, "
+                    f"but got W={W!r}."
+                )
+            return OscillatorState(Y, V)
+        W = number("W", self.drive.control * self.drive.no_load_speed if W is None else W)
+        require("W", W)
+        if self.clock_name == "phase":
+            return MotorState(Y, V, W)
+        return TimedMotorState(Y, V, W, jnp.zeros_like(W))
+
+    def adopt(self, start: Any) -> Any:
+        """A start made for either clock, as this scene's clock needs it."""
+        if isinstance(self.drive, IdealDrive):
+            wanted = OscillatorState
+        else:
+            wanted = MotorState if self.clock_name == "phase" else TimedMotorState
+            if wanted is TimedMotorState and isinstance(start, MotorState):
+                return TimedMotorState(start.Y, start.V, start.W, jnp.zeros_like(start.W))
+        if not isinstance(start, wanted):
+            raise TypeError(
+                f"Argument `start` must be a `{wanted.__name__}` for this scene (use "
+                f"`scene.start(...)`), but got a `{type(start).__name__}`."
+            )
+        return start
+
+    def field(self, s: Float[Array, ""], state: Any) -> Any:
+        """d(state)/ds: by crank angle (Eq. 8 to 9 of the paper) or by time τ (Eq. 5 to 7)."""
+        drive = self.drive
+        if isinstance(drive, IdealDrive):
+            if self.clock_name == "time":
+                slide = self.crank.slide(drive.frequency_ratio * s)
+                return OscillatorState(state.V, self._pull(slide.U, state))
+            slide = self.crank.slide(s)
+            pace = 1 / drive.frequency_ratio
+            return OscillatorState(pace * state.V, pace * self._pull(slide.U, state))
+        slide = self.crank.slide(s if self.clock_name == "phase" else state.phase)
+        pull = self._pull(slide.U, state)
+        spin = drive.acceleration(slide, state.Y, state.W)
+        if self.clock_name == "time":
+            return TimedMotorState(state.V, pull, spin, state.W)
+        pace = 1 / state.W
+        return MotorState(pace * state.V, pace * pull, pace * spin)
+
+    def _pull(self, U, state):
+        """d²Y/dτ²."""
+        return U - state.Y - 2 * self.damping_ratio * state.V
+
+    def clock(self, state: Any) -> Float[Array, ""] | None:
+        """The crank angle, where time is the independent variable of a motor scene."""
+        return state.phase if isinstance(state, TimedMotorState) else None
+
+    def rewound(self, state: Any) -> Any:
+        """The state with a full turn taken off the crank angle."""
+        return eqx.tree_at(lambda x: x.phase, state, state.phase - 2 * pi)
+
+    def pace(self, s: Float[Array, ""], state: Any) -> Float[Array, ""] | None:
+        """dτ/dφ = 1/W in the phase clock of a motor."""
+        return 1 / state.W if isinstance(state, MotorState) else None
+
+    def frequency_ratio(self, duration: Float[Array, "..."]) -> Float[Array, "..."]:
+        """ζ: mean crank speed over cycles of these durations (unit: ω)."""
+        if isinstance(self.drive, IdealDrive):
+            return jnp.broadcast_to(self.drive.frequency_ratio, duration.shape)
+        return 2 * pi / duration
+
+    def step_limit(self, s: Float[Array, ""], state: Any) -> Float[Array, ""]:
+        """An eighth of the shorter of the drive's turn and the body's natural period."""
+        if isinstance(self.drive, IdealDrive):
+            speed = self.drive.frequency_ratio
+        else:
+            speed = jnp.abs(state.W)
+        if self.clock_name == "phase":
+            return pi / 4 * jnp.minimum(1.0, speed)
+        return pi / 4 / jnp.maximum(1.0, speed)
+
+    def alive(self, state: Any) -> jax.Array | None:
+        """In the phase clock of a motor the crank must turn forward."""
+        return state.W > 0 if isinstance(state, MotorState) else None
+
+    def check_start(self, start: Any) -> None:
+        """Raise a `ValueError` if the crank does not turn forward in the phase clock."""
+        if isinstance(start, MotorState):
+            speed = concrete(start.W)
+            if speed is not None and not (speed > 0).all():
+                raise ValueError(
+                    "Argument `start` must have W > 0 in the phase clock, but has "
+                    f"W = {speed.min():g}. Pass `clock=\"time\"` to start from rest."
+                )
+
+
+def _check_room(stops: tuple[RigidStop, ...]) -> None:
+    if len(stops) > 2 or len({stop.side for stop in stops}) != len(stops):
+        raise ValueError(
+            "Argument `stops` must hold at most one stop on each side, but holds "
+            f"{[stop.side for stop in stops]}."
+        )
+    gaps = [concrete(stop.gap) for stop in stops]
+    if len(stops) == 2 and gaps[0] is not None and gaps[1] is not None:
+        room = gaps[0] + gaps[1]
+        if not (room > 0).all():
+            raise ValueError(
+                "Argument `stops` must leave room between the two stops (gaps adding up to more "
+                f"than 0), but their gaps add up to {room.min():g}."
+            )
