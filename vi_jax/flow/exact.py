@@ -54,7 +54,7 @@ class ExactFlight(AbstractMethod):
         """Strong damping asks for shorter arcs, which keeps the arguments of the series small."""
         return limit / jnp.maximum(1.0, scene.damping_ratio)
 
-    def step(self, scene, s0, s1, state, time):
+    def step(self, scene, s0, s1, state, time, one):
         """The flight from `s0` to `s1`, exact to rounding."""
         zeta, xi = scene.drive.frequency_ratio, scene.damping_ratio
         in_phase = scene.clock_name == "phase"

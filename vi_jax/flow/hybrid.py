@@ -68,14 +68,34 @@ def select(condition: Flag, a: Any, b: Any) -> Any:
     return jtu.tree_map(lambda x, y: jnp.where(condition, x, y), a, b)
 
 
+def pin(x: Any, one: Scalar) -> Any:
+    """The same values, divided by a 1 that the compiler does not know.
+
+    XLA's CPU backend copies cheap producers into each of their consumers when it fuses, which
+    multiplies the work of an iteration; it does not copy divisions.
+    """
+    return jtu.tree_map(lambda v: v / one, x)
+
+
+def pin_flag(flag: Flag, one: Scalar) -> Flag:
+    """`pin` for a truth value."""
+    return pin(jnp.where(flag, one, 0.0), one) > 0.5
+
+
 def iterate(plan: Plan, lane: Lane) -> Lane:
     """One step of one lane: advance, aim or land. A lane that has ended is left as it is."""
     active = (lane.done < plan.intervals) & (lane.fault == 0)
     trial = _try(plan, lane, active)
     aim, attempt, target = _aim(plan, lane, trial)
-    aim, taken, rejected = active & aim, active & trial.good & ~aim, active & ~trial.good
+    one = lane.one
+    aim = pin_flag(active & aim, one)
+    taken = pin_flag(active & trial.good & ~aim, one)
+    rejected = active & ~trial.good
+    attempt, target = pin((attempt, target), one)
     length = _resized(plan, lane, trial, taken, rejected)
     s, state, direction, record, completed = _arrive(plan, lane, trial, taken)
+    completed = pin_flag(completed, one)
+    s, state, direction = pin((s, state, direction), one)
 
     done, part = lane.done + jnp.where(completed, 1.0, 0.0), lane.part
     turned = completed
@@ -109,6 +129,7 @@ def iterate(plan: Plan, lane: Lane) -> Lane:
         fault=fault,
         steps=steps,
         rejected=lane.rejected + jnp.where(rejected, 1.0, 0.0),
+        one=one,
         kept_state=kept_state,
         kept=kept,
     )
@@ -127,25 +148,30 @@ def _try(plan: Plan, lane: Lane, active: Flag) -> Trial:
         last = free & (stop_gradient(bound - lane.s) <= h * (1 + 1e-6))
         s1 = jnp.where(last, bound, s1)
     s1 = jnp.where(active, s1, lane.s)
+    s1 = pin(s1, lane.one)
     h = s1 - lane.s
 
     paced = plan.motion and scene.pace(lane.s, lane.state) is not None
     time = lane.record.time if paced else None
-    new, time, error = method.step(scene, lane.s, s1, lane.state, time)
+    new, time, error = method.step(scene, lane.s, s1, lane.state, time, lane.one)
     if not paced and lane.record.time is not None:
         time = lane.record.time + h
+    new = pin(new, lane.one)
     good = jnp.isfinite(sum(jtu.tree_leaves(new), jnp.zeros_like(h)))
     alive = scene.alive(new)
     if alive is not None:
         good = good & alive
     if method.adaptive:
+        error = pin(error, lane.one)
         good = good & (error <= 1)
+    good = pin_flag(good, lane.one)
 
     crossings, position = [], None
     at_turn = jnp.zeros_like(free)
     if plan.motion or scene.stops:
         begin = rates(scene.field, scene.position, lane.s, lane.state)
         end = rates(scene.field, scene.position, s1, new)
+        begin, end = pin((begin, end), lane.one)
         position = begin, end
         shift = _to_turn(end)
         met = (jnp.abs(shift) <= _turn_tolerance(h)) | (lane.aims >= _PATIENCE)
@@ -172,7 +198,7 @@ def _seen(lane: Lane, good: Flag, h: Scalar, crossing: tuple, all_of_them: list)
     for other, _, beyond, _ in all_of_them:
         if other != name:  # what lies beyond another stop was not reached
             aimed = aimed & (beyond.x <= 0)
-    offset, square = landing(end)
+    offset, square = pin(landing(end), lane.one)
     size = stop_gradient(jnp.abs(offset))
     eps = float(jnp.finfo(h.dtype).eps)
     # Two ways of being there to rounding: in place along the path, or, near grazing, in position.
@@ -180,8 +206,8 @@ def _seen(lane: Lane, good: Flag, h: Scalar, crossing: tuple, all_of_them: list)
     close = close | ((jnp.abs(end.x) <= 4 * eps * scale) & (end.v >= 0))
     close = close | (lane.aims >= _PATIENCE)
     real = stop_gradient(square) > 0
-    landed = aimed & close & real
-    again = aimed & ~close & real & (size < 0.25 * h)
+    landed = pin_flag(aimed & close & real, lane.one)
+    again = pin_flag(aimed & ~close & real & (size < 0.25 * h), lane.one)
     return Crossing(name, begin, end, offset, landed, again)
 
 
@@ -229,7 +255,8 @@ def _aim(plan: Plan, lane: Lane, trial: Trial) -> tuple[Flag, Scalar, Scalar]:
         facing = tuple(-lane.direction * c for c in slope(path))
         polynomial = facing if polynomial is None else select(crossed, polynomial, facing)
     assert polynomial is not None
-    theta = rising_root(stop_gradient(polynomial))
+    polynomial = pin(stop_gradient(polynomial), lane.one)
+    theta = pin(rising_root(polynomial), lane.one)
     if trial.position is not None and not plan.motion:
         height = stop_gradient(path[0])
         for n in range(1, len(path)):

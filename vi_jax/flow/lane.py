@@ -53,6 +53,8 @@ class Lane(eqx.Module):
     """Reason why the lane ended before its time (see `results`), or 0."""
     steps: Scalar
     rejected: Scalar
+    one: Scalar
+    """1, which the compiler cannot know (see `hybrid.pin`)."""
     kept_state: Any
     kept: Record
     """State at the end of the last completed interval, and its record, for the caller to store."""
@@ -129,6 +131,7 @@ class Plan(eqx.Module):
             fault=jnp.where(bad, float(results.BAD_START), zero),
             steps=zero,
             rejected=zero,
+            one=jnp.where(bad, jnp.nan, 1.0).astype(zero.dtype),
             kept_state=start,
             kept=self.fresh(start),
         )

@@ -17,6 +17,10 @@ from .unrolled import Unrolled
 Scalar = Float[Array, ""]
 
 
+def pin(x: Any, one: Scalar) -> Any:
+    return jtu.tree_map(lambda v: v / one, x)
+
+
 class AbstractMethod(eqx.Module):
     """What the hybrid step asks of a method."""
 
@@ -40,7 +44,7 @@ class AbstractMethod(eqx.Module):
 
     @abc.abstractmethod
     def step(
-        self, scene: AbstractScene, s0: Scalar, s1: Scalar, state: Any, time: Scalar | None
+        self, scene: AbstractScene, s0: Scalar, s1: Scalar, state: Any, time: Scalar | None, one: Scalar
     ) -> tuple[Any, Scalar | None, Scalar]:
         """State and elapsed time at `s1` from those at `s0`, and the step's error.
 
@@ -57,10 +61,11 @@ def _unrolled(solver: Any) -> Unrolled:
     return solver if isinstance(solver, Unrolled) else Unrolled(solver)
 
 
-def _runge_kutta(solver: Unrolled, scene: AbstractScene, s0, s1, state, time):
+def _runge_kutta(solver: Unrolled, scene: AbstractScene, s0, s1, state, time, one):
     def field(s, y, args):
         state, time = y
-        return scene.field(s, state), None if time is None else scene.pace(s, state)
+        k = scene.field(s, state), None if time is None else scene.pace(s, state)
+        return pin(k, one)
 
     y1, error, *_ = solver.step(
         diffrax.ODETerm(field), s0, s1, (state, time), None, None, made_jump=True
@@ -98,9 +103,9 @@ class Adaptive(AbstractMethod):
         """True."""
         return True
 
-    def step(self, scene, s0, s1, state, time):
+    def step(self, scene, s0, s1, state, time, one):
         """One Runge–Kutta step and its error norm (root mean square over the components)."""
-        new, time, error = _runge_kutta(self.solver, scene, s0, s1, state, time)
+        new, time, error = _runge_kutta(self.solver, scene, s0, s1, state, time, one)
         # Below the precision's own rounding a tolerance would only be rejected for ever.
         floor = 8 * jnp.finfo(s0.dtype).eps
         rtol = jnp.maximum(jnp.asarray(self.rtol, s0.dtype), floor)
@@ -139,7 +144,7 @@ class FixedStep(AbstractMethod):
     def __check_init__(self):
         count("steps_per_cycle", self.steps_per_cycle, least=8)
 
-    def step(self, scene, s0, s1, state, time):
+    def step(self, scene, s0, s1, state, time, one):
         """One Runge–Kutta step; its error is not asked for."""
-        new, time, _ = _runge_kutta(self.solver, scene, s0, s1, state, time)
+        new, time, _ = _runge_kutta(self.solver, scene, s0, s1, state, time, one)
         return new, time, jnp.zeros_like(s0)

@@ -125,20 +125,17 @@ def one_impact_orbits(zeta: Any, xi: Any, k: Any, d: Any, n: int) -> ClosedFormO
     start = _after_impact(k, d, v, phase)
     section = _dot(expm(rates * wait[:, None, None]), start[..., None])[..., 0]
 
-    M = flights[-1][:2, :2]
-    multipliers = _multipliers(M, xi, k, d, v, phase, period)
+    numbers = (*section[:, :2].T, phase + 2 * pi * (n - 1), v, y_min, y_max, clearance)
+    multipliers = _multipliers(flights[-1], xi, k, d, v, phase, period)
     admissible = exists & (clearance >= 0)
-    order = jnp.lexsort((-v, ~exists, ~admissible))
-    Y, V, phase, v, y_min, y_max, clearance = (
-        jnp.where(exists, x, jnp.nan)[order]
-        for x in (
-            section[:, 0], section[:, 1], phase + 2 * pi * (n - 1), v, y_min, y_max, clearance,
-        )
-    )  # fmt: skip
-    multipliers = jnp.where(exists[:, None], multipliers, jnp.nan)[order]
-    return ClosedFormOrbits(
-        Y, V, phase, v, y_min, y_max, clearance, multipliers, admissible[order], exists[order]
+    orbits = ClosedFormOrbits(
+        *(jnp.where(exists, x, jnp.nan) for x in numbers),
+        jnp.where(exists[:, None], multipliers, jnp.nan),
+        admissible,
+        exists,
     )
+    order = jnp.lexsort((-v, ~exists, ~admissible))
+    return jax.tree.map(lambda x: x[order], orbits)
 
 
 def _dot(a, b):
@@ -148,15 +145,8 @@ def _dot(a, b):
 
 def _rates(zeta: Scalar, xi: Scalar) -> Float[Array, "4 4"]:
     """The matrix of d/dτ (Y, V, cos φ, sin φ)."""
-    one, none = jnp.ones_like(zeta), jnp.zeros_like(zeta)
-    return jnp.array(
-        [
-            [none, one, none, none],
-            [-one, -2 * xi, one, none],
-            [none, none, none, -zeta],
-            [none, none, zeta, none],
-        ]
-    )
+    constant = jnp.zeros((4, 4), zeta.dtype).at[0, 1].set(1).at[1, 0].set(-1).at[1, 2].set(1)
+    return constant.at[1, 1].set(-2 * xi).at[2, 3].set(-zeta).at[3, 2].set(zeta)
 
 
 def _after_impact(k, d, v, phase) -> Float[Array, "... 4"]:
@@ -167,7 +157,7 @@ def _after_impact(k, d, v, phase) -> Float[Array, "... 4"]:
 
 def _impacts(
     flight: Float[Array, "4 4"], k: Scalar, d: Scalar, period: Scalar
-) -> tuple[Float[Array, "2"], Float[Array, "2"], Bool[Array, "2"]]:
+) -> tuple[Float[Array, "2"], Float[Array, "2"], Bool[Array, ""]]:
     """Impact speeds (unit: a ω), impact phases in [0, 2π), and whether they are real.
 
     With r(v) = f + g v = (d, v) - M (d, -k v) and the adjugate G⁺ of G, the condition on the
@@ -180,10 +170,10 @@ def _impacts(
     adjugate = jnp.stack([jnp.stack([G[1, 1], -G[0, 1]]), jnp.stack([-G[1, 0], G[0, 0]])])
     det = G[0, 0] * G[1, 1] - G[0, 1] * G[1, 0]
     p, q = _dot(adjugate, f), _dot(adjugate, g)
-    spread = jnp.sum(q * q) - (f[0] * g[1] - f[1] * g[0]) ** 2
+    size = jnp.sum(q * q)
+    spread = size - (f[0] * g[1] - f[1] * g[0]) ** 2
     # Guarded on both sides of `where`, so that no derivative is infinite at a fold or beyond it.
     root = jnp.where(spread > 0, jnp.sqrt(jnp.where(spread > 0, spread, 1.0)), 0.0)
-    size = jnp.sum(q * q)
     # A flight that is the identity to rounding (sin(nπ/ζ) = 0 with ξ = 0) decides nothing.
     noise = 16 * jnp.finfo(flight.dtype).eps * (1 + period)
     decided = size > noise**2
@@ -245,14 +235,16 @@ def _turning_point(rates, state, guess, h) -> Scalar:
     return Y - 0.5 * velocity * velocity / pull
 
 
-def _multipliers(M, xi, k, d, v, phase, period) -> Complex[Array, "2 2"]:
+def _multipliers(flight, xi, k, d, v, phase, period) -> Complex[Array, "2 2"]:
     """Eigenvalues of saltation times flight; [motion, multiplier].
 
     The saltation (δ before to δ after, at fixed time) is [[-k, 0], [(k a⁻ + a⁺)/V⁻, -k]], where
     damping drops out of k a⁻ + a⁺ = (1 + k)(cos φ0 - d).
     """
     kick = (1 + k) * (jnp.cos(phase) - d) / v
-    half = 0.5 * (kick * M[0, 1] - k * (M[0, 0] + M[1, 1]))
+    half = 0.5 * (kick * flight[0, 1] - k * (flight[0, 0] + flight[1, 1]))
     det = k * k * jnp.exp(-2 * xi * period)
-    root = jnp.sqrt((half * half - det).astype(jnp.result_type(half, jnp.complex64)))
+    square = (half * half - det).astype(jnp.result_type(half, jnp.complex64))
+    double = square == 0  # where the derivative of the root is infinite
+    root = jnp.where(double, 0.0, jnp.sqrt(jnp.where(double, 1.0, square)))
     return jnp.stack([half + root, half - root], axis=-1)

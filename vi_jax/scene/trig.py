@@ -33,12 +33,13 @@ def sincos(phase: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array
     turns = jnp.round(phase * (0.5 / pi))
     quarter = 0.25 * (phase - (2 * pi) * turns)
     square = quarter * quarter
-    sine = quarter * horner(_SIN, square)
-    cosine = horner(_COS, square)
-    for _ in range(2):
-        # 1 - 2 sin^2 keeps the cosine's absolute error from growing through the doublings.
-        sine, cosine = 2 * sine * cosine, 1 - 2 * sine * sine
-    return sine, cosine
+    # XLA copies cheap producers into each of their consumers, but no division: through the tangent
+    # the polynomials are evaluated once.
+    tangent = quarter * horner(_SIN, square) / horner(_COS, square)
+    share = 1 / (1 + tangent * tangent)
+    sine, cosine = 2 * tangent * share, (1 - tangent * tangent) * share
+    # 1 - 2 sin^2 keeps the cosine's absolute error from growing with the doubling.
+    return 2 * sine * cosine, 1 - 2 * sine * sine
 
 
 @sincos.defjvp

@@ -1,0 +1,354 @@
+"""The closed form against the paper's numbers, and against flights computed in other ways."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+from scipy.integrate import solve_ivp
+from scipy.optimize import minimize_scalar
+from vi_jax.orbit.closed_form import closed_form_orbits, one_impact_orbits
+
+FIELDS = ("Y", "V", "impact_phase", "impact_speed", "y_min", "y_max", "clearance")
+
+
+def flight(zeta, xi, phase, Y, V, tau):
+    """Y and V a time tau after (Y, V) at crank angle `phase`: free plus steady response, NumPy."""
+    steady = np.exp(1j * phase) / (1 - zeta**2 + 2j * xi * zeta)
+    y, v = Y - steady.real, V - (1j * zeta * steady).real
+    omega = np.sqrt(1 - xi**2 + 0j)
+    C, S = np.cos(omega * tau), np.sin(omega * tau) / omega
+    fade, later = np.exp(-xi * tau), steady * np.exp(1j * zeta * tau)
+    return (
+        (fade * ((C + xi * S) * y + S * v)).real + later.real,
+        (fade * ((C - xi * S) * v - S * y)).real + (1j * zeta * later).real,
+    )
+
+
+def samples(seed, count=400):
+    """ζ, ξ, k, d drawn at random, half of them undamped and some overdamped."""
+    draw = np.random.default_rng(seed)
+    zeta, k, d = (
+        draw.uniform(0.4, 2.5, count),
+        draw.uniform(0.05, 1, count),
+        draw.uniform(0, 3, count),
+    )
+    xi = np.where(draw.random(count) < 0.5, 0.0, 10 ** draw.uniform(-3, 0.3, count))
+    apart = np.abs(1 - zeta**2 + 2j * xi * zeta) > 0.02  # the reference flight cancels there
+    return zeta[apart], xi[apart], k[apart], d[apart]
+
+
+solve = jax.jit(one_impact_orbits, static_argnums=4)
+solve_many = jax.jit(
+    lambda zeta, xi, k, d, n: jax.vmap(partial(one_impact_orbits, n=n))(zeta, xi, k, d),
+    static_argnums=4,
+)
+
+
+@pytest.mark.parametrize(
+    "n, wanted",
+    [
+        (1, (1.92303, -0.876442, 6.19998, 1.57475, -1.883583)),
+        (2, (1.609674, -1.943612, 12.37807, 3.54674, -3.254293)),
+    ],
+)
+def test_agrees_with_the_table_of_the_undamped_motions(n, wanted):
+    orbits = solve(0.9, 0.0, 0.5, 2.0, n)
+    found = [float(getattr(orbits, name)[0]) for name in FIELDS[:5]]
+    np.testing.assert_allclose(found, wanted, atol=6e-6)
+    assert orbits.admissible.tolist() == [True, False]
+    assert orbits.exists.tolist() == [True, False]
+    assert np.isnan(orbits.Y[1]) and np.isnan(orbits.multipliers[1]).all()
+    assert orbits.y_max[0] == 2.0
+
+
+def test_multipliers_agree_with_the_table():
+    unstable = solve(0.9, 0.0, 0.5, 2.0, 1).multipliers[0]
+    np.testing.assert_allclose(unstable, [-0.214402, -1.166036], atol=6e-7)
+    stable = solve(0.9, 0.0, 0.5, 2.0, 2).multipliers[0]
+    np.testing.assert_allclose(stable, -0.298755 + 0.400931j * np.array([1, -1]), atol=6e-7)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_meets_the_boundary_conditions_and_passes_the_section(n):
+    zeta, xi, k, d = (x[:, None] for x in samples(0))
+    orbits = solve_many(*(x[:, 0] for x in (zeta, xi, k, d)), n)
+    exists = np.asarray(orbits.exists)
+    assert exists.sum() > 100
+    phase, v = np.asarray(orbits.impact_phase), np.asarray(orbits.impact_speed)
+    scale = (1 + np.abs(v) + d) / np.abs(1 - zeta**2 + 2j * xi * zeta)
+    Y, V = flight(zeta, xi, phase, d, -k * v, 2 * np.pi * n / zeta)
+    assert np.nanmax(np.abs(Y - d) / scale) < 1e-12
+    assert np.nanmax(np.abs(V - v) / scale) < 1e-12
+    assert (v[exists] > 0).all()
+    assert (phase[exists] >= 2 * np.pi * (n - 1)).all() and (phase[exists] < 2 * np.pi * n).all()
+    Y, V = flight(zeta, xi, phase, d, -k * v, (2 * np.pi * n - phase) / zeta)
+    assert np.nanmax(np.abs(Y - orbits.Y) / scale) < 1e-12
+    assert np.nanmax(np.abs(V - orbits.V) / scale) < 1e-12
+
+
+@pytest.mark.parametrize(
+    "n, zeta, xi", [(1, 0.9, 0.0), (2, 0.9, 0.01), (1, 1.0, 0.0), (1, 0.8, 1.0)]
+)
+def test_meets_the_boundary_conditions_by_runge_kutta(n, zeta, xi):
+    k, d = 0.5, (2.0 if xi < 1 else 0.1)
+    orbits = solve(zeta, xi, k, d, n)
+    phase, v = float(orbits.impact_phase[0]), float(orbits.impact_speed[0])
+    field = lambda t, x: (x[1], np.cos(phase + zeta * t) - x[0] - 2 * xi * x[1])
+    period = 2 * np.pi * n / zeta
+    run = solve_ivp(field, (0, period), (d, -k * v), method="DOP853", rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(run.y[:, -1], (d, v), atol=2e-11)
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_finds_every_motion(n):
+    zeta, xi, k, d = samples(1)
+    orbits = solve_many(zeta, xi, k, d, n)
+    phase = np.linspace(0, 2 * np.pi, 20001)
+    for i in range(zeta.size):
+        period = 2 * np.pi * n / zeta[i]
+        Y0, V0 = flight(zeta[i], xi[i], phase, d[i], 0.0, period)
+        dY, dV = np.subtract(flight(zeta[i], xi[i], 0.0, d[i], 1.0, period),
+                             flight(zeta[i], xi[i], 0.0, d[i], 0.0, period))  # fmt: skip
+        v = (Y0 - d[i]) / (k[i] * dY)  # returns to the stop at any phase, with a wrong speed
+        wrong = V0 - k[i] * v * dV - v
+        crossings = np.diff(np.sign(wrong)) != 0
+        assert (crossings & (v[1:] > 0)).sum() == orbits.exists[i].sum()
+
+
+def test_extremes_are_those_of_the_motion():
+    zeta, xi, k, d = samples(2)
+    for n in (1, 2):
+        orbits = solve_many(zeta, xi, k, d, n)
+        for i, j in np.argwhere(np.asarray(orbits.exists))[:120]:
+            period = 2 * np.pi * n / zeta[i]
+            phase, v = float(orbits.impact_phase[i, j]), float(orbits.impact_speed[i, j])
+            at = lambda t: flight(zeta[i], xi[i], phase, d[i], -k[i] * v, t)[0]  # noqa: B023
+            t = np.linspace(0, period, 20001)
+            Y = at(t)
+
+            def best(sign, where):
+                bounds = (t[where - 1], t[where + 1])  # noqa: B023
+                options = {"xatol": 1e-10}
+                turn = lambda s: sign * at(s)  # noqa: B023
+                return (
+                    sign
+                    * minimize_scalar(turn, bounds=bounds, method="bounded", options=options).fun
+                )
+
+            scale = 1e-10 * (1 + np.abs(Y).max())
+            assert abs(best(1, Y.argmin()) - orbits.y_min[i, j]) < scale
+            peaks = 1 + np.flatnonzero((Y[1:-1] > Y[:-2]) & (Y[1:-1] > Y[2:]))
+            if peaks.size == 0:
+                assert orbits.clearance[i, j] == np.inf and orbits.y_max[i, j] == d[i]
+                continue
+            highest = best(-1, peaks[Y[peaks].argmax()])
+            assert abs(d[i] - highest - orbits.clearance[i, j]) < scale
+            assert abs(max(highest, d[i]) - orbits.y_max[i, j]) < scale
+            assert bool(orbits.admissible[i, j]) == bool(highest <= d[i])
+
+
+def test_multipliers_have_the_determinant_and_are_those_of_the_cycle_map():
+    zeta, xi, k, d = samples(3)
+    for n in (1, 2):
+        orbits = solve_many(zeta, xi, k, d, n)
+        wanted = (k**2 * np.exp(-4 * np.pi * n * xi / zeta))[:, None]
+        product = np.asarray(jnp.prod(orbits.multipliers, axis=-1))
+        size = np.abs(np.asarray(orbits.multipliers)).max(-1) ** 2
+        assert np.nanmax(np.abs(product - wanted) / (1 + size)) < 1e-12
+
+    # The map from the state just before an impact to the one before the next, differenced.
+    zeta, xi, k, d, n = 0.9, 0.02, 0.5, 1.5, 1
+    orbits = solve(zeta, xi, k, d, n)
+    phase, v = float(orbits.impact_phase[0]), float(orbits.impact_speed[0])
+
+    def next_impact(phase, v):
+        t = 2 * np.pi * n / zeta
+        for _ in range(20):
+            Y, V = flight(zeta, xi, phase, d, -k * v, t)
+            t -= (Y - d) / V
+        return np.array([phase + zeta * t, flight(zeta, xi, phase, d, -k * v, t)[1]])
+
+    h = 1e-5
+    columns = [next_impact(phase + h, v) - next_impact(phase - h, v),
+               next_impact(phase, v + h) - next_impact(phase, v - h)]  # fmt: skip
+    wanted = np.sort_complex(np.linalg.eigvals(np.stack(columns, axis=1) / (2 * h)))
+    found = np.sort_complex(np.asarray(orbits.multipliers[0]))
+    np.testing.assert_allclose(found, wanted, atol=1e-8)
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_equation_21_needs_the_factor_zeta(n):
+    zeta, k, d = 0.9, 0.5, 2.0
+    A, cot = 1 / (1 - zeta**2), 1 / np.tan(n * np.pi / zeta)
+
+    def miss(factor):
+        # v0 = dY/dφ from cos² + sin² = 1 with sin φ0 = -p v0 and cos φ0 = d/A + q v0.
+        p, q = (1 - k) / (2 * A), factor * (1 + k) / (2 * A) * cot
+        v0 = max(np.roots([p * p + q * q, 2 * q * d / A, (d / A) ** 2 - 1]).real)
+        phase = np.arctan2(-p * v0, d / A + q * v0)
+        v = zeta * v0
+        Y, V = flight(zeta, 0.0, phase, d, -k * v, 2 * np.pi * n / zeta)
+        return max(abs(Y - d), abs(V - v)), v
+
+    printed, _ = miss(1.0)
+    right, v = miss(zeta)
+    assert printed > 1e-2
+    assert right < 1e-12
+    np.testing.assert_allclose(solve(zeta, 0.0, k, d, n).impact_speed[0], v, rtol=1e-12)
+
+
+def test_damped_motions_tend_to_the_undamped_one():
+    undamped = solve(0.9, 0.0, 0.5, 2.0, 1)
+    errors = []
+    for xi in (1e-4, 1e-6, 1e-12):
+        damped = solve(0.9, xi, 0.5, 2.0, 1)
+        errors.append(abs(float(damped.Y[0] - undamped.Y[0])))
+        assert errors[-1] < 20 * xi + 1e-13
+    assert errors[0] > 50 * errors[1] > 0
+
+
+def test_resonance_is_the_limit_from_both_sides():
+    # There cos φ0 = 1 and v = nπ/(1 + k), whatever the gap.
+    for n in (1, 2):
+        at = solve(1.0, 0.0, 0.5, 2.0, n)
+        np.testing.assert_allclose(at.impact_speed[0], np.pi * n / 1.5, rtol=1e-12)
+        for zeta in (1 - 1e-8, 1 + 1e-8):
+            near = solve(zeta, 0.0, 0.5, 2.0, n)
+            np.testing.assert_allclose(near.impact_speed[0], at.impact_speed[0], rtol=1e-6)
+            np.testing.assert_allclose(near.y_min[0], at.y_min[0], rtol=1e-6)
+
+
+@pytest.mark.parametrize("zeta, n", [(1 / 2, 1), (1 / 3, 1), (2 / 3, 2), (2.0, 2), (0.4, 2)])
+def test_nothing_exists_where_the_free_motion_is_periodic(zeta, n):
+    orbits = solve(zeta, 0.0, 0.5, 2.0, n)
+    assert not orbits.exists.any() and not orbits.admissible.any()
+    assert all(np.isnan(getattr(orbits, name)).all() for name in FIELDS)
+
+
+def test_admissible_ones_come_first_then_faster_ones():
+    orbits = solve_many(*samples(4), 1)
+    admissible, exists = np.asarray(orbits.admissible), np.asarray(orbits.exists)
+    assert (exists.sum(1) == 2).sum() > 5  # the draw holds pairs
+    assert not (admissible & ~exists).any()
+    assert not (~admissible[:, 0] & admissible[:, 1]).any()
+    assert not (~exists[:, 0] & exists[:, 1]).any()
+    alike = exists.all(1) & (admissible[:, 0] == admissible[:, 1])
+    speed = np.asarray(orbits.impact_speed)[alike]
+    assert (speed[:, 0] >= speed[:, 1]).all()
+
+
+def test_vmap_equals_a_loop():
+    zeta, xi, k, d = (x[:12] for x in samples(5))
+    together = solve_many(zeta, xi, k, d, 2)
+    alone = [solve(*each, 2) for each in zip(zeta, xi, k, d, strict=True)]
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *alone)
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-10, atol=1e-11), together, stacked)
+
+
+@partial(jax.jit, static_argnums=1)
+def answer(at, n):
+    """All numbers of the first motion, derivatives of which the absent second must not spoil."""
+    orbits = one_impact_orbits(*at, n)
+    values = jnp.stack([getattr(orbits, name)[0] for name in FIELDS])
+    values = jnp.where(jnp.isinf(values), 0.0, values)
+    return jnp.append(values, orbits.multipliers[0, 0].real)
+
+
+@partial(jax.jit, static_argnums=1)
+def slopes(at, n):
+    return jax.jacfwd(answer)(at, n), jax.jacrev(answer)(at, n)
+
+
+@pytest.mark.parametrize(
+    "at, n",
+    [
+        ((0.9, 0.0, 0.5, 2.0), 1),
+        ((0.9, 0.0, 0.5, 2.0), 2),
+        ((0.9, 0.03, 0.5, 1.5), 1),
+        ((1.0, 0.0, 0.4, 1.5), 1),
+        ((0.8, 1.0, 0.5, 0.1), 1),
+    ],
+)
+def test_gradients_agree_with_central_differences(at, n):
+    at = jnp.array(at)
+    forward, reverse = slopes(at, n)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-9, atol=1e-10)
+    # At resonance the section is at the impact itself, where its state jumps, and the multiplier
+    # is double, so that it has no derivative.
+    kept = slice(3, 5) if at[0] == 1 else slice(None)
+    h = 1e-5  # ξ may step below zero: the formulas continue there
+    differences = [(answer(at + e, n) - answer(at - e, n)) / (2 * h) for e in h * jnp.eye(4)]
+    np.testing.assert_allclose(forward[kept], jnp.stack(differences, 1)[kept], rtol=2e-6, atol=2e-7)
+
+
+def test_absent_motions_have_finite_derivatives_behind_a_where():
+    @partial(jax.jit, static_argnums=1)
+    @jax.grad
+    def slope(at, n):
+        orbits = solve(*at, n)
+        fields = jnp.stack([getattr(orbits, name) for name in FIELDS[:6]])
+        return jnp.where(orbits.exists, fields, 0.0).sum()
+
+    for at, n in (((0.5, 0.0, 0.5, 2.0), 1), ((0.9, 0.0, 0.5, 9.0), 1), ((0.9, 0.1, 0.0, 2.0), 1)):
+        assert jnp.isfinite(slope(jnp.array(at), n)).all()
+
+
+def test_single_precision():
+    at = [jnp.float32(x) for x in (0.9, 0.0, 0.5, 2.0)]
+    orbits = solve(*at, 2)
+    assert orbits.Y.dtype == jnp.float32
+    np.testing.assert_allclose(orbits.Y[0], 1.609674, atol=5e-5)
+    np.testing.assert_allclose(orbits.y_min[0], -3.254293, atol=1e-4)
+
+
+def ideal(**changes):
+    numbers = {"frequency_ratio": 0.9, "restitution": 0.5, "gap": 2.0, "damping_ratio": 0.0}
+    return vi.Scene.ideal(**(numbers | changes))
+
+
+def test_reads_the_scene_and_its_tracers():
+    scene = ideal(damping_ratio=0.01)
+    orbits = jax.jit(partial(closed_form_orbits, cycles=2))(scene)
+    direct = solve(0.9, 0.01, 0.5, 2.0, 2)
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-12), orbits, direct)
+
+    def speed(zeta):
+        return closed_form_orbits(ideal(frequency_ratio=zeta)).impact_speed[0]
+
+    speeds, zetas = jax.jit(jax.vmap(speed)), jnp.array([0.85, 0.9, 0.95])
+    found = jax.jit(jax.vmap(jax.grad(speed)))(zetas)
+    wanted = (speeds(zetas + 1e-5) - speeds(zetas - 1e-5)) / 2e-5
+    np.testing.assert_allclose(found, wanted, rtol=1e-6)
+
+
+def driven_by_a_motor():
+    motor = vi.Motor(strength=1.0, control=1.0, coupling=0.01, slider_inertia=0.01)
+    return vi.Scene(vi.Oscillator(0.0), motor, (vi.RigidStop(2.0, 0.5),))
+
+
+def stopped_on_the_left():
+    stop = vi.RigidStop(2.0, 0.5, side="left")
+    return vi.Scene(vi.Oscillator(0.0), vi.IdealDrive(0.9), (stop,))
+
+
+@pytest.mark.parametrize(
+    "scene, message",
+    [
+        (driven_by_a_motor, "`scene`.*IdealDrive.*Motor"),
+        (lambda: ideal(crank=vi.SliderCrank(1 / 3)), "`scene`.*CosineCrank.*SliderCrank"),
+        (stopped_on_the_left, r"`scene`.*on the right.*\['left'\]"),
+        (lambda: ideal(gap=None), r"`scene`.*exactly one stop.*\[\]"),
+        (lambda: ideal(frequency_ratio=jnp.array([0.8, 0.9])), r"`scene`.*vmap.*\(2,\)"),
+    ],
+)
+def test_says_what_is_wrong_with_the_scene(scene, message):
+    with pytest.raises(ValueError, match=message):
+        closed_form_orbits(scene())
+
+
+def test_says_what_is_wrong_with_the_cycles():
+    with pytest.raises(ValueError, match="`cycles` must be at least 1, but got 0"):
+        closed_form_orbits(ideal(), cycles=0)
