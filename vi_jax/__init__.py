@@ -9,7 +9,10 @@ from .flow import ImpactLog as ImpactLog
 from .flow import Run as Run
 from .flow import Samples as Samples
 from .flow import Unrolled as Unrolled
+from .flow import jit as jit
 from .flow import simulate as simulate
+from .orbit import ClosedFormOrbits as ClosedFormOrbits
+from .orbit import closed_form_orbits as closed_form_orbits
 from .scene import AbstractCrank as AbstractCrank
 from .scene import AbstractScene as AbstractScene
 from .scene import CosineCrank as CosineCrank

@@ -1,6 +1,7 @@
 """How a scene moves: methods, the hybrid step, the closed-form flight, `simulate`, results."""
 
 from .exact import ExactFlight as ExactFlight
+from .fusion import jit as jit
 from .methods import AbstractMethod as AbstractMethod
 from .methods import Adaptive as Adaptive
 from .methods import FixedStep as FixedStep

@@ -63,7 +63,7 @@ def slope(c: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
     return (*(n * c[n] for n in range(1, len(c))), jnp.zeros_like(c[0]))
 
 
-def rising_root(c: tuple[Scalar, ...], *, iterations: int = 4) -> Scalar:
+def rising_root(c: tuple[Scalar, ...], *, iterations: int = 3) -> Scalar:
     """The θ in [0, 1] at which a polynomial that ends positive last rose through zero.
 
     Newton's method kept inside a bracket; a place where the polynomial falls lies to the left of

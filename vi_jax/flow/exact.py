@@ -14,7 +14,6 @@ Scalar = Float[Array, ""]
 
 _COS = tuple((-1) ** n / factorial(2 * n) for n in range(10))
 _SINC = tuple((-1) ** n / factorial(2 * n + 1) for n in range(10))
-_EXP = tuple(1 / factorial(n) for n in range(19))
 _EXP_SLOPE = tuple(1 / factorial(n + 1) for n in range(10))
 
 # Below this distance from resonance |1 - ζ² + 2iξζ| the steady response, which grows like its
@@ -27,14 +26,14 @@ class ExactFlight(AbstractMethod):
 
     Holds for every ξ ≥ 0 (under-, critically and over-damped) and every ζ > 0, ζ = 1 with ξ = 0
     (the secular case) included. For ideal drives with a `CosineCrank`. The motion is followed in
-    arcs of at most an eighth of the shorter period, each ended at the next turning point, so that
+    arcs of at most a fifth of the shorter period, each ended at the next turning point, so that
     an impact is missed only if it is shallower than rounding.
     """
 
     @property
     def steps_per_cycle(self) -> int:
-        """Eight arcs of at most an eighth of a turn."""
-        return 8
+        """Five arcs of at most a fifth of a turn."""
+        return 5
 
     def check(self, scene):
         """Refuse scenes whose flight has no closed form."""
@@ -69,8 +68,8 @@ def flight(
 ) -> tuple[Scalar, Scalar]:
     """Y and V after a time τ of free flight from (Y, V) at crank angle `phase`.
 
-    Dimensionless scalars; |τ| up to an eighth of the shorter of the periods 2π and 2π/ζ, less
-    under strong damping (|ξτ| ≤ π/4). Paper, Eq. 14, here with damping.
+    Dimensionless scalars; |τ| up to a fifth of the shorter of the periods 2π and 2π/ζ, less
+    under strong damping (|ξτ| ≤ 0.4π). Paper, Eq. 14, here with damping.
     """
     # C = cos(ω_d τ) and S = sin(ω_d τ)/ω_d are entire in ω_d² = 1 - ξ², whatever its sign.
     square = (1 - xi * xi) * tau * tau

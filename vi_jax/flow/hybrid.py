@@ -22,6 +22,7 @@ from jaxtyping import Array, Bool, Float
 
 from . import results
 from .events import Rates, landing, quintic, rates, rising_root, slope
+from .fusion import pin, pin_flag
 from .lane import FREE, SECTION, TURN, Lane, Plan, Record
 
 Scalar = Float[Array, ""]
@@ -68,20 +69,6 @@ def select(condition: Flag, a: Any, b: Any) -> Any:
     return jtu.tree_map(lambda x, y: jnp.where(condition, x, y), a, b)
 
 
-def pin(x: Any, one: Scalar) -> Any:
-    """The same values, divided by a 1 that the compiler does not know.
-
-    XLA's CPU backend copies cheap producers into each of their consumers when it fuses, which
-    multiplies the work of an iteration; it does not copy divisions.
-    """
-    return jtu.tree_map(lambda v: v / one, x)
-
-
-def pin_flag(flag: Flag, one: Scalar) -> Flag:
-    """`pin` for a truth value."""
-    return pin(jnp.where(flag, one, 0.0), one) > 0.5
-
-
 def iterate(plan: Plan, lane: Lane) -> Lane:
     """One step of one lane: advance, aim or land. A lane that has ended is left as it is."""
     active = (lane.done < plan.intervals) & (lane.fault == 0)
@@ -91,11 +78,9 @@ def iterate(plan: Plan, lane: Lane) -> Lane:
     aim = pin_flag(active & aim, one)
     taken = pin_flag(active & trial.good & ~aim, one)
     rejected = active & ~trial.good
-    attempt, target = pin((attempt, target), one)
     length = _resized(plan, lane, trial, taken, rejected)
     s, state, direction, record, completed = _arrive(plan, lane, trial, taken)
     completed = pin_flag(completed, one)
-    s, state, direction = pin((s, state, direction), one)
 
     done, part = lane.done + jnp.where(completed, 1.0, 0.0), lane.part
     turned = completed
@@ -171,7 +156,6 @@ def _try(plan: Plan, lane: Lane, active: Flag) -> Trial:
     if plan.motion or scene.stops:
         begin = rates(scene.field, scene.position, lane.s, lane.state)
         end = rates(scene.field, scene.position, s1, new)
-        begin, end = pin((begin, end), lane.one)
         position = begin, end
         shift = _to_turn(end)
         met = (jnp.abs(shift) <= _turn_tolerance(h)) | (lane.aims >= _PATIENCE)
@@ -198,7 +182,7 @@ def _seen(lane: Lane, good: Flag, h: Scalar, crossing: tuple, all_of_them: list)
     for other, _, beyond, _ in all_of_them:
         if other != name:  # what lies beyond another stop was not reached
             aimed = aimed & (beyond.x <= 0)
-    offset, square = pin(landing(end), lane.one)
+    offset, square = landing(end)
     size = stop_gradient(jnp.abs(offset))
     eps = float(jnp.finfo(h.dtype).eps)
     # Two ways of being there to rounding: in place along the path, or, near grazing, in position.
@@ -207,7 +191,7 @@ def _seen(lane: Lane, good: Flag, h: Scalar, crossing: tuple, all_of_them: list)
     close = close | (lane.aims >= _PATIENCE)
     real = stop_gradient(square) > 0
     landed = pin_flag(aimed & close & real, lane.one)
-    again = pin_flag(aimed & ~close & real & (size < 0.25 * h), lane.one)
+    again = aimed & ~close & real & (size < 0.25 * h)
     return Crossing(name, begin, end, offset, landed, again)
 
 
@@ -255,8 +239,7 @@ def _aim(plan: Plan, lane: Lane, trial: Trial) -> tuple[Flag, Scalar, Scalar]:
         facing = tuple(-lane.direction * c for c in slope(path))
         polynomial = facing if polynomial is None else select(crossed, polynomial, facing)
     assert polynomial is not None
-    polynomial = pin(stop_gradient(polynomial), lane.one)
-    theta = pin(rising_root(polynomial), lane.one)
+    theta = pin(rising_root(stop_gradient(polynomial)), lane.one)
     if trial.position is not None and not plan.motion:
         height = stop_gradient(path[0])
         for n in range(1, len(path)):

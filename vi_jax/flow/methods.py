@@ -12,13 +12,10 @@ from jaxtyping import Array, Float
 
 from .._checks import count, require
 from ..scene import AbstractScene
+from .fusion import pin
 from .unrolled import Unrolled
 
 Scalar = Float[Array, ""]
-
-
-def pin(x: Any, one: Scalar) -> Any:
-    return jtu.tree_map(lambda v: v / one, x)
 
 
 class AbstractMethod(eqx.Module):
@@ -48,7 +45,7 @@ class AbstractMethod(eqx.Module):
     ) -> tuple[Any, Scalar | None, Scalar]:
         """State and elapsed time at `s1` from those at `s0`, and the step's error.
 
-        The error is relative to the tolerance (a step is accepted up to 1); it is 0 for methods
+        `one` is a 1 that the compiler does not know, see `fusion.pin`. The error is relative to the tolerance (a step is accepted up to 1); it is 0 for methods
         that are not adaptive. `time` is `None` unless the scene has a pace that is asked for.
         """
 
@@ -64,8 +61,8 @@ def _unrolled(solver: Any) -> Unrolled:
 def _runge_kutta(solver: Unrolled, scene: AbstractScene, s0, s1, state, time, one):
     def field(s, y, args):
         state, time = y
-        k = scene.field(s, state), None if time is None else scene.pace(s, state)
-        return pin(k, one)
+        pace = None if time is None else scene.pace(s, state)
+        return pin((scene.field(s, state), pace), one)
 
     y1, error, *_ = solver.step(
         diffrax.ODETerm(field), s0, s1, (state, time), None, None, made_jump=True
@@ -95,8 +92,8 @@ class Adaptive(AbstractMethod):
 
     @property
     def steps_per_cycle(self) -> int:
-        """Eight: no step is longer than an eighth of a cycle, so that it holds one hump."""
-        return 8
+        """Five: no step is longer than a fifth of a cycle, so that it holds one hump."""
+        return 5
 
     @property
     def adaptive(self) -> bool:

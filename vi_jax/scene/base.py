@@ -67,8 +67,8 @@ class AbstractScene(eqx.Module):
         return None
 
     def step_limit(self, s: Float[Array, ""], state: State) -> Float[Array, ""] | float:
-        """The longest step that holds at most one extremum of the motion; at most `cycle`/8."""
-        return self.cycle / 8
+        """The longest step that holds at most one extremum of the motion; at most `cycle`/5."""
+        return self.cycle / 5
 
     def alive(self, state: State) -> jax.Array | None:
         """False where the clock of this scene breaks down; `None` where it cannot."""

@@ -45,11 +45,14 @@ class Motor(eqx.Module):
         require("slider_inertia", self.slider_inertia, low=0.0)
         require("no_load_speed", self.no_load_speed, low=0.0, open_low=True)
 
-    def acceleration(
+    def torque(
         self, slide: Slide, Y: Float[Array, "..."], W: Float[Array, "..."]
     ) -> Float[Array, "..."]:
-        """dW/dτ of the shaft (dimensionless) at slider position `slide` and speed `W`."""
-        torque = self.strength * (self.control - W / self.no_load_speed)
+        """What accelerates the shaft at slider position `slide` and speed `W`, per J ω²."""
+        motor = self.strength * (self.control - W * (1 / self.no_load_speed))
         spring = self.coupling * slide.U_phi * (Y - slide.U)
-        inertia = self.slider_inertia * slide.U_phi * slide.U_phiphi * W * W
-        return (torque + spring - inertia) / (1 + self.slider_inertia * slide.U_phi**2)
+        return motor + spring - self.slider_inertia * slide.U_phi * slide.U_phiphi * W * W
+
+    def inertia(self, slide: Slide) -> Float[Array, "..."]:
+        """Inertia that the shaft feels, per J."""
+        return 1 + self.slider_inertia * slide.U_phi**2

@@ -178,19 +178,20 @@ class Scene(AbstractScene):
         """d(state)/ds: by crank angle (Eq. 8 to 9 of the paper) or by time τ (Eq. 5 to 7)."""
         drive = self.drive
         if isinstance(drive, IdealDrive):
+            zeta = drive.frequency_ratio
             if self.clock_name == "time":
-                slide = self.crank.slide(drive.frequency_ratio * s)
+                slide = self.crank.slide(zeta * s)
                 return OscillatorState(state.V, self._pull(slide.U, state))
             slide = self.crank.slide(s)
-            pace = 1 / drive.frequency_ratio
-            return OscillatorState(pace * state.V, pace * self._pull(slide.U, state))
+            return OscillatorState(state.V / zeta, self._pull(slide.U, state) / zeta)
         slide = self.crank.slide(s if self.clock_name == "phase" else state.phase)
         pull = self._pull(slide.U, state)
-        spin = drive.acceleration(slide, state.Y, state.W)
+        torque = drive.torque(slide, state.Y, state.W)
+        inertia = drive.inertia(slide)
         if self.clock_name == "time":
-            return TimedMotorState(state.V, pull, spin, state.W)
+            return TimedMotorState(state.V, pull, torque / inertia, state.W)
         pace = 1 / state.W
-        return MotorState(pace * state.V, pace * pull, pace * spin)
+        return MotorState(pace * state.V, pace * pull, pace * torque / inertia)
 
     def _pull(self, U, state):
         """d²Y/dτ²."""
@@ -215,14 +216,14 @@ class Scene(AbstractScene):
         return 2 * pi / duration
 
     def step_limit(self, s: Float[Array, ""], state: Any) -> Float[Array, ""]:
-        """An eighth of the shorter of the drive's turn and the body's natural period."""
+        """A fifth of the shorter of the drive's turn and the body's natural period."""
         if isinstance(self.drive, IdealDrive):
             speed = self.drive.frequency_ratio
         else:
             speed = jnp.abs(state.W)
         if self.clock_name == "phase":
-            return pi / 4 * jnp.minimum(1.0, speed)
-        return pi / 4 / jnp.maximum(1.0, speed)
+            return 0.4 * pi * jnp.minimum(1.0, speed)
+        return 0.4 * pi / jnp.maximum(1.0, speed)
 
     def alive(self, state: Any) -> jax.Array | None:
         """In the phase clock of a motor the crank must turn forward."""
