@@ -1,10 +1,11 @@
-"""Host-side checks of what a user passes in: they run on concrete numbers and let tracers through."""
+"""Host-side checks of what a user passes in. Concrete numbers are looked at; tracers pass."""
 
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 
 def number(name: str, value: Any) -> jax.Array:
@@ -31,7 +32,7 @@ def concrete(value: Any) -> np.ndarray | None:
     """The numbers behind `value`, or `None` while they are being traced."""
     if not isinstance(value, jax.Array | np.ndarray | float | int):
         return None  # a placeholder (a spec, a tangent's None), which holds no number to check
-    if isinstance(value, jax.core.Tracer):
+    if isinstance(value, Tracer):
         return None
     return np.asarray(value)
 

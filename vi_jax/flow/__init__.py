@@ -5,8 +5,8 @@ from .fusion import jit as jit
 from .methods import AbstractMethod as AbstractMethod
 from .methods import Adaptive as Adaptive
 from .methods import FixedStep as FixedStep
-from .results import ImpactLog as ImpactLog
 from .results import RESULTS as RESULTS
+from .results import ImpactLog as ImpactLog
 from .results import Run as Run
 from .results import Samples as Samples
 from .simulate import simulate as simulate

@@ -2,11 +2,10 @@
 
 from math import factorial
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..scene import CosineCrank, IdealDrive, OscillatorState, Scene
+from ..scene import AbstractScene, CosineCrank, IdealDrive, OscillatorState, Scene
 from ..scene.trig import horner, sincos
 from .methods import AbstractMethod
 
@@ -51,16 +50,21 @@ class ExactFlight(AbstractMethod):
 
     def limited(self, scene, limit):
         """Strong damping asks for shorter arcs, which keeps the arguments of the series small."""
-        return limit / jnp.maximum(1.0, scene.damping_ratio)
+        return limit / jnp.maximum(1.0, _numbers(scene)[1])
 
     def step(self, scene, s0, s1, state, time, one):
         """The flight from `s0` to `s1`, exact to rounding."""
-        zeta, xi = scene.drive.frequency_ratio, scene.damping_ratio
-        in_phase = scene.clock_name == "phase"
+        zeta, xi, in_phase = _numbers(scene)
         tau = (s1 - s0) / zeta if in_phase else s1 - s0
         phase = s0 if in_phase else zeta * s0
         Y, V = flight(zeta, xi, phase, state.Y, state.V, tau)
         return OscillatorState(Y, V), time, jnp.zeros_like(s0)
+
+
+def _numbers(scene: AbstractScene) -> tuple[Scalar, Scalar, bool]:
+    """ζ, ξ and whether the scene is in the phase clock."""
+    assert isinstance(scene, Scene) and isinstance(scene.drive, IdealDrive)
+    return scene.drive.frequency_ratio, scene.damping_ratio, scene.clock_name == "phase"
 
 
 def flight(

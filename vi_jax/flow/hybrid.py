@@ -14,7 +14,6 @@ forward and reverse derivatives through an impact are exact (the saltation matri
 
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.lax import stop_gradient
@@ -164,9 +163,13 @@ def _try(plan: Plan, lane: Lane, active: Flag) -> Trial:
             ends = begin.scaled(stop.sign, stop.gap), end.scaled(stop.sign, stop.gap)
             crossings.append((1.0 + i, *ends, 1 + jnp.abs(stop.gap)))
     if not plan.ticks(lane.state):
+
+        def clock(state: Any) -> Scalar:
+            return jnp.asarray(scene.clock(state))
+
         ends = (
-            rates(scene.field, scene.clock, lane.s, lane.state).scaled(1, bound),
-            rates(scene.field, scene.clock, s1, new).scaled(1, bound),
+            rates(scene.field, clock, lane.s, lane.state).scaled(1, bound),
+            rates(scene.field, clock, s1, new).scaled(1, bound),
         )
         crossings.append((SECTION, *ends, bound))
     seen = tuple(_seen(lane, good, h, crossing, crossings) for crossing in crossings)
@@ -220,7 +223,7 @@ def _aim(plan: Plan, lane: Lane, trial: Trial) -> tuple[Flag, Scalar, Scalar]:
     # The earliest of several events is met first. The chord tells well enough which that is: a
     # landing that lies beyond another stop is not accepted.
     first, target = jnp.full_like(h, jnp.inf), jnp.full_like(h, TURN)
-    polynomial, crossed, landed = None, none, none
+    polynomial, path, crossed, landed = None, None, none, none
     for c in trial.crossings:
         over = trial.good & (c.end.x > 0)
         rise = jnp.where(over, c.end.x - c.begin.x, 1.0)
@@ -240,7 +243,7 @@ def _aim(plan: Plan, lane: Lane, trial: Trial) -> tuple[Flag, Scalar, Scalar]:
         polynomial = facing if polynomial is None else select(crossed, polynomial, facing)
     assert polynomial is not None
     theta = pin(rising_root(stop_gradient(polynomial)), lane.one)
-    if trial.position is not None and not plan.motion:
+    if path is not None and not plan.motion:
         height = stop_gradient(path[0])
         for n in range(1, len(path)):
             height = height + stop_gradient(path[n]) * theta**n
@@ -277,6 +280,8 @@ def _arrive(
         direction = jnp.where(v == 0, direction, jnp.sign(v))
         # Here the sign of the velocity is rounding's.
         direction = jnp.where(trial.at_turn, -lane.direction, direction)
+    flow: Any = None
+    pace = None
     if trial.crossings:
         flow = scene.field(trial.s, trial.state)
         pace = None if time is None else scene.pace(trial.s, trial.state)
@@ -311,7 +316,7 @@ def _arrive(
         reached = jnp.where(trial.at_turn, top, scene.position(state))
         y_max = jnp.where(taken, jnp.maximum(y_max, reached), y_max)
         y_min = jnp.where(taken, jnp.minimum(y_min, reached), y_min)
-    if time is not None:
+    if time is not None and record.time is not None:
         time = jnp.where(taken, time, record.time)
     return (
         jnp.where(taken, s, lane.s),

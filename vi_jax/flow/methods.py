@@ -41,12 +41,19 @@ class AbstractMethod(eqx.Module):
 
     @abc.abstractmethod
     def step(
-        self, scene: AbstractScene, s0: Scalar, s1: Scalar, state: Any, time: Scalar | None, one: Scalar
+        self,
+        scene: AbstractScene,
+        s0: Scalar,
+        s1: Scalar,
+        state: Any,
+        time: Scalar | None,
+        one: Scalar,
     ) -> tuple[Any, Scalar | None, Scalar]:
         """State and elapsed time at `s1` from those at `s0`, and the step's error.
 
-        `one` is a 1 that the compiler does not know, see `fusion.pin`. The error is relative to the tolerance (a step is accepted up to 1); it is 0 for methods
+        The error is relative to the tolerance (a step is accepted up to 1); it is 0 for methods
         that are not adaptive. `time` is `None` unless the scene has a pace that is asked for.
+        `one` is a 1 that the compiler does not know, see `fusion.pin`.
         """
 
     def resize(self, error: Scalar) -> Scalar:
@@ -117,7 +124,7 @@ class Adaptive(AbstractMethod):
     def resize(self, error):
         """0.9 · error^(-1/order), between 0.2 and 5."""
         # A step length needs no double precision, and single precision powers vectorise.
-        order = self.solver.order(None)
+        order = self.solver.order(None) or 1
         small = jnp.clip(error, 1e-20, 1e20).astype(jnp.float32)
         factor = 0.9 * small ** (-1.0 / order)
         return jnp.clip(factor, 0.2, 5.0).astype(error.dtype)

@@ -5,6 +5,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 
@@ -106,7 +107,7 @@ class Run(eqx.Module):
         return self.result == RESULTS.successful
 
     def __str__(self) -> str:
-        if isinstance(self.steps, jax.core.Tracer):
+        if isinstance(self.steps, Tracer):
             return repr(self)
         if self.steps.ndim:
             good = int(jnp.sum(self.successful))

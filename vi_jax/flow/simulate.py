@@ -13,7 +13,7 @@ from ..scene import AbstractScene, Scene
 from .lane import Plan, Record
 from .loop import run_forward, run_reverse
 from .methods import AbstractMethod, Adaptive
-from .results import BAD_START, ImpactLog, Run, Samples, reason
+from .results import ImpactLog, Run, Samples, reason
 
 
 def simulate(
@@ -57,8 +57,8 @@ def simulate(
 
     **Returns:** a `Run`.
 
-    **Raises:** `ValueError` or `TypeError` for arguments that cannot be run, before any work. Starts
-    and parameters that are being traced cannot be looked at; such a lane ends with
+    **Raises:** `ValueError` or `TypeError` for arguments that cannot be run, before any work.
+    Starts and parameters that are being traced cannot be looked at; such a lane ends with
     `RESULTS.bad_start` and harms no other.
     """
     if not isinstance(scene, AbstractScene):

@@ -50,7 +50,7 @@ class Unrolled(diffrax.AbstractSolver):
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         """One step over [t0, t1], with the arguments and results of `diffrax`'s `step`."""
-        tableau = self.solver.tableau
+        tableau = _tableau(self.solver)
         control = terms.contr(t0, t1)
         stages = [terms.vf_prod(t0, y0, args, control)]
         y1 = None
@@ -64,6 +64,13 @@ class Unrolled(diffrax.AbstractSolver):
         error = _combine(None, tableau.b_error, stages)
         k = jtu.tree_map(lambda *leaves: jnp.stack(leaves), *stages)
         return y1, error, {"y0": y0, "y1": y1, "k": k}, None, diffrax.RESULTS.successful
+
+
+def _tableau(solver: diffrax.AbstractERK) -> diffrax.ButcherTableau:
+    tableau = solver.tableau
+    if not isinstance(tableau, diffrax.ButcherTableau):
+        raise TypeError(f"Argument `solver` must have one Butcher tableau, but got {solver!r}.")
+    return tableau
 
 
 def _combine(base: Any, weights: np.ndarray, stages: list) -> Any:

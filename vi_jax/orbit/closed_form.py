@@ -125,14 +125,23 @@ def one_impact_orbits(zeta: Any, xi: Any, k: Any, d: Any, n: int) -> ClosedFormO
     start = _after_impact(k, d, v, phase)
     section = _dot(expm(rates * wait[:, None, None]), start[..., None])[..., 0]
 
-    numbers = (*section[:, :2].T, phase + 2 * pi * (n - 1), v, y_min, y_max, clearance)
     multipliers = _multipliers(flights[-1], xi, k, d, v, phase, period)
     admissible = exists & (clearance >= 0)
+
+    def known(x):
+        return jnp.where(exists, x, jnp.nan)
+
     orbits = ClosedFormOrbits(
-        *(jnp.where(exists, x, jnp.nan) for x in numbers),
-        jnp.where(exists[:, None], multipliers, jnp.nan),
-        admissible,
-        exists,
+        Y=known(section[:, 0]),
+        V=known(section[:, 1]),
+        impact_phase=known(phase + 2 * pi * (n - 1)),
+        impact_speed=known(v),
+        y_min=known(y_min),
+        y_max=known(y_max),
+        clearance=known(clearance),
+        multipliers=jnp.where(exists[:, None], multipliers, jnp.nan),
+        admissible=admissible,
+        exists=exists,
     )
     order = jnp.lexsort((-v, ~exists, ~admissible))
     return jax.tree.map(lambda x: x[order], orbits)

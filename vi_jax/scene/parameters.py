@@ -13,6 +13,10 @@ from .scene import Oscillator, Scene
 from .stop import RigidStop
 
 
+# A plain number is taken as well as an array of them to `vmap` over.
+Number = Float[Array, "..."] | float
+
+
 def _si(name: str, default: float) -> Any:
     return eqx.field(default=default, converter=lambda x: number(name, x), kw_only=True)
 
@@ -24,29 +28,29 @@ class Parameters(eqx.Module):
     ε = m_C a²/J, τ0 = T0/(J ω²), w0 = Ω0/ω, λ = a/l.
     """
 
-    body_mass: Float[Array, "..."] = _si("body_mass", 0.35)
+    body_mass: Number = _si("body_mass", 0.35)
     """m_C, mass of the impacting body, kg."""
-    slider_mass: Float[Array, "..."] = _si("slider_mass", 0.2)
+    slider_mass: Number = _si("slider_mass", 0.2)
     """m_B, mass of the slider, kg."""
-    stiffness: Float[Array, "..."] = _si("stiffness", 9 * pi**2)
+    stiffness: Number = _si("stiffness", 9 * pi**2)
     """k0, stiffness of the spring, N/m."""
-    damping: Float[Array, "..."] = _si("damping", 0.5)
+    damping: Number = _si("damping", 0.5)
     """c, viscous damping of the body, N·s/m."""
-    crank_radius: Float[Array, "..."] = _si("crank_radius", 0.04)
+    crank_radius: Number = _si("crank_radius", 0.04)
     """a, crank radius and unit of length, m."""
-    rod_length: Float[Array, "..."] = _si("rod_length", 0.12)
+    rod_length: Number = _si("rod_length", 0.12)
     """l, length of the rod, m (exact kinematics only)."""
-    inertia: Float[Array, "..."] = _si("inertia", 0.06)
+    inertia: Number = _si("inertia", 0.06)
     """J, moment of inertia of the disc, kg·m²."""
-    restitution: Float[Array, "..."] = _si("restitution", 0.5)
+    restitution: Number = _si("restitution", 0.5)
     """k, coefficient of restitution, dimensionless."""
-    gap: Float[Array, "..."] = _si("gap", 0.08)
+    gap: Number = _si("gap", 0.08)
     """Δ, distance of the stop from the unstretched position, m."""
-    torque: Float[Array, "..."] = _si("torque", 10.0)
+    torque: Number = _si("torque", 10.0)
     """T0, stall torque of the motor at κ = 1, N·m."""
-    kappa: Float[Array, "..."] = _si("kappa", 0.9)
+    kappa: Number = _si("kappa", 0.9)
     """κ, motor control, dimensionless; the frequency ratio ζ of an ideal drive."""
-    no_load_speed: Float[Array, "..."] | None = eqx.field(
+    no_load_speed: Number | None = eqx.field(
         default=None,
         converter=lambda x: x if x is None else number("no_load_speed", x),
         kw_only=True,
@@ -66,7 +70,7 @@ class Parameters(eqx.Module):
             require("no_load_speed", self.no_load_speed, low=0.0, open_low=True)
 
     @property
-    def natural_frequency(self) -> Float[Array, "..."]:
+    def natural_frequency(self) -> Number:
         """ω = √(k0/m_C), rad/s."""
         return (self.stiffness / self.body_mass) ** 0.5
 
@@ -91,11 +95,12 @@ class Parameters(eqx.Module):
                 slider_inertia=self.slider_mass * per_inertia,
                 no_load_speed=free,
             )
+        exact = SliderCrank(self.crank_radius / self.rod_length) if crank == "slider" else None
         return Scene(
-            Oscillator(self.damping / (2 * self.body_mass * omega)),
-            turning,
-            (RigidStop(self.gap / self.crank_radius, self.restitution),),
-            CosineCrank() if crank == "cosine" else SliderCrank(self.crank_radius / self.rod_length),
+            oscillator=Oscillator(self.damping / (2 * self.body_mass * omega)),
+            drive=turning,
+            stops=(RigidStop(self.gap / self.crank_radius, self.restitution),),
+            crank=exact or CosineCrank(),
         )
 
     def metres(self, Y: Any) -> Any:

@@ -107,7 +107,10 @@ class Scene(AbstractScene):
         """
         stops = () if gap is None else (RigidStop(gap, restitution),)
         return cls(
-            Oscillator(damping_ratio), IdealDrive(frequency_ratio), stops, crank or CosineCrank()
+            oscillator=Oscillator(damping_ratio),
+            drive=IdealDrive(frequency_ratio),
+            stops=stops,
+            crank=crank or CosineCrank(),
         )
 
     @property
@@ -132,7 +135,13 @@ class Scene(AbstractScene):
     def in_clock(self, clock: str) -> "Scene":
         """The same scene in the `"phase"` or the `"time"` clock."""
         one_of("clock", clock, ("phase", "time"))
-        return Scene(self.oscillator, self.drive, self.stops, self.crank, clock)
+        return Scene(
+            oscillator=self.oscillator,
+            drive=self.drive,
+            stops=self.stops,
+            crank=self.crank,
+            clock_name=clock,
+        )
 
     def start(
         self, *, Y: Any = 0.0, V: Any = 0.0, W: Any = None
@@ -236,7 +245,7 @@ class Scene(AbstractScene):
             if speed is not None and not (speed > 0).all():
                 raise ValueError(
                     "Argument `start` must have W > 0 in the phase clock, but has "
-                    f"W = {speed.min():g}. Pass `clock=\"time\"` to start from rest."
+                    f'W = {speed.min():g}. Pass `clock="time"` to start from rest.'
                 )
 
 
