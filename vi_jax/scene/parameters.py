@@ -12,7 +12,6 @@ from .drive import IdealDrive, Motor
 from .scene import Oscillator, Scene
 from .stop import RigidStop
 
-
 # A plain number is taken as well as an array of them to `vmap` over.
 Number = Float[Array, "..."] | float
 
