@@ -64,19 +64,22 @@ def slope(c: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
 
 
 def rising_root(c: tuple[Scalar, ...], *, iterations: int = 3) -> Scalar:
-    """The θ in [0, 1] at which a polynomial that ends positive last rose through zero.
+    """The θ in [0, 1] at which a polynomial that ends positive first rises through zero.
 
-    Newton's method kept inside a bracket; a place where the polynomial falls lies to the left of
-    the root (the body leaves the stop before it comes back).
+    Newton's method kept inside a bracket. A polynomial that starts at zero and falls (the body
+    leaves the stop) has its root later; one that falls at a positive value has passed it.
     """
     derivative = slope(c)[:-1]
     low, high = jnp.zeros_like(c[0]), jnp.ones_like(c[0])
-    end = sum(c[1:], c[0])
-    theta = jnp.where(c[0] < end, -c[0] / jnp.where(c[0] < end, end - c[0], 1.0), 0.5)
+    end, end_rate = sum(c[1:], c[0]), sum(derivative[1:], derivative[0])
+    # The tangent at the start of a hump lies short of the root; otherwise the chord is close.
+    rise = jnp.where(end_rate > 0, end - c[0], c[1])
+    theta = jnp.where(rise > 0, -c[0] / jnp.where(rise > 0, rise, 1.0), 0.5)
     theta = jnp.clip(theta, 0.0, 1.0)
+    floor = jnp.maximum(c[0], 0.0)
     for _ in range(iterations):
         value, rate = horner(c, theta), horner(derivative, theta)
-        left = (value < 0) | (rate <= 0)
+        left = (value < 0) | ((rate <= 0) & (value <= floor))
         low, high = jnp.where(left, theta, low), jnp.where(left, high, theta)
         newton = theta - value / jnp.where(rate > 0, rate, 1.0)
         inside = (rate > 0) & (newton >= low) & (newton <= high)

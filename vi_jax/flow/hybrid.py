@@ -27,9 +27,10 @@ from .lane import FREE, SECTION, TURN, Lane, Plan, Record
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]
 
-# A lane that has aimed this often without landing accepts what it has; Newton's method on a smooth
-# flow needs two or three, and rounding stops it from gaining more.
-_PATIENCE = 12.0
+# Newton's method on a smooth flow needs two or three aims. Where rounding keeps it from gaining
+# more, a lane that has aimed this often accepts a thousand times the tolerance, and one that has
+# aimed much more often is lost.
+_PATIENCE, _LOST = 12.0, 64.0
 # Turning points this far inside the gap (unit: a) are passed by where only impacts matter.
 _MARGIN = 0.02
 
@@ -96,7 +97,8 @@ def iterate(plan: Plan, lane: Lane) -> Lane:
 
     steps = lane.steps + jnp.where(active, 1.0, 0.0)
     fault = lane.fault
-    for condition, code in _faults(plan, trial, rejected, length, record, steps):
+    aims = jnp.where(aim, lane.aims + 1, 0.0)
+    for condition, code in _faults(plan, trial, rejected, length, record, steps, aims):
         stops_here = active & (fault == 0) & condition & (done < plan.intervals)
         fault = jnp.where(stops_here, float(code), fault)
     return Lane(
@@ -107,7 +109,7 @@ def iterate(plan: Plan, lane: Lane) -> Lane:
         length=length,
         attempt=jnp.where(aim, attempt, length),
         target=jnp.where(aim, target, FREE),
-        aims=jnp.where(aim, lane.aims + 1, 0.0),
+        aims=aims,
         part=part,
         done=done,
         fault=fault,
@@ -157,7 +159,7 @@ def _try(plan: Plan, lane: Lane, active: Flag) -> Trial:
         end = rates(scene.field, scene.position, s1, new)
         position = begin, end
         shift = _to_turn(end)
-        met = (jnp.abs(shift) <= _turn_tolerance(h)) | (lane.aims >= _PATIENCE)
+        met = jnp.abs(shift) <= _turn_tolerance(h) * _leniency(lane)
         at_turn = good & (lane.target == TURN) & met
         for i, stop in enumerate(scene.stops):
             ends = begin.scaled(stop.sign, stop.gap), end.scaled(stop.sign, stop.gap)
@@ -173,8 +175,6 @@ def _try(plan: Plan, lane: Lane, active: Flag) -> Trial:
         )
         crossings.append((SECTION, *ends, bound))
     seen = tuple(_seen(lane, good, h, crossing, crossings) for crossing in crossings)
-    for crossing in seen:
-        at_turn = at_turn & ~(crossing.end.x > 0)
     return Trial(s1, h, new, time, error, good, last, seen, position, at_turn)
 
 
@@ -189,13 +189,16 @@ def _seen(lane: Lane, good: Flag, h: Scalar, crossing: tuple, all_of_them: list)
     size = stop_gradient(jnp.abs(offset))
     eps = float(jnp.finfo(h.dtype).eps)
     # Two ways of being there to rounding: in place along the path, or, near grazing, in position.
-    close = size <= _landing_tolerance(h)
+    close = size <= _landing_tolerance(h) * _leniency(lane)
     close = close | ((jnp.abs(end.x) <= 4 * eps * scale) & (end.v >= 0))
-    close = close | (lane.aims >= _PATIENCE)
     real = stop_gradient(square) > 0
     landed = pin_flag(aimed & close & real, lane.one)
     again = aimed & ~close & real & (size < 0.25 * h)
     return Crossing(name, begin, end, offset, landed, again)
+
+
+def _leniency(lane: Lane) -> Scalar:
+    return jnp.where(lane.aims >= _PATIENCE, 1e3, jnp.ones_like(lane.aims))
 
 
 def _landing_tolerance(x: Scalar) -> float:
@@ -223,7 +226,7 @@ def _aim(plan: Plan, lane: Lane, trial: Trial) -> tuple[Flag, Scalar, Scalar]:
     # The earliest of several events is met first. The chord tells well enough which that is: a
     # landing that lies beyond another stop is not accepted.
     first, target = jnp.full_like(h, jnp.inf), jnp.full_like(h, TURN)
-    polynomial, path, crossed, landed = None, None, none, none
+    polynomial, crossed, landed, facing_stop = None, none, none, none
     for c in trial.crossings:
         over = trial.good & (c.end.x > 0)
         rise = jnp.where(over, c.end.x - c.begin.x, 1.0)
@@ -234,35 +237,55 @@ def _aim(plan: Plan, lane: Lane, trial: Trial) -> tuple[Flag, Scalar, Scalar]:
         target = jnp.where(sooner, c.name, target)
         first = jnp.where(sooner, place, first)
         crossed, landed = crossed | over, landed | c.landed
-    turn = none
+        if c.name > 0:
+            sign = plan.scene.stops[int(c.name) - 1].sign
+            facing_stop = facing_stop | (over & (lane.direction == sign))
+    aim, turn, path, wiggle = crossed & ~landed, none, None, none
     if trial.position is not None:
         begin, end = trial.position
-        turn = trial.good & (lane.direction * end.v < 0) & ~trial.at_turn
         path = quintic(begin, end, h)
         facing = tuple(-lane.direction * c for c in slope(path))
-        polynomial = facing if polynomial is None else select(crossed, polynomial, facing)
+        # The motion turned within the step. Unless it went through a stop before, that comes
+        # first: what lies beyond the turn is met from there.
+        turn = trial.good & (lane.direction * end.v < 0) & ~trial.at_turn & ~facing_stop
+        polynomial = facing if polynomial is None else select(turn, facing, polynomial)
     assert polynomial is not None
     theta = pin(rising_root(stop_gradient(polynomial)), lane.one)
-    if path is not None and not plan.motion:
-        height = stop_gradient(path[0])
-        for n in range(1, len(path)):
-            height = height + stop_gradient(path[n]) * theta**n
-        close = none
-        for stop in plan.scene.stops:
-            close = close | (stop.sign * height - stop.gap > -_MARGIN)
-        turn = turn & close
-
-    aim, attempt = crossed | turn, theta * h
-    if trial.position is not None:
+    attempt = theta * h
+    if path is not None and trial.position is not None:
+        if not plan.motion:
+            height = stop_gradient(path[0])
+            for n in range(1, len(path)):
+                height = height + stop_gradient(path[n]) * theta**n
+            close = crossed | landed
+            for stop in plan.scene.stops:
+                close = close | (stop.sign * height - stop.gap > -_MARGIN)
+            turn = turn & close
+        wiggle = trial.good & _may_turn_twice(lane, *stop_gradient(trial.position), h)
+        wiggle = wiggle & ~(aim | turn | landed | trial.at_turn)
         # Newton's step is better than the quintic once it is short.
         shift = _to_turn(trial.position[1])
-        again = turn & ~crossed & (lane.target == TURN) & (jnp.abs(shift) < 0.25 * h)
+        again = turn & (lane.target == TURN) & (jnp.abs(shift) < 0.25 * h)
         attempt = jnp.where(again, h + shift, attempt)
     for c in trial.crossings:
-        aim = aim | c.again
-        attempt = jnp.where(c.again, h + stop_gradient(c.offset), attempt)
-        target = jnp.where(c.again, c.name, target)
-    return aim & ~landed, stop_gradient(attempt), target
+        again = c.again & ~turn
+        aim = aim | again
+        attempt = jnp.where(again, h + stop_gradient(c.offset), attempt)
+        target = jnp.where(again, c.name, target)
+    target = jnp.where(turn, TURN, jnp.where(wiggle, FREE, target))
+    attempt = jnp.where(wiggle, 0.5 * h, attempt)
+    return aim | turn | wiggle, stop_gradient(attempt), target
+
+
+def _may_turn_twice(lane: Lane, begin: Rates, end: Rates, h: Scalar) -> Flag:
+    """Whether the velocity, of one sign at both ends, dips so deep that it may have been zero.
+
+    Such a step is halved until the turns lie apart or the dip is too short to matter.
+    """
+    a0, a1 = lane.direction * begin.a, lane.direction * end.a
+    dips = (a0 < 0) & (a1 > 0) & (h > 1e-3)
+    lowest = lane.direction * begin.v + 0.5 * h * a0 * (a0 / jnp.where(dips, a0 - a1, 1.0))
+    return dips & (lowest < 0.1 * lane.direction * (begin.v + end.v))
 
 
 def _arrive(
@@ -350,7 +373,13 @@ def _resized(plan: Plan, lane: Lane, trial: Trial, taken: Flag, rejected: Flag) 
 
 
 def _faults(
-    plan: Plan, trial: Trial, rejected: Flag, length: Scalar, record: Record, steps: Scalar
+    plan: Plan,
+    trial: Trial,
+    rejected: Flag,
+    length: Scalar,
+    record: Record,
+    steps: Scalar,
+    aims: Scalar,
 ) -> list[tuple[Flag, int]]:
     """What ends a lane, the first that holds being the reason."""
     broken = results.NOT_FINITE
@@ -359,6 +388,7 @@ def _faults(
         broken = results.STALLED
     ends = [
         (record.impacts > plan.max_impacts, results.CHATTER),
+        (aims >= _LOST, results.UNRESOLVED),
         (steps >= plan.max_steps, results.MAX_STEPS),
     ]
     if not plan.method.adaptive:

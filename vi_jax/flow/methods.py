@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array, Float
 
 from .._checks import count, require
@@ -90,8 +91,11 @@ class Adaptive(AbstractMethod):
     """
 
     solver: Unrolled = eqx.field(default_factory=diffrax.Dopri8, converter=_unrolled)
-    rtol: float = eqx.field(kw_only=True, default=1e-9)
-    atol: float | None = eqx.field(kw_only=True, default=None)
+    # Arrays, so that another tolerance is not another program.
+    rtol: np.ndarray | float = eqx.field(kw_only=True, default=1e-9, converter=np.asarray)
+    atol: np.ndarray | float | None = eqx.field(
+        kw_only=True, default=None, converter=lambda x: x if x is None else np.asarray(x)
+    )
 
     def __check_init__(self):
         require("rtol", self.rtol, low=0.0, high=1.0, open_low=True)

@@ -21,6 +21,7 @@ class RESULTS(eqx.Enumeration):
     chatter = "The impacts within one cycle exceeded `max_impacts` (chatter)."
     underflow = "The step size fell below what the precision resolves. Loosen the tolerance."
     not_finite = "The state ceased to be finite."
+    unresolved = "An impact could not be located within the step."
     max_steps = "The number of steps exceeded `max_steps` before the last cycle was complete."
 
 
@@ -32,9 +33,19 @@ REASONS = (
     RESULTS.chatter,
     RESULTS.underflow,
     RESULTS.not_finite,
+    RESULTS.unresolved,
     RESULTS.max_steps,
 )
-(SUCCESSFUL, BAD_START, STALLED, CHATTER, UNDERFLOW, NOT_FINITE, MAX_STEPS) = range(7)
+(
+    SUCCESSFUL,
+    BAD_START,
+    STALLED,
+    CHATTER,
+    UNDERFLOW,
+    NOT_FINITE,
+    UNRESOLVED,
+    MAX_STEPS,
+) = range(len(REASONS))
 
 
 def reason(code: Float[Array, ""]) -> RESULTS:

@@ -1,5 +1,6 @@
 """`simulate`: a scene, a start, a number of cycles and a method give a run."""
 
+import warnings
 from typing import Any
 
 import equinox as eqx
@@ -89,6 +90,12 @@ def simulate(
         start = scene.adopt(start)
     method.check(scene)
     _check_start(scene, start)
+    if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
+        warnings.warn(
+            "vi_jax is running in single precision: errors near 1e-6 and tolerances to match. For "
+            'double precision call `jax.config.update("jax_enable_x64", True)` first.',
+            stacklevel=2,
+        )
     plan = Plan(
         scene=scene,
         method=method,
