@@ -141,8 +141,8 @@ class FixedStep(AbstractMethod):
     Under `vmap` this is the faster choice: no lane waits for another's rejected steps. A step that
     meets a stop is split there. Steps are shortened where the scene's `step_limit` asks for it.
 
-    **Arguments:** `solver` (default `diffrax.Dopri8()`), `steps_per_cycle` (at least 8; the default,
-    12, measured a final-state error of 7e-10 over 200 cycles of Table 1's motor scene).
+    **Arguments:** `solver` (default `diffrax.Dopri8()`), `steps_per_cycle` (at least 8; the
+    default, 12, measured a final-state error of 7e-10 over 200 cycles of Table 1's motor scene).
 
     **Raises:** `TypeError` if the solver is not explicit Runge–Kutta; `ValueError` for fewer than
     8 steps.

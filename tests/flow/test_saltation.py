@@ -1,0 +1,92 @@
+"""Derivatives through impacts are the product of flights and saltation matrices."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+import vi_jax as vi
+
+ZETA, XI, K, GAP = 0.9, 0.05, 0.5, 2.0
+# Starts and cycles with one and with three impacts.
+CASES = {1: (0.1, 0.2, 2), 3: (1.6, -1.9, 5)}
+
+
+def final(method, cycles, adjoint="forward"):
+    def f(x):
+        zeta, xi, k, d, Y, V = x
+        scene = vi.Scene.ideal(frequency_ratio=zeta, restitution=k, gap=d, damping_ratio=xi)
+        run = vi.simulate(scene, scene.start(Y=Y, V=V), cycles, method=method, adjoint=adjoint)
+        return jnp.stack([run.sections.Y[-1], run.sections.V[-1]])
+
+    return f
+
+
+def flight(time: float) -> np.ndarray:
+    return expm(np.array([[0.0, 1.0], [-1.0, -2 * XI]]) * time)
+
+
+def product(Y: float, V: float, cycles: int) -> tuple[np.ndarray, int]:
+    """The monodromy matrix from impact phases and speeds, and the number of impacts."""
+    scene = vi.Scene.ideal(frequency_ratio=ZETA, restitution=K, gap=GAP, damping_ratio=XI)
+    run = vi.simulate(scene, scene.start(Y=Y, V=V), cycles, method=vi.ExactFlight(), impact_log=4)
+    matrix, time, impacts = np.eye(2), 0.0, 0
+    for cycle, row in enumerate(np.asarray(run.impact_log.phase)):
+        for place, phase in enumerate(row[np.isfinite(row)]):
+            speed = float(run.impact_log.speed[cycle, place])
+            now = (2 * np.pi * cycle + phase) / ZETA
+            before = np.cos(phase) - GAP - 2 * XI * speed
+            after = np.cos(phase) - GAP + 2 * XI * K * speed
+            saltation = np.array([[-K, 0.0], [(K * before + after) / speed, -K]])
+            matrix = saltation @ flight(now - time) @ matrix
+            time, impacts = now, impacts + 1
+    return flight(2 * np.pi * cycles / ZETA - time) @ matrix, impacts
+
+
+@pytest.mark.parametrize("impacts", CASES)
+@pytest.mark.parametrize("adjoint", ["forward", "reverse"])
+@pytest.mark.parametrize(
+    ("method", "tolerance"),
+    [(vi.ExactFlight(), 1e-9), (vi.Adaptive(diffrax.Tsit5(), rtol=1e-11), 1e-7)],
+    ids=["ExactFlight", "Adaptive"],
+)
+def test_jacobian_is_the_product(method, tolerance, adjoint, impacts):
+    Y, V, cycles = CASES[impacts]
+    truth, counted = product(Y, V, cycles)
+    assert counted == impacts
+    jacobian = jax.jacfwd if adjoint == "forward" else jax.jacrev
+    f = final(method, cycles, adjoint)
+    parameters = jnp.array([ZETA, XI, K, GAP])
+    found = jax.jit(jacobian(lambda x: f(jnp.concatenate([parameters, x]))))(jnp.array([Y, V]))
+    np.testing.assert_allclose(found, truth, atol=tolerance)
+
+
+@pytest.mark.parametrize("impacts", CASES)
+def test_parameters_by_central_differences(impacts):
+    Y, V, cycles = CASES[impacts]
+    f = jax.jit(final(vi.ExactFlight(), cycles))
+    x = jnp.array([ZETA, XI, K, GAP, Y, V])
+    found = jax.jit(jax.jacfwd(f))(x)
+    for i in range(6):
+        h = 1e-6 * jnp.eye(6)[i]
+        difference = (f(x + h) - f(x - h)) / 2e-6
+        # The difference's own error: rounding 1e-15/1e-6, truncation (1e-6)² f'''.
+        np.testing.assert_allclose(found[:, i], difference, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("clock", ["phase", "time"])
+def test_motor_control_by_central_differences(clock):
+    def f(kappa):
+        scene = vi.Parameters(torque=10.0, kappa=kappa).scene()
+        run = vi.simulate(
+            scene, scene.start(V=0.5, W=0.9), 4, method=vi.Adaptive(rtol=1e-11), clock=clock
+        )
+        state = run.sections
+        return jnp.stack([state.Y[-1], state.V[-1], state.W[-1], run.duration[-1]])
+
+    f = jax.jit(f)
+    found = jax.jit(jax.jacfwd(f))(0.9)
+    difference = (f(0.9 + 1e-5) - f(0.9 - 1e-5)) / 2e-5
+    np.testing.assert_allclose(found, difference, rtol=1e-5, atol=1e-6)

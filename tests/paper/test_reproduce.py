@@ -1,0 +1,142 @@
+"""The reproduction: what it measures, and that its report says so."""
+
+import json
+from math import isnan
+
+import numpy as np
+import pytest
+from PIL import Image
+from vi_jax.paper import check_claims, check_faults, reproduce, simulate_cases
+from vi_jax.paper.faults import period_doubling_damping
+from vi_jax.paper.figures import draw_figure
+from vi_jax.paper.motions import closed_form, sampled
+from vi_jax.paper.printed import energy_drift, eq21_misses
+
+
+@pytest.fixture(scope="module")
+def cases():
+    return simulate_cases(quick=True)
+
+
+@pytest.fixture(scope="module")
+def claims(cases):
+    return {claim.name: claim for claim in check_claims(cases)}
+
+
+@pytest.fixture(scope="module")
+def faults():
+    return {fault.number: fault for fault in check_faults()}
+
+
+def test_verdicts(claims):
+    assert {name: claim.verdict for name, claim in claims.items()} == {
+        "first 4π from rest follow the 2π motion": "contradicted",
+        "begins near the 2π motion": "confirmed undamped only",
+        "leaves the 2π motion": "confirmed undamped only",
+        "rounding errors drive the transient": "contradicted",
+        "settles on the 4π motion": "confirmed undamped only",
+        "simulation and 4π closed form agree": "confirmed undamped only",
+        "no transient from the 4π state": "confirmed undamped only",
+        "no discrepancy of the maximum": "confirmed",
+        "discrepancy of the minimum": "confirmed undamped only",
+    }
+
+
+def test_transient_from_rest(claims):
+    near = claims["begins near the 2π motion"].numbers
+    assert near["minima_cycles_3_4"]["undamped"] == pytest.approx([-2.004, -1.737], abs=1e-3)
+    assert near["closed_form_minimum_2pi"]["undamped"] == pytest.approx(-1.883583, abs=1e-6)
+    settled = claims["settles on the 4π motion"].numbers
+    assert 25 <= settled["cycle_settled_on_4pi_undamped"] <= 45
+    assert settled["last_minima"]["undamped"] == pytest.approx([-3.254, -1.544], abs=1e-3)
+
+
+def test_departure_has_the_rate_of_the_multiplier(claims):
+    numbers = claims["leaves the 2π motion"].numbers
+    assert numbers["rate_small_deviation"]["undamped"] == pytest.approx(1.166036, abs=1e-5)
+    assert numbers["rate_small_deviation"]["damped"] == pytest.approx(0.88598, abs=1e-4)
+
+
+def test_four_pi_motion_has_no_transient(claims):
+    assert claims["no transient from the 4π state"].numbers["max_deviation_undamped"] < 1e-11
+
+
+def test_alignment_is_the_one_that_fits(cases):
+    case = cases[0]
+    Y = sampled(case.from_rest)[0]
+    right = np.abs(Y - closed_form(case, len(Y), 2))[-2:].max()
+    other = case._replace(long_shift=1 - case.long_shift)
+    wrong = np.abs(Y - closed_form(other, len(Y), 2))[-2:].max()
+    assert right < 1e-5 < 1 < wrong
+
+
+def test_right_equation_keeps_energy_and_printed_ones_do_not(faults):
+    first, second = faults[1].numbers, faults[2].numbers
+    assert first["energy_drift_right"] < 1e-10
+    assert first["energy_drift_printed_in_metres"] > 0.1
+    assert first["energy_drift_printed_in_crank_radii"] > 0.01
+    assert second["energy_drift_printed"] > 0.1
+
+
+def test_energy_drift_needs_both_faults_gone():
+    assert energy_drift(coupling=0.3, slider_inertia=0.4) < 1e-9
+    assert energy_drift(coupling=0.3, slider_inertia=0.4, printed_coupling=0.31) > 1e-4
+
+
+@pytest.mark.parametrize("zeta", [0.75, 0.9, 1.2])
+@pytest.mark.parametrize("n", [1, 2])
+def test_eq21_needs_its_zeta(zeta, n):
+    right = eq21_misses(zeta, 0.6, 2.0, n, printed=False)
+    printed = eq21_misses(zeta, 0.6, 2.0, n, printed=True)
+    assert max(right[name] for name in right if name.startswith("miss")) < 1e-11
+    assert printed["miss_17_before"] > 0.01
+
+
+def test_eq21_gives_the_checked_impacts():
+    for n, speed in ((1, 1.57475), (2, 3.54674)):
+        v0 = eq21_misses(0.9, 0.5, 2.0, n, printed=False)["v0"]
+        assert 0.9 * v0 == pytest.approx(speed, abs=1e-5)
+
+
+def test_no_load_speed_maps_kappa_to_zeta(faults):
+    by_kappa = faults[4].numbers["frequency_ratio_by_kappa"]["omega"]
+    for kappa, ratio in by_kappa.items():
+        assert ratio == pytest.approx(float(kappa), abs=1e-3)
+
+
+def test_damping_at_the_period_doubling(faults):
+    assert period_doubling_damping() == pytest.approx(0.27, abs=0.005)
+    assert faults[6].numbers["largest_multiplier_by_c"]["0.5"] < 1
+    assert faults[6].numbers["largest_multiplier_by_c"]["0"] > 1
+
+
+def test_reproduce_writes_figures_and_reports(tmp_path):
+    steps = []
+    found = reproduce(tmp_path / "a" / "b", quick=True, progress=steps.append)
+    names = ["fig3.png", "fig4.png", "report.json", "report.md"]
+    assert [path.name for path in found.files] == names
+    assert len(steps) == 5
+    for name in names[:2]:
+        path = tmp_path / "a" / "b" / name
+        assert path.stat().st_size < 200_000
+        picture = Image.open(path)
+        assert picture.size == (1540, 924)
+        assert len(set(picture.convert("RGB").getdata())) > 16
+
+    def refuse(constant):
+        raise AssertionError(constant)
+
+    text = (tmp_path / "a" / "b" / "report.json").read_text(encoding="utf-8")
+    data = json.loads(text, parse_constant=refuse)
+    assert len(data["claims"]) == 9 and len(data["faults"]) == 6
+    assert not any(isnan(x) for x in data["settings"]["damping_ratio"].values())
+    page = (tmp_path / "a" / "b" / "report.md").read_text(encoding="utf-8")
+    for claim in found.claims:
+        assert claim.measured in page
+    assert "None" not in page and "nan" not in page
+
+
+def test_figure_numbers(cases, tmp_path):
+    with pytest.raises(ValueError, match="3 or 4"):
+        draw_figure(2, cases, tmp_path / "fig.png")
+    assert not list(tmp_path.iterdir())

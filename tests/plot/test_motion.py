@@ -1,0 +1,108 @@
+"""Pictures draw what was simulated: points, impacts, stops, units."""
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+from matplotlib.figure import Figure
+from vi_jax.plot import motion_path, plot_history, plot_phase_portrait
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return vi.Scene.ideal(frequency_ratio=0.9)
+
+
+@pytest.fixture(scope="module")
+def run(scene):
+    return vi.simulate(
+        scene, scene.start(), 6, method=vi.ExactFlight(), samples=32, impact_log=2, throw=True
+    )
+
+
+def _axes():
+    return Figure().subplots()
+
+
+def test_path_holds_the_samples_and_the_impacts(scene, run):
+    path = motion_path(run, scene=scene)
+    impacts = int(run.impacts.sum())
+    assert impacts > 0
+    assert path.Y.size == 6 * 32 + 1 + 2 * impacts
+    assert (np.diff(path.cycles) >= 0).all()
+    touching = np.flatnonzero(path.Y == 2.0)
+    assert touching.size == 2 * impacts
+    before, after = path.V[touching[::2]], path.V[touching[1::2]]
+    assert (before > 0).all()
+    np.testing.assert_allclose(after, -0.5 * before)
+    # Without the corners no point reaches the stop, with them none passes it.
+    assert motion_path(run).Y.max() < 2.0 == path.Y.max()
+
+
+def test_impacts_lie_on_the_path_of_their_neighbours(scene, run):
+    path = motion_path(run, scene=scene)
+    step = np.abs(np.diff(path.Y))
+    # No jump in position: a misplaced impact would make one of several tenths.
+    assert step.max() < 1.05 * np.abs(path.V).max() * 2 * np.pi / 0.9 / 32
+
+
+def test_stop_on_the_left(run):
+    left = vi.Scene(
+        oscillator=vi.Oscillator(0.01),
+        drive=vi.IdealDrive(0.9),
+        stops=(vi.RigidStop(1.0, 0.7, side="left"),),
+    )
+    run = vi.simulate(left, left.start(), 6, samples=32, impact_log=4)
+    path = motion_path(run, scene=left)
+    at = np.flatnonzero(path.Y == -1.0)
+    assert at.size == 2 * int(run.impacts.sum()) > 0
+    assert (path.V[at[::2]] < 0).all() and (path.V[at[1::2]] > 0).all()
+
+
+def test_history_axis_and_stop(scene, run):
+    ax = _axes()
+    assert plot_history(run, scene=scene, ax=ax, window=(2, 4), shift=1) is ax
+    line, stop = ax.lines
+    x = line.get_xdata()
+    # Crank angle in units of π: two for each cycle.
+    assert x.min() == pytest.approx(6.0) and x.max() == pytest.approx(10.0)
+    assert set(stop.get_ydata()) == {2.0}
+    assert ax.get_ylabel() == "Y = y/a"
+    ticks = ax.xaxis.get_major_formatter()
+    assert [ticks(v, 0) for v in (0, 1, 4, -1)] == ["0", "π", "4π", "-π"]
+    cycles = plot_history(run.samples, ax=_axes(), unit="cycles")
+    assert cycles.lines[0].get_xdata().max() == pytest.approx(6.0)
+
+
+def test_phase_portrait_marks_sections(scene, run):
+    ax = plot_phase_portrait(run, scene, ax=_axes())
+    _, dots, _ = ax.lines
+    np.testing.assert_array_equal(dots.get_xdata(), np.asarray(run.sections.Y))
+    np.testing.assert_array_equal(dots.get_ydata(), np.asarray(run.sections.V))
+
+
+def test_new_axes_by_default(run):
+    import matplotlib.pyplot as plt
+
+    ax = plot_history(run)
+    assert ax.figure in map(plt.figure, plt.get_fignums())
+    plt.close(ax.figure)
+
+
+def test_errors_name_the_argument(scene, run):
+    plain = vi.simulate(scene, scene.start(), 6, method=vi.ExactFlight())
+    with pytest.raises(ValueError, match="`motion` must have samples"):
+        plot_history(plain)
+    with pytest.raises(ValueError, match="`unit` must be"):
+        plot_history(run, unit="seconds")
+    import equinox as eqx
+
+    sweep = eqx.filter_vmap(
+        lambda Y: vi.simulate(scene, scene.start(Y=Y), 2, method=vi.ExactFlight(), samples=8)
+    )(jnp.array([0.0, 0.1]))
+    with pytest.raises(ValueError, match="one motion"):
+        motion_path(sweep)

@@ -1,0 +1,74 @@
+"""The command line: what it prints, where it writes, how it fails."""
+
+import pytest
+from vi_jax import cli
+
+
+def test_version(capsys):
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["--version"])
+    assert ended.value.code == 0
+    assert capsys.readouterr().out.startswith("vi-jax ")
+
+
+def test_a_command_is_needed(capsys):
+    with pytest.raises(SystemExit) as ended:
+        cli.main([])
+    assert ended.value.code == 2
+    assert "command" in capsys.readouterr().err
+
+
+def test_reproduce(tmp_path, capsys):
+    out = tmp_path / "new" / "folder"
+    assert cli.main(["reproduce", "--quick", "--out", str(out)]) == 0
+    printed = capsys.readouterr()
+    assert {path.name for path in out.iterdir()} == {
+        "fig3.png",
+        "fig4.png",
+        "report.md",
+        "report.json",
+    }
+    assert len(printed.out.splitlines()) <= 14
+    assert str(out) in printed.out
+    assert "simulating" in printed.err and "simulating" not in printed.out
+
+
+def _no_work(*args, **options):
+    raise AssertionError("work began")
+
+
+@pytest.mark.parametrize("below", ["", "folder"])
+def test_a_file_in_the_way(tmp_path, capsys, monkeypatch, below):
+    monkeypatch.setattr(cli, "reproduce", _no_work)
+    file = tmp_path / "taken"
+    file.write_text("mine")
+    assert cli.main(["reproduce", "--out", str(file / below)]) == 2
+    printed = capsys.readouterr()
+    assert printed.err.count("\n") == 1 and "taken" in printed.err
+    assert file.read_text() == "mine"
+
+
+@pytest.mark.parametrize("out", ["", "/proc/nowhere", "bad\0name"])
+def test_a_path_that_cannot_be_written(capsys, monkeypatch, out):
+    monkeypatch.setattr(cli, "reproduce", _no_work)
+    assert cli.main(["reproduce", "--out", out]) == 2
+    printed = capsys.readouterr()
+    assert printed.err.count("\n") == 1 and "error" in printed.err and not printed.out
+
+
+def test_interrupt_keeps_what_was_written(tmp_path, capsys, monkeypatch):
+    from vi_jax.paper import report
+
+    def interrupt(cases):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(report, "check_claims", interrupt)
+    assert cli.main(["reproduce", "--quick", "--out", str(tmp_path)]) == 130
+    assert {path.name for path in tmp_path.iterdir()} == {"fig3.png", "fig4.png"}
+    assert "interrupted" in capsys.readouterr().err
+
+
+def test_a_failing_write_is_one_line(tmp_path, capsys):
+    (tmp_path / "fig3.png").mkdir()
+    assert cli.main(["reproduce", "--quick", "--out", str(tmp_path)]) == 1
+    assert capsys.readouterr().err.splitlines()[-1].startswith("vi-jax: error:")
