@@ -5,9 +5,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.linalg import expm
-
 import vi_jax as vi
+from scipy.linalg import expm
 
 ZETA, XI, K, GAP = 0.9, 0.05, 0.5, 2.0
 # Starts and cycles with one and with three impacts.

@@ -31,6 +31,8 @@ Flag = Bool[Array, ""]
 # more, a lane that has aimed this often accepts a thousand times the tolerance, and one that has
 # aimed much more often is lost.
 _PATIENCE, _LOST = 12.0, 64.0
+# A lane that is lost after so many impacts in one interval was chattering.
+_MANY = 16.0
 # Turning points this far inside the gap (unit: a) are passed by where only impacts matter.
 _MARGIN = 0.02
 
@@ -388,6 +390,7 @@ def _faults(
         broken = results.STALLED
     ends = [
         (record.impacts > plan.max_impacts, results.CHATTER),
+        ((aims >= _LOST) & (record.impacts > _MANY), results.CHATTER),
         (aims >= _LOST, results.UNRESOLVED),
         (steps >= plan.max_steps, results.MAX_STEPS),
     ]

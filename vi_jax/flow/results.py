@@ -18,7 +18,10 @@ class RESULTS(eqx.Enumeration):
         "The crank stopped turning forward, which the phase clock cannot follow. Simulate with "
         '`clock="time"`.'
     )
-    chatter = "The impacts within one cycle exceeded `max_impacts` (chatter)."
+    chatter = (
+        "The impacts within one cycle exceeded `max_impacts`, or followed each other too fast to be "
+        "told apart (chatter)."
+    )
     underflow = "The step size fell below what the precision resolves. Loosen the tolerance."
     not_finite = "The state ceased to be finite."
     unresolved = "An impact could not be located within the step."

@@ -21,7 +21,7 @@ class Unrolled(diffrax.AbstractSolver):
     **Raises:** `TypeError` if `solver` is not one.
     """
 
-    solver: diffrax.AbstractERK
+    solver: Any  # not yet known to be a solver when it is checked below
     term_structure: ClassVar[Any] = diffrax.AbstractTerm
 
     def __check_init__(self):

@@ -1,0 +1,92 @@
+"""What a run holds: samples, log, counts, words."""
+
+import re
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+
+SCENE = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.0)
+
+
+@pytest.mark.parametrize("method", [vi.ExactFlight(), vi.Adaptive(rtol=1e-11)])
+def test_samples_refine_the_sections(method):
+    plain = vi.simulate(SCENE, SCENE.start(V=1.0), 6, method=method, impact_log=2)
+    dense = vi.simulate(SCENE, SCENE.start(V=1.0), 6, method=method, impact_log=2, samples=50)
+    samples = dense.samples
+    assert samples.state.Y.shape == (301,) and dense.sections.Y.shape == (7,)
+    np.testing.assert_allclose(samples.state.Y[::50], plain.sections.Y, atol=1e-8)
+    np.testing.assert_allclose(samples.time, samples.cycles * 2 * np.pi / 0.9, rtol=1e-13)
+    np.testing.assert_allclose(dense.y_max, plain.y_max, atol=1e-8)
+    np.testing.assert_allclose(dense.y_min, plain.y_min, atol=1e-8)
+    np.testing.assert_array_equal(dense.impacts, plain.impacts)
+    np.testing.assert_allclose(dense.impact_log.phase, plain.impact_log.phase, atol=1e-8)
+    np.testing.assert_allclose(dense.impact_speed, plain.impact_speed, atol=1e-8)
+    speeds = np.asarray(plain.impact_log.speed)
+    np.testing.assert_allclose(
+        np.where(np.isnan(speeds), 0.0, speeds).max(axis=1), plain.impact_speed, atol=1e-12
+    )
+
+
+def test_samples_of_a_motor_in_both_clocks():
+    scene = vi.Parameters().scene()
+    runs = [
+        vi.simulate(scene, scene.start(), 5, method=vi.Adaptive(rtol=1e-11), samples=16, clock=c)
+        for c in ("phase", "time")
+    ]
+    for name in ("Y", "V", "W"):
+        a, b = (getattr(run.samples.state, name) for run in runs)
+        np.testing.assert_allclose(a, b, atol=1e-7)
+    np.testing.assert_allclose(runs[0].samples.time, runs[1].samples.time, atol=1e-7)
+    np.testing.assert_allclose(runs[0].duration, runs[1].duration, atol=1e-7)
+
+
+def test_sections_only():
+    full = vi.simulate(SCENE, SCENE.start(), 9)
+    lean = vi.simulate(SCENE, SCENE.start(), 9, record="sections")
+    assert lean.y_max is None and lean.impact_speed is None and lean.frequency_ratio is None
+    np.testing.assert_array_equal(lean.impacts, full.impacts)
+    np.testing.assert_allclose(lean.sections.Y, full.sections.Y, atol=1e-7)
+    assert int(lean.steps) < int(full.steps)
+
+
+def test_words():
+    run = vi.simulate(SCENE, SCENE.start(), 9, method=vi.ExactFlight())
+    text = str(run)
+    assert "Run of 9 cycles" in text and "ended: completed" in text and "Y in [" in text
+    assert bool(run.successful) and bool(jnp.all(run.duration == run.duration[0]))
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"cycles": 0}, ValueError, r"`cycles` must be at least 1, but got 0"),
+        ({"cycles": 2.5}, TypeError, r"`cycles` must be an integer, but got 2.5"),
+        ({"clock": "phases"}, ValueError, r"`clock` must be one of 'phase', 'time', but got"),
+        ({"record": "all"}, ValueError, r"`record` must be one of 'motion', 'sections'"),
+        ({"adjoint": "back"}, ValueError, r"`adjoint` must be one of"),
+        ({"start": SCENE.start(Y=2.5)}, ValueError, r"`start` must not lie beyond a stop.*0.5 bey"),
+        ({"start": vi.Parameters().scene().start()}, TypeError, r"`start` must be a `Oscillator"),
+        (
+            {"start": vi.OscillatorState(jnp.asarray(jnp.nan), jnp.asarray(0.0))},
+            ValueError,
+            "finite",
+        ),
+    ],
+)
+def test_bad_input(change, error, message):
+    arguments = {"scene": SCENE, "start": SCENE.start(), "cycles": 3, **change}
+    # The run-time type checks of the tests may come first; they are `TypeError`s as well.
+    with pytest.raises(error) as caught:
+        vi.simulate(**arguments)
+    assert error is TypeError or re.search(message, str(caught.value))
+
+
+def test_exact_flight_says_what_it_needs():
+    motor = vi.Parameters().scene()
+    with pytest.raises(ValueError, match=r"`ExactFlight` needs.*`IdealDrive`.*`Motor`"):
+        vi.simulate(motor, motor.start(), 3, method=vi.ExactFlight())
+    slider = vi.Parameters().scene(drive="ideal", crank="slider")
+    with pytest.raises(ValueError, match=r"`ExactFlight` needs a `CosineCrank`.*`SliderCrank`"):
+        vi.simulate(slider, slider.start(), 3, method=vi.ExactFlight())

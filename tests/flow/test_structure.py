@@ -1,0 +1,103 @@
+"""What a scene does not have is not in the compiled program, and numbers are not part of it."""
+
+from collections import Counter
+
+import jax
+import jax.numpy as jnp
+import pytest
+import vi_jax as vi
+
+
+def count(jaxpr, counter=None) -> Counter:
+    """Primitives of a jaxpr and of all it calls."""
+    counter = Counter() if counter is None else counter
+    for equation in jaxpr.eqns:
+        counter[equation.primitive.name] += 1
+        for parameter in equation.params.values():
+            for inner in parameter if isinstance(parameter, (tuple, list)) else (parameter,):
+                if hasattr(inner, "jaxpr"):
+                    inner = inner.jaxpr
+                if hasattr(inner, "eqns"):
+                    count(inner, counter)
+    return counter
+
+
+def carried(jaxpr) -> int:
+    """Number of arrays that the longest-carrying loop hands on."""
+    sizes = [0]
+    for equation in jaxpr.eqns:
+        if equation.primitive.name == "while":
+            sizes.append(len(equation.outvars))
+        for parameter in equation.params.values():
+            inner = getattr(parameter, "jaxpr", parameter)
+            if hasattr(inner, "eqns"):
+                sizes.append(carried(inner))
+    return max(sizes)
+
+
+def program(scene, start, **options):
+    options = {"method": vi.FixedStep(), "record": "sections", **options}
+    return jax.make_jaxpr(lambda s: vi.simulate(scene, s, 3, **options).sections)(start).jaxpr
+
+
+IDEAL = vi.Scene.ideal(frequency_ratio=0.9)
+FREE = vi.Scene.ideal(frequency_ratio=0.9, gap=None)
+MOTOR = vi.Parameters().scene()
+
+
+def test_no_stop_no_search():
+    with_stop, without = (count(program(s, s.start())) for s in (IDEAL, FREE))
+    assert with_stop["sqrt"] > 0  # of the landing
+    assert without["sqrt"] == 0
+    assert sum(without.values()) < sum(with_stop.values())
+    two = vi.Scene(
+        oscillator=IDEAL.oscillator, drive=IDEAL.drive,
+        stops=(*IDEAL.stops, vi.RigidStop(2.0, 0.5, "left")),
+    )  # fmt: skip
+    assert sum(count(program(two, two.start())).values()) > sum(with_stop.values())
+
+
+def test_the_state_is_what_the_scene_needs():
+    ideal, motor = program(IDEAL, IDEAL.start()), program(MOTOR, MOTOR.start())
+    timed = program(MOTOR, MOTOR.start(), clock="time")
+    # W is carried twice: where the lane is, and where its last cycle ended. So is the phase.
+    assert carried(motor) == carried(ideal) + 2
+    assert carried(timed) == carried(motor) + 2
+    assert sum(count(ideal).values()) < sum(count(motor).values())
+    # Elapsed time, extremes and speeds are carried where they are asked for.
+    assert carried(program(MOTOR, MOTOR.start(), record="motion")) == carried(motor) + 8
+    assert carried(program(IDEAL, IDEAL.start(), record="motion")) == carried(ideal) + 6
+
+
+@pytest.mark.parametrize("method", [vi.Adaptive(), vi.FixedStep(), vi.ExactFlight()])
+def test_other_numbers_are_the_same_program(method):
+    traced = []
+
+    class Counting(vi.CosineCrank):
+        def slide(self, phase):
+            traced.append(phase)
+            return super().slide(phase)
+
+    crank = vi.CosineCrank() if isinstance(method, vi.ExactFlight) else Counting()
+    for zeta, k in ((0.9, 0.5), (0.8, 0.7)):
+        scene = vi.Scene.ideal(frequency_ratio=zeta, restitution=k, crank=crank)
+        vi.simulate(scene, scene.start(Y=zeta), 2, method=method)
+        traced.append("call")
+    assert traced[-2:] == ["call", "call"]  # the second call traced nothing
+
+
+def test_a_tolerance_is_a_number():
+    first, second = (jax.tree.structure(vi.Adaptive(rtol=r)) for r in (1e-6, 1e-9))
+    assert first == second
+    assert len(jax.tree.leaves(vi.Adaptive(rtol=1e-6))) == 1
+
+
+def test_single_precision_works_and_says_so():
+    with jax.enable_x64(False):
+        scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.05)
+        with pytest.warns(UserWarning, match="single precision"):
+            run = vi.simulate(scene, scene.start(), 60, method=vi.ExactFlight())
+        assert run.sections.Y.dtype == jnp.float32
+    exact = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.05)
+    truth = vi.simulate(exact, exact.start(), 60, method=vi.ExactFlight())
+    assert float(jnp.abs(run.sections.Y[-1] - truth.sections.Y[-1])) < 1e-4

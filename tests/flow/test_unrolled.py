@@ -1,0 +1,58 @@
+"""`Unrolled` is the solver that it wraps."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+
+SOLVERS = [
+    diffrax.Tsit5(), diffrax.Dopri5(), diffrax.Dopri8(), diffrax.Bosh3(),
+    diffrax.Heun(), diffrax.Euler(),
+]  # fmt: skip
+NAMES = [type(solver).__name__ for solver in SOLVERS]
+
+
+def field(t, y, args):
+    return {"x": y["v"], "v": jnp.cos(t) - y["x"] ** 3 - args * y["v"]}
+
+
+TERM = diffrax.ODETerm(field)
+START = {"x": jnp.asarray(0.3), "v": jnp.asarray(-0.7)}
+
+
+@pytest.mark.parametrize("solver", SOLVERS[:5], ids=NAMES[:5])
+def test_step_is_that_of_diffrax(solver):
+    args = 0.1
+    hidden = solver.init(TERM, 0.2, 0.5, START, args)
+    original = solver.step(TERM, 0.2, 0.5, START, args, hidden, False)
+    unrolled = vi.Unrolled(solver).step(TERM, 0.2, 0.5, START, args, None, False)
+    for mine, theirs in zip(unrolled[:2], original[:2], strict=True):
+        for name in START:
+            np.testing.assert_allclose(mine[name], theirs[name], rtol=1e-14, atol=1e-16)
+    mine = vi.Unrolled(solver).interpolation_cls(t0=0.2, t1=0.5, **unrolled[2])
+    theirs = solver.interpolation_cls(t0=0.2, t1=0.5, **original[2])
+    for t in (0.23, 0.4, 0.5):
+        a, b = mine.evaluate(t), theirs.evaluate(t)
+        np.testing.assert_allclose(a["x"], b["x"], rtol=1e-14)
+
+
+@pytest.mark.parametrize("solver", SOLVERS[:3], ids=NAMES[:3])
+def test_serves_diffeqsolve(solver):
+    def solve(solver):
+        return diffrax.diffeqsolve(
+            TERM, solver, 0.0, 20.0, 0.1, START, args=0.1,
+            stepsize_controller=diffrax.PIDController(rtol=1e-8, atol=1e-8),
+        ).ys["x"][-1]  # fmt: skip
+
+    assert float(jax.jit(lambda: solve(vi.Unrolled(solver)))()) == pytest.approx(
+        float(solve(solver)), abs=1e-10
+    )
+
+
+@pytest.mark.parametrize("method", [vi.Adaptive, vi.FixedStep])
+@pytest.mark.parametrize("solver", [diffrax.Kvaerno5(), diffrax.SemiImplicitEuler(), "Tsit5"])
+def test_other_solvers_are_refused(method, solver):
+    with pytest.raises(TypeError, match=r"`solver` must be an explicit diffrax Runge–Kutta solver"):
+        method(solver)

@@ -1,0 +1,104 @@
+"""Scenes and parameters: groups, kinematics, and errors that say what is wrong."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+
+
+def test_groups_of_table_1():
+    table = vi.Parameters(torque=2.0, kappa=0.7, restitution=0.8)
+    scene = table.scene()
+    drive = scene.drive
+    assert float(table.natural_frequency) == pytest.approx(15.930782, abs=5e-7)
+    assert float(scene.damping_ratio) == pytest.approx(0.0448368, abs=5e-8)
+    assert float(scene.stops[0].gap) == pytest.approx(2.0)
+    assert float(drive.slider_inertia) == pytest.approx(0.0053333, abs=5e-8)
+    assert float(drive.coupling) == pytest.approx(0.0093333, abs=5e-8)
+    assert float(drive.strength) == pytest.approx(0.13134, abs=5e-6)
+    assert float(vi.Parameters(torque=100.0).scene().drive.strength) == pytest.approx(
+        6.5671, abs=5e-5
+    )
+    assert float(drive.no_load_speed) == 1.0 and float(drive.control) == pytest.approx(0.7)
+    assert float(table.scene(drive="ideal").drive.frequency_ratio) == pytest.approx(0.7)
+    assert float(table.scene(crank="slider").crank.ratio) == pytest.approx(1 / 3)
+    assert float(vi.Parameters(no_load_speed=20.0).scene().drive.no_load_speed) == pytest.approx(
+        20.0 / 15.930782, rel=1e-7
+    )
+    assert float(table.metres(2.0)) == pytest.approx(0.08)
+    assert float(table.seconds(table.natural_frequency)) == pytest.approx(1.0)
+    assert float(table.metres_per_second(1.0)) == pytest.approx(0.04 * 15.930782, rel=1e-7)
+    assert float(table.radians_per_second(0.5)) == pytest.approx(0.5 * 15.930782, rel=1e-7)
+
+
+@pytest.mark.parametrize("ratio", [1e-9, 1 / 3, 0.9])
+def test_slider_crank_kinematics(ratio):
+    crank = vi.SliderCrank(ratio)
+    phase = jnp.linspace(0.0, 6.28, 101)
+    U = lambda x: crank.slide(x).U
+    slide = jax.vmap(crank.slide)(phase)
+    exact = np.cos(phase) + (np.sqrt(1 - (ratio * np.sin(phase)) ** 2) - 1) / ratio
+    np.testing.assert_allclose(
+        slide.U, exact, atol=1e-15 / min(ratio, 1.0) if ratio < 1e-3 else 1e-14
+    )
+    np.testing.assert_allclose(slide.U_phi, jax.vmap(jax.grad(U))(phase), atol=1e-12)
+    np.testing.assert_allclose(slide.U_phiphi, jax.vmap(jax.grad(jax.grad(U)))(phase), atol=1e-11)
+    if ratio < 1e-3:  # a long rod is the first approximation
+        np.testing.assert_allclose(slide.U, np.cos(phase), atol=2e-9)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: vi.RigidStop(2.0, 1.5), r"`restitution`.*in \[0, 1\].*1.5"),
+        (lambda: vi.RigidStop(2.0, -0.1), r"`restitution`.*-0.1"),
+        (lambda: vi.RigidStop(float("nan"), 0.5), r"`gap` must be finite.*nan"),
+        (lambda: vi.RigidStop(2.0, 0.5, "top"), r"`side` must be one of 'right', 'left'.*'top'"),
+        (lambda: vi.IdealDrive(0.0), r"`frequency_ratio`.*\(0, inf\).*0"),
+        (lambda: vi.SliderCrank(1.0), r"`ratio`.*\(0, 1\).*1"),
+        (lambda: vi.Oscillator(-0.1), r"`damping_ratio`.*-0.1"),
+        (lambda: vi.Parameters(damping=-1.0), r"`damping`.*-1"),
+        (lambda: vi.Parameters(inertia=0.0), r"`inertia`.*0"),
+        (lambda: vi.Parameters().scene(drive="steam"), r"`drive` must be one of.*'steam'"),
+        (lambda: vi.Parameters().scene(crank="cos"), r"`crank` must be one of.*'cos'"),
+        (lambda: vi.Scene.ideal(frequency_ratio=0.9).start(W=1.0), r"`W` must be left out"),
+        (lambda: vi.Scene.ideal(frequency_ratio=0.9).start(Y=np.inf), r"`Y` must be finite.*inf"),
+        (lambda: vi.Scene.ideal(frequency_ratio=0.9).in_clock("wall"), r"`clock` must be one of"),
+        (
+            lambda: vi.Scene(
+                oscillator=vi.Oscillator(), drive=vi.IdealDrive(1.0), stops=[vi.RigidStop(1, 1)] * 2
+            ),
+            r"`stops` must hold at most one stop on each side.*'right', 'right'",
+        ),
+        (
+            lambda: vi.Scene(
+                oscillator=vi.Oscillator(), drive=vi.IdealDrive(1.0),
+                stops=(vi.RigidStop(1, 1), vi.RigidStop(-1.5, 1, "left")),
+            ),
+            r"`stops` must leave room.*-0.5",
+        ),
+    ],
+)  # fmt: skip
+def test_errors_name_argument_requirement_and_value(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+@pytest.mark.parametrize("value", ["0.9", None, True, 1j])
+def test_numbers_are_numbers(value):
+    with pytest.raises(TypeError, match=r"`frequency_ratio` must be a real number, but"):
+        vi.IdealDrive(value)
+
+
+def test_unknown_parameters_are_refused():
+    with pytest.raises(TypeError, match="frequenzy_ratio"):
+        vi.Scene.ideal(frequency_ratio=0.9, frequenzy_ratio=0.9)
+    with pytest.raises(TypeError, match="masss"):
+        vi.Parameters(masss=1.0)
+
+
+def test_every_number_is_a_leaf():
+    assert len(jax.tree.leaves(vi.Scene.ideal(frequency_ratio=0.9))) == 4
+    assert len(jax.tree.leaves(vi.Parameters().scene(crank="slider"))) == 9
+    assert len(jax.tree.leaves(vi.Parameters())) == 11

@@ -1,0 +1,6 @@
+"""Pictures of motions: every function takes an `ax`, or makes one, and returns it."""
+
+from .motion import plot_history as plot_history
+from .motion import plot_phase_portrait as plot_phase_portrait
+from .path import MotionPath as MotionPath
+from .path import motion_path as motion_path

@@ -1,0 +1,109 @@
+"""Time histories and phase portraits of single motions."""
+
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.ticker import FuncFormatter, MultipleLocator
+
+from ..flow import Run, Samples
+from ..scene import AbstractScene
+from .path import motion_path
+
+BLUE, RED, PINK, GREEN = "#1f4fd8", "#d62728", "#ff5fc4", "#1a9641"
+
+
+def new_axes(ax: Axes | None) -> Axes:
+    """`ax`, or the axes of a new figure."""
+    if ax is not None:
+        return ax
+    import matplotlib.pyplot as plt  # only here, so that drawing into given axes has no state
+
+    return plt.subplots(figsize=(7, 3.5), layout="constrained")[1]
+
+
+def plot_history(
+    motion: Run | Samples,
+    *,
+    scene: AbstractScene | None = None,
+    ax: Axes | None = None,
+    window: tuple[float | int, float | int] | None = None,
+    shift: float | int = 0,
+    unit: str = "angle",
+    stops: bool = True,
+    **style: Any,
+) -> Axes:
+    """Position over the drive's clock, with the stops of `scene` as green lines.
+
+    **Arguments:**
+
+    - `motion`: a `Run` simulated with `samples=...`, or its `Samples`.
+    - `scene`: the scene, for its stops and for impacts logged in the run.
+    - `ax`: axes to draw into; a new figure if left out.
+    - `window`: the first and the last cycle to draw.
+    - `shift`: cycles to move the motion by along the axis.
+    - `unit`: `"angle"` (crank angle φ in units of π) or `"cycles"`.
+    - `stops`: whether to draw the stops.
+    - `style`: options of `Axes.plot`.
+
+    **Returns:** the axes.
+    """
+    if unit not in ("angle", "cycles"):
+        raise ValueError(f"Argument `unit` must be 'angle' or 'cycles', but got {unit!r}.")
+    ax = new_axes(ax)
+    path = motion_path(motion, scene=scene, window=window)
+    factor = 2.0 if unit == "angle" else 1.0
+    ax.plot(factor * (path.cycles + shift), path.Y, **{"color": BLUE, "lw": 1.3, **style})
+    if stops and scene is not None:
+        for i, stop in enumerate(scene.stops):
+            label = None if i else "stop"
+            ax.axhline(stop.sign * float(stop.gap), color=GREEN, lw=1.8, label=label)
+    ax.set_ylabel("Y = y/a")
+    if unit == "cycles":
+        ax.set_xlabel("drive cycles φ/(2π)")
+    else:
+        angle_axis(ax)
+    return ax
+
+
+def angle_axis(ax: Axes, *, every: int = 1) -> None:
+    """Label an axis that counts the crank angle in units of π, at multiples of `every`."""
+    ax.set_xlabel("crank angle φ")
+    ax.xaxis.set_major_locator(MultipleLocator(every))
+    ax.xaxis.set_major_formatter(FuncFormatter(_multiple_of_pi))
+
+
+def _multiple_of_pi(value: float | int, _: int | None = None) -> str:
+    whole = round(value)
+    return {0: "0", 1: "π", -1: "-π"}.get(whole, f"{whole}π")
+
+
+def plot_phase_portrait(
+    motion: Run | Samples,
+    scene: AbstractScene | None = None,
+    *,
+    ax: Axes | None = None,
+    window: tuple[float | int, float | int] | None = None,
+    sections: bool = True,
+    **style: Any,
+) -> Axes:
+    """Velocity over position, with the stops as green lines and the sections as dots.
+
+    **Arguments:** as for `plot_history`; `sections` marks the state after each whole cycle. An
+    impact is the vertical line along the stop from V to -k V (if the run has an impact log).
+
+    **Returns:** the axes.
+    """
+    ax = new_axes(ax)
+    path = motion_path(motion, scene=scene, window=window)
+    (line,) = ax.plot(path.Y, path.V, **{"color": BLUE, "lw": 1.0, **style})
+    if sections:
+        samples = motion_path(motion, window=window)
+        whole = abs(samples.cycles - samples.cycles.round()) < 1e-9
+        dots = {"ms": 4, "color": line.get_color(), "zorder": 3}
+        ax.plot(samples.Y[whole], samples.V[whole], "o", **dots)
+    if scene is not None:
+        for stop in scene.stops:
+            ax.axvline(stop.sign * float(stop.gap), color=GREEN, lw=1.8)
+    ax.set_xlabel("Y = y/a")
+    ax.set_ylabel("V = dY/dτ")
+    return ax

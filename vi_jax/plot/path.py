@@ -1,0 +1,78 @@
+"""A sampled run as a path to draw, with its impacts put in between the samples."""
+
+from math import pi
+from typing import NamedTuple
+
+import numpy as np
+
+from ..flow import Run, Samples
+from ..scene import AbstractScene, Scene
+
+
+class MotionPath(NamedTuple):
+    """Points of a motion in their order, as NumPy arrays of one length."""
+
+    cycles: np.ndarray
+    """Place on the drive's clock, in cycles since the start (crank angle over 2π)."""
+    Y: np.ndarray
+    """Position (unit: a)."""
+    V: np.ndarray
+    """dY/dτ (unit: a ω)."""
+
+
+def motion_path(
+    motion: Run | Samples,
+    *,
+    scene: AbstractScene | None = None,
+    window: tuple[float | int, float | int] | None = None,
+) -> MotionPath:
+    """The path of one sampled motion.
+
+    **Arguments:** a `Run` simulated with `samples=...` (or its `Samples`); with the `scene`, the
+    impacts logged (`impact_log=...`) enter as two points each, before and after the impact, so
+    that a corner at the stop is drawn where it is; `window`, the first and the last cycle to keep.
+
+    **Raises:** `ValueError` if the run has no samples or is a batch.
+    """
+    samples = motion.samples if isinstance(motion, Run) else motion
+    if samples is None:
+        raise ValueError("Argument `motion` must have samples: simulate with `samples=64`, say.")
+    cycles = np.asarray(samples.cycles, float)
+    if cycles.ndim != 1:
+        raise ValueError(
+            f"Argument `motion` must be one motion, but is a batch of shape {cycles.shape[:-1]}."
+        )
+    path = MotionPath(
+        cycles, np.asarray(samples.state.Y, float), np.asarray(samples.state.V, float)
+    )
+    if isinstance(motion, Run) and motion.impact_log is not None and scene is not None:
+        path = _with_impacts(path, motion, scene)
+    if window is not None:
+        keep = (path.cycles >= window[0]) & (path.cycles <= window[1])
+        path = MotionPath(*(x[keep] for x in path))
+    return path
+
+
+def _with_impacts(path: MotionPath, run: Run, scene: AbstractScene) -> MotionPath:
+    log = run.impact_log
+    assert log is not None
+    stop = np.asarray(log.stop)
+    cycle, _ = np.nonzero(stop >= 0)
+    stop = stop[stop >= 0]
+    if not stop.size:
+        return path
+    logged = np.asarray(log.stop) >= 0
+    # The clock of a `Scene` is the crank angle; that of other scenes is their own.
+    turn = 2 * pi if isinstance(scene, Scene) else float(scene.cycle)
+    at = cycle + np.asarray(log.phase)[logged] / turn
+    speed = np.asarray(log.speed)[logged]
+    sign = np.array([s.sign for s in scene.stops])[stop]
+    gap = np.array([float(s.gap) for s in scene.stops])[stop]
+    bounce = np.array([float(s.restitution) for s in scene.stops])[stop]
+    extra = MotionPath(
+        np.repeat(at, 2),
+        np.repeat(sign * gap, 2),
+        np.stack([sign * speed, -bounce * sign * speed], axis=1).ravel(),
+    )
+    places = np.searchsorted(path.cycles, extra.cycles)
+    return MotionPath(*(np.insert(a, places, b) for a, b in zip(path, extra, strict=True)))
