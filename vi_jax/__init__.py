@@ -13,6 +13,8 @@ from .flow import jit as jit
 from .flow import simulate as simulate
 from .orbit import ClosedFormOrbits as ClosedFormOrbits
 from .orbit import closed_form_orbits as closed_form_orbits
+from .plot import plot_history as plot_history
+from .plot import plot_phase_portrait as plot_phase_portrait
 from .scene import AbstractCrank as AbstractCrank
 from .scene import AbstractScene as AbstractScene
 from .scene import CosineCrank as CosineCrank

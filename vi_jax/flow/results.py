@@ -19,8 +19,8 @@ class RESULTS(eqx.Enumeration):
         '`clock="time"`.'
     )
     chatter = (
-        "The impacts within one cycle exceeded `max_impacts`, or followed each other too fast to be "
-        "told apart (chatter)."
+        "The impacts within one cycle exceeded `max_impacts`, or followed each other too fast to "
+        "be told apart (chatter)."
     )
     underflow = "The step size fell below what the precision resolves. Loosen the tolerance."
     not_finite = "The state ceased to be finite."
