@@ -220,7 +220,14 @@ for axes, title, rows in zip(
     for name, _, seconds, error in rows:
         peer = name.startswith("heyoka")
         axes.loglog(error, seconds, "s" if peer else "o", color="tab:red" if peer else "tab:blue")
-        axes.annotate(name, (error, seconds), xytext=(5, 4), textcoords="offset points", fontsize=7)
+        axes.annotate(
+            name,
+            (error, seconds),
+            xytext=(3, 4),
+            textcoords="offset points",
+            fontsize=6.5,
+            rotation=28,
+        )
     axes.set_title(f"{title}: {LANES:,} lanes, {CYCLES} cycles, one core")
     axes.set_xlabel("median error of the final state (units of a, aω)")
     axes.margins(x=0.35, y=0.2)
