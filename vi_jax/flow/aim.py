@@ -1,0 +1,95 @@
+"""Where the next step should end: at the earliest event that a tried step ran past."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax.lax import stop_gradient
+from jaxtyping import Array, Bool, Float
+
+from .events import Rates, quintic, rising_root, slope
+from .fusion import pin
+from .lane import FREE, TURN, Lane, Plan
+from .trial import Trial, to_turn
+
+Scalar = Float[Array, ""]
+Flag = Bool[Array, ""]
+
+# Turning points this far inside the gap (unit: a) are passed by where only impacts matter.
+_MARGIN = 0.02
+
+
+def select(condition: Flag, a: Any, b: Any) -> Any:
+    """`jnp.where` for pytrees."""
+    return jtu.tree_map(lambda x, y: jnp.where(condition, x, y), a, b)
+
+
+def aim_at(plan: Plan, lane: Lane, trial: Trial) -> tuple[Flag, Scalar, Scalar]:
+    """Whether to shorten the step, to what length, and at what it then aims."""
+    h = stop_gradient(trial.h)
+    none = jnp.zeros_like(trial.good)
+    if trial.position is None and not trial.crossings:
+        return none, h, jnp.full_like(h, FREE)
+    # The earliest of several events is met first. The chord tells well enough which that is: a
+    # landing that lies beyond another stop is not accepted.
+    first, target = jnp.full_like(h, jnp.inf), jnp.full_like(h, TURN)
+    polynomial, crossed, landed, facing_stop = None, none, none, none
+    for c in trial.crossings:
+        over = trial.good & (c.end.x > 0)
+        rise = jnp.where(over, c.end.x - c.begin.x, 1.0)
+        place = jnp.where(over, jnp.maximum(-c.begin.x, 0.0) / rise, jnp.inf)
+        sooner = place < first
+        curve = quintic(c.begin, c.end, h)
+        polynomial = curve if polynomial is None else select(sooner, curve, polynomial)
+        target = jnp.where(sooner, c.name, target)
+        first = jnp.where(sooner, place, first)
+        crossed, landed = crossed | over, landed | c.landed
+        if c.name > 0:
+            sign = plan.scene.stops[int(c.name) - 1].sign
+            facing_stop = facing_stop | (over & (lane.direction == sign))
+    aim, turn, path, wiggle = crossed & ~landed, none, None, none
+    if trial.position is not None:
+        begin, end = trial.position
+        path = quintic(begin, end, h)
+        facing = tuple(-lane.direction * c for c in slope(path))
+        # The motion turned within the step. Unless it went through a stop before, that comes
+        # first: what lies beyond the turn is met from there.
+        turn = trial.good & (lane.direction * end.v < 0) & ~trial.at_turn & ~facing_stop
+        polynomial = facing if polynomial is None else select(turn, facing, polynomial)
+    assert polynomial is not None
+    theta = pin(rising_root(stop_gradient(polynomial)), lane.one)
+    attempt = theta * h
+    if path is not None and trial.position is not None:
+        if not plan.motion:
+            height = stop_gradient(path[0])
+            for n in range(1, len(path)):
+                height = height + stop_gradient(path[n]) * theta**n
+            close = crossed | landed
+            for stop in plan.scene.stops:
+                close = close | (stop.sign * height - stop.gap > -_MARGIN)
+            turn = turn & close
+        wiggle = trial.good & _may_turn_twice(lane, *stop_gradient(trial.position), h)
+        wiggle = wiggle & ~(aim | turn | landed | trial.at_turn)
+        # Newton's step is better than the quintic once it is short.
+        shift = to_turn(trial.position[1])
+        again = turn & (lane.target == TURN) & (jnp.abs(shift) < 0.25 * h)
+        attempt = jnp.where(again, h + shift, attempt)
+    for c in trial.crossings:
+        again = c.again & ~turn
+        aim = aim | again
+        attempt = jnp.where(again, h + stop_gradient(c.offset), attempt)
+        target = jnp.where(again, c.name, target)
+    target = jnp.where(turn, TURN, jnp.where(wiggle, FREE, target))
+    attempt = jnp.where(wiggle, 0.5 * h, attempt)
+    return aim | turn | wiggle, stop_gradient(attempt), target
+
+
+def _may_turn_twice(lane: Lane, begin: Rates, end: Rates, h: Scalar) -> Flag:
+    """Whether the velocity, of one sign at both ends, dips so deep that it may have been zero.
+
+    Such a step is halved until the turns lie apart or the dip is too short to matter.
+    """
+    a0, a1 = lane.direction * begin.a, lane.direction * end.a
+    dips = (a0 < 0) & (a1 > 0) & (h > 1e-3)
+    lowest = lane.direction * begin.v + 0.5 * h * a0 * (a0 / jnp.where(dips, a0 - a1, 1.0))
+    return dips & (lowest < 0.1 * lane.direction * (begin.v + end.v))
