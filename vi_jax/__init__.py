@@ -11,8 +11,17 @@ from .flow import Samples as Samples
 from .flow import Unrolled as Unrolled
 from .flow import jit as jit
 from .flow import simulate as simulate
+from .orbit import ORBIT_RESULTS as ORBIT_RESULTS
+from .orbit import STABILITY as STABILITY
+from .orbit import AbstractSearch as AbstractSearch
 from .orbit import ClosedFormOrbits as ClosedFormOrbits
+from .orbit import CycleMap as CycleMap
+from .orbit import Gradient as Gradient
+from .orbit import Newton as Newton
+from .orbit import Orbit as Orbit
 from .orbit import closed_form_orbits as closed_form_orbits
+from .orbit import cycle_map as cycle_map
+from .orbit import find_orbit as find_orbit
 from .plot import plot_history as plot_history
 from .plot import plot_phase_portrait as plot_phase_portrait
 from .scene import AbstractCrank as AbstractCrank

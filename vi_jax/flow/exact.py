@@ -56,7 +56,7 @@ class ExactFlight(AbstractMethod):
         """The flight from `s0` to `s1`, exact to rounding."""
         zeta, xi, in_phase = _numbers(scene)
         tau = (s1 - s0) / zeta if in_phase else s1 - s0
-        phase = s0 if in_phase else zeta * s0
+        phase = scene.phase_at(s0 if in_phase else zeta * s0)
         Y, V = flight(zeta, xi, phase, state.Y, state.V, tau)
         return OscillatorState(Y, V), time, jnp.zeros_like(s0)
 

@@ -14,6 +14,7 @@ forward and reverse derivatives through an impact are exact (the saltation matri
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.lax import stop_gradient
@@ -94,6 +95,7 @@ def _arrive(
     s, state, time, direction = trial.s, trial.state, trial.time, lane.direction
     record = lane.record
     impacts, speed, log = record.impacts, record.speed, record.log
+    clearance = record.clearance
     completed = trial.ends_interval
     if trial.position is not None:
         v = stop_gradient(trial.position[1].v)
@@ -101,17 +103,18 @@ def _arrive(
         # Here the sign of the velocity is rounding's.
         direction = jnp.where(trial.at_turn, -lane.direction, direction)
     flow: Any = None
-    pace = None
+    bend: Any = None
     if trial.crossings:
-        flow = scene.field(trial.s, trial.state)
-        pace = None if time is None else scene.pace(trial.s, trial.state)
+        flow, bend = _flow_and_bend(scene, time is not None, trial.s, trial.state)
     for c in trial.crossings:
         offset = jnp.where(c.landed, c.offset, 0.0)
-        # First order suffices for the rest of the state: the offset is tiny.
-        there = jtu.tree_map(lambda x, dx, d=offset: x + d * dx, trial.state, flow)
+        there, passed = jtu.tree_map(
+            lambda x, dx, ddx, d=offset: x + d * dx + _second(d, ddx),
+            (trial.state, time), flow, bend,
+        )  # fmt: skip
         s = s + offset
         if time is not None:
-            time = time + (offset if pace is None else offset * pace)
+            time = passed
         if c.name == SECTION:
             completed = completed | c.landed
             state = select(c.landed, there, state)
@@ -123,17 +126,22 @@ def _arrive(
         state = select(c.landed, scene.placed(there, stop.sign * stop.gap, rebound), state)
         direction = jnp.where(c.landed, -float(stop.sign), direction)
         hit = taken & c.landed
+        clock = s if scene.clock(there) is None else scene.clock(there)
+        log = _logged(log, hit, impacts, clock, approach, index)
         impacts = impacts + jnp.where(hit, 1.0, 0.0)
         if speed is not None:
             speed = jnp.where(hit, jnp.maximum(speed, approach), speed)
-        clock = scene.clock(there)
-        log = _logged(log, hit, s if clock is None else clock, approach, float(index))
     y_max, y_min = record.y_max, record.y_min
     if y_max is not None and y_min is not None and trial.position is not None:
         end = trial.position[1]
         bend = jnp.where(end.a == 0, 1.0, end.a)
         top = end.x - jnp.where(trial.at_turn, 0.5 * end.v**2 / bend, 0.0)
         reached = jnp.where(trial.at_turn, top, scene.position(state))
+        if clearance is not None:
+            for stop in scene.stops:
+                short = taken & trial.at_turn & (lane.direction == stop.sign)
+                room = jnp.where(short, stop.gap - stop.sign * top, jnp.inf)
+                clearance = jnp.minimum(clearance, room)
         y_max = jnp.where(taken, jnp.maximum(y_max, reached), y_max)
         y_min = jnp.where(taken, jnp.minimum(y_min, reached), y_min)
     if time is not None and record.time is not None:
@@ -142,19 +150,43 @@ def _arrive(
         jnp.where(taken, s, lane.s),
         select(taken, state, lane.state),
         jnp.where(taken, direction, lane.direction),
-        Record(time, y_max, y_min, impacts, speed, log),
+        Record(time, y_max, y_min, impacts, speed, log, clearance),
         taken & completed,
     )
 
 
-def _logged(log: tuple, hit: Flag, clock: Scalar, approach: Scalar, stop: float) -> tuple:
-    """The log with this impact in its first unused place."""
-    entries = []
-    for entry in log:
-        here = hit & (entry[2] < 0)
-        entries.append(select(here, (clock, approach, jnp.full_like(clock, stop)), entry))
-        hit = hit & ~here
-    return tuple(entries)
+@jax.custom_jvp
+def _second(offset: Scalar, bend: Scalar) -> Scalar:
+    """½δ² x'', which is below rounding and left out; only its derivatives count."""
+    return jnp.zeros_like(bend)
+
+
+@_second.defjvp
+def _(primals, tangents):
+    (offset, bend), (rate, _) = primals, tangents
+    return jnp.zeros_like(bend), offset * rate * bend
+
+
+def _flow_and_bend(scene: Any, timed: bool, s: Scalar, state: Any) -> tuple[Any, Any]:
+    """First and second derivatives by s of the state and of the elapsed time."""
+
+    def field(s, state):
+        pace = scene.pace(s, state) if timed else None
+        if timed and pace is None:
+            pace = jnp.ones_like(s)
+        return scene.field(s, state), pace
+
+    flow = field(s, state)
+    return flow, jax.jvp(field, (s, state), (jnp.ones_like(s), flow[0]))[1]
+
+
+def _logged(log: Any, hit: Flag, place: Scalar, clock: Scalar, approach: Scalar, stop: int) -> Any:
+    """The log with this impact, the `place`-th of its interval."""
+    if log is None:
+        return None
+    here = hit & (jnp.arange(log.shape[1], dtype=log.dtype) == place)
+    entry = jnp.stack([clock, approach, jnp.full_like(clock, stop)])
+    return jnp.where(here, entry[:, None], log)
 
 
 def _resized(plan: Plan, lane: Lane, trial: Trial, taken: Flag, rejected: Flag) -> Scalar:

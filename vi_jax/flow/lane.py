@@ -26,7 +26,9 @@ class Record(eqx.Module):
     y_min: Scalar | None
     impacts: Scalar
     speed: Scalar | None
-    log: tuple[tuple[Scalar, Scalar, Scalar], ...]
+    log: Float[Array, "3 size"] | None
+    """Clock, V⁻ and stop of each impact, NaN where there was none."""
+    clearance: Scalar | None
 
 
 class Lane(eqx.Module):
@@ -96,14 +98,15 @@ class Plan(eqx.Module):
     def fresh(self, state: Any) -> Record:
         """The record of an interval that begins in `state`."""
         Y = self.scene.position(state)
-        zero, nan = jnp.zeros_like(Y), jnp.full_like(Y, jnp.nan)
+        zero = jnp.zeros_like(Y)
         return Record(
             time=zero if self.timed(state) else None,
             y_max=Y if self.motion else None,
             y_min=Y if self.motion else None,
             impacts=zero,
             speed=zero if self.motion else None,
-            log=((nan, nan, jnp.full_like(Y, -1.0)),) * self.log,
+            log=jnp.full((3, self.log), jnp.nan, Y.dtype) if self.log else None,
+            clearance=jnp.full_like(Y, jnp.inf) if self.motion and self.log else None,
         )
 
     def launch(self, start: Any, bad: jax.Array) -> Lane:

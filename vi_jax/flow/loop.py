@@ -6,6 +6,7 @@ import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool
 
 from .hybrid import iterate
@@ -41,14 +42,14 @@ def run_forward(plan: Plan, lane: Lane) -> tuple[Lane, Any, Record]:
     **Returns:** the final lane, and the states and records of all intervals, with leading axis
     `plan.intervals`.
     """
-    leaves, treedef = jtu.tree_flatten((lane.kept_state, lane.kept))
-    store = jnp.full((plan.intervals, len(leaves)), jnp.nan, leaves[0].dtype)
+    flat, unravel = ravel_pytree((lane.kept_state, lane.kept))
+    store = jnp.full((plan.intervals, flat.size), jnp.nan, flat.dtype)
 
     def body(carry):
         lane, store = carry
         before = lane.done
         lane = jax.lax.fori_loop(0, plan.block, lambda _, x: iterate(plan, x), lane)
-        kept = jnp.stack(jtu.tree_leaves((lane.kept_state, lane.kept)))
+        kept, _ = ravel_pytree((lane.kept_state, lane.kept))
         place = jnp.where(lane.done > before, lane.done - 1, float(plan.intervals))
         index = jax.lax.stop_gradient(place).astype(jnp.int32)
         return lane, store.at[index].set(kept, mode="drop")
@@ -57,7 +58,7 @@ def run_forward(plan: Plan, lane: Lane) -> tuple[Lane, Any, Record]:
         return any_lane(_active(plan, carry[0]))
 
     lane, store = jax.lax.while_loop(going, body, (lane, store))
-    state, record = jtu.tree_unflatten(treedef, list(jnp.moveaxis(store, -1, 0)))
+    state, record = jax.vmap(unravel)(store)
     return lane, state, record
 
 

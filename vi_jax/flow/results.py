@@ -100,6 +100,9 @@ class Run(eqx.Module):
     """Number of impacts in each cycle."""
     impact_speed: Float[Array, " cycles"] | None
     """Greatest V⁻ in each cycle (unit: a ω), 0 without impact."""
+    clearance: Float[Array, " cycles"] | None
+    """Smallest distance to a stop at which the body turned back in each cycle without touching it
+    (unit: a), infinite where it did not; recorded along with the impact log."""
     duration: Float[Array, " cycles"] | None
     """Time τ that each cycle took."""
     frequency_ratio: Float[Array, " cycles"] | None

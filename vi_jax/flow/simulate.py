@@ -47,7 +47,7 @@ def simulate(
       that turns forward; the time clock carries a start from rest and a stall.
     - `samples`: dense samples per cycle, evenly spaced on the drive's clock. Steps end on them, so
       that they have the method's own accuracy.
-    - `impact_log`: number of impacts to log in each cycle.
+    - `impact_log`: number of impacts to log in each cycle; with it comes `Run.clearance`.
     - `record`: `"motion"`, or `"sections"` to leave out extremes, durations and impact speeds
       (then `None`), which is faster.
     - `adjoint`: `"forward"` (fast; `jvp`, `jacfwd`) or `"reverse"` (checkpointed; `vjp`, `grad`).
@@ -178,6 +178,7 @@ def _collect(plan: Plan, start: Any, sampled: bool, lane, states: Any, records: 
         y_min=per_cycle(records.y_min, jnp.min),
         impacts=whole(per_cycle(records.impacts, jnp.sum)),
         impact_speed=per_cycle(records.speed, jnp.max),
+        clearance=per_cycle(records.clearance, jnp.min),
         duration=duration,
         frequency_ratio=None if duration is None else scene.frequency_ratio(duration),
         samples=dense,
@@ -188,11 +189,10 @@ def _collect(plan: Plan, start: Any, sampled: bool, lane, states: Any, records: 
     )
 
 
-def _log(plan: Plan, entries: tuple) -> ImpactLog:
+def _log(plan: Plan, entries: Any) -> ImpactLog:
     """The first `plan.log` impacts of each cycle, from those of its intervals."""
-    columns = [jnp.stack(column, axis=-1) for column in zip(*entries, strict=True)]
-    phase, speed, stop = (c.reshape(plan.cycles, plan.parts * plan.log) for c in columns)
-    stop = jnp.where(jnp.isfinite(stop), stop, -1.0)
-    order = jnp.argsort(stop < 0, axis=1, stable=True)[:, : plan.log]
-    phase, speed, stop = (jnp.take_along_axis(x, order, axis=1) for x in (phase, speed, stop))
-    return ImpactLog(phase, speed, stop.astype(jnp.int32))
+    entries = entries.reshape(plan.cycles, plan.parts, 3, plan.log)
+    entries = jnp.moveaxis(entries, 2, 0).reshape(3, plan.cycles, plan.parts * plan.log)
+    order = jnp.argsort(jnp.isnan(entries[2]), axis=1, stable=True)[:, : plan.log]
+    phase, speed, stop = (jnp.take_along_axis(x, order, axis=1) for x in entries)
+    return ImpactLog(phase, speed, jnp.where(jnp.isnan(stop), -1.0, stop).astype(jnp.int32))

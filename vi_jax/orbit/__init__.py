@@ -1,4 +1,13 @@
-"""Periodic motion: closed-form solutions."""
+"""Periodic motion: the cycle map, closed-form solutions, finding orbits and judging them."""
 
 from .closed_form import ClosedFormOrbits as ClosedFormOrbits
 from .closed_form import closed_form_orbits as closed_form_orbits
+from .cycle_map import CycleMap as CycleMap
+from .cycle_map import cycle_map as cycle_map
+from .find import find_orbit as find_orbit
+from .floquet import STABILITY as STABILITY
+from .results import ORBIT_RESULTS as ORBIT_RESULTS
+from .results import Orbit as Orbit
+from .search import AbstractSearch as AbstractSearch
+from .search import Gradient as Gradient
+from .search import Newton as Newton

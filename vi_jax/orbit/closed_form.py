@@ -27,6 +27,7 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from .._checks import count
 from ..scene import CosineCrank, IdealDrive, Scene
+from .floquet import eigenvalues
 
 Scalar = Float[Array, ""]
 
@@ -252,8 +253,5 @@ def _multipliers(flight, xi, k, d, v, phase, period) -> Complex[Array, "2 2"]:
     """
     kick = (1 + k) * (jnp.cos(phase) - d) / v
     half = 0.5 * (kick * flight[0, 1] - k * (flight[0, 0] + flight[1, 1]))
-    det = k * k * jnp.exp(-2 * xi * period)
-    square = (half * half - det).astype(jnp.result_type(half, jnp.complex64))
-    double = square == 0  # where the derivative of the root is infinite
-    root = jnp.where(double, 0.0, jnp.sqrt(jnp.where(double, 1.0, square)))
-    return jnp.stack([half + root, half - root], axis=-1)
+    det = jnp.broadcast_to(k * k * jnp.exp(-2 * xi * period), half.shape)
+    return eigenvalues(half, det)

@@ -1,5 +1,6 @@
 """The scene of the paper: oscillator, crank, drive and stops, in the phase or the time clock."""
 
+import dataclasses
 from math import pi
 from typing import Any
 
@@ -76,6 +77,11 @@ class Scene(AbstractScene):
     stops: tuple[RigidStop, ...] = eqx.field(default=(), converter=tuple)
     crank: AbstractCrank = eqx.field(default_factory=CosineCrank)
     clock_name: str = eqx.field(static=True, default="phase")
+    section_phase: Float[Array, "..."] | None = eqx.field(
+        default=None, converter=lambda x: x if x is None else number("section_phase", x)
+    )
+    """Crank angle of the section (radians, in [-2π, 2π]); `None` is 0. Phases of states and of
+    impacts are counted from it."""
 
     def __check_init__(self):
         one_of("clock_name", self.clock_name, ("phase", "time"))
@@ -87,6 +93,8 @@ class Scene(AbstractScene):
             if not isinstance(stop, RigidStop):
                 raise TypeError(f"Argument `stops` must hold `RigidStop`s, but holds {stop!r}.")
         _check_room(self.stops)
+        if self.section_phase is not None:
+            require("section_phase", self.section_phase, low=-2 * pi, high=2 * pi)
 
     @classmethod
     def ideal(
@@ -135,18 +143,20 @@ class Scene(AbstractScene):
     def in_clock(self, clock: str) -> "Scene":
         """The same scene in the `"phase"` or the `"time"` clock."""
         one_of("clock", clock, ("phase", "time"))
-        return Scene(
-            oscillator=self.oscillator,
-            drive=self.drive,
-            stops=self.stops,
-            crank=self.crank,
-            clock_name=clock,
-        )
+        return dataclasses.replace(self, clock_name=clock)
+
+    def at_section(self, phase: Any) -> "Scene":
+        """The same scene, observed where the crank angle is `phase` (radians) instead of 0."""
+        return dataclasses.replace(self, section_phase=phase)
+
+    def phase_at(self, since_section: Any) -> Any:
+        """Crank angle from the one counted since the section."""
+        return since_section if self.section_phase is None else since_section + self.section_phase
 
     def start(
         self, *, Y: Any = 0.0, V: Any = 0.0, W: Any = None
     ) -> OscillatorState | MotorState | TimedMotorState:
-        """A state on the section φ = 0: position (unit: a), velocity (a ω), crank speed (ω).
+        """A state on the section: position (unit: a), velocity (a ω), crank speed (ω).
 
         `W` belongs to motor scenes and defaults to the motor's no-load speed κ w0.
 
@@ -189,11 +199,12 @@ class Scene(AbstractScene):
         if isinstance(drive, IdealDrive):
             zeta = drive.frequency_ratio
             if self.clock_name == "time":
-                slide = self.crank.slide(zeta * s)
+                slide = self.crank.slide(self.phase_at(zeta * s))
                 return OscillatorState(state.V, self._pull(slide.U, state))
-            slide = self.crank.slide(s)
+            slide = self.crank.slide(self.phase_at(s))
             return OscillatorState(state.V / zeta, self._pull(slide.U, state) / zeta)
-        slide = self.crank.slide(s if self.clock_name == "phase" else state.phase)
+        since = s if self.clock_name == "phase" else state.phase
+        slide = self.crank.slide(self.phase_at(since))
         pull = self._pull(slide.U, state)
         torque = drive.torque(slide, state.Y, state.W)
         inertia = drive.inertia(slide)

@@ -1,0 +1,126 @@
+"""The cycle map: a state on the section to the state n drive cycles later."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from .._checks import count
+from ..flow import AbstractMethod, Adaptive, ExactFlight, simulate
+from ..scene import AbstractScene, Scene
+from .tangent import by_columns
+
+
+class CycleMap(eqx.Module):
+    """The Poincaré map over `cycles` drive cycles; made by `cycle_map`.
+
+    Differentiable in forward and in reverse mode, to any order, by the state and by every leaf of
+    the scene; clean under `jit` and `vmap`. Where a run fails the values are NaN.
+    """
+
+    scene: AbstractScene
+    """In the phase clock; a `Scene` carries the section phase."""
+    flow: AbstractMethod
+    cycles: int = eqx.field(static=True)
+
+    def __call__(self, state: Any) -> Any:
+        """The state `cycles` drive cycles after `state`."""
+        return _end(self, adopted(self.scene, state))
+
+    def residual(self, state: Any) -> Any:
+        """What the motion from `state` lacks to be periodic: the mapped state less `state`."""
+        state = adopted(self.scene, state)
+        return jtu.tree_map(lambda a, b: a - b, _end(self, state), state)
+
+    def jacobian(self, state: Any) -> Float[Array, "states states"]:
+        """Derivative of the map: the monodromy matrix if `state` lies on a periodic motion.
+
+        Rows and columns are in the order of the state's leaves: Y, V, and W for a motor.
+        """
+        x, unravel = ravel_pytree(adopted(self.scene, state))
+        return jax.jacfwd(lambda x: ravel_pytree(_end(self, unravel(x)))[0])(x)
+
+
+@by_columns
+def _end(cycle_map: CycleMap, state: Any) -> Any:
+    run = simulate(
+        cycle_map.scene, state, cycle_map.cycles, method=cycle_map.flow, record="sections"
+    )
+    return jtu.tree_map(lambda x: x[-1], run.sections)
+
+
+def cycle_map(
+    scene: AbstractScene,
+    cycles: int = 1,
+    *,
+    flow: AbstractMethod | None = None,
+    section: Any = None,
+) -> CycleMap:
+    """The Poincaré map of `scene` over a number of drive cycles.
+
+    **Arguments:**
+
+    - `scene`: a `Scene` with an ideal drive (2 states) or a motor (3 states), or one of your own
+      whose independent variable counts its cycles.
+    - `cycles`: number of drive cycles n, at least 1; static.
+    - `flow`: the method that carries the scene: by default `ExactFlight()` where it applies, else
+      `Adaptive(rtol=1e-11)`.
+    - `section`: crank angle of the section (radians) instead of the scene's own, which is 0.
+
+    **Returns:** a `CycleMap`: call it on a state from `scene.start(...)`.
+
+    **Raises:** `ValueError` or `TypeError` for arguments that cannot be used.
+    """
+    if not isinstance(scene, AbstractScene):
+        raise TypeError(
+            f"Argument `scene` must be a `Scene` or an `AbstractScene`, but got {scene!r}."
+        )
+    if isinstance(scene, Scene):
+        # In time the section would be an event of its own, and the crank angle a fourth state.
+        scene = scene.in_clock("phase")
+        if section is not None:
+            scene = scene.at_section(section)
+    elif section is not None:
+        raise ValueError(
+            "Argument `section` must be left out for a scene of your own, which has its own "
+            f"section, but got {section!r}."
+        )
+    if flow is None:
+        flow = default_flow(scene)
+    elif not isinstance(flow, AbstractMethod):
+        raise TypeError(
+            "Argument `flow` must be `Adaptive(...)`, `FixedStep(...)` or `ExactFlight()`, but "
+            f"got {flow!r}."
+        )
+    flow.check(scene)
+    # Tolerances are numbers: another one must not be another program.
+    flow = jtu.tree_map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, flow)
+    return CycleMap(scene, flow, count("cycles", cycles, least=1))
+
+
+def default_flow(scene: AbstractScene) -> AbstractMethod:
+    """`ExactFlight` where it applies, else an `Adaptive` accurate enough to search with."""
+    exact = ExactFlight()
+    try:
+        exact.check(scene)
+    except ValueError:
+        return Adaptive(rtol=1e-11)
+    return exact
+
+
+def adopted(scene: AbstractScene, state: Any) -> Any:
+    """`state` as the scene needs it, in floating-point arrays of one type."""
+    if isinstance(scene, Scene):
+        state = scene.adopt(state)
+    elif scene.clock(state) is not None:
+        raise ValueError(
+            "Argument `scene` must count its cycles by its independent variable, but its state "
+            "has a clock."
+        )
+    dtype = jnp.result_type(float, *jtu.tree_leaves(state))
+    return jtu.tree_map(lambda x: jnp.asarray(x, dtype), state)

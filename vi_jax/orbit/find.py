@@ -1,0 +1,294 @@
+"""`find_orbit`: from a guess to a periodic motion that is judged and differentiable."""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jax.scipy.linalg import block_diag
+from jaxtyping import Array, Float
+
+from .._checks import concrete, count
+from ..flow import AbstractMethod, simulate
+from ..scene import AbstractScene
+from .cycle_map import CycleMap, adopted, cycle_map
+from .floquet import multipliers_of
+from .results import ORBIT_RESULTS, Orbit, trimmed
+from .search import AbstractSearch, Newton, search
+from .tangent import by_columns
+
+# Lanes searched at once: a batch lasts as long as its slowest lane.
+_BATCH = 512
+
+# A search that fails with an impact slower than this (or a turn that would be one) failed at a
+# grazing: there the map's derivative is of the order of 1/V⁻ and jumps.
+_SLOW = 0.02
+
+
+def find_orbit(
+    scene: AbstractScene,
+    guess: Any,
+    cycles: int = 1,
+    *,
+    method: AbstractSearch | None = None,
+    flow: AbstractMethod | None = None,
+    section: Any = None,
+    impact_log: int = 8,
+    throw: bool = False,
+) -> Orbit:
+    """Find the periodic motion of `scene` near `guess`.
+
+    Works under `jit` and `vmap`. Everything in the orbit is differentiable by every leaf of the
+    scene, in either mode and to any order, by the implicit function theorem: the search is not
+    differentiated. Where no orbit was found the derivatives are NaN.
+
+    **Arguments:**
+
+    - `scene`: a `Scene` (ideal drive or motor, any crank, any stops), or one of your own whose
+      independent variable counts its cycles.
+    - `guess`: a state on the section from `scene.start(...)`, or another `Orbit`. With arrays of
+      one leading axis in it, every guess is searched from in one compiled call.
+    - `cycles`: period in drive cycles; static.
+    - `method`: `Newton()` (default) or `Gradient(optax_optimiser)`.
+    - `flow`: the method that carries the scene: by default `ExactFlight()` where it applies, else
+      `Adaptive(rtol=1e-11)`.
+    - `section`: crank angle of the section (radians) instead of the scene's own, which is 0. An
+      impact just on the section makes the map jump there: choose another.
+    - `impact_log`: impacts of one cycle that the orbit can list.
+    - `throw`: raise an error if no orbit is found, instead of only saying so in `result`.
+
+    **Returns:** an `Orbit`. Its `result` tells an orbit of a smaller period, a search that found
+    none, one that ended at a grazing and a guess that cannot be simulated from each other.
+
+    **Raises:** `ValueError` or `TypeError` for arguments that cannot be used, before any work.
+    """
+    method = Newton() if method is None else method
+    if not isinstance(method, AbstractSearch):
+        raise TypeError(
+            f"Argument `method` must be `Newton(...)` or `Gradient(...)`, but got {method!r}. The "
+            "method of integration is the argument `flow`."
+        )
+    impact_log = count("impact_log", impact_log, least=1)
+    the_map = cycle_map(scene, cycles, flow=flow, section=section)
+    if the_map.cycles % method.arcs:
+        raise ValueError(
+            f"Argument `method` must have a number of arcs that divides the {cycles} cycles, but "
+            f"has {method.arcs}."
+        )
+    state = adopted(the_map.scene, guess.state if isinstance(guess, Orbit) else guess)
+    shapes = {jnp.shape(leaf) for leaf in jtu.tree_leaves(state)}
+    if len(shapes) > 1 or len(next(iter(shapes))) > 1:
+        raise ValueError(
+            "Argument `guess` must hold scalars, or arrays of one length, but holds shapes "
+            f"{sorted(shapes)}."
+        )
+    _check_finite(state)
+    orbit = _find(the_map, state, method, impact_log)
+    if throw:
+        orbit = eqx.error_if(orbit, ~orbit.successful, "No orbit was found; see `Orbit.result`.")
+    return trimmed(orbit)
+
+
+def _check_finite(state: Any) -> None:
+    for path, leaf in jtu.tree_leaves_with_path(state):
+        numbers = concrete(leaf)
+        if numbers is not None and numbers.ndim == 0 and not np.isfinite(numbers):
+            name = jtu.keystr(path).lstrip(".")
+            raise ValueError(f"Argument `guess` must be finite, but its {name} is {numbers}.")
+
+
+@eqx.filter_jit
+def _find(the_map: CycleMap, guess: Any, method: AbstractSearch, impact_log: int) -> Orbit:
+    def one(guess):
+        return _judged(the_map, guess, method, impact_log)
+
+    first = jtu.tree_leaves(guess)[0]
+    if not first.ndim:
+        return one(guess)
+    return jax.lax.map(one, guess, batch_size=min(_BATCH, first.shape[0]))
+
+
+class _Root(NamedTuple):
+    """Starting states of the arcs, as rows, and how the search went; all floats."""
+
+    arcs: Float[Array, "arcs states"]
+    residual: Float[Array, ""]
+    converged: Float[Array, ""]
+    steps: Float[Array, ""]
+    history: Float[Array, " max_steps"]
+
+
+def _missing(arc: CycleMap, arcs: Float[Array, "arcs states"], unravel: Any) -> Array:
+    """What each arc lacks to end where the next one begins."""
+    ends = jax.vmap(lambda x: ravel_pytree(arc(unravel(x)))[0])(arcs)
+    return ends - jnp.roll(arcs, -1, axis=0)
+
+
+@eqx.filter_custom_jvp
+def _root(arc: CycleMap, guess: Any, method: AbstractSearch) -> _Root:
+    x, unravel = ravel_pytree(guess)
+    arcs = x[None]
+    if method.arcs > 1:
+        run = simulate(arc.scene, guess, arc.cycles * method.arcs, method=arc.flow)
+        sections = jnp.stack(jtu.tree_leaves(run.sections), axis=-1)[:-1 : arc.cycles]
+        arcs = jnp.where(jnp.isfinite(sections), sections, x)
+    found = search(method, lambda arcs: _missing(arc, arcs, unravel), arcs)
+    dtype = x.dtype
+    return _Root(
+        found.x,
+        found.residual,
+        found.converged.astype(dtype),
+        found.steps.astype(dtype),
+        found.history,
+    )
+
+
+@_root.def_jvp
+def _(primals, tangents):
+    arc, guess, method = primals
+    root = _root(arc, guess, method)
+    _, unravel = ravel_pytree(guess)
+    still = jtu.tree_map(jnp.zeros_like, root)
+    if not jtu.tree_leaves(tangents[0]):
+        return root, still
+
+    jacobians = jax.vmap(lambda x: arc.jacobian(unravel(x)))(root.arcs)
+    _, rate = eqx.filter_jvp(
+        lambda arc: _missing(arc, root.arcs, unravel).ravel(), (arc,), (tangents[0],)
+    )
+    move = -jnp.linalg.solve(_shooting_matrix(jacobians), rate).reshape(root.arcs.shape)
+    # Where there is no orbit there is no derivative of one.
+    return root, still._replace(arcs=jnp.where(root.converged > 0, move, jnp.nan))
+
+
+def _shooting_matrix(jacobians: Float[Array, "arcs states states"]) -> Float[Array, "all all"]:
+    """Derivative of `_missing` by the arcs, from the derivative of each arc's end by its start."""
+    arcs, states, _ = jacobians.shape
+    following = jnp.kron(jnp.roll(jnp.eye(arcs), 1, axis=1), jnp.eye(states))
+    return block_diag(*jacobians) - following.astype(jacobians.dtype)
+
+
+class _Seen(NamedTuple):
+    """One arc followed from its start; all floats, cycle by cycle."""
+
+    sections: Float[Array, "cycles states"]
+    """States after each cycle."""
+    jacobians: Float[Array, "cycles states states"]
+    """Their derivatives by the start."""
+    y_min: Float[Array, " cycles"]
+    y_max: Float[Array, " cycles"]
+    clearance: Float[Array, " cycles"]
+    duration: Float[Array, " cycles"]
+    impacts: Float[Array, " cycles"]
+    phase: Float[Array, "cycles log"]
+    speed: Float[Array, "cycles log"]
+    stop: Float[Array, "cycles log"]
+
+
+def _follow(arc: CycleMap, state: Any, impact_log: int) -> _Seen:
+    @by_columns
+    def seen(arc, state):
+        x, unravel = ravel_pytree(state)
+
+        def sections(x):
+            run = simulate(arc.scene, unravel(x), arc.cycles, method=arc.flow, record="sections")
+            sections = jnp.stack(jtu.tree_leaves(run.sections), axis=-1)[1:]
+            return sections, sections
+
+        # Apart from the motion: a program with second derivatives should hold no more than it must.
+        jacobians, ends = jax.jacfwd(sections, has_aux=True)(x)
+        run = simulate(arc.scene, state, arc.cycles, method=arc.flow, impact_log=impact_log)
+        log = run.impact_log
+        return _Seen(
+            ends, jacobians, run.y_min, run.y_max, run.clearance, run.duration,
+            run.impacts.astype(x.dtype), log.phase, log.speed, log.stop.astype(x.dtype),
+        )  # fmt: skip
+
+    return seen(arc, state)
+
+
+def _judged(the_map: CycleMap, guess: Any, method: AbstractSearch, impact_log: int) -> Orbit:
+    """The orbit found from one guess, with all that is said about it."""
+    scene, arcs = the_map.scene, method.arcs
+    arc = dataclasses.replace(the_map, cycles=the_map.cycles // arcs)
+    root = _root(arc, jax.lax.stop_gradient(guess), method)
+    x, unravel = root.arcs, ravel_pytree(guess)[1]
+    seen = jax.vmap(lambda x: _follow(arc, unravel(x), impact_log))(x)
+    sections = jnp.concatenate([x[:, None], seen.sections[:, :-1]], axis=1)
+    sections = sections.reshape(the_map.cycles, -1)
+    # Derivatives by the very first state: those within an arc after those of the arcs before.
+    passed, jacobians = jnp.eye(x.shape[1], dtype=x.dtype), []
+    for i in range(arcs):
+        jacobians.append(seen.jacobians[i] @ passed)
+        passed = jacobians[-1][-1]
+    jacobians = jnp.concatenate(jacobians)
+    missing = seen.sections[:, -1] - jnp.roll(x, -1, axis=0)
+    step = jnp.linalg.solve(_shooting_matrix(seen.jacobians[:, -1]), missing.ravel())
+    error = jnp.max(jnp.abs(step))
+    seen = jtu.tree_map(lambda a: a.reshape(the_map.cycles, *a.shape[2:]), seen)
+
+    least = _least_period(sections, error)
+    monodromy = jacobians[least - 1]
+
+    within = jnp.arange(the_map.cycles) < least
+    turn = jnp.asarray(scene.cycle, x.dtype)
+    phase = seen.phase + turn * jnp.arange(the_map.cycles)[:, None]
+    phase = phase if not hasattr(scene, "phase_at") else scene.phase_at(phase)
+    hit = (seen.stop >= 0) & within[:, None]
+    order = jnp.argsort(~hit.ravel(), stable=True)
+    phase, speed, stop = (
+        jnp.where(hit, a, none).ravel()[order]
+        for a, none in ((phase, jnp.nan), (seen.speed, jnp.nan), (seen.stop, -1.0))
+    )
+    duration = jnp.sum(jnp.where(within, seen.duration, 0.0))
+    clearance = jnp.min(jnp.where(within, seen.clearance, jnp.inf))
+    found = (root.converged > 0) & (error < jnp.sqrt(jnp.finfo(x.dtype).eps) * 100)
+    slowest = jnp.min(jnp.where(hit, seen.speed, jnp.inf))
+    near = jnp.minimum(slowest, jnp.sqrt(2 * jnp.maximum(clearance, 0))) < _SLOW
+    return Orbit(
+        scene=scene,
+        flow=the_map.flow,
+        state=unravel(x[0]),
+        sections=jax.vmap(unravel)(sections),
+        cycles=least,
+        duration=duration,
+        frequency_ratio=scene.frequency_ratio(duration / least),
+        impact_phase=phase,
+        impact_speed=speed,
+        impact_stop=stop.astype(jnp.int32),
+        impacts=jnp.sum(jnp.where(within, seen.impacts, 0.0)).astype(jnp.int32),
+        y_min=jnp.min(jnp.where(within, seen.y_min, jnp.inf)),
+        y_max=jnp.max(jnp.where(within, seen.y_max, -jnp.inf)),
+        clearance=clearance,
+        monodromy=monodromy,
+        multipliers=multipliers_of(monodromy),
+        residual=root.residual,
+        error=error,
+        iterations=root.steps.astype(jnp.int32),
+        history=root.history,
+        result=_verdict(found, least < the_map.cycles, near, jnp.isnan(root.residual)),
+    )
+
+
+def _least_period(sections: Float[Array, "cycles states"], error: Array) -> Array:
+    """The fewest cycles after which the sections repeat."""
+    cycles = sections.shape[0]
+    least = jnp.asarray(cycles, jnp.int32)
+    slack = jnp.maximum(1e-6 if sections.dtype == jnp.float64 else 1e-3, 100 * error)
+    for m in range(cycles - 1, 0, -1):
+        if cycles % m == 0:
+            apart = jnp.abs(sections - jnp.roll(sections, -m, axis=0))
+            same = jnp.all(apart <= slack * (1 + jnp.abs(sections)))
+            least = jnp.where(same, m, least)
+    return least
+
+
+def _verdict(found: Array, smaller: Array, near_grazing: Array, no_run: Array) -> ORBIT_RESULTS:
+    where, results = ORBIT_RESULTS.where, ORBIT_RESULTS
+    missed = where(near_grazing, results.grazing, results.no_orbit)
+    missed = where(no_run, results.not_simulated, missed)
+    return where(found, where(smaller, results.smaller_period, results.converged), missed)

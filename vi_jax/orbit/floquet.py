@@ -1,0 +1,52 @@
+"""Floquet multipliers and what they say about a periodic motion."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Complex, Float
+
+
+class STABILITY(eqx.Enumeration):
+    """Whether a periodic motion is stable, or how it lost its stability."""
+
+    stable = "stable"
+    fold = "unstable: a real multiplier above 1 (past a fold)"
+    period_doubling = "unstable: a real multiplier below -1 (past a period doubling)"
+    neimark_sacker = "unstable: a complex pair outside the unit circle (past a Neimark–Sacker)"
+    unknown = "unknown: no orbit was found"
+
+
+def multipliers_of(monodromy: Float[Array, "n n"]) -> Complex[Array, " n"]:
+    """Eigenvalues of a monodromy matrix, the largest modulus first; NaN if it is not finite."""
+    finite = jnp.all(jnp.isfinite(monodromy))
+    safe = jnp.where(finite, monodromy, jnp.eye(monodromy.shape[0], dtype=monodromy.dtype))
+    if monodromy.shape == (2, 2):
+        half = 0.5 * (safe[0, 0] + safe[1, 1])
+        values = eigenvalues(half, safe[0, 0] * safe[1, 1] - safe[0, 1] * safe[1, 0])
+    else:
+        values = jnp.linalg.eigvals(safe)
+    order = jnp.argsort(-jnp.abs(values))
+    return jnp.where(finite, values[order], jnp.nan)
+
+
+def eigenvalues(
+    half: Float[Array, "..."], determinant: Float[Array, "..."]
+) -> Complex[Array, "... 2"]:
+    """Eigenvalues of 2x2 matrices from half their trace and their determinant."""
+    square = (half * half - determinant).astype(jnp.result_type(half, jnp.complex64))
+    double = square == 0  # where the derivative of the root is infinite
+    root = jnp.where(double, 0.0, jnp.sqrt(jnp.where(double, 1.0, square)))
+    return jnp.stack([half + root, half - root], axis=-1)
+
+
+def stability_of(multipliers: Complex[Array, " n"]) -> STABILITY:
+    """The verdict of a set of multipliers: that of the largest."""
+    largest = multipliers[jnp.argmax(jnp.abs(multipliers))]
+    size = jnp.abs(largest)
+    real = jnp.abs(largest.imag) <= 1e-9 * size
+    how = STABILITY.where(
+        real & (largest.real > 0),
+        STABILITY.fold,
+        STABILITY.where(real, STABILITY.period_doubling, STABILITY.neimark_sacker),
+    )
+    verdict = STABILITY.where(size < 1, STABILITY.stable, how)
+    return STABILITY.where(jnp.isnan(size), STABILITY.unknown, verdict)

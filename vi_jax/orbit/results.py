@@ -1,0 +1,196 @@
+"""Periodic motions as data, and why a search for one ended."""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Bool, Complex, Float, Int
+
+from ..flow import AbstractMethod, Run, simulate
+from ..scene import AbstractScene, Scene
+from .floquet import STABILITY, stability_of
+
+
+class ORBIT_RESULTS(eqx.Enumeration):
+    """How a search for a periodic motion ended; `find_orbit` gives one to each guess."""
+
+    converged = ""
+    smaller_period = "The motion found has a smaller period than was asked for; see `Orbit.cycles`."
+    inadmissible = "The motion found would pass through a stop."
+    no_orbit = "The residual did not fall below the tolerance: no orbit was found from this guess."
+    grazing = (
+        "No orbit was found: the search ended beside a grazing, where the cycle map has no "
+        "derivative."
+    )
+    not_simulated = "The guess cannot be simulated: see `simulate(...).result` for the reason."
+
+
+class Orbit(eqx.Module):
+    """A periodic motion, from `find_orbit`; look at `result` before you use it.
+
+    Under `vmap` every array has the batch axes in front, and the impact arrays are padded with
+    NaN (stops: -1).
+    """
+
+    scene: AbstractScene
+    """What moves; in the phase clock."""
+    flow: AbstractMethod
+    state: Any
+    """State on the section, a pytree like a start (Y in a, V in a ω, W in ω)."""
+    sections: Any
+    """States on the sections of the cycles that were asked for; leaves (cycles,)."""
+    cycles: Int[Array, "..."]
+    """Least period in drive cycles."""
+    duration: Float[Array, "..."]
+    """Least period in time τ."""
+    frequency_ratio: Float[Array, "..."] | None
+    """ζ: mean crank speed over the period (unit: ω); `None` for scenes that are not driven."""
+    impact_phase: Float[Array, "... impacts"]
+    """Crank angle of each impact of the period (radians), in the section's cycle and the next."""
+    impact_speed: Float[Array, "... impacts"]
+    """V⁻, speed of approach just before each impact (unit: a ω)."""
+    impact_stop: Int[Array, "... impacts"]
+    """Index into `scene.stops` of each impact."""
+    impacts: Int[Array, "..."]
+    """Number of impacts in the period."""
+    y_min: Float[Array, "..."]
+    """Smallest Y of the period (unit: a)."""
+    y_max: Float[Array, "..."]
+    """Largest Y of the period (unit: a)."""
+    clearance: Float[Array, "..."]
+    """Smallest distance to a stop at which the body turns back without touching it (unit: a);
+    infinite if it never does, negative where it would pass through the stop."""
+    monodromy: Float[Array, "... states states"]
+    """Derivative of the map over the period, in the order of the state's leaves."""
+    multipliers: Complex[Array, "... states"]
+    """Floquet multipliers over the period, the largest modulus first."""
+    residual: Float[Array, "..."]
+    """Largest component of what the motion lacks to be periodic."""
+    error: Float[Array, "..."]
+    """Estimated error of `state`: largest component of Newton's next step."""
+    iterations: Int[Array, "..."]
+    """Steps of the search."""
+    history: Float[Array, "... max_steps"]
+    """Residual after each step of the search, NaN beyond the last."""
+    result: ORBIT_RESULTS
+    """Whether an orbit was found, or why not."""
+
+    @property
+    def successful(self) -> Bool[Array, "..."]:
+        """Whether this is an orbit, of the period asked for or a smaller one."""
+        return (self.result == ORBIT_RESULTS.converged) | (
+            self.result == ORBIT_RESULTS.smaller_period
+        )
+
+    @property
+    def stable(self) -> Bool[Array, "..."]:
+        """Whether all multipliers lie inside the unit circle."""
+        return self.successful & (jnp.max(jnp.abs(self.multipliers), axis=-1) < 1)
+
+    @property
+    def stability(self) -> STABILITY:
+        """Stable, or how stability was lost: fold, period doubling or Neimark–Sacker."""
+        verdict = stability_of
+        for _ in range(self.multipliers.ndim - 1):
+            verdict = jax.vmap(verdict)
+        return STABILITY.where(self.successful, verdict(self.multipliers), STABILITY.unknown)
+
+    @property
+    def slowest_impact(self) -> Float[Array, "..."]:
+        """Smallest V⁻, the distance to a grazing by losing an impact (unit: a ω); infinite without
+        impacts. The other distance is `clearance`."""
+        speed = jnp.where(jnp.isnan(self.impact_speed), jnp.inf, self.impact_speed)
+        return jnp.min(speed, axis=-1, initial=jnp.inf)
+
+    @property
+    def admissible(self) -> Bool[Array, "..."]:
+        """Whether the motion stays inside the gap and every impact approaches its stop."""
+        slack = 1e4 * jnp.finfo(self.y_max.dtype).eps
+        inside = self.clearance >= 0
+        for stop in self.scene.stops:
+            reach = self.y_max if stop.sign > 0 else -self.y_min
+            inside = inside & (reach <= stop.gap + slack * (1 + jnp.abs(stop.gap)))
+        return self.successful & inside & (self.slowest_impact > 0)
+
+    def trajectory(
+        self, *, cycles: int | None = None, samples: int = 128, impact_log: int = 8
+    ) -> Run:
+        """The motion over one period (or `cycles` drive cycles), sampled, for plots.
+
+        **Raises:** `ValueError` for a batch of orbits.
+        """
+        if self.residual.ndim:
+            raise ValueError(
+                f"`trajectory` needs one orbit, but this is a batch of shape {self.residual.shape}."
+            )
+        if cycles is None:
+            cycles = int(self.cycles)
+        return simulate(
+            self.scene, self.state, cycles, method=self.flow, samples=samples,
+            impact_log=impact_log,
+        )  # fmt: skip
+
+    def __str__(self) -> str:
+        if isinstance(self.residual, Tracer):
+            return repr(self)
+        if self.residual.ndim:
+            found, stable = int(jnp.sum(self.successful)), int(jnp.sum(self.stable))
+            return (
+                f"{self.residual.size} searches {self.residual.shape}: {found} orbits found, "
+                f"{stable} of them stable"
+            )
+        if not bool(self.successful):
+            reason = ORBIT_RESULTS[self.result]
+            return f"No orbit: {reason} Residual {float(self.residual):.3g}."
+        count, cycles = int(self.impacts), int(self.cycles)
+        where = ", ".join(f"{name} = {float(x):.9g}" for name, x in vars(self.state).items())
+        period = f"{2 * cycles}π" if isinstance(self.scene, Scene) else f"{cycles} cycles"
+        lines = [
+            f"Orbit of period {period} with {count} impact{'' if count == 1 else 's'}, "
+            f"{STABILITY[self.stability]}",
+            f"  section: {where}",
+            f"  Y in [{float(self.y_min):.9g}, {float(self.y_max):.9g}]",
+        ]
+        for phase, speed, stop in zip(
+            self.impact_phase, self.impact_speed, self.impact_stop, strict=True
+        ):
+            if stop >= 0:
+                name = self.scene.stops[int(stop)].side
+                lines.append(
+                    f"  impact: {name} stop at phase {float(phase):.6f}, V⁻ = {float(speed):.9g}"
+                )
+        values = ", ".join(_complex(m) for m in np.asarray(self.multipliers))
+        lines.append(f"  multipliers: {values}")
+        lines.append(f"  clearance: {float(self.clearance):.4g}")
+        lines.append(
+            f"  residual {float(self.residual):.2g} after {int(self.iterations)} steps, estimated "
+            f"error {float(self.error):.2g}"
+        )
+        reason = ORBIT_RESULTS[self.result]
+        return "\n".join([*lines, f"  note: {reason}"] if reason else lines)
+
+
+def _complex(z: complex) -> str:
+    if abs(z.imag) <= 1e-12 * abs(z):
+        return f"{z.real:.7g}"
+    return f"{z.real:.7g}{z.imag:+.7g}i"
+
+
+def trimmed(orbit: Orbit) -> Orbit:
+    """One orbit without the padding of its impacts; anything traced or batched as it is."""
+    if isinstance(orbit.residual, Tracer) or orbit.residual.ndim:
+        return orbit
+    keep = slice(int(orbit.impacts))
+    cut = {name: getattr(orbit, name)[keep] for name in ("impact_phase", "impact_speed")}
+    cycles = int(orbit.cycles)
+    return dataclasses.replace(
+        orbit,
+        **cut,
+        impact_stop=orbit.impact_stop[keep],
+        sections=jtu.tree_map(lambda x: x[:cycles], orbit.sections),
+    )

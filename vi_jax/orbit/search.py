@@ -1,0 +1,200 @@
+"""Searches for a zero of the periodic-orbit residual: damped Newton, and optax descent."""
+
+import abc
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+import optimistix as optx
+from jaxtyping import Array, Float, Int
+
+from .._checks import count, require
+
+Unknowns = Float[Array, "..."]
+Residual = Callable[[Any], Any]
+
+
+class AbstractSearch(eqx.Module):
+    """A way to a zero of a residual."""
+
+    tolerance: eqx.AbstractVar[Any]
+    max_steps: eqx.AbstractVar[int]
+    arcs: eqx.AbstractVar[int]
+
+    @abc.abstractmethod
+    def init(self, residual: Residual, x: Unknowns) -> Any:
+        """What the search remembers between its steps."""
+
+    @abc.abstractmethod
+    def step(
+        self, residual: Residual, x: Unknowns, memory: Any
+    ) -> tuple[Unknowns, Any, Unknowns, Float[Array, ""]]:
+        """One step: where to go on from, the memory, and a place with its largest residual."""
+
+    @property
+    @abc.abstractmethod
+    def usual_tolerance(self) -> float:
+        """The tolerance in double precision, if none is given."""
+
+
+def _tolerance(value: Any) -> Any:
+    return None if value is None else jnp.asarray(value, jnp.result_type(float))
+
+
+def _check(search: AbstractSearch) -> None:
+    if search.tolerance is not None:
+        require("tolerance", search.tolerance, low=0.0, open_low=True)
+    count("max_steps", search.max_steps, least=1)
+    count("arcs", search.arcs, least=1)
+
+
+class Newton(AbstractSearch):
+    """Newton's method, damped by a trust region (optimistix' dogleg): quadratic near the orbit.
+
+    **Arguments:**
+
+    - `tolerance`: largest residual component of a found orbit; by default 1e-10 in double and
+      1e-4 in single precision. The search goes on below it while that still gains.
+    - `max_steps`: steps after which it gives up; static.
+    - `arcs`: 1 for single shooting. With more, the period is cut into that many arcs, whose
+      starting states are all unknowns (multiple shooting): for motions so unstable that a
+      perturbation is amplified beyond use within one period. Must divide the cycles; static.
+    """
+
+    tolerance: Any = eqx.field(kw_only=True, default=None, converter=_tolerance)
+    max_steps: int = eqx.field(kw_only=True, static=True, default=50)
+    arcs: int = eqx.field(kw_only=True, static=True, default=1)
+
+    def __check_init__(self):
+        _check(self)
+
+    @property
+    def _solver(self):
+        return optx.Dogleg(rtol=1e-15, atol=1e-15)
+
+    def init(self, residual, x):
+        """The dogleg's state."""
+        fn = _with_aux(residual)
+        shapes, aux = eqx.filter_eval_shape(fn, x, None)
+        return self._solver.init(fn, x, None, {}, shapes, aux, frozenset())
+
+    def step(self, residual, x, memory):
+        """One dogleg step, tried; the place moves only if the residual falls."""
+        x, memory, _ = self._solver.step(_with_aux(residual), x, None, {}, memory, frozenset())
+        return x, memory, x, _largest(memory.f_info.residual)
+
+    @property
+    def usual_tolerance(self) -> float:
+        """1e-10."""
+        return 1e-10
+
+
+def _with_aux(residual: Residual) -> Callable[[Any, Any], tuple[Any, None]]:
+    return lambda x, args: (residual(x), None)
+
+
+class Gradient(AbstractSearch):
+    """Descent on half the squared residual with an optax optimiser.
+
+    **Arguments:**
+
+    - `optimiser`: an `optax.GradientTransformation`; by default Adam, its rate falling along a
+      cosine from 0.02 to zero over `max_steps`.
+    - `tolerance`: largest residual component of a found orbit, 1e-7 by default in double and 1e-4
+      in single precision.
+    - `max_steps`: steps after which it gives up; static.
+    - `arcs`: as for `Newton`.
+    """
+
+    optimiser: optax.GradientTransformation | None = eqx.field(static=True, default=None)
+    tolerance: Any = eqx.field(kw_only=True, default=None, converter=_tolerance)
+    max_steps: int = eqx.field(kw_only=True, static=True, default=1000)
+    arcs: int = eqx.field(kw_only=True, static=True, default=1)
+
+    def __check_init__(self):
+        _check(self)
+
+    @property
+    def _optimiser(self) -> optax.GradientTransformation:
+        if self.optimiser is not None:
+            return self.optimiser
+        return optax.adam(optax.cosine_decay_schedule(0.02, self.max_steps))
+
+    def init(self, residual, x):
+        """The optimiser's state."""
+        return self._optimiser.init(x)
+
+    def step(self, residual, x, memory):
+        """One step of the optimiser; the place returned is the one it began from."""
+
+        def loss(x):
+            missing = residual(x)
+            return 0.5 * jnp.sum(missing**2), missing
+
+        slope, missing = jax.grad(loss, has_aux=True)(x)
+        update, memory = self._optimiser.update(slope, memory, x)
+        return x + update, memory, x, _largest(missing)
+
+    @property
+    def usual_tolerance(self) -> float:
+        """1e-7."""
+        return 1e-7
+
+
+def _largest(missing: Array) -> Array:
+    # A NaN must win, which `max` does not promise on every backend.
+    return jnp.where(jnp.all(jnp.isfinite(missing)), jnp.max(jnp.abs(missing)), jnp.nan)
+
+
+class Found(NamedTuple):
+    """Where a search ended."""
+
+    x: Unknowns
+    """The place with the smallest residual that was met."""
+    residual: Float[Array, ""]
+    converged: Array
+    steps: Int[Array, ""]
+    history: Float[Array, " max_steps"]
+    """Largest residual component after each step, NaN beyond the last."""
+
+
+def search(method: AbstractSearch, residual: Residual, x: Unknowns) -> Found:
+    """Run `method` until the residual is within its tolerance and gains no more.
+
+    A place where the residual is not finite is never taken for better than another.
+    """
+    tolerance = method.tolerance
+    if tolerance is None:
+        tolerance = method.usual_tolerance if x.dtype == jnp.float64 else 1e-4
+    nan = jnp.full((), jnp.nan, x.dtype)
+    memory, static = eqx.partition(method.init(residual, x), eqx.is_array)
+    history = jnp.full((method.max_steps,), jnp.nan, x.dtype)
+
+    def going(carry):
+        *_, size, last, steps, _ = carry
+        # Newton's last steps fall from below the tolerance to rounding: worth their cost.
+        gaining = (size <= 0.1 * last) & (size > 0)
+        hopeless = (steps > 0) & jnp.isnan(size)
+        done = hopeless | ((size <= tolerance) & ~gaining)
+        return ~done & (steps < method.max_steps)
+
+    def body(carry):
+        x, memory, best, size, _, steps, history = carry
+        x, memory, place, now = method.step(residual, x, eqx.combine(memory, static))
+        better = ~jnp.isnan(now) & ~(now >= size)
+        return (
+            x,
+            eqx.filter(memory, eqx.is_array),
+            jnp.where(better, place, best),
+            jnp.where(better, now, size),
+            size,
+            steps + 1,
+            history.at[steps].set(now),
+        )
+
+    carry = (x, memory, x, nan, nan, jnp.zeros((), jnp.int32), history)
+    _, _, best, size, _, steps, history = jax.lax.while_loop(going, body, carry)
+    return Found(best, size, size <= tolerance, steps, history)
