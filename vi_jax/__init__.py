@@ -21,9 +21,12 @@ from .orbit import Newton as Newton
 from .orbit import Orbit as Orbit
 from .orbit import closed_form_orbits as closed_form_orbits
 from .orbit import cycle_map as cycle_map
+from .orbit import distinct_orbits as distinct_orbits
 from .orbit import find_orbit as find_orbit
 from .plot import plot_history as plot_history
+from .plot import plot_multipliers as plot_multipliers
 from .plot import plot_phase_portrait as plot_phase_portrait
+from .plot import save_picture as save_picture
 from .scene import AbstractCrank as AbstractCrank
 from .scene import AbstractScene as AbstractScene
 from .scene import CosineCrank as CosineCrank

@@ -4,6 +4,7 @@ from .closed_form import ClosedFormOrbits as ClosedFormOrbits
 from .closed_form import closed_form_orbits as closed_form_orbits
 from .cycle_map import CycleMap as CycleMap
 from .cycle_map import cycle_map as cycle_map
+from .distinct import distinct_orbits as distinct_orbits
 from .find import find_orbit as find_orbit
 from .floquet import STABILITY as STABILITY
 from .results import ORBIT_RESULTS as ORBIT_RESULTS

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from .._checks import concrete, count
 from ..flow import AbstractMethod, simulate
-from ..scene import AbstractScene
+from ..scene import AbstractScene, Scene
 from .cycle_map import CycleMap, adopted, cycle_map
 from .floquet import multipliers_of
 from .results import ORBIT_RESULTS, Orbit, trimmed
@@ -134,7 +134,7 @@ def _root(arc: CycleMap, guess: Any, method: AbstractSearch) -> _Root:
     arcs = x[None]
     if method.arcs > 1:
         run = simulate(arc.scene, guess, arc.cycles * method.arcs, method=arc.flow)
-        sections = jnp.stack(jtu.tree_leaves(run.sections), axis=-1)[:-1 : arc.cycles]
+        sections = jnp.stack(jtu.tree_leaves(run.sections), axis=-1)[: -1 : arc.cycles]
         arcs = jnp.where(jnp.isfinite(sections), sections, x)
     found = search(method, lambda arcs: _missing(arc, arcs, unravel), arcs)
     dtype = x.dtype
@@ -203,6 +203,8 @@ def _follow(arc: CycleMap, state: Any, impact_log: int) -> _Seen:
         jacobians, ends = jax.jacfwd(sections, has_aux=True)(x)
         run = simulate(arc.scene, state, arc.cycles, method=arc.flow, impact_log=impact_log)
         log = run.impact_log
+        assert log is not None and run.y_min is not None and run.y_max is not None
+        assert run.clearance is not None and run.duration is not None
         return _Seen(
             ends, jacobians, run.y_min, run.y_max, run.clearance, run.duration,
             run.impacts.astype(x.dtype), log.phase, log.speed, log.stop.astype(x.dtype),
@@ -237,7 +239,8 @@ def _judged(the_map: CycleMap, guess: Any, method: AbstractSearch, impact_log: i
     within = jnp.arange(the_map.cycles) < least
     turn = jnp.asarray(scene.cycle, x.dtype)
     phase = seen.phase + turn * jnp.arange(the_map.cycles)[:, None]
-    phase = phase if not hasattr(scene, "phase_at") else scene.phase_at(phase)
+    if isinstance(scene, Scene):
+        phase = scene.phase_at(phase)
     hit = (seen.stop >= 0) & within[:, None]
     order = jnp.argsort(~hit.ravel(), stable=True)
     phase, speed, stop = (

@@ -136,7 +136,7 @@ class Gradient(AbstractSearch):
 
         slope, missing = jax.grad(loss, has_aux=True)(x)
         update, memory = self._optimiser.update(slope, memory, x)
-        return x + update, memory, x, _largest(missing)
+        return jnp.asarray(optax.apply_updates(x, update)), memory, x, _largest(missing)
 
     @property
     def usual_tolerance(self) -> float:
@@ -176,7 +176,7 @@ def search(method: AbstractSearch, residual: Residual, x: Unknowns) -> Found:
     def going(carry):
         *_, size, last, steps, _ = carry
         # Newton's last steps fall from below the tolerance to rounding: worth their cost.
-        gaining = (size <= 0.1 * last) & (size > 0)
+        gaining = ~(size > 0.1 * last) & (size > 0)
         hopeless = (steps > 0) & jnp.isnan(size)
         done = hopeless | ((size <= tolerance) & ~gaining)
         return ~done & (steps < method.max_steps)

@@ -27,9 +27,7 @@ def by_columns(f: Callable[..., Any]) -> Callable[..., Any]:
 
     @wrapped.def_jvp
     def _(primals, tangents):
-        perturbed = jtu.tree_map(
-            lambda t: t is not None, tangents, is_leaf=lambda t: t is None
-        )
+        perturbed = jtu.tree_map(lambda t: t is not None, tangents, is_leaf=lambda t: t is None)
 
         def columns(*args):
             moving, still = eqx.partition(args, perturbed)

@@ -1,16 +1,13 @@
 """Draws Figures 3 and 4: three panels each, the undamped system above the damped one."""
 
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from PIL import Image
 
 from ..flow import Run
-from ..plot import motion_path, plot_history
+from ..plot import motion_path, plot_history, save_picture
 from ..plot.motion import GREEN, PINK, RED, angle_axis
 from .motions import Case
 
@@ -25,7 +22,6 @@ def draw_figure(number: int, cases: tuple[Case, Case], path: Path) -> None:
     if number not in (3, 4):
         raise ValueError(f"Argument `number` must be 3 or 4, but got {number!r}.")
     figure = Figure(figsize=(14, 8.4), dpi=_DPI)
-    canvas = FigureCanvasAgg(figure)
     figure.set_layout_engine("constrained", w_pad=0.08)
     grid = figure.subplots(2, 3, sharey=True)
     for row, case in zip(grid, cases, strict=True):
@@ -34,13 +30,7 @@ def draw_figure(number: int, cases: tuple[Case, Case], path: Path) -> None:
     # An undamped panel has every curve.
     handles, labels = grid[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False, fontsize=11)
-    canvas.draw()
-    picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
-    # Few colours make a small file; the dense panels need no more.
-    picture = picture.quantize(64, dither=Image.Dither.NONE)
-    png = BytesIO()
-    picture.save(png, "png", optimize=True, dpi=(_DPI, _DPI))
-    path.write_bytes(png.getvalue())  # whole, or not at all if interrupted before
+    save_picture(figure, path, dpi=_DPI)
 
 
 def _title(number: int) -> str:

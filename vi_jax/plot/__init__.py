@@ -2,5 +2,7 @@
 
 from .motion import plot_history as plot_history
 from .motion import plot_phase_portrait as plot_phase_portrait
+from .orbit import plot_multipliers as plot_multipliers
 from .path import MotionPath as MotionPath
 from .path import motion_path as motion_path
+from .save import save_picture as save_picture

@@ -1,0 +1,44 @@
+"""Which of many found orbits are different motions."""
+
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+
+from .results import Orbit, trimmed
+
+
+def distinct_orbits(orbits: Orbit, *, tolerance: float = 1e-6) -> tuple[list[Orbit], np.ndarray]:
+    """The different motions among many searches.
+
+    Motions that differ only by the cycle on which they are observed count as one, and a motion
+    found with a multiple of its period counts with its least period. Searches that found nothing
+    are left out. Host-side: not to be traced.
+
+    **Arguments:** a batch of orbits from `find_orbit` (of any shape); two motions are the same if
+    their sections agree to `tolerance` (relative to 1 + |state|).
+
+    **Returns:** the orbits, by period and then by least Y, each on the section of its period with
+    the smallest Y; and for each the number of searches that found it.
+    """
+    shape = orbits.residual.shape
+    flat = jtu.tree_map(lambda x: jnp.reshape(x, (-1, *x.shape[len(shape) :])), orbits)
+    sections = np.stack([np.asarray(x) for x in jtu.tree_leaves(flat.sections)], axis=-1)
+    cycles, found = np.asarray(flat.cycles), np.asarray(flat.successful)
+    kinds: list[tuple[int, np.ndarray]] = []
+    first: list[int] = []
+    counts: list[int] = []
+    for i in np.flatnonzero(found):
+        path = sections[i, : cycles[i]]
+        for j, (period, other) in enumerate(kinds):
+            if period == cycles[i]:
+                apart = np.abs(other - path[0]) / (1 + np.abs(other))
+                if (apart.max(axis=1) <= tolerance).any():
+                    counts[j] += 1
+                    break
+        else:
+            kinds.append((int(cycles[i]), path))
+            first.append(int(i))
+            counts.append(1)
+    chosen = [trimmed(jtu.tree_map(lambda x, i=i: x[i], flat)) for i in first]
+    order = sorted(range(len(chosen)), key=lambda j: (kinds[j][0], float(chosen[j].y_min)))
+    return [chosen[j] for j in order], np.array([counts[j] for j in order], int)
