@@ -89,3 +89,17 @@ def test_motor_control_by_central_differences(clock):
     found = jax.jit(jax.jacfwd(f))(0.9)
     difference = (f(0.9 + 1e-5) - f(0.9 - 1e-5)) / 2e-5
     np.testing.assert_allclose(found, difference, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "method", [vi.ExactFlight(), vi.Adaptive(rtol=1e-12)], ids=["ExactFlight", "Adaptive"]
+)
+@pytest.mark.parametrize("cycles", [1, 3])  # without an impact, and with three
+def test_second_derivatives_pass_through_impacts(method, cycles):
+    slope = jax.jit(jax.jacfwd(final(method, cycles)))
+    x, h = jnp.array([ZETA, XI, K, GAP, 0.1, 0.2]), 1e-5
+    bend = jax.jit(jax.jacfwd(jax.jacfwd(final(method, cycles))))(x)
+    difference = [(slope(x + h * e) - slope(x - h * e)) / (2 * h) for e in jnp.eye(6)]
+    # The difference's own truncation is h²/6 times the third derivative.
+    scale = float(jnp.abs(bend).max())
+    np.testing.assert_allclose(bend, jnp.stack(difference, -1), atol=1e-7 * (1 + scale))

@@ -54,6 +54,7 @@ class ExactFlight(AbstractMethod):
 
     def step(self, scene, s0, s1, state, time, one):
         """The flight from `s0` to `s1`, exact to rounding."""
+        assert isinstance(scene, Scene)
         zeta, xi, in_phase = _numbers(scene)
         tau = (s1 - s0) / zeta if in_phase else s1 - s0
         phase = scene.phase_at(s0 if in_phase else zeta * s0)

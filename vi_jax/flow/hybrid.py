@@ -126,8 +126,8 @@ def _arrive(
         state = select(c.landed, scene.placed(there, stop.sign * stop.gap, rebound), state)
         direction = jnp.where(c.landed, -float(stop.sign), direction)
         hit = taken & c.landed
-        clock = s if scene.clock(there) is None else scene.clock(there)
-        log = _logged(log, hit, impacts, clock, approach, index)
+        clock = scene.clock(there)
+        log = _logged(log, hit, impacts, s if clock is None else clock, approach, index)
         impacts = impacts + jnp.where(hit, 1.0, 0.0)
         if speed is not None:
             speed = jnp.where(hit, jnp.maximum(speed, approach), speed)

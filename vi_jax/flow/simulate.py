@@ -89,6 +89,8 @@ def simulate(
     if isinstance(scene, Scene):
         start = scene.adopt(start)
     method.check(scene)
+    if isinstance(scene, Scene):
+        _check_scalars(scene=scene, start=start)
     _check_start(scene, start)
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         warnings.warn(
@@ -106,13 +108,30 @@ def simulate(
         max_steps=float(max_steps),
         max_impacts=float(max_impacts),
     )
-    dtype = jnp.result_type(float, *jtu.tree_leaves(start))
-    start = jtu.tree_map(lambda x: jnp.asarray(x, dtype), start)
+    start = as_floats(scene, start)
     run = _simulate(plan, start, samples > 0, adjoint == "reverse")
     if throw:
         failed = "A lane of the simulation failed; see `RESULTS` and `Run.result`."
         run = eqx.error_if(run, ~run.successful, failed)
     return run
+
+
+def as_floats(scene: AbstractScene, state: Any) -> Any:
+    """`state` in arrays of the one floating-point type that it and the scene's numbers ask for."""
+    numbers = jtu.tree_leaves(eqx.filter((scene, state), eqx.is_array_like))
+    dtype = jnp.result_type(float, *numbers)
+    return jtu.tree_map(lambda x: jnp.asarray(x, dtype), state)
+
+
+def _check_scalars(**arguments: Any) -> None:
+    for name, tree in arguments.items():
+        for path, leaf in jtu.tree_leaves_with_path(eqx.filter(tree, eqx.is_array)):
+            if leaf.ndim:
+                where = jtu.keystr(path).lstrip(".")
+                raise ValueError(
+                    f"Argument `{name}` must hold scalars (use `jax.vmap` for a batch), but its "
+                    f"{where} has shape {leaf.shape}."
+                )
 
 
 def _check_start(scene: AbstractScene, start: Any) -> None:

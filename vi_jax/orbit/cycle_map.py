@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from .._checks import count
 from ..flow import AbstractMethod, Adaptive, ExactFlight, simulate
+from ..flow.simulate import as_floats
 from ..scene import AbstractScene, Scene
 from .tangent import by_columns
 
@@ -99,8 +100,10 @@ def cycle_map(
         )
     flow.check(scene)
     # Tolerances are numbers: another one must not be another program.
-    flow = jtu.tree_map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, flow)
-    return CycleMap(scene, flow, count("cycles", cycles, least=1))
+    carried: AbstractMethod = jtu.tree_map(
+        lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, flow
+    )
+    return CycleMap(scene, carried, count("cycles", cycles, least=1))
 
 
 def default_flow(scene: AbstractScene) -> AbstractMethod:
@@ -122,5 +125,4 @@ def adopted(scene: AbstractScene, state: Any) -> Any:
             "Argument `scene` must count its cycles by its independent variable, but its state "
             "has a clock."
         )
-    dtype = jnp.result_type(float, *jtu.tree_leaves(state))
-    return jtu.tree_map(lambda x: jnp.asarray(x, dtype), state)
+    return as_floats(scene, state)

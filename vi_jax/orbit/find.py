@@ -1,6 +1,7 @@
 """`find_orbit`: from a guess to a periodic motion that is judged and differentiable."""
 
 import dataclasses
+from math import pi
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -10,7 +11,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import block_diag
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from .._checks import concrete, count
 from ..flow import AbstractMethod, simulate
@@ -20,6 +21,9 @@ from .floquet import multipliers_of
 from .results import ORBIT_RESULTS, Orbit, trimmed
 from .search import AbstractSearch, Newton, search
 from .tangent import by_columns
+
+# Places in a cycle at which an orbit can be searched.
+_PLACES = 8
 
 # Lanes searched at once: a batch lasts as long as its slowest lane.
 _BATCH = 512
@@ -56,8 +60,10 @@ def find_orbit(
     - `method`: `Newton()` (default) or `Gradient(optax_optimiser)`.
     - `flow`: the method that carries the scene: by default `ExactFlight()` where it applies, else
       `Adaptive(rtol=1e-11)`.
-    - `section`: crank angle of the section (radians) instead of the scene's own, which is 0. An
-      impact just on the section makes the map jump there: choose another.
+    - `section`: crank angle of the section (radians) instead of the scene's own, which is 0. The
+      guess and the orbit's states are on it; the search itself is done in eighths of a cycle
+      away from it, where the guess's motion is farthest from its impacts, because the map jumps
+      where an impact falls on the section.
     - `impact_log`: impacts of one cycle that the orbit can list.
     - `throw`: raise an error if no orbit is found, instead of only saying so in `result`.
 
@@ -110,6 +116,32 @@ def _find(the_map: CycleMap, guess: Any, method: AbstractSearch, impact_log: int
     if not first.ndim:
         return one(guess)
     return jax.lax.map(one, guess, batch_size=min(_BATCH, first.shape[0]))
+
+
+def _moved(the_map: CycleMap, guess: Any) -> tuple[CycleMap, Any, Int[Array, ""]]:
+    """Map, guess and their place (in eighths of a cycle) on the section to search on.
+
+    The map jumps where an impact falls on its section, and no search gets across; so it is done
+    where the guess's motion is farthest from its impacts.
+    """
+    scene = the_map.scene
+    if not isinstance(scene, Scene):
+        return the_map, guess, jnp.zeros((), jnp.int32)
+    run = simulate(
+        scene, guess, the_map.cycles, method=the_map.flow, samples=_PLACES, impact_log=8,
+        record="sections",
+    )  # fmt: skip
+    assert run.samples is not None and run.impact_log is not None
+    step = 2 * pi / _PLACES
+    phase = run.impact_log.phase.ravel() - step * jnp.arange(_PLACES)[:, None]
+    apart = jnp.abs(jnp.mod(phase + pi, 2 * pi) - pi)
+    place = jnp.argmax(jnp.min(jnp.where(jnp.isnan(apart), pi, apart), axis=1))
+    there = jtu.tree_map(lambda x: x[place], run.samples.state)
+    lost = ~jnp.isfinite(sum(jtu.tree_leaves(there)))
+    place = jnp.where(lost, 0, place)
+    there = jtu.tree_map(lambda a, b: jnp.where(lost, a, b), guess, there)
+    moved = scene.at_section(scene.phase_at(jnp.asarray(step, phase.dtype) * place))
+    return dataclasses.replace(the_map, scene=moved), there, place
 
 
 class _Root(NamedTuple):
@@ -175,10 +207,10 @@ def _shooting_matrix(jacobians: Float[Array, "arcs states states"]) -> Float[Arr
 class _Seen(NamedTuple):
     """One arc followed from its start; all floats, cycle by cycle."""
 
-    sections: Float[Array, "cycles states"]
-    """States after each cycle."""
+    states: Float[Array, "cycles places states"]
+    """States at each place of each cycle, the start left out."""
     jacobians: Float[Array, "cycles states states"]
-    """Their derivatives by the start."""
+    """Derivatives by the start of the states after each cycle."""
     y_min: Float[Array, " cycles"]
     y_max: Float[Array, " cycles"]
     clearance: Float[Array, " cycles"]
@@ -194,19 +226,24 @@ def _follow(arc: CycleMap, state: Any, impact_log: int) -> _Seen:
     def seen(arc, state):
         x, unravel = ravel_pytree(state)
 
-        def sections(x):
-            run = simulate(arc.scene, unravel(x), arc.cycles, method=arc.flow, record="sections")
-            sections = jnp.stack(jtu.tree_leaves(run.sections), axis=-1)[1:]
-            return sections, sections
+        def states(x):
+            run = simulate(
+                arc.scene, unravel(x), arc.cycles, method=arc.flow, samples=_PLACES,
+                record="sections",
+            )  # fmt: skip
+            assert run.samples is not None
+            states = jnp.stack(jtu.tree_leaves(run.samples.state), axis=-1)[1:]
+            states = states.reshape(arc.cycles, _PLACES, -1)
+            return states[:, -1], states
 
         # Apart from the motion: a program with second derivatives should hold no more than it must.
-        jacobians, ends = jax.jacfwd(sections, has_aux=True)(x)
+        jacobians, places = jax.jacfwd(states, has_aux=True)(x)
         run = simulate(arc.scene, state, arc.cycles, method=arc.flow, impact_log=impact_log)
         log = run.impact_log
         assert log is not None and run.y_min is not None and run.y_max is not None
         assert run.clearance is not None and run.duration is not None
         return _Seen(
-            ends, jacobians, run.y_min, run.y_max, run.clearance, run.duration,
+            places, jacobians, run.y_min, run.y_max, run.clearance, run.duration,
             run.impacts.astype(x.dtype), log.phase, log.speed, log.stop.astype(x.dtype),
         )  # fmt: skip
 
@@ -215,38 +252,39 @@ def _follow(arc: CycleMap, state: Any, impact_log: int) -> _Seen:
 
 def _judged(the_map: CycleMap, guess: Any, method: AbstractSearch, impact_log: int) -> Orbit:
     """The orbit found from one guess, with all that is said about it."""
-    scene, arcs = the_map.scene, method.arcs
-    arc = dataclasses.replace(the_map, cycles=the_map.cycles // arcs)
-    root = _root(arc, jax.lax.stop_gradient(guess), method)
+    scene, arcs, cycles = the_map.scene, method.arcs, the_map.cycles
+    moved, start, place = _moved(the_map, jax.lax.stop_gradient(guess))
+    arc = dataclasses.replace(moved, cycles=cycles // arcs)
+    root = _root(arc, start, method)
     x, unravel = root.arcs, ravel_pytree(guess)[1]
     seen = jax.vmap(lambda x: _follow(arc, unravel(x), impact_log))(x)
-    sections = jnp.concatenate([x[:, None], seen.sections[:, :-1]], axis=1)
-    sections = sections.reshape(the_map.cycles, -1)
     # Derivatives by the very first state: those within an arc after those of the arcs before.
     passed, jacobians = jnp.eye(x.shape[1], dtype=x.dtype), []
     for i in range(arcs):
         jacobians.append(seen.jacobians[i] @ passed)
         passed = jacobians[-1][-1]
     jacobians = jnp.concatenate(jacobians)
-    missing = seen.sections[:, -1] - jnp.roll(x, -1, axis=0)
+    missing = seen.states[:, -1, -1] - jnp.roll(x, -1, axis=0)
     step = jnp.linalg.solve(_shooting_matrix(seen.jacobians[:, -1]), missing.ravel())
     error = jnp.max(jnp.abs(step))
-    seen = jtu.tree_map(lambda a: a.reshape(the_map.cycles, *a.shape[2:]), seen)
+    seen = jtu.tree_map(lambda a: a.reshape(cycles, *a.shape[2:]), seen)
 
+    # Back on the section asked for, of which the last one met is the guess's.
+    sections = jnp.roll(jnp.take(seen.states, _PLACES - 1 - place, axis=1), 1, axis=0)
     least = _least_period(sections, error)
     monodromy = jacobians[least - 1]
-
-    within = jnp.arange(the_map.cycles) < least
+    within = jnp.arange(cycles) < least
     turn = jnp.asarray(scene.cycle, x.dtype)
-    phase = seen.phase + turn * jnp.arange(the_map.cycles)[:, None]
-    if isinstance(scene, Scene):
-        phase = scene.phase_at(phase)
     hit = (seen.stop >= 0) & within[:, None]
-    order = jnp.argsort(~hit.ravel(), stable=True)
+    phase = seen.phase + turn * (jnp.arange(cycles)[:, None] + place / _PLACES)
+    phase = jnp.where(hit, jnp.mod(phase, turn * least), jnp.inf).ravel()
+    order = jnp.argsort(phase)
     phase, speed, stop = (
-        jnp.where(hit, a, none).ravel()[order]
+        jnp.where(hit.ravel(), a.ravel(), none)[order]
         for a, none in ((phase, jnp.nan), (seen.speed, jnp.nan), (seen.stop, -1.0))
     )
+    if isinstance(scene, Scene):
+        phase = scene.phase_at(phase)
     duration = jnp.sum(jnp.where(within, seen.duration, 0.0))
     clearance = jnp.min(jnp.where(within, seen.clearance, jnp.inf))
     found = (root.converged > 0) & (error < jnp.sqrt(jnp.finfo(x.dtype).eps) * 100)
@@ -255,7 +293,7 @@ def _judged(the_map: CycleMap, guess: Any, method: AbstractSearch, impact_log: i
     return Orbit(
         scene=scene,
         flow=the_map.flow,
-        state=unravel(x[0]),
+        state=unravel(sections[0]),
         sections=jax.vmap(unravel)(sections),
         cycles=least,
         duration=duration,
@@ -273,7 +311,7 @@ def _judged(the_map: CycleMap, guess: Any, method: AbstractSearch, impact_log: i
         error=error,
         iterations=root.steps.astype(jnp.int32),
         history=root.history,
-        result=_verdict(found, least < the_map.cycles, near, jnp.isnan(root.residual)),
+        result=_verdict(found, least < cycles, near, jnp.isnan(root.residual)),
     )
 
 

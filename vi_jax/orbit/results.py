@@ -51,7 +51,8 @@ class Orbit(eqx.Module):
     frequency_ratio: Float[Array, "..."] | None
     """ζ: mean crank speed over the period (unit: ω); `None` for scenes that are not driven."""
     impact_phase: Float[Array, "... impacts"]
-    """Crank angle of each impact of the period (radians), in the section's cycle and the next."""
+    """Crank angle of each impact (radians), rising from the section on; clock of the period for
+    scenes of your own."""
     impact_speed: Float[Array, "... impacts"]
     """V⁻, speed of approach just before each impact (unit: a ω)."""
     impact_stop: Int[Array, "... impacts"]
@@ -66,7 +67,8 @@ class Orbit(eqx.Module):
     """Smallest distance to a stop at which the body turns back without touching it (unit: a);
     infinite if it never does, negative where it would pass through the stop."""
     monodromy: Float[Array, "... states states"]
-    """Derivative of the map over the period, in the order of the state's leaves."""
+    """Derivative of the map over the period, in the order of the state's leaves; on the section on
+    which the orbit was searched, which `find_orbit` chooses away from the impacts."""
     multipliers: Complex[Array, "... states"]
     """Floquet multipliers over the period, the largest modulus first."""
     residual: Float[Array, "..."]

@@ -258,6 +258,13 @@ class Scene(AbstractScene):
                     "Argument `start` must have W > 0 in the phase clock, but has "
                     f'W = {speed.min():g}. Pass `clock="time"` to start from rest.'
                 )
+        if isinstance(start, TimedMotorState):
+            phase = concrete(start.phase)
+            if phase is not None and not (phase < 2 * pi).all():
+                raise ValueError(
+                    "Argument `start` must have its phase, counted from the last section, below "
+                    f"2π, but has {phase.max():g}."
+                )
 
 
 def _check_room(stops: tuple[RigidStop, ...]) -> None:

@@ -1,0 +1,251 @@
+"""Found orbits beside the closed form, long simulations, differences and each other."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+import vi_jax as vi
+
+UNDAMPED = vi.Scene.ideal(frequency_ratio=0.9)
+# Printed values: Y, V, least Y, impact phase, V⁻, multipliers.
+TABLE = {
+    1: (1.92303, -0.876442, -1.883583, 6.19998, 1.57475, [-1.166036, -0.214402]),
+    2: (1.609674, -1.943612, -3.254294, 12.37807, 3.54674, [-0.298755 + 0.400931j] * 2),
+}
+
+
+def near(scene, cycles, by=0.01):
+    closed = vi.closed_form_orbits(scene, cycles=cycles)
+    return scene.start(Y=closed.Y[0] - by, V=closed.V[0] - by)
+
+
+@pytest.mark.parametrize("cycles", [1, 2])
+def test_the_table_of_values(cycles):
+    Y, V, y_min, phase, speed, multipliers = TABLE[cycles]
+    orbit = vi.find_orbit(UNDAMPED, near(UNDAMPED, cycles), cycles=cycles, throw=True)
+    assert float(orbit.residual) < 1e-12 and orbit.result == vi.ORBIT_RESULTS.converged
+    assert int(orbit.cycles) == cycles and int(orbit.impacts) == 1 and bool(orbit.admissible)
+    assert bool(orbit.stable) == (cycles == 2)
+    assert orbit.impact_phase.shape == orbit.impact_speed.shape == (1,)
+    assert float(orbit.state.Y) == pytest.approx(Y, abs=1e-6)
+    assert float(orbit.state.V) == pytest.approx(V, abs=1e-6)
+    assert float(orbit.y_min) == pytest.approx(y_min, abs=1e-6)
+    assert float(orbit.impact_phase[0]) == pytest.approx(phase, abs=1e-5)
+    assert float(orbit.impact_speed[0]) == pytest.approx(speed, abs=1e-5)
+    np.testing.assert_allclose(orbit.multipliers.real, np.real(multipliers), atol=1e-6)
+    np.testing.assert_allclose(np.abs(orbit.multipliers.imag), np.imag(multipliers), atol=1e-6)
+    flow = vi.Adaptive(rtol=1e-11)
+    stepped = vi.find_orbit(UNDAMPED, near(UNDAMPED, cycles), cycles=cycles, flow=flow)
+    for a, b in zip(jax.tree.leaves(stepped.state), jax.tree.leaves(orbit.state), strict=True):
+        assert float(a) == pytest.approx(float(b), abs=1e-8)
+    np.testing.assert_allclose(stepped.multipliers, orbit.multipliers, atol=1e-8)
+
+
+@pytest.mark.parametrize("cycles", [1, 2])
+def test_a_grid_of_closed_forms(cycles):
+    zetas = [0.75, 0.9, 1.0, 1.3] if cycles == 1 else [0.86, 0.9, 0.94, 1.0, 1.9, 2.2]
+    grid = [zetas, [0.3, 0.5, 0.8], [1.2, 2.0], [0.0, 0.0448, 0.2]]
+    zeta, k, d, xi = (jnp.asarray(x.ravel()) for x in np.meshgrid(*grid))
+
+    @jax.jit
+    @jax.vmap
+    def both(zeta, k, d, xi):
+        scene = vi.Scene.ideal(frequency_ratio=zeta, restitution=k, gap=d, damping_ratio=xi)
+        closed = vi.closed_form_orbits(scene, cycles=cycles)
+        found = vi.find_orbit(scene, near(scene, cycles, 1e-4), cycles=cycles)
+        trace = jnp.trace(found.monodromy), jnp.linalg.det(found.monodromy)
+        return closed, found, trace
+
+    closed, found, (trace, determinant) = both(zeta, k, d, xi)
+    there = np.asarray(closed.admissible)[:, 0] & (np.asarray(closed.impact_speed)[:, 0] > 0.1)
+    assert there.sum() > (20 if cycles == 1 else 10)
+    assert np.asarray(found.successful)[there].all()
+    for a, b in ((found.state.Y, closed.Y), (found.state.V, closed.V), (found.y_min, closed.y_min)):
+        np.testing.assert_allclose(np.asarray(a)[there], np.asarray(b)[there, 0], atol=1e-10)
+    analytic = np.asarray(closed.multipliers)[there, 0]
+    np.testing.assert_allclose(np.asarray(trace)[there], analytic.sum(-1).real, atol=1e-9)
+    np.testing.assert_allclose(np.asarray(determinant)[there], analytic.prod(-1).real, atol=1e-9)
+    largest = np.abs(np.asarray(found.multipliers)[there, 0])
+    np.testing.assert_allclose(largest, np.abs(analytic).max(-1), atol=1e-9)
+
+
+def test_optax_finds_the_start_without_transient():
+    closed = vi.closed_form_orbits(UNDAMPED, cycles=2)
+    guess = UNDAMPED.start(Y=1.05 * closed.Y[0], V=0.95 * closed.V[0])
+    orbit = vi.find_orbit(UNDAMPED, guess, cycles=2, method=vi.Gradient())
+    assert bool(orbit.successful) and float(orbit.residual) < 1e-6
+    assert float(orbit.history[0]) > 0.1
+    run = vi.simulate(UNDAMPED, orbit.state, 500, method=vi.ExactFlight())
+    for section in (run.sections.Y, run.sections.V):
+        np.testing.assert_allclose(section[2:], section[:-2], atol=1e-5)
+    sgd = vi.find_orbit(UNDAMPED, guess, cycles=2, method=vi.Gradient(optax.sgd(0.05)))
+    assert float(sgd.state.Y) == pytest.approx(float(closed.Y[0]), abs=1e-5)
+
+
+def test_many_guesses_in_one_program():
+    compiled = []
+    draw = np.random.default_rng(0).uniform
+    Y, V = jnp.asarray(draw(-3, 2, 4096)), jnp.asarray(draw(-3, 3, 4096))
+
+    def search(zeta):
+        scene = vi.Scene.ideal(frequency_ratio=zeta, restitution=0.8)
+        return vi.find_orbit(scene, scene.start(Y=Y, V=V), cycles=2)
+
+    first = search(0.9)
+    jax.monitoring.register_event_duration_secs_listener(
+        lambda name, *_, **__: compiled.append(name) if "backend_compile" in name else None
+    )
+    second = search(0.91)
+    jax.block_until_ready(second.state)
+    assert not compiled
+    for batch in (first, second):
+        assert batch.residual.shape == (4096,)
+        orbits, counts = vi.distinct_orbits(batch)
+        assert [int(orbit.cycles) for orbit in orbits] == [1, 2]
+        assert [bool(orbit.stable) for orbit in orbits] == [False, True]
+        assert counts.sum() == int(batch.successful.sum()) > 1500
+        for orbit in orbits:
+            closed = vi.closed_form_orbits(
+                vi.Scene.ideal(frequency_ratio=orbit.scene.drive.frequency_ratio, restitution=0.8),
+                cycles=int(orbit.cycles),
+            )
+            assert float(orbit.y_min) == pytest.approx(float(closed.y_min[0]), abs=1e-9)
+            assert float(orbit.impact_speed[0]) == pytest.approx(float(closed.impact_speed[0]))
+
+
+def quantity(x, name):
+    scene = vi.Scene.ideal(frequency_ratio=x[0], restitution=x[1], damping_ratio=x[2], gap=x[3])
+    orbit = vi.find_orbit(scene, scene.start(Y=1.9, V=-0.9))
+    return {
+        "y_min": orbit.y_min,
+        "V⁻": orbit.impact_speed[0],
+        "largest multiplier": jnp.abs(orbit.multipliers[0]),
+    }[name]
+
+
+@pytest.mark.parametrize("name", ["y_min", "V⁻", "largest multiplier"])
+def test_gradients_by_the_implicit_function_theorem(name):
+    x, h = jnp.array([0.9, 0.5, 0.01, 2.0]), 1e-5
+    value = jax.jit(lambda x: quantity(x, name))
+    gradient = jax.jit(jax.grad(lambda x: quantity(x, name)))(x)
+    difference = [(value(x + h * e) - value(x - h * e)) / (2 * h) for e in jnp.eye(4)]
+    np.testing.assert_allclose(gradient, difference, atol=1e-6)
+
+
+def test_damping_at_which_the_2pi_motion_becomes_stable():
+    """Newton's method on "multiplier = -1", with the derivative of the found orbit."""
+    table = vi.Parameters(restitution=0.5, gap=0.08)
+
+    def excess(damping):
+        xi = damping * (table.scene(drive="ideal").damping_ratio / table.damping)
+        scene = vi.Scene.ideal(frequency_ratio=0.9, damping_ratio=xi)
+        closed = jax.lax.stop_gradient(vi.closed_form_orbits(scene))
+        start = scene.start(Y=closed.Y[0] + 1e-3, V=closed.V[0])
+        return vi.find_orbit(scene, start).multipliers[0].real + 1
+
+    slope = jax.jit(jax.value_and_grad(excess))
+    damping = jnp.asarray(0.1)
+    for _ in range(6):
+        value, rate = slope(damping)
+        damping = damping - value / rate
+    assert abs(float(value)) < 1e-12
+    assert float(damping) == pytest.approx(0.2711, abs=1e-4)  # N·s/m
+    # The closed form says the same.
+    xi = damping * (table.scene(drive="ideal").damping_ratio / table.damping)
+    closed = vi.closed_form_orbits(vi.Scene.ideal(frequency_ratio=0.9, damping_ratio=xi))
+    assert float(closed.multipliers[0].real.min()) == pytest.approx(-1, abs=1e-10)
+
+
+def test_multiple_shooting_where_one_arc_cannot():
+    """200 cycles of the unstable 2π motion amplify rounding by 1.166^200 = 2e13."""
+    closed = vi.closed_form_orbits(UNDAMPED)
+    guess = UNDAMPED.start(Y=closed.Y[0] + 1e-13, V=closed.V[0])
+    one = vi.find_orbit(UNDAMPED, guess, cycles=200)
+    many = vi.find_orbit(UNDAMPED, guess, cycles=200, method=vi.Newton(arcs=20))
+    assert float(many.residual) < 1e-12 and int(many.cycles) == 1
+    assert many.result == vi.ORBIT_RESULTS.smaller_period
+    assert float(many.state.Y) == pytest.approx(float(closed.Y[0]), abs=1e-13)
+    assert not bool(one.successful) and float(one.residual) > 1e-6
+
+
+def test_edges_are_told_apart():
+    results = vi.ORBIT_RESULTS
+    twice = vi.find_orbit(UNDAMPED, near(UNDAMPED, 1), cycles=2)
+    assert twice.result == results.smaller_period and int(twice.cycles) == 1
+    np.testing.assert_allclose(twice.multipliers[0].real, TABLE[1][5][0], atol=1e-6)
+    # Below ζ = 1/√2 the 2π impact motion is not yet born, and the free one passes the stop.
+    scene = vi.Scene.ideal(frequency_ratio=0.72, gap=1.5, restitution=0.8)
+    none = vi.find_orbit(scene, scene.start(Y=-3.0, V=3.0), method=vi.Newton(max_steps=3))
+    assert none.result == results.no_orbit and "no orbit" in str(none)
+    with pytest.raises(Exception, match="No orbit was found"):
+        jax.block_until_ready(
+            vi.find_orbit(
+                scene, scene.start(Y=-3.0, V=3.0), method=vi.Newton(max_steps=3), throw=True
+            )
+        )
+    beyond = vi.find_orbit(
+        UNDAMPED, UNDAMPED.start(Y=jnp.array([2.5, 1.9]), V=jnp.array([0, -0.9]))
+    )
+    assert (beyond.result == results.not_simulated).tolist() == [True, False]
+    assert beyond.successful.tolist() == [False, True]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"cycles": 0}, "`cycles` must be at least 1"),
+        ({"method": vi.Newton(arcs=3), "cycles": 4}, "arcs that divides the 4 cycles"),
+    ],
+)
+def test_says_what_is_wrong(arguments, message):
+    with pytest.raises((TypeError, ValueError), match=message):
+        vi.find_orbit(UNDAMPED, UNDAMPED.start(), **arguments)
+
+
+def test_says_what_is_wrong_with_guess_and_search():
+    with pytest.raises(ValueError, match="`guess` must be finite, but its V is nan"):
+        vi.find_orbit(UNDAMPED, UNDAMPED.start().__class__(jnp.asarray(0.0), jnp.asarray(jnp.nan)))
+    with pytest.raises(ValueError, match="arrays of one length"):
+        vi.find_orbit(UNDAMPED, UNDAMPED.start(Y=jnp.zeros(3), V=jnp.zeros(4)))
+    with pytest.raises(ValueError, match="`tolerance` must be finite and in"):
+        vi.Newton(tolerance=-1.0)
+
+
+def motor(torque, restitution, damping=0.5):
+    return vi.Parameters(
+        torque=torque, kappa=0.9, restitution=restitution, gap=0.08, damping=damping
+    ).scene(drive="motor")
+
+
+@pytest.mark.parametrize("restitution", [0.5, 0.8])
+def test_motor_orbits_are_where_long_simulation_settles(restitution):
+    for torque in (2.0, 10.0, 100.0):
+        scene = motor(torque, restitution)
+        run = vi.simulate(scene, scene.start(), 400, method=vi.Adaptive(rtol=1e-10))
+        last = jax.tree.map(lambda x: x[-1], run.sections)
+        orbit = vi.find_orbit(scene, last, cycles=2)
+        assert bool(orbit.stable) and bool(orbit.admissible)
+        # k = 0.5 settles on a 2π motion, k = 0.8 on the 4π motion.
+        assert int(orbit.cycles) == (1 if restitution == 0.5 else 2)
+        assert float(orbit.y_min) == pytest.approx(float(run.y_min[-2:].min()), abs=1e-8)
+        for a, b in zip(jax.tree.leaves(orbit.state), jax.tree.leaves(last), strict=True):
+            assert float(a) == pytest.approx(float(b), abs=1e-7)
+        assert float(orbit.frequency_ratio) == pytest.approx(
+            float(2 / (1 / run.frequency_ratio[-1] + 1 / run.frequency_ratio[-2])), abs=1e-9
+        )
+
+
+def test_a_strong_motor_approaches_the_ideal_drive_at_first_order():
+    ideal = vi.Parameters(restitution=0.8, gap=0.08).scene(drive="ideal")
+    ideal = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.8, damping_ratio=ideal.damping_ratio)
+    closed = vi.closed_form_orbits(ideal, cycles=2)
+    apart, torques = [], np.array([50.0, 100.0, 200.0, 400.0])
+    for torque in torques:
+        scene = motor(torque, 0.8)
+        guess = scene.start(Y=closed.Y[0], V=closed.V[0])
+        orbit = vi.find_orbit(scene, guess, cycles=2)
+        assert bool(orbit.successful) and int(orbit.cycles) == 2
+        apart.append(abs(float(orbit.y_min - closed.y_min[0])))
+    slope = np.polyfit(np.log(torques), np.log(apart), 1)[0]
+    assert slope == pytest.approx(-1, abs=0.05)
