@@ -232,14 +232,15 @@ def _agrees(cases) -> Claim:
 
 def _no_transient(cases) -> Claim:
     case, damped = cases
-    states = half_turn_states(case.from_long)
+    states = half_turn_states(case.from_fit)
     worst = float(np.abs(states - states[np.arange(len(states)) % 2]).max())
-    left = _settling(damped.from_long, damped.on_short, 1, 0)
+    left = _settling(damped.from_fit, damped.on_short, 1, 0)
     return Claim(
         "no transient from the 4π state",
         "Fig. 4 a, b, c",
         "With accurate initial conditions the motion has the period 4π from the start.",
-        f"Over {len(states)} cycles the states at φ = π differ from those of the first two cycles "
+        f"From initial conditions fitted by gradient, over {len(states)} cycles the states at "
+        "φ = π differ from those of the first two cycles "
         f"by at most {worst:.1e}. Damped the same start leads to the 2π motion, from cycle {left} "
         "on.",
         _verdict(worst < 1e-8, left is None),

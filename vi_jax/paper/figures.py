@@ -34,12 +34,12 @@ def draw_figure(number: int, cases: tuple[Case, Case], path: Path) -> None:
 
 
 def _title(number: int) -> str:
-    begins = "from rest (Y = V = 0)" if number == 3 else "from the 4π closed-form state"
+    begins = "from rest (Y = V = 0)" if number == 3 else "from the 4π state fitted by optax"
     return f"Fig. {number} of the paper: ζ = 0.90, k = 0.50, Δ = 2a, ideal drive, {begins}"
 
 
 def _draw_row(number: int, case: Case, axes: list[Axes]) -> None:
-    run = case.from_rest if number == 3 else case.from_long
+    run = case.from_rest if number == 3 else case.from_fit
     cycles = run.impacts.shape[0]
     ratio = float(case.scene.damping_ratio)
     named = "undamped, ξ = 0" if case.name == "undamped" else f"Table 1, ξ = {ratio:.4f}"
