@@ -1,0 +1,131 @@
+"""Pseudo-arclength: a curve of solutions of n - 1 equations in n unknowns, followed by steps."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+Vector = Float[Array, " n"]
+
+
+class Step(NamedTuple):
+    """A point of the curve, as one corrector finds it."""
+
+    x: Vector
+    tangent: Vector
+    """Unit tangent in scaled unknowns, in the sense of the step."""
+    size: Float[Array, ""]
+    """Largest component of the last correction (scaled)."""
+    iterations: Int[Array, ""]
+    good: Bool[Array, ""]
+    seen: Any
+
+
+def corrected(
+    residual: Callable[[Vector], Vector],
+    observe: Callable[[Vector, Vector], Any],
+    x: Vector,
+    tangent: Vector,
+    scale: Vector,
+    length: Float[Array, ""],
+    *,
+    tolerance: float = 1e-11,
+) -> Step:
+    """The point of the curve on the plane that lies `length` along the tangent from `x`.
+
+    Newton's method on the equations and the plane. Nothing is close to singular at a fold, since
+    the parameter is one of the unknowns.
+
+    **Arguments:** the equations; what to observe, of a point and its tangent; the last point and
+    its unit tangent in unknowns divided by `scale`; the length of the step.
+    """
+
+    def plane(y):
+        return jnp.dot(tangent, y - y0)
+
+    def equations(y):
+        missing = jnp.concatenate([residual(y * scale), plane(y)[None]])
+        return missing, missing
+
+    def newton(carry):
+        y, _, count = carry
+        jacobian, missing = jax.jacfwd(equations, has_aux=True)(y)
+        move = jnp.linalg.solve(jacobian, missing)
+        return y - move, jnp.max(jnp.abs(move)), count + 1
+
+    def going(carry):
+        _, size, count = carry
+        return (size > tolerance) & (size < 10.0) & (count < 12)
+
+    y0 = x / scale + length * tangent
+    start = (y0, jnp.ones((), x.dtype), jnp.zeros((), jnp.int32))
+    y, size, count = jax.lax.while_loop(going, newton, start)
+    jacobian, _ = jax.jacfwd(equations, has_aux=True)(y)
+    along = jnp.zeros_like(y).at[-1].set(1.0)
+    along = jnp.linalg.solve(jacobian, along)
+    along = along / jnp.linalg.norm(along)
+    # Rounding may keep the last correction above the tolerance where the curve is steep.
+    good = (size <= 1e3 * tolerance) & jnp.all(jnp.isfinite(along))
+    return Step(y * scale, along, size, count, good, observe(y * scale, along))
+
+
+def first_tangent(residual: Callable[[Vector], Vector], x: Vector, scale: Vector) -> Vector:
+    """Unit tangent (scaled) at a point that solves the equations, the last unknown rising."""
+    jacobian = jax.jacfwd(lambda y: residual(y * scale))(x / scale)
+    tangent = jnp.linalg.svd(jacobian, full_matrices=True)[2][-1]
+    return tangent * jnp.where(tangent[-1] < 0, -1.0, 1.0)
+
+
+class Walk(NamedTuple):
+    """Points met on the way in one direction, the first one included."""
+
+    steps: list[Step]
+    end: str
+    """Why it ended."""
+
+
+def walk(
+    advance: Callable[[Vector, Vector, float], Step],
+    start: Step,
+    *,
+    stop: Callable[[Step, Step], tuple[Step, str] | None],
+    step: float,
+    max_step: float,
+    max_points: int,
+) -> Walk:
+    """Follow the curve from `start` in the sense of its tangent. Host-side.
+
+    **Arguments:** `advance`, the compiled corrector; `stop`, asked after each step, which may name
+    a reason to end and the last point; the first and the longest step length.
+    """
+    steps, length = [start], step
+    while len(steps) < max_points:
+        here = steps[-1]
+        new = advance(here.x, here.tangent, length)
+        turn = float(np.dot(np.asarray(new.tangent), np.asarray(here.tangent)))
+        if not bool(new.good) or turn < 0.9:
+            length *= 0.4
+            if length < 1e-9:
+                return Walk(steps, "stalled")
+            continue
+        ending = stop(here, new)
+        if ending is not None:
+            last, reason = ending
+            if last is not here:
+                steps.append(last)
+            return Walk(steps, reason)
+        steps.append(new)
+        if turn > 0.99 and int(new.iterations) <= 5:
+            length = min(1.4 * length, max_step)
+        elif turn < 0.97:
+            length *= 0.7
+    return Walk(steps, "max_points")
+
+
+def array_of(tree: Any) -> Any:
+    """Host copies of a compiled call's results, so that what follows costs no dispatch."""
+    return jax.tree.map(lambda x: np.asarray(x) if eqx.is_array(x) else x, tree)

@@ -1,0 +1,318 @@
+"""A periodic motion as a smooth system of equations: its impacts in a given order.
+
+The cycle map has no derivative where an impact grazes. From impact to impact it has: with the
+order of the impacts given, the unknowns are the clock and the state at each of them, the equations
+say that the flight from one leads to the next, and nothing has to be detected. Such a solution
+passes smoothly through V⁻ = 0 and through a touch of the stop; on the far side it is a motion that
+the stop forbids, and is told so by the sign of V⁻ or of the clearance. (The same idea carries
+`hspo` of COCO.)
+"""
+
+import dataclasses
+from math import ceil
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Complex, Float
+
+from ..flow import AbstractMethod, ExactFlight, FixedStep
+from ..flow.events import rates
+from ..scene import AbstractScene
+from ..scene.leaves import with_leaf
+from .floquet import multipliers_of
+
+Vector = Float[Array, " n"]
+
+
+class _Hit(NamedTuple):
+    """What a stop asks of an impact, in numbers."""
+
+    gap: Any
+    restitution: Any
+    sign: Any
+
+
+class Observed(NamedTuple):
+    """What is said about a solution."""
+
+    multipliers: Complex[Array, " states"]
+    monodromy: Float[Array, "states states"]
+    approach: Float[Array, " impacts"]
+    """V⁻ at each impact; negative where the impact has become impossible."""
+    y_min: Float[Array, ""]
+    y_max: Float[Array, ""]
+    clearance: Float[Array, ""]
+    """Distance to the stop at the turn nearest to one; negative where it is passed through."""
+    touch: Float[Array, ""]
+    """Clock of that turn."""
+    duration: Float[Array, ""]
+
+
+class Shooting(eqx.Module):
+    """The equations of an orbit with given impacts.
+
+    Unknowns, in one vector: the clock at each impact, the state just before each, and then the
+    parameters named. A motion without impacts has its state at the clock's zero instead.
+    """
+
+    scene: AbstractScene
+    flow: AbstractMethod
+    like: Any
+    """A state, for its structure."""
+    cycles: int = eqx.field(static=True)
+    stops: tuple[int, ...] = eqx.field(static=True)
+    """The stop of each impact, in their order."""
+    steps: int = eqx.field(static=True)
+    """Steps of a flight."""
+    parameters: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns, parameters included."""
+        legs = max(1, len(self.stops))
+        return legs * self.states + len(self.stops) + len(self.parameters)
+
+    @property
+    def states(self) -> int:
+        """Number of state components."""
+        return len(jtu.tree_leaves(self.like))
+
+    def at(self, x: Vector) -> AbstractScene:
+        """The scene with the parameters of `x`."""
+        scene = self.scene
+        count = len(self.parameters)
+        for i, name in enumerate(self.parameters):
+            scene = with_leaf(scene, name, x[x.shape[0] - count + i])
+        return scene
+
+    def parts(self, x: Vector) -> tuple[Float[Array, " legs"], Float[Array, "legs states"]]:
+        """Clock and state at the start of each leg (before its impact)."""
+        legs = len(self.stops)
+        if not legs:
+            return jnp.zeros((1,), x.dtype), x[: self.states][None]
+        end = legs * (1 + self.states)
+        return x[:legs], x[legs:end].reshape(legs, self.states)
+
+    def pack(self, clock: Any, states: Any, parameters: Any) -> Vector:
+        """The vector of unknowns."""
+        clock = jnp.asarray(clock) if self.stops else jnp.zeros((0,))
+        return jnp.concatenate([clock, jnp.ravel(states), jnp.ravel(jnp.asarray(parameters))])
+
+    def unravel(self, u: Vector) -> Any:
+        """A state from its vector."""
+        return ravel_pytree(self.like)[1](u)
+
+    def hit(self, scene: AbstractScene, leg: Any) -> _Hit | None:
+        """The stop of the impact that begins a leg, whose number may be traced."""
+        if not self.stops:
+            return None
+        which = jnp.asarray(self.stops)[leg]
+        gap, restitution, sign = (
+            jnp.stack([jnp.asarray(value(stop)) for stop in scene.stops])[which]
+            for value in (lambda x: x.gap, lambda x: x.restitution, lambda x: float(x.sign))
+        )
+        return _Hit(gap, restitution, sign)
+
+    def bounced(self, scene: AbstractScene, leg: Any, u: Vector, *, keep: bool = False) -> Vector:
+        """The state after the impact that begins a leg; `keep` leaves the position as it is."""
+        stop = self.hit(scene, leg)
+        if stop is None:
+            return u
+        state = self.unravel(u)
+        Y = scene.position(state) if keep else stop.sign * stop.gap
+        return ravel_pytree(scene.placed(state, Y, -stop.restitution * scene.velocity(state)))[0]
+
+    def ends(self, clock: Float[Array, " legs"], scene: AbstractScene) -> Float[Array, " legs"]:
+        """Clock at the end of each leg."""
+        turn = jnp.asarray(scene.cycle, clock.dtype) * self.cycles
+        return jnp.concatenate([clock[1:], clock[:1] + turn])
+
+    def flight(
+        self, scene: AbstractScene, s0: Array, s1: Array, u: Vector
+    ) -> tuple[Vector, Array, tuple[Array, Float[Array, "steps states"]]]:
+        """State and elapsed time at the end of a flight, and clock and state along it."""
+        h = (s1 - s0) / self.steps
+
+        def step(carry, i):
+            u, time = carry
+            s = s0 + i * h
+            return self._step(scene, s, s + h, u, time), (s, u)
+
+        places = jnp.arange(self.steps, dtype=u.dtype)
+        (end, time), path = jax.lax.scan(step, (u, jnp.zeros_like(h)), places)
+        return end, time, path
+
+    def _step(self, scene, s0, s1, u, time) -> tuple[Vector, Array]:
+        """One step of the method. Runge–Kutta stages stay a loop, as diffrax has them: written
+        out, as for the flat loop, their derivatives would compile for minutes."""
+        flow = self.flow
+        if not isinstance(flow, FixedStep):
+            new, _, _ = flow.step(scene, s0, s1, self.unravel(u), None, jnp.ones_like(s0))
+            return ravel_pytree(new)[0], time + (s1 - s0)
+
+        def field(s, y, args):
+            state = self.unravel(y[:-1])
+            pace = scene.pace(s, state)
+            rate = ravel_pytree(scene.field(s, state))[0]
+            return jnp.append(rate, jnp.ones_like(s) if pace is None else pace)
+
+        solver = dataclasses.replace(flow.solver.solver, scan_kind="lax")  # which jvp can pass
+        term, y0 = diffrax.ODETerm(field), jnp.append(u, time)
+        memory = solver.init(term, s0, s1, y0, None)
+        y1, *_ = solver.step(term, s0, s1, y0, None, memory, made_jump=True)
+        return y1[:-1], y1[-1]
+
+    def residual(self, x: Vector) -> Vector:
+        """What the flights from impact to impact lack; zero for a periodic motion."""
+        scene = self.at(x)
+        clock, states = self.parts(x)
+
+        def arrive(leg, s0, s1, u):
+            end, _, _ = self.flight(scene, s0, s1, self.bounced(scene, leg, u))
+            stop = self.hit(scene, leg)
+            if stop is None:
+                return end, jnp.zeros((0,), x.dtype)
+            return end, (stop.sign * scene.position(self.unravel(u)) - stop.gap)[None]
+
+        legs = jnp.arange(len(states))
+        arrived, away = jax.vmap(arrive)(legs, clock, self.ends(clock, scene), states)
+        return jnp.concatenate([(arrived - jnp.roll(states, -1, axis=0)).ravel(), away.ravel()])
+
+    def observe(self, x: Vector) -> Observed:
+        """Multipliers, extremes and the distances to grazing of a solution."""
+        scene = self.at(x)
+        clock, states = self.parts(x)
+
+        def follow(leg, s0, s1, u):
+            def end(u):
+                end, time, path = self.flight(scene, s0, s1, u)
+                return end, (time, path)
+
+            carried, (time, path) = jax.jacfwd(end, has_aux=True)(self.bounced(scene, leg, u))
+            if self.stops:
+                carried = carried @ self._saltation(scene, leg, s0, u)
+            return carried, time, self._turns(scene, s1, path)
+
+        legs = jnp.arange(len(states))
+        carried, time, turns = jax.vmap(follow)(legs, clock, self.ends(clock, scene), states)
+        monodromy = jnp.eye(self.states, dtype=x.dtype)
+        for leg in range(len(states)):
+            monodromy = carried[leg] @ monodromy
+        low, high, room, touch = turns
+        Y = jax.vmap(lambda u: scene.position(self.unravel(u)))(states)
+        approach = jnp.zeros((0,), x.dtype)
+        if self.stops:
+            V = jax.vmap(lambda u: scene.velocity(self.unravel(u)))(states)
+            approach = jnp.array([scene.stops[i].sign for i in self.stops], x.dtype) * V
+        nearest = jnp.argmin(room)
+        return Observed(
+            multipliers=multipliers_of(monodromy),
+            monodromy=monodromy,
+            approach=approach,
+            y_min=jnp.minimum(jnp.min(Y), jnp.min(low)),
+            y_max=jnp.maximum(jnp.max(Y), jnp.max(high)),
+            clearance=room[nearest],
+            touch=touch[nearest],
+            duration=jnp.sum(time),
+        )
+
+    def _saltation(self, scene, leg, s, u):
+        """How a perturbation passes an impact: R + (f⁺ - R f⁻) ∇g / (∇g·f⁻)."""
+
+        def field(u):
+            return ravel_pytree(scene.field(s, self.unravel(u)))[0]
+
+        def reset(u):
+            return self.bounced(scene, leg, u, keep=True)
+
+        jacobian = jax.jacfwd(reset)(u)
+        before, after = field(u), field(reset(u))
+        slope = jax.grad(lambda u: scene.position(self.unravel(u)))(u)
+        return jacobian + jnp.outer(after - jacobian @ before, slope) / jnp.dot(slope, before)
+
+    def state_at(self, x: Vector, leg: Any, s: Array) -> Any:
+        """The state at clock `s`, which lies in leg number `leg`."""
+        scene = self.at(x)
+        clock, states = self.parts(x)
+        return self.unravel(
+            self.flight(scene, clock[leg], s, self.bounced(scene, leg, states[leg]))[0]
+        )
+
+    def _turns(self, scene, s1, path):
+        """Least and greatest Y at the turning points of a leg; the smallest room at one, and where.
+
+        Where the velocity changes sign within a step, Newton's method from the step's start.
+        """
+        places, states = path
+        h = (s1 - places[0]) / self.steps
+
+        def velocity(u):
+            return scene.velocity(self.unravel(u))
+
+        def turn(s, u, v0, v1):
+            turns = v0 * v1 < 0
+
+            def at(scene, s, u, length):
+                new, _ = self._step(scene, s, s + length, u, jnp.zeros_like(s))
+                return rates(scene.field, scene.position, s + length, self.unravel(new))
+
+            held = jax.lax.stop_gradient((scene, s, u))
+            limit = jax.lax.stop_gradient(h)
+
+            def newton(_, length):
+                here = at(*held, length)
+                bend = jnp.where(here.a == 0, 1.0, here.a)
+                return jnp.clip(length - here.v / bend, 0.0, limit)
+
+            share = jnp.where(turns, v0 / jnp.where(turns, v0 - v1, 1.0), 0.5)
+            length = jax.lax.fori_loop(0, 4, newton, jax.lax.stop_gradient(h * share))
+            here = at(scene, s, u, length)
+            bend = jnp.where(here.a == 0, 1.0, here.a)
+            return turns, here.x - 0.5 * here.v**2 / bend, s + length - here.v / bend, v0
+
+        v = jax.vmap(velocity)(states)
+        # The end of the last step is the next impact: its velocity is that of a further step.
+        last, _ = self._step(scene, places[-1], places[-1] + h, states[-1], jnp.zeros_like(h))
+        v1 = jnp.concatenate([v[1:], velocity(last)[None]])
+        turns, height, place, v0 = jax.vmap(turn)(places, states, v, v1)
+        low = jnp.min(jnp.where(turns, height, jnp.inf))
+        high = jnp.max(jnp.where(turns, height, -jnp.inf))
+        room, touch = jnp.full((), jnp.inf, h.dtype), jnp.zeros((), h.dtype)
+        for stop in scene.stops:
+            rooms = jnp.where(turns & (stop.sign * v0 > 0), stop.gap - stop.sign * height, jnp.inf)
+            nearest = jnp.argmin(rooms)
+            touch = jnp.where(rooms[nearest] < room, place[nearest], touch)
+            room = jnp.minimum(room, rooms[nearest])
+        return low, high, room, touch
+
+
+def carrier(flow: AbstractMethod | None, scene: AbstractScene) -> AbstractMethod:
+    """A method of fixed steps, which a smooth system of equations needs.
+
+    `ExactFlight` where it applies; else a Runge–Kutta method of 32 steps a cycle (Dopri8's error
+    there is 1e-13), with the solver of `flow` if it has one.
+    """
+    if flow is None or isinstance(flow, ExactFlight):
+        try:
+            ExactFlight().check(scene)
+        except ValueError:
+            return FixedStep(diffrax.Dopri8(), 32)
+        return ExactFlight()
+    if isinstance(flow, FixedStep):
+        return flow
+    return FixedStep(getattr(flow, "solver", diffrax.Dopri8()), 32)
+
+
+def steps_of(flow: AbstractMethod, scenes: list[AbstractScene], like: Any, cycles: int) -> int:
+    """Steps that a flight over the whole period needs, in the most demanding of the scenes."""
+    # Turning points are looked for between steps: more of them than flying needs.
+    most = max(flow.steps_per_cycle, 16)
+    for scene in scenes:
+        limit = flow.limited(scene, scene.step_limit(jnp.zeros(()), like))
+        most = max(most, ceil(1.02 * float(scene.cycle / limit)))
+    return most * cycles

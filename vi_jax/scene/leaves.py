@@ -1,0 +1,52 @@
+"""Numbers of a scene by name: `"drive.frequency_ratio"`, `"stops.0.gap"`, …"""
+
+import difflib
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Float
+
+
+def leaf_names(tree: Any) -> list[str]:
+    """Names of all numbers in a scene (or another pytree), in the order of its leaves."""
+    return [name for name, _ in _named(tree)]
+
+
+def leaf(tree: Any, name: str) -> Float[Array, "..."]:
+    """The number of that name. **Raises:** `ValueError` that lists the near names."""
+    return dict(_named(tree))[check_leaf(tree, name)]
+
+
+def with_leaf(tree: Any, name: str, value: Any) -> Any:
+    """The same scene with another number in place of that name; traced values pass."""
+    index = leaf_names(tree).index(check_leaf(tree, name))
+    leaves, treedef = jtu.tree_flatten(tree)
+    arrays = [i for i, x in enumerate(leaves) if eqx.is_array_like(x)]
+    old = leaves[arrays[index]]
+    leaves[arrays[index]] = jnp.asarray(value, jnp.result_type(old))
+    return jtu.tree_unflatten(treedef, leaves)
+
+
+def check_leaf(tree: Any, name: str, *, argument: str = "parameter") -> str:
+    """`name`, if the scene has such a number."""
+    names = leaf_names(tree)
+    if name in names:
+        return name
+    near = difflib.get_close_matches(str(name), names, n=3, cutoff=0.3)
+    ending = [other for other in names if str(name).split(".")[-1] in other]
+    near = list(dict.fromkeys(ending + near))
+    hint = f"near names: {', '.join(near)}" if near else f"its names: {', '.join(names)}"
+    raise ValueError(
+        f"Argument `{argument}` must be a number of the scene, but got {name!r}; {hint}."
+    )
+
+
+def _named(tree: Any) -> list[tuple[str, Any]]:
+    named = []
+    for path, value in jtu.tree_leaves_with_path(tree):
+        if eqx.is_array_like(value):
+            words = (str(getattr(key, "name", getattr(key, "idx", key))) for key in path)
+            named.append((".".join(words), value))
+    return named
