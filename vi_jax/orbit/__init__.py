@@ -1,5 +1,10 @@
 """Periodic motion: the cycle map, closed-form solutions, finding orbits and judging them."""
 
+from .boundary import Boundary as Boundary
+from .boundary import boundary as boundary
+from .branch import Branch as Branch
+from .branch import SpecialPoint as SpecialPoint
+from .branch import continue_orbit as continue_orbit
 from .closed_form import ClosedFormOrbits as ClosedFormOrbits
 from .closed_form import closed_form_orbits as closed_form_orbits
 from .cycle_map import CycleMap as CycleMap

@@ -106,7 +106,7 @@ class Branch:
 
     def orbit(self, index: int) -> Orbit:
         """The motion at one point."""
-        return _orbit_of(self.problem, self.steps[index])
+        return orbit_of(self.problem, self.steps[index])
 
     def to_xarray(self) -> Any:
         """The branch as an `xarray.Dataset` over its points (needs xarray)."""
@@ -313,7 +313,7 @@ def _compiled_state(problem, x, leg, s):
     return problem.state_at(x, leg, s)
 
 
-def _orbit_of(problem: Shooting, step: Step) -> Orbit:
+def orbit_of(problem: Shooting, step: Step) -> Orbit:
     """The solution at a step as an `Orbit`."""
     x, seen = jnp.asarray(step.x), step.seen
     scene = problem.at(x)
@@ -423,11 +423,13 @@ class _Follower:
             return None
         root = float(brentq(value, 0.0, length, xtol=1e-14, rtol=1e-14, maxiter=80))  # pyright: ignore
         value(root)
-        return at[root] if bool(at[root].good) else None
+        # Where branches cross the corrector has no answer; a point beside it will do.
+        good = [step for step in at.values() if bool(step.good)]
+        return min(good, key=lambda step: abs(test(step)), default=None)
 
     def _point(self, kind: str, step: Step, detail: str, impact: int | None = None) -> SpecialPoint:
         return SpecialPoint(
-            kind, float(step.x[-1]), _orbit_of(self.problem, step), detail, self.problem, step,
+            kind, float(step.x[-1]), orbit_of(self.problem, step), detail, self.problem, step,
             self.scale, impact,
         )  # fmt: skip
 
@@ -537,7 +539,7 @@ def _doubled(point: SpecialPoint, distance: float) -> Orbit:
         raise ValueError(
             f"No motion of twice the period was found at distance {distance:g}; try another."
         )
-    return _orbit_of(new, step)
+    return orbit_of(new, step)
 
 
 @eqx.filter_jit
@@ -584,7 +586,7 @@ def _beyond_grazing(point: SpecialPoint, distance: float) -> Orbit:
         if not bool(found.good):
             continue
         if found.seen.clearance > 0 and min(found.seen.approach, default=1.0) > 0:
-            return _orbit_of(new, found)
+            return orbit_of(new, found)
     raise ValueError(
         "Beyond this grazing there is no admissible motion with "
         f"{len(stops)} impacts at distance {distance:g}."

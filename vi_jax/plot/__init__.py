@@ -1,5 +1,8 @@
 """Pictures of motions: every function takes an `ax`, or makes one, and returns it."""
 
+from .branch import plot_boundary as plot_boundary
+from .branch import plot_branch as plot_branch
+from .branch import plot_sweep as plot_sweep
 from .motion import plot_history as plot_history
 from .motion import plot_phase_portrait as plot_phase_portrait
 from .orbit import plot_multipliers as plot_multipliers

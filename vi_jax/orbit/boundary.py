@@ -1,0 +1,207 @@
+"""`boundary`: curves of folds, period doublings and grazings in two parameters."""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from .._checks import count
+from ..scene.leaves import check_leaf, leaf
+from .branch import (
+    CROSSING,
+    DOUBLING,
+    FOLD,
+    GRAZING,
+    SpecialPoint,
+    orbit_of,
+)
+from .curve import Step, array_of, corrected, first_tangent, walk
+from .results import Orbit
+from .shooting import Shooting, steps_of
+
+
+@dataclasses.dataclass(frozen=True)
+class Boundary:
+    """A curve in two parameters along which an orbit bifurcates: host arrays, a row a point."""
+
+    kind: str
+    """"fold", "period-doubling", "branch-point" or "grazing"."""
+    names: tuple[str, str]
+    """Names of the two parameters."""
+    parameters: np.ndarray
+    """Their values; (points, 2)."""
+    y_min: np.ndarray
+    """Smallest Y (unit: a)."""
+    multipliers: np.ndarray
+    """Floquet multipliers over the period; (points, states)."""
+    impact_speed: np.ndarray
+    """V⁻ of each impact (unit: a ω); (points, impacts)."""
+    clearance: np.ndarray
+    """Smallest distance to a stop at a turn that does not touch it (unit: a)."""
+    ends: tuple[str, str]
+    """Why the curve ends on each side: "bounds", "grazing" (an impact more or less), "stalled",
+    "max_points"."""
+    problem: Shooting = dataclasses.field(repr=False)
+    steps: list[Step] = dataclasses.field(repr=False)
+
+    def orbit(self, index: int) -> Orbit:
+        """The motion at one point."""
+        return orbit_of(self.problem, self.steps[index])
+
+    def __str__(self) -> str:
+        low, high = self.parameters.min(axis=0), self.parameters.max(axis=0)
+        return (
+            f"Curve of {len(self.parameters)} points of {self.kind}: {self.names[0]} in "
+            f"[{low[0]:.6g}, {high[0]:.6g}], {self.names[1]} in [{low[1]:.6g}, {high[1]:.6g}]; "
+            f"ends: {self.ends[0]}, {self.ends[1]}"
+        )
+
+
+def boundary(
+    point: SpecialPoint,
+    *,
+    parameter: str,
+    bounds: tuple[tuple[float, float], tuple[float, float]],
+    step: float = 0.01,
+    max_step: float = 0.05,
+    max_points: int = 1000,
+) -> Boundary:
+    """Follow a bifurcation of a branch in a second parameter, both ways.
+
+    Pseudo-arclength on the orbit's equations together with the condition that makes the point
+    special: det(M - I) = 0 for a fold, det(M + I) = 0 for a period doubling, V⁻ = 0 or a clearance
+    of zero for a grazing. Host-side: not to be traced.
+
+    **Arguments:**
+
+    - `point`: from `Branch.special`; its parameter is the first of the two.
+    - `parameter`: name of the second.
+    - `bounds`: intervals of the first and of the second parameter.
+    - `step`, `max_step`, `max_points`: as for `continue_orbit`, parameters in half their intervals.
+
+    **Returns:** a `Boundary`. It ends where the motion ceases to be one (another impact grazes).
+
+    **Raises:** `ValueError` if the point is of another kind, outside the bounds, or the name
+    unknown or the same.
+    """
+    if point.kind not in (FOLD, DOUBLING, CROSSING, GRAZING):
+        raise ValueError(
+            "Argument `point` must be a fold, a period doubling or a grazing, but is a "
+            f"{point.kind}."
+        )
+    old = point.problem
+    check_leaf(old.scene, parameter)
+    names = (old.parameters[0], parameter)
+    if names[0] == names[1]:
+        raise ValueError(f"Argument `parameter` must be another one than {names[0]}.")
+    count("max_points", max_points, least=2)
+    values = (point.parameter, float(leaf(old.scene, parameter)))
+    for name, value, (low, high) in zip(names, values, bounds, strict=True):
+        if not low <= value <= high:
+            raise ValueError(
+                f"Argument `bounds` must hold the point's {name} = {value:g}, but is "
+                f"({low:g}, {high:g})."
+            )
+    corners = []
+    for a in bounds[0]:
+        for b in bounds[1]:
+            probe = dataclasses.replace(old, parameters=names)
+            corners.append(probe.at(jnp.asarray([a, b])))
+    steps = max(old.steps, steps_of(old.flow, corners, old.like, old.cycles))
+    problem = dataclasses.replace(old, parameters=names, steps=steps)
+    x = np.append(np.asarray(point.step.x)[:-1], values)
+    scale = np.ones(problem.size)
+    scale[-2:] = [0.5 * (high - low) for low, high in bounds]
+    condition = _Condition(problem, point.kind, point.impact)
+    tangent = np.asarray(_tangent(condition, jnp.asarray(x), jnp.asarray(scale)))
+
+    def advance(x: Any, tangent: Any, length: float) -> Step:
+        arguments = (jnp.asarray(a) for a in (x, tangent, scale, length))
+        return array_of(_advance(condition, *arguments))
+
+    start = advance(x, tangent, 0.0)
+    if not bool(start.good):
+        raise ValueError(
+            "Argument `point` could not be refined in two parameters (last correction "
+            f"{float(start.size):.2g})."
+        )
+
+    def stop(here: Step, new: Step) -> tuple[Step, str] | None:
+        inside = all(
+            low <= value <= high for value, (low, high) in zip(new.x[-2:], bounds, strict=True)
+        )
+        if not inside:
+            return _cut(advance, here, new, bounds), "bounds"
+        others = [v for i, v in enumerate(new.seen.approach) if i != condition.impact]
+        if min(others, default=1.0) <= 0:
+            return here, "grazing"
+        touching = point.kind == GRAZING and condition.impact is None
+        if not touching and new.seen.clearance < 0:
+            return here, "grazing"
+        return None
+
+    settings = {"step": step, "max_step": max_step, "max_points": max_points}
+    forward = walk(advance, start, stop=stop, **settings)
+    backward = walk(advance, start._replace(tangent=-start.tangent), stop=stop, **settings)
+    path = [*reversed(backward.steps[1:]), *forward.steps]
+    return Boundary(
+        kind=point.kind,
+        names=names,
+        parameters=np.stack([step.x[-2:] for step in path]),
+        y_min=np.array([step.seen.y_min for step in path]),
+        multipliers=np.stack([step.seen.multipliers for step in path]),
+        impact_speed=np.stack([step.seen.approach for step in path]),
+        clearance=np.array([step.seen.clearance for step in path]),
+        ends=(backward.end, forward.end),
+        problem=problem,
+        steps=path,
+    )
+
+
+class _Condition(eqx.Module):
+    """The equations of an orbit and what makes it special."""
+
+    problem: Shooting
+    kind: str = eqx.field(static=True)
+    impact: int | None = eqx.field(static=True)
+
+    def residual(self, x):
+        missing, seen = self.problem.residual(x), self.problem.observe(x)
+        identity = jnp.eye(seen.monodromy.shape[0], dtype=x.dtype)
+        if self.kind == GRAZING:
+            extra = seen.clearance if self.impact is None else seen.approach[self.impact]
+        elif self.kind == DOUBLING:
+            extra = jnp.linalg.det(seen.monodromy + identity)
+        else:
+            extra = jnp.linalg.det(seen.monodromy - identity)
+        return jnp.append(missing, extra)
+
+
+@eqx.filter_jit
+def _tangent(condition: _Condition, x, scale):
+    return first_tangent(condition.residual, x, scale)
+
+
+@eqx.filter_jit
+def _advance(condition: _Condition, x, tangent, scale, length) -> Step:
+    def observe(x, tangent):
+        return condition.problem.observe(x)
+
+    return corrected(condition.residual, observe, x, tangent, scale, length)
+
+
+def _cut(advance: Any, here: Step, new: Step, bounds: Any) -> Step:
+    """The last point inside the bounds, by halving the step."""
+    low, high = 0.0, float(np.linalg.norm(new.x - here.x))
+    last = here
+    for _ in range(30):
+        middle = 0.5 * (low + high)
+        step = advance(here.x, here.tangent, middle)
+        inside = bool(step.good) and all(
+            a <= value <= b for value, (a, b) in zip(step.x[-2:], bounds, strict=True)
+        )
+        low, high = (middle, high) if inside else (low, middle)
+        last = step if inside else last
+    return last

@@ -1,0 +1,134 @@
+"""`sweep`: a parameter changed little by little, the motion carried from value to value."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from .._checks import concrete, count
+from ..flow import RESULTS, AbstractMethod, simulate
+from ..orbit.cycle_map import default_flow
+from ..scene import AbstractScene, Scene
+from ..scene.leaves import check_leaf, with_leaf
+from .regime import least_period
+
+
+class Sweep(eqx.Module):
+    """What a sweep settled on at each value, in their order. Under `vmap` batch axes come first."""
+
+    values: Float[Array, " values"]
+    """The parameter."""
+    y_min: Float[Array, " values"]
+    """Smallest Y over the cycles observed (unit: a)."""
+    y_max: Float[Array, " values"]
+    """Largest Y over the cycles observed (unit: a)."""
+    period: Int[Array, " values"]
+    """Period in drive cycles, 0 if none was found."""
+    impacts: Float[Array, " values"]
+    """Impacts in a period; in a cycle, on average, where there is no period."""
+    frequency_ratio: Float[Array, " values"] | None
+    """ζ: mean crank speed (unit: ω); `None` for scenes that are not driven."""
+    impact_speed: Float[Array, " values"]
+    """Greatest V⁻ over the cycles observed (unit: a ω)."""
+    sections: Any
+    """Section states of the cycles observed; leaves (values, cycles)."""
+    result: RESULTS
+    """Whether each value was simulated to its end."""
+
+    @property
+    def successful(self) -> Bool[Array, " values"]:
+        """Whether each value was simulated to its end."""
+        return self.result == RESULTS.successful
+
+
+def sweep(
+    scene: AbstractScene,
+    parameter: str,
+    values: Any,
+    *,
+    start: Any = None,
+    settle: int = 200,
+    cycles: int = 32,
+    method: AbstractMethod | None = None,
+    clock: str | None = None,
+    tolerance: float = 1e-6,
+    max_steps: int | None = None,
+) -> Sweep:
+    """Quasi-static sweep: run-up with rising values, close-down with falling ones.
+
+    At each value the motion goes on from where it was at the one before (what the paper calls the
+    continuation method), so that it keeps to its branch until that ends: up and down show
+    hysteresis. Clean under `jit` and `vmap` (over other parameters, starts, or values).
+
+    **Arguments:**
+
+    - `scene`, `parameter`: the scene and the name of the number that is changed, such as
+      `"drive.frequency_ratio"`.
+    - `values`: its values in the order of the sweep.
+    - `start`: state at the first value; by default at rest (a motor at its no-load speed).
+    - `settle`, `cycles`: drive cycles at each value before observing, and observed; static.
+    - `method`, `clock`: as for `simulate`; by default `ExactFlight` where it applies, else
+      `Adaptive(rtol=1e-11)`.
+    - `tolerance`: how closely sections must repeat for a period.
+    - `max_steps`: steps at each value beyond which it counts as failed.
+
+    **Returns:** a `Sweep`. A value that fails is NaN, and the next goes on from the one before it.
+
+    **Raises:** `ValueError` or `TypeError` for an unknown name or values that are no numbers.
+    """
+    check_leaf(scene, parameter)
+    settle, cycles = count("settle", settle), count("cycles", cycles, least=2)
+    values = jnp.asarray(values, jnp.result_type(float))
+    numbers = concrete(values)
+    if values.ndim != 1 or (numbers is not None and not np.isfinite(numbers).all()):
+        raise ValueError(
+            "Argument `values` must be finite numbers in one row, but has shape "
+            f"{values.shape}{'' if values.ndim != 1 else ' and numbers that are not finite'}."
+        )
+    if start is None:
+        if not isinstance(scene, Scene):
+            raise ValueError("Argument `start` must be given for a scene of your own.")
+        first = with_leaf(scene, parameter, values[0])
+        assert isinstance(first, Scene)
+        start = first.start()
+    method = default_flow(scene) if method is None else method
+    if clock is not None:
+        if not isinstance(scene, Scene):
+            raise ValueError("Argument `clock` must be left out for a scene of your own.")
+        scene = scene.in_clock(clock)
+    if isinstance(scene, Scene):
+        start = scene.adopt(start)
+    start = jtu.tree_map(lambda x: jnp.asarray(x, values.dtype), start)
+    return _sweep(scene, parameter, values, start, settle, cycles, method, tolerance, max_steps)
+
+
+@eqx.filter_jit
+def _sweep(scene, parameter, values, start, settle, cycles, method, tolerance, max_steps) -> Sweep:
+    def one(state, value):
+        here = with_leaf(scene, parameter, value)
+        run = simulate(here, state, settle + cycles, method=method, max_steps=max_steps)
+        sections = jtu.tree_map(lambda x: x[settle + 1 :], run.sections)
+        last = jtu.tree_map(lambda x: x[-1], sections)
+        state = jtu.tree_map(lambda a, b: jnp.where(run.successful, a, b), last, state)
+        assert run.y_min is not None and run.y_max is not None
+        assert run.impact_speed is not None and run.duration is not None
+        period = least_period(sections, longest=cycles // 2, tolerance=tolerance)
+        hits = run.impacts[settle:].astype(value.dtype)
+        total = jnp.sum(jnp.where(jnp.arange(cycles) < period, hits, 0.0))
+        return state, Sweep(
+            values=value,
+            y_min=jnp.min(run.y_min[settle:]),
+            y_max=jnp.max(run.y_max[settle:]),
+            period=period,
+            impacts=jnp.where(period > 0, total, jnp.mean(hits)),
+            frequency_ratio=here.frequency_ratio(jnp.mean(run.duration[settle:])),
+            impact_speed=jnp.max(run.impact_speed[settle:]),
+            sections=sections,
+            result=run.result,
+        )
+
+    return jax.lax.scan(one, start, values)[1]
