@@ -135,10 +135,9 @@ def boundary(
         if not inside:
             return _cut(advance, here, new, bounds), "bounds"
         others = [v for i, v in enumerate(new.seen.approach) if i != condition.impact]
-        if min(others, default=1.0) <= 0:
-            return here, "grazing"
+        # At a grazing the body turns on the stop, to rounding.
         touching = point.kind == GRAZING and condition.impact is None
-        if not touching and new.seen.clearance < 0:
+        if min(others, default=1.0) <= 0 or (not touching and new.seen.clearance < -1e-9):
             return here, "grazing"
         return None
 
