@@ -26,7 +26,7 @@ from ..scene import AbstractScene
 from ..scene.leaves import with_leaf
 from .floquet import multipliers_of
 
-Vector = Float[Array, " n"]
+Vector = Float[Array, " _"]
 
 
 class _Hit(NamedTuple):

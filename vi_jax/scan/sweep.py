@@ -20,19 +20,19 @@ from .regime import least_period
 class Sweep(eqx.Module):
     """What a sweep settled on at each value, in their order. Under `vmap` batch axes come first."""
 
-    values: Float[Array, " values"]
+    values: Float[Array, "..."]
     """The parameter."""
-    y_min: Float[Array, " values"]
+    y_min: Float[Array, "..."]
     """Smallest Y over the cycles observed (unit: a)."""
-    y_max: Float[Array, " values"]
+    y_max: Float[Array, "..."]
     """Largest Y over the cycles observed (unit: a)."""
-    period: Int[Array, " values"]
+    period: Int[Array, "..."]
     """Period in drive cycles, 0 if none was found."""
-    impacts: Float[Array, " values"]
+    impacts: Float[Array, "..."]
     """Impacts in a period; in a cycle, on average, where there is no period."""
-    frequency_ratio: Float[Array, " values"] | None
+    frequency_ratio: Float[Array, "..."] | None
     """ζ: mean crank speed (unit: ω); `None` for scenes that are not driven."""
-    impact_speed: Float[Array, " values"]
+    impact_speed: Float[Array, "..."]
     """Greatest V⁻ over the cycles observed (unit: a ω)."""
     sections: Any
     """Section states of the cycles observed; leaves (values, cycles)."""
@@ -40,7 +40,7 @@ class Sweep(eqx.Module):
     """Whether each value was simulated to its end."""
 
     @property
-    def successful(self) -> Bool[Array, " values"]:
+    def successful(self) -> Bool[Array, "..."]:
         """Whether each value was simulated to its end."""
         return self.result == RESULTS.successful
 

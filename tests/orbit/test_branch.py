@@ -1,0 +1,270 @@
+"""Branches, what happens on them, and boundaries, beside closed forms and found orbits."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
+
+ZETA = "drive.frequency_ratio"
+
+
+def short_orbit(scene):
+    closed = vi.closed_form_orbits(scene)
+    return vi.find_orbit(scene, scene.start(Y=closed.Y[0] - 1e-3, V=closed.V[0]), throw=True)
+
+
+def branch_of(restitution):
+    scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=restitution)
+    return vi.continue_orbit(short_orbit(scene), parameter=ZETA, bounds=(0.5, 1.9))
+
+
+@pytest.fixture(scope="module", params=[0.5, 0.8])
+def restitution(request):
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def short(restitution):
+    return branch_of(restitution)
+
+
+@pytest.fixture(scope="module")
+def long(short):
+    """The doubled motion with two impacts, and the one-impact 4π motion beyond its grazing."""
+    doubling = next(p for p in short.special if p.kind == "period-doubling")
+    doubled = vi.continue_orbit(doubling.switch(), parameter=ZETA, bounds=(0.5, 1.9))
+    grazing = next(p for p in doubled.special if p.kind == "grazing")
+    return doubled, vi.continue_orbit(grazing.switch(), parameter=ZETA, bounds=(0.5, 1.9))
+
+
+def fold_by_eq_21(k, d, low, high):
+    """Where the quadratic of Eq. 21 (with its ζ) in the impact speed has a double root."""
+
+    def discriminant(zeta):
+        steep = zeta * (1 + k) / np.tan(np.pi / zeta)
+        return (1 - k) ** 2 * ((d * (1 - zeta**2)) ** 2 - 1) - steep**2
+
+    return brentq(discriminant, low, high, xtol=1e-14)
+
+
+def test_special_points_of_the_undamped_2pi_branch(short, restitution):
+    kinds = {point.kind: point for point in short.special}
+    assert short.ends == ("grazing", "grazing")
+    born = min((p for p in short.special if p.kind == "grazing"), key=lambda p: p.parameter)
+    assert born.parameter == pytest.approx(1 / np.sqrt(2), abs=1e-9)
+    assert abs(float(born.orbit.impact_speed[0])) < 1e-9
+    doubling = kinds["period-doubling"]
+    assert doubling.parameter == pytest.approx({0.5: 0.94, 0.8: 0.995}[restitution], abs=0.005)
+    assert np.abs(np.asarray(doubling.orbit.multipliers) + 1).min() < 1e-8
+    fold = fold_by_eq_21(restitution, 2.0, *{0.5: (1.4, 1.6), 0.8: (1.6, 1.8)}[restitution])
+    assert kinds["fold"].parameter == pytest.approx(fold, abs=1e-8)
+    assert np.abs(np.asarray(kinds["fold"].orbit.multipliers) - 1).min() < 1e-6
+    # The period doubling as the closed form has it.
+    closed = jax.jit(lambda z: vi.closed_form_orbits(scene_at(z, restitution)).multipliers[0])
+    at = brentq(lambda z: float(closed(z).real.min()) + 1, 0.9, 1.05, xtol=1e-12)
+    assert doubling.parameter == pytest.approx(at, abs=1e-8)
+
+
+def scene_at(zeta, restitution):
+    return vi.Scene.ideal(frequency_ratio=zeta, restitution=restitution)
+
+
+def test_points_of_the_branches_are_closed_forms(short, long, restitution):
+    for branch in (short, long[1]):
+        closed = jax.jit(
+            jax.vmap(
+                lambda z, n=branch.cycles: vi.closed_form_orbits(scene_at(z, restitution), cycles=n)
+            )
+        )(jnp.asarray(branch.parameter))
+        apart = np.abs(np.asarray(closed.impact_speed) - branch.impact_speed)
+        which = np.nanargmin(np.where(np.isnan(apart), np.inf, apart), axis=1)
+        rows = np.arange(len(which))
+        far = (branch.impact_speed[:, 0] > 1e-3) & (np.abs(branch.multipliers - 1).min(1) > 1e-3)
+        assert far.sum() > 15
+        for name in ("y_min", "clearance"):
+            wanted = np.asarray(getattr(closed, name))[rows, which]
+            np.testing.assert_allclose(getattr(branch, name)[far], wanted[far], atol=1e-9)
+        trace = np.asarray(closed.multipliers).sum(-1)[rows, which].real
+        np.testing.assert_allclose(branch.multipliers.sum(1).real[far], trace[far], rtol=1e-8)
+        assert branch.admissible.all()
+
+
+def test_switched_branches(short, long, restitution):
+    doubled, single = long
+    assert doubled.cycles == 2 and doubled.impact_speed.shape[1] == 2
+    assert doubled.ends[1] == "period-doubling" or doubled.ends[0] == "period-doubling"
+    doubling = next(p for p in short.special if p.kind == "period-doubling")
+    springs = next(p for p in doubled.special if p.kind == "period-doubling")
+    assert springs.parameter == pytest.approx(doubling.parameter, abs=1e-8)
+    # Where it loses an impact the one-impact 4π motion begins, with the same parameter.
+    lost = next(p for p in doubled.special if p.kind == "grazing")
+    assert single.cycles == 2 and single.impact_speed.shape[1] == 1
+    touches = [p for p in single.special if p.kind == "grazing"]
+    assert min(abs(p.parameter - lost.parameter) for p in touches) < 1e-8
+    assert all(abs(float(p.orbit.clearance)) < 1e-9 for p in touches)
+    for point in single.special:
+        if point.kind == "period-doubling":
+            assert np.abs(np.asarray(point.orbit.multipliers) + 1).min() < 1e-8
+
+
+def test_sweeps_lie_on_stable_points(short, long, restitution):
+    zetas = np.array([0.87, 0.9, 0.92, 0.95, 1.0, 1.1, 1.2])
+    up = vi.sweep(scene_at(0.9, restitution), ZETA, zetas, settle=2000, cycles=16)
+    assert bool(up.successful.all())
+    for zeta, y_min, period in zip(zetas, up.y_min, up.period, strict=True):
+        branch = {1: short, 2: long[1]}[int(period)]
+        inside = [p for p in branch.special if abs(p.parameter - zeta) < 5e-3]
+        if inside:
+            continue  # near a bifurcation the transient outlasts any sweep
+        near = np.interp(zeta, np.sort(branch.parameter), np.argsort(branch.parameter))
+        guess = branch.orbit(round(float(near)))
+        orbit = vi.find_orbit(scene_at(zeta, restitution), guess, cycles=int(period))
+        assert bool(orbit.stable)
+        assert float(orbit.y_min) == pytest.approx(float(y_min), abs=1e-6)
+
+
+def test_a_motor_branch_agrees_with_found_orbits():
+    scene = vi.Parameters(torque=10.0, kappa=0.9, restitution=0.8, gap=0.08).scene(drive="motor")
+    run = vi.simulate(scene, scene.start(), 200)
+    last = jax.tree.map(lambda x: x[-1], run.sections)
+    orbit = vi.find_orbit(scene, last, cycles=2)
+    branch = vi.continue_orbit(orbit, parameter="drive.control", bounds=(0.88, 0.95))
+    assert branch.ends == ("bounds", "bounds") and branch.stable.all()
+    np.testing.assert_allclose(branch.parameter[[0, -1]], [0.88, 0.95], atol=1e-10)
+    for end in (0, -1):
+        there = eqx.tree_at(lambda s: s.drive.control, scene, jnp.asarray(branch.parameter[end]))
+        found = vi.find_orbit(there, branch.orbit(end), cycles=2)
+        assert float(found.y_min) == pytest.approx(float(branch.y_min[end]), abs=1e-9)
+        np.testing.assert_allclose(found.multipliers, branch.multipliers[end], atol=1e-7)
+        assert float(found.frequency_ratio) == pytest.approx(branch.frequency_ratio[end], abs=1e-9)
+
+
+def test_grazing_of_the_classic_impact_oscillator():
+    """The motion that stays off the stop has the amplitude 1/√((1 - ζ²)² + (2ξζ)²); it grazes
+    where that is the gap (Shaw and Holmes 1983; Nordmark 1991)."""
+    xi, gap = 0.05, 1.5
+    scene = vi.Scene.ideal(frequency_ratio=0.3, restitution=0.8, gap=gap, damping_ratio=xi)
+    rest = vi.find_orbit(scene, scene.start(), throw=True)
+    assert int(rest.impacts) == 0
+    branch = vi.continue_orbit(rest, parameter=ZETA, bounds=(0.2, 0.9))
+    wanted = brentq(lambda z: (1 - z * z) ** 2 + (2 * xi * z) ** 2 - gap**-2, 0.3, 0.9)
+    assert branch.ends == ("bounds", "grazing") and branch.stable.all()
+    grazing = branch.special[-1]
+    assert grazing.kind == "grazing" and grazing.parameter == pytest.approx(wanted, abs=1e-9)
+    amplitude = 1 / np.hypot(1 - branch.parameter**2, 2 * xi * branch.parameter)
+    np.testing.assert_allclose(branch.y_max, amplitude, rtol=1e-10)
+    # Beyond it an impact is gained: the closed form knows that motion.
+    gained = grazing.switch()
+    assert int(gained.impacts) == 1 and float(gained.impact_speed[0]) > 0
+    there = vi.Scene.ideal(
+        frequency_ratio=gained.scene.drive.frequency_ratio, restitution=0.8, gap=gap,
+        damping_ratio=xi,
+    )  # fmt: skip
+    closed = vi.closed_form_orbits(there)
+    assert np.nanmin(np.abs(closed.impact_speed - gained.impact_speed[0])) < 1e-9
+    # In ζ and d the grazing is the resonance curve itself.
+    curve = vi.boundary(grazing, parameter="stops.0.gap", bounds=((0.3, 0.95), (1.1, 3.0)))
+    zeta, d = curve.parameters.T
+    np.testing.assert_allclose(1 / np.hypot(1 - zeta**2, 2 * xi * zeta), d, rtol=1e-9)
+    assert np.ptp(d) > 1
+
+
+class Duffing(vi.AbstractScene):
+    """Y'' + 2ξY' + Y + γY³ = F cos(Ωt), over the cycles of its force."""
+
+    stops: tuple[vi.RigidStop, ...]
+    frequency: jax.Array
+    cubic: jax.Array
+    force: jax.Array
+    damping: jax.Array
+
+    @property
+    def cycle(self):
+        return 2 * np.pi
+
+    def field(self, s, state):
+        pull = self.force * jnp.cos(s) - 2 * self.damping * state.V - state.Y
+        pull = pull - self.cubic * state.Y**3
+        return vi.OscillatorState(state.V / self.frequency, pull / self.frequency)
+
+
+def test_folds_of_a_duffing_oscillator():
+    """Jump frequencies of a hardening oscillator: up at 1 + ½ (3/2)^(4/3) γ^(1/3) F^(2/3) to first
+    order in γ (Kovacic and Brennan, The Duffing Equation, 2011, section 5.3); and SciPy's word that
+    at the folds a multiplier is 1."""
+    gamma, force, xi = 1e-3, 0.2, 0.005
+    scene = Duffing((), *(jnp.asarray(x) for x in (0.8, gamma, force, xi)))
+    guess = vi.OscillatorState(jnp.asarray(force / (1 - 0.64)), jnp.asarray(0.0))
+    orbit = vi.find_orbit(scene, guess, throw=True)
+    branch = vi.continue_orbit(
+        orbit, parameter="frequency", bounds=(0.7, 1.6), max_step=0.5, max_points=2000
+    )
+    folds = [p for p in branch.special if p.kind == "fold"]
+    assert branch.ends == ("bounds", "bounds") and len(folds) == 2
+    lower = min(p.parameter for p in folds)
+    first_order = 1 + 0.5 * 1.5 ** (4 / 3) * gamma ** (1 / 3) * force ** (2 / 3)
+    assert lower == pytest.approx(first_order, abs=0.01)
+    for point in folds:
+        state = np.array([float(point.orbit.state.Y), float(point.orbit.state.V)])
+        omega = point.parameter
+
+        def field(t, x, omega=omega):
+            A = np.array([[0, 1], [-1 - 3 * gamma * x[0] ** 2, -2 * xi]])
+            pull = force * np.cos(omega * t) - x[0] - gamma * x[0] ** 3 - 2 * xi * x[1]
+            return np.concatenate([[x[1], pull], (A @ x[2:].reshape(2, 2)).ravel()])
+
+        start = np.concatenate([state, np.eye(2).ravel()])
+        end = solve_ivp(field, (0, 2 * np.pi / omega), start, rtol=1e-12, atol=1e-12).y[:, -1]
+        np.testing.assert_allclose(end[:2], state, atol=1e-7)
+        assert np.abs(np.linalg.eigvals(end[2:].reshape(2, 2)) - 1).min() < 1e-4
+
+
+def test_boundaries_in_a_second_parameter():
+    branch = branch_of(0.5)
+    doubling = next(p for p in branch.special if p.kind == "period-doubling")
+    curve = vi.boundary(
+        doubling, parameter="oscillator.damping_ratio", bounds=((0.5, 1.2), (0.0, 0.1))
+    )
+    multipliers = jax.jit(
+        jax.vmap(
+            lambda z, xi: vi.closed_form_orbits(
+                vi.Scene.ideal(frequency_ratio=z, damping_ratio=xi)
+            ).multipliers[0]
+        )
+    )(*jnp.asarray(curve.parameters.T))
+    np.testing.assert_allclose(np.asarray(multipliers).real.min(1), -1, atol=1e-8)
+    # At ζ = 0.9 it is met at c = 0.2711 N·s/m.
+    table = vi.Parameters(restitution=0.5, gap=0.08)
+    order = np.argsort(curve.parameters[:, 0])
+    xi = np.interp(0.9, *curve.parameters[order].T)
+    ratio = float(table.scene(drive="ideal").damping_ratio / table.damping)
+    assert xi / ratio == pytest.approx(0.2711, abs=2e-3)
+    fold = next(p for p in branch.special if p.kind == "fold")
+    folds = vi.boundary(fold, parameter="stops.0.restitution", bounds=((1.2, 1.9), (0.1, 0.9)))
+    for zeta, k in folds.parameters[::10]:
+        assert zeta == pytest.approx(fold_by_eq_21(k, 2.0, zeta - 1e-3, zeta + 1e-3), abs=1e-8)
+
+
+def test_a_branch_as_data(short):
+    data = short.to_xarray()
+    assert data.sizes == {"point": len(short.parameter), "impact": 1, "state": 2}
+    assert data.y_min.attrs["units"] == "a" and data.attrs["parameter"] == ZETA
+    assert "period-doubling at" in str(short)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"parameter": "drive.frequency"}, "near names: drive.frequency_ratio"),
+        ({"bounds": (1.0, 1.2)}, "`bounds` must hold the orbit's drive.frequency_ratio = 0.9"),
+        ({"step": 0.0}, "`step` must be finite and in"),
+    ],
+)
+def test_says_what_is_wrong(arguments, message):
+    orbit = short_orbit(scene_at(0.9, 0.5))
+    with pytest.raises(ValueError, match=message):
+        vi.continue_orbit(orbit, **{"parameter": ZETA, "bounds": (0.5, 1.9), **arguments})
