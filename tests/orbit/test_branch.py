@@ -117,16 +117,15 @@ def test_sweeps_lie_on_stable_points(short, long, restitution):
     assert bool(up.successful.all())
     for zeta, y_min, period in zip(zetas, up.y_min, up.period, strict=True):
         branch = {1: short, 2: long[1]}[int(period)]
-        inside = [p for p in branch.special if abs(p.parameter - zeta) < 5e-3]
+        inside = [p for p in branch.special if abs(p.parameter - zeta) < 1e-2]
         if inside:
             continue  # near a bifurcation the transient outlasts any sweep
-        near = np.interp(zeta, np.sort(branch.parameter), np.argsort(branch.parameter))
-        guess = branch.orbit(round(float(near)))
-        orbit = vi.find_orbit(scene_at(zeta, restitution), guess, cycles=int(period))
-        assert bool(orbit.stable)
+        (orbit,) = (orbit for orbit in branch.at(zeta) if orbit.stable)
+        assert float(orbit.scene.drive.frequency_ratio) == pytest.approx(zeta, abs=1e-12)
         assert float(orbit.y_min) == pytest.approx(float(y_min), abs=1e-6)
 
 
+@pytest.mark.slow
 def test_a_motor_branch_agrees_with_found_orbits():
     scene = vi.Parameters(torque=10.0, kappa=0.9, restitution=0.8, gap=0.08).scene(drive="motor")
     run = vi.simulate(scene, scene.start(), 200)

@@ -1,6 +1,7 @@
 """`continue_orbit`: a branch of periodic motions in one parameter, and why it changes."""
 
 import dataclasses
+import itertools
 from collections.abc import Callable
 from typing import Any
 
@@ -92,6 +93,7 @@ class Branch:
     "max_points"."""
     problem: Shooting = dataclasses.field(repr=False)
     steps: list[Step] = dataclasses.field(repr=False)
+    scale: np.ndarray = dataclasses.field(repr=False)
 
     @property
     def stable(self) -> np.ndarray:
@@ -107,6 +109,23 @@ class Branch:
     def orbit(self, index: int) -> Orbit:
         """The motion at one point."""
         return orbit_of(self.problem, self.steps[index])
+
+    def at(self, value: float) -> list[Orbit]:
+        """The branch's motions at a value of the parameter, solved for; in the branch's order."""
+        found = []
+        for here, new in itertools.pairwise(self.steps):
+            # Steps follow the branch's sense, except in its backward half, which is turned.
+            if (here.x[-1] - value) * (new.x[-1] - value) > 0 or new.x[-1] == value:
+                continue
+            if float(np.dot(here.tangent, (new.x - here.x) / self.scale)) < 0:
+                here, new = new, here
+            step = _where(
+                lambda s, here=here: _advance(self.problem, here.x, here.tangent, self.scale, s),
+                here, new, self.scale, lambda step: float(step.x[-1]) - value,
+            )  # fmt: skip
+            if step is not None:
+                found.append(orbit_of(self.problem, step))
+        return found
 
     def to_xarray(self) -> Any:
         """The branch as an `xarray.Dataset` over its points (needs xarray)."""
@@ -208,10 +227,11 @@ def continue_orbit(
         backward = walk(back.advance, turned, stop=back.stop, **settings)
         backward_steps, ends = backward.steps[1:], (backward.end, forward.end)
     special = [*reversed(back.special), *ahead.special]
-    return _branch(problem, parameter, [*reversed(backward_steps), *forward.steps], special, ends)
+    steps = [*reversed(backward_steps), *forward.steps]
+    return _branch(problem, parameter, steps, special, ends, scale)
 
 
-def _branch(problem, name, steps, special, ends) -> Branch:
+def _branch(problem, name, steps, special, ends, scale) -> Branch:
     xs = np.stack([step.x for step in steps])
     legs = len(problem.stops)
 
@@ -237,6 +257,7 @@ def _branch(problem, name, steps, special, ends) -> Branch:
         ends=ends,
         problem=problem,
         steps=steps,
+        scale=scale,
     )
 
 
@@ -371,6 +392,31 @@ def _tests(step: Step) -> dict[str, float]:
     }
 
 
+def _where(
+    advance: Callable[[float], Step],
+    here: Step,
+    new: Step,
+    scale: np.ndarray,
+    test: Callable[[Step], float],
+) -> Step | None:
+    """The point between two at which a test is zero; `advance` goes along `here`'s tangent."""
+    length = float(np.dot(here.tangent, (new.x - here.x) / scale))
+    at: dict[float, Step] = {0.0: here, length: new}
+
+    def value(s: float) -> float:
+        if s not in at:
+            at[s] = advance(s)
+        return test(at[s])
+
+    if not value(0.0) * value(length) <= 0:
+        return None
+    root = float(brentq(value, 0.0, length, xtol=1e-14, rtol=1e-14, maxiter=80))  # pyright: ignore
+    value(root)
+    # Where branches cross the corrector has no answer; a point beside it will do.
+    good = [step for step in at.values() if bool(step.good)]
+    return min(good, key=lambda step: abs(test(step)), default=None)
+
+
 class _Follower:
     """Looks at each step of a walk: locates what happens in it and says when to end."""
 
@@ -411,21 +457,7 @@ class _Follower:
 
     def _where(self, here: Step, new: Step, test: Callable[[Step], float]) -> Step | None:
         """The point between two at which a test is zero."""
-        length = float(np.dot(here.tangent, (new.x - here.x) / self.scale))
-        at: dict[float, Step] = {0.0: here, length: new}
-
-        def value(s: float) -> float:
-            if s not in at:
-                at[s] = self.advance(here.x, here.tangent, s)
-            return test(at[s])
-
-        if not value(0.0) * value(length) <= 0:
-            return None
-        root = float(brentq(value, 0.0, length, xtol=1e-14, rtol=1e-14, maxiter=80))  # pyright: ignore
-        value(root)
-        # Where branches cross the corrector has no answer; a point beside it will do.
-        good = [step for step in at.values() if bool(step.good)]
-        return min(good, key=lambda step: abs(test(step)), default=None)
+        return _where(lambda s: self.advance(here.x, here.tangent, s), here, new, self.scale, test)
 
     def _point(self, kind: str, step: Step, detail: str, impact: int | None = None) -> SpecialPoint:
         return SpecialPoint(
