@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -70,7 +71,7 @@ def cycle_map(
       whose independent variable counts its cycles.
     - `cycles`: number of drive cycles n, at least 1; static.
     - `flow`: the method that carries the scene: by default `ExactFlight()` where it applies, else
-      `Adaptive(rtol=1e-11)`.
+      `Adaptive(Tsit5(), rtol=1e-11)`, which compiles in half the time of the default solver.
     - `section`: crank angle of the section (radians) instead of the scene's own, which is 0.
 
     **Returns:** a `CycleMap`: call it on a state from `scene.start(...)`.
@@ -92,7 +93,7 @@ def cycle_map(
             f"section, but got {section!r}."
         )
     if flow is None:
-        flow = default_flow(scene)
+        flow = default_flow(scene, Adaptive(diffrax.Tsit5(), rtol=1e-11))
     elif not isinstance(flow, AbstractMethod):
         raise TypeError(
             "Argument `flow` must be `Adaptive(...)`, `FixedStep(...)` or `ExactFlight()`, but "
@@ -106,13 +107,13 @@ def cycle_map(
     return CycleMap(scene, carried, count("cycles", cycles, least=1))
 
 
-def default_flow(scene: AbstractScene) -> AbstractMethod:
-    """`ExactFlight` where it applies, else an `Adaptive` accurate enough to search with."""
+def default_flow(scene: AbstractScene, otherwise: AbstractMethod) -> AbstractMethod:
+    """`ExactFlight` where it applies, else the other."""
     exact = ExactFlight()
     try:
         exact.check(scene)
     except ValueError:
-        return Adaptive(rtol=1e-11)
+        return otherwise
     return exact
 
 

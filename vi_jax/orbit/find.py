@@ -59,7 +59,7 @@ def find_orbit(
     - `cycles`: period in drive cycles; static.
     - `method`: `Newton()` (default) or `Gradient(optax_optimiser)`.
     - `flow`: the method that carries the scene: by default `ExactFlight()` where it applies, else
-      `Adaptive(rtol=1e-11)`.
+      `Adaptive(Tsit5(), rtol=1e-11)`, which compiles in half the time of the default solver.
     - `section`: crank angle of the section (radians) instead of the scene's own, which is 0. The
       guess and the orbit's states are on it; the search itself is done in eighths of a cycle
       away from it, where the guess's motion is farthest from its impacts, because the map jumps

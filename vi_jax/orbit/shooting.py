@@ -24,6 +24,7 @@ from ..flow import AbstractMethod, ExactFlight, FixedStep
 from ..flow.events import rates
 from ..scene import AbstractScene
 from ..scene.leaves import with_leaf
+from .cycle_map import default_flow
 from .floquet import multipliers_of
 
 Vector = Float[Array, " _"]
@@ -292,20 +293,11 @@ class Shooting(eqx.Module):
 
 
 def carrier(flow: AbstractMethod | None, scene: AbstractScene) -> AbstractMethod:
-    """A method of fixed steps, which a smooth system of equations needs.
-
-    `ExactFlight` where it applies; else a Runge–Kutta method of 32 steps a cycle (Dopri8's error
-    there is 1e-13), with the solver of `flow` if it has one.
-    """
-    if flow is None or isinstance(flow, ExactFlight):
-        try:
-            ExactFlight().check(scene)
-        except ValueError:
-            return FixedStep(diffrax.Dopri8(), 32)
-        return ExactFlight()
+    """A method of fixed steps, which a smooth system of equations needs: `flow` if it is one, else
+    `ExactFlight` where it applies, else 32 steps of Dopri8 a cycle, whose error is 1e-13."""
     if isinstance(flow, FixedStep):
         return flow
-    return FixedStep(getattr(flow, "solver", diffrax.Dopri8()), 32)
+    return default_flow(scene, FixedStep(diffrax.Dopri8(), 32))
 
 
 def steps_of(flow: AbstractMethod, scenes: list[AbstractScene], like: Any, cycles: int) -> int:

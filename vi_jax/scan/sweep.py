@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._checks import concrete, count
-from ..flow import RESULTS, AbstractMethod, simulate
+from ..flow import RESULTS, AbstractMethod, FixedStep, simulate
 from ..orbit.cycle_map import default_flow
 from ..scene import AbstractScene, Scene
 from ..scene.leaves import check_leaf, with_leaf
@@ -72,7 +72,7 @@ def sweep(
     - `start`: state at the first value; by default at rest (a motor at its no-load speed).
     - `settle`, `cycles`: drive cycles at each value before observing, and observed; static.
     - `method`, `clock`: as for `simulate`; by default `ExactFlight` where it applies, else
-      `Adaptive(rtol=1e-11)`.
+      `FixedStep()`.
     - `tolerance`: how closely sections must repeat for a period.
     - `max_steps`: steps at each value beyond which it counts as failed.
 
@@ -95,7 +95,7 @@ def sweep(
         first = with_leaf(scene, parameter, values[0])
         assert isinstance(first, Scene)
         start = first.start()
-    method = default_flow(scene) if method is None else method
+    method = default_flow(scene, FixedStep()) if method is None else method
     if clock is not None:
         if not isinstance(scene, Scene):
             raise ValueError("Argument `clock` must be left out for a scene of your own.")
