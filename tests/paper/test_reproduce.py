@@ -58,7 +58,8 @@ def test_departure_has_the_rate_of_the_multiplier(claims):
 
 
 def test_four_pi_motion_has_no_transient(claims):
-    assert claims["no transient from the 4π state"].numbers["max_deviation_undamped"] < 1e-11
+    # The state is the one optax fitted to a residual of 1e-10.
+    assert claims["no transient from the 4π state"].numbers["max_deviation_undamped"] < 1e-9
 
 
 def test_alignment_is_the_one_that_fits(cases):
@@ -115,7 +116,7 @@ def test_reproduce_writes_figures_and_reports(tmp_path):
     found = reproduce(tmp_path / "a" / "b", quick=True, progress=steps.append)
     names = ["fig3.png", "fig4.png", "report.json", "report.md"]
     assert [path.name for path in found.files] == names
-    assert len(steps) == 5
+    assert len(steps) == 6
     for name in names[:2]:
         path = tmp_path / "a" / "b" / name
         assert path.stat().st_size < 200_000

@@ -1,0 +1,277 @@
+# %% [markdown]
+# # All periodic motions at one parameter point
+#
+# Above its natural frequency the lightly damped machine (ideal drive, ζ = 3.2, k = 0.9, d = 1.05,
+# ξ = 0.002) has several stable motions at once. 4,096 random guesses for each period of 1 to 6
+# drive cycles are searched from by Newton's method, one compiled call per period, and the motions
+# found are merged into one list. Every motion is then tested by simulation, which knows nothing of
+# the search: a stable one must draw a disturbed start back at the rate of its multiplier, and from
+# an unstable one the start must leave at that rate.
+#
+# Run with `python experiments/all_orbits.py`; `--quick` takes few guesses and writes nothing.
+
+# %%
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import vi_jax as vi
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+
+jax.config.update("jax_enable_x64", True)
+
+HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments")
+QUICK = "--quick" in sys.argv
+GUESSES, GRID, SETTLE = (128, 12, 600) if QUICK else (4096, 96, 3000)
+PERIODS = range(1, 3) if QUICK else range(1, 7)
+ZETA, K, GAP, XI = 3.2, 0.9, 1.05, 0.002
+# Impacts lie near φ = 0. There the map jumps, so everything is looked at half a turn later.
+SECTION = np.pi
+LOW, HIGH = np.array([-3.5, -4.0]), np.array([GAP, 4.0])
+
+
+def ideal(zeta: float, k: float) -> vi.Scene:
+    """The scene at these numbers."""
+    return vi.Scene.ideal(frequency_ratio=zeta, restitution=k, gap=GAP, damping_ratio=XI)
+
+
+SCENE = ideal(ZETA, K).at_section(SECTION)
+
+# %% [markdown]
+# ## The search
+#
+# The period is part of the program, so each n compiles once; all other numbers are arguments of it.
+# Compilations are counted, so that "no second one" is a measurement.
+
+# %%
+COMPILED: list[str] = []
+jax.monitoring.register_event_duration_secs_listener(  # pyright: ignore[reportArgumentType]
+    lambda event, *_, **__: COMPILED.append(event) if "backend_compile" in event else None
+)
+
+
+def searched(scene: vi.Scene, cycles: int) -> tuple[vi.Orbit, float]:
+    """A batch of searches from random guesses, and the seconds that it took."""
+    Y, V = np.random.default_rng(cycles).uniform(LOW, HIGH, (GUESSES, 2)).T
+    begin = time.perf_counter()
+    batch = vi.find_orbit(
+        scene, scene.start(Y=jnp.asarray(Y), V=jnp.asarray(V)), cycles=cycles, section=SECTION
+    )
+    jax.block_until_ready(batch.residual)
+    return batch, time.perf_counter() - begin
+
+
+class Kind:
+    """A motion of the merged list, with the number of guesses that led to it for each n."""
+
+    def __init__(self, orbit: vi.Orbit):
+        self.orbit = orbit
+        self.path = np.stack([np.asarray(orbit.sections.Y), np.asarray(orbit.sections.V)], axis=-1)
+        self.counts: Counter[int] = Counter()
+
+    def same(self, other: vi.Orbit) -> bool:
+        """Whether `other` runs through the same sections, from whichever of them it starts."""
+        start = np.array([float(other.state.Y), float(other.state.V)])
+        alike = int(other.cycles) == len(self.path)
+        return alike and bool(np.abs(self.path - start).max(axis=1).min() < 1e-6)
+
+    @property
+    def size(self) -> float:
+        return float(abs(self.orbit.multipliers[0]))
+
+
+kinds: list[Kind] = []
+search_rows = []
+again = ""
+for n in PERIODS:
+    batch, seconds = searched(SCENE, n)
+    orbits, counts = vi.distinct_orbits(batch)
+    for orbit, many in zip(orbits, counts, strict=True):
+        kind = next((kind for kind in kinds if kind.same(orbit)), None)
+        if kind is None:
+            kind = Kind(orbit)
+            kinds.append(kind)
+        kind.counts[n] += int(many)
+    search_rows.append((n, int(batch.successful.sum()), len(orbits), seconds))
+    print(f"n = {n}: {batch}; {seconds:.1f} s")
+    if n == 2:
+        built = len(COMPILED)
+        _, repeated = searched(ideal(3.15, 0.88), n)
+        built = len(COMPILED) - built
+        again = (
+            f"With other parameters (ζ = 3.15, k = 0.88) the call for n = 2 took {repeated:.1f} s "
+            f"instead of {seconds:.1f} s and compiled {built} programs."
+        )
+        print(again)
+kinds.sort(key=lambda kind: (len(kind.path), kind.size))
+
+# %% [markdown]
+# ## Simulation as the judge
+#
+# Two starts off each motion by 1e-7, to either side, are simulated. What takes a disturbance of one
+# period to that of the next, while it is between rounding and where the flow is no longer linear,
+# is fitted by a matrix, whose eigenvalue is set beside the multiplier of the search.
+
+
+# %%
+@vi.jit
+@jax.vmap
+def followed(Y: jax.Array, V: jax.Array) -> jax.Array:
+    """Sections (Y, V) of the simulated motion."""
+    start = SCENE.start(Y=Y, V=V)
+    run = vi.simulate(SCENE, start, SETTLE, method=vi.ExactFlight(), record="sections")
+    return jnp.stack([run.sections.Y, run.sections.V], axis=-1)
+
+
+def arrived(paths: np.ndarray, within: float = 0.03) -> np.ndarray:
+    """Index of the stable motion at which each simulated path ends, or -1."""
+    end = np.full(len(paths), -1)
+    for j, kind in enumerate(kinds):
+        if bool(kind.orbit.stable):
+            # Two periods at the end must run along the motion, one of whose phases fits.
+            period = len(kind.path)
+            last = paths[:, -2 * period :]
+            for shift in range(period):
+                away = last - np.tile(np.roll(kind.path, -shift, axis=0), (2, 1))
+                end[np.abs(away).max(axis=(1, 2)) < within] = j
+    return end
+
+
+def growth(paths: np.ndarray, kind: Kind) -> float:
+    """Largest |multiplier| of the linear map that fits the simulated disturbances."""
+    before, after = [], []
+    for path in paths:
+        off = path[:: len(kind.path)] - kind.path[0]
+        size = np.linalg.norm(off, axis=1, keepdims=True)
+        outside = np.append((size[:, 0] > 1e-5) | (size[:, 0] < 1e-10), True)
+        stop = int(np.argmax(outside))
+        before.append(off[: stop - 1] / size[: stop - 1])
+        after.append(off[1:stop] / size[: stop - 1])
+    fitted = np.linalg.lstsq(np.concatenate(before), np.concatenate(after))[0]
+    return float(np.abs(np.linalg.eigvals(fitted)).max())
+
+
+# The disturbed starts and the grid of the basins share one program.
+side = [np.linspace(low, high, GRID + 1) for low, high in zip(LOW, HIGH, strict=True)]
+grid = np.stack(np.meshgrid(*[0.5 * (x[1:] + x[:-1]) for x in side]), axis=-1).reshape(-1, 2)
+offset = 1e-7 * np.array([0.6, 0.8])
+starts = np.concatenate([[k.path[0] + s * offset for k in kinds for s in (1, -1)], grid])
+begin = time.perf_counter()
+# Only the ends of the basins' paths are kept, batch by batch: whole ones would fill the memory.
+ends, paths = [], np.zeros((0, SETTLE + 1, 2))
+for chunk in np.array_split(starts, max(1, round(len(starts) / 1024))):
+    padded = np.pad(chunk, ((0, -len(chunk) % 1024), (0, 0)), mode="edge")[: max(len(chunk), 1024)]
+    path = np.asarray(followed(*jnp.asarray(padded).T))[: len(chunk)]
+    ends.append(arrived(path))
+    if not len(paths):
+        paths = path[: 2 * len(kinds)]
+ends = np.concatenate(ends)
+print(f"basins and tests: {time.perf_counter() - begin:.1f} s")
+basin = ends[2 * len(kinds) :].reshape(GRID, GRID)
+measured = [growth(paths[2 * j : 2 * j + 2], kind) for j, kind in enumerate(kinds)]
+
+# %% [markdown]
+# ## Table
+
+
+# %%
+def row(j: int, kind: Kind) -> str:
+    o = kind.orbit
+    named = [f"{chr(65 + i)}" if i >= 0 else "none" for i in ends[2 * j : 2 * j + 2]]
+    clear = float(o.clearance)
+    return (
+        f"| {chr(65 + j)} | {len(kind.path)} | {int(o.impacts)} "
+        f"| ({float(o.state.Y):.6f}, {float(o.state.V):.6f}) "
+        f"| {float(o.y_min):.4f} … {float(o.y_max):.4f} | {kind.size:.6f} | {measured[j]:.6f} "
+        f"| {vi.STABILITY[o.stability].split(':')[-1].strip()} "
+        f"| {'∞' if np.isinf(clear) else f'{clear:.3f}'} "
+        f"| {'–' if not int(o.impacts) else f'{float(o.slowest_impact):.3f}'} "
+        f"| {sum(kind.counts.values()):,} (n = {', '.join(map(str, sorted(kind.counts)))}) "
+        f"| {' / '.join(named)} | {100 * np.mean(basin == j):.1f} % |"
+    )
+
+
+report = "\n".join(
+    [
+        f"{GUESSES:,} guesses each, uniform over Y = {LOW[0]:g} … {HIGH[0]:g}, V = ±{HIGH[1]:g} at "
+        f"φ = π; ζ = {ZETA:g}, k = {K:g}, d = {GAP:g}, ξ = {XI:g}. Two cores.",
+        "",
+        "| motion | period, cycles | impacts | section (Y, V) at φ = π | Y over the period "
+        "| largest multiplier | simulated growth | stability | clearance | slowest V⁻ "
+        "| guesses that found it | disturbed start ends at | basin |",
+        "|" + "---|" * 13,
+        *[row(j, kind) for j, kind in enumerate(kinds)],
+        "",
+        "| n | searches that found an orbit | distinct orbits | call with its compilation, s |",
+        "|---|---|---|---|",
+        *[
+            f"| {n} | {found:,} of {GUESSES:,} | {many} | {seconds:.1f} |"
+            for n, found, many, seconds in search_rows
+        ],
+        "",
+        again,
+        "",
+        f"Basins: {GRID}² starts, {SETTLE:,} cycles each; {100 * np.mean(basin < 0):.1f} % "
+        "ended at none of the listed motions.",
+    ]
+)
+print(report)
+
+# %% [markdown]
+# ## Figure: sections over the basins, and a phase portrait of each motion
+
+# %%
+PALE = ["#f2e6b8", "#bcdcf0", "#cfe8c6", "#e3cdea", "#f6d0c0", "#d9d9d9", "#fff7ec"]
+RED, BLUE = "#d62728", "#1f4fd8"
+figure = Figure(figsize=(12.5, 6.6), layout="constrained")
+FigureCanvasAgg(figure)
+left, right = np.ravel(figure.subfigures(1, 2, width_ratios=(1, 1.15), squeeze=False))
+axes = left.subplots(1, 1, squeeze=False)[0, 0]
+stable = [j for j, kind in enumerate(kinds) if bool(kind.orbit.stable)]
+axes.pcolormesh(
+    *side,
+    np.select([basin == j for j in stable], list(range(len(stable))), len(stable)),
+    cmap=ListedColormap([*PALE[: len(stable)], "white"]),
+    vmin=-0.5,
+    vmax=len(stable) + 0.5,
+)
+for j, kind in enumerate(kinds):
+    good = bool(kind.orbit.stable)
+    axes.plot(*kind.path.T, "o" if good else "X", color=BLUE if good else RED, ms=6, mec="white")
+    for point in kind.path:
+        place = {"xytext": (4, 4), "textcoords": "offset points"}
+        axes.annotate(chr(65 + j), tuple(point), fontsize=10, **place)
+for j, _ in enumerate(stable):
+    name = f"basin of {chr(65 + stable[j])}"
+    axes.plot([], [], "s", ms=10, color=PALE[j], mec="0.6", label=name)
+axes.plot([], [], "s", ms=10, color="white", mec="0.6", label="none of these")
+axes.plot([], [], "o", color=BLUE, label="stable orbit")
+axes.plot([], [], "X", color=RED, label="unstable orbit")
+axes.axvline(GAP, color="#1a9641", lw=1.8, label="stop")
+axes.set(xlabel="Y = y/a at φ = π", ylabel="V = dY/dτ at φ = π")
+axes.set(xlim=(LOW[0], HIGH[0] + 0.2), ylim=(LOW[1], HIGH[1]))
+left.legend(loc="outside upper center", ncols=4, fontsize=9)
+
+panels = right.subplots(-(-len(kinds) // 2), 2, squeeze=False).ravel()
+for j, (panel, kind) in enumerate(zip(panels, kinds, strict=False)):
+    run = kind.orbit.trajectory()
+    color = BLUE if bool(kind.orbit.stable) else RED
+    vi.plot_phase_portrait(run, kind.orbit.scene, ax=panel, color=color)
+    cycles = len(kind.path)
+    panel.set_title(f"{chr(65 + j)}: {2 * cycles}π, |μ| = {kind.size:.3f}", fontsize=10)
+    panel.label_outer()
+    panel.set(xlim=(-3.4, 1.4), ylim=(-4, 4))
+    if j + 2 >= len(kinds):  # the lowest panel of its column
+        panel.tick_params(labelbottom=True)
+        panel.set_xlabel("Y = y/a")
+for panel in panels[len(kinds) :]:
+    panel.axis("off")
+if not QUICK:
+    (HERE / "all_orbits.md").write_text("# All periodic motions at one point\n\n" + report + "\n")
+    vi.save_picture(figure, HERE / "figures" / "all_orbits.png")
