@@ -64,8 +64,8 @@ def test_the_state_is_what_the_scene_needs():
     assert carried(motor) == carried(ideal) + 2
     assert carried(timed) == carried(motor) + 2
     assert sum(count(ideal).values()) < sum(count(motor).values())
-    # Elapsed time, extremes and speeds are carried where they are asked for.
-    assert carried(program(MOTOR, MOTOR.start(), record="motion")) == carried(motor) + 8
+    # Elapsed time, extremes, speeds and energies are carried where they are asked for.
+    assert carried(program(MOTOR, MOTOR.start(), record="motion")) == carried(motor) + 10
     assert carried(program(IDEAL, IDEAL.start(), record="motion")) == carried(ideal) + 6
 
 

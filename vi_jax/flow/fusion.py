@@ -38,6 +38,9 @@ def jit(function: Callable, **options: Any) -> jax.stages.Wrapped:
 
     **Arguments:** `function` and any options of `jax.jit`.
     """
-    if jax.default_backend() == "cpu":
-        options = {"compiler_options": _CPU_OPTIONS, **options}
-    return jax.jit(function, **options)
+    return jax.jit(function, **{**compiling(), **options})
+
+
+def compiling() -> dict[str, Any]:
+    """Options for `jax.jit`, by backend."""
+    return {"compiler_options": _CPU_OPTIONS} if jax.default_backend() == "cpu" else {}

@@ -94,8 +94,8 @@ def _arrive(
     scene = plan.scene
     s, state, time, direction = trial.s, trial.state, trial.time, lane.direction
     record = lane.record
-    impacts, speed, log = record.impacts, record.speed, record.log
-    clearance = record.clearance
+    impacts, speed, loss = record.impacts, record.speed, record.loss
+    log, clearance = record.log, record.clearance
     completed = trial.ends_interval
     if trial.position is not None:
         v = stop_gradient(trial.position[1].v)
@@ -131,6 +131,9 @@ def _arrive(
         impacts = impacts + jnp.where(hit, 1.0, 0.0)
         if speed is not None:
             speed = jnp.where(hit, jnp.maximum(speed, approach), speed)
+        if loss is not None:
+            lost = 0.5 * (1 - stop.restitution**2) * approach**2
+            loss = loss + jnp.where(hit, lost, 0.0)
     y_max, y_min = record.y_max, record.y_min
     if y_max is not None and y_min is not None and trial.position is not None:
         end = trial.position[1]
@@ -150,7 +153,7 @@ def _arrive(
         jnp.where(taken, s, lane.s),
         select(taken, state, lane.state),
         jnp.where(taken, direction, lane.direction),
-        Record(time, y_max, y_min, impacts, speed, log, clearance),
+        Record(time, y_max, y_min, impacts, speed, loss, log, clearance),
         taken & completed,
     )
 

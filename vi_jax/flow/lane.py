@@ -5,6 +5,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
 from ..scene import AbstractScene
@@ -26,6 +27,7 @@ class Record(eqx.Module):
     y_min: Scalar | None
     impacts: Scalar
     speed: Scalar | None
+    loss: Scalar | None
     log: Float[Array, "3 size"] | None
     """Clock, V⁻ and stop of each impact, NaN where there was none."""
     clearance: Scalar | None
@@ -68,18 +70,34 @@ class Plan(eqx.Module):
     scene: AbstractScene
     method: AbstractMethod
     cycles: int = eqx.field(static=True)
+    """Cycles to record."""
     parts: int = eqx.field(static=True)
     """Record points per cycle."""
     motion: bool = eqx.field(static=True)
     """Whether extremes, durations and impact speeds are recorded."""
     log: int = eqx.field(static=True)
-    max_steps: float = eqx.field(static=True)
-    max_impacts: float = eqx.field(static=True)
+    bound: int = eqx.field(static=True)
+    """Steps that reverse mode must be able to store; 0 in forward mode."""
+    # Numbers that are no part of the program, so that others are not another one.
+    settle: Scalar
+    """Cycles before the first one recorded."""
+    max_steps: Scalar
+    max_impacts: Scalar
 
     @property
-    def intervals(self) -> int:
+    def kept(self) -> int:
         """Number of intervals to record."""
         return self.cycles * self.parts
+
+    @property
+    def skipped(self) -> Scalar:
+        """Number of intervals before the first one recorded."""
+        return self.settle * self.parts
+
+    @property
+    def intervals(self) -> Scalar:
+        """Number of intervals to go through."""
+        return self.skipped + self.kept
 
     @property
     def block(self) -> int:
@@ -105,14 +123,20 @@ class Plan(eqx.Module):
             y_min=Y if self.motion else None,
             impacts=zero,
             speed=zero if self.motion else None,
+            loss=zero if self.motion else None,
             log=jnp.full((3, self.log), jnp.nan, Y.dtype) if self.log else None,
             clearance=jnp.full_like(Y, jnp.inf) if self.motion and self.log else None,
         )
 
-    def launch(self, start: Any, bad: jax.Array) -> Lane:
-        """A lane on its first section; `bad` marks a start that cannot be run."""
+    def launch(self, start: Any, wanted: Any = True) -> Lane:
+        """A lane on its first section; one that cannot be run, or is not wanted, has ended."""
         scene = self.scene
         Y = scene.position(start)
+        numbers = jtu.tree_leaves((start, eqx.filter(scene, eqx.is_inexact_array)))
+        bad = ~jnp.isfinite(sum(numbers)) | ~jnp.asarray(wanted)
+        for stop in scene.stops:
+            bad = bad | (stop.sign * Y > stop.gap)
+        bad = jax.lax.stop_gradient(bad)
         zero = jnp.zeros_like(Y)
         here = rates(scene.field, scene.position, zero, start)
         # At rest the acceleration says which way the motion goes.

@@ -39,20 +39,20 @@ def run_forward(plan: Plan, lane: Lane) -> tuple[Lane, Any, Record]:
     Steps are taken in blocks in which a lane completes at most one interval, so that results are
     stored once a block. Differentiable in forward mode.
 
-    **Returns:** the final lane, and the states and records of all intervals, with leading axis
-    `plan.intervals`.
+    **Returns:** the final lane, and the states and records of the intervals kept, with leading
+    axis `plan.kept + 1`: the first holds the state in which recording begins, and no record.
     """
     flat, unravel = ravel_pytree((lane.kept_state, lane.kept))
-    store = jnp.full((plan.intervals, flat.size), jnp.nan, flat.dtype)
+    store = jnp.full((plan.kept + 1, flat.size), jnp.nan, flat.dtype)
+    store = store.at[place_of(plan, lane.done, True)].set(flat, mode="drop")
 
     def body(carry):
         lane, store = carry
         before = lane.done
         lane = jax.lax.fori_loop(0, plan.block, lambda _, x: iterate(plan, x), lane)
         kept, _ = ravel_pytree((lane.kept_state, lane.kept))
-        place = jnp.where(lane.done > before, lane.done - 1, float(plan.intervals))
-        index = jax.lax.stop_gradient(place).astype(jnp.int32)
-        return lane, store.at[index].set(kept, mode="drop")
+        place = place_of(plan, lane.done, lane.done > before)
+        return lane, store.at[place].set(kept, mode="drop")
 
     def going(carry):
         return any_lane(_active(plan, carry[0]))
@@ -62,27 +62,30 @@ def run_forward(plan: Plan, lane: Lane) -> tuple[Lane, Any, Record]:
     return lane, state, record
 
 
+def place_of(plan: Plan, done: jax.Array, new: jax.Array | bool) -> jax.Array:
+    """Where the interval just completed is stored; beyond the end if nowhere."""
+    place = jax.lax.stop_gradient(done) - plan.skipped
+    return jnp.where(new & (place >= 0), place, float(plan.kept + 1)).astype(jnp.int32)
+
+
 def run_reverse(plan: Plan, lane: Lane) -> tuple[Lane, Any, Record]:
     """As `run_forward`, by a scan over intervals with a checkpointed loop in each.
 
     Differentiable in reverse mode, with memory that grows with the root of the number of steps.
     """
 
-    def interval(lane, _):
-        goal = lane.done + 1
-
+    def interval(lane, goal):
         def going(lane):
             return any_lane(_active(plan, lane) & (jax.lax.stop_gradient(lane.done - goal) < 0))
 
         def body(lane):
             return _held(plan, goal, lane)
 
-        lane = eqxi.while_loop(
-            going, body, lane, kind="checkpointed", max_steps=int(plan.max_steps)
-        )
+        lane = eqxi.while_loop(going, body, lane, kind="checkpointed", max_steps=plan.bound)
         return lane, (lane.kept_state, lane.kept, lane.done >= goal)
 
-    lane, (state, record, complete) = jax.lax.scan(interval, lane, None, length=plan.intervals)
+    goals = plan.skipped + jnp.arange(plan.kept + 1, dtype=lane.done.dtype)
+    lane, (state, record, complete) = jax.lax.scan(interval, lane, goals)
     state, record = jtu.tree_map(
         lambda x: jax.vmap(jnp.where)(complete, x, jnp.full_like(x, jnp.nan)), (state, record)
     )

@@ -59,6 +59,11 @@ def reason(code: Float[Array, ""]) -> RESULTS:
     return result
 
 
+def number_of(result: RESULTS) -> Int[Array, "..."]:
+    """The place of a reason in `REASONS`; 0 is success."""
+    return jnp.asarray(sum(jnp.where(result == item, i, 0) for i, item in enumerate(REASONS)))
+
+
 class Samples(eqx.Module):
     """Dense samples, evenly spaced in the cycle; arrays have shape (cycles · samples + 1,)."""
 
@@ -100,6 +105,8 @@ class Run(eqx.Module):
     """Number of impacts in each cycle."""
     impact_speed: Float[Array, " cycles"] | None
     """Greatest V⁻ in each cycle (unit: a ω), 0 without impact."""
+    impact_energy: Float[Array, " cycles"] | None
+    """Energy lost in impacts in each cycle, Σ ½(1 - k²)V⁻² (unit: m_C a²ω²)."""
     clearance: Float[Array, " cycles"] | None
     """Smallest distance to a stop at which the body turned back in each cycle without touching it
     (unit: a), infinite where it did not; recorded along with the impact log."""

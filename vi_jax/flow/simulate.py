@@ -1,6 +1,7 @@
 """`simulate`: a scene, a start, a number of cycles and a method give a run."""
 
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -11,10 +12,14 @@ import numpy as np
 
 from .._checks import concrete, count, one_of
 from ..scene import AbstractScene, Scene
-from .lane import Plan, Record
+from .lane import Lane, Plan, Record
 from .loop import run_forward, run_reverse
 from .methods import AbstractMethod, Adaptive
+from .pool import run_pool
 from .results import ImpactLog, Run, Samples, reason
+
+# Steps in a cycle beyond which a lane is given up, unless the caller says otherwise.
+_STEPS = 65536
 
 
 def simulate(
@@ -22,6 +27,7 @@ def simulate(
     start: Any,
     cycles: int,
     *,
+    settle: Any = 0,
     method: AbstractMethod | None = None,
     clock: str | None = None,
     samples: int = 0,
@@ -41,7 +47,9 @@ def simulate(
 
     - `scene`: a `Scene`, or an `AbstractScene` of your own.
     - `start`: the state on the first section, from `scene.start(...)`.
-    - `cycles`: number of drive cycles, at least 1; static.
+    - `cycles`: number of drive cycles to record, at least 1; static.
+    - `settle`: drive cycles before them, of which nothing is kept; another number is not another
+      program.
     - `method`: `Adaptive` (default), `FixedStep` or `ExactFlight`.
     - `clock`: `"phase"` or `"time"`; `None` leaves the scene's own. The phase clock needs a crank
       that turns forward; the time clock carries a start from rest and a stall.
@@ -62,6 +70,35 @@ def simulate(
     Starts and parameters that are being traced cannot be looked at; such a lane ends with
     `RESULTS.bad_start` and harms no other.
     """
+    one_of("adjoint", adjoint, ("forward", "reverse"))
+    plan, start = planned(
+        scene, start, cycles, settle=settle, method=method, clock=clock, samples=samples,
+        impact_log=impact_log, record=record, reverse=adjoint == "reverse",
+        max_impacts=max_impacts, max_steps=max_steps,
+    )  # fmt: skip
+    run = _simulate(plan, start, samples > 0)
+    if throw:
+        failed = "A lane of the simulation failed; see `RESULTS` and `Run.result`."
+        run = eqx.error_if(run, ~run.successful, failed)
+    return run
+
+
+def planned(
+    scene: AbstractScene,
+    start: Any,
+    cycles: int,
+    *,
+    settle: Any = 0,
+    method: AbstractMethod | None = None,
+    clock: str | None = None,
+    samples: int = 0,
+    impact_log: int = 0,
+    record: str = "motion",
+    reverse: bool = False,
+    max_impacts: int = 1000,
+    max_steps: int | None = None,
+) -> tuple[Plan, Any]:
+    """The arguments of `simulate`, checked and put in the form in which the loop needs them."""
     if not isinstance(scene, AbstractScene):
         raise TypeError(
             f"Argument `scene` must be a `Scene` or an `AbstractScene`, but got {scene!r}."
@@ -76,9 +113,11 @@ def simulate(
     samples = count("samples", samples)
     impact_log = count("impact_log", impact_log)
     max_impacts = count("max_impacts", max_impacts)
-    max_steps = 65536 * cycles if max_steps is None else count("max_steps", max_steps, least=1)
+    if concrete(settle) is not None:
+        settle = count("settle", np.asarray(settle)[()])
+    if max_steps is not None:
+        max_steps = count("max_steps", max_steps, least=1)
     one_of("record", record, ("motion", "sections"))
-    one_of("adjoint", adjoint, ("forward", "reverse"))
     if clock is not None:
         if not isinstance(scene, Scene):
             raise ValueError(
@@ -96,8 +135,16 @@ def simulate(
         warnings.warn(
             "vi_jax is running in single precision: errors near 1e-6 and tolerances to match. For "
             'double precision call `jax.config.update("jax_enable_x64", True)` first.',
-            stacklevel=2,
+            stacklevel=3,
         )
+    start = as_floats(scene, start)
+    dtype = scene.position(start).dtype
+    bound = 0
+    if reverse:
+        if max_steps is None and concrete(settle) is None:
+            raise ValueError("Argument `max_steps` must be given where `settle` is traced.")
+        bound = int(_STEPS * (cycles + settle) if max_steps is None else max_steps)
+    steps = _STEPS * (cycles + jnp.asarray(settle, dtype)) if max_steps is None else max_steps
     plan = Plan(
         scene=scene,
         method=method,
@@ -105,15 +152,12 @@ def simulate(
         parts=max(1, samples),
         motion=record == "motion",
         log=impact_log,
-        max_steps=float(max_steps),
-        max_impacts=float(max_impacts),
+        bound=bound,
+        settle=jnp.asarray(settle, dtype),
+        max_steps=jnp.asarray(steps, dtype),
+        max_impacts=jnp.asarray(max_impacts, dtype),
     )
-    start = as_floats(scene, start)
-    run = _simulate(plan, start, samples > 0, adjoint == "reverse")
-    if throw:
-        failed = "A lane of the simulation failed; see `RESULTS` and `Run.result`."
-        run = eqx.error_if(run, ~run.successful, failed)
-    return run
+    return plan, start
 
 
 def as_floats(scene: AbstractScene, state: Any) -> Any:
@@ -155,22 +199,45 @@ def _check_start(scene: AbstractScene, start: Any) -> None:
 
 
 @eqx.filter_jit
-def _simulate(plan: Plan, start: Any, sampled: bool, reverse: bool) -> Run:
-    scene = plan.scene
-    Y = scene.position(start)
-    bad = ~jnp.isfinite(sum(jtu.tree_leaves((start, eqx.filter(scene, eqx.is_inexact_array)))))
-    for stop in scene.stops:
-        bad = bad | (stop.sign * Y > stop.gap)
-    lane, states, records = (run_reverse if reverse else run_forward)(
-        plan, plan.launch(start, jax.lax.stop_gradient(bad))
-    )
-    return _collect(plan, start, sampled, lane, states, records)
+def _simulate(plan: Plan, start: Any, sampled: bool) -> Run:
+    run = run_reverse if plan.bound else run_forward
+    lane, states, records = run(plan, plan.launch(start))
+    return collect(plan, sampled, lane, states, records)
 
 
-def _collect(plan: Plan, start: Any, sampled: bool, lane, states: Any, records: Record) -> Run:
+def simulate_pool(
+    lane_of: Callable[[Any], tuple[AbstractScene, Any]],
+    values: Any,
+    cycles: int,
+    *,
+    wanted: Any = None,
+    places: int = 256,
+    **options: Any,
+) -> Run:
+    """As `simulate` under `vmap`, a few lanes at a time (see `run_pool`); forward mode only.
+
+    **Arguments:** scene and start of one lane from its values; the values of all lanes, a pytree
+    with one leading axis; flags of the lanes that are wanted (the others are not run and come
+    back as failed); `places`, lanes on their way at once; `options` as for `simulate`.
+    """
+
+    def begin(value):
+        return planned(*lane_of(value), cycles, **options)
+
+    if wanted is None:
+        wanted = jnp.ones(jtu.tree_leaves(values)[0].shape[0], bool)
+    lanes, points, records = run_pool(begin, values, wanted, places)
+
+    def one(value, lane, points, records):
+        return collect(begin(value)[0], False, lane, points, records)
+
+    return jax.vmap(one)(values, lanes, points, records)
+
+
+def collect(plan: Plan, sampled: bool, lane: Lane, points: Any, records: Record) -> Run:
     """The run from what the loop stored for each interval."""
     scene, parts = plan.scene, plan.parts
-    points = jtu.tree_map(lambda a, b: jnp.concatenate([a[None], b]), start, states)
+    records = jtu.tree_map(lambda x: x[1:], records)
 
     def per_cycle(values, reduce):
         return None if values is None else reduce(values.reshape(plan.cycles, parts), axis=1)
@@ -178,7 +245,7 @@ def _collect(plan: Plan, start: Any, sampled: bool, lane, states: Any, records: 
     def whole(values):
         return jnp.where(jnp.isfinite(values), values, 0.0).astype(jnp.int32)
 
-    period = jnp.broadcast_to(scene.period, (plan.cycles,)).astype(scene.position(start).dtype)
+    period = jnp.broadcast_to(scene.period, (plan.cycles,)).astype(lane.done.dtype)
     duration = None
     if plan.motion:
         duration = period if records.time is None else per_cycle(records.time, jnp.sum)
@@ -186,7 +253,7 @@ def _collect(plan: Plan, start: Any, sampled: bool, lane, states: Any, records: 
     if sampled:
         interval = jnp.repeat(period / parts, parts) if records.time is None else records.time
         time = jnp.concatenate([jnp.zeros_like(interval[:1]), jnp.cumsum(interval)])
-        place = jnp.arange(plan.intervals + 1, dtype=time.dtype) / parts
+        place = jnp.arange(plan.kept + 1, dtype=time.dtype) / parts
         dense = Samples(place, time, points)
     log = None
     if plan.log:
@@ -197,6 +264,7 @@ def _collect(plan: Plan, start: Any, sampled: bool, lane, states: Any, records: 
         y_min=per_cycle(records.y_min, jnp.min),
         impacts=whole(per_cycle(records.impacts, jnp.sum)),
         impact_speed=per_cycle(records.speed, jnp.max),
+        impact_energy=per_cycle(records.loss, jnp.sum),
         clearance=per_cycle(records.clearance, jnp.min),
         duration=duration,
         frequency_ratio=None if duration is None else scene.frequency_ratio(duration),

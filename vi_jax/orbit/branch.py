@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import xarray as xr
 from jax.flatten_util import ravel_pytree
 from scipy.optimize import brentq
 
@@ -127,10 +128,8 @@ class Branch:
                 found.append(orbit_of(self.problem, step))
         return found
 
-    def to_xarray(self) -> Any:
-        """The branch as an `xarray.Dataset` over its points (needs xarray)."""
-        import xarray as xr
-
+    def to_xarray(self) -> xr.Dataset:
+        """The branch as an `xarray.Dataset` over its points."""
         units = {"y_min": "a", "y_max": "a", "clearance": "a", "impact_speed": "a ω"}
         data = {
             name: ("point", getattr(self, name))

@@ -20,7 +20,7 @@ import jax.tree_util as jtu
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Complex, Float
 
-from ..flow import AbstractMethod, ExactFlight, FixedStep
+from ..flow import AbstractMethod, FixedStep
 from ..flow.events import rates
 from ..scene import AbstractScene
 from ..scene.leaves import with_leaf

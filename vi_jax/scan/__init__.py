@@ -1,5 +1,15 @@
-"""Many motions at once: quasi-static sweeps, and what a settled motion is."""
+"""Many motions at once: grids, sweeps, basins, Lyapunov exponents, regimes."""
 
-from .regime import least_period as least_period
+from .basins import Attractor as Attractor
+from .basins import Basins as Basins
+from .basins import basins as basins
+from .lyapunov import Lyapunov as Lyapunov
+from .lyapunov import lyapunov as lyapunov
+from .measures import AbstractMeasure as AbstractMeasure
+from .measures import Exponent as Exponent
+from .measures import Regime as Regime
+from .measures import Sections as Sections
+from .scan import ScanInterrupted as ScanInterrupted
+from .scan import scan as scan
 from .sweep import Sweep as Sweep
 from .sweep import sweep as sweep

@@ -2,9 +2,12 @@
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float, Int
+
+_SLACK = 100.0
 
 
 def least_period(
@@ -12,14 +15,26 @@ def least_period(
 ) -> Int[Array, ""]:
     """The fewest drive cycles after which a motion repeats, or 0 if it does not.
 
-    **Arguments:** section states one after the other, a pytree with leaves (cycles,); the longest
-    period looked for; how far sections a period apart may differ (relative to 1 + |state|).
+    A motion that still spirals in may repeat better after several turns of the spiral than after
+    its period. So it counts as settled if some period fits within the tolerance, and of the
+    periods that fit within a hundred times the tolerance the least is taken.
+
+    **Arguments:** section states one after the other, a pytree with leaves (cycles,), more than
+    `longest` of them; the longest period looked for; how far sections a period apart may differ
+    (relative to 1 + |state|).
     """
-    period = jnp.zeros((), jnp.int32)
-    for p in range(longest, 0, -1):
-        apart = [
-            jnp.max(jnp.abs(x[p:] - x[:-p]) / (1 + jnp.abs(x[p:])))
-            for x in jtu.tree_leaves(sections)
-        ]
-        period = jnp.where(jnp.max(jnp.stack(apart)) <= tolerance, p, period)
-    return period
+    states = jnp.stack(jtu.tree_leaves(sections))
+    size = states.shape[1] - longest
+    last = states[:, longest:]
+    scale = 1 + jnp.abs(last)
+
+    def compared(carry, p):
+        period, least = carry
+        before = jax.lax.dynamic_slice_in_dim(states, longest - p, size, axis=1)
+        apart = jnp.max(jnp.abs(last - before) / scale)
+        return (jnp.where(apart <= _SLACK * tolerance, p, period), jnp.minimum(apart, least)), None
+
+    periods = jnp.arange(longest, 0, -1, dtype=jnp.int32)
+    begin = jnp.zeros((), jnp.int32), jnp.full((), jnp.inf, states.dtype)
+    (period, least), _ = jax.lax.scan(compared, begin, periods)
+    return jnp.where(least <= tolerance, period, 0)

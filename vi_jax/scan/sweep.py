@@ -110,23 +110,23 @@ def sweep(
 def _sweep(scene, parameter, values, start, settle, cycles, method, tolerance, max_steps) -> Sweep:
     def one(state, value):
         here = with_leaf(scene, parameter, value)
-        run = simulate(here, state, settle + cycles, method=method, max_steps=max_steps)
-        sections = jtu.tree_map(lambda x: x[settle + 1 :], run.sections)
+        run = simulate(here, state, cycles, settle=settle, method=method, max_steps=max_steps)
+        sections = jtu.tree_map(lambda x: x[1:], run.sections)
         last = jtu.tree_map(lambda x: x[-1], sections)
         state = jtu.tree_map(lambda a, b: jnp.where(run.successful, a, b), last, state)
         assert run.y_min is not None and run.y_max is not None
         assert run.impact_speed is not None and run.duration is not None
         period = least_period(sections, longest=cycles // 2, tolerance=tolerance)
-        hits = run.impacts[settle:].astype(value.dtype)
+        hits = run.impacts.astype(value.dtype)
         total = jnp.sum(jnp.where(jnp.arange(cycles) < period, hits, 0.0))
         return state, Sweep(
             values=value,
-            y_min=jnp.min(run.y_min[settle:]),
-            y_max=jnp.max(run.y_max[settle:]),
+            y_min=jnp.min(run.y_min),
+            y_max=jnp.max(run.y_max),
             period=period,
             impacts=jnp.where(period > 0, total, jnp.mean(hits)),
-            frequency_ratio=here.frequency_ratio(jnp.mean(run.duration[settle:])),
-            impact_speed=jnp.max(run.impact_speed[settle:]),
+            frequency_ratio=here.frequency_ratio(jnp.mean(run.duration)),
+            impact_speed=jnp.max(run.impact_speed),
             sections=sections,
             result=run.result,
         )

@@ -31,7 +31,11 @@ def with_leaf(tree: Any, name: str, value: Any) -> Any:
 
 def check_leaf(tree: Any, name: str, *, argument: str = "parameter") -> str:
     """`name`, if the scene has such a number."""
-    names = leaf_names(tree)
+    return check_name(leaf_names(tree), name, argument)
+
+
+def check_name(names: list[str], name: str, argument: str) -> str:
+    """`name`, if it is among the names of numbers. **Raises:** as `leaf`."""
     if name in names:
         return name
     near = difflib.get_close_matches(str(name), names, n=3, cutoff=0.3)

@@ -1,0 +1,40 @@
+"""A scan of a few seconds into a store, to be interrupted: `long_scan.py STORE [options]`."""
+
+import argparse
+import os
+import threading
+
+import jax
+import numpy as np
+
+AXES = {"drive.frequency_ratio": np.linspace(0.6, 1.4, 128), "start.Y": np.linspace(-1, 1, 64)}
+
+
+def main() -> None:
+    """Run it."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("store")
+    parser.add_argument("--devices", type=int, default=1)
+    parser.add_argument("--cluster", action="store_true")
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    jax.config.update("jax_num_cpu_devices", options.devices)
+    import vi_jax as vi
+
+    scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.8, gap=2.0)
+    vi.scan(scene, {"start.Y": [0.0]}, settle=300, lanes=1024, workers=2)  # compiles
+    print("begins", flush=True)
+    if not options.cluster:
+        vi.scan(scene, AXES, settle=300, lanes=1024, workers=2, store=options.store)
+        return
+    from dask.distributed import Client, LocalCluster
+
+    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+        with Client(cluster) as client:
+            first = next(iter(client.run(os.getpid).values()))
+            threading.Timer(8.0, os.kill, (first, 9)).start()
+            vi.scan(scene, AXES, settle=300, lanes=1024, cluster=client, store=options.store)
+
+
+if __name__ == "__main__":
+    main()

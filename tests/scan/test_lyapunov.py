@@ -1,0 +1,101 @@
+"""Exponents against the damping, the multipliers of orbits, and the growth of a disturbance."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+
+
+def ideal(zeta=0.9, k=0.5, xi=0.0, gap=2.0):
+    return vi.Scene.ideal(frequency_ratio=zeta, restitution=k, damping_ratio=xi, gap=gap)
+
+
+@pytest.mark.parametrize("xi", [0.02, 0.3, 0.9])
+def test_linear_oscillator(xi):
+    scene = ideal(xi=xi, gap=None)
+    found = vi.lyapunov(scene, scene.start(Y=1.0), 200)
+    # Both turn around each other; the weights average that out to the eighth digit or so.
+    np.testing.assert_allclose(found.exponents, [-xi, -xi], atol=1e-7)
+
+
+def test_overdamped_oscillator():
+    xi = 1.5
+    rates = -xi + np.array([1, -1]) * np.sqrt(xi**2 - 1)
+    scene = ideal(xi=xi, gap=None)
+    found = vi.lyapunov(scene, scene.start(Y=1.0), 400)
+    np.testing.assert_allclose(found.exponents, rates, atol=1e-9)
+
+
+@pytest.mark.parametrize("k, xi", [(0.5, 0.0), (0.8, 0.01)])
+def test_stable_orbit_has_the_rates_of_its_multipliers(k, xi):
+    scene = ideal(k=k, xi=xi)
+    found = vi.lyapunov(scene, scene.start(), 400, settle=600)
+    closed = vi.closed_form_orbits(scene, cycles=2)
+    orbit = vi.find_orbit(scene, scene.start(Y=closed.Y[0], V=closed.V[0]), cycles=2)
+    rates = np.sort(np.log(np.abs(orbit.multipliers)) / (4 * np.pi / 0.9))[::-1]
+    np.testing.assert_allclose(found.exponents, rates, atol=1e-6)
+
+
+def test_unstable_orbit_has_the_rates_of_its_multipliers():
+    # Started on it, the motion stays for the few cycles in which it is observed.
+    scene = ideal()
+    closed = vi.closed_form_orbits(scene, cycles=1)
+    start = scene.start(Y=closed.Y[0], V=closed.V[0])
+    found = vi.lyapunov(scene, start, 60, settle=0)
+    rates = np.sort(np.log(np.abs(closed.multipliers[0])) * 0.9 / (2 * np.pi))[::-1]
+    np.testing.assert_allclose(found.exponents, rates, atol=1e-4)
+    assert float(found.exponents[0]) > 0.01
+
+
+@pytest.mark.parametrize("zeta", [0.6, 0.7, 0.97])
+def test_exponents_add_up_to_the_mean_contraction(zeta):
+    # Volumes shrink by e^{-2ξ} in unit time and by k² in an impact, whatever the motion does.
+    k, xi = 0.8, 0.003
+    scene = ideal(zeta=zeta, k=k, xi=xi)
+    cycles = 4000
+    found = vi.lyapunov(scene, scene.start(Y=0.3), cycles, settle=500)
+    run = vi.simulate(scene, scene.start(Y=0.3), cycles, settle=500, method=vi.ExactFlight())
+    time = cycles * 2 * np.pi / zeta
+    contraction = -2 * xi + 2 * np.log(k) * int(run.impacts.sum()) / time
+    assert float(found.exponents.sum()) == pytest.approx(contraction, abs=2e-3)
+
+
+def test_chaos_is_seen_by_a_disturbance_too():
+    scene = ideal(zeta=0.7, k=0.8)
+    found = vi.lyapunov(scene, scene.start(), 4000, settle=2000)
+    assert float(found.exponents[0]) > 10 * float(found.spread) > 0
+
+    def after(Y, cycles):
+        start = vi.OscillatorState(Y, found.state.V)
+        return vi.simulate(scene, start, cycles, method=vi.ExactFlight()).sections.Y
+
+    Y = found.state.Y
+    apart = jnp.abs(after(Y + 1e-12, 60) - after(Y, 60))
+    rate = np.polyfit(np.arange(61)[5:], np.log(np.asarray(apart) + 1e-300)[5:], 1)[0]
+    # One stretch of sixty cycles grows at its own rate, not at the mean one.
+    assert rate == pytest.approx(float(found.per_cycle[0]), rel=0.6)
+
+
+def test_motor_has_three_and_vmap_gives_the_same():
+    scene = vi.Parameters(torque=10.0, kappa=0.9, restitution=0.8, gap=0.08).scene()
+    start = scene.start(Y=0.5)
+    found = vi.lyapunov(scene, start, 200, settle=300)
+    assert found.exponents.shape == (3,)
+    assert bool(found.successful) and float(found.exponents[0]) < 0
+    first = vi.lyapunov(scene, start, 200, settle=300, number=1)
+    np.testing.assert_allclose(first.exponents[0], found.exponents[0], atol=1e-7)
+
+
+def test_failed_runs_and_bad_arguments():
+    scene = ideal()
+    lost = jax.vmap(lambda Y: vi.lyapunov(scene, vi.OscillatorState(Y, 0.0 * Y), 8))(
+        jnp.array([0.0, 5.0])
+    )
+    assert np.isfinite(lost.exponents[0]).all()
+    assert list(np.asarray(lost.successful)) == [True, False]
+    assert np.isnan(lost.exponents[1]).all()
+    with pytest.raises(ValueError, match="`number` must be at most 2"):
+        vi.lyapunov(scene, scene.start(), number=3)
+    with pytest.raises(ValueError, match="`cycles` must be at least 8"):
+        vi.lyapunov(scene, scene.start(), 2)

@@ -1,0 +1,281 @@
+"""Scans against single runs; blocks, stores, devices, clusters; what goes wrong and what is said."""
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+import vi_jax as vi
+import xarray as xr
+
+SCENE = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.01)
+AXES = {
+    "drive.frequency_ratio": np.linspace(0.6, 1.4, 7),
+    "start.Y": np.linspace(-1.0, 1.0, 5),
+}
+SCRIPT = Path(__file__).with_name("long_scan.py")
+
+
+@pytest.fixture(scope="module")
+def data():
+    measure = ("extremes", "regime", "speed", "power", "impacts", "sections", "steps")
+    return vi.scan(SCENE, AXES, measure=measure, settle=100, cycles=130)
+
+
+def test_every_lane_is_a_run(data):
+    assert data.sizes["drive.frequency_ratio"] == 7 and data.sizes["start.Y"] == 5
+    for i, j in [(0, 0), (3, 2), (6, 4)]:
+        zeta, Y = AXES["drive.frequency_ratio"][i], AXES["start.Y"][j]
+        scene = vi.Scene.ideal(frequency_ratio=zeta, restitution=0.5, gap=2.0, damping_ratio=0.01)
+        run = vi.simulate(scene, scene.start(Y=Y), 130, settle=100, method=vi.ExactFlight())
+        lane = data.isel({"drive.frequency_ratio": i, "start.Y": j})
+        assert float(lane.y_min) == pytest.approx(float(run.y_min.min()), abs=1e-9)
+        assert float(lane.y_max) == pytest.approx(float(run.y_max.max()), abs=1e-9)
+        assert float(lane.impact_speed) == pytest.approx(float(run.impact_speed.max()), abs=1e-9)
+        assert float(lane.impact_rate) == pytest.approx(float(run.impacts.mean()), abs=1e-12)
+        assert float(lane.zeta) == pytest.approx(zeta, rel=1e-12)
+        np.testing.assert_allclose(lane.Y, run.sections.Y[-16:], atol=1e-9)
+        assert int(lane.steps) == int(run.steps)
+
+
+def test_power_is_what_the_impacts_take():
+    orbit = vi.closed_form_orbits(SCENE, cycles=1)
+    start = SCENE.start(Y=orbit.Y[0], V=orbit.V[0])
+    scene = SCENE
+    found = vi.scan(
+        scene, {"stops.0.restitution": [0.5]}, start=start, measure="power", settle=0, cycles=40
+    )
+    expected = 0.5 * (1 - 0.25) * float(orbit.impact_speed[0]) ** 2 * 0.9 / (2 * np.pi)
+    assert float(found.power[0]) == pytest.approx(expected, rel=1e-6)
+
+
+def test_labels_units_and_origin(data):
+    assert data.y_min.attrs["units"] == "a" and "long_name" in data.period.attrs
+    assert data["drive.frequency_ratio"].attrs["units"] == "ω"
+    assert "ExactFlight" in data.attrs["method"] and data.attrs["settle"] == 100
+    assert set(data.Y.dims) == {"drive.frequency_ratio", "start.Y", "cycle"}
+    assert data.result.attrs["flag_meanings"].split()[1] == "successful"
+
+
+def test_regime_tells_periods_chaos_and_what_does_not_settle():
+    scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.8, gap=2.0)
+    zetas = [0.65, 0.7, 0.9, 0.97, 1.1, 1.4]
+    data = vi.scan(scene, {"drive.frequency_ratio": zetas}, settle=3000)
+    period = dict(zip(zetas, np.asarray(data.period).tolist(), strict=True))
+    assert period[0.9] == 2 and period[1.1] == 1
+    assert period[0.7] == -1 and period[0.97] == -1
+    # A free motion without damping, off resonance, has two frequencies and repeats never.
+    free = vi.Scene.ideal(frequency_ratio=0.77, gap=None)
+    quiet = vi.scan(free, {"start.Y": [0.3]}, measure="regime", settle=10)
+    assert int(quiet.period[0]) == 0
+
+
+def test_blocks_do_not_change_numbers(data):
+    same = vi.scan(SCENE, AXES, measure=("extremes", "regime"), settle=100, cycles=130, workers=3)
+    xr.testing.assert_equal(same.y_min, data.y_min)
+    rows = {
+        "drive.frequency_ratio": np.repeat(AXES["drive.frequency_ratio"], 200),
+        "start.Y": np.tile(np.linspace(-1, 1, 200), 7),
+    }
+    pair = vi.scan(SCENE, rows, measure="extremes", settle=20, paired=True, lanes=256)
+    grid = vi.scan(
+        SCENE, {**AXES, "start.Y": np.linspace(-1, 1, 200)}, measure="extremes", settle=20
+    )
+    assert pair.y_min.dims == ("sample",)
+    np.testing.assert_array_equal(np.asarray(pair.y_min), np.asarray(grid.y_min).ravel())
+
+
+def test_other_numbers_compile_nothing(data):
+    compiled = []
+    jax.monitoring.register_event_duration_secs_listener(
+        lambda name, *_, **__: compiled.append(name) if "backend_compile" in name else None
+    )
+    axes = {name: row[:-1] + 0.01 for name, row in AXES.items()}
+    scene = vi.Scene.ideal(frequency_ratio=0.8, restitution=0.7, gap=1.5, damping_ratio=0.02)
+    measure = ("extremes", "regime", "speed", "power", "impacts", "sections", "steps")
+    vi.scan(scene, axes, measure=measure, settle=77, cycles=130)
+    assert not compiled
+
+
+def test_own_measures_scenes_and_starts():
+    def span(scene, run):
+        return {"span": run.y_max[-1] - run.y_min[-1], "last": run.sections.Y[-3:]}
+
+    def machine(kappa, torque):
+        return vi.Parameters(torque=torque, kappa=kappa, gap=0.08).scene(drive="motor")
+
+    data = vi.scan(
+        machine, {"kappa": [0.8, 0.9], "torque": [10.0, 100.0], "start.Y": [0.0, 1.0]},
+        measure=(span, "speed"), settle=20, cycles=20,
+    )  # fmt: skip
+    assert data.span.shape == (2, 2, 2) and data.last.shape == (2, 2, 2, 3)
+    scene = machine(0.9, 100.0)
+    run = vi.simulate(scene, scene.start(Y=1.0), 20, settle=20, method=vi.FixedStep())
+    lane = data.sel({"kappa": 0.9, "torque": 100.0, "start.Y": 1.0})
+    np.testing.assert_allclose(lane["last"], run.sections.Y[-3:], atol=1e-9)
+    speed = 2 * np.pi * 20 / float(run.duration.sum())
+    assert float(lane.zeta) == pytest.approx(speed, rel=1e-9)
+
+
+def test_derivatives_are_those_of_a_run():
+    names = ("drive.frequency_ratio", "start.V", "stops.0.gap")
+    data = vi.scan(
+        SCENE, {"start.Y": [0.1, 0.4]}, measure="extremes", settle=5, cycles=1, derivatives=names
+    )
+
+    def y_min(zeta, V, gap):
+        scene = vi.Scene.ideal(frequency_ratio=zeta, gap=gap, damping_ratio=0.01)
+        start = scene.start(Y=0.4, V=V)
+        return vi.simulate(scene, start, 1, settle=5, method=vi.ExactFlight()).y_min[0]
+
+    numbers = np.array([0.9, 0.0, 2.0])
+    for i, found in enumerate(np.asarray(data.d_y_min[1])):
+        step = np.zeros(3)
+        step[i] = 1e-6
+        slope = (y_min(*(numbers + step)) - y_min(*(numbers - step))) / 2e-6
+        assert found == pytest.approx(float(slope), rel=1e-5, abs=1e-7)
+
+
+def test_failing_lanes_are_counted_and_harm_no_other():
+    Y = [0.0, 5.0, 0.5]
+    with pytest.warns(UserWarning, match=r"1 of 3 lanes failed \(bad_start: 1\)"):
+        data = vi.scan(SCENE, {"start.Y": Y}, settle=10, cycles=128)
+    assert np.asarray(data.result).tolist() == [0, 1, 0]
+    assert np.isnan(data.y_min[1]) and int(data.period[1]) == -2
+    good = vi.scan(SCENE, {"start.Y": [0.0, 0.5]}, settle=10, cycles=128)
+    np.testing.assert_array_equal(data.y_min[[0, 2]], good.y_min)
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"axes": {"drive.freqency_ratio": [1.0]}}, "near names: drive.frequency_ratio"),
+        ({"axes": {"start.W": [1.0]}}, "`axes` must be a number of the scene"),
+        ({"axes": {"drive.frequency_ratio": [1.0, np.nan]}}, "finite"),
+        ({"axes": {"stops.0.restitution": [0.5, 1.5]}}, r"`restitution`.*\[0, 1\]"),
+        ({"axes": {}}, "`axes` must map"),
+        ({"measure": "extreme"}, "near names: extremes"),
+        ({"measure": ()}, "at least one"),
+        ({"cycles": 12}, "at least 128 for the measure Regime"),
+        ({"derivatives": ["stops.1.gap"]}, "near names: stops.0.gap"),
+        ({"store": "/dev/null/x"}, "`store` must be a path"),
+        ({"devices": 99}, "`devices` must be at most"),
+        ({"paired": True}, "rows of one length"),
+        ({"method": "exact"}, "`method` must be"),
+    ],
+)
+def test_what_cannot_be_run_is_said_before_any_work(change, message):
+    arguments = {"axes": AXES, **change}
+    with pytest.raises((ValueError, TypeError), match=message):
+        vi.scan(SCENE, **arguments)
+
+
+def test_a_store_is_resumed_and_guards_itself(tmp_path, monkeypatch):
+    import vi_jax.scan.work as work
+
+    axes = {"drive.frequency_ratio": np.linspace(0.6, 1.4, 40), "start.Y": np.linspace(-1, 1, 30)}
+    options = {"settle": 20, "cycles": 128, "lanes": 256, "workers": 1}
+    whole = vi.scan(SCENE, axes, **options)
+    path = tmp_path / "new" / "store.zarr"
+    done = []
+    compute = work.compute
+
+    def interrupted(*arguments):
+        if len(done) == 2:
+            raise KeyboardInterrupt
+        done.append(1)
+        return compute(*arguments)
+
+    monkeypatch.setattr(work, "compute", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        vi.scan(SCENE, axes, store=path, **options)
+    half = xr.open_zarr(path, consolidated=False, chunks=None, mask_and_scale=False)
+    assert 0 < int((half.result == 0).sum()) < half.result.size
+    counted = []
+    monkeypatch.setattr(work, "compute", lambda *a: counted.append(1) or compute(*a))
+    rest = vi.scan(SCENE, axes, store=path, **options)
+    assert len(counted) == 5 - len(done)
+    for name in whole.data_vars:
+        np.testing.assert_array_equal(rest[name].values, whole[name].values)
+    with pytest.raises(ValueError, match="settle is 20, and now it is 21"):
+        vi.scan(SCENE, axes, store=path, **{**options, "settle": 21})
+    with pytest.raises(ValueError, match=r"axis start.Y is .*, and now it is"):
+        vi.scan(SCENE, {**axes, "start.Y": np.linspace(-1, 1.1, 30)}, store=path, **options)
+    other = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.1, damping_ratio=0.01)
+    with pytest.raises(ValueError, match="scene stops.0.gap is 2.0, and now it is 2.1"):
+        vi.scan(other, axes, store=path, **options)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "letter.txt").write_text("mine")
+    with pytest.raises(ValueError, match="neither"):
+        vi.scan(SCENE, axes, store=tmp_path / "full", **options)
+
+
+def test_an_interrupted_scan_in_memory_gives_what_it_has(monkeypatch):
+    import vi_jax.scan.work as work
+
+    done = []
+    compute = work.compute
+
+    def interrupted(*arguments):
+        if done:
+            raise KeyboardInterrupt
+        done.append(1)
+        return compute(*arguments)
+
+    monkeypatch.setattr(work, "compute", interrupted)
+    with pytest.raises(vi.ScanInterrupted) as caught:
+        vi.scan(SCENE, {"start.Y": np.linspace(-1, 1, 600)}, settle=5, lanes=256, workers=1)
+    codes = np.asarray(caught.value.data.result)
+    assert (codes == 0).sum() == 256 and (codes == -1).sum() == 344
+
+
+def _run(path, *options, **environment):
+    command = [sys.executable, str(SCRIPT), str(path), *options]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, **environment)
+
+
+def _finished(path, *options):
+    process = _run(path, *options)
+    out, _ = process.communicate(timeout=300)
+    assert process.returncode == 0, out
+    data = xr.open_zarr(path, consolidated=False, chunks=None, mask_and_scale=False)
+    return {name: data[name].values for name in data.data_vars}
+
+
+@pytest.mark.slow
+def test_killed_at_any_moment_the_store_ends_the_same(tmp_path):
+    whole = _finished(tmp_path / "whole")
+    rng = np.random.default_rng(3)
+    killed = 0
+    for i in range(10):
+        path = tmp_path / f"killed{i}"
+        process = _run(path)
+        assert process.stdout is not None
+        process.stdout.readline()  # it is under way
+        time.sleep(rng.uniform(0, 1.5))
+        process.send_signal(signal.SIGKILL)
+        killed += process.wait() == -signal.SIGKILL
+        found = _finished(path)
+        for name, numbers in whole.items():
+            np.testing.assert_array_equal(found[name], numbers)
+    assert killed >= 5
+
+
+@pytest.mark.slow
+def test_any_number_of_devices_gives_the_same_numbers(tmp_path):
+    one, *others = (_finished(tmp_path / n, "--devices", n) for n in ("1", "2", "4"))
+    for other in others:
+        for name, numbers in one.items():
+            np.testing.assert_array_equal(other[name], numbers)
+
+
+@pytest.mark.slow
+def test_a_cluster_that_loses_a_worker_gives_the_same(tmp_path):
+    whole = _finished(tmp_path / "whole")
+    found = _finished(tmp_path / "cluster", "--cluster")
+    for name, numbers in whole.items():
+        np.testing.assert_array_equal(found[name], numbers)

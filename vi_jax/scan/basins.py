@@ -1,0 +1,235 @@
+"""`basins`: which start goes to which motion, the motions found on the way."""
+
+import dataclasses
+import math
+import warnings
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+
+from .._checks import count
+from ..flow import AbstractMethod, FixedStep, simulate
+from ..orbit.cycle_map import default_flow
+from ..scene import AbstractScene, Scene
+from .grid import axes_of
+from .job import START
+from .measures import AbstractMeasure, Regime
+from .scan import scan
+
+CHAOTIC, UNSETTLED, FAILED = -1, -2, -3
+
+
+class Attractor(NamedTuple):
+    """A motion on which starts have ended."""
+
+    label: int
+    period: int
+    """Period in drive cycles."""
+    impacts: float
+    """Impacts in a period."""
+    sections: dict[str, np.ndarray]
+    """Its section states, arrays of shape (period,)."""
+    starts: int
+    """Number of starts that ended on it."""
+    fraction: float
+    """Part of all starts."""
+    error: float
+    """Standard error of `fraction` for random starts, √(p(1 - p)/N); on a grid it is an upper
+    estimate."""
+
+
+class Basins(NamedTuple):
+    """Basins of attraction."""
+
+    data: xr.Dataset
+    """`label` over the region (or over `sample`): a number in `attractors`, or -1 for chaotic, -2
+    for unsettled and -3 for failed lanes; `period`, `impacts`, `result`, and a section state on
+    which the lane ended."""
+    attractors: list[Attractor]
+    """The periodic motions, the largest basin first: label i is `attractors[i]`."""
+    irregular: dict[str, float]
+    """Fractions of the starts that ended on no periodic motion: chaotic, unsettled, failed."""
+
+    def __str__(self) -> str:
+        lines = [f"Basins of {len(self.attractors)} periodic motions"]
+        for a in self.attractors:
+            where = ", ".join(f"{name} = {x[0]:.6g}" for name, x in a.sections.items())
+            lines.append(
+                f"  {a.label}: period {2 * a.period}π, {a.impacts:g} impacts, {where}: "
+                f"{100 * a.fraction:.2f} ± {100 * a.error:.2f} %"
+            )
+        lines += [f"  {name}: {100 * x:.2f} %" for name, x in self.irregular.items() if x]
+        return "\n".join(lines)
+
+
+class _Mark(AbstractMeasure):
+    """The section state of greatest Y among the last ones: the same for all lanes on a motion."""
+
+    longest: int = eqx.field(static=True)
+
+    @property
+    def cycles(self):
+        """As many as are compared."""
+        return self.longest
+
+    def __call__(self, scene, run):
+        """Of one lane."""
+        states = {name: x[-self.longest :] for name, x in vars(run.sections).items()}
+        highest = jnp.argmax(states["Y"])
+        return {name: x[highest] for name, x in states.items()}
+
+
+def basins(
+    scene: AbstractScene,
+    region: Mapping[str, tuple[float, float]],
+    *,
+    resolution: int | tuple[int, ...] = 128,
+    samples: int | None = None,
+    seed: int = 0,
+    settle: int = 400,
+    longest: int = 64,
+    tolerance: float = 1e-6,
+    apart: float = 1e-3,
+    method: AbstractMethod | None = None,
+    start: Any = None,
+    **options: Any,
+) -> Basins:
+    """Find the motions that starts in a region settle on, and which start goes to which.
+
+    No motion has to be known before: where each lane has ended is compared with the motions found
+    so far, phase shifts included, and a new motion is added where none is near. Starts beyond a
+    stop count as failed.
+
+    **Arguments:**
+
+    - `scene`: the scene.
+    - `region`: ranges of parts of the start, such as `{"start.Y": (-4, 2), "start.V": (-4, 4)}`.
+    - `resolution`: starts along each of them, on a grid that fills the range (cell centres).
+    - `samples`: instead of the grid so many random starts, uniform in the region (with `seed`),
+      for fractions with a standard error.
+    - `settle`: drive cycles before the motion is judged.
+    - `longest`, `tolerance`: as in `Regime`.
+    - `apart`: section states farther apart than this (relative to 1 + |state|) belong to different
+      motions.
+    - `method`, `start`, and further options: as for `scan` (`store` to interrupt and resume).
+
+    **Returns:** `Basins`.
+
+    **Raises:** as `scan`.
+    """
+    if not isinstance(scene, AbstractScene):
+        raise TypeError(f"Argument `scene` must be a `Scene`, but got {scene!r}.")
+    ranges = axes_of(region, "region")
+    for name, row in ranges.items():
+        if row.size != 2 or not row[0] < row[1] or not name.startswith(START):
+            raise ValueError(
+                'Argument `region` must give ranges (low, high) of parts of the start, "start.Y" '
+                f"and such, but got {region[name]!r} for {name!r}."
+            )
+    if samples is None:
+        sizes = resolution if isinstance(resolution, tuple) else (resolution,) * len(ranges)
+        if len(sizes) != len(ranges):
+            raise ValueError(
+                f"Argument `resolution` must be one number or {len(ranges)}, but got "
+                f"{resolution!r}."
+            )
+        axes = {}
+        for (name, (low, high)), size in zip(ranges.items(), sizes, strict=True):
+            size = count("resolution", size, least=1)
+            axes[name] = low + (high - low) * (np.arange(size) + 0.5) / size
+    else:
+        samples = count("samples", samples, least=1)
+        rng = np.random.default_rng(seed)
+        axes = {name: rng.uniform(low, high, samples) for name, (low, high) in ranges.items()}
+    method = default_flow(scene, FixedStep()) if method is None else method
+    measure = (Regime(longest=longest, tolerance=tolerance), _Mark(longest))
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "[0-9,]+ of [0-9,]+ lanes failed")
+        data = scan(
+            scene, axes, measure=measure, start=start, settle=settle, method=method,
+            paired=samples is not None, **options,
+        )  # fmt: skip
+    if start is None:
+        assert isinstance(scene, Scene)
+        start = scene.start()
+    names = [field.name for field in dataclasses.fields(start)]
+    period = np.asarray(data["period"]).ravel()
+    impacts = np.asarray(data["impacts"]).ravel()
+    states = np.stack([np.asarray(data[name]).ravel() for name in names], axis=1)
+
+    def followed(state: np.ndarray, cycles: int) -> np.ndarray:
+        parts = dict(zip(names, map(jnp.asarray, state), strict=True))
+        run = simulate(scene, dataclasses.replace(start, **parts), cycles, method=method)
+        return np.stack([np.asarray(x)[1:] for x in vars(run.sections).values()], axis=1)
+
+    label, motions = _sorted_out(period, states, apart, followed)
+    attractors = []
+    order = np.argsort([-np.sum(label == i) for i in range(len(motions))], kind="stable")
+    place = np.empty(len(order) + 3, int)
+    place[order] = np.arange(len(order))
+    place[[CHAOTIC, UNSETTLED, FAILED]] = [CHAOTIC, UNSETTLED, FAILED]
+    label = place[label]
+    for i, old in enumerate(order):
+        here = label == i
+        p = float(np.mean(here))
+        attractors.append(
+            Attractor(
+                label=i,
+                period=len(motions[old]),
+                impacts=float(np.median(impacts[here])),
+                sections=dict(zip(names, motions[old].T, strict=True)),
+                starts=int(np.sum(here)),
+                fraction=p,
+                error=math.sqrt(p * (1 - p) / label.size),
+            )
+        )
+    irregular = {
+        name: float(np.mean(label == number))
+        for name, number in (("chaotic", CHAOTIC), ("unsettled", UNSETTLED), ("failed", FAILED))
+    }
+    about = {
+        "long_name": "motion that the start settles on",
+        "flag_values": [CHAOTIC, UNSETTLED, FAILED],
+        "flag_meanings": "chaotic unsettled failed",
+    }
+    dims = data["period"].dims
+    kind = np.min_scalar_type(-max(3, len(order)))
+    data = data.assign(label=(dims, label.astype(kind).reshape(data["period"].shape), about))
+    return Basins(data, attractors, irregular)
+
+
+def _sorted_out(
+    period: np.ndarray,
+    states: np.ndarray,
+    apart: float,
+    followed: Callable[[np.ndarray, int], np.ndarray],
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """A label for each lane, and the section states of each motion."""
+    label = np.full(period.size, FAILED)
+    label[period == 0] = UNSETTLED
+    label[period == -1] = CHAOTIC
+    settled = np.flatnonzero(period > 0)
+    if not settled.size:
+        return label, []
+    # Lanes on one motion fall into few cells; what is told of one of them holds for all.
+    cells = np.floor(states[settled] / apart).astype(np.int64)
+    cells = np.column_stack([period[settled].astype(np.int64), cells])
+    _, first, inverse = np.unique(cells, axis=0, return_index=True, return_inverse=True)
+    motions: list[np.ndarray] = []
+    of_cell = np.empty(first.size, int)
+    for i, lane in enumerate(settled[first]):
+        p, state = int(period[lane]), states[lane]
+        for j, motion in enumerate(motions):
+            distance = np.abs(motion - state) / (1 + np.abs(state))
+            if len(motion) == p and np.min(np.max(distance, axis=1)) <= apart:
+                of_cell[i] = j
+                break
+        else:
+            of_cell[i] = len(motions)
+            motions.append(followed(state, p))
+    label[settled] = of_cell[inverse.ravel()]
+    return label, motions

@@ -1,0 +1,86 @@
+"""The grid of a scan, and the blocks in which it is worked off and stored."""
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+
+def axes_of(axes: Mapping[str, Any], argument: str = "axes") -> dict[str, np.ndarray]:
+    """The axes as rows of numbers.
+
+    **Raises:** `ValueError` or `TypeError` that names the axis.
+    """
+    if not isinstance(axes, Mapping) or not axes:
+        raise TypeError(
+            f"Argument `{argument}` must map names of numbers to rows of values, such as "
+            f'{{"drive.frequency_ratio": [0.8, 0.9]}}, but got {axes!r}.'
+        )
+    found = {}
+    for name, values in axes.items():
+        try:
+            row = np.asarray(values, float)
+        except (TypeError, ValueError):
+            raise TypeError(f"Axis {name!r} must hold numbers, but got {values!r}.") from None
+        if row.ndim != 1 or not row.size or not np.isfinite(row).all():
+            raise ValueError(
+                f"Axis {name!r} must be one row of finite numbers, but has shape {row.shape}"
+                f"{'.' if row.ndim != 1 or not row.size else ' and some are not finite.'}"
+            )
+        found[str(name)] = row
+    return found
+
+
+class Blocks:
+    """A grid cut into rectangles of at most so many lanes, contiguous in the grid's order.
+
+    If its axes are `paired`, their values are taken together, one lane for each place in the rows.
+    """
+
+    def __init__(self, axes: Mapping[str, np.ndarray], lanes: int, *, paired: bool = False):
+        self.axes, self.paired, self.lanes = dict(axes), paired, lanes
+        self.dims = ("sample",) if paired else tuple(axes)
+        self.shape = tuple(x.size for x in axes.values())[: 1 if paired else None]
+        room = lanes
+        block = []
+        for size in reversed(self.shape):
+            block.append(min(size, room))
+            room //= min(size, room)
+        self.block = tuple(reversed(block))
+        self.counts = tuple(
+            math.ceil(size / part) for size, part in zip(self.shape, self.block, strict=True)
+        )
+
+    @property
+    def total(self) -> int:
+        """Number of lanes."""
+        return math.prod(self.shape)
+
+    def dims_of(self, name: str) -> tuple[str]:
+        """The dimension along which an axis' values lie."""
+        return ("sample",) if self.paired else (name,)
+
+    def __len__(self) -> int:
+        return math.prod(self.counts)
+
+    def __iter__(self) -> Iterator[tuple[slice, ...]]:
+        return (self[i] for i in range(len(self)))
+
+    def __getitem__(self, index: int) -> tuple[slice, ...]:
+        """Where the block lies in the grid."""
+        if not 0 <= index < len(self):
+            raise IndexError(index)
+        corner = np.unravel_index(index, self.counts)
+        return tuple(
+            slice(int(c) * part, min(size, (int(c) + 1) * part))
+            for c, part, size in zip(corner, self.block, self.shape, strict=True)
+        )
+
+    def values(self, where: tuple[slice, ...]) -> dict[str, np.ndarray]:
+        """The axes' values of the block's lanes."""
+        if self.paired:
+            return {name: x[where] for name, x in self.axes.items()}
+        rows = [x[part] for x, part in zip(self.axes.values(), where, strict=True)]
+        grid = np.meshgrid(*rows, indexing="ij")
+        return {name: x.ravel() for name, x in zip(self.axes, grid, strict=True)}

@@ -1,0 +1,251 @@
+"""What a scan computes of its lanes: a pytree that is compiled once and can be sent away."""
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._checks import count
+from ..flow import AbstractMethod, FixedStep
+from ..flow.aim import select
+from ..flow.results import number_of
+from ..flow.simulate import simulate_pool
+from ..orbit.cycle_map import default_flow
+from ..scene import AbstractScene, Scene
+from ..scene.leaves import check_name, leaf, leaf_names, with_leaf
+from .grid import Blocks
+from .measures import AbstractMeasure, Numbers, measures_of
+
+START = "start."
+
+# Lanes on their way at once: on a CPU they should fit its cache.
+PLACES = 256
+
+# Lanes looked at again in one go by the measures that need it.
+_AGAIN = 64
+
+
+class Job(eqx.Module):
+    """What is computed of every lane of a scan."""
+
+    scene: AbstractScene | None
+    build: Callable[..., Any] | None = eqx.field(static=True)
+    """Makes the scene of the axes' values, in place of `scene`."""
+    start: Any
+    """The first state, or `None` for the scene's own."""
+    names: tuple[str, ...] = eqx.field(static=True)
+    derivatives: tuple[str, ...] = eqx.field(static=True)
+    measures: tuple[AbstractMeasure, ...]
+    method: AbstractMethod
+    clock: str | None = eqx.field(static=True)
+    cycles: int = eqx.field(static=True)
+    settle: Array
+    max_impacts: int = eqx.field(static=True)
+    max_steps: int | None = eqx.field(static=True)
+    places: int = eqx.field(static=True)
+
+    def lane(self, values: dict[str, Any], nudge: Any = None) -> tuple[AbstractScene, Any]:
+        """Scene and start of the lane with these values on the axes."""
+        of_scene = {name: x for name, x in values.items() if not name.startswith(START)}
+        if self.build is not None:
+            scene = self.build(**of_scene)
+        else:
+            scene = self.scene
+            for name, value in of_scene.items():
+                scene = with_leaf(scene, name, value)
+        assert scene is not None
+        scene = self._nudged(scene, "", nudge)
+        if self.clock is not None and isinstance(scene, Scene):
+            scene = scene.in_clock(self.clock)
+        start = self.start
+        if start is None:
+            assert isinstance(scene, Scene)
+            start = scene.start()
+        for name, value in values.items():
+            if name.startswith(START):
+                start = with_leaf(start, name.removeprefix(START), value)
+        return scene, self._nudged(start, START, nudge)
+
+    def _nudged(self, tree: Any, prefix: str, nudge: Any) -> Any:
+        """`tree` with the numbers moved that derivatives are asked for."""
+        if nudge is None:
+            return tree
+        for name, change in zip(self.derivatives, nudge, strict=True):
+            if name.startswith(START) == bool(prefix):
+                own = name.removeprefix(prefix)
+                tree = with_leaf(tree, own, leaf(tree, own) + change)
+        return tree
+
+    def __call__(
+        self, values: dict[str, Float[Array, " lanes"]], wanted: Array
+    ) -> dict[str, Array]:
+        """The numbers of all lanes, by name; `result` among them."""
+        found, state = self._first(values, wanted, None)
+        out = dict(found)
+        for measure in self.measures:
+            out = self._again(measure, values, wanted, state, out)
+        if self.derivatives:
+            basis = jnp.eye(len(self.derivatives), dtype=jtu.tree_leaves(values)[0].dtype)
+
+            def floats(nudge):
+                found, _ = self._first(values, wanted, nudge)
+                return {n: x for n, x in found.items() if jnp.issubdtype(x.dtype, jnp.floating)}
+
+            slopes = jax.vmap(lambda e: jax.jvp(floats, (jnp.zeros_like(e),), (e,))[1])(basis)
+            out |= {f"d_{n}": jnp.moveaxis(x, 0, 1) for n, x in slopes.items()}
+        return out
+
+    def _first(self, values, wanted, nudge) -> tuple[Numbers, Any]:
+        def lane_of(values):
+            return self.lane(values, nudge)
+
+        run = simulate_pool(
+            lane_of, values, self.cycles,
+            wanted=wanted, places=self.places, method=self.method, settle=self.settle,
+            max_impacts=self.max_impacts, max_steps=self.max_steps,
+        )  # fmt: skip
+
+        def measured(values, run):
+            scene, _ = lane_of(values)
+            found = {}
+            for measure in self.measures:
+                found |= measure(scene, run)
+            return {**found, "result": number_of(run.result).astype(jnp.int8)}
+
+        last = jtu.tree_map(lambda x: x[:, -1], run.sections)
+        return jax.vmap(measured)(values, run), last
+
+    def _again(self, measure: AbstractMeasure, values, wanted, state, out: Numbers) -> Numbers:
+        """`out` with what `measure` finds at a second look, at the lanes that need it only."""
+        lanes = wanted.shape[0]
+        unclear = jax.vmap(measure.unclear)(out)
+        if unclear is None:
+            return out
+        unclear = unclear & wanted & (out["result"] == 0)
+        order = jnp.argsort(~unclear, stable=True)
+        order = jnp.concatenate([order, jnp.full((_AGAIN,), lanes, order.dtype)])
+
+        def body(carry):
+            begin, out = carry
+            index = jax.lax.dynamic_slice_in_dim(order, begin, _AGAIN)
+
+            def one(index):
+                here = jtu.tree_map(lambda x: x[index], (values, state, out))
+                scene, _ = self.lane(here[0])
+                return {**here[2], **measure.later(scene, here[1], self.method, here[2])}
+
+            new = jax.vmap(one)(jnp.minimum(index, lanes - 1))
+            fits = (index < lanes) & unclear[jnp.minimum(index, lanes - 1)]
+            old = jtu.tree_map(lambda x: x[jnp.minimum(index, lanes - 1)], out)
+            new = jax.vmap(select)(fits, new, old)
+            return begin + _AGAIN, jtu.tree_map(
+                lambda x, y: x.at[index].set(y, mode="drop"), out, new
+            )
+
+        begin = jnp.zeros((), order.dtype)
+        total = jnp.sum(unclear)
+        return jax.lax.while_loop(lambda carry: carry[0] < total, body, (begin, out))[1]
+
+
+def make_job(
+    scene: Any,
+    names: tuple[str, ...],
+    *,
+    measure: Any,
+    start: Any = None,
+    settle: Any = 200,
+    cycles: int | None = None,
+    method: AbstractMethod | None = None,
+    clock: str | None = None,
+    derivatives: Iterable[str] = (),
+    max_impacts: int = 1000,
+    max_steps: int | None = None,
+) -> Job:
+    """The work for each lane, its arguments checked as far as they can be without the axes."""
+    measures = measures_of(measure)
+    needed = max(m.cycles for m in measures)
+    cycles = max(32, needed) if cycles is None else count("cycles", cycles, least=1)
+    if cycles < needed:
+        who = next(type(m).__name__ for m in measures if m.cycles > cycles)
+        raise ValueError(
+            f"Argument `cycles` must be at least {needed} for the measure {who}, but got {cycles}."
+        )
+    settle = count("settle", settle)
+    if isinstance(scene, AbstractScene):
+        template, build = scene, None
+    elif callable(scene):
+        template, build = None, scene
+    else:
+        raise TypeError(
+            "Argument `scene` must be a `Scene`, an `AbstractScene` or a function that makes one, "
+            f"but got {scene!r}."
+        )
+    if template is not None and not isinstance(template, Scene) and start is None:
+        raise ValueError("Argument `start` must be given for a scene of your own.")
+    if template is not None:
+        first = template.start() if start is None and isinstance(template, Scene) else start
+        for name in names:
+            _check_name(template, first, name, "axes")
+    if method is not None and not isinstance(method, AbstractMethod):
+        raise TypeError(
+            "Argument `method` must be `Adaptive(...)`, `FixedStep(...)` or `ExactFlight()`, but "
+            f"got {method!r}."
+        )
+    return Job(
+        scene=_as_arrays(template),
+        build=build,
+        start=_as_arrays(start),
+        names=names,
+        derivatives=tuple(derivatives),
+        measures=_as_arrays(measures),
+        method=_as_arrays(method if method is not None else _default(template)),
+        clock=clock,
+        cycles=cycles,
+        settle=jnp.asarray(settle),
+        max_impacts=count("max_impacts", max_impacts),
+        max_steps=None if max_steps is None else count("max_steps", max_steps, least=1),
+        places=PLACES,
+    )
+
+
+def _default(template: AbstractScene | None) -> AbstractMethod:
+    return FixedStep() if template is None else default_flow(template, FixedStep())
+
+
+def _as_arrays(tree: Any) -> Any:
+    """Numbers as arrays, so that others are not another program."""
+    return jtu.tree_map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray | float) else x, tree)
+
+
+def _check_name(scene: AbstractScene, start: Any, name: str, argument: str) -> None:
+    names = leaf_names(scene) + [START + n for n in leaf_names(start)]
+    check_name(names, name, argument)
+
+
+def check_corners(job: Job, blocks: Blocks) -> None:
+    """Run the checks of scene, start and method on the corners of the grid, before any work."""
+    corners: Any = [np.unique([x.min(), x.max()]) for x in blocks.axes.values()]
+    for values in np.stack(np.meshgrid(*corners, indexing="ij"), axis=-1).reshape(-1, len(corners)):
+        lane = {name: jnp.asarray(x) for name, x in zip(blocks.axes, values, strict=True)}
+        scene, start = job.lane(lane)
+        _checked(scene)
+        for name in job.derivatives:
+            _check_name(scene, start, name, "derivatives")
+        job.method.check(scene)
+        if isinstance(scene, Scene):
+            scene.adopt(start)
+
+
+def _checked(scene: AbstractScene) -> None:
+    """Run the scene's own checks again: a number put in place of another has passed none."""
+    parts = jtu.tree_leaves(scene, is_leaf=lambda x: isinstance(x, eqx.Module) and x is not scene)
+    for part in parts:
+        if isinstance(part, eqx.Module):
+            check = getattr(part, "__check_init__", None)
+            if check is not None:
+                check()

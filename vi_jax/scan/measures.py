@@ -1,0 +1,285 @@
+"""Measures: what a scan keeps of each motion."""
+
+import abc
+import difflib
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+from .._checks import count, require
+from ..flow import AbstractMethod, Run
+from ..scene import AbstractScene
+from .lyapunov import lyapunov
+from .regime import least_period
+
+Numbers = dict[str, Array]
+About = Mapping[str, Mapping[str, Any]]
+
+
+class AbstractMeasure(eqx.Module):
+    """What is computed of each lane from the cycles observed, before the next lanes are run."""
+
+    attributes: ClassVar[About] = {}
+    """Attributes of the variables by name, such as `units` and `long_name`; `dims` names the axes
+    of one that is an array."""
+
+    @property
+    def cycles(self) -> int:
+        """The fewest cycles that it must see."""
+        return 1
+
+    @abc.abstractmethod
+    def __call__(self, scene: AbstractScene, run: Run) -> Numbers:
+        """Named numbers (or short arrays) of one lane."""
+
+    def unclear(self, found: Numbers) -> Bool[Array, ""] | None:
+        """Whether `later` is needed for a lane; `None` if for none."""
+        return None
+
+    def later(
+        self, scene: AbstractScene, state: Any, method: AbstractMethod, found: Numbers
+    ) -> Numbers:
+        """Costlier numbers, only for lanes that are unclear; they replace those found."""
+        return {}
+
+
+class Extremes(AbstractMeasure):
+    """`y_min`, `y_max` and the greatest impact speed `impact_speed` over the cycles observed."""
+
+    attributes: ClassVar[About] = {
+        "y_min": {"units": "a", "long_name": "smallest Y"},
+        "y_max": {"units": "a", "long_name": "greatest Y"},
+        "impact_speed": {"units": "a ω", "long_name": "greatest V⁻"},
+    }
+
+    def __call__(self, scene, run):
+        """Of one lane."""
+        assert run.y_min is not None and run.y_max is not None and run.impact_speed is not None
+        return {
+            "y_min": jnp.min(run.y_min),
+            "y_max": jnp.max(run.y_max),
+            "impact_speed": jnp.max(run.impact_speed),
+        }
+
+
+class Speed(AbstractMeasure):
+    """`zeta`, the mean crank speed over the cycles observed."""
+
+    attributes: ClassVar[About] = {"zeta": {"units": "ω", "long_name": "mean crank speed ζ"}}
+
+    def __call__(self, scene, run):
+        """Of one lane."""
+        assert run.duration is not None
+        zeta = scene.frequency_ratio(jnp.mean(run.duration))
+        if zeta is None:
+            raise ValueError("Measure `speed` needs a scene that is driven.")
+        return {"zeta": zeta}
+
+
+class Power(AbstractMeasure):
+    """`power`, the mean rate at which impacts take up energy."""
+
+    attributes: ClassVar[About] = {
+        "power": {"units": "m_C a² ω³", "long_name": "mean impact power"}
+    }
+
+    def __call__(self, scene, run):
+        """Of one lane."""
+        assert run.duration is not None and run.impact_energy is not None
+        return {"power": jnp.sum(run.impact_energy) / jnp.sum(run.duration)}
+
+
+class Sections(AbstractMeasure):
+    """The section states of the last `number` cycles, one variable for each part of the state."""
+
+    number: int = eqx.field(static=True, default=16)
+    attributes: ClassVar[About] = {
+        "Y": {"units": "a", "long_name": "Y on the section", "dims": ("cycle",)},
+        "V": {"units": "a ω", "long_name": "V on the section", "dims": ("cycle",)},
+        "W": {"units": "ω", "long_name": "crank speed on the section", "dims": ("cycle",)},
+    }
+
+    def __check_init__(self):
+        count("number", self.number, least=1)
+
+    @property
+    def cycles(self):
+        """As many as are kept."""
+        return self.number
+
+    def __call__(self, scene, run):
+        """Of one lane, arrays of shape (number,)."""
+        return {name: x[-self.number :] for name, x in vars(run.sections).items()}
+
+
+class Impacts(AbstractMeasure):
+    """`impact_rate`, the impacts in a drive cycle, on average over the cycles observed."""
+
+    attributes: ClassVar[About] = {
+        "impact_rate": {"units": "1/cycle", "long_name": "impacts per drive cycle"}
+    }
+
+    def __call__(self, scene, run):
+        """Of one lane."""
+        return {"impact_rate": jnp.mean(run.impacts.astype(run.sections.Y.dtype))}
+
+
+class Steps(AbstractMeasure):
+    """`steps` and `rejected`, the steps tried and those rejected on their error estimate."""
+
+    attributes: ClassVar[About] = {
+        "steps": {"long_name": "steps tried"},
+        "rejected": {"long_name": "steps rejected"},
+    }
+
+    def __call__(self, scene, run):
+        """Of one lane."""
+        return {"steps": run.steps, "rejected": run.rejected}
+
+
+class Exponent(AbstractMeasure):
+    """`exponent`, the greatest Lyapunov exponent, over `observed` further drive cycles."""
+
+    observed: int = eqx.field(static=True, default=128)
+    attributes: ClassVar[About] = {
+        "exponent": {"units": "ω", "long_name": "greatest Lyapunov exponent"}
+    }
+
+    def __check_init__(self):
+        count("observed", self.observed, least=8)
+
+    def __call__(self, scene, run):
+        """Not yet known."""
+        return {"exponent": jnp.full_like(run.sections.Y[-1], jnp.nan)}
+
+    def unclear(self, found):
+        """Always."""
+        return jnp.asarray(True)
+
+    def later(self, scene, state, method, found):
+        """Of one lane."""
+        found_out = lyapunov(scene, state, self.observed, settle=0, number=1, method=method)
+        return {"exponent": found_out.exponents[0]}
+
+
+class Regime(AbstractMeasure):
+    """`period` in drive cycles and `impacts` in a period; unsettled and chaotic told apart.
+
+    A motion has the least period p ≤ `longest` after which its sections repeat within
+    `tolerance` (relative to 1 + |state|; see `least_period` for one that still spirals in). One
+    that does not repeat is looked at for another `observed` cycles: it is chaotic (period -1) if
+    its greatest Lyapunov exponent exceeds `threshold` (unit: ω), else unsettled or quasi-periodic
+    (period 0).
+    """
+
+    longest: int = eqx.field(static=True, default=64)
+    observed: int = eqx.field(static=True, default=256)
+    tolerance: float = eqx.field(default=1e-6)
+    threshold: float = eqx.field(default=2e-3)
+    attributes: ClassVar[About] = {
+        "period": {
+            "units": "cycles",
+            "long_name": "least period",
+            "flag_values": [-2, -1, 0],
+            "flag_meanings": "failed chaotic unsettled",
+        },
+        "impacts": {
+            "units": "1",
+            "long_name": "impacts in a period (per cycle, on average, where there is none)",
+        },
+    }
+
+    def __check_init__(self):
+        count("longest", self.longest, least=1)
+        count("observed", self.observed, least=8)
+        require("tolerance", self.tolerance, low=0.0, open_low=True)
+        require("threshold", self.threshold)
+
+    @property
+    def cycles(self):
+        """Twice the longest period."""
+        return 2 * self.longest
+
+    def __call__(self, scene, run):
+        """Of one lane; chaos is not yet told."""
+        sections = {name: x[1:] for name, x in vars(run.sections).items()}
+        period = least_period(sections, longest=self.longest, tolerance=self.tolerance)
+        hits = run.impacts.astype(run.sections.Y.dtype)
+        place = jnp.arange(hits.size)
+        total = jnp.sum(jnp.where(place >= hits.size - period, hits, 0.0))
+        return {
+            "period": jnp.where(run.successful, period, -2).astype(jnp.int16),
+            "impacts": jnp.where(period > 0, total, jnp.mean(hits)),
+        }
+
+    def unclear(self, found):
+        """Where it does not repeat."""
+        return found["period"] == 0
+
+    def later(self, scene, state, method, found):
+        """Chaotic or not."""
+        out = lyapunov(scene, state, self.observed, settle=0, number=1, method=method)
+        period = jnp.where(out.exponents[0] > self.threshold, -1, found["period"])
+        return {"period": period.astype(found["period"].dtype)}
+
+
+class Custom(AbstractMeasure):
+    """A user's own function of one lane's scene and run."""
+
+    function: Callable[..., Any] = eqx.field(static=True)
+
+    def __call__(self, scene, run):
+        """Of one lane."""
+        found = self.function(scene, run)
+        if not isinstance(found, Mapping):
+            raise TypeError(
+                "A function in argument `measure` must return a mapping of names to numbers, but "
+                f"returned {type(found).__name__}."
+            )
+        return {name: jnp.asarray(value) for name, value in found.items()}
+
+
+MEASURES: Mapping[str, Callable[[], AbstractMeasure]] = {
+    "extremes": Extremes,
+    "regime": Regime,
+    "speed": Speed,
+    "power": Power,
+    "impacts": Impacts,
+    "sections": Sections,
+    "exponent": Exponent,
+    "steps": Steps,
+}
+
+
+def measures_of(measure: Any) -> tuple[AbstractMeasure, ...]:
+    """Measures by name, as objects, or functions of a scene and a run; one or several.
+
+    **Raises:** `ValueError` for an unknown name, `TypeError` for anything else.
+    """
+    if isinstance(measure, str | AbstractMeasure) or callable(measure):
+        measure = (measure,)
+    if not isinstance(measure, Iterable):
+        raise TypeError(f"Argument `measure` must be a name or a function, but got {measure!r}.")
+    found = tuple(_measure(one) for one in measure)
+    if not found:
+        raise ValueError("Argument `measure` must name at least one measure, but is empty.")
+    return found
+
+
+def _measure(one: Any) -> AbstractMeasure:
+    if isinstance(one, AbstractMeasure):
+        return one
+    if isinstance(one, str):
+        if one in MEASURES:
+            return MEASURES[one]()
+        near = difflib.get_close_matches(one, MEASURES, n=2, cutoff=0.4) or list(MEASURES)
+        raise ValueError(
+            f"Argument `measure` must name a measure, but got {one!r}; near names: "
+            f"{', '.join(near)}."
+        )
+    if callable(one):
+        return Custom(one)
+    raise TypeError(f"Argument `measure` must be a name or a function, but got {one!r}.")

@@ -1,0 +1,288 @@
+"""`scan`: axes over parameters and starts give a labelled data set."""
+
+import dataclasses
+import hashlib
+import json
+import warnings
+from collections.abc import Callable, Iterable, Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+import xarray as xr
+from tqdm import tqdm
+
+from .._checks import count
+from ..flow import AbstractMethod
+from ..flow.results import REASONS, RESULTS
+from ..scene import AbstractScene
+from ..scene.leaves import leaf, leaf_names
+from .grid import Blocks, axes_of
+from .job import Job, check_corners, make_job
+from .store import MemoryStore, Variable, ZarrStore, check_writable, dataset, open_dataset
+from .work import block_size, rounded, run_here, run_on_cluster, size_of, worker_count
+
+_UNITS = {"Y": "a", "V": "a ω", "W": "ω", "phase": "rad", "frequency_ratio": "ω", "gap": "a"}
+
+
+class ScanInterrupted(KeyboardInterrupt):
+    """Raised when a scan in memory is interrupted: what was computed is not lost."""
+
+    def __init__(self, data: xr.Dataset):
+        super().__init__("the scan was interrupted; what was computed is in `.data`")
+        self.data = data
+
+
+def scan(
+    scene: AbstractScene | Callable[..., AbstractScene],
+    axes: Mapping[str, Any],
+    *,
+    measure: Any = ("extremes", "regime"),
+    start: Any = None,
+    settle: int = 200,
+    cycles: int | None = None,
+    method: AbstractMethod | None = None,
+    clock: str | None = None,
+    derivatives: Iterable[str] = (),
+    paired: bool = False,
+    max_impacts: int = 1000,
+    max_steps: int | None = None,
+    store: str | Path | None = None,
+    lanes: int | None = None,
+    workers: int | None = None,
+    devices: int | None = None,
+    cluster: Any = None,
+    progress: bool = True,
+) -> xr.Dataset:
+    """Simulate every combination of the axes' values and keep what is measured.
+
+    The grid is worked off in blocks of lanes, several at a time, all by one compiled program.
+    Inside a block a lane that has ended makes room for the next. Other numbers on the axes, in the
+    scene or in `settle` compile nothing again.
+
+    **Arguments:**
+
+    - `scene`: the scene, or a function of the axes' values by name that makes it (then define the
+      function once: another one is another program).
+    - `axes`: names of numbers of the scene (`"drive.frequency_ratio"`, `"stops.0.restitution"`)
+      or of the start (`"start.Y"`), each with a row of values.
+    - `measure`: what is kept: names out of `"extremes"`, `"regime"`, `"speed"`, `"power"`,
+      `"impacts"`, `"sections"`, `"exponent"`, `"steps"`; `AbstractMeasure`s; functions of a
+      lane's scene and `Run` that return named numbers.
+    - `start`: the first state; by default the scene's own start at rest.
+    - `settle`, `cycles`: drive cycles before observing (any number), and observed (static; by
+      default as many as the measures need, at least 32).
+    - `method`, `clock`, `max_impacts`, `max_steps`: as for `simulate`; by default `ExactFlight`
+      where it applies, else `FixedStep()`.
+    - `derivatives`: names, as on the axes, by which all floating-point variables are
+      differentiated, in forward mode: `d_y_min` and so on, with an axis `by`.
+    - `paired`: take the axes' values together, one lane for each place in the rows (which must be
+      of one length), along the dimension `sample`, instead of every combination.
+    - `store`: folder of a Zarr store, written block by block. The same call resumes it after an
+      interruption; a changed one is refused with the difference named.
+    - `lanes`: lanes in a block (a multiple of 256); memory grows with it and with `cycles`.
+    - `workers`: blocks at work at the same time on a CPU, by default as many as it has cores.
+    - `devices`: local devices over which a block is spread; all by default.
+    - `cluster`: a `dask.distributed.Client`, to work off the blocks there instead of here.
+    - `progress`: show a bar with rate and time left (in a terminal or notebook).
+
+    **Returns:** an `xarray.Dataset` over the axes, with units; `result` says of each lane how it
+    ended (0: well; -1: not computed). With a `store` it is read lazily from there.
+
+    **Raises:** `ValueError` or `TypeError` before any work for what cannot be run;
+    `ScanInterrupted` on Ctrl-C without a store.
+    """
+    grid = axes_of(axes)
+    if paired and len({x.size for x in grid.values()}) != 1:
+        raise ValueError(
+            "Argument `axes` must hold rows of one length if they are `paired`, but they have "
+            f"{[x.size for x in grid.values()]}."
+        )
+    job = make_job(
+        scene, tuple(grid), measure=measure, start=start, settle=settle, cycles=cycles,
+        method=method, clock=clock, derivatives=derivatives, max_impacts=max_impacts,
+        max_steps=max_steps,
+    )  # fmt: skip
+    workers = worker_count(workers)
+    devices = len(jax.local_devices()) if devices is None else count("devices", devices, least=1)
+    if devices > len(jax.local_devices()):
+        raise ValueError(
+            f"Argument `devices` must be at most {len(jax.local_devices())}, the local devices, "
+            f"but got {devices}."
+        )
+    total = Blocks(grid, 1, paired=paired).total
+    if store is not None and lanes is None:
+        lanes = _lanes_in(Path(store))
+    lanes = block_size(total, workers, devices) if lanes is None else rounded(lanes, devices)
+    if jax.default_backend() != "cpu":
+        job = dataclasses.replace(job, places=lanes // devices)
+    blocks = Blocks(grid, lanes, paired=paired)
+    check_corners(job, blocks)
+    variables = variables_of(job, blocks)
+    attributes = _attributes(job, blocks)
+    if store is not None:
+        check_writable(store)
+        kept: MemoryStore | ZarrStore = ZarrStore(
+            store, _description(job, blocks), blocks, variables
+        )
+    else:
+        kept = MemoryStore(blocks.shape, variables)
+
+    def collected() -> xr.Dataset:
+        if isinstance(kept, MemoryStore):
+            data = dataset(kept.arrays, blocks, variables)
+        else:
+            data = open_dataset(kept.path)
+        for name in grid:
+            data[name].attrs["units"] = _UNITS.get(name.split(".")[-1], "1")
+        data.attrs = attributes
+        return data
+
+    open_blocks = [where for where in blocks if not kept.done(where)]
+    try:
+        with tqdm(
+            total=total,
+            initial=total - sum(size_of(where) for where in open_blocks),
+            unit="lane",
+            unit_scale=True,
+            disable=None if progress else True,
+        ) as bar:
+            done = (
+                run_on_cluster(job, blocks, open_blocks, cluster)
+                if cluster is not None
+                else run_here(job, blocks, open_blocks, workers, devices)
+            )
+            for where, numbers in done:
+                kept.write(where, numbers)
+                bar.update(size_of(where))
+    except KeyboardInterrupt:
+        if isinstance(kept, ZarrStore):
+            raise
+        raise ScanInterrupted(collected()) from None
+    data = collected()
+    _tell_failures(data)
+    return data
+
+
+def variables_of(job: Job, blocks: Blocks) -> dict[str, Variable]:
+    """What the job computes, found without computing it."""
+    values = {name: jnp.zeros(4) + x[0] for name, x in blocks.axes.items()}
+    shapes = eqx.filter_eval_shape(job, values, jnp.ones(4, bool))
+    known: dict[str, Mapping[str, Any]] = {
+        "result": {
+            "long_name": "how the lane ended",
+            "flag_values": [-1, *range(len(REASONS))],
+            "flag_meanings": " ".join(["not_computed", *reason_names()]),
+        }
+    }
+    for measure in job.measures:
+        known |= measure.attributes
+    found = {}
+    for name, shape in shapes.items():
+        by = name.startswith("d_") and name not in known and bool(job.derivatives)
+        about = dict(known.get(name.removeprefix("d_") if by else name, {}))
+        dims = tuple(about.pop("dims", ()))
+        if by:
+            dims = ("by", *dims)
+            about = {
+                "long_name": f"derivative of {name.removeprefix('d_')}",
+                "by": list(job.derivatives),
+            }
+        sizes = shape.shape[1:]
+        if len(dims) != len(sizes):
+            dims = tuple(f"{name}_{i}" for i in range(len(sizes)))
+        found[name] = Variable(dims, tuple(sizes), np.dtype(shape.dtype), about)
+    return found
+
+
+def reason_names() -> list[str]:
+    """The names of `RESULTS` in the order of their numbers."""
+    names = {RESULTS[getattr(RESULTS, n)]: n for n in vars(RESULTS) if not n.startswith("_")}
+    return [names.get(RESULTS[item], str(i)) for i, item in enumerate(REASONS)]
+
+
+def _tell_failures(data: xr.Dataset) -> None:
+    codes, numbers = np.unique(np.asarray(data["result"]), return_counts=True)
+    failed = {int(c): int(n) for c, n in zip(codes, numbers, strict=True) if c != 0}
+    if not failed:
+        return
+    names = ["not_computed", *reason_names()]
+    why = ", ".join(f"{names[code + 1]}: {n:,}" for code, n in failed.items())
+    warnings.warn(
+        f"{sum(failed.values()):,} of {data['result'].size:,} lanes failed ({why}); see `result` "
+        "and `RESULTS`.",
+        stacklevel=3,
+    )
+
+
+def _lanes_in(path: Path) -> int | None:
+    """The block size of a store that is there already."""
+    try:
+        attributes = json.loads((path / "zarr.json").read_text(encoding="utf-8"))["attributes"]
+        return int(attributes["scan"]["lanes"])
+    except (OSError, KeyError, ValueError, TypeError):
+        return None
+
+
+def _description(job: Job, blocks: Blocks) -> dict[str, Any]:
+    """What makes two scans the same, in words and numbers that JSON can hold."""
+
+    def told(tree: Any) -> str:
+        return eqx.tree_pformat(tree, short_arrays=False, width=10**6)
+
+    scene = {"made by": getattr(job.build, "__qualname__", repr(job.build))}
+    if job.scene is not None:
+        scene = {name: _told(leaf(job.scene, name)) for name in leaf_names(job.scene)}
+        scene["structure"] = str(jtu.tree_structure(job.scene))
+    start = {"": "the scene's own"}
+    if job.start is not None:
+        start = {name: _told(leaf(job.start, name)) for name in leaf_names(job.start)}
+    return {
+        "scene": scene,
+        "start": start,
+        "axis": {
+            name: {
+                "values": x.size,
+                "from": float(x[0]),
+                "to": float(x[-1]),
+                "digest": hashlib.sha256(x.tobytes()).hexdigest()[:16],
+            }
+            for name, x in blocks.axes.items()
+        },
+        "measure": [told(m) for m in job.measures],
+        "method": told(job.method),
+        "clock": job.clock,
+        "settle": int(job.settle),
+        "cycles": job.cycles,
+        "derivatives": list(job.derivatives),
+        "max_impacts": job.max_impacts,
+        "max_steps": job.max_steps,
+        "lanes": blocks.lanes,
+        "precision": str(jnp.result_type(float)),
+    }
+
+
+def _told(x: Any) -> Any:
+    return np.asarray(x, float).tolist()
+
+
+def _attributes(job: Job, blocks: Blocks) -> dict[str, Any]:
+    about = _description(job, blocks)
+    try:
+        number = version("vi-jax")
+    except PackageNotFoundError:
+        number = "not installed"
+    return {
+        "vi_jax": number,
+        "method": about["method"],
+        "settle": about["settle"],
+        "cycles": about["cycles"],
+        "scene": json.dumps(about["scene"]),
+        "start": json.dumps(about["start"]),
+        "precision": about["precision"],
+    }

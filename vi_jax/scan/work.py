@@ -1,0 +1,152 @@
+"""How the blocks of a scan are worked off: threads and devices here, or a Dask cluster."""
+
+import functools
+import math
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import Array
+
+from .._checks import count
+from ..flow.fusion import compiling
+from .grid import Blocks
+from .job import PLACES, Job
+
+# Lanes of a block on a CPU and on an accelerator.
+_MOST, _ON_ACCELERATOR = 4096, 65536
+
+
+def size_of(where: tuple[slice, ...]) -> int:
+    return math.prod(part.stop - part.start for part in where)
+
+
+def worker_count(workers: int | None) -> int:
+    if workers is not None:
+        return count("workers", workers, least=1)
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:
+        return os.cpu_count() or 1
+
+
+def block_size(total: int, workers: int, devices: int) -> int:
+    """Few sizes, because each is a program of its own; small enough to occupy every core."""
+    if jax.default_backend() != "cpu":
+        most, share = _ON_ACCELERATOR * devices, total
+    else:
+        most, share = _MOST * devices, math.ceil(total / workers)
+    size = PLACES * devices
+    while size < min(share, most):
+        size *= 2
+    return size
+
+
+def rounded(lanes: int, devices: int) -> int:
+    lanes = count("lanes", lanes, least=1)
+    step = PLACES * devices
+    return math.ceil(lanes / step) * step
+
+
+@functools.cache
+def _compiled(devices: int) -> Callable[..., dict[str, Array]]:
+    if devices == 1:
+        return eqx.filter_jit(lambda job, values, wanted: job(values, wanted), **compiling())
+    mesh = Mesh(np.asarray(jax.local_devices()[:devices]), ("lanes",))
+    whole, split = PartitionSpec(), PartitionSpec("lanes")
+
+    def spread(job, values, wanted):
+        numbers, rest = eqx.partition(job, eqx.is_array)
+
+        def here(numbers, values, wanted):
+            return eqx.combine(numbers, rest)(values, wanted)
+
+        return jax.shard_map(
+            here, mesh=mesh, in_specs=(whole, split, split), out_specs=split, check_vma=False
+        )(numbers, values, wanted)
+
+    return eqx.filter_jit(spread, **compiling())
+
+
+def compute(
+    job: Job, values: dict[str, np.ndarray], lanes: int, devices: int = 1
+) -> dict[str, np.ndarray]:
+    """The numbers of a block of lanes, filled up to `lanes` so that every block is one program.
+
+    With several devices the lanes are dealt to them in turn, since neighbours take alike long.
+    """
+    size = next(iter(values.values())).size
+    deal = np.arange(lanes).reshape(-1, devices).T.ravel()
+    place = np.minimum(deal, size - 1)
+    filled = {name: jnp.asarray(x[place]) for name, x in values.items()}
+    out = _compiled(devices)(job, filled, jnp.asarray(deal < size))
+    back = np.argsort(deal)[:size]
+    return {name: np.asarray(x)[back] for name, x in out.items()}
+
+
+def run_here(
+    job: Job, blocks: Blocks, todo: list, workers: int, devices: int
+) -> Iterator[tuple[tuple[slice, ...], dict[str, np.ndarray]]]:
+    """Blocks as they are done. Each runs on one core; several at a time keep all of them busy."""
+    if devices > 1 or jax.default_backend() != "cpu":
+        workers = 1
+
+    def work(where):
+        return where, compute(job, blocks.values(where), blocks.lanes, devices)
+
+    waiting = iter(todo)
+    pool = ThreadPoolExecutor(workers)
+    running: set[Future] = set()
+    try:
+        while True:
+            while len(running) < workers:
+                where = next(waiting, None)
+                if where is None:
+                    break
+                running.add(pool.submit(work, where))
+            if not running:
+                return
+            ended, running = wait(running, return_when=FIRST_COMPLETED)
+            for future in ended:
+                yield future.result()
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def run_on_cluster(job: Job, blocks: Blocks, todo: list, client: Any) -> Iterator[Any]:
+    """Blocks as Dask tasks, as they are done."""
+    from dask.distributed import as_completed
+
+    x64 = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
+    shared = client.scatter(_Parcel(job), broadcast=True, hash=False)
+    where_of = {
+        client.submit(
+            _remote, shared, blocks.values(where), blocks.lanes, x64, pure=False, retries=3
+        ): where
+        for where in todo
+    }
+    try:
+        for future in as_completed(list(where_of)):
+            yield where_of.pop(future), future.result()
+    finally:
+        client.cancel(list(where_of))
+
+
+class _Parcel:
+    """A job on its way to another process, its arrays as numpy ones."""
+
+    def __init__(self, job: Job):
+        self.job = jtu.tree_map(lambda x: np.asarray(x) if eqx.is_array(x) else x, job)
+
+
+def _remote(parcel: _Parcel, values: dict, lanes: int, x64: bool) -> dict[str, np.ndarray]:
+    with jax.enable_x64(x64):
+        job = jtu.tree_map(lambda x: jnp.asarray(x) if eqx.is_array_like(x) else x, parcel.job)
+        return compute(job, values, lanes)
