@@ -28,11 +28,13 @@ from .orbit import continue_orbit as continue_orbit
 from .orbit import cycle_map as cycle_map
 from .orbit import distinct_orbits as distinct_orbits
 from .orbit import find_orbit as find_orbit
+from .plot import plot_basins as plot_basins
 from .plot import plot_boundary as plot_boundary
 from .plot import plot_branch as plot_branch
 from .plot import plot_history as plot_history
 from .plot import plot_multipliers as plot_multipliers
 from .plot import plot_phase_portrait as plot_phase_portrait
+from .plot import plot_regimes as plot_regimes
 from .plot import plot_sweep as plot_sweep
 from .plot import save_picture as save_picture
 from .scan import AbstractMeasure as AbstractMeasure

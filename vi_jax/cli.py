@@ -1,4 +1,4 @@
-"""The command line: `vi-jax reproduce`."""
+"""The command line: `vi-jax reproduce`, and `vi-jax VERB FILE.toml` for what a file asks."""
 
 import argparse
 import sys
@@ -9,7 +9,26 @@ from pathlib import Path
 
 import jax
 
+from ._toml import ConfigError, keys_of
+from .config import (
+    BasinsTable,
+    ContinueTable,
+    OrbitTable,
+    ScanTable,
+    SimulateTable,
+    SweepTable,
+    read,
+)
 from .paper.report import reproduce, summary
+from .verbs import VERBS
+
+_ABOUT = {
+    "scan": ("every combination of the values on the axes", (ScanTable,)),
+    "sweep": ("one number changed little by little", (SweepTable,)),
+    "basins": ("which start settles on which motion", (BasinsTable,)),
+    "orbit": ("a periodic motion, and its branch", (OrbitTable, ContinueTable)),
+    "simulate": ("one motion, cycle by cycle", (SimulateTable,)),
+}
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -18,10 +37,15 @@ def main(argv: list[str] | None = None) -> int:
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal without Greek letters
     options = _parser().parse_args(argv)
+    if options.command == "reproduce":
+        return _reproduce(options)
+    return _run_file(options)
+
+
+def _reproduce(options: argparse.Namespace) -> int:
     problem = _unusable(options.out)
     if problem:
-        print(f"vi-jax: error: {problem}", file=sys.stderr)
-        return 2
+        return _error(problem, 2)
     jax.config.update("jax_enable_x64", True)
     try:
         found = reproduce(options.out, quick=options.quick, progress=_tell)
@@ -29,10 +53,43 @@ def main(argv: list[str] | None = None) -> int:
         print(f"vi-jax: interrupted; what was written is in {options.out}", file=sys.stderr)
         return 130
     except OSError as error:
-        print(f"vi-jax: error: {error}", file=sys.stderr)
-        return 1
+        return _error(error, 1)
     print(summary(found))
     return 0
+
+
+def _run_file(options: argparse.Namespace) -> int:
+    """Do what the file asks of the verb."""
+    jax.config.update("jax_enable_x64", True)
+    verb, store = options.command, None
+    try:
+        config = read(options.file)
+        table = getattr(config, verb)
+        if table is None:
+            raise ConfigError(f"missing table [{verb}], which says what to do")
+        store = getattr(table, "store", None)
+        found = VERBS[verb](config, _tell)
+    except ConfigError as error:
+        for problem in error.problems:
+            _error(f"{options.file}: {problem}", 2)
+        return 2
+    except KeyboardInterrupt:
+        how = f"nothing was kept (only a `store` in [{verb}] could be resumed)"
+        if store is not None:
+            how = f"the same command goes on from what is in {store}"
+        elif verb not in ("scan", "basins"):
+            how = "nothing was written"
+        print(f"vi-jax: interrupted; {how}", file=sys.stderr)
+        return 130
+    except OSError as error:
+        return _error(error, 1)
+    print(found.text)
+    return 0 if found.good else 1
+
+
+def _error(problem: object, code: int) -> int:
+    print(f"vi-jax: error: {problem}", file=sys.stderr)
+    return code
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -43,9 +100,10 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True)
     verb = commands.add_parser(
         "reproduce",
-        help="draw Figures 3 and 4 of the paper and write a report",
-        description="Draws Figures 3 and 4 of the paper (fig3.png, fig4.png), measures what it "
-        "claims with them and the faults of its printed text (report.md, report.json).",
+        help="draw Figures 2, 3 and 4 of the paper and write a report",
+        description="Draws Figures 2, 3 and 4 of the paper and the boundaries of its discrepancy, "
+        "measures what it claims with them and the faults of its printed text (report.md, "
+        "report.json).",
     )
     verb.add_argument(
         "--out", default="reproduction", metavar="DIR", help="folder to write into (%(default)s)"
@@ -53,7 +111,22 @@ def _parser() -> argparse.ArgumentParser:
     verb.add_argument(
         "--quick", action="store_true", help="60 cycles instead of 200, and fewer samples"
     )
+    for name, (about, tables) in _ABOUT.items():
+        verb = commands.add_parser(
+            name,
+            help=f"{about}, as a file says",
+            description=f"Does what FILE says: {about}. The file holds [scene] or [machine], if "
+            f"need be [start] and [method]{', [axes]' if name == 'scan' else ''}, and [{name}].",
+            epilog="; ".join(_keys(kind) for kind in tables),
+        )
+        verb.add_argument("file", metavar="FILE", help="a TOML file")
     return parser
+
+
+def _keys(kind: type) -> str:
+    """The keys of a table, for the help."""
+    name = (kind.__doc__ or "").strip("`.")
+    return f"keys of {name}: {', '.join(key.rstrip('_') for key in keys_of(kind))}"
 
 
 def _version() -> str:

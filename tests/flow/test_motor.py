@@ -94,3 +94,18 @@ def test_sine_and_cosine_to_rounding():
     np.testing.assert_allclose(cosine, np.cos(phase), atol=1e-15)
     slope = jax.vmap(jax.grad(jax.grad(lambda x: sincos(x)[0])))(phase[:50])
     np.testing.assert_allclose(slope, -np.sin(phase[:50]), atol=1e-15)
+
+
+@pytest.mark.parametrize("torque", [100.0, 1000.0])
+def test_fixed_steps_stay_stable_for_a_strong_motor(torque):
+    # Its shaft comes back to speed within a small part of a cycle, at low speed most of all.
+    def last(kappa, method):
+        scene = vi.Parameters(torque=torque, kappa=kappa, gap=0.08).scene()
+        run = vi.simulate(scene, scene.start(), 20, method=method)
+        return run.sections.Y[-1], run.successful
+
+    kappas = jnp.array([0.3, 0.6, 1.2])
+    found, good = jax.vmap(lambda kappa: last(kappa, vi.FixedStep()))(kappas)
+    exact, _ = jax.vmap(lambda kappa: last(kappa, vi.Adaptive(rtol=1e-11)))(kappas)
+    assert bool(good.all())
+    np.testing.assert_allclose(found, exact, atol=1e-6)

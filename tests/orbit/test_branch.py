@@ -267,3 +267,40 @@ def test_says_what_is_wrong(arguments, message):
     orbit = short_orbit(scene_at(0.9, 0.5))
     with pytest.raises(ValueError, match=message):
         vi.continue_orbit(orbit, **{"parameter": ZETA, "bounds": (0.5, 1.9), **arguments})
+
+
+@pytest.mark.slow
+def test_branches_do_not_depend_on_where_they_begin(short, long, restitution):
+    # At ζ = 1.2 the impact lies on the other side of the section than at 0.9.
+    scene = vi.Scene.ideal(frequency_ratio=1.2, restitution=restitution)
+    other = vi.continue_orbit(short_orbit(scene), parameter=ZETA, bounds=(0.5, 1.9))
+    same = {(p.kind, round(p.parameter, 8)) for p in short.special}
+    assert {(p.kind, round(p.parameter, 8)) for p in other.special} == same
+    doubling = next(p for p in other.special if p.kind == "period-doubling")
+    switched = doubling.switch()
+    assert (np.asarray(switched.impact_phase) < 4 * np.pi).all()
+    doubled = vi.continue_orbit(switched, parameter=ZETA, bounds=(0.5, 1.9))
+    assert doubled.admissible.all()
+    for mine, its in zip(
+        sorted(p.parameter for p in doubled.special),
+        sorted(p.parameter for p in long[0].special),
+        strict=True,
+    ):
+        assert mine == pytest.approx(its, abs=1e-8)
+
+
+def test_a_doubled_branch_springs_where_the_other_doubles(short, long):
+    doubling = next(p for p in short.special if p.kind == "period-doubling")
+    springs = next(p for p in long[0].special if "springs" in p.detail)
+    assert springs.parameter == pytest.approx(doubling.parameter, abs=1e-11)
+    assert float(springs.orbit.residual) < 1e-12
+
+
+def test_a_boundary_ends_on_its_bounds(short):
+    # Its second parameter has a scale far below 1.
+    doubling = next(p for p in short.special if p.kind == "period-doubling")
+    xi = "oscillator.damping_ratio"
+    curve = vi.boundary(doubling, parameter=xi, bounds=((0.5, 1.9), (0.0, 0.004)))
+    assert "bounds" in curve.ends
+    ends = curve.parameters[[0, -1], 1]
+    assert min(abs(ends)) < 1e-9 and max(ends) == pytest.approx(0.004, abs=1e-9)

@@ -19,7 +19,7 @@ def test_motions_are_orbits(found):
     for attractor in found.attractors:
         start = SCENE.start(**{name: x[0] for name, x in attractor.sections.items()})
         orbit = vi.find_orbit(SCENE, start, cycles=attractor.period)
-        assert bool(orbit.stable) and int(orbit.period) == attractor.period
+        assert bool(orbit.stable) and int(orbit.cycles) == attractor.period
         assert len(attractor.sections["Y"]) == attractor.period
         assert float(orbit.state.Y) == pytest.approx(attractor.sections["Y"][0], abs=1e-4)
 

@@ -14,9 +14,9 @@ def ideal(zeta=0.9, k=0.5, xi=0.0, gap=2.0):
 @pytest.mark.parametrize("xi", [0.02, 0.3, 0.9])
 def test_linear_oscillator(xi):
     scene = ideal(xi=xi, gap=None)
-    found = vi.lyapunov(scene, scene.start(Y=1.0), 200)
-    # Both turn around each other; the weights average that out to the eighth digit or so.
-    np.testing.assert_allclose(found.exponents, [-xi, -xi], atol=1e-7)
+    found = vi.lyapunov(scene, scene.start(Y=1.0), 1000)
+    # Both turn around each other, slowly for ξ = 0.9; the weights average that out.
+    np.testing.assert_allclose(found.exponents, [-xi, -xi], atol=1e-9)
 
 
 def test_overdamped_oscillator():

@@ -49,6 +49,16 @@ REASONS = (
     UNRESOLVED,
     MAX_STEPS,
 ) = range(len(REASONS))
+REASON_NAMES = (
+    "successful",
+    "bad_start",
+    "stalled",
+    "chatter",
+    "underflow",
+    "not_finite",
+    "unresolved",
+    "max_steps",
+)
 
 
 def reason(code: Float[Array, ""]) -> RESULTS:

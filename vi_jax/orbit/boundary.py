@@ -133,7 +133,7 @@ def boundary(
             low <= value <= high for value, (low, high) in zip(new.x[-2:], bounds, strict=True)
         )
         if not inside:
-            return _cut(advance, here, new, bounds), "bounds"
+            return _cut(advance, here, new, bounds, scale), "bounds"
         others = [v for i, v in enumerate(new.seen.approach) if i != condition.impact]
         # At a grazing the body turns on the stop, to rounding.
         touching = point.kind == GRAZING and condition.impact is None
@@ -191,9 +191,9 @@ def _advance(condition: _Condition, x, tangent, scale, length) -> Step:
     return corrected(condition.residual, observe, x, tangent, scale, length)
 
 
-def _cut(advance: Any, here: Step, new: Step, bounds: Any) -> Step:
+def _cut(advance: Any, here: Step, new: Step, bounds: Any, scale: np.ndarray) -> Step:
     """The last point inside the bounds, by halving the step."""
-    low, high = 0.0, float(np.linalg.norm(new.x - here.x))
+    low, high = 0.0, float(np.dot(here.tangent, (new.x - here.x) / scale))
     last = here
     for _ in range(30):
         middle = 0.5 * (low + high)

@@ -11,14 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 from jax.flatten_util import ravel_pytree
-from scipy.optimize import brentq
+from scipy.optimize import brentq, newton
 
 from .._checks import count, require
 from ..flow import AbstractMethod
 from ..scene import AbstractScene, Scene
 from ..scene.leaves import check_leaf, leaf, with_leaf
 from .curve import Step, array_of, corrected, first_tangent, walk
-from .results import ORBIT_RESULTS, Orbit
+from .results import ORBIT_RESULTS, Orbit, told_impacts
 from .shooting import Shooting, carrier, steps_of
 
 FOLD, DOUBLING, TORUS = "fold", "period-doubling", "neimark-sacker"
@@ -148,8 +148,8 @@ class Branch:
     def __str__(self) -> str:
         low, high = self.parameter.min(), self.parameter.max()
         lines = [
-            f"Branch of {len(self.parameter)} motions of period {self.cycles} with "
-            f"{self.impact_speed.shape[1]} impacts, {self.name} in [{low:.6g}, {high:.6g}], "
+            f"Branch of {len(self.parameter)} motions of period {2 * self.cycles}π with "
+            f"{told_impacts(self.impact_speed.shape[1])}, {self.name} in [{low:.6g}, {high:.6g}], "
             f"{int(self.stable.sum())} of them stable; ends: {self.ends[0]}, {self.ends[1]}",
             *(f"  {point}" for point in self.special),
         ]
@@ -224,9 +224,9 @@ def continue_orbit(
         backward_steps, ends = [], ("closed", "closed")
     else:
         backward = walk(back.advance, turned, stop=back.stop, **settings)
-        backward_steps, ends = backward.steps[1:], (backward.end, forward.end)
+        backward_steps, ends = back.path(backward.steps[1:]), (backward.end, forward.end)
     special = [*reversed(back.special), *ahead.special]
-    steps = [*reversed(backward_steps), *forward.steps]
+    steps = [*reversed(backward_steps), *ahead.path(forward.steps)]
     return _branch(problem, parameter, steps, special, ends, scale)
 
 
@@ -320,6 +320,15 @@ def _advance(problem: Shooting, x, tangent, scale, length) -> Step:
 
 
 @eqx.filter_jit
+def _compiled_observe(problem, x):
+    return problem.observe(x)
+
+
+def _observe(problem: Shooting, x: np.ndarray) -> Any:
+    return array_of(_compiled_observe(problem, jnp.asarray(x)))
+
+
+@eqx.filter_jit
 def _compiled_tangent(problem, x, scale):
     return first_tangent(problem.residual, x, scale)
 
@@ -333,42 +342,50 @@ def _compiled_state(problem, x, leg, s):
     return problem.state_at(x, leg, s)
 
 
+@eqx.filter_jit
+def _compiled_sections(problem, x, legs, places):
+    states = jax.vmap(lambda leg, s: problem.state_at(x, leg, s))(legs, places)
+    return states, jnp.max(jnp.abs(problem.residual(x)))
+
+
 def orbit_of(problem: Shooting, step: Step) -> Orbit:
     """The solution at a step as an `Orbit`."""
     x, seen = jnp.asarray(step.x), step.seen
     scene = problem.at(x)
     clock = np.asarray(step.x)[: len(problem.stops)]
     turn = float(scene.cycle)
-    sections = []
-    for cycle in range(problem.cycles):
-        s = turn * cycle
-        while len(clock) and s < clock[0]:
-            s += turn * problem.cycles
-        leg = max(0, int(np.searchsorted(clock, s, side="right")) - 1)
-        sections.append(_compiled_state(problem, x, jnp.asarray(leg), jnp.asarray(s)))
+    places = turn * np.arange(problem.cycles)
+    legs = np.zeros(problem.cycles, int)
+    # Along a branch an impact may move past the section: an orbit's clocks lie within its period.
+    within = np.mod(clock, turn * problem.cycles)
+    order = np.argsort(within)
+    if len(clock):
+        places = clock[0] + np.mod(places - clock[0], turn * problem.cycles)
+        legs = np.searchsorted(clock, places, side="right") - 1
+    sections, residual = _compiled_sections(problem, x, jnp.asarray(legs), jnp.asarray(places))
     admissible = seen.clearance >= -1e-9 and min(seen.approach, default=1.0) > -1e-9
-    since = clock
+    since = within[order]
     if isinstance(scene, Scene):
-        since = scene.phase_at(clock)
+        since = scene.phase_at(since)
     duration = jnp.asarray(seen.duration)
     return Orbit(
         scene=scene,
         flow=problem.flow,
-        state=sections[0],
-        sections=jax.tree.map(lambda *a: jnp.stack(a), *sections),
+        state=jax.tree.map(lambda x: x[0], sections),
+        sections=sections,
         cycles=jnp.asarray(problem.cycles, jnp.int32),
         duration=duration,
         frequency_ratio=scene.frequency_ratio(duration / problem.cycles),
         impact_phase=jnp.asarray(since),
-        impact_speed=jnp.asarray(seen.approach),
-        impact_stop=jnp.asarray(problem.stops, jnp.int32),
+        impact_speed=jnp.asarray(np.asarray(seen.approach)[order]),
+        impact_stop=jnp.asarray(np.asarray(problem.stops, np.int32)[order]),
         impacts=jnp.asarray(len(problem.stops), jnp.int32),
         y_min=jnp.asarray(seen.y_min),
         y_max=jnp.asarray(seen.y_max),
         clearance=jnp.asarray(seen.clearance),
         monodromy=jnp.asarray(seen.monodromy),
         multipliers=jnp.asarray(seen.multipliers),
-        residual=jnp.max(jnp.abs(problem.residual(x))),
+        residual=residual,
         error=jnp.asarray(step.size),
         iterations=jnp.asarray(step.iterations, jnp.int32),
         history=jnp.zeros((0,)),
@@ -422,6 +439,7 @@ class _Follower:
     def __init__(self, problem: Shooting, scale: np.ndarray, bounds: tuple[float, float]):
         self.problem, self.scale, self.bounds = problem, scale, bounds
         self.special: list[SpecialPoint] = []
+        self.between: dict[int, list[Step]] = {}
         self.start: Step | None = None
         self.away = False
 
@@ -499,6 +517,7 @@ class _Follower:
         if apart.size and np.dot(apart, self._halves(last)) < 0:
             at = self._where(here, last, lambda step: float(np.dot(apart, self._halves(step))))
             if at is not None:
+                at = self._origin(at)
                 told = "the branch springs from a motion of half the period"
                 self.special.append(self._point(DOUBLING, at, told))
                 return at
@@ -526,9 +545,55 @@ class _Follower:
             }[kind]
             if on_circle < 1e-5:  # or else a pole of the determinant, or a real pair μ, 1/μ
                 found.append((float(np.dot(here.tangent, at.x - here.x)), kind, at, told))
-        for _, kind, at, told in sorted(found, key=lambda f: f[0]):
+        found.sort(key=lambda f: f[0])
+        for _, kind, at, told in found:
             self.special.append(self._point(kind, at, told))
+        self.between[id(last)] = [at for _, _, at, _ in found]
         return None
+
+    def path(self, steps: list[Step]) -> list[Step]:
+        """The steps of a walk with the bifurcations located between them."""
+        return [step for new in steps for step in [*self.between.get(id(new), ()), new]]
+
+    def _origin(self, at: Step) -> Step:
+        """The point where the branch springs, located on the motion of half the period.
+
+        Both branches cross there, so that the equations of this one cannot be solved close by. The
+        mean of the two halves is a motion of half the period but for a term of second order.
+        """
+        problem, count = self.problem, len(self.problem.parameters)
+        legs, x = len(problem.stops) // 2, jnp.asarray(at.x)
+        turn = float(problem.scene.cycle) * problem.cycles / 2
+        half = dataclasses.replace(
+            problem, cycles=problem.cycles // 2, stops=problem.stops[:legs],
+            steps=problem.steps // 2,
+        )  # fmt: skip
+        clock, states = (np.asarray(a) for a in problem.parts(x))
+        if legs:
+            clock = 0.5 * (clock[:legs] + clock[legs:] - turn)
+            states = 0.5 * (states[:legs] + states[legs:])
+        else:
+            states = states + 0.5 * self._halves(at)
+        mean = np.asarray(half.pack(clock, states, at.x[-count:]))
+        scale = np.append(np.ones(mean.size - count), self.scale[-count:])
+        along = np.append(np.zeros(mean.size - 1), 1.0)
+
+        def missing(shift: float) -> float:
+            step = _advance(half, mean, along, scale, shift)
+            M = step.seen.monodromy
+            return float(np.linalg.det(M + np.eye(len(M)))) if bool(step.good) else np.nan
+
+        shift, report = newton(  # pyright: ignore[reportAssignmentType]
+            missing, 0.0, x1=1e-6, tol=1e-14, full_output=True, disp=False
+        )
+        if not report.converged or not abs(shift) < 1e-2:
+            return at
+        found = _advance(half, mean, along, scale, float(shift))
+        clock, states = (np.asarray(a) for a in half.parts(jnp.asarray(found.x)))
+        if legs:
+            clock, states = np.append(clock, clock + turn), np.concatenate([states, states])
+        x = np.asarray(problem.pack(clock, states, found.x[-count:]))
+        return at._replace(x=x, size=found.size, seen=_observe(problem, x))
 
     def _halves(self, step: Step) -> np.ndarray:
         """How the second half of the period differs from the first; empty if it cannot be alike."""

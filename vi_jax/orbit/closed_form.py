@@ -22,7 +22,6 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import expm
 from jaxtyping import Array, Bool, Complex, Float
 
 from .._checks import count
@@ -112,7 +111,7 @@ def one_impact_orbits(zeta: Any, xi: Any, k: Any, d: Any, n: int) -> ClosedFormO
     # Squarings of the flight over one grid step: over 1, 2, 4, … steps, and last over T. They
     # hold through resonance and critical damping, where sines and a steady response do not.
     doublings = (_POINTS * n - 1).bit_length()
-    flights = [expm(rates * (period / 2**doublings))]
+    flights = [_exponential(rates * (period / 2**doublings))]
     for _ in range(doublings):
         flights.append(_dot(flights[-1], flights[-1]))
     v, phase, resolved = _impacts(flights[-1], k, d, period)
@@ -124,7 +123,8 @@ def one_impact_orbits(zeta: Any, xi: Any, k: Any, d: Any, n: int) -> ClosedFormO
     y_min, y_max, clearance = follow(v, phase)
     wait = (2 * pi - phase) / zeta
     start = _after_impact(k, d, v, phase)
-    section = _dot(expm(rates * wait[:, None, None]), start[..., None])[..., 0]
+    carried = _exponential(rates * wait[:, None, None] / 2**doublings, doublings)
+    section = _dot(carried, start[..., None])[..., 0]
 
     multipliers = _multipliers(flights[-1], xi, k, d, v, phase, period)
     admissible = exists & (clearance >= 0)
@@ -151,6 +151,20 @@ def one_impact_orbits(zeta: Any, xi: Any, k: Any, d: Any, n: int) -> ClosedFormO
 def _dot(a, b):
     # Accelerators may round the factors of a float32 product to fewer bits unless told not to.
     return jnp.matmul(a, b, precision=jax.lax.Precision.HIGHEST)
+
+
+def _exponential(matrix: Float[Array, "... 4 4"], doublings: int = 0) -> Float[Array, "... 4 4"]:
+    """e^(2^doublings matrix), for matrices of norm up to 8, by Taylor's series and squaring.
+
+    Products only: the library's solver for batches of small systems can lock up two threads.
+    """
+    identity = jnp.eye(matrix.shape[-1], dtype=matrix.dtype)
+    small, total = matrix / 4, identity
+    for n in range(24, 0, -1):
+        total = identity + _dot(small, total) / n
+    for _ in range(2 + doublings):
+        total = _dot(total, total)
+    return total
 
 
 def _rates(zeta: Scalar, xi: Scalar) -> Float[Array, "4 4"]:
@@ -229,7 +243,7 @@ def _turning_point(rates, state, guess, h) -> Scalar:
     """Y where its velocity vanishes near the time `guess` after `state`, by Newton's method."""
 
     def at(time, rates, state):
-        state = _dot(expm(rates * time), state)
+        state = _dot(_exponential(rates * time), state)
         pull = _dot(rates[1], state)
         return state[0], state[1], jnp.where(jnp.abs(pull) > 0, pull, 1.0)
 

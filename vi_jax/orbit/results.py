@@ -16,6 +16,11 @@ from ..scene import AbstractScene, Scene
 from .floquet import STABILITY, stability_of
 
 
+def told_impacts(count: int) -> str:
+    """So many impacts, in words."""
+    return f"{count} impact{'' if count == 1 else 's'}"
+
+
 class ORBIT_RESULTS(eqx.Enumeration):
     """How a search for a periodic motion ended; `find_orbit` gives one to each guess."""
 
@@ -153,8 +158,7 @@ class Orbit(eqx.Module):
         where = ", ".join(f"{name} = {float(x):.9g}" for name, x in vars(self.state).items())
         period = f"{2 * cycles}π" if isinstance(self.scene, Scene) else f"{cycles} cycles"
         lines = [
-            f"Orbit of period {period} with {count} impact{'' if count == 1 else 's'}, "
-            f"{STABILITY[self.stability]}",
+            f"Orbit of period {period} with {told_impacts(count)}, {STABILITY[self.stability]}",
             f"  section: {where}",
             f"  Y in [{float(self.y_min):.9g}, {float(self.y_max):.9g}]",
         ]

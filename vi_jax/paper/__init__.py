@@ -1,4 +1,4 @@
-"""The paper's Figures 3 and 4 again: drawn, measured, and compared with what it says."""
+"""The paper's Figures 2, 3 and 4 again: drawn, measured, and compared with what it says."""
 
 from .claims import Claim as Claim
 from .claims import check_claims as check_claims

@@ -1,8 +1,6 @@
 """Figure 2: smallest and largest Y over ζ, by closed form, by continuation and by sweeps."""
 
-from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -10,306 +8,366 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from ..flow import jit
 from ..orbit import (
     Branch,
     ClosedFormOrbits,
-    CycleMap,
-    Orbit,
     closed_form_orbits,
     continue_orbit,
-    cycle_map,
     find_orbit,
 )
-from ..plot import plot_branch, plot_sweep, save_picture
-from ..plot.motion import BLUE, GREEN, PINK, RED
-from ..scan import Sweep, sweep
+from ..scan import Sweep, lyapunov, sweep
 from ..scene import RigidStop, Scene
 from ..scene.leaves import with_leaf
+from .motions import GAP, table_damping_ratio
 
+RESTITUTIONS = (0.8, 0.5)
 RANGE = (0.5, 1.9)
-GAP = 2.0
-# The paper draws "a potential position" of a left wall and gives no number. This one lies below
-# the 2π motion and above the 4π motion wherever both exist between BB' and CC'.
-WALL = 2.5
-RATIO = "drive.frequency_ratio"
+RATIO, DAMPING, BOUNCE = "drive.frequency_ratio", "oscillator.damping_ratio", "stops.0.restitution"
 
-# A region where the sweeps change much is stepped through more finely.
-_FINE = (0.69, 1.02)
-# Periods longer than this many cycles are not looked for: they are called irregular.
-_LONGEST = 16
-# Mean growth of a small disturbance per cycle, beyond which a motion counts as chaotic.
+# Between these the motions change much, and ζ is stepped through more finely.
+FINE = (0.695, 1.015)
+# Periods of more cycles than this are not looked for.
+_LONGEST = 12
+# Lanes of the programs that look at single values again; another number would be another program.
+_LANES = 128
+# A motion without a period counts as chaotic beyond this exponent (per drive cycle).
 _CHAOS = 0.01
+# From where on the minimum counts as apart from the 2π analysis (unit: a).
+_APART = 1e-3
 
 
-class Settled(NamedTuple):
-    """What one sweep is on at each ζ, in the order of rising ζ."""
-
-    sweep: Sweep
-    """Observed after the sweep went on for thousands of cycles at each value."""
-    exponent: np.ndarray
-    """Largest Lyapunov exponent, per drive cycle."""
-
-
-class Response(NamedTuple):
-    """Everything in one panel of Figure 2."""
+class System(NamedTuple):
+    """One k and one ξ of Figure 2. Arrays of the sweeps are in the order of rising ζ."""
 
     restitution: float
     damping_ratio: float
-    ratios: np.ndarray
-    """ζ, rising."""
     closed: dict[int, ClosedFormOrbits]
     """Motions with one impact per 1 and per 2 drive cycles at each ζ (2π and 4π)."""
     branches: list[Branch]
-    """The 2π branch first, then what springs from its period doubling, grazing by grazing."""
+    """The 2π branch, what springs from its period doubling, and so on, grazing by grazing."""
     stretch: tuple[float, float]
     """ζ of BB' and CC': birth and period doubling of the 2π impact motion."""
-    up: Settled
-    down: Settled
-    walled: tuple[Settled, Settled] | None
-    """Run-up and close-down through `_FINE` with a left stop at Y = -WALL (undamped only)."""
-
-    @property
-    def inside(self) -> np.ndarray:
-        """Which ζ lie between BB' and CC'."""
-        return (self.ratios >= self.stretch[0]) & (self.ratios <= self.stretch[1])
+    sweeps: dict[str, Sweep]
+    """"run-up" and "close-down"."""
+    exponents: dict[str, np.ndarray]
+    """Largest Lyapunov exponent per drive cycle where a sweep has no period, else NaN."""
 
 
-class Row(NamedTuple):
-    """One motion that a sweep keeps to over an interval of ζ."""
+class Response(NamedTuple):
+    """Everything in Figure 2."""
 
-    direction: str
-    low: float
-    high: float
-    values: int
-    """How many values of ζ the sweep has there."""
-    cycles: int
-    """Period in drive cycles; 0 for a motion that does not repeat."""
-    impacts: float
-    """Impacts in a period; in a cycle, on average, where there is no period."""
-    exponent: float
-    """Median of the largest Lyapunov exponent, per drive cycle."""
-    confirmed: int
-    """At how many of the values `find_orbit` gives this very motion, and it is stable."""
-    deviation: float
-    """Largest |min Y - min Y of the closed form| (unit: a); NaN where there is no closed form."""
-    from_short: float
-    """Largest |min Y - min Y of the 2π closed form| (unit: a)."""
-
-    @property
-    def motion(self) -> str:
-        return motion_name(self.cycles, self.impacts, self.exponent)
+    ratios: np.ndarray
+    """ζ, rising."""
+    systems: list[System]
+    """For each k of `RESTITUTIONS` the undamped one and the one with Table 1's damping."""
+    wall: float | None
+    """Y of the second stop below, if there is one."""
+    walled: list[System]
+    """The undamped sweeps again with that stop, for each k."""
 
 
-def motion_name(cycles: int, impacts: float, exponent: float) -> str:
-    """In words: period and impacts."""
-    if not cycles:
-        kind = "chaotic" if exponent > _CHAOS else "no short period"
-        return f"{kind}, {impacts:.2f} impacts per 2π"
-    count = round(impacts)
-    return f"{2 * cycles}π, {count} impact{'' if count == 1 else 's'}"
+def response(*, quick: bool = False, wall: float | None = None) -> Response:
+    """Closed forms, continued branches and both sweeps, for both k and both ξ.
 
-
-def response(restitution: float, damping_ratio: float, quick: bool = False) -> Response:
-    """Closed forms, continued branches and both sweeps for one k and ξ, with d = 2.
-
-    **Arguments:** k; ξ; `quick` for coarser sweeps that settle for a shorter time.
+    **Arguments:** `quick` for coarser sweeps; the place of a second stop below (unit: a,
+    negative), which has the k of the first: then the undamped sweeps are made with it as well.
     """
-    step, fine, settle, long = (0.02, 0.01, 100, 400) if quick else (0.005, 0.002, 250, 4000)
-    scene = Scene.ideal(frequency_ratio=0.9, restitution=restitution, damping_ratio=damping_ratio)
+    step, fine = (0.02, 0.01) if quick else (0.01, 0.002)
     low, high = RANGE
     ratios = np.concatenate(
         [
-            np.arange(low, _FINE[0] - step / 2, step),
-            np.arange(_FINE[0], _FINE[1] - fine / 2, fine),
-            np.arange(_FINE[1], high + step / 2, step),
+            np.arange(low, FINE[0], step),
+            np.arange(FINE[0], FINE[1] - fine / 2, fine),
+            np.arange(FINE[1], high + step / 2, step),
         ]
     )
-    closed = {n: _closed(scene, ratios, n) for n in (1, 2)}
-    branches = _branches(scene)
-    first = branches[0]
-    born = min(p.parameter for p in first.special if p.kind == "grazing")
-    doubling = max(p.parameter for p in first.special if p.kind == "period-doubling")
-    starts = _stack([_steady(scene, low), _steady(scene, high)])
-    up, down = _both(scene, ratios, starts, settle, long)
-    walled = None
-    if not damping_ratio:
-        k = float(scene.stops[0].restitution)
+    scene = Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=GAP, damping_ratio=0.0)
+    numbers = [(k, xi) for k in RESTITUTIONS for xi in (0.0, table_damping_ratio())]
+    grid = jnp.asarray(numbers)
+    closed = {n: jtu.tree_map(np.asarray, _closed_forms(scene, grid, ratios, n)) for n in (1, 2)}
+    each = [{n: jtu.tree_map(lambda x, i=i: x[i], closed[n]) for n in closed} for i in range(4)]
+    settled = _sweeps(scene, numbers, ratios, each)
+    systems = []
+    for (k, xi), forms, (sweeps, exponents) in zip(numbers, each, settled, strict=True):
+        branches, stretch = _branches(with_numbers(scene, k, xi, 0.9), ratios, forms[1])
+        systems.append(System(k, xi, forms, branches, stretch, sweeps, exponents))
+    walled = []
+    if wall is not None:
         fenced = eqx.tree_at(
             lambda s: s.stops,
             scene,
-            (*scene.stops, RigidStop(WALL, k, side="left")),
+            (*scene.stops, RigidStop(-wall, 0.5, side="left")),
             is_leaf=lambda x: isinstance(x, tuple),
         )
-        part = (ratios >= _FINE[0]) & (ratios <= _FINE[1])
-        last = np.flatnonzero(part)[-1]
-        above = scene.start(Y=closed[1].Y[last, 0], V=closed[1].V[last, 0])
-        starts = _stack([_steady(scene, ratios[part][0]), above])
-        walled = _both(fenced, ratios[part], starts, settle, long)
-    return Response(
-        restitution, damping_ratio, ratios, closed, branches, (born, doubling), up, down, walled
-    )
+        bare = [system for system in systems if not system.damping_ratio]
+        part = (ratios >= FINE[0]) & (ratios <= FINE[1])
+        again = _sweeps(
+            fenced, [(s.restitution, 0.0) for s in bare], ratios[part], [s.closed for s in bare],
+            part=part,
+        )  # fmt: skip
+        for system, (sweeps, exponents) in zip(bare, again, strict=True):
+            forms = {n: jtu.tree_map(lambda x: x[part], system.closed[n]) for n in system.closed}
+            walled.append(system._replace(closed=forms, sweeps=sweeps, exponents=exponents))
+    return Response(ratios, systems, wall, walled)
 
 
-def _stack(states: Sequence[Any]) -> Any:
-    return jtu.tree_map(lambda *x: jnp.stack([jnp.asarray(a, float) for a in x]), *states)
-
-
-def _steady(scene: Scene, ratio: float) -> Any:
-    """The motion without impacts, on the section: undamped, a start at rest would never forget."""
-    gain = 1 / (1 - ratio**2 + 2j * float(scene.damping_ratio) * ratio)
-    return scene.start(Y=gain.real, V=(1j * ratio * gain).real)
+def with_numbers(scene: Scene, k: Any, xi: Any, ratio: Any) -> Any:
+    """The scene with this k at every stop, this ξ and this ζ."""
+    for name, value in ((BOUNCE, k), (DAMPING, xi), (RATIO, ratio)):
+        scene = with_leaf(scene, name, value)
+    return with_leaf(scene, "stops.1.restitution", k) if len(scene.stops) > 1 else scene
 
 
 @partial(jit, static_argnames="cycles")
-def _closed_forms(scene: Scene, ratios: jax.Array, cycles: int) -> ClosedFormOrbits:
-    return jax.vmap(lambda z: closed_form_orbits(with_leaf(scene, RATIO, z), cycles=cycles))(ratios)
+def _closed_forms(scene: Scene, grid, ratios, cycles: int) -> ClosedFormOrbits:
+    def one(numbers, ratio):
+        return closed_form_orbits(with_numbers(scene, numbers[0], numbers[1], ratio), cycles=cycles)
+
+    return jax.vmap(lambda numbers: jax.vmap(lambda z: one(numbers, z))(ratios))(grid)
 
 
-def _closed(scene: Scene, ratios: np.ndarray, cycles: int) -> ClosedFormOrbits:
-    return jtu.tree_map(np.asarray, _closed_forms(scene, jnp.asarray(ratios), cycles))
-
-
-def _branches(scene: Scene) -> list[Branch]:
-    """The 2π branch; from its period doubling on, what lies beyond each grazing."""
-    above = with_leaf(scene, RATIO, jnp.asarray(1.2))
-    assert isinstance(above, Scene)
-    closed = closed_form_orbits(above)
-    orbit = find_orbit(above, above.start(Y=closed.Y[0], V=closed.V[0]), throw=True)
-    follow = partial(continue_orbit, parameter=RATIO, bounds=RANGE)
+def _branches(
+    scene: Scene, ratios: np.ndarray, closed: ClosedFormOrbits
+) -> tuple[list[Branch], tuple[float, float]]:
+    """The 2π branch and what springs from it; ζ of BB' and CC'."""
+    near = int(np.argmin(abs(ratios - 0.9)))
+    orbit = find_orbit(scene, scene.start(Y=closed.Y[near, 0], V=closed.V[near, 0]), throw=True)
+    follow = partial(continue_orbit, parameter=RATIO, bounds=RANGE, max_step=0.2)
     branches = [follow(orbit)]
-    for point in branches[0].special:
-        if point.kind != "period-doubling":
+    born = min(p.parameter for p in branches[0].special if p.kind == "grazing")
+    waiting = [p for p in branches[0].special if p.kind == "period-doubling"]
+    doubling = max(p.parameter for p in waiting)
+    seen: set[float] = set()
+    # Each grazing of a doubled motion leads to the next motion; below 1/√2 nothing is of interest.
+    while waiting and len(branches) < 4:
+        at = waiting.pop()
+        try:
+            branch = follow(at.switch())
+        except ValueError:  # no admissible motion beyond
             continue
-        seen: set[float] = set()
-        waiting = [point]
-        # Each grazing of a doubled motion leads on to the next one; the last leads nowhere.
-        while waiting and len(branches) < 4:
-            at = waiting.pop()
-            try:
-                branch = follow(at.switch())
-            except ValueError:  # no admissible motion beyond
-                continue
-            branches.append(branch)
-            seen.add(round(at.parameter, 7))
-            waiting += [
-                p
-                for p in branch.special
-                if p.kind == "grazing" and round(p.parameter, 7) not in seen
-            ]
-    return branches
+        branches.append(branch)
+        seen.add(round(at.parameter, 7))
+        waiting += [
+            p
+            for p in branch.special
+            if p.kind == "grazing" and p.parameter > born and round(p.parameter, 7) not in seen
+        ]
+    return branches, (born, doubling)
 
 
-@partial(jit, static_argnames=("settle", "long"))
-def _sweeps(scene: Scene, values, starts, settle: int, long: int):
-    """Two sweeps, one after each row of values, and the same motions a long time later."""
-    longest = 2 * _LONGEST
+@partial(jit, static_argnames="settle")
+def _carried(scene: Scene, numbers, values, starts, settle: int) -> Sweep:
+    """One sweep for each row of values."""
 
-    def go(start, values):
-        return sweep(scene, RATIO, values, start=start, settle=settle, cycles=longest)
-
-    first = jax.vmap(go)(starts, values)
-    states = jtu.tree_map(lambda x: x[..., -1].ravel(), first.sections)
-
-    def stay(value, state):
-        later = sweep(scene, RATIO, value[None], start=state, settle=long, cycles=longest)
-        later = jtu.tree_map(lambda x: x[0], later)
-        end = jtu.tree_map(lambda x: x[-1], later.sections)
-        return later, _exponent(cycle_map(with_leaf(scene, RATIO, value)), end, 300)
-
-    # Lanes of one batch last as long as their slowest one.
-    return jax.lax.map(lambda x: stay(*x), (values.ravel(), states), batch_size=256)
-
-
-def _exponent(the_map: CycleMap, state: Any, cycles: int) -> jax.Array:
-    """Largest Lyapunov exponent per drive cycle: mean growth of a small disturbance."""
-
-    def one(carry, _):
-        state, tangent = carry
-        state, tangent = jax.jvp(the_map, (state,), (tangent,))
-        size = jnp.sqrt(sum(jnp.sum(x * x) for x in jtu.tree_leaves(tangent)))
-        size = jnp.maximum(size, 1e-300)
-        return (state, jtu.tree_map(lambda x: x / size, tangent)), jnp.log(size)
-
-    begin = (state, jtu.tree_map(jnp.ones_like, state))
-    return jnp.mean(jax.lax.scan(one, begin, length=cycles)[1][cycles // 10 :])
-
-
-def _both(scene: Scene, ratios: np.ndarray, starts, settle: int, long: int):
-    """Run-up and close-down, both in the order of rising ζ."""
-    values = jnp.asarray(np.stack([ratios, ratios[::-1]]))
-    found = _sweeps(scene, values, starts, settle, long)
-    sweeps, exponents = jtu.tree_map(lambda x: np.asarray(x).reshape(2, -1, *x.shape[1:]), found)
-    up = Settled(jtu.tree_map(lambda x: x[0], sweeps), exponents[0])
-    down = Settled(jtu.tree_map(lambda x: x[1, ::-1], sweeps), exponents[1, ::-1])
-    return up, down
-
-
-@partial(jit, static_argnames="cycles")
-def _found(scene: Scene, ratios, states, cycles: int) -> Orbit:
-    def one(x):
-        return find_orbit(with_leaf(scene, RATIO, x[0]), x[1], cycles=cycles)
-
-    return jax.lax.map(one, (ratios, states), batch_size=64)
-
-
-def describe(found: Response) -> list[Row]:
-    """What the sweeps are on between BB' and CC': one row for each motion they keep to.
-
-    Each periodic motion is searched for with `find_orbit` from the sweep's last section state, and
-    compared with the closed form where it has one impact per 2π or 4π.
-    """
-    scene = Scene.ideal(
-        frequency_ratio=0.9, restitution=found.restitution, damping_ratio=found.damping_ratio
-    )
-    return [
-        row
-        for name, settled in (("run-up", found.up), ("close-down", found.down))
-        for row in _rows(found, scene, name, settled)
-    ]
-
-
-def _rows(found: Response, scene: Scene, direction: str, settled: Settled) -> list[Row]:
-    at = settled.sweep
-    inside = np.flatnonzero(found.inside)
-    period, impacts = np.asarray(at.period), np.asarray(at.impacts)
-    confirmed = np.zeros(len(found.ratios), bool)
-    ends = jtu.tree_map(lambda x: jnp.asarray(x[:, -1]), at.sections)
-    for cycles in sorted(set(period[inside].tolist()) - {0}):
-        # Always all values, so that another k is not another program.
-        orbit = _found(scene, jnp.asarray(found.ratios), ends, cycles)
-        near = np.abs(np.asarray(orbit.y_min) - np.asarray(at.y_min)) < 1e-5
-        same = (np.asarray(orbit.cycles) == period) & (np.asarray(orbit.impacts) == impacts)
-        confirmed |= np.asarray(orbit.stable) & near & same & (period == cycles)
-    kind = np.stack([period, np.where(period > 0, np.round(impacts), settled.exponent > _CHAOS)])
-    rows = []
-    for part in np.split(inside, 1 + np.flatnonzero(np.any(np.diff(kind[:, inside]), axis=0))):
-        cycles = int(period[part[0]])
-        deviation = np.nan
-        if cycles in (1, 2) and round(float(impacts[part[0]])) == 1:
-            deviation = _apart(found, cycles, at, part)
-        rows.append(
-            Row(
-                direction=direction,
-                low=float(found.ratios[part[0]]),
-                high=float(found.ratios[part[-1]]),
-                values=len(part),
-                cycles=cycles,
-                impacts=float(np.mean(impacts[part])),
-                exponent=float(np.median(settled.exponent[part])),
-                confirmed=int(confirmed[part].sum()),
-                deviation=deviation,
-                from_short=_apart(found, 1, at, part),
-            )
+    def one(numbers, values, start):
+        here = with_numbers(scene, numbers[0], numbers[1], values[0])
+        return sweep(
+            here, RATIO, values, start=start, settle=settle, cycles=2 * _LONGEST, tolerance=1e-9
         )
-    return rows
+
+    return jax.vmap(one)(numbers, values, starts)
 
 
-def _apart(found: Response, cycles: int, at: Sweep, part: np.ndarray) -> float:
-    closed = found.closed[cycles]
-    y_min = np.where(closed.admissible[part, 0], closed.y_min[part, 0], np.nan)
-    return float(np.max(np.abs(np.asarray(at.y_min)[part] - y_min)))
+@jit
+def _exponents(scene: Scene, numbers, values, starts):
+    """Largest Lyapunov exponents per drive cycle."""
+
+    def one(numbers, value, start):
+        here = with_numbers(scene, numbers[0], numbers[1], value)
+        return lyapunov(here, start, 500, settle=0, number=1).per_cycle[0]
+
+    return jax.vmap(one)(numbers, values, starts)
+
+
+def _sweeps(
+    scene: Scene,
+    numbers: list[tuple[float, float]],
+    ratios: np.ndarray,
+    closed: list[dict[int, ClosedFormOrbits]],
+    part: np.ndarray | None = None,
+) -> list[tuple[dict[str, Sweep], dict[str, np.ndarray]]]:
+    """Run-up and close-down of each system, all in one program."""
+    lanes = [(k, xi, up) for k, xi in numbers for up in (True, False)]
+    pairs = np.array([lane[:2] for lane in lanes])
+    values = np.stack([ratios if up else ratios[::-1] for *_, up in lanes])
+    # On the motion without impacts: undamped, a start at rest would never be forgotten.
+    gain = 1 / (1 - values[:, 0] ** 2 + 2j * pairs[:, 1] * values[:, 0])
+    begin_Y, begin_V = gain.real, (1j * values[:, 0] * gain).real
+    if part is not None:  # inside the range of impacts: the close-down begins on the 2π motion
+        last = int(np.flatnonzero(part)[-1])
+        for i, (*_, up) in enumerate(lanes):
+            if not up:
+                short = closed[i // 2][1]
+                begin_Y[i], begin_V[i] = short.Y[last, 0], short.V[last, 0]
+    starts = jax.vmap(lambda Y, V: scene.start(Y=Y, V=V))(begin_Y, begin_V)
+    found = _carried(scene, pairs, values, starts, 120)
+    flat = jtu.tree_map(lambda x: np.array(x).reshape(-1, *x.shape[2:]), found)
+    pairs, values = np.repeat(pairs, len(ratios), axis=0), values.ravel()
+    for _ in range(2):
+        _again(scene, flat, pairs, values, np.flatnonzero((flat.period == 0) | (flat.period > 2)))
+    exponents = np.full(len(values), np.nan)
+    for some in _chunks(np.flatnonzero(flat.period == 0)):
+        ends = jtu.tree_map(lambda x, some=some: x[some, -1], flat.sections)
+        exponents[some] = _exponents(scene, pairs[some], values[some], ends)
+    for _ in range(6):  # near a bifurcation motions come to rest slowly
+        _again(scene, flat, pairs, values, np.flatnonzero((flat.period == 0) & (exponents < 0.002)))
+    exponents[flat.period > 0] = np.nan
+    results = []
+    for i in range(len(numbers)):
+        sweeps, grown = {}, {}
+        for j, name in enumerate(("run-up", "close-down")):
+            rows = slice((2 * i + j) * len(ratios), (2 * i + j + 1) * len(ratios))
+            turn = slice(None, None, -1 if j else 1)
+            sweeps[name] = jtu.tree_map(lambda x, r=rows, t=turn: x[r][t], flat)
+            grown[name] = exponents[rows][turn]
+        results.append((sweeps, grown))
+    return results
+
+
+def _again(scene: Scene, flat: Sweep, pairs: np.ndarray, values: np.ndarray, going) -> None:
+    """Settle these values for another 1,000 cycles, in place."""
+    for some in _chunks(going):
+        ends = jtu.tree_map(lambda x, some=some: x[some, -1], flat.sections)
+        later = _carried(scene, pairs[some], values[some][:, None], ends, 1000)
+
+        def put(old, new, some=some):
+            old[some] = np.asarray(new)[:, 0]
+
+        jtu.tree_map(put, flat, later)
+
+
+def _chunks(indices: np.ndarray) -> list[np.ndarray]:
+    """Indices in rows of equal length; the last row repeats its last one."""
+    if not indices.size:
+        return []
+    padded = np.append(indices, np.repeat(indices[-1:], -len(indices) % _LANES))
+    return list(padded.reshape(-1, _LANES))
+
+
+def _stable(closed: ClosedFormOrbits) -> np.ndarray:
+    """Where the first closed form is a motion and stable."""
+    return closed.admissible[:, 0] & (np.abs(closed.multipliers[:, 0]).max(axis=-1) < 1)
+
+
+class Row(NamedTuple):
+    """One motion that a sweep keeps to over neighbouring ζ."""
+
+    part: np.ndarray
+    """Indices into ζ."""
+    cycles: int
+    """Period in drive cycles; 0 for none found."""
+    impacts: float
+    """In a period; without one, per cycle on average."""
+    exponent: float
+    """Median of the largest Lyapunov exponents where there is no period, else NaN."""
+
+    @property
+    def motion(self) -> str:
+        """In words."""
+        if not self.cycles:
+            if self.exponent > _CHAOS:
+                return "chaotic"
+            return f"period over {2 * _LONGEST}π" if self.exponent < -_CHAOS else "no period found"
+        count = round(self.impacts)
+        return f"{2 * self.cycles}π, {count} impact{'' if count == 1 else 's'}"
+
+
+def rows(system: System, direction: str, inside: np.ndarray) -> list[Row]:
+    """What a sweep keeps to, over the indices `inside` of ζ."""
+    at, exponent = system.sweeps[direction], system.exponents[direction]
+    period, impacts = np.asarray(at.period), np.asarray(at.impacts)
+    kind = np.stack([period, np.where(period > 0, np.round(impacts), exponent > _CHAOS)])[:, inside]
+    found = []
+    for part in np.split(inside, 1 + np.flatnonzero(np.any(np.diff(kind), axis=0))):
+        cycles = int(period[part[0]])
+        middle = float(np.median(exponent[part])) if not cycles else float("nan")
+        found.append(Row(part, cycles, float(np.mean(impacts[part])), middle))
+    return found
+
+
+def between(system: System, ratios: np.ndarray) -> np.ndarray:
+    """Indices of the ζ between BB' and CC'."""
+    return np.flatnonzero((ratios > system.stretch[0]) & (ratios < system.stretch[1]))
+
+
+def describe(found: Response) -> dict[str, Any]:
+    """Where the numerical minimum and the 2π analysis part in each panel, and what it is on.
+
+    Floats, integers, strings, lists and `None` only. "apart" is where |min Y - min Y of the 2π
+    closed form| > 1e-3; "on_the_4pi_curve" compares all values at which the one-impact 4π motion
+    is admissible and stable; a motion's "off_branch" is the difference to the continued branch
+    with its period and impacts at the middle ζ (`None` if none of them reaches there).
+    """
+    return {
+        "printed": "The text sees a discrepancy between BB' and CC', in the minimum only, and puts "
+        "it down to a motion of period 4π. It gives no ζ for the two lines and no place for the "
+        "wall drawn below.",
+        "panels": [_panel(found, system) for system in found.systems],
+    }
+
+
+def _panel(found: Response, system: System) -> dict[str, Any]:
+    ratios, inside = found.ratios, between(system, found.ratios)
+    directions = {}
+    for name, at in system.sweeps.items():
+        y_min, y_max = np.asarray(at.y_min), np.asarray(at.y_max)
+        short, long = system.closed[1], system.closed[2]
+        off = np.abs(y_min - short.y_min[:, 0])
+        apart = inside[off[inside] > _APART]
+        stable = np.flatnonzero(_stable(long))
+        off_long = np.abs(y_min - long.y_min[:, 0])[stable]
+        on_it = off_long < 1e-6
+        widest = inside[np.argmax(off[inside])]
+        impacting = inside[np.asarray(at.impacts)[inside] > 0]
+        directions[name] = {
+            "values": len(inside),
+            "apart": len(apart),
+            "apart_from": float(ratios[apart].min()) if len(apart) else None,
+            "apart_to": float(ratios[apart].max()) if len(apart) else None,
+            "widest": float(off[widest]),
+            "widest_at": float(ratios[widest]),
+            "maximum_off": float(np.max(np.abs(y_max[impacting] - GAP))),
+            "on_the_4pi_curve": {
+                "stable_values": len(stable),
+                "on_it": int(on_it.sum()),
+                "largest_difference_on_it": float(off_long[on_it].max()) if on_it.any() else None,
+                "elsewhere": [round(float(z), 6) for z in ratios[stable][~on_it]],
+            },
+            "motions": [_motion(system, at, ratios, row) for row in rows(system, name, inside)],
+        }
+    return {
+        "restitution": system.restitution,
+        "damping_ratio": system.damping_ratio,
+        "BB": system.stretch[0],
+        "CC": system.stretch[1],
+        "special_points": [
+            {"cycles": b.cycles, "impacts": b.impact_speed.shape[1], "kind": p.kind,
+             "frequency_ratio": p.parameter}
+            for b in system.branches for p in b.special
+        ],
+        "sweeps": directions,
+    }  # fmt: skip
+
+
+def _motion(system: System, at: Sweep, ratios: np.ndarray, row: Row) -> dict[str, Any]:
+    middle = row.part[len(row.part) // 2]
+    off, stable = None, None
+    for branch in system.branches:
+        if (branch.cycles, branch.impact_speed.shape[1]) != (row.cycles, round(row.impacts)):
+            continue
+        for orbit in branch.at(float(ratios[middle])):
+            apart = abs(float(orbit.y_min) - float(at.y_min[middle]))
+            if off is None or apart < off:
+                off, stable = apart, bool(orbit.stable)
+    return {
+        "motion": row.motion,
+        "from": float(ratios[row.part[0]]),
+        "to": float(ratios[row.part[-1]]),
+        "values": len(row.part),
+        "impacts_per_2pi": row.impacts / max(row.cycles, 1),
+        "exponent": row.exponent if np.isfinite(row.exponent) else None,
+        "off_branch": off,
+        "branch_stable": stable,
+    }

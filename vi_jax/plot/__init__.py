@@ -9,3 +9,5 @@ from .orbit import plot_multipliers as plot_multipliers
 from .path import MotionPath as MotionPath
 from .path import motion_path as motion_path
 from .save import save_picture as save_picture
+from .scan import plot_basins as plot_basins
+from .scan import plot_regimes as plot_regimes

@@ -37,7 +37,10 @@ def plot_branch(
     **Returns:** the axes.
     """
     ax = new_axes(ax)
-    across, up, stable = getattr(branch, x), getattr(branch, y), branch.stable
+    across, up = getattr(branch, x), getattr(branch, y)
+    # The points where stability changes are among the branch's: there it is rounding's.
+    inside = np.abs(branch.multipliers).max(axis=1) < 1 + 1e-6
+    stable = inside[1:] & inside[:-1]
     label = style.pop("label", None)
     look = {"color": BLUE, "lw": 1.6, **style}
     for start, end, solid in _stretches(stable):
@@ -56,9 +59,9 @@ def plot_branch(
 
 
 def _stretches(stable: np.ndarray) -> list[tuple[int, int, bool]]:
-    """Start, end and stability of each stretch; neighbours share a point, to leave no gap."""
+    """First and last point (exclusive) and stability of each stretch of like segments."""
     edges = [0, *(np.flatnonzero(np.diff(stable.astype(int))) + 1), len(stable)]
-    return [(max(0, a - 1), b, bool(stable[a])) for a, b in itertools.pairwise(edges)]
+    return [(int(a), int(b) + 1, bool(stable[a])) for a, b in itertools.pairwise(edges)]
 
 
 def plot_sweep(

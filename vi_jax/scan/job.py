@@ -115,6 +115,9 @@ class Job(eqx.Module):
             found = {}
             for measure in self.measures:
                 found |= measure(scene, run)
+            for name, x in found.items():
+                if jnp.issubdtype(x.dtype, jnp.floating):  # fast minima lose NaN
+                    found[name] = jnp.where(run.successful, x, jnp.nan)
             return {**found, "result": number_of(run.result).astype(jnp.int8)}
 
         last = jtu.tree_map(lambda x: x[:, -1], run.sections)

@@ -107,15 +107,15 @@ def _lyapunov(scene, flow, start, cycles: int, settle, number: int) -> Lyapunov:
             return jax.jvp(image, (x,), (direction,), has_aux=True)
 
         new, grown, (duration, ended) = jax.vmap(along, in_axes=1, out_axes=(None, 1, None))(frame)
-        frame, upper = jnp.linalg.qr(grown)
+        frame, sizes = _orthogonal(grown)
         result = RESULTS.where(result == RESULTS.successful, ended, result)
-        rates = jnp.log(jnp.abs(jnp.diagonal(upper)))
-        return (new, frame, result), (rates, duration)
+        return (new, frame, result), (jnp.log(sizes), duration)
 
     frame = jnp.eye(x.size, number, dtype=x.dtype)
     carry = (x, frame, before.result)
     (x, _, result), (rates, duration) = jax.lax.scan(cycle, carry, length=cycles)
     mean, halves = _weighted(rates, duration)
+    mean = jnp.where(result == RESULTS.successful, mean, jnp.nan)
     exponents = jnp.sort(mean, descending=True)
     return Lyapunov(
         exponents=exponents,
@@ -124,6 +124,21 @@ def _lyapunov(scene, flow, start, cycles: int, settle, number: int) -> Lyapunov:
         state=unravel(x),
         result=result,
     )
+
+
+def _orthogonal(
+    frame: Float[Array, "states number"],
+) -> tuple[Float[Array, "states number"], Float[Array, " number"]]:
+    """The frame made orthonormal (Gram and Schmidt, twice), and the lengths that it had left."""
+    columns, sizes = [], []
+    for column in frame.T:
+        for _ in range(2):
+            for other in columns:
+                column = column - jnp.dot(other, column) * other
+        size = jnp.linalg.norm(column)
+        columns.append(column / size)
+        sizes.append(size)
+    return jnp.stack(columns, axis=1), jnp.stack(sizes)
 
 
 def _weighted(rates, duration):

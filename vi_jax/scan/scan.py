@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from .._checks import count
 from ..flow import AbstractMethod
-from ..flow.results import REASONS, RESULTS
+from ..flow.results import REASON_NAMES
 from ..scene import AbstractScene
 from ..scene.leaves import leaf, leaf_names
 from .grid import Blocks, axes_of
@@ -176,8 +176,8 @@ def variables_of(job: Job, blocks: Blocks) -> dict[str, Variable]:
     known: dict[str, Mapping[str, Any]] = {
         "result": {
             "long_name": "how the lane ended",
-            "flag_values": [-1, *range(len(REASONS))],
-            "flag_meanings": " ".join(["not_computed", *reason_names()]),
+            "flag_values": [-1, *range(len(REASON_NAMES))],
+            "flag_meanings": " ".join(["not_computed", *REASON_NAMES]),
         }
     }
     for measure in job.measures:
@@ -200,18 +200,12 @@ def variables_of(job: Job, blocks: Blocks) -> dict[str, Variable]:
     return found
 
 
-def reason_names() -> list[str]:
-    """The names of `RESULTS` in the order of their numbers."""
-    names = {RESULTS[getattr(RESULTS, n)]: n for n in vars(RESULTS) if not n.startswith("_")}
-    return [names.get(RESULTS[item], str(i)) for i, item in enumerate(REASONS)]
-
-
 def _tell_failures(data: xr.Dataset) -> None:
     codes, numbers = np.unique(np.asarray(data["result"]), return_counts=True)
     failed = {int(c): int(n) for c, n in zip(codes, numbers, strict=True) if c != 0}
     if not failed:
         return
-    names = ["not_computed", *reason_names()]
+    names = ["not_computed", *REASON_NAMES]
     why = ", ".join(f"{names[code + 1]}: {n:,}" for code, n in failed.items())
     warnings.warn(
         f"{sum(failed.values()):,} of {data['result'].size:,} lanes failed ({why}); see `result` "

@@ -114,9 +114,9 @@ def check_writable(path: str | Path) -> None:
         trial = path.parent / f".{path.name}.trial"
         trial.mkdir()
         trial.rmdir()
-    except FileExistsError:
-        pass
     except OSError as error:
+        if isinstance(error, FileExistsError) and path.parent.is_dir():
+            return  # another scan's trial
         raise ValueError(
             f"Argument `store` must be a path that can be written to, but {path} is not: "
             f"{error.strerror or error}."

@@ -27,7 +27,7 @@ class Sweep(eqx.Module):
     y_max: Float[Array, "..."]
     """Largest Y over the cycles observed (unit: a)."""
     period: Int[Array, "..."]
-    """Period in drive cycles, 0 if none was found."""
+    """Period in drive cycles, 0 if none was found, -2 if the value failed."""
     impacts: Float[Array, "..."]
     """Impacts in a period; in a cycle, on average, where there is no period."""
     frequency_ratio: Float[Array, "..."] | None
@@ -123,8 +123,10 @@ def _sweep(scene, parameter, values, start, settle, cycles, method, tolerance, m
             values=value,
             y_min=jnp.min(run.y_min),
             y_max=jnp.max(run.y_max),
-            period=period,
-            impacts=jnp.where(period > 0, total, jnp.mean(hits)),
+            period=jnp.where(run.successful, period, -2),
+            impacts=jnp.where(
+                run.successful, jnp.where(period > 0, total, jnp.mean(hits)), jnp.nan
+            ),
             frequency_ratio=here.frequency_ratio(jnp.mean(run.duration)),
             impact_speed=jnp.max(run.impact_speed),
             sections=sections,

@@ -125,10 +125,11 @@ def run_on_cluster(job: Job, blocks: Blocks, todo: list, client: Any) -> Iterato
     from dask.distributed import as_completed
 
     x64 = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
-    shared = client.scatter(_Parcel(job), broadcast=True, hash=False)
+    # Small enough to go with every task: data that are shared would die with their worker.
+    parcel = _Parcel(job)
     where_of = {
         client.submit(
-            _remote, shared, blocks.values(where), blocks.lanes, x64, pure=False, retries=3
+            _remote, parcel, blocks.values(where), blocks.lanes, x64, pure=False, retries=3
         ): where
         for where in todo
     }

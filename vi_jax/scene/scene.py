@@ -236,14 +236,19 @@ class Scene(AbstractScene):
         return 2 * pi / duration
 
     def step_limit(self, s: Float[Array, ""], state: Any) -> Float[Array, ""]:
-        """A fifth of the shorter of the drive's turn and the body's natural period."""
+        """A fifth of the shorter of the drive's turn and the body's natural period.
+
+        A strong motor pulls its shaft back to speed within w0/τ0 of time: no step is longer than
+        three of that, up to which explicit Runge–Kutta methods stay stable.
+        """
         if isinstance(self.drive, IdealDrive):
-            speed = self.drive.frequency_ratio
+            speed, pull = self.drive.frequency_ratio, 0.0
         else:
             speed = jnp.abs(state.W)
+            pull = self.drive.strength / self.drive.no_load_speed
         if self.clock_name == "phase":
-            return 0.4 * pi * jnp.minimum(1.0, speed)
-        return 0.4 * pi / jnp.maximum(1.0, speed)
+            return 0.4 * pi * speed / jnp.maximum(jnp.maximum(1.0, speed), 0.4 * pi / 3 * pull)
+        return 0.4 * pi / jnp.maximum(jnp.maximum(1.0, speed), 0.4 * pi / 3 * pull)
 
     def alive(self, state: Any) -> jax.Array | None:
         """In the phase clock of a motor the crank must turn forward."""

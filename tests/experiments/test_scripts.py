@@ -1,0 +1,36 @@
+"""Every study runs as a plain script, and has its table and figure beside it."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+FOLDER = Path(__file__).parents[2] / "experiments"
+STUDIES = sorted(p for p in FOLDER.glob("*.py") if p.stem != "peers")
+# It needs the extra `bench`; its figures are of a machine at rest.
+NEEDS_PEERS = {"engine_speed"}
+
+
+@pytest.mark.parametrize("study", STUDIES, ids=lambda path: path.stem)
+def test_table_and_figure_are_kept(study):
+    assert (FOLDER / f"{study.stem}.md").exists()
+    path = FOLDER / "figures" / f"{study.stem}.png"
+    assert path.stat().st_size < 200_000
+    assert Image.open(path).size[0] >= 800
+    assert study.read_text(encoding="utf-8").startswith(("# %%", '"""'))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "study", [p for p in STUDIES if p.stem not in NEEDS_PEERS], ids=lambda path: path.stem
+)
+def test_runs(study, tmp_path):
+    environment = {**os.environ, "PYTHONPATH": str(FOLDER.parent)}
+    done = subprocess.run(
+        [sys.executable, str(study), "--quick"],
+        cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=900,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-2000:]

@@ -1,0 +1,273 @@
+"""TOML files read strictly into classes: every fault is named with its place in the file."""
+
+import difflib
+import re
+import tomllib
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal, TypeVar, get_args, get_origin
+
+import attrs
+import cattrs
+import numpy as np
+from cattrs.gen import make_dict_structure_fn, override
+
+T = TypeVar("T")
+Place = tuple[str | int, ...]
+
+
+class ConfigError(ValueError):
+    """What is wrong with a file: one sentence for each fault, with its place in the file."""
+
+    def __init__(self, *problems: str):
+        super().__init__("\n".join(problems))
+        self.problems = problems
+
+
+class Row(tuple[float, ...]):
+    """Numbers in a row, written as a list or as `{ from = …, to = …, count = … }`."""
+
+    __slots__ = ()
+
+
+def read_toml(path: str | Path, kind: type[T]) -> T:
+    """The file as an object of an attrs class; a trailing `_` of a field is not in its key.
+
+    **Raises:** `ConfigError` that names every fault with its place.
+    """
+    try:
+        tables = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"the file is not valid TOML: {error}") from None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise ConfigError(f"the file cannot be read: {reason}") from None
+    try:
+        return _CONVERTER.structure(tables, kind)
+    except cattrs.BaseValidationError as error:
+        raise ConfigError(*_problems(error, ())) from None
+
+
+def keys_of(kind: type) -> list[str]:
+    """Names of an attrs class' fields."""
+    return [field.name for field in attrs.fields(kind)]
+
+
+def unknown(what: str, name: str, place: str, known: Iterable[str]) -> str:
+    """A sentence about a name that is none of those known, with the nearest of them."""
+    known = list(known)
+    near = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
+    ending = name.split(".")[-1]
+    near += [other for other in known if other.split(".")[-1] == ending and other not in near]
+    hint = f"near names: {', '.join(near)}" if near else f"known: {', '.join(known)}"
+    return f"unknown {what} `{name}` in {place}; {hint}"
+
+
+def given(table: Any, *but: str) -> dict[str, Any]:
+    """What the keys of a table were set to, without those keys."""
+    pairs = ((name, getattr(table, name)) for name in keys_of(type(table)) if name not in but)
+    return {name: value for name, value in pairs if value is not None}
+
+
+@contextmanager
+def spoken(table: str, *, keys: Iterable[str] | None = None) -> Iterator[None]:
+    """Errors of the library about its arguments, in the words of the file.
+
+    **Arguments:** the table; `keys`, the arguments that stand in it (all by default).
+    """
+    try:
+        yield
+    except (ValueError, TypeError) as error:
+        text = str(error).rstrip(".")
+        told = re.match(r"Argument `(\w+)`", text)
+        if told is None:
+            if isinstance(error, ConfigError) or not text.startswith(("Axis ", "Me", "Scan ")):
+                raise
+            raise ConfigError(f"{table}: {text}") from None
+        name, rest = told[1], text[told.end() :]
+        if name in ("axes", "start", "method", "flow") and keys is not None:
+            place = f"[{'method' if name == 'flow' else name}]"
+        else:
+            place = f"`{name}` in {table}" if keys is None or name in keys else f"`{name}`"
+        raise ConfigError(f"{place}{rest}") from None
+
+
+def _problems(error: BaseException, place: Place) -> Iterator[str]:
+    if isinstance(error, cattrs.ForbiddenExtraKeysError):
+        known = [name.rstrip("_") for name in keys_of(error.cl)]
+        for key in sorted(error.extra_fields):
+            where = _table(place) if place else "the file"
+            yield unknown("key" if place else "table", key, where, known)
+    elif isinstance(error, cattrs.BaseValidationError):
+        for inner in error.exceptions:
+            yield from _problems(inner, (*place, *_step(inner)))
+    elif isinstance(error, KeyError):
+        yield f"missing key `{place[-1]}` in {_table(place[:-1])}"
+    else:
+        yield f"{_spoken(place)} {error}"
+
+
+def _step(error: BaseException) -> Place:
+    """The key, or the place in a list, at which an error happened."""
+    for note in getattr(error, "__notes__", ()):
+        if isinstance(note, cattrs.AttributeValidationNote):
+            return (note.name.rstrip("_"),)
+        if isinstance(note, cattrs.IterableValidationNote):
+            return (note.index,)
+    return ()
+
+
+def _table(place: Place) -> str:
+    name = ".".join(x for x in place if isinstance(x, str))
+    numbers = [x for x in place if isinstance(x, int)]
+    return f"[[{name}]] number {numbers[-1] + 1}" if numbers else f"[{name}]"
+
+
+def _spoken(place: Place) -> str:
+    if len(place) < 2:
+        return _table(place)
+    last = place[-1]
+    if isinstance(last, int):
+        return f"item {last + 1} of {_spoken(place[:-1])}"
+    return f"`{last}` in {_table(place[:-1])}"
+
+
+def _number(value: Any, _: Any = None) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise TypeError(f"must be a number, but is {_shown(value)}")
+    return float(value)
+
+
+def _integer(value: Any, _: Any = None) -> int:
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise TypeError(f"must be a whole number, but is {_shown(value)}")
+    return value
+
+
+def _flag(value: Any, _: Any = None) -> bool:
+    if not isinstance(value, bool):
+        raise TypeError(f"must be true or false, but is {_shown(value)}")
+    return value
+
+
+def _text(value: Any, _: Any = None) -> str:
+    if not isinstance(value, str) or not value:
+        raise TypeError(f"must be a text in quotes, but is {_shown(value)}")
+    return value
+
+
+def _row(value: Any, _: Any = None) -> Row:
+    if isinstance(value, list) and value:
+        return Row(_number(x) for x in value)
+    if not isinstance(value, dict):
+        raise TypeError(
+            "must be a list of numbers or { from = …, to = …, count = … }, but is "
+            f"{_shown(value)}"
+        )
+    if set(value) != {"from", "to", "count"}:
+        raise ValueError(f"must have the keys from, to and count, but has {', '.join(value)}")
+    count = _integer(value["count"])
+    if count < 1:
+        raise ValueError(f"must have a count of at least 1, but it is {count}")
+    return Row(np.linspace(_number(value["from"]), _number(value["to"]), count).tolist())
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, dict):
+        return "a table"
+    return f'"{value}"' if isinstance(value, str) else repr(value)
+
+
+def _word(kind: Any) -> Callable[[Any, Any], str]:
+    words = get_args(kind)
+
+    def hook(value: Any, _: Any) -> str:
+        if value in words:
+            return value
+        listed = ", ".join(f'"{word}"' for word in words)
+        raise ValueError(f"must be one of {listed}, but is {_shown(value)}")
+
+    return hook
+
+
+def _list(kind: Any) -> Callable[[Any, Any], tuple[Any, ...]]:
+    item, *rest = get_args(kind)
+    size = None if rest == [...] else 1 + len(rest)
+
+    def hook(value: Any, _: Any) -> tuple[Any, ...]:
+        if not isinstance(value, list) and size is None:
+            value = [value]  # one of several, without brackets
+        if not isinstance(value, list) or len(value) != (size or len(value)):
+            raise TypeError(f"must be a list of {size}, but is {_shown(value)}")
+        return tuple(_each(enumerate(value), item, kind).values())
+
+    return hook
+
+
+def _mapping(kind: Any) -> Callable[[Any, Any], dict[str, Any]]:
+    item = get_args(kind)[1]
+
+    def hook(value: Any, _: Any) -> dict[str, Any]:
+        if not isinstance(value, dict):
+            raise TypeError(f"must be a table, but is {_shown(value)}")
+        return _each(_flat(value), item, kind)
+
+    return hook
+
+
+def _flat(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Items by their dotted names, whether these were put in quotes or not."""
+    for key, value in table.items():
+        if isinstance(value, dict) and any(isinstance(x, dict | list) for x in value.values()):
+            yield from _flat(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+def _each(items: Iterable[tuple[Any, Any]], item: Any, kind: Any) -> dict[Any, Any]:
+    note: Any = cattrs.IterableValidationNote
+    found, wrong = {}, []
+    for place, value in items:
+        try:
+            found[place] = _CONVERTER.structure(value, item)
+        except Exception as error:
+            error.add_note(note("", place, item))
+            wrong.append(error)
+    if wrong:
+        group: Any = cattrs.IterableValidationError
+        raise group("", wrong, kind)
+    return found
+
+
+def _class(kind: Any) -> Callable[[Any, Any], Any]:
+    names = {
+        name: override(rename=name.rstrip("_")) for name in keys_of(kind) if name.endswith("_")
+    }
+    settings: dict[str, Any] = {"_cattrs_forbid_extra_keys": True, **names}
+    structured = make_dict_structure_fn(kind, _CONVERTER, **settings)
+
+    def hook(value: Any, _: Any) -> Any:
+        if not isinstance(value, dict):
+            raise TypeError(f"must be a table, but is {_shown(value)}")
+        return structured(value, kind)
+
+    return hook
+
+
+def _converter() -> cattrs.Converter:
+    converter = cattrs.Converter()
+    plain = {float: _number, int: _integer, bool: _flag, str: _text, Row: _row}
+    for kind, hook in plain.items():
+        converter.register_structure_hook(kind, hook)
+    for of, factory in {Literal: _word, tuple: _list, dict: _mapping}.items():
+        converter.register_structure_hook_factory(
+            lambda kind, of=of: get_origin(kind) is of, factory
+        )
+    converter.register_structure_hook_factory(attrs.has, _class)
+    return converter
+
+
+_CONVERTER = _converter()

@@ -1,0 +1,296 @@
+"""Files for the command line: a scene, how it moves and what is asked of it, as TOML.
+
+    [scene]                         # dimensionless; or [machine], the keys of `Parameters` in SI
+    frequency_ratio = 0.9           # drive = "motor" takes [scene.motor], the keys of `Motor`
+    restitution = 0.5
+    gap = 2.0                       # or [[scene.stops]] with side, gap, restitution
+    crank = "slider"                # with crank_ratio; "cosine" by default
+
+    [start]                         # Y, V and, for a motor, W; at rest if left out
+    [method]                        # name = "exact-flight", "adaptive" or "fixed-step"; solver, …
+    [axes]                          # for scan: rows of values, as lists or as below
+    "stops.0.restitution" = { from = 0.1, to = 0.9, count = 64 }
+
+and one table for each verb: `[scan]`, `[sweep]`, `[basins]`, `[orbit]`, `[simulate]`. Their keys
+are the arguments of that function, and the files to write; what is left out is as in Python.
+"""
+
+import dataclasses
+from pathlib import Path
+from typing import Any, Literal
+
+import diffrax
+from attrs import frozen
+
+from ._toml import ConfigError as ConfigError
+from ._toml import Row, given, read_toml, spoken, unknown
+from .flow import AbstractMethod, Adaptive, ExactFlight, FixedStep
+from .orbit import AbstractSearch, Gradient, Newton
+from .scene import IdealDrive, Motor, Oscillator, Parameters, RigidStop, Scene, SliderCrank
+
+_METHODS = {"exact-flight": ExactFlight, "adaptive": Adaptive, "fixed-step": FixedStep}
+_SOLVERS = {
+    name: kind
+    for name, kind in vars(diffrax).items()
+    if isinstance(kind, type) and issubclass(kind, diffrax.AbstractERK) and name[:8] != "Abstract"
+}
+
+
+@frozen(kw_only=True)
+class MachineTable:
+    """`[machine]`: the numbers of `Parameters` in SI units."""
+
+    drive: Literal["motor", "ideal"] = "motor"
+    crank: Literal["cosine", "slider"] = "cosine"
+    clock: Literal["phase", "time"] = "phase"
+    body_mass: float | None = None
+    slider_mass: float | None = None
+    stiffness: float | None = None
+    damping: float | None = None
+    crank_radius: float | None = None
+    rod_length: float | None = None
+    inertia: float | None = None
+    restitution: float | None = None
+    gap: float | None = None
+    torque: float | None = None
+    kappa: float | None = None
+    no_load_speed: float | None = None
+
+    def build(self) -> Scene:
+        """The dimensionless scene."""
+        with spoken("[machine]"):
+            table = Parameters(**given(self, "drive", "crank", "clock"))
+            return table.scene(drive=self.drive, crank=self.crank).in_clock(self.clock)
+
+
+@frozen(kw_only=True)
+class StopTable:
+    """One `[[scene.stops]]`."""
+
+    gap: float
+    restitution: float | None = None
+    side: Literal["right", "left"] = "right"
+
+
+@frozen(kw_only=True)
+class MotorTable:
+    """`[scene.motor]`: the numbers of `Motor`."""
+
+    strength: float
+    control: float
+    coupling: float
+    slider_inertia: float
+    no_load_speed: float | None = None
+
+
+@frozen(kw_only=True)
+class SceneTable:
+    """`[scene]`: dimensionless numbers."""
+
+    drive: Literal["ideal", "motor"] = "ideal"
+    frequency_ratio: float | None = None
+    motor: MotorTable | None = None
+    damping_ratio: float = 0.0
+    restitution: float = 0.5
+    gap: float | None = None
+    stops: tuple[StopTable, ...] | None = None
+    crank: Literal["cosine", "slider"] = "cosine"
+    crank_ratio: float | None = None
+    clock: Literal["phase", "time"] = "phase"
+
+    def build(self) -> Scene:
+        """The scene; without `gap` and `stops` it has one stop on the right at gap 2."""
+        self._check()
+        stops = []
+        for i, stop in enumerate(self.stops or ()):
+            bounce = self.restitution if stop.restitution is None else stop.restitution
+            with spoken(f"[[scene.stops]] number {i + 1}"):
+                stops.append(RigidStop(stop.gap, bounce, side=stop.side))
+        with spoken("[scene.motor]"):
+            turning = None if self.motor is None else Motor(**given(self.motor))
+        with spoken("[scene]"):
+            if self.stops is None:
+                stops = [RigidStop(2.0 if self.gap is None else self.gap, self.restitution)]
+            return Scene(
+                oscillator=Oscillator(self.damping_ratio),
+                drive=turning or IdealDrive(self.frequency_ratio),
+                stops=tuple(stops),
+                clock_name=self.clock,
+                **({} if self.crank_ratio is None else {"crank": SliderCrank(self.crank_ratio)}),
+            )
+
+    def _check(self) -> None:
+        for drive, key in (("ideal", "frequency_ratio"), ("motor", "motor")):
+            if (getattr(self, key) is not None) != (drive == self.drive):
+                what = "missing key" if drive == self.drive else "unfitting key"
+                raise ConfigError(f'{what} `{key}` in [scene]: drive = "{self.drive}"')
+        if self.stops is not None and self.gap is not None:
+            raise ConfigError("[scene] must hold `gap` or [[scene.stops]], but holds both")
+        if (self.crank_ratio is not None) != (self.crank == "slider"):
+            raise ConfigError('`crank_ratio` in [scene] must stand beside crank = "slider"')
+
+
+@frozen(kw_only=True)
+class StartTable:
+    """`[start]` or a guess: a state on the section."""
+
+    Y: float = 0.0
+    V: float = 0.0
+    W: float | None = None
+
+    def build(self, scene: Scene, place: str) -> Any:
+        """The state, for this scene."""
+        with spoken(place):
+            return scene.start(**given(self))
+
+
+@frozen(kw_only=True)
+class MethodTable:
+    """`[method]`: how the scene is carried."""
+
+    name: Literal["exact-flight", "adaptive", "fixed-step"]
+    solver: str | None = None
+    rtol: float | None = None
+    atol: float | None = None
+    steps_per_cycle: int | None = None
+
+    def build(self) -> AbstractMethod:
+        """The method."""
+        kind, options = _METHODS[self.name], given(self, "name")
+        for key in options.keys() - {field.name for field in dataclasses.fields(kind)}:
+            raise ConfigError(f'`{key}` in [method] does not belong to name = "{self.name}"')
+        if self.solver is not None:
+            if self.solver not in _SOLVERS:
+                raise ConfigError(unknown("solver", self.solver, "[method]", _SOLVERS))
+            options["solver"] = _SOLVERS[self.solver]()
+        with spoken("[method]"):
+            return kind(**options)
+
+
+@frozen(kw_only=True)
+class _Grid:
+    """What every verb that runs many lanes takes."""
+
+    settle: int | None = None
+    max_impacts: int | None = None
+    max_steps: int | None = None
+    lanes: int | None = None
+    workers: int | None = None
+    store: str | None = None
+    picture: str | None = None
+
+
+@frozen(kw_only=True)
+class ScanTable(_Grid):
+    """`[scan]`."""
+
+    measure: tuple[str, ...] | None = None
+    cycles: int | None = None
+    derivatives: tuple[str, ...] | None = None
+    paired: bool = False
+
+
+@frozen(kw_only=True)
+class BasinsTable(_Grid):
+    """`[basins]`."""
+
+    region: dict[str, tuple[float, float]]
+    resolution: tuple[int, ...] | None = None
+    samples: int | None = None
+    seed: int | None = None
+    longest: int | None = None
+    tolerance: float | None = None
+    apart: float | None = None
+    output: str | None = None
+
+
+@frozen(kw_only=True)
+class SweepTable:
+    """`[sweep]`."""
+
+    parameter: str
+    values: Row
+    settle: int | None = None
+    cycles: int | None = None
+    tolerance: float | None = None
+    max_steps: int | None = None
+    up_and_down: bool = False
+    picture: str | None = None
+    output: str | None = None
+
+
+@frozen(kw_only=True)
+class ContinueTable:
+    """`[orbit.continue]`."""
+
+    parameter: str
+    bounds: tuple[float, float]
+    step: float | None = None
+    max_step: float | None = None
+    max_points: int | None = None
+    picture: str | None = None
+    output: str | None = None
+
+
+@frozen(kw_only=True)
+class OrbitTable:
+    """`[orbit]`."""
+
+    cycles: int = 1
+    guess: StartTable | None = None
+    method: Literal["newton", "gradient"] = "newton"
+    tolerance: float | None = None
+    max_steps: int | None = None
+    arcs: int | None = None
+    picture: str | None = None
+    continue_: ContinueTable | None = None
+
+    def search(self) -> AbstractSearch:
+        """The search for the motion."""
+        options = given(self, "cycles", "guess", "method", "picture", "continue_")
+        with spoken("[orbit]"):
+            return (Newton if self.method == "newton" else Gradient)(**options)
+
+
+@frozen(kw_only=True)
+class SimulateTable:
+    """`[simulate]`."""
+
+    cycles: int
+    settle: int | None = None
+    samples: int | None = None
+    max_impacts: int | None = None
+    max_steps: int | None = None
+    picture: str | None = None
+    output: str | None = None
+
+
+@frozen(kw_only=True)
+class Config:
+    """A whole file."""
+
+    machine: MachineTable | None = None
+    scene: SceneTable | None = None
+    start: StartTable | None = None
+    method: MethodTable | None = None
+    axes: dict[str, Row] | None = None
+    scan: ScanTable | None = None
+    sweep: SweepTable | None = None
+    basins: BasinsTable | None = None
+    orbit: OrbitTable | None = None
+    simulate: SimulateTable | None = None
+
+    def build(self) -> tuple[Scene, Any, AbstractMethod | None]:
+        """Scene, start and method; `None` for what the file leaves out."""
+        table = self.scene or self.machine
+        if table is None or (self.scene and self.machine):
+            many = "both" if table else "neither"
+            raise ConfigError(f"the file must hold [scene] or [machine], but holds {many}")
+        scene = table.build()
+        start = self.start and self.start.build(scene, "[start]")
+        return scene, start, self.method and self.method.build()
+
+
+def read(path: str | Path) -> Config:
+    """Read a file. **Raises:** `ConfigError` that names every fault with its place."""
+    return read_toml(path, Config)

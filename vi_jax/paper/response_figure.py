@@ -1,0 +1,168 @@
+"""The picture of Figure 2: closed forms, branches, sweeps, and what the sweeps settle on."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from ..plot import plot_branch, save_picture
+from ..plot.motion import BLUE, GREEN, PINK, RED
+from .motions import GAP
+from .response import FINE, RANGE, RESTITUTIONS, Response, System, between, rows
+
+
+def draw_response(found: Response, path: Path) -> None:
+    """Draw Figure 2 into a PNG file: the range of ζ above, from BB' to CC' below."""
+    titles = ["undamped, ξ = 0", f"Table 1, ξ = {found.systems[1].damping_ratio:.4f}"]
+    count = 3 + bool(found.walled)
+    figure = Figure(figsize=(15, 4.0 * count + 1.2))
+    figure.set_layout_engine("constrained", w_pad=0.08)
+    grid = figure.subplots(count, 2)
+    colors = _colors(found)
+    for column, k in enumerate(RESTITUTIONS):
+        bare, damped = found.systems[2 * column : 2 * column + 2]
+        _whole(grid[0, column], found, bare, damped)
+        grid[0, column].set_title(f"{'ab'[column]}) k = {k:g}, d = 2, undamped sweeps", fontsize=12)
+        for row, system in ((1, bare), (2, damped)):
+            _zoom(grid[row, column], found.ratios, system, colors, found.wall)
+            grid[row, column].set_title(f"k = {k:g}, {titles[row - 1]}", fontsize=11)
+        if found.walled:
+            part = (found.ratios >= FINE[0]) & (found.ratios <= FINE[1])
+            ax, system = grid[3, column], found.walled[column]
+            _zoom(ax, found.ratios[part], system, colors, found.wall, solid=True)
+            ax.set_title(f"k = {k:g}, undamped, second stop at Y = {found.wall:g}", fontsize=11)
+    for ax, row in zip(grid.T.ravel(), list(range(count)) * 2, strict=True):
+        ax.grid(alpha=0.25, lw=0.5)
+        ax.set_xlabel("frequency ratio ζ")
+        ax.set_ylabel("min Y, max Y (a)" if not row else "min Y (a)")
+    lines: list[Any] = [
+        Line2D([], [], color=RED, lw=2.6, alpha=0.45, label="2π closed form"),
+        Line2D([], [], color=PINK, lw=3.6, alpha=0.5, label="4π closed form, 1 impact"),
+        Line2D([], [], color=BLUE, lw=1.4, label="continued: stable"),
+        Line2D([], [], color=BLUE, lw=1.4, ls="--", label="continued: unstable"),
+        Line2D([], [], color="tab:orange", lw=1.2, label="continued, Table 1's damping (top)"),
+        Line2D([], [], color="k", marker="o", mfc="none", ms=4, ls="", label="run-up"),
+        Line2D([], [], color=RED, marker=".", ms=5, ls="", label="close-down"),
+        Line2D([], [], color="tab:red", marker="D", ms=5, ls="", label="period doubling"),
+        Line2D([], [], color="tab:orange", marker="s", ms=5, ls="", label="fold"),
+        Line2D([], [], color="k", marker="o", ms=5, ls="", label="grazing"),
+        *(Patch(color=color, label=name) for name, color in colors.items()),
+    ]
+    figure.legend(handles=lines, loc="outside lower center", ncols=6, frameon=False, fontsize=10)
+    figure.suptitle(
+        "Fig. 2 of the paper: ideal drive, Δ = 2a. Strips: what the sweeps settle on", fontsize=14
+    )
+    save_picture(figure, path, dpi=80, colors=96)
+
+
+def _colors(found: Response) -> dict[str, str]:
+    """A colour for each kind of motion in the strips; rare ones share one."""
+    fixed = {
+        "2π, 1 impact": "#f2b8b5",
+        "4π, 1 impact": "#ff9bdc",
+        "4π, 2 impacts": "#9fb8ff",
+        "6π, 2 impacts": "#8fd3a5",
+        "8π, 4 impacts": "#c9a6e8",
+        "4π, 3 impacts": "#f0b27a",
+        "8π, 5 impacts": "#a3dbe0",
+        "other period": "#f4ea7a",
+        "chaotic": "#8c8c8c",
+        "no period found": "#e4e4e4",
+    }
+    names = set()
+    for ratios, systems in ((found.ratios, found.systems), (_fine(found.ratios), found.walled)):
+        for system in systems:
+            for name in system.sweeps:
+                names |= {r.motion for r in rows(system, name, between(system, ratios))}
+    if names - set(fixed):
+        names.add("other period")
+    return {name: color for name, color in fixed.items() if name in names}
+
+
+def _fine(ratios: np.ndarray) -> np.ndarray:
+    return ratios[(ratios >= FINE[0]) & (ratios <= FINE[1])]
+
+
+def _closed_curves(ax: Axes, ratios: np.ndarray, system: System) -> None:
+    for n, color, width in ((2, PINK, 3.6), (1, RED, 2.6)):
+        form = system.closed[n]
+        for i in range(2):
+            y_min = np.where(form.admissible[:, i], form.y_min[:, i], np.nan)
+            ax.plot(ratios, y_min, color=color, lw=width, alpha=0.45)
+
+
+def _sweep_marks(ax: Axes, ratios: np.ndarray, system: System, name: str = "y_min") -> None:
+    """Circles for the run-up and dots for the close-down, as in the paper."""
+    up, down = (np.asarray(getattr(system.sweeps[s], name)) for s in ("run-up", "close-down"))
+    ax.plot(ratios, up, "o", color="k", mfc="none", ms=4, mew=0.7, zorder=5)
+    ax.plot(ratios, down, ".", color=RED, ms=4, zorder=6)
+
+
+def _lines(ax: Axes, system: System) -> None:
+    """BB' and CC'."""
+    for letter, place in zip("BC", system.stretch, strict=True):
+        ax.axvline(place, color="0.25", lw=1.0, ls=(0, (6, 3)))
+        ax.text(
+            place, 0.985, f" {letter}{letter}'", transform=ax.get_xaxis_transform(), va="top",
+            fontsize=10,
+        )  # fmt: skip
+
+
+def _whole(ax: Axes, found: Response, bare: System, damped: System) -> None:
+    _closed_curves(ax, found.ratios, bare)
+    for branch in damped.branches:
+        plot_branch(branch, ax=ax, special=False, color="tab:orange", lw=1.1)
+    for branch in bare.branches:
+        plot_branch(branch, ax=ax, special=False, lw=1.2)
+    _sweep_marks(ax, found.ratios, bare)
+    _sweep_marks(ax, found.ratios, bare, "y_max")
+    ax.axhline(GAP, color=GREEN, lw=1.6)
+    if found.wall is not None:
+        ax.axhline(found.wall, color="k", lw=1.0, ls="--")
+    _lines(ax, bare)
+    ax.set_xlim(*RANGE)
+    ax.set_ylim(min(float(b.y_min.min()) for b in bare.branches) - 0.3, 2.7)
+
+
+def _zoom(
+    ax: Axes,
+    ratios: np.ndarray,
+    system: System,
+    colors: dict[str, str],
+    wall: float | None,
+    solid: bool = False,
+) -> None:
+    """From BB' to CC', with a strip for each sweep that names its motions by colour."""
+    _closed_curves(ax, ratios, system)
+    for branch in system.branches:
+        plot_branch(branch, ax=ax, lw=1.3)
+    _sweep_marks(ax, ratios, system)
+    if wall is not None:
+        look = {"color": GREEN, "lw": 1.8} if solid else {"color": "k", "lw": 1.0, "ls": "--"}
+        ax.axhline(wall, **look)
+        named = "second stop" if solid else "a stop here?"
+        ax.text(0.672, wall + 0.05, named, fontsize=8.5)
+    _lines(ax, system)
+    ax.set_xlim(0.67, 1.01)
+    ax.set_ylim(-4.45, -1.0)
+    for y, name in ((-4.32, "run-up"), (-4.12, "close-down")):
+        for row in rows(system, name, between(system, ratios)):
+            color = colors.get(row.motion, colors.get("other period", "0.5"))
+            ends = _edges(ratios, row.part)
+            ax.fill_between(ends, y - 0.09, y + 0.09, color=color, lw=0)
+            if ends[1] - ends[0] > 0.03 * len(row.motion) / 12:
+                ax.text(
+                    sum(ends) / 2, y, row.motion, ha="center", va="center", fontsize=8, zorder=7
+                )
+        ax.text(0.704, y, name, ha="right", va="center", fontsize=8.5)
+
+
+def _edges(ratios: np.ndarray, part: np.ndarray) -> tuple[float, float]:
+    """Where a row's strip begins and ends: half a step beyond its values."""
+    half = np.gradient(ratios) / 2
+    first, last = part[0], part[-1]
+    return float(ratios[first] - half[first]), float(ratios[last] + half[last])

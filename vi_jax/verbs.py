@@ -1,0 +1,439 @@
+"""What the command line does with a file: one function for each verb.
+
+Each checks everything, the paths it will write to included, before it simulates, and returns the
+lines to print and whether anything succeeded.
+"""
+
+import csv
+import os
+import tempfile
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ._toml import ConfigError, given, keys_of, spoken, unknown
+from .config import Config, OrbitTable
+from .flow import RESULTS, Adaptive
+from .flow import simulate as run_motion
+from .flow.results import REASONS, number_of
+from .orbit import Orbit, continue_orbit, find_orbit
+from .orbit.cycle_map import default_flow
+from .plot import (
+    plot_basins,
+    plot_branch,
+    plot_history,
+    plot_phase_portrait,
+    plot_regimes,
+    plot_sweep,
+    save_picture,
+)
+from .plot.branch import axis_name
+from .plot.motion import BLUE, RED
+from .scan import Sweep
+from .scan import basins as find_basins
+from .scan import scan as run_scan
+from .scan import sweep as run_sweep
+from .scan.grid import Blocks, axes_of
+from .scan.job import check_corners, make_job
+from .scene import Scene
+from .scene.leaves import leaf, leaf_names
+
+Tell = Callable[[str], None]
+
+
+class Outcome(NamedTuple):
+    """How a verb ended."""
+
+    text: str
+    """What to print."""
+    good: bool
+    """Whether anything succeeded."""
+
+
+def scan(config: Config, tell: Tell) -> Outcome:
+    """`vi-jax scan`."""
+    scene, start, method = config.build()
+    table, axes = config.scan, config.axes
+    assert table is not None
+    if not axes:
+        raise ConfigError("missing table [axes]: a scan needs at least one")
+    check_names(scene, axes, "[axes]", start=True)
+    if table.picture is not None:
+        _check_map(axes, table.measure, paired=table.paired)
+    check_paths("[scan]", picture=table.picture)
+    options = given(table, "picture")
+    tell(f"scanning {Blocks(axes_of(axes), 1, paired=table.paired).total:,} motions")
+    with spoken("[scan]", keys=keys_of(type(table))), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "[0-9,]+ of [0-9,]+ lanes failed")
+        data = run_scan(scene, axes, start=start, method=method, **options)
+    lines = [f"Scan of {data['result'].size:,} motions over {_told_axes(axes)}"]
+    if "period" in data:
+        lines += _regimes(data)
+    lines += _ranges(data)
+    if table.store is None:
+        lines += ["", str(data), "", "Nothing was written: name a `store` in [scan] to keep it."]
+    else:
+        lines.append(f'  data: xarray.open_zarr("{table.store}", consolidated=False)')
+    if table.picture is not None:
+        ax = _axes()
+        plot_regimes(data, ax=ax)
+        lines.append(_saved(ax, table.picture))
+    failed, good = failures(np.asarray(data["result"]))
+    return Outcome("\n".join([*lines, *failed]), good)
+
+
+def sweep(config: Config, tell: Tell) -> Outcome:
+    """`vi-jax sweep`."""
+    scene, start, method = config.build()
+    table = config.sweep
+    assert table is not None
+    check_names(scene, [table.parameter], "[sweep]")
+    check_range(scene, table.parameter, table.values, "`values` in [sweep]")
+    check_paths("[sweep]", picture=table.picture, output=table.output)
+    options = given(table, "values", "up_and_down", "picture", "output")
+    there, back = ("up", "down") if table.values[0] <= table.values[-1] else ("down", "up")
+    found: dict[str, Sweep] = {}
+    with spoken("[sweep]", keys=keys_of(type(table))):
+        tell(f"sweeping {table.parameter} {there}, {len(table.values)} values")
+        found[there] = run_sweep(
+            scene, values=jnp.asarray(table.values), start=start, method=method, **options
+        )
+        if table.up_and_down:
+            tell(f"sweeping {table.parameter} {back}")
+            last = _last_state(found[there], start)
+            values = jnp.asarray(table.values[::-1])
+            found[back] = run_sweep(scene, values=values, start=last, method=method, **options)
+    lines = [f"Sweep of {table.parameter}, {len(table.values)} values"]
+    codes = []
+    for way, run in found.items():
+        lines.append(f"  {way}: {_run_lengths(np.asarray(run.values), np.asarray(run.period))}")
+        codes.append(np.asarray(number_of(run.result)))
+    if table.output is not None:
+        _write_rows(table.output, [_sweep_columns(way, run) for way, run in found.items()])
+        lines.append(f"  data: {table.output}")
+    if table.picture is not None:
+        ax = _axes()
+        for way, run in found.items():
+            look = {"color": BLUE, "ms": 6} if way == "up" else {"color": RED, "ms": 3}
+            plot_sweep(run, ax=ax, label=way, **look)
+        ax.set_xlabel(axis_name(table.parameter))
+        ax.legend(frameon=False)
+        lines.append(_saved(ax, table.picture))
+    failed, good = failures(np.concatenate(codes), what="values")
+    return Outcome("\n".join([*lines, *failed]), good)
+
+
+def basins(config: Config, tell: Tell) -> Outcome:
+    """`vi-jax basins`."""
+    scene, start, method = config.build()
+    table = config.basins
+    assert table is not None
+    check_names(scene, table.region, "[basins.region]", start=True)
+    if table.picture is not None and len(table.region) != 2:
+        raise ConfigError(
+            "`picture` in [basins] needs a region of two parts of the start, but it has "
+            f"{len(table.region)}"
+        )
+    check_paths("[basins]", picture=table.picture, output=table.output)
+    options = given(table, "resolution", "picture", "output")
+    if table.resolution is not None:
+        one = len(table.resolution) == 1
+        options["resolution"] = table.resolution[0] if one else table.resolution
+    tell("looking where the starts settle")
+    with spoken("[basins]", keys=keys_of(type(table))):
+        found = find_basins(scene, start=start, method=method, **options)
+    lines = [str(found)]
+    if table.output is not None:
+        kept = found.data[["label", "period", "impacts"]]
+        kept.to_dataframe().reset_index().to_csv(table.output, index=False)
+        lines.append(f"  data: {table.output}")
+    if table.picture is not None:
+        ax = _axes()
+        plot_basins(found, ax=ax)
+        lines.append(_saved(ax, table.picture))
+    failed, good = failures(np.asarray(found.data["result"]), what="starts")
+    return Outcome("\n".join([*lines, *failed]), good)
+
+
+def orbit(config: Config, tell: Tell) -> Outcome:
+    """`vi-jax orbit`."""
+    scene, start, method = config.build()
+    table = config.orbit
+    assert table is not None
+    check_paths("[orbit]", picture=table.picture)
+    if table.continue_ is not None:
+        _check_continuation(scene, table)
+    guess = start
+    if table.guess is not None:
+        guess = table.guess.build(scene, "`guess` in [orbit]")
+    tell(f"searching a motion of {table.cycles} cycle{'' if table.cycles == 1 else 's'}")
+    with spoken("[orbit]", keys=keys_of(type(table))):
+        found = find_orbit(
+            scene,
+            scene.start() if guess is None else guess,
+            table.cycles,
+            method=table.search(),
+            flow=method,
+        )
+    lines = [str(found)]
+    if not bool(found.successful):
+        return Outcome("\n".join(lines), False)
+    if table.picture is not None:
+        lines.append(_saved(_portrait(found), table.picture))
+    if table.continue_ is not None:
+        lines += _continued(found, table, tell)
+    return Outcome("\n".join(lines), True)
+
+
+def _check_continuation(scene: Scene, table: OrbitTable) -> None:
+    asked = table.continue_
+    assert asked is not None
+    check_names(scene, [asked.parameter], "[orbit.continue]")
+    low, high = asked.bounds
+    value = float(leaf(scene, asked.parameter))
+    if not low <= value <= high or low == high:
+        raise ConfigError(
+            f"`bounds` in [orbit.continue] must hold the scene's {asked.parameter} = {value:g}, "
+            f"but is [{low:g}, {high:g}]"
+        )
+    check_range(scene, asked.parameter, asked.bounds, "`bounds` in [orbit.continue]")
+    check_paths("[orbit.continue]", picture=asked.picture, output=asked.output)
+
+
+def _continued(found: Orbit, table: OrbitTable, tell: Tell) -> list[str]:
+    asked = table.continue_
+    assert asked is not None
+    tell(f"following it in {asked.parameter}")
+    with spoken("[orbit.continue]"):
+        branch = continue_orbit(found, **given(asked, "picture", "output"))
+    lines = [str(branch)]
+    if asked.output is not None:
+        data = branch.to_xarray()
+        columns = {name: np.asarray(x) for name, x in data.items() if x.dims == ("point",)}
+        _write_rows(asked.output, [{str(name): x for name, x in columns.items()}])
+        lines.append(f"  data: {asked.output}")
+    if asked.picture is not None:
+        ax = _axes()
+        plot_branch(branch, ax=ax)
+        lines.append(_saved(ax, asked.picture))
+    return lines
+
+
+def _portrait(found: Orbit) -> Axes:
+    """The phase portrait of a periodic motion."""
+    ax = _axes()
+    run = run_motion(
+        found.scene, found.state, int(found.cycles), method=found.flow, samples=128, impact_log=8
+    )
+    scene = found.scene
+    plot_phase_portrait(run, scene, ax=ax)
+    return ax
+
+
+def simulate(config: Config, tell: Tell) -> Outcome:
+    """`vi-jax simulate`."""
+    scene, start, method = config.build()
+    table = config.simulate
+    assert table is not None
+    check_paths("[simulate]", picture=table.picture, output=table.output)
+    options = given(table, "picture", "output")
+    if table.picture is not None:
+        options = {"samples": 64, "impact_log": 8, **options}
+    tell(f"simulating {table.cycles:,} cycles")
+    with spoken("[simulate]", keys=keys_of(type(table))):
+        run = run_motion(
+            scene,
+            scene.start() if start is None else start,
+            method=default_flow(scene, Adaptive()) if method is None else method,
+            **options,
+        )
+    lines = [str(run)]
+    if table.output is not None:
+        columns = _sample_columns(run.samples) if table.samples else _cycle_columns(run)
+        _write_rows(table.output, [columns])
+        lines.append(f"  data: {table.output}")
+    if table.picture is not None:
+        if not run.samples:
+            raise ConfigError("`samples` in [simulate] must be at least 1 for a picture")
+        figure = Figure(figsize=(11, 3.6), layout="constrained")
+        left, right = figure.subplots(1, 2, width_ratios=(2, 1))
+        plot_history(run, scene=scene, ax=left, unit="cycles")
+        plot_phase_portrait(run, scene, ax=right)
+        lines.append(_saved(left, table.picture))
+    return Outcome("\n".join(lines), bool(run.successful))
+
+
+VERBS: Mapping[str, Callable[[Config, Tell], Outcome]] = {
+    "scan": scan,
+    "sweep": sweep,
+    "basins": basins,
+    "orbit": orbit,
+    "simulate": simulate,
+}
+
+
+def check_names(scene: Scene, names: Iterable[str], place: str, *, start: bool = False) -> None:
+    """**Raises:** `ConfigError` for a name that no number of the scene (or the start) has."""
+    known = leaf_names(scene)
+    if start:
+        known += [f"start.{name}" for name in leaf_names(scene.start())]
+    wrong = [unknown("name", name, place, known) for name in names if name not in known]
+    if wrong:
+        raise ConfigError(*wrong)
+
+
+def check_range(scene: Scene, name: str, values: Sequence[float], place: str) -> None:
+    """**Raises:** `ConfigError` if the scene refuses the least or the greatest of these values."""
+    with spoken(place, keys=()):
+        axes = axes_of({name: values})
+        check_corners(make_job(scene, (name,), measure="extremes"), Blocks(axes, 1))
+
+
+def check_paths(table: str, *, picture: str | None = None, output: str | None = None) -> None:
+    """**Raises:** `ConfigError` if a file cannot be written; makes the folders above them."""
+    for key, path, ending in (("picture", picture, ".png"), ("output", output, ".csv")):
+        if path is None:
+            continue
+        if not path.endswith(ending):
+            raise ConfigError(f'`{key}` in {table} must end in {ending}, but is "{path}"')
+        reason = _unwritable(Path(path))
+        if reason:
+            raise ConfigError(f"`{key}` in {table} cannot be written: {path}: {reason}")
+
+
+def _unwritable(path: Path) -> str | None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+        if path.is_dir():
+            return "it is a folder"
+        return None if not path.exists() or os.access(path, os.W_OK) else "permission denied"
+    except (OSError, ValueError) as error:
+        return str(getattr(error, "strerror", None) or error)
+
+
+def _check_map(axes: Mapping[str, Any], measure: Iterable[str] | None, *, paired: bool) -> None:
+    if measure is not None and "regime" not in measure:
+        raise ConfigError('`picture` in [scan] needs "regime" among the measures')
+    if len(axes) != 2 or paired:
+        raise ConfigError(
+            f"`picture` in [scan] needs a grid of two axes, but there are {len(axes)}"
+        )
+
+
+def failures(codes: np.ndarray, *, what: str = "motions") -> tuple[list[str], bool]:
+    """Lines on the lanes that failed and why, and whether any did not."""
+    counts = {int(c): int(np.sum(codes == c)) for c in np.unique(codes) if c != 0}
+    if not counts:
+        return [], True
+    total = sum(counts.values())
+    lines = [f"  failed: {total:,} of {codes.size:,} {what}"]
+    lines += [f"    {n:,}: {_reason(code)}" for code, n in counts.items()]
+    return lines, total < codes.size
+
+
+def _reason(code: int) -> str:
+    return "Not computed." if code < 0 else RESULTS[REASONS[code]] or "completed"
+
+
+def _told_axes(axes: Mapping[str, Sequence[float]]) -> str:
+    return ", ".join(f"{n} ({len(x)}: {min(x):g} … {max(x):g})" for n, x in axes.items())
+
+
+def _regimes(data: xr.Dataset) -> list[str]:
+    """How many motions there are of each period."""
+    period = np.asarray(data["period"])[np.asarray(data["result"]) == 0]
+    names = {0: "unsettled", -1: "chaotic"}
+    kinds, counts = np.unique(period, return_counts=True)
+    order = sorted(zip(kinds.tolist(), counts.tolist(), strict=True), key=lambda pair: -pair[1])
+    lines = [
+        f"  {names.get(kind, f'period {2 * kind}π')}: {n:,} ({100 * n / data['result'].size:.1f} %)"
+        for kind, n in order
+    ]
+    return lines if len(lines) <= 12 else [*lines[:12], f"  {len(lines) - 12} further periods"]
+
+
+def _ranges(data: xr.Dataset) -> list[str]:
+    """The span of each number over the motions that did not fail."""
+    lines = []
+    for name, x in data.items():
+        if x.dtype.kind != "f" or name == "impacts":
+            continue
+        numbers = np.asarray(x.where(data["result"] == 0))
+        numbers = numbers[np.isfinite(numbers)]
+        if numbers.size:
+            span = f"{numbers.min():.6g} … {numbers.max():.6g}"
+            lines.append(f"  {name}: {span} {x.attrs.get('units', '')}".rstrip())
+    return lines
+
+
+def _run_lengths(values: np.ndarray, period: np.ndarray) -> str:
+    """Periods in the order in which a sweep meets them, with where each begins."""
+    begins = [0, *(np.flatnonzero(np.diff(period)) + 1)]
+    told = [
+        f"{f'{2 * period[i]}π' if period[i] > 0 else 'no period'} from {values[i]:.6g}"
+        for i in begins
+    ]
+    return ", ".join(told if len(told) <= 12 else [*told[:12], f"{len(told) - 12} further changes"])
+
+
+def _last_state(run: Sweep, otherwise: Any) -> Any:
+    """The section state on which a sweep ended."""
+    good = np.flatnonzero(np.asarray(run.result == RESULTS.successful))
+    if not good.size:
+        return otherwise
+    return jtu.tree_map(lambda x: x[good[-1], -1], run.sections)
+
+
+def _sweep_columns(way: str, run: Sweep) -> dict[str, np.ndarray]:
+    names = ("values", "y_min", "y_max", "period", "impacts", "frequency_ratio", "impact_speed")
+    columns = {name: np.asarray(getattr(run, name)) for name in names}
+    results = np.array([_reason(int(code)) for code in number_of(run.result)])
+    return {"direction": np.full(results.size, way), **columns, "result": results}
+
+
+def _sample_columns(samples: Any) -> dict[str, np.ndarray]:
+    return {
+        "cycles": np.asarray(samples.cycles),
+        "time": np.asarray(samples.time),
+        **{name: np.asarray(x) for name, x in vars(samples.state).items()},
+    }
+
+
+def _cycle_columns(run: Any) -> dict[str, np.ndarray]:
+    """One row for each cycle: the state at its end, and what happened in it."""
+    names = ("y_min", "y_max", "impacts", "impact_speed", "frequency_ratio")
+    return {
+        "cycle": np.arange(1, run.impacts.size + 1),
+        **{name: np.asarray(x)[1:] for name, x in vars(run.sections).items()},
+        **{name: np.asarray(getattr(run, name)) for name in names},
+    }
+
+
+def _write_rows(path: str, tables: Iterable[Mapping[str, np.ndarray]]) -> None:
+    """Columns as CSV, several tables of the same columns below each other."""
+    with Path(path).open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        for i, table in enumerate(tables):
+            if not i:
+                writer.writerow(table)
+            writer.writerows(zip(*(x.tolist() for x in table.values()), strict=True))
+
+
+def _axes() -> Axes:
+    return Figure(figsize=(7.5, 4.2), layout="constrained").subplots()
+
+
+def _saved(ax: Axes, path: str) -> str:
+    figure = ax.figure
+    assert isinstance(figure, Figure)
+    return f"  picture: {save_picture(figure, path)}"
