@@ -82,14 +82,15 @@ def spoken(table: str, *, keys: Iterable[str] | None = None) -> Iterator[None]:
         text = str(error).rstrip(".")
         told = re.match(r"Argument `(\w+)`", text)
         if told is None:
-            if isinstance(error, ConfigError) or not text.startswith(("Axis ", "Me", "Scan ")):
+            own = text.startswith(("Axis ", "Method ", "Measure "))
+            if not own or isinstance(error, ConfigError):
                 raise
             raise ConfigError(f"{table}: {text}") from None
         name, rest = told[1], text[told.end() :]
         if name in ("axes", "start", "method", "flow") and keys is not None:
             place = f"[{'method' if name == 'flow' else name}]"
         else:
-            place = f"`{name}` in {table}" if keys is None or name in keys else f"`{name}`"
+            place = f"`{name}` in {table}" if keys is None or name in keys else f"{table}: `{name}`"
         raise ConfigError(f"{place}{rest}") from None
 
 

@@ -247,6 +247,8 @@ def simulate(config: Config, tell: Tell) -> Outcome:
     options = given(table, "picture", "output")
     if table.picture is not None:
         options = {"samples": 64, "impact_log": 8, **options}
+        if options["samples"] < 1:
+            raise ConfigError("`samples` in [simulate] must be at least 1 for a picture")
     tell(f"simulating {table.cycles:,} cycles")
     with spoken("[simulate]", keys=keys_of(type(table))):
         run = run_motion(
@@ -261,8 +263,6 @@ def simulate(config: Config, tell: Tell) -> Outcome:
         _write_rows(table.output, [columns])
         lines.append(f"  data: {table.output}")
     if table.picture is not None:
-        if not run.samples:
-            raise ConfigError("`samples` in [simulate] must be at least 1 for a picture")
         figure = Figure(figsize=(11, 3.6), layout="constrained")
         left, right = figure.subplots(1, 2, width_ratios=(2, 1))
         plot_history(run, scene=scene, ax=left, unit="cycles")
@@ -365,7 +365,8 @@ def _regimes(data: xr.Dataset) -> list[str]:
 def _ranges(data: xr.Dataset) -> list[str]:
     """The span of each number over the motions that did not fail."""
     lines = []
-    for name, x in data.items():
+    for name in sorted(map(str, data)):  # a store does not keep their order
+        x = data[name]
         if x.dtype.kind != "f" or name == "impacts":
             continue
         numbers = np.asarray(x.where(data["result"] == 0))

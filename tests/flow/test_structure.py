@@ -66,7 +66,7 @@ def test_the_state_is_what_the_scene_needs():
     assert sum(count(ideal).values()) < sum(count(motor).values())
     # Elapsed time, extremes, speeds and energies are carried where they are asked for.
     assert carried(program(MOTOR, MOTOR.start(), record="motion")) == carried(motor) + 10
-    assert carried(program(IDEAL, IDEAL.start(), record="motion")) == carried(ideal) + 6
+    assert carried(program(IDEAL, IDEAL.start(), record="motion")) == carried(ideal) + 8
 
 
 @pytest.mark.parametrize("method", [vi.Adaptive(), vi.FixedStep(), vi.ExactFlight()])

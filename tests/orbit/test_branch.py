@@ -142,6 +142,7 @@ def test_a_motor_branch_agrees_with_found_orbits():
         assert float(found.frequency_ratio) == pytest.approx(branch.frequency_ratio[end], abs=1e-9)
 
 
+@pytest.mark.slow
 def test_grazing_of_the_classic_impact_oscillator():
     """The motion that stays off the stop has the amplitude 1/√((1 - ζ²)² + (2ξζ)²); it grazes
     where that is the gap (Shaw and Holmes 1983; Nordmark 1991)."""
@@ -191,6 +192,7 @@ class Duffing(vi.AbstractScene):
         return vi.OscillatorState(state.V / self.frequency, pull / self.frequency)
 
 
+@pytest.mark.slow
 def test_folds_of_a_duffing_oscillator():
     """Jump frequencies of a hardening oscillator: up at 1 + ½ (3/2)^(4/3) γ^(1/3) F^(2/3) to first
     order in γ (Kovacic and Brennan, The Duffing Equation, 2011, section 5.3); and SciPy's word that
@@ -222,6 +224,7 @@ def test_folds_of_a_duffing_oscillator():
         assert np.abs(np.linalg.eigvals(end[2:].reshape(2, 2)) - 1).min() < 1e-4
 
 
+@pytest.mark.slow
 def test_boundaries_in_a_second_parameter():
     branch = branch_of(0.5)
     doubling = next(p for p in branch.special if p.kind == "period-doubling")

@@ -133,6 +133,7 @@ def test_gradients_by_the_implicit_function_theorem(name):
     np.testing.assert_allclose(gradient, difference, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_damping_at_which_the_2pi_motion_becomes_stable():
     """Newton's method on "multiplier = -1", with the derivative of the found orbit."""
     table = vi.Parameters(restitution=0.5, gap=0.08)

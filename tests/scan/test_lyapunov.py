@@ -48,6 +48,7 @@ def test_unstable_orbit_has_the_rates_of_its_multipliers():
     assert float(found.exponents[0]) > 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("zeta", [0.6, 0.7, 0.97])
 def test_exponents_add_up_to_the_mean_contraction(zeta):
     # Volumes shrink by e^{-2ξ} in unit time and by k² in an impact, whatever the motion does.
@@ -61,6 +62,7 @@ def test_exponents_add_up_to_the_mean_contraction(zeta):
     assert float(found.exponents.sum()) == pytest.approx(contraction, abs=2e-3)
 
 
+@pytest.mark.slow
 def test_chaos_is_seen_by_a_disturbance_too():
     scene = ideal(zeta=0.7, k=0.8)
     found = vi.lyapunov(scene, scene.start(), 4000, settle=2000)

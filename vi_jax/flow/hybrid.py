@@ -33,6 +33,9 @@ Flag = Bool[Array, ""]
 # it was chattering.
 _LOST, _MANY = 64.0, 16.0
 
+# Nothing that a lane could do in one interval takes so many steps.
+_STUCK = 65536.0
+
 
 def iterate(plan: Plan, lane: Lane) -> Lane:
     """One step of one lane: advance, aim or land. A lane that has ended is left as it is."""
@@ -63,7 +66,7 @@ def iterate(plan: Plan, lane: Lane) -> Lane:
     steps = lane.steps + jnp.where(active, 1.0, 0.0)
     fault = lane.fault
     aims = jnp.where(aim, lane.aims + 1, 0.0)
-    for condition, code in _faults(plan, trial, rejected, length, record, steps, aims):
+    for condition, code in _faults(plan, lane, trial, rejected, length, record, steps, aims):
         stops_here = active & (fault == 0) & condition & (done < plan.intervals)
         fault = jnp.where(stops_here, float(code), fault)
     return Lane(
@@ -79,6 +82,7 @@ def iterate(plan: Plan, lane: Lane) -> Lane:
         done=done,
         fault=fault,
         steps=steps,
+        begun=jnp.where(completed, steps, lane.begun),
         rejected=lane.rejected + jnp.where(rejected, 1.0, 0.0),
         one=one,
         kept_state=kept_state,
@@ -206,6 +210,7 @@ def _resized(plan: Plan, lane: Lane, trial: Trial, taken: Flag, rejected: Flag) 
 
 def _faults(
     plan: Plan,
+    lane: Lane,
     trial: Trial,
     rejected: Flag,
     length: Scalar,
@@ -223,6 +228,7 @@ def _faults(
         ((aims >= _LOST) & (record.impacts > _MANY), results.CHATTER),
         (aims >= _LOST, results.UNRESOLVED),
         (steps >= plan.max_steps, results.MAX_STEPS),
+        (steps - lane.begun >= _STUCK, results.MAX_STEPS),
     ]
     if not plan.method.adaptive:
         return [(rejected, broken), *ends]

@@ -56,6 +56,8 @@ class Lane(eqx.Module):
     fault: Scalar
     """Reason why the lane ended before its time (see `results`), or 0."""
     steps: Scalar
+    begun: Scalar
+    """Steps tried before the interval on its way."""
     rejected: Scalar
     one: Scalar
     """1, which the compiler cannot know (see `hybrid.pin`)."""
@@ -157,6 +159,7 @@ class Plan(eqx.Module):
             done=zero,
             fault=jnp.where(bad, float(results.BAD_START), zero),
             steps=zero,
+            begun=zero,
             rejected=zero,
             one=jnp.where(bad, jnp.nan, 1.0).astype(zero.dtype),
             kept_state=start,

@@ -25,7 +25,10 @@ class RESULTS(eqx.Enumeration):
     underflow = "The step size fell below what the precision resolves. Loosen the tolerance."
     not_finite = "The state ceased to be finite."
     unresolved = "An impact could not be located within the step."
-    max_steps = "The number of steps exceeded `max_steps` before the last cycle was complete."
+    max_steps = (
+        "The number of steps exceeded `max_steps` before the last cycle was complete, or 65,536 "
+        "within one."
+    )
 
 
 # The loop carries reasons as numbers; this is their order.

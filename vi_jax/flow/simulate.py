@@ -18,7 +18,7 @@ from .methods import AbstractMethod, Adaptive
 from .pool import run_pool
 from .results import ImpactLog, Run, Samples, reason
 
-# Steps in a cycle beyond which a lane is given up, unless the caller says otherwise.
+# Steps in a cycle that reverse mode makes room for, unless the caller says otherwise.
 _STEPS = 65536
 
 
@@ -61,7 +61,8 @@ def simulate(
     - `adjoint`: `"forward"` (fast; `jvp`, `jacfwd`) or `"reverse"` (checkpointed; `vjp`, `grad`).
     - `max_impacts`: impacts in one cycle (or sampling interval) beyond which a lane ends as
       chattering.
-    - `max_steps`: steps beyond which a lane ends; by default 65,536 a cycle.
+    - `max_steps`: steps beyond which a lane ends, apart from 65,536 in any one cycle (or sampling
+      interval).
     - `throw`: raise an error if a lane fails, instead of only reporting it in `result`.
 
     **Returns:** a `Run`.
@@ -144,7 +145,6 @@ def planned(
         if max_steps is None and concrete(settle) is None:
             raise ValueError("Argument `max_steps` must be given where `settle` is traced.")
         bound = int(_STEPS * (cycles + settle) if max_steps is None else max_steps)
-    steps = _STEPS * (cycles + jnp.asarray(settle, dtype)) if max_steps is None else max_steps
     plan = Plan(
         scene=scene,
         method=method,
@@ -154,7 +154,7 @@ def planned(
         log=impact_log,
         bound=bound,
         settle=jnp.asarray(settle, dtype),
-        max_steps=jnp.asarray(steps, dtype),
+        max_steps=jnp.asarray(jnp.inf if max_steps is None else max_steps, dtype),
         max_impacts=jnp.asarray(max_impacts, dtype),
     )
     return plan, start

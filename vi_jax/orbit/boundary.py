@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._checks import count
-from ..scene.leaves import check_leaf, leaf
+from ..scene.leaves import check_again, check_leaf, leaf, with_leaf
 from .branch import (
     CROSSING,
     DOUBLING,
@@ -104,6 +104,8 @@ def boundary(
                 f"Argument `bounds` must hold the point's {name} = {value:g}, but is "
                 f"({low:g}, {high:g})."
             )
+        for bound in (low, high):
+            check_again(with_leaf(old.scene, name, bound))
     corners = []
     for a in bounds[0]:
         for b in bounds[1]:

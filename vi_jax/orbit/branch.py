@@ -16,7 +16,7 @@ from scipy.optimize import brentq, newton
 from .._checks import count, require
 from ..flow import AbstractMethod
 from ..scene import AbstractScene, Scene
-from ..scene.leaves import check_leaf, leaf, with_leaf
+from ..scene.leaves import check_again, check_leaf, leaf, with_leaf
 from .curve import Step, array_of, corrected, first_tangent, walk
 from .results import ORBIT_RESULTS, Orbit, told_impacts
 from .shooting import Shooting, carrier, steps_of
@@ -203,6 +203,8 @@ def continue_orbit(
             f"Argument `bounds` must hold the orbit's {parameter} = {value:g}, but is "
             f"({low:g}, {high:g})."
         )
+    for bound in (low, high):
+        check_again(with_leaf(orbit.scene, parameter, bound))
     require("step", step, low=0.0, open_low=True)
     count("max_points", max_points, least=2)
     problem, x = _problem(orbit, (parameter,), [(low, high)], flow)

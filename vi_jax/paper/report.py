@@ -175,8 +175,8 @@ def _response(panels: dict[str, Any]) -> list[str]:
         '"Apart" counts the values of ζ there at which the swept min Y differs from it by more '
         'than 0.001 a. "On the 4π curve" counts those of the values with an admissible and stable '
         "4π motion of one impact at which the sweep is on it to 1e-6; at the others the sweep is "
-        "on a motion that coexists with it. Without damping a free motion is never forgotten: where "
-        "the sweeps do not strike, outside of the stretch, their marks wander.",
+        "on a motion that coexists with it. Without damping a free motion is never forgotten: "
+        "where the sweeps do not strike, outside of the stretch, their marks wander.",
         "",
         "| k | ξ | sweep | BB' | CC' | apart | largest difference of min Y | of max Y | on the 4π "
         "curve |",

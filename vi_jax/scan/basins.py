@@ -14,6 +14,7 @@ import xarray as xr
 from .._checks import count
 from ..flow import AbstractMethod, FixedStep, simulate
 from ..orbit.cycle_map import default_flow
+from ..orbit.results import told_impacts
 from ..scene import AbstractScene, Scene
 from .grid import axes_of
 from .job import START
@@ -55,11 +56,12 @@ class Basins(NamedTuple):
     """Fractions of the starts that ended on no periodic motion: chaotic, unsettled, failed."""
 
     def __str__(self) -> str:
-        lines = [f"Basins of {len(self.attractors)} periodic motions"]
+        many = "" if len(self.attractors) == 1 else "s"
+        lines = [f"Basins of {len(self.attractors)} periodic motion{many}"]
         for a in self.attractors:
             where = ", ".join(f"{name} = {x[0]:.6g}" for name, x in a.sections.items())
             lines.append(
-                f"  {a.label}: period {2 * a.period}π, {a.impacts:g} impacts, {where}: "
+                f"  {a.label}: period {2 * a.period}π, {told_impacts(round(a.impacts))}, {where}: "
                 f"{100 * a.fraction:.2f} ± {100 * a.error:.2f} %"
             )
         lines += [f"  {name}: {100 * x:.2f} %" for name, x in self.irregular.items() if x]

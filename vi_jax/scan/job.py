@@ -17,7 +17,7 @@ from ..flow.results import number_of
 from ..flow.simulate import simulate_pool
 from ..orbit.cycle_map import default_flow
 from ..scene import AbstractScene, Scene
-from ..scene.leaves import check_name, leaf, leaf_names, with_leaf
+from ..scene.leaves import check_again, check_name, leaf, leaf_names, with_leaf
 from .grid import Blocks
 from .measures import AbstractMeasure, Numbers, measures_of
 
@@ -236,19 +236,9 @@ def check_corners(job: Job, blocks: Blocks) -> None:
     for values in np.stack(np.meshgrid(*corners, indexing="ij"), axis=-1).reshape(-1, len(corners)):
         lane = {name: jnp.asarray(x) for name, x in zip(blocks.axes, values, strict=True)}
         scene, start = job.lane(lane)
-        _checked(scene)
+        check_again(scene)
         for name in job.derivatives:
             _check_name(scene, start, name, "derivatives")
         job.method.check(scene)
         if isinstance(scene, Scene):
             scene.adopt(start)
-
-
-def _checked(scene: AbstractScene) -> None:
-    """Run the scene's own checks again: a number put in place of another has passed none."""
-    parts = jtu.tree_leaves(scene, is_leaf=lambda x: isinstance(x, eqx.Module) and x is not scene)
-    for part in parts:
-        if isinstance(part, eqx.Module):
-            check = getattr(part, "__check_init__", None)
-            if check is not None:
-                check()

@@ -13,7 +13,7 @@ from .._checks import concrete, count
 from ..flow import RESULTS, AbstractMethod, FixedStep, simulate
 from ..orbit.cycle_map import default_flow
 from ..scene import AbstractScene, Scene
-from ..scene.leaves import check_leaf, with_leaf
+from ..scene.leaves import check_again, check_leaf, with_leaf
 from .regime import least_period
 
 
@@ -89,6 +89,9 @@ def sweep(
             "Argument `values` must be finite numbers in one row, but has shape "
             f"{values.shape}{'' if values.ndim != 1 else ' and numbers that are not finite'}."
         )
+    if numbers is not None:
+        for value in {numbers.min(), numbers.max()}:
+            check_again(with_leaf(scene, parameter, value))
     if start is None:
         if not isinstance(scene, Scene):
             raise ValueError("Argument `start` must be given for a scene of your own.")

@@ -47,6 +47,15 @@ def check_name(names: list[str], name: str, argument: str) -> str:
     )
 
 
+def check_again(scene: Any) -> None:
+    """Run the scene's own checks: a number put in place of another has passed none."""
+    parts = jtu.tree_leaves(scene, is_leaf=lambda x: isinstance(x, eqx.Module) and x is not scene)
+    for part in [*parts, scene]:
+        check = getattr(part, "__check_init__", None)
+        if check is not None:
+            check()
+
+
 def _named(tree: Any) -> list[tuple[str, Any]]:
     named = []
     for path, value in jtu.tree_leaves_with_path(tree):

@@ -1,0 +1,134 @@
+"""Maps show what was computed: each cell, each motion, each entry of the legend."""
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+import numpy as np
+import pytest
+import vi_jax as vi
+import xarray as xr
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+
+PERIODS = np.array([[1, 2, 8], [9, 64, 0], [-1, -2, 1], [1, -1, 2]])
+
+
+def _axes():
+    return Figure().subplots()
+
+
+def _data(period=PERIODS, x=(0.5, 0.7, 0.9, 1.1), y=(0.1, 0.2, 0.3), result=None):
+    result = np.zeros_like(period) if result is None else result
+    dims = ("drive.frequency_ratio", "stops.0.restitution")
+    return xr.Dataset(
+        {"period": (dims, period.astype(np.int16)), "result": (dims, result.astype(np.int8))},
+        coords={dims[0]: np.array(x), dims[1]: np.array(y)},
+    )
+
+
+def _cells(ax):
+    """Colours of the cells, by column and row."""
+    (mesh,) = ax.collections
+    mesh.update_scalarmappable()
+    rows, columns = mesh.get_array().shape
+    return mesh.get_facecolors().reshape(rows, columns, 4)[..., :3].transpose(1, 0, 2), mesh
+
+
+def _legend(ax):
+    legend = ax.get_legend()
+    return {
+        text.get_text(): to_rgb(patch.get_facecolor()[:3])
+        for text, patch in zip(legend.get_texts(), legend.get_patches(), strict=True)
+    }
+
+
+def test_regimes_have_the_colours_of_the_legend():
+    ax = _axes()
+    assert vi.plot_regimes(_data(), ax=ax) is ax
+    names = {1: "2π", 2: "4π", 8: "16π", 9: "> 16π", 64: "> 16π"}
+    names |= {0: "unsettled", -1: "chaotic", -2: "failed"}
+    cells, _ = _cells(ax)
+    legend = _legend(ax)
+    assert list(legend) == ["2π", "4π", "16π", "> 16π", "unsettled", "chaotic", "failed"]
+    assert len(set(legend.values())) == len(legend)
+    for place, period in np.ndenumerate(PERIODS):
+        np.testing.assert_allclose(cells[place], legend[names[period]])
+    assert ax.get_xlabel() == "frequency ratio ζ" and ax.get_ylabel() == "restitution k"
+
+
+def test_regimes_lie_around_their_values():
+    shuffled = _data(PERIODS[[2, 0, 3, 1]], x=(0.9, 0.5, 1.1, 0.7))
+    (cells, mesh), (others, _) = (
+        _cells(vi.plot_regimes(_data(), ax=_axes())),
+        _cells(vi.plot_regimes(shuffled, ax=_axes())),
+    )
+    np.testing.assert_array_equal(cells, others)
+    edges = mesh.get_coordinates()
+    np.testing.assert_allclose(edges[0, :, 0], [0.4, 0.6, 0.8, 1.0, 1.2])
+    np.testing.assert_allclose(edges[:, 0, 1], [0.05, 0.15, 0.25, 0.35])
+
+
+def test_axes_by_name_single_rows_and_what_was_not_computed():
+    turned = vi.plot_regimes(_data(), ax=_axes(), x="stops.0.restitution")
+    straight, _ = _cells(vi.plot_regimes(_data(), ax=_axes()))
+    np.testing.assert_array_equal(_cells(turned)[0], straight.transpose(1, 0, 2))
+    assert turned.get_xlabel() == "restitution k"
+    one = _data(PERIODS[:, :1], y=(0.4,), result=np.array([[0], [0], [-1], [0]]))
+    assert list(_legend(vi.plot_regimes(one, ax=_axes()))) == ["2π", "> 16π", "not computed"]
+
+
+def test_maps_need_two_axes():
+    with pytest.raises(ValueError, match="must hold `period`"):
+        vi.plot_regimes(_data().drop_vars("period"))
+    with pytest.raises(ValueError, match="two axes"):
+        vi.plot_regimes(_data().isel({"stops.0.restitution": 0}))
+    with pytest.raises(ValueError, match="`x` must be one of"):
+        vi.plot_regimes(_data(), x="gap")
+    with pytest.raises(ValueError, match="different axes"):
+        vi.plot_regimes(_data(), x="stops.0.restitution", y="stops.0.restitution")
+
+
+def _basins(label, dims, **coords):
+    motions = [
+        vi.Attractor(0, 1, 1.0, {"Y": np.array([0.2]), "V": np.array([1.0])}, 4, 0.5, 0.1),
+        vi.Attractor(
+            1, 2, 3.0, {"Y": np.array([0.0, 9.0]), "V": np.array([0.0, 9.0])}, 2, 0.2, 0.1
+        ),
+    ]
+    data = xr.Dataset({"label": (dims, np.asarray(label, np.int8))}, coords=coords)
+    return vi.Basins(data, motions, {"chaotic": 0.1, "unsettled": 0.0, "failed": 0.2})
+
+
+def test_basins_on_a_grid():
+    label = [[0, 0, 1], [1, -1, -3]]
+    dims = ("start.Y", "start.V")
+    found = _basins(label, dims, **{"start.Y": [-1.0, 1.0], "start.V": [-1.0, 0.0, 1.0]})
+    ax = _axes()
+    assert vi.plot_basins(found, ax=ax) is ax
+    legend = _legend(ax)
+    names = ["2π, 1 impact: 50.0 %", "4π, 3 impacts: 20.0 %", "chaotic: 10.0 %", "failed: 20.0 %"]
+    assert list(legend) == names
+    cells, _ = _cells(ax)
+    of = {0: names[0], 1: names[1], -1: names[2], -3: names[3]}
+    for place, value in np.ndenumerate(np.array(label)):
+        np.testing.assert_allclose(cells[place], legend[of[value]])
+    first, second = ax.lines
+    assert first.get_xydata().tolist() == [[0.2, 1.0]]
+    assert second.get_xydata().tolist() == [[0.0, 0.0], [9.0, 9.0]]
+    # The point outside of the region does not widen the picture.
+    assert ax.get_xlim() == (-2.0, 2.0) and ax.get_ylim() == (-1.5, 1.5)
+    assert ax.get_xlabel().startswith("Y") and ax.get_ylabel().startswith("V")
+
+
+def test_basins_of_random_starts():
+    coords = {"start.Y": ("sample", [0.0, 1.0, 2.0]), "start.V": ("sample", [0.5, 0.5, 0.0])}
+    ax = vi.plot_basins(_basins([0, 1, -2], ("sample",), **coords), ax=_axes())
+    (dots,) = ax.collections
+    assert dots.get_offsets().tolist() == [[0.0, 0.5], [1.0, 0.5], [2.0, 0.0]]
+    assert len({tuple(color) for color in dots.get_facecolors()}) == 3
+
+
+def test_basins_need_two_parts_of_the_start():
+    with pytest.raises(ValueError, match="two axes"):
+        vi.plot_basins(_basins([0, 1], ("start.Y",), **{"start.Y": [0.0, 1.0]}))
