@@ -57,10 +57,14 @@ def test_bounces_of_a_ball(method):
     np.testing.assert_allclose(run.duration, 1.0)
 
 
-def test_endless_bounces_end_with_a_reason():
+def test_endless_bounces_end_in_rest():
     start = Ball(jnp.asarray(1.0), jnp.asarray(0.0))
     run = vi.simulate(ball(restitution=0.3), start, 10, method=vi.Adaptive())
-    assert bool(run.result == vi.RESULTS.chatter)
+    assert bool(run.successful) and int(run.rests.sum()) == 1
+    assert float(run.sections.Y[-1]) == 0.0 and float(run.sections.V[-1]) == 0.0
+    # Left out of the program, rest is told from other failures.
+    without = vi.simulate(ball(restitution=0.3), start, 10, method=vi.Adaptive(), rests=False)
+    assert bool(without.result == vi.RESULTS.chatter)
 
 
 def test_derivative_of_the_first_impact():

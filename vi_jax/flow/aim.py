@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from .events import Rates, quintic, rising_root, slope
 from .fusion import pin
-from .lane import FREE, TURN, Lane, Plan
+from .lane import FREE, RELEASE, TURN, Lane, Plan
 from .trial import Trial, to_turn
 
 Scalar = Float[Array, ""]
@@ -81,6 +81,11 @@ def aim_at(plan: Plan, lane: Lane, trial: Trial) -> tuple[Flag, Scalar, Scalar]:
         target = jnp.where(again, c.name, target)
     target = jnp.where(turn, TURN, jnp.where(wiggle, FREE, target))
     attempt = jnp.where(wiggle, 0.5 * h, attempt)
+    if trial.leaves is not None:
+        left, released, place, _ = trial.leaves
+        aim, turn, wiggle = aim & ~released | left, turn & ~left, wiggle & ~left
+        attempt = jnp.where(left, place, attempt)
+        target = jnp.where(left, RELEASE, target)
     return aim | turn | wiggle, stop_gradient(attempt), target
 
 

@@ -34,6 +34,11 @@ class ExactFlight(AbstractMethod):
         """Five arcs of at most a fifth of a turn."""
         return 5
 
+    @property
+    def uses_field(self) -> bool:
+        """False: the flight is written out."""
+        return False
+
     def check(self, scene):
         """Refuse scenes whose flight has no closed form."""
         if not isinstance(scene, Scene) or not isinstance(scene.drive, IdealDrive):

@@ -22,8 +22,9 @@ from jaxtyping import Array, Bool, Float
 
 from . import results
 from .aim import aim_at, select
-from .fusion import pin_flag
+from .fusion import pin, pin_flag
 from .lane import FREE, SECTION, Lane, Plan, Record
+from .rest import brief, remaining
 from .trial import Trial, attempt
 
 Scalar = Float[Array, ""]
@@ -47,7 +48,7 @@ def iterate(plan: Plan, lane: Lane) -> Lane:
     taken = pin_flag(active & trial.good & ~aim, one)
     rejected = active & ~trial.good
     length = _resized(plan, lane, trial, taken, rejected)
-    s, state, direction, record, completed = _arrive(plan, lane, trial, taken)
+    s, state, direction, contact, record, completed = _arrive(plan, lane, trial, taken)
     completed = pin_flag(completed, one)
 
     done, part = lane.done + jnp.where(completed, 1.0, 0.0), lane.part
@@ -74,6 +75,7 @@ def iterate(plan: Plan, lane: Lane) -> Lane:
         state=state,
         record=record,
         direction=direction,
+        contact=contact,
         length=length,
         attempt=jnp.where(aim, goal, length),
         target=jnp.where(aim, target, FREE),
@@ -92,14 +94,15 @@ def iterate(plan: Plan, lane: Lane) -> Lane:
 
 def _arrive(
     plan: Plan, lane: Lane, trial: Trial, taken: Flag
-) -> tuple[Scalar, Any, Scalar, Record, Flag]:
-    """Where the step leads: s, the state with its jump, the direction, the record, whether the
-    interval is complete."""
+) -> tuple[Scalar, Any, Scalar, Scalar | None, Record, Flag]:
+    """Where the step leads: s, the state with its jump, the direction, the stop rested on, the
+    record, whether the interval is complete."""
     scene = plan.scene
     s, state, time, direction = trial.s, trial.state, trial.time, lane.direction
     record = lane.record
     impacts, speed, loss = record.impacts, record.speed, record.loss
-    log, clearance = record.log, record.clearance
+    log, clearance, rests = record.log, record.clearance, record.rests
+    contact = lane.contact
     completed = trial.ends_interval
     if trial.position is not None:
         v = stop_gradient(trial.position[1].v)
@@ -109,7 +112,7 @@ def _arrive(
     flow: Any = None
     bend: Any = None
     if trial.crossings:
-        flow, bend = _flow_and_bend(scene, time is not None, trial.s, trial.state)
+        flow, bend = _flow_and_bend(trial.holding, time is not None, trial.s, trial.state)
     for c in trial.crossings:
         offset = jnp.where(c.landed, c.offset, 0.0)
         there, passed = jtu.tree_map(
@@ -129,15 +132,44 @@ def _arrive(
         rebound = -stop.sign * stop.restitution * approach
         state = select(c.landed, scene.placed(there, stop.sign * stop.gap, rebound), state)
         direction = jnp.where(c.landed, -float(stop.sign), direction)
-        hit = taken & c.landed
+        hit, met = taken & c.landed, s
+        if contact is not None and trial.position is not None:
+            end = trial.position[1]
+            left = remaining(
+                stop.restitution, jnp.maximum(stop.sign * end.v, 0.0), stop.sign * end.a
+            )
+            bound = _bound(plan, lane)
+            ends = (
+                c.landed
+                & (stop_gradient(left) <= brief(scene, s))
+                & (stop_gradient(s + left) < bound)
+            )
+            ends = pin_flag(ends, lane.one)
+            wait = pin(jnp.where(ends, left, 0.0), lane.one)
+            (later, passed) = jtu.tree_map(lambda x, dx, w=wait: x + w * dx, (state, time), flow)
+            still = scene.placed(later, stop.sign * stop.gap, jnp.zeros_like(s))
+            state = select(ends, still, state)
+            time = select(ends, passed, time)
+            s = s + wait
+            contact = jnp.where(ends, float(c.name), contact)
+            direction = jnp.where(ends, float(stop.sign), direction)
+            if rests is not None:
+                rests = rests + jnp.where(taken & ends, 1.0, 0.0)
         clock = scene.clock(there)
-        log = _logged(log, hit, impacts, s if clock is None else clock, approach, index)
+        log = _logged(log, hit, impacts, met if clock is None else clock, approach, index)
         impacts = impacts + jnp.where(hit, 1.0, 0.0)
         if speed is not None:
             speed = jnp.where(hit, jnp.maximum(speed, approach), speed)
         if loss is not None:
             lost = 0.5 * (1 - stop.restitution**2) * approach**2
             loss = loss + jnp.where(hit, lost, 0.0)
+    if trial.leaves is not None:
+        assert contact is not None and lane.contact is not None
+        _, released, _, offset = trial.leaves
+        s = s + offset
+        state, time = jtu.tree_map(lambda x, dx: x + offset * dx, (state, time), flow)
+        direction = jnp.where(released, -lane.direction, direction)
+        contact = jnp.where(released, 0.0, contact)
     y_max, y_min = record.y_max, record.y_min
     if y_max is not None and y_min is not None and trial.position is not None:
         end = trial.position[1]
@@ -157,9 +189,18 @@ def _arrive(
         jnp.where(taken, s, lane.s),
         select(taken, state, lane.state),
         jnp.where(taken, direction, lane.direction),
-        Record(time, y_max, y_min, impacts, speed, loss, log, clearance),
+        None if contact is None else select(taken, contact, lane.contact),
+        Record(time, y_max, y_min, impacts, speed, loss, rests, log, clearance),
         taken & completed,
     )
+
+
+def _bound(plan: Plan, lane: Lane) -> Scalar:
+    """Where the interval ends, if `s` itself counts; otherwise nowhere."""
+    if not plan.ticks(lane.state):
+        return jnp.full_like(lane.s, jnp.inf)
+    cycle = jnp.asarray(plan.scene.cycle, lane.s.dtype)
+    return stop_gradient(cycle * (lane.part + 1) / plan.parts)
 
 
 @jax.custom_jvp

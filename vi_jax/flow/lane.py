@@ -15,8 +15,9 @@ from .methods import AbstractMethod
 
 Scalar = Float[Array, ""]
 
-# What the next step aims at: nothing, a turning point, the section, or 1 + i for stop number i.
-FREE, TURN, SECTION = 0.0, -1.0, -2.0
+# What the next step aims at: nothing, a turning point, the section, the release of a body at rest,
+# or 1 + i for stop number i.
+FREE, TURN, SECTION, RELEASE = 0.0, -1.0, -2.0, -3.0
 
 
 class Record(eqx.Module):
@@ -28,6 +29,8 @@ class Record(eqx.Module):
     impacts: Scalar
     speed: Scalar | None
     loss: Scalar | None
+    rests: Scalar | None
+    """Times the body came to rest on a stop."""
     log: Float[Array, "3 size"] | None
     """Clock, V⁻ and stop of each impact, NaN where there was none."""
     clearance: Scalar | None
@@ -41,6 +44,8 @@ class Lane(eqx.Module):
     record: Record
     direction: Scalar
     """Sign of the velocity since the last turn or impact."""
+    contact: Scalar | None
+    """1 + i while the body rests on stop number i, else 0; absent without stops."""
     length: Scalar
     """Length proposed for an ordinary step."""
     attempt: Scalar
@@ -78,6 +83,8 @@ class Plan(eqx.Module):
     motion: bool = eqx.field(static=True)
     """Whether extremes, durations and impact speeds are recorded."""
     log: int = eqx.field(static=True)
+    rests: bool = eqx.field(static=True)
+    """Whether the body may come to rest on a stop."""
     bound: int = eqx.field(static=True)
     """Steps that reverse mode must be able to store; 0 in forward mode."""
     # Numbers that are no part of the program, so that others are not another one.
@@ -126,6 +133,7 @@ class Plan(eqx.Module):
             impacts=zero,
             speed=zero if self.motion else None,
             loss=zero if self.motion else None,
+            rests=zero if self.motion and self.rests else None,
             log=jnp.full((3, self.log), jnp.nan, Y.dtype) if self.log else None,
             clearance=jnp.full_like(Y, jnp.inf) if self.motion and self.log else None,
         )
@@ -143,6 +151,12 @@ class Plan(eqx.Module):
         here = rates(scene.field, scene.position, zero, start)
         # At rest the acceleration says which way the motion goes.
         direction = jnp.where(here.v == 0, jnp.sign(here.a), jnp.sign(here.v))
+        contact = None
+        if self.rests:
+            contact = zero
+            for i, stop in enumerate(scene.stops):
+                rests = (stop.sign * Y >= stop.gap) & (here.v == 0) & (stop.sign * here.a > 0)
+                contact = jnp.where(rests, 1.0 + i, contact)
         length = zero + jax.lax.stop_gradient(scene.cycle) / self.method.steps_per_cycle
         if self.method.adaptive:
             length = length / 8
@@ -151,6 +165,7 @@ class Plan(eqx.Module):
             state=start,
             record=self.fresh(start),
             direction=jax.lax.stop_gradient(direction),
+            contact=contact,
             length=length,
             attempt=length,
             target=zero,

@@ -32,6 +32,11 @@ class AbstractMethod(eqx.Module):
         """Whether steps can be rejected and resized."""
         return False
 
+    @property
+    def uses_field(self) -> bool:
+        """Whether a step evaluates the scene's field, and so holds what the field holds."""
+        return True
+
     def check(self, scene: AbstractScene) -> None:
         """Raise a `ValueError` if this method cannot move `scene`."""
         return None

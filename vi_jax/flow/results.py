@@ -118,6 +118,9 @@ class Run(eqx.Module):
     """Number of impacts in each cycle."""
     impact_speed: Float[Array, " cycles"] | None
     """Greatest V⁻ in each cycle (unit: a ω), 0 without impact."""
+    rests: Int[Array, " cycles"] | None
+    """Times the body came to rest on a stop, its endless last impacts completed at once (they are
+    not among `impacts`)."""
     impact_energy: Float[Array, " cycles"] | None
     """Energy lost in impacts in each cycle, Σ ½(1 - k²)V⁻² (unit: m_C a²ω²)."""
     clearance: Float[Array, " cycles"] | None

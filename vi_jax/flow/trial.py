@@ -7,9 +7,11 @@ import jax.tree_util as jtu
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
+from ..scene import AbstractScene
 from .events import Rates, landing, rates
 from .fusion import pin, pin_flag
 from .lane import FREE, SECTION, TURN, Lane, Plan
+from .rest import Holding, release
 
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]
@@ -46,6 +48,10 @@ class Trial(NamedTuple):
     position: tuple[Rates, Rates] | None
     at_turn: Flag
     """It was aimed at a turning point and met it."""
+    holding: Any
+    """The scene as the step saw it: its body held where it rests."""
+    leaves: tuple[Flag, Flag, Scalar, Scalar] | None
+    """Whether and where a body at rest is released (see `rest.release`)."""
 
 
 def attempt(plan: Plan, lane: Lane, active: Flag) -> Trial:
@@ -64,11 +70,19 @@ def attempt(plan: Plan, lane: Lane, active: Flag) -> Trial:
     s1 = pin(s1, lane.one)
     h = s1 - lane.s
 
+    held: Any = None
+    holding: AbstractScene = scene
+    if lane.contact is not None:
+        held = lane.contact > 0
+        holding = Holding(scene=scene, held=held, stops=scene.stops)
     paced = plan.motion and scene.pace(lane.s, lane.state) is not None
     time = lane.record.time if paced else None
-    new, time, error = method.step(scene, lane.s, s1, lane.state, time, lane.one)
+    moved: Any = holding if method.uses_field else scene
+    new, time, error = method.step(moved, lane.s, s1, lane.state, time, lane.one)
     if not paced and lane.record.time is not None:
         time = lane.record.time + h
+    if held is not None and not method.uses_field:
+        new = jtu.tree_map(lambda a, b: jnp.where(held, a, b), lane.state, new)
     new = pin(new, lane.one)
     good = jnp.isfinite(sum(jtu.tree_leaves(new), jnp.zeros_like(h)))
     alive = scene.alive(new)
@@ -101,8 +115,13 @@ def attempt(plan: Plan, lane: Lane, active: Flag) -> Trial:
             rates(scene.field, clock, s1, new).scaled(1, bound),
         )
         crossings.append((SECTION, *ends, bound))
+    leaves = None
+    if position is not None and lane.contact is not None:
+        leaves = release(lane, scene.stops, *position, good, h)
     seen = tuple(_seen(lane, good, h, crossing, crossings) for crossing in crossings)
-    return Trial(s1, h, new, time, error, good, last, seen, position, at_turn)
+    return Trial(
+        s1, h, new, time, error, good, last, seen, position, at_turn, holding, leaves
+    )  # fmt: skip
 
 
 def _seen(lane: Lane, good: Flag, h: Scalar, crossing: tuple, all_of_them: list) -> Crossing:

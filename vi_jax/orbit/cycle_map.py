@@ -29,6 +29,8 @@ class CycleMap(eqx.Module):
     """In the phase clock; a `Scene` carries the section phase."""
     flow: AbstractMethod
     cycles: int = eqx.field(static=True)
+    rests: bool = eqx.field(static=True)
+    """Whether the body may come to rest on a stop."""
 
     def __call__(self, state: Any) -> Any:
         """The state `cycles` drive cycles after `state`."""
@@ -51,8 +53,9 @@ class CycleMap(eqx.Module):
 @by_columns
 def _end(cycle_map: CycleMap, state: Any) -> Any:
     run = simulate(
-        cycle_map.scene, state, cycle_map.cycles, method=cycle_map.flow, record="sections"
-    )
+        cycle_map.scene, state, cycle_map.cycles, method=cycle_map.flow, record="sections",
+        rests=cycle_map.rests,
+    )  # fmt: skip
     return jtu.tree_map(lambda x: x[-1], run.sections)
 
 
@@ -104,7 +107,7 @@ def cycle_map(
     carried: AbstractMethod = jtu.tree_map(
         lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, flow
     )
-    return CycleMap(scene, carried, count("cycles", cycles, least=1))
+    return CycleMap(scene, carried, count("cycles", cycles, least=1), scene.may_rest())
 
 
 def default_flow(scene: AbstractScene, otherwise: AbstractMethod) -> AbstractMethod:

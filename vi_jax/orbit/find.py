@@ -129,7 +129,7 @@ def _moved(the_map: CycleMap, guess: Any) -> tuple[CycleMap, Any, Int[Array, ""]
         return the_map, guess, jnp.zeros((), jnp.int32)
     run = simulate(
         scene, guess, the_map.cycles, method=the_map.flow, samples=_PLACES, impact_log=8,
-        record="sections",
+        record="sections", rests=the_map.rests,
     )  # fmt: skip
     assert run.samples is not None and run.impact_log is not None
     step = 2 * pi / _PLACES
@@ -165,7 +165,7 @@ def _root(arc: CycleMap, guess: Any, method: AbstractSearch) -> _Root:
     x, unravel = ravel_pytree(guess)
     arcs = x[None]
     if method.arcs > 1:
-        run = simulate(arc.scene, guess, arc.cycles * method.arcs, method=arc.flow)
+        run = simulate(arc.scene, guess, arc.cycles * method.arcs, method=arc.flow, rests=arc.rests)
         sections = jnp.stack(jtu.tree_leaves(run.sections), axis=-1)[: -1 : arc.cycles]
         arcs = jnp.where(jnp.isfinite(sections), sections, x)
     found = search(method, lambda arcs: _missing(arc, arcs, unravel), arcs)
@@ -229,7 +229,7 @@ def _follow(arc: CycleMap, state: Any, impact_log: int) -> _Seen:
         def states(x):
             run = simulate(
                 arc.scene, unravel(x), arc.cycles, method=arc.flow, samples=_PLACES,
-                record="sections",
+                record="sections", rests=arc.rests,
             )  # fmt: skip
             assert run.samples is not None
             states = jnp.stack(jtu.tree_leaves(run.samples.state), axis=-1)[1:]
@@ -238,7 +238,9 @@ def _follow(arc: CycleMap, state: Any, impact_log: int) -> _Seen:
 
         # Apart from the motion: a program with second derivatives should hold no more than it must.
         jacobians, places = jax.jacfwd(states, has_aux=True)(x)
-        run = simulate(arc.scene, state, arc.cycles, method=arc.flow, impact_log=impact_log)
+        run = simulate(
+            arc.scene, state, arc.cycles, method=arc.flow, impact_log=impact_log, rests=arc.rests
+        )
         log = run.impact_log
         assert log is not None and run.y_min is not None and run.y_max is not None
         assert run.clearance is not None and run.duration is not None

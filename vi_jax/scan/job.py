@@ -1,5 +1,6 @@
 """What a scan computes of its lanes: a pytree that is compiled once and can be sent away."""
 
+import dataclasses
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -48,6 +49,8 @@ class Job(eqx.Module):
     max_impacts: int = eqx.field(static=True)
     max_steps: int | None = eqx.field(static=True)
     places: int = eqx.field(static=True)
+    rests: bool = eqx.field(static=True, default=True)
+    """Whether the body may come to rest on a stop."""
 
     def lane(self, values: dict[str, Any], nudge: Any = None) -> tuple[AbstractScene, Any]:
         """Scene and start of the lane with these values on the axes."""
@@ -107,7 +110,7 @@ class Job(eqx.Module):
         run = simulate_pool(
             lane_of, values, self.cycles,
             wanted=wanted, places=self.places, method=self.method, settle=self.settle,
-            max_impacts=self.max_impacts, max_steps=self.max_steps,
+            max_impacts=self.max_impacts, max_steps=self.max_steps, rests=self.rests,
         )  # fmt: skip
 
         def measured(values, run):
@@ -230,15 +233,21 @@ def _check_name(scene: AbstractScene, start: Any, name: str, argument: str) -> N
     check_name(names, name, argument)
 
 
-def check_corners(job: Job, blocks: Blocks) -> None:
-    """Run the checks of scene, start and method on the corners of the grid, before any work."""
+def check_corners(job: Job, blocks: Blocks) -> Job:
+    """The job, after the checks of scene, start and method on the corners of the grid.
+
+    What the corners say about the gaps holds for the grid: if no body can rest, that is left out.
+    """
+    rests = False
     corners: Any = [np.unique([x.min(), x.max()]) for x in blocks.axes.values()]
     for values in np.stack(np.meshgrid(*corners, indexing="ij"), axis=-1).reshape(-1, len(corners)):
         lane = {name: jnp.asarray(x) for name, x in zip(blocks.axes, values, strict=True)}
         scene, start = job.lane(lane)
         check_again(scene)
+        rests = rests or job.build is not None or scene.may_rest()
         for name in job.derivatives:
             _check_name(scene, start, name, "derivatives")
         job.method.check(scene)
         if isinstance(scene, Scene):
             scene.adopt(start)
+    return dataclasses.replace(job, rests=rests)

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._checks import count
 from ..flow import RESULTS, AbstractMethod, FixedStep, simulate
-from ..orbit.cycle_map import adopted, cycle_map, default_flow
+from ..orbit.cycle_map import CycleMap, adopted, cycle_map, default_flow
 from ..scene import AbstractScene, MotorState, TimedMotorState
 
 
@@ -86,16 +86,17 @@ def lyapunov(
             f"Argument `number` must be at most {states}, the states of this scene, but got "
             f"{number}."
         )
-    return _lyapunov(carried.scene, carried.flow, start, cycles, settle, number)
+    return _lyapunov(carried, start, cycles, settle, number)
 
 
 @eqx.filter_jit
-def _lyapunov(scene, flow, start, cycles: int, settle, number: int) -> Lyapunov:
-    before = simulate(scene, start, 1, settle=settle, method=flow)
+def _lyapunov(the_map: CycleMap, start, cycles: int, settle, number: int) -> Lyapunov:
+    scene, flow, rests = the_map.scene, the_map.flow, the_map.rests
+    before = simulate(scene, start, 1, settle=settle, method=flow, rests=rests)
     x, unravel = ravel_pytree(jtu.tree_map(lambda x: x[-1], before.sections))
 
     def image(x):
-        run = simulate(scene, unravel(x), 1, method=flow)
+        run = simulate(scene, unravel(x), 1, method=flow, rests=rests)
         assert run.duration is not None
         out, _ = ravel_pytree(jtu.tree_map(lambda x: x[-1], run.sections))
         return out, (run.duration[0], run.result)

@@ -122,7 +122,7 @@ def scan(
     if jax.default_backend() != "cpu":
         job = dataclasses.replace(job, places=lanes // devices)
     blocks = Blocks(grid, lanes, paired=paired)
-    check_corners(job, blocks)
+    job = check_corners(job, blocks)
     variables = variables_of(job, blocks)
     attributes = _attributes(job, blocks)
     if store is not None:

@@ -89,9 +89,12 @@ def sweep(
             "Argument `values` must be finite numbers in one row, but has shape "
             f"{values.shape}{'' if values.ndim != 1 else ' and numbers that are not finite'}."
         )
+    rests = True
     if numbers is not None:
-        for value in {numbers.min(), numbers.max()}:
-            check_again(with_leaf(scene, parameter, value))
+        ends = [with_leaf(scene, parameter, value) for value in {numbers.min(), numbers.max()}]
+        for end in ends:
+            check_again(end)
+        rests = any(end.may_rest() for end in ends)
     if start is None:
         if not isinstance(scene, Scene):
             raise ValueError("Argument `start` must be given for a scene of your own.")
@@ -106,14 +109,20 @@ def sweep(
     if isinstance(scene, Scene):
         start = scene.adopt(start)
     start = jtu.tree_map(lambda x: jnp.asarray(x, values.dtype), start)
-    return _sweep(scene, parameter, values, start, settle, cycles, method, tolerance, max_steps)
+    return _sweep(
+        scene, parameter, values, start, settle, cycles, method, rests, tolerance, max_steps
+    )
 
 
 @eqx.filter_jit
-def _sweep(scene, parameter, values, start, settle, cycles, method, tolerance, max_steps) -> Sweep:
+def _sweep(
+    scene, parameter, values, start, settle, cycles, method, rests, tolerance, max_steps
+) -> Sweep:
     def one(state, value):
         here = with_leaf(scene, parameter, value)
-        run = simulate(here, state, cycles, settle=settle, method=method, max_steps=max_steps)
+        run = simulate(
+            here, state, cycles, settle=settle, method=method, rests=rests, max_steps=max_steps
+        )
         sections = jtu.tree_map(lambda x: x[1:], run.sections)
         last = jtu.tree_map(lambda x: x[-1], sections)
         state = jtu.tree_map(lambda a, b: jnp.where(run.successful, a, b), last, state)

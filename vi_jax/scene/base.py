@@ -70,6 +70,10 @@ class AbstractScene(eqx.Module):
         """The longest step that holds at most one extremum of the motion; at most `cycle`/5."""
         return self.cycle / 5
 
+    def may_rest(self) -> bool:
+        """Whether the body can come to rest on a stop, as far as is known; static."""
+        return bool(self.stops)
+
     def alive(self, state: State) -> jax.Array | None:
         """False where the clock of this scene breaks down; `None` where it cannot."""
         return None

@@ -250,6 +250,11 @@ class Scene(AbstractScene):
             return 0.4 * pi * speed / jnp.maximum(jnp.maximum(1.0, speed), 0.4 * pi / 3 * pull)
         return 0.4 * pi / jnp.maximum(jnp.maximum(1.0, speed), 0.4 * pi / 3 * pull)
 
+    def may_rest(self) -> bool:
+        """Not if all gaps are known and beyond the crank's reach, so that nothing presses on."""
+        gaps = [concrete(stop.gap) for stop in self.stops]
+        return any(gap is None or not (gap > 1).all() for gap in gaps)
+
     def alive(self, state: Any) -> jax.Array | None:
         """In the phase clock of a motor the crank must turn forward."""
         return state.W > 0 if isinstance(state, MotorState) else None

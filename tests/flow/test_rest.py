@@ -1,0 +1,210 @@
+"""Coming to rest on a stop, staying there, leaving: beside closed forms."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+from scipy.optimize import brentq
+
+METHODS = [vi.ExactFlight(), vi.Adaptive(rtol=1e-11), vi.FixedStep(steps_per_cycle=64)]
+IDS = ["exact", "adaptive", "fixed"]
+GAP, K, ZETA, XI = 0.3, 0.4, 0.3, 0.05
+
+
+def scene(zeta=ZETA, k=K, gap=GAP, xi=XI):
+    return vi.Scene.ideal(frequency_ratio=zeta, restitution=k, gap=gap, damping_ratio=xi)
+
+
+class Ball(eqx.Module):
+    """Height Y, velocity V, and when the ball came to rest: T grows while it has not."""
+
+    Y: jax.Array
+    V: jax.Array
+    T: jax.Array
+
+
+class Ground(vi.AbstractScene):
+    """A ball on the ground, and a clock that goes as the square of its speed changes."""
+
+    gravity: jax.Array
+    stops: tuple[vi.RigidStop, ...]
+
+    @property
+    def cycle(self):
+        return 10.0
+
+    def field(self, s, state):
+        return Ball(state.V, -self.gravity, jnp.where(state.Y > 0, 1.0, 0.0))
+
+
+@pytest.mark.parametrize("k", [0.0, 0.3, 0.8])
+def test_a_bouncing_ball_rests_after_the_time_of_the_series(k):
+    # From height h: the fall, then flights of 2 kⁿ times it; in all t (1 + k)/(1 - k).
+    def run(height, samples):
+        ground = Ground(jnp.asarray(2.0), (vi.RigidStop(0.0, k, "left"),))
+        start = Ball(*map(jnp.asarray, (height, 0.0, 0.0)))
+        return vi.simulate(
+            ground, start, 1, method=vi.Adaptive(rtol=1e-12), samples=samples, impact_log=80
+        )
+
+    height = 0.5
+    found = run(height, 1)
+    log = found.impact_log
+    times = np.asarray(log.phase[0])[np.asarray(log.stop[0]) >= 0]
+    fall = np.sqrt(2 * height / 2.0)
+    end = fall * (1 + k) / (1 - k)
+    # What is left after the last impact is of the order of its own flight.
+    last = 2 * fall * k ** len(times)
+    assert times[-1] + last / (1 - k) == pytest.approx(end, abs=1e-9)
+    assert bool(found.successful) and int(found.rests[0]) == 1
+    assert len(times) <= 2 + np.log(1e-6) / np.log(max(k, 1e-6))
+    assert float(found.sections.Y[-1]) == float(found.sections.V[-1]) == 0.0
+
+
+@pytest.mark.parametrize("method", METHODS, ids=IDS)
+def test_release_when_the_crank_no_longer_presses(method):
+    # U = cos φ > d presses the body on; it leaves at φ = arccos d, and moves from there as the
+    # linear oscillator does from rest.
+    body = scene()
+    run = vi.simulate(body, body.start(Y=0.1), 3, method=method, samples=200)
+    assert bool(run.successful) and np.asarray(run.rests).tolist() == [2, 1, 1]
+    Y = np.asarray(run.samples.state.Y)[400:]
+    angle = 2 * np.pi * np.arange(201) / 200
+    release = np.arccos(GAP)
+    held = angle < release
+    assert (Y[held] == GAP).all()
+
+    def free(angle):
+        """Y at `angle` after a release from rest, by SciPy's matrix exponential."""
+        from scipy.linalg import expm
+
+        A = np.zeros((4, 4))
+        A[0, 1], A[1, 0], A[1, 1], A[1, 2] = 1, -1, -2 * XI, 1
+        A[2, 3], A[3, 2] = -ZETA, ZETA
+        begin = np.array([GAP, 0.0, np.cos(release), np.sin(release)])
+        return (expm(A * (angle - release) / ZETA) @ begin)[0]
+
+    flight = (angle > release) & (angle < release + 1.2)
+    truth = np.array([free(a) for a in angle[flight]])
+    np.testing.assert_allclose(Y[flight], truth, atol=1e-9)
+
+
+def test_every_method_and_both_clocks_agree():
+    body = scene(k=0.6)
+    runs = [vi.simulate(body, body.start(Y=0.1), 4, method=m) for m in METHODS]
+    runs.append(vi.simulate(body, body.start(Y=0.1), 4, method=METHODS[0], clock="time"))
+    for run in runs[1:]:
+        np.testing.assert_array_equal(run.impacts, runs[0].impacts)
+        np.testing.assert_array_equal(run.rests, runs[0].rests)
+        np.testing.assert_allclose(run.y_min, runs[0].y_min, atol=1e-8)
+        np.testing.assert_allclose(run.impact_speed, runs[0].impact_speed, atol=1e-8)
+
+
+def test_impacts_shrink_by_k_and_are_few():
+    body = scene()
+    run = vi.simulate(body, body.start(), 3, method=vi.ExactFlight(), impact_log=40)
+    speed = np.asarray(run.impact_log.speed[2])
+    speed = speed[np.isfinite(speed)]
+    np.testing.assert_allclose(speed[-4:] / speed[-5:-1], K, rtol=1e-3)
+    assert len(speed) < 20
+
+
+def test_a_motion_through_rest_forgets_its_start():
+    body = scene()
+    orbit = vi.find_orbit(body, body.start(Y=0.1), impact_log=20)
+    assert bool(orbit.successful) and bool(orbit.stable)
+    np.testing.assert_allclose(np.abs(orbit.multipliers), 0.0, atol=1e-12)
+    assert float(orbit.state.Y) == GAP and float(orbit.state.V) == 0.0
+
+
+@pytest.mark.parametrize("adjoint", ["forward", "reverse"])
+def test_derivatives_pass_through_rest(adjoint):
+    def lowest(zeta):
+        body = scene(zeta)
+        run = vi.simulate(
+            body, body.start(Y=0.1), 2, method=vi.ExactFlight(), adjoint=adjoint, max_steps=2000
+        )
+        return run.y_min[1]
+
+    slope = (jax.jacfwd if adjoint == "forward" else jax.grad)(lowest)(ZETA)
+    h = 1e-6
+    difference = (lowest(ZETA + h) - lowest(ZETA - h)) / (2 * h)
+    assert float(slope) == pytest.approx(float(difference), rel=1e-6)
+
+
+def test_starts_on_the_stop():
+    body = scene(gap=0.5)
+    # Pressed on at φ = 0 it stays; with the slightest velocity inwards it does not.
+    for V, rest in ((0.0, True), (-0.3, False), (0.2, False)):
+        run = vi.simulate(body, body.start(Y=0.5, V=V), 1, method=vi.ExactFlight(), samples=64)
+        assert bool(run.successful)
+        assert (float(run.samples.state.Y[1]) == 0.5) == rest
+    # With the stop beyond the crank's reach nothing presses on, and a start at rest leaves.
+    wide = scene(gap=1.5)
+    run = vi.simulate(wide, wide.start(Y=1.5), 1, method=vi.ExactFlight(), samples=64)
+    assert run.rests is None and float(run.samples.state.Y[1]) < 1.5
+
+
+def test_k_of_zero_sticks_at_the_first_impact():
+    body = scene(k=0.0)
+    run = vi.simulate(body, body.start(), 3, method=vi.ExactFlight(), samples=100)
+    # It may be driven away once before it is pressed on.
+    assert (np.asarray(run.rests) >= 1).all() and (np.asarray(run.impacts) <= 4).all()
+    assert float(run.samples.state.Y[200]) == GAP and float(run.samples.state.V[200]) == 0.0
+
+
+def test_a_motor_turns_on_while_the_body_rests():
+    # The shaft at rest contact feels a spring whose end is held: energy is kept without a motor.
+    table = vi.Parameters(torque=0.0, kappa=0.5, restitution=0.3, gap=0.3 * 0.04, damping=0.0)
+    motor = table.scene()
+    start = motor.start(Y=0.3, V=0.0, W=1.2)
+    run = vi.simulate(motor, start, 1, method=vi.Adaptive(rtol=1e-12), samples=400)
+    Y, W = np.asarray(run.samples.state.Y), np.asarray(run.samples.state.W)
+    held = np.arange(401) < 400 * np.arccos(0.3) / (2 * np.pi)
+    held &= np.cumprod(Y == Y[0]).astype(bool)
+    assert held.sum() > 20
+    phase = 2 * np.pi * np.arange(401) / 400
+    drive = motor.drive
+    inertia = 1 + drive.slider_inertia * np.sin(phase) ** 2
+    energy = 0.5 * inertia * W**2 + 0.5 * drive.coupling * (Y - np.cos(phase)) ** 2
+    np.testing.assert_allclose(np.asarray(energy)[held], float(energy[0]), rtol=1e-10)
+
+
+def test_two_stops_and_many_lanes():
+    stops = (vi.RigidStop(0.2, 0.3), vi.RigidStop(0.3, 0.5, "left"))
+    base = scene()
+    body = eqx.tree_at(lambda s: s.stops, base, stops, is_leaf=lambda x: isinstance(x, tuple))
+    zetas = jnp.linspace(0.1, 2.0, 64)
+
+    def lane(zeta):
+        here = eqx.tree_at(lambda s: s.drive.frequency_ratio, body, zeta)
+        run = vi.simulate(here, here.start(), 20, method=vi.ExactFlight())
+        return run.successful, run.y_min, run.y_max, run.rests
+
+    good, low, high, rests = jax.vmap(lane)(zetas)
+    assert bool(good.all())
+    assert float(low.min()) >= -0.3 - 1e-12 and float(high.max()) <= 0.2 + 1e-12
+    alone = [lane(zeta)[3] for zeta in zetas[::16]]
+    np.testing.assert_array_equal(rests[::16], jnp.stack(alone))
+
+
+def test_release_phase_to_nine_digits():
+    # V⁻ of the first impact after a release depends on nothing but the release.
+    body = scene()
+    run = vi.simulate(body, body.start(), 4, method=vi.ExactFlight(), impact_log=20)
+    first = np.asarray(run.impact_log.phase[3][0])
+    release = np.arccos(GAP)
+
+    def height(angle):
+        from scipy.linalg import expm
+
+        A = np.zeros((4, 4))
+        A[0, 1], A[1, 0], A[1, 1], A[1, 2] = 1, -1, -2 * XI, 1
+        A[2, 3], A[3, 2] = -ZETA, ZETA
+        begin = np.array([GAP, 0.0, np.cos(release), np.sin(release)])
+        return (expm(A * (angle - release) / ZETA) @ begin)[0] - GAP
+
+    truth = brentq(height, first - 0.3, first + 0.1, xtol=1e-13)
+    assert first == pytest.approx(truth, abs=1e-9)

@@ -1,0 +1,95 @@
+"""A body at rest on a stop: how it comes there, stays there, and leaves.
+
+With small impact speeds and a force that presses the body on, impacts follow each other ever
+faster, their speeds a geometric series in k, and end in rest after a finite time (chatter). The
+series is completed at once where what is left of it is brief. The body is held while it is pressed
+on, and leaves when its acceleration changes sign. The drive goes on turning, with the reaction of
+a spring whose end is held.
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax.lax import stop_gradient
+from jaxtyping import Array, Bool, Float
+
+from ..scene import AbstractScene, RigidStop
+from .events import Rates
+from .fusion import pin, pin_flag
+from .lane import RELEASE, Lane
+
+Scalar = Float[Array, ""]
+Flag = Bool[Array, ""]
+
+# A release is approached by steps taken from the pressed side, each this much short of where the
+# last one says that it is, until one is so short that the force is straight over it.
+_SHORT, _STRAIGHT = 1e-3, 1e-5
+
+
+class Holding(AbstractScene):
+    """A scene whose body is held where `held` says so: all that a step asks of a scene."""
+
+    scene: AbstractScene
+    held: Flag
+
+    stops: tuple[RigidStop, ...]
+
+    @property
+    def cycle(self):
+        """That of the scene."""
+        return self.scene.cycle
+
+    def field(self, s: Scalar, state: Any) -> Any:
+        """d(state)/ds, without motion of a body that is held."""
+        free = self.scene.field(s, state)
+        zero = jnp.zeros_like(s)
+        still = self.scene.placed(free, zero, zero)
+        return jtu.tree_map(lambda a, b: jnp.where(self.held, a, b), still, free)
+
+    def pace(self, s: Scalar, state: Any) -> Scalar | None:
+        """That of the scene."""
+        return self.scene.pace(s, state)
+
+
+def brief(scene: AbstractScene, like: Scalar) -> Scalar:
+    """How much of a chatter may be left when it is completed: its error is of second order."""
+    share = 1.6e-6 if like.dtype == jnp.float64 else 1.6e-4
+    return stop_gradient(share * jnp.asarray(scene.cycle, like.dtype))
+
+
+def remaining(restitution: Scalar, approach: Scalar, pressing: Scalar) -> Scalar:
+    """Time (in s) from an impact to rest: Σ 2 kⁿ V⁻ / a = 2 k V⁻ / (a (1 - k)).
+
+    **Arguments:** k; speed of approach and acceleration towards the stop, by s. Infinite where the
+    body is not pressed on, or loses nothing.
+    """
+    force = pressing * (1 - restitution)
+    ends = force > 0
+    return jnp.where(ends, 2 * restitution * approach / jnp.where(ends, force, 1.0), jnp.inf)
+
+
+def release(
+    lane: Lane, stops: tuple, begin: Rates, end: Rates, good: Flag, h: Scalar
+) -> tuple[Flag, Flag, Scalar, Scalar]:
+    """Whether a held body left within the step, whether the step landed on that, where to end the
+    next step, and the offset from the step's end.
+
+    The force is the acceleration that a free body would have there.
+    """
+    assert lane.contact is not None
+    sign = jnp.zeros_like(h)
+    for i, stop in enumerate(stops):
+        sign = jnp.where(lane.contact == 1.0 + i, float(stop.sign), sign)
+    before, after = pin((-sign * begin.a, -sign * end.a), lane.one)
+    rise = stop_gradient(after - before)
+    held = good & (sign != 0)
+    rising = held & (rise > 0)
+    offset = -after * h / jnp.where(rising, rise, 1.0)
+    close = jnp.abs(stop_gradient(offset)) <= 1e-9 if h.dtype == jnp.float64 else 1e-5
+    landed = rising & (lane.target == RELEASE) & (h <= 2 * _STRAIGHT) & close
+    left = rising & (after > 0) & ~landed
+    place = stop_gradient(h + offset)
+    place = jnp.where(h > _STRAIGHT, (1 - _SHORT) * place, place)
+    landed = pin_flag(landed, lane.one)
+    return pin_flag(left, lane.one), landed, place, jnp.where(landed, offset, 0.0)
