@@ -428,6 +428,7 @@ def test_basins(here, capsys):
     assert {row["start.Y"] for row in table} == {"0.55", "1.55", "2.55", "3.55"}
 
 
+@pytest.mark.slow
 def test_orbit_and_its_branch(here, capsys):
     text = """[orbit]
     guess = { Y = 1.9, V = 1.54 }

@@ -91,6 +91,7 @@ def test_motor_control_by_central_differences(clock):
     np.testing.assert_allclose(found, difference, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "method", [vi.ExactFlight(), vi.Adaptive(rtol=1e-12)], ids=["ExactFlight", "Adaptive"]
 )

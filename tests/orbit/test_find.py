@@ -124,7 +124,14 @@ def quantity(x, name):
     }[name]
 
 
-@pytest.mark.parametrize("name", ["y_min", "V⁻", "largest multiplier"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("y_min", marks=pytest.mark.slow),
+        pytest.param("V⁻", marks=pytest.mark.slow),
+        "largest multiplier",
+    ],
+)
 def test_gradients_by_the_implicit_function_theorem(name):
     x, h = jnp.array([0.9, 0.5, 0.01, 2.0]), 1e-5
     value = jax.jit(lambda x: quantity(x, name))
@@ -158,6 +165,7 @@ def test_damping_at_which_the_2pi_motion_becomes_stable():
     assert float(closed.multipliers[0].real.min()) == pytest.approx(-1, abs=1e-10)
 
 
+@pytest.mark.slow
 def test_multiple_shooting_where_one_arc_cannot():
     """200 cycles of the unstable 2π motion amplify rounding by 1.166^200 = 2e13."""
     closed = vi.closed_form_orbits(UNDAMPED)
@@ -237,6 +245,7 @@ def test_motor_orbits_are_where_long_simulation_settles(restitution):
         )
 
 
+@pytest.mark.slow
 def test_a_strong_motor_approaches_the_ideal_drive_at_first_order():
     ideal = vi.Parameters(restitution=0.8, gap=0.08).scene(drive="ideal")
     ideal = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.8, damping_ratio=ideal.damping_ratio)

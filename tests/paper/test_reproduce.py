@@ -111,6 +111,7 @@ def test_damping_at_the_period_doubling(faults):
     assert faults[6].numbers["largest_multiplier_by_c"]["0"] > 1
 
 
+@pytest.mark.slow
 def test_reproduce_writes_figures_and_reports(tmp_path):
     steps = []
     found = reproduce(tmp_path / "a" / "b", quick=True, progress=steps.append)

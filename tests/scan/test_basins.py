@@ -40,6 +40,7 @@ def test_starts_belong_where_they_end(found):
             assert int(np.argmin(distance)) == label and min(distance) < 1e-3
 
 
+@pytest.mark.slow
 def test_fractions_add_up_and_random_starts_agree(found):
     total = sum(a.fraction for a in found.attractors) + sum(found.irregular.values())
     assert total == pytest.approx(1.0)

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 
-def save_picture(figure: Figure, path: str | Path, *, dpi: int = 110, colors: int = 64) -> Path:
+def save_picture(figure: Figure, path: str | Path, *, dpi: int = 110, colors: int = 200) -> Path:
     """Write a figure as a PNG of few colours, which is small and loses nothing in line drawings.
 
     The file appears whole, or not at all if interrupted before. Returns the path.

@@ -125,6 +125,9 @@ def basins(
     """
     if not isinstance(scene, AbstractScene):
         raise TypeError(f"Argument `scene` must be a `Scene`, but got {scene!r}.")
+    for name in ("measure", "paired", "cycles", "derivatives"):
+        if name in options:
+            raise TypeError(f"Argument `{name}` is `scan`'s, and not to be given to `basins`.")
     ranges = axes_of(region, "region")
     for name, row in ranges.items():
         if row.size != 2 or not row[0] < row[1] or not name.startswith(START):
@@ -165,8 +168,11 @@ def basins(
 
     def followed(state: np.ndarray, cycles: int) -> np.ndarray:
         parts = dict(zip(names, map(jnp.asarray, state), strict=True))
-        run = simulate(scene, dataclasses.replace(start, **parts), cycles, method=method)
-        return np.stack([np.asarray(x)[1:] for x in vars(run.sections).values()], axis=1)
+        # Always as many cycles, so that another period is not another program.
+        run = simulate(scene, dataclasses.replace(start, **parts), longest, method=method)
+        return np.stack(
+            [np.asarray(x)[1 : cycles + 1] for x in vars(run.sections).values()], axis=1
+        )
 
     label, motions = _sorted_out(period, states, apart, followed)
     attractors = []

@@ -57,8 +57,9 @@ def lyapunov(
     Tangent vectors are carried through the flow and its impacts (the saltation matrix) and made
     orthogonal after each drive cycle (Benettin's method). Rates are averaged with weights that
     vanish smoothly at both ends (Das, Saiki, Sander and Yorke 2017), which on periodic and
-    quasi-periodic motions converges faster than any power of the number of cycles. The exponent 0
-    along the motion itself is not among them. Clean under `jit` and `vmap`.
+    quasi-periodic motions converges faster than any power of the number of cycles, once these are
+    some tens of the motion's periods. The exponent 0 along the motion itself is not among them. A
+    motion that rests on a stop forgets its past at once: -∞. Clean under `jit` and `vmap`.
 
     **Arguments:**
 

@@ -1,0 +1,223 @@
+# %% [markdown]
+# # Basins of coexisting motions
+#
+# Where several motions are stable at one parameter point, the start decides. `vi.basins` simulates
+# a grid of starts, finds the motions on the way and labels each start. Three scenes (ideal drive):
+# the lightly damped one of `all_orbits.py`, one in which motions of 2π and 6π share the starts, and
+# Table 1's machine above resonance, where the body may also swing free of the stop.
+#
+# The fractions of the grid are held against those of random starts with their standard error, the
+# random starts' labels against `vi.FixedStep`, and the stability of each motion against its
+# Lyapunov exponents.
+#
+# Run with `python experiments/basins_map.py` (`--quick` for coarse grids and few cycles).
+
+# %%
+import os
+import sys
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+import vi_jax as vi
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+jax.config.update("jax_enable_x64", True)
+
+HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments")
+QUICK = "--quick" in sys.argv
+BEGIN = time.perf_counter()
+# One size of block for all calls: one program. Impacts lie near φ = 0; look half a turn later.
+LANES, WORKERS, SECTION = (256, 2, np.pi) if QUICK else (4096, 2, np.pi)
+SAMPLES, AGAIN = (400, 100) if QUICK else (8192, 1000)
+# A whole number of periods of every motion found here.
+WATCHED = 600
+
+
+def say(text: object) -> None:
+    print(f"[{time.perf_counter() - BEGIN:5.1f} s] {text}", flush=True)
+
+
+class Case(NamedTuple):
+    title: str
+    zeta: float
+    k: float
+    gap: float
+    xi: float
+    region: dict[str, tuple[float, float]]
+    side: int
+    settle: int
+
+
+def region(low: float, gap: float, speed: float) -> dict[str, tuple[float, float]]:
+    return {"start.Y": (low, gap), "start.V": (-speed, speed)}
+
+
+TABLE_XI = float(vi.Parameters().scene(drive="ideal").damping_ratio)
+CASES = [
+    Case("ζ = 3.2, k = 0.9, d = 1.05, ξ = 0.002", 3.2, 0.9, 1.05, 0.002, region(-3.5, 1.05, 4.0),
+         160, 3000),
+    Case("ζ = 1.1, k = 0.85, d = 2, ξ = 0.005", 1.1, 0.85, 2.0, 0.005, region(-6.0, 2.0, 6.0),
+         256, 800),
+    Case("ζ = 1.4, k = 0.8, d = 2, Table 1's ξ = 0.0448", 1.4, 0.8, 2.0, TABLE_XI,
+         region(-6.0, 2.0, 6.0), 256, 400),
+]  # fmt: skip
+if QUICK:
+    CASES = [case._replace(side=32, settle=400) for case in CASES]
+
+
+def scene_of(case: Case) -> vi.Scene:
+    scene = vi.Scene.ideal(
+        frequency_ratio=case.zeta, restitution=case.k, gap=case.gap, damping_ratio=case.xi
+    )
+    return scene.at_section(SECTION)
+
+
+# %% [markdown]
+# ## Grid, random starts, another method
+
+
+# %%
+def matched(one: vi.Basins, other: vi.Basins) -> dict[int, int]:
+    """Labels of the motions of `one` by those of `other`."""
+    pairs = {}
+    for a in one.attractors:
+        here = np.array([a.sections["Y"][0], a.sections["V"][0]])
+        for b in other.attractors:
+            points = np.stack([b.sections["Y"], b.sections["V"]], axis=1)
+            if a.period == b.period and np.abs(points - here).max(axis=1).min() < 1e-2:
+                pairs[b.label] = a.label
+    return pairs
+
+
+class Found(NamedTuple):
+    case: Case
+    grid: vi.Basins
+    wall: float
+    cpu: float
+    random: vi.Basins
+    other: int
+    """Labels that `FixedStep` changed."""
+    multipliers: list[float]
+    """Sizes of the greatest multipliers over the period."""
+
+
+everything: list[Found] = []
+for case in CASES:
+    scene = scene_of(case)
+    options = {"settle": case.settle, "workers": WORKERS, "progress": False}
+    if not everything:  # so that the clock below does not count compiling
+        vi.basins(scene, case.region, resolution=4, lanes=LANES, **{**options, "settle": 10})
+    begin = os.times()
+    grid = vi.basins(scene, case.region, resolution=case.side, lanes=LANES, **options)
+    end = os.times()
+    wall, cpu = end.elapsed - begin.elapsed, sum(end[:2]) - sum(begin[:2])
+    say(f"{case.title}: {wall:.1f} s, {cpu:.1f} s of CPU time\n{grid}")
+    random = vi.basins(scene, case.region, samples=SAMPLES, seed=1, lanes=LANES, **options)
+    few = {"samples": AGAIN, "seed": 2, "lanes": 512}
+    one = vi.basins(scene, case.region, **few, **options)
+    two = vi.basins(scene, case.region, **few, method=vi.FixedStep(), **options)
+    names = {**matched(one, two), -1: -1, -2: -2, -3: -3}
+    labels = np.array([names.get(int(x), -9) for x in two.data["label"].values])
+    other = int(np.sum(labels != one.data["label"].values))
+    sizes = []
+    for a in grid.attractors:
+        start = scene.start(Y=a.sections["Y"][0], V=a.sections["V"][0])
+        seen = vi.lyapunov(scene, start, WATCHED, settle=0, method=vi.ExactFlight())
+        sizes.append(float(np.exp(a.period * seen.per_cycle[0])))
+    everything.append(Found(case, grid, wall, cpu, random, other, sizes))
+    say(f"random starts and FixedStep: {other} of {AGAIN} labels differ")
+
+# %% [markdown]
+# ## The picture
+
+# %%
+figure = Figure(figsize=(15.5, 5.8), layout="constrained")
+FigureCanvasAgg(figure)
+for ax, found in zip(figure.subplots(1, 3), everything, strict=True):
+    vi.plot_basins(found.grid, ax=ax)
+    handles = ax.get_legend().legend_handles
+    ax.legend(
+        handles=[h for h in handles if h is not None], loc="upper center", ncols=2,
+        bbox_to_anchor=(0.5, -0.12), frameon=False, fontsize=10,
+    )  # fmt: skip
+    ax.set(title=found.case.title, xlabel="Y at the start (φ = π), a")
+    ax.set_ylabel("V at the start, a ω")
+figure.suptitle("Which start settles on which motion; circles: the motions' section points")
+if not QUICK:
+    (HERE / "figures").mkdir(exist_ok=True)
+    vi.save_picture(figure, HERE / "figures" / "basins_map.png", dpi=85)
+
+# %% [markdown]
+# ## The table
+
+# %%
+lines = [
+    "# Basins of coexisting motions",
+    "",
+    "Ideal drive, section at φ = π. *Grid* and *random* are parts of all starts (grid: cell",
+    f"centres; random: {SAMPLES:,} starts with standard error); *off* is their difference in",
+    "standard errors of both together; *multiplier* the size of the greatest one over the period,",
+    f"from Lyapunov exponents over {WATCHED} cycles.",
+    "",
+    "| scene | period | impacts | section (Y, V) | grid, % | random, % | off | multiplier |",
+    "|---|---|---|---|---|---|---|---|",
+]
+times = []
+for found in everything:
+    size = found.case.side**2
+    pairs = {mine: theirs for theirs, mine in matched(found.grid, found.random).items()}
+    rows = []
+    for a, multiplier in zip(found.grid.attractors, found.multipliers, strict=True):
+        twin = found.random.attractors[pairs[a.label]] if a.label in pairs else None
+        there = twin.fraction if twin else 0.0
+        where = f"({a.sections['Y'][0]:.5f}, {a.sections['V'][0]:.5f})"
+        rows.append((f"{2 * a.period}π", f"{a.impacts:g}", where, a.fraction, there, multiplier))
+    for name, part in found.grid.irregular.items():
+        if part or found.random.irregular[name]:
+            rows.append((name, "–", "–", part, found.random.irregular[name], None))
+    for i, (period, impacts, where, here, there, multiplier) in enumerate(rows):
+        p = (here * size + there * SAMPLES) / (size + SAMPLES)
+        error = (there * (1 - there) / SAMPLES) ** 0.5
+        both = (p * (1 - p) * (1 / size + 1 / SAMPLES)) ** 0.5
+        off = f"{(here - there) / both:+.1f}" if both else "–"
+        told = "–" if multiplier is None else f"{multiplier:.4f}"
+        lines.append(
+            f"| {found.case.title if i == 0 else ''} | {period} | {impacts} | {where} "
+            f"| {100 * here:.2f} | {100 * there:.2f} ± {100 * error:.2f} | {off} | {told} |"
+        )
+    times.append(
+        f"| {found.case.title} | {found.case.side}² × {found.case.settle + 128:,} "
+        f"| {found.wall:.1f} | {found.cpu:.1f} | {found.other} of {AGAIN:,} |"
+    )
+lines += [
+    "",
+    "| scene | starts × cycles | wall, s | CPU, s | labels that `FixedStep` changes |",
+    "|---|---|---|---|---|",
+    *times,
+]
+lines.append(
+    """
+- Nothing was listed beforehand. In the first scene `vi.basins` finds the four stable motions of
+  `all_orbits.md` with their multipliers (0.9961, 0.8930, 0.8895, 0.7943), and one more, of 15
+  cycles with 6 impacts, which that search for periods up to 6 could not find: it is what one in a
+  hundred starts was missing there.
+- The basins of the 4π motion and of the free one have whole parts; elsewhere the basins are mixed
+  down to single cells. There the label of a start depends on the last digits, and `FixedStep`
+  changes some labels while the fractions stay. In the other two scenes the borders are smooth and
+  it changes none.
+- The multiplier of the free motion is e^(-2πξ/ζ): it is the slowest to be reached, and its late
+  arrivals are what is called unsettled after 3,000 cycles.
+- Random starts agree with the grid within their error. A grid's own error is smaller than that of
+  as many random starts, where the basins have whole parts.
+- In the third scene the body of Table 1's machine, above resonance, keeps hitting the stop or
+  swings free, by its start; from rest it swings free.
+"""
+)
+print("\n".join(lines))
+if not QUICK:
+    (HERE / "basins_map.md").write_text("\n".join(lines), encoding="utf-8")
+say(f"done, {time.process_time():.0f} s of CPU time")
