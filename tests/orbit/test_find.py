@@ -124,6 +124,17 @@ def quantity(x, name):
     }[name]
 
 
+def test_there_is_no_gradient_where_there_is_no_orbit():
+    def lowest(zeta):
+        scene = vi.Scene.ideal(
+            frequency_ratio=zeta, restitution=0.56437685, gap=1.22917006, damping_ratio=0.02
+        )
+        guess = scene.start(Y=0.4013157121071995, V=-0.1321048632913019)
+        return vi.find_orbit(scene, guess, method=vi.Newton(max_steps=2)).y_min
+
+    assert np.isnan(jax.grad(lowest)(1.15136991))
+
+
 @pytest.mark.parametrize(
     "name",
     [

@@ -101,3 +101,9 @@ def test_failed_runs_and_bad_arguments():
         vi.lyapunov(scene, scene.start(), number=3)
     with pytest.raises(ValueError, match="`cycles` must be at least 8"):
         vi.lyapunov(scene, scene.start(), 2)
+
+
+def test_a_motion_that_rests_forgets_at_once():
+    scene = vi.Scene.ideal(frequency_ratio=0.4, restitution=0.6, gap=0.3, damping_ratio=0.05)
+    found = vi.lyapunov(scene, scene.start(), 40)
+    assert bool(found.successful) and (np.asarray(found.exponents) == -np.inf).all()

@@ -22,6 +22,7 @@ from jaxtyping import Array, Bool, Float
 
 from . import results
 from .aim import aim_at, select
+from .events import rates
 from .fusion import pin, pin_flag
 from .lane import FREE, SECTION, Lane, Plan, Record
 from .rest import brief, remaining
@@ -134,10 +135,11 @@ def _arrive(
         direction = jnp.where(c.landed, -float(stop.sign), direction)
         hit, met = taken & c.landed, s
         if contact is not None and trial.position is not None:
-            end = trial.position[1]
-            left = remaining(
-                stop.restitution, jnp.maximum(stop.sign * end.v, 0.0), stop.sign * end.a
-            )
+            # What presses a body at rest on: with its velocity goes its damping.
+            rested = scene.placed(there, jnp.asarray(stop.sign * stop.gap), jnp.zeros_like(s))
+            pressing = stop.sign * rates(scene.field, scene.position, s, rested).a
+            arriving = jnp.maximum(stop.sign * trial.position[1].v, 0.0)
+            left = remaining(stop.restitution, arriving, pressing)
             bound = _bound(plan, lane)
             ends = (
                 c.landed

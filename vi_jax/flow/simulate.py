@@ -136,7 +136,7 @@ def planned(
     method.check(scene)
     if isinstance(scene, Scene):
         _check_scalars(scene=scene, start=start)
-    _check_start(scene, start)
+    check_start(scene, start)
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         warnings.warn(
             "vi_jax is running in single precision: errors near 1e-6 and tolerances to match. For "
@@ -184,7 +184,8 @@ def _check_scalars(**arguments: Any) -> None:
                 )
 
 
-def _check_start(scene: AbstractScene, start: Any) -> None:
+def check_start(scene: AbstractScene, start: Any) -> None:
+    """**Raises:** `ValueError` if a concrete start cannot be simulated."""
     for path, leaf in jtu.tree_leaves_with_path(start):
         numbers = concrete(leaf)
         if numbers is not None and not np.isfinite(numbers).all():

@@ -215,7 +215,8 @@ def continue_orbit(
     if not bool(start.good):
         raise ValueError(
             "Argument `orbit` could not be refined from impact to impact (last correction "
-            f"{float(start.size):.2g}): branches cross there, or it is no orbit of this scene."
+            f"{float(start.size):.2g}): branches cross there, it is no orbit of this scene, or its "
+            "body comes to rest on a stop, which cannot be followed from impact to impact."
         )
     ahead = _Follower(problem, scale, (low, high))
     settings = {"step": step, "max_step": max_step, "max_points": max_points}

@@ -194,7 +194,8 @@ def _(primals, tangents):
     )
     move = -jnp.linalg.solve(_shooting_matrix(jacobians), rate).reshape(root.arcs.shape)
     # Where there is no orbit there is no derivative of one.
-    return root, still._replace(arcs=jnp.where(root.converged > 0, move, jnp.nan))
+    # A product, since the transpose of a choice would be zero.
+    return root, still._replace(arcs=move * jnp.where(root.converged > 0, 1.0, jnp.nan))
 
 
 def _shooting_matrix(jacobians: Float[Array, "arcs states states"]) -> Float[Array, "all all"]:

@@ -132,8 +132,8 @@ def basins(
     for name, row in ranges.items():
         if row.size != 2 or not row[0] < row[1] or not name.startswith(START):
             raise ValueError(
-                'Argument `region` must give ranges (low, high) of parts of the start, "start.Y" '
-                f"and such, but got {region[name]!r} for {name!r}."
+                "Argument `region` must give ranges (low, high), low < high, of parts of the "
+                f'start, "start.Y" and such, but got {region[name]!r} for {name!r}.'
             )
     if samples is None:
         sizes = resolution if isinstance(resolution, tuple) else (resolution,) * len(ranges)

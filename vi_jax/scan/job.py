@@ -207,7 +207,7 @@ def make_job(
         build=build,
         start=_as_arrays(start),
         names=names,
-        derivatives=tuple(derivatives),
+        derivatives=(derivatives,) if isinstance(derivatives, str) else tuple(derivatives),
         measures=_as_arrays(measures),
         method=_as_arrays(method if method is not None else _default(template)),
         clock=clock,

@@ -122,7 +122,7 @@ def _lyapunov(the_map: CycleMap, start, cycles: int, settle, number: int) -> Lya
     return Lyapunov(
         exponents=exponents,
         per_cycle=exponents * jnp.mean(duration),
-        spread=jnp.abs(halves[0] - halves[1]),
+        spread=jnp.where(halves[0] == halves[1], 0.0, jnp.abs(halves[0] - halves[1])),
         state=unravel(x),
         result=result,
     )
@@ -138,7 +138,8 @@ def _orthogonal(
             for other in columns:
                 column = column - jnp.dot(other, column) * other
         size = jnp.linalg.norm(column)
-        columns.append(column / size)
+        # Nothing is left of a direction that is forgotten at once, as where the body rests.
+        columns.append(column / jnp.where(size > 0, size, 1.0))
         sizes.append(size)
     return jnp.stack(columns, axis=1), jnp.stack(sizes)
 

@@ -18,12 +18,13 @@ import xarray as xr
 from tqdm import tqdm
 
 from .._checks import count
-from ..flow import AbstractMethod
+from ..flow import AbstractMethod, simulate
 from ..flow.results import REASON_NAMES
 from ..scene import AbstractScene
 from ..scene.leaves import leaf, leaf_names
 from .grid import Blocks, axes_of
 from .job import Job, check_corners, make_job
+from .measures import Custom
 from .store import MemoryStore, Variable, ZarrStore, check_writable, dataset, open_dataset
 from .work import block_size, rounded, run_here, run_on_cluster, size_of, worker_count
 
@@ -124,12 +125,11 @@ def scan(
     blocks = Blocks(grid, lanes, paired=paired)
     job = check_corners(job, blocks)
     variables = variables_of(job, blocks)
-    attributes = _attributes(job, blocks)
+    description = _description(job, blocks, probe=store is not None)
+    attributes = _attributes(description)
     if store is not None:
         check_writable(store)
-        kept: MemoryStore | ZarrStore = ZarrStore(
-            store, _description(job, blocks), blocks, variables
-        )
+        kept: MemoryStore | ZarrStore = ZarrStore(store, description, blocks, variables)
     else:
         kept = MemoryStore(blocks.shape, variables)
 
@@ -223,22 +223,29 @@ def _lanes_in(path: Path) -> int | None:
         return None
 
 
-def _description(job: Job, blocks: Blocks) -> dict[str, Any]:
+def _description(job: Job, blocks: Blocks, *, probe: bool) -> dict[str, Any]:
     """What makes two scans the same, in words and numbers that JSON can hold."""
 
     def told(tree: Any) -> str:
         return eqx.tree_pformat(tree, short_arrays=False, width=10**6)
 
-    scene = {"made by": getattr(job.build, "__qualname__", repr(job.build))}
+    scene: dict[str, Any]
     if job.scene is not None:
         scene = {name: _told(leaf(job.scene, name)) for name in leaf_names(job.scene)}
         scene["structure"] = str(jtu.tree_structure(job.scene))
-    start = {"": "the scene's own"}
+    else:  # a function is known by what it makes
+        scene = {"made by": getattr(job.build, "__qualname__", repr(job.build))}
+        for name, place in (("first", 0), ("last", -1)):
+            made, _ = job.lane(_lane(blocks, place))
+            scene |= {f"{name} {leaf_}": _told(leaf(made, leaf_)) for leaf_ in leaf_names(made)}
+            scene[f"{name} structure"] = str(jtu.tree_structure(made))
+    start: Any = "the scene's own"
     if job.start is not None:
         start = {name: _told(leaf(job.start, name)) for name in leaf_names(job.start)}
     return {
         "scene": scene,
         "start": start,
+        "paired": blocks.paired,
         "axis": {
             name: {
                 "values": x.size,
@@ -258,15 +265,33 @@ def _description(job: Job, blocks: Blocks) -> dict[str, Any]:
         "max_steps": job.max_steps,
         "lanes": blocks.lanes,
         "precision": str(jnp.result_type(float)),
+        "result of own measures": _probe(job, blocks) if probe else {},
     }
+
+
+def _lane(blocks: Blocks, place: int) -> dict[str, Any]:
+    return {name: jnp.asarray(x[place]) for name, x in blocks.axes.items()}
+
+
+def _probe(job: Job, blocks: Blocks) -> dict[str, Any]:
+    """What a user's own measures say of the first lane, by which another function is noticed."""
+    own = [measure for measure in job.measures if isinstance(measure, Custom)]
+    if not own:
+        return {}
+    scene, start = job.lane(_lane(blocks, 0))
+    run = simulate(scene, start, job.cycles, method=job.method)
+    found = {}
+    for measure in own:
+        for name, x in measure(scene, run).items():
+            found[name] = [f"{number:.6g}" for number in np.ravel(np.asarray(x, float))]
+    return found
 
 
 def _told(x: Any) -> Any:
     return np.asarray(x, float).tolist()
 
 
-def _attributes(job: Job, blocks: Blocks) -> dict[str, Any]:
-    about = _description(job, blocks)
+def _attributes(about: dict[str, Any]) -> dict[str, Any]:
     try:
         number = version("vi-jax")
     except PackageNotFoundError:

@@ -131,7 +131,7 @@ def _compare(path: Path, attributes: Mapping[str, Any], wanted: Mapping[str, Any
             f"Argument `store` must be a new folder or the store of a scan, but {path} is another "
             "Zarr group (or one whose making was interrupted: then delete it)."
         )
-    for key in sorted({*there, *wanted}):
+    for key in dict.fromkeys([*wanted, *there]):
         old, new = there.get(key), wanted.get(key)
         if old == new:
             continue

@@ -9,8 +9,9 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._checks import concrete, count
+from .._checks import concrete, count, number, require
 from ..flow import RESULTS, AbstractMethod, FixedStep, simulate
+from ..flow.simulate import check_start
 from ..orbit.cycle_map import default_flow
 from ..scene import AbstractScene, Scene
 from ..scene.leaves import check_again, check_leaf, with_leaf
@@ -82,9 +83,10 @@ def sweep(
     """
     check_leaf(scene, parameter)
     settle, cycles = count("settle", settle), count("cycles", cycles, least=2)
-    values = jnp.asarray(values, jnp.result_type(float))
+    values = number("values", values).astype(jnp.result_type(float))
     numbers = concrete(values)
-    if values.ndim != 1 or (numbers is not None and not np.isfinite(numbers).all()):
+    require("tolerance", tolerance, low=0.0, open_low=True)
+    if values.ndim != 1 or not values.size or not _finite(numbers):
         raise ValueError(
             "Argument `values` must be finite numbers in one row, but has shape "
             f"{values.shape}{'' if values.ndim != 1 else ' and numbers that are not finite'}."
@@ -109,9 +111,15 @@ def sweep(
     if isinstance(scene, Scene):
         start = scene.adopt(start)
     start = jtu.tree_map(lambda x: jnp.asarray(x, values.dtype), start)
+    if numbers is not None:
+        check_start(with_leaf(scene, parameter, numbers[0]), start)
     return _sweep(
         scene, parameter, values, start, settle, cycles, method, rests, tolerance, max_steps
     )
+
+
+def _finite(numbers: np.ndarray | None) -> bool:
+    return numbers is None or bool(np.isfinite(numbers).all())
 
 
 @eqx.filter_jit
@@ -120,6 +128,11 @@ def _sweep(
 ) -> Sweep:
     def one(state, value):
         here = with_leaf(scene, parameter, value)
+        for stop in here.stops:  # one that has come nearer takes the body with it
+            Y = here.position(state)
+            beyond = stop.sign * Y > stop.gap
+            moved = here.placed(state, stop.sign * stop.gap, jnp.zeros_like(Y))
+            state = jtu.tree_map(lambda a, b, c=beyond: jnp.where(c, a, b), moved, state)
         run = simulate(
             here, state, cycles, settle=settle, method=method, rests=rests, max_steps=max_steps
         )
