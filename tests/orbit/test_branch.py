@@ -299,6 +299,7 @@ def test_a_doubled_branch_springs_where_the_other_doubles(short, long):
     assert float(springs.orbit.residual) < 1e-12
 
 
+@pytest.mark.slow
 def test_a_boundary_ends_on_its_bounds(short):
     # Its second parameter has a scale far below 1.
     doubling = next(p for p in short.special if p.kind == "period-doubling")

@@ -262,6 +262,7 @@ def slopes(at, n):
     return jax.jacfwd(answer)(at, n), jax.jacrev(answer)(at, n)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "at, n",
     [

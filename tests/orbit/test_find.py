@@ -42,6 +42,7 @@ def test_the_table_of_values(cycles):
     np.testing.assert_allclose(stepped.multipliers, orbit.multipliers, atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cycles", [1, 2])
 def test_a_grid_of_closed_forms(cycles):
     zetas = [0.75, 0.9, 1.0, 1.3] if cycles == 1 else [0.86, 0.9, 0.94, 1.0, 1.9, 2.2]
@@ -135,14 +136,8 @@ def test_there_is_no_gradient_where_there_is_no_orbit():
     assert np.isnan(jax.grad(lowest)(1.15136991))
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param("y_min", marks=pytest.mark.slow),
-        pytest.param("V⁻", marks=pytest.mark.slow),
-        "largest multiplier",
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["y_min", "V⁻", "largest multiplier"])
 def test_gradients_by_the_implicit_function_theorem(name):
     x, h = jnp.array([0.9, 0.5, 0.01, 2.0]), 1e-5
     value = jax.jit(lambda x: quantity(x, name))
@@ -238,6 +233,7 @@ def motor(torque, restitution, damping=0.5):
     ).scene(drive="motor")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("restitution", [0.5, 0.8])
 def test_motor_orbits_are_where_long_simulation_settles(restitution):
     for torque in (2.0, 10.0, 100.0):

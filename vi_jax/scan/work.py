@@ -76,17 +76,18 @@ def _compiled(devices: int) -> Callable[..., dict[str, Array]]:
 
 
 def compute(
-    job: Job, values: dict[str, np.ndarray], lanes: int, devices: int = 1
+    job: Job, values: dict[str, np.ndarray], lanes: int, devices: int = 1, *, dry: bool = False
 ) -> dict[str, np.ndarray]:
     """The numbers of a block of lanes, filled up to `lanes` so that every block is one program.
 
     With several devices the lanes are dealt to them in turn, since neighbours take alike long.
+    `dry` wants none of them.
     """
     size = next(iter(values.values())).size
     deal = np.arange(lanes).reshape(-1, devices).T.ravel()
     place = np.minimum(deal, size - 1)
     filled = {name: jnp.asarray(x[place]) for name, x in values.items()}
-    out = _compiled(devices)(job, filled, jnp.asarray(deal < size))
+    out = _compiled(devices)(job, filled, jnp.asarray((deal < size) & (not dry)))
     back = np.argsort(deal)[:size]
     return {name: np.asarray(x)[back] for name, x in out.items()}
 
@@ -97,6 +98,9 @@ def run_here(
     """Blocks as they are done. Each runs on one core; several at a time keep all of them busy."""
     if devices > 1 or jax.default_backend() != "cpu":
         workers = 1
+    if todo and workers > 1:
+        # Compiled here, once and not in several threads at a time, by a block without lanes.
+        compute(job, blocks.values(todo[0]), blocks.lanes, devices, dry=True)
 
     def work(where):
         return where, compute(job, blocks.values(where), blocks.lanes, devices)
