@@ -5,6 +5,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
@@ -145,6 +146,11 @@ class Run(eqx.Module):
     def successful(self) -> jax.Array:
         """Whether the lane completed all its cycles."""
         return self.result == RESULTS.successful
+
+    @property
+    def last(self) -> Any:
+        """The state on the last section: a start to go on from, or a guess for `find_orbit`."""
+        return jtu.tree_map(lambda x: x[..., -1], self.sections)
 
     def __str__(self) -> str:
         if isinstance(self.steps, Tracer):

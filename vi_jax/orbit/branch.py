@@ -24,6 +24,10 @@ from .shooting import Shooting, carrier, steps_of
 FOLD, DOUBLING, TORUS = "fold", "period-doubling", "neimark-sacker"
 GRAZING, CROSSING = "grazing", "branch-point"
 
+# An orbit found on the cycle map solves the equations from impact to impact closer than this; one
+# that rests on a stop does not.
+_SAME = 1e-3
+
 
 @dataclasses.dataclass(frozen=True)
 class SpecialPoint:
@@ -212,11 +216,12 @@ def continue_orbit(
     scale[-1] = 0.5 * (high - low)
     # Across the branch, not at a fixed parameter: the orbit may lie at a fold.
     start = _advance(problem, x, _tangent_at(problem, x, scale), scale, 0.0)
-    if not bool(start.good):
+    moved = float(np.max(np.abs(start.x - x) / scale))
+    if not bool(start.good) or moved > _SAME:
         raise ValueError(
             "Argument `orbit` could not be refined from impact to impact (last correction "
-            f"{float(start.size):.2g}): branches cross there, it is no orbit of this scene, or its "
-            "body comes to rest on a stop, which cannot be followed from impact to impact."
+            f"{max(moved, float(start.size)):.2g}): branches cross there, it is no orbit of this "
+            "scene, or its body comes to rest on a stop, which cannot be followed from impact to impact."
         )
     ahead = _Follower(problem, scale, (low, high))
     settings = {"step": step, "max_step": max_step, "max_points": max_points}

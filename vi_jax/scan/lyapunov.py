@@ -59,7 +59,8 @@ def lyapunov(
     vanish smoothly at both ends (Das, Saiki, Sander and Yorke 2017), which on periodic and
     quasi-periodic motions converges faster than any power of the number of cycles, once these are
     some tens of the motion's periods. The exponent 0 along the motion itself is not among them. A
-    motion that rests on a stop forgets its past at once: -∞. Clean under `jit` and `vmap`.
+    motion that rests on a stop forgets its past at once: -∞, or a few powers of ten below rounding
+    in each cycle, where the release is not met to the last digit. Clean under `jit` and `vmap`.
 
     **Arguments:**
 

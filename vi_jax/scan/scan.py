@@ -32,10 +32,13 @@ _UNITS = {"Y": "a", "V": "a ω", "W": "ω", "phase": "rad", "frequency_ratio": "
 
 
 class ScanInterrupted(KeyboardInterrupt):
-    """Raised when a scan in memory is interrupted: what was computed is not lost."""
+    """Raised when a scan is interrupted: what was computed is not lost."""
 
-    def __init__(self, data: xr.Dataset):
-        super().__init__("the scan was interrupted; what was computed is in `.data`")
+    def __init__(self, data: xr.Dataset, store: str | Path | None):
+        kept = "what was computed is in `.data`"
+        if store is not None:
+            kept = f"what was computed is in {store}, and the same call goes on from there"
+        super().__init__(f"the scan was interrupted; {kept}")
         self.data = data
 
 
@@ -96,7 +99,7 @@ def scan(
     ended (0: well; -1: not computed). With a `store` it is read lazily from there.
 
     **Raises:** `ValueError` or `TypeError` before any work for what cannot be run;
-    `ScanInterrupted` on Ctrl-C without a store.
+    `ScanInterrupted`, a `KeyboardInterrupt`, on Ctrl-C.
     """
     grid = axes_of(axes)
     if paired and len({x.size for x in grid.values()}) != 1:
@@ -161,9 +164,7 @@ def scan(
                 kept.write(where, numbers)
                 bar.update(size_of(where))
     except KeyboardInterrupt:
-        if isinstance(kept, ZarrStore):
-            raise
-        raise ScanInterrupted(collected()) from None
+        raise ScanInterrupted(collected(), store) from None
     data = collected()
     _tell_failures(data)
     return data
