@@ -221,7 +221,8 @@ def continue_orbit(
         raise ValueError(
             "Argument `orbit` could not be refined from impact to impact (last correction "
             f"{max(moved, float(start.size)):.2g}): branches cross there, it is no orbit of this "
-            "scene, or its body comes to rest on a stop, which cannot be followed from impact to impact."
+            "scene, or its body comes to rest on a stop, which cannot be followed from impact to "
+            "impact."
         )
     ahead = _Follower(problem, scale, (low, high))
     settings = {"step": step, "max_step": max_step, "max_points": max_points}
