@@ -1,5 +1,7 @@
 """Host-side checks of what a user passes in. Concrete numbers are looked at; tracers pass."""
 
+import tempfile
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -70,6 +72,18 @@ def count(name: str, value: Any, *, least: int = 0) -> int:
     if value < least:
         raise ValueError(f"Argument `{name}` must be at least {least}, but got {value}.")
     return int(value)
+
+
+def unwritable(folder: str | Path) -> str | None:
+    """Why nothing can be written into this folder, or `None`; makes the folder."""
+    try:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return None
+    except (FileExistsError, NotADirectoryError):
+        return f"{folder} is or lies below a file"
+    except (OSError, ValueError) as error:
+        return str(getattr(error, "strerror", None) or error)
 
 
 def one_of(name: str, value: Any, allowed: tuple[str, ...]) -> str:

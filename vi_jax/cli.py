@@ -2,13 +2,12 @@
 
 import argparse
 import sys
-import tempfile
 from importlib.metadata import PackageNotFoundError, version
 from io import TextIOWrapper
-from pathlib import Path
 
 import jax
 
+from ._checks import unwritable
 from ._toml import ConfigError, keys_of
 from .config import (
     BasinsTable,
@@ -43,9 +42,9 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _reproduce(options: argparse.Namespace) -> int:
-    problem = _unusable(options.out)
+    problem = unwritable(options.out) if options.out else "it is empty"
     if problem:
-        return _error(problem, 2)
+        return _error(f"argument --out must be a folder to write into: {problem}", 2)
     jax.config.update("jax_enable_x64", True)
     try:
         found = reproduce(options.out, quick=options.quick, progress=_tell)
@@ -134,21 +133,6 @@ def _version() -> str:
         return version("vi-jax")
     except PackageNotFoundError:
         return "(not installed)"
-
-
-def _unusable(out: str) -> str | None:
-    """Why nothing can be written into this folder, or `None`; makes the folder."""
-    if not out:
-        return "argument --out must name a folder"
-    try:
-        Path(out).mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=out):
-            pass
-    except (FileExistsError, NotADirectoryError):
-        return f"argument --out must be a folder, but {out} is or lies below a file"
-    except (OSError, ValueError) as error:
-        return f"cannot write into {out}: {getattr(error, 'strerror', None) or error}"
-    return None
 
 
 def _tell(step: str) -> None:

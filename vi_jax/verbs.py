@@ -6,7 +6,6 @@ lines to print and whether anything succeeded.
 
 import csv
 import os
-import tempfile
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -19,13 +18,13 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from ._checks import unwritable
 from ._toml import ConfigError, given, keys_of, spoken, unknown
 from .config import Config, OrbitTable
-from .flow import RESULTS, Adaptive
+from .flow import RESULTS
 from .flow import simulate as run_motion
 from .flow.results import REASONS, number_of
 from .orbit import Orbit, continue_orbit, find_orbit
-from .orbit.cycle_map import default_flow
 from .plot import (
     plot_basins,
     plot_branch,
@@ -254,7 +253,7 @@ def simulate(config: Config, tell: Tell) -> Outcome:
         run = run_motion(
             scene,
             scene.start() if start is None else start,
-            method=default_flow(scene, Adaptive()) if method is None else method,
+            method=method,
             **options,
         )
     lines = [str(run)]
@@ -304,21 +303,13 @@ def check_paths(table: str, *, picture: str | None = None, output: str | None = 
             continue
         if not path.endswith(ending):
             raise ConfigError(f'`{key}` in {table} must end in {ending}, but is "{path}"')
-        reason = _unwritable(Path(path))
+        reason = unwritable(Path(path).parent)
+        if reason is None and Path(path).is_dir():
+            reason = "it is a folder"
+        elif reason is None and Path(path).exists() and not os.access(path, os.W_OK):
+            reason = "permission denied"
         if reason:
             raise ConfigError(f"`{key}` in {table} cannot be written: {path}: {reason}")
-
-
-def _unwritable(path: Path) -> str | None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=path.parent):
-            pass
-        if path.is_dir():
-            return "it is a folder"
-        return None if not path.exists() or os.access(path, os.W_OK) else "permission denied"
-    except (OSError, ValueError) as error:
-        return str(getattr(error, "strerror", None) or error)
 
 
 def _check_map(axes: Mapping[str, Any], measure: Iterable[str] | None, *, paired: bool) -> None:

@@ -250,6 +250,27 @@ def test_a_sweep_takes_the_body_along_with_a_stop_that_comes_nearer():
         vi.sweep(SCENE, "stops.0.gap", [])
 
 
+def test_a_store_is_made_whole_or_not_at_all(tmp_path, monkeypatch):
+    store = importlib.import_module("vi_jax.scan.store")
+    create = store.zarr.Group.create_array
+
+    def interrupted(group, name, **options):
+        if name == "y_min":
+            raise KeyboardInterrupt
+        return create(group, name, **options)
+
+    def run():
+        return vi.scan(SCENE, {"start.Y": [0.0, 0.1]}, settle=5, store=tmp_path / "store")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(store.zarr.Group, "create_array", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            run()
+    assert not list(tmp_path.iterdir())
+    assert bool((run().result == 0).all())
+    assert [path.name for path in tmp_path.iterdir()] == ["store"]
+
+
 def test_an_interrupted_scan_in_memory_gives_what_it_has(monkeypatch):
     work = importlib.import_module("vi_jax.scan.work")
     done = []

@@ -22,10 +22,9 @@ from jaxtyping import Array, Bool, Float
 
 from . import results
 from .aim import aim_at, select
-from .events import rates
 from .fusion import pin, pin_flag
 from .lane import FREE, SECTION, Lane, Plan, Record
-from .rest import brief, remaining
+from .rest import settled
 from .trial import Trial, attempt
 
 Scalar = Float[Array, ""]
@@ -135,18 +134,9 @@ def _arrive(
         direction = jnp.where(c.landed, -float(stop.sign), direction)
         hit, met = taken & c.landed, s
         if contact is not None and trial.position is not None:
-            # What presses a body at rest on: with its velocity goes its damping.
-            rested = scene.placed(there, jnp.asarray(stop.sign * stop.gap), jnp.zeros_like(s))
-            pressing = stop.sign * rates(scene.field, scene.position, s, rested).a
-            arriving = jnp.maximum(stop.sign * trial.position[1].v, 0.0)
-            left = remaining(stop.restitution, arriving, pressing)
-            bound = _bound(plan, lane)
-            ends = (
-                c.landed
-                & (stop_gradient(left) <= brief(scene, s))
-                & (stop_gradient(s + left) < bound)
-            )
-            ends = pin_flag(ends, lane.one)
+            arriving = stop.sign * trial.position[1].v
+            last, left = settled(plan, lane, stop, arriving, s, there)
+            ends = pin_flag(c.landed & last, lane.one)
             wait = pin(jnp.where(ends, left, 0.0), lane.one)
             (later, passed) = jtu.tree_map(lambda x, dx, w=wait: x + w * dx, (state, time), flow)
             still = scene.placed(later, stop.sign * stop.gap, jnp.zeros_like(s))
@@ -195,14 +185,6 @@ def _arrive(
         Record(time, y_max, y_min, impacts, speed, loss, rests, log, clearance),
         taken & completed,
     )
-
-
-def _bound(plan: Plan, lane: Lane) -> Scalar:
-    """Where the interval ends, if `s` itself counts; otherwise nowhere."""
-    if not plan.ticks(lane.state):
-        return jnp.full_like(lane.s, jnp.inf)
-    cycle = jnp.asarray(plan.scene.cycle, lane.s.dtype)
-    return stop_gradient(cycle * (lane.part + 1) / plan.parts)
 
 
 @jax.custom_jvp

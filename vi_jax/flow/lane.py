@@ -113,6 +113,11 @@ class Plan(eqx.Module):
         """Iterations in which a lane completes at most one interval, its steps being so short."""
         return max(1, self.method.steps_per_cycle // self.parts)
 
+    def end(self, part: Scalar) -> Scalar:
+        """Clock reading at the end of the `part`-th interval of a cycle."""
+        cycle = jnp.asarray(self.scene.cycle, part.dtype)
+        return cycle * (part + 1) / self.parts if self.parts > 1 else cycle
+
     def ticks(self, state: Any) -> bool:
         """Whether `s` itself counts the cycles."""
         return self.scene.clock(state) is None

@@ -15,9 +15,9 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
 from ..scene import AbstractScene, RigidStop
-from .events import Rates
+from .events import Rates, rates
 from .fusion import pin, pin_flag
-from .lane import RELEASE, Lane
+from .lane import RELEASE, Lane, Plan
 
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]
@@ -69,6 +69,24 @@ def remaining(restitution: Scalar, approach: Scalar, pressing: Scalar) -> Scalar
     return jnp.where(ends, 2 * restitution * approach / jnp.where(ends, force, 1.0), jnp.inf)
 
 
+def settled(
+    plan: Plan, lane: Lane, stop: RigidStop, speed: Scalar, s: Scalar, there: Any
+) -> tuple[Flag, Scalar]:
+    """Whether an impact is one of the endless last ones before rest, and the time they take.
+
+    **Arguments:** the stop, the speed of approach by s, and s and the state of the impact.
+    """
+    scene = plan.scene
+    # What presses a body at rest on: with its velocity goes its damping.
+    rested = scene.placed(there, jnp.asarray(stop.sign * stop.gap), jnp.zeros_like(s))
+    pressing = stop.sign * rates(scene.field, scene.position, s, rested).a
+    left = remaining(stop.restitution, jnp.maximum(speed, 0.0), pressing)
+    ends = stop_gradient(left) <= brief(scene, s)
+    if plan.ticks(lane.state):
+        ends = ends & (stop_gradient(s + left) < stop_gradient(plan.end(lane.part)))
+    return ends, left
+
+
 def release(
     lane: Lane, stops: tuple, begin: Rates, end: Rates, good: Flag, h: Scalar
 ) -> tuple[Flag, Flag, Scalar, Scalar]:
@@ -86,7 +104,7 @@ def release(
     held = good & (sign != 0)
     rising = held & (rise > 0)
     offset = -after * h / jnp.where(rising, rise, 1.0)
-    close = jnp.abs(stop_gradient(offset)) <= 1e-9 if h.dtype == jnp.float64 else 1e-5
+    close = jnp.abs(stop_gradient(offset)) <= (1e-9 if h.dtype == jnp.float64 else 1e-5)
     landed = rising & (lane.target == RELEASE) & (h <= 2 * _STRAIGHT) & close
     left = rising & (after > 0) & ~landed
     place = stop_gradient(h + offset)

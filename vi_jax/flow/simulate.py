@@ -12,6 +12,7 @@ import numpy as np
 
 from .._checks import concrete, count, one_of
 from ..scene import AbstractScene, Scene
+from .choice import chosen
 from .lane import Lane, Plan, Record
 from .loop import run_forward, run_reverse
 from .methods import AbstractMethod, Adaptive
@@ -51,7 +52,8 @@ def simulate(
     - `cycles`: number of drive cycles to record, at least 1; static.
     - `settle`: drive cycles before them, of which nothing is kept; another number is not another
       program.
-    - `method`: `Adaptive` (default), `FixedStep` or `ExactFlight`.
+    - `method`: `Adaptive`, `FixedStep` or `ExactFlight`; by default `ExactFlight()` where it
+      applies, else `Adaptive()`.
     - `clock`: `"phase"` or `"time"`; `None` leaves the scene's own. The phase clock needs a crank
       that turns forward; the time clock carries a start from rest and a stall.
     - `samples`: dense samples per cycle, evenly spaced on the drive's clock. Steps end on them, so
@@ -109,12 +111,7 @@ def planned(
         raise TypeError(
             f"Argument `scene` must be a `Scene` or an `AbstractScene`, but got {scene!r}."
         )
-    method = Adaptive() if method is None else method
-    if not isinstance(method, AbstractMethod):
-        raise TypeError(
-            "Argument `method` must be `Adaptive(...)`, `FixedStep(...)` or `ExactFlight()`, but "
-            f"got {method!r}."
-        )
+    method = chosen(scene, method, Adaptive())
     cycles = count("cycles", cycles, least=1)
     samples = count("samples", samples)
     impact_log = count("impact_log", impact_log)

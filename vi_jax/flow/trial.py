@@ -58,7 +58,7 @@ def attempt(plan: Plan, lane: Lane, active: Flag) -> Trial:
     """Try the next step and see what it meets; of length zero for a lane that has ended."""
     scene, method = plan.scene, plan.method
     free = lane.target == FREE
-    bound = scene.cycle * (lane.part + 1) / plan.parts if plan.parts > 1 else scene.cycle
+    bound = plan.end(lane.part)
     limit = method.limited(scene, scene.step_limit(lane.s, lane.state))
     h = stop_gradient(jnp.where(free, jnp.minimum(lane.attempt, limit), lane.attempt))
     s1, last = lane.s + h, jnp.zeros_like(free)

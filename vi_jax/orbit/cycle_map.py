@@ -12,7 +12,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from .._checks import count
-from ..flow import AbstractMethod, Adaptive, ExactFlight, simulate
+from ..flow import AbstractMethod, Adaptive, simulate
+from ..flow.choice import chosen
 from ..flow.simulate import as_floats
 from ..scene import AbstractScene, Scene
 from .tangent import by_columns
@@ -56,7 +57,7 @@ def _end(cycle_map: CycleMap, state: Any) -> Any:
         cycle_map.scene, state, cycle_map.cycles, method=cycle_map.flow, record="sections",
         rests=cycle_map.rests,
     )  # fmt: skip
-    return jtu.tree_map(lambda x: x[-1], run.sections)
+    return run.last
 
 
 def cycle_map(
@@ -95,29 +96,13 @@ def cycle_map(
             "Argument `section` must be left out for a scene of your own, which has its own "
             f"section, but got {section!r}."
         )
-    if flow is None:
-        flow = default_flow(scene, Adaptive(diffrax.Tsit5(), rtol=1e-11))
-    elif not isinstance(flow, AbstractMethod):
-        raise TypeError(
-            "Argument `flow` must be `Adaptive(...)`, `FixedStep(...)` or `ExactFlight()`, but "
-            f"got {flow!r}."
-        )
+    flow = chosen(scene, flow, Adaptive(diffrax.Tsit5(), rtol=1e-11), argument="flow")
     flow.check(scene)
     # Tolerances are numbers: another one must not be another program.
     carried: AbstractMethod = jtu.tree_map(
         lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, flow
     )
     return CycleMap(scene, carried, count("cycles", cycles, least=1), scene.may_rest())
-
-
-def default_flow(scene: AbstractScene, otherwise: AbstractMethod) -> AbstractMethod:
-    """`ExactFlight` where it applies, else the other."""
-    exact = ExactFlight()
-    try:
-        exact.check(scene)
-    except ValueError:
-        return otherwise
-    return exact
 
 
 def adopted(scene: AbstractScene, state: Any) -> Any:

@@ -21,10 +21,10 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Complex, Float
 
 from ..flow import AbstractMethod, FixedStep
+from ..flow.choice import chosen
 from ..flow.events import rates
 from ..scene import AbstractScene
 from ..scene.leaves import with_leaf
-from .cycle_map import default_flow
 from .floquet import multipliers_of
 
 Vector = Float[Array, " _"]
@@ -297,7 +297,7 @@ def carrier(flow: AbstractMethod | None, scene: AbstractScene) -> AbstractMethod
     `ExactFlight` where it applies, else 32 steps of Dopri8 a cycle, whose error is 1e-13."""
     if isinstance(flow, FixedStep):
         return flow
-    return default_flow(scene, FixedStep(diffrax.Dopri8(), 32))
+    return chosen(scene, None, FixedStep(diffrax.Dopri8(), 32))
 
 
 def steps_of(flow: AbstractMethod, scenes: list[AbstractScene], like: Any, cycles: int) -> int:

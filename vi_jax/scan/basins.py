@@ -13,7 +13,7 @@ import xarray as xr
 
 from .._checks import count
 from ..flow import AbstractMethod, FixedStep, simulate
-from ..orbit.cycle_map import default_flow
+from ..flow.choice import chosen
 from ..orbit.results import told_impacts
 from ..scene import AbstractScene, Scene
 from .grid import axes_of
@@ -150,7 +150,7 @@ def basins(
         samples = count("samples", samples, least=1)
         rng = np.random.default_rng(seed)
         axes = {name: rng.uniform(low, high, samples) for name, (low, high) in ranges.items()}
-    method = default_flow(scene, FixedStep()) if method is None else method
+    method = chosen(scene, method, FixedStep())
     measure = (Regime(longest=longest, tolerance=tolerance), _Mark(longest))
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "[0-9,]+ of [0-9,]+ lanes failed")

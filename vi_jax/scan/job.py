@@ -14,9 +14,9 @@ from jaxtyping import Array, Float
 from .._checks import count
 from ..flow import AbstractMethod, FixedStep
 from ..flow.aim import select
+from ..flow.choice import chosen
 from ..flow.results import number_of
 from ..flow.simulate import simulate_pool
-from ..orbit.cycle_map import default_flow
 from ..scene import AbstractScene, Scene
 from ..scene.leaves import check_again, check_name, leaf, leaf_names, with_leaf
 from .grid import Blocks
@@ -39,7 +39,6 @@ class Job(eqx.Module):
     """Makes the scene of the axes' values, in place of `scene`."""
     start: Any
     """The first state, or `None` for the scene's own."""
-    names: tuple[str, ...] = eqx.field(static=True)
     derivatives: tuple[str, ...] = eqx.field(static=True)
     measures: tuple[AbstractMeasure, ...]
     method: AbstractMethod
@@ -123,8 +122,7 @@ class Job(eqx.Module):
                     found[name] = jnp.where(run.successful, x, jnp.nan)
             return {**found, "result": number_of(run.result).astype(jnp.int8)}
 
-        last = jtu.tree_map(lambda x: x[:, -1], run.sections)
-        return jax.vmap(measured)(values, run), last
+        return jax.vmap(measured)(values, run), jax.vmap(lambda run: run.last)(run)
 
     def _again(self, measure: AbstractMeasure, values, wanted, state, out: Numbers) -> Numbers:
         """`out` with what `measure` finds at a second look, at the lanes that need it only."""
@@ -197,19 +195,13 @@ def make_job(
         first = template.start() if start is None and isinstance(template, Scene) else start
         for name in names:
             _check_name(template, first, name, "axes")
-    if method is not None and not isinstance(method, AbstractMethod):
-        raise TypeError(
-            "Argument `method` must be `Adaptive(...)`, `FixedStep(...)` or `ExactFlight()`, but "
-            f"got {method!r}."
-        )
     return Job(
         scene=_as_arrays(template),
         build=build,
         start=_as_arrays(start),
-        names=names,
         derivatives=(derivatives,) if isinstance(derivatives, str) else tuple(derivatives),
         measures=_as_arrays(measures),
-        method=_as_arrays(method if method is not None else _default(template)),
+        method=_as_arrays(chosen(template, method, FixedStep())),
         clock=clock,
         cycles=cycles,
         settle=jnp.asarray(settle),
@@ -217,10 +209,6 @@ def make_job(
         max_steps=None if max_steps is None else count("max_steps", max_steps, least=1),
         places=PLACES,
     )
-
-
-def _default(template: AbstractScene | None) -> AbstractMethod:
-    return FixedStep() if template is None else default_flow(template, FixedStep())
 
 
 def _as_arrays(tree: Any) -> Any:

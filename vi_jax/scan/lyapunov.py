@@ -5,14 +5,14 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
 from .._checks import count
 from ..flow import RESULTS, AbstractMethod, FixedStep, simulate
-from ..orbit.cycle_map import CycleMap, adopted, cycle_map, default_flow
+from ..flow.choice import chosen
+from ..orbit.cycle_map import CycleMap, adopted, cycle_map
 from ..scene import AbstractScene, MotorState, TimedMotorState
 
 
@@ -78,7 +78,7 @@ def lyapunov(
     cycles = count("cycles", cycles, least=8)
     if isinstance(start, TimedMotorState):
         start = MotorState(start.Y, start.V, start.W)
-    flow = default_flow(scene, FixedStep()) if method is None else method
+    flow = chosen(scene, method, FixedStep())
     carried = cycle_map(scene, flow=flow)
     start = adopted(carried.scene, start)
     states = ravel_pytree(start)[0].size
@@ -95,12 +95,12 @@ def lyapunov(
 def _lyapunov(the_map: CycleMap, start, cycles: int, settle, number: int) -> Lyapunov:
     scene, flow, rests = the_map.scene, the_map.flow, the_map.rests
     before = simulate(scene, start, 1, settle=settle, method=flow, rests=rests)
-    x, unravel = ravel_pytree(jtu.tree_map(lambda x: x[-1], before.sections))
+    x, unravel = ravel_pytree(before.last)
 
     def image(x):
         run = simulate(scene, unravel(x), 1, method=flow, rests=rests)
         assert run.duration is not None
-        out, _ = ravel_pytree(jtu.tree_map(lambda x: x[-1], run.sections))
+        out, _ = ravel_pytree(run.last)
         return out, (run.duration[0], run.result)
 
     def cycle(carry, _):

@@ -13,7 +13,7 @@ from .._checks import count, require
 from ..flow import AbstractMethod, Run
 from ..scene import AbstractScene
 from .lyapunov import lyapunov
-from .regime import least_period
+from .regime import impacts_of, least_period
 
 Numbers = dict[str, Array]
 About = Mapping[str, Mapping[str, Any]]
@@ -207,12 +207,9 @@ class Regime(AbstractMeasure):
         """Of one lane; chaos is not yet told."""
         sections = {name: x[1:] for name, x in vars(run.sections).items()}
         period = least_period(sections, longest=self.longest, tolerance=self.tolerance)
-        hits = run.impacts.astype(run.sections.Y.dtype)
-        place = jnp.arange(hits.size)
-        total = jnp.sum(jnp.where(place >= hits.size - period, hits, 0.0))
         return {
             "period": jnp.where(run.successful, period, -2).astype(jnp.int16),
-            "impacts": jnp.where(period > 0, total, jnp.mean(hits)),
+            "impacts": impacts_of(run.impacts.astype(run.sections.Y.dtype), period),
         }
 
     def unclear(self, found):

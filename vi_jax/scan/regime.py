@@ -38,3 +38,10 @@ def least_period(
     begin = jnp.zeros((), jnp.int32), jnp.full((), jnp.inf, states.dtype)
     (period, least), _ = jax.lax.scan(compared, begin, periods)
     return jnp.where(least <= tolerance, period, 0)
+
+
+def impacts_of(impacts: Float[Array, " cycles"], period: Int[Array, ""]) -> Float[Array, ""]:
+    """Impacts in a period of a motion; in a cycle, on average, where it has none."""
+    last = jnp.arange(impacts.size) >= impacts.size - period
+    total = jnp.sum(jnp.where(last, impacts, 0.0))
+    return jnp.where(period > 0, total, jnp.mean(impacts))

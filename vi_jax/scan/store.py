@@ -1,6 +1,7 @@
 """Where a scan's numbers go: arrays in memory, or a Zarr store that survives interruption."""
 
 import json
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -9,6 +10,7 @@ import numpy as np
 import xarray as xr
 import zarr
 
+from .._checks import unwritable
 from .grid import Blocks
 
 _UNDONE = -1
@@ -63,33 +65,15 @@ class ZarrStore:
     ):
         self.path = Path(path)
         description = json.loads(json.dumps(description))
-        if (self.path / "zarr.json").exists():
-            self.group = zarr.open_group(str(self.path), mode="r+", zarr_format=3)
-            _compare(self.path, dict(self.group.attrs), description)
-        else:
+        if not (self.path / "zarr.json").exists():
             if self.path.exists() and (self.path.is_file() or any(self.path.iterdir())):
                 raise ValueError(
                     f"Argument `store` must be a new folder or the store of a scan, but {path} "
                     "is neither."
                 )
-            self.group = zarr.create_group(str(self.path), zarr_format=3)
-            for name, x in blocks.axes.items():
-                coordinate = self.group.create_array(
-                    name, shape=x.shape, dtype=x.dtype, dimension_names=blocks.dims_of(name)
-                )
-                coordinate[:] = x
-            for name, v in variables.items():
-                self.group.create_array(
-                    name,
-                    shape=blocks.shape + v.sizes,
-                    chunks=blocks.block + v.sizes,
-                    dtype=v.dtype,
-                    fill_value=v.empty,
-                    dimension_names=(*blocks.dims, *v.dims),
-                    attributes=dict(v.attributes),
-                )
-            self.group.attrs.update({"scan": description})
-        self.names = list(variables)
+            _make(self.path, description, blocks, variables)
+        self.group = zarr.open_group(str(self.path), mode="r+", zarr_format=3)
+        _compare(self.path, dict(self.group.attrs), description)
 
     def done(self, where: tuple[slice, ...]) -> bool:
         """Whether the block was computed."""
@@ -106,21 +90,43 @@ class ZarrStore:
         return self.group[name]
 
 
+def _make(
+    path: Path, description: Mapping[str, Any], blocks: Blocks, variables: Mapping[str, Variable]
+) -> None:
+    """An empty store, made beside its place and then renamed: it is there whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as beside:
+        made = Path(beside) / "store"
+        group = zarr.create_group(str(made), zarr_format=3, attributes={"scan": description})
+        for name, x in blocks.axes.items():
+            coordinate = group.create_array(
+                name, shape=x.shape, dtype=x.dtype, dimension_names=blocks.dims_of(name)
+            )
+            coordinate[:] = x
+        for name, v in variables.items():
+            group.create_array(
+                name,
+                shape=blocks.shape + v.sizes,
+                chunks=blocks.block + v.sizes,
+                dtype=v.dtype,
+                fill_value=v.empty,
+                dimension_names=(*blocks.dims, *v.dims),
+                attributes=dict(v.attributes),
+            )
+        try:
+            made.rename(path)
+        except OSError:
+            if not (path / "zarr.json").exists():
+                raise  # else another scan made it in the meantime
+
+
 def check_writable(path: str | Path) -> None:
     """**Raises:** `ValueError` if no store can be written there; makes the folders above it."""
-    path = Path(path)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        trial = path.parent / f".{path.name}.trial"
-        trial.mkdir()
-        trial.rmdir()
-    except OSError as error:
-        if isinstance(error, FileExistsError) and path.parent.is_dir():
-            return  # another scan's trial
+    problem = unwritable(Path(path).parent)
+    if problem is not None:
         raise ValueError(
-            f"Argument `store` must be a path that can be written to, but {path} is not: "
-            f"{error.strerror or error}."
-        ) from None
+            f"Argument `store` must be a path that can be written to, but {path} is not: {problem}."
+        )
 
 
 def _compare(path: Path, attributes: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
@@ -129,7 +135,7 @@ def _compare(path: Path, attributes: Mapping[str, Any], wanted: Mapping[str, Any
     if there is None:
         raise ValueError(
             f"Argument `store` must be a new folder or the store of a scan, but {path} is another "
-            "Zarr group (or one whose making was interrupted: then delete it)."
+            "Zarr group."
         )
     for key in dict.fromkeys([*wanted, *there]):
         old, new = there.get(key), wanted.get(key)

@@ -11,11 +11,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._checks import concrete, count, number, require
 from ..flow import RESULTS, AbstractMethod, FixedStep, simulate
+from ..flow.choice import chosen
 from ..flow.simulate import check_start
-from ..orbit.cycle_map import default_flow
 from ..scene import AbstractScene, Scene
 from ..scene.leaves import check_again, check_leaf, with_leaf
-from .regime import least_period
+from .regime import impacts_of, least_period
 
 
 class Sweep(eqx.Module):
@@ -103,7 +103,7 @@ def sweep(
         first = with_leaf(scene, parameter, values[0])
         assert isinstance(first, Scene)
         start = first.start()
-    method = default_flow(scene, FixedStep()) if method is None else method
+    method = chosen(scene, method, FixedStep())
     if clock is not None:
         if not isinstance(scene, Scene):
             raise ValueError("Argument `clock` must be left out for a scene of your own.")
@@ -137,21 +137,17 @@ def _sweep(
             here, state, cycles, settle=settle, method=method, rests=rests, max_steps=max_steps
         )
         sections = jtu.tree_map(lambda x: x[1:], run.sections)
-        last = jtu.tree_map(lambda x: x[-1], sections)
-        state = jtu.tree_map(lambda a, b: jnp.where(run.successful, a, b), last, state)
+        state = jtu.tree_map(lambda a, b: jnp.where(run.successful, a, b), run.last, state)
         assert run.y_min is not None and run.y_max is not None
         assert run.impact_speed is not None and run.duration is not None
         period = least_period(sections, longest=cycles // 2, tolerance=tolerance)
-        hits = run.impacts.astype(value.dtype)
-        total = jnp.sum(jnp.where(jnp.arange(cycles) < period, hits, 0.0))
+        impacts = impacts_of(run.impacts.astype(value.dtype), period)
         return state, Sweep(
             values=value,
             y_min=jnp.min(run.y_min),
             y_max=jnp.max(run.y_max),
             period=jnp.where(run.successful, period, -2),
-            impacts=jnp.where(
-                run.successful, jnp.where(period > 0, total, jnp.mean(hits)), jnp.nan
-            ),
+            impacts=jnp.where(run.successful, impacts, jnp.nan),
             frequency_ratio=here.frequency_ratio(jnp.mean(run.duration)),
             impact_speed=jnp.max(run.impact_speed),
             sections=sections,
