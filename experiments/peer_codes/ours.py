@@ -15,13 +15,13 @@ from .task import Run, Task
 jax.config.update("jax_enable_x64", True)
 
 
-def method(name: str, number: float) -> vi.AbstractMethod:
+def method(name: str, number: float, solver: str = "Dopri8") -> vi.AbstractMethod:
     """The method by the name that the tables use."""
     if name == "ExactFlight":
         return vi.ExactFlight()
     if name == "FixedStep":
-        return vi.FixedStep(diffrax.Dopri8(), int(number))
-    return vi.Adaptive(diffrax.Dopri8(), rtol=number)
+        return vi.FixedStep(getattr(diffrax, solver)(), int(number))
+    return vi.Adaptive(getattr(diffrax, solver)(), rtol=number)
 
 
 def final(task: Task, how: vi.AbstractMethod, theta: jax.Array, Y0: jax.Array) -> jax.Array:

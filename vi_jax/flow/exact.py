@@ -53,10 +53,6 @@ class ExactFlight(AbstractMethod):
                 f"`{type(scene.crank).__name__}`. Use `Adaptive` or `FixedStep`."
             )
 
-    def limited(self, scene, limit):
-        """Strong damping asks for shorter arcs, which keeps the arguments of the series small."""
-        return limit / jnp.maximum(1.0, _numbers(scene)[1])
-
     def step(self, scene, s0, s1, state, time, one):
         """The flight from `s0` to `s1`, exact to rounding."""
         assert isinstance(scene, Scene)

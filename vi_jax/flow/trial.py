@@ -59,7 +59,7 @@ def attempt(plan: Plan, lane: Lane, active: Flag) -> Trial:
     scene, method = plan.scene, plan.method
     free = lane.target == FREE
     bound = plan.end(lane.part)
-    limit = method.limited(scene, scene.step_limit(lane.s, lane.state))
+    limit = method.longest(scene, lane.s, lane.state)
     h = stop_gradient(jnp.where(free, jnp.minimum(lane.attempt, limit), lane.attempt))
     s1, last = lane.s + h, jnp.zeros_like(free)
     if plan.ticks(lane.state):

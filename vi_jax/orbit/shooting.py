@@ -305,6 +305,6 @@ def steps_of(flow: AbstractMethod, scenes: list[AbstractScene], like: Any, cycle
     # Turning points are looked for between steps: more of them than flying needs.
     most = max(flow.steps_per_cycle, 16)
     for scene in scenes:
-        limit = flow.limited(scene, scene.step_limit(jnp.zeros(()), like))
+        limit = flow.longest(scene, jnp.zeros(()), like)
         most = max(most, ceil(1.02 * float(scene.cycle / limit)))
     return most * cycles

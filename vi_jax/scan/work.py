@@ -102,8 +102,11 @@ def run_here(
         # Compiled here, once and not in several threads at a time, by a block without lanes.
         compute(job, blocks.values(todo[0]), blocks.lanes, devices, dry=True)
 
+    x64 = _x64()
+
     def work(where):
-        return where, compute(job, blocks.values(where), blocks.lanes, devices)
+        with jax.enable_x64(x64):  # a thread has its own
+            return where, compute(job, blocks.values(where), blocks.lanes, devices)
 
     waiting = iter(todo)
     pool = ThreadPoolExecutor(workers)
@@ -128,7 +131,7 @@ def run_on_cluster(job: Job, blocks: Blocks, todo: list, client: Any) -> Iterato
     """Blocks as Dask tasks, as they are done."""
     from dask.distributed import as_completed
 
-    x64 = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
+    x64 = _x64()
     # Small enough to go with every task: data that are shared would die with their worker.
     parcel = _Parcel(job)
     where_of = {
@@ -142,6 +145,10 @@ def run_on_cluster(job: Job, blocks: Blocks, todo: list, client: Any) -> Iterato
             yield where_of.pop(future), future.result()
     finally:
         client.cancel(list(where_of))
+
+
+def _x64() -> bool:
+    return jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
 
 
 class _Parcel:

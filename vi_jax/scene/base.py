@@ -70,6 +70,13 @@ class AbstractScene(eqx.Module):
         """The longest step that holds at most one extremum of the motion; at most `cycle`/5."""
         return self.cycle / 5
 
+    def relaxation(self, s: Float[Array, ""], state: State) -> Float[Array, ""] | None:
+        """The shortest time constant (in `s`) with which something fades, `None` if nothing does.
+
+        Explicit Runge–Kutta methods are unstable with steps much longer than this.
+        """
+        return None
+
     def may_rest(self) -> bool:
         """Whether the body can come to rest on a stop, as far as is known; static."""
         return bool(self.stops)

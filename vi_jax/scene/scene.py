@@ -236,19 +236,23 @@ class Scene(AbstractScene):
         return 2 * pi / duration
 
     def step_limit(self, s: Float[Array, ""], state: Any) -> Float[Array, ""]:
-        """A fifth of the shorter of the drive's turn and the body's natural period.
+        """A fifth of the shorter of the drive's turn and the body's natural period."""
+        speed = self._speed(state)
+        turn = 0.4 * pi / jnp.maximum(1.0, speed)
+        return turn * speed if self.clock_name == "phase" else turn
 
-        A strong motor pulls its shaft back to speed within w0/τ0 of time: no step is longer than
-        three of that, up to which explicit Runge–Kutta methods stay stable.
-        """
-        if isinstance(self.drive, IdealDrive):
-            speed, pull = self.drive.frequency_ratio, 0.0
-        else:
-            speed = jnp.abs(state.W)
-            pull = self.drive.strength / self.drive.no_load_speed
-        if self.clock_name == "phase":
-            return 0.4 * pi * speed / jnp.maximum(jnp.maximum(1.0, speed), 0.4 * pi / 3 * pull)
-        return 0.4 * pi / jnp.maximum(jnp.maximum(1.0, speed), 0.4 * pi / 3 * pull)
+    def relaxation(self, s: Float[Array, ""], state: Any) -> Float[Array, ""]:
+        """1/2ξ of a strongly damped body, or the time w0/τ0 in which a motor is back at speed."""
+        rate = 2 * self.damping_ratio
+        if isinstance(self.drive, Motor):
+            rate = jnp.maximum(rate, self.drive.strength / self.drive.no_load_speed)
+        pace = self._speed(state) if self.clock_name == "phase" else 1.0
+        return pace / jnp.maximum(rate, 1e-6)
+
+    def _speed(self, state: Any) -> Float[Array, "..."]:
+        """Of the crank, without its sign."""
+        drive = self.drive
+        return drive.frequency_ratio if isinstance(drive, IdealDrive) else jnp.abs(state.W)
 
     def may_rest(self) -> bool:
         """Not if all gaps are known and beyond the crank's reach, so that nothing presses on."""
