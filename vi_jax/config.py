@@ -7,7 +7,8 @@
     crank = "slider"                # with crank_ratio; "cosine" by default
 
     [start]                         # Y, V and, for a motor, W; at rest if left out
-    [method]                        # name = "exact-flight", "adaptive" or "fixed-step"; solver, …
+    [method]                        # name = "draft", "standard", "reference", or "exact-flight",
+                                    # "adaptive", "fixed-step" with solver, rtol, …
     [axes]                          # for scan: rows of values, as lists or as below
     "stops.0.restitution" = { from = 0.1, to = 0.9, count = 64 }
 
@@ -148,17 +149,20 @@ class StartTable:
 class MethodTable:
     """`[method]`: how the scene is carried."""
 
-    name: Literal["exact-flight", "adaptive", "fixed-step"]
+    name: Literal["draft", "standard", "reference", "exact-flight", "adaptive", "fixed-step"]
     solver: str | None = None
     rtol: float | None = None
     atol: float | None = None
     steps_per_cycle: int | None = None
 
-    def build(self) -> AbstractMethod:
-        """The method."""
-        kind, options = _METHODS[self.name], given(self, "name")
-        for key in options.keys() - {field.name for field in dataclasses.fields(kind)}:
+    def build(self) -> AbstractMethod | str:
+        """The method, or the name of a preset."""
+        kind, options = _METHODS.get(self.name), given(self, "name")
+        known = {field.name for field in dataclasses.fields(kind)} if kind else set()
+        for key in options.keys() - known:
             raise ConfigError(f'`{key}` in [method] does not belong to name = "{self.name}"')
+        if kind is None:
+            return self.name
         if self.solver is not None:
             if self.solver not in _SOLVERS:
                 raise ConfigError(unknown("solver", self.solver, "[method]", _SOLVERS))
@@ -280,7 +284,7 @@ class Config:
     orbit: OrbitTable | None = None
     simulate: SimulateTable | None = None
 
-    def build(self) -> tuple[Scene, Any, AbstractMethod | None]:
+    def build(self) -> tuple[Scene, Any, AbstractMethod | str | None]:
         """Scene, start and method; `None` for what the file leaves out."""
         table = self.scene or self.machine
         if table is None or (self.scene and self.machine):

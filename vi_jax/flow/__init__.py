@@ -1,13 +1,17 @@
 """How a scene moves: methods, the hybrid step, the closed-form flight, `simulate`, results."""
 
+from .choice import preset as preset
 from .exact import ExactFlight as ExactFlight
 from .fusion import jit as jit
 from .methods import AbstractMethod as AbstractMethod
 from .methods import Adaptive as Adaptive
 from .methods import FixedStep as FixedStep
 from .results import RESULTS as RESULTS
+from .results import Errors as Errors
 from .results import ImpactLog as ImpactLog
 from .results import Run as Run
 from .results import Samples as Samples
 from .simulate import simulate as simulate
+from .suggest import Suggestion as Suggestion
+from .suggest import suggest_method as suggest_method
 from .unrolled import Unrolled as Unrolled

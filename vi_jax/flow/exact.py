@@ -2,9 +2,11 @@
 
 from math import factorial
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._checks import count
 from ..scene import AbstractScene, CosineCrank, IdealDrive, OscillatorState, Scene
 from ..scene.trig import horner, sincos
 from .methods import AbstractMethod
@@ -27,12 +29,21 @@ class ExactFlight(AbstractMethod):
     (the secular case) included. For ideal drives with a `CosineCrank`. The motion is followed in
     arcs of at most a fifth of the shorter period, each ended at the next turning point, so that
     an impact is missed only if it is shallower than rounding.
+
+    **Arguments:** `steps_per_cycle`, arcs in a turn (default 5, the fewest). More of them change
+    nothing but the rounding.
+
+    **Raises:** `ValueError` for fewer than 5 arcs.
     """
 
-    @property
-    def steps_per_cycle(self) -> int:
-        """Five arcs of at most a fifth of a turn."""
-        return 5
+    steps_per_cycle: int = eqx.field(static=True, default=5)  # pyright: ignore
+
+    def __check_init__(self):
+        count("steps_per_cycle", self.steps_per_cycle, least=5)
+
+    def tighter(self):
+        """Three more arcs: the difference is what rounding has grown to."""
+        return ExactFlight(self.steps_per_cycle + 3)
 
     @property
     def uses_field(self) -> bool:

@@ -70,6 +70,10 @@ class AbstractMethod(eqx.Module):
         `one` is a 1 that the compiler does not know, see `fusion.pin`.
         """
 
+    @abc.abstractmethod
+    def tighter(self) -> "AbstractMethod":
+        """A method of the same kind and much smaller error, by which this one's is estimated."""
+
     def resize(self, error: Scalar) -> Scalar:
         """Factor from one step's length to the next one's."""
         return jnp.ones_like(error)
@@ -139,6 +143,12 @@ class Adaptive(AbstractMethod):
         parts = jtu.tree_leaves(scaled)
         return new, time, jnp.sqrt(jax.lax.stop_gradient(sum(parts) / len(parts)))
 
+    def tighter(self):
+        """A hundredth of the tolerances."""
+        tolerances = [self.rtol] if self.atol is None else [self.rtol, self.atol]
+        smaller = [x / 100 for x in tolerances]
+        return eqx.tree_at(lambda m: [m.rtol, m.atol][: len(smaller)], self, smaller)
+
     def resize(self, error):
         """0.9 · error^(-1/order), between 0.2 and 5."""
         # A step length needs no double precision, and single precision powers vectorise.
@@ -173,3 +183,7 @@ class FixedStep(AbstractMethod):
         """One Runge–Kutta step; its error is not asked for."""
         new, time, _ = _runge_kutta(self.solver, scene, s0, s1, state, time, one)
         return new, time, jnp.zeros_like(s0)
+
+    def tighter(self):
+        """Twice the steps."""
+        return FixedStep(self.solver, 2 * self.steps_per_cycle)

@@ -103,6 +103,23 @@ class ImpactLog(eqx.Module):
     """Index into `scene.stops`."""
 
 
+class Errors(eqx.Module):
+    """Estimated errors of a run: its differences to a run by the method's `tighter` one.
+
+    NaN where either run failed. Where a motion is chaotic they grow until they are as large as the
+    motion. Under `vmap` batch axes come first.
+    """
+
+    sections: Any
+    """Of the section states, a pytree like them; leaves (cycles + 1,)."""
+    y_max: Float[Array, " cycles"] | None
+    """Of the greatest Y in each cycle."""
+    y_min: Float[Array, " cycles"] | None
+    """Of the smallest Y in each cycle."""
+    impacts: Int[Array, " cycles"]
+    """Difference of the impact counts in each cycle."""
+
+
 class Run(eqx.Module):
     """What `simulate` returns, cycle by cycle. After a failure the rest is NaN (counts: 0).
 
@@ -135,6 +152,8 @@ class Run(eqx.Module):
     """Dense samples, if asked for."""
     impact_log: ImpactLog | None
     """The impacts, if asked for."""
+    errors: Errors | None
+    """Estimated errors, if asked for."""
     result: RESULTS
     """Why the run ended: `RESULTS.successful`, or what went wrong."""
     steps: Int[Array, ""]
@@ -166,6 +185,9 @@ class Run(eqx.Module):
         lines.append(f"  last section: {last}")
         if self.y_min is not None and self.y_max is not None:
             lines.append(f"  last cycle: Y in [{self.y_min[-1]:.6g}, {self.y_max[-1]:.6g}]")
+        if self.errors is not None:
+            worst = max(float(jnp.max(x)) for x in jtu.tree_leaves(self.errors.sections))
+            lines.append(f"  error of the sections, estimated: {worst:.2g}")
         lines.append(f"  steps: {int(self.steps)} tried, {int(self.rejected)} rejected")
         ended = "completed" if bool(self.successful) else RESULTS[self.result]
         return "\n".join([*lines, f"  ended: {ended}"])

@@ -1,5 +1,6 @@
 """`simulate`: a scene, a start, a number of cycles and a method give a run."""
 
+import dataclasses
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -12,12 +13,12 @@ import numpy as np
 
 from .._checks import concrete, count, one_of
 from ..scene import AbstractScene, Scene
-from .choice import chosen
+from .choice import MethodLike, chosen
 from .lane import Lane, Plan, Record
 from .loop import run_forward, run_reverse
-from .methods import AbstractMethod, Adaptive
+from .methods import Adaptive
 from .pool import run_pool
-from .results import ImpactLog, Run, Samples, reason
+from .results import Errors, ImpactLog, Run, Samples, reason
 
 # Steps in a cycle that reverse mode makes room for, unless the caller says otherwise.
 _STEPS = 65536
@@ -29,11 +30,12 @@ def simulate(
     cycles: int,
     *,
     settle: Any = 0,
-    method: AbstractMethod | None = None,
+    method: MethodLike = None,
     clock: str | None = None,
     samples: int = 0,
     impact_log: int = 0,
     record: str = "motion",
+    estimate: bool = False,
     adjoint: str = "forward",
     rests: bool | None = None,
     max_impacts: int = 1000,
@@ -52,8 +54,9 @@ def simulate(
     - `cycles`: number of drive cycles to record, at least 1; static.
     - `settle`: drive cycles before them, of which nothing is kept; another number is not another
       program.
-    - `method`: `Adaptive`, `FixedStep` or `ExactFlight`; by default `ExactFlight()` where it
-      applies, else `Adaptive()`.
+    - `method`: `Adaptive(...)`, `FixedStep(...)`, `ExactFlight()`, or the name of a `preset`; by
+      default `ExactFlight()` where it applies, else `Adaptive()`, which on a single lane is faster
+      than fixed steps and minds scenes of any kind.
     - `clock`: `"phase"` or `"time"`; `None` leaves the scene's own. The phase clock needs a crank
       that turns forward; the time clock carries a start from rest and a stall.
     - `samples`: dense samples per cycle, evenly spaced on the drive's clock. Steps end on them, so
@@ -61,6 +64,8 @@ def simulate(
     - `impact_log`: number of impacts to log in each cycle; with it comes `Run.clearance`.
     - `record`: `"motion"`, or `"sections"` to leave out extremes, durations and impact speeds
       (then `None`), which is faster.
+    - `estimate`: run it again by a tighter method (`AbstractMethod.tighter`) and give the
+      differences as `Run.errors`, for two to three times the work.
     - `adjoint`: `"forward"` (fast; `jvp`, `jacfwd`) or `"reverse"` (checkpointed; `vjp`, `grad`).
     - `rests`: whether the body may come to rest on a stop; `False` leaves that out of the program,
       which is a fifth faster. By default it is left out if all gaps are known and greater than 1,
@@ -84,6 +89,10 @@ def simulate(
         max_impacts=max_impacts, max_steps=max_steps,
     )  # fmt: skip
     run = _simulate(plan, start, samples > 0)
+    if estimate:
+        tighter = dataclasses.replace(plan, method=plan.method.tighter())
+        errors = _errors(run, _simulate(tighter, start, False))
+        run = dataclasses.replace(run, errors=errors)
     if throw:
         failed = "A lane of the simulation failed; see `RESULTS` and `Run.result`."
         run = eqx.error_if(run, ~run.successful, failed)
@@ -96,7 +105,7 @@ def planned(
     cycles: int,
     *,
     settle: Any = 0,
-    method: AbstractMethod | None = None,
+    method: MethodLike = None,
     clock: str | None = None,
     samples: int = 0,
     impact_log: int = 0,
@@ -111,7 +120,7 @@ def planned(
         raise TypeError(
             f"Argument `scene` must be a `Scene` or an `AbstractScene`, but got {scene!r}."
         )
-    method = chosen(scene, method, Adaptive())
+    method = chosen(scene, method)
     cycles = count("cycles", cycles, least=1)
     samples = count("samples", samples)
     impact_log = count("impact_log", impact_log)
@@ -209,6 +218,21 @@ def _simulate(plan: Plan, start: Any, sampled: bool) -> Run:
     return collect(plan, sampled, lane, states, records)
 
 
+def _errors(run: Run, tighter: Run) -> Errors:
+    """What two runs differ by."""
+
+    def apart(a: Any, b: Any) -> Any:
+        both = run.successful & tighter.successful
+        return jtu.tree_map(lambda a, b: jnp.where(both, jnp.abs(a - b), jnp.nan), a, b)
+
+    return Errors(
+        sections=apart(run.sections, tighter.sections),
+        y_max=apart(run.y_max, tighter.y_max),
+        y_min=apart(run.y_min, tighter.y_min),
+        impacts=jnp.abs(run.impacts - tighter.impacts),
+    )
+
+
 def simulate_pool(
     lane_of: Callable[[Any], tuple[AbstractScene, Any]],
     values: Any,
@@ -275,6 +299,7 @@ def collect(plan: Plan, sampled: bool, lane: Lane, points: Any, records: Record)
         frequency_ratio=None if duration is None else scene.frequency_ratio(duration),
         samples=dense,
         impact_log=log,
+        errors=None,
         result=reason(lane.fault),
         steps=lane.steps.astype(jnp.int32),
         rejected=lane.rejected.astype(jnp.int32),

@@ -14,7 +14,7 @@ from jax.flatten_util import ravel_pytree
 from scipy.optimize import brentq, newton
 
 from .._checks import count, require
-from ..flow import AbstractMethod
+from ..flow.choice import MethodLike
 from ..scene import AbstractScene, Scene
 from ..scene.leaves import check_again, check_leaf, leaf, with_leaf
 from .curve import Step, array_of, corrected, first_tangent, walk
@@ -168,7 +168,7 @@ def continue_orbit(
     step: float = 0.01,
     max_step: float = 0.1,
     max_points: int = 1000,
-    flow: AbstractMethod | None = None,
+    flow: MethodLike = None,
 ) -> Branch:
     """Follow a periodic motion in one number of its scene, both ways, through folds.
 
@@ -273,7 +273,7 @@ def _problem(
     orbit: Orbit,
     parameters: tuple[str, ...],
     ranges: list[tuple[float, float]],
-    flow: AbstractMethod | None,
+    flow: MethodLike,
 ) -> tuple[Shooting, np.ndarray]:
     """The equations of an orbit from impact to impact, and the unknowns it gives."""
     scene = orbit.scene

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from .._checks import count
 from ..flow import AbstractMethod, Adaptive, simulate
-from ..flow.choice import chosen
+from ..flow.choice import MethodLike, chosen
 from ..flow.simulate import as_floats
 from ..scene import AbstractScene, Scene
 from .tangent import by_columns
@@ -64,7 +64,7 @@ def cycle_map(
     scene: AbstractScene,
     cycles: int = 1,
     *,
-    flow: AbstractMethod | None = None,
+    flow: MethodLike = None,
     section: Any = None,
 ) -> CycleMap:
     """The Poincaré map of `scene` over a number of drive cycles.

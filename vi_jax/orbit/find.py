@@ -14,7 +14,8 @@ from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Float, Int
 
 from .._checks import concrete, count
-from ..flow import AbstractMethod, simulate
+from ..flow import simulate
+from ..flow.choice import MethodLike
 from ..scene import AbstractScene, Scene
 from .cycle_map import CycleMap, adopted, cycle_map
 from .floquet import multipliers_of
@@ -39,7 +40,7 @@ def find_orbit(
     cycles: int = 1,
     *,
     method: AbstractSearch | None = None,
-    flow: AbstractMethod | None = None,
+    flow: MethodLike = None,
     section: Any = None,
     impact_log: int = 8,
     throw: bool = False,

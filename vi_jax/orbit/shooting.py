@@ -21,7 +21,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Complex, Float
 
 from ..flow import AbstractMethod, FixedStep
-from ..flow.choice import chosen
+from ..flow.choice import MethodLike, chosen
 from ..flow.events import rates
 from ..scene import AbstractScene
 from ..scene.leaves import with_leaf
@@ -292,9 +292,10 @@ class Shooting(eqx.Module):
         return low, high, room, touch
 
 
-def carrier(flow: AbstractMethod | None, scene: AbstractScene) -> AbstractMethod:
+def carrier(flow: MethodLike, scene: AbstractScene) -> AbstractMethod:
     """A method of fixed steps, which a smooth system of equations needs: `flow` if it is one, else
     `ExactFlight` where it applies, else 32 steps of Dopri8 a cycle, whose error is 1e-13."""
+    flow = chosen(scene, flow, argument="flow")
     if isinstance(flow, FixedStep):
         return flow
     return chosen(scene, None, FixedStep(diffrax.Dopri8(), 32))

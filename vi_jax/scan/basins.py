@@ -12,8 +12,8 @@ import numpy as np
 import xarray as xr
 
 from .._checks import count
-from ..flow import AbstractMethod, FixedStep, simulate
-from ..flow.choice import chosen
+from ..flow import simulate
+from ..flow.choice import MethodLike, chosen
 from ..orbit.results import told_impacts
 from ..scene import AbstractScene, Scene
 from .grid import axes_of
@@ -96,7 +96,7 @@ def basins(
     longest: int = 64,
     tolerance: float = 1e-6,
     apart: float = 1e-3,
-    method: AbstractMethod | None = None,
+    method: MethodLike = None,
     start: Any = None,
     **options: Any,
 ) -> Basins:
@@ -150,7 +150,7 @@ def basins(
         samples = count("samples", samples, least=1)
         rng = np.random.default_rng(seed)
         axes = {name: rng.uniform(low, high, samples) for name, (low, high) in ranges.items()}
-    method = chosen(scene, method, FixedStep())
+    method = chosen(scene, method)
     measure = (Regime(longest=longest, tolerance=tolerance), _Mark(longest))
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "[0-9,]+ of [0-9,]+ lanes failed")

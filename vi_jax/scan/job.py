@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._checks import count
-from ..flow import AbstractMethod, FixedStep
+from ..flow import AbstractMethod
 from ..flow.aim import select
-from ..flow.choice import chosen
+from ..flow.choice import MethodLike, chosen
 from ..flow.results import number_of
 from ..flow.simulate import simulate_pool
 from ..scene import AbstractScene, Scene
@@ -164,7 +164,7 @@ def make_job(
     start: Any = None,
     settle: Any = 200,
     cycles: int | None = None,
-    method: AbstractMethod | None = None,
+    method: MethodLike = None,
     clock: str | None = None,
     derivatives: Iterable[str] = (),
     max_impacts: int = 1000,
@@ -201,7 +201,7 @@ def make_job(
         start=_as_arrays(start),
         derivatives=(derivatives,) if isinstance(derivatives, str) else tuple(derivatives),
         measures=_as_arrays(measures),
-        method=_as_arrays(chosen(template, method, FixedStep())),
+        method=_as_arrays(chosen(template, method)),
         clock=clock,
         cycles=cycles,
         settle=jnp.asarray(settle),

@@ -10,8 +10,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
 from .._checks import count
-from ..flow import RESULTS, AbstractMethod, FixedStep, simulate
-from ..flow.choice import chosen
+from ..flow import RESULTS, simulate
+from ..flow.choice import MethodLike, chosen
 from ..orbit.cycle_map import CycleMap, adopted, cycle_map
 from ..scene import AbstractScene, MotorState, TimedMotorState
 
@@ -50,7 +50,7 @@ def lyapunov(
     *,
     settle: Any = 200,
     number: int | None = None,
-    method: AbstractMethod | None = None,
+    method: MethodLike = None,
 ) -> Lyapunov:
     """The Lyapunov spectrum of the motion that `start` settles on.
 
@@ -69,7 +69,7 @@ def lyapunov(
     - `settle`: drive cycles before that.
     - `number`: how many exponents, the greatest ones; all by default. Each costs about as much
       as the simulation itself.
-    - `method`: by default `ExactFlight` where it applies, else `FixedStep()`.
+    - `method`: by default the `"standard"` preset.
 
     **Returns:** a `Lyapunov`.
 
@@ -78,7 +78,7 @@ def lyapunov(
     cycles = count("cycles", cycles, least=8)
     if isinstance(start, TimedMotorState):
         start = MotorState(start.Y, start.V, start.W)
-    flow = chosen(scene, method, FixedStep())
+    flow = chosen(scene, method)
     carried = cycle_map(scene, flow=flow)
     start = adopted(carried.scene, start)
     states = ravel_pytree(start)[0].size

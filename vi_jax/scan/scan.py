@@ -18,7 +18,8 @@ import xarray as xr
 from tqdm import tqdm
 
 from .._checks import count
-from ..flow import AbstractMethod, simulate
+from ..flow import simulate
+from ..flow.choice import MethodLike
 from ..flow.results import REASON_NAMES
 from ..scene import AbstractScene
 from ..scene.leaves import leaf, leaf_names
@@ -50,7 +51,7 @@ def scan(
     start: Any = None,
     settle: int = 200,
     cycles: int | None = None,
-    method: AbstractMethod | None = None,
+    method: MethodLike = None,
     clock: str | None = None,
     derivatives: Iterable[str] = (),
     paired: bool = False,
@@ -81,8 +82,8 @@ def scan(
     - `start`: the first state; by default the scene's own start at rest.
     - `settle`, `cycles`: drive cycles before observing (any number), and observed (static; by
       default as many as the measures need, at least 32).
-    - `method`, `clock`, `max_impacts`, `max_steps`: as for `simulate`; by default `ExactFlight`
-      where it applies, else `FixedStep()`.
+    - `method`, `clock`, `max_impacts`, `max_steps`: as for `simulate`; by default the
+      `"standard"` preset.
     - `derivatives`: names, as on the axes, by which all floating-point variables are
       differentiated, in forward mode: `d_y_min` and so on, with an axis `by`.
     - `paired`: take the axes' values together, one lane for each place in the rows (which must be

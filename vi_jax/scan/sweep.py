@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._checks import concrete, count, number, require
-from ..flow import RESULTS, AbstractMethod, FixedStep, simulate
-from ..flow.choice import chosen
+from ..flow import RESULTS, simulate
+from ..flow.choice import MethodLike, chosen
 from ..flow.simulate import check_start
 from ..scene import AbstractScene, Scene
 from ..scene.leaves import check_again, check_leaf, with_leaf
@@ -54,7 +54,7 @@ def sweep(
     start: Any = None,
     settle: int = 200,
     cycles: int = 32,
-    method: AbstractMethod | None = None,
+    method: MethodLike = None,
     clock: str | None = None,
     tolerance: float = 1e-6,
     max_steps: int | None = None,
@@ -72,8 +72,7 @@ def sweep(
     - `values`: its values in the order of the sweep.
     - `start`: state at the first value; by default at rest (a motor at its no-load speed).
     - `settle`, `cycles`: drive cycles at each value before observing, and observed; static.
-    - `method`, `clock`: as for `simulate`; by default `ExactFlight` where it applies, else
-      `FixedStep()`.
+    - `method`, `clock`: as for `simulate`; by default the `"standard"` preset.
     - `tolerance`: how closely sections must repeat for a period.
     - `max_steps`: steps at each value beyond which it counts as failed.
 
@@ -103,7 +102,7 @@ def sweep(
         first = with_leaf(scene, parameter, values[0])
         assert isinstance(first, Scene)
         start = first.start()
-    method = chosen(scene, method, FixedStep())
+    method = chosen(scene, method)
     if clock is not None:
         if not isinstance(scene, Scene):
             raise ValueError("Argument `clock` must be left out for a scene of your own.")

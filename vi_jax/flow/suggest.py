@@ -1,0 +1,207 @@
+"""`suggest_method`: the fastest method for an error, measured on the user's own scene."""
+
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+
+from .._checks import count, one_of, require
+from ..scene import AbstractScene, Scene
+from .choice import preset
+from .exact import ExactFlight
+from .fusion import jit
+from .methods import AbstractMethod, Adaptive, FixedStep
+from .simulate import check_start, simulate
+
+QUANTITIES = ("state", "extremes", "impacts", "derivative")
+
+_STEPS = (5, 6, 7, 8, 10, 12, 16, 20, 24, 32, 48, 64)
+_TOLERANCES = tuple(10.0**-n for n in range(3, 15))
+_ROUNDS = 5
+
+
+class Tried(NamedTuple):
+    """A method that was measured."""
+
+    method: AbstractMethod
+    name: str
+    error: float
+    seconds: float
+    """For all lanes; NaN where the error ruled it out and it was not timed."""
+
+
+class Suggestion(NamedTuple):
+    """What `suggest_method` found."""
+
+    method: AbstractMethod
+    """The fastest that keeps to the error, or the most accurate if none does."""
+    reached: bool
+    """Whether it keeps to the error."""
+    error: float
+    """What was measured of it."""
+    tried: tuple[Tried, ...]
+
+    def __str__(self) -> str:
+        best = next(t for t in self.tried if t.method is self.method)
+        kept = "" if self.reached else "; no method tried keeps to the error asked for"
+        lines = [f"{best.name}: error {self.error:.1e}{kept}", "  tried:"]
+        for t in self.tried:
+            took = "" if np.isnan(t.seconds) else f", {1e3 * t.seconds:.3g} ms"
+            lines.append(f"    {t.name}: error {t.error:.1e}{took}")
+        return "\n".join(lines)
+
+
+def suggest_method(
+    scene: AbstractScene,
+    *,
+    error: float = 1e-6,
+    quantity: str = "state",
+    start: Any = None,
+    cycles: int = 20,
+    lanes: int = 256,
+) -> Suggestion:
+    """The fastest method that keeps to an error, from a short calibration on the scene itself.
+
+    Takes half a minute or so, most of it compiling. Of a few methods of each kind it measures the
+    error against `ExactFlight` where that applies and else against `Adaptive` at its tightest, and
+    the time of those that keep to it, on lanes that differ in their first velocity.
+
+    **Arguments:**
+
+    - `scene`: the scene, its numbers known.
+    - `error`: the error asked for, relative to 1 + |x|, for 95 of 100 lanes.
+    - `quantity`: of what: `"state"` (on the last section), `"extremes"` (in each cycle),
+      `"impacts"` (phase and speed of each; a missed one is an infinite error) or `"derivative"`
+      (of the last section state by the first velocity).
+    - `start`: the first state; by default the scene's own.
+    - `cycles`: drive cycles of the calibration; in a chaotic motion errors grow with them.
+    - `lanes`: lanes of a batch such as it will be used in; 1 for a single motion.
+
+    **Returns:** a `Suggestion`; its `method` is what the verbs take, and it prints what was tried.
+
+    **Raises:** `ValueError` or `TypeError` for arguments that cannot be used.
+    """
+    require("error", error, low=0.0, open_low=True)
+    one_of("quantity", quantity, QUANTITIES)
+    cycles, lanes = count("cycles", cycles, least=1), count("lanes", lanes, least=1)
+    if start is None:
+        if not isinstance(scene, Scene):
+            raise ValueError("Argument `start` must be given for a scene of your own.")
+        start = scene.start()
+    check_start(scene, start)
+    bench = _Bench(scene, start, quantity, cycles, lanes)
+    best = preset(scene, "reference")
+    if isinstance(best, ExactFlight):
+        bench.truth = bench.result(best.tighter())
+        tried = [bench.tried(best, "ExactFlight()")]
+    else:
+        bench.truth = bench.result(Adaptive(diffrax.Dopri8(), rtol=1e-14))
+        tried = _fixed(bench, error)
+        for tolerance in _TOLERANCES[:-1]:
+            method = Adaptive(diffrax.Dopri8(), rtol=tolerance)
+            tried.append(bench.tried(method, f"Adaptive(Dopri8(), rtol={tolerance:.0e})"))
+            if tried[-1].error <= error:
+                break
+    good = [t for t in tried if t.error <= error]
+    timed = bench.race(good)
+    tried = [timed.get(t.name, t) for t in tried]
+    if timed:
+        found = min(timed.values(), key=lambda t: t.seconds)
+    else:
+        found = min(tried, key=lambda t: t.error)
+    return Suggestion(found.method, bool(timed), found.error, tuple(tried))
+
+
+def _fixed(bench: "_Bench", error: float) -> list[Tried]:
+    """The fewest fixed steps that keep to the error, by bisection: each number is a program."""
+    tried, low, high = [], 0, len(_STEPS) - 1
+    while low <= high:
+        middle = (low + high) // 2
+        steps = _STEPS[middle]
+        method = FixedStep(diffrax.Dopri8(), steps)
+        tried.append(bench.tried(method, f"FixedStep(Dopri8(), {steps})"))
+        if tried[-1].error <= error:
+            high = middle - 1
+        else:
+            low = middle + 1
+    return tried
+
+
+class _Bench:
+    """The calibration run."""
+
+    truth: np.ndarray
+
+    def __init__(self, scene: AbstractScene, start: Any, quantity: str, cycles: int, lanes: int):
+        self.scene, self.start, self.quantity, self.cycles = scene, start, quantity, cycles
+        # Nothing but the velocity is free of stops.
+        self.nudges = jnp.linspace(-0.1, 0.1, lanes) if lanes > 1 else jnp.zeros(1)
+        self.compiled: dict[Any, Callable] = {}
+
+    def lane(self, method: AbstractMethod, nudge: Any) -> Any:
+        """What is looked at, of one lane."""
+        scene = self.scene
+
+        def last(nudge, **options):
+            velocity = scene.velocity(self.start) + nudge
+            start = scene.placed(self.start, scene.position(self.start), velocity)
+            return simulate(scene, start, self.cycles, method=method, **options)
+
+        if self.quantity == "derivative":
+            found = jax.jacfwd(lambda nudge: last(nudge, record="sections").last)(nudge)
+        elif self.quantity == "state":
+            found = last(nudge, record="sections").last
+        elif self.quantity == "extremes":
+            run = last(nudge)
+            found = run.y_min, run.y_max
+        else:
+            run = last(nudge, impact_log=8)
+            assert run.impact_log is not None
+            found = run.impact_log.phase, run.impact_log.speed
+        return jnp.concatenate([jnp.ravel(x) for x in jtu.tree_leaves(found)])
+
+    def program(self, method: AbstractMethod) -> Callable[[], Any]:
+        """All lanes under a method; other tolerances are no other program."""
+        numbers, rest = eqx.partition(method, lambda x: isinstance(x, np.ndarray))
+        key = jtu.tree_structure(rest), tuple(map(repr, jtu.tree_leaves(rest)))
+        if key not in self.compiled:
+            self.compiled[key] = jit(
+                jax.vmap(
+                    lambda numbers, nudge: self.lane(eqx.combine(numbers, rest), nudge),
+                    in_axes=(None, 0),
+                )
+            )
+        run = self.compiled[key]
+        return lambda: jax.block_until_ready(run(numbers, self.nudges))
+
+    def result(self, method: AbstractMethod) -> np.ndarray:
+        """What is looked at, of all lanes."""
+        return np.asarray(self.program(method)())
+
+    def tried(self, method: AbstractMethod, name: str) -> Tried:
+        """A method with its error."""
+        found, truth = self.result(method), self.truth
+        apart = np.abs(found - truth) / (1 + np.abs(truth))
+        apart = np.where(np.isnan(found) & np.isnan(truth), 0.0, apart)
+        worst = np.where(np.isfinite(apart), apart, np.inf).max(axis=1)
+        return Tried(method, name, float(np.quantile(worst, 0.95, method="higher")), np.nan)
+
+    def race(self, tried: list[Tried]) -> dict[str, Tried]:
+        """These with their times, in interleaved rounds."""
+        runs = [self.program(t.method) for t in tried]
+        times: list[list[float]] = [[] for _ in runs]
+        for _ in range(_ROUNDS):
+            for run, seconds in zip(runs, times, strict=True):
+                begin = time.perf_counter()
+                run()
+                seconds.append(time.perf_counter() - begin)
+        return {
+            t.name: t._replace(seconds=float(np.median(seconds)))
+            for t, seconds in zip(tried, times, strict=True)
+        }
