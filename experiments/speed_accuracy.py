@@ -164,6 +164,13 @@ def carried(kind: str, choice: Choice, function: Callable, *arguments: np.ndarra
     return Program(lambda: jax.block_until_ready(compiled(*batch)), seconds)
 
 
+def forget(*kinds: str) -> None:
+    """Let go of compiled programs: a process can hold only so many pieces of memory."""
+    for key in [key for key in _compiled if key[0].endswith(kinds)]:
+        del _compiled[key]
+    jax.clear_caches()
+
+
 # %% [markdown]
 # ## What goes wrong with the motion
 #
@@ -357,8 +364,8 @@ def guesses(drive: str) -> np.ndarray:
 # %% [markdown]
 # ## Chaos
 #
-# In a chaotic motion (here without damping) no method keeps to the truth; the cycles until the error exceeds 1e-3 grow
-# with the logarithm of its accuracy.
+# In a chaotic motion (here without damping) no method keeps to the truth; the cycles until the
+# error exceeds 1e-3 grow with the logarithm of its accuracy.
 
 
 # %%
@@ -531,8 +538,11 @@ def rows_of(drive: str) -> tuple[list[Row], dict[str, float]]:
     second, _ = regimes(adaptive("Dopri8", 1e-13), drive)
     firm = (sure == second).all(axis=0)
     note(f"{drive}: {firm.sum()} of {firm.size} regimes are firm")
-    found = []
+    found, family = [], ""
     for choice in CHOICES[drive]:
+        if choice.family != family or not choice.method.adaptive:
+            forget("seen")
+        family = choice.family
         errors = errors_of(observe(choice, drive), truth, calm)
         wrong, scanning = np.nan, np.nan
         if choice.name in SCANNED:
@@ -541,6 +551,7 @@ def rows_of(drive: str) -> tuple[list[Row], dict[str, float]]:
         found.append((choice, errors, wrong, scanning, timed(choice, drive)))
         note(f"{drive}: {choice.name}: {errors['late95']:.1e}, regimes wrong {wrong:.4f}")
     seconds = race([program for *_, program in found])
+    forget("seen", "timed")
     rows = [
         Row(choice, errors, program.compiling, took, wrong, scanning)
         for (choice, errors, wrong, scanning, program), took in zip(found, seconds, strict=True)
@@ -573,6 +584,7 @@ for drive in ("ideal", "motor"):
     true_states, _ = horizon(TRUTH[drive], drive, None)
     horizons[drive] = [(choice, horizon(choice, drive, true_states)[1]) for choice in fewer]
     note(f"{drive}: orbits and chaos")
+    forget("alone", "cycle", "chaos")
 taken_apart = landings()
 note("measured")
 
@@ -679,8 +691,8 @@ lines += [
     "",
     "## Chaos",
     "",
-    "Without damping: cycles until a run is off by 1e-3 (median of 32 starts), where the greatest Lyapunov exponent "
-    "is "
+    "Without damping: cycles until a run is off by 1e-3 (median of 32 starts), where the "
+    "greatest Lyapunov exponent is "
     + " and ".join(
         f"{rate[d]:.3f} ω ({d}, {'ζ' if d == 'ideal' else 'κ'} = {CHAOTIC[d]:.2f})" for d in CHAOTIC
     )

@@ -133,10 +133,12 @@ def _arrive(
         state = select(c.landed, scene.placed(there, stop.sign * stop.gap, rebound), state)
         direction = jnp.where(c.landed, -float(stop.sign), direction)
         hit, met = taken & c.landed, s
+        lost = 0.5 * (1 - stop.restitution**2) * approach**2
         if contact is not None and trial.position is not None:
             arriving = stop.sign * trial.position[1].v
             last, left = settled(plan, lane, stop, arriving, s, there)
             ends = pin_flag(c.landed & last, lane.one)
+            lost = jnp.where(ends, 0.5 * approach**2, lost)
             wait = pin(jnp.where(ends, left, 0.0), lane.one)
             (later, passed) = jtu.tree_map(lambda x, dx, w=wait: x + w * dx, (state, time), flow)
             still = scene.placed(later, stop.sign * stop.gap, jnp.zeros_like(s))
@@ -153,7 +155,6 @@ def _arrive(
         if speed is not None:
             speed = jnp.where(hit, jnp.maximum(speed, approach), speed)
         if loss is not None:
-            lost = 0.5 * (1 - stop.restitution**2) * approach**2
             loss = loss + jnp.where(hit, lost, 0.0)
     if trial.leaves is not None:
         assert contact is not None and lane.contact is not None

@@ -23,8 +23,9 @@ Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]
 
 # A release is approached by steps taken from the pressed side, each this much short of where the
-# last one says that it is, until one is so short that the force is straight over it.
-_SHORT, _STRAIGHT = 1e-3, 1e-5
+# last one says that it is, until one is so short that the force is straight over it; it is met if
+# it is this close then.
+_IN_DOUBLE, _IN_SINGLE = (1e-3, 1e-5, 1e-9), (1e-2, 1e-3, 1e-4)
 
 
 class Holding(AbstractScene):
@@ -52,10 +53,10 @@ class Holding(AbstractScene):
         return self.scene.pace(s, state)
 
 
-def brief(scene: AbstractScene, like: Scalar) -> Scalar:
+def brief(scene: AbstractScene, s: Scalar, state: Any) -> Scalar:
     """How much of a chatter may be left when it is completed: its error is of second order."""
-    share = 1.6e-6 if like.dtype == jnp.float64 else 1.6e-4
-    return stop_gradient(share * jnp.asarray(scene.cycle, like.dtype))
+    share = 8e-6 if s.dtype == jnp.float64 else 8e-4
+    return stop_gradient(share * jnp.asarray(scene.step_limit(s, state), s.dtype))
 
 
 def remaining(restitution: Scalar, approach: Scalar, pressing: Scalar) -> Scalar:
@@ -81,7 +82,7 @@ def settled(
     rested = scene.placed(there, jnp.asarray(stop.sign * stop.gap), jnp.zeros_like(s))
     pressing = stop.sign * rates(scene.field, scene.position, s, rested).a
     left = remaining(stop.restitution, jnp.maximum(speed, 0.0), pressing)
-    ends = stop_gradient(left) <= brief(scene, s)
+    ends = stop_gradient(left) <= brief(scene, s, there)
     if plan.ticks(lane.state):
         ends = ends & (stop_gradient(s + left) < stop_gradient(plan.end(lane.part)))
     return ends, left
@@ -96,6 +97,7 @@ def release(
     The force is the acceleration that a free body would have there.
     """
     assert lane.contact is not None
+    short, straight, closeness = _IN_DOUBLE if h.dtype == jnp.float64 else _IN_SINGLE
     sign = jnp.zeros_like(h)
     for i, stop in enumerate(stops):
         sign = jnp.where(lane.contact == 1.0 + i, float(stop.sign), sign)
@@ -104,10 +106,14 @@ def release(
     held = good & (sign != 0)
     rising = held & (rise > 0)
     offset = -after * h / jnp.where(rising, rise, 1.0)
-    close = jnp.abs(stop_gradient(offset)) <= (1e-9 if h.dtype == jnp.float64 else 1e-5)
-    landed = rising & (lane.target == RELEASE) & (h <= 2 * _STRAIGHT) & close
+    close = jnp.abs(stop_gradient(offset)) <= closeness
+    landed = rising & (lane.target == RELEASE) & (h <= 2 * straight) & close
     left = rising & (after > 0) & ~landed
     place = stop_gradient(h + offset)
-    place = jnp.where(h > _STRAIGHT, (1 - _SHORT) * place, place)
+    place = jnp.where(h > straight, (1 - short) * place, place)
     landed = pin_flag(landed, lane.one)
-    return pin_flag(left, lane.one), landed, place, jnp.where(landed, offset, 0.0)
+    # By rounding's measure late rather than early, when it would be pressed on again; and no step
+    # towards it is so short that it would not move on.
+    late = 8 * float(jnp.finfo(h.dtype).eps) * (1 + stop_gradient(lane.s + h))
+    place = jnp.maximum(place, 2 * late)
+    return pin_flag(left, lane.one), landed, place, jnp.where(landed, offset + late, 0.0)

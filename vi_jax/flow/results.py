@@ -140,7 +140,8 @@ class Run(eqx.Module):
     """Times the body came to rest on a stop, its endless last impacts completed at once (they are
     not among `impacts`)."""
     impact_energy: Float[Array, " cycles"] | None
-    """Energy lost in impacts in each cycle, Σ ½(1 - k²)V⁻² (unit: m_C a²ω²)."""
+    """Energy lost in impacts in each cycle, Σ ½(1 - k²)V⁻², and ½V⁻² where the body came to rest
+    (unit: m_C a²ω²)."""
     clearance: Float[Array, " cycles"] | None
     """Smallest distance to a stop at which the body turned back in each cycle without touching it
     (unit: a), infinite where it did not; recorded along with the impact log."""

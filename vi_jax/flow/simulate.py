@@ -16,7 +16,6 @@ from ..scene import AbstractScene, Scene
 from .choice import MethodLike, chosen
 from .lane import Lane, Plan, Record
 from .loop import run_forward, run_reverse
-from .methods import Adaptive
 from .pool import run_pool
 from .results import Errors, ImpactLog, Run, Samples, reason
 
@@ -54,9 +53,8 @@ def simulate(
     - `cycles`: number of drive cycles to record, at least 1; static.
     - `settle`: drive cycles before them, of which nothing is kept; another number is not another
       program.
-    - `method`: `Adaptive(...)`, `FixedStep(...)`, `ExactFlight()`, or the name of a `preset`; by
-      default `ExactFlight()` where it applies, else `Adaptive()`, which on a single lane is faster
-      than fixed steps and minds scenes of any kind.
+    - `method`: `Adaptive(...)`, `FixedStep(...)`, `ExactFlight()`, or the name of a `preset`,
+      by default `"standard"`.
     - `clock`: `"phase"` or `"time"`; `None` leaves the scene's own. The phase clock needs a crank
       that turns forward; the time clock carries a start from rest and a stall.
     - `samples`: dense samples per cycle, evenly spaced on the drive's clock. Steps end on them, so
