@@ -77,6 +77,12 @@ def within(exact: float, fixed: float, adaptive: float) -> dict[str, float]:
 
 
 # %%
+def root(function: Callable[[float], float], low: float, high: float, xtol: float) -> float:
+    """Where a function of opposite signs at both ends is zero."""
+    found: Any = brentq(function, low, high, xtol=xtol)
+    return float(found)
+
+
 def flown(zeta: float, xi: float, stops: list, Y: float, V: float, cycles: int) -> np.ndarray:
     """States of the ideal drive in each half cycle, by matrix exponentials.
 
@@ -91,7 +97,8 @@ def flown(zeta: float, xi: float, stops: list, Y: float, V: float, cycles: int) 
     steps = 2 * int(200 * max(1.0, 1 / zeta))
     dt = 2 * pi / zeta / steps
     whole = expm(matrix * dt)
-    y, states = np.array([Y, V]), [(Y, V)]
+    y: Any = np.array([Y, V])
+    states = [(Y, V)]
 
     def moved(y, at, length):
         z = np.array([*y, cos(zeta * at), sin(zeta * at)])
@@ -116,7 +123,7 @@ def flown(zeta: float, xi: float, stops: list, Y: float, V: float, cycles: int) 
 
                     if force(left) > 0:
                         break
-                    wait = brentq(force, 0, left, xtol=1e-15)
+                    wait = root(force, 0, left, xtol=1e-15)
                     at, left = at + wait + 1e-15, left - wait
                 length = dt if left == dt else left
                 new = moved(y, at, length)
@@ -130,12 +137,24 @@ def flown(zeta: float, xi: float, stops: list, Y: float, V: float, cycles: int) 
                     return sign * moved(y, at, t)[0] - gap
 
                 first = 1e-12 * dt if beyond(0.0) >= 0 else 0.0
-                spent = brentq(beyond, first, left, xtol=1e-16) if beyond(first) < 0 else first
+                spent = root(beyond, first, left, xtol=1e-16) if beyond(first) < 0 else first
                 speed = moved(y, at, spent)[1]
                 y = np.array([sign * gap, -k * speed if k else 0.0])
                 at, left = at + spent, left - spent
         states.append(tuple(y))
     return np.array(states)
+
+
+class Event:
+    """Ends a SciPy run where a function of the state rises through zero."""
+
+    terminal, direction = True, 1
+
+    def __init__(self, function: Callable[[Any], float]):
+        self.function = function
+
+    def __call__(self, t, x):
+        return self.function(x)
 
 
 def turned(motor: dict, stops: list, start: list, cycles: int, ratio: float = 0.0) -> np.ndarray:
@@ -158,18 +177,8 @@ def turned(motor: dict, stops: list, start: list, cycles: int, ratio: float = 0.
         torque -= motor["mu"] * du * ddu * W * W
         return [V, u - Y - 2 * motor["xi"] * V, torque / (1 + motor["mu"] * du**2), W]
 
-    def section(t, x):
-        return x[3] - 2 * pi
-
-    def met(sign, gap):
-        def event(t, x):
-            return sign * x[0] - gap
-
-        event.terminal, event.direction = True, 1
-        return event
-
-    section.terminal, section.direction = True, 1
-    events = [section, *(met(sign, gap) for sign, gap, _ in stops)]
+    events = [Event(lambda x: x[3] - 2 * pi)]
+    events += [Event(lambda x, sign=sign, gap=gap: sign * x[0] - gap) for sign, gap, _ in stops]
     x, states = np.array([*start, 0.0]), [start]
     while len(states) <= cycles:
         run = solve_ivp(
@@ -318,7 +327,7 @@ def damping() -> Found:
 def resonance() -> Found:
     """The secular case."""
     scene, found = ideal(1.0, 0.0, [(1, 2.0, 0.5)]), {}
-    tau = brentq(lambda t: 0.5 * t * sin(t) - 2.0, 6.5, 7.5, xtol=1e-15)
+    tau = root(lambda t: 0.5 * t * sin(t) - 2.0, 6.5, 7.5, xtol=1e-15)
     speed = 0.5 * (sin(tau) + tau * cos(tau))
     for name, method in ALL.items():
         run = vi.simulate(scene, scene.start(), 2, method=method, impact_log=2)
@@ -472,7 +481,7 @@ def machine(xi: float = 0.05, stops: Any = ((1, 2.0, 0.5),), ratio: float = 0.0,
     return scene, {"xi": xi, **motor}
 
 
-def against_scipy(start: list, cycles: int, clock: str = "phase", **options: Any) -> Found:
+def against_scipy(start: list, cycles: int, **options: Any) -> Found:
     """Section states of a motor beside SciPy's."""
     scene, numbers = machine(**options)
     truth = turned(
@@ -481,7 +490,7 @@ def against_scipy(start: list, cycles: int, clock: str = "phase", **options: Any
     found = {}
     for name, method in STEPPED.items():
         state = scene.start(Y=start[0], V=start[1], W=start[2])
-        mine = sections(scene, state, cycles, method, clock=clock)
+        mine = sections(scene, state, cycles, method)
         found[name] = float(np.max(np.abs(mine - truth) / (1 + np.abs(truth))))
     return found
 
@@ -515,7 +524,7 @@ def stalling() -> Found:
     timed = scene.in_clock("time")
     # Swings last long: a scene of its own clock is observed as often as asked.
     for name, method in STEPPED.items():
-        watched = Watched(timed, timed.stops)
+        watched = Watched(scene=timed, stops=timed.stops)
         run = vi.simulate(watched, timed.adopt(start), 40, method=method)
         turned_back = bool((run.sections.W < 0).any())
         change = energy(scene, run.last) / energy(scene, start) - 1

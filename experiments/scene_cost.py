@@ -65,7 +65,7 @@ def lane(
     return lambda ratio: jax.jvp(run, (ratio,), (1.0,))
 
 
-bare = {"record": "sections"}
+bare: dict[str, Any] = {"record": "sections"}
 SCENES = [
     Made("ideal, no stop", lane(stops=0, **bare)),
     Made("ideal, one stop", lane(**bare), "ideal, no stop"),

@@ -13,16 +13,25 @@ from jax.core import Tracer
 def number(name: str, value: Any) -> jax.Array:
     """A real number or array of numbers as a floating-point JAX array.
 
+    What is no tracer stays a known number inside of `jit` too, so that it can be checked there.
+
     **Raises:** `TypeError` if `value` is not real-valued.
     """
     if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jnp.floating):
         return value
     if isinstance(value, bool | str) or value is None:
         raise TypeError(f"Argument `{name}` must be a real number, but got {value!r}.")
+    if isinstance(value, int | float | np.generic | np.ndarray):
+        with jax.ensure_compile_time_eval():
+            return _floating(name, jnp.asarray(value))
     try:
         array = jnp.asarray(value)
     except (TypeError, ValueError):
         raise TypeError(f"Argument `{name}` must be a real number, but got {value!r}.") from None
+    return _floating(name, array)
+
+
+def _floating(name: str, array: jax.Array) -> jax.Array:
     if not (jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)):
         raise TypeError(
             f"Argument `{name}` must be a real number, but its dtype is {array.dtype.name}."

@@ -108,7 +108,7 @@ GROUPS = {
     "steps, motor by phase": (lambda x: motor(x, "phase"), vi.FixedStep()),
     "tolerance, motor in time": (lambda x: motor(x, "time"), vi.Adaptive(rtol=1e-7)),
     "tolerance, energy on the books": (
-        lambda x: Budget(x["zeta"], x["xi"], stops(x, 2)),
+        lambda x: Budget(zeta=x["zeta"], xi=x["xi"], stops=stops(x, 2)),
         vi.Adaptive(rtol=1e-10),
     ),
 }

@@ -14,7 +14,7 @@ MethodLike = AbstractMethod | str | None
 
 # Steps a cycle of a `Scene`, and the tolerance for a scene of one's own, whose time scales are not
 # known. Chosen from the front that `experiments/speed_accuracy.py` measures.
-_PRESETS = {"draft": (6, 1e-6), "standard": (12, 1e-9), "reference": (32, 1e-13)}
+_PRESETS = {"draft": (6, 1e-6), "standard": (12, 1e-9), "reference": (48, 1e-13)}
 
 
 def preset(scene: AbstractScene | None, name: str = "standard") -> AbstractMethod:
@@ -25,9 +25,11 @@ def preset(scene: AbstractScene | None, name: str = "standard") -> AbstractMetho
     k = 0.8, κ from 0.5 to 1.9; error of the section state after 1,000 cycles that 95 of 100 lanes
     stay under, for lanes that do not amplify 1e-10 beyond 1e-6):
 
-    - `"draft"`: 6 steps of Dopri8 a cycle; DRAFT;
-    - `"standard"`: 12 steps of Dopri8; STANDARD;
-    - `"reference"`: 32 steps of Dopri8; REFERENCE.
+    - `"draft"`: 6 steps of Dopri8 a cycle, error 1e-6, half the time of the next;
+    - `"standard"`: 12 steps of Dopri8, error 4e-9 (the median lane's: 4e-10);
+    - `"reference"`: 48 steps of Dopri8, error 6e-14, four times the time of the one before.
+
+    No regime of 1,024 settled motions came out wrong under the first two.
 
     A scene of your own, whose time scales are not known, gets `Adaptive` with the tolerances 1e-6,
     1e-9 and 1e-13.

@@ -1,6 +1,7 @@
 """`scan`: axes over parameters and starts give a labelled data set."""
 
 import dataclasses
+import functools
 import hashlib
 import json
 import warnings
@@ -55,6 +56,7 @@ def scan(
     clock: str | None = None,
     derivatives: Iterable[str] = (),
     paired: bool = False,
+    verify: int = 0,
     max_impacts: int = 1000,
     max_steps: int | None = None,
     store: str | Path | None = None,
@@ -88,6 +90,10 @@ def scan(
       differentiated, in forward mode: `d_y_min` and so on, with an axis `by`.
     - `paired`: take the axes' values together, one lane for each place in the rows (which must be
       of one length), along the dimension `sample`, instead of every combination.
+    - `verify`: so many lanes, drawn at random, are run again by a tighter method
+      (`AbstractMethod.tighter`). `data.attrs` then says of each variable how many of them came out
+      otherwise (`verified_changed_period`, for whole numbers) or by how much (median:
+      `verified_error_y_min`): whether the method is good enough for this scan.
     - `store`: folder of a Zarr store, written block by block. The same call resumes it after an
       interruption; a changed one is refused with the difference named.
     - `lanes`: lanes in a block (a multiple of 256); memory grows with it and with `cycles`.
@@ -102,7 +108,7 @@ def scan(
     **Raises:** `ValueError` or `TypeError` before any work for what cannot be run;
     `ScanInterrupted`, a `KeyboardInterrupt`, on Ctrl-C.
     """
-    grid = axes_of(axes)
+    grid, verify = axes_of(axes), count("verify", verify)
     if paired and len({x.size for x in grid.values()}) != 1:
         raise ValueError(
             "Argument `axes` must hold rows of one length if they are `paired`, but they have "
@@ -167,8 +173,41 @@ def scan(
     except KeyboardInterrupt:
         raise ScanInterrupted(collected(), store) from None
     data = collected()
+    if verify:
+        again = functools.partial(
+            scan, scene, measure=measure, start=start, settle=settle, cycles=cycles,
+            method=job.method.tighter(), clock=clock, paired=True, max_impacts=max_impacts,
+            max_steps=max_steps, workers=workers, devices=devices, cluster=cluster, progress=False,
+        )  # fmt: skip
+        data.attrs |= _verified(data, blocks, min(verify, total), again)
     _tell_failures(data)
     return data
+
+
+def _verified(
+    data: xr.Dataset, blocks: Blocks, lanes: int, again: Callable[..., xr.Dataset]
+) -> dict[str, Any]:
+    """How some of the lanes come out by a tighter method."""
+    total = data["result"].size
+    drawn = np.sort(np.random.default_rng(0).choice(total, lanes, replace=False))
+    places = np.unravel_index(drawn, data["result"].shape)
+    if blocks.paired:
+        places = (drawn,) * len(blocks.axes)
+    axes = {name: x[place] for (name, x), place in zip(blocks.axes.items(), places, strict=True)}
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "[0-9,]+ of [0-9,]+ lanes failed")
+        tighter = again(axes)
+    found: dict[str, Any] = {"verified_lanes": lanes}
+    for name in tighter:
+        mine = np.asarray(data[name]).reshape(total, -1)[drawn]
+        other = np.asarray(tighter[name]).reshape(lanes, -1)
+        if mine.dtype.kind == "f":
+            apart = np.abs(mine - other)
+            apart = apart[np.isfinite(apart)]
+            found[f"verified_error_{name}"] = float(np.median(apart)) if apart.size else np.nan
+        else:
+            found[f"verified_changed_{name}"] = int((mine != other).any(axis=1).sum())
+    return found
 
 
 def variables_of(job: Job, blocks: Blocks) -> dict[str, Variable]:

@@ -6,7 +6,7 @@ from typing import Any
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from .._checks import number, one_of, require
+from .._checks import concrete, number, one_of, require
 from .crank import CosineCrank, SliderCrank
 from .drive import IdealDrive, Motor
 from .scene import Oscillator, Scene
@@ -98,7 +98,7 @@ class Parameters(eqx.Module):
         return Scene(
             oscillator=Oscillator(self.damping / (2 * self.body_mass * omega)),
             drive=turning,
-            stops=(RigidStop(self.gap / self.crank_radius, self.restitution),),
+            stops=(RigidStop(_ratio(self.gap, self.crank_radius), self.restitution),),
             crank=exact or CosineCrank(),
         )
 
@@ -117,3 +117,9 @@ class Parameters(eqx.Module):
     def seconds(self, tau: Any) -> Any:
         """A dimensionless time τ in s."""
         return tau / self.natural_frequency
+
+
+def _ratio(a: Any, b: Any) -> Any:
+    """a / b; of known numbers a known one, inside of `jit` too."""
+    over, under = concrete(a), concrete(b)
+    return a / b if over is None or under is None else over / under
