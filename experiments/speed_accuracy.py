@@ -385,7 +385,7 @@ def horizon(choice: Choice, drive: str, truth: np.ndarray | None) -> tuple[np.nd
         return jnp.stack([run.sections.Y, run.sections.V], axis=-1)
 
     batch = jax.vmap(lane, in_axes=(None, 0, 0))
-    lanes = np.full(32, CHAOTIC[drive]), np.linspace(-1, 1, 32)
+    lanes = np.full(32, CHAOTIC), np.linspace(-1, 1, 32)
     found = np.asarray(carried(f"{drive} chaos", choice, batch, *lanes).run())
     if truth is None:
         return found, np.nan
@@ -568,8 +568,8 @@ results = {drive: rows_of(drive) for drive in ("ideal", "motor")}
 # %%
 alone: dict[str, list[tuple[Choice, float]]] = {}
 found_orbits: dict[str, list[tuple[Choice, list[float]]]] = {}
-horizons: dict[str, list[tuple[Choice, float]]] = {}
-CHAOTIC, rate = {}, {}
+horizons: list[tuple[Choice, float]] = []
+CHAOTIC = rate = 0.0
 for drive in ("ideal", "motor"):
     fewer = [*([EXACT] if drive == "ideal" else []), *FEWER]
     seconds = race([timed(choice, drive, alone=True) for choice in fewer])
@@ -580,9 +580,10 @@ for drive in ("ideal", "motor"):
         mine = orbit_of(choice, drive, right[0])
         wrongs = [float(np.abs(a - b).max()) for a, b in zip(mine, right, strict=True)]
         found_orbits[drive].append((choice, wrongs))
-    CHAOTIC[drive], rate[drive] = most_chaotic(drive)
-    true_states, _ = horizon(TRUTH[drive], drive, None)
-    horizons[drive] = [(choice, horizon(choice, drive, true_states)[1]) for choice in fewer]
+    if drive == "ideal":
+        CHAOTIC, rate = most_chaotic(drive)
+        true_states, _ = horizon(TRUTH[drive], drive, None)
+        horizons = [(choice, horizon(choice, drive, true_states)[1]) for choice in fewer]
     note(f"{drive}: orbits and chaos")
     forget("alone", "cycle", "chaos")
 taken_apart = landings()
@@ -607,6 +608,11 @@ def fastest(rows: list[Row], target: float) -> list[Row]:
     return list(first.values())
 
 
+def scanned(row: Row) -> str:
+    """What the scan said, where there was one."""
+    return "– | –" if np.isnan(row.wrong) else f"{row.wrong:.2%} | {row.scanning:.1f}"
+
+
 def told(row: Row) -> str:
     """A method and what it costs."""
     return f"{row.choice.name} ({1e3 * row.seconds:.0f} ms, {row.errors['late95']:.0e})"
@@ -621,6 +627,11 @@ lines = [
     f"displacement of 1e-10 grows to no more than 1e-6 in {MANY} cycles).",
     "",
     "![Speed against accuracy](figures/speed_accuracy.png)",
+    "",
+    "The map of a fixed-step method has periodic motions of its own, which repeat to rounding: its "
+    "regimes come out right even where its states are off by 1e-5. With steps by a tolerance the "
+    "sections wander within that tolerance, and a motion counts as unsettled unless it is well "
+    "below the 1e-6 by which sections are compared.",
     "",
     "## The fastest for an error",
     "",
@@ -659,7 +670,7 @@ for drive, (rows, about) in results.items():
             f"| {row.choice.name} | {row.compiling:.1f} | {1e3 * row.seconds:.0f} | "
             f"{e['state']:.0e} | {e['state95']:.0e} | {e['late']:.0e} | {e['late95']:.0e} | "
             f"{e['phase95']:.0e} | {e['extremes95']:.0e} | {e['counts']:.2%} | {e['lost']:.2%} | "
-            f"{e['failed']:.2%} | {row.wrong:.2%} | {row.scanning:.1f} |"
+            f"{e['failed']:.2%} | {scanned(row)} |"
         )
 lines += [
     "",
@@ -691,19 +702,16 @@ lines += [
     "",
     "## Chaos",
     "",
-    "Without damping: cycles until a run is off by 1e-3 (median of 32 starts), where the "
-    "greatest Lyapunov exponent is "
-    + " and ".join(
-        f"{rate[d]:.3f} ω ({d}, {'ζ' if d == 'ideal' else 'κ'} = {CHAOTIC[d]:.2f})" for d in CHAOTIC
-    )
-    + ". A run that stays to the end is given as 200.",
+    "Ideal drive without damping: cycles until a run is off by 1e-3 (median of 32 starts) at "
+    f"ζ = {CHAOTIC:.2f}, where the greatest Lyapunov exponent is {rate:.3f} ω.",
     "",
-    "| scene | method | cycles |",
-    "|---|---|---|",
-]
-for drive, pairs in horizons.items():
-    lines += [f"| {drive} | {choice.name} | {cycles:.0f} |" for choice, cycles in pairs]
-lines += [
+    "| method | cycles |",
+    "|---|---|",
+    *(
+        f"| {choice.name} | {cycles:.0f} |"
+        for choice, cycles in horizons
+        if choice.name != EXACT.name
+    ),
     "",
     "## The landing, taken apart",
     "",

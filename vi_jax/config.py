@@ -192,6 +192,7 @@ class ScanTable(_Grid):
     cycles: int | None = None
     derivatives: tuple[str, ...] | None = None
     paired: bool = False
+    verify: int | None = None
 
 
 @frozen(kw_only=True)

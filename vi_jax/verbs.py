@@ -34,7 +34,6 @@ from .plot import (
     plot_sweep,
     save_picture,
 )
-from .plot.branch import axis_name
 from .plot.motion import BLUE, RED
 from .scan import Sweep
 from .scan import basins as find_basins
@@ -77,6 +76,9 @@ def scan(config: Config, tell: Tell) -> Outcome:
     if "period" in data:
         lines += _regimes(data)
     lines += _ranges(data)
+    if "verified_changed_period" in data.attrs:
+        changed, lanes = data.attrs["verified_changed_period"], data.attrs["verified_lanes"]
+        lines.append(f"  regime changed by a tighter method: {changed} of {lanes} lanes tried")
     if table.store is None:
         lines += ["", str(data), "", "Nothing was written: name a `store` in [scan] to keep it."]
     else:
@@ -110,10 +112,9 @@ def sweep(config: Config, tell: Tell) -> Outcome:
             last = _last_state(found[there], start)
             values = jnp.asarray(table.values[::-1])
             found[back] = run_sweep(scene, values=values, start=last, method=method, **options)
-    lines = [f"Sweep of {table.parameter}, {len(table.values)} values"]
-    codes = []
+    lines, codes = [], []
     for way, run in found.items():
-        lines.append(f"  {way}: {_run_lengths(np.asarray(run.values), np.asarray(run.period))}")
+        lines.append(f"{way}: {run}")
         codes.append(np.asarray(number_of(run.result)))
     if table.output is not None:
         _write_rows(table.output, [_sweep_columns(way, run) for way, run in found.items()])
@@ -123,7 +124,6 @@ def sweep(config: Config, tell: Tell) -> Outcome:
         for way, run in found.items():
             look = {"color": BLUE, "ms": 6} if way == "up" else {"color": RED, "ms": 3}
             plot_sweep(run, ax=ax, label=way, **look)
-        ax.set_xlabel(axis_name(table.parameter))
         ax.legend(frameon=False)
         lines.append(_saved(ax, table.picture))
     failed, good = failures(np.concatenate(codes), what="values")
@@ -366,16 +366,6 @@ def _ranges(data: xr.Dataset) -> list[str]:
             span = f"{numbers.min():.6g} … {numbers.max():.6g}"
             lines.append(f"  {name}: {span} {x.attrs.get('units', '')}".rstrip())
     return lines
-
-
-def _run_lengths(values: np.ndarray, period: np.ndarray) -> str:
-    """Periods in the order in which a sweep meets them, with where each begins."""
-    begins = [0, *(np.flatnonzero(np.diff(period)) + 1)]
-    told = [
-        f"{f'{2 * period[i]}π' if period[i] > 0 else 'no period'} from {values[i]:.6g}"
-        for i in begins
-    ]
-    return ", ".join(told if len(told) <= 12 else [*told[:12], f"{len(told) - 12} further changes"])
 
 
 def _last_state(run: Sweep, otherwise: Any) -> Any:

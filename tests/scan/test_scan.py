@@ -7,6 +7,7 @@ import sys
 import time
 from pathlib import Path
 
+import diffrax
 import jax
 import numpy as np
 import pytest
@@ -248,6 +249,16 @@ def test_a_sweep_takes_the_body_along_with_a_stop_that_comes_nearer():
         vi.sweep(SCENE, "stops.0.gap", gaps, start=SCENE.start(Y=3.0))
     with pytest.raises(ValueError, match="in one row"):
         vi.sweep(SCENE, "stops.0.gap", [])
+
+
+def test_some_lanes_are_verified_by_a_tighter_method():
+    axes = {"drive.frequency_ratio": np.linspace(1.0, 1.4, 6), "start.Y": [0.0, 0.5]}
+    data = vi.scan(SCENE, axes, method=vi.FixedStep(), settle=200, verify=5)
+    assert data.attrs["verified_lanes"] == 5
+    assert data.attrs["verified_changed_period"] == 0
+    assert 0 < data.attrs["verified_error_y_min"] < 1e-8
+    rough = vi.scan(SCENE, axes, method=vi.Adaptive(diffrax.Bosh3(), rtol=1e-3), verify=12)
+    assert rough.attrs["verified_changed_period"] > 6
 
 
 def test_a_store_is_made_whole_or_not_at_all(tmp_path, monkeypatch):

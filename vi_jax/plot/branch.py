@@ -76,6 +76,7 @@ def plot_sweep(
     ax = new_axes(ax)
     across, up = np.asarray(getattr(sweep, x)), np.asarray(getattr(sweep, y))
     ax.plot(across, up, **{"marker": ".", "ms": 3, "ls": "none", "color": "0.3", **style})
+    ax.set_xlabel(axis_name(sweep.parameter if x == "values" else x))
     ax.set_ylabel({"y_min": "min Y (a)", "y_max": "max Y (a)"}.get(y, y))
     return ax
 

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from .._checks import concrete, count, number, require
@@ -21,8 +22,10 @@ from .regime import impacts_of, least_period
 class Sweep(eqx.Module):
     """What a sweep settled on at each value, in their order. Under `vmap` batch axes come first."""
 
+    parameter: str = eqx.field(static=True)
+    """Name of the number that was changed."""
     values: Float[Array, "..."]
-    """The parameter."""
+    """Its values."""
     y_min: Float[Array, "..."]
     """Smallest Y over the cycles observed (unit: a)."""
     y_max: Float[Array, "..."]
@@ -44,6 +47,20 @@ class Sweep(eqx.Module):
     def successful(self) -> Bool[Array, "..."]:
         """Whether each value was simulated to its end."""
         return self.result == RESULTS.successful
+
+    def __str__(self) -> str:
+        if isinstance(self.values, Tracer) or self.values.ndim != 1:
+            return repr(self)
+        values, period = np.asarray(self.values), np.asarray(self.period)
+        begins = [0, *(np.flatnonzero(np.diff(period)) + 1)]
+        names = {0: "no period", -2: "failed"}
+        told = [
+            f"{names.get(int(period[i])) or f'{2 * period[i]}π'} from {values[i]:.6g}"
+            for i in begins
+        ]
+        if len(told) > 12:
+            told = [*told[:12], f"{len(told) - 12} further changes"]
+        return f"Sweep of {self.parameter}, {values.size} values: {', '.join(told)}"
 
 
 def sweep(
@@ -142,6 +159,7 @@ def _sweep(
         period = least_period(sections, longest=cycles // 2, tolerance=tolerance)
         impacts = impacts_of(run.impacts.astype(value.dtype), period)
         return state, Sweep(
+            parameter=parameter,
             values=value,
             y_min=jnp.min(run.y_min),
             y_max=jnp.max(run.y_max),

@@ -1,0 +1,101 @@
+"""Presets, `suggest_method`, estimated errors, and numbers that stay known inside of `jit`."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+from vi_jax.flow.choice import chosen
+
+IDEAL = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.8, damping_ratio=0.045)
+MOTOR = vi.Parameters(torque=10.0, restitution=0.8, gap=0.08, kappa=1.1).scene()
+
+
+def test_presets_by_scene():
+    assert all(
+        isinstance(vi.preset(IDEAL, n), vi.ExactFlight) for n in ("draft", "standard", "reference")
+    )
+    steps = [vi.preset(MOTOR, name).steps_per_cycle for name in ("draft", "standard", "reference")]
+    assert steps == sorted(steps) and len(set(steps)) == 3
+    assert chosen(MOTOR, None).steps_per_cycle == vi.preset(MOTOR).steps_per_cycle
+    with pytest.raises(ValueError, match="'draft', 'standard', 'reference', but got 'fast'"):
+        vi.simulate(MOTOR, MOTOR.start(), 2, method="fast")
+    with pytest.raises(TypeError, match="name of a preset"):
+        vi.cycle_map(IDEAL, flow=3)
+
+
+def test_presets_keep_their_promise_from_slow_to_fast_drives():
+    """The promise was measured for κ from 0.5 to 1.9; the steps in a free period keep it."""
+
+    def last(kappa, method):
+        motor = vi.Motor(0.65, kappa, 0.0093, 0.0053)
+        scene = vi.Scene(
+            oscillator=vi.Oscillator(0.045), drive=motor, stops=[vi.RigidStop(2.0, 0.8)]
+        )
+        return jnp.stack(jax.tree_util.tree_leaves(vi.simulate(scene, scene.start(), 30,
+                                                               method=method).last))  # fmt: skip
+
+    kappas = jnp.geomspace(0.1, 10.0, 33)
+    runs = {
+        name: np.asarray(jax.jit(jax.vmap(lambda kappa, n=name: last(kappa, n)))(kappas))
+        for name in ("draft", "standard", "reference")
+    }
+    for name, promise in (("draft", 1e-6), ("standard", 4e-9)):
+        error = np.abs(runs[name] - runs["reference"]).max(axis=1)
+        # 95 of 100 lanes; some of these impact many times in a slow cycle, hence the factor.
+        assert np.quantile(error, 0.95) < 10 * promise
+
+
+@pytest.mark.parametrize("scene, method", [(MOTOR, "draft"), (MOTOR, vi.Adaptive(rtol=1e-7))])
+def test_estimated_errors_are_those_made(scene, method):
+    run = vi.simulate(scene, scene.start(), 40, method=method, estimate=True)
+    truth = vi.simulate(scene, scene.start(), 40, method="reference")
+    made = np.abs(np.asarray(run.sections.Y - truth.sections.Y))
+    told = np.asarray(run.errors.sections.Y)
+    assert 0.5 < told.max() / made.max() < 2.0
+    assert int(run.errors.impacts.max()) == 0
+    assert "estimated" in str(run)
+    assert vi.simulate(scene, scene.start(), 2).errors is None
+
+
+def test_rounding_is_estimated_under_exact_flight():
+    run = vi.simulate(IDEAL, IDEAL.start(), 40, estimate=True)
+    assert 0 < float(jnp.max(run.errors.sections.Y)) < 1e-12
+
+
+@pytest.mark.parametrize("quantity", ["state", "extremes", "impacts", "derivative"])
+def test_suggested_for_an_ideal_drive(quantity):
+    found = vi.suggest_method(IDEAL, error=1e-9, quantity=quantity, cycles=5, lanes=4)
+    assert isinstance(found.method, vi.ExactFlight) and found.reached
+    assert found.error < 1e-10
+
+
+def test_suggested_for_a_motor():
+    found = vi.suggest_method(MOTOR, error=1e-7, cycles=5, lanes=16)
+    assert found.reached and found.error <= 1e-7
+    assert min(t.seconds for t in found.tried if t.error <= 1e-7) == next(
+        t.seconds for t in found.tried if t.method is found.method
+    )
+    # What it says is true on the scene itself.
+    run = vi.simulate(MOTOR, MOTOR.start(), 5, method=found.method)
+    truth = vi.simulate(MOTOR, MOTOR.start(), 5, method="reference")
+    assert abs(float(run.last.Y - truth.last.Y)) < 1e-6
+    assert "tried" in str(found)
+    with pytest.raises(ValueError, match="quantity"):
+        vi.suggest_method(MOTOR, quantity="speed")
+
+
+def test_known_numbers_stay_known_inside_of_jit():
+    seen = {}
+
+    @jax.jit
+    def run(zeta):
+        for gap in (1.0, 2.0):
+            seen[gap] = vi.Scene.ideal(frequency_ratio=zeta, gap=gap).may_rest()
+        seen["table"] = vi.Parameters(gap=0.08).scene().may_rest()
+        return zeta
+
+    run(0.9)
+    assert seen == {1.0: True, 2.0: False, "table": False}
+    with pytest.raises(ValueError, match="restitution"):
+        jax.jit(lambda z: vi.Scene.ideal(frequency_ratio=z, restitution=2.0).drive)(0.9)
