@@ -393,48 +393,50 @@ def report(sections: dict[str, dict]) -> str:
     return "\n".join(lines)
 
 
+LOOKS = {
+    f"{OURS} FixedStep": ("tab:blue", "s"),
+    f"{OURS} Adaptive": ("tab:blue", "o"),
+    f"{OURS} ExactFlight": ("tab:blue", "*"),
+    "heyoka batch": ("tab:red", "s"),
+    "heyoka scalar": ("tab:red", "o"),
+    "heyoka ensemble": ("tab:red", "^"),
+    "numba": ("tab:green", "s"),
+    "diffrax Event Tsit5": ("tab:purple", "s"),
+    "diffrax Event Dopri8": ("tab:purple", "o"),
+    "SciPy": ("tab:gray", "s"),
+}
+
+
 def picture(sections: dict[str, dict], path: Path) -> None:
-    """Time against error, a panel for each drive and number of cores."""
+    """Time against error at the first restitution, a panel for each drive and number of cores."""
     import vi_jax as vi
     from matplotlib.figure import Figure
-    from matplotlib.lines import Line2D
 
-    colors = {
-        OURS: "tab:blue", "heyoka": "tab:red", "numba": "tab:green",
-        "diffrax": "tab:purple", "SciPy": "tab:gray",
-    }  # fmt: skip
     figure = Figure(figsize=(9, 7), layout="constrained")
     panels = figure.subplots(2, 2, sharex="row", sharey="row")
+    handles: dict[str, Any] = {}
     for axes, (drive, used) in zip(
         panels.flat, ((d, u) for d in ("motor", "ideal") for u in ("one", "all")), strict=True
     ):
-        for k, mark in zip(RESTITUTIONS, "os", strict=True):
-            for row in sections[f"states, {drive}, {k}, {used}"]["rows"]:
-                code = row["name"].split()[0]
-                face = colors[code] if k == RESTITUTIONS[0] else "none"
-                axes.loglog(row["error"], row["seconds"], mark, color=colors[code], mfc=face, ms=5)
-                if k == RESTITUTIONS[0]:
-                    axes.annotate(
-                        row["name"].removeprefix(code).strip(", "),
-                        (row["error"], row["seconds"]),
-                        xytext=(4, 2),
-                        textcoords="offset points",
-                        fontsize=5.5,
-                        rotation=15,
-                    )
+        rows = sections[f"states, {drive}, {RESTITUTIONS[0]}, {used}"]["rows"]
+        for family, (color, mark) in LOOKS.items():
+            mine = [
+                row
+                for row in rows
+                if row["name"].startswith(family) and "forced" not in row["name"]
+            ]
+            points = sorted((row["error"], row["seconds"]) for row in mine)
+            if points:
+                size = 11 if mark == "*" else 5
+                look = {"color": color, "marker": mark, "ms": size, "lw": 1, "label": family}
+                (handles[family],) = axes.loglog(*zip(*points, strict=True), **look)
         axes.set_title(f"{drive} drive, {used} core{'s' * (used == 'all')}", fontsize=10)
         axes.grid(alpha=0.3)
-        axes.margins(x=0.15, y=0.12)
     for axes in panels[:, 0]:
-        axes.set_ylabel("run time, s")
+        axes.set_ylabel("1,024 lanes, 200 cycles: run time (s)")
     for axes in panels[1]:
-        axes.set_xlabel("median error of the final state (units of a, aω)")
-    handles = [Line2D([], [], ls="", marker="o", color=c, label=n) for n, c in colors.items()]
-    handles += [
-        Line2D([], [], ls="", marker=m, color="k", mfc=f, label=f"k = {k}")
-        for k, m, f in zip(RESTITUTIONS, "os", ("k", "none"), strict=True)
-    ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=7, fontsize=8)
+        axes.set_xlabel("median error of the final state (a, a ω)")
+    figure.legend(handles=handles.values(), loc="outside lower center", ncols=5, fontsize=8)
     vi.save_picture(figure, path)
 
 
