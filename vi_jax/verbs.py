@@ -78,7 +78,7 @@ def scan(config: Config, tell: Tell) -> Outcome:
     lines += _ranges(data)
     if "verified_changed_period" in data.attrs:
         changed, lanes = data.attrs["verified_changed_period"], data.attrs["verified_lanes"]
-        lines.append(f"  regime changed by a tighter method: {changed} of {lanes} lanes tried")
+        lines.append(f"  regime otherwise by a better method: {changed} of {lanes} lanes tried")
     if table.store is None:
         lines += ["", str(data), "", "Nothing was written: name a `store` in [scan] to keep it."]
     else:
