@@ -401,7 +401,9 @@ def test_sweep(here, capsys):
     output = "s.csv"
     """
     out = ran(capsys, "sweep", text)
-    assert "  up: 2π from 1.2" in out and "  down: 2π from 1.7" in out and is_png("s.png")
+    name = "Sweep of drive.frequency_ratio, 11 values"
+    assert f"up: {name}: 2π from 1.2" in out and f"down: {name}: 2π from 1.7" in out
+    assert is_png("s.png")
     table = rows("s.csv")
     assert [row["direction"] for row in table] == ["up"] * 11 + ["down"] * 11
     assert {row["result"] for row in table} == {"completed"}

@@ -84,6 +84,7 @@ def test_optax_finds_the_start_without_transient():
     assert float(sgd.state.Y) == pytest.approx(float(closed.Y[0]), abs=1e-5)
 
 
+@pytest.mark.slow
 def test_many_guesses_in_one_program():
     compiled = []
     draw = np.random.default_rng(0).uniform
@@ -125,6 +126,7 @@ def quantity(x, name):
     }[name]
 
 
+@pytest.mark.slow
 def test_there_is_no_gradient_where_there_is_no_orbit():
     def lowest(zeta):
         scene = vi.Scene.ideal(
@@ -184,6 +186,7 @@ def test_multiple_shooting_where_one_arc_cannot():
     assert not bool(one.successful) and float(one.residual) > 1e-6
 
 
+@pytest.mark.slow
 def test_edges_are_told_apart():
     results = vi.ORBIT_RESULTS
     twice = vi.find_orbit(UNDAMPED, near(UNDAMPED, 1), cycles=2)
