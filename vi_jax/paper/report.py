@@ -19,6 +19,22 @@ from .response_figure import draw_response
 REPORT, NUMBERS = "report.md", "report.json"
 
 
+class Findings(NamedTuple):
+    """All that the report tells; what a quick one leaves out is `None`."""
+
+    cases: tuple[Case, Case]
+    claims: list[Claim]
+    faults: list[Fault]
+    orbits: list[TableRow]
+    panels: dict[str, Any] | None
+    borders: dict[str, float | None] | None
+
+    @property
+    def quick(self) -> bool:
+        """Whether parts were left out."""
+        return self.panels is None
+
+
 class Reproduction(NamedTuple):
     """What a reproduction found, and the files that it wrote."""
 
@@ -70,26 +86,16 @@ def reproduce(
         borders = describe_boundaries(curves)
         files.append(out / "boundaries.png")
         save_picture(draw_boundaries(curves), files[-1])
-    for name, text in (
-        (NUMBERS, as_json(cases, claims, faults, orbits, panels, borders, quick=quick)),
-        (REPORT, as_markdown(cases, claims, faults, orbits, panels, borders, quick=quick)),
-    ):
+    findings = Findings(cases, claims, faults, orbits, panels, borders)
+    for name, text in ((NUMBERS, as_json(findings)), (REPORT, as_markdown(findings))):
         files.append(out / name)
         files[-1].write_text(text, encoding="utf-8")
     return Reproduction(claims, faults, files)
 
 
-def as_json(
-    cases: tuple[Case, Case],
-    claims: list[Claim],
-    faults: list[Fault],
-    orbits: list[TableRow],
-    panels: dict[str, Any] | None,
-    borders: dict[str, float | None] | None,
-    *,
-    quick: bool,
-) -> str:
+def as_json(found: Findings) -> str:
     """The report as strict JSON: no NaN; what is absent is null."""
+    cases = found.cases
     data = {
         "settings": {
             "frequency_ratio": FREQUENCY_RATIO,
@@ -97,16 +103,16 @@ def as_json(
             "gap": GAP,
             "damping_ratio": {case.name: float(case.scene.damping_ratio) for case in cases},
             "cycles": int(cases[0].from_rest.impacts.shape[0]),
-            "quick": quick,
+            "quick": found.quick,
         },
         "closed_forms": {
             case.name: {"2pi": _orbit(case.short), "4pi": _orbit(case.long)} for case in cases
         },
-        "claims": [claim._asdict() for claim in claims],
-        "faults": [fault._asdict() for fault in faults],
-        "orbits": [_found(row) for row in orbits],
-        "figure_2": panels,
-        "boundaries": borders,
+        "claims": [claim._asdict() for claim in found.claims],
+        "faults": [fault._asdict() for fault in found.faults],
+        "orbits": [_found(row) for row in found.orbits],
+        "figure_2": found.panels,
+        "boundaries": found.borders,
     }
     return json.dumps(data, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
@@ -246,27 +252,18 @@ def _borders(borders: dict[str, float | None]) -> list[str]:
     ]
 
 
-def as_markdown(
-    cases: tuple[Case, Case],
-    claims: list[Claim],
-    faults: list[Fault],
-    orbits: list[TableRow],
-    panels: dict[str, Any] | None,
-    borders: dict[str, float | None] | None,
-    *,
-    quick: bool,
-) -> str:
+def as_markdown(found: Findings) -> str:
     """The report as a page to read, with the figures in it."""
-    undamped, damped = cases
+    undamped, damped = found.cases
     cycles = undamped.from_rest.impacts.shape[0]
     ratio = float(damped.scene.damping_ratio)
     even = "second" if undamped.long_shift else "first"
     lines = [
-        f"# Figures {'' if quick else '2, '}3 and 4 of the paper, again",
+        f"# Figures {'' if found.quick else '2, '}3 and 4 of the paper, again",
         "",
         f"ζ = {FREQUENCY_RATIO:.2f}, k = {RESTITUTION:.2f}, d = Δ/a = {GAP:g}, ideal drive, "
-        f"{cycles} drive cycles{' (quick)' if quick else ''}. Lengths are in units of the crank "
-        "radius a; the simulation carries flights in closed form and solves for the impacts.",
+        f"{cycles} drive cycles{' (quick)' if found.quick else ''}. Lengths are in units of the "
+        "crank radius a; the simulation carries flights in closed form and solves for the impacts.",
         "",
         "The figures cannot be had with the damping of Table 1 (fault 6 below). The upper row of "
         f"each picture is the undamped system (ξ = 0), the lower row Table 1 (ξ = {ratio:.7f}).",
@@ -285,10 +282,10 @@ def as_markdown(
         "",
         "| claim | where | verdict |",
         "|---|---|---|",
-        *(f"| {claim.name} | {claim.place} | {claim.verdict} |" for claim in claims),
+        *(f"| {claim.name} | {claim.place} | {claim.verdict} |" for claim in found.claims),
         "",
     ]
-    for claim in claims:
+    for claim in found.claims:
         lines += [
             f"### {claim.name[0].upper()}{claim.name[1:]}: {claim.verdict}",
             "",
@@ -303,14 +300,14 @@ def as_markdown(
         "Found by Newton's method on the cycle map from the closed forms, stable or not; Y and V "
         "on the section φ = 0, the largest multiplier by modulus.",
         "",
-        *_table(orbits),
+        *_table(found.orbits),
         "",
-        *([] if panels is None else _response(panels)),
-        *([] if borders is None else _borders(borders)),
+        *([] if found.panels is None else _response(found.panels)),
+        *([] if found.borders is None else _borders(found.borders)),
         "## Faults of the printed text",
         "",
     ]
-    for fault in faults:
+    for fault in found.faults:
         lines += [
             f"### {fault.number}. {fault.place}",
             "",
