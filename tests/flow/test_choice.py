@@ -59,6 +59,16 @@ def test_estimated_errors_are_those_made(scene, method):
     assert vi.simulate(scene, scene.start(), 2).errors is None
 
 
+@pytest.mark.parametrize("xi", [3.0, 10.0])
+def test_errors_are_estimated_under_strong_damping(xi):
+    scene = vi.Scene.ideal(frequency_ratio=1.0, gap=None, damping_ratio=xi)
+    run = vi.simulate(scene, scene.start(), 8, method=vi.FixedStep(), estimate=True)
+    truth = vi.simulate(scene, scene.start(), 8, method=vi.ExactFlight())
+    made = float(jnp.max(jnp.abs(run.sections.Y - truth.sections.Y)))
+    assert 0.5 < float(jnp.max(run.errors.sections.Y)) / made < 2.0
+    assert made < 4e-9
+
+
 def test_rounding_is_estimated_under_exact_flight():
     run = vi.simulate(IDEAL, IDEAL.start(), 40, estimate=True)
     assert 0 < float(jnp.max(run.errors.sections.Y)) < 1e-12
@@ -69,6 +79,20 @@ def test_suggested_for_an_ideal_drive(quantity):
     found = vi.suggest_method(IDEAL, error=1e-9, quantity=quantity, cycles=5, lanes=4)
     assert isinstance(found.method, vi.ExactFlight) and found.reached
     assert found.error < 1e-10
+
+
+def test_what_cannot_be_calibrated_is_refused():
+    with pytest.raises(ValueError, match="quantity"):
+        vi.suggest_method(IDEAL, quantity="speed")
+    with pytest.raises(TypeError, match="outside of `jit`"):
+        jax.jit(
+            lambda z: vi.suggest_method(vi.Scene.ideal(frequency_ratio=z)).error
+        )(0.9)  # fmt: skip
+    # Its crank stops in every lane.
+    drive = vi.Motor(0.0, 0.0, 1.0, 0.005)
+    weak = vi.Scene(oscillator=vi.Oscillator(0.0), drive=drive, stops=[vi.RigidStop(2.0, 0.5)])
+    with pytest.raises(ValueError, match="4 of 4 lanes of the calibration failed"):
+        vi.suggest_method(weak, start=weak.start(Y=-1.0, W=0.05), lanes=4, cycles=3)
 
 
 @pytest.mark.slow
@@ -83,8 +107,6 @@ def test_suggested_for_a_motor():
     truth = vi.simulate(MOTOR, MOTOR.start(), 5, method="reference")
     assert abs(float(run.last.Y - truth.last.Y)) < 1e-6
     assert "tried" in str(found)
-    with pytest.raises(ValueError, match="quantity"):
-        vi.suggest_method(MOTOR, quantity="speed")
 
 
 def test_known_numbers_stay_known_inside_of_jit():

@@ -232,3 +232,28 @@ def test_one_impact_and_rest_without_restitution():
     for method in METHODS[:2]:
         orbit = vi.find_orbit(body, body.start(Y=0.2), flow=method)
         assert bool(orbit.successful) and int(orbit.impacts) == 1
+
+
+def test_single_precision_rests_as_double_does():
+    """Random machines that chatter, rest and leave; the flattest hops are below rounding."""
+    rng = np.random.default_rng(0)
+    lanes, uniform = 200, rng.uniform
+    gap = uniform(-0.9, 1, lanes)
+    numbers = np.stack([
+        uniform(0.02, 0.5, lanes), uniform(0, 0.3, lanes), uniform(0, 0.6, lanes), gap,
+        gap - uniform(0, 1.5, lanes) * (rng.random(lanes) > 0.2), uniform(-1, 1, lanes),
+    ])  # fmt: skip
+
+    def lane(x):
+        zeta, xi, k, gap, Y, V = x
+        one = scene(zeta, k, gap, xi)
+        run = vi.simulate(one, one.start(Y=Y, V=V), 6, method=vi.ExactFlight(), samples=2)
+        return run.successful, run.samples.state.Y, run.rests
+
+    found = {}
+    for double in (True, False):
+        with jax.enable_x64(double):
+            found[double] = [np.asarray(x) for x in jax.jit(jax.vmap(lane))(jnp.asarray(numbers.T))]
+    assert found[True][0].all() and found[False][0].all()
+    assert np.abs(found[True][1] - found[False][1]).max() < 1e-5
+    np.testing.assert_array_equal(found[True][2].sum(1), found[False][2].sum(1))

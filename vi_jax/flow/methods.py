@@ -46,12 +46,13 @@ class AbstractMethod(eqx.Module):
         """The longest step from here.
 
         A method of so many steps in a drive cycle takes as many in a natural period, where that is
-        shorter. No step is longer than 0.8π relaxation times: up to there explicit Runge–Kutta
-        methods are stable, and the series of `ExactFlight` exact.
+        shorter. With the fewest, five, a step may be as long as 0.8π relaxation times: up to there
+        explicit Runge–Kutta methods are stable, and the series of `ExactFlight` exact.
         """
-        limit = scene.step_limit(s, state) * (5 / self.steps_per_cycle)
-        fading = scene.relaxation(s, state)
-        return limit if fading is None else jnp.minimum(limit, 0.8 * pi * fading)
+        limit, fading = scene.step_limit(s, state), scene.relaxation(s, state)
+        if fading is not None:
+            limit = jnp.minimum(limit, 0.8 * pi * fading)
+        return limit * (5 / self.steps_per_cycle)
 
     @abc.abstractmethod
     def step(
@@ -144,7 +145,11 @@ class Adaptive(AbstractMethod):
         return new, time, jnp.sqrt(jax.lax.stop_gradient(sum(parts) / len(parts)))
 
     def tighter(self):
-        """A hundredth of the tolerances."""
+        """A hundredth of the tolerances.
+
+        Where the longest step allowed is short enough for both, they are the same: the error is
+        below the tolerance then.
+        """
         tolerances = [self.rtol] if self.atol is None else [self.rtol, self.atol]
         smaller = [x / 100 for x in tolerances]
         return eqx.tree_at(lambda m: [m.rtol, m.atol][: len(smaller)], self, smaller)

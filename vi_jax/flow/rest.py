@@ -28,6 +28,11 @@ Flag = Bool[Array, ""]
 _IN_DOUBLE, _IN_SINGLE = (1e-3, 1e-5, 1e-9), (1e-2, 1e-3, 1e-4)
 
 
+# How much of a chatter may be left when it is completed, as a share of the longest step: its error
+# is of second order.
+_BRIEF, _BRIEF_IN_SINGLE = 8e-6, 8e-3
+
+
 class Holding(AbstractScene):
     """A scene whose body is held where `held` says so: all that a step asks of a scene."""
 
@@ -53,12 +58,6 @@ class Holding(AbstractScene):
         return self.scene.pace(s, state)
 
 
-def brief(scene: AbstractScene, s: Scalar, state: Any) -> Scalar:
-    """How much of a chatter may be left when it is completed: its error is of second order."""
-    share = 8e-6 if s.dtype == jnp.float64 else 8e-4
-    return stop_gradient(share * jnp.asarray(scene.step_limit(s, state), s.dtype))
-
-
 def remaining(restitution: Scalar, approach: Scalar, pressing: Scalar) -> Scalar:
     """Time (in s) from an impact to rest: Σ 2 kⁿ V⁻ / a = 2 k V⁻ / (a (1 - k)).
 
@@ -81,8 +80,15 @@ def settled(
     # What presses a body at rest on: with its velocity goes its damping.
     rested = scene.placed(there, jnp.asarray(stop.sign * stop.gap), jnp.zeros_like(s))
     pressing = stop.sign * rates(scene.field, scene.position, s, rested).a
-    left = remaining(stop.restitution, jnp.maximum(speed, 0.0), pressing)
-    ends = stop_gradient(left) <= brief(scene, s, there)
+    speed = jnp.maximum(speed, 0.0)
+    left = remaining(stop.restitution, speed, pressing)
+    limit = stop_gradient(jnp.asarray(scene.step_limit(s, there), s.dtype))
+    # Hops no higher than rounding cannot be followed, however long they last.
+    height = (stop.restitution * speed) ** 2 / jnp.where(pressing > 0, 2 * pressing, 1.0)
+    flat = height <= 16 * float(jnp.finfo(s.dtype).eps) * (1 + jnp.abs(stop.gap))
+    share = _BRIEF if s.dtype == jnp.float64 else _BRIEF_IN_SINGLE
+    ends = left <= jnp.where(flat, 0.1, share) * limit
+    ends = stop_gradient(ends)
     if plan.ticks(lane.state):
         ends = ends & (stop_gradient(s + left) < stop_gradient(plan.end(lane.part)))
     return ends, left

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jax.core import Tracer
 
 from .._checks import count, one_of, require
 from ..scene import AbstractScene, Scene
@@ -77,7 +78,8 @@ def suggest_method(
     - `scene`: the scene, its numbers known.
     - `error`: the error asked for, relative to 1 + |x|, for 95 of 100 lanes.
     - `quantity`: of what: `"state"` (on the last section), `"extremes"` (in each cycle),
-      `"impacts"` (phase and speed of each; a missed one is an infinite error) or `"derivative"`
+      `"impacts"` (phase and speed of the first 32 in each cycle; a missed one is an infinite
+      error) or `"derivative"`
       (of the last section state by the first velocity).
     - `start`: the first state; by default the scene's own.
     - `cycles`: drive cycles of the calibration; in a chaotic motion errors grow with them.
@@ -87,21 +89,40 @@ def suggest_method(
 
     **Raises:** `ValueError` or `TypeError` for arguments that cannot be used.
     """
+    if not isinstance(error, int | float | np.floating):
+        raise TypeError(f"Argument `error` must be a number, but got {error!r}.")
     require("error", error, low=0.0, open_low=True)
     one_of("quantity", quantity, QUANTITIES)
     cycles, lanes = count("cycles", cycles, least=1), count("lanes", lanes, least=1)
+    if not isinstance(scene, AbstractScene):
+        raise TypeError(
+            f"Argument `scene` must be a `Scene` or an `AbstractScene`, but got {scene!r}."
+        )
+    if any(isinstance(x, Tracer) for x in jtu.tree_leaves((scene, start))):
+        raise TypeError(
+            "Arguments `scene` and `start` must hold known numbers, but are being traced: call "
+            "`suggest_method` outside of `jit`, `vmap` and `grad`."
+        )
     if start is None:
         if not isinstance(scene, Scene):
             raise ValueError("Argument `start` must be given for a scene of your own.")
         start = scene.start()
+    if isinstance(scene, Scene):
+        start = scene.adopt(start)
     check_start(scene, start)
     bench = _Bench(scene, start, quantity, cycles, lanes)
     best = preset(scene, "reference")
-    if isinstance(best, ExactFlight):
-        bench.truth = bench.result(best.tighter())
+    exact = isinstance(best, ExactFlight)
+    bench.truth = bench.result(best.tighter() if exact else Adaptive(diffrax.Dopri8(), rtol=1e-14))
+    failed = int(np.sum(~np.isfinite(bench.truth[:, 0])))
+    if failed:
+        raise ValueError(
+            f"Argument `scene` must be one that runs for {cycles} cycles, but {failed} of {lanes} "
+            "lanes of the calibration failed: look at `simulate(...).result` for the reason."
+        )
+    if exact:
         tried = [bench.tried(best, "ExactFlight()")]
     else:
-        bench.truth = bench.result(Adaptive(diffrax.Dopri8(), rtol=1e-14))
         tried = _fixed(bench, error)
         for tolerance in _TOLERANCES[:-1]:
             method = Adaptive(diffrax.Dopri8(), rtol=tolerance)
@@ -148,23 +169,28 @@ class _Bench:
         """What is looked at, of one lane."""
         scene = self.scene
 
-        def last(nudge, **options):
+        def looked_at(nudge):
             velocity = scene.velocity(self.start) + nudge
             start = scene.placed(self.start, scene.position(self.start), velocity)
-            return simulate(scene, start, self.cycles, method=method, **options)
+            options: dict[str, Any] = {"record": "sections"}
+            if self.quantity in ("extremes", "impacts"):
+                options = {"impact_log": 32 if self.quantity == "impacts" else 0}
+            run = simulate(scene, start, self.cycles, method=method, **options)
+            found: Any = run.last
+            if self.quantity == "extremes":
+                found = run.y_min, run.y_max
+            elif self.quantity == "impacts":
+                assert run.impact_log is not None
+                found = run.impact_log.phase, run.impact_log.speed
+            return found, run.successful
 
         if self.quantity == "derivative":
-            found = jax.jacfwd(lambda nudge: last(nudge, record="sections").last)(nudge)
-        elif self.quantity == "state":
-            found = last(nudge, record="sections").last
-        elif self.quantity == "extremes":
-            run = last(nudge)
-            found = run.y_min, run.y_max
+            found, good = jax.jacfwd(looked_at, has_aux=True)(nudge)
         else:
-            run = last(nudge, impact_log=8)
-            assert run.impact_log is not None
-            found = run.impact_log.phase, run.impact_log.speed
-        return jnp.concatenate([jnp.ravel(x) for x in jtu.tree_leaves(found)])
+            found, good = looked_at(nudge)
+        # The first number tells a failed lane; NaN elsewhere is where there was no impact.
+        ended = jnp.where(good, jnp.zeros_like(nudge), jnp.inf)
+        return jnp.concatenate([ended[None], *map(jnp.ravel, jtu.tree_leaves(found))])
 
     def program(self, method: AbstractMethod) -> Callable[[], Any]:
         """All lanes under a method; other tolerances are no other program."""
