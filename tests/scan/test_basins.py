@@ -14,6 +14,7 @@ def found():
     return vi.basins(SCENE, REGION, resolution=(24, 20), settle=1500)
 
 
+@pytest.mark.slow
 def test_motions_are_orbits(found):
     assert len(found.attractors) >= 2
     for attractor in found.attractors:
