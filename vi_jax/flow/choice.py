@@ -40,10 +40,13 @@ def preset(scene: AbstractScene | None, name: str = "standard") -> AbstractMetho
 
     **Raises:** `ValueError` for another name.
     """
-    one_of("name", name, tuple(_PRESETS))
+    return _named(scene, name, "name")
+
+
+def _named(scene: AbstractScene | None, name: str, argument: str) -> AbstractMethod:
+    steps, tolerance = _PRESETS[one_of(argument, name, tuple(_PRESETS))]
     if scene is not None and _flies(scene):
         return ExactFlight()
-    steps, tolerance = _PRESETS[name]
     if scene is None or isinstance(scene, Scene):
         return FixedStep(diffrax.Dopri8(), steps)
     return Adaptive(diffrax.Dopri8(), rtol=tolerance)
@@ -67,7 +70,7 @@ def chosen(
             return preset(scene)
         return otherwise
     if isinstance(method, str):
-        return preset(scene, one_of(argument, method, tuple(_PRESETS)))
+        return _named(scene, method, argument)
     if not isinstance(method, AbstractMethod):
         raise TypeError(
             f"Argument `{argument}` must be `Adaptive(...)`, `FixedStep(...)`, `ExactFlight()` or "

@@ -99,10 +99,9 @@ def _runge_kutta(solver: Unrolled, scene: AbstractScene, s0, s1, state, time, on
 class Adaptive(AbstractMethod):
     """An explicit diffrax Runge–Kutta solver with steps sized by its error estimate.
 
-    **Arguments:** `solver` (default `diffrax.Dopri8()`, the fastest measured from
-    1e-6 on); `rtol` and `atol`, tolerances relative to
-    each state component and absolute (in the scene's dimensionless units; `atol` defaults to
-    `rtol`).
+    **Arguments:** `solver` (default `diffrax.Dopri8()`, the fastest measured from 1e-6 on); `rtol`
+    and `atol`, tolerances relative to each state component and absolute (in the scene's
+    dimensionless units; `atol` defaults to `rtol`).
 
     **Raises:** `TypeError` if the solver is not explicit Runge–Kutta, `ValueError` for tolerances
     out of (0, 1].
@@ -169,10 +168,10 @@ class FixedStep(AbstractMethod):
     Under `vmap` this is the faster choice: no lane waits for another's rejected steps. A step that
     meets a stop is split there. There are as many steps in a natural period of the body, where that
     is shorter than the drive cycle, so that the error does not depend on ζ; and more where strong
-    damping or a strong motor would make the method unstable.
+    damping or a strong motor makes something fade fast.
 
-    **Arguments:** `solver` (default `diffrax.Dopri8()`), `steps_per_cycle` (at least 5; the
-    default, 12, measured a final-state error of 7e-10 over 200 cycles of Table 1's motor scene).
+    **Arguments:** `solver` (default `diffrax.Dopri8()`), `steps_per_cycle` (at least 5; what the
+    default, 12, was measured to err is said at `preset`).
 
     **Raises:** `TypeError` if the solver is not explicit Runge–Kutta; `ValueError` for fewer than
     5 steps.

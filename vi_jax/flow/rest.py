@@ -7,7 +7,7 @@ on, and leaves when its acceleration changes sign. The drive goes on turning, wi
 a spring whose end is held.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -22,15 +22,27 @@ from .lane import RELEASE, Lane, Plan
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]
 
-# A release is approached by steps taken from the pressed side, each this much short of where the
-# last one says that it is, until one is so short that the force is straight over it; it is met if
-# it is this close then.
-_IN_DOUBLE, _IN_SINGLE = (1e-3, 1e-5, 1e-9), (1e-2, 1e-3, 1e-4)
+
+class _Precision(NamedTuple):
+    """What a precision allows."""
+
+    # A release is approached by steps taken from the pressed side, each this share short of where
+    # the last one says that it is, until one is so short that the force is straight over it; it is
+    # met if it is this close then.
+    short: float
+    straight: float
+    close: float
+    # How much of a chatter may be left when it is completed, as a share of the longest step: its
+    # error is of second order.
+    brief: float
 
 
-# How much of a chatter may be left when it is completed, as a share of the longest step: its error
-# is of second order.
-_BRIEF, _BRIEF_IN_SINGLE = 8e-6, 8e-3
+_DOUBLE = _Precision(short=1e-3, straight=1e-5, close=1e-9, brief=8e-6)
+_SINGLE = _Precision(short=1e-2, straight=1e-3, close=1e-4, brief=8e-3)
+
+
+def _allowed(s: Scalar) -> _Precision:
+    return _DOUBLE if s.dtype == jnp.float64 else _SINGLE
 
 
 class Holding(AbstractScene):
@@ -86,9 +98,7 @@ def settled(
     # Hops no higher than rounding cannot be followed, however long they last.
     height = (stop.restitution * speed) ** 2 / jnp.where(pressing > 0, 2 * pressing, 1.0)
     flat = height <= 16 * float(jnp.finfo(s.dtype).eps) * (1 + jnp.abs(stop.gap))
-    share = _BRIEF if s.dtype == jnp.float64 else _BRIEF_IN_SINGLE
-    ends = left <= jnp.where(flat, 0.1, share) * limit
-    ends = stop_gradient(ends)
+    ends = stop_gradient(left <= jnp.where(flat, 0.1, _allowed(s).brief) * limit)
     if plan.ticks(lane.state):
         ends = ends & (stop_gradient(s + left) < stop_gradient(plan.end(lane.part)))
     return ends, left
@@ -103,7 +113,7 @@ def release(
     The force is the acceleration that a free body would have there.
     """
     assert lane.contact is not None
-    short, straight, closeness = _IN_DOUBLE if h.dtype == jnp.float64 else _IN_SINGLE
+    allowed = _allowed(h)
     sign = jnp.zeros_like(h)
     for i, stop in enumerate(stops):
         sign = jnp.where(lane.contact == 1.0 + i, float(stop.sign), sign)
@@ -112,11 +122,11 @@ def release(
     held = good & (sign != 0)
     rising = held & (rise > 0)
     offset = -after * h / jnp.where(rising, rise, 1.0)
-    close = jnp.abs(stop_gradient(offset)) <= closeness
-    landed = rising & (lane.target == RELEASE) & (h <= 2 * straight) & close
+    close = jnp.abs(stop_gradient(offset)) <= allowed.close
+    landed = rising & (lane.target == RELEASE) & (h <= 2 * allowed.straight) & close
     left = rising & (after > 0) & ~landed
     place = stop_gradient(h + offset)
-    place = jnp.where(h > straight, (1 - short) * place, place)
+    place = jnp.where(h > allowed.straight, (1 - allowed.short) * place, place)
     landed = pin_flag(landed, lane.one)
     # By rounding's measure late rather than early, when it would be pressed on again; and no step
     # towards it is so short that it would not move on.

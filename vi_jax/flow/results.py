@@ -33,26 +33,6 @@ class RESULTS(eqx.Enumeration):
 
 
 # The loop carries reasons as numbers; this is their order.
-REASONS = (
-    RESULTS.successful,
-    RESULTS.bad_start,
-    RESULTS.stalled,
-    RESULTS.chatter,
-    RESULTS.underflow,
-    RESULTS.not_finite,
-    RESULTS.unresolved,
-    RESULTS.max_steps,
-)
-(
-    SUCCESSFUL,
-    BAD_START,
-    STALLED,
-    CHATTER,
-    UNDERFLOW,
-    NOT_FINITE,
-    UNRESOLVED,
-    MAX_STEPS,
-) = range(len(REASONS))
 REASON_NAMES = (
     "successful",
     "bad_start",
@@ -63,6 +43,17 @@ REASON_NAMES = (
     "unresolved",
     "max_steps",
 )
+REASONS = tuple(getattr(RESULTS, name) for name in REASON_NAMES)
+(
+    SUCCESSFUL,
+    BAD_START,
+    STALLED,
+    CHATTER,
+    UNDERFLOW,
+    NOT_FINITE,
+    UNRESOLVED,
+    MAX_STEPS,
+) = range(len(REASONS))
 
 
 def reason(code: Float[Array, ""]) -> RESULTS:

@@ -79,8 +79,7 @@ def suggest_method(
     - `error`: the error asked for, relative to 1 + |x|, for 95 of 100 lanes.
     - `quantity`: of what: `"state"` (on the last section), `"extremes"` (in each cycle),
       `"impacts"` (phase and speed of the first 32 in each cycle; a missed one is an infinite
-      error) or `"derivative"`
-      (of the last section state by the first velocity).
+      error) or `"derivative"` (of the last section state by the first velocity).
     - `start`: the first state; by default the scene's own.
     - `cycles`: drive cycles of the calibration; in a chaotic motion errors grow with them.
     - `lanes`: lanes of a batch such as it will be used in; 1 for a single motion.

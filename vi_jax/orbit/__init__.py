@@ -3,7 +3,6 @@
 from .boundary import Boundary as Boundary
 from .boundary import boundary as boundary
 from .branch import Branch as Branch
-from .branch import SpecialPoint as SpecialPoint
 from .branch import continue_orbit as continue_orbit
 from .closed_form import ClosedFormOrbits as ClosedFormOrbits
 from .closed_form import closed_form_orbits as closed_form_orbits
@@ -17,3 +16,4 @@ from .results import Orbit as Orbit
 from .search import AbstractSearch as AbstractSearch
 from .search import Gradient as Gradient
 from .search import Newton as Newton
+from .special import SpecialPoint as SpecialPoint

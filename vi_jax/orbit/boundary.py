@@ -9,17 +9,11 @@ import numpy as np
 
 from .._checks import count
 from ..scene.leaves import check_again, check_leaf, leaf, with_leaf
-from .branch import (
-    CROSSING,
-    DOUBLING,
-    FOLD,
-    GRAZING,
-    SpecialPoint,
-    orbit_of,
-)
 from .curve import Step, array_of, corrected, first_tangent, walk
 from .results import Orbit
 from .shooting import Shooting, steps_of
+from .solve import orbit_of
+from .special import CROSSING, DOUBLING, FOLD, GRAZING, SpecialPoint
 
 
 @dataclasses.dataclass(frozen=True)

@@ -40,7 +40,7 @@ class MemoryStore:
 
     def done(self, where: tuple[slice, ...]) -> bool:
         """Whether the block was computed."""
-        return bool((self.arrays["result"][where] != _UNDONE).all())
+        return _computed(self.arrays["result"], where)
 
     def write(self, where: tuple[slice, ...], numbers: Mapping[str, np.ndarray]) -> None:
         """Keep a block's numbers."""
@@ -77,7 +77,7 @@ class ZarrStore:
 
     def done(self, where: tuple[slice, ...]) -> bool:
         """Whether the block was computed."""
-        return bool((self._array("result")[where] != _UNDONE).all())
+        return _computed(self._array("result"), where)
 
     def write(self, where: tuple[slice, ...], numbers: Mapping[str, np.ndarray]) -> None:
         """Keep a block's numbers."""
@@ -88,6 +88,10 @@ class ZarrStore:
 
     def _array(self, name: str) -> Any:
         return self.group[name]
+
+
+def _computed(results: Any, where: tuple[slice, ...]) -> bool:
+    return bool((results[where] != _UNDONE).all())
 
 
 def _make(

@@ -1,0 +1,209 @@
+"""Following a branch: what happens between two of its points, and when it ends."""
+
+import dataclasses
+from collections.abc import Callable
+
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from scipy.optimize import newton
+
+from .curve import Step
+from .shooting import Shooting
+from .solve import advance, located, observe, orbit_of, state_at
+from .special import CROSSING, DOUBLING, FOLD, GRAZING, TORUS, SpecialPoint
+
+
+class Follower:
+    """Looks at each step of a walk: locates what happens in it and says when to end."""
+
+    def __init__(self, problem: Shooting, scale: np.ndarray, bounds: tuple[float, float]):
+        self.problem, self.scale, self.bounds = problem, scale, bounds
+        self.special: list[SpecialPoint] = []
+        self.between: dict[int, list[Step]] = {}
+        self.start: Step | None = None
+        self.away = False
+
+    def advance(self, x, tangent, length) -> Step:
+        """The point at this length along the tangent."""
+        return advance(self.problem, x, tangent, self.scale, length)
+
+    def stop(self, here: Step, new: Step) -> tuple[Step, str] | None:
+        """The last point, and why the branch ends between these two; `None` if it does not."""
+        reason, last = None, new
+        low, high = self.bounds
+        if not low <= new.x[-1] <= high:
+            bound = low if new.x[-1] < low else high
+            last = self._where(here, new, lambda step: float(step.x[-1]) - bound) or here
+            reason = "bounds"
+        grazing = self._grazing(here, last)
+        if grazing is not None:
+            last, reason = grazing.step, "grazing"
+        origin = self._bifurcations(here, last)
+        if origin is not None:
+            return origin, "period-doubling"
+        if grazing is not None:
+            self.special.append(grazing)
+        elif reason is None and self._closed(here, new):
+            return here, "closed"
+        return None if reason is None else (last, reason)
+
+    def _closed(self, here: Step, new: Step) -> bool:
+        self.start = here if self.start is None else self.start
+        apart = float(np.linalg.norm((new.x - self.start.x) / self.scale))
+        length = float(np.linalg.norm((new.x - here.x) / self.scale))
+        self.away = self.away or apart > 3 * length
+        return self.away and apart < 0.5 * length
+
+    def _where(self, here: Step, new: Step, test: Callable[[Step], float]) -> Step | None:
+        """The point between two at which a test is zero."""
+        return located(self.problem, here, new, self.scale, test)
+
+    def _point(self, kind: str, step: Step, detail: str, impact: int | None = None) -> SpecialPoint:
+        return SpecialPoint(
+            kind, float(step.x[-1]), orbit_of(self.problem, step), detail, self.problem, step,
+            self.scale, impact,
+        )  # fmt: skip
+
+    def _grazing(self, here: Step, new: Step) -> SpecialPoint | None:
+        """The first of the impacts lost and the stops touched between two points."""
+        found = []
+
+        def room(step: Step) -> float:
+            return float(np.clip(step.seen.clearance, -1.0, 1.0))
+
+        for i in range(len(self.problem.stops)):
+            if new.seen.approach[i] <= 0 < here.seen.approach[i]:
+                at = self._where(here, new, lambda step, i=i: float(step.seen.approach[i]))
+                if at is not None:
+                    found.append((at, i))
+        if room(new) < 0 < room(here):
+            at = self._where(here, new, room)
+            if at is not None:
+                found.append((at, None))
+        if not found:
+            return None
+        at, impact = min(found, key=lambda f: float(np.dot(here.tangent, f[0].x - here.x)))
+        if impact is None:
+            told = f"touches a stop at clock {float(at.seen.touch):.6g}"
+        else:
+            told = f"impact {impact} is lost"
+        return self._point(GRAZING, at, told, impact)
+
+    def _bifurcations(self, here: Step, last: Step) -> Step | None:
+        """Record what happens between two points; the point where the branch springs, if met.
+
+        There the two halves of the period become alike, and beyond it the same motions come again,
+        observed half a period later.
+        """
+        apart = self._halves(here)
+        if apart.size and np.dot(apart, self._halves(last)) < 0:
+            at = self._where(here, last, lambda step: float(np.dot(apart, self._halves(step))))
+            if at is not None:
+                at = self._origin(at)
+                told = "the branch springs from a motion of half the period"
+                self.special.append(self._point(DOUBLING, at, told))
+                return at
+        before, after = _tests(here), _tests(last)
+        changed = {kind for kind in before if before[kind] * after[kind] < 0}
+        if FOLD in changed:
+            changed.discard(CROSSING)
+        found = []
+        for kind in changed:
+            at = self._where(here, last, lambda step, kind=kind: _tests(step)[kind])
+            if at is None:
+                continue
+            values = at.seen.multipliers
+            told = {
+                FOLD: "a multiplier passes 1 and the branch turns back",
+                DOUBLING: "a multiplier passes -1",
+                CROSSING: "a multiplier passes 1 and another branch crosses",
+                TORUS: "a complex pair of multipliers leaves the unit circle",
+            }[kind]
+            on_circle = {
+                FOLD: np.abs(values - 1).min(),
+                DOUBLING: np.abs(values + 1).min(),
+                CROSSING: np.abs(values - 1).min(),
+                TORUS: np.abs(np.abs(values[np.abs(values.imag) > 1e-9]) - 1).min(initial=np.inf),
+            }[kind]
+            if on_circle < 1e-5:  # or else a pole of the determinant, or a real pair μ, 1/μ
+                found.append((float(np.dot(here.tangent, at.x - here.x)), kind, at, told))
+        found.sort(key=lambda f: f[0])
+        for _, kind, at, told in found:
+            self.special.append(self._point(kind, at, told))
+        self.between[id(last)] = [at for _, _, at, _ in found]
+        return None
+
+    def path(self, steps: list[Step]) -> list[Step]:
+        """The steps of a walk with the bifurcations located between them."""
+        return [step for new in steps for step in [*self.between.get(id(new), ()), new]]
+
+    def _origin(self, at: Step) -> Step:
+        """The point where the branch springs, located on the motion of half the period.
+
+        Both branches cross there, so that the equations of this one cannot be solved close by. The
+        mean of the two halves is a motion of half the period but for a term of second order.
+        """
+        problem, count = self.problem, len(self.problem.parameters)
+        legs, x = len(problem.stops) // 2, jnp.asarray(at.x)
+        turn = float(problem.scene.cycle) * problem.cycles / 2
+        half = dataclasses.replace(
+            problem, cycles=problem.cycles // 2, stops=problem.stops[:legs],
+            steps=problem.steps // 2,
+        )  # fmt: skip
+        clock, states = (np.asarray(a) for a in problem.parts(x))
+        if legs:
+            clock = 0.5 * (clock[:legs] + clock[legs:] - turn)
+            states = 0.5 * (states[:legs] + states[legs:])
+        else:
+            states = states + 0.5 * self._halves(at)
+        mean = np.asarray(half.pack(clock, states, at.x[-count:]))
+        scale = np.append(np.ones(mean.size - count), self.scale[-count:])
+        along = np.append(np.zeros(mean.size - 1), 1.0)
+
+        def missing(shift: float) -> float:
+            step = advance(half, mean, along, scale, shift)
+            M = step.seen.monodromy
+            return float(np.linalg.det(M + np.eye(len(M)))) if bool(step.good) else np.nan
+
+        shift, report = newton(  # pyright: ignore[reportAssignmentType]
+            missing, 0.0, x1=1e-6, tol=1e-14, full_output=True, disp=False
+        )
+        if not report.converged or not abs(shift) < 1e-2:
+            return at
+        found = advance(half, mean, along, scale, float(shift))
+        clock, states = (np.asarray(a) for a in half.parts(jnp.asarray(found.x)))
+        if legs:
+            clock, states = np.append(clock, clock + turn), np.concatenate([states, states])
+        x = np.asarray(problem.pack(clock, states, found.x[-count:]))
+        return at._replace(x=x, size=found.size, seen=observe(problem, x))
+
+    def _halves(self, step: Step) -> np.ndarray:
+        """How the second half of the period differs from the first; empty if it cannot be alike."""
+        legs, cycles = len(self.problem.stops), self.problem.cycles
+        if cycles % 2 or legs % 2:
+            return np.zeros(0)
+        turn = float(self.problem.scene.cycle) * cycles / 2
+        x = jnp.asarray(step.x)
+        if not legs:
+            middle = state_at(self.problem, x, jnp.asarray(0), jnp.asarray(turn))
+            return np.asarray(ravel_pytree(middle)[0]) - step.x[: self.problem.states]
+        clock, states = (np.asarray(a) for a in self.problem.parts(x))
+        half = legs // 2
+        late = clock[half:] - clock[:half] - turn
+        return np.append(late, (states[half:] - states[:half]).ravel())
+
+
+def _tests(step: Step) -> dict[str, float]:
+    """Functions that change sign at the bifurcations."""
+    M, identity = step.seen.monodromy, np.eye(step.seen.monodromy.shape[0])
+    values = step.seen.multipliers
+    pairs = [
+        1 - values[i] * values[j] for i in range(len(values)) for j in range(i + 1, len(values))
+    ]
+    return {
+        FOLD: float(step.tangent[-1]),
+        DOUBLING: float(np.linalg.det(M + identity)),
+        CROSSING: float(np.linalg.det(M - identity)),
+        TORUS: float(np.real(np.prod(pairs))),
+    }

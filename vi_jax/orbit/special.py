@@ -1,0 +1,133 @@
+"""Special points of a branch, and the branches that begin there."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from ..scene import AbstractScene
+from .curve import Step
+from .results import Orbit
+from .shooting import Shooting
+from .solve import advance, jacobian_at, orbit_of, state_at, tangent_at
+
+FOLD, DOUBLING, TORUS = "fold", "period-doubling", "neimark-sacker"
+GRAZING, CROSSING = "grazing", "branch-point"
+
+
+@dataclasses.dataclass(frozen=True)
+class SpecialPoint:
+    """A point of a branch at which something happens."""
+
+    kind: str
+    """"fold", "period-doubling", "neimark-sacker", "branch-point" or "grazing"."""
+    parameter: float
+    orbit: Orbit
+    detail: str
+    """What happens there, in words."""
+    problem: Shooting = dataclasses.field(repr=False)
+    step: Step = dataclasses.field(repr=False)
+    scale: np.ndarray = dataclasses.field(repr=False)
+    impact: int | None = None
+    """The impact that grazes; `None` where the body touches a stop that it did not hit before."""
+
+    def switch(self, *, distance: float = 0.01) -> Orbit:
+        """An orbit of the other branch that begins here, to be continued.
+
+        At a period doubling, the motion of twice the period; at a grazing, the motion with that
+        impact less or one more, on the side on which it is admissible.
+
+        **Arguments:** how far from the point (in the norm of the scaled unknowns).
+
+        **Raises:** `ValueError` for other kinds, or if there is no admissible motion beyond.
+        """
+        if self.kind == DOUBLING:
+            return _doubled(self, distance)
+        if self.kind == GRAZING:
+            return _beyond_grazing(self, distance)
+        raise ValueError(
+            "`switch` needs a period doubling or a grazing, but this special point is a "
+            f"{self.kind}."
+        )
+
+    def __str__(self) -> str:
+        return f"{self.kind} at {self.parameter:.10g}: {self.detail}"
+
+
+def _doubled(point: SpecialPoint, distance: float) -> Orbit:
+    """A motion of twice the period, along what the multiplier -1 makes possible."""
+    old = point.problem
+    x = np.asarray(point.step.x)
+    clock, states = (np.asarray(a) for a in old.parts(jnp.asarray(x)))
+    turn = float(old.scene.cycle) * old.cycles
+    if old.stops:
+        clock, states = np.concatenate([clock, clock + turn]), np.concatenate([states, states])
+        stops = old.stops * 2
+    else:
+        stops = ()
+    new = dataclasses.replace(old, cycles=2 * old.cycles, stops=stops, steps=2 * old.steps)
+    count = len(old.parameters)
+    twice = np.asarray(new.pack(clock, states, x[-count:]))
+    scale = np.concatenate([np.ones(len(twice) - count), point.scale[-count:]])
+    jacobian = np.asarray(jacobian_at(new, jnp.asarray(twice))) * scale
+    # Without the parameter's column the equations have one null vector here: that of -1.
+    tangent = np.zeros(len(twice))
+    tangent[:-count] = np.linalg.svd(jacobian[:, :-count])[2][-1]
+    step = advance(new, twice, tangent, scale, distance)
+    if not bool(step.good):
+        raise ValueError(
+            f"No motion of twice the period was found at distance {distance:g}; try another."
+        )
+    return orbit_of(new, step)
+
+
+def _beyond_grazing(point: SpecialPoint, distance: float) -> Orbit:
+    """The motion with the grazing impact less, or with the touch as an impact more."""
+    old, step = point.problem, point.step
+    x = jnp.asarray(step.x)
+    scene = old.at(x)
+    clock, states = (np.asarray(a) for a in old.parts(x))
+    stops, value = list(old.stops), np.asarray(step.x)[-1:]
+    if point.impact is not None:
+        del stops[point.impact]
+        if stops:
+            clock, states = (np.delete(a, point.impact, axis=0) for a in (clock, states))
+        else:
+            end = jnp.asarray(float(scene.cycle) * old.cycles)
+            section = state_at(old, x, jnp.asarray(0), end)
+            clock, states = np.zeros(0), np.asarray(ravel_pytree(section)[0])[None]
+    else:
+        touch = float(step.seen.touch)
+        leg = max(0, int(np.searchsorted(clock, touch, side="right")) - 1) if stops else 0
+        there = state_at(old, x, jnp.asarray(leg), jnp.asarray(touch))
+        Y = float(scene.position(there))
+        hit = min(range(len(scene.stops)), key=lambda i: abs(_room(scene, i, Y)))
+        u = np.asarray(ravel_pytree(there)[0])[None]
+        period = float(scene.cycle) * old.cycles
+        if not stops:
+            clock, states, stops = np.array([touch]), u, [hit]
+        else:
+            clock, states = np.append(clock, touch), np.append(states, u, axis=0)
+            order = np.argsort(np.mod(clock, period))
+            clock, states = np.mod(clock, period)[order], states[order]
+            stops = [[*stops, hit][i] for i in order]
+    new = dataclasses.replace(old, stops=tuple(stops))
+    start = np.asarray(new.pack(clock, states, value))
+    scale = np.concatenate([np.ones(len(start) - 1), point.scale[-1:]])
+    tangent = tangent_at(new, start, scale)
+    for sense in (1.0, -1.0):
+        found = advance(new, start, sense * tangent, scale, distance)
+        if not bool(found.good):
+            continue
+        if found.seen.clearance > 0 and min(found.seen.approach, default=1.0) > 0:
+            return orbit_of(new, found)
+    raise ValueError(
+        "Beyond this grazing there is no admissible motion with "
+        f"{len(stops)} impacts at distance {distance:g}."
+    )
+
+
+def _room(scene: AbstractScene, i: int, Y: float) -> float:
+    stop = scene.stops[i]
+    return float(stop.gap) - stop.sign * Y
