@@ -22,7 +22,8 @@ def main() -> None:
     import vi_jax as vi
 
     scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.8, gap=2.0)
-    vi.scan(scene, {"start.Y": [0.0]}, settle=300, lanes=1024, workers=2)  # compiles
+    one = {name: values[:1] for name, values in AXES.items()}
+    vi.scan(scene, one, settle=300, lanes=1024, workers=2)  # compiles
     print("begins", flush=True)
     if not options.cluster:
         vi.scan(scene, AXES, settle=300, lanes=1024, workers=2, store=options.store)
