@@ -101,7 +101,7 @@ def _arrive(
     s, state, time, direction = trial.s, trial.state, trial.time, lane.direction
     record = lane.record
     impacts, speed, loss = record.impacts, record.speed, record.loss
-    log, clearance, rests = record.log, record.clearance, record.rests
+    log, rests = record.log, record.rests
     contact = lane.contact
     completed = trial.ends_interval
     if trial.position is not None:
@@ -163,19 +163,7 @@ def _arrive(
         state, time = jtu.tree_map(lambda x, dx: x + offset * dx, (state, time), flow)
         direction = jnp.where(released, -lane.direction, direction)
         contact = jnp.where(released, 0.0, contact)
-    y_max, y_min = record.y_max, record.y_min
-    if y_max is not None and y_min is not None and trial.position is not None:
-        end = trial.position[1]
-        bend = jnp.where(end.a == 0, 1.0, end.a)
-        top = end.x - jnp.where(trial.at_turn, 0.5 * end.v**2 / bend, 0.0)
-        reached = jnp.where(trial.at_turn, top, scene.position(state))
-        if clearance is not None:
-            for stop in scene.stops:
-                short = taken & trial.at_turn & (lane.direction == stop.sign)
-                room = jnp.where(short, stop.gap - stop.sign * top, jnp.inf)
-                clearance = jnp.minimum(clearance, room)
-        y_max = jnp.where(taken, jnp.maximum(y_max, reached), y_max)
-        y_min = jnp.where(taken, jnp.minimum(y_min, reached), y_min)
+    y_max, y_min, clearance = _reached(plan, lane, trial, taken, state)
     if time is not None and record.time is not None:
         time = jnp.where(taken, time, record.time)
     return (
@@ -186,6 +174,28 @@ def _arrive(
         Record(time, y_max, y_min, impacts, speed, loss, rests, log, clearance),
         taken & completed,
     )
+
+
+def _reached(
+    plan: Plan, lane: Lane, trial: Trial, taken: Flag, state: Any
+) -> tuple[Scalar | None, Scalar | None, Scalar | None]:
+    """Greatest and smallest Y so far, and the smallest distance at a turn that met no stop."""
+    record = lane.record
+    y_max, y_min, clearance = record.y_max, record.y_min, record.clearance
+    if y_max is None or y_min is None or trial.position is None:
+        return y_max, y_min, clearance
+    end = trial.position[1]
+    bend = jnp.where(end.a == 0, 1.0, end.a)
+    top = end.x - jnp.where(trial.at_turn, 0.5 * end.v**2 / bend, 0.0)
+    reached = jnp.where(trial.at_turn, top, plan.scene.position(state))
+    if clearance is not None:
+        for stop in plan.scene.stops:
+            short = taken & trial.at_turn & (lane.direction == stop.sign)
+            room = jnp.where(short, stop.gap - stop.sign * top, jnp.inf)
+            clearance = jnp.minimum(clearance, room)
+    y_max = jnp.where(taken, jnp.maximum(y_max, reached), y_max)
+    y_min = jnp.where(taken, jnp.minimum(y_min, reached), y_min)
+    return y_max, y_min, clearance
 
 
 @jax.custom_jvp
