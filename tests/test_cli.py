@@ -18,6 +18,7 @@ def test_a_command_is_needed(capsys):
     assert "command" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_reproduce(tmp_path, capsys):
     out = tmp_path / "new" / "folder"
     assert cli.main(["reproduce", "--quick", "--out", str(out)]) == 0
