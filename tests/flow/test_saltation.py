@@ -44,8 +44,14 @@ def product(Y: float, V: float, cycles: int) -> tuple[np.ndarray, int]:
     return flight(2 * np.pi * cycles / ZETA - time) @ matrix, impacts
 
 
-@pytest.mark.parametrize("impacts", CASES)
-@pytest.mark.parametrize("adjoint", ["forward", "reverse"])
+@pytest.mark.parametrize(
+    ("adjoint", "impacts"),
+    [
+        *(("forward", impacts) for impacts in CASES),
+        ("reverse", 1),
+        *(pytest.param("reverse", n, marks=pytest.mark.slow) for n in CASES if n > 1),
+    ],
+)
 @pytest.mark.parametrize(
     ("method", "tolerance"),
     [(vi.ExactFlight(), 1e-9), (vi.Adaptive(diffrax.Tsit5(), rtol=1e-11), 1e-7)],

@@ -38,6 +38,7 @@ def test_given_axes_are_used(branch):
     assert len(ax.lines[-1].get_xdata()) == 4
 
 
+@pytest.mark.slow
 def test_boundary_is_drawn_in_its_plane(branch):
     doubling = next(p for p in branch.special if p.kind == "period-doubling")
     curve = vi.boundary(
