@@ -18,5 +18,5 @@ def _room_for_programs():
     """Compiled programs go before they use up the memory maps that Linux grants a process (65,530
     by default), beyond which the compiler dies; a file of tests needs up to 31,000."""
     yield
-    if _MAPS.exists() and _MAPS.read_bytes().count(b"\n") > 25_000:
+    if _MAPS.exists() and _MAPS.read_bytes().count(b"\n") > 15_000:
         jax.clear_caches()
