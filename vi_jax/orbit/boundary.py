@@ -9,10 +9,11 @@ import numpy as np
 
 from .._checks import count
 from ..scene.leaves import check_again, check_leaf, leaf, with_leaf
-from .curve import Step, array_of, corrected, first_tangent, walk
+from .curve import Step, walk
 from .results import Orbit
 from .shooting import Shooting, steps_of
-from .solve import orbit_of
+from .solve import advance as solved
+from .solve import orbit_of, tangent_at
 from .special import CROSSING, DOUBLING, FOLD, GRAZING, SpecialPoint
 
 
@@ -111,11 +112,10 @@ def boundary(
     scale = np.ones(problem.size)
     scale[-2:] = [0.5 * (high - low) for low, high in bounds]
     condition = _Condition(problem, point.kind, point.impact)
-    tangent = np.asarray(_tangent(condition, jnp.asarray(x), jnp.asarray(scale)))
+    tangent = tangent_at(condition, x, scale)
 
     def advance(x: Any, tangent: Any, length: float) -> Step:
-        arguments = (jnp.asarray(a) for a in (x, tangent, scale, length))
-        return array_of(_advance(condition, *arguments))
+        return solved(condition, x, tangent, scale, length)
 
     start = advance(x, tangent, 0.0)
     if not bool(start.good):
@@ -173,18 +173,8 @@ class _Condition(eqx.Module):
             extra = jnp.linalg.det(seen.monodromy - identity)
         return jnp.append(missing, extra)
 
-
-@eqx.filter_jit
-def _tangent(condition: _Condition, x, scale):
-    return first_tangent(condition.residual, x, scale)
-
-
-@eqx.filter_jit
-def _advance(condition: _Condition, x, tangent, scale, length) -> Step:
-    def observe(x, tangent):
-        return condition.problem.observe(x)
-
-    return corrected(condition.residual, observe, x, tangent, scale, length)
+    def observe(self, x):
+        return self.problem.observe(x)
 
 
 def _cut(advance: Any, here: Step, new: Step, bounds: Any, scale: np.ndarray) -> Step:

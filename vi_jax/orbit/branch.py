@@ -166,7 +166,7 @@ def continue_orbit(
         check_again(with_leaf(orbit.scene, parameter, bound))
     require("step", step, low=0.0, open_low=True)
     count("max_points", max_points, least=2)
-    problem, x = problem_of(orbit, (parameter,), [(low, high)], flow)
+    problem, x = problem_of(orbit, parameter, (low, high), flow)
     scale = np.ones(problem.size)
     scale[-1] = 0.5 * (high - low)
     # Across the branch, not at a fixed parameter: the orbit may lie at a fold.

@@ -1,7 +1,7 @@
 """The equations of an orbit from impact to impact, solved: their programs, and what they say."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -18,18 +18,26 @@ from .results import ORBIT_RESULTS, Orbit
 from .shooting import Shooting, carrier, steps_of
 
 
+@runtime_checkable
+class Equations(Protocol):
+    """What is solved here: an orbit's equations, or those with a condition beside them."""
+
+    def residual(self, x: Any) -> Any:
+        """What the unknowns `x` lack to be a solution."""
+        ...
+
+    def observe(self, x: Any) -> Any:
+        """What is seen of a solution."""
+        ...
+
+
 def problem_of(
-    orbit: Orbit,
-    parameters: tuple[str, ...],
-    ranges: list[tuple[float, float]],
-    flow: MethodLike,
+    orbit: Orbit, parameter: str, bounds: tuple[float, float], flow: MethodLike
 ) -> tuple[Shooting, np.ndarray]:
     """The equations of an orbit from impact to impact, and the unknowns it gives."""
     scene = orbit.scene
     carried = carrier(flow or orbit.flow, scene)
-    corners = [scene]
-    for name, ends in zip(parameters, ranges, strict=True):
-        corners = [with_leaf(x, name, end) for x in corners for end in ends]
+    corners = [with_leaf(scene, parameter, end) for end in bounds]
     cycles = int(orbit.cycles)
     stops = tuple(int(i) for i in np.asarray(orbit.impact_stop) if i >= 0)
     if len(stops) != int(orbit.impacts):
@@ -38,7 +46,7 @@ def problem_of(
             f"{len(stops)}: find it with a larger `impact_log`."
         )
     steps = steps_of(carried, corners, orbit.state, cycles)
-    problem = Shooting(scene, carried, orbit.state, cycles, stops, steps, parameters)
+    problem = Shooting(scene, carried, orbit.state, cycles, stops, steps, (parameter,))
     section = 0.0
     if isinstance(scene, Scene) and scene.section_phase is not None:
         section = float(scene.section_phase)
@@ -49,8 +57,8 @@ def problem_of(
         u = _carry(problem, s, place, u)
         states.append(u)
         u, s = _bounce(problem, i, u), place
-    values = [leaf(scene, name) for name in parameters]
-    x = problem.pack(clock, jnp.stack(states) if states else u, values)
+    value = leaf(scene, parameter)
+    x = problem.pack(clock, jnp.stack(states) if states else u, [value])
     return problem, np.asarray(x)
 
 
@@ -65,17 +73,17 @@ def _bounce(problem: Shooting, leg, u):
 
 
 @eqx.filter_jit
-def _compiled_advance(problem, x, tangent, scale, length) -> Step:
+def _compiled_advance(equations, x, tangent, scale, length) -> Step:
     def observe(x, tangent):
-        return problem.observe(x)
+        return equations.observe(x)
 
-    return corrected(problem.residual, observe, x, tangent, scale, length)
+    return corrected(equations.residual, observe, x, tangent, scale, length)
 
 
-def advance(problem: Shooting, x, tangent, scale, length) -> Step:
+def advance(equations: Equations, x, tangent, scale, length) -> Step:
     """The solution at this length along a tangent from `x` (scaled unknowns)."""
     arguments = (jnp.asarray(a) for a in (x, tangent, scale, length))
-    return array_of(_compiled_advance(problem, *arguments))
+    return array_of(_compiled_advance(equations, *arguments))
 
 
 @eqx.filter_jit
@@ -89,13 +97,13 @@ def observe(problem: Shooting, x: np.ndarray) -> Any:
 
 
 @eqx.filter_jit
-def _compiled_tangent(problem, x, scale):
-    return first_tangent(problem.residual, x, scale)
+def _compiled_tangent(equations, x, scale):
+    return first_tangent(equations.residual, x, scale)
 
 
-def tangent_at(problem: Shooting, x: np.ndarray, scale: np.ndarray) -> np.ndarray:
+def tangent_at(equations: Equations, x: np.ndarray, scale: np.ndarray) -> np.ndarray:
     """The unit tangent of the solutions through `x`, in scaled unknowns."""
-    return np.asarray(_compiled_tangent(problem, jnp.asarray(x), jnp.asarray(scale)))
+    return np.asarray(_compiled_tangent(equations, jnp.asarray(x), jnp.asarray(scale)))
 
 
 @eqx.filter_jit

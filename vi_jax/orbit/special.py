@@ -89,13 +89,13 @@ def _beyond_grazing(point: SpecialPoint, distance: float) -> Orbit:
     scene = old.at(x)
     clock, states = (np.asarray(a) for a in old.parts(x))
     stops, value = list(old.stops), np.asarray(step.x)[-1:]
+    period = float(scene.cycle) * old.cycles
     if point.impact is not None:
         del stops[point.impact]
         if stops:
             clock, states = (np.delete(a, point.impact, axis=0) for a in (clock, states))
         else:
-            end = jnp.asarray(float(scene.cycle) * old.cycles)
-            section = state_at(old, x, jnp.asarray(0), end)
+            section = state_at(old, x, jnp.asarray(0), jnp.asarray(period))
             clock, states = np.zeros(0), np.asarray(ravel_pytree(section)[0])[None]
     else:
         touch = float(step.seen.touch)
@@ -104,7 +104,6 @@ def _beyond_grazing(point: SpecialPoint, distance: float) -> Orbit:
         Y = float(scene.position(there))
         hit = min(range(len(scene.stops)), key=lambda i: abs(_room(scene, i, Y)))
         u = np.asarray(ravel_pytree(there)[0])[None]
-        period = float(scene.cycle) * old.cycles
         if not stops:
             clock, states, stops = np.array([touch]), u, [hit]
         else:
