@@ -4,9 +4,9 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
-import jax.tree_util as jtu
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
+
+from .. import lanes
 
 _CPU_OPTIONS = {
     # Small kernels lose more by being split over threads than they gain.
@@ -15,18 +15,12 @@ _CPU_OPTIONS = {
 }
 
 
-def pin(x: Any, one: Float[Array, ""]) -> Any:
-    """The same values, divided by a 1 that the compiler does not know.
-
-    XLA's CPU backend copies cheap producers into each of their consumers when it fuses, which
-    multiplies the work of an iteration; it does not copy divisions.
-    """
-    return jtu.tree_map(lambda v: v / one, x)
+def pin(x: Any, one: Any) -> Any:
+    return lanes.pin(x)
 
 
-def pin_flag(flag: Bool[Array, ""], one: Float[Array, ""]) -> Bool[Array, ""]:
-    """`pin` for a truth value."""
-    return pin(jnp.where(flag, one, 0.0), one) > 0.5
+def pin_flag(flag: Bool[Array, ""], one: Any) -> Bool[Array, ""]:
+    return lanes.pin_flag(flag, one)
 
 
 def jit(function: Callable, **options: Any) -> jax.stages.Wrapped:

@@ -12,7 +12,7 @@ The length of an aimed step is a constant for differentiation, while δ carries 
 forward and reverse derivatives through an impact are exact (the saltation matrix).
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -38,7 +38,18 @@ _LOST, _MANY = 64.0, 16.0
 _STUCK = 65536.0
 
 
-def iterate(plan: Plan, lane: Lane) -> Lane:
+class Step(NamedTuple):
+    """What a step made of a lane."""
+
+    lane: Lane
+    completed: Flag
+    """Whether an interval ended with it."""
+    state: Any
+    record: Record
+    """Of that interval."""
+
+
+def iterate(plan: Plan, lane: Lane) -> Step:
     """One step of one lane: advance, aim or land. A lane that has ended is left as it is."""
     active = (lane.done < plan.intervals) & (lane.fault == 0)
     trial = attempt(plan, lane, active)
@@ -60,8 +71,7 @@ def iterate(plan: Plan, lane: Lane) -> Lane:
     s = jnp.where(turned, 0.0, s)
     if not plan.ticks(state):
         state = select(turned, plan.scene.rewound(state), state)
-    kept_state = select(completed, state, lane.kept_state)
-    kept = select(completed, record, lane.kept)
+    of_interval = record
     record = select(completed, plan.fresh(state), record)
 
     steps = lane.steps + jnp.where(active, 1.0, 0.0)
@@ -70,7 +80,7 @@ def iterate(plan: Plan, lane: Lane) -> Lane:
     for condition, code in _faults(plan, lane, trial, rejected, length, record, steps, aims):
         stops_here = active & (fault == 0) & condition & (done < plan.intervals)
         fault = jnp.where(stops_here, float(code), fault)
-    return Lane(
+    new = Lane(
         s=s,
         state=state,
         record=record,
@@ -87,9 +97,8 @@ def iterate(plan: Plan, lane: Lane) -> Lane:
         begun=jnp.where(completed, steps, lane.begun),
         rejected=lane.rejected + jnp.where(rejected, 1.0, 0.0),
         one=one,
-        kept_state=kept_state,
-        kept=kept,
     )
+    return Step(new, completed, state, of_interval)
 
 
 def _arrive(

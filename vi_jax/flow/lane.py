@@ -66,9 +66,6 @@ class Lane(eqx.Module):
     rejected: Scalar
     one: Scalar
     """1, which the compiler cannot know (see `hybrid.pin`)."""
-    kept_state: Any
-    kept: Record
-    """State at the end of the last completed interval, and its record, for the caller to store."""
 
 
 class Plan(eqx.Module):
@@ -87,6 +84,8 @@ class Plan(eqx.Module):
     """Whether the body may come to rest on a stop."""
     bound: int = eqx.field(static=True)
     """Steps that reverse mode must be able to store; 0 in forward mode."""
+    road: str = eqx.field(static=True)
+    """Which compiler runs it (see `lanes.road`)."""
     # Numbers that are no part of the program, so that others are not another one.
     settle: Scalar
     """Cycles before the first one recorded."""
@@ -182,6 +181,4 @@ class Plan(eqx.Module):
             begun=zero,
             rejected=zero,
             one=jnp.where(bad, jnp.nan, 1.0).astype(zero.dtype),
-            kept_state=start,
-            kept=self.fresh(start),
         )

@@ -1,14 +1,16 @@
 """The loop around the hybrid step: forward, or so that it can be differentiated in reverse."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool
 
+from .. import lanes
+from .aim import select
 from .hybrid import iterate
 from .lane import Lane, Plan, Record
 
@@ -33,67 +35,82 @@ def _active(plan: Plan, lane: Lane) -> Bool[Array, ""]:
     )
 
 
-def run_forward(plan: Plan, lane: Lane) -> tuple[Lane, Any, Record]:
-    """All lanes to their end, in one flat loop: no lane waits for another at a section.
+class Ends(NamedTuple):
+    """How a lane ended."""
 
-    Steps are taken in blocks in which a lane completes at most one interval, so that results are
-    stored once a block. Differentiable in forward mode.
+    done: Any
+    fault: Any
+    steps: Any
+    rejected: Any
 
-    **Returns:** the final lane, and the states and records of the intervals kept, with leading
-    axis `plan.kept + 1`: the first holds the state in which recording begins, and no record.
+    @classmethod
+    def of(cls, lane: Lane) -> "Ends":
+        return cls(lane.done, lane.fault, lane.steps, lane.rejected)
+
+
+def run_forward(plan: Plan, start: Any, wanted: Any = True) -> tuple[Ends, Any, Record]:
+    """A lane to its end, in one flat loop: in a batch no lane waits for another at a section.
+
+    Differentiable in forward mode.
+
+    **Returns:** how it ended, and the states and records of the intervals kept, with leading axis
+    `plan.kept + 1`: the first holds the state in which recording begins, and no record.
     """
-    flat, unravel = ravel_pytree((lane.kept_state, lane.kept))
-    store = jnp.full((plan.kept + 1, flat.size), jnp.nan, flat.dtype)
-    store = store.at[place_of(plan, lane.done, True)].set(flat, mode="drop")
+    numbers, rest = eqx.partition(plan, eqx.is_array)
 
-    def body(carry):
-        lane, store = carry
-        before = lane.done
-        lane = jax.lax.fori_loop(0, plan.block, lambda _, x: iterate(plan, x), lane)
-        kept, _ = ravel_pytree((lane.kept_state, lane.kept))
-        place = place_of(plan, lane.done, lane.done > before)
-        return lane, store.at[place].set(kept, mode="drop")
+    def begin(inputs):
+        numbers, start, wanted = inputs
+        plan = eqx.combine(numbers, rest)
+        lane = plan.launch(start, wanted)
+        first = plan.skipped <= 0
+        return lane, lanes.Emitted(_active(plan, lane), first, (start, plan.fresh(start)))
 
-    def going(carry):
-        return any_lane(_active(plan, carry[0]))
+    def step(inputs, lane):
+        plan = eqx.combine(inputs[0], rest)
+        new = iterate(plan, lane)
+        complete = new.completed & (new.lane.done >= plan.skipped)
+        return new.lane, lanes.Emitted(_active(plan, new.lane), complete, (new.state, new.record))
 
-    lane, store = jax.lax.while_loop(going, body, (lane, store))
-    state, record = jax.vmap(unravel)(store)
-    return lane, state, record
+    def end(inputs, lane):
+        return Ends.of(lane)
+
+    inputs = numbers, start, jnp.asarray(wanted)
+    ends, (states, records) = lanes.run(
+        begin, step, end, inputs, rows=plan.kept + 1, block=plan.block, road=plan.road
+    )
+    return ends, states, records
 
 
-def place_of(plan: Plan, done: jax.Array, new: jax.Array | bool) -> jax.Array:
-    """Where the interval just completed is stored; beyond the end if nowhere."""
-    place = jax.lax.stop_gradient(done) - plan.skipped
-    return jnp.where(new & (place >= 0), place, float(plan.kept + 1)).astype(jnp.int32)
-
-
-def run_reverse(plan: Plan, lane: Lane) -> tuple[Lane, Any, Record]:
+def run_reverse(plan: Plan, start: Any) -> tuple[Ends, Any, Record]:
     """As `run_forward`, by a scan over intervals with a checkpointed loop in each.
 
     Differentiable in reverse mode, with memory that grows with the root of the number of steps.
     """
 
-    def interval(lane, goal):
-        def going(lane):
+    def interval(carry, goal):
+        def going(carry):
+            lane, *_ = carry
             return any_lane(_active(plan, lane) & (jax.lax.stop_gradient(lane.done - goal) < 0))
 
-        def body(lane):
-            return _held(plan, goal, lane)
+        def body(carry):
+            return _held(plan, goal, *carry)
 
-        lane = eqxi.while_loop(going, body, lane, kind="checkpointed", max_steps=plan.bound)
-        return lane, (lane.kept_state, lane.kept, lane.done >= goal)
+        carry = eqxi.while_loop(going, body, carry, kind="checkpointed", max_steps=plan.bound)
+        lane, state, record = carry
+        return carry, (state, record, lane.done >= goal)
 
-    goals = plan.skipped + jnp.arange(plan.kept + 1, dtype=lane.done.dtype)
-    lane, (state, record, complete) = jax.lax.scan(interval, lane, goals)
+    goals = plan.skipped + jnp.arange(plan.kept + 1, dtype=plan.settle.dtype)
+    first = plan.launch(start), start, plan.fresh(start)
+    (lane, *_), (state, record, complete) = jax.lax.scan(interval, first, goals)
     state, record = jtu.tree_map(
         lambda x: jax.vmap(jnp.where)(complete, x, jnp.full_like(x, jnp.nan)), (state, record)
     )
-    return lane, state, record
+    return Ends.of(lane), state, record
 
 
-def _held(plan: Plan, goal, lane: Lane) -> Lane:
+def _held(plan: Plan, goal, lane: Lane, state: Any, record: Record) -> tuple[Lane, Any, Record]:
     """One step of a lane that has not yet reached its goal."""
     new = iterate(plan, lane)
-    waiting = lane.done >= goal
-    return jtu.tree_map(lambda a, b: jnp.where(waiting, a, b), lane, new)
+    waiting, completed = lane.done >= goal, new.completed & (lane.done < goal)
+    kept = select(completed, (new.state, new.record), (state, record))
+    return select(waiting, lane, new.lane), *kept

@@ -11,12 +11,12 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
+from .. import lanes
 from .._checks import concrete, count, one_of
 from ..scene import AbstractScene, Scene
 from .choice import MethodLike, chosen
-from .lane import Lane, Plan, Record
-from .loop import run_forward, run_reverse
-from .pool import run_pool
+from .lane import Plan, Record
+from .loop import Ends, run_forward, run_reverse
 from .results import Errors, ImpactLog, Run, Samples, reason
 
 # Steps in a cycle that reverse mode makes room for, unless the caller says otherwise.
@@ -163,6 +163,7 @@ def planned(
         log=impact_log,
         rests=(scene.may_rest() if rests is None else rests) and bool(scene.stops),
         bound=bound,
+        road=lanes.current_road(),
         settle=jnp.asarray(settle, dtype),
         max_steps=jnp.asarray(jnp.inf if max_steps is None else max_steps, dtype),
         max_impacts=jnp.asarray(max_impacts, dtype),
@@ -212,8 +213,7 @@ def check_start(scene: AbstractScene, start: Any) -> None:
 @eqx.filter_jit
 def _simulate(plan: Plan, start: Any, sampled: bool) -> Run:
     run = run_reverse if plan.bound else run_forward
-    lane, states, records = run(plan, plan.launch(start))
-    return collect(plan, sampled, lane, states, records)
+    return collect(plan, sampled, *run(plan, start))
 
 
 def _errors(run: Run, tighter: Run) -> Errors:
@@ -247,20 +247,16 @@ def simulate_pool(
     back as failed); `places`, lanes on their way at once; `options` as for `simulate`.
     """
 
-    def begin(value):
-        return planned(*lane_of(value), cycles, **options)
+    def one(value, wanted):
+        plan, start = planned(*lane_of(value), cycles, **options)
+        return collect(plan, False, *run_forward(plan, start, wanted))
 
     if wanted is None:
         wanted = jnp.ones(jtu.tree_leaves(values)[0].shape[0], bool)
-    lanes, points, records = run_pool(begin, values, wanted, places)
-
-    def one(value, lane, points, records):
-        return collect(begin(value)[0], False, lane, points, records)
-
-    return jax.vmap(one)(values, lanes, points, records)
+    return jax.vmap(one)(values, wanted)
 
 
-def collect(plan: Plan, sampled: bool, lane: Lane, points: Any, records: Record) -> Run:
+def collect(plan: Plan, sampled: bool, lane: Ends, points: Any, records: Record) -> Run:
     """The run from what the loop stored for each interval."""
     scene, parts = plan.scene, plan.parts
     records = jtu.tree_map(lambda x: x[1:], records)

@@ -1,0 +1,11 @@
+"""One lane's loop, run for any number of lanes: vector code by LLVM on a CPU, else XLA."""
+
+from .elementary import pin as pin
+from .elementary import pin_flag as pin_flag
+from .elementary import sincos as sincos
+from .loop import Emitted as Emitted
+from .loop import current_road as current_road
+from .loop import road as road
+from .loop import run as run
+from .machine import processor as processor
+from .machine import threads as threads

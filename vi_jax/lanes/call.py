@@ -1,0 +1,134 @@
+"""The way from a compiled XLA program into a kernel: a foreign-function handler made by ctypes.
+
+The call frame is read as XLA's `ffi/api/c_api.h` lays it out, whose version the handler states.
+"""
+
+import ctypes
+import functools
+from ctypes import POINTER, Structure, c_char_p, c_int, c_int32, c_int64, c_size_t, c_void_p
+
+import jax
+import numpy as np
+
+from .machine import living
+
+TARGET = "vi_jax_lanes"
+
+# Of the interface that is written out below.
+_MAJOR, _MINOR = 0, 3
+
+_METADATA, _EXECUTE, _CANCELLED, _INTERNAL = 1, 3, 1, 13
+
+
+class _Extension(Structure):
+    pass
+
+
+_Extension._fields_ = [
+    ("struct_size", c_size_t), ("type", c_int), ("next", POINTER(_Extension)),
+]  # fmt: skip
+
+
+class _Version(Structure):
+    _fields_ = [
+        ("struct_size", c_size_t), ("extension", c_void_p), ("major", c_int), ("minor", c_int),
+    ]  # fmt: skip
+
+
+class _Metadata(Structure):
+    _fields_ = [("struct_size", c_size_t), ("version", _Version)]
+
+
+class _MetadataExtension(Structure):
+    _fields_ = [("base", _Extension), ("metadata", POINTER(_Metadata))]
+
+
+class _Buffer(Structure):
+    _fields_ = [
+        ("struct_size", c_size_t), ("extension", c_void_p), ("dtype", c_int), ("data", c_void_p),
+        ("rank", c_int64), ("dims", POINTER(c_int64)),
+    ]  # fmt: skip
+
+
+class _Buffers(Structure):
+    _fields_ = [
+        ("struct_size", c_size_t), ("extension", c_void_p), ("size", c_int64),
+        ("types", c_void_p), ("items", POINTER(POINTER(_Buffer))),
+    ]  # fmt: skip
+
+
+class _ErrorArguments(Structure):
+    _fields_ = [
+        ("struct_size", c_size_t), ("extension", c_void_p), ("message", c_char_p), ("code", c_int),
+    ]  # fmt: skip
+
+
+class _Api(Structure):
+    _fields_ = [
+        ("struct_size", c_size_t), ("extension", c_void_p), ("version", _Version),
+        ("internal", c_void_p),
+        ("error_create", ctypes.CFUNCTYPE(c_void_p, POINTER(_ErrorArguments))),
+    ]  # fmt: skip
+
+
+class _Frame(Structure):
+    _fields_ = [
+        ("struct_size", c_size_t), ("extension", POINTER(_Extension)), ("api", POINTER(_Api)),
+        ("context", c_void_p), ("stage", c_int), ("arguments", _Buffers), ("results", _Buffers),
+    ]  # fmt: skip
+
+
+def _failed(frame: _Frame, message: str, code: int) -> int | None:
+    arguments = _ErrorArguments(
+        ctypes.sizeof(_ErrorArguments), None, message.encode(errors="replace"), code
+    )
+    return frame.api.contents.error_create(ctypes.byref(arguments))
+
+
+@ctypes.CFUNCTYPE(c_void_p, POINTER(_Frame))
+def _handler(pointer):
+    frame = pointer.contents
+    extension = frame.extension
+    while extension:
+        if extension.contents.type == _METADATA:
+            metadata = ctypes.cast(extension, POINTER(_MetadataExtension)).contents.metadata
+            metadata.contents.version.major, metadata.contents.version.minor = _MAJOR, _MINOR
+            return None
+        extension = extension.contents.next
+    if frame.stage != _EXECUTE:
+        return None
+    try:
+        return _run(frame)
+    except KeyboardInterrupt:
+        return _failed(frame, "interrupted", _CANCELLED)
+    except BaseException as error:  # nothing may escape into XLA
+        return _failed(frame, f"{type(error).__name__}: {error}", _INTERNAL)
+
+
+def _run(frame: _Frame) -> int | None:
+    arguments, results = frame.arguments, frame.results
+    head = arguments.items[0].contents
+    # Which kernel, how many lanes, and the strides of the inputs, as pairs of 32 bits.
+    numbers = np.ctypeslib.as_array(
+        ctypes.cast(head.data, POINTER(c_int32)), (2 * (arguments.size + 1),)
+    )
+    key, lanes, *strides = (int(x) for x in numbers.view(np.int64))
+    kernel = living(key)
+    if kernel is None:
+        return _failed(frame, "The kernel of this program is not of this process.", _INTERNAL)
+    inputs = [arguments.items[i].contents.data or 0 for i in range(1, arguments.size)]
+    outputs = [results.items[i].contents.data or 0 for i in range(results.size)]
+    kernel.run(inputs, strides, outputs, lanes)
+    return None
+
+
+@functools.cache
+def registered() -> str:
+    """The name by which XLA knows the handler; registered on first use."""
+    jax.ffi.register_ffi_target(TARGET, jax.ffi.pycapsule(_handler), platform="cpu", api_version=1)
+    return TARGET
+
+
+def header(key: int, lanes: int, strides: list[int]) -> np.ndarray:
+    """The first argument of a call; of 32 bits, since 64 may be switched off."""
+    return np.asarray([key, lanes, *strides], np.int64).view(np.int32)

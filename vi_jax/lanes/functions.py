@@ -1,0 +1,137 @@
+"""Elementary functions without a hardware instruction, as polynomials on whole vectors."""
+
+from collections.abc import Sequence
+from math import factorial, log, pi
+
+from .text import Text, Value
+
+_SIN = tuple((-1) ** n / factorial(2 * n + 1) for n in range(11))
+_COS = tuple((-1) ** n / factorial(2 * n) for n in range(12))
+_EXP = tuple(1 / factorial(n) for n in range(14))
+_ATANH = tuple(2 / (2 * n + 1) for n in range(12))
+
+
+def _parts(number: float, count: int) -> list[float]:
+    """`number` (to some hundred bits) as a sum of doubles whose products with small integers are
+    exact."""
+    from fractions import Fraction
+
+    exact = {
+        pi: Fraction(884279719003555, 281474976710656) + Fraction(1.2246467991473532e-16)
+        + Fraction(-2.9947698097183397e-33),
+        log(2): Fraction(log(2)) + Fraction(2.3190468138462996e-17),
+    }[number]  # fmt: skip
+    parts = []
+    for _ in range(count - 1):
+        scale = 2.0 ** (29 - _exponent(float(exact)))
+        head = round(exact * Fraction(scale)) / scale
+        parts.append(head)
+        exact -= Fraction(head)
+    return [*parts, float(exact)]
+
+
+def _exponent(number: float) -> int:
+    from math import frexp
+
+    return frexp(abs(number))[1]
+
+
+_PI, _LN2 = _parts(pi, 3), _parts(log(2), 2)
+
+
+def _add(t: Text, a: Value, b: Value) -> Value:
+    return t.binary("fadd contract", a, b)
+
+
+def _mul(t: Text, a: Value, b: Value) -> Value:
+    return t.binary("fmul contract", a, b)
+
+
+def _horner(t: Text, coefficients: Sequence[float], x: Value) -> Value:
+    total = t.constant(coefficients[-1], x.kind)
+    for c in coefficients[-2::-1]:
+        total = _add(t, _mul(t, total, x), t.constant(c, x.kind))
+    return total
+
+
+def _less_multiples(t: Text, x: Value, turns: Value, parts: Sequence[float]) -> Value:
+    for part in parts:
+        x = t.binary("fsub contract", x, _mul(t, turns, t.constant(part, x.kind)))
+    return x
+
+
+def _reduced(t: Text, x: Value) -> tuple[Value, Value]:
+    """x less a multiple of π, within ±π/2, and the sign bit of (-1)^multiple."""
+    turns = t.intrinsic("roundeven", _mul(t, x, t.constant(1 / pi, "double")))
+    whole = t.cast("fptosi", turns, "i64")
+    odd = t.binary("shl", whole, t.constant(63, "i64"))
+    return _less_multiples(t, x, turns, _PI), odd
+
+
+def _flipped(t: Text, x: Value, bit: Value) -> Value:
+    return t.cast("bitcast", t.binary("xor", t.cast("bitcast", x, "i64"), bit), "double")
+
+
+def sincos(t: Text, x: Value) -> tuple[Value, Value]:
+    """Sine and cosine of a phase, to rounding up to a million turns."""
+    wide = t.cast("fpext", x, "double") if x.kind == "float" else x
+    rest, bit = _reduced(t, wide)
+    square = _mul(t, rest, rest)
+    sine = _flipped(t, _mul(t, rest, _horner(t, _SIN, square)), bit)
+    cosine = _flipped(t, _horner(t, _COS, square), bit)
+    if x.kind == "float":
+        return t.cast("fptrunc", sine, "float"), t.cast("fptrunc", cosine, "float")
+    return sine, cosine
+
+
+def exp(t: Text, x: Value) -> Value:
+    """e to the x, overflow and underflow included."""
+    if x.kind == "float":
+        return t.cast("fptrunc", exp(t, t.cast("fpext", x, "double")), "float")
+    low, high = t.constant(-760.0, "double"), t.constant(720.0, "double")
+    # Not a number stays one: the comparisons are false for it.
+    y = t.select(_compare(t, "olt", x, low), low, x)
+    y = t.select(_compare(t, "ogt", y, high), high, y)
+    n = t.intrinsic("roundeven", _mul(t, y, t.constant(1 / log(2), "double")))
+    value = _horner(t, _EXP, _less_multiples(t, y, n, _LN2))
+    # 2^n in two factors, so that neither leaves the range of exponents.
+    finite = t.select(_compare(t, "uno", x, x), t.zero("double"), n)
+    whole = t.cast("fptosi", finite, "i64")
+    half = t.binary("ashr", whole, t.constant(1, "i64"))
+    for power in (half, t.binary("sub", whole, half)):
+        biased = t.binary("add", power, t.constant(1023, "i64"))
+        factor = t.cast("bitcast", t.binary("shl", biased, t.constant(52, "i64")), "double")
+        value = _mul(t, value, factor)
+    return value
+
+
+def log_(t: Text, x: Value) -> Value:
+    """Natural logarithm."""
+    if x.kind == "float":
+        return t.cast("fptrunc", log_(t, t.cast("fpext", x, "double")), "float")
+    tiny = _compare(t, "olt", x, t.constant(2.0**-1000, "double"))
+    scaled = t.select(tiny, _mul(t, x, t.constant(2.0**54, "double")), x)
+    bits = t.cast("bitcast", scaled, "i64")
+    # The mantissa between √½ and √2.
+    shifted = t.binary("sub", bits, t.constant(0x3FE6A09E667F3BCD, "i64"))
+    power = t.binary("ashr", shifted, t.constant(52, "i64"))
+    mantissa = t.cast(
+        "bitcast", t.binary("sub", bits, t.binary("shl", power, t.constant(52, "i64"))), "double"
+    )
+    n = t.cast("sitofp", power, "double")
+    n = t.select(tiny, t.binary("fsub", n, t.constant(54.0, "double")), n)
+    one = t.constant(1.0, "double")
+    ratio = t.binary("fdiv", t.binary("fsub", mantissa, one), t.binary("fadd", mantissa, one))
+    series = _mul(t, ratio, _horner(t, _ATANH, _mul(t, ratio, ratio)))
+    low = _add(t, series, _mul(t, n, t.constant(_LN2[1], "double")))
+    value = _add(t, _mul(t, n, t.constant(_LN2[0], "double")), low)
+    infinity, nan = t.constant(float("inf"), "double"), t.constant(float("nan"), "double")
+    value = t.select(_compare(t, "olt", x, infinity), value, x)
+    value = t.select(
+        _compare(t, "oeq", x, t.zero("double")), t.constant(-float("inf"), "double"), value
+    )
+    return t.select(_compare(t, "olt", x, t.zero("double")), nan, value)
+
+
+def _compare(t: Text, how: str, a: Value, b: Value) -> Value:
+    return t.binary(f"fcmp {how}", a, b, "i1")

@@ -1,0 +1,196 @@
+"""From LLVM's text to machine code for this processor, and its call on several threads."""
+
+import ctypes
+import functools
+import hashlib
+import os
+import threading
+import weakref
+from collections import OrderedDict
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import Any
+
+import numpy as np
+
+from .kernel import kernel_text
+from .program import Program
+from .vector import Unsupported, check
+
+_KEPT = 64
+
+_threads: ContextVar[int | None] = ContextVar("threads", default=None)
+_cpu: ContextVar[str | None] = ContextVar("cpu", default=None)
+
+
+class Interrupted(RuntimeError):
+    """A call that was ended from outside before its lanes were done."""
+
+
+@contextmanager
+def threads(number: int):
+    """Run lanes on so many threads within this context (default: the cores of this process)."""
+    token = _threads.set(number)
+    try:
+        yield
+    finally:
+        _threads.reset(token)
+
+
+@contextmanager
+def processor(name: str):
+    """Write machine code for this processor (in LLVM's words, such as `"x86-64-v3"`) within this
+    context; it must be one that this one can stand in for."""
+    token = _cpu.set(name)
+    try:
+        yield
+    finally:
+        _cpu.reset(token)
+
+
+def thread_count() -> int:
+    """Threads that lanes run on."""
+    asked = _threads.get()
+    if asked is not None:
+        return asked
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:
+        return os.cpu_count() or 1
+
+
+@functools.cache
+def _llvm() -> Any:
+    """llvmlite's binding, ready for this processor. **Raises:** `Unsupported` without it."""
+    try:
+        import llvmlite.binding as llvm
+    except ImportError as error:
+        raise Unsupported(f"no llvmlite ({error})") from None
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    return llvm
+
+
+@functools.cache
+def _register_bits(cpu: str | None) -> int:
+    """Width of the vector registers."""
+    llvm = _llvm()
+    if cpu is not None:
+        return {"x86-64-v4": 512, "x86-64-v3": 256}.get(cpu, 128)
+    features = llvm.get_host_cpu_features()
+    if features.get("avx512f") and features.get("avx512dq") and features.get("avx512vl"):
+        return 512
+    return 256 if features.get("avx2") else 128
+
+
+class Kernel:
+    """Machine code of a program. It lives as long as this object."""
+
+    def __init__(self, text: str, cpu: str | None):
+        llvm = _llvm()
+        target = llvm.Target.from_default_triple()
+        if cpu is None:
+            features = llvm.get_host_cpu_features().flatten()
+            machine = target.create_target_machine(
+                cpu=llvm.get_host_cpu_name(), features=features, opt=2
+            )
+        else:
+            machine = target.create_target_machine(cpu=cpu, features="", opt=2)
+        module = llvm.parse_assembly(text)
+        module.triple = llvm.get_default_triple()
+        module.data_layout = str(machine.target_data)
+        options = llvm.create_pipeline_tuning_options(speed_level=2)
+        options.loop_vectorization = options.slp_vectorization = False
+        options.loop_unrolling = False
+        builder = llvm.create_pass_builder(machine, options)
+        builder.getModulePassManager().run(module, builder)
+        self._engine = llvm.create_mcjit_compiler(module, machine)
+        self._engine.finalize_object()
+        address = self._engine.get_function_address("kernel")
+        pointer = ctypes.c_void_p
+        self._call = ctypes.CFUNCTYPE(
+            None, pointer, pointer, pointer, ctypes.c_int64, pointer, pointer
+        )(address)
+        # The first half of a digest of the text: a name that the same program has in any process.
+        self.key = key_of(text)
+        self.width = 0
+
+    def run(self, inputs: list[int], strides: list[int], outputs: list[int], lanes: int) -> None:
+        """All lanes, from and to the arrays at these addresses.
+
+        **Raises:** `KeyboardInterrupt` as it comes, in the main thread.
+        """
+        table = (ctypes.c_void_p * max(1, len(inputs)))(*inputs)
+        steps = (ctypes.c_int64 * max(1, len(strides)))(*strides)
+        results = (ctypes.c_void_p * max(1, len(outputs)))(*outputs)
+        following, stop = ctypes.c_int64(0), ctypes.c_int8(0)
+        arguments = (
+            ctypes.addressof(table), ctypes.addressof(steps), ctypes.addressof(results),
+            lanes, ctypes.addressof(following), ctypes.addressof(stop),
+        )  # fmt: skip
+        number = min(thread_count(), -(-lanes // self.width))
+        if number <= 1 and threading.current_thread() is not threading.main_thread():
+            self._call(*arguments)
+            return
+        # The main thread must stay free to hear an interrupt.
+        jobs: list[Future] = [_pool(number).submit(self._call, *arguments) for _ in range(number)]
+        try:
+            for job in jobs:
+                job.result()
+        except BaseException:
+            stop.value = 1
+            for job in jobs:
+                job.exception()
+            raise
+
+
+@functools.cache
+def _pool(number: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(number, thread_name_prefix="lanes")
+
+
+def key_of(text: str) -> int:
+    """A name of a program's text, the same in every process."""
+    return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=7).digest(), "little")
+
+
+_living: "weakref.WeakValueDictionary[int, Kernel]" = weakref.WeakValueDictionary()
+_recent: "OrderedDict[int, Kernel]" = OrderedDict()
+_lock = threading.Lock()
+
+
+def kernel_of(program: Program) -> Kernel:
+    """The kernel of a program: the same for the same text, compiled once while it is in use.
+
+    **Raises:** `Unsupported` if the program has no vector form, or LLVM cannot be had.
+    """
+    for jaxpr in (program.begin, program.step, program.end):
+        check(jaxpr.jaxpr)
+    cpu = _cpu.get()
+    bits = _register_bits(cpu)
+    avals = [*program.in_avals, *program.carry_avals]
+    wide = any(np.dtype(a.dtype).itemsize == 8 for a in avals)
+    # Two registers' worth where they are narrow, to hide the arithmetic's latency.
+    width = max(4, bits // (64 if wide else 32))
+    text = kernel_text(program, width, bits)
+    key = key_of(text + (cpu or ""))
+    with _lock:
+        kernel = _living.get(key)
+        if kernel is None:
+            try:
+                kernel = Kernel(text, cpu)
+            except RuntimeError as error:
+                raise Unsupported(f"LLVM: {error}") from None
+            kernel.key, kernel.width = key, width
+            _living[key] = kernel
+        _recent[key] = kernel
+        _recent.move_to_end(key)
+        while len(_recent) > _KEPT:
+            _recent.popitem(last=False)
+    return kernel
+
+
+def living(key: int) -> Kernel | None:
+    """The kernel of this name, if it is in use."""
+    return _living.get(key)

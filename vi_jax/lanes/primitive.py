@@ -1,0 +1,175 @@
+"""The JAX primitive behind `run`: batched, differentiated forward, and lowered on either road."""
+
+import functools
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+
+from . import xla
+from .call import header, registered
+from .derivative import forward, widened
+from .machine import kernel_of
+from .program import Program, spread
+from .vector import Unsupported
+
+lanes_p = Primitive("lanes")
+lanes_p.multiple_results = True
+
+
+def _batch(program: Program, shapes: list[tuple[int, ...]]) -> tuple[int, ...]:
+    """The axes that operands have beyond those of one lane."""
+    for aval, shape in zip(program.in_avals, shapes, strict=True):
+        if len(shape) > aval.ndim:
+            return shape[: len(shape) - aval.ndim]
+    return ()
+
+
+@lanes_p.def_abstract_eval
+def _(*args, program: Program, road: str):
+    batch = _batch(program, [a.shape for a in args])
+    rows = [(*batch, program.rows, *a.shape) for a in program.row_avals]
+    outs = [(*batch, *a.shape) for a in program.out_avals]
+    avals = [*program.out_avals, *program.row_avals]
+    return [
+        jax.core.ShapedArray(shape, a.dtype) for shape, a in zip([*outs, *rows], avals, strict=True)
+    ]
+
+
+@lanes_p.def_impl
+def _(*args, program: Program, road: str):
+    return jax.jit(functools.partial(lanes_p.bind, program=program, road=road))(*args)
+
+
+# Directions of a derivative that one lane carries along.
+_DIRECTIONS = 8
+
+
+def _batched(args, dims, *, program: Program, road: str):
+    args = [jnp.asarray(x) for x in args]
+    size = next(x.shape[d] for x, d in zip(args, dims, strict=True) if d is not None)
+    many = tuple(d is not None for d in dims)
+    slopes = program.slopes or (False,) * len(many)
+    if all(s or not m for s, m in zip(slopes, many, strict=True)) and 1 < size <= _DIRECTIONS:
+        return _directions(args, dims, many, size, program, road)
+    shapes = [
+        x.shape if d is None else x.shape[:d] + x.shape[d + 1 :]
+        for x, d in zip(args, dims, strict=True)
+    ]
+    inner = _batch(program, shapes)
+    moved = []
+    for x, d, shape, aval in zip(args, dims, shapes, program.in_avals, strict=True):
+        if d is None and len(shape) == aval.ndim:
+            moved.append(x)  # one for all lanes
+            continue
+        x = x[None] if d is None else jnp.moveaxis(x, d, 0)
+        if len(shape) == aval.ndim:
+            x = x.reshape(x.shape[0], *(1 for _ in inner), *aval.shape)
+        moved.append(jnp.broadcast_to(x, (size, *inner, *aval.shape)))
+    out = lanes_p.bind(*moved, program=program, road=road)
+    there = spread(program, many, smooth=False)
+    wide = [there.control or w for w in (*there.outs, *there.rows)]
+    # What is the same in all lanes is one, as `vmap` has it for what does not depend on its axis.
+    return [x if w else x[0] for x, w in zip(out, wide, strict=True)], [
+        0 if w else None for w in wide
+    ]
+
+
+def _directions(args, dims, many, size: int, program: Program, road: str):
+    """Tangents in several directions go along with one motion."""
+    wide, there = widened(program, many, size)
+    inner = len(_batch(program, [
+        x.shape if d is None else x.shape[:d] + x.shape[d + 1 :]
+        for x, d in zip(args, dims, strict=True)
+    ]))  # fmt: skip
+    moved = []
+    for x, d, aval in zip(args, dims, program.in_avals, strict=True):
+        # Behind the axes of the lanes, before those of the number itself.
+        own = 0 if d is None or x.ndim - 1 == aval.ndim else inner
+        moved.append(x if d is None else jnp.moveaxis(x, d, own))
+    out = lanes_p.bind(*moved, program=wide, road=road)
+    places = [inner if w else None for w in there.outs]
+    places += [inner + 1 if w else None for w in there.rows]
+    return out, places
+
+
+batching.primitive_batchers[lanes_p] = _batched
+
+
+def _jvp(primals, tangents, *, program: Program, road: str):
+    moving = tuple(type(t) is not ad.Zero for t in tangents)
+    derived, has = forward(program, moving)
+    changes = [t for t in tangents if type(t) is not ad.Zero]
+    out = iter(lanes_p.bind(*primals, *changes, program=derived, road=road))
+    values, slopes = [], []
+    # The results and their derivatives, then the rows and theirs.
+    for part in (has[: _outs(program)], has[_outs(program) :]):
+        values += [next(out) for _ in part]
+        slopes += [next(out) if there else None for there in part]
+    return values, [
+        ad.Zero(jax.typeof(v).to_tangent_aval()) if s is None else s
+        for v, s in zip(values, slopes, strict=True)
+    ]
+
+
+def _outs(program: Program) -> int:
+    return len(program.out_avals)
+
+
+ad.primitive_jvps[lanes_p] = _jvp
+
+
+def _transposed(*args, **params):
+    raise NotImplementedError(
+        "Reverse-mode differentiation through lanes that run forward: ask for "
+        '`adjoint="reverse"`, or use forward mode (`jax.jvp`, `jax.jacfwd`).'
+    )
+
+
+ad.primitive_transposes[lanes_p] = _transposed
+
+
+def _on_xla(*args, program: Program, road: str):
+    return xla.run(program, *args)
+
+
+def _lowered(ctx, *args, program: Program, road: str):
+    if road == "xla":
+        return mlir.lower_fun(_on_xla, multiple_results=True)(
+            ctx, *args, program=program, road=road
+        )
+    try:
+        kernel = kernel_of(program)
+    except Unsupported as reason:
+        _tell(str(reason))
+        return mlir.lower_fun(_on_xla, multiple_results=True)(
+            ctx, *args, program=program, road=road
+        )
+    ctx.module_context.add_keepalive(kernel)
+    call = functools.partial(_called, kernel, program, ctx.avals_out)
+    return mlir.lower_fun(call, multiple_results=True)(ctx, *args)
+
+
+def _called(kernel, program: Program, avals, *args):
+    batch = _batch(program, [x.shape for x in args])
+    strides = [
+        aval.size if x.ndim > aval.ndim else 0
+        for x, aval in zip(args, program.in_avals, strict=True)
+    ]
+    head = header(kernel.key, int(np.prod(batch, dtype=int)), strides)
+    results = [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in avals]
+    return jax.ffi.ffi_call(registered(), results)(head, *args)
+
+
+@functools.cache
+def _tell(reason: str) -> None:
+    warnings.warn(
+        f"Lanes run on XLA's slower road, because this program needs {reason}.", stacklevel=2
+    )
+
+
+mlir.register_lowering(lanes_p, _lowered, platform="cpu")
+mlir.register_lowering(lanes_p, mlir.lower_fun(_on_xla, multiple_results=True))

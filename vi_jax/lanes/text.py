@@ -1,0 +1,174 @@
+"""Vector code as LLVM's text: values, operations on them, and blocks."""
+
+import struct
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+
+@dataclass(frozen=True, slots=True)
+class Value:
+    """One number of every lane of a group: an SSA name or a constant, and its type."""
+
+    text: str
+    kind: str
+    """`double`, `float`, `i1`, `i8` … `i64`."""
+    number: float | int | bool | None = None
+    """Of a constant."""
+
+
+KINDS = {
+    "float64": "double", "float32": "float", "bool": "i1",
+    "int8": "i8", "int16": "i16", "int32": "i32", "int64": "i64",
+    "uint8": "i8", "uint16": "i16", "uint32": "i32", "uint64": "i64",
+}  # fmt: skip
+
+
+def is_float(kind: str) -> bool:
+    return kind in ("double", "float")
+
+
+class Text:
+    """Lines of a function under way, with equal operations merged."""
+
+    def __init__(self, width: int):
+        self.width = width
+        self.lines: list[str] = []
+        self.declared: dict[str, str] = {}
+        self.block = "entry"
+        self._names = 0
+        # Operations seen, in the blocks that dominate the one under way.
+        self._seen: list[dict[tuple, Value]] = [{}]
+
+    def vector(self, kind: str) -> str:
+        return f"<{self.width} x {kind}>"
+
+    def fresh(self) -> str:
+        self._names += 1
+        return f"%v{self._names}"
+
+    def constant(self, number: Any, kind: str) -> Value:
+        """The same number in every lane."""
+        if kind == "i1":
+            word, number = ("true" if number else "false"), bool(number)
+        elif is_float(kind):
+            number = float(np.float32(number)) if kind == "float" else float(number)
+            word = "0x" + struct.pack(">d", number).hex().upper()
+        else:
+            number = int(number)
+            word = str(number)
+        return Value(f"splat ({kind} {word})", kind, number)
+
+    def zero(self, kind: str) -> Value:
+        return self.constant(0, kind)
+
+    def line(self, text: str) -> None:
+        self.lines.append("  " + text)
+
+    def raw(self, operation: str) -> str:
+        """The name of a result that is no vector of the group."""
+        name = self.fresh()
+        self.line(f"{name} = {operation}")
+        return name
+
+    def value(self, operation: str, kind: str, *, merge: bool = True) -> Value:
+        """The result of an operation; equal ones are done once."""
+        key = (operation, kind)
+        if merge:
+            for seen in self._seen:
+                if key in seen:
+                    return seen[key]
+        result = Value(self.raw(operation), kind)
+        if merge:
+            self._seen[-1][key] = result
+        return result
+
+    def binary(self, operation: str, a: Value, b: Value, kind: str | None = None) -> Value:
+        return self.value(f"{operation} {self.vector(a.kind)} {a.text}, {b.text}", kind or a.kind)
+
+    def cast(self, operation: str, a: Value, kind: str) -> Value:
+        return self.value(
+            f"{operation} {self.vector(a.kind)} {a.text} to {self.vector(kind)}", kind
+        )
+
+    def select(self, condition: Value, a: Value, b: Value) -> Value:
+        """a where the condition holds, else b."""
+        if a == b:
+            return a
+        if condition.number is not None:
+            return a if condition.number else b
+        v = self.vector(a.kind)
+        flags = f"{self.vector('i1')} {condition.text}"
+        return self.value(f"select {flags}, {v} {a.text}, {v} {b.text}", a.kind)
+
+    def suffix(self, kind: str) -> str:
+        return f"v{self.width}" + {"double": "f64", "float": "f32"}.get(kind, kind)
+
+    def intrinsic(self, name: str, *args: Value, kind: str | None = None) -> Value:
+        """A vector intrinsic of LLVM on values of one type."""
+        own = args[0].kind
+        function = f"@llvm.{name}.{self.suffix(own)}"
+        result = kind or own
+        types = ", ".join(self.vector(a.kind) for a in args)
+        self.declared[function] = f"declare {self.vector(result)} {function}({types})"
+        call = ", ".join(f"{self.vector(a.kind)} {a.text}" for a in args)
+        return self.value(f"call {self.vector(result)} {function}({call})", result)
+
+    def each(self, name: str, *args: Value) -> Value:
+        """A function of the C library, lane by lane, in double precision."""
+        wide = [self.cast("fpext", a, "double") if a.kind == "float" else a for a in args]
+        types = ", ".join("double" for _ in args)
+        attributes = "nounwind willreturn memory(none)"
+        self.declared["@" + name] = f"declare double @{name}({types}) {attributes}"
+        v = self.vector("double")
+        total = "poison"
+        for lane in range(self.width):
+            parts = [self.raw(f"extractelement {v} {a.text}, i32 {lane}") for a in wide]
+            call = ", ".join(f"double {p}" for p in parts)
+            one = self.raw(f"call double @{name}({call})")
+            total = self.raw(f"insertelement {v} {total}, double {one}, i32 {lane}")
+        result = Value(total, "double")
+        return self.cast("fptrunc", result, "float") if args[0].kind == "float" else result
+
+    # Flags
+
+    def both(self, a: Value, b: Value) -> Value:
+        if a.number is not None:
+            return b if a.number else a
+        if b.number is not None:
+            return a if b.number else b
+        return self.binary("and", a, b)
+
+    def inverse(self, a: Value) -> Value:
+        return self.binary("xor", a, self.constant(True, "i1"))
+
+    def any(self, a: Value) -> str:
+        """Whether a flag holds in any lane: the name of an `i1`."""
+        bits = self.raw(f"bitcast {self.vector('i1')} {a.text} to i{self.width}")
+        return self.raw(f"icmp ne i{self.width} {bits}, 0")
+
+    # Blocks
+
+    def open(self, label: str) -> None:
+        """Begin a block; what it computes is known in it alone until `close`."""
+        self.lines.append(f"{label}:")
+        self.block = label
+        self._seen.append({})
+
+    def close(self) -> None:
+        self._seen.pop()
+
+    def follow(self, label: str) -> None:
+        """Go on in a block that everything computed so far dominates."""
+        self.lines.append(f"{label}:")
+        self.block = label
+
+    def label(self) -> str:
+        self._names += 1
+        return f"b{self._names}"
+
+    def phi(self, kind: str, *ways: tuple[str, str]) -> Value:
+        """The value that came with the block it was reached from."""
+        pairs = ", ".join(f"[ {text}, %{block} ]" for text, block in ways)
+        return self.value(f"phi {self.vector(kind)} {pairs}", kind, merge=False)

@@ -1,0 +1,262 @@
+"""A jaxpr of one lane's scalars written out as vector code for a group of lanes."""
+
+from typing import Any
+
+import numpy as np
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+
+from .table import ELEMENTWISE, STRUCTURAL, Values, kind_of
+from .text import Text, Value
+
+# Calls whose body is written out in their place.
+_CALLS = {
+    "jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr",
+    "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "remat": "jaxpr",
+    "checkpoint": "jaxpr", "remat2": "jaxpr", "custom_lin": "jaxpr",
+}  # fmt: skip
+
+# A loop of known length is written out if that makes no more operations than this.
+_WRITTEN_OUT = 4096
+
+# What is no more than this is computed without asking whether any lane needs it.
+_CHEAP = 4
+
+
+class Unsupported(Exception):
+    """A program that has no vector form; the argument says what stopped it."""
+
+
+def _inner(value: Any) -> tuple[Jaxpr, list]:
+    if isinstance(value, ClosedJaxpr):
+        return value.jaxpr, list(value.consts)
+    return value, []
+
+
+def check(jaxpr: Jaxpr) -> None:
+    """**Raises:** `Unsupported` naming the first primitive, or type, that has no vector form."""
+    for var in (*jaxpr.invars, *jaxpr.constvars, *(v for e in jaxpr.eqns for v in e.outvars)):
+        dtype = getattr(var.aval, "dtype", None)
+        try:
+            kind_of(dtype)
+        except (KeyError, TypeError):
+            raise Unsupported(f"a value of type {dtype}") from None
+    for eqn in jaxpr.eqns:
+        name = eqn.primitive.name
+        if name in _CALLS:
+            check(_inner(eqn.params[_CALLS[name]])[0])
+        elif name == "cond":
+            for branch in eqn.params["branches"]:
+                check(_inner(branch)[0])
+        elif name == "while":
+            check(_inner(eqn.params["cond_jaxpr"])[0])
+            check(_inner(eqn.params["body_jaxpr"])[0])
+        elif name == "scan":
+            body = _inner(eqn.params["jaxpr"])[0]
+            check(body)
+            if _size(body) * eqn.params["length"] > _WRITTEN_OUT:
+                raise Unsupported(f"the primitive `scan` of length {eqn.params['length']}")
+        elif name not in ELEMENTWISE and name not in STRUCTURAL:
+            raise Unsupported(f"the primitive `{name}`")
+
+
+def _size(jaxpr: Jaxpr) -> int:
+    total = 0
+    for eqn in jaxpr.eqns:
+        inner = [x for v in eqn.params.values() for x in (v if isinstance(v, tuple) else (v,))]
+        inner = [x for x in inner if isinstance(x, Jaxpr | ClosedJaxpr)]
+        total += 1 + sum(_size(_inner(x)[0]) for x in inner)
+    return total
+
+
+def constants(t: Text, array: Any) -> Values:
+    """A known array in every lane."""
+    array = np.asarray(array)
+    kind = kind_of(array.dtype)
+    out = np.empty(array.shape, object)
+    for i in np.ndindex(array.shape):
+        out[i] = t.constant(array[i], kind)
+    return out
+
+
+def write(t: Text, jaxpr: Jaxpr, consts: list, args: list[Values], mask: Value) -> list[Values]:
+    """The values of a jaxpr's results. `mask` says which lanes ask for them."""
+    env: dict[Any, Values] = {}
+
+    def read(atom: Any) -> Values:
+        if isinstance(atom, Literal):
+            return constants(t, np.asarray(atom.val, atom.aval.dtype))
+        return env[atom]
+
+    for var, const in zip(jaxpr.constvars, consts, strict=True):
+        env[var] = const if _is_values(const) else constants(t, const)
+    env.update(zip(jaxpr.invars, args, strict=True))
+    for eqn in _needed(jaxpr):
+        outs = _equation(t, eqn, [read(a) for a in eqn.invars], mask)
+        env.update(zip(eqn.outvars, outs, strict=True))
+    return [read(a) for a in jaxpr.outvars]
+
+
+def _needed(jaxpr: Jaxpr) -> list[Any]:
+    """The equations that the results depend on, in their order."""
+    wanted = {a for a in jaxpr.outvars if not isinstance(a, Literal)}
+    kept = []
+    for eqn in reversed(jaxpr.eqns):
+        if any(v in wanted for v in eqn.outvars):
+            kept.append(eqn)
+            wanted.update(a for a in eqn.invars if not isinstance(a, Literal))
+    return kept[::-1]
+
+
+def _is_values(x: Any) -> bool:
+    return isinstance(x, np.ndarray) and x.dtype == object
+
+
+def _equation(t: Text, eqn: Any, args: list[Values], mask: Value) -> list[Values]:
+    name, params = eqn.primitive.name, eqn.params
+    if name in ELEMENTWISE:
+        dtypes = [a.aval.dtype for a in eqn.invars]
+        return _elementwise(t, name, params, dtypes, args, len(eqn.outvars))
+    if name in STRUCTURAL:
+        out = STRUCTURAL[name](t, params, [v.aval for v in eqn.outvars], *args)
+        return list(out) if eqn.primitive.multiple_results else [out]
+    if name in _CALLS:
+        jaxpr, consts = _inner(params[_CALLS[name]])
+        return write(t, jaxpr, consts, args, mask)
+    if name == "cond":
+        return _cond(t, params["branches"], args[0][()], args[1:], mask)
+    if name == "while":
+        return _while(t, params, args, mask)
+    if name == "scan":
+        return _scan(t, params, args, mask)
+    raise Unsupported(f"the primitive `{name}`")
+
+
+def _elementwise(t: Text, name, params, dtypes, args, results: int) -> list[Values]:
+    args = np.broadcast_arrays(*args, subok=False)
+    outs = [np.empty(args[0].shape, object) for _ in range(results)]
+    for i in np.ndindex(args[0].shape):
+        out = ELEMENTWISE[name](t, params, dtypes, *(a[i] for a in args))
+        for array, value in zip(outs, out if results > 1 else (out,), strict=True):
+            array[i] = value
+    return outs
+
+
+def _cond(t: Text, branches: tuple, which: Value, args: list[Values], mask: Value) -> list[Values]:
+    """Each branch is skipped where no lane of the group takes it."""
+    last = len(branches) - 1
+    taken = []
+    for i in range(len(branches)):
+        how = "sle" if i == 0 else "sge" if i == last else "eq"
+        if which.kind == "i1":
+            flag = which if i else t.inverse(which)
+        else:
+            flag = t.binary(f"icmp {how}", which, t.constant(i, which.kind), "i1")
+        taken.append(flag)
+    # The cheapest of them is the one that the others are laid over.
+    order = sorted(range(len(branches)), key=lambda i: _size(_inner(branches[i])[0]))
+    result: list[Values] | None = None
+    for i in order:
+        jaxpr, consts = _inner(branches[i])
+        if result is None and _size(jaxpr) <= _CHEAP:
+            result = write(t, jaxpr, consts, args, mask)
+            continue
+        result = _skipped(t, jaxpr, consts, args, t.both(mask, taken[i]), result)
+    assert result is not None
+    return result
+
+
+def _skipped(t: Text, jaxpr, consts, args, mask: Value, otherwise) -> list[Values]:
+    """The values of a jaxpr in the lanes of `mask`, laid over others; nothing where there is none."""
+    inside, after = t.label(), t.label()
+    before = t.block
+    needed = t.any(mask)
+    t.line(f"br i1 {needed}, label %{inside}, label %{after}")
+    t.open(inside)
+    found = write(t, jaxpr, consts, args, mask)
+    if otherwise is None:
+        otherwise = [_like(t, x) for x in found]
+        laid = found
+    else:
+        laid = [
+            _zipped(lambda a, b: t.select(mask, a, b), x, y)
+            for x, y in zip(found, otherwise, strict=True)
+        ]
+    end = t.block
+    t.line(f"br label %{after}")
+    t.close()
+    t.follow(after)
+    return [
+        _zipped(lambda a, b: a if a == b else t.phi(a.kind, (a.text, end), (b.text, before)), x, y)
+        for x, y in zip(laid, otherwise, strict=True)
+    ]
+
+
+def _like(t: Text, x: Values) -> Values:
+    return _zipped(lambda a: t.zero(a.kind), x)
+
+
+def _zipped(function, *arrays: Values) -> Values:
+    out = np.empty(arrays[0].shape, object)
+    for i in np.ndindex(out.shape):
+        out[i] = function(*(a[i] for a in arrays))
+    return out
+
+
+def _while(t: Text, params: dict, args: list[Values], mask: Value) -> list[Values]:
+    """Until no lane of the group goes on; a lane that has ended keeps what it had."""
+    n, m = params["cond_nconsts"], params["body_nconsts"]
+    cond_args, body_args, first = args[:n], args[n : n + m], args[n + m :]
+    head, inside, after = t.label(), t.label(), t.label()
+    before = t.block
+    t.line(f"br label %{head}")
+    t.open(head)
+    place = len(t.lines)
+    carry = [_zipped(lambda a: Value(t.fresh(), a.kind), x) for x in first]
+    live = Value(t.fresh(), "i1")
+    jaxpr, consts = _inner(params["cond_jaxpr"])
+    going = write(t, jaxpr, consts, [*cond_args, *carry], live)[0][()]
+    going = t.both(live, going)
+    head_end = t.block
+    needed = t.any(going)
+    t.line(f"br i1 {needed}, label %{inside}, label %{after}")
+    t.open(inside)
+    jaxpr, consts = _inner(params["body_jaxpr"])
+    new = write(t, jaxpr, consts, [*body_args, *carry], going)
+    new = [
+        _zipped(lambda a, b: t.select(going, a, b), x, y) for x, y in zip(new, carry, strict=True)
+    ]
+    end = t.block
+    t.line(f"br label %{head}")
+    t.close()
+    t.close()
+    del head_end
+    phis = []
+    for old, here, back in zip([*first, mask], [*carry, live], [*new, going], strict=True):
+        for a, h, b in zip(*map(_flat, (old, here, back)), strict=True):
+            ways = f"[ {a.text}, %{before} ], [ {b.text}, %{end} ]"
+            phis.append(f"  {h.text} = phi {t.vector(h.kind)} {ways}")
+    t.lines[place:place] = phis
+    t.follow(after)
+    return carry
+
+
+def _flat(x: Any) -> list[Value]:
+    return [x] if isinstance(x, Value) else list(x.ravel())
+
+
+def _scan(t: Text, params: dict, args: list[Values], mask: Value) -> list[Values]:
+    """A loop of known length, written out."""
+    n, m, length = params["num_consts"], params["num_carry"], params["length"]
+    fixed, carry, rows = args[:n], args[n : n + m], args[n + m :]
+    jaxpr, consts = _inner(params["jaxpr"])
+    order = range(length)[::-1] if params["reverse"] else range(length)
+    kept: dict[int, list[Values]] = {}
+    for i in order:
+        out = write(t, jaxpr, consts, [*fixed, *carry, *(x[i] for x in map(_rowwise, rows))], mask)
+        carry, kept[i] = out[:m], out[m:]
+    columns = [np.stack([kept[i][j] for i in range(length)]) for j in range(len(jaxpr.outvars) - m)]
+    return [*carry, *columns]
+
+
+def _rowwise(x: Values) -> list[Values]:
+    return [np.asarray(x[i], object).reshape(x.shape[1:]) for i in range(x.shape[0])]
