@@ -81,6 +81,13 @@ def aim_at(plan: Plan, lane: Lane, trial: Trial) -> tuple[Flag, Scalar, Scalar]:
         target = jnp.where(again, c.name, target)
     target = jnp.where(turn, TURN, jnp.where(wiggle, FREE, target))
     attempt = jnp.where(wiggle, 0.5 * h, attempt)
+    if trial.surge is not None and trial.position is not None:
+        # What the step met may not have been the first: look at the turn of the force before.
+        hidden, place = _force_may_turn(lane, *stop_gradient(trial.position), *trial.surge, h)
+        hidden = hidden & trial.good & ~(landed | trial.at_turn)
+        aim, turn, wiggle = aim & ~hidden, turn & ~hidden, wiggle | hidden
+        attempt = jnp.where(hidden, place, attempt)
+        target = jnp.where(hidden, FREE, target)
     if trial.leaves is not None:
         left, released, place, _ = trial.leaves
         aim, turn, wiggle = aim & ~released | left, turn & ~left, wiggle & ~left
@@ -98,3 +105,23 @@ def _may_turn_twice(lane: Lane, begin: Rates, end: Rates, h: Scalar) -> Flag:
     dips = (a0 < 0) & (a1 > 0) & (h > 1e-3)
     lowest = lane.direction * begin.v + 0.5 * h * a0 * (a0 / jnp.where(dips, a0 - a1, 1.0))
     return dips & (lowest < 0.1 * lane.direction * (begin.v + end.v))
+
+
+def _force_may_turn(
+    lane: Lane, begin: Rates, end: Rates, rate0: Scalar, rate1: Scalar, brief: Scalar, h: Scalar
+) -> tuple[Flag, Scalar]:
+    """Whether the force, of one sign at both ends, may have had the other in between for a body
+    that is slow enough to notice, and where it turned.
+
+    It releases a body at rest for a moment, or turns one twice that has just left the stop. The
+    tangents at both ends bound a force that is curved one way.
+    """
+    a0, a1 = begin.a, end.a
+    place = h * rate0 / jnp.where(rate0 == rate1, 1.0, rate0 - rate1)
+    turns = (rate0 * rate1 < 0) & (place > brief) & (h - place > brief)
+    corner = (a1 - rate1 * h - a0) / jnp.where(rate0 == rate1, 1.0, rate0 - rate1)
+    bound = a0 + rate0 * corner
+    hidden = turns & (a0 * a1 > 0) & (bound * a0 < 0)
+    largest = jnp.maximum(jnp.maximum(jnp.abs(a0), jnp.abs(a1)), jnp.abs(bound))
+    slow = jnp.minimum(jnp.abs(begin.v), jnp.abs(end.v)) <= largest * h
+    return hidden & slow, place

@@ -42,6 +42,20 @@ def rates(
     return Rates(x, v, a)
 
 
+def force_rate(scene: Any, holding: Any, s: Scalar, state: Any) -> Scalar:
+    """d/ds of the acceleration that a free body would have, along the flow of `holding`.
+
+    A constant for differentiation: it tells where to look.
+    """
+    s, state = jax.lax.stop_gradient((s, state))
+
+    def force(s, state):
+        return rates(scene.field, scene.position, s, state).a
+
+    flow = holding.field(s, state)
+    return jax.lax.stop_gradient(jax.jvp(force, (s, state), (jnp.ones_like(s), flow))[1])
+
+
 def quintic(begin: Rates, end: Rates, h: Scalar) -> tuple[Scalar, ...]:
     """Coefficients in θ ∈ [0, 1] of the quintic Hermite interpolant of a step of length h."""
     v0, v1 = h * begin.v, h * end.v

@@ -8,7 +8,7 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
 from ..scene import AbstractScene
-from .events import Rates, landing, rates
+from .events import Rates, force_rate, landing, rates
 from .fusion import pin, pin_flag
 from .lane import FREE, SECTION, TURN, Lane, Plan
 from .rest import Holding, release
@@ -19,6 +19,9 @@ Flag = Bool[Array, ""]
 # Newton's method on a smooth flow needs two or three aims. Where rounding keeps it from gaining
 # more, a lane that has aimed this often accepts a thousand times the tolerance.
 _PATIENCE = 12.0
+
+# A window of force shorter than this share of the longest step moves the body by its third power.
+_SLIVER = 1e-3
 
 
 class Crossing(NamedTuple):
@@ -52,6 +55,9 @@ class Trial(NamedTuple):
     """The scene as the step saw it: its body held where it rests."""
     leaves: tuple[Flag, Flag, Scalar, Scalar] | None
     """Whether and where a body at rest is released (see `rest.release`)."""
+    surge: tuple[Scalar, Scalar, Scalar] | None
+    """How fast the force changes at both ends, and the shortest step that is cut at a turn of the
+    force; absent where the body cannot rest."""
 
 
 def attempt(plan: Plan, lane: Lane, active: Flag) -> Trial:
@@ -115,12 +121,17 @@ def attempt(plan: Plan, lane: Lane, active: Flag) -> Trial:
             rates(scene.field, clock, s1, new).scaled(1, bound),
         )
         crossings.append((SECTION, *ends, bound))
-    leaves = None
+    leaves, surge = None, None
     if position is not None and lane.contact is not None:
         leaves = release(lane, scene.stops, *position, good, h)
+        surge = (
+            force_rate(scene, holding, lane.s, lane.state),
+            force_rate(scene, holding, s1, new),
+            stop_gradient(_SLIVER * limit + jnp.zeros_like(h)),
+        )
     seen = tuple(_seen(lane, good, h, crossing, crossings) for crossing in crossings)
     return Trial(
-        s1, h, new, time, error, good, last, seen, position, at_turn, holding, leaves
+        s1, h, new, time, error, good, last, seen, position, at_turn, holding, leaves, surge
     )  # fmt: skip
 
 

@@ -1,0 +1,185 @@
+"""Independent truth for the tests: the motion with impacts, chatter and rest, without the package.
+
+`flown` follows many ideally driven lanes at once in closed form, with NumPy; `integrated` follows
+one machine, ideal drive or motor, with SciPy's `solve_ivp` and its events. Neither looks at step
+ends only: `flown` isolates every root between the zeros of the next higher derivatives, and
+`integrated` takes short steps and looks for a contact only after the body has turned towards it.
+
+A body with ever smaller impacts is put to rest when what is left of them is shorter than 1e-6, is
+held while it is pressed on, and is released where the force on it falls through zero.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+# What is left of a chatter when it is completed: its error is of second order. Hops lower than
+# rounding are completed too, unless that would take long.
+BRIEF, FLAT, LONG = 1e-6, 1e-13, 1e-3
+LATE, ROUNDING = 1e-12, 4e-15
+
+
+class Truth(NamedTuple):
+    """What was found; arrays have a trailing axis of lanes in `flown`, none in `integrated`."""
+
+    sections: np.ndarray
+    """(cycles + 1, Y and V (and W)): the states on the sections."""
+    y_min: np.ndarray
+    """(cycles,): smallest Y in each cycle."""
+    y_max: np.ndarray
+    impacts: np.ndarray
+    """(cycles,): impacts, those left out that were completed at once."""
+    rests: np.ndarray
+    """(cycles,): times that the body came to rest."""
+
+
+class _Flight:
+    """Y(τ) = Re{c e^(pτ) + F e^(iζτ)} and its derivatives, of many lanes; needs ξ < 1."""
+
+    def __init__(self, zeta, xi, phase, Y, V):
+        self.p = -xi + 1j * np.sqrt(1 - xi * xi)
+        self.i_zeta = 1j * zeta
+        self.forced = np.exp(1j * phase) / (1 - zeta * zeta + 2j * xi * zeta)
+        y = Y - self.forced.real
+        v = V - (self.i_zeta * self.forced).real
+        self.free = y - 1j * (v + xi * y) / self.p.imag
+
+    def at(self, order, tau, lanes=slice(None)):
+        """The derivative of this order at times since the start, of all or some lanes."""
+        p, i_zeta = self.p[lanes], self.i_zeta[lanes]
+        free = self.free[lanes] * p**order * np.exp(p * tau)
+        return (free + self.forced[lanes] * i_zeta**order * np.exp(i_zeta * tau)).real
+
+    def root(self, order, low, high, lanes, offset=0.0):
+        """Where a derivative, less `offset`, changes sign between two times, by bisection."""
+        sign = np.sign(self.at(order, high, lanes) - offset)
+        for _ in range(60):
+            middle = 0.5 * (low + high)
+            beyond = (self.at(order, middle, lanes) - offset) * sign > 0
+            low, high = np.where(beyond, low, middle), np.where(beyond, middle, high)
+        return high
+
+    def pieces(self, length):
+        """Times (points, lanes) between which Y is monotone, from the zeros of Y''' downwards."""
+        times = [np.zeros_like(length), length]
+        for order in (3, 2, 1):
+            values = [self.at(order, time) for time in times]
+            finer = times[:1]
+            for i in range(len(times) - 1):
+                turn = times[i].copy()
+                turns = np.flatnonzero(values[i] * values[i + 1] < 0)
+                turn[turns] = self.root(order, times[i][turns], times[i + 1][turns], turns)
+                finer += [turn, times[i + 1]]
+            times = finer
+        return np.array(times)
+
+
+def flown(zeta, xi, stops, Y, V, cycles, *, section=0.0, fineness=32):
+    """Lanes of the ideally driven oscillator (cosine crank) through `cycles` drive cycles.
+
+    **Arguments:** ζ, ξ < 1 (not both at resonance), a tuple of (sign, gap, k), the state on the
+    section at crank angle `section`; each a number or an array of lanes. `fineness`: looks in the
+    shorter of the two periods.
+
+    **Returns:** a `Truth`.
+    """
+    numbers = [x for _, gap, k in stops for x in (gap, k)]
+    arrays = np.broadcast_arrays(*(np.atleast_1d(np.asarray(x, float)) for x in (
+        zeta, xi, Y, V, section, *numbers)))  # fmt: skip
+    zeta, xi, Y, V, section, *numbers = (x.copy() for x in arrays)
+    stops = [(sign, numbers[2 * i], numbers[2 * i + 1]) for i, (sign, *_) in enumerate(stops)]
+    lanes = zeta.size
+    look = 2 * np.pi / np.maximum(1.0, zeta) / fineness
+    held = np.zeros(lanes, int)  # 1 + the stop rested on, or 0
+    for i, (sign, gap, _) in enumerate(stops):
+        there = (sign * Y >= gap) & (V == 0) & (sign * np.cos(section) > gap)
+        held[there] = 1 + i
+    whole = 2 * np.pi / zeta
+    kept, lows, highs, impacts, rests = [np.stack([Y, V])], [], [], [], []
+    for _ in range(cycles):
+        t = np.zeros(lanes)
+        low, high = Y.copy(), Y.copy()
+        hits, comes = np.zeros(lanes, int), np.zeros(lanes, int)
+        while True:
+            on = np.flatnonzero(t < whole)
+            if not on.size:
+                break
+            for i, (sign, gap, _) in enumerate(stops):
+                mine = on[held[on] == 1 + i]
+                until = _release(sign, gap[mine], section[mine] + zeta[mine] * t[mine])
+                # A hair late, when rounding cannot press it on again.
+                later = t[mine] + until / zeta[mine] + LATE
+                t[mine] = np.minimum(later, whole[mine])
+                held[mine[later <= whole[mine]]] = 0
+            on = on[(held[on] == 0) & (t[on] < whole[on])]
+            _look(on, zeta, xi, section, stops, look, whole, (t, Y, V, held, low, high, hits, comes))
+        kept.append(np.stack([Y, V]))
+        lows.append(low)
+        highs.append(high)
+        impacts.append(hits)
+        rests.append(comes)
+    return Truth(*map(np.array, (kept, lows, highs, impacts, rests)))
+
+
+def _look(on, zeta, xi, section, stops, look, whole, arrays):
+    """Free lanes `on` by one look ahead or up to their next contact, in place."""
+    t, Y, V, held, low, high, hits, comes = arrays
+    if not on.size:
+        return
+    phase = section[on] + zeta[on] * t[on]
+    flight = _Flight(zeta[on], xi[on], phase, Y[on], V[on])
+    left = whole[on] - t[on]
+    length = np.where(left <= look[on] * (1 + 1e-9), left, look[on])
+    times = flight.pieces(length)
+    heights = np.array([flight.at(0, time) for time in times])
+    first = np.full(on.size, len(times))
+    which = np.full(on.size, -1)
+    for i, (sign, gap, _) in enumerate(stops):
+        over = (sign * heights - gap[on] > ROUNDING) & (sign * np.diff(heights, axis=0, prepend=0) > 0)
+        over[0] = False
+        place = np.where(over.any(axis=0), over.argmax(axis=0), len(times))
+        which, first = np.where(place < first, i, which), np.minimum(first, place)
+    end = length.copy()
+    for i, (sign, gap, _) in enumerate(stops):
+        mine = np.flatnonzero(which == i)
+        rows = first[mine]
+        end[mine] = flight.root(
+            0, times[rows - 1, mine], times[rows, mine], mine, sign * gap[on[mine]]
+        )
+    passed = np.arange(len(times))[:, None] < first
+    low[on] = np.minimum(low[on], np.where(passed, heights, np.inf).min(axis=0))
+    high[on] = np.maximum(high[on], np.where(passed, heights, -np.inf).max(axis=0))
+    everyone = np.arange(on.size)
+    Y[on], V[on] = flight.at(0, end, everyone), flight.at(1, end, everyone)
+    t[on] = np.where(end == left, whole[on], t[on] + end)
+    for i, (sign, gap, k) in enumerate(stops):
+        mine = on[which == i]
+        speed = np.maximum(sign * V[mine], 0.0)
+        force = sign * np.cos(section[mine] + zeta[mine] * t[mine]) - gap[mine]
+        done, wait = chatter(k[mine], speed, force)
+        Y[mine] = sign * gap[mine]
+        V[mine] = np.where(done, 0.0, -sign * k[mine] * speed)
+        held[mine[done]] = 1 + i
+        t[mine] += np.where(done, np.minimum(wait, whole[mine] - t[mine]), 0.0)
+        hits[mine] += 1
+        comes[mine] += done
+        low[mine], high[mine] = np.minimum(low[mine], Y[mine]), np.maximum(high[mine], Y[mine])
+
+
+def chatter(k, speed, force):
+    """Whether impacts at this speed of approach and pressing force end in rest, and after how long.
+
+    Flights of 2kⁿV/a follow each other: Σ = 2kV/(a(1 - k)).
+    """
+    ends = (force > 0) & (k < 1)
+    safe = np.where(ends, force * (1 - k), 1.0)
+    wait = np.where(ends, 2 * k * speed / safe, np.inf)
+    height = (k * speed) ** 2 / (2 * np.where(ends, force, 1.0))
+    return ends & ((wait <= BRIEF) | ((height <= FLAT) & (wait <= LONG))), wait
+
+
+def _release(sign, gap, phase):
+    """Crank angle until sign·cos φ falls through `gap`; infinite where it never does."""
+    falls = np.arccos(np.clip(gap, -1, 1)) + (0 if sign > 0 else np.pi)
+    return np.where(gap > -1, np.mod(falls - phase, 2 * np.pi), np.inf)
