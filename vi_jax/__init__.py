@@ -10,6 +10,7 @@ from .flow import ImpactLog as ImpactLog
 from .flow import Run as Run
 from .flow import Samples as Samples
 from .flow import Suggestion as Suggestion
+from .flow import Taylor as Taylor
 from .flow import Unrolled as Unrolled
 from .flow import jit as jit
 from .flow import preset as preset

@@ -2,13 +2,14 @@
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
+from ..lanes import pin
 from .events import Rates, quintic, rising_root, slope
-from .fusion import pin
 from .lane import FREE, RELEASE, TURN, Lane, Plan
 from .trial import Trial, to_turn
 
@@ -16,7 +17,7 @@ Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]
 
 # Turning points this far inside the gap (unit: a) are passed by where only impacts matter.
-_MARGIN = 0.02
+MARGIN = 0.02
 
 
 def select(condition: Flag, a: Any, b: Any) -> Any:
@@ -27,9 +28,31 @@ def select(condition: Flag, a: Any, b: Any) -> Any:
 def aim_at(plan: Plan, lane: Lane, trial: Trial) -> tuple[Flag, Scalar, Scalar]:
     """Whether to shorten the step, to what length, and at what it then aims."""
     h = stop_gradient(trial.h)
-    none = jnp.zeros_like(trial.good)
+    nothing = jnp.zeros_like(trial.good), h, jnp.full_like(h, FREE)
     if trial.position is None and not trial.crossings:
-        return none, h, jnp.full_like(h, FREE)
+        return nothing
+    # Rare: skipped where no lane of a group has met anything.
+    return jax.lax.cond(
+        _met_something(plan, lane, trial), lambda _: _aimed(plan, lane, trial), lambda x: x, nothing
+    )
+
+
+def _met_something(plan: Plan, lane: Lane, trial: Trial) -> Flag:
+    """Whether `_aimed` has anything to say, or may have."""
+    met = trial.good & (lane.target != FREE) & ~trial.at_turn
+    for c in trial.crossings:
+        met = met | trial.good & (c.end.x > 0) & ~c.landed | c.again
+    if trial.position is not None:
+        begin, end = stop_gradient(trial.position)
+        if not plan.method.sees_ahead:
+            met = met | trial.good & (lane.direction * end.v < 0) & ~trial.at_turn
+        met = met | trial.good & _may_turn_twice(lane, begin, end, stop_gradient(trial.h))
+    return jnp.ones_like(met) if trial.leaves is not None else met
+
+
+def _aimed(plan: Plan, lane: Lane, trial: Trial) -> tuple[Flag, Scalar, Scalar]:
+    h = stop_gradient(trial.h)
+    none = jnp.zeros_like(trial.good)
     # The earliest of several events is met first. The chord tells well enough which that is: a
     # landing that lies beyond another stop is not accepted.
     first, target = jnp.full_like(h, jnp.inf), jnp.full_like(h, TURN)
@@ -57,7 +80,7 @@ def aim_at(plan: Plan, lane: Lane, trial: Trial) -> tuple[Flag, Scalar, Scalar]:
         turn = trial.good & (lane.direction * end.v < 0) & ~trial.at_turn & ~facing_stop
         polynomial = facing if polynomial is None else select(turn, facing, polynomial)
     assert polynomial is not None
-    theta = pin(rising_root(stop_gradient(polynomial)), lane.one)
+    theta = pin(rising_root(stop_gradient(polynomial)))
     attempt = theta * h
     if path is not None and trial.position is not None:
         if not plan.motion:
@@ -66,7 +89,7 @@ def aim_at(plan: Plan, lane: Lane, trial: Trial) -> tuple[Flag, Scalar, Scalar]:
                 height = height + stop_gradient(path[n]) * theta**n
             close = crossed | landed
             for stop in plan.scene.stops:
-                close = close | (stop.sign * height - stop.gap > -_MARGIN)
+                close = close | (stop.sign * height - stop.gap > -MARGIN)
             turn = turn & close
         wiggle = trial.good & _may_turn_twice(lane, *stop_gradient(trial.position), h)
         wiggle = wiggle & ~(aim | turn | landed | trial.at_turn)

@@ -64,7 +64,7 @@ class ExactFlight(AbstractMethod):
                 f"`{type(scene.crank).__name__}`. Use `Adaptive` or `FixedStep`."
             )
 
-    def step(self, scene, s0, s1, state, time, one):
+    def step(self, scene, s0, s1, state, time):
         """The flight from `s0` to `s1`, exact to rounding."""
         assert isinstance(scene, Scene)
         zeta, xi, in_phase = _numbers(scene)

@@ -4,23 +4,12 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-from jaxtyping import Array, Bool
-
-from .. import lanes
 
 _CPU_OPTIONS = {
     # Small kernels lose more by being split over threads than they gain.
     "xla_disable_hlo_passes": "cpu-parallel-task-assigner",
     "xla_cpu_prefer_vector_width": 512,
 }
-
-
-def pin(x: Any, one: Any) -> Any:
-    return lanes.pin(x)
-
-
-def pin_flag(flag: Bool[Array, ""], one: Any) -> Bool[Array, ""]:
-    return lanes.pin_flag(flag, one)
 
 
 def jit(function: Callable, **options: Any) -> jax.stages.Wrapped:

@@ -12,6 +12,7 @@ The length of an aimed step is a constant for differentiation, while δ carries 
 forward and reverse derivatives through an impact are exact (the saltation matrix).
 """
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import jax
@@ -20,12 +21,14 @@ import jax.tree_util as jtu
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
+from ..lanes import pin, pin_flag
 from . import results
+from .ahead import ahead
 from .aim import aim_at, select
-from .fusion import pin, pin_flag
 from .lane import FREE, SECTION, Lane, Plan, Record
 from .rest import settled
-from .trial import Trial, attempt
+from .taylor import Taylor
+from .trial import Crossing, Trial, attempt, held, timing
 
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]
@@ -52,15 +55,19 @@ class Step(NamedTuple):
 def iterate(plan: Plan, lane: Lane) -> Step:
     """One step of one lane: advance, aim or land. A lane that has ended is left as it is."""
     active = (lane.done < plan.intervals) & (lane.fault == 0)
-    trial = attempt(plan, lane, active)
+    holding, motion = held(plan, lane), None
+    if isinstance(plan.method, Taylor):
+        motion = plan.method.expand(holding, lane.s, lane.state, timing(plan, lane))
+        lane = ahead(plan, lane, motion)
+    trial = attempt(plan, lane, active, holding, motion)
     aim, goal, target = aim_at(plan, lane, trial)
-    one = lane.one
-    aim = pin_flag(active & aim, one)
-    taken = pin_flag(active & trial.good & ~aim, one)
+    aim = pin_flag(active & aim, lane.s)
+    taken = pin_flag(active & trial.good & ~aim, lane.s)
     rejected = active & ~trial.good
     length = _resized(plan, lane, trial, taken, rejected)
-    s, state, direction, contact, record, completed = _arrive(plan, lane, trial, taken)
-    completed = pin_flag(completed, one)
+    there, completed = _arrive(plan, lane, trial, taken)
+    completed = pin_flag(completed, lane.s)
+    s, state, record = there.s, there.state, there.record
 
     done, part = lane.done + jnp.where(completed, 1.0, 0.0), lane.part
     turned = completed
@@ -80,12 +87,11 @@ def iterate(plan: Plan, lane: Lane) -> Step:
     for condition, code in _faults(plan, lane, trial, rejected, length, record, steps, aims):
         stops_here = active & (fault == 0) & condition & (done < plan.intervals)
         fault = jnp.where(stops_here, float(code), fault)
-    new = Lane(
+    new = dataclasses.replace(
+        there,
         s=s,
         state=state,
         record=record,
-        direction=direction,
-        contact=contact,
         length=length,
         attempt=jnp.where(aim, goal, length),
         target=jnp.where(aim, target, FREE),
@@ -96,92 +102,145 @@ def iterate(plan: Plan, lane: Lane) -> Step:
         steps=steps,
         begun=jnp.where(completed, steps, lane.begun),
         rejected=lane.rejected + jnp.where(rejected, 1.0, 0.0),
-        one=one,
     )
     return Step(new, completed, state, of_interval)
 
 
-def _arrive(
-    plan: Plan, lane: Lane, trial: Trial, taken: Flag
-) -> tuple[Scalar, Any, Scalar, Scalar | None, Record, Flag]:
-    """Where the step leads: s, the state with its jump, the direction, the stop rested on, the
-    record, whether the interval is complete."""
-    scene = plan.scene
-    s, state, time, direction = trial.s, trial.state, trial.time, lane.direction
-    record = lane.record
-    impacts, speed, loss = record.impacts, record.speed, record.loss
-    log, rests = record.log, record.rests
-    contact = lane.contact
-    completed = trial.ends_interval
+class Arrival(NamedTuple):
+    """Where a step leads."""
+
+    s: Scalar
+    state: Any
+    time: Scalar | None
+    direction: Scalar
+    contact: Scalar | None
+    """The stop rested on."""
+    impacts: Scalar
+    speed: Scalar | None
+    loss: Scalar | None
+    rests: Scalar | None
+    log: Any
+    completed: Flag
+    """Whether the interval is complete."""
+
+
+def _arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Flag]:
+    """The lane where the step leads, its record kept, and whether the interval is complete."""
+    old, direction = lane.record, lane.direction
     if trial.position is not None:
         v = stop_gradient(trial.position[1].v)
         direction = jnp.where(v == 0, direction, jnp.sign(v))
         # Here the sign of the velocity is rounding's.
         direction = jnp.where(trial.at_turn, -lane.direction, direction)
-    flow: Any = None
-    bend: Any = None
+    arrival = Arrival(
+        trial.s, trial.state, trial.time, direction, lane.contact,
+        old.impacts, old.speed, old.loss, old.rests, old.log, trial.ends_interval,
+    )  # fmt: skip
     if trial.crossings:
-        flow, bend = _flow_and_bend(trial.holding, time is not None, trial.s, trial.state)
+        met = jnp.zeros_like(taken)
+        for c in trial.crossings:
+            met = met | c.landed
+        if trial.leaves is not None:
+            met = met | trial.leaves[1]
+        # Rare: skipped where no lane of a group has met anything.
+        arrival = jax.lax.cond(
+            met, lambda x: _met(plan, lane, trial, taken, x), lambda x: x, arrival
+        )
+    y_max, y_min, clearance = _reached(plan, lane, trial, taken, arrival.state)
+    time = arrival.time
+    if time is not None and old.time is not None:
+        time = jnp.where(taken, time, old.time)
+    contact = arrival.contact
+    there = dataclasses.replace(
+        lane,
+        s=jnp.where(taken, arrival.s, lane.s),
+        state=select(taken, arrival.state, lane.state),
+        direction=jnp.where(taken, arrival.direction, lane.direction),
+        contact=None if contact is None else select(taken, contact, lane.contact),
+        record=Record(
+            time, y_max, y_min, arrival.impacts, arrival.speed, arrival.loss, arrival.rests,
+            arrival.log, clearance,
+        ),
+    )  # fmt: skip
+    return there, taken & arrival.completed
+
+
+def _met(plan: Plan, lane: Lane, trial: Trial, taken: Flag, arrival: Arrival) -> Arrival:
+    """What the event makes of a step that met one: the last part of its way, and the jump."""
+    flow, bend = _flow_and_bend(trial.holding, arrival.time is not None, trial.s, trial.state)
     for c in trial.crossings:
         offset = jnp.where(c.landed, c.offset, 0.0)
         there, passed = jtu.tree_map(
             lambda x, dx, ddx, d=offset: x + d * dx + _second(d, ddx),
-            (trial.state, time), flow, bend,
+            (trial.state, arrival.time), flow, bend,
         )  # fmt: skip
-        s = s + offset
-        if time is not None:
-            time = passed
+        arrival = arrival._replace(s=arrival.s + offset, time=passed)
         if c.name == SECTION:
-            completed = completed | c.landed
-            state = select(c.landed, there, state)
-            continue
-        index = int(c.name) - 1
-        stop = scene.stops[index]
-        approach = jnp.maximum(stop.sign * scene.velocity(there), 0.0)
-        rebound = -stop.sign * stop.restitution * approach
-        state = select(c.landed, scene.placed(there, stop.sign * stop.gap, rebound), state)
-        direction = jnp.where(c.landed, -float(stop.sign), direction)
-        hit, met = taken & c.landed, s
-        lost = 0.5 * (1 - stop.restitution**2) * approach**2
-        if contact is not None and trial.position is not None:
-            arriving = stop.sign * trial.position[1].v
-            last, left = settled(plan, lane, stop, arriving, s, there)
-            ends = pin_flag(c.landed & last, lane.one)
-            lost = jnp.where(ends, 0.5 * approach**2, lost)
-            wait = pin(jnp.where(ends, left, 0.0), lane.one)
-            (later, passed) = jtu.tree_map(lambda x, dx, w=wait: x + w * dx, (state, time), flow)
-            still = scene.placed(later, stop.sign * stop.gap, jnp.zeros_like(s))
-            state = select(ends, still, state)
-            time = select(ends, passed, time)
-            s = s + wait
-            contact = jnp.where(ends, float(c.name), contact)
-            direction = jnp.where(ends, float(stop.sign), direction)
-            if rests is not None:
-                rests = rests + jnp.where(taken & ends, 1.0, 0.0)
-        clock = scene.clock(there)
-        log = _logged(log, hit, impacts, met if clock is None else clock, approach, index)
-        impacts = impacts + jnp.where(hit, 1.0, 0.0)
-        if speed is not None:
-            speed = jnp.where(hit, jnp.maximum(speed, approach), speed)
-        if loss is not None:
-            loss = loss + jnp.where(hit, lost, 0.0)
-    if trial.leaves is not None:
-        assert contact is not None and lane.contact is not None
-        _, released, _, offset = trial.leaves
-        s = s + offset
-        state, time = jtu.tree_map(lambda x, dx: x + offset * dx, (state, time), flow)
-        direction = jnp.where(released, -lane.direction, direction)
-        contact = jnp.where(released, 0.0, contact)
-    y_max, y_min, clearance = _reached(plan, lane, trial, taken, state)
-    if time is not None and record.time is not None:
-        time = jnp.where(taken, time, record.time)
-    return (
-        jnp.where(taken, s, lane.s),
-        select(taken, state, lane.state),
-        jnp.where(taken, direction, lane.direction),
-        None if contact is None else select(taken, contact, lane.contact),
-        Record(time, y_max, y_min, impacts, speed, loss, rests, log, clearance),
-        taken & completed,
+            arrival = arrival._replace(
+                completed=arrival.completed | c.landed,
+                state=select(c.landed, there, arrival.state),
+            )
+        else:
+            arrival = _impact(plan, lane, trial, taken, arrival, c, there, flow)
+    if trial.leaves is None:
+        return arrival
+    assert arrival.contact is not None
+    _, released, _, offset = trial.leaves
+    state, time = jtu.tree_map(lambda x, dx: x + offset * dx, (arrival.state, arrival.time), flow)
+    return arrival._replace(
+        s=arrival.s + offset,
+        state=state,
+        time=time,
+        direction=jnp.where(released, -lane.direction, arrival.direction),
+        contact=jnp.where(released, 0.0, arrival.contact),
+    )
+
+
+def _impact(
+    plan: Plan, lane: Lane, trial: Trial, taken: Flag, arrival: Arrival,
+    c: Crossing, there: Any, flow: Any,
+) -> Arrival:  # fmt: skip
+    """The rebound from a stop in `there`, the state of the impact; or coming to rest on it."""
+    scene, index = plan.scene, int(c.name) - 1
+    stop = scene.stops[index]
+    s, state, time, direction = arrival.s, arrival.state, arrival.time, arrival.direction
+    contact, rests, met = arrival.contact, arrival.rests, s
+    approach = jnp.maximum(stop.sign * scene.velocity(there), 0.0)
+    rebound = -stop.sign * stop.restitution * approach
+    state = select(c.landed, scene.placed(there, stop.sign * stop.gap, rebound), state)
+    direction = jnp.where(c.landed, -float(stop.sign), direction)
+    hit = taken & c.landed
+    lost = 0.5 * (1 - stop.restitution**2) * approach**2
+    if contact is not None and trial.position is not None:
+        arriving = stop.sign * trial.position[1].v
+        last, left = settled(plan, lane, stop, arriving, s, there)
+        ends = pin_flag(c.landed & last, s)
+        lost = jnp.where(ends, 0.5 * approach**2, lost)
+        wait = pin(jnp.where(ends, left, 0.0))
+        (later, passed) = jtu.tree_map(lambda x, dx: x + wait * dx, (state, time), flow)
+        still = scene.placed(later, stop.sign * stop.gap, jnp.zeros_like(s))
+        state = select(ends, still, state)
+        time = select(ends, passed, time)
+        s = s + wait
+        contact = jnp.where(ends, float(c.name), contact)
+        direction = jnp.where(ends, float(stop.sign), direction)
+        if rests is not None:
+            rests = rests + jnp.where(taken & ends, 1.0, 0.0)
+    clock, speed, loss = scene.clock(there), arrival.speed, arrival.loss
+    log = _logged(
+        arrival.log, hit, arrival.impacts, met if clock is None else clock, approach, index
+    )
+    return arrival._replace(
+        s=s,
+        state=state,
+        time=time,
+        direction=direction,
+        contact=contact,
+        impacts=arrival.impacts + jnp.where(hit, 1.0, 0.0),
+        speed=None if speed is None else jnp.where(hit, jnp.maximum(speed, approach), speed),
+        loss=None if loss is None else loss + jnp.where(hit, lost, 0.0),
+        rests=rests,
+        log=log,
     )
 
 

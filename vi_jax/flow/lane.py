@@ -64,8 +64,6 @@ class Lane(eqx.Module):
     begun: Scalar
     """Steps tried before the interval on its way."""
     rejected: Scalar
-    one: Scalar
-    """1, which the compiler cannot know (see `hybrid.pin`)."""
 
 
 class Plan(eqx.Module):
@@ -180,5 +178,4 @@ class Plan(eqx.Module):
             steps=zero,
             begun=zero,
             rejected=zero,
-            one=jnp.where(bad, jnp.nan, 1.0).astype(zero.dtype),
         )

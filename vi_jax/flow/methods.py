@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._checks import count, require
+from ..lanes import pin
 from ..scene import AbstractScene
-from .fusion import pin
 from .unrolled import Unrolled
 
 Scalar = Float[Array, ""]
@@ -31,6 +31,11 @@ class AbstractMethod(eqx.Module):
     @property
     def adaptive(self) -> bool:
         """Whether steps can be rejected and resized."""
+        return False
+
+    @property
+    def sees_ahead(self) -> bool:
+        """Whether it knows the motion before a step is taken (see `Taylor`)."""
         return False
 
     @property
@@ -62,13 +67,11 @@ class AbstractMethod(eqx.Module):
         s1: Scalar,
         state: Any,
         time: Scalar | None,
-        one: Scalar,
     ) -> tuple[Any, Scalar | None, Scalar]:
         """State and elapsed time at `s1` from those at `s0`, and the step's error.
 
         The error is relative to the tolerance (a step is accepted up to 1); it is 0 for methods
         that are not adaptive. `time` is `None` unless the scene has a pace that is asked for.
-        `one` is a 1 that the compiler does not know, see `fusion.pin`.
         """
 
     @abc.abstractmethod
@@ -84,11 +87,11 @@ def _unrolled(solver: Any) -> Unrolled:
     return solver if isinstance(solver, Unrolled) else Unrolled(solver)
 
 
-def _runge_kutta(solver: Unrolled, scene: AbstractScene, s0, s1, state, time, one):
+def _runge_kutta(solver: Unrolled, scene: AbstractScene, s0, s1, state, time):
     def field(s, y, args):
         state, time = y
         pace = None if time is None else scene.pace(s, state)
-        return pin((scene.field(s, state), pace), one)
+        return pin((scene.field(s, state), pace))
 
     y1, error, *_ = solver.step(
         diffrax.ODETerm(field), s0, s1, (state, time), None, None, made_jump=True
@@ -129,9 +132,9 @@ class Adaptive(AbstractMethod):
         """True."""
         return True
 
-    def step(self, scene, s0, s1, state, time, one):
+    def step(self, scene, s0, s1, state, time):
         """One Runge–Kutta step and its error norm (root mean square over the components)."""
-        new, time, error = _runge_kutta(self.solver, scene, s0, s1, state, time, one)
+        new, time, error = _runge_kutta(self.solver, scene, s0, s1, state, time)
         # Below the precision's own rounding a tolerance would only be rejected for ever.
         floor = 8 * jnp.finfo(s0.dtype).eps
         rtol = jnp.maximum(jnp.asarray(self.rtol, s0.dtype), floor)
@@ -183,9 +186,9 @@ class FixedStep(AbstractMethod):
     def __check_init__(self):
         count("steps_per_cycle", self.steps_per_cycle, least=5)
 
-    def step(self, scene, s0, s1, state, time, one):
+    def step(self, scene, s0, s1, state, time):
         """One Runge–Kutta step; its error is not asked for."""
-        new, time, _ = _runge_kutta(self.solver, scene, s0, s1, state, time, one)
+        new, time, _ = _runge_kutta(self.solver, scene, s0, s1, state, time)
         return new, time, jnp.zeros_like(s0)
 
     def tighter(self):

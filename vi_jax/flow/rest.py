@@ -14,9 +14,9 @@ import jax.tree_util as jtu
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
+from ..lanes import pin, pin_flag
 from ..scene import AbstractScene, RigidStop
 from .events import Rates, rates
-from .fusion import pin, pin_flag
 from .lane import RELEASE, Lane, Plan
 
 Scalar = Float[Array, ""]
@@ -117,7 +117,7 @@ def release(
     sign = jnp.zeros_like(h)
     for i, stop in enumerate(stops):
         sign = jnp.where(lane.contact == 1.0 + i, float(stop.sign), sign)
-    before, after = pin((-sign * begin.a, -sign * end.a), lane.one)
+    before, after = pin((-sign * begin.a, -sign * end.a))
     rise = stop_gradient(after - before)
     held = good & (sign != 0)
     rising = held & (rise > 0)
@@ -127,9 +127,9 @@ def release(
     left = rising & (after > 0) & ~landed
     place = stop_gradient(h + offset)
     place = jnp.where(h > allowed.straight, (1 - allowed.short) * place, place)
-    landed = pin_flag(landed, lane.one)
+    landed = pin_flag(landed, h)
     # By rounding's measure late rather than early, when it would be pressed on again; and no step
     # towards it is so short that it would not move on.
     late = 8 * float(jnp.finfo(h.dtype).eps) * (1 + stop_gradient(lane.s + h))
     place = jnp.maximum(place, 2 * late)
-    return pin_flag(left, lane.one), landed, place, jnp.where(landed, offset + late, 0.0)
+    return pin_flag(left, h), landed, place, jnp.where(landed, offset + late, 0.0)

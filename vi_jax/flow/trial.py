@@ -7,11 +7,12 @@ import jax.tree_util as jtu
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
+from ..lanes import pin, pin_flag
 from ..scene import AbstractScene
 from .events import Rates, force_rate, landing, rates
-from .fusion import pin, pin_flag
 from .lane import FREE, SECTION, TURN, Lane, Plan
 from .rest import Holding, release
+from .taylor import Expansion
 
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]
@@ -60,7 +61,23 @@ class Trial(NamedTuple):
     force; absent where the body cannot rest."""
 
 
-def attempt(plan: Plan, lane: Lane, active: Flag) -> Trial:
+def held(plan: Plan, lane: Lane) -> AbstractScene:
+    """The scene with its body held where it rests."""
+    scene = plan.scene
+    if lane.contact is None:
+        return scene
+    return Holding(scene=scene, held=lane.contact > 0, stops=scene.stops)
+
+
+def timing(plan: Plan, lane: Lane) -> Scalar | None:
+    """The elapsed time, where the method has to carry it along."""
+    paced = plan.motion and plan.scene.pace(lane.s, lane.state) is not None
+    return lane.record.time if paced else None
+
+
+def attempt(
+    plan: Plan, lane: Lane, active: Flag, holding: AbstractScene, motion: Expansion | None
+) -> Trial:
     """Try the next step and see what it meets; of length zero for a lane that has ended."""
     scene, method = plan.scene, plan.method
     free = lane.target == FREE
@@ -73,31 +90,30 @@ def attempt(plan: Plan, lane: Lane, active: Flag) -> Trial:
         last = free & (stop_gradient(bound - lane.s) <= h * (1 + 1e-6))
         s1 = jnp.where(last, bound, s1)
     s1 = jnp.where(active, s1, lane.s)
-    s1 = pin(s1, lane.one)
+    s1 = pin(s1)
     h = s1 - lane.s
 
-    held: Any = None
-    holding: AbstractScene = scene
-    if lane.contact is not None:
-        held = lane.contact > 0
-        holding = Holding(scene=scene, held=held, stops=scene.stops)
-    paced = plan.motion and scene.pace(lane.s, lane.state) is not None
-    time = lane.record.time if paced else None
-    moved: Any = holding if method.uses_field else scene
-    new, time, error = method.step(moved, lane.s, s1, lane.state, time, lane.one)
+    time = timing(plan, lane)
+    paced = time is not None
+    if motion is not None:
+        (new, time), error = motion.at(h), jnp.zeros_like(h)
+    else:
+        moved: Any = holding if method.uses_field else scene
+        new, time, error = method.step(moved, lane.s, s1, lane.state, time)
     if not paced and lane.record.time is not None:
         time = lane.record.time + h
-    if held is not None and not method.uses_field:
-        new = jtu.tree_map(lambda a, b: jnp.where(held, a, b), lane.state, new)
-    new = pin(new, lane.one)
+    if lane.contact is not None and not method.uses_field:
+        rests = lane.contact > 0
+        new = jtu.tree_map(lambda a, b: jnp.where(rests, a, b), lane.state, new)
+    new = pin(new)
     good = jnp.isfinite(sum(jtu.tree_leaves(new), jnp.zeros_like(h)))
     alive = scene.alive(new)
     if alive is not None:
         good = good & alive
     if method.adaptive:
-        error = pin(error, lane.one)
+        error = pin(error)
         good = good & (error <= 1)
-    good = pin_flag(good, lane.one)
+    good = pin_flag(good, h)
 
     crossings, position = [], None
     at_turn = jnp.zeros_like(free)
@@ -149,7 +165,7 @@ def _seen(lane: Lane, good: Flag, h: Scalar, crossing: tuple, all_of_them: list)
     close = size <= _landing_tolerance(h) * _leniency(lane)
     close = close | ((jnp.abs(end.x) <= 4 * eps * scale) & (end.v >= 0))
     real = stop_gradient(square) > 0
-    landed = pin_flag(aimed & close & real, lane.one)
+    landed = pin_flag(aimed & close & real, h)
     again = aimed & ~close & real & (size < 0.25 * h)
     return Crossing(name, begin, end, offset, landed, again)
 

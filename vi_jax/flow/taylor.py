@@ -1,0 +1,126 @@
+"""A Taylor method: each step is a power series, which also says where in it an event lies."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jax.lax import stop_gradient
+from jaxtyping import Array, Float
+
+from .._checks import count, require
+from . import series as power_series
+from .methods import AbstractMethod
+from .series import NoSeries, Series
+
+Scalar = Float[Array, ""]
+
+
+class Expansion(NamedTuple):
+    """A motion about a point, in powers of s - s0."""
+
+    treedef: Any
+    """Of the state and the elapsed time."""
+    series: list[Series]
+    timed: bool
+
+    def at(self, h: Scalar) -> tuple[Any, Scalar | None]:
+        """State and elapsed time a length h away."""
+        return jtu.tree_unflatten(self.treedef, [power_series.at(x, h) for x in self.series])
+
+    def of(self, function: Any) -> Series:
+        """The series of a scalar function of the state, a constant for differentiation."""
+        still = [[None if c is None else stop_gradient(c) for c in x] for x in self.series]
+        return power_series.along(lambda y: function(y[0]), self.treedef, still)
+
+    def reach(self, tolerance: Any) -> Scalar:
+        """The length at which the last two terms are as small as the tolerance, relative to the
+        state (Jorba and Zou, Experimental Mathematics 14, 2005)."""
+        shortest = None
+        size = sum(jnp.abs(stop_gradient(x[0])) for x in self.series)
+        allowed = tolerance * (1 + size)
+        for n in (len(self.series[0]) - 2, len(self.series[0]) - 1):
+            terms = [jnp.abs(stop_gradient(x[n])) for x in self.series if x[n] is not None]
+            if not terms:
+                continue
+            term = jnp.maximum(sum(terms), jnp.finfo(size.dtype).tiny)
+            # A length needs no double precision, and single precision powers vectorise.
+            ratio = jnp.clip(allowed / term, 1e-30, 1e30).astype(jnp.float32)
+            length = (ratio ** (1.0 / n)).astype(size.dtype)
+            shortest = length if shortest is None else jnp.minimum(shortest, length)
+        assert shortest is not None
+        return shortest
+
+
+class Taylor(AbstractMethod):
+    """Power series of the motion, their coefficients by recursion over the scene's own field.
+
+    A step knows the motion all along it, so that an event is found where it lies and met at once.
+    The method of choice for smooth fields at small errors; `NotImplementedError` names what a field
+    uses that has no recursion.
+
+    **Arguments:** `order` of the series (at least 4, default 16); `steps_per_cycle` (at least 5,
+    default 8), as for `FixedStep`; `rtol`, if given, sizes each step by its last terms instead, and
+    `steps_per_cycle` is the fewest.
+
+    **Raises:** `ValueError` for numbers out of range.
+    """
+
+    order: int = eqx.field(static=True, default=16)
+    steps_per_cycle: int = eqx.field(static=True, default=8)  # pyright: ignore
+    rtol: np.ndarray | float | None = eqx.field(
+        kw_only=True, default=None, converter=lambda x: x if x is None else np.asarray(x)
+    )
+
+    def __check_init__(self):
+        count("order", self.order, least=4)
+        count("steps_per_cycle", self.steps_per_cycle, least=5)
+        if self.rtol is not None:
+            require("rtol", self.rtol, low=0.0, high=1.0, open_low=True)
+
+    @property
+    def sees_ahead(self) -> bool:
+        """True: events are found before a step is taken."""
+        return True
+
+    def tighter(self):
+        """Twice the steps, or a hundredth of the tolerance."""
+        if self.rtol is None:
+            return Taylor(self.order, 2 * self.steps_per_cycle)
+        return Taylor(self.order + 4, self.steps_per_cycle, rtol=self.rtol / 100)
+
+    def longest(self, scene, s, state):
+        """As for every method of fixed steps; as long as the scene allows where they are sized."""
+        if self.rtol is None:
+            return super().longest(scene, s, state)
+        return scene.step_limit(s, state) * (5 / self.steps_per_cycle)
+
+    def expand(self, scene: Any, s: Scalar, state: Any, time: Scalar | None) -> Expansion:
+        """The motion about (s, state)."""
+
+        def field(s, y):
+            state, time = y
+            return scene.field(s, state), None if time is None else scene.pace(s, state)
+
+        try:
+            treedef, series = power_series.expand(field, s, (state, time), self.order)
+        except NoSeries as error:
+            raise NotImplementedError(
+                f"Method `Taylor` has no recursion for the primitive `{error}` in the scene's "
+                "field. Use `Adaptive` or `FixedStep`."
+            ) from None
+        return Expansion(treedef, series, time is not None)
+
+    def reach(self, motion: Expansion, limit: Scalar) -> Scalar:
+        """The longest step from there."""
+        if self.rtol is None:
+            return limit
+        floor = 8 * jnp.finfo(limit.dtype).eps
+        tolerance = jnp.maximum(jnp.asarray(self.rtol, limit.dtype), floor)
+        return jnp.minimum(limit, motion.reach(tolerance))
+
+    def step(self, scene, s0, s1, state, time):
+        """The sum of the series at `s1`."""
+        new, time = self.expand(scene, s0, state, time).at(s1 - s0)
+        return new, time, jnp.zeros_like(s0)
