@@ -113,7 +113,9 @@ def flown(zeta, xi, stops, Y, V, cycles, *, section=0.0, fineness=32):
                 t[mine] = np.minimum(later, whole[mine])
                 held[mine[later <= whole[mine]]] = 0
             on = on[(held[on] == 0) & (t[on] < whole[on])]
-            _look(on, zeta, xi, section, stops, look, whole, (t, Y, V, held, low, high, hits, comes))
+            _look(
+                on, zeta, xi, section, stops, look, whole, (t, Y, V, held, low, high, hits, comes)
+            )
         kept.append(np.stack([Y, V]))
         lows.append(low)
         highs.append(high)
@@ -136,7 +138,9 @@ def _look(on, zeta, xi, section, stops, look, whole, arrays):
     first = np.full(on.size, len(times))
     which = np.full(on.size, -1)
     for i, (sign, gap, _) in enumerate(stops):
-        over = (sign * heights - gap[on] > ROUNDING) & (sign * np.diff(heights, axis=0, prepend=0) > 0)
+        over = (sign * heights - gap[on] > ROUNDING) & (
+            sign * np.diff(heights, axis=0, prepend=0) > 0
+        )
         over[0] = False
         place = np.where(over.any(axis=0), over.argmax(axis=0), len(times))
         which, first = np.where(place < first, i, which), np.minimum(first, place)

@@ -1,6 +1,7 @@
 """The program that carries a lane and its forward derivative along together."""
 
 import functools
+from itertools import pairwise
 from typing import Any
 
 import jax
@@ -49,7 +50,7 @@ def _derived(
         given = iter(args)
         primals: list[Any] = []
         tangents: list[Any] = []
-        for begin, end in zip(ends, ends[1:], strict=False):
+        for begin, end in pairwise(ends):
             primals += [next(given) for _ in moving[begin:end]]
             tangents += [next(given) for there in moving[begin:end] if there]
 
@@ -70,7 +71,7 @@ def _derived(
         return out
 
     shapes: list[Any] = []
-    for begin, end in zip(ends, ends[1:], strict=False):
+    for begin, end in pairwise(ends):
         part = [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in closed.in_avals[begin:end]]
         shapes += part + [s for s, m in zip(part, moving[begin:end], strict=True) if m]
     return jax.make_jaxpr(both)(*shapes)

@@ -102,9 +102,8 @@ class _Writer:
             [*names, index, filled, active],
             strict=True,
         ):
-            t.line(
-                f"{v.text} = phi {t.vector(v.kind)} [ {a.text}, %entry ], [ {b.text}, %{flush_end} ]"
-            )
+            ways = f"[ {a.text}, %entry ], [ {b.text}, %{flush_end} ]"
+            t.line(f"{v.text} = phi {t.vector(v.kind)} {ways}")
         free = t.inverse(busy)
         bits_free = t.raw(f"bitcast {t.vector('i1')} {free.text} to i{t.width}")
         t.declared["@llvm.ctpop"] = f"declare i{t.width} @llvm.ctpop.i{t.width}(i{t.width})"
@@ -309,7 +308,7 @@ class _Writer:
     def _run(
         self, jaxpr: ClosedJaxpr, args: list[Values], mask: Value
     ) -> tuple[list[Values], Value, Value, list[Values]]:
-        """What `begin` or `step` gives: carry, whether it goes on, whether a row is complete, row."""
+        """What `begin` or `step` gives: carry, whether the lane goes on, has a row, the row."""
         out: list[Any] = write(self.t, jaxpr.jaxpr, jaxpr.consts, args, mask)
         n = len(self.program.carry_avals)
         return out[:n], out[n][()], out[n + 1][()], out[n + 2 :]

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.extend.core import ClosedJaxpr
 
-from .primitive import lanes_p
+from .primitive import FORWARD_ONLY, lanes_p
 from .program import Program
 
 ROADS = ("auto", "xla")
@@ -31,7 +31,10 @@ class Emitted(NamedTuple):
 
 @contextmanager
 def road(name: str):
-    """Within this context lanes are traced for `"xla"`, or for what suits the machine (`"auto"`)."""
+    """Trace lanes for `"xla"` within this context, or for what suits the machine (`"auto"`).
+
+    What is compiled already keeps its road.
+    """
     if name not in ROADS:
         raise ValueError(f"Argument `name` must be one of {ROADS}, but got {name!r}.")
     token = _road.set(name)
@@ -106,7 +109,12 @@ def run(
     jaxprs = [first, jax.make_jaxpr(stepped)(*both), jax.make_jaxpr(ended)(*both)]
     (first, second, last), leaves = _without_consts(jaxprs, leaves)
     program = Program(begin=first, step=second, end=last, rows=rows, block=block)
-    out = lanes_p.bind(*leaves, program=program, road=current_road() if road is None else road)
+    try:
+        out = lanes_p.bind(*leaves, program=program, road=current_road() if road is None else road)
+    except ValueError as error:
+        if "Linearization failed" in str(error):
+            raise NotImplementedError(FORWARD_ONLY) from None
+        raise
     results = jtu.tree_unflatten(flat["out"], out[: len(last.out_avals)])
     return results, jtu.tree_unflatten(flat["row"], out[len(last.out_avals) :])
 

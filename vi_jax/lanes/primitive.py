@@ -16,6 +16,11 @@ from .machine import kernel_of
 from .program import Program, spread
 from .vector import Unsupported
 
+FORWARD_ONLY = (
+    "This loop is differentiated forward only (`jax.jvp`, `jax.jacfwd`). Where there is an "
+    'argument `adjoint`, ask for `adjoint="reverse"`.'
+)
+
 lanes_p = Primitive("lanes")
 lanes_p.multiple_results = True
 
@@ -120,16 +125,6 @@ def _outs(program: Program) -> int:
 
 
 ad.primitive_jvps[lanes_p] = _jvp
-
-
-def _transposed(*args, **params):
-    raise NotImplementedError(
-        "Reverse-mode differentiation through lanes that run forward: ask for "
-        '`adjoint="reverse"`, or use forward mode (`jax.jvp`, `jax.jacfwd`).'
-    )
-
-
-ad.primitive_transposes[lanes_p] = _transposed
 
 
 def _on_xla(*args, program: Program, road: str):

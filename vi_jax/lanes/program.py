@@ -11,8 +11,8 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 class Program(eqx.Module):
     """A lane's loop as jaxprs of flat arguments; hashable, as a primitive's parameter must be.
 
-    `begin(inputs)` and `step(inputs, carry)` give the carry, whether the lane goes on, whether a row
-    is complete, and the row; `end(inputs, carry)` gives the results.
+    `begin(inputs)` and `step(inputs, carry)` give the carry, whether the lane goes on, whether a
+    row is complete, and the row; `end(inputs, carry)` gives the results.
     """
 
     begin: ClosedJaxpr = eqx.field(static=True)

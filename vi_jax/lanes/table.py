@@ -411,13 +411,11 @@ for _name, _with in {
 
 @structural("cumsum")
 def _(t, p, avals, x):
-    moved = np.moveaxis(x, p["axis"], 0)
-    moved = moved[::-1] if p["reverse"] else moved
-    rows = [moved[0]]
-    for row in moved[1:]:
-        rows.append(_each(lambda a, b: add(t, a, b), rows[-1], row))
-    out = np.stack(rows[::-1] if p["reverse"] else rows)
-    return np.moveaxis(out, 0, p["axis"])
+    out = np.moveaxis(x, p["axis"], 0).copy()
+    out = out[::-1] if p["reverse"] else out
+    for i in range(1, len(out)):
+        out[i : i + 1] = _each(lambda a, b: add(t, a, b), out[i - 1 : i], out[i : i + 1])
+    return np.moveaxis(out[::-1] if p["reverse"] else out, 0, p["axis"])
 
 
 @structural("dot_general")
@@ -444,7 +442,7 @@ def _(t, p, avals, a, b):
 
 
 def _here(t: Text, starts: list[Value], sizes: list[int], shape: tuple[int, ...]):
-    """Every place at which a block of `sizes` may begin, with whether it does; clamped as in JAX."""
+    """Every place at which a block of `sizes` may begin, and whether it does (clamped)."""
     for corner in np.ndindex(*(n - m + 1 for n, m in zip(shape, sizes, strict=True))):
         flag = t.constant(True, "i1")
         for i, start, n, m in zip(corner, starts, shape, sizes, strict=True):

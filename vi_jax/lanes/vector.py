@@ -166,7 +166,7 @@ def _cond(t: Text, branches: tuple, which: Value, args: list[Values], mask: Valu
 
 
 def _skipped(t: Text, jaxpr, consts, args, mask: Value, otherwise) -> list[Values]:
-    """The values of a jaxpr in the lanes of `mask`, laid over others; nothing where there is none."""
+    """The values of a jaxpr in the lanes of `mask`, laid over others; skipped if there are none."""
     inside, after = t.label(), t.label()
     before = t.block
     needed = t.any(mask)
@@ -216,7 +216,6 @@ def _while(t: Text, params: dict, args: list[Values], mask: Value) -> list[Value
     jaxpr, consts = _inner(params["cond_jaxpr"])
     going = write(t, jaxpr, consts, [*cond_args, *carry], live)[0][()]
     going = t.both(live, going)
-    head_end = t.block
     needed = t.any(going)
     t.line(f"br i1 {needed}, label %{inside}, label %{after}")
     t.open(inside)
@@ -229,7 +228,6 @@ def _while(t: Text, params: dict, args: list[Values], mask: Value) -> list[Value
     t.line(f"br label %{head}")
     t.close()
     t.close()
-    del head_end
     phis = []
     for old, here, back in zip([*first, mask], [*carry, live], [*new, going], strict=True):
         for a, h, b in zip(*map(_flat, (old, here, back)), strict=True):

@@ -1,0 +1,162 @@
+"""Every operation of the vector code against XLA's, at ordinary numbers and at the corners."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from vi_jax import lanes
+
+X = np.concatenate(
+    [
+        np.random.default_rng(1).normal(0, 3, 300),
+        [0.0, -0.0, 1.0, -1.0, 0.5, 1.5, 2.5, -2.5, 1e-300, 5e-324, 1e300, 708.0, -745.0, 1e5],
+        [np.inf, -np.inf, np.nan],
+    ]
+)
+Y = np.random.default_rng(2).permutation(X)
+
+
+def once(function, *args, road):
+    """`function` of every lane, by a loop of one step."""
+
+    def lane(*args):
+        def begin(args):
+            return jnp.zeros(()), lanes.Emitted(False, False, None)
+
+        def end(args, carry):
+            return function(*args)
+
+        return lanes.run(begin, lambda args, carry: begin(args), end, args, rows=0, road=road)[0]
+
+    return jax.jit(jax.vmap(lane))(*args)
+
+
+# The functions and how many units of rounding they may differ by (of results near one).
+FUNCTIONS = {
+    "arithmetic": (lambda x, y: (x + y, x - y, x * y, x / y, -x), 1),
+    "powers": (lambda x, y: (x**2, x**3, x**7, x**-1, x**-2, jnp.square(x), x**0), 2),
+    "roots": (lambda x, y: (jnp.sqrt(x), jax.lax.rsqrt(x)), 2),
+    "general power": (lambda x, y: (jnp.abs(x) ** 1.5, jnp.abs(x) ** y), 8),
+    "rounding": (
+        lambda x, y: (jnp.round(x), jnp.floor(x), jnp.ceil(x), jax.lax.round(x)), 0,
+    ),
+    "extremes": (
+        lambda x, y: (jnp.maximum(x, y), jnp.minimum(x, y), jnp.maximum(x, 1.0),
+                      jnp.minimum(0.5, y), jnp.clip(x, -1.0, 1.0), jnp.abs(x)), 0,
+    ),
+    "signs": (lambda x, y: (jnp.sign(x), jnp.where(x < y, x, y)), 0),
+    "comparisons": (
+        lambda x, y: (x < y, x <= y, x > y, x >= y, x == y, x != y, jnp.isfinite(x)), 0,
+    ),
+    "flags": (lambda x, y: ((x < 0) & (y < 0), (x < 0) | (y < 0), (x < 0) ^ (y < 0), ~(x < 0)), 0),
+    "exponential": (lambda x, y: (jnp.exp(x), jax.nn.sigmoid(x)), 4),
+    "logarithm": (lambda x, y: (jnp.log(x), jnp.log(jnp.abs(x))), 4),
+    "circle": (lambda x, y: (jnp.sin(x), jnp.cos(x)), 4),
+    "library": (
+        lambda x, y: (jnp.tanh(x), jnp.arctan(x), jnp.arctan2(x, y), jnp.expm1(-jnp.abs(x)),
+                      jnp.log1p(jnp.abs(x)), jnp.cbrt(x), jax.scipy.special.erf(x)), 16,
+    ),
+    "remainder": (lambda x, y: (jax.lax.rem(x, jnp.full_like(x, 2.0)),), 1),
+    "whole numbers": (
+        lambda x, y: (x.astype(jnp.int32), (x.astype(jnp.int32) % 7) // 3,
+                      x.astype(jnp.int32) + 3, (x > 0).astype(jnp.int32)), 0,
+    ),
+    "choice": (
+        lambda x, y: (jax.lax.select_n(jnp.clip(x, 0, 2).astype(jnp.int32), x, y, x + y),), 1,
+    ),
+}  # fmt: skip
+
+
+def ordinary(function, x, y):
+    """Lanes whose whole numbers are defined."""
+    return (np.abs(x) < 1e9) & (np.abs(y) < 1e9) if function == "whole numbers" else x == x
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_elementwise(name, dtype):
+    function, units = FUNCTIONS[name]
+    with np.errstate(over="ignore"):
+        x, y = X.astype(dtype), Y.astype(dtype)
+    if name == "whole numbers":
+        keep = (np.abs(x) < 1e9) & (np.abs(y) < 1e9)
+        x, y = x[keep], y[keep]
+    if name == "circle":  # beyond a million turns the reduction loses digits
+        x = np.where(np.abs(x) > 1e6, dtype(1.0), x)
+    mine = once(function, x, y, road="auto")
+    eps = np.finfo(dtype).eps
+    for a, b in zip(mine, function(jnp.asarray(x), jnp.asarray(y)), strict=True):
+        assert a.dtype == b.dtype
+        a, b = np.asarray(a), np.asarray(b)
+        if a.dtype.kind != "f":
+            np.testing.assert_array_equal(a, b)
+            continue
+        tiny = np.finfo(dtype).tiny  # XLA takes smaller numbers for zero
+        np.testing.assert_allclose(a, b, rtol=units * eps, atol=max(units * eps * 0.5, tiny))
+
+
+def test_exponential_is_right_to_rounding():
+    x = np.linspace(-700, 700, 4001)
+    value = once(lambda x: jnp.exp(x), x, road="auto")
+    np.testing.assert_allclose(value, np.exp(x), rtol=4e-16)
+
+
+def test_circle_is_right_to_rounding():
+    x = np.linspace(-40, 40, 8001)
+    sine, cosine = once(lambda x: lanes.sincos(x), x, road="auto")
+    np.testing.assert_allclose(sine, np.sin(x), atol=3e-16, rtol=0)
+    np.testing.assert_allclose(cosine, np.cos(x), atol=3e-16, rtol=0)
+
+
+ARRAYS = {
+    "product": lambda x, y: jnp.stack([x, y, x * y]) @ jnp.stack([y, x, 1 + x]),
+    "matrix": lambda x, y: jnp.array([[1.0, x], [y, 2.0]]) @ jnp.array([[x, 0.5], [1.0, y]]),
+    "sums": lambda x, y: jnp.sum(jnp.stack([x, y, x])) + jnp.max(jnp.stack([x, y])),
+    "moved": lambda x, y: jnp.concatenate([jnp.stack([x, y]).T[::-1], jnp.zeros(2) + x])[1:],
+    "running": lambda x, y: jnp.cumsum(jnp.stack([x, y, x + y])),
+    "padded": lambda x, y: jnp.pad(jnp.stack([x, y]), (1, 2), constant_values=3.0),
+    "placed": lambda x, y: jnp.where(jnp.arange(4) == (jnp.abs(x) % 4).astype(int), x, y),
+    "sliced": lambda x, y: jax.lax.dynamic_slice(
+        jnp.stack([x, y, x * y, x + y]), ((jnp.abs(x) % 5).astype(int),), (2,)
+    ),
+    "updated": lambda x, y: jax.lax.dynamic_update_slice(
+        jnp.stack([x, y, x * y, x + y]), jnp.stack([y]), ((jnp.abs(x) % 5).astype(int),)
+    ),
+    "split": lambda x, y: jnp.split(jnp.stack([x, y, x, y]), 2)[1],
+    "several at once": lambda x, y: jax.vmap(lambda t: t * x + y)(jnp.arange(3.0)),
+}
+
+
+@pytest.mark.parametrize("name", ARRAYS)
+def test_arrays_in_a_lane(name):
+    x, y = np.random.default_rng(3).normal(0, 2, (2, 37))
+    function = ARRAYS[name]
+    mine = once(function, x, y, road="auto")
+    np.testing.assert_allclose(mine, jax.vmap(function)(x, y), rtol=1e-14, atol=1e-14)
+
+
+def branches(x, y):
+    """A branch in a branch in a loop whose length differs from lane to lane."""
+
+    def body(state):
+        i, total = state
+        inner = jax.lax.cond(
+            total > 1.0,
+            lambda t: jax.lax.cond(t > 2.0, lambda t: 0.25 * t, lambda t: t - 0.5, t),
+            lambda t: t + jnp.abs(y),
+            total,
+        )
+        return i + 1, inner
+
+    count, total = jax.lax.while_loop(lambda s: s[0] < jnp.abs(x) * 3, body, (0.0, y))
+    doubled, steps = jax.lax.scan(lambda c, k: (c * 0.5 + k, c), total, jnp.arange(4.0))
+    case = jax.lax.switch(
+        jnp.clip(x, 0, 3).astype(int), [lambda t: t, jnp.sin, lambda t: t * t, lambda t: -t], y
+    )
+    return count, total, doubled, steps, case, jax.lax.fori_loop(0, 3, lambda i, t: t * x, y)
+
+
+def test_control_flow():
+    x, y = np.random.default_rng(4).normal(0, 2, (2, 203))
+    for a, b in zip(once(branches, x, y, road="auto"), jax.vmap(branches)(x, y), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-14, atol=1e-15)

@@ -1,0 +1,318 @@
+"""The loop over lanes, with toys: a logistic map and a ball that falls until it hits the floor."""
+
+import ast
+import sys
+import warnings
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from vi_jax import lanes
+from vi_jax.lanes import machine
+
+ROWS = 12
+
+
+def logistic(x, r, n, *, road=None):
+    """n steps of x ← r x (1 - x) with a rare branch; a row for every step."""
+
+    def begin(inputs):
+        x, _, n = inputs
+        return (x, jnp.zeros_like(x)), lanes.Emitted(n > 0, True, {"x": x, "steps": 0})
+
+    def step(inputs, carry):
+        _, r, n = inputs
+        x, done = carry
+        x = r * x * (1 - x)
+        x = jax.lax.cond(x > 0.9, lambda x: 0.9 + 0.1 * jnp.sin(x - 0.9), lambda x: x, x)
+        done = done + 1
+        row = {"x": x, "steps": done.astype(jnp.int32)}
+        return (x, done), lanes.Emitted(done < n, True, row)
+
+    def end(inputs, carry):
+        return carry[0], carry[1].astype(jnp.int32)
+
+    return lanes.run(begin, step, end, (x, r, n), rows=ROWS, road=road)
+
+
+def fall(height, gravity, h=0.05, *, road=None):
+    """A ball falls in steps of h until an event: time and speed when it hits the floor."""
+
+    def begin(inputs):
+        height, _ = inputs
+        return (height, 0 * height, 0 * height), lanes.Emitted(True, False, height)
+
+    def step(inputs, carry):
+        _, gravity = inputs
+        x, v, t = carry
+        x1, v1 = x + v * h - 0.5 * gravity * h * h, v - gravity * h
+        hits = x1 <= 0
+        left = (v + jnp.sqrt(v * v + 2 * gravity * jnp.maximum(x, 0.0))) / gravity
+        carry = (
+            jnp.where(hits, 0.0, x1), jnp.where(hits, v - gravity * left, v1),
+            t + jnp.where(hits, left, h),
+        )  # fmt: skip
+        return carry, lanes.Emitted(~hits, hits, carry[1])
+
+    def end(inputs, carry):
+        return carry[2], carry[1]
+
+    return lanes.run(begin, step, end, (height, gravity), rows=1, road=road)
+
+
+MANY = jax.jit(jax.vmap(logistic))
+
+
+def batch(size):
+    draw = np.random.default_rng(size).uniform
+    return draw(0.1, 0.9, size), draw(2.5, 3.99, size), np.floor(draw(0, 16, size))
+
+
+def plain(x, r, n):
+    """The same map in numpy, one lane at a time."""
+    out = [x]
+    for _ in range(int(n)):
+        x = r * x * (1 - x)
+        x = 0.9 + 0.1 * np.sin(x - 0.9) if x > 0.9 else x
+        out.append(x)
+    return out
+
+
+@pytest.mark.parametrize("size", [0, 1, 2, 7, 8, 9, 101, 1000])
+def test_every_batch(size):
+    x, r, n = batch(size)
+    (last, steps), rows = MANY(x, r, n)
+    assert last.shape == (size,) and rows["x"].shape == (size, ROWS)
+    np.testing.assert_array_equal(steps, n)
+    for i in range(0, size, max(1, size // 20)):
+        expected = plain(x[i], r[i], n[i])
+        np.testing.assert_allclose(last[i], expected[-1], rtol=1e-9)
+        kept = np.full(ROWS, np.nan)
+        kept[: len(expected)] = expected[:ROWS]
+        np.testing.assert_allclose(rows["x"][i], kept, rtol=1e-9)
+        assert rows["steps"][i, min(len(expected), ROWS) - 1] == min(len(expected), ROWS) - 1
+
+
+def test_roads_agree():
+    for size in (1, 7, 600):
+        values = batch(size)
+        other = jax.jit(jax.vmap(lambda *a: logistic(*a, road="xla")))(*values)
+        for a, b in zip(jax.tree.leaves(MANY(*values)), jax.tree.leaves(other), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-13)
+
+
+def test_the_road_of_the_context():
+    with lanes.road("xla"):
+        jaxpr = jax.make_jaxpr(lambda x: logistic(x, 3.0, 4.0))(0.5)
+    assert "road=xla" in str(jaxpr)
+    with pytest.raises(ValueError, match="name"), lanes.road("motorway"):
+        pass
+
+
+@settings(max_examples=25, deadline=None, derandomize=True)
+@given(st.data())
+def test_lanes_know_nothing_of_each_other(data):
+    """To the last bit, whatever lanes go along, in whatever order, on however many threads."""
+    values = batch(211)
+    with lanes.threads(1):
+        whole = jax.tree.leaves(MANY(*values))
+    chosen = data.draw(st.lists(st.integers(0, 210), min_size=1, max_size=40))
+    chosen = np.resize(chosen, 40)  # one program
+    with lanes.threads(data.draw(st.integers(1, 4))):
+        part = jax.tree.leaves(MANY(*(x[chosen] for x in values)))
+    for a, b in zip(whole, part, strict=True):
+        np.testing.assert_array_equal(np.asarray(a)[chosen], b)
+
+
+def test_nested_and_shared_axes():
+    x, r, _ = batch(6)
+    flat = MANY(np.repeat(x, 5), np.tile(r[:5], 6), np.full(30, 9.0))
+    both = jax.vmap(jax.vmap(logistic, (None, 0, None)), (0, None, None))(x, r[:5], 9.0)
+    swapped = jax.vmap(jax.vmap(logistic, (0, None, None)), (None, 0, None))(x, r[:5], 9.0)
+    for a, b, c in zip(*map(jax.tree.leaves, (flat, both, swapped)), strict=True):
+        np.testing.assert_array_equal(a.reshape(b.shape), b)
+        np.testing.assert_array_equal(b, np.swapaxes(c, 0, 1))
+
+
+def test_a_ball_falls():
+    height = np.linspace(0.1, 5, 50)
+    (time, speed), rows = jax.vmap(fall, (0, None))(height, 9.81)
+    np.testing.assert_allclose(time, np.sqrt(2 * height / 9.81), rtol=1e-13)
+    np.testing.assert_allclose(speed, -np.sqrt(2 * height * 9.81), rtol=1e-13)
+    np.testing.assert_array_equal(rows[:, 0], speed)
+
+
+def test_forward_derivatives():
+    """Through the event, in one direction and in several, of first and second order."""
+    time = lambda height, gravity: fall(height, gravity)[0][0]
+    h, g = 1.7, 9.81
+    slope = jax.jacfwd(time, (0, 1))(h, g)
+    np.testing.assert_allclose(slope, [0.5 * np.sqrt(2 / h / g), -0.5 * np.sqrt(2 * h / g**3)])
+    bend = jax.jacfwd(jax.jacfwd(time))(h, g)
+    np.testing.assert_allclose(bend, -0.25 * np.sqrt(2 / h**3 / g))
+    many = jax.vmap(jax.jacfwd(time, (0, 1)), (0, None))(np.linspace(1, 2, 11), g)
+    np.testing.assert_allclose(many[0], 0.5 * np.sqrt(2 / np.linspace(1, 2, 11) / g))
+    one = jax.jit(lambda x: jax.jvp(lambda x: logistic(x, 3.7, 6.0), (x,), (1.0,)))(0.3)
+    two = jax.jit(lambda x: jax.jvp(lambda x: logistic(x, 3.7, 6.0, road="xla"), (x,), (1.0,)))(0.3)
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True):
+        if a.dtype != jax.dtypes.float0:
+            np.testing.assert_allclose(a, b, rtol=1e-12)
+
+
+def test_directions_share_one_motion():
+    """Six directions make one program whose primal part is there once."""
+    rows = jax.make_jaxpr(jax.jacfwd(lambda x: logistic(*x, road="xla")[1]["x"]))(
+        jnp.asarray([0.3, 3.7, 6.0])
+    )
+    equations = [e for e in rows.jaxpr.eqns if e.primitive.name == "lanes"]
+    assert len(equations) == 1 and equations[0].outvars[0].aval.shape == ()
+
+
+def test_reverse_mode_says_what_to_do():
+    with pytest.raises(NotImplementedError, match="forward"):
+        jax.grad(lambda x: logistic(x, 3.7, 6.0)[0][0])(0.3)
+
+
+def test_closed_over_arrays_are_inputs():
+    """Numbers that the functions close over may be traced, batched and differentiated."""
+
+    def shifted(offset):
+        def begin(x):
+            return x + offset, lanes.Emitted(True, False, None)
+
+        def step(x, carry):
+            return carry * offset, lanes.Emitted(jnp.abs(carry) > 1.0, False, None)
+
+        return lanes.run(begin, step, lambda x, carry: carry, 3.0, rows=0)[0]
+
+    offsets = jnp.asarray([0.5, 0.25, 0.1])
+    loop = []
+    for o in [0.5, 0.25, 0.1]:
+        value = 3.0 + o
+        going = True
+        while going:
+            going, value = abs(value) > 1.0, value * o
+        loop.append(value)
+    np.testing.assert_allclose(jax.vmap(shifted)(offsets), loop)
+    slope = jax.vmap(jax.jacfwd(shifted))(offsets)
+    h = 1e-6
+    change = jax.vmap(shifted)(offsets + h) - jax.vmap(shifted)(offsets - h)
+    np.testing.assert_allclose(slope, change / (2 * h), rtol=1e-7)
+
+
+def test_single_precision():
+    values = [x.astype(np.float32) for x in batch(50)]
+    values[2] = np.minimum(values[2], 5)
+    (last, _), rows = MANY(*values)
+    assert last.dtype == np.float32 and rows["x"].dtype == np.float32
+    wide = MANY(*(x.astype(float) for x in values))
+    np.testing.assert_allclose(last, wide[0][0], rtol=2e-4)
+
+
+@pytest.mark.parametrize("cpu", ["x86-64-v3", "x86-64-v2", "x86-64"])
+def test_lesser_processors(cpu):
+    import platform
+
+    if platform.machine() not in ("x86_64", "AMD64"):
+        pytest.skip("another architecture")
+    values = batch(33)
+    with lanes.processor(cpu):
+        mine = jax.jit(jax.vmap(logistic))(*values)
+    for a, b in zip(jax.tree.leaves(mine), jax.tree.leaves(MANY(*values)), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9)
+
+
+def sorting(x, *, road=None):
+    def begin(x):
+        return x, lanes.Emitted(True, False, None)
+
+    def step(x, carry):
+        return jnp.sort(jnp.stack([carry, 1.0]))[0], lanes.Emitted(False, False, None)
+
+    return lanes.run(begin, step, lambda x, carry: carry, x, rows=0, road=road)[0]
+
+
+def test_what_has_no_vector_form_takes_the_other_road_and_says_so():
+    from vi_jax.lanes import primitive
+
+    primitive._tell.cache_clear()
+    with pytest.warns(UserWarning, match="`sort`"):
+        out = jax.vmap(sorting)(jnp.asarray([0.5, 3.0]))
+    np.testing.assert_array_equal(out, [0.5, 1.0])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # once
+        jax.vmap(sorting)(jnp.asarray([0.5, 3.0, 4.0]))
+        jax.vmap(lambda x: sorting(x, road="xla"))(jnp.asarray([0.5, 3.0]))
+
+
+@pytest.mark.parametrize("fault", ["missing", "broken"])
+def test_without_llvm(fault, monkeypatch):
+    from vi_jax.lanes import primitive
+
+    for cached in (primitive._tell, machine._llvm, machine._register_bits):
+        cached.cache_clear()
+    if fault == "missing":
+        monkeypatch.setitem(sys.modules, "llvmlite.binding", None)
+    else:
+        monkeypatch.setattr(machine, "kernel_text", lambda *_: "nonsense")
+    try:
+        with pytest.warns(UserWarning, match="llvmlite" if fault == "missing" else "LLVM"):
+            out = jax.vmap(lambda x: fall(x, 9.8125)[0][0])(jnp.linspace(1.0, 2.0, 5))
+    finally:
+        machine._llvm.cache_clear()
+        machine._register_bits.cache_clear()
+    np.testing.assert_allclose(out, np.sqrt(2 * np.linspace(1, 2, 5) / 9.8125), rtol=1e-12)
+
+
+def test_what_a_step_must_give():
+    def begin(x):
+        return x, lanes.Emitted(True, False, None)
+
+    def step(x, carry):
+        return (carry, carry), lanes.Emitted(False, False, None)
+
+    with pytest.raises(TypeError, match="carry of the structure"):
+        lanes.run(begin, step, lambda x, carry: carry, 1.0, rows=0)
+
+
+def test_programs_are_not_kept_for_ever():
+    """Many programs in one process, each used once: memory maps and kernels stay few."""
+    maps = Path("/proc/self/maps")
+
+    def one(number):
+        def begin(x):
+            return x, lanes.Emitted(True, False, None)
+
+        def step(x, carry):
+            return carry + number, lanes.Emitted(False, False, None)
+
+        return lanes.run(begin, step, lambda x, carry: carry, 1.0, rows=0)[0]
+
+    def kernels(numbers):
+        from vi_jax.lanes.machine import kernel_of
+
+        for number in numbers:
+            jaxpr = jax.make_jaxpr(lambda: one(float(number)))().jaxpr  # noqa: B023
+            kernel_of(next(e for e in jaxpr.eqns if e.primitive.name == "lanes").params["program"])
+
+    kernels(range(80))
+    before = maps.read_bytes().count(b"\n") if maps.exists() else 0
+    kernels(range(80, 240))
+    after = maps.read_bytes().count(b"\n") if maps.exists() else 0
+    assert after - before < 160
+    assert len(machine._recent) <= machine._KEPT
+
+
+def test_the_room_stands_alone():
+    """Nothing in it comes from the rest of the package."""
+    folder = Path(vi_jax.__file__).parent / "lanes"
+    for file in folder.glob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.ImportFrom):
+                assert node.level <= 1, f"{file.name} imports {node.module}"
+                assert not (node.module or "").startswith(("vi_jax", "jax._src"))
