@@ -357,12 +357,17 @@ def fast_drive() -> Found:
 
 
 # %%
-@case("d = 0 and d = -0.5, k = 0", "held while cos φ > d, then released", within(1e-10, 1e-7, 1e-8))
+@case(
+    "d = 0, -0.5, -0.9 and -0.99, k = 0",
+    "held while cos φ > d, then released, if only for a moment",
+    within(1e-10, 1e-7, 1e-8),
+)
 def pressed() -> Found:
     """A body that its spring presses on."""
     return worst(
         deviations(0.3, 0.1, [(1, 0.0, 0.0)], -1.0, 0.0, 10),
         deviations(0.7, 0.0, [(1, -0.5, 0.0)], -1.0, 0.0, 10),
+        *(deviations(1.1, 0.05, [(1, d, 0.0)], d, 0.0, 5) for d in (-0.9, -0.99)),
     )
 
 

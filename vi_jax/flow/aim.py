@@ -91,7 +91,7 @@ def _aimed(plan: Plan, lane: Lane, trial: Trial) -> tuple[Flag, Scalar, Scalar]:
             for stop in plan.scene.stops:
                 close = close | (stop.sign * height - stop.gap > -MARGIN)
             turn = turn & close
-        wiggle = trial.good & _may_turn_twice(lane, *stop_gradient(trial.position), h)
+        wiggle = trial.good & _may_turn_twice(lane, trial, *stop_gradient(trial.position), h)
         wiggle = wiggle & ~(aim | turn | landed | trial.at_turn)
         # Newton's step is better than the quintic once it is short.
         shift = to_turn(trial.position[1])
@@ -119,14 +119,24 @@ def _aimed(plan: Plan, lane: Lane, trial: Trial) -> tuple[Flag, Scalar, Scalar]:
     return aim | turn | wiggle, stop_gradient(attempt), target
 
 
-def _may_turn_twice(lane: Lane, begin: Rates, end: Rates, h: Scalar) -> Flag:
+def _may_turn_twice(lane: Lane, trial: Trial, begin: Rates, end: Rates, h: Scalar) -> Flag:
     """Whether the velocity, of one sign at both ends, dips so deep that it may have been zero.
 
-    Such a step is halved until the turns lie apart or the dip is too short to matter.
+    Such a step is halved until the turns lie apart or the dip is too short to matter. Where the
+    force's rate of change is known, a force that sags between the ends is not taken for straight.
     """
     a0, a1 = lane.direction * begin.a, lane.direction * end.a
     dips = (a0 < 0) & (a1 > 0) & (h > 1e-3)
-    lowest = lane.direction * begin.v + 0.5 * h * a0 * (a0 / jnp.where(dips, a0 - a1, 1.0))
+    drop = 0.5 * h * a0 * (a0 / jnp.where(dips, a0 - a1, 1.0))
+    if trial.surge is not None:
+        j0, j1 = lane.direction * trial.surge[0], lane.direction * trial.surge[1]
+        sags = dips & (j0 * h < a1 - a0) & (a1 - a0 < j1 * h)
+        corner = jnp.where(sags, a1 - j1 * h - a0, 0.0) / jnp.where(sags, j0 - j1, 1.0)
+        low = a0 + j0 * corner
+        deep = 0.5 * corner * (a0 + low) - 0.5 * low * low / jnp.where(sags, j1, 1.0)
+        flat = -0.5 * a0 * a0 / jnp.where(sags & (low >= 0), j0, 1.0)
+        drop = jnp.where(sags, jnp.where(low < 0, deep, flat), drop)
+    lowest = lane.direction * begin.v + drop
     return dips & (lowest < 0.1 * lane.direction * (begin.v + end.v))
 
 
