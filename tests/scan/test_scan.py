@@ -235,7 +235,7 @@ def test_a_store_knows_functions_by_what_they_make(tmp_path):
     np.testing.assert_array_equal(run(2.0, 1.0).depth, first.depth)
     with pytest.raises(ValueError, match=r"scene first stops\.0\.gap is 2\.0, and now it is 1\.5"):
         run(1.5, 1.0)
-    with pytest.raises(ValueError, match="own measures depth"):
+    with pytest.raises(ValueError, match=r"code of measure 1 is \w+, and now it is"):
         run(2.0, 3.0)
     with pytest.raises(ValueError, match="paired is False, and now it is True"):
         run(2.0, 1.0, paired=True)

@@ -77,6 +77,11 @@ class Blocks:
             for c, part, size in zip(corner, self.block, self.shape, strict=True)
         )
 
+    def index(self, where: tuple[slice, ...]) -> int:
+        """Which block lies there."""
+        corner = [part.start // size for part, size in zip(where, self.block, strict=True)]
+        return int(np.ravel_multi_index(corner, self.counts))
+
     def values(self, where: tuple[slice, ...]) -> dict[str, np.ndarray]:
         """The axes' values of the block's lanes."""
         if self.paired:
