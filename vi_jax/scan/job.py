@@ -221,14 +221,29 @@ def _check_name(scene: AbstractScene, start: Any, name: str, argument: str) -> N
     check_name(names, name, argument)
 
 
+def _corners(blocks: Blocks) -> np.ndarray:
+    """The lanes in which the axes have their least and greatest values, one in a row."""
+    rows = list(blocks.axes.values())
+    if blocks.paired:
+        ends = {int(place) for x in rows for place in (x.argmin(), x.argmax())}
+        return np.stack([x[sorted(ends)] for x in rows], axis=-1)
+    corners: Any = [np.unique([x.min(), x.max()]) for x in rows]
+    return np.stack(np.meshgrid(*corners, indexing="ij"), axis=-1).reshape(-1, len(rows))
+
+
 def check_corners(job: Job, blocks: Blocks) -> Job:
     """The job, after the checks of scene, start and method on the corners of the grid.
 
     What the corners say about the gaps holds for the grid: if no body can rest, that is left out.
     """
     rests = False
-    corners: Any = [np.unique([x.min(), x.max()]) for x in blocks.axes.values()]
-    for values in np.stack(np.meshgrid(*corners, indexing="ij"), axis=-1).reshape(-1, len(corners)):
+    if blocks.paired and job.scene is not None:
+        lanes = {name: jnp.asarray(x) for name, x in blocks.axes.items() if name[:6] != START}
+        scene = job.scene
+        for name, x in lanes.items():
+            scene = with_leaf(scene, name, x)
+        check_again(scene)  # all lanes at a time
+    for values in _corners(blocks):
         lane = {name: jnp.asarray(x) for name, x in zip(blocks.axes, values, strict=True)}
         scene, start = job.lane(lane)
         check_again(scene)
