@@ -177,7 +177,45 @@ def count_or_traced(name: str, value: Any) -> Any:
     return count(name, np.asarray(value)[()] if known else value)
 
 
-def fits_memory(name: str, size: float) -> None:
+def tuple_of(name: str, value: Any, kind: type) -> tuple[Any, ...]:
+    """A tuple of what is listed; what it holds is not looked at."""
+    try:
+        if isinstance(value, str):
+            raise TypeError
+        return tuple(value)
+    except TypeError:
+        raise TypeError(
+            f"Argument `{name}` must be a tuple of `{kind.__name__}`s, but got {value!r}."
+        ) from None
+
+
+def instance_of(name: str, value: Any, kind: type | tuple[type, ...], told: str) -> None:
+    """**Raises:** `TypeError` if `value` is none of this kind, which is `told`."""
+    if not isinstance(value, kind):
+        raise TypeError(f"Argument `{name}` must be {told}, but got {value!r}.")
+
+
+def state_of_numbers(name: str, state: Any) -> Any:
+    """`state`, each part of which is a number or an array.
+
+    **Raises:** `TypeError` that names the part which is none.
+    """
+    for part, value in vars(state).items():
+        kinds = (jax.Array, np.ndarray, np.generic, int, float)  # tracers are among the first
+        if isinstance(value, bool) or not isinstance(value, kinds):
+            raise TypeError(
+                f"Argument `{name}` must hold real numbers, but its {part} is {value!r}."
+            )
+    return state
+
+
+def fits_records(name: str, records: int, numbers: int) -> None:
+    """**Raises:** `ValueError` if so many records of so many numbers cannot be held."""
+    count(name, records, most=2**31 - 2)
+    fits_memory(name, 8.0 * records * numbers)
+
+
+def fits_memory(name: str, size: int | float) -> None:
     """**Raises:** `ValueError` if so many bytes are more than this machine's memory."""
     try:
         there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")

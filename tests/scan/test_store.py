@@ -73,6 +73,28 @@ def test_what_is_damaged_is_told_and_computed_again(
     assert len(computed) == blocks
 
 
+def test_a_folder_that_cannot_be_written_to_is_refused_before_any_work(whole, monkeypatch):
+    """Though the folder above can be."""
+    checks = importlib.import_module("vi_jax._checks")
+    create = checks.tempfile.TemporaryFile
+
+    def refused(dir=None, **options):
+        if dir == whole[0]:
+            raise PermissionError(13, "Permission denied")
+        return create(dir=dir, **options)
+
+    monkeypatch.setattr(checks.tempfile, "TemporaryFile", refused)
+    with pytest.raises(ValueError, match=r"`store` must be a path .*: Permission denied"):
+        scanned(whole[0])
+
+
+def test_a_block_is_no_larger_than_the_grid():
+    data = vi.scan(
+        SCENE, {"start.Y": [0.0, 0.5]}, measure="extremes", settle=5, cycles=4, lanes=10**9
+    )
+    assert (data.result == 0).all()
+
+
 def test_a_store_whose_head_is_cut_is_refused(whole, tmp_path):
     path = tmp_path / "store"
     shutil.copytree(whole[0], path)

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import json
+import math
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -15,7 +16,7 @@ import numpy as np
 import xarray as xr
 from tqdm import tqdm
 
-from .._checks import count
+from .._checks import count, fits_memory, fits_records, flag, instance_of
 from ..flow import AbstractMethod
 from ..flow.choice import MethodLike, preset
 from ..flow.results import REASON_NAMES
@@ -114,6 +115,13 @@ def scan(
     `ScanInterrupted`, a `KeyboardInterrupt`, on Ctrl-C.
     """
     grid, verify = axes_of(axes), count("verify", verify)
+    if store is not None:
+        instance_of("store", store, (str, Path), "a path")
+    paired, progress = flag("paired", paired), flag("progress", progress)
+    if cluster is not None and not (hasattr(cluster, "submit") and hasattr(cluster, "cancel")):
+        raise TypeError(
+            f"Argument `cluster` must be a `dask.distributed.Client`, but got {cluster!r}."
+        )
     if paired and len({x.size for x in grid.values()}) != 1:
         raise ValueError(
             "Argument `axes` must hold rows of one length if they are `paired`, but they have "
@@ -134,12 +142,16 @@ def scan(
     total = Blocks(grid, 1, paired=paired).total
     if store is not None and lanes is None:
         lanes = _lanes_in(Path(store))
-    lanes = block_size(total, workers, devices) if lanes is None else rounded(lanes, devices)
+    at_fault = "cycles" if lanes is None else "lanes"
+    lanes = block_size(total, workers, devices) if lanes is None else rounded(lanes, total, devices)
+    fits_records(at_fault, lanes * (job.cycles + 1), 12)
     if jax.default_backend() != "cpu":
         job = dataclasses.replace(job, places=lanes // devices)
     blocks = Blocks(grid, lanes, paired=paired)
     job = check_corners(job, blocks)
     variables = variables_of(job, blocks)
+    per_lane = sum(math.prod(v.sizes) * v.dtype.itemsize for v in variables.values())
+    fits_memory("axes", total * per_lane if store is None else total + 500 * len(blocks))
     description = description_of(job, blocks)
     attributes = attributes_of(description)
     if store is not None:
@@ -250,6 +262,11 @@ def variables_of(job: Job, blocks: Blocks) -> dict[str, Variable]:
         sizes = shape.shape[1:]
         if len(dims) != len(sizes):
             dims = tuple(f"{name}_{i}" for i in range(len(sizes)))
+        for taken in {name, *dims} & {*blocks.axes, *blocks.dims}:
+            raise ValueError(
+                f"Measure {name!r} must have another name than the axis {taken!r}, or one on "
+                "other dimensions."
+            )
         found[name] = Variable(dims, tuple(sizes), np.dtype(shape.dtype), about)
     return found
 

@@ -219,7 +219,11 @@ def _add_sums(group: Any, shape: tuple[int, int]) -> None:
 
 def check_writable(path: str | Path) -> None:
     """**Raises:** `ValueError` if no store can be written there; makes the folders above it."""
-    problem = unwritable(Path(path).parent)
+    problem = "it is empty" if path == "" else unwritable(Path(path).parent)
+    if problem is None and "\0" in str(path):
+        problem = "it holds a null character"
+    elif problem is None and Path(path).is_dir():
+        problem = unwritable(path)
     if problem is not None:
         raise ValueError(
             f"Argument `store` must be a path that can be written to, but {path} is not: {problem}."
