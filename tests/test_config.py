@@ -179,10 +179,24 @@ def test_there_are_ready_files():
         ("[axes]\na.b = {from = 1, to = 2, cout = 3}",
          "`a.b` in [axes] must have the keys from, to and count, but has from, to, cout"),
         ("[axes]\na = {from = 1, to = 2, count = 0}",
-         "`a` in [axes] must have a count of at least 1, but it is 0"),
+         "`a` in [axes] must have a count of at least 1 and at most 10000000, but it is 0"),
         ("[axes]\na = []", "`a` in [axes] must be a list of numbers or { from = …, to = …, "
          "count = … }, but is []"),
         ("axes = 1", "[axes] must be a table, but is 1"),
+        ("[axes]\na = [1, nan]", "item 2 of `a` in [axes] must be a finite number, but is nan"),
+        ("[axes]\na = {from = 1, to = inf, count = 3}",
+         "`a` in [axes] must be a finite number, but is inf"),
+        ("[axes]\na = {from = 1, to = 2, count = 100000000}",
+         "`a` in [axes] must have a count of at least 1 and at most 10000000, but it is 100000000"),
+        ("[sweep]\nparameter = 'x'\nvalues = [inf]",
+         "item 1 of `values` in [sweep] must be a finite number, but is inf"),
+        ("[simulate]\ncycles = 99999999999999999999", "`cycles` in [simulate] must be a whole "
+         "number up to 2147483647, but is 99999999999999999999"),
+        (f"[scene]\nfrequency_ratio = 1{'0' * 400}",
+         "`frequency_ratio` in [scene] must be a number below 1.8e308, but is a longer one"),
+        ('[scan]\nstore = "a\\u0000b"',
+         "`store` in [scan] must be a text without null characters, but is 'a\\x00b'"),
+        ("scene = " + "[" * 5000 + "]" * 5000, "the file is nested too deeply"),
         ("[basins]\nregion = {start.Y = [0, '1']}",
          'item 2 of `start.Y` in [basins.region] must be a number, but is "1"'),
     ],
@@ -221,6 +235,12 @@ def test_what_cannot_be_read(here, text, sentence):
 def test_what_makes_no_scene(here, text, sentence):
     problems = told(text)
     assert sentence in problems, problems
+
+
+def test_an_editors_mark_is_no_fault(here):
+    Path("file.toml").write_bytes(b"\xef\xbb\xbf" + IDEAL.encode())
+    scene, _, _ = config.read("file.toml").build()
+    assert float(scene.drive.frequency_ratio) == 0.9
 
 
 def test_every_fault_is_told(here):
@@ -275,6 +295,22 @@ AXES = "[axes]\ndrive.frequency_ratio = [0.8, 0.9]\nstops.0.gap = [1, 2]\n"
         ("basins", "[basins]\nregion = {start.Y = [1, 0]}",
          "`region` in [basins] must give ranges"),
         ("basins", "[basins]\npicture = 'x.png'\nregion = {start.Y = [0, 1]}", "two parts"),
+        ("scan", "[axes]\nstart.Y = {from = 0, to = 1, count = 1000000}\n"
+         "start.V = {from = 0, to = 1, count = 1000000}\n[scan]",
+         "[axes] must ask for results that fit into the memory"),
+        ("scan", AXES + "[scan]\ncycles = 2000000000", "`cycles` in [scan] must"),
+        ("simulate", "[simulate]\ncycles = 2000000000", "`cycles` in [simulate] must ask for"),
+        ("simulate", "[simulate]\ncycles = 1\noutput = '" + "a" * 400 + ".csv'",
+         "File name too long"),
+        ("basins", "[basins]\nregion = {start.Y = [0, 1]}\nsamples = 3\nseed = -1",
+         "`seed` in [basins] must be at least 0"),
+        ("basins", "[basins]\nregion = {start.Y = [0, 1]}\napart = 0", "`apart` in [basins] must"),
+        ("orbit", "[orbit]\ncycles = 3\narcs = 2",
+         "[orbit] must have a number of arcs that divides the 3 cycles, but has 2 arcs"),
+        ("orbit", "[orbit.continue]\nparameter = 'stops.0.gap'\nbounds = [1, 3]\nstep = 0",
+         "`step` in [orbit.continue] must be finite and in (0, inf), but got 0.0"),
+        ("orbit", "[orbit.continue]\nparameter = 'stops.0.gap'\nbounds = [1, 3]\nmax_step = nan",
+         "`max_step` in [orbit.continue] must be finite"),
         ("orbit", "[orbit]\nmethod = 'newtn'", '`method` in [orbit] must be one of "newton"'),
         ("orbit", "[orbit]\ntolerance = -1", "`tolerance` in [orbit] must be finite"),
         ("orbit", "[orbit]\nguess = {W = 1}", "`W` in `guess` in [orbit] must be left out"),

@@ -1,5 +1,7 @@
 """Host-side checks of what a user passes in. Concrete numbers are looked at; tracers pass."""
 
+import math
+import os
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -21,12 +23,12 @@ def number(name: str, value: Any) -> jax.Array:
         return value
     if isinstance(value, bool | str) or value is None:
         raise TypeError(f"Argument `{name}` must be a real number, but got {value!r}.")
-    if isinstance(value, int | float | np.generic | np.ndarray):
-        with jax.ensure_compile_time_eval():
-            return _floating(name, jnp.asarray(value))
     try:
+        if isinstance(value, int | float | np.generic | np.ndarray):
+            with jax.ensure_compile_time_eval():
+                return _floating(name, jnp.asarray(value))
         array = jnp.asarray(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise TypeError(f"Argument `{name}` must be a real number, but got {value!r}.") from None
     return _floating(name, array)
 
@@ -41,7 +43,7 @@ def _floating(name: str, array: jax.Array) -> jax.Array:
 
 def concrete(value: Any) -> np.ndarray | None:
     """The numbers behind `value`, or `None` while they are being traced."""
-    if not isinstance(value, jax.Array | np.ndarray | float | int):
+    if not isinstance(value, jax.Array | np.ndarray | np.generic | float | int):
         return None  # a placeholder (a spec, a tangent's None), which holds no number to check
     if isinstance(value, Tracer):
         return None
@@ -57,8 +59,11 @@ def require(
     open_low: bool = False,
     open_high: bool = False,
 ) -> None:
-    """Raise a `ValueError` unless every concrete number in `value` is finite and in range."""
-    numbers = concrete(value)
+    """Raise a `ValueError` unless every concrete number in `value` is finite and in range.
+
+    **Raises:** `TypeError` for what is no real number; placeholders and tracers pass.
+    """
+    numbers = _real(name, value)
     if numbers is None:
         return
     fits = np.isfinite(numbers)
@@ -74,12 +79,14 @@ def require(
         )
 
 
-def count(name: str, value: Any, *, least: int = 0) -> int:
-    """A Python integer not below `least`, or an error that says what came."""
+def count(name: str, value: Any, *, least: int = 0, most: int = 2**31 - 1) -> int:
+    """A Python integer from `least` to `most`, or an error that says what came."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise TypeError(f"Argument `{name}` must be an integer, but got {value!r}.")
     if value < least:
         raise ValueError(f"Argument `{name}` must be at least {least}, but got {value}.")
+    if value > most:
+        raise ValueError(f"Argument `{name}` must be at most {most}, but got {value}.")
     return int(value)
 
 
@@ -97,7 +104,125 @@ def unwritable(folder: str | Path) -> str | None:
 
 def one_of(name: str, value: Any, allowed: tuple[str, ...]) -> str:
     """One of a few words, or an error that lists them."""
-    if value not in allowed:
+    if not isinstance(value, str) or value not in allowed:
         words = ", ".join(repr(word) for word in allowed)
         raise ValueError(f"Argument `{name}` must be one of {words}, but got {value!r}.")
     return value
+
+
+def _real(name: str, value: Any) -> np.ndarray | None:
+    """The numbers behind `value`, or `None` for tracers and placeholders."""
+    numbers = concrete(value)
+    kind = None if numbers is None else numbers.dtype
+    wrong = isinstance(value, bool | str | bytes | complex | list | tuple | set | dict)
+    if kind is not None and not wrong:
+        wrong = not (jnp.issubdtype(kind, jnp.floating) or jnp.issubdtype(kind, jnp.integer))
+    if wrong:
+        raise TypeError(f"Argument `{name}` must be a real number, but got {value!r}.")
+    return numbers
+
+
+def given_number(name: str, value: Any, **limits: Any) -> float:
+    """One finite real number that is known, in the limits of `require`."""
+    numbers = _real(name, value)
+    if numbers is None or numbers.ndim:
+        raise TypeError(f"Argument `{name}` must be a real number, but got {value!r}.")
+    require(name, value, **limits)
+    return float(numbers)
+
+
+def interval(name: str, value: Any) -> tuple[float, float]:
+    """Two finite numbers, the lower one first."""
+    try:
+        low, high = (given_number(name, x) for x in value)
+        if low < high:
+            return low, high
+    except (TypeError, ValueError):
+        pass
+    raise ValueError(
+        f"Argument `{name}` must be two finite numbers (low, high), low < high, but got {value!r}."
+    )
+
+
+def row_of_numbers(values: Any) -> np.ndarray | None:
+    """Finite real numbers in one row, one at least, or `None` if `values` is none such.
+
+    Texts, truth values, dates and complex numbers are no real numbers, even where NumPy takes them.
+    """
+    if isinstance(values, list | tuple) and any(isinstance(x, bool | np.bool_) for x in values):
+        return None
+    try:
+        row = np.asarray(values)
+    except (TypeError, ValueError):
+        return None
+    real = jnp.issubdtype(row.dtype, jnp.floating) or jnp.issubdtype(row.dtype, jnp.integer)
+    if not real or row.ndim != 1 or not row.size:
+        return None
+    row = row.astype(float)
+    return row if np.isfinite(row).all() else None
+
+
+def flag(name: str, value: Any) -> bool:
+    """`True` or `False`."""
+    if not isinstance(value, bool | np.bool_):
+        raise TypeError(f"Argument `{name}` must be True or False, but got {value!r}.")
+    return bool(value)
+
+
+def count_or_traced(name: str, value: Any) -> Any:
+    """As `count`, where the number may be traced, or a JAX array."""
+    if isinstance(value, Tracer):
+        return value
+    known = isinstance(value, jax.Array | np.ndarray)
+    return count(name, np.asarray(value)[()] if known else value)
+
+
+def tuple_of(name: str, value: Any, kind: type) -> tuple[Any, ...]:
+    """A tuple of what is listed; what it holds is not looked at."""
+    try:
+        if isinstance(value, str):
+            raise TypeError
+        return tuple(value)
+    except TypeError:
+        raise TypeError(
+            f"Argument `{name}` must be a tuple of `{kind.__name__}`s, but got {value!r}."
+        ) from None
+
+
+def instance_of(name: str, value: Any, kind: type | tuple[type, ...], told: str) -> None:
+    """**Raises:** `TypeError` if `value` is none of this kind, which is `told`."""
+    if not isinstance(value, kind):
+        raise TypeError(f"Argument `{name}` must be {told}, but got {value!r}.")
+
+
+def state_of_numbers(name: str, state: Any) -> Any:
+    """`state`, each part of which is a number or an array.
+
+    **Raises:** `TypeError` that names the part which is none.
+    """
+    for part, value in vars(state).items():
+        kinds = (jax.Array, np.ndarray, np.generic, int, float)  # tracers are among the first
+        if isinstance(value, bool) or not isinstance(value, kinds):
+            raise TypeError(
+                f"Argument `{name}` must hold real numbers, but its {part} is {value!r}."
+            )
+    return state
+
+
+def fits_records(name: str, records: int, numbers: int) -> None:
+    """**Raises:** `ValueError` if so many records of so many numbers cannot be held."""
+    count(name, records, most=2**31 - 2)
+    fits_memory(name, 8.0 * records * numbers)
+
+
+def fits_memory(name: str, size: int | float) -> None:
+    """**Raises:** `ValueError` if so many bytes are more than this machine's memory."""
+    try:
+        there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, OSError, ValueError):
+        return
+    if size > there:
+        raise ValueError(
+            f"Argument `{name}` must ask for results that fit into the memory, "
+            f"{math.ceil(there / 1e9):,} GB, but asks for {math.ceil(size / 1e9):,} GB."
+        )

@@ -1,17 +1,21 @@
 """TOML files read strictly into classes: every fault is named with its place in the file."""
 
 import difflib
+import math
 import re
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args, get_origin
+from typing import Any, Literal, NewType, TypeVar, get_args, get_origin
 
 import attrs
 import cattrs
 import numpy as np
 from cattrs.gen import make_dict_structure_fn, override
+
+# Whole numbers are of 32 bits, and a row is held as Python's numbers.
+_MOST, _LONGEST = 2**31 - 1, 10**7
 
 T = TypeVar("T")
 Place = tuple[str | int, ...]
@@ -23,6 +27,9 @@ class ConfigError(ValueError):
     def __init__(self, *problems: str):
         super().__init__("\n".join(problems))
         self.problems = problems
+
+
+Finite = NewType("Finite", float)
 
 
 class Row(tuple[float, ...]):
@@ -37,14 +44,18 @@ def read_toml(path: str | Path, kind: type[T]) -> T:
     **Raises:** `ConfigError` that names every fault with its place.
     """
     try:
-        tables = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        tables = tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))  # some editors' mark
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"the file is not valid TOML: {error}") from None
+    except RecursionError:
+        raise ConfigError("the file is nested too deeply") from None
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise ConfigError(f"the file cannot be read: {reason}") from None
     try:
         return _CONVERTER.structure(tables, kind)
+    except RecursionError:
+        raise ConfigError("the file is nested too deeply") from None
     except cattrs.BaseValidationError as error:
         raise ConfigError(*_problems(error, ())) from None
 
@@ -71,10 +82,16 @@ def given(table: Any, *but: str) -> dict[str, Any]:
 
 
 @contextmanager
-def spoken(table: str, *, keys: Iterable[str] | None = None) -> Iterator[None]:
+def spoken(
+    table: str,
+    *,
+    keys: Iterable[str] | None = None,
+    named: Mapping[str, str] | None = None,
+) -> Iterator[None]:
     """Errors of the library about its arguments, in the words of the file.
 
-    **Arguments:** the table; `keys`, the arguments that stand in it (all by default).
+    **Arguments:** the table; `keys`, the arguments that stand in it (all by default); `named`,
+    where arguments stand that are called otherwise in the file.
     """
     try:
         yield
@@ -87,8 +104,9 @@ def spoken(table: str, *, keys: Iterable[str] | None = None) -> Iterator[None]:
                 raise
             raise ConfigError(f"{table}: {text}") from None
         name, rest = told[1], text[told.end() :]
-        if name in ("axes", "start", "method", "flow") and keys is not None:
-            place = f"[{'method' if name == 'flow' else name}]"
+        elsewhere = {"axes": "[axes]", "start": "[start]", "method": "[method]", **(named or {})}
+        if name in elsewhere and keys is not None:
+            place = elsewhere[name]
         else:
             place = f"`{name}` in {table}" if keys is None or name in keys else f"{table}: `{name}`"
         raise ConfigError(f"{place}{rest}") from None
@@ -137,12 +155,24 @@ def _spoken(place: Place) -> str:
 def _number(value: Any, _: Any = None) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise TypeError(f"must be a number, but is {_shown(value)}")
-    return float(value)
+    try:
+        return float(value)
+    except OverflowError:
+        raise ValueError("must be a number below 1.8e308, but is a longer one") from None
+
+
+def _finite(value: Any, _: Any = None) -> float:
+    number = _number(value)
+    if not math.isfinite(number):
+        raise ValueError(f"must be a finite number, but is {number}")
+    return number
 
 
 def _integer(value: Any, _: Any = None) -> int:
     if isinstance(value, bool) or not isinstance(value, int):
         raise TypeError(f"must be a whole number, but is {_shown(value)}")
+    if abs(value) > _MOST:
+        raise ValueError(f"must be a whole number up to {_MOST}, but is {_cut(str(value))}")
     return value
 
 
@@ -155,12 +185,14 @@ def _flag(value: Any, _: Any = None) -> bool:
 def _text(value: Any, _: Any = None) -> str:
     if not isinstance(value, str) or not value:
         raise TypeError(f"must be a text in quotes, but is {_shown(value)}")
+    if "\0" in value:
+        raise ValueError(f"must be a text without null characters, but is {value!r}")
     return value
 
 
 def _row(value: Any, _: Any = None) -> Row:
     if isinstance(value, list) and value:
-        return Row(_number(x) for x in value)
+        return Row(_each(enumerate(value), Finite, Row).values())
     if not isinstance(value, dict):
         raise TypeError(
             "must be a list of numbers or { from = …, to = …, count = … }, but is "
@@ -169,9 +201,11 @@ def _row(value: Any, _: Any = None) -> Row:
     if set(value) != {"from", "to", "count"}:
         raise ValueError(f"must have the keys from, to and count, but has {', '.join(value)}")
     count = _integer(value["count"])
-    if count < 1:
-        raise ValueError(f"must have a count of at least 1, but it is {count}")
-    return Row(np.linspace(_number(value["from"]), _number(value["to"]), count).tolist())
+    if not 1 <= count <= _LONGEST:
+        raise ValueError(
+            f"must have a count of at least 1 and at most {_LONGEST}, but it is {count}"
+        )
+    return Row(np.linspace(_finite(value["from"]), _finite(value["to"]), count).tolist())
 
 
 def _shown(value: Any) -> str:
@@ -179,7 +213,12 @@ def _shown(value: Any) -> str:
         return "true" if value else "false"
     if isinstance(value, dict):
         return "a table"
-    return f'"{value}"' if isinstance(value, str) else repr(value)
+    return _cut(f'"{value}"' if isinstance(value, str) else repr(value))
+
+
+def _cut(text: str) -> str:
+    """No longer than a sentence bears."""
+    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def _word(kind: Any) -> Callable[[Any, Any], str]:
@@ -260,7 +299,7 @@ def _class(kind: Any) -> Callable[[Any, Any], Any]:
 
 def _converter() -> cattrs.Converter:
     converter = cattrs.Converter()
-    plain = {float: _number, int: _integer, bool: _flag, str: _text, Row: _row}
+    plain = {float: _number, Finite: _finite, int: _integer, bool: _flag, str: _text, Row: _row}
     for kind, hook in plain.items():
         converter.register_structure_hook(kind, hook)
     for of, factory in {Literal: _word, tuple: _list, dict: _mapping}.items():

@@ -5,9 +5,11 @@ lines to print and whether anything succeeded.
 """
 
 import csv
+import math
 import os
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from io import StringIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,12 +21,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ._checks import unwritable
+from ._files import write_whole
 from ._toml import ConfigError, given, keys_of, spoken, unknown
 from .config import Config, OrbitTable
 from .flow import RESULTS
 from .flow import simulate as run_motion
 from .flow.results import REASONS, number_of
 from .orbit import Orbit, continue_orbit, find_orbit
+from .orbit.curve import check_walk
 from .plot import (
     plot_basins,
     plot_branch,
@@ -68,7 +72,10 @@ def scan(config: Config, tell: Tell) -> Outcome:
         _check_map(axes, table.measure, paired=table.paired)
     check_paths("[scan]", picture=table.picture)
     options = given(table, "picture")
-    tell(f"scanning {Blocks(axes_of(axes), 1, paired=table.paired).total:,} motions")
+    total = len(next(iter(axes.values())))
+    if not table.paired:
+        total = math.prod(len(row) for row in axes.values())
+    tell(f"scanning {total:,} motions")
     with spoken("[scan]", keys=keys_of(type(table))), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "[0-9,]+ of [0-9,]+ lanes failed")
         data = run_scan(scene, axes, start=start, method=method, **options)
@@ -152,7 +159,7 @@ def basins(config: Config, tell: Tell) -> Outcome:
     lines = [str(found)]
     if table.output is not None:
         kept = found.data[["label", "period", "impacts"]]
-        kept.to_dataframe().reset_index().to_csv(table.output, index=False)
+        write_whole(table.output, kept.to_dataframe().reset_index().to_csv(index=False))
         lines.append(f"  data: {table.output}")
     if table.picture is not None:
         ax = _axes()
@@ -174,7 +181,11 @@ def orbit(config: Config, tell: Tell) -> Outcome:
     if table.guess is not None:
         guess = table.guess.build(scene, "`guess` in [orbit]")
     tell(f"searching a motion of {table.cycles} cycle{'' if table.cycles == 1 else 's'}")
-    with spoken("[orbit]", keys=keys_of(type(table))):
+    # What the library calls the method is the search here, and the file's method is the flow.
+    named = {"method": "[orbit]", "flow": "[method]", "guess": "[start]"}
+    if table.guess is not None:
+        named["guess"] = "`guess` in [orbit]"
+    with spoken("[orbit]", keys=keys_of(type(table)), named=named):
         found = find_orbit(
             scene,
             scene.start() if guess is None else guess,
@@ -204,6 +215,9 @@ def _check_continuation(scene: Scene, table: OrbitTable) -> None:
             f"but is [{low:g}, {high:g}]"
         )
     check_range(scene, asked.parameter, asked.bounds, "`bounds` in [orbit.continue]")
+    walk = {"step": 0.01, "max_step": 0.1, "max_points": 1000}
+    with spoken("[orbit.continue]"):
+        check_walk(**{name: given(asked).get(name, usual) for name, usual in walk.items()})
     check_paths("[orbit.continue]", picture=asked.picture, output=asked.output)
 
 
@@ -304,10 +318,13 @@ def check_paths(table: str, *, picture: str | None = None, output: str | None = 
         if not path.endswith(ending):
             raise ConfigError(f'`{key}` in {table} must end in {ending}, but is "{path}"')
         reason = unwritable(Path(path).parent)
-        if reason is None and Path(path).is_dir():
-            reason = "it is a folder"
-        elif reason is None and Path(path).exists() and not os.access(path, os.W_OK):
-            reason = "permission denied"
+        try:
+            if reason is None and Path(path).is_dir():
+                reason = "it is a folder"
+            elif reason is None and Path(path).exists() and not os.access(path, os.W_OK):
+                reason = "permission denied"
+        except OSError as error:  # a name that is too long
+            reason = error.strerror
         if reason:
             raise ConfigError(f"`{key}` in {table} cannot be written: {path}: {reason}")
 
@@ -403,12 +420,13 @@ def _cycle_columns(run: Any) -> dict[str, np.ndarray]:
 
 def _write_rows(path: str, tables: Iterable[Mapping[str, np.ndarray]]) -> None:
     """Columns as CSV, several tables of the same columns below each other."""
-    with Path(path).open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        for i, table in enumerate(tables):
-            if not i:
-                writer.writerow(table)
-            writer.writerows(zip(*(x.tolist() for x in table.values()), strict=True))
+    text = StringIO(newline="")
+    writer = csv.writer(text)
+    for i, table in enumerate(tables):
+        if not i:
+            writer.writerow(table)
+        writer.writerows(zip(*(x.tolist() for x in table.values()), strict=True))
+    write_whole(path, text.getvalue())
 
 
 def _axes() -> Axes:

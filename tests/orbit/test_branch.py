@@ -272,6 +272,28 @@ def test_says_what_is_wrong(arguments, message):
         vi.continue_orbit(orbit, **{"parameter": ZETA, "bounds": (0.5, 1.9), **arguments})
 
 
+@pytest.mark.parametrize("name", ["step", "max_step"])
+@pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf])
+def test_steps_that_would_never_end_are_refused(short, name, value):
+    point, settings = short.special[0], {"parameter": "stops.0.gap", name: value}
+    with pytest.raises(ValueError, match=f"Argument `{name}` must be finite and in"):
+        vi.continue_orbit(point.orbit, bounds=(1.0, 3.0), **settings)
+    with pytest.raises(ValueError, match=f"Argument `{name}` must be finite and in"):
+        vi.boundary(point, bounds=((0.5, 1.9), (1.0, 3.0)), **settings)
+
+
+def test_bounds_and_distances_that_are_none(short):
+    point = short.special[0]
+    for bounds in [(1.9, 0.5), (0.5, np.nan), (0.9, 0.9), (0.5, np.inf)]:
+        with pytest.raises(ValueError, match="Argument `bounds` must be two finite numbers"):
+            vi.continue_orbit(point.orbit, parameter=ZETA, bounds=bounds)
+        with pytest.raises(ValueError, match="Argument `bounds` must be two finite numbers"):
+            vi.boundary(point, parameter="stops.0.gap", bounds=((0.5, 1.9), bounds))
+    for distance in (0.0, -1.0, np.nan):
+        with pytest.raises(ValueError, match="Argument `distance` must be finite"):
+            point.switch(distance=distance)
+
+
 @pytest.mark.slow
 def test_branches_do_not_depend_on_where_they_begin(short, long, restitution):
     # At ζ = 1.2 the impact lies on the other side of the section than at 0.9.

@@ -92,6 +92,24 @@ def test_blocks_do_not_change_numbers(data):
     np.testing.assert_array_equal(np.asarray(pair.y_min), np.asarray(grid.y_min).ravel())
 
 
+def test_paired_lanes_are_checked_one_by_one():
+    """No product of the rows: the least gap on one side stands beside a wide one on the other."""
+    scene = vi.Scene(
+        oscillator=vi.Oscillator(0.05),
+        drive=vi.IdealDrive(0.9),
+        stops=(vi.RigidStop(2.0, 0.5), vi.RigidStop(2.0, 0.5, side="left")),
+    )
+    rows = {"stops.0.gap": [-0.5, 1.0, 2.0], "stops.1.gap": [2.0, 1.0, -0.5]}
+    start = {"start.Y": [-1.0, 0.0, 1.0]}
+    options = {"measure": "extremes", "settle": 5, "cycles": 4, "paired": True}
+    data = vi.scan(scene, {**rows, **start}, **options)
+    assert np.asarray(data.result).tolist() == [0, 0, 0]
+    assert (data.y_max <= np.array(rows["stops.0.gap"]) + 1e-12).all()
+    for bad in ([-0.5, -1.0, 2.0], [-0.5, 1.0, np.nextafter(0.5, 0)]):
+        with pytest.raises(ValueError, match="must leave room"):
+            vi.scan(scene, {**rows, "stops.0.gap": bad, **start}, **options)
+
+
 def test_other_numbers_compile_nothing(data):
     compiled = []
     jax.monitoring.register_event_duration_secs_listener(
@@ -235,7 +253,7 @@ def test_a_store_knows_functions_by_what_they_make(tmp_path):
     np.testing.assert_array_equal(run(2.0, 1.0).depth, first.depth)
     with pytest.raises(ValueError, match=r"scene first stops\.0\.gap is 2\.0, and now it is 1\.5"):
         run(1.5, 1.0)
-    with pytest.raises(ValueError, match="own measures depth"):
+    with pytest.raises(ValueError, match=r"code of measure 1 is \w+, and now it is"):
         run(2.0, 3.0)
     with pytest.raises(ValueError, match="paired is False, and now it is True"):
         run(2.0, 1.0, paired=True)

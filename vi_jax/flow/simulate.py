@@ -12,7 +12,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .. import lanes
-from .._checks import concrete, count, one_of
+from .._checks import concrete, count, count_or_traced, fits_records, flag, one_of
 from ..scene import AbstractScene, Scene
 from .choice import MethodLike, chosen
 from .lane import Plan, Record
@@ -81,6 +81,7 @@ def simulate(
     `RESULTS.bad_start` and harms no other.
     """
     one_of("adjoint", adjoint, ("forward", "reverse"))
+    estimate, throw = flag("estimate", estimate), flag("throw", throw)
     plan, start = planned(
         scene, start, cycles, settle=settle, method=method, clock=clock, samples=samples,
         impact_log=impact_log, record=record, reverse=adjoint == "reverse", rests=rests,
@@ -123,8 +124,9 @@ def planned(
     samples = count("samples", samples)
     impact_log = count("impact_log", impact_log)
     max_impacts = count("max_impacts", max_impacts)
-    if concrete(settle) is not None:
-        settle = count("settle", np.asarray(settle)[()])
+    settle = count_or_traced("settle", settle)
+    if rests is not None:
+        rests = flag("rests", rests)
     if max_steps is not None:
         max_steps = count("max_steps", max_steps, least=1)
     one_of("record", record, ("motion", "sections"))
@@ -141,6 +143,7 @@ def planned(
     if isinstance(scene, Scene):
         _check_scalars(scene=scene, start=start)
     check_start(scene, start)
+    fits_records("cycles", cycles * max(1, samples), 12 + 3 * impact_log)
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         warnings.warn(
             "vi_jax is running in single precision: errors near 1e-6 and tolerances to match. For "
@@ -191,6 +194,12 @@ def _check_scalars(**arguments: Any) -> None:
 
 def check_start(scene: AbstractScene, start: Any) -> None:
     """**Raises:** `ValueError` if a concrete start cannot be simulated."""
+    try:
+        _ = scene.position(start), scene.velocity(start)
+    except (AttributeError, TypeError, LookupError):
+        raise TypeError(
+            f"Argument `start` must be a state of this scene, but got {start!r}."
+        ) from None
     for path, leaf in jtu.tree_leaves_with_path(start):
         numbers = concrete(leaf)
         if numbers is not None and not np.isfinite(numbers).all():

@@ -7,9 +7,9 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from .._checks import count
+from .._checks import interval
 from ..scene.leaves import check_again, check_leaf, leaf, with_leaf
-from .curve import Step, walk
+from .curve import Step, check_walk, walk
 from .results import Orbit
 from .shooting import Shooting, steps_of
 from .solve import advance as solved
@@ -81,6 +81,11 @@ def boundary(
     **Raises:** `ValueError` if the point is of another kind, outside the bounds, or the name
     unknown or the same.
     """
+    settings = check_walk(step=step, max_step=max_step, max_points=max_points)
+    if not isinstance(point, SpecialPoint):
+        raise TypeError(
+            f"Argument `point` must be a `SpecialPoint`, from `Branch.special`, but got {point!r}."
+        )
     if point.kind not in (FOLD, DOUBLING, CROSSING, GRAZING):
         raise ValueError(
             "Argument `point` must be a fold, a period doubling or a grazing, but is a "
@@ -91,7 +96,14 @@ def boundary(
     names = (old.parameters[0], parameter)
     if names[0] == names[1]:
         raise ValueError(f"Argument `parameter` must be another one than {names[0]}.")
-    count("max_points", max_points, least=2)
+    try:
+        first, second = bounds
+    except (TypeError, ValueError):
+        raise ValueError(
+            "Argument `bounds` must be an interval for each of the two parameters, but got "
+            f"{bounds!r}."
+        ) from None
+    bounds = (interval("bounds", first), interval("bounds", second))
     values = (point.parameter, float(leaf(old.scene, parameter)))
     for name, value, (low, high) in zip(names, values, bounds, strict=True):
         if not low <= value <= high:
@@ -137,7 +149,6 @@ def boundary(
             return here, "grazing"
         return None
 
-    settings = {"step": step, "max_step": max_step, "max_points": max_points}
     forward = walk(advance, start, stop=stop, **settings)
     backward = walk(advance, start._replace(tangent=-start.tangent), stop=stop, **settings)
     path = [*reversed(backward.steps[1:]), *forward.steps]

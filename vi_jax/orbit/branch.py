@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from .._checks import count, require
+from .._checks import interval
 from ..flow.choice import MethodLike
 from ..scene.leaves import check_again, check_leaf, leaf, with_leaf
-from .curve import Step, walk
+from .curve import Step, check_walk, walk
 from .follow import Follower
 from .results import ORBIT_RESULTS, Orbit, told_impacts
 from .shooting import Shooting
@@ -149,23 +149,22 @@ def continue_orbit(
 
     **Raises:** `ValueError` if the orbit is none, lies outside the bounds, or the name is unknown.
     """
+    settings = check_walk(step=step, max_step=max_step, max_points=max_points)
     if not isinstance(orbit, Orbit) or orbit.residual.ndim:
         raise ValueError("Argument `orbit` must be one `Orbit`, not a batch or a state.")
     if not bool(orbit.successful):
         reason = ORBIT_RESULTS[orbit.result]
         raise ValueError(f"Argument `orbit` must be an orbit, but is: {reason}")
     check_leaf(orbit.scene, parameter)
-    low, high = float(bounds[0]), float(bounds[1])
+    low, high = interval("bounds", bounds)
     value = float(leaf(orbit.scene, parameter))
-    if not low <= value <= high or low == high:
+    if not low <= value <= high:
         raise ValueError(
             f"Argument `bounds` must hold the orbit's {parameter} = {value:g}, but is "
             f"({low:g}, {high:g})."
         )
     for bound in (low, high):
         check_again(with_leaf(orbit.scene, parameter, bound))
-    require("step", step, low=0.0, open_low=True)
-    count("max_points", max_points, least=2)
     problem, x = problem_of(orbit, parameter, (low, high), flow)
     scale = np.ones(problem.size)
     scale[-1] = 0.5 * (high - low)
@@ -180,7 +179,6 @@ def continue_orbit(
             "impact."
         )
     ahead = Follower(problem, scale, (low, high))
-    settings = {"step": step, "max_step": max_step, "max_points": max_points}
     forward = walk(ahead.advance, start, stop=ahead.stop, **settings)
     back = Follower(problem, scale, (low, high))
     turned = start._replace(tangent=-start.tangent)

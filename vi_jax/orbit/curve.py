@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from .._checks import count, given_number
+
 Vector = Float[Array, " n"]
 
 
@@ -78,6 +80,15 @@ def first_tangent(residual: Callable[[Vector], Vector], x: Vector, scale: Vector
     jacobian = jax.jacfwd(lambda y: residual(y * scale))(x / scale)
     tangent = jnp.linalg.svd(jacobian, full_matrices=True)[2][-1]
     return tangent * jnp.where(tangent[-1] < 0, -1.0, 1.0)
+
+
+def check_walk(*, step: Any, max_step: Any, max_points: Any) -> dict[str, Any]:
+    """The settings of `walk`. **Raises:** `ValueError` or `TypeError` that names the wrong one."""
+    return {
+        "step": given_number("step", step, low=0.0, open_low=True),
+        "max_step": given_number("max_step", max_step, low=0.0, open_low=True),
+        "max_points": count("max_points", max_points, least=2),
+    }
 
 
 class Walk(NamedTuple):

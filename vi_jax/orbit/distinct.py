@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
+from .._checks import given_number
 from .results import Orbit, trimmed
 
 
@@ -20,6 +21,9 @@ def distinct_orbits(orbits: Orbit, *, tolerance: float = 1e-6) -> tuple[list[Orb
     **Returns:** the orbits, by period and then by least Y, each on the section of its period with
     the smallest Y; and for each the number of searches that found it.
     """
+    if not isinstance(orbits, Orbit):
+        raise TypeError(f"Argument `orbits` must be from `find_orbit`, but got {orbits!r}.")
+    given_number("tolerance", tolerance, low=0.0)
     shape = orbits.residual.shape
     flat = jtu.tree_map(lambda x: jnp.reshape(x, (-1, *x.shape[len(shape) :])), orbits)
     sections = np.stack([np.asarray(x) for x in jtu.tree_leaves(flat.sections)], axis=-1)

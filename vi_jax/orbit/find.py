@@ -13,7 +13,7 @@ from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Float, Int
 
-from .._checks import concrete, count
+from .._checks import concrete, count, flag
 from ..flow import simulate
 from ..flow.choice import MethodLike
 from ..scene import AbstractScene, Scene
@@ -79,12 +79,12 @@ def find_orbit(
             f"Argument `method` must be `Newton(...)` or `Gradient(...)`, but got {method!r}. The "
             "method of integration is the argument `flow`."
         )
-    impact_log = count("impact_log", impact_log, least=1)
+    impact_log, throw = count("impact_log", impact_log, least=1), flag("throw", throw)
     the_map = cycle_map(scene, cycles, flow=flow, section=section)
     if the_map.cycles % method.arcs:
         raise ValueError(
             f"Argument `method` must have a number of arcs that divides the {cycles} cycles, but "
-            f"has {method.arcs}."
+            f"has {method.arcs} arcs."
         )
     state = adopted(the_map.scene, guess.state if isinstance(guess, Orbit) else guess)
     shapes = {jnp.shape(leaf) for leaf in jtu.tree_leaves(state)}

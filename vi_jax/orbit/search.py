@@ -11,7 +11,7 @@ import optax
 import optimistix as optx
 from jaxtyping import Array, Float, Int
 
-from .._checks import count, require
+from .._checks import count, instance_of, number, require
 
 Unknowns = Float[Array, "..."]
 Residual = Callable[[Any], Any]
@@ -41,7 +41,7 @@ class AbstractSearch(eqx.Module):
 
 
 def _tolerance(value: Any) -> Any:
-    return None if value is None else jnp.asarray(value, jnp.result_type(float))
+    return None if value is None else number("tolerance", value)
 
 
 def _check(search: AbstractSearch) -> None:
@@ -116,6 +116,9 @@ class Gradient(AbstractSearch):
 
     def __check_init__(self):
         _check(self)
+        if self.optimiser is not None:
+            told = "an `optax.GradientTransformation`, such as `optax.adam(0.01)`"
+            instance_of("optimiser", self.optimiser, optax.GradientTransformation, told)
 
     @property
     def _optimiser(self) -> optax.GradientTransformation:

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from .._checks import given_number
 from ..scene import AbstractScene
 from .curve import Step
 from .results import Orbit
@@ -42,6 +43,7 @@ class SpecialPoint:
 
         **Raises:** `ValueError` for other kinds, or if there is no admissible motion beyond.
         """
+        given_number("distance", distance, low=0.0, open_low=True)
         if self.kind == DOUBLING:
             return _doubled(self, distance)
         if self.kind == GRAZING:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from .._files import write_whole
 from ..orbit import ORBIT_RESULTS
 from ..plot import save_picture
 from .boundaries import boundary_curves, describe_boundaries, draw_boundaries
@@ -89,7 +90,7 @@ def reproduce(
     findings = Findings(cases, claims, faults, orbits, panels, borders)
     for name, text in ((NUMBERS, as_json(findings)), (REPORT, as_markdown(findings))):
         files.append(out / name)
-        files[-1].write_text(text, encoding="utf-8")
+        write_whole(files[-1], text)
     return Reproduction(claims, faults, files)
 
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from .._checks import count
+from .._checks import count, fits_records, given_number
 from ..flow import simulate
 from ..flow.choice import MethodLike, chosen
 from ..orbit.results import told_impacts
@@ -128,6 +128,8 @@ def basins(
     for name in ("measure", "paired", "cycles", "derivatives"):
         if name in options:
             raise TypeError(f"Argument `{name}` is `scan`'s, and not to be given to `basins`.")
+    given_number("apart", apart, low=0.0, open_low=True)
+    seed = count("seed", seed)
     ranges = axes_of(region, "region")
     for name, row in ranges.items():
         if row.size != 2 or not row[0] < row[1] or not name.startswith(START):
@@ -148,6 +150,7 @@ def basins(
             axes[name] = low + (high - low) * (np.arange(size) + 0.5) / size
     else:
         samples = count("samples", samples, least=1)
+        fits_records("samples", samples, len(ranges))
         rng = np.random.default_rng(seed)
         axes = {name: rng.uniform(low, high, samples) for name, (low, high) in ranges.items()}
     method = chosen(scene, method)

@@ -1,16 +1,19 @@
 """The grid of a scan, and the blocks in which it is worked off and stored."""
 
 import math
+import reprlib
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
+from .._checks import row_of_numbers
+
 
 def axes_of(axes: Mapping[str, Any], argument: str = "axes") -> dict[str, np.ndarray]:
     """The axes as rows of numbers.
 
-    **Raises:** `ValueError` or `TypeError` that names the axis.
+    **Raises:** `ValueError` that names the axis, or `TypeError` for what is no mapping.
     """
     if not isinstance(axes, Mapping) or not axes:
         raise TypeError(
@@ -19,14 +22,11 @@ def axes_of(axes: Mapping[str, Any], argument: str = "axes") -> dict[str, np.nda
         )
     found = {}
     for name, values in axes.items():
-        try:
-            row = np.asarray(values, float)
-        except (TypeError, ValueError):
-            raise TypeError(f"Axis {name!r} must hold numbers, but got {values!r}.") from None
-        if row.ndim != 1 or not row.size or not np.isfinite(row).all():
+        row = row_of_numbers(values)
+        if row is None:
             raise ValueError(
-                f"Axis {name!r} must be one row of finite numbers, but has shape {row.shape}"
-                f"{'.' if row.ndim != 1 or not row.size else ' and some are not finite.'}"
+                f"Axis {name!r} must be one row of finite real numbers, but got "
+                f"{reprlib.repr(values)}."
             )
         found[str(name)] = row
     return found
@@ -76,6 +76,11 @@ class Blocks:
             slice(int(c) * part, min(size, (int(c) + 1) * part))
             for c, part, size in zip(corner, self.block, self.shape, strict=True)
         )
+
+    def index(self, where: tuple[slice, ...]) -> int:
+        """Which block lies there."""
+        corner = [part.start // size for part, size in zip(where, self.block, strict=True)]
+        return int(np.ravel_multi_index(corner, self.counts))
 
     def values(self, where: tuple[slice, ...]) -> dict[str, np.ndarray]:
         """The axes' values of the block's lanes."""

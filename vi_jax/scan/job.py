@@ -1,6 +1,7 @@
 """What a scan computes of its lanes: a pytree that is compiled once and can be sent away."""
 
 import dataclasses
+import inspect
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -11,7 +12,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._checks import count
+from .._checks import count, tuple_of
 from ..flow import AbstractMethod
 from ..flow.aim import select
 from ..flow.choice import MethodLike, chosen
@@ -56,6 +57,11 @@ class Job(eqx.Module):
         of_scene = {name: x for name, x in values.items() if not name.startswith(START)}
         if self.build is not None:
             scene = self.build(**of_scene)
+            if not isinstance(scene, AbstractScene):
+                raise TypeError(
+                    "Argument `scene` must be a function that returns a `Scene` or an "
+                    f"`AbstractScene`, but it returned {scene!r}."
+                )
         else:
             scene = self.scene
             for name, value in of_scene.items():
@@ -66,7 +72,8 @@ class Job(eqx.Module):
             scene = scene.in_clock(self.clock)
         start = self.start
         if start is None:
-            assert isinstance(scene, Scene)
+            if not isinstance(scene, Scene):
+                raise ValueError("Argument `start` must be given for a scene of your own.")
             start = scene.start()
         for name, value in values.items():
             if name.startswith(START):
@@ -116,7 +123,9 @@ class Job(eqx.Module):
             scene, _ = lane_of(values)
             found = {}
             for measure in self.measures:
-                found |= measure(scene, run)
+                new = measure(scene, run)
+                _check_variables(measure, new, [*found, "result"])
+                found |= new
             for name, x in found.items():
                 if jnp.issubdtype(x.dtype, jnp.floating):  # fast minima lose NaN
                     found[name] = jnp.where(run.successful, x, jnp.nan)
@@ -180,10 +189,12 @@ def make_job(
             f"Argument `cycles` must be at least {needed} for the measure {who}, but got {cycles}."
         )
     settle = count("settle", settle)
+    derivatives = (derivatives,) if isinstance(derivatives, str) else derivatives
     if isinstance(scene, AbstractScene):
         template, build = scene, None
     elif callable(scene):
         template, build = None, scene
+        _check_names_of(scene, [name for name in names if not name.startswith(START)])
     else:
         raise TypeError(
             "Argument `scene` must be a `Scene`, an `AbstractScene` or a function that makes one, "
@@ -199,7 +210,7 @@ def make_job(
         scene=_as_arrays(template),
         build=build,
         start=_as_arrays(start),
-        derivatives=(derivatives,) if isinstance(derivatives, str) else tuple(derivatives),
+        derivatives=tuple_of("derivatives", derivatives, str),
         measures=_as_arrays(measures),
         method=_as_arrays(chosen(template, method)),
         clock=clock,
@@ -209,6 +220,30 @@ def make_job(
         max_steps=None if max_steps is None else count("max_steps", max_steps, least=1),
         places=PLACES,
     )
+
+
+def _check_names_of(build: Callable[..., Any], names: list[str]) -> None:
+    """**Raises:** `ValueError` if the function that makes the scenes does not take these names."""
+    try:
+        inspect.signature(build).bind(**dict.fromkeys(names))
+    except TypeError as error:
+        raise ValueError(
+            "Argument `axes` must give the function in argument `scene` what it takes, but: "
+            f"{error}."
+        ) from None
+    except ValueError:
+        return  # its arguments are not known
+
+
+def _check_variables(measure: AbstractMeasure, new: Iterable[str], taken: list[str]) -> None:
+    """**Raises:** `ValueError` if a name is none for a variable, or another's."""
+    who = getattr(measure, "function", measure)
+    who = getattr(who, "__name__", type(who).__name__)
+    for name in new:
+        if not isinstance(name, str) or not name or "/" in name or name.startswith("__"):
+            raise ValueError(f"Measure {who} must name its numbers by words, but gives {name!r}.")
+        if name in taken:
+            raise ValueError(f"Measure {who} must not give {name!r}, which is another's name.")
 
 
 def _as_arrays(tree: Any) -> Any:
@@ -221,14 +256,29 @@ def _check_name(scene: AbstractScene, start: Any, name: str, argument: str) -> N
     check_name(names, name, argument)
 
 
+def _corners(blocks: Blocks) -> np.ndarray:
+    """The lanes in which the axes have their least and greatest values, one in a row."""
+    rows = list(blocks.axes.values())
+    if blocks.paired:
+        ends = {int(place) for x in rows for place in (x.argmin(), x.argmax())}
+        return np.stack([x[sorted(ends)] for x in rows], axis=-1)
+    corners: Any = [np.unique([x.min(), x.max()]) for x in rows]
+    return np.stack(np.meshgrid(*corners, indexing="ij"), axis=-1).reshape(-1, len(rows))
+
+
 def check_corners(job: Job, blocks: Blocks) -> Job:
     """The job, after the checks of scene, start and method on the corners of the grid.
 
     What the corners say about the gaps holds for the grid: if no body can rest, that is left out.
     """
     rests = False
-    corners: Any = [np.unique([x.min(), x.max()]) for x in blocks.axes.values()]
-    for values in np.stack(np.meshgrid(*corners, indexing="ij"), axis=-1).reshape(-1, len(corners)):
+    if blocks.paired and job.scene is not None:
+        lanes = {name: jnp.asarray(x) for name, x in blocks.axes.items() if name[:6] != START}
+        scene = job.scene
+        for name, x in lanes.items():
+            scene = with_leaf(scene, name, x)
+        check_again(scene)  # all lanes at a time
+    for values in _corners(blocks):
         lane = {name: jnp.asarray(x) for name, x in zip(blocks.axes, values, strict=True)}
         scene, start = job.lane(lane)
         check_again(scene)

@@ -236,7 +236,16 @@ class Custom(AbstractMeasure):
                 "A function in argument `measure` must return a mapping of names to numbers, but "
                 f"returned {type(found).__name__}."
             )
-        return {name: jnp.asarray(value) for name, value in found.items()}
+        numbers = {}
+        for name, value in found.items():
+            try:
+                numbers[name] = jnp.asarray(value)
+            except (TypeError, ValueError):
+                raise TypeError(
+                    "A function in argument `measure` must return numbers, but its "
+                    f"{name!r} is {value!r}."
+                ) from None
+        return numbers
 
 
 MEASURES: Mapping[str, Callable[[], AbstractMeasure]] = {

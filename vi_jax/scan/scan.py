@@ -2,32 +2,36 @@
 
 import dataclasses
 import functools
-import hashlib
 import json
+import math
 import warnings
 from collections.abc import Callable, Iterable, Mapping
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 import numpy as np
 import xarray as xr
 from tqdm import tqdm
 
-from .._checks import count
-from ..flow import AbstractMethod, simulate
+from .._checks import count, fits_memory, fits_records, flag, instance_of
+from ..flow import AbstractMethod
 from ..flow.choice import MethodLike, preset
 from ..flow.results import REASON_NAMES
 from ..scene import AbstractScene
-from ..scene.leaves import leaf, leaf_names
+from .describe import attributes_of, description_of
 from .grid import Blocks, axes_of
 from .job import Job, check_corners, make_job
-from .measures import Custom
-from .store import MemoryStore, Variable, ZarrStore, check_writable, dataset, open_dataset
+from .store import (
+    MemoryStore,
+    Variable,
+    ZarrStore,
+    check_writable,
+    dataset,
+    open_dataset,
+)
 from .work import block_size, rounded, run_here, run_on_cluster, size_of, worker_count
 
 _UNITS = {"Y": "a", "V": "a ω", "W": "ω", "phase": "rad", "frequency_ratio": "ω", "gap": "a"}
@@ -96,7 +100,8 @@ def scan(
       are off by at most (`verified_error_y_min`; infinite where one of both failed): whether the
       method is good enough for this scan.
     - `store`: folder of a Zarr store, written block by block. The same call resumes it after an
-      interruption; a changed one is refused with the difference named.
+      interruption; a changed one is refused with the difference named, the code of your own
+      functions included. Chunks that were lost or damaged are named and computed again.
     - `lanes`: lanes in a block (a multiple of 256); memory grows with it and with `cycles`.
     - `workers`: blocks at work at the same time on a CPU, by default as many as it has cores.
     - `devices`: local devices over which a block is spread; all by default.
@@ -110,6 +115,13 @@ def scan(
     `ScanInterrupted`, a `KeyboardInterrupt`, on Ctrl-C.
     """
     grid, verify = axes_of(axes), count("verify", verify)
+    if store is not None:
+        instance_of("store", store, (str, Path), "a path")
+    paired, progress = flag("paired", paired), flag("progress", progress)
+    if cluster is not None and not (hasattr(cluster, "submit") and hasattr(cluster, "cancel")):
+        raise TypeError(
+            f"Argument `cluster` must be a `dask.distributed.Client`, but got {cluster!r}."
+        )
     if paired and len({x.size for x in grid.values()}) != 1:
         raise ValueError(
             "Argument `axes` must hold rows of one length if they are `paired`, but they have "
@@ -130,19 +142,23 @@ def scan(
     total = Blocks(grid, 1, paired=paired).total
     if store is not None and lanes is None:
         lanes = _lanes_in(Path(store))
-    lanes = block_size(total, workers, devices) if lanes is None else rounded(lanes, devices)
+    at_fault = "cycles" if lanes is None else "lanes"
+    lanes = block_size(total, workers, devices) if lanes is None else rounded(lanes, total, devices)
+    fits_records(at_fault, lanes * (job.cycles + 1), 12)
     if jax.default_backend() != "cpu":
         job = dataclasses.replace(job, places=lanes // devices)
     blocks = Blocks(grid, lanes, paired=paired)
     job = check_corners(job, blocks)
     variables = variables_of(job, blocks)
-    description = _description(job, blocks, probe=store is not None)
-    attributes = _attributes(description)
+    per_lane = sum(math.prod(v.sizes) * v.dtype.itemsize for v in variables.values())
+    fits_memory("axes", total * per_lane if store is None else total + 500 * len(blocks))
+    description = description_of(job, blocks)
+    attributes = attributes_of(description)
     if store is not None:
         check_writable(store)
         kept: MemoryStore | ZarrStore = ZarrStore(store, description, blocks, variables)
     else:
-        kept = MemoryStore(blocks.shape, variables)
+        kept = MemoryStore(blocks, variables)
 
     def collected() -> xr.Dataset:
         if isinstance(kept, MemoryStore):
@@ -154,7 +170,7 @@ def scan(
         data.attrs = attributes
         return data
 
-    open_blocks = [where for where in blocks if not kept.done(where)]
+    open_blocks = kept.open_blocks()
     try:
         with tqdm(
             total=total,
@@ -246,6 +262,11 @@ def variables_of(job: Job, blocks: Blocks) -> dict[str, Variable]:
         sizes = shape.shape[1:]
         if len(dims) != len(sizes):
             dims = tuple(f"{name}_{i}" for i in range(len(sizes)))
+        for taken in {name, *dims} & {*blocks.axes, *blocks.dims}:
+            raise ValueError(
+                f"Measure {name!r} must have another name than the axis {taken!r}, or one on "
+                "other dimensions."
+            )
         found[name] = Variable(dims, tuple(sizes), np.dtype(shape.dtype), about)
     return found
 
@@ -271,87 +292,3 @@ def _lanes_in(path: Path) -> int | None:
         return int(attributes["scan"]["lanes"])
     except (OSError, KeyError, ValueError, TypeError):
         return None
-
-
-def _description(job: Job, blocks: Blocks, *, probe: bool) -> dict[str, Any]:
-    """What makes two scans the same, in words and numbers that JSON can hold."""
-
-    def told(tree: Any) -> str:
-        return eqx.tree_pformat(tree, short_arrays=False, width=10**6)
-
-    scene: dict[str, Any]
-    if job.scene is not None:
-        scene = {name: _told(leaf(job.scene, name)) for name in leaf_names(job.scene)}
-        scene["structure"] = str(jtu.tree_structure(job.scene))
-    else:  # a function is known by what it makes
-        scene = {"made by": getattr(job.build, "__qualname__", repr(job.build))}
-        for name, place in (("first", 0), ("last", -1)):
-            made, _ = job.lane(_lane(blocks, place))
-            scene |= {f"{name} {leaf_}": _told(leaf(made, leaf_)) for leaf_ in leaf_names(made)}
-            scene[f"{name} structure"] = str(jtu.tree_structure(made))
-    start: Any = "the scene's own"
-    if job.start is not None:
-        start = {name: _told(leaf(job.start, name)) for name in leaf_names(job.start)}
-    return {
-        "scene": scene,
-        "start": start,
-        "paired": blocks.paired,
-        "axis": {
-            name: {
-                "values": x.size,
-                "from": float(x[0]),
-                "to": float(x[-1]),
-                "digest": hashlib.sha256(x.tobytes()).hexdigest()[:16],
-            }
-            for name, x in blocks.axes.items()
-        },
-        "measure": [told(m) for m in job.measures],
-        "method": told(job.method),
-        "clock": job.clock,
-        "settle": int(job.settle),
-        "cycles": job.cycles,
-        "derivatives": list(job.derivatives),
-        "max_impacts": job.max_impacts,
-        "max_steps": job.max_steps,
-        "lanes": blocks.lanes,
-        "precision": str(jnp.result_type(float)),
-        "result of own measures": _probe(job, blocks) if probe else {},
-    }
-
-
-def _lane(blocks: Blocks, place: int) -> dict[str, Any]:
-    return {name: jnp.asarray(x[place]) for name, x in blocks.axes.items()}
-
-
-def _probe(job: Job, blocks: Blocks) -> dict[str, Any]:
-    """What a user's own measures say of the first lane, by which another function is noticed."""
-    own = [measure for measure in job.measures if isinstance(measure, Custom)]
-    if not own:
-        return {}
-    scene, start = job.lane(_lane(blocks, 0))
-    run = simulate(scene, start, job.cycles, method=job.method)
-    found = {}
-    for measure in own:
-        for name, x in measure(scene, run).items():
-            found[name] = [f"{number:.6g}" for number in np.ravel(np.asarray(x, float))]
-    return found
-
-
-def _told(x: Any) -> Any:
-    return np.asarray(x, float).tolist()
-
-
-def _attributes(about: dict[str, Any]) -> dict[str, Any]:
-    try:
-        number = version("vi-jax")
-    except PackageNotFoundError:
-        number = "not installed"
-    return {
-        "vi_jax": number,
-        "method": about["method"],
-        "settle": about["settle"],
-        "cycles": about["cycles"],
-        "scene": json.dumps(about["scene"]),
-        "start": json.dumps(about["start"]),
-        "precision": about["precision"],
-    }

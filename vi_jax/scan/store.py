@@ -2,7 +2,9 @@
 
 import json
 import tempfile
-from collections.abc import Mapping
+import warnings
+import zlib
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,6 +16,11 @@ from .._checks import unwritable
 from .grid import Blocks
 
 _UNDONE = -1
+
+UNVERIFIABLE = "it cannot be looked at: "
+
+# Where the check sums lie: a row for each block, a column for each variable. They are written last.
+_SUMS = "check/sums"
 
 
 class Variable(NamedTuple):
@@ -33,14 +40,15 @@ class Variable(NamedTuple):
 class MemoryStore:
     """Arrays in memory."""
 
-    def __init__(self, shape: tuple[int, ...], variables: Mapping[str, Variable]):
+    def __init__(self, blocks: Blocks, variables: Mapping[str, Variable]):
         self.arrays = {
-            name: np.full(shape + v.sizes, v.empty, v.dtype) for name, v in variables.items()
+            name: np.full(blocks.shape + v.sizes, v.empty, v.dtype) for name, v in variables.items()
         }
+        self.blocks = blocks
 
-    def done(self, where: tuple[slice, ...]) -> bool:
-        """Whether the block was computed."""
-        return _computed(self.arrays["result"], where)
+    def open_blocks(self) -> list[tuple[slice, ...]]:
+        """The blocks still to be computed: all."""
+        return list(self.blocks)
 
     def write(self, where: tuple[slice, ...], numbers: Mapping[str, np.ndarray]) -> None:
         """Keep a block's numbers."""
@@ -50,10 +58,10 @@ class MemoryStore:
 
 
 class ZarrStore:
-    """A Zarr group on disk, one chunk for each block.
+    """A Zarr group on disk, one chunk for each block, with a check sum of each chunk.
 
-    `result` is written last, and a chunk appears whole or not at all, so that a block counts as
-    done only if all its numbers are there.
+    The check sums of a block are written last, so that it counts as done only if all its numbers
+    are there, and are those that were computed. What was lost since is told and computed again.
     """
 
     def __init__(
@@ -63,35 +71,103 @@ class ZarrStore:
         blocks: Blocks,
         variables: Mapping[str, Variable],
     ):
-        self.path = Path(path)
+        self.path, self.blocks, self.variables = Path(path), blocks, dict(variables)
+        self.names = sorted(variables)
+        self.lost: list[str] = []
         description = json.loads(json.dumps(description))
-        if not (self.path / "zarr.json").exists():
+        new = not (self.path / "zarr.json").exists()
+        if new:
             if self.path.exists() and (self.path.is_file() or any(self.path.iterdir())):
                 raise ValueError(
                     f"Argument `store` must be a new folder or the store of a scan, but {path} "
                     "is neither."
                 )
             _make(self.path, description, blocks, variables)
-        self.group = zarr.open_group(str(self.path), mode="r+", zarr_format=3)
-        _compare(self.path, dict(self.group.attrs), description)
+        try:
+            self.group = zarr.open_group(str(self.path), mode="r+", zarr_format=3)
+        except Exception as error:
+            raise ValueError(
+                f"Argument `store` must be the store of a scan, but {self.path / 'zarr.json'} "
+                f"cannot be read: {error}."
+            ) from None
+        _compare(self.path, dict(self.group.attrs), description, new=new)
+        self._complete()
 
-    def done(self, where: tuple[slice, ...]) -> bool:
-        """Whether the block was computed."""
-        return _computed(self._array("result"), where)
+    def _complete(self) -> None:
+        """Make again what arrays are missing, or are not those of this scan."""
+        for name, v in self.variables.items():
+            array = _tried(lambda name=name: self.group[name])
+            if not isinstance(array, zarr.Array) or array.chunks != self.blocks.block + v.sizes:
+                self.lost.append(name)
+                _add_variable(self.group, name, v, self.blocks)
+        for name, x in self.blocks.axes.items():
+            there = _tried(lambda name=name: np.asarray(self.group[name]))
+            if not isinstance(there, np.ndarray) or not np.array_equal(there, x):
+                self.lost.append(name)
+                _add_axis(self.group, name, x, self.blocks)
+        shape = (len(self.blocks), len(self.names))
+        if getattr(_tried(lambda: self.group[_SUMS]), "shape", None) != shape:
+            self.lost.append(_SUMS)
+            _add_sums(self.group, shape)
+
+    def open_blocks(self) -> list[tuple[slice, ...]]:
+        """The blocks still to be computed. Warns of those that were, and are not as they were."""
+        found = [where for i, where in enumerate(self.blocks) if not self._done(i, where)]
+        if self.lost:
+            more = f" and {len(self.lost) - 5:,} more" if len(self.lost) > 5 else ""
+            warnings.warn(
+                f"In {self.path} what was computed is lost or damaged, and is computed again: "
+                f"{', '.join(self.lost[:5])}{more}.",
+                stacklevel=3,
+            )
+        return found
+
+    def _done(self, index: int, where: tuple[slice, ...]) -> bool:
+        sums = _tried(lambda: self._array(_SUMS)[index])
+        if not isinstance(sums, np.ndarray):
+            self.lost.append(f"{_SUMS}/c/{index}/0")
+            return False
+        if not sums.any():
+            return False  # not yet computed, or not to its end
+        lost = []
+        for name, wanted in zip(self.names, sums.tolist(), strict=True):
+            array = self._array(name)
+            numbers = _tried(lambda array=array: np.asarray(array[where]))
+            if not isinstance(numbers, np.ndarray) or _sum(numbers, array.dtype) != wanted:
+                corner = [part.start // n for part, n in zip(where, self.blocks.block, strict=True)]
+                corner += [0] * (array.ndim - len(corner))
+                lost.append("/".join([name, "c", *map(str, corner)]))
+        self.lost += lost
+        return not lost
 
     def write(self, where: tuple[slice, ...], numbers: Mapping[str, np.ndarray]) -> None:
         """Keep a block's numbers."""
-        for name in sorted(numbers, key=lambda name: name == "result"):
+        sums = []
+        for name in self.names:
             array = self._array(name)
             shape = tuple(part.stop - part.start for part in where) + array.shape[len(where) :]
             array[where] = numbers[name].reshape(shape)
+            sums.append(_sum(numbers[name], array.dtype))
+        self._array(_SUMS)[self.blocks.index(where)] = sums
 
     def _array(self, name: str) -> Any:
         return self.group[name]
 
 
-def _computed(results: Any, where: tuple[slice, ...]) -> bool:
-    return bool((results[where] != _UNDONE).all())
+def _tried(read: Callable[[], Any]) -> Any:
+    """What is read, or `None`: a file may be missing, cut short or hold anything."""
+    try:
+        return read()
+    except Exception:
+        return None
+
+
+def _sum(numbers: np.ndarray, dtype: np.dtype) -> int:
+    """A check sum, never 0, of numbers of any shape; Zarr stores every NaN as the same one."""
+    numbers = np.ascontiguousarray(numbers, dtype)
+    if dtype.kind == "f":
+        numbers = np.where(np.isnan(numbers), dtype.type(np.nan), numbers)
+    return zlib.crc32(numbers.tobytes()) or 1
 
 
 def _make(
@@ -103,20 +179,10 @@ def _make(
         made = Path(beside) / "store"
         group = zarr.create_group(str(made), zarr_format=3, attributes={"scan": description})
         for name, x in blocks.axes.items():
-            coordinate = group.create_array(
-                name, shape=x.shape, dtype=x.dtype, dimension_names=blocks.dims_of(name)
-            )
-            coordinate[:] = x
+            _add_axis(group, name, x, blocks)
         for name, v in variables.items():
-            group.create_array(
-                name,
-                shape=blocks.shape + v.sizes,
-                chunks=blocks.block + v.sizes,
-                dtype=v.dtype,
-                fill_value=v.empty,
-                dimension_names=(*blocks.dims, *v.dims),
-                attributes=dict(v.attributes),
-            )
+            _add_variable(group, name, v, blocks)
+        _add_sums(group, (len(blocks), len(variables)))
         try:
             made.rename(path)
         except OSError:
@@ -124,16 +190,49 @@ def _make(
                 raise  # else another scan made it in the meantime
 
 
+def _add_axis(group: Any, name: str, x: np.ndarray, blocks: Blocks) -> None:
+    coordinate = group.create_array(
+        name, shape=x.shape, dtype=x.dtype, dimension_names=blocks.dims_of(name), overwrite=True
+    )
+    coordinate[:] = x
+
+
+def _add_variable(group: Any, name: str, v: Variable, blocks: Blocks) -> None:
+    group.create_array(
+        name,
+        shape=blocks.shape + v.sizes,
+        chunks=blocks.block + v.sizes,
+        dtype=v.dtype,
+        fill_value=v.empty,
+        dimension_names=(*blocks.dims, *v.dims),
+        attributes=dict(v.attributes),
+        overwrite=True,
+    )
+
+
+def _add_sums(group: Any, shape: tuple[int, int]) -> None:
+    # In a group of its own, so that it is no variable of the data set.
+    group.create_array(
+        _SUMS, shape=shape, chunks=(1, shape[1]), dtype="uint32", fill_value=0, overwrite=True
+    )
+
+
 def check_writable(path: str | Path) -> None:
     """**Raises:** `ValueError` if no store can be written there; makes the folders above it."""
-    problem = unwritable(Path(path).parent)
+    problem = "it is empty" if path == "" else unwritable(Path(path).parent)
+    if problem is None and "\0" in str(path):
+        problem = "it holds a null character"
+    elif problem is None and Path(path).is_dir():
+        problem = unwritable(path)
     if problem is not None:
         raise ValueError(
             f"Argument `store` must be a path that can be written to, but {path} is not: {problem}."
         )
 
 
-def _compare(path: Path, attributes: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
+def _compare(
+    path: Path, attributes: Mapping[str, Any], wanted: Mapping[str, Any], *, new: bool
+) -> None:
     """Refuse to mix two scans in one store."""
     there = attributes.get("scan")
     if there is None:
@@ -142,16 +241,22 @@ def _compare(path: Path, attributes: Mapping[str, Any], wanted: Mapping[str, Any
             "Zarr group."
         )
     for key in dict.fromkeys([*wanted, *there]):
-        old, new = there.get(key), wanted.get(key)
-        if old == new:
+        old, now = there.get(key), wanted.get(key)
+        if old == now:
             continue
-        if isinstance(old, dict) and isinstance(new, dict):
-            inner = next(k for k in sorted({*old, *new}) if old.get(k) != new.get(k))
-            key, old, new = f"{key} {inner}", old.get(inner), new.get(inner)
+        if isinstance(old, dict) and isinstance(now, dict):
+            inner = next(k for k in sorted({*old, *now}) if old.get(k) != now.get(k))
+            key, old, now = f"{key} {inner}", old.get(inner), now.get(inner)
         raise ValueError(
             f"Argument `store` must be new or hold the same scan, but in {path} the {key} is "
-            f"{old}, and now it is {new}."
+            f"{old}, and now it is {now}."
         )
+    for what, code in wanted["code of"].items():
+        if not new and code.startswith(UNVERIFIABLE):
+            raise ValueError(
+                f"Argument `store` must be new, since it cannot be told whether the {what} is the "
+                f"same as that in {path}: {code}."
+            )
 
 
 def open_dataset(path: Path) -> xr.Dataset:

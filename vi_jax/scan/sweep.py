@@ -10,7 +10,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
-from .._checks import concrete, count, number, require
+from .._checks import concrete, count, fits_records, instance_of, number, require
 from ..flow import RESULTS, simulate
 from ..flow.choice import MethodLike, chosen
 from ..flow.simulate import check_start
@@ -97,10 +97,15 @@ def sweep(
 
     **Raises:** `ValueError` or `TypeError` for an unknown name or values that are no numbers.
     """
+    told = "a `Scene` or an `AbstractScene`"
+    instance_of("scene", scene, AbstractScene, told)
     check_leaf(scene, parameter)
     settle, cycles = count("settle", settle), count("cycles", cycles, least=2)
     values = number("values", values).astype(jnp.result_type(float))
     numbers = concrete(values)
+    if max_steps is not None:
+        max_steps = count("max_steps", max_steps, least=1)
+    fits_records("cycles", values.size * cycles, 4)
     require("tolerance", tolerance, low=0.0, open_low=True)
     if values.ndim != 1 or not values.size or not _finite(numbers):
         raise ValueError(

@@ -49,8 +49,9 @@ def block_size(total: int, workers: int, devices: int) -> int:
     return size
 
 
-def rounded(lanes: int, devices: int) -> int:
-    lanes = count("lanes", lanes, least=1)
+def rounded(lanes: int, total: int, devices: int) -> int:
+    """As many lanes in a block, made full; no more than the grid has."""
+    lanes = min(count("lanes", lanes, least=1), total)
     step = PLACES * devices
     return math.ceil(lanes / step) * step
 

@@ -9,7 +9,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import concrete, number, one_of, require
+from .._checks import (
+    concrete,
+    instance_of,
+    number,
+    one_of,
+    require,
+    state_of_numbers,
+    tuple_of,
+)
 from .base import AbstractScene
 from .crank import AbstractCrank, CosineCrank
 from .drive import IdealDrive, Motor
@@ -74,7 +82,9 @@ class Scene(AbstractScene):
 
     oscillator: Oscillator
     drive: IdealDrive | Motor
-    stops: tuple[RigidStop, ...] = eqx.field(default=(), converter=tuple)
+    stops: tuple[RigidStop, ...] = eqx.field(
+        default=(), converter=lambda x: tuple_of("stops", x, RigidStop)
+    )
     crank: AbstractCrank = eqx.field(default_factory=CosineCrank)
     clock_name: str = eqx.field(static=True, default="phase")
     section_phase: Float[Array, "..."] | None = eqx.field(
@@ -85,6 +95,8 @@ class Scene(AbstractScene):
 
     def __check_init__(self):
         one_of("clock_name", self.clock_name, ("phase", "time"))
+        instance_of("oscillator", self.oscillator, Oscillator, "an `Oscillator`")
+        instance_of("crank", self.crank, AbstractCrank, "a `CosineCrank()` or another crank")
         if not isinstance(self.drive, IdealDrive | Motor):
             raise TypeError(
                 f"Argument `drive` must be an `IdealDrive` or a `Motor`, but got {self.drive!r}."
@@ -118,7 +130,7 @@ class Scene(AbstractScene):
             oscillator=Oscillator(damping_ratio),
             drive=IdealDrive(frequency_ratio),
             stops=stops,
-            crank=crank or CosineCrank(),
+            crank=CosineCrank() if crank is None else crank,
         )
 
     @property
@@ -191,7 +203,7 @@ class Scene(AbstractScene):
                 f"Argument `start` must be a `{wanted.__name__}` for this scene (use "
                 f"`scene.start(...)`), but got a `{type(start).__name__}`."
             )
-        return start
+        return state_of_numbers("start", start)
 
     def field(self, s: Float[Array, ""], state: Any) -> Any:
         """d(state)/ds: by crank angle (Eq. 8 to 9 of the paper) or by time τ (Eq. 5 to 7)."""

@@ -1,0 +1,182 @@
+"""Calls that cannot be run, each with what must be said. Prints what was said instead, if any.
+
+A script of its own, since the tests check the package's annotations, which would say it first."""
+
+import datetime
+import importlib
+import json
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+jax.config.update("jax_enable_x64", True)
+import vi_jax as vi
+
+SCENE = vi.Scene.ideal(frequency_ratio=0.9)
+START = SCENE.start(Y=1.6, V=-1.9)
+ZETA = "drive.frequency_ratio"
+AXES = {ZETA: [0.8, 0.9]}
+REGION = {"start.Y": (0.0, 1.0)}
+
+
+class Own(vi.AbstractScene):
+    """A body on a spring, alone."""
+
+    stops: tuple = ()
+    cycle: float = 1.0
+
+    def field(self, s, state):
+        """Y'' = -Y."""
+        return vi.OscillatorState(state.V, -state.Y)
+
+
+def simulate(start=START, cycles=2, **options):
+    return lambda: vi.simulate(SCENE, start, cycles, **options)
+
+
+def scan(axes=AXES, scene=SCENE, **options):
+    return lambda: vi.scan(scene, axes, **{"measure": "extremes", "cycles": 4, **options})
+
+
+def measured(**numbers):
+    return scan(measure=lambda scene, run: numbers)
+
+
+def sweep(scene=SCENE, values=(0.8, 0.9), parameter=ZETA, **options):
+    return lambda: vi.sweep(scene, parameter, values, **options)
+
+
+def basins(region=REGION, **options):
+    return lambda: vi.basins(SCENE, region, **options)
+
+
+def built(**parts):
+    usual = {"oscillator": vi.Oscillator(0.1), "drive": vi.IdealDrive(0.9)}
+    return lambda: vi.Scene(**{**usual, **parts})
+
+
+def orbit(guess=START, **options):
+    return lambda: vi.find_orbit(SCENE, guess, 2, **options)
+
+
+COUNT, REAL = "must be an integer", "must be a real number"
+ROW = "must be one row of finite real numbers"
+CALLS = {
+    **{f"settle={x!r}": (simulate(settle=x), f"`settle` {COUNT}") for x in ("3", None, 2.5, True)},
+    "settle=[1]": (simulate(settle=[1]), f"`settle` {COUNT}"),
+    "settle=10**20": (simulate(settle=10**20), "`settle` must be at most"),
+    "settle of lyapunov": (lambda: vi.lyapunov(SCENE, START, 10, settle="3"), f"`settle` {COUNT}"),
+    "a list as start": (simulate([0.0, 0.0]), "`start` must be a `OscillatorState`"),
+    "a text as start": (simulate("ab"), "`start` must be a `OscillatorState`"),
+    "lists in a start": (simulate(vi.OscillatorState([0.0], [0.0])), "its Y is [0.0]"),
+    "a text in a start": (simulate(vi.OscillatorState(0.0, "a")), "its V is 'a'"),
+    "None in a start": (simulate(vi.OscillatorState(None, 0.0)), "its Y is None"),
+    "texts in a guess": (orbit(vi.OscillatorState("a", "b")), "its Y is 'a'"),
+    "a list for an own scene": (lambda: vi.simulate(Own(), [0.0], 2), "`start` must be a state"),
+    "a text for an own scene": (lambda: vi.simulate(Own(), "ab", 2), "`start` must be a state"),
+    "a list as a scan's start": (scan(start=[0.0]), "`start` must be a `OscillatorState`"),
+    "a text as a sweep's start": (sweep(start="ab"), "`start` must be a `OscillatorState`"),
+    "cycles=10**12": (simulate(cycles=10**12), "`cycles` must be at most"),
+    "cycles=2*10**9": (simulate(cycles=2 * 10**9), "results that fit into the memory"),
+    "cycles=10**20": (simulate(cycles=10**20), "`cycles` must be at most"),
+    "samples=10**12": (simulate(samples=10**12), "`samples` must be at most"),
+    "impact_log=10**12": (simulate(impact_log=10**12), "`impact_log` must be at most"),
+    "cycles of a sweep": (sweep(cycles=10**12), "`cycles` must be at most"),
+    "cycles of a scan": (scan(cycles=10**12), "`cycles` must be at most"),
+    "a grid": (scan({ZETA: np.linspace(0.5, 1, 10**6), "start.Y": np.linspace(0, 1, 10**6)}),
+               "`axes` must ask for results that fit into the memory"),
+    "flags": (simulate(estimate="no"), "`estimate` must be True or False"),
+    "rests='no'": (simulate(rests="no"), "`rests` must be True or False"),
+    "paired='no'": (scan(paired="no"), "`paired` must be True or False"),
+    "throw='no'": (orbit(throw="no"), "`throw` must be True or False"),
+    **{f"axis of {x!r}": (scan({ZETA: x}), ROW) for x in (
+        ["0.8"], [True], np.array([True]), [True, 0.5], [1 + 0j], [None], [datetime.date.max],
+        np.array(["2020-01-01"], "M8[D]"), [[0.8]], [np.nan], "0.8", 0.8, [])},
+    **{f"values of {x!r}": (sweep(values=x), "Argument `values` must be") for x in (
+        ["0.8"], [True], [1j], np.array(["2020-01-01"], "M8[D]"), [np.nan], 0.8)},
+    "sweep of None": (sweep(None), "`scene` must be a `Scene`"),
+    "sweep of no name": (sweep(parameter=None), "`parameter` must be"),
+    **{f"tolerance={x!r}": (sweep(tolerance=x), "Argument `tolerance` must be") for x in (
+        np.nan, np.float32("nan"), "1", True, 1j, 0.0)},
+    "max_steps=-1": (sweep(max_steps=-1), "`max_steps` must be at least 1"),
+    **{f"rtol={x!r}": (lambda x=x: vi.Adaptive(rtol=x), f"`rtol` {REAL}") for x in (
+        1e-3 + 0j, True, "a", None)},
+    "atol='a'": (lambda: vi.Adaptive(atol="a"), f"`atol` {REAL}"),
+    **{f"apart={x!r}": (basins(apart=x), "Argument `apart` must be") for x in (
+        0, -1, np.nan, "a", None, True)},
+    "seed=-1": (basins(samples=3, seed=-1), "`seed` must be at least 0"),
+    "seed='a'": (basins(samples=3, seed="a"), f"`seed` {COUNT}"),
+    "tolerance of basins": (basins(tolerance="1"), f"`tolerance` {REAL}"),
+    "a region of three": (basins({"start.Y": (0.0, 1.0, 2.0)}), "`region` must give ranges"),
+    "a region of texts": (basins({"start.Y": ("0", "1")}), ROW),
+    "crank='cosine'": (lambda: vi.Scene.ideal(frequency_ratio=0.9, crank="cosine"),
+                       "`crank` must be a `CosineCrank()`"),
+    "oscillator=0.1": (built(oscillator=0.1), "`oscillator` must be an `Oscillator`"),
+    "one stop": (built(stops=vi.RigidStop(1.0, 0.5)), "`stops` must be a tuple"),
+    "stops=3": (built(stops=3), "`stops` must be a tuple"),
+    "stops=None": (built(stops=None), "`stops` must be a tuple"),
+    "stops='ab'": (built(stops="ab"), "`stops` must be a tuple"),
+    **{f"frequency_ratio={x!r}": (
+        lambda x=x: vi.Scene.ideal(frequency_ratio=x), "Argument `frequency_ratio` must be") for x
+       in (1j, True, jnp.array(True), np.str_("0.9"), ["0.9"], np.datetime64("2020"), 10**400)},
+    "Y='1'": (lambda: SCENE.start(Y="1"), f"`Y` {REAL}"),
+    "clock=['phase']": (simulate(clock=["phase"]), "`clock` must be one of"),
+    "Gradient('adam')": (lambda: vi.Gradient("adam"), "`optimiser` must be an `optax"),
+    **{f"Newton(tolerance={x!r})": (
+        lambda x=x: vi.Newton(tolerance=x), "Argument `tolerance` must be") for x in (
+        np.nan, True, 1j, "a", 0.0)},
+    "method=Newton": (orbit(method=vi.Newton), "`method` must be `Newton(...)`"),
+    "boundary('x')": (lambda: vi.boundary("x", parameter="stops.0.gap", bounds=((0, 1), (0, 1))),
+                      "`point` must be a `SpecialPoint`"),
+    "continue_orbit('x')": (lambda: vi.continue_orbit("x", parameter=ZETA, bounds=(0, 1)),
+                            "`orbit` must be one `Orbit`"),
+    "step='a'": (lambda: vi.continue_orbit("x", parameter=ZETA, bounds=(0, 1), step="a"),
+                 f"`step` {REAL}"),
+    "distinct_orbits('x')": (lambda: vi.distinct_orbits("x"), "`orbits` must be from"),
+    "cluster='tcp://x'": (scan(cluster="tcp://x"), "`cluster` must be a `dask"),
+    "a scene of 5": (scan({"zeta": [1.0]}, lambda zeta: 5), "but it returned 5"),
+    "a scene of another name": (scan({"zeta": [1.0]}, lambda xi: SCENE), "missing a required"),
+    "an own scene without start": (scan({"x": [1.0]}, lambda x: Own()), "`start` must be given"),
+    "a measure of 5": (scan(measure=lambda scene, run: 5), "must return a mapping of names"),
+    "a measure of texts": (measured(a="b"), "its 'a' is 'b'"),
+    "a measure named result": (measured(result=1.0), "must not give 'result'"),
+    "a measure named like an axis": (measured(**{ZETA: 1.0}), "another name than the axis"),
+    "a dimension named like an axis": (
+        scan({"cycle": [0.8, 0.9]}, lambda cycle: SCENE, measure="sections", cycles=16),
+        "another name than the axis 'cycle'"),
+    "two measures of one name": (
+        scan(measure=("extremes", lambda scene, run: {"y_min": 1.0})), "must not give 'y_min'"),
+    "a measure with a path": (measured(**{"a/b": 1.0}), "must name its numbers by words"),
+    "derivatives=5": (scan(derivatives=5), "`derivatives` must be a tuple"),
+    "store=5": (scan(store=5), "`store` must be a path"),
+    "store=''": (scan(store=""), "`store` must be a path"),
+    "store of a null": (scan(store="a\0b"), "`store` must be a path"),
+    "FixedStep": (lambda: vi.FixedStep(steps_per_cycle=10**12), "`steps_per_cycle` must be at"),
+}  # fmt: skip
+
+
+def work(*arguments, **options):
+    raise RuntimeError("work began")
+
+
+if __name__ == "__main__":
+    for module, name in (
+        ("scan.scan", "run_here"),
+        ("scan.scan", "run_on_cluster"),
+        ("scan.sweep", "_sweep"),
+        ("orbit.find", "_find"),
+        ("flow.simulate", "_simulate"),
+    ):
+        setattr(importlib.import_module(f"vi_jax.{module}"), name, work)
+    wrong = {}
+    for what, (call, words) in CALLS.items():
+        try:
+            found = f"accepted: {call()!r}"
+        except Exception as error:
+            found = f"{type(error).__name__}: {error}"
+        refused = found.startswith(("ValueError", "TypeError")) and words in found
+        if not refused:
+            wrong[what] = found[:300]
+    json.dump({"calls": len(CALLS), "wrong": wrong}, sys.stdout)

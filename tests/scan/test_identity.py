@@ -1,0 +1,141 @@
+"""Functions and classes known by what they do: another code or content is another identity."""
+
+import functools
+import subprocess
+import sys
+import threading
+
+import equinox as eqx
+import jax
+import pytest
+import vi_jax as vi
+from vi_jax.scan.identity import Unverifiable, identity
+
+# What a user may have written: a global number, a helper, a closure, a default, a class.
+SOURCE = """
+import functools
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import vi_jax as vi
+
+FACTOR = 2.0
+
+def helper(x):
+    return FACTOR * x if "a" in {"a", "b", "c"} else x
+
+def measure(scene, run, power=2):
+    return {"depth": helper(run.y_min[-1]) ** power}
+
+def maker(offset):
+    def machine(zeta):
+        return vi.Scene.ideal(frequency_ratio=zeta + offset)
+    return machine
+
+class Depth(vi.AbstractMeasure):
+    power: float = 2.0
+
+    def __call__(self, scene, run):
+        return {"depth": self.scaled(run.y_min[-1])}
+
+    def scaled(self, x):
+        return helper(x)
+
+class Ball(vi.AbstractScene):
+    stops: tuple = ()
+    cycle: float = 1.0
+
+    def field(self, s, state):
+        return vi.OscillatorState(state.V, -9.81)
+
+class Plain:
+    def __init__(self):
+        self.gain = 1.5
+
+    def __call__(self, scene, run):
+        return {"depth": self.gain * run.y_min[-1]}
+"""
+THINGS = {
+    "measure": "measure",
+    "lambda": "lambda scene, run: {'depth': helper(run.y_min[-1])}",
+    "partial": "functools.partial(measure, power=3)",
+    "compiled": "jax.jit(measure)",
+    "filtered": "eqx.filter_jit(measure)",
+    "mapped": "jax.vmap(measure)",
+    "closure": "maker(0.1)",
+    "module": "Depth()",
+    "scene": "Ball()",
+    "object": "Plain()",
+}
+
+
+def identities(source):
+    space = {"__name__": "study"}
+    exec(compile(source, "study.py", "exec"), space)
+    return {name: identity(eval(text, space)) for name, text in THINGS.items()}
+
+
+@pytest.mark.parametrize(
+    "old, new, changed",
+    [
+        ("FACTOR = 2.0", "FACTOR = 2.0  # unit: a", set()),
+        ("power=2)", "power=3)", {"measure", "compiled", "filtered", "mapped", "partial"}),
+        ("maker(offset):\n", "maker(offset):\n    offset = 2 * offset\n", {"closure"}),
+        ("-9.81", "-9.82", {"scene"}),
+        ("self.gain = 1.5", "self.gain = 1.6", {"object"}),
+        ('return {"depth": self.scaled', 'return {"deep": self.scaled', {"module"}),
+        ("power: float = 2.0", "power: float = 3.0", {"module"}),
+        (
+            "FACTOR = 2.0",
+            "FACTOR = 3.0",
+            {"measure", "compiled", "filtered", "mapped", "partial", "lambda", "module"},
+        ),
+    ],
+)
+def test_what_changes_the_identity(old, new, changed):
+    assert old in SOURCE
+    before, after = identities(SOURCE), identities(SOURCE.replace(old, new))
+    assert {name for name in before if before[name] != after[name]} == changed
+
+
+def test_another_process_gives_the_same(tmp_path):
+    """Whatever order its sets have."""
+    (tmp_path / "study.py").write_text(SOURCE)
+    script = tmp_path / "tell.py"
+    script.write_text(
+        "from study import *\nimport study\nfrom vi_jax.scan.identity import identity\n"
+        f"print([identity(eval(t, vars(study))) for t in {list(THINGS.values())!r}])\n"
+    )
+    told = [
+        subprocess.run(
+            [sys.executable, str(script)],
+            env={"PYTHONHASHSEED": seed, "PYTHONPATH": ":".join(filter(None, sys.path))},
+            capture_output=True, text=True, check=True,
+        ).stdout
+        for seed in ("1", "2")
+    ]  # fmt: skip
+    assert told[0] == told[1] and told[0].count(",") == len(THINGS) - 1
+
+
+def test_what_the_library_gives_can_be_told():
+    scene = vi.Scene.ideal(frequency_ratio=0.9)
+    other = eqx.tree_at(lambda s: s.drive.frequency_ratio, scene, 0.91)
+    assert identity(scene) == identity(vi.Scene.ideal(frequency_ratio=0.9)) != identity(other)
+    methods = [vi.ExactFlight(), vi.FixedStep(), vi.FixedStep(steps_per_cycle=24), vi.Adaptive()]
+    assert len({identity(method) for method in methods}) == 4
+
+
+def test_rings_are_told_and_what_hides_is_refused():
+    def ring(n):
+        return ring(n - 1) if n else 0
+
+    assert identity(ring) == identity(ring)
+
+    lock = threading.Lock()
+
+    def hiding(scene, run):
+        return {"held": lock.locked()}
+
+    for thing in (hiding, functools.partial(hiding, 1), jax.jit(hiding), (x for x in "ab")):
+        with pytest.raises(Unverifiable):
+            identity(thing)

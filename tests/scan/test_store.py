@@ -1,0 +1,152 @@
+"""Stores that were damaged, and functions that are no longer those of the store."""
+
+import importlib
+import shutil
+import warnings
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+
+SCENE = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.01)
+AXES = {"start.Y": np.linspace(-1.0, 1.0, 600)}
+
+
+def scanned(path):
+    return vi.scan(
+        SCENE, AXES, measure="extremes", settle=5, cycles=4, lanes=256, workers=1, store=path
+    )
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    path = tmp_path_factory.mktemp("store") / "whole"
+    return path, {name: x.values for name, x in scanned(path).variables.items()}
+
+
+def _flip(path):
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 0x10
+    path.write_bytes(content)
+
+
+def _cut(path):
+    path.write_bytes(path.read_bytes()[:-3])
+
+
+@pytest.mark.parametrize(
+    "damage, where, told, blocks",
+    [
+        ("deleted", "y_min/c/1", "y_min/c/1", 1),
+        ("deleted", "y_min", "y_min, y_min/c/0, y_min/c/1, y_min/c/2", 3),
+        (_cut, "y_max/c/2", "y_max/c/2", 1),
+        (_flip, "impact_speed/c/0", "impact_speed/c/0", 1),
+        (_flip, "result/c/0", "result/c/0", 1),
+        (_cut, "check/sums/c/1/0", "check/sums/c/1/0", 1),
+        ("deleted", "check", "check/sums", 3),
+        (_cut, "y_min/zarr.json", "y_min, y_min/c/0, y_min/c/1, y_min/c/2", 3),
+        (_cut, "start.Y/c/0", "start.Y", 0),
+    ],
+)
+def test_what_is_damaged_is_told_and_computed_again(
+    whole, tmp_path, monkeypatch, damage, where, told, blocks
+):
+    path = tmp_path / "store"
+    shutil.copytree(whole[0], path)
+    broken = path / where
+    if damage == "deleted":
+        shutil.rmtree(broken) if broken.is_dir() else broken.unlink()
+    else:
+        damage(broken)
+    work = importlib.import_module("vi_jax.scan.work")
+    compute, computed = work.compute, []
+    monkeypatch.setattr(work, "compute", lambda *a: computed.append(1) or compute(*a))
+    with pytest.warns(UserWarning, match=f"lost or damaged, and is computed again: {told}[.]"):
+        found = scanned(path)
+    assert len(computed) == blocks
+    for name, numbers in whole[1].items():
+        np.testing.assert_array_equal(found[name].values, numbers)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        scanned(path)
+    assert len(computed) == blocks
+
+
+def test_a_folder_that_cannot_be_written_to_is_refused_before_any_work(whole, monkeypatch):
+    """Though the folder above can be."""
+    checks = importlib.import_module("vi_jax._checks")
+    create = checks.tempfile.TemporaryFile
+
+    def refused(dir=None, **options):
+        if dir == whole[0]:
+            raise PermissionError(13, "Permission denied")
+        return create(dir=dir, **options)
+
+    monkeypatch.setattr(checks.tempfile, "TemporaryFile", refused)
+    with pytest.raises(ValueError, match=r"`store` must be a path .*: Permission denied"):
+        scanned(whole[0])
+
+
+def test_a_block_is_no_larger_than_the_grid():
+    data = vi.scan(
+        SCENE, {"start.Y": [0.0, 0.5]}, measure="extremes", settle=5, cycles=4, lanes=10**9
+    )
+    assert (data.result == 0).all()
+
+
+def test_a_store_whose_head_is_cut_is_refused(whole, tmp_path):
+    path = tmp_path / "store"
+    shutil.copytree(whole[0], path)
+    _cut(path / "zarr.json")
+    with pytest.raises(ValueError, match=r"`store` must be the store of a scan, but .*zarr.json"):
+        scanned(path)
+
+
+def test_failed_lanes_are_no_damage(tmp_path):
+    """They are NaN, which Zarr stores as the empty chunk."""
+
+    def run():
+        axes = {"start.Y": np.linspace(2.5, 3.0, 256)}
+        return vi.scan(
+            SCENE, axes, measure="extremes", settle=5, cycles=4, workers=1, store=tmp_path / "s"
+        )
+
+    with pytest.warns(UserWarning, match="256 of 256 lanes failed"):
+        run()
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        run()
+    assert [str(w.message)[:7] for w in said] == ["256 of "]
+
+
+def test_functions_that_differ_between_the_probed_lanes_are_refused(tmp_path, monkeypatch):
+    """First and last lane are alike: only their code tells them apart."""
+    module = importlib.import_module("vi_jax.scan.scan")
+    monkeypatch.setattr(module, "run_here", lambda *arguments: iter(()))
+
+    def run(name, change=0.0, hidden=None):
+        def machine(zeta):
+            bump = change * (zeta - 0.8) * (1.2 - zeta)
+            return vi.Scene.ideal(frequency_ratio=zeta + bump, damping_ratio=0.02)
+
+        def measure(scene, run):
+            late = jnp.where(scene.drive.frequency_ratio > 0.9, 1.0 + change, 1.0)
+            return {"depth": late * run.y_min[-1], "hidden": 0.0 if hidden is None else 1.0}
+
+        scene, kept = (machine, "extremes") if name == "scene" else (SCENE, measure)
+        axes = {"zeta" if name == "scene" else "drive.frequency_ratio": [0.8, 1.0, 1.2]}
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "3 of 3 lanes failed .not_computed")
+            vi.scan(scene, axes, measure=kept, settle=5, cycles=4, store=tmp_path / name)
+
+    for name, what in {"scene": "scene", "measure": "measure 1"}.items():
+        run(name)
+        run(name)
+        with pytest.raises(ValueError, match=rf"the code of {what} is \w+, and now it is \w+"):
+            run(name, change=0.1)
+    opaque = (x for x in "ab")
+    shutil.rmtree(tmp_path / "measure")
+    run("measure", hidden=opaque)
+    with pytest.raises(ValueError, match=r"must be new, since it cannot be told .* measure 1"):
+        run("measure", hidden=opaque)

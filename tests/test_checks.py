@@ -1,0 +1,31 @@
+"""What is passed in is looked at before any work, and refused with a sentence that names it."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from vi_jax import _checks
+
+
+def test_calls_that_cannot_be_run_are_refused_with_a_reason():
+    script = Path(__file__).with_name("refused_calls.py")
+    root = Path(_checks.__file__).parents[1]
+    told = subprocess.run(
+        [sys.executable, str(script)],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(root)},
+        cwd=script.parent,
+    )
+    assert told.returncode == 0, told.stderr
+    found = json.loads(told.stdout)
+    assert found["wrong"] == {} and found["calls"] > 100
+
+
+def test_no_more_than_the_memory_is_asked_for():
+    _checks.fits_memory("cycles", 1e6)
+    with pytest.raises(ValueError, match=r"`cycles` must ask for results that fit into the memory"):
+        _checks.fits_memory("cycles", 1e18)

@@ -1,0 +1,109 @@
+"""What a scan is, in words and numbers: by it a store knows its own scan, and data their origin."""
+
+import hashlib
+import json
+import re
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+
+from ..scene.leaves import leaf, leaf_names
+from .grid import Blocks
+from .identity import Unverifiable, identity
+from .job import Job
+from .store import UNVERIFIABLE
+
+
+def description_of(job: Job, blocks: Blocks) -> dict[str, Any]:
+    """What makes two scans the same, in words and numbers that JSON can hold."""
+
+    def told(tree: Any) -> str:
+        return _lasting(eqx.tree_pformat(tree, short_arrays=False, width=10**6))
+
+    scene: dict[str, Any]
+    if job.scene is not None:
+        scene = {name: _told(leaf(job.scene, name)) for name in leaf_names(job.scene)}
+        scene["structure"] = _lasting(str(jtu.tree_structure(job.scene)))
+    else:  # a function is known by what it makes
+        scene = {"made by": _lasting(getattr(job.build, "__qualname__", repr(job.build)))}
+        for name, place in (("first", 0), ("last", -1)):
+            made, _ = job.lane(_lane(blocks, place))
+            scene |= {f"{name} {leaf_}": _told(leaf(made, leaf_)) for leaf_ in leaf_names(made)}
+            scene[f"{name} structure"] = _lasting(str(jtu.tree_structure(made)))
+    start: Any = "the scene's own"
+    if job.start is not None:
+        start = {name: _told(leaf(job.start, name)) for name in leaf_names(job.start)}
+    return {
+        "scene": scene,
+        "start": start,
+        "paired": blocks.paired,
+        "axis": {
+            name: {
+                "values": x.size,
+                "from": float(x[0]),
+                "to": float(x[-1]),
+                "digest": hashlib.sha256(x.tobytes()).hexdigest()[:16],
+            }
+            for name, x in blocks.axes.items()
+        },
+        "measure": [told(m) for m in job.measures],
+        "method": told(job.method),
+        "clock": job.clock,
+        "settle": int(job.settle),
+        "cycles": job.cycles,
+        "derivatives": list(job.derivatives),
+        "max_impacts": job.max_impacts,
+        "max_steps": job.max_steps,
+        "lanes": blocks.lanes,
+        "precision": str(jnp.result_type(float)),
+        "code of": _codes(job),
+    }
+
+
+def _lasting(text: str) -> str:
+    """Without addresses in memory, which are others in each process."""
+    return re.sub(r" at 0x[0-9a-fA-F]+", "", text)
+
+
+def _lane(blocks: Blocks, place: int) -> dict[str, Any]:
+    return {name: jnp.asarray(x[place]) for name, x in blocks.axes.items()}
+
+
+def _codes(job: Job) -> dict[str, str]:
+    """What tells the user's own functions and classes from others of the same name."""
+    parts: dict[str, Any] = {"scene": job.scene if job.build is None else job.build}
+    parts |= {"start": job.start, "method": job.method}
+    for i, measure in enumerate(job.measures):
+        parts[f"measure {i + 1}"] = measure
+    found = {}
+    for name, part in parts.items():
+        try:
+            found[name] = identity(part)
+        except Unverifiable as error:
+            found[name] = f"{UNVERIFIABLE}{error}"
+    return found
+
+
+def _told(x: Any) -> Any:
+    return np.asarray(x, float).tolist()
+
+
+def attributes_of(about: dict[str, Any]) -> dict[str, Any]:
+    """The attributes of a scan's data, from its description."""
+    try:
+        number = version("vi-jax")
+    except PackageNotFoundError:
+        number = "not installed"
+    return {
+        "vi_jax": number,
+        "method": about["method"],
+        "settle": about["settle"],
+        "cycles": about["cycles"],
+        "scene": json.dumps(about["scene"]),
+        "start": json.dumps(about["start"]),
+        "precision": about["precision"],
+    }
