@@ -360,7 +360,7 @@ def _told_axes(axes: Mapping[str, Sequence[float]]) -> str:
 def _regimes(data: xr.Dataset) -> list[str]:
     """How many motions there are of each period."""
     period = np.asarray(data["period"])[np.asarray(data["result"]) == 0]
-    names = {0: "unsettled", -1: "chaotic"}
+    names = {0: "unsettled", -1: "chaotic", -3: "transiently chaotic"}
     kinds, counts = np.unique(period, return_counts=True)
     order = sorted(zip(kinds.tolist(), counts.tolist(), strict=True), key=lambda pair: -pair[1])
     lines = [

@@ -11,7 +11,10 @@ import xarray as xr
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
-PERIODS = np.array([[1, 2, 8], [9, 64, 0], [-1, -2, 1], [1, -1, 2]])
+PERIODS = np.array([[1, 2, 8], [9, 64, 0], [-1, -2, 1], [-3, -1, 2]])
+
+
+IRREGULAR = {"chaotic": 0.1, "unsettled": 0.0, "failed": 0.1, "transient": 0.1}
 
 
 def _axes():
@@ -47,10 +50,11 @@ def test_regimes_have_the_colours_of_the_legend():
     ax = _axes()
     assert vi.plot_regimes(_data(), ax=ax) is ax
     names = {1: "2π", 2: "4π", 8: "16π", 9: "> 16π", 64: "> 16π"}
-    names |= {0: "unsettled", -1: "chaotic", -2: "failed"}
+    names |= {0: "unsettled", -1: "chaotic", -2: "failed", -3: "transiently chaotic"}
     cells, _ = _cells(ax)
     legend = _legend(ax)
-    assert list(legend) == ["2π", "4π", "16π", "> 16π", "unsettled", "chaotic", "failed"]
+    told = ["2π", "4π", "16π", "> 16π", "unsettled", "transiently chaotic", "chaotic", "failed"]
+    assert list(legend) == told
     assert len(set(legend.values())) == len(legend)
     for place, period in np.ndenumerate(PERIODS):
         np.testing.assert_allclose(cells[place], legend[names[period]])
@@ -75,7 +79,8 @@ def test_axes_by_name_single_rows_and_what_was_not_computed():
     np.testing.assert_array_equal(_cells(turned)[0], straight.transpose(1, 0, 2))
     assert turned.get_xlabel() == "restitution k"
     one = _data(PERIODS[:, :1], y=(0.4,), result=np.array([[0], [0], [-1], [0]]))
-    assert list(_legend(vi.plot_regimes(one, ax=_axes()))) == ["2π", "> 16π", "not computed"]
+    told = ["2π", "> 16π", "transiently chaotic", "not computed"]
+    assert list(_legend(vi.plot_regimes(one, ax=_axes()))) == told
 
 
 def test_maps_need_two_axes():
@@ -97,20 +102,21 @@ def _basins(label, dims, **coords):
         ),
     ]
     data = xr.Dataset({"label": (dims, np.asarray(label, np.int8))}, coords=coords)
-    return vi.Basins(data, motions, {"chaotic": 0.1, "unsettled": 0.0, "failed": 0.2})
+    return vi.Basins(data, motions, {**IRREGULAR})
 
 
 def test_basins_on_a_grid():
-    label = [[0, 0, 1], [1, -1, -3]]
+    label = [[0, -4, 1], [1, -1, -3]]
     dims = ("start.Y", "start.V")
     found = _basins(label, dims, **{"start.Y": [-1.0, 1.0], "start.V": [-1.0, 0.0, 1.0]})
     ax = _axes()
     assert vi.plot_basins(found, ax=ax) is ax
     legend = _legend(ax)
-    names = ["2π, 1 impact: 50.0 %", "4π, 3 impacts: 20.0 %", "chaotic: 10.0 %", "failed: 20.0 %"]
+    names = ["2π, 1 impact: 50.0 %", "4π, 3 impacts: 20.0 %", "chaotic: 10.0 %", "failed: 10.0 %"]
+    names.append("transiently chaotic: 10.0 %")
     assert list(legend) == names
     cells, _ = _cells(ax)
-    of = {0: names[0], 1: names[1], -1: names[2], -3: names[3]}
+    of = {0: names[0], 1: names[1], -1: names[2], -3: names[3], -4: names[4]}
     for place, value in np.ndenumerate(np.array(label)):
         np.testing.assert_allclose(cells[place], legend[of[value]])
     first, second = ax.lines

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
+from vi_jax.scan.lyapunov import _weighted
 
 
 def ideal(zeta=0.9, k=0.5, xi=0.0, gap=2.0):
@@ -104,7 +105,25 @@ def test_failed_runs_and_bad_arguments():
         vi.lyapunov(scene, scene.start(), 2)
 
 
-def test_a_motion_that_rests_forgets_at_once():
-    scene = vi.Scene.ideal(frequency_ratio=0.4, restitution=0.6, gap=0.3, damping_ratio=0.05)
-    found = vi.lyapunov(scene, scene.start(), 40)
+@pytest.mark.parametrize(
+    "zeta, k, gap, xi", [(0.3, 0.4, 0.3, 0.05), (0.17, 0.6, 0.5, 0.02), (0.4, 0.6, 0.3, 0.05)]
+)
+def test_a_motion_that_rests_forgets_at_once(zeta, k, gap, xi):
+    # At the default 400 cycles, whose outermost weights are 0.
+    scene = ideal(zeta=zeta, k=k, xi=xi, gap=gap)
+    start = scene.start(Y=-0.5, V=0.1)
+    found = vi.lyapunov(scene, start)
     assert bool(found.successful) and (np.asarray(found.exponents) == -np.inf).all()
+    assert (np.asarray(found.per_cycle) == -np.inf).all() and float(found.spread) == 0
+    # The two starts end alike to the last digit: that is what -∞ says.
+    ends = [vi.simulate(scene, scene.start(Y=Y), 1, settle=40).last for Y in (-0.5, -0.4)]
+    np.testing.assert_allclose(*(jnp.stack(jax.tree.leaves(end)) for end in ends), rtol=1e-12)
+
+
+def test_one_rest_is_enough():
+    # Whatever the weight of the cycle in which a direction is forgotten: it does not come back.
+    rates, duration = np.full((400, 2), -0.1), np.ones(400)
+    rates[-1, 1] = -np.inf
+    mean, halves = _weighted(jnp.asarray(rates), jnp.asarray(duration))
+    np.testing.assert_allclose(mean, [-0.1, -np.inf])
+    np.testing.assert_allclose(halves, [-0.1, -0.1])

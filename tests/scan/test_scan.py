@@ -64,10 +64,19 @@ def test_labels_units_and_origin(data):
     assert data.result.attrs["flag_meanings"].split()[1] == "successful"
 
 
+def _regimes_of(lanes, settle):
+    zeta, k, xi = np.array(lanes).T
+    axes = {
+        "drive.frequency_ratio": zeta,
+        "stops.0.restitution": k,
+        "oscillator.damping_ratio": xi,
+    }
+    return vi.scan(SCENE, axes, measure="regime", settle=settle, paired=True)
+
+
 def test_regime_tells_periods_chaos_and_what_does_not_settle():
-    scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.8, gap=2.0)
     zetas = [0.65, 0.7, 0.9, 0.97, 1.1, 1.4]
-    data = vi.scan(scene, {"drive.frequency_ratio": zetas}, settle=3000)
+    data = _regimes_of([(zeta, 0.8, 0.0) for zeta in zetas], settle=3000)
     period = dict(zip(zetas, np.asarray(data.period).tolist(), strict=True))
     assert period[0.9] == 2 and period[1.1] == 1
     assert period[0.7] == -1 and period[0.97] == -1
@@ -75,6 +84,51 @@ def test_regime_tells_periods_chaos_and_what_does_not_settle():
     free = vi.Scene.ideal(frequency_ratio=0.77, gap=None)
     quiet = vi.scan(free, {"start.Y": [0.3]}, measure="regime", settle=10)
     assert int(quiet.period[0]) == 0
+
+
+def test_a_chaotic_transient_is_not_called_chaos():
+    """Off the stop the motion is linear and fades at the rate ξ: nothing grows any more."""
+    lanes = [(0.69, 0.7, 0.001), (0.69, 0.5, 0.003), (0.7, 0.8, 0.0), (0.97, 0.8, 0.0)]
+    data = _regimes_of(lanes, settle=22)
+    assert np.asarray(data.period).tolist() == [-3, -3, -1, -1]
+    assert dict(
+        zip(
+            data.period.attrs["flag_meanings"].split(),
+            data.period.attrs["flag_values"],
+            strict=True,
+        )
+    ) == {"transient": -3, "failed": -2, "chaotic": -1, "unsettled": 0}
+
+    @jax.jit
+    @jax.vmap
+    def looked_at(zeta, k, xi):
+        scene = vi.Scene.ideal(frequency_ratio=zeta, restitution=k, damping_ratio=xi)
+        first = vi.lyapunov(scene, scene.start(), 256, settle=150, number=1).exponents[0]
+        return first, vi.simulate(scene, scene.start(), 64, settle=4000)
+
+    first, run = looked_at(*np.array(lanes).T)
+    assert (first > 5e-3).all()
+    assert (np.asarray(run.impacts.sum(axis=1)) == 0).tolist() == [True, True, False, False]
+    for (zeta, _, xi), Y in zip(lanes[:2], run.last.Y, strict=False):
+        steady = (1 / (1 - zeta**2 + 2j * xi * zeta)).real
+        assert float(Y) == pytest.approx(steady, abs=1e-9)
+
+
+@pytest.mark.slow
+def test_few_of_the_chaotic_lanes_are_transients():
+    """Of 16 × 16 lanes from rest without damping, those called chaotic, much later."""
+
+    def machine(zeta, k):
+        return vi.Scene.ideal(frequency_ratio=zeta, restitution=k, gap=2.0)
+
+    axes = {"zeta": np.linspace(0.5, 0.705, 16), "k": np.linspace(0.05, 0.95, 16)}
+    wrong = {}
+    later = vi.scan(machine, axes, measure=vi.Regime(lasting=0), settle=12_000)
+    for lasting in (0, 4000):
+        found = vi.scan(machine, axes, measure=vi.Regime(lasting=lasting), settle=400)
+        chaotic = np.asarray(found.period) == -1
+        wrong[lasting] = float(np.mean(np.asarray(later.period)[chaotic] != -1))
+    assert wrong[0] > 0.15 and wrong[4000] < 0.5 * wrong[0], wrong
 
 
 def test_blocks_do_not_change_numbers(data):

@@ -17,8 +17,16 @@ _PERIODS = (
     "#4c78a8", "#f58518", "#54a24b", "#e45756", "#72b7b2", "#eeca3b", "#b279a2", "#9d755d",
     "#ff9da6",
 )  # fmt: skip
-_OTHERS = {0: ("unsettled", "#c8c8c8"), -1: ("chaotic", "#222222"), -2: ("failed", "#ffffff")}
-_NOT_COMPUTED = "#f3f3f3"
+_OTHERS = {
+    0: ("unsettled", "#c8c8c8"),
+    -1: ("chaotic", "#222222"),
+    -2: ("failed", "#ffffff"),
+    -3: ("transiently chaotic", "#7a6f86"),
+    -4: ("not computed", "#f3f3f3"),
+}
+_LEAST = min(_OTHERS)
+# What the labels of basins say, in these codes: -1 and so on.
+_IRREGULAR = {"chaotic": -1, "unsettled": 0, "failed": -2, "transient": -3}
 
 # Motions named one by one in the legend; further ones share its last line.
 _NAMED = 12
@@ -29,8 +37,8 @@ def plot_regimes(
 ) -> Axes:
     """A map of the regimes of motion over two axes of a scan.
 
-    Each cell has the colour of its period, up to 8 drive cycles and beyond; chaotic, unsettled
-    and failed lanes have colours of their own. The legend names what is there.
+    Each cell has the colour of its period, up to 8 drive cycles and beyond; chaotic, transiently
+    chaotic, unsettled and failed lanes have colours of their own. The legend names what is there.
 
     **Arguments:** the data of a scan that measured `"regime"`; `ax`, axes to draw into, a new
     figure if left out; `x` and `y`, the names of the axes to draw along, the first and the second
@@ -46,13 +54,15 @@ def plot_regimes(
     x, y = _two_axes([str(name) for name in period.dims], x, y)
     period = period.transpose(y, x)
     codes = np.asarray(period).astype(int)
-    shades = np.clip(codes, -2, len(_PERIODS))
+    shades = np.clip(codes, _LEAST + 1, len(_PERIODS))
     if "result" in data:
-        shades[np.asarray(data["result"].transpose(y, x)) == -1] = -3
+        shades[np.asarray(data["result"].transpose(y, x)) == -1] = _LEAST
     ax = new_axes(ax)
     across, up = np.asarray(data[x], float), np.asarray(data[y], float)
-    _image(ax, across, up, shades + 3, [_shade(i)[1] for i in range(-3, len(_PERIODS) + 1)])
-    order = [i for i in [*range(1, len(_PERIODS) + 1), 0, -1, -2, -3] if (shades == i).any()]
+    colors = [_shade(i)[1] for i in range(_LEAST, len(_PERIODS) + 1)]
+    _image(ax, across, up, shades - _LEAST, colors)
+    order = [*range(1, len(_PERIODS) + 1), 0, -3, -1, -2, _LEAST]
+    order = [i for i in order if (shades == i).any()]
     _legend(ax, [_shade(i) for i in order])
     ax.set_xlabel(axis_name(x))
     ax.set_ylabel(axis_name(y))
@@ -61,8 +71,6 @@ def plot_regimes(
 
 def _shade(code: int) -> tuple[str, str]:
     """Name and colour of a regime."""
-    if code == -3:
-        return "not computed", _NOT_COMPUTED
     if code <= 0:
         return _OTHERS[code]
     most = len(_PERIODS)
@@ -86,15 +94,15 @@ def plot_basins(found: Basins, *, ax: Axes | None = None) -> Axes:
     x, y = _two_axes(names, None, None)
     ax = new_axes(ax)
     across, up = np.asarray(found.data[x], float), np.asarray(found.data[y], float)
-    colors = _basin_colors(len(found.attractors))
+    colors, irregular = _basin_colors(len(found.attractors)), len(_IRREGULAR)
     if label.dims == ("sample",):
-        ax.scatter(across, up, c=[colors[i + 3] for i in np.asarray(label)], s=6, lw=0)
+        ax.scatter(across, up, c=[colors[i + irregular] for i in np.asarray(label)], s=6, lw=0)
     else:
-        _image(ax, across, up, np.asarray(label.transpose(y, x)).astype(int) + 3, colors)
+        _image(ax, across, up, np.asarray(label.transpose(y, x)).astype(int) + irregular, colors)
     region = ax.get_xlim(), ax.get_ylim()
     entries = []
     for a in found.attractors:
-        color = colors[a.label + 3]
+        color = colors[a.label + irregular]
         parts = [a.sections[name.removeprefix("start.")] for name in (x, y)]
         ax.plot(*parts, "o", color=color, mec="k", mew=1.0, ms=6, zorder=3)
         impacts = f"{a.impacts:g} impact{'' if a.impacts == 1 else 's'}"
@@ -103,10 +111,10 @@ def plot_basins(found: Basins, *, ax: Axes | None = None) -> Axes:
         rest = sum(a.fraction for a in found.attractors[_NAMED:])
         further = (f"{len(entries) - _NAMED} further: {100 * rest:.1f} %", "none")
         entries = [*entries[:_NAMED], further]
-    for code, name in zip((0, -1, -2), ("unsettled", "chaotic", "failed"), strict=True):
+    for name, code in _IRREGULAR.items():
         part = found.irregular[name]
         if part:
-            entries.append((f"{name}: {100 * part:.1f} %", _OTHERS[code][1]))
+            entries.append((f"{_OTHERS[code][0]}: {100 * part:.1f} %", _OTHERS[code][1]))
     _legend(ax, entries)
     ax.set(xlim=region[0], ylim=region[1])  # section points beyond the region stay outside
     ax.set_xlabel(f"{x.removeprefix('start.')} at the start")
@@ -115,8 +123,8 @@ def plot_basins(found: Basins, *, ax: Axes | None = None) -> Axes:
 
 
 def _basin_colors(motions: int) -> list[str]:
-    """Colours of the labels -3, -2, -1, 0, 1, …; many motions share them in turn."""
-    irregular = [_OTHERS[code][1] for code in (-2, 0, -1)]
+    """Colours of the labels -4, -3, …, 0, 1, …; many motions share them in turn."""
+    irregular = [_OTHERS[code][1] for code in reversed(_IRREGULAR.values())]
     return irregular + [_PERIODS[i % len(_PERIODS)] for i in range(motions)]
 
 

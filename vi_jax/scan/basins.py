@@ -21,7 +21,13 @@ from .job import START
 from .measures import AbstractMeasure, Regime
 from .scan import scan
 
-CHAOTIC, UNSETTLED, FAILED = -1, -2, -3
+CHAOTIC, UNSETTLED, FAILED, TRANSIENT = -1, -2, -3, -4
+_IRREGULAR = {
+    "chaotic": CHAOTIC,
+    "unsettled": UNSETTLED,
+    "failed": FAILED,
+    "transient": TRANSIENT,
+}
 
 
 class Attractor(NamedTuple):
@@ -48,12 +54,13 @@ class Basins(NamedTuple):
 
     data: xr.Dataset
     """`label` over the region (or over `sample`): a number in `attractors`, or -1 for chaotic, -2
-    for unsettled and -3 for failed lanes; `period`, `impacts`, `result`, and a section state on
-    which the lane ended."""
+    for unsettled, -3 for failed and -4 for transiently chaotic lanes; `period`, `impacts`,
+    `result`, and a section state on which the lane ended."""
     attractors: list[Attractor]
     """The periodic motions, the largest basin first: label i is `attractors[i]`."""
     irregular: dict[str, float]
-    """Fractions of the starts that ended on no periodic motion: chaotic, unsettled, failed."""
+    """Fractions of the starts that ended on no periodic motion: chaotic, unsettled, failed,
+    transient (transiently chaotic, see `Regime`)."""
 
     def __str__(self) -> str:
         many = "" if len(self.attractors) == 1 else "s"
@@ -180,9 +187,10 @@ def basins(
     label, motions = _sorted_out(period, states, apart, followed)
     attractors = []
     order = np.argsort([-np.sum(label == i) for i in range(len(motions))], kind="stable")
-    place = np.empty(len(order) + 3, int)
+    irregular = list(_IRREGULAR.values())
+    place = np.empty(len(order) + len(irregular), int)
     place[order] = np.arange(len(order))
-    place[[CHAOTIC, UNSETTLED, FAILED]] = [CHAOTIC, UNSETTLED, FAILED]
+    place[irregular] = irregular
     label = place[label]
     for i, old in enumerate(order):
         here = label == i
@@ -198,19 +206,16 @@ def basins(
                 error=math.sqrt(p * (1 - p) / label.size),
             )
         )
-    irregular = {
-        name: float(np.mean(label == number))
-        for name, number in (("chaotic", CHAOTIC), ("unsettled", UNSETTLED), ("failed", FAILED))
-    }
+    parts = {name: float(np.mean(label == number)) for name, number in _IRREGULAR.items()}
     about = {
         "long_name": "motion that the start settles on",
-        "flag_values": [CHAOTIC, UNSETTLED, FAILED],
-        "flag_meanings": "chaotic unsettled failed",
+        "flag_values": irregular,
+        "flag_meanings": " ".join(_IRREGULAR),
     }
     dims = data["period"].dims
-    kind = np.min_scalar_type(-max(3, len(order)))
+    kind = np.min_scalar_type(-max(4, len(order)))
     data = data.assign(label=(dims, label.astype(kind).reshape(data["period"].shape), about))
-    return Basins(data, attractors, irregular)
+    return Basins(data, attractors, parts)
 
 
 def _sorted_out(
@@ -223,6 +228,7 @@ def _sorted_out(
     label = np.full(period.size, FAILED)
     label[period == 0] = UNSETTLED
     label[period == -1] = CHAOTIC
+    label[period == -3] = TRANSIENT
     settled = np.flatnonzero(period > 0)
     if not settled.size:
         return label, []

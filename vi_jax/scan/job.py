@@ -97,7 +97,14 @@ class Job(eqx.Module):
         found, state = self._first(values, wanted, None)
         out = dict(found)
         for measure in self.measures:
-            out = self._again(measure, values, wanted, state, out)
+            if measure.looks == 1:
+                out = self._again(measure, values, wanted, state, out)
+                continue
+
+            def look(number, out, measure=measure):
+                return self._again(measure, values, wanted, state, out, number)
+
+            out = jax.lax.fori_loop(0, measure.looks, look, out)
         if self.derivatives:
             basis = jnp.eye(len(self.derivatives), dtype=jtu.tree_leaves(values)[0].dtype)
 
@@ -133,10 +140,12 @@ class Job(eqx.Module):
 
         return jax.vmap(measured)(values, run), jax.vmap(lambda run: run.last)(run)
 
-    def _again(self, measure: AbstractMeasure, values, wanted, state, out: Numbers) -> Numbers:
-        """`out` with what `measure` finds at a second look, at the lanes that need it only."""
+    def _again(
+        self, measure: AbstractMeasure, values, wanted, state, out: Numbers, *look: Array
+    ) -> Numbers:
+        """`out` with what `measure` finds at another look, at the lanes that need it only."""
         lanes = wanted.shape[0]
-        unclear = jax.vmap(measure.unclear)(out)
+        unclear = jax.vmap(lambda found: measure.unclear(found, *look))(out)
         if unclear is None:
             return out
         unclear = unclear & wanted & (out["result"] == 0)
@@ -150,7 +159,8 @@ class Job(eqx.Module):
             def one(index):
                 here = jtu.tree_map(lambda x: x[index], (values, state, out))
                 scene, _ = self.lane(here[0])
-                return {**here[2], **measure.later(scene, here[1], self.method, here[2])}
+                later = measure.later(scene, here[1], self.method, here[2], *look)
+                return {**here[2], **later}
 
             new = jax.vmap(one)(jnp.minimum(index, lanes - 1))
             fits = (index < lanes) & unclear[jnp.minimum(index, lanes - 1)]

@@ -151,7 +151,9 @@ def _weighted(rates, duration):
     def mean(rates, duration):
         place = (jnp.arange(duration.size, dtype=duration.dtype) + 0.5) / duration.size
         weight = jnp.exp(-1 / (place * (1 - place)))
-        return (weight @ rates) / (weight @ duration)
+        # At both ends weights fall below the smallest number, and 0 · ∞ is no number.
+        lost = jnp.any(rates == -jnp.inf, axis=0)
+        return jnp.where(lost, -jnp.inf, weight @ jnp.where(lost, 0.0, rates)) / (weight @ duration)
 
     half = duration.size // 2
     halves = [mean(rates[part, :1], duration[part])[0] for part in (slice(half), slice(half, None))]

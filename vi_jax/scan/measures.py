@@ -35,14 +35,25 @@ class AbstractMeasure(eqx.Module):
     def __call__(self, scene: AbstractScene, run: Run) -> Numbers:
         """Named numbers (or short arrays) of one lane."""
 
-    def unclear(self, found: Numbers) -> Bool[Array, ""] | None:
-        """Whether `later` is needed for a lane; `None` if for none."""
+    @property
+    def looks(self) -> int:
+        """How often `later` may be needed for a lane."""
+        return 1
+
+    def unclear(self, found: Numbers, look: Any = 0) -> Bool[Array, ""] | None:
+        """Whether `later` is needed for a lane, at look number `look`; `None` if for none."""
         return None
 
     def later(
-        self, scene: AbstractScene, state: Any, method: AbstractMethod, found: Numbers
+        self,
+        scene: AbstractScene,
+        state: Any,
+        method: AbstractMethod,
+        found: Numbers,
+        look: Any = 0,
     ) -> Numbers:
-        """Costlier numbers, only for lanes that are unclear; they replace those found."""
+        """Costlier numbers, only for lanes that are unclear; they replace those found. `state` is
+        that after the cycles observed, at every look."""
         return {}
 
 
@@ -155,36 +166,43 @@ class Exponent(AbstractMeasure):
         """Not yet known."""
         return {"exponent": jnp.full_like(run.sections.Y[-1], jnp.nan)}
 
-    def unclear(self, found):
+    def unclear(self, found, look=0):
         """Always."""
         return jnp.asarray(True)
 
-    def later(self, scene, state, method, found):
+    def later(self, scene, state, method, found, look=0):
         """Of one lane."""
         found_out = lyapunov(scene, state, self.observed, settle=0, number=1, method=method)
         return {"exponent": found_out.exponents[0]}
 
 
 class Regime(AbstractMeasure):
-    """`period` in drive cycles and `impacts` in a period; unsettled and chaotic told apart.
+    """`period` in drive cycles and `impacts` in a period; what has none is told apart.
 
     A motion has the least period p ≤ `longest` after which its sections repeat within
     `tolerance` (relative to 1 + |state|; see `least_period` for one that still spirals in). One
-    that does not repeat is looked at for another `observed` cycles: it is chaotic (period -1) if
-    its greatest Lyapunov exponent exceeds `threshold` (unit: ω), else unsettled or quasi-periodic
-    (period 0).
+    that does not repeat is looked at for another `observed` cycles. Unless its greatest Lyapunov
+    exponent exceeds `threshold` (unit: ω) there, it is unsettled or quasi-periodic (period 0). If
+    it does, the motion is continued for `lasting` cycles and observed once more: it is chaotic
+    (period -1) if its exponent exceeds `threshold` again, else transiently chaotic (period -3): it
+    has settled on something else meanwhile, or is about to.
+
+    While a chaotic transient lasts, nothing tells it from chaos; what is called chaotic may leave
+    off later still. The longer `lasting`, the fewer do, and the more the chaotic lanes cost; 0
+    leaves the second look out.
     """
 
     longest: int = eqx.field(static=True, default=64)
     observed: int = eqx.field(static=True, default=256)
     tolerance: float = eqx.field(default=1e-6)
     threshold: float = eqx.field(default=2e-3)
+    lasting: int = eqx.field(static=True, default=4000)
     attributes: ClassVar[About] = {
         "period": {
             "units": "cycles",
             "long_name": "least period",
-            "flag_values": [-2, -1, 0],
-            "flag_meanings": "failed chaotic unsettled",
+            "flag_values": [-3, -2, -1, 0],
+            "flag_meanings": "transient failed chaotic unsettled",
         },
         "impacts": {
             "units": "1",
@@ -197,11 +215,17 @@ class Regime(AbstractMeasure):
         count("observed", self.observed, least=8)
         require("tolerance", self.tolerance, low=0.0, open_low=True)
         require("threshold", self.threshold)
+        count("lasting", self.lasting)
 
     @property
     def cycles(self):
         """Twice the longest period."""
         return 2 * self.longest
+
+    @property
+    def looks(self):
+        """One at what does not repeat, and one at what is chaotic."""
+        return 2 if self.lasting else 1
 
     def __call__(self, scene, run):
         """Of one lane; chaos is not yet told."""
@@ -212,15 +236,18 @@ class Regime(AbstractMeasure):
             "impacts": impacts_of(run.impacts.astype(run.sections.Y.dtype), period),
         }
 
-    def unclear(self, found):
-        """Where it does not repeat."""
-        return found["period"] == 0
+    def unclear(self, found, look=0):
+        """Where it does not repeat; at the second look, where it is chaotic."""
+        return found["period"] == -look
 
-    def later(self, scene, state, method, found):
-        """Chaotic or not."""
-        out = lyapunov(scene, state, self.observed, settle=0, number=1, method=method)
-        period = jnp.where(out.exponents[0] > self.threshold, -1, found["period"])
-        return {"period": period.astype(found["period"].dtype)}
+    def later(self, scene, state, method, found, look=0):
+        """Chaotic or not; at the second look, still or not."""
+        settle = look * (self.observed + self.lasting)
+        out = lyapunov(scene, state, self.observed, settle=settle, number=1, method=method)
+        chaotic = out.exponents[0] > self.threshold
+        # What cannot be continued is left as it was.
+        otherwise = jnp.where(out.successful & (look > 0), -3, found["period"])
+        return {"period": jnp.where(chaotic, -1, otherwise).astype(found["period"].dtype)}
 
 
 class Custom(AbstractMeasure):
