@@ -293,7 +293,7 @@ for system in found.systems:
             strict=True,
         )
     )
-for system, branch in everything:
+for system, branch in ((s, b) for s in found.systems for b in s.branches):
     count = branch.impact_speed.shape[1]
     motion = f"{2 * branch.cycles}π, {count} impact{'s' * (count > 1)}"
     for point in sorted(branch.special, key=lambda p: p.parameter):

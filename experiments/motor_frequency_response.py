@@ -97,7 +97,7 @@ down = {key: jax.tree.map(lambda x, i=i: x[i + len(LANES)], both) for i, key in 
 
 # The strong motors close down once more, in steps sixty times as fine below κ = 1.235, where their
 # free motion comes near the stop. The rows of the other motors are filled with the same.
-FINE = tuple(torque for torque in (100.0, 10.0, 2.0) if (torque, NEAR) in LANES)
+FINE = tuple(torque for torque in (100.0, 10.0) if (torque, NEAR) in LANES)
 near_stop = np.concatenate([np.linspace(1.9, 1.24, VALUES // 3), np.linspace(
     1.235, 1.217, VALUES - VALUES // 3)])  # fmt: skip
 rows_of = np.resize(FINE, len(torques))
@@ -319,7 +319,7 @@ within 1e-6 in up to 16 cycles.
   ({", ".join(outside)}).
   Where strong motors close down, it is the coarse step of κ that sets off a transient which reaches
   the stop too early. In steps of {1e4 * (1.235 - 1.217) / (VALUES - VALUES // 3 - 1):.1f}e-4 they
-  jump at their grazings: {fine_told}.
+  jump at their grazings, to one step: {fine_told}.
   The weakest motor passes its fold (T0 = 0.05 N·m, close-down at
   {points[(0.05, NEAR), "down"]:.3f}) and jumps only at {weakest[0]:.3f} … {weakest[1]:.3f}: it
   needs the cycles of several values to leave it.

@@ -13,8 +13,7 @@ from typing import Any
 
 import vi_jax as vi
 from matplotlib.figure import Figure
-from PIL import Image
-from PIL.PngImagePlugin import PngInfo
+from vi_jax.plot.stamp import stamp
 
 FINGERPRINT = "vi_jax fingerprint of the table's numbers"
 _TITLE = "## Headline numbers"
@@ -36,7 +35,7 @@ def keep(
     picture = folder / "figures" / f"{study}.png"
     picture.parent.mkdir(exist_ok=True)
     vi.save_picture(figure, picture, **look)
-    stamp(picture, fingerprint(page))
+    stamp(picture, FINGERPRINT, fingerprint(page))
     (folder / f"{study}.md").write_text(page, encoding="utf-8")
 
 
@@ -52,18 +51,3 @@ def fingerprint(page: str) -> str:
     tables = "\n".join(line for line in page.splitlines() if line.startswith("|"))
     told = json.dumps(headlines(page), sort_keys=True, ensure_ascii=False)
     return hashlib.sha256((" ".join(_NUMBER.findall(tables)) + told).encode()).hexdigest()
-
-
-def stamp(picture: Path, mark: str) -> None:
-    """Put a fingerprint into a PNG, whose pixels stay as they are."""
-    with Image.open(picture) as image:
-        image.load()
-        info = PngInfo()
-        info.add_itxt(FINGERPRINT, mark)
-        image.save(picture, "png", optimize=True, pnginfo=info, dpi=image.info.get("dpi"))
-
-
-def stamped(picture: Path) -> str | None:
-    """The fingerprint in a PNG, if there is one."""
-    with Image.open(picture) as image:
-        return image.info.get(FINGERPRINT)

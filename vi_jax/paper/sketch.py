@@ -20,7 +20,7 @@ def draw_sketch() -> Figure:
     """
     table = Parameters()
     a, rod, gap = 1.0, float(table.rod_length / table.crank_radius), 2.0
-    figure = Figure(figsize=(12, 4.4), dpi=110)
+    figure = Figure(figsize=(12, 5), dpi=110)
     figure.set_layout_engine("constrained")
     ax = figure.subplots()
     phi = 0.3 * pi
@@ -38,21 +38,18 @@ def draw_sketch() -> Figure:
     ax.plot([stop, stop], [-0.75, 0.95], color=GREEN, lw=3)
     for y in np.arange(-0.7, 0.95, 0.2):
         ax.plot([stop, stop + 0.18], [y, y + 0.14], color=GREEN, lw=1.0)
-    ax.text(stop, 1.05, "stop, restitution $k$", ha="center", color=GREEN, fontsize=12)
+    ax.text(stop + 0.3, 0.1, "stop,\nrestitution $k$", ha="left", color=GREEN, fontsize=12)
     ax.plot([-1.6, stop + 0.3], [-0.42, -0.42], color="0.7", lw=1.0, zorder=0)
     _length(ax, 0, slider, -1.75, "$u(\\varphi)$")
     _length(ax, rest, body, 1.35, "$y$")
     _length(ax, rest, rest + gap, 1.8, "$\\Delta = 2a$")
-    _length(ax, 0, body, -2.2, "$x = l_0 + l + y$")
+    _length(ax, 0, body, -2.4, "$x = l_0 + l + y$")
     ax.plot([rest, rest], [0.45, 1.95], color="0.5", lw=0.8, ls=":")
     ax.plot([rest + gap, rest + gap], [0.2, 1.95], color="0.5", lw=0.8, ls=":")
     ax.set_aspect("equal")
+    ax.set(xlim=(-1.9, stop + 1.9), ylim=(-2.7, 2.4))
     ax.axis("off")
-    ax.set_title(
-        "Fig. 1 of the paper, drawn from its text: $J\\ddot\\varphi$ is driven by "
-        "$T(\\dot\\varphi) = \\kappa T_0 (1 - \\dot\\varphi/\\kappa\\Omega_0)$",
-        fontsize=12,
-    )
+    ax.set_title("Fig. 1 of the paper, drawn from its text", fontsize=12)
     return figure
 
 
@@ -71,17 +68,17 @@ def _drive(ax: Axes, a: float, pin: tuple[float, float], slider: float, phi: flo
     ax.text((pin[0] + slider) / 2, pin[1] / 2 + 0.2, "$l$ (massless)", fontsize=12)
     ax.text(-0.72, -0.6, "$J$", fontsize=12)
     arrow = FancyArrowPatch(
-        (-0.9, 0.75), (-0.2, 1.18), connectionstyle="arc3,rad=-0.3", arrowstyle="->",
+        (-0.2, 1.18), (-0.9, 0.75), connectionstyle="arc3,rad=0.3", arrowstyle="->",
         mutation_scale=14, color="0.15",
     )  # fmt: skip
     ax.add_patch(arrow)
-    ax.text(-1.5, 1.15, "motor, $T(\\dot\\varphi)$", fontsize=12)
+    ax.text(-1.8, 1.35, "motor, $T(\\varphi')$", fontsize=12)
 
 
 def _block(ax: Axes, x: float, width: float, color: str, name: str) -> None:
     box = Rectangle((x - width / 2, -0.4), width, 0.8, facecolor=color, alpha=0.25, edgecolor=color)
     ax.add_patch(box)
-    ax.text(x, -0.72, name, ha="center", fontsize=12, color=color)
+    ax.text(x - width / 2, -0.75, name, ha="left", fontsize=12, color=color)
     ax.plot(x, 0, ".", color=color)
 
 
@@ -93,7 +90,7 @@ def _spring(ax: Axes, left: float, right: float) -> None:
 
 def _damper(ax: Axes, body: float) -> None:
     """Of the body to the ground."""
-    x, y = body + 0.15, -1.15
+    x, y = body + 0.32, -1.3
     ax.plot([x, x], [-0.4, y + 0.15], color="0.15", lw=1.2)
     ax.plot([x - 0.14, x + 0.14], [y + 0.15, y + 0.15], color="0.15", lw=1.6)
     ax.plot([x - 0.2, x - 0.2, x + 0.2, x + 0.2], [y + 0.28, y, y, y + 0.28], color="0.15", lw=1.2)
