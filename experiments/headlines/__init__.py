@@ -33,7 +33,7 @@ def keep(
     listed = json.dumps(rounded, indent=2, ensure_ascii=False, allow_nan=False)
     page = f"{text.rstrip()}\n\n{_TITLE}\n\n{_TOLD}\n\n```json\n{listed}\n```\n"
     picture = folder / "figures" / f"{study}.png"
-    picture.parent.mkdir(exist_ok=True)
+    picture.parent.mkdir(parents=True, exist_ok=True)
     vi.save_picture(figure, picture, **look)
     stamp(picture, FINGERPRINT, fingerprint(page))
     (folder / f"{study}.md").write_text(page, encoding="utf-8")

@@ -45,7 +45,13 @@ def test_every_study_has_headline_numbers():
     assert sorted(COMPUTED) == STUDIES
 
 
-@pytest.mark.parametrize("study", STUDIES)
+# Their programs take longer to compile than the rest of this file.
+LONGER = {"identify", "peers", "regime_maps"}
+
+
+@pytest.mark.parametrize(
+    "study", [pytest.param(x, marks=[pytest.mark.slow] * (x in LONGER)) for x in STUDIES]
+)
 def test_headline_numbers(study):
     kept, function = headlines(page_of(study)), COMPUTED[study]
     computed = function(kept) if inspect.signature(function).parameters else function()
@@ -78,7 +84,6 @@ def test_what_is_stale_is_told(tmp_path):
 
     figure = Figure(figsize=(2, 1))
     figure.subplots().plot([0, 1], [0, 1])
-    (tmp_path / "figures").mkdir()
     text = "# A study\n\nProse of 5 words.\n\n| ζ | k |\n|---|---|\n| 0.82456 | 1e-12 |\n"
     keep(tmp_path, "study", text, {"doubling": 0.8245572210017}, figure)
     picture, page = tmp_path / "figures" / "study.png", (tmp_path / "study.md").read_text()

@@ -9,6 +9,7 @@ from ..scene import Parameters, Scene, SliderCrank
 from .claims import CONFIRMED, CONTRADICTED, PARTLY, Claim
 from .motions import CYCLES, FREQUENCY_RATIO, GAP, RESTITUTION, Case, run_of, sampled
 from .motors import Motors
+from .orbits import mean_ratio
 
 # Crank angles at the start: eighths of a turn.
 _PHASES = 8
@@ -81,7 +82,7 @@ def _motor(motors: Motors) -> Claim:
         minima = np.asarray(run.from_rest.y_min)
         numbers[f"{run.torque:g}"] = {
             "kappa": run.kappa,
-            "frequency_ratio": float(run.orbit.frequency_ratio),
+            "frequency_ratio": mean_ratio(run.orbit),
             "minimum": float(run.orbit.y_min),
             "largest_multiplier": float(abs(complex(run.orbit.multipliers[0]))),
             "minima_cycles_3_4_from_rest": minima[2:4].tolist(),

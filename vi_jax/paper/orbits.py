@@ -24,6 +24,12 @@ class TableRow(NamedTuple):
     """κ of a motor, tuned so that the mean ζ is 0.90."""
 
 
+def mean_ratio(orbit: Orbit) -> float:
+    """ζ of a driven motion."""
+    assert orbit.frequency_ratio is not None
+    return float(orbit.frequency_ratio)
+
+
 def fit_long(scene: Scene) -> Orbit:
     """The 4π motion, fitted by optax' Adam from a state 5 % off the closed form.
 

@@ -8,7 +8,7 @@ from .claims import Claim
 from .faults import Fault
 from .motions import FREQUENCY_RATIO, GAP, RESTITUTION, Case
 from .motors import Motors
-from .orbits import TableRow
+from .orbits import TableRow, mean_ratio
 
 
 class Findings(NamedTuple):
@@ -73,7 +73,7 @@ def _found(row: TableRow) -> dict:
         "scene": row.scene,
         "found": True,
         "kappa": row.kappa,
-        "frequency_ratio": float(orbit.frequency_ratio),
+        "frequency_ratio": mean_ratio(orbit),
         "period_in_cycles": int(orbit.cycles),
         "state": {name: float(x) for name, x in vars(orbit.state).items()},
         "y_min": float(orbit.y_min),
@@ -98,7 +98,7 @@ def _table(orbits: list[TableRow]) -> list[str]:
         turns = "–" if kappa is None else f"{kappa:.6f}"
         speeds = ", ".join(f"{float(v):.5f}" for v in orbit.impact_speed)
         lines.append(
-            f"| {name} | {turns} | {float(orbit.frequency_ratio):.6f} | "
+            f"| {name} | {turns} | {mean_ratio(orbit):.6f} | "
             f"{2 * int(orbit.cycles)}π | {float(orbit.state.Y):.6f} | "
             f"{float(orbit.state.V):.6f} | {float(orbit.y_min):.6f} | {speeds} | "
             f"{abs(complex(orbit.multipliers[0])):.6f} | {'yes' if orbit.stable else 'no'} | "

@@ -1,8 +1,11 @@
 """The reproduction in one go: figures, measured claims and faults, and a report of them."""
 
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
+
+from matplotlib.figure import Figure
 
 from ..plot import save_picture
 from ..scene import Scene
@@ -13,10 +16,10 @@ from .faults import Fault, check_faults
 from .figure2_claims import check_figure_2
 from .figures import draw_figure
 from .motions import figure_scene, simulate_cases, table_damping_ratio
-from .motors import draw_motors, simulate_motors
+from .motors import Motors, draw_motors, simulate_motors
 from .orbits import orbit_table
 from .pages import Findings, as_json, as_markdown
-from .response import Response, describe, response
+from .response import describe, response
 from .response_figure import LOOK, draw_response
 from .sketch import draw_sketch
 
@@ -45,17 +48,30 @@ def reproduce(
     `fig1.png`, `fig3.png`, `fig4.png`, `motor.png`, `fig2.png`, `boundaries.png`, `report.json`,
     `report.md`.
     """
-    tell = progress or (lambda _: None)
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
-    files = []
+    files: list[Path] = []
+    # What takes the time is compiling, of which two threads do more than one.
+    with ThreadPoolExecutor(1) as aside:
+        motors = None if quick else aside.submit(simulate_motors)
+        findings = _measured(out, files, motors, progress or (lambda _: None))
+    for name, text in ((NUMBERS, as_json(findings)), (REPORT, as_markdown(findings))):
+        files.append(out / name)
+        files[-1].write_text(text, encoding="utf-8")
+    return Reproduction(findings.claims, findings.faults, files)
 
-    def keep(name: str, figure: Any, **look: Any) -> None:
+
+def _measured(
+    out: Path, files: list[Path], motors: Future[Motors] | None, tell: Callable[[str], None]
+) -> Findings:
+    """All work but the report's; without motors the quick one. Pictures are added to `files`."""
+
+    def keep(name: str, figure: Figure, **look: Any) -> None:
         files.append(save_picture(figure, out / name, **look))
 
     tell("simulating: from rest, from the 4π and from the 2π state, undamped and damped")
     keep("fig1.png", draw_sketch())
-    cases = simulate_cases(quick=quick)
+    cases = simulate_cases(quick=motors is None)
     for number in (3, 4):
         tell(f"drawing Figure {number}")
         files.append(out / f"fig{number}.png")
@@ -63,33 +79,26 @@ def reproduce(
     tell("measuring the faults of the printed text")
     faults = check_faults()
     tell("finding the periodic motions")
-    orbits, motors = orbit_table(_table_scenes()), None
-    found: Response | None = None
-    panels: dict[str, Any] | None = None
-    borders: dict[str, float | None] | None = None
-    if not quick:
-        tell("Figures 3 and 4 with the motor")
-        motors = simulate_motors()
-        orbits += motors.rows
-        keep("motor.png", draw_motors(motors.runs, cases[0].from_rest))
-        tell("Figure 2: closed forms, branches, sweeps up and down")
-        found = response()
-        panels = describe(found)
-        keep("fig2.png", draw_response(found), **LOOK)
-        tell("following the boundaries of the discrepancy in (ζ, k) and (ζ, c)")
-        curves = boundary_curves([b for system in found.systems for b in system.branches])
-        borders = describe_boundaries(curves)
-        keep("boundaries.png", draw_boundaries(curves))
+    orbits = orbit_table(_table_scenes())
+    if motors is None:
+        tell("measuring what the paper claims and assumes")
+        claims = [*check_claims(cases), *check_assumptions(cases[0])]
+        return Findings(cases, claims, faults, orbits, None, None, None)
+    tell("Figure 2: closed forms, branches, sweeps up and down")
+    found = response()
+    panels = describe(found)
+    tell("following the boundaries of the discrepancy in (ζ, k) and (ζ, c)")
+    curves = boundary_curves([b for system in found.systems for b in system.branches])
+    tell("Figures 3 and 4 with the motor")
+    driven = motors.result()
+    keep("motor.png", draw_motors(driven.runs, cases[0].from_rest))
+    keep("fig2.png", draw_response(found), **LOOK)
+    keep("boundaries.png", draw_boundaries(curves))
     tell("measuring what the paper claims and assumes")
-    seen = panels["panels"] if panels else []
-    claims = check_claims(cases, seen)
-    claims += check_figure_2(found, seen) if found is not None else []
-    claims += check_assumptions(cases[0], motors)
-    findings = Findings(cases, claims, faults, orbits, motors, panels, borders)
-    for name, text in ((NUMBERS, as_json(findings)), (REPORT, as_markdown(findings))):
-        files.append(out / name)
-        files[-1].write_text(text, encoding="utf-8")
-    return Reproduction(claims, faults, files)
+    claims = check_claims(cases, panels["panels"]) + check_figure_2(found, panels["panels"])
+    claims += check_assumptions(cases[0], driven)
+    borders = describe_boundaries(curves)
+    return Findings(cases, claims, faults, orbits + driven.rows, driven, panels, borders)
 
 
 def _table_scenes() -> dict[str, Scene]:

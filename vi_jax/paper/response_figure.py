@@ -14,7 +14,7 @@ from .motions import GAP
 from .response import FINE, RANGE, RESTITUTIONS, Response, System, between, rows
 
 # What `save_picture` makes a small file of it with.
-LOOK = {"dpi": 72, "colors": 96}
+LOOK = {"dpi": 72, "colors": 250}
 
 
 def draw_response(found: Response) -> Figure:
