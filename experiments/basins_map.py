@@ -28,6 +28,9 @@ from matplotlib.figure import Figure
 jax.config.update("jax_enable_x64", True)
 
 HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments")
+sys.path.insert(0, str(HERE))
+from headlines import keep
+
 QUICK = "--quick" in sys.argv
 BEGIN = time.perf_counter()
 # One size of block for all calls: one program. Impacts lie near φ = 0; look half a turn later.
@@ -147,9 +150,6 @@ for ax, found in zip(figure.subplots(1, 3), everything, strict=True):
     ax.set(title=found.case.title, xlabel="Y at the start (φ = π), a")
     ax.set_ylabel("V at the start, a ω")
 figure.suptitle("Which start settles on which motion; circles: the motions' section points")
-if not QUICK:
-    (HERE / "figures").mkdir(exist_ok=True)
-    vi.save_picture(figure, HERE / "figures" / "basins_map.png", dpi=85)
 
 # %% [markdown]
 # ## The table
@@ -218,6 +218,11 @@ lines.append(
 """
 )
 print("\n".join(lines))
+numbers = {
+    f"{found.case.title}: multiplier of the {2 * a.period}π motion, {a.impacts:g} impacts": size
+    for found in everything
+    for a, size in zip(found.grid.attractors, found.multipliers, strict=True)
+}
 if not QUICK:
-    (HERE / "basins_map.md").write_text("\n".join(lines), encoding="utf-8")
+    keep(HERE, "basins_map", "\n".join(lines), numbers, figure, dpi=85)
 say(f"done, {time.process_time():.0f} s of CPU time")

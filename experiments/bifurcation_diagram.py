@@ -33,6 +33,9 @@ from scipy.optimize import brentq
 jax.config.update("jax_enable_x64", True)
 
 HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments")
+sys.path.insert(0, str(HERE))
+from headlines import keep
+
 QUICK = "--quick" in sys.argv
 BEGIN = time.perf_counter()
 K, GAP, NAME = 0.8, 2.0, "drive.frequency_ratio"
@@ -423,7 +426,15 @@ values) of {CHUNKS * CHUNK:,} cycles, then {SEEN} observed, in one compiled call
   second start, the same for all ζ, goes to the other motion before the 4π motion ends.
 """
 print(report)
+numbers = {
+    "4π motion doubles": first,
+    "8π motion touches the stop": born,
+    "8π motion touches the stop, upper end": dies,
+    "4π motion doubles, upper end": second,
+    "4π motion with 2 impacts folds": fold,
+    "2π motion doubles": two_doubles,
+    "4π motion touches the stop": four_ends,
+}
 if not QUICK:
-    vi.save_picture(figure, HERE / "figures" / "bifurcation_diagram.png", colors=200)
-    (HERE / "bifurcation_diagram.md").write_text(report)
+    keep(HERE, "bifurcation_diagram", report, numbers, figure, colors=200)
 say("done")

@@ -35,6 +35,9 @@ from vi_jax.paper.boundaries import (
 jax.config.update("jax_enable_x64", True)
 
 HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments")
+sys.path.insert(0, str(HERE))
+from headlines import keep
+
 QUICK = "--quick" in sys.argv
 BEGIN = time.perf_counter()
 GAP, RESTITUTION, ZETA = 2.0, 0.5, 0.9
@@ -329,9 +332,6 @@ handles += [
 ]
 old.remove()
 figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False, fontsize=9)
-(HERE / "figures").mkdir(exist_ok=True)
-if not QUICK:
-    vi.save_picture(figure, HERE / "figures" / "boundaries.png", dpi=100)
 
 # %% [markdown]
 # ## The table
@@ -389,6 +389,8 @@ lines.append(
   two thirds of Table 1's c. At ζ = 0.9 the 2π motion is stable from c = {stable_from:.4f} on, so
   that the figures cannot be had with Table 1's c = 0.5: the simulations around that point are on
   the 2π motion.
+- Blue is the region of this family of 4π motions with one impact, the paper's; the dots show that
+  there is another one outside of it (see below).
 - The strip itself goes on. At Table 1's c it reaches from ζ = {birth_table:.3f} to
   {doubling_table:.3f}, and 4π motions with more than one impact are seen in it.
 - Motions coexist: the touch curve runs a little outside the doubling curve near ζ = 0.9; inside it,
@@ -397,7 +399,8 @@ lines.append(
   begun without damping, do not bound. With Table 1's c it ends before the 2π motion is born.
 """
 )
+kept = {name: x for name, x in told.items() if x is not None}
 if not QUICK:
-    (HERE / "boundaries.md").write_text("\n".join(lines), encoding="utf-8")
+    keep(HERE, "boundaries", "\n".join(lines), kept, figure, dpi=100)
 print("\n".join(lines[9:]))
 say(f"done, {time.process_time():.0f} s of CPU time")

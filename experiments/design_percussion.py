@@ -30,6 +30,9 @@ from matplotlib.figure import Figure
 jax.config.update("jax_enable_x64", True)
 
 HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments")
+sys.path.insert(0, str(HERE))
+from headlines import keep
+
 QUICK = "--quick" in sys.argv
 STEPS = 60 if QUICK else 300
 BEGUN = time.perf_counter()
@@ -384,7 +387,18 @@ for axes, title in zip(
 ):
     axes.set_title(title)
     axes.grid(alpha=0.3)
+numbers = {}
+for name, design, end in (
+    ("start", first, before),
+    *((name, ascent.design, ascent.end) for name, ascent in ascents.items()),
+):
+    machine = parameters(design)
+    numbers |= {
+        f"{name}: ζ": float(machine.kappa),
+        f"{name}: Δ, mm": float(machine.gap) * 1e3,
+        f"{name}: c, N·s/m": float(machine.damping),
+        f"{name}: power, W": float(end.power),
+        f"{name}: largest modulus": float(end.modulus),
+    }
 if not QUICK:
-    (HERE / "figures").mkdir(exist_ok=True)
-    vi.save_picture(figure, HERE / "figures" / "design_percussion.png")
-    (HERE / "design_percussion.md").write_text(report.replace("\\\n", ""))
+    keep(HERE, "design_percussion", report.replace("\\\n", ""), numbers, figure)

@@ -27,6 +27,9 @@ jax.config.update("jax_enable_x64", True)
 warnings.filterwarnings("ignore", message="vi_jax is running in single precision")
 
 HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments")
+sys.path.insert(0, str(HERE))
+from headlines import keep
+
 QUICK = "--quick" in sys.argv
 CYCLES, NEAR = 600, 0.05
 STYLE = {
@@ -284,6 +287,11 @@ same with only the error's part along the unstable direction, added up over the 
 
 {table}
 """
+numbers = {
+    "multiplier of the 2π motion": MULTIPLIER,
+    "cycles near the 2π motion, displaced by 1e-7": float(
+        next(r for r in rows if r.setting == "1e-07" and r.group == "displaced start").cycles
+    ),
+}
 if not QUICK:
-    (HERE / "escape_from_2pi.md").write_text(text)
-    vi.save_picture(figure, HERE / "figures" / "escape_from_2pi.png")
+    keep(HERE, "escape_from_2pi", text, numbers, figure)

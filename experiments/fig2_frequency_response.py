@@ -13,7 +13,6 @@
 
 # %%
 import sys
-import tempfile
 import time
 from pathlib import Path
 from typing import Any
@@ -24,6 +23,7 @@ import vi_jax as vi
 from vi_jax.paper.response import (
     RANGE,
     RATIO,
+    WALL,
     Response,
     System,
     between,
@@ -32,22 +32,19 @@ from vi_jax.paper.response import (
     rows,
     with_numbers,
 )
-from vi_jax.paper.response_figure import draw_response
+from vi_jax.paper.response_figure import LOOK, draw_response
 
 jax.config.update("jax_enable_x64", True)
 
 HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments")
-QUICK = "--quick" in sys.argv
-# The paper draws the wall without a number. Here the 2π motion is clear of it, and most of the
-# motions that the sweeps settle on are not.
-WALL = -2.5
+sys.path.insert(0, str(HERE))
+from headlines import keep
 
+QUICK = "--quick" in sys.argv
 begin = time.perf_counter()
-found: Response = response(quick=QUICK, wall=WALL)
+found: Response = response(quick=QUICK, walled=True)
 print(f"closed forms, branches, sweeps: {time.perf_counter() - begin:.0f} s", flush=True)
-with tempfile.TemporaryDirectory() as folder:
-    out = Path(folder) if QUICK else HERE / "figures"
-    draw_response(found, out / "fig2_frequency_response.png")
+figure = draw_response(found)
 panels = describe(found)["panels"]
 
 
@@ -287,6 +284,21 @@ filled = text.format(
     shares="; ".join(shares),
     **{name: "\n".join(lines) for name, lines in tables.items()},
 )
+numbers: dict[str, float] = {}
+for system in found.systems:
+    numbers |= dict(
+        zip(
+            (f"{panel_name(system)}: BB'", f"{panel_name(system)}: CC'"),
+            system.stretch,
+            strict=True,
+        )
+    )
+for system, branch in ((s, b) for s in found.systems for b in s.branches):
+    count = branch.impact_speed.shape[1]
+    motion = f"{2 * branch.cycles}π, {count} impact{'s' * (count > 1)}"
+    for point in sorted(branch.special, key=lambda p: p.parameter):
+        name = f"{panel_name(system)}, {motion}: {point.kind} {point.parameter:.3f}"
+        numbers[name] = point.parameter
 if not QUICK:
-    (HERE / "fig2_frequency_response.md").write_text(filled)
+    keep(HERE, "fig2_frequency_response", filled, numbers, figure, **LOOK)
 print(f"in all: {time.perf_counter() - begin:.0f} s")

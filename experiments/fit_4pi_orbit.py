@@ -26,6 +26,9 @@ from matplotlib.figure import Figure
 jax.config.update("jax_enable_x64", True)
 
 HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments")
+sys.path.insert(0, str(HERE))
+from headlines import keep
+
 QUICK = "--quick" in sys.argv
 KAPPA, TRANSIENT = 0.9, 1000
 # The rate falls from 0.02 to zero, as it does by default.
@@ -315,6 +318,11 @@ motion. A transient is over when the section repeats within 1e-6.
 - At k = 0.95 half of the random guesses lead Newton nowhere: the map over two cycles has many
   jumps there, where the motion gains or loses an impact, and the residual falls towards them.
 """
+fitted = rows[0]["newton, displaced"][0]
+numbers = {
+    "4π motion, k = 0.5, undamped, ideal: min Y": float(fitted.y_min),
+    "largest multiplier": float(abs(fitted.multipliers[0])),
+    "cycles of the transient from rest": float(rows[0]["transient"][1]),
+}
 if not QUICK:
-    (HERE / "fit_4pi_orbit.md").write_text(text)
-    vi.save_picture(figure, HERE / "figures" / "fit_4pi_orbit.png")
+    keep(HERE, "fit_4pi_orbit", text, numbers, figure)

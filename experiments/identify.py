@@ -30,6 +30,9 @@ from matplotlib.ticker import MaxNLocator
 jax.config.update("jax_enable_x64", True)
 
 HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments")
+sys.path.insert(0, str(HERE))
+from headlines import keep
+
 QUICK = "--quick" in sys.argv
 RECORDS = 16 if QUICK else 256
 CYCLES, SAMPLES, DECIBELS = 10, 32, 30.0
@@ -221,7 +224,8 @@ axes[NAMES[2]].set_title(
     "record above, ± its standard error",
     fontsize=10,
 )
+numbers = {f"{name}, first record": float(estimates[0, i]) for i, name in enumerate(NAMES)}
+numbers["k and ξ: correlation"] = float(correlation[0, 1])
+numbers["noise"] = noise
 if not QUICK:
-    (HERE / "figures").mkdir(exist_ok=True)
-    vi.save_picture(figure, HERE / "figures" / "identify.png")
-    (HERE / "identify.md").write_text(report.replace("\\\n", ""))
+    keep(HERE, "identify", report.replace("\\\n", ""), numbers, figure)

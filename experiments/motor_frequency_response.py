@@ -29,6 +29,9 @@ from matplotlib.lines import Line2D
 jax.config.update("jax_enable_x64", True)
 
 HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments")
+sys.path.insert(0, str(HERE))
+from headlines import keep
+
 QUICK = "--quick" in sys.argv
 BEGIN = time.perf_counter()
 K, NEAR, FAR = 0.5, 0.08, 0.8  # restitution; gaps in metres, 2a and 20a: the free motion needs 11a
@@ -82,14 +85,28 @@ def one_sweep(torque, gap, kappas):
 grid = np.stack([np.linspace(0.5, high, VALUES) for high in LANES.values()])
 torques, gaps = (np.tile(a, 2) for a in np.array(list(LANES)).T)
 begin = time.perf_counter()
-both = vi.jit(jax.vmap(one_sweep)).lower(torques, gaps, np.concatenate([grid, grid[:, ::-1]]))
-both = both.compile()
+both_of = vi.jit(jax.vmap(one_sweep)).lower(torques, gaps, np.concatenate([grid, grid[:, ::-1]]))
+both_of = both_of.compile()
 say(f"sweeps compiled in {time.perf_counter() - begin:.1f} s")
 begin = time.perf_counter()
-both = jax.tree.map(np.asarray, both(torques, gaps, np.concatenate([grid, grid[:, ::-1]])))
+both = jax.tree.map(np.asarray, both_of(torques, gaps, np.concatenate([grid, grid[:, ::-1]])))
 say(f"{grid.size * 2} values of κ swept in {time.perf_counter() - begin:.1f} s")
 up = {key: jax.tree.map(lambda x, i=i: x[i], both) for i, key in enumerate(LANES)}
 down = {key: jax.tree.map(lambda x, i=i: x[i + len(LANES)], both) for i, key in enumerate(LANES)}
+
+
+# The strong motors close down once more, in steps sixty times as fine below κ = 1.235, where their
+# free motion comes near the stop. The rows of the other motors are filled with the same.
+FINE = tuple(torque for torque in (100.0, 10.0) if (torque, NEAR) in LANES)
+near_stop = np.concatenate([np.linspace(1.9, 1.24, VALUES // 3), np.linspace(
+    1.235, 1.217, VALUES - VALUES // 3)])  # fmt: skip
+rows_of = np.resize(FINE, len(torques))
+begin = time.perf_counter()
+slow = jax.tree.map(
+    np.asarray, both_of(rows_of, np.full_like(gaps, NEAR), np.tile(near_stop, (len(torques), 1)))
+)
+slow = {torque: jax.tree.map(lambda x, i=i: x[i], slow) for i, torque in enumerate(FINE)}
+say(f"fine close-down in {time.perf_counter() - begin:.1f} s")
 
 
 def jump(sweep: vi.Sweep) -> int:
@@ -234,6 +251,21 @@ say(f"{sum(inside)} of {len(inside)} special points lie between the two values o
 
 points = {(key, way): special(key, way).parameter for key in LANES for way in ("up", "down")}
 missed = max(abs(forecast(*key, way) / value - 1) for (key, way), value in points.items())
+
+
+def fine_jump(torque: float) -> str:
+    """Where the close-down in fine steps jumps, and the special point there."""
+    i = jump(slow[torque])
+    pair = sorted(float(x) for x in slow[torque].values[i : i + 2])
+    point = special((torque, NEAR), "down")
+    return (
+        f"T0 = {torque:g} N·m between {pair[0]:.4f} and {pair[1]:.4f} ({point.kind} at "
+        f"{point.parameter:.4f})"
+    )
+
+
+fine_told = "; ".join(fine_jump(torque) for torque in FINE)
+say(fine_told)
 outside = [
     f"T0 = {key[0]:g} {'run-up' if way == 'up' else 'close-down'}"
     for (key, way), within in zip(points, inside, strict=True)
@@ -256,15 +288,25 @@ limits = [steepest[part].max() / PER_NM for part in (fine < 3, 1 / np.abs(
     1 - fine**2 + 2j * XI * fine) < NEAR / 0.04)]  # fmt: skip
 say(f"fold of the ideal drive {ideal_fold:.4f}, slope {slope:.4f} N·m; torques {limits}; {outside}")
 
+numbers = {"ideal drive: 2π motion folds, ζ": ideal_fold}
+for (key, way), value in points.items():
+    name = (
+        f"T0 = {key[0]:g} N·m, gap {key[1] / 0.04:g}a, {'run-up' if way == 'up' else 'close-down'}"
+    )
+    numbers[f"{name}: {special(key, way).kind}, κ"] = value
+    numbers[f"{name}: forecast, κ"] = forecast(*key, way)
+
 text = ""
 if not QUICK:
     folds = [points[(torque, NEAR), "up"] for torque in (10.0, 100.0)]
     measured = (folds[0] - folds[1]) / (1 / 10 - 1 / 100)
+    i, last = jump(down[0.05, NEAR]), down[0.05, NEAR].values
+    weakest = sorted((float(last[i]), float(last[i + 1])))
     text = f"""# Frequency response with a motor of limited power
 
 k = 0.5, Table 1's damping, cosine kinematics. Each sweep: {VALUES} values of κ from 0.5 up or down
 to it, at each {SETTLE} drive cycles to settle and 32 observed. *Special point*: where the
-continued 2π motion ends or turns. *Forecast*: κ = ζ + L(ζ)/τ0 with the ideal
+continued 2π motion ends or turns. *Forecast* of that point: κ = ζ + L(ζ)/τ0 with the ideal
 machine's load L in closed form. *Misfit*: largest error of that formula's κ - ζ along the
 continued branch, as a part of the largest κ - ζ. Last column:
 values of both sweeps that failed, that still drift, and that do neither but do not repeat
@@ -275,11 +317,16 @@ within 1e-6 in up to 16 cycles.
 - **Jumps.** {sum(inside)} of {len(inside)} special points lie between the two values of κ where the
   sweep jumps; the others miss by less than two steps of κ
   ({", ".join(outside)}).
-  Strong motors jump before the grazing, probably because the step of κ sets off a transient that
-  reaches the stop; the weakest one needs the cycles of several values to leave its fold.
-- **Forecast.** The load of the ideal machine tells all {len(inside)} jumps to
-  {100 * missed:.2f} % of κ, from T0 = 0.05 to 100 N·m, although it leaves out that the
-  shaft's speed varies within a cycle.
+  Where strong motors close down, it is the coarse step of κ that sets off a transient which reaches
+  the stop too early. In steps of {1e4 * (1.235 - 1.217) / (VALUES - VALUES // 3 - 1):.1f}e-4 they
+  jump at their grazings, to one step: {fine_told}.
+  The weakest motor passes its fold (T0 = 0.05 N·m, close-down at
+  {points[(0.05, NEAR), "down"]:.3f}) and jumps only at {weakest[0]:.3f} … {weakest[1]:.3f}: it
+  needs the cycles of several values to leave it.
+- **Forecast.** It is about special points, not about jumps: the load of the ideal machine gives
+  the κ of all {len(inside)} of them to {100 * missed:.2f} %, from T0 = 0.05 to 100 N·m, although
+  it leaves out that the shaft's speed varies within a cycle. Where a sweep jumps it tells as well
+  as that point does (see above).
 - **T0 to infinity.** The ideal drive's 2π motion folds at ζ = {ideal_fold:.4f}; the motor's fold in
   κ lies about {slope:.2f} N·m / T0 above it, since κ - ζ = L/τ0
   ({measured:.3f} N·m from T0 = 10 and 100, both continued; the load is steep at the fold, so that
@@ -390,6 +437,5 @@ figure.suptitle(
     fontsize=11,
 )
 if not QUICK:
-    vi.save_picture(figure, HERE / "figures" / "motor_frequency_response.png")
-    (HERE / "motor_frequency_response.md").write_text(text)
+    keep(HERE, "motor_frequency_response", text, numbers, figure)
 say(f"done; {time.process_time():.0f} s of processor time")

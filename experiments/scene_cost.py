@@ -25,6 +25,9 @@ from matplotlib.figure import Figure
 jax.config.update("jax_enable_x64", True)
 
 HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments")
+sys.path.insert(0, str(HERE))
+from headlines import keep
+
 QUICK = "--quick" in sys.argv
 LANES, CYCLES, ROUNDS = (32, 10, 3) if QUICK else (256, 200, 7)
 
@@ -157,6 +160,6 @@ names = [made.name for made in SCENES][::-1]
 ax.barh(names, [cost[name] for name in names], color="tab:blue")
 ax.set(xlabel="run time of a drive cycle of one lane (µs)")
 ax.spines[["top", "right"]].set_visible(False)
+numbers = {f"operations: {name}": float(count) for name, count in size.items()}
 if not QUICK:
-    (HERE / "scene_cost.md").write_text("\n".join(lines) + "\n")
-    vi.save_picture(figure, HERE / "figures" / "scene_cost.png")
+    keep(HERE, "scene_cost", "\n".join(lines), numbers, figure)

@@ -24,12 +24,13 @@ def test_reproduce(tmp_path, capsys):
     assert cli.main(["reproduce", "--quick", "--out", str(out)]) == 0
     printed = capsys.readouterr()
     assert {path.name for path in out.iterdir()} == {
+        "fig1.png",
         "fig3.png",
         "fig4.png",
         "report.md",
         "report.json",
     }
-    assert len(printed.out.splitlines()) <= 14
+    assert len(printed.out.splitlines()) <= 16
     assert str(out) in printed.out
     assert "simulating" in printed.err and "simulating" not in printed.out
 

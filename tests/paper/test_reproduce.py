@@ -2,15 +2,21 @@
 
 import json
 from math import isnan
+from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 from vi_jax.paper import check_claims, check_faults, reproduce, simulate_cases
+from vi_jax.paper.assumptions import check_assumptions
 from vi_jax.paper.faults import period_doubling_damping
-from vi_jax.paper.figures import draw_figure
+from vi_jax.paper.figures import DRAWN, draw_figure, drawn_numbers
 from vi_jax.paper.motions import closed_form, sampled
+from vi_jax.paper.motors import TORQUES, simulate_motors
 from vi_jax.paper.printed import energy_drift, eq21_misses
+from vi_jax.plot.stamp import stamped
+
+KEPT = Path(__file__).parents[2] / "experiments" / "figures"
 
 
 @pytest.fixture(scope="module")
@@ -37,9 +43,70 @@ def test_verdicts(claims):
         "settles on the 4π motion": "confirmed undamped only",
         "simulation and 4π closed form agree": "confirmed undamped only",
         "no transient from the 4π state": "confirmed undamped only",
+        "direct 2π solutions by initial conditions": "confirmed",
         "no discrepancy of the maximum": "confirmed",
         "discrepancy of the minimum": "confirmed undamped only",
     }
+
+
+@pytest.fixture(scope="module")
+def assumptions(cases):
+    return {claim.name: claim for claim in check_assumptions(cases[0])}
+
+
+def test_crank_phase_of_the_start(assumptions):
+    claim = assumptions["the start's crank phase"]
+    apart = claim.numbers["max_difference_cycles_3_4_by_phase_over_pi"]
+    assert claim.verdict == "confirmed in part"
+    assert apart["0"] == pytest.approx([0.197, 0.170], abs=2e-3)
+    assert apart["1"] == pytest.approx([1.708, 1.708], abs=2e-3)
+    # From every phase the same 4π motion in the end.
+    assert claim.numbers["last_minima"] == pytest.approx([-3.2543] * len(apart), abs=1e-2)
+
+
+def test_exact_crank(assumptions):
+    claim = assumptions["the cosine in the crank's place (Eq. 4)"]
+    assert claim.verdict == "confirmed"
+    assert claim.numbers["minima_exact"] == pytest.approx([-3.2985, -1.7043], abs=1e-4)
+    assert claim.numbers["minima_cosine"] == pytest.approx([-3.2543, -1.5442], abs=1e-4)
+
+
+def test_direct_short(claims):
+    numbers = claims["direct 2π solutions by initial conditions"].numbers
+    assert numbers["cycles_within_0.05"] == {"undamped": 60, "damped": 60}
+
+
+@pytest.mark.slow
+def test_motors_at_the_stated_speed(cases):
+    """κ and minima from an independent code (SciPy), at a mean ζ of 0.90."""
+    motors = simulate_motors()
+    for row in motors.rows:
+        assert row.kappa is not None and bool(row.orbit.successful)
+        assert float(row.orbit.frequency_ratio) == pytest.approx(0.9, abs=1e-9)
+    assert [run.torque for run in motors.runs] == list(TORQUES)
+    kappa = [run.kappa for run in motors.runs]
+    assert kappa == pytest.approx([0.9277, 0.9055, 0.9005], abs=1e-4)
+    minima = [float(run.orbit.y_min) for run in motors.runs]
+    assert minima == pytest.approx([-3.291, -3.282, -3.257], abs=1e-3)
+    found = {claim.name: claim for claim in check_assumptions(cases[0], motors)}
+    assert found["Figures 3 and 4 with the motor"].verdict == "confirmed"
+    speed = found["the speed hardly varies within a cycle (Eq. 10)"].numbers
+    assert 0 < speed["variation_by_torque"]["100"] < speed["variation_by_torque"]["2"] < 0.1
+
+
+def test_disc_and_lever(faults):
+    assert faults[8].numbers["mass_of_the_disc"] == pytest.approx(75.0)
+    assert faults[7].numbers["mass_of_such_a_lever"] == pytest.approx(12.5)
+
+
+@pytest.mark.parametrize("number", [3, 4])
+def test_kept_figures_show_these_numbers(cases, number):
+    """The pictures beside the studies are of the motions as they are computed now."""
+    kept = json.loads(stamped(KEPT / f"fig{number}.png", DRAWN) or "{}")
+    drawn = drawn_numbers(number, cases)
+    assert kept.keys() == drawn.keys()
+    for name, numbers in drawn.items():
+        assert kept[name] == pytest.approx(numbers, abs=1e-7)
 
 
 def test_transient_from_rest(claims):
@@ -115,10 +182,10 @@ def test_damping_at_the_period_doubling(faults):
 def test_reproduce_writes_figures_and_reports(tmp_path):
     steps = []
     found = reproduce(tmp_path / "a" / "b", quick=True, progress=steps.append)
-    names = ["fig3.png", "fig4.png", "report.json", "report.md"]
+    names = ["fig1.png", "fig3.png", "fig4.png", "report.json", "report.md"]
     assert [path.name for path in found.files] == names
     assert len(steps) == 6
-    for name in names[:2]:
+    for name in names[1:3]:
         path = tmp_path / "a" / "b" / name
         assert path.stat().st_size < 200_000
         picture = Image.open(path)
@@ -130,7 +197,7 @@ def test_reproduce_writes_figures_and_reports(tmp_path):
 
     text = (tmp_path / "a" / "b" / "report.json").read_text(encoding="utf-8")
     data = json.loads(text, parse_constant=refuse)
-    assert len(data["claims"]) == 9 and len(data["faults"]) == 6
+    assert len(data["claims"]) == 12 and len(data["faults"]) == 9
     assert not any(isnan(x) for x in data["settings"]["damping_ratio"].values())
     page = (tmp_path / "a" / "b" / "report.md").read_text(encoding="utf-8")
     for claim in found.claims:

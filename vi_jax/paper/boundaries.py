@@ -45,7 +45,9 @@ class BoundaryCurves(NamedTuple):
     doubling_k: Boundary
     """Period doubling of the 2π motion, which is unstable on the side of smaller ζ."""
     touch_k: Boundary
-    """The 4π motion touches the stop a second time: it exists between the curve's two arms."""
+    """The 4π motion touches the stop a second time: it exists between the curve's two arms.
+    That is the family of the figures' motion; with more damping than the curves begin with there
+    is another one beside the birth."""
     doubling_c: Boundary
     touch_c: Boundary
     birth_c: Boundary
@@ -204,7 +206,7 @@ def draw_boundaries(curves: BoundaryCurves) -> Figure:
             _draw(ax, curves, plane, zoom)
     handles = [
         Patch(color=SHORT_FILL, label="2π motion unstable"),
-        Patch(color=LONG_FILL, label="a 4π motion with one impact exists"),
+        Patch(color=LONG_FILL, label="4π with one impact, the paper's family"),
         Line2D([], [], color=RED, lw=2.0, label="2π: period doubling"),
         Line2D([], [], color=GREY, lw=2.0, label="2π: born by grazing"),
         Line2D([], [], color=ORANGE, lw=2.0, label="2π: fold"),
@@ -218,7 +220,9 @@ def draw_boundaries(curves: BoundaryCurves) -> Figure:
     absent = {"2π: fold": curves.fold_k, "4π: period doubling": curves.long_doubling_k}
     handles = [h for h in handles if absent.get(str(h.get_label()), h) is not None]
     figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False, fontsize=10)
-    figure.suptitle("Where the 2π motion is unstable and a 4π motion is seen (ideal drive, Δ = 2a)")
+    figure.suptitle(
+        "Where the 2π motion is unstable and the paper's 4π motion exists (ideal, Δ = 2a)"
+    )
     return figure
 
 

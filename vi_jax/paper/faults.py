@@ -26,7 +26,10 @@ class Fault(NamedTuple):
 
 def check_faults() -> list[Fault]:
     """Each fault of the printed text, measured."""
-    return [_inertia_term(), _coupling(), _phase(), _no_load_speed(), _captions(), _damping()]
+    return [
+        _inertia_term(), _coupling(), _phase(), _no_load_speed(), _captions(), _damping(),
+        _lever(), _disc(), _lines(),
+    ]  # fmt: skip
 
 
 def _groups() -> tuple[Parameters, float, float]:
@@ -140,9 +143,7 @@ def _no_load_speed() -> Fault:
 def _captions() -> Fault:
     amplitude = 1 / (1 - FREQUENCY_RATIO**2)
     scene = figure_scene(0.0)
-    wide = type(scene).ideal(
-        frequency_ratio=FREQUENCY_RATIO, restitution=RESTITUTION, gap=2 * amplitude
-    )
+    wide = figure_scene(0.0, gap=2 * amplitude)
     counts = {
         name: int(sum(int(np.sum(orbits(s, cycles=n).admissible)) for n in (1, 2)))
         for name, s in (("2a", scene), ("2A", wide))
@@ -198,4 +199,49 @@ def _damping() -> Fault:
         f"Largest |multiplier| of the 2π motion: {with_table:.4f} with c = {table:g} (stable), "
         f"{with_zero:.4f} with c = 0 (unstable); it crosses -1 at c = {crossing:.4f} N·s/m.",
         {"largest_multiplier_by_c": largest, "period_doubling_c": crossing},
+    )
+
+
+def _lever() -> Fault:
+    table = Parameters()
+    J, rod = float(table.inertia), float(table.rod_length)
+    mass = 3 * J / rod**2  # a uniform rod about its end
+    return Fault(
+        7,
+        "Table 1",
+        "J is the moment of inertia of the lever",
+        "J is that of the disc on the shaft, as the text has it",
+        f"The text calls the lever massless, and J is the shaft's in Eq. 1. A lever of {rod:g} m "
+        f"with J = {J:g} kg·m² about its end would weigh {mass:.1f} kg.",
+        {"mass_of_such_a_lever": mass},
+    )
+
+
+def _disc() -> Fault:
+    table = Parameters()
+    J, radius = float(table.inertia), float(table.crank_radius)
+    mass = 2 * J / radius**2
+    body = float(table.body_mass)
+    return Fault(
+        8,
+        "Table 1",
+        f"J = {J:g} kg·m² for a homogeneous disc of radius {radius:g} m",
+        "J as printed, as the inertia of everything on the shaft",
+        f"Such a disc weighs 2J/a² = {mass:.0f} kg, beside a body of {body:g} kg. What that does: "
+        f"ε = m_C a²/J = {float(body * radius**2 / J):.5f}, so that the body hardly slows the "
+        "shaft.",
+        {"mass_of_the_disc": mass, "coupling": body * radius**2 / J},
+    )
+
+
+def _lines() -> Fault:
+    return Fault(
+        9,
+        "Fig. 2, caption and text",
+        "caption: blue and red solid lines, black circles and red dots; text: a solid blue and a "
+        "dashed red curve, black and red circles",
+        "which of the curves is dashed cannot be told; here dashed is unstable",
+        "Caption and text differ in 2 of the 4 styles: the red curve (solid; dashed) and the red "
+        "marks of the close-down (dots; circles).",
+        {"styles_that_differ": 2, "styles": 4},
     )

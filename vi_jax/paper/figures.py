@@ -1,5 +1,6 @@
 """Draws Figures 3 and 4: three panels each, the undamped system above the damped one."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +10,13 @@ from matplotlib.figure import Figure
 from ..flow import Run
 from ..plot import motion_path, plot_history, save_picture
 from ..plot.motion import GREEN, PINK, RED, angle_axis
+from ..plot.stamp import stamp
 from .motions import Case
 
 _DPI = 110
+
+# Under this name a picture keeps what it shows.
+DRAWN = "vi_jax numbers drawn"
 
 
 def draw_figure(number: int, cases: tuple[Case, Case], path: Path) -> None:
@@ -30,7 +35,18 @@ def draw_figure(number: int, cases: tuple[Case, Case], path: Path) -> None:
     # An undamped panel has every curve.
     handles, labels = grid[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False, fontsize=11)
-    save_picture(figure, path, dpi=_DPI)
+    save_picture(figure, path, dpi=_DPI, colors=64)
+    stamp(path, DRAWN, json.dumps(drawn_numbers(number, cases)))
+
+
+def drawn_numbers(number: int, cases: tuple[Case, Case]) -> dict[str, list[float]]:
+    """What tells a picture of other numbers: minima of the first cycles and of the closed forms."""
+    numbers = {}
+    for case in cases:
+        run = case.from_rest if number == 3 else case.from_fit
+        minima = np.asarray(run.y_min)[:40].tolist()
+        numbers[case.name] = [*minima, float(case.short.y_min[0]), float(case.long.y_min[0])]
+    return numbers
 
 
 def _title(number: int) -> str:

@@ -2,22 +2,19 @@
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import numpy as np
 
 from ..flow import ExactFlight, Run, simulate
-from ..orbit import ClosedFormOrbits, closed_form_orbits
+from ..orbit import ClosedFormOrbits
 from ..scene import Parameters, Scene
 from .orbits import fit_long
+from .orbits import orbits as orbits
 
 # ζ, k and d of both figures.
 FREQUENCY_RATIO, RESTITUTION, GAP = 0.9, 0.5, 2.0
 CYCLES, QUICK_CYCLES = 200, 60
 SAMPLES, QUICK_SAMPLES = 96, 64
-
-# Compiled once for each period; the damping is a number of the scene.
-orbits = eqx.filter_jit(closed_form_orbits)
 
 
 class Case(NamedTuple):
@@ -47,14 +44,16 @@ class Case(NamedTuple):
         return bool(self.long.admissible[0])
 
 
-def figure_scene(damping_ratio: Any) -> Scene:
-    """The scene of Figures 3 and 4 with this ξ (dimensionless)."""
-    return Scene.ideal(
+def figure_scene(damping_ratio: Any, *, restitution: Any = RESTITUTION, gap: Any = GAP) -> Scene:
+    """The scene of Figures 3 and 4 with this ξ (dimensionless), at ζ = 0.90."""
+    scene = Scene.ideal(
         frequency_ratio=FREQUENCY_RATIO,
-        restitution=RESTITUTION,
-        gap=GAP,
+        restitution=restitution,
+        gap=gap,
         damping_ratio=damping_ratio,
     )
+    # A number, so that a run from another crank angle is the same program.
+    return scene.at_section(0.0)
 
 
 def table_damping_ratio() -> float:
@@ -74,16 +73,7 @@ def simulate_cases(*, quick: bool = False) -> tuple[Case, Case]:
         short, long = orbits(scene, cycles=1), orbits(scene, cycles=2)
         origin = long if bool(long.admissible[0]) else long_state
         runs = [
-            # Every run has the same length, so that all of them share one compiled program.
-            simulate(
-                scene,
-                start,
-                cycles,
-                method=ExactFlight(),
-                samples=samples,
-                impact_log=2,
-                throw=True,
-            )
+            run_of(scene, start, cycles, samples)
             for start in (
                 scene.start(),
                 scene.start(Y=origin.Y[0], V=origin.V[0]),
@@ -95,6 +85,13 @@ def simulate_cases(*, quick: bool = False) -> tuple[Case, Case]:
         shift = _alignment(runs[0], runs[1]) if bool(long.admissible[0]) else 0
         cases.append(Case(name, scene, short, long, *runs, long_shift=shift))
     return cases[0], cases[1]
+
+
+def run_of(scene: Scene, start: Any, cycles: int, samples: int) -> Run:
+    """A run with the options of all runs here, so that they share one compiled program."""
+    return simulate(
+        scene, start, cycles, method=ExactFlight(), samples=samples, impact_log=2, throw=True
+    )
 
 
 def _alignment(from_rest: Run, orbit: Run) -> int:

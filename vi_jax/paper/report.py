@@ -1,39 +1,30 @@
 """The reproduction in one go: figures, measured claims and faults, and a report of them."""
 
-import json
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from matplotlib.figure import Figure
+
 from .._files import write_whole
-from ..orbit import ORBIT_RESULTS
 from ..plot import save_picture
+from ..scene import Scene
+from .assumptions import check_assumptions
 from .boundaries import boundary_curves, describe_boundaries, draw_boundaries
 from .claims import Claim, check_claims
 from .faults import Fault, check_faults
+from .figure2_claims import check_figure_2
 from .figures import draw_figure
-from .motions import FREQUENCY_RATIO, GAP, RESTITUTION, Case, simulate_cases
-from .orbits import TableRow, orbit_table
+from .motions import figure_scene, simulate_cases, table_damping_ratio
+from .motors import Motors, draw_motors, simulate_motors
+from .orbits import orbit_table
+from .pages import Findings, as_json, as_markdown
 from .response import describe, response
-from .response_figure import draw_response
+from .response_figure import LOOK, draw_response
+from .sketch import draw_sketch
 
 REPORT, NUMBERS = "report.md", "report.json"
-
-
-class Findings(NamedTuple):
-    """All that the report tells; what a quick one leaves out is `None`."""
-
-    cases: tuple[Case, Case]
-    claims: list[Claim]
-    faults: list[Fault]
-    orbits: list[TableRow]
-    panels: dict[str, Any] | None
-    borders: dict[str, float | None] | None
-
-    @property
-    def quick(self) -> bool:
-        """Whether parts were left out."""
-        return self.panels is None
 
 
 class Reproduction(NamedTuple):
@@ -47,7 +38,7 @@ class Reproduction(NamedTuple):
 def reproduce(
     out: str | Path, *, quick: bool = False, progress: Callable[[str], None] | None = None
 ) -> Reproduction:
-    """Draw Figures 2, 3 and 4 and the boundaries of the discrepancy, and write the report.
+    """Draw Figures 1 to 4 and the boundaries of the discrepancy, and write the report.
 
     **Arguments:** the folder to write into, made if it is missing; `quick` for fewer cycles and
     samples, without Figure 2, the boundaries and the motors; `progress`, called with the name of
@@ -55,280 +46,81 @@ def reproduce(
     (`jax.config.update("jax_enable_x64", True)`), which the command line turns on.
 
     **Returns:** the claims, the faults, and the files in the order in which they were written:
-    `fig3.png`, `fig4.png`, `fig2.png`, `boundaries.png`, `report.json`, `report.md`.
+    `fig1.png`, `fig3.png`, `fig4.png`, `motor.png`, `fig2.png`, `boundaries.png`, `report.json`,
+    `report.md`.
     """
-    tell = progress or (lambda _: None)
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
-    files = []
+    files: list[Path] = []
+    # What takes the time is compiling, of which two threads do more than one.
+    with ThreadPoolExecutor(1) as aside:
+        motors = None if quick else aside.submit(simulate_motors)
+        findings = _measured(out, files, motors, progress or (lambda _: None))
+    for name, text in ((NUMBERS, as_json(findings)), (REPORT, as_markdown(findings))):
+        files.append(out / name)
+        write_whole(files[-1], text)
+    return Reproduction(findings.claims, findings.faults, files)
+
+
+def _measured(
+    out: Path, files: list[Path], motors: Future[Motors] | None, tell: Callable[[str], None]
+) -> Findings:
+    """All work but the report's; without motors the quick one. Pictures are added to `files`."""
+
+    def keep(name: str, figure: Figure, **look: Any) -> None:
+        files.append(save_picture(figure, out / name, **look))
 
     tell("simulating: from rest, from the 4π and from the 2π state, undamped and damped")
-    cases = simulate_cases(quick=quick)
+    keep("fig1.png", draw_sketch())
+    cases = simulate_cases(quick=motors is None)
     for number in (3, 4):
         tell(f"drawing Figure {number}")
         files.append(out / f"fig{number}.png")
         draw_figure(number, cases, files[-1])
-    tell("measuring what the paper claims with the figures")
-    claims = check_claims(cases)
     tell("measuring the faults of the printed text")
     faults = check_faults()
     tell("finding the periodic motions")
-    orbits = orbit_table(quick=quick)
-    panels: dict[str, Any] | None = None
-    borders: dict[str, float | None] | None = None
-    if not quick:
-        tell("Figure 2: closed forms, branches, sweeps up and down")
-        found = response()
-        panels = describe(found)
-        files.append(out / "fig2.png")
-        draw_response(found, files[-1])
-        tell("following the boundaries of the discrepancy in (ζ, k) and (ζ, c)")
-        curves = boundary_curves([b for system in found.systems for b in system.branches])
-        borders = describe_boundaries(curves)
-        files.append(out / "boundaries.png")
-        save_picture(draw_boundaries(curves), files[-1])
-    findings = Findings(cases, claims, faults, orbits, panels, borders)
-    for name, text in ((NUMBERS, as_json(findings)), (REPORT, as_markdown(findings))):
-        files.append(out / name)
-        write_whole(files[-1], text)
-    return Reproduction(claims, faults, files)
+    orbits = orbit_table(_table_scenes())
+    if motors is None:
+        tell("measuring what the paper claims and assumes")
+        claims = [*check_claims(cases), *check_assumptions(cases[0])]
+        return Findings(cases, claims, faults, orbits, None, None, None)
+    tell("Figure 2: closed forms, branches, sweeps up and down")
+    found = response()
+    panels = describe(found)
+    tell("following the boundaries of the discrepancy in (ζ, k) and (ζ, c)")
+    curves = boundary_curves([b for system in found.systems for b in system.branches])
+    tell("Figures 3 and 4 with the motor")
+    driven = motors.result()
+    keep("motor.png", draw_motors(driven.runs, cases[0].from_rest))
+    keep("fig2.png", draw_response(found), **LOOK)
+    keep("boundaries.png", draw_boundaries(curves))
+    tell("measuring what the paper claims and assumes")
+    claims = check_claims(cases, panels["panels"]) + check_figure_2(found, panels["panels"])
+    claims += check_assumptions(cases[0], driven)
+    borders = describe_boundaries(curves)
+    return Findings(cases, claims, faults, orbits + driven.rows, driven, panels, borders)
 
 
-def as_json(found: Findings) -> str:
-    """The report as strict JSON: no NaN; what is absent is null."""
-    cases = found.cases
-    data = {
-        "settings": {
-            "frequency_ratio": FREQUENCY_RATIO,
-            "restitution": RESTITUTION,
-            "gap": GAP,
-            "damping_ratio": {case.name: float(case.scene.damping_ratio) for case in cases},
-            "cycles": int(cases[0].from_rest.impacts.shape[0]),
-            "quick": found.quick,
-        },
-        "closed_forms": {
-            case.name: {"2pi": _orbit(case.short), "4pi": _orbit(case.long)} for case in cases
-        },
-        "claims": [claim._asdict() for claim in found.claims],
-        "faults": [fault._asdict() for fault in found.faults],
-        "orbits": [_found(row) for row in found.orbits],
-        "figure_2": found.panels,
-        "boundaries": found.borders,
-    }
-    return json.dumps(data, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-
-
-def _orbit(orbits) -> dict:
-    """The first motion of its kind, admissible or not."""
-    if not bool(orbits.exists[0]):
-        return {"exists": False}
-    names = ("Y", "V", "impact_phase", "impact_speed", "y_min", "y_max")
+def _table_scenes() -> dict[str, Scene]:
+    """The ideal scenes whose 2π and 4π motions are listed."""
+    table = table_damping_ratio()
     return {
-        "exists": True,
-        "admissible": bool(orbits.admissible[0]),
-        **{name: float(getattr(orbits, name)[0]) for name in names},
-        "multipliers": [[float(m.real), float(m.imag)] for m in orbits.multipliers[0]],
+        "k = 0.5, undamped": figure_scene(0.0),
+        "k = 0.5, Table 1's damping": figure_scene(table),
+        "k = 0.8, Table 1's damping": figure_scene(table, restitution=0.8),
     }
-
-
-def _found(row: TableRow) -> dict:
-    orbit = row.orbit
-    if not bool(orbit.successful):
-        return {"scene": row.scene, "found": False, "reason": ORBIT_RESULTS[orbit.result]}
-    return {
-        "scene": row.scene,
-        "found": True,
-        "period_in_cycles": int(orbit.cycles),
-        "state": {name: float(x) for name, x in vars(orbit.state).items()},
-        "y_min": float(orbit.y_min),
-        "impact_phase": [float(x) for x in orbit.impact_phase],
-        "impact_speed": [float(x) for x in orbit.impact_speed],
-        "multipliers": [[float(m.real), float(m.imag)] for m in orbit.multipliers],
-        "stable": bool(orbit.stable),
-        "residual": float(orbit.residual),
-    }
-
-
-def _table(orbits: list[TableRow]) -> list[str]:
-    lines = [
-        "| scene | period | Y | V | min Y | V⁻ | largest multiplier | stable | residual |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
-    for name, orbit in orbits:
-        if not bool(orbit.successful):
-            lines.append(f"| {name} | none found | | | | | | | {float(orbit.residual):.1e} |")
-            continue
-        speeds = ", ".join(f"{float(v):.5f}" for v in orbit.impact_speed)
-        lines.append(
-            f"| {name} | {2 * int(orbit.cycles)}π | {float(orbit.state.Y):.6f} | "
-            f"{float(orbit.state.V):.6f} | {float(orbit.y_min):.6f} | {speeds} | "
-            f"{abs(complex(orbit.multipliers[0])):.6f} | {'yes' if orbit.stable else 'no'} | "
-            f"{float(orbit.residual):.0e} |"
-        )
-    return lines
-
-
-def _response(panels: dict[str, Any]) -> list[str]:
-    """Figure 2, panel by panel."""
-    lines = [
-        "## Figure 2",
-        "",
-        "![Figure 2](fig2.png)",
-        "",
-        f"Printed: {panels['printed']}",
-        "",
-        "BB' is where the 2π motion with one impact is born in a grazing, CC' where it becomes "
-        "stable in a period doubling. Between them the 2π analysis is about an unstable motion. "
-        '"Apart" counts the values of ζ there at which the swept min Y differs from it by more '
-        'than 0.001 a. "On the 4π curve" counts those of the values with an admissible and stable '
-        "4π motion of one impact at which the sweep is on it to 1e-6; at the others the sweep is "
-        "on a motion that coexists with it. Without damping a free motion is never forgotten: "
-        "where the sweeps do not strike, outside of the stretch, their marks wander.",
-        "",
-        "| k | ξ | sweep | BB' | CC' | apart | largest difference of min Y | of max Y | on the 4π "
-        "curve |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
-    for panel in panels["panels"]:
-        for name, at in panel["sweeps"].items():
-            curve = at["on_the_4pi_curve"]
-            lines.append(
-                f"| {panel['restitution']:g} | {panel['damping_ratio']:.4f} | {name} | "
-                f"{panel['BB']:.6f} | {panel['CC']:.6f} | {at['apart']} of {at['values']} | "
-                f"{at['widest']:.3f} at ζ = {at['widest_at']:.3f} | {at['maximum_off']:.0e} | "
-                f"{curve['on_it']} of {curve['stable_values']} |"
-            )
-    lines += [
-        "",
-        "What the sweeps are on between BB' and CC' (stretches of at least four values of ζ):",
-        "",
-        "| k | ξ | sweep | motions |",
-        "|---|---|---|---|",
-    ]
-    explained = []
-    for panel in panels["panels"]:
-        for name, at in panel["sweeps"].items():
-            told = "; ".join(
-                f"{m['from']:.3f}…{m['to']:.3f} {m['motion']}"
-                for m in at["motions"]
-                if m["values"] >= 4
-            )
-            k, xi = panel["restitution"], panel["damping_ratio"]
-            lines.append(f"| {k:g} | {xi:.4f} | {name} | {told} |")
-            one = sum(m["values"] for m in at["motions"] if m["motion"] == "4π, 1 impact")
-            four = sum(m["values"] for m in at["motions"] if m["motion"].startswith("4π"))
-            explained.append((k, xi, name, one / at["values"], four / at["values"]))
-    share = "; ".join(
-        f"k = {k:g}, ξ = {xi:.3f}, {name}: {one:.0%} and {four:.0%}"
-        for k, xi, name, one, four in explained
-    )
-    return [
-        *lines,
-        "",
-        "So far the paper's explanation reaches: the minimum parts from the 2π analysis because "
-        "the 2π motion is unstable, and over a part of the stretch the motion is the one of period "
-        "4π with one impact that the paper names. Over the rest it has other impacts, other "
-        "periods, or none. Shares of the stretch on the 4π motion with one impact, and on any of "
-        f"period 4π: {share}.",
-        "",
-    ]
-
-
-def _borders(borders: dict[str, float | None]) -> list[str]:
-    """Where the discrepancy lives, in two planes."""
-    return [
-        "## Where the discrepancy lives",
-        "",
-        "![Boundaries](boundaries.png)",
-        "",
-        "Bifurcations and grazings followed in two parameters (c in N·s/m).",
-        "",
-        "| | |",
-        "|---|---|",
-        *(
-            f"| {name} | {'is not reached' if x is None else f'{x:.6f}'} |"
-            for name, x in borders.items()
-        ),
-        "",
-    ]
-
-
-def as_markdown(found: Findings) -> str:
-    """The report as a page to read, with the figures in it."""
-    undamped, damped = found.cases
-    cycles = undamped.from_rest.impacts.shape[0]
-    ratio = float(damped.scene.damping_ratio)
-    even = "second" if undamped.long_shift else "first"
-    lines = [
-        f"# Figures {'' if found.quick else '2, '}3 and 4 of the paper, again",
-        "",
-        f"ζ = {FREQUENCY_RATIO:.2f}, k = {RESTITUTION:.2f}, d = Δ/a = {GAP:g}, ideal drive, "
-        f"{cycles} drive cycles{' (quick)' if found.quick else ''}. Lengths are in units of the "
-        "crank radius a; the simulation carries flights in closed form and solves for the impacts.",
-        "",
-        "The figures cannot be had with the damping of Table 1 (fault 6 below). The upper row of "
-        f"each picture is the undamped system (ξ = 0), the lower row Table 1 (ξ = {ratio:.7f}).",
-        "",
-        "![Figure 3](fig3.png)",
-        "",
-        "![Figure 4](fig4.png)",
-        "",
-        "A motion of period 4π can lie on the axis of φ in two ways, one cycle apart. In Figure 3 "
-        f"the 4π closed form is drawn so that it is on its {even} section (of the two after its "
-        "impact) at even cycles, as the run from rest is in the end; in Figure 4 the run starts "
-        "on the first, from a state that optax (Adam) fitted to the periodic-orbit residual from a "
-        "guess 5 % off.",
-        "",
-        "## What the paper claims with them",
-        "",
-        "| claim | where | verdict |",
-        "|---|---|---|",
-        *(f"| {claim.name} | {claim.place} | {claim.verdict} |" for claim in found.claims),
-        "",
-    ]
-    for claim in found.claims:
-        lines += [
-            f"### {claim.name[0].upper()}{claim.name[1:]}: {claim.verdict}",
-            "",
-            f"Claimed ({claim.place}): {claim.claimed}",
-            "",
-            f"Measured: {claim.measured}",
-            "",
-        ]
-    lines += [
-        "## Periodic motions",
-        "",
-        "Found by Newton's method on the cycle map from the closed forms, stable or not; Y and V "
-        "on the section φ = 0, the largest multiplier by modulus.",
-        "",
-        *_table(found.orbits),
-        "",
-        *([] if found.panels is None else _response(found.panels)),
-        *([] if found.borders is None else _borders(found.borders)),
-        "## Faults of the printed text",
-        "",
-    ]
-    for fault in found.faults:
-        lines += [
-            f"### {fault.number}. {fault.place}",
-            "",
-            f"Printed: {fault.printed}. Right, or taken here: {fault.right}.",
-            "",
-            fault.measured,
-            "",
-        ]
-    return "\n".join(lines)
 
 
 def summary(found: Reproduction) -> str:
-    """About twelve lines for a terminal."""
+    """A line for each claim, and where the rest is."""
     width = max(len(claim.verdict) for claim in found.claims)
     lines = [f"  {claim.verdict:<{width}}  {claim.name}" for claim in found.claims]
     folder = found.files[0].parent
     names = ", ".join(path.name for path in found.files)
     return "\n".join(
         [
-            "Claims of the paper on Figures 3 and 4 (ζ = 0.90, k = 0.50, Δ = 2a):",
+            "Claims and assumptions of the paper (Figures 3 and 4: ζ = 0.90, k = 0.50, Δ = 2a):",
             *lines,
             f"{len(found.faults)} faults of the printed text, with their numbers: {REPORT}",
             f"Written to {folder}: {names}",

@@ -26,6 +26,9 @@ RESTITUTIONS = (0.8, 0.5)
 RANGE = (0.5, 1.9)
 RATIO, DAMPING, BOUNCE = "drive.frequency_ratio", "oscillator.damping_ratio", "stops.0.restitution"
 
+# The paper draws a second stop below without a number. Here the 2π motion is clear of it, and most
+# of the motions that the sweeps settle on are not.
+WALL = -2.5
 # Between these the motions change much, and ζ is stepped through more finely.
 FINE = (0.695, 1.015)
 # Periods of more cycles than this are not looked for.
@@ -62,17 +65,17 @@ class Response(NamedTuple):
     """ζ, rising."""
     systems: list[System]
     """For each k of `RESTITUTIONS` the undamped one and the one with Table 1's damping."""
-    wall: float | None
-    """Y of the second stop below, if there is one."""
+    wall: float
+    """Y of the second stop below, which the paper only draws."""
     walled: list[System]
-    """The undamped sweeps again with that stop, for each k."""
+    """The undamped sweeps again with that stop, for each k, where they were asked for."""
 
 
-def response(*, quick: bool = False, wall: float | None = None) -> Response:
+def response(*, quick: bool = False, wall: float = WALL, walled: bool = False) -> Response:
     """Closed forms, continued branches and both sweeps, for both k and both ξ.
 
     **Arguments:** `quick` for coarser sweeps; the place of a second stop below (unit: a,
-    negative), which has the k of the first: then the undamped sweeps are made with it as well.
+    negative), which has the k of the first; `walled` for the undamped sweeps with that stop too.
     """
     step, fine = (0.02, 0.01) if quick else (0.01, 0.002)
     low, high = RANGE
@@ -93,8 +96,8 @@ def response(*, quick: bool = False, wall: float | None = None) -> Response:
     for (k, xi), forms, (sweeps, exponents) in zip(numbers, each, settled, strict=True):
         branches, stretch = _branches(with_numbers(scene, k, xi, 0.9), ratios, forms[1])
         systems.append(System(k, xi, forms, branches, stretch, sweeps, exponents))
-    walled = []
-    if wall is not None:
+    fenced_off = []
+    if walled:
         fenced = eqx.tree_at(
             lambda s: s.stops,
             scene,
@@ -109,8 +112,8 @@ def response(*, quick: bool = False, wall: float | None = None) -> Response:
         )  # fmt: skip
         for system, (sweeps, exponents) in zip(bare, again, strict=True):
             forms = {n: jtu.tree_map(lambda x: x[part], system.closed[n]) for n in system.closed}
-            walled.append(system._replace(closed=forms, sweeps=sweeps, exponents=exponents))
-    return Response(ratios, systems, wall, walled)
+            fenced_off.append(system._replace(closed=forms, sweeps=sweeps, exponents=exponents))
+    return Response(ratios, systems, wall, fenced_off)
 
 
 def with_numbers(scene: Scene, k: Any, xi: Any, ratio: Any) -> Any:
@@ -321,6 +324,7 @@ def _panel(found: Response, system: System) -> dict[str, Any]:
         on_it = off_long < 1e-6
         widest = inside[np.argmax(off[inside])]
         impacting = inside[np.asarray(at.impacts)[inside] > 0]
+        reach, clear = y_min[inside] < found.wall, short.y_min[inside, 0] > found.wall
         directions[name] = {
             "values": len(inside),
             "apart": len(apart),
@@ -329,6 +333,9 @@ def _panel(found: Response, system: System) -> dict[str, Any]:
             "widest": float(off[widest]),
             "widest_at": float(ratios[widest]),
             "maximum_off": float(np.max(np.abs(y_max[impacting] - GAP))),
+            "impacting": len(impacting),
+            "analysis_clear_of_the_wall": int(clear.sum()),
+            "sweep_reaches_the_wall": int((reach & clear).sum()),
             "on_the_4pi_curve": {
                 "stable_values": len(stable),
                 "on_it": int(on_it.sum()),

@@ -1,6 +1,5 @@
 """The picture of Figure 2: closed forms, branches, sweeps, and what the sweeps settle on."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,42 +8,47 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from ..plot import plot_branch, save_picture
+from ..plot import plot_branch
 from ..plot.motion import BLUE, GREEN, PINK, RED
 from .motions import GAP
 from .response import FINE, RANGE, RESTITUTIONS, Response, System, between, rows
 
+# What `save_picture` makes a small file of it with.
+LOOK = {"dpi": 72, "colors": 250}
 
-def draw_response(found: Response, path: Path) -> None:
-    """Draw Figure 2 into a PNG file: the range of ζ above, from BB' to CC' below."""
+
+def draw_response(found: Response) -> Figure:
+    """Figure 2: the range of ζ above, undamped and damped, from BB' to CC' below."""
     titles = ["undamped, ξ = 0", f"Table 1, ξ = {found.systems[1].damping_ratio:.4f}"]
-    count = 3 + bool(found.walled)
+    count = 4 + bool(found.walled)
     figure = Figure(figsize=(15, 4.0 * count + 1.2))
     figure.set_layout_engine("constrained", w_pad=0.08)
     grid = figure.subplots(count, 2)
     colors = _colors(found)
     for column, k in enumerate(RESTITUTIONS):
-        bare, damped = found.systems[2 * column : 2 * column + 2]
-        _whole(grid[0, column], found, bare, damped)
-        grid[0, column].set_title(f"{'ab'[column]}) k = {k:g}, d = 2, undamped sweeps", fontsize=12)
-        for row, system in ((1, bare), (2, damped)):
-            _zoom(grid[row, column], found.ratios, system, colors, found.wall)
-            grid[row, column].set_title(f"k = {k:g}, {titles[row - 1]}", fontsize=11)
+        pair = found.systems[2 * column : 2 * column + 2]
+        for row, (system, title) in enumerate(zip(pair, titles, strict=True)):
+            _whole(grid[row, column], found, system)
+            name = f"{'ab'[column]}) " if not row else ""
+            grid[row, column].set_title(f"{name}k = {k:g}, d = 2, {title}", fontsize=12)
+            _zoom(grid[2 + row, column], found.ratios, system, colors, found.wall)
+            grid[2 + row, column].set_title(f"k = {k:g}, {title}, enlarged", fontsize=11)
         if found.walled:
             part = (found.ratios >= FINE[0]) & (found.ratios <= FINE[1])
-            ax, system = grid[3, column], found.walled[column]
+            ax, system = grid[4, column], found.walled[column]
             _zoom(ax, found.ratios[part], system, colors, found.wall, solid=True)
             ax.set_title(f"k = {k:g}, undamped, second stop at Y = {found.wall:g}", fontsize=11)
     for ax, row in zip(grid.T.ravel(), list(range(count)) * 2, strict=True):
         ax.grid(alpha=0.25, lw=0.5)
         ax.set_xlabel("frequency ratio ζ")
-        ax.set_ylabel("min Y, max Y (a)" if not row else "min Y (a)")
+        ax.set_ylabel("min Y, max Y (a)" if row < 2 else "min Y (a)")
     lines: list[Any] = [
         Line2D([], [], color=RED, lw=2.6, alpha=0.45, label="2π closed form"),
         Line2D([], [], color=PINK, lw=3.6, alpha=0.5, label="4π closed form, 1 impact"),
         Line2D([], [], color=BLUE, lw=1.4, label="continued: stable"),
         Line2D([], [], color=BLUE, lw=1.4, ls="--", label="continued: unstable"),
-        Line2D([], [], color="tab:orange", lw=1.2, label="continued, Table 1's damping (top)"),
+        Line2D([], [], color="0.45", lw=1.1, ls="-.", label="free motion, ±1/|1 - ζ² + 2iξζ|"),
+        Line2D([], [], color=GREEN, lw=1.8, label="stop"),
         Line2D([], [], color="k", marker="o", mfc="none", ms=4, ls="", label="run-up"),
         Line2D([], [], color=RED, marker=".", ms=5, ls="", label="close-down"),
         Line2D([], [], color="tab:red", marker="D", ms=5, ls="", label="period doubling"),
@@ -56,7 +60,7 @@ def draw_response(found: Response, path: Path) -> None:
     figure.suptitle(
         "Fig. 2 of the paper: ideal drive, Δ = 2a. Strips: what the sweeps settle on", fontsize=14
     )
-    save_picture(figure, path, dpi=80, colors=96)
+    return figure
 
 
 def _colors(found: Response) -> dict[str, str]:
@@ -112,20 +116,22 @@ def _lines(ax: Axes, system: System) -> None:
         )  # fmt: skip
 
 
-def _whole(ax: Axes, found: Response, bare: System, damped: System) -> None:
-    _closed_curves(ax, found.ratios, bare)
-    for branch in damped.branches:
-        plot_branch(branch, ax=ax, special=False, color="tab:orange", lw=1.1)
-    for branch in bare.branches:
+def _whole(ax: Axes, found: Response, system: System) -> None:
+    _closed_curves(ax, found.ratios, system)
+    zeta = np.linspace(*RANGE, 1401)
+    free = 1 / np.abs(1 - zeta**2 + 2j * system.damping_ratio * zeta + 1e-300)
+    for sign in (-1, 1):
+        ax.plot(zeta, sign * free, color="0.45", lw=1.1, ls="-.", zorder=1)
+    for branch in system.branches:
         plot_branch(branch, ax=ax, special=False, lw=1.2)
-    _sweep_marks(ax, found.ratios, bare)
-    _sweep_marks(ax, found.ratios, bare, "y_max")
+    _sweep_marks(ax, found.ratios, system)
+    _sweep_marks(ax, found.ratios, system, "y_max")
     ax.axhline(GAP, color=GREEN, lw=1.6)
-    if found.wall is not None:
-        ax.axhline(found.wall, color="k", lw=1.0, ls="--")
-    _lines(ax, bare)
+    ax.axhline(found.wall, color="k", lw=1.0, ls="--")
+    ax.text(0.51, found.wall + 0.06, "a stop here?", fontsize=8.5)
+    _lines(ax, system)
     ax.set_xlim(*RANGE)
-    ax.set_ylim(min(float(b.y_min.min()) for b in bare.branches) - 0.3, 2.7)
+    ax.set_ylim(min(float(b.y_min.min()) for b in system.branches) - 0.3, 2.7)
 
 
 def _zoom(
@@ -133,7 +139,7 @@ def _zoom(
     ratios: np.ndarray,
     system: System,
     colors: dict[str, str],
-    wall: float | None,
+    wall: float,
     solid: bool = False,
 ) -> None:
     """From BB' to CC', with a strip for each sweep that names its motions by colour."""
@@ -141,13 +147,11 @@ def _zoom(
     for branch in system.branches:
         plot_branch(branch, ax=ax, lw=1.3)
     _sweep_marks(ax, ratios, system)
-    if wall is not None:
-        look = {"color": GREEN, "lw": 1.8} if solid else {"color": "k", "lw": 1.0, "ls": "--"}
-        ax.axhline(wall, **look)
-        named = "second stop" if solid else "a stop here?"
-        ax.text(0.672, wall + 0.05, named, fontsize=8.5)
+    look: dict[str, Any] = {"color": "k", "lw": 1.0, "ls": "--"}
+    ax.axhline(wall, **({"color": GREEN, "lw": 1.8} if solid else look))
+    ax.text(0.658, wall + 0.05, "second stop" if solid else "a stop here?", fontsize=8.5)
     _lines(ax, system)
-    ax.set_xlim(0.67, 1.01)
+    ax.set_xlim(0.655, 1.01)
     ax.set_ylim(-4.45, -1.0)
     for y, name in ((-4.32, "run-up"), (-4.12, "close-down")):
         for row in rows(system, name, between(system, ratios)):

@@ -1,0 +1,179 @@
+"""Figures 3 and 4 with the motor of Table 1 in the ideal drive's place, tuned to ζ = 0.90."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from matplotlib.figure import Figure
+
+from ..flow import Run, simulate
+from ..orbit import Orbit, find_orbit
+from ..orbit.results import trimmed
+from ..plot.motion import BLUE, GREEN, PINK, angle_axis
+from ..scene import Parameters, Scene
+from .motions import CYCLES, FREQUENCY_RATIO, RESTITUTION, SAMPLES, figure_scene
+from .orbits import TableRow, orbits
+
+TORQUES = (2.0, 10.0, 100.0)
+# (k, c in N·s/m, words): the figures, and the case in which Table 1's machine has a 4π motion.
+_MACHINES = (
+    (RESTITUTION, 0.0, "k = 0.5, undamped"),
+    (0.8, float(Parameters().damping), "k = 0.8, Table 1's damping"),
+)
+# ζ is tuned to this.
+_TUNED = 1e-9
+
+
+class MotorRun(NamedTuple):
+    """What the machine of Figures 3 and 4 does with one motor; lengths in units of a."""
+
+    torque: float
+    """T0 (N·m)."""
+    kappa: float
+    """κ, tuned so that the 4π motion has ζ = 0.90."""
+    orbit: Orbit
+    """That motion."""
+    from_rest: Run
+    """200 cycles from Y = V = 0 and the no-load speed."""
+    from_long: Run
+    """200 cycles from the 4π motion."""
+
+    @property
+    def speed_variation(self) -> float:
+        """(largest - smallest crank speed) / mean, over the 4π motion."""
+        assert self.from_long.samples is not None
+        W = np.asarray(self.from_long.samples.state.W)[: 2 * SAMPLES + 1]
+        return float(np.ptp(W) / FREQUENCY_RATIO)
+
+
+class Motors(NamedTuple):
+    """All that is measured with motors."""
+
+    rows: list[TableRow]
+    runs: list[MotorRun]
+    ideal_minimum: float
+    """Smallest Y of the ideal drive's 4π motion."""
+
+
+def _machine(torque: Any, kappa: Any, k: Any, c: Any) -> Scene:
+    return Parameters(torque=torque, kappa=kappa, restitution=k, damping=c).scene()
+
+
+@eqx.filter_jit
+def _searched(cycles: int, lanes: Any, kappa: Any, guess: Any) -> Orbit:
+    """One search for each row of (T0, k, c)."""
+
+    def one(lane, kappa, guess):
+        torque, k, c = lane
+        scene = _machine(torque, kappa, k, c)
+        return find_orbit(scene, scene.start(Y=guess[0], V=guess[1], W=guess[2]), cycles=cycles)
+
+    return jax.vmap(one)(lanes, kappa, guess)
+
+
+def _tuned(cycles: int) -> list[TableRow]:
+    """The motions of this period with every motor, at ζ = 0.90, in one compiled program."""
+    lanes = [(torque, k, c) for k, c, _ in _MACHINES for torque in TORQUES]
+    starts = []
+    for _, k, c in lanes:
+        ratio = Parameters(damping=c).scene(drive="ideal").damping_ratio
+        closed = orbits(figure_scene(ratio, restitution=k), cycles=cycles)
+        starts.append([float(closed.Y[0]), float(closed.V[0]), FREQUENCY_RATIO])
+    kappa, guess = np.full(len(lanes), FREQUENCY_RATIO), jnp.asarray(starts)
+    slope = np.ones(len(lanes))
+    found, before = None, None
+    for _ in range(8):
+        found = _searched(cycles, jnp.asarray(lanes), jnp.asarray(kappa), guess)
+        off = np.asarray(found.frequency_ratio) - FREQUENCY_RATIO
+        if np.abs(off).max() < _TUNED:
+            break
+        if before is not None and np.all(kappa != before[0]):  # secants
+            slope = (off - before[1]) / (kappa - before[0])
+        before = kappa, off
+        kappa = kappa - off / slope
+        state = found.state
+        guess = jnp.stack([state.Y, state.V, state.W], axis=1)
+    rows = []
+    for i, (torque, k, c) in enumerate(lanes):
+        words = next(words for *key, words in _MACHINES if key == [k, c])
+        orbit = trimmed(jtu.tree_map(lambda x, i=i: x[i], found))
+        rows.append(TableRow(f"motor T0 = {torque:g} N·m, {words}", orbit, float(kappa[i])))
+    return rows
+
+
+@eqx.filter_jit
+def _simulated(kappa: Any, starts: Any) -> Run:
+    def one(torque, kappa, start):
+        scene = _machine(torque, kappa, RESTITUTION, 0.0)
+        begin = scene.start(Y=start[0], V=start[1], W=start[2])
+        return simulate(scene, begin, CYCLES, samples=SAMPLES)
+
+    return jax.vmap(one)(jnp.tile(jnp.asarray(TORQUES), 2), kappa, starts)
+
+
+def simulate_motors() -> Motors:
+    """The motions of Figures 3 and 4 with each motor of Table 1, and their runs."""
+    short, long = _tuned(1), _tuned(2)
+    tuned = long[: len(TORQUES)]
+    kappa = [row.kappa for row in tuned]
+    rest = [[0.0, 0.0, x] for x in kappa]
+    there = [[float(getattr(row.orbit.state, name)) for name in "YVW"] for row in tuned]
+    runs = jax.block_until_ready(_simulated(jnp.asarray(2 * kappa), jnp.asarray(rest + there)))
+    each = [jtu.tree_map(lambda x, i=i: x[i], runs) for i in range(2 * len(TORQUES))]
+    made = [
+        MotorRun(torque, row.kappa or 0.0, row.orbit, each[i], each[i + len(TORQUES)])
+        for i, (torque, row) in enumerate(zip(TORQUES, tuned, strict=True))
+    ]
+    pairs = [row for pair in zip(short, long, strict=True) for row in pair]
+    ideal = orbits(figure_scene(0.0), cycles=2)
+    return Motors(pairs, made, float(ideal.y_min[0]))
+
+
+def draw_motors(motors: Sequence[MotorRun], ideal: Run) -> Figure:
+    """The last 8π from rest with each motor above its crank speed.
+
+    **Arguments:** the motors' runs; the ideal drive's run from rest, for comparison.
+    """
+    figure = Figure(figsize=(14, 6.6), dpi=110)
+    figure.set_layout_engine("constrained", w_pad=0.08)
+    grid = figure.subplots(2, len(motors), sharex=True, sharey="row")
+    last = slice(-4 * SAMPLES - 1, None)
+    place = np.linspace(0, 8, 4 * SAMPLES + 1)
+    assert ideal.samples is not None
+    for (above, below), motor in zip(grid.T, motors, strict=True):
+        assert motor.from_rest.samples is not None
+        state = motor.from_rest.samples.state
+        above.plot(place, np.asarray(state.Y)[last], color=BLUE, lw=2.2, alpha=0.8, label="motor")
+        above.plot(
+            place, _in_step(np.asarray(ideal.samples.state.Y), np.asarray(state.Y))[last],
+            color=PINK, lw=1.5, dashes=(5, 3), label="ideal drive",
+        )  # fmt: skip
+        above.axhline(2.0, color=GREEN, lw=1.8, label="stop, Y = 2")
+        below.plot(place, np.asarray(state.W)[last], color=BLUE, lw=1.6)
+        below.axhline(FREQUENCY_RATIO, color="0.4", lw=1.0, ls=":")
+        above.set_title(f"T0 = {motor.torque:g} N·m, κ = {motor.kappa:.4f}", fontsize=11)
+        angle_axis(below, every=2)
+        below.set_xlim(0, 8)
+        for ax in (above, below):
+            ax.grid(alpha=0.25, lw=0.5)
+    grid[0, 0].set_ylabel("Y = y/a")
+    grid[1, 0].set_ylabel("crank speed φ'/ω")
+    handles, labels = grid[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=11)
+    figure.suptitle(
+        f"Figures 3 and 4 with the motor: the last 8π of {CYCLES} cycles from rest "
+        "(k = 0.50, undamped, Δ = 2a, mean ζ = 0.90)"
+    )
+    return figure
+
+
+def _in_step(ideal: np.ndarray, motor: np.ndarray) -> np.ndarray:
+    """The ideal run, a cycle later where its 4π motion lies so beside the motor's."""
+    later = np.roll(ideal, SAMPLES)
+    tail = slice(-2 * SAMPLES, None)
+    near = [np.abs(x[tail] - motor[tail]).max() for x in (ideal, later)]
+    return ideal if near[0] <= near[1] else later
