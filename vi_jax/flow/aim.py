@@ -46,7 +46,8 @@ def _met_something(plan: Plan, lane: Lane, trial: Trial) -> Flag:
         begin, end = stop_gradient(trial.position)
         if not plan.method.sees_ahead:
             met = met | trial.good & (lane.direction * end.v < 0) & ~trial.at_turn
-        met = met | trial.good & _may_turn_twice(lane, begin, end, stop_gradient(trial.h))
+        twice = _may_turn_twice(lane, trial, begin, end, stop_gradient(trial.h))
+        met = met | trial.good & twice
     return jnp.ones_like(met) if trial.leaves is not None else met
 
 
