@@ -5,6 +5,7 @@ from .elementary import pin_flag as pin_flag
 from .elementary import sincos as sincos
 from .loop import Emitted as Emitted
 from .loop import current_road as current_road
+from .loop import once as once
 from .loop import road as road
 from .loop import run as run
 from .machine import processor as processor

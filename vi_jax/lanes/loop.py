@@ -119,6 +119,18 @@ def run(
     return results, jtu.tree_unflatten(flat["row"], out[len(last.out_avals) :])
 
 
+def once(function: Callable[[Any], Any], inputs: Any) -> Any:
+    """`function` of one lane's numbers as vector code."""
+
+    def begin(inputs):
+        return (), Emitted(False, False, ())
+
+    def step(inputs, carry):
+        return carry, Emitted(False, False, ())
+
+    return run(begin, step, lambda inputs, carry: function(inputs), inputs, rows=0)[0]
+
+
 def _one(x: Any) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct(x.shape, x.dtype)
 

@@ -53,7 +53,8 @@ def check(jaxpr: Jaxpr) -> None:
         elif name == "scan":
             body = _inner(eqn.params["jaxpr"])[0]
             check(body)
-            if _size(body) * eqn.params["length"] > _WRITTEN_OUT:
+            plain = _counts_only(eqn.params, len(eqn.invars), len(eqn.outvars))
+            if not plain and _size(body) * eqn.params["length"] > _WRITTEN_OUT:
                 raise Unsupported(f"the primitive `scan` of length {eqn.params['length']}")
         elif name not in ELEMENTWISE and name not in STRUCTURAL:
             raise Unsupported(f"the primitive `{name}`")
@@ -242,8 +243,48 @@ def _flat(x: Any) -> list[Value]:
     return [x] if isinstance(x, Value) else list(x.ravel())
 
 
+def _counts_only(params: dict, inputs: int, outputs: int) -> bool:
+    """Whether a loop of known length carries numbers along and has no rows."""
+    carried = params["num_carry"]
+    return params["length"] > 0 and inputs == params["num_consts"] + carried == outputs + (
+        inputs - carried
+    )
+
+
+def _counted(t: Text, params: dict, args: list[Values], mask: Value) -> list[Values]:
+    """A loop of known length without rows, as a loop."""
+    n = params["num_consts"]
+    fixed, first = args[:n], args[n:]
+    inside, after = t.label(), t.label()
+    before = t.block
+    t.line(f"br label %{inside}")
+    t.open(inside)
+    place = len(t.lines)
+    carry = [_zipped(lambda a: Value(t.fresh(), a.kind), x) for x in first]
+    count, following = t.fresh(), t.fresh()
+    jaxpr, consts = _inner(params["jaxpr"])
+    new = write(t, jaxpr, consts, [*fixed, *carry], mask)
+    end = t.block
+    t.line(f"{following} = add i64 {count}, 1")
+    more = t.raw(f"icmp slt i64 {following}, {params['length']}")
+    phis = [f"  {count} = phi i64 [ 0, %{before} ], [ {following}, %{end} ]"]
+    for old, here, back in zip(first, carry, new, strict=True):
+        for a, h, b in zip(*map(_flat, (old, here, back)), strict=True):
+            ways = f"[ {a.text}, %{before} ], [ {b.text}, %{end} ]"
+            phis.append(f"  {h.text} = phi {t.vector(h.kind)} {ways}")
+    t.lines[place:place] = phis
+    t.line(f"br i1 {more}, label %{inside}, label %{after}")
+    t.close()
+    t.follow(after)
+    return new
+
+
 def _scan(t: Text, params: dict, args: list[Values], mask: Value) -> list[Values]:
-    """A loop of known length, written out."""
+    """A loop of known length: written out, unless it is long and has no rows."""
+    body = _inner(params["jaxpr"])[0]
+    big = _size(body) * params["length"] > _WRITTEN_OUT // 16
+    if big and _counts_only(params, len(args), len(body.outvars)):
+        return _counted(t, params, args, mask)
     n, m, length = params["num_consts"], params["num_carry"], params["length"]
     fixed, carry, rows = args[:n], args[n : n + m], args[n + m :]
     jaxpr, consts = _inner(params["jaxpr"])
