@@ -6,15 +6,16 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 
-from .flow import RESULTS, Run
+from .flow import RESULTS, Run, Samples
 from .flow.simulate import planned, simulate
 from .scan.sweep import Sweep, sweep, taken_along
 from .scene import AbstractScene
@@ -115,8 +116,7 @@ def _joined(runs: list[Run], cycles: int, samples: int, steps: int) -> Run:
     def joined(parts: list[Any], number: int, *, shared: int = 0) -> Any:
         """Rows of all parts; `shared` of each are those with which the part before has ended."""
         return jtu.tree_map(
-            lambda first, *others: jnp.concatenate([first, *(x[shared:] for x in others)])[:number],
-            *parts,
+            lambda first, *others: _row([first, *(x[shared:] for x in others)])[:number], *parts
         )
 
     rows = {
@@ -125,26 +125,29 @@ def _joined(runs: list[Run], cycles: int, samples: int, steps: int) -> Run:
         if field.name not in ("sections", "samples", "errors", "result", "steps", "rejected")
     }
     sections = joined([run.sections for run in runs], done + 1, shared=1)
-    dense, passed = [], 0.0
-    for i, run in enumerate(runs):
-        if run.samples is not None:
-            place = jnp.arange(length * samples + 1) / samples + i * length
-            dense.append(dataclasses.replace(
-                run.samples, cycles=place.astype(run.samples.time.dtype),
-                time=run.samples.time + passed,
-            ))  # fmt: skip
-            passed = dense[-1].time[-1]
+    dense, sampled = None, [run.samples for run in runs if run.samples is not None]
+    if sampled:
+        times, passed = [], 0.0
+        for part in sampled:
+            times.append(np.asarray(part.time) + passed)
+            passed = times[-1][-1]
+        states = [part.state for part in sampled]
+        dense = Samples(
+            cycles=jnp.arange(done * samples + 1, dtype=sampled[0].time.dtype) / samples,
+            time=joined(times, done * samples + 1, shared=1),
+            state=joined(states, done * samples + 1, shared=1),
+        )
     failed = next((run for run in runs if not bool(run.successful)), last)
     # What happened after the last cycle that was asked for is nobody's concern.
     whole = all(bool(jnp.isfinite(x[-1])) for x in jtu.tree_leaves(sections))
     return Run(
         **rows,
         sections=sections,
-        samples=joined(dense, done * samples + 1, shared=1) if dense else None,
+        samples=dense,
         errors=None,
         result=RESULTS.successful if whole else failed.result,
         steps=jnp.asarray(steps, last.steps.dtype),
-        rejected=jnp.asarray(sum(run.rejected for run in runs)),
+        rejected=jnp.asarray(sum(int(run.rejected) for run in runs), last.rejected.dtype),
     )
 
 
@@ -173,4 +176,9 @@ def sweep_in_parts(
             start = jtu.tree_map(lambda x: x[0, -1], run.sections)
         if interrupted():
             break
-    return jtu.tree_map(lambda *x: jnp.concatenate(x), *found)
+    return jtu.tree_map(lambda *x: _row(x), *found)
+
+
+def _row(parts: Sequence[Any]) -> Any:
+    """Parts in a row, put together by NumPy: hundreds of them would be a program to compile."""
+    return jnp.asarray(np.concatenate([np.asarray(part) for part in parts]))
