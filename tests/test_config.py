@@ -348,7 +348,7 @@ def test_a_fault_of_the_library_is_not_taken_for_the_users(here, monkeypatch):
     def broken(*args, **options):
         raise TypeError("something else")
 
-    monkeypatch.setattr(verbs, "run_motion", broken)
+    monkeypatch.setattr(verbs, "simulate_in_parts", broken)
     with pytest.raises(TypeError, match="something else"):
         cli.main(["simulate", written(IDEAL + "[simulate]\ncycles = 1")])
 

@@ -83,6 +83,9 @@ def _run_file(options: argparse.Namespace) -> int:
     except OSError as error:
         return _error(error, 1)
     print(found.text)
+    if found.interrupted is not None:
+        print(f"vi-jax: interrupted {found.interrupted}, which are kept", file=sys.stderr)
+        return 130
     return 0 if found.good else 1
 
 

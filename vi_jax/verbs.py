@@ -13,7 +13,6 @@ from io import StringIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 import xarray as xr
@@ -22,9 +21,10 @@ from matplotlib.figure import Figure
 
 from ._checks import unwritable
 from ._files import write_whole
+from ._parts import noted_interrupts, simulate_in_parts, sweep_in_parts
 from ._toml import ConfigError, given, keys_of, spoken, unknown
-from .config import Config, OrbitTable
-from .flow import RESULTS
+from .config import Config, OrbitTable, SimulateTable, SweepTable
+from .flow import RESULTS, Run
 from .flow import simulate as run_motion
 from .flow.results import REASONS, number_of
 from .orbit import Orbit, continue_orbit, find_orbit
@@ -42,7 +42,6 @@ from .plot.motion import BLUE, RED
 from .scan import Sweep
 from .scan import basins as find_basins
 from .scan import scan as run_scan
-from .scan import sweep as run_sweep
 from .scan.grid import Blocks, axes_of
 from .scan.job import check_corners, make_job
 from .scene import Scene
@@ -58,6 +57,8 @@ class Outcome(NamedTuple):
     """What to print."""
     good: bool
     """Whether anything succeeded."""
+    interrupted: str | None = None
+    """Where Ctrl-C ended it, if it did; what was computed before is kept."""
 
 
 def scan(config: Config, tell: Tell) -> Outcome:
@@ -109,16 +110,25 @@ def sweep(config: Config, tell: Tell) -> Outcome:
     options = given(table, "values", "up_and_down", "picture", "output")
     there, back = ("up", "down") if table.values[0] <= table.values[-1] else ("down", "up")
     found: dict[str, Sweep] = {}
-    with spoken("[sweep]", keys=keys_of(type(table))):
-        tell(f"sweeping {table.parameter} {there}, {len(table.values)} values")
-        found[there] = run_sweep(
-            scene, values=jnp.asarray(table.values), start=start, method=method, **options
-        )
-        if table.up_and_down:
-            tell(f"sweeping {table.parameter} {back}")
-            last = _last_state(found[there], start)
-            values = jnp.asarray(table.values[::-1])
-            found[back] = run_sweep(scene, values=values, start=last, method=method, **options)
+    with noted_interrupts() as interrupted:
+        with spoken("[sweep]", keys=keys_of(type(table))):
+            options |= {"method": method, "interrupted": interrupted}
+            tell(f"sweeping {table.parameter} {there}, {len(table.values)} values")
+            found[there] = sweep_in_parts(scene, values=table.values, start=start, **options)
+            if table.up_and_down and not interrupted():
+                tell(f"sweeping {table.parameter} {back}")
+                last = _last_state(found[there], start)
+                back_again = table.values[::-1]
+                found[back] = sweep_in_parts(scene, values=back_again, start=last, **options)
+        told = _told_sweeps(found, table)
+        done = sum(run.values.size for run in found.values())
+        wanted = len(table.values) * (2 if table.up_and_down else 1)
+        if interrupted() and done < wanted:
+            return told._replace(interrupted=f"after {done:,} of {wanted:,} values")
+        return told
+
+
+def _told_sweeps(found: Mapping[str, Sweep], table: SweepTable) -> Outcome:
     lines, codes = [], []
     for way, run in found.items():
         lines.append(f"{way}: {run}")
@@ -263,13 +273,18 @@ def simulate(config: Config, tell: Tell) -> Outcome:
         if options["samples"] < 1:
             raise ConfigError("`samples` in [simulate] must be at least 1 for a picture")
     tell(f"simulating {table.cycles:,} cycles")
-    with spoken("[simulate]", keys=keys_of(type(table))):
-        run = run_motion(
-            scene,
-            scene.start() if start is None else start,
-            method=method,
-            **options,
-        )
+    with noted_interrupts() as interrupted:
+        with spoken("[simulate]", keys=keys_of(type(table))):
+            start = scene.start() if start is None else start
+            run = simulate_in_parts(scene, start, method=method, interrupted=interrupted, **options)
+        told = _told_run(scene, run, table)
+        done = run.impacts.size
+        if interrupted() and done < table.cycles:
+            return told._replace(interrupted=f"after {done:,} of {table.cycles:,} cycles")
+        return told
+
+
+def _told_run(scene: Scene, run: Run, table: SimulateTable) -> Outcome:
     lines = [str(run)]
     if table.output is not None:
         columns = _sample_columns(run.samples) if table.samples else _cycle_columns(run)

@@ -143,17 +143,23 @@ def _finite(numbers: np.ndarray | None) -> bool:
     return numbers is None or bool(np.isfinite(numbers).all())
 
 
+def taken_along(scene: AbstractScene, state: Any) -> Any:
+    """The state, the body taken along by a stop that has come nearer."""
+    for stop in scene.stops:
+        Y = scene.position(state)
+        beyond = stop.sign * Y > stop.gap
+        moved = scene.placed(state, stop.sign * stop.gap, jnp.zeros_like(Y))
+        state = jtu.tree_map(lambda a, b, c=beyond: jnp.where(c, a, b), moved, state)
+    return state
+
+
 @eqx.filter_jit
 def _sweep(
     scene, parameter, values, start, settle, cycles, method, rests, tolerance, max_steps
 ) -> Sweep:
     def one(state, value):
         here = with_leaf(scene, parameter, value)
-        for stop in here.stops:  # one that has come nearer takes the body with it
-            Y = here.position(state)
-            beyond = stop.sign * Y > stop.gap
-            moved = here.placed(state, stop.sign * stop.gap, jnp.zeros_like(Y))
-            state = jtu.tree_map(lambda a, b, c=beyond: jnp.where(c, a, b), moved, state)
+        state = taken_along(here, state)
         run = simulate(
             here, state, cycles, settle=settle, method=method, rests=rests, max_steps=max_steps
         )
