@@ -223,7 +223,9 @@ def _impacts(
     phase = jnp.mod(jnp.arctan2(jnp.where(resolved, direction[1], 0.0), cosine), 2 * pi)
     # A rounding error below zero comes back from `mod` as a full turn.
     phase = jnp.where(phase >= 2 * pi, 0.0, phase)
-    terms = jnp.sqrt(jnp.sum(p * p)) + jnp.sqrt(jnp.where(decided, size, 1.0)) * jnp.abs(v)
+    # What v is made of cancels towards a grazing, and what the phase is made of too.
+    length = jnp.sqrt(jnp.where(decided, size, 1.0))
+    terms = 2 * jnp.sqrt(jnp.sum(p * p)) + jnp.abs(det) * root / length + length * jnp.abs(v)
     slack = 16 * noise * terms / jnp.where(resolved, jnp.hypot(*direction), 1.0)
     return v, phase, jax.lax.stop_gradient(jnp.minimum(slack, 1e3 * noise)), resolved
 
