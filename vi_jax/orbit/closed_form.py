@@ -40,11 +40,12 @@ class ClosedFormOrbits(eqx.Module):
     """
 
     Y: Float[Array, "... 2"]
-    """Position on the section φ = 0 mod 2π, at the first section after the impact."""
+    """Position on the scene's section (φ = 0 mod 2π, unless `at_section` has moved it), the first
+    one after the impact; d, just after the impact, where that falls on the section."""
     V: Float[Array, "... 2"]
     """dY/dτ on that section."""
     impact_phase: Float[Array, "... 2"]
-    """Crank angle of the impact (radians), counted from that section: in [2π(n - 1), 2πn)."""
+    """Crank angle of the next impact (radians): in (2π(n - 1), 2πn] from the section on."""
     impact_speed: Float[Array, "... 2"]
     """dY/dτ just before the impact, positive."""
     y_min: Float[Array, "... 2"]
@@ -75,6 +76,11 @@ def closed_form_orbits(scene: Scene, *, cycles: int = 1) -> ClosedFormOrbits:
     count as grazing too. Turning points are bracketed on 256 points per drive cycle and then
     solved for, so ζ should be well above 1/256, or peaks between the points can be missed.
 
+    An impact may fall on the section itself: on φ = 0 it does with ξ = 0 and k = 1 or ζ = 1. The
+    state is that just after it, and the next impact is the last thing that happens in the period;
+    V is changed in its last digits if that keeps rounding from putting it beyond. With ξ = 0 and
+    ζ = 1 nothing can: there take another section, `scene.at_section(pi)`, to simulate from.
+
     **Raises:** `ValueError` if the scene has no such closed form or `cycles` < 1.
     """
     if not isinstance(scene, Scene) or not isinstance(scene.drive, IdealDrive):
@@ -99,13 +105,16 @@ def closed_form_orbits(scene: Scene, *, cycles: int = 1) -> ClosedFormOrbits:
             "Argument `scene` must hold scalars (use `jax.vmap` for arrays), but its frequency "
             f"ratio, damping ratio, restitution and gap have shapes {shapes}."
         )
-    return one_impact_orbits(*numbers, count("cycles", cycles, least=1))
+    section = 0.0 if scene.section_phase is None else scene.section_phase
+    return one_impact_orbits(*numbers, count("cycles", cycles, least=1), section)
 
 
-def one_impact_orbits(zeta: Any, xi: Any, k: Any, d: Any, n: int) -> ClosedFormOrbits:
+def one_impact_orbits(
+    zeta: Any, xi: Any, k: Any, d: Any, n: int, section: Any = 0.0
+) -> ClosedFormOrbits:
     """`closed_form_orbits` on bare dimensionless scalars: ζ > 0, ξ ≥ 0, k in [0, 1], d, n ≥ 1."""
     dtype = jnp.result_type(float, zeta, xi, k, d)
-    zeta, xi, k, d = (jnp.asarray(x, dtype) for x in (zeta, xi, k, d))
+    zeta, xi, k, d, section = (jnp.asarray(x, dtype) for x in (zeta, xi, k, d, section))
     period = 2 * pi * n / zeta
     rates = _rates(zeta, xi)
     # Squarings of the flight over one grid step: over 1, 2, 4, … steps, and last over T. They
@@ -114,17 +123,20 @@ def one_impact_orbits(zeta: Any, xi: Any, k: Any, d: Any, n: int) -> ClosedFormO
     flights = [_exponential(rates * (period / 2**doublings))]
     for _ in range(doublings):
         flights.append(_dot(flights[-1], flights[-1]))
-    v, phase, resolved = _impacts(flights[-1], k, d, period)
+    v, phase, slack, resolved = _impacts(flights[-1], k, d, period)
 
     # Absent motions go on as a harmless one, so that their derivatives cannot be NaN.
     exists = resolved & (v > 64 * jnp.finfo(dtype).eps * (1 + period) * (1 + jnp.abs(d)))
     v, phase = jnp.where(exists, v, 1.0), jnp.where(exists, phase, 1.0)
     follow = jax.vmap(lambda v, phase: _follow(rates, flights[:-1], period, k, d, v, phase))
     y_min, y_max, clearance = follow(v, phase)
-    wait = (2 * pi - phase) / zeta
+    turn = jnp.mod(section - phase, 2 * pi)
+    on = jax.lax.stop_gradient((turn <= slack) | (turn >= 2 * pi - slack))
+    turn = turn - jax.lax.stop_gradient(jnp.where(on, turn, 0.0))
     start = _after_impact(k, d, v, phase)
-    carried = _exponential(rates * wait[:, None, None] / 2**doublings, doublings)
-    section = _dot(carried, start[..., None])[..., 0]
+    carried = _exponential(rates * (turn / zeta)[:, None, None] / 2**doublings, doublings)
+    there = _dot(carried, start[..., None])[..., 0]
+    nudge = jnp.where(on, _early(flights[-1], k, d, v, period), 0.0)
 
     multipliers = _multipliers(flights[-1], xi, k, d, v, phase, period)
     admissible = exists & (clearance >= 0)
@@ -133,9 +145,9 @@ def one_impact_orbits(zeta: Any, xi: Any, k: Any, d: Any, n: int) -> ClosedFormO
         return jnp.where(exists, x, jnp.nan)
 
     orbits = ClosedFormOrbits(
-        Y=known(section[:, 0]),
-        V=known(section[:, 1]),
-        impact_phase=known(phase + 2 * pi * (n - 1)),
+        Y=known(there[:, 0]),
+        V=known(there[:, 1] + nudge),
+        impact_phase=known(section + 2 * pi * n - turn),
         impact_speed=known(v),
         y_min=known(y_min),
         y_max=known(y_max),
@@ -181,8 +193,9 @@ def _after_impact(k, d, v, phase) -> Float[Array, "... 4"]:
 
 def _impacts(
     flight: Float[Array, "4 4"], k: Scalar, d: Scalar, period: Scalar
-) -> tuple[Float[Array, "2"], Float[Array, "2"], Bool[Array, ""]]:
-    """Impact speeds (unit: a ω), impact phases in [0, 2π), and whether they are real.
+) -> tuple[Float[Array, "2"], Float[Array, "2"], Float[Array, "2"], Bool[Array, ""]]:
+    """Impact speeds (unit: a ω), impact phases in [0, 2π) with what rounding leaves open of them,
+    and whether they are real.
 
     With r(v) = f + g v = (d, v) - M (d, -k v) and the adjugate G⁺ of G, the condition on the
     phase is |G⁺ r(v)| = |det G|. Since det G⁺ = det G, the discriminant is det² (|G⁺ g|² -
@@ -209,7 +222,21 @@ def _impacts(
     cosine = jnp.where(resolved, direction[0], 1.0)
     phase = jnp.mod(jnp.arctan2(jnp.where(resolved, direction[1], 0.0), cosine), 2 * pi)
     # A rounding error below zero comes back from `mod` as a full turn.
-    return v, jnp.where(phase >= 2 * pi, 0.0, phase), resolved
+    phase = jnp.where(phase >= 2 * pi, 0.0, phase)
+    # What v is made of cancels towards a grazing, and what the phase is made of too.
+    length = jnp.sqrt(jnp.where(decided, size, 1.0))
+    terms = 2 * jnp.sqrt(jnp.sum(p * p)) + jnp.abs(det) * root / length + length * jnp.abs(v)
+    slack = 16 * noise * terms / jnp.where(resolved, jnp.hypot(*direction), 1.0)
+    return v, phase, jax.lax.stop_gradient(jnp.minimum(slack, 1e3 * noise)), resolved
+
+
+def _early(flight, k, d, v, period) -> Float[Array, "2"]:
+    """A change of V just after the impact, in its last digits, by which the next one comes before
+    the section on which both fall, rather than where rounding puts it."""
+    rounding = 64 * jnp.finfo(v.dtype).eps * (1 + period) * (1 + jnp.abs(d) + v)
+    rise = flight[0, 1]
+    change = rounding * rise / (rise * rise + 0.01)
+    return jax.lax.stop_gradient(jnp.where(1e3 * jnp.abs(change) < k * v, change, 0.0))
 
 
 def _follow(rates, flights, period, k, d, v, phase) -> tuple[Scalar, Scalar, Scalar]:
