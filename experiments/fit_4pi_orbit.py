@@ -318,11 +318,10 @@ motion. A transient is over when the section repeats within 1e-6.
 - At k = 0.95 half of the random guesses lead Newton nowhere: the map over two cycles has many
   jumps there, where the motion gains or loses an impact, and the residual falls towards them.
 """
-fitted = rows[0]["newton, displaced"][0]
 numbers = {
-    "4π motion, k = 0.5, undamped, ideal: min Y": float(fitted.y_min),
-    "largest multiplier": float(abs(fitted.multipliers[0])),
-    "cycles of the transient from rest": float(rows[0]["transient"][1]),
+    f"{title(row)}: cycles of the transient": float(row["transient"][1])
+    for row in rows
+    if row["torque"] is None
 }
 if not QUICK:
     keep(HERE, "fit_4pi_orbit", text, numbers, figure)

@@ -176,7 +176,9 @@ def basins_map() -> Expected:
     third = "ζ = 1.4, k = 0.8, d = 2, Table 1's ξ = 0.0448"
 
     def stable(zeta, k, xi, gap, cycles):
-        return float(np.abs(closed(zeta, k, xi, gap, cycles=cycles).multipliers).max(axis=1).min())
+        return float(
+            np.nanmin(np.abs(closed(zeta, k, xi, gap, cycles=cycles).multipliers).max(axis=1))
+        )
 
     numbers = {
         f"{first}: multiplier of the 4π motion, 1 impacts": stable(3.2, 0.9, 0.002, 1.05, 2),
@@ -220,16 +222,18 @@ def escape_from_2pi() -> Expected:
 
 
 def fit_4pi_orbit() -> Expected:
-    found = closed(0.9, 0.5, 0.0, 2.0, cycles=2)
-    scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0)
-    run = vi.simulate(scene, scene.start(), 120, method=vi.ExactFlight(), record="sections")
-    sections = np.stack([run.sections.Y, run.sections.V], axis=1)
-    late = np.flatnonzero(~(np.abs(sections[2:] - sections[:-2]).max(axis=1) < 1e-6))
-    return {
-        "4π motion, k = 0.5, undamped, ideal: min Y": (float(found.y_min[0]), 1e-9),
-        "largest multiplier": (float(np.abs(found.multipliers[0]).max()), 1e-7),
-        "cycles of the transient from rest": (int(late[-1]) + 1, 0),
-    }
+    numbers = {}
+    for k, xi, name in (
+        (0.5, 0.0, "k = 0.5, undamped"), (0.8, XI, "k = 0.8, Table 1"),
+        (0.95, 0.0, "k = 0.95, undamped"),
+    ):  # fmt: skip
+        scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=k, gap=2.0, damping_ratio=xi)
+        run = vi.simulate(scene, scene.start(), 1000, method=vi.ExactFlight(), record="sections")
+        sections = np.stack([run.sections.Y, run.sections.V], axis=1)
+        late = np.flatnonzero(~(np.abs(sections[2:] - sections[:-2]).max(axis=1) < 1e-6))
+        # A cycle more or less where rounding decides when 1e-6 is passed.
+        numbers[f"{name}, ideal: cycles of the transient"] = (float(late[-1]) + 1, 1)
+    return numbers
 
 
 def identify() -> Expected:
@@ -254,20 +258,23 @@ def identify() -> Expected:
 
 
 def regime_maps() -> Expected:
+    """Every fourth lane each way of the map with Table 1's damping."""
     data = vi.scan(
         lambda zeta, k: vi.Scene.ideal(
             frequency_ratio=zeta, restitution=k, gap=2.0, damping_ratio=XI
         ),
-        {"zeta": np.linspace(0.5, 1.9, 256)[::16], "k": np.linspace(0.05, 0.95, 256)[::16]},
+        {"zeta": np.linspace(0.5, 1.9, 256)[::4], "k": np.linspace(0.05, 0.95, 256)[::4]},
         measure="regime", settle=400, method=vi.ExactFlight(), progress=False,
     )  # fmt: skip
     period, impacts = data["period"].values, data["impacts"].values
-    name = "(ζ, k), c = 0.5 N·s/m (Table 1), every 16th lane"
-    return {
-        f"{name}: 2π with impacts": (float(np.sum((period == 1) & (impacts > 0))), 0),
-        f"{name}: 4π with one impact": (float(np.sum((period == 2) & (impacts == 1))), 0),
-        f"{name}: without impacts": (float(np.sum(impacts == 0)), 0),
+    parts = {
+        "without impacts, periodic, %": (impacts == 0) & (period > 0),
+        "2π with impacts, %": (impacts > 0) & (period == 1),
+        "4π with one impact, %": (impacts == 1) & (period == 2),
     }
+    # Borders cross the coarse grid elsewhere, by about half its step: 1 % of a side.
+    name = "(ζ, k), c = 0.5 N·s/m (Table 1)"
+    return {f"{name}: {kind}": (100 * float(np.mean(x)), 1.0) for kind, x in parts.items()}
 
 
 def fixed_steps_error(cycles: int) -> float:
