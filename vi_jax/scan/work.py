@@ -15,6 +15,7 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array
 
+from .. import lanes
 from .._checks import count
 from ..flow.fusion import compiling
 from .grid import Blocks
@@ -106,7 +107,7 @@ def run_here(
     x64 = _x64()
 
     def work(where):
-        with jax.enable_x64(x64):  # a thread has its own
+        with jax.enable_x64(x64), lanes.threads(1):  # a thread has its own
             return where, compute(job, blocks.values(where), blocks.lanes, devices)
 
     waiting = iter(todo)
