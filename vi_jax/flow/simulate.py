@@ -87,7 +87,8 @@ def simulate(
         impact_log=impact_log, record=record, reverse=adjoint == "reverse", rests=rests,
         max_impacts=max_impacts, max_steps=max_steps,
     )  # fmt: skip
-    run = _simulate(plan, start, samples > 0)
+    with lanes.interruptible():
+        run = _simulate(plan, start, samples > 0)
     if estimate:
         tighter = dataclasses.replace(plan, method=plan.method.tighter())
         errors = _errors(run, _simulate(tighter, start, False))

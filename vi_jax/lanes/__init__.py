@@ -1,5 +1,6 @@
 """One lane's loop, run for any number of lanes: vector code by LLVM on a CPU, else XLA."""
 
+from .call import interruptible as interruptible
 from .elementary import pin as pin
 from .elementary import pin_flag as pin_flag
 from .elementary import sincos as sincos

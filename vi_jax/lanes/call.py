@@ -5,6 +5,7 @@ The call frame is read as XLA's `ffi/api/c_api.h` lays it out, whose version the
 
 import ctypes
 import functools
+from contextlib import contextmanager
 from ctypes import POINTER, Structure, c_char_p, c_int, c_int32, c_int64, c_size_t, c_void_p
 
 import jax
@@ -14,10 +15,23 @@ from .machine import living
 
 TARGET = "vi_jax_lanes"
 
+INTERRUPTED = "Lanes were interrupted before all of them had ended."
+
 # Of the interface that is written out below.
 _MAJOR, _MINOR = 0, 3
 
 _METADATA, _EXECUTE, _CANCELLED, _INTERNAL = 1, 3, 1, 13
+
+
+@contextmanager
+def interruptible():
+    """An interrupt while lanes run, of which XLA makes an error, is a `KeyboardInterrupt` again."""
+    try:
+        yield
+    except (ValueError, RuntimeError) as error:
+        if INTERRUPTED in str(error):
+            raise KeyboardInterrupt from None
+        raise
 
 
 class _Extension(Structure):
@@ -100,7 +114,7 @@ def _handler(pointer):
     try:
         return _run(frame)
     except KeyboardInterrupt:
-        return _failed(frame, "interrupted", _CANCELLED)
+        return _failed(frame, INTERRUPTED, _CANCELLED)
     except BaseException as error:  # nothing may escape into XLA
         return _failed(frame, f"{type(error).__name__}: {error}", _INTERNAL)
 
