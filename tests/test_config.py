@@ -438,7 +438,9 @@ def test_sweep(here, capsys):
     """
     out = ran(capsys, "sweep", text)
     name = "Sweep of drive.frequency_ratio, 11 values"
-    assert f"up: {name}: 2π from 1.2" in out and f"down: {name}: 2π from 1.7" in out
+    assert f"up: {name}:\n  2π with 1 impact from 1.2\n" in out
+    assert f"down: {name}:\n  2π with 0 impacts from 1.7\n" in out
+    assert out.count(", jump since ") == 2
     assert is_png("s.png")
     table = rows("s.csv")
     assert [row["direction"] for row in table] == ["up"] * 11 + ["down"] * 11

@@ -14,9 +14,13 @@ from .._checks import concrete, count, fits_records, instance_of, number, requir
 from ..flow import RESULTS, simulate
 from ..flow.choice import MethodLike, chosen
 from ..flow.simulate import check_start
+from ..orbit.results import told_impacts
 from ..scene import AbstractScene, Scene
 from ..scene.leaves import check_again, check_leaf, with_leaf
 from .regime import impacts_of, least_period
+
+# A jump is so many times the change at the values beside it, and this part of 1 + |number|.
+_JUMP, _NOTED = 3.0, 0.01
 
 
 class Sweep(eqx.Module):
@@ -51,16 +55,49 @@ class Sweep(eqx.Module):
     def __str__(self) -> str:
         if isinstance(self.values, Tracer) or self.values.ndim != 1:
             return repr(self)
-        values, period = np.asarray(self.values), np.asarray(self.period)
-        begins = [0, *(np.flatnonzero(np.diff(period)) + 1)]
-        names = {0: "no period", -2: "failed"}
-        told = [
-            f"{names.get(int(period[i])) or f'{2 * period[i]}π'} from {values[i]:.6g}"
-            for i in begins
-        ]
+        values, told = np.asarray(self.values), []
+        kinds, jumps = self._kinds(), self._jumps()
+        for i, value in enumerate(values):
+            same = bool(i) and kinds[i] == kinds[i - 1]
+            if same and not jumps[i]:
+                continue
+            line = f"  {'still ' if same else ''}{kinds[i]} from {value:.6g}"
+            if jumps[i]:
+                line += f", jump since {values[i - 1]:.6g}: {', '.join(jumps[i])}"
+            told.append(line)
         if len(told) > 12:
-            told = [*told[:12], f"{len(told) - 12} further changes"]
-        return f"Sweep of {self.parameter}, {values.size} values: {', '.join(told)}"
+            told = [*told[:12], f"  {len(told) - 12} further changes"]
+        return "\n".join([f"Sweep of {self.parameter}, {values.size} values:", *told])
+
+    def _kinds(self) -> list[str]:
+        """The motion at each value in words: its period and its impacts."""
+        names = {0: "no period", -2: "failed"}
+        return [
+            names.get(int(p)) or f"{2 * int(p)}π with {told_impacts(round(float(n)))}"
+            for p, n in zip(np.asarray(self.period), np.asarray(self.impacts), strict=True)
+        ]
+
+    def _jumps(self) -> list[list[str]]:
+        """What changes at each value by far more than at the values beside it.
+
+        Not looked for within motions without a period, whose extremes differ by chance.
+        """
+        numbers = {"min Y": self.y_min, "max Y": self.y_max, "ζ": self.frequency_ratio}
+        period = np.asarray(self.period)
+        found: list[list[str]] = [[] for _ in period]
+        for name, x in numbers.items():
+            if x is None:
+                continue
+            x = np.asarray(x)
+            steps = np.abs(np.diff(x))
+            beside = np.nan_to_num(np.concatenate([[0.0], steps, [0.0]]))
+            usual = np.maximum(beside[:-2], beside[2:])
+            scale = 1 + np.maximum(np.abs(x[1:]), np.abs(x[:-1]))
+            far = (steps > _JUMP * usual) & (steps > _NOTED * scale)
+            far &= (period[1:] > 0) | (period[:-1] > 0)
+            for i in np.flatnonzero(far) + 1:
+                found[i].append(f"{name} {x[i - 1]:.6g} → {x[i]:.6g}")
+        return found
 
 
 def sweep(
