@@ -1,5 +1,7 @@
 """vi_jax: differentiable, vectorised simulation of vibro-impact systems."""
 
+from typing import TYPE_CHECKING
+
 from .flow import RESULTS as RESULTS
 from .flow import AbstractMethod as AbstractMethod
 from .flow import Adaptive as Adaptive
@@ -33,15 +35,6 @@ from .orbit import continue_orbit as continue_orbit
 from .orbit import cycle_map as cycle_map
 from .orbit import distinct_orbits as distinct_orbits
 from .orbit import find_orbit as find_orbit
-from .plot import plot_basins as plot_basins
-from .plot import plot_boundary as plot_boundary
-from .plot import plot_branch as plot_branch
-from .plot import plot_history as plot_history
-from .plot import plot_multipliers as plot_multipliers
-from .plot import plot_phase_portrait as plot_phase_portrait
-from .plot import plot_regimes as plot_regimes
-from .plot import plot_sweep as plot_sweep
-from .plot import save_picture as save_picture
 from .scan import AbstractMeasure as AbstractMeasure
 from .scan import Attractor as Attractor
 from .scan import Basins as Basins
@@ -68,3 +61,29 @@ from .scene import RigidStop as RigidStop
 from .scene import Scene as Scene
 from .scene import SliderCrank as SliderCrank
 from .scene import TimedMotorState as TimedMotorState
+
+if TYPE_CHECKING:
+    from .plot import plot_basins as plot_basins
+    from .plot import plot_boundary as plot_boundary
+    from .plot import plot_branch as plot_branch
+    from .plot import plot_history as plot_history
+    from .plot import plot_multipliers as plot_multipliers
+    from .plot import plot_phase_portrait as plot_phase_portrait
+    from .plot import plot_regimes as plot_regimes
+    from .plot import plot_sweep as plot_sweep
+    from .plot import save_picture as save_picture
+
+
+def __getattr__(name: str):
+    """Plots, loaded when the first of them is asked for: matplotlib takes long to load."""
+    if name.startswith("plot_") or name == "save_picture":
+        from . import plot
+
+        return getattr(plot, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    from . import plot
+
+    return sorted({*globals(), *(name for name in vars(plot) if name.startswith("plot_"))})

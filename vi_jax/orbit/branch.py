@@ -3,13 +3,13 @@
 import dataclasses
 import itertools
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 import numpy as np
-import xarray as xr
 
 from .._checks import interval
+from .._lazy import lazy
 from ..flow.choice import MethodLike
 from ..scene.leaves import check_again, check_leaf, leaf, with_leaf
 from .curve import Step, check_walk, walk
@@ -18,6 +18,11 @@ from .results import ORBIT_RESULTS, Orbit, told_impacts
 from .shooting import Shooting
 from .solve import advance, located, orbit_of, problem_of, tangent_at
 from .special import SpecialPoint
+
+if TYPE_CHECKING:
+    import xarray as xr
+else:
+    xr = lazy("xarray")
 
 # An orbit found on the cycle map solves the equations from impact to impact closer than this; one
 # that rests on a stop does not.
@@ -87,7 +92,7 @@ class Branch:
                 found.append(orbit_of(self.problem, step))
         return found
 
-    def to_xarray(self) -> xr.Dataset:
+    def to_xarray(self) -> "xr.Dataset":
         """The branch as an `xarray.Dataset` over its points."""
         units = {"y_min": "a", "y_max": "a", "clearance": "a", "impact_speed": "a ω"}
         data = {

@@ -6,7 +6,6 @@ from collections.abc import Callable
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from scipy.optimize import newton
 
 from .curve import Step
 from .shooting import Shooting
@@ -165,6 +164,8 @@ class Follower:
             step = advance(half, mean, along, scale, shift)
             M = step.seen.monodromy
             return float(np.linalg.det(M + np.eye(len(M)))) if bool(step.good) else np.nan
+
+        from scipy.optimize import newton  # slow to load
 
         shift, report = newton(  # pyright: ignore[reportAssignmentType]
             missing, 0.0, x1=1e-6, tol=1e-14, full_output=True, disp=False

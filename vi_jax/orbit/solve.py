@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from scipy.optimize import brentq
 
 from ..flow.choice import MethodLike
 from ..scene import Scene
@@ -136,6 +135,8 @@ def located(
 
     if not value(0.0) * value(length) <= 0:
         return None
+    from scipy.optimize import brentq  # slow to load
+
     root = float(brentq(value, 0.0, length, xtol=1e-14, rtol=1e-14, maxiter=80))  # pyright: ignore
     value(root)
     # Where branches cross the corrector has no answer; a point beside it will do.

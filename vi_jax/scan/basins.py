@@ -4,14 +4,14 @@ import dataclasses
 import math
 import warnings
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-import xarray as xr
 
 from .._checks import count, fits_records, given_number
+from .._lazy import lazy
 from ..flow import simulate
 from ..flow.choice import MethodLike, chosen
 from ..orbit.results import told_impacts
@@ -20,6 +20,11 @@ from .grid import axes_of
 from .job import START
 from .measures import AbstractMeasure, Regime
 from .scan import scan
+
+if TYPE_CHECKING:
+    import xarray as xr
+else:
+    xr = lazy("xarray")
 
 CHAOTIC, UNSETTLED, FAILED, TRANSIENT = -1, -2, -3, -4
 _IRREGULAR = {
@@ -52,7 +57,7 @@ class Attractor(NamedTuple):
 class Basins(NamedTuple):
     """Basins of attraction."""
 
-    data: xr.Dataset
+    data: "xr.Dataset"
     """`label` over the region (or over `sample`): a number in `attractors`, or -1 for chaotic, -2
     for unsettled, -3 for failed and -4 for transiently chaotic lanes; `period`, `impacts`,
     `result`, and a section state on which the lane ended."""

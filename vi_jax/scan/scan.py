@@ -7,16 +7,16 @@ import math
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import xarray as xr
 from tqdm import tqdm
 
 from .._checks import count, fits_memory, fits_records, flag, instance_of
+from .._lazy import lazy
 from ..flow import AbstractMethod
 from ..flow.choice import MethodLike, preset
 from ..flow.results import REASON_NAMES
@@ -34,13 +34,18 @@ from .store import (
 )
 from .work import block_size, rounded, run_here, run_on_cluster, size_of, worker_count
 
+if TYPE_CHECKING:
+    import xarray as xr
+else:
+    xr = lazy("xarray")
+
 _UNITS = {"Y": "a", "V": "a ω", "W": "ω", "phase": "rad", "frequency_ratio": "ω", "gap": "a"}
 
 
 class ScanInterrupted(KeyboardInterrupt):
     """Raised when a scan is interrupted: what was computed is not lost."""
 
-    def __init__(self, data: xr.Dataset, store: str | Path | None):
+    def __init__(self, data: "xr.Dataset", store: str | Path | None):
         kept = "what was computed is in `.data`"
         if store is not None:
             kept = f"what was computed is in {store}, and the same call goes on from there"
@@ -69,7 +74,7 @@ def scan(
     devices: int | None = None,
     cluster: Any = None,
     progress: bool = True,
-) -> xr.Dataset:
+) -> "xr.Dataset":
     """Simulate every combination of the axes' values and keep what is measured.
 
     The grid is worked off in blocks of lanes, several at a time, all by one compiled program.
@@ -160,7 +165,7 @@ def scan(
     else:
         kept = MemoryStore(blocks, variables)
 
-    def collected() -> xr.Dataset:
+    def collected() -> "xr.Dataset":
         if isinstance(kept, MemoryStore):
             data = dataset(kept.arrays, blocks, variables)
         else:
@@ -209,7 +214,7 @@ def _better(job: Job) -> AbstractMethod:
 
 
 def _verified(
-    data: xr.Dataset, blocks: Blocks, lanes: int, again: Callable[..., xr.Dataset]
+    data: "xr.Dataset", blocks: Blocks, lanes: int, again: Callable[..., "xr.Dataset"]
 ) -> dict[str, Any]:
     """How some of the lanes come out by a better method."""
     total = data["result"].size
@@ -271,7 +276,7 @@ def variables_of(job: Job, blocks: Blocks) -> dict[str, Variable]:
     return found
 
 
-def _tell_failures(data: xr.Dataset) -> None:
+def _tell_failures(data: "xr.Dataset") -> None:
     codes, numbers = np.unique(np.asarray(data["result"]), return_counts=True)
     failed = {int(c): int(n) for c, n in zip(codes, numbers, strict=True) if c != 0}
     if not failed:

@@ -6,14 +6,20 @@ import warnings
 import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import xarray as xr
-import zarr
 
 from .._checks import unwritable
+from .._lazy import lazy
 from .grid import Blocks
+
+if TYPE_CHECKING:
+    import xarray as xr
+    import zarr
+else:
+    xr = lazy("xarray")
+    zarr = lazy("zarr")
 
 _UNDONE = -1
 
@@ -259,7 +265,7 @@ def _compare(
             )
 
 
-def open_dataset(path: Path) -> xr.Dataset:
+def open_dataset(path: Path) -> "xr.Dataset":
     """The data of a store, read as they are looked at."""
     return xr.open_zarr(str(path), consolidated=False, chunks=None, mask_and_scale=False)
 
@@ -268,7 +274,7 @@ def dataset(
     arrays: Mapping[str, np.ndarray],
     blocks: Blocks,
     variables: Mapping[str, Variable],
-) -> xr.Dataset:
+) -> "xr.Dataset":
     """Arrays with their axes and attributes."""
     return xr.Dataset(
         {
