@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 Coefficient = Any
@@ -107,7 +108,7 @@ class _Flow:
 
         def read(atom: Any) -> Series:
             if isinstance(atom, Literal):
-                return [jnp.asarray(atom.val, atom.aval.dtype)]
+                return [np.asarray(atom.val, atom.aval.dtype)]
             return names[atom]
 
         for eqn in jaxpr.eqns:
@@ -183,7 +184,10 @@ def _square(a: Series, n: int) -> Coefficient:
 
 
 def _bound(eqn: Any, *values: Any) -> Any:
-    return eqn.primitive.bind(*values, **eqn.params)
+    if any(isinstance(v, jax.core.Tracer) for v in values):
+        return eqn.primitive.bind(*values, **eqn.params)
+    with jax.ensure_compile_time_eval():  # what is known, such as an exponent, stays known
+        return eqn.primitive.bind(*values, **eqn.params)
 
 
 def _linear(eqn, n, operands, results, extra):

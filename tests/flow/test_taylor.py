@@ -1,0 +1,140 @@
+"""Taylor series: each rule against derivatives by JAX, the method against the exact flight."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+from vi_jax.flow import series as power_series
+
+RULES = {
+    "arithmetic": lambda t, x: 2 * x - x * t + (x + 1) / (2 + t * t) - x / 3,
+    "powers": lambda t, x: x**2 + 0.1 * x**3 + (1 + x) ** -2 + jnp.square(t) + x**4 / 7 + x**5 / 9,
+    "roots": lambda t, x: jnp.sqrt(1 + x * x) + jax.lax.rsqrt(2 + x) + (1.5 + x) ** 1.5,
+    "exponential": lambda t, x: jnp.exp(-x) + jnp.log(2 + x * t) + jax.nn.sigmoid(x),
+    "circle": lambda t, x: jnp.sin(3 * x) * jnp.cos(t + x),
+    "saturation": lambda t, x: jnp.tanh(2 * x) + jnp.abs(x - 3) + jnp.sign(x),
+    "choice": lambda t, x: jnp.where(x > 0, x * x, -x) + jnp.maximum(x, 0.1) + jnp.minimum(t, x),
+    "arrays": lambda t, x: jnp.sum(
+        jnp.array([[1.0, 2.0], [0.5, -1.0]]) @ jnp.stack([x * x, t]) * jnp.arange(1.0, 3.0)
+    ),
+}
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_a_rule_gives_the_derivatives(name):
+    """Coefficients n! c_n are the solution's derivatives, found by repeated forward mode."""
+    field, order = RULES[name], 6
+    t0, x0 = jnp.asarray(0.3), jnp.asarray(0.7)
+    _, (found,) = power_series.expand(field, t0, x0, order)
+    rate, factor = field, 1.0
+    np.testing.assert_allclose(found[0], x0)
+    for n in range(1, order + 1):
+        factor *= n
+        np.testing.assert_allclose(factor * (found[n] or 0.0), rate(t0, x0), rtol=1e-11, atol=1e-12)
+        rate = lambda t, x, f=rate: jax.jvp(f, (t, x), (jnp.ones_like(t), field(t, x)))[1]
+
+
+def last(scene, start, method, cycles=20, **options):
+    return vi.simulate(scene, start, cycles, method=method, **options)
+
+
+SCENES = {
+    "free": dict(restitution=0.5, gap=None),
+    "hard": dict(restitution=0.5, gap=1.6),
+    "k = 0": dict(restitution=0.0, gap=1.2),
+    "k = 1": dict(restitution=1.0, gap=1.1),
+    "rests": dict(restitution=0.3, gap=0.4),
+}
+
+
+@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("clock", ["phase", "time"])
+def test_an_ideal_drive_as_the_exact_flight(name, clock):
+    scene = vi.Scene.ideal(frequency_ratio=0.8, damping_ratio=0.1, **SCENES[name])
+    start = scene.start(Y=0.2, V=0.4)
+    mine = last(scene, start, vi.Taylor(20, 12), clock=clock)
+    truth = last(scene, start, vi.ExactFlight(), clock=clock)
+    assert bool(mine.successful)
+    np.testing.assert_array_equal(mine.impacts, truth.impacts)
+    np.testing.assert_allclose(mine.sections.Y, truth.sections.Y, atol=1e-10)
+    np.testing.assert_allclose(mine.sections.V, truth.sections.V, atol=1e-10)
+    np.testing.assert_allclose(mine.y_max, truth.y_max, atol=1e-10)
+    np.testing.assert_allclose(mine.y_min, truth.y_min, atol=1e-10)
+    if mine.rests is not None and truth.rests is not None:
+        np.testing.assert_array_equal(mine.rests, truth.rests)
+
+
+MOTOR = vi.Parameters(torque=10.0, restitution=0.5, gap=0.08, kappa=0.9)
+
+
+@pytest.mark.parametrize("clock", ["phase", "time"])
+@pytest.mark.parametrize("method", [vi.Taylor(16, 8), vi.Taylor(16, rtol=1e-12)])
+def test_a_motor_as_the_reference(clock, method):
+    scene = MOTOR.scene()
+    start = scene.start(W=0.9)
+    mine = last(scene, start, method, clock=clock)
+    truth = last(scene, start, "reference", clock=clock)
+    np.testing.assert_array_equal(mine.impacts, truth.impacts)
+    for a, b in zip(mine.sections.__dict__.values(), truth.sections.__dict__.values(), strict=True):
+        np.testing.assert_allclose(a, b, atol=2e-9)
+    np.testing.assert_allclose(mine.impact_speed, truth.impact_speed, atol=2e-9)
+    np.testing.assert_allclose(mine.duration, truth.duration, atol=2e-9)
+
+
+def test_two_stops_and_the_exact_crank():
+    oscillator = vi.Oscillator(0.02)
+    stops = (vi.RigidStop(0.9, 0.6), vi.RigidStop(1.1, 0.7, "left"))
+    scene = vi.Scene(
+        oscillator=oscillator, drive=vi.IdealDrive(0.7), stops=stops, crank=vi.SliderCrank(1 / 3)
+    )
+    start = scene.start(Y=0.1, V=0.3)
+    mine = last(scene, start, vi.Taylor(18, 12))
+    truth = last(scene, start, "reference")
+    np.testing.assert_array_equal(mine.impacts, truth.impacts)
+    np.testing.assert_allclose(mine.sections.Y, truth.sections.Y, atol=1e-9)
+
+
+def test_more_orders_and_shorter_steps_are_better():
+    scene = MOTOR.scene()
+    start = scene.start(W=0.9)
+    truth = last(scene, start, "reference").last.Y
+
+    def error(method):
+        return abs(float(last(scene, start, method).last.Y - truth))
+
+    assert error(vi.Taylor(8, 8)) > 10 * error(vi.Taylor(12, 8)) > 100 * error(vi.Taylor(16, 8))
+    assert error(vi.Taylor(8, 8)) > 10 * error(vi.Taylor(8, 16))
+
+
+def test_derivatives_pass_through_impacts():
+    """Forward by the lanes' program, reverse by the checkpointed loop, against differences."""
+
+    def final(kappa, adjoint="forward"):
+        motor = vi.Parameters(torque=10.0, restitution=0.5, gap=0.08, kappa=kappa).scene()
+        start = motor.start(W=0.9)
+        return vi.simulate(motor, start, 6, method=vi.Taylor(18, 10), adjoint=adjoint).last.Y
+
+    slope = jax.jacfwd(final)(0.9)
+    h = 1e-5
+    change = (final(0.9 + h) - final(0.9 - h)) / (2 * h)
+    np.testing.assert_allclose(slope, change, rtol=1e-7)
+
+
+def test_what_has_no_recursion_is_named():
+    class Odd(vi.CosineCrank):
+        def slide(self, phase):
+            slide = super().slide(phase)
+            return slide._replace(U=slide.U + 0 * jax.scipy.special.erf(phase))
+
+    scene = vi.Scene.ideal(frequency_ratio=0.9, crank=Odd())
+    with pytest.raises(NotImplementedError, match="`erf`"):
+        vi.simulate(scene, scene.start(), 2, method=vi.Taylor())
+
+
+@pytest.mark.parametrize(
+    "options", [dict(order=3), dict(steps_per_cycle=4), dict(rtol=0.0), dict(rtol=float("nan"))]
+)
+def test_bad_numbers_are_refused(options):
+    with pytest.raises(ValueError, match=next(iter(options))):
+        vi.Taylor(**options)
