@@ -12,6 +12,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .._checks import concrete, count, count_or_traced, fits_records, flag, one_of
+from .._programs import compiled
 from ..scene import AbstractScene, Scene
 from .choice import MethodLike, chosen
 from .lane import Lane, Plan, Record
@@ -218,7 +219,7 @@ def check_start(scene: AbstractScene, start: Any) -> None:
             )
 
 
-@eqx.filter_jit
+@compiled
 def _simulate(plan: Plan, start: Any, sampled: bool) -> Run:
     run = run_reverse if plan.bound else run_forward
     lane, states, records = run(plan, plan.launch(start))
