@@ -13,6 +13,7 @@ import numpy as np
 
 from .. import lanes
 from .._checks import concrete, count, count_or_traced, fits_records, flag, one_of
+from .._programs import compiled
 from ..scene import AbstractScene, Scene
 from .choice import MethodLike, chosen
 from .lane import Plan, Record
@@ -220,7 +221,7 @@ def check_start(scene: AbstractScene, start: Any) -> None:
             )
 
 
-@eqx.filter_jit
+@compiled
 def _simulate(plan: Plan, start: Any, sampled: bool) -> Run:
     run = run_reverse if plan.bound else run_forward
     return collect(plan, sampled, *run(plan, start))

@@ -14,6 +14,7 @@ from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Float, Int
 
 from .._checks import concrete, count, flag
+from .._programs import compiled
 from ..flow import simulate
 from ..flow.choice import MethodLike
 from ..scene import AbstractScene, Scene
@@ -108,7 +109,7 @@ def _check_finite(state: Any) -> None:
             raise ValueError(f"Argument `guess` must be finite, but its {name} is {numbers}.")
 
 
-@eqx.filter_jit
+@compiled
 def _find(the_map: CycleMap, guess: Any, method: AbstractSearch, impact_log: int) -> Orbit:
     def one(guess):
         return _judged(the_map, guess, method, impact_log)

@@ -3,12 +3,12 @@
 from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from .._programs import compiled
 from ..flow.choice import MethodLike
 from ..scene import Scene
 from ..scene.leaves import leaf, with_leaf
@@ -61,17 +61,17 @@ def problem_of(
     return problem, np.asarray(x)
 
 
-@eqx.filter_jit
+@compiled
 def _carry(problem: Shooting, s0, s1, u):
     return problem.flight(problem.scene, jnp.asarray(s0), jnp.asarray(s1), u)[0]
 
 
-@eqx.filter_jit
+@compiled
 def _bounce(problem: Shooting, leg, u):
     return problem.bounced(problem.scene, jnp.asarray(leg), u)
 
 
-@eqx.filter_jit
+@compiled
 def _compiled_advance(equations, x, tangent, scale, length) -> Step:
     def observe(x, tangent):
         return equations.observe(x)
@@ -85,7 +85,7 @@ def advance(equations: Equations, x, tangent, scale, length) -> Step:
     return array_of(_compiled_advance(equations, *arguments))
 
 
-@eqx.filter_jit
+@compiled
 def _compiled_observe(problem, x):
     return problem.observe(x)
 
@@ -95,7 +95,7 @@ def observe(problem: Shooting, x: np.ndarray) -> Any:
     return array_of(_compiled_observe(problem, jnp.asarray(x)))
 
 
-@eqx.filter_jit
+@compiled
 def _compiled_tangent(equations, x, scale):
     return first_tangent(equations.residual, x, scale)
 
@@ -105,13 +105,13 @@ def tangent_at(equations: Equations, x: np.ndarray, scale: np.ndarray) -> np.nda
     return np.asarray(_compiled_tangent(equations, jnp.asarray(x), jnp.asarray(scale)))
 
 
-@eqx.filter_jit
+@compiled
 def state_at(problem: Shooting, x, leg, s):
     """The state at a clock reading within the flight after an impact."""
     return problem.state_at(x, leg, s)
 
 
-@eqx.filter_jit
+@compiled
 def jacobian_at(problem: Shooting, x):
     """The derivatives of the equations by all unknowns."""
     return jax.jacfwd(problem.residual)(x)
@@ -144,7 +144,7 @@ def located(
     return min(good, key=lambda step: abs(test(step)), default=None)
 
 
-@eqx.filter_jit
+@compiled
 def _compiled_sections(problem, x, legs, places):
     states = jax.vmap(lambda leg, s: problem.state_at(x, leg, s))(legs, places)
     return states, jnp.max(jnp.abs(problem.residual(x)))

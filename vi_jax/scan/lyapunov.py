@@ -10,6 +10,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
 from .._checks import count
+from .._programs import compiled
 from ..flow import RESULTS, simulate
 from ..flow.choice import MethodLike, chosen
 from ..orbit.cycle_map import CycleMap, adopted, cycle_map
@@ -91,7 +92,7 @@ def lyapunov(
     return _lyapunov(carried, start, cycles, settle, number)
 
 
-@eqx.filter_jit
+@compiled
 def _lyapunov(the_map: CycleMap, start, cycles: int, settle, number: int) -> Lyapunov:
     scene, flow, rests = the_map.scene, the_map.flow, the_map.rests
     before = simulate(scene, start, 1, settle=settle, method=flow, rests=rests)

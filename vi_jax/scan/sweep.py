@@ -11,6 +11,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from .._checks import concrete, count, fits_records, instance_of, number, require
+from .._programs import compiled
 from ..flow import RESULTS, simulate
 from ..flow.choice import MethodLike, chosen
 from ..flow.simulate import check_start
@@ -190,7 +191,7 @@ def taken_along(scene: AbstractScene, state: Any) -> Any:
     return state
 
 
-@eqx.filter_jit
+@compiled
 def _sweep(
     scene, parameter, values, start, settle, cycles, method, rests, tolerance, max_steps
 ) -> Sweep:

@@ -17,6 +17,7 @@ from jaxtyping import Array
 
 from .. import lanes
 from .._checks import count
+from .._programs import Program
 from ..flow.fusion import compiling
 from .grid import Blocks
 from .job import PLACES, Job
@@ -60,7 +61,7 @@ def rounded(lanes: int, total: int, devices: int) -> int:
 @functools.cache
 def _compiled(devices: int) -> Callable[..., dict[str, Array]]:
     if devices == 1:
-        return eqx.filter_jit(lambda job, values, wanted: job(values, wanted), **compiling())
+        return Program(lambda job, values, wanted: job(values, wanted), **compiling())
     mesh = Mesh(np.asarray(jax.local_devices()[:devices]), ("lanes",))
     whole, split = PartitionSpec(), PartitionSpec("lanes")
 
@@ -74,7 +75,7 @@ def _compiled(devices: int) -> Callable[..., dict[str, Array]]:
             here, mesh=mesh, in_specs=(whole, split, split), out_specs=split, check_vma=False
         )(numbers, values, wanted)
 
-    return eqx.filter_jit(spread, **compiling())
+    return Program(spread, **compiling())
 
 
 def compute(

@@ -1,0 +1,73 @@
+"""Programs go before they use up the memory maps that Linux grants a process."""
+
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+from vi_jax import _programs
+
+SCENE = vi.Scene.ideal(frequency_ratio=0.9, gap=None)
+
+
+def section(cycles):
+    return vi.simulate(SCENE, SCENE.start(Y=0.1), cycles, record="sections").sections.Y
+
+
+@pytest.fixture
+def watch(monkeypatch):
+    """A watch that looks at every call."""
+    watch = _programs._Watch()
+    monkeypatch.setattr(_programs, "_watch", watch)
+    monkeypatch.setattr(_programs, "_SELDOM", 0)
+    monkeypatch.setattr(_programs, "_PAUSE", 0)
+    return watch
+
+
+def test_the_oldest_programs_are_dropped_in_time(watch, monkeypatch):
+    jax.clear_caches()
+    first, used = section(1), _programs.maps_used()
+    section(2)
+    one = _programs.maps_used() - used
+    assert one > 50
+    most = int((used + 3.5 * one) / _programs._FULL)
+    monkeypatch.setattr(_programs, "_ROOM", (used + 2 * one) / most)
+    monkeypatch.setattr(_programs, "maps_granted", lambda: most)
+    counts = []
+    with pytest.warns(RuntimeWarning, match=r"memory maps .* The oldest programs were dropped"):
+        for cycles in range(3, 12):
+            section(cycles)
+            counts.append(_programs.maps_used())
+    assert max(counts) < most and sum(np.diff(counts) < 0) >= 2
+    np.testing.assert_array_equal(section(1), first)
+
+
+def test_what_was_called_last_goes_last(watch, monkeypatch):
+    dropped = []
+
+    def program(name):
+        made = _programs.Program(lambda x: x + 1)
+        monkeypatch.setattr(made, "drop", lambda: dropped.append(name))
+        return made
+
+    a, b, c = (program(name) for name in "abc")
+    for each in (a, b, c, a):
+        each(jnp.zeros(3))
+    used = iter([900, 800, 300, 300])
+    monkeypatch.setattr(_programs, "maps_granted", lambda: 1000)
+    monkeypatch.setattr(_programs, "maps_used", lambda: next(used))
+    with pytest.warns(RuntimeWarning, match=r"used 900 of the 1,000 .* which leaves 300[.]$"):
+        a(jnp.zeros(3))
+    assert dropped == ["b", "c"]
+    used = iter([900, 900, 900, 900])
+    with pytest.warns(RuntimeWarning, match=r"call `jax.clear_caches\(\)` now and then"):
+        a(jnp.zeros(3))
+
+
+def test_elsewhere_nothing_is_looked_at(watch, monkeypatch, tmp_path):
+    monkeypatch.setattr(_programs, "_MAPS", tmp_path / "maps")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        section(1)

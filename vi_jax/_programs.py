@@ -1,0 +1,115 @@
+"""The compiled programs of this package, and the room that Linux grants a process for them.
+
+A program takes some hundreds of memory maps; where a process has none left, the compiler dies with
+a segmentation fault. JAX keeps every program, so that a long script gets there.
+"""
+
+import functools
+import gc
+import threading
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+
+_MAPS, _MOST = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
+
+# Parts of the maps beyond which programs are dropped, and down to which.
+_FULL, _ROOM = 0.6, 0.4
+
+# A look costs up to a tenth of a second: one in so many times what it took, and in half a second.
+_SELDOM, _PAUSE = 50, 0.5
+
+
+class _Watch:
+    """Who was compiled, the least recently called first, and when the maps were last looked at."""
+
+    def __init__(self):
+        self.lock = threading.Lock()
+        self.programs: dict[Program, None] = {}
+        self.next_look = 0.0
+
+    def called(self, program: "Program") -> None:
+        """Note a call. Now and then, look whether there is room for what it may compile."""
+        if time.monotonic() < self.next_look and next(reversed(self.programs), None) is program:
+            return
+        with self.lock:
+            self.programs.pop(program, None)
+            self.programs[program] = None
+            begin = time.monotonic()
+            if begin < self.next_look:
+                return
+            self._look()
+            self.next_look = begin + max(_PAUSE, _SELDOM * (time.monotonic() - begin))
+
+    def _look(self) -> None:
+        used, most = maps_used(), maps_granted()
+        if used is None or most is None or used < _FULL * most:
+            return
+        left = used
+        for program in list(self.programs):
+            program.drop()
+            gc.collect()
+            left = maps_used() or 0
+            if left < _ROOM * most:
+                break
+        advice = ""
+        if left >= _FULL * most:
+            advice = (
+                " Others take the most of it: call `jax.clear_caches()` now and then, or raise "
+                f"{_MOST}, before the process dies."
+            )
+        warnings.warn(
+            f"This process used {used:,} of the {most:,} memory maps that Linux grants it, most of "
+            "them for compiled programs. The oldest programs were dropped (they are compiled again "
+            f"if called again), which leaves {left:,}.{advice}",
+            RuntimeWarning,
+            stacklevel=4,
+        )
+
+
+def maps_used() -> int | None:
+    """Memory maps of this process, or `None` where that is not to be known."""
+    try:
+        return _MAPS.read_bytes().count(b"\n")
+    except OSError:
+        return None
+
+
+def maps_granted() -> int | None:
+    """The most that it may have, or `None`."""
+    try:
+        return int(_MOST.read_text())
+    except (OSError, ValueError):
+        return None
+
+
+_watch = _Watch()
+
+
+class Program:
+    """A function that is compiled as by `eqx.filter_jit`, and whose programs can be dropped."""
+
+    def __init__(self, function: Callable[..., Any], **options: Any):
+        functools.update_wrapper(self, function)
+        self._compiled = eqx.filter_jit(function, **options)
+
+    def drop(self) -> None:
+        """Let go of what was compiled."""
+        # Equinox passes this on to nobody. To forget the wrapper would not do: JAX keeps the rest.
+        cached = getattr(self._compiled, "_cached", None)
+        getattr(cached, "clear_cache", jax.clear_caches)()
+
+    def __call__(self, *arguments: Any, **keywords: Any) -> Any:
+        """As the function."""
+        _watch.called(self)
+        return self._compiled(*arguments, **keywords)
+
+
+def compiled(function: Callable[..., Any]) -> Program:
+    """Decorator: the function, compiled, its programs dropped if the room for them runs out."""
+    return Program(function)
