@@ -1,5 +1,7 @@
 """Branches, what happens on them, and boundaries, beside closed forms and found orbits."""
 
+import re
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -106,6 +108,16 @@ def test_switched_branches(short, long, restitution):
     touches = [p for p in single.special if p.kind == "grazing"]
     assert min(abs(p.parameter - lost.parameter) for p in touches) < 1e-8
     assert all(abs(float(p.orbit.clearance)) < 1e-9 for p in touches)
+    for point in touches:  # the place is told within the period, and there the body is at the stop
+        told = re.search(r"touches a stop at crank angle φ = ([0-9.]+) of 4π", str(point))
+        assert told is not None and 0 <= float(told[1]) < 4 * np.pi
+        run = point.orbit.trajectory(samples=4096)
+        there = np.interp(float(told[1]) / (2 * np.pi), run.samples.cycles, run.samples.state.Y)
+        assert float(there) == pytest.approx(2.0, abs=1e-4)
+    slowest = int(np.argmin(np.abs(lost.orbit.impact_speed)))
+    told = re.search(r"the impact at crank angle φ = ([0-9.]+) of 4π is lost", str(lost))
+    assert told is not None
+    assert float(told[1]) == pytest.approx(float(lost.orbit.impact_phase[slowest]), abs=1e-4)
     for point in single.special:
         if point.kind == "period-doubling":
             assert np.abs(np.asarray(point.orbit.multipliers) + 1).min() < 1e-8

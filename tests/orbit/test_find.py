@@ -1,5 +1,7 @@
 """Found orbits beside the closed form, long simulations, differences and each other."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -40,6 +42,23 @@ def test_the_table_of_values(cycles):
     for a, b in zip(jax.tree.leaves(stepped.state), jax.tree.leaves(orbit.state), strict=True):
         assert float(a) == pytest.approx(float(b), abs=1e-8)
     np.testing.assert_allclose(stepped.multipliers, orbit.multipliers, atol=1e-8)
+
+
+def test_orbits_are_told_in_words():
+    orbit = vi.find_orbit(UNDAMPED, near(UNDAMPED, 1), cycles=1)
+    assert "are listed" not in str(orbit)
+    # As where a body that comes to rest has more impacts than are logged.
+    more = dataclasses.replace(orbit, impacts=jnp.asarray(38))
+    assert "  only 1 of 38 impacts are listed: see `impact_log`" in str(more)
+    batch = jax.tree.map(lambda x: jnp.stack([x, x]), orbit)
+    orbits, counts = vi.distinct_orbits(batch)
+    assert isinstance(orbits, list) and counts.tolist() == [2]
+    assert str(orbits).splitlines() == [
+        "1 orbit",
+        "  2π, 1 impact, unstable: Y = 1.92303, V = -0.876442; Y in [-1.88358, 2]; "
+        "greatest multiplier 1.16604",
+    ]
+    assert str(orbits) in str((orbits, counts))
 
 
 @pytest.mark.slow

@@ -5,10 +5,31 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .._checks import given_number
-from .results import Orbit, trimmed
+from ..scene import Scene
+from .results import Orbit, told_impacts, trimmed
 
 
-def distinct_orbits(orbits: Orbit, *, tolerance: float = 1e-6) -> tuple[list[Orbit], np.ndarray]:
+class Orbits(list[Orbit]):
+    """Several periodic motions: a list that prints as a table, one motion a line."""
+
+    def __str__(self) -> str:
+        return "\n".join([f"{len(self)} orbit{'' if len(self) == 1 else 's'}", *map(_told, self)])
+
+    __repr__ = __str__
+
+
+def _told(orbit: Orbit) -> str:
+    """A motion in one line."""
+    cycles = int(orbit.cycles)
+    period = f"{2 * cycles}π" if isinstance(orbit.scene, Scene) else f"{cycles} cycles"
+    stable = "stable" if bool(orbit.stable) else "unstable"
+    where = ", ".join(f"{name} = {float(x):.6g}" for name, x in vars(orbit.state).items())
+    span = f"Y in [{float(orbit.y_min):.6g}, {float(orbit.y_max):.6g}]"
+    size = f"greatest multiplier {np.abs(orbit.multipliers).max():.6g}"
+    return f"  {period}, {told_impacts(int(orbit.impacts))}, {stable}: {where}; {span}; {size}"
+
+
+def distinct_orbits(orbits: Orbit, *, tolerance: float = 1e-6) -> tuple[Orbits, np.ndarray]:
     """The different motions among many searches.
 
     Motions that differ only by the cycle on which they are observed count as one, and a motion
@@ -18,8 +39,9 @@ def distinct_orbits(orbits: Orbit, *, tolerance: float = 1e-6) -> tuple[list[Orb
     **Arguments:** a batch of orbits from `find_orbit` (of any shape); two motions are the same if
     their sections agree to `tolerance` (relative to 1 + |state|).
 
-    **Returns:** the orbits, by period and then by least Y, each on the section of its period with
-    the smallest Y; and for each the number of searches that found it.
+    **Returns:** the orbits, a list that prints one motion a line, by period and then by least Y,
+    each on the section on which it was first found; and for each the number of searches that found
+    it.
     """
     if not isinstance(orbits, Orbit):
         raise TypeError(f"Argument `orbits` must be from `find_orbit`, but got {orbits!r}.")
@@ -45,4 +67,4 @@ def distinct_orbits(orbits: Orbit, *, tolerance: float = 1e-6) -> tuple[list[Orb
             counts.append(1)
     chosen = [trimmed(jtu.tree_map(lambda x, i=i: x[i], flat)) for i in first]
     order = sorted(range(len(chosen)), key=lambda j: (kinds[j][0], float(chosen[j].y_min)))
-    return [chosen[j] for j in order], np.array([counts[j] for j in order], int)
+    return Orbits(chosen[j] for j in order), np.array([counts[j] for j in order], int)

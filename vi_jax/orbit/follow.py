@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from ..scene import Scene
 from .curve import Step
 from .shooting import Shooting
 from .solve import advance, located, observe, orbit_of, state_at
@@ -84,10 +85,19 @@ class Follower:
             return None
         at, impact = min(found, key=lambda f: float(np.dot(here.tangent, f[0].x - here.x)))
         if impact is None:
-            told = f"touches a stop at clock {float(at.seen.touch):.6g}"
+            told = f"touches a stop at {self._place(float(at.seen.touch))}"
         else:
-            told = f"impact {impact} is lost"
+            clock = float(np.asarray(self.problem.parts(jnp.asarray(at.x))[0])[impact])
+            told = f"the impact at {self._place(clock)} is lost"
         return self._point(GRAZING, at, told, impact)
+
+    def _place(self, clock: float) -> str:
+        """A reading of the clock of impacts, in words, within one period from the section on."""
+        scene, cycles = self.problem.scene, self.problem.cycles
+        since = clock % (float(scene.cycle) * cycles)
+        if isinstance(scene, Scene):
+            return f"crank angle φ = {float(scene.phase_at(since)):.6g} of {2 * cycles}π"
+        return f"clock {since:.6g} of its {cycles} cycle{'' if cycles == 1 else 's'}"
 
     def _bifurcations(self, here: Step, last: Step) -> Step | None:
         """Record what happens between two points; the point where the branch springs, if met.

@@ -170,6 +170,9 @@ class Orbit(eqx.Module):
                 lines.append(
                     f"  impact: {name} stop at phase {float(phase):.6f}, V⁻ = {float(speed):.9g}"
                 )
+        listed = int(jnp.sum(self.impact_stop >= 0))
+        if listed < count:
+            lines.append(f"  only {listed} of {count} impacts are listed: see `impact_log`")
         values = ", ".join(_complex(m) for m in np.asarray(self.multipliers))
         lines.append(f"  multipliers: {values}")
         lines.append(f"  clearance: {float(self.clearance):.4g}")
