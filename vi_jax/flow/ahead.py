@@ -55,11 +55,11 @@ def look(plan: Plan, lane: Lane, motion: Any, h: Scalar) -> tuple[Scalar, Scalar
     path: Series | None = None
     turn = none
     if plan.motion or scene.stops:
-        path = motion.of(scene.position)
-        speed = _slope(path)
+        path = along = motion.of(scene.position)
+        speed = _slope(along)
         turn = lane.direction * _sum(speed, h, zero) < 0
         for i, stop in enumerate(scene.stops):
-            events.append((1.0 + i, _shifted(path, float(stop.sign), stop_gradient(stop.gap))))
+            events.append((1.0 + i, _shifted(along, float(stop.sign), stop_gradient(stop.gap))))
     if not plan.ticks(lane.state):
         bound = stop_gradient(plan.end(lane.part))
         events.append((SECTION, _shifted(motion.of(scene.clock), 1.0, bound)))

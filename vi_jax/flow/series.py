@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 Coefficient = Any
@@ -108,7 +109,7 @@ class _Flow:
 
         def read(atom: Any) -> Series:
             if isinstance(atom, Literal):
-                return [np.asarray(atom.val, atom.aval.dtype)]
+                return [np.asarray(atom.val, getattr(atom.aval, "dtype", None))]
             return names[atom]
 
         for eqn in jaxpr.eqns:
@@ -184,7 +185,7 @@ def _square(a: Series, n: int) -> Coefficient:
 
 
 def _bound(eqn: Any, *values: Any) -> Any:
-    if any(isinstance(v, jax.core.Tracer) for v in values):
+    if any(isinstance(v, Tracer) for v in values):
         return eqn.primitive.bind(*values, **eqn.params)
     with jax.ensure_compile_time_eval():  # what is known, such as an exponent, stays known
         return eqn.primitive.bind(*values, **eqn.params)

@@ -216,7 +216,7 @@ class _Writer:
         base = t.binary("mul", index, stride)
         out = np.empty(old.shape, object)
         for n, i in enumerate(np.ndindex(old.shape)):
-            kind = old[i].kind
+            kind: str = old[i].kind  # pyright: ignore[reportAttributeAccessIssue]
             stored = "i8" if kind == "i1" else kind
             where = self._addresses(pointer, t.binary("add", base, t.constant(n, "i64")), kind)
             v, p = t.vector(stored), f"<{t.width} x ptr>"

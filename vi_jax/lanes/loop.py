@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+from jax.core import eval_jaxpr
 from jax.extend.core import ClosedJaxpr
 
 from .primitive import FORWARD_ONLY, lanes_p
@@ -172,7 +173,7 @@ def _without_consts(jaxprs: list[ClosedJaxpr], leaves: list) -> tuple[list[Close
                 for x in jaxpr.consts
             ]
             own = (*args[:n], *args[n + len(consts) :])
-            return jax.core.eval_jaxpr(jaxpr.jaxpr, held, *own)
+            return eval_jaxpr(jaxpr.jaxpr, held, *own)
 
         shapes = [*map(_one, jaxpr.in_avals[:n]), *map(_one, consts), *map(_one, rest)]
         return jax.make_jaxpr(function)(*shapes)

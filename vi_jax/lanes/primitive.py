@@ -6,6 +6,7 @@ import warnings
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
@@ -39,9 +40,7 @@ def _(*args, program: Program, road: str):
     rows = [(*batch, program.rows, *a.shape) for a in program.row_avals]
     outs = [(*batch, *a.shape) for a in program.out_avals]
     avals = [*program.out_avals, *program.row_avals]
-    return [
-        jax.core.ShapedArray(shape, a.dtype) for shape, a in zip([*outs, *rows], avals, strict=True)
-    ]
+    return [ShapedArray(shape, a.dtype) for shape, a in zip([*outs, *rows], avals, strict=True)]
 
 
 @lanes_p.def_impl

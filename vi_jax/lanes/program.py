@@ -75,6 +75,10 @@ class Spread(NamedTuple):
     outs: tuple[bool, ...]
 
 
+def _dtype(var: Any) -> Any:
+    return var.aval.dtype
+
+
 # What has no derivative although it gives floating-point numbers.
 _FLAT = ("stop_gradient", "sign", "round", "floor", "ceil")
 
@@ -98,6 +102,6 @@ def reached(jaxpr: Jaxpr, sources: Sequence[bool], *, smooth: bool) -> list[bool
             ways = [reached(b.jaxpr, args[1:], smooth=smooth) for b in eqn.params["branches"]]
             outs = [any(way) for way in zip(*ways, strict=True)]
         for var, there in zip(eqn.outvars, outs, strict=True):
-            if there and not (smooth and not jnp.issubdtype(var.aval.dtype, jnp.inexact)):
+            if there and not (smooth and not jnp.issubdtype(_dtype(var), jnp.inexact)):
                 found.add(var)
     return [touched(a) for a in jaxpr.outvars]

@@ -85,7 +85,8 @@ def write(t: Text, jaxpr: Jaxpr, consts: list, args: list[Values], mask: Value) 
 
     def read(atom: Any) -> Values:
         if isinstance(atom, Literal):
-            return constants(t, np.asarray(atom.val, atom.aval.dtype))
+            aval: Any = atom.aval
+            return constants(t, np.asarray(atom.val, aval.dtype))
         return env[atom]
 
     for var, const in zip(jaxpr.constvars, consts, strict=True):
@@ -124,7 +125,7 @@ def _equation(t: Text, eqn: Any, args: list[Values], mask: Value) -> list[Values
         jaxpr, consts = _inner(params[_CALLS[name]])
         return write(t, jaxpr, consts, args, mask)
     if name == "cond":
-        return _cond(t, params["branches"], args[0][()], args[1:], mask)
+        return _cond(t, params["branches"], args[0].item(), args[1:], mask)
     if name == "while":
         return _while(t, params, args, mask)
     if name == "scan":
@@ -215,8 +216,7 @@ def _while(t: Text, params: dict, args: list[Values], mask: Value) -> list[Value
     carry = [_zipped(lambda a: Value(t.fresh(), a.kind), x) for x in first]
     live = Value(t.fresh(), "i1")
     jaxpr, consts = _inner(params["cond_jaxpr"])
-    going = write(t, jaxpr, consts, [*cond_args, *carry], live)[0][()]
-    going = t.both(live, going)
+    going = t.both(live, write(t, jaxpr, consts, [*cond_args, *carry], live)[0].item())
     needed = t.any(going)
     t.line(f"br i1 {needed}, label %{inside}, label %{after}")
     t.open(inside)

@@ -159,9 +159,10 @@ class Shooting(eqx.Module):
 
     def _step(self, scene, s0, s1, u, time) -> tuple[Vector, Array]:
         """One step of the method."""
-        state, paced = self.unravel(u), scene.pace(s0, self.unravel(u)) is not None
+        state = self.unravel(u)
+        paced = scene.pace(s0, state) is not None
         new, after, _ = self.flow.step(scene, s0, s1, state, time if paced else None)
-        return ravel_pytree(new)[0], after if paced else time + (s1 - s0)
+        return ravel_pytree(new)[0], time + (s1 - s0) if after is None else after
 
     def residual(self, x: Vector) -> Vector:
         """What the flights from impact to impact lack; zero for a periodic motion."""
