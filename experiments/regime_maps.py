@@ -449,10 +449,12 @@ table.append(
   is, by chance). Left of the first birth the same vibration leads to rare impacts. With
   c = 0.1 and more all that is gone; the chaos that remains lies at the first birth and, up to
   c = 0.2, in a tongue about ζ = 0.55.
-- Transient chaos: without damping the body hits the stop, strongly and then rarely, for hundreds to
-  tens of thousands of cycles, until a vibration is left that stays off the stop for good. While it
-  lasts nothing tells it from chaos: {over[0][1]} of {over[0][0]} lanes called chaotic without
-  damping are not after {LATE:,} cycles. So "chaotic" says: still so after some {LASTING:,} cycles.
+- Transient chaos: without damping the body hits the stop irregularly for hundreds to tens of
+  thousands of cycles; what is left in the end mostly stays off the stop for good, or meets it a few
+  times in some hundred cycles, or is periodic. With damping some lanes at the first birth do so
+  too. While it lasts nothing tells it from chaos: {over[0][1]} of {over[0][0]} lanes called chaotic
+  without damping are not after {LATE:,} cycles. So "chaotic" says: still so after some {LASTING:,}
+  cycles.
 - Left of the paper's range of interest Table 1's machine hits the stop in a small island near
   ζ = 0.6 (k above 0.85), and along the birth it has motions of longer periods and chaos.
 - `Adaptive` gives {sum(x[0] for x in told)} of {SAMPLE * len(maps):,} random lanes another regime;
