@@ -3,13 +3,16 @@
 import math
 import os
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jaxtyping import Array, Bool
 
 
 def number(name: str, value: Any) -> jax.Array:
@@ -50,33 +53,74 @@ def concrete(value: Any) -> np.ndarray | None:
     return np.asarray(value)
 
 
-def require(
-    name: str,
-    value: Any,
-    *,
-    low: float = -np.inf,
-    high: float = np.inf,
-    open_low: bool = False,
-    open_high: bool = False,
-) -> None:
-    """Raise a `ValueError` unless every concrete number in `value` is finite and in range.
+class Range(NamedTuple):
+    """Finite numbers between two bounds, which are in it unless they are open."""
+
+    low: float = -np.inf
+    high: float = np.inf
+    open_low: bool = False
+    open_high: bool = False
+
+    def holds(self, numbers: Any) -> Any:
+        """Whether each of these is in it; of traced numbers a traced truth."""
+        fits = jnp.isfinite(numbers) if isinstance(numbers, jax.Array) else np.isfinite(numbers)
+        fits = fits & (numbers > self.low if self.open_low else numbers >= self.low)
+        return fits & (numbers < self.high if self.open_high else numbers <= self.high)
+
+    def __str__(self) -> str:
+        left = "(" if self.open_low or np.isinf(self.low) else "["
+        right = ")" if self.open_high or np.isinf(self.high) else "]"
+        return f"{left}{self.low:g}, {self.high:g}{right}"
+
+
+REAL, POSITIVE, NOT_NEGATIVE, SHARE = Range(), Range(0.0, open_low=True), Range(0.0), Range(0, 1)
+
+
+def require(name: str, value: Any, **bounds: Any) -> None:
+    """Raise a `ValueError` unless every concrete number in `value` is finite and in range, the
+    `Range` of these bounds.
 
     **Raises:** `TypeError` for what is no real number; placeholders and tracers pass.
     """
-    numbers = _real(name, value)
+    numbers, range_ = _real(name, value), Range(**bounds)
     if numbers is None:
         return
-    fits = np.isfinite(numbers)
-    fits &= numbers > low if open_low else numbers >= low
-    fits &= numbers < high if open_high else numbers <= high
+    fits = np.asarray(range_.holds(numbers))
     if not fits.all():
-        left = "(" if open_low or np.isinf(low) else "["
-        right = ")" if open_high or np.isinf(high) else "]"
         worst = numbers[~fits].ravel()[0] if numbers.ndim else numbers[()]
-        raise ValueError(
-            f"Argument `{name}` must be finite and in {left}{low:g}, {high:g}{right}, "
-            f"but got {worst!s}."
-        )
+        raise ValueError(f"Argument `{name}` must be finite and in {range_}, but got {worst!s}.")
+
+
+def require_ranges(part: Any) -> None:
+    """`require` for every number of a module that says in `ranges` what it may be."""
+    for name, range_ in part.ranges.items():
+        value = getattr(part, name)
+        if value is not None:
+            require(name, value, **range_._asdict())
+
+
+def in_range(tree: Any) -> Bool[Array, ""]:
+    """Whether all numbers of all modules in a tree are in their `ranges`, traced ones too.
+
+    What is put into a module by `eqx.tree_at`, or is being traced, has passed no other check.
+    """
+    good = jnp.asarray(True)
+    for part in _modules(tree):
+        for name, range_ in getattr(part, "ranges", {}).items():
+            value = getattr(part, name)
+            if value is not None:
+                good = good & jnp.all(range_.holds(jnp.asarray(value)))
+    return good
+
+
+def _modules(node: Any) -> Iterator[eqx.Module]:
+    if isinstance(node, eqx.Module):
+        yield node
+        inner = list(vars(node).values())
+    else:
+        inner = list(node) if isinstance(node, tuple | list) else []
+    for part in inner:
+        yield from _modules(part)
 
 
 def count(name: str, value: Any, *, least: int = 0, most: int = 2**31 - 1) -> int:

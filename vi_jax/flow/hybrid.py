@@ -82,9 +82,11 @@ def iterate(plan: Plan, lane: Lane) -> Step:
     record = select(completed, plan.fresh(state), record)
 
     steps = lane.steps + jnp.where(active, 1.0, 0.0)
+    # Counted anew in each interval: in single precision the sum of all stands still at 2²⁴.
+    spent = jnp.where(completed, 0.0, lane.spent + 1.0)
     fault = lane.fault
     aims = jnp.where(aim, lane.aims + 1, 0.0)
-    for condition, code in _faults(plan, lane, trial, rejected, length, record, steps, aims):
+    for condition, code in _faults(plan, lane, trial, rejected, length, record, steps, spent, aims):
         stops_here = active & (fault == 0) & condition & (done < plan.intervals)
         fault = jnp.where(stops_here, float(code), fault)
     new = dataclasses.replace(
@@ -100,7 +102,7 @@ def iterate(plan: Plan, lane: Lane) -> Step:
         done=done,
         fault=fault,
         steps=steps,
-        begun=jnp.where(completed, steps, lane.begun),
+        spent=spent,
         rejected=lane.rejected + jnp.where(rejected, 1.0, 0.0),
     )
     return Step(new, completed, state, of_interval)
@@ -320,6 +322,7 @@ def _faults(
     length: Scalar,
     record: Record,
     steps: Scalar,
+    spent: Scalar,
     aims: Scalar,
 ) -> list[tuple[Flag, int]]:
     """What ends a lane, the first that holds being the reason."""
@@ -332,7 +335,7 @@ def _faults(
         ((aims >= _LOST) & (record.impacts > _MANY), results.CHATTER),
         (aims >= _LOST, results.UNRESOLVED),
         (steps >= plan.max_steps, results.MAX_STEPS),
-        (steps - lane.begun >= _STUCK, results.MAX_STEPS),
+        (spent >= _STUCK, results.MAX_STEPS),
     ]
     if not plan.method.adaptive:
         return [(rejected, broken), *ends]

@@ -61,8 +61,8 @@ class Lane(eqx.Module):
     fault: Scalar
     """Reason why the lane ended before its time (see `results`), or 0."""
     steps: Scalar
-    begun: Scalar
-    """Steps tried before the interval on its way."""
+    spent: Scalar
+    """Steps tried in the interval on its way."""
     rejected: Scalar
 
 
@@ -145,7 +145,8 @@ class Plan(eqx.Module):
         scene = self.scene
         Y = scene.position(start)
         numbers = jtu.tree_leaves((start, eqx.filter(scene, eqx.is_inexact_array)))
-        bad = ~jnp.isfinite(sum(numbers)) | ~jnp.asarray(wanted)
+        bad = ~jnp.isfinite(sum(numbers, self.settle)) | ~jnp.asarray(wanted)
+        bad = bad | ~scene.in_range(start)
         for stop in scene.stops:
             bad = bad | (stop.sign * Y > stop.gap)
         bad = jax.lax.stop_gradient(bad)
@@ -176,6 +177,6 @@ class Plan(eqx.Module):
             done=zero,
             fault=jnp.where(bad, float(results.BAD_START), zero),
             steps=zero,
-            begun=zero,
+            spent=zero,
             rejected=zero,
         )

@@ -14,7 +14,10 @@ class RESULTS(eqx.Enumeration):
     """Why a lane ended; `simulate` gives one to each."""
 
     successful = ""
-    bad_start = "The start is not finite or lies beyond a stop."
+    bad_start = (
+        "The start or a number of the scene is not finite or out of its range, or the start lies "
+        "beyond a stop."
+    )
     stalled = (
         "The crank stopped turning forward, which the phase clock cannot follow. Simulate with "
         '`clock="time"`.'
@@ -149,7 +152,8 @@ class Run(eqx.Module):
     result: RESULTS
     """Why the run ended: `RESULTS.successful`, or what went wrong."""
     steps: Int[Array, ""]
-    """Steps tried, those included that were rejected or shortened to meet an impact."""
+    """Steps tried, those included that were rejected or shortened to meet an impact (in single
+    precision no more than 2²⁴ are told)."""
     rejected: Int[Array, ""]
     """Steps rejected on their error estimate."""
 

@@ -154,6 +154,12 @@ def planned(
         )
     start = as_floats(scene, start)
     dtype = scene.position(start).dtype
+    for name, value in (("max_impacts", max_impacts), ("max_steps", max_steps)):
+        if value is not None and value > _most(dtype):
+            raise ValueError(
+                f"Argument `{name}` must be at most {_most(dtype)}, up to which numbers of type "
+                f"{dtype} count, but got {value}."
+            )
     bound = 0
     if reverse:
         if max_steps is None and concrete(settle) is None:
@@ -169,11 +175,36 @@ def planned(
         rests=(scene.may_rest() if rests is None else rests) and bool(scene.stops),
         bound=bound,
         road=lanes.current_road(),
-        settle=jnp.asarray(settle, dtype),
+        settle=_countable(cycles, settle, max(1, samples), dtype),
         max_steps=jnp.asarray(jnp.inf if max_steps is None else max_steps, dtype),
         max_impacts=jnp.asarray(max_impacts, dtype),
     )
     return plan, start
+
+
+def _most(dtype: Any) -> int:
+    """The loop counts in floating-point numbers, which do so up to here."""
+    return round(2 / float(jnp.finfo(dtype).eps))
+
+
+def _countable(cycles: int, settle: Any, parts: int, dtype: Any) -> jax.Array:
+    """`settle` as the loop needs it: NaN, with which no lane starts, if it is traced and no number
+    of cycles that can be counted.
+
+    **Raises:** `ValueError` if it is known and cannot be counted.
+    """
+    most = _most(dtype) // parts
+    if concrete(settle) is not None:
+        if settle + cycles > most:
+            raise ValueError(
+                f"Arguments `settle` and `cycles` must add up to at most {most} cycles (of {parts} "
+                f"interval(s) each), up to which numbers of type {dtype} count, but got "
+                f"{settle} + {cycles}."
+            )
+        return jnp.asarray(settle, dtype)
+    settle = jnp.asarray(settle)
+    counts = (settle >= 0) & (settle == jnp.round(settle)) & (settle <= most - cycles)
+    return jnp.where(counts, settle.astype(dtype), jnp.nan)
 
 
 def as_floats(scene: AbstractScene, state: Any) -> Any:

@@ -5,8 +5,9 @@ from typing import Any
 
 import equinox as eqx
 import jax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
+from .._checks import in_range
 from .stop import RigidStop
 
 State = Any
@@ -84,6 +85,11 @@ class AbstractScene(eqx.Module):
     def alive(self, state: State) -> jax.Array | None:
         """False where the clock of this scene breaks down; `None` where it cannot."""
         return None
+
+    def in_range(self, start: State) -> Bool[Array, ""]:
+        """Whether the numbers of this scene, traced ones too, are such that it can be run from
+        `start`; asked once, when a lane begins. By default what its parts say (`ranges`)."""
+        return in_range(self)
 
     def check_start(self, start: State) -> None:
         """Raise a `ValueError` if the concrete `start` cannot be simulated (stops apart)."""

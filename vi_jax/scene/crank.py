@@ -1,12 +1,12 @@
 """Cranks: how the slider moves with the crank angle."""
 
 import abc
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from .._checks import number, require
+from .._checks import Range, number, require_ranges
 from .trig import sincos
 
 
@@ -40,9 +40,10 @@ class SliderCrank(AbstractCrank):
 
     ratio: Float[Array, "..."] = eqx.field(converter=lambda x: number("ratio", x))
     """λ = a/l (dimensionless), in (0, 1)."""
+    ranges: ClassVar = {"ratio": Range(0.0, 1.0, open_low=True, open_high=True)}
 
     def __check_init__(self):
-        require("ratio", self.ratio, low=0.0, high=1.0, open_low=True, open_high=True)
+        require_ranges(self)
 
     def slide(self, phase: Float[Array, "..."]) -> Slide:
         """Exact U and its derivatives (dimensionless)."""

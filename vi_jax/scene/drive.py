@@ -1,9 +1,11 @@
 """Drives: what turns the crank."""
 
+from typing import ClassVar
+
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from .._checks import number, require
+from .._checks import NOT_NEGATIVE, POSITIVE, REAL, number, require_ranges
 from .crank import Slide
 
 
@@ -14,9 +16,10 @@ class IdealDrive(eqx.Module):
         converter=lambda x: number("frequency_ratio", x)
     )
     """ζ = Ω/ω (dimensionless), positive."""
+    ranges: ClassVar = {"frequency_ratio": POSITIVE}
 
     def __check_init__(self):
-        require("frequency_ratio", self.frequency_ratio, low=0.0, open_low=True)
+        require_ranges(self)
 
 
 class Motor(eqx.Module):
@@ -37,13 +40,16 @@ class Motor(eqx.Module):
         default=1.0, converter=lambda x: number("no_load_speed", x)
     )
     """w0 = Ω0/ω, the no-load speed at κ = 1 (dimensionless), positive."""
+    ranges: ClassVar = {
+        "strength": NOT_NEGATIVE,
+        "control": REAL,
+        "coupling": NOT_NEGATIVE,
+        "slider_inertia": NOT_NEGATIVE,
+        "no_load_speed": POSITIVE,
+    }
 
     def __check_init__(self):
-        require("strength", self.strength, low=0.0)
-        require("control", self.control)
-        require("coupling", self.coupling, low=0.0)
-        require("slider_inertia", self.slider_inertia, low=0.0)
-        require("no_load_speed", self.no_load_speed, low=0.0, open_low=True)
+        require_ranges(self)
 
     def torque(
         self, slide: Slide, Y: Float[Array, "..."], W: Float[Array, "..."]

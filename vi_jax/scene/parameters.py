@@ -1,12 +1,25 @@
 """Table 1 of the paper in SI units, and the way from there to a dimensionless scene and back."""
 
 from math import pi
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from .._checks import concrete, number, one_of, require
+from .._checks import (
+    NOT_NEGATIVE,
+    POSITIVE,
+    REAL,
+    SHARE,
+    concrete,
+    in_range,
+    number,
+    one_of,
+    require_ranges,
+)
 from .crank import CosineCrank, SliderCrank
 from .drive import IdealDrive, Motor
 from .scene import Oscillator, Scene
@@ -57,16 +70,23 @@ class Parameters(eqx.Module):
     """Ω0, no-load speed of the motor at κ = 1, rad/s. `None` means ω, which makes the tabulated
     κ = 0.5…1.9 the tabulated range of ζ; the paper does not give Ω0."""
 
+    ranges: ClassVar = {
+        "body_mass": POSITIVE,
+        "slider_mass": NOT_NEGATIVE,
+        "stiffness": POSITIVE,
+        "damping": NOT_NEGATIVE,
+        "crank_radius": POSITIVE,
+        "rod_length": POSITIVE,
+        "inertia": POSITIVE,
+        "restitution": SHARE,
+        "gap": REAL,
+        "torque": NOT_NEGATIVE,
+        "kappa": REAL,
+        "no_load_speed": POSITIVE,
+    }
+
     def __check_init__(self):
-        for name in ("body_mass", "stiffness", "crank_radius", "rod_length", "inertia"):
-            require(name, getattr(self, name), low=0.0, open_low=True)
-        for name in ("slider_mass", "damping", "torque"):
-            require(name, getattr(self, name), low=0.0)
-        require("restitution", self.restitution, low=0.0, high=1.0)
-        require("gap", self.gap)
-        require("kappa", self.kappa)
-        if self.no_load_speed is not None:
-            require("no_load_speed", self.no_load_speed, low=0.0, open_low=True)
+        require_ranges(self)
 
     @property
     def natural_frequency(self) -> Number:
@@ -81,6 +101,7 @@ class Parameters(eqx.Module):
         """
         one_of("drive", drive, ("motor", "ideal"))
         one_of("crank", crank, ("cosine", "slider"))
+        require_ranges(self)  # again: a number may have been put in place of another
         omega = self.natural_frequency
         if drive == "ideal":
             turning: IdealDrive | Motor = IdealDrive(self.kappa)
@@ -94,9 +115,13 @@ class Parameters(eqx.Module):
                 slider_inertia=self.slider_mass * per_inertia,
                 no_load_speed=free,
             )
+        damping = self.damping / (2 * self.body_mass * omega)
+        if any(isinstance(x, Tracer) for x in jtu.tree_leaves(self)):
+            # Of numbers that are out of range some give a scene of numbers that are not.
+            damping = jnp.where(in_range(self), damping, jnp.nan)
         exact = SliderCrank(self.crank_radius / self.rod_length) if crank == "slider" else None
         return Scene(
-            oscillator=Oscillator(self.damping / (2 * self.body_mass * omega)),
+            oscillator=Oscillator(damping),
             drive=turning,
             stops=(RigidStop(_ratio(self.gap, self.crank_radius), self.restitution),),
             crank=exact or CosineCrank(),

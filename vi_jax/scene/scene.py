@@ -2,19 +2,23 @@
 
 import dataclasses
 from math import pi
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .._checks import (
+    NOT_NEGATIVE,
+    Range,
     concrete,
+    in_range,
     instance_of,
     number,
     one_of,
     require,
+    require_ranges,
     state_of_numbers,
     tuple_of,
 )
@@ -64,9 +68,10 @@ class Oscillator(eqx.Module):
         default=0.0, converter=lambda x: number("damping_ratio", x)
     )
     """ξ = c/(2 m_C ω) (dimensionless), not negative."""
+    ranges: ClassVar = {"damping_ratio": NOT_NEGATIVE}
 
     def __check_init__(self):
-        require("damping_ratio", self.damping_ratio, low=0.0)
+        require_ranges(self)
 
 
 class Scene(AbstractScene):
@@ -92,6 +97,7 @@ class Scene(AbstractScene):
     )
     """Crank angle of the section (radians, in [-2π, 2π]); `None` is 0. Phases of states and of
     impacts are counted from it."""
+    ranges: ClassVar = {"section_phase": Range(-2 * pi, 2 * pi)}
 
     def __check_init__(self):
         one_of("clock_name", self.clock_name, ("phase", "time"))
@@ -105,8 +111,7 @@ class Scene(AbstractScene):
             if not isinstance(stop, RigidStop):
                 raise TypeError(f"Argument `stops` must hold `RigidStop`s, but holds {stop!r}.")
         _check_room(self.stops)
-        if self.section_phase is not None:
-            require("section_phase", self.section_phase, low=-2 * pi, high=2 * pi)
+        require_ranges(self)
 
     @classmethod
     def ideal(
@@ -271,6 +276,15 @@ class Scene(AbstractScene):
         gaps = [concrete(stop.gap) for stop in self.stops]
         return any(gap is None or not (gap > 1).all() for gap in gaps)
 
+    def in_range(self, start: Any) -> Bool[Array, ""]:
+        """As its parts say; with room between two stops, and not beyond the section."""
+        good = in_range(self)
+        if len(self.stops) == 2:
+            good = good & (_room(self.stops) > 0)
+        if isinstance(start, TimedMotorState):
+            good = good & (start.phase < 2 * pi)
+        return good
+
     def alive(self, state: Any) -> jax.Array | None:
         """In the phase clock of a motor the crank must turn forward."""
         return state.W > 0 if isinstance(state, MotorState) else None
@@ -299,11 +313,18 @@ def _check_room(stops: tuple[RigidStop, ...]) -> None:
             "Argument `stops` must hold at most one stop on each side, but holds "
             f"{[stop.side for stop in stops]}."
         )
-    gaps = [concrete(stop.gap) for stop in stops]
-    if len(stops) == 2 and gaps[0] is not None and gaps[1] is not None:
-        room = gaps[0] + gaps[1]
-        if not (room > 0).all():
+    if len(stops) == 2:
+        room = concrete(_room(stops))
+        if room is not None and not (room > 0).all():
             raise ValueError(
                 "Argument `stops` must leave room between the two stops (gaps adding up to more "
                 f"than 0), but their gaps add up to {room.min():g}."
             )
+
+
+def _room(stops: tuple[RigidStop, ...]) -> Any:
+    """Distance between two stops; of known gaps a known one, inside of `jit` too."""
+    one, other = (concrete(stop.gap) for stop in stops)
+    if one is None or other is None:
+        return stops[0].gap + stops[1].gap
+    return one + other

@@ -1,9 +1,11 @@
 """Stops: rigid walls that the body may hit."""
 
+from typing import ClassVar
+
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from .._checks import number, one_of, require
+from .._checks import REAL, SHARE, number, one_of, require_ranges
 
 
 class RigidStop(eqx.Module):
@@ -19,10 +21,10 @@ class RigidStop(eqx.Module):
     """k, coefficient of restitution (dimensionless)."""
     side: str = eqx.field(static=True, default="right")
     """"right" or "left"."""
+    ranges: ClassVar = {"gap": REAL, "restitution": SHARE}
 
     def __check_init__(self):
-        require("gap", self.gap)
-        require("restitution", self.restitution, low=0.0, high=1.0)
+        require_ranges(self)
         one_of("side", self.side, ("right", "left"))
 
     @property

@@ -1,0 +1,117 @@
+"""Numbers that no check has seen, traced or put in by `eqx.tree_at`: such a lane is refused."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+from vi_jax.flow.results import BAD_START, number_of
+
+CYCLES = 3
+BASE = vi.Scene(
+    oscillator=vi.Oscillator(0.05),
+    drive=vi.Motor(0.6, 0.9, 0.01, 0.005),
+    stops=[vi.RigidStop(2.0, 0.5), vi.RigidStop(2.5, 0.5, "left")],
+    crank=vi.SliderCrank(1 / 3),
+    section_phase=0.1,
+)
+PLACES = {
+    "restitution": lambda s: s.stops[0].restitution,
+    "left restitution": lambda s: s.stops[1].restitution,
+    "damping_ratio": lambda s: s.oscillator.damping_ratio,
+    "ratio": lambda s: s.crank.ratio,
+    "strength": lambda s: s.drive.strength,
+    "coupling": lambda s: s.drive.coupling,
+    "slider_inertia": lambda s: s.drive.slider_inertia,
+    "no_load_speed": lambda s: s.drive.no_load_speed,
+    "section_phase": lambda s: s.section_phase,
+    "gap": lambda s: s.stops[1].gap,
+}
+# The last beside the other stop's gap of 2.
+OUTSIDE = [2.0, -0.1, -0.9, -0.5, -1.0, -1.0, -1.0, 0.0, 7.0, -2.0]
+
+
+@eqx.filter_jit
+def lanes(values, settle):
+    def lane(values, settle):
+        scene = eqx.tree_at(lambda s: [place(s) for place in PLACES.values()], BASE, list(values))
+        start = scene.start(Y=0.0, W=0.9)
+        run = vi.simulate(scene, start, CYCLES, method=vi.FixedStep(), settle=settle)
+        return number_of(run.result), run.sections.Y, run.steps
+
+    return jax.vmap(lane)(values, settle)
+
+
+def inside():
+    return [float(place(BASE)) for place in PLACES.values()]
+
+
+def test_a_traced_number_out_of_range_ends_its_lane_and_no_other():
+    rows = [inside()]
+    for i, value in enumerate(OUTSIDE):
+        rows += [[*rows[0][:i], value, *rows[0][i + 1 :]], rows[0]]
+    good = lanes(jnp.asarray(rows[:1] * len(rows)), jnp.full(len(rows), 1.0))
+    codes, Y, steps = lanes(jnp.asarray(rows), jnp.full(len(rows), 1.0))
+    expected = np.where(np.arange(len(rows)) % 2 == 1, BAD_START, 0)
+    told = dict(zip(["base", *np.repeat(list(PLACES), 2)], codes.tolist(), strict=True))
+    assert codes.tolist() == expected.tolist(), told
+    fine = expected == 0
+    np.testing.assert_array_equal(np.asarray(Y)[fine], np.asarray(good[1])[fine])
+    assert np.isnan(np.asarray(Y)[~fine][:, 1:]).all()
+    assert (np.asarray(steps)[~fine] == 0).all()
+
+
+def test_a_traced_settle_is_a_number_of_cycles_or_the_lane_is_refused():
+    settle = jnp.asarray([0.0, -5.0, jnp.nan, 2.5, jnp.inf, 1e300, 2.0])
+    rows = jnp.asarray([inside()] * len(settle))
+    codes, Y, _ = lanes(rows, settle)
+    assert codes.tolist() == [0, *[BAD_START] * 5, 0]
+    assert np.isfinite(np.asarray(Y)[[0, -1]]).all()
+    # The same with integers that are traced.
+    codes, again, _ = lanes(rows, jnp.asarray([0, -5, -1, 2, 2, 2, 2]))
+    assert codes.tolist() == [0, BAD_START, BAD_START, 0, 0, 0, 0]
+    np.testing.assert_array_equal(again[-1], Y[-1])
+
+
+@pytest.mark.parametrize("place", ["restitution", "damping_ratio"])
+def test_a_known_number_put_in_ends_as_bad_start(place):
+    value = dict(zip(PLACES, OUTSIDE, strict=True))[place]
+    base = vi.Scene.ideal(frequency_ratio=0.9, damping_ratio=0.05)
+    scene = eqx.tree_at(PLACES[place], base, jnp.asarray(value))
+    run = vi.simulate(scene, scene.start(), 2)
+    assert run.result == vi.RESULTS.bad_start
+
+
+def test_parameters_out_of_range_make_no_scene_that_runs():
+    """A negative crank radius: every group but the gap's sign looks as if all were well."""
+
+    def code(radius):
+        table = eqx.tree_at(lambda p: p.crank_radius, vi.Parameters(), radius)
+        scene = table.scene(drive="ideal")
+        return number_of(vi.simulate(scene, scene.start(Y=-3.0), 1).result)
+
+    assert jax.jit(jax.vmap(code))(jnp.asarray([0.04, -0.04])).tolist() == [0, BAD_START]
+    with pytest.raises(ValueError, match="crank_radius"):
+        code(jnp.asarray(-0.04))
+
+
+@pytest.mark.filterwarnings("ignore:vi_jax is running in single precision")
+def test_single_precision_counts_no_further_than_it_can():
+    with jax.enable_x64(False):
+        scene = vi.Scene.ideal(frequency_ratio=0.9)
+        start = scene.start()
+        for arguments in (
+            {"settle": 2**24},
+            {"settle": 2**14, "samples": 2**10},
+            {"max_steps": 2**24 + 1},
+            {"max_impacts": 2**24 + 1},
+        ):
+            with pytest.raises(ValueError, match=f"{next(iter(arguments))}.*at most"):
+                vi.simulate(scene, start, 1, **arguments)
+
+        def code(settle):
+            return number_of(vi.simulate(scene, start, 1, settle=settle).result)
+
+        assert jax.jit(code)(jnp.float32(2.0**24)) == BAD_START
+        assert jax.jit(code)(jnp.float32(3.0)) == 0
