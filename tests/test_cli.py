@@ -66,7 +66,7 @@ def test_interrupt_keeps_what_was_written(tmp_path, capsys, monkeypatch):
 
     monkeypatch.setattr(report, "check_claims", interrupt)
     assert cli.main(["reproduce", "--quick", "--out", str(tmp_path)]) == 130
-    assert {path.name for path in tmp_path.iterdir()} == {"fig3.png", "fig4.png"}
+    assert {path.name for path in tmp_path.iterdir()} == {"fig1.png", "fig3.png", "fig4.png"}
     assert "interrupted" in capsys.readouterr().err
 
 

@@ -12,8 +12,9 @@ from vi_jax.paper.assumptions import check_assumptions
 from vi_jax.paper.faults import period_doubling_damping
 from vi_jax.paper.figures import DRAWN, draw_figure, drawn_numbers
 from vi_jax.paper.motions import closed_form, sampled
-from vi_jax.paper.motors import TORQUES, simulate_motors
+from vi_jax.paper.motors import TORQUES, draw_motors, simulate_motors
 from vi_jax.paper.printed import energy_drift, eq21_misses
+from vi_jax.paper.sketch import draw_sketch
 from vi_jax.plot.stamp import stamped
 
 KEPT = Path(__file__).parents[2] / "experiments" / "figures"
@@ -91,7 +92,15 @@ def test_motors_at_the_stated_speed(cases):
     found = {claim.name: claim for claim in check_assumptions(cases[0], motors)}
     assert found["Figures 3 and 4 with the motor"].verdict == "confirmed"
     speed = found["the speed hardly varies within a cycle (Eq. 10)"].numbers
+    assert len(draw_motors(motors.runs, cases[0].from_rest).axes) == 6
     assert 0 < speed["variation_by_torque"]["100"] < speed["variation_by_torque"]["2"] < 0.1
+
+
+def test_sketch_names_the_machine():
+    figure = draw_sketch()
+    words = " ".join(text.get_text() for text in figure.axes[0].texts)
+    for name in ("m_B", "m_C", "k_0", "l_0", "J", "Delta", "varphi", "$c$", "$l$", "$a$"):
+        assert name in words
 
 
 def test_disc_and_lever(faults):
