@@ -168,19 +168,26 @@ def _convolution(
     a: Series, b: Series, n: int, begin: int = 0, weight: Callable[[int], float] | None = None
 ) -> Coefficient:
     """Σ weight(j) a_j b_{n-j} over j from `begin` to n."""
-    total = None
-    for j in range(begin, n + 1):
+    terms = []
+    # What is known longest comes first: only the last products wait for the newest coefficients.
+    for j in sorted(range(begin, n + 1), key=lambda j: max(j, n - j)):
         term = _times(_get(a, j), _get(b, n - j))
-        total = _plus(total, term if weight is None else _scaled(weight(j), term))
-    return total
+        terms.append(term if weight is None else _scaled(weight(j), term))
+    return _total(terms)
+
+
+def _total(terms: list[Coefficient]) -> Coefficient:
+    """Their sum, by two chains of additions that do not wait for each other."""
+    chains: list[Coefficient] = [None, None]
+    for i, term in enumerate(t for t in terms if t is not None):
+        chains[i % 2] = _plus(chains[i % 2], term)
+    return _plus(*chains)
 
 
 def _square(a: Series, n: int) -> Coefficient:
     """Of a series with itself: each mixed product once."""
-    total = None
-    for j in range((n + 1) // 2):
-        total = _plus(total, _times(_get(a, j), _get(a, n - j)))
-    total = _scaled(2.0, total)
+    pairs = [_times(_get(a, j), _get(a, n - j)) for j in reversed(range((n + 1) // 2))]
+    total = _scaled(2.0, _total(pairs))
     return _plus(total, _times(_get(a, n // 2), _get(a, n // 2))) if n % 2 == 0 else total
 
 
