@@ -182,7 +182,8 @@ class Plan(eqx.Module):
             steps=zero,
             spent=zero,
             rejected=zero,
-            one=jnp.where(bad, jnp.nan, 1.0).astype(zero.dtype),
+            # A lane that never runs must not spoil the gradients of a loss that leaves it out.
+            one=jnp.where(bad, 2.0, 1.0).astype(zero.dtype),
             kept_state=start,
             kept=self.fresh(start),
         )

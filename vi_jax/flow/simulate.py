@@ -18,6 +18,7 @@ from .lane import Lane, Plan, Record
 from .loop import run_forward, run_reverse
 from .pool import run_pool
 from .results import Errors, ImpactLog, Run, Samples, reason
+from .spoil import spoiled
 
 # Steps in a cycle that reverse mode makes room for, unless the caller says otherwise.
 _STEPS = 65536
@@ -244,7 +245,7 @@ def check_start(scene: AbstractScene, start: Any) -> None:
 def _simulate(plan: Plan, start: Any, sampled: bool) -> Run:
     run = run_reverse if plan.bound else run_forward
     lane, states, records = run(plan, plan.launch(start))
-    return collect(plan, sampled, lane, states, records)
+    return spoiled(plan, start, collect(plan, sampled, lane, states, records))
 
 
 def _errors(run: Run, tighter: Run) -> Errors:
@@ -286,7 +287,8 @@ def simulate_pool(
     lanes, points, records = run_pool(begin, values, wanted, places)
 
     def one(value, lane, points, records):
-        return collect(begin(value)[0], False, lane, points, records)
+        plan, start = begin(value)
+        return spoiled(plan, start, collect(plan, False, lane, points, records))
 
     return jax.vmap(one)(values, lanes, points, records)
 
