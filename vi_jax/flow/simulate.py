@@ -19,6 +19,7 @@ from .choice import MethodLike, chosen
 from .lane import Plan, Record
 from .loop import Ends, run_forward, run_reverse
 from .results import Errors, ImpactLog, Run, Samples, reason
+from .spoil import spoiled
 
 # Steps in a cycle that reverse mode makes room for, unless the caller says otherwise.
 _STEPS = 65536
@@ -255,7 +256,7 @@ def check_start(scene: AbstractScene, start: Any) -> None:
 @compiled
 def _simulate(plan: Plan, start: Any, sampled: bool) -> Run:
     run = run_reverse if plan.bound else run_forward
-    return collect(plan, sampled, *run(plan, start))
+    return spoiled(plan, start, collect(plan, sampled, *run(plan, start)))
 
 
 def _errors(run: Run, tighter: Run) -> Errors:
@@ -291,7 +292,7 @@ def simulate_pool(
 
     def one(value, wanted):
         plan, start = planned(*lane_of(value), cycles, **options)
-        return collect(plan, False, *run_forward(plan, start, wanted))
+        return spoiled(plan, start, collect(plan, False, *run_forward(plan, start, wanted)))
 
     if wanted is None:
         wanted = jnp.ones(jtu.tree_leaves(values)[0].shape[0], bool)

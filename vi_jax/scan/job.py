@@ -135,7 +135,8 @@ class Job(eqx.Module):
                 found |= new
             for name, x in found.items():
                 if jnp.issubdtype(x.dtype, jnp.floating):  # fast minima lose NaN
-                    found[name] = jnp.where(run.successful, x, jnp.nan)
+                    # Added, not chosen: the derivative of a failed lane stays NaN as well.
+                    found[name] = x + jnp.where(run.successful, 0.0, jnp.nan)
             return {**found, "result": number_of(run.result).astype(jnp.int8)}
 
         return jax.vmap(measured)(values, run), jax.vmap(lambda run: run.last)(run)
