@@ -18,6 +18,8 @@ from .flow import jit as jit
 from .flow import preset as preset
 from .flow import simulate as simulate
 from .flow import suggest_method as suggest_method
+from .lanes import road as road
+from .lanes import threads as threads
 from .orbit import ORBIT_RESULTS as ORBIT_RESULTS
 from .orbit import STABILITY as STABILITY
 from .orbit import AbstractSearch as AbstractSearch

@@ -314,6 +314,7 @@ def scene_cost() -> Expected:
         inner = 0
         for equation in jaxpr.eqns:
             for parameter in equation.params.values():
+                parameter = getattr(parameter, "jaxprs", parameter)  # of a loop over lanes
                 for one in parameter if isinstance(parameter, tuple | list) else (parameter,):
                     one = getattr(one, "jaxpr", one)
                     inner += counted(one) if hasattr(one, "eqns") else 0

@@ -15,8 +15,7 @@ def count(jaxpr, counter=None) -> Counter:
     for equation in jaxpr.eqns:
         counter[equation.primitive.name] += 1
         for parameter in equation.params.values():
-            if isinstance(parameter, Program):
-                parameter = (parameter.begin, parameter.step, parameter.end)
+            parameter = getattr(parameter, "jaxprs", parameter)
             for inner in parameter if isinstance(parameter, (tuple, list)) else (parameter,):
                 if hasattr(inner, "jaxpr"):
                     inner = inner.jaxpr

@@ -165,7 +165,7 @@ def kernel_of(program: Program) -> Kernel:
 
     **Raises:** `Unsupported` if the program has no vector form, or LLVM cannot be had.
     """
-    for jaxpr in (program.begin, program.step, program.end):
+    for jaxpr in program.jaxprs:
         check(jaxpr.jaxpr)
     cpu = _cpu.get()
     bits = _register_bits(cpu)

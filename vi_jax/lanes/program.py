@@ -29,6 +29,11 @@ class Program(eqx.Module):
     __eq__ = object.__eq__
 
     @property
+    def jaxprs(self) -> tuple[ClosedJaxpr, ...]:
+        """All of them."""
+        return self.begin, self.step, self.end
+
+    @property
     def in_avals(self) -> list[Any]:
         """Of one lane's inputs."""
         return self.begin.in_avals
