@@ -25,7 +25,7 @@ from ..lanes import pin, pin_flag
 from . import results
 from .ahead import ahead
 from .aim import aim_at, select
-from .lane import FREE, SECTION, Lane, Plan, Record
+from .lane import FREE, SECTION, Lane, Plan, Record, total
 from .rest import settled
 from .taylor import Taylor
 from .trial import Crossing, Trial, attempt, held, timing
@@ -269,7 +269,7 @@ def _reached(
 
 
 @jax.custom_jvp
-def _second(offset: Scalar, bend: Scalar) -> Scalar:
+def _second(offset: Scalar, bend: Float[Array, "..."]) -> Float[Array, "..."]:
     """½δ² x'', which is below rounding and left out; only its derivatives count."""
     return jnp.zeros_like(bend)
 
@@ -341,6 +341,6 @@ def _faults(
         return [(rejected, broken), *ends]
     eps = float(jnp.finfo(length.dtype).eps)
     gone = rejected & (length < 4 * eps * jnp.maximum(1.0, plan.scene.cycle))
-    numeric = jnp.isfinite(sum(jtu.tree_leaves(trial.state), length))
+    numeric = jnp.isfinite(total(trial.state, length))
     tiny = results.UNDERFLOW if broken == results.NOT_FINITE else broken
     return [(gone & ~numeric, broken), (gone, tiny), *ends]

@@ -20,6 +20,13 @@ Scalar = Float[Array, ""]
 FREE, TURN, SECTION, RELEASE = 0.0, -1.0, -2.0, -3.0
 
 
+def total(tree: Any, start: Scalar) -> Scalar:
+    """Sum of all numbers in a tree and of `start`: finite if all of them are."""
+    for leaf in jtu.tree_leaves(tree):
+        start = start + jnp.sum(leaf)
+    return start
+
+
 class Record(eqx.Module):
     """What is kept of an interval between two record points; `None` where it was not asked for."""
 
@@ -145,7 +152,7 @@ class Plan(eqx.Module):
         scene = self.scene
         Y = scene.position(start)
         numbers = jtu.tree_leaves((start, eqx.filter(scene, eqx.is_inexact_array)))
-        bad = ~jnp.isfinite(sum(numbers, self.settle)) | ~jnp.asarray(wanted)
+        bad = ~jnp.isfinite(total(numbers, self.settle)) | ~jnp.asarray(wanted)
         bad = bad | ~scene.in_range(start)
         for stop in scene.stops:
             bad = bad | (stop.sign * Y > stop.gap)

@@ -144,7 +144,8 @@ class Adaptive(AbstractMethod):
             error, state, new,
         )  # fmt: skip
         parts = jtu.tree_leaves(scaled)
-        return new, time, jnp.sqrt(jax.lax.stop_gradient(sum(parts) / len(parts)))
+        number = sum(x.size for x in parts)
+        return new, time, jnp.sqrt(jax.lax.stop_gradient(sum(map(jnp.sum, parts)) / number))
 
     def tighter(self):
         """A hundredth of the tolerances.

@@ -38,10 +38,11 @@ class Expansion(NamedTuple):
         """The length at which the last two terms are as small as the tolerance, relative to the
         state (Jorba and Zou, Experimental Mathematics 14, 2005)."""
         shortest = None
-        size = jnp.asarray(sum(jnp.abs(stop_gradient(x[0])) for x in self.series))
+        size = jnp.asarray(sum(jnp.sum(jnp.abs(stop_gradient(x[0]))) for x in self.series))
         allowed = tolerance * (1 + size)
         for n in (len(self.series[0]) - 2, len(self.series[0]) - 1):
-            terms = [jnp.abs(stop_gradient(x[n])) for x in self.series if x[n] is not None]
+            there = [stop_gradient(x[n]) for x in self.series if x[n] is not None]
+            terms = [jnp.sum(jnp.abs(x)) for x in there]
             if not terms:
                 continue
             term = jnp.maximum(sum(terms), jnp.finfo(size.dtype).tiny)

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 from ..lanes import pin, pin_flag
 from ..scene import AbstractScene
 from .events import Rates, force_rate, landing, rates
-from .lane import FREE, SECTION, TURN, Lane, Plan
+from .lane import FREE, SECTION, TURN, Lane, Plan, total
 from .rest import Holding, release
 from .taylor import Expansion
 
@@ -106,7 +106,7 @@ def attempt(
         rests = lane.contact > 0
         new = jtu.tree_map(lambda a, b: jnp.where(rests, a, b), lane.state, new)
     new = pin(new)
-    good = jnp.isfinite(sum(jtu.tree_leaves(new), jnp.zeros_like(h)))
+    good = jnp.isfinite(total(new, jnp.zeros_like(h)))
     alive = scene.alive(new)
     if alive is not None:
         good = good & alive

@@ -1,0 +1,138 @@
+"""The loop as vector code and by XLA: the same motion to rounding, impact by impact."""
+
+import warnings
+from typing import Any, NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+from vi_jax.scene.base import AbstractScene
+
+IDEAL = vi.Oscillator(0.05)
+ONE, TWO = (vi.RigidStop(1.3, 0.6),), (vi.RigidStop(1.3, 0.6), vi.RigidStop(1.5, 0.4, "left"))
+PRESSED = (vi.RigidStop(0.3, 0.4),)
+
+
+def ideal(ratio, stops=ONE):
+    return vi.Scene(oscillator=IDEAL, drive=vi.IdealDrive(ratio), stops=stops)
+
+
+def motor(kappa):
+    return vi.Parameters(torque=10.0, restitution=0.5, gap=0.05, kappa=kappa).scene()
+
+
+# Scene of a lane's number, method, options of `simulate`.
+CASES = {
+    "exact flight": (ideal, vi.ExactFlight(), {}),
+    "exact flight, two stops": (lambda r: ideal(r, TWO), vi.ExactFlight(), {"impact_log": 4}),
+    "exact flight, rest": (lambda r: ideal(0.4 * r, PRESSED), vi.ExactFlight(), {}),
+    "fixed steps, time": (ideal, vi.FixedStep(), {"clock": "time"}),
+    "adaptive steps": (ideal, vi.Adaptive(diffrax.Tsit5(), rtol=1e-9), {"samples": 4}),
+    "motor": (motor, vi.FixedStep(), {}),
+    "motor, time": (motor, vi.Adaptive(rtol=1e-10), {"clock": "time"}),
+    "motor, series": (motor, vi.Taylor(12, 8), {}),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_roads_agree(name):
+    make, method, options = CASES[name]
+
+    def lane(ratio):
+        scene = make(ratio)
+        return vi.simulate(scene, scene.start(Y=0.1, V=0.2), 12, method=method, **options)
+
+    ratios = jnp.linspace(0.7, 1.3, 11)
+    runs = []
+    for road in ("auto", "xla"):
+        with vi.road(road):
+            runs.append(jax.jit(jax.vmap(lane))(ratios))
+    fast, slow = runs
+    assert bool(jnp.all(fast.successful))
+    np.testing.assert_array_equal(fast.impacts, slow.impacts)
+    # Rounding sizes the steps of an adaptive method, and of the thousand aims of a chatter it may
+    # ask for one more.
+    if not isinstance(method, vi.Adaptive):
+        np.testing.assert_allclose(fast.steps, slow.steps, rtol=2e-3 if "rest" in name else 0)
+    # Rounding grows with the motion, by a factor of 1e3 at most in these lanes; where it sizes the
+    # steps, results differ as the tolerance allows.
+    close = 1e-9 if isinstance(method, vi.Adaptive) else 1e-12
+    for a, b in zip(jax.tree.leaves(fast), jax.tree.leaves(slow), strict=True):
+        if a.dtype == jnp.float64:
+            np.testing.assert_allclose(a, b, rtol=0, atol=close)
+
+
+def test_single_precision():
+    """In its own measure."""
+
+    def lane(ratio):
+        scene = vi.Scene.ideal(frequency_ratio=ratio, restitution=0.6, gap=1.3, damping_ratio=0.05)
+        return vi.simulate(scene, scene.start(Y=0.1, V=0.2), 12, method=vi.ExactFlight()).sections.Y
+
+    runs = []
+    with jax.enable_x64(False), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for road in ("auto", "xla"):
+            with vi.road(road):
+                runs.append(jax.jit(jax.vmap(lane))(jnp.linspace(0.7, 1.3, 33)))
+    assert runs[0].dtype == jnp.float32
+    np.testing.assert_allclose(*runs, atol=2e-5)
+
+
+class Place(NamedTuple):
+    """A body with two more numbers beside it."""
+
+    Y: Any
+    V: Any
+    memory: Any
+
+
+class Odd(AbstractScene):
+    """A stop and a field of many kinds of functions, with a 3-vector in its state."""
+
+    stiffness: Any
+    table: Any = None
+    stops: tuple = (vi.RigidStop(0.8, 0.7),)
+
+    @property
+    def cycle(self):
+        return 2.0
+
+    def placed(self, state, Y, V):
+        return state._replace(Y=Y, V=V)
+
+    def field(self, s, state):
+        pull = jnp.where(state.Y > 0, state.Y, jnp.tanh(2 * state.Y)) + jnp.abs(state.Y) ** 1.5
+        push = jax.lax.cond(s > 1.0, lambda s: jnp.exp(-s), lambda s: 0.3 * jnp.cos(3 * s), s)
+        if self.table is not None:
+            push = push + jnp.interp(s, jnp.linspace(0, 2, 5), self.table)
+        relaxed = jnp.array([[-1.0, 0.2, 0.0], [0.1, -2.0, 0.0], [0.0, 0.3, -0.5]]) @ state.memory
+        return Place(
+            state.V, push - self.stiffness * pull - 0.1 * state.V + 0.1 * jnp.sum(state.memory),
+            relaxed + state.Y,
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize("table", [None, jnp.array([0.0, 0.4, -0.2, 0.1, 0.0])])
+def test_a_scene_of_ones_own(table):
+    """On the fast road, or told why not; right on either."""
+    start = Place(jnp.asarray(0.1), jnp.asarray(0.5), jnp.zeros(3))
+
+    def lane(stiffness):
+        run = vi.simulate(Odd(stiffness, table), start, 6, method=vi.FixedStep())
+        return run.last, run.impacts
+
+    values = jnp.linspace(1.0, 4.0, 9)
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        fast = jax.jit(jax.vmap(lane))(values)
+    if table is None:
+        assert not told
+    with vi.road("xla"):
+        slow = jax.jit(jax.vmap(lane))(values)
+    for a, b in zip(jax.tree.leaves(fast), jax.tree.leaves(slow), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-12)
+    assert int(jnp.max(fast[1])) > 0
