@@ -399,7 +399,7 @@ SCAN = (
 def test_scan(here, capsys):
     out = ran(capsys, "scan", SCAN)
     assert "Scan of 6 motions over drive.frequency_ratio (2: 0.8 … 0.9), start.Y" in out
-    assert "failed: 2 of 6 motions" in out and "2: The start is not finite or lies beyond" in out
+    assert "failed: 2 of 6 motions" in out and "2: The start or a number of the scene" in out
     assert "<xarray.Dataset>" in out and "Nothing was written" in out
     assert [path.name for path in here.iterdir()] == ["file.toml"]
     out = ran(capsys, "scan", SCAN + "store = 'new/s.zarr'\npicture = 's.png'")

@@ -13,7 +13,8 @@ SCENE = vi.Scene.ideal(frequency_ratio=0.9, gap=None)
 
 
 def section(cycles):
-    return vi.simulate(SCENE, SCENE.start(Y=0.1), cycles, record="sections").sections.Y
+    with vi.road("xla"):  # whose programs take hundreds of maps
+        return vi.simulate(SCENE, SCENE.start(Y=0.1), cycles, record="sections").sections.Y
 
 
 @pytest.fixture

@@ -3,6 +3,7 @@
 import math
 import os
 import tempfile
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,7 +24,7 @@ def number(name: str, value: Any) -> jax.Array:
     **Raises:** `TypeError` if `value` is not real-valued.
     """
     if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jnp.floating):
-        return value
+        return _floating(name, value)
     if isinstance(value, bool | str) or value is None:
         raise TypeError(f"Argument `{name}` must be a real number, but got {value!r}.")
     try:
@@ -41,7 +42,27 @@ def _floating(name: str, array: jax.Array) -> jax.Array:
         raise TypeError(
             f"Argument `{name}` must be a real number, but its dtype is {array.dtype.name}."
         )
+    if narrow(array):
+        warn_of_narrow(f"Argument `{name}` is")
+    elif jnp.issubdtype(array.dtype, jnp.floating):
+        return array
     return array.astype(jnp.result_type(float))
+
+
+def narrow(value: Any) -> bool:
+    """Whether these are floating-point numbers of less than the session's precision."""
+    floating = eqx.is_inexact_array(value) and jnp.issubdtype(value.dtype, jnp.floating)
+    return floating and jnp.finfo(value.dtype).bits < jnp.finfo(jnp.result_type(float)).bits
+
+
+def warn_of_narrow(what: str) -> None:
+    """Say that numbers came in less than the session's precision, which nothing gives back."""
+    eps = float(jnp.finfo(jnp.float32).eps)
+    warnings.warn(
+        f"{what} of less than double precision, known to {eps:.0e} only, in a session of double "
+        "precision, to which it is promoted. Make numbers after double precision is switched on.",
+        stacklevel=4,
+    )
 
 
 def concrete(value: Any) -> np.ndarray | None:

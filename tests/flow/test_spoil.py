@@ -57,12 +57,10 @@ def test_gradients_of_a_failed_lane_are_nan_unless_it_is_left_out():
 
 def test_a_scan_tells_no_slope_of_a_failed_lane():
     scene = vi.Scene.ideal(frequency_ratio=0.9, gap=-0.5, damping_ratio=0.05)
+    options = {"cycles": CYCLES, "settle": 0, "max_steps": STEPS, "start": scene.start(Y=-0.6)}
+    axes, slope = {"stops.0.gap": jnp.asarray([-0.5, 1.5])}, ("stops.0.gap",)
     with pytest.warns(UserWarning, match="failed"):
-        data = vi.scan(
-        scene, {"stops.0.gap": jnp.asarray([-0.5, 1.5])}, start=scene.start(Y=-0.6),
-        cycles=CYCLES, settle=0, measure="extremes", derivatives=("stops.0.gap",),
-        max_steps=STEPS,
-    )  # fmt: skip
+        data = vi.scan(scene, axes, measure="extremes", derivatives=slope, **options)
     assert (np.asarray(data.result) != 0).tolist() == [True, False]
     slopes = [name for name in data if str(name).startswith("d_")]
     assert slopes

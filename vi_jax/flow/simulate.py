@@ -12,7 +12,16 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .. import lanes
-from .._checks import concrete, count, count_or_traced, fits_records, flag, one_of
+from .._checks import (
+    concrete,
+    count,
+    count_or_traced,
+    fits_records,
+    flag,
+    narrow,
+    one_of,
+    warn_of_narrow,
+)
 from .._programs import compiled
 from ..scene import AbstractScene, Scene
 from .choice import MethodLike, chosen
@@ -153,7 +162,7 @@ def planned(
             'double precision call `jax.config.update("jax_enable_x64", True)` first.',
             stacklevel=3,
         )
-    start = as_floats(scene, start)
+    scene, start = of_one_type(scene, start)
     dtype = scene.position(start).dtype
     for name, value in (("max_impacts", max_impacts), ("max_steps", max_steps)):
         if value is not None and value > _most(dtype):
@@ -210,9 +219,28 @@ def _countable(cycles: int, settle: Any, parts: int, dtype: Any) -> jax.Array:
 
 def as_floats(scene: AbstractScene, state: Any) -> Any:
     """`state` in arrays of the one floating-point type that it and the scene's numbers ask for."""
-    numbers = jtu.tree_leaves(eqx.filter((scene, state), eqx.is_array_like))
-    dtype = jnp.result_type(float, *numbers)
+    dtype = _type_of(scene, state)
     return jtu.tree_map(lambda x: jnp.asarray(x, dtype), state)
+
+
+def of_one_type(scene: AbstractScene, start: Any) -> tuple[AbstractScene, Any]:
+    """Scene and start with all their floating-point numbers of one type, the widest among them.
+
+    Numbers of a scene made before double precision was switched on are promoted, with a warning.
+    """
+    dtype = _type_of(scene, start)
+    for name, tree in {"scene": scene, "start": start}.items():
+        short = [path for path, x in jtu.tree_leaves_with_path(tree) if narrow(x)]
+        if short:
+            names = ", ".join(jtu.keystr(path).lstrip(".") for path in short)
+            warn_of_narrow(f"Argument `{name}` has numbers ({names})")
+    scene = jtu.tree_map(lambda x: x.astype(dtype) if narrow(x) else x, scene)
+    return scene, as_floats(scene, start)
+
+
+def _type_of(scene: AbstractScene, state: Any) -> Any:
+    numbers = jtu.tree_leaves(eqx.filter((scene, state), eqx.is_array_like))
+    return jnp.result_type(jnp.result_type(float), *numbers)
 
 
 def _check_scalars(**arguments: Any) -> None:

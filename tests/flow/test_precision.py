@@ -1,0 +1,40 @@
+"""Numbers of single precision in a session of double precision."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+
+METHODS = [vi.ExactFlight(), vi.FixedStep(), vi.Adaptive(rtol=1e-9)]
+NUMBERS = {"frequency_ratio": 0.9, "restitution": 0.7, "gap": 0.6, "damping_ratio": 0.05}
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_scene_made_before_double_precision_is_promoted_and_says_so(method):
+    with jax.enable_x64(False):
+        early = vi.Scene.ideal(**NUMBERS)
+        started = early.start(Y=-0.3)
+    late = vi.Scene.ideal(**{n: float(np.float32(x)) for n, x in NUMBERS.items()})
+    start = late.start(Y=float(np.float32(-0.3)))
+
+    def last(scene, start):
+        return vi.simulate(scene, start, 3, method=method).last.Y
+
+    expected = jax.jvp(lambda s: last(late, s), (start,), (start,))
+    with pytest.warns(UserWarning, match="stops.*gap.*double precision"):
+        found = jax.jvp(lambda s: last(early, s), (start,), (start,))
+    assert found[0].dtype == jnp.float64
+    np.testing.assert_array_equal(found, expected)
+    for scene in (late, early):  # and with nothing at all in double precision
+        with pytest.warns(UserWarning, match="`start`.*double precision"):
+            np.testing.assert_array_equal(last(scene, started), expected[0])
+
+
+@pytest.mark.parametrize("single", [np.float32, jnp.float32])
+def test_a_number_of_single_precision_is_told_where_it_comes_in(single):
+    with pytest.warns(UserWarning, match="`gap`.*double precision"):
+        scene = vi.Scene.ideal(**{**NUMBERS, "gap": single(0.6)})
+    assert scene.stops[0].gap.dtype == jnp.float64
+    with pytest.warns(UserWarning, match="`Y`.*double precision"):
+        assert scene.start(Y=single(0.1)).Y.dtype == jnp.float64
