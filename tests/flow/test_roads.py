@@ -95,7 +95,7 @@ class Odd(AbstractScene):
 
     stiffness: Any
     table: Any = None
-    stops: tuple = (vi.RigidStop(0.8, 0.7),)
+    stops: tuple = (vi.RigidStop(0.2, 0.7),)
 
     @property
     def cycle(self):
