@@ -119,11 +119,12 @@ for made in SCENES:
     compiling[made.name] = time.perf_counter() - begin
     size[made.name] = operations(made.run, 0.9)
 times: dict[str, list[float]] = {name: [] for name in programs}
-for _ in range(ROUNDS):
-    for name, program in programs.items():
-        begin = time.perf_counter()
-        jax.block_until_ready(program(ratios))
-        times[name].append(time.perf_counter() - begin)
+with vi.threads(1):
+    for _ in range(ROUNDS):
+        for name, program in programs.items():
+            begin = time.perf_counter()
+            jax.block_until_ready(program(ratios))
+            times[name].append(time.perf_counter() - begin)
 cost = {name: 1e6 * float(np.median(t)) / LANES / CYCLES for name, t in times.items()}
 
 # %% [markdown]

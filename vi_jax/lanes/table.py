@@ -188,6 +188,15 @@ def _(t, p, d, a):
 def _(t, p, d, a, b):
     if b.kind != a.kind:
         b = convert(t, b, a.kind, False)
+    if b.number in (0.5, 1.5, -0.5):
+        # A root but for two corners: powers of -∞ are infinite, those of -0 those of 0.
+        infinity = t.constant(float("inf"), a.kind)
+        root = t.intrinsic("sqrt", t.binary("fadd", a, t.zero(a.kind)))
+        lowest = t.binary("fcmp oeq", a, t.constant(-float("inf"), a.kind), "i1")
+        root = t.select(lowest, infinity, root)
+        if b.number < 0:
+            return div(t, t.constant(1, a.kind), root)
+        return root if b.number == 0.5 else mul(t, t.intrinsic("fabs", a), root)
     if a.kind == "float" and b.number is not None and b.number != round(b.number):
         # No negative base has such a power, and double precision leaves single to rounding.
         wide = t.cast("fpext", a, "double")
