@@ -37,7 +37,8 @@ FUNCTIONS = {
     "powers": (lambda x, y: (x**2, x**3, x**7, x**-1, x**-2, jnp.square(x), x**0), 2),
     "roots": (lambda x, y: (jnp.sqrt(x), jax.lax.rsqrt(x)), 2),
     "general power": (
-        lambda x, y: (jnp.abs(x) ** 1.5, x**0.5, x**-0.5, jnp.abs(x) ** 0.3, jnp.abs(x) ** y), 8,
+        lambda x, y: (jnp.abs(x) ** 1.5, x**0.5, jnp.where(jnp.abs(x) < 1e-300, 1.0, x) ** -0.5,
+                      jnp.abs(x) ** 0.3, jnp.abs(x) ** y), 8,
     ),
     "rounding": (
         lambda x, y: (jnp.round(x), jnp.floor(x), jnp.ceil(x), jax.lax.round(x)), 0,
