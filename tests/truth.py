@@ -108,9 +108,9 @@ def flown(zeta, xi, stops, Y, V, cycles, *, section=0.0, fineness=32):
             for i, (sign, gap, _) in enumerate(stops):
                 mine = on[held[on] == 1 + i]
                 until = _release(sign, gap[mine], section[mine] + zeta[mine] * t[mine])
+                later = t[mine] + until / zeta[mine]
                 # A hair late, when rounding cannot press it on again.
-                later = t[mine] + until / zeta[mine] + LATE
-                t[mine] = np.minimum(later, whole[mine])
+                t[mine] = np.minimum(later + LATE, whole[mine])
                 held[mine[later <= whole[mine]]] = 0
             on = on[(held[on] == 0) & (t[on] < whole[on])]
             _look(

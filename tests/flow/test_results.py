@@ -90,3 +90,14 @@ def test_exact_flight_says_what_it_needs():
     slider = vi.Parameters().scene(drive="ideal", crank="slider")
     with pytest.raises(ValueError, match=r"`ExactFlight` needs a `CosineCrank`.*`SliderCrank`"):
         vi.simulate(slider, slider.start(), 3, method=vi.ExactFlight())
+
+
+def test_the_impact_log_tells_crank_angles_in_both_clocks():
+    scene = vi.Scene.ideal(frequency_ratio=0.4, restitution=0.5, gap=0.8, damping_ratio=0.05)
+    logs = [
+        vi.simulate(scene, scene.start(), 3, clock=clock, impact_log=6).impact_log
+        for clock in ("phase", "time")
+    ]
+    assert np.isfinite(logs[0].phase).sum() > 3
+    np.testing.assert_allclose(logs[1].phase, logs[0].phase, atol=1e-9)
+    assert np.nanmax(logs[1].phase) <= 2 * np.pi

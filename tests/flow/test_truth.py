@@ -60,7 +60,18 @@ def program(name):
     return vi.jit(lambda x: jax.lax.map(lane, x, batch_size=256))
 
 
-def compared(name, lanes, seed):
+def draw_short(lanes, seed):
+    """At rest 1e-15 to 1e-8 short of the stop, where the force on it is or falls near zero."""
+    rng = np.random.default_rng(seed)
+    zeta, xi, k, gap, *_ = draw(lanes, seed)
+    gap = np.clip(gap, -0.999, 0.999)
+    section = np.arccos(gap) * rng.choice([-1, 1], lanes)
+    section[::3] += 10 ** rng.uniform(-12, -3, section[::3].size)
+    off = 10 ** rng.uniform(-15, -8, lanes)
+    return zeta, xi, k, gap, gap - off, np.zeros(lanes), section
+
+
+def compared(name, lanes, seed, draw=draw):
     """Each lane's largest deviation, the truth's own sensitivity, and both counts of rests."""
     x = draw(lanes, seed)
     states, low, high, rests, good = map(np.asarray, program(name)(tuple(map(jnp.asarray, x))))
@@ -94,6 +105,14 @@ def check(name, lanes, seed):
 )
 def test_random_lanes_from_deep_stops_to_beyond_reach(name):
     check(name, METHODS[name][1], 0)
+
+
+def test_a_start_at_rest_just_short_of_the_stop():
+    apart, growth, expected, rests = compared("exact", 1_000, 0, draw_short)
+    clear = growth < 1e3
+    assert clear.mean() > 0.99
+    assert apart[clear].max() < 1e-9
+    assert (rests == expected).all(axis=1)[clear].mean() > 0.999
 
 
 @pytest.mark.slow

@@ -155,7 +155,11 @@ def _force_may_turn(
     turns = (rate0 * rate1 < 0) & (place > brief) & (h - place > brief)
     corner = (a1 - rate1 * h - a0) / jnp.where(rate0 == rate1, 1.0, rate0 - rate1)
     bound = a0 + rate0 * corner
-    hidden = turns & (a0 * a1 > 0) & (bound * a0 < 0)
+    hidden = turns & (a0 * a1 >= 0) & (bound * (a0 + a1) < 0)
+    if lane.contact is not None:
+        # At rest the step may begin, to rounding, where the window does.
+        pressed = (lane.contact > 0) & (lane.direction * a1 >= 0) & (lane.direction * bound < 0)
+        hidden = hidden | (turns & pressed)
     largest = jnp.maximum(jnp.maximum(jnp.abs(a0), jnp.abs(a1)), jnp.abs(bound))
     slow = jnp.minimum(jnp.abs(begin.v), jnp.abs(end.v)) <= largest * h
     return hidden & slow, place

@@ -15,6 +15,7 @@ Scalar = Float[Array, ""]
 
 _COS = tuple((-1) ** n / factorial(2 * n) for n in range(10))
 _SINC = tuple((-1) ** n / factorial(2 * n + 1) for n in range(10))
+# (e^x - 1)/x
 _EXP_SLOPE = tuple(1 / factorial(n + 1) for n in range(10))
 
 # Below this distance from resonance |1 - ζ² + 2iξζ| the steady response, which grows like its
@@ -87,14 +88,19 @@ def flight(
 
     Dimensionless scalars; |τ| up to a fifth of the shorter of the periods 2π and 2π/ζ, less
     under strong damping (|ξτ| ≤ 0.4π). Paper, Eq. 14, here with damping.
+
+    What is summed are changes, each of the order of τ: the rounding of a short flight is that of
+    its own length, as it has to be where a body leaves the stop by less than its position rounds.
     """
     # C = cos(ω_d τ) and S = sin(ω_d τ)/ω_d are entire in ω_d² = 1 - ξ², whatever its sign.
     square = (1 - xi * xi) * tau * tau
-    C, S = horner(_COS, square), tau * horner(_SINC, square)
-    fade = jnp.exp(-xi * tau)
+    bend, S = square * horner(_COS[1:], square), tau * horner(_SINC, square)
+    loss = _less_one(-xi * tau)
+    fade = 1 + loss
+    fall = bend + loss + loss * bend  # of the free motion: fade·C - 1
 
     sine0, cosine0 = sincos(phase)
-    sine1, cosine1 = sincos(phase + zeta * tau)
+    turn = _turned(sine0, cosine0, 0.5 * zeta * tau)
     detune, drag = 1 - zeta * zeta, 2 * xi * zeta
     size = detune * detune + drag * drag
     near = size < _NEAR * _NEAR
@@ -106,11 +112,29 @@ def flight(
     v = V - zeta * (Q * cosine0 - P * sine0)
     Y_rest, V_rest = _from_rest(
         jnp.where(near, zeta, 1.0), jnp.where(near, xi, 0.0),
-        (cosine0, sine0), (cosine1, sine1), tau,
+        (cosine0, sine0), turn, tau,
     )  # fmt: skip
-    Y1 = fade * ((C + xi * S) * y + S * v) + P * cosine1 + Q * sine1
-    V1 = fade * ((C - xi * S) * v - S * y) + zeta * (Q * cosine1 - P * sine1)
-    return Y1 + jnp.where(near, Y_rest, 0.0), V1 + jnp.where(near, V_rest, 0.0)
+    pull = fade * S
+    Y_change = fall * y + pull * (xi * y + v) + (P * turn[0] + Q * turn[1])
+    V_change = fall * v - pull * (xi * v + y) + zeta * (Q * turn[0] - P * turn[1])
+    return (
+        Y + (Y_change + jnp.where(near, Y_rest, 0.0)),
+        V + (V_change + jnp.where(near, V_rest, 0.0)),
+    )
+
+
+def _less_one(x: Scalar) -> Scalar:
+    """e^x - 1 for |x| up to 1.3, without its cancellation."""
+    part = 0.125 * x * horner(_EXP_SLOPE, 0.125 * x)
+    for _ in range(3):
+        part = part * (part + 2)
+    return part
+
+
+def _turned(sine: Scalar, cosine: Scalar, half: Scalar) -> tuple[Scalar, Scalar]:
+    """Changes of a phase's cosine and sine, in this order, over twice the angle `half`."""
+    s, c = sincos(half)
+    return -2 * s * (sine * c + cosine * s), 2 * s * (cosine * c - sine * s)
 
 
 def _times(a, b):
@@ -121,17 +145,20 @@ def _minus(a, b):
     return a[0] - b[0], a[1] - b[1]
 
 
-def _from_rest(zeta, xi, begin, end, tau):
-    """Response from rest at phases whose (cos, sin) are `begin` and `end`, near resonance only.
+def _from_rest(zeta, xi, begin, turn, tau):
+    """Response from rest at a phase whose (cos, sin) is `begin` and changes by `turn`, near
+    resonance only.
 
     With p = -ξ + iω_d it is Re{[τ e^{pτ} E(w) e^{iφ0} - (e^{iφ1} - e^{p̄τ} e^{iφ0})/(iζ - p̄)]
     / (2iω_d)}, w = (iζ - p)τ, where E(w) = (e^w - 1)/w stays smooth through resonance. Complex
     numbers are pairs, because pairs of floats fuse.
     """
     omega = (1 - xi * xi) ** 0.5
-    fade = jnp.exp(-xi * tau)
-    sine, cosine = sincos(omega * tau)
-    decay = (fade * cosine, fade * sine)
+    loss = _less_one(-xi * tau)
+    # e^(pτ) - 1
+    bend, sine = _turned(jnp.zeros_like(tau), jnp.ones_like(tau), 0.5 * omega * tau)
+    change = (bend + loss + loss * bend, (1 + loss) * sine)
+    decay = (1 + change[0], change[1])
     w = (xi * tau, (zeta - omega) * tau)
     series = (jnp.full_like(tau, _EXP_SLOPE[-1]), jnp.zeros_like(tau))
     for coefficient in _EXP_SLOPE[-2::-1]:
@@ -141,14 +168,14 @@ def _from_rest(zeta, xi, begin, end, tau):
     other = (xi, zeta + omega)
     scale = 1 / (other[0] ** 2 + other[1] ** 2)
     inverse = (other[0] * scale, -other[1] * scale)
-    turned = _times((decay[0], -decay[1]), begin)
-    z = _minus(resonant, _times(_minus(end, turned), inverse))
-    # d/dτ of each part, from its definition.
+    lag = _times((change[0], -change[1]), begin)
+    z = _minus(resonant, _times(_minus(turn, lag), inverse))
+    # d/dτ of each part, from its definition; what both hold of the beginning cancels.
     p, p_bar = (-xi, omega), (-xi, -omega)
     i_zeta = (jnp.zeros_like(zeta), zeta)
     rate_resonant = _times(p, resonant)
-    rate_resonant = (rate_resonant[0] + end[0], rate_resonant[1] + end[1])
-    rate_other = _minus(_times(i_zeta, end), _times(p_bar, turned))
+    rate_resonant = (rate_resonant[0] + turn[0], rate_resonant[1] + turn[1])
+    rate_other = _minus(_times(i_zeta, turn), _times(p_bar, lag))
     rate = _minus(rate_resonant, _times(rate_other, inverse))
     # Re{z / (2iω)} = Im{z} / (2ω)
     half = 0.5 / omega

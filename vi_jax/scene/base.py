@@ -50,6 +50,10 @@ class AbstractScene(eqx.Module):
         """The state component that counts cycles, or `None` where `s` itself does."""
         return None
 
+    def told(self, clock: Float[Array, "..."]) -> Float[Array, "..."]:
+        """A reading of what counts the cycles, as the impact log tells it; by default itself."""
+        return clock
+
     def rewound(self, state: State) -> State:
         """`state` with its clock set back by one cycle (only asked where there is a clock)."""
         return state

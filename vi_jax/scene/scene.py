@@ -238,6 +238,12 @@ class Scene(AbstractScene):
         """The crank angle, where time is the independent variable of a motor scene."""
         return state.phase if isinstance(state, TimedMotorState) else None
 
+    def told(self, clock: Float[Array, "..."]) -> Float[Array, "..."]:
+        """The crank angle since the section, where time counts the cycles of an ideal drive."""
+        if isinstance(self.drive, IdealDrive) and self.clock_name == "time":
+            return self.drive.frequency_ratio * clock
+        return clock
+
     def rewound(self, state: Any) -> Any:
         """The state with a full turn taken off the crank angle."""
         return eqx.tree_at(lambda x: x.phase, state, state.phase - 2 * pi)
