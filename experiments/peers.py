@@ -74,7 +74,7 @@ class Entry:
 
 def ours(name: str, number: float = 0.0, *, whole: bool = False, **options: Any) -> Entry:
     """An entry of vi_jax."""
-    inside = f"Dopri8, {number:g}" if number else ""
+    inside = "" if not number else f"{number:g}" if name == "Taylor" else f"Dopri8, {number:g}"
     label = f"{OURS} {name}({inside})" + (", forced devices" if whole else "")
     return Entry(label, "ours", {"name": name, "number": number, **options}, whole=whole)
 
@@ -88,7 +88,7 @@ def entries(drive: str, all_cores: bool) -> list[Entry]:
     """All codes for one scene."""
     sparse = LANES // 8 if not all_cores else LANES // (8 if len(cores()) > 8 else 16)
     motor = [("FixedStep", n) for n in (5, 6, 8, 12, 24, 36)]
-    motor += [("Adaptive", 1e-6), ("Adaptive", 1e-9)]
+    motor += [("Taylor", 1e-7), ("Taylor", 1e-9), ("Taylor", 1e-12), ("Taylor", 1e-13)]
     methods = motor if drive == "motor" else [("ExactFlight", 0), ("FixedStep", 12)]
     listed = [ours(*method) for method in methods]
     listed += [heyoka(tol) for tol in (1e-6, 1e-9, 1e-15)]
@@ -124,11 +124,9 @@ def entries(drive: str, all_cores: bool) -> list[Entry]:
 def derivative_entries() -> list[Entry]:
     """The codes that give derivatives by six parameters, each primal beside its derivatives."""
     listed = []
-    for method in (("FixedStep", 12), ("FixedStep", 24)):
+    for method in (("FixedStep", 12), ("FixedStep", 24), ("Taylor", 1e-12)):
         primal = ours(*method)
-        with_six = Entry(
-            primal.name + " six jvp", "ours", {**primal.options, "jacobian": True, "batch": 64}
-        )
+        with_six = Entry(primal.name + " six jvp", "ours", {**primal.options, "jacobian": True})
         listed += [primal, with_six]
     for tol in (1e-6, 1e-9, 1e-15):
         options = {"tol": tol, "jacobian": True}
@@ -282,7 +280,9 @@ def sources() -> str:
     """Fingerprint of all that decides the figures: what was measured with other code is stale."""
     files = [*HERE.glob("peers.py"), *HERE.glob("peer_codes/*.py")]
     files += [
-        file for room in ("flow", "scene") for file in (HERE.parent / "vi_jax" / room).iterdir()
+        file
+        for room in ("flow", "lanes", "scene")
+        for file in (HERE.parent / "vi_jax" / room).iterdir()
     ]
     return hashlib.sha256(
         b"".join(file.read_bytes() for file in sorted(files) if file.is_file())
@@ -395,7 +395,7 @@ def report(sections: dict[str, dict]) -> str:
 
 LOOKS = {
     f"{OURS} FixedStep": ("tab:blue", "s"),
-    f"{OURS} Adaptive": ("tab:blue", "o"),
+    f"{OURS} Taylor": ("tab:blue", "o"),
     f"{OURS} ExactFlight": ("tab:blue", "*"),
     "heyoka batch": ("tab:red", "s"),
     "heyoka scalar": ("tab:red", "o"),
