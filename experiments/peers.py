@@ -517,7 +517,7 @@ def on_gpu() -> str:
                 scene = scene_of(kappa)
                 one = jnp.ones_like(kappa)
                 start = start_of(scene, kappa)
-                return method.step(scene, 0 * one, 0.5 * one, start, None, one)[0]
+                return method.step(scene, 0 * one, 0.5 * one, start, None)[0]
 
             stepped = jax.jit(one_step).lower(jnp.asarray(0.9, dtype)).compile().cost_analysis()
             operations = float(stepped["flops"]) if stepped else float("nan")
