@@ -372,7 +372,7 @@ lines = [
     for color, style, label in LOOKS.values()
 ]  # fmt: skip
 figure.legend(
-    handles=[*patches, *lines], loc="outside lower center", ncols=8, frameon=False, fontsize=9.5
+    handles=[*patches, *lines], loc="outside lower center", ncols=6, frameon=False, fontsize=9
 )
 figure.suptitle(
     f"What the machine settles on from rest within {SETTLE} cycles (ideal drive, Δ = 2a)"
