@@ -178,6 +178,19 @@ def test_reverse_mode_says_what_to_do():
         jax.grad(lambda x: logistic(x, 3.7, 6.0)[0][0])(0.3)
 
 
+def test_values_beside_a_gradient_and_linear_parts():
+    """Where the loop's derivative is asked for forward only, the rest may be reversed."""
+
+    def last(x):
+        return logistic(x, 3.7, 6.0)[0][0]
+
+    value, along = jax.linearize(last, 0.3)
+    np.testing.assert_allclose(value, last(0.3))
+    np.testing.assert_allclose(along(1.0), jax.jacfwd(last)(0.3))
+    slope = jax.grad(lambda x: x * jax.lax.stop_gradient(last(x)) + 0 * last(0.3 + 0 * x) ** 0)
+    np.testing.assert_allclose(slope(0.3), last(0.3))
+
+
 def test_closed_over_arrays_are_inputs():
     """Numbers that the functions close over may be traced, batched and differentiated."""
 

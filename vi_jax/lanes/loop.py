@@ -11,7 +11,7 @@ import jax.tree_util as jtu
 from jax.core import eval_jaxpr
 from jax.extend.core import ClosedJaxpr
 
-from .primitive import FORWARD_ONLY, lanes_p
+from .primitive import lanes_p
 from .program import Program
 
 ROADS = ("auto", "xla")
@@ -110,12 +110,7 @@ def run(
     jaxprs = [first, jax.make_jaxpr(stepped)(*both), jax.make_jaxpr(ended)(*both)]
     (first, second, last), leaves = _without_consts(jaxprs, leaves)
     program = Program(begin=first, step=second, end=last, rows=rows, block=block)
-    try:
-        out = lanes_p.bind(*leaves, program=program, road=current_road() if road is None else road)
-    except ValueError as error:
-        if "Linearization failed" in str(error):
-            raise NotImplementedError(FORWARD_ONLY) from None
-        raise
+    out = lanes_p.bind(*leaves, program=program, road=current_road() if road is None else road)
     results = jtu.tree_unflatten(flat["out"], out[: len(last.out_avals)])
     return results, jtu.tree_unflatten(flat["row"], out[len(last.out_avals) :])
 

@@ -113,10 +113,22 @@ def _jvp(primals, tangents, *, program: Program, road: str):
     for part in (has[: _outs(program)], has[_outs(program) :]):
         values += [next(out) for _ in part]
         slopes += [next(out) if there else None for there in part]
+    if _put_off(changes):
+        values = lanes_p.bind(*primals, program=program, road=road)
     return values, [
         ad.Zero(jax.typeof(v).to_tangent_aval()) if s is None else s
         for v, s in zip(values, slopes, strict=True)
     ]
+
+
+def _put_off(tangents) -> bool:
+    """Whether the tangents are yet unknown, as in `jax.linearize` and `jax.grad`, while the values
+    are wanted now: what is computed along with such tangents is not known either."""
+    return any(type(x).__name__ == "JaxprTracer" for x in tangents)
+
+
+def _transposed(*args, **params):
+    raise NotImplementedError(FORWARD_ONLY)
 
 
 def _outs(program: Program) -> int:
@@ -124,6 +136,7 @@ def _outs(program: Program) -> int:
 
 
 ad.primitive_jvps[lanes_p] = _jvp
+ad.primitive_transposes[lanes_p] = _transposed
 
 
 def _on_xla(*args, program: Program, road: str):
