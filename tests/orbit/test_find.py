@@ -79,6 +79,10 @@ def test_a_grid_of_closed_forms(cycles):
 
     closed, found, (trace, determinant) = both(zeta, k, d, xi)
     there = np.asarray(closed.admissible)[:, 0] & (np.asarray(closed.impact_speed)[:, 0] > 0.1)
+    # At resonance without damping the impact falls on the section, where the cycle map jumps: the
+    # state just after it has no neighbourhood in which a search could end.
+    phase = np.asarray(closed.impact_phase)[:, 0]
+    there &= np.minimum(phase, 2 * np.pi * cycles - phase) > 1e-6
     assert there.sum() > (20 if cycles == 1 else 10)
     assert np.asarray(found.successful)[there].all()
     for a, b in ((found.state.Y, closed.Y), (found.state.V, closed.V), (found.y_min, closed.y_min)):
