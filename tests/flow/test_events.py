@@ -111,3 +111,22 @@ def test_limits_of_restitution():
         runs = [vi.simulate(scene, scene.start(V=1.0), 12, method=m) for m in METHODS[:2]]
         assert all(bool(run.successful) for run in runs) and int(runs[0].impacts.sum()) > 3
         np.testing.assert_allclose(runs[0].sections.Y, runs[1].sections.Y, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "method",
+    [vi.ExactFlight(), vi.FixedStep(diffrax.Dopri8(), 48), vi.Taylor(16, 8)],
+    ids=["exact", "fixed", "taylor"],
+)
+def test_an_impact_on_the_section_belongs_to_the_cycle_that_ends_there(method):
+    """At resonance without damping the attracting motion has its impact at φ = 2π exactly: were it
+    counted now before the section and now after it, its period would be told wrong."""
+    scene = vi.Scene.ideal(frequency_ratio=1.0, restitution=0.5)
+    starts = jax.vmap(lambda Y, V: scene.start(Y=Y, V=V))(
+        jnp.asarray([-2.0, 0.0, -1.0, 0.5]), jnp.asarray([0.0, 0.5, 1.0, -0.8])
+    )
+    run = vi.jit(jax.vmap(lambda x: vi.simulate(scene, x, 8, settle=200, method=method)))(starts)
+    assert bool(run.successful.all()) and (np.asarray(run.impacts) == 1).all()
+    np.testing.assert_allclose(run.sections.Y, 2.0, rtol=1e-12)
+    # The impact speed of the closed form is π/(1 + k); k of it is left.
+    np.testing.assert_allclose(run.sections.V, -0.5 * np.pi / 1.5, rtol=1e-10)

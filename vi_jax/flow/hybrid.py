@@ -172,6 +172,10 @@ def _met(plan: Plan, lane: Lane, trial: Trial, taken: Flag, arrival: Arrival) ->
     flow, bend = _flow_and_bend(trial.holding, arrival.time is not None, trial.s, trial.state)
     for c in trial.crossings:
         offset = jnp.where(c.landed, c.offset, 0.0)
+        if c.name != SECTION and plan.ticks(lane.state):
+            # Met on the section it is not beyond it.
+            beyond = stop_gradient(trial.s + offset - plan.end(lane.part))
+            offset = offset - jnp.maximum(beyond, 0.0)
         there, passed = jtu.tree_map(
             lambda x, dx, ddx, d=offset: x + d * dx + _second(d, ddx),
             (trial.state, arrival.time), flow, bend,

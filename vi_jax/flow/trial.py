@@ -145,14 +145,20 @@ def attempt(
             force_rate(scene, holding, s1, new),
             stop_gradient(_SLIVER * limit + jnp.zeros_like(h)),
         )
-    seen = tuple(_seen(lane, good, h, crossing, crossings) for crossing in crossings)
+    seen = tuple(_seen(lane, good & last, good, h, each, crossings) for each in crossings)
     return Trial(
         s1, h, new, time, error, good, last, seen, position, at_turn, holding, leaves, surge
     )  # fmt: skip
 
 
-def _seen(lane: Lane, good: Flag, h: Scalar, crossing: tuple, all_of_them: list) -> Crossing:
-    """Whether a step that was aimed at this event met it."""
+def _seen(
+    lane: Lane, ends: Flag, good: Flag, h: Scalar, crossing: tuple, all_of_them: list
+) -> Crossing:
+    """Whether a step that was aimed at this event met it.
+
+    A step that ends an interval as it meets a stop, to rounding, is aimed at it: an impact on the
+    section belongs to the cycle that ends there, so that it is not now in one, now in the next.
+    """
     name, begin, end, scale = crossing
     aimed = good & (lane.target == name)
     for other, _, beyond, _ in all_of_them:
@@ -163,10 +169,12 @@ def _seen(lane: Lane, good: Flag, h: Scalar, crossing: tuple, all_of_them: list)
     eps = float(jnp.finfo(h.dtype).eps)
     # Two ways of being there to rounding: in place along the path, or, near grazing, in position.
     close = size <= _landing_tolerance(h) * _leniency(lane)
-    close = close | ((jnp.abs(end.x) <= 4 * eps * scale) & (end.v >= 0))
+    there = jnp.abs(end.x) <= 4 * eps * scale
+    close = close | (there & (end.v >= 0))
     real = stop_gradient(square) > 0
     landed = pin_flag(aimed & close & real, h)
     again = aimed & ~close & real & (size < 0.25 * h)
+    again = again | ends & there & (end.v > 0)
     return Crossing(name, begin, end, offset, landed, again)
 
 
