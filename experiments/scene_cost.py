@@ -27,6 +27,7 @@ jax.config.update("jax_enable_x64", True)
 HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments")
 sys.path.insert(0, str(HERE))
 from headlines import keep
+from headlines.jaxprs import primitives
 
 QUICK = "--quick" in sys.argv
 LANES, CYCLES, ROUNDS = (32, 10, 3) if QUICK else (256, 200, 7)
@@ -95,29 +96,13 @@ SCENES = [
 
 
 # %%
-def operations(function: Callable, value: Any) -> int:
-    """Operations in the jaxpr, those of inner ones included."""
-
-    def counted(jaxpr) -> int:
-        inner = 0
-        for equation in jaxpr.eqns:
-            for parameter in equation.params.values():
-                parameter = getattr(parameter, "jaxprs", parameter)  # of a loop over lanes
-                for one in parameter if isinstance(parameter, tuple | list) else (parameter,):
-                    one = getattr(one, "jaxpr", one)
-                    inner += counted(one) if hasattr(one, "eqns") else 0
-        return len(jaxpr.eqns) + inner
-
-    return counted(jax.make_jaxpr(function)(value).jaxpr)
-
-
 ratios = jnp.linspace(0.5, 1.9, LANES)
 programs, compiling, size = {}, {}, {}
 for made in SCENES:
     begin = time.perf_counter()
     programs[made.name] = vi.jit(jax.vmap(made.run)).lower(ratios).compile()
     compiling[made.name] = time.perf_counter() - begin
-    size[made.name] = operations(made.run, 0.9)
+    size[made.name] = primitives(jax.make_jaxpr(made.run)(0.9).jaxpr).total()
 times: dict[str, list[float]] = {name: [] for name in programs}
 with vi.threads(1):
     for _ in range(ROUNDS):

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import vi_jax as vi
+from headlines.jaxprs import primitives
 from scipy.optimize import brentq
 
 Expected = dict[str, tuple[float, float]]
@@ -310,16 +311,6 @@ def peers() -> Expected:
 def scene_cost() -> Expected:
     """Operations in the program of a lane; other versions of JAX write some of it otherwise."""
 
-    def counted(jaxpr) -> int:
-        inner = 0
-        for equation in jaxpr.eqns:
-            for parameter in equation.params.values():
-                parameter = getattr(parameter, "jaxprs", parameter)  # of a loop over lanes
-                for one in parameter if isinstance(parameter, tuple | list) else (parameter,):
-                    one = getattr(one, "jaxpr", one)
-                    inner += counted(one) if hasattr(one, "eqns") else 0
-        return len(jaxpr.eqns) + inner
-
     def run(method, ratio):
         scene = vi.Scene(
             oscillator=vi.Oscillator(0.0448), drive=vi.IdealDrive(ratio),
@@ -330,6 +321,6 @@ def scene_cost() -> Expected:
 
     numbers = {}
     for name, method in (("one stop", vi.FixedStep()), ("exact flight", vi.ExactFlight())):
-        size = counted(jax.make_jaxpr(partial(run, method))(0.9).jaxpr)
+        size = primitives(jax.make_jaxpr(partial(run, method))(0.9).jaxpr).total()
         numbers[f"operations: ideal, {name}"] = (float(size), 0.05 * size)
     return numbers

@@ -2,7 +2,6 @@
 
 import inspect
 import shutil
-import sys
 from functools import partial
 from pathlib import Path
 
@@ -11,12 +10,11 @@ import jax
 import numpy as np
 import pytest
 import vi_jax as vi
+from headlines import FINGERPRINT, fingerprint, headlines, keep
 from vi_jax.paper.response import RATIO, _branches, _closed_forms, with_numbers
 from vi_jax.plot.stamp import stamped
 
 FOLDER = Path(__file__).parents[2] / "experiments"
-sys.path.insert(0, str(FOLDER))
-from headlines import FINGERPRINT, fingerprint, headlines, keep
 
 COMPUTED = {
     name: function

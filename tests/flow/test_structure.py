@@ -1,27 +1,11 @@
 """What a scene does not have is not in the compiled program, and numbers are not part of it."""
 
-from collections import Counter
-
 import jax
 import jax.numpy as jnp
 import pytest
 import vi_jax as vi
+from headlines.jaxprs import primitives
 from vi_jax.lanes.program import Program
-
-
-def count(jaxpr, counter=None) -> Counter:
-    """Primitives of a jaxpr and of all it calls."""
-    counter = Counter() if counter is None else counter
-    for equation in jaxpr.eqns:
-        counter[equation.primitive.name] += 1
-        for parameter in equation.params.values():
-            parameter = getattr(parameter, "jaxprs", parameter)
-            for inner in parameter if isinstance(parameter, (tuple, list)) else (parameter,):
-                if hasattr(inner, "jaxpr"):
-                    inner = inner.jaxpr
-                if hasattr(inner, "eqns"):
-                    count(inner, counter)
-    return counter
 
 
 def carried(jaxpr) -> int:
@@ -48,15 +32,15 @@ MOTOR = vi.Parameters().scene()
 
 
 def test_no_stop_no_search():
-    with_stop, without = (count(program(s, s.start())) for s in (IDEAL, FREE))
+    with_stop, without = (primitives(program(s, s.start())) for s in (IDEAL, FREE))
     assert with_stop["sqrt"] > 0  # of the landing
     assert without["sqrt"] == 0
-    assert sum(without.values()) < sum(with_stop.values())
+    assert without.total() < with_stop.total()
     two = vi.Scene(
         oscillator=IDEAL.oscillator, drive=IDEAL.drive,
         stops=(*IDEAL.stops, vi.RigidStop(2.0, 0.5, "left")),
     )  # fmt: skip
-    assert sum(count(program(two, two.start())).values()) > sum(with_stop.values())
+    assert primitives(program(two, two.start())).total() > with_stop.total()
 
 
 def test_the_state_is_what_the_scene_needs():
@@ -64,7 +48,7 @@ def test_the_state_is_what_the_scene_needs():
     timed = program(MOTOR, MOTOR.start(), clock="time")
     assert carried(motor) == carried(ideal) + 1  # W
     assert carried(timed) == carried(motor) + 1  # φ
-    assert sum(count(ideal).values()) < sum(count(motor).values())
+    assert primitives(ideal).total() < primitives(motor).total()
     # Elapsed time, extremes, speeds and energies are carried where they are asked for.
     assert carried(program(MOTOR, MOTOR.start(), record="motion")) == carried(motor) + 5
     assert carried(program(IDEAL, IDEAL.start(), record="motion")) == carried(ideal) + 4

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..scene.trig import horner
 from .aim import MARGIN, select
-from .events import rising_root
+from .events import rising_root, slope
 from .lane import FREE, SECTION, TURN, Lane, Plan
 from .series import Series, at
 
@@ -29,10 +29,6 @@ def _powers(series: Series, h: Scalar, zero: Scalar) -> tuple[Scalar, ...]:
 
 def _slope(series: Series) -> Series:
     return [None if c is None else c * float(n) for n, c in enumerate(series)][1:]
-
-
-def _slopes(c: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
-    return tuple(float(n) * c[n] for n in range(1, len(c)))
 
 
 def _shifted(series: Series, sign: float, offset: Any) -> Series:
@@ -93,10 +89,11 @@ def look(plan: Plan, lane: Lane, motion: Any, h: Scalar) -> tuple[Scalar, Scalar
         assert polynomial is not None
         # The low orders lead near the root; what is left is a correction.
         theta = rising_root(polynomial[:7], iterations=3)
+        derivative = slope(polynomial)[:-1]
         for _ in range(2):
-            value, slope = horner(polynomial, theta), horner(_slopes(polynomial), theta)
-            better = theta - value / jnp.where(slope > 0, slope, 1.0)
-            theta = jnp.where((slope > 0) & (better > 0) & (better <= 1), better, theta)
+            value, rate = horner(polynomial, theta), horner(derivative, theta)
+            better = theta - value / jnp.where(rate > 0, rate, 1.0)
+            theta = jnp.where((rate > 0) & (better > 0) & (better <= 1), better, theta)
         length = theta * h
         if path is not None:
             if not plan.motion:

@@ -111,6 +111,6 @@ def run_reverse(plan: Plan, start: Any) -> tuple[Ends, Any, Record]:
 def _held(plan: Plan, goal, lane: Lane, state: Any, record: Record) -> tuple[Lane, Any, Record]:
     """One step of a lane that has not yet reached its goal."""
     new = iterate(plan, lane)
-    waiting, completed = lane.done >= goal, new.completed & (lane.done < goal)
-    kept = select(completed, (new.state, new.record), (state, record))
+    waiting = lane.done >= goal
+    kept = select(new.completed & ~waiting, (new.state, new.record), (state, record))
     return select(waiting, lane, new.lane), *kept

@@ -308,14 +308,13 @@ def simulate_pool(
     cycles: int,
     *,
     wanted: Any = None,
-    places: int = 256,
     **options: Any,
 ) -> Run:
-    """As `simulate` under `vmap`, a few lanes at a time (see `run_pool`); forward mode only.
+    """As `simulate` under `vmap`, for lanes some of which are not wanted; forward mode only.
 
     **Arguments:** scene and start of one lane from its values; the values of all lanes, a pytree
     with one leading axis; flags of the lanes that are wanted (the others are not run and come
-    back as failed); `places`, lanes on their way at once; `options` as for `simulate`.
+    back as failed); `options` as for `simulate`.
     """
 
     def one(value, wanted):

@@ -23,7 +23,6 @@ class Expansion(NamedTuple):
     treedef: Any
     """Of the state and the elapsed time."""
     series: list[Series]
-    timed: bool
 
     def at(self, h: Scalar) -> tuple[Any, Scalar | None]:
         """State and elapsed time a length h away."""
@@ -111,7 +110,7 @@ class Taylor(AbstractMethod):
                 f"Method `Taylor` has no recursion for the primitive `{error}` in the scene's "
                 "field. Use `Adaptive` or `FixedStep`."
             ) from None
-        return Expansion(treedef, series, time is not None)
+        return Expansion(treedef, series)
 
     def reach(self, motion: Expansion, limit: Scalar) -> Scalar:
         """The longest step from there."""

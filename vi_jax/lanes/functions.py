@@ -1,7 +1,8 @@
 """Elementary functions without a hardware instruction, as polynomials on whole vectors."""
 
 from collections.abc import Sequence
-from math import factorial, log, pi
+from fractions import Fraction
+from math import factorial, frexp, log, pi
 
 from .text import Text, Value
 
@@ -14,8 +15,6 @@ _ATANH = tuple(2 / (2 * n + 1) for n in range(12))
 def _parts(number: float, count: int) -> list[float]:
     """`number` (to some hundred bits) as a sum of doubles whose products with small integers are
     exact."""
-    from fractions import Fraction
-
     exact = {
         pi: Fraction(884279719003555, 281474976710656) + Fraction(1.2246467991473532e-16)
         + Fraction(-2.9947698097183397e-33),
@@ -23,17 +22,11 @@ def _parts(number: float, count: int) -> list[float]:
     }[number]  # fmt: skip
     parts = []
     for _ in range(count - 1):
-        scale = 2.0 ** (29 - _exponent(float(exact)))
+        scale = 2.0 ** (29 - frexp(abs(float(exact)))[1])
         head = round(exact * Fraction(scale)) / scale
         parts.append(head)
         exact -= Fraction(head)
     return [*parts, float(exact)]
-
-
-def _exponent(number: float) -> int:
-    from math import frexp
-
-    return frexp(abs(number))[1]
 
 
 _PI, _LN2 = _parts(pi, 3), _parts(log(2), 2)

@@ -1,7 +1,7 @@
 """`run`: one lane's loop, written as JAX; batched by `vmap` it runs as vector code."""
 
 from collections.abc import Callable
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from contextvars import ContextVar
 from typing import Any, NamedTuple
 
@@ -11,6 +11,7 @@ import jax.tree_util as jtu
 from jax.core import eval_jaxpr
 from jax.extend.core import ClosedJaxpr
 
+from .context import within
 from .primitive import lanes_p
 from .program import Program
 
@@ -30,19 +31,14 @@ class Emitted(NamedTuple):
     """The row, a pytree."""
 
 
-@contextmanager
-def road(name: str):
+def road(name: str) -> AbstractContextManager:
     """Trace lanes for `"xla"` within this context, or for what suits the machine (`"auto"`).
 
     What is compiled already keeps its road.
     """
     if name not in ROADS:
         raise ValueError(f"Argument `name` must be one of {ROADS}, but got {name!r}.")
-    token = _road.set(name)
-    try:
-        yield
-    finally:
-        _road.reset(token)
+    return within(_road, name)
 
 
 def current_road() -> str:

@@ -8,12 +8,13 @@ import threading
 import weakref
 from collections import OrderedDict
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from contextvars import ContextVar
 from typing import Any
 
 import numpy as np
 
+from .context import within
 from .kernel import kernel_text
 from .program import Program
 from .vector import Unsupported, check
@@ -24,29 +25,15 @@ _threads: ContextVar[int | None] = ContextVar("threads", default=None)
 _cpu: ContextVar[str | None] = ContextVar("cpu", default=None)
 
 
-class Interrupted(RuntimeError):
-    """A call that was ended from outside before its lanes were done."""
-
-
-@contextmanager
-def threads(number: int):
+def threads(number: int) -> AbstractContextManager:
     """Run lanes on so many threads within this context (default: the cores of this process)."""
-    token = _threads.set(number)
-    try:
-        yield
-    finally:
-        _threads.reset(token)
+    return within(_threads, number)
 
 
-@contextmanager
-def processor(name: str):
+def processor(name: str) -> AbstractContextManager:
     """Write machine code for this processor (in LLVM's words, such as `"x86-64-v3"`) within this
     context; it must be one that this one can stand in for."""
-    token = _cpu.set(name)
-    try:
-        yield
-    finally:
-        _cpu.reset(token)
+    return within(_cpu, name)
 
 
 def thread_count() -> int:
@@ -87,7 +74,8 @@ def _register_bits(cpu: str | None) -> int:
 class Kernel:
     """Machine code of a program. It lives as long as this object."""
 
-    def __init__(self, text: str, cpu: str | None):
+    def __init__(self, text: str, cpu: str | None, width: int):
+        self.key, self.width = key_of(text, cpu), width
         llvm = _llvm()
         target = llvm.Target.from_default_triple()
         if cpu is None:
@@ -112,9 +100,6 @@ class Kernel:
         self._call = ctypes.CFUNCTYPE(
             None, pointer, pointer, pointer, ctypes.c_int64, pointer, pointer
         )(address)
-        # The first half of a digest of the text: a name that the same program has in any process.
-        self.key = key_of(text)
-        self.width = 0
 
     def run(self, inputs: list[int], strides: list[int], outputs: list[int], lanes: int) -> None:
         """All lanes, from and to the arrays at these addresses.
@@ -150,9 +135,10 @@ def _pool(number: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(number, thread_name_prefix="lanes")
 
 
-def key_of(text: str) -> int:
-    """A name of a program's text, the same in every process."""
-    return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=7).digest(), "little")
+def key_of(text: str, cpu: str | None) -> int:
+    """A name of a program's text for a processor, the same in every process."""
+    digest = hashlib.blake2b((text + (cpu or "")).encode(), digest_size=7).digest()
+    return int.from_bytes(digest, "little")
 
 
 _living: "weakref.WeakValueDictionary[int, Kernel]" = weakref.WeakValueDictionary()
@@ -174,15 +160,14 @@ def kernel_of(program: Program) -> Kernel:
     # Two registers' worth where they are narrow, to hide the arithmetic's latency.
     width = max(4, bits // (64 if wide else 32))
     text = kernel_text(program, width, bits)
-    key = key_of(text + (cpu or ""))
+    key = key_of(text, cpu)
     with _lock:
         kernel = _living.get(key)
         if kernel is None:
             try:
-                kernel = Kernel(text, cpu)
+                kernel = Kernel(text, cpu, width)
             except RuntimeError as error:
                 raise Unsupported(f"LLVM: {error}") from None
-            kernel.key, kernel.width = key, width
             _living[key] = kernel
         _recent[key] = kernel
         _recent.move_to_end(key)

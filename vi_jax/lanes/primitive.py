@@ -26,17 +26,9 @@ lanes_p = Primitive("lanes")
 lanes_p.multiple_results = True
 
 
-def _batch(program: Program, shapes: list[tuple[int, ...]]) -> tuple[int, ...]:
-    """The axes that operands have beyond those of one lane."""
-    for aval, shape in zip(program.in_avals, shapes, strict=True):
-        if len(shape) > aval.ndim:
-            return shape[: len(shape) - aval.ndim]
-    return ()
-
-
 @lanes_p.def_abstract_eval
 def _(*args, program: Program, road: str):
-    batch = _batch(program, [a.shape for a in args])
+    batch = program.batch([a.shape for a in args])
     rows = [(*batch, program.rows, *a.shape) for a in program.row_avals]
     outs = [(*batch, *a.shape) for a in program.out_avals]
     avals = [*program.out_avals, *program.row_avals]
@@ -56,14 +48,14 @@ def _batched(args, dims, *, program: Program, road: str):
     args = [jnp.asarray(x) for x in args]
     size = next(x.shape[d] for x, d in zip(args, dims, strict=True) if d is not None)
     many = tuple(d is not None for d in dims)
-    slopes = program.slopes or (False,) * len(many)
-    if all(s or not m for s, m in zip(slopes, many, strict=True)) and 1 < size <= _DIRECTIONS:
-        return _directions(args, dims, many, size, program, road)
     shapes = [
         x.shape if d is None else x.shape[:d] + x.shape[d + 1 :]
         for x, d in zip(args, dims, strict=True)
     ]
-    inner = _batch(program, shapes)
+    inner = program.batch(shapes)
+    slopes = program.slopes or (False,) * len(many)
+    if all(s or not m for s, m in zip(slopes, many, strict=True)) and 1 < size <= _DIRECTIONS:
+        return _directions(args, dims, inner, many, size, program, road)
     moved = []
     for x, d, shape, aval in zip(args, dims, shapes, program.in_avals, strict=True):
         if d is None and len(shape) == aval.ndim:
@@ -82,21 +74,17 @@ def _batched(args, dims, *, program: Program, road: str):
     ]
 
 
-def _directions(args, dims, many, size: int, program: Program, road: str):
+def _directions(args, dims, inner: tuple, many, size: int, program: Program, road: str):
     """Tangents in several directions go along with one motion."""
     wide, there = widened(program, many, size)
-    inner = len(_batch(program, [
-        x.shape if d is None else x.shape[:d] + x.shape[d + 1 :]
-        for x, d in zip(args, dims, strict=True)
-    ]))  # fmt: skip
-    moved = []
+    axes, moved = len(inner), []
     for x, d, aval in zip(args, dims, program.in_avals, strict=True):
         # Behind the axes of the lanes, before those of the number itself.
-        own = 0 if d is None or x.ndim - 1 == aval.ndim else inner
+        own = 0 if d is None or x.ndim - 1 == aval.ndim else axes
         moved.append(x if d is None else jnp.moveaxis(x, d, own))
     out = lanes_p.bind(*moved, program=wide, road=road)
-    places = [inner if w else None for w in there.outs]
-    places += [inner + 1 if w else None for w in there.rows]
+    places = [axes if w else None for w in there.outs]
+    places += [axes + 1 if w else None for w in there.rows]
     return out, places
 
 
@@ -139,29 +127,26 @@ ad.primitive_jvps[lanes_p] = _jvp
 ad.primitive_transposes[lanes_p] = _transposed
 
 
-def _on_xla(*args, program: Program, road: str):
-    return xla.run(program, *args)
+_on_xla = mlir.lower_fun(
+    lambda *args, program, road: xla.run(program, *args), multiple_results=True
+)
 
 
 def _lowered(ctx, *args, program: Program, road: str):
     if road == "xla":
-        return mlir.lower_fun(_on_xla, multiple_results=True)(
-            ctx, *args, program=program, road=road
-        )
+        return _on_xla(ctx, *args, program=program, road=road)
     try:
         kernel = kernel_of(program)
     except Unsupported as reason:
         _tell(str(reason))
-        return mlir.lower_fun(_on_xla, multiple_results=True)(
-            ctx, *args, program=program, road=road
-        )
+        return _on_xla(ctx, *args, program=program, road=road)
     ctx.module_context.add_keepalive(kernel)
     call = functools.partial(_called, kernel, program, ctx.avals_out)
     return mlir.lower_fun(call, multiple_results=True)(ctx, *args)
 
 
 def _called(kernel, program: Program, avals, *args):
-    batch = _batch(program, [x.shape for x in args])
+    batch = program.batch([x.shape for x in args])
     strides = [
         aval.size if x.ndim > aval.ndim else 0
         for x, aval in zip(args, program.in_avals, strict=True)
@@ -179,4 +164,4 @@ def _tell(reason: str) -> None:
 
 
 mlir.register_lowering(lanes_p, _lowered, platform="cpu")
-mlir.register_lowering(lanes_p, mlir.lower_fun(_on_xla, multiple_results=True))
+mlir.register_lowering(lanes_p, _on_xla)

@@ -48,6 +48,13 @@ class Program(eqx.Module):
         """Of one lane's results."""
         return self.end.out_avals
 
+    def batch(self, shapes: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
+        """The axes that inputs of these shapes have beyond those of one lane."""
+        for aval, shape in zip(self.in_avals, shapes, strict=True):
+            if len(shape) > aval.ndim:
+                return shape[: len(shape) - aval.ndim]
+        return ()
+
     @property
     def row_avals(self) -> list[Any]:
         """Of a row."""

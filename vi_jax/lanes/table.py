@@ -5,6 +5,7 @@ transposes, concatenations) is done while the code is written and costs nothing.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -29,22 +30,15 @@ def _is_unsigned(dtype: Any) -> bool:
     return np.dtype(dtype).kind in "ub"
 
 
-def elementwise(*names: str) -> Callable[[Rule], Rule]:
+def _into(table: dict[str, Rule], *names: str) -> Callable[[Rule], Rule]:
     def put(rule: Rule) -> Rule:
-        for name in names:
-            ELEMENTWISE[name] = rule
+        table.update(dict.fromkeys(names, rule))
         return rule
 
     return put
 
 
-def structural(*names: str) -> Callable[[Rule], Rule]:
-    def put(rule: Rule) -> Rule:
-        for name in names:
-            STRUCTURAL[name] = rule
-        return rule
-
-    return put
+elementwise, structural = partial(_into, ELEMENTWISE), partial(_into, STRUCTURAL)
 
 
 # --- arithmetic

@@ -19,10 +19,7 @@ _PLACES = 256
 
 def run(program: Program, *args: Any) -> list[Any]:
     """Results and rows of a batch of lanes: what the primitive gives."""
-    batch: tuple[int, ...] = ()
-    for x, aval in zip(args, program.in_avals, strict=True):
-        if x.ndim > aval.ndim:
-            batch = x.shape[: x.ndim - aval.ndim]
+    batch = program.batch([x.shape for x in args])
     lanes = math.prod(batch)
     if lanes == 0:
         avals = [(a, a.shape) for a in program.out_avals]

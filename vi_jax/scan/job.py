@@ -48,7 +48,6 @@ class Job(eqx.Module):
     settle: Array
     max_impacts: int = eqx.field(static=True)
     max_steps: int | None = eqx.field(static=True)
-    places: int = eqx.field(static=True)
     rests: bool = eqx.field(static=True, default=True)
     """Whether the body may come to rest on a stop."""
 
@@ -122,7 +121,7 @@ class Job(eqx.Module):
 
         run = simulate_pool(
             lane_of, values, self.cycles,
-            wanted=wanted, places=self.places, method=self.method, settle=self.settle,
+            wanted=wanted, method=self.method, settle=self.settle,
             max_impacts=self.max_impacts, max_steps=self.max_steps, rests=self.rests,
         )  # fmt: skip
 
@@ -229,7 +228,6 @@ def make_job(
         settle=jnp.asarray(settle),
         max_impacts=count("max_impacts", max_impacts),
         max_steps=None if max_steps is None else count("max_steps", max_steps, least=1),
-        places=PLACES,
     )
 
 
