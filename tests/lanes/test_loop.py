@@ -250,6 +250,27 @@ def sorting(x, *, road=None):
     return lanes.run(begin, step, lambda x, carry: carry, x, rows=0, road=road)[0]
 
 
+def test_shards_of_a_batch_take_the_same_road():
+    """`shard_map` marks what lanes share, zeros of derivatives included; that is no computation."""
+    mesh = jax.sharding.Mesh(np.asarray(jax.devices()[:1]), ("lanes",))
+    split = jax.sharding.PartitionSpec("lanes")
+    heights = jnp.linspace(0.5, 2.0, 13)
+
+    def both(height):
+        return jax.jvp(lambda x: fall(x, 9.81)[0], (height,), (jnp.ones_like(height),))
+
+    def sharded(x):
+        return jax.shard_map(
+            jax.vmap(both), mesh=mesh, in_specs=split, out_specs=split, check_vma=False
+        )(x)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = jax.jit(sharded)(heights)
+    for a, b in zip(found, jax.vmap(both)(heights), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
 def test_what_has_no_vector_form_takes_the_other_road_and_says_so():
     from vi_jax.lanes import primitive
 

@@ -102,7 +102,8 @@ ELEMENTWISE["div"] = lambda t, p, d, a, b: div(t, a, b, unsigned=_is_unsigned(d[
 ELEMENTWISE["neg"] = lambda t, p, d, a: neg(t, a)
 for _name in ("eq", "ne", "lt", "le", "gt", "ge"):
     ELEMENTWISE[_name] = lambda t, p, d, a, b, how=_name: compare(t, how, a, b, _is_unsigned(d[0]))
-for _name in ("stop_gradient", "copy", "copy_p", "name", "pvary", "reduce_precision", "pin"):
+_SAME = "stop_gradient copy copy_p name pvary reshard reduce_precision pin"
+for _name in _SAME.split():
     ELEMENTWISE[_name] = lambda t, p, d, a: a
 ELEMENTWISE["square"] = lambda t, p, d, a: mul(t, a, a)
 ELEMENTWISE["sqrt"] = lambda t, p, d, a: t.intrinsic("sqrt", a)

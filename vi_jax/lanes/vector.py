@@ -34,13 +34,14 @@ def _inner(value: Any) -> tuple[Jaxpr, list]:
 
 def check(jaxpr: Jaxpr) -> None:
     """**Raises:** `Unsupported` naming the first primitive, or type, that has no vector form."""
-    for var in (*jaxpr.invars, *jaxpr.constvars, *(v for e in jaxpr.eqns for v in e.outvars)):
+    needed = _needed(jaxpr)
+    for var in (*jaxpr.invars, *jaxpr.constvars, *(v for e in needed for v in e.outvars)):
         dtype = getattr(var.aval, "dtype", None)
         try:
             kind_of(dtype)
         except (KeyError, TypeError):
             raise Unsupported(f"a value of type {dtype}") from None
-    for eqn in jaxpr.eqns:
+    for eqn in needed:
         name = eqn.primitive.name
         if name in _CALLS:
             check(_inner(eqn.params[_CALLS[name]])[0])

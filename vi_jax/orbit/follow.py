@@ -13,6 +13,9 @@ from .shooting import Shooting
 from .solve import advance, located, observe, orbit_of, state_at
 from .special import CROSSING, DOUBLING, FOLD, GRAZING, TORUS, SpecialPoint
 
+# What lies before the place where a branch springs is looked for on so much of the way there.
+_SHORT = 0.999
+
 
 class Follower:
     """Looks at each step of a walk: locates what happens in it and says when to end."""
@@ -109,10 +112,22 @@ class Follower:
         if apart.size and np.dot(apart, self._halves(last)) < 0:
             at = self._where(here, last, lambda step: float(np.dot(apart, self._halves(step))))
             if at is not None:
+                # Beyond it the tests have changed twice: what lies before it shows from short of it.
+                length = float(np.dot(here.tangent, (at.x - here.x) / self.scale))
+                found = self._changes(here, self.advance(here.x, here.tangent, _SHORT * length))
                 at = self._origin(at)
+                self.between[id(at)] = found
                 told = "the branch springs from a motion of half the period"
                 self.special.append(self._point(DOUBLING, at, told))
                 return at
+        self.between[id(last)] = self._changes(here, last)
+        return None
+
+    def _changes(self, here: Step, last: Step) -> list[Step]:
+        """Record the bifurcations between two points, by the tests that change their signs.
+
+        **Returns:** where they are, in their order.
+        """
         before, after = _tests(here), _tests(last)
         changed = {kind for kind in before if before[kind] * after[kind] < 0}
         if FOLD in changed:
@@ -140,8 +155,7 @@ class Follower:
         found.sort(key=lambda f: f[0])
         for _, kind, at, told in found:
             self.special.append(self._point(kind, at, told))
-        self.between[id(last)] = [at for _, _, at, _ in found]
-        return None
+        return [at for _, _, at, _ in found]
 
     def path(self, steps: list[Step]) -> list[Step]:
         """The steps of a walk with the bifurcations located between them."""

@@ -8,7 +8,6 @@ the stop forbids, and is told so by the sign of V⁻ or of the clearance. (The s
 `hspo` of COCO.)
 """
 
-import dataclasses
 from math import ceil
 from typing import Any, NamedTuple
 
@@ -20,6 +19,7 @@ import jax.tree_util as jtu
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Complex, Float
 
+from .. import lanes
 from ..flow import AbstractMethod, FixedStep
 from ..flow.choice import MethodLike, chosen
 from ..flow.events import rates
@@ -139,34 +139,30 @@ class Shooting(eqx.Module):
         """State and elapsed time at the end of a flight, and clock and state along it."""
         h = (s1 - s0) / self.steps
 
-        def step(carry, i):
-            u, time = carry
-            s = s0 + i * h
-            return self._step(scene, s, s + h, u, time), (s, u)
+        def begin(inputs):
+            s0, _, u = inputs
+            zero = jnp.zeros_like(s0)
+            return (u, zero, zero), lanes.Emitted(True, True, (s0, u))
 
-        places = jnp.arange(self.steps, dtype=u.dtype)
-        (end, time), path = jax.lax.scan(step, (u, jnp.zeros_like(h)), places)
-        return end, time, path
+        def step(inputs, carry):
+            (s0, h, _), (u, time, i) = inputs, carry
+            s = s0 + i * h
+            u, time = self._step(scene, s, s + h, u, time)
+            i = i + 1
+            return (u, time, i), lanes.Emitted(i < self.steps, True, (s0 + i * h, u))
+
+        def end(inputs, carry):
+            return carry[0], carry[1]
+
+        (u, time), path = lanes.run(begin, step, end, (s0, h, u), rows=self.steps)
+        return u, time, path
 
     def _step(self, scene, s0, s1, u, time) -> tuple[Vector, Array]:
-        """One step of the method. Runge–Kutta stages stay a loop, as diffrax has them: written
-        out, as for the flat loop, their derivatives would compile for minutes."""
-        flow = self.flow
-        if not isinstance(flow, FixedStep):
-            new, _, _ = flow.step(scene, s0, s1, self.unravel(u), None)
-            return ravel_pytree(new)[0], time + (s1 - s0)
-
-        def field(s, y, args):
-            state = self.unravel(y[:-1])
-            pace = scene.pace(s, state)
-            rate = ravel_pytree(scene.field(s, state))[0]
-            return jnp.append(rate, jnp.ones_like(s) if pace is None else pace)
-
-        solver = dataclasses.replace(flow.solver.solver, scan_kind="lax")  # which jvp can pass
-        term, y0 = diffrax.ODETerm(field), jnp.append(u, time)
-        memory = solver.init(term, s0, s1, y0, None)
-        y1, *_ = solver.step(term, s0, s1, y0, None, memory, made_jump=True)
-        return y1[:-1], y1[-1]
+        """One step of the method."""
+        state = self.unravel(u)
+        paced = scene.pace(s0, state) is not None
+        new, after, _ = self.flow.step(scene, s0, s1, state, time if paced else None)
+        return ravel_pytree(new)[0], time + (s1 - s0) if after is None else after
 
     def residual(self, x: Vector) -> Vector:
         """What the flights from impact to impact lack; zero for a periodic motion."""
@@ -278,9 +274,14 @@ class Shooting(eqx.Module):
 
         v = jax.vmap(velocity)(states)
         # The end of the last step is the next impact: its velocity is that of a further step.
-        last, _ = self._step(scene, places[-1], places[-1] + h, states[-1], jnp.zeros_like(h))
+        last, _ = lanes.once(
+            lambda x: self._step(scene, *x),
+            (places[-1], places[-1] + h, states[-1], jnp.zeros_like(h)),
+        )
         v1 = jnp.concatenate([v[1:], velocity(last)[None]])
-        turns, height, place, v0 = jax.vmap(turn)(places, states, v, v1)
+        turns, height, place, v0 = jax.vmap(lambda *x: lanes.once(lambda x: turn(*x), x))(
+            places, states, v, v1
+        )
         low = jnp.min(jnp.where(turns, height, jnp.inf))
         high = jnp.max(jnp.where(turns, height, -jnp.inf))
         room, touch = jnp.full((), jnp.inf, h.dtype), jnp.zeros((), h.dtype)
