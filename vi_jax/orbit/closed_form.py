@@ -25,6 +25,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float
 
 from .._checks import count
+from .._programs import compiled
 from ..scene import CosineCrank, IdealDrive, Scene
 from .floquet import eigenvalues
 
@@ -106,7 +107,14 @@ def closed_form_orbits(scene: Scene, *, cycles: int = 1) -> ClosedFormOrbits:
             f"ratio, damping ratio, restitution and gap have shapes {shapes}."
         )
     section = 0.0 if scene.section_phase is None else scene.section_phase
-    return one_impact_orbits(*numbers, count("cycles", cycles, least=1), section)
+    dtype = jnp.result_type(float, *numbers)
+    arrays = (jnp.asarray(x, dtype) for x in (*numbers, section))
+    return _compiled_orbits(*arrays, n=count("cycles", cycles, least=1))
+
+
+@compiled
+def _compiled_orbits(zeta, xi, k, d, section, *, n: int) -> ClosedFormOrbits:
+    return one_impact_orbits(zeta, xi, k, d, n, section)
 
 
 def one_impact_orbits(
@@ -120,15 +128,13 @@ def one_impact_orbits(
     # Squarings of the flight over one grid step: over 1, 2, 4, … steps, and last over T. They
     # hold through resonance and critical damping, where sines and a steady response do not.
     doublings = (_POINTS * n - 1).bit_length()
-    flights = [_exponential(rates * (period / 2**doublings))]
-    for _ in range(doublings):
-        flights.append(_dot(flights[-1], flights[-1]))
-    v, phase, slack, resolved = _impacts(flights[-1], k, d, period)
+    whole, flights = _squared(_exponential(rates * (period / 2**doublings)), doublings)
+    v, phase, slack, resolved = _impacts(whole, k, d, period)
 
     # Absent motions go on as a harmless one, so that their derivatives cannot be NaN.
     exists = resolved & (v > 64 * jnp.finfo(dtype).eps * (1 + period) * (1 + jnp.abs(d)))
     v, phase = jnp.where(exists, v, 1.0), jnp.where(exists, phase, 1.0)
-    follow = jax.vmap(lambda v, phase: _follow(rates, flights[:-1], period, k, d, v, phase))
+    follow = jax.vmap(lambda v, phase: _follow(rates, flights, period, k, d, v, phase))
     y_min, y_max, clearance = follow(v, phase)
     turn = jnp.mod(section - phase, 2 * pi)
     on = jax.lax.stop_gradient((turn <= slack) | (turn >= 2 * pi - slack))
@@ -136,9 +142,9 @@ def one_impact_orbits(
     start = _after_impact(k, d, v, phase)
     carried = _exponential(rates * (turn / zeta)[:, None, None] / 2**doublings, doublings)
     there = _dot(carried, start[..., None])[..., 0]
-    nudge = jnp.where(on, _early(flights[-1], k, d, v, period), 0.0)
+    nudge = jnp.where(on, _early(whole, k, d, v, period), 0.0)
 
-    multipliers = _multipliers(flights[-1], xi, k, d, v, phase, period)
+    multipliers = _multipliers(whole, xi, k, d, v, phase, period)
     admissible = exists & (clearance >= 0)
 
     def known(x):
@@ -171,12 +177,21 @@ def _exponential(matrix: Float[Array, "... 4 4"], doublings: int = 0) -> Float[A
     Products only: the library's solver for batches of small systems can lock up two threads.
     """
     identity = jnp.eye(matrix.shape[-1], dtype=matrix.dtype)
-    small, total = matrix / 4, identity
-    for n in range(24, 0, -1):
-        total = identity + _dot(small, total) / n
-    for _ in range(2 + doublings):
-        total = _dot(total, total)
-    return total
+    small, first = matrix / 4, jnp.broadcast_to(identity, matrix.shape)
+    # Loops rather than written out, to be compiled sooner.
+    total, _ = jax.lax.scan(
+        lambda total, n: (identity + _dot(small, total) / n, None),
+        first,
+        jnp.arange(24, 0, -1, dtype=matrix.dtype),
+    )
+    return _squared(total, 2 + doublings)[0]
+
+
+def _squared(
+    matrix: Float[Array, "... n n"], times: int
+) -> tuple[Float[Array, "... n n"], Float[Array, "times ... n n"]]:
+    """matrix^(2^times), and the powers before it: 1, 2, 4, …"""
+    return jax.lax.scan(lambda m, _: (_dot(m, m), m), matrix, length=times)
 
 
 def _rates(zeta: Scalar, xi: Scalar) -> Float[Array, "4 4"]:
