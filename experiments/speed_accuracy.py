@@ -88,6 +88,11 @@ def adaptive(solver: str, tolerance: float, *, double: bool = True) -> Choice:
     return Choice(f"Adaptive {solver}{single}", f"{tolerance:.0e}", method, double)
 
 
+def series(order: int, tolerance: float) -> Choice:
+    """Power series, their steps by a tolerance."""
+    return Choice(f"Taylor {order}", f"{tolerance:.0e}", vi.Taylor(order, rtol=tolerance))
+
+
 EXACT = Choice("ExactFlight", "closed form", vi.ExactFlight())
 if QUICK:
     CARRIED = [fixed("Dopri8", 12), adaptive("Dopri8", 1e-9)]
@@ -101,6 +106,9 @@ else:
         *(adaptive("Tsit5", 10.0**-n) for n in (3, 5, 7, 9, 11)),
         *(adaptive("Dopri5", 10.0**-n) for n in (3, 6, 9)),
         *(adaptive("Bosh3", 10.0**-n) for n in (3, 5, 7)),
+        *(series(12, 10.0**-n) for n in (5, 7, 9)),
+        *(series(16, 10.0**-n) for n in (7, 9, 11)),
+        *(series(20, 10.0**-n) for n in (9, 11, 12, 13, 14)),
         fixed("Dopri8", 8, double=False),
         fixed("Tsit5", 16, double=False),
         adaptive("Dopri8", 1e-5, double=False),
@@ -111,6 +119,8 @@ SCANNED = {
     *(fixed("Dopri8", n).name for n in (5, 6, 12, 24)),
     fixed("Tsit5", 16).name,
     fixed("Dopri8", 8, double=False).name,
+    series(16, 1e-9).name,
+    series(20, 1e-13).name,
     *(choice.name for choice in CARRIED if choice.method.adaptive and choice.double),
 }
 TRUTH = {"ideal": EXACT, "motor": fixed("Dopri8", 64)}
@@ -570,6 +580,8 @@ else:
     FEWER = [
         *(fixed("Dopri8", n) for n in (6, 12, 24, 48)),
         *(adaptive("Dopri8", t) for t in (1e-6, 1e-9, 1e-12)),
+        series(16, 1e-9),
+        series(20, 1e-13),
     ]
 results = {drive: rows_of(drive) for drive in DRIVES}
 
@@ -750,6 +762,9 @@ STYLE = {
     "Adaptive Tsit5": ("tab:red", "o"),
     "Adaptive Dopri5": ("tab:green", "o"),
     "Adaptive Bosh3": ("tab:purple", "o"),
+    "Taylor 12": ("gold", "^"),
+    "Taylor 16": ("tab:orange", "^"),
+    "Taylor 20": ("tab:brown", "^"),
 }
 figure = Figure(figsize=(11, 8), layout="constrained")
 panels = figure.subplots(2, len(DRIVES), squeeze=False)
@@ -771,7 +786,7 @@ for top, bottom, drive in zip(*panels, DRIVES, strict=True):
         time_ms = [1e3 * row.seconds for row in mine]
         top.loglog([max(row.errors["late95"], 1e-16) for row in mine], time_ms, **look)
         grid = [max(row.wrong, 0.3 / about["firm"]) for row in mine]  # NaN where not scanned
-        bottom.loglog(grid, time_ms, **look)
+        bottom.loglog(grid, time_ms, **{**look, "ls": ""})
     top.set(
         title=f"{drive} drive",
         xlabel=f"error of the state after {MANY:,} cycles, 95 of 100 lanes (a, a ω, ω)",
@@ -783,7 +798,7 @@ for top, bottom, drive in zip(*panels, DRIVES, strict=True):
     )
     for ax in (top, bottom):
         ax.grid(alpha=0.3)
-panels[0, -1].legend(frameon=False, fontsize=7)
+panels[0, 0].legend(frameon=False, fontsize=7)
 numbers = {
     f"{row.choice.name}: median error of the state, 20 cycles, ideal drive": row.errors["state"]
     for row in results["ideal"][0]

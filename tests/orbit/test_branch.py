@@ -326,6 +326,20 @@ def test_branches_do_not_depend_on_where_they_begin(short, long, restitution):
         assert mine == pytest.approx(its, abs=1e-8)
 
 
+@pytest.mark.parametrize("max_step", [0.015, 0.2])
+def test_special_points_do_not_depend_on_the_step(long, restitution, max_step):
+    """With k = 0.8 the doubled branch turns back 1e-5 (in ζ) from where it springs."""
+    doubled = long[0]
+    again = vi.continue_orbit(
+        doubled.orbit(1), parameter=ZETA, bounds=(0.5, 1.9), max_step=max_step
+    )
+    kinds = {"grazing", "fold", "period-doubling"}
+    assert {p.kind for p in again.special} == kinds and len(again.special) == 3
+    for mine in again.special:
+        (its,) = (p for p in doubled.special if p.kind == mine.kind)
+        assert mine.parameter == pytest.approx(its.parameter, abs=1e-8)
+
+
 def test_a_doubled_branch_springs_where_the_other_doubles(short, long):
     doubling = next(p for p in short.special if p.kind == "period-doubling")
     springs = next(p for p in long[0].special if "springs" in p.detail)

@@ -200,7 +200,9 @@ def test_damping_at_which_the_2pi_motion_becomes_stable():
 def test_multiple_shooting_where_one_arc_cannot():
     """200 cycles of the unstable 2π motion amplify rounding by 1.166^200 = 2e13."""
     closed = vi.closed_form_orbits(UNDAMPED)
-    guess = UNDAMPED.start(Y=closed.Y[0] + 1e-13, V=closed.V[0])
+    # Right to rounding: from 1e-13 beside it the last arcs begin on another motion, and whether
+    # the search comes back from there is a matter of the last digits.
+    guess = vi.find_orbit(UNDAMPED, near(UNDAMPED, 1)).state
     one = vi.find_orbit(UNDAMPED, guess, cycles=200)
     many = vi.find_orbit(UNDAMPED, guess, cycles=200, method=vi.Newton(arcs=20))
     assert float(many.residual) < 1e-12 and int(many.cycles) == 1

@@ -81,14 +81,14 @@ class Kernel:
         if cpu is None:
             features = llvm.get_host_cpu_features().flatten()
             machine = target.create_target_machine(
-                cpu=llvm.get_host_cpu_name(), features=features, opt=2
+                cpu=llvm.get_host_cpu_name(), features=features, opt=1
             )
         else:
-            machine = target.create_target_machine(cpu=cpu, features="", opt=2)
+            machine = target.create_target_machine(cpu=cpu, features="", opt=1)
         module = llvm.parse_assembly(text)
         module.triple = llvm.get_default_triple()
         module.data_layout = str(machine.target_data)
-        options = llvm.create_pipeline_tuning_options(speed_level=2)
+        options = llvm.create_pipeline_tuning_options(speed_level=1)
         options.loop_vectorization = options.slp_vectorization = False
         options.loop_unrolling = False
         builder = llvm.create_pass_builder(machine, options)

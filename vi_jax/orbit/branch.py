@@ -173,10 +173,12 @@ def continue_orbit(
     problem, x = problem_of(orbit, parameter, (low, high), flow)
     scale = np.ones(problem.size)
     scale[-1] = 0.5 * (high - low)
-    # Across the branch, not at a fixed parameter: the orbit may lie at a fold.
-    start = advance(problem, x, tangent_at(problem, x, scale), scale, 0.0)
-    moved = float(np.max(np.abs(start.x - x) / scale))
-    if not bool(start.good) or moved > _SAME:
+    # At a fixed parameter, unless the orbit lies at a fold: then across the branch, which takes a
+    # program of its own.
+    start, moved = _refined(problem, x, np.eye(problem.size)[-1], scale)
+    if moved > _SAME:
+        start, moved = _refined(problem, x, tangent_at(problem, x, scale), scale)
+    if moved > _SAME:
         raise ValueError(
             "Argument `orbit` could not be refined from impact to impact (last correction "
             f"{max(moved, float(start.size)):.2g}): branches cross there, it is no orbit of this "
@@ -195,6 +197,12 @@ def continue_orbit(
     special = [*reversed(back.special), *ahead.special]
     steps = [*reversed(backward_steps), *ahead.path(forward.steps)]
     return _branch(problem, parameter, steps, special, ends, scale)
+
+
+def _refined(problem: Shooting, x, tangent, scale) -> tuple[Step, float]:
+    """The solution in the plane across a tangent at `x`, and how far (scaled) it is from there."""
+    start = advance(problem, x, tangent, scale, 0.0)
+    return start, float(np.max(np.abs(start.x - x) / scale)) if bool(start.good) else np.inf
 
 
 def _branch(problem, name, steps, special, ends, scale) -> Branch:

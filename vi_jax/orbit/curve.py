@@ -54,21 +54,20 @@ def corrected(
         return missing, missing
 
     def newton(carry):
-        y, _, count = carry
+        y, before, count, *_ = carry
         jacobian, missing = jax.jacfwd(equations, has_aux=True)(y)
-        move = jnp.linalg.solve(jacobian, missing)
-        return y - move, jnp.max(jnp.abs(move)), count + 1
+        both = jnp.stack([missing, jnp.zeros_like(y).at[-1].set(1.0)], axis=-1)
+        move, along = jnp.linalg.solve(jacobian, both).T
+        return y - move, jnp.max(jnp.abs(move)), count + 1, along, before <= tolerance
 
     def going(carry):
-        _, size, count = carry
-        return (size > tolerance) & (size < 10.0) & (count < 12)
+        _, size, count, _, done = carry
+        return ~done & (size < 10.0) & (count < 13)
 
     y0 = x / scale + length * tangent
-    start = (y0, jnp.ones((), x.dtype), jnp.zeros((), jnp.int32))
-    y, size, count = jax.lax.while_loop(going, newton, start)
-    jacobian, _ = jax.jacfwd(equations, has_aux=True)(y)
-    along = jnp.zeros_like(y).at[-1].set(1.0)
-    along = jnp.linalg.solve(jacobian, along)
+    start = (y0, jnp.ones((), x.dtype), jnp.zeros((), jnp.int32), y0, jnp.zeros((), bool))
+    # One correction more than it takes: the tangent is then that of the solution.
+    y, size, count, along, _ = jax.lax.while_loop(going, newton, start)
     along = along / jnp.linalg.norm(along)
     # Rounding may keep the last correction above the tolerance where the curve is steep.
     good = (size <= 1e3 * tolerance) & jnp.all(jnp.isfinite(along))
@@ -130,7 +129,7 @@ def walk(
                 steps.append(last)
             return Walk(steps, reason)
         steps.append(new)
-        if turn > 0.99 and int(new.iterations) <= 5:
+        if turn > 0.99 and int(new.iterations) <= 6:
             length = min(1.4 * length, max_step)
         elif turn < 0.97:
             length *= 0.7

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from .._checks import concrete, count, flag
 from .._programs import compiled
-from ..flow import simulate
+from ..flow import Run, simulate
 from ..flow.choice import MethodLike
 from ..scene import AbstractScene, Scene
 from .cycle_map import CycleMap, adopted, cycle_map
@@ -120,7 +120,16 @@ def _find(the_map: CycleMap, guess: Any, method: AbstractSearch, impact_log: int
     return jax.lax.map(one, guess, batch_size=min(_BATCH, first.shape[0]))
 
 
-def _moved(the_map: CycleMap, guess: Any) -> tuple[CycleMap, Any, Int[Array, ""]]:
+def _run(the_map: CycleMap, state: Any, impact_log: int) -> Run:
+    """The motion with its impacts: one program for the look at the guess and for that at the orbit,
+    where they are as long."""
+    return simulate(
+        the_map.scene, state, the_map.cycles, method=the_map.flow, samples=_PLACES,
+        impact_log=impact_log, rests=the_map.rests,
+    )  # fmt: skip
+
+
+def _moved(the_map: CycleMap, guess: Any, impact_log: int) -> tuple[CycleMap, Any, Int[Array, ""]]:
     """Map, guess and their place (in eighths of a cycle) on the section to search on.
 
     The map jumps where an impact falls on its section, and no search gets across; so it is done
@@ -129,10 +138,7 @@ def _moved(the_map: CycleMap, guess: Any) -> tuple[CycleMap, Any, Int[Array, ""]
     scene = the_map.scene
     if not isinstance(scene, Scene):
         return the_map, guess, jnp.zeros((), jnp.int32)
-    run = simulate(
-        scene, guess, the_map.cycles, method=the_map.flow, samples=_PLACES, impact_log=8,
-        record="sections", rests=the_map.rests,
-    )  # fmt: skip
+    run = _run(the_map, guess, impact_log)
     assert run.samples is not None and run.impact_log is not None
     step = 2 * pi / _PLACES
     phase = run.impact_log.phase.ravel() - step * jnp.arange(_PLACES)[:, None]
@@ -231,21 +237,19 @@ def _follow(arc: CycleMap, state: Any, impact_log: int) -> _Seen:
 
         def states(x):
             run = simulate(
-                arc.scene, unravel(x), arc.cycles, method=arc.flow, samples=_PLACES,
-                record="sections", rests=arc.rests,
+                arc.scene, unravel(x), arc.cycles, method=arc.flow, record="sections",
+                rests=arc.rests,
             )  # fmt: skip
-            assert run.samples is not None
-            states = jnp.stack(jtu.tree_leaves(run.samples.state), axis=-1)[1:]
-            states = states.reshape(arc.cycles, _PLACES, -1)
-            return states[:, -1], states
+            return jnp.stack(jtu.tree_leaves(run.sections), axis=-1)[1:]
 
         # Apart from the motion: a program with second derivatives should hold no more than it must.
-        jacobians, places = jax.jacfwd(states, has_aux=True)(x)
-        run = simulate(
-            arc.scene, state, arc.cycles, method=arc.flow, impact_log=impact_log, rests=arc.rests
-        )
+        jacobians = jax.jacfwd(states)(x)
+        run = _run(arc, state, impact_log)
         log = run.impact_log
-        assert log is not None and run.y_min is not None and run.y_max is not None
+        assert run.samples is not None and log is not None
+        assert run.y_min is not None and run.y_max is not None
+        places = jnp.stack(jtu.tree_leaves(run.samples.state), axis=-1)[1:]
+        places = places.reshape(arc.cycles, _PLACES, -1)
         assert run.clearance is not None and run.duration is not None
         return _Seen(
             places, jacobians, run.y_min, run.y_max, run.clearance, run.duration,
@@ -258,7 +262,7 @@ def _follow(arc: CycleMap, state: Any, impact_log: int) -> _Seen:
 def _judged(the_map: CycleMap, guess: Any, method: AbstractSearch, impact_log: int) -> Orbit:
     """The orbit found from one guess, with all that is said about it."""
     scene, arcs, cycles = the_map.scene, method.arcs, the_map.cycles
-    moved, start, place = _moved(the_map, jax.lax.stop_gradient(guess))
+    moved, start, place = _moved(the_map, jax.lax.stop_gradient(guess), impact_log)
     arc = dataclasses.replace(moved, cycles=cycles // arcs)
     root = _root(arc, start, method)
     x, unravel = root.arcs, ravel_pytree(guess)[1]

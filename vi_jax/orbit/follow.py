@@ -16,6 +16,9 @@ from .special import CROSSING, DOUBLING, FOLD, GRAZING, TORUS, SpecialPoint
 # What lies before the place where a branch springs is looked for on so much of the way there.
 _SHORT = 0.999
 
+# Halves of a period that differ by less than this are those of a motion of half the period.
+_ALIKE = 1e-3
+
 
 class Follower:
     """Looks at each step of a walk: locates what happens in it and says when to end."""
@@ -112,7 +115,7 @@ class Follower:
         if apart.size and np.dot(apart, self._halves(last)) < 0:
             at = self._where(here, last, lambda step: float(np.dot(apart, self._halves(step))))
             if at is not None:
-                # Beyond it the tests have changed twice: what lies before it shows from short of it.
+                # Beyond it the tests have changed twice: what lies before it shows short of it.
                 length = float(np.dot(here.tangent, (at.x - here.x) / self.scale))
                 found = self._changes(here, self.advance(here.x, here.tangent, _SHORT * length))
                 at = self._origin(at)
@@ -130,6 +133,7 @@ class Follower:
         """
         before, after = _tests(here), _tests(last)
         changed = {kind for kind in before if before[kind] * after[kind] < 0}
+        both = {FOLD, CROSSING} <= changed
         if FOLD in changed:
             changed.discard(CROSSING)
         found = []
@@ -137,6 +141,11 @@ class Follower:
             at = self._where(here, last, lambda step, kind=kind: _tests(step)[kind])
             if at is None:
                 continue
+            if kind == FOLD and not both and not self._turns_back(here, at, last):
+                continue  # rounding: the tangent is ill-defined close to where branches cross
+            apart = self._halves(at)
+            if kind in (FOLD, CROSSING) and apart.size and np.linalg.norm(apart) < _ALIKE:
+                continue  # where the branch springs both are zero; that is seen by the halves
             values = at.seen.multipliers
             told = {
                 FOLD: "a multiplier passes 1 and the branch turns back",
@@ -156,6 +165,11 @@ class Follower:
         for _, kind, at, told in found:
             self.special.append(self._point(kind, at, told))
         return [at for _, _, at, _ in found]
+
+    def _turns_back(self, here: Step, at: Step, last: Step) -> bool:
+        """Whether the parameter there lies beyond that at both others, by more than rounding."""
+        sides = [(float(at.x[-1]) - float(step.x[-1])) / self.scale[-1] for step in (here, last)]
+        return bool(sides[0] * sides[1] > 0 and min(map(abs, sides)) > 1e-12)
 
     def path(self, steps: list[Step]) -> list[Step]:
         """The steps of a walk with the bifurcations located between them."""
