@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING
 
+from . import machines as machines
 from .flow import RESULTS as RESULTS
 from .flow import AbstractMethod as AbstractMethod
 from .flow import Adaptive as Adaptive

@@ -30,9 +30,10 @@ def preset(scene: AbstractScene | None, name: str = "standard") -> AbstractMetho
 
     - `"draft"`: 6 steps of Dopri8 a cycle, error 1e-6, half the time of the next;
     - `"standard"`: 12 steps of Dopri8, error 4e-9 (the median lane's: 4e-10);
-    - `"reference"`: 48 steps of Dopri8, error 6e-14, four times the time of the one before.
+    - `"reference"`: 48 steps of Dopri8, error 6e-14, three times the time of the one before.
+      `Taylor(20, rtol=1e-13)` is as exact in two thirds of that, for fields that have a series.
 
-    No regime of 1,024 settled motions came out wrong under the first two.
+    Of 1,024 settled motions none got a wrong regime under the first, one under the second.
 
     Shorter steps where damping is strong (ξ > 0.5) or the motor (τ0 > 1) keep the errors small
     there too. A scene of your own, whose time scales are not known, gets `Adaptive` with the

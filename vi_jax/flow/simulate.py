@@ -143,14 +143,8 @@ def planned(
         max_steps = count("max_steps", max_steps, least=1)
     one_of("record", record, ("motion", "sections"))
     if clock is not None:
-        if not isinstance(scene, Scene):
-            raise ValueError(
-                "Argument `clock` must be left out for a scene of your own, which has its own "
-                f"clock, but got {clock!r}."
-            )
         scene = scene.in_clock(clock)
-    if isinstance(scene, Scene):
-        start = scene.adopt(start)
+    start = scene.adopt(start)
     method.check(scene)
     if isinstance(scene, Scene):
         _check_scalars(scene=scene, start=start)

@@ -13,7 +13,7 @@ import numpy as np
 from jax.core import Tracer
 
 from .._checks import count, one_of, require
-from ..scene import AbstractScene, Scene
+from ..scene import AbstractScene
 from .choice import preset
 from .exact import ExactFlight
 from .fusion import jit
@@ -104,11 +104,8 @@ def suggest_method(
             "`suggest_method` outside of `jit`, `vmap` and `grad`."
         )
     if start is None:
-        if not isinstance(scene, Scene):
-            raise ValueError("Argument `start` must be given for a scene of your own.")
         start = scene.start()
-    if isinstance(scene, Scene):
-        start = scene.adopt(start)
+    start = scene.adopt(start)
     check_start(scene, start)
     bench = _Bench(scene, start, quantity, cycles, lanes)
     best = preset(scene, "reference")

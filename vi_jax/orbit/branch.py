@@ -111,8 +111,9 @@ class Branch:
 
     def __str__(self) -> str:
         low, high = self.parameter.min(), self.parameter.max()
+        period = self.problem.scene.period_of(self.cycles)
         lines = [
-            f"Branch of {len(self.parameter)} motions of period {2 * self.cycles}π with "
+            f"Branch of {len(self.parameter)} motions of period {period} with "
             f"{told_impacts(self.impact_speed.shape[1])}, {self.name} in [{low:.6g}, {high:.6g}], "
             f"{int(self.stable.sum())} of them stable; ends: {self.ends[0]}, {self.ends[1]}",
             *(f"  {point}" for point in self.special),

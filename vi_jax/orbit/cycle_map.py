@@ -89,13 +89,8 @@ def cycle_map(
     if isinstance(scene, Scene):
         # In time the section would be an event of its own, and the crank angle a fourth state.
         scene = scene.in_clock("phase")
-        if section is not None:
-            scene = scene.at_section(section)
-    elif section is not None:
-        raise ValueError(
-            "Argument `section` must be left out for a scene of your own, which has its own "
-            f"section, but got {section!r}."
-        )
+    if section is not None:
+        scene = scene.at_section(section)
     flow = chosen(scene, flow, Adaptive(diffrax.Tsit5(), rtol=1e-11), argument="flow")
     flow.check(scene)
     # Tolerances are numbers: another one must not be another program.
@@ -107,9 +102,8 @@ def cycle_map(
 
 def adopted(scene: AbstractScene, state: Any) -> Any:
     """`state` as the scene needs it, in floating-point arrays of one type."""
-    if isinstance(scene, Scene):
-        state = scene.adopt(state)
-    elif scene.clock(state) is not None:
+    state = scene.adopt(state)
+    if scene.clock(state) is not None:
         raise ValueError(
             "Argument `scene` must count its cycles by its independent variable, but its state "
             "has a clock."

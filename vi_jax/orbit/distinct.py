@@ -5,7 +5,6 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .._checks import given_number
-from ..scene import Scene
 from .results import Orbit, told_impacts, trimmed
 
 
@@ -21,7 +20,7 @@ class Orbits(list[Orbit]):
 def _told(orbit: Orbit) -> str:
     """A motion in one line."""
     cycles = int(orbit.cycles)
-    period = f"{2 * cycles}π" if isinstance(orbit.scene, Scene) else f"{cycles} cycles"
+    period = orbit.scene.period_of(cycles)
     stable = "stable" if bool(orbit.stable) else "unstable"
     where = ", ".join(f"{name} = {float(x):.6g}" for name, x in vars(orbit.state).items())
     span = f"Y in [{float(orbit.y_min):.6g}, {float(orbit.y_max):.6g}]"

@@ -292,8 +292,7 @@ def _judged(the_map: CycleMap, guess: Any, method: AbstractSearch, impact_log: i
         jnp.where(hit.ravel(), a.ravel(), none)[order]
         for a, none in ((phase, jnp.nan), (seen.speed, jnp.nan), (seen.stop, -1.0))
     )
-    if isinstance(scene, Scene):
-        phase = scene.phase_at(phase)
+    phase = scene.phase_at(phase)
     duration = jnp.sum(jnp.where(within, seen.duration, 0.0))
     clearance = jnp.min(jnp.where(within, seen.clearance, jnp.inf))
     found = (root.converged > 0) & (error < jnp.sqrt(jnp.finfo(x.dtype).eps) * 100)

@@ -2,19 +2,22 @@
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from ..scene import Scene
 from .curve import Step
 from .shooting import Shooting
 from .solve import advance, located, observe, orbit_of, state_at
-from .special import CROSSING, DOUBLING, FOLD, GRAZING, TORUS, SpecialPoint
+from .special import CROSSING, DOUBLING, FOLD, GRAZING, SYMMETRY, TORUS, SpecialPoint
 
 # What lies before the place where a branch springs is looked for on so much of the way there.
 _SHORT = 0.999
+
+# How far beside a point where branches cross (in the norm of the scaled unknowns) it is looked at.
+_BESIDE = 1e-3
 
 # Halves of a period that differ by less than this are those of a motion of half the period.
 _ALIKE = 1e-3
@@ -100,10 +103,7 @@ class Follower:
     def _place(self, clock: float) -> str:
         """A reading of the clock of impacts, in words, within one period from the section on."""
         scene, cycles = self.problem.scene, self.problem.cycles
-        since = clock % (float(scene.cycle) * cycles)
-        if isinstance(scene, Scene):
-            return f"crank angle φ = {float(scene.phase_at(since)):.6g} of {2 * cycles}π"
-        return f"clock {since:.6g} of its {cycles} cycle{'' if cycles == 1 else 's'}"
+        return scene.place_of(clock % (float(scene.cycle) * cycles), cycles)
 
     def _bifurcations(self, here: Step, last: Step) -> Step | None:
         """Record what happens between two points; the point where the branch springs, if met.
@@ -146,6 +146,8 @@ class Follower:
             apart = self._halves(at)
             if kind in (FOLD, CROSSING) and apart.size and np.linalg.norm(apart) < _ALIKE:
                 continue  # where the branch springs both are zero; that is seen by the halves
+            if kind == CROSSING:
+                at = self._crossing(here, at)
             values = at.seen.multipliers
             told = {
                 FOLD: "a multiplier passes 1 and the branch turns back",
@@ -163,8 +165,57 @@ class Follower:
                 found.append((float(np.dot(here.tangent, at.x - here.x)), kind, at, told))
         found.sort(key=lambda f: f[0])
         for _, kind, at, told in found:
+            if kind == CROSSING and self._symmetric(at):
+                kind, told = SYMMETRY, "a multiplier passes 1 and the motion loses its symmetry"
             self.special.append(self._point(kind, at, told))
         return [at for _, _, at, _ in found]
+
+    def _crossing(self, here: Step, at: Step) -> Step:
+        """The point where branches cross, from points on both sides.
+
+        Close to it the equations cannot be solved, but the branch passes through it smoothly, so
+        that a polynomial through its neighbours tells where it is, and what the motion is there.
+        """
+        root = float(np.dot(here.tangent, (at.x - here.x) / self.scale))
+        places = _BESIDE * np.array([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0])
+        beside = [self.advance(here.x, here.tangent, root + place) for place in places]
+        if not all(bool(step.good) for step in beside):
+            return at
+
+        def through(values: Any) -> np.polynomial.Polynomial:
+            return np.polynomial.Polynomial.fit(places, values, len(places) - 1)
+
+        zeros = through([np.asarray(_tests(step)[CROSSING]) for step in beside]).roots()
+        zeros = zeros[np.abs(zeros.imag) < 1e-12].real
+        if not zeros.size or np.abs(zeros).min() > _BESIDE:
+            return at
+        place = zeros[np.argmin(np.abs(zeros))]
+
+        def there(get: Callable[[Step], Any]) -> np.ndarray:
+            return np.stack([through(x)(place) for x in zip(*map(get, beside), strict=True)])
+
+        x, tangent = there(lambda step: step.x), there(lambda step: step.tangent)
+        return at._replace(
+            x=x, tangent=tangent / np.linalg.norm(tangent), seen=observe(self.problem, x)
+        )
+
+    def _symmetric(self, step: Step) -> bool:
+        """Whether the motion is its own image under the symmetry of its machine."""
+        problem, scene = self.problem, self.problem.scene
+        if problem.cycles % 2 == 0 or scene.mirrored(problem.like) is None:
+            return False
+        x = jnp.asarray(step.x)
+        clock = np.asarray(problem.parts(x)[0])
+        turn = float(scene.cycle) * problem.cycles
+        # A place within the first flight, and the one half a period later.
+        first = clock[0] + 0.25 * ((clock[1] if len(clock) > 1 else clock[0] + turn) - clock[0])
+        states = []
+        for place in (first, first + 0.5 * turn):
+            leg = max(0, int(np.searchsorted(clock, place, side="right")) - 1)
+            states.append(state_at(problem, x, jnp.asarray(leg), jnp.asarray(place)))
+        image = ravel_pytree(scene.mirrored(states[0]))[0]
+        apart = np.abs(np.asarray(image - ravel_pytree(states[1])[0]))
+        return bool(apart.max() < _ALIKE)
 
     def _turns_back(self, here: Step, at: Step, last: Step) -> bool:
         """Whether the parameter there lies beyond that at both others, by more than rounding."""

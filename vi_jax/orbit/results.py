@@ -12,7 +12,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from ..flow import AbstractMethod, Run, simulate
-from ..scene import AbstractScene, Scene
+from ..scene import AbstractScene
 from .floquet import STABILITY, stability_of
 
 
@@ -156,7 +156,7 @@ class Orbit(eqx.Module):
             return f"No orbit: {reason} Residual {float(self.residual):.3g}."
         count, cycles = int(self.impacts), int(self.cycles)
         where = ", ".join(f"{name} = {float(x):.9g}" for name, x in vars(self.state).items())
-        period = f"{2 * cycles}π" if isinstance(self.scene, Scene) else f"{cycles} cycles"
+        period = self.scene.period_of(cycles)
         lines = [
             f"Orbit of period {period} with {told_impacts(count)}, {STABILITY[self.stability]}",
             f"  section: {where}",

@@ -10,7 +10,6 @@ from jax.flatten_util import ravel_pytree
 
 from .._programs import compiled
 from ..flow.choice import MethodLike
-from ..scene import Scene
 from ..scene.leaves import leaf, with_leaf
 from .curve import Step, array_of, corrected, first_tangent
 from .results import ORBIT_RESULTS, Orbit
@@ -46,9 +45,7 @@ def problem_of(
         )
     steps = steps_of(carried, corners, orbit.state, cycles)
     problem = Shooting(scene, carried, orbit.state, cycles, stops, steps, (parameter,))
-    section = 0.0
-    if isinstance(scene, Scene) and scene.section_phase is not None:
-        section = float(scene.section_phase)
+    section = float(scene.phase_at(0.0))
     clock = np.asarray(orbit.impact_phase)[: len(stops)] - section
     u, s = ravel_pytree(orbit.state)[0], 0.0
     states = []
@@ -166,9 +163,7 @@ def orbit_of(problem: Shooting, step: Step) -> Orbit:
         legs = np.searchsorted(clock, places, side="right") - 1
     sections, residual = _compiled_sections(problem, x, jnp.asarray(legs), jnp.asarray(places))
     admissible = seen.clearance >= -1e-9 and min(seen.approach, default=1.0) > -1e-9
-    since = within[order]
-    if isinstance(scene, Scene):
-        since = scene.phase_at(since)
+    since = scene.phase_at(within[order])
     duration = jnp.asarray(seen.duration)
     return Orbit(
         scene=scene,

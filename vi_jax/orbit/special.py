@@ -14,7 +14,7 @@ from .shooting import Shooting
 from .solve import advance, jacobian_at, orbit_of, state_at, tangent_at
 
 FOLD, DOUBLING, TORUS = "fold", "period-doubling", "neimark-sacker"
-GRAZING, CROSSING = "grazing", "branch-point"
+GRAZING, CROSSING, SYMMETRY = "grazing", "branch-point", "symmetry-breaking"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,7 +22,8 @@ class SpecialPoint:
     """A point of a branch at which something happens."""
 
     kind: str
-    """"fold", "period-doubling", "neimark-sacker", "branch-point" or "grazing"."""
+    """"fold", "period-doubling", "neimark-sacker", "branch-point", "symmetry-breaking" (a branch
+    point of a motion that is its own image under the symmetry of its machine) or "grazing"."""
     parameter: float
     orbit: Orbit
     detail: str
@@ -37,7 +38,8 @@ class SpecialPoint:
         """An orbit of the other branch that begins here, to be continued.
 
         At a period doubling, the motion of twice the period; at a grazing, the motion with that
-        impact less or one more, on the side on which it is admissible.
+        impact less or one more, on the side on which it is admissible; where branches cross, a
+        motion of the other one.
 
         **Arguments:** how far from the point (in the norm of the scaled unknowns).
 
@@ -48,9 +50,11 @@ class SpecialPoint:
             return _doubled(self, distance)
         if self.kind == GRAZING:
             return _beyond_grazing(self, distance)
+        if self.kind in (CROSSING, SYMMETRY):
+            return _crossed(self, distance)
         raise ValueError(
-            "`switch` needs a period doubling or a grazing, but this special point is a "
-            f"{self.kind}."
+            "`switch` needs a period doubling, a grazing or a point where branches cross, but this "
+            f"special point is a {self.kind}."
         )
 
     def __str__(self) -> str:
@@ -82,6 +86,24 @@ def _doubled(point: SpecialPoint, distance: float) -> Orbit:
             f"No motion of twice the period was found at distance {distance:g}; try another."
         )
     return orbit_of(new, step)
+
+
+def _crossed(point: SpecialPoint, distance: float) -> Orbit:
+    """A motion of the branch that crosses here."""
+    problem, x = point.problem, np.asarray(point.step.x)
+    jacobian = np.asarray(jacobian_at(problem, jnp.asarray(x))) * point.scale
+    # Here the equations have two null vectors: one leads along this branch, the other off it.
+    plane = np.linalg.svd(jacobian)[2][-2:]
+    along = np.asarray(point.step.tangent)
+    along = plane.T @ (plane @ along)
+    off = plane[0] * (plane[1] @ along) - plane[1] * (plane[0] @ along)
+    off = off / np.linalg.norm(off)
+    step = advance(problem, x, off, point.scale, distance)
+    if not bool(step.good):
+        raise ValueError(
+            f"No motion of the other branch was found at distance {distance:g}; try another."
+        )
+    return orbit_of(problem, step)
 
 
 def _beyond_grazing(point: SpecialPoint, distance: float) -> Orbit:

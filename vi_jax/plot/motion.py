@@ -97,7 +97,9 @@ def plot_phase_portrait(
     path = motion_path(motion, scene=scene, window=window)
     (line,) = ax.plot(path.Y, path.V, **{"color": BLUE, "lw": 1.0, **style})
     if sections:
-        samples = motion_path(motion, window=window)
+        only = motion.samples if isinstance(motion, Run) else motion  # without the impacts
+        assert only is not None
+        samples = motion_path(only, scene=scene, window=window)
         whole = abs(samples.cycles - samples.cycles.round()) < 1e-9
         dots = {"ms": 4, "color": line.get_color(), "zorder": 3}
         ax.plot(samples.Y[whole], samples.V[whole], "o", **dots)

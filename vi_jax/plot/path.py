@@ -1,12 +1,20 @@
 """A sampled run as a path to draw, with its impacts put in between the samples."""
 
-from math import pi
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from ..flow import Run, Samples
-from ..scene import AbstractScene, Scene
+from ..scene import AbstractScene
+
+
+def _coordinates(scene: AbstractScene | None) -> tuple[Callable[[Any], Any], ...]:
+    """What the stops limit and its velocity, of a state; by default the names of the paper."""
+    if scene is not None:
+        return jax.vmap(scene.position), jax.vmap(scene.velocity)
+    return (lambda state: state.Y), (lambda state: state.V)
 
 
 class MotionPath(NamedTuple):
@@ -43,7 +51,7 @@ def motion_path(
             f"Argument `motion` must be one motion, but is a batch of shape {cycles.shape[:-1]}."
         )
     path = MotionPath(
-        cycles, np.asarray(samples.state.Y, float), np.asarray(samples.state.V, float)
+        cycles, *(np.asarray(read(samples.state), float) for read in _coordinates(scene))
     )
     if isinstance(motion, Run) and motion.impact_log is not None and scene is not None:
         path = _with_impacts(path, motion, scene)
@@ -62,9 +70,7 @@ def _with_impacts(path: MotionPath, run: Run, scene: AbstractScene) -> MotionPat
     if not stop.size:
         return path
     logged = np.asarray(log.stop) >= 0
-    # The clock of a `Scene` is the crank angle; that of other scenes is their own.
-    turn = 2 * pi if isinstance(scene, Scene) else float(scene.cycle)
-    at = cycle + np.asarray(log.phase)[logged] / turn
+    at = cycle + np.asarray(log.phase)[logged] / float(scene.turn)
     speed = np.asarray(log.speed)[logged]
     sign = np.array([s.sign for s in scene.stops])[stop]
     gap = np.array([float(s.gap) for s in scene.stops])[stop]

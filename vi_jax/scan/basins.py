@@ -15,7 +15,7 @@ from .._lazy import lazy
 from ..flow import simulate
 from ..flow.choice import MethodLike, chosen
 from ..orbit.results import told_impacts
-from ..scene import AbstractScene, Scene
+from ..scene import AbstractScene
 from .grid import axes_of
 from .job import START
 from .measures import AbstractMeasure, Regime
@@ -174,7 +174,6 @@ def basins(
             paired=samples is not None, **options,
         )  # fmt: skip
     if start is None:
-        assert isinstance(scene, Scene)
         start = scene.start()
     names = [field.name for field in dataclasses.fields(start)]
     period = np.asarray(data["period"]).ravel()

@@ -18,7 +18,7 @@ from ..flow.aim import select
 from ..flow.choice import MethodLike, chosen
 from ..flow.results import number_of
 from ..flow.simulate import simulate_pool
-from ..scene import AbstractScene, Scene
+from ..scene import AbstractScene
 from ..scene.leaves import check_again, check_name, leaf, leaf_names, with_leaf
 from .grid import Blocks
 from .measures import AbstractMeasure, Numbers, measures_of
@@ -67,12 +67,10 @@ class Job(eqx.Module):
                 scene = with_leaf(scene, name, value)
         assert scene is not None
         scene = self._nudged(scene, "", nudge)
-        if self.clock is not None and isinstance(scene, Scene):
+        if self.clock is not None:
             scene = scene.in_clock(self.clock)
         start = self.start
         if start is None:
-            if not isinstance(scene, Scene):
-                raise ValueError("Argument `start` must be given for a scene of your own.")
             start = scene.start()
         for name, value in values.items():
             if name.startswith(START):
@@ -210,10 +208,8 @@ def make_job(
             "Argument `scene` must be a `Scene`, an `AbstractScene` or a function that makes one, "
             f"but got {scene!r}."
         )
-    if template is not None and not isinstance(template, Scene) and start is None:
-        raise ValueError("Argument `start` must be given for a scene of your own.")
     if template is not None:
-        first = template.start() if start is None and isinstance(template, Scene) else start
+        first = template.start() if start is None else start
         for name in names:
             _check_name(template, first, name, "axes")
     return Job(
@@ -295,6 +291,5 @@ def check_corners(job: Job, blocks: Blocks) -> Job:
         for name in job.derivatives:
             _check_name(scene, start, name, "derivatives")
         job.method.check(scene)
-        if isinstance(scene, Scene):
-            scene.adopt(start)
+        scene.adopt(start)
     return dataclasses.replace(job, rests=rests)

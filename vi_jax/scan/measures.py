@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
+import jax.tree_util as jtu
 from jaxtyping import Array, Bool
 
 from .._checks import count, require
@@ -17,6 +18,10 @@ from .regime import impacts_of, least_period
 
 Numbers = dict[str, Array]
 About = Mapping[str, Mapping[str, Any]]
+
+
+def _dtype(run: Run) -> Any:
+    return jtu.tree_leaves(run.sections)[0].dtype
 
 
 class AbstractMeasure(eqx.Module):
@@ -135,7 +140,7 @@ class Impacts(AbstractMeasure):
 
     def __call__(self, scene, run):
         """Of one lane."""
-        return {"impact_rate": jnp.mean(run.impacts.astype(run.sections.Y.dtype))}
+        return {"impact_rate": jnp.mean(run.impacts.astype(_dtype(run)))}
 
 
 class Steps(AbstractMeasure):
@@ -164,7 +169,7 @@ class Exponent(AbstractMeasure):
 
     def __call__(self, scene, run):
         """Not yet known."""
-        return {"exponent": jnp.full_like(run.sections.Y[-1], jnp.nan)}
+        return {"exponent": jnp.full((), jnp.nan, _dtype(run))}
 
     def unclear(self, found, look=0):
         """Always."""
@@ -233,7 +238,7 @@ class Regime(AbstractMeasure):
         period = least_period(sections, longest=self.longest, tolerance=self.tolerance)
         return {
             "period": jnp.where(run.successful, period, -2).astype(jnp.int16),
-            "impacts": impacts_of(run.impacts.astype(run.sections.Y.dtype), period),
+            "impacts": impacts_of(run.impacts.astype(_dtype(run)), period),
         }
 
     def unclear(self, found, look=0):

@@ -16,7 +16,7 @@ from ..flow import RESULTS, simulate
 from ..flow.choice import MethodLike, chosen
 from ..flow.simulate import check_start
 from ..orbit.results import told_impacts
-from ..scene import AbstractScene, Scene
+from ..scene import AbstractScene
 from ..scene.leaves import check_again, check_leaf, with_leaf
 from .regime import impacts_of, least_period
 
@@ -157,18 +157,11 @@ def sweep(
             check_again(end)
         rests = any(end.may_rest() for end in ends)
     if start is None:
-        if not isinstance(scene, Scene):
-            raise ValueError("Argument `start` must be given for a scene of your own.")
-        first = with_leaf(scene, parameter, values[0])
-        assert isinstance(first, Scene)
-        start = first.start()
+        start = with_leaf(scene, parameter, values[0]).start()
     method = chosen(scene, method)
     if clock is not None:
-        if not isinstance(scene, Scene):
-            raise ValueError("Argument `clock` must be left out for a scene of your own.")
         scene = scene.in_clock(clock)
-    if isinstance(scene, Scene):
-        start = scene.adopt(start)
+    start = scene.adopt(start)
     start = jtu.tree_map(lambda x: jnp.asarray(x, values.dtype), start)
     if numbers is not None:
         check_start(with_leaf(scene, parameter, numbers[0]), start)

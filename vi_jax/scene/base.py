@@ -17,10 +17,14 @@ State = Any
 class AbstractScene(eqx.Module):
     """A mechanical system with one impacting coordinate, observed cycle by cycle.
 
-    Its independent variable is called `s`; `s` restarts from zero in each cycle.
+    Its independent variable is called `s`; `s` restarts from zero in each cycle, and the field is
+    periodic in it.
 
-    To write a scene of your own, give it `stops`, `cycle` and `field`. The other methods have
-    defaults that suit a state with the fields `Y` and `V` whose independent variable is time.
+    To write a scene of your own, give it `stops`, `cycle` and `field`, and `start` if there is a
+    state to begin from where none is given. The other methods have defaults that suit a state with
+    the fields `Y` and `V` whose independent variable is time; a state with other names says by
+    `position`, `velocity` and `placed` which of them the stops limit. Ready machines, each written
+    in this way, are in `vi_jax.machines`.
     """
 
     stops: eqx.AbstractVar[tuple[RigidStop, ...]]
@@ -49,6 +53,53 @@ class AbstractScene(eqx.Module):
     def clock(self, state: State) -> Float[Array, ""] | None:
         """The state component that counts cycles, or `None` where `s` itself does."""
         return None
+
+    def start(self) -> State:
+        """The state to begin from where none is given.
+
+        **Raises:** `ValueError` where this scene has none.
+        """
+        raise ValueError("Argument `start` must be given for a scene of your own.")
+
+    def adopt(self, start: Any) -> State:
+        """A start as this scene needs it. **Raises:** `TypeError` if it is none."""
+        return start
+
+    def in_clock(self, clock: str) -> "AbstractScene":
+        """The same scene with another independent variable, for one that has several."""
+        raise ValueError(
+            "Argument `clock` must be left out for a scene of your own, which has its own clock, "
+            f"but got {clock!r}."
+        )
+
+    def at_section(self, phase: Any) -> "AbstractScene":
+        """The same scene observed elsewhere in its cycle, for one that can be."""
+        raise ValueError(
+            "Argument `section` must be left out for a scene of your own, which has its own "
+            f"section, but got {phase!r}."
+        )
+
+    def phase_at(self, since_section: Any) -> Any:
+        """What the clock reads, from what it counted since the section."""
+        return since_section
+
+    def mirrored(self, state: State) -> State | None:
+        """The image of a state under the symmetry of this scene, for one whose motions have an
+        image among them half a cycle later; `None` for one without."""
+        return None
+
+    def period_of(self, cycles: int) -> str:
+        """A duration of so many cycles, in words."""
+        return f"{cycles} cycle{'' if cycles == 1 else 's'}"
+
+    def place_of(self, since_section: float, cycles: int) -> str:
+        """A reading of the clock within a motion of so many cycles, in words."""
+        return f"clock {since_section:.6g} of its {self.period_of(cycles)}"
+
+    @property
+    def turn(self) -> Float[Array, ""] | float:
+        """What an impact log counts in one cycle."""
+        return self.cycle
 
     def told(self, clock: Float[Array, "..."]) -> Float[Array, "..."]:
         """A reading of what counts the cycles, as the impact log tells it; by default itself."""

@@ -162,6 +162,19 @@ class Scene(AbstractScene):
         one_of("clock", clock, ("phase", "time"))
         return dataclasses.replace(self, clock_name=clock)
 
+    def period_of(self, cycles: int) -> str:
+        """In crank angle: 2π, 4π, …"""
+        return f"{2 * cycles}π"
+
+    def place_of(self, since_section: float, cycles: int) -> str:
+        """In crank angle."""
+        return f"crank angle φ = {float(self.phase_at(since_section)):.6g} of {2 * cycles}π"
+
+    @property
+    def turn(self) -> float:
+        """2π: impacts are logged by crank angle."""
+        return 2 * pi
+
     def at_section(self, phase: Any) -> "Scene":
         """The same scene, observed where the crank angle is `phase` (radians) instead of 0."""
         return dataclasses.replace(self, section_phase=phase)

@@ -1,0 +1,8 @@
+"""Ready machines of other kinds than the paper's, each in a file that shows how to write one."""
+
+from .bouncing_ball import BallState as BallState
+from .bouncing_ball import BouncingBall as BouncingBall
+from .duffing import Duffing as Duffing
+from .impact_pair import FreePairState as FreePairState
+from .impact_pair import ImpactPair as ImpactPair
+from .impact_pair import PairState as PairState

@@ -1,0 +1,76 @@
+"""A ball that bounces on a shaken table."""
+
+from math import pi
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._checks import NOT_NEGATIVE, SHARE, number, require_ranges
+from ..scene import AbstractScene, RigidStop
+
+Scalar = Float[Array, ""]
+
+
+class BallState(eqx.Module):
+    """A ball as seen from the table."""
+
+    height: Scalar
+    """Above the table (unit: g/ω²)."""
+    speed: Scalar
+    """Relative to the table, upward (unit: g/ω)."""
+
+
+class BouncingBall(AbstractScene):
+    """A ball under gravity on a table that moves as -(Γ g/ω²) cos ωt.
+
+    The independent variable is ωt, a cycle 2π. One bounce in n cycles is born at
+    Γ = nπ (1 - e)/(1 + e), and doubles its period at Γ² = [nπ (1 - e)/(1 + e)]² +
+    [2 (1 + e²)/(1 + e)²]² (Holmes, Journal of Sound and Vibration 84, 1982; Luo and Han, Nonlinear
+    Dynamics 10, 1996).
+
+    **Arguments:** `acceleration` Γ, the table's largest acceleration (unit: g), not negative;
+    `restitution` e in [0, 1].
+    """
+
+    acceleration: Scalar = eqx.field(
+        kw_only=True, default=1.2, converter=lambda x: number("acceleration", x)
+    )
+    restitution: Scalar = eqx.field(
+        kw_only=True, default=0.5, converter=lambda x: number("restitution", x)
+    )
+    ranges: ClassVar = {"acceleration": NOT_NEGATIVE, "restitution": SHARE}
+
+    def __check_init__(self):
+        require_ranges(self)
+
+    @property
+    def stops(self) -> tuple[RigidStop, ...]:  # pyright: ignore
+        """The table, below the ball."""
+        return (RigidStop(0.0, self.restitution, "left"),)
+
+    @property
+    def cycle(self) -> float:
+        """2π."""
+        return 2 * pi
+
+    def field(self, s: Scalar, state: BallState) -> BallState:
+        """Free fall less the table's acceleration."""
+        return BallState(state.speed, -1 - self.acceleration * jnp.cos(s))
+
+    def start(self, *, height: Any = 1.0, speed: Any = 0.0) -> BallState:
+        """A ball above the table at ωt = 0, where the table is lowest."""
+        return BallState(number("height", height), number("speed", speed))
+
+    def position(self, state: BallState) -> Scalar:
+        """The height."""
+        return state.height
+
+    def velocity(self, state: BallState) -> Scalar:
+        """The relative speed."""
+        return state.speed
+
+    def placed(self, state: BallState, Y: Scalar, V: Scalar) -> BallState:
+        """A ball of this height and speed."""
+        return BallState(Y, V)

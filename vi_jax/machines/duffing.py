@@ -1,0 +1,84 @@
+"""A Duffing oscillator between two stops; with no cubic term the classic impact oscillator."""
+
+from math import pi
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, number, require_ranges
+from ..scene import AbstractScene, OscillatorState, RigidStop
+
+Scalar = Float[Array, ""]
+
+
+class Duffing(AbstractScene):
+    """x'' + δ x' + α x + β x³ = A cos ωt, between stops at ±gap or with one on the right alone.
+
+    The independent variable is the phase ωt, a cycle 2π. A motion of small amplitude that stays off
+    the stops is that of a linear oscillator if β = 0: it grazes where A² = gap² ((α - ω²)² + δ²ω²).
+
+    **Arguments:** `amplitude` A, `frequency` ω (positive), `damping` δ (not negative), `stiffness`
+    α and `cubic` β (of any sign), `gap` (positive), `restitution` in [0, 1], `two_sided` whether
+    there is a stop on the left as well; static.
+    """
+
+    amplitude: Scalar = eqx.field(
+        kw_only=True, default=0.3, converter=lambda x: number("amplitude", x)
+    )
+    frequency: Scalar = eqx.field(
+        kw_only=True, default=1.0, converter=lambda x: number("frequency", x)
+    )
+    damping: Scalar = eqx.field(kw_only=True, default=0.1, converter=lambda x: number("damping", x))
+    stiffness: Scalar = eqx.field(
+        kw_only=True, default=1.0, converter=lambda x: number("stiffness", x)
+    )
+    cubic: Scalar = eqx.field(kw_only=True, default=0.0, converter=lambda x: number("cubic", x))
+    gap: Scalar = eqx.field(kw_only=True, default=1.0, converter=lambda x: number("gap", x))
+    restitution: Scalar = eqx.field(
+        kw_only=True, default=0.8, converter=lambda x: number("restitution", x)
+    )
+    two_sided: bool = eqx.field(kw_only=True, static=True, default=True)
+    ranges: ClassVar = {
+        "amplitude": REAL, "frequency": POSITIVE, "damping": NOT_NEGATIVE, "stiffness": REAL,
+        "cubic": REAL, "gap": POSITIVE, "restitution": SHARE,
+    }  # fmt: skip
+
+    def __check_init__(self):
+        require_ranges(self)
+
+    @property
+    def stops(self) -> tuple[RigidStop, ...]:  # pyright: ignore
+        """One on the right, and one on the left of a two-sided machine."""
+        sides = ("right", "left") if self.two_sided else ("right",)
+        return tuple(RigidStop(self.gap, self.restitution, side) for side in sides)
+
+    @property
+    def cycle(self) -> float:
+        """2π."""
+        return 2 * pi
+
+    @property
+    def period(self) -> Scalar:
+        """2π/ω."""
+        return 2 * pi / self.frequency
+
+    def pace(self, s: Scalar, state: Any) -> Scalar:
+        """dt/ds = 1/ω."""
+        return 1 / self.frequency
+
+    def field(self, s: Scalar, state: OscillatorState) -> OscillatorState:
+        """By phase; V is dx/dt."""
+        x, v = state.Y, state.V
+        force = self.amplitude * jnp.cos(s) - self.damping * v
+        force = force - x * (self.stiffness + self.cubic * x * x)
+        return OscillatorState(v / self.frequency, force / self.frequency)
+
+    def start(self, *, Y: Any = 0.0, V: Any = 0.0) -> OscillatorState:
+        """At rest in the middle by default."""
+        return OscillatorState(number("Y", Y), number("V", V))
+
+    def mirrored(self, state: OscillatorState) -> OscillatorState | None:
+        """x → -x half a cycle later, if there are two stops."""
+        return OscillatorState(-state.Y, -state.V) if self.two_sided else None

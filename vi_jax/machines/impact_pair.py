@@ -1,0 +1,139 @@
+"""A ball in a shaken box: impact pair, impact damper, vibro-impact harvester."""
+
+from math import pi
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, number, require_ranges
+from ..scene import AbstractScene, RigidStop
+
+Scalar = Float[Array, ""]
+
+
+class PairState(eqx.Module):
+    """The ball in its box."""
+
+    place: Scalar
+    """From the middle of the box (unit: a)."""
+    speed: Scalar
+    """Relative to the box (unit: a ω)."""
+
+
+class FreePairState(eqx.Module):
+    """The ball in its box, and the box."""
+
+    place: Scalar
+    """Of the ball, from the middle of the box (unit: a)."""
+    speed: Scalar
+    """Of the ball, relative to the box (unit: a ω)."""
+    box: Scalar
+    """Place of the box (unit: a)."""
+    box_speed: Scalar
+    """Speed of the box (unit: a ω)."""
+
+
+def _optional(name: str) -> Any:
+    return lambda x: x if x is None else number(name, x)
+
+
+class ImpactPair(AbstractScene):
+    """A ball between the walls of a box.
+
+    The box moves as a sin ωt; or, if `mass_ratio` is given, it is itself a body on a spring and a
+    damper, driven by a force: X'' + 2 ξ Ω X' + Ω² X = F sin s between impacts, at which the
+    relative speed is reversed and scaled by e and the momentum of both is kept. The independent
+    variable is s = ωt, a cycle 2π.
+
+    With the prescribed box and σ = (1 - e)/(1 + e), the symmetric motion with one impact at each
+    wall in a cycle has the flight speed w of (π w/2 - λ)² + σ² w² = 1 and the speed of approach
+    2w/(1 + e); its fold is at λ = √(1 + π²/(4σ²)), and it loses its symmetry at
+    λ = (π/2 - 2/π)/√(4/π² + σ²) (Heiman, Bajaj and Sherman, Journal of Sound and Vibration 124,
+    1988).
+
+    **Arguments:**
+
+    - `half_gap` λ: half the box's length less the ball's (unit: a), positive.
+    - `restitution` e in [0, 1].
+    - `mass_ratio`: the ball's mass over the box's; without it the motion of the box is given.
+    - `damping_ratio` ξ, `frequency` Ω (of the box on its spring, unit: ω; 0 leaves out the spring)
+      and `force` F (unit: M a ω²), of a box that is free.
+    """
+
+    half_gap: Scalar = eqx.field(
+        kw_only=True, default=1.6, converter=lambda x: number("half_gap", x)
+    )
+    restitution: Scalar = eqx.field(
+        kw_only=True, default=0.5, converter=lambda x: number("restitution", x)
+    )
+    mass_ratio: Scalar | None = eqx.field(
+        kw_only=True, default=None, converter=_optional("mass_ratio")
+    )
+    damping_ratio: Scalar = eqx.field(
+        kw_only=True, default=0.05, converter=lambda x: number("damping_ratio", x)
+    )
+    frequency: Scalar = eqx.field(
+        kw_only=True, default=1.0, converter=lambda x: number("frequency", x)
+    )
+    force: Scalar = eqx.field(kw_only=True, default=0.5, converter=lambda x: number("force", x))
+    ranges: ClassVar = {
+        "half_gap": POSITIVE, "restitution": SHARE, "mass_ratio": NOT_NEGATIVE,
+        "damping_ratio": NOT_NEGATIVE, "frequency": NOT_NEGATIVE, "force": REAL,
+    }  # fmt: skip
+
+    def __check_init__(self):
+        require_ranges(self)
+
+    @property
+    def stops(self) -> tuple[RigidStop, ...]:  # pyright: ignore
+        """Both walls, the right one first."""
+        return tuple(RigidStop(self.half_gap, self.restitution, side) for side in ("right", "left"))
+
+    @property
+    def cycle(self) -> float:
+        """2π."""
+        return 2 * pi
+
+    def may_rest(self) -> bool:
+        """A wall accelerates towards the ball for half of each cycle."""
+        return True
+
+    def field(self, s: Scalar, state: Any) -> Any:
+        """A ball on which nothing acts, seen from the box."""
+        if self.mass_ratio is None:
+            return PairState(state.speed, jnp.sin(s))
+        omega, xi = self.frequency, self.damping_ratio
+        pull = -omega * (omega * state.box + 2 * xi * state.box_speed)
+        box = pull + self.force * jnp.sin(s)
+        return FreePairState(state.speed, -box, state.box_speed, box)
+
+    def start(
+        self, *, place: Any = 0.0, speed: Any = 0.5, box: Any = 0.0, box_speed: Any = 0.0
+    ) -> Any:
+        """The ball in the middle of the box by default; a box that is free at rest."""
+        ball = number("place", place), number("speed", speed)
+        if self.mass_ratio is None:
+            return PairState(*ball)
+        return FreePairState(*ball, number("box", box), number("box_speed", box_speed))
+
+    def position(self, state: Any) -> Scalar:
+        """The place of the ball in the box."""
+        return state.place
+
+    def velocity(self, state: Any) -> Scalar:
+        """The relative speed."""
+        return state.speed
+
+    def placed(self, state: Any, Y: Scalar, V: Scalar) -> Any:
+        """The ball at this place with this relative speed; what the box gains or loses by it keeps
+        the momentum of both."""
+        if self.mass_ratio is None:
+            return PairState(Y, V)
+        share = self.mass_ratio / (1 + self.mass_ratio)
+        return FreePairState(Y, V, state.box, state.box_speed - share * (V - state.speed))
+
+    def mirrored(self, state: Any) -> Any:
+        """Left and right exchanged, half a cycle later."""
+        return type(state)(*(-x for x in vars(state).values()))
