@@ -51,6 +51,11 @@ class BouncingBall(AbstractScene):
         return (RigidStop(0.0, self.restitution, "left"),)
 
     @property
+    def labels(self) -> tuple[str, str]:
+        """Of pictures."""
+        return "height (g/ω²)", "speed from the table (g/ω)"
+
+    @property
     def cycle(self) -> float:
         """2π."""
         return 2 * pi

@@ -55,6 +55,11 @@ class Duffing(AbstractScene):
         return tuple(RigidStop(self.gap, self.restitution, side) for side in sides)
 
     @property
+    def labels(self) -> tuple[str, str]:
+        """Of pictures."""
+        return "x", "dx/dt"
+
+    @property
     def cycle(self) -> float:
         """2π."""
         return 2 * pi

@@ -92,6 +92,11 @@ class ImpactPair(AbstractScene):
         return tuple(RigidStop(self.half_gap, self.restitution, side) for side in ("right", "left"))
 
     @property
+    def labels(self) -> tuple[str, str]:
+        """Of pictures."""
+        return "place in the box (a)", "speed in the box (a ω)"
+
+    @property
     def cycle(self) -> float:
         """2π."""
         return 2 * pi

@@ -21,6 +21,10 @@ def new_axes(ax: Axes | None) -> Axes:
     return plt.subplots(figsize=(7, 3.5), layout="constrained")[1]
 
 
+# Of the paper's machine, where no scene is given.
+_LABELS = "Y = y/a", "V = dY/dτ"
+
+
 def plot_history(
     motion: Run | Samples,
     *,
@@ -57,7 +61,7 @@ def plot_history(
         for i, stop in enumerate(scene.stops):
             label = None if i else "stop"
             ax.axhline(stop.sign * float(stop.gap), color=GREEN, lw=1.8, label=label)
-    ax.set_ylabel("Y = y/a")
+    ax.set_ylabel((_LABELS if scene is None else scene.labels)[0])
     if unit == "cycles":
         ax.set_xlabel("drive cycles φ/(2π)")
     else:
@@ -106,6 +110,7 @@ def plot_phase_portrait(
     if scene is not None:
         for stop in scene.stops:
             ax.axvline(stop.sign * float(stop.gap), color=GREEN, lw=1.8)
-    ax.set_xlabel("Y = y/a")
-    ax.set_ylabel("V = dY/dτ")
+    position, velocity = _LABELS if scene is None else scene.labels
+    ax.set_xlabel(position)
+    ax.set_ylabel(velocity)
     return ax

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -81,7 +82,7 @@ class Basins(NamedTuple):
 
 
 class _Mark(AbstractMeasure):
-    """The section state of greatest Y among the last ones: the same for all lanes on a motion."""
+    """Of the last section states that of greatest position, the same for all lanes on a motion."""
 
     longest: int = eqx.field(static=True)
 
@@ -93,7 +94,7 @@ class _Mark(AbstractMeasure):
     def __call__(self, scene, run):
         """Of one lane."""
         states = {name: x[-self.longest :] for name, x in vars(run.sections).items()}
-        highest = jnp.argmax(states["Y"])
+        highest = jnp.argmax(jax.vmap(scene.position)(run.sections)[-self.longest :])
         return {name: x[highest] for name, x in states.items()}
 
 

@@ -97,6 +97,11 @@ class AbstractScene(eqx.Module):
         return f"clock {since_section:.6g} of its {self.period_of(cycles)}"
 
     @property
+    def labels(self) -> tuple[str, str]:
+        """What pictures write beside position and velocity, with units."""
+        return "position", "velocity"
+
+    @property
     def turn(self) -> Float[Array, ""] | float:
         """What an impact log counts in one cycle."""
         return self.cycle

@@ -171,6 +171,11 @@ class Scene(AbstractScene):
         return f"crank angle φ = {float(self.phase_at(since_section)):.6g} of {2 * cycles}π"
 
     @property
+    def labels(self) -> tuple[str, str]:
+        """In the paper's units."""
+        return "Y = y/a", "V = dY/dτ"
+
+    @property
     def turn(self) -> float:
         """2π: impacts are logged by crank angle."""
         return 2 * pi
