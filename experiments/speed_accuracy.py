@@ -798,10 +798,7 @@ for top, bottom, drive in zip(*panels, DRIVES, strict=True):
     )
     for ax in (top, bottom):
         ax.grid(alpha=0.3)
-figure.legend(
-    *panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False,
-    fontsize=8,
-)  # fmt: skip
+panels[0, 0].legend(frameon=False, fontsize=7)
 numbers = {
     f"{row.choice.name}: median error of the state, 20 cycles, ideal drive": row.errors["state"]
     for row in results["ideal"][0]
