@@ -78,9 +78,9 @@ def closed_form_orbits(scene: Scene, *, cycles: int = 1) -> ClosedFormOrbits:
     solved for, so ζ should be well above 1/256, or peaks between the points can be missed.
 
     An impact may fall on the section itself: on φ = 0 it does with ξ = 0 and k = 1 or ζ = 1. The
-    state is that just after it, and the next impact is the last thing that happens in the period;
-    V is changed in its last digits if that keeps rounding from putting it beyond. With ξ = 0 and
-    ζ = 1 nothing can: there take another section, `scene.at_section(pi)`, to simulate from.
+    state is that just after it, and the next impact is the last thing that happens in the period:
+    V is changed in its last digits if that keeps rounding from putting it beyond, and what comes to
+    the section within rounding of the stop is counted by `simulate` before it.
 
     **Raises:** `ValueError` if the scene has no such closed form or `cycles` < 1.
     """
