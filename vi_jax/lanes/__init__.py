@@ -9,5 +9,6 @@ from .loop import current_road as current_road
 from .loop import once as once
 from .loop import road as road
 from .loop import run as run
+from .machine import cores as cores
 from .machine import processor as processor
 from .machine import threads as threads

@@ -39,8 +39,11 @@ def processor(name: str) -> AbstractContextManager:
 def thread_count() -> int:
     """Threads that lanes run on."""
     asked = _threads.get()
-    if asked is not None:
-        return asked
+    return cores() if asked is None else asked
+
+
+def cores() -> int:
+    """Cores that this process may use."""
     try:
         return len(os.sched_getaffinity(0))
     except AttributeError:

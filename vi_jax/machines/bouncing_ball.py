@@ -1,14 +1,14 @@
 """A ball that bounces on a shaken table."""
 
-from math import pi
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import NOT_NEGATIVE, SHARE, number, require_ranges
-from ..scene import AbstractScene, RigidStop
+from .._checks import NOT_NEGATIVE, SHARE, number
+from ..scene import RigidStop
+from .base import PhaseMachine
 
 Scalar = Float[Array, ""]
 
@@ -22,7 +22,7 @@ class BallState(eqx.Module):
     """Relative to the table, upward (unit: g/ω)."""
 
 
-class BouncingBall(AbstractScene):
+class BouncingBall(PhaseMachine):
     """A ball under gravity on a table that moves as -(Γ g/ω²) cos ωt.
 
     The independent variable is ωt, a cycle 2π. One bounce in n cycles is born at
@@ -40,10 +40,7 @@ class BouncingBall(AbstractScene):
     restitution: Scalar = eqx.field(
         kw_only=True, default=0.5, converter=lambda x: number("restitution", x)
     )
-    ranges: ClassVar = {"acceleration": NOT_NEGATIVE, "restitution": SHARE}
-
-    def __check_init__(self):
-        require_ranges(self)
+    ranges: ClassVar[dict[str, Any]] = {"acceleration": NOT_NEGATIVE, "restitution": SHARE}
 
     @property
     def stops(self) -> tuple[RigidStop, ...]:  # pyright: ignore
@@ -54,11 +51,6 @@ class BouncingBall(AbstractScene):
     def labels(self) -> tuple[str, str]:
         """Of pictures."""
         return "height (g/ω²)", "speed from the table (g/ω)"
-
-    @property
-    def cycle(self) -> float:
-        """2π."""
-        return 2 * pi
 
     def field(self, s: Scalar, state: BallState) -> BallState:
         """Free fall less the table's acceleration."""

@@ -7,13 +7,14 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, number, require_ranges
-from ..scene import AbstractScene, OscillatorState, RigidStop
+from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, number
+from ..scene import OscillatorState, RigidStop
+from .base import PhaseMachine
 
 Scalar = Float[Array, ""]
 
 
-class Duffing(AbstractScene):
+class Duffing(PhaseMachine):
     """x'' + δ x' + α x + β x³ = A cos ωt, between stops at ±gap or with one on the right alone.
 
     The independent variable is the phase ωt, a cycle 2π. A motion of small amplitude that stays off
@@ -40,13 +41,10 @@ class Duffing(AbstractScene):
         kw_only=True, default=0.8, converter=lambda x: number("restitution", x)
     )
     two_sided: bool = eqx.field(kw_only=True, static=True, default=True)
-    ranges: ClassVar = {
+    ranges: ClassVar[dict[str, Any]] = {
         "amplitude": REAL, "frequency": POSITIVE, "damping": NOT_NEGATIVE, "stiffness": REAL,
         "cubic": REAL, "gap": POSITIVE, "restitution": SHARE,
     }  # fmt: skip
-
-    def __check_init__(self):
-        require_ranges(self)
 
     @property
     def stops(self) -> tuple[RigidStop, ...]:  # pyright: ignore
@@ -58,11 +56,6 @@ class Duffing(AbstractScene):
     def labels(self) -> tuple[str, str]:
         """Of pictures."""
         return "x", "dx/dt"
-
-    @property
-    def cycle(self) -> float:
-        """2π."""
-        return 2 * pi
 
     @property
     def period(self) -> Scalar:

@@ -1,14 +1,14 @@
 """A ball in a shaken box: impact pair, impact damper, vibro-impact harvester."""
 
-from math import pi
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, number, require_ranges
-from ..scene import AbstractScene, RigidStop
+from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, number
+from ..scene import RigidStop
+from .base import PhaseMachine
 
 Scalar = Float[Array, ""]
 
@@ -39,7 +39,7 @@ def _optional(name: str) -> Any:
     return lambda x: x if x is None else number(name, x)
 
 
-class ImpactPair(AbstractScene):
+class ImpactPair(PhaseMachine):
     """A ball between the walls of a box.
 
     The box moves as a sin ωt; or, if `mass_ratio` is given, it is itself a body on a spring and a
@@ -78,13 +78,10 @@ class ImpactPair(AbstractScene):
         kw_only=True, default=1.0, converter=lambda x: number("frequency", x)
     )
     force: Scalar = eqx.field(kw_only=True, default=0.5, converter=lambda x: number("force", x))
-    ranges: ClassVar = {
+    ranges: ClassVar[dict[str, Any]] = {
         "half_gap": POSITIVE, "restitution": SHARE, "mass_ratio": NOT_NEGATIVE,
         "damping_ratio": NOT_NEGATIVE, "frequency": NOT_NEGATIVE, "force": REAL,
     }  # fmt: skip
-
-    def __check_init__(self):
-        require_ranges(self)
 
     @property
     def stops(self) -> tuple[RigidStop, ...]:  # pyright: ignore
@@ -95,15 +92,6 @@ class ImpactPair(AbstractScene):
     def labels(self) -> tuple[str, str]:
         """Of pictures."""
         return "place in the box (a)", "speed in the box (a ω)"
-
-    @property
-    def cycle(self) -> float:
-        """2π."""
-        return 2 * pi
-
-    def may_rest(self) -> bool:
-        """A wall accelerates towards the ball for half of each cycle."""
-        return True
 
     def field(self, s: Scalar, state: Any) -> Any:
         """A ball on which nothing acts, seen from the box."""

@@ -6,7 +6,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, MultipleLocator
 
 from ..flow import Run, Samples
-from ..scene import AbstractScene
+from ..scene import LABELS, AbstractScene
 from .path import motion_path
 
 BLUE, RED, PINK, GREEN = "#1f4fd8", "#d62728", "#ff5fc4", "#1a9641"
@@ -19,10 +19,6 @@ def new_axes(ax: Axes | None) -> Axes:
     import matplotlib.pyplot as plt  # only here, so that drawing into given axes has no state
 
     return plt.subplots(figsize=(7, 3.5), layout="constrained")[1]
-
-
-# Of the paper's machine, where no scene is given.
-_LABELS = "Y = y/a", "V = dY/dτ"
 
 
 def plot_history(
@@ -61,7 +57,7 @@ def plot_history(
         for i, stop in enumerate(scene.stops):
             label = None if i else "stop"
             ax.axhline(stop.sign * float(stop.gap), color=GREEN, lw=1.8, label=label)
-    ax.set_ylabel((_LABELS if scene is None else scene.labels)[0])
+    ax.set_ylabel((LABELS if scene is None else scene.labels)[0])
     if unit == "cycles":
         ax.set_xlabel("drive cycles φ/(2π)")
     else:
@@ -110,7 +106,7 @@ def plot_phase_portrait(
     if scene is not None:
         for stop in scene.stops:
             ax.axvline(stop.sign * float(stop.gap), color=GREEN, lw=1.8)
-    position, velocity = _LABELS if scene is None else scene.labels
+    position, velocity = LABELS if scene is None else scene.labels
     ax.set_xlabel(position)
     ax.set_ylabel(velocity)
     return ax

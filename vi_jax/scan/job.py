@@ -25,9 +25,6 @@ from .measures import AbstractMeasure, Numbers, measures_of
 
 START = "start."
 
-# Lanes on their way at once: on a CPU they should fit its cache.
-PLACES = 256
-
 # Lanes looked at again in one go by the measures that need it.
 _AGAIN = 64
 

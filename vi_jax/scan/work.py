@@ -2,7 +2,6 @@
 
 import functools
 import math
-import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from typing import Any
@@ -20,10 +19,13 @@ from .._checks import count
 from .._programs import Program
 from ..flow.fusion import compiling
 from .grid import Blocks
-from .job import PLACES, Job
+from .job import Job
 
 # Lanes of a block on a CPU and on an accelerator.
 _MOST, _ON_ACCELERATOR = 4096, 65536
+
+# A block has a multiple of so many lanes on each device: few sizes, for few programs.
+_LEAST = 256
 
 
 def size_of(where: tuple[slice, ...]) -> int:
@@ -33,10 +35,7 @@ def size_of(where: tuple[slice, ...]) -> int:
 def worker_count(workers: int | None) -> int:
     if workers is not None:
         return count("workers", workers, least=1)
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:
-        return os.cpu_count() or 1
+    return lanes.cores()
 
 
 def block_size(total: int, workers: int, devices: int) -> int:
@@ -45,7 +44,7 @@ def block_size(total: int, workers: int, devices: int) -> int:
         most, share = _ON_ACCELERATOR * devices, total
     else:
         most, share = _MOST * devices, math.ceil(total / workers)
-    size = PLACES * devices
+    size = _LEAST * devices
     while size < min(share, most):
         size *= 2
     return size
@@ -54,7 +53,7 @@ def block_size(total: int, workers: int, devices: int) -> int:
 def rounded(lanes: int, total: int, devices: int) -> int:
     """As many lanes in a block, made full; no more than the grid has."""
     lanes = min(count("lanes", lanes, least=1), total)
-    step = PLACES * devices
+    step = _LEAST * devices
     return math.ceil(lanes / step) * step
 
 

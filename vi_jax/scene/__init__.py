@@ -7,6 +7,7 @@ from .crank import SliderCrank as SliderCrank
 from .drive import IdealDrive as IdealDrive
 from .drive import Motor as Motor
 from .parameters import Parameters as Parameters
+from .scene import LABELS as LABELS
 from .scene import MotorState as MotorState
 from .scene import Oscillator as Oscillator
 from .scene import OscillatorState as OscillatorState

@@ -27,6 +27,9 @@ from .crank import AbstractCrank, CosineCrank
 from .drive import IdealDrive, Motor
 from .stop import RigidStop
 
+# What pictures write beside Y and V.
+LABELS = "Y = y/a", "V = dY/dτ"
+
 
 class OscillatorState(eqx.Module):
     """State of an ideally driven scene."""
@@ -173,7 +176,7 @@ class Scene(AbstractScene):
     @property
     def labels(self) -> tuple[str, str]:
         """In the paper's units."""
-        return "Y = y/a", "V = dY/dτ"
+        return LABELS
 
     @property
     def turn(self) -> float:
