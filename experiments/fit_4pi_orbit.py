@@ -78,7 +78,9 @@ def flow(scene: vi.Scene) -> vi.AbstractMethod:
 
 def search(scene: vi.Scene, guess: Any, method: vi.AbstractSearch, section=0.0) -> vi.Orbit:
     """A search for the 4π motion."""
-    return vi.find_orbit(scene, guess, cycles=2, method=method, flow=flow(scene), section=section)
+    return vi.find_orbit(
+        scene, guess, cycles=2, root_finder=method, method=flow(scene), section=section
+    )
 
 
 def timed(work: Callable[[], Any], rounds: int = 5) -> tuple[Any, float]:

@@ -127,7 +127,7 @@ CALLS = {
     **{f"Newton(tolerance={x!r})": (
         lambda x=x: vi.Newton(tolerance=x), "Argument `tolerance` must be") for x in (
         np.nan, True, 1j, "a", 0.0)},
-    "method=Newton": (orbit(method=vi.Newton), "`method` must be `Newton(...)`"),
+    "root_finder=Newton": (orbit(root_finder=vi.Newton), "`root_finder` must be `Newton(...)`"),
     "boundary('x')": (lambda: vi.boundary("x", parameter="stops.0.gap", bounds=((0, 1), (0, 1))),
                       "`point` must be a `SpecialPoint`"),
     "continue_orbit('x')": (lambda: vi.continue_orbit("x", parameter=ZETA, bounds=(0, 1)),

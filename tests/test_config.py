@@ -311,7 +311,8 @@ AXES = "[axes]\ndrive.frequency_ratio = [0.8, 0.9]\nstops.0.gap = [1, 2]\n"
          "`step` in [orbit.continue] must be finite and in (0, inf), but got 0.0"),
         ("orbit", "[orbit.continue]\nparameter = 'stops.0.gap'\nbounds = [1, 3]\nmax_step = nan",
          "`max_step` in [orbit.continue] must be finite"),
-        ("orbit", "[orbit]\nmethod = 'newtn'", '`method` in [orbit] must be one of "newton"'),
+        ("orbit", "[orbit]\nroot_finder = 'newtn'",
+         '`root_finder` in [orbit] must be one of "newton"'),
         ("orbit", "[orbit]\ntolerance = -1", "`tolerance` in [orbit] must be finite"),
         ("orbit", "[orbit]\nguess = {W = 1}", "`W` in `guess` in [orbit] must be left out"),
         ("orbit", "[orbit.continue]\nparameter = 'drive.frequency_ratio'\nbounds = [1, 2]",
@@ -489,7 +490,7 @@ def test_orbit_and_its_branch(here, capsys):
 
 
 def test_an_orbit_that_is_not_found(here, capsys):
-    text = "[orbit]\nguess = { Y = 1.9, V = 1.54 }\nmethod = 'gradient'\nmax_steps = 3"
+    text = "[orbit]\nguess = { Y = 1.9, V = 1.54 }\nroot_finder = 'gradient'\nmax_steps = 3"
     assert "No orbit" in ran(capsys, "orbit", text, code=1)
 
 
@@ -498,7 +499,9 @@ def test_help_lists_the_keys(capsys):
         cli.main(["orbit", "--help"])
     assert ended.value.code == 0
     out = " ".join(capsys.readouterr().out.split())
-    assert "keys of [orbit]: cycles, guess, method" in out and "keys of [orbit.continue]:" in out
+    assert (
+        "keys of [orbit]: cycles, guess, root_finder" in out and "keys of [orbit.continue]:" in out
+    )
 
 
 def test_the_example_of_the_module_is_valid(here):

@@ -243,7 +243,7 @@ class OrbitTable:
 
     cycles: int = 1
     guess: StartTable | None = None
-    method: Literal["newton", "gradient"] = "newton"
+    root_finder: Literal["newton", "gradient"] = "newton"
     tolerance: float | None = None
     max_steps: int | None = None
     arcs: int | None = None
@@ -252,9 +252,9 @@ class OrbitTable:
 
     def search(self) -> AbstractSearch:
         """The search for the motion."""
-        options = given(self, "cycles", "guess", "method", "picture", "continue_")
+        options = given(self, "cycles", "guess", "root_finder", "picture", "continue_")
         with spoken("[orbit]"):
-            return (Newton if self.method == "newton" else Gradient)(**options)
+            return (Newton if self.root_finder == "newton" else Gradient)(**options)
 
 
 @frozen(kw_only=True)

@@ -191,8 +191,7 @@ def orbit(config: Config, tell: Tell) -> Outcome:
     if table.guess is not None:
         guess = table.guess.build(scene, "`guess` in [orbit]")
     tell(f"searching a motion of {table.cycles} cycle{'' if table.cycles == 1 else 's'}")
-    # What the library calls the method is the search here, and the file's method is the flow.
-    named = {"method": "[orbit]", "flow": "[method]", "guess": "[start]"}
+    named = {"root_finder": "[orbit]", "method": "[method]", "guess": "[start]"}
     if table.guess is not None:
         named["guess"] = "`guess` in [orbit]"
     with spoken("[orbit]", keys=keys_of(type(table)), named=named):
@@ -200,8 +199,8 @@ def orbit(config: Config, tell: Tell) -> Outcome:
             scene,
             scene.start() if guess is None else guess,
             table.cycles,
-            method=table.search(),
-            flow=method,
+            root_finder=table.search(),
+            method=method,
         )
     lines = [str(found)]
     if not bool(found.successful):
@@ -254,7 +253,7 @@ def _portrait(found: Orbit) -> Axes:
     """The phase portrait of a periodic motion."""
     ax = _axes()
     run = run_motion(
-        found.scene, found.state, int(found.cycles), method=found.flow, samples=128, impact_log=8
+        found.scene, found.state, int(found.cycles), method=found.method, samples=128, impact_log=8
     )
     scene = found.scene
     plot_phase_portrait(run, scene, ax=ax)

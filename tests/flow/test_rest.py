@@ -232,7 +232,7 @@ def test_nothing_is_lost_over_many_machines(k):
 )
 def test_one_impact_and_rest_without_restitution(method):
     body = scene(zeta=0.9, k=0.0, gap=0.8)
-    orbit = vi.find_orbit(body, body.start(Y=0.2), flow=method)
+    orbit = vi.find_orbit(body, body.start(Y=0.2), method=method)
     assert bool(orbit.successful) and int(orbit.impacts) == 1
 
 

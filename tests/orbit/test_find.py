@@ -37,8 +37,8 @@ def test_the_table_of_values(cycles):
     assert float(orbit.impact_speed[0]) == pytest.approx(speed, abs=1e-5)
     np.testing.assert_allclose(orbit.multipliers.real, np.real(multipliers), atol=1e-6)
     np.testing.assert_allclose(np.abs(orbit.multipliers.imag), np.imag(multipliers), atol=1e-6)
-    flow = vi.Adaptive(rtol=1e-11)
-    stepped = vi.find_orbit(UNDAMPED, near(UNDAMPED, cycles), cycles=cycles, flow=flow)
+    method = vi.Adaptive(rtol=1e-11)
+    stepped = vi.find_orbit(UNDAMPED, near(UNDAMPED, cycles), cycles=cycles, method=method)
     for a, b in zip(jax.tree.leaves(stepped.state), jax.tree.leaves(orbit.state), strict=True):
         assert float(a) == pytest.approx(float(b), abs=1e-8)
     np.testing.assert_allclose(stepped.multipliers, orbit.multipliers, atol=1e-8)
@@ -97,13 +97,13 @@ def test_a_grid_of_closed_forms(cycles):
 def test_optax_finds_the_start_without_transient():
     closed = vi.closed_form_orbits(UNDAMPED, cycles=2)
     guess = UNDAMPED.start(Y=1.05 * closed.Y[0], V=0.95 * closed.V[0])
-    orbit = vi.find_orbit(UNDAMPED, guess, cycles=2, method=vi.Gradient())
+    orbit = vi.find_orbit(UNDAMPED, guess, cycles=2, root_finder=vi.Gradient())
     assert bool(orbit.successful) and float(orbit.residual) < 1e-6
     assert float(orbit.history[0]) > 0.1
     run = vi.simulate(UNDAMPED, orbit.state, 500, method=vi.ExactFlight())
     for section in (run.sections.Y, run.sections.V):
         np.testing.assert_allclose(section[2:], section[:-2], atol=1e-5)
-    sgd = vi.find_orbit(UNDAMPED, guess, cycles=2, method=vi.Gradient(optax.sgd(0.05)))
+    sgd = vi.find_orbit(UNDAMPED, guess, cycles=2, root_finder=vi.Gradient(optax.sgd(0.05)))
     assert float(sgd.state.Y) == pytest.approx(float(closed.Y[0]), abs=1e-5)
 
 
@@ -156,7 +156,7 @@ def test_there_is_no_gradient_where_there_is_no_orbit():
             frequency_ratio=zeta, restitution=0.56437685, gap=1.22917006, damping_ratio=0.02
         )
         guess = scene.start(Y=0.4013157121071995, V=-0.1321048632913019)
-        return vi.find_orbit(scene, guess, method=vi.Newton(max_steps=2)).y_min
+        return vi.find_orbit(scene, guess, root_finder=vi.Newton(max_steps=2)).y_min
 
     assert np.isnan(jax.grad(lowest)(1.15136991))
 
@@ -204,7 +204,7 @@ def test_multiple_shooting_where_one_arc_cannot():
     # the search comes back from there is a matter of the last digits.
     guess = vi.find_orbit(UNDAMPED, near(UNDAMPED, 1)).state
     one = vi.find_orbit(UNDAMPED, guess, cycles=200)
-    many = vi.find_orbit(UNDAMPED, guess, cycles=200, method=vi.Newton(arcs=20))
+    many = vi.find_orbit(UNDAMPED, guess, cycles=200, root_finder=vi.Newton(arcs=20))
     assert float(many.residual) < 1e-12 and int(many.cycles) == 1
     assert many.result == vi.ORBIT_RESULTS.smaller_period
     assert float(many.state.Y) == pytest.approx(float(closed.Y[0]), abs=1e-13)
@@ -219,12 +219,12 @@ def test_edges_are_told_apart():
     np.testing.assert_allclose(twice.multipliers[0].real, TABLE[1][5][0], atol=1e-6)
     # Below ζ = 1/√2 the 2π impact motion is not yet born, and the free one passes the stop.
     scene = vi.Scene.ideal(frequency_ratio=0.72, gap=1.5, restitution=0.8)
-    none = vi.find_orbit(scene, scene.start(Y=-3.0, V=3.0), method=vi.Newton(max_steps=3))
+    none = vi.find_orbit(scene, scene.start(Y=-3.0, V=3.0), root_finder=vi.Newton(max_steps=3))
     assert none.result == results.no_orbit and "no orbit" in str(none)
     with pytest.raises(Exception, match="No orbit was found"):
         jax.block_until_ready(
             vi.find_orbit(
-                scene, scene.start(Y=-3.0, V=3.0), method=vi.Newton(max_steps=3), throw=True
+                scene, scene.start(Y=-3.0, V=3.0), root_finder=vi.Newton(max_steps=3), throw=True
             )
         )
     beyond = vi.find_orbit(
@@ -238,7 +238,7 @@ def test_edges_are_told_apart():
     ("arguments", "message"),
     [
         ({"cycles": 0}, "`cycles` must be at least 1"),
-        ({"method": vi.Newton(arcs=3), "cycles": 4}, "arcs that divides the 4 cycles"),
+        ({"root_finder": vi.Newton(arcs=3), "cycles": 4}, "arcs that divides the 4 cycles"),
     ],
 )
 def test_says_what_is_wrong(arguments, message):

@@ -118,7 +118,7 @@ def boundary(
         for b in bounds[1]:
             probe = dataclasses.replace(old, parameters=names)
             corners.append(probe.at(jnp.asarray([a, b])))
-    steps = max(old.steps, steps_of(old.flow, corners, old.like, old.cycles))
+    steps = max(old.steps, steps_of(old.method, corners, old.like, old.cycles))
     problem = dataclasses.replace(old, parameters=names, steps=steps)
     x = np.append(np.asarray(point.step.x)[:-1], values)
     scale = np.ones(problem.size)

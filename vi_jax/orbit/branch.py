@@ -129,7 +129,7 @@ def continue_orbit(
     step: float = 0.01,
     max_step: float = 0.1,
     max_points: int = 1000,
-    flow: MethodLike = None,
+    method: MethodLike = None,
 ) -> Branch:
     """Follow a periodic motion in one number of its scene, both ways, through folds.
 
@@ -148,7 +148,7 @@ def continue_orbit(
     - `step`, `max_step`: first and longest step along the branch, in the norm of the unknowns
       (positions in a, velocities in a ω, clocks in radians, the parameter in half its interval).
     - `max_points`: points in each direction at most.
-    - `flow`: the method that carries the scene, of fixed steps: by default `ExactFlight()` where it
+    - `method`: how the scene is carried, of fixed steps: by default `ExactFlight()` where it
       applies, else 32 steps of `Dopri8` a cycle.
 
     **Returns:** a `Branch`.
@@ -171,7 +171,7 @@ def continue_orbit(
         )
     for bound in (low, high):
         check_again(with_leaf(orbit.scene, parameter, bound))
-    problem, x = problem_of(orbit, parameter, (low, high), flow)
+    problem, x = problem_of(orbit, parameter, (low, high), method)
     scale = np.ones(problem.size)
     scale[-1] = 0.5 * (high - low)
     # At a fixed parameter, unless the orbit lies at a fold: then across the branch, which takes a

@@ -28,7 +28,7 @@ class CycleMap(eqx.Module):
 
     scene: AbstractScene
     """In the phase clock; a `Scene` carries the section phase."""
-    flow: AbstractMethod
+    method: AbstractMethod
     cycles: int = eqx.field(static=True)
     rests: bool = eqx.field(static=True)
     """Whether the body may come to rest on a stop."""
@@ -54,7 +54,7 @@ class CycleMap(eqx.Module):
 @by_columns
 def _end(cycle_map: CycleMap, state: Any) -> Any:
     run = simulate(
-        cycle_map.scene, state, cycle_map.cycles, method=cycle_map.flow, record="sections",
+        cycle_map.scene, state, cycle_map.cycles, method=cycle_map.method, record="sections",
         rests=cycle_map.rests,
     )  # fmt: skip
     return run.last
@@ -64,7 +64,7 @@ def cycle_map(
     scene: AbstractScene,
     cycles: int = 1,
     *,
-    flow: MethodLike = None,
+    method: MethodLike = None,
     section: Any = None,
 ) -> CycleMap:
     """The Poincaré map of `scene` over a number of drive cycles.
@@ -74,7 +74,7 @@ def cycle_map(
     - `scene`: a `Scene` with an ideal drive (2 states) or a motor (3 states), or one of your own
       whose independent variable counts its cycles.
     - `cycles`: number of drive cycles n, at least 1; static.
-    - `flow`: the method that carries the scene: by default `ExactFlight()` where it applies, else
+    - `method`: how the scene is carried: by default `ExactFlight()` where it applies, else
       `Adaptive(Tsit5(), rtol=1e-11)`, which compiles in half the time of the default solver.
     - `section`: crank angle of the section (radians) instead of the scene's own, which is 0.
 
@@ -91,11 +91,11 @@ def cycle_map(
         scene = scene.in_clock("phase")
     if section is not None:
         scene = scene.at_section(section)
-    flow = chosen(scene, flow, Adaptive(diffrax.Tsit5(), rtol=1e-11), argument="flow")
-    flow.check(scene)
+    method = chosen(scene, method, Adaptive(diffrax.Tsit5(), rtol=1e-11))
+    method.check(scene)
     # Tolerances are numbers: another one must not be another program.
     carried: AbstractMethod = jtu.tree_map(
-        lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, flow
+        lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, method
     )
     return CycleMap(scene, carried, count("cycles", cycles, least=1), scene.may_rest())
 

@@ -40,8 +40,8 @@ def find_orbit(
     guess: Any,
     cycles: int = 1,
     *,
-    method: AbstractSearch | None = None,
-    flow: MethodLike = None,
+    root_finder: AbstractSearch | None = None,
+    method: MethodLike = None,
     section: Any = None,
     impact_log: int = 8,
     throw: bool = False,
@@ -59,8 +59,8 @@ def find_orbit(
     - `guess`: a state on the section from `scene.start(...)`, or another `Orbit`. With arrays of
       one leading axis in it, every guess is searched from in one compiled call.
     - `cycles`: period in drive cycles; static.
-    - `method`: `Newton()` (default) or `Gradient(optax_optimiser)`.
-    - `flow`: the method that carries the scene: by default `ExactFlight()` where it applies, else
+    - `root_finder`: `Newton()` (default) or `Gradient(optax_optimiser)`.
+    - `method`: how the scene is carried: by default `ExactFlight()` where it applies, else
       `Adaptive(Tsit5(), rtol=1e-11)`, which compiles in half the time of the default solver.
     - `section`: crank angle of the section (radians) instead of the scene's own, which is 0. The
       guess and the orbit's states are on it; the search itself is done in eighths of a cycle
@@ -74,18 +74,18 @@ def find_orbit(
 
     **Raises:** `ValueError` or `TypeError` for arguments that cannot be used, before any work.
     """
-    method = Newton() if method is None else method
-    if not isinstance(method, AbstractSearch):
+    root_finder = Newton() if root_finder is None else root_finder
+    if not isinstance(root_finder, AbstractSearch):
         raise TypeError(
-            f"Argument `method` must be `Newton(...)` or `Gradient(...)`, but got {method!r}. The "
-            "method of integration is the argument `flow`."
+            f"Argument `root_finder` must be `Newton(...)` or `Gradient(...)`, but got "
+            f"{root_finder!r}. The integrator is the argument `method`."
         )
     impact_log, throw = count("impact_log", impact_log, least=1), flag("throw", throw)
-    the_map = cycle_map(scene, cycles, flow=flow, section=section)
-    if the_map.cycles % method.arcs:
+    the_map = cycle_map(scene, cycles, method=method, section=section)
+    if the_map.cycles % root_finder.arcs:
         raise ValueError(
-            f"Argument `method` must have a number of arcs that divides the {cycles} cycles, but "
-            f"has {method.arcs} arcs."
+            "Argument `root_finder` must have a number of arcs that divides the "
+            f"{cycles} cycles, but has {root_finder.arcs} arcs."
         )
     state = adopted(the_map.scene, guess.state if isinstance(guess, Orbit) else guess)
     shapes = {jnp.shape(leaf) for leaf in jtu.tree_leaves(state)}
@@ -95,7 +95,7 @@ def find_orbit(
             f"{sorted(shapes)}."
         )
     _check_finite(state)
-    orbit = _find(the_map, state, method, impact_log)
+    orbit = _find(the_map, state, root_finder, impact_log)
     if throw:
         orbit = eqx.error_if(orbit, ~orbit.successful, "No orbit was found; see `Orbit.result`.")
     return trimmed(orbit)
@@ -110,9 +110,9 @@ def _check_finite(state: Any) -> None:
 
 
 @compiled
-def _find(the_map: CycleMap, guess: Any, method: AbstractSearch, impact_log: int) -> Orbit:
+def _find(the_map: CycleMap, guess: Any, root_finder: AbstractSearch, impact_log: int) -> Orbit:
     def one(guess):
-        return _judged(the_map, guess, method, impact_log)
+        return _judged(the_map, guess, root_finder, impact_log)
 
     first = jtu.tree_leaves(guess)[0]
     if not first.ndim:
@@ -124,7 +124,7 @@ def _run(the_map: CycleMap, state: Any, impact_log: int) -> Run:
     """The motion with its impacts: one program for the look at the guess and for that at the orbit,
     where they are as long."""
     return simulate(
-        the_map.scene, state, the_map.cycles, method=the_map.flow, samples=_PLACES,
+        the_map.scene, state, the_map.cycles, method=the_map.method, samples=_PLACES,
         impact_log=impact_log, rests=the_map.rests,
     )  # fmt: skip
 
@@ -169,14 +169,16 @@ def _missing(arc: CycleMap, arcs: Float[Array, "arcs states"], unravel: Any) -> 
 
 
 @eqx.filter_custom_jvp
-def _root(arc: CycleMap, guess: Any, method: AbstractSearch) -> _Root:
+def _root(arc: CycleMap, guess: Any, root_finder: AbstractSearch) -> _Root:
     x, unravel = ravel_pytree(guess)
     arcs = x[None]
-    if method.arcs > 1:
-        run = simulate(arc.scene, guess, arc.cycles * method.arcs, method=arc.flow, rests=arc.rests)
+    if root_finder.arcs > 1:
+        run = simulate(
+            arc.scene, guess, arc.cycles * root_finder.arcs, method=arc.method, rests=arc.rests
+        )
         sections = jnp.stack(jtu.tree_leaves(run.sections), axis=-1)[: -1 : arc.cycles]
         arcs = jnp.where(jnp.isfinite(sections), sections, x)
-    found = search(method, lambda arcs: _missing(arc, arcs, unravel), arcs)
+    found = search(root_finder, lambda arcs: _missing(arc, arcs, unravel), arcs)
     dtype = x.dtype
     return _Root(
         found.x,
@@ -189,8 +191,8 @@ def _root(arc: CycleMap, guess: Any, method: AbstractSearch) -> _Root:
 
 @_root.def_jvp
 def _(primals, tangents):
-    arc, guess, method = primals
-    root = _root(arc, guess, method)
+    arc, guess, root_finder = primals
+    root = _root(arc, guess, root_finder)
     _, unravel = ravel_pytree(guess)
     still = jtu.tree_map(jnp.zeros_like, root)
     if not jtu.tree_leaves(tangents[0]):
@@ -237,7 +239,7 @@ def _follow(arc: CycleMap, state: Any, impact_log: int) -> _Seen:
 
         def states(x):
             run = simulate(
-                arc.scene, unravel(x), arc.cycles, method=arc.flow, record="sections",
+                arc.scene, unravel(x), arc.cycles, method=arc.method, record="sections",
                 rests=arc.rests,
             )  # fmt: skip
             return jnp.stack(jtu.tree_leaves(run.sections), axis=-1)[1:]
@@ -259,12 +261,12 @@ def _follow(arc: CycleMap, state: Any, impact_log: int) -> _Seen:
     return seen(arc, state)
 
 
-def _judged(the_map: CycleMap, guess: Any, method: AbstractSearch, impact_log: int) -> Orbit:
+def _judged(the_map: CycleMap, guess: Any, root_finder: AbstractSearch, impact_log: int) -> Orbit:
     """The orbit found from one guess, with all that is said about it."""
-    scene, arcs, cycles = the_map.scene, method.arcs, the_map.cycles
+    scene, arcs, cycles = the_map.scene, root_finder.arcs, the_map.cycles
     moved, start, place = _moved(the_map, jax.lax.stop_gradient(guess), impact_log)
     arc = dataclasses.replace(moved, cycles=cycles // arcs)
-    root = _root(arc, start, method)
+    root = _root(arc, start, root_finder)
     x, unravel = root.arcs, ravel_pytree(guess)[1]
     seen = jax.vmap(lambda x: _follow(arc, unravel(x), impact_log))(x)
     # Derivatives by the very first state: those within an arc after those of the arcs before.
@@ -300,7 +302,7 @@ def _judged(the_map: CycleMap, guess: Any, method: AbstractSearch, impact_log: i
     near = jnp.minimum(slowest, jnp.sqrt(2 * jnp.maximum(clearance, 0))) < _SLOW
     return Orbit(
         scene=scene,
-        flow=the_map.flow,
+        method=the_map.method,
         state=unravel(sections[0]),
         sections=jax.vmap(unravel)(sections),
         cycles=least,

@@ -44,7 +44,7 @@ class Orbit(eqx.Module):
 
     scene: AbstractScene
     """What moves; in the phase clock."""
-    flow: AbstractMethod
+    method: AbstractMethod
     state: Any
     """State on the section, a pytree like a start (Y in a, V in a ω, W in ω)."""
     sections: Any
@@ -138,7 +138,7 @@ class Orbit(eqx.Module):
         if cycles is None:
             cycles = int(self.cycles)
         return simulate(
-            self.scene, self.state, cycles, method=self.flow, samples=samples,
+            self.scene, self.state, cycles, method=self.method, samples=samples,
             impact_log=impact_log,
         )  # fmt: skip
 

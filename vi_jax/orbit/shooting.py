@@ -20,7 +20,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Complex, Float
 
 from .. import lanes
-from ..flow import AbstractMethod, FixedStep
+from ..flow import AbstractMethod, ExactFlight, FixedStep
 from ..flow.choice import MethodLike, chosen
 from ..flow.events import rates
 from ..scene import AbstractScene
@@ -62,7 +62,7 @@ class Shooting(eqx.Module):
     """
 
     scene: AbstractScene
-    flow: AbstractMethod
+    method: AbstractMethod
     like: Any
     """A state, for its structure."""
     cycles: int = eqx.field(static=True)
@@ -161,7 +161,7 @@ class Shooting(eqx.Module):
         """One step of the method."""
         state = self.unravel(u)
         paced = scene.pace(s0, state) is not None
-        new, after, _ = self.flow.step(scene, s0, s1, state, time if paced else None)
+        new, after, _ = self.method.step(scene, s0, s1, state, time if paced else None)
         return ravel_pytree(new)[0], time + (s1 - s0) if after is None else after
 
     def residual(self, x: Vector) -> Vector:
@@ -293,20 +293,32 @@ class Shooting(eqx.Module):
         return low, high, room, touch
 
 
-def carrier(flow: MethodLike, scene: AbstractScene) -> AbstractMethod:
-    """A method of fixed steps, which a smooth system of equations needs: `flow` if it is one, else
-    `ExactFlight` where it applies, else 32 steps of Dopri8 a cycle, whose error is 1e-13."""
-    flow = chosen(scene, flow, argument="flow")
-    if isinstance(flow, FixedStep):
-        return flow
+def carrier(asked: MethodLike, found_with: AbstractMethod, scene: AbstractScene) -> AbstractMethod:
+    """A method of fixed steps, which a smooth system of equations needs: the one asked for, else
+    that of the orbit if it is one, else `ExactFlight` where it applies, else 32 steps of Dopri8 a
+    cycle, whose error is 1e-13.
+
+    **Raises:** `ValueError` if one is asked for that has no fixed steps.
+    """
+    if asked is not None:
+        method = chosen(scene, asked)
+        if not isinstance(method, FixedStep | ExactFlight):
+            raise ValueError(
+                "Argument `method` must be of fixed steps, `FixedStep(...)` or `ExactFlight()`, "
+                f"to follow an orbit, but got {method!r}."
+            )
+        method.check(scene)
+        return method
+    if isinstance(found_with, FixedStep):
+        return found_with
     return chosen(scene, None, FixedStep(diffrax.Dopri8(), 32))
 
 
-def steps_of(flow: AbstractMethod, scenes: list[AbstractScene], like: Any, cycles: int) -> int:
+def steps_of(method: AbstractMethod, scenes: list[AbstractScene], like: Any, cycles: int) -> int:
     """Steps that a flight over the whole period needs, in the most demanding of the scenes."""
     # Turning points are looked for between steps: more of them than flying needs.
-    most = max(flow.steps_per_cycle, 16)
+    most = max(method.steps_per_cycle, 16)
     for scene in scenes:
-        limit = flow.longest(scene, jnp.zeros(()), like)
+        limit = method.longest(scene, jnp.zeros(()), like)
         most = max(most, ceil(1.02 * float(scene.cycle / limit)))
     return most * cycles

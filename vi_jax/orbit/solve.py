@@ -30,11 +30,11 @@ class Equations(Protocol):
 
 
 def problem_of(
-    orbit: Orbit, parameter: str, bounds: tuple[float, float], flow: MethodLike
+    orbit: Orbit, parameter: str, bounds: tuple[float, float], method: MethodLike
 ) -> tuple[Shooting, np.ndarray]:
     """The equations of an orbit from impact to impact, and the unknowns it gives."""
     scene = orbit.scene
-    carried = carrier(flow or orbit.flow, scene)
+    carried = carrier(method, orbit.method, scene)
     corners = [with_leaf(scene, parameter, end) for end in bounds]
     cycles = int(orbit.cycles)
     stops = tuple(int(i) for i in np.asarray(orbit.impact_stop) if i >= 0)
@@ -167,7 +167,7 @@ def orbit_of(problem: Shooting, step: Step) -> Orbit:
     duration = jnp.asarray(seen.duration)
     return Orbit(
         scene=scene,
-        flow=problem.flow,
+        method=problem.method,
         state=jax.tree.map(lambda x: x[0], sections),
         sections=sections,
         cycles=jnp.asarray(problem.cycles, jnp.int32),

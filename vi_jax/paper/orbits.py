@@ -42,7 +42,7 @@ def fit_long(scene: Scene) -> Orbit:
     descent = Gradient(
         optax.adam(optax.cosine_decay_schedule(0.02, steps)), tolerance=_FITTED, max_steps=steps
     )
-    return find_orbit(scene, guess, cycles=2, method=descent, throw=True)
+    return find_orbit(scene, guess, cycles=2, root_finder=descent, throw=True)
 
 
 def orbit_table(scenes: dict[str, Scene]) -> list[TableRow]:

@@ -79,8 +79,8 @@ def lyapunov(
     cycles = count("cycles", cycles, least=8)
     if isinstance(start, TimedMotorState):
         start = MotorState(start.Y, start.V, start.W)
-    flow = chosen(scene, method)
-    carried = cycle_map(scene, flow=flow)
+    method = chosen(scene, method)
+    carried = cycle_map(scene, method=method)
     start = adopted(carried.scene, start)
     states = ravel_pytree(start)[0].size
     number = states if number is None else count("number", number, least=1)
@@ -94,12 +94,12 @@ def lyapunov(
 
 @compiled
 def _lyapunov(the_map: CycleMap, start, cycles: int, settle, number: int) -> Lyapunov:
-    scene, flow, rests = the_map.scene, the_map.flow, the_map.rests
-    before = simulate(scene, start, 1, settle=settle, method=flow, rests=rests)
+    scene, method, rests = the_map.scene, the_map.method, the_map.rests
+    before = simulate(scene, start, 1, settle=settle, method=method, rests=rests)
     x, unravel = ravel_pytree(before.last)
 
     def image(x):
-        run = simulate(scene, unravel(x), 1, method=flow, rests=rests)
+        run = simulate(scene, unravel(x), 1, method=method, rests=rests)
         assert run.duration is not None
         out, _ = ravel_pytree(run.last)
         return out, (run.duration[0], run.result)
