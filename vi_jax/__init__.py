@@ -53,7 +53,10 @@ from .scan import scan as scan
 from .scan import sweep as sweep
 from .scene import AbstractCrank as AbstractCrank
 from .scene import AbstractScene as AbstractScene
+from .scene import AbstractSwitch as AbstractSwitch
+from .scene import Coordinate as Coordinate
 from .scene import CosineCrank as CosineCrank
+from .scene import DryFriction as DryFriction
 from .scene import IdealDrive as IdealDrive
 from .scene import Motor as Motor
 from .scene import MotorState as MotorState
@@ -63,6 +66,8 @@ from .scene import Parameters as Parameters
 from .scene import RigidStop as RigidStop
 from .scene import Scene as Scene
 from .scene import SliderCrank as SliderCrank
+from .scene import SoftStop as SoftStop
+from .scene import Switch as Switch
 from .scene import TimedMotorState as TimedMotorState
 
 if TYPE_CHECKING:

@@ -116,7 +116,7 @@ def require_ranges(part: Any) -> None:
     """`require` for every number of a module that says in `ranges` what it may be."""
     for name, range_ in part.ranges.items():
         value = getattr(part, name)
-        if value is not None:
+        if value is not None and not callable(value):
             require(name, value, **range_._asdict())
 
 
@@ -129,7 +129,7 @@ def in_range(tree: Any) -> Bool[Array, ""]:
     for part in _modules(tree):
         for name, range_ in getattr(part, "ranges", {}).items():
             value = getattr(part, name)
-            if value is not None:
+            if value is not None and not callable(value):
                 good = good & jnp.all(range_.holds(jnp.asarray(value)))
     return good
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 from ..scene.trig import horner
 from .aim import MARGIN, select
 from .events import rising_root, slope
-from .lane import FREE, SECTION, TURN, Lane, Plan
+from .lane import FREE, SECTION, Lane, Plan, to_stop, to_turn_of
 from .series import Series, at
 
 Scalar = Float[Array, ""]
@@ -48,27 +48,30 @@ def look(plan: Plan, lane: Lane, motion: Any, h: Scalar) -> tuple[Scalar, Scalar
     scene = plan.scene
     zero, none = jnp.zeros_like(h), jnp.zeros_like(h, bool)
     events: list[tuple[float, Series]] = []
-    path: Series | None = None
-    turn = none
+    paths, turns = [], []
     if plan.motion or scene.stops:
-        path = along = motion.of(scene.position)
-        speed = _slope(along)
-        turn = lane.direction * _sum(speed, h, zero) < 0
+        for k, coordinate in enumerate(scene.coordinates):
+            paths.append(motion.of(coordinate.position))
+            turn = lane.direction[k] * _sum(_slope(paths[k]), h, zero) < 0
+            # A body at rest meets nothing.
+            turns.append(turn if lane.contact is None else turn & (lane.contact[k] == 0))
         for i, stop in enumerate(scene.stops):
-            events.append((1.0 + i, _shifted(along, float(stop.sign), stop_gradient(stop.gap))))
-    if not plan.ticks(lane.state):
+            along, gap = paths[stop.coordinate], stop_gradient(stop.gap)
+            events.append((to_stop(i), _shifted(along, float(stop.sign), gap)))
+    if scene.clock(lane.state) is not None:
         bound = stop_gradient(plan.end(lane.part))
         events.append((SECTION, _shifted(motion.of(scene.clock), 1.0, bound)))
-    if lane.contact is not None:  # a body at rest meets nothing
-        turn = turn & (lane.contact == 0)
-    crossed = none
+    crossed, turned = none, none
     for _, series in events:
         crossed = crossed | (_sum(series, h, zero) > 0)
+    for turn in turns:
+        turned = turned | turn
 
     def found(_):
         # The earliest of several is met first; the chord tells well enough which that is. What lies
         # beyond a turn is met from there.
-        first, target, polynomial, facing_stop = jnp.full_like(h, jnp.inf), zero + FREE, None, none
+        first, target, polynomial = jnp.full_like(h, jnp.inf), zero + FREE, None
+        facing_stop = [none for _ in paths]
         for name, series in events:
             begin, end = _sum(series[:1], h, zero), _sum(series, h, zero)
             over = end > 0
@@ -78,14 +81,16 @@ def look(plan: Plan, lane: Lane, motion: Any, h: Scalar) -> tuple[Scalar, Scalar
             polynomial = curve if polynomial is None else select(sooner, curve, polynomial)
             target = jnp.where(sooner, name, target)
             first = jnp.where(sooner, place, first)
-            if name > 0:
-                sign = scene.stops[int(name) - 1].sign
-                facing_stop = facing_stop | over & (lane.direction == sign)
-        turns = turn & ~facing_stop
-        if path is not None:
-            facing = tuple(-lane.direction * c for c in _powers(_slope(path), h, zero))
+            if name != SECTION:
+                stop = scene.stops[int(name - to_stop(0))]
+                k = stop.coordinate
+                facing_stop[k] = facing_stop[k] | over & (lane.direction[k] == stop.sign)
+        cut = jnp.isfinite(first)
+        for k, path in enumerate(paths):
+            facing = tuple(-lane.direction[k] * c for c in _powers(_slope(path), h, zero))
             facing = (*facing, zero)
-            polynomial = facing if polynomial is None else select(turns, facing, polynomial)
+            turn = turns[k] & ~facing_stop[k]
+            polynomial = facing if polynomial is None else select(turn, facing, polynomial)
         assert polynomial is not None
         # The low orders lead near the root; what is left is a correction.
         theta = rising_root(polynomial[:7], iterations=3)
@@ -95,17 +100,21 @@ def look(plan: Plan, lane: Lane, motion: Any, h: Scalar) -> tuple[Scalar, Scalar
             better = theta - value / jnp.where(rate > 0, rate, 1.0)
             theta = jnp.where((rate > 0) & (better > 0) & (better <= 1), better, theta)
         length = theta * h
-        if path is not None:
-            if not plan.motion:
+        for k, path in enumerate(paths):
+            turn = turns[k] & ~facing_stop[k]
+            # Where only impacts matter, a turn far from the stops is passed by.
+            matters = turn
+            if not plan.motion and not scene.switches:
                 close, height = none, _sum(path, length, zero)
                 for stop in scene.stops:
-                    close = close | (stop.sign * height - stop_gradient(stop.gap) > -MARGIN)
-                turns = turns & close
-            target = jnp.where(turns, TURN, target)
-        cut = turns | (jnp.isfinite(first) & ~turn) | (facing_stop & turn)
+                    if stop.coordinate == k:
+                        close = close | (stop.beyond(height) > -MARGIN)
+                matters = turn & close
+            target = jnp.where(matters, to_turn_of(k), target)
+            cut = jnp.where(turn, matters, cut)
         return jnp.where(cut, length, h), jnp.where(cut, target, FREE)
 
-    return jax.lax.cond(crossed | turn, found, lambda _: (h, jnp.full_like(h, FREE)), None)
+    return jax.lax.cond(crossed | turned, found, lambda _: (h, jnp.full_like(h, FREE)), None)
 
 
 def _sum(series: Series, h: Scalar, zero: Scalar) -> Scalar:

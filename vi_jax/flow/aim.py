@@ -1,6 +1,6 @@
 """Where the next step should end: at the earliest event that a tried step ran past."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,11 +10,14 @@ from jaxtyping import Array, Bool, Float
 
 from ..lanes import pin
 from .events import Rates, quintic, rising_root, slope
-from .lane import FREE, RELEASE, TURN, Lane, Plan
-from .trial import Trial, to_turn
+from .lane import FREE, Lane, Plan, to_release, to_turn_of
+from .trial import Crossing, Path, Trial, to_turn
 
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]
+
+# A hump of a guard this close to an end of a step (as a share of it) is seen from there.
+_BRIEF = 1e-3
 
 # Turning points this far inside the gap (unit: a) are passed by where only impacts matter.
 MARGIN = 0.02
@@ -29,7 +32,7 @@ def aim_at(plan: Plan, lane: Lane, trial: Trial) -> tuple[Flag, Scalar, Scalar]:
     """Whether to shorten the step, to what length, and at what it then aims."""
     h = stop_gradient(trial.h)
     nothing = jnp.zeros_like(trial.good), h, jnp.full_like(h, FREE)
-    if trial.position is None and not trial.crossings:
+    if not trial.paths and not trial.crossings:
         return nothing
     # Rare: skipped where no lane of a group has met anything.
     return jax.lax.cond(
@@ -39,25 +42,58 @@ def aim_at(plan: Plan, lane: Lane, trial: Trial) -> tuple[Flag, Scalar, Scalar]:
 
 def _met_something(plan: Plan, lane: Lane, trial: Trial) -> Flag:
     """Whether `_aimed` has anything to say, or may have."""
-    met = trial.good & (lane.target != FREE) & ~trial.at_turn
+    met = trial.good & (lane.target != FREE) & ~at_a_turn(trial)
     for c in trial.crossings:
         met = met | trial.good & (c.end.x > 0) & ~c.landed | c.again
-    if trial.position is not None:
-        begin, end = stop_gradient(trial.position)
+        if c.kind == "switch":
+            met = met | trial.good & _hump(c, stop_gradient(trial.h))[0]
+    for path, direction in zip(trial.paths, lane.direction, strict=False):
+        begin, end = stop_gradient((path.begin, path.end))
         if not plan.method.sees_ahead:
-            met = met | trial.good & (lane.direction * end.v < 0) & ~trial.at_turn
-        twice = _may_turn_twice(lane, trial, begin, end, stop_gradient(trial.h))
+            met = met | trial.good & (direction * end.v < 0) & ~path.at_turn
+        twice = _may_turn_twice(direction, path.surge, begin, end, stop_gradient(trial.h))
         met = met | trial.good & twice
-    return jnp.ones_like(met) if trial.leaves is not None else met
+    rests = any(path.leaves is not None for path in trial.paths)
+    return jnp.ones_like(met) if rests else met
+
+
+def at_a_turn(trial: Trial) -> Flag:
+    """Whether the step met a turning point that it was aimed at."""
+    met = jnp.zeros_like(trial.good)
+    for path in trial.paths:
+        met = met | path.at_turn
+    return met
+
+
+class _Goal(NamedTuple):
+    """Where the next step ends."""
+
+    aim: Flag
+    """At an event that was crossed."""
+    turn: Flag
+    """At a turning point."""
+    shorter: Flag
+    """Short of where something may have happened twice."""
+    length: Scalar
+    target: Scalar
+
+    def instead(self, when: Flag, length: Scalar, target: float, **flags: Any) -> "_Goal":
+        """Another length and target where `when` holds."""
+        return self._replace(
+            length=jnp.where(when, length, self.length),
+            target=jnp.where(when, target, self.target),
+            **flags,
+        )
 
 
 def _aimed(plan: Plan, lane: Lane, trial: Trial) -> tuple[Flag, Scalar, Scalar]:
     h = stop_gradient(trial.h)
     none = jnp.zeros_like(trial.good)
     # The earliest of several events is met first. The chord tells well enough which that is: a
-    # landing that lies beyond another stop is not accepted.
-    first, target = jnp.full_like(h, jnp.inf), jnp.full_like(h, TURN)
-    polynomial, crossed, landed, facing_stop = None, none, none, none
+    # landing that lies beyond another event is not accepted.
+    first, target = jnp.full_like(h, jnp.inf), jnp.full_like(h, FREE)
+    polynomial, crossed, landed = None, none, none
+    facing_stop = [none for _ in trial.paths]
     for c in trial.crossings:
         over = trial.good & (c.end.x > 0)
         rise = jnp.where(over, c.end.x - c.begin.x, 1.0)
@@ -68,81 +104,130 @@ def _aimed(plan: Plan, lane: Lane, trial: Trial) -> tuple[Flag, Scalar, Scalar]:
         target = jnp.where(sooner, c.name, target)
         first = jnp.where(sooner, place, first)
         crossed, landed = crossed | over, landed | c.landed
-        if c.name > 0:
-            sign = plan.scene.stops[int(c.name) - 1].sign
-            facing_stop = facing_stop | (over & (lane.direction == sign))
-    aim, turn, path, wiggle = crossed & ~landed, none, None, none
-    if trial.position is not None:
-        begin, end = trial.position
-        path = quintic(begin, end, h)
-        facing = tuple(-lane.direction * c for c in slope(path))
+        if c.kind == "stop":
+            stop = plan.scene.stops[c.number]
+            k = stop.coordinate
+            facing_stop[k] = facing_stop[k] | (over & (lane.direction[k] == stop.sign))
+    turns, curves = [], []
+    for k, path in enumerate(trial.paths):
+        curves.append(quintic(path.begin, path.end, h))
+        facing = tuple(-lane.direction[k] * c for c in slope(curves[k]))
         # The motion turned within the step. Unless it went through a stop before, that comes
         # first: what lies beyond the turn is met from there.
-        turn = trial.good & (lane.direction * end.v < 0) & ~trial.at_turn & ~facing_stop
-        polynomial = facing if polynomial is None else select(turn, facing, polynomial)
+        turned = trial.good & (lane.direction[k] * path.end.v < 0)
+        turns.append(turned & ~path.at_turn & ~facing_stop[k])
+        polynomial = facing if polynomial is None else select(turns[k], facing, polynomial)
+        target = jnp.where(turns[k], to_turn_of(k), target)
     assert polynomial is not None
     theta = pin(rising_root(stop_gradient(polynomial)))
-    attempt = theta * h
-    if path is not None and trial.position is not None:
-        if not plan.motion:
-            height = stop_gradient(path[0])
-            for n in range(1, len(path)):
-                height = height + stop_gradient(path[n]) * theta**n
-            close = crossed | landed
-            for stop in plan.scene.stops:
-                close = close | (stop.sign * height - stop.gap > -MARGIN)
-            turn = turn & close
-        wiggle = trial.good & _may_turn_twice(lane, trial, *stop_gradient(trial.position), h)
-        wiggle = wiggle & ~(aim | turn | landed | trial.at_turn)
+    goal = _Goal(crossed & ~landed, none, none, theta * h, target)
+    for k, path in enumerate(trial.paths):
+        turn = turns[k]
+        if not plan.motion and not plan.scene.switches:
+            turn = turn & (crossed | landed | _near_a_stop(plan, k, curves[k], theta))
+        goal = goal._replace(turn=goal.turn | turn)
         # Newton's step is better than the quintic once it is short.
-        shift = to_turn(trial.position[1])
-        again = turn & (lane.target == TURN) & (jnp.abs(shift) < 0.25 * h)
-        attempt = jnp.where(again, h + shift, attempt)
+        shift = to_turn(path.end)
+        again = turn & (lane.target == to_turn_of(k)) & (jnp.abs(shift) < 0.25 * h)
+        goal = goal._replace(length=jnp.where(again, h + shift, goal.length))
+    busy = goal.aim | goal.turn | landed | at_a_turn(trial)
+    for k, path in enumerate(trial.paths):
+        begin, end = stop_gradient((path.begin, path.end))
+        twice = trial.good & _may_turn_twice(lane.direction[k], path.surge, begin, end, h)
+        goal = goal._replace(shorter=goal.shorter | twice & ~busy)
     for c in trial.crossings:
-        again = c.again & ~turn
-        aim = aim | again
-        attempt = jnp.where(again, h + stop_gradient(c.offset), attempt)
-        target = jnp.where(again, c.name, target)
-    target = jnp.where(turn, TURN, jnp.where(wiggle, FREE, target))
-    attempt = jnp.where(wiggle, 0.5 * h, attempt)
-    if trial.surge is not None and trial.position is not None:
+        again = c.again & ~goal.turn
+        goal = goal.instead(again, h + stop_gradient(c.offset), c.name, aim=goal.aim | again)
+    goal = goal.instead(goal.shorter, 0.5 * h, FREE)
+    for c in trial.crossings:
+        if c.kind == "switch":
+            above, place = _hump(c, h)
+            above = above & trial.good & ~(goal.aim | goal.shorter | landed)
+            goal = goal.instead(
+                above, place, FREE, turn=goal.turn & ~above, shorter=goal.shorter | above
+            )
+    for k, path in enumerate(trial.paths):
+        goal = _at_rest(lane, trial, goal, k, path, landed)
+    return goal.aim | goal.turn | goal.shorter, stop_gradient(goal.length), goal.target
+
+
+def _hump(c: Crossing, h: Scalar) -> tuple[Flag, Scalar]:
+    """Whether a guard that is negative at both ends may have been positive in between, and where
+    it was greatest. The tangents at both ends bound a hump that is curved one way."""
+    begin, end = stop_gradient((c.begin, c.end))
+    rises = (begin.x < 0) & (end.x < 0) & (begin.v > 0) & (end.v < 0)
+    fall = jnp.where(rises, begin.v - end.v, 1.0)
+    place = h * begin.v / fall
+    bound = begin.x + begin.v * (end.x - end.v * h - begin.x) / fall
+    brief = _BRIEF * h
+    return rises & (bound > 0) & (place > brief) & (h - place > brief), place
+
+
+def _near_a_stop(plan: Plan, k: int, curve: tuple, theta: Scalar) -> Flag:
+    """Whether a turn comes close to a stop: where only impacts matter, others are passed by."""
+    height = stop_gradient(curve[0])
+    for n in range(1, len(curve)):
+        height = height + stop_gradient(curve[n]) * theta**n
+    close = jnp.zeros_like(theta, bool)
+    for stop in plan.scene.stops:
+        if stop.coordinate == k:
+            close = close | (stop.beyond(height) > -MARGIN)
+    return close
+
+
+def _at_rest(lane: Lane, trial: Trial, goal: _Goal, k: int, path: Path, landed: Flag) -> _Goal:
+    """The goal, where the force on a body that can rest is what matters first."""
+    h = stop_gradient(trial.h)
+    if path.surge is not None:
         # What the step met may not have been the first: look at the turn of the force before.
-        hidden, place = _force_may_turn(lane, *stop_gradient(trial.position), *trial.surge, h)
-        hidden = hidden & trial.good & ~(landed | trial.at_turn)
-        aim, turn, wiggle = aim & ~hidden, turn & ~hidden, wiggle | hidden
-        attempt = jnp.where(hidden, place, attempt)
-        target = jnp.where(hidden, FREE, target)
-    if trial.leaves is not None:
-        left, released, place, _ = trial.leaves
-        aim, turn, wiggle = aim & ~released | left, turn & ~left, wiggle & ~left
-        attempt = jnp.where(left, place, attempt)
-        target = jnp.where(left, RELEASE, target)
-    return aim | turn | wiggle, stop_gradient(attempt), target
+        begin, end = stop_gradient((path.begin, path.end))
+        hidden, place = _force_may_turn(lane, k, begin, end, *path.surge, h)
+        hidden = hidden & trial.good & ~(landed | at_a_turn(trial))
+        goal = goal.instead(
+            hidden, place, FREE,
+            aim=goal.aim & ~hidden, turn=goal.turn & ~hidden, shorter=goal.shorter | hidden,
+        )  # fmt: skip
+    if path.leaves is not None:
+        left, released = path.leaves.left, path.leaves.landed
+        goal = goal.instead(
+            left, path.leaves.place, to_release(k),
+            aim=goal.aim & ~released | left, turn=goal.turn & ~left, shorter=goal.shorter & ~left,
+        )  # fmt: skip
+    return goal
 
 
-def _may_turn_twice(lane: Lane, trial: Trial, begin: Rates, end: Rates, h: Scalar) -> Flag:
+def _may_turn_twice(
+    direction: Scalar, surge: tuple | None, begin: Rates, end: Rates, h: Scalar
+) -> Flag:
     """Whether the velocity, of one sign at both ends, dips so deep that it may have been zero.
 
     Such a step is halved until the turns lie apart or the dip is too short to matter. Where the
     force's rate of change is known, a force that sags between the ends is not taken for straight.
     """
-    a0, a1 = lane.direction * begin.a, lane.direction * end.a
+    a0, a1 = direction * begin.a, direction * end.a
     dips = (a0 < 0) & (a1 > 0) & (h > 1e-3)
     drop = 0.5 * h * a0 * (a0 / jnp.where(dips, a0 - a1, 1.0))
-    if trial.surge is not None:
-        j0, j1 = lane.direction * trial.surge[0], lane.direction * trial.surge[1]
+    if surge is not None:
+        j0, j1 = direction * surge[0], direction * surge[1]
         sags = dips & (j0 * h < a1 - a0) & (a1 - a0 < j1 * h)
         corner = jnp.where(sags, a1 - j1 * h - a0, 0.0) / jnp.where(sags, j0 - j1, 1.0)
         low = a0 + j0 * corner
         deep = 0.5 * corner * (a0 + low) - 0.5 * low * low / jnp.where(sags, j1, 1.0)
         flat = -0.5 * a0 * a0 / jnp.where(sags & (low >= 0), j0, 1.0)
         drop = jnp.where(sags, jnp.where(low < 0, deep, flat), drop)
-    lowest = lane.direction * begin.v + drop
-    return dips & (lowest < 0.1 * lane.direction * (begin.v + end.v))
+    lowest = direction * begin.v + drop
+    return dips & (lowest < 0.1 * direction * (begin.v + end.v))
 
 
 def _force_may_turn(
-    lane: Lane, begin: Rates, end: Rates, rate0: Scalar, rate1: Scalar, brief: Scalar, h: Scalar
+    lane: Lane,
+    k: int,
+    begin: Rates,
+    end: Rates,
+    rate0: Scalar,
+    rate1: Scalar,
+    brief: Scalar,
+    h: Scalar,
 ) -> tuple[Flag, Scalar]:
     """Whether the force, of one sign at both ends, may have had the other in between for a body
     that is slow enough to notice, and where it turned.
@@ -158,7 +243,8 @@ def _force_may_turn(
     hidden = turns & (a0 * a1 >= 0) & (bound * (a0 + a1) < 0)
     if lane.contact is not None:
         # At rest the step may begin, to rounding, where the window does.
-        pressed = (lane.contact > 0) & (lane.direction * a1 >= 0) & (lane.direction * bound < 0)
+        direction = lane.direction[k]
+        pressed = (lane.contact[k] > 0) & (direction * a1 >= 0) & (direction * bound < 0)
         hidden = hidden | (turns & pressed)
     largest = jnp.maximum(jnp.maximum(jnp.abs(a0), jnp.abs(a1)), jnp.abs(bound))
     slow = jnp.minimum(jnp.abs(begin.v), jnp.abs(end.v)) <= largest * h

@@ -48,7 +48,7 @@ def _named(scene: AbstractScene | None, name: str, argument: str) -> AbstractMet
     steps, tolerance = _PRESETS[one_of(argument, name, tuple(_PRESETS))]
     if scene is not None and _flies(scene):
         return ExactFlight()
-    if scene is None or isinstance(scene, Scene):
+    if scene is None or (isinstance(scene, Scene) and not scene.soft_stops):
         return FixedStep(diffrax.Dopri8(), steps)
     return Adaptive(diffrax.Dopri8(), rtol=tolerance)
 

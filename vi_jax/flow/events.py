@@ -33,16 +33,26 @@ def rates(
     field: Callable[[Scalar, Any], Any], coordinate: Callable[[Any], Scalar], s: Scalar, state: Any
 ) -> Rates:
     """Rates of `coordinate(state)` along the flow of `field`, by two forward derivatives."""
+    return guard_rates(field, lambda _, state: coordinate(state), s, state)
+
+
+def guard_rates(
+    field: Callable[[Scalar, Any], Any],
+    guard: Callable[[Scalar, Any], Scalar],
+    s: Scalar,
+    state: Any,
+) -> Rates:
+    """Rates of `guard(s, state)` along the flow of `field`, by two forward derivatives."""
     one = jnp.ones_like(s)
 
     def first(s, state):
-        return jax.jvp(coordinate, (state,), (field(s, state),))
+        return jax.jvp(guard, (s, state), (one, field(s, state)))
 
     (x, v), (_, a) = jax.jvp(first, (s, state), (one, field(s, state)))
     return Rates(x, v, a)
 
 
-def force_rate(scene: Any, holding: Any, s: Scalar, state: Any) -> Scalar:
+def force_rate(scene: Any, position: Any, holding: Any, s: Scalar, state: Any) -> Scalar:
     """d/ds of the acceleration that a free body would have, along the flow of `holding`.
 
     A constant for differentiation: it tells where to look.
@@ -50,7 +60,7 @@ def force_rate(scene: Any, holding: Any, s: Scalar, state: Any) -> Scalar:
     s, state = jax.lax.stop_gradient((s, state))
 
     def force(s, state):
-        return rates(scene.field, scene.position, s, state).a
+        return rates(scene.field, position, s, state).a
 
     flow = holding.field(s, state)
     return jax.lax.stop_gradient(jax.jvp(force, (s, state), (jnp.ones_like(s), flow))[1])

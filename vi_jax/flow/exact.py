@@ -65,6 +65,12 @@ class ExactFlight(AbstractMethod):
                 f"`{type(scene.crank).__name__}`. Use `Adaptive` or `FixedStep`."
             )
 
+        if scene.soft_stops:
+            raise ValueError(
+                "Method `ExactFlight` needs a scene without soft stops, but it has "
+                f"{len(scene.soft_stops)}. Use `Adaptive` or `FixedStep`."
+            )
+
     def step(self, scene, s0, s1, state, time):
         """The flight from `s0` to `s1`, exact to rounding."""
         assert isinstance(scene, Scene)

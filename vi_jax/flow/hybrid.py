@@ -25,10 +25,11 @@ from ..lanes import pin, pin_flag
 from . import results
 from .ahead import ahead
 from .aim import aim_at, select
-from .lane import FREE, SECTION, Lane, Plan, Record, total
-from .rest import settled
+from .lane import FREE, Lane, Plan, Record, to_stop, to_turn_of, total
+from .moving import struck_modes
+from .rest import Release, settled
 from .taylor import Taylor
-from .trial import Crossing, Trial, attempt, held, timing
+from .trial import Crossing, Path, Trial, attempt, held, timing
 
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]
@@ -78,6 +79,9 @@ def iterate(plan: Plan, lane: Lane) -> Step:
     s = jnp.where(turned, 0.0, s)
     if not plan.ticks(state):
         state = select(turned, plan.scene.rewound(state), state)
+    renewed = plan.scene.renewed(state)
+    if renewed is not state:
+        state = select(turned, renewed, state)
     of_interval = record
     record = select(completed, plan.fresh(state), record)
 
@@ -114,9 +118,10 @@ class Arrival(NamedTuple):
     s: Scalar
     state: Any
     time: Scalar | None
-    direction: Scalar
-    contact: Scalar | None
-    """The stop rested on."""
+    direction: tuple[Scalar, ...]
+    contact: tuple[Scalar, ...] | None
+    """The stops rested on."""
+    modes: tuple[Scalar, ...]
     impacts: Scalar
     speed: Scalar | None
     loss: Scalar | None
@@ -128,22 +133,31 @@ class Arrival(NamedTuple):
 
 def _arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Flag]:
     """The lane where the step leads, its record kept, and whether the interval is complete."""
-    old, direction = lane.record, lane.direction
-    if trial.position is not None:
-        v = stop_gradient(trial.position[1].v)
-        direction = jnp.where(v == 0, direction, jnp.sign(v))
-        # Here the sign of the velocity is rounding's.
-        direction = jnp.where(trial.at_turn, -lane.direction, direction)
+    old = lane.record
+    direction = []
+    for k, along in enumerate(lane.direction):
+        if trial.paths:
+            v = stop_gradient(trial.paths[k].end.v)
+            turned = jnp.where(v == 0, along, jnp.sign(v))
+            # At a turn the sign of the velocity is rounding's.
+            away = -along
+            if plan.scene.switches or plan.scene.section(lane.state) is not None:
+                # Where a turn is another event too, it may have been met before.
+                met_before = lane.target != to_turn_of(k)
+                away = jnp.where(met_before, stop_gradient(jnp.sign(trial.paths[k].end.a)), away)
+            along = jnp.where(trial.paths[k].at_turn, away, turned)
+        direction.append(along)
     arrival = Arrival(
-        trial.s, trial.state, trial.time, direction, lane.contact,
+        trial.s, trial.state, trial.time, tuple(direction), lane.contact, lane.modes,
         old.impacts, old.speed, old.loss, old.rests, old.log, trial.ends_interval,
     )  # fmt: skip
     if trial.crossings:
         met = jnp.zeros_like(taken)
         for c in trial.crossings:
             met = met | c.landed
-        if trial.leaves is not None:
-            met = met | trial.leaves[1]
+        for path in trial.paths:
+            if path.leaves is not None:
+                met = met | path.leaves.landed
         # Rare: skipped where no lane of a group has met anything.
         arrival = jax.lax.cond(
             met, lambda x: _met(plan, lane, trial, taken, x), lambda x: x, arrival
@@ -152,13 +166,13 @@ def _arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Fl
     time = arrival.time
     if time is not None and old.time is not None:
         time = jnp.where(taken, time, old.time)
-    contact = arrival.contact
     there = dataclasses.replace(
         lane,
         s=jnp.where(taken, arrival.s, lane.s),
         state=select(taken, arrival.state, lane.state),
-        direction=jnp.where(taken, arrival.direction, lane.direction),
-        contact=None if contact is None else select(taken, contact, lane.contact),
+        direction=select(taken, arrival.direction, lane.direction),
+        contact=select(taken, arrival.contact, lane.contact),
+        modes=select(taken, arrival.modes, lane.modes),
         record=Record(
             time, y_max, y_min, arrival.impacts, arrival.speed, arrival.loss, arrival.rests,
             arrival.log, clearance,
@@ -168,11 +182,15 @@ def _arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Fl
 
 
 def _met(plan: Plan, lane: Lane, trial: Trial, taken: Flag, arrival: Arrival) -> Arrival:
-    """What the event makes of a step that met one: the last part of its way, and the jump."""
+    """What the event makes of a step that met one: the last part of its way, and the jump.
+
+    Of events met together the stops come first, in their order, then the switches, then the
+    section.
+    """
     flow, bend = _flow_and_bend(trial.holding, arrival.time is not None, trial.s, trial.state)
     for c in trial.crossings:
         offset = jnp.where(c.landed, c.offset, 0.0)
-        if c.name != SECTION and plan.ticks(lane.state):
+        if c.kind != "section" and plan.ticks(lane.state):
             # Met on the section it is not beyond it.
             beyond = stop_gradient(trial.s + offset - plan.end(lane.part))
             offset = offset - jnp.maximum(beyond, 0.0)
@@ -181,24 +199,61 @@ def _met(plan: Plan, lane: Lane, trial: Trial, taken: Flag, arrival: Arrival) ->
             (trial.state, arrival.time), flow, bend,
         )  # fmt: skip
         arrival = arrival._replace(s=arrival.s + offset, time=passed)
-        if c.name == SECTION:
+        if c.kind == "section":
             arrival = arrival._replace(
                 completed=arrival.completed | c.landed,
                 state=select(c.landed, there, arrival.state),
             )
+        elif c.kind == "switch":
+            arrival = _switched(plan, lane, trial, taken, arrival, c, there)
         else:
             arrival = _impact(plan, lane, trial, taken, arrival, c, there, flow)
-    if trial.leaves is None:
-        return arrival
+    for k, path in enumerate(trial.paths):
+        if path.leaves is not None:
+            arrival = _released(lane, arrival, k, path.leaves, flow)
+    return arrival
+
+
+def _released(lane: Lane, arrival: Arrival, k: int, leaves: Release, flow: Any) -> Arrival:
+    """Coordinate number k free again."""
     assert arrival.contact is not None
-    _, released, _, offset = trial.leaves
+    offset, free = leaves.offset, leaves.landed
     state, time = jtu.tree_map(lambda x, dx: x + offset * dx, (arrival.state, arrival.time), flow)
+    direction = jnp.where(free, -lane.direction[k], arrival.direction[k])
     return arrival._replace(
         s=arrival.s + offset,
         state=state,
         time=time,
-        direction=jnp.where(released, -lane.direction, arrival.direction),
-        contact=jnp.where(released, 0.0, arrival.contact),
+        direction=_put(arrival.direction, k, direction),
+        contact=_put(arrival.contact, k, jnp.where(free, 0.0, arrival.contact[k])),
+    )
+
+
+def _put(values: tuple, k: int, value: Any) -> tuple:
+    return (*values[:k], value, *values[k + 1 :])
+
+
+def _switched(
+    plan: Plan, lane: Lane, trial: Trial, taken: Flag, arrival: Arrival, c: Crossing, there: Any
+) -> Arrival:
+    """The next mode of a switch that changed in the state `there`."""
+    scene, j = plan.scene, c.number
+    state, mode = scene.switches[j].after(scene, arrival.s, there, lane.modes[j])
+    mode = stop_gradient(jnp.asarray(mode, arrival.s.dtype))
+    log = arrival.log
+    if plan.log_switches:
+        clock = scene.clock(there)
+        log = _logged(
+            log, taken & c.landed, arrival.impacts, arrival.s if clock is None else clock,
+            jnp.zeros_like(arrival.s), len(scene.stops) + j,
+        )  # fmt: skip
+        # Listed as an impact is, and so counted.
+        count = jnp.where(taken & c.landed, 1.0, 0.0)
+        arrival = arrival._replace(impacts=arrival.impacts + count)
+    return arrival._replace(
+        state=select(c.landed, state, arrival.state),
+        modes=_put(arrival.modes, j, jnp.where(c.landed, mode, arrival.modes[j])),
+        log=log,
     )
 
 
@@ -207,41 +262,57 @@ def _impact(
     c: Crossing, there: Any, flow: Any,
 ) -> Arrival:  # fmt: skip
     """The rebound from a stop in `there`, the state of the impact; or coming to rest on it."""
-    scene, index = plan.scene, int(c.name) - 1
-    stop = scene.stops[index]
-    s, state, time, direction = arrival.s, arrival.state, arrival.time, arrival.direction
+    scene, stop = plan.scene, plan.scene.stops[c.number]
+    k = stop.coordinate
+    body = scene.coordinates[k]
+    s, state, time, direction = arrival.s, arrival.state, arrival.time, arrival.direction[k]
     contact, rests, met = arrival.contact, arrival.rests, s
-    approach = jnp.maximum(stop.sign * scene.velocity(there), 0.0)
-    rebound = -stop.sign * stop.restitution * approach
-    state = select(c.landed, scene.placed(there, stop.sign * stop.gap, rebound), state)
+    approach = jnp.maximum(stop.approach(body.velocity(there)), 0.0)
+    rebound = stop.rebound(stop.sign * approach)
+    state = select(c.landed, body.placed(there, stop.place, rebound), state)
     direction = jnp.where(c.landed, -float(stop.sign), direction)
     hit = taken & c.landed
-    lost = 0.5 * (1 - stop.restitution**2) * approach**2
-    if contact is not None and trial.position is not None:
-        arriving = stop.sign * trial.position[1].v
-        last, left = settled(plan, lane, stop, arriving, s, there)
+    lost = stop.loss(approach)
+    if contact is not None:
+        arriving = stop.approach(trial.paths[k].end.v)
+        last, left = settled(plan, lane, trial.free, stop, arriving, s, there)
         ends = pin_flag(c.landed & last, s)
         lost = jnp.where(ends, 0.5 * approach**2, lost)
         wait = pin(jnp.where(ends, left, 0.0))
         (later, passed) = jtu.tree_map(lambda x, dx: x + wait * dx, (state, time), flow)
-        still = scene.placed(later, stop.sign * stop.gap, jnp.zeros_like(s))
+        still = body.placed(later, stop.place, jnp.zeros_like(s))
         state = select(ends, still, state)
         time = select(ends, passed, time)
         s = s + wait
-        contact = jnp.where(ends, float(c.name), contact)
+        contact = _put(contact, k, jnp.where(ends, to_stop(c.number), contact[k]))
         direction = jnp.where(ends, float(stop.sign), direction)
         if rests is not None:
             rests = rests + jnp.where(taken & ends, 1.0, 0.0)
+    if not _is_one(body.mass):
+        lost = body.mass * lost
+    directions = _put(arrival.direction, k, direction)
+    for j, other in enumerate(scene.coordinates):
+        if j != k:  # it may share a body with the one that was hit
+            v = stop_gradient(other.velocity(state))
+            struck = c.landed & (v != 0)
+            turned = jnp.where(struck, jnp.sign(v), directions[j])
+            directions = _put(directions, j, turned)
+            if contact is not None:
+                contact = _put(contact, j, jnp.where(struck, 0.0, contact[j]))
+    modes = arrival.modes
+    if modes:
+        modes = select(c.landed, struck_modes(scene, s, state, modes), modes)
     clock, speed, loss = scene.clock(there), arrival.speed, arrival.loss
     log = _logged(
-        arrival.log, hit, arrival.impacts, met if clock is None else clock, approach, index
+        arrival.log, hit, arrival.impacts, met if clock is None else clock, approach, c.number
     )
     return arrival._replace(
         s=s,
         state=state,
         time=time,
-        direction=direction,
+        direction=directions,
         contact=contact,
+        modes=modes,
         impacts=arrival.impacts + jnp.where(hit, 1.0, 0.0),
         speed=None if speed is None else jnp.where(hit, jnp.maximum(speed, approach), speed),
         loss=None if loss is None else loss + jnp.where(hit, lost, 0.0),
@@ -250,26 +321,37 @@ def _impact(
     )
 
 
+def _is_one(mass: Any) -> bool:
+    return isinstance(mass, float) and mass == 1.0
+
+
 def _reached(
     plan: Plan, lane: Lane, trial: Trial, taken: Flag, state: Any
 ) -> tuple[Scalar | None, Scalar | None, Scalar | None]:
     """Greatest and smallest Y so far, and the smallest distance at a turn that met no stop."""
     record = lane.record
     y_max, y_min, clearance = record.y_max, record.y_min, record.clearance
-    if y_max is None or y_min is None or trial.position is None:
+    if y_max is None or y_min is None or not trial.paths:
         return y_max, y_min, clearance
-    end = trial.position[1]
-    bend = jnp.where(end.a == 0, 1.0, end.a)
-    top = end.x - jnp.where(trial.at_turn, 0.5 * end.v**2 / bend, 0.0)
-    reached = jnp.where(trial.at_turn, top, plan.scene.position(state))
+    tops = [_top(path) for path in trial.paths]
+    at_turn = trial.paths[0].at_turn
+    reached = jnp.where(at_turn, tops[0], plan.scene.position(state))
     if clearance is not None:
         for stop in plan.scene.stops:
-            short = taken & trial.at_turn & (lane.direction == stop.sign)
-            room = jnp.where(short, stop.gap - stop.sign * top, jnp.inf)
+            k = stop.coordinate
+            short = taken & trial.paths[k].at_turn & (lane.direction[k] == stop.sign)
+            room = jnp.where(short, -stop.beyond(tops[k]), jnp.inf)
             clearance = jnp.minimum(clearance, room)
     y_max = jnp.where(taken, jnp.maximum(y_max, reached), y_max)
     y_min = jnp.where(taken, jnp.minimum(y_min, reached), y_min)
     return y_max, y_min, clearance
+
+
+def _top(path: Path) -> Scalar:
+    """The coordinate at the turning point that a step was aimed at, or else at its end."""
+    end = path.end
+    bend = jnp.where(end.a == 0, 1.0, end.a)
+    return end.x - jnp.where(path.at_turn, 0.5 * end.v**2 / bend, 0.0)
 
 
 @jax.custom_jvp

@@ -10,14 +10,34 @@ from jaxtyping import Array, Float
 
 from ..scene import AbstractScene
 from . import results
-from .events import rates
+from .events import Rates, rates
 from .methods import AbstractMethod
+from .moving import begin_modes, in_modes
 
 Scalar = Float[Array, ""]
 
-# What the next step aims at: nothing, a turning point, the section, the release of a body at rest,
-# or 1 + i for stop number i.
-FREE, TURN, SECTION, RELEASE = 0.0, -1.0, -2.0, -3.0
+# What the next step aims at: nothing, the section, or one of those below.
+FREE, SECTION = 0.0, -1.0
+
+
+def to_stop(i: int) -> float:
+    """Name of the impact on stop number i."""
+    return 1.0 + i
+
+
+def to_switch(j: int) -> float:
+    """Name of the event of switch number j."""
+    return 101.0 + j
+
+
+def to_turn_of(k: int) -> float:
+    """Name of a turning point of coordinate number k."""
+    return -2.0 - 2 * k
+
+
+def to_release(k: int) -> float:
+    """Name of the release of coordinate number k from the stop on which it rests."""
+    return -3.0 - 2 * k
 
 
 def total(tree: Any, start: Scalar) -> Scalar:
@@ -49,10 +69,12 @@ class Lane(eqx.Module):
     s: Scalar
     state: Any
     record: Record
-    direction: Scalar
-    """Sign of the velocity since the last turn or impact."""
-    contact: Scalar | None
-    """1 + i while the body rests on stop number i, else 0; absent without stops."""
+    direction: tuple[Scalar, ...]
+    """Of each coordinate, the sign of its velocity since the last turn or impact."""
+    contact: tuple[Scalar, ...] | None
+    """Of each coordinate, 1 + i while it rests on stop number i, else 0; absent where none can."""
+    modes: tuple[Scalar, ...]
+    """Of each switch."""
     length: Scalar
     """Length proposed for an ordinary step."""
     attempt: Scalar
@@ -85,6 +107,8 @@ class Plan(eqx.Module):
     motion: bool = eqx.field(static=True)
     """Whether extremes, durations and impact speeds are recorded."""
     log: int = eqx.field(static=True)
+    log_switches: bool = eqx.field(static=True)
+    """Whether the log lists switches too, as stops beyond the last, and counts them."""
     rests: bool = eqx.field(static=True)
     """Whether the body may come to rest on a stop."""
     bound: int = eqx.field(static=True)
@@ -124,7 +148,7 @@ class Plan(eqx.Module):
 
     def ticks(self, state: Any) -> bool:
         """Whether `s` itself counts the cycles."""
-        return self.scene.clock(state) is None
+        return self.scene.clock(state) is None and self.scene.section(state) is None
 
     def timed(self, state: Any) -> bool:
         """Whether the duration of a cycle is recorded, which only a fixed one need not be."""
@@ -155,18 +179,17 @@ class Plan(eqx.Module):
         bad = ~jnp.isfinite(total(numbers, self.settle)) | ~jnp.asarray(wanted)
         bad = bad | ~scene.in_range(start)
         for stop in scene.stops:
-            bad = bad | (stop.sign * Y > stop.gap)
+            bad = bad | (stop.beyond(scene.coordinates[stop.coordinate].position(start)) > 0)
         bad = jax.lax.stop_gradient(bad)
         zero = jnp.zeros_like(Y)
-        here = rates(scene.field, scene.position, zero, start)
+        modes = jax.lax.stop_gradient(begin_modes(scene, zero, start))
+        free = in_modes(scene, modes)
+        here = [rates(free.field, x.position, zero, start) for x in scene.coordinates]
         # At rest the acceleration says which way the motion goes.
-        direction = jnp.where(here.v == 0, jnp.sign(here.a), jnp.sign(here.v))
+        direction = tuple(jnp.where(x.v == 0, jnp.sign(x.a), jnp.sign(x.v)) for x in here)
         contact = None
         if self.rests:
-            contact = zero
-            for i, stop in enumerate(scene.stops):
-                rests = (stop.sign * Y >= stop.gap) & (here.v == 0) & (stop.sign * here.a > 0)
-                contact = jnp.where(rests, 1.0 + i, contact)
+            contact = tuple(self._rests_on(k, x) for k, x in enumerate(here))
         length = zero + jax.lax.stop_gradient(scene.cycle) / self.method.steps_per_cycle
         if self.method.adaptive:
             length = length / 8
@@ -176,6 +199,7 @@ class Plan(eqx.Module):
             record=self.fresh(start),
             direction=jax.lax.stop_gradient(direction),
             contact=contact,
+            modes=modes,
             length=length,
             attempt=length,
             target=zero,
@@ -187,3 +211,12 @@ class Plan(eqx.Module):
             spent=zero,
             rejected=zero,
         )
+
+    def _rests_on(self, k: int, here: Rates) -> Scalar:
+        """The stop that coordinate number k rests on as the motion begins."""
+        contact = jnp.zeros_like(here.x)
+        for i, stop in enumerate(self.scene.stops):
+            if stop.coordinate == k:
+                rests = (stop.beyond(here.x) >= 0) & (here.v == 0) & (stop.sign * here.a > 0)
+                contact = jnp.where(rests, to_stop(i), contact)
+        return contact

@@ -125,6 +125,7 @@ def planned(
     rests: bool | None = None,
     max_impacts: int = 1000,
     max_steps: int | None = None,
+    log_switches: bool = False,
 ) -> tuple[Plan, Any]:
     """The arguments of `simulate`, checked and put in the form in which the loop needs them."""
     if not isinstance(scene, AbstractScene):
@@ -146,6 +147,12 @@ def planned(
         scene = scene.in_clock(clock)
     start = scene.adopt(start)
     method.check(scene)
+    if samples and scene.section(start) is not None:
+        raise ValueError(
+            "Argument `samples` must be 0 for a machine whose cycles end on a section, but got "
+            f"{samples}: their lengths are not known beforehand. Observe it at equal intervals: "
+            "`simulate(scene.observed_every(interval), ...)`."
+        )
     if isinstance(scene, Scene):
         _check_scalars(scene=scene, start=start)
     check_start(scene, start)
@@ -176,6 +183,7 @@ def planned(
         parts=max(1, samples),
         motion=record == "motion",
         log=impact_log,
+        log_switches=log_switches,
         rests=(scene.may_rest() if rests is None else rests) and bool(scene.stops),
         bound=bound,
         road=lanes.current_road(),
@@ -262,9 +270,9 @@ def check_start(scene: AbstractScene, start: Any) -> None:
             name = jtu.keystr(path).lstrip(".")
             raise ValueError(f"Argument `start` must be finite, but its {name} is {numbers}.")
     scene.check_start(start)
-    Y = concrete(scene.position(start))
     for i, stop in enumerate(scene.stops):
         gap = concrete(stop.gap)
+        Y = concrete(scene.coordinates[stop.coordinate].position(start))
         if Y is None or gap is None:
             continue
         depth = np.max(stop.sign * Y - gap)

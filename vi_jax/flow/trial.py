@@ -9,9 +9,10 @@ from jaxtyping import Array, Bool, Float
 
 from ..lanes import pin, pin_flag
 from ..scene import AbstractScene
-from .events import Rates, force_rate, landing, rates
-from .lane import FREE, SECTION, TURN, Lane, Plan, total
-from .rest import Holding, release
+from .events import Rates, force_rate, guard_rates, landing, rates
+from .lane import FREE, SECTION, Lane, Plan, to_stop, to_switch, to_turn_of, total
+from .moving import Moving, in_modes
+from .rest import Release, release
 from .taylor import Expansion
 
 Scalar = Float[Array, ""]
@@ -29,6 +30,10 @@ class Crossing(NamedTuple):
     """An event g = 0 seen by a step: g at both ends, and how a step aimed at it landed."""
 
     name: float
+    kind: str
+    """"stop", "switch" or "section"."""
+    number: int
+    """Of the stop or switch."""
     begin: Rates
     end: Rates
     offset: Scalar
@@ -49,24 +54,35 @@ class Trial(NamedTuple):
     good: Flag
     ends_interval: Flag
     crossings: tuple[Crossing, ...]
-    position: tuple[Rates, Rates] | None
-    at_turn: Flag
-    """It was aimed at a turning point and met it."""
+    paths: tuple["Path", ...]
+    """Of each coordinate; none where nothing asks for it."""
+    free: Any
+    """The machine in its modes, with nothing held."""
     holding: Any
-    """The scene as the step saw it: its body held where it rests."""
-    leaves: tuple[Flag, Flag, Scalar, Scalar] | None
-    """Whether and where a body at rest is released (see `rest.release`)."""
+    """The machine as the step saw it: its bodies held where they rest."""
+
+
+class Path(NamedTuple):
+    """What a step saw of a coordinate."""
+
+    begin: Rates
+    end: Rates
+    at_turn: Flag
+    """The step was aimed at a turning point of it, and met it."""
+    leaves: Release | None
+    """Whether and where it is released, if it can rest."""
     surge: tuple[Scalar, Scalar, Scalar] | None
     """How fast the force changes at both ends, and the shortest step that is cut at a turn of the
     force; absent where the body cannot rest."""
 
 
 def held(plan: Plan, lane: Lane) -> AbstractScene:
-    """The scene with its body held where it rests."""
+    """The machine in its modes, with the bodies held that rest."""
     scene = plan.scene
     if lane.contact is None:
-        return scene
-    return Holding(scene=scene, held=lane.contact > 0, stops=scene.stops)
+        return in_modes(scene, lane.modes)
+    rests = tuple(x > 0 for x in lane.contact)
+    return Moving(scene=scene, modes=lane.modes, held=rests, stops=scene.stops)
 
 
 def timing(plan: Plan, lane: Lane) -> Scalar | None:
@@ -103,7 +119,7 @@ def attempt(
     if not paced and lane.record.time is not None:
         time = lane.record.time + h
     if lane.contact is not None and not method.uses_field:
-        rests = lane.contact > 0
+        rests = lane.contact[0] > 0
         new = jtu.tree_map(lambda a, b: jnp.where(rests, a, b), lane.state, new)
     new = pin(new)
     good = jnp.isfinite(total(new, jnp.zeros_like(h)))
@@ -115,67 +131,140 @@ def attempt(
         good = good & (error <= 1)
     good = pin_flag(good, h)
 
-    crossings, position = [], None
-    at_turn = jnp.zeros_like(free)
+    free_scene = in_modes(scene, lane.modes)
+    paths = []
     if plan.motion or scene.stops:
-        begin = rates(scene.field, scene.position, lane.s, lane.state)
-        end = rates(scene.field, scene.position, s1, new)
-        position = begin, end
-        shift = to_turn(end)
-        met = jnp.abs(shift) <= _turn_tolerance(h) * _leniency(lane)
-        at_turn = good & (lane.target == TURN) & met
-        for i, stop in enumerate(scene.stops):
-            ends = begin.scaled(stop.sign, stop.gap), end.scaled(stop.sign, stop.gap)
-            crossings.append((1.0 + i, *ends, 1 + jnp.abs(stop.gap)))
-    if not plan.ticks(lane.state):
+        for k in range(len(scene.coordinates)):
+            paths.append(_path(plan, lane, k, free_scene, holding, (s1, new, h, limit), good))
+    guards = [
+        *_stops(scene, paths),
+        *_switches(lane, scene, free_scene, s1, new),
+        *_section(plan, lane, free_scene, s1, new),
+    ]
+    seen = tuple(_seen(lane, good & last, good, h, each, guards) for each in guards)
+    return Trial(s1, h, new, time, error, good, last, seen, tuple(paths), free_scene, holding)
+
+
+def _path(
+    plan: Plan, lane: Lane, k: int, free: Any, holding: Any, there: tuple, good: Flag
+) -> Path:
+    """What a step that ends `there` saw of coordinate number k."""
+    s1, new, h, limit = there
+    position = plan.scene.coordinates[k].position
+    begin = rates(free.field, position, lane.s, lane.state)
+    end = rates(free.field, position, s1, new)
+    met = jnp.abs(to_turn(end)) <= _turn_tolerance(h) * _leniency(lane)
+    aimed = lane.target == to_turn_of(k)
+    if plan.scene.switches:  # such an event may be a turning point as well
+        aimed = aimed | (lane.target >= to_switch(0))
+    if plan.scene.section(lane.state) is not None:
+        aimed = aimed | (lane.target == SECTION)
+    at_turn = good & aimed & met
+    leaves, surge = None, None
+    if lane.contact is not None:
+        leaves = release(lane, k, plan.scene.stops, begin, end, good, h)
+        surge = (
+            force_rate(free, position, holding, lane.s, lane.state),
+            force_rate(free, position, holding, s1, new),
+            stop_gradient(_SLIVER * limit + jnp.zeros_like(h)),
+        )
+    return Path(begin, end, at_turn, leaves, surge)
+
+
+class _Guard(NamedTuple):
+    """An event g = 0: g at both ends of a step."""
+
+    name: float
+    kind: str
+    number: int
+    begin: Rates
+    end: Rates
+    scale: Any
+    """Of g, for its rounding."""
+
+
+def _stops(scene: AbstractScene, paths: list[Path]) -> list[_Guard]:
+    found = []
+    for i, stop in enumerate(scene.stops):
+        path = paths[stop.coordinate]
+        begin, end = (x.scaled(stop.sign, stop.gap) for x in (path.begin, path.end))
+        found.append(_Guard(to_stop(i), "stop", i, begin, end, 1 + jnp.abs(stop.gap)))
+    return found
+
+
+def _switches(lane: Lane, scene: AbstractScene, free: Any, s1: Scalar, new: Any) -> list[_Guard]:
+    found = []
+    for j, (switch, mode) in enumerate(zip(scene.switches, lane.modes, strict=True)):
+
+        def guard(s: Scalar, state: Any, switch=switch, mode=mode) -> Scalar:
+            return switch.guard(scene, s, state, mode)
+
+        begin = guard_rates(free.field, guard, lane.s, lane.state)
+        end = guard_rates(free.field, guard, s1, new)
+        scale = 1 + stop_gradient(jnp.abs(end.v))
+        found.append(_Guard(to_switch(j), "switch", j, begin, end, scale))
+    return found
+
+
+def _section(plan: Plan, lane: Lane, free: Any, s1: Scalar, new: Any) -> list[_Guard]:
+    """What ends a cycle, unless `s` itself does."""
+    scene = plan.scene
+    if plan.ticks(lane.state):
+        return []
+    if scene.section(lane.state) is None:
+        bound = plan.end(lane.part)
 
         def clock(state: Any) -> Scalar:
             return jnp.asarray(scene.clock(state))
 
         ends = (
-            rates(scene.field, clock, lane.s, lane.state).scaled(1, bound),
-            rates(scene.field, clock, s1, new).scaled(1, bound),
+            rates(free.field, clock, lane.s, lane.state).scaled(1, bound),
+            rates(free.field, clock, s1, new).scaled(1, bound),
         )
-        crossings.append((SECTION, *ends, bound))
-    leaves, surge = None, None
-    if position is not None and lane.contact is not None:
-        leaves = release(lane, scene.stops, *position, good, h)
-        surge = (
-            force_rate(scene, holding, lane.s, lane.state),
-            force_rate(scene, holding, s1, new),
-            stop_gradient(_SLIVER * limit + jnp.zeros_like(h)),
-        )
-    seen = tuple(_seen(lane, good & last, good, h, each, crossings) for each in crossings)
-    return Trial(
-        s1, h, new, time, error, good, last, seen, position, at_turn, holding, leaves, surge
-    )  # fmt: skip
+        return [_Guard(SECTION, "section", 0, *ends, bound)]
+
+    def section(state: Any) -> Scalar:
+        return jnp.asarray(scene.section(state))
+
+    begin = rates(free.field, section, lane.s, lane.state)
+    end = rates(free.field, section, s1, new)
+    scale = 1 + stop_gradient(jnp.abs(end.v))
+    # From the section it rises: it ends the next cycle only once it has been below.
+    armed = stop_gradient(begin.x) < -1e4 * float(jnp.finfo(end.x.dtype).eps) * scale
+    begin, end = (
+        Rates(jnp.where(armed, r.x, -1.0), *(jnp.where(armed, x, 0.0) for x in (r.v, r.a)))
+        for r in (begin, end)
+    )
+    return [_Guard(SECTION, "section", 0, begin, end, scale)]
 
 
 def _seen(
-    lane: Lane, ends: Flag, good: Flag, h: Scalar, crossing: tuple, all_of_them: list
+    lane: Lane, ends: Flag, good: Flag, h: Scalar, guard: _Guard, all_of_them: list[_Guard]
 ) -> Crossing:
     """Whether a step that was aimed at this event met it.
 
     A step that ends an interval as it meets a stop, to rounding, is aimed at it: an impact on the
     section belongs to the cycle that ends there, so that it is not now in one, now in the next.
     """
-    name, begin, end, scale = crossing
+    name, begin, end = guard.name, guard.begin, guard.end
     aimed = good & (lane.target == name)
-    for other, _, beyond, _ in all_of_them:
-        if other != name:  # what lies beyond another stop was not reached
-            aimed = aimed & (beyond.x <= 0)
+    eps = float(jnp.finfo(h.dtype).eps)
+    for other in all_of_them:
+        if other.name != name:  # what lies beyond another event was not reached
+            # Events of different kinds may come together: then one is met after the other.
+            slack = 0.0 if other.kind == guard.kind == "stop" else 16 * eps * other.scale
+            aimed = aimed & (other.end.x <= slack)
     offset, square = landing(end)
     size = stop_gradient(jnp.abs(offset))
-    eps = float(jnp.finfo(h.dtype).eps)
     # Two ways of being there to rounding: in place along the path, or, near grazing, in position.
     close = size <= _landing_tolerance(h) * _leniency(lane)
-    there = jnp.abs(end.x) <= 4 * eps * scale
+    there = jnp.abs(end.x) <= 4 * eps * guard.scale
     close = close | (there & (end.v >= 0))
     real = stop_gradient(square) > 0
     landed = pin_flag(aimed & close & real, h)
     again = aimed & ~close & real & (size < 0.25 * h)
     again = again | ends & there & (end.v > 0)
-    return Crossing(name, begin, end, offset, landed, again)
+    return Crossing(name, guard.kind, guard.number, begin, end, offset, landed, again)
 
 
 def _leniency(lane: Lane) -> Scalar:

@@ -99,6 +99,11 @@ def closed_form_orbits(scene: Scene, *, cycles: int = 1) -> ClosedFormOrbits:
             f"Argument `scene` must have exactly one stop, on the right, but has stops {sides}."
         )
     stop = scene.stops[0]
+    if callable(stop.restitution) or scene.soft_stops:
+        raise ValueError(
+            "Argument `scene` must have a stop with one number as its restitution, and no soft "
+            f"stops, but has {stop!r} and {len(scene.soft_stops)} soft stops."
+        )
     numbers = (scene.drive.frequency_ratio, scene.damping_ratio, stop.restitution, stop.gap)
     shapes = [jnp.shape(number) for number in numbers]
     if any(shapes):

@@ -72,13 +72,13 @@ def _with_impacts(path: MotionPath, run: Run, scene: AbstractScene) -> MotionPat
     logged = np.asarray(log.stop) >= 0
     at = cycle + np.asarray(log.phase)[logged] / float(scene.turn)
     speed = np.asarray(log.speed)[logged]
-    sign = np.array([s.sign for s in scene.stops])[stop]
-    gap = np.array([float(s.gap) for s in scene.stops])[stop]
-    bounce = np.array([float(s.restitution) for s in scene.stops])[stop]
+    hit = [scene.stops[i] for i in stop]
+    before = np.array([s.sign for s in hit]) * speed
+    after = [float(s.rebound(v)) for s, v in zip(hit, before, strict=True)]
     extra = MotionPath(
         np.repeat(at, 2),
-        np.repeat(sign * gap, 2),
-        np.stack([sign * speed, -bounce * sign * speed], axis=1).ravel(),
+        np.repeat([float(s.place) for s in hit], 2),
+        np.stack([before, after], axis=1).ravel(),
     )
     places = np.searchsorted(path.cycles, extra.cycles)
     return MotionPath(*(np.insert(a, places, b) for a, b in zip(path, extra, strict=True)))

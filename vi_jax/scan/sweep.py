@@ -177,9 +177,10 @@ def _finite(numbers: np.ndarray | None) -> bool:
 def taken_along(scene: AbstractScene, state: Any) -> Any:
     """The state, the body taken along by a stop that has come nearer."""
     for stop in scene.stops:
-        Y = scene.position(state)
-        beyond = stop.sign * Y > stop.gap
-        moved = scene.placed(state, stop.sign * stop.gap, jnp.zeros_like(Y))
+        body = scene.coordinates[stop.coordinate]
+        Y = body.position(state)
+        beyond = stop.beyond(Y) > 0
+        moved = body.placed(state, stop.place, jnp.zeros_like(Y))
         state = jtu.tree_map(lambda a, b, c=beyond: jnp.where(c, a, b), moved, state)
     return state
 

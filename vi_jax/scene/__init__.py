@@ -1,11 +1,13 @@
 """What is modelled: parameters, crank, drive, stops, and the scene that composes them."""
 
 from .base import AbstractScene as AbstractScene
+from .base import Coordinate as Coordinate
 from .crank import AbstractCrank as AbstractCrank
 from .crank import CosineCrank as CosineCrank
 from .crank import SliderCrank as SliderCrank
 from .drive import IdealDrive as IdealDrive
 from .drive import Motor as Motor
+from .friction import DryFriction as DryFriction
 from .parameters import Parameters as Parameters
 from .scene import LABELS as LABELS
 from .scene import MotorState as MotorState
@@ -13,4 +15,7 @@ from .scene import Oscillator as Oscillator
 from .scene import OscillatorState as OscillatorState
 from .scene import Scene as Scene
 from .scene import TimedMotorState as TimedMotorState
+from .soft import SoftStop as SoftStop
 from .stop import RigidStop as RigidStop
+from .switch import AbstractSwitch as AbstractSwitch
+from .switch import Switch as Switch

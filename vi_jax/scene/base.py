@@ -1,7 +1,8 @@
 """What `simulate` asks of a scene. A class of your own with these few methods runs like ours."""
 
 import abc
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -9,22 +10,57 @@ from jaxtyping import Array, Bool, Float
 
 from .._checks import in_range
 from .stop import RigidStop
+from .switch import AbstractSwitch
 
 State = Any
 """A pytree of scalars; the defaults below expect the fields `Y` and `V`."""
 
 
+class Coordinate(NamedTuple):
+    """A coordinate that stops limit."""
+
+    position: Callable[[State], Float[Array, ""]]
+    velocity: Callable[[State], Float[Array, ""]]
+    """What an impact reverses; of the sign of d(position)/ds."""
+    placed: Callable[[State, Any, Any], State]
+    """A state with another position and velocity, and with all that an impact changes besides."""
+    mass: Any = 1.0
+    """What an impact acts on, in the machine's unit of mass: of two bodies the reduced mass."""
+
+
 class AbstractScene(eqx.Module):
-    """A mechanical system with one impacting coordinate, observed cycle by cycle.
+    """A machine: smooth motion between events, observed cycle by cycle.
 
-    Its independent variable is called `s`; `s` restarts from zero in each cycle, and the field is
-    periodic in it.
+    Its independent variable is called `s`. The machine is driven, and its field periodic in `s`
+    (`s` restarts from zero in each cycle); or it is autonomous, and a cycle ends where `section`
+    rises through zero.
 
-    To write a scene of your own, give it `stops`, `cycle` and `field`, and `start` if there is a
-    state to begin from where none is given. The other methods have defaults that suit a state with
-    the fields `Y` and `V` whose independent variable is time; a state with other names says by
-    `position`, `velocity` and `placed` which of them the stops limit. Ready machines, each written
-    in this way, are in `vi_jax.machines`.
+    To write a machine of your own, give it `stops`, `cycle` and `field`, and `start` if there is a
+    state to begin from where none is given. All else has a default; those below suit a state with
+    the fields `Y` and `V` whose independent variable is time.
+
+    | a machine must say | |
+    |---|---|
+    | `stops` | the rigid stops, `()` if there are none |
+    | `cycle` | the length of a cycle in `s` |
+    | `field` | how the state changes between events |
+
+    | it may say | and gets |
+    |---|---|
+    | `start` | verbs without an explicit start |
+    | `position`, `velocity`, `placed` | a state of any names; what else an impact changes |
+    | `coordinates` | stops on several coordinates (`RigidStop(..., coordinate=1)`) |
+    | `switches` | a field with modes, landed upon where they change: soft stops, dry friction |
+    | `section` | an autonomous machine, whose cycles are counted by an event |
+    | `renewed` | a drift, counted by the cycle |
+    | `clock`, `rewound`, `pace` | another variable than `s` that counts cycles or measures time |
+    | `step_limit`, `relaxation` | steps that fit time scales shorter than the cycle |
+    | `may_rest` | programs without rest on a stop |
+    | `mirrored` | branches that name a loss of symmetry |
+    | `labels`, `period_of`, `place_of` | pictures and messages in its own words |
+    | `in_range`, `check_start`, `alive` | its own limits, checked before and while it runs |
+
+    Ready machines, each written in this way, are in `vi_jax.machines`.
     """
 
     stops: eqx.AbstractVar[tuple[RigidStop, ...]]
@@ -32,11 +68,33 @@ class AbstractScene(eqx.Module):
     @property
     @abc.abstractmethod
     def cycle(self) -> Float[Array, ""] | float:
-        """Length of one cycle in `s` (or in `clock(state)`, where that is not `None`)."""
+        """Length of one cycle in `s` (or in `clock(state)`, where that is not `None`); where
+        `section` ends a cycle, its usual length, by which steps are sized."""
 
     @abc.abstractmethod
-    def field(self, s: Float[Array, ""], state: State) -> State:
-        """d(state)/ds between impacts, a pytree like `state`."""
+    def field(self, *args: Any, **kwargs: Any) -> State:
+        """`field(s, state)`: d(state)/ds between events, a pytree like `state`.
+
+        With `switches` it is `field(s, state, mode, ...)`, which gets the mode of each.
+        """
+
+    @property
+    def switches(self) -> tuple[AbstractSwitch, ...]:
+        """Where the field changes without an impact."""
+        return ()
+
+    def section(self, state: State) -> Float[Array, ""] | None:
+        """What rises through zero where a cycle ends; `None` where `s` or `clock` counts them."""
+        return None
+
+    def observed_every(self, interval: Any) -> "AbstractScene":
+        """An autonomous machine observed at equal intervals of `s` instead of on its section."""
+        raise ValueError(f"A {type(self).__name__} is driven: its cycle is its drive's.")
+
+    @property
+    def coordinates(self) -> tuple[Coordinate, ...]:
+        """What stops limit; extremes are recorded of the first."""
+        return (Coordinate(self.position, self.velocity, self.placed),)
 
     def position(self, state: State) -> Float[Array, ""]:
         """The coordinate that stops limit."""
@@ -112,6 +170,11 @@ class AbstractScene(eqx.Module):
 
     def rewound(self, state: State) -> State:
         """`state` with its clock set back by one cycle (only asked where there is a clock)."""
+        return state
+
+    def renewed(self, state: State) -> State:
+        """`state` as the next cycle begins, where something is counted by the cycle: a drift, say,
+        is told as the progress in the last cycle and begins again from zero."""
         return state
 
     def pace(self, s: Float[Array, ""], state: State) -> Float[Array, ""] | None:

@@ -25,6 +25,7 @@ from .._checks import (
 from .base import AbstractScene
 from .crank import AbstractCrank, CosineCrank
 from .drive import IdealDrive, Motor
+from .soft import SoftStop
 from .stop import RigidStop
 
 # What pictures write beside Y and V.
@@ -100,6 +101,10 @@ class Scene(AbstractScene):
     )
     """Crank angle of the section (radians, in [-2π, 2π]); `None` is 0. Phases of states and of
     impacts are counted from it."""
+    soft_stops: tuple[SoftStop, ...] = eqx.field(
+        default=(), converter=lambda x: tuple_of("soft_stops", x, SoftStop)
+    )
+    """Compliant stops; their stiffness in units of the body's own spring."""
     ranges: ClassVar = {"section_phase": Range(-2 * pi, 2 * pi)}
 
     def __check_init__(self):
@@ -113,6 +118,9 @@ class Scene(AbstractScene):
         for stop in self.stops:
             if not isinstance(stop, RigidStop):
                 raise TypeError(f"Argument `stops` must hold `RigidStop`s, but holds {stop!r}.")
+        for stop in self.soft_stops:
+            if not isinstance(stop, SoftStop):
+                raise TypeError(f"Argument `soft_stops` must hold `SoftStop`s, but holds {stop!r}.")
         _check_room(self.stops)
         require_ranges(self)
 
@@ -231,19 +239,24 @@ class Scene(AbstractScene):
             )
         return state_of_numbers("start", start)
 
-    def field(self, s: Float[Array, ""], state: Any) -> Any:
+    @property
+    def switches(self) -> tuple[SoftStop, ...]:
+        """The compliant stops."""
+        return self.soft_stops
+
+    def field(self, s: Float[Array, ""], state: Any, *modes: Float[Array, ""]) -> Any:
         """d(state)/ds: by crank angle (Eq. 8 to 9 of the paper) or by time τ (Eq. 5 to 7)."""
         drive = self.drive
         if isinstance(drive, IdealDrive):
             zeta = drive.frequency_ratio
             if self.clock_name == "time":
                 slide = self.crank.slide(self.phase_at(zeta * s))
-                return OscillatorState(state.V, self._pull(slide.U, state))
+                return OscillatorState(state.V, self._pull(slide.U, state, modes))
             slide = self.crank.slide(self.phase_at(s))
-            return OscillatorState(state.V / zeta, self._pull(slide.U, state) / zeta)
+            return OscillatorState(state.V / zeta, self._pull(slide.U, state, modes) / zeta)
         since = s if self.clock_name == "phase" else state.phase
         slide = self.crank.slide(self.phase_at(since))
-        pull = self._pull(slide.U, state)
+        pull = self._pull(slide.U, state, modes)
         torque = drive.torque(slide, state.Y, state.W)
         inertia = drive.inertia(slide)
         if self.clock_name == "time":
@@ -251,9 +264,12 @@ class Scene(AbstractScene):
         pace = 1 / state.W
         return MotorState(pace * state.V, pace * pull, pace * torque / inertia)
 
-    def _pull(self, U, state):
+    def _pull(self, U, state, modes):
         """d²Y/dτ²."""
-        return U - state.Y - 2 * self.damping_ratio * state.V
+        pull = U - state.Y - 2 * self.damping_ratio * state.V
+        for stop, mode in zip(self.soft_stops, modes, strict=True):
+            pull = pull + stop.push(self, state, mode)
+        return pull
 
     def clock(self, state: Any) -> Float[Array, ""] | None:
         """The crank angle, where time is the independent variable of a motor scene."""
@@ -283,6 +299,8 @@ class Scene(AbstractScene):
         """A fifth of the shorter of the drive's turn and the body's natural period."""
         speed = self._speed(state)
         turn = 0.4 * pi / jnp.maximum(1.0, speed)
+        for stop in self.soft_stops:
+            turn = jnp.minimum(turn, stop.longest_step(self, state))
         return turn * speed if self.clock_name == "phase" else turn
 
     def relaxation(self, s: Float[Array, ""], state: Any) -> Float[Array, ""]:

@@ -1,33 +1,81 @@
-"""Stops: rigid walls that the body may hit."""
+"""Rigid stops: the contact law, wherever it is asked for."""
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import REAL, SHARE, number, one_of, require_ranges
+from .._checks import REAL, SHARE, count, number, one_of, require_ranges
+
+
+def _restitution(x: Any) -> Any:
+    return x if callable(x) else number("restitution", x)
 
 
 class RigidStop(eqx.Module):
     """A rigid wall with Newton's restitution law: at contact and approaching, V ← -k V.
 
     A stop on the right keeps Y ≤ gap, one on the left keeps Y ≥ -gap. The gap may be zero or
-    negative (a body pressed on); the restitution is in [0, 1], both ends included.
+    negative (a body pressed on); the restitution is in [0, 1], both ends included, or a function of
+    the speed of approach with values there (a pytree, if it has numbers of its own).
+
+    What is hit is the machine's first coordinate unless another is named by its index.
     """
 
     gap: Float[Array, "..."] = eqx.field(converter=lambda x: number("gap", x))
     """d, distance of the stop from the unstretched position (unit: a)."""
-    restitution: Float[Array, "..."] = eqx.field(converter=lambda x: number("restitution", x))
+    restitution: Any = eqx.field(converter=_restitution)
     """k, coefficient of restitution (dimensionless)."""
     side: str = eqx.field(static=True, default="right")
     """"right" or "left"."""
+    coordinate: int = eqx.field(static=True, default=0, kw_only=True)
+    """Index into the machine's `coordinates`."""
     ranges: ClassVar = {"gap": REAL, "restitution": SHARE}
 
     def __check_init__(self):
         require_ranges(self)
         one_of("side", self.side, ("right", "left"))
+        count("coordinate", self.coordinate)
 
     @property
     def sign(self) -> int:
         """+1 on the right, -1 on the left: the body is inside while sign·Y ≤ gap."""
         return 1 if self.side == "right" else -1
+
+    @property
+    def place(self) -> Float[Array, "..."]:
+        """Position of the stop."""
+        return self.sign * self.gap
+
+    def beyond(self, Y: Any) -> Any:
+        """How far a position lies beyond the stop; negative inside."""
+        return self.sign * Y - self.gap
+
+    def approach(self, V: Any) -> Any:
+        """Speed towards the stop."""
+        return self.sign * V
+
+    def coefficient(self, approach: Any) -> Any:
+        """k at this speed of approach."""
+        return self.restitution(approach) if callable(self.restitution) else self.restitution
+
+    def rebound(self, V: Any) -> Any:
+        """The velocity after an impact with this one (Eq. 17 of the paper)."""
+        return -self.coefficient(self.approach(V)) * V
+
+    def loss(self, approach: Any) -> Any:
+        """Energy lost in an impact, per unit of mass: ½(1 - k²) V⁻²."""
+        return 0.5 * (1 - self.coefficient(approach) ** 2) * approach**2
+
+    def remaining(self, approach: Any, pressing: Any) -> Any:
+        """Time from an impact to rest: Σ 2 kⁿ V⁻ / a = 2 k V⁻ / (a (1 - k)).
+
+        **Arguments:** speed of approach and acceleration towards the stop. Infinite where the body
+        is not pressed on, or loses nothing. A coefficient that depends on the speed is taken as it
+        is at this impact.
+        """
+        k = self.coefficient(approach)
+        force = pressing * (1 - k)
+        ends = force > 0
+        return jnp.where(ends, 2 * k * approach / jnp.where(ends, force, 1.0), jnp.inf)

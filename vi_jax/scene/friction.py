@@ -1,0 +1,67 @@
+"""Dry friction, with sticking as a mode."""
+
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._checks import NOT_NEGATIVE, Range, number, require_ranges
+from .switch import AbstractSwitch
+
+
+class DryFriction(AbstractSwitch):
+    """Coulomb friction on one body: it slides against a constant force, or sticks.
+
+    While it slides forward (mode +1) or backward (-1) friction is `level` against the motion. Where
+    the velocity vanishes the body sticks (mode 0) as long as what else acts on it stays below
+    `static_ratio` times `level`; there friction balances it. A body that is pulled harder goes
+    through, or off. In the machine's field, with everything else that acts on the body as `force`:
+
+        acceleration = (force - friction.resistance(mode, force)) / mass
+
+    **Arguments:**
+
+    - `level`: μN in the machine's unit of force, not negative.
+    - `static_ratio`: μ_s/μ, at least 1.
+    - `velocity(machine, state)`: of the body against what it rubs on.
+    - `force(machine, s, state)`: what acts on it besides.
+    - `stopped(machine, state)`: the state with that velocity set to zero.
+    """
+
+    level: Float[Array, "..."] = eqx.field(converter=lambda x: number("level", x))
+    velocity: Callable[..., Any] = eqx.field(static=True, kw_only=True)
+    force: Callable[..., Any] = eqx.field(static=True, kw_only=True)
+    stopped: Callable[..., Any] = eqx.field(static=True, kw_only=True)
+    static_ratio: Float[Array, "..."] = eqx.field(
+        kw_only=True, default=1.0, converter=lambda x: number("static_ratio", x)
+    )
+    ranges: ClassVar = {"level": NOT_NEGATIVE, "static_ratio": Range(1.0, float("inf"))}
+
+    def __check_init__(self):
+        require_ranges(self)
+
+    def resistance(self, mode: Any, force: Any) -> Any:
+        """What friction takes from the force on the body."""
+        return jnp.where(mode == 0, force, self.level * mode)
+
+    def begin(self, machine, s, state):
+        """Sliding, or sticking where the velocity is zero and the force too small."""
+        velocity, force = self.velocity(machine, state), self.force(machine, s, state)
+        sticks = jnp.abs(force) <= self.level * self.static_ratio
+        return jnp.where(velocity != 0, jnp.sign(velocity), self._from_rest(sticks, force))
+
+    def guard(self, machine, s, state, mode):
+        """The velocity coming to zero; or the force coming to what friction can hold."""
+        excess = jnp.abs(self.force(machine, s, state)) - self.level * self.static_ratio
+        return jnp.where(mode == 0, excess, -mode * self.velocity(machine, state))
+
+    def after(self, machine, s, state, mode):
+        """Sticking, or sliding the way the force pulls."""
+        state, force = self.stopped(machine, state), self.force(machine, s, state)
+        sticks = (jnp.abs(force) <= self.level * self.static_ratio) & (mode != 0)
+        return state, self._from_rest(sticks, force)
+
+    def _from_rest(self, sticks: Any, force: Any) -> Any:
+        return jnp.where(sticks, 0.0, jnp.where(force < 0, -1.0, 1.0))

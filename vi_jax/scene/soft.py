@@ -1,0 +1,190 @@
+"""Compliant stops: a force while the body penetrates, no jump."""
+
+from math import pi, sqrt
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._checks import NOT_NEGATIVE, POSITIVE, REAL, count, number, one_of, require, require_ranges
+from .switch import AbstractSwitch
+
+Scalar = Float[Array, ""]
+
+# Modes: the body touches; it has been let go of, but has not yet come out; it is apart.
+TOUCHING, RELEASED, APART = 1.0, 0.0, -1.0
+
+# A body is near enough for the contact's time scale to matter (unit: that of the coordinate).
+_NEAR = 1e-6
+
+
+class SoftStop(AbstractSwitch):
+    """A compliant stop: pushes the body back while it penetrates by δ > 0.
+
+    With unit mass the force is F0 + K δᵖ + α √K δ^((p-1)/2) δ' under `law="power"`: p = 1 is a
+    spring with a dashpot, p = 3/2 Hertz's contact. Its coefficient of restitution does not depend
+    on the speed, α = √(2(p+1)) (-ln e)/√(π² + ln² e) (Feng, arXiv 2603.27764), so that
+    `restitution` may be given instead of `damping`. Under `law="hunt-crossley"` it is
+    F0 + K δᵖ (1 + α δ'), whose restitution falls with speed.
+
+    With p > 1 the power law's force has a steep start, of the order δ^((p-1)/2); steps sized by
+    their error (`Adaptive`) follow it, fixed ones lose their order there.
+
+    **Arguments:**
+
+    - `gap`: distance of the stop from the coordinate's zero (its unit); the body touches beyond.
+    - `stiffness` K per unit of mass, positive (for a `Scene`: in units of the body's own spring).
+    - `restitution` e in (0, 1], or `damping` α, not negative; neither: no damping.
+    - `exponent` p, at least 1; static.
+    - `law`: `"power"` or `"hunt-crossley"`; static.
+    - `prestress` F0: the force at first touch, not negative; none by default.
+    - `adhesive`: whether the dashpot may pull at the end of its stroke; `False` lets the body go
+      where the force falls to zero. Static.
+    - `side`: `"right"` or `"left"`; `coordinate`: index into the machine's `coordinates`.
+
+    **Raises:** `ValueError` naming the argument that is out of range.
+    """
+
+    gap: Float[Array, "..."]
+    stiffness: Float[Array, "..."]
+    damping: Float[Array, "..."]
+    prestress: Float[Array, "..."] | None
+    exponent: float = eqx.field(static=True)
+    law: str = eqx.field(static=True)
+    adhesive: bool = eqx.field(static=True)
+    side: str = eqx.field(static=True)
+    coordinate: int = eqx.field(static=True)
+    ranges: ClassVar = {
+        "gap": REAL, "stiffness": POSITIVE, "damping": NOT_NEGATIVE, "prestress": NOT_NEGATIVE,
+    }  # fmt: skip
+
+    def __init__(
+        self,
+        gap: Any,
+        stiffness: Any,
+        *,
+        restitution: Any = None,
+        damping: Any = None,
+        exponent: float = 1.0,
+        law: str = "power",
+        prestress: Any = None,
+        adhesive: bool = True,
+        side: str = "right",
+        coordinate: int = 0,
+    ):
+        require("exponent", exponent, low=1.0)
+        self.exponent = float(exponent)
+        self.law = one_of("law", law, ("power", "hunt-crossley"))
+        if restitution is not None:
+            if damping is not None or law != "power":
+                raise ValueError(
+                    "Argument `restitution` must be given without `damping`, and for the law "
+                    f'"power", whose restitution is one number, but got {restitution!r} with '
+                    f"damping={damping!r} and law={law!r}."
+                )
+            damping = damping_of(restitution, exponent)
+        self.gap = number("gap", gap)
+        self.stiffness = number("stiffness", stiffness)
+        self.damping = number("damping", 0.0 if damping is None else damping)
+        self.prestress = None if prestress is None else number("prestress", prestress)
+        self.adhesive = bool(adhesive)
+        self.side = one_of("side", side, ("right", "left"))
+        self.coordinate = count("coordinate", coordinate)
+        require_ranges(self)
+
+    @property
+    def sign(self) -> int:
+        """+1 on the right, -1 on the left."""
+        return 1 if self.side == "right" else -1
+
+    @property
+    def place(self) -> Float[Array, "..."]:
+        """Position of the stop."""
+        return self.sign * self.gap
+
+    def depth(self, machine: Any, state: Any) -> tuple[Any, Any]:
+        """δ and δ' (by time); δ is negative apart from the stop."""
+        body = machine.coordinates[self.coordinate]
+        return self.sign * body.position(state) - self.gap, self.sign * body.velocity(state)
+
+    def force(self, depth: Any, rate: Any) -> Any:
+        """Force away from the stop, per unit of mass, of a body that touches."""
+        p = self.exponent
+        spring = self.stiffness * _power(depth, p)
+        if self.law == "power":
+            resist = self.damping * jnp.sqrt(self.stiffness) * _power(depth, 0.5 * (p - 1)) * rate
+        else:
+            resist = self.damping * spring * rate
+        return spring + resist if self.prestress is None else self.prestress + spring + resist
+
+    def push(self, machine: Any, state: Any, mode: Any) -> Any:
+        """What the stop adds to the coordinate's acceleration."""
+        return jnp.where(mode > 0, -self.sign * self.force(*self.depth(machine, state)), 0.0)
+
+    def begin(self, machine, s, state):
+        """Touching, unless apart or let go of."""
+        depth, rate = self.depth(machine, state)
+        inside = (depth > 0) | ((depth == 0) & (rate > 0))
+        holds = TOUCHING
+        if not self.adhesive:
+            holds = jnp.where(self._pulls(depth, rate) < 0, TOUCHING, RELEASED)
+        return jnp.where(inside, holds, APART)
+
+    def guard(self, machine, s, state, mode):
+        """Going in, coming out, or let go of."""
+        depth, rate = self.depth(machine, state)
+        if self.adhesive:
+            return -mode * depth
+        pulls = self._pulls(depth, rate)
+        ends = jnp.where(mode > 0, pulls, -pulls)
+        return jnp.where(mode < 0, depth, jnp.maximum(ends, -depth))
+
+    def after(self, machine, s, state, mode):
+        """Touching, released or apart, by what has risen to zero."""
+        if self.adhesive:
+            return state, -mode
+        depth, rate = self.depth(machine, state)
+        pulls = self._pulls(depth, rate)
+        released = jnp.where(pulls >= -depth, RELEASED, APART)
+        again = jnp.where(-pulls > -depth, TOUCHING, APART)
+        return state, jnp.where(mode < 0, TOUCHING, jnp.where(mode > 0, released, again))
+
+    def longest_step(self, machine: Any, state: Any) -> Any:
+        """A fifth of the period in which a body oscillates on the stop; infinite apart from it."""
+        p = self.exponent
+        depth, rate = self.depth(machine, state)
+        deepest = jnp.maximum(depth, 1e-12)
+        if p > 1:
+            reach = (0.5 * (p + 1) * rate**2 / self.stiffness + 1e-30) ** (1 / (p + 1))
+            deepest = jnp.maximum(deepest, reach)
+        frequency = jnp.sqrt(p * self.stiffness * _power(deepest, p - 1))
+        return jnp.where(depth > -_NEAR, 0.4 * pi / frequency, jnp.inf)
+
+    def _pulls(self, depth: Any, rate: Any) -> Any:
+        """Of the sign of the force, turned: positive where it would pull; smooth at first touch."""
+        if self.law == "power":
+            root = _power(depth, 0.5 * (self.exponent + 1))
+            pull = -self.stiffness * root - self.damping * jnp.sqrt(self.stiffness) * rate
+            flat = _power(depth, 0.5 * (self.exponent - 1))
+            return pull if self.prestress is None else pull * flat - self.prestress
+        if self.prestress is None:
+            return -(1 + self.damping * rate)
+        return -self.force(depth, rate)
+
+
+def damping_of(restitution: Any, exponent: float = 1.0) -> Any:
+    """α of the power law from its coefficient of restitution (Feng, arXiv 2603.27764)."""
+    require("restitution", restitution, low=0.0, high=1.0, open_low=True)
+    drop = -jnp.log(jnp.asarray(restitution, float))
+    return sqrt(2 * (exponent + 1)) * drop / jnp.sqrt(pi**2 + drop**2)
+
+
+def _power(x: Any, n: float) -> Any:
+    """xⁿ inside; for n = 0 and 1 continued smoothly to where a step may look beyond the surface."""
+    if n == 0:
+        return jnp.ones_like(x)
+    if n == 1:
+        return x
+    inside = x > 0
+    return jnp.where(inside, jnp.where(inside, x, 1.0) ** n, 0.0)
