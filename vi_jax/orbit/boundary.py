@@ -158,7 +158,7 @@ def boundary(
         parameters=np.stack([step.x[-2:] for step in path]),
         y_min=np.array([step.seen.y_min for step in path]),
         multipliers=np.stack([step.seen.multipliers for step in path]),
-        impact_speed=np.stack([step.seen.approach for step in path]),
+        impact_speed=np.stack([step.seen.approach[list(problem.impacts)] for step in path]),
         clearance=np.array([step.seen.clearance for step in path]),
         ends=(backward.end, forward.end),
         problem=problem,

@@ -55,8 +55,8 @@ class Branch:
     special: list[SpecialPoint]
     ends: tuple[str, str]
     """Why the branch ends on each side: "bounds", "grazing" (an impact is lost or a stop touched),
-    "period-doubling" (it springs there from a motion of half its period), "closed", "stalled",
-    "max_points"."""
+    "period-doubling" (it springs there from a motion of half its period), "hopf" (it shrinks to
+    rest), "closed", "stalled", "max_points"."""
     problem: Shooting = dataclasses.field(repr=False)
     steps: list[Step] = dataclasses.field(repr=False)
     scale: np.ndarray = dataclasses.field(repr=False)
@@ -208,7 +208,7 @@ def _refined(problem: Shooting, x, tangent, scale) -> tuple[Step, float]:
 
 def _branch(problem, name, steps, special, ends, scale) -> Branch:
     xs = np.stack([step.x for step in steps])
-    legs = len(problem.stops)
+    impacts = np.asarray(problem.impacts, int)
 
     def column(get: Callable[[Any], Any]) -> np.ndarray:
         return np.stack([np.asarray(get(step.seen)) for step in steps])
@@ -223,8 +223,8 @@ def _branch(problem, name, steps, special, ends, scale) -> Branch:
         y_min=column(lambda seen: seen.y_min),
         y_max=column(lambda seen: seen.y_max),
         multipliers=column(lambda seen: seen.multipliers),
-        impact_phase=xs[:, :legs],
-        impact_speed=column(lambda seen: seen.approach),
+        impact_phase=xs[:, impacts],
+        impact_speed=column(lambda seen: np.asarray(seen.approach)[impacts]),
         clearance=column(lambda seen: seen.clearance),
         frequency_ratio=np.full(len(xs), np.nan) if ratio is None else np.asarray(ratio),
         cycles=problem.cycles,

@@ -123,10 +123,16 @@ def _find(the_map: CycleMap, guess: Any, root_finder: AbstractSearch, impact_log
 def _run(the_map: CycleMap, state: Any, impact_log: int) -> Run:
     """The motion with its impacts: one program for the look at the guess and for that at the orbit,
     where they are as long."""
+    places = _places(the_map, state)
     return simulate(
-        the_map.scene, state, the_map.cycles, method=the_map.method, samples=_PLACES,
-        impact_log=impact_log, rests=the_map.rests,
+        the_map.scene, state, the_map.cycles, method=the_map.method,
+        samples=0 if places == 1 else places, impact_log=impact_log, rests=the_map.rests,
     )  # fmt: skip
+
+
+def _places(the_map: CycleMap, state: Any) -> int:
+    """Places of a cycle that are looked at: of an autonomous machine only its section."""
+    return _PLACES if the_map.scene.section(state) is None else 1
 
 
 def _moved(the_map: CycleMap, guess: Any, impact_log: int) -> tuple[CycleMap, Any, Int[Array, ""]]:
@@ -248,10 +254,10 @@ def _follow(arc: CycleMap, state: Any, impact_log: int) -> _Seen:
         jacobians = jax.jacfwd(states)(x)
         run = _run(arc, state, impact_log)
         log = run.impact_log
-        assert run.samples is not None and log is not None
-        assert run.y_min is not None and run.y_max is not None
-        places = jnp.stack(jtu.tree_leaves(run.samples.state), axis=-1)[1:]
-        places = places.reshape(arc.cycles, _PLACES, -1)
+        assert log is not None and run.y_min is not None and run.y_max is not None
+        met = run.sections if run.samples is None else run.samples.state
+        places = jnp.stack(jtu.tree_leaves(met), axis=-1)[1:]
+        places = places.reshape(arc.cycles, _places(arc, state), -1)
         assert run.clearance is not None and run.duration is not None
         return _Seen(
             places, jacobians, run.y_min, run.y_max, run.clearance, run.duration,
@@ -281,14 +287,19 @@ def _judged(the_map: CycleMap, guess: Any, root_finder: AbstractSearch, impact_l
     seen = jtu.tree_map(lambda a: a.reshape(cycles, *a.shape[2:]), seen)
 
     # Back on the section asked for, of which the last one met is the guess's.
-    sections = jnp.roll(jnp.take(seen.states, _PLACES - 1 - place, axis=1), 1, axis=0)
+    last = seen.states.shape[1] - 1
+    sections = jnp.roll(jnp.take(seen.states, last - place, axis=1), 1, axis=0)
     least = _least_period(sections, error)
     monodromy = jacobians[least - 1]
     within = jnp.arange(cycles) < least
     turn = jnp.asarray(scene.cycle, x.dtype)
     hit = (seen.stop >= 0) & within[:, None]
-    phase = seen.phase + turn * (jnp.arange(cycles)[:, None] + place / _PLACES)
-    phase = jnp.where(hit, jnp.mod(phase, turn * least), jnp.inf).ravel()
+    if last:
+        phase = seen.phase + turn * (jnp.arange(cycles)[:, None] + place / _PLACES)
+        phase = jnp.mod(phase, turn * least)
+    else:  # each cycle as long as it lasts
+        phase = seen.phase + (jnp.cumsum(seen.duration) - seen.duration)[:, None]
+    phase = jnp.where(hit, phase, jnp.inf).ravel()
     order = jnp.argsort(phase)
     phase, speed, stop = (
         jnp.where(hit.ravel(), a.ravel(), none)[order]

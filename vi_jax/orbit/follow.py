@@ -9,15 +9,20 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from .curve import Step
-from .shooting import Shooting
+from .shooting import Event, Shooting
 from .solve import advance, located, observe, orbit_of, state_at
-from .special import CROSSING, DOUBLING, FOLD, GRAZING, SYMMETRY, TORUS, SpecialPoint
+from .special import CROSSING, DOUBLING, FOLD, GRAZING, HOPF, SYMMETRY, TORUS, SpecialPoint
 
 # What lies before the place where a branch springs is looked for on so much of the way there.
 _SHORT = 0.999
 
 # How far beside a point where branches cross (in the norm of the scaled unknowns) it is looked at.
 _BESIDE = 1e-3
+
+# A motion of no more amplitude than this is rest.
+_STILL = 1e-3
+
+_NAMES = {"stop": "impact", "switch": "switch", "section": "section"}
 
 # Halves of a period that differ by less than this are those of a motion of half the period.
 _ALIKE = 1e-3
@@ -47,7 +52,7 @@ class Follower:
             reason = "bounds"
         grazing = self._grazing(here, last)
         if grazing is not None:
-            last, reason = grazing.step, "grazing"
+            last, reason = grazing.step, grazing.kind
         origin = self._bifurcations(here, last)
         if origin is not None:
             return origin, "period-doubling"
@@ -81,7 +86,7 @@ class Follower:
         def room(step: Step) -> float:
             return float(np.clip(step.seen.clearance, -1.0, 1.0))
 
-        for i in range(len(self.problem.stops)):
+        for i in range(len(self.problem.events)):
             if new.seen.approach[i] <= 0 < here.seen.approach[i]:
                 at = self._where(here, new, lambda step, i=i: float(step.seen.approach[i]))
                 if at is not None:
@@ -94,16 +99,19 @@ class Follower:
             return None
         at, impact = min(found, key=lambda f: float(np.dot(here.tangent, f[0].x - here.x)))
         if impact is None:
-            told = f"touches a stop at {self._place(float(at.seen.touch))}"
+            told = f"touches a stop at {self._place(at, float(at.seen.touch))}"
         else:
             clock = float(np.asarray(self.problem.parts(jnp.asarray(at.x))[0])[impact])
-            told = f"the impact at {self._place(clock)} is lost"
+            kind = self.problem.events[impact].kind
+            told = f"the {_NAMES[kind]} at {self._place(at, clock)} is lost"
+            if kind == "section" and float(at.seen.y_max - at.seen.y_min) < _STILL:
+                return self._point(HOPF, at, "the motion shrinks to rest", impact)
         return self._point(GRAZING, at, told, impact)
 
-    def _place(self, clock: float) -> str:
+    def _place(self, at: Step, clock: float) -> str:
         """A reading of the clock of impacts, in words, within one period from the section on."""
-        scene, cycles = self.problem.scene, self.problem.cycles
-        return scene.place_of(clock % (float(scene.cycle) * cycles), cycles)
+        period = float(self.problem.period(jnp.asarray(at.x)))
+        return self.problem.scene.place_of(clock % period, self.problem.cycles)
 
     def _bifurcations(self, here: Step, last: Step) -> Step | None:
         """Record what happens between two points; the point where the branch springs, if met.
@@ -206,7 +214,7 @@ class Follower:
             return False
         x = jnp.asarray(step.x)
         clock = np.asarray(problem.parts(x)[0])
-        turn = float(scene.cycle) * problem.cycles
+        turn = float(problem.period(x))
         # A place within the first flight, and the one half a period later.
         first = clock[0] + 0.25 * ((clock[1] if len(clock) > 1 else clock[0] + turn) - clock[0])
         states = []
@@ -233,11 +241,11 @@ class Follower:
         mean of the two halves is a motion of half the period but for a term of second order.
         """
         problem, count = self.problem, len(self.problem.parameters)
-        legs, x = len(problem.stops) // 2, jnp.asarray(at.x)
-        turn = float(problem.scene.cycle) * problem.cycles / 2
+        legs, x = len(problem.events) // 2, jnp.asarray(at.x)
+        turn = float(problem.period(x)) / 2
         half = dataclasses.replace(
-            problem, cycles=problem.cycles // 2, stops=problem.stops[:legs],
-            steps=problem.steps // 2,
+            problem, cycles=problem.cycles // 2, events=problem.events[:legs],
+            modes=problem.modes[: max(1, legs)], steps=problem.steps // 2,
         )  # fmt: skip
         clock, states = (np.asarray(a) for a in problem.parts(x))
         if legs:
@@ -245,7 +253,7 @@ class Follower:
             states = 0.5 * (states[:legs] + states[legs:])
         else:
             states = states + 0.5 * self._halves(at)
-        mean = np.asarray(half.pack(clock, states, at.x[-count:]))
+        mean = np.asarray(half.pack(clock, states, at.x[-count:], turn))
         scale = np.append(np.ones(mean.size - count), self.scale[-count:])
         along = np.append(np.zeros(mean.size - 1), 1.0)
 
@@ -263,18 +271,20 @@ class Follower:
             return at
         found = advance(half, mean, along, scale, float(shift))
         clock, states = (np.asarray(a) for a in half.parts(jnp.asarray(found.x)))
+        turn = float(half.period(jnp.asarray(found.x)))
         if legs:
             clock, states = np.append(clock, clock + turn), np.concatenate([states, states])
-        x = np.asarray(problem.pack(clock, states, found.x[-count:]))
+        x = np.asarray(problem.pack(clock, states, found.x[-count:], 2 * turn))
         return at._replace(x=x, size=found.size, seen=observe(problem, x))
 
     def _halves(self, step: Step) -> np.ndarray:
         """How the second half of the period differs from the first; empty if it cannot be alike."""
-        legs, cycles = len(self.problem.stops), self.problem.cycles
-        if cycles % 2 or legs % 2:
+        events, cycles = self.problem.events, self.problem.cycles
+        legs = len(events)
+        if cycles % 2 or legs % 2 or not _alike(events, cycles):
             return np.zeros(0)
-        turn = float(self.problem.scene.cycle) * cycles / 2
         x = jnp.asarray(step.x)
+        turn = float(self.problem.period(x)) / 2
         if not legs:
             middle = state_at(self.problem, x, jnp.asarray(0), jnp.asarray(turn))
             return np.asarray(ravel_pytree(middle)[0]) - step.x[: self.problem.states]
@@ -282,6 +292,16 @@ class Follower:
         half = legs // 2
         late = clock[half:] - clock[:half] - turn
         return np.append(late, (states[half:] - states[:half]).ravel())
+
+
+def _alike(events: tuple[Event, ...], cycles: int) -> bool:
+    """Whether both halves of a period have the same events."""
+    half = len(events) // 2
+    later = [
+        event._replace(number=event.number - cycles // 2) if event.kind == "section" else event
+        for event in events[half:]
+    ]
+    return list(events[:half]) == later
 
 
 def _tests(step: Step) -> dict[str, float]:

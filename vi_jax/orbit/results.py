@@ -135,10 +135,15 @@ class Orbit(eqx.Module):
             raise ValueError(
                 f"`trajectory` needs one orbit, but this is a batch of shape {self.residual.shape}."
             )
+        scene = self.scene
         if cycles is None:
             cycles = int(self.cycles)
+        if scene.section(self.state) is not None:
+            # Its cycles need not be of one length: the whole motion is one interval.
+            scene = scene.observed_every(self.duration * (cycles / self.cycles))
+            samples, cycles = samples * cycles, 1
         return simulate(
-            self.scene, self.state, cycles, method=self.method, samples=samples,
+            scene, self.state, cycles, method=self.method, samples=samples,
             impact_log=impact_log,
         )  # fmt: skip
 

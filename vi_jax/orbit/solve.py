@@ -1,7 +1,8 @@
 """The equations of an orbit from impact to impact, solved: their programs, and what they say."""
 
+import dataclasses
 from collections.abc import Callable
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -10,10 +11,21 @@ from jax.flatten_util import ravel_pytree
 
 from .._programs import compiled
 from ..flow.choice import MethodLike
+from ..flow.loop import run_forward
+from ..flow.moving import begin_modes, in_modes, struck_modes
+from ..flow.simulate import collect, planned
+from ..scene import Scene
 from ..scene.leaves import leaf, with_leaf
 from .curve import Step, array_of, corrected, first_tangent
 from .results import ORBIT_RESULTS, Orbit
-from .shooting import Shooting, carrier, steps_of
+from .shooting import Event, Shooting, carrier, jump, renews, steps_of
+
+# Events of a cycle that can be followed, of a machine with switches or a section of its own.
+_LISTED = 32
+
+# Twice the steps of a flight change its end by less than this (relative to 1 + |state|); a motion
+# that asks for more of them than this is followed with so many.
+_SETTLED, _MOST = 1e-11, 4096
 
 
 @runtime_checkable
@@ -37,35 +49,112 @@ def problem_of(
     carried = carrier(method, orbit.method, scene)
     corners = [with_leaf(scene, parameter, end) for end in bounds]
     cycles = int(orbit.cycles)
-    stops = tuple(int(i) for i in np.asarray(orbit.impact_stop) if i >= 0)
-    if len(stops) != int(orbit.impacts):
+    if int(np.sum(np.asarray(orbit.impact_stop) >= 0)) != int(orbit.impacts):
         raise ValueError(
             f"Argument `orbit` must list all its {int(orbit.impacts)} impacts, but lists "
-            f"{len(stops)}: find it with a larger `impact_log`."
+            f"{len(orbit.impact_stop)}: find it with a larger `impact_log`."
         )
     steps = steps_of(carried, corners, orbit.state, cycles)
-    problem = Shooting(scene, carried, orbit.state, cycles, stops, steps, (parameter,))
-    section = float(scene.phase_at(0.0))
-    clock = np.asarray(orbit.impact_phase)[: len(stops)] - section
-    u, s = ravel_pytree(orbit.state)[0], 0.0
-    states = []
-    for i, place in enumerate(clock):
-        u = _carry(problem, s, place, u)
-        states.append(u)
-        u, s = _bounce(problem, i, u), place
+    found = events_of(orbit)
+    blank = Shooting(scene, carried, orbit.state, cycles, (), (), steps, (parameter,))
+    period = float(scene.cycle) * cycles
+    if blank.autonomous:
+        period = float(orbit.duration)
+    way = _followed(blank, orbit.state, found, period)
+    while not isinstance(scene, Scene):  # whose own steps are known to be enough
+        finer = dataclasses.replace(blank, steps=2 * blank.steps)
+        again = _followed(finer, orbit.state, found, period)
+        apart = np.max(np.abs(again.states - way.states) / (1 + np.abs(again.states)))
+        if apart < _SETTLED or finer.steps > _MOST:
+            break
+        blank, way = finer, again
+    problem = dataclasses.replace(blank, events=tuple(event for _, event in found), modes=way.modes)
+    states = way.states[:-1] if found else way.states
     value = leaf(scene, parameter)
-    x = problem.pack(clock, jnp.stack(states) if states else u, [value])
+    x = problem.pack([place for place, _ in found], states, [value], period)
     return problem, np.asarray(x)
 
 
-@compiled
-def _carry(problem: Shooting, s0, s1, u):
-    return problem.flight(problem.scene, jnp.asarray(s0), jnp.asarray(s1), u)[0]
+class _Way(NamedTuple):
+    """A motion followed from event to event."""
+
+    states: np.ndarray
+    """Just before each, and at the end of the period."""
+    modes: tuple[tuple[float, ...], ...]
+    """Of each flight."""
+
+
+def _followed(blank: Shooting, state: Any, found: list[tuple[float, Event]], period: float) -> _Way:
+    scene = blank.scene
+    modes = list(begin_modes(scene, jnp.zeros(()), state))
+    u, s = ravel_pytree(state)[0], 0.0
+    states, in_flight = [], []
+    for place, event in found:
+        if place > s:
+            u = _carry(blank, tuple(modes), s, place, u)
+        states.append(np.asarray(u))
+        here, clock = blank.unravel(u), jnp.asarray(place)
+        mode = modes[event.number] if event.kind == "switch" else None
+        if mode is not None:
+            modes[event.number] = scene.switches[event.number].after(scene, clock, here, mode)[1]
+        here = jump(scene, event, clock, here, mode)
+        if event.kind == "stop":
+            modes = list(struck_modes(scene, clock, here, tuple(modes)))
+        in_flight.append(tuple(float(m) for m in modes))
+        u, s = ravel_pytree(here)[0], place
+    states.append(np.asarray(_carry(blank, tuple(modes), s, period, u)))
+    return _Way(np.stack(states), tuple(in_flight) or (tuple(float(m) for m in modes),))
+
+
+def events_of(orbit: Orbit) -> list[tuple[float, Event]]:
+    """The events of a motion, with the clock of each since the section, in their order."""
+    scene, cycles = orbit.scene, int(orbit.cycles)
+    stops = np.asarray(orbit.impact_stop)
+    if scene.section(orbit.state) is None and not scene.switches:
+        clock = np.asarray(orbit.impact_phase) - float(scene.phase_at(0.0))
+        found = [
+            (float(s), Event("stop", int(i))) for s, i in zip(clock, stops, strict=True) if i >= 0
+        ]
+        begins = float(scene.cycle) * np.arange(cycles + 1)
+    else:
+        plan, start = planned(
+            scene, orbit.state, cycles, method=orbit.method, impact_log=_LISTED, log_switches=True
+        )
+        log, begins, counts = (np.asarray(a) for a in _listed(plan, start))
+        if counts.max() > _LISTED:
+            raise ValueError(
+                f"Argument `orbit` must have at most {_LISTED} events in a cycle, but has "
+                f"{int(counts.max())}."
+            )
+        found = []
+        for begin, clock, number in zip(begins, log[0], log[1], strict=False):
+            for s, i in zip(clock[number >= 0], number[number >= 0].astype(int), strict=True):
+                beyond = i - len(scene.stops)
+                event = Event("stop", int(i)) if beyond < 0 else Event("switch", int(beyond))
+                found.append((float(begin + s), event))
+    if scene.section(orbit.state) is not None or renews(scene):
+        found += [(float(begins[n]), Event("section", n)) for n in range(cycles)]
+    # What is met with a section belongs to the cycle that ends there.
+    return sorted(found, key=lambda f: (f[0], f[1].kind == "section"))
 
 
 @compiled
-def _bounce(problem: Shooting, leg, u):
-    return problem.bounced(problem.scene, jnp.asarray(leg), u)
+def _listed(plan, start):
+    """Clock and number of the events of each cycle, when each cycle begins, and their counts."""
+    run = collect(plan, False, *run_forward(plan, start))
+    assert run.impact_log is not None and run.duration is not None
+    begins = jnp.concatenate([jnp.zeros((1,)), jnp.cumsum(run.duration)])
+    if plan.ticks(start):
+        begins = jnp.asarray(plan.scene.cycle) * jnp.arange(plan.cycles + 1)
+    events = run.impact_log
+    log = jnp.stack([events.phase, events.stop.astype(events.phase.dtype)])
+    return log, begins, run.impacts
+
+
+@compiled
+def _carry(blank: Shooting, modes, s0, s1, u):
+    moving = in_modes(blank.scene, modes)
+    return blank.fly(moving, jnp.asarray(s0), jnp.asarray(s1), u)[0]
 
 
 @compiled
@@ -151,18 +240,24 @@ def orbit_of(problem: Shooting, step: Step) -> Orbit:
     """The solution at a step as an `Orbit`."""
     x, seen = jnp.asarray(step.x), step.seen
     scene = problem.at(x)
-    clock = np.asarray(step.x)[: len(problem.stops)]
-    turn = float(scene.cycle)
-    places = turn * np.arange(problem.cycles)
-    legs = np.zeros(problem.cycles, int)
-    # Along a branch an impact may move past the section: an orbit's clocks lie within its period.
-    within = np.mod(clock, turn * problem.cycles)
-    order = np.argsort(within)
-    if len(clock):
-        places = clock[0] + np.mod(places - clock[0], turn * problem.cycles)
-        legs = np.searchsorted(clock, places, side="right") - 1
+    clock = np.asarray(problem.parts(x)[0])[: len(problem.events)]
+    period = float(problem.period(x))
+    begins = [i for i, event in enumerate(problem.events) if event.kind == "section"]
+    if begins:
+        places, legs = clock[begins], np.asarray(begins)
+    else:
+        places = float(scene.cycle) * np.arange(problem.cycles)
+        legs = np.zeros(problem.cycles, int)
+        if len(clock):
+            places = clock[0] + np.mod(places - clock[0], period)
+            legs = np.searchsorted(clock, places, side="right") - 1
     sections, residual = _compiled_sections(problem, x, jnp.asarray(legs), jnp.asarray(places))
     admissible = seen.clearance >= -1e-9 and min(seen.approach, default=1.0) > -1e-9
+    # Along a branch an impact may move past the section: an orbit's clocks lie within its period.
+    impacts = np.asarray(problem.impacts, int)
+    within = np.mod(clock[impacts], period)
+    order = np.argsort(within)
+    stops = np.asarray([problem.events[i].number for i in impacts], np.int32)
     since = scene.phase_at(within[order])
     duration = jnp.asarray(seen.duration)
     return Orbit(
@@ -174,9 +269,9 @@ def orbit_of(problem: Shooting, step: Step) -> Orbit:
         duration=duration,
         frequency_ratio=scene.frequency_ratio(duration / problem.cycles),
         impact_phase=jnp.asarray(since),
-        impact_speed=jnp.asarray(np.asarray(seen.approach)[order]),
-        impact_stop=jnp.asarray(np.asarray(problem.stops, np.int32)[order]),
-        impacts=jnp.asarray(len(problem.stops), jnp.int32),
+        impact_speed=jnp.asarray(np.asarray(seen.approach)[impacts][order]),
+        impact_stop=jnp.asarray(stops[order]),
+        impacts=jnp.asarray(len(impacts), jnp.int32),
         y_min=jnp.asarray(seen.y_min),
         y_max=jnp.asarray(seen.y_max),
         clearance=jnp.asarray(seen.clearance),

@@ -1,6 +1,7 @@
 """Special points of a branch, and the branches that begin there."""
 
 import dataclasses
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,11 +11,12 @@ from .._checks import given_number
 from ..scene import AbstractScene
 from .curve import Step
 from .results import Orbit
-from .shooting import Shooting
+from .shooting import Event, Shooting
 from .solve import advance, jacobian_at, orbit_of, state_at, tangent_at
 
 FOLD, DOUBLING, TORUS = "fold", "period-doubling", "neimark-sacker"
 GRAZING, CROSSING, SYMMETRY = "grazing", "branch-point", "symmetry-breaking"
+HOPF = "hopf"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,7 +25,8 @@ class SpecialPoint:
 
     kind: str
     """"fold", "period-doubling", "neimark-sacker", "branch-point", "symmetry-breaking" (a branch
-    point of a motion that is its own image under the symmetry of its machine) or "grazing"."""
+    point of a motion that is its own image under the symmetry of its machine), "grazing", or "hopf"
+    (an autonomous machine's motion shrinks to rest)."""
     parameter: float
     orbit: Orbit
     detail: str
@@ -66,15 +69,16 @@ def _doubled(point: SpecialPoint, distance: float) -> Orbit:
     old = point.problem
     x = np.asarray(point.step.x)
     clock, states = (np.asarray(a) for a in old.parts(jnp.asarray(x)))
-    turn = float(old.scene.cycle) * old.cycles
-    if old.stops:
+    turn = float(old.period(jnp.asarray(x)))
+    events, modes = old.events, old.modes
+    if events:
         clock, states = np.concatenate([clock, clock + turn]), np.concatenate([states, states])
-        stops = old.stops * 2
-    else:
-        stops = ()
-    new = dataclasses.replace(old, cycles=2 * old.cycles, stops=stops, steps=2 * old.steps)
+        events, modes = (*events, *(_later(event, old.cycles) for event in events)), modes * 2
+    new = dataclasses.replace(
+        old, cycles=2 * old.cycles, events=events, modes=modes, steps=2 * old.steps
+    )
     count = len(old.parameters)
-    twice = np.asarray(new.pack(clock, states, x[-count:]))
+    twice = np.asarray(new.pack(clock, states, x[-count:], 2 * turn))
     scale = np.concatenate([np.ones(len(twice) - count), point.scale[-count:]])
     jacobian = np.asarray(jacobian_at(new, jnp.asarray(twice))) * scale
     # Without the parameter's column the equations have one null vector here: that of -1.
@@ -86,6 +90,11 @@ def _doubled(point: SpecialPoint, distance: float) -> Orbit:
             f"No motion of twice the period was found at distance {distance:g}; try another."
         )
     return orbit_of(new, step)
+
+
+def _later(event: Event, cycles: int) -> Event:
+    """The same event so many cycles later."""
+    return event._replace(number=event.number + cycles) if event.kind == "section" else event
 
 
 def _crossed(point: SpecialPoint, distance: float) -> Orbit:
@@ -109,34 +118,38 @@ def _crossed(point: SpecialPoint, distance: float) -> Orbit:
 def _beyond_grazing(point: SpecialPoint, distance: float) -> Orbit:
     """The motion with the grazing impact less, or with the touch as an impact more."""
     old, step = point.problem, point.step
+    if old.scene.switches:
+        raise ValueError(
+            "`switch` at a grazing needs a machine without soft stops, friction or other switches: "
+            "find the motion beyond it with `find_orbit`."
+        )
     x = jnp.asarray(step.x)
     scene = old.at(x)
     clock, states = (np.asarray(a) for a in old.parts(x))
-    stops, value = list(old.stops), np.asarray(step.x)[-1:]
-    period = float(scene.cycle) * old.cycles
+    events, value = list(old.events), np.asarray(step.x)[-1:]
+    period = float(old.period(x))
     if point.impact is not None:
-        del stops[point.impact]
-        if stops:
+        del events[point.impact]
+        if events:
             clock, states = (np.delete(a, point.impact, axis=0) for a in (clock, states))
         else:
             section = state_at(old, x, jnp.asarray(0), jnp.asarray(period))
             clock, states = np.zeros(0), np.asarray(ravel_pytree(section)[0])[None]
     else:
         touch = float(step.seen.touch)
-        leg = max(0, int(np.searchsorted(clock, touch, side="right")) - 1) if stops else 0
+        leg = max(0, int(np.searchsorted(clock, touch, side="right")) - 1) if events else 0
         there = state_at(old, x, jnp.asarray(leg), jnp.asarray(touch))
-        Y = float(scene.position(there))
-        hit = min(range(len(scene.stops)), key=lambda i: abs(_room(scene, i, Y)))
-        u = np.asarray(ravel_pytree(there)[0])[None]
-        if not stops:
-            clock, states, stops = np.array([touch]), u, [hit]
+        hit = min(range(len(scene.stops)), key=lambda i: abs(_room(scene, i, there)))
+        u, hit = np.asarray(ravel_pytree(there)[0])[None], Event("stop", hit)
+        if not events:
+            clock, states, events = np.array([touch]), u, [hit]
         else:
             clock, states = np.append(clock, touch), np.append(states, u, axis=0)
             order = np.argsort(np.mod(clock, period))
             clock, states = np.mod(clock, period)[order], states[order]
-            stops = [[*stops, hit][i] for i in order]
-    new = dataclasses.replace(old, stops=tuple(stops))
-    start = np.asarray(new.pack(clock, states, value))
+            events = [[*events, hit][i] for i in order]
+    new = dataclasses.replace(old, events=tuple(events), modes=((),) * max(1, len(events)))
+    start = np.asarray(new.pack(clock, states, value, period))
     scale = np.concatenate([np.ones(len(start) - 1), point.scale[-1:]])
     tangent = tangent_at(new, start, scale)
     for sense in (1.0, -1.0):
@@ -147,10 +160,10 @@ def _beyond_grazing(point: SpecialPoint, distance: float) -> Orbit:
             return orbit_of(new, found)
     raise ValueError(
         "Beyond this grazing there is no admissible motion with "
-        f"{len(stops)} impacts at distance {distance:g}."
+        f"{len(new.impacts)} impacts at distance {distance:g}."
     )
 
 
-def _room(scene: AbstractScene, i: int, Y: float) -> float:
+def _room(scene: AbstractScene, i: int, state: Any) -> float:
     stop = scene.stops[i]
-    return float(stop.gap) - stop.sign * Y
+    return -float(stop.beyond(scene.coordinates[stop.coordinate].position(state)))

@@ -59,7 +59,8 @@ def lyapunov(
     orthogonal after each drive cycle (Benettin's method). Rates are averaged with weights that
     vanish smoothly at both ends (Das, Saiki, Sander and Yorke 2017), which on periodic and
     quasi-periodic motions converges faster than any power of the number of cycles, once these are
-    some tens of the motion's periods. The exponent 0 along the motion itself is not among them. A
+    some tens of the motion's periods. The exponent 0 along the motion itself is not among them,
+    unless the machine is autonomous: it is observed at intervals of its usual `cycle` then. A
     motion that rests on a stop forgets its past at once: -∞, or a few powers of ten below rounding
     in each cycle, where the release is not met to the last digit. Clean under `jit` and `vmap`.
 
@@ -79,6 +80,9 @@ def lyapunov(
     cycles = count("cycles", cycles, least=8)
     if isinstance(start, TimedMotorState):
         start = MotorState(start.Y, start.V, start.W)
+    if scene.section(start) is not None:
+        # On its section the exponent 0 along the motion could not be seen.
+        scene = scene.observed_every(scene.cycle)
     method = chosen(scene, method)
     carried = cycle_map(scene, method=method)
     start = adopted(carried.scene, start)
