@@ -173,6 +173,7 @@ def _arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Fl
         direction=select(taken, arrival.direction, lane.direction),
         contact=select(taken, arrival.contact, lane.contact),
         modes=select(taken, arrival.modes, lane.modes),
+        below=_below(lane, trial, taken, arrival.completed),
         record=Record(
             time, y_max, y_min, arrival.impacts, arrival.speed, arrival.loss, arrival.rests,
             arrival.log, clearance,
@@ -227,6 +228,12 @@ def _released(lane: Lane, arrival: Arrival, k: int, leaves: Release, flow: Any) 
         direction=_put(arrival.direction, k, direction),
         contact=_put(arrival.contact, k, jnp.where(free, 0.0, arrival.contact[k])),
     )
+
+
+def _below(lane: Lane, trial: Trial, taken: Flag, completed: Flag) -> Scalar | None:
+    if trial.below is None or lane.below is None:
+        return None
+    return jnp.where(taken, jnp.where(completed, 0.0, trial.below), lane.below)
 
 
 def _put(values: tuple, k: int, value: Any) -> tuple:

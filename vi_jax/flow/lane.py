@@ -75,6 +75,9 @@ class Lane(eqx.Module):
     """Of each coordinate, 1 + i while it rests on stop number i, else 0; absent where none can."""
     modes: tuple[Scalar, ...]
     """Of each switch."""
+    below: Scalar | None
+    """1 once the section's guard has been below zero since the last section, else 0; absent where
+    the clock counts the cycles."""
     length: Scalar
     """Length proposed for an ordinary step."""
     attempt: Scalar
@@ -200,6 +203,7 @@ class Plan(eqx.Module):
             direction=jax.lax.stop_gradient(direction),
             contact=contact,
             modes=modes,
+            below=None if scene.section(start) is None else zero,
             length=length,
             attempt=length,
             target=zero,

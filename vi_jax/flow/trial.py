@@ -60,6 +60,8 @@ class Trial(NamedTuple):
     """The machine in its modes, with nothing held."""
     holding: Any
     """The machine as the step saw it: its bodies held where they rest."""
+    below: Scalar | None
+    """As in `Lane`, at the step's end."""
 
 
 class Path(NamedTuple):
@@ -136,13 +138,14 @@ def attempt(
     if plan.motion or scene.stops:
         for k in range(len(scene.coordinates)):
             paths.append(_path(plan, lane, k, free_scene, holding, (s1, new, h, limit), good))
+    section, below = _section(plan, lane, free_scene, s1, new)
     guards = [
-        *_stops(scene, paths),
-        *_switches(lane, scene, free_scene, s1, new),
-        *_section(plan, lane, free_scene, s1, new),
-    ]
+        *_stops(scene, paths), *_switches(lane, scene, free_scene, s1, new), *section
+    ]  # fmt: skip
     seen = tuple(_seen(lane, good & last, good, h, each, guards) for each in guards)
-    return Trial(s1, h, new, time, error, good, last, seen, tuple(paths), free_scene, holding)
+    return Trial(
+        s1, h, new, time, error, good, last, seen, tuple(paths), free_scene, holding, below
+    )
 
 
 def _path(
@@ -206,11 +209,13 @@ def _switches(lane: Lane, scene: AbstractScene, free: Any, s1: Scalar, new: Any)
     return found
 
 
-def _section(plan: Plan, lane: Lane, free: Any, s1: Scalar, new: Any) -> list[_Guard]:
-    """What ends a cycle, unless `s` itself does."""
+def _section(
+    plan: Plan, lane: Lane, free: Any, s1: Scalar, new: Any
+) -> tuple[list[_Guard], Scalar | None]:
+    """What ends a cycle, unless `s` itself does; and `Lane.below`."""
     scene = plan.scene
     if plan.ticks(lane.state):
-        return []
+        return [], None
     if scene.section(lane.state) is None:
         bound = plan.end(lane.part)
 
@@ -221,7 +226,7 @@ def _section(plan: Plan, lane: Lane, free: Any, s1: Scalar, new: Any) -> list[_G
             rates(free.field, clock, lane.s, lane.state).scaled(1, bound),
             rates(free.field, clock, s1, new).scaled(1, bound),
         )
-        return [_Guard(SECTION, "section", 0, *ends, bound)]
+        return [_Guard(SECTION, "section", 0, *ends, bound)], None
 
     def section(state: Any) -> Scalar:
         return jnp.asarray(scene.section(state))
@@ -230,12 +235,15 @@ def _section(plan: Plan, lane: Lane, free: Any, s1: Scalar, new: Any) -> list[_G
     end = rates(free.field, section, s1, new)
     scale = 1 + stop_gradient(jnp.abs(end.v))
     # From the section it rises: it ends the next cycle only once it has been below.
-    armed = stop_gradient(begin.x) < -1e4 * float(jnp.finfo(end.x.dtype).eps) * scale
+    assert lane.below is not None
+    rounding = 1e4 * float(jnp.finfo(end.x.dtype).eps) * scale
+    armed = (lane.below > 0) | (stop_gradient(begin.x) < -rounding)
+    below = jnp.where(armed | (stop_gradient(end.x) < -rounding), 1.0, lane.below)
     begin, end = (
         Rates(jnp.where(armed, r.x, -1.0), *(jnp.where(armed, x, 0.0) for x in (r.v, r.a)))
         for r in (begin, end)
     )
-    return [_Guard(SECTION, "section", 0, begin, end, scale)]
+    return [_Guard(SECTION, "section", 0, begin, end, scale)], below
 
 
 def _seen(

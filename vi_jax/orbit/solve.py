@@ -109,33 +109,38 @@ def _followed(blank: Shooting, state: Any, found: list[tuple[float, Event]], per
 def events_of(orbit: Orbit) -> list[tuple[float, Event]]:
     """The events of a motion, with the clock of each since the section, in their order."""
     scene, cycles = orbit.scene, int(orbit.cycles)
+    autonomous = scene.section(orbit.state) is not None
+    clock = np.asarray(orbit.impact_phase) - float(scene.phase_at(0.0))
     stops = np.asarray(orbit.impact_stop)
-    if scene.section(orbit.state) is None and not scene.switches:
-        clock = np.asarray(orbit.impact_phase) - float(scene.phase_at(0.0))
-        found = [
-            (float(s), Event("stop", int(i))) for s, i in zip(clock, stops, strict=True) if i >= 0
-        ]
-        begins = float(scene.cycle) * np.arange(cycles + 1)
-    else:
-        plan, start = planned(
-            scene, orbit.state, cycles, method=orbit.method, impact_log=_LISTED, log_switches=True
-        )
-        log, begins, counts = (np.asarray(a) for a in _listed(plan, start))
-        if counts.max() > _LISTED:
-            raise ValueError(
-                f"Argument `orbit` must have at most {_LISTED} events in a cycle, but has "
-                f"{int(counts.max())}."
-            )
-        found = []
-        for begin, clock, number in zip(begins, log[0], log[1], strict=False):
-            for s, i in zip(clock[number >= 0], number[number >= 0].astype(int), strict=True):
-                beyond = i - len(scene.stops)
-                event = Event("stop", int(i)) if beyond < 0 else Event("switch", int(beyond))
-                found.append((float(begin + s), event))
-    if scene.section(orbit.state) is not None or renews(scene):
+    found = [(float(s), Event("stop", int(i))) for s, i in zip(clock, stops, strict=True) if i >= 0]
+    begins = float(scene.cycle) * np.arange(cycles)
+    if scene.switches or (autonomous and cycles > 1):
+        begins, listed = _listed_events(orbit)
+        found = listed if scene.switches else found
+    if autonomous or renews(scene):
         found += [(float(begins[n]), Event("section", n)) for n in range(cycles)]
     # What is met with a section belongs to the cycle that ends there.
     return sorted(found, key=lambda f: (f[0], f[1].kind == "section"))
+
+
+def _listed_events(orbit: Orbit) -> tuple[np.ndarray, list[tuple[float, Event]]]:
+    """When each cycle of a motion begins, and its impacts and switches, as a simulation has them."""
+    plan, start = planned(
+        orbit.scene, orbit.state, int(orbit.cycles), method=orbit.method, impact_log=_LISTED,
+        log_switches=True,
+    )  # fmt: skip
+    log, begins, counts = (np.asarray(a) for a in _listed(plan, start))
+    if counts.max() > _LISTED:
+        raise ValueError(
+            f"Argument `orbit` must have at most {_LISTED} events in a cycle, but has "
+            f"{int(counts.max())}."
+        )
+    found, stops = [], len(orbit.scene.stops)
+    for begin, clock, number in zip(begins, log[0], log[1], strict=False):
+        for s, i in zip(clock[number >= 0], number[number >= 0].astype(int), strict=True):
+            event = Event("stop", int(i)) if i < stops else Event("switch", int(i) - stops)
+            found.append((float(begin + s), event))
+    return begins, found
 
 
 @compiled
