@@ -124,7 +124,7 @@ def events_of(orbit: Orbit) -> list[tuple[float, Event]]:
 
 
 def _listed_events(orbit: Orbit) -> tuple[np.ndarray, list[tuple[float, Event]]]:
-    """When each cycle of a motion begins, and its impacts and switches, as a simulation has them."""
+    """When each cycle of a motion begins, and its impacts and switches, by a simulation."""
     plan, start = planned(
         orbit.scene, orbit.state, int(orbit.cycles), method=orbit.method, impact_log=_LISTED,
         log_switches=True,
@@ -228,8 +228,11 @@ def located(
         return None
     from scipy.optimize import brentq  # slow to load
 
-    root = float(brentq(value, 0.0, length, xtol=1e-14, rtol=1e-14, maxiter=80))  # pyright: ignore
-    value(root)
+    # Where the test jumps, or has no value, the closest point to it has to do.
+    root = brentq(  # pyright: ignore[reportAssignmentType]
+        value, 0.0, length, xtol=1e-14, rtol=1e-14, maxiter=80, full_output=True, disp=False
+    )[0]
+    value(float(root))
     # Where branches cross the corrector has no answer; a point beside it will do.
     good = [step for step in at.values() if bool(step.good)]
     return min(good, key=lambda step: abs(test(step)), default=None)
