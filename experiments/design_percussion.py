@@ -62,7 +62,7 @@ DESIGNS = {"A": (0.8, np.inf), "B": (0.5, np.inf), "C": (0.8, 0.95)}
 # %%
 def parameters(design: Any) -> vi.Parameters:
     numbers = LOW + (HIGH - LOW) * design
-    return eqx.tree_at(lambda p: (p.kappa, p.gap, p.damping), MACHINE, tuple(numbers))
+    return eqx.tree_at(lambda p: (p.control, p.gap, p.damping), MACHINE, tuple(numbers))
 
 
 def impact_power(machine: vi.Parameters, orbit: vi.Orbit) -> Any:
@@ -93,7 +93,7 @@ def lagrangian(design: Any, guess: Any, force: Force) -> tuple[Any, tuple]:
     power = impact_power(machine, orbit)
     trace = jnp.trace(orbit.monodromy) / force.limit
     det = jnp.linalg.det(orbit.monodromy) / force.limit**2
-    free = jnp.hypot(1 - machine.kappa**2, 2 * scene.damping_ratio * machine.kappa)
+    free = jnp.hypot(1 - machine.control**2, 2 * scene.damping_ratio * machine.control)
     gap = scene.stops[0].gap * free / force.reach
     excess = jnp.stack([trace - det, -trace - det, gap]) - 1  # to be ≤ 0
     pushed = jnp.maximum(0.0, force.price + force.weight * excess)
@@ -237,7 +237,7 @@ def grid_power(force: Force, gap: Any, zetas: Any) -> Any:
 
     def one(zeta):
         machine = eqx.tree_at(
-            lambda p: (p.kappa, p.gap, p.damping), MACHINE, (zeta, gap, jnp.asarray(LOW[2]))
+            lambda p: (p.control, p.gap, p.damping), MACHINE, (zeta, gap, jnp.asarray(LOW[2]))
         )
         scene = machine.scene(drive="ideal")
         orbits = vi.closed_form_orbits(scene)
@@ -283,7 +283,7 @@ def row(name: str, design: Any, end: Outcome) -> str:
     room = float(machine.metres(end.orbit.clearance)) * 1e3
     cells = [
         name,
-        f"{float(machine.kappa):.4f}",
+        f"{float(machine.control):.4f}",
         f"{float(machine.gap) * 1e3:.1f}",
         f"{float(machine.damping):.3f}",
         f"{float(end.power):.4f}",
@@ -314,7 +314,7 @@ print(table)
 end_a, end_c = ascents["A"].end, ascents["C"].end
 # Where the motion of A ends if the drive turns faster: the closed form finds it no more.
 machine_a = parameters(ascents["A"].design)
-faster = jnp.linspace(float(machine_a.kappa), LOW[0] + 1.0, zetas.size)
+faster = jnp.linspace(float(machine_a.control), LOW[0] + 1.0, zetas.size)
 power_there = grid_power(none._replace(limit=jnp.array(np.inf)), jnp.asarray(machine_a.gap), faster)
 fold = float(jnp.max(jnp.where(jnp.isfinite(power_there), faster, 0.0)))
 gain = float(end_a.power / before.power)
@@ -394,7 +394,7 @@ for name, design, end in (
 ):
     machine = parameters(design)
     numbers |= {
-        f"{name}: ζ": float(machine.kappa),
+        f"{name}: ζ": float(machine.control),
         f"{name}: Δ, mm": float(machine.gap) * 1e3,
         f"{name}: c, N·s/m": float(machine.damping),
         f"{name}: power, W": float(end.power),

@@ -62,7 +62,7 @@ def make(machine: str, torque: float | None) -> vi.Scene:
     """The scene with the ideal drive (no torque given) or the motor."""
     values = MACHINES[machine]
     table = vi.Parameters(
-        kappa=KAPPA, gap=0.08, torque=10.0 if torque is None else torque, **values
+        control=KAPPA, gap=0.08, torque=10.0 if torque is None else torque, **values
     )
     return table.scene(drive="ideal" if torque is None else "motor")
 

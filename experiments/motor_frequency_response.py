@@ -54,7 +54,7 @@ def say(text: object) -> None:
 
 
 def machine(torque: float, gap: float, kappa: float) -> vi.Scene:
-    return vi.Parameters(torque=torque, kappa=kappa, restitution=K, gap=gap).scene(drive="motor")
+    return vi.Parameters(torque=torque, control=kappa, restitution=K, gap=gap).scene(drive="motor")
 
 
 SCENE = machine(1.0, NEAR, 1.0)

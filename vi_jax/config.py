@@ -54,7 +54,7 @@ class MachineTable:
     restitution: float | None = None
     gap: float | None = None
     torque: float | None = None
-    kappa: float | None = None
+    control: float | None = None
     no_load_speed: float | None = None
 
     def build(self) -> Scene:

@@ -142,7 +142,7 @@ def test_special_points_of_figure_2_and_of_the_bifurcation_diagram():
 @pytest.mark.slow
 def test_motors_fold():
     """The fold of Table 1's T0 = 10 N·m, which no closed form knows."""
-    motor = vi.Parameters(torque=10.0, kappa=1.2, restitution=0.5, gap=0.08).scene()
+    motor = vi.Parameters(torque=10.0, control=1.2, restitution=0.5, gap=0.08).scene()
     guess = headline_numbers.closed(1.19, 0.5, headline_numbers.XI, 2.0, cycles=1)
     orbit = vi.find_orbit(motor, motor.start(Y=guess.Y[0], V=guess.V[0], W=1.19), throw=True)
     branch = vi.continue_orbit(orbit, parameter="drive.control", bounds=(0.5, 6.0), max_step=0.2)

@@ -10,7 +10,7 @@ from vi_jax.scene.trig import sincos
 
 @pytest.mark.parametrize("crank", ["cosine", "slider"])
 def test_clocks_agree(crank):
-    scene = vi.Parameters(torque=10.0, kappa=0.9, restitution=0.5).scene(crank=crank)
+    scene = vi.Parameters(torque=10.0, control=0.9, restitution=0.5).scene(crank=crank)
     start = scene.start(Y=0.0, V=0.0, W=0.9)
     method = vi.Adaptive(rtol=1e-12)
     phase, time = (vi.simulate(scene, start, 50, method=method, clock=c) for c in ("phase", "time"))
@@ -66,7 +66,7 @@ def test_a_strong_motor_approaches_the_ideal_drive():
 
 @pytest.mark.parametrize("method", [vi.Adaptive(), vi.FixedStep()], ids=["adaptive", "fixed"])
 def test_a_stall_points_to_the_time_clock(method):
-    scene = vi.Parameters(torque=0.5, kappa=-0.5).scene()  # the motor brakes
+    scene = vi.Parameters(torque=0.5, control=-0.5).scene()  # the motor brakes
     start = scene.start(V=0.5, W=0.5)
     run = vi.simulate(scene, start, 20, method=method)
     assert bool(run.result == vi.RESULTS.stalled)
@@ -78,7 +78,7 @@ def test_a_stall_points_to_the_time_clock(method):
 
 
 def test_start_from_rest():
-    scene = vi.Parameters(torque=10.0, kappa=0.9).scene()
+    scene = vi.Parameters(torque=10.0, control=0.9).scene()
     with pytest.raises(ValueError, match=r'W > 0 in the phase clock.*W = 0.*clock="time"'):
         vi.simulate(scene, scene.start(W=0.0), 5)
     run = vi.simulate(scene, scene.start(W=0.0), 60, method=vi.Adaptive(), clock="time")
@@ -100,7 +100,7 @@ def test_sine_and_cosine_to_rounding():
 def test_fixed_steps_stay_stable_for_a_strong_motor(torque):
     # Its shaft comes back to speed within a small part of a cycle, at low speed most of all.
     def last(kappa, method):
-        scene = vi.Parameters(torque=torque, kappa=kappa, gap=0.08).scene()
+        scene = vi.Parameters(torque=torque, control=kappa, gap=0.08).scene()
         run = vi.simulate(scene, scene.start(), 20, method=method)
         return run.sections.Y[-1], run.successful
 

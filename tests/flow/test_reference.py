@@ -156,7 +156,7 @@ def motor_by_scipy(torque, kappa, d, k, ratio, start, cycles):
     [("cosine", 2.0, 0.9, 2.0, 0.5), ("slider", 2.0, 0.9, 2.0, 0.5), ("slider", 10.0, 0.7, 1.1, 0)],
 )
 def test_motor_by_scipy(crank, torque, kappa, d, k):
-    scene = vi.Parameters(torque=torque, kappa=kappa, restitution=k, gap=0.04 * d).scene(
+    scene = vi.Parameters(torque=torque, control=kappa, restitution=k, gap=0.04 * d).scene(
         crank=crank
     )
     ratio = 1 / 3 if crank == "slider" else None

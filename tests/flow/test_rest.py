@@ -157,7 +157,7 @@ def test_k_of_zero_sticks_at_the_first_impact():
 
 def test_a_motor_turns_on_while_the_body_rests():
     # The shaft at rest contact feels a spring whose end is held: energy is kept without a motor.
-    table = vi.Parameters(torque=0.0, kappa=0.5, restitution=0.3, gap=0.3 * 0.04, damping=0.0)
+    table = vi.Parameters(torque=0.0, control=0.5, restitution=0.3, gap=0.3 * 0.04, damping=0.0)
     motor = table.scene()
     start = motor.start(Y=0.3, V=0.0, W=1.2)
     run = vi.simulate(motor, start, 1, method=vi.Adaptive(rtol=1e-12), samples=400)

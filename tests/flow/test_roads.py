@@ -21,7 +21,7 @@ def ideal(ratio, stops=ONE):
 
 
 def motor(kappa):
-    return vi.Parameters(torque=10.0, restitution=0.5, gap=0.05, kappa=kappa).scene()
+    return vi.Parameters(torque=10.0, restitution=0.5, gap=0.05, control=kappa).scene()
 
 
 # Scene of a lane's number, method, options of `simulate`.

@@ -84,7 +84,7 @@ def test_parameters_by_central_differences(impacts):
 @pytest.mark.parametrize("clock", ["phase", "time"])
 def test_motor_control_by_central_differences(clock):
     def f(kappa):
-        scene = vi.Parameters(torque=10.0, kappa=kappa).scene()
+        scene = vi.Parameters(torque=10.0, control=kappa).scene()
         run = vi.simulate(
             scene, scene.start(V=0.5, W=0.9), 4, method=vi.Adaptive(rtol=1e-11), clock=clock
         )

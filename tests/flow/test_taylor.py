@@ -65,7 +65,7 @@ def test_an_ideal_drive_as_the_exact_flight(name, clock):
         np.testing.assert_array_equal(mine.rests, truth.rests)
 
 
-MOTOR = vi.Parameters(torque=10.0, restitution=0.5, gap=0.08, kappa=0.9)
+MOTOR = vi.Parameters(torque=10.0, restitution=0.5, gap=0.08, control=0.9)
 
 
 @pytest.mark.parametrize("clock", ["phase", "time"])
@@ -111,7 +111,7 @@ def test_derivatives_pass_through_impacts():
     """Forward by the lanes' program, reverse by the checkpointed loop, against differences."""
 
     def final(kappa, adjoint="forward"):
-        motor = vi.Parameters(torque=10.0, restitution=0.5, gap=0.08, kappa=kappa).scene()
+        motor = vi.Parameters(torque=10.0, restitution=0.5, gap=0.08, control=kappa).scene()
         start = motor.start(W=0.9)
         return vi.simulate(motor, start, 6, method=vi.Taylor(18, 10), adjoint=adjoint).last.Y
 

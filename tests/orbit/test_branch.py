@@ -139,7 +139,7 @@ def test_sweeps_lie_on_stable_points(short, long, restitution):
 
 @pytest.mark.slow
 def test_a_motor_branch_agrees_with_found_orbits():
-    scene = vi.Parameters(torque=10.0, kappa=0.9, restitution=0.8, gap=0.08).scene(drive="motor")
+    scene = vi.Parameters(torque=10.0, control=0.9, restitution=0.8, gap=0.08).scene(drive="motor")
     run = vi.simulate(scene, scene.start(), 200)
     last = jax.tree.map(lambda x: x[-1], run.sections)
     orbit = vi.find_orbit(scene, last, cycles=2)

@@ -257,7 +257,7 @@ def test_says_what_is_wrong_with_guess_and_search():
 
 def motor(torque, restitution, damping=0.5):
     return vi.Parameters(
-        torque=torque, kappa=0.9, restitution=restitution, gap=0.08, damping=damping
+        torque=torque, control=0.9, restitution=restitution, gap=0.08, damping=damping
     ).scene(drive="motor")
 
 

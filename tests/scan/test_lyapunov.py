@@ -82,7 +82,7 @@ def test_chaos_is_seen_by_a_disturbance_too():
 
 @pytest.mark.slow
 def test_motor_has_three_and_vmap_gives_the_same():
-    scene = vi.Parameters(torque=10.0, kappa=0.9, restitution=0.8, gap=0.08).scene()
+    scene = vi.Parameters(torque=10.0, control=0.9, restitution=0.8, gap=0.08).scene()
     start = scene.start(Y=0.5)
     found = vi.lyapunov(scene, start, 200, settle=300)
     assert found.exponents.shape == (3,)

@@ -183,7 +183,7 @@ def test_own_measures_scenes_and_starts():
         return {"span": run.y_max[-1] - run.y_min[-1], "last": run.sections.Y[-3:]}
 
     def machine(kappa, torque):
-        return vi.Parameters(torque=torque, kappa=kappa, gap=0.08).scene(drive="motor")
+        return vi.Parameters(torque=torque, control=kappa, gap=0.08).scene(drive="motor")
 
     data = vi.scan(
         machine, {"kappa": [0.8, 0.9], "torque": [10.0, 100.0], "start.Y": [0.0, 1.0]},
@@ -365,7 +365,7 @@ def test_a_sweep_tells_what_happens_to_the_motion():
 
 @pytest.mark.slow
 def test_a_weak_motor_that_comes_off_the_stop_is_told():
-    motor = vi.Parameters(torque=2.0, restitution=0.5, gap=0.08, kappa=1.45).scene(drive="motor")
+    motor = vi.Parameters(torque=2.0, restitution=0.5, gap=0.08, control=1.45).scene(drive="motor")
     sweep = vi.sweep(motor, "drive.control", [1.45, 1.5, 1.55, 1.6], start=motor.start(W=1.2))
     _, before, after = str(sweep).splitlines()
     assert before == "  2π with 1 impact from 1.45"

@@ -8,7 +8,7 @@ import vi_jax as vi
 
 
 def test_groups_of_table_1():
-    table = vi.Parameters(torque=2.0, kappa=0.7, restitution=0.8)
+    table = vi.Parameters(torque=2.0, control=0.7, restitution=0.8)
     scene = table.scene()
     drive = scene.drive
     assert float(table.natural_frequency) == pytest.approx(15.930782, abs=5e-7)

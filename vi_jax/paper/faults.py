@@ -118,9 +118,9 @@ def _no_load_speed() -> Fault:
     for name, factor in (("omega", 1.0), ("2 omega", 2.0)):
         ratios = []
         for kappa in kappas:
-            table = Parameters(torque=100.0, kappa=kappa)
+            table = Parameters(torque=100.0, control=kappa)
             free = factor * float(table.natural_frequency)
-            scene = Parameters(torque=100.0, kappa=kappa, no_load_speed=free).scene()
+            scene = Parameters(torque=100.0, control=kappa, no_load_speed=free).scene()
             run = simulate(scene, scene.start(), 120, throw=True)
             assert run.frequency_ratio is not None
             ratios.append(float(run.frequency_ratio[-20:].mean()))

@@ -60,7 +60,7 @@ class Motors(NamedTuple):
 
 
 def _machine(torque: Any, kappa: Any, k: Any, c: Any) -> Scene:
-    return Parameters(torque=torque, kappa=kappa, restitution=k, damping=c).scene()
+    return Parameters(torque=torque, control=kappa, restitution=k, damping=c).scene()
 
 
 @eqx.filter_jit

@@ -60,7 +60,7 @@ class Parameters(eqx.Module):
     """Δ, distance of the stop from the unstretched position, m."""
     torque: Number = _si("torque", 10.0)
     """T0, stall torque of the motor at κ = 1, N·m."""
-    kappa: Number = _si("kappa", 0.9)
+    control: Number = _si("control", 0.9)
     """κ, motor control, dimensionless; the frequency ratio ζ of an ideal drive."""
     no_load_speed: Number | None = eqx.field(
         default=None,
@@ -81,7 +81,7 @@ class Parameters(eqx.Module):
         "restitution": SHARE,
         "gap": REAL,
         "torque": NOT_NEGATIVE,
-        "kappa": REAL,
+        "control": REAL,
         "no_load_speed": POSITIVE,
     }
 
@@ -104,13 +104,13 @@ class Parameters(eqx.Module):
         require_ranges(self)  # again: a number may have been put in place of another
         omega = self.natural_frequency
         if drive == "ideal":
-            turning: IdealDrive | Motor = IdealDrive(self.kappa)
+            turning: IdealDrive | Motor = IdealDrive(self.control)
         else:
             per_inertia = self.crank_radius**2 / self.inertia
             free = 1.0 if self.no_load_speed is None else self.no_load_speed / omega
             turning = Motor(
                 strength=self.torque / (self.inertia * omega**2),
-                control=self.kappa,
+                control=self.control,
                 coupling=self.body_mass * per_inertia,
                 slider_inertia=self.slider_mass * per_inertia,
                 no_load_speed=free,
