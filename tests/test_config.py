@@ -282,7 +282,7 @@ AXES = "[axes]\ndrive.frequency_ratio = [0.8, 0.9]\nstops.0.gap = [1, 2]\n"
         ("scan", AXES + "[scan]\npicture = 'x.jpg'", "`picture` in [scan] must end in .png"),
         ("scan", AXES + "[scan]\npicture = 'file.toml/x.png'", "`picture` in [scan] cannot be"),
         ("scan", AXES + "[scan]\npicture = 'folder.png'", "it is a folder"),
-        ("scan", AXES + "[scan]\nmeasure = 'speed'\npicture = 'x.png'", 'needs "regime"'),
+        ("scan", AXES + "[scan]\nmeasure = 'frequency_ratio'\npicture = 'x.png'", 'needs "regime"'),
         ("scan", "[axes]\nstart.Y = [1]\n[scan]\npicture = 'x.png'", "two axes, but there are 1"),
         ("scan", AXES + "[scan]\nstore = 'file.toml/x'", "`store` in [scan] must be a path"),
         ("scan", AXES + "[scan]\nstore = 'full'", "`store` in [scan] must be a new folder"),

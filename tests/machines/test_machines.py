@@ -266,7 +266,7 @@ def test_every_verb_takes_a_machine(name, tmp_path):
         warnings.simplefilter("ignore")  # lanes of a scan that fail are not what this is about
         data = vi.scan(
             machine, {parameter: values, start: [0.3, 0.5]}, settle=50, cycles=128,
-            measure=[vi.Regime(), "extremes", vi.Sections(), "impacts"],
+            measure=[vi.Regime(), "extremes", vi.Sections(), "impact_rate"],
         )  # fmt: skip
         assert data["period"].shape == (3, 2)
         second = "start.V" if start == "start.Y" else "start.speed"

@@ -26,7 +26,7 @@ SCRIPT = Path(__file__).with_name("long_scan.py")
 
 @pytest.fixture(scope="module")
 def data():
-    measure = ("extremes", "regime", "speed", "power", "impacts", "sections", "steps")
+    measure = ("extremes", "regime", "frequency_ratio", "power", "impact_rate", "sections", "steps")
     return vi.scan(SCENE, AXES, measure=measure, settle=100, cycles=130)
 
 
@@ -41,7 +41,7 @@ def test_every_lane_is_a_run(data):
         assert float(lane.y_max) == pytest.approx(float(run.y_max.max()), abs=1e-9)
         assert float(lane.impact_speed) == pytest.approx(float(run.impact_speed.max()), abs=1e-9)
         assert float(lane.impact_rate) == pytest.approx(float(run.impacts.mean()), abs=1e-12)
-        assert float(lane.zeta) == pytest.approx(zeta, rel=1e-12)
+        assert float(lane.frequency_ratio) == pytest.approx(zeta, rel=1e-12)
         np.testing.assert_allclose(lane.Y, run.sections.Y[-16:], atol=1e-9)
         assert int(lane.steps) == int(run.steps)
 
@@ -173,7 +173,7 @@ def test_other_numbers_compile_nothing(data):
     )
     axes = {name: row[:-1] + 0.01 for name, row in AXES.items()}
     scene = vi.Scene.ideal(frequency_ratio=0.8, restitution=0.7, gap=1.5, damping_ratio=0.02)
-    measure = ("extremes", "regime", "speed", "power", "impacts", "sections", "steps")
+    measure = ("extremes", "regime", "frequency_ratio", "power", "impact_rate", "sections", "steps")
     vi.scan(scene, axes, measure=measure, settle=77, cycles=130)
     assert not compiled
 
@@ -187,7 +187,7 @@ def test_own_measures_scenes_and_starts():
 
     data = vi.scan(
         machine, {"kappa": [0.8, 0.9], "torque": [10.0, 100.0], "start.Y": [0.0, 1.0]},
-        measure=(span, "speed"), settle=20, cycles=20,
+        measure=(span, "frequency_ratio"), settle=20, cycles=20,
     )  # fmt: skip
     assert data.span.shape == (2, 2, 2) and data.last.shape == (2, 2, 2, 3)
     scene = machine(0.9, 100.0)
@@ -195,7 +195,7 @@ def test_own_measures_scenes_and_starts():
     lane = data.sel({"kappa": 0.9, "torque": 100.0, "start.Y": 1.0})
     np.testing.assert_allclose(lane["last"], run.sections.Y[-3:], atol=1e-9)
     speed = 2 * np.pi * 20 / float(run.duration.sum())
-    assert float(lane.zeta) == pytest.approx(speed, rel=1e-9)
+    assert float(lane.frequency_ratio) == pytest.approx(speed, rel=1e-9)
 
 
 def test_derivatives_are_those_of_a_run():

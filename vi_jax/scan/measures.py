@@ -81,18 +81,20 @@ class Extremes(AbstractMeasure):
         }
 
 
-class Speed(AbstractMeasure):
-    """`zeta`, the mean crank speed over the cycles observed."""
+class FrequencyRatio(AbstractMeasure):
+    """`frequency_ratio`, the mean crank speed over the cycles observed."""
 
-    attributes: ClassVar[About] = {"zeta": {"units": "ω", "long_name": "mean crank speed ζ"}}
+    attributes: ClassVar[About] = {
+        "frequency_ratio": {"units": "ω", "long_name": "mean crank speed ζ"}
+    }
 
     def __call__(self, scene, run):
         """Of one lane."""
         assert run.duration is not None
-        zeta = scene.frequency_ratio(jnp.mean(run.duration))
-        if zeta is None:
-            raise ValueError("Measure `speed` needs a scene that is driven.")
-        return {"zeta": zeta}
+        ratio = scene.frequency_ratio(jnp.mean(run.duration))
+        if ratio is None:
+            raise ValueError("Measure `frequency_ratio` needs a scene that is driven.")
+        return {"frequency_ratio": ratio}
 
 
 class Power(AbstractMeasure):
@@ -131,7 +133,7 @@ class Sections(AbstractMeasure):
         return {name: x[-self.number :] for name, x in vars(run.sections).items()}
 
 
-class Impacts(AbstractMeasure):
+class ImpactRate(AbstractMeasure):
     """`impact_rate`, the impacts in a drive cycle, on average over the cycles observed."""
 
     attributes: ClassVar[About] = {
@@ -283,9 +285,9 @@ class Custom(AbstractMeasure):
 MEASURES: Mapping[str, Callable[[], AbstractMeasure]] = {
     "extremes": Extremes,
     "regime": Regime,
-    "speed": Speed,
+    "frequency_ratio": FrequencyRatio,
     "power": Power,
-    "impacts": Impacts,
+    "impact_rate": ImpactRate,
     "sections": Sections,
     "exponent": Exponent,
     "steps": Steps,

@@ -87,9 +87,9 @@ def scan(
       function once: another one is another program).
     - `axes`: names of numbers of the scene (`"drive.frequency_ratio"`, `"stops.0.restitution"`)
       or of the start (`"start.Y"`), each with a row of values.
-    - `measure`: what is kept: names out of `"extremes"`, `"regime"`, `"speed"`, `"power"`,
-      `"impacts"`, `"sections"`, `"exponent"`, `"steps"`; `AbstractMeasure`s; functions of a
-      lane's scene and `Run` that return named numbers.
+    - `measure`: what is kept: names out of `"extremes"`, `"regime"`, `"frequency_ratio"`,
+      `"power"`, `"impact_rate"`, `"sections"`, `"exponent"`, `"steps"`; `AbstractMeasure`s;
+      functions of a lane's scene and `Run` that return named numbers.
     - `start`: the first state; by default the scene's own start at rest.
     - `settle`, `cycles`: drive cycles before observing (any number), and observed (static; by
       default as many as the measures need, at least 32).
