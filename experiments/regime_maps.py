@@ -270,10 +270,10 @@ rng = np.random.default_rng(0)
 
 def over_later(seen: Seen) -> tuple[int, int]:
     """Of so many lanes called chaotic, those that are no longer so."""
-    chaotic = np.argwhere(seen.period == -1)
+    chaotic = np.argwhere(seen.period == vi.REGIMES.chaotic)
     i, j = rng.permutation(chaotic)[:LOOKED_AT].T
     late = settled(seen.plane.lane(i, j), vi.ExactFlight(), paired=True, settle=LATE)
-    return i.size, int(np.sum(late["period"].values != -1))
+    return i.size, int(np.sum(late["period"].values != vi.REGIMES.chaotic))
 
 
 over = [over_later(seen) for seen in maps]
@@ -385,10 +385,11 @@ figure.suptitle(
 # %%
 def shares(seen: Seen) -> list[float]:
     """Parts of the lanes (percent) by what they settle on."""
-    free, p, n = seen.impacts == 0, seen.period, seen.impacts
+    free, p, n, R = seen.impacts == 0, seen.period, seen.impacts, vi.REGIMES
     parts = [
-        free & (p > 0), free & (p == 0), ~free & (p == 1), ~free & (p == 2) & (n == 1),
-        ~free & (p == 2) & (n > 1), ~free & (p > 2), p == -1, p == -3, ~free & (p == 0),
+        free & (p > 0), free & (p == R.unsettled), ~free & (p == 1), ~free & (p == 2) & (n == 1),
+        ~free & (p == 2) & (n > 1), ~free & (p > 2), p == R.chaotic, p == R.transient,
+        ~free & (p == R.unsettled),
     ]  # fmt: skip
     return [100 * float(np.mean(part)) for part in parts]
 

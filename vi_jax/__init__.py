@@ -38,6 +38,7 @@ from .orbit import continue_orbit as continue_orbit
 from .orbit import cycle_map as cycle_map
 from .orbit import distinct_orbits as distinct_orbits
 from .orbit import find_orbit as find_orbit
+from .scan import REGIMES as REGIMES
 from .scan import AbstractMeasure as AbstractMeasure
 from .scan import Attractor as Attractor
 from .scan import Basins as Basins

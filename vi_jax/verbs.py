@@ -44,6 +44,8 @@ from .scan import basins as find_basins
 from .scan import scan as run_scan
 from .scan.grid import Blocks, axes_of
 from .scan.job import check_corners, make_job
+from .scan.regime import REGIMES
+from .scan.store import NOT_COMPUTED
 from .scene import Scene
 from .scene.leaves import leaf, leaf_names
 
@@ -364,7 +366,7 @@ def failures(codes: np.ndarray, *, what: str = "motions") -> tuple[list[str], bo
 
 
 def _reason(code: int) -> str:
-    return "Not computed." if code < 0 else RESULTS[REASONS[code]] or "completed"
+    return "Not computed." if code == NOT_COMPUTED else RESULTS[REASONS[code]] or "completed"
 
 
 def _told_axes(axes: Mapping[str, Sequence[float]]) -> str:
@@ -374,7 +376,7 @@ def _told_axes(axes: Mapping[str, Sequence[float]]) -> str:
 def _regimes(data: xr.Dataset) -> list[str]:
     """How many motions there are of each period."""
     period = np.asarray(data["period"])[np.asarray(data["result"]) == 0]
-    names = {0: "unsettled", -1: "chaotic", -3: "transiently chaotic"}
+    names: dict[int, str] = {regime: regime.meaning for regime in REGIMES}
     kinds, counts = np.unique(period, return_counts=True)
     order = sorted(zip(kinds.tolist(), counts.tolist(), strict=True), key=lambda pair: -pair[1])
     lines = [

@@ -8,7 +8,9 @@ from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap, to_rgb
 from matplotlib.patches import Patch
 
-from ..scan import Basins
+from ..scan import REGIMES, Basins
+from ..scan.regime import LABELS
+from ..scan.store import NOT_COMPUTED
 from .branch import axis_name
 from .motion import new_axes
 
@@ -17,16 +19,18 @@ _PERIODS = (
     "#4c78a8", "#f58518", "#54a24b", "#e45756", "#72b7b2", "#eeca3b", "#b279a2", "#9d755d",
     "#ff9da6",
 )  # fmt: skip
-_OTHERS = {
-    0: ("unsettled", "#c8c8c8"),
-    -1: ("chaotic", "#222222"),
-    -2: ("failed", "#ffffff"),
-    -3: ("transiently chaotic", "#7a6f86"),
-    -4: ("not computed", "#f3f3f3"),
+_COLORS = {
+    REGIMES.unsettled: "#c8c8c8",
+    REGIMES.transient: "#7a6f86",
+    REGIMES.chaotic: "#222222",
+    REGIMES.failed: "#ffffff",
 }
-_LEAST = min(_OTHERS)
-# What the labels of basins say, in these codes: -1 and so on.
-_IRREGULAR = {"chaotic": -1, "unsettled": 0, "failed": -2, "transient": -3}
+# What was not computed lies below all regimes.
+_LEAST = min(REGIMES) - 1
+_OTHERS: dict[int, tuple[str, str]] = {
+    **{regime: (regime.meaning, color) for regime, color in _COLORS.items()},
+    _LEAST: ("not computed", "#f3f3f3"),
+}
 
 # Motions named one by one in the legend; further ones share its last line.
 _NAMED = 12
@@ -56,12 +60,12 @@ def plot_regimes(
     codes = np.asarray(period).astype(int)
     shades = np.clip(codes, _LEAST + 1, len(_PERIODS))
     if "result" in data:
-        shades[np.asarray(data["result"].transpose(y, x)) == -1] = _LEAST
+        shades[np.asarray(data["result"].transpose(y, x)) == NOT_COMPUTED] = _LEAST
     ax = new_axes(ax)
     across, up = np.asarray(data[x], float), np.asarray(data[y], float)
     colors = [_shade(i)[1] for i in range(_LEAST, len(_PERIODS) + 1)]
     _image(ax, across, up, shades - _LEAST, colors)
-    order = [*range(1, len(_PERIODS) + 1), 0, -3, -1, -2, _LEAST]
+    order = [*range(1, len(_PERIODS) + 1), *_OTHERS]
     order = [i for i in order if (shades == i).any()]
     _legend(ax, [_shade(i) for i in order])
     ax.set_xlabel(axis_name(x))
@@ -94,7 +98,7 @@ def plot_basins(found: Basins, *, ax: Axes | None = None) -> Axes:
     x, y = _two_axes(names, None, None)
     ax = new_axes(ax)
     across, up = np.asarray(found.data[x], float), np.asarray(found.data[y], float)
-    colors, irregular = _basin_colors(len(found.attractors)), len(_IRREGULAR)
+    colors, irregular = _basin_colors(len(found.attractors)), len(LABELS)
     if label.dims == ("sample",):
         ax.scatter(across, up, c=[colors[i + irregular] for i in np.asarray(label)], s=6, lw=0)
     else:
@@ -111,10 +115,10 @@ def plot_basins(found: Basins, *, ax: Axes | None = None) -> Axes:
         rest = sum(a.fraction for a in found.attractors[_NAMED:])
         further = (f"{len(entries) - _NAMED} further: {100 * rest:.1f} %", "none")
         entries = [*entries[:_NAMED], further]
-    for name, code in _IRREGULAR.items():
-        part = found.irregular[name]
+    for regime in LABELS:
+        part = found.irregular[regime.name]
         if part:
-            entries.append((f"{_OTHERS[code][0]}: {100 * part:.1f} %", _OTHERS[code][1]))
+            entries.append((f"{regime.meaning}: {100 * part:.1f} %", _COLORS[regime]))
     _legend(ax, entries)
     ax.set(xlim=region[0], ylim=region[1])  # section points beyond the region stay outside
     ax.set_xlabel(f"{x.removeprefix('start.')} at the start")
@@ -123,8 +127,8 @@ def plot_basins(found: Basins, *, ax: Axes | None = None) -> Axes:
 
 
 def _basin_colors(motions: int) -> list[str]:
-    """Colours of the labels -4, -3, …, 0, 1, …; many motions share them in turn."""
-    irregular = [_OTHERS[code][1] for code in reversed(_IRREGULAR.values())]
+    """Colours of the labels, the least first; many motions share them in turn."""
+    irregular = [_COLORS[regime] for regime in sorted(LABELS, key=LABELS.__getitem__)]
     return irregular + [_PERIODS[i % len(_PERIODS)] for i in range(motions)]
 
 

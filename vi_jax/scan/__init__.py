@@ -9,6 +9,7 @@ from .measures import AbstractMeasure as AbstractMeasure
 from .measures import Exponent as Exponent
 from .measures import Regime as Regime
 from .measures import Sections as Sections
+from .regime import REGIMES as REGIMES
 from .scan import ScanInterrupted as ScanInterrupted
 from .scan import scan as scan
 from .sweep import Sweep as Sweep

@@ -20,6 +20,7 @@ from ..scene import AbstractScene
 from .grid import axes_of
 from .job import START
 from .measures import AbstractMeasure, Regime
+from .regime import LABELS, REGIMES, flags
 from .scan import scan
 
 if TYPE_CHECKING:
@@ -27,13 +28,7 @@ if TYPE_CHECKING:
 else:
     xr = lazy("xarray")
 
-CHAOTIC, UNSETTLED, FAILED, TRANSIENT = -1, -2, -3, -4
-_IRREGULAR = {
-    "chaotic": CHAOTIC,
-    "unsettled": UNSETTLED,
-    "failed": FAILED,
-    "transient": TRANSIENT,
-}
+_IRREGULAR = {regime.name: label for regime, label in LABELS.items()}
 
 
 class Attractor(NamedTuple):
@@ -59,9 +54,9 @@ class Basins(NamedTuple):
     """Basins of attraction."""
 
     data: "xr.Dataset"
-    """`label` over the region (or over `sample`): a number in `attractors`, or -1 for chaotic, -2
-    for unsettled, -3 for failed and -4 for transiently chaotic lanes; `period`, `impacts`,
-    `result`, and a section state on which the lane ended."""
+    """`label` over the region (or over `sample`): a number in `attractors`, or below 0 for
+    what is on none (`label.attrs` says which); `period`, `impacts`, `result`, and a section state
+    on which the lane ended."""
     attractors: list[Attractor]
     """The periodic motions, the largest basin first: label i is `attractors[i]`."""
     irregular: dict[str, float]
@@ -212,11 +207,7 @@ def basins(
             )
         )
     parts = {name: float(np.mean(label == number)) for name, number in _IRREGULAR.items()}
-    about = {
-        "long_name": "motion that the start settles on",
-        "flag_values": irregular,
-        "flag_meanings": " ".join(_IRREGULAR),
-    }
+    about = {"long_name": "motion that the start settles on", **flags(_IRREGULAR)}
     dims = data["period"].dims
     kind = np.min_scalar_type(-max(4, len(order)))
     data = data.assign(label=(dims, label.astype(kind).reshape(data["period"].shape), about))
@@ -230,10 +221,9 @@ def _sorted_out(
     followed: Callable[[np.ndarray, int], np.ndarray],
 ) -> tuple[np.ndarray, list[np.ndarray]]:
     """A label for each lane, and the section states of each motion."""
-    label = np.full(period.size, FAILED)
-    label[period == 0] = UNSETTLED
-    label[period == -1] = CHAOTIC
-    label[period == -3] = TRANSIENT
+    label = np.full(period.size, LABELS[REGIMES.failed])
+    for regime, number in LABELS.items():
+        label[period == regime] = number
     settled = np.flatnonzero(period > 0)
     if not settled.size:
         return label, []

@@ -14,7 +14,7 @@ from .._checks import count, require
 from ..flow import AbstractMethod, Run
 from ..scene import AbstractScene
 from .lyapunov import lyapunov
-from .regime import impacts_of, least_period
+from .regime import REGIMES, flags, impacts_of, least_period
 
 Numbers = dict[str, Array]
 About = Mapping[str, Mapping[str, Any]]
@@ -189,10 +189,10 @@ class Regime(AbstractMeasure):
     A motion has the least period p ≤ `longest` after which its sections repeat within
     `tolerance` (relative to 1 + |state|; see `least_period` for one that still spirals in). One
     that does not repeat is looked at for another `observed` cycles. Unless its greatest Lyapunov
-    exponent exceeds `threshold` (unit: ω) there, it is unsettled or quasi-periodic (period 0). If
-    it does, the motion is continued for `lasting` cycles and observed once more: it is chaotic
-    (period -1) if its exponent exceeds `threshold` again, else transiently chaotic (period -3): it
-    has settled on something else meanwhile, or is about to.
+    exponent exceeds `threshold` (unit: ω) there, it is unsettled or quasi-periodic. If it does, the
+    motion is continued for `lasting` cycles and observed once more: it is chaotic if its exponent
+    exceeds `threshold` again, else transiently chaotic: it has settled on something else
+    meanwhile, or is about to. `REGIMES` has the numbers that stand for these in `period`.
 
     While a chaotic transient lasts, nothing tells it from chaos; what is called chaotic may leave
     off later still. The longer `lasting`, the fewer do, and the more the chaotic lanes cost; 0
@@ -208,8 +208,7 @@ class Regime(AbstractMeasure):
         "period": {
             "units": "cycles",
             "long_name": "least period",
-            "flag_values": [-3, -2, -1, 0],
-            "flag_meanings": "transient failed chaotic unsettled",
+            **flags({regime.name: int(regime) for regime in sorted(REGIMES)}),
         },
         "impacts": {
             "units": "1",
@@ -239,13 +238,15 @@ class Regime(AbstractMeasure):
         sections = {name: x[1:] for name, x in vars(run.sections).items()}
         period = least_period(sections, longest=self.longest, tolerance=self.tolerance)
         return {
-            "period": jnp.where(run.successful, period, -2).astype(jnp.int16),
+            "period": jnp.where(run.successful, period, REGIMES.failed).astype(jnp.int16),
             "impacts": impacts_of(run.impacts.astype(_dtype(run)), period),
         }
 
     def unclear(self, found, look=0):
         """Where it does not repeat; at the second look, where it is chaotic."""
-        return found["period"] == -look
+        return found["period"] == jnp.where(
+            jnp.asarray(look) == 0, REGIMES.unsettled, REGIMES.chaotic
+        )
 
     def later(self, scene, state, method, found, look=0):
         """Chaotic or not; at the second look, still or not."""
@@ -253,8 +254,10 @@ class Regime(AbstractMeasure):
         out = lyapunov(scene, state, self.observed, settle=settle, number=1, method=method)
         chaotic = out.exponents[0] > self.threshold
         # What cannot be continued is left as it was.
-        otherwise = jnp.where(out.successful & (look > 0), -3, found["period"])
-        return {"period": jnp.where(chaotic, -1, otherwise).astype(found["period"].dtype)}
+        otherwise = jnp.where(out.successful & (look > 0), REGIMES.transient, found["period"])
+        return {
+            "period": jnp.where(chaotic, REGIMES.chaotic, otherwise).astype(found["period"].dtype)
+        }
 
 
 class Custom(AbstractMeasure):

@@ -1,5 +1,7 @@
-"""What a settled motion is: its period in drive cycles."""
+"""What a settled motion is: its period in drive cycles, or why it has none."""
 
+from collections.abc import Mapping
+from enum import IntEnum
 from typing import Any
 
 import jax
@@ -8,6 +10,37 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float, Int
 
 _SLACK = 100.0
+
+
+class REGIMES(IntEnum):
+    """What stands in `period` for a motion that has none: numbers that are no periods."""
+
+    unsettled = 0, "unsettled"
+    chaotic = -1, "chaotic"
+    failed = -2, "failed"
+    transient = -3, "transiently chaotic"
+
+    meaning: str
+
+    def __new__(cls, code: int, meaning: str):
+        """A number with a meaning in words."""
+        self = int.__new__(cls, code)
+        self._value_, self.meaning = code, meaning
+        return self
+
+
+LABELS = {
+    regime: -1 - place
+    for place, regime in enumerate(
+        (REGIMES.chaotic, REGIMES.unsettled, REGIMES.failed, REGIMES.transient)
+    )
+}
+"""The same as labels of basins, where 0 is a motion."""
+
+
+def flags(codes: Mapping[str, int]) -> dict[str, Any]:
+    """Attributes of a variable that say what its special numbers mean."""
+    return {"flag_values": list(codes.values()), "flag_meanings": " ".join(codes)}
 
 
 def least_period(

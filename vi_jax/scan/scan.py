@@ -24,7 +24,9 @@ from ..scene import AbstractScene
 from .describe import attributes_of, description_of
 from .grid import Blocks, axes_of
 from .job import Job, check_corners, make_job
+from .regime import flags
 from .store import (
+    NOT_COMPUTED,
     MemoryStore,
     Variable,
     ZarrStore,
@@ -247,8 +249,7 @@ def variables_of(job: Job, blocks: Blocks) -> dict[str, Variable]:
     known: dict[str, Mapping[str, Any]] = {
         "result": {
             "long_name": "how the lane ended",
-            "flag_values": [-1, *range(len(REASON_NAMES))],
-            "flag_meanings": " ".join(["not_computed", *REASON_NAMES]),
+            **flags({"not_computed": NOT_COMPUTED} | {n: i for i, n in enumerate(REASON_NAMES)}),
         }
     }
     for measure in job.measures:

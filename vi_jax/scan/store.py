@@ -21,7 +21,8 @@ else:
     xr = lazy("xarray")
     zarr = lazy("zarr")
 
-_UNDONE = -1
+# What stands in whole numbers of lanes that were not computed, `result` among them.
+NOT_COMPUTED = -1
 
 UNVERIFIABLE = "it cannot be looked at: "
 
@@ -40,7 +41,7 @@ class Variable(NamedTuple):
     @property
     def empty(self) -> Any:
         """What stands where nothing was computed."""
-        return np.nan if np.issubdtype(self.dtype, np.floating) else _UNDONE
+        return np.nan if np.issubdtype(self.dtype, np.floating) else NOT_COMPUTED
 
 
 class MemoryStore:

@@ -18,7 +18,7 @@ from ..flow.simulate import check_start
 from ..orbit.results import told_impacts
 from ..scene import AbstractScene
 from ..scene.leaves import check_again, check_leaf, with_leaf
-from .regime import impacts_of, least_period
+from .regime import REGIMES, impacts_of, least_period
 
 # A jump is so many times the change at the values beside it, and this part of 1 + |number|.
 _JUMP, _NOTED = 3.0, 0.01
@@ -36,7 +36,7 @@ class Sweep(eqx.Module):
     y_max: Float[Array, "..."]
     """Largest Y over the cycles observed (unit: a)."""
     period: Int[Array, "..."]
-    """Period in drive cycles, 0 if none was found, -2 if the value failed."""
+    """Period in drive cycles, or `REGIMES.unsettled` if none was found, or `REGIMES.failed`."""
     impacts: Float[Array, "..."]
     """Impacts in a period; in a cycle, on average, where there is no period."""
     frequency_ratio: Float[Array, "..."] | None
@@ -72,7 +72,10 @@ class Sweep(eqx.Module):
 
     def _kinds(self) -> list[str]:
         """The motion at each value in words: its period and its impacts."""
-        names = {0: "no period", -2: "failed"}
+        names: dict[int, str] = {
+            REGIMES.unsettled: "no period",
+            REGIMES.failed: REGIMES.failed.meaning,
+        }
         return [
             names.get(int(p)) or f"{2 * int(p)}π with {told_impacts(round(float(n)))}"
             for p, n in zip(np.asarray(self.period), np.asarray(self.impacts), strict=True)
@@ -206,7 +209,7 @@ def _sweep(
             values=value,
             y_min=jnp.min(run.y_min),
             y_max=jnp.max(run.y_max),
-            period=jnp.where(run.successful, period, -2),
+            period=jnp.where(run.successful, period, REGIMES.failed),
             impacts=jnp.where(run.successful, impacts, jnp.nan),
             frequency_ratio=here.frequency_ratio(jnp.mean(run.duration)),
             impact_speed=jnp.max(run.impact_speed),
