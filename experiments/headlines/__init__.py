@@ -26,13 +26,14 @@ def keep(
 ) -> None:
     """Write a study's page with its headline numbers, and its picture with their fingerprint.
 
-    **Arguments:** the folder of the studies; the study's name; its page; headline numbers by name;
-    the picture, and how `save_picture` is to save it.
+    **Arguments:** the folder of the page, beside which is that of the pictures; the study's name;
+    its page; headline numbers by name; the picture, and how `save_picture` is to save it.
     """
     rounded = {name: float(f"{value:.12g}") for name, value in numbers.items()}
     listed = json.dumps(rounded, indent=2, ensure_ascii=False, allow_nan=False)
     page = f"{text.rstrip()}\n\n{_TITLE}\n\n{_TOLD}\n\n```json\n{listed}\n```\n"
-    picture = folder / "figures" / f"{study}.png"
+    picture = folder.parent / "figures" / f"{study}.png"
+    folder.mkdir(parents=True, exist_ok=True)
     picture.parent.mkdir(parents=True, exist_ok=True)
     vi.save_picture(figure, picture, **look)
     stamp(picture, FINGERPRINT, fingerprint(page))

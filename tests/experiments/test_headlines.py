@@ -16,17 +16,18 @@ from vi_jax.plot.stamp import stamped
 
 FOLDER = Path(__file__).parents[2] / "experiments"
 
+PATHS = {p.stem: p for room in ("studies", "benchmarks") for p in FOLDER.glob(f"{room}/*.py")}
 COMPUTED = {
     name: function
     for name, function in inspect.getmembers(headline_numbers, inspect.isfunction)
-    if (FOLDER / f"{name}.py").exists()
+    if name in PATHS
 }
 # The rows of `extremes` are tests of their own (`tests/flow/test_extremes.py`).
-STUDIES = sorted(path.stem for path in FOLDER.glob("*.py") if path.stem != "extremes")
+STUDIES = sorted(set(PATHS) - {"extremes"})
 
 
 def page_of(study: str) -> str:
-    return (FOLDER / f"{study}.md").read_text(encoding="utf-8")
+    return PATHS[study].with_suffix(".md").read_text(encoding="utf-8")
 
 
 def stale(kept: dict[str, float], computed: headline_numbers.Expected) -> list[str]:
@@ -83,8 +84,9 @@ def test_what_is_stale_is_told(tmp_path):
     figure = Figure(figsize=(2, 1))
     figure.subplots().plot([0, 1], [0, 1])
     text = "# A study\n\nProse of 5 words.\n\n| ζ | k |\n|---|---|\n| 0.82456 | 1e-12 |\n"
-    keep(tmp_path, "study", text, {"doubling": 0.8245572210017}, figure)
-    picture, page = tmp_path / "figures" / "study.png", (tmp_path / "study.md").read_text()
+    folder, figures = tmp_path / "studies", tmp_path / "figures"
+    keep(folder, "study", text, {"doubling": 0.8245572210017}, figure)
+    picture, page = figures / "study.png", (folder / "study.md").read_text()
     assert headlines(page) == {"doubling": 0.824557221002}
     assert not stale(headlines(page), {"doubling": (0.8245572, 1e-7)})
     assert stale(headlines(page), {"doubling": (0.82470, 1e-7)})
@@ -98,7 +100,7 @@ def test_what_is_stale_is_told(tmp_path):
         assert fingerprint(page.replace(old, new)) != stamped(picture, FINGERPRINT)
     # A picture of another run.
     other = tmp_path / "other"
-    keep(other, "study", text.replace("0.82456", "0.8"), {"doubling": 0.8}, figure)
+    keep(other / "studies", "study", text.replace("0.82456", "0.8"), {"doubling": 0.8}, figure)
     shutil.copy(other / "figures" / "study.png", picture)
     assert fingerprint(page) != stamped(picture, FINGERPRINT)
 

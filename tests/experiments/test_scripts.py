@@ -1,4 +1,4 @@
-"""Every study runs as a plain script, and has its table and figure beside it."""
+"""Every study and benchmark runs as a plain script, and has its table and its figure."""
 
 import os
 import subprocess
@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 FOLDER = Path(__file__).parents[2] / "experiments"
-STUDIES = sorted(FOLDER.glob("*.py"))
+STUDIES = sorted([*FOLDER.glob("studies/*.py"), *FOLDER.glob("benchmarks/*.py")])
 # A table is all there is to see.
 WITHOUT_FIGURE = {"extremes"}
 # `peers` needs the extra `bench`; the rows of `extremes` are tests of their own.
@@ -18,7 +18,7 @@ RUN_ELSEWHERE = {"peers", "extremes"}
 
 @pytest.mark.parametrize("study", STUDIES, ids=lambda path: path.stem)
 def test_table_and_figure_are_kept(study):
-    assert (FOLDER / f"{study.stem}.md").exists()
+    assert study.with_suffix(".md").exists()
     assert study.read_text(encoding="utf-8").startswith(("# %%", '"""'))
     if study.stem in WITHOUT_FIGURE:
         return

@@ -1,4 +1,4 @@
-"""The rows of `experiments/extremes.py`: each corner beside its own expectation."""
+"""The rows of `experiments/studies/extremes.py`: each corner beside its own expectation."""
 
 import importlib.util
 import sys
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-PATH = Path(__file__).parents[2] / "experiments" / "extremes.py"
+PATH = Path(__file__).parents[2] / "experiments" / "studies" / "extremes.py"
 spec = importlib.util.spec_from_file_location("extremes", PATH)
 assert spec is not None and spec.loader is not None
 extremes = importlib.util.module_from_spec(spec)

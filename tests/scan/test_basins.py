@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import vi_jax as vi
 
-# Several motions live side by side here; see `experiments/all_orbits.py`.
+# Several motions live side by side here; see `experiments/studies/all_orbits.py`.
 SCENE = vi.Scene.ideal(frequency_ratio=3.2, restitution=0.9, gap=1.05, damping_ratio=0.01)
 REGION = {"start.Y": (-3.5, 1.05), "start.V": (-4.0, 4.0)}
 

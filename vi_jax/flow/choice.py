@@ -13,7 +13,7 @@ MethodLike = AbstractMethod | str | None
 """What an argument `method` takes: a method, the name of a preset, or `None` for the default."""
 
 # Steps a cycle of a `Scene`, and the tolerance for a scene of one's own, whose time scales are not
-# known. Chosen from the front that `experiments/speed_accuracy.py` measures.
+# known. Chosen from the front that `experiments/benchmarks/speed_accuracy.py` measures.
 _PRESETS = {"draft": (6, 1e-6), "standard": (12, 1e-9), "reference": (48, 1e-13)}
 
 

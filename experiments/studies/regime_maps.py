@@ -14,7 +14,7 @@
 # stays for good. The map says "unsettled" (or a period, where free and driven vibration happen to
 # have one in common), and rightly so.
 #
-# Run with `python experiments/regime_maps.py` (`--quick` for coarse maps and fewer curves).
+# Run with `python experiments/studies/regime_maps.py` (`--quick` for coarse maps and fewer curves).
 
 # %%
 import itertools
@@ -38,8 +38,8 @@ from matplotlib.patches import Patch
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments")
-sys.path.insert(0, str(HERE))
+HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
+sys.path.insert(0, str(HERE.parent))
 from headlines import keep
 
 QUICK = "--quick" in sys.argv

@@ -8,8 +8,8 @@
 # each motion that they settle on is named, searched for, and followed. Last, the second stop that
 # the paper only draws is really put there.
 #
-# Run with `python experiments/fig2_frequency_response.py`; `--quick` takes fewer values of ζ and
-# writes nothing.
+# Run with `python experiments/studies/fig2_frequency_response.py`; `--quick` takes fewer values of
+# ζ and writes nothing.
 
 # %%
 import sys
@@ -36,8 +36,8 @@ from vi_jax.paper.response_figure import LOOK, draw_response
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments")
-sys.path.insert(0, str(HERE))
+HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
+sys.path.insert(0, str(HERE.parent))
 from headlines import keep
 
 QUICK = "--quick" in sys.argv

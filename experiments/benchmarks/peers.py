@@ -9,9 +9,9 @@
 # Rounds are interleaved; compile time is apart. The error is the median difference of the final
 # (Y, V) to a full-precision run, over the lanes that do not amplify 1e-10 beyond 1e-6.
 #
-# Run with `python experiments/peers.py` (extra `bench`). What is measured is kept in the folder for
-# temporary files, and an interrupted run goes on from there; `--fresh` forgets it. `--quick` takes
-# few lanes and writes nothing. `--gpu` runs vi_jax on a GPU instead (no peers).
+# Run with `python experiments/benchmarks/peers.py` (extra `bench`). What is measured is kept in the
+# folder for temporary files, and an interrupted run goes on from there; `--fresh` forgets it.
+# `--quick` takes few lanes and writes nothing. `--gpu` runs vi_jax on a GPU instead (no peers).
 
 # %%
 import hashlib
@@ -28,8 +28,8 @@ from typing import Any
 
 import numpy as np
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments")
-sys.path.insert(0, str(HERE))
+HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/benchmarks")
+sys.path[:0] = [str(HERE), str(HERE.parent)]
 from peer_codes.pool import Worker, cores, together
 from peer_codes.task import PARAMETERS, Task
 
@@ -282,7 +282,7 @@ def sources() -> str:
     files += [
         file
         for room in ("flow", "lanes", "scene")
-        for file in (HERE.parent / "vi_jax" / room).iterdir()
+        for file in (HERE.parents[1] / "vi_jax" / room).iterdir()
     ]
     return hashlib.sha256(
         b"".join(file.read_bytes() for file in sorted(files) if file.is_file())

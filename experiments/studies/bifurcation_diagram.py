@@ -12,7 +12,8 @@
 # impact that is born in a grazing begins at zero. The section is at φ = π, because impacts lie near
 # φ = 0.
 #
-# Run with `python experiments/bifurcation_diagram.py` (`--quick` for few values and short runs).
+# Run with `python experiments/studies/bifurcation_diagram.py` (`--quick` for few values and short
+# runs).
 
 # %%
 import itertools
@@ -32,8 +33,8 @@ from scipy.optimize import brentq
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments")
-sys.path.insert(0, str(HERE))
+HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
+sys.path.insert(0, str(HERE.parent))
 from headlines import keep
 
 QUICK = "--quick" in sys.argv

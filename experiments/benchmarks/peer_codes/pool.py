@@ -31,7 +31,7 @@ class Worker:
     def __init__(self, cores: list[int], *, devices: int = 1):
         flags = os.environ.get("XLA_FLAGS", "")
         here = Path(__file__).parents[1]
-        paths = [str(here), str(here.parent), os.environ.get("PYTHONPATH", "")]
+        paths = [str(here), str(here.parents[1]), os.environ.get("PYTHONPATH", "")]
         env = {
             **os.environ,
             "PYTHONPATH": os.pathsep.join(paths),

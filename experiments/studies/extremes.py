@@ -6,7 +6,7 @@
 # impacts for the ideal drive, `solve_ivp` with events for the motor). What is measured is the
 # largest deviation from it, beside what is promised. The tests run the same rows.
 #
-# Run with `python experiments/extremes.py` (`--quick` leaves out the longest rows).
+# Run with `python experiments/studies/extremes.py` (`--quick` leaves out the longest rows).
 
 # %%
 import sys
@@ -26,7 +26,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from scipy.optimize import brentq
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments")
+HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
 QUICK = "--quick" in sys.argv
 
 EXACT = {"ExactFlight": vi.ExactFlight()}

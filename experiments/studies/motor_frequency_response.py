@@ -9,7 +9,7 @@
 # with a forecast that knows no motor motion at all: the load that the ideal machine puts on its
 # drive at each ζ, from the closed form, met with the motor's line (Kononenko's method).
 #
-# Run with `python experiments/motor_frequency_response.py` (`--quick` for fewer and coarser
+# Run with `python experiments/studies/motor_frequency_response.py` (`--quick` for fewer and coarser
 # sweeps, two branches, and no files).
 
 # %%
@@ -28,8 +28,8 @@ from matplotlib.lines import Line2D
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments")
-sys.path.insert(0, str(HERE))
+HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
+sys.path.insert(0, str(HERE.parent))
 from headlines import keep
 
 QUICK = "--quick" in sys.argv

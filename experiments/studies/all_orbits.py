@@ -9,7 +9,8 @@
 # simulation, which knows nothing of the search: a stable one must draw a disturbed start back at
 # the rate of its multiplier, and from an unstable one the start must leave at that rate.
 #
-# Run with `python experiments/all_orbits.py`; `--quick` takes few guesses and writes nothing.
+# Run with `python experiments/studies/all_orbits.py`; `--quick` takes few guesses and writes
+# nothing.
 
 # %%
 import sys
@@ -27,8 +28,8 @@ from matplotlib.figure import Figure
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments")
-sys.path.insert(0, str(HERE))
+HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
+sys.path.insert(0, str(HERE.parent))
 from headlines import keep
 
 QUICK = "--quick" in sys.argv

@@ -8,7 +8,7 @@
 # damping), each driven ideally at ζ = 0.9 and by motors of T0 = 100, 10 and 2 N·m at κ = 0.9; and,
 # because the transients of these are short, a third one that loses little (k = 0.95, undamped).
 #
-# Run with `python experiments/fit_4pi_orbit.py` (`--quick` for two scenes and few guesses).
+# Run with `python experiments/studies/fit_4pi_orbit.py` (`--quick` for two scenes and few guesses).
 
 # %%
 import sys
@@ -25,8 +25,8 @@ from matplotlib.figure import Figure
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments")
-sys.path.insert(0, str(HERE))
+HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
+sys.path.insert(0, str(HERE.parent))
 from headlines import keep
 
 QUICK = "--quick" in sys.argv

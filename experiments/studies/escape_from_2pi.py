@@ -7,7 +7,7 @@
 # where "error" is what the method adds in one cycle. The cycles counted are so a measure of the
 # method that looks at nothing but the motion; here they stand beside the error that is measured.
 #
-# Run with `python experiments/escape_from_2pi.py` (`--quick` for a few settings only).
+# Run with `python experiments/studies/escape_from_2pi.py` (`--quick` for a few settings only).
 
 # %%
 import sys
@@ -26,8 +26,8 @@ jax.config.update("jax_enable_x64", True)
 # Single precision is one of the things compared here.
 warnings.filterwarnings("ignore", message="vi_jax is running in single precision")
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments")
-sys.path.insert(0, str(HERE))
+HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
+sys.path.insert(0, str(HERE.parent))
 from headlines import keep
 
 QUICK = "--quick" in sys.argv

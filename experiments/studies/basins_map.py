@@ -10,7 +10,7 @@
 # random starts' labels against `vi.FixedStep`, and the stability of each motion against its
 # Lyapunov exponents.
 #
-# Run with `python experiments/basins_map.py` (`--quick` for coarse grids and few cycles).
+# Run with `python experiments/studies/basins_map.py` (`--quick` for coarse grids and few cycles).
 
 # %%
 import os
@@ -27,8 +27,8 @@ from matplotlib.figure import Figure
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments")
-sys.path.insert(0, str(HERE))
+HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
+sys.path.insert(0, str(HERE.parent))
 from headlines import keep
 
 QUICK = "--quick" in sys.argv

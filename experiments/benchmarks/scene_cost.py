@@ -7,7 +7,7 @@
 # the time, and in the number of operations of the compiled program's source (the jaxpr), which is
 # that of the smaller scene.
 #
-# Run with `python experiments/scene_cost.py` (`--quick` for few lanes, writes nothing).
+# Run with `python experiments/benchmarks/scene_cost.py` (`--quick` for few lanes, writes nothing).
 
 # %%
 import sys
@@ -24,8 +24,8 @@ from matplotlib.figure import Figure
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments")
-sys.path.insert(0, str(HERE))
+HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/benchmarks")
+sys.path.insert(0, str(HERE.parent))
 from headlines import keep
 from headlines.jaxprs import primitives
 
@@ -124,7 +124,7 @@ lines = [
     f"interleaved rounds; JAX {jax.__version__}. Operations are those of the program that JAX is "
     "given.",
     "",
-    "![Cost](figures/scene_cost.png)",
+    "![Cost](../figures/scene_cost.png)",
     "",
     "| scene | µs a lane-cycle | beside | ratio | compile s | operations |",
     "|---|---|---|---|---|---|",

@@ -11,7 +11,7 @@
 # `value_and_grad` gives the power, the multipliers and their slopes. Each step starts its search
 # from the orbit of the step before.
 #
-# Run with `python experiments/design_percussion.py` (`--quick` for fewer steps).
+# Run with `python experiments/studies/design_percussion.py` (`--quick` for fewer steps).
 
 # %%
 import sys
@@ -29,8 +29,8 @@ from matplotlib.figure import Figure
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments")
-sys.path.insert(0, str(HERE))
+HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
+sys.path.insert(0, str(HERE.parent))
 from headlines import keep
 
 QUICK = "--quick" in sys.argv

@@ -11,7 +11,7 @@
 # Jacobian at the estimate gives standard errors. Whether these are honest is tested by repeating
 # the whole estimate, from the same poor first guess, for many records in one `vmap`.
 #
-# Run with `python experiments/identify.py` (`--quick` for fewer records).
+# Run with `python experiments/studies/identify.py` (`--quick` for fewer records).
 
 # %%
 import sys
@@ -29,8 +29,8 @@ from matplotlib.ticker import MaxNLocator
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments")
-sys.path.insert(0, str(HERE))
+HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
+sys.path.insert(0, str(HERE.parent))
 from headlines import keep
 
 QUICK = "--quick" in sys.argv

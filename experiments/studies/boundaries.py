@@ -8,7 +8,7 @@
 # it knows nothing of the curves. Each curve is checked in two more ways: against the closed form
 # on it, and by a simulation on either side of it.
 #
-# Run with `python experiments/boundaries.py` (`--quick` for fewer curves and dots).
+# Run with `python experiments/studies/boundaries.py` (`--quick` for fewer curves and dots).
 
 # %%
 import sys
@@ -34,8 +34,8 @@ from vi_jax.paper.boundaries import (
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments")
-sys.path.insert(0, str(HERE))
+HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
+sys.path.insert(0, str(HERE.parent))
 from headlines import keep
 
 QUICK = "--quick" in sys.argv

@@ -12,8 +12,8 @@
 # times are medians of five interleaved rounds of 200 cycles, compiled before; what takes one
 # thread is measured on one thread.
 #
-# Run with `python experiments/speed_accuracy.py` (`--quick` for few methods and lanes of the ideal
-# drive).
+# Run with `python experiments/benchmarks/speed_accuracy.py` (`--quick` for few methods and lanes of
+# the ideal drive).
 
 # %%
 import sys
@@ -37,8 +37,8 @@ jax.config.update("jax_enable_x64", True)
 warnings.filterwarnings("ignore", message="vi_jax is running in single precision")
 warnings.filterwarnings("ignore", message="[0-9,]+ of [0-9,]+ lanes failed")
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments")
-sys.path.insert(0, str(HERE))
+HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/benchmarks")
+sys.path.insert(0, str(HERE.parent))
 from headlines import keep
 
 QUICK = "--quick" in sys.argv
@@ -646,7 +646,7 @@ lines = [
     "interleaved rounds. Errors are those that 95 of 100 calm lanes stay under (calm: a "
     f"displacement of 1e-10 grows to no more than 1e-6 in {MANY} cycles).",
     "",
-    "![Speed against accuracy](figures/speed_accuracy.png)",
+    "![Speed against accuracy](../figures/speed_accuracy.png)",
     "",
     "The map of a fixed-step method has periodic motions of its own, which repeat to rounding: its "
     "regimes come out right even where its states are off by 1e-5. With steps by a tolerance the "
