@@ -2,6 +2,7 @@
 
 import pytest
 from vi_jax import cli
+from vi_jax.cli import entry
 
 
 def test_version(capsys):
@@ -41,7 +42,7 @@ def _no_work(*args, **options):
 
 @pytest.mark.parametrize("below", ["", "folder"])
 def test_a_file_in_the_way(tmp_path, capsys, monkeypatch, below):
-    monkeypatch.setattr(cli, "reproduce", _no_work)
+    monkeypatch.setattr(entry, "reproduce", _no_work)
     file = tmp_path / "taken"
     file.write_text("mine")
     assert cli.main(["reproduce", "--out", str(file / below)]) == 2
@@ -52,7 +53,7 @@ def test_a_file_in_the_way(tmp_path, capsys, monkeypatch, below):
 
 @pytest.mark.parametrize("out", ["", "/proc/nowhere", "bad\0name"])
 def test_a_path_that_cannot_be_written(capsys, monkeypatch, out):
-    monkeypatch.setattr(cli, "reproduce", _no_work)
+    monkeypatch.setattr(entry, "reproduce", _no_work)
     assert cli.main(["reproduce", "--out", out]) == 2
     printed = capsys.readouterr()
     assert printed.err.count("\n") == 1 and "error" in printed.err and not printed.out

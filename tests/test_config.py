@@ -12,8 +12,9 @@ import vi_jax as vi
 import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from vi_jax import cli, config, verbs
-from vi_jax._toml import ConfigError, keys_of, read_toml
+from vi_jax import cli
+from vi_jax.cli import checks, config, verbs
+from vi_jax.cli.toml import ConfigError, keys_of, read_toml
 from vi_jax.scene.leaves import leaf, leaf_names
 
 READY = sorted((Path(__file__).parents[1] / "experiments").glob("*.toml"))
@@ -139,7 +140,7 @@ def test_ready_files(path):
             break
     else:
         raise AssertionError("no verb")
-    verbs.check_names(scene, file.axes or (), "[axes]", start=True)
+    checks.check_names(scene, file.axes or (), "[axes]", start=True)
     assert f"vi-jax {verb} experiments/{path.name}" in path.read_text()
 
 

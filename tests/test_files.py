@@ -8,7 +8,7 @@ import pytest
 import vi_jax._files as files
 from matplotlib.figure import Figure
 from vi_jax import save_picture
-from vi_jax.verbs import _write_rows
+from vi_jax.cli.output import write_rows
 
 
 def _full(handle):
@@ -22,7 +22,7 @@ def test_a_full_disk_leaves_what_was_there(tmp_path, monkeypatch, written):
 
     def write():
         if written == "a.csv":
-            _write_rows(str(path), [{"x": np.arange(5.0)}])
+            write_rows(str(path), [{"x": np.arange(5.0)}])
         else:
             figure = Figure(figsize=(1, 1))
             figure.subplots().plot([0, 1])

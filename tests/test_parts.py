@@ -10,7 +10,8 @@ import jax.tree_util as jtu
 import numpy as np
 import pytest
 import vi_jax as vi
-from vi_jax import _parts, cli, verbs
+from vi_jax import _parts, cli
+from vi_jax.cli import output
 
 SCENE = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.02)
 START = SCENE.start(Y=0.3)
@@ -88,7 +89,7 @@ def test_interrupts_keep_what_was_computed(
     """Pressed in the second part, again at once, and while the file is written."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file.toml").write_text(FILE + text + "output = 'out.csv'\n")
-    compute, calls, write = getattr(_parts, part), [], verbs.write_whole
+    compute, calls, write = getattr(_parts, part), [], output.write_whole
 
     def computed(*arguments, **options):
         calls.append(1)
@@ -98,7 +99,7 @@ def test_interrupts_keep_what_was_computed(
         return compute(*arguments, **options)
 
     monkeypatch.setattr(_parts, part, computed)
-    monkeypatch.setattr(verbs, "write_whole", lambda *a: (press(), write(*a)))
+    monkeypatch.setattr(output, "write_whole", lambda *a: (press(), write(*a)))
     before = signal.getsignal(signal.SIGINT)
     assert cli.main([verb, "file.toml"]) == 130
     assert signal.getsignal(signal.SIGINT) is before and len(calls) == 2

@@ -7,8 +7,8 @@ from io import TextIOWrapper
 
 import jax
 
-from ._checks import unwritable
-from ._toml import ConfigError, keys_of
+from .._checks import unwritable
+from ..paper.report import reproduce, summary
 from .config import (
     BasinsTable,
     ContinueTable,
@@ -18,7 +18,7 @@ from .config import (
     SweepTable,
     read,
 )
-from .paper.report import reproduce, summary
+from .toml import ConfigError, keys_of
 from .verbs import VERBS
 
 _ABOUT = {
@@ -140,7 +140,3 @@ def _version() -> str:
 
 def _tell(step: str) -> None:
     print(f"{step} …", file=sys.stderr, flush=True)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

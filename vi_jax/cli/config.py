@@ -23,11 +23,11 @@ from typing import Any, Literal
 import diffrax
 from attrs import frozen
 
-from ._toml import ConfigError as ConfigError
-from ._toml import Row, given, read_toml, spoken, unknown
-from .flow import AbstractMethod, Adaptive, ExactFlight, FixedStep
-from .orbit import AbstractSearch, Gradient, Newton
-from .scene import IdealDrive, Motor, Oscillator, Parameters, RigidStop, Scene, SliderCrank
+from ..flow import AbstractMethod, Adaptive, ExactFlight, FixedStep
+from ..orbit import AbstractSearch, Gradient, Newton
+from ..scene import IdealDrive, Motor, Oscillator, Parameters, RigidStop, Scene, SliderCrank
+from .toml import ConfigError as ConfigError
+from .toml import Row, given, read_toml, spoken, unknown
 
 _METHODS = {"exact-flight": ExactFlight, "adaptive": Adaptive, "fixed-step": FixedStep}
 _SOLVERS = {

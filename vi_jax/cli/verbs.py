@@ -4,50 +4,50 @@ Each checks everything, the paths it will write to included, before it simulates
 lines to print and whether anything succeeded.
 """
 
-import csv
 import math
-import os
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from io import StringIO
-from pathlib import Path
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax.tree_util as jtu
 import numpy as np
-import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ._checks import unwritable
-from ._files import write_whole
-from ._parts import noted_interrupts, simulate_in_parts, sweep_in_parts
-from ._toml import ConfigError, given, keys_of, spoken, unknown
-from .config import Config, OrbitTable, SimulateTable, SweepTable
-from .flow import RESULTS, Run
-from .flow import simulate as run_motion
-from .flow.results import REASONS, number_of
-from .orbit import Orbit, continue_orbit, find_orbit
-from .orbit.curve import check_walk
-from .plot import (
+from .._files import write_whole
+from .._parts import noted_interrupts, simulate_in_parts, sweep_in_parts
+from ..flow import RESULTS, Run
+from ..flow import simulate as run_motion
+from ..flow.results import number_of
+from ..orbit import Orbit, continue_orbit, find_orbit
+from ..plot import (
     plot_basins,
     plot_branch,
     plot_history,
     plot_phase_portrait,
     plot_regimes,
     plot_sweep,
-    save_picture,
 )
-from .plot.motion import BLUE, RED
-from .scan import Sweep
-from .scan import basins as find_basins
-from .scan import scan as run_scan
-from .scan.grid import Blocks, axes_of
-from .scan.job import check_corners, make_job
-from .scan.regime import REGIMES
-from .scan.store import NOT_COMPUTED
-from .scene import Scene
-from .scene.leaves import leaf, leaf_names
+from ..plot.motion import BLUE, RED
+from ..scan import Sweep
+from ..scan import basins as find_basins
+from ..scan import scan as run_scan
+from ..scene import Scene
+from .checks import check_continuation, check_map, check_names, check_paths, check_range
+from .config import Config, OrbitTable, SimulateTable, SweepTable
+from .output import (
+    axes_in_words,
+    cycle_columns,
+    failures,
+    new_axes,
+    ranges_in_words,
+    regimes_in_words,
+    sample_columns,
+    saved,
+    sweep_columns,
+    write_rows,
+)
+from .toml import ConfigError, given, keys_of, spoken
 
 Tell = Callable[[str], None]
 
@@ -72,7 +72,7 @@ def scan(config: Config, tell: Tell) -> Outcome:
         raise ConfigError("missing table [axes]: a scan needs at least one")
     check_names(scene, axes, "[axes]", start=True)
     if table.picture is not None:
-        _check_map(axes, table.measure, paired=table.paired)
+        check_map(axes, table.measure, paired=table.paired)
     check_paths("[scan]", picture=table.picture)
     options = given(table, "picture")
     total = len(next(iter(axes.values())))
@@ -82,10 +82,10 @@ def scan(config: Config, tell: Tell) -> Outcome:
     with spoken("[scan]", keys=keys_of(type(table))), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "[0-9,]+ of [0-9,]+ lanes failed")
         data = run_scan(scene, axes, start=start, method=method, **options)
-    lines = [f"Scan of {data['result'].size:,} motions over {_told_axes(axes)}"]
+    lines = [f"Scan of {data['result'].size:,} motions over {axes_in_words(axes)}"]
     if "period" in data:
-        lines += _regimes(data)
-    lines += _ranges(data)
+        lines += regimes_in_words(data)
+    lines += ranges_in_words(data)
     if "verified_changed_period" in data.attrs:
         changed, lanes = data.attrs["verified_changed_period"], data.attrs["verified_lanes"]
         lines.append(f"  regime otherwise by a better method: {changed} of {lanes} lanes tried")
@@ -94,9 +94,9 @@ def scan(config: Config, tell: Tell) -> Outcome:
     else:
         lines.append(f'  data: xarray.open_zarr("{table.store}", consolidated=False)')
     if table.picture is not None:
-        ax = _axes()
+        ax = new_axes()
         plot_regimes(data, ax=ax)
-        lines.append(_saved(ax, table.picture))
+        lines.append(saved(ax, table.picture))
     failed, good = failures(np.asarray(data["result"]))
     return Outcome("\n".join([*lines, *failed]), good)
 
@@ -136,15 +136,15 @@ def _told_sweeps(found: Mapping[str, Sweep], table: SweepTable) -> Outcome:
         lines.append(f"{way}: {run}")
         codes.append(np.asarray(number_of(run.result)))
     if table.output is not None:
-        _write_rows(table.output, [_sweep_columns(way, run) for way, run in found.items()])
+        write_rows(table.output, [sweep_columns(way, run) for way, run in found.items()])
         lines.append(f"  data: {table.output}")
     if table.picture is not None:
-        ax = _axes()
+        ax = new_axes()
         for way, run in found.items():
             look = {"color": BLUE, "ms": 6} if way == "up" else {"color": RED, "ms": 3}
             plot_sweep(run, ax=ax, label=way, **look)
         ax.legend(frameon=False)
-        lines.append(_saved(ax, table.picture))
+        lines.append(saved(ax, table.picture))
     failed, good = failures(np.concatenate(codes), what="values")
     return Outcome("\n".join([*lines, *failed]), good)
 
@@ -174,9 +174,9 @@ def basins(config: Config, tell: Tell) -> Outcome:
         write_whole(table.output, kept.to_dataframe().reset_index().to_csv(index=False))
         lines.append(f"  data: {table.output}")
     if table.picture is not None:
-        ax = _axes()
+        ax = new_axes()
         plot_basins(found, ax=ax)
-        lines.append(_saved(ax, table.picture))
+        lines.append(saved(ax, table.picture))
     failed, good = failures(np.asarray(found.data["result"]), what="starts")
     return Outcome("\n".join([*lines, *failed]), good)
 
@@ -188,7 +188,7 @@ def orbit(config: Config, tell: Tell) -> Outcome:
     assert table is not None
     check_paths("[orbit]", picture=table.picture)
     if table.continue_ is not None:
-        _check_continuation(scene, table)
+        check_continuation(scene, table)
     guess = start
     if table.guess is not None:
         guess = table.guess.build(scene, "`guess` in [orbit]")
@@ -208,28 +208,10 @@ def orbit(config: Config, tell: Tell) -> Outcome:
     if not bool(found.successful):
         return Outcome("\n".join(lines), False)
     if table.picture is not None:
-        lines.append(_saved(_portrait(found), table.picture))
+        lines.append(saved(_portrait(found), table.picture))
     if table.continue_ is not None:
         lines += _continued(found, table, tell)
     return Outcome("\n".join(lines), True)
-
-
-def _check_continuation(scene: Scene, table: OrbitTable) -> None:
-    asked = table.continue_
-    assert asked is not None
-    check_names(scene, [asked.parameter], "[orbit.continue]")
-    low, high = asked.bounds
-    value = float(leaf(scene, asked.parameter))
-    if not low <= value <= high or low == high:
-        raise ConfigError(
-            f"`bounds` in [orbit.continue] must hold the scene's {asked.parameter} = {value:g}, "
-            f"but is [{low:g}, {high:g}]"
-        )
-    check_range(scene, asked.parameter, asked.bounds, "`bounds` in [orbit.continue]")
-    walk = {"step": 0.01, "max_step": 0.1, "max_points": 1000}
-    with spoken("[orbit.continue]"):
-        check_walk(**{name: given(asked).get(name, usual) for name, usual in walk.items()})
-    check_paths("[orbit.continue]", picture=asked.picture, output=asked.output)
 
 
 def _continued(found: Orbit, table: OrbitTable, tell: Tell) -> list[str]:
@@ -242,18 +224,18 @@ def _continued(found: Orbit, table: OrbitTable, tell: Tell) -> list[str]:
     if asked.output is not None:
         data = branch.to_xarray()
         columns = {name: np.asarray(x) for name, x in data.items() if x.dims == ("point",)}
-        _write_rows(asked.output, [{str(name): x for name, x in columns.items()}])
+        write_rows(asked.output, [{str(name): x for name, x in columns.items()}])
         lines.append(f"  data: {asked.output}")
     if asked.picture is not None:
-        ax = _axes()
+        ax = new_axes()
         plot_branch(branch, ax=ax)
-        lines.append(_saved(ax, asked.picture))
+        lines.append(saved(ax, asked.picture))
     return lines
 
 
 def _portrait(found: Orbit) -> Axes:
     """The phase portrait of a periodic motion."""
-    ax = _axes()
+    ax = new_axes()
     run = run_motion(
         found.scene, found.state, int(found.cycles), method=found.method, samples=128, impact_log=8
     )
@@ -288,15 +270,15 @@ def simulate(config: Config, tell: Tell) -> Outcome:
 def _told_run(scene: Scene, run: Run, table: SimulateTable) -> Outcome:
     lines = [str(run)]
     if table.output is not None:
-        columns = _sample_columns(run.samples) if table.samples else _cycle_columns(run)
-        _write_rows(table.output, [columns])
+        columns = sample_columns(run.samples) if table.samples else cycle_columns(run)
+        write_rows(table.output, [columns])
         lines.append(f"  data: {table.output}")
     if table.picture is not None:
         figure = Figure(figsize=(11, 3.6), layout="constrained")
         left, right = figure.subplots(1, 2, width_ratios=(2, 1))
         plot_history(run, scene=scene, ax=left, unit="cycles")
         plot_phase_portrait(run, scene, ax=right)
-        lines.append(_saved(left, table.picture))
+        lines.append(saved(left, table.picture))
     return Outcome("\n".join(lines), bool(run.successful))
 
 
@@ -309,147 +291,9 @@ VERBS: Mapping[str, Callable[[Config, Tell], Outcome]] = {
 }
 
 
-def check_names(scene: Scene, names: Iterable[str], place: str, *, start: bool = False) -> None:
-    """**Raises:** `ConfigError` for a name that no number of the scene (or the start) has."""
-    known = leaf_names(scene)
-    if start:
-        known += [f"start.{name}" for name in leaf_names(scene.start())]
-    wrong = [unknown("name", name, place, known) for name in names if name not in known]
-    if wrong:
-        raise ConfigError(*wrong)
-
-
-def check_range(scene: Scene, name: str, values: Sequence[float], place: str) -> None:
-    """**Raises:** `ConfigError` if the scene refuses the least or the greatest of these values."""
-    with spoken(place, keys=()):
-        axes = axes_of({name: values})
-        check_corners(make_job(scene, (name,), measure="extremes"), Blocks(axes, 1))
-
-
-def check_paths(table: str, *, picture: str | None = None, output: str | None = None) -> None:
-    """**Raises:** `ConfigError` if a file cannot be written; makes the folders above them."""
-    for key, path, ending in (("picture", picture, ".png"), ("output", output, ".csv")):
-        if path is None:
-            continue
-        if not path.endswith(ending):
-            raise ConfigError(f'`{key}` in {table} must end in {ending}, but is "{path}"')
-        reason = unwritable(Path(path).parent)
-        try:
-            if reason is None and Path(path).is_dir():
-                reason = "it is a folder"
-            elif reason is None and Path(path).exists() and not os.access(path, os.W_OK):
-                reason = "permission denied"
-        except OSError as error:  # a name that is too long
-            reason = error.strerror
-        if reason:
-            raise ConfigError(f"`{key}` in {table} cannot be written: {path}: {reason}")
-
-
-def _check_map(axes: Mapping[str, Any], measure: Iterable[str] | None, *, paired: bool) -> None:
-    if measure is not None and "regime" not in measure:
-        raise ConfigError('`picture` in [scan] needs "regime" among the measures')
-    if len(axes) != 2 or paired:
-        raise ConfigError(
-            f"`picture` in [scan] needs a grid of two axes, but there are {len(axes)}"
-        )
-
-
-def failures(codes: np.ndarray, *, what: str = "motions") -> tuple[list[str], bool]:
-    """Lines on the lanes that failed and why, and whether any did not."""
-    counts = {int(c): int(np.sum(codes == c)) for c in np.unique(codes) if c != 0}
-    if not counts:
-        return [], True
-    total = sum(counts.values())
-    lines = [f"  failed: {total:,} of {codes.size:,} {what}"]
-    lines += [f"    {n:,}: {_reason(code)}" for code, n in counts.items()]
-    return lines, total < codes.size
-
-
-def _reason(code: int) -> str:
-    return "Not computed." if code == NOT_COMPUTED else RESULTS[REASONS[code]] or "completed"
-
-
-def _told_axes(axes: Mapping[str, Sequence[float]]) -> str:
-    return ", ".join(f"{n} ({len(x)}: {min(x):g} … {max(x):g})" for n, x in axes.items())
-
-
-def _regimes(data: xr.Dataset) -> list[str]:
-    """How many motions there are of each period."""
-    period = np.asarray(data["period"])[np.asarray(data["result"]) == 0]
-    names: dict[int, str] = {regime: regime.meaning for regime in REGIMES}
-    kinds, counts = np.unique(period, return_counts=True)
-    order = sorted(zip(kinds.tolist(), counts.tolist(), strict=True), key=lambda pair: -pair[1])
-    lines = [
-        f"  {names.get(kind, f'period {2 * kind}π')}: {n:,} ({100 * n / data['result'].size:.1f} %)"
-        for kind, n in order
-    ]
-    return lines if len(lines) <= 12 else [*lines[:12], f"  {len(lines) - 12} further periods"]
-
-
-def _ranges(data: xr.Dataset) -> list[str]:
-    """The span of each number over the motions that did not fail."""
-    lines = []
-    for name in sorted(map(str, data)):  # a store does not keep their order
-        x = data[name]
-        if x.dtype.kind != "f" or name == "impacts":
-            continue
-        numbers = np.asarray(x.where(data["result"] == 0))
-        numbers = numbers[np.isfinite(numbers)]
-        if numbers.size:
-            span = f"{numbers.min():.6g} … {numbers.max():.6g}"
-            lines.append(f"  {name}: {span} {x.attrs.get('units', '')}".rstrip())
-    return lines
-
-
 def _last_state(run: Sweep, otherwise: Any) -> Any:
     """The section state on which a sweep ended."""
     good = np.flatnonzero(np.asarray(run.result == RESULTS.successful))
     if not good.size:
         return otherwise
     return jtu.tree_map(lambda x: x[good[-1], -1], run.sections)
-
-
-def _sweep_columns(way: str, run: Sweep) -> dict[str, np.ndarray]:
-    names = ("values", "y_min", "y_max", "period", "impacts", "frequency_ratio", "impact_speed")
-    columns = {name: np.asarray(getattr(run, name)) for name in names}
-    results = np.array([_reason(int(code)) for code in number_of(run.result)])
-    return {"direction": np.full(results.size, way), **columns, "result": results}
-
-
-def _sample_columns(samples: Any) -> dict[str, np.ndarray]:
-    return {
-        "cycles": np.asarray(samples.cycles),
-        "time": np.asarray(samples.time),
-        **{name: np.asarray(x) for name, x in vars(samples.state).items()},
-    }
-
-
-def _cycle_columns(run: Any) -> dict[str, np.ndarray]:
-    """One row for each cycle: the state at its end, and what happened in it."""
-    names = ("y_min", "y_max", "impacts", "impact_speed", "frequency_ratio")
-    return {
-        "cycle": np.arange(1, run.impacts.size + 1),
-        **{name: np.asarray(x)[1:] for name, x in vars(run.sections).items()},
-        **{name: np.asarray(getattr(run, name)) for name in names},
-    }
-
-
-def _write_rows(path: str, tables: Iterable[Mapping[str, np.ndarray]]) -> None:
-    """Columns as CSV, several tables of the same columns below each other."""
-    text = StringIO(newline="")
-    writer = csv.writer(text)
-    for i, table in enumerate(tables):
-        if not i:
-            writer.writerow(table)
-        writer.writerows(zip(*(x.tolist() for x in table.values()), strict=True))
-    write_whole(path, text.getvalue())
-
-
-def _axes() -> Axes:
-    return Figure(figsize=(7.5, 4.2), layout="constrained").subplots()
-
-
-def _saved(ax: Axes, path: str) -> str:
-    figure = ax.figure
-    assert isinstance(figure, Figure)
-    return f"  picture: {save_picture(figure, path)}"

@@ -1,0 +1,80 @@
+"""What a file must hold beyond its form, checked before anything is simulated."""
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from .._checks import unwritable
+from ..orbit.curve import check_walk
+from ..scan.grid import Blocks, axes_of
+from ..scan.job import check_corners, make_job
+from ..scene import Scene
+from ..scene.leaves import leaf, leaf_names
+from .config import OrbitTable
+from .toml import ConfigError, given, spoken, unknown
+
+
+def check_names(scene: Scene, names: Iterable[str], place: str, *, start: bool = False) -> None:
+    """**Raises:** `ConfigError` for a name that no number of the scene (or the start) has."""
+    known = leaf_names(scene)
+    if start:
+        known += [f"start.{name}" for name in leaf_names(scene.start())]
+    wrong = [unknown("name", name, place, known) for name in names if name not in known]
+    if wrong:
+        raise ConfigError(*wrong)
+
+
+def check_range(scene: Scene, name: str, values: Sequence[float], place: str) -> None:
+    """**Raises:** `ConfigError` if the scene refuses the least or the greatest of these values."""
+    with spoken(place, keys=()):
+        axes = axes_of({name: values})
+        check_corners(make_job(scene, (name,), measure="extremes"), Blocks(axes, 1))
+
+
+def check_paths(table: str, *, picture: str | None = None, output: str | None = None) -> None:
+    """**Raises:** `ConfigError` if a file cannot be written; makes the folders above them."""
+    for key, path, ending in (("picture", picture, ".png"), ("output", output, ".csv")):
+        if path is None:
+            continue
+        if not path.endswith(ending):
+            raise ConfigError(f'`{key}` in {table} must end in {ending}, but is "{path}"')
+        reason = unwritable(Path(path).parent)
+        try:
+            if reason is None and Path(path).is_dir():
+                reason = "it is a folder"
+            elif reason is None and Path(path).exists() and not os.access(path, os.W_OK):
+                reason = "permission denied"
+        except OSError as error:  # a name that is too long
+            reason = error.strerror
+        if reason:
+            raise ConfigError(f"`{key}` in {table} cannot be written: {path}: {reason}")
+
+
+def check_map(axes: Mapping[str, Any], measure: Iterable[str] | None, *, paired: bool) -> None:
+    """**Raises:** `ConfigError` if a scan cannot be drawn as a map of regimes."""
+    if measure is not None and "regime" not in measure:
+        raise ConfigError('`picture` in [scan] needs "regime" among the measures')
+    if len(axes) != 2 or paired:
+        raise ConfigError(
+            f"`picture` in [scan] needs a grid of two axes, but there are {len(axes)}"
+        )
+
+
+def check_continuation(scene: Scene, table: OrbitTable) -> None:
+    """**Raises:** `ConfigError` if the branch cannot begin, or its files not be written."""
+    asked = table.continue_
+    assert asked is not None
+    check_names(scene, [asked.parameter], "[orbit.continue]")
+    low, high = asked.bounds
+    value = float(leaf(scene, asked.parameter))
+    if not low <= value <= high or low == high:
+        raise ConfigError(
+            f"`bounds` in [orbit.continue] must hold the scene's {asked.parameter} = {value:g}, "
+            f"but is [{low:g}, {high:g}]"
+        )
+    check_range(scene, asked.parameter, asked.bounds, "`bounds` in [orbit.continue]")
+    walk = {"step": 0.01, "max_step": 0.1, "max_points": 1000}
+    with spoken("[orbit.continue]"):
+        check_walk(**{name: given(asked).get(name, usual) for name, usual in walk.items()})
+    check_paths("[orbit.continue]", picture=asked.picture, output=asked.output)
