@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
+from .arrays import Values
+from .operations import kind_of
 from .program import Program
-from .table import Values, kind_of
 from .text import Text, Value, is_float
 from .vector import write
 

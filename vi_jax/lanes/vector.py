@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
-from .table import ELEMENTWISE, STRUCTURAL, Values, kind_of
+from .arrays import STRUCTURAL, Values
+from .operations import ELEMENTWISE, kind_of
 from .text import Text, Value
 
 # Calls whose body is written out in their place.
