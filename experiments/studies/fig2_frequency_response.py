@@ -20,18 +20,8 @@ from typing import Any
 import jax
 import numpy as np
 import vi_jax as vi
-from vi_jax.paper.response import (
-    RANGE,
-    RATIO,
-    WALL,
-    Response,
-    System,
-    between,
-    describe,
-    response,
-    rows,
-    with_numbers,
-)
+from vi_jax.paper.discrepancy import between, describe, rows
+from vi_jax.paper.response import RANGE, RATIO, WALL, Response, System, response, with_numbers
 from vi_jax.paper.response_figure import LOOK, draw_response
 
 jax.config.update("jax_enable_x64", True)

@@ -13,6 +13,7 @@ from ..scene import Scene
 from .assumptions import check_assumptions
 from .boundaries import boundary_curves, describe_boundaries, draw_boundaries
 from .claims import Claim, check_claims
+from .discrepancy import describe
 from .faults import Fault, check_faults
 from .figure2_claims import check_figure_2
 from .figures import draw_figure
@@ -20,7 +21,7 @@ from .motions import figure_scene, simulate_cases, table_damping_ratio
 from .motors import Motors, draw_motors, simulate_motors
 from .orbits import orbit_table
 from .pages import Findings, as_json, as_markdown
-from .response import describe, response
+from .response import response
 from .response_figure import LOOK, draw_response
 from .sketch import draw_sketch
 

@@ -10,8 +10,9 @@ from matplotlib.patches import Patch
 
 from ..plot import plot_branch
 from ..plot.motion import BLUE, GREEN, PINK, RED
+from .discrepancy import between, rows
 from .motions import GAP
-from .response import FINE, RANGE, RESTITUTIONS, Response, System, between, rows
+from .response import FINE, RANGE, RESTITUTIONS, Response, System
 
 # What `save_picture` makes a small file of it with.
 LOOK = {"dpi": 72, "colors": 250}
