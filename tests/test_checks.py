@@ -13,15 +13,15 @@ from vi_jax import _checks
 def test_calls_that_cannot_be_run_are_refused_with_a_reason():
     script = Path(__file__).with_name("refused_calls.py")
     root = Path(_checks.__file__).parents[1]
-    told = subprocess.run(
+    process = subprocess.run(
         [sys.executable, str(script)],
         capture_output=True,
         text=True,
         env={**os.environ, "PYTHONPATH": str(root)},
         cwd=script.parent,
     )
-    assert told.returncode == 0, told.stderr
-    found = json.loads(told.stdout)
+    assert process.returncode == 0, process.stderr
+    found = json.loads(process.stdout)
     assert found["wrong"] == {} and found["calls"] > 100
 
 

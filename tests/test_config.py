@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from vi_jax import cli
 from vi_jax.cli import checks, config, verbs
 from vi_jax.cli.toml import ConfigError, keys_of, read_toml
-from vi_jax.scene.leaves import leaf, leaf_names
+from vi_jax.scene.numbers import leaf, leaf_names
 
 READY = sorted((Path(__file__).parents[1] / "experiments").glob("*.toml"))
 
@@ -37,7 +37,7 @@ def written(text, path="file.toml"):
     return path
 
 
-def told(text):
+def problems_of(text):
     """The sentences with which a file is refused, from reading it or building its scene."""
     with pytest.raises(ConfigError) as refused:
         config.read(written(text)).build()
@@ -203,7 +203,7 @@ def test_there_are_ready_files():
     ],
 )  # fmt: skip
 def test_what_cannot_be_read(here, text, sentence):
-    assert sentence in told(text)
+    assert sentence in problems_of(text)
 
 
 @pytest.mark.parametrize(
@@ -234,7 +234,7 @@ def test_what_cannot_be_read(here, text, sentence):
     ],
 )  # fmt: skip
 def test_what_makes_no_scene(here, text, sentence):
-    problems = told(text)
+    problems = problems_of(text)
     assert sentence in problems, problems
 
 
@@ -245,7 +245,7 @@ def test_an_editors_mark_is_no_fault(here):
 
 
 def test_every_fault_is_told(here):
-    problems = told("[scene]\nrestitition = 1\nfrequency_ratio = 'x'\n[scan]\nsettle = 'y'")
+    problems = problems_of("[scene]\nrestitition = 1\nfrequency_ratio = 'x'\n[scan]\nsettle = 'y'")
     assert len(problems) == 3
 
 
@@ -425,8 +425,8 @@ def test_interrupted_scans_tell_how_to_go_on(here, capsys, monkeypatch):
     assert cli.main(["scan", written(IDEAL + SCAN)]) == 130
     assert "nothing was kept" in capsys.readouterr().err.splitlines()[-1]
     assert cli.main(["scan", written(IDEAL + SCAN + "store = 's.zarr'")]) == 130
-    told = capsys.readouterr().err.splitlines()[-1]
-    assert told == "vi-jax: interrupted; the same command goes on from what is in s.zarr"
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last == "vi-jax: interrupted; the same command goes on from what is in s.zarr"
 
 
 def test_sweep(here, capsys):

@@ -77,14 +77,14 @@ SWEEP = "[sweep]\nparameter = 'stops.0.gap'\nvalues = [2.0, 1.9, 1.8]\nsettle = 
 
 
 @pytest.mark.parametrize(
-    "verb, text, part, told, rows",
+    "verb, text, part, words, rows",
     [
         ("simulate", SIMULATE, "simulate", "after 10 of 13 cycles", 41),
         ("sweep", SWEEP + "up_and_down = true\n", "sweep", "after 2 of 6 values", 2),
     ],
 )
 def test_interrupts_keep_what_was_computed(
-    short, tmp_path, monkeypatch, capsys, verb, text, part, told, rows
+    short, tmp_path, monkeypatch, capsys, verb, text, part, words, rows
 ):
     """Pressed in the second part, again at once, and while the file is written."""
     monkeypatch.chdir(tmp_path)
@@ -104,7 +104,7 @@ def test_interrupts_keep_what_was_computed(
     assert cli.main([verb, "file.toml"]) == 130
     assert signal.getsignal(signal.SIGINT) is before and len(calls) == 2
     printed = capsys.readouterr()
-    assert printed.err.splitlines()[-1] == f"vi-jax: interrupted {told}, which are kept"
+    assert printed.err.splitlines()[-1] == f"vi-jax: interrupted {words}, which are kept"
     assert printed.err.count("keeping what was computed") == 1 and "out.csv" in printed.out
     with open("out.csv", newline="", encoding="utf-8") as file:
         assert len(list(csv.DictReader(file))) == rows
@@ -120,16 +120,16 @@ def test_an_interrupt_before_anything_is_kept(short, tmp_path, monkeypatch, caps
 
 
 def test_another_thread_has_no_interrupts():
-    told = []
+    words = []
 
     def work():
         with _parts.noted_interrupts() as interrupted:
-            told.append(interrupted())
+            words.append(interrupted())
 
     thread = threading.Thread(target=work)
     thread.start()
     thread.join()
-    assert told == [False]
+    assert words == [False]
 
 
 def test_a_long_run_takes_parts_of_a_fraction_of_a_second():

@@ -254,10 +254,10 @@ def tuple_of(name: str, value: Any, kind: type) -> tuple[Any, ...]:
         ) from None
 
 
-def instance_of(name: str, value: Any, kind: type | tuple[type, ...], told: str) -> None:
-    """**Raises:** `TypeError` if `value` is none of this kind, which is `told`."""
+def instance_of(name: str, value: Any, kind: type | tuple[type, ...], described: str) -> None:
+    """**Raises:** `TypeError` if `value` is none of this kind, which is `described`."""
     if not isinstance(value, kind):
-        raise TypeError(f"Argument `{name}` must be {told}, but got {value!r}.")
+        raise TypeError(f"Argument `{name}` must be {described}, but got {value!r}.")
 
 
 def state_of_numbers(name: str, state: Any) -> Any:

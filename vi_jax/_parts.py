@@ -19,7 +19,7 @@ from .flow import RESULTS, Run, Samples
 from .flow.simulate import planned, simulate
 from .scan.sweep import Sweep, sweep, taken_along
 from .scene import AbstractScene
-from .scene.leaves import with_leaf
+from .scene.numbers import with_leaf
 
 # Intervals (samples, or cycles as so many) of one part: a fraction of a second. Each other length
 # is another program, so that it is chosen before the time is known.

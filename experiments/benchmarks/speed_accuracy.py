@@ -633,7 +633,7 @@ def scanned(row: Row) -> str:
     return "– | –" if np.isnan(row.wrong) else f"{row.wrong:.2%} | {row.scanning:.1f}"
 
 
-def told(row: Row) -> str:
+def in_words(row: Row) -> str:
     """A method and what it costs."""
     return f"{row.choice.name} ({1e3 * row.seconds:.0f} ms, {row.errors['late95']:.0e})"
 
@@ -664,9 +664,9 @@ lines = [
 for drive, (rows, _) in results.items():
     for target in TARGETS:
         front = fastest(rows, target)[:3]
-        cells = [told(front[0])] if front else ["none"]
+        cells = [in_words(front[0])] if front else ["none"]
         for row in front[1:]:
-            cells += [told(row), f"{row.seconds / front[0].seconds:.2f}"]
+            cells += [in_words(row), f"{row.seconds / front[0].seconds:.2f}"]
         cells += [""] * (5 - len(cells))
         lines.append(f"| {drive} | {target:.0e} | {' | '.join(cells)} |")
 for drive, (rows, about) in results.items():

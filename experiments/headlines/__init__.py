@@ -17,7 +17,7 @@ from vi_jax.plot.stamp import stamp
 
 FINGERPRINT = "vi_jax fingerprint of the table's numbers"
 _TITLE = "## Headline numbers"
-_TOLD = "Computed again by the tests, which fail where the library gives others."
+_NOTE = "Computed again by the tests, which fail where the library gives others."
 _NUMBER = re.compile(r"\d+(?:,\d{3})*(?:\.\d+)?(?:e[+-]?\d+)?")
 
 
@@ -31,7 +31,7 @@ def keep(
     """
     rounded = {name: float(f"{value:.12g}") for name, value in numbers.items()}
     listed = json.dumps(rounded, indent=2, ensure_ascii=False, allow_nan=False)
-    page = f"{text.rstrip()}\n\n{_TITLE}\n\n{_TOLD}\n\n```json\n{listed}\n```\n"
+    page = f"{text.rstrip()}\n\n{_TITLE}\n\n{_NOTE}\n\n```json\n{listed}\n```\n"
     picture = folder.parent / "figures" / f"{study}.png"
     folder.mkdir(parents=True, exist_ok=True)
     picture.parent.mkdir(parents=True, exist_ok=True)
@@ -50,5 +50,5 @@ def headlines(page: str) -> dict[str, float]:
 def fingerprint(page: str) -> str:
     """Of the numbers in a page's tables and of its headline numbers; its prose is free."""
     tables = "\n".join(line for line in page.splitlines() if line.startswith("|"))
-    told = json.dumps(headlines(page), sort_keys=True, ensure_ascii=False)
-    return hashlib.sha256((" ".join(_NUMBER.findall(tables)) + told).encode()).hexdigest()
+    kept = json.dumps(headlines(page), sort_keys=True, ensure_ascii=False)
+    return hashlib.sha256((" ".join(_NUMBER.findall(tables)) + kept).encode()).hexdigest()

@@ -184,10 +184,10 @@ for found in everything:
         error = (there * (1 - there) / SAMPLES) ** 0.5
         both = (p * (1 - p) * (1 / size + 1 / SAMPLES)) ** 0.5
         off = f"{(here - there) / both:+.1f}" if both else "–"
-        told = "–" if multiplier is None else f"{multiplier:.4f}"
+        shown = "–" if multiplier is None else f"{multiplier:.4f}"
         lines.append(
             f"| {found.case.title if i == 0 else ''} | {period} | {impacts} | {where} "
-            f"| {100 * here:.2f} | {100 * there:.2f} ± {100 * error:.2f} | {off} | {told} |"
+            f"| {100 * here:.2f} | {100 * there:.2f} ± {100 * error:.2f} | {off} | {shown} |"
         )
     times.append(
         f"| {found.case.title} | {found.case.side}² × {found.case.settle + 128:,} "

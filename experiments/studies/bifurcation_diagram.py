@@ -336,9 +336,9 @@ panels["right"].set_title("4π and 2π motion coexist")
 for name in ("left", "middle", "right"):
     panels[name].locator_params(axis="x", nbins=4)
 handles = [
-    Line2D([], [], color=color, lw=2.6, alpha=0.6, label=told)
-    for _, told, color in BRANCHES
-    if told
+    Line2D([], [], color=color, lw=2.6, alpha=0.6, label=label)
+    for _, label, color in BRANCHES
+    if label
 ]
 handles += [
     Line2D([], [], color="k", ls=ls, label=x) for x, ls in (("stable", "-"), ("unstable", "--"))

@@ -69,9 +69,9 @@ def numbers(plane: str, points: np.ndarray) -> np.ndarray:
 
 # %%
 curves = boundary_curves(quick=QUICK)
-told = describe_boundaries(curves)
+described = describe_boundaries(curves)
 say(f"{sum(len(c.parameters) for c in curves if c)} points on {sum(c is not None for c in curves)}")
-for name, value in told.items():
+for name, value in described.items():
     print(f"  {name}: {value if value is None else round(value, 6)}")
 
 # %% [markdown]
@@ -366,14 +366,14 @@ lines += [
     "",
     "| number | value |",
     "|---|---|",
-    *(f"| {name} | {'none' if x is None else f'{x:.5f}'} |" for name, x in told.items()),
+    *(f"| {name} | {'none' if x is None else f'{x:.5f}'} |" for name, x in described.items()),
     f"| doubling at ζ = 0.9, k = 0.5, c, by the closed form alone | {stable_from:.7f} |",
     f"| greatest c of the map at which a 4π motion is seen | {highest:.3f} |",
     "| ζ of any 4π motion with one impact at Table 1's c, k = 0.5, by the closed form | "
     f"{table_ratios.min():.3f} … {table_ratios.max():.3f} |",
 ]
 birth_table, doubling_table = (
-    told[f"{name} at Table 1's c, k = 0.5, ζ"] for name in ("birth", "doubling")
+    described[f"{name} at Table 1's c, k = 0.5, ζ"] for name in ("birth", "doubling")
 )
 lines.append(
     f"""
@@ -382,10 +382,10 @@ lines.append(
   on a 4π motion. The 4π motion with one impact, which the paper computes and Figures 3 and 4 show,
   fills only the right part of the strip. Left of it the 4π motions seen have more impacts, and
   further left the periods are longer or there is none.
-- Without damping that motion needs k > {told["4π motion, undamped, from k"]:.3f}; the figures'
+- Without damping that motion needs k > {described["4π motion, undamped, from k"]:.3f}; the figures'
   ζ = 0.9, k = 0.5 lies well inside. From k = 0.71 on it is itself unstable in a part of its region,
   where no simulation shows it.
-- With k = 0.5 it ends at c = {told["4π motion at k = 0.5, up to c"]:.3f} N·s/m,
+- With k = 0.5 it ends at c = {described["4π motion at k = 0.5, up to c"]:.3f} N·s/m,
   two thirds of Table 1's c. At ζ = 0.9 the 2π motion is stable from c = {stable_from:.4f} on, so
   that the figures cannot be had with Table 1's c = 0.5: the simulations around that point are on
   the 2π motion.
@@ -399,7 +399,7 @@ lines.append(
   begun without damping, do not bound. With Table 1's c it ends before the 2π motion is born.
 """
 )
-kept = {name: x for name, x in told.items() if x is not None}
+kept = {name: x for name, x in described.items() if x is not None}
 if not QUICK:
     keep(HERE, "boundaries", "\n".join(lines), kept, figure, dpi=100)
 print("\n".join(lines[9:]))

@@ -103,14 +103,14 @@ def main() -> None:
         except (RuntimeError, AssertionError) as error:
             found = {name: np.inf for name in row.promise}
             print(f"  {row.range}: {error!r}", file=sys.stderr)
-        told = []
+        measured = []
         for name, promise in row.promise.items():
             broken += not found[name] <= promise
-            told.append(f"{name}: {found[name]:.1e} ({promise:.0e})")
-        cells = row.range, row.expected, "<br>".join(told), row.beyond
+            measured.append(f"{name}: {found[name]:.1e} ({promise:.0e})")
+        cells = row.range, row.expected, "<br>".join(measured), row.beyond
         lines.append("| " + " | ".join(cells) + " |")
         took = time.perf_counter() - begin
-        print(f"{took:6.1f} s  {row.range}: {'; '.join(told)}", file=sys.stderr, flush=True)
+        print(f"{took:6.1f} s  {row.range}: {'; '.join(measured)}", file=sys.stderr, flush=True)
     lines += ["", f"Promises broken: {broken}.", "", "## Stiff motors, ten cycles", "", *stiff()]
     print("\n".join(lines))
     if not QUICK:

@@ -213,9 +213,9 @@ def misfit(key: tuple[float, float], impacts: int) -> float:
     if impacts and branch.parameter[0] > branch.parameter[-1]:
         keep = np.arange(len(branch.parameter)) >= turn
     zeta, kappa = branch.frequency_ratio[keep], branch.parameter[keep]
-    told = np.interp(zeta, zetas, hard if impacts else idle)
+    expected = np.interp(zeta, zetas, hard if impacts else idle)
     slip = kappa - zeta
-    return float(np.nanmax(np.abs(slip - told / (PER_NM * key[0]))) / np.nanmax(np.abs(slip)))
+    return float(np.nanmax(np.abs(slip - expected / (PER_NM * key[0]))) / np.nanmax(np.abs(slip)))
 
 
 # %% [markdown]
@@ -264,8 +264,8 @@ def fine_jump(torque: float) -> str:
     )
 
 
-fine_told = "; ".join(fine_jump(torque) for torque in FINE)
-say(fine_told)
+fine_jumps = "; ".join(fine_jump(torque) for torque in FINE)
+say(fine_jumps)
 outside = [
     f"T0 = {key[0]:g} {'run-up' if way == 'up' else 'close-down'}"
     for (key, way), within in zip(points, inside, strict=True)
@@ -319,7 +319,7 @@ within 1e-6 in up to 16 cycles.
   ({", ".join(outside)}).
   Where strong motors close down, it is the coarse step of κ that sets off a transient which reaches
   the stop too early. In steps of {1e4 * (1.235 - 1.217) / (VALUES - VALUES // 3 - 1):.1f}e-4 they
-  jump at their grazings, to one step: {fine_told}.
+  jump at their grazings, to one step: {fine_jumps}.
   The weakest motor passes its fold (T0 = 0.05 N·m, close-down at
   {points[(0.05, NEAR), "down"]:.3f}) and jumps only at {weakest[0]:.3f} … {weakest[1]:.3f}: it
   needs the cycles of several values to leave it.
@@ -413,9 +413,9 @@ scan = np.logspace(np.log10(0.04), 2, 120)
 for gap, tone, name in ((NEAR, "k", "2a"), (FAR, "#8c564b", "20a")):
     for way, dash in (("up", "-"), ("down", "--")):
         reached = scan if gap == NEAR else scan[(scan > 0.4) & (scan < limits[0])]
-        told = [forecast(t, gap, way) for t in reached]
+        expected = [forecast(t, gap, way) for t in reached]
         ax_jump.plot(
-            reached, told, dash, color=tone, lw=1.2, label=f"{way}, stop at {name}: forecast"
+            reached, expected, dash, color=tone, lw=1.2, label=f"{way}, stop at {name}: forecast"
         )
         keys = [key for key in LANES if key[1] == gap]
         x, y = zip(*((key[0], special(key, way).parameter) for key in keys), strict=True)

@@ -309,7 +309,7 @@ again = settled(
     lanes=256,
 )
 say(f"{again.sizes['sample']} lanes by Adaptive in {os.times().elapsed - begin.elapsed:.1f} s")
-told = []
+differing = []
 for seen, (i, j), part in zip(maps, picked, range(len(maps)), strict=True):
     one = again.isel(sample=slice(part * SAMPLE, (part + 1) * SAMPLE))
     period, impacts = one["period"].values, one["impacts"].values
@@ -318,7 +318,7 @@ for seen, (i, j), part in zip(maps, picked, range(len(maps)), strict=True):
     irregular = other & ((was <= 0) | (period <= 0))
     edge = other & ~irregular & borders(seen)[i, j]
     rest = other & ~irregular & ~edge
-    told.append((int(other.sum()), int(irregular.sum()), int(edge.sum()), int(rest.sum())))
+    differing.append((int(other.sum()), int(irregular.sum()), int(edge.sum()), int(rest.sum())))
     for n in np.flatnonzero(other):
         where = ", ".join(f"{name} = {x[n]:.4f}" for name, x in lanes[part].items())
         say(
@@ -418,10 +418,10 @@ rows += [
     ("every third lane on a 2π or 4π motion with one impact", [f"{x[0]:,}" for x in limits]),
     ("of these: no such stable motion in the closed form", [str(x[1]) for x in limits]),
     ("lanes without impacts between the births", [str(x[2]) for x in limits]),
-    (f"of {SAMPLE:,} random lanes: another regime by Adaptive", [str(x[0]) for x in told]),
-    ("of these: chaotic or unsettled by one of the two", [str(x[1]) for x in told]),
-    ("regular, with a neighbour of another regime", [str(x[2]) for x in told]),
-    ("neither", [str(x[3]) for x in told]),
+    (f"of {SAMPLE:,} random lanes: another regime by Adaptive", [str(x[0]) for x in differing]),
+    ("of these: chaotic or unsettled by one of the two", [str(x[1]) for x in differing]),
+    ("regular, with a neighbour of another regime", [str(x[2]) for x in differing]),
+    ("neither", [str(x[3]) for x in differing]),
 ]
 table = [
     "# Regime maps",
@@ -458,9 +458,9 @@ table.append(
   cycles.
 - Left of the paper's range of interest Table 1's machine hits the stop in a small island near
   ζ = 0.6 (k above 0.85), and along the birth it has motions of longer periods and chaos.
-- `Adaptive` gives {sum(x[0] for x in told)} of {SAMPLE * len(maps):,} random lanes another regime;
-  {sum(x[1] for x in told)} of these are chaotic or unsettled by one of the two: long transients
-  and chaos, where each method goes its own way.
+- `Adaptive` gives {sum(x[0] for x in differing)} of {SAMPLE * len(maps):,} random lanes another
+  regime; {sum(x[1] for x in differing)} of these are chaotic or unsettled by one of the two: long
+  transients and chaos, where each method goes its own way.
 """
 )
 print("\n".join(table))

@@ -81,8 +81,8 @@ def poisoned() -> Found:
     others = np.ones(lanes, bool)
     others[bad] = False
     same = np.array_equal(np.asarray(clean)[others], np.asarray(mixed)[others])
-    told = np.array_equal(np.asarray(refused), ~others)
-    return {"ExactFlight": 0.0 if same and told else np.inf}
+    named = np.array_equal(np.asarray(refused), ~others)
+    return {"ExactFlight": 0.0 if same and named else np.inf}
 
 
 SINGLE = {

@@ -67,9 +67,9 @@ def test_numbers_in_the_prose_of_figure_2():
     prose, _, tables = page_of("fig2_frequency_response").partition("## Continued branches")
     prose = prose.partition("## Where the minimum")[0]
     places = {float(x) for x in _decimals(tables, least=5)}
-    for told in _decimals(prose, least=4):
-        digits = len(told.partition(".")[2])
-        assert any(abs(place - float(told)) <= 0.51 * 10**-digits for place in places), told
+    for printed in _decimals(prose, least=4):
+        digits = len(printed.partition(".")[2])
+        assert any(abs(place - float(printed)) <= 0.51 * 10**-digits for place in places), printed
 
 
 def _decimals(text: str, least: int) -> list[str]:

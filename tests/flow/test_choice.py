@@ -52,8 +52,8 @@ def test_estimated_errors_are_those_made(scene, method):
     run = vi.simulate(scene, scene.start(), 40, method=method, estimate=True)
     truth = vi.simulate(scene, scene.start(), 40, method="reference")
     made = np.abs(np.asarray(run.sections.Y - truth.sections.Y))
-    told = np.asarray(run.errors.sections.Y)
-    assert 0.5 < told.max() / made.max() < 2.0
+    estimated = np.asarray(run.errors.sections.Y)
+    assert 0.5 < estimated.max() / made.max() < 2.0
     assert int(run.errors.impacts.max()) == 0
     assert "estimated" in str(run)
     assert vi.simulate(scene, scene.start(), 2).errors is None

@@ -54,8 +54,8 @@ def test_a_traced_number_out_of_range_ends_its_lane_and_no_other():
     good = lanes(jnp.asarray(rows[:1] * len(rows)), jnp.full(len(rows), 1.0))
     codes, Y, steps = lanes(jnp.asarray(rows), jnp.full(len(rows), 1.0))
     expected = np.where(np.arange(len(rows)) % 2 == 1, BAD_START, 0)
-    told = dict(zip(["base", *np.repeat(list(PLACES), 2)], codes.tolist(), strict=True))
-    assert codes.tolist() == expected.tolist(), told
+    by_place = dict(zip(["base", *np.repeat(list(PLACES), 2)], codes.tolist(), strict=True))
+    assert codes.tolist() == expected.tolist(), by_place
     fine = expected == 0
     np.testing.assert_array_equal(np.asarray(Y)[fine], np.asarray(good[1])[fine])
     assert np.isnan(np.asarray(Y)[~fine][:, 1:]).all()

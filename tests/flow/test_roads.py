@@ -126,11 +126,11 @@ def test_a_scene_of_ones_own(table):
         return run.last, run.impacts
 
     values = jnp.linspace(1.0, 4.0, 9)
-    with warnings.catch_warnings(record=True) as told:
+    with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
         fast = jax.jit(jax.vmap(lane))(values)
     if table is None:
-        assert not told
+        assert not warned
     with vi.road("xla"):
         slow = jax.jit(jax.vmap(lane))(values)
     for a, b in zip(jax.tree.leaves(fast), jax.tree.leaves(slow), strict=True):

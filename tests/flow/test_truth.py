@@ -192,12 +192,12 @@ def test_scipy_over_gaps_restitutions_stops_and_clocks(drive, clock, sides):
         expected = truth.integrated(
             MOTOR if drive == "motor" else 0.9, 0.05, walls(d, k), start, cycles
         )
-        told = f"d = {d}, k = {k}, start {start}"
-        assert bool(good), told
-        np.testing.assert_allclose(states, expected.sections, atol=1e-7, err_msg=told)
-        np.testing.assert_allclose(low, expected.y_min, atol=1e-7, err_msg=told)
-        np.testing.assert_allclose(high, expected.y_max, atol=1e-7, err_msg=told)
-        assert rests.tolist() == expected.rests.tolist(), told
+        where = f"d = {d}, k = {k}, start {start}"
+        assert bool(good), where
+        np.testing.assert_allclose(states, expected.sections, atol=1e-7, err_msg=where)
+        np.testing.assert_allclose(low, expected.y_min, atol=1e-7, err_msg=where)
+        np.testing.assert_allclose(high, expected.y_max, atol=1e-7, err_msg=where)
+        assert rests.tolist() == expected.rests.tolist(), where
 
 
 def test_the_two_truths_agree():

@@ -53,8 +53,8 @@ def test_regimes_have_the_colours_of_the_legend():
     names |= {0: "unsettled", -1: "chaotic", -2: "failed", -3: "transiently chaotic"}
     cells, _ = _cells(ax)
     legend = _legend(ax)
-    told = ["2π", "4π", "16π", "> 16π", "unsettled", "transiently chaotic", "chaotic", "failed"]
-    assert list(legend) == told
+    wanted = ["2π", "4π", "16π", "> 16π", "unsettled", "transiently chaotic", "chaotic", "failed"]
+    assert list(legend) == wanted
     assert len(set(legend.values())) == len(legend)
     for place, period in np.ndenumerate(PERIODS):
         np.testing.assert_allclose(cells[place], legend[names[period]])
@@ -79,8 +79,8 @@ def test_axes_by_name_single_rows_and_what_was_not_computed():
     np.testing.assert_array_equal(_cells(turned)[0], straight.transpose(1, 0, 2))
     assert turned.get_xlabel() == "restitution k"
     one = _data(PERIODS[:, :1], y=(0.4,), result=np.array([[0], [0], [-1], [0]]))
-    told = ["2π", "> 16π", "transiently chaotic", "not computed"]
-    assert list(_legend(vi.plot_regimes(one, ax=_axes()))) == told
+    wanted = ["2π", "> 16π", "transiently chaotic", "not computed"]
+    assert list(_legend(vi.plot_regimes(one, ax=_axes()))) == wanted
 
 
 def test_maps_need_two_axes():

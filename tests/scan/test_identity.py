@@ -106,7 +106,7 @@ def test_another_process_gives_the_same(tmp_path):
         "from study import *\nimport study\nfrom vi_jax.scan.identity import identity\n"
         f"print([identity(eval(t, vars(study))) for t in {list(THINGS.values())!r}])\n"
     )
-    told = [
+    described = [
         subprocess.run(
             [sys.executable, str(script)],
             env={"PYTHONHASHSEED": seed, "PYTHONPATH": ":".join(filter(None, sys.path))},
@@ -114,7 +114,7 @@ def test_another_process_gives_the_same(tmp_path):
         ).stdout
         for seed in ("1", "2")
     ]  # fmt: skip
-    assert told[0] == told[1] and told[0].count(",") == len(THINGS) - 1
+    assert described[0] == described[1] and described[0].count(",") == len(THINGS) - 1
 
 
 def test_what_the_library_gives_can_be_told():

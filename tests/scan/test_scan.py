@@ -326,7 +326,7 @@ def test_a_sweep_takes_the_body_along_with_a_stop_that_comes_nearer():
         vi.sweep(SCENE, "stops.0.gap", [])
 
 
-def _told(y_min, period, impacts, zeta=None):
+def _described(y_min, period, impacts, zeta=None):
     size = len(y_min)
     zeros = jnp.zeros(size)
     sweep = vi.Sweep(
@@ -346,20 +346,22 @@ def _told(y_min, period, impacts, zeta=None):
 
 def test_a_sweep_tells_what_happens_to_the_motion():
     # The period stays, and all else changes.
-    lost = _told([-3.3, -3.4, -0.7, -0.68], [1] * 4, [1.0, 1.0, 0.0, 0.0], [1.0, 1, 1.3, 1.3])
+    lost = _described([-3.3, -3.4, -0.7, -0.68], [1] * 4, [1.0, 1.0, 0.0, 0.0], [1.0, 1, 1.3, 1.3])
     assert lost == [
         "  2π with 1 impact from 1",
         "  2π with 0 impacts from 1.2, jump since 1.1: min Y -3.4 → -0.7, ζ 1 → 1.3",
     ]
     # A motion of the same kind on another branch.
-    other = _told([-1.0, -1.05, -1.1, -2.0, -2.04, -2.08], [2] * 6, [3.0] * 6)
+    other = _described([-1.0, -1.05, -1.1, -2.0, -2.04, -2.08], [2] * 6, [3.0] * 6)
     assert other[1] == "  still 4π with 3 impacts from 1.3, jump since 1.2: min Y -1.1 → -2"
     # What goes on steadily, however steep, is none; nor is what chaos does from value to value.
-    assert len(_told([-1.0, -2.0, -3.0, -4.2], [1] * 4, [1.0] * 4)) == 1
-    assert len(_told([-1.0, -1.01, -2.3, -2.31, -1.2], [0] * 5, [0.4, 0.5, 0.6, 0.3, 0.4])) == 1
-    failed = _told([-1.0, np.nan, -1.0], [1, -2, 1], [1.0, np.nan, 1.0])
+    assert len(_described([-1.0, -2.0, -3.0, -4.2], [1] * 4, [1.0] * 4)) == 1
+    assert (
+        len(_described([-1.0, -1.01, -2.3, -2.31, -1.2], [0] * 5, [0.4, 0.5, 0.6, 0.3, 0.4])) == 1
+    )
+    failed = _described([-1.0, np.nan, -1.0], [1, -2, 1], [1.0, np.nan, 1.0])
     assert [line.split(" from ")[0].strip() for line in failed][1] == "failed"
-    many = _told([-1.0, -1.1] * 20, [1, 2] * 20, [1.0] * 40)
+    many = _described([-1.0, -1.1] * 20, [1, 2] * 20, [1.0] * 40)
     assert len(many) == 13 and many[-1] == "  28 further changes"
 
 

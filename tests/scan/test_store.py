@@ -36,7 +36,7 @@ def _cut(path):
 
 
 @pytest.mark.parametrize(
-    "damage, where, told, blocks",
+    "damage, where, words, blocks",
     [
         ("deleted", "y_min/c/1", "y_min/c/1", 1),
         ("deleted", "y_min", "y_min, y_min/c/0, y_min/c/1, y_min/c/2", 3),
@@ -50,7 +50,7 @@ def _cut(path):
     ],
 )
 def test_what_is_damaged_is_told_and_computed_again(
-    whole, tmp_path, monkeypatch, damage, where, told, blocks
+    whole, tmp_path, monkeypatch, damage, where, words, blocks
 ):
     path = tmp_path / "store"
     shutil.copytree(whole[0], path)
@@ -62,7 +62,7 @@ def test_what_is_damaged_is_told_and_computed_again(
     work = importlib.import_module("vi_jax.scan.work")
     compute, computed = work.compute, []
     monkeypatch.setattr(work, "compute", lambda *a: computed.append(1) or compute(*a))
-    with pytest.warns(UserWarning, match=f"lost or damaged, and is computed again: {told}[.]"):
+    with pytest.warns(UserWarning, match=f"lost or damaged, and is computed again: {words}[.]"):
         found = scanned(path)
     assert len(computed) == blocks
     for name, numbers in whole[1].items():

@@ -10,9 +10,9 @@ from ..orbit.curve import check_walk
 from ..scan.grid import Blocks, axes_of
 from ..scan.job import check_corners, make_job
 from ..scene import Scene
-from ..scene.leaves import leaf, leaf_names
+from ..scene.numbers import leaf, leaf_names
 from .config import OrbitTable
-from .toml import ConfigError, given, spoken, unknown
+from .toml import ConfigError, given, in_terms_of, unknown
 
 
 def check_names(scene: Scene, names: Iterable[str], place: str, *, start: bool = False) -> None:
@@ -27,7 +27,7 @@ def check_names(scene: Scene, names: Iterable[str], place: str, *, start: bool =
 
 def check_range(scene: Scene, name: str, values: Sequence[float], place: str) -> None:
     """**Raises:** `ConfigError` if the scene refuses the least or the greatest of these values."""
-    with spoken(place, keys=()):
+    with in_terms_of(place, keys=()):
         axes = axes_of({name: values})
         check_corners(make_job(scene, (name,), measure="extremes"), Blocks(axes, 1))
 
@@ -75,6 +75,6 @@ def check_continuation(scene: Scene, table: OrbitTable) -> None:
         )
     check_range(scene, asked.parameter, asked.bounds, "`bounds` in [orbit.continue]")
     walk = {"step": 0.01, "max_step": 0.1, "max_points": 1000}
-    with spoken("[orbit.continue]"):
+    with in_terms_of("[orbit.continue]"):
         check_walk(**{name: given(asked).get(name, usual) for name, usual in walk.items()})
     check_paths("[orbit.continue]", picture=asked.picture, output=asked.output)

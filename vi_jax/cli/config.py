@@ -27,7 +27,7 @@ from ..flow import AbstractMethod, Adaptive, ExactFlight, FixedStep
 from ..orbit import AbstractSearch, Gradient, Newton
 from ..scene import IdealDrive, Motor, Oscillator, Parameters, RigidStop, Scene, SliderCrank
 from .toml import ConfigError as ConfigError
-from .toml import Row, given, read_toml, spoken, unknown
+from .toml import Row, given, in_terms_of, read_toml, unknown
 
 _METHODS = {"exact-flight": ExactFlight, "adaptive": Adaptive, "fixed-step": FixedStep}
 _SOLVERS = {
@@ -59,7 +59,7 @@ class MachineTable:
 
     def build(self) -> Scene:
         """The dimensionless scene."""
-        with spoken("[machine]"):
+        with in_terms_of("[machine]"):
             table = Parameters(**given(self, "drive", "crank", "clock"))
             return table.scene(drive=self.drive, crank=self.crank).in_clock(self.clock)
 
@@ -105,11 +105,11 @@ class SceneTable:
         stops = []
         for i, stop in enumerate(self.stops or ()):
             bounce = self.restitution if stop.restitution is None else stop.restitution
-            with spoken(f"[[scene.stops]] number {i + 1}"):
+            with in_terms_of(f"[[scene.stops]] number {i + 1}"):
                 stops.append(RigidStop(stop.gap, bounce, side=stop.side))
-        with spoken("[scene.motor]"):
+        with in_terms_of("[scene.motor]"):
             turning = None if self.motor is None else Motor(**given(self.motor))
-        with spoken("[scene]"):
+        with in_terms_of("[scene]"):
             if self.stops is None:
                 stops = [RigidStop(2.0 if self.gap is None else self.gap, self.restitution)]
             return Scene(
@@ -141,7 +141,7 @@ class StartTable:
 
     def build(self, scene: Scene, place: str) -> Any:
         """The state, for this scene."""
-        with spoken(place):
+        with in_terms_of(place):
             return scene.start(**given(self))
 
 
@@ -167,7 +167,7 @@ class MethodTable:
             if self.solver not in _SOLVERS:
                 raise ConfigError(unknown("solver", self.solver, "[method]", _SOLVERS))
             options["solver"] = _SOLVERS[self.solver]()
-        with spoken("[method]"):
+        with in_terms_of("[method]"):
             return kind(**options)
 
 
@@ -253,7 +253,7 @@ class OrbitTable:
     def search(self) -> AbstractSearch:
         """The search for the motion."""
         options = given(self, "cycles", "guess", "root_finder", "picture", "continue_")
-        with spoken("[orbit]"):
+        with in_terms_of("[orbit]"):
             return (Newton if self.root_finder == "newton" else Gradient)(**options)
 
 

@@ -82,7 +82,7 @@ def given(table: Any, *but: str) -> dict[str, Any]:
 
 
 @contextmanager
-def spoken(
+def in_terms_of(
     table: str,
     *,
     keys: Iterable[str] | None = None,
@@ -97,13 +97,13 @@ def spoken(
         yield
     except (ValueError, TypeError) as error:
         text = str(error).rstrip(".")
-        told = re.match(r"Argument `(\w+)`", text)
-        if told is None:
+        match = re.match(r"Argument `(\w+)`", text)
+        if match is None:
             own = text.startswith(("Axis ", "Method ", "Measure "))
             if not own or isinstance(error, ConfigError):
                 raise
             raise ConfigError(f"{table}: {text}") from None
-        name, rest = told[1], text[told.end() :]
+        name, rest = match[1], text[match.end() :]
         elsewhere = {"axes": "[axes]", "start": "[start]", "method": "[method]", **(named or {})}
         if name in elsewhere and keys is not None:
             place = elsewhere[name]
@@ -124,7 +124,7 @@ def _problems(error: BaseException, place: Place) -> Iterator[str]:
     elif isinstance(error, KeyError):
         yield f"missing key `{place[-1]}` in {_table(place[:-1])}"
     else:
-        yield f"{_spoken(place)} {error}"
+        yield f"{_in_words(place)} {error}"
 
 
 def _step(error: BaseException) -> Place:
@@ -143,12 +143,12 @@ def _table(place: Place) -> str:
     return f"[[{name}]] number {numbers[-1] + 1}" if numbers else f"[{name}]"
 
 
-def _spoken(place: Place) -> str:
+def _in_words(place: Place) -> str:
     if len(place) < 2:
         return _table(place)
     last = place[-1]
     if isinstance(last, int):
-        return f"item {last + 1} of {_spoken(place[:-1])}"
+        return f"item {last + 1} of {_in_words(place[:-1])}"
     return f"`{last}` in {_table(place[:-1])}"
 
 

@@ -47,7 +47,7 @@ from .output import (
     sweep_columns,
     write_rows,
 )
-from .toml import ConfigError, given, keys_of, spoken
+from .toml import ConfigError, given, in_terms_of, keys_of
 
 Tell = Callable[[str], None]
 
@@ -79,7 +79,7 @@ def scan(config: Config, tell: Tell) -> Outcome:
     if not table.paired:
         total = math.prod(len(row) for row in axes.values())
     tell(f"scanning {total:,} motions")
-    with spoken("[scan]", keys=keys_of(type(table))), warnings.catch_warnings():
+    with in_terms_of("[scan]", keys=keys_of(type(table))), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "[0-9,]+ of [0-9,]+ lanes failed")
         data = run_scan(scene, axes, start=start, method=method, **options)
     lines = [f"Scan of {data['result'].size:,} motions over {axes_in_words(axes)}"]
@@ -113,7 +113,7 @@ def sweep(config: Config, tell: Tell) -> Outcome:
     there, back = ("up", "down") if table.values[0] <= table.values[-1] else ("down", "up")
     found: dict[str, Sweep] = {}
     with noted_interrupts() as interrupted:
-        with spoken("[sweep]", keys=keys_of(type(table))):
+        with in_terms_of("[sweep]", keys=keys_of(type(table))):
             options |= {"method": method, "interrupted": interrupted}
             tell(f"sweeping {table.parameter} {there}, {len(table.values)} values")
             found[there] = sweep_in_parts(scene, values=table.values, start=start, **options)
@@ -122,15 +122,15 @@ def sweep(config: Config, tell: Tell) -> Outcome:
                 last = _last_state(found[there], start)
                 back_again = table.values[::-1]
                 found[back] = sweep_in_parts(scene, values=back_again, start=last, **options)
-        told = _told_sweeps(found, table)
+        outcome = _describe_sweeps(found, table)
         done = sum(run.values.size for run in found.values())
         wanted = len(table.values) * (2 if table.up_and_down else 1)
         if interrupted() and done < wanted:
-            return told._replace(interrupted=f"after {done:,} of {wanted:,} values")
-        return told
+            return outcome._replace(interrupted=f"after {done:,} of {wanted:,} values")
+        return outcome
 
 
-def _told_sweeps(found: Mapping[str, Sweep], table: SweepTable) -> Outcome:
+def _describe_sweeps(found: Mapping[str, Sweep], table: SweepTable) -> Outcome:
     lines, codes = [], []
     for way, run in found.items():
         lines.append(f"{way}: {run}")
@@ -166,7 +166,7 @@ def basins(config: Config, tell: Tell) -> Outcome:
         one = len(table.resolution) == 1
         options["resolution"] = table.resolution[0] if one else table.resolution
     tell("looking where the starts settle")
-    with spoken("[basins]", keys=keys_of(type(table))):
+    with in_terms_of("[basins]", keys=keys_of(type(table))):
         found = find_basins(scene, start=start, method=method, **options)
     lines = [str(found)]
     if table.output is not None:
@@ -196,7 +196,7 @@ def orbit(config: Config, tell: Tell) -> Outcome:
     named = {"root_finder": "[orbit]", "method": "[method]", "guess": "[start]"}
     if table.guess is not None:
         named["guess"] = "`guess` in [orbit]"
-    with spoken("[orbit]", keys=keys_of(type(table)), named=named):
+    with in_terms_of("[orbit]", keys=keys_of(type(table)), named=named):
         found = find_orbit(
             scene,
             scene.start() if guess is None else guess,
@@ -218,7 +218,7 @@ def _continued(found: Orbit, table: OrbitTable, tell: Tell) -> list[str]:
     asked = table.continue_
     assert asked is not None
     tell(f"following it in {asked.parameter}")
-    with spoken("[orbit.continue]"):
+    with in_terms_of("[orbit.continue]"):
         branch = continue_orbit(found, **given(asked, "picture", "output"))
     lines = [str(branch)]
     if asked.output is not None:
@@ -257,17 +257,17 @@ def simulate(config: Config, tell: Tell) -> Outcome:
             raise ConfigError("`samples` in [simulate] must be at least 1 for a picture")
     tell(f"simulating {table.cycles:,} cycles")
     with noted_interrupts() as interrupted:
-        with spoken("[simulate]", keys=keys_of(type(table))):
+        with in_terms_of("[simulate]", keys=keys_of(type(table))):
             start = scene.start() if start is None else start
             run = simulate_in_parts(scene, start, method=method, interrupted=interrupted, **options)
-        told = _told_run(scene, run, table)
+        outcome = _describe_run(scene, run, table)
         done = run.impacts.size
         if interrupted() and done < table.cycles:
-            return told._replace(interrupted=f"after {done:,} of {table.cycles:,} cycles")
-        return told
+            return outcome._replace(interrupted=f"after {done:,} of {table.cycles:,} cycles")
+        return outcome
 
 
-def _told_run(scene: Scene, run: Run, table: SimulateTable) -> Outcome:
+def _describe_run(scene: Scene, run: Run, table: SimulateTable) -> Outcome:
     lines = [str(run)]
     if table.output is not None:
         columns = sample_columns(run.samples) if table.samples else cycle_columns(run)

@@ -153,7 +153,7 @@ class Run(eqx.Module):
     """Why the run ended: `RESULTS.successful`, or what went wrong."""
     steps: Int[Array, ""]
     """Steps tried, those included that were rejected or shortened to meet an impact (in single
-    precision no more than 2²⁴ are told)."""
+    precision no more than 2²⁴ are seen)."""
     rejected: Int[Array, ""]
     """Steps rejected on their error estimate."""
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._checks import interval
-from ..scene.leaves import check_again, check_leaf, leaf, with_leaf
+from ..scene.numbers import check_again, check_leaf, leaf, with_leaf
 from .curve import Step, check_walk, walk
 from .results import Orbit
 from .shooting import Shooting, steps_of

@@ -11,7 +11,7 @@ import numpy as np
 from .._checks import interval
 from .._lazy import lazy
 from ..flow.choice import MethodLike
-from ..scene.leaves import check_again, check_leaf, leaf, with_leaf
+from ..scene.numbers import check_again, check_leaf, leaf, with_leaf
 from .curve import Step, check_walk, walk
 from .follow import Follower
 from .results import ORBIT_RESULTS, Orbit, told_impacts

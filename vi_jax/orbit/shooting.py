@@ -27,7 +27,7 @@ from ..flow.choice import MethodLike, chosen
 from ..flow.events import guard_rates
 from ..flow.moving import in_modes
 from ..scene import AbstractScene
-from ..scene.leaves import with_leaf
+from ..scene.numbers import with_leaf
 from .floquet import multipliers_of
 
 Vector = Float[Array, " _"]

@@ -15,7 +15,7 @@ from ..flow.loop import run_forward
 from ..flow.moving import begin_modes, in_modes, struck_modes
 from ..flow.simulate import collect, planned
 from ..scene import Scene
-from ..scene.leaves import leaf, with_leaf
+from ..scene.numbers import leaf, with_leaf
 from .curve import Step, array_of, corrected, first_tangent
 from .results import ORBIT_RESULTS, Orbit
 from .shooting import Event, Shooting, carrier, jump, renews, steps_of

@@ -34,7 +34,7 @@ def _crank_phase(case: Case) -> Claim:
         off = np.abs(Y - np.roll(short, -size * i // _PHASES))
         apart[f"{2 * i / _PHASES:g}"] = off[2:4].max(axis=1).tolist()
         ends.append(float(Y[-2:].min()))
-    told = ", ".join(f"{x[0]:.2f}/{x[1]:.2f} at {name}π" for name, x in apart.items())
+    listed = ", ".join(f"{x[0]:.2f}/{x[1]:.2f} at {name}π" for name, x in apart.items())
     near = [max(x) < _NEAR for x in apart.values()]
     long = float(case.long.y_min[0])
     settled = all(abs(y - long) < 1e-2 for y in ends)
@@ -43,7 +43,7 @@ def _crank_phase(case: Case) -> Claim:
         "Fig. 3 a, conclusion",
         "From zero position and velocity the motion begins near the 2π motion; the crank's angle "
         "at the start is not given, and taken as φ(0) = 0.",
-        f"Greatest |Y - Y(2π)| in the third/fourth cycle by φ(0): {told}. The motion ends on the "
+        f"Greatest |Y - Y(2π)| in the third/fourth cycle by φ(0): {listed}. The motion ends on the "
         f"4π motion from {'all' if settled else 'not all'} of these, but is near the 2π motion "
         "before from some only.",
         (CONFIRMED if all(near) else PARTLY) if near[0] else CONTRADICTED,
@@ -88,7 +88,7 @@ def _motor(motors: Motors) -> Claim:
             "minima_cycles_3_4_from_rest": minima[2:4].tolist(),
             "last_minima_from_rest": sorted(minima[-2:].tolist()),
         }
-    told = "; ".join(
+    listed = "; ".join(
         f"T0 = {name} N·m, κ = {x['kappa']:.4f}: minimum {x['minimum']:.3f}, largest multiplier "
         f"{x['largest_multiplier']:.3f}, from rest {x['minima_cycles_3_4_from_rest'][0]:.2f} and "
         f"{x['minima_cycles_3_4_from_rest'][1]:.2f} in cycles 3 and 4, "
@@ -104,7 +104,7 @@ def _motor(motors: Motors) -> Claim:
         "Title, Eq. 7; Fig. 3, 4",
         "The motions are those of the system with non-ideal excitation; the figures are computed "
         "with an ideal one.",
-        f"Undamped, k = 0.50, κ tuned to a mean ζ of 0.90: {told}.",
+        f"Undamped, k = 0.50, κ tuned to a mean ζ of 0.90: {listed}.",
         CONFIRMED if same else CONTRADICTED,
         {"by_torque": numbers},
     )
@@ -112,13 +112,13 @@ def _motor(motors: Motors) -> Claim:
 
 def _even_speed(motors: Motors) -> Claim:
     variation = {f"{run.torque:g}": run.speed_variation for run in motors.runs}
-    told = ", ".join(f"{100 * x:.2f} % with T0 = {name}" for name, x in variation.items())
+    listed = ", ".join(f"{100 * x:.2f} % with T0 = {name}" for name, x in variation.items())
     return Claim(
         "the speed hardly varies within a cycle (Eq. 10)",
         "Eq. 10 to 12",
         "Ω = Ωa + ε f(φ), with a small ε whose terms are dropped.",
-        f"On the 4π motions tuned to ζ = 0.90 the crank's speed varies by {told} N·m of its mean, "
-        "from least to greatest. Their minima differ from the ideal drive's by as much as "
+        f"On the 4π motions tuned to ζ = 0.90 the crank's speed varies by {listed} N·m of its "
+        "mean, from least to greatest. Their minima differ from the ideal drive's by as much as "
         f"{max(abs(float(r.orbit.y_min) - float(motors.ideal_minimum)) for r in motors.runs):.3f}.",
         CONFIRMED if max(variation.values()) < 0.1 else CONTRADICTED,
         {"variation_by_torque": variation},

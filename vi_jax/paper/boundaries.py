@@ -264,8 +264,8 @@ def _draw(ax: Axes, curves: BoundaryCurves, plane: str, zoom: bool) -> None:
     ax.set_ylim(low, 1.0 if plane == "k" else high)
     ax.set_xlabel("frequency ratio ζ")
     ax.set_ylabel("restitution k" if plane == "k" else "damping c (N·s/m)")
-    told = "without damping" if plane == "k" else f"k = {RESTITUTION:g}"
-    ax.set_title(f"{told}, enlarged" if zoom else told, fontsize=11)
+    described = "without damping" if plane == "k" else f"k = {RESTITUTION:g}"
+    ax.set_title(f"{described}, enlarged" if zoom else described, fontsize=11)
     ax.grid(alpha=0.25, lw=0.5)
 
 

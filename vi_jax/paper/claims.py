@@ -64,13 +64,13 @@ def _first_cycles(cases) -> Claim:
     numbers = {
         case.name: [_gap(case, case.from_rest, i, i + 1, 1) for i in range(4)] for case in cases
     }
-    told = {name: ", ".join(f"{x:.2f}" for x in gaps) for name, gaps in numbers.items()}
+    listed = {name: ", ".join(f"{x:.2f}" for x in gaps) for name, gaps in numbers.items()}
     return Claim(
         "first 4π from rest follow the 2π motion",
         "Fig. 3 a",
         "In the first 4π simulation and analysis oscillate with period 2π.",
-        f"Greatest |Y - Y(2π)| in the first, second, third and fourth cycle: {told['undamped']} "
-        f"(damped {told['damped']}). The first cycle is a start-up without impact; the 2π motion "
+        f"Greatest |Y - Y(2π)| in the first, second, third and fourth cycle: {listed['undamped']} "
+        f"(damped {listed['damped']}). The first cycle is a start-up without impact; the 2π motion "
         "is neared, undamped not reached, in the cycles after it.",
         _verdict(max(numbers["undamped"][:2]) < 0.5),
         {"max_difference_cycles_1_to_4": numbers},
@@ -282,7 +282,7 @@ def _maximum(cases, panels: list[dict]) -> Claim:
         "simulation_damped": float(np.asarray(cases[1].from_rest.y_max)[-2:].max()),
     }
     worst = max(abs(y - stop) for y in top.values())
-    told = (
+    listed = (
         f"differ from the stop by at most {worst:.1g}" if worst else "are the stop to the last bit"
     )
     swept = [at for panel in panels for at in panel["sweeps"].values()]
@@ -298,7 +298,7 @@ def _maximum(cases, panels: list[dict]) -> Claim:
         "no discrepancy of the maximum",
         "Results, on Fig. 2",
         "Both are impact solutions, so the maximum is the stop for both.",
-        f"At ζ = 0.90 the maxima over the period {told}: simulations and closed forms, undamped "
+        f"At ζ = 0.90 the maxima over the period {listed}: simulations and closed forms, undamped "
         f"and damped.{figure_2}",
         _verdict(max(worst, wide) < 1e-9 and struck == values),
         {

@@ -125,7 +125,7 @@ def _no_load_speed() -> Fault:
             assert run.frequency_ratio is not None
             ratios.append(float(run.frequency_ratio[-20:].mean()))
         numbers[name] = dict(zip(map(str, kappas), ratios, strict=True))
-    told = {
+    listed = {
         name: ", ".join(f"{x:.4f}" for x in ratios.values()) for name, ratios in numbers.items()
     }
     return Fault(
@@ -133,9 +133,9 @@ def _no_load_speed() -> Fault:
         "Eq. 3, Table 1",
         "Ω0 is never given",
         "Ω0 = ω (w0 = 1), by default",
-        f"A strong motor (T0 = 100 N·m) at κ = 0.5, 0.9, 1.9 settles at ζ = {told['omega']} with "
+        f"A strong motor (T0 = 100 N·m) at κ = 0.5, 0.9, 1.9 settles at ζ = {listed['omega']} with "
         f"Ω0 = ω: the tabulated κ = 0.5…1.9 is then the range of ζ. With Ω0 = 2ω it is "
-        f"{told['2 omega']}.",
+        f"{listed['2 omega']}.",
         {"frequency_ratio_by_kappa": numbers},
     )
 

@@ -70,7 +70,7 @@ def _everywhere(panels: list[dict]) -> Claim:
 
 
 def _reason(panels: list[dict]) -> Claim:
-    numbers, told = {}, []
+    numbers, described = {}, []
     for panel in panels:
         for name, at in panel["sweeps"].items():
             one, four = (
@@ -78,13 +78,13 @@ def _reason(panels: list[dict]) -> Claim:
                 for fits in (lambda x: x == "4π, 1 impact", lambda x: x.startswith("4π"))
             )
             numbers[_named(panel, name)] = {"4pi_one_impact": one, "any_4pi": four}
-            told.append(f"{_named(panel, name)} {one:.0%} and {four:.0%}")
+            described.append(f"{_named(panel, name)} {one:.0%} and {four:.0%}")
     return Claim(
         "the reason is a motion of period 4π",
         "Results, conclusion",
         "Between BB' and CC' the numerical solution has the period 4π of the second analysis.",
         "Parts of the stretch on the 4π motion with one impact, which that analysis is about, and "
-        f"on any of period 4π: {'; '.join(told)}. The rest has other periods or none.",
+        f"on any of period 4π: {'; '.join(described)}. The rest has other periods or none.",
         PARTLY if any(x["4pi_one_impact"] for x in numbers.values()) else CONTRADICTED,
         numbers,
     )
@@ -100,7 +100,9 @@ def _wall(wall: float, panels: list[dict]) -> Claim:
         for panel in panels
         for name, at in panel["sweeps"].items()
     }
-    told = "; ".join(f"{name} {x['sweep_reaches']} of {x['values']}" for name, x in numbers.items())
+    described = "; ".join(
+        f"{name} {x['sweep_reaches']} of {x['values']}" for name, x in numbers.items()
+    )
     clear = all(x["analysis_clear"] == x["values"] for x in numbers.values())
     reach = [x["sweep_reaches"] for x in numbers.values()]
     return Claim(
@@ -109,7 +111,7 @@ def _wall(wall: float, panels: list[dict]) -> Claim:
         "The 2π analysis stays away from a further wall below, which the numerical motion reaches.",
         f"The wall's place is not given; it is taken as Y = {wall:g}. The 2π analysis is clear of "
         f"it {'everywhere' if clear else 'not everywhere'} between BB' and CC'; swept motions "
-        f"reach it at: {told}.",
+        f"reach it at: {described}.",
         (CONFIRMED if all(reach) else PARTLY) if clear and any(reach) else CONTRADICTED,
         {"wall": wall, "sweeps": numbers},
     )

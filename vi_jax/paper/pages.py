@@ -147,13 +147,13 @@ def _response(panels: dict[str, Any]) -> list[str]:
     explained = []
     for panel in panels["panels"]:
         for name, at in panel["sweeps"].items():
-            told = "; ".join(
+            described = "; ".join(
                 f"{m['from']:.3f}…{m['to']:.3f} {m['motion']}"
                 for m in at["motions"]
                 if m["values"] >= 4
             )
             k, xi = panel["restitution"], panel["damping_ratio"]
-            lines.append(f"| {k:g} | {xi:.4f} | {name} | {told} |")
+            lines.append(f"| {k:g} | {xi:.4f} | {name} | {described} |")
             one = sum(m["values"] for m in at["motions"] if m["motion"] == "4π, 1 impact")
             four = sum(m["values"] for m in at["motions"] if m["motion"].startswith("4π"))
             explained.append((k, xi, name, one / at["values"], four / at["values"]))

@@ -19,7 +19,7 @@ from ..orbit import (
 )
 from ..scan import Sweep, lyapunov, sweep
 from ..scene import RigidStop, Scene
-from ..scene.leaves import with_leaf
+from ..scene.numbers import with_leaf
 from .motions import GAP, table_damping_ratio
 
 RESTITUTIONS = (0.8, 0.5)

@@ -227,7 +227,7 @@ def _sorted_out(
     settled = np.flatnonzero(period > 0)
     if not settled.size:
         return label, []
-    # Lanes on one motion fall into few cells; what is told of one of them holds for all.
+    # Lanes on one motion fall into few cells; what is found for one of them holds for all.
     cells = np.floor(states[settled] / apart).astype(np.int64)
     cells = np.column_stack([period[settled].astype(np.int64), cells])
     _, first, inverse = np.unique(cells, axis=0, return_index=True, return_inverse=True)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
-from ..scene.leaves import leaf, leaf_names
+from ..scene.numbers import leaf, leaf_names
 from .grid import Blocks
 from .identity import Unverifiable, identity
 from .job import Job
@@ -21,22 +21,24 @@ from .store import UNVERIFIABLE
 def description_of(job: Job, blocks: Blocks) -> dict[str, Any]:
     """What makes two scans the same, in words and numbers that JSON can hold."""
 
-    def told(tree: Any) -> str:
+    def described(tree: Any) -> str:
         return _lasting(eqx.tree_pformat(tree, short_arrays=False, width=10**6))
 
     scene: dict[str, Any]
     if job.scene is not None:
-        scene = {name: _told(leaf(job.scene, name)) for name in leaf_names(job.scene)}
+        scene = {name: _described(leaf(job.scene, name)) for name in leaf_names(job.scene)}
         scene["structure"] = _lasting(str(jtu.tree_structure(job.scene)))
     else:  # a function is known by what it makes
         scene = {"made by": _lasting(getattr(job.build, "__qualname__", repr(job.build)))}
         for name, place in (("first", 0), ("last", -1)):
             made, _ = job.lane(_lane(blocks, place))
-            scene |= {f"{name} {leaf_}": _told(leaf(made, leaf_)) for leaf_ in leaf_names(made)}
+            scene |= {
+                f"{name} {leaf_}": _described(leaf(made, leaf_)) for leaf_ in leaf_names(made)
+            }
             scene[f"{name} structure"] = _lasting(str(jtu.tree_structure(made)))
     start: Any = "the scene's own"
     if job.start is not None:
-        start = {name: _told(leaf(job.start, name)) for name in leaf_names(job.start)}
+        start = {name: _described(leaf(job.start, name)) for name in leaf_names(job.start)}
     return {
         "scene": scene,
         "start": start,
@@ -50,8 +52,8 @@ def description_of(job: Job, blocks: Blocks) -> dict[str, Any]:
             }
             for name, x in blocks.axes.items()
         },
-        "measure": [told(m) for m in job.measures],
-        "method": told(job.method),
+        "measure": [described(m) for m in job.measures],
+        "method": described(job.method),
         "clock": job.clock,
         "settle": int(job.settle),
         "cycles": job.cycles,
@@ -88,7 +90,7 @@ def _codes(job: Job) -> dict[str, str]:
     return found
 
 
-def _told(x: Any) -> Any:
+def _described(x: Any) -> Any:
     return np.asarray(x, float).tolist()
 
 

@@ -1,4 +1,4 @@
-"""The grid of a scan, and the blocks in which it is worked off and stored."""
+"""The grid of a scan, and the blocks in which it is computed and stored."""
 
 import math
 import reprlib

@@ -19,7 +19,7 @@ from ..flow.choice import MethodLike, chosen
 from ..flow.results import number_of
 from ..flow.simulate import simulate_pool
 from ..scene import AbstractScene
-from ..scene.leaves import check_again, check_name, leaf, leaf_names, with_leaf
+from ..scene.numbers import check_again, check_name, leaf, leaf_names, with_leaf
 from .grid import Blocks
 from .measures import AbstractMeasure, Numbers, measures_of
 

@@ -184,7 +184,7 @@ class Exponent(AbstractMeasure):
 
 
 class Regime(AbstractMeasure):
-    """`period` in drive cycles and `impacts` in a period; what has none is told apart.
+    """`period` in drive cycles and `impacts` in a period; motions without a period by kind.
 
     A motion has the least period p ≤ `longest` after which its sections repeat within
     `tolerance` (relative to 1 + |state|; see `least_period` for one that still spirals in). One
@@ -234,7 +234,7 @@ class Regime(AbstractMeasure):
         return 2 if self.lasting else 1
 
     def __call__(self, scene, run):
-        """Of one lane; chaos is not yet told."""
+        """Of one lane; chaos is not yet looked for."""
         sections = {name: x[1:] for name, x in vars(run.sections).items()}
         period = least_period(sections, longest=self.longest, tolerance=self.tolerance)
         return {

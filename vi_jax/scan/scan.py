@@ -79,7 +79,7 @@ def scan(
 ) -> "xr.Dataset":
     """Simulate every combination of the axes' values and keep what is measured.
 
-    The grid is worked off in blocks of lanes, several at a time, all by one compiled program.
+    The grid is computed in blocks of lanes, several at a time, all by one compiled program.
     Inside a block a lane that has ended makes room for the next. Other numbers on the axes, in the
     scene or in `settle` compile nothing again.
 
@@ -112,7 +112,7 @@ def scan(
     - `lanes`: lanes in a block (a multiple of 256); memory grows with it and with `cycles`.
     - `workers`: blocks at work at the same time on a CPU, by default as many as it has cores.
     - `devices`: local devices over which a block is spread; all by default.
-    - `cluster`: a `dask.distributed.Client`, to work off the blocks there instead of here.
+    - `cluster`: a `dask.distributed.Client`, to compute the blocks there instead of here.
     - `progress`: show a bar with rate and time left (in a terminal or notebook).
 
     **Returns:** an `xarray.Dataset` over the axes, with units; `result` says of each lane how it

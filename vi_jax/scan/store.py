@@ -68,7 +68,7 @@ class ZarrStore:
     """A Zarr group on disk, one chunk for each block, with a check sum of each chunk.
 
     The check sums of a block are written last, so that it counts as done only if all its numbers
-    are there, and are those that were computed. What was lost since is told and computed again.
+    are there, and are those that were computed. What was lost since is named and computed again.
     """
 
     def __init__(

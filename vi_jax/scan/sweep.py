@@ -17,7 +17,7 @@ from ..flow.choice import MethodLike, chosen
 from ..flow.simulate import check_start
 from ..orbit.results import told_impacts
 from ..scene import AbstractScene
-from ..scene.leaves import check_again, check_leaf, with_leaf
+from ..scene.numbers import check_again, check_leaf, with_leaf
 from .regime import REGIMES, impacts_of, least_period
 
 # A jump is so many times the change at the values beside it, and this part of 1 + |number|.
@@ -56,7 +56,7 @@ class Sweep(eqx.Module):
     def __str__(self) -> str:
         if isinstance(self.values, Tracer) or self.values.ndim != 1:
             return repr(self)
-        values, told = np.asarray(self.values), []
+        values, lines = np.asarray(self.values), []
         kinds, jumps = self._kinds(), self._jumps()
         for i, value in enumerate(values):
             same = bool(i) and kinds[i] == kinds[i - 1]
@@ -65,10 +65,10 @@ class Sweep(eqx.Module):
             line = f"  {'still ' if same else ''}{kinds[i]} from {value:.6g}"
             if jumps[i]:
                 line += f", jump since {values[i - 1]:.6g}: {', '.join(jumps[i])}"
-            told.append(line)
-        if len(told) > 12:
-            told = [*told[:12], f"  {len(told) - 12} further changes"]
-        return "\n".join([f"Sweep of {self.parameter}, {values.size} values:", *told])
+            lines.append(line)
+        if len(lines) > 12:
+            lines = [*lines[:12], f"  {len(lines) - 12} further changes"]
+        return "\n".join([f"Sweep of {self.parameter}, {values.size} values:", *lines])
 
     def _kinds(self) -> list[str]:
         """The motion at each value in words: its period and its impacts."""
@@ -138,8 +138,7 @@ def sweep(
 
     **Raises:** `ValueError` or `TypeError` for an unknown name or values that are no numbers.
     """
-    told = "a `Scene` or an `AbstractScene`"
-    instance_of("scene", scene, AbstractScene, told)
+    instance_of("scene", scene, AbstractScene, "a `Scene` or an `AbstractScene`")
     check_leaf(scene, parameter)
     settle, cycles = count("settle", settle), count("cycles", cycles, least=2)
     values = number("values", values).astype(jnp.result_type(float))

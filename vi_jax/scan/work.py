@@ -1,4 +1,4 @@
-"""How the blocks of a scan are worked off: threads and devices here, or a Dask cluster."""
+"""how the blocks of a scan are computed: threads and devices here, or a Dask cluster."""
 
 import functools
 import math
