@@ -229,10 +229,8 @@ def located(
     from scipy.optimize import brentq  # slow to load
 
     # Where the test jumps, or has no value, the closest point to it has to do.
-    root = brentq(  # pyright: ignore[reportAssignmentType]
-        value, 0.0, length, xtol=1e-14, rtol=1e-14, maxiter=80, full_output=True, disp=False
-    )[0]
-    value(float(root))
+    options: Any = {"xtol": 1e-14, "rtol": 1e-14, "maxiter": 80}
+    value(float(brentq(value, 0.0, length, full_output=True, disp=False, **options)[0]))
     # Where branches cross the corrector has no answer; a point beside it will do.
     good = [step for step in at.values() if bool(step.good)]
     return min(good, key=lambda step: abs(test(step)), default=None)
