@@ -378,5 +378,5 @@ def _log(plan: Plan, entries: Any) -> ImpactLog:
     entries = jnp.moveaxis(entries, 2, 0).reshape(3, plan.cycles, plan.parts * plan.log)
     order = jnp.argsort(jnp.isnan(entries[2]), axis=1, stable=True)[:, : plan.log]
     phase, speed, stop = (jnp.take_along_axis(x, order, axis=1) for x in entries)
-    phase = plan.scene.told(phase)
+    phase = plan.scene.as_logged(phase)
     return ImpactLog(phase, speed, jnp.where(jnp.isnan(stop), -1.0, stop).astype(jnp.int32))

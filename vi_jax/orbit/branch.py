@@ -14,7 +14,7 @@ from ..flow.choice import MethodLike
 from ..scene.numbers import check_again, check_leaf, leaf, with_leaf
 from .curve import Step, check_walk, walk
 from .follow import Follower
-from .results import ORBIT_RESULTS, Orbit, told_impacts
+from .results import ORBIT_RESULTS, Orbit, impacts_in_words
 from .shooting import Shooting
 from .solve import advance, located, orbit_of, problem_of, tangent_at
 from .special import SpecialPoint
@@ -114,7 +114,8 @@ class Branch:
         period = self.problem.scene.period_of(self.cycles)
         lines = [
             f"Branch of {len(self.parameter)} motions of period {period} with "
-            f"{told_impacts(self.impact_speed.shape[1])}, {self.name} in [{low:.6g}, {high:.6g}], "
+            f"{impacts_in_words(self.impact_speed.shape[1])}, "
+            f"{self.name} in [{low:.6g}, {high:.6g}], "
             f"{int(self.stable.sum())} of them stable; ends: {self.ends[0]}, {self.ends[1]}",
             *(f"  {point}" for point in self.special),
         ]

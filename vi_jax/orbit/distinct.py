@@ -5,19 +5,21 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .._checks import given_number
-from .results import Orbit, told_impacts, trimmed
+from .results import Orbit, impacts_in_words, trimmed
 
 
 class Orbits(list[Orbit]):
     """Several periodic motions: a list that prints as a table, one motion a line."""
 
     def __str__(self) -> str:
-        return "\n".join([f"{len(self)} orbit{'' if len(self) == 1 else 's'}", *map(_told, self)])
+        return "\n".join(
+            [f"{len(self)} orbit{'' if len(self) == 1 else 's'}", *map(_in_words, self)]
+        )
 
     __repr__ = __str__
 
 
-def _told(orbit: Orbit) -> str:
+def _in_words(orbit: Orbit) -> str:
     """A motion in one line."""
     cycles = int(orbit.cycles)
     period = orbit.scene.period_of(cycles)
@@ -25,7 +27,7 @@ def _told(orbit: Orbit) -> str:
     where = ", ".join(f"{name} = {float(x):.6g}" for name, x in vars(orbit.state).items())
     span = f"Y in [{float(orbit.y_min):.6g}, {float(orbit.y_max):.6g}]"
     size = f"greatest multiplier {np.abs(orbit.multipliers).max():.6g}"
-    return f"  {period}, {told_impacts(int(orbit.impacts))}, {stable}: {where}; {span}; {size}"
+    return f"  {period}, {impacts_in_words(int(orbit.impacts))}, {stable}: {where}; {span}; {size}"
 
 
 def distinct_orbits(orbits: Orbit, *, tolerance: float = 1e-6) -> tuple[Orbits, np.ndarray]:

@@ -95,18 +95,25 @@ class Follower:
             at = self._where(here, new, room)
             if at is not None:
                 found.append((at, None))
+        if new.seen.order < 0 < here.seen.order:
+            at = self._where(here, new, lambda step: float(step.seen.order))
+            if at is not None:
+                detail = "a switch goes into another mode: the motion sticks or slips anew"
+                return self._point(GRAZING, at, detail)
         if not found:
             return None
         at, impact = min(found, key=lambda f: float(np.dot(here.tangent, f[0].x - here.x)))
         if impact is None:
-            told = f"touches a stop at {self._place(at, float(at.seen.touch))}"
+            touched = int(at.seen.touched) - len(self.problem.scene.stops)
+            what = "a stop" if touched < 0 else f"the guard of switch {touched}"
+            detail = f"touches {what} at {self._place(at, float(at.seen.touch))}"
         else:
             clock = float(np.asarray(self.problem.parts(jnp.asarray(at.x))[0])[impact])
             kind = self.problem.events[impact].kind
-            told = f"the {_NAMES[kind]} at {self._place(at, clock)} is lost"
+            detail = f"the {_NAMES[kind]} at {self._place(at, clock)} is lost"
             if kind == "section" and float(at.seen.y_max - at.seen.y_min) < _STILL:
                 return self._point(HOPF, at, "the motion shrinks to rest", impact)
-        return self._point(GRAZING, at, told, impact)
+        return self._point(GRAZING, at, detail, impact)
 
     def _place(self, at: Step, clock: float) -> str:
         """A reading of the clock of impacts, in words, within one period from the section on."""
@@ -128,8 +135,8 @@ class Follower:
                 found = self._changes(here, self.advance(here.x, here.tangent, _SHORT * length))
                 at = self._origin(at)
                 self.between[id(at)] = found
-                told = "the branch springs from a motion of half the period"
-                self.special.append(self._point(DOUBLING, at, told))
+                detail = "the branch springs from a motion of half the period"
+                self.special.append(self._point(DOUBLING, at, detail))
                 return at
         self.between[id(last)] = self._changes(here, last)
         return None
@@ -157,7 +164,7 @@ class Follower:
             if kind == CROSSING:
                 at = self._crossing(here, at)
             values = at.seen.multipliers
-            told = {
+            detail = {
                 FOLD: "a multiplier passes 1 and the branch turns back",
                 DOUBLING: "a multiplier passes -1",
                 CROSSING: "a multiplier passes 1 and another branch crosses",
@@ -170,12 +177,12 @@ class Follower:
                 TORUS: np.abs(np.abs(values[np.abs(values.imag) > 1e-9]) - 1).min(initial=np.inf),
             }[kind]
             if on_circle < 1e-5:  # or else a pole of the determinant, or a real pair μ, 1/μ
-                found.append((float(np.dot(here.tangent, at.x - here.x)), kind, at, told))
+                found.append((float(np.dot(here.tangent, at.x - here.x)), kind, at, detail))
         found.sort(key=lambda f: f[0])
-        for _, kind, at, told in found:
+        for _, kind, at, detail in found:
             if kind == CROSSING and self._symmetric(at):
-                kind, told = SYMMETRY, "a multiplier passes 1 and the motion loses its symmetry"
-            self.special.append(self._point(kind, at, told))
+                kind, detail = SYMMETRY, "a multiplier passes 1 and the motion loses its symmetry"
+            self.special.append(self._point(kind, at, detail))
         return [at for _, _, at, _ in found]
 
     def _crossing(self, here: Step, at: Step) -> Step:

@@ -16,7 +16,7 @@ from ..scene import AbstractScene
 from .floquet import STABILITY, stability_of
 
 
-def told_impacts(count: int) -> str:
+def impacts_in_words(count: int) -> str:
     """So many impacts, in words."""
     return f"{count} impact{'' if count == 1 else 's'}"
 
@@ -163,7 +163,7 @@ class Orbit(eqx.Module):
         where = ", ".join(f"{name} = {float(x):.9g}" for name, x in vars(self.state).items())
         period = self.scene.period_of(cycles)
         lines = [
-            f"Orbit of period {period} with {told_impacts(count)}, {STABILITY[self.stability]}",
+            f"Orbit of period {period} with {impacts_in_words(count)}, {STABILITY[self.stability]}",
             f"  section: {where}",
             f"  Y in [{float(self.y_min):.9g}, {float(self.y_max):.9g}]",
         ]

@@ -68,6 +68,10 @@ class Observed(NamedTuple):
     is greatest; negative where it is passed through."""
     touch: Float[Array, ""]
     """Clock of that turn."""
+    touched: Float[Array, ""]
+    """The stop there, or the switch, counted after the stops."""
+    order: Float[Array, ""]
+    """1 where each switch goes into the mode that is its next one here, else -1."""
     duration: Float[Array, ""]
 
 
@@ -275,19 +279,20 @@ class Shooting(eqx.Module):
                 return end, (time, path)
 
             carried, (time, path) = jax.jacfwd(end, has_aux=True)(self.after(scene, leg, s0, u))
-            approach = jnp.zeros((0,), x.dtype)
+            approach, order = jnp.zeros((0,), x.dtype), jnp.ones((), x.dtype)
             if self.events:
                 saltation, rises = self._saltation(scene, leg, s0, u)
                 carried, approach = carried @ saltation, rises[None]
-            return carried, time, approach, self._turns(scene, leg, s1, path)
+                order = self._each(leg, lambda event: partial(self._next, scene, event, leg), s0, u)
+            return carried, time, approach, order, self._turns(scene, leg, s1, path)
 
         legs = jnp.arange(len(states))
         ends = self.ends(clock, self.period(x))
-        carried, time, approach, turns = jax.vmap(follow)(legs, clock, ends, states)
+        carried, time, approach, order, turns = jax.vmap(follow)(legs, clock, ends, states)
         monodromy = jnp.eye(self.states, dtype=x.dtype)
         for leg in range(len(states)):
             monodromy = carried[leg] @ monodromy
-        low, high, room, touch = turns
+        low, high, room, touch, touched = turns
         Y = jax.vmap(lambda u: scene.position(self.unravel(u)))(states)
         nearest = jnp.argmin(room)
         return Observed(
@@ -298,6 +303,8 @@ class Shooting(eqx.Module):
             y_max=jnp.maximum(jnp.max(Y), jnp.max(high)),
             clearance=room[nearest],
             touch=touch[nearest],
+            touched=touched[nearest],
+            order=jnp.min(order),
             duration=jnp.sum(time),
         )
 
@@ -351,6 +358,15 @@ class Shooting(eqx.Module):
             return stop.approach(scene.coordinates[stop.coordinate].velocity(self.unravel(u)))
         return rate
 
+    def _next(self, scene, event: Event, leg, s, u):
+        """Whether a switch goes into the mode of the flight that begins with its event."""
+        one = jnp.ones_like(s)
+        if event.kind != "switch":
+            return one
+        j, before = event.number, self._mode_before(leg, event, s)
+        mode = scene.switches[j].after(scene, s, self.unravel(u), before)[1]
+        return jnp.where(mode == jnp.asarray([x[j] for x in self.modes], s.dtype)[leg], one, -one)
+
     def state_at(self, x: Vector, leg: Any, s: Array) -> Any:
         """The state at clock `s`, which lies in leg number `leg`."""
         scene = self.at(x)
@@ -359,7 +375,8 @@ class Shooting(eqx.Module):
         return self.unravel(self.flight(scene, leg, clock[leg], s, u)[0])
 
     def _turns(self, scene, leg, s1, path):
-        """Least and greatest Y at the turning points of a leg; the smallest room at one, and where.
+        """Least and greatest Y at the turning points of a leg; the smallest room at one, where it
+        is, and to what.
 
         Where the velocity changes sign within a step, Newton's method from the step's start.
         """
@@ -427,11 +444,13 @@ class Shooting(eqx.Module):
             turns, height, place, v0 = found(guard, rise)
             rooms.append((jnp.where(turns & (v0 > 0), -height, jnp.inf), place))
         room, touch = jnp.full((), jnp.inf, h.dtype), jnp.zeros((), h.dtype)
-        for values, place in rooms:
+        touched = touch
+        for i, (values, place) in enumerate(rooms):
             nearest = jnp.argmin(values)
             touch = jnp.where(values[nearest] < room, place[nearest], touch)
+            touched = jnp.where(values[nearest] < room, float(i), touched)
             room = jnp.minimum(room, values[nearest])
-        return low, high, room, touch
+        return low, high, room, touch, touched
 
 
 def renews(scene: AbstractScene) -> bool:

@@ -1,14 +1,12 @@
 """Special points of a branch, and the branches that begin there."""
 
 import dataclasses
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from .._checks import given_number
-from ..scene import AbstractScene
 from .curve import Step
 from .results import Orbit
 from .shooting import Event, Shooting
@@ -124,7 +122,6 @@ def _beyond_grazing(point: SpecialPoint, distance: float) -> Orbit:
             "find the motion beyond it with `find_orbit`."
         )
     x = jnp.asarray(step.x)
-    scene = old.at(x)
     clock, states = (np.asarray(a) for a in old.parts(x))
     events, value = list(old.events), np.asarray(step.x)[-1:]
     period = float(old.period(x))
@@ -139,8 +136,7 @@ def _beyond_grazing(point: SpecialPoint, distance: float) -> Orbit:
         touch = float(step.seen.touch)
         leg = max(0, int(np.searchsorted(clock, touch, side="right")) - 1) if events else 0
         there = state_at(old, x, jnp.asarray(leg), jnp.asarray(touch))
-        hit = min(range(len(scene.stops)), key=lambda i: abs(_room(scene, i, there)))
-        u, hit = np.asarray(ravel_pytree(there)[0])[None], Event("stop", hit)
+        u, hit = np.asarray(ravel_pytree(there)[0])[None], Event("stop", int(step.seen.touched))
         if not events:
             clock, states, events = np.array([touch]), u, [hit]
         else:
@@ -162,8 +158,3 @@ def _beyond_grazing(point: SpecialPoint, distance: float) -> Orbit:
         "Beyond this grazing there is no admissible motion with "
         f"{len(new.impacts)} impacts at distance {distance:g}."
     )
-
-
-def _room(scene: AbstractScene, i: int, state: Any) -> float:
-    stop = scene.stops[i]
-    return -float(stop.beyond(scene.coordinates[stop.coordinate].position(state)))

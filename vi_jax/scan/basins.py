@@ -15,7 +15,7 @@ from .._checks import count, fits_records, given_number
 from .._lazy import lazy
 from ..flow import simulate
 from ..flow.choice import MethodLike, chosen
-from ..orbit.results import told_impacts
+from ..orbit.results import impacts_in_words
 from ..scene import AbstractScene
 from .grid import axes_of
 from .job import START
@@ -69,7 +69,8 @@ class Basins(NamedTuple):
         for a in self.attractors:
             where = ", ".join(f"{name} = {x[0]:.6g}" for name, x in a.sections.items())
             lines.append(
-                f"  {a.label}: period {2 * a.period}π, {told_impacts(round(a.impacts))}, {where}: "
+                f"  {a.label}: period {2 * a.period}π, "
+                f"{impacts_in_words(round(a.impacts))}, {where}: "
                 f"{100 * a.fraction:.2f} ± {100 * a.error:.2f} %"
             )
         lines += [f"  {name}: {100 * x:.2f} %" for name, x in self.irregular.items() if x]

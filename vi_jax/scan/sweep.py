@@ -15,7 +15,7 @@ from .._programs import compiled
 from ..flow import RESULTS, simulate
 from ..flow.choice import MethodLike, chosen
 from ..flow.simulate import check_start
-from ..orbit.results import told_impacts
+from ..orbit.results import impacts_in_words
 from ..scene import AbstractScene
 from ..scene.numbers import check_again, check_leaf, with_leaf
 from .regime import REGIMES, impacts_of, least_period
@@ -77,7 +77,7 @@ class Sweep(eqx.Module):
             REGIMES.failed: REGIMES.failed.meaning,
         }
         return [
-            names.get(int(p)) or f"{2 * int(p)}π with {told_impacts(round(float(n)))}"
+            names.get(int(p)) or f"{2 * int(p)}π with {impacts_in_words(round(float(n)))}"
             for p, n in zip(np.asarray(self.period), np.asarray(self.impacts), strict=True)
         ]
 

@@ -164,7 +164,7 @@ class AbstractScene(eqx.Module):
         """What an impact log counts in one cycle."""
         return self.cycle
 
-    def told(self, clock: Float[Array, "..."]) -> Float[Array, "..."]:
+    def as_logged(self, clock: Float[Array, "..."]) -> Float[Array, "..."]:
         """A reading of what counts the cycles, as the impact log tells it; by default itself."""
         return clock
 

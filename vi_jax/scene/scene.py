@@ -275,7 +275,7 @@ class Scene(AbstractScene):
         """The crank angle, where time is the independent variable of a motor scene."""
         return state.phase if isinstance(state, TimedMotorState) else None
 
-    def told(self, clock: Float[Array, "..."]) -> Float[Array, "..."]:
+    def as_logged(self, clock: Float[Array, "..."]) -> Float[Array, "..."]:
         """The crank angle since the section, where time counts the cycles of an ideal drive."""
         if isinstance(self.drive, IdealDrive) and self.clock_name == "time":
             return self.drive.frequency_ratio * clock
