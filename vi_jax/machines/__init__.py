@@ -6,3 +6,5 @@ from .duffing import Duffing as Duffing
 from .impact_pair import FreePairState as FreePairState
 from .impact_pair import ImpactPair as ImpactPair
 from .impact_pair import PairState as PairState
+from .relief_valve import ReliefValve as ReliefValve
+from .relief_valve import ValveState as ValveState

@@ -1,10 +1,22 @@
 """What the machines of this room share."""
 
+import dataclasses
 from math import pi
 from typing import Any, ClassVar
 
-from .._checks import require_ranges
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._checks import number, require, require_ranges
 from ..scene import AbstractScene
+
+Scalar = Float[Array, ""]
+
+
+def optional(name: str) -> Any:
+    """What makes a number of an argument that may be left out."""
+    return lambda x: x if x is None else number(name, x)
 
 
 class PhaseMachine(AbstractScene):
@@ -20,3 +32,47 @@ class PhaseMachine(AbstractScene):
     def cycle(self) -> float:
         """2π."""
         return 2 * pi
+
+
+class AutonomousMachine(AbstractScene):
+    """A machine without a drive, whose independent variable is time, and whose numbers are in their
+    `ranges`. A cycle ends where `event` rises through zero; if `interval` is given (positive), at
+    equal times instead."""
+
+    interval: Scalar | None = eqx.field(kw_only=True, default=None, converter=optional("interval"))
+    ranges: ClassVar[dict[str, Any]]
+
+    def __check_init__(self):
+        require_ranges(self)
+
+    def event(self, state: Any) -> Scalar:
+        """What rises through zero once in a cycle."""
+        raise NotImplementedError
+
+    @property
+    def usual(self) -> Scalar | float:
+        """About how long a cycle is: steps are sized by it."""
+        raise NotImplementedError
+
+    @property
+    def cycle(self) -> Scalar | float:
+        """The interval between observations, or the usual time from event to event."""
+        return self.usual if self.interval is None else self.interval
+
+    def section(self, state: Any) -> Scalar | None:
+        """The event, unless time ends the cycles."""
+        return self.event(state) if self.interval is None else None
+
+    def step_limit(self, s: Scalar, state: Any) -> Scalar | float:
+        """A fifth of the usual cycle, however rarely it is observed."""
+        if self.interval is None:
+            return self.usual / 5
+        return jnp.minimum(self.usual, self.interval) / 5
+
+    def observed_every(self, interval: Any) -> "AutonomousMachine":
+        """The same machine observed at equal intervals of time, positive.
+
+        **Raises:** `ValueError` for an interval that is not.
+        """
+        require("interval", number("interval", interval), low=0.0, open_low=True)
+        return dataclasses.replace(self, interval=interval)

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, number
 from ..scene import RigidStop
-from .base import PhaseMachine
+from .base import PhaseMachine, optional
 
 Scalar = Float[Array, ""]
 
@@ -33,10 +33,6 @@ class FreePairState(eqx.Module):
     """Place of the box (unit: a)."""
     box_speed: Scalar
     """Speed of the box (unit: a ω)."""
-
-
-def _optional(name: str) -> Any:
-    return lambda x: x if x is None else number(name, x)
 
 
 class ImpactPair(PhaseMachine):
@@ -69,7 +65,7 @@ class ImpactPair(PhaseMachine):
         kw_only=True, default=0.5, converter=lambda x: number("restitution", x)
     )
     mass_ratio: Scalar | None = eqx.field(
-        kw_only=True, default=None, converter=_optional("mass_ratio")
+        kw_only=True, default=None, converter=optional("mass_ratio")
     )
     damping_ratio: Scalar = eqx.field(
         kw_only=True, default=0.05, converter=lambda x: number("damping_ratio", x)

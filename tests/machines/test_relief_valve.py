@@ -1,0 +1,164 @@
+"""A machine whose cycles are counted by an event: the relief valve, beside SciPy."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+from scipy.integrate import solve_ivp
+
+VALVE = vi.machines.ReliefValve
+CLOSE = vi.Adaptive(rtol=1e-12)
+
+
+def flown(q, start, cycles):
+    """Sections, impacts and durations by SciPy's DOP853, the laws written out again; `None` for a
+    motion with impacts too weak to be told from rest."""
+
+    def rate(t, x):
+        return [x[1], x[2] - 1.25 * x[1] - x[0] - 10, 20 * (q - x[0] * np.sqrt(x[2]))]
+
+    def seat(t, x):
+        return -x[0]
+
+    def top(t, x):
+        return -x[1]
+
+    def bottom(t, x):
+        return x[1]
+
+    for event in (seat, top, bottom):
+        event.terminal, event.direction = True, 1
+    x, sections, impacts, durations = np.array(start, float), [], [0], [0.0]
+    while len(sections) < cycles:
+        # A top can only come while it rises; falling, it comes to the seat or to its lowest point.
+        x[1] = -1e-15 if x[1] == 0 else x[1]
+        falls = x[1] < 0
+        found = solve_ivp(
+            rate, (0, 50), x, method="DOP853", rtol=1e-13, atol=1e-13,
+            events=[seat, bottom if falls else top],
+        )  # fmt: skip
+        durations[-1] += found.t[-1]
+        x = found.y[:, -1].copy()
+        if found.t_events[0].size:
+            if -x[1] < 1e-4:
+                return None
+            x[0], x[1] = 0.0, -0.8 * x[1]
+            impacts[-1] += 1
+        elif falls:
+            x[1] = 1e-15
+        else:
+            x[1] = 0.0
+            sections.append(x.copy())
+            impacts.append(0)
+            durations.append(0.0)
+    return np.array(sections), np.array(impacts[:-1]), np.array(durations[:-1])
+
+
+def lanes(flow_rates, starts, cycles, **options):
+    def one(q, start):
+        valve = VALVE(flow_rate=q)
+        return vi.simulate(valve, valve.start(**start), cycles, **options)
+
+    return vi.jit(jax.vmap(one))(jnp.asarray(flow_rates), jax.tree.map(jnp.asarray, starts))
+
+
+def test_a_valve_beside_scipy():
+    draw, cycles = np.random.default_rng(3).uniform, 6
+    q = np.linspace(0.5, 8.0, 32)
+    starts = {"lift": draw(0.5, 4, 32), "speed": draw(-2, 2, 32), "pressure": draw(8, 14, 32)}
+    run = lanes(q, starts, cycles, method=CLOSE)
+    assert bool(run.successful.all())
+    compared = impacts = 0
+    for i in range(32):
+        wanted = flown(q[i], [x[i] for x in starts.values()], cycles)
+        if wanted is None:
+            continue
+        np.testing.assert_array_equal(run.impacts[i], wanted[1])
+        np.testing.assert_allclose(run.duration[i], wanted[2], atol=1e-8)
+        found = np.stack(jax.tree.leaves(run.sections), -1)[i, 1:]
+        np.testing.assert_allclose(found, wanted[0], atol=1e-8)
+        np.testing.assert_allclose(run.y_max[i, 1:], np.maximum(found[1:, 0], found[:-1, 0]))
+        np.testing.assert_array_equal(run.y_min[i][wanted[1] > 0], 0.0)
+        compared, impacts = compared + 1, impacts + wanted[1].sum()
+    assert compared >= 28 and impacts > 100
+
+
+@pytest.mark.parametrize(
+    "method", [vi.Adaptive(), vi.FixedStep(), vi.Taylor(rtol=1e-10)], ids="aft"
+)
+@pytest.mark.parametrize("record", ["motion", "sections"])
+def test_no_cycle_is_passed_by(method, record):
+    """Where the section is a turning point as well, one event must not hide the other."""
+    q = np.linspace(1.6, 5.4, 12)
+    start = {"lift": np.ones(12), "speed": np.zeros(12), "pressure": np.full(12, 12.0)}
+    run = lanes(q, start, 40, settle=60, method=method, record=record)
+    assert bool(run.successful.all())
+    # Here it is one impact in each cycle, and each cycle like the one before.
+    assert (run.impacts == 1).all()
+    np.testing.assert_allclose(run.sections.speed[:, 1:], 0, atol=1e-9)
+    if record == "motion":
+        np.testing.assert_allclose(np.ptp(run.duration, axis=1), 0, atol=1e-6)
+
+
+@pytest.mark.parametrize("steps", [6, 24, 48])
+def test_a_first_cycle_shorter_than_a_step(steps):
+    """From the lowest point, on the section too, up to a top close by."""
+    valve = VALVE(flow_rate=1.6)
+    for method in (vi.FixedStep(steps_per_cycle=steps), vi.Taylor(20, steps_per_cycle=steps)):
+        run = vi.simulate(valve, valve.start(lift=1.0, pressure=12.0), 2, method=method)
+        np.testing.assert_allclose(run.duration, [0.0559729, 1.5679299], atol=1e-2 / steps)
+
+
+def test_a_closed_valve_rests_on_its_seat():
+    """Pressed on until the pressure has risen to the spring's: δ = p0 + β q t."""
+    valve = VALVE(flow_rate=0.5).observed_every(0.05)
+    run = vi.simulate(valve, valve.start(lift=0.0, pressure=4.0), 20, method=CLOSE)
+    closed = np.asarray(run.sections.lift) == 0
+    np.testing.assert_array_equal(closed[:13], True)
+    assert not closed[13:].any()
+    np.testing.assert_allclose(run.sections.pressure[:13], 4 + 0.5 * np.arange(13), atol=1e-10)
+
+
+def test_a_valve_observed_at_equal_times():
+    valve = VALVE(flow_rate=5.0)
+    by_event = vi.simulate(valve, valve.start(), 4, method=CLOSE)
+    total = by_event.duration.sum()
+    by_time = vi.simulate(valve.observed_every(total), valve.start(), 1, samples=50, method=CLOSE)
+    for a, b in zip(*map(jax.tree.leaves, (by_event.last, by_time.last)), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-9)
+    assert int(by_time.impacts.sum()) == int(by_event.impacts.sum())
+    with pytest.raises(ValueError, match="`samples` must be 0"):
+        vi.simulate(valve, valve.start(), 4, samples=10)
+    with pytest.raises(ValueError, match="`interval`"):
+        valve.observed_every(0.0)
+    with pytest.raises(ValueError, match="driven"):
+        vi.machines.Duffing().observed_every(1.0)
+
+
+def test_derivatives_of_returns():
+    """Of state, count of returns being fixed: dt*/dq is in them."""
+
+    def last(q, **options):
+        valve = eqx.tree_at(lambda m: m.flow_rate, VALVE(), q)
+        run = vi.simulate(valve, valve.start(), 3, method="reference", **options)
+        return jnp.stack([run.last.lift, run.last.pressure, run.duration.sum()])
+
+    h, q = 1e-5, jnp.asarray(4.0)
+    slope = (last(q + h) - last(q - h)) / (2 * h)
+    forward = jax.jacfwd(last)(q)
+    np.testing.assert_allclose(forward, slope, rtol=1e-6, atol=1e-6)
+    backward = jax.jacrev(lambda q: last(q, adjoint="reverse", max_steps=1000))(q)
+    np.testing.assert_allclose(backward, forward, rtol=1e-9, atol=1e-9)
+
+
+def test_wrong_numbers_are_named():
+    with pytest.raises(ValueError, match="`flow_rate`"):
+        VALVE(flow_rate=0.0)
+    with pytest.raises(ValueError, match="`compressibility`"):
+        VALVE(compressibility=-1.0)
+    with pytest.raises(ValueError, match="positive pressure"):
+        vi.simulate(VALVE(), VALVE().start(pressure=0.0), 1)
+    run = vi.jit(lambda p: vi.simulate(VALVE(), VALVE().start(pressure=p), 1))(-1.0)
+    assert bool(run.result == vi.RESULTS.bad_start)

@@ -1,0 +1,123 @@
+"""A pressure relief valve that chatters on its seat, by itself."""
+
+from math import pi
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from .._checks import NOT_NEGATIVE, POSITIVE, SHARE, concrete, number
+from ..scene import RigidStop
+from .base import AutonomousMachine
+
+Scalar = Float[Array, ""]
+
+
+class ValveState(eqx.Module):
+    """The valve's body and the vessel under it; without units, as the numbers of `ReliefValve`."""
+
+    lift: Scalar
+    """Of the body from its seat."""
+    speed: Scalar
+    """Of the body, opening."""
+    pressure: Scalar
+    """In the vessel, above the ambient; positive."""
+
+
+class ReliefValve(AutonomousMachine):
+    """A vessel filled at a steady rate, and the valve that relieves it: a body on a spring that the
+    pressure lifts off its seat.
+
+        lift'' = pressure - κ lift' - (lift + δ),    pressure' = β (q - lift √pressure)
+
+    and impacts on the seat at lift = 0 (Hős and Champneys, Physica D 241, 2012). Nothing drives it:
+    a cycle ends where the lift is greatest (the speed falls through zero), and takes a time of its
+    own. Above q ≈ 8.2 (with the other numbers as they are by default) the open valve stands still,
+    and where it does there is no next cycle: observe it at equal times by `observed_every`.
+
+    **Arguments:** `flow_rate` q, positive; `damping` κ, `precompression` δ of the spring, both not
+    negative; `compressibility` β, positive; `restitution` r on the seat, in [0, 1]; `interval` of
+    time between observations, positive, for one that is not observed where its lift is greatest.
+    """
+
+    flow_rate: Scalar = eqx.field(
+        kw_only=True, default=3.0, converter=lambda x: number("flow_rate", x)
+    )
+    damping: Scalar = eqx.field(
+        kw_only=True, default=1.25, converter=lambda x: number("damping", x)
+    )
+    precompression: Scalar = eqx.field(
+        kw_only=True, default=10.0, converter=lambda x: number("precompression", x)
+    )
+    compressibility: Scalar = eqx.field(
+        kw_only=True, default=20.0, converter=lambda x: number("compressibility", x)
+    )
+    restitution: Scalar = eqx.field(
+        kw_only=True, default=0.8, converter=lambda x: number("restitution", x)
+    )
+    ranges: ClassVar[dict[str, Any]] = {
+        "flow_rate": POSITIVE, "damping": NOT_NEGATIVE, "precompression": NOT_NEGATIVE,
+        "compressibility": POSITIVE, "restitution": SHARE, "interval": POSITIVE,
+    }  # fmt: skip
+
+    @property
+    def stops(self) -> tuple[RigidStop, ...]:  # pyright: ignore
+        """The seat, below the body."""
+        return (RigidStop(0.0, self.restitution, "left"),)
+
+    @property
+    def labels(self) -> tuple[str, str]:
+        """Of pictures."""
+        return "lift", "speed of opening"
+
+    @property
+    def usual(self) -> float:
+        """π/2: cycles take between 0.5 and 3 units of time."""
+        return pi / 2
+
+    def field(self, s: Scalar, state: ValveState) -> ValveState:
+        """By time."""
+        spring = state.lift + self.precompression
+        force = state.pressure - self.damping * state.speed - spring
+        leaves = state.lift * jnp.sqrt(state.pressure)
+        return ValveState(state.speed, force, self.compressibility * (self.flow_rate - leaves))
+
+    def event(self, state: ValveState) -> Scalar:
+        """The speed of closing."""
+        return -state.speed
+
+    def relaxation(self, s: Scalar, state: ValveState) -> Scalar:
+        """Of the motion, or of the pressure under an open valve."""
+        drains = self.compressibility * jnp.abs(state.lift) / (2 * jnp.sqrt(state.pressure))
+        return 1 / jnp.maximum(jnp.maximum(self.damping, drains), 1e-6)
+
+    def start(self, *, lift: Any = 1.0, speed: Any = 0.0, pressure: Any = 12.0) -> ValveState:
+        """An open valve by default, its lift about to fall."""
+        return ValveState(
+            number("lift", lift), number("speed", speed), number("pressure", pressure)
+        )
+
+    def in_range(self, start: ValveState) -> Bool[Array, ""]:
+        """As its numbers say, and with a positive pressure."""
+        return super().in_range(start) & (start.pressure > 0)
+
+    def check_start(self, start: ValveState) -> None:
+        """**Raises:** `ValueError` if the pressure is not positive."""
+        pressure = concrete(start.pressure)
+        if pressure is not None and not (pressure > 0).all():
+            raise ValueError(
+                f"Argument `start` must have a positive pressure, but has {pressure.min():g}."
+            )
+
+    def position(self, state: ValveState) -> Scalar:
+        """The lift."""
+        return state.lift
+
+    def velocity(self, state: ValveState) -> Scalar:
+        """The speed of opening."""
+        return state.speed
+
+    def placed(self, state: ValveState, Y: Scalar, V: Scalar) -> ValveState:
+        """The body at this lift with this speed, the pressure as it was."""
+        return ValveState(Y, V, state.pressure)
