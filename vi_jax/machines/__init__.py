@@ -2,6 +2,8 @@
 
 from .bouncing_ball import BallState as BallState
 from .bouncing_ball import BouncingBall as BouncingBall
+from .capsule import Capsule as Capsule
+from .capsule import CapsuleState as CapsuleState
 from .duffing import Duffing as Duffing
 from .impact_pair import FreePairState as FreePairState
 from .impact_pair import ImpactPair as ImpactPair

@@ -1,0 +1,175 @@
+"""A capsule that drives itself along the ground: dry friction, sticking, impacts and drift."""
+
+from math import pi
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Range, number
+from ..scene import Coordinate, DryFriction, RigidStop
+from .base import PhaseMachine
+
+Scalar = Float[Array, ""]
+
+
+class CapsuleState(eqx.Module):
+    """The mass inside as seen from the capsule, and the capsule as seen from the ground."""
+
+    place: Scalar
+    """Of the mass, from where its spring is relaxed (unit: F/k)."""
+    speed: Scalar
+    """Of the mass, relative to the capsule (unit: F/√(k m))."""
+    capsule_speed: Scalar
+    """Of the capsule on the ground (unit: F/√(k m))."""
+    travel: Scalar
+    """Of the capsule since the cycle began (unit: F/k)."""
+    progress: Scalar
+    """Of the capsule in the cycle before (unit: F/k)."""
+
+
+class Capsule(PhaseMachine):
+    """A mass m on a spring k in a capsule of mass M, driven against a rigid stop of the capsule,
+    which rubs on the ground and so moves along.
+
+    With lengths in F/k and times in √(m/k), where F is the unit of force (that of friction with
+    `friction=1`; Liu and Páez Chávez, Nonlinear Dynamics 88, 2017, where the stop is elastic):
+
+        x1'' = α cos ωt - p - 2 ξ p',   γ x2'' = p + 2 ξ p' - friction,   p = x1 - x2 ≤ δ
+
+    for the mass x1 and the capsule x2. At p = δ the relative speed is reversed and scaled by e and
+    the momentum of both is kept. The independent variable is ωt, a cycle 2π. How far the capsule
+    goes is told cycle by cycle, as `progress`; where it stands is the sum of it.
+
+    **Arguments:** `amplitude` α of the force on the mass, any number; `frequency` ω, positive;
+    `damping_ratio` ξ, not negative; `mass_ratio` γ = M/m, positive; `gap` δ, any number;
+    `restitution` e in [0, 1]; `friction` of the sliding capsule, not negative, and `static_ratio`,
+    how much more it can be while it sticks, at least 1.
+    """
+
+    amplitude: Scalar = eqx.field(
+        kw_only=True, default=1.6, converter=lambda x: number("amplitude", x)
+    )
+    frequency: Scalar = eqx.field(
+        kw_only=True, default=1.0, converter=lambda x: number("frequency", x)
+    )
+    damping_ratio: Scalar = eqx.field(
+        kw_only=True, default=0.05, converter=lambda x: number("damping_ratio", x)
+    )
+    mass_ratio: Scalar = eqx.field(
+        kw_only=True, default=5.0, converter=lambda x: number("mass_ratio", x)
+    )
+    gap: Scalar = eqx.field(kw_only=True, default=0.5, converter=lambda x: number("gap", x))
+    restitution: Scalar = eqx.field(
+        kw_only=True, default=0.6, converter=lambda x: number("restitution", x)
+    )
+    friction: Scalar = eqx.field(
+        kw_only=True, default=1.0, converter=lambda x: number("friction", x)
+    )
+    static_ratio: Scalar = eqx.field(
+        kw_only=True, default=1.0, converter=lambda x: number("static_ratio", x)
+    )
+    ranges: ClassVar[dict[str, Any]] = {
+        "amplitude": REAL, "frequency": POSITIVE, "damping_ratio": NOT_NEGATIVE,
+        "mass_ratio": POSITIVE, "gap": REAL, "restitution": SHARE, "friction": NOT_NEGATIVE,
+        "static_ratio": Range(1.0),
+    }  # fmt: skip
+
+    @property
+    def stops(self) -> tuple[RigidStop, ...]:  # pyright: ignore
+        """The stop in the capsule, on the right of the mass."""
+        return (RigidStop(self.gap, self.restitution),)
+
+    @property
+    def coordinates(self) -> tuple[Coordinate, ...]:
+        """The place of the mass; the mass that its impacts act on is the reduced one (unit: m)."""
+        reduced = self.mass_ratio / (1 + self.mass_ratio)
+        return (Coordinate(self.position, self.velocity, self.placed, reduced),)
+
+    @property
+    def switches(self) -> tuple[DryFriction, ...]:
+        """The ground under the capsule."""
+        return (
+            DryFriction(
+                self.friction,
+                static_ratio=self.static_ratio,
+                velocity=_speed_on_ground,
+                force=_force_on_capsule,
+                stopped=_stopped,
+            ),
+        )
+
+    @property
+    def labels(self) -> tuple[str, str]:
+        """Of pictures."""
+        return "place in the capsule (F/k)", "speed in the capsule (F/√(k m))"
+
+    @property
+    def period(self) -> Scalar:
+        """2π/ω."""
+        return 2 * pi / self.frequency
+
+    def pace(self, s: Scalar, state: Any) -> Scalar:
+        """dt/ds = 1/ω."""
+        return 1 / self.frequency
+
+    def step_limit(self, s: Scalar, state: Any) -> Scalar:
+        """A fifth of the shorter of the drive's cycle and the period of the mass on its spring."""
+        stiffness = jnp.sqrt(1 + 1 / self.mass_ratio)
+        return 0.4 * pi * jnp.minimum(1.0, self.frequency / stiffness)
+
+    def field(self, s: Scalar, state: CapsuleState, mode: Scalar) -> CapsuleState:
+        """By phase."""
+        (ground,) = self.switches
+        pull = self.pull(state)
+        rubs = ground.resistance(mode, _force_on_capsule(self, s, state))
+        capsule = (pull - rubs) / self.mass_ratio
+        relative = self.amplitude * jnp.cos(s) - pull - capsule
+        rates = state.speed, relative, capsule, state.capsule_speed
+        return CapsuleState(*(x / self.frequency for x in rates), jnp.zeros_like(s))
+
+    def pull(self, state: CapsuleState) -> Scalar:
+        """What spring and dashpot pull the capsule with (unit: F)."""
+        return state.place + 2 * self.damping_ratio * state.speed
+
+    def renewed(self, state: CapsuleState) -> CapsuleState:
+        """The travel of a cycle is its progress."""
+        x = state
+        return CapsuleState(x.place, x.speed, x.capsule_speed, jnp.zeros_like(x.travel), x.travel)
+
+    def start(self, *, place: Any = 0.0, speed: Any = 0.0, capsule_speed: Any = 0.0) -> Any:
+        """At rest, with the spring relaxed, by default."""
+        given = number("place", place), number("speed", speed)
+        capsule = number("capsule_speed", capsule_speed)
+        return CapsuleState(*given, capsule, jnp.zeros_like(capsule), jnp.zeros_like(capsule))
+
+    def position(self, state: CapsuleState) -> Scalar:
+        """The place of the mass in the capsule."""
+        return state.place
+
+    def velocity(self, state: CapsuleState) -> Scalar:
+        """The relative speed."""
+        return state.speed
+
+    def placed(self, state: CapsuleState, Y: Scalar, V: Scalar) -> CapsuleState:
+        """The mass at this place with this relative speed; what the capsule gains or loses by it
+        keeps the momentum of both."""
+        gained = (state.speed - V) / (1 + self.mass_ratio)
+        return CapsuleState(Y, V, state.capsule_speed + gained, state.travel, state.progress)
+
+
+def _speed_on_ground(machine: Capsule, state: CapsuleState) -> Scalar:
+    return state.capsule_speed
+
+
+def _force_on_capsule(machine: Capsule, s: Scalar, state: CapsuleState) -> Scalar:
+    """Of the spring; and of a mass that rests on the stop and is pressed on, so that what acts on
+    the mass acts on the capsule."""
+    pull = machine.pull(state)
+    rests = (state.place >= machine.gap) & (state.speed == 0)
+    return jnp.where(rests, jnp.maximum(pull, machine.amplitude * jnp.cos(s)), pull)
+
+
+def _stopped(machine: Capsule, state: CapsuleState) -> CapsuleState:
+    return eqx.tree_at(lambda x: x.capsule_speed, state, jnp.zeros_like(state.capsule_speed))
