@@ -234,10 +234,13 @@ def _section(
     begin = rates(free.field, section, lane.s, lane.state)
     end = rates(free.field, section, s1, new)
     scale = 1 + stop_gradient(jnp.abs(end.v))
-    # From the section it rises: it ends the next cycle only once it has been below.
+    # From the section it rises: it ends the next cycle only once it has been below, where one that
+    # is started on the section and falls already is.
     assert lane.below is not None
     rounding = 1e4 * float(jnp.finfo(end.x.dtype).eps) * scale
-    armed = (lane.below > 0) | (stop_gradient(begin.x) < -rounding)
+    here = stop_gradient(begin)
+    falls = (here.x <= rounding) & (here.v < 0)
+    armed = (lane.below > 0) | (here.x < -rounding) | falls
     below = jnp.where(armed | (stop_gradient(end.x) < -rounding), 1.0, lane.below)
     begin, end = (
         Rates(jnp.where(armed, r.x, -1.0), *(jnp.where(armed, x, 0.0) for x in (r.v, r.a)))
