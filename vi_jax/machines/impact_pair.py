@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, number
-from ..scene import RigidStop
+from ..scene import Coordinate, RigidStop
 from .base import PhaseMachine, optional
 
 Scalar = Float[Array, ""]
@@ -83,6 +83,15 @@ class ImpactPair(PhaseMachine):
     def stops(self) -> tuple[RigidStop, ...]:  # pyright: ignore
         """Both walls, the right one first."""
         return tuple(RigidStop(self.half_gap, self.restitution, side) for side in ("right", "left"))
+
+    @property
+    def coordinates(self) -> tuple[Coordinate, ...]:
+        """The place of the ball. Its impacts act on its mass, per unit of which energy is then
+        counted; in a box that is free on the reduced mass, in units of the box's."""
+        if self.mass_ratio is None:
+            return super().coordinates
+        reduced = self.mass_ratio / (1 + self.mass_ratio)
+        return (Coordinate(self.position, self.velocity, self.placed, reduced),)
 
     @property
     def labels(self) -> tuple[str, str]:
