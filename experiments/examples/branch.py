@@ -1,0 +1,39 @@
+# %% [markdown]
+"""# Follow a motion and switch where it bifurcates
+
+The 2π motion is followed in the frequency ratio ζ, through folds and instability. Where it doubles
+its period a 4π motion with two impacts is born; where that loses an impact, the paper's 4π motion
+with one impact goes on. All special points are located to rounding.
+"""
+
+# %%
+import jax
+
+jax.config.update("jax_enable_x64", True)
+import matplotlib.pyplot as plt
+import vi_jax as vi
+
+scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.0)
+
+
+# %%
+def follow(orbit):
+    branch = vi.continue_orbit(orbit, parameter="drive.frequency_ratio", bounds=(0.6, 1.2))
+    print(branch)
+    return branch, {point.kind: point for point in branch.special}
+
+
+short, points = follow(vi.find_orbit(scene, scene.start(Y=1.9, V=-0.9)))
+two, points = follow(points["period-doubling"].switch())
+one, _ = follow(points["grazing"].switch())
+
+# %% Solid: stable; dashed: unstable; marks: special points
+figure, ax = plt.subplots(figsize=(8, 4), layout="constrained")
+looks = (short, "2π", "#d55e00"), (two, "4π, two impacts", "#009e73"), (one, "4π", "#0072b2")
+for branch, name, color in looks:
+    vi.plot_branch(branch, ax=ax, color=color)
+    ax.plot([], [], color=color, label=name)
+ax.set(xlim=(0.69, 1.1), ylim=(-4.2, -1.4), ylabel="lowest position, min Y (a)")
+ax.set_title("dashed: unstable; circles: grazings, square: fold, diamond: period doubling")
+ax.legend(frameon=False)
+vi.save_picture(figure, "branch.png")

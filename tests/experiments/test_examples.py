@@ -1,0 +1,42 @@
+"""The examples run, are short, and agree with their notebooks; their pictures are kept."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+from examples.__main__ import EXAMPLES, FIGURES, HERE, notebook
+from PIL import Image
+
+# The quickest of them; the others run with the slow tests.
+QUICK = {"paper_discrepancy", "own_machine"}
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
+def test_script_notebook_and_picture_are_kept(example):
+    text = example.read_text(encoding="utf-8")
+    assert text.startswith('# %% [markdown]\n"""# ')
+    assert len(text.splitlines()) <= 40
+    assert f'vi.save_picture(figure, "{example.stem}.png")' in text
+    book = example.with_suffix(".ipynb").read_text(encoding="utf-8")
+    assert book == notebook(example), "run `python experiments/examples --notebooks`"
+    picture = FIGURES / f"{example.stem}.png"
+    assert picture.stat().st_size < 100_000
+    assert Image.open(picture).size[0] >= 700
+
+
+@pytest.mark.parametrize(
+    "example",
+    [
+        pytest.param(path, id=path.stem, marks=[] if path.stem in QUICK else pytest.mark.slow)
+        for path in EXAMPLES
+    ],
+)
+def test_runs(example, tmp_path):
+    environment = {**os.environ, "PYTHONPATH": str(HERE.parents[1])}
+    done = subprocess.run(
+        [sys.executable, str(example)],
+        cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert (tmp_path / f"{example.stem}.png").exists()
