@@ -1,0 +1,84 @@
+"""The code of the README and of every page runs, its links resolve; public names are described."""
+
+import os
+import re
+import subprocess
+import sys
+from inspect import ismodule
+from pathlib import Path
+
+import pytest
+import vi_jax as vi
+
+ROOT = Path(__file__).parents[2]
+DOCS = sorted((ROOT / "docs").rglob("*.md"))
+PAGES = [ROOT / "README.md", *DOCS]
+LINKED = [*PAGES, ROOT / "CHANGELOG.md", *sorted((ROOT / "experiments").rglob("*.md"))]
+# The quickest pages; the others run with the slow tests.
+QUICK = {"README.md"}
+
+
+def name_of(page: Path) -> str:
+    return page.relative_to(ROOT).as_posix()
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    """The blocks of code in this language."""
+    return re.findall(rf"^```{language}\n(.*?)^```$", page.read_text("utf-8"), re.M | re.S)
+
+
+def cases(language: str):
+    """Pages that have such blocks."""
+    return [
+        pytest.param(
+            page, id=name_of(page), marks=[] if name_of(page) in QUICK else pytest.mark.slow
+        )
+        for page in PAGES
+        if blocks(page, language)
+    ]
+
+
+def run(folder: Path, *command: str) -> None:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "agg"}
+    done = subprocess.run(
+        [sys.executable, *command],
+        cwd=folder, env=environment, capture_output=True, text=True, timeout=600,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-2000:]
+
+
+@pytest.mark.parametrize("page", cases("python"))
+def test_code_runs(page, tmp_path):
+    """The blocks of a page one after the other, in one process."""
+    code = "\n".join(blocks(page, "python"))
+    (tmp_path / "page.py").write_text(code, encoding="utf-8")
+    run(tmp_path, "page.py")
+    for picture in re.findall(r'save_picture\(.*"(.*)"\)', code):
+        assert (tmp_path / picture).exists()
+
+
+@pytest.mark.parametrize("page", cases("toml"))
+def test_files_run(page, tmp_path):
+    """Each file by the verb that it has a table of."""
+    for text in blocks(page, "toml"):
+        (tmp_path / "page.toml").write_text(text, encoding="utf-8")
+        verb = next(x for x in ("scan", "sweep", "basins", "orbit", "simulate") if f"[{x}]" in text)
+        run(tmp_path, "-m", "vi_jax.cli", verb, "page.toml")
+        for name in re.findall(r'^(?:picture|output|store) = "(.*)"', text, re.M):
+            assert (tmp_path / name).exists()
+
+
+@pytest.mark.parametrize("page", LINKED, ids=name_of)
+def test_links_resolve(page):
+    text = re.sub(r"^```.*?^```$", "", page.read_text("utf-8"), flags=re.M | re.S)
+    for link in re.findall(r"\]\(([^)\s]+)\)", text):
+        if not link.startswith(("http://", "https://", "#", "mailto:")):
+            assert (page.parent / link.split("#")[0]).exists(), link
+
+
+def test_every_public_name_is_in_the_reference():
+    text = "".join(page.read_text("utf-8") for page in (ROOT / "docs" / "reference").glob("*.md"))
+    described = {path.split(".")[-1] for path in re.findall(r"^::: (\S+)$", text, re.M)}
+    for module in (vi, vi.machines):
+        public = {x for x in dir(module) if x[0] != "_" and not ismodule(getattr(module, x))}
+        assert public - {"TYPE_CHECKING"} <= described
