@@ -19,7 +19,7 @@ import vi_jax as vi
 scene = vi.Scene.ideal(frequency_ratio=3.2, restitution=0.9, gap=1.05, damping_ratio=0.004)
 scene = scene.at_section(pi)
 region = {"start.Y": (-3.5, 1.05), "start.V": (-4.0, 4.0)}
-found = vi.basins(scene, region, resolution=112, settle=1600, tolerance=1e-5, progress=False)
+found = vi.basins(scene, region, resolution=96, settle=1600, tolerance=1e-5, progress=False)
 print(found)
 
 # %%
