@@ -5,7 +5,7 @@ import subprocess
 import sys
 
 import pytest
-from examples.__main__ import EXAMPLES, FIGURES, HERE, notebook
+from examples.__main__ import EXAMPLES, FIGURES, HERE, cells, notebook
 from PIL import Image
 
 # The quickest of them; the others run with the slow tests.
@@ -23,6 +23,14 @@ def test_script_notebook_and_picture_are_kept(example):
     picture = FIGURES / f"{example.stem}.png"
     assert picture.stat().st_size < 100_000
     assert Image.open(picture).size[0] >= 700
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
+def test_the_gallery_shows_it(example):
+    gallery = (HERE.parents[1] / "docs" / "gallery.md").read_text(encoding="utf-8")
+    (_, told), *_ = cells(example.read_text(encoding="utf-8"))
+    assert f"#{told}\n\n" in gallery
+    assert f"(../experiments/figures/examples/{example.stem}.png)" in gallery
 
 
 @pytest.mark.parametrize(
