@@ -95,4 +95,5 @@ def __getattr__(name: str):
 def __dir__() -> list[str]:
     from . import plot
 
-    return sorted({*globals(), *(name for name in vars(plot) if name.startswith("plot_"))})
+    pictures = (name for name in vars(plot) if name.startswith("plot_"))
+    return sorted({*globals(), *pictures, "save_picture"})

@@ -275,7 +275,9 @@ def _impact(
     s, state, time, direction = arrival.s, arrival.state, arrival.time, arrival.direction[k]
     contact, rests, met = arrival.contact, arrival.rests, s
     approach = jnp.maximum(stop.approach(body.velocity(there)), 0.0)
-    rebound = stop.rebound(stop.sign * approach)
+    # A speed whose square is no number ends here: a body may die out on a stop.
+    least = 100 * float(jnp.finfo(s.dtype).tiny) ** 0.5
+    rebound = stop.rebound(stop.sign * jnp.where(approach > least, approach, 0.0))
     state = select(c.landed, body.placed(there, stop.place, rebound), state)
     direction = jnp.where(c.landed, -float(stop.sign), direction)
     hit = taken & c.landed

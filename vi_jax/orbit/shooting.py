@@ -393,7 +393,8 @@ class Shooting(eqx.Module):
             """Turning points of a function of (s, state) with this rate, or of its sign."""
 
             def turn(s, u, v0, v1):
-                turns = v0 * v1 < 0
+                # A turn may fall on the end of a step.
+                turns = (v0 * v1 < 0) | ((v1 == 0) & (v0 != 0))
 
                 def at(scene, s, u, length):
                     new, _ = self._step(scene, s, s + length, u, jnp.zeros_like(s))
