@@ -119,6 +119,14 @@ def test_scenes(here):
     assert [(s.side, float(s.restitution)) for s in scene.stops] == [("right", 0.6), ("left", 0.2)]
     assert isinstance(start, vi.TimedMotorState) and float(start.W) == 0.8
     assert isinstance(method, vi.FixedStep) and method.steps_per_cycle == 20
+    lagging = text.replace(
+        "slider_inertia = 0.05 }", "slider_inertia = 0.05, electrical_time = 0.2 }"
+    )
+    scene, start, _ = config.read(written(lagging + "[simulate]\ncycles = 1")).build()
+    assert isinstance(scene.drive, vi.DCMotor) and float(scene.drive.electrical_time) == 0.2
+    assert isinstance(start, vi.TimedDCMotorState) and float(start.M) == 0.0
+    switched_on = lagging.replace("Y = 0.25", "W = 0\nM = 0.125")
+    assert float(config.read(written(switched_on)).build()[1].M) == 0.125
     assert not config.read(written(IDEAL + "stops = []")).build()[0].stops
 
 
@@ -225,6 +233,10 @@ def test_what_cannot_be_read(here, text, sentence):
          "`inertia` in [machine] must be finite and in (0, inf), but got 0.0"),
         (IDEAL + "[start]\nW = 1", "`W` in [start] must be left out: an ideal drive turns at its "
          "frequency ratio, but got W=1.0"),
+        (IDEAL + "[start]\nM = 1", "`M` in [start] must be left out: only a `DCMotor` has a torque "
+         "of its own, but got M=1.0"),
+        ("[machine]\nelectrical_time = 0",
+         "`electrical_time` in [machine] must be finite and in (0, inf), but got 0.0"),
         (IDEAL + "[method]\nname = 'exact-flight'\nrtol = 1e-6",
          '`rtol` in [method] does not belong to name = "exact-flight"'),
         (IDEAL + "[method]\nname = 'adaptive'\nsolver = 'Dopri9'",

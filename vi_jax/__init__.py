@@ -57,6 +57,8 @@ from .scene import AbstractScene as AbstractScene
 from .scene import AbstractSwitch as AbstractSwitch
 from .scene import Coordinate as Coordinate
 from .scene import CosineCrank as CosineCrank
+from .scene import DCMotor as DCMotor
+from .scene import DCMotorState as DCMotorState
 from .scene import DryFriction as DryFriction
 from .scene import IdealDrive as IdealDrive
 from .scene import Motor as Motor
@@ -69,6 +71,7 @@ from .scene import Scene as Scene
 from .scene import SliderCrank as SliderCrank
 from .scene import SoftStop as SoftStop
 from .scene import Switch as Switch
+from .scene import TimedDCMotorState as TimedDCMotorState
 from .scene import TimedMotorState as TimedMotorState
 
 if TYPE_CHECKING:

@@ -1,12 +1,13 @@
 """Files for the command line: a scene, how it moves and what is asked of it, as TOML.
 
     [scene]                         # dimensionless; or [machine], the keys of `Parameters` in SI
-    frequency_ratio = 0.9           # drive = "motor" takes [scene.motor], the keys of `Motor`
+    frequency_ratio = 0.9           # drive = "motor" takes [scene.motor], the keys of `Motor`,
+                                    # or of `DCMotor` with its electrical_time
     restitution = 0.5
     gap = 2.0                       # or [[scene.stops]] with side, gap, restitution
     crank = "slider"                # with crank_ratio; "cosine" by default
 
-    [start]                         # Y, V and, for a motor, W; at rest if left out
+    [start]                         # Y, V and, for a motor, W (and M); at rest if left out
     [method]                        # name = "draft", "standard", "reference", or "exact-flight",
                                     # "adaptive", "fixed-step" with solver, rtol, …
     [axes]                          # for scan: rows of values, as lists or as below
@@ -25,7 +26,7 @@ from attrs import frozen
 
 from ..flow import AbstractMethod, Adaptive, ExactFlight, FixedStep
 from ..orbit import AbstractSearch, Gradient, Newton
-from ..scene import IdealDrive, Motor, Oscillator, Parameters, RigidStop, Scene, SliderCrank
+from ..scene import DCMotor, IdealDrive, Motor, Oscillator, Parameters, RigidStop, Scene, SliderCrank
 from .toml import ConfigError as ConfigError
 from .toml import Row, given, in_terms_of, read_toml, unknown
 
@@ -56,6 +57,7 @@ class MachineTable:
     torque: float | None = None
     control: float | None = None
     no_load_speed: float | None = None
+    electrical_time: float | None = None
 
     def build(self) -> Scene:
         """The dimensionless scene."""
@@ -75,13 +77,18 @@ class StopTable:
 
 @frozen(kw_only=True)
 class MotorTable:
-    """`[scene.motor]`: the numbers of `Motor`."""
+    """`[scene.motor]`: the numbers of `Motor`, or of `DCMotor` with `electrical_time`."""
 
     strength: float
     control: float
     coupling: float
     slider_inertia: float
     no_load_speed: float | None = None
+    electrical_time: float | None = None
+
+    def build(self) -> Motor:
+        """The drive."""
+        return (Motor if self.electrical_time is None else DCMotor)(**given(self))
 
 
 @frozen(kw_only=True)
@@ -108,7 +115,7 @@ class SceneTable:
             with in_terms_of(f"[[scene.stops]] number {i + 1}"):
                 stops.append(RigidStop(stop.gap, bounce, side=stop.side))
         with in_terms_of("[scene.motor]"):
-            turning = None if self.motor is None else Motor(**given(self.motor))
+            turning = None if self.motor is None else self.motor.build()
         with in_terms_of("[scene]"):
             if self.stops is None:
                 stops = [RigidStop(2.0 if self.gap is None else self.gap, self.restitution)]
@@ -138,6 +145,7 @@ class StartTable:
     Y: float = 0.0
     V: float = 0.0
     W: float | None = None
+    M: float | None = None
 
     def build(self, scene: Scene, place: str) -> Any:
         """The state, for this scene."""

@@ -14,7 +14,7 @@ from .._programs import compiled
 from ..flow import RESULTS, simulate
 from ..flow.choice import MethodLike, chosen
 from ..orbit.cycle_map import CycleMap, adopted, cycle_map
-from ..scene import AbstractScene, MotorState, TimedMotorState
+from ..scene import AbstractScene, Scene
 
 
 class Lyapunov(eqx.Module):
@@ -78,8 +78,8 @@ def lyapunov(
     **Raises:** as `simulate`.
     """
     cycles = count("cycles", cycles, least=8)
-    if isinstance(start, TimedMotorState):
-        start = MotorState(start.Y, start.V, start.W)
+    if isinstance(scene, Scene):
+        start = scene.by_phase(start)
     if scene.section(start) is not None:
         # On its section the exponent 0 along the motion could not be seen.
         scene = scene.observed_every(scene.cycle)

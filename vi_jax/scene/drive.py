@@ -3,6 +3,7 @@
 from typing import ClassVar
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, number, require_ranges
@@ -51,14 +52,68 @@ class Motor(eqx.Module):
     def __check_init__(self):
         require_ranges(self)
 
+    def rate(self) -> Float[Array, "..."]:
+        """The rate, by τ, at which the shaft comes back to speed."""
+        return self.strength / self.no_load_speed
+
+    def line(self, W: Float[Array, "..."]) -> Float[Array, "..."]:
+        """The straight line: the motor's steady torque at speed `W`, per J ω²."""
+        return self.strength * (self.control - W * (1 / self.no_load_speed))
+
     def torque(
-        self, slide: Slide, Y: Float[Array, "..."], W: Float[Array, "..."]
+        self,
+        slide: Slide,
+        Y: Float[Array, "..."],
+        W: Float[Array, "..."],
+        motor: Float[Array, "..."] | None = None,
     ) -> Float[Array, "..."]:
-        """What accelerates the shaft at slider position `slide` and speed `W`, per J ω²."""
-        motor = self.strength * (self.control - W * (1 / self.no_load_speed))
+        """What accelerates the shaft at slider position `slide` and speed `W`, per J ω².
+
+        `motor` is what the motor itself gives, by default its straight line.
+        """
+        motor = self.line(W) if motor is None else motor
         spring = self.coupling * slide.U_phi * (Y - slide.U)
         return motor + spring - self.slider_inertia * slide.U_phi * slide.U_phiphi * W * W
 
     def inertia(self, slide: Slide) -> Float[Array, "..."]:
         """Inertia that the shaft feels, per J."""
         return 1 + self.slider_inertia * slide.U_phi**2
+
+
+class DCMotor(Motor):
+    """A DC motor with the inductance of its armature, at a constant voltage.
+
+    With the armature's L i' + R i + K_e φ' = u and the torque K_t i (primes: d/dt), and the torque
+    M = K_t i/(J ω²) as one more component of the state, it has
+
+        τe dM/dτ = τ0 (κ - W/w0) - M
+
+    and `Motor`'s equation of the shaft with M in the line's place, where
+
+        τe = ω L/R,  κ τ0 = K_t u/(R J ω²),  κ w0 = u/(K_e ω).
+
+    Its steady torque is `Motor`'s line, which it approaches at first order in τe as τe → 0. In
+    units of J ω² (and J ω³) the source gives the power κ w0 M, the armature turns the power
+    M² w0/τ0 into heat and holds the energy τe M² w0/(2 τ0), and the shaft gets the power M W.
+
+    Explicit methods are kept to steps of about τe, so that a motor of small τe costs more the
+    smaller it is: below 0.05 use `Motor`, unless the current itself is asked for.
+    """
+
+    electrical_time: Float[Array, "..."] = eqx.field(
+        kw_only=True, converter=lambda x: number("electrical_time", x)
+    )
+    """τe = ω L/R, the electrical time constant (dimensionless), positive."""
+    ranges: ClassVar = {**Motor.ranges, "electrical_time": POSITIVE}
+
+    def build_up(self, W: Float[Array, "..."], M: Float[Array, "..."]) -> Float[Array, "..."]:
+        """dM/dτ at this speed and torque."""
+        return (self.line(W) - M) / self.electrical_time
+
+    def rate(self) -> Float[Array, "..."]:
+        """The fastest rate of shaft and armature together, by τ.
+
+        1/τe of the current, or where that is slow √(τ0/(w0 τe)), at which speed and current swing.
+        """
+        own = 1 / self.electrical_time
+        return jnp.maximum(own, jnp.sqrt(own * self.strength / self.no_load_speed))

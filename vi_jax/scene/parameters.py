@@ -21,7 +21,7 @@ from .._checks import (
     require_ranges,
 )
 from .crank import CosineCrank, SliderCrank
-from .drive import IdealDrive, Motor
+from .drive import DCMotor, IdealDrive, Motor
 from .scene import Oscillator, Scene
 from .stop import RigidStop
 
@@ -37,7 +37,8 @@ class Parameters(eqx.Module):
     """The machine in SI units; the defaults are Table 1 of the paper (T0 = 10 N·m, κ = 0.9).
 
     The dimensionless groups, with ω = √(k0/m_C): ξ = c/(2 m_C ω), d = Δ/a, μ = m_B a²/J,
-    ε = m_C a²/J, τ0 = T0/(J ω²), w0 = Ω0/ω, λ = a/l.
+    ε = m_C a²/J, τ0 = T0/(J ω²), w0 = Ω0/ω, λ = a/l, and with `electrical_time`
+    τe = ωL/R. A motor of the constants K_t and K_e at the voltage u has κT0 = K_t u/R, κΩ0 = u/K_e.
     """
 
     body_mass: Number = _si("body_mass", 0.35)
@@ -70,6 +71,13 @@ class Parameters(eqx.Module):
     """Ω0, no-load speed of the motor at κ = 1, rad/s. `None` means ω, which makes the tabulated
     κ = 0.5…1.9 the tabulated range of ζ; the paper does not give Ω0."""
 
+    electrical_time: Number | None = eqx.field(
+        default=None,
+        converter=lambda x: x if x is None else number("electrical_time", x),
+        kw_only=True,
+    )
+    """L/R, the armature's inductance over its resistance, s. `None` leaves the armature out."""
+
     ranges: ClassVar = {
         "body_mass": POSITIVE,
         "slider_mass": NOT_NEGATIVE,
@@ -83,6 +91,7 @@ class Parameters(eqx.Module):
         "torque": NOT_NEGATIVE,
         "control": REAL,
         "no_load_speed": POSITIVE,
+        "electrical_time": POSITIVE,
     }
 
     def __check_init__(self):
@@ -108,12 +117,15 @@ class Parameters(eqx.Module):
         else:
             per_inertia = self.crank_radius**2 / self.inertia
             free = 1.0 if self.no_load_speed is None else self.no_load_speed / omega
-            turning = Motor(
+            time = self.electrical_time
+            lag = {} if time is None else {"electrical_time": time * omega}
+            turning = (DCMotor if lag else Motor)(
                 strength=self.torque / (self.inertia * omega**2),
                 control=self.control,
                 coupling=self.body_mass * per_inertia,
                 slider_inertia=self.slider_mass * per_inertia,
                 no_load_speed=free,
+                **lag,
             )
         damping = self.damping / (2 * self.body_mass * omega)
         if any(isinstance(x, Tracer) for x in jtu.tree_leaves(self)):

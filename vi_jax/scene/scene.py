@@ -24,7 +24,7 @@ from .._checks import (
 )
 from .base import AbstractScene
 from .crank import AbstractCrank, CosineCrank
-from .drive import IdealDrive, Motor
+from .drive import DCMotor, IdealDrive, Motor
 from .soft import SoftStop
 from .stop import RigidStop
 
@@ -63,6 +63,39 @@ class TimedMotorState(eqx.Module):
     """Speed of the crank dφ/dτ (unit: ω)."""
     phase: Float[Array, "..."]
     """Crank angle since the last section (radians)."""
+
+
+class DCMotorState(eqx.Module):
+    """State of a scene with a `DCMotor` whose independent variable is the crank angle."""
+
+    Y: Float[Array, "..."]
+    """Position of the body (unit: a)."""
+    V: Float[Array, "..."]
+    """dY/dτ (unit: a ω)."""
+    W: Float[Array, "..."]
+    """Speed of the crank dφ/dτ (unit: ω)."""
+    M: Float[Array, "..."]
+    """Torque of the motor, which its armature current gives (unit: J ω²)."""
+
+
+class TimedDCMotorState(eqx.Module):
+    """State of a scene with a `DCMotor` whose independent variable is time."""
+
+    Y: Float[Array, "..."]
+    """Position of the body (unit: a)."""
+    V: Float[Array, "..."]
+    """dY/dτ (unit: a ω)."""
+    W: Float[Array, "..."]
+    """Speed of the crank dφ/dτ (unit: ω)."""
+    M: Float[Array, "..."]
+    """Torque of the motor, which its armature current gives (unit: J ω²)."""
+    phase: Float[Array, "..."]
+    """Crank angle since the last section (radians)."""
+
+
+# The states of motors, and what they are called where time is the independent variable.
+_TIMED = {MotorState: TimedMotorState, DCMotorState: TimedDCMotorState}
+_CLOCKED = tuple(_TIMED.values())
 
 
 class Oscillator(eqx.Module):
@@ -200,17 +233,24 @@ class Scene(AbstractScene):
         return since_section if self.section_phase is None else since_section + self.section_phase
 
     def start(
-        self, *, Y: Any = 0.0, V: Any = 0.0, W: Any = None
-    ) -> OscillatorState | MotorState | TimedMotorState:
-        """A state on the section: position (unit: a), velocity (a ω), crank speed (ω).
+        self, *, Y: Any = 0.0, V: Any = 0.0, W: Any = None, M: Any = None
+    ) -> OscillatorState | MotorState | TimedMotorState | DCMotorState | TimedDCMotorState:
+        """A state on the section: position (unit: a), velocity (a ω), crank speed (ω) and the
+        torque of a `DCMotor` (J ω²).
 
-        `W` belongs to motor scenes and defaults to the motor's no-load speed κ w0.
+        `W` belongs to motor scenes and defaults to the motor's no-load speed κ w0. `M` defaults to
+        the steady torque at that speed; a motor that is being switched on has `W=0, M=0`.
 
-        **Raises:** `ValueError` if a number is not finite or `W` is given to an ideal drive.
+        **Raises:** `ValueError` if a number is not finite, or is given to a drive that has none.
         """
         Y, V = number("Y", Y), number("V", V)
         require("Y", Y)
         require("V", V)
+        if M is not None and not isinstance(self.drive, DCMotor):
+            raise ValueError(
+                "Argument `M` must be left out: only a `DCMotor` has a torque of its own, but got "
+                f"M={M!r}."
+            )
         if isinstance(self.drive, IdealDrive):
             if W is not None:
                 raise ValueError(
@@ -220,24 +260,41 @@ class Scene(AbstractScene):
             return OscillatorState(Y, V)
         W = number("W", self.drive.control * self.drive.no_load_speed if W is None else W)
         require("W", W)
+        parts = [Y, V, W]
+        if isinstance(self.drive, DCMotor):
+            parts.append(number("M", self.drive.line(W) if M is None else M))
+            require("M", parts[-1])
+        kind = self._kind
         if self.clock_name == "phase":
-            return MotorState(Y, V, W)
-        return TimedMotorState(Y, V, W, jnp.zeros_like(W))
+            return kind(*parts)
+        return _TIMED[kind](*parts, jnp.zeros_like(W))
+
+    @property
+    def _kind(self) -> Any:
+        """Of the states in the phase clock."""
+        if isinstance(self.drive, IdealDrive):
+            return OscillatorState
+        return DCMotorState if isinstance(self.drive, DCMotor) else MotorState
 
     def adopt(self, start: Any) -> Any:
         """A start made for either clock, as this scene's clock needs it."""
-        if isinstance(self.drive, IdealDrive):
-            wanted = OscillatorState
-        else:
-            wanted = MotorState if self.clock_name == "phase" else TimedMotorState
-            if wanted is TimedMotorState and isinstance(start, MotorState):
-                return TimedMotorState(start.Y, start.V, start.W, jnp.zeros_like(start.W))
+        wanted = self._kind
+        if self.clock_name == "time" and wanted in _TIMED:
+            if isinstance(start, wanted):
+                return _TIMED[wanted](*vars(start).values(), jnp.zeros_like(start.W))
+            wanted = _TIMED[wanted]
         if not isinstance(start, wanted):
             raise TypeError(
                 f"Argument `start` must be a `{wanted.__name__}` for this scene (use "
                 f"`scene.start(...)`), but got a `{type(start).__name__}`."
             )
         return state_of_numbers("start", start)
+
+    def by_phase(self, start: Any) -> Any:
+        """A start made for the time clock without its crank angle; any other as it is."""
+        if isinstance(start, _CLOCKED):
+            return self._kind(*list(vars(start).values())[:-1])
+        return start
 
     @property
     def switches(self) -> tuple[SoftStop, ...]:
@@ -257,12 +314,15 @@ class Scene(AbstractScene):
         since = s if self.clock_name == "phase" else state.phase
         slide = self.crank.slide(self.phase_at(since))
         pull = self._pull(slide.U, state, modes)
-        torque = drive.torque(slide, state.Y, state.W)
+        own = isinstance(drive, DCMotor)
+        torque = drive.torque(slide, state.Y, state.W, state.M if own else None)
         inertia = drive.inertia(slide)
+        more = (drive.build_up(state.W, state.M),) if own else ()
         if self.clock_name == "time":
-            return TimedMotorState(state.V, pull, torque / inertia, state.W)
+            return type(state)(state.V, pull, torque / inertia, *more, state.W)
         pace = 1 / state.W
-        return MotorState(pace * state.V, pace * pull, pace * torque / inertia)
+        more = [pace * x for x in more]
+        return type(state)(pace * state.V, pace * pull, pace * torque / inertia, *more)
 
     def _pull(self, U, state, modes):
         """d²Y/dτ²."""
@@ -273,7 +333,7 @@ class Scene(AbstractScene):
 
     def clock(self, state: Any) -> Float[Array, ""] | None:
         """The crank angle, where time is the independent variable of a motor scene."""
-        return state.phase if isinstance(state, TimedMotorState) else None
+        return state.phase if isinstance(state, _CLOCKED) else None
 
     def as_logged(self, clock: Float[Array, "..."]) -> Float[Array, "..."]:
         """The crank angle since the section, where time counts the cycles of an ideal drive."""
@@ -287,7 +347,7 @@ class Scene(AbstractScene):
 
     def pace(self, s: Float[Array, ""], state: Any) -> Float[Array, ""] | None:
         """dτ/dφ = 1/W in the phase clock of a motor."""
-        return 1 / state.W if isinstance(state, MotorState) else None
+        return 1 / state.W if isinstance(state, tuple(_TIMED)) else None
 
     def frequency_ratio(self, duration: Float[Array, "..."]) -> Float[Array, "..."]:
         """ζ: mean crank speed over cycles of these durations (unit: ω)."""
@@ -304,10 +364,11 @@ class Scene(AbstractScene):
         return turn * speed if self.clock_name == "phase" else turn
 
     def relaxation(self, s: Float[Array, ""], state: Any) -> Float[Array, ""]:
-        """1/2ξ of a strongly damped body, or the time w0/τ0 in which a motor is back at speed."""
+        """1/2ξ of a strongly damped body, or what the motor says: the time w0/τ0 in which it is
+        back at speed, or in which the current of a `DCMotor` settles."""
         rate = 2 * self.damping_ratio
         if isinstance(self.drive, Motor):
-            rate = jnp.maximum(rate, self.drive.strength / self.drive.no_load_speed)
+            rate = jnp.maximum(rate, self.drive.rate())
         pace = self._speed(state) if self.clock_name == "phase" else 1.0
         return pace / jnp.maximum(rate, 1e-6)
 
@@ -326,24 +387,24 @@ class Scene(AbstractScene):
         good = in_range(self)
         if len(self.stops) == 2:
             good = good & (_room(self.stops) > 0)
-        if isinstance(start, TimedMotorState):
+        if isinstance(start, _CLOCKED):
             good = good & (start.phase < 2 * pi)
         return good
 
     def alive(self, state: Any) -> jax.Array | None:
         """In the phase clock of a motor the crank must turn forward."""
-        return state.W > 0 if isinstance(state, MotorState) else None
+        return state.W > 0 if isinstance(state, tuple(_TIMED)) else None
 
     def check_start(self, start: Any) -> None:
         """Raise a `ValueError` if the crank does not turn forward in the phase clock."""
-        if isinstance(start, MotorState):
+        if isinstance(start, tuple(_TIMED)):
             speed = concrete(start.W)
             if speed is not None and not (speed > 0).all():
                 raise ValueError(
                     "Argument `start` must have W > 0 in the phase clock, but has "
                     f'W = {speed.min():g}. Pass `clock="time"` to start from rest.'
                 )
-        if isinstance(start, TimedMotorState):
+        if isinstance(start, _CLOCKED):
             phase = concrete(start.phase)
             if phase is not None and not (phase < 2 * pi).all():
                 raise ValueError(
