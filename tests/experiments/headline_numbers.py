@@ -308,6 +308,23 @@ def peers() -> Expected:
     return {name: (error, error / 3)}
 
 
+def dc_motor() -> Expected:
+    """From closed forms of the ideal drive on; the study comes from a long simulation."""
+    guess = closed(0.896, 0.5, XI, 2.0, cycles=1)
+    found = []
+    for time in (None, 0.1):
+        lag = None if time is None else time / float(vi.Parameters().natural_frequency)
+        scene = vi.Parameters(torque=10.0, restitution=0.5, electrical_time=lag).scene()
+        begin = scene.start(Y=guess.Y[0], V=guess.V[0], W=0.896)
+        found.append(vi.find_orbit(scene, begin, method="reference", throw=True))
+    line, lagging = found
+    return {
+        "T0 = 10 N·m, κ = 0.9, straight line: min Y": (float(line.y_min), 1e-7),
+        "T0 = 10 N·m, κ = 0.9, τe = 0.1: min Y": (float(lagging.y_min), 1e-7),
+        "T0 = 10 N·m, κ = 0.9, τe = 0.1: ζ": (float(lagging.frequency_ratio), 1e-7),
+    }
+
+
 def scene_cost() -> Expected:
     """Operations in the program of a lane; other versions of JAX write some of it otherwise."""
 
