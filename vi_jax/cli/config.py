@@ -26,7 +26,16 @@ from attrs import frozen
 
 from ..flow import AbstractMethod, Adaptive, ExactFlight, FixedStep
 from ..orbit import AbstractSearch, Gradient, Newton
-from ..scene import DCMotor, IdealDrive, Motor, Oscillator, Parameters, RigidStop, Scene, SliderCrank
+from ..scene import (
+    DCMotor,
+    IdealDrive,
+    Motor,
+    Oscillator,
+    Parameters,
+    RigidStop,
+    Scene,
+    SliderCrank,
+)
 from .toml import ConfigError as ConfigError
 from .toml import Row, given, in_terms_of, read_toml, unknown
 

@@ -10,3 +10,6 @@ from .impact_pair import ImpactPair as ImpactPair
 from .impact_pair import PairState as PairState
 from .relief_valve import ReliefValve as ReliefValve
 from .relief_valve import ValveState as ValveState
+from .unbalanced_rotor import RotorState as RotorState
+from .unbalanced_rotor import TimedRotorState as TimedRotorState
+from .unbalanced_rotor import UnbalancedRotor as UnbalancedRotor

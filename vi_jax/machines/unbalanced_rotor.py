@@ -1,0 +1,253 @@
+"""A motor with an unbalanced rotor on an elastic support: the Sommerfeld effect."""
+
+import dataclasses
+from math import pi
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._checks import (
+    NOT_NEGATIVE,
+    POSITIVE,
+    REAL,
+    SHARE,
+    Range,
+    concrete,
+    number,
+    one_of,
+    require,
+    state_of_numbers,
+)
+from ..scene import RigidStop
+from .base import PhaseMachine
+
+Scalar = Float[Array, ""]
+
+
+class RotorState(eqx.Module):
+    """Body and shaft, by the angle of the rotor."""
+
+    Y: Scalar
+    """Displacement of the body (unit: m r/M)."""
+    V: Scalar
+    """dY/dτ (unit: m r ω/M)."""
+    P: Scalar
+    """Momentum of the shaft, W - ε V sin φ, which impacts keep (unit: J ω); on the section it is
+    the speed W itself."""
+
+
+class TimedRotorState(eqx.Module):
+    """Body and shaft, by time."""
+
+    Y: Scalar
+    """Displacement of the body (unit: m r/M)."""
+    V: Scalar
+    """dY/dτ (unit: m r ω/M)."""
+    P: Scalar
+    """Momentum of the shaft, W - ε V sin φ, which impacts keep (unit: J ω)."""
+    phase: Scalar
+    """Angle of the rotor since the last section (radians)."""
+
+
+class UnbalancedRotor(PhaseMachine):
+    """A body of mass M on a spring k and a damper c, on which a motor of limited power turns a
+    rotor with an unbalance m at the radius r; if `gap` is given, between stops.
+
+    With the body's displacement Y in units of m r/M, time τ = ω t, ω² = k/M, and the rotor's speed
+    W = dφ/dτ:
+
+        Y'' + 2ξ Y' + Y = W² cos φ + W' sin φ
+        W' = τ0 (κ - W/w0) + ε Y'' sin φ
+
+    Passing the resonance takes power, so that the speed of a weak motor stays behind its control
+    and then jumps (Sommerfeld 1902). At a slowly varying speed ζ the load, averaged over a turn, is
+    ε ξ ζ⁵/D with D = (1 - ζ²)² + 4ξ²ζ², and to first order in ε
+
+        τ0 (κ - ζ/w0) = ε ξ ζ⁵/D
+
+    (V. O. Kononenko, Vibrating Systems with a Limited Power Supply, 1969; I. I. Blekhman,
+    Vibrational Mechanics, 2000). Gravity is left out, as for a shaft that stands upright or turns
+    fast.
+
+    A stop gives the body a push and so the shaft a jerk: the velocity of the body is reversed and
+    scaled, and what is kept is the momentum of the shaft P = W - ε Y' sin φ, a component of the
+    state. The energy ½Y'² + ½Y² - W Y' sin φ + W²/(2ε) then falls by ½(1 - k²)(1 - ε sin²φ)V⁻².
+
+    The independent variable is φ, a cycle 2π, which the rotor must turn through forward;
+    `simulate(..., clock="time")` has time instead, and starts from rest.
+
+    **Arguments:**
+
+    - `strength` τ0 = T0/(J ω²), the motor's stall torque at κ = 1; not negative.
+    - `control` κ of the motor.
+    - `no_load_speed` w0 at κ = 1 (unit: ω), positive.
+    - `coupling` ε = (m r)²/(M J), with J the inertia of the shaft and the unbalance, in [0, 1).
+    - `damping_ratio` ξ = c/(2 M ω), not negative.
+    - `gap` of the stops (unit: m r/M), positive; `None` for none.
+    - `restitution` in [0, 1].
+    - `two_sided`: whether there is a stop on the left as well; static.
+    - `clock_name`: `"phase"` or `"time"`; static.
+    """
+
+    strength: Scalar = eqx.field(
+        kw_only=True, default=0.1, converter=lambda x: number("strength", x)
+    )
+    control: Scalar = eqx.field(kw_only=True, default=0.9, converter=lambda x: number("control", x))
+    no_load_speed: Scalar = eqx.field(
+        kw_only=True, default=1.0, converter=lambda x: number("no_load_speed", x)
+    )
+    coupling: Scalar = eqx.field(
+        kw_only=True, default=0.01, converter=lambda x: number("coupling", x)
+    )
+    damping_ratio: Scalar = eqx.field(
+        kw_only=True, default=0.05, converter=lambda x: number("damping_ratio", x)
+    )
+    gap: Scalar | None = eqx.field(
+        kw_only=True, default=None, converter=lambda x: x if x is None else number("gap", x)
+    )
+    restitution: Scalar = eqx.field(
+        kw_only=True, default=0.5, converter=lambda x: number("restitution", x)
+    )
+    two_sided: bool = eqx.field(kw_only=True, static=True, default=False)
+    clock_name: str = eqx.field(kw_only=True, static=True, default="phase")
+    ranges: ClassVar[dict[str, Any]] = {
+        "strength": NOT_NEGATIVE, "control": REAL, "no_load_speed": POSITIVE,
+        "coupling": Range(0.0, 1.0, open_high=True), "damping_ratio": NOT_NEGATIVE,
+        "gap": POSITIVE, "restitution": SHARE,
+    }  # fmt: skip
+
+    def __check_init__(self):
+        one_of("clock_name", self.clock_name, ("phase", "time"))
+
+    @property
+    def stops(self) -> tuple[RigidStop, ...]:  # pyright: ignore
+        """None without `gap`; else one on the right, and one on the left if two-sided."""
+        if self.gap is None:
+            return ()
+        sides = ("right", "left") if self.two_sided else ("right",)
+        return tuple(RigidStop(self.gap, self.restitution, side) for side in sides)
+
+    @property
+    def labels(self) -> tuple[str, str]:
+        """Of pictures."""
+        return "Y (m r/M)", "dY/dτ (m r ω/M)"
+
+    def in_clock(self, clock: str) -> "UnbalancedRotor":
+        """The same machine in the `"phase"` or the `"time"` clock."""
+        one_of("clock", clock, ("phase", "time"))
+        return dataclasses.replace(self, clock_name=clock)
+
+    def speed(self, phase: Any, state: Any) -> Scalar:
+        """W = dφ/dτ of the rotor (unit: ω) at this angle."""
+        return state.P + self.coupling * state.V * jnp.sin(phase)
+
+    def load(self, speed: Any) -> Float[Array, "..."]:
+        """ε ξ ζ⁵/D, the averaged load of the vibration on a rotor of this speed (unit: J ω²)."""
+        z = jnp.asarray(speed)
+        detuned = (1 - z * z) ** 2 + (2 * self.damping_ratio * z) ** 2
+        return self.coupling * self.damping_ratio * z**5 / detuned
+
+    def averaged_control(self, speed: Any) -> Float[Array, "..."]:
+        """κ at which a motor runs at this mean speed, to first order in ε and without stops."""
+        return jnp.asarray(speed) / self.no_load_speed + self.load(speed) / self.strength
+
+    def field(self, s: Scalar, state: Any) -> Any:
+        """By the angle of the rotor, or by time."""
+        timed = isinstance(state, TimedRotorState)
+        phase = state.phase if timed else s
+        sine, cosine = jnp.sin(phase), jnp.cos(phase)
+        W = state.P + self.coupling * state.V * sine
+        motor = self.strength * (self.control - W / self.no_load_speed)
+        force = W * W * cosine - state.Y - 2 * self.damping_ratio * state.V
+        # Both equations solved for Y''; the shaft's own is that of its momentum.
+        push = (force + sine * motor) / (1 - self.coupling * sine * sine)
+        twist = motor - self.coupling * state.V * W * cosine
+        if timed:
+            return TimedRotorState(state.V, push, twist, W)
+        pace = _pace(W)
+        return RotorState(pace * state.V, pace * push, pace * twist)
+
+    def start(self, *, Y: Any = 0.0, V: Any = 0.0, W: Any = None) -> Any:
+        """A state on the section φ = 0; `W` (unit: ω) defaults to the no-load speed κ w0, and
+        `W=0` is a start from rest, for the time clock."""
+        speed = self.control * self.no_load_speed if W is None else W
+        Y, V, P = number("Y", Y), number("V", V), number("W", speed)
+        for name, value in (("Y", Y), ("V", V), ("W", P)):
+            require(name, value)
+        if self.clock_name == "phase":
+            return RotorState(Y, V, P)
+        return TimedRotorState(Y, V, P, jnp.zeros_like(P))
+
+    def adopt(self, start: Any) -> Any:
+        """A start made for either clock, as this machine's clock needs it."""
+        wanted = RotorState if self.clock_name == "phase" else TimedRotorState
+        if wanted is TimedRotorState and isinstance(start, RotorState):
+            return TimedRotorState(start.Y, start.V, start.P, jnp.zeros_like(start.P))
+        if not isinstance(start, wanted):
+            raise TypeError(
+                f"Argument `start` must be a `{wanted.__name__}` for this machine (use "
+                f"`machine.start(...)`), but got a `{type(start).__name__}`."
+            )
+        return state_of_numbers("start", start)
+
+    def check_start(self, start: Any) -> None:
+        """Raise a `ValueError` if the rotor does not turn forward in the phase clock, or is beyond
+        its section."""
+        if isinstance(start, RotorState):
+            speed = concrete(start.P)
+            if speed is not None and not (speed > 0).all():
+                raise ValueError(
+                    "Argument `start` must have W > 0 in the phase clock, but has "
+                    f'W = {speed.min():g}. Pass `clock="time"` to start from rest.'
+                )
+        else:
+            phase = concrete(start.phase)
+            if phase is not None and not (phase < 2 * pi).all():
+                raise ValueError(
+                    "Argument `start` must have its phase, counted from the last section, below "
+                    f"2π, but has {phase.max():g}."
+                )
+
+    def clock(self, state: Any) -> Scalar | None:
+        """The angle of the rotor, where time is the independent variable."""
+        return state.phase if isinstance(state, TimedRotorState) else None
+
+    def rewound(self, state: Any) -> Any:
+        """The state with a full turn taken off the angle."""
+        return eqx.tree_at(lambda x: x.phase, state, state.phase - 2 * pi)
+
+    def pace(self, s: Scalar, state: Any) -> Scalar | None:
+        """dτ/dφ = 1/W where the angle is the independent variable."""
+        return _pace(self.speed(s, state)) if isinstance(state, RotorState) else None
+
+    def frequency_ratio(self, duration: Float[Array, "..."]) -> Float[Array, "..."]:
+        """ζ: mean speed of the rotor over cycles of these durations (unit: ω)."""
+        return 2 * pi / duration
+
+    def step_limit(self, s: Scalar, state: Any) -> Scalar:
+        """A fifth of the shorter of the rotor's turn and the body's natural period."""
+        speed = self._speed(s, state)
+        turn = 0.4 * pi / jnp.maximum(1.0, speed)
+        return turn * speed if self.clock_name == "phase" else turn
+
+    def relaxation(self, s: Scalar, state: Any) -> Scalar:
+        """Of a strongly damped body, or of a motor that is soon back at speed."""
+        rate = jnp.maximum(2 * self.damping_ratio, self.strength / self.no_load_speed)
+        pace = self._speed(s, state) if self.clock_name == "phase" else 1.0
+        return pace * (1 - self.coupling) / jnp.maximum(rate, 1e-6)
+
+    def _speed(self, s: Scalar, state: Any) -> Scalar:
+        """Of the rotor, without its sign."""
+        return jnp.abs(self.speed(state.phase if isinstance(state, TimedRotorState) else s, state))
+
+    def alive(self, state: Any) -> jax.Array | None:
+        """In the phase clock a rotor that does not turn forward has a state that is no number."""
+        return jnp.isfinite(state.P) if isinstance(state, RotorState) else None
+
+
+def _pace(W: Scalar) -> Scalar:
+    """dτ/dφ; no number where the rotor does not turn forward."""
+    return jnp.where(W > 0, 1 / W, jnp.nan)
