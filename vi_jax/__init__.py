@@ -75,6 +75,7 @@ from .scene import TimedDCMotorState as TimedDCMotorState
 from .scene import TimedMotorState as TimedMotorState
 
 if TYPE_CHECKING:
+    from .plot import animate as animate
     from .plot import plot_basins as plot_basins
     from .plot import plot_boundary as plot_boundary
     from .plot import plot_branch as plot_branch
@@ -82,13 +83,14 @@ if TYPE_CHECKING:
     from .plot import plot_multipliers as plot_multipliers
     from .plot import plot_phase_portrait as plot_phase_portrait
     from .plot import plot_regimes as plot_regimes
+    from .plot import plot_sketch as plot_sketch
     from .plot import plot_sweep as plot_sweep
     from .plot import save_picture as save_picture
 
 
 def __getattr__(name: str):
     """Plots, loaded when the first of them is asked for: matplotlib takes long to load."""
-    if name.startswith("plot_") or name == "save_picture":
+    if name.startswith("plot_") or name in ("animate", "save_picture"):
         from . import plot
 
         return getattr(plot, name)

@@ -230,7 +230,9 @@ def test_derivatives_beside_differences():
     def last(values, **options):
         scene = machine(electrical_time=values[0], control=values[1])
         start = scene.start(Y=0.4, W=0.7, M=values[2])
-        run = vi.simulate(scene, start, 3, method=vi.FixedStep(steps_per_cycle=24), **options)
+        run = vi.simulate(scene, start, 3, method=vi.FixedStep(steps_per_cycle=24),
+            record="sections", rests=False, **options,
+        )  # fmt: skip
         return jnp.stack(jax.tree.leaves(run.last)), run.impacts
 
     at, h = jnp.asarray([0.4, 0.9, 0.1]), 1e-5

@@ -1,0 +1,195 @@
+"""Animations and schematics: what moves, what is written, what is refused."""
+
+import base64
+
+import jax
+import jax.numpy as jnp
+import matplotlib
+
+matplotlib.use("Agg")
+
+import numpy as np
+import pytest
+import vi_jax as vi
+from matplotlib import animation
+from matplotlib.figure import Figure
+from PIL import Image
+from vi_jax.plot.schematic import sketch
+
+M = vi.machines
+MACHINES = {
+    "ideal": vi.Scene.ideal(frequency_ratio=0.9, damping_ratio=0.05),
+    "motor": vi.Parameters().scene(crank="slider"),
+    "two stops": vi.Scene(
+        oscillator=vi.Oscillator(0.05), drive=vi.IdealDrive(0.9),
+        stops=(vi.RigidStop(1.2, 0.5), vi.RigidStop(1.0, 0.5, "left")),
+    ),
+    "soft stop": vi.Scene(
+        oscillator=vi.Oscillator(0.05), drive=vi.IdealDrive(0.9),
+        soft_stops=(vi.SoftStop(1.2, 50.0, restitution=0.5),),
+    ),
+    "ball": M.BouncingBall(), "pair": M.ImpactPair(), "free pair": M.ImpactPair(mass_ratio=0.2),
+    "duffing": M.Duffing(), "rotor": M.UnbalancedRotor(gap=1.5),
+}  # fmt: skip
+
+
+class Own(vi.AbstractScene):
+    """A body on a spring between two stops."""
+
+    stops: tuple = (vi.RigidStop(1.0, 0.5), vi.RigidStop(1.0, 0.5, "left"))
+    cycle: float = 6.0
+
+    def field(self, s, state):
+        return vi.OscillatorState(state.V, -state.Y)
+
+
+class Drawn(Own):
+    """The same, which says how it is drawn."""
+
+    def sketch(self, pen, state, phase):
+        pen.ball(float(state.Y), phase, 0.1, color=pen.red)
+
+
+def moved(scene, start=None, cycles=2):
+    start = scene.start() if start is None else start
+    return vi.simulate(scene, start, cycles, samples=32, impact_log=4, throw=True)
+
+
+@pytest.fixture(scope="module")
+def run():
+    return moved(MACHINES["ideal"], MACHINES["ideal"].start(Y=1.6, V=-1.9))
+
+
+def picture(figure):
+    canvas = matplotlib.backends.backend_agg.FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba()).astype(int)
+
+
+@pytest.mark.parametrize("name", MACHINES)
+def test_every_machine_is_drawn(name):
+    scene = MACHINES[name]
+    ax = vi.plot_sketch(scene, ax=Figure().subplots())
+    assert ax.texts and (ax.patches or ax.lines)
+    if name == "soft stop":
+        return
+    shown = vi.animate(moved(scene), scene, seconds=0.4, fps=10)
+    assert len(shown) == 4
+    first, third = (picture(shown.draw(i)) for i in (0, 2))
+    half = first.shape[0] // 3  # the machine itself moves, not the history alone
+    assert first.shape == third.shape and (first[:half] != third[:half]).any()
+
+
+def test_a_body_is_where_it_is(run):
+    scene = MACHINES["ideal"]
+    shown = vi.animate(run, scene, seconds=2.0, fps=25, window=(0, 2))
+    figure = shown.draw(-1)
+    above, below = figure.axes
+    dot = below.lines[-1]
+    assert float(dot.get_xdata()[0]) == pytest.approx(4.0)  # 2 cycles, in units of π
+    assert float(dot.get_ydata()[0]) == pytest.approx(float(run.last.Y))
+    limits = above.get_xlim(), above.get_ylim()
+
+    def body():
+        return max(p.get_x() for p in above.patches if hasattr(p, "get_x"))
+
+    places = [body()]
+    for i in range(len(shown) - 1):
+        shown.draw(i)
+        places.append(body())
+        assert (above.get_xlim(), above.get_ylim()) == limits
+    # As far as the motion, up to the face of the stop.
+    walked = float(run.y_max.max() - run.y_min.min())
+    assert np.ptp(places) == pytest.approx(walked, abs=0.15)
+    wall = max(line.get_xdata()[0] for line in above.lines if line.get_color() == "#1a9641"
+               and len(set(line.get_xdata())) == 1)  # fmt: skip
+    assert max(places) + 0.8 <= wall + 1e-9
+
+
+def test_frames_are_even_in_time():
+    """A shaft that runs up from rest turns slowly at first."""
+    scene = MACHINES["motor"].in_clock("time")
+    start = scene.start(W=0.0)
+    shown = vi.animate(moved(scene, start), scene, seconds=1.0, fps=40)
+    cycles = shown._frames.cycles
+    assert np.diff(cycles)[0] < 0.3 * np.diff(cycles)[-1]
+
+
+def test_an_orbit_knows_its_machine():
+    scene = MACHINES["ideal"]
+    orbit = vi.find_orbit(scene, scene.start(Y=1.9, V=1.4), throw=True)
+    shown = vi.animate(orbit, seconds=0.2, fps=20, history=False)
+    assert len(shown.draw(0).axes) == 1
+    with pytest.raises(ValueError, match="`scene` must be left out"):
+        vi.animate(orbit, scene)
+
+
+def test_a_machine_says_how_it_is_drawn():
+    own, drawn = Own(), Drawn()
+    start = vi.OscillatorState(jnp.asarray(0.5), jnp.asarray(0.0))
+    plain = vi.plot_sketch(own, start, ax=Figure().subplots())
+    assert len(plain.patches) == 2  # a body, filled and outlined
+    assert len(plain.lines) > 4  # two walls, the ground
+    with pytest.raises(ValueError, match="`start` must be given"):
+        vi.plot_sketch(own)
+    ax = Figure().subplots()
+    sketch(drawn, vi.plot.Pen(ax), start, 0.25)
+    assert ax.patches[0].center == (0.5, 0.25)
+
+
+def test_files_are_written(run, tmp_path, monkeypatch):
+    shown = vi.animate(run, MACHINES["ideal"], seconds=0.4, fps=10)
+    shown.save(tmp_path / "motion.gif")
+    with Image.open(tmp_path / "motion.gif") as gif:
+        assert gif.n_frames == 4 and gif.size[0] >= 600 and gif.info["duration"] == 100
+    assert (tmp_path / "motion.gif").stat().st_size < 200_000
+    shown.save(str(tmp_path / "motion.html"))
+    text = (tmp_path / "motion.html").read_text()
+    assert ("<img" in text and text == shown._repr_html_()) or "data:image/png;base64" in text
+    first = text.split("data:image/png;base64,")[1].split('"')[0].replace("\\\n", "")
+    assert base64.b64decode(first)[:4] == b"\x89PNG"
+    monkeypatch.setattr(animation.FFMpegWriter, "isAvailable", classmethod(lambda cls: False))
+    with pytest.raises(ValueError, match=r"\.gif or \.html where ffmpeg is not installed"):
+        shown.save(tmp_path / "motion.mp4")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["motion.gif", "motion.html"]
+
+
+@pytest.mark.skipif(not animation.FFMpegWriter.isAvailable(), reason="needs ffmpeg")
+def test_a_movie_is_written(run, tmp_path):
+    vi.animate(run, MACHINES["ideal"], seconds=0.4, fps=10).save(tmp_path / "motion.mp4")
+    assert (tmp_path / "motion.mp4").stat().st_size > 1000
+
+
+def test_what_cannot_be_written_is_told_before_any_drawing(run, tmp_path):
+    shown = vi.animate(run, MACHINES["ideal"], seconds=0.4, fps=10)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ValueError, match=r"`filename` must be a file.*lies below a file"):
+        shown.save(tmp_path / "file" / "motion.gif")
+    (tmp_path / "folder.gif").mkdir()
+    with pytest.raises(ValueError, match="it is a folder"):
+        shown.save(tmp_path / "folder.gif")
+    with pytest.raises(ValueError, match=r"must end in \.gif, \.mp4, \.html, but got .*\.avi"):
+        shown.save(tmp_path / "motion.avi")
+
+
+def test_wrong_arguments_are_named(run):
+    scene = MACHINES["ideal"]
+    with pytest.raises(ValueError, match="`scene` must be given"):
+        vi.animate(run)
+    with pytest.raises(ValueError, match="`motion` must have samples"):
+        vi.animate(vi.simulate(scene, scene.start(), 2), scene)
+    with pytest.raises(ValueError, match=r"`fps` must be at least 1, but got 0"):
+        vi.animate(run, scene, fps=0)
+    with pytest.raises(ValueError, match=r"`seconds`"):
+        vi.animate(run, scene, seconds=-1.0)
+    with pytest.raises(ValueError, match="two samples at least within the window"):
+        vi.animate(run, scene, window=(7, 8))
+    batch = jax.vmap(
+        lambda Y: vi.simulate(scene, scene.start(Y=Y), 2, samples=8)
+    )(jnp.array([0.0, 0.1]))  # fmt: skip
+    with pytest.raises(ValueError, match="one motion"):
+        vi.animate(batch, scene)
+    lost = vi.find_orbit(scene, scene.start(Y=0.0), cycles=1, root_finder=vi.Newton(max_steps=1))
+    if not bool(lost.successful):
+        with pytest.raises(ValueError, match="an orbit that was found"):
+            vi.animate(lost)

@@ -1,0 +1,300 @@
+"""Animations: a machine that moves above its time history."""
+
+import os
+import tempfile
+from io import BytesIO
+from math import ceil
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from matplotlib import animation
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from PIL import Image
+
+from .._checks import count, flag, given_number, instance_of, unwritable
+from .._files import write_whole
+from ..flow import Run
+from ..orbit import Orbit
+from ..scene import AbstractScene, Scene
+from .motion import BLUE, RED, plot_history
+from .path import motion_path
+from .pen import Pen
+from .schematic import reach_of, size_of, sketch
+
+# Samples of a cycle that an orbit is drawn with, and how long a cycle takes to look at.
+_SAMPLES, _UNHURRIED, _LONGEST = 128, 2.5, 12.0
+# Frames by which the room that a drawing takes is measured.
+_MEASURED = 12
+# Inches: of a figure, and what the time history takes of its height.
+_WIDE, _BELOW = 7.2, 2.1
+_ENDINGS = (".gif", ".mp4", ".html")
+
+
+class _Frames(NamedTuple):
+    """What is drawn, one row for each frame."""
+
+    cycles: np.ndarray
+    states: Any
+    positions: np.ndarray
+
+
+def animate(
+    motion: Run | Orbit,
+    scene: AbstractScene | None = None,
+    *,
+    window: tuple[float | int, float | int] | None = None,
+    seconds: float | int | None = None,
+    fps: int = 25,
+    history: bool = True,
+    figure: Figure | None = None,
+) -> "MotionAnimation":
+    """A motion as an animation: the machine moves above its time history.
+
+    Shown in a notebook as it is; `animation.save("motion.gif")` writes a file.
+
+    **Arguments:**
+
+    - `motion`: a `Run` simulated with `samples=...` (and `impact_log=...`, so that impacts are met
+      where they are), or an `Orbit`, of which one period is drawn.
+    - `scene`: the machine; needed for a run, and left out for an orbit, which knows its own. How it
+      is drawn is told at `plot_sketch`.
+    - `window`: the first and the last cycle to draw.
+    - `seconds`: how long it lasts; by default 2.5 s a cycle, up to 12 s.
+    - `fps`: frames a second.
+    - `history`: whether to draw the time history below.
+    - `figure`: an empty figure to draw into, one of pyplot's to see it in a window; by default one
+      of its own.
+
+    **Returns:** a `MotionAnimation`, which is one of matplotlib's.
+
+    **Raises:** `TypeError` for what is no motion, `ValueError` for a motion without samples, a
+    batch or one that failed, or numbers out of range.
+    """
+    instance_of("motion", motion, (Run, Orbit), "a `Run` or an `Orbit`")
+    fps = count("fps", fps, least=1, most=100)
+    history = flag("history", history)
+    if isinstance(motion, Orbit):
+        if scene is not None:
+            raise ValueError("Argument `scene` must be left out: an orbit has its own.")
+        if not motion.residual.ndim and not bool(motion.successful):
+            raise ValueError("Argument `motion` must be an orbit that was found, but is none.")
+        scene, motion = motion.scene, motion.trajectory(samples=_SAMPLES)
+    if scene is None:
+        raise ValueError("Argument `scene` must be given for a `Run`: it says what to draw.")
+    instance_of("scene", scene, AbstractScene, "a `Scene` or an `AbstractScene`")
+    path = motion_path(motion, scene=scene, window=window)
+    good = np.isfinite(path.Y)
+    if np.sum(good) < 2:
+        raise ValueError(
+            "Argument `motion` must have two samples at least within the window that are numbers, "
+            f"but has {int(np.sum(good))}."
+        )
+    shown = float(np.ptp(path.cycles[good]))
+    if seconds is None:
+        seconds = min(_LONGEST, _UNHURRIED * shown)
+    seconds = given_number("seconds", seconds, low=0.0, high=3600.0, open_low=True)
+    frames = _frames(motion, scene, path, good, max(2, ceil(seconds * fps)))
+    return MotionAnimation(figure, scene, motion, frames, fps, history)
+
+
+def _frames(run: Run, scene: AbstractScene, path: Any, good: np.ndarray, number: int) -> _Frames:
+    """Frames evenly spaced in time, states in between samples by interpolation."""
+    samples = run.samples
+    assert samples is not None
+    cycles, time = (np.asarray(x, float) for x in (samples.cycles, samples.time))
+    inside = np.isfinite(time)
+    low, high = path.cycles[good][[0, -1]]
+    ends = np.interp([low, high], cycles[inside], time[inside])
+    at = np.interp(np.linspace(ends[0], ends[1], number), time[inside], cycles[inside])
+
+    def between(x: Any) -> np.ndarray:
+        return np.interp(at, cycles[inside], np.asarray(x, float)[inside])
+
+    states = jax.tree_util.tree_map(between, samples.state)
+    # The corners of the path at its impacts, which no samples have.
+    Y, V = (np.interp(at, path.cycles[good], x[good]) for x in (path.Y, path.V))
+    states = jax.vmap(scene.placed)(states, Y, V)
+    places = [np.asarray(jax.vmap(c.position)(states), float) for c in scene.coordinates]
+    return _Frames(at, states, np.stack(places))
+
+
+class MotionAnimation(animation.FuncAnimation):
+    """An animation of a motion; made by `animate`.
+
+    Shown in a notebook as it is, saved by `save`; `draw(i)` gives one frame.
+    """
+
+    def __init__(
+        self, figure: Figure | None, scene: AbstractScene, run: Run, frames: _Frames, fps: int,
+        history: bool,
+    ):  # fmt: skip
+        self.fps = fps
+        """Frames a second."""
+        self._scene, self._frames = scene, frames
+        self._reach = reach_of(scene, frames.positions)
+        self._above = Figure().subplots()
+        self._limits = self._measured()
+        (left, right), (low, high) = self._limits
+        tall = float(np.clip(_WIDE * (high - low) / (right - left), 1.2, 4.2))
+        if figure is None:
+            figure = Figure(figsize=(_WIDE, tall + _BELOW * history), dpi=100)
+            FigureCanvasAgg(figure)
+        rows = figure.subplots(1 + history, 1, height_ratios=(tall, 1.3)[: 1 + history])
+        self._figure = figure
+        self._above, *below = np.atleast_1d(rows)
+        figure.subplots_adjust(left=0.09, right=0.98, top=0.98, bottom=0.55 / (tall + _BELOW))
+        if not history:
+            figure.subplots_adjust(bottom=0.02)
+        self._below = _History(below[0], run, scene, frames) if history else None
+        super().__init__(
+            figure, self._draw, frames=len(frames.cycles), interval=1000 / fps, repeat=True
+        )
+        # One that nobody looked at is no mistake.
+        self._draw_was_started = True
+
+    def __len__(self) -> int:
+        return len(self._frames.cycles)
+
+    def draw(self, index: int) -> Figure:
+        """The figure at one frame, a still picture."""
+        self._draw(range(len(self))[index])
+        return self._figure
+
+    def _draw(self, index: int) -> list[Any]:
+        ax = self._above
+        ax.clear()
+        self._sketched(index)
+        ax.axis("off")
+        ax.set_aspect("equal")
+        (left, right), (low, high) = self._limits
+        ax.set(xlim=(left, right), ylim=(low, high))
+        if self._below is not None:
+            self._below.move(index)
+        return []
+
+    def _sketched(self, index: int) -> None:
+        scene, frames = self._scene, self._frames
+        state = jax.tree_util.tree_map(lambda x: x[index], frames.states)
+        turn = float(scene.turn)
+        phase = float(scene.phase_at((frames.cycles[index] % 1.0) * turn))
+        pen = Pen(self._above, reach=self._reach, size=size_of(scene, self._reach))
+        sketch(scene, pen, state, phase)
+
+    def _measured(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """The room that all frames take, so that none of them moves the others."""
+        places = self._frames.positions
+        number = places.shape[1]
+        chosen = {int(f(row)) for row in places for f in (np.argmin, np.argmax)}
+        chosen |= {int(i) for i in np.linspace(0, number - 1, _MEASURED)}
+        for index in sorted(chosen):
+            self._sketched(index)
+        box = self._above.dataLim
+        wide, tall = 0.04 * box.width, 0.06 * box.height
+        self._above.clear()
+        return (box.x0 - wide, box.x1 + wide), (box.y0 - tall, box.y1 + tall)
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows."""
+        return self.to_jshtml(fps=self.fps)
+
+    def save(self, filename: str | Path, *args: Any, **options: Any) -> None:  # pyright: ignore
+        """Write a `.gif`, an `.html` or, where ffmpeg is installed, an `.mp4`.
+
+        The file appears whole or not at all. Further arguments, `writer` and so on, are those of
+        matplotlib's `Animation.save`; without any, a GIF is kept small by its few colours.
+
+        **Raises:** `ValueError` if the ending is another, the file cannot be written, or there is
+        no ffmpeg; before anything is drawn.
+        """
+        path = Path(filename)
+        _check_path(path)
+        if args or options:
+            super().save(filename, *args, **options)
+        elif path.suffix == ".html":
+            write_whole(path, self.to_jshtml(fps=self.fps))
+        elif path.suffix == ".gif":
+            write_whole(path, self._gif())
+        else:
+            self._movie(path)
+
+    def _movie(self, path: Path) -> None:
+        handle, beside = tempfile.mkstemp(suffix=path.suffix, dir=path.parent)
+        os.close(handle)
+        try:
+            super().save(beside, writer=animation.FFMpegWriter(fps=self.fps))
+            os.replace(beside, path)
+        except BaseException:
+            Path(beside).unlink(missing_ok=True)
+            raise
+
+    def _gif(self, colors: int = 48) -> bytes:
+        """All frames in one palette, which makes what does not move cost nothing."""
+        canvas = FigureCanvasAgg(self._figure)
+
+        def frame(index: int) -> Image.Image:
+            self.draw(index)
+            canvas.draw()
+            return Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+
+        plain = Image.Dither.NONE
+        exact = Image.Quantize.MAXCOVERAGE  # keeps white white
+        palette = frame(len(self) // 2).quantize(colors, method=exact, dither=plain)
+        pictures = [frame(i).quantize(palette=palette, dither=plain) for i in range(len(self))]
+        file = BytesIO()
+        pictures[0].save(
+            file, "gif", save_all=True, append_images=pictures[1:], loop=0, optimize=True,
+            duration=round(1000 / self.fps),
+        )  # fmt: skip
+        return file.getvalue()
+
+
+class _History:
+    """The time history with what has passed drawn over it."""
+
+    def __init__(self, ax: Axes, run: Run, scene: AbstractScene, frames: _Frames):
+        unit = "angle" if isinstance(scene, Scene) else "cycles"
+        ends = float(frames.cycles[0]), float(frames.cycles[-1])
+        window = ends[0] - 1e-9, ends[1] + 1e-9
+        plot_history(run, scene=scene, ax=ax, window=window, unit=unit, color="0.75", lw=1.2)
+        if unit == "cycles":
+            ax.set_xlabel("drive cycles")
+        self._factor = 2.0 if unit == "angle" else 1.0
+        path = motion_path(run, scene=scene, window=window)
+        self._place, self._Y = self._factor * path.cycles, path.Y
+        self._frames = frames
+        (self._line,) = ax.plot([], [], color=BLUE, lw=1.6)
+        (self._dot,) = ax.plot([], [], "o", color=RED, ms=6, zorder=5)
+        ax.set_xlim(self._factor * ends[0], self._factor * ends[1])
+        ax.spines[["top", "right"]].set_visible(False)
+
+    def move(self, index: int) -> None:
+        """To this frame."""
+        place, Y = self._factor * self._frames.cycles[index], self._frames.positions[0, index]
+        passed = self._place <= place
+        self._line.set_data([*self._place[passed], place], [*self._Y[passed], Y])
+        self._dot.set_data([place], [Y])
+
+
+def _check_path(path: Path) -> None:
+    reason = unwritable(path.parent)
+    if reason is None and path.is_dir():
+        reason = "it is a folder"
+    elif reason is None and path.exists() and not os.access(path, os.W_OK):
+        reason = "permission denied"
+    if reason is not None:
+        raise ValueError(
+            f"Argument `filename` must be a file that can be written, but {path} is none: {reason}."
+        )
+    if path.suffix not in _ENDINGS:
+        raise ValueError(
+            f"Argument `filename` must end in {', '.join(_ENDINGS)}, but got {str(path)!r}."
+        )
+    if path.suffix == ".mp4" and not animation.FFMpegWriter.isAvailable():
+        raise ValueError(
+            "Argument `filename` must end in .gif or .html where ffmpeg is not installed, but got "
+            f"{str(path)!r}."
+        )
