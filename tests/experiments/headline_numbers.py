@@ -325,6 +325,24 @@ def dc_motor() -> Expected:
     }
 
 
+def sommerfeld() -> Expected:
+    """Where the averaged κ = ζ + ε ξ ζ⁵/(τ0 D) turns; the motion's own folds lie beside it."""
+    numbers: Expected = {}
+
+    def kappa(z: float, strength: float) -> float:
+        return z + 0.01 * 0.05 * z**5 / ((1 - z * z) ** 2 + (0.1 * z) ** 2) / strength
+
+    def slope(z: float, strength: float) -> float:
+        return (kappa(z + 1e-6, strength) - kappa(z - 1e-6, strength)) / 2e-6
+
+    for strength in (0.1, 0.2):
+        for way, low, high in (("run-up", 0.9, 1.03), ("close-down", 1.03, 1.4)):
+            at = kappa(float(brentq(slope, low, high, args=(strength,))), strength)
+            numbers[f"τ0 = {strength:g}, {way}: averaged fold, κ"] = at, 1e-8
+            numbers[f"τ0 = {strength:g}, {way}: fold, κ"] = at, 1e-3
+    return numbers
+
+
 def scene_cost() -> Expected:
     """Operations in the program of a lane; other versions of JAX write some of it otherwise."""
 

@@ -298,11 +298,11 @@ def test_grids_and_sweeps():
 
 
 def test_from_numbers_in_si():
-    table = vi.Parameters(torque=10.0, kappa=0.9, electrical_time=0.01)
+    table = vi.Parameters(torque=10.0, control=0.9, electrical_time=0.01)
     scene = table.scene()
     assert isinstance(scene.drive, vi.DCMotor)
     assert float(scene.drive.electrical_time) == pytest.approx(0.15930782, abs=5e-9)
-    plain = vi.Parameters(torque=10.0, kappa=0.9).scene()
+    plain = vi.Parameters(torque=10.0, control=0.9).scene()
     assert type(plain.drive) is vi.Motor
     assert float(scene.drive.strength) == float(plain.drive.strength)
     assert isinstance(vi.Parameters(electrical_time=0.01).scene(drive="ideal").drive, vi.IdealDrive)

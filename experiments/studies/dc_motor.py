@@ -6,7 +6,7 @@
 # both, over κ, for four motors and a range of τe = ωL/R, and their extremes, frequency ratios and
 # rates of decay are compared; and both are switched on at rest.
 #
-# Run with `python experiments/dc_motor.py` (`--quick` for fewer motions, writes nothing).
+# Run with `python experiments/studies/dc_motor.py` (`--quick` for fewer motions, writes nothing).
 
 # %%
 import sys
@@ -21,8 +21,8 @@ from matplotlib.figure import Figure
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments")
-sys.path.insert(0, str(HERE))
+HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
+sys.path.insert(0, str(HERE.parent))
 from headlines import keep
 
 QUICK = "--quick" in sys.argv
@@ -37,7 +37,7 @@ def machine(torque: Any, kappa: Any, time: Any = None) -> vi.Scene:
     """Table 1 at k = 0.5, with an armature of τe = `time` or without one."""
     lag = None if time is None else time / OMEGA
     return vi.Parameters(
-        torque=torque, kappa=kappa, restitution=0.5, electrical_time=lag
+        torque=torque, control=kappa, restitution=0.5, electrical_time=lag
     ).scene()  # fmt: skip
 
 
@@ -165,7 +165,7 @@ constant τe = ωL/R. Largest changes over κ; lengths in a. *Largest multiplier
 approached. *From rest*: both switched on at rest at κ = 0.9, the difference in φ'/ω at worst within
 40 units of time, and that of its peaks.
 
-![Straight line or armature](figures/dc_motor.png)
+![Straight line or armature](../figures/dc_motor.png)
 
 - **Steady motion hardly notices.** Over a period the armature keeps nothing, so that the *mean*
   torque and speed lie on the straight line whatever the inductance is; only the swing of the torque

@@ -7,7 +7,7 @@
 # is continued through its folds, and both are laid over the averaged response in closed form
 # (first order in ε). With a stop the body is held, and the resonance with it.
 #
-# Run with `python experiments/sommerfeld.py` (`--quick` for coarse sweeps, writes nothing).
+# Run with `python experiments/studies/sommerfeld.py` (`--quick` for coarse sweeps, writes nothing).
 
 # %%
 import sys
@@ -22,8 +22,8 @@ from matplotlib.figure import Figure
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments")
-sys.path.insert(0, str(HERE))
+HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
+sys.path.insert(0, str(HERE.parent))
 from headlines import keep
 
 QUICK = "--quick" in sys.argv
@@ -35,7 +35,7 @@ LOW, HIGH = 0.6, 1.8
 
 def machine(strength: float, control: float = 0.8, *, stop: bool = False) -> vi.AbstractScene:
     gap = GAP if stop else None
-    return vi.machines.UnbalancedRotor(
+    return vi.machines.UnbalancedRotor(  # pyright: ignore[reportCallIssue]
         strength=strength, control=control, coupling=EPSILON, damping_ratio=XI, gap=gap
     )  # fmt: skip
 
@@ -82,7 +82,7 @@ def averaged(strength: float) -> tuple[np.ndarray, np.ndarray, list[float]]:
     assert isinstance(rotor, vi.machines.UnbalancedRotor)
     kappa = np.asarray(rotor.averaged_control(speeds))
     falls = np.flatnonzero(np.diff(kappa) < 0)
-    return speeds, kappa, [kappa[falls[0]], kappa[falls[-1] + 1]] if falls.size else []
+    return speeds, kappa, [float(kappa[i]) for i in (falls[0], falls[-1] + 1)] if falls.size else []
 
 
 branches, folds = {}, {}
@@ -156,13 +156,15 @@ sweep: {VALUES} values of κ from {LOW:g} to {HIGH:g} or back, at each {SETTLE} 
 κ = ζ/w0 + ε ξ ζ⁵/(τ0 D), first order in ε. In the picture the averaged response is the broad line,
 the continued motion the thin one (unstable: dashed).
 
-![Sommerfeld effect](figures/sommerfeld.png)
+![Sommerfeld effect](../figures/sommerfeld.png)
 
 - Averaging gives the κ of the folds to {100 * max(apart):.1f} %. Where a motor is strong enough
   (τ0 = {STRENGTHS[-1]:g}) the line never falls, and there is no jump.
-- With a stop at {GAP:g} m r/M, less than half of what the free body reaches at resonance, the
-  impacts take their share of the motor's power over a broad range: the speed is caught between
-  resonance and the control over much more of κ than without, or jumps elsewhere.
+- A stop at {GAP:g} m r/M, less than half of what the free body reaches at resonance, takes the peak
+  away and bends the response to higher speeds, as a hardening spring would: the run-up follows
+  the impacting motion far beyond the resonance, with the strong motor too, and the close-down does
+  not know of it. So a stop can bring a jump where there was none (τ0 = {STRENGTHS[-1]:g}), and hold
+  a weak motor down all the way (τ0 = {STRENGTHS[0]:g}: no jump up to κ = {HIGH:g}).
 
 {table}
 """
