@@ -126,8 +126,14 @@ class Capsule(PhaseMachine):
         rubs = ground.resistance(mode, _force_on_capsule(self, s, state))
         capsule = (pull - rubs) / self.mass_ratio
         relative = self.amplitude * jnp.cos(s) - pull - capsule
-        rates = state.speed, relative, capsule, state.capsule_speed
-        return CapsuleState(*(x / self.frequency for x in rates), jnp.zeros_like(s))
+        pace = 1 / self.frequency
+        return CapsuleState(
+            place=pace * state.speed,
+            speed=pace * relative,
+            capsule_speed=pace * capsule,
+            travel=pace * state.capsule_speed,
+            progress=jnp.zeros_like(s),
+        )
 
     def pull(self, state: CapsuleState) -> Scalar:
         """What spring and dashpot pull the capsule with (unit: F)."""

@@ -295,6 +295,7 @@ class Shooting(eqx.Module):
         low, high, room, touch, touched = turns
         Y = jax.vmap(lambda u: scene.position(self.unravel(u)))(states)
         nearest = jnp.argmin(room)
+        timed = self.autonomous or scene.pace(clock[0], self.unravel(states[0])) is not None
         return Observed(
             multipliers=multipliers_of(monodromy),
             monodromy=monodromy,
@@ -305,7 +306,7 @@ class Shooting(eqx.Module):
             touch=touch[nearest],
             touched=touched[nearest],
             order=jnp.min(order),
-            duration=jnp.sum(time),
+            duration=jnp.sum(time) if timed else jnp.asarray(scene.period, x.dtype) * self.cycles,
         )
 
     def _saltation(self, scene, leg, s, u):

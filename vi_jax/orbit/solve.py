@@ -97,12 +97,15 @@ def _followed(blank: Shooting, state: Any, found: list[tuple[float, Event]], per
         mode = modes[event.number] if event.kind == "switch" else None
         if mode is not None:
             modes[event.number] = scene.switches[event.number].after(scene, clock, here, mode)[1]
-        here = jump(scene, event, clock, here, mode)
+        if (place, event.kind) != (0.0, "section"):  # after which an orbit's state is
+            here = jump(scene, event, clock, here, mode)
         if event.kind == "stop":
             modes = list(struck_modes(scene, clock, here, tuple(modes)))
         in_flight.append(tuple(float(m) for m in modes))
         u, s = ravel_pytree(here)[0], place
     states.append(np.asarray(_carry(blank, tuple(modes), s, period, u)))
+    if found and found[0] == (0.0, Event("section", 0)) and renews(scene):
+        states[0] = states[-1]
     return _Way(np.stack(states), tuple(in_flight) or (tuple(float(m) for m in modes),))
 
 
