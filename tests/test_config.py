@@ -217,8 +217,15 @@ def test_what_cannot_be_read(here, text, sentence):
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("", "the file must hold [scene] or [machine], but holds neither"),
-        (IDEAL + "[machine]", "the file must hold [scene] or [machine], but holds both"),
+        ("", "the file must hold [scene], [machine] or [model], but holds none of them"),
+        (IDEAL + "[machine]",
+         "the file must hold [scene], [machine] or [model], but holds [scene] and [machine]"),
+        ("[model]\nname = 'ImpactPear'",
+         "unknown machine `ImpactPear` in [model]; near names: ImpactPair"),
+        ("[model]\nname = 'ImpactPair'\nnumbers = {gap = 2.0}",
+         "unknown number `gap` in [model.numbers]; near names: half_gap"),
+        ("[model]\nname = 'ImpactPair'\nnumbers = {half_gap = -2.0}",
+         "`half_gap` in [model.numbers] must be finite and in (0, inf), but got -2.0"),
         ("[scene]", 'missing key `frequency_ratio` in [scene]: drive = "ideal"'),
         ("[scene]\ndrive = 'motor'\nfrequency_ratio = 1",
          'unfitting key `frequency_ratio` in [scene]: drive = "motor"'),
@@ -521,5 +528,32 @@ def test_the_example_of_the_module_is_valid(here):
     lines = (config.__doc__ or "").splitlines()
     text = "\n".join(line[4:] for line in lines if line.startswith("    "))
     tomllib.loads(text)
-    file = read_toml(written(text.replace("name =", "#").replace("[method]", "")), config.Config)
+    file = read_toml(written(text.replace("[method]", "")), config.Config)
+    assert file.model is not None and file.model.build().half_gap == 2
     assert file.axes is not None and list(file.axes) == ["stops.0.restitution"]
+
+
+def test_a_ready_machine_and_one_of_ones_own(here, capsys):
+    own = "import vi_jax as vi\n\n\ndef ball():\n    return vi.machines.BouncingBall()\n"
+    (here / "shaken.py").write_text(own)
+    asked = written("[simulate]\ncycles = 3")
+    assert cli.main(["simulate", str(asked), "--machine", "shaken:ball"]) == 0
+    assert "Run of 3 cycles" in capsys.readouterr().out
+    ready = written("[model]\nname = 'BouncingBall'\n[start]\nspeed = 1.5\n[simulate]\ncycles = 3")
+    assert cli.main(["simulate", str(ready)]) == 0
+    for name, sentence in (
+        ("shaken:bell", "cannot be found"),
+        ("nowhere:ball", "cannot be found"),
+        ("shaken", "must be package.module:function"),
+    ):
+        assert cli.main(["simulate", str(asked), "--machine", name]) == 2
+        assert sentence in capsys.readouterr().err
+    assert cli.main(["simulate", str(ready), "--machine", "shaken:ball"]) == 2
+    assert "beside --machine" in capsys.readouterr().err
+
+
+def test_soft_stops(here):
+    text = IDEAL + "[[scene.soft_stops]]\ngap = 2.0\nstiffness = 50.0\nrestitution = 0.5"
+    scene, _, _ = config.read(written(text)).build()
+    assert isinstance(scene, vi.Scene) and not scene.stops
+    assert float(scene.soft_stops[0].damping) == pytest.approx(0.43090752, abs=1e-8)

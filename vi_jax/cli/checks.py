@@ -9,13 +9,15 @@ from .._checks import unwritable
 from ..orbit.curve import check_walk
 from ..scan.grid import Blocks, axes_of
 from ..scan.job import check_corners, make_job
-from ..scene import Scene
+from ..scene import AbstractScene
 from ..scene.numbers import leaf, leaf_names
 from .config import OrbitTable
 from .toml import ConfigError, given, in_terms_of, unknown
 
 
-def check_names(scene: Scene, names: Iterable[str], place: str, *, start: bool = False) -> None:
+def check_names(
+    scene: AbstractScene, names: Iterable[str], place: str, *, start: bool = False
+) -> None:
     """**Raises:** `ConfigError` for a name that no number of the scene (or the start) has."""
     known = leaf_names(scene)
     if start:
@@ -25,7 +27,7 @@ def check_names(scene: Scene, names: Iterable[str], place: str, *, start: bool =
         raise ConfigError(*wrong)
 
 
-def check_range(scene: Scene, name: str, values: Sequence[float], place: str) -> None:
+def check_range(scene: AbstractScene, name: str, values: Sequence[float], place: str) -> None:
     """**Raises:** `ConfigError` if the scene refuses the least or the greatest of these values."""
     with in_terms_of(place, keys=()):
         axes = axes_of({name: values})
@@ -61,7 +63,7 @@ def check_map(axes: Mapping[str, Any], measure: Iterable[str] | None, *, paired:
         )
 
 
-def check_continuation(scene: Scene, table: OrbitTable) -> None:
+def check_continuation(scene: AbstractScene, table: OrbitTable) -> None:
     """**Raises:** `ConfigError` if the branch cannot begin, or its files not be written."""
     asked = table.continue_
     assert asked is not None

@@ -4,10 +4,16 @@
     frequency_ratio = 0.9           # drive = "motor" takes [scene.motor], the keys of `Motor`,
                                     # or of `DCMotor` with its electrical_time
     restitution = 0.5
-    gap = 2.0                       # or [[scene.stops]] with side, gap, restitution
+    gap = 2.0                       # or [[scene.stops]] with side, gap, restitution; and
+                                    # [[scene.soft_stops]], the arguments of `SoftStop`
     crank = "slider"                # with crank_ratio; "cosine" by default
 
-    [start]                         # Y, V and, for a motor, W (and M); at rest if left out
+    [model]                         # instead: a machine of `vi_jax.machines`
+    name = "ImpactPair"
+    numbers = { half_gap = 2.0 }    # its arguments
+
+    [start]                         # Y, V and, for a motor, W (and M), or what the model's start
+                                    # takes; at rest if left out
     [method]                        # name = "draft", "standard", "reference", or "exact-flight",
                                     # "adaptive", "fixed-step" with solver, rtol, …
     [axes]                          # for scan: rows of values, as lists or as below
@@ -18,15 +24,22 @@ are the arguments of that function, and the files to write; what is left out is 
 """
 
 import dataclasses
+import importlib
+import inspect
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
 import diffrax
-from attrs import frozen
+from attrs import field, frozen
 
+from .. import machines
 from ..flow import AbstractMethod, Adaptive, ExactFlight, FixedStep
 from ..orbit import AbstractSearch, Gradient, Newton
 from ..scene import (
+    AbstractScene,
     DCMotor,
     IdealDrive,
     Motor,
@@ -35,6 +48,7 @@ from ..scene import (
     RigidStop,
     Scene,
     SliderCrank,
+    SoftStop,
 )
 from .toml import ConfigError as ConfigError
 from .toml import Row, given, in_terms_of, read_toml, unknown
@@ -85,6 +99,45 @@ class StopTable:
 
 
 @frozen(kw_only=True)
+class SoftStopTable:
+    """One `[[scene.soft_stops]]`: the arguments of `SoftStop`."""
+
+    gap: float
+    stiffness: float
+    restitution: float | None = None
+    damping: float | None = None
+    exponent: float | None = None
+    law: Literal["power", "hunt-crossley"] | None = None
+    prestress: float | None = None
+    adhesive: bool | None = None
+    side: Literal["right", "left"] = "right"
+
+
+@frozen(kw_only=True)
+class ModelTable:
+    """`[model]`: a ready machine by its name, and its numbers."""
+
+    name: str
+    numbers: dict[str, float] = field(factory=dict)
+
+    def build(self) -> AbstractScene:
+        """The machine."""
+        kinds = {name: x for name, x in vars(machines).items() if _is_machine(x)}
+        if self.name not in kinds:
+            raise ConfigError(unknown("machine", self.name, "[model]", sorted(kinds)))
+        known = list(inspect.signature(kinds[self.name]).parameters)
+        wrong = [name for name in self.numbers if name not in known]
+        if wrong:
+            raise ConfigError(*(unknown("number", x, "[model.numbers]", known) for x in wrong))
+        with in_terms_of("[model.numbers]"):
+            return kinds[self.name](**self.numbers)
+
+
+def _is_machine(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, AbstractScene)
+
+
+@frozen(kw_only=True)
 class MotorTable:
     """`[scene.motor]`: the numbers of `Motor`, or of `DCMotor` with `electrical_time`."""
 
@@ -111,27 +164,33 @@ class SceneTable:
     restitution: float = 0.5
     gap: float | None = None
     stops: tuple[StopTable, ...] | None = None
+    soft_stops: tuple[SoftStopTable, ...] = ()
     crank: Literal["cosine", "slider"] = "cosine"
     crank_ratio: float | None = None
     clock: Literal["phase", "time"] = "phase"
 
     def build(self) -> Scene:
-        """The scene; without `gap` and `stops` it has one stop on the right at gap 2."""
+        """The scene; without `gap` and stops it has one stop on the right at gap 2."""
         self._check()
         stops = []
         for i, stop in enumerate(self.stops or ()):
             bounce = self.restitution if stop.restitution is None else stop.restitution
             with in_terms_of(f"[[scene.stops]] number {i + 1}"):
                 stops.append(RigidStop(stop.gap, bounce, side=stop.side))
+        soft = []
+        for i, stop in enumerate(self.soft_stops):
+            with in_terms_of(f"[[scene.soft_stops]] number {i + 1}"):
+                soft.append(SoftStop(**given(stop)))
         with in_terms_of("[scene.motor]"):
             turning = None if self.motor is None else self.motor.build()
         with in_terms_of("[scene]"):
-            if self.stops is None:
+            if self.stops is None and (self.gap is not None or not soft):
                 stops = [RigidStop(2.0 if self.gap is None else self.gap, self.restitution)]
             return Scene(
                 oscillator=Oscillator(self.damping_ratio),
                 drive=turning or IdealDrive(self.frequency_ratio),
                 stops=tuple(stops),
+                soft_stops=tuple(soft),
                 clock_name=self.clock,
                 **({} if self.crank_ratio is None else {"crank": SliderCrank(self.crank_ratio)}),
             )
@@ -147,19 +206,14 @@ class SceneTable:
             raise ConfigError('`crank_ratio` in [scene] must stand beside crank = "slider"')
 
 
-@frozen(kw_only=True)
-class StartTable:
-    """`[start]` or a guess: a state on the section."""
-
-    Y: float = 0.0
-    V: float = 0.0
-    W: float | None = None
-    M: float | None = None
-
-    def build(self, scene: Scene, place: str) -> Any:
-        """The state, for this scene."""
-        with in_terms_of(place):
-            return scene.start(**given(self))
+def start_of(scene: AbstractScene, numbers: Mapping[str, float], place: str) -> Any:
+    """A state on the section, from `[start]` or a guess."""
+    known = list(inspect.signature(scene.start).parameters)
+    wrong = [unknown("key", name, place, known) for name in numbers if name not in known]
+    if wrong:
+        raise ConfigError(*wrong)
+    with in_terms_of(place):
+        return scene.start(**numbers)
 
 
 @frozen(kw_only=True)
@@ -259,7 +313,7 @@ class OrbitTable:
     """`[orbit]`."""
 
     cycles: int = 1
-    guess: StartTable | None = None
+    guess: dict[str, float] | None = None
     root_finder: Literal["newton", "gradient"] = "newton"
     tolerance: float | None = None
     max_steps: int | None = None
@@ -293,7 +347,8 @@ class Config:
 
     machine: MachineTable | None = None
     scene: SceneTable | None = None
-    start: StartTable | None = None
+    model: ModelTable | None = None
+    start: dict[str, float] | None = None
     method: MethodTable | None = None
     axes: dict[str, Row] | None = None
     scan: ScanTable | None = None
@@ -302,17 +357,53 @@ class Config:
     orbit: OrbitTable | None = None
     simulate: SimulateTable | None = None
 
-    def build(self) -> tuple[Scene, Any, AbstractMethod | str | None]:
+    own: AbstractScene | None = field(init=False, default=None)
+    """A machine that the command line names, not the file."""
+
+    def build(self) -> tuple[AbstractScene, Any, AbstractMethod | str | None]:
         """Scene, start and method; `None` for what the file leaves out."""
-        table = self.scene or self.machine
-        if table is None or (self.scene and self.machine):
-            many = "both" if table else "neither"
-            raise ConfigError(f"the file must hold [scene] or [machine], but holds {many}")
-        scene = table.build()
-        start = self.start and self.start.build(scene, "[start]")
+        names = [name for name in ("scene", "machine", "model") if getattr(self, name) is not None]
+        held = " and ".join(f"[{name}]" for name in names) or "none of them"
+        if self.own is not None and names:
+            raise ConfigError(
+                f"the file must not describe a machine beside --machine, but has {held}"
+            )
+        if self.own is None and len(names) != 1:
+            raise ConfigError(f"the file must hold [scene], [machine] or [model], but holds {held}")
+        scene = self.own or getattr(self, names[0]).build()
+        start = None if self.start is None else start_of(scene, self.start, "[start]")
         return scene, start, self.method and self.method.build()
 
 
-def read(path: str | Path) -> Config:
-    """Read a file. **Raises:** `ConfigError` that names every fault with its place."""
-    return read_toml(path, Config)
+def read(path: str | Path, *, machine: str | None = None) -> Config:
+    """Read a file; with `machine`, a name `package.module:function`, for the machine that this
+    function returns. **Raises:** `ConfigError` that names every fault with its place."""
+    config = read_toml(path, Config)
+    if machine is not None:
+        object.__setattr__(config, "own", _called(machine))
+    return config
+
+
+def _called(name: str) -> AbstractScene:
+    """The machine that a function of this name returns."""
+    module, _, function = name.partition(":")
+    if not module or not function:
+        raise ConfigError(f"--machine must be package.module:function, but is {name!r}")
+    try:
+        with _beside():
+            found = getattr(importlib.import_module(module), function)()
+    except (ImportError, AttributeError) as error:
+        raise ConfigError(f"--machine {name} cannot be found: {error}") from None
+    if not isinstance(found, AbstractScene):
+        raise ConfigError(f"--machine {name} must return a machine, but returned {found!r}")
+    return found
+
+
+@contextmanager
+def _beside() -> Iterator[None]:
+    """Modules of the folder in which the command is run can be imported, as by `python -m`."""
+    sys.path.insert(0, "")
+    try:
+        yield
+    finally:
+        sys.path.remove("")

@@ -62,7 +62,7 @@ def _run_file(options: argparse.Namespace) -> int:
     jax.config.update("jax_enable_x64", True)
     verb, store = options.command, None
     try:
-        config = read(options.file)
+        config = read(options.file, machine=options.machine)
         table = getattr(config, verb)
         if table is None:
             raise ConfigError(f"missing table [{verb}], which says what to do")
@@ -117,11 +117,17 @@ def _parser() -> argparse.ArgumentParser:
         verb = commands.add_parser(
             name,
             help=f"{about}, as a file says",
-            description=f"Does what FILE says: {about}. The file holds [scene] or [machine], if "
-            f"need be [start] and [method]{', [axes]' if name == 'scan' else ''}, and [{name}].",
+            description=f"Does what FILE says: {about}. The file holds [scene], [machine] or "
+            "[model], if need be [start] and [method]"
+            f"{', [axes]' if name == 'scan' else ''}, and [{name}].",
             epilog="; ".join(_keys(kind) for kind in tables),
         )
         verb.add_argument("file", metavar="FILE", help="a TOML file")
+        verb.add_argument(
+            "--machine",
+            metavar="MODULE:FUNCTION",
+            help="a function without arguments that returns the machine, instead of the file's",
+        )
     return parser
 
 

@@ -17,7 +17,6 @@ from matplotlib.figure import Figure
 from .._files import write_whole
 from .._parts import noted_interrupts, simulate_in_parts, sweep_in_parts
 from ..flow import RESULTS, Run
-from ..flow import simulate as run_motion
 from ..flow.results import number_of
 from ..orbit import Orbit, continue_orbit, find_orbit
 from ..plot import (
@@ -32,9 +31,9 @@ from ..plot.motion import BLUE, RED
 from ..scan import Sweep
 from ..scan import basins as find_basins
 from ..scan import scan as run_scan
-from ..scene import Scene
+from ..scene import AbstractScene
 from .checks import check_continuation, check_map, check_names, check_paths, check_range
-from .config import Config, OrbitTable, SimulateTable, SweepTable
+from .config import Config, OrbitTable, SimulateTable, SweepTable, start_of
 from .output import (
     axes_in_words,
     cycle_columns,
@@ -191,7 +190,7 @@ def orbit(config: Config, tell: Tell) -> Outcome:
         check_continuation(scene, table)
     guess = start
     if table.guess is not None:
-        guess = table.guess.build(scene, "`guess` in [orbit]")
+        guess = start_of(scene, table.guess, "`guess` in [orbit]")
     tell(f"searching a motion of {table.cycles} cycle{'' if table.cycles == 1 else 's'}")
     named = {"root_finder": "[orbit]", "method": "[method]", "guess": "[start]"}
     if table.guess is not None:
@@ -236,11 +235,7 @@ def _continued(found: Orbit, table: OrbitTable, tell: Tell) -> list[str]:
 def _portrait(found: Orbit) -> Axes:
     """The phase portrait of a periodic motion."""
     ax = new_axes()
-    run = run_motion(
-        found.scene, found.state, int(found.cycles), method=found.method, samples=128, impact_log=8
-    )
-    scene = found.scene
-    plot_phase_portrait(run, scene, ax=ax)
+    plot_phase_portrait(found.trajectory(), found.scene, ax=ax)
     return ax
 
 
@@ -267,7 +262,7 @@ def simulate(config: Config, tell: Tell) -> Outcome:
         return outcome
 
 
-def _describe_run(scene: Scene, run: Run, table: SimulateTable) -> Outcome:
+def _describe_run(scene: AbstractScene, run: Run, table: SimulateTable) -> Outcome:
     lines = [str(run)]
     if table.output is not None:
         columns = sample_columns(run.samples) if table.samples else cycle_columns(run)
