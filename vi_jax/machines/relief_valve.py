@@ -33,7 +33,7 @@ class ReliefValve(AutonomousMachine):
 
     and impacts on the seat at lift = 0 (Hős and Champneys, Physica D 241, 2012). Nothing drives it:
     a cycle ends where the lift is greatest (the speed falls through zero), and takes a time of its
-    own. Above q ≈ 8.2 (with the other numbers as they are by default) the open valve stands still,
+    own. Above q = 8.491 (with the other numbers as they are by default) the open valve stands still,
     and where it does there is no next cycle: observe it at equal times by `observed_every`.
 
     **Arguments:** `flow_rate` q, positive; `damping` κ, `precompression` δ of the spring, both not
