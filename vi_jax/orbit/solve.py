@@ -61,7 +61,8 @@ def problem_of(
     if blank.autonomous:
         period = float(orbit.duration)
     way = _followed(blank, orbit.state, found, period)
-    while not isinstance(scene, Scene):  # whose own steps are known to be enough
+    known = isinstance(scene, Scene) and not scene.soft_stops  # steps that are enough
+    while not known:
         finer = dataclasses.replace(blank, steps=2 * blank.steps)
         again = _followed(finer, orbit.state, found, period)
         apart = np.max(np.abs(again.states - way.states) / (1 + np.abs(again.states)))
