@@ -325,6 +325,31 @@ def dc_motor() -> Expected:
     }
 
 
+def relief_valve() -> Expected:
+    """The Hopf bifurcation by eigenvalues, the others from motions beside them."""
+
+    def growth(rate: float) -> float:
+        lift = brentq(lambda y: rate - y * np.sqrt(y + 10), 1e-9, 50)
+        root = np.sqrt(lift + 10)
+        jacobian = [[0, 1, 0], [-1, -1.25, 1], [-20 * root, 0, -10 * lift / root]]
+        return float(np.linalg.eigvals(np.array(jacobian)).real.max())
+
+    def special(rate: float, bounds: tuple[float, float]) -> vi.SpecialPoint:
+        valve = vi.machines.ReliefValve(flow_rate=rate)
+        settled = vi.simulate(valve, valve.start(), 1, settle=400).last
+        branch = vi.continue_orbit(
+            vi.find_orbit(valve, settled), parameter="flow_rate", bounds=bounds
+        )
+        return branch.special[0]
+
+    return {
+        "Hopf, q": (float(brentq(growth, 8.0, 9.0)), 1e-6),
+        "grazing, q": (special(7.8, (7.4, 7.9)).parameter, 1e-8),
+        "first doubling, q": (special(1.6, (1.2, 1.7)).parameter, 1e-8),
+        "second doubling, q": (special(5.8, (5.7, 6.2)).parameter, 1e-8),
+    }
+
+
 def sommerfeld() -> Expected:
     """Where the averaged κ = ζ + ε ξ ζ⁵/(τ0 D) turns; the motion's own folds lie beside it."""
     numbers: Expected = {}

@@ -158,6 +158,8 @@ class Follower:
                 continue
             if kind == FOLD and not both and not self._turns_back(here, at, last):
                 continue  # rounding: the tangent is ill-defined close to where branches cross
+            if self.problem.autonomous and float(at.seen.y_max - at.seen.y_min) < 10 * _STILL:
+                continue  # a motion about to shrink to rest has a multiplier 1 to rounding
             apart = self._halves(at)
             if kind in (FOLD, CROSSING) and apart.size and np.linalg.norm(apart) < _ALIKE:
                 continue  # where the branch springs both are zero; that is seen by the halves

@@ -1,0 +1,145 @@
+# %% [markdown]
+# # A relief valve, from rest to chatter
+#
+# A machine that nothing drives: its cycles end where the lift is greatest, and have lengths of
+# their own. Over the flow rate q the open valve loses its rest (Hopf), its oscillation touches the
+# seat (grazing), and chaos and windows follow (Hős and Champneys, Physica D 241, 2012). Branches
+# are followed through all of it, beside what 600 valves settle on.
+#
+# Run with `python experiments/studies/relief_valve.py` (`--quick` for fewer, writes nothing).
+
+# %%
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import vi_jax as vi
+from matplotlib.figure import Figure
+from scipy.optimize import brentq
+
+jax.config.update("jax_enable_x64", True)
+
+HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
+sys.path.insert(0, str(HERE.parent))
+from headlines import keep
+
+QUICK = "--quick" in sys.argv
+RATES = np.linspace(0.3, 8.48, 60 if QUICK else 600)
+SETTLE, SEEN = (100, 16) if QUICK else (600, 64)
+BOUNDS = (0.3, 9.0)
+
+# %% [markdown]
+# ## What valves settle on
+
+
+# %%
+def settled(rate):
+    valve = vi.machines.ReliefValve(flow_rate=rate)
+    run = vi.simulate(valve, valve.start(), SEEN, settle=SETTLE)
+    return run.sections.lift[1:], run.impacts, run.successful
+
+
+lifts, impacts, good = (np.asarray(x) for x in vi.jit(jax.vmap(settled))(jnp.asarray(RATES)))
+assert good.all()
+
+# %% [markdown]
+# ## Branches: the oscillation, the one that hits the seat, and those of twice the period
+
+
+# %%
+def followed(orbit: vi.Orbit) -> vi.Branch:
+    return vi.continue_orbit(orbit, parameter="flow_rate", bounds=BOUNDS)
+
+
+valve = vi.machines.ReliefValve(flow_rate=8.3)
+free = followed(vi.find_orbit(valve, vi.simulate(valve, valve.start(), 1, settle=400).last))
+graze = next(p for p in free.special if p.kind == "grazing")
+hopf = next(p for p in free.special if p.kind == "hopf")
+hitting = followed(graze.switch())
+doublings = [p for p in hitting.special if p.kind == "period-doubling"]
+doubled = [followed(p.switch()) for p in doublings]
+
+
+def growth(rate: float) -> float:
+    """The greatest real part of the eigenvalues of the open valve at rest."""
+    lift = brentq(lambda y: rate - y * np.sqrt(y + 10), 1e-9, 50)
+    root = np.sqrt(lift + 10)
+    jacobian = [[0, 1, 0], [-1, -1.25, 1], [-20 * root, 0, -10 * lift / root]]
+    return float(np.linalg.eigvals(np.array(jacobian)).real.max())
+
+
+rest_lost = float(brentq(growth, 8.0, 9.0, xtol=1e-12))
+
+# %% [markdown]
+# ## Table and figure
+
+# %%
+rows = ["| q | what happens | period, in maxima of the lift | duration |", "|---|---|---|---|"]
+for branch in (free, hitting, *doubled):
+    for point in branch.special:
+        rows.append(
+            f"| {point.parameter:.9f} | {point.kind}: {point.detail} | {branch.cycles} | "
+            f"{float(point.orbit.duration):.6f} |"
+        )
+table = "\n".join(rows)
+print(table)
+
+figure = Figure(figsize=(11, 5.4), layout="constrained")
+upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
+upper.plot(np.repeat(RATES, SEEN), lifts.ravel(), ",", color="0.45", rasterized=True)
+upper.plot([], [], ".", color="0.45", ms=3, label="what valves settle on")
+colors = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
+names = ("without impact", "one impact", "twice the period", None)
+for branch, color, name in zip((free, hitting, *doubled), colors, names, strict=False):
+    for stable, style in ((True, "-"), (False, "--")):
+        shown = np.where(branch.stable == stable, branch.y_max, np.nan)
+        upper.plot(
+            branch.parameter, shown, style, color=color, lw=1.3, label=name if stable else None
+        )
+marks = {"hopf": ("D", "Hopf"), "grazing": ("^", "grazing"), "period-doubling": ("s", "doubling")}
+seen = set()
+for branch in (free, hitting, *doubled):
+    for point in branch.special:
+        marker, word = marks.get(point.kind, ("o", point.kind))
+        label = None if word in seen else word
+        seen.add(word)
+        upper.plot(
+            point.parameter, float(point.orbit.y_max), marker, color="k", ms=5, mfc="w", label=label
+        )
+upper.set_ylabel("lift at its maxima")
+upper.legend(frameon=False, fontsize=9, ncols=2, loc="upper left")
+lower.plot(RATES, impacts.mean(axis=1), ".", color="0.3", ms=2.5)
+lower.set(xlabel="flow rate q", ylabel="impacts in a cycle", xlim=(0, 9))
+for ax in (upper, lower):
+    ax.spines[["top", "right"]].set_visible(False)
+
+# %%
+text = f"""# A relief valve, from rest to chatter
+
+κ = 1.25, δ = 10, β = 20, r = 0.8, the setting of Hős and Champneys (Physica D 241, 2012). Grey:
+the lift at its maxima, {SEEN} of them after {SETTLE}, for {len(RATES)} flow rates q from
+{RATES[0]:g} to {RATES[-1]:g}, all from one start. Lines: the greatest lift of periodic motions,
+broken where they are unstable.
+
+![Lift and impacts over the flow rate](../figures/relief_valve.png)
+
+- **Rest is lost** in a Hopf bifurcation at q = {hopf.parameter:.9f}, where the branch shrinks to
+  nothing; the eigenvalues of the linearised valve say {rest_lost:.9f}.
+- **The seat is touched** at q = {graze.parameter:.9f}. The motion without impact, stable up to
+  there, ends; that with one impact begins in the other direction and is unstable at once, one of
+  its multipliers growing beyond all bounds like 1/V⁻: what is left is chaos.
+- **Below, one impact a cycle** is stable between the period doublings at
+  q = {min(p.parameter for p in doublings):.9f} and {max(p.parameter for p in doublings):.9f}.
+
+{table}
+"""
+numbers = {
+    "Hopf, q": hopf.parameter,
+    "grazing, q": graze.parameter,
+    "first doubling, q": min(p.parameter for p in doublings),
+    "second doubling, q": max(p.parameter for p in doublings),
+}
+if not QUICK:
+    keep(HERE, "relief_valve", text, numbers, figure)
