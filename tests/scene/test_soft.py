@@ -1,0 +1,331 @@
+"""Compliant stops: restitution in closed form, SciPy beside every law, the rigid limit."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+from scipy.integrate import solve_ivp
+
+CLOSE = vi.Adaptive(rtol=1e-13, atol=1e-15)
+
+
+class Body(eqx.Module):
+    Y: jax.Array
+    V: jax.Array
+
+
+class Thrown(vi.AbstractScene):
+    """A body on which nothing acts but its stop."""
+
+    stop: vi.SoftStop
+    length: jax.Array
+    stops: tuple = ()
+
+    @property
+    def switches(self):
+        return (self.stop,)
+
+    @property
+    def cycle(self):
+        return self.length
+
+    def field(self, s, state, mode):
+        return Body(state.V, self.stop.push(self, state, mode))
+
+    def step_limit(self, s, state):
+        return jnp.minimum(self.length / 5, self.stop.longest_step(self, state))
+
+
+def thrown(stop, speed, length, **options):
+    """The run of a body that starts from zero."""
+    options = {"method": CLOSE, **options}
+    start = Body(jnp.zeros_like(speed), speed)
+    return vi.simulate(Thrown(stop, length), start, 1, **options)
+
+
+@pytest.mark.parametrize("exponent", [1.0, 1.5, 2.0])
+@pytest.mark.parametrize("restitution", [0.5, 0.7, 0.9])
+def test_restitution_does_not_depend_on_the_speed(exponent, restitution):
+    speed = 10.0 ** np.arange(-3.0, 4.0)
+    stop = vi.SoftStop(0.5, 100.0, restitution=restitution, exponent=exponent)
+
+    def left(v):
+        run = thrown(stop, v, jnp.maximum(3.0, 2.0 / v))
+        return -run.last.V / v, run.successful
+
+    found, good = vi.jit(jax.vmap(left))(jnp.asarray(speed))
+    assert bool(good.all())
+    np.testing.assert_allclose(found, restitution, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("exponent", "damping"), [(1.0, 0.43090752), (1.5, 0.48176926), (2.0, 0.52775178)]
+)
+def test_damping_that_belongs_to_a_restitution_of_one_half(exponent, damping):
+    stop = vi.SoftStop(0.0, 1.0, restitution=0.5, exponent=exponent)
+    assert float(stop.damping) == pytest.approx(damping, abs=5e-9)
+
+
+LAWS = [
+    {"damping": 1.2},
+    {"damping": 1.2, "exponent": 1.5},
+    {"damping": 0.6, "law": "hunt-crossley", "exponent": 1.5},
+    {"damping": 0.6, "law": "hunt-crossley"},
+    {"damping": 0.8, "prestress": 3.0},
+    {"damping": 0.4, "prestress": 3.0, "exponent": 2.0},
+    {"damping": 2.0, "law": "hunt-crossley", "exponent": 1.5, "prestress": 1.0},
+    {"exponent": 2.5},
+]
+
+
+def force(depth, rate, stiffness, *, damping=0.0, exponent=1.0, law="power", prestress=0.0):
+    """The laws, written out again."""
+    depth = max(depth, 0.0)
+    spring = stiffness * depth**exponent
+    if law == "power":
+        resist = damping * np.sqrt(stiffness) * depth ** (0.5 * (exponent - 1)) * rate
+    else:
+        resist = damping * spring * rate
+    return prestress + spring + resist
+
+
+class Contact:
+    """A stop for `solve_ivp`: its force, and the event that ends its mode."""
+
+    def __init__(self, gap, stiffness, sign, adhesive, law):
+        self.gap, self.stiffness, self.sign, self.law = gap, stiffness, sign, law
+        self.adhesive, self.mode, self.changes = adhesive, "apart", 0
+
+    def seen(self, x):
+        return self.sign * x[0] - self.gap, self.sign * x[1]
+
+    def push(self, x):
+        touching = self.mode == "touching"
+        return -self.sign * force(*self.seen(x), self.stiffness, **self.law) if touching else 0.0
+
+    def event(self):
+        def ends(t, x):
+            depth = self.seen(x)[0]
+            if self.mode == "apart":
+                return depth
+            if self.adhesive or (self.mode == "touching" and depth < 1e-9):
+                return -depth
+            pushes = force(*self.seen(x), self.stiffness, **self.law)
+            return max(-pushes if self.mode == "touching" else pushes, -depth)
+
+        ends.terminal, ends.direction = True, 1
+        return ends
+
+    def change(self, x):
+        self.changes += 1
+        inside = self.seen(x)[0] > 1e-9
+        if self.mode == "apart" or (self.mode == "released" and inside):
+            self.mode = "touching"
+        else:
+            self.mode = "released" if inside else "apart"
+
+
+def integrated(rate, x, contacts, duration, *, ends=None, max_step=0.05):
+    """The state after a duration, or where the event `ends` happens, by SciPy's DOP853."""
+    t, x = 0.0, np.array(x, float)
+    while t < duration - 1e-14:
+        events = [c.event() for c in contacts] + ([ends] if ends else [])
+        found = solve_ivp(
+            rate, (t, duration), x, method="DOP853", rtol=1e-13, atol=1e-14, events=events,
+            max_step=max_step,
+        )  # fmt: skip
+        t, x = found.t[-1], found.y[:, -1]
+        if ends and found.t_events[-1].size:
+            break
+        for contact, hit in zip(contacts, found.t_events, strict=False):
+            if hit.size:
+                contact.change(x)
+    return x
+
+
+@pytest.mark.parametrize("law", LAWS, ids=str)
+@pytest.mark.parametrize("adhesive", [True, False])
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_a_law_beside_scipy(law, adhesive, side):
+    sign = 1 if side == "right" else -1
+    stop = vi.SoftStop(0.5, 100.0, adhesive=adhesive, side=side, **law)
+    speeds = np.array([0.2, 1.0, 5.0])
+    run = vi.jit(jax.vmap(lambda v: thrown(stop, sign * v, 0.5 / v + 3.0)))(jnp.asarray(speeds))
+    assert bool(run.successful.all())
+    for i, v in enumerate(speeds):
+        contact = Contact(0.5, 100.0, sign, adhesive, law)
+        wanted = integrated(
+            lambda t, x, c=contact: [x[1], c.push(x)], [0.0, sign * v], [contact], 0.5 / v + 3.0,
+            max_step=0.02 / max(1.0, v),
+        )  # fmt: skip
+        found = [run.last.Y[i], run.last.V[i]]
+        np.testing.assert_allclose(found, wanted, atol=1e-8 * max(1, v))
+        assert contact.changes >= 2
+        if law.get("damping", 0) == 0:
+            assert float(run.last.V[i]) == pytest.approx(-sign * v, abs=1e-10)
+
+
+def test_restitution_of_hunt_and_crossley_falls_with_the_speed():
+    stop = vi.SoftStop(0.5, 100.0, damping=0.5, law="hunt-crossley", exponent=1.5)
+    speeds = jnp.asarray([0.01, 0.1, 1.0, 10.0])
+    run = vi.jit(jax.vmap(lambda v: thrown(stop, v, 3.0 / v)))(speeds)
+    kept = np.asarray(-run.last.V / speeds)
+    assert (np.diff(kept) < 0).all()
+    # For slow impacts 1 - e = 2/3 α v (Hunt and Crossley, Journal of Applied Mechanics 42, 1975).
+    assert 1 - kept[0] == pytest.approx(2 / 3 * 0.5 * 0.01, rel=0.01)
+
+
+XI, ZETA = 0.05, 0.8
+MOTOR = {"tau0": 0.9, "kappa": 1.1, "epsilon": 0.15, "mu": 0.1, "w0": 1.0}
+
+
+def shaken(t, x, contacts):
+    return np.cos(ZETA * t) - x[0] - 2 * XI * x[1] + sum(c.push(x) for c in contacts)
+
+
+def motor_driven(t, x, contacts):
+    m, c, s = MOTOR, np.cos(x[3]), np.sin(x[3])
+    torque = m["tau0"] * (m["kappa"] - x[2] / m["w0"]) - m["epsilon"] * s * (x[0] - c)
+    torque -= m["mu"] * s * c * x[2] ** 2
+    pull = c - x[0] - 2 * XI * x[1] + sum(contact.push(x) for contact in contacts)
+    return [x[1], pull, torque / (1 + m["mu"] * s * s), x[2]]
+
+
+@pytest.mark.parametrize("drive", ["ideal", "motor"])
+@pytest.mark.parametrize(
+    ("adhesive", "law"),
+    [(True, {"damping": 0.4}), (False, {"damping": 0.5, "exponent": 1.5}),
+     (False, {"damping": 0.3, "prestress": 0.2})],
+)  # fmt: skip
+def test_a_scene_with_two_compliant_stops(drive, adhesive, law):
+    stops = (
+        vi.SoftStop(0.6, 80.0, adhesive=adhesive, **law),
+        vi.SoftStop(0.9, 40.0, adhesive=adhesive, side="left", **law),
+    )
+    contacts = [Contact(0.6, 80.0, 1, adhesive, law), Contact(0.9, 40.0, -1, adhesive, law)]
+    cycles = 3
+    if drive == "ideal":
+        turning = vi.IdealDrive(ZETA)
+        x = integrated(
+            lambda t, x: [x[1], shaken(t, x, contacts)], [0.1, 0.4], contacts,
+            2 * np.pi * cycles / ZETA,
+        )  # fmt: skip
+    else:
+        m = MOTOR
+        turning = vi.Motor(
+            strength=m["tau0"], control=m["kappa"], coupling=m["epsilon"], slider_inertia=m["mu"],
+            no_load_speed=m["w0"],
+        )  # fmt: skip
+
+        def turned(t, x):
+            return x[3] - 2 * np.pi * cycles
+
+        turned.terminal = True
+        x = integrated(
+            lambda t, x: motor_driven(t, x, contacts), [0.1, 0.4, 1.0, 0.0], contacts, 100.0,
+            ends=turned,
+        )  # fmt: skip
+    assert sum(c.changes for c in contacts) >= 6
+    scene = vi.Scene(oscillator=vi.Oscillator(XI), drive=turning, soft_stops=stops)
+    given = {"W": 1.0} if drive == "motor" else {}
+    for clock in ("phase", "time"):
+        run = vi.simulate(
+            scene, scene.start(Y=0.1, V=0.4, **given), cycles, clock=clock,
+            method=vi.Adaptive(rtol=1e-12),
+        )  # fmt: skip
+        found = jax.tree.leaves(run.last)[: 2 if drive == "ideal" else 3]
+        np.testing.assert_allclose(found, x[: len(found)], atol=1e-8)
+        assert int(run.impacts.sum()) == 0
+
+
+def scene_of(stiffness, **options):
+    options = {"restitution": 0.5, "exponent": 1.0, **options}
+    return vi.Scene(
+        oscillator=vi.Oscillator(0.0),
+        drive=vi.IdealDrive(0.9),
+        soft_stops=(vi.SoftStop(0.7, stiffness, **options),),
+    )
+
+
+def test_a_stiff_stop_is_a_rigid_one():
+    """The time in contact falls with K^-½, and so does what it makes of the motion."""
+    rigid = vi.Scene(
+        oscillator=vi.Oscillator(0.0), drive=vi.IdealDrive(0.9), stops=(vi.RigidStop(0.7, 0.5),)
+    )
+    start = rigid.start(Y=0.2, V=0.3)
+    limit = vi.simulate(rigid, start, 1, method="reference")
+    assert int(limit.impacts[0]) >= 1
+    stiffness = 10.0 ** np.arange(3, 8)
+
+    def last(stiffness):
+        return vi.simulate(scene_of(stiffness), start, 1, method=vi.Adaptive(rtol=1e-11)).last
+
+    found = vi.jit(jax.vmap(last))(jnp.asarray(stiffness))
+    away = np.hypot(found.Y - limit.last.Y, found.V - limit.last.V)
+    slope = np.diff(np.log10(away))
+    np.testing.assert_allclose(slope[1:], -0.5, atol=0.02)
+    # Many lanes are the one, taken one after the other.
+    for i in (0, 4):
+        alone = last(jnp.asarray(stiffness[i]))
+        np.testing.assert_allclose([alone.Y, alone.V], [found.Y[i], found.V[i]], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("options", "method"),
+    [({}, vi.FixedStep(steps_per_cycle=48)),
+     ({"exponent": 1.5, "adhesive": False}, vi.Adaptive(rtol=1e-12))],
+    ids=["spring", "Hertz"],
+)  # fmt: skip
+def test_derivatives_through_a_contact(options, method):
+    def last(x, **more):
+        gap, stiffness, restitution, speed = x
+        options_ = {**options, "restitution": restitution}
+        scene = eqx.tree_at(lambda s: s.soft_stops[0].gap, scene_of(stiffness, **options_), gap)
+        run = vi.simulate(scene, scene.start(Y=0.2, V=speed), 1, method=method, **more)
+        return run.last.Y + 2 * run.last.V
+
+    at = jnp.asarray([0.7, 60.0, 0.5, 0.3])
+    simulated, h = vi.jit(last), 1e-6 * np.array([1, 60, 1, 1])
+    slope = [
+        (simulated(at.at[i].add(h[i])) - simulated(at.at[i].add(-h[i]))) / (2 * h[i])
+        for i in range(4)
+    ]
+    forward = vi.jit(jax.jacfwd(last))(at)
+    np.testing.assert_allclose(forward, slope, rtol=1e-6, atol=1e-7)
+    backward = vi.jit(jax.grad(lambda x: last(x, adjoint="reverse", max_steps=300)))(at)
+    np.testing.assert_allclose(backward, forward, rtol=1e-9, atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        ({"gap": float("inf")}, "`gap`"),
+        ({"stiffness": 0.0}, "`stiffness`"),
+        ({"stiffness": -1.0}, "`stiffness`"),
+        ({"damping": -0.1}, "`damping`"),
+        ({"restitution": 0.0}, "`restitution`"),
+        ({"restitution": 1.1}, "`restitution`"),
+        ({"restitution": 0.5, "damping": 0.1}, "`restitution` must be given without `damping`"),
+        ({"restitution": 0.5, "law": "hunt-crossley"}, "`restitution` must be given"),
+        ({"exponent": 0.5}, "`exponent`"),
+        ({"law": "hertz"}, "`law`"),
+        ({"prestress": -1.0}, "`prestress`"),
+        ({"side": "up"}, "`side`"),
+        ({"coordinate": -1}, "`coordinate`"),
+    ],
+)
+def test_wrong_arguments_are_named(arguments, told):
+    with pytest.raises(ValueError, match=told):
+        vi.SoftStop(**{"gap": 1.0, "stiffness": 10.0, **arguments})
+
+
+def test_a_scene_takes_no_other_kinds_among_its_compliant_stops():
+    with pytest.raises(TypeError, match="`soft_stops`"):
+        vi.Scene(vi.Oscillator(), vi.IdealDrive(1.0), soft_stops=(vi.RigidStop(1.0, 0.5),))
+    with pytest.raises(TypeError, match="`stops`"):
+        vi.Scene(vi.Oscillator(), vi.IdealDrive(1.0), stops=(vi.SoftStop(1.0, 10.0),))
+    with pytest.raises(ValueError, match="ExactFlight"):
+        scene = scene_of(50.0)
+        vi.simulate(scene, scene.start(), 1, method=vi.ExactFlight())
