@@ -9,6 +9,8 @@ import jax.tree_util as jtu
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
+from ..scene.numbers import by_name
+
 
 class RESULTS(eqx.Enumeration):
     """Why a lane ended; `simulate` gives one to each."""
@@ -176,7 +178,7 @@ class Run(eqx.Module):
         cycles = self.impacts.shape[-1]
         lines = [f"Run of {cycles} cycles, {int(jnp.sum(self.impacts))} impacts"]
         last = ", ".join(
-            f"{name} = {float(value[-1]):.9g}" for name, value in vars(self.sections).items()
+            f"{name} = {float(value[-1]):.9g}" for name, value in by_name(self.sections).items()
         )
         lines.append(f"  last section: {last}")
         if self.y_min is not None and self.y_max is not None:

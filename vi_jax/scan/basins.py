@@ -1,6 +1,5 @@
 """`basins`: which start goes to which motion, the motions found on the way."""
 
-import dataclasses
 import math
 import warnings
 from collections.abc import Callable, Mapping
@@ -17,6 +16,7 @@ from ..flow import simulate
 from ..flow.choice import MethodLike, chosen
 from ..orbit.results import impacts_in_words
 from ..scene import AbstractScene
+from ..scene.numbers import by_name, with_leaf
 from .grid import axes_of
 from .job import START
 from .measures import AbstractMeasure, Regime
@@ -89,7 +89,7 @@ class _Mark(AbstractMeasure):
 
     def __call__(self, scene, run):
         """Of one lane."""
-        states = {name: x[-self.longest :] for name, x in vars(run.sections).items()}
+        states = {name: x[-self.longest :] for name, x in by_name(run.sections).items()}
         highest = jnp.argmax(jax.vmap(scene.position)(run.sections)[-self.longest :])
         return {name: x[highest] for name, x in states.items()}
 
@@ -172,17 +172,19 @@ def basins(
         )  # fmt: skip
     if start is None:
         start = scene.start()
-    names = [field.name for field in dataclasses.fields(start)]
+    names = list(by_name(start))
     period = np.asarray(data["period"]).ravel()
     impacts = np.asarray(data["impacts"]).ravel()
     states = np.stack([np.asarray(data[name]).ravel() for name in names], axis=1)
 
     def followed(state: np.ndarray, cycles: int) -> np.ndarray:
-        parts = dict(zip(names, map(jnp.asarray, state), strict=True))
+        begin = start
+        for name, value in zip(names, state, strict=True):
+            begin = with_leaf(begin, name, value)
         # Always as many cycles, so that another period is not another program.
-        run = simulate(scene, dataclasses.replace(start, **parts), longest, method=method)
+        run = simulate(scene, begin, longest, method=method)
         return np.stack(
-            [np.asarray(x)[1 : cycles + 1] for x in vars(run.sections).values()], axis=1
+            [np.asarray(x)[1 : cycles + 1] for x in by_name(run.sections).values()], axis=1
         )
 
     label, motions = _sorted_out(period, states, apart, followed)

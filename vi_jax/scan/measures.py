@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool
 from .._checks import count, require
 from ..flow import AbstractMethod, Run
 from ..scene import AbstractScene
+from ..scene.numbers import by_name
 from .lyapunov import lyapunov
 from .regime import REGIMES, flags, impacts_of, least_period
 
@@ -130,7 +131,7 @@ class Sections(AbstractMeasure):
 
     def __call__(self, scene, run):
         """Of one lane, arrays of shape (number,)."""
-        return {name: x[-self.number :] for name, x in vars(run.sections).items()}
+        return {name: x[-self.number :] for name, x in by_name(run.sections).items()}
 
 
 class ImpactRate(AbstractMeasure):
@@ -235,7 +236,7 @@ class Regime(AbstractMeasure):
 
     def __call__(self, scene, run):
         """Of one lane; chaos is not yet looked for."""
-        sections = {name: x[1:] for name, x in vars(run.sections).items()}
+        sections = {name: x[1:] for name, x in by_name(run.sections).items()}
         period = least_period(sections, longest=self.longest, tolerance=self.tolerance)
         return {
             "period": jnp.where(run.successful, period, REGIMES.failed).astype(jnp.int16),

@@ -11,12 +11,18 @@ from jaxtyping import Array, Float
 
 def leaf_names(tree: Any) -> list[str]:
     """Names of all numbers in a scene (or another pytree), in the order of its leaves."""
-    return [name for name, _ in _named(tree)]
+    return list(by_name(tree))
+
+
+def by_name(tree: Any) -> dict[str, Any]:
+    """All numbers of a scene, a state or another pytree by their names, in the order of its
+    leaves."""
+    return dict(_named(tree))
 
 
 def leaf(tree: Any, name: str) -> Float[Array, "..."]:
     """The number of that name. **Raises:** `ValueError` that lists the near names."""
-    return dict(_named(tree))[check_leaf(tree, name)]
+    return by_name(tree)[check_leaf(tree, name)]
 
 
 def with_leaf(tree: Any, name: str, value: Any) -> Any:
@@ -60,6 +66,14 @@ def _named(tree: Any) -> list[tuple[str, Any]]:
     named = []
     for path, value in jtu.tree_leaves_with_path(tree):
         if eqx.is_array_like(value):
-            words = (str(getattr(key, "name", getattr(key, "idx", key))) for key in path)
+            words = (str(_word(key)) for key in path)
             named.append((".".join(words), value))
     return named
+
+
+def _word(key: Any) -> Any:
+    """Of an attribute, an index or a key."""
+    for kind in ("name", "idx", "key"):
+        if hasattr(key, kind):
+            return getattr(key, kind)
+    return key
