@@ -141,7 +141,8 @@ def _arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Fl
             turned = jnp.where(v == 0, along, jnp.sign(v))
             # At a turn the sign of the velocity is rounding's.
             away = -along
-            if plan.scene.switches or plan.scene.section(lane.state) is not None:
+            several = plan.scene.switches or len(trial.paths) > 1
+            if several or plan.scene.section(lane.state) is not None:
                 # Where a turn is another event too, it may have been met before.
                 met_before = lane.target != to_turn_of(k)
                 away = jnp.where(met_before, stop_gradient(jnp.sign(trial.paths[k].end.a)), away)

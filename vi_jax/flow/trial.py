@@ -158,6 +158,8 @@ def _path(
     end = rates(free.field, position, s1, new)
     met = jnp.abs(to_turn(end)) <= _turn_tolerance(h) * _leniency(lane)
     aimed = lane.target == to_turn_of(k)
+    for j in range(len(plan.scene.coordinates)):  # several may turn at once
+        aimed = aimed if j == k else aimed | (lane.target == to_turn_of(j))
     if plan.scene.switches:  # such an event may be a turning point as well
         aimed = aimed | (lane.target >= to_switch(0))
     if plan.scene.section(lane.state) is not None:
@@ -184,6 +186,8 @@ class _Guard(NamedTuple):
     end: Rates
     scale: Any
     """Of g, for its rounding."""
+    coordinate: int | None = None
+    """That a stop limits."""
 
 
 def _stops(scene: AbstractScene, paths: list[Path]) -> list[_Guard]:
@@ -191,7 +195,8 @@ def _stops(scene: AbstractScene, paths: list[Path]) -> list[_Guard]:
     for i, stop in enumerate(scene.stops):
         path = paths[stop.coordinate]
         begin, end = (x.scaled(stop.sign, stop.gap) for x in (path.begin, path.end))
-        found.append(_Guard(to_stop(i), "stop", i, begin, end, 1 + jnp.abs(stop.gap)))
+        scale = 1 + jnp.abs(stop.gap)
+        found.append(_Guard(to_stop(i), "stop", i, begin, end, scale, stop.coordinate))
     return found
 
 
@@ -262,8 +267,10 @@ def _seen(
     eps = float(jnp.finfo(h.dtype).eps)
     for other in all_of_them:
         if other.name != name:  # what lies beyond another event was not reached
-            # Events of different kinds may come together: then one is met after the other.
-            slack = 0.0 if other.kind == guard.kind == "stop" else 16 * eps * other.scale
+            # Events may come together, but for the stops of one coordinate: then one is met after
+            # the other.
+            alone = guard.coordinate is not None and guard.coordinate == other.coordinate
+            slack = 0.0 if alone else 16 * eps * other.scale
             aimed = aimed & (other.end.x <= slack)
     offset, square = landing(end)
     size = stop_gradient(jnp.abs(offset))
