@@ -1,4 +1,5 @@
-"""The command line: `vi-jax reproduce`, and `vi-jax VERB FILE.toml` for what a file asks."""
+"""The command line: `vi-jax reproduce`, `vi-jax explore`, and `vi-jax VERB FILE.toml` for what a
+file asks."""
 
 import argparse
 import sys
@@ -8,6 +9,7 @@ from io import TextIOWrapper
 import jax
 
 from .._checks import unwritable
+from ..explore.serve import missing, serve
 from ..paper.report import reproduce, summary
 from .config import (
     BasinsTable,
@@ -38,6 +40,8 @@ def main(argv: list[str] | None = None) -> int:
     options = _parser().parse_args(argv)
     if options.command == "reproduce":
         return _reproduce(options)
+    if options.command == "explore":
+        return _explore(options)
     return _run_file(options)
 
 
@@ -54,6 +58,23 @@ def _reproduce(options: argparse.Namespace) -> int:
     except OSError as error:
         return _error(error, 1)
     print(summary(found))
+    return 0
+
+
+def _explore(options: argparse.Namespace) -> int:
+    if not 0 <= options.port <= 65535:
+        return _error(f"argument --port must be between 0 and 65535, but is {options.port}", 2)
+    problem = missing()
+    if problem:
+        return _error(problem, 1)
+    jax.config.update("jax_enable_x64", True)
+    jax.config.update("jax_platforms", "cpu")  # the fastest for one motion
+    try:
+        serve(options.host, options.port, browser=options.browser, tell=_tell)
+    except KeyboardInterrupt:
+        pass
+    except OSError as error:
+        return _error(f"cannot serve {options.host} port {options.port}: {error.strerror}", 1)
     return 0
 
 
@@ -112,6 +133,20 @@ def _parser() -> argparse.ArgumentParser:
     )
     verb.add_argument(
         "--quick", action="store_true", help="60 cycles instead of 200, and fewer samples"
+    )
+    verb = commands.add_parser(
+        "explore",
+        help="open a page with sliders, on which motions are seen at once",
+        description="Serves a page with sliders for the numbers of the machine and its start: "
+        "motions, phase portraits, impact maps, regimes, multipliers, bifurcation diagrams, and "
+        "a motor. Ctrl-C ends it.",
+    )
+    verb.add_argument("--host", default="127.0.0.1", help="address to listen at (%(default)s)")
+    verb.add_argument(
+        "--port", type=int, default=8417, help="port to listen at; 0 is any free one (%(default)s)"
+    )
+    verb.add_argument(
+        "--no-browser", dest="browser", action="store_false", help="do not open a browser"
     )
     for name, (about, tables) in _ABOUT.items():
         verb = commands.add_parser(

@@ -1,0 +1,1 @@
+"""A page with sliders on which motions are seen at once: `vi-jax explore`."""

@@ -1,0 +1,178 @@
+"""What the page shows of one motion: its course, its impacts, its regime and its multipliers.
+
+Every number of the scene and of the start is traced, so that no other value is another program.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+
+from .._programs import compiled
+from ..flow import RESULTS, Run, simulate
+from ..flow.choice import chosen
+from ..orbit import STABILITY
+from ..orbit.cycle_map import cycle_map
+from ..orbit.floquet import stability_of
+from ..orbit.results import impacts_in_words
+from ..plot.path import MotionPath, motion_path
+from ..scan import REGIMES, lyapunov
+from ..scan.measures import Regime
+from ..scan.sweep import taken_along
+from ..scene import AbstractScene
+
+WINDOW = 8
+"""Drive cycles drawn as a motion."""
+
+OBSERVED = 256
+"""Drive cycles observed for the maps, the regime and the multipliers."""
+
+_REGIME = Regime(longest=32, observed=128, lasting=0)
+
+# Samples of a cycle; impacts of one that are drawn, and that enter the impact map.
+_SAMPLES, _DRAWN, _MAPPED = 48, 8, 4
+
+# Multipliers so near to 1 in size, or to the real axis, cannot be told from those on it.
+_NEUTRAL = 1e-7
+
+# Steps beyond which a motion is given up, so that no slider waits for long.
+_MOST_STEPS = 400_000
+
+
+class Motion(NamedTuple):
+    """One motion as NumPy arrays and words."""
+
+    path: MotionPath
+    """The motion over `WINDOW` cycles, the impacts put in."""
+    sections: Any
+    """Section states of all cycles observed, a state of NumPy arrays."""
+    impact_phase: np.ndarray
+    """Crank angle of each impact observed (radians)."""
+    impact_speed: np.ndarray
+    """Speed V⁻ of each."""
+    frequency_ratio: np.ndarray
+    """ζ of each cycle observed."""
+    extremes: tuple[float, float]
+    """Smallest and greatest Y over the cycles observed."""
+    period: int
+    """Period in drive cycles, or one of `REGIMES`."""
+    impacts: float
+    """Impacts in a period; in a cycle, on average, where there is no period."""
+    multipliers: np.ndarray
+    """Floquet multipliers, the greatest first; none where there is no period."""
+    exponent: float
+    """Greatest Lyapunov exponent where there is no period, else NaN."""
+    fault: str
+    """Why it could not be simulated; empty if it could."""
+
+    @property
+    def regime(self) -> str:
+        """The regime in words."""
+        if self.period > 0:
+            impacts = impacts_in_words(round(self.impacts))
+            return f"period {2 * self.period}π with {impacts}"
+        kinds: dict[int, str] = {regime: regime.meaning for regime in REGIMES}
+        if self.period == REGIMES.failed:
+            return kinds[self.period]
+        kind = kinds[self.period]
+        if self.period == REGIMES.unsettled:
+            kind = f"no period up to {2 * _REGIME.longest}π: still settling, or quasi-periodic"
+        return f"{kind}, {self.impacts:.2f} impacts in a cycle"
+
+    @property
+    def stability(self) -> str:
+        """The multipliers in words, or the exponent."""
+        if self.period <= 0:
+            return f"greatest Lyapunov exponent {self.exponent:.4f} ω" if not self.fault else ""
+        if not np.isfinite(self.multipliers).all():
+            return "no multipliers: an impact falls on the section"
+        verdict = STABILITY[stability_of(jnp.asarray(self.multipliers))]
+        if abs(abs(self.multipliers[0]) - 1) < _NEUTRAL:
+            verdict = "neither stable nor unstable to rounding"
+        return f"multipliers {', '.join(map(_complex, self.multipliers))}: {verdict}"
+
+
+def _complex(number: complex) -> str:
+    if abs(number.imag) < _NEUTRAL * abs(number):
+        return f"{number.real:.4g}"
+    return f"{number.real:.4g} {'-' if number.imag < 0 else '+'} {abs(number.imag):.4g}i"
+
+
+def look(scene: AbstractScene, start: Any, settle: int = 1000) -> Motion:
+    """The motion of a scene after `settle` cycles, by its standard method.
+
+    A start beyond a stop is put on it.
+    """
+    run, window, found, monodromy = _seen(scene, start, jnp.asarray(float(settle)))
+    period = int(found["period"])
+    exponent = np.nan
+    if period == REGIMES.unsettled:
+        exponent = float(_exponent(scene, run.last))
+        if exponent > _REGIME.threshold:
+            period = int(REGIMES.chaotic)
+    multipliers = np.empty(0, complex)
+    if period > 0:
+        matrix = np.asarray(monodromy)
+        multipliers = np.full(len(matrix), complex(np.nan))
+        if np.isfinite(matrix).all():
+            multipliers = np.linalg.eigvals(matrix).astype(complex)
+            multipliers = multipliers[np.argsort(-abs(multipliers), kind="stable")]
+    log = run.impact_log
+    assert log is not None and run.y_min is not None and run.y_max is not None
+    assert run.frequency_ratio is not None
+    met = np.asarray(log.stop) >= 0
+    good = bool(run.successful)
+    return Motion(
+        path=motion_path(window, scene=scene),
+        sections=jtu.tree_map(np.asarray, run.sections),
+        impact_phase=np.asarray(log.phase)[met],
+        impact_speed=np.asarray(log.speed)[met],
+        frequency_ratio=np.asarray(run.frequency_ratio),
+        extremes=(float(np.min(run.y_min)), float(np.max(run.y_max))),
+        period=period,
+        impacts=float(found["impacts"]),
+        multipliers=multipliers,
+        exponent=exponent,
+        fault="" if good else str(RESULTS[run.result]),
+    )
+
+
+def prepare(scene: AbstractScene, start: Any) -> Motion:
+    """Compile what `look` needs for scenes of this structure; the motion that it sees."""
+    found = look(scene, start, 0)
+    _exponent(scene, jtu.tree_map(lambda x: jnp.asarray(x[-1]), found.sections))
+    return found
+
+
+@compiled
+def _seen(scene: AbstractScene, start: Any, settle: Any) -> tuple[Run, Run, Any, Any]:
+    """The run observed, its first cycles sampled, its regime, and the derivative of its map."""
+    method = chosen(scene, None)
+    options = {"method": method, "max_steps": _MOST_STEPS}
+    start = taken_along(scene, scene.adopt(start))
+    run = simulate(scene, start, OBSERVED, settle=settle, impact_log=_MAPPED, **options)
+    first = jtu.tree_map(lambda x: x[0], run.sections)
+    window = simulate(scene, first, WINDOW, samples=_SAMPLES, impact_log=_DRAWN, **options)
+    found = _REGIME(scene, run)
+    return run, window, found, _monodromy(scene, run, found["period"], method)
+
+
+def _monodromy(scene: AbstractScene, run: Run, period: Any, method: Any) -> jax.Array:
+    """Derivative of the map over the last `period` cycles, cycle by cycle."""
+    the_map = cycle_map(scene, method=method)
+    cycles = jnp.maximum(period, 0).astype(jnp.int32)
+
+    def one(i, product):
+        place = OBSERVED - cycles + i
+        return the_map.jacobian(jtu.tree_map(lambda x: x[place], run.sections)) @ product
+
+    leaves = jtu.tree_leaves(run.sections)
+    return jax.lax.fori_loop(0, cycles, one, jnp.eye(len(leaves), dtype=leaves[0].dtype))
+
+
+@compiled
+def _exponent(scene: AbstractScene, state: Any) -> jax.Array:
+    out = lyapunov(scene, state, _REGIME.observed, settle=0, number=1)
+    return out.exponents[0]

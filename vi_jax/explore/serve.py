@@ -1,0 +1,61 @@
+"""The page, served on this machine."""
+
+import importlib.util
+import socket
+import threading
+import webbrowser
+from collections.abc import Callable
+from pathlib import Path
+
+from . import controls
+from .diagram import diagram
+from .motion import prepare
+
+NEEDED = "marimo>=0.25"
+"""What the page needs beside the library."""
+
+
+def missing() -> str | None:
+    """What to do if the page cannot be served because marimo is not installed, else `None`."""
+    if importlib.util.find_spec("marimo") is not None:
+        return None
+    return f"the page needs marimo, which is not installed: pip install '{NEEDED}'"
+
+
+def compile_all(tell: Callable[[str], None]) -> None:
+    """Compile every program that a slider can ask for."""
+    tell("compiling the ideal drive")
+    values = controls.beginning(controls.IDEAL)
+    _ = prepare(*controls.ideal(values)).stability
+    tell("compiling the diagram")
+    name, control = next(iter(controls.NUMBERS.items()))
+    numbers = {name: values[name] for name in controls.NUMBERS}
+    diagram(numbers, name, (control.low, control.high), Y=values["Y"], V=values["V"])
+    tell("compiling the motor")
+    prepare(*controls.motor(controls.beginning(controls.MOTOR)))
+
+
+def serve(host: str, port: int, *, browser: bool, tell: Callable[[str], None]) -> None:
+    """Serve the page until Ctrl-C.
+
+    **Arguments:** address and port to listen at (port 0: any that is free); whether to open a
+    browser; what is told of the progress.
+
+    **Raises:** `OSError` if it cannot listen there.
+    """
+    import marimo
+    import uvicorn
+
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.create_server((host, port), family=family) as listening:
+        compile_all(tell)
+        name = f"[{host}]" if ":" in host else host
+        address = f"http://{name}:{listening.getsockname()[1]}"
+        page = str(Path(__file__).with_name("page.py"))
+        app = marimo.create_asgi_app(quiet=True).with_app(path="", root=page).build()
+        options = {"log_level": "warning", "timeout_graceful_shutdown": 1}
+        server = uvicorn.Server(uvicorn.Config(app, **options))
+        tell(f"serving {address}, until Ctrl-C")
+        if browser:  # it waits until it is answered
+            threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
+        server.run(sockets=[listening])
