@@ -1,6 +1,6 @@
 """The page itself, a marimo app: what to show where. All that is computed comes from elsewhere."""
 
-import marimo
+import marimo  # pyright: ignore[reportMissingImports]
 
 app = marimo.App(width="full", app_title="vi_jax")
 
@@ -11,7 +11,7 @@ def _():
     import time
     from base64 import b64encode
 
-    import marimo as mo
+    import marimo as mo  # pyright: ignore[reportMissingImports]
 
     from vi_jax.explore import controls
     from vi_jax.explore.diagram import SHOWN, diagram

@@ -1,7 +1,10 @@
 """The page, served on this machine."""
 
+import contextlib
 import importlib.util
+import os
 import socket
+import sys
 import threading
 import webbrowser
 from collections.abc import Callable
@@ -36,15 +39,15 @@ def compile_all(tell: Callable[[str], None]) -> None:
 
 
 def serve(host: str, port: int, *, browser: bool, tell: Callable[[str], None]) -> None:
-    """Serve the page until Ctrl-C.
+    """Serve the page until Ctrl-C, which ends the process.
 
     **Arguments:** address and port to listen at (port 0: any that is free); whether to open a
     browser; what is told of the progress.
 
     **Raises:** `OSError` if it cannot listen there.
     """
-    import marimo
-    import uvicorn
+    import marimo  # pyright: ignore[reportMissingImports]
+    import uvicorn  # pyright: ignore[reportMissingImports]
 
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.create_server((host, port), family=family) as listening:
@@ -58,4 +61,9 @@ def serve(host: str, port: int, *, browser: bool, tell: Callable[[str], None]) -
         tell(f"serving {address}, until Ctrl-C")
         if browser:  # it waits until it is answered
             threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
-        server.run(sockets=[listening])
+        with contextlib.suppress(KeyboardInterrupt):
+            server.run(sockets=[listening])
+    # marimo leaves threads that wait for its pages, for which Python would wait in turn.
+    for stream in (sys.stdout, sys.stderr):
+        stream.flush()
+    os._exit(0)
