@@ -13,7 +13,7 @@ from ..flow import simulate
 from ..scan.sweep import taken_along
 from ..scene import OscillatorState, Scene
 
-VALUES, SETTLE, CYCLES = 320, 250, 20
+VALUES, SETTLE, CYCLES = 281, 250, 16
 """Values across a diagram, drive cycles before what is drawn, and drive cycles drawn."""
 
 SHOWN = {
