@@ -8,6 +8,7 @@ from functools import partial
 from typing import Any
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -384,3 +385,28 @@ def scene_cost() -> Expected:
         size = primitives(jax.make_jaxpr(partial(run, method))(0.9).jaxpr).total()
         numbers[f"operations: ideal, {name}"] = (float(size), 0.05 * size)
     return numbers
+
+
+def soft_stop() -> Expected:
+    """Where the 2π motion doubles its period before a linear stop, and a multiplier well above."""
+    closed_form = closed(0.9, 0.5, 0.0, 2.0, cycles=1)
+    stop = vi.SoftStop(2.0, 1.0, restitution=0.5)
+    doubles = "K at the doubling, spring and dashpot"
+
+    def least(stiffness):
+        scene = vi.Scene(
+            vi.Oscillator(0.0), vi.IdealDrive(0.9), soft_stops=(with_stiffness(stop, stiffness),)
+        )
+        orbit = vi.find_orbit(scene, guess[0], throw=True)
+        guess[0] = orbit.state
+        return float(np.min(np.real(np.asarray(orbit.multipliers))))
+
+    guess = [vi.OscillatorState(closed_form.Y[0], closed_form.V[0])]
+    found = {"multiplier of the 2π motion at K = 1000, spring and dashpot": (least(1000.0), 1e-6)}
+    least(200.0)
+    stiffness = float(brentq(lambda K: least(K) + 1, 60, 90, xtol=1e-9))
+    return {doubles: (stiffness, 1e-6), **found}
+
+
+def with_stiffness(stop: vi.SoftStop, stiffness: float) -> vi.SoftStop:
+    return eqx.tree_at(lambda x: x.stiffness, stop, jnp.asarray(stiffness))
