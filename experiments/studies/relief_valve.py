@@ -11,6 +11,7 @@
 # %%
 import sys
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -35,8 +36,12 @@ BOUNDS = (0.3, 9.0)
 
 
 # %%
+def valve_of(rate: Any) -> vi.machines.ReliefValve:
+    return vi.machines.ReliefValve(flow_rate=rate)  # pyright: ignore[reportCallIssue]
+
+
 def settled(rate):
-    valve = vi.machines.ReliefValve(flow_rate=rate)
+    valve = valve_of(rate)
     run = vi.simulate(valve, valve.start(), SEEN, settle=SETTLE)
     return run.sections.lift[1:], run.impacts, run.successful
 
@@ -53,7 +58,7 @@ def followed(orbit: vi.Orbit) -> vi.Branch:
     return vi.continue_orbit(orbit, parameter="flow_rate", bounds=BOUNDS)
 
 
-valve = vi.machines.ReliefValve(flow_rate=8.3)
+valve = valve_of(8.3)
 free = followed(vi.find_orbit(valve, vi.simulate(valve, valve.start(), 1, settle=400).last))
 graze = next(p for p in free.special if p.kind == "grazing")
 hopf = next(p for p in free.special if p.kind == "hopf")
@@ -64,13 +69,13 @@ doubled = [followed(p.switch()) for p in doublings]
 
 def growth(rate: float) -> float:
     """The greatest real part of the eigenvalues of the open valve at rest."""
-    lift = brentq(lambda y: rate - y * np.sqrt(y + 10), 1e-9, 50)
+    lift: Any = brentq(lambda y: rate - y * np.sqrt(y + 10), 1e-9, 50)
     root = np.sqrt(lift + 10)
     jacobian = [[0, 1, 0], [-1, -1.25, 1], [-20 * root, 0, -10 * lift / root]]
     return float(np.linalg.eigvals(np.array(jacobian)).real.max())
 
 
-rest_lost = float(brentq(growth, 8.0, 9.0, xtol=1e-12))
+rest_lost: Any = brentq(growth, 8.0, 9.0, xtol=1e-12)
 
 # %% [markdown]
 # ## Table and figure

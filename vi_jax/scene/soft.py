@@ -28,8 +28,12 @@ class SoftStop(AbstractSwitch):
     `restitution` may be given instead of `damping`. Under `law="hunt-crossley"` it is
     F0 + K δᵖ (1 + α δ'), whose restitution falls with speed.
 
-    With p > 1 the power law's force has a steep start, of the order δ^((p-1)/2); steps sized by
-    their error (`Adaptive`) follow it, fixed ones lose their order there.
+    With p > 1 the power law's force has a steep start and, where it may pull, a steep end, of the
+    order δ^((p-1)/2); steps sized by their error (`Adaptive`) follow it, fixed ones lose their
+    order there. What a step's error does
+    not show is the derivative of such an end: through an adhesive stop with 1 < p < 3 derivatives,
+    and with them multipliers and `find_orbit`, are right to 1e-2 only. Take `adhesive=False` there
+    (1e-6 and better), or the Hunt–Crossley law.
 
     **Arguments:**
 
