@@ -64,7 +64,8 @@ class Taylor(AbstractMethod):
     default 8), as for `FixedStep`; `rtol`, if given, sizes each step by its last terms instead, and
     `steps_per_cycle` is the fewest.
 
-    **Raises:** `ValueError` for numbers out of range.
+    **Raises:** `ValueError` for numbers out of range; when it is to carry a `SoftStop` of another
+    exponent than 1, whose force has no series at first touch.
     """
 
     order: int = eqx.field(static=True, default=16)
@@ -89,6 +90,16 @@ class Taylor(AbstractMethod):
         if self.rtol is None:
             return Taylor(self.order, 2 * self.steps_per_cycle)
         return Taylor(self.order + 4, self.steps_per_cycle, rtol=self.rtol / 100)
+
+    def check(self, scene):
+        """**Raises:** `ValueError` for a soft stop whose force has no series at first touch."""
+        for i, switch in enumerate(scene.switches):
+            if not switch.analytic:
+                raise ValueError(
+                    f"Method `Taylor` cannot carry switch {i}, {type(switch).__name__}: at first "
+                    "touch its force has no power series (a soft stop's has one with exponent 1). "
+                    "Use `Adaptive`."
+                )
 
     def longest(self, scene, s, state):
         """As for every method of fixed steps; as long as the scene allows where they are sized."""

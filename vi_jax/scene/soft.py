@@ -98,6 +98,11 @@ class SoftStop(AbstractSwitch):
         require_ranges(self)
 
     @property
+    def analytic(self) -> bool:
+        """Of a force that is straight in the depth; others have a kink or a root at first touch."""
+        return self.exponent == 1
+
+    @property
     def sign(self) -> int:
         """+1 on the right, -1 on the left."""
         return 1 if self.side == "right" else -1
@@ -150,8 +155,9 @@ class SoftStop(AbstractSwitch):
             return state, -mode
         depth, rate = self.depth(machine, state)
         pulls = self._pulls(depth, rate)
-        released = jnp.where(pulls >= -depth, RELEASED, APART)
-        again = jnp.where(-pulls > -depth, TOUCHING, APART)
+        inside = depth > 0  # without damping the force falls to zero as the body comes out
+        released = jnp.where(inside & (pulls >= -depth), RELEASED, APART)
+        again = jnp.where(inside & (-pulls > -depth), TOUCHING, APART)
         return state, jnp.where(mode < 0, TOUCHING, jnp.where(mode > 0, released, again))
 
     def longest_step(self, machine: Any, state: Any) -> Any:

@@ -24,6 +24,11 @@ class AbstractSwitch(eqx.Module):
     every method of steps (`step_limit` bounds them).
     """
 
+    @property
+    def analytic(self) -> bool:
+        """Whether what a mode adds to the field has power series up to the event that ends it."""
+        return True
+
     @abc.abstractmethod
     def begin(self, machine: Any, s: Scalar, state: Any) -> Scalar:
         """The mode of a motion that begins in `state`."""
