@@ -17,6 +17,9 @@ from .series import Series, at
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]
 
+# A turn whose velocity is told no better than to this share of that at the step's ends.
+_UNTOLD = 1e-3
+
 
 def _powers(series: Series, h: Scalar, zero: Scalar) -> tuple[Scalar, ...]:
     """Coefficients in θ = (s - s0)/h, so that the step is θ from 0 to 1."""
@@ -61,6 +64,8 @@ def look(plan: Plan, lane: Lane, motion: Any, h: Scalar) -> tuple[Scalar, Scalar
     if scene.clock(lane.state) is not None:
         bound = stop_gradient(plan.end(lane.part))
         events.append((SECTION, _shifted(motion.of(scene.clock), 1.0, bound)))
+    if not events and not turns:
+        return h, jnp.full_like(h, FREE)
     crossed, turned = none, none
     for _, series in events:
         crossed = crossed | (_sum(series, h, zero) > 0)
@@ -85,36 +90,57 @@ def look(plan: Plan, lane: Lane, motion: Any, h: Scalar) -> tuple[Scalar, Scalar
                 stop = scene.stops[int(name - to_stop(0))]
                 k = stop.coordinate
                 facing_stop[k] = facing_stop[k] | over & (lane.direction[k] == stop.sign)
-        cut = jnp.isfinite(first)
+        cut, soonest = jnp.isfinite(first), jnp.full_like(h, jnp.inf)
         for k, path in enumerate(paths):
             facing = tuple(-lane.direction[k] * c for c in _powers(_slope(path), h, zero))
             facing = (*facing, zero)
             turn = turns[k] & ~facing_stop[k]
+            if len(paths) > 1:  # of their turns that matter the earliest comes first
+                place = _root(facing)
+                matters = _matters(plan, k, path, facing, place, place * h)
+                turn = turn & (place < soonest) & matters
+                soonest = jnp.where(turn, place, soonest)
+                target, cut = jnp.where(turn, to_turn_of(k), target), cut | turn
             polynomial = facing if polynomial is None else select(turn, facing, polynomial)
         assert polynomial is not None
-        # The low orders lead near the root; what is left is a correction.
-        theta = rising_root(polynomial[:7], iterations=3)
-        derivative = slope(polynomial)[:-1]
-        for _ in range(2):
-            value, rate = horner(polynomial, theta), horner(derivative, theta)
-            better = theta - value / jnp.where(rate > 0, rate, 1.0)
-            theta = jnp.where((rate > 0) & (better > 0) & (better <= 1), better, theta)
+        theta = _root(polynomial)
         length = theta * h
-        for k, path in enumerate(paths):
-            turn = turns[k] & ~facing_stop[k]
-            # Where only impacts matter, a turn far from the stops is passed by.
-            matters = turn
-            if not plan.motion and not scene.switches:
-                close, height = none, _sum(path, length, zero)
-                for stop in scene.stops:
-                    if stop.coordinate == k:
-                        close = close | (stop.beyond(height) > -MARGIN)
-                matters = turn & close
-            target = jnp.where(matters, to_turn_of(k), target)
+        if len(paths) == 1:
+            turn = turns[0] & ~facing_stop[0]
+            matters = turn & _matters(plan, 0, paths[0], polynomial, theta, length)
+            target = jnp.where(matters, to_turn_of(0), target)
             cut = jnp.where(turn, matters, cut)
         return jnp.where(cut, length, h), jnp.where(cut, target, FREE)
 
     return jax.lax.cond(crossed | turned, found, lambda _: (h, jnp.full_like(h, FREE)), None)
+
+
+def _root(polynomial: tuple[Scalar, ...]) -> Scalar:
+    """Where a motion's polynomial in θ first rises through zero."""
+    # The low orders lead near the root; what is left is a correction.
+    theta = rising_root(polynomial[:7], iterations=3)
+    derivative = slope(polynomial)[:-1]
+    for _ in range(2):
+        value, rate = horner(polynomial, theta), horner(derivative, theta)
+        better = theta - value / jnp.where(rate > 0, rate, 1.0)
+        theta = jnp.where((rate > 0) & (better > 0) & (better <= 1), better, theta)
+    return theta
+
+
+def _matters(
+    plan: Plan, k: int, path: Series, facing: tuple[Scalar, ...], theta: Scalar, length: Scalar
+) -> Flag:
+    """Whether a turn of coordinate number k, at θ, has to be met: where only impacts matter, one
+    far from the stops is passed by, unless its place could not be told."""
+    if plan.motion or plan.scene.switches:
+        return jnp.ones_like(length, bool)
+    ends = jnp.maximum(jnp.abs(facing[0]), jnp.abs(sum(facing[1:], facing[0])))
+    close = jnp.abs(horner(facing, theta)) > _UNTOLD * ends
+    for stop in plan.scene.stops:
+        if stop.coordinate == k:
+            height = _sum(path, length, jnp.zeros_like(length))
+            close = close | (stop.beyond(height) > -MARGIN)
+    return close
 
 
 def _sum(series: Series, h: Scalar, zero: Scalar) -> Scalar:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 from ..lanes import pin
 from .events import Rates, quintic, rising_root, slope
 from .lane import FREE, Lane, Plan, to_release, to_turn_of
-from .trial import Crossing, Path, Trial, to_turn
+from .trial import Crossing, Path, Trial, beyond, to_turn
 
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]
@@ -44,7 +44,7 @@ def _met_something(plan: Plan, lane: Lane, trial: Trial) -> Flag:
     """Whether `_aimed` has anything to say, or may have."""
     met = trial.good & (lane.target != FREE) & ~at_a_turn(trial)
     for c in trial.crossings:
-        met = met | trial.good & (c.end.x > 0) & ~c.landed | c.again
+        met = met | trial.good & beyond(c) & ~c.landed | c.again
         if c.kind == "switch":
             met = met | trial.good & _hump(c, stop_gradient(trial.h))[0]
     for path, direction in zip(trial.paths, lane.direction, strict=False):
@@ -95,7 +95,7 @@ def _aimed(plan: Plan, lane: Lane, trial: Trial) -> tuple[Flag, Scalar, Scalar]:
     polynomial, crossed, landed = None, none, none
     facing_stop = [none for _ in trial.paths]
     for c in trial.crossings:
-        over = trial.good & (c.end.x > 0)
+        over = trial.good & beyond(c)
         rise = jnp.where(over, c.end.x - c.begin.x, 1.0)
         place = jnp.where(over, jnp.maximum(-c.begin.x, 0.0) / rise, jnp.inf)
         sooner = place < first
@@ -109,26 +109,39 @@ def _aimed(plan: Plan, lane: Lane, trial: Trial) -> tuple[Flag, Scalar, Scalar]:
             k = stop.coordinate
             facing_stop[k] = facing_stop[k] | (over & (lane.direction[k] == stop.sign))
     turns, curves = [], []
+    everything, soonest = plan.motion or bool(plan.scene.switches), jnp.full_like(h, jnp.inf)
+    several = len(trial.paths) > 1
     for k, path in enumerate(trial.paths):
         curves.append(quintic(path.begin, path.end, h))
         facing = tuple(-lane.direction[k] * c for c in slope(curves[k]))
         # The motion turned within the step. Unless it went through a stop before, that comes
         # first: what lies beyond the turn is met from there.
         turned = trial.good & (lane.direction[k] * path.end.v < 0)
-        turns.append(turned & ~path.at_turn & ~facing_stop[k])
-        polynomial = facing if polynomial is None else select(turns[k], facing, polynomial)
-        target = jnp.where(turns[k], to_turn_of(k), target)
+        turned = turned & ~path.at_turn & ~facing_stop[k]
+        ahead = turned
+        if several:  # of their turns that matter the earliest comes first
+            place = rising_root(stop_gradient(facing))
+            if not everything:
+                near = _near_a_stop(plan, k, curves[k], place)
+                turned = turned & (crossed | landed | near)
+            ahead = turned & (place < soonest)
+            soonest = jnp.where(ahead, place, soonest)
+        turns.append(turned)
+        polynomial = facing if polynomial is None else select(ahead, facing, polynomial)
+        target = jnp.where(ahead, to_turn_of(k), target)
     assert polynomial is not None
     theta = pin(rising_root(stop_gradient(polynomial)))
     goal = _Goal(crossed & ~landed, none, none, theta * h, target)
     for k, path in enumerate(trial.paths):
         turn = turns[k]
-        if not plan.motion and not plan.scene.switches:
+        if not everything and not several:
             turn = turn & (crossed | landed | _near_a_stop(plan, k, curves[k], theta))
         goal = goal._replace(turn=goal.turn | turn)
         # Newton's step is better than the quintic once it is short.
         shift = to_turn(path.end)
         again = turn & (lane.target == to_turn_of(k)) & (jnp.abs(shift) < 0.25 * h)
+        if several:
+            again = again & (goal.target == to_turn_of(k))
         goal = goal._replace(length=jnp.where(again, h + shift, goal.length))
     busy = goal.aim | goal.turn | landed | at_a_turn(trial)
     for k, path in enumerate(trial.paths):

@@ -285,7 +285,7 @@ def _impact(
     lost = stop.loss(approach)
     if contact is not None:
         arriving = stop.approach(trial.paths[k].end.v)
-        last, left = settled(plan, lane, trial.free, stop, arriving, s, there)
+        last, left = settled(plan, lane, trial.alone[k], stop, arriving, s, there)
         ends = pin_flag(c.landed & last, s)
         lost = jnp.where(ends, 0.5 * approach**2, lost)
         wait = pin(jnp.where(ends, left, 0.0))

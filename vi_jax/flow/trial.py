@@ -56,8 +56,8 @@ class Trial(NamedTuple):
     crossings: tuple[Crossing, ...]
     paths: tuple["Path", ...]
     """Of each coordinate; none where nothing asks for it."""
-    free: Any
-    """The machine in its modes, with nothing held."""
+    alone: tuple[Any, ...]
+    """Of each coordinate, the machine in its modes with the other bodies held that rest."""
     holding: Any
     """The machine as the step saw it: its bodies held where they rest."""
     below: Scalar | None
@@ -84,6 +84,15 @@ def held(plan: Plan, lane: Lane) -> AbstractScene:
     if lane.contact is None:
         return in_modes(scene, lane.modes)
     rests = tuple(x > 0 for x in lane.contact)
+    return Moving(scene=scene, modes=lane.modes, held=rests, stops=scene.stops)
+
+
+def alone(plan: Plan, lane: Lane, k: int) -> AbstractScene:
+    """As `held`, but without a hold on coordinate number k."""
+    scene = plan.scene
+    if lane.contact is None or len(scene.coordinates) == 1:
+        return in_modes(scene, lane.modes)
+    rests = tuple((x > 0) & (j != k) for j, x in enumerate(lane.contact))
     return Moving(scene=scene, modes=lane.modes, held=rests, stops=scene.stops)
 
 
@@ -133,18 +142,18 @@ def attempt(
         good = good & (error <= 1)
     good = pin_flag(good, h)
 
-    free_scene = in_modes(scene, lane.modes)
+    each_alone = tuple(alone(plan, lane, k) for k in range(len(scene.coordinates)))
     paths = []
     if plan.motion or scene.stops:
-        for k in range(len(scene.coordinates)):
-            paths.append(_path(plan, lane, k, free_scene, holding, (s1, new, h, limit), good))
-    section, below = _section(plan, lane, free_scene, s1, new)
+        for k, one in enumerate(each_alone):
+            paths.append(_path(plan, lane, k, one, holding, (s1, new, h, limit), good))
+    section, below = _section(plan, lane, holding, s1, new)
     guards = [
-        *_stops(scene, paths), *_switches(lane, scene, free_scene, s1, new), *section
+        *_stops(scene, paths), *_switches(lane, scene, holding, s1, new), *section
     ]  # fmt: skip
     seen = tuple(_seen(lane, good & last, good, h, each, guards) for each in guards)
     return Trial(
-        s1, h, new, time, error, good, last, seen, tuple(paths), free_scene, holding, below
+        s1, h, new, time, error, good, last, seen, tuple(paths), each_alone, holding, below
     )
 
 
@@ -156,6 +165,17 @@ def _path(
     position = plan.scene.coordinates[k].position
     begin = rates(free.field, position, lane.s, lane.state)
     end = rates(free.field, position, s1, new)
+    if lane.contact is not None:
+        # Of a body at rest place and velocity are known better than the state tells them, where
+        # the coordinate is a difference. Its force is that on a free body.
+        rests, place = lane.contact[k] > 0, begin.x
+        for i, stop in enumerate(plan.scene.stops):
+            if stop.coordinate == k:
+                place = jnp.where(lane.contact[k] == to_stop(i), stop.place, place)
+        begin, end = (
+            Rates(jnp.where(rests, place, r.x), jnp.where(rests, 0.0, r.v), r.a)
+            for r in (begin, end)
+        )
     met = jnp.abs(to_turn(end)) <= _turn_tolerance(h) * _leniency(lane)
     aimed = lane.target == to_turn_of(k)
     for j in range(len(plan.scene.coordinates)):  # several may turn at once
@@ -200,22 +220,22 @@ def _stops(scene: AbstractScene, paths: list[Path]) -> list[_Guard]:
     return found
 
 
-def _switches(lane: Lane, scene: AbstractScene, free: Any, s1: Scalar, new: Any) -> list[_Guard]:
+def _switches(lane: Lane, scene: AbstractScene, moving: Any, s1: Scalar, new: Any) -> list[_Guard]:
     found = []
     for j, (switch, mode) in enumerate(zip(scene.switches, lane.modes, strict=True)):
 
         def guard(s: Scalar, state: Any, switch=switch, mode=mode) -> Scalar:
             return switch.guard(scene, s, state, mode)
 
-        begin = guard_rates(free.field, guard, lane.s, lane.state)
-        end = guard_rates(free.field, guard, s1, new)
+        begin = guard_rates(moving.field, guard, lane.s, lane.state)
+        end = guard_rates(moving.field, guard, s1, new)
         scale = 1 + stop_gradient(jnp.abs(end.v))
         found.append(_Guard(to_switch(j), "switch", j, begin, end, scale))
     return found
 
 
 def _section(
-    plan: Plan, lane: Lane, free: Any, s1: Scalar, new: Any
+    plan: Plan, lane: Lane, moving: Any, s1: Scalar, new: Any
 ) -> tuple[list[_Guard], Scalar | None]:
     """What ends a cycle, unless `s` itself does; and `Lane.below`."""
     scene = plan.scene
@@ -228,16 +248,16 @@ def _section(
             return jnp.asarray(scene.clock(state))
 
         ends = (
-            rates(free.field, clock, lane.s, lane.state).scaled(1, bound),
-            rates(free.field, clock, s1, new).scaled(1, bound),
+            rates(moving.field, clock, lane.s, lane.state).scaled(1, bound),
+            rates(moving.field, clock, s1, new).scaled(1, bound),
         )
         return [_Guard(SECTION, "section", 0, *ends, bound)], None
 
     def section(state: Any) -> Scalar:
         return jnp.asarray(scene.section(state))
 
-    begin = rates(free.field, section, lane.s, lane.state)
-    end = rates(free.field, section, s1, new)
+    begin = rates(moving.field, section, lane.s, lane.state)
+    end = rates(moving.field, section, s1, new)
     scale = 1 + stop_gradient(jnp.abs(end.v))
     # From the section it rises: it ends the next cycle only once it has been below, where one that
     # is started on the section and falls already is.
@@ -252,6 +272,13 @@ def _section(
         for r in (begin, end)
     )
     return [_Guard(SECTION, "section", 0, begin, end, scale)], below
+
+
+def beyond(event: _Guard | Crossing) -> Flag:
+    """Whether a step ends beyond an event. One that begins there to rounding, after the event
+    before, and still falls has not met it: it may end at once, at a turning point."""
+    begin, end = event.begin, event.end
+    return (end.x > 0) & ~((begin.v < 0) & (end.v < 0) & (begin.x >= end.x))
 
 
 def _seen(
@@ -271,7 +298,7 @@ def _seen(
             # the other.
             alone = guard.coordinate is not None and guard.coordinate == other.coordinate
             slack = 0.0 if alone else 16 * eps * other.scale
-            aimed = aimed & (other.end.x <= slack)
+            aimed = aimed & ((other.end.x <= slack) | ~beyond(other))
     offset, square = landing(end)
     size = stop_gradient(jnp.abs(offset))
     # Two ways of being there to rounding: in place along the path, or, near grazing, in position.
