@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import vi_jax as vi
 from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
 
 VALVE = vi.machines.ReliefValve
 CLOSE = vi.Adaptive(rtol=1e-12)
@@ -162,3 +163,23 @@ def test_wrong_numbers_are_named():
         vi.simulate(VALVE(), VALVE().start(pressure=0.0), 1)
     run = vi.jit(lambda p: vi.simulate(VALVE(), VALVE().start(pressure=p), 1))(-1.0)
     assert bool(run.result == vi.RESULTS.bad_start)
+
+
+def test_the_open_valve_comes_to_rest_where_its_equilibrium_turns_stable():
+    """The Hopf bifurcation, beside the eigenvalues of the linearised valve."""
+    valve = VALVE(flow_rate=8.0)
+    orbit = vi.find_orbit(valve, vi.simulate(valve, valve.start(), 1, settle=300).last)
+    branch = vi.continue_orbit(orbit, parameter="flow_rate", bounds=(7.9, 9.0))
+    assert branch.ends == ("bounds", "hopf")
+    (hopf,) = branch.special
+    assert hopf.kind == "hopf"
+
+    def growth(q):
+        lift = brentq(lambda x: x * np.sqrt(x + 10) - q, 0, 10)
+        root = np.sqrt(lift + 10)
+        values = np.linalg.eigvals([[0, 1, 0], [-1, -1.25, 1], [-20 * root, 0, -10 * lift / root]])
+        return values[np.argmax(values.imag)]
+
+    q = brentq(lambda q: growth(q).real, 8, 9, xtol=1e-13)
+    assert hopf.parameter == pytest.approx(q, abs=5e-9)
+    assert float(hopf.orbit.duration) == pytest.approx(2 * np.pi / growth(q).imag, abs=1e-5)

@@ -16,6 +16,9 @@ from .solve import advance as solved
 from .solve import orbit_of, tangent_at
 from .special import CROSSING, DOUBLING, FOLD, GRAZING, SpecialPoint
 
+# Where something grazes it is touched to rounding.
+_TOUCHES = 1e-6
+
 
 @dataclasses.dataclass(frozen=True)
 class Boundary:
@@ -90,6 +93,11 @@ def boundary(
         raise ValueError(
             "Argument `point` must be a fold, a period doubling or a grazing, but is a "
             f"{point.kind}."
+        )
+    if point.kind == GRAZING and point.impact is None and abs(point.step.seen.clearance) > _TOUCHES:
+        raise ValueError(
+            "Argument `point` must be a grazing at which something is touched, but there "
+            f"{point.detail}."
         )
     old = point.problem
     check_leaf(old.scene, parameter)

@@ -50,12 +50,11 @@ def corrected(
         return jnp.dot(tangent, y - y0)
 
     def equations(y):
-        missing = jnp.concatenate([residual(y * scale), plane(y)[None]])
-        return missing, missing
+        return jnp.concatenate([residual(y * scale), plane(y)[None]])
 
     def newton(carry):
         y, before, count, *_ = carry
-        jacobian, missing = jax.jacfwd(equations, has_aux=True)(y)
+        jacobian, missing = _jacobian(equations, y)
         both = jnp.stack([missing, jnp.zeros_like(y).at[-1].set(1.0)], axis=-1)
         move, along = jnp.linalg.solve(jacobian, both).T
         return y - move, jnp.max(jnp.abs(move)), count + 1, along, before <= tolerance
@@ -74,9 +73,20 @@ def corrected(
     return Step(y * scale, along, size, count, good, observe(y * scale, along))
 
 
+def _jacobian(function: Callable[[Vector], Vector], x: Vector) -> tuple[Array, Vector]:
+    """Derivative and value. Loops within a function may leave nothing of it the same for all
+    directions, of which `jax.jacfwd` would not hear."""
+
+    def along(direction):
+        return jax.jvp(function, (x,), (direction,))
+
+    values, columns = jax.vmap(along)(jnp.eye(x.size, dtype=x.dtype))
+    return columns.T, values[0]
+
+
 def first_tangent(residual: Callable[[Vector], Vector], x: Vector, scale: Vector) -> Vector:
     """Unit tangent (scaled) at a point that solves the equations, the last unknown rising."""
-    jacobian = jax.jacfwd(lambda y: residual(y * scale))(x / scale)
+    jacobian, _ = _jacobian(lambda y: residual(y * scale), x / scale)
     tangent = jnp.linalg.svd(jacobian, full_matrices=True)[2][-1]
     return tangent * jnp.where(tangent[-1] < 0, -1.0, 1.0)
 

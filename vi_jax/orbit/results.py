@@ -120,6 +120,8 @@ class Orbit(eqx.Module):
         slack = 1e4 * jnp.finfo(self.y_max.dtype).eps
         inside = self.clearance >= 0
         for stop in self.scene.stops:
+            if stop.coordinate:
+                continue  # the extremes are those of the first coordinate
             reach = self.y_max if stop.sign > 0 else -self.y_min
             inside = inside & (reach <= stop.gap + slack * (1 + jnp.abs(stop.gap)))
         return self.successful & inside & (self.slowest_impact > 0)

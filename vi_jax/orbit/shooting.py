@@ -32,6 +32,9 @@ from .floquet import multipliers_of
 
 Vector = Float[Array, " _"]
 
+# Newton's method has met a turn if it ends this close to it (as a share of the step).
+_TURNED = 1e-3
+
 
 class Event(NamedTuple):
     """What begins a flight: an impact, a switch, or a section that counts for the motion."""
@@ -413,7 +416,11 @@ class Shooting(eqx.Module):
                 length = jax.lax.fori_loop(0, 4, newton, jax.lax.stop_gradient(h * share))
                 here = at(moving, s, u, length)
                 bend = jnp.where(here.a == 0, 1.0, here.a)
-                return turns, here.x - 0.5 * here.v**2 / bend, s + length - here.v / bend, v0
+                # A guard with a kink (as that of dry friction, where its force vanishes) may have
+                # no turn there.
+                found = jnp.abs(here.v) <= jnp.abs(_TURNED * limit * bend)
+                shift = jnp.where(found, here.v, 0.0) / bend
+                return turns, here.x - 0.5 * here.v * shift, s + length - shift, v0
 
             def velocity(s, u):
                 return rate(s, self.unravel(u))
@@ -444,7 +451,9 @@ class Shooting(eqx.Module):
                 return guard_rates(moving.field, guard, s, state).v
 
             turns, height, place, v0 = found(guard, rise)
-            rooms.append((jnp.where(turns & (v0 > 0), -height, jnp.inf), place))
+            # A body that friction lets go begins to slide with velocity and acceleration zero.
+            away = place > places[0] + _TURNED * h
+            rooms.append((jnp.where(turns & (v0 > 0) & away, -height, jnp.inf), place))
         room, touch = jnp.full((), jnp.inf, h.dtype), jnp.zeros((), h.dtype)
         touched = touch
         for i, (values, place) in enumerate(rooms):

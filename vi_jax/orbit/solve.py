@@ -27,6 +27,9 @@ _LISTED = 32
 # that asks for more of them than this is followed with so many.
 _SETTLED, _MOST = 1e-11, 4096
 
+# How far short of a place that has no solution (as a share of the step) one is looked for.
+_SHORT_OF = (1e-6, 1e-5, 1e-4, 1e-3)
+
 
 @runtime_checkable
 class Equations(Protocol):
@@ -234,8 +237,14 @@ def located(
 
     # Where the test jumps, or has no value, the closest point to it has to do.
     options: Any = {"xtol": 1e-14, "rtol": 1e-14, "maxiter": 80}
-    value(float(brentq(value, 0.0, length, full_output=True, disp=False, **options)[0]))
-    # Where branches cross the corrector has no answer; a point beside it will do.
+    root = float(brentq(value, 0.0, length, full_output=True, disp=False, **options)[0])
+    value(root)
+    # Where branches cross, or a motion shrinks to rest, the corrector has no answer; a point short
+    # of it will do.
+    for short in _SHORT_OF:
+        if any(bool(at[s].good) for s in at if abs(s - root) <= short * abs(length)):
+            break
+        value(root - short * length)
     good = [step for step in at.values() if bool(step.good)]
     return min(good, key=lambda step: abs(test(step)), default=None)
 

@@ -121,6 +121,11 @@ def _beyond_grazing(point: SpecialPoint, distance: float) -> Orbit:
             "`switch` at a grazing needs a machine without soft stops, friction or other switches: "
             "find the motion beyond it with `find_orbit`."
         )
+    if point.impact is not None and old.events[point.impact].kind == "section":
+        raise ValueError(
+            "`switch` needs an impact that grazes, but here the section of the machine is touched: "
+            "beyond it the motion has another number of cycles. Find it with `find_orbit`."
+        )
     x = jnp.asarray(step.x)
     clock, states = (np.asarray(a) for a in old.parts(x))
     events, value = list(old.events), np.asarray(step.x)[-1:]

@@ -52,6 +52,7 @@ class AbstractScene(eqx.Module):
     | `coordinates` | stops on several coordinates (`RigidStop(..., coordinate=1)`) |
     | `switches` | a field with modes, landed upon where they change: soft stops, dry friction |
     | `section` | an autonomous machine, whose cycles are counted by an event |
+    | `observed_every` | its Lyapunov exponents, and samples of its orbits |
     | `renewed` | a drift, counted by the cycle |
     | `clock`, `rewound`, `pace` | another variable than `s` that counts cycles or measures time |
     | `step_limit`, `relaxation` | steps that fit time scales shorter than the cycle |
@@ -89,7 +90,13 @@ class AbstractScene(eqx.Module):
 
     def observed_every(self, interval: Any) -> "AbstractScene":
         """An autonomous machine observed at equal intervals of `s` instead of on its section."""
-        raise ValueError(f"A {type(self).__name__} is driven: its cycle is its drive's.")
+        name = type(self).__name__
+        if type(self).section is AbstractScene.section:
+            raise ValueError(f"A {name} is driven: its cycle is its drive's.")
+        raise ValueError(
+            f"A {name} has a `section` but no `observed_every`: give it this method, which returns "
+            "the same machine with `interval` as its cycle and `None` as its section."
+        )
 
     @property
     def coordinates(self) -> tuple[Coordinate, ...]:
