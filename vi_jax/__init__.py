@@ -101,4 +101,4 @@ def __dir__() -> list[str]:
     from . import plot
 
     pictures = (name for name in vars(plot) if name.startswith("plot_"))
-    return sorted({*globals(), *pictures, "save_picture"})
+    return sorted({*globals(), *pictures, "animate", "save_picture"})

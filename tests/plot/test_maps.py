@@ -10,6 +10,8 @@ import vi_jax as vi
 import xarray as xr
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from vi_jax.plot.colors import color_of
 
 PERIODS = np.array([[1, 2, 8], [9, 64, 0], [-1, -2, 1], [-3, -1, 2]])
 
@@ -42,7 +44,8 @@ def _legend(ax):
     legend = ax.get_legend()
     return {
         text.get_text(): to_rgb(patch.get_facecolor()[:3])
-        for text, patch in zip(legend.get_texts(), legend.get_patches(), strict=True)
+        for text, patch in zip(legend.get_texts(), legend.legend_handles, strict=True)
+        if isinstance(patch, Patch)
     }
 
 
@@ -125,6 +128,57 @@ def test_basins_on_a_grid():
     # The point outside of the region does not widen the picture.
     assert ax.get_xlim() == (-2.0, 2.0) and ax.get_ylim() == (-1.5, 1.5)
     assert ax.get_xlabel().startswith("Y") and ax.get_ylabel().startswith("V")
+
+
+def test_basins_name_their_circles_and_tell_motions_of_one_period_apart():
+    dims, starts = ("start.Y", "start.V"), {"start.Y": [0.0, 1.0], "start.V": [0.0, 1.0]}
+    found = _basins([[0, 1], [1, 0]], dims, **starts)
+    ax = vi.plot_basins(found, ax=_axes())
+    assert ax.get_legend().get_texts()[-1].get_text() == "sections of the motions"
+    alike = [a._replace(period=1, impacts=1.0) for a in found.attractors]
+    first, second, *_ = _legend(
+        vi.plot_basins(found._replace(attractors=alike), ax=_axes())
+    ).values()
+    assert first == to_rgb(color_of(1, 1)) != second
+
+
+def test_maps_of_a_machine_speak_its_words():
+    ball = vi.machines.BouncingBall(restitution=0.5, acceleration=3.0)
+    dims, starts = ("start.Y", "start.V"), {"start.Y": [0.0, 1.0], "start.V": [0.0, 1.0]}
+    found = _basins([[0, 1], [1, 0]], dims, **starts)
+    paper = found._replace(scene=vi.Scene.ideal(frequency_ratio=0.9))
+    ax = vi.plot_basins(paper, ax=_axes())
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("Y at the start (a)", "V at the start (a ω)")
+    names = {"Y": "height", "V": "speed"}
+    renamed = [
+        a._replace(sections={names[key]: x for key, x in a.sections.items()})
+        for a in found.attractors
+    ]
+    data = found.data.rename({f"start.{key}": f"start.{name}" for key, name in names.items()})
+    found = found._replace(scene=ball, attractors=renamed, data=data)
+    ax = vi.plot_basins(found, ax=_axes())
+    assert next(iter(_legend(ax))).startswith("1 cycle, 1 impact")
+    assert "period 1 cycle" in str(found) and "π" not in str(found)
+    assert ax.get_xlabel() == "height (g/ω²) at the start"
+    named = _legend(vi.plot_regimes(_data(), scene=ball, ax=_axes()))
+    assert "1 cycle" in named and "> 8 cycles" in named
+    data = vi.scan(
+        ball, {"start.height": [1.0, 2.0], "start.speed": [0.0, 1.0]}, measure="regime",
+        settle=20, progress=False,
+    )  # fmt: skip
+    assert not any("π" in name for name in _legend(vi.plot_regimes(data, ax=_axes())))
+
+
+def test_impacts_tell_regimes_of_one_period_apart():
+    impacts = np.array([[0.0, 1.0, 4.0], [5.0, 9.0, 0.0], [0.4, 0.0, 1.0], [0.4, 0.4, 2.0]])
+    data = _data().assign(impacts=(_data()["period"].dims, impacts))
+    ax = vi.plot_regimes(data, ax=_axes())
+    cells, legend = _cells(ax)[0], _legend(ax)
+    assert list(legend)[:4] == ["2π", "2π, no impact", "4π, 1 impact", "4π, more impacts"]
+    for place, name in (((0, 0), "2π, no impact"), ((2, 2), "2π"), ((0, 1), "4π, 1 impact"),
+                        ((3, 2), "4π, more impacts"), ((2, 0), "chaotic")):  # fmt: skip
+        np.testing.assert_allclose(cells[place], legend[name])
+    assert legend["2π"] == to_rgb(color_of(1))
 
 
 def test_basins_of_random_starts():

@@ -78,6 +78,18 @@ def test_history_axis_and_stop(scene, run):
     assert cycles.lines[0].get_xdata().max() == pytest.approx(6.0)
 
 
+def test_history_of_a_machine_counts_its_own_cycles():
+    ball = vi.machines.BouncingBall(restitution=0.5, acceleration=3.0)
+    run = vi.simulate(ball, ball.start(), 3, samples=16)
+    ax = plot_history(run, scene=ball, ax=_axes())
+    assert ax.get_xlabel() == "cycles since the start" and ax.get_ylabel() == "height (g/ω²)"
+    assert ax.lines[0].get_xdata().max() == pytest.approx(3.0)
+
+
+def test_pictures_are_listed():
+    assert {"save_picture", "animate", "plot_history"} <= set(dir(vi))
+
+
 def test_phase_portrait_marks_sections(scene, run):
     ax = plot_phase_portrait(run, scene, ax=_axes())
     _, dots, _ = ax.lines

@@ -1,11 +1,19 @@
 """Pictures of orbits, branches, sweeps and boundaries."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import vi_jax as vi
 from matplotlib.figure import Figure
+from vi_jax.orbit import special
+from vi_jax.plot.colors import MARKS, color_of
 
 NAME = "drive.frequency_ratio"
+
+
+def _axes():
+    return Figure().subplots()
 
 
 @pytest.fixture(scope="module")
@@ -27,6 +35,37 @@ def test_branch_changes_its_line_where_it_changes_stability(branch):
     assert solid.min() == pytest.approx(dashed.max(), abs=1e-9)
     assert ax.get_xlabel() == "frequency ratio ζ" and ax.get_ylabel() == "min Y (a)"
     assert [line.get_label() for line in ax.lines].count("2π") == 1
+
+
+def test_branch_names_its_marks_and_begins_its_legend_solid(branch):
+    for turn in (slice(None), slice(None, None, -1)):  # begins stable, begins unstable
+        rows = {name: getattr(branch, name)[turn] for name in ("parameter", "y_min", "multipliers")}
+        ax = vi.plot_branch(dataclasses.replace(branch, **rows), ax=_axes(), label="2π")
+        legend = ax.get_legend()
+        named = [t.get_text() for t in legend.get_texts()]
+        handles = dict(zip(named, legend.legend_handles, strict=True))
+        kinds = {p.kind for p in branch.special}
+        assert len(named) == len(set(named)) and set(named) == {"2π", "unstable", *kinds}
+        assert handles["2π"].get_linestyle() == "-"
+        assert handles["2π"].get_color() == color_of(1)
+        # Another branch in the same axes names nothing twice.
+        vi.plot_branch(branch, ax=ax)
+        assert [t.get_text() for t in ax.get_legend().get_texts()] == named
+
+
+def test_every_special_point_has_a_mark_of_its_own():
+    assert len({mark for mark, _ in MARKS.values()}) == len(MARKS)
+    assert set(MARKS) == {
+        getattr(special, name)
+        for name in ("FOLD", "DOUBLING", "TORUS", "GRAZING", "CROSSING", "SYMMETRY", "HOPF")
+    }
+
+
+def test_sweep_of_a_machine_speaks_its_words():
+    ball = vi.machines.BouncingBall(restitution=0.5, acceleration=1.2)
+    sweep = vi.sweep(ball, "acceleration", np.array([1.2, 1.25]), settle=200, cycles=8)
+    assert "cycle" in str(sweep) and "π" not in str(sweep)
+    assert vi.plot_sweep(sweep, ax=_axes()).get_ylabel() == "min height (g/ω²)"
 
 
 def test_given_axes_are_used(branch):

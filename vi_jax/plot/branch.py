@@ -8,15 +8,9 @@ from matplotlib.axes import Axes
 
 from ..orbit import Boundary, Branch
 from ..scan import Sweep
-from .motion import BLUE, new_axes
-
-MARKERS = {
-    "fold": ("s", "tab:orange"),
-    "period-doubling": ("D", "tab:red"),
-    "neimark-sacker": ("^", "tab:purple"),
-    "branch-point": ("X", "tab:brown"),
-    "grazing": ("o", "k"),
-}
+from ..scene import LABELS
+from .colors import DASHES, color_of, mark_style, once
+from .motion import new_axes
 
 
 def plot_branch(
@@ -26,13 +20,18 @@ def plot_branch(
     y: str = "y_min",
     x: str = "parameter",
     special: bool = True,
+    legend: bool = True,
     **style: Any,
 ) -> Axes:
     """A branch: stable parts solid, unstable ones dashed, special points marked.
 
+    Its colour is that of its period, as in all pictures; a 4π motion with several impacts has
+    another than one with a single impact.
+
     **Arguments:** the branch; `ax`, a new figure if left out; `y` and `x`, names of the branch's
     arrays; `special`, whether to mark the special points (where `y` is a number of an orbit);
-    options of `Axes.plot`.
+    `legend`, whether to draw one, which names the marks and, given `label`, the branch; options of
+    `Axes.plot`.
 
     **Returns:** the axes.
     """
@@ -42,19 +41,25 @@ def plot_branch(
     inside = np.abs(branch.multipliers).max(axis=1) < 1 + 1e-6
     stable = inside[1:] & inside[:-1]
     label = style.pop("label", None)
-    look = {"color": BLUE, "lw": 1.6, **style}
+    own = color_of(branch.cycles, branch.impact_speed.shape[1])
+    look = {"color": own, "lw": 1.6, **style}
+    if label is not None:
+        ax.plot([], [], label=label, **{"ls": "-", **look})
     for start, end, solid in _stretches(stable):
         part = slice(start, end)
-        ax.plot(across[part], up[part], ls="-" if solid else "--", label=label, **look)
-        label = None
+        ax.plot(across[part], up[part], **{"ls": "-" if solid else "--", **look})
+    if not stable.all():
+        ax.plot([], [], "--", color="0.3", lw=look["lw"], label=once(ax, "unstable"))
     if special and x == "parameter":
         for point in branch.special:
             value = getattr(point.orbit, y, None)
             if value is not None and np.ndim(value) == 0:
-                marker, color = MARKERS[point.kind]
-                ax.plot(point.parameter, float(value), marker, color=color, ms=5, zorder=4)
+                mark = {**mark_style(point.kind), "zorder": 4, "label": once(ax, point.kind)}
+                ax.plot(point.parameter, float(value), **mark)
+    if legend and ax.get_legend_handles_labels()[1]:
+        ax.legend(fontsize="small", frameon=False)
     ax.set_xlabel("ζ" if x == "frequency_ratio" else axis_name(branch.name))
-    ax.set_ylabel({"y_min": "min Y (a)", "y_max": "max Y (a)"}.get(y, y))
+    ax.set_ylabel(extreme_name(y, branch.problem.scene.labels))
     return ax
 
 
@@ -77,23 +82,37 @@ def plot_sweep(
     across, up = np.asarray(getattr(sweep, x)), np.asarray(getattr(sweep, y))
     ax.plot(across, up, **{"marker": ".", "ms": 3, "ls": "none", "color": "0.3", **style})
     ax.set_xlabel(axis_name(sweep.parameter if x == "values" else x))
-    ax.set_ylabel({"y_min": "min Y (a)", "y_max": "max Y (a)"}.get(y, y))
+    ax.set_ylabel(extreme_name(y, sweep.labels))
     return ax
 
 
 def plot_boundary(curve: Boundary, *, ax: Axes | None = None, **style: Any) -> Axes:
     """A boundary curve in the plane of its two parameters.
 
+    Its colour is that of the motion's period, its dash tells what happens there: solid a grazing,
+    dashed a period doubling, dash-dotted a fold, dotted a branch point.
+
     **Arguments:** the curve; `ax`; options of `Axes.plot`.
 
     **Returns:** the axes.
     """
     ax = new_axes(ax)
-    color = MARKERS[curve.kind][1]
-    ax.plot(*curve.parameters.T, **{"color": color, "lw": 1.6, "label": curve.kind, **style})
+    look = {"ls": DASHES[curve.kind], "lw": 1.6, "label": curve.kind}
+    if "linestyle" in style:
+        look.pop("ls")
+    color = color_of(curve.problem.cycles, curve.impact_speed.shape[1])
+    ax.plot(*curve.parameters.T, **{"color": color, **look, **style})
     ax.set_xlabel(axis_name(curve.names[0]))
     ax.set_ylabel(axis_name(curve.names[1]))
     return ax
+
+
+def extreme_name(name: str, labels: tuple[str, str]) -> str:
+    """What an axis of smallest or greatest positions says, in the words of a scene."""
+    least = {"y_min": "min", "y_max": "max"}.get(name)
+    if least is None:
+        return "mean frequency ratio ζ" if name == "frequency_ratio" else name
+    return f"{least} Y (a)" if labels == LABELS else f"{least} {labels[0]}"
 
 
 def axis_name(name: str) -> str:

@@ -7,9 +7,11 @@ from matplotlib.ticker import FuncFormatter, MultipleLocator
 
 from ..flow import Run, Samples
 from ..scene import LABELS, AbstractScene
+from .colors import BLUE as BLUE
+from .colors import GREEN as GREEN
+from .colors import RED as RED
+from .colors import STOP, once
 from .path import motion_path
-
-BLUE, RED, PINK, GREEN = "#1f4fd8", "#d62728", "#ff5fc4", "#1a9641"
 
 
 def new_axes(ax: Axes | None) -> Axes:
@@ -28,7 +30,7 @@ def plot_history(
     ax: Axes | None = None,
     window: tuple[float | int, float | int] | None = None,
     shift: float | int = 0,
-    unit: str = "angle",
+    unit: str | None = None,
     stops: bool = True,
     **style: Any,
 ) -> Axes:
@@ -41,12 +43,16 @@ def plot_history(
     - `ax`: axes to draw into; a new figure if left out.
     - `window`: the first and the last cycle to draw.
     - `shift`: cycles to move the motion by along the axis.
-    - `unit`: `"angle"` (crank angle φ in units of π) or `"cycles"`.
+    - `unit`: `"angle"` (crank angle φ in units of π) or `"cycles"`; by default the clock of the
+      `scene`, which is the angle for the paper's machine and where no scene is given.
     - `stops`: whether to draw the stops.
     - `style`: options of `Axes.plot`.
 
     **Returns:** the axes.
     """
+    turning = scene is None or scene.period_of(1) == "2π"
+    if unit is None:
+        unit = "angle" if turning else "cycles"
     if unit not in ("angle", "cycles"):
         raise ValueError(f"Argument `unit` must be 'angle' or 'cycles', but got {unit!r}.")
     ax = new_axes(ax)
@@ -54,12 +60,11 @@ def plot_history(
     factor = 2.0 if unit == "angle" else 1.0
     ax.plot(factor * (path.cycles + shift), path.Y, **{"color": BLUE, "lw": 1.3, **style})
     if stops and scene is not None:
-        for i, stop in enumerate(scene.stops):
-            label = None if i else "stop"
-            ax.axhline(stop.sign * float(stop.gap), color=GREEN, lw=1.8, label=label)
+        for stop in scene.stops:
+            ax.axhline(stop.sign * float(stop.gap), color=STOP, lw=1.8, label=once(ax, "stop"))
     ax.set_ylabel((LABELS if scene is None else scene.labels)[0])
     if unit == "cycles":
-        ax.set_xlabel("drive cycles φ/(2π)")
+        ax.set_xlabel("drive cycles φ/(2π)" if turning else "cycles since the start")
     else:
         angle_axis(ax)
     return ax
@@ -101,11 +106,11 @@ def plot_phase_portrait(
         assert only is not None
         samples = motion_path(only, scene=scene, window=window)
         whole = abs(samples.cycles - samples.cycles.round()) < 1e-9
-        dots = {"ms": 4, "color": line.get_color(), "zorder": 3}
+        dots = {"ms": 4, "color": line.get_color(), "zorder": 3, "label": once(ax, "section")}
         ax.plot(samples.Y[whole], samples.V[whole], "o", **dots)
     if scene is not None:
         for stop in scene.stops:
-            ax.axvline(stop.sign * float(stop.gap), color=GREEN, lw=1.8)
+            ax.axvline(stop.sign * float(stop.gap), color=STOP, lw=1.8, label=once(ax, "stop"))
     position, velocity = LABELS if scene is None else scene.labels
     ax.set_xlabel(position)
     ax.set_ylabel(velocity)

@@ -1,52 +1,60 @@
 """Pictures of grids: maps of the regimes of motion, and basins of attraction."""
 
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap, to_rgb
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from ..orbit.results import impacts_in_words
 from ..scan import REGIMES, Basins
 from ..scan.regime import LABELS
 from ..scan.store import NOT_COMPUTED
+from ..scene import AbstractScene, Scene
+from . import colors as look
 from .branch import axis_name
+from .colors import IRREGULAR, PERIODS, color_of, shades
 from .motion import new_axes
 
-# Colours by period; a period beyond the list has the last one.
-_PERIODS = (
-    "#4c78a8", "#f58518", "#54a24b", "#e45756", "#72b7b2", "#eeca3b", "#b279a2", "#9d755d",
-    "#ff9da6",
-)  # fmt: skip
-_COLORS = {
-    REGIMES.unsettled: "#c8c8c8",
-    REGIMES.transient: "#7a6f86",
-    REGIMES.chaotic: "#222222",
-    REGIMES.failed: "#ffffff",
-}
 # What was not computed lies below all regimes.
 _LEAST = min(REGIMES) - 1
-_OTHERS: dict[int, tuple[str, str]] = {
-    **{regime: (regime.meaning, color) for regime, color in _COLORS.items()},
-    _LEAST: ("not computed", "#f3f3f3"),
+# In the order of a legend, after the periods.
+_OTHERS = {
+    **{int(regime): (regime.meaning, color) for regime, color in IRREGULAR.items()},
+    _LEAST: ("not computed", look.NOT_COMPUTED),
 }
+# Motions told apart by their impacts: without any, with one or more than one in two cycles.
+_NONE, _ONE, _MORE = 100, 200, 300
 
 # Motions named one by one in the legend; further ones share its last line.
 _NAMED = 12
 
 
 def plot_regimes(
-    data: xr.Dataset, *, ax: Axes | None = None, x: str | None = None, y: str | None = None
+    data: xr.Dataset,
+    *,
+    scene: AbstractScene | None = None,
+    ax: Axes | None = None,
+    x: str | None = None,
+    y: str | None = None,
 ) -> Axes:
     """A map of the regimes of motion over two axes of a scan.
 
     Each cell has the colour of its period, up to 8 drive cycles and beyond; chaotic, transiently
-    chaotic, unsettled and failed lanes have colours of their own. The legend names what is there.
+    chaotic, unsettled and failed lanes have greys of their own. Where the data hold `impacts`,
+    motions without any are paler, and motions of two cycles with one impact and with more are
+    told apart. The legend names what is there.
 
-    **Arguments:** the data of a scan that measured `"regime"`; `ax`, axes to draw into, a new
-    figure if left out; `x` and `y`, the names of the axes to draw along, the first and the second
-    of the scan if left out.
+    **Arguments:** the data of a scan that measured `"regime"`; `scene`, whose words name the
+    periods (left out: 2π and so on for a `Scene`, cycles for any other machine); `ax`, axes to draw
+    into, a new figure if left out; `x` and `y`, the names of the axes to draw along, the first and
+    the second of the scan if left out.
 
     **Returns:** the axes.
 
@@ -57,35 +65,63 @@ def plot_regimes(
     period = data["period"]
     x, y = _two_axes([str(name) for name in period.dims], x, y)
     period = period.transpose(y, x)
-    codes = np.asarray(period).astype(int)
-    shades = np.clip(codes, _LEAST + 1, len(_PERIODS))
+    codes = np.clip(np.asarray(period).astype(int), _LEAST + 1, len(PERIODS))
+    if "impacts" in data:
+        impacts = np.asarray(data["impacts"].transpose(y, x), float)
+        free, two = (codes > 0) & (impacts < 0.5), (codes == 2) & (impacts >= 0.5)
+        codes = codes + _NONE * free + np.where(impacts > 1.5, _MORE, _ONE) * two
     if "result" in data:
-        shades[np.asarray(data["result"].transpose(y, x)) == NOT_COMPUTED] = _LEAST
+        codes[np.asarray(data["result"].transpose(y, x)) == NOT_COMPUTED] = _LEAST
+    word = _word_of(data) if scene is None else scene.period_of
     ax = new_axes(ax)
     across, up = np.asarray(data[x], float), np.asarray(data[y], float)
-    colors = [_shade(i)[1] for i in range(_LEAST, len(_PERIODS) + 1)]
-    _image(ax, across, up, shades - _LEAST, colors)
-    order = [*range(1, len(_PERIODS) + 1), *_OTHERS]
-    order = [i for i in order if (shades == i).any()]
-    _legend(ax, [_shade(i) for i in order])
+    present = sorted({int(code) for code in codes.flat}, key=_place)
+    names, colors = zip(*(_named(code, word) for code in present), strict=True)
+    shown = np.searchsorted(np.sort(present), codes)
+    order = np.argsort(present)
+    _image(ax, across, up, shown, [colors[i] for i in order])
+    _legend(ax, list(zip(names, colors, strict=True)))
     ax.set_xlabel(axis_name(x))
     ax.set_ylabel(axis_name(y))
     return ax
 
 
-def _shade(code: int) -> tuple[str, str]:
+def _place(code: int) -> tuple[int, int]:
+    """Of a code in the legend: by period, and by impacts within one."""
+    if code <= 0:
+        return 1, list(_OTHERS).index(code)
+    return 0, 1000 * (code % 100) + code
+
+
+def _named(code: int, word: Callable[[int], str]) -> tuple[str, str]:
     """Name and colour of a regime."""
     if code <= 0:
         return _OTHERS[code]
-    most = len(_PERIODS)
-    return f"> {2 * (most - 1)}π" if code == most else f"{2 * code}π", _PERIODS[code - 1]
+    cycles, most = code % 100, len(PERIODS)
+    name = f"> {word(most - 1)}" if cycles == most else word(cycles)
+    kind, impacts = {
+        0: ("", None),
+        _NONE: (", no impact", 0),
+        _ONE: (", 1 impact", 1),
+        _MORE: (", more impacts", 2),
+    }[code - cycles]
+    return name + kind, color_of(cycles, impacts)
+
+
+def _word_of(data: xr.Dataset) -> Callable[[int], str]:
+    """How to call periods in these data, whose attributes tell the class of the scene."""
+    about = str(data.attrs.get("scene", ""))
+    if "CustomNode(" in about and "CustomNode(Scene[" not in about:
+        return lambda cycles: f"{cycles} cycle{'' if cycles == 1 else 's'}"
+    return lambda cycles: f"{2 * cycles}π"
 
 
 def plot_basins(found: Basins, *, ax: Axes | None = None) -> Axes:
     """Basins of attraction over two parts of the start, with the motions' section points.
 
     A grid of starts is drawn as an image, random starts as dots. The legend gives each motion's
-    period, its impacts and its part of the starts.
+    period, its impacts and its part of the starts. A basin has the colour of its motion's period,
+    as in all pictures; further motions of the same kind have other shades of it.
 
     **Arguments:** what `basins` found; `ax`, axes to draw into, a new figure if left out.
 
@@ -98,7 +134,7 @@ def plot_basins(found: Basins, *, ax: Axes | None = None) -> Axes:
     x, y = _two_axes(names, None, None)
     ax = new_axes(ax)
     across, up = np.asarray(found.data[x], float), np.asarray(found.data[y], float)
-    colors, irregular = _basin_colors(len(found.attractors)), len(LABELS)
+    colors, irregular = _basin_colors(found), len(LABELS)
     if label.dims == ("sample",):
         ax.scatter(across, up, c=[colors[i + irregular] for i in np.asarray(label)], s=6, lw=0)
     else:
@@ -109,8 +145,8 @@ def plot_basins(found: Basins, *, ax: Axes | None = None) -> Axes:
         color = colors[a.label + irregular]
         parts = [a.sections[name.removeprefix("start.")] for name in (x, y)]
         ax.plot(*parts, "o", color=color, mec="k", mew=1.0, ms=6, zorder=3)
-        impacts = f"{a.impacts:g} impact{'' if a.impacts == 1 else 's'}"
-        entries.append((f"{2 * a.period}π, {impacts}: {100 * a.fraction:.1f} %", color))
+        motion = f"{found.period_of(a.period)}, {impacts_in_words(round(a.impacts))}"
+        entries.append((f"{motion}: {100 * a.fraction:.1f} %", color))
     if len(entries) > _NAMED:
         rest = sum(a.fraction for a in found.attractors[_NAMED:])
         further = (f"{len(entries) - _NAMED} further: {100 * rest:.1f} %", "none")
@@ -118,18 +154,45 @@ def plot_basins(found: Basins, *, ax: Axes | None = None) -> Axes:
     for regime in LABELS:
         part = found.irregular[regime.name]
         if part:
-            entries.append((f"{regime.meaning}: {100 * part:.1f} %", _COLORS[regime]))
-    _legend(ax, entries)
+            entries.append((f"{regime.meaning}: {100 * part:.1f} %", IRREGULAR[regime]))
+    points = {"ls": "none", "marker": "o", "mfc": "w", "mec": "k", "ms": 6}
+    named = [Line2D([], [], label="sections of the motions", **points)]
+    _legend(ax, entries, named if found.attractors else [])
     ax.set(xlim=region[0], ylim=region[1])  # section points beyond the region stay outside
-    ax.set_xlabel(f"{x.removeprefix('start.')} at the start")
-    ax.set_ylabel(f"{y.removeprefix('start.')} at the start")
+    ax.set_xlabel(_start_name(found.scene, x))
+    ax.set_ylabel(_start_name(found.scene, y))
     return ax
 
 
-def _basin_colors(motions: int) -> list[str]:
-    """Colours of the labels, the least first; many motions share them in turn."""
-    irregular = [_COLORS[regime] for regime in sorted(LABELS, key=LABELS.__getitem__)]
-    return irregular + [_PERIODS[i % len(_PERIODS)] for i in range(motions)]
+def _start_name(scene: AbstractScene | None, name: str) -> str:
+    """What an axis of starts says: the scene's words, with units, for what is a position or a
+    velocity; else the name alone."""
+    name = name.removeprefix("start.")
+    if isinstance(scene, Scene):
+        unit = {"Y": " (a)", "V": " (a ω)", "W": " (ω)"}.get(name, "")
+        return f"{name} at the start{unit}"
+    try:
+        start = None if scene is None else scene.start()
+    except ValueError:  # a scene that has no start of its own
+        start = None
+    if scene is not None and start is not None:
+        values = {key: float(i) + 2.5 for i, key in enumerate(vars(start))}
+        probe = dataclasses.replace(start, **{k: jnp.asarray(v) for k, v in values.items()})
+        for read, words in zip((scene.position, scene.velocity), scene.labels, strict=True):
+            if float(read(probe)) == values[name]:
+                return f"{words} at the start"
+    return f"{name} at the start"
+
+
+def _basin_colors(found: Basins) -> list[str]:
+    """Colours of the labels, the least first."""
+    irregular = [IRREGULAR[regime] for regime in sorted(LABELS, key=LABELS.__getitem__)]
+    kinds: dict[str, Iterator[str]] = {}
+    colors = {}
+    for a in found.attractors:
+        color = color_of(a.period, a.impacts)
+        colors[a.label] = next(kinds.setdefault(color, shades(color)))
+    return irregular + [colors[label] for label in sorted(colors)]
 
 
 def _two_axes(names: list[str], x: str | None, y: str | None) -> tuple[str, str]:
@@ -172,7 +235,9 @@ def _edges(row: np.ndarray) -> np.ndarray:
     return np.concatenate([[2 * row[0] - middle[0]], middle, [2 * row[-1] - middle[-1]]])
 
 
-def _legend(ax: Axes, entries: list[tuple[str, str]]) -> None:
-    patches = [Patch(facecolor=color, edgecolor="0.4", label=name) for name, color in entries]
+def _legend(ax: Axes, entries: list[tuple[str, str]], marks: Sequence[Line2D] = ()) -> None:
+    patches: list[Any] = [
+        Patch(facecolor=color, edgecolor="0.4", label=name) for name, color in entries
+    ]
     place = {"loc": "upper left", "bbox_to_anchor": (1.01, 1.0), "borderaxespad": 0.0}
-    ax.legend(handles=patches, frameon=False, fontsize="small", **place)
+    ax.legend(handles=[*patches, *marks], frameon=False, fontsize="small", **place)

@@ -62,6 +62,12 @@ class Basins(NamedTuple):
     irregular: dict[str, float]
     """Fractions of the starts that ended on no periodic motion: chaotic, unsettled, failed,
     transient (transiently chaotic, see `Regime`)."""
+    scene: AbstractScene | None = None
+    """What moves; its words name the periods."""
+
+    def period_of(self, cycles: int) -> str:
+        """A duration of so many cycles, in the words of the scene."""
+        return f"{2 * cycles}π" if self.scene is None else self.scene.period_of(cycles)
 
     def __str__(self) -> str:
         many = "" if len(self.attractors) == 1 else "s"
@@ -69,7 +75,7 @@ class Basins(NamedTuple):
         for a in self.attractors:
             where = ", ".join(f"{name} = {x[0]:.6g}" for name, x in a.sections.items())
             lines.append(
-                f"  {a.label}: period {2 * a.period}π, "
+                f"  {a.label}: period {self.period_of(a.period)}, "
                 f"{impacts_in_words(round(a.impacts))}, {where}: "
                 f"{100 * a.fraction:.2f} ± {100 * a.error:.2f} %"
             )
@@ -214,7 +220,7 @@ def basins(
     dims = data["period"].dims
     kind = np.min_scalar_type(-max(4, len(order)))
     data = data.assign(label=(dims, label.astype(kind).reshape(data["period"].shape), about))
-    return Basins(data, attractors, parts)
+    return Basins(data, attractors, parts, scene)
 
 
 def _sorted_out(

@@ -16,7 +16,7 @@ from ..flow import RESULTS, simulate
 from ..flow.choice import MethodLike, chosen
 from ..flow.simulate import check_start
 from ..orbit.results import impacts_in_words
-from ..scene import AbstractScene
+from ..scene import LABELS, AbstractScene
 from ..scene.numbers import check_again, check_leaf, with_leaf
 from .regime import REGIMES, impacts_of, least_period
 
@@ -47,6 +47,10 @@ class Sweep(eqx.Module):
     """Section states of the cycles observed; leaves (values, cycles)."""
     result: RESULTS
     """Whether each value was simulated to its end."""
+    labels: tuple[str, str] = eqx.field(static=True, default=LABELS)
+    """What pictures write beside position and velocity, in the scene's words."""
+    periods: tuple[str, ...] = eqx.field(static=True, default=())
+    """Names of the periods of 1, 2, ... cycles, in the scene's words."""
 
     @property
     def successful(self) -> Bool[Array, "..."]:
@@ -76,8 +80,10 @@ class Sweep(eqx.Module):
             REGIMES.unsettled: "no period",
             REGIMES.failed: REGIMES.failed.meaning,
         }
+        periods = dict(enumerate(self.periods, 1))
         return [
-            names.get(int(p)) or f"{2 * int(p)}π with {impacts_in_words(round(float(n)))}"
+            names.get(int(p))
+            or f"{periods.get(int(p), f'{2 * int(p)}π')} with {impacts_in_words(round(float(n)))}"
             for p, n in zip(np.asarray(self.period), np.asarray(self.impacts), strict=True)
         ]
 
@@ -214,6 +220,8 @@ def _sweep(
             impact_speed=jnp.max(run.impact_speed),
             sections=sections,
             result=run.result,
+            labels=scene.labels,
+            periods=tuple(scene.period_of(n) for n in range(1, cycles // 2 + 1)),
         )
 
     return jax.lax.scan(one, start, values)[1]

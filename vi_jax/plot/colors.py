@@ -1,0 +1,107 @@
+"""The colours of all pictures, told apart with any colour vision; the marks of special points.
+
+A colour stands for a period, and for the same period everywhere; what has no period is grey. They
+are of the sets of Okabe and Ito and of Paul Tol, put in such an order that each differs from those
+before it, in lightness too, as seen with normal and with each kind of dichromatic vision (a test
+measures by how much). Bifurcations are told by mark and dash, so that they need no colour.
+"""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import to_hex, to_rgb
+from matplotlib.lines import Line2D
+
+from ..scan import REGIMES
+
+# By period in drive cycles: 2π, 4π, ...; a period beyond the list has the last one.
+PERIODS = (
+    "#0072b2", "#e69f00", "#882255", "#66ccee", "#332288", "#ddcc77", "#d55e00", "#5e3c99",
+    "#cc79a7",
+)  # fmt: skip
+# The 4π motions that hit more than once: darker, as they are another family.
+MORE_IMPACTS = "#a3480b"
+
+# The less regular, the darker; what failed is white.
+IRREGULAR = {
+    REGIMES.unsettled: "#b9b9b9",
+    REGIMES.transient: "#7f7f7f",
+    REGIMES.chaotic: "#1a1a1a",
+    REGIMES.failed: "#ffffff",
+}
+NOT_COMPUTED = "#e6e6e6"
+
+BLUE, ORANGE, RED, GREEN = "#0072b2", "#e69f00", "#d55e00", "#009e73"
+STOP = GREEN
+
+# Mark and fill; the edge is black.
+MARKS = {
+    "grazing": ("o", "k"),
+    "fold": ("s", "w"),
+    "period-doubling": ("D", "0.7"),
+    "neimark-sacker": ("^", "w"),
+    "branch-point": ("X", "k"),
+    "symmetry-breaking": ("P", "w"),
+    "hopf": ("*", "0.7"),
+}
+DASHES = {
+    "grazing": "-",
+    "period-doubling": (0, (5, 2)),
+    "fold": (0, (6, 1.5, 1.2, 1.5)),
+    "branch-point": (0, (1.2, 1.2)),
+}
+
+
+def color_of(cycles: int, impacts: float | int | None = None) -> str:
+    """Colour of a motion of this period in drive cycles, or of a regime without one.
+
+    With the impacts in a period, a motion without any is paler, and one of two cycles with more
+    than one has a colour of its own.
+    """
+    if cycles <= 0:
+        return IRREGULAR[REGIMES(cycles)]
+    color = PERIODS[min(cycles, len(PERIODS)) - 1]
+    if impacts is None:
+        return color
+    if impacts < 0.5:
+        return paler(color)
+    return MORE_IMPACTS if cycles == 2 and impacts > 1.5 else color
+
+
+def shades(color: str) -> Iterator[str]:
+    """The colour, and then others of its hue for further motions of the same kind."""
+    yield color
+    while True:
+        for part in (0.7, 0.35):
+            yield paler(color, part)
+        for part in (0.75, 0.5):
+            yield _hex(part * np.array(to_rgb(color)))
+
+
+def paler(color: str, part: float | int = 0.45) -> str:
+    """So much of the colour, the rest white."""
+    return _hex(part * np.array(to_rgb(color)) + 1 - part)
+
+
+def _hex(rgb: np.ndarray) -> str:
+    red, green, blue = map(float, rgb)
+    return to_hex((red, green, blue))
+
+
+def mark_of(kind: str, **style: Any) -> Line2D:
+    """How a special point of this kind looks in a legend."""
+    return Line2D([], [], **{**mark_style(kind), "label": kind, **style})
+
+
+def mark_style(kind: str) -> dict[str, Any]:
+    """Options of `Axes.plot` for a special point."""
+    marker, fill = MARKS[kind]
+    size = {"*": 9.0, "X": 7.0, "P": 7.0}.get(marker, 5.0)
+    return {"marker": marker, "mfc": fill, "mec": "k", "mew": 0.8, "ms": size, "ls": "none"}
+
+
+def once(ax: Axes, label: str) -> str | None:
+    """The label, unless something in the axes has it."""
+    return None if label in ax.get_legend_handles_labels()[1] else label
