@@ -12,17 +12,19 @@ from matplotlib.patches import Patch
 from scipy.interpolate import CubicSpline
 
 from ..orbit import Boundary, Branch, SpecialPoint, boundary, continue_orbit, find_orbit
-from ..plot.motion import BLUE, RED
+from ..plot.colors import DASHES, color_of, paler
 from ..scene import Parameters, Scene
-from .motions import FREQUENCY_RATIO, RESTITUTION, orbits, table_damping_ratio
+from .motions import FREQUENCY_RATIO, GAP, RESTITUTION, orbits, table_damping_ratio
 from .response import RANGE, RATIO
 
 K, XI = "stops.0.restitution", "oscillator.damping_ratio"
 # At k = 1 without damping the motions are no longer isolated, and the curves end there.
 K_RANGE, C_RANGE = (0.02, 0.999), (0.0, 1.2)
 
-ORANGE, GREY = "#e08214", "0.25"
-SHORT_FILL, LONG_FILL = "#f6d5d3", "#c9d8f8"
+SHORT, LONG = color_of(1, 1), color_of(2, 1)
+# Darker, to be seen on its filling.
+LONG_LINE = "#b87f00"
+SHORT_FILL, LONG_FILL = paler(SHORT, 0.2), paler(LONG, 0.4)
 
 
 def table_damping() -> float:
@@ -160,6 +162,15 @@ def birth_without_damping(curves: BoundaryCurves) -> float:
     return float(points[np.argmin(points[:, 1]), 0])
 
 
+def free_motion_touches(c: np.ndarray) -> np.ndarray:
+    """The larger ζ at which the motion without impacts reaches the stop, for each c (N·s/m).
+
+    There, as at the smaller one, a motion with an impact is born; without damping at √(1 + 1/d).
+    """
+    q = 1 - 2 * (np.asarray(c) * xi_per_c()) ** 2
+    return np.sqrt(q + np.sqrt(q**2 - 1 + 1 / GAP**2))
+
+
 def describe_boundaries(curves: BoundaryCurves) -> dict[str, float | None]:
     """What the curves say about the figures' ζ and k, and about Table 1's c, in numbers.
 
@@ -207,11 +218,16 @@ def draw_boundaries(curves: BoundaryCurves) -> Figure:
     handles = [
         Patch(color=SHORT_FILL, label="2π motion unstable"),
         Patch(color=LONG_FILL, label="4π with one impact, the paper's family"),
-        Line2D([], [], color=RED, lw=2.0, label="2π: period doubling"),
-        Line2D([], [], color=GREY, lw=2.0, label="2π: born by grazing"),
-        Line2D([], [], color=ORANGE, lw=2.0, label="2π: fold"),
-        Line2D([], [], color=BLUE, lw=2.0, label="4π: touches the stop again"),
-        Line2D([], [], color=BLUE, lw=1.6, ls="--", label="4π: period doubling"),
+        *(
+            Line2D([], [], color=color, lw=1.8, ls=DASHES[kind], label=label)
+            for color, kind, label in (
+                (SHORT, "grazing", "2π: born by grazing"),
+                (SHORT, "period-doubling", "2π: period doubling"),
+                (SHORT, "fold", "2π: fold"),
+                (LONG_LINE, "grazing", "4π: touches the stop again"),
+                (LONG_LINE, "period-doubling", "4π: period doubling"),
+            )
+        ),
         Line2D(
             [], [], color="k", marker="*", ls="none", ms=11, label="Figs. 3 and 4: k = 0.5, ζ = 0.9"
         ),
@@ -243,13 +259,18 @@ def _draw(ax: Axes, curves: BoundaryCurves, plane: str, zoom: bool) -> None:
     left, right = (_over(points, levels) for points in (birth, doubling))
     ax.fill_betweenx(levels, left, right, color=SHORT_FILL, lw=0, zorder=0)
     ax.fill(*touch.T, color=LONG_FILL, lw=0, zorder=1)
-    ax.plot(*birth.T, color=GREY, lw=2.0)
-    ax.plot(*doubling.T, color=RED, lw=2.0)
-    ax.plot(*touch.T, color=BLUE, lw=2.0)
-    if plane == "k" and curves.long_doubling_k is not None:
-        ax.plot(*plane_points(curves.long_doubling_k).T, color=BLUE, lw=1.6, ls="--")
-    if fold is not None:
-        ax.plot(*plane_points(fold).T, color=ORANGE, lw=2.0)
+    upper = np.column_stack([free_motion_touches(0.0 * levels if plane == "k" else levels), levels])
+    for points, color, kind in (
+        (birth, SHORT, "grazing"),
+        (upper, SHORT, "grazing"),
+        (doubling, SHORT, "period-doubling"),
+        (touch, LONG_LINE, "grazing"),
+        (curves.long_doubling_k if plane == "k" else None, LONG_LINE, "period-doubling"),
+        (fold, SHORT, "fold"),
+    ):
+        if points is not None:
+            points = plane_points(points) if isinstance(points, Boundary) else points
+            ax.plot(*points.T, color=color, lw=1.8, ls=DASHES[kind])
     undamped = RESTITUTION if plane == "k" else 0.0
     ax.plot(FREQUENCY_RATIO, undamped, "k*", ms=11, clip_on=False, zorder=6)
     if plane == "c":

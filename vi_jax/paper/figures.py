@@ -9,11 +9,14 @@ from matplotlib.figure import Figure
 
 from ..flow import Run
 from ..plot import motion_path, plot_history, save_picture
-from ..plot.motion import GREEN, PINK, RED, angle_axis
+from ..plot.colors import STOP, color_of
+from ..plot.motion import angle_axis
 from ..plot.stamp import stamp
 from .motions import Case
 
 _DPI = 110
+# A simulated motion, whose regime is what the picture is to show.
+_INK = "0.2"
 
 # Under this name a picture keeps what it shows.
 DRAWN = "vi_jax numbers drawn"
@@ -32,9 +35,10 @@ def draw_figure(number: int, cases: tuple[Case, Case], path: Path) -> None:
     for row, case in zip(grid, cases, strict=True):
         _draw_row(number, case, list(row))
     figure.suptitle(_title(number), fontsize=13)
-    # An undamped panel has every curve.
-    handles, labels = grid[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False, fontsize=11)
+    # The undamped panels have every curve.
+    named = [ax.get_legend_handles_labels() for ax in grid[0, :2]]
+    handles, labels = (list(named[0][i]) + list(named[1][i]) for i in (0, 1))
+    figure.legend(handles, labels, loc="outside lower center", ncols=7, frameon=False, fontsize=11)
     save_picture(figure, path, dpi=_DPI, colors=64)
     stamp(path, DRAWN, json.dumps(drawn_numbers(number, cases)))
 
@@ -81,17 +85,18 @@ def _draw_row(number: int, case: Case, axes: list[Axes]) -> None:
 def _panel(ax: Axes, number: int, case: Case, run: Run, window: tuple[int, int]) -> None:
     """A few cycles of the run with the closed forms on top."""
     plot_history(
-        run, scene=case.scene, ax=ax, window=window, stops=False, lw=2.4, alpha=0.75,
-        label="simulation",
+        run, scene=case.scene, ax=ax, window=window, stops=False, lw=3.2,
+        color=_INK, alpha=0.55, label="simulation",
     )  # fmt: skip
-    for period, color, dash in ((1, RED, (4, 2)), (2, PINK, (5, 3))):
+    for period, dash in ((1, (4, 2)), (2, (5, 3))):
+        color = color_of(period, 1)
         if period == 2 and not case.long_exists:
             continue
         # In Figure 4 the run starts on the closed form's own section.
         shift = case.long_shift if number == 3 and period == 2 else 0
         place, Y = _tiled(case, period, shift, window)
-        ax.plot(2 * place, Y, color=color, lw=1.6, dashes=dash, label=f"{2 * period}π closed form")
-    _stop(ax, case)
+        ax.plot(2 * place, Y, color=color, lw=1.8, dashes=dash, label=f"{2 * period}π closed form")
+    _stop(ax, case, label=True)
     angle_axis(ax, every=1 if window[1] - window[0] < 3 else 2)
     ax.set_xlim(2 * window[0], 2 * window[1])
 
@@ -111,18 +116,22 @@ def _tiled(
 
 
 def _whole(ax: Axes, case: Case, run: Run) -> None:
-    """The whole run, with the smallest Y of the closed forms as levels."""
-    plot_history(run, scene=case.scene, ax=ax, unit="cycles", stops=False, lw=0.5)
-    ax.axhline(float(case.short.y_min[0]), color=RED, lw=1.4, dashes=(4, 2))
-    if case.long_exists:
-        ax.axhline(float(case.long.y_min[0]), color=PINK, lw=1.4, dashes=(5, 3))
-    ax.text(
-        0.98, 0.02, "dashed levels: smallest Y of the closed forms", transform=ax.transAxes,
-        ha="right", fontsize=9, color="0.3",
-    )  # fmt: skip
+    """The smallest Y of each cycle of the run, with those of the closed forms as levels."""
+    assert run.y_min is not None
+    cycle = np.arange(run.impacts.shape[0]) + 0.5
+    dots = {"ls": "none", "ms": 4.5, "mew": 0, "color": _INK, "alpha": 0.55}
+    ax.plot(cycle, np.asarray(run.y_min), "o", label="simulation: smallest Y of each cycle", **dots)
+    forms = [(1, case.on_short)] + [(2, case.from_long)] * case.long_exists
+    for period, motion in forms:
+        color, dash = color_of(period, 1), (4, 2) if period == 1 else (5, 3)
+        assert motion.y_min is not None
+        for Y in np.asarray(motion.y_min)[:period]:
+            ax.axhline(float(Y), color=color, lw=1.4, dashes=dash, zorder=3)
     _stop(ax, case)
+    ax.set_xlabel("drive cycles φ/(2π)")
     ax.set_xlim(0, run.impacts.shape[0])
 
 
-def _stop(ax: Axes, case: Case) -> None:
-    ax.axhline(float(case.scene.stops[0].gap), color=GREEN, lw=1.8, label="stop, Y = 2")
+def _stop(ax: Axes, case: Case, *, label: bool = False) -> None:
+    name = "stop, Y = 2" if label else None
+    ax.axhline(float(case.scene.stops[0].gap), color=STOP, lw=1.8, label=name)

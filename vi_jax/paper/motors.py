@@ -13,7 +13,8 @@ from matplotlib.figure import Figure
 from ..flow import Run, simulate
 from ..orbit import Orbit, find_orbit
 from ..orbit.results import trimmed
-from ..plot.motion import BLUE, GREEN, PINK, angle_axis
+from ..plot.colors import STOP, color_of
+from ..plot.motion import angle_axis
 from ..scene import Parameters, Scene
 from .motions import CYCLES, FREQUENCY_RATIO, RESTITUTION, SAMPLES, figure_scene
 from .orbits import TableRow, orbits
@@ -147,23 +148,24 @@ def draw_motors(motors: Sequence[MotorRun], ideal: Run) -> Figure:
     for (above, below), motor in zip(grid.T, motors, strict=True):
         assert motor.from_rest.samples is not None
         state = motor.from_rest.samples.state
-        above.plot(place, np.asarray(state.Y)[last], color=BLUE, lw=2.2, alpha=0.8, label="motor")
+        above.plot(place, np.asarray(state.Y)[last], color="0.2", lw=3.0, alpha=0.55, label="motor")
         above.plot(
             place, _in_step(np.asarray(ideal.samples.state.Y), np.asarray(state.Y))[last],
-            color=PINK, lw=1.5, dashes=(5, 3), label="ideal drive",
+            color=color_of(2, 1), lw=1.8, dashes=(5, 3), label="ideal drive, 4π",
         )  # fmt: skip
-        above.axhline(2.0, color=GREEN, lw=1.8, label="stop, Y = 2")
-        below.plot(place, np.asarray(state.W)[last], color=BLUE, lw=1.6)
-        below.axhline(FREQUENCY_RATIO, color="0.4", lw=1.0, ls=":")
+        above.axhline(2.0, color=STOP, lw=1.8, label="stop, Y = 2")
+        below.plot(place, np.asarray(state.W)[last], color="0.2", lw=1.6)
+        below.axhline(FREQUENCY_RATIO, color="0.4", lw=1.2, ls=":", label="mean ζ = 0.90")
         above.set_title(f"T0 = {motor.torque:g} N·m, κ = {motor.kappa:.4f}", fontsize=11)
         angle_axis(below, every=2)
         below.set_xlim(0, 8)
         for ax in (above, below):
             ax.grid(alpha=0.25, lw=0.5)
     grid[0, 0].set_ylabel("Y = y/a")
-    grid[1, 0].set_ylabel("crank speed φ'/ω")
-    handles, labels = grid[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=11)
+    grid[1, 0].set_ylabel("crank speed dφ/dτ (ω)")
+    named = [ax.get_legend_handles_labels() for ax in grid[:, 0]]
+    handles, labels = (list(named[0][i]) + list(named[1][i]) for i in (0, 1))
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False, fontsize=11)
     figure.suptitle(
         f"Figures 3 and 4 with the motor: the last 8π of {CYCLES} cycles from rest "
         "(k = 0.50, undamped, Δ = 2a, mean ζ = 0.90)"

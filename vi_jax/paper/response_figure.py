@@ -4,18 +4,30 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from ..plot import plot_branch
-from ..plot.motion import BLUE, GREEN, PINK, RED
+from ..plot.colors import MORE_IMPACTS, STOP, color_of, mark_of, paler
+from ..scan import REGIMES
 from .discrepancy import between, rows
 from .motions import GAP
 from .response import FINE, RANGE, RESTITUTIONS, Response, System
 
 # What `save_picture` makes a small file of it with.
 LOOK = {"dpi": 72, "colors": 250}
+
+# Width of a closed form, which is seen on both sides of what lies on it.
+_BAND = 7.0
+# Circles for the run-up and dots for the close-down, as in the paper.
+_UP: dict[str, Any] = {
+    "marker": "o", "ls": "none", "color": "0.3", "mfc": "none", "ms": 3.8, "mew": 0.6, "zorder": 5
+}  # fmt: skip
+_DOWN: dict[str, Any] = {
+    "marker": "o", "ls": "none", "color": "k", "mew": 0, "ms": 1.7, "zorder": 6
+}  # fmt: skip
 
 
 def draw_response(found: Response) -> Figure:
@@ -44,20 +56,22 @@ def draw_response(found: Response) -> Figure:
         ax.set_xlabel("frequency ratio ζ")
         ax.set_ylabel("min Y, max Y (a)" if row < 2 else "min Y (a)")
     lines: list[Any] = [
-        Line2D([], [], color=RED, lw=2.6, alpha=0.45, label="2π closed form"),
-        Line2D([], [], color=PINK, lw=3.6, alpha=0.5, label="4π closed form, 1 impact"),
-        Line2D([], [], color=BLUE, lw=1.4, label="continued: stable"),
-        Line2D([], [], color=BLUE, lw=1.4, ls="--", label="continued: unstable"),
-        Line2D([], [], color="0.45", lw=1.1, ls="-.", label="free motion, ±1/|1 - ζ² + 2iξζ|"),
-        Line2D([], [], color=GREEN, lw=1.8, label="stop"),
-        Line2D([], [], color="k", marker="o", mfc="none", ms=4, ls="", label="run-up"),
-        Line2D([], [], color=RED, marker=".", ms=5, ls="", label="close-down"),
-        Line2D([], [], color="tab:red", marker="D", ms=5, ls="", label="period doubling"),
-        Line2D([], [], color="tab:orange", marker="s", ms=5, ls="", label="fold"),
-        Line2D([], [], color="k", marker="o", ms=5, ls="", label="grazing"),
-        *(Patch(color=color, label=name) for name, color in colors.items()),
+        Line2D([], [], color="0.4", lw=_BAND, alpha=0.35, label="closed form"),
+        Line2D([], [], color="0.2", lw=1.4, label="continued: stable"),
+        Line2D([], [], color="0.2", lw=1.4, ls="--", label="continued: unstable"),
+        Line2D([], [], color="0.45", lw=1.4, ls="-.", label="free motion, ±1/|1 - ζ² + 2iξζ|"),
+        Line2D([], [], color=STOP, lw=1.8, label="stop"),
+        Line2D([], [], color="k", lw=1.0, ls=":", label="second stop of the paper's drawing?"),
+        Line2D([], [], label="run-up", **{**_UP, "ms": 5}),
+        Line2D([], [], label="close-down", **{**_DOWN, "ms": 3}),
+        *(mark_of(kind) for kind in ("period-doubling", "fold", "grazing")),
     ]
-    figure.legend(handles=lines, loc="outside lower center", ncols=6, frameon=False, fontsize=10)
+    look: dict[str, Any] = {"frameon": False, "fontsize": 10, "alignment": "left"}
+    figure.legend(handles=lines, loc="outside lower left", ncols=4, title="lines and marks", **look)
+    motions = [Patch(color=color, label=name) for name, color in colors.items()]
+    figure.legend(
+        handles=motions, loc="outside lower right", ncols=3, title="colours: motions", **look
+    )
     figure.suptitle(
         "Fig. 2 of the paper: ideal drive, Δ = 2a. Strips: what the sweeps settle on", fontsize=14
     )
@@ -67,16 +81,16 @@ def draw_response(found: Response) -> Figure:
 def _colors(found: Response) -> dict[str, str]:
     """A colour for each kind of motion in the strips; rare ones share one."""
     fixed = {
-        "2π, 1 impact": "#f2b8b5",
-        "4π, 1 impact": "#ff9bdc",
-        "4π, 2 impacts": "#9fb8ff",
-        "6π, 2 impacts": "#8fd3a5",
-        "8π, 4 impacts": "#c9a6e8",
-        "4π, 3 impacts": "#f0b27a",
-        "8π, 5 impacts": "#a3dbe0",
-        "other period": "#f4ea7a",
-        "chaotic": "#8c8c8c",
-        "no period found": "#e4e4e4",
+        "2π, 1 impact": color_of(1, 1),
+        "4π, 1 impact": color_of(2, 1),
+        "4π, 2 impacts": MORE_IMPACTS,
+        "4π, 3 impacts": paler(MORE_IMPACTS, 0.6),
+        "6π, 2 impacts": color_of(3),
+        "8π, 4 impacts": color_of(4),
+        "8π, 5 impacts": paler(color_of(4), 0.55),
+        "other period": color_of(9),
+        "chaotic": color_of(REGIMES.chaotic),
+        "no period found": color_of(REGIMES.unsettled),
     }
     names = set()
     for ratios, systems in ((found.ratios, found.systems), (_fine(found.ratios), found.walled)):
@@ -85,6 +99,7 @@ def _colors(found: Response) -> dict[str, str]:
                 names |= {r.motion for r in rows(system, name, between(system, ratios))}
     if names - set(fixed):
         names.add("other period")
+    names |= {"2π, 1 impact", "4π, 1 impact", "4π, 2 impacts"}  # the lines'
     return {name: color for name, color in fixed.items() if name in names}
 
 
@@ -93,18 +108,29 @@ def _fine(ratios: np.ndarray) -> np.ndarray:
 
 
 def _closed_curves(ax: Axes, ratios: np.ndarray, system: System) -> None:
-    for n, color, width in ((2, PINK, 3.6), (1, RED, 2.6)):
+    for n in (2, 1):
         form = system.closed[n]
         for i in range(2):
             y_min = np.where(form.admissible[:, i], form.y_min[:, i], np.nan)
-            ax.plot(ratios, y_min, color=color, lw=width, alpha=0.45)
+            ax.plot(
+                ratios, y_min, color=color_of(n, 1), lw=_BAND, alpha=0.35,
+                solid_capstyle="butt", zorder=1.5,
+            )  # fmt: skip
 
 
 def _sweep_marks(ax: Axes, ratios: np.ndarray, system: System, name: str = "y_min") -> None:
     """Circles for the run-up and dots for the close-down, as in the paper."""
     up, down = (np.asarray(getattr(system.sweeps[s], name)) for s in ("run-up", "close-down"))
-    ax.plot(ratios, up, "o", color="k", mfc="none", ms=4, mew=0.7, zorder=5)
-    ax.plot(ratios, down, ".", color=RED, ms=4, zorder=6)
+    ax.plot(ratios, up, **_UP)
+    ax.plot(ratios, down, **_DOWN)
+
+
+def _free(ax: Axes, system: System) -> None:
+    """The motion without impacts, with and without its reaching the stop."""
+    zeta = np.linspace(*RANGE, 1401)
+    free = 1 / np.abs(1 - zeta**2 + 2j * system.damping_ratio * zeta + 1e-300)
+    for sign in (-1, 1):
+        ax.plot(zeta, sign * free, color="0.45", lw=1.4, ls="-.", zorder=1)
 
 
 def _lines(ax: Axes, system: System) -> None:
@@ -119,16 +145,13 @@ def _lines(ax: Axes, system: System) -> None:
 
 def _whole(ax: Axes, found: Response, system: System) -> None:
     _closed_curves(ax, found.ratios, system)
-    zeta = np.linspace(*RANGE, 1401)
-    free = 1 / np.abs(1 - zeta**2 + 2j * system.damping_ratio * zeta + 1e-300)
-    for sign in (-1, 1):
-        ax.plot(zeta, sign * free, color="0.45", lw=1.1, ls="-.", zorder=1)
+    _free(ax, system)
     for branch in system.branches:
-        plot_branch(branch, ax=ax, special=False, lw=1.2)
+        plot_branch(branch, ax=ax, special=False, legend=False, lw=1.4)
     _sweep_marks(ax, found.ratios, system)
     _sweep_marks(ax, found.ratios, system, "y_max")
-    ax.axhline(GAP, color=GREEN, lw=1.6)
-    ax.axhline(found.wall, color="k", lw=1.0, ls="--")
+    ax.axhline(GAP, color=STOP, lw=1.6)
+    ax.axhline(found.wall, color="k", lw=1.0, ls=":")
     ax.text(0.51, found.wall + 0.06, "a stop here?", fontsize=8.5)
     _lines(ax, system)
     ax.set_xlim(*RANGE)
@@ -145,11 +168,12 @@ def _zoom(
 ) -> None:
     """From BB' to CC', with a strip for each sweep that names its motions by colour."""
     _closed_curves(ax, ratios, system)
+    _free(ax, system)
     for branch in system.branches:
-        plot_branch(branch, ax=ax, lw=1.3)
+        plot_branch(branch, ax=ax, legend=False, lw=1.5)
     _sweep_marks(ax, ratios, system)
-    look: dict[str, Any] = {"color": "k", "lw": 1.0, "ls": "--"}
-    ax.axhline(wall, **({"color": GREEN, "lw": 1.8} if solid else look))
+    look: dict[str, Any] = {"color": "k", "lw": 1.0, "ls": ":"}
+    ax.axhline(wall, **({"color": STOP, "lw": 1.8} if solid else look))
     ax.text(0.658, wall + 0.05, "second stop" if solid else "a stop here?", fontsize=8.5)
     _lines(ax, system)
     ax.set_xlim(0.655, 1.01)
@@ -159,11 +183,18 @@ def _zoom(
             color = colors.get(row.motion, colors.get("other period", "0.5"))
             ends = _edges(ratios, row.part)
             ax.fill_between(ends, y - 0.09, y + 0.09, color=color, lw=0)
-            if ends[1] - ends[0] > 0.03 * len(row.motion) / 12:
-                ax.text(
-                    sum(ends) / 2, y, row.motion, ha="center", va="center", fontsize=8, zorder=7
-                )
+            _name(ax, sum(ends) / 2, y, row.motion, ends[1] - ends[0], color)
         ax.text(0.704, y, name, ha="right", va="center", fontsize=8.5)
+
+
+def _name(ax: Axes, x: float, y: float, motion: str, width: float, color: str) -> None:
+    """A strip's motion, or where it is too narrow only its period."""
+    dark = np.dot(to_rgb(color), (0.3, 0.59, 0.11)) < 0.55
+    for name in (motion, motion.partition(",")[0]):
+        if width > 0.0026 * len(name):
+            look = {"ha": "center", "va": "center", "fontsize": 8, "zorder": 7}
+            ax.text(x, y, name, color="w" if dark else "k", **look)
+            return
 
 
 def _edges(ratios: np.ndarray, part: np.ndarray) -> tuple[float, float]:
