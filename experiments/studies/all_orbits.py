@@ -22,9 +22,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import vi_jax as vi
+from matplotlib import patheffects
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
+from vi_jax.plot.colors import STOP, color_of, paler
 
 jax.config.update("jax_enable_x64", True)
 
@@ -235,51 +237,67 @@ print(report)
 # ## Figure: sections over the basins, and a phase portrait of each motion
 
 # %%
-PALE = ["#f2e6b8", "#bcdcf0", "#cfe8c6", "#e3cdea", "#f6d0c0", "#d9d9d9", "#fff7ec"]
-RED, BLUE = "#d62728", "#1f4fd8"
+COLORS = [color_of(len(kind.path), float(kind.orbit.impacts)) for kind in kinds]
 figure = Figure(figsize=(12.5, 6.6), layout="constrained")
 FigureCanvasAgg(figure)
 left, right = np.ravel(figure.subfigures(1, 2, width_ratios=(1, 1.15), squeeze=False))
 axes = left.subplots(1, 1, squeeze=False)[0, 0]
 stable = [j for j, kind in enumerate(kinds) if bool(kind.orbit.stable)]
+pale = [paler(COLORS[j], 0.45) for j in stable]
 axes.pcolormesh(
     *side,
     np.select([basin == j for j in stable], list(range(len(stable))), len(stable)),
-    cmap=ListedColormap([*PALE[: len(stable)], "white"]),
+    cmap=ListedColormap([*pale, "white"]),
     vmin=-0.5,
     vmax=len(stable) + 0.5,
 )
+axes.set(xlabel="Y = y/a at φ = π", ylabel="V = dY/dτ at φ = π (a ω)")
+axes.set(xlim=(LOW[0], HIGH[0] + 0.2), ylim=(LOW[1], HIGH[1]))
+axes.axvline(GAP, color=STOP, lw=1.8, label="stop")
+everywhere = np.concatenate([kind.path for kind in kinds])
+ways = 0.17 * np.stack([f(np.arange(16) * np.pi / 8) for f in (np.cos, np.sin)], axis=1) * (1, 1.5)
+taken = everywhere.copy()
 for j, kind in enumerate(kinds):
     good = bool(kind.orbit.stable)
-    axes.plot(*kind.path.T, "o" if good else "X", color=BLUE if good else RED, ms=6, mec="white")
-    for point in kind.path:
-        place = {"xytext": (4, 4), "textcoords": "offset points"}
-        axes.annotate(chr(65 + j), tuple(point), fontsize=10, **place)
-for j, _ in enumerate(stable):
-    name = f"basin of {chr(65 + stable[j])}"
-    axes.plot([], [], "s", ms=10, color=PALE[j], mec="0.6", label=name)
+    look = {"color": COLORS[j], "mec": "k", "mew": 0.7, "ms": 6 if good else 7}
+    axes.plot(*kind.path.T, "o" if good else "X", **look)
+    for point in kind.path:  # a letter where there is most room
+        places = point + ways
+        far = np.abs((places[:, None] - taken) / (1, 1.5)).max(axis=2)
+        far = np.where(places[:, 0] > HIGH[0] + 0.1, 0.0, far.min(axis=1))
+        place = places[np.argmax(far)]
+        taken = np.concatenate([taken, [place]])
+        text = axes.text(*place, chr(65 + j), fontsize=10, ha="center", va="center")
+        text.set_path_effects([patheffects.withStroke(linewidth=2.2, foreground="w")])
+for j, color in zip(stable, pale, strict=True):
+    axes.plot([], [], "s", ms=10, color=color, mec="0.6", label=f"basin of {chr(65 + j)}")
 axes.plot([], [], "s", ms=10, color="white", mec="0.6", label="none of these")
-axes.plot([], [], "o", color=BLUE, label="stable orbit")
-axes.plot([], [], "X", color=RED, label="unstable orbit")
-axes.axvline(GAP, color="#1a9641", lw=1.8, label="stop")
-axes.set(xlabel="Y = y/a at φ = π", ylabel="V = dY/dτ at φ = π")
-axes.set(xlim=(LOW[0], HIGH[0] + 0.2), ylim=(LOW[1], HIGH[1]))
+axes.plot([], [], "o", color="w", mec="k", label="stable orbit")
+axes.plot([], [], "X", color="w", mec="k", label="unstable orbit")
 left.legend(loc="outside upper center", ncols=4, fontsize=9)
 
-panels = right.subplots(-(-len(kinds) // 2), 2, squeeze=False).ravel()
+panels = right.subplots(-(-len(kinds) // 2), 2, sharex=True, sharey=True, squeeze=False).ravel()
 for j, (panel, kind) in enumerate(zip(panels, kinds, strict=False)):
     run = kind.orbit.trajectory()
-    color = BLUE if bool(kind.orbit.stable) else RED
-    vi.plot_phase_portrait(run, kind.orbit.scene, ax=panel, color=color)
+    good = bool(kind.orbit.stable)
+    vi.plot_phase_portrait(
+        run, kind.orbit.scene, ax=panel, color=COLORS[j], lw=1.4, ls="-" if good else "--"
+    )
     cycles = len(kind.path)
     panel.set_title(f"{chr(65 + j)}: {2 * cycles}π, |μ| = {kind.size:.3f}", fontsize=10)
+    panel.set(xlim=(-3.4, 1.4), ylim=(-4, 4), ylabel="V (a ω)")
     panel.label_outer()
-    panel.set(xlim=(-3.4, 1.4), ylim=(-4, 4))
-    if j + 2 >= len(kinds):  # the lowest panel of its column
-        panel.tick_params(labelbottom=True)
-        panel.set_xlabel("Y = y/a")
-for panel in panels[len(kinds) :]:
-    panel.axis("off")
+last = panels[-1]
+if len(kinds) < len(panels):  # an empty panel: the axis of its column, and what the lines are
+    last.spines[["left", "right", "top"]].set_visible(False)
+    last.tick_params(left=False)
+    last.plot([], [], color="k", lw=1.4, label="stable")
+    last.plot([], [], color="k", lw=1.4, ls="--", label="unstable")
+    last.plot([], [], "ko", ms=4, label="at φ = π")
+    last.plot([], [], color=STOP, lw=1.8, label="stop")
+    last.legend(loc="center", ncols=2, fontsize=9, frameon=False)
+for panel in panels[-2:]:
+    panel.set_xlabel("Y = y/a")
 numbers = {f"largest multiplier of {chr(65 + j)}": kind.size for j, kind in enumerate(kinds)}
 if not QUICK:
     keep(HERE, "all_orbits", f"# Periodic motions at one point\n\n{report}", numbers, figure)

@@ -23,6 +23,7 @@ import vi_jax as vi
 from matplotlib.lines import Line2D
 from matplotlib.path import Path as Polygon
 from vi_jax.paper.boundaries import (
+    LONG_LINE,
     birth_without_damping,
     boundary_curves,
     describe_boundaries,
@@ -31,6 +32,7 @@ from vi_jax.paper.boundaries import (
     table_damping,
     xi_per_c,
 )
+from vi_jax.plot.colors import color_of
 
 jax.config.update("jax_enable_x64", True)
 
@@ -309,11 +311,11 @@ def shares(plane: str, points: np.ndarray, kinds: np.ndarray) -> list[str]:
 
 figure = draw_boundaries(curves)
 LOOKS = [
-    ("o", "#8c8c8c", "2π, one impact"),
-    ("o", "#0b2e8a", "4π, one impact"),
-    ("s", "#7b3294", "4π, more impacts"),
-    ("x", "#b2182b", "longer, or no period"),
-    ("_", "#8c8c8c", "no impact"),
+    ("o", color_of(1, 1), "2π, one impact"),
+    ("o", LONG_LINE, "4π, one impact"),
+    ("s", color_of(2, 2), "4π, more impacts"),
+    ("x", "0.3", "longer, or no period"),
+    ("_", "0.5", "no impact"),
 ]
 tallies, highest = [], 0.0
 for i, (plane, points) in enumerate(maps.items()):

@@ -21,6 +21,7 @@ import jax
 import numpy as np
 import vi_jax as vi
 from matplotlib.figure import Figure
+from vi_jax.plot.colors import BLUE, ORANGE, RED
 
 jax.config.update("jax_enable_x64", True)
 # Single precision is one of the things compared here.
@@ -34,11 +35,11 @@ QUICK = "--quick" in sys.argv
 CYCLES, NEAR = 600, 0.05
 STYLE = {
     "displaced start": ("k", "x"),
-    "ExactFlight": ("tab:orange", "*"),
-    "Adaptive Dopri8": ("tab:blue", "o"),
-    "Adaptive Tsit5": ("tab:red", "o"),
-    "FixedStep Dopri8": ("tab:blue", "s"),
-    "FixedStep Tsit5": ("tab:red", "s"),
+    "ExactFlight": (ORANGE, "*"),
+    "Adaptive Dopri8": (BLUE, "o"),
+    "Adaptive Tsit5": (RED, "o"),
+    "FixedStep Dopri8": (BLUE, "s"),
+    "FixedStep Tsit5": (RED, "s"),
 }
 SOLVERS = {"Dopri8": diffrax.Dopri8(), "Tsit5": diffrax.Tsit5()}
 
@@ -228,9 +229,11 @@ print(spread)
 # ## Figure
 
 # %%
-figure = Figure(figsize=(10.5, 4.6), layout="constrained")
-left, right = figure.subplots(1, 2, sharey=True)
-TOP = 212.0  # where the runs that stayed are drawn
+figure = Figure(figsize=(10.5, 5.0), layout="constrained")
+figure.get_layout_engine().set(hspace=0.0, h_pad=0.02)  # pyright: ignore
+(above, beside), (left, right) = figure.subplots(
+    2, 2, sharex="col", sharey="row", height_ratios=(1, 8)
+)
 for row in rows:
     name, _, precision = row.group.partition(", ")
     color, marker = STYLE[name]
@@ -241,22 +244,34 @@ for row in rows:
         dots |= {"marker": "^", "ms": 8}
     if precision:
         dots["mfc"] = "none"
-    height = TOP if row.cycles < 0 else row.cycles
-    left.plot(row.error, height, **dots)
-    right.plot(row.tolerance, height, **dots)
+    stayed = row.cycles < 0
+    height = CYCLES if stayed else row.cycles
+    (above if stayed else left).plot(row.error, height, **dots)
+    (beside if stayed else right).plot(row.tolerance, height, **dots)
 for name, (color, marker) in STYLE.items():
     left.plot([], [], marker, color=color, ms=11 if marker == "*" else 6, label=name)
 left.plot([], [], "o", color="0.4", mfc="none", label="hollow: float32")
 left.plot([], [], "^", color="0.4", mfc="none", label=f"stayed all {CYCLES} cycles")
-for axes, label in ((left, "error of one cycle (units of a, aω)"), (right, "rtol = atol")):
+for axes, label in ((left, "error of one cycle (a, a ω)"), (right, "rtol = atol")):
     errors = np.logspace(-15, -2, 50)
     axes.plot(errors, law(errors), color="0.5", lw=1.2, zorder=0, label="ln(0.05/error)/ln 1.166")
     axes.set_xscale("log")
     axes.set_xlabel(label)
     axes.grid(alpha=0.3)
 left.set_ylabel("cycles within 0.05 of the unstable 2π motion")
-left.set_title("against the error measured")
-right.set_title("against the tolerance asked for (Adaptive)")
+above.set_title("against the error measured")
+beside.set_title("against the tolerance asked for (Adaptive)")
+above.set_yticks([CYCLES], [f"{CYCLES}\n(all)"])
+above.set_ylim(CYCLES - 30, CYCLES + 30)
+left.set_ylim(0, 215)
+for top, bottom in ((above, left), (beside, right)):  # the break of the axis
+    top.spines.bottom.set_visible(False)
+    bottom.spines.top.set_visible(False)
+    top.tick_params(bottom=False, which="both")
+    top.grid(alpha=0.3)
+    cut = {"marker": [(-1, -0.5), (1, 0.5)], "ms": 9, "ls": "none", "color": "k", "clip_on": False}
+    top.plot([0, 1], [0, 0], transform=top.transAxes, **cut)
+    bottom.plot([0, 1], [1, 1], transform=bottom.transAxes, **cut)
 left.legend(fontsize=8.5, loc="lower left")
 exact = next(row for row in rows if row.group == "ExactFlight" and row.setting == "–")
 polished = next(row for row in rows if row.setting == "polished")

@@ -26,6 +26,7 @@ import optimistix as optx
 import vi_jax as vi
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
+from vi_jax.plot.colors import BLUE, ORANGE, RED, STOP, paler
 
 jax.config.update("jax_enable_x64", True)
 
@@ -196,32 +197,33 @@ place = 2 * np.arange(1, clean.size + 1) / SAMPLES
 history.plot(place, records[0], ".", color="0.45", ms=3.5, label="record")
 show = jax.jit(motion)
 for unknowns, name, style in (
-    (GUESS, "first guess", {"color": "#ff9f1c", "lw": 1.0, "ls": "--"}),
-    (jnp.asarray(estimates[0]), "fit", {"color": "#1f4fd8", "lw": 1.3}),
+    (GUESS, "first guess", {"color": ORANGE, "lw": 1.0, "ls": "--"}),
+    (jnp.asarray(estimates[0]), "fit", {"color": BLUE, "lw": 1.3}),
 ):
     vi.plot_history(
         show(unknowns), scene=scene_of(unknowns), ax=history, label=name, stops=False, **style
     )
-history.axhline(truth[2], color="#1a9641", lw=1.5, label="stop", zorder=0)
+history.axhline(truth[2], color=STOP, lw=1.5, label="stop", zorder=0)
 history.set(xlim=(0, 2 * CYCLES), ylim=(-2.6, 2.1))
 history.legend(loc="upper center", ncol=4, fontsize=9)
-for i, name in enumerate(NAMES):
+units = ("dimensionless", "dimensionless", "a", "a", "a ω")
+for i, (name, unit) in enumerate(zip(NAMES, units, strict=True)):
     small = axes[name]
-    small.hist(estimates[found, i], bins=14, color="#9db7f5", density=True)
+    small.hist(estimates[found, i], bins=14, color=paler(BLUE), density=True)
     spread = errors[found, i].mean()
     x = truth[i] + spread * np.linspace(-3.5, 3.5, 141)
     bell = np.exp(-0.5 * ((x - truth[i]) / spread) ** 2) / (spread * np.sqrt(2 * np.pi))
-    small.plot(x, bell, color="#1f4fd8", lw=1.3)
-    small.axvline(truth[i], color="#d62728", lw=1.2)
+    small.plot(x, bell, color=BLUE, lw=1.3)
+    small.axvline(truth[i], color=RED, lw=1.4, ls="--")
     height = 1.5 * bell.max()
     small.errorbar(estimates[0, i], height, xerr=errors[0, i], fmt="ko", ms=4, capsize=3)
     small.set(ylim=(0, 1.65 * bell.max()), yticks=[])
     small.xaxis.set_major_locator(MaxNLocator(3))
     small.tick_params(labelsize=8)
-    small.set_xlabel(f"{name} ({covered[:, i].mean():.1%} covered)")
+    small.set_xlabel(f"{name} ({unit})\n{covered[:, i].mean():.1%} covered")
 axes[NAMES[2]].set_title(
-    f"estimates from {RECORDS} records, truth (red), bell of the mean standard error; black: the "
-    "record above, ± its standard error",
+    f"estimates from {RECORDS} records, truth (dashed), bell of the mean standard error; black: "
+    "the record above, ± its standard error",
     fontsize=10,
 )
 numbers = {f"{name}, first record": float(estimates[0, i]) for i, name in enumerate(NAMES)}

@@ -25,6 +25,7 @@ import numpy as np
 import vi_jax as vi
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from vi_jax.plot.colors import RED, color_of
 
 jax.config.update("jax_enable_x64", True)
 
@@ -43,8 +44,8 @@ LANES = {
 }  # fmt: skip
 VALUES, SETTLE = (41, 300) if QUICK else (181, 400)
 BOUNDS = (0.5, 6.0)
-COLORS = {100.0: "k", 10.0: "#1f4fd8", 2.0: "#1a9641", 0.5: "#8c564b", 0.2: "#e68a00",
-          0.1: "#d62728", 0.05: "#17a2b8"}  # fmt: skip
+COLORS = {100.0: "k", 10.0: "#0072b2", 2.0: "#56b4e9", 0.5: "#882255", 0.2: "#e69f00",
+          0.1: "#d55e00", 0.05: "#332288"}  # fmt: skip
 if QUICK:
     LANES = {key: LANES[key] for key in ((10.0, NEAR), (0.2, NEAR), (2.0, FAR))}
 
@@ -363,13 +364,15 @@ LEGEND: dict[str, Any] = {"fontsize": 8.5, "framealpha": 0.9}
 
 def draw(ax: Any, key: tuple[float, float], y: str, x: str, *, lines: bool = True) -> None:
     """A motor's sweeps and branches, in its colour."""
-    look = {"color": COLORS[key[0]], "mew": 0.8, "markevery": 3}
+    look = {"color": COLORS[key[0]], "mew": 0.7, "markevery": 6, "alpha": 0.8}
     dots = "values" if x == "parameter" else x
     for (name, _), branch in branches.items():
         if name == key and lines:
             color = COLORS[key[0]]
-            vi.plot_branch(branch, ax=ax, y=y, x=x, special=False, color=color, lw=1.1)
-    vi.plot_sweep(up[key], ax=ax, y=y, x=dots, marker="o", mfc="none", ms=4, **look)
+            vi.plot_branch(
+                branch, ax=ax, y=y, x=x, special=False, legend=False, color=color, lw=1.8, zorder=3
+            )
+    vi.plot_sweep(up[key], ax=ax, y=y, x=dots, marker="o", mfc="none", ms=4.5, **look)
     vi.plot_sweep(down[key], ax=ax, y=y, x=dots, marker="x", ms=3.6, **look)
 
 
@@ -401,16 +404,19 @@ for ax, keys, title in ((ax_strong, strong, "Table 1's"), (ax_weak, weak, "weak"
 for key in LANES:
     for sweep, dot in ((up[key], "o"), (down[key], "x")):
         slip = (np.asarray(sweep.values) - np.asarray(sweep.frequency_ratio)) * key[0]
-        look = {"mfc": "none", "mew": 0.8, "color": COLORS[key[0]], "markevery": 4}
+        look = {"mfc": "none", "mew": 0.6, "color": COLORS[key[0]], "markevery": 8}
         ax_load.plot(sweep.frequency_ratio, slip, dot, ms=4, **look)
-ax_load.plot(zetas, idle / PER_NM, color="0.35", lw=1.2, label="ideal drive, no impacts")
-ax_load.plot(zetas, hard / PER_NM, color="#ff5fc4", lw=1.6, label="ideal drive, 2π with impact")
+for needed, color, label in (
+    (idle, "0.35", "ideal drive, no impacts"),
+    (hard, color_of(1, 1), "ideal drive, 2π with impact"),
+):
+    ax_load.plot(zetas, needed / PER_NM, color=color, lw=2.6, alpha=0.6, zorder=3, label=label)
 ax_load.set(yscale="log", xlim=(0.5, 1.9), ylim=(1e-3, 2), xlabel="mean frequency ratio ζ",
             ylabel="T0 (κ - ζ) (N·m)", title="Load on the motor, all sweeps")  # fmt: skip
 ax_load.legend(loc="upper right", **LEGEND)
 ax_load.grid(alpha=0.3)
 scan = np.logspace(np.log10(0.04), 2, 120)
-for gap, tone, name in ((NEAR, "k", "2a"), (FAR, "#8c564b", "20a")):
+for gap, tone, name in ((NEAR, "k", "2a"), (FAR, "0.6", "20a")):
     for way, dash in (("up", "-"), ("down", "--")):
         reached = scan if gap == NEAR else scan[(scan > 0.4) & (scan < limits[0])]
         expected = [forecast(t, gap, way) for t in reached]
@@ -425,15 +431,15 @@ for gap, tone, name in ((NEAR, "k", "2a"), (FAR, "#8c564b", "20a")):
             sweep = (up if way == "up" else down)[key]
             i = jump(sweep)
             middle = float(np.mean(np.asarray(sweep.values)[i : i + 2]))
-            ax_jump.plot(key[0], middle, "o", ms=4, color="#d62728")
-ax_jump.plot([], [], "o", ms=4, color="#d62728", label="swept")
+            ax_jump.plot(key[0], middle, "o", ms=4, color=RED)
+ax_jump.plot([], [], "o", ms=4, color=RED, label="swept")
 ax_jump.set(xscale="log", ylim=(0.9, 6), xlabel="stall torque T0 (N·m)", ylabel="κ of the jump",
             title="Where the sweeps jump")  # fmt: skip
 ax_jump.legend(loc="upper right", **LEGEND)
 ax_jump.grid(alpha=0.3)
 figure.suptitle(
     "k = 0.5, Table 1's damping. ○ run-up, × close-down; lines: 2π motions continued in κ "
-    "(dashed: unstable)",
+    "(dashed: unstable); dotted: ζ = κ",
     fontsize=11,
 )
 if not QUICK:
