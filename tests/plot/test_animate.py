@@ -14,6 +14,7 @@ import vi_jax as vi
 from matplotlib import animation
 from matplotlib.figure import Figure
 from PIL import Image
+from vi_jax.plot.colors import GREEN
 from vi_jax.plot.schematic import sketch
 
 M = vi.machines
@@ -101,7 +102,7 @@ def test_a_body_is_where_it_is(run):
     # As far as the motion, up to the face of the stop.
     walked = float(run.y_max.max() - run.y_min.min())
     assert np.ptp(places) == pytest.approx(walked, abs=0.15)
-    wall = max(line.get_xdata()[0] for line in above.lines if line.get_color() == "#1a9641"
+    wall = max(line.get_xdata()[0] for line in above.lines if line.get_color() == GREEN
                and len(set(line.get_xdata())) == 1)  # fmt: skip
     assert max(places) + 0.8 <= wall + 1e-9
 

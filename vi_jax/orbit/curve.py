@@ -73,7 +73,7 @@ def corrected(
     return Step(y * scale, along, size, count, good, observe(y * scale, along))
 
 
-def _jacobian(function: Callable[[Vector], Vector], x: Vector) -> tuple[Array, Vector]:
+def _jacobian(function: Callable[..., Any], x: Array) -> tuple[Array, Array]:
     """Derivative and value. Loops within a function may leave nothing of it the same for all
     directions, of which `jax.jacfwd` would not hear."""
 
