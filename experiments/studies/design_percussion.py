@@ -26,6 +26,8 @@ import numpy as np
 import optax
 import vi_jax as vi
 from matplotlib.figure import Figure
+from vi_jax.plot import motion_path
+from vi_jax.plot.colors import BLUE, ORANGE, RED
 
 jax.config.update("jax_enable_x64", True)
 
@@ -356,25 +358,30 @@ print(f"{total:.0f} s in all, {compile_seconds:.0f} s before the first step")
 # %%
 figure = Figure(figsize=(11.5, 3.9), layout="constrained")
 power_axes, modulus_axes, portrait = figure.subplots(1, 3)
-colours = {"start": "0.35", "A": "#d62728", "B": "#ff9f1c", "C": "#1f4fd8"}
+colours = {"start": "0.35", "A": RED, "B": ORANGE, "C": BLUE}
 notes = {"A": "A: |μ| ≤ 0.8", "B": "B: |μ| ≤ 0.5", "C": "C: |μ| ≤ 0.8, self-starting"}
 for name, ascent in ascents.items():
     style: dict[str, Any] = {"color": colours[name], "ls": "--" if name == "B" else "-"}
     power_axes.plot(ascent.power, label=notes[name], **style)
     modulus_axes.plot(ascent.modulus, **style)
-power_axes.set(xlabel="step", ylabel="impact power, W")
+power_axes.set(xlabel="step", ylabel="impact power (W)")
 power_axes.legend(loc="center right", bbox_to_anchor=(1.0, 0.72), fontsize=9)
 for limit in sorted({limit for limit, _ in DESIGNS.values()}):
     modulus_axes.axhline(limit, color="0.6", lw=1, ls=":")
-modulus_axes.set(xlabel="step", ylabel="largest |μ|", ylim=(0.3, 0.95))
+modulus_axes.set(xlabel="step", ylabel="largest |μ| (dimensionless)", ylim=(0.3, 0.95))
 orbits = {"start": before.orbit, "A": ascents["A"].end.orbit, "C": ascents["C"].end.orbit}
 for name, orbit in orbits.items():
     motion = vi.simulate(
         orbit.scene, orbit.state, 1, method=vi.ExactFlight(), samples=200, impact_log=4
     )  # fmt: skip
-    vi.plot_phase_portrait(motion, orbit.scene, ax=portrait, sections=False, color=colours[name])
-    assert motion.samples is not None
-    path = motion.samples.state
+    path = motion_path(motion, scene=orbit.scene)
+    portrait.plot(path.Y, path.V, color=colours[name], lw=1.3)
+    gap = float(orbit.scene.stops[0].gap)
+    portrait.axvline(gap, color=colours[name], lw=2.0, ls=(0, (4, 1.5)))
+    portrait.text(
+        gap, 0.98, f"stop of {name} ", transform=portrait.get_xaxis_transform(), rotation=90,
+        ha="right", va="top", fontsize=8.5, color=colours[name],
+    )  # fmt: skip
     left, inside = int(np.argmin(path.Y)), name == "start"
     portrait.annotate(
         name, (float(path.Y[left]), float(path.V[left])), (5 if inside else -5, 0),
@@ -382,6 +389,7 @@ for name, orbit in orbits.items():
         color=colours[name],
     )  # fmt: skip
 portrait.margins(x=0.1)
+portrait.set(xlabel="Y = y/a", ylabel="V = dY/dτ (a ω)", ylim=(-4.6, 8.2))
 for axes, title in zip(
     figure.axes, ("power", "stability (dotted: limits)", "motions and their stops"), strict=True
 ):
