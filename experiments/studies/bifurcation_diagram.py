@@ -30,6 +30,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from scipy.optimize import brentq
+from vi_jax.plot.colors import RED, color_of, mark_of, mark_style
 
 jax.config.update("jax_enable_x64", True)
 
@@ -189,12 +190,12 @@ with ThreadPoolExecutor(2) as threads:  # what takes the time is compiling
 doubling = of(four_pi, "period-doubling")
 touches = [of(branch, "grazing")[0] for branch in eight]
 BRANCHES = [
-    (two_pi, "2π, 1 impact", "tab:green"),
-    (paired, "4π, 2 impacts", "tab:olive"),
-    (four_pi, "4π, 1 impact", "tab:blue"),
-    (eight[0], "8π, 2 impacts", "tab:purple"),
-    (eight[1], "", "tab:purple"),
-    (three, "8π, 3 impacts", "tab:orange"),
+    (two_pi, "2π, 1 impact", color_of(1, 1)),
+    (paired, "4π, 2 impacts", color_of(2, 2)),
+    (four_pi, "4π, 1 impact", color_of(2, 1)),
+    (eight[0], "8π, 2 impacts", color_of(4)),
+    (eight[1], "", color_of(4)),
+    (three, "8π, 3 impacts", "#2e7d99"),
 ]
 
 # %% [markdown]
@@ -243,8 +244,8 @@ left_alone = chaotic & (escaped > 0)
 waited = escaped[left_alone] * exponent[left_alone] / np.log(LARGE / SMALL)
 
 # %%
-COLORS = ("0.25", "tab:red")
-KINDS = {"period-doubling": ("D", "tab:red"), "fold": ("s", "gold"), "grazing": ("o", "k")}
+COLORS = ("0.25", RED)
+KINDS = ("period-doubling", "fold", "grazing")
 
 
 def pieces(branch: vi.Branch) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, bool]]:
@@ -307,10 +308,9 @@ for name, bounds in PARTS.items():
         axes.plot(across, hits.ravel(), ".", ms=1.4, mew=0, color=color)
     draw(axes, 1, bounds)
     for point in (point for branch, *_ in BRANCHES for point in branch.special):
-        marker, color = KINDS[point.kind]
         hits = np.asarray(point.orbit.impact_speed)
         across = np.full(len(hits), point.parameter)
-        axes.plot(across, hits, marker, color=color, mec="k", mew=0.5, ms=5, zorder=4)
+        axes.plot(across, hits, zorder=4, **mark_style(point.kind))
     axes.ticklabel_format(useOffset=False)
 axes = panels["exponent"]
 axes.axhline(0, color="k", lw=0.8)
@@ -343,10 +343,7 @@ handles = [
 handles += [
     Line2D([], [], color="k", ls=ls, label=x) for x, ls in (("stable", "-"), ("unstable", "--"))
 ]
-handles += [
-    Line2D([], [], marker=m, color=c, mec="k", mew=0.5, ls="none", label=kind)
-    for kind, (m, c) in KINDS.items()
-]
+handles += [mark_of(kind) for kind in KINDS]
 handles += [
     Line2D([], [], marker=".", color=c, ls="none", label=f"simulated, start {i + 1}")
     for i, c in enumerate(COLORS)
