@@ -25,6 +25,5 @@ print(found)
 # %%
 figure, ax = plt.subplots(figsize=(8, 4.6), layout="constrained")
 vi.plot_basins(found, ax=ax)
-ax.set(xlabel="position Y at the start (a)", ylabel="velocity V at the start (a ω)")
-ax.set_title("Start and the motion it settles on (circles: the motions)")
+ax.set_title("Start and the motion it settles on")
 vi.save_picture(figure, "basins.png")

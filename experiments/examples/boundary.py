@@ -31,9 +31,9 @@ print(doubling, grazing, sep="\n")
 
 # %%
 figure, ax = plt.subplots(figsize=(7, 4), layout="constrained")
-vi.plot_boundary(doubling, ax=ax, label="2π motion doubles its period", color="#d55e00")
-vi.plot_boundary(grazing, ax=ax, label="4π motion ends by a grazing", color="#0072b2", ls="--")
+vi.plot_boundary(doubling, ax=ax, label="2π motion doubles its period")
+vi.plot_boundary(grazing, ax=ax, label="4π motion ends by a grazing")
 ax.plot(0.9, 0.5, "k*", ms=11, label="the paper's Figures 3 and 4")
-ax.set_title("No damping: left of the solid line the 2π motion is unstable")
+ax.set_title("No damping: left of the dashed line the 2π motion is unstable")
 ax.legend(loc="lower right", frameon=False)
 vi.save_picture(figure, "boundary.png")

@@ -29,11 +29,7 @@ one, _ = follow(points["grazing"].switch())
 
 # %% Solid: stable; dashed: unstable; marks: special points
 figure, ax = plt.subplots(figsize=(8, 4), layout="constrained")
-looks = (short, "2π", "#d55e00"), (two, "4π, two impacts", "#009e73"), (one, "4π", "#0072b2")
-for branch, name, color in looks:
-    vi.plot_branch(branch, ax=ax, color=color)
-    ax.plot([], [], color=color, label=name)
+for branch, name in (short, "2π"), (two, "4π, two impacts"), (one, "4π, one impact"):
+    vi.plot_branch(branch, ax=ax, label=name)
 ax.set(xlim=(0.69, 1.1), ylim=(-4.2, -1.4), ylabel="lowest position, min Y (a)")
-ax.set_title("dashed: unstable; circles: grazings, square: fold, diamond: period doubling")
-ax.legend(frameon=False)
 vi.save_picture(figure, "branch.png")

@@ -23,10 +23,11 @@ print(long)
 
 # %%
 figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.9), layout="constrained")
-for orbit, color, name in ((short, "#d55e00", "2π, unstable"), (long, "#0072b2", "4π, stable")):
+for orbit, color, name in ((short, "#0072b2", "2π, unstable"), (long, "#e69f00", "4π, stable")):
     vi.plot_phase_portrait(orbit.trajectory(), scene, ax=left, lw=1.5, color=color, label=name)
     vi.plot_multipliers(orbit, ax=right, color=color)
 left.set(xlabel="position Y (a)", ylabel="velocity V (a ω)", title="dots: after each drive cycle")
-left.legend(loc="upper left", frameon=False)
+left.set_ylim(-2.8, 5.4)
+left.legend(loc="upper left", frameon=False, ncols=2)
 right.set_title("Floquet multipliers and the unit circle")
 vi.save_picture(figure, "find_orbit.png")

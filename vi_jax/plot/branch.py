@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from ..orbit import Boundary, Branch
 from ..scan import Sweep
 from ..scene import LABELS
-from .colors import DASHES, color_of, mark_style, once
+from .colors import DASHES, MARKS, color_of, mark_style, once
 from .motion import new_axes
 
 
@@ -56,11 +56,20 @@ def plot_branch(
             if value is not None and np.ndim(value) == 0:
                 mark = {**mark_style(point.kind), "zorder": 4, "label": once(ax, point.kind)}
                 ax.plot(point.parameter, float(value), **mark)
-    if legend and ax.get_legend_handles_labels()[1]:
-        ax.legend(fontsize="small", frameon=False)
+    if legend:
+        _legend(ax)
     ax.set_xlabel("ζ" if x == "frequency_ratio" else axis_name(branch.name))
     ax.set_ylabel(extreme_name(y, branch.problem.scene.labels))
     return ax
+
+
+def _legend(ax: Axes) -> None:
+    """Branches first, then what is common to all."""
+    named = list(zip(*ax.get_legend_handles_labels(), strict=True))
+    named.sort(key=lambda x: x[1] in MARKS or x[1] == "unstable")
+    if named:
+        handles, labels = zip(*named, strict=True)
+        ax.legend(handles, labels, fontsize="small", frameon=False)
 
 
 def _stretches(stable: np.ndarray) -> list[tuple[int, int, bool]]:
