@@ -22,6 +22,7 @@ import numpy as np
 import optax
 import vi_jax as vi
 from matplotlib.figure import Figure
+from vi_jax.plot.colors import color_of
 
 jax.config.update("jax_enable_x64", True)
 
@@ -240,7 +241,7 @@ print(table)
 # ## Figure
 
 # %%
-COLORS = {"newton": "tab:blue", "adam": "tab:red"}
+COLORS = {"newton": "0.2", "adam": "#cc79a7"}
 figure = Figure(figsize=(11, 8), layout="constrained")
 (first, second), (bars, times) = figure.subplots(2, 2)
 shown = [rows[0], next(r for r in rows if r["machine"] == SECOND and r["torque"] == 10.0)]
@@ -255,16 +256,16 @@ for axes, row in zip((first, second), shown, strict=True):
         axes.loglog(steps, history, style, color=COLORS[method], lw=1.3, label=label)
     axes.set_title(title(row))
     axes.set_xlabel("step of the search")
-    axes.set_ylabel("largest residual component (a, aω, ω)")
-    axes.set_ylim(1e-16, 1e5)
+    axes.set_ylabel("largest residual component (a, a ω, ω)")
+    axes.set_ylim(1e-16, 10)
     axes.grid(alpha=0.3)
-    axes.legend(fontsize=8.5, loc="upper center", ncols=2)
+    axes.legend(fontsize=8.5, loc="lower right")
 
 place = np.arange(len(rows))[::-1]
 names = [title(row) for row in rows]
 for shift, method, alpha in ((0.2, "newton", 1.0), (-0.2, "adam", 0.5)):
     start = np.zeros(len(rows))
-    for wanted, color in (("4π", "tab:green"), ("2π", "tab:orange"), ("none", "0.7")):
+    for wanted, color in (("4π", color_of(2)), ("2π", color_of(1)), ("none", "0.7")):
         part = np.zeros(len(rows))
         for i, row in enumerate(rows):
             orbits = row["tally"][method]

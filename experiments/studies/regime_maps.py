@@ -35,6 +35,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from vi_jax.plot.colors import DASHES
 
 jax.config.update("jax_enable_x64", True)
 
@@ -330,10 +331,14 @@ for seen, (i, j), part in zip(maps, picked, range(len(maps)), strict=True):
 
 # %%
 LOOKS = {
-    "birth": ("w", "-", "2π: born by grazing, where the free motion reaches the stop"),
-    "doubling": ("#d7191c", "-", "2π: period doubling"),
-    "fold": ("#ffff33", "-", "2π: fold"),
-    "touch": ("#00d5ff", "--", "4π with one impact: touches the stop again"),
+    "birth": (
+        "w",
+        DASHES["grazing"],
+        "2π: born where the free motion reaches the stop",
+    ),
+    "doubling": ("w", DASHES["period-doubling"], "2π: period doubling"),
+    "fold": ("w", DASHES["fold"], "2π: fold"),
+    "touch": ("#ffe08a", DASHES["grazing"], "4π with one impact: touches the stop again"),
 }
 figure = Figure(figsize=(15.5, 5.6), layout="constrained")
 FigureCanvasAgg(figure)
@@ -345,14 +350,11 @@ for ax, seen in zip(figure.subplots(1, 3), maps, strict=True):
     for patch in legend.get_patches():
         names.setdefault(patch.get_label(), patch)
     legend.remove()
-    # Motions without impacts are paled.
-    free = np.where(seen.impacts.T == 0, 1.0, np.nan)
     levels = seen.plane.axes[other]
-    ax.pcolormesh(ZETA, levels, free, cmap="gray", vmin=0, vmax=1, alpha=0.6, rasterized=True)
     for name, parts in seen.plane.curves.items():
         color, style, _ = LOOKS[name]
         for points in parts:
-            (line,) = ax.plot(*points.T, style, color=color, lw=1.7)
+            (line,) = ax.plot(*points.T, ls=style, color=color, lw=1.7)
             line.set_path_effects(
                 [patheffects.Stroke(linewidth=3.0, foreground="k"), patheffects.Normal()]
             )
@@ -363,8 +365,7 @@ for ax, seen in zip(figure.subplots(1, 3), maps, strict=True):
     ax.set_title(f"{seen.plane.title}", fontsize=11)
 
 order = {f"{2 * n}π": n for n in range(1, 9)}
-patches = [names[name] for name in sorted(names, key=lambda name: order.get(name, 9))]
-patches.append(Patch(facecolor="#b5c8dd", edgecolor="0.4", label="paled: without impacts"))
+patches = [names[x] for x in sorted(names, key=lambda x: (order.get(x.partition(",")[0], 9), x))]
 lines = [
     Line2D([], [], color=color, ls=style, lw=2.0, label=label, path_effects=[
         patheffects.Stroke(linewidth=3.4, foreground="k"), patheffects.Normal()
