@@ -10,8 +10,9 @@ import jax.tree_util as jtu
 import numpy as np
 import pytest
 import vi_jax as vi
-from vi_jax import _parts, cli
+from vi_jax import cli
 from vi_jax.cli import output
+from vi_jax.cli import parts as in_parts
 
 SCENE = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.02)
 START = SCENE.start(Y=0.3)
@@ -28,7 +29,7 @@ def press(*_):
 @pytest.fixture
 def short(monkeypatch):
     """Parts of five cycles."""
-    monkeypatch.setattr(_parts, "_INTERVALS", 5 * _parts._PER_CYCLE)
+    monkeypatch.setattr(in_parts, "_INTERVALS", 5 * in_parts._PER_CYCLE)
 
 
 def same(a, b):
@@ -40,7 +41,7 @@ def same(a, b):
 def test_a_run_in_parts_is_the_same_run(short, settle):
     options = {"settle": settle, "samples": 4, "impact_log": 2}
     whole = vi.simulate(SCENE, START, 13, **options)
-    parts = _parts.simulate_in_parts(SCENE, START, 13, interrupted=never, **options)
+    parts = in_parts.simulate_in_parts(SCENE, START, 13, interrupted=never, **options)
     for name in ("sections", "y_min", "impacts", "duration", "samples", "impact_log", "clearance"):
         same(getattr(parts, name), getattr(whole, name))
     assert bool(parts.successful) and parts.impacts.shape == (13,)
@@ -50,7 +51,7 @@ def test_a_run_in_parts_is_the_same_run(short, settle):
 def test_a_run_that_fails_is_nan_from_there_on(short):
     options = {"settle": 3, "samples": 4, "impact_log": 2, "max_steps": 80}
     whole = vi.simulate(SCENE, START, 13, **options)
-    parts = _parts.simulate_in_parts(SCENE, START, 13, interrupted=never, **options)
+    parts = in_parts.simulate_in_parts(SCENE, START, 13, interrupted=never, **options)
     assert parts.result == whole.result == vi.RESULTS.max_steps
     good = np.isfinite(np.asarray(whole.y_min))
     assert 0 < good.sum() < 13
@@ -62,7 +63,7 @@ def test_a_sweep_in_parts_is_the_same_sweep():
     gaps = [2.0, 1.2, 0.5, -0.5, 0.5, 2.0]
     options = {"settle": 50, "cycles": 8, "start": START}
     whole = vi.sweep(SCENE, "stops.0.gap", gaps, **options)
-    parts = _parts.sweep_in_parts(SCENE, "stops.0.gap", gaps, interrupted=never, **options)
+    parts = in_parts.sweep_in_parts(SCENE, "stops.0.gap", gaps, interrupted=never, **options)
     same((parts.values, parts.y_min, parts.period, parts.sections), (
         whole.values, whole.y_min, whole.period, whole.sections))  # fmt: skip
 
@@ -89,7 +90,7 @@ def test_interrupts_keep_what_was_computed(
     """Pressed in the second part, again at once, and while the file is written."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file.toml").write_text(FILE + text + "output = 'out.csv'\n")
-    compute, calls, write = getattr(_parts, part), [], output.write_whole
+    compute, calls, write = getattr(in_parts, part), [], output.write_whole
 
     def computed(*arguments, **options):
         calls.append(1)
@@ -98,7 +99,7 @@ def test_interrupts_keep_what_was_computed(
             press()
         return compute(*arguments, **options)
 
-    monkeypatch.setattr(_parts, part, computed)
+    monkeypatch.setattr(in_parts, part, computed)
     monkeypatch.setattr(output, "write_whole", lambda *a: (press(), write(*a)))
     before = signal.getsignal(signal.SIGINT)
     assert cli.main([verb, "file.toml"]) == 130
@@ -113,8 +114,8 @@ def test_interrupts_keep_what_was_computed(
 def test_an_interrupt_before_anything_is_kept(short, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file.toml").write_text(FILE + SIMULATE.replace("settle = 3", "settle = 90"))
-    compute = _parts.simulate
-    monkeypatch.setattr(_parts, "simulate", lambda *a, **o: (press(), compute(*a, **o))[1])
+    compute = in_parts.simulate
+    monkeypatch.setattr(in_parts, "simulate", lambda *a, **o: (press(), compute(*a, **o))[1])
     assert cli.main(["simulate", "file.toml"]) == 130
     assert capsys.readouterr().err.splitlines()[-1] == "vi-jax: interrupted; nothing was written"
 
@@ -123,7 +124,7 @@ def test_another_thread_has_no_interrupts():
     words = []
 
     def work():
-        with _parts.noted_interrupts() as interrupted:
+        with in_parts.noted_interrupts() as interrupted:
             words.append(interrupted())
 
     thread = threading.Thread(target=work)
@@ -140,5 +141,5 @@ def test_a_long_run_takes_parts_of_a_fraction_of_a_second():
         seen.append(1)
         return len(seen) == 2
 
-    run = _parts.simulate_in_parts(SCENE, START, 10**6, interrupted=once)
+    run = in_parts.simulate_in_parts(SCENE, START, 10**6, interrupted=once)
     assert run.impacts.size <= 2 * 1024 and jnp.isfinite(run.last.Y)

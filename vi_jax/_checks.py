@@ -4,7 +4,8 @@ import math
 import os
 import tempfile
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -35,6 +36,16 @@ def number(name: str, value: Any) -> jax.Array:
     except (TypeError, ValueError, OverflowError):
         raise TypeError(f"Argument `{name}` must be a real number, but got {value!r}.") from None
     return _floating(name, array)
+
+
+def real(name: str) -> Callable[[Any], jax.Array]:
+    """The converter of a field that holds real numbers."""
+    return partial(number, name)
+
+
+def optional_real(name: str) -> Callable[[Any], jax.Array | None]:
+    """The converter of a field that holds real numbers or `None`."""
+    return lambda value: None if value is None else number(name, value)
 
 
 def _floating(name: str, array: jax.Array) -> jax.Array:

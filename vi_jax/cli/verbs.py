@@ -15,7 +15,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from .._files import write_whole
-from .._parts import noted_interrupts, simulate_in_parts, sweep_in_parts
 from ..flow import RESULTS, Run
 from ..flow.results import number_of
 from ..orbit import Orbit, continue_orbit, find_orbit
@@ -46,6 +45,7 @@ from .output import (
     sweep_columns,
     write_rows,
 )
+from .parts import noted_interrupts, simulate_in_parts, sweep_in_parts
 from .toml import ConfigError, given, in_terms_of, keys_of
 
 Tell = Callable[[str], None]

@@ -8,15 +8,10 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import number, require, require_ranges
+from .._checks import number, optional_real, require, require_ranges
 from ..scene import AbstractScene
 
 Scalar = Float[Array, ""]
-
-
-def optional(name: str) -> Any:
-    """What makes a number of an argument that may be left out."""
-    return lambda x: x if x is None else number(name, x)
 
 
 class PhaseMachine(AbstractScene):
@@ -39,7 +34,9 @@ class AutonomousMachine(AbstractScene):
     `ranges`. A cycle ends where `event` rises through zero; if `interval` is given (positive), at
     equal times instead."""
 
-    interval: Scalar | None = eqx.field(kw_only=True, default=None, converter=optional("interval"))
+    interval: Scalar | None = eqx.field(
+        kw_only=True, default=None, converter=optional_real("interval")
+    )
     ranges: ClassVar[dict[str, Any]]
 
     def __check_init__(self):

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import NOT_NEGATIVE, SHARE, number
+from .._checks import NOT_NEGATIVE, SHARE, number, real
 from ..scene import RigidStop
 from .base import PhaseMachine
 
@@ -34,12 +34,8 @@ class BouncingBall(PhaseMachine):
     `restitution` e in [0, 1].
     """
 
-    acceleration: Scalar = eqx.field(
-        kw_only=True, default=1.2, converter=lambda x: number("acceleration", x)
-    )
-    restitution: Scalar = eqx.field(
-        kw_only=True, default=0.5, converter=lambda x: number("restitution", x)
-    )
+    acceleration: Scalar = eqx.field(kw_only=True, default=1.2, converter=real("acceleration"))
+    restitution: Scalar = eqx.field(kw_only=True, default=0.5, converter=real("restitution"))
     ranges: ClassVar[dict[str, Any]] = {"acceleration": NOT_NEGATIVE, "restitution": SHARE}
 
     @property

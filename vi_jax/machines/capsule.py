@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Range, number
+from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Range, number, real
 from ..scene import Coordinate, DryFriction, RigidStop
 from .base import PhaseMachine
 
@@ -48,28 +48,14 @@ class Capsule(PhaseMachine):
     how much more it can be while it sticks, at least 1.
     """
 
-    amplitude: Scalar = eqx.field(
-        kw_only=True, default=1.6, converter=lambda x: number("amplitude", x)
-    )
-    frequency: Scalar = eqx.field(
-        kw_only=True, default=1.0, converter=lambda x: number("frequency", x)
-    )
-    damping_ratio: Scalar = eqx.field(
-        kw_only=True, default=0.05, converter=lambda x: number("damping_ratio", x)
-    )
-    mass_ratio: Scalar = eqx.field(
-        kw_only=True, default=5.0, converter=lambda x: number("mass_ratio", x)
-    )
-    gap: Scalar = eqx.field(kw_only=True, default=0.5, converter=lambda x: number("gap", x))
-    restitution: Scalar = eqx.field(
-        kw_only=True, default=0.6, converter=lambda x: number("restitution", x)
-    )
-    friction: Scalar = eqx.field(
-        kw_only=True, default=1.0, converter=lambda x: number("friction", x)
-    )
-    static_ratio: Scalar = eqx.field(
-        kw_only=True, default=1.0, converter=lambda x: number("static_ratio", x)
-    )
+    amplitude: Scalar = eqx.field(kw_only=True, default=1.6, converter=real("amplitude"))
+    frequency: Scalar = eqx.field(kw_only=True, default=1.0, converter=real("frequency"))
+    damping_ratio: Scalar = eqx.field(kw_only=True, default=0.05, converter=real("damping_ratio"))
+    mass_ratio: Scalar = eqx.field(kw_only=True, default=5.0, converter=real("mass_ratio"))
+    gap: Scalar = eqx.field(kw_only=True, default=0.5, converter=real("gap"))
+    restitution: Scalar = eqx.field(kw_only=True, default=0.6, converter=real("restitution"))
+    friction: Scalar = eqx.field(kw_only=True, default=1.0, converter=real("friction"))
+    static_ratio: Scalar = eqx.field(kw_only=True, default=1.0, converter=real("static_ratio"))
     ranges: ClassVar[dict[str, Any]] = {
         "amplitude": REAL, "frequency": POSITIVE, "damping_ratio": NOT_NEGATIVE,
         "mass_ratio": POSITIVE, "gap": REAL, "restitution": SHARE, "friction": NOT_NEGATIVE,

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, number
+from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, number, real
 from ..scene import OscillatorState, RigidStop
 from .base import PhaseMachine
 
@@ -25,21 +25,13 @@ class Duffing(PhaseMachine):
     there is a stop on the left as well; static.
     """
 
-    amplitude: Scalar = eqx.field(
-        kw_only=True, default=0.3, converter=lambda x: number("amplitude", x)
-    )
-    frequency: Scalar = eqx.field(
-        kw_only=True, default=1.0, converter=lambda x: number("frequency", x)
-    )
-    damping: Scalar = eqx.field(kw_only=True, default=0.1, converter=lambda x: number("damping", x))
-    stiffness: Scalar = eqx.field(
-        kw_only=True, default=1.0, converter=lambda x: number("stiffness", x)
-    )
-    cubic: Scalar = eqx.field(kw_only=True, default=0.0, converter=lambda x: number("cubic", x))
-    gap: Scalar = eqx.field(kw_only=True, default=1.0, converter=lambda x: number("gap", x))
-    restitution: Scalar = eqx.field(
-        kw_only=True, default=0.8, converter=lambda x: number("restitution", x)
-    )
+    amplitude: Scalar = eqx.field(kw_only=True, default=0.3, converter=real("amplitude"))
+    frequency: Scalar = eqx.field(kw_only=True, default=1.0, converter=real("frequency"))
+    damping: Scalar = eqx.field(kw_only=True, default=0.1, converter=real("damping"))
+    stiffness: Scalar = eqx.field(kw_only=True, default=1.0, converter=real("stiffness"))
+    cubic: Scalar = eqx.field(kw_only=True, default=0.0, converter=real("cubic"))
+    gap: Scalar = eqx.field(kw_only=True, default=1.0, converter=real("gap"))
+    restitution: Scalar = eqx.field(kw_only=True, default=0.8, converter=real("restitution"))
     two_sided: bool = eqx.field(kw_only=True, static=True, default=True)
     ranges: ClassVar[dict[str, Any]] = {
         "amplitude": REAL, "frequency": POSITIVE, "damping": NOT_NEGATIVE, "stiffness": REAL,

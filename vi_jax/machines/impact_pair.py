@@ -6,9 +6,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, number
+from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, number, optional_real, real
 from ..scene import Coordinate, RigidStop
-from .base import PhaseMachine, optional
+from .base import PhaseMachine
 
 Scalar = Float[Array, ""]
 
@@ -58,22 +58,14 @@ class ImpactPair(PhaseMachine):
       and `force` F (unit: M a ω²), of a box that is free.
     """
 
-    half_gap: Scalar = eqx.field(
-        kw_only=True, default=1.6, converter=lambda x: number("half_gap", x)
-    )
-    restitution: Scalar = eqx.field(
-        kw_only=True, default=0.5, converter=lambda x: number("restitution", x)
-    )
+    half_gap: Scalar = eqx.field(kw_only=True, default=1.6, converter=real("half_gap"))
+    restitution: Scalar = eqx.field(kw_only=True, default=0.5, converter=real("restitution"))
     mass_ratio: Scalar | None = eqx.field(
-        kw_only=True, default=None, converter=optional("mass_ratio")
+        kw_only=True, default=None, converter=optional_real("mass_ratio")
     )
-    damping_ratio: Scalar = eqx.field(
-        kw_only=True, default=0.05, converter=lambda x: number("damping_ratio", x)
-    )
-    frequency: Scalar = eqx.field(
-        kw_only=True, default=1.0, converter=lambda x: number("frequency", x)
-    )
-    force: Scalar = eqx.field(kw_only=True, default=0.5, converter=lambda x: number("force", x))
+    damping_ratio: Scalar = eqx.field(kw_only=True, default=0.05, converter=real("damping_ratio"))
+    frequency: Scalar = eqx.field(kw_only=True, default=1.0, converter=real("frequency"))
+    force: Scalar = eqx.field(kw_only=True, default=0.5, converter=real("force"))
     ranges: ClassVar[dict[str, Any]] = {
         "half_gap": POSITIVE, "restitution": SHARE, "mass_ratio": NOT_NEGATIVE,
         "damping_ratio": NOT_NEGATIVE, "frequency": NOT_NEGATIVE, "force": REAL,

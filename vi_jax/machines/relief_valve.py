@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .._checks import NOT_NEGATIVE, POSITIVE, SHARE, concrete, number
+from .._checks import NOT_NEGATIVE, POSITIVE, SHARE, concrete, number, real
 from ..scene import RigidStop
 from .base import AutonomousMachine
 
@@ -41,21 +41,13 @@ class ReliefValve(AutonomousMachine):
     time between observations, positive, for one that is not observed where its lift is greatest.
     """
 
-    flow_rate: Scalar = eqx.field(
-        kw_only=True, default=3.0, converter=lambda x: number("flow_rate", x)
-    )
-    damping: Scalar = eqx.field(
-        kw_only=True, default=1.25, converter=lambda x: number("damping", x)
-    )
-    precompression: Scalar = eqx.field(
-        kw_only=True, default=10.0, converter=lambda x: number("precompression", x)
-    )
+    flow_rate: Scalar = eqx.field(kw_only=True, default=3.0, converter=real("flow_rate"))
+    damping: Scalar = eqx.field(kw_only=True, default=1.25, converter=real("damping"))
+    precompression: Scalar = eqx.field(kw_only=True, default=10.0, converter=real("precompression"))
     compressibility: Scalar = eqx.field(
-        kw_only=True, default=20.0, converter=lambda x: number("compressibility", x)
+        kw_only=True, default=20.0, converter=real("compressibility")
     )
-    restitution: Scalar = eqx.field(
-        kw_only=True, default=0.8, converter=lambda x: number("restitution", x)
-    )
+    restitution: Scalar = eqx.field(kw_only=True, default=0.8, converter=real("restitution"))
     ranges: ClassVar[dict[str, Any]] = {
         "flow_rate": POSITIVE, "damping": NOT_NEGATIVE, "precompression": NOT_NEGATIVE,
         "compressibility": POSITIVE, "restitution": SHARE, "interval": POSITIVE,

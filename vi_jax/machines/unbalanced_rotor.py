@@ -1,6 +1,5 @@
 """A motor with an unbalanced rotor on an elastic support: the Sommerfeld effect."""
 
-import dataclasses
 from math import pi
 from typing import Any, ClassVar
 
@@ -15,13 +14,12 @@ from .._checks import (
     REAL,
     SHARE,
     Range,
-    concrete,
     number,
-    one_of,
+    optional_real,
+    real,
     require,
-    state_of_numbers,
 )
-from ..scene import RigidStop
+from ..scene import RigidStop, ShaftScene
 from .base import PhaseMachine
 
 Scalar = Float[Array, ""]
@@ -39,20 +37,14 @@ class RotorState(eqx.Module):
     the speed W itself."""
 
 
-class TimedRotorState(eqx.Module):
+class TimedRotorState(RotorState):
     """Body and shaft, by time."""
 
-    Y: Scalar
-    """Displacement of the body (unit: m r/M)."""
-    V: Scalar
-    """dY/dτ (unit: m r ω/M)."""
-    P: Scalar
-    """Momentum of the shaft, W - ε V sin φ, which impacts keep (unit: J ω)."""
     phase: Scalar
     """Angle of the rotor since the last section (radians)."""
 
 
-class UnbalancedRotor(PhaseMachine):
+class UnbalancedRotor(ShaftScene, PhaseMachine):
     """A body of mass M on a spring k and a damper c, on which a motor of limited power turns a
     rotor with an unbalance m at the radius r; if `gap` is given, between stops.
 
@@ -92,25 +84,13 @@ class UnbalancedRotor(PhaseMachine):
     - `clock_name`: `"phase"` or `"time"`; static.
     """
 
-    strength: Scalar = eqx.field(
-        kw_only=True, default=0.1, converter=lambda x: number("strength", x)
-    )
-    control: Scalar = eqx.field(kw_only=True, default=0.9, converter=lambda x: number("control", x))
-    no_load_speed: Scalar = eqx.field(
-        kw_only=True, default=1.0, converter=lambda x: number("no_load_speed", x)
-    )
-    coupling: Scalar = eqx.field(
-        kw_only=True, default=0.01, converter=lambda x: number("coupling", x)
-    )
-    damping_ratio: Scalar = eqx.field(
-        kw_only=True, default=0.05, converter=lambda x: number("damping_ratio", x)
-    )
-    gap: Scalar | None = eqx.field(
-        kw_only=True, default=None, converter=lambda x: x if x is None else number("gap", x)
-    )
-    restitution: Scalar = eqx.field(
-        kw_only=True, default=0.5, converter=lambda x: number("restitution", x)
-    )
+    strength: Scalar = eqx.field(kw_only=True, default=0.1, converter=real("strength"))
+    control: Scalar = eqx.field(kw_only=True, default=0.9, converter=real("control"))
+    no_load_speed: Scalar = eqx.field(kw_only=True, default=1.0, converter=real("no_load_speed"))
+    coupling: Scalar = eqx.field(kw_only=True, default=0.01, converter=real("coupling"))
+    damping_ratio: Scalar = eqx.field(kw_only=True, default=0.05, converter=real("damping_ratio"))
+    gap: Scalar | None = eqx.field(kw_only=True, default=None, converter=optional_real("gap"))
+    restitution: Scalar = eqx.field(kw_only=True, default=0.5, converter=real("restitution"))
     two_sided: bool = eqx.field(kw_only=True, static=True, default=False)
     clock_name: str = eqx.field(kw_only=True, static=True, default="phase")
     ranges: ClassVar[dict[str, Any]] = {
@@ -118,9 +98,7 @@ class UnbalancedRotor(PhaseMachine):
         "coupling": Range(0.0, 1.0, open_high=True), "damping_ratio": NOT_NEGATIVE,
         "gap": POSITIVE, "restitution": SHARE,
     }  # fmt: skip
-
-    def __check_init__(self):
-        one_of("clock_name", self.clock_name, ("phase", "time"))
+    timed_states: ClassVar = {RotorState: TimedRotorState}
 
     @property
     def stops(self) -> tuple[RigidStop, ...]:  # pyright: ignore
@@ -134,11 +112,6 @@ class UnbalancedRotor(PhaseMachine):
     def labels(self) -> tuple[str, str]:
         """Of pictures."""
         return "Y (m r/M)", "dY/dτ (m r ω/M)"
-
-    def in_clock(self, clock: str) -> "UnbalancedRotor":
-        """The same machine in the `"phase"` or the `"time"` clock."""
-        one_of("clock", clock, ("phase", "time"))
-        return dataclasses.replace(self, clock_name=clock)
 
     def speed(self, phase: Any, state: Any) -> Scalar:
         """W = dφ/dτ of the rotor (unit: ω) at this angle."""
@@ -156,7 +129,7 @@ class UnbalancedRotor(PhaseMachine):
 
     def field(self, s: Scalar, state: Any) -> Any:
         """By the angle of the rotor, or by time."""
-        timed = isinstance(state, TimedRotorState)
+        timed = self.is_timed(state)
         phase = state.phase if timed else s
         sine, cosine = jnp.sin(phase), jnp.cos(phase)
         W = state.P + self.coupling * state.V * sine
@@ -177,55 +150,20 @@ class UnbalancedRotor(PhaseMachine):
         Y, V, P = number("Y", Y), number("V", V), number("W", speed)
         for name, value in (("Y", Y), ("V", V), ("W", P)):
             require(name, value)
-        if self.clock_name == "phase":
-            return RotorState(Y, V, P)
-        return TimedRotorState(Y, V, P, jnp.zeros_like(P))
+        return self.adopt(RotorState(Y, V, P))
 
-    def adopt(self, start: Any) -> Any:
-        """A start made for either clock, as this machine's clock needs it."""
-        wanted = RotorState if self.clock_name == "phase" else TimedRotorState
-        if wanted is TimedRotorState and isinstance(start, RotorState):
-            return TimedRotorState(start.Y, start.V, start.P, jnp.zeros_like(start.P))
-        if not isinstance(start, wanted):
-            raise TypeError(
-                f"Argument `start` must be a `{wanted.__name__}` for this machine (use "
-                f"`machine.start(...)`), but got a `{type(start).__name__}`."
-            )
-        return state_of_numbers("start", start)
+    @property
+    def state_type(self) -> Any:
+        """Of a state in the phase clock."""
+        return RotorState
 
-    def check_start(self, start: Any) -> None:
-        """Raise a `ValueError` if the rotor does not turn forward in the phase clock, or is beyond
-        its section."""
-        if isinstance(start, RotorState):
-            speed = concrete(start.P)
-            if speed is not None and not (speed > 0).all():
-                raise ValueError(
-                    "Argument `start` must have W > 0 in the phase clock, but has "
-                    f'W = {speed.min():g}. Pass `clock="time"` to start from rest.'
-                )
-        else:
-            phase = concrete(start.phase)
-            if phase is not None and not (phase < 2 * pi).all():
-                raise ValueError(
-                    "Argument `start` must have its phase, counted from the last section, below "
-                    f"2π, but has {phase.max():g}."
-                )
-
-    def clock(self, state: Any) -> Scalar | None:
-        """The angle of the rotor, where time is the independent variable."""
-        return state.phase if isinstance(state, TimedRotorState) else None
-
-    def rewound(self, state: Any) -> Any:
-        """The state with a full turn taken off the angle."""
-        return eqx.tree_at(lambda x: x.phase, state, state.phase - 2 * pi)
+    def section_speed(self, state: Any) -> Any:
+        """The momentum of the shaft is its speed where φ = 0."""
+        return state.P
 
     def pace(self, s: Scalar, state: Any) -> Scalar | None:
         """dτ/dφ = 1/W where the angle is the independent variable."""
-        return _pace(self.speed(s, state)) if isinstance(state, RotorState) else None
-
-    def frequency_ratio(self, duration: Float[Array, "..."]) -> Float[Array, "..."]:
-        """ζ: mean speed of the rotor over cycles of these durations (unit: ω)."""
-        return 2 * pi / duration
+        return _pace(self.speed(s, state)) if self.is_paced(state) else None
 
     def step_limit(self, s: Scalar, state: Any) -> Scalar:
         """A fifth of the shorter of the rotor's turn and the body's natural period."""
@@ -241,11 +179,11 @@ class UnbalancedRotor(PhaseMachine):
 
     def _speed(self, s: Scalar, state: Any) -> Scalar:
         """Of the rotor, without its sign."""
-        return jnp.abs(self.speed(state.phase if isinstance(state, TimedRotorState) else s, state))
+        return jnp.abs(self.speed(state.phase if self.is_timed(state) else s, state))
 
     def alive(self, state: Any) -> jax.Array | None:
         """In the phase clock a rotor that does not turn forward has a state that is no number."""
-        return jnp.isfinite(state.P) if isinstance(state, RotorState) else None
+        return jnp.isfinite(state.P) if self.is_paced(state) else None
 
 
 def _pace(W: Scalar) -> Scalar:

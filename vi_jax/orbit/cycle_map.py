@@ -13,8 +13,8 @@ from jaxtyping import Array, Float
 
 from .._checks import count
 from ..flow import AbstractMethod, Adaptive, simulate
+from ..flow.arguments import as_floats
 from ..flow.choice import MethodLike, chosen
-from ..flow.simulate import as_floats
 from ..scene import AbstractScene, Scene
 from .tangent import by_columns
 

@@ -9,7 +9,8 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from .curve import Step
-from .shooting import Event, Shooting
+from .events import Event
+from .shooting import Shooting
 from .solve import advance, located, observe, orbit_of, state_at
 from .special import CROSSING, DOUBLING, FOLD, GRAZING, HOPF, SYMMETRY, TORUS, SpecialPoint
 

@@ -10,10 +10,8 @@ motion that the stop forbids, as the sign of V⁻ or of the clearance says. (The
 
 from collections.abc import Callable
 from functools import partial
-from math import ceil
 from typing import Any, NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -22,38 +20,18 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Complex, Float
 
 from .. import lanes
-from ..flow import AbstractMethod, ExactFlight, FixedStep
-from ..flow.choice import MethodLike, chosen
-from ..flow.events import guard_rates
+from ..flow import AbstractMethod
 from ..flow.moving import in_modes
 from ..scene import AbstractScene
 from ..scene.numbers import with_leaf
+from .events import Event, approach_of, guard_of, jump
 from .floquet import multipliers_of
+from .turns import Flight, Turns, turns_of
 
 Vector = Float[Array, " _"]
 
 # Newton's method has met a turn if it ends this close to it (as a share of the step).
 _TURNED = 1e-3
-
-
-class Event(NamedTuple):
-    """What begins a flight: an impact, a switch, or a section that counts for the motion."""
-
-    kind: str
-    """"stop", "switch" or "section"."""
-    number: int
-    """Of the stop or switch; of the cycle that a section begins."""
-
-
-def jump(scene: AbstractScene, event: Event, s: Any, state: Any, mode: Any) -> Any:
-    """The state after an event, from that in which it is met."""
-    if event.kind == "stop":
-        stop = scene.stops[event.number]
-        body = scene.coordinates[stop.coordinate]
-        return body.placed(state, stop.place, stop.rebound(body.velocity(state)))
-    if event.kind == "switch":
-        return scene.switches[event.number].after(scene, s, state, mode)[0]
-    return scene.renewed(state)
 
 
 class Observed(NamedTuple):
@@ -193,16 +171,8 @@ class Shooting(eqx.Module):
 
         def of(event: Event) -> Callable[..., Array]:
             def value(s, u):
-                state = self.unravel(u)
-                if event.kind == "stop":
-                    stop = scene.stops[event.number]
-                    return stop.beyond(scene.coordinates[stop.coordinate].position(state))
-                if event.kind == "switch":
-                    mode = self._mode_before(leg, event, s)
-                    return scene.switches[event.number].guard(scene, s, state, mode)
-                if self.autonomous:
-                    return jnp.asarray(scene.section(state))
-                return s - jnp.asarray(scene.cycle, s.dtype) * event.number
+                mode = self._mode_before(leg, event, s)
+                return guard_of(scene, event, s, self.unravel(u), mode)
 
             return value
 
@@ -286,7 +256,7 @@ class Shooting(eqx.Module):
             if self.events:
                 saltation, rises = self._saltation(scene, leg, s0, u)
                 carried, approach = carried @ saltation, rises[None]
-                order = self._each(leg, lambda event: partial(self._next, scene, event, leg), s0, u)
+                order = self._each(leg, partial(self._order, scene, leg), s0, u)
             return carried, time, approach, order, self._turns(scene, leg, s1, path)
 
         legs = jnp.arange(len(states))
@@ -295,19 +265,18 @@ class Shooting(eqx.Module):
         monodromy = jnp.eye(self.states, dtype=x.dtype)
         for leg in range(len(states)):
             monodromy = carried[leg] @ monodromy
-        low, high, room, touch, touched = turns
         Y = jax.vmap(lambda u: scene.position(self.unravel(u)))(states)
-        nearest = jnp.argmin(room)
+        nearest = jnp.argmin(turns.room)
         timed = self.autonomous or scene.pace(clock[0], self.unravel(states[0])) is not None
         return Observed(
             multipliers=multipliers_of(monodromy),
             monodromy=monodromy,
             approach=approach.ravel(),
-            y_min=jnp.minimum(jnp.min(Y), jnp.min(low)),
-            y_max=jnp.maximum(jnp.max(Y), jnp.max(high)),
-            clearance=room[nearest],
-            touch=touch[nearest],
-            touched=touched[nearest],
+            y_min=jnp.minimum(jnp.min(Y), jnp.min(turns.low)),
+            y_max=jnp.maximum(jnp.max(Y), jnp.max(turns.high)),
+            clearance=turns.room[nearest],
+            touch=turns.touch[nearest],
+            touched=turns.touched[nearest],
             order=jnp.min(order),
             duration=jnp.sum(time) if timed else jnp.asarray(scene.period, x.dtype) * self.cycles,
         )
@@ -323,7 +292,12 @@ class Shooting(eqx.Module):
             return ravel_pytree(scene.field(s, self.unravel(u)))[0]
 
         def reset(u):
-            return self._crossed(scene, leg, s, u)
+            def of(event: Event) -> Callable[..., Vector]:
+                return lambda u: ravel_pytree(
+                    jump(scene, event, s, self.unravel(u), None, landed=False)
+                )[0]
+
+            return self._each(leg, of, u)
 
         jacobian = jax.jacfwd(reset)(u)
         before, after = field(old, u), field(new, reset(u))
@@ -333,43 +307,40 @@ class Shooting(eqx.Module):
             after = jnp.asarray(goes_on, u.dtype)[leg] * after
         gained, slope = jax.grad(lambda s, u: self.guard(scene, leg, s, u), argnums=(0, 1))(s, u)
         rate = gained + jnp.dot(slope, before)
-        approach = self._each(leg, lambda event: partial(self._met, scene, event), u, rate)
+
+        def met(event: Event) -> Callable[..., Array]:
+            return lambda u, rate: approach_of(scene, event, self.unravel(u), rate)
+
+        approach = self._each(leg, met, u, rate)
         return jacobian + jnp.outer(after - jacobian @ before, slope) / rate, approach
 
-    def _crossed(self, scene, leg, s, u):
-        """As `after`, with the position left as it is: the jump of states beside the event's."""
+    def _turns(self, scene: AbstractScene, leg: Any, s1: Array, path: Any) -> Turns:
+        """The turning points of a leg."""
+        places, states = path
 
-        def of(event: Event) -> Callable[..., Vector]:
-            def new(u):
-                state = self.unravel(u)
-                if event.kind == "section":
-                    return ravel_pytree(scene.renewed(state))[0]
-                if event.kind == "stop":
-                    stop = scene.stops[event.number]
-                    body = scene.coordinates[stop.coordinate]
-                    rebound = stop.rebound(body.velocity(state))
-                    state = body.placed(state, body.position(state), rebound)
-                return ravel_pytree(state)[0]
+        def step(moving, s0, s1, u):
+            return self._step(moving, s0, s1, u, jnp.zeros_like(s0))[0]
 
-            return new
+        count, modes = len(scene.switches), jnp.asarray(self.modes, places.dtype)[leg]
+        return turns_of(
+            Flight(
+                scene, self.moving(scene, leg), tuple(modes[j] for j in range(count)), step,
+                self.unravel, places, states, (s1 - places[0]) / self.steps,
+            )
+        )  # fmt: skip
 
-        return self._each(leg, of, u)
+    def _order(self, scene: AbstractScene, leg: Any, event: Event) -> Callable[..., Array]:
+        """Whether a switch goes into the mode of the flight that begins with its event: 1 or -1."""
 
-    def _met(self, scene, event: Event, u, rate):
-        """V⁻ of an impact; of another event how fast its guard rises."""
-        if event.kind == "stop":
-            stop = scene.stops[event.number]
-            return stop.approach(scene.coordinates[stop.coordinate].velocity(self.unravel(u)))
-        return rate
+        def order(s, u):
+            if event.kind != "switch":
+                return jnp.ones_like(s)
+            j, before = event.number, self._mode_before(leg, event, s)
+            mode = scene.switches[j].after(scene, s, self.unravel(u), before)[1]
+            wanted = jnp.asarray([x[j] for x in self.modes], s.dtype)[leg]
+            return jnp.where(mode == wanted, 1.0, -1.0).astype(s.dtype)
 
-    def _next(self, scene, event: Event, leg, s, u):
-        """Whether a switch goes into the mode of the flight that begins with its event."""
-        one = jnp.ones_like(s)
-        if event.kind != "switch":
-            return one
-        j, before = event.number, self._mode_before(leg, event, s)
-        mode = scene.switches[j].after(scene, s, self.unravel(u), before)[1]
-        return jnp.where(mode == jnp.asarray([x[j] for x in self.modes], s.dtype)[leg], one, -one)
+        return order
 
     def state_at(self, x: Vector, leg: Any, s: Array) -> Any:
         """The state at clock `s`, which lies in leg number `leg`."""
@@ -377,124 +348,3 @@ class Shooting(eqx.Module):
         clock, states = self.parts(x)
         u = self.after(scene, leg, clock[leg], states[leg])
         return self.unravel(self.flight(scene, leg, clock[leg], s, u)[0])
-
-    def _turns(self, scene, leg, s1, path):
-        """Least and greatest Y at the turning points of a leg; the smallest room at one, where it
-        is, and to what.
-
-        Where the velocity changes sign within a step, Newton's method from the step's start.
-        """
-        places, states = path
-        h = (s1 - places[0]) / self.steps
-        moving = self.moving(scene, leg)
-        # The end of the last step is the next event: its velocity is that of a further step.
-        last, _ = lanes.once(
-            lambda x: self._step(moving, *x),
-            (places[-1], places[-1] + h, states[-1], jnp.zeros_like(h)),
-        )
-
-        def found(function, rate):
-            """Turning points of a function of (s, state) with this rate, or of its sign."""
-
-            def turn(s, u, v0, v1):
-                # A turn may fall on the end of a step.
-                turns = (v0 * v1 < 0) | ((v1 == 0) & (v0 != 0))
-
-                def at(scene, s, u, length):
-                    new, _ = self._step(scene, s, s + length, u, jnp.zeros_like(s))
-                    return guard_rates(scene.field, function, s + length, self.unravel(new))
-
-                held = jax.lax.stop_gradient((moving, s, u))
-                limit = jax.lax.stop_gradient(h)
-
-                def newton(_, length):
-                    here = at(*held, length)
-                    bend = jnp.where(here.a == 0, 1.0, here.a)
-                    return jnp.clip(length - here.v / bend, 0.0, limit)
-
-                share = jnp.where(turns, v0 / jnp.where(turns, v0 - v1, 1.0), 0.5)
-                length = jax.lax.fori_loop(0, 4, newton, jax.lax.stop_gradient(h * share))
-                here = at(moving, s, u, length)
-                bend = jnp.where(here.a == 0, 1.0, here.a)
-                # A guard with a kink (as that of dry friction, where its force vanishes) may have
-                # no turn there.
-                found = jnp.abs(here.v) <= jnp.abs(_TURNED * limit * bend)
-                shift = jnp.where(found, here.v, 0.0) / bend
-                return turns, here.x - 0.5 * here.v * shift, s + length - shift, v0
-
-            def velocity(s, u):
-                return rate(s, self.unravel(u))
-
-            v = jax.vmap(velocity)(places, states)
-            v1 = jnp.concatenate([v[1:], velocity(places[-1] + h, last)[None]])
-            return jax.vmap(lambda *x: lanes.once(lambda x: turn(*x), x))(places, states, v, v1)
-
-        tops = [
-            found(lambda _, x, c=body: c.position(x), lambda _, x, c=body: c.velocity(x))
-            for body in scene.coordinates
-        ]
-        turns, height, _, _ = tops[0]
-        low = jnp.min(jnp.where(turns, height, jnp.inf))
-        high = jnp.max(jnp.where(turns, height, -jnp.inf))
-        rooms = []
-        for stop in scene.stops:
-            turns, height, place, v0 = tops[stop.coordinate]
-            facing = turns & (stop.sign * v0 > 0)
-            rooms.append((jnp.where(facing, -stop.beyond(height), jnp.inf), place))
-        for j, switch in enumerate(scene.switches):
-            mode = jnp.asarray([x[j] for x in self.modes], h.dtype)[leg]
-
-            def guard(s, state, switch=switch, mode=mode):
-                return switch.guard(scene, s, state, mode)
-
-            def rise(s, state, guard=guard):
-                return guard_rates(moving.field, guard, s, state).v
-
-            turns, height, place, v0 = found(guard, rise)
-            # A body that friction lets go begins to slide with velocity and acceleration zero.
-            away = place > places[0] + _TURNED * h
-            rooms.append((jnp.where(turns & (v0 > 0) & away, -height, jnp.inf), place))
-        room, touch = jnp.full((), jnp.inf, h.dtype), jnp.zeros((), h.dtype)
-        touched = touch
-        for i, (values, place) in enumerate(rooms):
-            nearest = jnp.argmin(values)
-            touch = jnp.where(values[nearest] < room, place[nearest], touch)
-            touched = jnp.where(values[nearest] < room, float(i), touched)
-            room = jnp.minimum(room, values[nearest])
-        return low, high, room, touch, touched
-
-
-def renews(scene: AbstractScene) -> bool:
-    """Whether a machine begins each cycle with something set back."""
-    return type(scene).renewed is not AbstractScene.renewed
-
-
-def carrier(asked: MethodLike, found_with: AbstractMethod, scene: AbstractScene) -> AbstractMethod:
-    """A method of fixed steps, which a smooth system of equations needs: the one asked for, else
-    that of the orbit if it is one, else `ExactFlight` where it applies, else 32 steps of Dopri8 a
-    cycle, whose error is 1e-13.
-
-    **Raises:** `ValueError` if one is asked for that has no fixed steps.
-    """
-    if asked is not None:
-        method = chosen(scene, asked)
-        if not isinstance(method, FixedStep | ExactFlight):
-            raise ValueError(
-                "Argument `method` must be of fixed steps, `FixedStep(...)` or `ExactFlight()`, "
-                f"to follow an orbit, but got {method!r}."
-            )
-        method.check(scene)
-        return method
-    if isinstance(found_with, FixedStep):
-        return found_with
-    return chosen(scene, None, FixedStep(diffrax.Dopri8(), 32))
-
-
-def steps_of(method: AbstractMethod, scenes: list[AbstractScene], like: Any, cycles: int) -> int:
-    """Steps that a flight over the whole period needs, in the most demanding of the scenes."""
-    # Turning points are looked for between steps: more of them than flying needs.
-    most = max(method.steps_per_cycle, 16)
-    for scene in scenes:
-        limit = method.longest(scene, jnp.zeros(()), like)
-        most = max(most, ceil(1.02 * float(scene.cycle / limit)))
-    return most * cycles

@@ -8,8 +8,9 @@ from jax.flatten_util import ravel_pytree
 
 from .._checks import given_number
 from .curve import Step
+from .events import Event
 from .results import Orbit
-from .shooting import Event, Shooting
+from .shooting import Shooting
 from .solve import advance, jacobian_at, orbit_of, state_at, tangent_at
 
 FOLD, DOUBLING, TORUS = "fold", "period-doubling", "neimark-sacker"

@@ -13,8 +13,8 @@ from jaxtyping import Array, Bool, Float, Int
 from .._checks import concrete, count, fits_records, instance_of, number, require
 from .._programs import compiled
 from ..flow import RESULTS, simulate
+from ..flow.arguments import check_start
 from ..flow.choice import MethodLike, chosen
-from ..flow.simulate import check_start
 from ..orbit.results import impacts_in_words
 from ..scene import LABELS, AbstractScene
 from ..scene.numbers import check_again, check_leaf, with_leaf

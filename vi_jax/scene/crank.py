@@ -6,7 +6,7 @@ from typing import ClassVar, NamedTuple
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from .._checks import Range, number, require_ranges
+from .._checks import Range, real, require_ranges
 from .trig import sincos
 
 
@@ -38,7 +38,7 @@ class CosineCrank(AbstractCrank):
 class SliderCrank(AbstractCrank):
     """The exact kinematics of crank a and rod l: U = cos φ + (√(1 - λ² sin² φ) - 1)/λ."""
 
-    ratio: Float[Array, "..."] = eqx.field(converter=lambda x: number("ratio", x))
+    ratio: Float[Array, "..."] = eqx.field(converter=real("ratio"))
     """λ = a/l (dimensionless), in (0, 1)."""
     ranges: ClassVar = {"ratio": Range(0.0, 1.0, open_low=True, open_high=True)}
 

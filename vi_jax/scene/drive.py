@@ -6,16 +6,14 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import NOT_NEGATIVE, POSITIVE, REAL, number, require_ranges
+from .._checks import NOT_NEGATIVE, POSITIVE, REAL, real, require_ranges
 from .crank import Slide
 
 
 class IdealDrive(eqx.Module):
     """A drive of unlimited power: the crank turns at a constant rate."""
 
-    frequency_ratio: Float[Array, "..."] = eqx.field(
-        converter=lambda x: number("frequency_ratio", x)
-    )
+    frequency_ratio: Float[Array, "..."] = eqx.field(converter=real("frequency_ratio"))
     """ζ = Ω/ω (dimensionless), positive."""
     ranges: ClassVar = {"frequency_ratio": POSITIVE}
 
@@ -29,17 +27,15 @@ class Motor(eqx.Module):
     (1 + μ U_φ²) φ'' + μ U_φ U_φφ φ'² = τ0 (κ - φ'/w0) + ε U_φ (Y - U)
     """
 
-    strength: Float[Array, "..."] = eqx.field(converter=lambda x: number("strength", x))
+    strength: Float[Array, "..."] = eqx.field(converter=real("strength"))
     """τ0 = T0/(J ω²) (dimensionless), not negative; 0 lets the shaft coast."""
-    control: Float[Array, "..."] = eqx.field(converter=lambda x: number("control", x))
+    control: Float[Array, "..."] = eqx.field(converter=real("control"))
     """κ, motor control (dimensionless)."""
-    coupling: Float[Array, "..."] = eqx.field(converter=lambda x: number("coupling", x))
+    coupling: Float[Array, "..."] = eqx.field(converter=real("coupling"))
     """ε = k0 a²/(J ω²), the spring's reaction on the shaft (dimensionless), not negative."""
-    slider_inertia: Float[Array, "..."] = eqx.field(converter=lambda x: number("slider_inertia", x))
+    slider_inertia: Float[Array, "..."] = eqx.field(converter=real("slider_inertia"))
     """μ = m_B a²/J (dimensionless), not negative."""
-    no_load_speed: Float[Array, "..."] = eqx.field(
-        default=1.0, converter=lambda x: number("no_load_speed", x)
-    )
+    no_load_speed: Float[Array, "..."] = eqx.field(default=1.0, converter=real("no_load_speed"))
     """w0 = Ω0/ω, the no-load speed at κ = 1 (dimensionless), positive."""
     ranges: ClassVar = {
         "strength": NOT_NEGATIVE,
@@ -101,7 +97,7 @@ class DCMotor(Motor):
     """
 
     electrical_time: Float[Array, "..."] = eqx.field(
-        kw_only=True, converter=lambda x: number("electrical_time", x)
+        kw_only=True, converter=real("electrical_time")
     )
     """τe = ω L/R, the electrical time constant (dimensionless), positive."""
     ranges: ClassVar = {**Motor.ranges, "electrical_time": POSITIVE}

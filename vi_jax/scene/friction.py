@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import NOT_NEGATIVE, Range, number, require_ranges
+from .._checks import NOT_NEGATIVE, Range, real, require_ranges
 from .switch import AbstractSwitch
 
 
@@ -30,12 +30,12 @@ class DryFriction(AbstractSwitch):
     - `stopped(machine, state)`: the state with that velocity set to zero.
     """
 
-    level: Float[Array, "..."] = eqx.field(converter=lambda x: number("level", x))
+    level: Float[Array, "..."] = eqx.field(converter=real("level"))
     velocity: Callable[..., Any] = eqx.field(static=True, kw_only=True)
     force: Callable[..., Any] = eqx.field(static=True, kw_only=True)
     stopped: Callable[..., Any] = eqx.field(static=True, kw_only=True)
     static_ratio: Float[Array, "..."] = eqx.field(
-        kw_only=True, default=1.0, converter=lambda x: number("static_ratio", x)
+        kw_only=True, default=1.0, converter=real("static_ratio")
     )
     ranges: ClassVar = {"level": NOT_NEGATIVE, "static_ratio": Range(1.0, float("inf"))}
 

@@ -16,8 +16,9 @@ from .._checks import (
     SHARE,
     concrete,
     in_range,
-    number,
     one_of,
+    optional_real,
+    real,
     require_ranges,
 )
 from .crank import CosineCrank, SliderCrank
@@ -30,7 +31,7 @@ Number = Float[Array, "..."] | float
 
 
 def _si(name: str, default: float) -> Any:
-    return eqx.field(default=default, converter=lambda x: number(name, x), kw_only=True)
+    return eqx.field(default=default, converter=real(name), kw_only=True)
 
 
 class Parameters(eqx.Module):
@@ -64,17 +65,13 @@ class Parameters(eqx.Module):
     control: Number = _si("control", 0.9)
     """κ, motor control, dimensionless; the frequency ratio ζ of an ideal drive."""
     no_load_speed: Number | None = eqx.field(
-        default=None,
-        converter=lambda x: x if x is None else number("no_load_speed", x),
-        kw_only=True,
+        default=None, converter=optional_real("no_load_speed"), kw_only=True
     )
     """Ω0, no-load speed of the motor at κ = 1, rad/s. `None` means ω, which makes the tabulated
     κ = 0.5…1.9 the tabulated range of ζ; the paper does not give Ω0."""
 
     electrical_time: Number | None = eqx.field(
-        default=None,
-        converter=lambda x: x if x is None else number("electrical_time", x),
-        kw_only=True,
+        default=None, converter=optional_real("electrical_time"), kw_only=True
     )
     """L/R, the armature's inductance over its resistance, s. `None` leaves the armature out."""
 

@@ -13,97 +13,36 @@ from .._checks import (
     NOT_NEGATIVE,
     Range,
     concrete,
-    in_range,
     instance_of,
     number,
-    one_of,
+    optional_real,
+    real,
     require,
     require_ranges,
-    state_of_numbers,
     tuple_of,
 )
-from .base import AbstractScene
 from .crank import AbstractCrank, CosineCrank
 from .drive import DCMotor, IdealDrive, Motor
+from .shaft import ShaftScene
 from .soft import SoftStop
+from .states import (
+    TIMED,
+    DCMotorState,
+    MotorState,
+    OscillatorState,
+    TimedDCMotorState,
+    TimedMotorState,
+)
 from .stop import RigidStop
 
 # What pictures write beside Y and V.
 LABELS = "Y = y/a", "V = dY/dτ"
 
 
-class OscillatorState(eqx.Module):
-    """State of an ideally driven scene."""
-
-    Y: Float[Array, "..."]
-    """Position of the body (unit: a)."""
-    V: Float[Array, "..."]
-    """dY/dτ (unit: a ω)."""
-
-
-class MotorState(eqx.Module):
-    """State of a motor scene whose independent variable is the crank angle."""
-
-    Y: Float[Array, "..."]
-    """Position of the body (unit: a)."""
-    V: Float[Array, "..."]
-    """dY/dτ (unit: a ω)."""
-    W: Float[Array, "..."]
-    """Speed of the crank dφ/dτ (unit: ω)."""
-
-
-class TimedMotorState(eqx.Module):
-    """State of a motor scene whose independent variable is time."""
-
-    Y: Float[Array, "..."]
-    """Position of the body (unit: a)."""
-    V: Float[Array, "..."]
-    """dY/dτ (unit: a ω)."""
-    W: Float[Array, "..."]
-    """Speed of the crank dφ/dτ (unit: ω)."""
-    phase: Float[Array, "..."]
-    """Crank angle since the last section (radians)."""
-
-
-class DCMotorState(eqx.Module):
-    """State of a scene with a `DCMotor` whose independent variable is the crank angle."""
-
-    Y: Float[Array, "..."]
-    """Position of the body (unit: a)."""
-    V: Float[Array, "..."]
-    """dY/dτ (unit: a ω)."""
-    W: Float[Array, "..."]
-    """Speed of the crank dφ/dτ (unit: ω)."""
-    M: Float[Array, "..."]
-    """Torque of the motor, which its armature current gives (unit: J ω²)."""
-
-
-class TimedDCMotorState(eqx.Module):
-    """State of a scene with a `DCMotor` whose independent variable is time."""
-
-    Y: Float[Array, "..."]
-    """Position of the body (unit: a)."""
-    V: Float[Array, "..."]
-    """dY/dτ (unit: a ω)."""
-    W: Float[Array, "..."]
-    """Speed of the crank dφ/dτ (unit: ω)."""
-    M: Float[Array, "..."]
-    """Torque of the motor, which its armature current gives (unit: J ω²)."""
-    phase: Float[Array, "..."]
-    """Crank angle since the last section (radians)."""
-
-
-# The states of motors, and what they are called where time is the independent variable.
-_TIMED = {MotorState: TimedMotorState, DCMotorState: TimedDCMotorState}
-_CLOCKED = tuple(_TIMED.values())
-
-
 class Oscillator(eqx.Module):
     """The body C on its spring, in units of its natural frequency."""
 
-    damping_ratio: Float[Array, "..."] = eqx.field(
-        default=0.0, converter=lambda x: number("damping_ratio", x)
-    )
+    damping_ratio: Float[Array, "..."] = eqx.field(default=0.0, converter=real("damping_ratio"))
     """ξ = c/(2 m_C ω) (dimensionless), not negative."""
     ranges: ClassVar = {"damping_ratio": NOT_NEGATIVE}
 
@@ -111,7 +50,7 @@ class Oscillator(eqx.Module):
         require_ranges(self)
 
 
-class Scene(AbstractScene):
+class Scene(ShaftScene):
     """A body on a spring, shaken by a crank, with stops: Y'' + 2ξY' + Y = U(φ).
 
     Every number is a leaf, so that any of them can be a `vmap` axis or be differentiated; what is
@@ -130,7 +69,7 @@ class Scene(AbstractScene):
     crank: AbstractCrank = eqx.field(default_factory=CosineCrank)
     clock_name: str = eqx.field(static=True, default="phase")
     section_phase: Float[Array, "..."] | None = eqx.field(
-        default=None, converter=lambda x: x if x is None else number("section_phase", x)
+        default=None, converter=optional_real("section_phase")
     )
     """Crank angle of the section (radians, in [-2π, 2π]); `None` is 0. Phases of states and of
     impacts are counted from it."""
@@ -139,9 +78,9 @@ class Scene(AbstractScene):
     )
     """Compliant stops; their stiffness in units of the body's own spring."""
     ranges: ClassVar = {"section_phase": Range(-2 * pi, 2 * pi)}
+    timed_states: ClassVar = TIMED
 
     def __check_init__(self):
-        one_of("clock_name", self.clock_name, ("phase", "time"))
         instance_of("oscillator", self.oscillator, Oscillator, "an `Oscillator`")
         instance_of("crank", self.crank, AbstractCrank, "a `CosineCrank()` or another crank")
         if not isinstance(self.drive, IdealDrive | Motor):
@@ -201,11 +140,6 @@ class Scene(AbstractScene):
             return 2 * pi / self.drive.frequency_ratio
         return 2 * pi
 
-    def in_clock(self, clock: str) -> "Scene":
-        """The same scene in the `"phase"` or the `"time"` clock."""
-        one_of("clock", clock, ("phase", "time"))
-        return dataclasses.replace(self, clock_name=clock)
-
     def period_of(self, cycles: int) -> str:
         """In crank angle: 2π, 4π, …"""
         return f"{2 * cycles}π"
@@ -264,36 +198,19 @@ class Scene(AbstractScene):
         if isinstance(self.drive, DCMotor):
             parts.append(number("M", self.drive.line(W) if M is None else M))
             require("M", parts[-1])
-        kind = self._kind
-        if self.clock_name == "phase":
-            return kind(*parts)
-        return _TIMED[kind](*parts, jnp.zeros_like(W))
+        return self.adopt(self.state_type(*parts))
 
     @property
-    def _kind(self) -> Any:
-        """Of the states in the phase clock."""
+    def state_type(self) -> Any:
+        """Of a state in the phase clock."""
         if isinstance(self.drive, IdealDrive):
             return OscillatorState
         return DCMotorState if isinstance(self.drive, DCMotor) else MotorState
 
-    def adopt(self, start: Any) -> Any:
-        """A start made for either clock, as this scene's clock needs it."""
-        wanted = self._kind
-        if self.clock_name == "time" and wanted in _TIMED:
-            if isinstance(start, wanted):
-                return _TIMED[wanted](*vars(start).values(), jnp.zeros_like(start.W))
-            wanted = _TIMED[wanted]
-        if not isinstance(start, wanted):
-            raise TypeError(
-                f"Argument `start` must be a `{wanted.__name__}` for this scene (use "
-                f"`scene.start(...)`), but got a `{type(start).__name__}`."
-            )
-        return state_of_numbers("start", start)
-
     def by_phase(self, start: Any) -> Any:
         """A start made for the time clock without its crank angle; any other as it is."""
-        if isinstance(start, _CLOCKED):
-            return self._kind(*list(vars(start).values())[:-1])
+        if self.is_timed(start):
+            return self.state_type(*list(vars(start).values())[:-1])
         return start
 
     @property
@@ -331,29 +248,21 @@ class Scene(AbstractScene):
             pull = pull + stop.push(self, state, mode)
         return pull
 
-    def clock(self, state: Any) -> Float[Array, ""] | None:
-        """The crank angle, where time is the independent variable of a motor scene."""
-        return state.phase if isinstance(state, _CLOCKED) else None
-
     def as_logged(self, clock: Float[Array, "..."]) -> Float[Array, "..."]:
         """The crank angle since the section, where time counts the cycles of an ideal drive."""
         if isinstance(self.drive, IdealDrive) and self.clock_name == "time":
             return self.drive.frequency_ratio * clock
         return clock
 
-    def rewound(self, state: Any) -> Any:
-        """The state with a full turn taken off the crank angle."""
-        return eqx.tree_at(lambda x: x.phase, state, state.phase - 2 * pi)
-
     def pace(self, s: Float[Array, ""], state: Any) -> Float[Array, ""] | None:
         """dτ/dφ = 1/W in the phase clock of a motor."""
-        return 1 / state.W if isinstance(state, tuple(_TIMED)) else None
+        return 1 / state.W if self.is_paced(state) else None
 
     def frequency_ratio(self, duration: Float[Array, "..."]) -> Float[Array, "..."]:
         """ζ: mean crank speed over cycles of these durations (unit: ω)."""
         if isinstance(self.drive, IdealDrive):
             return jnp.broadcast_to(self.drive.frequency_ratio, duration.shape)
-        return 2 * pi / duration
+        return super().frequency_ratio(duration)
 
     def step_limit(self, s: Float[Array, ""], state: Any) -> Float[Array, ""]:
         """A fifth of the shorter of the drive's turn and the body's natural period."""
@@ -384,33 +293,12 @@ class Scene(AbstractScene):
 
     def in_range(self, start: Any) -> Bool[Array, ""]:
         """As its parts say; with room between two stops, and not beyond the section."""
-        good = in_range(self)
-        if len(self.stops) == 2:
-            good = good & (_room(self.stops) > 0)
-        if isinstance(start, _CLOCKED):
-            good = good & (start.phase < 2 * pi)
-        return good
+        good = super().in_range(start)
+        return good & (_room(self.stops) > 0) if len(self.stops) == 2 else good
 
     def alive(self, state: Any) -> jax.Array | None:
         """In the phase clock of a motor the crank must turn forward."""
-        return state.W > 0 if isinstance(state, tuple(_TIMED)) else None
-
-    def check_start(self, start: Any) -> None:
-        """Raise a `ValueError` if the crank does not turn forward in the phase clock."""
-        if isinstance(start, tuple(_TIMED)):
-            speed = concrete(start.W)
-            if speed is not None and not (speed > 0).all():
-                raise ValueError(
-                    "Argument `start` must have W > 0 in the phase clock, but has "
-                    f'W = {speed.min():g}. Pass `clock="time"` to start from rest.'
-                )
-        if isinstance(start, _CLOCKED):
-            phase = concrete(start.phase)
-            if phase is not None and not (phase < 2 * pi).all():
-                raise ValueError(
-                    "Argument `start` must have its phase, counted from the last section, below "
-                    f"2π, but has {phase.max():g}."
-                )
+        return state.W > 0 if self.is_paced(state) else None
 
 
 def _check_room(stops: tuple[RigidStop, ...]) -> None:

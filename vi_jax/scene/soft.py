@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, count, number, one_of, require, require_ranges
+from .stop import Wall
 from .switch import AbstractSwitch
 
 Scalar = Float[Array, ""]
@@ -19,7 +20,7 @@ TOUCHING, RELEASED, APART = 1.0, 0.0, -1.0
 _NEAR = 1e-6
 
 
-class SoftStop(AbstractSwitch):
+class SoftStop(Wall, AbstractSwitch):
     """A compliant stop: pushes the body back while it penetrates by δ > 0.
 
     With unit mass the force is F0 + K δᵖ + α √K δ^((p-1)/2) δ' under `law="power"`: p = 1 is a
@@ -102,20 +103,10 @@ class SoftStop(AbstractSwitch):
         """Of a force that is straight in the depth; others have a kink or a root at first touch."""
         return self.exponent == 1
 
-    @property
-    def sign(self) -> int:
-        """+1 on the right, -1 on the left."""
-        return 1 if self.side == "right" else -1
-
-    @property
-    def place(self) -> Float[Array, "..."]:
-        """Position of the stop."""
-        return self.sign * self.gap
-
     def depth(self, machine: Any, state: Any) -> tuple[Any, Any]:
         """δ and δ' (by time); δ is negative apart from the stop."""
         body = machine.coordinates[self.coordinate]
-        return self.sign * body.position(state) - self.gap, self.sign * body.velocity(state)
+        return self.beyond(body.position(state)), self.approach(body.velocity(state))
 
     def force(self, depth: Any, rate: Any) -> Any:
         """Force away from the stop, per unit of mass, of a body that touches."""

@@ -6,42 +6,22 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import REAL, SHARE, count, number, one_of, require_ranges
+from .._checks import REAL, SHARE, count, number, one_of, real, require_ranges
 
 
 def _restitution(x: Any) -> Any:
     return x if callable(x) else number("restitution", x)
 
 
-class RigidStop(eqx.Module):
-    """A rigid wall with Newton's restitution law: at contact and approaching, V ← -k V.
+class Wall(eqx.Module):
+    """Where a stop stands, rigid or compliant: at `gap` on its `side`."""
 
-    A stop on the right keeps Y ≤ gap, one on the left keeps Y ≥ -gap. The gap may be zero or
-    negative (a body pressed on); the restitution is in [0, 1], both ends included, or a function of
-    the speed of approach with values there (a pytree, if it has numbers of its own).
-
-    What is hit is the machine's first coordinate unless another is named by its index.
-    """
-
-    gap: Float[Array, "..."] = eqx.field(converter=lambda x: number("gap", x))
-    """d, distance of the stop from the unstretched position (unit: a)."""
-    restitution: Any = eqx.field(converter=_restitution)
-    """k, coefficient of restitution (dimensionless)."""
-    side: str = eqx.field(static=True, default="right")
-    """"right" or "left"."""
-    coordinate: int = eqx.field(static=True, default=0, kw_only=True)
-    """Index into the machine's `coordinates`."""
-    ranges: ClassVar = {"gap": REAL, "restitution": SHARE}
-
-    def __check_init__(self):
-        require_ranges(self)
-        one_of("side", self.side, ("right", "left"))
-        count("coordinate", self.coordinate)
+    gap: eqx.AbstractVar[Float[Array, "..."]]
 
     @property
     def sign(self) -> int:
         """+1 on the right, -1 on the left: the body is inside while sign·Y ≤ gap."""
-        return 1 if self.side == "right" else -1
+        return 1 if self.side == "right" else -1  # pyright: ignore[reportAttributeAccessIssue]
 
     @property
     def place(self) -> Float[Array, "..."]:
@@ -55,6 +35,32 @@ class RigidStop(eqx.Module):
     def approach(self, V: Any) -> Any:
         """Speed towards the stop."""
         return self.sign * V
+
+
+class RigidStop(Wall):
+    """A rigid wall with Newton's restitution law: at contact and approaching, V ← -k V.
+
+    A stop on the right keeps Y ≤ gap, one on the left keeps Y ≥ -gap. The gap may be zero or
+    negative (a body pressed on); the restitution is in [0, 1], both ends included, or a function of
+    the speed of approach with values there (a pytree, if it has numbers of its own).
+
+    What is hit is the machine's first coordinate unless another is named by its index.
+    """
+
+    gap: Float[Array, "..."] = eqx.field(converter=real("gap"))
+    """d, distance of the stop from the unstretched position (unit: a)."""
+    restitution: Any = eqx.field(converter=_restitution)
+    """k, coefficient of restitution (dimensionless)."""
+    side: str = eqx.field(static=True, default="right")
+    """"right" or "left"."""
+    coordinate: int = eqx.field(static=True, default=0, kw_only=True)
+    """Index into the machine's `coordinates`."""
+    ranges: ClassVar = {"gap": REAL, "restitution": SHARE}
+
+    def __check_init__(self):
+        require_ranges(self)
+        one_of("side", self.side, ("right", "left"))
+        count("coordinate", self.coordinate)
 
     def coefficient(self, approach: Any) -> Any:
         """k at this speed of approach."""

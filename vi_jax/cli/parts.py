@@ -15,11 +15,12 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
-from .flow import RESULTS, Run, Samples
-from .flow.simulate import planned, simulate
-from .scan.sweep import Sweep, sweep, taken_along
-from .scene import AbstractScene
-from .scene.numbers import with_leaf
+from ..flow import RESULTS, Run, Samples
+from ..flow.arguments import planned
+from ..flow.simulate import simulate
+from ..scan.sweep import Sweep, sweep, taken_along
+from ..scene import AbstractScene
+from ..scene.numbers import with_leaf
 
 # Intervals (samples, or cycles as so many) of one part: a fraction of a second. Each other length
 # is another program, so that it is chosen before the time is known.

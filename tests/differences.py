@@ -1,0 +1,41 @@
+"""Derivatives of simulated motions beside what they must agree with."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import vi_jax as vi
+
+
+def check_derivatives(
+    last: Callable[..., Any], at: Any, *, step: Any = 1e-5, tolerance: float = 1e-6, impacts: int,
+    max_steps: int | None = None,
+) -> None:  # fmt: skip
+    """Forward derivatives beside central differences, and reverse ones beside forward ones.
+
+    `last(x, **options)` simulates by a vector of numbers, and gives the state at the end and the
+    impacts, which no step may change, and of which there are to be at least so many.
+    """
+    at = jnp.asarray(at)
+    steps = jnp.diag(jnp.broadcast_to(jnp.asarray(step), at.shape))
+
+    def numbers(x: Any, **options: Any) -> tuple[Any, Any]:
+        state, counts = last(x, **options)
+        return jnp.stack(jax.tree.leaves(state)), counts
+
+    moved, counts = vi.jit(jax.vmap(numbers))(jnp.concatenate([at + steps, at - steps]))
+    assert (counts == counts[0]).all() and int(counts[0].sum()) >= impacts
+    ahead, behind = np.split(np.asarray(moved), 2)
+    slope = (ahead - behind).T / (2 * np.diag(steps))
+    forward = np.asarray(vi.jit(jax.jacfwd(lambda x: numbers(x)[0]))(at))
+    np.testing.assert_allclose(forward, slope, rtol=tolerance, atol=tolerance)
+    # Another weight for each component, so that none can be left out.
+    weights = jnp.arange(1.0, forward.shape[0] + 1)
+
+    def weighted(x: Any) -> Any:
+        return weights @ numbers(x, adjoint="reverse", max_steps=max_steps)[0]
+
+    backward = vi.jit(jax.grad(weighted))(at)
+    np.testing.assert_allclose(backward, weights @ forward, rtol=1e-9, atol=1e-9)

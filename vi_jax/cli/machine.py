@@ -1,0 +1,205 @@
+"""The tables of a file that describe a machine, and a machine named on the command line."""
+
+import importlib
+import inspect
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, Literal
+
+from attrs import field, frozen
+
+from .. import machines
+from ..scene import (
+    AbstractScene,
+    DCMotor,
+    IdealDrive,
+    Motor,
+    Oscillator,
+    Parameters,
+    RigidStop,
+    Scene,
+    SliderCrank,
+    SoftStop,
+)
+from .toml import ConfigError, given, in_terms_of, unknown
+
+
+@frozen(kw_only=True)
+class MachineTable:
+    """`[machine]`: the numbers of `Parameters` in SI units."""
+
+    drive: Literal["motor", "ideal"] = "motor"
+    crank: Literal["cosine", "slider"] = "cosine"
+    clock: Literal["phase", "time"] = "phase"
+    body_mass: float | None = None
+    slider_mass: float | None = None
+    stiffness: float | None = None
+    damping: float | None = None
+    crank_radius: float | None = None
+    rod_length: float | None = None
+    inertia: float | None = None
+    restitution: float | None = None
+    gap: float | None = None
+    torque: float | None = None
+    control: float | None = None
+    no_load_speed: float | None = None
+    electrical_time: float | None = None
+
+    def build(self) -> Scene:
+        """The dimensionless scene."""
+        with in_terms_of("[machine]"):
+            table = Parameters(**given(self, "drive", "crank", "clock"))
+            return table.scene(drive=self.drive, crank=self.crank).in_clock(self.clock)
+
+
+@frozen(kw_only=True)
+class StopTable:
+    """One `[[scene.stops]]`."""
+
+    gap: float
+    restitution: float | None = None
+    side: Literal["right", "left"] = "right"
+
+
+@frozen(kw_only=True)
+class SoftStopTable:
+    """One `[[scene.soft_stops]]`: the arguments of `SoftStop`."""
+
+    gap: float
+    stiffness: float
+    restitution: float | None = None
+    damping: float | None = None
+    exponent: float | None = None
+    law: Literal["power", "hunt-crossley"] | None = None
+    prestress: float | None = None
+    adhesive: bool | None = None
+    side: Literal["right", "left"] = "right"
+
+
+@frozen(kw_only=True)
+class ModelTable:
+    """`[model]`: a ready machine by its name, and its numbers."""
+
+    name: str
+    numbers: dict[str, float] = field(factory=dict)
+
+    def build(self) -> AbstractScene:
+        """The machine."""
+        kinds = {name: x for name, x in vars(machines).items() if _is_machine(x)}
+        if self.name not in kinds:
+            raise ConfigError(unknown("machine", self.name, "[model]", sorted(kinds)))
+        known = list(inspect.signature(kinds[self.name]).parameters)
+        wrong = [name for name in self.numbers if name not in known]
+        if wrong:
+            raise ConfigError(*(unknown("number", x, "[model.numbers]", known) for x in wrong))
+        with in_terms_of("[model.numbers]"):
+            return kinds[self.name](**self.numbers)
+
+
+def _is_machine(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, AbstractScene)
+
+
+@frozen(kw_only=True)
+class MotorTable:
+    """`[scene.motor]`: the numbers of `Motor`, or of `DCMotor` with `electrical_time`."""
+
+    strength: float
+    control: float
+    coupling: float
+    slider_inertia: float
+    no_load_speed: float | None = None
+    electrical_time: float | None = None
+
+    def build(self) -> Motor:
+        """The drive."""
+        return (Motor if self.electrical_time is None else DCMotor)(**given(self))
+
+
+@frozen(kw_only=True)
+class SceneTable:
+    """`[scene]`: dimensionless numbers."""
+
+    drive: Literal["ideal", "motor"] = "ideal"
+    frequency_ratio: float | None = None
+    motor: MotorTable | None = None
+    damping_ratio: float = 0.0
+    restitution: float = 0.5
+    gap: float | None = None
+    stops: tuple[StopTable, ...] | None = None
+    soft_stops: tuple[SoftStopTable, ...] = ()
+    crank: Literal["cosine", "slider"] = "cosine"
+    crank_ratio: float | None = None
+    clock: Literal["phase", "time"] = "phase"
+
+    def build(self) -> Scene:
+        """The scene; without `gap` and stops it has one stop on the right at gap 2."""
+        self._check()
+        stops = []
+        for i, stop in enumerate(self.stops or ()):
+            bounce = self.restitution if stop.restitution is None else stop.restitution
+            with in_terms_of(f"[[scene.stops]] number {i + 1}"):
+                stops.append(RigidStop(stop.gap, bounce, side=stop.side))
+        soft = []
+        for i, stop in enumerate(self.soft_stops):
+            with in_terms_of(f"[[scene.soft_stops]] number {i + 1}"):
+                soft.append(SoftStop(**given(stop)))
+        with in_terms_of("[scene.motor]"):
+            turning = None if self.motor is None else self.motor.build()
+        with in_terms_of("[scene]"):
+            if self.stops is None and (self.gap is not None or not soft):
+                stops = [RigidStop(2.0 if self.gap is None else self.gap, self.restitution)]
+            return Scene(
+                oscillator=Oscillator(self.damping_ratio),
+                drive=turning or IdealDrive(self.frequency_ratio),
+                stops=tuple(stops),
+                soft_stops=tuple(soft),
+                clock_name=self.clock,
+                **({} if self.crank_ratio is None else {"crank": SliderCrank(self.crank_ratio)}),
+            )
+
+    def _check(self) -> None:
+        for drive, key in (("ideal", "frequency_ratio"), ("motor", "motor")):
+            if (getattr(self, key) is not None) != (drive == self.drive):
+                what = "missing key" if drive == self.drive else "unfitting key"
+                raise ConfigError(f'{what} `{key}` in [scene]: drive = "{self.drive}"')
+        if self.stops is not None and self.gap is not None:
+            raise ConfigError("[scene] must hold `gap` or [[scene.stops]], but holds both")
+        if (self.crank_ratio is not None) != (self.crank == "slider"):
+            raise ConfigError('`crank_ratio` in [scene] must stand beside crank = "slider"')
+
+
+def start_of(scene: AbstractScene, numbers: Mapping[str, float], place: str) -> Any:
+    """A state on the section, from `[start]` or a guess."""
+    known = list(inspect.signature(scene.start).parameters)
+    wrong = [unknown("key", name, place, known) for name in numbers if name not in known]
+    if wrong:
+        raise ConfigError(*wrong)
+    with in_terms_of(place):
+        return scene.start(**numbers)
+
+
+def machine_named(name: str) -> AbstractScene:
+    """The machine that a function of this name returns."""
+    module, _, function = name.partition(":")
+    if not module or not function:
+        raise ConfigError(f"--machine must be package.module:function, but is {name!r}")
+    try:
+        with _beside():
+            found = getattr(importlib.import_module(module), function)()
+    except (ImportError, AttributeError) as error:
+        raise ConfigError(f"--machine {name} cannot be found: {error}") from None
+    if not isinstance(found, AbstractScene):
+        raise ConfigError(f"--machine {name} must return a machine, but returned {found!r}")
+    return found
+
+
+@contextmanager
+def _beside() -> Iterator[None]:
+    """Modules of the folder in which the command is run can be imported, as by `python -m`."""
+    sys.path.insert(0, "")
+    try:
+        yield
+    finally:
+        sys.path.remove("")

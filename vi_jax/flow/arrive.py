@@ -1,0 +1,306 @@
+"""Where a step leads: rebounds, rest, changes of mode, and what is recorded of the way."""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax.lax import stop_gradient
+from jaxtyping import Array, Bool, Float
+
+from ..lanes import pin, pin_flag
+from .aim import select
+from .lane import Lane, Plan, Record, to_stop, to_turn_of
+from .moving import struck_modes
+from .rest import Release, settled
+from .trial import Crossing, Path, Trial
+
+Scalar = Float[Array, ""]
+Flag = Bool[Array, ""]
+
+
+class Arrival(NamedTuple):
+    """Where a step leads."""
+
+    s: Scalar
+    state: Any
+    time: Scalar | None
+    direction: tuple[Scalar, ...]
+    contact: tuple[Scalar, ...] | None
+    """The stops rested on."""
+    modes: tuple[Scalar, ...]
+    impacts: Scalar
+    speed: Scalar | None
+    loss: Scalar | None
+    rests: Scalar | None
+    log: Any
+    completed: Flag
+    """Whether the interval is complete."""
+
+
+def arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Flag]:
+    """The lane where the step leads, its record kept, and whether the interval is complete."""
+    old = lane.record
+    direction = []
+    for k, along in enumerate(lane.direction):
+        if trial.paths:
+            v = stop_gradient(trial.paths[k].end.v)
+            turned = jnp.where(v == 0, along, jnp.sign(v))
+            # At a turn the sign of the velocity is rounding's.
+            away = -along
+            several = plan.scene.switches or len(trial.paths) > 1
+            if several or plan.scene.section(lane.state) is not None:
+                # Where a turn is another event too, it may have been met before.
+                met_before = lane.target != to_turn_of(k)
+                away = jnp.where(met_before, stop_gradient(jnp.sign(trial.paths[k].end.a)), away)
+            along = jnp.where(trial.paths[k].at_turn, away, turned)
+        direction.append(along)
+    arrival = Arrival(
+        trial.s, trial.state, trial.time, tuple(direction), lane.contact, lane.modes,
+        old.impacts, old.speed, old.loss, old.rests, old.log, trial.ends_interval,
+    )  # fmt: skip
+    if trial.crossings:
+        met = jnp.zeros_like(taken)
+        for c in trial.crossings:
+            met = met | c.landed
+        for path in trial.paths:
+            if path.leaves is not None:
+                met = met | path.leaves.landed
+        # Rare: skipped where no lane of a group has met anything.
+        arrival = jax.lax.cond(
+            met, lambda x: _met(plan, lane, trial, taken, x), lambda x: x, arrival
+        )
+    y_max, y_min, clearance = _reached(plan, lane, trial, taken, arrival.state)
+    time = arrival.time
+    if time is not None and old.time is not None:
+        time = jnp.where(taken, time, old.time)
+    there = dataclasses.replace(
+        lane,
+        s=jnp.where(taken, arrival.s, lane.s),
+        state=select(taken, arrival.state, lane.state),
+        direction=select(taken, arrival.direction, lane.direction),
+        contact=select(taken, arrival.contact, lane.contact),
+        modes=select(taken, arrival.modes, lane.modes),
+        below=_below(lane, trial, taken, arrival.completed),
+        record=Record(
+            time, y_max, y_min, arrival.impacts, arrival.speed, arrival.loss, arrival.rests,
+            arrival.log, clearance,
+        ),
+    )  # fmt: skip
+    return there, taken & arrival.completed
+
+
+def _met(plan: Plan, lane: Lane, trial: Trial, taken: Flag, arrival: Arrival) -> Arrival:
+    """What the event makes of a step that met one: the last part of its way, and the jump.
+
+    Of events met together the stops come first, in their order, then the switches, then the
+    section.
+    """
+    flow, bend = _flow_and_bend(trial.holding, arrival.time is not None, trial.s, trial.state)
+    for c in trial.crossings:
+        offset = jnp.where(c.landed, c.offset, 0.0)
+        if c.kind != "section" and plan.ticks(lane.state):
+            # Met on the section it is not beyond it.
+            beyond = stop_gradient(trial.s + offset - plan.end(lane.part))
+            offset = offset - jnp.maximum(beyond, 0.0)
+        there, passed = jtu.tree_map(
+            lambda x, dx, ddx, d=offset: x + d * dx + _second(d, ddx),
+            (trial.state, arrival.time), flow, bend,
+        )  # fmt: skip
+        arrival = arrival._replace(s=arrival.s + offset, time=passed)
+        if c.kind == "section":
+            arrival = arrival._replace(
+                completed=arrival.completed | c.landed,
+                state=select(c.landed, there, arrival.state),
+            )
+        elif c.kind == "switch":
+            arrival = _switched(plan, lane, trial, taken, arrival, c, there)
+        else:
+            arrival = _impact(plan, lane, trial, taken, arrival, c, there, flow)
+    for k, path in enumerate(trial.paths):
+        if path.leaves is not None:
+            arrival = _released(lane, arrival, k, path.leaves, flow)
+    return arrival
+
+
+def _released(lane: Lane, arrival: Arrival, k: int, leaves: Release, flow: Any) -> Arrival:
+    """Coordinate number k free again."""
+    assert arrival.contact is not None
+    offset, free = leaves.offset, leaves.landed
+    state, time = jtu.tree_map(lambda x, dx: x + offset * dx, (arrival.state, arrival.time), flow)
+    direction = jnp.where(free, -lane.direction[k], arrival.direction[k])
+    return arrival._replace(
+        s=arrival.s + offset,
+        state=state,
+        time=time,
+        direction=_put(arrival.direction, k, direction),
+        contact=_put(arrival.contact, k, jnp.where(free, 0.0, arrival.contact[k])),
+    )
+
+
+def _below(lane: Lane, trial: Trial, taken: Flag, completed: Flag) -> Scalar | None:
+    if trial.below is None or lane.below is None:
+        return None
+    return jnp.where(taken, jnp.where(completed, 0.0, trial.below), lane.below)
+
+
+def _put(values: tuple, k: int, value: Any) -> tuple:
+    return (*values[:k], value, *values[k + 1 :])
+
+
+def _switched(
+    plan: Plan, lane: Lane, trial: Trial, taken: Flag, arrival: Arrival, c: Crossing, there: Any
+) -> Arrival:
+    """The next mode of a switch that changed in the state `there`."""
+    scene, j = plan.scene, c.number
+    state, mode = scene.switches[j].after(scene, arrival.s, there, lane.modes[j])
+    mode = stop_gradient(jnp.asarray(mode, arrival.s.dtype))
+    log = arrival.log
+    if plan.log_switches:
+        clock = scene.clock(there)
+        log = _logged(
+            log, taken & c.landed, arrival.impacts, arrival.s if clock is None else clock,
+            jnp.zeros_like(arrival.s), len(scene.stops) + j,
+        )  # fmt: skip
+        # Listed as an impact is, and so counted.
+        count = jnp.where(taken & c.landed, 1.0, 0.0)
+        arrival = arrival._replace(impacts=arrival.impacts + count)
+    return arrival._replace(
+        state=select(c.landed, state, arrival.state),
+        modes=_put(arrival.modes, j, jnp.where(c.landed, mode, arrival.modes[j])),
+        log=log,
+    )
+
+
+def _impact(
+    plan: Plan, lane: Lane, trial: Trial, taken: Flag, arrival: Arrival,
+    c: Crossing, there: Any, flow: Any,
+) -> Arrival:  # fmt: skip
+    """The rebound from a stop in `there`, the state of the impact; or coming to rest on it."""
+    scene, stop = plan.scene, plan.scene.stops[c.number]
+    k = stop.coordinate
+    body = scene.coordinates[k]
+    s, state, time, direction = arrival.s, arrival.state, arrival.time, arrival.direction[k]
+    contact, rests, met = arrival.contact, arrival.rests, s
+    approach = jnp.maximum(stop.approach(body.velocity(there)), 0.0)
+    # A speed whose square is no number ends here: a body may die out on a stop.
+    least = 100 * float(jnp.finfo(s.dtype).tiny) ** 0.5
+    rebound = stop.rebound(stop.sign * jnp.where(approach > least, approach, 0.0))
+    state = select(c.landed, body.placed(there, stop.place, rebound), state)
+    direction = jnp.where(c.landed, -float(stop.sign), direction)
+    hit = taken & c.landed
+    lost = stop.loss(approach)
+    if contact is not None:
+        arriving = stop.approach(trial.paths[k].end.v)
+        last, left = settled(plan, lane, trial.alone[k], stop, arriving, s, there)
+        ends = pin_flag(c.landed & last, s)
+        lost = jnp.where(ends, 0.5 * approach**2, lost)
+        wait = pin(jnp.where(ends, left, 0.0))
+        (later, passed) = jtu.tree_map(lambda x, dx: x + wait * dx, (state, time), flow)
+        still = body.placed(later, stop.place, jnp.zeros_like(s))
+        state = select(ends, still, state)
+        time = select(ends, passed, time)
+        s = s + wait
+        contact = _put(contact, k, jnp.where(ends, to_stop(c.number), contact[k]))
+        direction = jnp.where(ends, float(stop.sign), direction)
+        if rests is not None:
+            rests = rests + jnp.where(taken & ends, 1.0, 0.0)
+    if not _is_one(body.mass):
+        lost = body.mass * lost
+    directions = _put(arrival.direction, k, direction)
+    for j, other in enumerate(scene.coordinates):
+        if j != k:  # it may share a body with the one that was hit
+            v = stop_gradient(other.velocity(state))
+            struck = c.landed & (v != 0)
+            turned = jnp.where(struck, jnp.sign(v), directions[j])
+            directions = _put(directions, j, turned)
+            if contact is not None:
+                contact = _put(contact, j, jnp.where(struck, 0.0, contact[j]))
+    modes = arrival.modes
+    if modes:
+        modes = select(c.landed, struck_modes(scene, s, state, modes), modes)
+    clock, speed, loss = scene.clock(there), arrival.speed, arrival.loss
+    log = _logged(
+        arrival.log, hit, arrival.impacts, met if clock is None else clock, approach, c.number
+    )
+    return arrival._replace(
+        s=s,
+        state=state,
+        time=time,
+        direction=directions,
+        contact=contact,
+        modes=modes,
+        impacts=arrival.impacts + jnp.where(hit, 1.0, 0.0),
+        speed=None if speed is None else jnp.where(hit, jnp.maximum(speed, approach), speed),
+        loss=None if loss is None else loss + jnp.where(hit, lost, 0.0),
+        rests=rests,
+        log=log,
+    )
+
+
+def _is_one(mass: Any) -> bool:
+    return isinstance(mass, float) and mass == 1.0
+
+
+def _reached(
+    plan: Plan, lane: Lane, trial: Trial, taken: Flag, state: Any
+) -> tuple[Scalar | None, Scalar | None, Scalar | None]:
+    """Greatest and smallest Y so far, and the smallest distance at a turn that met no stop."""
+    record = lane.record
+    y_max, y_min, clearance = record.y_max, record.y_min, record.clearance
+    if y_max is None or y_min is None or not trial.paths:
+        return y_max, y_min, clearance
+    tops = [_top(path) for path in trial.paths]
+    at_turn = trial.paths[0].at_turn
+    reached = jnp.where(at_turn, tops[0], plan.scene.position(state))
+    if clearance is not None:
+        for stop in plan.scene.stops:
+            k = stop.coordinate
+            short = taken & trial.paths[k].at_turn & (lane.direction[k] == stop.sign)
+            room = jnp.where(short, -stop.beyond(tops[k]), jnp.inf)
+            clearance = jnp.minimum(clearance, room)
+    y_max = jnp.where(taken, jnp.maximum(y_max, reached), y_max)
+    y_min = jnp.where(taken, jnp.minimum(y_min, reached), y_min)
+    return y_max, y_min, clearance
+
+
+def _top(path: Path) -> Scalar:
+    """The coordinate at the turning point that a step was aimed at, or else at its end."""
+    end = path.end
+    bend = jnp.where(end.a == 0, 1.0, end.a)
+    return end.x - jnp.where(path.at_turn, 0.5 * end.v**2 / bend, 0.0)
+
+
+@jax.custom_jvp
+def _second(offset: Scalar, bend: Float[Array, "..."]) -> Float[Array, "..."]:
+    """½δ² x'', which is below rounding and left out; only its derivatives count."""
+    return jnp.zeros_like(bend)
+
+
+@_second.defjvp
+def _(primals, tangents):
+    (offset, bend), (rate, _) = primals, tangents
+    return jnp.zeros_like(bend), offset * rate * bend
+
+
+def _flow_and_bend(scene: Any, timed: bool, s: Scalar, state: Any) -> tuple[Any, Any]:
+    """First and second derivatives by s of the state and of the elapsed time."""
+
+    def field(s, state):
+        pace = scene.pace(s, state) if timed else None
+        if timed and pace is None:
+            pace = jnp.ones_like(s)
+        return scene.field(s, state), pace
+
+    flow = field(s, state)
+    return flow, jax.jvp(field, (s, state), (jnp.ones_like(s), flow[0]))[1]
+
+
+def _logged(log: Any, hit: Flag, place: Scalar, clock: Scalar, approach: Scalar, stop: int) -> Any:
+    """The log with this impact, the `place`-th of its interval."""
+    if log is None:
+        return None
+    here = hit & (jnp.arange(log.shape[1], dtype=log.dtype) == place)
+    entry = jnp.stack([clock, approach, jnp.full_like(clock, stop)])
+    return jnp.where(here, entry[:, None], log)

@@ -1,0 +1,42 @@
+"""The method that a smooth system of equations is solved with, and the steps of its flights."""
+
+from math import ceil
+from typing import Any
+
+import diffrax
+import jax.numpy as jnp
+
+from ..flow import AbstractMethod, ExactFlight, FixedStep
+from ..flow.choice import MethodLike, chosen
+from ..scene import AbstractScene
+
+
+def carrier(asked: MethodLike, found_with: AbstractMethod, scene: AbstractScene) -> AbstractMethod:
+    """A method of fixed steps, which a smooth system of equations needs: the one asked for, else
+    that of the orbit if it is one, else `ExactFlight` where it applies, else 32 steps of Dopri8 a
+    cycle, whose error is 1e-13.
+
+    **Raises:** `ValueError` if one is asked for that has no fixed steps.
+    """
+    if asked is not None:
+        method = chosen(scene, asked)
+        if not isinstance(method, FixedStep | ExactFlight):
+            raise ValueError(
+                "Argument `method` must be of fixed steps, `FixedStep(...)` or `ExactFlight()`, "
+                f"to follow an orbit, but got {method!r}."
+            )
+        method.check(scene)
+        return method
+    if isinstance(found_with, FixedStep):
+        return found_with
+    return chosen(scene, None, FixedStep(diffrax.Dopri8(), 32))
+
+
+def steps_of(method: AbstractMethod, scenes: list[AbstractScene], like: Any, cycles: int) -> int:
+    """Steps that a flight over the whole period needs, in the most demanding of the scenes."""
+    # Turning points are looked for between steps: more of them than flying needs.
+    most = max(method.steps_per_cycle, 16)
+    for scene in scenes:
+        limit = method.longest(scene, jnp.zeros(()), like)
+        most = max(most, ceil(1.02 * float(scene.cycle / limit)))
+    return most * cycles

@@ -1,0 +1,102 @@
+"""What machines share whose cycle is a turn of a shaft."""
+
+import dataclasses
+from math import pi
+from typing import Any, ClassVar, TypeVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from .._checks import concrete, one_of, state_of_numbers
+from .base import AbstractScene
+
+Machine = TypeVar("Machine", bound="ShaftScene")
+
+
+class ShaftScene(AbstractScene):
+    """A machine driven by a shaft that turns once in a cycle.
+
+    Its clock is `"phase"`, with the angle of the shaft as the independent variable, or `"time"`. A
+    shaft whose speed W is part of the state must turn forward in the phase clock; by time it need
+    not, and its angle is a component `phase` of the state.
+    """
+
+    clock_name: eqx.AbstractVar[str]
+    timed_states: ClassVar[dict[type, type]]
+    """Of the states with a speed of the shaft: what they are by time, with `phase` at the end."""
+
+    def __check_init__(self):
+        one_of("clock_name", self.clock_name, ("phase", "time"))
+
+    @property
+    def state_type(self) -> Any:
+        """Of a state in the phase clock."""
+        raise NotImplementedError
+
+    def is_timed(self, state: Any) -> bool:
+        """Whether the angle of the shaft is part of the state."""
+        return type(state) in self.timed_states.values()
+
+    def is_paced(self, state: Any) -> bool:
+        """Whether time passes at the pace of the shaft, whose speed is part of the state."""
+        return type(state) in self.timed_states
+
+    def in_clock(self: Machine, clock: str) -> Machine:
+        """The same machine in the `"phase"` or the `"time"` clock."""
+        one_of("clock", clock, ("phase", "time"))
+        return dataclasses.replace(self, clock_name=clock)
+
+    def adopt(self, start: Any) -> Any:
+        """A start made for either clock, as this machine's clock needs it."""
+        wanted = self.state_type
+        if self.clock_name == "time" and wanted in self.timed_states:
+            if type(start) is wanted:
+                components = vars(start).values()
+                return self.timed_states[wanted](*components, jnp.zeros_like(start.Y))
+            wanted = self.timed_states[wanted]
+        if type(start) is not wanted:
+            raise TypeError(
+                f"Argument `start` must be a `{wanted.__name__}` for this machine (use its "
+                f"`start(...)`), but got a `{type(start).__name__}`."
+            )
+        return state_of_numbers("start", start)
+
+    def clock(self, state: Any) -> Float[Array, ""] | None:
+        """The angle of the shaft, where time is the independent variable."""
+        return state.phase if self.is_timed(state) else None
+
+    def rewound(self, state: Any) -> Any:
+        """The state with a full turn taken off the angle."""
+        return eqx.tree_at(lambda x: x.phase, state, state.phase - 2 * pi)
+
+    def frequency_ratio(self, duration: Float[Array, "..."]) -> Float[Array, "..."]:
+        """ζ: mean speed of the shaft over cycles of these durations (unit: ω)."""
+        return 2 * pi / duration
+
+    def in_range(self, start: Any) -> Bool[Array, ""]:
+        """As its parts say, and not beyond the section."""
+        good = super().in_range(start)
+        return good & (start.phase < 2 * pi) if self.is_timed(start) else good
+
+    def check_start(self, start: Any) -> None:
+        """Raise a `ValueError` if the shaft does not turn forward in the phase clock, or is beyond
+        its section."""
+        if self.is_paced(start):
+            speed = concrete(self.section_speed(start))
+            if speed is not None and not (speed > 0).all():
+                raise ValueError(
+                    "Argument `start` must have W > 0 in the phase clock, but has "
+                    f'W = {speed.min():g}. Pass `clock="time"` to start from rest.'
+                )
+        if self.is_timed(start):
+            phase = concrete(start.phase)
+            if phase is not None and not (phase < 2 * pi).all():
+                raise ValueError(
+                    "Argument `start` must have its phase, counted from the last section, below "
+                    f"2π, but has {phase.max():g}."
+                )
+
+    def section_speed(self, state: Any) -> Any:
+        """W of a state on the section."""
+        return state.W
