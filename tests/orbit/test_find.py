@@ -149,6 +149,19 @@ def quantity(x, name):
     }[name]
 
 
+@pytest.mark.parametrize("section", [-2 * np.pi, -1.0, np.pi, 2 * np.pi])
+def test_every_section_is_searched_from(section):
+    """The search moves to a section far from impacts, which must not lie beyond a turn."""
+    scene = vi.Scene.ideal(
+        frequency_ratio=3.2, restitution=0.9, gap=1.05, damping_ratio=0.002
+    ).at_section(section)
+    Y, V = np.random.default_rng(1).uniform((-3.5, -4.0), (1.05, 4.0), (32, 2)).T
+    guesses = scene.start(Y=jnp.asarray(Y), V=jnp.asarray(V))
+    batch = vi.find_orbit(scene, guesses, cycles=1, section=section)
+    assert bool(batch.successful.all())
+    np.testing.assert_allclose(batch.y_max, 1 / (3.2**2 - 1), atol=1e-5)
+
+
 @pytest.mark.slow
 def test_there_is_no_gradient_where_there_is_no_orbit():
     def lowest(zeta):

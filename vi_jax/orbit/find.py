@@ -154,7 +154,8 @@ def _moved(the_map: CycleMap, guess: Any, impact_log: int) -> tuple[CycleMap, An
     lost = ~jnp.isfinite(sum(jtu.tree_leaves(there)))
     place = jnp.where(lost, 0, place)
     there = jtu.tree_map(lambda a, b: jnp.where(lost, a, b), guess, there)
-    moved = scene.at_section(scene.phase_at(jnp.asarray(step, phase.dtype) * place))
+    angle = scene.phase_at(jnp.asarray(step, phase.dtype) * place)
+    moved = scene.at_section(jnp.where(angle > 2 * pi, angle - 2 * pi, angle))
     return dataclasses.replace(the_map, scene=moved), there, place
 
 
