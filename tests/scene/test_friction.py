@@ -22,6 +22,17 @@ class Books(eqx.Module):
     heat: jax.Array
 
 
+def on_a_belt(machine):
+    """Friction of a machine that has a `pull`, on a floor that moves at its `speed`."""
+    return vi.DryFriction(
+        machine.level,
+        static_ratio=machine.ratio,
+        velocity=lambda machine, x: x.V - machine.speed,
+        force=lambda machine, s, x: machine.pull(s, x),
+        stopped=lambda machine, x: eqx.tree_at(lambda x: x.V, x, machine.speed),
+    )
+
+
 class Rubbing(vi.AbstractScene):
     """x'' + x = A cos ωt - friction; by phase."""
 
@@ -29,19 +40,12 @@ class Rubbing(vi.AbstractScene):
     frequency: jax.Array
     level: jax.Array
     ratio: jax.Array
+    speed: jax.Array = eqx.field(default=0.0, converter=jnp.asarray)
     stops: tuple = ()
 
     @property
     def switches(self):
-        return (
-            vi.DryFriction(
-                self.level,
-                static_ratio=self.ratio,
-                velocity=lambda machine, x: x.V,
-                force=lambda machine, s, x: machine.pull(s, x),
-                stopped=lambda machine, x: eqx.tree_at(lambda x: x.V, x, jnp.zeros_like(x.V)),
-            ),
-        )
+        return (on_a_belt(self),)
 
     @property
     def cycle(self):
@@ -193,15 +197,7 @@ class OnABelt(vi.AbstractScene):
 
     @property
     def switches(self):
-        return (
-            vi.DryFriction(
-                self.level,
-                static_ratio=self.ratio,
-                velocity=lambda machine, x: x.V - machine.speed,
-                force=lambda machine, s, x: -x.Y,
-                stopped=lambda machine, x: eqx.tree_at(lambda x: x.V, x, machine.speed),
-            ),
-        )
+        return (on_a_belt(self),)
 
     @property
     def cycle(self):
@@ -210,9 +206,12 @@ class OnABelt(vi.AbstractScene):
     def section(self, state):
         return state.Y - self.level
 
+    def pull(self, s, x):
+        return -x.Y
+
     def field(self, s, x, mode):
-        zero = jnp.zeros_like(s)
-        return Books(x.V, -x.Y - self.switches[0].resistance(mode, -x.Y), zero, zero)
+        zero, pull = jnp.zeros_like(s), self.pull(s, x)
+        return Books(x.V, pull - self.switches[0].resistance(mode, pull), zero, zero)
 
 
 @pytest.mark.parametrize("method", [CLOSE, vi.FixedStep(steps_per_cycle=64), vi.Taylor()],

@@ -39,19 +39,19 @@ elementwise = partial(into, ELEMENTWISE)
 
 
 def add(t: Text, a: Value, b: Value) -> Value:
-    if not is_float(a.kind):
-        return t.binary("or" if a.kind == "i1" else "add", a, b)
-    if a.number == 0:
-        return b
-    return a if b.number == 0 else t.binary("fadd contract", *_ordered(a, b))
+    return _commuting(t, a, b, 0, "fadd contract", "or" if a.kind == "i1" else "add")
 
 
 def mul(t: Text, a: Value, b: Value) -> Value:
+    return _commuting(t, a, b, 1, "fmul contract", "and" if a.kind == "i1" else "mul")
+
+
+def _commuting(t: Text, a: Value, b: Value, neutral: int, real: str, whole: str) -> Value:
     if not is_float(a.kind):
-        return t.binary("and" if a.kind == "i1" else "mul", a, b)
-    if a.number == 1:
+        return t.binary(whole, a, b)
+    if a.number == neutral:
         return b
-    return a if b.number == 1 else t.binary("fmul contract", *_ordered(a, b))
+    return a if b.number == neutral else t.binary(real, *_ordered(a, b))
 
 
 def _ordered(a: Value, b: Value) -> tuple[Value, Value]:
