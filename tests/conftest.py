@@ -8,7 +8,14 @@ import pytest
 
 jax.config.update("jax_enable_x64", True)
 
-_hook = jaxtyping.install_import_hook("vi_jax", "beartype.beartype")
+# The lanes' many small functions, which write a program's text, would take three times as long;
+# they are checked in a process of their own (`lanes/test_types.py`).
+_PACKAGE = Path(__file__).parents[1] / "vi_jax"
+_ROOMS = sorted(
+    {path.name.removesuffix(".py") for path in _PACKAGE.iterdir() if path.name[0] != "."}
+    - {"__pycache__", "__init__", "py", "lanes"}
+)
+_hook = jaxtyping.install_import_hook([f"vi_jax.{x}" for x in _ROOMS], "beartype.beartype")
 
 _MAPS = Path("/proc/self/maps")
 

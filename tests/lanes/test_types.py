@@ -1,0 +1,42 @@
+"""The annotations of the lanes' own functions, checked at run time in a process of their own."""
+
+import subprocess
+import sys
+
+CHECKED = """
+import jax, jaxtyping
+import jax.numpy as jnp
+jax.config.update("jax_enable_x64", True)
+hook = jaxtyping.install_import_hook("vi_jax.lanes", "beartype.beartype")
+import vi_jax as vi
+import vi_jax.lanes.kernel
+
+try:
+    vi_jax.lanes.kernel.kernel_text("no program", 8, 512)
+except jaxtyping.TypeCheckError:
+    pass
+else:
+    raise AssertionError("nothing is checked")
+
+
+def last(control, method):
+    scene = vi.Parameters(control=control).scene()
+    run = vi.simulate(scene, scene.start(), 4, method=method, clock="time", samples=4, impact_log=2)
+    return run.last.Y, run.successful
+
+
+grid = jnp.linspace(0.7, 0.9, 5)
+for method in (vi.Taylor(), vi.Adaptive(), vi.FixedStep(steps_per_cycle=32)):
+    lanes = vi.jit(jax.vmap(lambda x: last(x, method)))(grid)
+    slopes = vi.jit(jax.vmap(jax.jacfwd(lambda x: last(x, method)[0])))(grid)
+    assert bool(lanes[1].all() & jnp.isfinite(slopes).all())
+valve = vi.machines.ReliefValve()
+assert bool(vi.simulate(valve, valve.start(), 4).successful)
+"""
+
+
+def test_the_types_of_the_lanes_are_right():
+    done = subprocess.run(
+        [sys.executable, "-W", "error::UserWarning", "-c", CHECKED], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
