@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Float, Int
 
 from .._checks import concrete, count, flag
@@ -21,7 +20,8 @@ from ..scene import AbstractScene, Scene
 from .cycle_map import CycleMap, adopted, cycle_map
 from .floquet import multipliers_of
 from .results import ORBIT_RESULTS, Orbit, trimmed
-from .search import AbstractSearch, Newton, search
+from .root import root_of, shooting_matrix
+from .search import AbstractSearch, Newton
 from .tangent import by_columns
 
 # Places in a cycle at which an orbit can be searched.
@@ -159,69 +159,6 @@ def _moved(the_map: CycleMap, guess: Any, impact_log: int) -> tuple[CycleMap, An
     return dataclasses.replace(the_map, scene=moved), there, place
 
 
-class _Root(NamedTuple):
-    """Starting states of the arcs, as rows, and how the search went; all floats."""
-
-    arcs: Float[Array, "arcs states"]
-    residual: Float[Array, ""]
-    converged: Float[Array, ""]
-    steps: Float[Array, ""]
-    history: Float[Array, " max_steps"]
-
-
-def _missing(arc: CycleMap, arcs: Float[Array, "arcs states"], unravel: Any) -> Array:
-    """What each arc lacks to end where the next one begins."""
-    ends = jax.vmap(lambda x: ravel_pytree(arc(unravel(x)))[0])(arcs)
-    return ends - jnp.roll(arcs, -1, axis=0)
-
-
-@eqx.filter_custom_jvp
-def _root(arc: CycleMap, guess: Any, root_finder: AbstractSearch) -> _Root:
-    x, unravel = ravel_pytree(guess)
-    arcs = x[None]
-    if root_finder.arcs > 1:
-        run = simulate(
-            arc.scene, guess, arc.cycles * root_finder.arcs, method=arc.method, rests=arc.rests
-        )
-        sections = jnp.stack(jtu.tree_leaves(run.sections), axis=-1)[: -1 : arc.cycles]
-        arcs = jnp.where(jnp.isfinite(sections), sections, x)
-    found = search(root_finder, lambda arcs: _missing(arc, arcs, unravel), arcs)
-    dtype = x.dtype
-    return _Root(
-        found.x,
-        found.residual,
-        found.converged.astype(dtype),
-        found.steps.astype(dtype),
-        found.history,
-    )
-
-
-@_root.def_jvp
-def _(primals, tangents):
-    arc, guess, root_finder = primals
-    root = _root(arc, guess, root_finder)
-    _, unravel = ravel_pytree(guess)
-    still = jtu.tree_map(jnp.zeros_like, root)
-    if not jtu.tree_leaves(tangents[0]):
-        return root, still
-
-    jacobians = jax.vmap(lambda x: arc.jacobian(unravel(x)))(root.arcs)
-    _, rate = eqx.filter_jvp(
-        lambda arc: _missing(arc, root.arcs, unravel).ravel(), (arc,), (tangents[0],)
-    )
-    move = -jnp.linalg.solve(_shooting_matrix(jacobians), rate).reshape(root.arcs.shape)
-    # Where there is no orbit there is no derivative of one.
-    # A product, since the transpose of a choice would be zero.
-    return root, still._replace(arcs=move * jnp.where(root.converged > 0, 1.0, jnp.nan))
-
-
-def _shooting_matrix(jacobians: Float[Array, "arcs states states"]) -> Float[Array, "all all"]:
-    """Derivative of `_missing` by the arcs, from the derivative of each arc's end by its start."""
-    arcs, states, _ = jacobians.shape
-    following = jnp.kron(jnp.roll(jnp.eye(arcs), 1, axis=1), jnp.eye(states))
-    return block_diag(*jacobians) - following.astype(jacobians.dtype)
-
-
 class _Seen(NamedTuple):
     """One arc followed from its start; all floats, cycle by cycle."""
 
@@ -273,7 +210,7 @@ def _judged(the_map: CycleMap, guess: Any, root_finder: AbstractSearch, impact_l
     scene, arcs, cycles = the_map.scene, root_finder.arcs, the_map.cycles
     moved, start, place = _moved(the_map, jax.lax.stop_gradient(guess), impact_log)
     arc = dataclasses.replace(moved, cycles=cycles // arcs)
-    root = _root(arc, start, root_finder)
+    root = root_of(arc, start, root_finder)
     x, unravel = root.arcs, ravel_pytree(guess)[1]
     seen = jax.vmap(lambda x: _follow(arc, unravel(x), impact_log))(x)
     # Derivatives by the very first state: those within an arc after those of the arcs before.
@@ -283,7 +220,7 @@ def _judged(the_map: CycleMap, guess: Any, root_finder: AbstractSearch, impact_l
         passed = jacobians[-1][-1]
     jacobians = jnp.concatenate(jacobians)
     missing = seen.states[:, -1, -1] - jnp.roll(x, -1, axis=0)
-    step = jnp.linalg.solve(_shooting_matrix(seen.jacobians[:, -1]), missing.ravel())
+    step = jnp.linalg.solve(shooting_matrix(seen.jacobians[:, -1]), missing.ravel())
     error = jnp.max(jnp.abs(step))
     seen = jtu.tree_map(lambda a: a.reshape(cycles, *a.shape[2:]), seen)
 

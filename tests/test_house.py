@@ -1,0 +1,57 @@
+"""Rooms import one way, nothing private of each other, and no file outgrows its subject."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+HOUSE = Path(__file__).parents[1] / "vi_jax"
+FILES = sorted(HOUSE.rglob("*.py"))
+
+# Each may import from those before it.
+ORDER = "lanes scene flow machines orbit scan plot paper explore cli".split()
+TOOLS = {"_checks", "_files", "_lazy", "_programs"}
+
+
+def imports(path: Path) -> Iterator[tuple[list[str], str]]:
+    """The package's own modules that a file imports from, and the names taken."""
+    here = list(path.relative_to(HOUSE).parts[:-1])
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if not isinstance(node, ast.ImportFrom):
+            continue
+        words = (node.module or "").split(".") if node.module else []
+        if node.level:
+            words = [*here[: len(here) + 1 - node.level], *words]
+        elif words[:1] == ["vi_jax"]:
+            words = words[1:]
+        else:
+            continue
+        for name in node.names:
+            yield words, name.name
+
+
+def test_rooms_import_one_way_and_nothing_private():
+    rooms = {path.name for path in HOUSE.iterdir() if (path / "__init__.py").exists()}
+    assert rooms == set(ORDER)
+    seen = 0
+    for path in FILES:
+        room = path.relative_to(HOUSE).parts[0]
+        if room not in ORDER:
+            continue
+        for words, name in imports(path):
+            other = words[0] if words else name
+            if other == room or other in TOOLS:
+                continue
+            seen += 1
+            assert other in ORDER and ORDER.index(other) < ORDER.index(room), (path, other)
+            private = [word for word in (*words, name) if word.startswith("_")]
+            assert not private, (path, private)
+    assert seen > 100
+
+
+def test_no_file_has_more_than_350_lines():
+    long = {
+        str(path.relative_to(HOUSE)): lines
+        for path in FILES
+        if (lines := path.read_text(encoding="utf-8").count("\n")) > 350
+    }
+    assert not long
