@@ -23,10 +23,10 @@ def main() -> None:
 
     scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.8, gap=2.0)
     one = {name: values[:1] for name, values in AXES.items()}
-    vi.scan(scene, one, settle=300, lanes=1024, workers=2)  # compiles
+    vi.scan(scene, one, settle=1500, lanes=512, workers=2)  # compiles
     print("begins", flush=True)
     if not options.cluster:
-        vi.scan(scene, AXES, settle=300, lanes=1024, workers=2, store=options.store)
+        vi.scan(scene, AXES, settle=1500, lanes=512, workers=2, store=options.store)
         return
     from dask.distributed import Client, LocalCluster
 
@@ -34,7 +34,7 @@ def main() -> None:
         with Client(cluster) as client:
             first = next(iter(client.run(os.getpid).values()))
             threading.Timer(8.0, os.kill, (first, 9)).start()
-            vi.scan(scene, AXES, settle=300, lanes=1024, cluster=client, store=options.store)
+            vi.scan(scene, AXES, settle=1500, lanes=512, cluster=client, store=options.store)
 
 
 if __name__ == "__main__":
