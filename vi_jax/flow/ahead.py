@@ -51,11 +51,12 @@ def look(plan: Plan, lane: Lane, motion: Any, h: Scalar) -> tuple[Scalar, Scalar
     scene = plan.scene
     zero, none = jnp.zeros_like(h), jnp.zeros_like(h, bool)
     events: list[tuple[float, Series]] = []
-    paths, turns = [], []
+    paths, speeds, turns = [], [], []
     if plan.motion or scene.stops:
         for k, coordinate in enumerate(scene.coordinates):
             paths.append(motion.of(coordinate.position))
-            turn = lane.direction[k] * _sum(_slope(paths[k]), h, zero) < 0
+            speeds.append(_sum(_slope(paths[k]), h, zero))
+            turn = lane.direction[k] * speeds[k] < 0
             # A body at rest meets nothing.
             turns.append(turn if lane.contact is None else turn & (lane.contact[k] == 0))
         for i, stop in enumerate(scene.stops):
@@ -96,18 +97,20 @@ def look(plan: Plan, lane: Lane, motion: Any, h: Scalar) -> tuple[Scalar, Scalar
             facing = (*facing, zero)
             turn = turns[k] & ~facing_stop[k]
             if len(paths) > 1:  # of their turns that matter the earliest comes first
-                place = _root(facing)
-                matters = _matters(plan, k, path, facing, place, place * h)
+                place, rest = _root(facing)
+                told = _is_told(rest, path, speeds[k], h)
+                matters = _matters(plan, k, path, told, place * h)
                 turn = turn & (place < soonest) & matters
                 soonest = jnp.where(turn, place, soonest)
                 target, cut = jnp.where(turn, to_turn_of(k), target), cut | turn
             polynomial = facing if polynomial is None else select(turn, facing, polynomial)
         assert polynomial is not None
-        theta = _root(polynomial)
+        theta, rest = _root(polynomial)
         length = theta * h
         if len(paths) == 1:
             turn = turns[0] & ~facing_stop[0]
-            matters = turn & _matters(plan, 0, paths[0], polynomial, theta, length)
+            told = _is_told(rest, paths[0], speeds[0], h)
+            matters = turn & _matters(plan, 0, paths[0], told, length)
             target = jnp.where(matters, to_turn_of(0), target)
             cut = jnp.where(turn, matters, cut)
         return jnp.where(cut, length, h), jnp.where(cut, target, FREE)
@@ -115,27 +118,32 @@ def look(plan: Plan, lane: Lane, motion: Any, h: Scalar) -> tuple[Scalar, Scalar
     return jax.lax.cond(crossed | turned, found, lambda _: (h, jnp.full_like(h, FREE)), None)
 
 
-def _root(polynomial: tuple[Scalar, ...]) -> Scalar:
-    """Where a motion's polynomial in θ first rises through zero."""
+def _root(polynomial: tuple[Scalar, ...]) -> tuple[Scalar, Scalar]:
+    """Where a motion's polynomial in θ first rises through zero, and what was left of it before the
+    last correction."""
     # The low orders lead near the root; what is left is a correction.
     theta = rising_root(polynomial[:7], iterations=3)
-    derivative = slope(polynomial)[:-1]
+    derivative, value = slope(polynomial)[:-1], jnp.zeros_like(theta)
     for _ in range(2):
         value, rate = horner(polynomial, theta), horner(derivative, theta)
         better = theta - value / jnp.where(rate > 0, rate, 1.0)
         theta = jnp.where((rate > 0) & (better > 0) & (better <= 1), better, theta)
-    return theta
+    return theta, value
 
 
-def _matters(
-    plan: Plan, k: int, path: Series, facing: tuple[Scalar, ...], theta: Scalar, length: Scalar
-) -> Flag:
-    """Whether a turn of coordinate number k, at θ, has to be met: where only impacts matter, one
-    far from the stops is passed by, unless its place could not be told."""
+def _is_told(rest: Scalar, path: Series, speed: Scalar, h: Scalar) -> Flag:
+    """Whether the place of a turn is known well enough: by what is left of the velocity there (by
+    θ), beside that at the step's ends."""
+    begin = jnp.zeros_like(h) if path[1] is None else path[1]
+    return jnp.abs(rest) <= _UNTOLD * h * jnp.maximum(jnp.abs(begin), jnp.abs(speed))
+
+
+def _matters(plan: Plan, k: int, path: Series, told: Flag, length: Scalar) -> Flag:
+    """Whether a turn of coordinate number k has to be met: where only impacts matter, one far from
+    the stops is passed by, unless its place could not be told."""
     if plan.motion or plan.scene.switches:
         return jnp.ones_like(length, bool)
-    ends = jnp.maximum(jnp.abs(facing[0]), jnp.abs(sum(facing[1:], facing[0])))
-    close = jnp.abs(horner(facing, theta)) > _UNTOLD * ends
+    close = ~told
     for stop in plan.scene.stops:
         if stop.coordinate == k:
             height = _sum(path, length, jnp.zeros_like(length))

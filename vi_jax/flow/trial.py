@@ -34,6 +34,8 @@ class Crossing(NamedTuple):
     """"stop", "switch" or "section"."""
     number: int
     """Of the stop or switch."""
+    lingers: bool
+    """Whether a step may begin beyond it, to rounding."""
     begin: Rates
     end: Rates
     offset: Scalar
@@ -148,9 +150,11 @@ def attempt(
         for k, one in enumerate(each_alone):
             paths.append(_path(plan, lane, k, one, holding, (s1, new, h, limit), good))
     section, below = _section(plan, lane, holding, s1, new)
-    guards = [
-        *_stops(scene, paths), *_switches(lane, scene, holding, s1, new), *section
-    ]  # fmt: skip
+    guards = [*_stops(scene, paths), *_switches(lane, scene, holding, s1, new), *section]
+    # The stops of one coordinate and a clock are never met together but on a section, where a step
+    # ends; other events can be.
+    if len(paths) > 1 or scene.switches or scene.section(lane.state) is not None:
+        guards = [guard._replace(lingers=True) for guard in guards]
     seen = tuple(_seen(lane, good & last, good, h, each, guards) for each in guards)
     return Trial(
         s1, h, new, time, error, good, last, seen, tuple(paths), each_alone, holding, below
@@ -165,7 +169,7 @@ def _path(
     position = plan.scene.coordinates[k].position
     begin = rates(free.field, position, lane.s, lane.state)
     end = rates(free.field, position, s1, new)
-    if lane.contact is not None:
+    if lane.contact is not None and len(plan.scene.coordinates) > 1:
         # Of a body at rest place and velocity are known better than the state tells them, where
         # the coordinate is a difference. Its force is that on a free body.
         rests, place = lane.contact[k] > 0, begin.x
@@ -208,6 +212,7 @@ class _Guard(NamedTuple):
     """Of g, for its rounding."""
     coordinate: int | None = None
     """That a stop limits."""
+    lingers: bool = False
 
 
 def _stops(scene: AbstractScene, paths: list[Path]) -> list[_Guard]:
@@ -278,6 +283,8 @@ def beyond(event: _Guard | Crossing) -> Flag:
     """Whether a step ends beyond an event. One that begins there to rounding, after the event
     before, and still falls has not met it: it may end at once, at a turning point."""
     begin, end = event.begin, event.end
+    if not event.lingers:
+        return end.x > 0
     return (end.x > 0) & ~((begin.v < 0) & (end.v < 0) & (begin.x >= end.x))
 
 
@@ -293,12 +300,15 @@ def _seen(
     aimed = good & (lane.target == name)
     eps = float(jnp.finfo(h.dtype).eps)
     for other in all_of_them:
-        if other.name != name:  # what lies beyond another event was not reached
-            # Events may come together, but for the stops of one coordinate: then one is met after
-            # the other.
-            alone = guard.coordinate is not None and guard.coordinate == other.coordinate
-            slack = 0.0 if alone else 16 * eps * other.scale
-            aimed = aimed & ((other.end.x <= slack) | ~beyond(other))
+        if other.name == name:
+            continue
+        # What lies beyond another event was not reached. Events may come together, but for the
+        # stops of one coordinate: then one is met after the other.
+        alone = guard.coordinate is not None and guard.coordinate == other.coordinate
+        if alone or not other.lingers:
+            aimed = aimed & ~beyond(other)
+        else:
+            aimed = aimed & ((other.end.x <= 16 * eps * other.scale) | ~beyond(other))
     offset, square = landing(end)
     size = stop_gradient(jnp.abs(offset))
     # Two ways of being there to rounding: in place along the path, or, near grazing, in position.
@@ -309,7 +319,9 @@ def _seen(
     landed = pin_flag(aimed & close & real, h)
     again = aimed & ~close & real & (size < 0.25 * h)
     again = again | ends & there & (end.v > 0)
-    return Crossing(name, guard.kind, guard.number, begin, end, offset, landed, again)
+    return Crossing(
+        name, guard.kind, guard.number, guard.lingers, begin, end, offset, landed, again
+    )
 
 
 def _leniency(lane: Lane) -> Scalar:
