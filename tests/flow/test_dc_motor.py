@@ -11,7 +11,7 @@ import vi_jax as vi
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from differences import check_derivatives
+from differences import check_derivatives, each_mode
 
 NUMBERS = {
     "strength": 0.65, "control": 0.9, "coupling": 0.0093, "slider_inertia": 0.0053,
@@ -226,7 +226,8 @@ def test_energy_is_accounted_for(clock):
     assert float(balance - change) == pytest.approx(0.0, abs=1e-10)
 
 
-def test_derivatives_beside_differences():
+@each_mode
+def test_derivatives_beside_differences(mode):
     """By an electrical, a mechanical and a starting number at once."""
 
     def last(values, **options):
@@ -237,7 +238,7 @@ def test_derivatives_beside_differences():
         )  # fmt: skip
         return run.last, run.impacts
 
-    check_derivatives(last, [0.4, 0.9, 0.1], tolerance=1e-7, impacts=2, max_steps=200)
+    check_derivatives(mode, last, [0.4, 0.9, 0.1], tolerance=1e-7, impacts=2, max_steps=200)
 
 
 def test_a_stall_points_to_the_time_clock():

@@ -119,7 +119,7 @@ def test_a_motion_through_rest_forgets_its_start():
     assert float(orbit.state.Y) == GAP and float(orbit.state.V) == 0.0
 
 
-@pytest.mark.parametrize("adjoint", ["forward", "reverse"])
+@pytest.mark.parametrize("adjoint", ["forward", pytest.param("reverse", marks=pytest.mark.slow)])
 def test_derivatives_pass_through_rest(adjoint):
     def lowest(zeta):
         body = scene(zeta)

@@ -110,3 +110,21 @@ def test_second_derivatives_pass_through_impacts(method, cycles):
     # The difference's own truncation is h²/6 times the third derivative.
     scale = float(jnp.abs(bend).max())
     np.testing.assert_allclose(bend, jnp.stack(difference, -1), atol=1e-7 * (1 + scale))
+
+
+def test_a_gradient_by_columns_is_the_forward_one():
+    """Of a function of two numbers, also under `vmap` and of second order."""
+
+    @vi.by_columns
+    def lowest(numbers):
+        scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=numbers[0], gap=numbers[1])
+        run = vi.simulate(scene, scene.start(), 6, method=vi.ExactFlight(), record="sections")
+        return run.last.Y * run.last.V
+
+    at = jnp.asarray([[0.5, 1.0], [0.7, 1.3]])
+    gradient = jax.jit(jax.vmap(jax.grad(lowest)))(at)
+    forward = jax.jit(jax.vmap(jax.jacfwd(lowest)))(at)
+    np.testing.assert_allclose(gradient, forward, rtol=1e-12)
+    h = 1e-6 * jnp.eye(2)
+    slope = [(lowest(at[0] + e) - lowest(at[0] - e)) / 2e-6 for e in h]
+    np.testing.assert_allclose(gradient[0], slope, rtol=1e-6, atol=1e-7)

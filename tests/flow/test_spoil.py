@@ -38,6 +38,7 @@ def test_forward_derivatives_of_a_failed_lane_are_nan_and_its_numbers_stay():
     assert np.isfinite(plain[0][0, 0]) and np.isnan(plain[0][0, -1])
 
 
+@pytest.mark.slow
 def test_gradients_of_a_failed_lane_are_nan_unless_it_is_left_out():
     def last(gap, k):
         run_ = run(gap, k, "reverse")

@@ -9,7 +9,7 @@ import pytest
 import vi_jax as vi
 from scipy.integrate import solve_ivp
 
-from differences import check_derivatives
+from differences import check_derivatives, each_mode
 
 CAPSULE = vi.machines.Capsule
 CLOSE = vi.Adaptive(rtol=1e-12)
@@ -191,7 +191,8 @@ def test_how_far_it_goes():
     np.testing.assert_allclose(np.diff(run.sections.progress[-10:]), 0, atol=1e-9)
 
 
-def test_derivatives_of_a_capsule():
+@each_mode
+def test_derivatives_of_a_capsule(mode):
     """Through impacts, through sticking and through the change of what is told as progress."""
     numbers, starts = drawn(100)
     numbers, start = jnp.asarray(numbers[:, 3]), jnp.asarray(starts[:, 3])
@@ -202,7 +203,7 @@ def test_derivatives_of_a_capsule():
         run = lane(numbers + h[0] * along, start, 1, method=method, **options)
         return run.last, run.impacts
 
-    check_derivatives(last, [0.0], step=1e-6, tolerance=2e-6, impacts=0, max_steps=200)
+    check_derivatives(mode, last, [0.0], step=1e-6, tolerance=2e-6, impacts=0, max_steps=200)
 
 
 @pytest.mark.parametrize(

@@ -271,7 +271,9 @@ def quietly(call):
         return call()
 
 
-@pytest.mark.parametrize("kind", [dict, Named, Plain])
+@pytest.mark.parametrize(
+    "kind", [dict, *(pytest.param(kind, marks=pytest.mark.slow) for kind in (Named, Plain))]
+)
 def test_a_state_of_any_kind(kind):
     machine, plain = Own(kind), Own(Plain)
     run = vi.simulate(machine, machine.start(), 5, samples=8)

@@ -11,7 +11,7 @@ import pytest
 import vi_jax as vi
 from scipy.integrate import solve_ivp
 
-from differences import check_derivatives
+from differences import check_derivatives, each_mode
 
 matplotlib.use("Agg")
 
@@ -110,6 +110,7 @@ def test_the_broken_symmetry_is_switched_onto(symmetric, restitution):
         np.testing.assert_allclose(whole.impact_speed, 1.87073, atol=6e-6)
 
 
+@pytest.mark.slow
 def test_a_duffing_oscillator_grazes_where_the_linear_one_reaches_its_stop():
     classic = DUFFING(amplitude=0.05, two_sided=False)
     rest = vi.find_orbit(classic, classic.start(), throw=True)
@@ -250,8 +251,9 @@ def test_energy_books_of_a_driven_box():
     assert float(run.impact_energy.sum()) > 0.1
 
 
+@each_mode
 @pytest.mark.parametrize("name", MACHINES)
-def test_derivatives_of_a_machine(name):
+def test_derivatives_of_a_machine(name, mode):
     machine = MACHINES[name]
     parameter = {"ball": "acceleration", "pair": "half_gap", "free pair": "mass_ratio"}.get(
         name, "cubic"
@@ -262,7 +264,7 @@ def test_derivatives_of_a_machine(name):
         run = vi.simulate(changed, starts_of(machine)[0], 1, method="reference", **options)
         return run.last, run.impacts
 
-    check_derivatives(last, [float(getattr(machine, parameter))], impacts=0)
+    check_derivatives(mode, last, [float(getattr(machine, parameter))], impacts=0)
 
 
 @pytest.mark.parametrize("name", MACHINES)

@@ -9,6 +9,8 @@ import vi_jax as vi
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
+from differences import check_derivatives, each_mode
+
 VALVE = vi.machines.ReliefValve
 CLOSE = vi.Adaptive(rtol=1e-12)
 
@@ -138,20 +140,16 @@ def test_a_valve_observed_at_equal_times():
         vi.machines.Duffing().observed_every(1.0)
 
 
-def test_derivatives_of_returns():
+@each_mode
+def test_derivatives_of_returns(mode):
     """Of state, count of returns being fixed: dt*/dq is in them."""
 
     def last(q, **options):
-        valve = eqx.tree_at(lambda m: m.flow_rate, VALVE(), q)
+        valve = eqx.tree_at(lambda m: m.flow_rate, VALVE(), q[0])
         run = vi.simulate(valve, valve.start(), 2, method=vi.FixedStep(), **options)
-        return jnp.stack([run.last.lift, run.last.pressure, run.duration.sum()])
+        return (run.last.lift, run.last.pressure, run.duration.sum()), run.impacts
 
-    h, q, simulated = 1e-6, 4.0, vi.jit(last)
-    slope = (simulated(q + h) - simulated(q - h)) / (2 * h)
-    _, forward = vi.jit(lambda q: jax.jvp(last, (q,), (1.0,)))(q)
-    np.testing.assert_allclose(forward, slope, rtol=1e-6, atol=1e-6)
-    backward = vi.jit(jax.grad(lambda q: last(q, adjoint="reverse", max_steps=200)[2]))(q)
-    np.testing.assert_allclose(backward, forward[2], rtol=1e-9, atol=1e-9)
+    check_derivatives(mode, last, [4.0], step=1e-6, impacts=0, max_steps=200)
 
 
 def test_wrong_numbers_are_named():

@@ -10,7 +10,7 @@ import pytest
 import vi_jax as vi
 from scipy.integrate import solve_ivp
 
-from differences import check_derivatives
+from differences import check_derivatives, each_mode
 
 ROTOR = vi.machines.UnbalancedRotor
 METHOD = vi.Adaptive(rtol=1e-12)
@@ -174,7 +174,8 @@ def test_an_elastic_impact_keeps_all():
     np.testing.assert_allclose(energy, energy[0], rtol=1e-10)
 
 
-def test_derivatives_beside_differences():
+@each_mode
+def test_derivatives_beside_differences(mode):
     def last(values, **options):
         rotor = ROTOR(coupling=values[0], control=values[1], gap=1.4, damping_ratio=values[2])
         run = vi.simulate(
@@ -183,7 +184,7 @@ def test_derivatives_beside_differences():
         )  # fmt: skip
         return run.last, run.impacts
 
-    check_derivatives(last, [0.1, 1.1, 0.05], tolerance=1e-7, impacts=1, max_steps=150)
+    check_derivatives(mode, last, [0.1, 1.1, 0.05], tolerance=1e-7, impacts=1, max_steps=150)
 
 
 def test_a_start_from_rest_and_a_stall():

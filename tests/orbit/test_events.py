@@ -80,7 +80,14 @@ CASES = {
 }
 
 
-@pytest.fixture(scope="module", params=list(CASES))
+# The slowest to compile.
+_LONG = {"capsule", "soft stop"}
+
+
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(x, marks=[pytest.mark.slow] * (x in _LONG)) for x in CASES],
+)
 def followed(request):
     """The case and its branch."""
     machine, settle, cycles, name, bounds, value = CASES[request.param]
@@ -149,6 +156,7 @@ def valve_return(state: np.ndarray, flow_rate: float) -> tuple[np.ndarray, float
         y[0], y[1] = 0.0, -0.8 * y[1]
 
 
+@pytest.mark.slow
 def test_the_valve_from_rest_to_chatter():
     """A Hopf bifurcation, a grazing and a period doubling in a row."""
     machine = vi.machines.ReliefValve(flow_rate=8.3)

@@ -8,7 +8,7 @@ import pytest
 import vi_jax as vi
 from scipy.integrate import solve_ivp
 
-from differences import check_derivatives
+from differences import check_derivatives, each_mode
 
 CLOSE = vi.Adaptive(rtol=1e-12)
 
@@ -228,7 +228,8 @@ def test_a_body_on_a_belt(method):
     np.testing.assert_allclose(run.sections.V[1:], v, atol=1e-14)
 
 
-def test_derivatives_through_sticking():
+@each_mode
+def test_derivatives_through_sticking(mode):
     numbers, starts = drawn(40)
 
     def last(x, **options):
@@ -236,7 +237,7 @@ def test_derivatives_through_sticking():
         return run.last, run.impacts
 
     at = [*numbers[:, 0], starts[0]]
-    check_derivatives(last, at, step=1e-6, impacts=0, max_steps=600)
+    check_derivatives(mode, last, at, step=1e-6, impacts=0, max_steps=600)
 
 
 @pytest.mark.parametrize(

@@ -14,5 +14,6 @@ from .results import Samples as Samples
 from .simulate import simulate as simulate
 from .suggest import Suggestion as Suggestion
 from .suggest import suggest_method as suggest_method
+from .tangent import by_columns as by_columns
 from .taylor import Taylor as Taylor
 from .unrolled import Unrolled as Unrolled

@@ -12,11 +12,10 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from .._checks import count
-from ..flow import AbstractMethod, Adaptive, simulate
+from ..flow import AbstractMethod, Adaptive, by_columns, simulate
 from ..flow.arguments import as_floats
 from ..flow.choice import MethodLike, chosen
 from ..scene import AbstractScene, Scene
-from .tangent import by_columns
 
 
 class CycleMap(eqx.Module):

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from .._checks import concrete, count, flag
 from .._programs import compiled
-from ..flow import Run, simulate
+from ..flow import Run, by_columns, simulate
 from ..flow.choice import MethodLike
 from ..scene import AbstractScene, Scene
 from .cycle_map import CycleMap, adopted, cycle_map
@@ -22,7 +22,6 @@ from .floquet import multipliers_of
 from .results import ORBIT_RESULTS, Orbit, trimmed
 from .root import root_of, shooting_matrix
 from .search import AbstractSearch, Newton
-from .tangent import by_columns
 
 # Places in a cycle at which an orbit can be searched.
 _PLACES = 8

@@ -55,11 +55,11 @@ def draw_sketch() -> Figure:
 
 def _drive(pen: Pen, a: float, pin: tuple[float, float], slider: float, phi: float) -> None:
     """The motor's disc, the lever and their names."""
-    pen.disc(0, 0, a)
-    pen.line((0, 0), pin)
-    pen.line(pin, (slider, 0), lw=3)
+    pen.disc(0.0, 0.0, a)
+    pen.line((0.0, 0.0), pin)
+    pen.line(pin, (slider, 0.0), lw=3)
     pen.pin(*pin)
-    pen.line((0, 0), (1.3, 0), color="0.5", lw=0.8, ls=":")
+    pen.line((0.0, 0.0), (1.3, 0.0), color="0.5", lw=0.8, ls=":")
     turn = np.linspace(0, phi, 40)
     pen.line(*zip(0.45 * np.cos(turn), 0.45 * np.sin(turn), strict=True), lw=1.0)
     pen.label(0.62, 0.25, "$\\varphi$")
