@@ -18,8 +18,9 @@ from .program import Program, spread
 from .vector import Unsupported
 
 FORWARD_ONLY = (
-    "This loop is differentiated forward only (`jax.jvp`, `jax.jacfwd`). Where there is an "
-    'argument `adjoint`, ask for `adjoint="reverse"`.'
+    "This loop is differentiated forward only (`jax.jvp`, `jax.jacfwd`). For `jax.grad` by a few "
+    "numbers decorate the function with `vi_jax.by_columns`; by many, where there is an argument "
+    '`adjoint`, ask for `adjoint="reverse"`.'
 )
 
 lanes_p = Primitive("lanes")
