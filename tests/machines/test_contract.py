@@ -302,6 +302,10 @@ def test_a_state_of_any_kind(kind):
                           settle=20)
     )  # fmt: skip
     assert found.data.sizes == {"start.y": 3, "start.v": 3}
+    orbit = vi.find_orbit(machine, vi.simulate(machine, machine.start(), 1, settle=200).last)
+    assert "y = -0.25498230" in str(orbit) and "position in [-1.8579" in str(orbit)
+    both = jax.tree.map(lambda x: jnp.stack([x, x]), orbit)
+    assert "v = -0.221262" in str(vi.distinct_orbits(both)[0])
 
 
 def test_single_precision():

@@ -17,6 +17,7 @@ from ..plot import save_picture
 from ..scan import Sweep
 from ..scan.regime import REGIMES
 from ..scan.store import NOT_COMPUTED
+from ..scene.numbers import by_name
 
 
 def failures(codes: np.ndarray, *, what: str = "motions") -> tuple[list[str], bool]:
@@ -80,7 +81,7 @@ def sample_columns(samples: Any) -> dict[str, np.ndarray]:
     return {
         "cycles": np.asarray(samples.cycles),
         "time": np.asarray(samples.time),
-        **{name: np.asarray(x) for name, x in vars(samples.state).items()},
+        **{name: np.asarray(x) for name, x in by_name(samples.state).items()},
     }
 
 
@@ -89,7 +90,7 @@ def cycle_columns(run: Any) -> dict[str, np.ndarray]:
     names = ("y_min", "y_max", "impacts", "impact_speed", "frequency_ratio")
     return {
         "cycle": np.arange(1, run.impacts.size + 1),
-        **{name: np.asarray(x)[1:] for name, x in vars(run.sections).items()},
+        **{name: np.asarray(x)[1:] for name, x in by_name(run.sections).items()},
         **{name: np.asarray(getattr(run, name)) for name in names},
     }
 

@@ -5,7 +5,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .._checks import given_number
-from .results import Orbit, impacts_in_words, trimmed
+from .results import Orbit, impacts_in_words, span_in_words, state_in_words, trimmed
 
 
 class Orbits(list[Orbit]):
@@ -24,8 +24,7 @@ def _in_words(orbit: Orbit) -> str:
     cycles = int(orbit.cycles)
     period = orbit.scene.period_of(cycles)
     stable = "stable" if bool(orbit.stable) else "unstable"
-    where = ", ".join(f"{name} = {float(x):.6g}" for name, x in vars(orbit.state).items())
-    span = f"Y in [{float(orbit.y_min):.6g}, {float(orbit.y_max):.6g}]"
+    where, span = state_in_words(orbit.state, 6), span_in_words(orbit, 6)
     size = f"greatest multiplier {np.abs(orbit.multipliers).max():.6g}"
     return f"  {period}, {impacts_in_words(int(orbit.impacts))}, {stable}: {where}; {span}; {size}"
 

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from ..flow import AbstractMethod, Run, simulate
 from ..scene import AbstractScene
+from ..scene.numbers import by_name
 from .floquet import STABILITY, stability_of
 
 
@@ -162,12 +163,11 @@ class Orbit(eqx.Module):
             reason = ORBIT_RESULTS[self.result]
             return f"No orbit: {reason} Residual {float(self.residual):.3g}."
         count, cycles = int(self.impacts), int(self.cycles)
-        where = ", ".join(f"{name} = {float(x):.9g}" for name, x in vars(self.state).items())
         period = self.scene.period_of(cycles)
         lines = [
             f"Orbit of period {period} with {impacts_in_words(count)}, {STABILITY[self.stability]}",
-            f"  section: {where}",
-            f"  Y in [{float(self.y_min):.9g}, {float(self.y_max):.9g}]",
+            f"  section: {state_in_words(self.state, 9)}",
+            f"  {span_in_words(self, 9)}",
         ]
         for phase, speed, stop in zip(
             self.impact_phase, self.impact_speed, self.impact_stop, strict=True
@@ -189,6 +189,24 @@ class Orbit(eqx.Module):
         )
         reason = ORBIT_RESULTS[self.result]
         return "\n".join([*lines, f"  note: {reason}"] if reason else lines)
+
+
+def state_in_words(state: Any, digits: int) -> str:
+    """The components of a state of any kind."""
+    parts = by_name(state).items()
+    return ", ".join(f"{name} = {_plain(x):.{digits}g}" for name, x in parts)
+
+
+def span_in_words(orbit: Orbit, digits: int) -> str:
+    """The interval of the first coordinate, by the name that pictures give it."""
+    name = orbit.scene.labels[0].split(" ")[0]
+    low, high = (f"{_plain(x):.{digits}g}" for x in (orbit.y_min, orbit.y_max))
+    return f"{name} in [{low}, {high}]"
+
+
+def _plain(x: Any) -> float:
+    """A number for print, where zero has no sign."""
+    return float(x) + 0.0
 
 
 def _complex(z: complex) -> str:

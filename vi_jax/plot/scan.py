@@ -1,10 +1,10 @@
 """Pictures of grids: maps of the regimes of motion, and basins of attraction."""
 
-import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
@@ -17,6 +17,7 @@ from ..scan import REGIMES, Basins
 from ..scan.regime import LABELS
 from ..scan.store import NOT_COMPUTED
 from ..scene import AbstractScene, Scene
+from ..scene.numbers import by_name
 from . import colors as look
 from .branch import axis_name
 from .colors import IRREGULAR, PERIODS, color_of, shades
@@ -176,8 +177,9 @@ def _start_name(scene: AbstractScene | None, name: str) -> str:
     except ValueError:  # a scene that has no start of its own
         start = None
     if scene is not None and start is not None:
-        values = {key: float(i) + 2.5 for i, key in enumerate(vars(start))}
-        probe = dataclasses.replace(start, **{k: jnp.asarray(v) for k, v in values.items()})
+        values = {key: float(i) + 2.5 for i, key in enumerate(by_name(start))}
+        leaves = [jnp.asarray(value) for value in values.values()]
+        probe = jtu.tree_unflatten(jtu.tree_structure(start), leaves)
         for read, words in zip((scene.position, scene.velocity), scene.labels, strict=True):
             if float(read(probe)) == values[name]:
                 return f"{words} at the start"
