@@ -1,0 +1,71 @@
+"""Ten thousand random machines of each kind: all end, none passes its stop, gains at a contact or
+fails without a reason."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+
+LANES, CYCLES = 10_000, 12
+M = vi.machines
+
+# Ranges of the numbers drawn, and of the start's. A rotor of more coupling often stalls.
+KINDS = {
+    "ball": (M.BouncingBall(), {"acceleration": (0.1, 5.0), "restitution": (0.0, 1.0)},
+             {"height": (0.0, 5.0), "speed": (-3.0, 3.0)}),
+    "pair": (M.ImpactPair(), {"half_gap": (0.2, 6.0), "restitution": (0.0, 1.0)},
+             {"place": (-0.2, 0.2), "speed": (-3.0, 3.0)}),
+    "free pair": (M.ImpactPair(mass_ratio=0.2),
+                  {"half_gap": (0.2, 6.0), "restitution": (0.0, 1.0), "mass_ratio": (0.01, 2.0),
+                   "damping_ratio": (0.0, 0.5), "force": (0.0, 2.0), "frequency": (0.3, 3.0)},
+                  {"place": (-0.2, 0.2), "speed": (-3.0, 3.0)}),
+    "duffing": (M.Duffing(), {"cubic": (0.0, 3.0), "amplitude": (0.0, 3.0), "gap": (0.1, 2.0),
+                              "restitution": (0.0, 1.0), "damping": (0.0, 0.5)},
+                {"Y": (-0.1, 0.1), "V": (-3.0, 3.0)}),
+    "valve": (M.ReliefValve(), {"flow_rate": (0.2, 8.0), "restitution": (0.0, 1.0),
+                                "damping": (0.5, 3.0)},
+              {"lift": (0.0, 3.0), "speed": (-2.0, 2.0), "pressure": (5.0, 20.0)}),
+    "capsule": (M.Capsule(), {"amplitude": (0.0, 4.0), "frequency": (0.3, 3.0), "gap": (0.0, 1.0),
+                              "mass_ratio": (0.5, 10.0), "restitution": (0.0, 1.0),
+                              "friction": (0.0, 4.0), "static_ratio": (1.0, 2.0)},
+                {"place": (-1.0, 0.0), "speed": (-2.0, 2.0)}),
+    "rotor": (M.UnbalancedRotor(gap=1.0), {"strength": (0.05, 3.0), "control": (0.3, 3.0),
+                                           "coupling": (0.0, 0.2), "damping_ratio": (0.0, 0.5),
+                                           "gap": (0.2, 3.0), "restitution": (0.0, 1.0)},
+              {"Y": (-0.2, 0.2), "V": (-2.0, 2.0)}),
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", KINDS)
+def test_a_crowd(name):
+    machine, numbers, begin = KINDS[name]
+    rng = np.random.default_rng(sum(map(ord, name)))
+    drawn = {key: jnp.asarray(rng.uniform(*ends, LANES)) for key, ends in numbers.items()}
+    starts = {key: jnp.asarray(rng.uniform(*ends, LANES)) for key, ends in begin.items()}
+
+    def one(drawn, starts):
+        def where(m):
+            return [getattr(m, key) for key in drawn]
+
+        scene = eqx.tree_at(where, machine, list(drawn.values()))
+        run = vi.simulate(scene, scene.start(**starts), CYCLES)
+        stops = [stop for stop in scene.stops if stop.coordinate == 0]
+        depth = [
+            jnp.where(stop.sign > 0, run.y_max - stop.gap, -run.y_min - stop.gap).max()
+            for stop in stops
+        ]
+        return run, jnp.stack(depth).max(), 1 + jnp.stack([abs(stop.gap) for stop in stops]).max()
+
+    run, depth, size = vi.jit(jax.vmap(one))(drawn, starts)
+    good = np.asarray(run.successful)
+    assert good.mean() > 0.95, np.unique(np.asarray(run.result._value), return_counts=True)
+    for leaf in jax.tree.leaves((run.sections, run.y_max, run.y_min, run.impact_energy)):
+        assert np.isfinite(np.asarray(leaf)[good]).all()
+    assert (np.asarray(depth / size)[good] < 1e-12).all()
+    assert (np.asarray(run.impact_energy)[good] >= 0).all()
+    assert int(np.asarray(run.impacts)[good].sum()) > LANES
+    # Each that failed has its reason, and what came before it.
+    assert (np.asarray(run.result._value)[~good] > 0).all()
