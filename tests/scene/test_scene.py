@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pint
 import pytest
 import vi_jax as vi
 
@@ -102,3 +103,23 @@ def test_every_number_is_a_leaf():
     assert len(jax.tree.leaves(vi.Scene.ideal(frequency_ratio=0.9))) == 4
     assert len(jax.tree.leaves(vi.Parameters().scene(crank="slider"))) == 9
     assert len(jax.tree.leaves(vi.Parameters())) == 11
+
+
+def test_parameters_take_quantities_with_units():
+    unit = pint.UnitRegistry()
+    given = vi.Parameters(
+        body_mass=350 * unit.gram,
+        gap=8 * unit.cm,
+        torque=np.array([1.0, 2.0]) * unit("kN*cm"),
+        no_load_speed=60 * unit.rpm,
+        restitution=0.5 * unit.dimensionless,
+    )
+    plain = vi.Parameters(
+        body_mass=0.35, gap=0.08, torque=np.array([10.0, 20.0]), no_load_speed=2 * np.pi
+    )
+    for a, b in zip(jax.tree.leaves(given), jax.tree.leaves(plain), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-14)
+    with pytest.raises(ValueError, match=r"`gap` must be in m, .* but got 8 gram"):
+        vi.Parameters(gap=8 * unit.gram)
+    with pytest.raises(ValueError, match="`restitution` must be in no unit"):
+        vi.Parameters(restitution=0.5 * unit.m)

@@ -30,49 +30,63 @@ from .stop import RigidStop
 Number = Float[Array, "..."] | float
 
 
-def _si(name: str, default: float) -> Any:
-    return eqx.field(default=default, converter=real(name), kw_only=True)
+def _si(name: str, unit: str, default: float | None) -> Any:
+    """A number in this unit, or a quantity of `pint` that can be given in it."""
+    convert = real(name) if default is not None else optional_real(name)
+    return eqx.field(
+        default=default, converter=lambda x: convert(_magnitude(name, unit, x)), kw_only=True
+    )
+
+
+def _magnitude(name: str, unit: str, value: Any) -> Any:
+    if not (hasattr(value, "magnitude") and hasattr(value, "to")):
+        return value
+    try:
+        return value.to(unit).magnitude
+    except Exception as error:  # of a kind that only its library knows
+        raise ValueError(
+            f"Argument `{name}` must be in {unit or 'no unit'}, or in one that can be converted, "
+            f"but got {value}."
+        ) from error
 
 
 class Parameters(eqx.Module):
     """The machine in SI units; the defaults are Table 1 of the paper (T0 = 10 N·m, κ = 0.9).
+
+    Each number may be a quantity of `pint`, in any unit of its kind.
 
     The dimensionless groups, with ω = √(k0/m_C): ξ = c/(2 m_C ω), d = Δ/a, μ = m_B a²/J,
     ε = m_C a²/J, τ0 = T0/(J ω²), w0 = Ω0/ω, λ = a/l, and with `electrical_time`
     τe = ωL/R. A motor of the constants K_t and K_e at the voltage u has κT0 = K_t u/R, κΩ0 = u/K_e.
     """
 
-    body_mass: Number = _si("body_mass", 0.35)
+    body_mass: Number = _si("body_mass", "kg", 0.35)
     """m_C, mass of the impacting body, kg."""
-    slider_mass: Number = _si("slider_mass", 0.2)
+    slider_mass: Number = _si("slider_mass", "kg", 0.2)
     """m_B, mass of the slider, kg."""
-    stiffness: Number = _si("stiffness", 9 * pi**2)
+    stiffness: Number = _si("stiffness", "N/m", 9 * pi**2)
     """k0, stiffness of the spring, N/m."""
-    damping: Number = _si("damping", 0.5)
+    damping: Number = _si("damping", "N*s/m", 0.5)
     """c, viscous damping of the body, N·s/m."""
-    crank_radius: Number = _si("crank_radius", 0.04)
+    crank_radius: Number = _si("crank_radius", "m", 0.04)
     """a, crank radius and unit of length, m."""
-    rod_length: Number = _si("rod_length", 0.12)
+    rod_length: Number = _si("rod_length", "m", 0.12)
     """l, length of the rod, m (exact kinematics only)."""
-    inertia: Number = _si("inertia", 0.06)
+    inertia: Number = _si("inertia", "kg*m**2", 0.06)
     """J, moment of inertia of the disc, kg·m²."""
-    restitution: Number = _si("restitution", 0.5)
+    restitution: Number = _si("restitution", "", 0.5)
     """k, coefficient of restitution, dimensionless."""
-    gap: Number = _si("gap", 0.08)
+    gap: Number = _si("gap", "m", 0.08)
     """Δ, distance of the stop from the unstretched position, m."""
-    torque: Number = _si("torque", 10.0)
+    torque: Number = _si("torque", "N*m", 10.0)
     """T0, stall torque of the motor at κ = 1, N·m."""
-    control: Number = _si("control", 0.9)
+    control: Number = _si("control", "", 0.9)
     """κ, motor control, dimensionless; the frequency ratio ζ of an ideal drive."""
-    no_load_speed: Number | None = eqx.field(
-        default=None, converter=optional_real("no_load_speed"), kw_only=True
-    )
+    no_load_speed: Number | None = _si("no_load_speed", "rad/s", None)
     """Ω0, no-load speed of the motor at κ = 1, rad/s. `None` means ω, which makes the tabulated
     κ = 0.5…1.9 the tabulated range of ζ; the paper does not give Ω0."""
 
-    electrical_time: Number | None = eqx.field(
-        default=None, converter=optional_real("electrical_time"), kw_only=True
-    )
+    electrical_time: Number | None = _si("electrical_time", "s", None)
     """L/R, the armature's inductance over its resistance, s. `None` leaves the armature out."""
 
     ranges: ClassVar = {
