@@ -51,6 +51,12 @@ def test_orbits_are_told_in_words():
     more = dataclasses.replace(orbit, impacts=jnp.asarray(38))
     assert "  only 1 of 38 impacts are listed: see `impact_log`" in str(more)
     batch = jax.tree.map(lambda x: jnp.stack([x, x]), orbit)
+    data = batch.to_xarray()
+    assert data["result"].values.tolist() == ["converged"] * 2
+    assert data["stability"].values.tolist() == ["period_doubling"] * 2
+    assert data["section_Y"].dims == ("lane", "section")
+    np.testing.assert_array_equal(data["multipliers"][0], orbit.multipliers)
+    assert orbit.to_xarray()["impact_speed"].shape == (1,)
     orbits, counts = vi.distinct_orbits(batch)
     assert isinstance(orbits, list) and counts.tolist() == [2]
     assert str(orbits).splitlines() == [

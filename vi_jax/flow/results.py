@@ -1,5 +1,6 @@
 """Why a simulation ended, and what it returns."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -10,6 +11,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from ..scene.numbers import by_name
+from .labelled import in_names, run_dataset
 
 
 class RESULTS(eqx.Enumeration):
@@ -168,6 +170,19 @@ class Run(eqx.Module):
     def last(self) -> Any:
         """The state on the last section: a start to go on from, or a guess for `find_orbit`."""
         return jtu.tree_map(lambda x: x[..., -1], self.sections)
+
+    def to_xarray(self, dims: Sequence[str] | None = None) -> Any:
+        """This run as an `xarray.Dataset`, labelled by cycle, section and sample.
+
+        States become a variable for each component: `section_Y` (cycles + 1), `sample_Y`; the
+        impact log `log_phase`, `log_speed` and `log_stop`; all else keeps its name, and `result`
+        is the reason's. Host-side: not to be traced.
+
+        **Arguments:** names of the batch axes of a run under `vmap`; by default `lane`.
+
+        **Raises:** `ValueError` if these are not as many as there are batch axes.
+        """
+        return run_dataset(self, dims, in_names(self.result, RESULTS, REASON_NAMES))
 
     def __str__(self) -> str:
         if isinstance(self.steps, Tracer):

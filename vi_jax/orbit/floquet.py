@@ -15,6 +15,9 @@ class STABILITY(eqx.Enumeration):
     unknown = "unknown: no orbit was found"
 
 
+STABILITY_NAMES = ("stable", "fold", "period_doubling", "neimark_sacker", "unknown")
+
+
 def multipliers_of(monodromy: Float[Array, "n n"]) -> Complex[Array, " n"]:
     """Eigenvalues of a monodromy matrix, the largest modulus first; NaN if it is not finite."""
     finite = jnp.all(jnp.isfinite(monodromy))

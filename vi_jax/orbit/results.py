@@ -1,6 +1,7 @@
 """Periodic motions as data, and why a search for one ended."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -12,9 +13,10 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from ..flow import AbstractMethod, Run, simulate
+from ..flow.labelled import batch_names, in_names, present, states
 from ..scene import AbstractScene
 from ..scene.numbers import by_name
-from .floquet import STABILITY, stability_of
+from .floquet import STABILITY, STABILITY_NAMES, stability_of
 
 
 def impacts_in_words(count: int) -> str:
@@ -34,6 +36,11 @@ class ORBIT_RESULTS(eqx.Enumeration):
         "derivative."
     )
     not_simulated = "The guess cannot be simulated: see `simulate(...).result` for the reason."
+
+
+_RESULT_NAMES = (
+    "converged", "smaller_period", "inadmissible", "no_orbit", "grazing", "not_simulated",
+)  # fmt: skip
 
 
 class Orbit(eqx.Module):
@@ -103,10 +110,13 @@ class Orbit(eqx.Module):
     @property
     def stability(self) -> STABILITY:
         """Stable, or how stability was lost: fold, period doubling or Neimark–Sacker."""
-        verdict = stability_of
+
+        def verdict(successful, multipliers):
+            return STABILITY.where(successful, stability_of(multipliers), STABILITY.unknown)
+
         for _ in range(self.multipliers.ndim - 1):
             verdict = jax.vmap(verdict)
-        return STABILITY.where(self.successful, verdict(self.multipliers), STABILITY.unknown)
+        return verdict(self.successful, self.multipliers)
 
     @property
     def slowest_impact(self) -> Float[Array, "..."]:
@@ -149,6 +159,33 @@ class Orbit(eqx.Module):
             scene, self.state, cycles, method=self.method, samples=samples,
             impact_log=impact_log,
         )  # fmt: skip
+
+    def to_xarray(self, dims: Sequence[str] | None = None) -> Any:
+        """This orbit, or a batch of them, as an `xarray.Dataset`.
+
+        Section states become a variable for each component (`section_Y`), multipliers complex
+        ones; `result` and `stability` are words. Host-side: not to be traced.
+
+        **Arguments:** names of the batch axes; by default `lane`.
+
+        **Raises:** `ValueError` if these are not as many as there are batch axes.
+        """
+        import xarray as xr  # slow to load
+
+        batch = batch_names(dims, self.residual.ndim)
+        alone = ("cycles", "duration", "frequency_ratio", "impacts", "y_min", "y_max", "clearance",
+                 "residual", "error", "iterations")  # fmt: skip
+        each = ("impact_phase", "impact_speed", "impact_stop")
+        variables = states("section", self.sections, (*batch, "section"))
+        variables |= present({name: getattr(self, name) for name in alone}, batch)
+        variables |= present({name: getattr(self, name) for name in each}, (*batch, "impact"))
+        variables |= present({"multipliers": self.multipliers}, (*batch, "multiplier"))
+        variables |= present({"monodromy": self.monodromy}, (*batch, "row", "column"))
+        words = {
+            "result": in_names(self.result, ORBIT_RESULTS, _RESULT_NAMES),
+            "stability": in_names(self.stability, STABILITY, STABILITY_NAMES),
+        }
+        return xr.Dataset(variables | present(words, batch))
 
     def __str__(self) -> str:
         if isinstance(self.residual, Tracer):

@@ -1,0 +1,69 @@
+"""Results as labelled data sets, for what reads xarray: ArviZ, hvPlot, NetCDF, Zarr."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ..scene.numbers import by_name
+
+Variables = dict[str, tuple[tuple[str, ...], np.ndarray]]
+
+
+def batch_names(dims: Sequence[str] | None, number: int) -> tuple[str, ...]:
+    """Names of the batch axes. **Raises:** `ValueError` if others are given than there are."""
+    if dims is None:
+        return ("lane",) if number == 1 else tuple(f"lane_{i}" for i in range(number))
+    if isinstance(dims, str) or len(dims) != number:
+        raise ValueError(
+            f"Argument `dims` must name the {number} batch axes of this result, but got {dims!r}."
+        )
+    return tuple(dims)
+
+
+def states(prefix: str, state: Any, dims: tuple[str, ...]) -> Variables:
+    """The components of a state, each a variable."""
+    return {f"{prefix}_{name}": (dims, np.asarray(x)) for name, x in by_name(state).items()}
+
+
+def present(values: Mapping[str, Any], dims: tuple[str, ...]) -> Variables:
+    """Those that are there."""
+    return {name: (dims, np.asarray(x)) for name, x in values.items() if x is not None}
+
+
+def in_names(item: Any, kind: Any, names: Sequence[str]) -> np.ndarray:
+    """Of items of an enumeration their names, one for each lane."""
+    chosen = np.stack([np.asarray(item == getattr(kind, name)) for name in names])
+    return np.asarray(np.asarray(names)[np.argmax(chosen, axis=0)])
+
+
+def run_dataset(run: Any, dims: Sequence[str] | None, result: np.ndarray) -> Any:
+    """A run as a data set (see `Run.to_xarray`)."""
+    import xarray as xr  # slow to load
+
+    batch = batch_names(dims, run.steps.ndim)
+    cycle, section = (*batch, "cycle"), (*batch, "section")
+    names = ("y_max", "y_min", "impacts", "impact_speed", "rests", "impact_energy", "clearance",
+             "duration", "frequency_ratio")  # fmt: skip
+    variables = states("section", run.sections, section)
+    variables |= present({name: getattr(run, name) for name in names}, cycle)
+    count = run.impacts.shape[-1]
+    coordinates: dict[str, Any] = {
+        "cycle": np.arange(1, count + 1), "section": np.arange(count + 1),
+    }  # fmt: skip
+    if run.samples is not None:
+        sample = (*batch, "sample")
+        variables |= states("sample", run.samples.state, sample)
+        variables["sample_time"] = sample, np.asarray(run.samples.time)
+        place = np.asarray(run.samples.cycles)
+        coordinates["sample"] = place.reshape(-1, place.shape[-1])[0]
+    if run.impact_log is not None:
+        log = (*cycle, "impact")
+        kept = {f"log_{name}": getattr(run.impact_log, name) for name in ("phase", "speed", "stop")}
+        variables |= present(kept, log)
+    if run.errors is not None:
+        variables |= states("error_section", run.errors.sections, section)
+        kept = {f"error_{name}": getattr(run.errors, name) for name in ("y_max", "y_min")}
+        variables |= present(kept, cycle)
+    variables |= present({"result": result, "steps": run.steps, "rejected": run.rejected}, batch)
+    return xr.Dataset(variables, coordinates)
