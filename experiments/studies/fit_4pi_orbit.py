@@ -98,8 +98,7 @@ def kind(orbit: vi.Orbit) -> str:
     """What a search found, in a word."""
     if bool(orbit.successful):
         return f"{2 * int(orbit.cycles)}π"
-    names = ("no_orbit", "grazing", "not_simulated")
-    return next(name for name in names if bool(orbit.result == getattr(vi.ORBIT_RESULTS, name)))
+    return str(orbit.to_xarray()["result"].item())
 
 
 def found(orbit: vi.Orbit) -> str:

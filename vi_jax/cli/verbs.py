@@ -26,7 +26,7 @@ from ..plot import (
     plot_regimes,
     plot_sweep,
 )
-from ..plot.motion import BLUE, RED
+from ..plot.colors import BLUE, RED
 from ..scan import Sweep
 from ..scan import basins as find_basins
 from ..scan import scan as run_scan

@@ -16,7 +16,7 @@ from ..flow.choice import chosen
 from ..orbit import STABILITY
 from ..orbit.cycle_map import cycle_map
 from ..orbit.floquet import stability_of
-from ..orbit.results import impacts_in_words
+from ..orbit.results import complex_in_words, impacts_in_words
 from ..plot.path import MotionPath, motion_path
 from ..scan import REGIMES, lyapunov
 from ..scan.measures import Regime
@@ -91,13 +91,8 @@ class Motion(NamedTuple):
         verdict = STABILITY[stability_of(jnp.asarray(self.multipliers))]
         if abs(abs(self.multipliers[0]) - 1) < _NEUTRAL:
             verdict = "neither stable nor unstable to rounding"
-        return f"multipliers {', '.join(map(_complex, self.multipliers))}: {verdict}"
-
-
-def _complex(number: complex) -> str:
-    if abs(number.imag) < _NEUTRAL * abs(number):
-        return f"{number.real:.4g}"
-    return f"{number.real:.4g} {'-' if number.imag < 0 else '+'} {abs(number.imag):.4g}i"
+        values = ", ".join(complex_in_words(m, 4, _NEUTRAL) for m in self.multipliers)
+        return f"multipliers {values}: {verdict}"
 
 
 def look(scene: AbstractScene, start: Any, settle: int = 1000) -> Motion:

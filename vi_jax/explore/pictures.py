@@ -14,7 +14,7 @@ from matplotlib.text import Text
 from PIL import Image
 
 from ..plot.branch import axis_name
-from ..plot.motion import BLUE, GREEN, RED
+from ..plot.colors import BLUE, GREEN, RED
 from .diagram import SHOWN, Diagram
 from .motion import WINDOW, Motion
 

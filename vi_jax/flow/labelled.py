@@ -3,7 +3,9 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Int
 
 from ..scene.numbers import by_name
 
@@ -31,10 +33,15 @@ def present(values: Mapping[str, Any], dims: tuple[str, ...]) -> Variables:
     return {name: (dims, np.asarray(x)) for name, x in values.items() if x is not None}
 
 
+def place_of(item: Any, items: Sequence[Any]) -> Int[Array, "..."]:
+    """Which of these items of an enumeration it is; a number for each lane."""
+    return jnp.asarray(sum(jnp.where(item == other, i, 0) for i, other in enumerate(items)))
+
+
 def in_names(item: Any, kind: Any, names: Sequence[str]) -> np.ndarray:
     """Of items of an enumeration their names, one for each lane."""
-    chosen = np.stack([np.asarray(item == getattr(kind, name)) for name in names])
-    return np.asarray(np.asarray(names)[np.argmax(chosen, axis=0)])
+    place = place_of(item, [getattr(kind, name) for name in names])
+    return np.asarray(np.asarray(names)[np.asarray(place)])
 
 
 def run_dataset(run: Any, dims: Sequence[str] | None, result: np.ndarray) -> Any:

@@ -11,7 +11,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from ..scene.numbers import by_name
-from .labelled import in_names, run_dataset
+from .labelled import in_names, place_of, run_dataset
 
 
 class RESULTS(eqx.Enumeration):
@@ -73,7 +73,7 @@ def reason(code: Float[Array, ""]) -> RESULTS:
 
 def number_of(result: RESULTS) -> Int[Array, "..."]:
     """The place of a reason in `REASONS`; 0 is success."""
-    return jnp.asarray(sum(jnp.where(result == item, i, 0) for i, item in enumerate(REASONS)))
+    return place_of(result, REASONS)
 
 
 class Samples(eqx.Module):

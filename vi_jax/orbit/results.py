@@ -217,7 +217,7 @@ class Orbit(eqx.Module):
         listed = int(jnp.sum(self.impact_stop >= 0))
         if listed < count:
             lines.append(f"  only {listed} of {count} impacts are listed: see `impact_log`")
-        values = ", ".join(_complex(m) for m in np.asarray(self.multipliers))
+        values = ", ".join(complex_in_words(m, 7, 1e-12) for m in np.asarray(self.multipliers))
         lines.append(f"  multipliers: {values}")
         lines.append(f"  clearance: {float(self.clearance):.4g}")
         lines.append(
@@ -246,10 +246,11 @@ def _plain(x: Any) -> float:
     return float(x) + 0.0
 
 
-def _complex(z: complex) -> str:
-    if abs(z.imag) <= 1e-12 * abs(z):
-        return f"{z.real:.7g}"
-    return f"{z.real:.7g}{z.imag:+.7g}i"
+def complex_in_words(z: complex, digits: int, rounding: float) -> str:
+    """A complex number, or a real one if its imaginary part is such a share of it."""
+    if abs(z.imag) <= rounding * abs(z):
+        return f"{z.real:.{digits}g}"
+    return f"{z.real:.{digits}g}{z.imag:+.{digits}g}i"
 
 
 def trimmed(orbit: Orbit) -> Orbit:

@@ -30,9 +30,6 @@ from .turns import Flight, Turns, turns_of
 
 Vector = Float[Array, " _"]
 
-# Newton's method has met a turn if it ends this close to it (as a share of the step).
-_TURNED = 1e-3
-
 
 class Observed(NamedTuple):
     """What is said about a solution."""
@@ -141,10 +138,12 @@ class Shooting(eqx.Module):
 
     def moving(self, scene: AbstractScene, leg: Any) -> AbstractScene:
         """The machine in the modes of a leg, whose number may be traced."""
-        if not scene.switches:
-            return scene
+        return in_modes(scene, self._modes_in(leg)) if scene.switches else scene
+
+    def _modes_in(self, leg: Any) -> tuple[Array, ...]:
+        """Of each switch, in a leg whose number may be traced."""
         modes = jnp.asarray(self.modes, jnp.result_type(float))[leg]
-        return in_modes(scene, tuple(modes[j] for j in range(len(scene.switches))))
+        return tuple(modes[j] for j in range(len(self.scene.switches)))
 
     def _each(self, leg: Any, of_event: Callable[[Event], Callable[..., Any]], *inputs: Any) -> Any:
         """A function that depends on the event of a leg, whose number may be traced."""
@@ -159,7 +158,7 @@ class Shooting(eqx.Module):
 
         def of(event: Event) -> Callable[..., Vector]:
             def new(s, u):
-                mode = self._mode_before(leg, event, s)
+                mode = self._mode_before(leg, event)
                 return ravel_pytree(jump(scene, event, s, self.unravel(u), mode))[0]
 
             return new
@@ -171,18 +170,16 @@ class Shooting(eqx.Module):
 
         def of(event: Event) -> Callable[..., Array]:
             def value(s, u):
-                mode = self._mode_before(leg, event, s)
+                mode = self._mode_before(leg, event)
                 return guard_of(scene, event, s, self.unravel(u), mode)
 
             return value
 
         return self._each(leg, of, s, u)
 
-    def _mode_before(self, leg: Any, event: Event, s: Any) -> Any:
+    def _mode_before(self, leg: Any, event: Event) -> Any:
         """The mode of a switch before the event that begins a leg."""
-        if event.kind != "switch":
-            return None
-        return jnp.asarray([x[event.number] for x in self.modes], jnp.result_type(s))[leg - 1]
+        return self._modes_in(leg - 1)[event.number] if event.kind == "switch" else None
 
     def ends(self, clock: Float[Array, " legs"], period: Any) -> Float[Array, " legs"]:
         """Clock at the end of each leg."""
@@ -321,10 +318,9 @@ class Shooting(eqx.Module):
         def step(moving, s0, s1, u):
             return self._step(moving, s0, s1, u, jnp.zeros_like(s0))[0]
 
-        count, modes = len(scene.switches), jnp.asarray(self.modes, places.dtype)[leg]
         return turns_of(
             Flight(
-                scene, self.moving(scene, leg), tuple(modes[j] for j in range(count)), step,
+                scene, self.moving(scene, leg), self._modes_in(leg), step,
                 self.unravel, places, states, (s1 - places[0]) / self.steps,
             )
         )  # fmt: skip
@@ -335,9 +331,9 @@ class Shooting(eqx.Module):
         def order(s, u):
             if event.kind != "switch":
                 return jnp.ones_like(s)
-            j, before = event.number, self._mode_before(leg, event, s)
+            j, before = event.number, self._mode_before(leg, event)
             mode = scene.switches[j].after(scene, s, self.unravel(u), before)[1]
-            wanted = jnp.asarray([x[j] for x in self.modes], s.dtype)[leg]
+            wanted = self._modes_in(leg)[j]
             return jnp.where(mode == wanted, 1.0, -1.0).astype(s.dtype)
 
         return order

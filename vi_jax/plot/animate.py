@@ -20,7 +20,8 @@ from .._files import write_whole
 from ..flow import Run
 from ..orbit import Orbit
 from ..scene import AbstractScene, Scene
-from .motion import BLUE, RED, plot_history
+from .colors import BLUE, RED
+from .motion import plot_history
 from .path import motion_path
 from .pen import Pen
 from .schematic import reach_of, size_of, sketch

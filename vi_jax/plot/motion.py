@@ -7,10 +7,7 @@ from matplotlib.ticker import FuncFormatter, MultipleLocator
 
 from ..flow import Run, Samples
 from ..scene import LABELS, AbstractScene
-from .colors import BLUE as BLUE
-from .colors import GREEN as GREEN
-from .colors import RED as RED
-from .colors import STOP, once
+from .colors import BLUE, STOP, once
 from .path import motion_path
 
 

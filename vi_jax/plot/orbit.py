@@ -7,7 +7,8 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from ..orbit import Orbit
-from .motion import BLUE, new_axes
+from .colors import BLUE
+from .motion import new_axes
 
 
 def plot_multipliers(

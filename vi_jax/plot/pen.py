@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle, FancyArrowPatch, Rectangle
 
-from .motion import BLUE, GREEN, RED
+from .colors import BLUE, GREEN, RED
 
 INK, PALE = "0.15", "0.55"
 

@@ -11,7 +11,8 @@ from matplotlib.axes import Axes
 from .._checks import instance_of
 from ..machines import BouncingBall, Duffing, ImpactPair, UnbalancedRotor
 from ..scene import AbstractScene, IdealDrive, Motor, Scene, SliderCrank
-from .motion import GREEN, RED, new_axes
+from .colors import GREEN, RED
+from .motion import new_axes
 from .pen import Pen
 
 
