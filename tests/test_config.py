@@ -137,6 +137,12 @@ def test_methods(here):
     assert isinstance(method('name = "exact-flight"'), vi.ExactFlight)
     adaptive = method('name = "adaptive"\nrtol = 1e-7')
     assert isinstance(adaptive, vi.Adaptive) and float(adaptive.rtol) == 1e-7
+    implicit = method('name = "adaptive"\nsolver = "Kvaerno5"')
+    assert isinstance(implicit, vi.Adaptive) and implicit.solver.implicit
+    series = method('name = "taylor"\norder = 12\nsteps_per_cycle = 6')
+    assert isinstance(series, vi.Taylor) and (series.order, series.steps_per_cycle) == (12, 6)
+    with pytest.raises(config.ConfigError, match=r"\[method\].*explicit"):
+        method('name = "fixed-step"\nsolver = "Kvaerno5"')
 
 
 @pytest.mark.parametrize("path", READY, ids=lambda path: path.stem)

@@ -4,6 +4,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 import pytest
 import vi_jax as vi
 
@@ -51,8 +52,25 @@ def test_serves_diffeqsolve(solver):
     )
 
 
+@pytest.mark.parametrize("kind", [diffrax.Kvaerno3, diffrax.Kvaerno4, diffrax.Kvaerno5])
+def test_an_implicit_step_is_that_of_diffrax(kind):
+    solver, args = kind(root_finder=optx.Newton(rtol=1e-13, atol=1e-13)), 0.1
+    times = jnp.asarray(0.2), jnp.asarray(0.5)
+    hidden = solver.init(TERM, *times, START, args)
+    original = solver.step(TERM, *times, START, args, hidden, jnp.asarray(True))
+    mine = vi.Unrolled(kind(), tolerance=1e-14).step(TERM, 0.2, 0.5, START, args, None, True)
+    for name in START:
+        np.testing.assert_allclose(mine[0][name], original[0][name], rtol=1e-12)
+        np.testing.assert_allclose(mine[1][name], abs(original[1][name]), atol=1e-12)
+
+
 @pytest.mark.parametrize("method", [vi.Adaptive, vi.FixedStep])
-@pytest.mark.parametrize("solver", [diffrax.Kvaerno5(), diffrax.SemiImplicitEuler(), "Tsit5"])
+@pytest.mark.parametrize("solver", [diffrax.SemiImplicitEuler(), "Tsit5"])
 def test_other_solvers_are_refused(method, solver):
-    with pytest.raises(TypeError, match=r"`solver` must be an explicit diffrax Runge–Kutta solver"):
+    with pytest.raises(TypeError, match=r"`solver` must be an explicit or diagonally implicit"):
         method(solver)
+
+
+def test_fixed_steps_are_explicit():
+    with pytest.raises(TypeError, match=r"`FixedStep` must be an explicit.*Use `Adaptive`"):
+        vi.FixedStep(diffrax.Kvaerno5())

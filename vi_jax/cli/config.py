@@ -15,7 +15,7 @@
     [start]                         # Y, V and, for a motor, W (and M), or what the model's start
                                     # takes; at rest if left out
     [method]                        # name = "draft", "standard", "reference", or "exact-flight",
-                                    # "adaptive", "fixed-step" with solver, rtol, …
+                                    # "adaptive", "fixed-step", "taylor" with their arguments
     [axes]                          # for scan: rows of values, as lists or as below
     "stops.0.restitution" = { from = 0.1, to = 0.9, count = 64 }
 
@@ -30,20 +30,22 @@ from typing import Any, Literal
 import diffrax
 from attrs import field, frozen
 
-from ..flow import AbstractMethod, Adaptive, ExactFlight, FixedStep
+from ..flow import AbstractMethod, Adaptive, ExactFlight, FixedStep, Taylor
 from ..orbit import AbstractSearch, Gradient, Newton
-from ..scene import (
-    AbstractScene,
-)
+from ..scene import AbstractScene
 from .machine import MachineTable, ModelTable, SceneTable, machine_named, start_of
 from .toml import ConfigError as ConfigError
 from .toml import Row, given, in_terms_of, read_toml, unknown
 
-_METHODS = {"exact-flight": ExactFlight, "adaptive": Adaptive, "fixed-step": FixedStep}
+_METHODS = {
+    "exact-flight": ExactFlight, "adaptive": Adaptive, "fixed-step": FixedStep, "taylor": Taylor,
+}  # fmt: skip
 _SOLVERS = {
     name: kind
     for name, kind in vars(diffrax).items()
-    if isinstance(kind, type) and issubclass(kind, diffrax.AbstractERK) and name[:8] != "Abstract"
+    if isinstance(kind, type)
+    and issubclass(kind, diffrax.AbstractERK | diffrax.AbstractESDIRK)
+    and name[:8] != "Abstract"
 }
 
 
@@ -51,8 +53,11 @@ _SOLVERS = {
 class MethodTable:
     """`[method]`: how the scene is carried."""
 
-    name: Literal["draft", "standard", "reference", "exact-flight", "adaptive", "fixed-step"]
+    name: Literal[
+        "draft", "standard", "reference", "exact-flight", "adaptive", "fixed-step", "taylor"
+    ]
     solver: str | None = None
+    order: int | None = None
     rtol: float | None = None
     atol: float | None = None
     steps_per_cycle: int | None = None

@@ -100,14 +100,17 @@ def _runge_kutta(solver: Unrolled, scene: AbstractScene, s0, s1, state, time):
 
 
 class Adaptive(AbstractMethod):
-    """An explicit diffrax Runge–Kutta solver with steps sized by its error estimate.
+    """A diffrax Runge–Kutta solver with steps sized by its error estimate.
+
+    An implicit one (`diffrax.Kvaerno5()`) is for machines of which a part fades much faster than
+    the rest moves, such as a strong motor: its steps need not follow what has faded.
 
     **Arguments:** `solver` (default `diffrax.Dopri8()`, the fastest measured from 1e-6 on); `rtol`
     and `atol`, tolerances relative to each state component and absolute (in the scene's
     dimensionless units; `atol` defaults to `rtol`).
 
-    **Raises:** `TypeError` if the solver is not explicit Runge–Kutta, `ValueError` for tolerances
-    out of (0, 1].
+    **Raises:** `TypeError` if the solver is neither explicit nor diagonally implicit Runge–Kutta,
+    `ValueError` for tolerances out of (0, 1].
     """
 
     solver: Unrolled = eqx.field(default_factory=diffrax.Dopri8, converter=_unrolled)
@@ -132,12 +135,21 @@ class Adaptive(AbstractMethod):
         """True."""
         return True
 
+    def longest(self, scene, s, state):
+        """As for all methods; of an implicit solver nothing that fades limits it."""
+        if self.solver.implicit:
+            return scene.step_limit(s, state)
+        return super().longest(scene, s, state)
+
     def step(self, scene, s0, s1, state, time):
         """One Runge–Kutta step and its error norm (root mean square over the components)."""
-        new, time, error = _runge_kutta(self.solver, scene, s0, s1, state, time)
         # Below the precision's own rounding a tolerance would only be rejected for ever.
         floor = 8 * jnp.finfo(s0.dtype).eps
         rtol = jnp.maximum(jnp.asarray(self.rtol, s0.dtype), floor)
+        solver = self.solver
+        if solver.implicit:
+            solver = Unrolled(solver.solver, tolerance=jnp.maximum(0.01 * rtol, floor))
+        new, time, error = _runge_kutta(solver, scene, s0, s1, state, time)
         atol = rtol if self.atol is None else jnp.maximum(jnp.asarray(self.atol, s0.dtype), floor)
         scaled = jtu.tree_map(
             lambda e, a, b: (e / (atol + rtol * jnp.maximum(jnp.abs(a), jnp.abs(b)))) ** 2,
@@ -177,8 +189,9 @@ class FixedStep(AbstractMethod):
     **Arguments:** `solver` (default `diffrax.Dopri8()`), `steps_per_cycle` (at least 5; what the
     default, 12, was measured to err is said at `preset`).
 
-    **Raises:** `TypeError` if the solver is not explicit Runge–Kutta; `ValueError` for fewer than
-    5 steps.
+    **Raises:** `TypeError` if the solver is not explicit Runge–Kutta, as the stages of an implicit
+    one may have no solution in a step that cannot be shortened; `ValueError` for fewer than 5
+    steps.
     """
 
     solver: Unrolled = eqx.field(default_factory=diffrax.Dopri8, converter=_unrolled)
@@ -186,6 +199,11 @@ class FixedStep(AbstractMethod):
 
     def __check_init__(self):
         count("steps_per_cycle", self.steps_per_cycle, least=5)
+        if self.solver.implicit:
+            raise TypeError(
+                "Argument `solver` of `FixedStep` must be an explicit diffrax Runge–Kutta solver, "
+                f"but got {self.solver.solver!r}. Use `Adaptive`."
+            )
 
     def step(self, scene, s0, s1, state, time):
         """One Runge–Kutta step; its error is not asked for."""

@@ -28,6 +28,9 @@ _STEPS = (5, 6, 7, 8, 10, 12, 16, 20, 24, 32, 48, 64)
 _TOLERANCES = tuple(10.0**-n for n in range(3, 15))
 _ROUNDS = 5
 
+# A scene is stiff if what fades fastest in it asks for steps so many times shorter than its motion.
+_STIFF = 20.0
+
 
 class Tried(NamedTuple):
     """A method that was measured."""
@@ -73,7 +76,8 @@ def suggest_method(
 
     Takes a few seconds, most of it compiling. Of a few methods of each kind it measures the
     error against `ExactFlight` where that applies and else against `Adaptive` at its tightest, and
-    the time of those that keep to it, on lanes that differ in their first velocity.
+    the time of those that keep to it, on lanes that differ in their first velocity. Where the scene
+    is stiff implicit ones are tried instead of those of fixed steps.
 
     **Arguments:**
 
@@ -110,8 +114,9 @@ def suggest_method(
     check_start(scene, start)
     bench = _Bench(scene, start, quantity, cycles, lanes)
     best = preset(scene, "reference")
-    exact = isinstance(best, ExactFlight)
-    bench.truth = bench.result(best.tighter() if exact else Adaptive(diffrax.Dopri8(), rtol=1e-14))
+    exact, stiff = isinstance(best, ExactFlight), _is_stiff(scene, start)
+    truth = best.tighter() if exact else Adaptive(diffrax.Dopri8(), rtol=1e-14)
+    bench.truth = bench.result(Adaptive(diffrax.Kvaerno5(), rtol=1e-12) if stiff else truth)
     failed = int(np.sum(~np.isfinite(bench.truth[:, 0])))
     if failed:
         raise ValueError(
@@ -121,12 +126,9 @@ def suggest_method(
     if exact:
         tried = [bench.tried(best, "ExactFlight()")]
     else:
-        tried = _fixed(bench, error)
-        for tolerance in _TOLERANCES[:-1]:
-            method = Adaptive(diffrax.Dopri8(), rtol=tolerance)
-            tried.append(bench.tried(method, f"Adaptive(Dopri8(), rtol={tolerance:.0e})"))
-            if tried[-1].error <= error:
-                break
+        tried = [] if stiff else _fixed(bench, error)
+        tried += _adaptive(bench, error, diffrax.Dopri8())
+        tried += _adaptive(bench, error, diffrax.Kvaerno5()) if stiff else []
         tried += _series(bench, error)
     good = [t for t in tried if t.error <= error]
     timed = bench.race(good)
@@ -136,6 +138,25 @@ def suggest_method(
     else:
         found = min(tried, key=lambda t: t.error)
     return Suggestion(found.method, bool(timed), found.error, tuple(tried))
+
+
+def _is_stiff(scene: AbstractScene, start: Any) -> bool:
+    """Whether something fades much faster than the motion goes, at its start."""
+    s = jnp.zeros(())
+    fading = scene.relaxation(s, start)
+    return fading is not None and bool(scene.step_limit(s, start) > _STIFF * fading)
+
+
+def _adaptive(bench: "_Bench", error: float, solver: Any) -> list[Tried]:
+    """The loosest tolerance that keeps to the error."""
+    tried: list[Tried] = []
+    for tolerance in _TOLERANCES[:-1]:
+        method = Adaptive(solver, rtol=tolerance)
+        name = f"Adaptive({type(solver).__name__}(), rtol={tolerance:.0e})"
+        tried.append(bench.tried(method, name))
+        if tried[-1].error <= error:
+            break
+    return tried
 
 
 def _fixed(bench: "_Bench", error: float) -> list[Tried]:

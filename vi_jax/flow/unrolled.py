@@ -3,33 +3,45 @@
 from typing import Any, ClassVar
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from .implicit import implicit_stages
 
 
 class Unrolled(diffrax.AbstractSolver):
-    """Any explicit diffrax Runge–Kutta solver, unrolled so that its stages fuse.
+    """Any explicit or diagonally implicit diffrax Runge–Kutta solver, its stages written out.
 
     diffrax keeps the stages in a buffer filled by an inner loop, which XLA cannot fuse. This solver
-    has the same tableau, error estimate and interpolant, evaluates them over the leaves of the
-    state, and can be used anywhere a diffrax solver can.
+    has the same tableau, error estimate and interpolant, and can be used anywhere a diffrax solver
+    can. The stages of an implicit one are solved by Newton's method with one matrix for all of a
+    step; its own `root_finder` is not used.
 
-    **Arguments:** `solver`, an explicit Runge–Kutta solver such as `diffrax.Tsit5()`.
+    **Arguments:** `solver`, a Runge–Kutta solver such as `diffrax.Tsit5()` or `diffrax.Kvaerno5()`;
+    `tolerance`, to which stages are solved, relative to 1 + |y|.
 
     **Raises:** `TypeError` if `solver` is not one.
     """
 
     solver: Any  # not yet known to be a solver when it is checked below
+    tolerance: Any = eqx.field(kw_only=True, default=1e-12)
     term_structure: ClassVar[Any] = diffrax.AbstractTerm
 
     def __check_init__(self):
-        if not isinstance(self.solver, diffrax.AbstractERK):
+        if not isinstance(self.solver, diffrax.AbstractERK | diffrax.AbstractESDIRK):
             raise TypeError(
-                "Argument `solver` must be an explicit diffrax Runge–Kutta solver, but got "
-                f"{self.solver!r}."
+                "Argument `solver` must be an explicit or diagonally implicit diffrax Runge–Kutta "
+                f"solver, but got {self.solver!r}."
             )
+
+    @property
+    def implicit(self) -> bool:
+        """Whether its stages are equations to be solved."""
+        return isinstance(self.solver, diffrax.AbstractESDIRK)
 
     @property
     def interpolation_cls(self):  # pyright: ignore
@@ -52,6 +64,8 @@ class Unrolled(diffrax.AbstractSolver):
         """One step over [t0, t1], with the arguments and results of `diffrax`'s `step`."""
         tableau = _tableau(self.solver)
         control = terms.contr(t0, t1)
+        if self.implicit:
+            return self._implicit(terms, t0, t1, y0, args, control)
         stages = [terms.vf_prod(t0, y0, args, control)]
         y1 = None
         for a, c in zip(tableau.a_lower, tableau.c, strict=True):
@@ -65,8 +79,23 @@ class Unrolled(diffrax.AbstractSolver):
         k = jtu.tree_map(lambda *leaves: jnp.stack(leaves), *stages)
         return y1, error, {"y0": y0, "y1": y1, "k": k}, None, diffrax.RESULTS.successful
 
+    def _implicit(self, terms, t0, t1, y0, args, control):
+        """The step of an implicit solver; its error is infinite where a stage was not solved."""
+        tableau = _tableau(self.solver)
+        flat, unravel = ravel_pytree(y0)
 
-def _tableau(solver: diffrax.AbstractERK) -> diffrax.ButcherTableau:
+        def field(t, y):
+            return ravel_pytree(terms.vf(t, unravel(y), args))[0]
+
+        stages, left = implicit_stages(tableau, field, t0, control, flat, self.tolerance)
+        stages = [unravel(control * k) for k in stages]
+        error = jtu.tree_map(lambda e: jnp.abs(e) + left, _combine(None, tableau.b_error, stages))
+        y1 = _combine(y0, tableau.b_sol, stages)
+        k = jtu.tree_map(lambda *leaves: jnp.stack(leaves), *stages)
+        return y1, error, {"y0": y0, "y1": y1, "k": k}, None, diffrax.RESULTS.successful
+
+
+def _tableau(solver: Any) -> diffrax.ButcherTableau:
     tableau = solver.tableau
     if not isinstance(tableau, diffrax.ButcherTableau):
         raise TypeError(f"Argument `solver` must have one Butcher tableau, but got {solver!r}.")

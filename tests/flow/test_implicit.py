@@ -1,0 +1,131 @@
+"""Implicit solvers carry what is stiff: strong motors and strong dashpots."""
+
+import dataclasses
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+from scipy.integrate import solve_ivp
+from vi_jax.flow.implicit import inverse_of
+
+from differences import check_derivatives, each_mode
+
+IMPLICIT = vi.Adaptive(diffrax.Kvaerno5(), rtol=1e-9)
+
+
+def strong(torque, *, control=0.9, gap=0.08):
+    return vi.Parameters(torque=torque, control=control, gap=gap).scene()
+
+
+def test_inverse_of_small_matrices():
+    rng = np.random.default_rng(0)
+    for n in range(1, 6):
+        matrix = rng.normal(size=(n, n))
+        matrix[0, 0] = 0.0 if n > 1 else 1.0  # no pivot where it is looked for first
+        np.testing.assert_allclose(inverse_of(jnp.asarray(matrix)) @ matrix, np.eye(n), atol=1e-12)
+
+
+def integrated(scene, cycles):
+    """The sections by SciPy's Radau in time, the equations of motion written out again here."""
+    drive, (stop,), xi = scene.drive, scene.stops, float(scene.damping_ratio)
+    gap, k = float(stop.gap), float(stop.restitution)
+    mu, eps = float(drive.slider_inertia), float(drive.coupling)
+
+    def rates(t, x):
+        Y, V, W, phi = x
+        U, slope, bend = np.cos(phi), -np.sin(phi), -np.cos(phi)
+        torque = float(drive.strength) * (float(drive.control) - W / float(drive.no_load_speed))
+        shaft = torque + eps * slope * (Y - U) - mu * slope * bend * W * W
+        return [V, U - Y - 2 * xi * V, shaft / (1 + mu * slope**2), W]
+
+    def contact(t, x):
+        return x[0] - gap
+
+    def section(t, x):
+        return x[3] - 2 * np.pi * (len(kept) + 1)
+
+    contact.terminal = section.terminal = True
+    contact.direction = section.direction = 1
+    start = scene.start()
+    x, kept, impacts = np.array([start.Y, start.V, start.W, 0.0], float), [], 0
+    while len(kept) < cycles:
+        found = solve_ivp(
+            rates, (0, 100), x, "Radau", rtol=1e-10, atol=1e-11, max_step=0.1,
+            events=(contact, section),
+        )  # fmt: skip
+        x = found.y[:, -1].copy()
+        if found.t_events[0].size:
+            x[:2] = gap, -k * x[1]
+            impacts += 1
+        else:
+            kept.append(x[:3].copy())
+    return np.array(kept), impacts
+
+
+@pytest.mark.parametrize("torque", [1e2, 1e4, 1e6])
+def test_strong_motors_beside_scipy(torque):
+    scene = strong(torque)
+    run = vi.simulate(scene, scene.start(), 4, method=IMPLICIT)
+    truth, impacts = integrated(scene, 4)
+    found = np.stack([getattr(run.sections, name)[1:] for name in "YVW"], axis=-1)
+    np.testing.assert_allclose(found, truth, atol=1e-7)
+    assert bool(run.successful) and int(run.impacts.sum()) == impacts >= 3
+
+
+def test_steps_do_not_grow_with_the_motor():
+    @vi.jit
+    @jax.vmap
+    def steps(torque):
+        scene = strong(torque)
+        return vi.simulate(scene, scene.start(), 20, method=IMPLICIT).steps
+
+    counts = steps(jnp.array([1e1, 1e2, 1e4, 1e6, 1e8]))
+    assert int(counts.max()) < 1.2 * int(counts.min())
+
+
+def test_both_clocks_agree():
+    scene = strong(1e3)
+    phase, time = (vi.simulate(scene, scene.start(), 8, method=IMPLICIT, clock=c)
+                   for c in ("phase", "time"))  # fmt: skip
+    np.testing.assert_allclose(phase.sections.Y, time.sections.Y, atol=1e-6)
+    np.testing.assert_allclose(phase.duration, time.duration, atol=1e-6)
+    np.testing.assert_array_equal(phase.impacts, time.impacts)
+
+
+@each_mode
+def test_derivatives(mode):
+    method = vi.Adaptive(diffrax.Kvaerno5(), rtol=1e-11)
+
+    def last(x, **options):
+        scene = strong(1e4, control=x[0], gap=0.04 * x[1])
+        run = vi.simulate(scene, scene.start(Y=x[2]), 4, method=method, **options)
+        return run.last, run.impacts
+
+    check_derivatives(
+        mode, last, [0.9, 1.25, 0.3], tolerance=2e-6, impacts=3,
+        max_steps=None if mode == "forward" else 2048,
+    )  # fmt: skip
+
+
+def test_a_strong_dashpot_beside_explicit_steps():
+    """A stop that is a dashpot of ten times its critical damping."""
+    base = vi.Scene.ideal(frequency_ratio=0.9, gap=None, damping_ratio=0.02)
+    stop = vi.SoftStop(1.0, 1e3, damping=20 * 1e3**0.5)
+    scene = dataclasses.replace(base, soft_stops=(stop,))
+    explicit, implicit = (
+        vi.simulate(scene, scene.start(), 5, method=method)
+        for method in (vi.Adaptive(rtol=1e-9), IMPLICIT)
+    )
+    assert bool(explicit.successful) and bool(implicit.successful)
+    np.testing.assert_allclose(implicit.sections.Y, explicit.sections.Y, atol=1e-6)
+    assert 10 * int(implicit.steps) < int(explicit.steps)
+
+
+def test_suggest_method_takes_it_where_a_scene_is_stiff():
+    found = vi.suggest_method(strong(1e3), error=1e-5, cycles=4, lanes=16)
+    assert found.reached and found.error <= 1e-5
+    assert any("Kvaerno5" in t.name for t in found.tried)
+    assert not any("FixedStep" in t.name for t in found.tried)
