@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-from vi_jax.flow.choice import chosen
+from vi_jax.flow.methods.choice import chosen
 
 IDEAL = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.8, damping_ratio=0.045)
 MOTOR = vi.Parameters(torque=10.0, restitution=0.8, gap=0.08, control=1.1).scene()

@@ -14,7 +14,7 @@ def rows():
         yield pytest.param(case, id=case.range, marks=slow)
 
 
-@pytest.mark.parametrize("case", rows())
+@pytest.mark.parametrize("case", list(rows()))
 def test_corner(case):
     found = case.measure()
     for name, promise in case.promise.items():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import vi_jax as vi
 from scipy.linalg import expm
-from vi_jax.flow.exact import flight
+from vi_jax.flow.methods.exact import flight
 
 SCENE = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.0)
 

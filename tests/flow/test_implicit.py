@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import vi_jax as vi
 from scipy.integrate import solve_ivp
-from vi_jax.flow.implicit import inverse_of
+from vi_jax.flow.methods._implicit import inverse_of
 
 from differences import check_derivatives, each_mode
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import pytest
 import vi_jax as vi
 from headlines.jaxprs import primitives
-from vi_jax.lanes.program import Program
+from vi_jax.lanes._program import Program
 
 
 def carried(jaxpr) -> int:

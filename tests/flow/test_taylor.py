@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-from vi_jax.flow import series as power_series
+from vi_jax.flow.methods import _series as power_series
 
 RULES = {
     "arithmetic": lambda t, x: 2 * x - x * t + (x + 1) / (2 + t * t) - x / 3,

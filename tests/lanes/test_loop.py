@@ -272,7 +272,7 @@ def test_shards_of_a_batch_take_the_same_road():
 
 
 def test_what_has_no_vector_form_takes_the_other_road_and_says_so():
-    from vi_jax.lanes import primitive
+    from vi_jax.lanes import _primitive as primitive
 
     primitive._tell.cache_clear()
     with pytest.warns(UserWarning, match="`sort`"):
@@ -286,7 +286,7 @@ def test_what_has_no_vector_form_takes_the_other_road_and_says_so():
 
 @pytest.mark.parametrize("fault", ["missing", "broken"])
 def test_without_llvm(fault, monkeypatch):
-    from vi_jax.lanes import primitive
+    from vi_jax.lanes import _primitive as primitive
 
     for cached in (primitive._tell, machine._llvm, machine._register_bits):
         cached.cache_clear()

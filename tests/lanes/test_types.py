@@ -9,7 +9,7 @@ import jax.numpy as jnp
 jax.config.update("jax_enable_x64", True)
 hook = jaxtyping.install_import_hook("vi_jax.lanes", "beartype.beartype")
 import vi_jax as vi
-import vi_jax.lanes.kernel
+import vi_jax.lanes._kernel
 
 try:
     vi_jax.lanes.kernel.kernel_text("no program", 8, 512)

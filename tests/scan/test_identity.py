@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import pytest
 import vi_jax as vi
-from vi_jax.scan.identity import Unverifiable, identity
+from vi_jax.scan._identity import Unverifiable, identity
 
 # What a user may have written: a global number, a helper, a closure, a default, a class.
 SOURCE = """

@@ -251,7 +251,7 @@ def test_what_cannot_be_run_is_said_before_any_work(change, message):
 
 
 def test_a_store_is_resumed_and_guards_itself(tmp_path, monkeypatch):
-    work = importlib.import_module("vi_jax.scan.work")
+    work = importlib.import_module("vi_jax.scan._work")
     axes = {"drive.frequency_ratio": np.linspace(0.6, 1.4, 40), "start.Y": np.linspace(-1, 1, 30)}
     options = {"settle": 20, "cycles": 128, "lanes": 256, "workers": 1}
     whole = vi.scan(SCENE, axes, **options)
@@ -412,7 +412,7 @@ def test_a_store_is_made_whole_or_not_at_all(tmp_path, monkeypatch):
 
 
 def test_an_interrupted_scan_in_memory_gives_what_it_has(monkeypatch):
-    work = importlib.import_module("vi_jax.scan.work")
+    work = importlib.import_module("vi_jax.scan._work")
     done = []
     compute = work.compute
 

@@ -59,7 +59,7 @@ def test_what_is_damaged_is_told_and_computed_again(
         shutil.rmtree(broken) if broken.is_dir() else broken.unlink()
     else:
         damage(broken)
-    work = importlib.import_module("vi_jax.scan.work")
+    work = importlib.import_module("vi_jax.scan._work")
     compute, computed = work.compute, []
     monkeypatch.setattr(work, "compute", lambda *a: computed.append(1) or compute(*a))
     with pytest.warns(UserWarning, match=f"lost or damaged, and is computed again: {words}[.]"):

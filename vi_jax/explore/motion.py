@@ -12,7 +12,7 @@ import numpy as np
 
 from .._programs import compiled
 from ..flow import RESULTS, Run, simulate
-from ..flow.choice import chosen
+from ..flow.methods import chosen
 from ..orbit import STABILITY
 from ..orbit.cycle_map import cycle_map
 from ..orbit.floquet import stability_of

@@ -1,11 +1,13 @@
 """How a scene moves: methods, the hybrid step, the closed-form flight, `simulate`, results."""
 
-from .choice import preset as preset
-from .exact import ExactFlight as ExactFlight
 from .fusion import jit as jit
 from .methods import AbstractMethod as AbstractMethod
 from .methods import Adaptive as Adaptive
+from .methods import ExactFlight as ExactFlight
 from .methods import FixedStep as FixedStep
+from .methods import Taylor as Taylor
+from .methods import Unrolled as Unrolled
+from .methods import preset as preset
 from .results import RESULTS as RESULTS
 from .results import Errors as Errors
 from .results import ImpactLog as ImpactLog
@@ -15,5 +17,3 @@ from .simulate import simulate as simulate
 from .suggest import Suggestion as Suggestion
 from .suggest import suggest_method as suggest_method
 from .tangent import by_columns as by_columns
-from .taylor import Taylor as Taylor
-from .unrolled import Unrolled as Unrolled

@@ -21,8 +21,8 @@ from .._checks import (
     warn_of_narrow,
 )
 from ..scene import AbstractScene, Scene
-from .choice import MethodLike, chosen
-from .lane import Plan
+from ._lane import Plan
+from .methods import MethodLike, chosen
 
 # Steps in a cycle that reverse mode makes room for, unless the caller says otherwise.
 _STEPS = 65536

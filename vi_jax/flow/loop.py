@@ -10,9 +10,9 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Bool
 
 from .. import lanes
-from .aim import select
-from .hybrid import iterate
-from .lane import Lane, Plan, Record
+from ._lane import Lane, Plan, Record
+from ._step.aim import select
+from ._step.hybrid import iterate
 
 
 @jax.custom_batching.custom_vmap

@@ -16,12 +16,12 @@ from .._checks import (
 )
 from .._programs import compiled
 from ..scene import AbstractScene
+from ._lane import Plan, Record
+from ._spoil import spoiled
 from .arguments import planned
-from .choice import MethodLike
-from .lane import Plan, Record
 from .loop import Ends, run_forward, run_reverse
+from .methods import MethodLike
 from .results import Errors, ImpactLog, Run, Samples, reason
-from .spoil import spoiled
 
 
 def simulate(

@@ -15,12 +15,9 @@ from jax.core import Tracer
 from .._checks import count, one_of, require
 from ..scene import AbstractScene
 from .arguments import check_start
-from .choice import preset
-from .exact import ExactFlight
 from .fusion import jit
-from .methods import AbstractMethod, Adaptive, FixedStep
+from .methods import AbstractMethod, Adaptive, ExactFlight, FixedStep, Taylor, preset
 from .simulate import simulate
-from .taylor import Taylor
 
 QUANTITIES = ("state", "extremes", "impacts", "derivative")
 

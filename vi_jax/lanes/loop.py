@@ -11,9 +11,9 @@ import jax.tree_util as jtu
 from jax.core import eval_jaxpr
 from jax.extend.core import ClosedJaxpr
 
-from .context import within
-from .primitive import lanes_p
-from .program import Program
+from ._context import within
+from ._primitive import lanes_p
+from ._program import Program
 
 ROADS = ("auto", "xla")
 

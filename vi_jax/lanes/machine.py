@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from .context import within
-from .kernel import kernel_text
-from .program import Program
-from .vector import Unsupported, check
+from ._context import within
+from ._kernel import kernel_text
+from ._program import Program
+from ._vector import Unsupported, check
 
 _KEPT = 64
 

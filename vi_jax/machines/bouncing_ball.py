@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from .._checks import NOT_NEGATIVE, SHARE, number, real
 from ..scene import RigidStop
-from .base import PhaseMachine
+from ._base import PhaseMachine
 
 Scalar = Float[Array, ""]
 

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Range, number, real
 from ..scene import Coordinate, DryFriction, RigidStop
-from .base import PhaseMachine
+from ._base import PhaseMachine
 
 Scalar = Float[Array, ""]
 

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, number, optional_real, real
 from ..scene import Coordinate, RigidStop
-from .base import PhaseMachine
+from ._base import PhaseMachine
 
 Scalar = Float[Array, ""]
 

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._checks import NOT_NEGATIVE, POSITIVE, SHARE, concrete, number, real
 from ..scene import RigidStop
-from .base import AutonomousMachine
+from ._base import AutonomousMachine
 
 Scalar = Float[Array, ""]
 

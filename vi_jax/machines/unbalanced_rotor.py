@@ -20,7 +20,7 @@ from .._checks import (
     require,
 )
 from ..scene import RigidStop, ShaftScene
-from .base import PhaseMachine
+from ._base import PhaseMachine
 
 Scalar = Float[Array, ""]
 

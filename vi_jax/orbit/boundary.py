@@ -9,12 +9,12 @@ import numpy as np
 
 from .._checks import interval
 from ..scene.numbers import check_again, check_leaf, leaf, with_leaf
-from .carrier import steps_of
+from ._carrier import steps_of
+from ._shooting import Shooting
+from ._solve import advance as solved
+from ._solve import orbit_of, tangent_at
 from .curve import Step, check_walk, walk
 from .results import Orbit
-from .shooting import Shooting
-from .solve import advance as solved
-from .solve import orbit_of, tangent_at
 from .special import CROSSING, DOUBLING, FOLD, GRAZING, SpecialPoint
 
 # Where something grazes it is touched to rounding.

@@ -10,13 +10,13 @@ import numpy as np
 
 from .._checks import interval
 from .._lazy import lazy
-from ..flow.choice import MethodLike
+from ..flow.methods import MethodLike
 from ..scene.numbers import check_again, check_leaf, leaf, with_leaf
+from ._follow import Follower
+from ._shooting import Shooting
+from ._solve import advance, located, orbit_of, problem_of, tangent_at
 from .curve import Step, check_walk, walk
-from .follow import Follower
 from .results import ORBIT_RESULTS, Orbit, impacts_in_words
-from .shooting import Shooting
-from .solve import advance, located, orbit_of, problem_of, tangent_at
 from .special import SpecialPoint
 
 if TYPE_CHECKING:

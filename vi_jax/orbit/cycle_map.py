@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from .._checks import count
 from ..flow import AbstractMethod, Adaptive, by_columns, simulate
 from ..flow.arguments import as_floats
-from ..flow.choice import MethodLike, chosen
+from ..flow.methods import MethodLike, chosen
 from ..scene import AbstractScene, Scene
 
 

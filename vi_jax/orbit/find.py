@@ -15,12 +15,12 @@ from jaxtyping import Array, Float, Int
 from .._checks import concrete, count, flag
 from .._programs import compiled
 from ..flow import Run, by_columns, simulate
-from ..flow.choice import MethodLike
+from ..flow.methods import MethodLike
 from ..scene import AbstractScene, Scene
+from ._root import root_of, shooting_matrix
 from .cycle_map import CycleMap, adopted, cycle_map
 from .floquet import multipliers_of
 from .results import ORBIT_RESULTS, Orbit, trimmed
-from .root import root_of, shooting_matrix
 from .search import AbstractSearch, Newton
 
 # Places in a cycle at which an orbit can be searched.

@@ -7,11 +7,11 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from .._checks import given_number
+from ._events import Event
+from ._shooting import Shooting
+from ._solve import advance, jacobian_at, orbit_of, state_at, tangent_at
 from .curve import Step
-from .events import Event
 from .results import Orbit
-from .shooting import Shooting
-from .solve import advance, jacobian_at, orbit_of, state_at, tangent_at
 
 FOLD, DOUBLING, TORUS = "fold", "period-doubling", "neimark-sacker"
 GRAZING, CROSSING, SYMMETRY = "grazing", "branch-point", "symmetry-breaking"

@@ -13,7 +13,7 @@ import numpy as np
 from .._checks import count, fits_records, given_number
 from .._lazy import lazy
 from ..flow import simulate
-from ..flow.choice import MethodLike, chosen
+from ..flow.methods import MethodLike, chosen
 from ..orbit.results import impacts_in_words
 from ..scene import AbstractScene
 from ..scene.numbers import by_name, with_leaf

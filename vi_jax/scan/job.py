@@ -14,8 +14,7 @@ from jaxtyping import Array, Float
 
 from .._checks import count, tuple_of
 from ..flow import AbstractMethod
-from ..flow.aim import select
-from ..flow.choice import MethodLike, chosen
+from ..flow.methods import MethodLike, chosen
 from ..flow.results import number_of
 from ..flow.simulate import simulate_pool
 from ..scene import AbstractScene
@@ -160,7 +159,9 @@ class Job(eqx.Module):
             new = jax.vmap(one)(jnp.minimum(index, lanes - 1))
             fits = (index < lanes) & unclear[jnp.minimum(index, lanes - 1)]
             old = jtu.tree_map(lambda x: x[jnp.minimum(index, lanes - 1)], out)
-            new = jax.vmap(select)(fits, new, old)
+            new = jax.vmap(lambda fits, *x: jtu.tree_map(lambda a, b: jnp.where(fits, a, b), *x))(
+                fits, new, old
+            )
             return begin + _AGAIN, jtu.tree_map(
                 lambda x, y: x.at[index].set(y, mode="drop"), out, new
             )

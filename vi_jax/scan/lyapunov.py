@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 from .._checks import count
 from .._programs import compiled
 from ..flow import RESULTS, simulate
-from ..flow.choice import MethodLike, chosen
+from ..flow.methods import MethodLike, chosen
 from ..orbit.cycle_map import CycleMap, adopted, cycle_map
 from ..scene import AbstractScene, Scene
 

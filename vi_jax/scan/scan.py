@@ -18,10 +18,11 @@ from tqdm import tqdm
 from .._checks import count, fits_memory, fits_records, flag, instance_of
 from .._lazy import lazy
 from ..flow import AbstractMethod
-from ..flow.choice import MethodLike, preset
+from ..flow.methods import MethodLike, preset
 from ..flow.results import REASON_NAMES
 from ..scene import AbstractScene
-from .describe import attributes_of, description_of
+from ._describe import attributes_of, description_of
+from ._work import block_size, rounded, run_here, run_on_cluster, size_of, worker_count
 from .grid import Blocks, axes_of
 from .job import Job, check_corners, make_job
 from .regime import flags
@@ -34,7 +35,6 @@ from .store import (
     dataset,
     open_dataset,
 )
-from .work import block_size, rounded, run_here, run_on_cluster, size_of, worker_count
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -14,7 +14,7 @@ from .._checks import concrete, count, fits_records, instance_of, number, requir
 from .._programs import compiled
 from ..flow import RESULTS, simulate
 from ..flow.arguments import check_start
-from ..flow.choice import MethodLike, chosen
+from ..flow.methods import MethodLike, chosen
 from ..orbit.results import impacts_in_words
 from ..scene import LABELS, AbstractScene
 from ..scene.numbers import check_again, check_leaf, with_leaf

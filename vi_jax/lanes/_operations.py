@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from . import functions
-from .text import KINDS, Text, Value, is_float
+from . import _functions as functions
+from ._text import KINDS, Text, Value, is_float
 
 Rule = Callable[..., Any]
 ELEMENTWISE: dict[str, Rule] = {}

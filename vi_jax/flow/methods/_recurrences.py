@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax.core import Tracer
 
-from .coefficients import (
+from ._coefficients import (
     Coefficient,
     NoSeries,
     Series,

@@ -8,9 +8,9 @@ import jax.tree_util as jtu
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
-from ..lanes import pin
-from .events import Rates, quintic, rising_root, slope
-from .lane import FREE, Lane, Plan, to_release, to_turn_of
+from ...lanes import pin
+from .._lane import FREE, Lane, Plan, to_release, to_turn_of
+from ..events import Rates, quintic, rising_root, slope
 from .trial import Crossing, Path, Trial, beyond, to_turn
 
 Scalar = Float[Array, ""]

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
-from .arrays import Values
-from .operations import kind_of
-from .program import Program
-from .text import Text, Value, is_float
-from .vector import write
+from ._arrays import Values
+from ._operations import kind_of
+from ._program import Program
+from ._text import Text, Value, is_float
+from ._vector import write
 
 _BYTES = {"double": 8, "float": 4, "i1": 1, "i8": 1, "i16": 2, "i32": 4, "i64": 8}
 

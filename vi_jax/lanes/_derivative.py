@@ -7,7 +7,7 @@ from typing import Any
 import jax
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
-from .program import Program, Spread, spread
+from ._program import Program, Spread, spread
 
 
 @functools.lru_cache(maxsize=256)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from fractions import Fraction
 from math import factorial, frexp, log, pi
 
-from .text import Text, Value
+from ._text import Text, Value
 
 _SIN = tuple((-1) ** n / factorial(2 * n + 1) for n in range(11))
 _COS = tuple((-1) ** n / factorial(2 * n) for n in range(12))

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax.extend.core import jaxpr_as_fun
 
-from .program import Program
+from ._program import Program
 
 # Lanes under way at once on a CPU; an accelerator takes all of them.
 _PLACES = 256

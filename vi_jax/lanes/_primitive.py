@@ -10,12 +10,12 @@ from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from . import xla
+from . import _xla as xla
+from ._derivative import forward, widened
+from ._program import Program, spread
+from ._vector import Unsupported
 from .call import header, registered
-from .derivative import forward, widened
 from .machine import kernel_of
-from .program import Program, spread
-from .vector import Unsupported
 
 FORWARD_ONLY = (
     "This loop is differentiated forward only (`jax.jvp`, `jax.jacfwd`). For `jax.grad` by a few "

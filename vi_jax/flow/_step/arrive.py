@@ -9,10 +9,10 @@ import jax.tree_util as jtu
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
-from ..lanes import pin, pin_flag
+from ...lanes import pin, pin_flag
+from .._lane import Lane, Plan, Record, to_stop, to_turn_of
+from ..moving import struck_modes
 from .aim import select
-from .lane import Lane, Plan, Record, to_stop, to_turn_of
-from .moving import struck_modes
 from .rest import Release, settled
 from .trial import Crossing, Path, Trial
 

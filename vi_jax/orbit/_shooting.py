@@ -24,9 +24,9 @@ from ..flow import AbstractMethod
 from ..flow.moving import in_modes
 from ..scene import AbstractScene
 from ..scene.numbers import with_leaf
-from .events import Event, approach_of, guard_of, jump
+from ._events import Event, approach_of, guard_of, jump
+from ._turns import Flight, Turns, turns_of
 from .floquet import multipliers_of
-from .turns import Flight, Turns, turns_of
 
 Vector = Float[Array, " _"]
 

@@ -19,13 +19,13 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
-from ..lanes import pin_flag
-from . import results
+from ...lanes import pin_flag
+from .. import results
+from .._lane import FREE, Lane, Plan, Record, total
+from ..methods import Taylor
 from .ahead import ahead
 from .aim import aim_at, select
 from .arrive import arrive
-from .lane import FREE, Lane, Plan, Record, total
-from .taylor import Taylor
 from .trial import Trial, attempt, held, timing
 
 Scalar = Float[Array, ""]

@@ -12,8 +12,8 @@ import jax.tree_util as jtu
 import numpy as np
 
 from ..scene.numbers import leaf, leaf_names
+from ._identity import Unverifiable, identity
 from .grid import Blocks
-from .identity import Unverifiable, identity
 from .job import Job
 from .store import UNVERIFIABLE
 

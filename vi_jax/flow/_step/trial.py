@@ -7,13 +7,13 @@ import jax.tree_util as jtu
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
-from ..lanes import pin, pin_flag
-from ..scene import AbstractScene
-from .events import Rates, force_rate, guard_rates, landing, rates
-from .lane import FREE, SECTION, Lane, Plan, to_stop, to_switch, to_turn_of, total
-from .moving import Moving, in_modes
+from ...lanes import pin, pin_flag
+from ...scene import AbstractScene
+from .._lane import FREE, SECTION, Lane, Plan, to_stop, to_switch, to_turn_of, total
+from ..events import Rates, force_rate, guard_rates, landing, rates
+from ..methods.taylor import Expansion
+from ..moving import Moving, in_modes
 from .rest import Release, release
-from .taylor import Expansion
 
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]

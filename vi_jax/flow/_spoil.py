@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
-from .lane import Plan
+from ._lane import Plan
 from .results import Run
 
 

@@ -9,8 +9,8 @@ from functools import partial
 
 import numpy as np
 
-from .operations import Rule, add, compare, extreme, into, kind_of, mul
-from .text import Text, Value
+from ._operations import Rule, add, compare, extreme, into, kind_of, mul
+from ._text import Text, Value
 
 Values = np.ndarray
 """An object array of `Value`s, of the shape of the JAX array."""

@@ -13,10 +13,10 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
-from ..lanes import pin, pin_flag
-from ..scene import AbstractScene, RigidStop
-from .events import Rates, rates
-from .lane import Lane, Plan, to_release, to_stop
+from ...lanes import pin, pin_flag
+from ...scene import AbstractScene, RigidStop
+from .._lane import Lane, Plan, to_release, to_stop
+from ..events import Rates, rates
 
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]

@@ -9,10 +9,10 @@ import numpy as np
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
-from .._checks import count, require
-from . import series as power_series
-from .methods import AbstractMethod
-from .series import NoSeries, Series
+from ..._checks import count, require
+from . import _series as power_series
+from ._series import NoSeries, Series
+from .base import AbstractMethod
 
 Scalar = Float[Array, ""]
 

@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
-from .arrays import STRUCTURAL, Values
-from .operations import ELEMENTWISE, kind_of
-from .text import Text, Value
+from ._arrays import STRUCTURAL, Values
+from ._operations import ELEMENTWISE, kind_of
+from ._text import Text, Value
 
 # Calls whose body is written out in their place.
 _CALLS = {

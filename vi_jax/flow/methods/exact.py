@@ -6,10 +6,10 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import count
-from ..scene import AbstractScene, CosineCrank, IdealDrive, OscillatorState, Scene
-from ..scene.trig import horner, sincos
-from .methods import AbstractMethod
+from ..._checks import count
+from ...scene import AbstractScene, CosineCrank, IdealDrive, OscillatorState, Scene
+from ...scene.trig import horner, sincos
+from .base import AbstractMethod
 
 Scalar = Float[Array, ""]
 

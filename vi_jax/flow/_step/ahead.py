@@ -8,11 +8,11 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
-from ..scene.trig import horner
+from ...scene.trig import horner
+from .._lane import FREE, SECTION, Lane, Plan, to_stop, to_turn_of
+from ..events import rising_root, slope
+from ..methods._series import Series, at
 from .aim import MARGIN, select
-from .events import rising_root, slope
-from .lane import FREE, SECTION, Lane, Plan, to_stop, to_turn_of
-from .series import Series, at
 
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]

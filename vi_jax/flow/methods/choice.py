@@ -4,10 +4,11 @@ from typing import Any
 
 import diffrax
 
-from .._checks import one_of
-from ..scene import AbstractScene, Scene
+from ..._checks import one_of
+from ...scene import AbstractScene, Scene
+from .base import AbstractMethod
 from .exact import ExactFlight
-from .methods import AbstractMethod, Adaptive, FixedStep
+from .runge_kutta import Adaptive, FixedStep
 
 MethodLike = AbstractMethod | str | None
 """What an argument `method` takes: a method, the name of a preset, or `None` for the default."""

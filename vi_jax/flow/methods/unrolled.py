@@ -10,7 +10,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from .implicit import implicit_stages
+from ._implicit import implicit_stages
 
 
 class Unrolled(diffrax.AbstractSolver):

@@ -11,17 +11,17 @@ from jax.flatten_util import ravel_pytree
 
 from .._programs import compiled
 from ..flow.arguments import planned
-from ..flow.choice import MethodLike
 from ..flow.loop import run_forward
+from ..flow.methods import MethodLike
 from ..flow.moving import begin_modes, in_modes, struck_modes
 from ..flow.simulate import collect
 from ..scene import Scene
 from ..scene.numbers import leaf, with_leaf
-from .carrier import carrier, steps_of
+from ._carrier import carrier, steps_of
+from ._events import Event, jump, renews
+from ._shooting import Shooting
 from .curve import Step, array_of, corrected, first_tangent
-from .events import Event, jump, renews
 from .results import ORBIT_RESULTS, Orbit
-from .shooting import Shooting
 
 # Events of a cycle that can be followed, of a machine with switches or a section of its own.
 _LISTED = 32

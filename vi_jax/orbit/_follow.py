@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from ._events import Event
+from ._shooting import Shooting
+from ._solve import advance, located, observe, orbit_of, state_at
 from .curve import Step
-from .events import Event
-from .shooting import Shooting
-from .solve import advance, located, observe, orbit_of, state_at
 from .special import CROSSING, DOUBLING, FOLD, GRAZING, HOPF, SYMMETRY, TORUS, SpecialPoint
 
 # What lies before the place where a branch springs is looked for on so much of the way there.

@@ -13,8 +13,8 @@ import jax.tree_util as jtu
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
-from .coefficients import Coefficient, NoSeries, Series, nth, plus
-from .recurrences import RULES
+from ._coefficients import Coefficient, NoSeries, Series, nth, plus
+from ._recurrences import RULES
 
 _CALLS = {
     "jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr",

@@ -7,7 +7,7 @@ import diffrax
 import jax.numpy as jnp
 
 from ..flow import AbstractMethod, ExactFlight, FixedStep
-from ..flow.choice import MethodLike, chosen
+from ..flow.methods import MethodLike, chosen
 from ..scene import AbstractScene
 
 

@@ -1,0 +1,11 @@
+"""How a scene is carried over one step: Runge–Kutta, power series, closed form; which to take."""
+
+from .base import AbstractMethod as AbstractMethod
+from .choice import MethodLike as MethodLike
+from .choice import chosen as chosen
+from .choice import preset as preset
+from .exact import ExactFlight as ExactFlight
+from .runge_kutta import Adaptive as Adaptive
+from .runge_kutta import FixedStep as FixedStep
+from .taylor import Taylor as Taylor
+from .unrolled import Unrolled as Unrolled

@@ -1,0 +1,76 @@
+"""What the hybrid step asks of a method, which is an argument of every verb."""
+
+import abc
+from math import pi
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ...scene import AbstractScene
+
+Scalar = Float[Array, ""]
+
+
+class AbstractMethod(eqx.Module):
+    """What the hybrid step asks of a method."""
+
+    @property
+    @abc.abstractmethod
+    def steps_per_cycle(self) -> int:
+        """The fewest ordinary steps in a cycle; static."""
+
+    @property
+    def adaptive(self) -> bool:
+        """Whether steps can be rejected and resized."""
+        return False
+
+    @property
+    def sees_ahead(self) -> bool:
+        """Whether it knows the motion before a step is taken (see `Taylor`)."""
+        return False
+
+    @property
+    def uses_field(self) -> bool:
+        """Whether a step evaluates the scene's field, and so holds what the field holds."""
+        return True
+
+    def check(self, scene: AbstractScene) -> None:
+        """Raise a `ValueError` if this method cannot move `scene`."""
+        return None
+
+    def longest(self, scene: AbstractScene, s: Any, state: Any) -> Any:
+        """The longest step from here.
+
+        A method of so many steps in a drive cycle takes as many in a natural period, where that is
+        shorter. With the fewest, five, a step may be as long as 0.8π relaxation times: up to there
+        explicit Runge–Kutta methods are stable, and the series of `ExactFlight` exact.
+        """
+        limit, fading = scene.step_limit(s, state), scene.relaxation(s, state)
+        if fading is not None:
+            limit = jnp.minimum(limit, 0.8 * pi * fading)
+        return limit * (5 / self.steps_per_cycle)
+
+    @abc.abstractmethod
+    def step(
+        self,
+        scene: AbstractScene,
+        s0: Scalar,
+        s1: Scalar,
+        state: Any,
+        time: Scalar | None,
+    ) -> tuple[Any, Scalar | None, Scalar]:
+        """State and elapsed time at `s1` from those at `s0`, and the step's error.
+
+        The error is relative to the tolerance (a step is accepted up to 1); it is 0 for methods
+        that are not adaptive. `time` is `None` unless the scene has a pace that is asked for.
+        """
+
+    @abc.abstractmethod
+    def tighter(self) -> "AbstractMethod":
+        """A method of the same kind and much smaller error, by which this one's is estimated."""
+
+    def resize(self, error: Scalar) -> Scalar:
+        """Factor from one step's length to the next one's."""
+        return jnp.ones_like(error)
