@@ -12,7 +12,7 @@ import vi_jax as vi
 import vi_jax.lanes._kernel
 
 try:
-    vi_jax.lanes.kernel.kernel_text("no program", 8, 512)
+    vi_jax.lanes._kernel.kernel_text("no program", 8, 512)
 except jaxtyping.TypeCheckError:
     pass
 else:

@@ -103,7 +103,7 @@ def test_another_process_gives_the_same(tmp_path):
     (tmp_path / "study.py").write_text(SOURCE)
     script = tmp_path / "tell.py"
     script.write_text(
-        "from study import *\nimport study\nfrom vi_jax.scan.identity import identity\n"
+        "from study import *\nimport study\nfrom vi_jax.scan._identity import identity\n"
         f"print([identity(eval(t, vars(study))) for t in {list(THINGS.values())!r}])\n"
     )
     described = [

@@ -22,13 +22,14 @@ class Unrolled(diffrax.AbstractSolver):
     step; its own `root_finder` is not used.
 
     **Arguments:** `solver`, a Runge–Kutta solver such as `diffrax.Tsit5()` or `diffrax.Kvaerno5()`;
-    `tolerance`, to which stages are solved, relative to 1 + |y|.
+    `tolerance`, to which stages are solved, relative to 1 + |y| (by default
+    1e-12).
 
     **Raises:** `TypeError` if `solver` is not one.
     """
 
     solver: Any  # not yet known to be a solver when it is checked below
-    tolerance: Any = eqx.field(kw_only=True, default=1e-12)
+    tolerance: Any = eqx.field(kw_only=True, default=None)
     term_structure: ClassVar[Any] = diffrax.AbstractTerm
 
     def __check_init__(self):
@@ -83,11 +84,12 @@ class Unrolled(diffrax.AbstractSolver):
         """The step of an implicit solver; its error is infinite where a stage was not solved."""
         tableau = _tableau(self.solver)
         flat, unravel = ravel_pytree(y0)
+        tolerance = 1e-12 if self.tolerance is None else self.tolerance
 
         def field(t, y):
             return ravel_pytree(terms.vf(t, unravel(y), args))[0]
 
-        stages, left = implicit_stages(tableau, field, t0, control, flat, self.tolerance)
+        stages, left = implicit_stages(tableau, field, t0, control, flat, tolerance)
         stages = [unravel(control * k) for k in stages]
         error = jtu.tree_map(lambda e: jnp.abs(e) + left, _combine(None, tableau.b_error, stages))
         y1 = _combine(y0, tableau.b_sol, stages)
