@@ -5,7 +5,6 @@ import shutil
 from functools import partial
 from pathlib import Path
 
-import headline_numbers
 import jax
 import numpy as np
 import pytest
@@ -13,6 +12,8 @@ import vi_jax as vi
 from headlines import FINGERPRINT, fingerprint, headlines, keep
 from vi_jax.paper.response import RATIO, _branches, _closed_forms, with_numbers
 from vi_jax.plot.stamp import stamped
+
+import headline_numbers
 
 FOLDER = Path(__file__).parents[2] / "experiments"
 
