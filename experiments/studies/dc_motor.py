@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import vi_jax as vi
 from matplotlib.figure import Figure
+from vi_jax.plot.colors import BLUE, GREEN, ORANGE, RED
 
 jax.config.update("jax_enable_x64", True)
 
@@ -134,22 +135,23 @@ print(f"{lost} motions lost; min Y changes by at most {worst.max():.1e} τe")
 
 figure = Figure(figsize=(11, 4.2), layout="constrained")
 left, right = figure.subplots(1, 2)
-colors = ("#17a2b8", "#1a9641", "#1f4fd8", "k")
+colors = (GREEN, ORANGE, BLUE, RED)
 for j, torque in enumerate(TORQUES):
-    left.loglog(TIMES, low[:, j], "o-", color=colors[j], ms=4, label=f"T0 = {torque:g} N·m")
+    left.loglog(
+        TIMES, low[:, j], "os^D"[j] + "-", color=colors[j], ms=4, label=f"T0 = {torque:g} N·m"
+    )
 guide = np.array([TIMES[0], TIMES[-1]])
 left.loglog(guide, worst.max() * guide, color="0.6", lw=1, ls="--", label="first order")
-left.set(xlabel="τe = ωL/R", ylabel="largest change of min Y (a)")
+left.set(xlabel="electrical time τe = ωL/R (1/ω)", ylabel="largest change of min Y (a)")
 left.set_title("2π motions, κ from 0.5 to 1.9", fontsize=10)
 left.legend(frameon=False, fontsize=9)
 shown = 10.0
-for time, color, style in ((None, "k", "-"), (0.1, "#1a9641", "--"), (1.0, "#1f4fd8", "-"),
-                           (3.0, "#d62728", "-")):  # fmt: skip
+for time, color, style in ((None, "k", "-"), (0.1, GREEN, "--"), (1.0, BLUE, "-"), (3.0, RED, "-")):
     if (shown, time) in ups:
         name = "straight line" if time is None else f"τe = {time:g}"
         right.plot(ticks, ups[shown, time], color=color, ls=style, lw=1.4, label=name)
-right.axhline(0.9, color="0.8", lw=0.8, zorder=0)
-right.set(xlabel="time τ", ylabel="crank speed φ'/ω", xlim=(0, 40))
+right.axhline(0.9, color="0.6", lw=0.8, ls=":", zorder=0, label="κ")
+right.set(xlabel="time τ (1/ω)", ylabel="crank speed φ'/ω", xlim=(0, 40))
 right.set_title(f"switched on at rest, T0 = {shown:g} N·m, κ = 0.9", fontsize=10)
 right.legend(frameon=False, fontsize=9, loc="lower right")
 for ax in (left, right):

@@ -22,6 +22,7 @@ import vi_jax as vi
 from matplotlib.figure import Figure
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
+from vi_jax.plot.colors import BLUE, GREEN, RED
 
 jax.config.update("jax_enable_x64", True)
 
@@ -72,7 +73,7 @@ LAWS = {
     "the same, never pulling": {"damping": damping(1.0), "adhesive": False},
     "Hertz, never pulling": {"damping": damping(1.5), "adhesive": False, "exponent": 1.5},
 }
-COLOURS = dict(zip(LAWS, ("tab:blue", "tab:green", "tab:red"), strict=True))
+COLOURS = dict(zip(LAWS, (BLUE, GREEN, RED), strict=True))
 
 rigid = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.0)
 CLOSED = {cycles: vi.closed_form_orbits(rigid, cycles=cycles) for cycles in (1, 2)}

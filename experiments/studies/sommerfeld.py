@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 import vi_jax as vi
 from matplotlib.figure import Figure
+from vi_jax.plot.colors import BLUE, GREEN, RED, once
 
 jax.config.update("jax_enable_x64", True)
 
@@ -125,27 +126,33 @@ print(table)
 
 figure = Figure(figsize=(11, 4.4), layout="constrained")
 left, right = figure.subplots(1, 2, sharex=True, sharey=True)
-colors = ("#d62728", "#1f4fd8", "k")
+colors = (RED, BLUE, GREEN)
 for i, strength in enumerate(STRENGTHS):
     speeds, kappa, _ = averaged(strength)
     inside = (kappa >= LOW) & (kappa <= HIGH)
-    left.plot(np.where(inside, kappa, np.nan), speeds, color=colors[i], lw=4, alpha=0.2)
-    vi.plot_branch(branches[strength], ax=left, y="frequency_ratio", color=colors[i], lw=1.2)
+    left.plot(
+        np.where(inside, kappa, np.nan), speeds, color=colors[i], lw=5, alpha=0.25,
+        label=once(left, "averaged"),
+    )  # fmt: skip
+    vi.plot_branch(
+        branches[strength], ax=left, y="frequency_ratio", color=colors[i], lw=1.2, legend=False,
+        label=f"τ0 = {strength:g}",
+    )  # fmt: skip
     for ax, sweep in ((left, free), (right, held)):
         for row, marker in ((i, "^"), (i + len(STRENGTHS), "v")):
             shown = slice(None, None, 3)
             ratio = np.asarray(sweep.frequency_ratio)[row][shown]
             ax.plot(
                 np.asarray(sweep.values)[row][shown], ratio, marker, color=colors[i], ms=3.5,
-                mfc="none", mew=0.8, label=f"τ0 = {strength:g}" if marker == "^" else None,
+                mfc="none", mew=0.8, label=once(ax, "run-up" if marker == "^" else "close-down"),
             )  # fmt: skip
 for ax, title in ((left, "no stop"), (right, f"a stop at {GAP:g} m r/M")):
-    ax.plot([LOW, HIGH], [LOW, HIGH], color="0.8", lw=0.8, zorder=0)
-    ax.set(xlabel="motor control κ", ylabel="mean speed ζ", xlim=(LOW, HIGH), ylim=(LOW, HIGH))
+    ax.plot([LOW, HIGH], [LOW, HIGH], color="0.6", lw=0.8, ls=":", zorder=0, label="ζ = κ")
+    ax.set(xlabel="motor control κ", ylabel="mean speed ζ (ω)", xlim=(LOW, HIGH), ylim=(LOW, HIGH))
     ax.set_title(title, fontsize=10)
     ax.spines[["top", "right"]].set_visible(False)
 right.set_ylabel("")
-left.legend(frameon=False, fontsize=9, loc="upper left", title="run-up ▵, close-down ▿")
+left.legend(frameon=False, fontsize=8, loc="upper left")
 
 # %%
 text = f"""# The Sommerfeld effect of an unbalanced rotor

@@ -13,7 +13,7 @@ import vi_jax
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from vi_jax import lanes
-from vi_jax.lanes import machine
+from vi_jax.lanes import _code, _primitive, machine
 
 ROWS = 12
 
@@ -272,9 +272,8 @@ def test_shards_of_a_batch_take_the_same_road():
 
 
 def test_what_has_no_vector_form_takes_the_other_road_and_says_so():
-    from vi_jax.lanes import _primitive as primitive
 
-    primitive._tell.cache_clear()
+    _primitive._tell.cache_clear()
     with pytest.warns(UserWarning, match="`sort`"):
         out = jax.vmap(sorting)(jnp.asarray([0.5, 3.0]))
     np.testing.assert_array_equal(out, [0.5, 1.0])
@@ -284,23 +283,68 @@ def test_what_has_no_vector_form_takes_the_other_road_and_says_so():
         jax.vmap(lambda x: sorting(x, road="xla"))(jnp.asarray([0.5, 3.0]))
 
 
+def failing(*_):
+    raise RuntimeError("no such instruction")
+
+
 @pytest.mark.parametrize("fault", ["missing", "broken"])
 def test_without_llvm(fault, monkeypatch):
-    from vi_jax.lanes import _primitive as primitive
-
-    for cached in (primitive._tell, machine._llvm, machine._register_bits):
+    for cached in (_primitive._tell, _code.llvm, machine._register_bits):
         cached.cache_clear()
     if fault == "missing":
         monkeypatch.setitem(sys.modules, "llvmlite.binding", None)
     else:
-        monkeypatch.setattr(machine, "kernel_text", lambda *_: "nonsense")
+        monkeypatch.setattr(_code, "compiled", failing)
     try:
-        with pytest.warns(UserWarning, match="llvmlite" if fault == "missing" else "LLVM"):
+        with pytest.warns(UserWarning, match="llvmlite" if fault == "missing" else "LLVM: no such"):
             out = jax.vmap(lambda x: fall(x, 9.8125)[0][0])(jnp.linspace(1.0, 2.0, 5))
     finally:
-        machine._llvm.cache_clear()
+        _code.llvm.cache_clear()
         machine._register_bits.cache_clear()
     np.testing.assert_allclose(out, np.sqrt(2 * np.linspace(1, 2, 5) / 9.8125), rtol=1e-12)
+
+
+def test_a_program_that_llvm_cannot_compile(monkeypatch):
+    def begin(x):
+        return x, lanes.Emitted(True, False, None)
+
+    def step(x, carry):
+        return carry + 0.15625, lanes.Emitted(False, False, None)
+
+    _code.llvm()  # which it can do at first
+    monkeypatch.setattr(_code, "compiled", failing)
+    with pytest.raises(jax.errors.JaxRuntimeError, match=r"LLVM: no such.*road\(.xla.\)"):
+        jax.block_until_ready(lanes.run(begin, step, lambda x, carry: carry, 1.0, rows=0)[0])
+
+
+def test_programs_are_kept_where_jax_keeps_its_own(monkeypatch, tmp_path):
+    def fallen():
+        kernel = machine.Kernel("define void @kernel() { ret void }", None, 8)
+        return kernel._call
+
+    monkeypatch.setattr(_code, "_store", lambda: tmp_path)
+    fallen()
+    (kept,) = tmp_path.rglob("*.o")
+    content = kept.read_bytes()
+    with monkeypatch.context() as patched:
+        patched.setattr(_code, "compiled", failing)
+        fallen()  # from the file
+        kept.write_bytes(content[:-1])
+        with pytest.raises(RuntimeError, match="LLVM: no such"):
+            fallen()
+    fallen()
+    assert kept.read_bytes() == content
+
+
+def test_where_programs_are_kept(tmp_path):
+    before = jax.config.jax_compilation_cache_dir  # pyright: ignore
+    try:
+        jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+        assert _code._store() == tmp_path / "vi_jax_lanes"
+        jax.config.update("jax_compilation_cache_dir", "gs://far/away")
+        assert _code._store() is None
+    finally:
+        jax.config.update("jax_compilation_cache_dir", before)
 
 
 def test_what_a_step_must_give():

@@ -14,10 +14,11 @@ from typing import Any
 
 import numpy as np
 
+from ._code import begun, function_at, llvm
 from ._context import within
 from ._kernel import kernel_text
 from ._program import Program
-from ._vector import Unsupported, check
+from ._vector import check
 
 _KEPT = 64
 
@@ -51,58 +52,31 @@ def cores() -> int:
 
 
 @functools.cache
-def _llvm() -> Any:
-    """llvmlite's binding, ready for this processor. **Raises:** `Unsupported` without it."""
-    try:
-        import llvmlite.binding as llvm
-    except ImportError as error:
-        raise Unsupported(f"no llvmlite ({error})") from None
-    llvm.initialize_native_target()
-    llvm.initialize_native_asmprinter()
-    return llvm
-
-
-@functools.cache
 def _register_bits(cpu: str | None) -> int:
     """Width of the vector registers."""
-    llvm = _llvm()
     if cpu is not None:
         return {"x86-64-v4": 512, "x86-64-v3": 256}.get(cpu, 128)
-    features = llvm.get_host_cpu_features()
+    features = llvm().get_host_cpu_features()
     if features.get("avx512f") and features.get("avx512dq") and features.get("avx512vl"):
         return 512
     return 256 if features.get("avx2") else 128
 
 
 class Kernel:
-    """Machine code of a program. It lives as long as this object."""
+    """Machine code of a program, perhaps still to come. It lives as long as this object."""
 
     def __init__(self, text: str, cpu: str | None, width: int):
         self.key, self.width = key_of(text, cpu), width
-        llvm = _llvm()
-        target = llvm.Target.from_default_triple()
-        if cpu is None:
-            features = llvm.get_host_cpu_features().flatten()
-            machine = target.create_target_machine(
-                cpu=llvm.get_host_cpu_name(), features=features, opt=1
-            )
-        else:
-            machine = target.create_target_machine(cpu=cpu, features="", opt=1)
-        module = llvm.parse_assembly(text)
-        module.triple = llvm.get_default_triple()
-        module.data_layout = str(machine.target_data)
-        options = llvm.create_pipeline_tuning_options(speed_level=1)
-        options.loop_vectorization = options.slp_vectorization = False
-        options.loop_unrolling = False
-        builder = llvm.create_pass_builder(machine, options)
-        builder.getModulePassManager().run(module, builder)
-        self._engine = llvm.create_mcjit_compiler(module, machine)
-        self._engine.finalize_object()
-        address = self._engine.get_function_address("kernel")
-        pointer = ctypes.c_void_p
-        self._call = ctypes.CFUNCTYPE(
-            None, pointer, pointer, pointer, ctypes.c_int64, pointer, pointer
-        )(address)
+        self._code = begun(text, cpu)
+
+    @functools.cached_property
+    def _call(self) -> Any:
+        """**Raises:** `RuntimeError` if LLVM could not compile it."""
+        try:
+            self._engine, address = self._code.result()
+        except RuntimeError as error:
+            raise RuntimeError(f'LLVM: {error}; `vi_jax.road("xla")` does without it') from None
+        return function_at(address)
 
     def run(self, inputs: list[int], strides: list[int], outputs: list[int], lanes: int) -> None:
         """All lanes, from and to the arrays at these addresses.
@@ -167,11 +141,7 @@ def kernel_of(program: Program) -> Kernel:
     with _lock:
         kernel = _living.get(key)
         if kernel is None:
-            try:
-                kernel = Kernel(text, cpu, width)
-            except RuntimeError as error:
-                raise Unsupported(f"LLVM: {error}") from None
-            _living[key] = kernel
+            kernel = _living[key] = Kernel(text, cpu, width)
         _recent[key] = kernel
         _recent.move_to_end(key)
         while len(_recent) > _KEPT:
