@@ -9,6 +9,12 @@ import numpy as np
 import pytest
 import vi_jax as vi
 
+
+def quick(cases, *names):
+    """Of these cases only the named ones run by default; the rest with the longer studies."""
+    return [x if x in names else pytest.param(x, marks=pytest.mark.slow) for x in cases]
+
+
 # Reverse mode takes ten times as long to compile.
 each_mode = pytest.mark.parametrize(
     "mode", ["forward", pytest.param("reverse", marks=pytest.mark.slow)]

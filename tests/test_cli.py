@@ -59,6 +59,7 @@ def test_a_path_that_cannot_be_written(capsys, monkeypatch, out):
     assert printed.err.count("\n") == 1 and "error" in printed.err and not printed.out
 
 
+@pytest.mark.slow
 def test_interrupt_keeps_what_was_written(tmp_path, capsys, monkeypatch):
     from vi_jax.paper import report
 

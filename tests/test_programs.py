@@ -46,6 +46,7 @@ def test_the_oldest_programs_are_dropped_in_time(watch, monkeypatch):
     np.testing.assert_array_equal(section(1), first)
 
 
+@pytest.mark.slow
 def test_what_was_called_last_goes_last(watch, monkeypatch):
     dropped = []
 

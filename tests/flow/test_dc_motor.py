@@ -259,6 +259,7 @@ def test_fixed_steps_stay_stable(te):
     np.testing.assert_allclose(run.last.Y, exact.last.Y, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_periodic_motions_and_what_follows_from_them():
     scene = machine()
     settled = vi.simulate(scene, scene.start(Y=1.5, V=1.0), 1, settle=300).last

@@ -11,6 +11,8 @@ import pytest
 import vi_jax as vi
 from vi_jax.scene.base import AbstractScene
 
+from differences import quick
+
 IDEAL = vi.Oscillator(0.05)
 ONE, TWO = (vi.RigidStop(1.3, 0.6),), (vi.RigidStop(1.3, 0.6), vi.RigidStop(1.5, 0.4, "left"))
 PRESSED = (vi.RigidStop(0.3, 0.4),)
@@ -37,7 +39,7 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", quick(CASES, "exact flight", "adaptive steps", "motor"))
 def test_roads_agree(name):
     make, method, options = CASES[name]
 
@@ -116,7 +118,9 @@ class Odd(AbstractScene):
         )  # fmt: skip
 
 
-@pytest.mark.parametrize("table", [None, jnp.array([0.0, 0.4, -0.2, 0.1, 0.0])])
+@pytest.mark.parametrize(
+    "table", [None, pytest.param(jnp.array([0.0, 0.4, -0.2, 0.1, 0.0]), marks=pytest.mark.slow)]
+)
 def test_a_scene_of_ones_own(table):
     """On the fast road, or told why not; right on either."""
     start = Place(jnp.asarray(0.1), jnp.asarray(0.5), jnp.zeros(3))

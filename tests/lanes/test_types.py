@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 CHECKED = """
 import jax, jaxtyping
 import jax.numpy as jnp
@@ -35,6 +37,7 @@ assert bool(vi.simulate(valve, valve.start(), 4).successful)
 """
 
 
+@pytest.mark.slow
 def test_the_types_of_the_lanes_are_right():
     done = subprocess.run(
         [sys.executable, "-W", "error::UserWarning", "-c", CHECKED], capture_output=True, text=True

@@ -13,6 +13,8 @@ import pytest
 import vi_jax as vi
 from scipy.integrate import solve_ivp
 
+from differences import quick
+
 matplotlib.use("Agg")
 
 CLOSE = vi.Adaptive(rtol=1e-12)
@@ -271,9 +273,7 @@ def quietly(call):
         return call()
 
 
-@pytest.mark.parametrize(
-    "kind", [dict, *(pytest.param(kind, marks=pytest.mark.slow) for kind in (Named, Plain))]
-)
+@pytest.mark.parametrize("kind", quick([dict, Named, Plain]))
 def test_a_state_of_any_kind(kind):
     machine, plain = Own(kind), Own(Plain)
     run = vi.simulate(machine, machine.start(), 5, samples=8)
@@ -330,7 +330,7 @@ MACHINES = {
 }
 
 
-@pytest.mark.parametrize("name", MACHINES)
+@pytest.mark.parametrize("name", quick(MACHINES, "two bodies"))
 def test_every_verb_takes_it(name):
     machine, parameter, values, (place, speed) = MACHINES[name]
     start = machine.start()

@@ -11,7 +11,7 @@ import pytest
 import vi_jax as vi
 from scipy.integrate import solve_ivp
 
-from differences import check_derivatives, each_mode
+from differences import check_derivatives, each_mode, quick
 
 matplotlib.use("Agg")
 
@@ -267,7 +267,7 @@ def test_derivatives_of_a_machine(name, mode):
     check_derivatives(mode, last, [float(getattr(machine, parameter))], impacts=0)
 
 
-@pytest.mark.parametrize("name", MACHINES)
+@pytest.mark.parametrize("name", quick(MACHINES, "pair"))
 def test_every_verb_takes_a_machine(name, tmp_path):
     machine = MACHINES[name]
     parameter, values, start = {
