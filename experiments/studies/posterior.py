@@ -4,7 +4,7 @@
 # A body is watched for four drive cycles as it leaves rest and meets its stop a few times: 64
 # noisy positions. What can be known from them of the restitution k, the gap d and the damping
 # ratio ξ is their posterior. It is sampled here by the no-U-turn sampler of BlackJAX, with
-# gradients that go through the impacts (`by_columns`), and kept for ArviZ.
+# gradients that go through the impacts, and kept for ArviZ.
 #
 # Whether such intervals are honest is tested as Talts et al. (arXiv 1804.06788) do: numbers are
 # drawn from the prior, a record is simulated with each, and the rank of the true number among the
@@ -65,7 +65,6 @@ def run_of(z: Any) -> vi.Run:
     return vi.simulate(scene, scene.start(), CYCLES, method=vi.ExactFlight(), samples=SAMPLES)
 
 
-@vi.by_columns
 def positions(z: Any) -> Any:
     """What would be seen without noise."""
     samples = run_of(z).samples

@@ -230,15 +230,15 @@ def test_energy_is_accounted_for(clock):
 def test_derivatives_beside_differences(mode):
     """By an electrical, a mechanical and a starting number at once."""
 
-    def last(values, **options):
+    def last(values):
         scene = machine(electrical_time=values[0], control=values[1])
         start = scene.start(Y=0.4, W=0.7, M=values[2])
         run = vi.simulate(scene, start, 3, method=vi.FixedStep(steps_per_cycle=24),
-            record="sections", rests=False, **options,
+            record="sections", rests=False,
         )  # fmt: skip
         return run.last, run.impacts
 
-    check_derivatives(mode, last, [0.4, 0.9, 0.1], tolerance=1e-7, impacts=2, max_steps=200)
+    check_derivatives(mode, last, [0.4, 0.9, 0.1], tolerance=1e-7, impacts=2)
 
 
 def test_a_stall_points_to_the_time_clock():

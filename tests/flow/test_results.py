@@ -67,7 +67,6 @@ def test_words():
         ({"cycles": 2.5}, TypeError, r"`cycles` must be an integer, but got 2.5"),
         ({"clock": "phases"}, ValueError, r"`clock` must be one of 'phase', 'time', but got"),
         ({"record": "all"}, ValueError, r"`record` must be one of 'motion', 'sections'"),
-        ({"adjoint": "back"}, ValueError, r"`adjoint` must be one of"),
         ({"start": SCENE.start(Y=2.5)}, ValueError, r"`start` must not lie beyond a stop.*0.5 bey"),
         ({"start": vi.Parameters().scene().start()}, TypeError, r"`start` must be a `Oscillator"),
         (

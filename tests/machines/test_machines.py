@@ -259,9 +259,9 @@ def test_derivatives_of_a_machine(name, mode):
         name, "cubic"
     )
 
-    def last(value, **options):
+    def last(value):
         changed = eqx.tree_at(lambda m: getattr(m, parameter), machine, value[0])
-        run = vi.simulate(changed, starts_of(machine)[0], 1, method="reference", **options)
+        run = vi.simulate(changed, starts_of(machine)[0], 1, method="reference")
         return run.last, run.impacts
 
     check_derivatives(mode, last, [float(getattr(machine, parameter))], impacts=0)

@@ -290,7 +290,7 @@ def test_derivatives_through_a_contact(options, method, mode):
         return run.last, run.impacts
 
     step = [1e-6, 6e-5, 1e-6, 1e-6]
-    check_derivatives(mode, last, [0.7, 60.0, 0.5, 0.3], step=step, impacts=0, max_steps=300)
+    check_derivatives(mode, last, [0.7, 60.0, 0.5, 0.3], step=step, impacts=0)
 
 
 @pytest.mark.parametrize(

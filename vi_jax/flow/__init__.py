@@ -16,4 +16,3 @@ from .results import Samples as Samples
 from .simulate import simulate as simulate
 from .suggest import Suggestion as Suggestion
 from .suggest import suggest_method as suggest_method
-from .tangent import by_columns as by_columns

@@ -114,8 +114,6 @@ class Plan(eqx.Module):
     """Whether the log lists switches too, as stops beyond the last, and counts them."""
     rests: bool = eqx.field(static=True)
     """Whether the body may come to rest on a stop."""
-    bound: int = eqx.field(static=True)
-    """Steps that reverse mode must be able to store; 0 in forward mode."""
     road: str = eqx.field(static=True)
     """Which compiler runs it (see `lanes.road`)."""
     # Numbers that are no part of the program, so that others are not another one.

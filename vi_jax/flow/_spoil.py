@@ -10,50 +10,61 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
 
-from ._lane import Plan
 from .results import Run
 
 
-def spoiled(plan: Plan, start: Any, run: Run) -> Run:
+def spoiled(run: Run) -> Run:
     """The same run, whose derivatives are NaN if it failed."""
     numbers, rest = eqx.partition(run, eqx.is_inexact_array)
-    if plan.bound:
-        inputs = eqx.filter((plan.scene, start), eqx.is_inexact_array)
-        numbers = _backward(run.successful, inputs, numbers)
-    else:
-        numbers = _forward(run.successful, numbers)
-    return eqx.combine(numbers, rest)
+    return eqx.combine(_marked(run.successful, numbers), rest)
 
 
 @jax.custom_jvp
-def _forward(good: Any, numbers: Any) -> Any:
+def _marked(good: Any, numbers: Any) -> Any:
     return numbers
 
 
-@_forward.defjvp
+@_marked.defjvp
 def _(primals, tangents):
     (good, numbers), (_, rates) = primals, tangents
-    return numbers, jtu.tree_map(lambda rate: jnp.where(good, rate, jnp.nan), rates)
+    return numbers, jtu.tree_map(lambda rate: _spoil.bind(good, rate, back=False), rates)
 
 
-@jax.custom_vjp
-def _backward(good: Any, inputs: Any, numbers: Any) -> Any:
-    return numbers
+# Linear as JAX understands it, with a transpose that arithmetic could not have: what asks for
+# nothing of a lane, as a loss that leaves failed ones out, gets nothing.
+_spoil = Primitive("spoil")
 
 
-def _begin(good, inputs, numbers):
-    return numbers, (good, inputs)
+def _value(good, x, *, back: bool):
+    good = jnp.reshape(good, good.shape + (1,) * (x.ndim - good.ndim))
+    return jnp.where(good | (x == 0) if back else good, x, jnp.nan)
 
 
-def _end(kept, weights):
-    # What asks for nothing of this lane, as a loss that leaves failed ones out, gets nothing.
-    good, inputs = kept
-    asked = jnp.asarray(False)
-    for weight in jtu.tree_leaves(weights):
-        asked = asked | jnp.any(weight != 0)
-    blame = jtu.tree_map(lambda x: jnp.where(asked & ~good, jnp.nan, jnp.zeros_like(x)), inputs)
-    return None, blame, weights
+def _batched(args, dims, *, back: bool):
+    size = next(x.shape[d] for x, d in zip(args, dims, strict=True) if d is not None)
+    good, x = (
+        jnp.broadcast_to(x, (size, *x.shape)) if d is None else jnp.moveaxis(x, d, 0)
+        for x, d in zip(args, dims, strict=True)
+    )
+    return _spoil.bind(good, x, back=back), 0
 
 
-_backward.defvjp(_begin, _end)
+def _jvp(primals, tangents, *, back: bool):
+    (good, x), (_, rate) = primals, tangents
+    out = _spoil.bind(good, x, back=back)
+    return out, rate if type(rate) is ad.Zero else _spoil.bind(good, rate, back=back)
+
+
+def _transposed(weight, good, _, *, back: bool):
+    return None, weight if type(weight) is ad.Zero else _spoil.bind(good, weight, back=not back)
+
+
+_spoil.def_abstract_eval(lambda good, x, *, back: x)
+_spoil.def_impl(_value)
+batching.primitive_batchers[_spoil] = _batched
+ad.primitive_jvps[_spoil] = _jvp
+ad.primitive_transposes[_spoil] = _transposed
+mlir.register_lowering(_spoil, mlir.lower_fun(_value, multiple_results=False))

@@ -24,9 +24,6 @@ from ..scene import AbstractScene, Scene
 from ._lane import Plan
 from .methods import MethodLike, chosen
 
-# Steps in a cycle that reverse mode makes room for, unless the caller says otherwise.
-_STEPS = 65536
-
 
 def planned(
     scene: AbstractScene,
@@ -39,7 +36,6 @@ def planned(
     samples: int = 0,
     impact_log: int = 0,
     record: str = "motion",
-    reverse: bool = False,
     rests: bool | None = None,
     max_impacts: int = 1000,
     max_steps: int | None = None,
@@ -89,11 +85,6 @@ def planned(
                 f"Argument `{name}` must be at most {_most(dtype)}, up to which numbers of type "
                 f"{dtype} count, but got {value}."
             )
-    bound = 0
-    if reverse:
-        if max_steps is None and concrete(settle) is None:
-            raise ValueError("Argument `max_steps` must be given where `settle` is traced.")
-        bound = int(_STEPS * (cycles + settle) if max_steps is None else max_steps)
     plan = Plan(
         scene=scene,
         method=method,
@@ -103,7 +94,6 @@ def planned(
         log=impact_log,
         log_switches=log_switches,
         rests=(scene.may_rest() if rests is None else rests) and bool(scene.stops),
-        bound=bound,
         road=lanes.current_road(),
         settle=_countable(cycles, settle, max(1, samples), dtype),
         max_steps=jnp.asarray(jnp.inf if max_steps is None else max_steps, dtype),

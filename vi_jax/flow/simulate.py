@@ -10,16 +10,13 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 
 from .. import lanes
-from .._checks import (
-    flag,
-    one_of,
-)
+from .._checks import flag
 from .._programs import compiled
 from ..scene import AbstractScene
 from ._lane import Plan, Record
 from ._spoil import spoiled
 from .arguments import planned
-from .loop import Ends, run_forward, run_reverse
+from .loop import Ends, run_lane
 from .methods import MethodLike
 from .results import Errors, ImpactLog, Run, Samples, reason
 
@@ -36,7 +33,6 @@ def simulate(
     impact_log: int = 0,
     record: str = "motion",
     estimate: bool = False,
-    adjoint: str = "forward",
     rests: bool | None = None,
     max_impacts: int = 1000,
     max_steps: int | None = None,
@@ -65,7 +61,6 @@ def simulate(
       (then `None`), which is faster.
     - `estimate`: run it again by a tighter method (`AbstractMethod.tighter`) and give the
       differences as `Run.errors`, for two to three times the work.
-    - `adjoint`: `"forward"` (fast; `jvp`, `jacfwd`) or `"reverse"` (checkpointed; `vjp`, `grad`).
     - `rests`: whether the body may come to rest on a stop; `False` leaves that out of the program,
       which is a fifth faster. By default it is left out if all gaps are known and greater than 1,
       so that nothing can press the body on.
@@ -81,11 +76,10 @@ def simulate(
     Starts and parameters that are being traced cannot be looked at; such a lane ends with
     `RESULTS.bad_start` and harms no other.
     """
-    one_of("adjoint", adjoint, ("forward", "reverse"))
     estimate, throw = flag("estimate", estimate), flag("throw", throw)
     plan, start = planned(
         scene, start, cycles, settle=settle, method=method, clock=clock, samples=samples,
-        impact_log=impact_log, record=record, reverse=adjoint == "reverse", rests=rests,
+        impact_log=impact_log, record=record, rests=rests,
         max_impacts=max_impacts, max_steps=max_steps,
     )  # fmt: skip
     with lanes.interruptible():
@@ -102,8 +96,7 @@ def simulate(
 
 @compiled
 def _simulate(plan: Plan, start: Any, sampled: bool) -> Run:
-    run = run_reverse if plan.bound else run_forward
-    return spoiled(plan, start, collect(plan, sampled, *run(plan, start)))
+    return spoiled(collect(plan, sampled, *run_lane(plan, start)))
 
 
 def _errors(run: Run, tighter: Run) -> Errors:
@@ -138,7 +131,7 @@ def simulate_pool(
 
     def one(value, wanted):
         plan, start = planned(*lane_of(value), cycles, **options)
-        return spoiled(plan, start, collect(plan, False, *run_forward(plan, start, wanted)))
+        return spoiled(collect(plan, False, *run_lane(plan, start, wanted)))
 
     if wanted is None:
         wanted = jnp.ones(jtu.tree_leaves(values)[0].shape[0], bool)

@@ -2,6 +2,7 @@
 
 import functools
 import warnings
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,12 +17,6 @@ from ._program import Program, spread
 from ._vector import Unsupported
 from .call import header, registered
 from .machine import kernel_of
-
-FORWARD_ONLY = (
-    "This loop is differentiated forward only (`jax.jvp`, `jax.jacfwd`). For `jax.grad` by a few "
-    "numbers decorate the function with `vi_jax.by_columns`; by many, where there is an argument "
-    '`adjoint`, ask for `adjoint="reverse"`.'
-)
 
 lanes_p = Primitive("lanes")
 lanes_p.multiple_results = True
@@ -116,8 +111,52 @@ def _put_off(tangents) -> bool:
     return any(type(x).__name__ == "JaxprTracer" for x in tangents)
 
 
-def _transposed(*args, **params):
-    raise NotImplementedError(FORWARD_ONLY)
+def _transposed(cotangents, *args, program: Program, road: str):
+    """By columns: the program is run along every number of the tangents asked for, several of them
+    with one motion, and what comes of each is weighed.
+
+    A reverse pass would have to take the steps again, and rounding may have them decide otherwise
+    about an event than the first time.
+    """
+    places: dict[int, slice] = {}  # of each tangent asked for, among all their numbers
+    number = 0
+    for i, (x, aval) in enumerate(zip(args, program.in_avals, strict=True)):
+        if ad.is_undefined_primal(x):
+            places[i] = slice(number, number + aval.size)
+            number += aval.size
+    args = [x if i in places else jnp.asarray(x) for i, x in enumerate(args)]
+    batch = program.batch([x.aval.shape if i in places else x.shape for i, x in enumerate(args)])
+    weights = [(k, ct) for k, ct in enumerate(cotangents) if type(ct) is not ad.Zero]
+    size = min(number, _DIRECTIONS)
+    units = jnp.eye(-(-number // size) * size, number)  # filled up: one program for all
+    along = jax.vmap(
+        functools.partial(lanes_p.bind, program=program, road=road),
+        [0 if i in places else None for i in range(len(args))],
+        axis_size=size,
+    )
+    found = []
+    for first in range(0, number, size):
+        given = list(args)
+        for i, place in places.items():
+            aval = program.in_avals[i]
+            some = units[first : first + size, place].astype(aval.dtype)
+            given[i] = some.reshape(size, *aval.shape)
+        columns = along(*given)
+        found.append(sum(_weighed(columns[k], ct, 1 + len(batch)) for k, ct in weights))
+    each = jnp.concatenate(found)  # (numbers, *batch)
+    out: list[Any] = [None] * len(args)
+    for i, place in places.items():
+        aval, x = args[i].aval, each[place]
+        if aval.ndim == program.in_avals[i].ndim:  # one for all lanes
+            x = jnp.sum(x, axis=tuple(range(1, x.ndim)))
+        out[i] = jnp.moveaxis(x, 0, -1).reshape(aval.shape).astype(aval.dtype)
+    return out
+
+
+def _weighed(column, weight, kept: int):
+    """Summed but for the first axes. What has no weight may be no number, as after a failure."""
+    product = jnp.where(weight == 0, 0.0, column * weight)
+    return jnp.sum(product, axis=tuple(range(kept, product.ndim)))
 
 
 def _outs(program: Program) -> int:

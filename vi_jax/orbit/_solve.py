@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 
 from .._programs import compiled
 from ..flow.arguments import planned
-from ..flow.loop import run_forward
+from ..flow.loop import run_lane
 from ..flow.methods import MethodLike
 from ..flow.moving import begin_modes, in_modes, struck_modes
 from ..flow.simulate import collect
@@ -156,7 +156,7 @@ def _listed_events(orbit: Orbit) -> tuple[np.ndarray, list[tuple[float, Event]]]
 @compiled
 def _listed(plan, start):
     """Clock and number of the events of each cycle, when each cycle begins, and their counts."""
-    run = collect(plan, False, *run_forward(plan, start))
+    run = collect(plan, False, *run_lane(plan, start))
     assert run.impact_log is not None and run.duration is not None
     begins = jnp.concatenate([jnp.zeros((1,)), jnp.cumsum(run.duration)])
     if plan.ticks(start):

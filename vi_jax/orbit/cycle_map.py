@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from .._checks import count
-from ..flow import AbstractMethod, Adaptive, by_columns, simulate
+from ..flow import AbstractMethod, Adaptive, simulate
 from ..flow.arguments import as_floats
 from ..flow.methods import MethodLike, chosen
 from ..scene import AbstractScene, Scene
@@ -50,7 +50,6 @@ class CycleMap(eqx.Module):
         return jax.jacfwd(lambda x: ravel_pytree(_end(self, unravel(x)))[0])(x)
 
 
-@by_columns
 def _end(cycle_map: CycleMap, state: Any) -> Any:
     run = simulate(
         cycle_map.scene, state, cycle_map.cycles, method=cycle_map.method, record="sections",

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from .._checks import concrete, count, flag
 from .._programs import compiled
-from ..flow import Run, by_columns, simulate
+from ..flow import Run, simulate
 from ..flow.methods import MethodLike
 from ..scene import AbstractScene, Scene
 from ._root import root_of, shooting_matrix
@@ -176,7 +176,6 @@ class _Seen(NamedTuple):
 
 
 def _follow(arc: CycleMap, state: Any, impact_log: int) -> _Seen:
-    @by_columns
     def seen(arc, state):
         x, unravel = ravel_pytree(state)
 
