@@ -32,7 +32,6 @@ HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/b
 sys.path[:0] = [str(HERE), str(HERE.parent)]
 from peer_codes.pool import Worker, cores, together
 from peer_codes.task import PARAMETERS, Task
-from vi_jax.plot.colors import BLUE, GREEN, RED
 
 QUICK, GPU = "--quick" in sys.argv, "--gpu" in sys.argv
 LANES, CYCLES, ROUNDS, SLOW_ROUNDS = (256, 20, 3, 1) if QUICK else (1024, 200, 5, 3)
@@ -395,16 +394,16 @@ def report(sections: dict[str, dict]) -> str:
 
 
 LOOKS = {
-    f"{OURS} FixedStep": (BLUE, "s"),
-    f"{OURS} Taylor": (BLUE, "o"),
-    f"{OURS} ExactFlight": (BLUE, "*"),
-    "heyoka batch": (RED, "s"),
-    "heyoka scalar": (RED, "o"),
-    "heyoka ensemble": (RED, "^"),
-    "numba": (GREEN, "s"),
-    "diffrax Event Tsit5": ("#5e3c99", "s"),
-    "diffrax Event Dopri8": ("#5e3c99", "o"),
-    "SciPy": ("0.5", "s"),
+    f"{OURS} FixedStep": ("tab:blue", "s"),
+    f"{OURS} Taylor": ("tab:blue", "o"),
+    f"{OURS} ExactFlight": ("tab:blue", "*"),
+    "heyoka batch": ("tab:red", "s"),
+    "heyoka scalar": ("tab:red", "o"),
+    "heyoka ensemble": ("tab:red", "^"),
+    "numba": ("tab:green", "s"),
+    "diffrax Event Tsit5": ("tab:purple", "s"),
+    "diffrax Event Dopri8": ("tab:purple", "o"),
+    "SciPy": ("tab:gray", "s"),
 }
 
 

@@ -31,7 +31,6 @@ import jax.tree_util as jtu
 import numpy as np
 import vi_jax as vi
 from matplotlib.figure import Figure
-from vi_jax.plot.colors import BLUE, GREEN, ORANGE, RED
 
 jax.config.update("jax_enable_x64", True)
 # Single precision is one of the things compared here.
@@ -753,23 +752,21 @@ print(report)
 
 
 # %%
-PURPLE = "#5e3c99"
 STYLE = {
     "ExactFlight": ("k", "*"),
-    "FixedStep Dopri8": (BLUE, "s"),
-    "FixedStep Tsit5": (RED, "s"),
-    "FixedStep Dopri5": (GREEN, "s"),
-    "FixedStep Bosh3": (PURPLE, "s"),
-    "Adaptive Dopri8": (BLUE, "o"),
-    "Adaptive Tsit5": (RED, "o"),
-    "Adaptive Dopri5": (GREEN, "o"),
-    "Adaptive Bosh3": (PURPLE, "o"),
-    "Taylor 12": (ORANGE, "^"),
-    "Taylor 16": (ORANGE, "v"),
-    "Taylor 20": (ORANGE, "D"),
+    "FixedStep Dopri8": ("tab:blue", "s"),
+    "FixedStep Tsit5": ("tab:red", "s"),
+    "FixedStep Dopri5": ("tab:green", "s"),
+    "FixedStep Bosh3": ("tab:purple", "s"),
+    "Adaptive Dopri8": ("tab:blue", "o"),
+    "Adaptive Tsit5": ("tab:red", "o"),
+    "Adaptive Dopri5": ("tab:green", "o"),
+    "Adaptive Bosh3": ("tab:purple", "o"),
+    "Taylor 12": ("gold", "^"),
+    "Taylor 16": ("tab:orange", "^"),
+    "Taylor 20": ("tab:brown", "^"),
 }
-figure = Figure(figsize=(11, 8.6), layout="constrained")
-handles: dict[str, Any] = {}
+figure = Figure(figsize=(11, 8), layout="constrained")
 panels = figure.subplots(2, len(DRIVES), squeeze=False)
 for top, bottom, drive in zip(*panels, DRIVES, strict=True):
     rows, about = results[drive]
@@ -787,8 +784,7 @@ for top, bottom, drive in zip(*panels, DRIVES, strict=True):
             "label": family,
         }
         time_ms = [1e3 * row.seconds for row in mine]
-        errors = [max(row.errors["late95"], 1e-16) for row in mine]
-        (handles[family],) = top.loglog(errors, time_ms, **look)
+        top.loglog([max(row.errors["late95"], 1e-16) for row in mine], time_ms, **look)
         grid = [max(row.wrong, 0.3 / about["firm"]) for row in mine]  # NaN where not scanned
         bottom.loglog(grid, time_ms, **{**look, "ls": ""})
     top.set(
@@ -802,7 +798,7 @@ for top, bottom, drive in zip(*panels, DRIVES, strict=True):
     )
     for ax in (top, bottom):
         ax.grid(alpha=0.3)
-figure.legend(handles=handles.values(), loc="outside lower center", ncols=5, fontsize=8)
+panels[0, 0].legend(frameon=False, fontsize=7)
 numbers = {
     f"{row.choice.name}: median error of the state, 20 cycles, ideal drive": row.errors["state"]
     for row in results["ideal"][0]

@@ -41,7 +41,10 @@ def simulate(
     """Simulate `scene` from `start` for a number of drive cycles.
 
     Works under `jit`, under `vmap` over any leaf of the scene and the start, and is differentiable
-    through impacts. Outside of a transformation it compiles itself, once for each structure.
+    through impacts to any order: forward, and in reverse, which runs forward along each number that
+    is differentiated (a reverse pass would take the steps again, and might decide otherwise about
+    an event) and so costs the more, the more of them there are. Outside of a transformation it
+    compiles itself, once for each structure.
 
     **Arguments:**
 
