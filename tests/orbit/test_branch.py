@@ -1,5 +1,6 @@
 """Branches, what happens on them, and boundaries, beside closed forms and found orbits."""
 
+import dataclasses
 import re
 
 import equinox as eqx
@@ -356,3 +357,21 @@ def test_a_boundary_ends_on_its_bounds(short):
     assert "bounds" in curve.ends
     ends = curve.parameters[[0, -1], 1]
     assert min(abs(ends)) < 1e-9 and max(ends) == pytest.approx(0.004, abs=1e-9)
+
+
+@pytest.mark.slow
+def test_a_motor_hangs_at_resonance_below_a_certain_torque():
+    """Without a stop the response folds where the motor's line, κ - ζ/w0 times τ0, is less steep
+    than the averaged load's steepest fall: Table 1's to first order in the coupling is 0.75461, a
+    torque of 11.49 N·m. There the two folds meet, at the top of their curve."""
+    table = vi.Parameters(torque=8.0, control=0.8)
+    scene = dataclasses.replace(table.scene(), stops=())
+    branch = vi.continue_orbit(
+        vi.find_orbit(scene, scene.start()), parameter="drive.control", bounds=(0.6, 1.6)
+    )
+    first, second = (point for point in branch.special if point.kind == "fold")
+    assert first.parameter > second.parameter
+    curve = vi.boundary(first, parameter="drive.strength", bounds=((0.6, 2.5), (0.3, 2.0)))
+    top = curve.parameters[:, 1].max()
+    assert top == pytest.approx(0.75461, rel=3e-3)
+    assert 8.0 * top / float(scene.drive.strength) == pytest.approx(11.49, rel=3e-3)
