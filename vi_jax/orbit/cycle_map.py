@@ -16,6 +16,7 @@ from ..flow import AbstractMethod, Adaptive, simulate
 from ..flow.arguments import as_floats
 from ..flow.methods import MethodLike, chosen
 from ..scene import AbstractScene, Scene
+from ._columns import by_columns
 
 
 class CycleMap(eqx.Module):
@@ -50,6 +51,7 @@ class CycleMap(eqx.Module):
         return jax.jacfwd(lambda x: ravel_pytree(_end(self, unravel(x)))[0])(x)
 
 
+@by_columns
 def _end(cycle_map: CycleMap, state: Any) -> Any:
     run = simulate(
         cycle_map.scene, state, cycle_map.cycles, method=cycle_map.method, record="sections",

@@ -17,6 +17,7 @@ from .._programs import compiled
 from ..flow import Run, simulate
 from ..flow.methods import MethodLike
 from ..scene import AbstractScene, Scene
+from ._columns import by_columns
 from ._root import root_of, shooting_matrix
 from .cycle_map import CycleMap, adopted, cycle_map
 from .floquet import multipliers_of
@@ -176,6 +177,7 @@ class _Seen(NamedTuple):
 
 
 def _follow(arc: CycleMap, state: Any, impact_log: int) -> _Seen:
+    @by_columns
     def seen(arc, state):
         x, unravel = ravel_pytree(state)
 
