@@ -353,6 +353,25 @@ def dc_motor() -> Expected:
     }
 
 
+def known_machines() -> Expected:
+    """Closed forms, and multipliers and clearances of motions found at them."""
+    e, s = 0.5, 1 / 3
+    fold = (1 + (np.pi / (2 * s)) ** 2) ** 0.5
+    breaks = (np.pi / 2 - 2 / np.pi) / np.sqrt(4 / np.pi**2 + s * s)
+    pair = vi.machines.ImpactPair(half_gap=breaks + 1e-3, restitution=e)
+    orbit = vi.find_orbit(pair, vi.simulate(pair, pair.start(), 1, settle=2000).last, throw=True)
+    branch = vi.continue_orbit(orbit, parameter="half_gap", bounds=(1.28, 1.32))
+    return {
+        "birth of one bounce, e = 0.5": (np.pi * s, 1e-9),
+        "its period doubling, e = 0.5": (
+            float(np.hypot(np.pi * s, 2 * (1 + e * e) / (1 + e) ** 2)), 1e-9,
+        ),
+        "fold of the pair, e = 0.5": (float(fold), 1e-9),
+        "its loss of symmetry, e = 0.5": (branch.special[0].parameter, 1e-8),
+        "grazing of the oscillator, ω = 1": (0.1, 1e-9),
+    }  # fmt: skip
+
+
 def relief_valve() -> Expected:
     """The Hopf bifurcation by eigenvalues, the others from motions beside them."""
 

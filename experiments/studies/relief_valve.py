@@ -85,7 +85,7 @@ rows = ["| q | what happens | period, in maxima of the lift | duration |", "|---
 for branch in (free, hitting, *doubled):
     for point in branch.special:
         rows.append(
-            f"| {point.parameter:.9f} | {point.kind}: {point.detail} | {branch.cycles} | "
+            f"| {point.parameter:.9f} | {point.kind}: {point.detail} | {int(point.orbit.cycles)} | "
             f"{float(point.orbit.duration):.6f} |"
         )
 table = "\n".join(rows)

@@ -13,77 +13,13 @@ import pytest
 import vi_jax as vi
 from scipy.integrate import solve_ivp
 
-from differences import quick
+from differences import check_derivatives, each_mode, quick
+from two_bodies import Pair, TwoBodies
 
 matplotlib.use("Agg")
 
 CLOSE = vi.Adaptive(rtol=1e-12)
 PI = np.pi
-
-
-class Pair(eqx.Module):
-    x1: jax.Array
-    v1: jax.Array
-    x2: jax.Array
-    v2: jax.Array
-
-
-class TwoBodies(vi.AbstractScene):
-    """Two bodies on springs, the first shaken: it has a wall on its right, the second one on its
-    left, and they hit each other where they are 0.4 apart."""
-
-    gap: Any = 0.6
-    restitution: Any = 0.7
-    force: Any = 0.8
-    ratio: Any = 1.0
-    """Mass of the second over that of the first."""
-    damping: Any = 0.1
-    """Of the first; that of the second is 0.05."""
-
-    @property
-    def stops(self):
-        return (
-            vi.RigidStop(self.gap, self.restitution),
-            vi.RigidStop(self.gap, self.restitution, "left", coordinate=1),
-            vi.RigidStop(0.4, self.restitution, coordinate=2),
-        )
-
-    @property
-    def coordinates(self):
-        share = self.ratio / (1 + self.ratio)  # of what they gain relative to each other
-
-        def met(x, Y, V):
-            far, fast = Y - (x.x1 - x.x2), V - (x.v1 - x.v2)
-            return Pair(
-                x.x1 + share * far, x.v1 + share * fast,
-                x.x2 - (1 - share) * far, x.v2 - (1 - share) * fast,
-            )  # fmt: skip
-
-        return (
-            vi.Coordinate(lambda x: x.x1, lambda x: x.v1, lambda x, Y, V: Pair(Y, V, x.x2, x.v2)),
-            vi.Coordinate(
-                lambda x: x.x2, lambda x: x.v2, lambda x, Y, V: Pair(x.x1, x.v1, Y, V), self.ratio
-            ),
-            vi.Coordinate(lambda x: x.x1 - x.x2, lambda x: x.v1 - x.v2, met, share),
-        )
-
-    @property
-    def cycle(self):
-        return 2 * PI
-
-    def position(self, x):
-        return x.x1
-
-    def velocity(self, x):
-        return x.v1
-
-    def field(self, s, x):
-        spring = 0.5 * (x.x1 - x.x2)
-        first = self.force * jnp.cos(s) - x.x1 - spring - self.damping * x.v1
-        return Pair(x.v1, first, x.v2, (spring - x.x2 - 0.05 * x.v2) / self.ratio)
-
-    def start(self):
-        return Pair(*map(jnp.asarray, (0.1, 0.0, -0.1, 0.0)))
 
 
 def flown(gap, k, force, ratio, x, duration):
@@ -149,7 +85,7 @@ METHODS = {
 
 
 def test_two_bodies_with_three_contacts():
-    numbers, starts = drawn(40)
+    numbers, starts = drawn(100)
     runs = [
         vi.jit(jax.vmap(lambda p, x, m=m: lane(p, x, method=m, impact_log=40), in_axes=1))(
             jnp.asarray(numbers), jnp.asarray(starts)
@@ -157,7 +93,7 @@ def test_two_bodies_with_three_contacts():
         for m in METHODS.values()
     ]
     compared, several = 0, np.zeros(3, int)
-    for i in range(40):
+    for i in range(100):
         wanted = flown(*numbers[:, i], starts[:, i], 8 * PI)
         if wanted is None:
             continue
@@ -172,7 +108,25 @@ def test_two_bodies_with_three_contacts():
         found = [leaf[i, -1] for leaf in jax.tree.leaves(runs[0].sections)]
         np.testing.assert_allclose(found, x, atol=1e-8)
         compared, several = compared + 1, several + impacts
-    assert compared > 30 and (several > 40).all()
+    assert compared > 80 and (several > 100).all()
+
+
+@each_mode
+def test_derivatives_of_two_bodies(mode):
+    """By all their numbers and their start, through impacts of all three kinds."""
+    numbers, starts = drawn(100)
+    log = vi.jit(jax.vmap(lambda p, x: lane(p, x, 2, impact_log=16).impact_log.stop, in_axes=1))(
+        jnp.asarray(numbers), jnp.asarray(starts)
+    )
+    kinds = np.stack([(np.asarray(log) == j).any(axis=(1, 2)) for j in range(3)])
+    i = int(np.flatnonzero(kinds.all(axis=0))[0])
+
+    def last(x):
+        run = lane(x[:4], x[4:], 2, method=vi.FixedStep(steps_per_cycle=64))
+        return run.last, run.impacts
+
+    at = [*numbers[:, i], *starts[:, i]]
+    check_derivatives(mode, last, at, step=1e-6, tolerance=2e-6, impacts=3)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -320,38 +274,3 @@ def test_single_precision():
         x, impacts, _ = flown(*numbers[:, i], starts[:, i], 4 * PI)
         assert int(run.impacts.sum()) == sum(impacts)
         np.testing.assert_allclose(jax.tree.leaves(run.last), x, atol=2e-3)
-
-
-MACHINES = {
-    "capsule": (vi.machines.Capsule(), "amplitude", [1.4, 1.6, 1.8], ("place", "speed")),
-    "two bodies": (TwoBodies(), "force", [0.7, 0.8, 0.9], ("x1", "v1")),
-}
-
-
-@pytest.mark.parametrize("name", quick(MACHINES, "two bodies"))
-def test_every_verb_takes_it(name):
-    machine, parameter, values, (place, speed) = MACHINES[name]
-    start = machine.start()
-    run = vi.simulate(machine, start, 6, samples=16, impact_log=8, estimate=True)
-    assert bool(run.successful) and float(run.errors.sections.__dict__[place].max()) < 1e-6
-    vi.plot_history(run, scene=machine)
-    vi.plot_phase_portrait(run, machine)
-    data = quietly(
-        lambda: vi.scan(
-            machine, {parameter: values, f"start.{place}": [0.0, 0.1]}, settle=50, cycles=128,
-            measure=[vi.Regime(), "extremes", vi.Sections(), "impact_rate"],
-        )
-    )  # fmt: skip
-    assert data["period"].shape == (3, 2)
-    swept = vi.sweep(machine, parameter, np.asarray(values), settle=50, cycles=8)
-    assert swept.y_min.shape == (3,) and bool(np.isfinite(swept.y_max).all())
-    vi.plot_sweep(swept)
-    if name == "two bodies":
-        return
-    region = {f"start.{place}": (-0.1, 0.2), f"start.{speed}": (-0.5, 0.5)}
-    found = quietly(lambda: vi.basins(machine, region, resolution=4, settle=50))
-    vi.plot_basins(found)
-    spectrum = vi.lyapunov(machine, start, cycles=40, settle=40)
-    assert spectrum.exponents.shape[-1] == len(jax.tree.leaves(start))
-    # What is counted anew in each cycle has no influence on the next; the motion itself settles.
-    assert float(spectrum.exponents[0]) < 0

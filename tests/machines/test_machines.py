@@ -1,19 +1,14 @@
-"""Ready machines: closed forms of their motions, an independent integration, every verb."""
-
-import warnings
+"""Ready machines: closed forms of their motions, and an independent integration."""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import matplotlib
 import numpy as np
 import pytest
 import vi_jax as vi
 from scipy.integrate import solve_ivp
 
-from differences import check_derivatives, each_mode, quick
-
-matplotlib.use("Agg")
+from differences import check_derivatives, each_mode
 
 PI = np.pi
 BALL, PAIR, DUFFING = vi.machines.BouncingBall, vi.machines.ImpactPair, vi.machines.Duffing
@@ -96,7 +91,11 @@ def test_an_impact_pair_folds_and_loses_its_symmetry(symmetric, restitution):
 def test_the_broken_symmetry_is_switched_onto(symmetric, restitution):
     breaking = next(p for p in symmetric.special if p.kind == "symmetry-breaking")
     broken = vi.continue_orbit(breaking.switch(), parameter="half_gap", bounds=(1.25, 1.5))
-    assert broken.parameter.max() == pytest.approx(breaking.parameter, abs=1e-6)
+    # It ends where it springs: beyond, there are the images of its motions.
+    assert "symmetry-breaking" in broken.ends
+    (spring,) = (p for p in broken.special if p.kind == "symmetry-breaking")
+    assert "fold" not in {p.kind for p in broken.special}
+    assert spring.parameter == pytest.approx(breaking.parameter, abs=1e-9)
     if restitution == 0.5:
         # Speeds of both flights as simulated independently (six digits).
         for orbit in broken.at(1.28):
@@ -108,6 +107,20 @@ def test_the_broken_symmetry_is_switched_onto(symmetric, restitution):
             assert bool(orbit.stable)
         (whole,) = (orbit for orbit in symmetric.at(1.32) if orbit.stable)
         np.testing.assert_allclose(whole.impact_speed, 1.87073, atol=6e-6)
+
+
+@pytest.mark.parametrize("whole", [True, False], ids=["symmetric", "broken"])
+def test_a_curve_of_lost_symmetry_is_its_closed_form(symmetric, whole, restitution):
+    branch, ends = symmetric, (1.2, 1.5)
+    point = next(p for p in branch.special if p.kind == "symmetry-breaking")
+    if not whole:
+        branch = vi.continue_orbit(point.switch(), parameter="half_gap", bounds=ends)
+        point = next(p for p in branch.special if p.kind == "symmetry-breaking")
+    curve = vi.boundary(point, parameter="restitution", bounds=(ends, (0.3, 0.9)))
+    half, e = curve.parameters.T
+    breaks = (PI / 2 - 2 / PI) / np.sqrt(4 / PI**2 + sigma(e) ** 2)
+    np.testing.assert_allclose(half, breaks, atol=1e-12)
+    assert np.ptp(e) > 0.4 and curve.kind == "symmetry-breaking"
 
 
 @pytest.mark.slow
@@ -265,38 +278,6 @@ def test_derivatives_of_a_machine(name, mode):
         return run.last, run.impacts
 
     check_derivatives(mode, last, [float(getattr(machine, parameter))], impacts=0)
-
-
-@pytest.mark.parametrize("name", quick(MACHINES, "pair"))
-def test_every_verb_takes_a_machine(name, tmp_path):
-    machine = MACHINES[name]
-    parameter, values, start = {
-        "ball": ("acceleration", [0.5, 0.6, 0.7], "start.height"),
-        "pair": ("half_gap", [1.5, 1.6, 1.7], "start.place"),
-        "free pair": ("force", [0.5, 0.6, 0.7], "start.place"),
-        "duffing": ("amplitude", [0.3, 0.35, 0.4], "start.Y"),
-    }[name]
-    run = vi.simulate(machine, machine.start(), 6, samples=16, impact_log=8)
-    assert bool(run.successful)
-    vi.plot_history(run, scene=machine)
-    vi.plot_phase_portrait(run, machine)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # lanes of a scan that fail are not what this is about
-        data = vi.scan(
-            machine, {parameter: values, start: [0.3, 0.5]}, settle=50, cycles=128,
-            measure=[vi.Regime(), "extremes", vi.Sections(), "impact_rate"],
-        )  # fmt: skip
-        assert data["period"].shape == (3, 2)
-        second = "start.V" if start == "start.Y" else "start.speed"
-        region = {start: (0.2, 0.8), second: (-0.5, 0.5)}
-        found = vi.basins(machine, region, resolution=4, settle=50)
-    assert found.data.sizes == {start: 4, second: 4}
-    vi.plot_basins(found)
-    swept = vi.sweep(machine, parameter, np.asarray(values), settle=50, cycles=8)
-    assert swept.y_min.shape == (3,)
-    vi.plot_sweep(swept)
-    spectrum = vi.lyapunov(machine, machine.start(), cycles=40, settle=40)
-    assert spectrum.exponents.shape[-1] == len(jax.tree.leaves(machine.start()))
 
 
 @pytest.mark.parametrize(

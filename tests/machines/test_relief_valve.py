@@ -69,12 +69,12 @@ def lanes(flow_rates, starts, cycles, **options):
 
 def test_a_valve_beside_scipy():
     draw, cycles = np.random.default_rng(3).uniform, 6
-    q = np.linspace(0.5, 8.0, 32)
-    starts = {"lift": draw(0.5, 4, 32), "speed": draw(-2, 2, 32), "pressure": draw(8, 14, 32)}
+    q = np.linspace(0.5, 8.0, 100)
+    starts = {"lift": draw(0.5, 4, 100), "speed": draw(-2, 2, 100), "pressure": draw(8, 14, 100)}
     run = lanes(q, starts, cycles, method=CLOSE)
     assert bool(run.successful.all())
     compared = impacts = 0
-    for i in range(32):
+    for i in range(100):
         wanted = flown(q[i], [x[i] for x in starts.values()], cycles)
         if wanted is None:
             continue
@@ -85,7 +85,7 @@ def test_a_valve_beside_scipy():
         np.testing.assert_allclose(run.y_max[i, 1:], np.maximum(found[1:, 0], found[:-1, 0]))
         np.testing.assert_array_equal(run.y_min[i][wanted[1] > 0], 0.0)
         compared, impacts = compared + 1, impacts + wanted[1].sum()
-    assert compared >= 28 and impacts > 100
+    assert compared >= 90 and impacts > 300
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,4 @@
-"""A motor with an unbalance: SciPy, the averaged Sommerfeld response, energy, every verb."""
-
-import warnings
+"""A motor with an unbalance: SciPy, the averaged Sommerfeld response, energy."""
 
 import equinox as eqx
 import jax
@@ -213,23 +211,6 @@ def test_a_body_pressed_on_comes_to_rest_and_leaves():
     for name in "YVP":
         a, b = getattr(phase.sections, name), getattr(time.sections, name)
         np.testing.assert_allclose(a, b, atol=1e-7)
-
-
-def test_every_verb_takes_it():
-    rotor = ROTOR(gap=1.5, control=1.1, strength=0.5)
-    run = vi.simulate(rotor, rotor.start(), 6, samples=16, impact_log=4)
-    vi.plot_history(run, scene=rotor)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        data = vi.scan(
-            rotor, {"control": [0.6, 0.7], "start.Y": [0.0, 0.2]}, settle=60, cycles=128,
-            measure=["regime", "extremes"],
-        )  # fmt: skip
-    assert (np.asarray(data["result"]) == 0).all()
-    swept = vi.sweep(rotor, "control", np.linspace(0.6, 0.7, 3), settle=60, cycles=8)
-    assert bool(np.isfinite(np.asarray(swept.y_min)).all())
-    spectrum = vi.lyapunov(rotor, rotor.start(), cycles=40, settle=40)
-    assert spectrum.exponents.shape == (3,)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """A motor with an unbalanced rotor on an elastic support: the Sommerfeld effect."""
 
+import dataclasses
 from math import pi
 from typing import Any, ClassVar
 
@@ -151,6 +152,12 @@ class UnbalancedRotor(ShaftScene, PhaseMachine):
         for name, value in (("Y", Y), ("V", V), ("W", P)):
             require(name, value)
         return self.adopt(RotorState(Y, V, P))
+
+    def mirrored(self, state: Any) -> Any:
+        """Y → -Y half a turn later, unless there is a stop on one side only."""
+        if self.gap is not None and not self.two_sided:
+            return None
+        return dataclasses.replace(state, Y=-state.Y, V=-state.V)
 
     @property
     def state_type(self) -> Any:

@@ -1,16 +1,16 @@
 """Following a branch: what happens between two of its points, and when it ends."""
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 
-from ._events import Event
+from ..scene.numbers import with_leaf
+from ._origin import halves, origin
 from ._shooting import Shooting
-from ._solve import advance, located, observe, orbit_of, state_at
+from ._solve import advance, images_at, located, observe, orbit_of
+from ._symmetry import may_be_symmetric
 from .curve import Step
 from .special import CROSSING, DOUBLING, FOLD, GRAZING, HOPF, SYMMETRY, TORUS, SpecialPoint
 
@@ -23,10 +23,19 @@ _BESIDE = 1e-3
 # A motion of no more amplitude than this is rest.
 _STILL = 1e-3
 
+# Events that are to come together do so within this.
+_TOGETHER = 1e-9
+
+# Stands where the number of an impact does, for events that fall together.
+_REORDERED = -1
+
 _NAMES = {"stop": "impact", "switch": "switch", "section": "section"}
 
 # Halves of a period that differ by less than this are those of a motion of half the period.
 _ALIKE = 1e-3
+
+# And by less than this but for rounding.
+_NOISE = 1e-7
 
 
 class Follower:
@@ -34,6 +43,10 @@ class Follower:
 
     def __init__(self, problem: Shooting, scale: np.ndarray, bounds: tuple[float, float]):
         self.problem, self.scale, self.bounds = problem, scale, bounds
+        scene, (name,) = problem.scene, problem.parameters
+        self.symmetric = may_be_symmetric(
+            problem, [scene, *(with_leaf(scene, name, bound) for bound in bounds)]
+        )
         self.special: list[SpecialPoint] = []
         self.between: dict[int, list[Step]] = {}
         self.start: Step | None = None
@@ -54,9 +67,9 @@ class Follower:
         grazing = self._grazing(here, last)
         if grazing is not None:
             last, reason = grazing.step, grazing.kind
-        origin = self._bifurcations(here, last)
-        if origin is not None:
-            return origin, "period-doubling"
+        spring = self._bifurcations(here, last)
+        if spring is not None:
+            return spring, self.special[-1].kind
         if grazing is not None:
             self.special.append(grazing)
         elif reason is None and self._closed(here, new):
@@ -80,6 +93,16 @@ class Follower:
             self.scale, impact,
         )  # fmt: skip
 
+    def _sprung(self, at: Step) -> tuple[Step, SpecialPoint]:
+        """Where the branch springs from a motion of half its period, on both."""
+        at, half, step = origin(self.problem, at, self.scale)
+        detail = "the branch springs from a motion of half the period"
+        scale = np.append(np.ones(step.x.size - 1), self.scale[-1])
+        return at, SpecialPoint(
+            DOUBLING, float(step.x[-1]), orbit_of(half, step), detail, half, step, scale,
+            springs=True,
+        )  # fmt: skip
+
     def _grazing(self, here: Step, new: Step) -> SpecialPoint | None:
         """The first of the impacts lost and the stops touched between two points."""
         found = []
@@ -101,9 +124,16 @@ class Follower:
             if at is not None:
                 detail = "a switch goes into another mode: the motion sticks or slips anew"
                 return self._point(GRAZING, at, detail)
+        if new.seen.apart < -_TOGETHER < here.seen.apart:
+            at = self._where(here, new, lambda step: float(step.seen.apart) + _TOGETHER)
+            if at is not None:
+                found.append((at, _REORDERED))
         if not found:
             return None
         at, impact = min(found, key=lambda f: float(np.dot(here.tangent, f[0].x - here.x)))
+        if impact == _REORDERED:
+            detail = "two of its events fall together, and come in another order beyond"
+            return self._point(GRAZING, at, detail)
         if impact is None:
             touched = int(at.seen.touched) - len(self.problem.scene.stops)
             what = "a stop" if touched < 0 else f"the guard of switch {touched}"
@@ -124,21 +154,29 @@ class Follower:
     def _bifurcations(self, here: Step, last: Step) -> Step | None:
         """Record what happens between two points; the point where the branch springs, if met.
 
-        There the two halves of the period become alike, and beyond it the same motions come again,
-        observed half a period later.
+        There the two halves of the period become alike, or images of each other, and beyond it the
+        same motions come again, observed half a period later or in the mirror.
         """
-        apart = self._halves(here)
-        if apart.size and np.dot(apart, self._halves(last)) < 0:
-            at = self._where(here, last, lambda step: float(np.dot(apart, self._halves(step))))
-            if at is not None:
-                # Beyond it the tests have changed twice: what lies before it shows short of it.
-                length = float(np.dot(here.tangent, (at.x - here.x) / self.scale))
-                found = self._changes(here, self.advance(here.x, here.tangent, _SHORT * length))
-                at = self._origin(at)
-                self.between[id(at)] = found
-                detail = "the branch springs from a motion of half the period"
-                self.special.append(self._point(DOUBLING, at, detail))
-                return at
+        for kind, told in ((DOUBLING, self._halves), (SYMMETRY, self._images)):
+            apart = told(here)
+            if np.linalg.norm(apart) < _NOISE or np.dot(apart, told(last)) >= 0:
+                continue
+            at = self._where(
+                here, last, lambda step, a=apart, told=told: float(np.dot(a, told(step)))
+            )
+            if at is None or np.linalg.norm(told(at)) > _ALIKE:
+                continue
+            if kind == DOUBLING:
+                at, point = self._sprung(at)
+            else:
+                at = self._crossing(here, at, FOLD)
+                point = self._point(kind, at, "the branch springs from a symmetric motion")
+            # Beyond it the tests have changed twice: what lies before it shows short of it.
+            length = float(np.dot(here.tangent, (at.x - here.x) / self.scale))
+            found = self._changes(here, self.advance(here.x, here.tangent, _SHORT * length))
+            self.between[id(at)] = found
+            self.special.append(point)
+            return at
         self.between[id(last)] = self._changes(here, last)
         return None
 
@@ -148,10 +186,10 @@ class Follower:
         **Returns:** where they are, in their order.
         """
         before, after = _tests(here), _tests(last)
-        changed = {kind for kind in before if before[kind] * after[kind] < 0}
-        both = {FOLD, CROSSING} <= changed
-        if FOLD in changed:
-            changed.discard(CROSSING)
+        changed = [kind for kind in before if before[kind] * after[kind] < 0]
+        both = FOLD in changed and CROSSING in changed
+        if both:
+            changed.remove(CROSSING)
         found = []
         for kind in changed:
             at = self._where(here, last, lambda step, kind=kind: _tests(step)[kind])
@@ -161,11 +199,10 @@ class Follower:
                 continue  # rounding: the tangent is ill-defined close to where branches cross
             if self.problem.autonomous and float(at.seen.y_max - at.seen.y_min) < 10 * _STILL:
                 continue  # a motion about to shrink to rest has a multiplier 1 to rounding
-            apart = self._halves(at)
-            if kind in (FOLD, CROSSING) and apart.size and np.linalg.norm(apart) < _ALIKE:
-                continue  # where the branch springs both are zero; that is seen by the halves
+            if kind in (FOLD, CROSSING) and self._springs(here, at):
+                continue  # both are zero there
             if kind == CROSSING:
-                at = self._crossing(here, at)
+                at = self._crossing(here, at, CROSSING)
             values = at.seen.multipliers
             detail = {
                 FOLD: "a multiplier passes 1 and the branch turns back",
@@ -183,27 +220,45 @@ class Follower:
                 found.append((float(np.dot(here.tangent, at.x - here.x)), kind, at, detail))
         found.sort(key=lambda f: f[0])
         for _, kind, at, detail in found:
-            if kind == CROSSING and self._symmetric(at):
+            if kind == CROSSING and self.symmetric and self._apart(at) < _ALIKE:
                 kind, detail = SYMMETRY, "a multiplier passes 1 and the motion loses its symmetry"
             self.special.append(self._point(kind, at, detail))
         return [at for _, _, at, _ in found]
 
-    def _crossing(self, here: Step, at: Step) -> Step:
-        """The point where branches cross, from points on both sides.
+    def _springs(self, here: Step, at: Step) -> bool:
+        """Whether the branch springs there, as is seen by halves of a period becoming alike."""
+        halves, images = self._halves(at), self._images(at)
+        if halves.size and np.linalg.norm(halves) < _ALIKE:
+            return True
+        before = np.linalg.norm(self._images(here))
+        close = np.linalg.norm(images) < min(_ALIKE, 0.5 * before)
+        return bool(images.size and close and before > _NOISE)
+
+    def _crossing(self, here: Step, at: Step, kind: str) -> Step:
+        """The point where branches cross, from points on both sides, by a test that is zero there.
 
         Close to it the equations cannot be solved, but the branch passes through it smoothly, so
         that a polynomial through its neighbours tells where it is, and what the motion is there.
         """
         root = float(np.dot(here.tangent, (at.x - here.x) / self.scale))
-        places = _BESIDE * np.array([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0])
-        beside = [self.advance(here.x, here.tangent, root + place) for place in places]
-        if not all(bool(step.good) for step in beside):
-            return at
+        found: dict[float, Step] = {}
+        for side, wanted in ((-_BESIDE, 3), (_BESIDE, 6)):
+            for n in range(1, 9):
+                if len(found) == wanted:
+                    break
+                step = self.advance(here.x, here.tangent, root + n * side)
+                # So close to where they cross the corrector may find the other branch.
+                other = self.symmetric and (kind == FOLD) == (self._apart(step) < _ALIKE * _BESIDE)
+                if bool(step.good) and not other:
+                    found[n * side] = step
+            if len(found) < wanted:
+                return at
+        places, beside = np.array(list(found)), list(found.values())
 
         def through(values: Any) -> np.polynomial.Polynomial:
             return np.polynomial.Polynomial.fit(places, values, len(places) - 1)
 
-        zeros = through([np.asarray(_tests(step)[CROSSING]) for step in beside]).roots()
+        zeros = through([np.asarray(_tests(step)[kind]) for step in beside]).roots()
         zeros = zeros[np.abs(zeros.imag) < 1e-12].real
         if not zeros.size or np.abs(zeros).min() > _BESIDE:
             return at
@@ -217,23 +272,14 @@ class Follower:
             x=x, tangent=tangent / np.linalg.norm(tangent), seen=observe(self.problem, x)
         )
 
-    def _symmetric(self, step: Step) -> bool:
-        """Whether the motion is its own image under the symmetry of its machine."""
-        problem, scene = self.problem, self.problem.scene
-        if problem.cycles % 2 == 0 or scene.mirrored(problem.like) is None:
-            return False
-        x = jnp.asarray(step.x)
-        clock = np.asarray(problem.parts(x)[0])
-        turn = float(problem.period(x))
-        # A place within the first flight, and the one half a period later.
-        first = clock[0] + 0.25 * ((clock[1] if len(clock) > 1 else clock[0] + turn) - clock[0])
-        states = []
-        for place in (first, first + 0.5 * turn):
-            leg = max(0, int(np.searchsorted(clock, place, side="right")) - 1)
-            states.append(state_at(problem, x, jnp.asarray(leg), jnp.asarray(place)))
-        image = ravel_pytree(scene.mirrored(states[0]))[0]
-        apart = np.abs(np.asarray(image - ravel_pytree(states[1])[0]))
-        return bool(apart.max() < _ALIKE)
+    def _images(self, step: Step) -> np.ndarray:
+        """How far the motion is from being its own image; empty if it cannot be."""
+        if not self.symmetric:
+            return np.zeros(0)
+        return np.asarray(images_at(self.problem, jnp.asarray(step.x)))
+
+    def _apart(self, step: Step) -> float:
+        return float(np.linalg.norm(self._images(step)))
 
     def _turns_back(self, here: Step, at: Step, last: Step) -> bool:
         """Whether the parameter there lies beyond that at both others, by more than rounding."""
@@ -244,86 +290,22 @@ class Follower:
         """The steps of a walk with the bifurcations located between them."""
         return [step for new in steps for step in [*self.between.get(id(new), ()), new]]
 
-    def _origin(self, at: Step) -> Step:
-        """The point where the branch springs, located on the motion of half the period.
-
-        Both branches cross there, so that the equations of this one cannot be solved close by. The
-        mean of the two halves is a motion of half the period but for a term of second order.
-        """
-        problem, count = self.problem, len(self.problem.parameters)
-        legs, x = len(problem.events) // 2, jnp.asarray(at.x)
-        turn = float(problem.period(x)) / 2
-        half = dataclasses.replace(
-            problem, cycles=problem.cycles // 2, events=problem.events[:legs],
-            modes=problem.modes[: max(1, legs)], steps=problem.steps // 2,
-        )  # fmt: skip
-        clock, states = (np.asarray(a) for a in problem.parts(x))
-        if legs:
-            clock = 0.5 * (clock[:legs] + clock[legs:] - turn)
-            states = 0.5 * (states[:legs] + states[legs:])
-        else:
-            states = states + 0.5 * self._halves(at)
-        mean = np.asarray(half.pack(clock, states, at.x[-count:], turn))
-        scale = np.append(np.ones(mean.size - count), self.scale[-count:])
-        along = np.append(np.zeros(mean.size - 1), 1.0)
-
-        def missing(shift: float) -> float:
-            step = advance(half, mean, along, scale, shift)
-            M = step.seen.monodromy
-            return float(np.linalg.det(M + np.eye(len(M)))) if bool(step.good) else np.nan
-
-        from scipy.optimize import newton  # slow to load
-
-        shift, report = newton(  # pyright: ignore[reportAssignmentType]
-            missing, 0.0, x1=1e-6, tol=1e-14, full_output=True, disp=False
-        )
-        if not report.converged or not abs(shift) < 1e-2:
-            return at
-        found = advance(half, mean, along, scale, float(shift))
-        clock, states = (np.asarray(a) for a in half.parts(jnp.asarray(found.x)))
-        turn = float(half.period(jnp.asarray(found.x)))
-        if legs:
-            clock, states = np.append(clock, clock + turn), np.concatenate([states, states])
-        x = np.asarray(problem.pack(clock, states, found.x[-count:], 2 * turn))
-        return at._replace(x=x, size=found.size, seen=observe(problem, x))
-
     def _halves(self, step: Step) -> np.ndarray:
-        """How the second half of the period differs from the first; empty if it cannot be alike."""
-        events, cycles = self.problem.events, self.problem.cycles
-        legs = len(events)
-        if cycles % 2 or legs % 2 or not _alike(events, cycles):
-            return np.zeros(0)
-        x = jnp.asarray(step.x)
-        turn = float(self.problem.period(x)) / 2
-        if not legs:
-            middle = state_at(self.problem, x, jnp.asarray(0), jnp.asarray(turn))
-            return np.asarray(ravel_pytree(middle)[0]) - step.x[: self.problem.states]
-        clock, states = (np.asarray(a) for a in self.problem.parts(x))
-        half = legs // 2
-        late = clock[half:] - clock[:half] - turn
-        return np.append(late, (states[half:] - states[:half]).ravel())
-
-
-def _alike(events: tuple[Event, ...], cycles: int) -> bool:
-    """Whether both halves of a period have the same events."""
-    half = len(events) // 2
-    later = [
-        event._replace(number=event.number - cycles // 2) if event.kind == "section" else event
-        for event in events[half:]
-    ]
-    return list(events[:half]) == later
+        return halves(self.problem, step.x)
 
 
 def _tests(step: Step) -> dict[str, float]:
     """Functions that change sign at the bifurcations."""
     M, identity = step.seen.monodromy, np.eye(step.seen.monodromy.shape[0])
     values = step.seen.multipliers
+    with np.errstate(invalid="ignore"):  # a step without an answer has none here either
+        doubling, crossing = np.linalg.det(M + identity), np.linalg.det(M - identity)
     pairs = [
         1 - values[i] * values[j] for i in range(len(values)) for j in range(i + 1, len(values))
     ]
     return {
         FOLD: float(step.tangent[-1]),
-        DOUBLING: float(np.linalg.det(M + identity)),
-        CROSSING: float(np.linalg.det(M - identity)),
+        DOUBLING: float(doubling),
+        CROSSING: float(crossing),
         TORUS: float(np.real(np.prod(pairs))),
     }

@@ -10,14 +10,14 @@ motion that the stop forbids, as the sign of V⁻ or of the clearance says. (The
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Float
 
 from .. import lanes
 from ..flow import AbstractMethod
@@ -25,32 +25,11 @@ from ..flow.moving import in_modes
 from ..scene import AbstractScene
 from ..scene.numbers import with_leaf
 from ._events import Event, approach_of, guard_of, jump
+from ._observed import Observed, apart
 from ._turns import Flight, Turns, turns_of
 from .floquet import multipliers_of
 
 Vector = Float[Array, " _"]
-
-
-class Observed(NamedTuple):
-    """What is said about a solution."""
-
-    multipliers: Complex[Array, " states"]
-    monodromy: Float[Array, "states states"]
-    approach: Float[Array, " events"]
-    """V⁻ at each impact, and how fast the guard rises at each other event; negative where it has
-    become impossible."""
-    y_min: Float[Array, ""]
-    y_max: Float[Array, ""]
-    clearance: Float[Array, ""]
-    """Distance to the stop at the turn nearest to one, or of a switch's guard below zero where it
-    is greatest; negative where it is passed through."""
-    touch: Float[Array, ""]
-    """Clock of that turn."""
-    touched: Float[Array, ""]
-    """The stop there, or the switch, counted after the stops."""
-    order: Float[Array, ""]
-    """1 where each switch goes into the mode that is its next one here, else -1."""
-    duration: Float[Array, ""]
 
 
 class Shooting(eqx.Module):
@@ -275,6 +254,14 @@ class Shooting(eqx.Module):
             touch=turns.touch[nearest],
             touched=turns.touched[nearest],
             order=jnp.min(order),
+            apart=apart(
+                scene,
+                self.events,
+                self.modes,
+                clock,
+                ends - clock,
+                [self.unravel(u) for u in states],
+            ),
             duration=jnp.sum(time) if timed else jnp.asarray(scene.period, x.dtype) * self.cycles,
         )
 

@@ -1,5 +1,6 @@
 """The equations of an orbit from impact to impact, solved: their programs, and what they say."""
 
+import contextlib
 import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -20,6 +21,7 @@ from ..scene.numbers import leaf, with_leaf
 from ._carrier import carrier, steps_of
 from ._events import Event, jump, renews
 from ._shooting import Shooting
+from ._symmetry import images
 from .curve import Step, array_of, corrected, first_tangent
 from .results import ORBIT_RESULTS, Orbit
 
@@ -32,6 +34,10 @@ _SETTLED, _MOST = 1e-11, 4096
 
 # How far short of a place that has no solution (as a share of the step) one is looked for.
 _SHORT_OF = (1e-6, 1e-5, 1e-4, 1e-3)
+
+
+class _NoValueError(ArithmeticError):
+    """A test has no value, because the corrector has no answer there."""
 
 
 @runtime_checkable
@@ -58,7 +64,8 @@ def problem_of(
     if int(np.sum(np.asarray(orbit.impact_stop) >= 0)) != int(orbit.impacts):
         raise ValueError(
             f"Argument `orbit` must list all its {int(orbit.impacts)} impacts, but lists "
-            f"{len(orbit.impact_stop)}: find it with a larger `impact_log`."
+            f"{len(orbit.impact_stop)}: find it with a larger `impact_log`. A motion that comes to "
+            "rest on a stop cannot be followed."
         )
     steps = steps_of(carried, corners, orbit.state, cycles)
     found = events_of(orbit)
@@ -218,6 +225,12 @@ def jacobian_at(problem: Shooting, x):
     return jax.jacfwd(problem.residual)(x)
 
 
+@compiled
+def images_at(problem: Shooting, x):
+    """How far a motion is from being its own image under the symmetry of its machine."""
+    return images(problem, x)
+
+
 def located(
     problem: Shooting,
     here: Step,
@@ -229,25 +242,41 @@ def located(
     length = float(np.dot(here.tangent, (new.x - here.x) / scale))
     at: dict[float, Step] = {0.0: here, length: new}
 
+    def reached(s: float) -> Step:
+        """There, or where there is no answer, as close to where branches cross, right beside."""
+        step = advance(problem, here.x, here.tangent, scale, s)
+        for short in _SHORT_OF:
+            if bool(step.good):
+                break
+            step = advance(problem, here.x, here.tangent, scale, s - short * length)
+        return step
+
     def value(s: float) -> float:
         if s not in at:
-            at[s] = advance(problem, here.x, here.tangent, scale, s)
-        return test(at[s])
+            at[s] = reached(s)
+        found = test(at[s])
+        if np.isnan(found):
+            raise _NoValueError
+        return found
 
-    if not value(0.0) * value(length) <= 0:
-        return None
     from scipy.optimize import brentq  # slow to load
 
     # Where the test jumps, or has no value, the closest point to it has to do.
     options: Any = {"xtol": 1e-14, "rtol": 1e-14, "maxiter": 80}
-    root = float(brentq(value, 0.0, length, full_output=True, disp=False, **options)[0])
-    value(root)
+    try:
+        if not value(0.0) * value(length) <= 0:
+            return None
+        root = float(brentq(value, 0.0, length, full_output=True, disp=False, **options)[0])
+        value(root)
+    except _NoValueError:
+        return None
     # Where branches cross, or a motion shrinks to rest, the corrector has no answer; a point short
     # of it will do.
     for short in _SHORT_OF:
         if any(bool(at[s].good) for s in at if abs(s - root) <= short * abs(length)):
             break
-        value(root - short * length)
+        with contextlib.suppress(_NoValueError):
+            value(root - short * length)
     good = [step for step in at.values() if bool(step.good)]
     return min(good, key=lambda step: abs(test(step)), default=None)
 

@@ -1,24 +1,27 @@
-"""`boundary`: curves of folds, period doublings and grazings in two parameters."""
+"""`boundary`: curves of folds, period doublings, lost symmetries and grazings."""
 
 import dataclasses
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from .._checks import interval
 from ..scene.numbers import check_again, check_leaf, leaf, with_leaf
 from ._carrier import steps_of
 from ._shooting import Shooting
 from ._solve import advance as solved
-from ._solve import orbit_of, tangent_at
+from ._solve import jacobian_at, orbit_of, tangent_at
+from ._symmetry import images, may_be_symmetric
 from .curve import Step, check_walk, walk
 from .results import Orbit
-from .special import CROSSING, DOUBLING, FOLD, GRAZING, SpecialPoint
+from .special import DOUBLING, FOLD, GRAZING, SYMMETRY, SpecialPoint
 
-# Where something grazes it is touched to rounding.
-_TOUCHES = 1e-6
+# What lies below zero by no more than this is zero to rounding.
+_NOISE = 1e-9
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,7 +29,7 @@ class Boundary:
     """A curve in two parameters along which an orbit bifurcates: host arrays, a row a point."""
 
     kind: str
-    """"fold", "period-doubling", "branch-point" or "grazing"."""
+    """"fold", "period-doubling", "symmetry-breaking" or "grazing"."""
     names: tuple[str, str]
     """Names of the two parameters."""
     parameters: np.ndarray
@@ -70,8 +73,8 @@ def boundary(
     """Follow a bifurcation of a branch in a second parameter, both ways.
 
     Pseudo-arclength on the orbit's equations together with the condition that makes the point
-    special: det(M - I) = 0 for a fold, det(M + I) = 0 for a period doubling, V⁻ = 0 or a clearance
-    of zero for a grazing. Host-side: not to be traced.
+    special: det(M - I) = 0 for a fold or a symmetry breaking, det(M + I) = 0 for a period doubling,
+    V⁻ = 0 or a clearance of zero for a grazing. Host-side: not to be traced.
 
     **Arguments:**
 
@@ -90,12 +93,12 @@ def boundary(
         raise TypeError(
             f"Argument `point` must be a `SpecialPoint`, from `Branch.special`, but got {point!r}."
         )
-    if point.kind not in (FOLD, DOUBLING, CROSSING, GRAZING):
+    if point.kind not in (FOLD, DOUBLING, SYMMETRY, GRAZING):
         raise ValueError(
-            "Argument `point` must be a fold, a period doubling or a grazing, but is a "
-            f"{point.kind}."
+            "Argument `point` must be a fold, a period doubling, a symmetry breaking or a grazing, "
+            f"but is a {point.kind}."
         )
-    if point.kind == GRAZING and point.impact is None and abs(point.step.seen.clearance) > _TOUCHES:
+    if point.kind == GRAZING and not point.touches:
         raise ValueError(
             "Argument `point` must be a grazing at which something is touched, but there "
             f"{point.detail}."
@@ -132,7 +135,15 @@ def boundary(
     x = np.append(np.asarray(point.step.x)[:-1], values)
     scale = np.ones(problem.size)
     scale[-2:] = [0.5 * (high - low) for low, high in bounds]
-    condition = _Condition(problem, point.kind, point.impact)
+    lone = None
+    if point.kind == SYMMETRY:
+        if not may_be_symmetric(problem, corners):
+            raise ValueError(
+                "Argument `parameter` must leave the machine its symmetry, but with another "
+                f"{parameter} a motion is not its own image."
+            )
+        lone = _lone(problem, x)
+    condition = _Condition(problem, point.kind, point.impact, lone)
     tangent = tangent_at(condition, x, scale)
 
     def advance(x: Any, tangent: Any, length: float) -> Step:
@@ -151,10 +162,11 @@ def boundary(
         )
         if not inside:
             return _cut(advance, here, new, bounds, scale), "bounds"
-        others = [v for i, v in enumerate(new.seen.approach) if i != condition.impact]
+        # In a symmetric motion another impact grazes as well, to rounding.
+        others = [v + _NOISE for i, v in enumerate(new.seen.approach) if i != condition.impact]
         # At a grazing the body turns on the stop, to rounding.
         touching = point.kind == GRAZING and condition.impact is None
-        if min(others, default=1.0) <= 0 or (not touching and new.seen.clearance < -1e-9):
+        if min(others, default=1.0) <= 0 or (not touching and new.seen.clearance < -_NOISE):
             return here, "grazing"
         return None
 
@@ -175,15 +187,45 @@ def boundary(
     )
 
 
+class _Lone(eqx.Module):
+    """What keeps a symmetric motion symmetric.
+
+    Where it loses its symmetry the equations cannot be solved for it: a departure along the
+    direction in which it does so is missed by none of them, and one combination of them is met by
+    every symmetric motion. That one gives way to the condition to be symmetric.
+    """
+
+    left: Float[Array, " equations"]
+    """That combination."""
+    weight: Float[Array, " differences"]
+    """Of what tells the motion from its image, as that direction does."""
+
+    def instead(self, problem: Shooting, missing: Array, x: Array) -> Array:
+        """What the equations lack, that one exchanged."""
+        departs = self.weight @ images(problem, x)
+        return missing + self.left * (departs - self.left @ missing)
+
+
+def _lone(problem: Shooting, x: np.ndarray) -> _Lone:
+    count = len(problem.parameters)
+    left, _, right = np.linalg.svd(np.asarray(jacobian_at(problem, jnp.asarray(x)))[:, :-count])
+    direction = jnp.append(jnp.asarray(right[-1]), jnp.zeros(count))
+    told = jax.jvp(lambda x: images(problem, x), (jnp.asarray(x),), (direction,))[1]
+    return _Lone(jnp.asarray(left[:, -1]), told / (told @ told))
+
+
 class _Condition(eqx.Module):
     """The equations of an orbit and what makes it special."""
 
     problem: Shooting
     kind: str = eqx.field(static=True)
     impact: int | None = eqx.field(static=True)
+    lone: "_Lone | None" = None
 
     def residual(self, x):
         missing, seen = self.problem.residual(x), self.problem.observe(x)
+        if self.lone is not None:
+            missing = self.lone.instead(self.problem, missing, x)
         identity = jnp.eye(seen.monodromy.shape[0], dtype=x.dtype)
         if self.kind == GRAZING:
             extra = seen.clearance if self.impact is None else seen.approach[self.impact]

@@ -55,8 +55,8 @@ class Branch:
     special: list[SpecialPoint]
     ends: tuple[str, str]
     """Why the branch ends on each side: "bounds", "grazing" (an impact is lost or a stop touched),
-    "period-doubling" (it springs there from a motion of half its period), "hopf" (it shrinks to
-    rest), "closed", "stalled", "max_points"."""
+    "period-doubling" (it springs there from a motion of half its period), "symmetry-breaking" (from
+    a symmetric one), "hopf" (it shrinks to rest), "closed", "stalled", "max_points"."""
     problem: Shooting = dataclasses.field(repr=False)
     steps: list[Step] = dataclasses.field(repr=False)
     scale: np.ndarray = dataclasses.field(repr=False)

@@ -9,7 +9,7 @@ class STABILITY(eqx.Enumeration):
     """Whether a periodic motion is stable, or how it lost its stability."""
 
     stable = "stable"
-    fold = "unstable: a real multiplier above 1 (past a fold)"
+    fold = "unstable: a real multiplier above 1 (past a fold or where branches cross)"
     period_doubling = "unstable: a real multiplier below -1 (past a period doubling)"
     neimark_sacker = "unstable: a complex pair outside the unit circle (past a Neimark–Sacker)"
     unknown = "unknown: no orbit was found"

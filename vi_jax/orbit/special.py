@@ -17,15 +17,18 @@ FOLD, DOUBLING, TORUS = "fold", "period-doubling", "neimark-sacker"
 GRAZING, CROSSING, SYMMETRY = "grazing", "branch-point", "symmetry-breaking"
 HOPF = "hopf"
 
+# Where something grazes it is touched to rounding.
+_TOUCHES = 1e-6
+
 
 @dataclasses.dataclass(frozen=True)
 class SpecialPoint:
     """A point of a branch at which something happens."""
 
     kind: str
-    """"fold", "period-doubling", "neimark-sacker", "branch-point", "symmetry-breaking" (a branch
-    point of a motion that is its own image under the symmetry of its machine), "grazing", or "hopf"
-    (an autonomous machine's motion shrinks to rest)."""
+    """"fold", "period-doubling", "neimark-sacker", "branch-point", "symmetry-breaking" (where
+    motions that are their own image under the symmetry of their machine meet some that are not),
+    "grazing", or "hopf" (an autonomous machine's motion shrinks to rest)."""
     parameter: float
     orbit: Orbit
     detail: str
@@ -35,13 +38,20 @@ class SpecialPoint:
     scale: np.ndarray = dataclasses.field(repr=False)
     impact: int | None = None
     """The impact that grazes; `None` where the body touches a stop that it did not hit before."""
+    springs: bool = False
+    """Whether the branch springs here from a motion of half its period, which `orbit` is then."""
+
+    @property
+    def touches(self) -> bool:
+        """Whether at a grazing an impact is lost or a stop is touched, to rounding."""
+        return self.impact is not None or abs(float(self.step.seen.clearance)) <= _TOUCHES
 
     def switch(self, *, distance: float = 0.01) -> Orbit:
         """An orbit of the other branch that begins here, to be continued.
 
-        At a period doubling, the motion of twice the period; at a grazing, the motion with that
-        impact less or one more, on the side on which it is admissible; where branches cross, a
-        motion of the other one.
+        At a period doubling, the motion of twice the period, or of half of it where the branch
+        springs from one; at a grazing, the motion with that impact less or one more, on the side on
+        which it is admissible; where branches cross, a motion of the other one.
 
         **Arguments:** how far from the point (in the norm of the scaled unknowns).
 
@@ -49,7 +59,7 @@ class SpecialPoint:
         """
         given_number("distance", distance, low=0.0, open_low=True)
         if self.kind == DOUBLING:
-            return _doubled(self, distance)
+            return (_along if self.springs else _doubled)(self, distance)
         if self.kind == GRAZING:
             return _beyond_grazing(self, distance)
         if self.kind in (CROSSING, SYMMETRY):
@@ -61,6 +71,18 @@ class SpecialPoint:
 
     def __str__(self) -> str:
         return f"{self.kind} at {self.parameter:.10g}: {self.detail}"
+
+
+def _along(point: SpecialPoint, distance: float) -> Orbit:
+    """A motion further on the branch that the point's own problem is of."""
+    x = np.asarray(point.step.x)
+    tangent = tangent_at(point.problem, x, point.scale)
+    step = advance(point.problem, x, tangent, point.scale, distance)
+    if not bool(step.good):
+        raise ValueError(
+            f"No motion of half the period was found at distance {distance:g}; try another."
+        )
+    return orbit_of(point.problem, step)
 
 
 def _doubled(point: SpecialPoint, distance: float) -> Orbit:
@@ -120,6 +142,11 @@ def _beyond_grazing(point: SpecialPoint, distance: float) -> Orbit:
     if old.scene.switches:
         raise ValueError(
             "`switch` at a grazing needs a machine without soft stops, friction or other switches: "
+            "find the motion beyond it with `find_orbit`."
+        )
+    if not point.touches:
+        raise ValueError(
+            f"`switch` at a grazing needs something that is touched, but there {point.detail}: "
             "find the motion beyond it with `find_orbit`."
         )
     if point.impact is not None and old.events[point.impact].kind == "section":

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
+from .._checks import instance_of, one_of
 from ..orbit import Boundary, Branch
 from ..scan import Sweep
 from ..scene import LABELS
@@ -17,7 +18,7 @@ def plot_branch(
     branch: Branch,
     *,
     ax: Axes | None = None,
-    y: str = "y_min",
+    y: str | None = None,
     x: str = "parameter",
     special: bool = True,
     legend: bool = True,
@@ -29,14 +30,19 @@ def plot_branch(
     another than one with a single impact.
 
     **Arguments:** the branch; `ax`, a new figure if left out; `y` and `x`, names of the branch's
-    arrays; `special`, whether to mark the special points (where `y` is a number of an orbit);
-    `legend`, whether to draw one, which names the marks and, given `label`, the branch; options of
-    `Axes.plot`.
+    arrays with a number for each point (`y` is by default the first of `"y_min"`, `"y_max"` that a
+    stop does not hold where it is); `special`, whether to mark the special points (where `y` is a
+    number of an orbit); `legend`, whether to draw one, which names the marks and, given `label`,
+    the branch; options of `Axes.plot`.
 
     **Returns:** the axes.
+
+    **Raises:** `TypeError` or `ValueError` if there is no such branch or array.
     """
+    instance_of("branch", branch, Branch, "a `Branch`, from `continue_orbit`")
+    y = _moving(branch) if y is None else y
+    across, up = _array(branch, "x", x), _array(branch, "y", y)
     ax = new_axes(ax)
-    across, up = getattr(branch, x), getattr(branch, y)
     # The points where stability changes are among the branch's: there it is rounding's.
     inside = np.abs(branch.multipliers).max(axis=1) < 1 + 1e-6
     stable = inside[1:] & inside[:-1]
@@ -63,6 +69,23 @@ def plot_branch(
     return ax
 
 
+def _moving(found: Branch | Sweep) -> str:
+    """The extreme that varies: the other one may be a stop's place."""
+    low, high = np.asarray(found.y_min), np.asarray(found.y_max)
+    held = np.ptp(low) <= 1e-9 * (1 + np.abs(low).max())
+    return "y_max" if held and np.ptp(high) > np.ptp(low) else "y_min"
+
+
+def _array(found: Branch | Sweep, argument: str, name: str) -> np.ndarray:
+    """An array with a number for each point. **Raises:** `ValueError` that lists them."""
+    arrays = {
+        name: x
+        for name, x in vars(found).items()
+        if hasattr(x, "dtype") and x.shape == found.y_min.shape
+    }
+    return np.asarray(arrays[one_of(argument, name, tuple(arrays))])
+
+
 def _legend(ax: Axes) -> None:
     """Branches first, then what is common to all."""
     named = list(zip(*ax.get_legend_handles_labels(), strict=True))
@@ -79,16 +102,21 @@ def _stretches(stable: np.ndarray) -> list[tuple[int, int, bool]]:
 
 
 def plot_sweep(
-    sweep: Sweep, *, ax: Axes | None = None, y: str = "y_min", x: str = "values", **style: Any
+    sweep: Sweep, *, ax: Axes | None = None, y: str | None = None, x: str = "values", **style: Any
 ) -> Axes:
     """A sweep as dots, one for each value.
 
-    **Arguments:** one sweep; `ax`; names of its arrays; options of `Axes.plot`.
+    **Arguments:** one sweep; `ax`; names of its arrays with a number for each value, as for
+    `plot_branch`; options of `Axes.plot`.
 
     **Returns:** the axes.
+
+    **Raises:** `TypeError` or `ValueError` if there is no such sweep or array.
     """
+    instance_of("sweep", sweep, Sweep, "a `Sweep`, from `sweep`")
+    y = _moving(sweep) if y is None else y
+    across, up = _array(sweep, "x", x), _array(sweep, "y", y)
     ax = new_axes(ax)
-    across, up = np.asarray(getattr(sweep, x)), np.asarray(getattr(sweep, y))
     ax.plot(across, up, **{"marker": ".", "ms": 3, "ls": "none", "color": "0.3", **style})
     ax.set_xlabel(axis_name(sweep.parameter if x == "values" else x))
     ax.set_ylabel(extreme_name(y, sweep.labels))
@@ -99,7 +127,7 @@ def plot_boundary(curve: Boundary, *, ax: Axes | None = None, **style: Any) -> A
     """A boundary curve in the plane of its two parameters.
 
     Its colour is that of the motion's period, its dash tells what happens there: solid a grazing,
-    dashed a period doubling, dash-dotted a fold, dotted a branch point.
+    dashed a period doubling, dash-dotted a fold, dotted a loss of symmetry.
 
     **Arguments:** the curve; `ax`; options of `Axes.plot`.
 

@@ -1,0 +1,189 @@
+"""Machines that are their own image: where motions lose the symmetry, and branches that spring."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+import vi_jax as vi
+from scipy.integrate import solve_ivp
+
+from differences import quick
+
+M = vi.machines
+
+
+def between(left=1.2, restitution=0.9):
+    """The paper's scene between two stops."""
+    ideal = vi.Scene.ideal(frequency_ratio=1.5, damping_ratio=0.03, gap=1.2, restitution=0.9)
+    return dataclasses.replace(
+        ideal, stops=(*ideal.stops, vi.RigidStop(left, restitution, "left"))
+    )  # fmt: skip
+
+
+def settled(machine, start=None, cycles=1):
+    start = machine.start() if start is None else start
+    return vi.find_orbit(
+        machine, vi.simulate(machine, start, 1, settle=500).last, cycles, throw=True
+    )
+
+
+def kinds(branch):
+    return [point.kind for point in branch.special]
+
+
+def test_a_scene_is_its_own_image_between_equal_stops():
+    scene = between()
+    image = scene.mirrored(scene.start(Y=0.3, V=-0.1))
+    assert (float(image.Y), float(image.V)) == (-0.3, 0.1)
+    assert between(left=1.3).mirrored(scene.start()) is None
+    assert between(restitution=0.8).mirrored(scene.start()) is None
+    crank = dataclasses.replace(scene, crank=vi.SliderCrank(0.2))
+    assert crank.mirrored(scene.start()) is None
+    free = dataclasses.replace(scene, stops=())
+    assert free.mirrored(scene.start()) is not None
+    soft = vi.SoftStop(1.0, 20.0, restitution=0.5)
+    both = (soft, dataclasses.replace(soft, side="left"))
+    assert dataclasses.replace(free, soft_stops=both).mirrored(scene.start()) is not None
+    assert dataclasses.replace(free, soft_stops=both[:1]).mirrored(scene.start()) is None
+
+
+@pytest.fixture(scope="module")
+def whole():
+    scene = between()
+    return vi.continue_orbit(
+        settled(scene), parameter="drive.frequency_ratio", bounds=(0.3, 2.5)
+    )  # fmt: skip
+
+
+def test_a_scene_between_equal_stops_loses_its_symmetry(whole):
+    assert kinds(whole) == ["grazing", "symmetry-breaking", "symmetry-breaking"]
+    point = whole.special[1]
+    broken = vi.continue_orbit(
+        point.switch(), parameter="drive.frequency_ratio", bounds=(0.3, 2.5)
+    )  # fmt: skip
+    (spring,) = (p for p in broken.special if p.kind == "symmetry-breaking")
+    assert min(abs(spring.parameter - p.parameter) for p in whole.special[1:]) < 1e-8
+    assert "symmetry-breaking" in broken.ends and "fold" not in kinds(broken)[-1:]
+
+
+def test_a_curve_of_lost_symmetry_of_a_scene(whole):
+    """Each of its motions is its own image as simulated, and has a multiplier 1."""
+    curve = vi.boundary(
+        whole.special[1], parameter="oscillator.damping_ratio", bounds=((0.3, 2.5), (0.0, 0.1))
+    )  # fmt: skip
+    assert len(curve.parameters) > 8
+    assert abs(curve.multipliers - 1).min(axis=1).max() < 1e-8
+    for i in (0, -1):
+        orbit = curve.orbit(i)
+        run = vi.simulate(orbit.scene, orbit.state, 1, samples=2, method="reference")
+        half = jax.tree.map(lambda x: float(x[1]), run.samples.state)
+        assert half.Y == pytest.approx(-float(orbit.state.Y), abs=1e-9)
+        assert half.V == pytest.approx(-float(orbit.state.V), abs=1e-9)
+    with pytest.raises(ValueError, match="symmetry"):
+        vi.boundary(
+            whole.special[1], parameter="stops.0.gap", bounds=((0.3, 2.5), (1.0, 1.3))
+        )  # fmt: skip
+
+
+# Steps at which branches were cut, or special points missed or told twice.
+STEPS = [0.02, 0.05, 0.1, 0.2, 0.4]
+
+
+@pytest.mark.parametrize("distance", [0.005, 0.01, 0.03])
+@pytest.mark.parametrize("max_step", quick(STEPS, 0.1, 0.2))
+def test_a_broken_branch_ends_nowhere_else(max_step, distance):
+    pair = M.ImpactPair(half_gap=1.35, restitution=0.5)
+    branch = vi.continue_orbit(settled(pair), parameter="half_gap", bounds=(1.25, 1.5))
+    (point,) = branch.special
+    broken = vi.continue_orbit(
+        point.switch(distance=distance), parameter="half_gap", bounds=(1.05, 6.0),
+        max_step=max_step,
+    )  # fmt: skip
+    assert kinds(broken) == ["symmetry-breaking"]
+    assert broken.ends == ("bounds", "symmetry-breaking")
+    assert broken.parameter.min() == pytest.approx(1.05)
+    # Phases of the impacts of the stable motion at 1.055, by an independent map from wall to wall.
+    (low,) = (orbit for orbit in broken.at(1.055) if bool(orbit.stable))
+    phases = np.sort(np.asarray(low.impact_phase))
+    apart = min(np.abs(phases - np.sort(x)).max() for x in ([5.7715, 1.5624], [2.6299, 4.7040]))
+    assert apart < 2e-4
+
+
+SNAP = M.Duffing(
+    amplitude=0.8, frequency=1.3, damping=0.1, stiffness=-1.0, cubic=1.0, gap=1.2, restitution=0.8
+)
+
+
+def snapped():
+    return vi.find_orbit(SNAP, SNAP.start(Y=-0.305011053, V=0.0199429225), throw=True)
+
+
+@pytest.mark.parametrize("max_step", quick([0.02, 0.05, 0.08, 0.1, 0.15], 0.1))
+def test_a_motion_without_impacts_loses_its_symmetry(max_step):
+    """Near where branches cross the equations may have no answer, or that of the other branch."""
+    branch = vi.continue_orbit(
+        snapped(), parameter="amplitude", bounds=(0.05, 2.0), max_step=max_step
+    )  # fmt: skip
+    assert kinds(branch) == ["symmetry-breaking", "fold", "grazing"]
+    assert branch.special[0].parameter == pytest.approx(1.752976613, abs=2e-8)
+
+
+def half_map(amplitude, damping, x):
+    """The state and its derivatives after half a cycle, in the mirror, by SciPy."""
+    w = float(SNAP.frequency)
+
+    def rate(t, z):
+        y, v, D = z[0], z[1], z[2:].reshape(2, 2)
+        force = amplitude * np.cos(t) - damping * v + y - y**3
+        field = np.array([[0, 1], [1 - 3 * y * y, -damping]])
+        return np.concatenate([[v / w, force / w], (field @ D / w).ravel()])
+
+    start = np.concatenate([x, np.eye(2).ravel()])
+    end = solve_ivp(rate, (0, np.pi), start, "DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+    return -end[:2], -end[2:].reshape(2, 2)
+
+
+def test_a_curve_of_lost_symmetry_without_impacts_is_that_of_the_half_map():
+    branch = vi.continue_orbit(
+        snapped(), parameter="amplitude", bounds=(0.05, 2.0), max_step=0.05
+    )  # fmt: skip
+    curve = vi.boundary(
+        branch.special[0], parameter="damping", bounds=((0.05, 2.0), (0.02, 0.3))
+    )  # fmt: skip
+    for i in (0, len(curve.parameters) // 2, -1):
+        orbit, (amplitude, damping) = curve.orbit(i), curve.parameters[i]
+        x = np.array([float(orbit.state.Y), float(orbit.state.V)])
+        image, slope = half_map(amplitude, damping, x)
+        np.testing.assert_allclose(image, x, atol=1e-8)
+        assert abs(np.linalg.det(slope + np.eye(2))) < 1e-7
+    assert np.ptp(curve.parameters[:, 1]) == pytest.approx(0.28)
+
+
+def test_a_doubled_branch_springs_from_the_motion_of_half_the_period():
+    ball = M.BouncingBall(acceleration=1.2, restitution=0.5)
+    orbit = vi.find_orbit(ball, ball.start(height=6.15831535, speed=-1.06063272), throw=True)
+    options = {"parameter": "acceleration", "bounds": (0.3, 3.0)}
+    once = vi.continue_orbit(orbit, **options)
+    doubling = next(p for p in once.special if p.kind == "period-doubling")
+    twice = vi.continue_orbit(doubling.switch(), **options)
+    (spring,) = (p for p in twice.special if p.springs)
+    assert spring.parameter == pytest.approx(doubling.parameter, abs=1e-9)
+    assert int(spring.orbit.cycles) == 1 and int(spring.switch().cycles) == 1
+    curve = vi.boundary(spring, parameter="restitution", bounds=((0.3, 3.0), (0.3, 0.7)))
+    table, e = curve.parameters.T
+    born = np.pi * (1 - e) / (1 + e)
+    np.testing.assert_allclose(table, np.hypot(born, 2 * (1 + e**2) / (1 + e) ** 2), atol=1e-9)
+
+
+def test_a_lost_impact_is_no_lost_symmetry():
+    """A motion of one impact cannot be its own image; its branch ends at a grazing."""
+    machine = M.Duffing(
+        amplitude=0.6, frequency=0.7, damping=0.05, stiffness=1.0, cubic=0.3, gap=0.8,
+        restitution=0.6,
+    )  # fmt: skip
+    orbit = vi.find_orbit(machine, machine.start(Y=0.709689275, V=0.323053158), throw=True)
+    options = {"parameter": "frequency", "bounds": (0.3, 2.5)}
+    grazing = vi.continue_orbit(orbit, **options).special[0]
+    other = vi.continue_orbit(grazing.switch(), **options)
+    assert set(kinds(other)) == {"grazing"} and other.ends == ("grazing", "grazing")

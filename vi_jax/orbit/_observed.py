@@ -1,0 +1,62 @@
+"""What is seen of a periodic motion, its events' distance from another order among it."""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Complex, Float
+
+from ..scene import AbstractScene
+from ._events import Event
+
+
+class Observed(NamedTuple):
+    """What is said about a solution."""
+
+    multipliers: Complex[Array, " states"]
+    monodromy: Float[Array, "states states"]
+    approach: Float[Array, " events"]
+    """V⁻ at each impact, and how fast the guard rises at each other event; negative where it has
+    become impossible."""
+    y_min: Float[Array, ""]
+    y_max: Float[Array, ""]
+    clearance: Float[Array, ""]
+    """Distance to the stop at the turn nearest to one, or of a switch's guard below zero where it
+    is greatest; negative where it is passed through."""
+    touch: Float[Array, ""]
+    """Clock of that turn."""
+    touched: Float[Array, ""]
+    """The stop there, or the switch, counted after the stops."""
+    order: Float[Array, ""]
+    """1 where each switch goes into the mode that is its next one here, else -1."""
+    apart: Float[Array, ""]
+    """How far its events are from coming in another order; see `apart`."""
+    duration: Float[Array, ""]
+
+
+def apart(
+    scene: AbstractScene,
+    events: tuple[Event, ...],
+    modes: tuple[tuple[float, ...], ...],
+    clock: Float[Array, " legs"],
+    lengths: Float[Array, " legs"],
+    states: list[Any],
+) -> Float[Array, ""]:
+    """How far the events are from coming in another order: the least time between two that follow
+    each other, or the least distance, where one is met, of the stops and the switches that are not
+    met there. Negative where the motion is none of the machine's.
+
+    **Arguments:** the machine; its events in their order, the modes of the flight that each begins,
+    its clock, the time to the next one, and the state just before it.
+    """
+    least = jnp.asarray(jnp.inf, clock.dtype)
+    for i, event in enumerate(events):
+        least = jnp.minimum(least, lengths[i])
+        for number, stop in enumerate(scene.stops):
+            if (event.kind, event.number) != ("stop", number):
+                body = scene.coordinates[stop.coordinate]
+                least = jnp.minimum(least, -stop.beyond(body.position(states[i])))
+        for number, switch in enumerate(scene.switches):
+            if (event.kind, event.number) != ("switch", number):
+                mode = jnp.asarray(modes[i - 1][number], clock.dtype)
+                least = jnp.minimum(least, -switch.guard(scene, clock[i], states[i], mode))
+    return least

@@ -1,0 +1,85 @@
+"""Where a branch springs from a motion of half the period of its own."""
+
+import dataclasses
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from ._events import Event
+from ._shooting import Shooting
+from ._solve import advance, observe, state_at
+from .curve import Step
+
+
+def halves(problem: Shooting, x: Any) -> np.ndarray:
+    """How the second half of the period differs from the first; empty if it cannot be alike."""
+    events, cycles = problem.events, problem.cycles
+    legs = len(events)
+    if cycles % 2 or legs % 2 or not _alike(events, cycles):
+        return np.zeros(0)
+    x = jnp.asarray(x)
+    turn = float(problem.period(x)) / 2
+    if not legs:
+        middle = state_at(problem, x, jnp.asarray(0), jnp.asarray(turn))
+        return np.asarray(ravel_pytree(middle)[0] - x[: problem.states])
+    clock, states = (np.asarray(a) for a in problem.parts(x))
+    half = legs // 2
+    late = clock[half:] - clock[:half] - turn
+    return np.append(late, (states[half:] - states[:half]).ravel())
+
+
+def _alike(events: tuple[Event, ...], cycles: int) -> bool:
+    """Whether both halves of a period have the same events."""
+    half = len(events) // 2
+    later = [
+        event._replace(number=event.number - cycles // 2) if event.kind == "section" else event
+        for event in events[half:]
+    ]
+    return list(events[:half]) == later
+
+
+def origin(problem: Shooting, at: Step, scale: np.ndarray) -> tuple[Step, Shooting, Step]:
+    """The point where a branch springs, on the branch and on the motion of half the period, with
+    the problem of that motion; on the latter it is located.
+
+    Both branches cross there, so that the equations of this one cannot be solved close by. The
+    mean of the two halves is a motion of half the period but for a term of second order.
+    """
+    count = len(problem.parameters)
+    legs, x = len(problem.events) // 2, jnp.asarray(at.x)
+    turn = float(problem.period(x)) / 2
+    half = dataclasses.replace(
+        problem, cycles=problem.cycles // 2, events=problem.events[:legs],
+        modes=problem.modes[: max(1, legs)], steps=problem.steps // 2,
+    )  # fmt: skip
+    clock, states = (np.asarray(a) for a in problem.parts(x))
+    if legs:
+        clock = 0.5 * (clock[:legs] + clock[legs:] - turn)
+        states = 0.5 * (states[:legs] + states[legs:])
+    else:
+        states = states + 0.5 * halves(problem, at.x)
+    mean = np.asarray(half.pack(clock, states, at.x[-count:], turn))
+    scale = np.append(np.ones(mean.size - count), scale[-count:])
+    along = np.append(np.zeros(mean.size - 1), 1.0)
+
+    def missing(shift: float) -> float:
+        step = advance(half, mean, along, scale, shift)
+        M = step.seen.monodromy
+        return float(np.linalg.det(M + np.eye(len(M)))) if bool(step.good) else np.nan
+
+    from scipy.optimize import newton  # slow to load
+
+    shift, report = newton(  # pyright: ignore[reportAssignmentType]
+        missing, 0.0, x1=1e-6, tol=1e-14, full_output=True, disp=False
+    )
+    if not report.converged or not abs(shift) < 1e-2:
+        return at, half, advance(half, mean, along, scale, 0.0)
+    found = advance(half, mean, along, scale, float(shift))
+    clock, states = (np.asarray(a) for a in half.parts(jnp.asarray(found.x)))
+    turn = float(half.period(jnp.asarray(found.x)))
+    if legs:
+        clock, states = np.append(clock, clock + turn), np.concatenate([states, states])
+    x = np.asarray(problem.pack(clock, states, found.x[-count:], 2 * turn))
+    return at._replace(x=x, size=found.size, seen=observe(problem, x)), half, found

@@ -1,0 +1,50 @@
+"""Motions that are their own image under the symmetry of their machine, half a period later."""
+
+from collections.abc import Iterable
+
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from ..scene import AbstractScene
+from ._events import Event
+from ._shooting import Shooting
+
+
+def may_be_symmetric(problem: Shooting, scenes: Iterable[AbstractScene]) -> bool:
+    """Whether a motion with these events can be its own image, on each of these machines.
+
+    A machine that is driven is its own image after half a drive cycle, so that only periods of an
+    odd number of cycles can be.
+    """
+    events, half = problem.events, len(problem.events) // 2
+    if problem.cycles % 2 == 0 or problem.autonomous or len(events) % 2:
+        return False
+    if any(scene.mirrored(problem.like) is None for scene in scenes):
+        return False
+    pairs = zip(events[:half], events[half:], strict=True)
+    return all(_are_images(problem.scene, one, other) for one, other in pairs)
+
+
+def _are_images(scene: AbstractScene, one: Event, other: Event) -> bool:
+    if one.kind == other.kind == "stop":
+        left, right = scene.stops[one.number], scene.stops[other.number]
+        return left.coordinate == right.coordinate and left.sign == -right.sign
+    return one.kind == other.kind == "switch"
+
+
+def images(problem: Shooting, x: Float[Array, " unknowns"]) -> Float[Array, " differences"]:
+    """How the second half of a period differs from the image of the first; zero for a motion that
+    is symmetric, and smooth along its branch, as the events of both halves are compared."""
+    half, turn = len(problem.events) // 2, 0.5 * problem.period(x)
+
+    def image(u):
+        return ravel_pytree(problem.scene.mirrored(problem.unravel(u)))[0]
+
+    if not half:
+        middle = ravel_pytree(problem.state_at(x, 0, turn))[0]
+        return image(x[: problem.states]) - middle
+    clock, states = problem.parts(x)
+    late = clock[half:] - clock[:half] - turn
+    return jnp.concatenate([late, (jax.vmap(image)(states[:half]) - states[half:]).ravel()])
