@@ -1,5 +1,8 @@
 """The command line: what it prints, where it writes, how it fails."""
 
+import subprocess
+import sys
+
 import pytest
 from vi_jax import cli
 from vi_jax.cli import entry
@@ -76,3 +79,15 @@ def test_a_failing_write_is_one_line(tmp_path, capsys):
     (tmp_path / "fig3.png").mkdir()
     assert cli.main(["reproduce", "--quick", "--out", str(tmp_path)]) == 1
     assert capsys.readouterr().err.splitlines()[-1].startswith("vi-jax: error:")
+
+
+def test_a_reader_that_has_seen_enough():
+    """`vi-jax ... | head` is no failure."""
+    code = "import sys; from vi_jax import cli; sys.exit(cli.main(['--help']))"
+    with subprocess.Popen(
+        [sys.executable, "-u", "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        assert process.stdout is not None and process.stderr is not None
+        process.stdout.close()
+        told = process.stderr.read().decode()
+    assert process.returncode == 0 and not told

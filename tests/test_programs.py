@@ -74,3 +74,61 @@ def test_elsewhere_nothing_is_looked_at(watch, monkeypatch, tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         section(1)
+
+
+class Table(vi.AbstractScene):
+    """A spring pushed by a table, whose look-up has no vector form, or by a cosine."""
+
+    looked_up: bool
+    stops: tuple = (vi.RigidStop(1.5, 0.7),)
+
+    @property
+    def cycle(self):
+        return 2 * np.pi
+
+    def field(self, s, state):
+        push = jnp.cos(s)
+        if self.looked_up:
+            push = jnp.interp(s, jnp.linspace(0, 7, 99), jnp.cos(jnp.linspace(0, 7, 99)))
+        return vi.OscillatorState(state.V, push - 0.1 * state.V - 0.5 * state.Y)
+
+
+def test_what_has_no_vector_form_is_compiled_in_full(monkeypatch):
+    """A program is compiled quickly only if its loops are not XLA's."""
+    made = []
+    original = _programs.Program._quick.func
+    monkeypatch.setattr(
+        _programs.Program, "_quick", property(lambda self: made.append(self) or original(self))
+    )
+    zero = jnp.zeros(())
+    function = _programs.Program(
+        lambda scene: vi.simulate(scene, vi.OscillatorState(zero, zero), 3, method="draft").last
+    )
+    last = function(Table(False))
+    assert made == [function] and function._may_be_quick
+    with pytest.warns(UserWarning, match="slower road"):
+        there = function(Table(True))
+    assert made == [function, function] and not function._may_be_quick
+    function(Table(False))
+    assert made == [function, function]
+    np.testing.assert_allclose(there.Y, last.Y, atol=1e-3)
+
+
+def test_a_part_of_another_program_is_compiled_with_it():
+    function = _programs.Program(lambda x: jnp.sin(x) * x)
+    x = jnp.asarray(0.7)
+    alone = function(x)
+    within = jax.jit(lambda y: function(x) + 0 * y)(x)  # what it is given is known there
+    np.testing.assert_allclose([within, jax.jit(function)(x)], alone, rtol=1e-15)
+    np.testing.assert_allclose(jax.vmap(function)(jnp.stack([x, x])), alone, rtol=1e-15)
+    np.testing.assert_allclose(jax.grad(function)(x), jnp.sin(x) + x * jnp.cos(x), rtol=1e-15)
+
+
+def test_compiler_options_that_xla_does_not_know_are_left_out(monkeypatch):
+    monkeypatch.setattr(_programs, "_QUICK", {"xla_no_such_option": 1, **_programs._QUICK})
+    _programs._quick_options.cache_clear()
+    try:
+        assert "xla_no_such_option" not in _programs._quick_options()
+        assert float(_programs.Program(lambda x: x + 1)(jnp.asarray(1.0))) == 2.0
+    finally:
+        _programs._quick_options.cache_clear()

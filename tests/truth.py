@@ -189,11 +189,12 @@ def _release(sign, gap, phase):
     return np.where(gap > -1, np.mod(falls - phase, 2 * np.pi), np.inf)
 
 
-def integrated(drive, xi, stops, start, cycles, *, look=0.05):
-    """One machine through `cycles` drive cycles, by SciPy's DOP853 in time τ.
+def integrated(drive, xi, stops, start, cycles, *, look=0.05, **options):
+    """One machine through `cycles` drive cycles, by SciPy in time τ.
 
-    **Arguments:** `drive`, a number ζ or a motor's dict of `tau0`, `kappa`, `eps`, `mu`; ξ; a tuple
-    of (sign, gap, k); the start (Y, V) or (Y, V, W) on the section φ = 0; the longest step.
+    **Arguments:** `drive`, a number ζ or a motor's dict of `tau0`, `kappa`, `eps`, `mu` and, unless
+    it is 1, `w0`; ξ; a tuple of (sign, gap, k); the start (Y, V) or (Y, V, W) on the section φ = 0;
+    the longest step; what `solve_ivp` is told instead of DOP853 at 1e-12.
 
     **Returns:** a `Truth`.
     """
@@ -208,7 +209,9 @@ def integrated(drive, xi, stops, start, cycles, *, look=0.05):
         low = high = state[0]
         hits = comes = 0
         while True:
-            state, seen, met = _leg(drive, xi, stops, state, held, leaving, look)
+            state, seen, met = _leg(
+                drive, xi, stops, state, held, leaving, max_step=look, **options
+            )
             low, high = min(low, *seen), max(high, *seen)
             if met == "section":
                 break
@@ -242,13 +245,15 @@ def _rates(drive, xi, x):
     turning = 0.0
     if isinstance(drive, dict):
         slope = -np.sin(phi)
-        torque = drive["tau0"] * (drive["kappa"] - W) + drive["eps"] * slope * (Y - np.cos(phi))
+        torque = drive["tau0"] * (drive["kappa"] - W / drive.get("w0", 1.0)) + drive[
+            "eps"
+        ] * slope * (Y - np.cos(phi))
         torque += drive["mu"] * slope * np.cos(phi) * W * W
         turning = torque / (1 + drive["mu"] * slope**2)
     return [V, np.cos(phi) - Y - 2 * xi * V, turning, W]
 
 
-def _leg(drive, xi, stops, state, held, leaving, look):
+def _leg(drive, xi, stops, state, held, leaving, **options):
     """From `state` to the next event: state, all Y on the way, and what was met.
 
     After an impact or a release the body has to turn towards the stop before it can meet it, so
@@ -281,10 +286,8 @@ def _leg(drive, xi, stops, state, held, leaving, look):
         names.append(("release" if held else "turn" if leaving[i] else "contact", i))
     # Extremes of the motion, which end nothing.
     events.append(stationary)
-    run = solve_ivp(
-        rates, (0, 1e4), state, method="DOP853", rtol=1e-12, atol=1e-13, events=events,
-        max_step=look,
-    )  # fmt: skip
+    options = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-13, **options}
+    run = solve_ivp(rates, (0, 1e4), state, events=events, **options)
     which = next(i for i, times in enumerate(run.t_events[:-1]) if len(times))
     seen = [run.y[0, -1], *(x[0] for x in run.y_events[-1])]
     after = run.y[:, -1].copy()

@@ -1,5 +1,6 @@
 """vi_jax: differentiable, vectorised simulation of vibro-impact systems."""
 
+import importlib
 from typing import TYPE_CHECKING
 
 from . import machines as machines
@@ -90,10 +91,9 @@ if TYPE_CHECKING:
 
 def __getattr__(name: str):
     """Plots, loaded when the first of them is asked for: matplotlib takes long to load."""
-    if name.startswith("plot_") or name in ("animate", "save_picture"):
-        from . import plot
-
-        return getattr(plot, name)
+    if name == "plot" or name.startswith("plot_") or name in ("animate", "save_picture"):
+        plot = importlib.import_module(".plot", __name__)
+        return plot if name == "plot" else getattr(plot, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

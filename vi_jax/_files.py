@@ -9,6 +9,10 @@ def write_whole(path: str | Path, content: str | bytes) -> None:
     """Write a file beside its place and then rename it, so that a full disk or an interrupt leaves
     what was there before. **Raises:** `OSError`."""
     path = Path(path)
+    if not path.parent.is_dir():
+        raise FileNotFoundError(
+            f"Argument `path` must lie in a folder that exists, but got {str(path)!r}."
+        )
     # A link keeps leading to its file, and a pipe or a device is written to as it is.
     path = path.resolve() if path.is_symlink() else path
     content = content.encode() if isinstance(content, str) else content

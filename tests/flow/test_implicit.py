@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-from scipy.integrate import solve_ivp
 from vi_jax.flow.methods._implicit import inverse_of
 
 from differences import check_derivatives, each_mode
+from truth import integrated
 
 IMPLICIT = vi.Adaptive(diffrax.Kvaerno5(), rtol=1e-9)
 
@@ -28,51 +28,25 @@ def test_inverse_of_small_matrices():
         np.testing.assert_allclose(inverse_of(jnp.asarray(matrix)) @ matrix, np.eye(n), atol=1e-12)
 
 
-def integrated(scene, cycles):
-    """The sections by SciPy's Radau in time, the equations of motion written out again here."""
-    drive, (stop,), xi = scene.drive, scene.stops, float(scene.damping_ratio)
-    gap, k = float(stop.gap), float(stop.restitution)
-    mu, eps = float(drive.slider_inertia), float(drive.coupling)
-
-    def rates(t, x):
-        Y, V, W, phi = x
-        U, slope, bend = np.cos(phi), -np.sin(phi), -np.cos(phi)
-        torque = float(drive.strength) * (float(drive.control) - W / float(drive.no_load_speed))
-        shaft = torque + eps * slope * (Y - U) - mu * slope * bend * W * W
-        return [V, U - Y - 2 * xi * V, shaft / (1 + mu * slope**2), W]
-
-    def contact(t, x):
-        return x[0] - gap
-
-    def section(t, x):
-        return x[3] - 2 * np.pi * (len(kept) + 1)
-
-    contact.terminal = section.terminal = True
-    contact.direction = section.direction = 1
-    start = scene.start()
-    x, kept, impacts = np.array([start.Y, start.V, start.W, 0.0], float), [], 0
-    while len(kept) < cycles:
-        found = solve_ivp(
-            rates, (0, 100), x, "Radau", rtol=1e-10, atol=1e-11, max_step=0.1,
-            events=(contact, section),
-        )  # fmt: skip
-        x = found.y[:, -1].copy()
-        if found.t_events[0].size:
-            x[:2] = gap, -k * x[1]
-            impacts += 1
-        else:
-            kept.append(x[:3].copy())
-    return np.array(kept), impacts
-
-
 @pytest.mark.parametrize("torque", [1e2, 1e4, 1e6])
 def test_strong_motors_beside_scipy(torque):
     scene = strong(torque)
     run = vi.simulate(scene, scene.start(), 4, method=IMPLICIT)
-    truth, impacts = integrated(scene, 4)
-    found = np.stack([getattr(run.sections, name)[1:] for name in "YVW"], axis=-1)
-    np.testing.assert_allclose(found, truth, atol=1e-7)
-    assert bool(run.successful) and int(run.impacts.sum()) == impacts >= 3
+    drive, (stop,), start = scene.drive, scene.stops, scene.start()
+    truth = integrated(
+        {
+            "tau0": float(drive.strength), "kappa": float(drive.control),
+            "eps": float(drive.coupling), "mu": float(drive.slider_inertia),
+            "w0": float(drive.no_load_speed),
+        },
+        float(scene.damping_ratio), ((1, float(stop.gap), float(stop.restitution)),),
+        (float(start.Y), float(start.V), float(start.W)), 4,
+        method="Radau", rtol=1e-10, atol=1e-11,
+    )  # fmt: skip
+    found = np.stack([getattr(run.sections, name) for name in "YVW"], axis=-1)
+    np.testing.assert_allclose(found, truth.sections, atol=1e-7)
+    np.testing.assert_array_equal(run.impacts, truth.impacts)
+    assert bool(run.successful) and int(run.impacts.sum()) >= 3
 
 
 def test_steps_do_not_grow_with_the_motor():

@@ -85,3 +85,75 @@ def test_own_scenes_have_their_own_clock_and_no_closed_form():
         vi.simulate(ball(), start, 1, clock="time")
     with pytest.raises(ValueError, match=r"`ExactFlight` needs a `Scene`.*BouncingBall"):
         vi.simulate(ball(), start, 1, method=vi.ExactFlight())
+
+
+class Wrong(BouncingBall):
+    """What a machine may be told wrong."""
+
+    kind: str = eqx.field(static=True, default="")
+
+    @property
+    def cycle(self):
+        return (lambda: 1.0) if self.kind == "cycle" else 1.0
+
+    def field(self, s, state):
+        if self.kind == "tuple":
+            return state.V, -self.gravity
+        if self.kind == "shape":
+            return Ball(state.V, jnp.ones(2))
+        if self.kind == "if" and state.Y > 0:
+            return Ball(state.V, state.V)
+        return Ball(state.V, -self.gravity)
+
+
+@pytest.mark.parametrize("verb", [lambda m, x: vi.simulate(m, x, 2), vi.find_orbit])
+@pytest.mark.parametrize(
+    ("kind", "stops", "told"),
+    [
+        ("cycle", (), "`cycle` of a Wrong must be a number"),
+        ("tuple", (), "`field` of a Wrong must return"),
+        ("shape", (), "`field` of a Wrong must return"),
+        ("if", (), "`jnp.where`, not `if`"),
+        ("", (0.5,), "`stops` of a Wrong must be a tuple"),
+        ("", vi.RigidStop(0.5, 0.5), "`stops` of a Wrong must be a tuple"),
+        ("", (vi.RigidStop(0.5, 0.5, coordinate=1),), "limits coordinate 1, but there are 1"),
+    ],
+)
+def test_a_machine_that_is_none_is_told_what_is_wrong(kind, stops, told, verb):
+    machine = Wrong(jnp.asarray(1.0), stops, kind)
+    with pytest.raises((TypeError, ValueError), match=told):
+        verb(machine, Ball(*map(jnp.asarray, (0.1, 0.0))))
+
+
+class Carried(BouncingBall):
+    """The same ball, whose height above a lift is what the floor limits."""
+
+    @property
+    def coordinates(self):
+        def place(state):
+            return state.Y - 1.0
+
+        return (vi.Coordinate(place, lambda x: x.V, lambda x, Y, V: Ball(Y + 1.0, V)),)
+
+
+def test_extremes_are_those_of_the_first_coordinate():
+    lifted = Carried(jnp.asarray(2.0), (vi.RigidStop(0.0, 0.8, "left"),))
+    start = Ball(*map(jnp.asarray, (1.5, 0.0)))
+    run, plain = vi.simulate(lifted, start, 3), vi.simulate(ball(), Ball(start.Y - 1, start.V), 3)
+    np.testing.assert_allclose(run.y_min, plain.y_min, atol=1e-12)
+    np.testing.assert_allclose(run.y_max, plain.y_max, atol=1e-12)
+    assert float(lifted.position(start)) == 0.5 and lifted.placed(start, start.V, start.V).Y == 1
+
+
+@pytest.mark.parametrize("clock", ["phase", "time"])
+def test_samples_cost_nothing_before_they_are_taken(clock):
+    scene = vi.Parameters(control=0.9).scene()
+    options = {"clock": clock, "samples": 64}
+    whole = vi.simulate(scene, scene.start(), 33, **options)
+    settled = vi.simulate(scene, scene.start(), 3, settle=30, **options)
+    assert int(settled.steps) < 0.35 * int(whole.steps)
+    for name in "YVW":
+        a, b = (getattr(run.samples.state, name) for run in (settled, whole))
+        np.testing.assert_allclose(a, b[30 * 64 :], atol=1e-6)
+    np.testing.assert_allclose(settled.duration, whole.duration[30:], atol=1e-8)
+    np.testing.assert_array_equal(settled.impacts, whole.impacts[30:])

@@ -256,3 +256,31 @@ def test_single_precision_rests_as_double_does():
     assert found[True][0].all() and found[False][0].all()
     assert np.abs(found[True][1] - found[False][1]).max() < 1e-5
     np.testing.assert_array_equal(found[True][2].sum(1), found[False][2].sum(1))
+
+
+@pytest.mark.parametrize(
+    ("machine", "start"),
+    [
+        (vi.machines.BouncingBall(acceleration=0.9), {}),
+        (scene(zeta=0.3, gap=-1.5), {"Y": -1.5, "V": 0.0}),
+    ],
+    ids=["ball", "pressed"],
+)
+def test_a_body_that_rests_for_ever_is_in_periodic_motion(machine, start):
+    """What departs a little from the stop comes to rest on it: nothing of it is left."""
+    settled = vi.simulate(machine, machine.start(**start), 1, settle=200).last
+    orbit = vi.find_orbit(machine, settled, throw=True)
+    assert int(orbit.impacts) == 0 and int(orbit.cycles) == 1 and bool(orbit.stable)
+    np.testing.assert_array_equal(orbit.multipliers, 0)
+    assert float(orbit.y_max) == float(orbit.y_min) == float(machine.position(settled))
+
+
+def test_a_body_that_rests_moves_with_its_stop():
+    """Its place by the stop's is 1, by its own start 0, until it leaves."""
+
+    def last(gap, start):
+        pressed = scene(gap=gap)
+        return vi.simulate(pressed, pressed.start(Y=start, V=0.0), 1, settle=3).last.Y
+
+    by_gap, by_start = jax.grad(last, argnums=(0, 1))(-1.5, -1.5)
+    assert (float(by_gap), float(by_start)) == (1.0, 0.0)

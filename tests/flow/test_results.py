@@ -127,3 +127,19 @@ def test_a_run_as_a_labelled_data_set():
     assert alone["result"].item() == "successful"
     with pytest.raises(ValueError, match=r"`dims` must name the 1 batch axes .* 'gap'"):
         run.to_xarray("gap")
+
+
+@pytest.mark.parametrize(
+    "method",
+    [vi.ExactFlight(), vi.Adaptive(rtol=1e-11), vi.Taylor(20, 8)],
+    ids=lambda method: type(method).__name__,
+)
+def test_turning_points_are_met_where_they_are_recorded(method):
+    """Settling takes fewer steps than recording, and leaves the extremes recorded as they are."""
+    scene = vi.Scene.ideal(frequency_ratio=0.6, gap=None, damping_ratio=0.05)
+    options = {"method": method, "record": "motion"}
+    whole = vi.simulate(scene, scene.start(V=1.0), 24, **options)
+    settled = vi.simulate(scene, scene.start(V=1.0), 4, settle=20, **options)
+    assert int(settled.steps) < int(whole.steps)
+    np.testing.assert_allclose(settled.y_max, whole.y_max[-4:], atol=1e-9)
+    np.testing.assert_allclose(settled.y_min, whole.y_min[-4:], atol=1e-9)

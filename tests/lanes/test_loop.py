@@ -3,6 +3,7 @@
 import ast
 import sys
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import jax
@@ -14,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from vi_jax import lanes
 from vi_jax.lanes import _code, _primitive, machine
+from vi_jax.lanes.machine import thread_count
 
 ROWS = 12
 
@@ -127,6 +129,21 @@ def test_lanes_know_nothing_of_each_other(data):
         part = jax.tree.leaves(MANY(*(x[chosen] for x in values)))
     for a, b in zip(whole, part, strict=True):
         np.testing.assert_array_equal(np.asarray(a)[chosen], b)
+
+
+def test_threads_hold_on_threads_of_no_context():
+    """As XLA's own are, on which it runs larger programs."""
+
+    def told():
+        with ThreadPoolExecutor(1) as pool:
+            return pool.submit(thread_count).result()
+
+    with lanes.threads(3):
+        assert told() == thread_count() == 3
+        with lanes.threads(1):
+            assert told() == thread_count() == 1
+        assert told() == 3
+    assert told() == thread_count() == lanes.cores()
 
 
 def test_nested_and_shared_axes():

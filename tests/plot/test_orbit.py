@@ -65,7 +65,7 @@ def test_sweep_of_a_machine_speaks_its_words():
     ball = vi.machines.BouncingBall(restitution=0.5, acceleration=1.2)
     sweep = vi.sweep(ball, "acceleration", np.array([1.2, 1.25]), settle=200, cycles=8)
     assert "cycle" in str(sweep) and "π" not in str(sweep)
-    assert vi.plot_sweep(sweep, ax=_axes()).get_ylabel() == "min height (g/ω²)"
+    assert vi.plot_sweep(sweep, ax=_axes()).get_ylabel() == "max height (g/ω²)"
 
 
 def test_given_axes_are_used(branch):
@@ -86,3 +86,20 @@ def test_boundary_is_drawn_in_its_plane(branch):
     ax = vi.plot_boundary(curve)
     assert ax.get_xlabel() == "frequency ratio ζ" and ax.get_ylabel() == "restitution k"
     np.testing.assert_allclose(np.asarray(ax.lines[0].get_xydata()), curve.parameters)
+
+
+def test_what_a_stop_holds_is_not_drawn(branch):
+    """Of a ball on a table the least height is the table's; and names are checked."""
+    ball = vi.machines.BouncingBall(acceleration=1.2, restitution=0.6)
+    swept = vi.sweep(
+        ball, "acceleration", np.linspace(1.1, 1.2, 3), start=ball.start(height=6.8, speed=-0.7),
+        settle=100, cycles=4,
+    )  # fmt: skip
+    assert np.ptp(vi.plot_sweep(swept).lines[0].get_ydata()) > 0.01
+    assert vi.plot_branch(branch).lines[0].get_ydata()[0] in branch.y_min
+    with pytest.raises(ValueError, match=r"`y` must be one of .*'y_min'"):
+        vi.plot_sweep(swept, y="Ymin")
+    with pytest.raises(ValueError, match=r"`y` must be one of .*'y_min'"):
+        vi.plot_branch(branch, y="Ymin")
+    with pytest.raises(TypeError, match="branch"):
+        vi.plot_branch(swept)

@@ -27,6 +27,7 @@ def main() -> None:
     print("begins", flush=True)
     if not options.cluster:
         vi.scan(scene, AXES, settle=1500, lanes=512, workers=2, store=options.store)
+        print("ends", flush=True)
         return
     from dask.distributed import Client, LocalCluster
 

@@ -2,6 +2,7 @@
 file asks."""
 
 import argparse
+import os
 import sys
 from importlib.metadata import PackageNotFoundError, version
 from io import TextIOWrapper
@@ -34,6 +35,16 @@ _ABOUT = {
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command line and return its exit code: 0, 1 (failed), 2 (usage) or 130 (Ctrl-C)."""
+    try:
+        code = _run(argv)
+        sys.stdout.flush()
+        return code
+    except BrokenPipeError:  # whoever reads has seen enough, as `head` has
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+def _run(argv: list[str] | None) -> int:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal without Greek letters
@@ -123,8 +134,8 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True)
     verb = commands.add_parser(
         "reproduce",
-        help="draw Figures 2, 3 and 4 of the paper and write a report",
-        description="Draws Figures 2, 3 and 4 of the paper and the boundaries of its discrepancy, "
+        help="draw Figures 1 to 4 of the paper and write a report",
+        description="Draws Figures 1 to 4 of the paper and the boundaries of its discrepancy, "
         "measures what it claims with them and the faults of its printed text (report.md, "
         "report.json).",
     )

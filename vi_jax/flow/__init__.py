@@ -1,5 +1,6 @@
 """How a scene moves: methods, the hybrid step, the closed-form flight, `simulate`, results."""
 
+from ._lane import has_fixed_cycle as has_fixed_cycle
 from .fusion import jit as jit
 from .methods import AbstractMethod as AbstractMethod
 from .methods import Adaptive as Adaptive

@@ -98,6 +98,16 @@ class Lane(eqx.Module):
     rejected: Scalar
 
 
+def ticks(scene: AbstractScene, state: Any) -> bool:
+    """Whether the independent variable itself counts the cycles."""
+    return scene.clock(state) is None and scene.section(state) is None
+
+
+def has_fixed_cycle(scene: AbstractScene, state: Any) -> bool:
+    """Whether all cycles have the same duration, `scene.period`."""
+    return ticks(scene, state) and scene.pace(jnp.zeros_like(scene.position(state)), state) is None
+
+
 class Plan(eqx.Module):
     """What is asked of the loop."""
 
@@ -128,14 +138,9 @@ class Plan(eqx.Module):
         return self.cycles * self.parts
 
     @property
-    def skipped(self) -> Scalar:
-        """Number of intervals before the first one recorded."""
-        return self.settle * self.parts
-
-    @property
     def intervals(self) -> Scalar:
-        """Number of intervals to go through."""
-        return self.skipped + self.kept
+        """Number of intervals to go through: whole cycles before those recorded."""
+        return self.settle + self.kept
 
     @property
     def block(self) -> int:
@@ -147,14 +152,25 @@ class Plan(eqx.Module):
         cycle = jnp.asarray(self.scene.cycle, part.dtype)
         return cycle * (part + 1) / self.parts if self.parts > 1 else cycle
 
+    def first_part(self, done: Scalar) -> Scalar:
+        """The part with which a cycle begins after so many intervals: those that are not kept are
+        whole cycles, as if only their last part were left."""
+        return jnp.where(done < self.settle, self.parts - 1.0, jnp.zeros_like(done))
+
     def ticks(self, state: Any) -> bool:
         """Whether `s` itself counts the cycles."""
-        return self.scene.clock(state) is None and self.scene.section(state) is None
+        return ticks(self.scene, state)
 
     def timed(self, state: Any) -> bool:
         """Whether the duration of a cycle is recorded, which only a fixed one need not be."""
-        paced = self.scene.pace(jnp.zeros_like(self.scene.position(state)), state) is not None
-        return self.motion and (paced or not self.ticks(state))
+        return self.motion and not has_fixed_cycle(self.scene, state)
+
+    def meets_turns(self, done: Scalar) -> Any:
+        """Whether every turning point is met after so many intervals, or only those that are close
+        to a stop: for extremes, and where something else may happen there."""
+        if self.scene.switches:
+            return True
+        return (done >= self.settle) if self.motion else False
 
     def fresh(self, state: Any) -> Record:
         """The record of an interval that begins in `state`."""
@@ -184,6 +200,7 @@ class Plan(eqx.Module):
         bad = jax.lax.stop_gradient(bad)
         zero = jnp.zeros_like(Y)
         modes = jax.lax.stop_gradient(begin_modes(scene, zero, start))
+        _check_field(scene, zero, start, modes)
         free = in_modes(scene, modes)
         here = [rates(free.field, x.position, zero, start) for x in scene.coordinates]
         # At rest the acceleration says which way the motion goes.
@@ -191,6 +208,11 @@ class Plan(eqx.Module):
         contact = None
         if self.rests:
             contact = tuple(self._rests_on(k, x) for k, x in enumerate(here))
+            for i, stop in enumerate(scene.stops):
+                # A little off the stop it would come to rest there: no derivative by the start.
+                at = scene.coordinates[stop.coordinate].placed(start, stop.place, zero)
+                rests = contact[stop.coordinate] == to_stop(i)
+                start = jtu.tree_map(lambda a, b, rests=rests: jnp.where(rests, a, b), at, start)
         length = zero + jax.lax.stop_gradient(scene.cycle) / self.method.steps_per_cycle
         if self.method.adaptive:
             length = length / 8
@@ -206,7 +228,7 @@ class Plan(eqx.Module):
             attempt=length,
             target=zero,
             aims=zero,
-            part=zero,
+            part=self.first_part(zero) if self.parts > 1 else zero,
             done=zero,
             fault=jnp.where(bad, float(results.BAD_START), zero),
             steps=zero,
@@ -222,3 +244,20 @@ class Plan(eqx.Module):
                 rests = (stop.beyond(here.x) >= 0) & (here.v == 0) & (stop.sign * here.a > 0)
                 contact = jnp.where(rests, to_stop(i), contact)
         return contact
+
+
+def _check_field(scene: AbstractScene, s: Scalar, state: Any, modes: tuple[Scalar, ...]) -> None:
+    """**Raises:** `TypeError` for a field that cannot be traced or whose result is no state; while
+    the loop is traced, and at no cost where it runs."""
+    whose = f"`field` of a {type(scene).__name__}"
+    try:
+        flow = jax.eval_shape(scene.field, s, state, *modes)
+    except jax.errors.TracerBoolConversionError as error:
+        raise TypeError(
+            f"{whose} must be written for numbers that are traced: `jnp.where`, not `if`."
+        ) from error
+    wanted, got = (jtu.tree_map(jnp.shape, x) for x in (state, flow))
+    if jtu.tree_structure(state) != jtu.tree_structure(flow) or wanted != got:
+        raise TypeError(
+            f"{whose} must return what is like its state, {wanted}, but returned {got}."
+        )

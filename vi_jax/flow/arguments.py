@@ -20,7 +20,7 @@ from .._checks import (
     one_of,
     warn_of_narrow,
 )
-from ..scene import AbstractScene, Scene
+from ..scene import AbstractScene, RigidStop, Scene
 from ._lane import Plan
 from .methods import MethodLike, chosen
 
@@ -46,6 +46,7 @@ def planned(
         raise TypeError(
             f"Argument `scene` must be a `Scene` or an `AbstractScene`, but got {scene!r}."
         )
+    _check_parts(scene)
     method = chosen(scene, method)
     cycles = count("cycles", cycles, least=1)
     samples = count("samples", samples)
@@ -100,6 +101,22 @@ def planned(
         max_impacts=jnp.asarray(max_impacts, dtype),
     )
     return plan, start
+
+
+def _check_parts(scene: AbstractScene) -> None:
+    """**Raises:** `TypeError` or `ValueError` for a machine whose parts are not what they must."""
+    name, stops = type(scene).__name__, scene.stops
+    if not isinstance(stops, tuple) or not all(isinstance(stop, RigidStop) for stop in stops):
+        raise TypeError(f"`stops` of a {name} must be a tuple of `RigidStop`s, but is {stops!r}.")
+    if callable(scene.cycle):
+        raise TypeError(f"`cycle` of a {name} must be a number, or a property that gives one.")
+    many = len(scene.coordinates)
+    for i, stop in enumerate(stops):
+        if stop.coordinate >= many:
+            raise ValueError(
+                f"Stop {i} of a {name} limits coordinate {stop.coordinate}, but there are {many}: "
+                "name each in `coordinates`."
+            )
 
 
 def _most(dtype: Any) -> int:
@@ -170,7 +187,9 @@ def check_start(scene: AbstractScene, start: Any) -> None:
         _ = scene.position(start), scene.velocity(start)
     except (AttributeError, TypeError, LookupError):
         raise TypeError(
-            f"Argument `start` must be a state of this scene, but got {start!r}."
+            f"Argument `start` must be a state of this scene, but got {start!r}. Of a state "
+            "without `Y` and `V` a machine of your own says by `position`, `velocity` and "
+            "`placed`, or by `coordinates`, what its stops limit."
         ) from None
     for path, leaf in jtu.tree_leaves_with_path(start):
         numbers = concrete(leaf)

@@ -43,13 +43,13 @@ def run_lane(plan: Plan, start: Any, wanted: Any = True) -> tuple[Ends, Any, Rec
         numbers, start, wanted = inputs
         plan = eqx.combine(numbers, rest)
         lane = plan.launch(start, wanted)
-        first = plan.skipped <= 0
+        first = plan.settle <= 0
         return lane, lanes.Emitted(_active(plan, lane), first, (start, plan.fresh(start)))
 
     def step(inputs, lane):
         plan = eqx.combine(inputs[0], rest)
         new = iterate(plan, lane)
-        complete = new.completed & (new.lane.done >= plan.skipped)
+        complete = new.completed & (new.lane.done >= plan.settle)
         return new.lane, lanes.Emitted(_active(plan, new.lane), complete, (new.state, new.record))
 
     def end(inputs, lane):

@@ -59,3 +59,11 @@ def struck_modes(
     """The modes after an impact."""
     new = (x.struck(scene, s, state, m) for x, m in zip(scene.switches, modes, strict=True))
     return tuple(stop_gradient(jnp.asarray(mode, jnp.result_type(s))) for mode in new)
+
+
+def exact(scene: AbstractScene, state: Any) -> bool:
+    """Whether one number of the state is all that stops limit, so that it can be put on a stop
+    without rounding; known while a step is traced."""
+    place = scene.coordinates[0].position(state)
+    own = any(place is x for x in jtu.tree_leaves(state))
+    return own and len(scene.coordinates) == 1

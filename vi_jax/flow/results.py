@@ -35,7 +35,7 @@ class RESULTS(eqx.Enumeration):
     unresolved = "An impact could not be located within the step."
     max_steps = (
         "The number of steps exceeded `max_steps` before the last cycle was complete, or 65,536 "
-        "within one."
+        "within one, as where an autonomous machine is at rest and meets its section no more."
     )
 
 

@@ -111,9 +111,15 @@ def suggest_method(
     check_start(scene, start)
     bench = _Bench(scene, start, quantity, cycles, lanes)
     best = preset(scene, "reference")
-    exact, stiff = isinstance(best, ExactFlight), _is_stiff(scene, start)
-    truth = best.tighter() if exact else Adaptive(diffrax.Dopri8(), rtol=1e-14)
-    bench.truth = bench.result(Adaptive(diffrax.Kvaerno5(), rtol=1e-12) if stiff else truth)
+    exact = isinstance(best, ExactFlight)
+    stiff = not exact and _is_stiff(scene, start)
+    if exact:
+        truth = best.tighter()
+    elif stiff:
+        truth = Adaptive(diffrax.Kvaerno5(), rtol=1e-12)
+    else:
+        truth = Adaptive(diffrax.Dopri8(), rtol=1e-14)
+    bench.truth = bench.result(truth)
     failed = int(np.sum(~np.isfinite(bench.truth[:, 0])))
     if failed:
         raise ValueError(
@@ -203,8 +209,9 @@ class _Bench:
         scene = self.scene
 
         def looked_at(nudge):
-            velocity = scene.velocity(self.start) + nudge
-            start = scene.placed(self.start, scene.position(self.start), velocity)
+            body = scene.coordinates[0]
+            velocity = body.velocity(self.start) + nudge
+            start = body.placed(self.start, body.position(self.start), velocity)
             options: dict[str, Any] = {"record": "sections"}
             if self.quantity in ("extremes", "impacts"):
                 options = {"impact_log": 32 if self.quantity == "impacts" else 0}

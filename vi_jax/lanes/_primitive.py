@@ -2,6 +2,8 @@
 
 import functools
 import warnings
+from contextlib import AbstractContextManager
+from contextvars import ContextVar
 from typing import Any
 
 import jax
@@ -12,11 +14,21 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from . import _xla as xla
+from ._context import within
 from ._derivative import forward, widened
 from ._program import Program, spread
 from ._vector import Unsupported
 from .call import header, registered
 from .machine import kernel_of
+
+_strict: ContextVar[bool] = ContextVar("strict", default=False)
+
+
+def vector_only() -> AbstractContextManager:
+    """Within this context a program with lanes that cannot be vector code is not compiled: it
+    raises `Unsupported`."""
+    return within(_strict, True)
+
 
 lanes_p = Primitive("lanes")
 lanes_p.multiple_results = True
@@ -174,10 +186,14 @@ _on_xla = mlir.lower_fun(
 
 def _lowered(ctx, *args, program: Program, road: str):
     if road == "xla":
+        if _strict.get():
+            raise Unsupported("the other road")
         return _on_xla(ctx, *args, program=program, road=road)
     try:
         kernel = kernel_of(program)
     except Unsupported as reason:
+        if _strict.get():
+            raise
         _tell(str(reason))
         return _on_xla(ctx, *args, program=program, road=road)
     ctx.module_context.add_keepalive(kernel)

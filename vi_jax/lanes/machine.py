@@ -7,8 +7,9 @@ import os
 import threading
 import weakref
 from collections import OrderedDict
+from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
 from typing import Any
 
@@ -23,12 +24,24 @@ from ._vector import check
 _KEPT = 64
 
 _threads: ContextVar[int | None] = ContextVar("threads", default=None)
+_entered: list[int] = []
 _cpu: ContextVar[str | None] = ContextVar("cpu", default=None)
 
 
-def threads(number: int) -> AbstractContextManager:
-    """Run lanes on so many threads within this context (default: the cores of this process)."""
-    return within(_threads, number)
+@contextmanager
+def threads(number: int) -> Iterator[None]:
+    """Run lanes on so many threads within this context (default: the cores of this process).
+
+    XLA runs larger programs on threads of its own, which belong to no context. Wait for what they
+    compute before you leave; if several of your threads have such a context, the one entered last
+    holds for all of them there.
+    """
+    with within(_threads, number):
+        _entered.append(number)
+        try:
+            yield
+        finally:
+            _entered.remove(number)
 
 
 def processor(name: str) -> AbstractContextManager:
@@ -40,6 +53,8 @@ def processor(name: str) -> AbstractContextManager:
 def thread_count() -> int:
     """Threads that lanes run on."""
     asked = _threads.get()
+    if asked is None:
+        asked = next(reversed(_entered), None)
     return cores() if asked is None else asked
 
 

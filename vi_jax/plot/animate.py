@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from matplotlib import animation
 from matplotlib.axes import Axes
@@ -118,7 +119,7 @@ def _frames(run: Run, scene: AbstractScene, path: Any, good: np.ndarray, number:
     states = jax.tree_util.tree_map(between, samples.state)
     # The corners of the path at its impacts, which no samples have.
     Y, V = (np.interp(at, path.cycles[good], x[good]) for x in (path.Y, path.V))
-    states = jax.vmap(scene.placed)(states, Y, V)
+    states = jax.vmap(scene.coordinates[0].placed)(states, Y, V)
     places = [np.asarray(jax.vmap(c.position)(states), float) for c in scene.coordinates]
     return _Frames(at, states, np.stack(places))
 
@@ -179,7 +180,7 @@ class MotionAnimation(animation.FuncAnimation):
 
     def _sketched(self, index: int) -> None:
         scene, frames = self._scene, self._frames
-        state = jax.tree_util.tree_map(lambda x: x[index], frames.states)
+        state = jax.tree_util.tree_map(lambda x: jnp.asarray(x[index]), frames.states)
         turn = float(scene.turn)
         phase = float(scene.phase_at((frames.cycles[index] % 1.0) * turn))
         pen = Pen(self._above, reach=self._reach, size=size_of(scene, self._reach))

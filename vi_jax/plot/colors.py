@@ -50,7 +50,7 @@ DASHES = {
     "grazing": "-",
     "period-doubling": (0, (5, 2)),
     "fold": (0, (6, 1.5, 1.2, 1.5)),
-    "branch-point": (0, (1.2, 1.2)),
+    "symmetry-breaking": (0, (1.2, 1.2)),
 }
 
 

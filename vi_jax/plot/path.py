@@ -7,6 +7,7 @@ import jax
 import numpy as np
 
 from ..flow import Run, Samples
+from ..orbit import Orbit
 from ..scene import AbstractScene
 
 
@@ -42,6 +43,8 @@ def motion_path(
 
     **Raises:** `ValueError` if the run has no samples or is a batch.
     """
+    if isinstance(motion, Orbit):
+        raise TypeError("Argument `motion` must be a `Run`: give `orbit.trajectory()` of an orbit.")
     samples = motion.samples if isinstance(motion, Run) else motion
     if samples is None:
         raise ValueError("Argument `motion` must have samples: simulate with `samples=64`, say.")

@@ -147,7 +147,12 @@ def basins(
     seed = count("seed", seed)
     ranges = axes_of(region, "region")
     for name, row in ranges.items():
-        if row.size != 2 or not row[0] < row[1] or not name.startswith(START):
+        if not name.startswith(START):
+            raise ValueError(
+                f'Argument `region` must name parts of the start, "start.Y" and such, but names '
+                f"{name!r}."
+            )
+        if row.size != 2 or not row[0] < row[1]:
             raise ValueError(
                 "Argument `region` must give ranges (low, high), low < high, of parts of the "
                 f'start, "start.Y" and such, but got {region[name]!r} for {name!r}.'

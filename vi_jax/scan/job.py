@@ -24,9 +24,6 @@ from .measures import AbstractMeasure, Numbers, measures_of
 
 START = "start."
 
-# Lanes looked at again in one go by the measures that need it.
-_AGAIN = 64
-
 
 class Job(eqx.Module):
     """What is computed of every lane of a scan."""
@@ -46,6 +43,11 @@ class Job(eqx.Module):
     max_steps: int | None = eqx.field(static=True)
     rests: bool = eqx.field(static=True, default=True)
     """Whether the body may come to rest on a stop."""
+
+    @property
+    def record(self) -> str:
+        """What the measures must see of the cycles."""
+        return "motion" if any(m.record == "motion" for m in self.measures) else "sections"
 
     def lane(self, values: dict[str, Any], nudge: Any = None) -> tuple[AbstractScene, Any]:
         """Scene and start of the lane with these values on the axes."""
@@ -117,6 +119,7 @@ class Job(eqx.Module):
             lane_of, values, self.cycles,
             wanted=wanted, method=self.method, settle=self.settle,
             max_impacts=self.max_impacts, max_steps=self.max_steps, rests=self.rests,
+            record=self.record,
         )  # fmt: skip
 
         def measured(values, run):
@@ -138,37 +141,19 @@ class Job(eqx.Module):
         self, measure: AbstractMeasure, values, wanted, state, out: Numbers, *look: Array
     ) -> Numbers:
         """`out` with what `measure` finds at another look, at the lanes that need it only."""
-        lanes = wanted.shape[0]
         unclear = jax.vmap(lambda found: measure.unclear(found, *look))(out)
         if unclear is None:
             return out
-        unclear = unclear & wanted & (out["result"] == 0)
-        order = jnp.argsort(~unclear, stable=True)
-        order = jnp.concatenate([order, jnp.full((_AGAIN,), lanes, order.dtype)])
 
-        def body(carry):
-            begin, out = carry
-            index = jax.lax.dynamic_slice_in_dim(order, begin, _AGAIN)
+        def one(values, state, out, unclear):
+            scene, _ = self.lane(values)
+            # Another lane ends at once, its start being no number.
+            state = jtu.tree_map(lambda x: jnp.where(unclear, x, jnp.nan), state)
+            later = measure.later(scene, state, self.method, out, *look, rests=self.rests)
+            new = {**out, **later}
+            return jtu.tree_map(lambda a, b: jnp.where(unclear, a, b), new, out)
 
-            def one(index):
-                here = jtu.tree_map(lambda x: x[index], (values, state, out))
-                scene, _ = self.lane(here[0])
-                later = measure.later(scene, here[1], self.method, here[2], *look)
-                return {**here[2], **later}
-
-            new = jax.vmap(one)(jnp.minimum(index, lanes - 1))
-            fits = (index < lanes) & unclear[jnp.minimum(index, lanes - 1)]
-            old = jtu.tree_map(lambda x: x[jnp.minimum(index, lanes - 1)], out)
-            new = jax.vmap(lambda fits, *x: jtu.tree_map(lambda a, b: jnp.where(fits, a, b), *x))(
-                fits, new, old
-            )
-            return begin + _AGAIN, jtu.tree_map(
-                lambda x, y: x.at[index].set(y, mode="drop"), out, new
-            )
-
-        begin = jnp.zeros((), order.dtype)
-        total = jnp.sum(unclear)
-        return jax.lax.while_loop(lambda carry: carry[0] < total, body, (begin, out))[1]
+        return jax.vmap(one)(values, state, out, unclear & wanted & (out["result"] == 0))
 
 
 def make_job(
@@ -197,10 +182,13 @@ def make_job(
     settle = count("settle", settle)
     derivatives = (derivatives,) if isinstance(derivatives, str) else derivatives
     if isinstance(scene, AbstractScene):
-        template, build = scene, None
+        template, build, rests = scene, None, True
+        method = chosen(scene, method)
     elif callable(scene):
         template, build = None, scene
-        _check_names_of(scene, [name for name in names if not name.startswith(START)])
+        own = [name for name in names if not name.startswith(START)]
+        _check_names_of(scene, own)
+        method, rests = _suited(build, own, method)
     else:
         raise TypeError(
             "Argument `scene` must be a `Scene`, an `AbstractScene` or a function that makes one, "
@@ -216,13 +204,32 @@ def make_job(
         start=_as_arrays(start),
         derivatives=tuple_of("derivatives", derivatives, str),
         measures=_as_arrays(measures),
-        method=_as_arrays(chosen(template, method)),
+        method=_as_arrays(method),
         clock=clock,
         cycles=cycles,
         settle=jnp.asarray(settle),
         max_impacts=count("max_impacts", max_impacts),
         max_steps=None if max_steps is None else count("max_steps", max_steps, least=1),
+        rests=rests,
     )
+
+
+def _suited(
+    build: Callable[..., Any], names: list[str], method: MethodLike
+) -> tuple[AbstractMethod, bool]:
+    """The method for the scenes that a function makes, and whether a body can come to rest in
+    them, whatever its values."""
+    found: list[tuple[AbstractMethod, bool]] = []
+
+    def made(values):
+        scene = build(**values)
+        if isinstance(scene, AbstractScene):
+            found.append((chosen(scene, method), scene.may_rest()))
+        else:  # refused once there are lanes
+            found.append((chosen(None, method), True))
+
+    jax.eval_shape(made, {name: jnp.zeros(()) for name in names})
+    return found[0]
 
 
 def _check_names_of(build: Callable[..., Any], names: list[str]) -> None:
@@ -272,7 +279,8 @@ def _corners(blocks: Blocks) -> np.ndarray:
 def check_corners(job: Job, blocks: Blocks) -> Job:
     """The job, after the checks of scene, start and method on the corners of the grid.
 
-    What the corners say about the gaps holds for the grid: if no body can rest, that is left out.
+    What the corners say about the gaps holds for the grid, unless a function makes the scenes, of
+    which it is known already: if no body can rest, that is left out.
     """
     rests = False
     if blocks.paired and job.scene is not None:
@@ -285,9 +293,9 @@ def check_corners(job: Job, blocks: Blocks) -> Job:
         lane = {name: jnp.asarray(x) for name, x in zip(blocks.axes, values, strict=True)}
         scene, start = job.lane(lane)
         check_again(scene)
-        rests = rests or job.build is not None or scene.may_rest()
+        rests = rests or scene.may_rest()
         for name in job.derivatives:
             _check_name(scene, start, name, "derivatives")
         job.method.check(scene)
         scene.adopt(start)
-    return dataclasses.replace(job, rests=rests)
+    return job if job.build is not None else dataclasses.replace(job, rests=rests)

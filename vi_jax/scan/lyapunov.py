@@ -1,5 +1,6 @@
 """Lyapunov exponents, through the impacts."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -9,9 +10,9 @@ from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
-from .._checks import count
+from .._checks import count, flag
 from .._programs import compiled
-from ..flow import RESULTS, simulate
+from ..flow import RESULTS, has_fixed_cycle, simulate
 from ..flow.methods import MethodLike, chosen
 from ..orbit.cycle_map import CycleMap, adopted, cycle_map
 from ..scene import AbstractScene, Scene
@@ -23,7 +24,8 @@ class Lyapunov(eqx.Module):
     exponents: Float[Array, "... states"]
     """The spectrum, greatest first: mean growth rates in time τ (unit: ω)."""
     per_cycle: Float[Array, "... states"]
-    """The same per drive cycle (dimensionless): ln|multipliers|/n on an orbit of n cycles."""
+    """The same per drive cycle (dimensionless): ln|multipliers|/n on an orbit of n cycles. Of an
+    autonomous machine per usual `cycle`, at which it is observed."""
     spread: Float[Array, "..."]
     """Difference of the greatest exponent between the two halves of the run (unit: ω)."""
     state: Any
@@ -52,6 +54,7 @@ def lyapunov(
     settle: Any = 200,
     number: int | None = None,
     method: MethodLike = None,
+    rests: bool | None = None,
 ) -> Lyapunov:
     """The Lyapunov spectrum of the motion that `start` settles on.
 
@@ -72,6 +75,7 @@ def lyapunov(
     - `number`: how many exponents, the greatest ones; all by default. Each costs about as much
       as the simulation itself.
     - `method`: by default the `"standard"` preset.
+    - `rests`: as for `simulate`.
 
     **Returns:** a `Lyapunov`.
 
@@ -85,6 +89,8 @@ def lyapunov(
         scene = scene.observed_every(scene.cycle)
     method = chosen(scene, method)
     carried = cycle_map(scene, method=method)
+    if rests is not None:
+        carried = dataclasses.replace(carried, rests=flag("rests", rests))
     start = adopted(carried.scene, start)
     states = ravel_pytree(start)[0].size
     number = states if number is None else count("number", number, least=1)
@@ -99,14 +105,19 @@ def lyapunov(
 @compiled
 def _lyapunov(the_map: CycleMap, start, cycles: int, settle, number: int) -> Lyapunov:
     scene, method, rests = the_map.scene, the_map.method, the_map.rests
-    before = simulate(scene, start, 1, settle=settle, method=method, rests=rests)
+    before = simulate(scene, start, 1, settle=settle, method=method, rests=rests, record="sections")
     x, unravel = ravel_pytree(before.last)
 
+    # Where all cycles last alike, turning points need not be met for the sake of durations.
+    record = "sections" if has_fixed_cycle(scene, before.last) else "motion"
+
     def image(x):
-        run = simulate(scene, unravel(x), 1, method=method, rests=rests)
-        assert run.duration is not None
+        run = simulate(scene, unravel(x), 1, method=method, rests=rests, record=record)
+        duration = jnp.asarray(scene.period, x.dtype)
+        if run.duration is not None:
+            duration = run.duration[0]
         out, _ = ravel_pytree(run.last)
-        return out, (run.duration[0], run.result)
+        return out, (duration, run.result)
 
     def cycle(carry, _):
         x, frame, result = carry

@@ -32,6 +32,10 @@ class AbstractMeasure(eqx.Module):
     """Attributes of the variables by name, such as `units` and `long_name`; `dims` names the axes
     of one that is an array."""
 
+    record: ClassVar[str] = "motion"
+    """What it must see of them, as in `simulate`: `"motion"`, or only `"sections"` and the numbers
+    of impacts and steps."""
+
     @property
     def cycles(self) -> int:
         """The fewest cycles that it must see."""
@@ -57,9 +61,10 @@ class AbstractMeasure(eqx.Module):
         method: AbstractMethod,
         found: Numbers,
         look: Any = 0,
+        rests: bool | None = None,
     ) -> Numbers:
         """Costlier numbers, only for lanes that are unclear; they replace those found. `state` is
-        that after the cycles observed, at every look."""
+        that after the cycles observed, at every look; `rests` is as for `simulate`."""
         return {}
 
 
@@ -115,6 +120,7 @@ class Sections(AbstractMeasure):
     """The section states of the last `number` cycles, one variable for each part of the state."""
 
     number: int = eqx.field(static=True, default=16)
+    record = "sections"
     attributes: ClassVar[About] = {
         "Y": {"units": "a", "long_name": "Y on the section", "dims": ("cycle",)},
         "V": {"units": "a ω", "long_name": "V on the section", "dims": ("cycle",)},
@@ -137,6 +143,7 @@ class Sections(AbstractMeasure):
 class ImpactRate(AbstractMeasure):
     """`impact_rate`, the impacts in a drive cycle, on average over the cycles observed."""
 
+    record = "sections"
     attributes: ClassVar[About] = {
         "impact_rate": {"units": "1/cycle", "long_name": "impacts per drive cycle"}
     }
@@ -149,6 +156,7 @@ class ImpactRate(AbstractMeasure):
 class Steps(AbstractMeasure):
     """`steps` and `rejected`, the steps tried and those rejected on their error estimate."""
 
+    record = "sections"
     attributes: ClassVar[About] = {
         "steps": {"long_name": "steps tried"},
         "rejected": {"long_name": "steps rejected"},
@@ -163,6 +171,7 @@ class Exponent(AbstractMeasure):
     """`exponent`, the greatest Lyapunov exponent, over `observed` further drive cycles."""
 
     observed: int = eqx.field(static=True, default=128)
+    record = "sections"
     attributes: ClassVar[About] = {
         "exponent": {"units": "ω", "long_name": "greatest Lyapunov exponent"}
     }
@@ -178,9 +187,11 @@ class Exponent(AbstractMeasure):
         """Always."""
         return jnp.asarray(True)
 
-    def later(self, scene, state, method, found, look=0):
+    def later(self, scene, state, method, found, look=0, rests=None):
         """Of one lane."""
-        found_out = lyapunov(scene, state, self.observed, settle=0, number=1, method=method)
+        found_out = lyapunov(
+            scene, state, self.observed, settle=0, number=1, method=method, rests=rests
+        )
         return {"exponent": found_out.exponents[0]}
 
 
@@ -205,6 +216,7 @@ class Regime(AbstractMeasure):
     tolerance: float = eqx.field(default=1e-6)
     threshold: float = eqx.field(default=2e-3)
     lasting: int = eqx.field(static=True, default=4000)
+    record = "sections"
     attributes: ClassVar[About] = {
         "period": {
             "units": "cycles",
@@ -249,10 +261,12 @@ class Regime(AbstractMeasure):
             jnp.asarray(look) == 0, REGIMES.unsettled, REGIMES.chaotic
         )
 
-    def later(self, scene, state, method, found, look=0):
+    def later(self, scene, state, method, found, look=0, rests=None):
         """Chaotic or not; at the second look, still or not."""
         settle = look * (self.observed + self.lasting)
-        out = lyapunov(scene, state, self.observed, settle=settle, number=1, method=method)
+        out = lyapunov(
+            scene, state, self.observed, settle=settle, number=1, method=method, rests=rests
+        )
         chaotic = out.exponents[0] > self.threshold
         # What cannot be continued is left as it was.
         otherwise = jnp.where(out.successful & (look > 0), REGIMES.transient, found["period"])

@@ -154,9 +154,10 @@ def sweep(
     fits_records("cycles", values.size * cycles, 4)
     require("tolerance", tolerance, low=0.0, open_low=True)
     if values.ndim != 1 or not values.size or not _finite(numbers):
+        infinite = values.ndim == 1 and values.size
         raise ValueError(
             "Argument `values` must be finite numbers in one row, but has shape "
-            f"{values.shape}{'' if values.ndim != 1 else ' and numbers that are not finite'}."
+            f"{values.shape}{' and numbers that are not finite' if infinite else ''}."
         )
     rests = True
     if numbers is not None:

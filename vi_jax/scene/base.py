@@ -104,16 +104,23 @@ class AbstractScene(eqx.Module):
         return (Coordinate(self.position, self.velocity, self.placed),)
 
     def position(self, state: State) -> Float[Array, ""]:
-        """The coordinate that stops limit."""
-        return state.Y
+        """The coordinate that stops limit: by default the first of `coordinates`, or `state.Y`."""
+        return self.coordinates[0].position(state) if self._has_coordinates else state.Y
 
     def velocity(self, state: State) -> Float[Array, ""]:
         """The velocity that an impact reverses; of the sign of d(position)/ds."""
-        return state.V
+        return self.coordinates[0].velocity(state) if self._has_coordinates else state.V
 
     def placed(self, state: State, Y: Float[Array, ""], V: Float[Array, ""]) -> State:
         """`state` with this position and velocity: how a landing and a rebound are applied."""
+        if self._has_coordinates:
+            return self.coordinates[0].placed(state, Y, V)
         return eqx.tree_at(lambda x: (x.Y, x.V), state, (Y, V))
+
+    @property
+    def _has_coordinates(self) -> bool:
+        """Whether a machine names its coordinates itself."""
+        return type(self).coordinates is not AbstractScene.coordinates
 
     def clock(self, state: State) -> Float[Array, ""] | None:
         """The state component that counts cycles, or `None` where `s` itself does."""

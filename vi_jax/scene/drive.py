@@ -52,24 +52,29 @@ class Motor(eqx.Module):
         """The rate, by τ, at which the shaft comes back to speed."""
         return self.strength / self.no_load_speed
 
-    def line(self, W: Float[Array, "..."]) -> Float[Array, "..."]:
-        """The straight line: the motor's steady torque at speed `W`, per J ω²."""
-        return self.strength * (self.control - W * (1 / self.no_load_speed))
+    def line(
+        self, W: Float[Array, "..."], pace: Float[Array, "..."] | None = None
+    ) -> Float[Array, "..."]:
+        """The straight line: the motor's steady torque at speed `W`, per J ω²; with `pace` 1/W,
+        divided by W."""
+        slope = 1 / self.no_load_speed
+        if pace is None:
+            return self.strength * (self.control - W * slope)
+        return self.strength * (self.control * pace - slope)
 
-    def torque(
+    def shaft(
         self,
         slide: Slide,
-        Y: Float[Array, "..."],
-        W: Float[Array, "..."],
-        motor: Float[Array, "..."] | None = None,
+        torque: Float[Array, "..."],
+        stretch: Float[Array, "..."],
+        square: Float[Array, "..."],
     ) -> Float[Array, "..."]:
-        """What accelerates the shaft at slider position `slide` and speed `W`, per J ω².
+        """dW/dτ from the motor's torque (per J ω²), U - Y and W² at this place of the slider.
 
-        `motor` is what the motor itself gives, by default its straight line.
+        It is linear in these three: divided by W they give dW/dφ.
         """
-        motor = self.line(W) if motor is None else motor
-        spring = self.coupling * slide.U_phi * (Y - slide.U)
-        return motor + spring - self.slider_inertia * slide.U_phi * slide.U_phiphi * W * W
+        load = self.coupling * stretch + self.slider_inertia * slide.U_phiphi * square
+        return (torque - slide.U_phi * load) / self.inertia(slide)
 
     def inertia(self, slide: Slide) -> Float[Array, "..."]:
         """Inertia that the shaft feels, per J."""

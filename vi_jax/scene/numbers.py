@@ -22,7 +22,7 @@ def by_name(tree: Any) -> dict[str, Any]:
 
 def leaf(tree: Any, name: str) -> Float[Array, "..."]:
     """The number of that name. **Raises:** `ValueError` that lists the near names."""
-    return by_name(tree)[check_leaf(tree, name)]
+    return jnp.asarray(by_name(tree)[check_leaf(tree, name)])
 
 
 def with_leaf(tree: Any, name: str, value: Any) -> Any:

@@ -225,28 +225,41 @@ class Scene(ShaftScene):
             zeta = drive.frequency_ratio
             if self.clock_name == "time":
                 slide = self.crank.slide(self.phase_at(zeta * s))
-                return OscillatorState(state.V, self._pull(slide.U, state, modes))
+                pull = self._pull(slide.U - state.Y, state.V, self._pushes(state, modes))
+                return OscillatorState(state.V, pull)
             slide = self.crank.slide(self.phase_at(s))
-            return OscillatorState(state.V / zeta, self._pull(slide.U, state, modes) / zeta)
-        since = s if self.clock_name == "phase" else state.phase
-        slide = self.crank.slide(self.phase_at(since))
-        pull = self._pull(slide.U, state, modes)
-        own = isinstance(drive, DCMotor)
-        torque = drive.torque(slide, state.Y, state.W, state.M if own else None)
-        inertia = drive.inertia(slide)
-        more = (drive.build_up(state.W, state.M),) if own else ()
-        if self.clock_name == "time":
-            return type(state)(state.V, pull, torque / inertia, *more, state.W)
-        pace = 1 / state.W
-        more = [pace * x for x in more]
-        return type(state)(pace * state.V, pace * pull, pace * torque / inertia, *more)
+            pull = self._pull(slide.U - state.Y, state.V, self._pushes(state, modes))
+            return OscillatorState(state.V / zeta, pull / zeta)
+        by_angle = self.clock_name == "phase"
+        slide = self.crank.slide(self.phase_at(s if by_angle else state.phase))
+        # By angle all is divided by W. Products with 1/W are shared: a power series pays for each.
+        pace = 1 / state.W if by_angle else None
 
-    def _pull(self, U, state, modes):
-        """d²Y/dτ²."""
-        pull = U - state.Y - 2 * self.damping_ratio * state.V
-        for stop, mode in zip(self.soft_stops, modes, strict=True):
-            pull = pull + stop.push(self, state, mode)
+        def paced(x):
+            return x if pace is None else pace * x
+
+        speed, stretch = paced(state.V), paced(slide.U - state.Y)
+        pull = self._pull(stretch, speed, map(paced, self._pushes(state, modes)))
+        if isinstance(drive, DCMotor):
+            torque, more = paced(state.M), (paced(drive.build_up(state.W, state.M)),)
+        else:
+            torque, more = drive.line(state.W, pace), ()
+        square = state.W if by_angle else state.W * state.W
+        shaft = drive.shaft(slide, torque, stretch, square)
+        clock = () if by_angle else (state.W,)
+        return type(state)(speed, pull, shaft, *more, *clock)
+
+    def _pull(self, stretch, speed, pushes):
+        """d²Y/dτ² from U - Y, V and what pushes; divided by W they give dV/dφ."""
+        pull = stretch - 2 * self.damping_ratio * speed
+        for push in pushes:
+            pull = pull + push
         return pull
+
+    def _pushes(self, state, modes):
+        """What each compliant stop adds to d²Y/dτ²."""
+        for stop, mode in zip(self.soft_stops, modes, strict=True):
+            yield stop.push(self, state, mode)
 
     def as_logged(self, clock: Float[Array, "..."]) -> Float[Array, "..."]:
         """The crank angle since the section, where time counts the cycles of an ideal drive."""
@@ -285,6 +298,15 @@ class Scene(ShaftScene):
         """Of the crank, without its sign."""
         drive = self.drive
         return drive.frequency_ratio if isinstance(drive, IdealDrive) else jnp.abs(state.W)
+
+    def mirrored(self, state: Any) -> Any:
+        """Y → -Y half a turn later, if both sides have the same stops and the crank the cosine."""
+        for stops in (self.stops, self.soft_stops):
+            if not all(any(stop.mirrors(other) for other in stops) for stop in stops):
+                return None
+        if type(self.crank) is not CosineCrank:
+            return None
+        return dataclasses.replace(state, Y=-state.Y, V=-state.V)
 
     def may_rest(self) -> bool:
         """Not if all gaps are known and beyond the crank's reach, so that nothing presses on."""

@@ -1,12 +1,15 @@
 """Rigid stops: the contact law, wherever it is asked for."""
 
+import dataclasses
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array, Float
 
-from .._checks import REAL, SHARE, count, number, one_of, real, require_ranges
+from .._checks import REAL, SHARE, concrete, count, number, one_of, real, require_ranges
 
 
 def _restitution(x: Any) -> Any:
@@ -35,6 +38,17 @@ class Wall(eqx.Module):
     def approach(self, V: Any) -> Any:
         """Speed towards the stop."""
         return self.sign * V
+
+    def mirrors(self, other: "Wall") -> bool:
+        """Whether the other is the image of this one, as far as their numbers are known."""
+        if type(other) is not type(self) or other.sign == self.sign:
+            return False
+        image = dataclasses.replace(other, side=self.side)  # pyright: ignore
+        if jtu.tree_structure(image) != jtu.tree_structure(self):
+            return False
+        known = (map(concrete, jtu.tree_leaves(x)) for x in (self, image))
+        pairs = zip(*known, strict=True)
+        return all(a is None or b is None or np.array_equal(a, b) for a, b in pairs)
 
 
 class RigidStop(Wall):

@@ -99,7 +99,7 @@ def look(plan: Plan, lane: Lane, motion: Any, h: Scalar) -> tuple[Scalar, Scalar
             if len(paths) > 1:  # of their turns that matter the earliest comes first
                 place, rest = _root(facing)
                 told = _is_told(rest, path, speeds[k], h)
-                matters = _matters(plan, k, path, told, place * h)
+                matters = _matters(plan, lane, k, path, told, place * h)
                 turn = turn & (place < soonest) & matters
                 soonest = jnp.where(turn, place, soonest)
                 target, cut = jnp.where(turn, to_turn_of(k), target), cut | turn
@@ -110,7 +110,7 @@ def look(plan: Plan, lane: Lane, motion: Any, h: Scalar) -> tuple[Scalar, Scalar
         if len(paths) == 1:
             turn = turns[0] & ~facing_stop[0]
             told = _is_told(rest, paths[0], speeds[0], h)
-            matters = turn & _matters(plan, 0, paths[0], told, length)
+            matters = turn & _matters(plan, lane, 0, paths[0], told, length)
             target = jnp.where(matters, to_turn_of(0), target)
             cut = jnp.where(turn, matters, cut)
         return jnp.where(cut, length, h), jnp.where(cut, target, FREE)
@@ -138,12 +138,13 @@ def _is_told(rest: Scalar, path: Series, speed: Scalar, h: Scalar) -> Flag:
     return jnp.abs(rest) <= _UNTOLD * h * jnp.maximum(jnp.abs(begin), jnp.abs(speed))
 
 
-def _matters(plan: Plan, k: int, path: Series, told: Flag, length: Scalar) -> Flag:
+def _matters(plan: Plan, lane: Lane, k: int, path: Series, told: Flag, length: Scalar) -> Flag:
     """Whether a turn of coordinate number k has to be met: where only impacts matter, one far from
     the stops is passed by, unless its place could not be told."""
-    if plan.motion or plan.scene.switches:
+    everything = plan.meets_turns(lane.done)
+    if everything is True:
         return jnp.ones_like(length, bool)
-    close = ~told
+    close = ~told if everything is False else ~told | everything
     for stop in plan.scene.stops:
         if stop.coordinate == k:
             height = _sum(path, length, jnp.zeros_like(length))

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float
 from ...lanes import pin
 from .._lane import FREE, Lane, Plan, to_release, to_turn_of
 from ..events import Rates, quintic, rising_root, slope
+from ..moving import exact
 from .trial import Crossing, Path, Trial, beyond, to_turn
 
 Scalar = Float[Array, ""]
@@ -109,8 +110,10 @@ def _aimed(plan: Plan, lane: Lane, trial: Trial) -> tuple[Flag, Scalar, Scalar]:
             k = stop.coordinate
             facing_stop[k] = facing_stop[k] | (over & (lane.direction[k] == stop.sign))
     turns, curves = [], []
-    everything, soonest = plan.motion or bool(plan.scene.switches), jnp.full_like(h, jnp.inf)
+    everything, soonest = plan.meets_turns(lane.done), jnp.full_like(h, jnp.inf)
     several = len(trial.paths) > 1
+    exactly = exact(plan.scene, lane.state)
+    now = 4 * float(jnp.finfo(h.dtype).eps) * (1 + stop_gradient(trial.s))
     for k, path in enumerate(trial.paths):
         curves.append(quintic(path.begin, path.end, h))
         facing = tuple(-lane.direction[k] * c for c in slope(curves[k]))
@@ -118,12 +121,16 @@ def _aimed(plan: Plan, lane: Lane, trial: Trial) -> tuple[Flag, Scalar, Scalar]:
         # first: what lies beyond the turn is met from there.
         turned = trial.good & (lane.direction[k] * path.end.v < 0)
         turned = turned & ~path.at_turn & ~facing_stop[k]
+        if not exactly:
+            # One that is closer than the clock can tell, as of a body that a rounded difference
+            # has all but stopped, has nothing before it that could be stepped to.
+            turned = turned & (jnp.abs(to_turn(path.end)) > now)
         ahead = turned
         if several:  # of their turns that matter the earliest comes first
             place = rising_root(stop_gradient(facing))
-            if not everything:
-                near = _near_a_stop(plan, k, curves[k], place)
-                turned = turned & (crossed | landed | near)
+            if everything is not True:
+                matters = _matters(plan, everything, k, curves[k], place)
+                turned = turned & (crossed | landed | matters)
             ahead = turned & (place < soonest)
             soonest = jnp.where(ahead, place, soonest)
         turns.append(turned)
@@ -134,8 +141,9 @@ def _aimed(plan: Plan, lane: Lane, trial: Trial) -> tuple[Flag, Scalar, Scalar]:
     goal = _Goal(crossed & ~landed, none, none, theta * h, target)
     for k, path in enumerate(trial.paths):
         turn = turns[k]
-        if not everything and not several:
-            turn = turn & (crossed | landed | _near_a_stop(plan, k, curves[k], theta))
+        if everything is not True and not several:
+            matters = _matters(plan, everything, k, curves[k], theta)
+            turn = turn & (crossed | landed | matters)
         goal = goal._replace(turn=goal.turn | turn)
         # Newton's step is better than the quintic once it is short.
         shift = to_turn(path.end)
@@ -176,12 +184,12 @@ def _hump(c: Crossing, h: Scalar) -> tuple[Flag, Scalar]:
     return rises & (bound > 0) & (place > brief) & (h - place > brief), place
 
 
-def _near_a_stop(plan: Plan, k: int, curve: tuple, theta: Scalar) -> Flag:
-    """Whether a turn comes close to a stop: where only impacts matter, others are passed by."""
+def _matters(plan: Plan, everything: Any, k: int, curve: tuple, theta: Scalar) -> Flag:
+    """Whether a turn has to be met: if not every one has, then only one close to a stop."""
     height = stop_gradient(curve[0])
     for n in range(1, len(curve)):
         height = height + stop_gradient(curve[n]) * theta**n
-    close = jnp.zeros_like(theta, bool)
+    close = jnp.zeros_like(theta, bool) if everything is False else everything
     for stop in plan.scene.stops:
         if stop.coordinate == k:
             close = close | (stop.beyond(height) > -MARGIN)

@@ -72,7 +72,7 @@ def iterate(plan: Plan, lane: Lane) -> Step:
     if plan.parts > 1:
         part = part + jnp.where(completed, 1.0, 0.0)
         turned = completed & (part >= plan.parts)
-        part = jnp.where(turned, 0.0, part)
+        part = jnp.where(turned, plan.first_part(done), part)
     s = jnp.where(turned, 0.0, s)
     if not plan.ticks(state):
         state = select(turned, plan.scene.rewound(state), state)

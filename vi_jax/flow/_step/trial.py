@@ -12,7 +12,7 @@ from ...scene import AbstractScene
 from .._lane import FREE, SECTION, Lane, Plan, to_stop, to_switch, to_turn_of, total
 from ..events import Rates, force_rate, guard_rates, landing, rates
 from ..methods.taylor import Expansion
-from ..moving import Moving, in_modes
+from ..moving import Moving, exact, in_modes
 from .rest import Release, release
 
 Scalar = Float[Array, ""]
@@ -153,7 +153,8 @@ def attempt(
     guards = [*_stops(scene, paths), *_switches(lane, scene, holding, s1, new), *section]
     # The stops of one coordinate and a clock are never met together but on a section, where a step
     # ends; other events can be.
-    if len(paths) > 1 or scene.switches or scene.section(lane.state) is not None:
+    together = scene.switches or scene.section(lane.state) is not None
+    if together or not exact(scene, lane.state):
         guards = [guard._replace(lingers=True) for guard in guards]
     seen = tuple(_seen(lane, good & last, good, h, each, guards) for each in guards)
     return Trial(
@@ -169,7 +170,7 @@ def _path(
     position = plan.scene.coordinates[k].position
     begin = rates(free.field, position, lane.s, lane.state)
     end = rates(free.field, position, s1, new)
-    if lane.contact is not None and len(plan.scene.coordinates) > 1:
+    if lane.contact is not None and not exact(plan.scene, lane.state):
         # Of a body at rest place and velocity are known better than the state tells them, where
         # the coordinate is a difference. Its force is that on a free body.
         rests, place = lane.contact[k] > 0, begin.x

@@ -1,10 +1,12 @@
 """Stages of a diagonally implicit Runge–Kutta solver, for fields that are stiff."""
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import numpy as np
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float
@@ -37,7 +39,7 @@ def implicit_stages(
     inverse = inverse_of(jnp.eye(y0.size, dtype=y0.dtype) - stop_gradient(h) * gamma * jacobian)
     stages, left = [field(s0, y0)], jnp.zeros_like(h)
     for row, predictor, c in zip(tableau.a_lower, tableau.a_predictor, tableau.c, strict=True):
-        base = y0 + h * weighed(row, stages)
+        base = y0 + h * weighted(row, stages)
         s = s0 + float(c) * h
 
         def lacks(k: Vector, s: Any = s, base: Any = base) -> Vector:
@@ -57,7 +59,7 @@ def implicit_stages(
             k, size, _ = jax.lax.while_loop(goes_on, newton, start)
             return k, jnp.where(size <= tolerance, size, jnp.inf)
 
-        guess = stop_gradient(weighed(predictor, stages))
+        guess = stop_gradient(weighted(predictor, stages))
         k, size = jax.lax.custom_root(lacks, guess, solve, _tangent, has_aux=True)
         stages.append(k)
         left = jnp.maximum(left, stop_gradient(size))
@@ -70,9 +72,15 @@ def change_of(change: Vector, y: Vector) -> Scalar:
     return jnp.where(jnp.isfinite(size), size, jnp.inf)
 
 
-def weighed(weights: np.ndarray, vectors: list[Vector]) -> Vector:
-    """The sum of these vectors with these weights, the zero ones left out."""
-    return sum(float(w) * x for w, x in zip(weights, vectors, strict=False) if w != 0)  # pyright: ignore
+def weighted(weights: np.ndarray, stages: list, base: Any = None) -> Any:
+    """base + Σ weight·stage, leaf by leaf, without the zero weights."""
+    used = [(float(w), stage) for w, stage in zip(weights, stages, strict=False) if w != 0]
+
+    def leaf(*leaves: jax.Array) -> jax.Array:
+        return functools.reduce(jnp.add, [w * x for (w, _), x in zip(used, leaves, strict=True)])
+
+    change = jtu.tree_map(leaf, *(stage for _, stage in used))
+    return change if base is None else jtu.tree_map(jnp.add, base, change)
 
 
 def dot(matrix: Float[Array, "n n"], vector: Vector) -> Vector:

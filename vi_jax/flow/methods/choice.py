@@ -32,7 +32,7 @@ def preset(scene: AbstractScene | None, name: str = "standard") -> AbstractMetho
     - `"draft"`: 6 steps of Dopri8 a cycle, error 1e-6, half the time of the next;
     - `"standard"`: 12 steps of Dopri8, error 4e-9 (the median lane's: 4e-10);
     - `"reference"`: 48 steps of Dopri8, error 6e-14, three times the time of the one before.
-      `Taylor(20, rtol=1e-13)` is as exact in two thirds of that, for fields that have a series.
+      `Taylor(20, rtol=1e-13)` is as exact in 0.6 of that, for fields that have a series.
 
     Of 1,024 settled motions none got a wrong regime under the first, one under the second.
 

@@ -3,6 +3,7 @@
 from math import factorial
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -116,17 +117,14 @@ def flight(
     Q = jnp.where(near, 0.0, drag * scale)
     y = Y - (P * cosine0 + Q * sine0)
     v = V - zeta * (Q * cosine0 - P * sine0)
-    Y_rest, V_rest = _from_rest(
-        jnp.where(near, zeta, 1.0), jnp.where(near, xi, 0.0),
-        (cosine0, sine0), turn, tau,
-    )  # fmt: skip
     pull = fade * S
     Y_change = fall * y + pull * (xi * y + v) + (P * turn[0] + Q * turn[1])
     V_change = fall * v - pull * (xi * v + y) + zeta * (Q * turn[0] - P * turn[1])
-    return (
-        Y + (Y_change + jnp.where(near, Y_rest, 0.0)),
-        V + (V_change + jnp.where(near, V_rest, 0.0)),
-    )
+    Y_rest, V_rest = jax.lax.cond(
+        near, _from_rest, lambda *_: (jnp.zeros_like(tau), jnp.zeros_like(tau)),
+        jnp.where(near, zeta, 1.0), jnp.where(near, xi, 0.0), (cosine0, sine0), turn, tau,
+    )  # fmt: skip
+    return Y + (Y_change + Y_rest), V + (V_change + V_rest)
 
 
 def _less_one(x: Scalar) -> Scalar:

@@ -4,13 +4,11 @@ from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from ._implicit import implicit_stages
+from ._implicit import implicit_stages, weighted
 
 
 class Unrolled(diffrax.AbstractSolver):
@@ -70,13 +68,13 @@ class Unrolled(diffrax.AbstractSolver):
         stages = [terms.vf_prod(t0, y0, args, control)]
         y1 = None
         for a, c in zip(tableau.a_lower, tableau.c, strict=True):
-            y = _combine(y0, a, stages)
+            y = weighted(a, stages, y0)
             t = t1 if c == 1 else t0 + float(c) * (t1 - t0)
             stages.append(terms.vf_prod(t, y, args, control))
             y1 = y
         if not tableau.ssal or y1 is None:
-            y1 = _combine(y0, tableau.b_sol, stages)
-        error = _combine(None, tableau.b_error, stages)
+            y1 = weighted(tableau.b_sol, stages, y0)
+        error = weighted(tableau.b_error, stages)
         k = jtu.tree_map(lambda *leaves: jnp.stack(leaves), *stages)
         return y1, error, {"y0": y0, "y1": y1, "k": k}, None, diffrax.RESULTS.successful
 
@@ -91,8 +89,8 @@ class Unrolled(diffrax.AbstractSolver):
 
         stages, left = implicit_stages(tableau, field, t0, control, flat, tolerance)
         stages = [unravel(control * k) for k in stages]
-        error = jtu.tree_map(lambda e: jnp.abs(e) + left, _combine(None, tableau.b_error, stages))
-        y1 = _combine(y0, tableau.b_sol, stages)
+        error = jtu.tree_map(lambda e: jnp.abs(e) + left, weighted(tableau.b_error, stages))
+        y1 = weighted(tableau.b_sol, stages, y0)
         k = jtu.tree_map(lambda *leaves: jnp.stack(leaves), *stages)
         return y1, error, {"y0": y0, "y1": y1, "k": k}, None, diffrax.RESULTS.successful
 
@@ -102,18 +100,3 @@ def _tableau(solver: Any) -> diffrax.ButcherTableau:
     if not isinstance(tableau, diffrax.ButcherTableau):
         raise TypeError(f"Argument `solver` must have one Butcher tableau, but got {solver!r}.")
     return tableau
-
-
-def _combine(base: Any, weights: np.ndarray, stages: list) -> Any:
-    """base + Σ weight·stage, leaf by leaf, without the zero weights."""
-    used = [(float(w), stage) for w, stage in zip(weights, stages, strict=False) if w != 0]
-
-    def leaf(*leaves: jax.Array) -> jax.Array:
-        terms = [w * x for (w, _), x in zip(used, leaves, strict=True)]
-        total = terms[0]
-        for term in terms[1:]:
-            total = total + term
-        return total
-
-    change = jtu.tree_map(leaf, *(stage for _, stage in used))
-    return change if base is None else jtu.tree_map(jnp.add, base, change)
