@@ -74,7 +74,11 @@ class Entry:
 
 def ours(name: str, number: float = 0.0, *, whole: bool = False, **options: Any) -> Entry:
     """An entry of vi_jax."""
-    inside = "" if not number else f"{number:g}" if name == "Taylor" else f"Dopri8, {number:g}"
+    inside = "" if not number else f"{number:g}"
+    if name == "Taylor" and number > 1:
+        inside += ", 8 steps"
+    elif name == "FixedStep":
+        inside = f"Dopri8, {inside}"
     label = f"{OURS} {name}({inside})" + (", forced devices" if whole else "")
     return Entry(label, "ours", {"name": name, "number": number, **options}, whole=whole)
 
@@ -88,7 +92,7 @@ def entries(drive: str, all_cores: bool) -> list[Entry]:
     """All codes for one scene."""
     sparse = LANES // 8 if not all_cores else LANES // (8 if len(cores()) > 8 else 16)
     motor = [("FixedStep", n) for n in (5, 6, 8, 12, 24, 36)]
-    motor += [("Taylor", 1e-7), ("Taylor", 1e-9), ("Taylor", 1e-12), ("Taylor", 1e-13)]
+    motor += [("Taylor", n) for n in (11, 12, 14, 16, 18)] + [("Taylor", 1e-12), ("Taylor", 1e-13)]
     methods = motor if drive == "motor" else [("ExactFlight", 0), ("FixedStep", 12)]
     listed = [ours(*method) for method in methods]
     listed += [heyoka(tol) for tol in (1e-6, 1e-9, 1e-15)]
@@ -124,7 +128,7 @@ def entries(drive: str, all_cores: bool) -> list[Entry]:
 def derivative_entries() -> list[Entry]:
     """The codes that give derivatives by six parameters, each primal beside its derivatives."""
     listed = []
-    for method in (("FixedStep", 12), ("FixedStep", 24), ("Taylor", 1e-12)):
+    for method in (("FixedStep", 12), ("FixedStep", 24), ("Taylor", 16), ("Taylor", 1e-12)):
         primal = ours(*method)
         with_six = Entry(primal.name + " six jvp", "ours", {**primal.options, "jacobian": True})
         listed += [primal, with_six]
@@ -393,24 +397,23 @@ def report(sections: dict[str, dict]) -> str:
     return "\n".join(lines)
 
 
-LOOKS = {
-    f"{OURS} FixedStep": ("tab:blue", "s"),
-    f"{OURS} Taylor": ("tab:blue", "o"),
-    f"{OURS} ExactFlight": ("tab:blue", "*"),
-    "heyoka batch": ("tab:red", "s"),
-    "heyoka scalar": ("tab:red", "o"),
-    "heyoka ensemble": ("tab:red", "^"),
-    "numba": ("tab:green", "s"),
-    "diffrax Event Tsit5": ("tab:purple", "s"),
-    "diffrax Event Dopri8": ("tab:purple", "o"),
-    "SciPy": ("tab:gray", "s"),
-}
-
-
 def picture(sections: dict[str, dict]) -> Any:
     """Time against error at the first restitution, a panel for each drive and number of cores."""
     from matplotlib.figure import Figure
+    from vi_jax.plot.colors import BLUE, GREEN, PERIODS, RED
 
+    looks = {
+        f"{OURS} FixedStep": (BLUE, "s"),
+        f"{OURS} Taylor": (BLUE, "o"),
+        f"{OURS} ExactFlight": (BLUE, "*"),
+        "heyoka batch": (RED, "s"),
+        "heyoka scalar": (RED, "o"),
+        "heyoka ensemble": (RED, "^"),
+        "numba": (GREEN, "s"),
+        "diffrax Event Tsit5": (PERIODS[2], "s"),
+        "diffrax Event Dopri8": (PERIODS[2], "o"),
+        "SciPy": ("0.5", "s"),
+    }
     figure = Figure(figsize=(9, 7), layout="constrained")
     panels = figure.subplots(2, 2, sharex="row", sharey="row")
     handles: dict[str, Any] = {}
@@ -418,7 +421,7 @@ def picture(sections: dict[str, dict]) -> Any:
         panels.flat, ((d, u) for d in ("motor", "ideal") for u in ("one", "all")), strict=True
     ):
         rows = sections[f"states, {drive}, {RESTITUTIONS[0]}, {used}"]["rows"]
-        for family, (color, mark) in LOOKS.items():
+        for family, (color, mark) in looks.items():
             mine = [
                 row
                 for row in rows

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 import vi_jax as vi
 from matplotlib.figure import Figure
+from vi_jax.plot.colors import BLUE
 
 jax.config.update("jax_enable_x64", True)
 
@@ -144,7 +145,7 @@ print("\n".join(lines))
 figure = Figure(figsize=(9, 4.6), layout="constrained")
 ax = figure.subplots()
 names = [made.name for made in SCENES][::-1]
-ax.barh(names, [cost[name] for name in names], color="tab:blue")
+ax.barh(names, [cost[name] for name in names], color=BLUE)
 ax.set(xlabel="run time of a drive cycle of one lane (µs)")
 ax.spines[["top", "right"]].set_visible(False)
 numbers = {f"operations: {name}": float(count) for name, count in size.items()}

@@ -31,6 +31,7 @@ import jax.tree_util as jtu
 import numpy as np
 import vi_jax as vi
 from matplotlib.figure import Figure
+from vi_jax.plot.colors import BLUE, GREEN, MORE_IMPACTS, ORANGE, PERIODS, RED
 
 jax.config.update("jax_enable_x64", True)
 # Single precision is one of the things compared here.
@@ -93,6 +94,11 @@ def series(order: int, tolerance: float) -> Choice:
     return Choice(f"Taylor {order}", f"{tolerance:.0e}", vi.Taylor(order, rtol=tolerance))
 
 
+def series_of(order: int) -> Choice:
+    """Power series in eight steps a cycle."""
+    return Choice("Taylor, 8 steps", f"order {order}", vi.Taylor(order, 8))
+
+
 EXACT = Choice("ExactFlight", "closed form", vi.ExactFlight())
 if QUICK:
     CARRIED = [fixed("Dopri8", 12), adaptive("Dopri8", 1e-9)]
@@ -109,6 +115,7 @@ else:
         *(series(12, 10.0**-n) for n in (5, 7, 9)),
         *(series(16, 10.0**-n) for n in (7, 9, 11)),
         *(series(20, 10.0**-n) for n in (9, 11, 12, 13, 14)),
+        *(series_of(n) for n in (10, 12, 14, 16, 18, 20)),
         fixed("Dopri8", 8, double=False),
         fixed("Tsit5", 16, double=False),
         adaptive("Dopri8", 1e-5, double=False),
@@ -121,6 +128,7 @@ SCANNED = {
     fixed("Dopri8", 8, double=False).name,
     series(16, 1e-9).name,
     series(20, 1e-13).name,
+    series_of(14).name,
     *(choice.name for choice in CARRIED if choice.method.adaptive and choice.double),
 }
 TRUTH = {"ideal": EXACT, "motor": fixed("Dopri8", 64)}
@@ -754,19 +762,20 @@ print(report)
 # %%
 STYLE = {
     "ExactFlight": ("k", "*"),
-    "FixedStep Dopri8": ("tab:blue", "s"),
-    "FixedStep Tsit5": ("tab:red", "s"),
-    "FixedStep Dopri5": ("tab:green", "s"),
-    "FixedStep Bosh3": ("tab:purple", "s"),
-    "Adaptive Dopri8": ("tab:blue", "o"),
-    "Adaptive Tsit5": ("tab:red", "o"),
-    "Adaptive Dopri5": ("tab:green", "o"),
-    "Adaptive Bosh3": ("tab:purple", "o"),
-    "Taylor 12": ("gold", "^"),
-    "Taylor 16": ("tab:orange", "^"),
-    "Taylor 20": ("tab:brown", "^"),
+    "FixedStep Dopri8": (BLUE, "s"),
+    "FixedStep Tsit5": (RED, "s"),
+    "FixedStep Dopri5": (GREEN, "s"),
+    "FixedStep Bosh3": (PERIODS[2], "s"),
+    "Adaptive Dopri8": (BLUE, "o"),
+    "Adaptive Tsit5": (RED, "o"),
+    "Adaptive Dopri5": (GREEN, "o"),
+    "Adaptive Bosh3": (PERIODS[2], "o"),
+    "Taylor, 8 steps": (PERIODS[4], "s"),
+    "Taylor 12": (PERIODS[5], "^"),
+    "Taylor 16": (ORANGE, "^"),
+    "Taylor 20": (MORE_IMPACTS, "^"),
 }
-figure = Figure(figsize=(11, 8), layout="constrained")
+figure = Figure(figsize=(11, 8.6), layout="constrained")
 panels = figure.subplots(2, len(DRIVES), squeeze=False)
 for top, bottom, drive in zip(*panels, DRIVES, strict=True):
     rows, about = results[drive]
@@ -798,7 +807,12 @@ for top, bottom, drive in zip(*panels, DRIVES, strict=True):
     )
     for ax in (top, bottom):
         ax.grid(alpha=0.3)
-panels[0, 0].legend(frameon=False, fontsize=7)
+figure.legend(
+    handles=panels[0, 0].get_legend_handles_labels()[0],
+    loc="outside lower center",
+    ncols=5,
+    fontsize=8,
+)
 numbers = {
     f"{row.choice.name}: median error of the state, 20 cycles, ideal drive": row.errors["state"]
     for row in results["ideal"][0]

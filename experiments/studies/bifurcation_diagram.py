@@ -265,7 +265,7 @@ def pieces(branch: vi.Branch) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, 
         [
             [
                 p.parameter,
-                *np.asarray(p.orbit.impact_speed),
+                *np.resize(np.asarray(p.orbit.impact_speed), branch.impact_speed.shape[1]),
                 *growth(np.asarray(p.orbit.multipliers)),
             ]
             for p in branch.special

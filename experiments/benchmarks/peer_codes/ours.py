@@ -21,6 +21,8 @@ def method(name: str, number: float, solver: str = "Dopri8") -> vi.AbstractMetho
         return vi.ExactFlight()
     if name == "FixedStep":
         return vi.FixedStep(getattr(diffrax, solver)(), int(number))
+    if name == "Taylor" and number > 1:
+        return vi.Taylor(int(number), 8)
     if name == "Taylor":
         order = 12 if number >= 1e-9 else 16 if number >= 1e-12 else 20
         return vi.Taylor(order, 5, rtol=number)
