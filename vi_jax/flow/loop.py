@@ -1,5 +1,6 @@
 """The loop around the hybrid step."""
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -38,25 +39,27 @@ def run_lane(plan: Plan, start: Any, wanted: Any = True) -> tuple[Ends, Any, Rec
     `plan.kept + 1`: the first holds the state in which recording begins, and no record.
     """
     numbers, rest = eqx.partition(plan, eqx.is_array)
-
-    def begin(inputs):
-        numbers, start, wanted = inputs
-        plan = eqx.combine(numbers, rest)
-        lane = plan.launch(start, wanted)
-        first = plan.settle <= 0
-        return lane, lanes.Emitted(_active(plan, lane), first, (start, plan.fresh(start)))
-
-    def step(inputs, lane):
-        plan = eqx.combine(inputs[0], rest)
-        new = iterate(plan, lane)
-        complete = new.completed & (new.lane.done >= plan.settle)
-        return new.lane, lanes.Emitted(_active(plan, new.lane), complete, (new.state, new.record))
-
-    def end(inputs, lane):
-        return Ends.of(lane)
-
-    inputs = numbers, start, jnp.asarray(wanted)
     ends, (states, records) = lanes.run(
-        begin, step, end, inputs, rows=plan.kept + 1, block=plan.block, road=plan.road
-    )
+        partial(_begin, rest), partial(_step, rest), _end, (numbers, start, jnp.asarray(wanted)),
+        rows=plan.kept + 1, block=plan.block, road=plan.road,
+    )  # fmt: skip
     return ends, states, records
+
+
+def _begin(rest: Any, inputs: Any) -> tuple[Lane, lanes.Emitted]:
+    numbers, start, wanted = inputs
+    plan = eqx.combine(numbers, rest)
+    lane = plan.launch(start, wanted)
+    first = plan.settle <= 0
+    return lane, lanes.Emitted(_active(plan, lane), first, (start, plan.fresh(start)))
+
+
+def _step(rest: Any, inputs: Any, lane: Lane) -> tuple[Lane, lanes.Emitted]:
+    plan = eqx.combine(inputs[0], rest)
+    new = iterate(plan, lane)
+    complete = new.completed & (new.lane.done >= plan.settle)
+    return new.lane, lanes.Emitted(_active(plan, new.lane), complete, (new.state, new.record))
+
+
+def _end(inputs: Any, lane: Lane) -> Ends:
+    return Ends.of(lane)

@@ -6,7 +6,6 @@ import hashlib
 import os
 import threading
 import weakref
-from collections import OrderedDict
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
@@ -16,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ._code import begun, function_at, llvm
-from ._context import within
+from ._context import Recent, within
 from ._kernel import kernel_text
 from ._program import Program
 from ._vector import check
@@ -134,8 +133,11 @@ def key_of(text: str, cpu: str | None) -> int:
 
 
 _living: "weakref.WeakValueDictionary[int, Kernel]" = weakref.WeakValueDictionary()
-_recent: "OrderedDict[int, Kernel]" = OrderedDict()
+_recent: "Recent[int, Kernel]" = Recent(_KEPT)
 _lock = threading.Lock()
+
+# The key of a program's text, so that it need not be written again to be known.
+_keys: "Recent[tuple[Program, str | None], int]" = Recent(8 * _KEPT)
 
 
 def kernel_of(program: Program) -> Kernel:
@@ -143,9 +145,19 @@ def kernel_of(program: Program) -> Kernel:
 
     **Raises:** `Unsupported` if the program has no vector form, or LLVM cannot be had.
     """
+    cpu = _cpu.get()
+    known = _keys.get((program, cpu))
+    kernel = None if known is None else _living.get(known)
+    if kernel is None:
+        kernel = _written(program, cpu)
+        _keys.put((program, cpu), kernel.key)
+    _recent.put(kernel.key, kernel)
+    return kernel
+
+
+def _written(program: Program, cpu: str | None) -> Kernel:
     for jaxpr in program.jaxprs:
         check(jaxpr.jaxpr)
-    cpu = _cpu.get()
     bits = _register_bits(cpu)
     avals = [*program.in_avals, *program.carry_avals]
     wide = any(np.dtype(a.dtype).itemsize == 8 for a in avals)
@@ -157,10 +169,6 @@ def kernel_of(program: Program) -> Kernel:
         kernel = _living.get(key)
         if kernel is None:
             kernel = _living[key] = Kernel(text, cpu, width)
-        _recent[key] = kernel
-        _recent.move_to_end(key)
-        while len(_recent) > _KEPT:
-            _recent.popitem(last=False)
     return kernel
 
 

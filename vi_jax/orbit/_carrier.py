@@ -6,6 +6,7 @@ from typing import Any
 import diffrax
 import jax.numpy as jnp
 
+from .._programs import compiled
 from ..flow import AbstractMethod, ExactFlight, FixedStep
 from ..flow.methods import MethodLike, chosen
 from ..scene import AbstractScene
@@ -37,6 +38,11 @@ def steps_of(method: AbstractMethod, scenes: list[AbstractScene], like: Any, cyc
     # Turning points are looked for between steps: more of them than flying needs.
     most = max(method.steps_per_cycle, 16)
     for scene in scenes:
-        limit = method.longest(scene, jnp.zeros(()), like)
-        most = max(most, ceil(1.02 * float(scene.cycle / limit)))
+        most = max(most, ceil(1.02 * float(_fewest(method, scene, like))))
     return most * cycles
+
+
+@compiled
+def _fewest(method: AbstractMethod, scene: AbstractScene, like: Any) -> Any:
+    """Steps of a cycle where they are as long as they may be."""
+    return scene.cycle / method.longest(scene, jnp.zeros(()), like)

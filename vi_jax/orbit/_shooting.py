@@ -19,14 +19,13 @@ import jax.tree_util as jtu
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from .. import lanes
 from ..flow import AbstractMethod
-from ..flow.moving import in_modes
 from ..scene import AbstractScene
 from ..scene.numbers import with_leaf
 from ._events import Event, approach_of, guard_of, jump
+from ._flight import Flight
 from ._observed import Observed, apart
-from ._turns import Flight, Turns, turns_of
+from ._turns import Turns, turns_of
 from .floquet import multipliers_of
 
 Vector = Float[Array, " _"]
@@ -115,10 +114,6 @@ class Shooting(eqx.Module):
         """A state from its vector."""
         return ravel_pytree(self.like)[1](u)
 
-    def moving(self, scene: AbstractScene, leg: Any) -> AbstractScene:
-        """The machine in the modes of a leg, whose number may be traced."""
-        return in_modes(scene, self._modes_in(leg)) if scene.switches else scene
-
     def _modes_in(self, leg: Any) -> tuple[Array, ...]:
         """Of each switch, in a leg whose number may be traced."""
         modes = jnp.asarray(self.modes, jnp.result_type(float))[leg]
@@ -164,42 +159,10 @@ class Shooting(eqx.Module):
         """Clock at the end of each leg."""
         return jnp.concatenate([clock[1:], clock[:1] + period])
 
-    def flight(
-        self, scene: AbstractScene, leg: Any, s0: Array, s1: Array, u: Vector
-    ) -> tuple[Vector, Array, tuple[Array, Float[Array, "steps states"]]]:
-        """State and elapsed time at the end of a flight, and clock and state along it."""
-        return self.fly(self.moving(scene, leg), s0, s1, u)
-
-    def fly(
-        self, moving: AbstractScene, s0: Array, s1: Array, u: Vector
-    ) -> tuple[Vector, Array, tuple[Array, Float[Array, "steps states"]]]:
-        """A flight of the machine in its modes."""
-        h = (s1 - s0) / self.steps
-
-        def begin(inputs):
-            s0, _, u = inputs
-            zero = jnp.zeros_like(s0)
-            return (u, zero, zero), lanes.Emitted(True, True, (s0, u))
-
-        def step(inputs, carry):
-            (s0, h, _), (u, time, i) = inputs, carry
-            s = s0 + i * h
-            u, time = self._step(moving, s, s + h, u, time)
-            i = i + 1
-            return (u, time, i), lanes.Emitted(i < self.steps, True, (s0 + i * h, u))
-
-        def end(inputs, carry):
-            return carry[0], carry[1]
-
-        (u, time), path = lanes.run(begin, step, end, (s0, h, u), rows=self.steps)
-        return u, time, path
-
-    def _step(self, moving, s0, s1, u, time) -> tuple[Vector, Array]:
-        """One step of the method."""
-        state = self.unravel(u)
-        paced = moving.pace(s0, state) is not None
-        new, after, _ = self.method.step(moving, s0, s1, state, time if paced else None)
-        return ravel_pytree(new)[0], time + (s1 - s0) if after is None else after
+    def flight(self, scene: AbstractScene, leg: Any) -> Flight:
+        """The flight of a leg, whose number may be traced."""
+        modes = self._modes_in(leg) if scene.switches else ()
+        return Flight(scene, modes, self.method, self.like)
 
     def residual(self, x: Vector) -> Vector:
         """What the flights from event to event lack; zero for a periodic motion."""
@@ -207,7 +170,8 @@ class Shooting(eqx.Module):
         clock, states = self.parts(x)
 
         def arrive(leg, s0, s1, u):
-            end, _, _ = self.flight(scene, leg, s0, s1, self.after(scene, leg, s0, u))
+            after = self.after(scene, leg, s0, u)
+            end, _, _ = self.flight(scene, leg).fly(s0, s1, after, self.steps)
             if not self.events:
                 return end, jnp.zeros((0,), x.dtype)
             return end, self.guard(scene, leg, s0, u)[None]
@@ -224,7 +188,7 @@ class Shooting(eqx.Module):
 
         def follow(leg, s0, s1, u):
             def end(u):
-                end, time, path = self.flight(scene, leg, s0, s1, u)
+                end, time, path = self.flight(scene, leg).fly(s0, s1, u, self.steps)
                 return end, (time, path)
 
             carried, (time, path) = jax.jacfwd(end, has_aux=True)(self.after(scene, leg, s0, u))
@@ -270,7 +234,7 @@ class Shooting(eqx.Module):
 
         R is the jump as a function of the state; ġ counts what the guard gains by the clock.
         """
-        old, new = self.moving(scene, leg - 1), self.moving(scene, leg)
+        old, new = (self.flight(scene, x).moving for x in (leg - 1, leg))
 
         def field(scene, u):
             return ravel_pytree(scene.field(s, self.unravel(u)))[0]
@@ -301,16 +265,8 @@ class Shooting(eqx.Module):
     def _turns(self, scene: AbstractScene, leg: Any, s1: Array, path: Any) -> Turns:
         """The turning points of a leg."""
         places, states = path
-
-        def step(moving, s0, s1, u):
-            return self._step(moving, s0, s1, u, jnp.zeros_like(s0))[0]
-
-        return turns_of(
-            Flight(
-                scene, self.moving(scene, leg), self._modes_in(leg), step,
-                self.unravel, places, states, (s1 - places[0]) / self.steps,
-            )
-        )  # fmt: skip
+        h = (s1 - places[0]) / self.steps
+        return turns_of(self.flight(scene, leg), places, states, h)
 
     def _order(self, scene: AbstractScene, leg: Any, event: Event) -> Callable[..., Array]:
         """Whether a switch goes into the mode of the flight that begins with its event: 1 or -1."""
@@ -330,4 +286,4 @@ class Shooting(eqx.Module):
         scene = self.at(x)
         clock, states = self.parts(x)
         u = self.after(scene, leg, clock[leg], states[leg])
-        return self.unravel(self.flight(scene, leg, clock[leg], s, u)[0])
+        return self.unravel(self.flight(scene, leg).fly(clock[leg], s, u, self.steps)[0])

@@ -14,12 +14,13 @@ from .._programs import compiled
 from ..flow.arguments import planned
 from ..flow.loop import run_lane
 from ..flow.methods import MethodLike
-from ..flow.moving import begin_modes, in_modes, struck_modes
+from ..flow.moving import begin_modes, struck_modes
 from ..flow.simulate import collect
 from ..scene import Scene
 from ..scene.numbers import leaf, with_leaf
 from ._carrier import carrier, steps_of
 from ._events import Event, jump, renews
+from ._flight import Flight
 from ._shooting import Shooting
 from ._symmetry import images
 from .curve import Step, array_of, corrected, first_tangent
@@ -175,8 +176,8 @@ def _listed(plan, start):
 
 @compiled
 def _carry(blank: Shooting, modes, s0, s1, u):
-    moving = in_modes(blank.scene, modes)
-    return blank.fly(moving, jnp.asarray(s0), jnp.asarray(s1), u)[0]
+    flight = Flight(blank.scene, modes, blank.method, blank.like)
+    return flight.fly(jnp.asarray(s0), jnp.asarray(s1), u, blank.steps)[0]
 
 
 @compiled

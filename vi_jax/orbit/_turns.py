@@ -1,38 +1,23 @@
 """Where a flight comes nearest to what it does not meet."""
 
-from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
-from .. import lanes
 from ..flow.events import Rates, guard_rates
 from ..scene import AbstractScene
+from ._flight import Flight
 
 Scalar = Float[Array, ""]
 Vector = Float[Array, " _"]
 
 # Newton's method has met a turn if it ends this close to it (as a share of the step).
 _TURNED = 1e-3
-
-
-class Flight(NamedTuple):
-    """A flight in steps of one length."""
-
-    scene: AbstractScene
-    moving: AbstractScene
-    """The machine in its modes."""
-    modes: tuple[Scalar, ...]
-    step: Callable[[AbstractScene, Scalar, Scalar, Vector], Vector]
-    """The state after a step from one clock to another."""
-    unravel: Callable[[Vector], Any]
-    places: Float[Array, " steps"]
-    """Clock at the start of each step."""
-    states: Float[Array, "steps states"]
-    h: Scalar
 
 
 class Turns(NamedTuple):
@@ -60,36 +45,70 @@ class _Found(NamedTuple):
     """The function's rate, or one of its sign, at the start of the step."""
 
 
-def turns_of(flight: Flight) -> Turns:
-    """The turning points of all coordinates and guards along a flight."""
+class _Watched(NamedTuple):
+    """What turns: a coordinate, or the guard of a switch."""
+
+    kind: str
+    number: int
+
+    def value(self, flight: Flight, s: Any, state: Any) -> Any:
+        """Of it."""
+        if self.kind == "coordinate":
+            return flight.scene.coordinates[self.number].position(state)
+        mode = flight.modes[self.number]
+        return flight.scene.switches[self.number].guard(flight.scene, s, state, mode)
+
+    def rate(self, flight: Flight, s: Any, u: Any) -> Any:
+        """Its rate, or one of its sign."""
+        state = flight.unravel(u)
+        if self.kind == "coordinate":
+            return flight.scene.coordinates[self.number].velocity(state)
+        return self.rates(flight, flight.moving, s, u).v
+
+    def rates(self, flight: Flight, moving: AbstractScene, s: Any, u: Any) -> Rates:
+        """It and its first two derivatives."""
+
+        def guard(s, state):
+            return self.value(flight, s, state)
+
+        return guard_rates(moving.field, guard, s, flight.unravel(u))
+
+
+def turns_of(
+    flight: Flight,
+    places: Float[Array, " steps"],
+    states: Float[Array, "steps states"],
+    h: Scalar,
+) -> Turns:
+    """The turning points of all coordinates and guards along a flight.
+
+    **Arguments:** the flight; clock and state at the start of each step, and its length.
+    """
+    scene, begin = flight.scene, places[0]
     # The end of the last step is the next event: its velocity is that of a further step.
-    last = lanes.once(
-        lambda x: flight.step(flight.moving, x[0], x[0] + x[1], x[2]),
-        (flight.places[-1], flight.h, flight.states[-1]),
-    )
-    bodies = [
-        _found(flight, last, lambda _, x, c=c: c.position(x), lambda _, x, c=c: c.velocity(x))
-        for c in flight.scene.coordinates
-    ]
+    last = flight.once(_stepped, (places[-1], h, states[-1]))
+
+    def found(kind: str, number: int) -> _Found:
+        watched = _Watched(kind, number)
+        v = jax.vmap(partial(watched.rate, flight))(places, states)
+        v1 = jnp.concatenate([v[1:], watched.rate(flight, places[-1] + h, last)[None]])
+        return jax.vmap(lambda *x: flight.once(partial(_turn, watched), (h, *x)))(
+            places, states, v, v1
+        )
+
+    bodies = [found("coordinate", k) for k in range(len(scene.coordinates))]
     rooms = []
-    for stop in flight.scene.stops:
+    for stop in scene.stops:
         at = bodies[stop.coordinate]
         facing = at.turns & (stop.sign * at.before > 0)
         rooms.append((jnp.where(facing, -stop.beyond(at.height), jnp.inf), at.place))
-    for switch, mode in zip(flight.scene.switches, flight.modes, strict=True):
-
-        def guard(s, state, switch=switch, mode=mode):
-            return switch.guard(flight.scene, s, state, mode)
-
-        def rise(s, state, guard=guard):
-            return guard_rates(flight.moving.field, guard, s, state).v
-
-        at = _found(flight, last, guard, rise)
+    for j in range(len(scene.switches)):
+        at = found("switch", j)
         # A body that friction lets go begins to slide with velocity and acceleration zero.
-        away = at.place > flight.places[0] + _TURNED * flight.h
+        away = at.place > begin + _TURNED * h
         facing = at.turns & (at.before > 0) & away
         rooms.append((jnp.where(facing, -at.height, jnp.inf), at.place))
-    room, touch = jnp.full((), jnp.inf, flight.h.dtype), jnp.zeros((), flight.h.dtype)
+    room, touch = jnp.full((), jnp.inf, h.dtype), jnp.zeros((), h.dtype)
     touched = touch
     for i, (values, place) in enumerate(rooms):
         nearest = jnp.argmin(values)
@@ -101,43 +120,36 @@ def turns_of(flight: Flight) -> Turns:
     return Turns(low, high, room, touch, touched)
 
 
-def _found(flight: Flight, last: Vector, function: Callable, rate: Callable) -> _Found:
-    """Turning points of a function of (s, state) with this rate, or one of its sign.
+def _stepped(flight: Flight, inputs: Any) -> Vector:
+    s, h, u = inputs
+    return flight.step(s, s + h, u, jnp.zeros_like(s))[0]
 
-    Where it changes sign within a step, Newton's method from the step's start.
-    """
-    h = flight.h
 
-    def turn(s, u, v0, v1):
-        # A turn may fall on the end of a step.
-        turns = (v0 * v1 < 0) | ((v1 == 0) & (v0 != 0))
+def _turn(watched: _Watched, flight: Flight, inputs: Any) -> _Found:
+    """Where it changes sign within a step, Newton's method from the step's start."""
+    h, s, u, v0, v1 = inputs
+    # A turn may fall on the end of a step.
+    turns = (v0 * v1 < 0) | ((v1 == 0) & (v0 != 0))
 
-        def at(moving: AbstractScene, s: Scalar, u: Vector, length: Scalar) -> Rates:
-            state = flight.unravel(flight.step(moving, s, s + length, u))
-            return guard_rates(moving.field, function, s + length, state)
+    def at(moved: Flight, s: Scalar, u: Vector, length: Scalar) -> Rates:
+        after = _stepped(moved, (s, length, u))
+        return watched.rates(flight, moved.moving, s + length, after)
 
-        held = stop_gradient((flight.moving, s, u))
-        limit = stop_gradient(h)
+    held = stop_gradient((eqx.filter(flight, eqx.is_array), s, u))
+    still = eqx.combine(held[0], flight)
+    limit = stop_gradient(h)
 
-        def newton(_, length):
-            here = at(*held, length)
-            bend = jnp.where(here.a == 0, 1.0, here.a)
-            return jnp.clip(length - here.v / bend, 0.0, limit)
-
-        share = jnp.where(turns, v0 / jnp.where(turns, v0 - v1, 1.0), 0.5)
-        length = jax.lax.fori_loop(0, 4, newton, stop_gradient(h * share))
-        here = at(flight.moving, s, u, length)
+    def newton(_, length):
+        here = at(still, *held[1:], length)
         bend = jnp.where(here.a == 0, 1.0, here.a)
-        # A guard with a kink (as that of dry friction, where its force vanishes) may have no turn
-        # there.
-        met = jnp.abs(here.v) <= jnp.abs(_TURNED * limit * bend)
-        shift = jnp.where(met, here.v, 0.0) / bend
-        return _Found(turns, here.x - 0.5 * here.v * shift, s + length - shift, v0)
+        return jnp.clip(length - here.v / bend, 0.0, limit)
 
-    def velocity(s, u):
-        return rate(s, flight.unravel(u))
-
-    v = jax.vmap(velocity)(flight.places, flight.states)
-    v1 = jnp.concatenate([v[1:], velocity(flight.places[-1] + h, last)[None]])
-    steps = flight.places, flight.states, v, v1
-    return jax.vmap(lambda *x: lanes.once(lambda x: turn(*x), x))(*steps)
+    share = jnp.where(turns, v0 / jnp.where(turns, v0 - v1, 1.0), 0.5)
+    length = jax.lax.fori_loop(0, 4, newton, stop_gradient(h * share))
+    here = at(flight, s, u, length)
+    bend = jnp.where(here.a == 0, 1.0, here.a)
+    # A guard with a kink (as that of dry friction, where its force vanishes) may have no turn
+    # there.
+    met = jnp.abs(here.v) <= jnp.abs(_TURNED * limit * bend)
+    shift = jnp.where(met, here.v, 0.0) / bend
+    return _Found(turns, here.x - 0.5 * here.v * shift, s + length - shift, v0)

@@ -1,0 +1,83 @@
+"""The flight from one event to the next, in steps of one length, as vector code."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from .. import lanes
+from ..flow import AbstractMethod
+from ..flow.moving import in_modes
+from ..scene import AbstractScene
+
+Scalar = Float[Array, ""]
+Vector = Float[Array, " _"]
+
+
+class Flight(eqx.Module):
+    """A machine between two events, and how it is carried."""
+
+    scene: AbstractScene
+    modes: tuple[Scalar, ...]
+    """Of its switches."""
+    method: AbstractMethod
+    like: Any
+    """A state, for its structure."""
+
+    @property
+    def moving(self) -> AbstractScene:
+        """The machine in its modes."""
+        return in_modes(self.scene, self.modes)
+
+    def unravel(self, u: Vector) -> Any:
+        """A state from its vector."""
+        return ravel_pytree(self.like)[1](u)
+
+    def step(self, s0: Scalar, s1: Scalar, u: Vector, time: Scalar) -> tuple[Vector, Scalar]:
+        """State and time after a step of the method."""
+        moving, state = self.moving, self.unravel(u)
+        paced = moving.pace(s0, state) is not None
+        new, after, _ = self.method.step(moving, s0, s1, state, time if paced else None)
+        return ravel_pytree(new)[0], time + (s1 - s0) if after is None else after
+
+    def once(self, function: Callable[["Flight", Any], Any], inputs: Any) -> Any:
+        """A function of the flight and of one lane's numbers as vector code."""
+        numbers, rest = eqx.partition(self, eqx.is_array)
+        return lanes.once(partial(_of_flight, rest, function), (numbers, inputs))
+
+    def fly(
+        self, s0: Scalar, s1: Scalar, u: Vector, steps: int
+    ) -> tuple[Vector, Scalar, tuple[Float[Array, " steps"], Float[Array, "steps states"]]]:
+        """State and elapsed time after so many steps, and clock and state before each of them."""
+        numbers, rest = eqx.partition(self, eqx.is_array)
+        (u, time), path = lanes.run(
+            _begin, partial(_step, rest, steps), _end, (numbers, s0, (s1 - s0) / steps, u),
+            rows=steps,
+        )  # fmt: skip
+        return u, time, path
+
+
+def _of_flight(rest: Flight, function: Callable[[Flight, Any], Any], inputs: Any) -> Any:
+    return function(eqx.combine(inputs[0], rest), inputs[1])
+
+
+def _begin(inputs: Any) -> tuple[Any, lanes.Emitted]:
+    _, s0, _, u = inputs
+    zero = jnp.zeros_like(s0)
+    return (u, zero, zero), lanes.Emitted(True, True, (s0, u))
+
+
+def _step(rest: Flight, steps: int, inputs: Any, carry: Any) -> tuple[Any, lanes.Emitted]:
+    (numbers, s0, h, _), (u, time, i) = inputs, carry
+    s = s0 + i * h
+    u, time = eqx.combine(numbers, rest).step(s, s + h, u, time)
+    i = i + 1
+    return (u, time, i), lanes.Emitted(i < steps, True, (s0 + i * h, u))
+
+
+def _end(inputs: Any, carry: Any) -> Any:
+    return carry[0], carry[1]
