@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Callable, Sequence
+from inspect import unwrap
 from types import FunctionType
 from typing import Any, NamedTuple
 
@@ -72,7 +73,7 @@ def _name(function: Callable[..., Any]) -> tuple:
         if function.keywords:
             raise TypeError("no place in an order")
         return (_name(function.func), *map(_bound, function.args))
-    if not isinstance(function, FunctionType) or function.__closure__ is not None:
+    if not isinstance(function, FunctionType) or unwrap(function).__closure__ is not None:
         raise TypeError("made for this call, perhaps")
     return (function,)
 
