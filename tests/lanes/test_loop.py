@@ -119,12 +119,14 @@ def test_the_road_of_the_context():
 @settings(max_examples=25, deadline=None, derandomize=True)
 @given(st.data())
 def test_lanes_know_nothing_of_each_other(data):
-    """To the last bit, whatever lanes go along, in whatever order, on however many threads."""
-    values = batch(211)
+    """To the last bit, whatever lanes go along, how many, in whatever order, on however many
+    threads."""
+    size = 64 * lanes.cores() + 19  # in wide groups
+    values = batch(size)
     with lanes.threads(1):
         whole = jax.tree.leaves(MANY(*values))
-    chosen = data.draw(st.lists(st.integers(0, 210), min_size=1, max_size=40))
-    chosen = np.resize(chosen, 40)  # one program
+    chosen = data.draw(st.lists(st.integers(0, size - 1), min_size=1, max_size=40))
+    chosen = np.resize(chosen, data.draw(st.sampled_from([3, 7, 40])))  # three programs
     with lanes.threads(data.draw(st.integers(1, 4))):
         part = jax.tree.leaves(MANY(*(x[chosen] for x in values)))
     for a, b in zip(whole, part, strict=True):
@@ -407,7 +409,9 @@ def test_programs_are_not_kept_for_ever():
 
         for number in numbers:
             jaxpr = jax.make_jaxpr(lambda: one(float(number)))().jaxpr  # noqa: B023
-            kernel_of(next(e for e in jaxpr.eqns if e.primitive.name == "lanes").params["program"])
+            kernel_of(
+                next(e for e in jaxpr.eqns if e.primitive.name == "lanes").params["program"], 1
+            )
 
     kernels(range(80))
     before = maps.read_bytes().count(b"\n") if maps.exists() else 0

@@ -1,6 +1,7 @@
 """The JAX primitive behind `run`: batched, differentiated forward, and lowered on either road."""
 
 import functools
+import math
 import warnings
 from contextlib import AbstractContextManager
 from contextvars import ContextVar
@@ -8,7 +9,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
@@ -190,7 +190,7 @@ def _lowered(ctx, *args, program: Program, road: str):
             raise Unsupported("the other road")
         return _on_xla(ctx, *args, program=program, road=road)
     try:
-        kernel = kernel_of(program)
+        kernel = kernel_of(program, _count(program, ctx.avals_in))
     except Unsupported as reason:
         if _strict.get():
             raise
@@ -202,14 +202,17 @@ def _lowered(ctx, *args, program: Program, road: str):
 
 
 def _called(kernel, program: Program, avals, *args):
-    batch = program.batch([x.shape for x in args])
     strides = [
         aval.size if x.ndim > aval.ndim else 0
         for x, aval in zip(args, program.in_avals, strict=True)
     ]
-    head = header(kernel.key, int(np.prod(batch, dtype=int)), strides)
+    head = header(kernel.key, _count(program, args), strides)
     results = [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in avals]
     return jax.ffi.ffi_call(registered(), results)(head, *args)
+
+
+def _count(program: Program, args) -> int:
+    return math.prod(program.batch([x.shape for x in args]))
 
 
 @functools.cache

@@ -137,32 +137,44 @@ _recent: "Recent[int, Kernel]" = Recent(_KEPT)
 _lock = threading.Lock()
 
 # The key of a program's text, so that it need not be written again to be known.
-_keys: "Recent[tuple[Program, str | None], int]" = Recent(8 * _KEPT)
+_keys: "Recent[tuple[Program, str | None, int], int]" = Recent(8 * _KEPT)
 
 
-def kernel_of(program: Program) -> Kernel:
-    """The kernel of a program: the same for the same text, compiled once while it is in use.
+def kernel_of(program: Program, lanes: int) -> Kernel:
+    """The kernel of a program for so many lanes: the same for the same text, compiled once while it
+    is in use.
 
     **Raises:** `Unsupported` if the program has no vector form, or LLVM cannot be had.
     """
     cpu = _cpu.get()
-    known = _keys.get((program, cpu))
+    bits = _register_bits(cpu)
+    width = _width(program, lanes, bits)
+    known = _keys.get((program, cpu, width))
     kernel = None if known is None else _living.get(known)
     if kernel is None:
-        kernel = _written(program, cpu)
-        _keys.put((program, cpu), kernel.key)
+        kernel = _written(program, cpu, width, bits)
+        _keys.put((program, cpu, width), kernel.key)
     _recent.put(kernel.key, kernel)
     return kernel
 
 
-def _written(program: Program, cpu: str | None) -> Kernel:
-    for jaxpr in program.jaxprs:
-        check(jaxpr.jaxpr)
-    bits = _register_bits(cpu)
+def _width(program: Program, lanes: int, bits: int) -> int:
+    """Lanes of a group. The width changes no result."""
     avals = [*program.in_avals, *program.carry_avals]
     wide = any(np.dtype(a.dtype).itemsize == 8 for a in avals)
     # Two registers' worth where they are narrow, to hide the arithmetic's latency.
-    width = max(4, bits // (64 if wide else 32))
+    full = max(4, bits // (64 if wide else 32))
+    if lanes <= full // 2:
+        return max(4, full // 2)  # short registers are quicker
+    # A step is a chain of operations that wait for each other: a second group fills the gaps, for a
+    # quarter less time where there are lanes enough.
+    many = bits >= 256 and lanes >= 4 * full * cores()
+    return 2 * full if many else full
+
+
+def _written(program: Program, cpu: str | None, width: int, bits: int) -> Kernel:
+    for jaxpr in program.jaxprs:
+        check(jaxpr.jaxpr)
     text = kernel_text(program, width, bits)
     key = key_of(text, cpu)
     with _lock:
