@@ -49,6 +49,19 @@ def test_unstable_orbit_has_the_rates_of_its_multipliers():
     assert float(found.exponents[0]) > 0.01
 
 
+@pytest.mark.parametrize("cycles", [16, 23, 36])
+def test_the_greatest_alone_is_the_greatest_of_all(cycles):
+    """One direction is made a unit only now and then, several are after every cycle."""
+    scene = ideal(zeta=0.7, k=0.8, xi=0.003)
+    alone = vi.lyapunov(scene, scene.start(), cycles, number=1)
+    whole = vi.lyapunov(scene, scene.start(), cycles)
+    for name in ("exponents", "per_cycle"):
+        one, all_of_them = (getattr(x, name) for x in (alone, whole))
+        np.testing.assert_allclose(one, all_of_them[:1], rtol=1e-9)
+    np.testing.assert_allclose(alone.spread, whole.spread, rtol=1e-9)
+    np.testing.assert_allclose(alone.state.Y, whole.state.Y, rtol=1e-9)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("zeta", [0.6, 0.7, 0.97])
 def test_exponents_add_up_to_the_mean_contraction(zeta):

@@ -111,28 +111,33 @@ def _lyapunov(the_map: CycleMap, start, cycles: int, settle, number: int) -> Lya
     # Where all cycles last alike, turning points need not be met for the sake of durations.
     record = "sections" if has_fixed_cycle(scene, before.last) else "motion"
 
-    def image(x):
-        run = simulate(scene, unravel(x), 1, method=method, rests=rests, record=record)
-        duration = jnp.asarray(scene.period, x.dtype)
-        if run.duration is not None:
-            duration = run.duration[0]
-        out, _ = ravel_pytree(run.last)
-        return out, (duration, run.result)
+    # One direction alone need not be kept apart from others, and is made a unit again now and then.
+    window = _window(cycles) if number == 1 else 1
 
-    def cycle(carry, _):
+    def image(x):
+        run = simulate(scene, unravel(x), window, method=method, rests=rests, record=record)
+        duration = run.duration
+        if duration is None:
+            duration = jnp.full(window, scene.period, x.dtype)
+        sections = jax.vmap(lambda state: ravel_pytree(state)[0])(run.sections)
+        return sections[1:], (duration, run.result)
+
+    def observe(carry, _):
         x, frame, result = carry
 
         def along(direction):
             return jax.jvp(image, (x,), (direction,), has_aux=True)
 
-        new, grown, (duration, ended) = jax.vmap(along, in_axes=1, out_axes=(None, 1, None))(frame)
-        frame, sizes = _orthogonal(grown)
+        new, grown, (duration, ended) = jax.vmap(along, in_axes=1, out_axes=(None, 2, None))(frame)
+        frame, sizes = _orthogonal(grown[-1])
+        rates = jnp.log(sizes)[None] if window == 1 else _growth(grown[..., 0])[:, None]
         result = RESULTS.where(result == RESULTS.successful, ended, result)
-        return (new, frame, result), (jnp.log(sizes), duration)
+        return (new[-1], frame, result), (rates, duration)
 
     frame = jnp.eye(x.size, number, dtype=x.dtype)
     carry = (x, frame, before.result)
-    (x, _, result), (rates, duration) = jax.lax.scan(cycle, carry, length=cycles)
+    carry, (rates, duration) = jax.lax.scan(observe, carry, length=cycles // window)
+    (x, _, result), rates, duration = carry, rates.reshape(cycles, number), duration.ravel()
     mean, halves = _weighted(rates, duration)
     mean = jnp.where(result == RESULTS.successful, mean, jnp.nan)
     exponents = jnp.sort(mean, descending=True)
@@ -143,6 +148,20 @@ def _lyapunov(the_map: CycleMap, start, cycles: int, settle, number: int) -> Lya
         state=unravel(x),
         result=result,
     )
+
+
+def _window(cycles: int) -> int:
+    """Cycles after which a direction is made a unit again: in so few it neither vanishes nor
+    becomes infinite, unless it changes by e^±80 in each."""
+    return next(n for n in range(8, 0, -1) if cycles % n == 0)
+
+
+def _growth(ways: Float[Array, "cycles states"]) -> Float[Array, " cycles"]:
+    """The logarithm of what each cycle makes of the length of a direction that begins as a unit."""
+    sizes = jnp.linalg.norm(ways, axis=1)
+    before = jnp.concatenate([jnp.ones_like(sizes[:1]), sizes[:-1]])
+    # Nothing is left of what is forgotten at once, nor after that.
+    return jnp.where(before > 0, jnp.log(sizes / jnp.where(before > 0, before, 1.0)), -jnp.inf)
 
 
 def _orthogonal(
