@@ -22,6 +22,9 @@ from ._vector import check
 
 _KEPT = 64
 
+# Of the vector unit; half as many where they are narrower, with half the lanes in each.
+_REGISTERS = 32
+
 _threads: ContextVar[int | None] = ContextVar("threads", default=None)
 _entered: list[int] = []
 _cpu: ContextVar[str | None] = ContextVar("cpu", default=None)
@@ -167,9 +170,9 @@ def _width(program: Program, lanes: int, bits: int) -> int:
     if lanes <= full // 2:
         return max(4, full // 2)  # short registers are quicker
     # A step is a chain of operations that wait for each other: a second group fills the gaps, for a
-    # quarter less time where there are lanes enough.
+    # quarter less time where there are lanes enough, and no more numbers than registers.
     many = bits >= 256 and lanes >= 4 * full * cores()
-    return 2 * full if many else full
+    return 2 * full if many and sum(a.size for a in avals) <= _REGISTERS else full
 
 
 def _written(program: Program, cpu: str | None, width: int, bits: int) -> Kernel:
