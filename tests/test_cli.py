@@ -2,10 +2,12 @@
 
 import subprocess
 import sys
+import time
+from io import StringIO
 
 import pytest
 from vi_jax import cli
-from vi_jax.cli import entry
+from vi_jax.cli import entry, progress
 
 
 def test_version(capsys):
@@ -37,6 +39,27 @@ def test_reproduce(tmp_path, capsys):
     assert len(printed.out.splitlines()) <= 16
     assert str(out) in printed.out
     assert "simulating" in printed.err and "simulating" not in printed.out
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_a_countdown_moves_in_a_terminal(terminal, monkeypatch):
+    class Stream(StringIO):
+        def isatty(self):
+            return terminal
+
+    monkeypatch.setattr(sys, "stderr", Stream())
+    monkeypatch.setattr(progress, "_PAUSE", 0.01)
+    with pytest.raises(KeyError), progress.Countdown() as countdown:
+        countdown("first", 60.0)
+        time.sleep(0.2)
+        countdown("second", 3.0)
+        raise KeyError
+    assert isinstance(sys.stderr, Stream)
+    printed = sys.stderr.getvalue()
+    assert printed.endswith("\n") and printed.count("\n") == 2
+    first, second, _ = printed.split("\n")
+    assert "about 60 s left] first" in first and "some seconds left] second" in second
+    assert (first.count("first") > 3) == terminal == ("\r" in printed)
 
 
 def _no_work(*args, **options):

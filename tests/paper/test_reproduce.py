@@ -190,7 +190,12 @@ def test_damping_at_the_period_doubling(faults):
 @pytest.mark.slow
 def test_reproduce_writes_figures_and_reports(tmp_path):
     steps = []
-    found = reproduce(tmp_path / "a" / "b", quick=True, progress=steps.append)
+
+    def progress(step, left):
+        assert left > 0
+        steps.append(step)
+
+    found = reproduce(tmp_path / "a" / "b", quick=True, progress=progress)
     names = ["fig1.png", "fig3.png", "fig4.png", "report.json", "report.md"]
     assert [path.name for path in found.files] == names
     assert len(steps) == 6

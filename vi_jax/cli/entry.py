@@ -21,6 +21,7 @@ from .config import (
     SweepTable,
     read,
 )
+from .progress import Countdown
 from .toml import ConfigError, keys_of
 from .verbs import VERBS
 
@@ -62,7 +63,8 @@ def _reproduce(options: argparse.Namespace) -> int:
         return _error(f"argument --out must be a folder to write into: {problem}", 2)
     jax.config.update("jax_enable_x64", True)
     try:
-        found = reproduce(options.out, quick=options.quick, progress=_tell)
+        with Countdown() as countdown:
+            found = reproduce(options.out, quick=options.quick, progress=countdown)
     except KeyboardInterrupt:
         print(f"vi-jax: interrupted; what was written is in {options.out}", file=sys.stderr)
         return 130

@@ -10,7 +10,7 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from ._program import Program, Spread, spread
 
 
-@functools.lru_cache(maxsize=256)
+@functools.lru_cache(maxsize=64)
 def forward(program: Program, moving: tuple[bool, ...]) -> tuple[Program, tuple[bool, ...]]:
     """The program of value and derivative, and which results and parts of the rows have one.
 
@@ -77,7 +77,7 @@ def _derived(
     return jax.make_jaxpr(both)(*shapes)
 
 
-@functools.lru_cache(maxsize=256)
+@functools.lru_cache(maxsize=64)
 def widened(program: Program, many: tuple[bool, ...], number: int) -> tuple[Program, Spread]:
     """The program with `number` of some of its inputs in one lane, and what there are so many of.
 

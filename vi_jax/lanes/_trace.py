@@ -37,7 +37,7 @@ class Traced(NamedTuple):
     """The structure of a row."""
 
 
-_recent: "Recent[Any, Traced]" = Recent(128)
+_recent: "Recent[Any, Traced]" = Recent(64)
 
 
 def traced(functions: Functions, treedef: Any, leaves: Sequence[Any], **options: int) -> Traced:

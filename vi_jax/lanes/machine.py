@@ -139,8 +139,8 @@ _living: "weakref.WeakValueDictionary[int, Kernel]" = weakref.WeakValueDictionar
 _recent: "Recent[int, Kernel]" = Recent(_KEPT)
 _lock = threading.Lock()
 
-# The key of a program's text, so that it need not be written again to be known.
-_keys: "Recent[tuple[Program, str | None, int], int]" = Recent(8 * _KEPT)
+# The keys of a program's texts, so that they need not be written again to be known.
+_keys: "weakref.WeakKeyDictionary[Program, dict[tuple, int]]" = weakref.WeakKeyDictionary()
 
 
 def kernel_of(program: Program, lanes: int) -> Kernel:
@@ -152,11 +152,12 @@ def kernel_of(program: Program, lanes: int) -> Kernel:
     cpu = _cpu.get()
     bits = _register_bits(cpu)
     width = _width(program, lanes, bits)
-    known = _keys.get((program, cpu, width))
-    kernel = None if known is None else _living.get(known)
+    with _lock:
+        keys = _keys.setdefault(program, {})
+        kernel = _living.get(keys.get((cpu, width), -1))
     if kernel is None:
         kernel = _written(program, cpu, width, bits)
-        _keys.put((program, cpu, width), kernel.key)
+        keys[cpu, width] = kernel.key
     _recent.put(kernel.key, kernel)
     return kernel
 

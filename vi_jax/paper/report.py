@@ -1,5 +1,6 @@
 """The reproduction in one go: figures, measured claims and faults, and a report of them."""
 
+import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -27,6 +28,26 @@ from .sketch import draw_sketch
 
 REPORT, NUMBERS = "report.md", "report.json"
 
+# The steps in their order, and the seconds that each took where it was measured (two cores).
+_CASES, _FIGURE_3, _FIGURE_4, _FAULTS, _ORBITS, _RESPONSE, _CURVES, _MOTORS, _CLAIMS = _STEPS = (
+    "simulating: from rest, from the 4π and from the 2π state, undamped and damped",
+    "drawing Figure 3",
+    "drawing Figure 4",
+    "measuring the faults of the printed text",
+    "finding the periodic motions",
+    "Figure 2: closed forms, branches, sweeps up and down",
+    "following the boundaries of the discrepancy in (ζ, k) and (ζ, c)",
+    "Figures 3 and 4 with the motor",
+    "measuring what the paper claims and assumes",
+)
+_SECONDS: dict[str, float] = dict(
+    zip(_STEPS, (8.0, 4.0, 1.0, 2.0, 2.0, 18.0, 11.0, 2.0, 5.0), strict=True)
+)
+_NOT_QUICK = (_RESPONSE, _CURVES, _MOTORS)
+
+Progress = Callable[[str, float], None]
+"""Called as a step begins with its name and about how many seconds there are left."""
+
 
 class Reproduction(NamedTuple):
     """What a reproduction found, and the files that it wrote."""
@@ -37,14 +58,15 @@ class Reproduction(NamedTuple):
 
 
 def reproduce(
-    out: str | Path, *, quick: bool = False, progress: Callable[[str], None] | None = None
+    out: str | Path, *, quick: bool = False, progress: Progress | None = None
 ) -> Reproduction:
     """Draw Figures 1 to 4 and the boundaries of the discrepancy, and write the report.
 
     **Arguments:** the folder to write into, made if it is missing; `quick` for fewer cycles and
-    samples, without Figure 2, the boundaries and the motors; `progress`, called with the name of
-    each step as it begins. The numbers need double precision
-    (`jax.config.update("jax_enable_x64", True)`), which the command line turns on.
+    samples, without Figure 2, the boundaries and the motors; `progress`, called as each step
+    begins with its name and about how many seconds there are left, as far as those before it tell.
+    The numbers need double precision (`jax.config.update("jax_enable_x64", True)`), which the
+    command line turns on.
 
     **Returns:** the claims, the faults, and the files in the order in which they were written:
     `fig1.png`, `fig3.png`, `fig4.png`, `motor.png`, `fig2.png`, `boundaries.png`, `report.json`,
@@ -56,11 +78,26 @@ def reproduce(
     # What takes the time is compiling, of which two threads do more than one.
     with ThreadPoolExecutor(1) as aside:
         motors = None if quick else aside.submit(simulate_motors)
-        findings = _measured(out, files, motors, progress or (lambda _: None))
+        findings = _measured(out, files, motors, _countdown(quick, progress))
     for name, text in ((NUMBERS, as_json(findings)), (REPORT, as_markdown(findings))):
         files.append(out / name)
         write_whole(files[-1], text)
     return Reproduction(findings.claims, findings.faults, files)
+
+
+def _countdown(quick: bool, progress: Progress | None) -> Callable[[str], None]:
+    """What tells that a step begins, and how long this machine will take from there on."""
+    steps = [step for step in _STEPS if not (quick and step in _NOT_QUICK)]
+    begin = time.perf_counter()
+
+    def tell(step: str) -> None:
+        place = steps.index(step)
+        past, ahead = (sum(_SECONDS[x] for x in part) for part in (steps[:place], steps[place:]))
+        pace = (time.perf_counter() - begin) / past if past else 1.0
+        if progress is not None:
+            progress(step, pace * ahead)
+
+    return tell
 
 
 def _measured(
@@ -71,32 +108,32 @@ def _measured(
     def keep(name: str, figure: Figure, **look: Any) -> None:
         files.append(save_picture(figure, out / name, **look))
 
-    tell("simulating: from rest, from the 4π and from the 2π state, undamped and damped")
+    tell(_CASES)
     keep("fig1.png", draw_sketch())
     cases = simulate_cases(quick=motors is None)
-    for number in (3, 4):
-        tell(f"drawing Figure {number}")
+    for number, step in ((3, _FIGURE_3), (4, _FIGURE_4)):
+        tell(step)
         files.append(out / f"fig{number}.png")
         draw_figure(number, cases, files[-1])
-    tell("measuring the faults of the printed text")
+    tell(_FAULTS)
     faults = check_faults()
-    tell("finding the periodic motions")
+    tell(_ORBITS)
     orbits = orbit_table(_table_scenes())
     if motors is None:
-        tell("measuring what the paper claims and assumes")
+        tell(_CLAIMS)
         claims = [*check_claims(cases), *check_assumptions(cases[0])]
         return Findings(cases, claims, faults, orbits, None, None, None)
-    tell("Figure 2: closed forms, branches, sweeps up and down")
+    tell(_RESPONSE)
     found = response()
     panels = describe(found)
-    tell("following the boundaries of the discrepancy in (ζ, k) and (ζ, c)")
+    tell(_CURVES)
     curves = boundary_curves([b for system in found.systems for b in system.branches])
-    tell("Figures 3 and 4 with the motor")
+    tell(_MOTORS)
     driven = motors.result()
     keep("motor.png", draw_motors(driven.runs, cases[0].from_rest))
     keep("fig2.png", draw_response(found), **LOOK)
     keep("boundaries.png", draw_boundaries(curves))
-    tell("measuring what the paper claims and assumes")
+    tell(_CLAIMS)
     claims = check_claims(cases, panels["panels"]) + check_figure_2(found, panels["panels"])
     claims += check_assumptions(cases[0], driven)
     borders = describe_boundaries(curves)
