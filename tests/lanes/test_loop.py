@@ -4,6 +4,7 @@ import ast
 import sys
 import warnings
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -429,3 +430,49 @@ def test_the_room_stands_alone():
             if isinstance(node, ast.ImportFrom):
                 assert node.level <= 1, f"{file.name} imports {node.module}"
                 assert not (node.module or "").startswith(("vi_jax", "jax._src"))
+
+
+def _sum(bound, x):
+    return x + bound["offset"] if isinstance(bound["offset"], float) else x - bound["offset"]
+
+
+@pytest.mark.parametrize("same", [True, False])
+def test_what_is_bound_to_a_function_tells_programs_apart(same):
+    """Equal constants make one program, and what only compares equal makes another."""
+
+    def found(offset):
+        jaxpr = jax.make_jaxpr(lambda x: lanes.once(partial(_sum, {"offset": offset}), x))(1.0)
+        (eqn,) = (e for e in jaxpr.jaxpr.eqns if e.primitive.name == "lanes")
+        return eqn.params["program"]
+
+    if same:
+        assert found(2.0) is found(2.0) and found(2) is found(2)
+        assert found(np.array([1.0, 2.0])[1]) is found(np.float64(2.0))
+        return
+    programs = [found(x) for x in (1.0, 1, True, np.float32(1.0), 0.0, -0.0, 0, np.float32(-0.0))]
+    assert len(set(map(id, programs))) == len(programs)
+    x = jnp.asarray(3.0)
+    assert lanes.once(partial(_sum, {"offset": 1.0}), x) == 4.0
+    assert lanes.once(partial(_sum, {"offset": 1}), x) == 2.0
+
+
+def test_what_is_traced_is_not_kept():
+    """A function bound as a constant may close over numbers that vary."""
+
+    def along(k):
+        return lanes.once(partial(_applied, Law(lambda x: k * x)), jnp.asarray(2.0))
+
+    np.testing.assert_allclose(jax.vmap(along)(jnp.arange(3.0)), [0.0, 2.0, 4.0])
+    np.testing.assert_allclose(jax.grad(along)(1.5), 2.0)
+    np.testing.assert_allclose([along(k) for k in (1.0, jnp.asarray(4.0))], [2.0, 8.0])
+
+
+class Law:
+    """A plain object that holds a function."""
+
+    def __init__(self, function):
+        self.function = function
+
+
+def _applied(law, x):
+    return law.function(x)

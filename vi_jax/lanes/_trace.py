@@ -92,7 +92,7 @@ def _constant(x: Any) -> Any:
     """
     if isinstance(x, jax.Array):
         raise TypeError("no constant")
-    if isinstance(x, np.ndarray):
+    if isinstance(x, np.ndarray | np.generic):
         return np.ndarray, x.shape, x.dtype, x.tobytes()
     return type(x), repr(x) if isinstance(x, float) else x
 
