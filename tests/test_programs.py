@@ -132,3 +132,17 @@ def test_compiler_options_that_xla_does_not_know_are_left_out(monkeypatch):
         assert float(_programs.Program(lambda x: x + 1)(jnp.asarray(1.0))) == 2.0
     finally:
         _programs._quick_options.cache_clear()
+
+
+def test_a_law_may_close_over_what_is_differentiated():
+    """Eagerly too, where no argument shows it."""
+
+    def speed(k):
+        stop = vi.RigidStop(0.4, lambda approach: k + 0 * approach)
+        scene = vi.Scene(oscillator=vi.Oscillator(0.1), drive=vi.IdealDrive(0.9), stops=(stop,))
+        return vi.simulate(scene, scene.start(), 3, method=vi.ExactFlight()).last.V
+
+    slope = (speed(0.6 + 1e-6) - speed(0.6 - 1e-6)) / 2e-6
+    for along in (jax.grad, jax.jacfwd):
+        np.testing.assert_allclose(along(speed)(0.6), slope, rtol=1e-6)
+        np.testing.assert_allclose(jax.jit(along(speed))(0.6), slope, rtol=1e-6)

@@ -131,6 +131,10 @@ class Program:
                     return self._quick(*arguments, **keywords)
             except Unsupported:
                 self._may_be_quick = False  # its loops would be XLA's, and slow
+            except ValueError as error:
+                # An argument's function closes over what is being differentiated.
+                if "compiler_options" not in str(error):
+                    raise
         return self._compiled(*arguments, **keywords)
 
 

@@ -4,7 +4,7 @@ import ast
 import sys
 import warnings
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from functools import partial, wraps
 from pathlib import Path
 
 import jax
@@ -449,11 +449,49 @@ def test_what_is_bound_to_a_function_tells_programs_apart(same):
         assert found(2.0) is found(2.0) and found(2) is found(2)
         assert found(np.array([1.0, 2.0])[1]) is found(np.float64(2.0))
         return
-    programs = [found(x) for x in (1.0, 1, True, np.float32(1.0), 0.0, -0.0, 0, np.float32(-0.0))]
+    several = 1.0, 1, True, np.float32(1.0), 0.0, -0.0, 0, np.float32(-0.0), Metres(1.29)
+    programs = [found(x) for x in (*several, Metres(1.31), 0j, complex(0.0, -0.0))]
     assert len(set(map(id, programs))) == len(programs)
     x = jnp.asarray(3.0)
     assert lanes.once(partial(_sum, {"offset": 1.0}), x) == 4.0
     assert lanes.once(partial(_sum, {"offset": 1}), x) == 2.0
+
+
+class Metres(float):
+    """A number that shows less than it is."""
+
+    def __repr__(self):
+        return f"{float(self):.1f} m"
+
+
+FACTOR = 2.0
+
+
+def _scaled(x):
+    return FACTOR * x
+
+
+def test_what_jax_forgets_is_forgotten(monkeypatch):
+    x = jnp.asarray(3.0)
+    assert lanes.once(_scaled, x) == 6.0
+    monkeypatch.setitem(globals(), "FACTOR", 5.0)
+    jax.clear_caches()
+    assert lanes.once(_scaled, x) == 15.0
+
+
+def test_a_decorated_function_is_what_decorates_it():
+    def times(box):
+        @wraps(_scaled)
+        def wrapper(x):
+            return box[0] * x
+
+        return wrapper
+
+    box, x = [2.0], jnp.asarray(3.0)
+    scaled = times(box)
+    assert lanes.once(scaled, x) == 6.0
+    box[0] = 5.0
+    assert lanes.once(scaled, x) == 15.0
 
 
 def test_what_is_traced_is_not_kept():

@@ -62,6 +62,23 @@ def test_the_greatest_alone_is_the_greatest_of_all(cycles):
     np.testing.assert_allclose(alone.state.Y, whole.state.Y, rtol=1e-9)
 
 
+@pytest.mark.parametrize("zeta, xi", [(0.05, 0.9), (0.02, 0.9)])
+def test_a_long_cycle_leaves_next_to_nothing(zeta, xi):
+    """Of a direction after one cycle e^-113, and e^-283, whose square is no number."""
+    scene = ideal(zeta=zeta, xi=xi, gap=None)
+    found = vi.lyapunov(scene, scene.start(Y=1.0), 16, settle=1, number=1)
+    np.testing.assert_allclose(found.exponents, -xi, atol=2e-3)
+
+
+def test_a_direction_in_single_precision():
+    with jax.enable_x64(False):
+        scene = ideal(xi=0.9, gap=None)
+        for number in (1, 2):
+            found = vi.lyapunov(scene, scene.start(Y=1.0), 400, number=number)
+            assert found.exponents.dtype == jnp.float32
+            np.testing.assert_allclose(found.exponents, -0.9, atol=1e-3)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("zeta", [0.6, 0.7, 0.97])
 def test_exponents_add_up_to_the_mean_contraction(zeta):

@@ -31,6 +31,11 @@ class Recent(Generic[K, V]):
     def __len__(self) -> int:
         return len(self._values)
 
+    def clear(self) -> None:
+        """Let go of all."""
+        with self._lock:
+            self._values.clear()
+
     def get(self, key: K) -> V | None:
         """What was put there, if it is still kept."""
         with self._lock:

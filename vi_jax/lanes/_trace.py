@@ -1,8 +1,8 @@
 """A lane's functions as jaxprs of flat arguments, traced once for all that is alike."""
 
 import functools
+import sys
 from collections.abc import Callable, Sequence
-from inspect import unwrap
 from types import FunctionType
 from typing import Any, NamedTuple
 
@@ -47,6 +47,7 @@ def traced(functions: Functions, treedef: Any, leaves: Sequence[Any], **options:
     """
     shapes = [one(x) for x in leaves]
     try:
+        jax.eval_shape(_forgets, jax.ShapeDtypeStruct((), jnp.int32))
         key = (
             *map(_name, functions),
             treedef,
@@ -64,8 +65,15 @@ def traced(functions: Functions, treedef: Any, leaves: Sequence[Any], **options:
     return found
 
 
+@jax.jit
+def _forgets(x: Any) -> Any:
+    # Traced again after `jax.clear_caches()`: what is forgotten there is forgotten here.
+    _recent.clear()
+    return x
+
+
 def _name(function: Callable[..., Any]) -> tuple:
-    """What is equal only for functions that do the same.
+    """What is equal only for functions that do the same, as long as they are pure.
 
     **Raises:** `TypeError` where that is not to be known.
     """
@@ -73,8 +81,13 @@ def _name(function: Callable[..., Any]) -> tuple:
         if function.keywords:
             raise TypeError("no place in an order")
         return (_name(function.func), *map(_bound, function.args))
-    if not isinstance(function, FunctionType) or unwrap(function).__closure__ is not None:
-        raise TypeError("made for this call, perhaps")
+    if not isinstance(function, FunctionType):
+        raise TypeError("no function")
+    if function.__closure__ is not None:
+        # A decorated function closes over what it decorates: there is one of it in its module.
+        module = sys.modules.get(function.__module__)
+        if getattr(module, function.__qualname__, None) is not function:
+            raise TypeError("made for this call, perhaps")
     return (function,)
 
 
@@ -93,8 +106,12 @@ def _constant(x: Any) -> Any:
     if isinstance(x, jax.Array):
         raise TypeError("no constant")
     if isinstance(x, np.ndarray | np.generic):
+        if x.dtype.hasobject:
+            raise TypeError("no numbers")
         return np.ndarray, x.shape, x.dtype, x.tobytes()
-    return type(x), repr(x) if isinstance(x, float) else x
+    if isinstance(x, float | complex):
+        return type(x), float.hex(x.real), float.hex(x.imag)
+    return type(x), x
 
 
 def _traced(functions: Functions, treedef: Any, leaves: list[Any], options: Any) -> Traced:

@@ -151,14 +151,21 @@ def _lyapunov(the_map: CycleMap, start, cycles: int, settle, number: int) -> Lya
 
 
 def _window(cycles: int) -> int:
-    """Cycles after which a direction is made a unit again: in so few it neither vanishes nor
-    becomes infinite, unless it changes by e^±80 in each."""
-    return next(n for n in range(8, 0, -1) if cycles % n == 0)
+    """Cycles after which a direction is made a unit again. In one it may change by as much as a
+    number can; in more of them it would vanish or become infinite where a cycle is long."""
+    return 2 if cycles % 2 == 0 else 1
+
+
+def _length(vector: Float[Array, " states"]) -> Float[Array, ""]:
+    """Its norm, of numbers whose squares are too small or too large for one too."""
+    largest = jnp.max(jnp.abs(vector))
+    unit = jnp.where((largest > 0) & (largest < jnp.inf), largest, 1.0)
+    return unit * jnp.linalg.norm(vector / unit)
 
 
 def _growth(ways: Float[Array, "cycles states"]) -> Float[Array, " cycles"]:
     """The logarithm of what each cycle makes of the length of a direction that begins as a unit."""
-    sizes = jnp.linalg.norm(ways, axis=1)
+    sizes = jax.vmap(_length)(ways)
     before = jnp.concatenate([jnp.ones_like(sizes[:1]), sizes[:-1]])
     # Nothing is left of what is forgotten at once, nor after that.
     return jnp.where(before > 0, jnp.log(sizes / jnp.where(before > 0, before, 1.0)), -jnp.inf)
@@ -173,7 +180,7 @@ def _orthogonal(
         for _ in range(2):
             for other in columns:
                 column = column - jnp.dot(other, column) * other
-        size = jnp.linalg.norm(column)
+        size = _length(column)
         # Nothing is left of a direction that is forgotten at once, as where the body rests.
         columns.append(column / jnp.where(size > 0, size, 1.0))
         sizes.append(size)
