@@ -433,6 +433,16 @@ def scene_cost() -> Expected:
     return numbers
 
 
+def explorer() -> Expected:
+    """The motion where the sliders begin: the 4π motion in closed form."""
+    scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.01)
+    found = vi.closed_form_orbits(scene, cycles=2)
+    return {
+        "lowest position where the sliders begin": (float(found.y_min[0]), 1e-9),
+        "highest": (2.0, 1e-9),
+    }
+
+
 def soft_stop() -> Expected:
     """Where the 2π motion doubles its period before a linear stop, and a multiplier well above."""
     closed_form = closed(0.9, 0.5, 0.0, 2.0, cycles=1)

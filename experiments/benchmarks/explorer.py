@@ -27,6 +27,9 @@ from vi_jax.explore.serve import compile_all
 jax.config.update("jax_enable_x64", True)
 
 HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/benchmarks")
+sys.path.insert(0, str(HERE.parent))
+from headlines import keep
+
 QUICK = "--quick" in sys.argv
 MOVES = 3 if QUICK else 50
 LIMIT = 0.2  # seconds, within which a redrawing seems immediate
@@ -100,13 +103,15 @@ TABLE = f"""# How quickly the explorer redraws
 {MOVES} moves of each slider over its range: computing and drawing, in ms by the clock of an idle
 machine ({os.cpu_count()} cores, {platform.machine()}), without what the browser needs to show it.
 
+![The motion where the sliders begin](../figures/explorer.png)
+
 | | moves | median | worst | later than {1e3 * LIMIT:.0f} ms, % |
 |---|---|---|---|---|
 """ + "\n".join(rows)
 
+values = controls.beginning(controls.IDEAL)
+ideal(values)
+low, high = look(*controls.ideal(values), int(values["settle"])).extremes
+numbers = {"lowest position where the sliders begin": low, "highest": high}
 if not QUICK:
-    HERE.joinpath("explorer.md").write_text(
-        TABLE + "\n\n![The picture](../figures/explorer.png)\n", encoding="utf-8"
-    )
-    picture = ideal(controls.beginning(controls.IDEAL))
-    HERE.parent.joinpath("figures", "explorer.png").write_bytes(picture)
+    keep(HERE, "explorer", TABLE, numbers, PICTURES["ideal"].figure)
