@@ -113,5 +113,8 @@ values = controls.beginning(controls.IDEAL)
 ideal(values)
 low, high = look(*controls.ideal(values), int(values["settle"])).extremes
 numbers = {"lowest position where the sliders begin": low, "highest": high}
+figure = PICTURES["ideal"].figure
+for artist in figure.findobj():
+    artist.set_animated(False)  # the page draws them over the frame
 if not QUICK:
-    keep(HERE, "explorer", TABLE, numbers, PICTURES["ideal"].figure)
+    keep(HERE, "explorer", TABLE, numbers, figure)
