@@ -13,8 +13,8 @@ import numpy as np
 from jax.core import Tracer, eval_jaxpr
 from jax.extend.core import ClosedJaxpr
 
-from ._context import Recent
 from ._program import Program
+from ._recent import Recent
 
 
 class Functions(NamedTuple):

@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 
 from ._code import begun, function_at, llvm
-from ._context import Recent, within
+from ._context import within
 from ._kernel import kernel_text
 from ._program import Program
+from ._recent import Recent
 from ._vector import check
 
 _KEPT = 64

@@ -111,7 +111,7 @@ def _lyapunov(the_map: CycleMap, start, cycles: int, settle, number: int) -> Lya
     # Where all cycles last alike, turning points need not be met for the sake of durations.
     record = "sections" if has_fixed_cycle(scene, before.last) else "motion"
 
-    # One direction alone need not be kept apart from others, and is made a unit again now and then.
+    # One direction alone need not be kept apart from others after every cycle.
     window = _window(cycles) if number == 1 else 1
 
     def image(x):
@@ -130,7 +130,7 @@ def _lyapunov(the_map: CycleMap, start, cycles: int, settle, number: int) -> Lya
 
         new, grown, (duration, ended) = jax.vmap(along, in_axes=1, out_axes=(None, 2, None))(frame)
         frame, sizes = _orthogonal(grown[-1])
-        rates = jnp.log(sizes)[None] if window == 1 else _growth(grown[..., 0])[:, None]
+        rates = _growth(grown[..., 0])[:, None] if number == 1 else jnp.log(sizes)[None]
         result = RESULTS.where(result == RESULTS.successful, ended, result)
         return (new[-1], frame, result), (rates, duration)
 
