@@ -82,6 +82,16 @@ def quintic(begin: Rates, end: Rates, h: Scalar) -> tuple[Scalar, ...]:
     )  # fmt: skip
 
 
+def highest(begin: Rates, end: Rates, h: Scalar) -> Scalar:
+    """What the quintic through both ends of a step stays below: the largest of its coefficients in
+    Bernstein's basis."""
+    v0, v1 = 0.2 * h * begin.v, 0.2 * h * end.v
+    a0, a1 = 0.05 * h * h * begin.a, 0.05 * h * h * end.a
+    from_begin = jnp.maximum(jnp.maximum(begin.x, begin.x + v0), begin.x + 2 * v0 + a0)
+    from_end = jnp.maximum(jnp.maximum(end.x, end.x - v1), end.x - 2 * v1 + a1)
+    return jnp.maximum(from_begin, from_end)
+
+
 def slope(c: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
     """Coefficients of the derivative, padded to the same length."""
     return (*(n * c[n] for n in range(1, len(c))), jnp.zeros_like(c[0]))

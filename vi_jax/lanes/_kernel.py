@@ -14,7 +14,7 @@ from jax.extend.core import ClosedJaxpr
 from ._arrays import Values
 from ._operations import kind_of
 from ._program import Program
-from ._text import Text, Value, is_float
+from ._text import RARE, Text, Value, is_float
 from ._vector import write
 
 _BYTES = {"double": 8, "float": 4, "i1": 1, "i8": 1, "i16": 2, "i32": 4, "i64": 8}
@@ -64,9 +64,9 @@ class _Writer:
         ended = t.any(t.both(present, t.inverse(active)))
         halt = t.raw("load volatile i8, ptr %stop")
         halted = t.raw(f"icmp ne i8 {halt}, 0")
-        t.line(f"br i1 {halted}, label %exit, label %look")
+        t.fork(halted, "exit", "look", rare=True)
         t.open("look")
-        t.line(f"br i1 {ended}, label %flush, label %step")
+        t.fork(ended, "flush", "step", rare=True)
 
         t.open("step")
         new, going, complete, row = self._run(program.step, [*inputs, *carry], active)
@@ -119,7 +119,7 @@ class _Writer:
         index2 = t.select(free, t.select(fresh, following, t.constant(-1, "i64")), place_of)
         some = t.any(fresh)
         before = t.block
-        t.line(f"br i1 {some}, label %begin, label %ready")
+        t.fork(some, "begin", "ready")
         t.open("begin")
         shaped, at = [], 0
         for aval in kept:
@@ -151,7 +151,7 @@ class _Writer:
             for a, b in zip([*begun, has, active2], [*old, had, busy], strict=True)
         ]
         left = t.any(t.binary("icmp sge", index2, t.zero("i64"), "i1"))
-        t.line(f"br i1 {left}, label %head, label %exit")
+        t.fork(left, "head", "exit")
         lines = []
         ready = [*ready[:-2], index2, *ready[-2:]]
         for v, a, b in zip([*names, index, filled, active], ready, after_step, strict=True):
@@ -167,7 +167,7 @@ class _Writer:
             f'attributes #0 = {{ nounwind "min-legal-vector-width"="{bits}" '
             f'"prefer-vector-width"="{bits}" }}'
         )
-        return "\n".join([*t.declared.values(), _PREAMBLE.rstrip(), *t.lines, attributes, ""])
+        return "\n".join([*t.declared.values(), _PREAMBLE.rstrip(), *t.lines, attributes, RARE, ""])
 
     # Memory
 
@@ -260,7 +260,7 @@ class _Writer:
             return
         fits = t.both(mask, t.binary("icmp slt", place, t.constant(rows, "i64"), "i1"))
         inside, after = t.label(), t.label()
-        t.line(f"br i1 {t.any(fits)}, label %{inside}, label %{after}")
+        t.fork(t.any(fits), inside, after, rare=True)
         t.open(inside)
         self._put_row(outs, index, fits, place, row)
         t.line(f"br label %{after}")
@@ -296,7 +296,7 @@ class _Writer:
         t.line(f"{place.text} = phi {t.vector('i64')} {ways}")
         room = t.binary("icmp slt", place, t.constant(program.rows, "i64"), "i1")
         room = t.both(over, room)
-        t.line(f"br i1 {t.any(room)}, label %{inside}, label %{after}")
+        t.fork(t.any(room), inside, after)
         t.open(inside)
         self._put_row(outs, index, room, place, empty)
         one = t.constant(1, "i64").text

@@ -174,7 +174,7 @@ def _skipped(t: Text, jaxpr, consts, args, mask: Value, otherwise) -> list[Value
     inside, after = t.label(), t.label()
     before = t.block
     needed = t.any(mask)
-    t.line(f"br i1 {needed}, label %{inside}, label %{after}")
+    t.fork(needed, inside, after, rare=True)
     t.open(inside)
     found = write(t, jaxpr, consts, args, mask)
     if otherwise is None:
@@ -220,7 +220,7 @@ def _while(t: Text, params: dict, args: list[Values], mask: Value) -> list[Value
     jaxpr, consts = _inner(params["cond_jaxpr"])
     going = t.both(live, write(t, jaxpr, consts, [*cond_args, *carry], live)[0].item())
     needed = t.any(going)
-    t.line(f"br i1 {needed}, label %{inside}, label %{after}")
+    t.fork(needed, inside, after)
     t.open(inside)
     jaxpr, consts = _inner(params["body_jaxpr"])
     new = write(t, jaxpr, consts, [*body_args, *carry], going)
@@ -275,7 +275,7 @@ def _counted(t: Text, params: dict, args: list[Values], mask: Value) -> list[Val
             ways = f"[ {a.text}, %{before} ], [ {b.text}, %{end} ]"
             phis.append(f"  {h.text} = phi {t.vector(h.kind)} {ways}")
     t.lines[place:place] = phis
-    t.line(f"br i1 {more}, label %{inside}, label %{after}")
+    t.fork(more, inside, after)
     t.close()
     t.follow(after)
     return new

@@ -10,9 +10,9 @@ from jaxtyping import Array, Bool, Float
 
 from ...scene.trig import horner
 from .._lane import FREE, SECTION, Lane, Plan, to_stop, to_turn_of
-from ..events import rising_root, slope
+from ..events import Rates, rising_root, slope
 from ..methods._series import Series, at
-from .aim import MARGIN, select
+from .aim import MARGIN, nears, select
 
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]
@@ -28,6 +28,13 @@ def _powers(series: Series, h: Scalar, zero: Scalar) -> tuple[Scalar, ...]:
         out.append(zero if c is None else c if power is None else c * power)
         power = h if power is None else power * h
     return tuple(out)
+
+
+def _ends(path: Series, speed: Scalar, h: Scalar, zero: Scalar) -> tuple[Rates, Rates]:
+    """Rates of a path at both ends of a step of length h, at whose end it has this speed."""
+    bend = _slope(_slope(path))
+    end = Rates(_sum(path, h, zero), speed, _sum(bend, h, zero))
+    return Rates(*(_sum(x[:1], h, zero) for x in (path, path[1:], bend))), end
 
 
 def _slope(series: Series) -> Series:
@@ -57,6 +64,10 @@ def look(plan: Plan, lane: Lane, motion: Any, h: Scalar) -> tuple[Scalar, Scalar
             paths.append(motion.of(coordinate.position))
             speeds.append(_sum(_slope(paths[k]), h, zero))
             turn = lane.direction[k] * speeds[k] < 0
+            everything = plan.meets_turns(lane.done)
+            if everything is not True:
+                close = nears(plan, k, *_ends(paths[k], speeds[k], h, zero), h)
+                turn = turn & (close if everything is False else close | everything)
             # A body at rest meets nothing.
             turns.append(turn if lane.contact is None else turn & (lane.contact[k] == 0))
         for i, stop in enumerate(scene.stops):

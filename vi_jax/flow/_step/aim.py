@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from ...lanes import pin
 from .._lane import FREE, Lane, Plan, to_release, to_turn_of
-from ..events import Rates, quintic, rising_root, slope
+from ..events import Rates, highest, quintic, rising_root, slope
 from ..moving import exact
 from .trial import Crossing, Path, Trial, beyond, to_turn
 
@@ -22,6 +22,9 @@ _BRIEF = 1e-3
 
 # Turning points this far inside the gap (unit: a) are passed by where only impacts matter.
 MARGIN = 0.02
+
+# By so much a bound is wider, for what rounding makes of it.
+_WIDER = 1.001
 
 
 def select(condition: Flag, a: Any, b: Any) -> Any:
@@ -48,10 +51,15 @@ def _met_something(plan: Plan, lane: Lane, trial: Trial) -> Flag:
         met = met | trial.good & beyond(c) & ~c.landed | c.again
         if c.kind == "switch":
             met = met | trial.good & _hump(c, stop_gradient(trial.h))[0]
-    for path, direction in zip(trial.paths, lane.direction, strict=False):
+    everything = plan.meets_turns(lane.done)
+    for k, (path, direction) in enumerate(zip(trial.paths, lane.direction, strict=False)):
         begin, end = stop_gradient((path.begin, path.end))
         if not plan.method.sees_ahead:
-            met = met | trial.good & (direction * end.v < 0) & ~path.at_turn
+            turned = trial.good & (direction * end.v < 0) & ~path.at_turn
+            if everything is not True:
+                close = nears(plan, k, begin, end, stop_gradient(trial.h))
+                turned = turned & (close if everything is False else close | everything)
+            met = met | turned
         twice = _may_turn_twice(direction, path.surge, begin, end, stop_gradient(trial.h))
         met = met | trial.good & twice
     rests = any(path.leaves is not None for path in trial.paths)
@@ -172,6 +180,18 @@ def _aimed(plan: Plan, lane: Lane, trial: Trial) -> tuple[Flag, Scalar, Scalar]:
     return goal.aim | goal.turn | goal.shorter, stop_gradient(goal.length), goal.target
 
 
+def nears(plan: Plan, k: int, begin: Rates, end: Rates, h: Scalar) -> Flag:
+    """Whether a turn of coordinate number k within a step may be one that matters where only
+    impacts do: a bound, where `_matters` looks at the turn itself."""
+    close = jnp.zeros_like(h, bool)
+    for stop in plan.scene.stops:
+        if stop.coordinate == k:
+            gap = stop_gradient(stop.gap)
+            top = highest(begin.scaled(stop.sign, gap), end.scaled(stop.sign, gap), h)
+            close = close | (top > -_WIDER * MARGIN)
+    return close
+
+
 def _hump(c: Crossing, h: Scalar) -> tuple[Flag, Scalar]:
     """Whether a guard that is negative at both ends may have been positive in between, and where
     it was greatest. The tangents at both ends bound a hump that is curved one way."""
@@ -227,6 +247,10 @@ def _may_turn_twice(
     """
     a0, a1 = direction * begin.a, direction * end.a
     dips = (a0 < 0) & (a1 > 0) & (h > 1e-3)
+    if surge is None:
+        # lowest < 0.1 (v0 + v1), times a1 - a0: without a division in each step.
+        room = direction * (begin.v - 0.1 * (begin.v + end.v))
+        return dips & (room * (a1 - a0) < 0.5 * h * a0 * a0)
     drop = 0.5 * h * a0 * (a0 / jnp.where(dips, a0 - a1, 1.0))
     if surge is not None:
         j0, j1 = direction * surge[0], direction * surge[1]

@@ -181,7 +181,7 @@ def _path(
             Rates(jnp.where(rests, place, r.x), jnp.where(rests, 0.0, r.v), r.a)
             for r in (begin, end)
         )
-    met = jnp.abs(to_turn(end)) <= _turn_tolerance(h) * _leniency(lane)
+    met = _turns_within(_turn_tolerance(h) * _leniency(lane), end)
     aimed = lane.target == to_turn_of(k)
     for j in range(len(plan.scene.coordinates)):  # several may turn at once
         aimed = aimed if j == k else aimed | (lane.target == to_turn_of(j))
@@ -343,3 +343,9 @@ def to_turn(end: Rates) -> Scalar:
     """Offset from a step's end to the turning point near it."""
     bend = stop_gradient(end.a)
     return -stop_gradient(end.v) / jnp.where(bend == 0, 1.0, bend)
+
+
+def _turns_within(length: Scalar, end: Rates) -> Flag:
+    """Whether `to_turn` is no longer than this; without its division, in each step."""
+    bend = stop_gradient(end.a)
+    return jnp.abs(stop_gradient(end.v)) <= length * jnp.where(bend == 0, 1.0, jnp.abs(bend))
