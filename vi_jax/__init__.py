@@ -16,6 +16,7 @@ from .flow import Samples as Samples
 from .flow import Suggestion as Suggestion
 from .flow import Taylor as Taylor
 from .flow import Unrolled as Unrolled
+from .flow import Verner9 as Verner9
 from .flow import jit as jit
 from .flow import preset as preset
 from .flow import simulate as simulate

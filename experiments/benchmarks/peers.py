@@ -78,7 +78,7 @@ def ours(name: str, number: float = 0.0, *, whole: bool = False, **options: Any)
     if name == "Taylor" and number > 1:
         inside += ", 8 steps"
     elif name == "FixedStep":
-        inside = f"Dopri8, {inside}"
+        inside = f"Verner9, {inside}"
     label = f"{OURS} {name}({inside})" + (", forced devices" if whole else "")
     return Entry(label, "ours", {"name": name, "number": number, **options}, whole=whole)
 
@@ -91,9 +91,9 @@ def heyoka(tol: float, **options: Any) -> Entry:
 def entries(drive: str, all_cores: bool) -> list[Entry]:
     """All codes for one scene."""
     sparse = LANES // 8 if not all_cores else LANES // (8 if len(cores()) > 8 else 16)
-    motor = [("FixedStep", n) for n in (5, 6, 8, 12, 24, 36)]
-    motor += [("Taylor", n) for n in (11, 12, 14, 16, 18)] + [("Taylor", 1e-12), ("Taylor", 1e-13)]
-    methods = motor if drive == "motor" else [("ExactFlight", 0), ("FixedStep", 12)]
+    motor = [("FixedStep", n) for n in (5, 6, 8, 10, 12, 16, 20, 24)]
+    motor += [("Taylor", n) for n in (14, 16, 18)] + [("Taylor", 1e-12), ("Taylor", 1e-13)]
+    methods = motor if drive == "motor" else [("ExactFlight", 0), ("FixedStep", 10)]
     listed = [ours(*method) for method in methods]
     listed += [heyoka(tol) for tol in (1e-6, 1e-9, 1e-15)]
     scalar = {"tol": 1e-9, "batch": 1}
@@ -114,7 +114,7 @@ def entries(drive: str, all_cores: bool) -> list[Entry]:
     ]
     listed += [Entry("SciPy DOP853, 1e-09", "scipy_ivp", {"tol": 1e-9}, block=1, every=sparse)]
     if all_cores:
-        best = ("FixedStep", 12) if drive == "motor" else methods[0]
+        best = ("FixedStep", 10) if drive == "motor" else methods[0]
         threads = {"tol": 1e-9, "threads": len(cores())}
         prange = {"tol": 1e-9, "parallel": True}
         listed += [
@@ -128,7 +128,7 @@ def entries(drive: str, all_cores: bool) -> list[Entry]:
 def derivative_entries() -> list[Entry]:
     """The codes that give derivatives by six parameters, each primal beside its derivatives."""
     listed = []
-    for method in (("FixedStep", 12), ("FixedStep", 24), ("Taylor", 16), ("Taylor", 1e-12)):
+    for method in (("FixedStep", 6), ("FixedStep", 10), ("FixedStep", 16), ("Taylor", 1e-12)):
         primal = ours(*method)
         with_six = Entry(primal.name + " six jvp", "ours", {**primal.options, "jacobian": True})
         listed += [primal, with_six]
@@ -444,7 +444,7 @@ def picture(sections: dict[str, dict]) -> Any:
 
 def headline(sections: dict[str, dict]) -> dict[str, float]:
     """What a test can compute again: an error of vi_jax's own."""
-    wanted = f"{OURS} FixedStep(Dopri8, 12)"
+    wanted = f"{OURS} FixedStep(Verner9, 10)"
     rows = sections[f"states, ideal, {RESTITUTIONS[-1]}, one"]["rows"]
     error = next((row["error"] for row in rows if row["name"] == wanted), None)
     name = f"{wanted}, ideal drive, k = {RESTITUTIONS[-1]:g}: median error"
@@ -461,7 +461,6 @@ def headline(sections: dict[str, dict]) -> dict[str, float]:
 # %%
 def on_gpu() -> str:
     """A table of vi_jax on JAX's default device."""
-    import diffrax
     import equinox as eqx
     import jax
     import jax.numpy as jnp
@@ -474,8 +473,8 @@ def on_gpu() -> str:
     sizes = (1_000, 4_000) if QUICK else (100_000, 1_000_000, 10_000_000)
     batch = 1_000 if QUICK else 500_000
     scenes = [
-        ("motor", "FixedStep(Dopri8, 12)", vi.FixedStep(diffrax.Dopri8(), 12)),
-        ("motor", "Adaptive(Dopri8, 1e-6)", vi.Adaptive(diffrax.Dopri8(), rtol=1e-6)),
+        ("motor", "FixedStep(Verner9, 10)", vi.FixedStep()),
+        ("motor", "Adaptive(Verner9, 1e-6)", vi.Adaptive(rtol=1e-6)),
         ("ideal", "ExactFlight()", vi.ExactFlight()),
     ]
     lines = [

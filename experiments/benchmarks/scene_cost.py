@@ -120,8 +120,8 @@ cost = {name: 1e6 * float(np.median(t)) / LANES / CYCLES for name, t in times.it
 lines = [
     "# What each part of a scene costs",
     "",
-    f"12 steps of Dopri8 a cycle unless it says exact flight; Table 1's damping, d = 2, k = 0.8, ζ "
-    f"or κ from 0.5 to 1.9. {LANES} lanes of {CYCLES} cycles on one core, medians of {ROUNDS} "
+    "10 steps of Verner9 a cycle unless it says exact flight; Table 1's damping, d = 2, k = 0.8, "
+    f"ζ or κ from 0.5 to 1.9. {LANES} lanes of {CYCLES} cycles on one core, medians of {ROUNDS} "
     f"interleaved rounds; JAX {jax.__version__}. Operations are those of the program that JAX is "
     "given.",
     "",

@@ -30,7 +30,7 @@ from typing import Any, Literal
 import diffrax
 from attrs import field, frozen
 
-from ..flow import AbstractMethod, Adaptive, ExactFlight, FixedStep, Taylor
+from ..flow import AbstractMethod, Adaptive, ExactFlight, FixedStep, Taylor, Verner9
 from ..orbit import AbstractSearch, Gradient, Newton
 from ..scene import AbstractScene
 from .machine import MachineTable, ModelTable, SceneTable, machine_named, start_of
@@ -46,7 +46,7 @@ _SOLVERS = {
     if isinstance(kind, type)
     and issubclass(kind, diffrax.AbstractERK | diffrax.AbstractESDIRK)
     and name[:8] != "Abstract"
-}
+} | {"Verner9": Verner9}
 
 
 @frozen(kw_only=True)

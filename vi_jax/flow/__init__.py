@@ -8,6 +8,7 @@ from .methods import ExactFlight as ExactFlight
 from .methods import FixedStep as FixedStep
 from .methods import Taylor as Taylor
 from .methods import Unrolled as Unrolled
+from .methods import Verner9 as Verner9
 from .methods import preset as preset
 from .results import RESULTS as RESULTS
 from .results import Errors as Errors

@@ -10,11 +10,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ..scene.trig import horner
 
 Scalar = Float[Array, ""]
+Flag = Bool[Array, ""]
 
 
 class Rates(NamedTuple):
@@ -134,3 +135,17 @@ def landing(gap: Rates) -> tuple[Scalar, Scalar]:
     bend = jnp.where(approaching | (gap.a == 0), 1.0, gap.a)
     delta = jnp.where(approaching, -2 * gap.x / sum_, (root - gap.v) / bend)
     return jnp.where(real, delta, jnp.inf), square
+
+
+def to_turn(end: Rates) -> Scalar:
+    """Offset from a step's end to the turning point near it."""
+    bend = jax.lax.stop_gradient(end.a)
+    return -jax.lax.stop_gradient(end.v) / jnp.where(bend == 0, 1.0, bend)
+
+
+def turns_within(length: Scalar, end: Rates) -> Flag:
+    """Whether `to_turn` is no longer than this; without its division, in each step."""
+    bend = jax.lax.stop_gradient(end.a)
+    return jnp.abs(jax.lax.stop_gradient(end.v)) <= length * jnp.where(
+        bend == 0, 1.0, jnp.abs(bend)
+    )

@@ -16,7 +16,7 @@ from .._checks import count, one_of, require
 from ..scene import AbstractScene
 from .arguments import check_start
 from .fusion import jit
-from .methods import AbstractMethod, Adaptive, ExactFlight, FixedStep, Taylor, preset
+from .methods import AbstractMethod, Adaptive, ExactFlight, FixedStep, Taylor, Verner9, preset
 from .simulate import simulate
 
 QUANTITIES = ("state", "extremes", "impacts", "derivative")
@@ -118,7 +118,7 @@ def suggest_method(
     elif stiff:
         truth = Adaptive(diffrax.Kvaerno5(), rtol=1e-12)
     else:
-        truth = Adaptive(diffrax.Dopri8(), rtol=1e-14)
+        truth = Adaptive(rtol=1e-14)
     bench.truth = bench.result(truth)
     failed = int(np.sum(~np.isfinite(bench.truth[:, 0])))
     if failed:
@@ -130,7 +130,7 @@ def suggest_method(
         tried = [bench.tried(best, "ExactFlight()")]
     else:
         tried = [] if stiff else _fixed(bench, error)
-        tried += _adaptive(bench, error, diffrax.Dopri8())
+        tried += _adaptive(bench, error, Verner9())
         tried += _adaptive(bench, error, diffrax.Kvaerno5()) if stiff else []
         tried += _series(bench, error)
     good = [t for t in tried if t.error <= error]
@@ -168,8 +168,8 @@ def _fixed(bench: "_Bench", error: float) -> list[Tried]:
     while low <= high:
         middle = (low + high) // 2
         steps = _STEPS[middle]
-        method = FixedStep(diffrax.Dopri8(), steps)
-        tried.append(bench.tried(method, f"FixedStep(Dopri8(), {steps})"))
+        method = FixedStep(Verner9(), steps)
+        tried.append(bench.tried(method, f"FixedStep(Verner9(), {steps})"))
         if tried[-1].error <= error:
             high = middle - 1
         else:

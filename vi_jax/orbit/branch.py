@@ -150,7 +150,7 @@ def continue_orbit(
       (positions in a, velocities in a ω, clocks in radians, the parameter in half its interval).
     - `max_points`: points in each direction at most.
     - `method`: how the scene is carried, of fixed steps: by default `ExactFlight()` where it
-      applies, else 32 steps of `Dopri8` a cycle.
+      applies, else 20 steps of `Verner9` a cycle.
 
     **Returns:** a `Branch`.
 

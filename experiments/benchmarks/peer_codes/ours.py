@@ -3,7 +3,6 @@
 import time
 from typing import Any
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,18 +14,18 @@ from .task import Run, Task
 jax.config.update("jax_enable_x64", True)
 
 
-def method(name: str, number: float, solver: str = "Dopri8") -> vi.AbstractMethod:
+def method(name: str, number: float) -> vi.AbstractMethod:
     """The method by the name that the tables use."""
     if name == "ExactFlight":
         return vi.ExactFlight()
     if name == "FixedStep":
-        return vi.FixedStep(getattr(diffrax, solver)(), int(number))
+        return vi.FixedStep(steps_per_cycle=int(number))
     if name == "Taylor" and number > 1:
         return vi.Taylor(int(number), 8)
     if name == "Taylor":
         order = 12 if number >= 1e-9 else 16 if number >= 1e-12 else 20
         return vi.Taylor(order, 5, rtol=number)
-    return vi.Adaptive(getattr(diffrax, solver)(), rtol=number)
+    return vi.Adaptive(rtol=number)
 
 
 def final(task: Task, how: vi.AbstractMethod, theta: jax.Array, Y0: jax.Array) -> jax.Array:

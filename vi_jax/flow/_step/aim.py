@@ -10,9 +10,9 @@ from jaxtyping import Array, Bool, Float
 
 from ...lanes import pin
 from .._lane import FREE, Lane, Plan, to_release, to_turn_of
-from ..events import Rates, highest, quintic, rising_root, slope
+from ..events import Rates, highest, quintic, rising_root, slope, to_turn
 from ..moving import exact
-from .trial import Crossing, Path, Trial, beyond, to_turn
+from .trial import Crossing, Path, Trial, beyond
 
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 from ...lanes import pin, pin_flag
 from ...scene import AbstractScene
 from .._lane import FREE, SECTION, Lane, Plan, to_stop, to_switch, to_turn_of, total
-from ..events import Rates, force_rate, guard_rates, landing, rates
+from ..events import Rates, force_rate, guard_rates, landing, rates, turns_within
 from ..methods.taylor import Expansion
 from ..moving import Moving, exact, in_modes
 from .rest import Release, release
@@ -181,7 +181,7 @@ def _path(
             Rates(jnp.where(rests, place, r.x), jnp.where(rests, 0.0, r.v), r.a)
             for r in (begin, end)
         )
-    met = _turns_within(_turn_tolerance(h) * _leniency(lane), end)
+    met = turns_within(_turn_tolerance(h) * _leniency(lane), end)
     aimed = lane.target == to_turn_of(k)
     for j in range(len(plan.scene.coordinates)):  # several may turn at once
         aimed = aimed if j == k else aimed | (lane.target == to_turn_of(j))
@@ -337,15 +337,3 @@ def _landing_tolerance(x: Scalar) -> float:
 def _turn_tolerance(x: Scalar) -> float:
     """Largest accepted offset from a turning point, whose height it enters in third order."""
     return 1e-5 if x.dtype == jnp.float64 else 1e-2
-
-
-def to_turn(end: Rates) -> Scalar:
-    """Offset from a step's end to the turning point near it."""
-    bend = stop_gradient(end.a)
-    return -stop_gradient(end.v) / jnp.where(bend == 0, 1.0, bend)
-
-
-def _turns_within(length: Scalar, end: Rates) -> Flag:
-    """Whether `to_turn` is no longer than this; without its division, in each step."""
-    bend = stop_gradient(end.a)
-    return jnp.abs(stop_gradient(end.v)) <= length * jnp.where(bend == 0, 1.0, jnp.abs(bend))

@@ -9,3 +9,4 @@ from .runge_kutta import Adaptive as Adaptive
 from .runge_kutta import FixedStep as FixedStep
 from .taylor import Taylor as Taylor
 from .unrolled import Unrolled as Unrolled
+from .verner import Verner9 as Verner9

@@ -2,8 +2,6 @@
 
 from typing import Any
 
-import diffrax
-
 from ..._checks import one_of
 from ...scene import AbstractScene, Scene
 from .base import AbstractMethod
@@ -15,7 +13,7 @@ MethodLike = AbstractMethod | str | None
 
 # Steps a cycle of a `Scene`, and the tolerance for a scene of one's own, whose time scales are not
 # known. Chosen from the front that `experiments/benchmarks/speed_accuracy.py` measures.
-_PRESETS = {"draft": (6, 1e-6), "standard": (12, 1e-9), "reference": (48, 1e-13)}
+_PRESETS = {"draft": (6, 1e-6), "standard": (10, 1e-9), "reference": (30, 1e-13)}
 
 
 def preset(scene: AbstractScene | None, name: str = "standard") -> AbstractMethod:
@@ -50,8 +48,8 @@ def _named(scene: AbstractScene | None, name: str, argument: str) -> AbstractMet
     if scene is not None and _flies(scene):
         return ExactFlight()
     if scene is None or (isinstance(scene, Scene) and not scene.soft_stops):
-        return FixedStep(diffrax.Dopri8(), steps)
-    return Adaptive(diffrax.Dopri8(), rtol=tolerance)
+        return FixedStep(steps_per_cycle=steps)
+    return Adaptive(rtol=tolerance)
 
 
 def chosen(
