@@ -105,6 +105,30 @@ def test_second_derivatives_pass_through_impacts(method, cycles):
     np.testing.assert_allclose(bend, jnp.stack(difference, -1), atol=1e-7 * (1 + scale))
 
 
+@pytest.mark.parametrize(
+    ("method", "order"),
+    [
+        (vi.ExactFlight(), 3),
+        pytest.param(vi.ExactFlight(), 4, marks=pytest.mark.slow),
+        pytest.param(vi.FixedStep(steps_per_cycle=24), 3, marks=pytest.mark.slow),
+        pytest.param(vi.Taylor(16, 8), 3, marks=pytest.mark.slow),
+    ],
+    ids=["ExactFlight, third", "ExactFlight, fourth", "FixedStep", "Taylor"],
+)
+def test_higher_derivatives_pass_through_impacts(method, order):
+    """Along a line through the parameters and the start, beside differences of one order less."""
+    at, along = jnp.array([ZETA, XI, K, GAP, 0.1, 0.2]), jnp.array([0.3, 0.2, -0.4, 0.1, 0.5, -0.2])
+    functions = [lambda t: final(method, 3)(at + t * along)]
+    for _ in range(order):
+        functions.append(jax.jacfwd(functions[-1]))
+    lower, higher = (jax.jit(f) for f in functions[-2:])
+    h = 1e-3
+    near, far = ((lower(x) - lower(-x)) / (2 * x) for x in (h, 2 * h))
+    found = np.asarray(higher(0.0))
+    # The difference of fourth order errs by h⁴/30 times a derivative of order + 4.
+    np.testing.assert_allclose(found, (4 * near - far) / 3, rtol=1e-6)
+
+
 def test_gradients_are_the_forward_ones():
     """Of a function of two numbers, also under `vmap`, and of second order."""
 

@@ -1,8 +1,10 @@
 """Where a step leads: rebounds, rest, changes of mode, and what is recorded of the way."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -11,7 +13,8 @@ from jaxtyping import Array, Bool, Float
 
 from ...lanes import pin, pin_flag
 from .._lane import Lane, Plan, Record, to_stop, to_turn_of
-from ..moving import struck_modes
+from ..drift import drifted, met_after
+from ..moving import Moving, struck_modes
 from .aim import select
 from .rest import Release, settled
 from .trial import Crossing, Path, Trial
@@ -97,18 +100,19 @@ def _met(plan: Plan, lane: Lane, trial: Trial, taken: Flag, arrival: Arrival) ->
     Of events met together the stops come first, in their order, then the switches, then the
     section.
     """
-    flow, bend = _flow_and_bend(trial.holding, arrival.time is not None, trial.s, trial.state)
+    way = _way(plan, lane, trial, arrival)
+    flow = way.rate(way.moving, way.fixed, way.rest)[1:]
     for c in trial.crossings:
-        offset = jnp.where(c.landed, c.offset, 0.0)
+        offset = stop_gradient(jnp.where(c.landed, c.offset, 0.0))
         if c.kind != "section" and plan.ticks(lane.state):
             # Met on the section it is not beyond it.
-            beyond = stop_gradient(trial.s + offset - plan.end(lane.part))
-            offset = offset - jnp.maximum(beyond, 0.0)
-        there, passed = jtu.tree_map(
-            lambda x, dx, ddx, d=offset: x + d * dx + _second(d, ddx),
-            (trial.state, arrival.time), flow, bend,
-        )  # fmt: skip
-        arrival = arrival._replace(s=arrival.s + offset, time=passed)
+            beyond = trial.s + offset - plan.end(lane.part)
+            offset = offset - jnp.maximum(stop_gradient(beyond), 0.0)
+        # With the derivatives of what is met, which mean nothing where nothing is.
+        offset = met_after(way.rate, way.guard(c), offset, way.moving, way.fixed, way.rest)
+        _, there, passed = drifted(way.rate, offset, way.moving, way.fixed, way.rest)
+        s = arrival.s + jnp.where(c.landed, offset, 0.0)
+        arrival = arrival._replace(s=s, time=select(c.landed, passed, arrival.time))
         if c.kind == "section":
             arrival = arrival._replace(
                 completed=arrival.completed | c.landed,
@@ -272,29 +276,45 @@ def _top(path: Path) -> Scalar:
     return end.x - jnp.where(path.at_turn, 0.5 * end.v**2 / bend, 0.0)
 
 
-@jax.custom_jvp
-def _second(offset: Scalar, bend: Float[Array, "..."]) -> Float[Array, "..."]:
-    """½δ² x'', which is below rounding and left out; only its derivatives count."""
-    return jnp.zeros_like(bend)
+class _Way(NamedTuple):
+    """What `drift` asks for, of the last part of a way."""
+
+    moving: tuple[Scalar, Any, Scalar | None]
+    fixed: Any
+    rest: Any
+    rate: Callable
+    guard: Callable[[Crossing], Callable]
 
 
-@_second.defjvp
-def _(primals, tangents):
-    (offset, bend), (rate, _) = primals, tangents
-    return jnp.zeros_like(bend), offset * rate * bend
+def _way(plan: Plan, lane: Lane, trial: Trial, arrival: Arrival) -> _Way:
+    # Functions that close over no number: everything that may have a derivative is an argument.
+    given = trial.holding, plan.end(lane.part)
+    fixed, others = eqx.partition(given, eqx.is_inexact_array)
+    rest, static = eqx.partition(others, eqx.is_array)
 
-
-def _flow_and_bend(scene: Any, timed: bool, s: Scalar, state: Any) -> tuple[Any, Any]:
-    """First and second derivatives by s of the state and of the elapsed time."""
-
-    def field(s, state):
-        pace = scene.pace(s, state) if timed else None
-        if timed and pace is None:
+    def rate(moving, fixed, rest):
+        (machine, _), (s, state, time) = eqx.combine(fixed, rest, static), moving
+        pace = None if time is None else machine.pace(s, state)
+        if time is not None and pace is None:
             pace = jnp.ones_like(s)
-        return scene.field(s, state), pace
+        return jnp.ones_like(s), machine.field(s, state), pace
 
-    flow = field(s, state)
-    return flow, jax.jvp(field, (s, state), (jnp.ones_like(s), flow[0]))[1]
+    def guard(c: Crossing) -> Callable:
+        def event(moving, fixed, rest):
+            (machine, bound), (s, state, _) = eqx.combine(fixed, rest, static), moving
+            scene = machine.scene if isinstance(machine, Moving) else machine
+            if c.kind == "stop":
+                stop = scene.stops[c.number]
+                return stop.beyond(scene.coordinates[stop.coordinate].position(state))
+            if c.kind == "switch":
+                mode = machine.modes[c.number]
+                return scene.switches[c.number].guard(scene, s, state, mode)
+            section: Any = scene.section(state)
+            return scene.clock(state) - bound if section is None else section
+
+        return event
+
+    return _Way((trial.s, trial.state, arrival.time), fixed, rest, rate, guard)
 
 
 def _logged(log: Any, hit: Flag, place: Scalar, clock: Scalar, approach: Scalar, stop: int) -> Any:

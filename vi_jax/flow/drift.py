@@ -1,0 +1,112 @@
+"""The way from a step's end to an event close by: too short to matter, but for its derivatives.
+
+A step ends within rounding of its event, so that in value little is left of the way. When the event
+is met, and how far the state has come then, depend on everything that came before, though: the
+derivatives of both are those of the flow and of the event's equation, and are given as such, to any
+order.
+
+A rate is a function `(moving, fixed, rest)`: how fast `moving` changes, where `fixed` are numbers
+that derivatives may be taken by, and `rest` what has none. A guard is such a function too, and zero
+at the event.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, Float
+
+Scalar = Float[Array, ""]
+
+
+def _numbers(tangents: Any) -> tuple[tuple[bool, ...], list[Any]]:
+    """Which leaves have a tangent, and those tangents."""
+    slopes = jtu.tree_leaves(tangents, is_leaf=lambda x: isinstance(x, SymbolicZero))
+    moves = tuple(not isinstance(x, SymbolicZero) for x in slopes)
+    return moves, [x for x, m in zip(slopes, moves, strict=True) if m]
+
+
+def _along(function: Callable, at: tuple, moves: tuple[bool, ...], slopes: list) -> tuple[Any, Any]:
+    """Value and derivative of a function of trees, along those of their leaves that move."""
+    leaves, tree = jtu.tree_flatten(at)
+
+    def of_moving(*changing):
+        given = iter(changing)
+        both = [next(given) if m else x for x, m in zip(leaves, moves, strict=True)]
+        return function(*jtu.tree_unflatten(tree, both))
+
+    return jax.jvp(of_moving, [x for x, m in zip(leaves, moves, strict=True) if m], slopes)
+
+
+def _written_out(tangents: Any) -> Any:
+    """Tangents with their zeros as numbers."""
+
+    def number(x: Any) -> Any:
+        aval: Any = getattr(x, "aval", None)
+        return jnp.zeros(aval.shape, aval.dtype) if isinstance(x, SymbolicZero) else x
+
+    return jtu.tree_map(number, tangents, is_leaf=lambda x: isinstance(x, SymbolicZero))
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def drifted(rate: Callable, offset: Scalar, moving: Any, fixed: Any, rest: Any) -> Any:
+    """Where the flow of `rate` carries `moving` within `offset`: to first order in value, with the
+    flow's derivatives."""
+    return jtu.tree_map(lambda x, dx: x + offset * dx, moving, rate(moving, fixed, rest))
+
+
+def _drifted_jvp(rate, primals, tangents):
+    offset, moving, fixed, rest = primals
+    there = drifted(rate, offset, moving, fixed, rest)
+    slope = _written_out(tangents[1])
+    moves, numbers = _numbers(tangents[2])
+    if any(moves) or any(_numbers(tangents[1])[0]):
+        # What the derivative by the beginning becomes: it is carried along by the same flow.
+        all_move = (True,) * len(jtu.tree_leaves(moving)) + moves
+
+        def both(pair, fixed_pair, rest):
+            slopes = [*jtu.tree_leaves(pair[1]), *fixed_pair[1]]
+            at = pair[0], fixed_pair[0]
+            return _along(lambda x, p: rate(x, p, rest), at, all_move, slopes)
+
+        slope = drifted(both, offset, (moving, slope), (fixed, numbers), rest)[1]
+    if not isinstance(tangents[0], SymbolicZero):
+        onward = rate(there, fixed, rest)
+        slope = jtu.tree_map(lambda dx, v: dx + tangents[0] * v, slope, onward)
+    return there, slope
+
+
+drifted.defjvp(_drifted_jvp, symbolic_zeros=True)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def met_after(
+    rate: Callable, guard: Callable, offset: Scalar, moving: Any, fixed: Any, rest: Any
+) -> Scalar:
+    """The offset at which the flow of `rate` from `moving` meets the zero of `guard`: `offset`
+    itself, which must be that to rounding, with the derivatives of the implicit function."""
+    return offset
+
+
+def _met_after_jvp(rate, guard, primals, tangents):
+    _, moving, fixed, rest = primals
+    offset = met_after(rate, guard, *primals)
+    moves, numbers = _numbers(tangents[1:3])
+    if not any(moves):
+        return offset, jnp.zeros_like(offset)
+
+    def left(moving, fixed):
+        return guard(drifted(rate, offset, moving, fixed, rest), fixed, rest)
+
+    change = _along(left, (moving, fixed), moves, numbers)[1]
+    there = drifted(rate, offset, moving, fixed, rest)
+    onward = rate(there, fixed, rest)
+    speed = jax.jvp(lambda x: guard(x, fixed, rest), (there,), (onward,))[1]
+    return offset, -change / jnp.where(speed == 0, 1.0, speed)
+
+
+met_after.defjvp(_met_after_jvp, symbolic_zeros=True)
