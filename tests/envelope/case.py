@@ -4,15 +4,14 @@ import sys
 from collections.abc import Callable
 from typing import NamedTuple
 
-import diffrax
 import vi_jax as vi
 
 QUICK = "--quick" in sys.argv
 
 EXACT = {"ExactFlight": vi.ExactFlight()}
 STEPPED = {
-    "FixedStep(12)": vi.FixedStep(diffrax.Dopri8(), 12),
-    "Adaptive(1e-11)": vi.Adaptive(diffrax.Dopri8(), rtol=1e-11),
+    "FixedStep(10)": vi.FixedStep(),
+    "Adaptive(1e-11)": vi.Adaptive(rtol=1e-11),
 }
 ALL = EXACT | STEPPED
 Found = dict[str, float]

@@ -9,20 +9,26 @@ from .case import STEPPED, Found, case
 from .scenes import MOTOR, against_scipy, energy, free_machine, ideal, machine, sections, worst
 
 
-@case("τ0 = 0", "the shaft coasts: the energy is kept, 200 cycles", {"FixedStep(12)": 1e-8})
+@case(
+    "τ0 = 0",
+    "the shaft coasts: the energy is kept, 200 cycles",
+    # Nothing brings back what a step loses: the loss grows with the number of steps.
+    {"FixedStep(10)": 1e-7, "Adaptive(1e-11)": 1e-9},
+)
 def coasting() -> Found:
     """No torque."""
-    scene = free_machine()
+    scene, found = free_machine(), {}
     start = scene.start(Y=-1.0, V=0.3, W=0.9)
-    run = vi.simulate(scene, start, 200, method=STEPPED["FixedStep(12)"])
-    change = energy(scene, run.last) / energy(scene, start) - 1
-    return {"FixedStep(12)": float(abs(change))}
+    for name, method in STEPPED.items():
+        run = vi.simulate(scene, start, 200, method=method)
+        found[name] = float(abs(energy(scene, run.last) / energy(scene, start) - 1))
+    return found
 
 
 @case(
     "τ0 = 0, W → 0",
     "the shaft swings to and fro; in time the energy is kept",
-    {"FixedStep(12)": 1e-5, "Adaptive(1e-11)": 1e-8},
+    {"FixedStep(10)": 1e-5, "Adaptive(1e-11)": 1e-8},
     "the phase clock ends as `stalled`; in time a cycle that never ends, as `max_steps`",
 )
 def stalling() -> Found:
@@ -86,7 +92,7 @@ def strong_motor() -> Found:
     return {"Adaptive(1e-11)": max(abs(x / scaled[0] - 1) for x in scaled)}
 
 
-@case("ε = 1 and 10", "SciPy, 5 cycles", {"FixedStep(12)": 1e-5, "Adaptive(1e-11)": 1e-8})
+@case("ε = 1 and 10", "SciPy, 5 cycles", {"FixedStep(10)": 1e-5, "Adaptive(1e-11)": 1e-8})
 def strong_feedback() -> Found:
     """A spring that rules the shaft."""
     return worst(
@@ -97,7 +103,7 @@ def strong_feedback() -> Found:
 
 @case(
     "λ = 0.99", "SciPy with the exact crank, 10 cycles",
-    {"FixedStep(12)": 1e-3, "Adaptive(1e-11)": 1e-8},
+    {"FixedStep(10)": 1e-3, "Adaptive(1e-11)": 1e-8},
     "λ ≥ 1 is refused; from λ = 0.9 on fixed steps need to be many",
 )  # fmt: skip
 def long_crank() -> Found:
