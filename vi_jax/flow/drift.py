@@ -18,9 +18,10 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 Scalar = Float[Array, ""]
+Flag = Bool[Array, ""]
 
 
 def _numbers(tangents: Any) -> tuple[tuple[bool, ...], list[Any]]:
@@ -110,3 +111,44 @@ def _met_after_jvp(rate, guard, primals, tangents):
 
 
 met_after.defjvp(_met_after_jvp, symbolic_zeros=True)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def height_of_turn(
+    rate: Callable,
+    place: Callable,
+    height: Scalar,
+    turns: Flag,
+    offset: Scalar,
+    moving: Any,
+    fixed: Any,
+    rest: Any,
+) -> Scalar:
+    """`height` itself, with the derivatives of `place` where the flow of `rate` turns, `offset`
+    from `moving`; or, where nothing `turns`, of `place` in `moving`."""
+    return height
+
+
+def _height_of_turn_jvp(rate, place, primals, tangents):
+    _, turns, offset, moving, fixed, rest = primals
+    height = height_of_turn(rate, place, *primals)
+    moves, numbers = _numbers(tangents[3:5])
+    if not any(moves):
+        return height, jnp.zeros_like(height)
+
+    def speed(moving, fixed, rest):
+        onward = rate(moving, fixed, rest)
+        return jax.jvp(lambda x: place(x, fixed, rest), (moving,), (onward,))[1]
+
+    def top(moving, fixed):
+        there = met_after(rate, speed, offset, moving, fixed, rest)
+        return place(drifted(rate, there, moving, fixed, rest), fixed, rest)
+
+    def slope_of(function: Callable) -> Scalar:
+        return _along(function, (moving, fixed), moves, numbers)[1]
+
+    here = slope_of(lambda x, p: place(x, p, rest))
+    return height, jax.lax.cond(turns, lambda _: slope_of(top), lambda x: x, here)
+
+
+height_of_turn.defjvp(_height_of_turn_jvp, symbolic_zeros=True)

@@ -13,11 +13,12 @@ from jaxtyping import Array, Bool, Float
 
 from ...lanes import pin, pin_flag
 from .._lane import Lane, Plan, Record, to_stop, to_turn_of
-from ..drift import drifted, met_after
+from ..drift import drifted, height_of_turn, met_after
+from ..events import Rates, to_turn
 from ..moving import Moving, struck_modes
 from .aim import select
 from .rest import Release, settled
-from .trial import Crossing, Path, Trial
+from .trial import Crossing, Trial
 
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]
@@ -100,7 +101,7 @@ def _met(plan: Plan, lane: Lane, trial: Trial, taken: Flag, arrival: Arrival) ->
     Of events met together the stops come first, in their order, then the switches, then the
     section.
     """
-    way = _way(plan, lane, trial, arrival)
+    way = _way(plan, lane, trial, arrival.time)
     flow = way.rate(way.moving, way.fixed, way.rest)[1:]
     for c in trial.crossings:
         offset = stop_gradient(jnp.where(c.landed, c.offset, 0.0))
@@ -255,7 +256,8 @@ def _reached(
     y_max, y_min, clearance = record.y_max, record.y_min, record.clearance
     if y_max is None or y_min is None or not trial.paths:
         return y_max, y_min, clearance
-    tops = [_top(path) for path in trial.paths]
+    way = _way(plan, lane, trial, None)
+    tops = [_top(trial, k, way) for k in range(len(trial.paths))]
     at_turn = trial.paths[0].at_turn
     reached = jnp.where(at_turn, tops[0], plan.scene.position(state))
     if clearance is not None:
@@ -269,11 +271,15 @@ def _reached(
     return y_max, y_min, clearance
 
 
-def _top(path: Path) -> Scalar:
-    """The coordinate at the turning point that a step was aimed at, or else at its end."""
-    end = path.end
+def _top(trial: Trial, k: int, way: "_Way") -> Scalar:
+    """Coordinate number k at the turning point that a step was aimed at, or else at its end."""
+    path = trial.paths[k]
+    end: Rates = stop_gradient(path.end)
     bend = jnp.where(end.a == 0, 1.0, end.a)
-    return end.x - jnp.where(path.at_turn, 0.5 * end.v**2 / bend, 0.0)
+    height = end.x - jnp.where(path.at_turn, 0.5 * end.v**2 / bend, 0.0)
+    return height_of_turn(
+        way.rate, way.place(k), height, path.at_turn, to_turn(end), way.moving, way.fixed, way.rest
+    )
 
 
 class _Way(NamedTuple):
@@ -284,9 +290,11 @@ class _Way(NamedTuple):
     rest: Any
     rate: Callable
     guard: Callable[[Crossing], Callable]
+    place: Callable[[int], Callable]
+    """Of each coordinate."""
 
 
-def _way(plan: Plan, lane: Lane, trial: Trial, arrival: Arrival) -> _Way:
+def _way(plan: Plan, lane: Lane, trial: Trial, time: Scalar | None) -> _Way:
     # Functions that close over no number: everything that may have a derivative is an argument.
     given = trial.holding, plan.end(lane.part)
     fixed, others = eqx.partition(given, eqx.is_inexact_array)
@@ -302,10 +310,10 @@ def _way(plan: Plan, lane: Lane, trial: Trial, arrival: Arrival) -> _Way:
     def guard(c: Crossing) -> Callable:
         def event(moving, fixed, rest):
             (machine, bound), (s, state, _) = eqx.combine(fixed, rest, static), moving
-            scene = machine.scene if isinstance(machine, Moving) else machine
+            scene = _whole(machine)
             if c.kind == "stop":
                 stop = scene.stops[c.number]
-                return stop.beyond(scene.coordinates[stop.coordinate].position(state))
+                return stop.beyond(place(stop.coordinate)(moving, fixed, rest))
             if c.kind == "switch":
                 mode = machine.modes[c.number]
                 return scene.switches[c.number].guard(scene, s, state, mode)
@@ -314,7 +322,18 @@ def _way(plan: Plan, lane: Lane, trial: Trial, arrival: Arrival) -> _Way:
 
         return event
 
-    return _Way((trial.s, trial.state, arrival.time), fixed, rest, rate, guard)
+    def place(k: int) -> Callable:
+        def coordinate(moving, fixed, rest):
+            machine, _ = eqx.combine(fixed, rest, static)
+            return _whole(machine).coordinates[k].position(moving[1])
+
+        return coordinate
+
+    return _Way((trial.s, trial.state, time), fixed, rest, rate, guard, place)
+
+
+def _whole(machine: Any) -> Any:
+    return machine.scene if isinstance(machine, Moving) else machine
 
 
 def _logged(log: Any, hit: Flag, place: Scalar, clock: Scalar, approach: Scalar, stop: int) -> Any:
