@@ -37,7 +37,7 @@ sys.path.insert(0, str(HERE.parent))
 from headlines import keep
 
 QUICK = "--quick" in sys.argv
-RECORDS, WARM_UP, DRAWS = (8, 100, 100) if QUICK else (200, 300, 400)
+RECORDS, WARM_UP, DRAWS = (8, 100, 100) if QUICK else (200, 300, 800)
 CYCLES, SAMPLES, NOISE = 4, 16, 0.05
 NAMES = ("restitution", "gap", "damping_ratio")
 LABELS = ("restitution k", "gap d (a)", "damping ratio ξ")
