@@ -134,6 +134,35 @@ def test_compiler_options_that_xla_does_not_know_are_left_out(monkeypatch):
         _programs._quick_options.cache_clear()
 
 
+@pytest.mark.parametrize("road", ["auto", "xla"])
+@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.grad])
+def test_a_field_may_close_over_what_is_differentiated(derivative, road):
+    """A machine written within a function of its numbers, through impacts and turns."""
+
+    def last(numbers):
+        class Shaken(vi.AbstractScene):
+            stops: tuple = (vi.RigidStop(0.8, 0.7),)
+
+            @property
+            def cycle(self):
+                return 2 * jnp.pi
+
+            def field(self, s, state):
+                pull = numbers[1] * jnp.cos(s) - state.Y * numbers[0]
+                return vi.OscillatorState(state.V, pull - 0.1 * state.V)
+
+        start = vi.OscillatorState(numbers[2], numbers[3])
+        run = vi.simulate(Shaken(), start, 2, method=vi.Adaptive(rtol=1e-12))
+        return run.last.Y + run.y_min[0]
+
+    at = jnp.array([1.2, 1.5, 0.1, 0.2])
+    with vi.road(road):
+        found = derivative(last)(at)
+    steps = 1e-5 * jnp.eye(4)
+    truth = [(last(at + h) - last(at - h)) / 2e-5 for h in steps]
+    np.testing.assert_allclose(found, truth, rtol=1e-7)
+
+
 def test_a_law_may_close_over_what_is_differentiated():
     """Eagerly too, where no argument shows it."""
 

@@ -1,10 +1,8 @@
 """Where a step leads: rebounds, rest, changes of mode, and what is recorded of the way."""
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -15,10 +13,11 @@ from ...lanes import pin, pin_flag
 from .._lane import Lane, Plan, Record, to_stop, to_turn_of
 from ..drift import drifted, height_of_turn, met_after
 from ..events import Rates, to_turn
-from ..moving import Moving, struck_modes
+from ..moving import struck_modes
 from .aim import select
 from .rest import Release, settled
 from .trial import Crossing, Trial
+from .way import Way, way_of
 
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]
@@ -101,16 +100,16 @@ def _met(plan: Plan, lane: Lane, trial: Trial, taken: Flag, arrival: Arrival) ->
     Of events met together the stops come first, in their order, then the switches, then the
     section.
     """
-    way = _way(plan, lane, trial, arrival.time)
+    way = way_of(plan, lane, trial, arrival.time)
     flow = way.rate(way.moving, way.fixed, way.rest)[1:]
-    for c in trial.crossings:
+    for c, guard in zip(trial.crossings, way.guards, strict=True):
         offset = stop_gradient(jnp.where(c.landed, c.offset, 0.0))
         if c.kind != "section" and plan.ticks(lane.state):
             # Met on the section it is not beyond it.
             beyond = trial.s + offset - plan.end(lane.part)
             offset = offset - jnp.maximum(stop_gradient(beyond), 0.0)
         # With the derivatives of what is met, which mean nothing where nothing is.
-        offset = met_after(way.rate, way.guard(c), offset, way.moving, way.fixed, way.rest)
+        offset = met_after(way.rate, guard, offset, way.moving, way.fixed, way.rest)
         _, there, passed = drifted(way.rate, offset, way.moving, way.fixed, way.rest)
         s = arrival.s + jnp.where(c.landed, offset, 0.0)
         arrival = arrival._replace(s=s, time=select(c.landed, passed, arrival.time))
@@ -256,7 +255,7 @@ def _reached(
     y_max, y_min, clearance = record.y_max, record.y_min, record.clearance
     if y_max is None or y_min is None or not trial.paths:
         return y_max, y_min, clearance
-    way = _way(plan, lane, trial, None)
+    way = way_of(plan, lane, trial, None)
     tops = [_top(trial, k, way) for k in range(len(trial.paths))]
     at_turn = trial.paths[0].at_turn
     reached = jnp.where(at_turn, tops[0], plan.scene.position(state))
@@ -271,69 +270,15 @@ def _reached(
     return y_max, y_min, clearance
 
 
-def _top(trial: Trial, k: int, way: "_Way") -> Scalar:
+def _top(trial: Trial, k: int, way: Way) -> Scalar:
     """Coordinate number k at the turning point that a step was aimed at, or else at its end."""
     path = trial.paths[k]
     end: Rates = stop_gradient(path.end)
     bend = jnp.where(end.a == 0, 1.0, end.a)
     height = end.x - jnp.where(path.at_turn, 0.5 * end.v**2 / bend, 0.0)
     return height_of_turn(
-        way.rate, way.place(k), height, path.at_turn, to_turn(end), way.moving, way.fixed, way.rest
+        way.rate, way.places[k], height, path.at_turn, to_turn(end), way.moving, way.fixed, way.rest
     )
-
-
-class _Way(NamedTuple):
-    """What `drift` asks for, of the last part of a way."""
-
-    moving: tuple[Scalar, Any, Scalar | None]
-    fixed: Any
-    rest: Any
-    rate: Callable
-    guard: Callable[[Crossing], Callable]
-    place: Callable[[int], Callable]
-    """Of each coordinate."""
-
-
-def _way(plan: Plan, lane: Lane, trial: Trial, time: Scalar | None) -> _Way:
-    # Functions that close over no number: everything that may have a derivative is an argument.
-    given = trial.holding, plan.end(lane.part)
-    fixed, others = eqx.partition(given, eqx.is_inexact_array)
-    rest, static = eqx.partition(others, eqx.is_array)
-
-    def rate(moving, fixed, rest):
-        (machine, _), (s, state, time) = eqx.combine(fixed, rest, static), moving
-        pace = None if time is None else machine.pace(s, state)
-        if time is not None and pace is None:
-            pace = jnp.ones_like(s)
-        return jnp.ones_like(s), machine.field(s, state), pace
-
-    def guard(c: Crossing) -> Callable:
-        def event(moving, fixed, rest):
-            (machine, bound), (s, state, _) = eqx.combine(fixed, rest, static), moving
-            scene = _whole(machine)
-            if c.kind == "stop":
-                stop = scene.stops[c.number]
-                return stop.beyond(place(stop.coordinate)(moving, fixed, rest))
-            if c.kind == "switch":
-                mode = machine.modes[c.number]
-                return scene.switches[c.number].guard(scene, s, state, mode)
-            section: Any = scene.section(state)
-            return scene.clock(state) - bound if section is None else section
-
-        return event
-
-    def place(k: int) -> Callable:
-        def coordinate(moving, fixed, rest):
-            machine, _ = eqx.combine(fixed, rest, static)
-            return _whole(machine).coordinates[k].position(moving[1])
-
-        return coordinate
-
-    return _Way((trial.s, trial.state, time), fixed, rest, rate, guard, place)
-
-
-def _whole(machine: Any) -> Any:
-    return machine.scene if isinstance(machine, Moving) else machine
 
 
 def _logged(log: Any, hit: Flag, place: Scalar, clock: Scalar, approach: Scalar, stop: int) -> Any:
