@@ -12,7 +12,7 @@ from ...scene.trig import horner
 from .._lane import FREE, SECTION, Lane, Plan, to_stop, to_turn_of
 from ..events import Rates, rising_root, slope
 from ..methods._series import Series, at
-from .aim import MARGIN, nears, select
+from .aim import MARGIN, may_matter, select
 
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]
@@ -64,10 +64,7 @@ def look(plan: Plan, lane: Lane, motion: Any, h: Scalar) -> tuple[Scalar, Scalar
             paths.append(motion.of(coordinate.position))
             speeds.append(_sum(_slope(paths[k]), h, zero))
             turn = lane.direction[k] * speeds[k] < 0
-            everything = plan.meets_turns(lane.done)
-            if everything is not True:
-                close = nears(plan, k, *_ends(paths[k], speeds[k], h, zero), h)
-                turn = turn & (close if everything is False else close | everything)
+            turn = turn & may_matter(plan, lane, k, *_ends(paths[k], speeds[k], h, zero), h)
             # A body at rest meets nothing.
             turns.append(turn if lane.contact is None else turn & (lane.contact[k] == 0))
         for i, stop in enumerate(scene.stops):

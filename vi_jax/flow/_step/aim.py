@@ -51,15 +51,11 @@ def _met_something(plan: Plan, lane: Lane, trial: Trial) -> Flag:
         met = met | trial.good & beyond(c) & ~c.landed | c.again
         if c.kind == "switch":
             met = met | trial.good & _hump(c, stop_gradient(trial.h))[0]
-    everything = plan.meets_turns(lane.done)
     for k, (path, direction) in enumerate(zip(trial.paths, lane.direction, strict=False)):
         begin, end = stop_gradient((path.begin, path.end))
         if not plan.method.sees_ahead:
             turned = trial.good & (direction * end.v < 0) & ~path.at_turn
-            if everything is not True:
-                close = nears(plan, k, begin, end, stop_gradient(trial.h))
-                turned = turned & (close if everything is False else close | everything)
-            met = met | turned
+            met = met | turned & may_matter(plan, lane, k, begin, end, stop_gradient(trial.h))
         twice = _may_turn_twice(direction, path.surge, begin, end, stop_gradient(trial.h))
         met = met | trial.good & twice
     rests = any(path.leaves is not None for path in trial.paths)
@@ -180,10 +176,13 @@ def _aimed(plan: Plan, lane: Lane, trial: Trial) -> tuple[Flag, Scalar, Scalar]:
     return goal.aim | goal.turn | goal.shorter, stop_gradient(goal.length), goal.target
 
 
-def nears(plan: Plan, k: int, begin: Rates, end: Rates, h: Scalar) -> Flag:
-    """Whether a turn of coordinate number k within a step may be one that matters where only
-    impacts do: a bound, where `_matters` looks at the turn itself."""
-    close = jnp.zeros_like(h, bool)
+def may_matter(plan: Plan, lane: Lane, k: int, begin: Rates, end: Rates, h: Scalar) -> Flag:
+    """Whether a turn of coordinate number k within a step may have to be met: by a bound, where
+    `_matters` looks at the turn itself."""
+    everything = plan.meets_turns(lane.done)
+    if everything is True:
+        return jnp.ones_like(h, bool)
+    close = jnp.zeros_like(h, bool) if everything is False else everything
     for stop in plan.scene.stops:
         if stop.coordinate == k:
             gap = stop_gradient(stop.gap)
@@ -252,14 +251,13 @@ def _may_turn_twice(
         room = direction * (begin.v - 0.1 * (begin.v + end.v))
         return dips & (room * (a1 - a0) < 0.5 * h * a0 * a0)
     drop = 0.5 * h * a0 * (a0 / jnp.where(dips, a0 - a1, 1.0))
-    if surge is not None:
-        j0, j1 = direction * surge[0], direction * surge[1]
-        sags = dips & (j0 * h < a1 - a0) & (a1 - a0 < j1 * h)
-        corner = jnp.where(sags, a1 - j1 * h - a0, 0.0) / jnp.where(sags, j0 - j1, 1.0)
-        low = a0 + j0 * corner
-        deep = 0.5 * corner * (a0 + low) - 0.5 * low * low / jnp.where(sags, j1, 1.0)
-        flat = -0.5 * a0 * a0 / jnp.where(sags & (low >= 0), j0, 1.0)
-        drop = jnp.where(sags, jnp.where(low < 0, deep, flat), drop)
+    j0, j1 = direction * surge[0], direction * surge[1]
+    sags = dips & (j0 * h < a1 - a0) & (a1 - a0 < j1 * h)
+    corner = jnp.where(sags, a1 - j1 * h - a0, 0.0) / jnp.where(sags, j0 - j1, 1.0)
+    low = a0 + j0 * corner
+    deep = 0.5 * corner * (a0 + low) - 0.5 * low * low / jnp.where(sags, j1, 1.0)
+    flat = -0.5 * a0 * a0 / jnp.where(sags & (low >= 0), j0, 1.0)
+    drop = jnp.where(sags, jnp.where(low < 0, deep, flat), drop)
     lowest = direction * begin.v + drop
     return dips & (lowest < 0.1 * direction * (begin.v + end.v))
 
