@@ -5,6 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from vi_jax import lanes
+from vi_jax.lanes import machine
+from vi_jax.lanes._kernel import kernel_text
 
 X = np.concatenate(
     [
@@ -163,3 +165,56 @@ def test_control_flow():
     x, y = np.random.default_rng(4).normal(0, 2, (2, 203))
     for a, b in zip(once(branches, x, y, road="auto"), jax.vmap(branches)(x, y), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-14, atol=1e-15)
+
+
+def quotients(x, y):
+    """Divisions in all places where a jaxpr has them, of numbers, constants and reciprocals."""
+    inner = jax.jit(lambda a: jnp.sin(a) / (1 + a * a))
+    branch = jax.lax.cond(x > 0, lambda a: a / y, lambda a: y / (2 + a), jnp.abs(x))
+    loop = jax.lax.fori_loop(0, 3, lambda i, a: a / (1 + y * y), x)
+    rows = jax.lax.scan(lambda a, b: (a / (1 + b * b), a / 3), y, jnp.stack([x, y]))[1]
+    return x / y + 1 / y - x / 2 + inner(y) + branch + loop + rows.sum()
+
+
+@pytest.mark.parametrize("road", ["auto", "xla"])
+def test_derivatives_of_quotients(road):
+    rng = np.random.default_rng(4)
+    x, y = rng.normal(0, 3, 50), rng.uniform(0.5, 3, 50) * rng.choice([-1, 1], 50)
+
+    def derivatives(function):
+        first = jax.jacfwd(function, (0, 1))
+        return function, first, jax.jacfwd(first, (0, 1))
+
+    def here(x, y):
+        return once(lambda x, y: (quotients(x, y),), x[None], y[None], road=road)[0][0]
+
+    for lanes_, plain in zip(derivatives(here), derivatives(quotients), strict=True):
+        found, wanted = jax.jit(jax.vmap(lanes_))(x, y), jax.jit(jax.vmap(plain))(x, y)
+        for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
+
+
+def test_directions_share_divisions(monkeypatch):
+    texts = []
+
+    def kept(*args):
+        texts.append(kernel_text(*args))
+        return texts[-1]
+
+    monkeypatch.setattr(machine, "kernel_text", kept)
+
+    def divisions(directions):
+        def lane(x, y, slopes):
+            def along(slope):
+                return jax.jvp(
+                    lambda y: once(lambda x, y: (x / y,), x, y, road=None), (y,), (slope,)
+                )
+
+            return jax.vmap(along)(slopes)[1]
+
+        texts.clear()
+        one = jnp.ones(8)
+        jax.jit(lane)(one, one, jnp.ones((directions, 8)))
+        return max(text.count("fdiv") for text in texts)
+
+    assert divisions(2) == divisions(6) == 2  # the ratio and the divisor's reciprocal

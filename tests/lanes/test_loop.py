@@ -193,6 +193,43 @@ def test_directions_share_one_motion():
     assert len(equations) == 1 and equations[0].outvars[0].aval.shape == ()
 
 
+INNER = {
+    "scan": lambda x: jax.lax.scan(lambda a, b: (a * b, a), x, jnp.stack([x, 2 * x]))[0],
+    "fori_loop": lambda x: jax.lax.fori_loop(0, 3, lambda i, a: a * a, x),
+    "while_loop": lambda x: jax.lax.while_loop(lambda a: a < 5, lambda a: a * a, x),
+    "cond": lambda x: jax.lax.cond(x > 1, lambda a: a * a, lambda a: a, x),
+    "checkpoint": lambda x: jax.checkpoint(jnp.sin)(x),
+    "custom_jvp": lambda x: with_its_own_derivative(x),
+}
+
+
+@jax.custom_jvp
+def with_its_own_derivative(x):
+    return jax.lax.stop_gradient(x)
+
+
+with_its_own_derivative.defjvps(lambda slope, out, x: 3 * x * slope)
+
+
+@pytest.mark.parametrize("name", INNER)
+def test_derivatives_of_a_step_that_holds(name):
+    def lane(x, y):
+        def begin(inputs):
+            return inputs[0], lanes.Emitted(True, False, None)
+
+        def step(inputs, carry):
+            return INNER[name](carry) * inputs[1], lanes.Emitted(False, False, None)
+
+        return lanes.run(begin, step, lambda inputs, carry: carry, (x, y), rows=0)[0]
+
+    def plain(x, y):
+        return INNER[name](x) * y
+
+    wanted = jax.jit(jax.jacfwd(plain, (0, 1)))(1.5, 2.5)
+    for along in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(jax.jit(along(lane, (0, 1)))(1.5, 2.5), wanted, rtol=1e-15)
+
+
 def test_reverse_mode_is_the_forward_one_transposed():
     """Of results and rows, of all inputs or some, of numbers of a lane's own and of common ones."""
 

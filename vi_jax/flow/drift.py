@@ -60,9 +60,15 @@ def drifted(rate: Callable, offset: Scalar, moving: Any, fixed: Any, rest: Any) 
     return jtu.tree_map(lambda x, dx: x + offset * dx, moving, rate(moving, fixed, rest))
 
 
-def _drifted_jvp(rate, primals, tangents):
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def unmoved(rate: Callable, offset: Scalar, moving: Any, fixed: Any, rest: Any) -> Any:
+    """`drifted` within an offset that is zero, but for its derivatives: `moving` itself."""
+    return moving
+
+
+def _carried_jvp(carried, rate, primals, tangents):
     offset, moving, fixed, rest = primals
-    there = drifted(rate, offset, moving, fixed, rest)
+    there = carried(rate, offset, moving, fixed, rest)
     slope = _written_out(tangents[1])
     moves, numbers = _numbers(tangents[2])
     if any(moves) or any(_numbers(tangents[1])[0]):
@@ -74,14 +80,15 @@ def _drifted_jvp(rate, primals, tangents):
             at = pair[0], fixed_pair[0]
             return _along(lambda x, p: rate(x, p, rest), at, all_move, slopes)
 
-        slope = drifted(both, offset, (moving, slope), (fixed, numbers), rest)[1]
+        slope = carried(both, offset, (moving, slope), (fixed, numbers), rest)[1]
     if not isinstance(tangents[0], SymbolicZero):
         onward = rate(there, fixed, rest)
         slope = jtu.tree_map(lambda dx, v: dx + tangents[0] * v, slope, onward)
     return there, slope
 
 
-drifted.defjvp(_drifted_jvp, symbolic_zeros=True)
+drifted.defjvp(partial(_carried_jvp, drifted), symbolic_zeros=True)
+unmoved.defjvp(partial(_carried_jvp, unmoved), symbolic_zeros=True)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))

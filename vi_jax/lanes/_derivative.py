@@ -8,6 +8,7 @@ import jax
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
 from ._program import Program, Spread, spread
+from ._quotient import with_quotients
 
 
 @functools.lru_cache(maxsize=64)
@@ -43,7 +44,7 @@ def _derived(
 ) -> ClosedJaxpr:
     """A jaxpr with derivatives: after each group of results (inputs: before and from `split` on)
     come those that are wanted (that move)."""
-    function = jaxpr_as_fun(closed)
+    function = jaxpr_as_fun(with_quotients(closed))
     ends = [0, len(moving) if split is None else split, len(moving)]
 
     def both(*args):

@@ -93,6 +93,7 @@ for _name in ("add", "add_any"):
 ELEMENTWISE["sub"] = lambda t, p, d, a, b: sub(t, a, b)
 ELEMENTWISE["mul"] = lambda t, p, d, a, b: mul(t, a, b)
 ELEMENTWISE["div"] = lambda t, p, d, a, b: div(t, a, b, unsigned=_is_unsigned(d[0]))
+ELEMENTWISE["quotient"] = lambda t, p, d, a, b: div(t, a, b)
 ELEMENTWISE["neg"] = lambda t, p, d, a: neg(t, a)
 for _name in ("eq", "ne", "lt", "le", "gt", "ge"):
     ELEMENTWISE[_name] = lambda t, p, d, a, b, how=_name: compare(t, how, a, b, _is_unsigned(d[0]))

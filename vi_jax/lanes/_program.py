@@ -1,6 +1,6 @@
 """What lanes run: a loop of one lane's numbers, traced once."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -87,6 +87,19 @@ class Spread(NamedTuple):
     outs: tuple[bool, ...]
 
 
+# Calls whose body stands for them, and the parameter that holds it.
+CALLS = {
+    "jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr",
+    "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "remat": "jaxpr",
+    "checkpoint": "jaxpr", "remat2": "jaxpr", "custom_lin": "jaxpr",
+}  # fmt: skip
+
+
+def inner(jaxpr: ClosedJaxpr | Jaxpr) -> Jaxpr:
+    """Without what it closes over."""
+    return jaxpr.jaxpr if isinstance(jaxpr, ClosedJaxpr) else jaxpr
+
+
 def _dtype(var: Any) -> Any:
     return var.aval.dtype
 
@@ -103,17 +116,44 @@ def reached(jaxpr: Jaxpr, sources: Sequence[bool], *, smooth: bool) -> list[bool
         return not isinstance(atom, Literal) and atom in found
 
     for eqn in jaxpr.eqns:
-        name = eqn.primitive.name
         args = [touched(a) for a in eqn.invars]
-        if not any(args) or (smooth and name in _FLAT):
+        if not any(args) or (smooth and eqn.primitive.name in _FLAT):
             continue
-        outs = [True] * len(eqn.outvars)
-        if name in ("jit", "pjit"):
-            outs = reached(eqn.params["jaxpr"].jaxpr, args, smooth=smooth)
-        elif name == "cond" and (smooth or not args[0]):
-            ways = [reached(b.jaxpr, args[1:], smooth=smooth) for b in eqn.params["branches"]]
-            outs = [any(way) for way in zip(*ways, strict=True)]
-        for var, there in zip(eqn.outvars, outs, strict=True):
+        for var, there in zip(eqn.outvars, _through(eqn, args, smooth=smooth), strict=True):
             if there and not (smooth and not jnp.issubdtype(_dtype(var), jnp.inexact)):
                 found.add(var)
     return [touched(a) for a in jaxpr.outvars]
+
+
+def _through(eqn: Any, args: list[bool], *, smooth: bool) -> list[bool]:
+    """Which results of an equation depend on these of its arguments."""
+    name, params = eqn.primitive.name, eqn.params
+    # What has a derivative of its own says nothing of it in its body.
+    if name in CALLS and not (smooth and name.startswith("custom")):
+        return reached(inner(params[CALLS[name]]), args, smooth=smooth)
+    if name == "cond" and (smooth or not args[0]):
+        ways = [reached(inner(b), args[1:], smooth=smooth) for b in params["branches"]]
+        return [any(way) for way in zip(*ways, strict=True)]
+    if name == "scan":
+        n, m = params["num_consts"], params["num_carry"]
+        fixed, carry, rows = args[:n], args[n : n + m], args[n + m :]
+        body = inner(params["jaxpr"])
+        return _settled(lambda c: reached(body, [*fixed, *c, *rows], smooth=smooth), carry)
+    if name == "while":
+        n, m = params["cond_nconsts"], params["body_nconsts"]
+        asked, fixed, carry = args[:n], args[n : n + m], args[n + m :]
+        body = inner(params["body_jaxpr"])
+        outs = _settled(lambda c: reached(body, [*fixed, *c], smooth=smooth), carry)
+        ends = reached(inner(params["cond_jaxpr"]), [*asked, *outs], smooth=smooth)
+        return [True] * len(outs) if any(ends) else outs
+    return [True] * len(eqn.outvars)
+
+
+def _settled(turn: Callable[[list[bool]], list[bool]], carry: list[bool]) -> list[bool]:
+    """What a loop's turn gives, carry first, once no more of the carry is reached."""
+    while True:
+        outs = turn(carry)
+        grown = [a or b for a, b in zip(carry, outs, strict=False)]
+        if grown == carry:
+            return [*carry, *outs[len(carry) :]]
+        carry = grown

@@ -7,14 +7,8 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from ._arrays import STRUCTURAL, Values
 from ._operations import ELEMENTWISE, kind_of
+from ._program import CALLS
 from ._text import Text, Value
-
-# Calls whose body is written out in their place.
-_CALLS = {
-    "jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr",
-    "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "remat": "jaxpr",
-    "checkpoint": "jaxpr", "remat2": "jaxpr", "custom_lin": "jaxpr",
-}  # fmt: skip
 
 # A loop of known length is written out if that makes no more operations than this.
 _WRITTEN_OUT = 4096
@@ -44,8 +38,8 @@ def check(jaxpr: Jaxpr) -> None:
             raise Unsupported(f"a value of type {dtype}") from None
     for eqn in needed:
         name = eqn.primitive.name
-        if name in _CALLS:
-            check(_inner(eqn.params[_CALLS[name]])[0])
+        if name in CALLS:
+            check(_inner(eqn.params[CALLS[name]])[0])
         elif name == "cond":
             for branch in eqn.params["branches"]:
                 check(_inner(branch)[0])
@@ -123,8 +117,8 @@ def _equation(t: Text, eqn: Any, args: list[Values], mask: Value) -> list[Values
     if name in STRUCTURAL:
         out = STRUCTURAL[name](t, params, [v.aval for v in eqn.outvars], *args)
         return list(out) if eqn.primitive.multiple_results else [out]
-    if name in _CALLS:
-        jaxpr, consts = _inner(params[_CALLS[name]])
+    if name in CALLS:
+        jaxpr, consts = _inner(params[CALLS[name]])
         return write(t, jaxpr, consts, args, mask)
     if name == "cond":
         return _cond(t, params["branches"], args[0].item(), args[1:], mask)

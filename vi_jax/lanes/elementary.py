@@ -1,5 +1,6 @@
 """Functions that either road has its own best form of."""
 
+from collections.abc import Callable
 from math import factorial, pi
 from typing import Any
 
@@ -94,15 +95,15 @@ def _divided(x):
     return x / jnp.where(x == x, jnp.ones_like(x), jnp.nan)
 
 
-def _jitted(primitive: Primitive, function):
+def jitted(primitive: Primitive, function: Callable) -> None:
     """What a primitive with a lowering needs: that it runs outside of `jit` too."""
     several = primitive.multiple_results
     primitive.def_impl(jax.jit(function))
     mlir.register_lowering(primitive, mlir.lower_fun(function, multiple_results=several))
 
 
-_jitted(sincos_p, _by_tangent)
-_jitted(pin_p, _divided)
+jitted(sincos_p, _by_tangent)
+jitted(pin_p, _divided)
 ad.primitive_jvps[sincos_p] = _sincos_jvp
 batching.primitive_batchers[sincos_p] = _sincos_batched
 ad.deflinear2(pin_p, lambda t, x: [t])

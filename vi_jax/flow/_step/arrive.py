@@ -11,13 +11,13 @@ from jaxtyping import Array, Bool, Float
 
 from ...lanes import pin, pin_flag
 from .._lane import Lane, Plan, Record, to_stop, to_turn_of
-from ..drift import drifted, height_of_turn, met_after
+from ..drift import drifted, height_of_turn, met_after, unmoved
 from ..events import Rates, to_turn
 from ..moving import struck_modes
 from .aim import select
 from .rest import Release, settled
-from .trial import Crossing, Trial
-from .way import Way, way_of
+from .trial import Crossing, Trial, held
+from .way import Way
 
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]
@@ -63,6 +63,7 @@ def arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Fla
         trial.s, trial.state, trial.time, tuple(direction), lane.contact, lane.modes,
         old.impacts, old.speed, old.loss, old.rests, old.log, trial.ends_interval,
     )  # fmt: skip
+    way = Way(plan, trial.holding, lane.part, (trial.s, trial.state, trial.time))
     if trial.crossings:
         met = jnp.zeros_like(taken)
         for c in trial.crossings:
@@ -72,9 +73,9 @@ def arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Fla
                 met = met | path.leaves.landed
         # Rare: skipped where no lane of a group has met anything.
         arrival = jax.lax.cond(
-            met, lambda x: _met(plan, lane, trial, taken, x), lambda x: x, arrival
+            met, lambda x: _met(plan, lane, trial, taken, way, x), lambda x: x, arrival
         )
-    y_max, y_min, clearance = _reached(plan, lane, trial, taken, arrival.state)
+    y_max, y_min, clearance = _reached(plan, lane, trial, taken, way, arrival.state)
     time = arrival.time
     if time is not None and old.time is not None:
         time = jnp.where(taken, time, old.time)
@@ -94,21 +95,21 @@ def arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Fla
     return there, taken & arrival.completed
 
 
-def _met(plan: Plan, lane: Lane, trial: Trial, taken: Flag, arrival: Arrival) -> Arrival:
+def _met(plan: Plan, lane: Lane, trial: Trial, taken: Flag, way: Way, arrival: Arrival) -> Arrival:
     """What the event makes of a step that met one: the last part of its way, and the jump.
 
     Of events met together the stops come first, in their order, then the switches, then the
     section.
     """
-    way = way_of(plan, lane, trial, arrival.time)
     flow = way.rate(way.moving, way.fixed, way.rest)[1:]
-    for c, guard in zip(trial.crossings, way.guards, strict=True):
+    for c in trial.crossings:
         offset = stop_gradient(jnp.where(c.landed, c.offset, 0.0))
         if c.kind != "section" and plan.ticks(lane.state):
             # Met on the section it is not beyond it.
             beyond = trial.s + offset - plan.end(lane.part)
             offset = offset - jnp.maximum(stop_gradient(beyond), 0.0)
         # With the derivatives of what is met, which mean nothing where nothing is.
+        guard = way.guard(c)
         offset = met_after(way.rate, guard, offset, way.moving, way.fixed, way.rest)
         _, there, passed = drifted(way.rate, offset, way.moving, way.fixed, way.rest)
         s = arrival.s + jnp.where(c.landed, offset, 0.0)
@@ -125,7 +126,20 @@ def _met(plan: Plan, lane: Lane, trial: Trial, taken: Flag, arrival: Arrival) ->
     for k, path in enumerate(trial.paths):
         if path.leaves is not None:
             arrival = _released(lane, arrival, k, path.leaves, flow)
-    return arrival
+    return _at_fixed_clock(plan, lane, trial, arrival) if plan.ticks(lane.state) else arrival
+
+
+def _at_fixed_clock(plan: Plan, lane: Lane, trial: Trial, arrival: Arrival) -> Arrival:
+    """The same place, its derivatives those at this reading of the clock rather than at an event
+    that comes sooner or later: so that those of the steps to come need no derivative of `s`."""
+    machine = held(plan, dataclasses.replace(lane, contact=arrival.contact, modes=arrival.modes))
+    bound = plan.end(lane.part)
+    # The end of the interval may depend on what is differentiated by.
+    moved = jnp.where(trial.ends_interval, bound - stop_gradient(bound), 0.0)
+    s = stop_gradient(arrival.s) + moved
+    way = Way(plan, machine, lane.part, (arrival.s, arrival.state, arrival.time))
+    _, state, time = unmoved(way.rate, s - arrival.s, way.moving, way.fixed, way.rest)
+    return arrival._replace(s=s, state=state, time=time)
 
 
 def _released(lane: Lane, arrival: Arrival, k: int, leaves: Release, flow: Any) -> Arrival:
@@ -248,14 +262,13 @@ def _is_one(mass: Any) -> bool:
 
 
 def _reached(
-    plan: Plan, lane: Lane, trial: Trial, taken: Flag, state: Any
+    plan: Plan, lane: Lane, trial: Trial, taken: Flag, way: Way, state: Any
 ) -> tuple[Scalar | None, Scalar | None, Scalar | None]:
     """Greatest and smallest Y so far, and the smallest distance at a turn that met no stop."""
     record = lane.record
     y_max, y_min, clearance = record.y_max, record.y_min, record.clearance
     if y_max is None or y_min is None or not trial.paths:
         return y_max, y_min, clearance
-    way = way_of(plan, lane, trial, None)
     tops = [_top(trial, k, way) for k in range(len(trial.paths))]
     at_turn = trial.paths[0].at_turn
     reached = jnp.where(at_turn, tops[0], plan.scene.position(state))
@@ -277,7 +290,7 @@ def _top(trial: Trial, k: int, way: Way) -> Scalar:
     bend = jnp.where(end.a == 0, 1.0, end.a)
     height = end.x - jnp.where(path.at_turn, 0.5 * end.v**2 / bend, 0.0)
     return height_of_turn(
-        way.rate, way.places[k], height, path.at_turn, to_turn(end), way.moving, way.fixed, way.rest
+        way.rate, way.place(k), height, path.at_turn, to_turn(end), way.moving, way.fixed, way.rest
     )
 
 

@@ -9,7 +9,8 @@ Each iteration tries one step of one lane:
   δ = t* - t puts the state on it, and the jump is applied. Otherwise it is aimed once more.
 
 The length of an aimed step is a constant for differentiation, while δ carries dt*/dp, so that
-forward and reverse derivatives through an impact are exact (the saltation matrix).
+forward and reverse derivatives through an impact are exact (the saltation matrix). Behind an event
+they are those at a fixed reading of the clock, so that the steps to come carry none of the clock's.
 """
 
 import dataclasses
@@ -139,7 +140,7 @@ def _faults(
         broken = results.STALLED
     ends = [
         (record.impacts > plan.max_impacts, results.CHATTER),
-        ((aims >= _LOST) & (record.impacts > _MANY), results.CHATTER),
+        (((aims >= _LOST) | (spent >= _STUCK)) & (record.impacts > _MANY), results.CHATTER),
         (aims >= _LOST, results.UNRESOLVED),
         (steps >= plan.max_steps, results.MAX_STEPS),
         (spent >= _STUCK, results.MAX_STEPS),

@@ -1,86 +1,82 @@
 """The last part of a way to an event, as `drift` asks for it."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._lane import Lane, Plan
+from .._lane import Plan
 from ..moving import Moving
-from .trial import Crossing, Trial
+from .trial import Crossing
 
 Scalar = Float[Array, ""]
 
 
-class Way(NamedTuple):
-    """What `drift` asks for."""
+class Way:
+    """The way that a machine goes on from `moving`: s, its state, and the time where it is asked
+    for.
 
-    moving: tuple[Scalar, Any, Scalar | None]
-    fixed: Any
-    rest: Any
-    rate: Callable
-    guards: tuple[Callable, ...]
-    """Of each crossing."""
-    places: tuple[Callable, ...]
-    """Of each coordinate."""
-
-
-def way_of(plan: Plan, lane: Lane, trial: Trial, time: Scalar | None) -> Way:
-    """The way from the end of a step that was tried, with the elapsed time if it is asked for.
-
-    Its functions close over no number: everything that may have a derivative is an argument.
+    Its functions close over no number: everything that may have a derivative is an argument, in
+    `fixed`.
     """
-    given = trial.holding, plan.end(lane.part)
-    fixed, others = eqx.partition(given, eqx.is_inexact_array)
-    rest, static = eqx.partition(others, eqx.is_array)
 
-    def rate(moving, fixed, rest):
-        (machine, _), (s, state, time) = eqx.combine(fixed, rest, static), moving
+    def __init__(self, plan: Plan, machine: Any, part: Scalar, moving: tuple):
+        self.moving = moving
+        self._fixed, others = eqx.partition((machine, plan.end(part)), eqx.is_inexact_array)
+        self.rest, self._static = eqx.partition(others, eqx.is_array)
+        self._around: list[Any] = []
+        self.rate = self._pure(self._rate)
+
+    @property
+    def fixed(self) -> Any:
+        """The machine's numbers, and those around what it was written as."""
+        return self._fixed, tuple(self._around)
+
+    def guard(self, c: Crossing) -> Callable:
+        """Of a crossing."""
+
+        def event(moving, fixed, rest):
+            (machine, bound), (s, state, _) = self._whole(fixed, rest), moving
+            scene = _scene(machine)
+            if c.kind == "stop":
+                stop = scene.stops[c.number]
+                return stop.beyond(scene.coordinates[stop.coordinate].position(state))
+            if c.kind == "switch":
+                return scene.switches[c.number].guard(scene, s, state, machine.modes[c.number])
+            section: Any = scene.section(state)
+            return scene.clock(state) - bound if section is None else section
+
+        return self._pure(event)
+
+    def place(self, k: int) -> Callable:
+        """Of coordinate number k."""
+
+        def coordinate(moving, fixed, rest):
+            machine, _ = self._whole(fixed, rest)
+            return _scene(machine).coordinates[k].position(moving[1])
+
+        return self._pure(coordinate)
+
+    def _rate(self, moving, fixed, rest):
+        (machine, _), (s, state, time) = self._whole(fixed, rest), moving
         pace = None if time is None else machine.pace(s, state)
         if time is not None and pace is None:
             pace = jnp.ones_like(s)
         return jnp.ones_like(s), machine.field(s, state), pace
 
-    def guard(c: Crossing) -> Callable:
-        def event(moving, fixed, rest):
-            (machine, bound), (s, state, _) = eqx.combine(fixed, rest, static), moving
-            scene = _whole(machine)
-            if c.kind == "stop":
-                stop = scene.stops[c.number]
-                return stop.beyond(place(stop.coordinate)(moving, fixed, rest))
-            if c.kind == "switch":
-                mode = machine.modes[c.number]
-                return scene.switches[c.number].guard(scene, s, state, mode)
-            section: Any = scene.section(state)
-            return scene.clock(state) - bound if section is None else section
+    def _whole(self, fixed: Any, rest: Any) -> Any:
+        return eqx.combine(fixed, rest, self._static)
 
-        return event
-
-    def place(k: int) -> Callable:
-        def coordinate(moving, fixed, rest):
-            machine, _ = eqx.combine(fixed, rest, static)
-            return _whole(machine).coordinates[k].position(moving[1])
-
-        return coordinate
-
-    moving = trial.s, trial.state, time
-    around: list[Any] = []
-
-    def pure(function: Callable) -> Callable:
+    def _pure(self, function: Callable) -> Callable:
         # A scene may be written as a function of numbers around it.
-        written, found = jax.closure_convert(function, moving, fixed, rest)
-        here = slice(len(around), len(around) + len(found))
-        around.extend(found)
+        written, found = jax.closure_convert(function, self.moving, self._fixed, self.rest)
+        here = slice(len(self._around), len(self._around) + len(found))
+        self._around.extend(found)
         return lambda moving, fixed, rest: written(moving, fixed[0], rest, *fixed[1][here])
 
-    whole = pure(rate)
-    guards = tuple(pure(guard(c)) for c in trial.crossings)
-    places = tuple(pure(place(k)) for k in range(len(trial.paths)))
-    return Way(moving, (fixed, around), rest, whole, guards, places)
 
-
-def _whole(machine: Any) -> Any:
+def _scene(machine: Any) -> Any:
     return machine.scene if isinstance(machine, Moving) else machine

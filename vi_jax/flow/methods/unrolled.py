@@ -65,16 +65,20 @@ class Unrolled(diffrax.AbstractSolver):
         control = terms.contr(t0, t1)
         if self.implicit:
             return self._implicit(terms, t0, t1, y0, args, control)
-        stages = [terms.vf_prod(t0, y0, args, control)]
-        y1 = None
+        # The length comes last: once for each sum of slopes, where it is part of the addition.
+        slopes, y1 = [terms.vf(t0, y0, args)], None
+
+        def reached(weights):
+            return jtu.tree_map(jnp.add, y0, terms.prod(weighted(weights, slopes), control))
+
         for a, c in zip(tableau.a_lower, tableau.c, strict=True):
-            y = weighted(a, stages, y0)
+            y1 = reached(a)
             t = t1 if c == 1 else t0 + float(c) * (t1 - t0)
-            stages.append(terms.vf_prod(t, y, args, control))
-            y1 = y
+            slopes.append(terms.vf(t, y1, args))
         if not tableau.ssal or y1 is None:
-            y1 = weighted(tableau.b_sol, stages, y0)
-        error = weighted(tableau.b_error, stages)
+            y1 = reached(tableau.b_sol)
+        error = terms.prod(weighted(tableau.b_error, slopes), control)
+        stages = [terms.prod(slope, control) for slope in slopes]
         k = jtu.tree_map(lambda *leaves: jnp.stack(leaves), *stages)
         return y1, error, {"y0": y0, "y1": y1, "k": k}, None, diffrax.RESULTS.successful
 
