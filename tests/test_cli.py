@@ -98,6 +98,7 @@ def test_interrupt_keeps_what_was_written(tmp_path, capsys, monkeypatch):
     assert "interrupted" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_failing_write_is_one_line(tmp_path, capsys):
     (tmp_path / "fig3.png").mkdir()
     assert cli.main(["reproduce", "--quick", "--out", str(tmp_path)]) == 1

@@ -93,6 +93,7 @@ class Table(vi.AbstractScene):
         return vi.OscillatorState(state.V, push - 0.1 * state.V - 0.5 * state.Y)
 
 
+@pytest.mark.slow
 def test_what_has_no_vector_form_is_compiled_in_full(monkeypatch):
     """A program is compiled quickly only if its loops are not XLA's."""
     made = []
@@ -134,7 +135,7 @@ def test_compiler_options_that_xla_does_not_know_are_left_out(monkeypatch):
         _programs._quick_options.cache_clear()
 
 
-@pytest.mark.parametrize("road", ["auto", "xla"])
+@pytest.mark.parametrize("road", ["auto", pytest.param("xla", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.grad])
 def test_a_field_may_close_over_what_is_differentiated(derivative, road):
     """A machine written within a function of its numbers, through impacts and turns."""

@@ -48,6 +48,7 @@ SCENES = st.tuples(
 )  # fmt: skip
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None, derandomize=True)
 @given(scene=SCENES)
 def test_any_scene_agrees(scene):

@@ -47,6 +47,7 @@ def test_presets_keep_their_promise_from_slow_to_fast_drives():
         assert np.quantile(error, 0.95) < 10 * promise
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene, method", [(MOTOR, "draft"), (MOTOR, vi.Adaptive(rtol=1e-7))])
 def test_estimated_errors_are_those_made(scene, method):
     run = vi.simulate(scene, scene.start(), 40, method=method, estimate=True)

@@ -283,6 +283,7 @@ def test_periodic_motions_and_what_follows_from_them():
     assert branch.parameter.min() == pytest.approx(0.2) and branch.parameter.max() > 0.99
 
 
+@pytest.mark.slow
 def test_grids_and_sweeps():
     scene = machine()
     data = vi.scan(

@@ -20,6 +20,7 @@ def strong(torque, *, control=0.9, gap=0.08):
     return vi.Parameters(torque=torque, control=control, gap=gap).scene()
 
 
+@pytest.mark.slow
 def test_inverse_of_small_matrices():
     rng = np.random.default_rng(0)
     for n in range(1, 6):
@@ -69,6 +70,7 @@ def test_both_clocks_agree():
     np.testing.assert_array_equal(phase.impacts, time.impacts)
 
 
+@pytest.mark.slow
 @each_mode
 def test_derivatives(mode):
     method = vi.Adaptive(diffrax.Kvaerno5(), rtol=1e-11)

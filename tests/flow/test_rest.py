@@ -258,6 +258,7 @@ def test_single_precision_rests_as_double_does():
     np.testing.assert_array_equal(found[True][2].sum(1), found[False][2].sum(1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("machine", "start"),
     [
@@ -284,3 +285,43 @@ def test_a_body_that_rests_moves_with_its_stop():
 
     by_gap, by_start = jax.grad(last, argnums=(0, 1))(-1.5, -1.5)
     assert (float(by_gap), float(by_start)) == (1.0, 0.0)
+
+
+NUMBERS = {  # restitution, gap, control, coupling, damping ratio, Y and V of the start
+    "plastic": ((0.0, 0.3, 0.7, 0.2, 0.05, 0.0, 1.0), [2, 1]),
+    "chatter": ((0.3, 0.3, 0.7, 0.2, 0.05, 0.0, 1.0), [0, 1]),
+    "chatter twice": ((0.45, -0.2, 0.8, 0.3, 0.1, -0.7, 0.4), [1, 1]),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NUMBERS)
+def test_higher_derivatives_pass_through_rest_and_release(name):
+    """While a shaft moves on that feels the body: by all numbers of the machine at once."""
+    numbers, expected = NUMBERS[name]
+    direction = jnp.asarray([0.3, 0.3, 0.2, 0.1, 0.1, 0.3, -0.3])
+
+    def run(shift):
+        k, gap, control, coupling, xi, Y, V = jnp.asarray(numbers) + shift * direction
+        machine = vi.Scene(
+            oscillator=vi.Oscillator(xi),
+            drive=vi.Motor(0.6, control, coupling, 0.1),
+            stops=(vi.RigidStop(gap, k if numbers[0] else 0.0),),
+        )
+        method = vi.FixedStep(steps_per_cycle=40)
+        return vi.simulate(machine, machine.start(Y=Y, V=V, W=0.7), 2, method=method)
+
+    def last(shift):
+        return jnp.stack(jax.tree.leaves(run(shift).last))
+
+    assert run(0.0).rests.tolist() == expected
+    orders, h = [jax.jit(last)], 1e-4
+    for order in (1, 2, 3):
+        orders.append(jax.jit(jax.jacfwd(orders[-1])))
+        near, far = (
+            (orders[-2](d) - orders[-2](-d)) / (2 * d) for d in (jnp.asarray(h), jnp.asarray(2 * h))
+        )
+        found = orders[-1](0.0)
+        scale = 1 + float(jnp.abs(found).max())
+        assert scale > 1.001, order
+        np.testing.assert_allclose(found, (4 * near - far) / 3, atol=1e-7 * scale)

@@ -132,6 +132,7 @@ def test_higher_derivatives_pass_through_impacts(method, order, extremes):
     np.testing.assert_allclose(found, (4 * near - far) / 3, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_gradients_are_the_forward_ones():
     """Of a function of two numbers, also under `vmap`, and of second order."""
 

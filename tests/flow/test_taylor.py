@@ -21,6 +21,7 @@ RULES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RULES)
 def test_a_rule_gives_the_derivatives(name):
     """Coefficients n! c_n are the solution's derivatives, found by repeated forward mode."""

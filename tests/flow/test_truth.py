@@ -100,6 +100,7 @@ def check(name, lanes, seed):
     assert (rests == expected).all(axis=1)[clear].mean() > 0.999
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["exact", "fixed", pytest.param("adaptive", marks=pytest.mark.slow)]
 )
@@ -107,6 +108,7 @@ def test_random_lanes_from_deep_stops_to_beyond_reach(name):
     check(name, METHODS[name][1], 0)
 
 
+@pytest.mark.slow
 def test_a_start_at_rest_just_short_of_the_stop():
     apart, growth, expected, rests = compared("exact", 1_000, 0, draw_short)
     clear = growth < 1e3

@@ -82,6 +82,7 @@ def lane(numbers, start, cycles=5, **options):
     return vi.simulate(capsule, start, cycles, **options)
 
 
+@pytest.mark.slow
 def test_a_capsule_beside_scipy():
     numbers, starts = drawn(100)
     run = vi.jit(jax.vmap(lambda p, x: lane(p, x, method=CLOSE), in_axes=1))(
@@ -109,6 +110,7 @@ def test_a_capsule_beside_scipy():
     assert compared >= 90 and several > 300 and held > 300
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [vi.FixedStep(steps_per_cycle=64), vi.Taylor(20, 16)], ids="ft")
 def test_other_methods_agree(method):
     numbers, starts = (jnp.asarray(x[:, :24]) for x in drawn(100))

@@ -84,6 +84,7 @@ METHODS = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_two_bodies_with_three_contacts():
     numbers, starts = drawn(100)
     runs = [
@@ -111,6 +112,7 @@ def test_two_bodies_with_three_contacts():
     assert compared > 80 and (several > 100).all()
 
 
+@pytest.mark.slow
 @each_mode
 def test_derivatives_of_two_bodies(mode):
     """By all their numbers and their start, through impacts of all three kinds."""
@@ -156,6 +158,7 @@ class Slowed(eqx.Module):
         return 1 / (1 + self.rate * approach)
 
 
+@pytest.mark.slow
 def test_restitution_that_depends_on_the_speed():
     machine = dataclasses.replace(TwoBodies(), restitution=Slowed(0.4))
     run = vi.simulate(machine, machine.start(), 6, impact_log=8, method=CLOSE)

@@ -54,6 +54,7 @@ def test_a_bounce_is_born_and_doubles_where_its_closed_form_does(bounces, restit
     assert {0.5: 1.5268237005, 0.8: 1.0708364682}[e] == pytest.approx(doubles, abs=1e-10)
 
 
+@pytest.mark.slow
 def test_a_bounce_of_twice_the_period(bounces):
     doubling = next(p for p in bounces.special if p.kind == "period-doubling")
     twice = doubling.switch()
@@ -88,6 +89,7 @@ def test_an_impact_pair_folds_and_loses_its_symmetry(symmetric, restitution):
     assert {0.5: 1.2999827618, 0.8: 1.4455492883}[restitution] == pytest.approx(breaks, abs=1e-10)
 
 
+@pytest.mark.slow
 def test_the_broken_symmetry_is_switched_onto(symmetric, restitution):
     breaking = next(p for p in symmetric.special if p.kind == "symmetry-breaking")
     broken = vi.continue_orbit(breaking.switch(), parameter="half_gap", bounds=(1.25, 1.5))
@@ -109,6 +111,7 @@ def test_the_broken_symmetry_is_switched_onto(symmetric, restitution):
         np.testing.assert_allclose(whole.impact_speed, 1.87073, atol=6e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("whole", [True, False], ids=["symmetric", "broken"])
 def test_a_curve_of_lost_symmetry_is_its_closed_form(symmetric, whole, restitution):
     branch, ends = symmetric, (1.2, 1.5)

@@ -209,6 +209,7 @@ def test_a_belt_beside_its_closed_form(record):
             assert float(run.duration[-1]) == pytest.approx(lasts, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_the_branch_of_a_belt_ends_where_slip_no_longer_reaches_it():
     belt = Belt()
     orbit = vi.find_orbit(belt, vi.simulate(belt, belt.start(), 20).last)
@@ -220,6 +221,7 @@ def test_the_branch_of_a_belt_ends_where_slip_no_longer_reaches_it():
         vi.lyapunov(belt, belt.start())
 
 
+@pytest.mark.slow
 def test_a_block_is_followed_while_it_sticks():
     """The beginning of a slip, with velocity and acceleration zero, is no touch."""
     block = Block()
@@ -239,6 +241,7 @@ def test_a_block_is_followed_while_it_sticks():
         vi.boundary(change, parameter="level", bounds=((0.2, 2.0), (0.1, 0.9)))
 
 
+@pytest.mark.slow
 def test_a_stop_of_another_coordinate_does_not_limit_the_first():
     pair = Meeting(gap=5.0, wall=0.05, amplitude=0.3)
     orbit = vi.find_orbit(pair, TwoBodies(*map(jnp.asarray, (0.2, 0.0, 0.0, 0.0))))

@@ -67,6 +67,7 @@ def lanes(flow_rates, starts, cycles, **options):
     return vi.jit(jax.vmap(one))(jnp.asarray(flow_rates), jax.tree.map(jnp.asarray, starts))
 
 
+@pytest.mark.slow
 def test_a_valve_beside_scipy():
     draw, cycles = np.random.default_rng(3).uniform, 6
     q = np.linspace(0.5, 8.0, 100)
@@ -105,6 +106,7 @@ def test_no_cycle_is_passed_by(method, record):
         np.testing.assert_allclose(np.ptp(run.duration, axis=1), 0, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("steps", [6, 24, 48])
 def test_a_first_cycle_shorter_than_a_step(steps):
     """From the lowest point, on the section too, up to a top close by."""
@@ -163,6 +165,7 @@ def test_wrong_numbers_are_named():
     assert bool(run.result == vi.RESULTS.bad_start)
 
 
+@pytest.mark.slow
 def test_the_open_valve_comes_to_rest_where_its_equilibrium_turns_stable():
     """The Hopf bifurcation, beside the eigenvalues of the linearised valve."""
     valve = VALVE(flow_rate=8.0)

@@ -69,6 +69,7 @@ def drawn(seed):
     return numbers, (draw(-0.8, 0.8), draw(-0.5, 0.5), draw(0.7, 1.3))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("clock", ["phase", "time"])
 @pytest.mark.parametrize("sides", [(), (1,), (1, -1)], ids=["free", "one stop", "two stops"])
 def test_beside_scipy(clock, sides):
@@ -105,6 +106,7 @@ def test_it_runs_as_it_is():
     assert float(run.frequency_ratio[-1]) == pytest.approx(0.87, abs=0.02)
 
 
+@pytest.mark.slow
 def test_the_sommerfeld_response_is_that_of_averaging_to_its_order():
     """Mean speed and amplitude beside the averaged ones, as ε and the motor's strength fall
     together, which leaves the averaged response as it is."""
@@ -128,6 +130,7 @@ def test_the_sommerfeld_response_is_that_of_averaging_to_its_order():
         assert abs(float(amplitude[-1])) < 1e-3 * abs(reach)
 
 
+@pytest.mark.slow
 def test_a_weak_motor_jumps_where_the_averaged_line_folds():
     rotor = ROTOR(strength=0.02, coupling=0.002)
     speeds = np.linspace(0.5, 2.5, 200_001)
@@ -172,6 +175,7 @@ def test_an_elastic_impact_keeps_all():
     np.testing.assert_allclose(energy, energy[0], rtol=1e-10)
 
 
+@pytest.mark.slow
 @each_mode
 def test_derivatives_beside_differences(mode):
     def last(values):

@@ -157,6 +157,7 @@ def test_continue_orbit(case, orbit, branch):
     vi.plot_branch(branch)
 
 
+@pytest.mark.slow
 def test_boundary(case, branch):
     point = next(point for point in branch.special if point.kind == case.curved)
     bounds = (case.bounds, case.ends)

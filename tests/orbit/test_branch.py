@@ -25,7 +25,7 @@ def branch_of(restitution):
     return vi.continue_orbit(short_orbit(scene), parameter=ZETA, bounds=(0.5, 1.9))
 
 
-@pytest.fixture(scope="module", params=[0.5, 0.8])
+@pytest.fixture(scope="module", params=[0.5, pytest.param(0.8, marks=pytest.mark.slow)])
 def restitution(request):
     return request.param
 
@@ -327,6 +327,7 @@ def test_branches_do_not_depend_on_where_they_begin(short, long, restitution):
         assert mine == pytest.approx(its, abs=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("max_step", [0.015, 0.2])
 def test_special_points_do_not_depend_on_the_step(long, restitution, max_step):
     """With k = 0.8 the doubled branch turns back 1e-5 (in ζ) from where it springs."""

@@ -118,6 +118,7 @@ def test_finds_every_motion(n):
         assert (crossings & (v[1:] > 0)).sum() == orbits.exists[i].sum()
 
 
+@pytest.mark.slow
 def test_extremes_are_those_of_the_motion():
     zeta, xi, k, d = samples(2)
     for n in (1, 2):
@@ -150,6 +151,7 @@ def test_extremes_are_those_of_the_motion():
             assert bool(orbits.admissible[i, j]) == bool(highest <= d[i])
 
 
+@pytest.mark.slow
 def test_multipliers_have_the_determinant_and_are_those_of_the_cycle_map():
     zeta, xi, k, d = samples(3)
     for n in (1, 2):
@@ -233,6 +235,7 @@ def simulated(zeta, k, d, section, n):
     return orbits, run.impacts.sum(), apart
 
 
+@pytest.mark.slow
 def test_an_impact_on_the_section_is_met_once():
     """Without damping elastic impacts fall on φ = 0 (or on φ = π); at ζ = 1 all do."""
     draw = np.random.default_rng(6)
@@ -338,6 +341,7 @@ def test_gradients_agree_with_central_differences(at, n):
     np.testing.assert_allclose(forward[kept], jnp.stack(differences, 1)[kept], rtol=2e-6, atol=2e-7)
 
 
+@pytest.mark.slow
 def test_absent_motions_have_finite_derivatives_behind_a_where():
     @partial(jax.jit, static_argnums=1)
     @jax.grad
@@ -363,6 +367,7 @@ def ideal(**changes):
     return vi.Scene.ideal(**(numbers | changes))
 
 
+@pytest.mark.slow
 def test_reads_the_scene_and_its_tracers():
     scene = ideal(damping_ratio=0.01)
     orbits = jax.jit(partial(closed_form_orbits, cycles=2))(scene)

@@ -81,7 +81,7 @@ CASES = {
 
 
 # The slowest to compile.
-_LONG = {"capsule", "soft stop"}
+_LONG = {"capsule", "soft stop", "valve", "stick-slip"}
 
 
 @pytest.fixture(
@@ -189,6 +189,7 @@ def test_the_valve_from_rest_to_chatter():
     assert int(doubled.cycles) == 2 and bool(doubled.successful)
 
 
+@pytest.mark.slow
 def test_a_flow_has_a_zero_exponent():
     """Along an autonomous motion nothing grows or fades."""
     machine = vi.machines.ReliefValve(flow_rate=5.0)

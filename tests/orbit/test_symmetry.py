@@ -67,6 +67,7 @@ def test_a_scene_between_equal_stops_loses_its_symmetry(whole):
     assert "symmetry-breaking" in broken.ends and "fold" not in kinds(broken)[-1:]
 
 
+@pytest.mark.slow
 def test_a_curve_of_lost_symmetry_of_a_scene(whole):
     """Each of its motions is its own image as simulated, and has a multiplier 1."""
     curve = vi.boundary(
@@ -90,6 +91,7 @@ def test_a_curve_of_lost_symmetry_of_a_scene(whole):
 STEPS = [0.02, 0.05, 0.1, 0.2, 0.4]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("distance", [0.005, 0.01, 0.03])
 @pytest.mark.parametrize("max_step", quick(STEPS, 0.1, 0.2))
 def test_a_broken_branch_ends_nowhere_else(max_step, distance):
@@ -119,6 +121,7 @@ def snapped():
     return vi.find_orbit(SNAP, SNAP.start(Y=-0.305011053, V=0.0199429225), throw=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("max_step", quick([0.02, 0.05, 0.08, 0.1, 0.15], 0.1))
 def test_a_motion_without_impacts_loses_its_symmetry(max_step):
     """Near where branches cross the equations may have no answer, or that of the other branch."""
@@ -144,6 +147,7 @@ def half_map(amplitude, damping, x):
     return -end[:2], -end[2:].reshape(2, 2)
 
 
+@pytest.mark.slow
 def test_a_curve_of_lost_symmetry_without_impacts_is_that_of_the_half_map():
     branch = vi.continue_orbit(
         snapped(), parameter="amplitude", bounds=(0.05, 2.0), max_step=0.05
@@ -160,6 +164,7 @@ def test_a_curve_of_lost_symmetry_without_impacts_is_that_of_the_half_map():
     assert np.ptp(curve.parameters[:, 1]) == pytest.approx(0.28)
 
 
+@pytest.mark.slow
 def test_a_doubled_branch_springs_from_the_motion_of_half_the_period():
     ball = M.BouncingBall(acceleration=1.2, restitution=0.5)
     orbit = vi.find_orbit(ball, ball.start(height=6.15831535, speed=-1.06063272), throw=True)
@@ -176,6 +181,7 @@ def test_a_doubled_branch_springs_from_the_motion_of_half_the_period():
     np.testing.assert_allclose(table, np.hypot(born, 2 * (1 + e**2) / (1 + e) ** 2), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_lost_impact_is_no_lost_symmetry():
     """A motion of one impact cannot be its own image; its branch ends at a grazing."""
     machine = M.Duffing(

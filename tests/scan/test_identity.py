@@ -98,6 +98,7 @@ def test_what_changes_the_identity(old, new, changed):
     assert {name for name in before if before[name] != after[name]} == changed
 
 
+@pytest.mark.slow
 def test_another_process_gives_the_same(tmp_path):
     """Whatever order its sets have."""
     (tmp_path / "study.py").write_text(SOURCE)

@@ -161,6 +161,7 @@ def test_a_motion_that_rests_forgets_at_once(zeta, k, gap, xi):
     np.testing.assert_allclose(*(jnp.stack(jax.tree.leaves(end)) for end in ends), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_one_rest_is_enough():
     # Whatever the weight of the cycle in which a direction is forgotten: it does not come back.
     rates, duration = np.full((400, 2), -0.1), np.ones(400)

@@ -113,6 +113,7 @@ def test_den_hartog(r):
             assert stops == 2
 
 
+@pytest.mark.slow
 def test_friction_that_holds_everything():
     held = rubbing((0.5, 0.7, 0.6, 1.0), jnp.asarray(0.05), 3, samples=20)
     np.testing.assert_array_equal(held.samples.state.Y, 0.05)
@@ -164,6 +165,7 @@ def drawn(number):
     return numbers, draw(-1, 1, number)
 
 
+@pytest.mark.slow
 def test_sticking_and_sliding_beside_scipy():
     numbers, starts = drawn(40)
     runs = [

@@ -149,7 +149,7 @@ def integrated(rate, x, contacts, duration, *, ends=None, max_step=0.05):
 
 @pytest.mark.parametrize("law", LAWS, ids=str)
 @pytest.mark.parametrize("adhesive", [True, False])
-@pytest.mark.parametrize("side", ["right", "left"])
+@pytest.mark.parametrize("side", ["right", pytest.param("left", marks=pytest.mark.slow)])
 def test_a_law_beside_scipy(law, adhesive, side):
     sign = 1 if side == "right" else -1
     stop = vi.SoftStop(0.5, 100.0, adhesive=adhesive, side=side, **law)
@@ -195,6 +195,7 @@ def motor_driven(t, x, contacts):
     return [x[1], pull, torque / (1 + m["mu"] * s * s), x[2]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("drive", ["ideal", "motor"])
 @pytest.mark.parametrize(
     ("adhesive", "law"),

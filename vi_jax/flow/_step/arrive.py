@@ -5,7 +5,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
@@ -101,7 +100,6 @@ def _met(plan: Plan, lane: Lane, trial: Trial, taken: Flag, way: Way, arrival: A
     Of events met together the stops come first, in their order, then the switches, then the
     section.
     """
-    flow = way.rate(way.moving, way.fixed, way.rest)[1:]
     for c in trial.crossings:
         offset = stop_gradient(jnp.where(c.landed, c.offset, 0.0))
         if c.kind != "section" and plan.ticks(lane.state):
@@ -122,10 +120,10 @@ def _met(plan: Plan, lane: Lane, trial: Trial, taken: Flag, way: Way, arrival: A
         elif c.kind == "switch":
             arrival = _switched(plan, lane, trial, taken, arrival, c, there)
         else:
-            arrival = _impact(plan, lane, trial, taken, arrival, c, there, flow)
+            arrival = _impact(plan, lane, trial, taken, arrival, c, there)
     for k, path in enumerate(trial.paths):
         if path.leaves is not None:
-            arrival = _released(lane, arrival, k, path.leaves, flow)
+            arrival = _released(lane, arrival, way, k, path.leaves)
     return _at_fixed_clock(plan, lane, trial, arrival) if plan.ticks(lane.state) else arrival
 
 
@@ -142,16 +140,18 @@ def _at_fixed_clock(plan: Plan, lane: Lane, trial: Trial, arrival: Arrival) -> A
     return arrival._replace(s=s, state=state, time=time)
 
 
-def _released(lane: Lane, arrival: Arrival, k: int, leaves: Release, flow: Any) -> Arrival:
+def _released(lane: Lane, arrival: Arrival, way: Way, k: int, leaves: Release) -> Arrival:
     """Coordinate number k free again."""
     assert arrival.contact is not None
-    offset, free = leaves.offset, leaves.landed
-    state, time = jtu.tree_map(lambda x, dx: x + offset * dx, (arrival.state, arrival.time), flow)
+    free, offset = leaves.landed, stop_gradient(leaves.offset)
+    offset = met_after(way.rate, way.force(k), offset, way.moving, way.fixed, way.rest)
+    moving = arrival.s, arrival.state, arrival.time
+    _, state, time = drifted(way.rate, offset, moving, way.fixed, way.rest)
     direction = jnp.where(free, -lane.direction[k], arrival.direction[k])
     return arrival._replace(
-        s=arrival.s + offset,
-        state=state,
-        time=time,
+        s=arrival.s + jnp.where(free, offset, 0.0),
+        state=select(free, state, arrival.state),
+        time=select(free, time, arrival.time),
         direction=_put(arrival.direction, k, direction),
         contact=_put(arrival.contact, k, jnp.where(free, 0.0, arrival.contact[k])),
     )
@@ -193,7 +193,7 @@ def _switched(
 
 def _impact(
     plan: Plan, lane: Lane, trial: Trial, taken: Flag, arrival: Arrival,
-    c: Crossing, there: Any, flow: Any,
+    c: Crossing, there: Any,
 ) -> Arrival:  # fmt: skip
     """The rebound from a stop in `there`, the state of the impact; or coming to rest on it."""
     scene, stop = plan.scene, plan.scene.stops[c.number]
@@ -215,12 +215,12 @@ def _impact(
         ends = pin_flag(c.landed & last, s)
         lost = jnp.where(ends, 0.5 * approach**2, lost)
         wait = pin(jnp.where(ends, left, 0.0))
-        (later, passed) = jtu.tree_map(lambda x, dx: x + wait * dx, (state, time), flow)
-        still = body.placed(later, stop.place, jnp.zeros_like(s))
-        state = select(ends, still, state)
-        time = select(ends, passed, time)
-        s = s + wait
         contact = _put(contact, k, jnp.where(ends, to_stop(c.number), contact[k]))
+        resting = held(plan, dataclasses.replace(lane, contact=contact, modes=arrival.modes))
+        still = body.placed(state, stop.place, jnp.zeros_like(s))
+        way = Way(plan, resting, lane.part, (s, still, time))
+        later, still, passed = drifted(way.rate, wait, way.moving, way.fixed, way.rest)
+        s, state, time = select(ends, (later, still, passed), (s, state, time))
         direction = jnp.where(ends, float(stop.sign), direction)
         if rests is not None:
             rests = rests + jnp.where(taken & ends, 1.0, 0.0)

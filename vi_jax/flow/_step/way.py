@@ -1,5 +1,6 @@
 """The last part of a way to an event, as `drift` asks for it."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -9,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._lane import Plan
+from ..events import rates
 from ..moving import Moving
 from .trial import Crossing
 
@@ -59,6 +61,17 @@ class Way:
             return _scene(machine).coordinates[k].position(moving[1])
 
         return self._pure(coordinate)
+
+    def force(self, k: int) -> Callable:
+        """What coordinate number k would be accelerated by if it were not held."""
+
+        def acceleration(moving, fixed, rest):
+            (machine, _), (s, state, _) = self._whole(fixed, rest), moving
+            held = tuple(x & (j != k) for j, x in enumerate(machine.held))
+            free = dataclasses.replace(machine, held=held)
+            return rates(free.field, machine.scene.coordinates[k].position, s, state).a
+
+        return self._pure(acceleration)
 
     def _rate(self, moving, fixed, rest):
         (machine, _), (s, state, time) = self._whole(fixed, rest), moving
