@@ -105,6 +105,7 @@ def test_a_failing_write_is_one_line(tmp_path, capsys):
     assert capsys.readouterr().err.splitlines()[-1].startswith("vi-jax: error:")
 
 
+@pytest.mark.slow
 def test_a_reader_that_has_seen_enough():
     """`vi-jax ... | head` is no failure."""
     code = "import sys; from vi_jax import cli; sys.exit(cli.main(['--help']))"

@@ -136,7 +136,7 @@ def test_compiler_options_that_xla_does_not_know_are_left_out(monkeypatch):
 
 
 @pytest.mark.parametrize("road", ["auto", pytest.param("xla", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.grad])
+@pytest.mark.parametrize("derivative", [jax.jacfwd, pytest.param(jax.grad, marks=pytest.mark.slow)])
 def test_a_field_may_close_over_what_is_differentiated(derivative, road):
     """A machine written within a function of its numbers, through impacts and turns."""
 
@@ -164,6 +164,7 @@ def test_a_field_may_close_over_what_is_differentiated(derivative, road):
     np.testing.assert_allclose(found, truth, rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_a_law_may_close_over_what_is_differentiated():
     """Eagerly too, where no argument shows it."""
 

@@ -80,6 +80,7 @@ def integrated(n, start, cycles, te):
     return np.array(kept), impacts
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("clock", ["phase", "time"])
 def test_beside_scipy(clock):
     cases, cycles = [drawn(seed) for seed in range(16)], 5
@@ -200,6 +201,7 @@ class Booked(vi.AbstractScene):
         return eqx.tree_at(lambda b: b.state, books, self.scene.rewound(books.state))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("clock", ["phase", "time"])
 def test_energy_is_accounted_for(clock):
     scene = machine(clock, coupling=0.05, electrical_time=0.8)

@@ -10,6 +10,7 @@ METHODS = [vi.ExactFlight(), vi.FixedStep(), vi.Adaptive(rtol=1e-9)]
 NUMBERS = {"frequency_ratio": 0.9, "restitution": 0.7, "gap": 0.6, "damping_ratio": 0.05}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_a_scene_made_before_double_precision_is_promoted_and_says_so(method):
     with jax.enable_x64(False):

@@ -140,6 +140,7 @@ class Odd(AbstractScene):
         )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "table", [None, pytest.param(jnp.array([0.0, 0.4, -0.2, 0.1, 0.0]), marks=pytest.mark.slow)]
 )

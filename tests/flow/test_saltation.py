@@ -107,6 +107,7 @@ def test_second_derivatives_pass_through_impacts(method, cycles):
     np.testing.assert_allclose(bend, jnp.stack(difference, -1), atol=1e-7 * (1 + scale))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("extremes", [False, True], ids=["state", "extremes"])
 @pytest.mark.parametrize(
     ("method", "order"),

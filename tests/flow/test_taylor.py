@@ -49,6 +49,7 @@ SCENES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.parametrize("clock", ["phase", "time"])
 def test_an_ideal_drive_as_the_exact_flight(name, clock):

@@ -52,6 +52,7 @@ def test_serves_diffeqsolve(solver):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [diffrax.Kvaerno3, diffrax.Kvaerno4, diffrax.Kvaerno5])
 def test_an_implicit_step_is_that_of_diffrax(kind):
     solver, args = kind(root_finder=optx.Newton(rtol=1e-13, atol=1e-13)), 0.1

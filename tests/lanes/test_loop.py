@@ -230,6 +230,7 @@ def test_derivatives_of_a_step_that_holds(name):
         np.testing.assert_allclose(jax.jit(along(lane, (0, 1)))(1.5, 2.5), wanted, rtol=1e-15)
 
 
+@pytest.mark.slow
 def test_reverse_mode_is_the_forward_one_transposed():
     """Of results and rows, of all inputs or some, of numbers of a lane's own and of common ones."""
 

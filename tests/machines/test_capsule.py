@@ -193,6 +193,7 @@ def test_how_far_it_goes():
     np.testing.assert_allclose(np.diff(run.sections.progress[-10:]), 0, atol=1e-9)
 
 
+@pytest.mark.slow
 @each_mode
 def test_derivatives_of_a_capsule(mode):
     """Through impacts, through sticking and through the change of what is told as progress."""

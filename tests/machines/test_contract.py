@@ -131,6 +131,7 @@ def test_derivatives_of_two_bodies(mode):
     check_derivatives(mode, last, at, step=1e-6, tolerance=2e-6, impacts=3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("gap", [0.15, 0.2])
 def test_events_that_come_together(gap, method):
@@ -263,6 +264,7 @@ def test_a_state_of_any_kind(kind):
     assert "v = -0.221262" in str(vi.distinct_orbits(both)[0])
 
 
+@pytest.mark.slow
 def test_single_precision():
     numbers, starts = drawn(6)
     with jax.enable_x64(False), warnings.catch_warnings():

@@ -80,6 +80,7 @@ def symmetric(restitution):
     return vi.continue_orbit(orbit, parameter="half_gap", bounds=(1.05, 20.0))
 
 
+@pytest.mark.slow
 def test_an_impact_pair_folds_and_loses_its_symmetry(symmetric, restitution):
     special = {p.kind: p.parameter for p in symmetric.special}
     s = sigma(restitution)
@@ -207,6 +208,7 @@ def starts_of(machine, number=12):
     return [machine.start(place=y, speed=v) for y, v in draw(-0.9, 0.9, (number, 2))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MACHINES)
 def test_a_machine_beside_scipy(name):
     machine, cycles = MACHINES[name], 3
@@ -267,6 +269,7 @@ def test_energy_books_of_a_driven_box():
     assert float(run.impact_energy.sum()) > 0.1
 
 
+@pytest.mark.slow
 @each_mode
 @pytest.mark.parametrize("name", MACHINES)
 def test_derivatives_of_a_machine(name, mode):

@@ -186,6 +186,7 @@ def test_two_bodies_at_rest_on_one_another():
     assert bool((~failed | chatters).all())
 
 
+@pytest.mark.slow
 def test_no_turn_hides_that_of_another_coordinate():
     truth = met(vi.FixedStep(steps_per_cycle=200), "motion")
     run = met(vi.Taylor(20, rtol=1e-12), "sections")
@@ -195,6 +196,7 @@ def test_no_turn_hides_that_of_another_coordinate():
     np.testing.assert_allclose(run.last.x[never], truth.last.x[never], atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("record", ["motion", "sections"])
 def test_a_belt_beside_its_closed_form(record):
     """It sticks for 2c/v and slips for 2π - 2 atan(c/v), c being what sticking holds above slip;

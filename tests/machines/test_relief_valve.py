@@ -89,6 +89,7 @@ def test_a_valve_beside_scipy():
     assert compared >= 90 and impacts > 300
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "method", [vi.Adaptive(), vi.FixedStep(), vi.Taylor(rtol=1e-10)], ids="aft"
 )

@@ -54,6 +54,7 @@ def fold_by_eq_21(k, d, low, high):
     return brentq(discriminant, low, high, xtol=1e-14)
 
 
+@pytest.mark.slow
 def test_special_points_of_the_undamped_2pi_branch(short, restitution):
     kinds = {point.kind: point for point in short.special}
     assert short.ends == ("grazing", "grazing")

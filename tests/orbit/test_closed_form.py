@@ -102,6 +102,7 @@ def test_meets_the_boundary_conditions_by_runge_kutta(n, zeta, xi):
     np.testing.assert_allclose(run.y[:, -1], (d, v), atol=2e-11)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [1, 2])
 def test_finds_every_motion(n):
     zeta, xi, k, d = samples(1)

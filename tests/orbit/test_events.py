@@ -97,6 +97,7 @@ def followed(request):
     return orbit, vi.continue_orbit(orbit, parameter=name, bounds=bounds), name, value
 
 
+@pytest.mark.slow
 def test_a_branch_agrees_with_a_search(followed):
     """Two ways to an orbit and its multipliers: by the cycle map, whose derivative passes the
     events as they are met, and from event to event, by the saltation matrix."""

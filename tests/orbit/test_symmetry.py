@@ -56,6 +56,7 @@ def whole():
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_scene_between_equal_stops_loses_its_symmetry(whole):
     assert kinds(whole) == ["grazing", "symmetry-breaking", "symmetry-breaking"]
     point = whole.special[1]

@@ -116,6 +116,7 @@ def test_frames_are_even_in_time():
     assert np.diff(cycles)[0] < 0.3 * np.diff(cycles)[-1]
 
 
+@pytest.mark.slow
 def test_an_orbit_knows_its_machine():
     scene = MACHINES["ideal"]
     orbit = vi.find_orbit(scene, scene.start(Y=1.9, V=1.4), throw=True)

@@ -381,6 +381,7 @@ def test_a_weak_motor_that_comes_off_the_stop_is_told():
     assert float(sweep.y_min[2]) == pytest.approx(-amplitude, rel=0.02)
 
 
+@pytest.mark.slow
 def test_some_lanes_are_verified_by_a_better_method():
     """At a loose tolerance sections do not repeat: the regimes are told wrongly."""
     axes = {"drive.frequency_ratio": np.linspace(1.0, 1.4, 6), "start.Y": [0.0, 0.5]}

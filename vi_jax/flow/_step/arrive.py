@@ -124,12 +124,15 @@ def _met(plan: Plan, lane: Lane, trial: Trial, taken: Flag, way: Way, arrival: A
     for k, path in enumerate(trial.paths):
         if path.leaves is not None:
             arrival = _released(lane, arrival, way, k, path.leaves)
-    return _at_fixed_clock(plan, lane, trial, arrival) if plan.ticks(lane.state) else arrival
+    # Where a switch is met the field may have an infinite slope (Hertz's damper as it is touched),
+    # which only derivatives along with the event do not see.
+    fixed = plan.ticks(lane.state) and not plan.scene.switches
+    return _at_fixed_clock(plan, lane, trial, arrival) if fixed else arrival
 
 
 def _at_fixed_clock(plan: Plan, lane: Lane, trial: Trial, arrival: Arrival) -> Arrival:
     """The same place, its derivatives those at this reading of the clock rather than at an event
-    that comes sooner or later: so that those of the steps to come need no derivative of `s`."""
+    that comes sooner or later: so that the steps to come need none of `s`."""
     machine = held(plan, dataclasses.replace(lane, contact=arrival.contact, modes=arrival.modes))
     bound = plan.end(lane.part)
     # The end of the interval may depend on what is differentiated by.

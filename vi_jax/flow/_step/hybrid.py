@@ -9,7 +9,7 @@ Each iteration tries one step of one lane:
   δ = t* - t puts the state on it, and the jump is applied. Otherwise it is aimed once more.
 
 The length of an aimed step is a constant for differentiation, while δ carries dt*/dp, so that
-forward and reverse derivatives through an impact are exact (the saltation matrix). Behind an event
+forward and reverse derivatives through an impact are exact (the saltation matrix). Behind an impact
 they are those at a fixed reading of the clock, so that the steps to come carry none of the clock's.
 """
 
