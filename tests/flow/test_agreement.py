@@ -56,6 +56,7 @@ def test_any_scene_agrees(scene):
     check([jnp.asarray([x]) for x in scene])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "seed", [1, *(pytest.param(s, marks=pytest.mark.slow) for s in range(2, 6))]
 )

@@ -228,6 +228,7 @@ def test_energy_is_accounted_for(clock):
     assert float(balance - change) == pytest.approx(0.0, abs=1e-10)
 
 
+@pytest.mark.slow
 @each_mode
 def test_derivatives_beside_differences(mode):
     """By an electrical, a mechanical and a starting number at once."""

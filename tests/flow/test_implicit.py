@@ -99,6 +99,7 @@ def test_a_strong_dashpot_beside_explicit_steps():
     assert 10 * int(implicit.steps) < int(explicit.steps)
 
 
+@pytest.mark.slow
 def test_suggest_method_takes_it_where_a_scene_is_stiff():
     found = vi.suggest_method(strong(1e3), error=1e-5, cycles=4, lanes=16)
     assert found.reached and found.error <= 1e-5

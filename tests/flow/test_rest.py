@@ -111,6 +111,7 @@ def test_impacts_shrink_by_k_and_are_few():
     assert len(speed) < 20
 
 
+@pytest.mark.slow
 def test_a_motion_through_rest_forgets_its_start():
     body = scene()
     orbit = vi.find_orbit(body, body.start(Y=0.1), impact_log=20)

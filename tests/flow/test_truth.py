@@ -161,6 +161,7 @@ def machine(drive, clock, stops):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("drive", "clock", "sides"),
     [

@@ -474,6 +474,7 @@ def _sum(bound, x):
     return x + bound["offset"] if isinstance(bound["offset"], float) else x - bound["offset"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("same", [True, False])
 def test_what_is_bound_to_a_function_tells_programs_apart(same):
     """Equal constants make one program, and what only compares equal makes another."""

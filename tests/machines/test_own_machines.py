@@ -302,6 +302,7 @@ class Cage(vi.AbstractScene):
         return Pushed(u, cage, v, body)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("k", [0.0, 0.2, 0.5, 0.8])
 def test_a_body_rests_on_another_where_their_distance_is_a_difference(k):
     """The difference of two rounded places is not the stop's to the last bit."""
@@ -319,6 +320,7 @@ def test_a_body_rests_on_another_where_their_distance_is_a_difference(k):
     np.testing.assert_array_equal(runs[0].rests[:5], runs[1].rests[:5])
 
 
+@pytest.mark.slow
 def test_bodies_that_push_each_other_onto_walls():
     """Without rebound impacts go to and fro between two contacts, ever weaker, until both hold."""
     draw = np.random.default_rng(7).uniform

@@ -71,7 +71,7 @@ def test_multipliers_agree_with_the_table():
     np.testing.assert_allclose(stable, -0.298755 + 0.400931j * np.array([1, -1]), atol=6e-7)
 
 
-@pytest.mark.parametrize("n", [1, 2, 3])
+@pytest.mark.parametrize("n", [1, 2, pytest.param(3, marks=pytest.mark.slow)])
 def test_meets_the_boundary_conditions_and_passes_the_section(n):
     zeta, xi, k, d = (x[:, None] for x in samples(0))
     orbits = solve_many(*(x[:, 0] for x in (zeta, xi, k, d)), n)
@@ -285,6 +285,7 @@ def test_nothing_exists_where_the_free_motion_is_periodic(zeta, n):
     assert all(np.isnan(getattr(orbits, name)).all() for name in FIELDS)
 
 
+@pytest.mark.slow
 def test_admissible_ones_come_first_then_faster_ones():
     orbits = solve_many(*samples(4), 1)
     admissible, exists = np.asarray(orbits.admissible), np.asarray(orbits.exists)
@@ -355,6 +356,7 @@ def test_absent_motions_have_finite_derivatives_behind_a_where():
         assert jnp.isfinite(slope(jnp.array(at), n)).all()
 
 
+@pytest.mark.slow
 def test_single_precision():
     at = [jnp.float32(x) for x in (0.9, 0.0, 0.5, 2.0)]
     orbits = solve(*at, 2)

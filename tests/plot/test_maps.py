@@ -142,6 +142,7 @@ def test_basins_name_their_circles_and_tell_motions_of_one_period_apart():
     assert first == to_rgb(color_of(1, 1)) != second
 
 
+@pytest.mark.slow
 def test_maps_of_a_machine_speak_its_words():
     ball = vi.machines.BouncingBall(restitution=0.5, acceleration=3.0)
     dims, starts = ("start.Y", "start.V"), {"start.Y": [0.0, 1.0], "start.V": [0.0, 1.0]}

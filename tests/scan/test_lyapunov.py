@@ -146,6 +146,7 @@ def test_failed_runs_and_bad_arguments():
         vi.lyapunov(scene, scene.start(), 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "zeta, k, gap, xi", [(0.3, 0.4, 0.3, 0.05), (0.17, 0.6, 0.5, 0.02), (0.4, 0.6, 0.3, 0.05)]
 )

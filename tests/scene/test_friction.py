@@ -230,6 +230,7 @@ def test_a_body_on_a_belt(method):
     np.testing.assert_allclose(run.sections.V[1:], v, atol=1e-14)
 
 
+@pytest.mark.slow
 @each_mode
 def test_derivatives_through_sticking(mode):
     numbers, starts = drawn(40)

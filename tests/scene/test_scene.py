@@ -33,6 +33,7 @@ def test_groups_of_table_1():
     assert float(table.radians_per_second(0.5)) == pytest.approx(0.5 * 15.930782, rel=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratio", [1e-9, 1 / 3, 0.9])
 def test_slider_crank_kinematics(ratio):
     crank = vi.SliderCrank(ratio)
