@@ -8,6 +8,8 @@ import pytest
 import vi_jax as vi
 from scipy.linalg import expm
 
+from differences import quick
+
 ZETA, XI, K, GAP = 0.9, 0.05, 0.5, 2.0
 # Starts and cycles with one and with three impacts.
 CASES = {1: (0.1, 0.2, 2), 3: (1.6, -1.9, 5)}
@@ -157,3 +159,47 @@ def test_gradients_are_the_forward_ones():
     h = 1e-6 * jnp.eye(2)
     slope = [(lowest(at[0] + e) - lowest(at[0] - e)) / 2e-6 for e in h]
     np.testing.assert_allclose(gradient[0], slope, rtol=1e-6, atol=1e-7)
+
+
+RECORDED = {
+    "ideal": ("ideal", "phase", vi.FixedStep(steps_per_cycle=40)),
+    "ideal, exact": ("ideal", "phase", vi.ExactFlight()),
+    "ideal, time": ("ideal", "time", vi.FixedStep(steps_per_cycle=40)),
+    "motor": ("motor", "phase", vi.FixedStep(steps_per_cycle=40)),
+    "motor, time": ("motor", "time", vi.Taylor(rtol=1e-12)),
+}
+
+
+@pytest.mark.parametrize("name", quick(RECORDED, "motor"))
+def test_derivatives_of_all_that_is_recorded(name):
+    """States on sections and between them, extremes, times, and the impacts' phases and speeds."""
+    kind, clock, method = RECORDED[name]
+
+    def recorded(x):
+        xi, k, gap, speed, V, section = x
+        drive = vi.Motor(0.6, speed, 0.1, 0.05) if kind == "motor" else vi.IdealDrive(speed)
+        stops = (vi.RigidStop(gap, k), vi.RigidStop(1.3 + gap, 0.5 * k, side="left"))
+        scene = vi.Scene(
+            oscillator=vi.Oscillator(xi), drive=drive, stops=stops, clock_name=clock,
+            section_phase=section,
+        )  # fmt: skip
+        start = scene.start(V=V, W=speed) if kind == "motor" else scene.start(V=V)
+        run = vi.simulate(scene, start, 3, method=method, impact_log=6, samples=3)
+        log = jax.tree.map(jnp.nan_to_num, (run.impact_log.phase, run.impact_log.speed))
+        every = (run.sections, run.samples.state, run.samples.time, run.y_max, run.y_min)
+        return (*every, run.impact_speed, *log), run.impacts
+
+    rng = np.random.default_rng(0)
+    low, high = np.array([[0.01, 0.3, 0.2, 0.6, -1, -1], [0.1, 0.9, 0.9, 1.2, 1, 1]])
+    derivatives = jax.jit(jax.jacfwd(lambda x: recorded(x)[0]))
+    values, h = jax.jit(recorded), 1e-6
+    for _ in range(4):
+        x = jnp.asarray(rng.uniform(low, high))
+        found = derivatives(x)
+        for i, e in enumerate(h * jnp.eye(6)):
+            (above, more), (below, fewer) = values(x + e), values(x - e)
+            assert (more == fewer).all() and more.sum() > 0
+            for slope, a, b in zip(*map(jax.tree.leaves, (found, above, below)), strict=True):
+                wanted = (a - b) / (2 * h)
+                scale = 1 + float(jnp.abs(wanted).max())
+                np.testing.assert_allclose(slope[..., i], wanted, atol=2e-6 * scale)

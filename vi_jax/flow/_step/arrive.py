@@ -27,6 +27,8 @@ class Arrival(NamedTuple):
 
     s: Scalar
     state: Any
+    place: Scalar
+    """Y there: on the stop, with the stop's derivatives, where one is met."""
     time: Scalar | None
     direction: tuple[Scalar, ...]
     contact: tuple[Scalar, ...] | None
@@ -59,7 +61,8 @@ def arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Fla
             along = jnp.where(trial.paths[k].at_turn, away, turned)
         direction.append(along)
     arrival = Arrival(
-        trial.s, trial.state, trial.time, tuple(direction), lane.contact, lane.modes,
+        trial.s, trial.state, plan.scene.position(trial.state), trial.time, tuple(direction),
+        lane.contact, lane.modes,
         old.impacts, old.speed, old.loss, old.rests, old.log, trial.ends_interval,
     )  # fmt: skip
     way = Way(plan, trial.holding, lane.part, (trial.s, trial.state, trial.time))
@@ -74,7 +77,7 @@ def arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Fla
         arrival = jax.lax.cond(
             met, lambda x: _met(plan, lane, trial, taken, way, x), lambda x: x, arrival
         )
-    y_max, y_min, clearance = _reached(plan, lane, trial, taken, way, arrival.state)
+    y_max, y_min, clearance = _reached(plan, lane, trial, taken, way, arrival.place)
     time = arrival.time
     if time is not None and old.time is not None:
         time = jnp.where(taken, time, old.time)
@@ -126,6 +129,7 @@ def _met(plan: Plan, lane: Lane, trial: Trial, taken: Flag, way: Way, arrival: A
             arrival = _released(lane, arrival, way, k, path.leaves)
     # Where a switch is met the field may have an infinite slope (Hertz's damper as it is touched),
     # which only derivatives along with the event do not see.
+    arrival = arrival._replace(place=plan.scene.position(arrival.state))
     fixed = plan.ticks(lane.state) and not plan.scene.switches
     return _at_fixed_clock(plan, lane, trial, arrival) if fixed else arrival
 
@@ -265,7 +269,7 @@ def _is_one(mass: Any) -> bool:
 
 
 def _reached(
-    plan: Plan, lane: Lane, trial: Trial, taken: Flag, way: Way, state: Any
+    plan: Plan, lane: Lane, trial: Trial, taken: Flag, way: Way, place: Scalar
 ) -> tuple[Scalar | None, Scalar | None, Scalar | None]:
     """Greatest and smallest Y so far, and the smallest distance at a turn that met no stop."""
     record = lane.record
@@ -274,7 +278,7 @@ def _reached(
         return y_max, y_min, clearance
     tops = [_top(trial, k, way) for k in range(len(trial.paths))]
     at_turn = trial.paths[0].at_turn
-    reached = jnp.where(at_turn, tops[0], plan.scene.position(state))
+    reached = jnp.where(at_turn, tops[0], place)
     if clearance is not None:
         for stop in plan.scene.stops:
             k = stop.coordinate
