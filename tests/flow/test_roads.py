@@ -141,9 +141,7 @@ class Odd(AbstractScene):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "table", [None, pytest.param(jnp.array([0.0, 0.4, -0.2, 0.1, 0.0]), marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("table", [None, jnp.array([0.0, 0.4, -0.2, 0.1, 0.0])])
 def test_a_scene_of_ones_own(table):
     """On the fast road, or told why not; right on either."""
     start = Place(jnp.asarray(0.1), jnp.asarray(0.5), jnp.zeros(3))

@@ -115,9 +115,9 @@ def test_second_derivatives_pass_through_impacts(method, cycles):
     ("method", "order"),
     [
         (vi.ExactFlight(), 3),
-        pytest.param(vi.ExactFlight(), 4, marks=pytest.mark.slow),
-        pytest.param(vi.FixedStep(steps_per_cycle=24), 3, marks=pytest.mark.slow),
-        pytest.param(vi.Taylor(16, 8), 3, marks=pytest.mark.slow),
+        (vi.ExactFlight(), 4),
+        (vi.FixedStep(steps_per_cycle=24), 3),
+        (vi.Taylor(16, 8), 3),
     ],
     ids=["ExactFlight, third", "ExactFlight, fourth", "FixedStep", "Taylor"],
 )

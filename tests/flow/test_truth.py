@@ -101,9 +101,7 @@ def check(name, lanes, seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", ["exact", "fixed", pytest.param("adaptive", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("name", METHODS)
 def test_random_lanes_from_deep_stops_to_beyond_reach(name):
     check(name, METHODS[name][1], 0)
 
@@ -167,9 +165,9 @@ def machine(drive, clock, stops):
     [
         ("ideal", "time", 2),
         ("motor", "phase", 1),
-        pytest.param("ideal", "phase", 2, marks=pytest.mark.slow),
-        pytest.param("motor", "time", 1, marks=pytest.mark.slow),
-        pytest.param("motor", "time", 2, marks=pytest.mark.slow),
+        ("ideal", "phase", 2),
+        ("motor", "time", 1),
+        ("motor", "time", 2),
     ],
 )
 def test_scipy_over_gaps_restitutions_stops_and_clocks(drive, clock, sides):

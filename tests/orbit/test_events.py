@@ -80,14 +80,7 @@ CASES = {
 }
 
 
-# The slowest to compile.
-_LONG = {"capsule", "soft stop", "valve", "stick-slip"}
-
-
-@pytest.fixture(
-    scope="module",
-    params=[pytest.param(x, marks=[pytest.mark.slow] * (x in _LONG)) for x in CASES],
-)
+@pytest.fixture(scope="module", params=CASES)
 def followed(request):
     """The case and its branch."""
     machine, settle, cycles, name, bounds, value = CASES[request.param]

@@ -64,14 +64,10 @@ class Program(eqx.Module):
 def spread(program: Program, sources: tuple[bool, ...], *, smooth: bool) -> "Spread":
     """Which parts of a program depend on these inputs; if `smooth`, differentiably."""
     n = len(program.carry_avals)
-    carry = [False] * n
-    while True:
-        begun = reached(program.begin.jaxpr, sources, smooth=smooth)
-        stepped = reached(program.step.jaxpr, (*sources, *carry), smooth=smooth)
-        grown = [a or b or c for a, b, c in zip(carry, begun[:n], stepped[:n], strict=True)]
-        if grown == carry:
-            break
-        carry = grown
+    begun = reached(program.begin.jaxpr, sources, smooth=smooth)
+    step = program.step.jaxpr
+    stepped = _settled(lambda c: reached(step, [*sources, *c], smooth=smooth), begun[:n])
+    carry = stepped[:n]
     rest = [a or b for a, b in zip(begun[n:], stepped[n:], strict=True)]
     outs = reached(program.end.jaxpr, (*sources, *carry), smooth=smooth)
     return Spread(tuple(carry), any(rest[:2]), tuple(rest[2:]), tuple(outs))
@@ -93,6 +89,10 @@ CALLS = {
     "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "remat": "jaxpr",
     "checkpoint": "jaxpr", "remat2": "jaxpr", "custom_lin": "jaxpr",
 }  # fmt: skip
+
+
+# Of these, what has a derivative of its own, of which its body says nothing.
+RULED = ("custom_jvp_call", "custom_vjp_call", "custom_lin")
 
 
 def inner(jaxpr: ClosedJaxpr | Jaxpr) -> Jaxpr:
@@ -128,8 +128,7 @@ def reached(jaxpr: Jaxpr, sources: Sequence[bool], *, smooth: bool) -> list[bool
 def _through(eqn: Any, args: list[bool], *, smooth: bool) -> list[bool]:
     """Which results of an equation depend on these of its arguments."""
     name, params = eqn.primitive.name, eqn.params
-    # What has a derivative of its own says nothing of it in its body.
-    if name in CALLS and not (smooth and name.startswith("custom")):
+    if name in CALLS and not (smooth and name in RULED):
         return reached(inner(params[CALLS[name]]), args, smooth=smooth)
     if name == "cond" and (smooth or not args[0]):
         ways = [reached(inner(b), args[1:], smooth=smooth) for b in params["branches"]]

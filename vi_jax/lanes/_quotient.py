@@ -13,12 +13,10 @@ from jax.core import ShapedArray
 from jax.extend.core import ClosedJaxpr, Jaxpr, Primitive
 from jax.interpreters import ad, batching
 
+from ._program import RULED
 from .elementary import jitted
 
 quotient_p = Primitive("quotient")
-
-# These come with a rule of their own for what is differentiated.
-_RULED = ("custom_jvp_call", "custom_vjp_call")
 
 
 @functools.lru_cache(maxsize=256)
@@ -35,7 +33,7 @@ def _equation(eqn: Any) -> Any:
     name = eqn.primitive.name
     if name == "div" and jnp.issubdtype(eqn.outvars[0].aval.dtype, jnp.floating):
         return eqn.replace(primitive=quotient_p, params={})
-    if name in _RULED:
+    if name in RULED:
         return eqn
     return eqn.replace(params={key: _parameter(x) for key, x in eqn.params.items()})
 

@@ -7,7 +7,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from ._arrays import STRUCTURAL, Values
 from ._operations import ELEMENTWISE, kind_of
-from ._program import CALLS
+from ._program import CALLS, inner
 from ._text import Text, Value
 
 # A loop of known length is written out if that makes no more operations than this.
@@ -39,15 +39,15 @@ def check(jaxpr: Jaxpr) -> None:
     for eqn in needed:
         name = eqn.primitive.name
         if name in CALLS:
-            check(_inner(eqn.params[CALLS[name]])[0])
+            check(inner(eqn.params[CALLS[name]]))
         elif name == "cond":
             for branch in eqn.params["branches"]:
-                check(_inner(branch)[0])
+                check(inner(branch))
         elif name == "while":
-            check(_inner(eqn.params["cond_jaxpr"])[0])
-            check(_inner(eqn.params["body_jaxpr"])[0])
+            check(inner(eqn.params["cond_jaxpr"]))
+            check(inner(eqn.params["body_jaxpr"]))
         elif name == "scan":
-            body = _inner(eqn.params["jaxpr"])[0]
+            body = inner(eqn.params["jaxpr"])
             check(body)
             plain = _counts_only(eqn.params, len(eqn.invars), len(eqn.outvars))
             if not plain and _size(body) * eqn.params["length"] > _WRITTEN_OUT:
@@ -59,9 +59,9 @@ def check(jaxpr: Jaxpr) -> None:
 def _size(jaxpr: Jaxpr) -> int:
     total = 0
     for eqn in jaxpr.eqns:
-        inner = [x for v in eqn.params.values() for x in (v if isinstance(v, tuple) else (v,))]
-        inner = [x for x in inner if isinstance(x, Jaxpr | ClosedJaxpr)]
-        total += 1 + sum(_size(_inner(x)[0]) for x in inner)
+        held = [x for v in eqn.params.values() for x in (v if isinstance(v, tuple) else (v,))]
+        held = [x for x in held if isinstance(x, Jaxpr | ClosedJaxpr)]
+        total += 1 + sum(_size(inner(x)) for x in held)
     return total
 
 
@@ -151,7 +151,7 @@ def _cond(t: Text, branches: tuple, which: Value, args: list[Values], mask: Valu
             flag = t.binary(f"icmp {how}", which, t.constant(i, which.kind), "i1")
         taken.append(flag)
     # The cheapest of them is the one that the others are laid over.
-    order = sorted(range(len(branches)), key=lambda i: _size(_inner(branches[i])[0]))
+    order = sorted(range(len(branches)), key=lambda i: _size(inner(branches[i])))
     result: list[Values] | None = None
     for i in order:
         jaxpr, consts = _inner(branches[i])
@@ -277,7 +277,7 @@ def _counted(t: Text, params: dict, args: list[Values], mask: Value) -> list[Val
 
 def _scan(t: Text, params: dict, args: list[Values], mask: Value) -> list[Values]:
     """A loop of known length: written out, unless it is long and has no rows."""
-    body = _inner(params["jaxpr"])[0]
+    body = inner(params["jaxpr"])
     big = _size(body) * params["length"] > _WRITTEN_OUT // 16
     if big and _counts_only(params, len(args), len(body.outvars)):
         return _counted(t, params, args, mask)

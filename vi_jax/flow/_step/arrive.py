@@ -110,8 +110,7 @@ def _met(plan: Plan, lane: Lane, trial: Trial, taken: Flag, way: Way, arrival: A
             beyond = trial.s + offset - plan.end(lane.part)
             offset = offset - jnp.maximum(stop_gradient(beyond), 0.0)
         # With the derivatives of what is met, which mean nothing where nothing is.
-        guard = way.guard(c)
-        offset = met_after(way.rate, guard, offset, way.moving, way.fixed, way.rest)
+        offset = met_after(way.rate, way.guard(c), offset, way.moving, way.fixed, way.rest)
         _, there, passed = drifted(way.rate, offset, way.moving, way.fixed, way.rest)
         s = arrival.s + jnp.where(c.landed, offset, 0.0)
         arrival = arrival._replace(s=s, time=select(c.landed, passed, arrival.time))
@@ -127,9 +126,9 @@ def _met(plan: Plan, lane: Lane, trial: Trial, taken: Flag, way: Way, arrival: A
     for k, path in enumerate(trial.paths):
         if path.leaves is not None:
             arrival = _released(lane, arrival, way, k, path.leaves)
+    arrival = arrival._replace(place=plan.scene.position(arrival.state))
     # Where a switch is met the field may have an infinite slope (Hertz's damper as it is touched),
     # which only derivatives along with the event do not see.
-    arrival = arrival._replace(place=plan.scene.position(arrival.state))
     fixed = plan.ticks(lane.state) and not plan.scene.switches
     return _at_fixed_clock(plan, lane, trial, arrival) if fixed else arrival
 
