@@ -18,6 +18,7 @@ from scipy.integrate import solve_ivp
 # rounding are completed too, unless that would take long.
 BRIEF, FLAT, LONG = 1e-6, 1e-13, 1e-3
 LATE, ROUNDING = 1e-12, 4e-15
+ULP = np.finfo(float).eps
 
 
 class Truth(NamedTuple):
@@ -38,41 +39,67 @@ class _Flight:
     """Y(τ) = Re{c e^(pτ) + F e^(iζτ)} and its derivatives, of many lanes; needs ξ < 1."""
 
     def __init__(self, zeta, xi, phase, Y, V):
-        self.p = -xi + 1j * np.sqrt(1 - xi * xi)
-        self.i_zeta = 1j * zeta
-        self.forced = np.exp(1j * phase) / (1 - zeta * zeta + 2j * xi * zeta)
-        y = Y - self.forced.real
-        v = V - (self.i_zeta * self.forced).real
-        self.free = y - 1j * (v + xi * y) / self.p.imag
+        forced = np.exp(1j * phase) / (1 - zeta * zeta + 2j * xi * zeta)
+        y = Y - forced.real
+        v = V - (1j * zeta * forced).real
+        p = -xi + 1j * np.sqrt(1 - xi * xi)
+        self.rates = np.array([p, 1j * zeta])
+        self.begin = np.array([y - 1j * (v + xi * y) / p.imag, forced])
 
-    def at(self, order, tau, lanes=slice(None)):
-        """The derivative of this order at times since the start, of all or some lanes."""
-        p, i_zeta = self.p[lanes], self.i_zeta[lanes]
-        free = self.free[lanes] * p**order * np.exp(p * tau)
-        return (free + self.forced[lanes] * i_zeta**order * np.exp(i_zeta * tau)).real
+    def terms(self, tau, lanes=slice(None)):
+        """c e^(pτ) and F e^(iζτ) at times since the start, of all or some lanes."""
+        return self.begin[:, lanes] * np.exp(self.rates[:, lanes] * tau)
+
+    def derivative(self, order, terms, lanes=slice(None)):
+        """That of this order where the two terms are these."""
+        for _ in range(order):
+            terms = terms * self.rates[:, lanes]
+        return terms.real.sum(axis=0)
 
     def root(self, order, low, high, lanes, offset=0.0):
-        """Where a derivative, less `offset`, changes sign between two times, by bisection."""
-        sign = np.sign(self.at(order, high, lanes) - offset)
-        for _ in range(60):
-            middle = 0.5 * (low + high)
-            beyond = (self.at(order, middle, lanes) - offset) * sign > 0
-            low, high = np.where(beyond, low, middle), np.where(beyond, middle, high)
-        return high
+        """Where a derivative, less `offset`, changes sign between two times: by Newton's steps, and
+        by bisection where these leave the bracket or do not shrink to half."""
+        at_end = self.derivative(order, self.terms(high, lanes), lanes)
+        offset = np.broadcast_to(offset, high.shape)
+        sign = np.sign(at_end - offset)
+        low, high, found = low.copy(), high.copy(), 0.5 * (low + high)
+        step = high - low
+        size = abs(self.begin[:, lanes] * self.rates[:, lanes] ** order).sum(axis=0) + abs(offset)
+        left = np.arange(high.size)
+        while left.size:
+            time, mine = found[left], lanes[left]
+            terms = self.terms(time, mine)
+            value = self.derivative(order, terms, mine) - offset[left]
+            slope = self.derivative(order + 1, terms, mine)
+            beyond = value * sign[left] > 0
+            high[left] = np.where(beyond, time, high[left])
+            low[left] = np.where(beyond, low[left], time)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                new = time - value / slope
+            newton = (
+                (abs(new - time) <= 0.5 * step[left]) & (low[left] <= new) & (new <= high[left])
+            )
+            new = np.where(newton, new, 0.5 * (low[left] + high[left]))
+            new = np.where(abs(value) <= ULP * size[left], time, new)
+            step[left], found[left] = abs(new - time), new
+            left = left[step[left] > ULP * new]
+        return found
 
     def pieces(self, length):
-        """Times (points, lanes) between which Y is monotone, from the zeros of Y''' downwards."""
-        times = [np.zeros_like(length), length]
+        """Times (points, lanes) between which Y is monotone, from the zeros of Y''' downwards, and
+        Y there."""
+        times, terms = [np.zeros_like(length), length], [self.begin, self.terms(length)]
         for order in (3, 2, 1):
-            values = [self.at(order, time) for time in times]
-            finer = times[:1]
+            values = [self.derivative(order, x) for x in terms]
+            finer, there = times[:1], terms[:1]
             for i in range(len(times) - 1):
-                turn = times[i].copy()
+                turn, at_turn = times[i].copy(), terms[i].copy()
                 turns = np.flatnonzero(values[i] * values[i + 1] < 0)
                 turn[turns] = self.root(order, times[i][turns], times[i + 1][turns], turns)
-                finer += [turn, times[i + 1]]
-            times = finer
-        return np.array(times)
+                at_turn[:, turns] = self.terms(turn[turns], turns)
+                finer, there = [*finer, turn, times[i + 1]], [*there, at_turn, terms[i + 1]]
+            times, terms = finer, there
+        return np.array(times), np.array([self.derivative(0, x) for x in terms])
 
 
 def flown(zeta, xi, stops, Y, V, cycles, *, section=0.0, fineness=32):
@@ -133,8 +160,7 @@ def _look(on, zeta, xi, section, stops, look, whole, arrays):
     flight = _Flight(zeta[on], xi[on], phase, Y[on], V[on])
     left = whole[on] - t[on]
     length = np.where(left <= look[on] * (1 + 1e-9), left, look[on])
-    times = flight.pieces(length)
-    heights = np.array([flight.at(0, time) for time in times])
+    times, heights = flight.pieces(length)
     first = np.full(on.size, len(times))
     which = np.full(on.size, -1)
     for i, (sign, gap, _) in enumerate(stops):
@@ -154,8 +180,8 @@ def _look(on, zeta, xi, section, stops, look, whole, arrays):
     passed = np.arange(len(times))[:, None] < first
     low[on] = np.minimum(low[on], np.where(passed, heights, np.inf).min(axis=0))
     high[on] = np.maximum(high[on], np.where(passed, heights, -np.inf).max(axis=0))
-    everyone = np.arange(on.size)
-    Y[on], V[on] = flight.at(0, end, everyone), flight.at(1, end, everyone)
+    terms = flight.terms(end)
+    Y[on], V[on] = flight.derivative(0, terms), flight.derivative(1, terms)
     t[on] = np.where(end == left, whole[on], t[on] + end)
     for i, (sign, gap, k) in enumerate(stops):
         mine = on[which == i]

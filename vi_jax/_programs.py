@@ -10,8 +10,9 @@ import gc
 import threading
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import equinox as eqx
@@ -22,8 +23,10 @@ from jax.core import Tracer
 from .lanes import Unsupported, current_road, vector_only
 
 # With these XLA compiles two to three times faster. What runs for long is in the lanes, whose code
-# is not XLA's.
-_QUICK = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 0}
+# is not XLA's; of a program that does much besides, the first alone saves half of that and costs it
+# nothing.
+PLAIN = {"xla_cpu_use_fusion_emitters": False}
+_QUICK = {**PLAIN, "xla_backend_optimization_level": 0}
 
 _MAPS, _MOST = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
 
@@ -101,17 +104,26 @@ _watch = _Watch()
 
 
 class Program:
-    """A function that is compiled as by `eqx.filter_jit`, and whose programs can be dropped."""
+    """A function that is compiled as by `eqx.filter_jit`, and whose programs can be dropped.
 
-    def __init__(self, function: Callable[..., Any], **options: Any):
+    **Arguments:** the function; XLA's options where lanes are vector code, and further arguments
+    of `eqx.filter_jit` where they are XLA's.
+    """
+
+    def __init__(
+        self,
+        function: Callable[..., Any],
+        quick: Mapping[str, Any] = MappingProxyType(_QUICK),
+        **options: Any,
+    ):
         functools.update_wrapper(self, function)
         self._compiled = eqx.filter_jit(function, **options)
-        self._function, self._options = function, options
-        self._may_be_quick = "compiler_options" not in options
+        self._function, self._quick_options = function, quick
+        self._may_be_quick = True
 
     @functools.cached_property
     def _quick(self) -> Any:
-        options: dict[str, Any] = {"compiler_options": _quick_options(), **self._options}
+        options: Any = {"compiler_options": _known(**self._quick_options)}
         return eqx.filter_jit(self._function, **options)
 
     def drop(self) -> None:
@@ -146,12 +158,12 @@ def _is_outermost(*arguments: Any) -> bool:
 
 
 @functools.cache
-def _quick_options() -> dict[str, Any]:
+def _known(**options: Any) -> dict[str, Any]:
     """Those of the options that this XLA knows."""
     if jax.default_backend() != "cpu":
         return {}
     known = {}
-    for name, value in _QUICK.items():
+    for name, value in options.items():
         with contextlib.suppress(jax.errors.JaxRuntimeError):
             jax.jit(lambda: 0, compiler_options={name: value}).lower().compile()
             known[name] = value

@@ -76,13 +76,14 @@ def compared(name, lanes, seed, draw=draw):
     x = draw(lanes, seed)
     states, low, high, rests, good = map(np.asarray, program(name)(tuple(map(jnp.asarray, x))))
     assert good.all()
-    zeta, xi, k, gap, Y, V, section = x
-
-    def true(shift):
-        stops = ((1, gap + shift, k),)
-        return truth.flown(zeta, xi, stops, Y + shift, V, CYCLES, section=section)
-
-    expected, nudged = true(0.0), true(1e-9)
+    # Once as they are, and once with all moved a little.
+    moved = np.repeat([0.0, 1e-9], lanes)
+    zeta, xi, k, gap, Y, V, section = (np.tile(numbers, 2) for numbers in x)
+    stops = ((1, gap + moved, k),)
+    both = truth.flown(zeta, xi, stops, Y + moved, V, CYCLES, section=section)
+    expected, nudged = (
+        truth.Truth(*(a[..., half] for a in both)) for half in (np.s_[:lanes], np.s_[lanes:])
+    )
     apart = np.abs(np.moveaxis(expected.sections, -1, 0) - states).max(axis=(1, 2))
     apart = np.maximum(apart, np.abs(expected.y_min.T - low).max(axis=1))
     apart = np.maximum(apart, np.abs(expected.y_max.T - high).max(axis=1))

@@ -22,8 +22,8 @@ def main() -> None:
     import vi_jax as vi
 
     scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.8, gap=2.0)
-    one = {name: values[:1] for name, values in AXES.items()}
-    vi.scan(scene, one, settle=1500, lanes=512, workers=2)  # compiles
+    block = {**AXES, "drive.frequency_ratio": AXES["drive.frequency_ratio"][:8]}
+    vi.scan(scene, block, settle=1500, lanes=512, workers=2)  # compiles
     print("begins", flush=True)
     if not options.cluster:
         vi.scan(scene, AXES, settle=1500, lanes=512, workers=2, store=options.store)

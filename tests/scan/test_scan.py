@@ -451,8 +451,27 @@ def _finished(path, *options, **environment):
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    return _finished(tmp_path_factory.mktemp("scan") / "whole")
+def undisturbed(tmp_path_factory):
+    """The numbers of the scan, and how long it takes once its programs are compiled."""
+    folder = tmp_path_factory.mktemp("scan")
+    kept = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(folder / "programs")}
+    process = _under_way(folder / "whole", env=kept)
+    begin = time.perf_counter()
+    assert process.stdout.readline() == "ends\n"
+    lasts = time.perf_counter() - begin
+    assert process.wait() == 0
+    return _stored(folder / "whole"), lasts, kept
+
+
+@pytest.fixture
+def whole(undisturbed):
+    return undisturbed[0]
+
+
+def _under_way(path, **environment):
+    process = _run(path, **environment)
+    assert process.stdout.readline() == "begins\n"
+    return process
 
 
 def _same(found, whole):
@@ -461,40 +480,27 @@ def _same(found, whole):
 
 
 @pytest.mark.slow
-def test_killed_at_any_moment_the_store_ends_the_same(tmp_path, whole):
-    kept = {"env": {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(tmp_path / "programs")}}
-
-    def under_way(path):
-        process = _run(path, **kept)
-        assert process.stdout is not None
-        process.stdout.readline()
-        return process
-
-    process = under_way(tmp_path / "first")
-    begin = time.perf_counter()
-    assert process.stdout is not None and process.stdout.readline() == "ends\n"
-    lasts = time.perf_counter() - begin  # the scan alone, without the interpreter's end
-    assert process.wait() == 0
+def test_killed_again_and_again_the_store_ends_the_same(tmp_path, undisturbed):
+    """Every run goes on with what the killed ones left, and is killed itself until one ends."""
+    whole, lasts, kept = undisturbed
     rng = np.random.default_rng(3)
-    killed = parts = tries = 0
-    while tries < 10 or (tries < 30 and (killed < 5 or parts < 3)):
-        path = tmp_path / f"killed{tries}"
-        process = under_way(path)
-        # One in each tenth of the scan.
-        moment = (tries % 10 + rng.uniform()) / 10 * lasts
-        tries += 1
+    killed, parts, path = 0, set(), tmp_path / "store"
+    for tries in range(40):
+        process = _under_way(path, env=kept)
         try:
-            process.wait(timeout=moment)
-            lasts *= 0.7  # it was over: the first scan had more to compile, or less of the cores
+            process.wait(timeout=0.5 * lasts * rng.uniform())
         except subprocess.TimeoutExpired:
             process.send_signal(signal.SIGKILL)
             killed += process.wait() == -signal.SIGKILL
-        if path.exists():
-            done = _stored(path)["result"] != -1
-            parts += bool(done.any() and not done.all())
-        _same(_finished(path, **kept), whole)
-    # The first tenths go to tracing and to making the store, and no run lasts as long as another.
-    assert killed >= 5 and parts >= 3, (killed, parts)
+        if process.wait() == 0:
+            _same(_stored(path), whole)
+            if killed >= 5 and len(parts) >= 3:
+                break
+            path = tmp_path / f"store{tries}"
+        elif path.exists():
+            done = (_stored(path)["result"] != -1).sum()
+            parts |= {done} - {0, whole["result"].size}
+    assert killed >= 5 and len(parts) >= 3, (killed, parts)
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""how the blocks of a scan are computed: threads and devices here, or a Dask cluster."""
+"""How the blocks of a scan are computed: threads and devices here, or a Dask cluster."""
 
 import functools
 import math
@@ -16,7 +16,7 @@ from jaxtyping import Array
 
 from .. import lanes
 from .._checks import count
-from .._programs import Program
+from .._programs import PLAIN, Program
 from ..flow.fusion import compiling
 from .grid import Blocks
 from .job import Job
@@ -60,7 +60,7 @@ def rounded(lanes: int, total: int, devices: int) -> int:
 @functools.cache
 def _compiled(devices: int) -> Callable[..., dict[str, Array]]:
     if devices == 1:
-        return Program(lambda job, values, wanted: job(values, wanted), **compiling())
+        return Program(lambda job, values, wanted: job(values, wanted), PLAIN, **compiling())
     mesh = Mesh(np.asarray(jax.local_devices()[:devices]), ("lanes",))
     whole, split = PartitionSpec(), PartitionSpec("lanes")
 
@@ -74,7 +74,7 @@ def _compiled(devices: int) -> Callable[..., dict[str, Array]]:
             here, mesh=mesh, in_specs=(whole, split, split), out_specs=split, check_vma=False
         )(numbers, values, wanted)
 
-    return Program(spread, **compiling())
+    return Program(spread, PLAIN, **compiling())
 
 
 def compute(
