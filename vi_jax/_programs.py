@@ -117,8 +117,8 @@ class Program:
         **options: Any,
     ):
         functools.update_wrapper(self, function)
-        self._compiled = eqx.filter_jit(function, **options)
-        self._function, self._quick_options = function, quick
+        self._function, self._quick_options = _uncollected(function), quick
+        self._compiled = eqx.filter_jit(self._function, **options)
         self._may_be_quick = True
 
     @functools.cached_property
@@ -148,6 +148,23 @@ class Program:
                 if "compiler_options" not in str(error):
                     raise
         return self._compiled(*arguments, **keywords)
+
+
+def _uncollected(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function, which runs only to be traced, without a search for rubbish meanwhile: hardly
+    any is made then, and the many objects that stay have it search all again and again."""
+
+    @functools.wraps(function)
+    def traced(*arguments: Any, **keywords: Any) -> Any:
+        enabled = gc.isenabled()
+        gc.disable()
+        try:
+            return function(*arguments, **keywords)
+        finally:
+            if enabled:
+                gc.enable()
+
+    return traced
 
 
 def _is_outermost(*arguments: Any) -> bool:
