@@ -74,8 +74,15 @@ CALLS = {
     "a text in a start": (simulate(vi.OscillatorState(0.0, "a")), "its V is 'a'"),
     "None in a start": (simulate(vi.OscillatorState(None, 0.0)), "its Y is None"),
     "texts in a guess": (orbit(vi.OscillatorState("a", "b")), "its Y is 'a'"),
+    **{f"{x!r} in {who}": (call(vi.OscillatorState(x, 0.0)), "must hold real numbers, but its Y")
+       for x in (1j, np.complex128(1j), jnp.array(1j), jnp.array(True), "a")
+       for who, call in {
+           "a start": simulate, "a guess": orbit,
+           "a sweep's start": lambda start: sweep(start=start),
+           "a scan's start": lambda start: scan(start=start),
+           "an own scene's start": lambda start: lambda: vi.simulate(Own(), start, 2)}.items()},
     "a list for an own scene": (lambda: vi.simulate(Own(), [0.0], 2), "`start` must be a state"),
-    "a text for an own scene": (lambda: vi.simulate(Own(), "ab", 2), "`start` must be a state"),
+    "a text for an own scene": (lambda: vi.simulate(Own(), "ab", 2), "`start` must hold real"),
     "a list as a scan's start": (scan(start=[0.0]), "`start` must be a `OscillatorState`"),
     "a text as a sweep's start": (sweep(start="ab"), "`start` must be a `OscillatorState`"),
     "cycles=10**12": (simulate(cycles=10**12), "`cycles` must be at most"),
@@ -153,6 +160,7 @@ CALLS = {
     "store=5": (scan(store=5), "`store` must be a path"),
     "store=''": (scan(store=""), "`store` must be a path"),
     "store of a null": (scan(store="a\0b"), "`store` must be a path"),
+    "a picture of axes": (lambda: vi.save_picture("ax", "a.png"), "`figure` must be a figure, as"),
     "FixedStep": (lambda: vi.FixedStep(steps_per_cycle=10**12), "`steps_per_cycle` must be at"),
 }  # fmt: skip
 

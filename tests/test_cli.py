@@ -3,14 +3,17 @@
 import subprocess
 import sys
 import time
+from importlib import metadata
 from io import StringIO
 
 import pytest
+import vi_jax as vi
 from vi_jax import cli
 from vi_jax.cli import entry, progress
 
 
 def test_version(capsys):
+    assert vi.__version__ == metadata.version("vi-jax") and "__version__" in dir(vi)
     with pytest.raises(SystemExit) as ended:
         cli.main(["--version"])
     assert ended.value.code == 0

@@ -305,7 +305,7 @@ AXES = "[axes]\ndrive.frequency_ratio = [0.8, 0.9]\nstops.0.gap = [1, 2]\n"
         ("scan", "[axes]\nstops.0.restitution = [2]\n[scan]",
          "[scan]: `restitution` must be finite"),
         ("scan", AXES + "[scan]\nderivatives = 'gap'", "near names: stops.0.gap"),
-        ("scan", AXES + "[scan]\npicture = 'x.jpg'", "`picture` in [scan] must end in .png"),
+        ("scan", AXES + "[scan]\npicture = 'x.jpg'", "must end in .png, .pdf, .svg, but"),
         ("scan", AXES + "[scan]\npicture = 'file.toml/x.png'", "`picture` in [scan] cannot be"),
         ("scan", AXES + "[scan]\npicture = 'folder.png'", "it is a folder"),
         ("scan", AXES + "[scan]\nmeasure = 'frequency_ratio'\npicture = 'x.png'", 'needs "regime"'),
@@ -431,7 +431,7 @@ def test_scan(here, capsys):
     assert [path.name for path in here.iterdir()] == ["file.toml"]
     out = ran(capsys, "scan", SCAN + "store = 'new/s.zarr'\npicture = 's.png'")
     assert "new/s.zarr" in out and "<xarray.Dataset>" not in out and is_png("s.png")
-    data = xr.open_zarr("new/s.zarr", consolidated=False)
+    data = xr.open_zarr("new/s.zarr")
     scene = vi.Scene.ideal(frequency_ratio=0.8, damping_ratio=0.05)
     run = vi.simulate(scene, scene.start(), 128, settle=60, method=vi.ExactFlight())
     assert float(data["y_min"][0, 0]) == pytest.approx(float(np.min(run.y_min)), abs=1e-12)
@@ -541,6 +541,7 @@ def test_the_example_of_the_module_is_valid(here):
 
 def test_a_ready_machine_and_one_of_ones_own(here, capsys):
     own = "import vi_jax as vi\n\n\ndef ball():\n    return vi.machines.BouncingBall()\n"
+    own += "\n\ndef dead():\n    return vi.machines.BouncingBall(restitution=-1)\n"
     (here / "shaken.py").write_text(own)
     asked = written("[simulate]\ncycles = 3")
     assert cli.main(["simulate", str(asked), "--machine", "shaken:ball"]) == 0
@@ -551,6 +552,11 @@ def test_a_ready_machine_and_one_of_ones_own(here, capsys):
         ("shaken:bell", "cannot be found"),
         ("nowhere:ball", "cannot be found"),
         ("shaken", "must be package.module:function"),
+        ("os:system", "must be a function without arguments"),
+        ("math:pi", "must be a function without arguments"),
+        ("sys:exit", "raised SystemExit"),
+        ("os:getcwd", "must return a machine"),
+        ("shaken:dead", "shaken.py, line 9)"),
     ):
         assert cli.main(["simulate", str(asked), "--machine", name]) == 2
         assert sentence in capsys.readouterr().err

@@ -1,15 +1,18 @@
 """Rooms import one way, nothing private of each other, and no file outgrows its subject."""
 
 import ast
+import importlib
 from collections.abc import Iterator
 from pathlib import Path
+
+import vi_jax
 
 HOUSE = Path(__file__).parents[1] / "vi_jax"
 FILES = sorted(HOUSE.rglob("*.py"))
 
 # Each may import from those before it.
 ORDER = "lanes scene flow machines orbit scan plot paper explore cli".split()
-TOOLS = {"_checks", "_files", "_lazy", "_programs"}
+TOOLS = {"_checks", "_files", "_interrupted", "_lazy", "_numbers", "_programs", "_version"}
 
 
 def imports(path: Path) -> Iterator[tuple[list[str], str]]:
@@ -55,3 +58,22 @@ def test_no_file_has_more_than_350_lines():
         if (lines := path.read_text(encoding="utf-8").count("\n")) > 350
     }
     assert not long
+
+
+def test_a_room_hidden_by_a_verb_can_be_imported_from():
+    import vi_jax.scan.store as store
+    from vi_jax.scan import measures
+
+    assert store is importlib.import_module("vi_jax.scan.store")
+    assert vi_jax.scan.measures is measures  # pyright: ignore
+    assert vi_jax.scan is importlib.import_module("vi_jax.scan").scan
+
+
+def test_what_is_listed_is_what_is_offered():
+    listed = dir(vi_jax)
+    assert not {"TYPE_CHECKING", "importlib", "lanes", "flow", "orbit", "scene", "sys"} & {*listed}
+    assert {"scan", "sweep", "machines", "plot", "__version__"} <= {*listed}
+    for name in listed:
+        value = getattr(vi_jax, name)
+        home = getattr(value, "__module__", None) or getattr(value, "__name__", "vi_jax")
+        assert home.startswith("vi_jax"), name

@@ -129,7 +129,7 @@ def test_a_part_of_another_program_is_compiled_with_it():
 
 def test_compiler_options_that_xla_does_not_know_are_left_out():
     options = {"xla_no_such_option": 1, **_programs.PLAIN}
-    assert _programs._known(**options) == _programs.PLAIN
+    assert _programs._known(options) == _programs.PLAIN
     assert float(_programs.Program(lambda x: x + 1, options)(jnp.asarray(1.0))) == 2.0
 
 

@@ -1,13 +1,19 @@
 """vi_jax: differentiable, vectorised simulation of vibro-impact systems."""
 
 import importlib
-from typing import TYPE_CHECKING
+import sys
+import types
+import typing
 
+from . import _version
 from . import machines as machines
+from ._interrupted import Interrupted as Interrupted
+from .flow import EVENTS as EVENTS
 from .flow import RESULTS as RESULTS
 from .flow import AbstractMethod as AbstractMethod
 from .flow import Adaptive as Adaptive
 from .flow import Errors as Errors
+from .flow import EventLog as EventLog
 from .flow import ExactFlight as ExactFlight
 from .flow import FixedStep as FixedStep
 from .flow import ImpactLog as ImpactLog
@@ -76,7 +82,8 @@ from .scene import Switch as Switch
 from .scene import TimedDCMotorState as TimedDCMotorState
 from .scene import TimedMotorState as TimedMotorState
 
-if TYPE_CHECKING:
+if typing.TYPE_CHECKING:
+    __version__: str
     from .plot import animate as animate
     from .plot import plot_basins as plot_basins
     from .plot import plot_boundary as plot_boundary
@@ -92,6 +99,8 @@ if TYPE_CHECKING:
 
 def __getattr__(name: str):
     """Plots, loaded when the first of them is asked for: matplotlib takes long to load."""
+    if name == "__version__":
+        return _version.installed_version()
     if name == "plot" or name.startswith("plot_") or name in ("animate", "save_picture"):
         plot = importlib.import_module(".plot", __name__)
         return plot if name == "plot" else getattr(plot, name)
@@ -99,7 +108,27 @@ def __getattr__(name: str):
 
 
 def __dir__() -> list[str]:
+    """What this package offers: its names, the plots and the rooms of ready parts."""
     from . import plot
 
-    pictures = (name for name in vars(plot) if name.startswith("plot_"))
-    return sorted({*globals(), *pictures, "animate", "save_picture"})
+    pictures = [name for name in vars(plot) if name.startswith("plot_")]
+    offered = (
+        name
+        for name, value in globals().items()
+        if not name.startswith("_") and not isinstance(value, types.ModuleType)
+    )
+    return sorted(
+        {*offered, *pictures, "__version__", "animate", "machines", "plot", "save_picture"}
+    )
+
+
+def _room_of(verb: typing.Any) -> None:
+    """Give a verb the modules of the room that it hides by its name, so that `import` finds them:
+    `import vi_jax.scan.store`, while `vi_jax.scan(...)` scans."""
+    room = sys.modules[f"{__name__}.{verb.__name__}"]
+    for name, value in list(vars(room).items()):
+        if isinstance(value, types.ModuleType) and value.__name__ == f"{room.__name__}.{name}":
+            setattr(verb, name, value)
+
+
+_room_of(scan)

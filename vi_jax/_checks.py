@@ -3,9 +3,7 @@
 import math
 import os
 import tempfile
-import warnings
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,73 +14,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool
 
-
-def number(name: str, value: Any) -> jax.Array:
-    """A real number or array of numbers as a floating-point JAX array.
-
-    What is no tracer stays a known number inside of `jit` too, so that it can be checked there.
-
-    **Raises:** `TypeError` if `value` is not real-valued.
-    """
-    if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jnp.floating):
-        return _floating(name, value)
-    if isinstance(value, bool | str) or value is None:
-        raise TypeError(f"Argument `{name}` must be a real number, but got {value!r}.")
-    try:
-        if isinstance(value, int | float | np.generic | np.ndarray):
-            with jax.ensure_compile_time_eval():
-                return _floating(name, jnp.asarray(value))
-        array = jnp.asarray(value)
-    except (TypeError, ValueError, OverflowError):
-        raise TypeError(f"Argument `{name}` must be a real number, but got {value!r}.") from None
-    return _floating(name, array)
-
-
-def real(name: str) -> Callable[[Any], jax.Array]:
-    """The converter of a field that holds real numbers."""
-    return partial(number, name)
-
-
-def optional_real(name: str) -> Callable[[Any], jax.Array | None]:
-    """The converter of a field that holds real numbers or `None`."""
-    return lambda value: None if value is None else number(name, value)
-
-
-def _floating(name: str, array: jax.Array) -> jax.Array:
-    if not (jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)):
-        raise TypeError(
-            f"Argument `{name}` must be a real number, but its dtype is {array.dtype.name}."
-        )
-    if narrow(array):
-        warn_of_narrow(f"Argument `{name}` is")
-    elif jnp.issubdtype(array.dtype, jnp.floating):
-        return array
-    return array.astype(jnp.result_type(float))
-
-
-def narrow(value: Any) -> bool:
-    """Whether these are floating-point numbers of less than the session's precision."""
-    floating = eqx.is_inexact_array(value) and jnp.issubdtype(value.dtype, jnp.floating)
-    return floating and jnp.finfo(value.dtype).bits < jnp.finfo(jnp.result_type(float)).bits
-
-
-def warn_of_narrow(what: str) -> None:
-    """Say that numbers came in less than the session's precision, which nothing gives back."""
-    eps = float(jnp.finfo(jnp.float32).eps)
-    warnings.warn(
-        f"{what} of less than double precision, known to {eps:.0e} only, in a session of double "
-        "precision, to which it is promoted. Make numbers after double precision is switched on.",
-        stacklevel=4,
-    )
-
-
-def concrete(value: Any) -> np.ndarray | None:
-    """The numbers behind `value`, or `None` while they are being traced."""
-    if not isinstance(value, jax.Array | np.ndarray | np.generic | float | int):
-        return None  # a placeholder (a spec, a tangent's None), which holds no number to check
-    if isinstance(value, Tracer):
-        return None
-    return np.asarray(value)
+from ._numbers import concrete
 
 
 class Range(NamedTuple):
@@ -137,7 +69,7 @@ def in_range(tree: Any) -> Bool[Array, ""]:
     What is put into a module by `eqx.tree_at`, or is being traced, has passed no other check.
     """
     good = jnp.asarray(True)
-    for part in _modules(tree):
+    for part in {id(part): part for part in _modules(tree)}.values():
         for name, range_ in getattr(part, "ranges", {}).items():
             value = getattr(part, name)
             if value is not None and not callable(value):
@@ -156,7 +88,12 @@ def _modules(node: Any) -> Iterator[eqx.Module]:
 
 
 def count(name: str, value: Any, *, least: int = 0, most: int = 2**31 - 1) -> int:
-    """A Python integer from `least` to `most`, or an error that says what came."""
+    """A Python integer from `least` to `most`, or an error that says what came. A known integer of
+    JAX's or NumPy's, such as an orbit's `cycles`, is one."""
+    if isinstance(value, Tracer):
+        raise TypeError(f"Argument `{name}` must be an integer that is known, but is being traced.")
+    if isinstance(value, jax.Array | np.ndarray) and not value.ndim:
+        value = np.asarray(value)[()]
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise TypeError(f"Argument `{name}` must be an integer, but got {value!r}.")
     if value < least:
@@ -249,8 +186,7 @@ def count_or_traced(name: str, value: Any) -> Any:
     """As `count`, where the number may be traced, or a JAX array."""
     if isinstance(value, Tracer):
         return value
-    known = isinstance(value, jax.Array | np.ndarray)
-    return count(name, np.asarray(value)[()] if known else value)
+    return count(name, value)
 
 
 def tuple_of(name: str, value: Any, kind: type) -> tuple[Any, ...]:
@@ -272,17 +208,23 @@ def instance_of(name: str, value: Any, kind: type | tuple[type, ...], described:
 
 
 def state_of_numbers(name: str, state: Any) -> Any:
-    """`state`, each part of which is a number or an array.
+    """`state`, each part of which is a real number or an array of them.
 
     **Raises:** `TypeError` that names the part which is none.
     """
     for part, value in vars(state).items():
-        kinds = (jax.Array, np.ndarray, np.generic, int, float)  # tracers are among the first
-        if isinstance(value, bool) or not isinstance(value, kinds):
-            raise TypeError(
-                f"Argument `{name}` must hold real numbers, but its {part} is {value!r}."
-            )
+        require_real(name, part, value)
     return state
+
+
+def require_real(name: str, part: str, value: Any) -> None:
+    """**Raises:** `TypeError` if this part of an argument is neither a real number nor an array of
+    them, traced or not."""
+    real = isinstance(value, int | float) and not isinstance(value, bool)
+    if isinstance(value, jax.Array | np.ndarray | np.generic):  # tracers are among the first
+        real = any(jnp.issubdtype(value.dtype, kind) for kind in (jnp.floating, jnp.integer))
+    if not real:
+        raise TypeError(f"Argument `{name}` must hold real numbers, but its {part} is {value!r}.")
 
 
 def fits_records(name: str, records: int, numbers: int) -> None:

@@ -12,7 +12,6 @@ import time
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import equinox as eqx
@@ -113,7 +112,7 @@ class Program:
     def __init__(
         self,
         function: Callable[..., Any],
-        quick: Mapping[str, Any] = MappingProxyType(_QUICK),
+        quick: Mapping[str, Any] = _QUICK,
         **options: Any,
     ):
         functools.update_wrapper(self, function)
@@ -123,7 +122,7 @@ class Program:
 
     @functools.cached_property
     def _quick(self) -> Any:
-        options: Any = {"compiler_options": _known(**self._quick_options)}
+        options: Any = {"compiler_options": _known(self._quick_options)}
         return eqx.filter_jit(self._function, **options)
 
     def drop(self) -> None:
@@ -137,7 +136,7 @@ class Program:
     def __call__(self, *arguments: Any, **keywords: Any) -> Any:
         """As the function."""
         _watch.called(self)
-        if self._may_be_quick and current_road() != "xla" and _is_outermost(arguments, keywords):
+        if self._may_be_quick and current_road() != "xla" and is_outermost(arguments, keywords):
             try:
                 with vector_only():
                     return self._quick(*arguments, **keywords)
@@ -167,24 +166,26 @@ def _uncollected(function: Callable[..., Any]) -> Callable[..., Any]:
     return traced
 
 
-def _is_outermost(*arguments: Any) -> bool:
+def is_outermost(*arguments: Any) -> bool:
     """Whether a call is not a part of another program: only then JAX takes compiler options."""
     if any(isinstance(x, Tracer) for x in jtu.tree_leaves(arguments)):
         return False
     return not isinstance(jax.lax.full((1,), 0.0), Tracer)
 
 
-@functools.cache
-def _known(**options: Any) -> dict[str, Any]:
+def _known(options: Mapping[str, Any]) -> dict[str, Any]:
     """Those of the options that this XLA knows."""
     if jax.default_backend() != "cpu":
         return {}
-    known = {}
-    for name, value in options.items():
-        with contextlib.suppress(jax.errors.JaxRuntimeError):
-            jax.jit(lambda: 0, compiler_options={name: value}).lower().compile()
-            known[name] = value
-    return known
+    return {name: value for name, value in options.items() if _is_known(name, value)}
+
+
+@functools.cache
+def _is_known(name: str, value: Any) -> bool:
+    with contextlib.suppress(jax.errors.JaxRuntimeError):
+        jax.jit(lambda: 0, compiler_options={name: value}).lower().compile()
+        return True
+    return False
 
 
 def compiled(function: Callable[..., Any]) -> Program:

@@ -141,7 +141,7 @@ def bands(count: int) -> np.ndarray:
     return found
 
 
-period = np.select([repeats(p) for p in (1, 2, 4, 8)], (1, 2, 4, 8), 0)
+period = np.select([repeats(p) for p in (1, 2, 4, 8)], (1, 2, 4, 8), int(vi.REGIMES.unsettled))
 
 # %% [markdown]
 # ## The branches
@@ -227,7 +227,7 @@ split = np.nan
 if fit.sum() >= 3:
     slope, offset = np.polyfit(zeta[fit] - LEFT[0], halves[fit] ** 2, 1)
     split = LEFT[0] - offset / slope
-chaotic = (exponent > 0.003) & (period == 0)
+chaotic = (exponent > 0.003) & (period == vi.REGIMES.unsettled)
 inside = (zeta >= zeta[chaotic].min()) & (zeta <= zeta[chaotic].max())
 regular = (zeta < doubling[0].parameter - 0.002) & (period == 2)
 

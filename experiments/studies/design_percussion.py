@@ -100,7 +100,7 @@ def lagrangian(design: Any, guess: Any, force: Force) -> tuple[Any, tuple]:
     excess = jnp.stack([trace - det, -trace - det, gap]) - 1  # to be ≤ 0
     pushed = jnp.maximum(0.0, force.price + force.weight * excess)
     penalty = jnp.sum(pushed**2 - force.price**2) / (2 * force.weight)
-    allowed = (orbit.result == vi.ORBIT_RESULTS.converged) & orbit.admissible
+    allowed = (orbit.result == vi.ORBIT_RESULTS.successful) & orbit.admissible
     modulus = jnp.max(jnp.abs(orbit.multipliers))
     return penalty - power, Outcome(power, modulus, excess, allowed, orbit)
 

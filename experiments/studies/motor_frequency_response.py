@@ -120,7 +120,7 @@ def restless(sweep: vi.Sweep) -> tuple[int, int, int]:
     W = np.asarray(sweep.sections.W)
     early, late = np.split(W, 2, axis=1)
     lost = ~np.isfinite(W).all(axis=1)
-    loose = (np.asarray(sweep.period) == 0) & ~lost
+    loose = (np.asarray(sweep.period) == vi.REGIMES.unsettled) & ~lost
     drift = np.abs(late.mean(axis=1) - early.mean(axis=1)) > 0.25 * np.ptp(W, axis=1)
     return int(lost.sum()), int((loose & drift).sum()), int((loose & ~drift).sum())
 

@@ -1,11 +1,16 @@
 """A user's own scene: a ball bouncing on a floor under constant force, beside its closed form."""
 
+import math
+import warnings
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
+from vi_jax.flow._by_numpy import by_numpy
 
 
 class Ball(eqx.Module):
@@ -105,7 +110,16 @@ class Wrong(BouncingBall):
             return Ball(state.V, jnp.ones(2))
         if self.kind == "if" and state.Y > 0:
             return Ball(state.V, state.V)
+        if self.kind == "numpy":
+            return Ball(state.V, -np.cos(s))
+        if self.kind == "math":
+            return Ball(state.V, -math.sin(state.Y))
         return Ball(state.V, -self.gravity)
+
+    def section(self, state):
+        if self.kind == "section":
+            return state.Y if state.V > 0 else -state.Y
+        return None
 
 
 @pytest.mark.parametrize("verb", [lambda m, x: vi.simulate(m, x, 2), vi.find_orbit])
@@ -116,6 +130,9 @@ class Wrong(BouncingBall):
         ("tuple", (), "`field` of a Wrong must return"),
         ("shape", (), "`field` of a Wrong must return"),
         ("if", (), "`jnp.where`, not `if`"),
+        ("numpy", (), "`field` of a Wrong .* with the functions of `jax.numpy`"),
+        ("math", (), "`field` of a Wrong .* with the functions of `jax.numpy`"),
+        ("section", (), "`section` of a Wrong .* `jnp.where`, not `if`"),
         ("", (0.5,), "`stops` of a Wrong must be a tuple"),
         ("", vi.RigidStop(0.5, 0.5), "`stops` of a Wrong must be a tuple"),
         ("", (vi.RigidStop(0.5, 0.5, coordinate=1),), "limits coordinate 1, but there are 1"),
@@ -125,6 +142,92 @@ def test_a_machine_that_is_none_is_told_what_is_wrong(kind, stops, told, verb):
     machine = Wrong(jnp.asarray(1.0), stops, kind)
     with pytest.raises((TypeError, ValueError), match=told):
         verb(machine, Ball(*map(jnp.asarray, (0.1, 0.0))))
+
+
+class Swapped(BouncingBall):
+    """Its field takes the state first, as others do."""
+
+    def field(self, state, s):  # pyright: ignore
+        return Ball(state.V, -self.gravity * jnp.cos(s))
+
+
+class Stateless(BouncingBall):
+    """Its field takes no clock."""
+
+    def field(self, state):  # pyright: ignore
+        return Ball(state.V, -self.gravity)
+
+
+@pytest.mark.parametrize(
+    ("kind", "told"),
+    [
+        (Swapped, "`field` of a Swapped must take `s` first and then the state"),
+        (Stateless, "`field` of a Stateless must take `s`, the state: too many"),
+    ],
+)
+def test_a_field_of_other_arguments_is_told_which_it_gets(kind, told):
+    with pytest.raises(TypeError, match=told):
+        vi.simulate(kind(jnp.asarray(1.0), ()), Ball(*map(jnp.asarray, (0.1, 0.0))), 2)
+
+
+class Shaken(BouncingBall):
+    """Shaken at a frequency; its cycle is a number beside."""
+
+    frequency: jax.Array = eqx.field(default=1.0, converter=jnp.asarray)
+    length: jax.Array = eqx.field(default=2 * np.pi, converter=jnp.asarray)
+
+    @property
+    def cycle(self):
+        return self.length
+
+    def field(self, s, state):
+        shaken = self.gravity * jnp.sin(self.frequency * s) * jnp.clip(state.Y, 1.0, 2.0)
+        return Ball(state.V, shaken - state.Y - jax.nn.relu(state.V) ** 2)
+
+
+def test_a_function_of_jax_computed_by_numpy():
+    def function(x, y):
+        far = jnp.interp(y, jnp.arange(4.0), jnp.arange(4.0) ** 2) + jnp.floor_divide(x, 0.3)
+        bent = jax.nn.relu(x - 1) + jax.nn.sigmoid(x) + jnp.clip(y, 0, 1) + jnp.mod(x, 1.0)
+        powers = x**3 + jnp.abs(y) ** 2.5 + x**-2 + jnp.square(y) + 1 / jnp.sqrt(x)
+        waves = jnp.sinc(x) + jnp.atan2(y, x) + jnp.sign(y) * jnp.cos(x) + jnp.log1p(x)
+        row = jnp.array([1.0, 2.0]) @ jnp.stack([x, y])
+        loop = jax.lax.fori_loop(0, 3, lambda i, z: 0.5 * z + i, x)
+        return {"z": far + bent + powers, "w": (waves + jax.lax.stop_gradient(row), loop)}
+
+    for x, y in ((0.37, -0.9), (1.9, 2.6)):
+        wanted = function(jnp.asarray(x), jnp.asarray(y))
+        found = by_numpy(function, jnp.asarray(x), y)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-14), found, wanted)
+        assert all(type(leaf) is np.ndarray for leaf in jax.tree.leaves(found))
+
+
+def test_a_field_of_another_period_than_its_cycle_is_warned_of_once():
+    start, floor = Ball(*map(jnp.asarray, (1.0, 0.3))), ()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for frequency, length in ((1.0, 6.28318), (2.0, np.pi), (3.0, 2 * np.pi)):
+            vi.simulate(Shaken(jnp.asarray(1.0), floor, frequency, length), start, 2)
+        # What is traced is not known.
+        machine = Shaken(jnp.asarray(1.0), floor, 1.1)
+        jax.jit(lambda x: vi.simulate(machine, x, 2).last.Y)(start)
+    verbs = (
+        lambda m: vi.simulate(m, start, 2),
+        lambda m: vi.find_orbit(m, start),
+        lambda m: vi.sweep(m, "gravity", [0.9, 1.0], start=start, settle=2, cycles=8),
+        lambda m: vi.scan(m, {"gravity": [0.9, 1.0]}, start=start, settle=2, cycles=8,
+                          measure="extremes"),
+        lambda m: vi.lyapunov(m, start, 8),
+    )  # fmt: skip
+    for verb in verbs:
+        own = type("Own", (Shaken,), {})
+        machine = own(jnp.asarray(1.0), floor, 1.1)
+        words = "`field` of a Own is not the same .* the rate of its V differs"
+        with pytest.warns(UserWarning, match=words) as told:
+            verb(machine)
+            verb(machine)
+        told = [w for w in told if "is not the same" in str(w.message)]
+        assert len(told) == 1 and told[0].filename == __file__
 
 
 class Carried(BouncingBall):
@@ -147,6 +250,32 @@ def test_extremes_are_those_of_the_first_coordinate():
     assert float(lifted.position(start)) == 0.5 and lifted.placed(start, start.V, start.V).Y == 1
 
 
+class Doubled(BouncingBall):
+    """The ball, named once more by what its class would say."""
+
+    @property
+    def coordinates(self):
+        return super().coordinates
+
+
+class DoubledCarried(Carried):
+    """The lifted ball, named once more."""
+
+    @property
+    def coordinates(self):
+        return super().coordinates
+
+
+@pytest.mark.parametrize("kind", [(BouncingBall, Doubled), (Carried, DoubledCarried)])
+def test_coordinates_may_ask_their_class(kind):
+    runs = []
+    for one in kind:
+        machine = one(jnp.asarray(2.0), (vi.RigidStop(0.0, 0.8, "left"),))
+        runs.append(vi.simulate(machine, Ball(jnp.asarray(1.5), jnp.asarray(0.0)), 3))
+    jax.tree.map(np.testing.assert_array_equal, *(run.sections for run in runs))
+    assert int(runs[1].impacts.sum()) > 0
+
+
 @pytest.mark.parametrize("clock", ["phase", "time"])
 def test_samples_cost_nothing_before_they_are_taken(clock):
     scene = vi.Parameters(control=0.9).scene()
@@ -159,3 +288,35 @@ def test_samples_cost_nothing_before_they_are_taken(clock):
         np.testing.assert_allclose(a, b[30 * 64 :], atol=1e-6)
     np.testing.assert_allclose(settled.duration, whole.duration[30:], atol=1e-8)
     np.testing.assert_array_equal(settled.impacts, whole.impacts[30:])
+
+
+class Odd(vi.AbstractScene):
+    """A machine of any cycle, whose field returns anything."""
+
+    length: float
+    returns: Any = eqx.field(static=True)
+    stops: tuple = ()
+
+    @property
+    def cycle(self):
+        return self.length
+
+    def field(self, s, state):
+        return self.returns(state)
+
+
+@pytest.mark.parametrize(
+    ("cycle", "returns", "words"),
+    [
+        (0.0, lambda x: x, "`cycle` of a Odd must be positive, but is 0.0"),
+        (-1.0, lambda x: x, "must be positive"),
+        (np.nan, lambda x: x, "must be positive"),
+        (1.0, lambda x: None, "but returned None"),
+        (1.0, lambda x: x.V, r"OscillatorState\(Y=f64\[\], V=f64\[\]\), but returned f64"),
+        (1.0, lambda x: (x.V, x.Y), r"but returned \(f64\[\], f64\[\]\)"),
+    ],
+)
+def test_a_cycle_or_a_field_that_is_none(cycle, returns, words):
+    start = vi.OscillatorState(jnp.array(1.0), jnp.array(0.0))
+    with pytest.raises((TypeError, ValueError), match=words):
+        vi.simulate(Odd(cycle, returns), start, 1)

@@ -39,3 +39,20 @@ def test_a_number_of_single_precision_is_told_where_it_comes_in(single):
     assert scene.stops[0].gap.dtype == jnp.float64
     with pytest.warns(UserWarning, match="`Y`.*double precision"):
         assert scene.start(Y=single(0.1)).Y.dtype == jnp.float64
+
+
+def test_a_scene_that_outlived_double_precision_is_refused_by_that_name():
+    scene, swept = vi.Scene.ideal(**NUMBERS), {"drive.frequency_ratio": [0.9, 1.0]}
+    start = scene.start(Y=-0.3)
+    with jax.enable_x64(False):
+        for call in (
+            lambda: vi.simulate(scene, start, 2),
+            lambda: vi.find_orbit(scene, start),
+            lambda: vi.sweep(scene, *swept, *swept.values(), start=start),
+            lambda: vi.scan(scene, swept, measure="extremes", cycles=2),
+        ):
+            with pytest.raises(TypeError, match=r"`scene` must be of single precision, .* \(.*gap"):
+                call()
+        early = vi.Scene.ideal(**NUMBERS)
+        with pytest.raises(TypeError, match=r"`start` .* double precision \(Y, V\)"):
+            vi.simulate(early, start, 2)

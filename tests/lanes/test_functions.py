@@ -72,25 +72,38 @@ FUNCTIONS = {
 }  # fmt: skip
 
 
-def ordinary(function, x, y):
-    """Lanes whose whole numbers are defined."""
-    return (np.abs(x) < 1e9) & (np.abs(y) < 1e9) if function == "whole numbers" else x == x
+def _numbers(name, x, y):
+    """The numbers that a function is asked at: lanes where another one is defined stay out."""
+    kind = x.dtype.type
+    if name == "whole numbers":
+        whole = (np.abs(x) < 1e9) & (np.abs(y) < 1e9)
+        return tuple(np.where(whole, z, kind(1.5)) for z in (x, y))
+    if name == "circle":  # beyond a million turns the reduction loses digits
+        return np.where(np.abs(x) > 1e6, kind(1.0), x), y
+    return x, y
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
-@pytest.mark.parametrize("name", FUNCTIONS)
-def test_elementwise(name, dtype):
-    function, units = FUNCTIONS[name]
+@pytest.fixture(scope="module", params=[np.float64, np.float32])
+def elementwise(request):
+    """All functions by one kernel and by XLA: type, and by name what either gives."""
+    dtype = request.param
     with np.errstate(over="ignore"):
         x, y = X.astype(dtype), Y.astype(dtype)
-    if name == "whole numbers":
-        keep = (np.abs(x) < 1e9) & (np.abs(y) < 1e9)
-        x, y = x[keep], y[keep]
-    if name == "circle":  # beyond a million turns the reduction loses digits
-        x = np.where(np.abs(x) > 1e6, dtype(1.0), x)
-    mine = once(function, x, y, road="auto")
-    eps = np.finfo(dtype).eps
-    for a, b in zip(mine, function(jnp.asarray(x), jnp.asarray(y)), strict=True):
+    numbers = {name: _numbers(name, x, y) for name in FUNCTIONS}
+
+    def all_of(numbers):
+        return {name: FUNCTIONS[name][0](*pair) for name, pair in numbers.items()}
+
+    mine = once(all_of, numbers, road="auto")
+    wanted = {name: FUNCTIONS[name][0](*map(jnp.asarray, pair)) for name, pair in numbers.items()}
+    return dtype, mine, wanted
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_elementwise(name, elementwise):
+    dtype, mine, wanted = elementwise
+    units, eps = FUNCTIONS[name][1], np.finfo(dtype).eps
+    for a, b in zip(mine[name], wanted[name], strict=True):
         assert a.dtype == b.dtype
         a, b = np.asarray(a), np.asarray(b)
         if a.dtype.kind != "f":
@@ -132,12 +145,21 @@ ARRAYS = {
 }
 
 
-@pytest.mark.parametrize("name", ARRAYS)
-def test_arrays_in_a_lane(name):
+@pytest.fixture(scope="module")
+def arrays():
+    """All of them by one kernel and by XLA."""
     x, y = np.random.default_rng(3).normal(0, 2, (2, 37))
-    function = ARRAYS[name]
-    mine = once(function, x, y, road="auto")
-    np.testing.assert_allclose(mine, jax.vmap(function)(x, y), rtol=1e-14, atol=1e-14)
+
+    def all_of(x, y):
+        return {name: function(x, y) for name, function in ARRAYS.items()}
+
+    return once(all_of, x, y, road="auto"), jax.vmap(all_of)(x, y)
+
+
+@pytest.mark.parametrize("name", ARRAYS)
+def test_arrays_in_a_lane(name, arrays):
+    mine, wanted = arrays
+    np.testing.assert_allclose(mine[name], wanted[name], rtol=1e-14, atol=1e-14)
 
 
 def branches(x, y):

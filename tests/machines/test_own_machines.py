@@ -1,6 +1,6 @@
 """Machines of one's own: two bodies that meet, a belt that drags, a block that sticks and slips."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -173,6 +173,46 @@ def met(method, record, number=250):
         return vi.simulate(Meeting(**numbers), start, 5, method=method, record=record)
 
     return vi.jit(jax.vmap(one))(*drawn(number))
+
+
+class Tanks(NamedTuple):
+    """A state of any names; the field is linear, x' = cos s - rate·x and y' = x - 2y."""
+
+    level: Any
+    heat: Any
+
+
+class Filter(vi.AbstractScene):
+    rate: jax.Array
+    stops = ()
+
+    @property
+    def cycle(self):
+        return 2 * np.pi
+
+    def field(self, s, state):
+        x, y = state
+        return Tanks(jnp.cos(s) - self.rate * x, x - 2 * y)
+
+    def start(self):
+        return Tanks(jnp.asarray(0.3), jnp.asarray(0.1))
+
+
+def test_a_machine_without_stops_needs_no_position():
+    """It runs with every verb, and its extremes are those of the first number of its state."""
+    machine = Filter(jnp.asarray(1.0))
+    orbit = vi.find_orbit(machine, machine.start())
+    run = vi.simulate(machine, orbit.state, 1)
+    x = 1 / (1j + 1)
+    wanted = x.real, (x / (1j + 2)).real
+    for state in (orbit.state, run.last):
+        np.testing.assert_allclose(state, wanted, atol=1e-9)
+    assert float(run.y_max[0]) == pytest.approx(abs(x), abs=1e-8)
+    np.testing.assert_allclose(orbit.multipliers, np.exp([-2 * np.pi, -4 * np.pi]), atol=1e-9)
+    branch = vi.continue_orbit(orbit, parameter="rate", bounds=(0.5, 2.0))
+    np.testing.assert_allclose(branch.y_max, 1 / np.abs(1j + branch.parameter), atol=1e-9)
+    with pytest.raises(TypeError, match="`start` must be a state of this scene, but got 'none'"):
+        vi.simulate(machine, "none", 1)
 
 
 def test_two_bodies_at_rest_on_one_another():

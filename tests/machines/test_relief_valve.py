@@ -183,5 +183,5 @@ def test_the_open_valve_comes_to_rest_where_its_equilibrium_turns_stable():
         return values[np.argmax(values.imag)]
 
     q = brentq(lambda q: growth(q).real, 8, 9, xtol=1e-13)
-    assert hopf.parameter == pytest.approx(q, abs=5e-9)
-    assert float(hopf.orbit.duration) == pytest.approx(2 * np.pi / growth(q).imag, abs=1e-5)
+    assert hopf.parameter == pytest.approx(q, abs=1e-12)
+    assert float(hopf.orbit.duration) == pytest.approx(2 * np.pi / growth(q).imag, abs=1e-11)

@@ -237,6 +237,21 @@ def test_wrong_numbers_are_named(make, told):
         make()
 
 
+def test_an_orbit_of_the_time_clock_is_that_of_the_angle():
+    """A search takes the machine by its angle, and states that were made for either clock."""
+    timed = ROTOR(clock_name="time")
+    settled = vi.simulate(timed, timed.start(), 1, settle=300, record="sections").last
+    by_time = vi.find_orbit(timed, settled)
+    by_angle = vi.find_orbit(ROTOR(), ROTOR().start())
+    assert bool(by_time.stable) and bool(by_angle.stable)
+    for name in "YVP":
+        values = [float(getattr(x, name)) for x in (settled, by_time.state, by_angle.state)]
+        assert values == pytest.approx(values[:1] * 3, abs=1e-6)
+    midway = eqx.tree_at(lambda x: x.phase, settled, jnp.asarray(1.3))
+    with pytest.raises(ValueError, match=r"`guess` must lie on the section, .* but has 1.3"):
+        vi.find_orbit(timed, midway)
+
+
 def test_a_start_of_another_kind_is_refused():
     rotor = ROTOR()
     with pytest.raises(TypeError, match=r"must be a `RotorState`.*got a `OscillatorState`"):

@@ -154,7 +154,10 @@ def test_continue_orbit(case, orbit, branch):
         lost = {"period-doubling": -1.0, "fold": 1.0, "symmetry-breaking": 1.0}.get(point.kind)
         if lost is not None:
             assert abs(np.linalg.eigvals(M) - lost).min() < 1e-5
-    vi.plot_branch(branch)
+    ax, data = vi.plot_branch(branch), branch.to_xarray()
+    position = case.machine.units.get("position", "1")
+    assert data.y_min.attrs.get("units", "1") == data.clearance.attrs.get("units", "1") == position
+    assert ax.get_ylabel().endswith(f" ({position})") or position == "1"
 
 
 @pytest.mark.slow

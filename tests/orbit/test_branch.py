@@ -265,11 +265,35 @@ def test_boundaries_in_a_second_parameter():
         assert zeta == pytest.approx(fold_by_eq_21(k, 2.0, zeta - 1e-3, zeta + 1e-3), abs=1e-8)
 
 
+def test_the_motions_at_its_bounds_and_ends(short, restitution):
+    low, high = bounds = (0.88, 0.92)
+    branch = vi.continue_orbit(
+        short_orbit(scene_at(0.9, restitution)), parameter=ZETA, bounds=bounds
+    )
+    assert branch.ends == ("bounds", "bounds")
+    for value in (low, 0.9, high):
+        (orbit,) = branch.at(value)
+        assert float(orbit.scene.drive.frequency_ratio) == pytest.approx(value, abs=1e-13)
+        closed = vi.closed_form_orbits(scene_at(value, restitution))
+        assert float(orbit.impact_speed[0]) == pytest.approx(
+            float(closed.impact_speed[0]), abs=1e-9
+        )
+    assert branch.at(high + 1e-9) == []
+    # On the fold two motions are one; where the second one's impact is lost, there is the first.
+    (fold,) = (point.parameter for point in short.special if point.kind == "fold")
+    assert len(short.at(fold)) == 1
+    first, lost = short.at(short.parameter[-1])
+    assert float(lost.impact_speed[0]) == pytest.approx(0, abs=1e-9)
+    assert float(first.impact_speed[0]) > 0.1
+
+
 def test_a_branch_as_data(short):
     data = short.to_xarray()
     assert data.sizes == {"point": len(short.parameter), "impact": 1, "state": 2}
     assert data.y_min.attrs["units"] == "a" and data.attrs["parameter"] == ZETA
     assert "period-doubling at" in str(short)
+    table = short.to_xarray(along="point").to_dataframe()
+    assert table.y_min.tolist() == short.y_min.tolist()
 
 
 @pytest.mark.parametrize(
@@ -284,6 +308,27 @@ def test_says_what_is_wrong(arguments, message):
     orbit = short_orbit(scene_at(0.9, 0.5))
     with pytest.raises(ValueError, match=message):
         vi.continue_orbit(orbit, **{"parameter": ZETA, "bounds": (0.5, 1.9), **arguments})
+
+
+def listing(orbit, count):
+    """An orbit with so many of its impacts listed, as by a shorter `impact_log`."""
+    listed = {name: getattr(orbit, f"impact_{name}")[:count] for name in ("phase", "speed", "stop")}
+    return dataclasses.replace(orbit, **{f"impact_{name}": x for name, x in listed.items()})
+
+
+def test_a_motion_that_rests_is_refused_for_that(short):
+    """However many of its impacts are listed: chatter, one that sticks, and rest all the time."""
+    for gap, restitution in ((0.3, 0.3), (0.3, 0.0), (-3.0, 0.3)):
+        scene = vi.Scene.ideal(
+            frequency_ratio=0.5, restitution=restitution, gap=gap, damping_ratio=0.05
+        )
+        orbit = vi.find_orbit(scene, scene.start(Y=gap), impact_log=32, throw=True)
+        assert (int(orbit.impacts) > 1) == (gap > 0)
+        for listed in (orbit, listing(orbit, 1)):
+            with pytest.raises(ValueError, match="`orbit` must not rest on a stop, but does"):
+                vi.continue_orbit(listed, parameter=ZETA, bounds=(0.4, 0.6))
+    with pytest.raises(ValueError, match=r"list all its 1 impacts, .* larger `impact_log`"):
+        vi.continue_orbit(listing(short.orbit(0), 0), parameter=ZETA, bounds=(0.5, 1.9))
 
 
 @pytest.mark.parametrize("name", ["step", "max_step"])
@@ -356,6 +401,10 @@ def test_a_boundary_ends_on_its_bounds(short):
     doubling = next(p for p in short.special if p.kind == "period-doubling")
     xi = "oscillator.damping_ratio"
     curve = vi.boundary(doubling, parameter=xi, bounds=((0.5, 1.9), (0.0, 0.004)))
+    data = curve.to_xarray()
+    np.testing.assert_array_equal(data[xi], curve.parameters[:, 1])
+    assert data[ZETA].attrs["units"] == "ω" and data.attrs["kind"] == curve.kind
+    assert len(curve.to_xarray(along="point").to_dataframe()) == len(curve.parameters)
     assert "bounds" in curve.ends
     ends = curve.parameters[[0, -1], 1]
     assert min(abs(ends)) < 1e-9 and max(ends) == pytest.approx(0.004, abs=1e-9)

@@ -159,7 +159,7 @@ def test_the_valve_from_rest_to_chatter():
     branch = vi.continue_orbit(orbit, parameter="flow_rate", bounds=(0.5, 9.5))
     assert branch.ends == ("grazing", "hopf")
     graze, hopf = branch.special
-    assert hopf.parameter == pytest.approx(brentq(equilibrium_growth, 8.0, 9.0), abs=1e-6)
+    assert hopf.parameter == pytest.approx(brentq(equilibrium_growth, 8.0, 9.0), abs=1e-11)
     start = np.array([float(x) for x in vars(graze.orbit.state).values()])
     end, low = valve_return(start, graze.parameter)
     # SciPy's dense output finds a maximum to some 1e-8 of time; the pressure gains 150 in a unit.

@@ -2,12 +2,14 @@
 
 import dataclasses
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
 import vi_jax as vi
+from scipy.integrate import solve_ivp
 
 UNDAMPED = vi.Scene.ideal(frequency_ratio=0.9)
 # Printed values: Y, V, least Y, impact phase, V⁻, multipliers.
@@ -26,7 +28,7 @@ def near(scene, cycles, by=0.01):
 def test_the_table_of_values(cycles):
     Y, V, y_min, phase, speed, multipliers = TABLE[cycles]
     orbit = vi.find_orbit(UNDAMPED, near(UNDAMPED, cycles), cycles=cycles, throw=True)
-    assert float(orbit.residual) < 1e-12 and orbit.result == vi.ORBIT_RESULTS.converged
+    assert float(orbit.residual) < 1e-12 and orbit.result == vi.ORBIT_RESULTS.successful
     assert int(orbit.cycles) == cycles and int(orbit.impacts) == 1 and bool(orbit.admissible)
     assert bool(orbit.stable) == (cycles == 2)
     assert orbit.impact_phase.shape == orbit.impact_speed.shape == (1,)
@@ -44,6 +46,55 @@ def test_the_table_of_values(cycles):
     np.testing.assert_allclose(stepped.multipliers, orbit.multipliers, atol=1e-8)
 
 
+def test_the_cycles_of_an_orbit_are_taken_as_a_number():
+    orbit = vi.find_orbit(UNDAMPED, near(UNDAMPED, 1))
+    again = vi.find_orbit(UNDAMPED, orbit.state, cycles=orbit.cycles)
+    run = vi.simulate(UNDAMPED, orbit.state, orbit.cycles, method=vi.ExactFlight())
+    assert int(again.cycles) == run.impacts.size == 1
+    assert float(again.state.Y) == pytest.approx(float(run.last.Y), abs=1e-12)
+    with pytest.raises(TypeError, match="`cycles` must be an integer that is known"):
+        jax.jit(lambda n: vi.find_orbit(UNDAMPED, orbit.state, cycles=n).state)(1)
+
+
+class VanDerPol(vi.AbstractScene):
+    """Y'' - μ(1 - Y²)Y' + Y = 0, observed where Y and Y' have risen, by a guard with a kink."""
+
+    mu: jax.Array
+    stops = ()
+
+    @property
+    def cycle(self):
+        return 6.6633
+
+    def section(self, state):
+        return jnp.minimum(state.Y, 2 * state.V) - 0.1
+
+    def field(self, s, state):
+        return vi.OscillatorState(state.V, self.mu * (1 - state.Y**2) * state.V - state.Y)
+
+
+def test_an_orbit_is_the_motion_that_is_simulated():
+    """Under the same method, in a machine of one's own; the period is SciPy's."""
+    machine = VanDerPol(jnp.asarray(5.0))
+    start = vi.OscillatorState(jnp.asarray(1.0), jnp.asarray(0.0))
+    settled = vi.simulate(machine, start, 1, settle=40)
+    orbit = vi.find_orbit(machine, settled.last)
+    run = vi.simulate(machine, orbit.state, 1)
+    # Both meet the section to 1e-9 in the clock, which enters the period in second order.
+    assert float(orbit.duration) == pytest.approx(float(run.duration[0]), abs=2e-11)
+    assert float(orbit.y_max) == pytest.approx(float(run.y_max[0]), abs=1e-12)
+
+    def field(_, x):
+        return [x[1], 5 * (1 - x[0] ** 2) * x[1] - x[0]]
+
+    def rises(_, x):
+        return x[0]
+
+    rises.direction = 1
+    truth = solve_ivp(field, (0, 150), [1, 0], "DOP853", rtol=1e-13, atol=1e-13, events=rises)
+    assert float(orbit.duration) == pytest.approx(np.diff(truth.t_events[0])[-1], abs=1e-9)
+
+
 def test_orbits_are_told_in_words():
     orbit = vi.find_orbit(UNDAMPED, near(UNDAMPED, 1), cycles=1)
     assert "are listed" not in str(orbit)
@@ -52,7 +103,7 @@ def test_orbits_are_told_in_words():
     assert "  only 1 of 38 impacts are listed: see `impact_log`" in str(more)
     batch = jax.tree.map(lambda x: jnp.stack([x, x]), orbit)
     data = batch.to_xarray()
-    assert data["result"].values.tolist() == ["converged"] * 2
+    assert data["result"].values.tolist() == ["successful"] * 2
     assert data["stability"].values.tolist() == ["period_doubling"] * 2
     assert data["section_Y"].dims == ("lane", "section")
     np.testing.assert_array_equal(data["multipliers"][0], orbit.multipliers)
@@ -61,7 +112,7 @@ def test_orbits_are_told_in_words():
     assert isinstance(orbits, list) and counts.tolist() == [2]
     assert str(orbits).splitlines() == [
         "1 orbit",
-        "  2π, 1 impact, unstable: Y = 1.92303, V = -0.876442; Y in [-1.88358, 2]; "
+        "  2π, 1 impact, unstable: Y = 1.92303 a, V = -0.876442 a ω; Y in [-1.88358, 2] a; "
         "greatest multiplier 1.16604",
     ]
     assert str(orbits) in str((orbits, counts))
@@ -251,6 +302,70 @@ def test_edges_are_told_apart():
     )
     assert (beyond.result == results.not_simulated).tolist() == [True, False]
     assert beyond.successful.tolist() == [False, True]
+
+
+class Sledges(eqx.Module):
+    """Places and speeds of two bodies."""
+
+    x: jax.Array
+    v: jax.Array
+    y: jax.Array
+    w: jax.Array
+
+
+class Coupled(vi.AbstractScene):
+    """Two bodies on a spring that nothing else holds: x'' = y - x - c x' + cos s, y'' = x - y -
+    c y' + push; where they are as a pair is free."""
+
+    damping: jax.Array = eqx.field(default=0.3, converter=jnp.asarray)
+    push: jax.Array = eqx.field(default=0.0, converter=jnp.asarray)
+    stops: tuple = ()
+
+    @property
+    def cycle(self):
+        return 2 * np.pi
+
+    def field(self, s, z):
+        pull = z.y - z.x
+        force = pull - self.damping * z.v + jnp.cos(s)
+        return Sledges(z.v, force, z.w, self.push - pull - self.damping * z.w)
+
+    def position(self, z):
+        return z.x
+
+    def velocity(self, z):
+        return z.v
+
+
+def sledge_speeds(damping):
+    """Of both bodies at s = 0: of their sum, which is free, and of their distance."""
+    both, apart = 1 / (1j + damping), 1j / (1 + 1j * damping)
+    return (both + apart).real / 2, (both - apart).real / 2
+
+
+def test_a_motion_that_may_be_anywhere_is_found_beside_the_guess():
+    """A multiplier is 1 to rounding: the equations of the orbit are singular."""
+    guess = Sledges(*map(jnp.asarray, (0.4, 0.1, 0.3, -0.2)))
+    orbit = vi.find_orbit(Coupled(), guess)
+    assert bool(orbit.successful) and orbit.stability == vi.STABILITY.neutral
+    assert not bool(orbit.stable)
+    speeds = [float(orbit.state.v), float(orbit.state.w)]
+    assert speeds == pytest.approx(sledge_speeds(0.3), abs=1e-10)
+    assert float(orbit.state.x + orbit.state.y) == pytest.approx(0.7, abs=1e-10)
+    with pytest.raises(ValueError, match="one of its multipliers is 1"):
+        vi.continue_orbit(orbit, parameter="damping", bounds=(0.2, 0.5))
+    drifting = vi.find_orbit(Coupled(push=0.01), guess)
+    assert drifting.result == vi.ORBIT_RESULTS.drifts and "drifts" in str(drifting)
+
+
+@pytest.mark.slow
+def test_the_derivative_of_a_motion_that_may_be_anywhere():
+    guess = Sledges(*map(jnp.asarray, (0.4, 0.1, 0.3, -0.2)))
+    found = jax.jacrev(lambda c: vi.find_orbit(Coupled(c), guess).state)(jnp.asarray(0.3))
+    h = 1e-6
+    wanted = np.subtract(sledge_speeds(0.3 + h), sledge_speeds(0.3 - h)) / (2 * h)
+    assert [float(found.v), float(found.w)] == pytest.approx(wanted, abs=1e-8)
+    assert float(found.x + found.y) == pytest.approx(0, abs=1e-10)
 
 
 @pytest.mark.parametrize(

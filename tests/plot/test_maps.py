@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from vi_jax.plot.colors import color_of
 
-PERIODS = np.array([[1, 2, 8], [9, 64, 0], [-1, -2, 1], [-3, -1, 2]])
+PERIODS = np.array([[1, 2, 8], [9, 64, -2], [-1, -3, 1], [-4, -1, 2]])
 
 
 IRREGULAR = {"chaotic": 0.1, "unsettled": 0.0, "failed": 0.1, "transient": 0.1}
@@ -53,7 +53,7 @@ def test_regimes_have_the_colours_of_the_legend():
     ax = _axes()
     assert vi.plot_regimes(_data(), ax=ax) is ax
     names = {1: "2π", 2: "4π", 8: "16π", 9: "> 16π", 64: "> 16π"}
-    names |= {0: "unsettled", -1: "chaotic", -2: "failed", -3: "transiently chaotic"}
+    names |= {regime: regime.meaning for regime in vi.REGIMES}
     cells, _ = _cells(ax)
     legend = _legend(ax)
     wanted = ["2π", "4π", "16π", "> 16π", "unsettled", "transiently chaotic", "chaotic", "failed"]
@@ -62,6 +62,20 @@ def test_regimes_have_the_colours_of_the_legend():
     for place, period in np.ndenumerate(PERIODS):
         np.testing.assert_allclose(cells[place], legend[names[period]])
     assert ax.get_xlabel() == "frequency ratio ζ" and ax.get_ylabel() == "restitution k"
+
+
+def test_other_numbers_of_a_store_are_drawn_as_its_attributes_say():
+    now = _data()
+    older = _data(np.select([PERIODS == -2, PERIODS < -2], [0, PERIODS + 1], PERIODS))
+    older.period.attrs = {
+        "flag_values": [-3, -2, -1, 0], "flag_meanings": "transient failed chaotic unsettled",
+    }  # fmt: skip
+    (cells, _), (others, _) = (_cells(vi.plot_regimes(x, ax=_axes())) for x in (now, older))
+    np.testing.assert_array_equal(cells, others)
+
+
+def test_a_map_without_its_legend():
+    assert vi.plot_regimes(_data(), ax=_axes(), legend=False).get_legend() is None
 
 
 def test_regimes_lie_around_their_values():

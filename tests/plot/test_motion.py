@@ -118,3 +118,6 @@ def test_errors_name_the_argument(scene, run):
     )(jnp.array([0.0, 0.1]))
     with pytest.raises(ValueError, match="one motion"):
         motion_path(sweep)
+    samples = vi.Samples(run.samples.cycles, run.samples.time, {"q": run.samples.state.Y})
+    with pytest.raises(ValueError, match="`scene` must be given"):
+        motion_path(samples)

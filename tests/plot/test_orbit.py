@@ -45,12 +45,26 @@ def test_branch_names_its_marks_and_begins_its_legend_solid(branch):
         named = [t.get_text() for t in legend.get_texts()]
         handles = dict(zip(named, legend.legend_handles, strict=True))
         kinds = {p.kind for p in branch.special}
-        assert len(named) == len(set(named)) and set(named) == {"2π", "unstable", *kinds}
+        assert len(named) == len(set(named)) and set(named) == {"2π", "stable", "unstable", *kinds}
+        assert named[:3] == ["2π", "stable", "unstable"]
         assert handles["2π"].get_linestyle() == "-"
         assert handles["2π"].get_color() == color_of(1)
-        # Another branch in the same axes names nothing twice.
-        vi.plot_branch(branch, ax=ax)
-        assert [t.get_text() for t in ax.get_legend().get_texts()] == named
+        assert [handles[word].get_linestyle() for word in named[1:3]] == ["-", "--"]
+        # Without a label the legend tells what the colour stands for, and nothing twice.
+        for _ in range(2):
+            vi.plot_branch(branch, ax=ax)
+            again = [t.get_text() for t in ax.get_legend().get_texts()]
+            assert again == ["2π", "2π, 1 impact", *named[1:]]
+
+
+def test_a_sweep_lies_above_branches_and_below_marks(branch):
+    sweep = vi.sweep(branch.orbit(0).scene, NAME, np.linspace(0.95, 1.0, 4), settle=10, cycles=8)
+    ax = vi.plot_sweep(sweep, ax=_axes())
+    vi.plot_branch(branch, ax=ax)
+    dots, *others = ax.lines
+    marks = [line for line in others if line.get_label() in MARKS]
+    lines = [line for line in others if line not in marks]
+    assert marks and max(x.zorder for x in lines) < dots.zorder < min(x.zorder for x in marks)
 
 
 def test_every_special_point_has_a_mark_of_its_own():

@@ -3,6 +3,9 @@
 import numpy as np
 import pytest
 import vi_jax as vi
+from vi_jax.scan._describe import description_of
+from vi_jax.scan.grid import Blocks
+from vi_jax.scan.job import make_job
 
 # Several motions live side by side here; see `experiments/studies/all_orbits.py`.
 SCENE = vi.Scene.ideal(frequency_ratio=3.2, restitution=0.9, gap=1.05, damping_ratio=0.01)
@@ -27,9 +30,11 @@ def test_motions_are_orbits(found):
 
 def test_starts_belong_where_they_end(found):
     rng = np.random.default_rng(0)
-    for i, j in zip(rng.integers(24, size=6), rng.integers(20, size=6), strict=True):
+    labels = np.asarray(found.data.label)
+    assert min(a.starts for a in found.attractors[:2]) > 20
+    lanes = [rng.choice(np.argwhere(labels == label), 3) for label in (0, 1)]
+    for i, j in np.concatenate(lanes):
         lane = found.data.isel({"start.Y": i, "start.V": j})
-        label = int(lane.label)
         start = SCENE.start(Y=float(lane["start.Y"]), V=float(lane["start.V"]))
         run = vi.simulate(SCENE, start, 1, settle=3000, method=vi.ExactFlight())
         end = np.array([float(run.sections.Y[-1]), float(run.sections.V[-1])])
@@ -37,8 +42,20 @@ def test_starts_belong_where_they_end(found):
             np.abs(np.stack([a.sections["Y"], a.sections["V"]]) - end[:, None]).max(0).min()
             for a in found.attractors
         ]
-        if label >= 0:
-            assert int(np.argmin(distance)) == label and min(distance) < 1e-3
+        assert int(np.argmin(distance)) == labels[i, j] and min(distance) < 1e-3
+
+
+def test_one_number_stands_for_a_regime(found):
+    """In the period of a scan and of a sweep as in the labels of basins."""
+    free = vi.Scene.ideal(frequency_ratio=0.77, gap=None)  # undamped: it never repeats
+    swept = vi.sweep(free, "drive.frequency_ratio", [0.77], start=free.start(Y=0.3), settle=5)
+    assert int(swept.period[0]) == vi.REGIMES.unsettled
+    assert str(swept).endswith("no period from 0.77")
+    flags = [found.data[x].attrs["flag_values"] for x in ("period", "label")]
+    assert flags[0] == flags[1] == sorted(vi.REGIMES) and max(vi.REGIMES) < 0
+    beyond = vi.basins(SCENE, {"start.Y": (0.05, 2.05)}, resolution=4, settle=200)
+    for x in (beyond.data.label, beyond.data.period):
+        assert np.asarray(x)[-2:].tolist() == [vi.REGIMES.failed] * 2
 
 
 @pytest.mark.slow
@@ -55,9 +72,13 @@ def test_fractions_add_up_and_random_starts_agree(found):
     assert "±" in str(random)
 
 
-def test_starts_beyond_a_stop_are_failed():
-    found = vi.basins(SCENE, {"start.Y": (0.05, 2.05)}, resolution=4, settle=200)
-    assert np.asarray(found.data.label)[-2:].tolist() == [-3, -3]
+def test_basins_as_data(found):
+    motions = found.to_xarray(along="motion").to_dataframe()
+    assert motions.motion_fraction.tolist() == [a.fraction for a in found.attractors]
+    orbits = found.to_xarray(along="cycle")
+    for i, a in enumerate(found.attractors):
+        np.testing.assert_array_equal(orbits.motion_Y[i, : a.period], a.sections["Y"])
+    assert len(found.to_xarray(along="start.V").to_dataframe()) == found.data.label.size
 
 
 def test_bad_regions():
@@ -67,3 +88,11 @@ def test_bad_regions():
         vi.basins(SCENE, {"drive.frequency_ratio": (0.5, 1.0)})
     with pytest.raises(ValueError, match="one number or 2"):
         vi.basins(SCENE, REGION, resolution=(3, 3, 3))
+
+
+def test_a_store_with_other_numbers_for_regimes_is_another_scan():
+    axes = {"start.Y": np.linspace(-1.0, 1.0, 4)}
+    blocks = Blocks(axes, 256, paired=False)
+    about = description_of(make_job(SCENE, tuple(axes), measure="regime"), blocks)
+    assert about["regimes"] == {regime.name: int(regime) for regime in vi.REGIMES}
+    assert "regimes" not in description_of(make_job(SCENE, tuple(axes), measure="steps"), blocks)

@@ -7,6 +7,8 @@ import pytest
 import vi_jax as vi
 from vi_jax.scan.lyapunov import _weighted
 
+from rimless_wheel import Wheel
+
 
 def ideal(zeta=0.9, k=0.5, xi=0.0, gap=2.0):
     return vi.Scene.ideal(frequency_ratio=zeta, restitution=k, damping_ratio=xi, gap=gap)
@@ -170,3 +172,9 @@ def test_one_rest_is_enough():
     mean, halves = _weighted(jnp.asarray(rates), jnp.asarray(duration))
     np.testing.assert_allclose(mean, [-0.1, -np.inf])
     np.testing.assert_allclose(halves, [-0.1, -0.1])
+
+
+def test_what_is_renewed_on_its_section_is_not_observed_at_intervals():
+    wheel = Wheel()
+    with pytest.raises(ValueError, match="both a `section` and a `renewed`"):
+        vi.lyapunov(wheel, wheel.start(), cycles=16)

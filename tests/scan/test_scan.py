@@ -2,10 +2,12 @@
 
 import importlib
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import diffrax
@@ -15,6 +17,8 @@ import numpy as np
 import pytest
 import vi_jax as vi
 import xarray as xr
+from vi_jax.scan.regime import least_period
+from vi_jax.scan.store import ZarrStore
 
 SCENE = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.01)
 AXES = {
@@ -80,25 +84,25 @@ def test_regime_tells_periods_chaos_and_what_does_not_settle():
     data = _regimes_of([(zeta, 0.8, 0.0) for zeta in zetas], settle=3000)
     period = dict(zip(zetas, np.asarray(data.period).tolist(), strict=True))
     assert period[0.9] == 2 and period[1.1] == 1
-    assert period[0.7] == -1 and period[0.97] == -1
+    assert period[0.7] == period[0.97] == vi.REGIMES.chaotic
     # A free motion without damping, off resonance, has two frequencies and repeats never.
     free = vi.Scene.ideal(frequency_ratio=0.77, gap=None)
     quiet = vi.scan(free, {"start.Y": [0.3]}, measure="regime", settle=10)
-    assert int(quiet.period[0]) == 0
+    assert int(quiet.period[0]) == vi.REGIMES.unsettled
 
 
 def test_a_chaotic_transient_is_not_called_chaos():
     """Off the stop the motion is linear and fades at the rate ξ: nothing grows any more."""
     lanes = [(0.69, 0.7, 0.001), (0.69, 0.5, 0.003), (0.7, 0.8, 0.0), (0.97, 0.8, 0.0)]
     data = _regimes_of(lanes, settle=22)
-    assert np.asarray(data.period).tolist() == [-3, -3, -1, -1]
+    assert np.asarray(data.period).tolist() == [-4, -4, -1, -1]
     assert dict(
         zip(
             data.period.attrs["flag_meanings"].split(),
             data.period.attrs["flag_values"],
             strict=True,
         )
-    ) == {"transient": -3, "failed": -2, "chaotic": -1, "unsettled": 0}
+    ) == {x.name: int(x) for x in vi.REGIMES}
 
     @jax.jit
     @jax.vmap
@@ -128,7 +132,7 @@ def test_few_of_the_chaotic_lanes_are_transients():
     later = vi.scan(machine, axes, measure=vi.Regime(lasting=0), settle=12_000)
     for lasting in (0, 4000):
         found = vi.scan(machine, axes, measure=vi.Regime(lasting=lasting), settle=400)
-        chaotic = np.asarray(found.period) == -1
+        chaotic = np.asarray(found.period) == vi.REGIMES.chaotic
         share = wrong[lasting] = float(np.mean(np.asarray(later.period)[chaotic] != -1))
         error[lasting] = np.sqrt(share * (1 - share) / chaotic.sum())
     # Seen: 20 % of 1,392 lanes, and 9 % of 1,178.
@@ -225,7 +229,7 @@ def test_failing_lanes_are_counted_and_harm_no_other():
     with pytest.warns(UserWarning, match=r"1 of 3 lanes failed \(bad_start: 1\)"):
         data = vi.scan(SCENE, {"start.Y": Y}, settle=10, cycles=128)
     assert np.asarray(data.result).tolist() == [0, 1, 0]
-    assert np.isnan(data.y_min[1]) and int(data.period[1]) == -2
+    assert np.isnan(data.y_min[1]) and int(data.period[1]) == vi.REGIMES.failed
     good = vi.scan(SCENE, {"start.Y": [0.0, 0.5]}, settle=10, cycles=128)
     np.testing.assert_array_equal(data.y_min[[0, 2]], good.y_min)
 
@@ -343,6 +347,8 @@ def _described(y_min, period, impacts, zeta=None):
         impact_speed=zeros,
         sections=None,
         result=vi.RESULTS.successful,
+        labels=SCENE.labels,
+        units=tuple(SCENE.units.items()),
     )
     return str(sweep).splitlines()[1:]
 
@@ -352,17 +358,17 @@ def test_a_sweep_tells_what_happens_to_the_motion():
     lost = _described([-3.3, -3.4, -0.7, -0.68], [1] * 4, [1.0, 1.0, 0.0, 0.0], [1.0, 1, 1.3, 1.3])
     assert lost == [
         "  2π with 1 impact from 1",
-        "  2π with 0 impacts from 1.2, jump since 1.1: min Y -3.4 → -0.7, ζ 1 → 1.3",
+        "  2π with 0 impacts from 1.2, jump since 1.1: min Y -3.4 → -0.7 a, ζ 1 → 1.3 ω",
     ]
     # A motion of the same kind on another branch.
     other = _described([-1.0, -1.05, -1.1, -2.0, -2.04, -2.08], [2] * 6, [3.0] * 6)
-    assert other[1] == "  still 4π with 3 impacts from 1.3, jump since 1.2: min Y -1.1 → -2"
+    assert other[1] == "  still 4π with 3 impacts from 1.3, jump since 1.2: min Y -1.1 → -2 a"
     # What goes on steadily, however steep, is none; nor is what chaos does from value to value.
     assert len(_described([-1.0, -2.0, -3.0, -4.2], [1] * 4, [1.0] * 4)) == 1
     assert (
-        len(_described([-1.0, -1.01, -2.3, -2.31, -1.2], [0] * 5, [0.4, 0.5, 0.6, 0.3, 0.4])) == 1
+        len(_described([-1.0, -1.01, -2.3, -2.31, -1.2], [-2] * 5, [0.4, 0.5, 0.6, 0.3, 0.4])) == 1
     )
-    failed = _described([-1.0, np.nan, -1.0], [1, -2, 1], [1.0, np.nan, 1.0])
+    failed = _described([-1.0, np.nan, -1.0], [1, -3, 1], [1.0, np.nan, 1.0])
     assert [line.split(" from ")[0].strip() for line in failed][1] == "failed"
     many = _described([-1.0, -1.1] * 20, [1, 2] * 20, [1.0] * 40)
     assert len(many) == 13 and many[-1] == "  28 further changes"
@@ -381,11 +387,52 @@ def test_a_weak_motor_that_comes_off_the_stop_is_told():
     assert float(sweep.y_min[2]) == pytest.approx(-amplitude, rel=0.02)
 
 
+def test_windows_of_periods_beside_a_grazing():
+    """Beyond the grazing of a motion whose multiplier is 1/2 there are windows of longer and longer
+    periods with one impact, with chaos between (Chin, Ott, Nusse and Grebogi, Phys. Rev. E 50,
+    1994); the sections of a period differ by 1e-4 to 1e-6."""
+    xi, ratio = 5.05, 0.2 * np.pi / np.log(2)
+    amplitude = 1 / np.hypot(1 - ratio**2, 2 * xi * ratio)
+    scene = vi.Scene.ideal(frequency_ratio=ratio, restitution=0.8, damping_ratio=xi)
+    beyond = {7.1e-7: 8, 4.0e-6: 7, 1.5e-5: 6, 3.5e-5: vi.REGIMES.chaotic, 8.4e-5: 5}
+    gaps = amplitude / (1 + np.array([*beyond])[::-1])
+    data = vi.scan(scene, {"stops.0.gap": gaps}, measure=vi.Regime(lasting=0), settle=400)
+    assert data["period"].values[::-1].tolist() == [*beyond.values()]
+    periodic = data["period"] > 0
+    np.testing.assert_array_equal(data["impacts"].values[periodic], 1)
+    # The same seen value by value; short of the grazing it is the driven vibration.
+    values = [gaps[0], amplitude / (1 - 1e-5)]
+    assert vi.sweep(scene, "stops.0.gap", values, settle=400).period.tolist() == [5, 1]
+
+
+def test_what_repeats_and_what_spirals_in():
+    """Sections made by hand: how closely periods must fit, by what fits best and by the method."""
+    n, one = jnp.arange(256), jnp.ones(256, int)
+
+    judged = jax.jit(partial(least_period, longest=64))
+
+    def period(sections, impacts=one, wander=0.0, **options):
+        return int(judged({"Y": sections}, impacts, wander=wander, **options))
+
+    none, split = vi.REGIMES.unsettled, 1e-7 * (-1.0) ** n
+    spiral = 3e-5 * 0.999**n * jnp.cos(2 * jnp.pi * n / 7)
+    noise = 1e-7 * jax.random.normal(jax.random.key(0), (256,))
+    assert period(0.0 * n) == 1 and period(split) == 2
+    assert period(0.0 * n, impacts=n % 3) == 3
+    assert period(spiral) == 1
+    assert period(0.0 * n, impacts=jnp.where(n == 200, 2, 1)) == none
+    assert period(1e-4 * jnp.cos(n)) == none and period(noise) == 1 and period(100 * noise) == none
+    # Steps of a tolerance wander within it, which hides a split as small.
+    assert period(100 * noise, wander=1e-5) == 1 and period(split, wander=1e-8) == 1
+    assert period(noise, tolerance=1e-8) == none
+
+
 @pytest.mark.slow
 def test_some_lanes_are_verified_by_a_better_method():
-    """At a loose tolerance sections do not repeat: the regimes are told wrongly."""
+    """Under steps of a loose tolerance sections do not repeat closely: the regimes are told wrongly
+    where that is asked for."""
     axes = {"drive.frequency_ratio": np.linspace(1.0, 1.4, 6), "start.Y": [0.0, 0.5]}
-    measure = ("extremes", vi.Regime(longest=4, observed=8, threshold=1.0))
+    measure = ("extremes", vi.Regime(longest=4, observed=8, threshold=1.0, tolerance=1e-6))
     method = vi.Adaptive(diffrax.Bosh3(), rtol=1e-3)
     data = vi.scan(SCENE, axes, measure=measure, method=method, settle=200, verify=10)
     assert data.attrs["verified_lanes"] == 10
@@ -512,6 +559,52 @@ def test_any_number_of_devices_gives_the_same_numbers(tmp_path, whole):
 @pytest.mark.slow
 def test_a_cluster_that_loses_a_worker_gives_the_same(tmp_path, whole):
     _same(_finished(tmp_path / "cluster", "--cluster"), whole)
+
+
+@pytest.mark.slow
+def test_a_cluster_that_loses_its_scheduler_says_how_to_go_on(tmp_path, monkeypatch):
+    distributed = pytest.importorskip("dask.distributed")
+    known, store = tmp_path / "scheduler.json", tmp_path / "store"
+    parts = [
+        subprocess.Popen(
+            [sys.executable, "-m", "dask", *words, "--scheduler-file", str(known)],
+            stderr=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+        )
+        for words in (
+            ("scheduler", "--port", "0", "--no-dashboard"),
+            ("worker", "--nthreads", "1", "--no-nanny", "--no-dashboard"),
+        )
+    ]
+    scene = vi.Scene.ideal(frequency_ratio=0.9)
+    axes = {"start.Y": np.linspace(-1.0, 1.0, 3000)}
+    options: dict = {"measure": "extremes", "settle": 500, "cycles": 50, "lanes": 256}
+    write = ZarrStore.write
+
+    def written(self, where, numbers):
+        write(self, where, numbers)
+        parts[0].kill()
+
+    try:
+        client = distributed.Client(scheduler_file=str(known), timeout=60)
+        client.wait_for_workers(1, timeout=60)
+        with monkeypatch.context() as patched:
+            patched.setattr(ZarrStore, "write", written)
+            told = r"scheduler .* was lost. (\d+) of 12 blocks .* kept in .*store: the same call"
+            with pytest.raises(ConnectionError, match=told) as lost:
+                vi.scan(scene, axes, **options, cluster=client, store=store)
+        done = int(re.search(told, str(lost.value))[1])
+        assert 1 <= done < 12
+        assert (_stored(store)["result"] != -1).sum() in (256 * done, 256 * done - 72)
+        with pytest.raises(ConnectionError, match="Nothing is kept: give the scan a `store`"):
+            vi.scan(scene, axes, **options, cluster=client)
+        client.close(timeout=1)
+    finally:
+        for part in parts:
+            part.kill()
+            part.wait()
+    found = vi.scan(scene, axes, **options, store=store)  # goes on
+    np.testing.assert_array_equal(found["y_max"], vi.scan(scene, axes, **options)["y_max"])
 
 
 def test_scenes_made_by_a_function_move_as_they_would_alone():

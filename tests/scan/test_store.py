@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
+import xarray as xr
 
 SCENE = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.01)
 AXES = {"start.Y": np.linspace(-1.0, 1.0, 600)}
@@ -23,6 +24,13 @@ def scanned(path):
 def whole(tmp_path_factory):
     path = tmp_path_factory.mktemp("store") / "whole"
     return path, {name: x.values for name, x in scanned(path).variables.items()}
+
+
+def test_a_store_is_opened_by_others_without_a_warning(whole):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        kept = xr.open_zarr(whole[0])
+    np.testing.assert_array_equal(kept.y_min, whole[1]["y_min"])
 
 
 def _flip(path):
@@ -44,7 +52,8 @@ def _cut(path):
         (_flip, "impact_speed/c/0", "impact_speed/c/0", 1),
         (_flip, "result/c/0", "result/c/0", 1),
         (_cut, "check/sums/c/1/0", "check/sums/c/1/0", 1),
-        ("deleted", "check", "check/sums", 3),
+        ("deleted", "check", "check/zarr.json, check/sums", 3),
+        (_cut, "check/zarr.json", "check/zarr.json", 0),
         (_cut, "y_min/zarr.json", "y_min, y_min/c/0, y_min/c/1, y_min/c/2", 3),
         (_cut, "start.Y/c/0", "start.Y", 0),
     ],

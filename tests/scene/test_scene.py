@@ -1,5 +1,7 @@
 """Scenes and parameters: groups, kinematics, and errors that say what is wrong."""
 
+import warnings
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -124,3 +126,16 @@ def test_parameters_take_quantities_with_units():
         vi.Parameters(gap=8 * unit.gram)
     with pytest.raises(ValueError, match="`restitution` must be in no unit"):
         vi.Parameters(restitution=0.5 * unit.m)
+
+
+def test_a_length_of_a_thousand_crank_radii_is_warned_of():
+    for numbers in ({"gap": 80}, {"gap": -80}, {"rod_length": 120.0}, {"gap": [0.08, 80.0]}):
+        ((name, value),) = numbers.items()
+        with pytest.warns(UserWarning, match=f"`{name}` is .* times the crank radius") as told:
+            vi.Parameters(**{name: jnp.asarray(value, float)})
+        assert told[0].filename == __file__
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        vi.Parameters(gap=8.0)
+        vi.Parameters(gap=80, crank_radius=40.0, rod_length=120.0)
+        jax.vmap(lambda gap: vi.Parameters(gap=gap).scene().stops[0].gap)(jnp.array([0.08, 80.0]))

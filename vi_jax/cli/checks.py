@@ -7,6 +7,7 @@ from typing import Any
 
 from .._checks import unwritable
 from ..orbit.curve import check_walk
+from ..plot.save import ENDINGS
 from ..scan.grid import Blocks, axes_of
 from ..scan.job import check_corners, make_job
 from ..scene import AbstractScene
@@ -36,11 +37,12 @@ def check_range(scene: AbstractScene, name: str, values: Sequence[float], place:
 
 def check_paths(table: str, *, picture: str | None = None, output: str | None = None) -> None:
     """**Raises:** `ConfigError` if a file cannot be written; makes the folders above them."""
-    for key, path, ending in (("picture", picture, ".png"), ("output", output, ".csv")):
+    for key, path, endings in (("picture", picture, ENDINGS), ("output", output, (".csv",))):
         if path is None:
             continue
-        if not path.endswith(ending):
-            raise ConfigError(f'`{key}` in {table} must end in {ending}, but is "{path}"')
+        if Path(path).suffix.lower() not in endings:
+            allowed = ", ".join(endings)
+            raise ConfigError(f'`{key}` in {table} must end in {allowed}, but is "{path}"')
         reason = unwritable(Path(path).parent)
         try:
             if reason is None and Path(path).is_dir():

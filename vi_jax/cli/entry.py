@@ -4,12 +4,12 @@ file asks."""
 import argparse
 import os
 import sys
-from importlib.metadata import PackageNotFoundError, version
 from io import TextIOWrapper
 
 import jax
 
 from .._checks import unwritable
+from .._version import installed_version
 from ..explore.serve import missing, serve
 from ..paper.report import reproduce, summary
 from .config import (
@@ -132,7 +132,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="vi-jax", description="Simulation of vibro-impact systems."
     )
-    parser.add_argument("--version", action="version", version=f"vi-jax {_version()}")
+    parser.add_argument("--version", action="version", version=f"vi-jax {installed_version()}")
     commands = parser.add_subparsers(dest="command", required=True)
     verb = commands.add_parser(
         "reproduce",
@@ -183,13 +183,6 @@ def _keys(kind: type) -> str:
     """The keys of a table, for the help."""
     name = (kind.__doc__ or "").strip("`.")
     return f"keys of {name}: {', '.join(key.rstrip('_') for key in keys_of(kind))}"
-
-
-def _version() -> str:
-    try:
-        return version("vi-jax")
-    except PackageNotFoundError:
-        return "(not installed)"
 
 
 def _tell(step: str) -> None:

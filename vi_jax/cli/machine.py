@@ -3,6 +3,7 @@
 import importlib
 import inspect
 import sys
+import traceback
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, Literal
@@ -185,14 +186,39 @@ def machine_named(name: str) -> AbstractScene:
     module, _, function = name.partition(":")
     if not module or not function:
         raise ConfigError(f"--machine must be package.module:function, but is {name!r}")
-    try:
-        with _beside():
-            found = getattr(importlib.import_module(module), function)()
-    except (ImportError, AttributeError) as error:
-        raise ConfigError(f"--machine {name} cannot be found: {error}") from None
+    with _beside():
+        try:
+            make = getattr(importlib.import_module(module), function)
+        except (ImportError, AttributeError) as error:
+            raise ConfigError(f"--machine {name} cannot be found: {error}") from None
+        except Exception as error:
+            raise _raised(name, error) from error
+        if not _is_called_with_nothing(make):
+            raise ConfigError(f"--machine {name} must be a function without arguments")
+        try:
+            found = make()
+        except (Exception, SystemExit) as error:
+            raise _raised(name, error) from error
     if not isinstance(found, AbstractScene):
         raise ConfigError(f"--machine {name} must return a machine, but returned {found!r}")
     return found
+
+
+def _is_called_with_nothing(make: Any) -> bool:
+    try:
+        inspect.signature(make).bind()
+    except (TypeError, ValueError):  # the second of what does not tell its arguments
+        return False
+    return True
+
+
+def _raised(name: str, error: BaseException) -> ConfigError:
+    """What went wrong in a user's module, and on which of its lines."""
+    own = getattr(sys.modules.get(name.partition(":")[0]), "__file__", None)
+    lines = traceback.extract_tb(error.__traceback__)
+    last = ([line for line in lines if line.filename == own] or lines)[-1]
+    where = f" ({last.filename}, line {last.lineno})"
+    return ConfigError(f"--machine {name} raised {type(error).__name__}: {error}{where}")
 
 
 @contextmanager

@@ -15,9 +15,9 @@ from ..flow import RESULTS
 from ..flow.results import REASONS, number_of
 from ..plot import save_picture
 from ..scan import Sweep
-from ..scan.regime import REGIMES
+from ..scan.regime import REGIMES, periods_of
 from ..scan.store import NOT_COMPUTED
-from ..scene.numbers import by_name
+from ..scene.numbers import components
 
 
 def failures(codes: np.ndarray, *, what: str = "motions") -> tuple[list[str], bool]:
@@ -42,7 +42,7 @@ def axes_in_words(axes: Mapping[str, Sequence[float]]) -> str:
 
 def regimes_in_words(data: xr.Dataset) -> list[str]:
     """How many motions there are of each period."""
-    period = np.asarray(data["period"])[np.asarray(data["result"]) == 0]
+    period = periods_of(data["period"])[np.asarray(data["result"]) == 0]
     names: dict[int, str] = {regime: regime.meaning for regime in REGIMES}
     kinds, counts = np.unique(period, return_counts=True)
     order = sorted(zip(kinds.tolist(), counts.tolist(), strict=True), key=lambda pair: -pair[1])
@@ -81,7 +81,7 @@ def sample_columns(samples: Any) -> dict[str, np.ndarray]:
     return {
         "cycles": np.asarray(samples.cycles),
         "time": np.asarray(samples.time),
-        **{name: np.asarray(x) for name, x in by_name(samples.state).items()},
+        **{name: np.asarray(x) for name, x in components(samples.state, 1).items()},
     }
 
 
@@ -90,7 +90,7 @@ def cycle_columns(run: Any) -> dict[str, np.ndarray]:
     names = ("y_min", "y_max", "impacts", "impact_speed", "frequency_ratio")
     return {
         "cycle": np.arange(1, run.impacts.size + 1),
-        **{name: np.asarray(x)[1:] for name, x in by_name(run.sections).items()},
+        **{name: np.asarray(x)[1:] for name, x in components(run.sections, 1).items()},
         **{name: np.asarray(getattr(run, name)) for name in names},
     }
 

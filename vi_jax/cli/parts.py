@@ -120,10 +120,11 @@ def _joined(runs: list[Run], cycles: int, samples: int, steps: int) -> Run:
             lambda first, *others: _row([first, *(x[shared:] for x in others)])[:number], *parts
         )
 
+    apart = ("sections", "samples", "errors", "result", "steps", "rejected", "labels", "units")
     rows = {
         field.name: joined([getattr(run, field.name) for run in runs], done)
         for field in dataclasses.fields(Run)
-        if field.name not in ("sections", "samples", "errors", "result", "steps", "rejected")
+        if field.name not in apart
     }
     sections = joined([run.sections for run in runs], done + 1, shared=1)
     dense, sampled = None, [run.samples for run in runs if run.samples is not None]
@@ -140,7 +141,7 @@ def _joined(runs: list[Run], cycles: int, samples: int, steps: int) -> Run:
         )
     failed = next((run for run in runs if not bool(run.successful)), last)
     # What happened after the last cycle that was asked for is nobody's concern.
-    whole = all(bool(jnp.isfinite(x[-1])) for x in jtu.tree_leaves(sections))
+    whole = all(bool(jnp.isfinite(x[-1]).all()) for x in jtu.tree_leaves(sections))
     return Run(
         **rows,
         sections=sections,
@@ -149,6 +150,8 @@ def _joined(runs: list[Run], cycles: int, samples: int, steps: int) -> Run:
         result=RESULTS.successful if whole else failed.result,
         steps=jnp.asarray(steps, last.steps.dtype),
         rejected=jnp.asarray(sum(int(run.rejected) for run in runs), last.rejected.dtype),
+        labels=last.labels,
+        units=last.units,
     )
 
 

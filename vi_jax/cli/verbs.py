@@ -91,7 +91,7 @@ def scan(config: Config, tell: Tell) -> Outcome:
     if table.store is None:
         lines += ["", str(data), "", "Nothing was written: name a `store` in [scan] to keep it."]
     else:
-        lines.append(f'  data: xarray.open_zarr("{table.store}", consolidated=False)')
+        lines.append(f'  data: xarray.open_zarr("{table.store}")')
     if table.picture is not None:
         ax = new_axes()
         plot_regimes(data, ax=ax)

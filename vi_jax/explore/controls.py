@@ -1,6 +1,7 @@
 """The numbers that the page lets one change, and the scenes made of them."""
 
 from collections.abc import Mapping
+from math import isfinite
 from typing import Any, NamedTuple
 
 from ..scene import Parameters, Scene
@@ -17,10 +18,21 @@ class Control(NamedTuple):
     """Where it begins."""
 
     def nearest(self, value: float) -> float:
-        """The place of the slider next to a value."""
+        """The place of the slider next to a value; where it begins, of what is no number."""
+        if not isfinite(value):
+            return self.value
         steps = round((min(max(value, self.low), self.high) - self.low) / self.step)
         return round(self.low + steps * self.step, 6)
 
+    def holds(self, value: Any) -> bool:
+        """Whether this is a number that the slider can be at."""
+        if not isinstance(value, int | float):
+            return False
+        return self.low - _ROUNDING <= value <= self.high + _ROUNDING
+
+
+# Of places reached in steps.
+_ROUNDING = 1e-9
 
 NUMBERS: Mapping[str, Control] = {
     "frequency_ratio": Control("frequency ratio ζ", 0.3, 2.5, 0.002, 0.9),
@@ -55,6 +67,17 @@ MOTOR: Mapping[str, Control] = {
 def beginning(controls: Mapping[str, Control]) -> dict[str, float]:
     """Where the sliders begin."""
     return {name: control.value for name, control in controls.items()}
+
+
+def fault(controls: Mapping[str, Control], values: Mapping[str, Any]) -> str | None:
+    """What is wrong with values that did not come from the sliders, in a sentence; else `None`."""
+    for name, control in controls.items():
+        if not control.holds(values.get(name)):
+            return (
+                f"The {control.label} must be a number from {control.low:g} to {control.high:g}, "
+                f"but is {values.get(name)!r}."
+            )
+    return None
 
 
 def ideal(values: Mapping[str, float]) -> tuple[Scene, Any]:

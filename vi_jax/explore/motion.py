@@ -90,7 +90,7 @@ class Motion(NamedTuple):
             return "no multipliers: an impact falls on the section"
         verdict = STABILITY[stability_of(jnp.asarray(self.multipliers))]
         if abs(abs(self.multipliers[0]) - 1) < _NEUTRAL:
-            verdict = "neither stable nor unstable to rounding"
+            verdict = STABILITY[STABILITY.neutral]
         values = ", ".join(complex_in_words(m, 4, _NEUTRAL) for m in self.multipliers)
         return f"multipliers {values}: {verdict}"
 

@@ -53,7 +53,11 @@ def _(DiagramPicture, MotionPicture, b64encode, html, mo, time):
             f'<p style="opacity: 0.6"><small>redrawn in {took:.0f} ms</small></p>'
         )
 
-    return pictures, shown, sliders
+    def stop_at(fault):
+        """Say what is wrong instead of showing anything."""
+        mo.stop(fault is not None, mo.Html(f'<p id="fault">{html.escape(str(fault))}</p>'))
+
+    return pictures, shown, sliders, stop_at
 
 
 @app.cell
@@ -98,8 +102,9 @@ def _(across, ideal, mo, motor, tab, upwards, which):
 
 
 @app.cell
-def _(across, controls, diagram, ideal, mo, pictures, tab, upwards):
+def _(across, controls, diagram, ideal, mo, pictures, stop_at, tab, upwards):
     mo.stop(tab.value != "Bifurcations")
+    stop_at(controls.fault(controls.IDEAL, ideal.value))
     _control, _values = controls.NUMBERS[across.value], ideal.value
     _found = diagram(
         {name: _values[name] for name in controls.NUMBERS},
@@ -123,8 +128,9 @@ def _(across, controls, ideal, pick, place):
 
 
 @app.cell
-def _(controls, ideal, look, mo, pictures, shown, tab, time, which):
+def _(controls, ideal, look, mo, pictures, shown, stop_at, tab, time, which):
     mo.stop(tab.value == "Motor")
+    stop_at(controls.fault(controls.IDEAL, ideal.value))
     _since = time.perf_counter()
     _scene, _start = controls.ideal(ideal.value)
     _motion = look(_scene, _start, ideal.value["settle"])
@@ -134,8 +140,9 @@ def _(controls, ideal, look, mo, pictures, shown, tab, time, which):
 
 
 @app.cell
-def _(controls, look, mo, motor, pictures, shown, tab, time):
+def _(controls, look, mo, motor, pictures, shown, stop_at, tab, time):
     mo.stop(tab.value != "Motor")
+    stop_at(controls.fault(controls.MOTOR, motor.value))
     _since = time.perf_counter()
     _scene, _start = controls.motor(motor.value)
     _motion = look(_scene, _start, motor.value["settle"])

@@ -15,6 +15,7 @@ from PIL import Image
 
 from ..plot.branch import axis_name
 from ..plot.colors import BLUE, GREEN, RED
+from ..scene.states import UNITS
 from .diagram import SHOWN, Diagram
 from .motion import WINDOW, Motion
 
@@ -146,7 +147,7 @@ class DiagramPicture:
         across = np.broadcast_to(found.values[:, None], rows.shape)
         self._dots.set_data(across.ravel(), rows.ravel())
         self._mark.set_xdata([chosen, chosen])
-        self.ax.set(xlabel=axis_name(found.parameter), ylabel=shown)
+        self.ax.set(xlabel=axis_name(found.parameter, UNITS), ylabel=shown)
         self.ax.set_xlim(found.values[0], found.values[-1])
         _fit(self.ax, y=rows)
         return self.ax

@@ -3,15 +3,18 @@
 import contextlib
 import importlib.util
 import os
+import secrets
 import socket
 import sys
 import threading
 import webbrowser
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from . import controls
 from .diagram import diagram
+from .guard import Guard
 from .motion import prepare
 
 NEEDED = "marimo>=0.25"
@@ -41,6 +44,8 @@ def compile_all(tell: Callable[[str], None]) -> None:
 def serve(host: str, port: int, *, browser: bool, tell: Callable[[str], None]) -> None:
     """Serve the page until Ctrl-C, which ends the process.
 
+    Its address, which is told, holds a token without which nothing is answered.
+
     **Arguments:** address and port to listen at (port 0: any that is free); whether to open a
     browser; what is told of the progress.
 
@@ -53,12 +58,12 @@ def serve(host: str, port: int, *, browser: bool, tell: Callable[[str], None]) -
     with socket.create_server((host, port), family=family) as listening:
         compile_all(tell)
         name = f"[{host}]" if ":" in host else host
-        address = f"http://{name}:{listening.getsockname()[1]}"
-        page = str(Path(__file__).with_name("page.py"))
-        app = marimo.create_asgi_app(quiet=True).with_app(path="", root=page).build()
+        port, token = listening.getsockname()[1], secrets.token_urlsafe(16)
+        address = f"http://{name}:{port}?access_token={token}"
+        app: Any = Guard(_page(marimo, port, token), host)
         options = {"log_level": "warning", "timeout_graceful_shutdown": 1}
         server = uvicorn.Server(uvicorn.Config(app, **options))
-        tell(f"serving {address}, until Ctrl-C")
+        tell(f"serving {address} until Ctrl-C")
         if browser:  # it waits until it is answered
             threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
         with contextlib.suppress(KeyboardInterrupt):
@@ -67,3 +72,15 @@ def serve(host: str, port: int, *, browser: bool, tell: Callable[[str], None]) -
     for stream in (sys.stdout, sys.stderr):
         stream.flush()
     os._exit(0)
+
+
+def _page(marimo: Any, port: int, token: str) -> Any:
+    """The page as an ASGI app that answers to who has the token."""
+    page = str(Path(__file__).with_name("page.py"))
+    made = marimo.create_asgi_app(quiet=True, token=token, skew_protection=True)
+    app = made.with_app(path="", root=page).build()
+    # The cookie that stands for the token is named by the port: a browser keeps one of each name
+    # for all ports of a host, and two of these servers would shut each other out.
+    for mounted in app.routes:
+        mounted.app.state.port = port
+    return app

@@ -10,8 +10,10 @@ from .methods import Taylor as Taylor
 from .methods import Unrolled as Unrolled
 from .methods import Verner9 as Verner9
 from .methods import preset as preset
+from .results import EVENTS as EVENTS
 from .results import RESULTS as RESULTS
 from .results import Errors as Errors
+from .results import EventLog as EventLog
 from .results import ImpactLog as ImpactLog
 from .results import Run as Run
 from .results import Samples as Samples

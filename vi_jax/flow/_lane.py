@@ -10,9 +10,10 @@ from jaxtyping import Array, Float
 
 from ..scene import AbstractScene
 from . import results
-from .events import Rates, rates
+from ._own import check_field, check_laws
+from .events import Rates, force_rate, rates
 from .methods import AbstractMethod
-from .moving import begin_modes, in_modes
+from .moving import begin_modes, in_modes, rounding
 
 Scalar = Float[Array, ""]
 
@@ -40,6 +41,10 @@ def to_release(k: int) -> float:
     return -3.0 - 2 * k
 
 
+# Kinds of events as the log of all of them lists them: their places in `results.EVENTS`.
+HIT, RESTS, LEAVES, CHANGES = 0.0, 1.0, 2.0, 3.0
+
+
 def total(tree: Any, start: Scalar) -> Scalar:
     """Sum of all numbers in a tree and of `start`: finite if all of them are."""
     for leaf in jtu.tree_leaves(tree):
@@ -61,6 +66,8 @@ class Record(eqx.Module):
     log: Float[Array, "3 size"] | None
     """Clock, V⁻ and stop of each impact, NaN where there was none."""
     clearance: Scalar | None
+    events: Float[Array, "4 listed"] | None
+    """Clock, kind, number and value of each event, NaN where there was none."""
 
 
 class Lane(eqx.Module):
@@ -122,6 +129,8 @@ class Plan(eqx.Module):
     log: int = eqx.field(static=True)
     log_switches: bool = eqx.field(static=True)
     """Whether the log lists switches too, as stops beyond the last, and counts them."""
+    events: int = eqx.field(static=True)
+    """Events of all kinds to log in each cycle."""
     rests: bool = eqx.field(static=True)
     """Whether the body may come to rest on a stop."""
     road: str = eqx.field(static=True)
@@ -186,6 +195,7 @@ class Plan(eqx.Module):
             rests=zero if self.motion and self.rests else None,
             log=jnp.full((3, self.log), jnp.nan, Y.dtype) if self.log else None,
             clearance=jnp.full_like(Y, jnp.inf) if self.motion and self.log else None,
+            events=jnp.full((4, self.events), jnp.nan, Y.dtype) if self.events else None,
         )
 
     def launch(self, start: Any, wanted: Any = True) -> Lane:
@@ -195,19 +205,27 @@ class Plan(eqx.Module):
         numbers = jtu.tree_leaves((start, eqx.filter(scene, eqx.is_inexact_array)))
         bad = ~jnp.isfinite(total(numbers, self.settle)) | ~jnp.asarray(wanted)
         bad = bad | ~scene.in_range(start)
+        slack = rounding(scene, start)
         for stop in scene.stops:
-            bad = bad | (stop.beyond(scene.coordinates[stop.coordinate].position(start)) > 0)
+            bad = bad | (stop.beyond(scene.coordinates[stop.coordinate].position(start)) > slack)
         bad = jax.lax.stop_gradient(bad)
         zero = jnp.zeros_like(Y)
         modes = jax.lax.stop_gradient(begin_modes(scene, zero, start))
-        _check_field(scene, zero, start, modes)
+        check_field(scene, zero, start, modes)
+        check_laws(scene, zero)
         free = in_modes(scene, modes)
         here = [rates(free.field, x.position, zero, start) for x in scene.coordinates]
         # At rest the acceleration says which way the motion goes.
         direction = tuple(jnp.where(x.v == 0, jnp.sign(x.a), jnp.sign(x.v)) for x in here)
         contact = None
         if self.rests:
-            contact = tuple(self._rests_on(k, x) for k, x in enumerate(here))
+            growth = [force_rate(free, x.position, free, zero, start) for x in scene.coordinates]
+            both = enumerate(zip(here, growth, strict=True))
+            contact = tuple(self._rests_on(k, *x, slack) for k, x in both)
+            direction = tuple(
+                jnp.where((x.v == 0) & (x.a == 0), jnp.sign(j), along)
+                for x, j, along in zip(here, growth, direction, strict=True)
+            )
             for i, stop in enumerate(scene.stops):
                 # A little off the stop it would come to rest there: no derivative by the start.
                 at = scene.coordinates[stop.coordinate].placed(start, stop.place, zero)
@@ -236,28 +254,21 @@ class Plan(eqx.Module):
             rejected=zero,
         )
 
-    def _rests_on(self, k: int, here: Rates) -> Scalar:
-        """The stop that coordinate number k rests on as the motion begins."""
+    def place(self, k: int, contact: Scalar, otherwise: Scalar) -> Scalar:
+        """Where coordinate number k is that rests on the stop named by `contact`."""
+        place = otherwise
+        for i, stop in enumerate(self.scene.stops):
+            if stop.coordinate == k:
+                place = jnp.where(contact == to_stop(i), stop.place, place)
+        return place
+
+    def _rests_on(self, k: int, here: Rates, growth: Scalar, slack: Any) -> Scalar:
+        """The stop that coordinate number k rests on as the motion begins: pressed on, or about to
+        be by a force that grows; place and velocity are known to within `slack`."""
         contact = jnp.zeros_like(here.x)
         for i, stop in enumerate(self.scene.stops):
             if stop.coordinate == k:
-                rests = (stop.beyond(here.x) >= 0) & (here.v == 0) & (stop.sign * here.a > 0)
+                pressed = (stop.sign * here.a > 0) | (here.a == 0) & (stop.sign * growth > 0)
+                rests = (stop.beyond(here.x) >= -slack) & (jnp.abs(here.v) <= slack) & pressed
                 contact = jnp.where(rests, to_stop(i), contact)
         return contact
-
-
-def _check_field(scene: AbstractScene, s: Scalar, state: Any, modes: tuple[Scalar, ...]) -> None:
-    """**Raises:** `TypeError` for a field that cannot be traced or whose result is no state; while
-    the loop is traced, and at no cost where it runs."""
-    whose = f"`field` of a {type(scene).__name__}"
-    try:
-        flow = jax.eval_shape(scene.field, s, state, *modes)
-    except jax.errors.TracerBoolConversionError as error:
-        raise TypeError(
-            f"{whose} must be written for numbers that are traced: `jnp.where`, not `if`."
-        ) from error
-    wanted, got = (jtu.tree_map(jnp.shape, x) for x in (state, flow))
-    if jtu.tree_structure(state) != jtu.tree_structure(flow) or wanted != got:
-        raise TypeError(
-            f"{whose} must return what is like its state, {wanted}, but returned {got}."
-        )

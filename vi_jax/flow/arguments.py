@@ -1,6 +1,5 @@
 """What `simulate` was asked, checked and put in the form in which the loop needs it."""
 
-import warnings
 from typing import Any
 
 import equinox as eqx
@@ -8,33 +7,29 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jaxtyping import Array, Int
 
 from .. import lanes
-from .._checks import (
-    concrete,
-    count,
-    count_or_traced,
-    fits_records,
-    flag,
-    narrow,
-    one_of,
-    warn_of_narrow,
-)
+from .._checks import count, count_or_traced, fits_records, flag, instance_of, one_of, require_real
+from .._numbers import concrete, narrow, require_session, strongly_typed, warn, warn_of_narrow
 from ..scene import AbstractScene, RigidStop, Scene
 from ._lane import Plan
+from ._own import check_period as check_period
 from .methods import MethodLike, chosen
+from .moving import rounding
 
 
 def planned(
     scene: AbstractScene,
     start: Any,
-    cycles: int,
+    cycles: int | Int[Array, ""],
     *,
     settle: Any = 0,
     method: MethodLike = None,
     clock: str | None = None,
     samples: int = 0,
     impact_log: int = 0,
+    event_log: int = 0,
     record: str = "motion",
     rests: bool | None = None,
     max_impacts: int = 1000,
@@ -42,15 +37,13 @@ def planned(
     log_switches: bool = False,
 ) -> tuple[Plan, Any]:
     """The arguments of `simulate`, checked and put in the form in which the loop needs them."""
-    if not isinstance(scene, AbstractScene):
-        raise TypeError(
-            f"Argument `scene` must be a `Scene` or an `AbstractScene`, but got {scene!r}."
-        )
+    scene = machine_of(scene)
     _check_parts(scene)
     method = chosen(scene, method)
     cycles = count("cycles", cycles, least=1)
     samples = count("samples", samples)
     impact_log = count("impact_log", impact_log)
+    event_log = count("event_log", event_log)
     max_impacts = count("max_impacts", max_impacts)
     settle = count_or_traced("settle", settle)
     if rests is not None:
@@ -60,7 +53,10 @@ def planned(
     one_of("record", record, ("motion", "sections"))
     if clock is not None:
         scene = scene.in_clock(clock)
+    require_session("scene", scene)
     start = scene.adopt(start)
+    check_leaves("start", start)
+    require_session("start", start)
     method.check(scene)
     if samples and scene.section(start) is not None:
         raise ValueError(
@@ -71,12 +67,11 @@ def planned(
     if isinstance(scene, Scene):
         _check_scalars(scene=scene, start=start)
     check_start(scene, start)
-    fits_records("cycles", cycles * max(1, samples), 12 + 3 * impact_log)
+    fits_records("cycles", cycles * max(1, samples), 12 + 3 * impact_log + 4 * event_log)
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
-        warnings.warn(
+        warn(
             "vi_jax is running in single precision: errors near 1e-6 and tolerances to match. For "
-            'double precision call `jax.config.update("jax_enable_x64", True)` first.',
-            stacklevel=3,
+            'double precision call `jax.config.update("jax_enable_x64", True)` first.'
         )
     scene, start = of_one_type(scene, start)
     dtype = scene.position(start).dtype
@@ -94,6 +89,7 @@ def planned(
         motion=record == "motion",
         log=impact_log,
         log_switches=log_switches,
+        events=event_log,
         rests=(scene.may_rest() if rests is None else rests) and bool(scene.stops),
         road=lanes.current_road(),
         settle=_countable(cycles, settle, max(1, samples), dtype),
@@ -103,6 +99,17 @@ def planned(
     return plan, start
 
 
+def machine_of(scene: Any) -> AbstractScene:
+    """The machine as every verb takes it, so that other numbers are not another program: each
+    number that is a `float` is an array. Whole numbers, truth values and words stay what they are,
+    and a part of the program.
+
+    **Raises:** `TypeError` if it is none.
+    """
+    instance_of("scene", scene, AbstractScene, "a `Scene` or an `AbstractScene`")
+    return jtu.tree_map(strongly_typed, scene)
+
+
 def _check_parts(scene: AbstractScene) -> None:
     """**Raises:** `TypeError` or `ValueError` for a machine whose parts are not what they must."""
     name, stops = type(scene).__name__, scene.stops
@@ -110,6 +117,9 @@ def _check_parts(scene: AbstractScene) -> None:
         raise TypeError(f"`stops` of a {name} must be a tuple of `RigidStop`s, but is {stops!r}.")
     if callable(scene.cycle):
         raise TypeError(f"`cycle` of a {name} must be a number, or a property that gives one.")
+    cycle = concrete(scene.cycle)
+    if cycle is not None and not (np.isfinite(cycle) & (cycle > 0)).all():
+        raise ValueError(f"`cycle` of a {name} must be positive, but is {cycle}.")
     many = len(scene.coordinates)
     for i, stop in enumerate(stops):
         if stop.coordinate >= many:
@@ -181,16 +191,68 @@ def _check_scalars(**arguments: Any) -> None:
                 )
 
 
-def check_start(scene: AbstractScene, start: Any) -> None:
-    """**Raises:** `ValueError` if a concrete start cannot be simulated."""
+def _check_flow(scene: AbstractScene, start: Any) -> None:
+    """**Raises:** `TypeError` for what is no state, where only the field says what one is."""
     try:
-        _ = scene.position(start), scene.velocity(start)
+        zero = jnp.zeros(())
+        jax.eval_shape(scene.field, zero, start, *[zero for _ in scene.switches])
+    except (AttributeError, TypeError, ValueError, LookupError) as error:
+        raise TypeError(
+            f"Argument `start` must be a state of this scene, but got {start!r}, of which its "
+            f"`field` says: {error}"
+        ) from None
+
+
+def check_leaves(argument: str, state: Any) -> None:
+    """**Raises:** `ValueError` if an array in a state holds no number."""
+    for path, leaf in jtu.tree_leaves_with_path(state):
+        if 0 in jnp.shape(leaf):
+            raise ValueError(
+                f"Argument `{argument}` must hold numbers, but {_leaf_in_words(path)} has shape "
+                f"{jnp.shape(leaf)}."
+            )
+
+
+def refuse_arrays(argument: str, verb: str, state: Any) -> None:
+    """**Raises:** `ValueError` if a state holds an array, for a verb that needs numbers."""
+    for path, leaf in jtu.tree_leaves_with_path(state):
+        if jnp.ndim(leaf):
+            raise ValueError(
+                f"Argument `{argument}` must hold scalars, each component a number of its own, "
+                f"but {_leaf_in_words(path)} has shape {jnp.shape(leaf)}: `{verb}` takes no arrays "
+                "in a state (`simulate`, `cycle_map` and `lyapunov` do)."
+            )
+
+
+def _leaf_in_words(path: Any) -> str:
+    return f"its {jtu.keystr(path).lstrip('.')}" if path else "it"
+
+
+def check_reals(name: str, state: Any) -> None:
+    """**Raises:** `TypeError` that names what is no real number in a state of any form."""
+    for path, leaf in jtu.tree_leaves_with_path(state):
+        require_real(name, jtu.keystr(path).lstrip(".") or "value", leaf)
+
+
+def check_start(scene: AbstractScene, start: Any) -> None:
+    """Warns of a field of another period. **Raises:** `ValueError` or `TypeError` if a concrete
+    start cannot be simulated."""
+    try:
+        shape = jnp.shape(scene.position(start)) or jnp.shape(scene.velocity(start))
     except (AttributeError, TypeError, LookupError):
         raise TypeError(
             f"Argument `start` must be a state of this scene, but got {start!r}. Of a state "
-            "without `Y` and `V` a machine of your own says by `position`, `velocity` and "
-            "`placed`, or by `coordinates`, what its stops limit."
+            "without `Y` and `V` a machine of your own with stops says by `position`, `velocity` "
+            "and `placed`, or by `coordinates`, what they limit."
         ) from None
+    check_reals("start", start)
+    if shape:
+        raise ValueError(
+            "Argument `start` must be one state (use `jax.vmap` for a batch), in which position "
+            f"and velocity are numbers, but there they have shape {shape}."
+        )
+    if not scene.has_velocity(start):
+        _check_flow(scene, start)
     for path, leaf in jtu.tree_leaves_with_path(start):
         numbers = concrete(leaf)
         if numbers is not None and not np.isfinite(numbers).all():
@@ -203,8 +265,9 @@ def check_start(scene: AbstractScene, start: Any) -> None:
         if Y is None or gap is None:
             continue
         depth = np.max(stop.sign * Y - gap)
-        if depth > 0:
+        if depth > np.max(rounding(scene, start)):
             raise ValueError(
                 f"Argument `start` must not lie beyond a stop, but lies {depth:g} beyond stop {i} "
                 f"({stop.side}, gap {gap})."
             )
+    check_period(scene, start)

@@ -7,7 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
+from .._checks import one_of
 from ..scene.numbers import by_name
+from ..scene.units import with_units
+
+EVENTS = ("impact", "rest", "release", "mode")
+"""What may happen to a motion, as `EventLog` lists it: an impact on a stop; a body that comes to
+rest on one; a body that leaves the stop on which it rested; a switch that changes its mode."""
 
 Variables = dict[str, tuple[tuple[str, ...], np.ndarray]]
 
@@ -24,13 +30,41 @@ def batch_names(dims: Sequence[str] | None, number: int) -> tuple[str, ...]:
 
 
 def states(prefix: str, state: Any, dims: tuple[str, ...]) -> Variables:
-    """The components of a state, each a variable."""
-    return {f"{prefix}_{name}": (dims, np.asarray(x)) for name, x in by_name(state).items()}
+    """The components of a state, each a variable; an array among them has axes of its own."""
+    found = {}
+    for name, x in by_name(state).items():
+        name, x = name or "state", np.asarray(x)
+        inner = tuple(f"{name}_{i}" for i in range(x.ndim - len(dims)))
+        found[f"{prefix}_{name}"] = (*dims, *inner), x
+    return found
 
 
 def present(values: Mapping[str, Any], dims: tuple[str, ...]) -> Variables:
     """Those that are there."""
     return {name: (dims, np.asarray(x)) for name, x in values.items() if x is not None}
+
+
+def tidy(data: Any, along: str | None) -> Any:
+    """Of a data set what is told along one of its dimensions, so that it makes a table with one
+    row for each of its places; all of it by default.
+
+    **Raises:** `ValueError` if there is no such dimension.
+    """
+    if along is None:
+        return data
+    last = {str(name): str(x.dims[-1]) for name, x in data.data_vars.items() if x.dims}
+    one_of("along", along, tuple(dict.fromkeys(last.values())))
+    return data[[name for name, dim in last.items() if dim == along]]
+
+
+# What tells, along these dimensions, which places of a log are used.
+_LISTED = {"impact": "log_stop", "event": "event_number"}
+
+
+def _met(log: Any, number: str) -> Any:
+    """The entries of a log one after the other, without the places that are not used."""
+    rows = log.stack(row=log[number].dims).reset_index("row")
+    return rows.isel(row=np.flatnonzero(np.asarray(rows[number]) >= 0))
 
 
 def place_of(item: Any, items: Sequence[Any]) -> Int[Array, "..."]:
@@ -44,7 +78,7 @@ def in_names(item: Any, kind: Any, names: Sequence[str]) -> np.ndarray:
     return np.asarray(np.asarray(names)[np.asarray(place)])
 
 
-def run_dataset(run: Any, dims: Sequence[str] | None, result: np.ndarray) -> Any:
+def run_dataset(run: Any, dims: Sequence[str] | None, result: np.ndarray, along: str | None) -> Any:
     """A run as a data set (see `Run.to_xarray`)."""
     import xarray as xr  # slow to load
 
@@ -68,9 +102,15 @@ def run_dataset(run: Any, dims: Sequence[str] | None, result: np.ndarray) -> Any
         log = (*cycle, "impact")
         kept = {f"log_{name}": getattr(run.impact_log, name) for name in ("phase", "speed", "stop")}
         variables |= present(kept, log)
+    if run.event_log is not None:
+        names = ("phase", "number", "value")
+        kept = {f"event_{name}": getattr(run.event_log, name) for name in names}
+        kept["event_kind"] = np.asarray([*EVENTS, ""])[np.asarray(run.event_log.kind)]
+        variables |= present(kept, (*cycle, "event"))
     if run.errors is not None:
         variables |= states("error_section", run.errors.sections, section)
         kept = {f"error_{name}": getattr(run.errors, name) for name in ("y_max", "y_min")}
         variables |= present(kept, cycle)
     variables |= present({"result": result, "steps": run.steps, "rejected": run.rejected}, batch)
-    return xr.Dataset(variables, coordinates)
+    data = tidy(with_units(xr.Dataset(variables, coordinates), dict(run.units)), along)
+    return _met(data, _LISTED[along]) if along in _LISTED else data

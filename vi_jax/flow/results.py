@@ -7,14 +7,18 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
-from ..scene.numbers import by_name
+from ..scene.numbers import state_in_words
+from ..scene.shown import Shown, Told
+from ..scene.units import PLAIN, Stated, in_unit, name_in
+from ._listed import listed
+from .enumeration import NamedEnumeration
+from .labelled import EVENTS as EVENTS
 from .labelled import in_names, place_of, run_dataset
 
 
-class RESULTS(eqx.Enumeration):
+class RESULTS(NamedEnumeration):
     """Why a lane ended; `simulate` gives one to each."""
 
     successful = ""
@@ -33,9 +37,29 @@ class RESULTS(eqx.Enumeration):
     underflow = "The step size fell below what the precision resolves. Loosen the tolerance."
     not_finite = "The state ceased to be finite."
     unresolved = "An impact could not be located within the step."
+    switch_unresolved = "The event of a switch could not be located within the step."
+    section_unresolved = (
+        "The end of a cycle, where the machine's section or clock says, could not be located "
+        "within the step."
+    )
+    turn_unresolved = (
+        "A turning point, or the release of a body from rest, could not be located within the step."
+    )
     max_steps = (
         "The number of steps exceeded `max_steps` before the last cycle was complete, or 65,536 "
         "within one, as where an autonomous machine is at rest and meets its section no more."
+    )
+    bad_impact = (
+        "An impact left faster than it came, or further into its stop: a restitution law must have "
+        "values in [0, 1]."
+    )
+    simultaneous = (
+        "Two impacts fell upon one instant, and what follows depends on which of them goes first, "
+        "which nothing says."
+    )
+    sliding = (
+        "The field on both sides of a switch points at its surface, so that the motion would have "
+        "to slide along it, which is no mode of the machine."
     )
 
 
@@ -49,6 +73,12 @@ REASON_NAMES = (
     "not_finite",
     "unresolved",
     "max_steps",
+    "switch_unresolved",
+    "section_unresolved",
+    "turn_unresolved",
+    "bad_impact",
+    "simultaneous",
+    "sliding",
 )
 REASONS = tuple(getattr(RESULTS, name) for name in REASON_NAMES)
 (
@@ -60,6 +90,12 @@ REASONS = tuple(getattr(RESULTS, name) for name in REASON_NAMES)
     NOT_FINITE,
     UNRESOLVED,
     MAX_STEPS,
+    SWITCH_UNRESOLVED,
+    SECTION_UNRESOLVED,
+    TURN_UNRESOLVED,
+    BAD_IMPACT,
+    SIMULTANEOUS,
+    SLIDING,
 ) = range(len(REASONS))
 
 
@@ -76,7 +112,7 @@ def number_of(result: RESULTS) -> Int[Array, "..."]:
     return place_of(result, REASONS)
 
 
-class Samples(eqx.Module):
+class Samples(Shown):
     """Dense samples, evenly spaced in the cycle; arrays have shape (cycles · samples + 1,)."""
 
     cycles: Float[Array, " points"]
@@ -87,21 +123,59 @@ class Samples(eqx.Module):
     """The states, a pytree like the start."""
 
 
-class ImpactLog(eqx.Module):
+class ImpactLog(Told):
     """The first impacts of each cycle in their order; arrays have shape (cycles, size).
 
     Unused places hold NaN, and -1 in `stop`.
     """
 
     phase: Float[Array, "cycles size"]
-    """Clock of the cycle at the impact: crank angle in [0, 2π] for a `Scene`."""
+    """Clock of the cycle at the impact, in the machine's units: the crank angle in [0, 2π] for a
+    `Scene`, what counts the cycles for any other."""
     speed: Float[Array, "cycles size"]
-    """V⁻, speed of approach just before the impact (unit: a ω)."""
+    """V⁻, speed of approach just before the impact."""
     stop: Int[Array, "cycles size"]
     """Index into `scene.stops`."""
 
+    def told(self) -> str:
+        """Impacts of the first cycles: where on the clock, on which stop, and how fast."""
 
-class Errors(eqx.Module):
+        def word(i: int, j: int) -> str:
+            return f"stop {self.stop[i, j]} at {self.phase[i, j]:.6g} by {self.speed[i, j]:.4g}"
+
+        return listed("impact", self.stop >= 0, word)
+
+
+class EventLog(Told):
+    """The first events of each cycle, of all kinds, in their order; arrays have shape (cycles,
+    size).
+
+    Unused places hold NaN, and -1 in `kind` and `number`.
+    """
+
+    phase: Float[Array, "cycles size"]
+    """Clock of the cycle at the event, as in `ImpactLog`."""
+    kind: Int[Array, "cycles size"]
+    """What happened: an index into `EVENTS`."""
+    number: Int[Array, "cycles size"]
+    """Index into the machine's `stops`, or for a mode into its `switches`."""
+    value: Float[Array, "cycles size"]
+    """V⁻ of an impact, or of the impact that came to rest; the mode of a switch after its change;
+    NaN for a release."""
+
+    def told(self) -> str:
+        """Events of the first cycles: what, of which stop or switch, where on the clock."""
+
+        def word(i: int, j: int) -> str:
+            kind = EVENTS[int(self.kind[i, j])]
+            after = f" becomes {self.value[i, j]:g}" if kind == "mode" else ""
+            of = "switch" if kind == "mode" else "stop"
+            return f"{kind} ({of} {self.number[i, j]}{after}) at {self.phase[i, j]:.6g}"
+
+        return listed("event", self.number >= 0, word)
+
+
+class Errors(Shown):
     """Estimated errors of a run: its differences to a run by the method's `tighter` one.
 
     NaN where either run failed. Where a motion is chaotic they grow until they are as large as the
@@ -118,39 +192,44 @@ class Errors(eqx.Module):
     """Difference of the impact counts in each cycle."""
 
 
-class Run(eqx.Module):
+class Run(Told):
     """What `simulate` returns, cycle by cycle. After a failure the rest is NaN (counts: 0).
 
-    Under `vmap` every array has the batch axes in front.
+    Under `vmap` every array has the batch axes in front. Numbers are in the machine's units (see
+    `AbstractScene.units`): those of a `Scene` in a, ω and m_C.
     """
 
     sections: Any
-    """States at the start and after each cycle, a pytree like the start; leaves (cycles + 1,)."""
+    """States at the start and after each cycle, a pytree like the start; leaves (cycles + 1,), of
+    an array in the state with its own axes behind."""
     y_max: Float[Array, " cycles"] | None
-    """Greatest Y of the motion in each cycle, not of sample points (unit: a)."""
+    """Greatest position (of the first coordinate) of the motion in each cycle, not of sample
+    points."""
     y_min: Float[Array, " cycles"] | None
-    """Smallest Y of the motion in each cycle (unit: a)."""
+    """Smallest position of the motion in each cycle."""
     impacts: Int[Array, " cycles"]
     """Number of impacts in each cycle."""
     impact_speed: Float[Array, " cycles"] | None
-    """Greatest V⁻ in each cycle (unit: a ω), 0 without impact."""
+    """Greatest V⁻ in each cycle, 0 without impact."""
     rests: Int[Array, " cycles"] | None
     """Times the body came to rest on a stop, its endless last impacts completed at once (they are
     not among `impacts`)."""
     impact_energy: Float[Array, " cycles"] | None
-    """Energy lost in impacts in each cycle, Σ ½(1 - k²)V⁻², and ½V⁻² where the body came to rest
-    (unit: m_C a²ω²)."""
+    """Energy lost in impacts in each cycle, Σ ½(1 - k²)V⁻², and ½V⁻² where the body came to rest,
+    times the mass that an impact acts on."""
     clearance: Float[Array, " cycles"] | None
-    """Smallest distance to a stop at which the body turned back in each cycle without touching it
-    (unit: a), infinite where it did not; recorded along with the impact log."""
+    """Smallest distance to a stop at which the body turned back in each cycle without touching it,
+    infinite where it did not; recorded along with the impact log."""
     duration: Float[Array, " cycles"] | None
     """Time τ that each cycle took."""
     frequency_ratio: Float[Array, " cycles"] | None
-    """ζ: mean crank speed over each cycle (unit: ω)."""
+    """ζ: mean speed of the drive over each cycle."""
     samples: Samples | None
     """Dense samples, if asked for."""
     impact_log: ImpactLog | None
     """The impacts, if asked for."""
+    event_log: EventLog | None
+    """Events of all kinds, if asked for."""
     errors: Errors | None
     """Estimated errors, if asked for."""
     result: RESULTS
@@ -160,6 +239,10 @@ class Run(eqx.Module):
     precision no more than 2²⁴ are seen)."""
     rejected: Int[Array, ""]
     """Steps rejected on their error estimate."""
+    labels: tuple[str, str] = eqx.field(static=True, default=PLAIN)
+    """What position and velocity are called, in the machine's words."""
+    units: Stated = eqx.field(static=True, default=())
+    """In which units its quantities are, as the machine states it."""
 
     @property
     def successful(self) -> jax.Array:
@@ -169,35 +252,49 @@ class Run(eqx.Module):
     @property
     def last(self) -> Any:
         """The state on the last section: a start to go on from, or a guess for `find_orbit`."""
-        return jtu.tree_map(lambda x: x[..., -1], self.sections)
+        # Batch axes are in front, those of an array in the state behind; how many there are in
+        # front is told by a number for each lane.
+        place = (*[slice(None)] * self.steps.ndim, -1)
+        return jtu.tree_map(lambda x: x[place], self.sections)
 
-    def to_xarray(self, dims: Sequence[str] | None = None) -> Any:
+    def to_xarray(self, dims: Sequence[str] | None = None, *, along: str | None = None) -> Any:
         """This run as an `xarray.Dataset`, labelled by cycle, section and sample.
 
-        States become a variable for each component: `section_Y` (cycles + 1), `sample_Y`; the
-        impact log `log_phase`, `log_speed` and `log_stop`; all else keeps its name, and `result`
-        is the reason's. Host-side: not to be traced.
+        States become a variable for each component: `section_Y` (cycles + 1), `sample_Y`; an array
+        in the state keeps its axes, as `q_0`, and a state that is one array is `section_state`. The
+        impact log becomes `log_phase`, `log_speed` and `log_stop`; that of all events
+        `event_phase`, `event_kind` in words, `event_number` and `event_value`; all else keeps its
+        name, and `result` is the reason's. Host-side: not to be traced.
 
-        **Arguments:** names of the batch axes of a run under `vmap`; by default `lane`.
+        As a table, everything together would have a row for each combination of a cycle, a section,
+        a sample and an impact. `to_xarray(along="cycle").to_dataframe()` has one for each cycle.
 
-        **Raises:** `ValueError` if these are not as many as there are batch axes.
+        **Arguments:** names of the batch axes of a run under `vmap`, by default `lane`; `along`, to
+        keep only what is told along one dimension: `"cycle"`, `"section"`, `"sample"`, `"impact"`
+        or `"event"` (then a row for each that was met), or a batch axis.
+
+        **Raises:** `ValueError` if these are not as many as there are batch axes, or there is no
+        such dimension.
         """
-        return run_dataset(self, dims, in_names(self.result, RESULTS, REASON_NAMES))
+        return run_dataset(self, dims, in_names(self.result, RESULTS, REASON_NAMES), along)
 
-    def __str__(self) -> str:
-        if isinstance(self.steps, Tracer):
-            return repr(self)
+    def drawn(self) -> Any:
+        """The smallest position in each cycle."""
+        return None if self.steps.ndim else self.y_min
+
+    def told(self) -> str:
+        """The last section and cycle, and how the run ended."""
         if self.steps.ndim:
             good = int(jnp.sum(self.successful))
             return f"Run of {self.steps.size} lanes {self.steps.shape}, {good} successful"
         cycles = self.impacts.shape[-1]
         lines = [f"Run of {cycles} cycles, {int(jnp.sum(self.impacts))} impacts"]
-        last = ", ".join(
-            f"{name} = {float(value[-1]):.9g}" for name, value in by_name(self.sections).items()
-        )
-        lines.append(f"  last section: {last}")
+        units = dict(self.units)
+        lines.append(f"  last section: {state_in_words(self.last, 9, units)}")
         if self.y_min is not None and self.y_max is not None:
-            lines.append(f"  last cycle: Y in [{self.y_min[-1]:.6g}, {self.y_max[-1]:.6g}]")
+            span = f"[{self.y_min[-1]:.6g}, {self.y_max[-1]:.6g}]"
+            span = in_unit(span, units, "position")
+            lines.append(f"  last cycle: {name_in(self.labels[0])} in {span}")
         if self.errors is not None:
             worst = max(float(jnp.max(x)) for x in jtu.tree_leaves(self.errors.sections))
             lines.append(f"  error of the sections, estimated: {worst:.2g}")

@@ -8,29 +8,32 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+from jaxtyping import Array, Int
 
 from .. import lanes
 from .._checks import flag
 from .._programs import compiled
 from ..scene import AbstractScene
+from ..scene.units import stated
 from ._lane import Plan, Record
 from ._spoil import spoiled
 from .arguments import planned
 from .loop import Ends, run_lane
 from .methods import MethodLike
-from .results import Errors, ImpactLog, Run, Samples, reason
+from .results import Errors, EventLog, ImpactLog, Run, Samples, reason
 
 
 def simulate(
     scene: AbstractScene,
     start: Any,
-    cycles: int,
+    cycles: int | Int[Array, ""],
     *,
     settle: Any = 0,
     method: MethodLike = None,
     clock: str | None = None,
     samples: int = 0,
     impact_log: int = 0,
+    event_log: int = 0,
     record: str = "motion",
     estimate: bool = False,
     rests: bool | None = None,
@@ -53,13 +56,15 @@ def simulate(
     - `cycles`: number of drive cycles to record, at least 1; static.
     - `settle`: drive cycles before them, of which nothing is kept; another number is not another
       program.
-    - `method`: `Adaptive(...)`, `FixedStep(...)`, `ExactFlight()`, or the name of a `preset`,
-      by default `"standard"`.
+    - `method`: `Adaptive(...)`, `FixedStep(...)`, `Taylor(...)`, `ExactFlight()`, or the name of a
+      `preset`, by default `"standard"`.
     - `clock`: `"phase"` or `"time"`; `None` leaves the scene's own. The phase clock needs a crank
       that turns forward; the time clock carries a start from rest and a stall.
     - `samples`: dense samples per cycle, evenly spaced on the drive's clock. Steps end on them, so
       that they have the method's own accuracy.
     - `impact_log`: number of impacts to log in each cycle; with it comes `Run.clearance`.
+    - `event_log`: number of events of any kind to log in each cycle (`EVENTS`): impacts, coming to
+      rest, releases, changes of mode.
     - `record`: `"motion"`, or `"sections"` to leave out extremes, durations and impact speeds
       (then `None`), which is faster.
     - `estimate`: run it again by a tighter method (`AbstractMethod.tighter`) and give the
@@ -82,7 +87,7 @@ def simulate(
     estimate, throw = flag("estimate", estimate), flag("throw", throw)
     plan, start = planned(
         scene, start, cycles, settle=settle, method=method, clock=clock, samples=samples,
-        impact_log=impact_log, record=record, rests=rests,
+        impact_log=impact_log, event_log=event_log, record=record, rests=rests,
         max_impacts=max_impacts, max_steps=max_steps,
     )  # fmt: skip
     with lanes.interruptible():
@@ -178,18 +183,37 @@ def collect(plan: Plan, sampled: bool, lane: Ends, points: Any, records: Record)
         frequency_ratio=None if duration is None else scene.frequency_ratio(duration),
         samples=dense,
         impact_log=log,
+        event_log=_events(plan, records.events) if plan.events else None,
         errors=None,
         result=reason(lane.fault),
         steps=lane.steps.astype(jnp.int32),
         rejected=lane.rejected.astype(jnp.int32),
+        labels=scene.labels,
+        units=stated(scene),
     )
 
 
 def _log(plan: Plan, entries: Any) -> ImpactLog:
     """The first `plan.log` impacts of each cycle, from those of its intervals."""
-    entries = entries.reshape(plan.cycles, plan.parts, 3, plan.log)
-    entries = jnp.moveaxis(entries, 2, 0).reshape(3, plan.cycles, plan.parts * plan.log)
-    order = jnp.argsort(jnp.isnan(entries[2]), axis=1, stable=True)[:, : plan.log]
-    phase, speed, stop = (jnp.take_along_axis(x, order, axis=1) for x in entries)
-    phase = plan.scene.as_logged(phase)
-    return ImpactLog(phase, speed, jnp.where(jnp.isnan(stop), -1.0, stop).astype(jnp.int32))
+    phase, speed, stop = _by_cycle(plan, entries, used=2)
+    return ImpactLog(plan.scene.as_logged(phase), speed, _numbers(stop))
+
+
+def _events(plan: Plan, entries: Any) -> EventLog:
+    """The first `plan.events` events of each cycle, from those of its intervals."""
+    phase, code, number, value = _by_cycle(plan, entries, used=1)
+    return EventLog(plan.scene.as_logged(phase), _numbers(code), _numbers(number), value)
+
+
+def _by_cycle(plan: Plan, entries: Any, *, used: int) -> list[Any]:
+    """The rows of a log (intervals, rows, size), each as (cycles, size), its entries in their order
+    and those not used last: they have NaN in the row `used`."""
+    rows, size = entries.shape[1:]
+    entries = entries.reshape(plan.cycles, plan.parts, rows, size)
+    entries = jnp.moveaxis(entries, 2, 0).reshape(rows, plan.cycles, plan.parts * size)
+    order = jnp.argsort(jnp.isnan(entries[used]), axis=1, stable=True)[:, :size]
+    return [jnp.take_along_axis(x, order, axis=1) for x in entries]
+
+
+def _numbers(x: Any) -> Any:
+    return jnp.where(jnp.isnan(x), -1.0, x).astype(jnp.int32)

@@ -14,7 +14,7 @@ from jax.core import Tracer
 
 from .._checks import count, one_of, require
 from ..scene import AbstractScene
-from .arguments import check_start
+from .arguments import check_start, machine_of
 from .fusion import jit
 from .methods import AbstractMethod, Adaptive, ExactFlight, FixedStep, Taylor, Verner9, preset
 from .simulate import simulate
@@ -96,10 +96,7 @@ def suggest_method(
     require("error", error, low=0.0, open_low=True)
     one_of("quantity", quantity, QUANTITIES)
     cycles, lanes = count("cycles", cycles, least=1), count("lanes", lanes, least=1)
-    if not isinstance(scene, AbstractScene):
-        raise TypeError(
-            f"Argument `scene` must be a `Scene` or an `AbstractScene`, but got {scene!r}."
-        )
+    scene = machine_of(scene)
     if any(isinstance(x, Tracer) for x in jtu.tree_leaves((scene, start))):
         raise TypeError(
             "Arguments `scene` and `start` must hold known numbers, but are being traced: call "

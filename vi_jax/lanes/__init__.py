@@ -1,8 +1,10 @@
 """One lane's loop, run for any number of lanes: vector code by LLVM on a CPU, else XLA."""
 
 from ._primitive import vector_only as vector_only
+from ._program import CALLS as CALLS
 from ._vector import Unsupported as Unsupported
 from .call import interruptible as interruptible
+from .elementary import horner as horner
 from .elementary import pin as pin
 from .elementary import pin_flag as pin_flag
 from .elementary import sincos as sincos

@@ -27,10 +27,15 @@ def llvm() -> Any:
     binding.initialize_native_asmprinter()
     try:
         # Once, so that a program can be sent the other road before any is under way.
-        loaded(binding, compiled(binding, "define void @kernel() { ret void }", None))
+        _loaded(binding, compiled(binding, "define void @kernel() { ret void }", None))
     except RuntimeError as error:
         raise Unsupported(f"LLVM: {error}") from None
     return binding
+
+
+def engine_of(text: str) -> Any:
+    """The engine that holds the machine code of a text, which must be kept."""
+    return _loaded(llvm(), compiled(llvm(), text, None))
 
 
 def begun(text: str, cpu: str | None) -> Future:
@@ -46,14 +51,18 @@ def _worker() -> ThreadPoolExecutor:
 
 def _made(binding: Any, text: str, cpu: str | None, store: Path | None) -> tuple[Any, int]:
     if store is None:
-        return loaded(binding, compiled(binding, text, cpu))
+        return _kernel(_loaded(binding, compiled(binding, text, cpu)))
     words = (text, cpu, *_host(binding), binding.llvm_version_info)
     place = store / f"{hashlib.blake2b(repr(words).encode(), digest_size=20).hexdigest()}.o"
     code = _read(place)
     if code is None:
         code = compiled(binding, text, cpu)
         _write(place, code)
-    return loaded(binding, code)
+    return _kernel(_loaded(binding, code))
+
+
+def _kernel(engine: Any) -> tuple[Any, int]:
+    return engine, engine.get_function_address("kernel")
 
 
 def _host(binding: Any) -> tuple[str, str]:
@@ -76,13 +85,13 @@ def compiled(binding: Any, text: str, cpu: str | None) -> bytes:
     return machine.emit_object(module)
 
 
-def loaded(binding: Any, code: bytes) -> tuple[Any, int]:
-    """An engine that holds object code, and the address of `kernel` in it."""
+def _loaded(binding: Any, code: bytes) -> Any:
+    """An engine that holds object code."""
     machine = binding.Target.from_default_triple().create_target_machine()
     engine = binding.create_mcjit_compiler(binding.parse_assembly(""), machine)
     engine.add_object_file(binding.ObjectFileRef.from_data(code))
     engine.finalize_object()
-    return engine, engine.get_function_address("kernel")
+    return engine
 
 
 def _store() -> Path | None:

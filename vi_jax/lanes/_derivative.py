@@ -31,6 +31,7 @@ def forward(program: Program, moving: tuple[bool, ...]) -> tuple[Program, tuple[
         rows=program.rows,
         block=program.block,
         slopes=(*slopes, *(True for m in moving if m)),
+        base=program,
     )
     return derived, (*there.outs, *rows)
 
@@ -100,6 +101,9 @@ def widened(program: Program, many: tuple[bool, ...], number: int) -> tuple[Prog
         return jax.make_jaxpr(function)(*shapes)
 
     flags = (*there.carry, False, False, *there.rows)
+    base = program.base
+    if base is not None and any(many[: len(base.in_avals)]):
+        base = None
     wide = Program(
         begin=over(program.begin, many, flags),
         step=over(program.step, (*many, *there.carry), flags),
@@ -107,5 +111,6 @@ def widened(program: Program, many: tuple[bool, ...], number: int) -> tuple[Prog
         rows=program.rows,
         block=program.block,
         slopes=program.slopes,
+        base=base,
     )
     return wide, there

@@ -10,8 +10,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax.core import ShapedArray
-from jax.extend.core import Primitive
-from jax.interpreters import ad, batching, mlir
+from jax.extend.core import Literal, Primitive
+from jax.interpreters import ad, batching, mlir, partial_eval
 
 from . import _xla as xla
 from ._context import within
@@ -109,18 +109,55 @@ def _jvp(primals, tangents, *, program: Program, road: str):
     for part in (has[: _outs(program)], has[_outs(program) :]):
         values += [next(out) for _ in part]
         slopes += [next(out) if there else None for there in part]
-    if _put_off(changes):
-        values = lanes_p.bind(*primals, program=program, road=road)
     return values, [
         ad.Zero(jax.typeof(v).to_tangent_aval()) if s is None else s
         for v, s in zip(values, slopes, strict=True)
     ]
 
 
-def _put_off(tangents) -> bool:
-    """Whether the tangents are yet unknown, as in `jax.linearize` and `jax.grad`, while the values
-    are wanted now: what is computed along with such tangents is not known either."""
-    return any(type(x).__name__ == "JaxprTracer" for x in tangents)
+def _partial(trace, *tracers, program: Program, road: str):
+    """Where tangents are not known yet, as in `jax.linearize` and `jax.grad`, the values are: what
+    is computed along with such tangents is not known either, and the values are computed alone."""
+    unknown = [not t.is_known() for t in tracers]
+    alone = program.values_without(unknown, [t.aval.shape for t in tracers])
+    later = trace.default_process_primitive(lanes_p, tracers, {"program": program, "road": road})
+    if alone is None or not any(unknown):
+        return later
+    smaller, there = alone
+    given = [t.pval.get_known() for t in tracers[: len(smaller.in_avals)]]
+    values = iter(lanes_p.bind(*given, program=smaller, road=road))
+    return [next(values) if known else x for known, x in zip(there, later, strict=True)]
+
+
+def _partial_equation(saveable, unknown, instantiated, equation):
+    """The same of an equation, for `jax.checkpoint`: what is computed now, and what later, when the
+    values are computed again along with their derivatives."""
+    program, outs = equation.params["program"], len(equation.outvars)
+    shapes = [x.aval.shape for x in equation.invars]
+    alone = program, [True] * outs
+    if any(unknown):
+        alone = program.values_without(unknown, shapes)
+    elif _saved(saveable(lanes_p, *(x.aval for x in equation.invars), **equation.params)):
+        return equation, None, [False] * outs, [False] * outs, []
+    kept = [
+        x
+        for x, there in zip(equation.invars, instantiated, strict=True)
+        if not there and not isinstance(x, Literal)
+    ]
+    if alone is None:
+        return None, equation, [True] * outs, [True] * outs, kept
+    smaller, there = alone
+    now = equation.replace(
+        invars=equation.invars[: len(smaller.in_avals)],
+        outvars=[x for x, known in zip(equation.outvars, there, strict=True) if known],
+        params={**equation.params, "program": smaller},
+    )
+    return now, equation, [not known for known in there], [True] * outs, kept
+
+
+def _saved(policy: Any) -> bool:
+    """Whether a policy of `jax.checkpoint` says so, by a truth value or by a word of JAX's."""
+    return policy is True or type(policy).__name__.startswith("Saveable")
 
 
 def _transposed(cotangents, *args, program: Program, road: str):
@@ -176,6 +213,8 @@ def _outs(program: Program) -> int:
 
 
 ad.primitive_jvps[lanes_p] = _jvp
+partial_eval.custom_partial_eval_rules[lanes_p] = _partial
+partial_eval.partial_eval_jaxpr_custom_rules[lanes_p] = _partial_equation
 ad.primitive_transposes[lanes_p] = _transposed
 
 

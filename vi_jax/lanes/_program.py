@@ -25,6 +25,9 @@ class Program(eqx.Module):
     slopes: tuple[bool, ...] = eqx.field(static=True, default=())
     """Which inputs are tangents; none may steer the loop."""
 
+    base: "Program | None" = eqx.field(static=True, default=None)
+    """Of a program of values and derivatives that of the values alone, whose inputs come first."""
+
     __hash__ = object.__hash__
     __eq__ = object.__eq__
 
@@ -47,6 +50,27 @@ class Program(eqx.Module):
     def out_avals(self) -> list[Any]:
         """Of one lane's results."""
         return self.end.out_avals
+
+    def values_without(
+        self, gone: Sequence[bool], shapes: Sequence[tuple[int, ...]]
+    ) -> "tuple[Program, list[bool]] | None":
+        """The program of what is known without some of the tangents, and which results and rows
+        of this one it gives, in their order; `None` if there is none.
+
+        **Arguments:** which inputs are missing, and the shapes of all.
+        """
+        found, base = [True] * (len(self.out_avals) + len(self.row_avals)), self.base
+        program, batch = self, self.batch(shapes)
+        while base is not None and any(gone[: len(program.in_avals)]):
+            outs, rows = len(base.out_avals), len(base.row_avals)
+            skipped = len(program.out_avals) - outs, len(program.row_avals) - rows
+            own = [True] * outs + [False] * skipped[0] + [True] * rows + [False] * skipped[1]
+            left = iter(own)
+            found = [f and next(left) for f in found]
+            program, base = base, base.base
+        number = len(program.in_avals)
+        alike = program.batch(shapes[:number]) == batch
+        return (program, found) if alike and not any(gone[:number]) else None
 
     def batch(self, shapes: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
         """The axes that inputs of these shapes have beyond those of one lane."""

@@ -1,7 +1,9 @@
 """What is kept of what was made, as long as it is in use."""
 
+import functools
 import threading
 from collections import OrderedDict
+from collections.abc import Callable
 from typing import Generic, TypeVar
 
 K = TypeVar("K")
@@ -39,3 +41,16 @@ class Recent(Generic[K, V]):
             self._values.move_to_end(key)
             while len(self._values) > self.most:
                 self._values.popitem(last=False)
+
+
+def once(make: Callable[[], V]) -> Callable[[], V]:
+    """A function that makes something the first time, whichever thread asks: of two that ask at
+    once `functools.cache` would let both make it, and drop one that may be in use."""
+    lock, kept = threading.Lock(), functools.cache(make)
+
+    @functools.wraps(make)
+    def made() -> V:
+        with lock:
+            return kept()
+
+    return made

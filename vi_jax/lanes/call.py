@@ -4,14 +4,17 @@ The call frame is read as XLA's `ffi/api/c_api.h` lays it out, whose version the
 """
 
 import ctypes
-import functools
+import signal
+import threading
 from contextlib import contextmanager
 from ctypes import POINTER, Structure, c_char_p, c_int, c_int32, c_int64, c_size_t, c_void_p
 
 import jax
 import numpy as np
 
-from .machine import living
+from ._interrupts import WELL, Out, guard, raises, watch
+from ._recent import once
+from .machine import Work, living
 
 TARGET = "vi_jax_lanes"
 
@@ -77,12 +80,27 @@ class _ErrorArguments(Structure):
     ]  # fmt: skip
 
 
+# Functions of the interface between that which makes errors and that which tells runs apart.
+_BETWEEN = 15
+
+
 class _Api(Structure):
     _fields_ = [
         ("struct_size", c_size_t), ("extension", c_void_p), ("version", _Version),
         ("internal", c_void_p),
         ("error_create", ctypes.CFUNCTYPE(c_void_p, POINTER(_ErrorArguments))),
+        ("others", c_void_p * _BETWEEN), ("run_get", c_void_p),
     ]  # fmt: skip
+
+
+class _Run(Structure):
+    _fields_ = [
+        ("struct_size", c_size_t), ("extension", c_void_p), ("context", c_void_p),
+        ("number", c_int64),
+    ]  # fmt: skip
+
+
+_RunGetter = ctypes.CFUNCTYPE(c_void_p, POINTER(_Run))
 
 
 class _Frame(Structure):
@@ -99,24 +117,49 @@ def _failed(frame: _Frame, message: str, code: int) -> int | None:
     return frame.api.contents.error_create(ctypes.byref(arguments))
 
 
-@ctypes.CFUNCTYPE(c_void_p, POINTER(_Frame))
-def _handler(pointer):
-    frame = pointer.contents
+# Of calls that are under way, by the address of XLA's frame.
+_works: dict[int, Work] = {}
+
+
+@ctypes.CFUNCTYPE(None, POINTER(_Frame), POINTER(Out))
+def _handler(frame, out):
+    """Called until it has put an answer there (see `guard`)."""
+    out, frame = out.contents, frame.contents
+    out.answer = _answered(frame, out)  # the last that a signal can come before
+
+
+def _answered(frame: _Frame, out: Out) -> int | None:
+    try:
+        if out.lost:
+            raise KeyboardInterrupt
+        return _answer(frame)
+    except KeyboardInterrupt:
+        _left(frame)
+        if threading.current_thread() is threading.main_thread() and raises():
+            out.signal = signal.SIGINT
+        return _failed(frame, INTERRUPTED, _CANCELLED)
+    except BaseException as error:  # nothing may escape into XLA
+        _left(frame)
+        return _failed(frame, f"{type(error).__name__}: {error}", _INTERNAL)
+
+
+def _answer(frame: _Frame) -> int | None:
     extension = frame.extension
     while extension:
         if extension.contents.type == _METADATA:
             metadata = ctypes.cast(extension, POINTER(_MetadataExtension)).contents.metadata
             metadata.contents.version.major, metadata.contents.version.minor = _MAJOR, _MINOR
-            return None
+            return WELL
         extension = extension.contents.next
-    if frame.stage != _EXECUTE:
-        return None
-    try:
-        return _run(frame)
-    except KeyboardInterrupt:
-        return _failed(frame, INTERRUPTED, _CANCELLED)
-    except BaseException as error:  # nothing may escape into XLA
-        return _failed(frame, f"{type(error).__name__}: {error}", _INTERNAL)
+    return _run(frame) if frame.stage == _EXECUTE else WELL
+
+
+def _left(frame: _Frame) -> None:
+    """Nothing of this call is under way any more."""
+    work = _works.get(ctypes.addressof(frame))
+    if work is not None:
+        work.leave()
+        del _works[ctypes.addressof(frame)]
 
 
 def _run(frame: _Frame) -> int | None:
@@ -132,14 +175,35 @@ def _run(frame: _Frame) -> int | None:
         return _failed(frame, "The kernel of this program is not of this process.", _INTERNAL)
     inputs = [arguments.items[i].contents.data or 0 for i in range(1, arguments.size)]
     outputs = [results.items[i].contents.data or 0 for i in range(results.size)]
-    kernel.run(inputs, strides, outputs, lanes)
-    return None
+    work = _works[ctypes.addressof(frame)] = kernel.work(inputs, strides, outputs, lanes)
+    if threading.current_thread() is threading.main_thread():
+        well = work.run()
+    else:
+        with watch.told(_run_of(frame), work.stop):
+            well = work.run()
+    del _works[ctypes.addressof(frame)]
+    if well:
+        return WELL
+    if work.stop.value:
+        return _failed(frame, INTERRUPTED, _CANCELLED)
+    return _failed(frame, "Not all lanes were run.", _INTERNAL)
 
 
-@functools.cache
+def _run_of(frame: _Frame) -> int:
+    """A number of XLA's run; 0 where XLA does not tell."""
+    api = frame.api.contents
+    if api.struct_size < _Api.run_get.offset + ctypes.sizeof(c_void_p) or not api.run_get:
+        return 0
+    run = _Run(ctypes.sizeof(_Run), None, frame.context, 0)
+    _RunGetter(api.run_get)(ctypes.byref(run))
+    return run.number
+
+
+@once
 def registered() -> str:
-    """The name by which XLA knows the handler; registered on first use."""
-    jax.ffi.register_ffi_target(TARGET, jax.ffi.pycapsule(_handler), platform="cpu", api_version=1)
+    """The name by which XLA knows the handler; registered on first use, whichever thread's."""
+    handler = ctypes.c_void_p(guard(_handler))
+    jax.ffi.register_ffi_target(TARGET, jax.ffi.pycapsule(handler), platform="cpu", api_version=1)
     return TARGET
 
 

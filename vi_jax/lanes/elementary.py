@@ -16,7 +16,8 @@ _SIN = tuple((-1) ** n / factorial(2 * n + 1) for n in range(8))
 _COS = tuple((-1) ** n / factorial(2 * n) for n in range(9))
 
 
-def _horner(coefficients: tuple, x):
+def horner(coefficients: tuple, x):
+    """The polynomial with these coefficients (constant term first) at `x`."""
     value = coefficients[-1]
     for coefficient in coefficients[-2::-1]:
         value = value * x + coefficient
@@ -49,7 +50,7 @@ def _by_tangent(phase):
     square = quarter * quarter
     # XLA copies cheap producers into each of their consumers, but no division: through the tangent
     # the polynomials are evaluated once.
-    tangent = quarter * _horner(_SIN, square) / _horner(_COS, square)
+    tangent = quarter * horner(_SIN, square) / horner(_COS, square)
     share = 1 / (1 + tangent * tangent)
     sine, cosine = 2 * tangent * share, (1 - tangent * tangent) * share
     # 1 - 2 sin^2 keeps the cosine's absolute error from growing with the doubling.

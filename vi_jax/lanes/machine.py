@@ -5,9 +5,10 @@ import functools
 import hashlib
 import os
 import threading
+import time
 import weakref
 from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
 from typing import Any
@@ -26,19 +27,37 @@ _KEPT = 64
 # Of the vector unit; half as many where they are narrower, with half the lanes in each.
 _REGISTERS = 32
 
+# More than any machine has cores; a process may not be granted so many threads.
+_MOST_THREADS = 1024
+
+# Seconds between two looks at threads that are about to stop.
+_PATIENCE = 1e-3
+
 _threads: ContextVar[int | None] = ContextVar("threads", default=None)
 _entered: list[int] = []
 _cpu: ContextVar[str | None] = ContextVar("cpu", default=None)
 
 
-@contextmanager
-def threads(number: int) -> Iterator[None]:
+def threads(number: int) -> AbstractContextManager:
     """Run lanes on so many threads within this context (default: the cores of this process).
 
     XLA runs larger programs on threads of its own, which belong to no context. Wait for what they
     compute before you leave; if several of your threads have such a context, the one entered last
     holds for all of them there.
+
+    **Arguments:** `number` of threads, from 1 to 1,024.
+
+    **Raises:** `TypeError` or `ValueError` for what is no such number.
     """
+    if isinstance(number, bool) or not isinstance(number, int | np.integer):
+        raise TypeError(f"Argument `number` must be an integer, but got {number!r}.")
+    if not 1 <= number <= _MOST_THREADS:
+        raise ValueError(f"Argument `number` must be from 1 to {_MOST_THREADS}, but got {number}.")
+    return _threads_within(int(number))
+
+
+@contextmanager
+def _threads_within(number: int) -> Iterator[None]:
     with within(_threads, number):
         _entered.append(number)
         try:
@@ -96,33 +115,61 @@ class Kernel:
             raise RuntimeError(f'LLVM: {error}; `vi_jax.road("xla")` does without it') from None
         return function_at(address)
 
-    def run(self, inputs: list[int], strides: list[int], outputs: list[int], lanes: int) -> None:
-        """All lanes, from and to the arrays at these addresses.
+    def work(self, inputs: list[int], strides: list[int], outputs: list[int], lanes: int) -> "Work":
+        """All lanes, from and to the arrays at these addresses."""
+        return Work(self._call, self.width, inputs, strides, outputs, lanes)
 
-        **Raises:** `KeyboardInterrupt` as it comes, in the main thread.
-        """
-        table = (ctypes.c_void_p * max(1, len(inputs)))(*inputs)
-        steps = (ctypes.c_int64 * max(1, len(strides)))(*strides)
-        results = (ctypes.c_void_p * max(1, len(outputs)))(*outputs)
-        following, stop = ctypes.c_int64(0), ctypes.c_int8(0)
-        arguments = (
-            ctypes.addressof(table), ctypes.addressof(steps), ctypes.addressof(results),
-            lanes, ctypes.addressof(following), ctypes.addressof(stop),
+
+class Work:
+    """One call of a kernel: what its threads read and write, which must be kept until they end."""
+
+    def __init__(self, call: Any, width: int, inputs, strides, outputs, lanes: int):
+        self._function, self._lanes = call, lanes
+        self._table = (ctypes.c_void_p * max(1, len(inputs)))(*inputs)
+        self._steps = (ctypes.c_int64 * max(1, len(strides)))(*strides)
+        self._results = (ctypes.c_void_p * max(1, len(outputs)))(*outputs)
+        self._given, self.stop = ctypes.c_int64(0), ctypes.c_int8(0)
+        self._arguments = (
+            ctypes.addressof(self._table), ctypes.addressof(self._steps),
+            ctypes.addressof(self._results), lanes, ctypes.addressof(self._given),
+            ctypes.addressof(self.stop),
         )  # fmt: skip
-        number = min(thread_count(), -(-lanes // self.width))
-        if number <= 1 and threading.current_thread() is not threading.main_thread():
-            self._call(*arguments)
-            return
-        # The main thread must stay free to hear an interrupt.
-        jobs: list[Future] = [_pool(number).submit(self._call, *arguments) for _ in range(number)]
-        try:
+        self._number = min(thread_count(), -(-lanes // width))
+        self._lock, self._inside = threading.Lock(), 0
+
+    def run(self) -> bool:
+        """Whether all lanes have ended, and not been stopped.
+
+        **Raises:** what a signal raises, in the main thread; then `leave` is to be called.
+        """
+        if self._number == 1 and threading.current_thread() is not threading.main_thread():
+            self._turn()
+        else:
+            # The main thread must stay free to hear an interrupt.
+            jobs = [_pool(self._number).submit(self._turn) for _ in range(self._number)]
             for job in jobs:
                 job.result()
-        except BaseException:
-            stop.value = 1
-            for job in jobs:
-                job.exception()
-            raise
+        # A thread takes lanes until none are left, and ends when its own have, if not stopped.
+        return self._given.value >= self._lanes and not self.stop.value
+
+    def _turn(self) -> None:
+        """What one thread does: lanes until none are left, unless the work was stopped before."""
+        with self._lock:
+            if self.stop.value:
+                return
+            self._inside += 1
+        try:
+            self._function(*self._arguments)
+        finally:
+            with self._lock:
+                self._inside -= 1
+
+    def leave(self) -> None:
+        """Stop, and wait until no thread is at work; to be called again if a signal comes."""
+        with self._lock:
+            self.stop.value = 1
+        while self._inside:
+            time.sleep(_PATIENCE)
 
 
 @functools.cache

@@ -8,7 +8,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import number, optional_real, require, require_ranges
+from .._checks import require, require_ranges
+from .._numbers import number, optional_real
 from ..scene import AbstractScene
 
 Scalar = Float[Array, ""]

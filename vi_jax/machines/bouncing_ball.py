@@ -1,20 +1,25 @@
 """A ball that bounces on a shaken table."""
 
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import NOT_NEGATIVE, SHARE, number, real
+from .._checks import NOT_NEGATIVE, SHARE
+from .._numbers import number, real
 from ..scene import RigidStop
+from ..scene.shown import Shown
 from ._base import PhaseMachine
 
 Scalar = Float[Array, ""]
 
 
-class BallState(eqx.Module):
+class BallState(Shown):
     """A ball as seen from the table."""
+
+    units: ClassVar = {"height": "g/ω²", "speed": "g/ω"}
 
     height: Scalar
     """Above the table (unit: g/ω²)."""
@@ -47,6 +52,13 @@ class BouncingBall(PhaseMachine):
     def labels(self) -> tuple[str, str]:
         """Of pictures."""
         return "height (g/ω²)", "speed from the table (g/ω)"
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """Accelerations in g, times in 1/ω."""
+        own = {**BallState.units, "acceleration": "g"}
+        rates = {"rate": "ω", "time": "1/ω", "energy": "m g²/ω²", "power": "m g²/ω"}
+        return {**super().units, **own, **rates, "": "1"}
 
     def field(self, s: Scalar, state: BallState) -> BallState:
         """Free fall less the table's acceleration."""

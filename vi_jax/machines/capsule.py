@@ -1,5 +1,6 @@
 """A capsule that drives itself along the ground: dry friction, sticking, impacts and drift."""
 
+from collections.abc import Mapping
 from math import pi
 from typing import Any, ClassVar
 
@@ -7,15 +8,22 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Range, number, real
+from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Range
+from .._numbers import number, real
 from ..scene import Coordinate, DryFriction, RigidStop
+from ..scene.shown import Shown
 from ._base import PhaseMachine
 
 Scalar = Float[Array, ""]
 
 
-class CapsuleState(eqx.Module):
+class CapsuleState(Shown):
     """The mass inside as seen from the capsule, and the capsule as seen from the ground."""
+
+    units: ClassVar = {
+        **dict.fromkeys(("place", "travel", "progress"), "F/k"),
+        **dict.fromkeys(("speed", "capsule_speed"), "F/√(k m)"),
+    }
 
     place: Scalar
     """Of the mass, from where its spring is relaxed (unit: F/k)."""
@@ -90,6 +98,14 @@ class Capsule(PhaseMachine):
     def labels(self) -> tuple[str, str]:
         """Of pictures."""
         return "place in the capsule (F/k)", "speed in the capsule (F/√(k m))"
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """Lengths in F/k, times in √(m/k)."""
+        own = {"gap": "F/k", "amplitude": "F", "friction": "F", "frequency": "√(k/m)"}
+        own |= CapsuleState.units
+        rates = {"rate": "√(k/m)", "time": "√(m/k)", "energy": "F²/k", "power": "F²/√(k m)"}
+        return {**super().units, **own, **rates, "": "1"}
 
     @property
     def period(self) -> Scalar:

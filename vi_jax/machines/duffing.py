@@ -1,5 +1,6 @@
 """A Duffing oscillator between two stops; with no cubic term the classic impact oscillator."""
 
+from collections.abc import Mapping
 from math import pi
 from typing import Any, ClassVar
 
@@ -7,7 +8,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, number, real
+from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE
+from .._numbers import number, real
 from ..scene import OscillatorState, RigidStop
 from ._base import PhaseMachine
 
@@ -48,6 +50,11 @@ class Duffing(PhaseMachine):
     def labels(self) -> tuple[str, str]:
         """Of pictures."""
         return "x", "dx/dt"
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """None: its numbers are the equation's."""
+        return {"": "1"}
 
     @property
     def period(self) -> Scalar:

@@ -1,20 +1,25 @@
 """A ball in a shaken box: impact pair, impact damper, vibro-impact harvester."""
 
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, number, optional_real, real
+from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE
+from .._numbers import number, optional_real, real
 from ..scene import Coordinate, RigidStop
+from ..scene.shown import Shown
 from ._base import PhaseMachine
 
 Scalar = Float[Array, ""]
 
 
-class PairState(eqx.Module):
+class PairState(Shown):
     """The ball in its box."""
+
+    units: ClassVar = {"place": "a", "speed": "a ω"}
 
     place: Scalar
     """From the middle of the box (unit: a)."""
@@ -22,8 +27,10 @@ class PairState(eqx.Module):
     """Relative to the box (unit: a ω)."""
 
 
-class FreePairState(eqx.Module):
+class FreePairState(Shown):
     """The ball in its box, and the box."""
+
+    units: ClassVar = {"place": "a", "speed": "a ω", "box": "a", "box_speed": "a ω"}
 
     place: Scalar
     """Of the ball, from the middle of the box (unit: a)."""
@@ -89,6 +96,15 @@ class ImpactPair(PhaseMachine):
     def labels(self) -> tuple[str, str]:
         """Of pictures."""
         return "place in the box (a)", "speed in the box (a ω)"
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """Lengths in a, times in 1/ω, masses in that of the ball, or of a box that is free."""
+        mass = "m" if self.mass_ratio is None else "M"
+        own = {**FreePairState.units, "half_gap": "a"}
+        own |= {"force": "M a ω²", "frequency": "ω"}
+        rates = {"rate": "ω", "time": "1/ω", "energy": f"{mass} a² ω²", "power": f"{mass} a² ω³"}
+        return {**super().units, **own, **rates, "": "1"}
 
     def field(self, s: Scalar, state: Any) -> Any:
         """A ball on which nothing acts, seen from the box."""

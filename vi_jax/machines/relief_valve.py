@@ -1,5 +1,6 @@
 """A pressure relief valve that chatters on its seat, by itself."""
 
+from collections.abc import Mapping
 from math import pi
 from typing import Any, ClassVar
 
@@ -7,14 +8,16 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .._checks import NOT_NEGATIVE, POSITIVE, SHARE, concrete, number, real
+from .._checks import NOT_NEGATIVE, POSITIVE, SHARE
+from .._numbers import concrete, number, real
 from ..scene import RigidStop
+from ..scene.shown import Shown
 from ._base import AutonomousMachine
 
 Scalar = Float[Array, ""]
 
 
-class ValveState(eqx.Module):
+class ValveState(Shown):
     """The valve's body and the vessel under it; without units, as the numbers of `ReliefValve`."""
 
     lift: Scalar
@@ -62,6 +65,11 @@ class ReliefValve(AutonomousMachine):
     def labels(self) -> tuple[str, str]:
         """Of pictures."""
         return "lift", "speed of opening"
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """None: its numbers are the equations'."""
+        return {"": "1"}
 
     @property
     def usual(self) -> float:

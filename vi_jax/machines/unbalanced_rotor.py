@@ -1,6 +1,7 @@
 """A motor with an unbalanced rotor on an elastic support: the Sommerfeld effect."""
 
 import dataclasses
+from collections.abc import Mapping
 from math import pi
 from typing import Any, ClassVar
 
@@ -9,25 +10,19 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import (
-    NOT_NEGATIVE,
-    POSITIVE,
-    REAL,
-    SHARE,
-    Range,
-    number,
-    optional_real,
-    real,
-    require,
-)
+from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Range, require
+from .._numbers import number, optional_real, real
 from ..scene import RigidStop, ShaftScene
+from ..scene.shown import Shown
 from ._base import PhaseMachine
 
 Scalar = Float[Array, ""]
 
 
-class RotorState(eqx.Module):
+class RotorState(Shown):
     """Body and shaft, by the angle of the rotor."""
+
+    units: ClassVar = {"Y": "m r/M", "V": "m r ω/M", "P": "J ω", "phase": "rad"}
 
     Y: Scalar
     """Displacement of the body (unit: m r/M)."""
@@ -113,6 +108,13 @@ class UnbalancedRotor(ShaftScene, PhaseMachine):
     def labels(self) -> tuple[str, str]:
         """Of pictures."""
         return "Y (m r/M)", "dY/dτ (m r ω/M)"
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """Lengths in m r/M, times in 1/ω."""
+        own = {**RotorState.units, "gap": "m r/M", "no_load_speed": "ω", "frequency_ratio": "ω"}
+        rates = {"rate": "ω", "time": "1/ω", "energy": "m² r² ω²/M", "power": "m² r² ω³/M"}
+        return {**super().units, **own, **rates, "": "1"}
 
     def speed(self, phase: Any, state: Any) -> Scalar:
         """W = dφ/dτ of the rotor (unit: ω) at this angle."""

@@ -36,11 +36,6 @@ def _met(scene: AbstractScene, event: Event) -> tuple[RigidStop, Coordinate]:
     return stop, scene.coordinates[stop.coordinate]
 
 
-def renews(scene: AbstractScene) -> bool:
-    """Whether a machine begins each cycle with something set back."""
-    return type(scene).renewed is not AbstractScene.renewed
-
-
 def approach_of(scene: AbstractScene, event: Event, state: Any, rate: Any) -> Any:
     """V⁻ of an impact; of another event how fast its guard rises."""
     if event.kind == "stop":

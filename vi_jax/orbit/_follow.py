@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..scene.numbers import with_leaf
+from ._hopf import hopf_between, size_of
 from ._origin import halves, origin
 from ._shooting import Shooting
 from ._solve import advance, images_at, located, observe, orbit_of
@@ -20,14 +21,27 @@ _SHORT = 0.999
 # How far beside a point where branches cross (in the norm of the scaled unknowns) it is looked at.
 _BESIDE = 1e-3
 
-# A motion of no more amplitude than this is rest.
-_STILL = 1e-3
+# An autonomous motion of so much of the size of another is rest: what solves its equations there is
+# an equilibrium.
+_STILL = 1e-6
+
+# One of so much of the size of its neighbours is about to shrink to rest.
+_SHRINKS = 1e-2
+
+# A motion so many times as long as that from which a branch begins has steps as much longer. Of a
+# rimless wheel towards its homoclinic motion the multiplier is right to 2e-12 then.
+_LONG = 4.0
 
 # Events that are to come together do so within this.
 _TOGETHER = 1e-9
 
-# Stands where the number of an impact does, for events that fall together.
-_REORDERED = -1
+# Stand where the number of an impact does, for what is no event of its own.
+_REORDERED, _RESTS, _ANEW = -1, -2, -3
+
+_DETAILS = {
+    _REORDERED: "two of its events fall together, and come in another order beyond",
+    _ANEW: "a switch goes into another mode: the motion sticks or slips anew",
+}
 
 _NAMES = {"stop": "impact", "switch": "switch", "section": "section"}
 
@@ -50,11 +64,16 @@ class Follower:
         self.special: list[SpecialPoint] = []
         self.between: dict[int, list[Step]] = {}
         self.start: Step | None = None
-        self.away = False
+        self.away, self.size, self.duration = False, None, None
 
     def advance(self, x, tangent, length) -> Step:
         """The point at this length along the tangent."""
-        return advance(self.problem, x, tangent, self.scale, length)
+        new = advance(self.problem, x, tangent, self.scale, length)
+        if not self.problem.autonomous or not bool(new.good):
+            return new
+        if self.size is None:
+            self.size = size_of(self.problem, x)
+        return new._replace(good=np.asarray(size_of(self.problem, new.x) > _STILL * self.size))
 
     def stop(self, here: Step, new: Step) -> tuple[Step, str] | None:
         """The last point, and why the branch ends between these two; `None` if it does not."""
@@ -64,6 +83,9 @@ class Follower:
             bound = low if new.x[-1] < low else high
             last = self._where(here, new, lambda step: float(step.x[-1]) - bound) or here
             reason = "bounds"
+        elif self._lengthened(here, new) > 0:
+            last = self._where(here, new, lambda step: self._lengthened(here, step)) or here
+            reason = "long"
         grazing = self._grazing(here, last)
         if grazing is not None:
             last, reason = grazing.step, grazing.kind
@@ -75,6 +97,13 @@ class Follower:
         elif reason is None and self._closed(here, new):
             return here, "closed"
         return None if reason is None else (last, reason)
+
+    def _lengthened(self, here: Step, new: Step) -> float:
+        """By how much an autonomous motion is longer than its steps, as many as ever, allow."""
+        if not self.problem.autonomous:
+            return -1.0
+        self.duration = float(here.seen.duration) if self.duration is None else self.duration
+        return float(new.seen.duration) / self.duration - _LONG
 
     def _closed(self, here: Step, new: Step) -> bool:
         self.start = here if self.start is None else self.start
@@ -112,6 +141,11 @@ class Follower:
 
         for i in range(len(self.problem.events)):
             if new.seen.approach[i] <= 0 < here.seen.approach[i]:
+                if self.problem.events[i].kind == "section":
+                    hopf = hopf_between(self.problem, here, new)
+                    if hopf is not None:
+                        found.append((hopf, _RESTS))
+                        continue
                 at = self._where(here, new, lambda step, i=i: float(step.seen.approach[i]))
                 if at is not None:
                     found.append((at, i))
@@ -122,8 +156,7 @@ class Follower:
         if new.seen.order < 0 < here.seen.order:
             at = self._where(here, new, lambda step: float(step.seen.order))
             if at is not None:
-                detail = "a switch goes into another mode: the motion sticks or slips anew"
-                return self._point(GRAZING, at, detail)
+                found.append((at, _ANEW))
         if new.seen.apart < -_TOGETHER < here.seen.apart:
             at = self._where(here, new, lambda step: float(step.seen.apart) + _TOGETHER)
             if at is not None:
@@ -131,9 +164,10 @@ class Follower:
         if not found:
             return None
         at, impact = min(found, key=lambda f: float(np.dot(here.tangent, f[0].x - here.x)))
-        if impact == _REORDERED:
-            detail = "two of its events fall together, and come in another order beyond"
-            return self._point(GRAZING, at, detail)
+        if impact in _DETAILS:
+            return self._point(GRAZING, at, _DETAILS[impact])
+        if impact == _RESTS:
+            return self._point(HOPF, at, "the motion shrinks to rest", 0)
         if impact is None:
             touched = int(at.seen.touched) - len(self.problem.scene.stops)
             what = "a stop" if touched < 0 else f"the guard of switch {touched}"
@@ -142,8 +176,6 @@ class Follower:
             clock = float(np.asarray(self.problem.parts(jnp.asarray(at.x))[0])[impact])
             kind = self.problem.events[impact].kind
             detail = f"the {_NAMES[kind]} at {self._place(at, clock)} is lost"
-            if kind == "section" and float(at.seen.y_max - at.seen.y_min) < _STILL:
-                return self._point(HOPF, at, "the motion shrinks to rest", impact)
         return self._point(GRAZING, at, detail, impact)
 
     def _place(self, at: Step, clock: float) -> str:
@@ -197,8 +229,8 @@ class Follower:
                 continue
             if kind == FOLD and not both and not self._turns_back(here, at, last):
                 continue  # rounding: the tangent is ill-defined close to where branches cross
-            if self.problem.autonomous and float(at.seen.y_max - at.seen.y_min) < 10 * _STILL:
-                continue  # a motion about to shrink to rest has a multiplier 1 to rounding
+            if kind in (FOLD, CROSSING) and self._shrinks(here, at, last):
+                continue  # it has a multiplier 1 to rounding
             if kind in (FOLD, CROSSING) and self._springs(here, at):
                 continue  # both are zero there
             if kind == CROSSING:
@@ -224,6 +256,13 @@ class Follower:
                 kind, detail = SYMMETRY, "a multiplier passes 1 and the motion loses its symmetry"
             self.special.append(self._point(kind, at, detail))
         return [at for _, _, at, _ in found]
+
+    def _shrinks(self, here: Step, at: Step, last: Step) -> bool:
+        """Whether an autonomous motion is about to shrink to rest."""
+        if not self.problem.autonomous:
+            return False
+        size, *beside = (size_of(self.problem, step.x) for step in (at, here, last))
+        return size < _SHRINKS * max(beside)
 
     def _springs(self, here: Step, at: Step) -> bool:
         """Whether the branch springs there, as is seen by halves of a period becoming alike."""

@@ -11,6 +11,7 @@ from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Float
 
 from ..flow import simulate
+from ._neutral import least
 from .cycle_map import CycleMap
 from .search import AbstractSearch, search
 
@@ -66,7 +67,7 @@ def _(primals, tangents):
     _, rate = eqx.filter_jvp(
         lambda arc: _missing(arc, root.arcs, unravel).ravel(), (arc,), (tangents[0],)
     )
-    move = -jnp.linalg.solve(shooting_matrix(jacobians), rate).reshape(root.arcs.shape)
+    move = -least(shooting_matrix(jacobians), rate).reshape(root.arcs.shape)
     # Where there is no orbit there is no derivative of one.
     # A product, since the transpose of a choice would be zero.
     return root, still._replace(arcs=move * jnp.where(root.converged > 0, 1.0, jnp.nan))

@@ -21,6 +21,7 @@ from jaxtyping import Array, Float
 
 from ..flow import AbstractMethod
 from ..scene import AbstractScene
+from ..scene.base import renews
 from ..scene.numbers import with_leaf
 from ._events import Event, approach_of, guard_of, jump
 from ._flight import Flight
@@ -205,7 +206,7 @@ class Shooting(eqx.Module):
         monodromy = jnp.eye(self.states, dtype=x.dtype)
         for leg in range(len(states)):
             monodromy = carried[leg] @ monodromy
-        Y = jax.vmap(lambda u: scene.position(self.unravel(u)))(states)
+        Y = jax.vmap(lambda u: scene.position(self.unravel(u)))(self._reached(scene, states))
         nearest = jnp.argmin(turns.room)
         timed = self.autonomous or scene.pace(clock[0], self.unravel(states[0])) is not None
         return Observed(
@@ -228,6 +229,14 @@ class Shooting(eqx.Module):
             ),
             duration=jnp.sum(time) if timed else jnp.asarray(scene.period, x.dtype) * self.cycles,
         )
+
+    def _reached(self, scene: AbstractScene, states: Array) -> Array:
+        """The states at the events, on both sides of those that may move the first coordinate."""
+        sections = [i for i, event in enumerate(self.events) if event.kind == "section"]
+        if not sections or not renews(scene):
+            return states
+        renewed = [scene.renewed(self.unravel(states[i])) for i in sections]
+        return jnp.concatenate([states, jnp.stack([ravel_pytree(x)[0] for x in renewed])])
 
     def _saltation(self, scene, leg, s, u):
         """How a perturbation passes an event, R + (f⁺ - R f⁻) ∇g / ġ, and how fast it is met.

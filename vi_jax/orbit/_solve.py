@@ -17,9 +17,10 @@ from ..flow.methods import MethodLike
 from ..flow.moving import begin_modes, struck_modes
 from ..flow.simulate import collect
 from ..scene import Scene
+from ..scene.base import renews
 from ..scene.numbers import leaf, with_leaf
 from ._carrier import carrier, steps_of
-from ._events import Event, jump, renews
+from ._events import Event, jump
 from ._flight import Flight
 from ._shooting import Shooting
 from ._symmetry import images
@@ -65,8 +66,7 @@ def problem_of(
     if int(np.sum(np.asarray(orbit.impact_stop) >= 0)) != int(orbit.impacts):
         raise ValueError(
             f"Argument `orbit` must list all its {int(orbit.impacts)} impacts, but lists "
-            f"{len(orbit.impact_stop)}: find it with a larger `impact_log`. A motion that comes to "
-            "rest on a stop cannot be followed."
+            f"{len(orbit.impact_stop)}: find it with a larger `impact_log`."
         )
     steps = steps_of(carried, corners, orbit.state, cycles)
     found = events_of(orbit)
@@ -80,9 +80,11 @@ def problem_of(
         finer = dataclasses.replace(blank, steps=2 * blank.steps)
         again = _followed(finer, orbit.state, found, period)
         apart = np.max(np.abs(again.states - way.states) / (1 + np.abs(again.states)))
-        if apart < _SETTLED or finer.steps > _MOST:
+        if finer.steps > _MOST:
             break
-        blank, way = finer, again
+        blank, way = finer, again  # the finer one: along the branch flights may ask for more
+        if apart < _SETTLED:
+            break
     problem = dataclasses.replace(blank, events=tuple(event for _, event in found), modes=way.modes)
     states = way.states[:-1] if found else way.states
     value = leaf(scene, parameter)
@@ -278,8 +280,15 @@ def located(
             break
         with contextlib.suppress(_NoValueError):
             value(root - short * length)
-    good = [step for step in at.values() if bool(step.good)]
-    return min(good, key=lambda step: abs(test(step)), default=None)
+    begin, good = test(here), [(s, step) for s, step in at.items() if bool(step.good)]
+
+    def off(place: tuple[float, Step]) -> tuple[float, bool, float]:
+        """How far a point is from it; of a test that only jumps, the last one before the jump is
+        closest."""
+        told = test(place[1])
+        return abs(told), bool(told * begin < 0), abs(place[0] - root)
+
+    return min(good, key=off)[1] if good else None
 
 
 @compiled
@@ -333,5 +342,5 @@ def orbit_of(problem: Shooting, step: Step) -> Orbit:
         error=jnp.asarray(step.size),
         iterations=jnp.asarray(step.iterations, jnp.int32),
         history=jnp.zeros((0,)),
-        result=ORBIT_RESULTS.converged if admissible else ORBIT_RESULTS.inadmissible,
+        result=ORBIT_RESULTS.successful if admissible else ORBIT_RESULTS.inadmissible,
     )

@@ -61,7 +61,7 @@ class _Watched(NamedTuple):
     def rate(self, flight: Flight, s: Any, u: Any) -> Any:
         """Its rate, or one of its sign."""
         state = flight.unravel(u)
-        if self.kind == "coordinate":
+        if self.kind == "coordinate" and flight.scene.has_velocity(state):
             return flight.scene.coordinates[self.number].velocity(state)
         return self.rates(flight, flight.moving, s, u).v
 

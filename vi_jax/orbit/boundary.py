@@ -1,7 +1,7 @@
 """`boundary`: curves of folds, period doublings, lost symmetries and grazings."""
 
 import dataclasses
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -10,15 +10,25 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._checks import interval
+from .._interrupted import Interrupted
+from .._lazy import lazy
+from ..flow.labelled import tidy
 from ..scene.numbers import check_again, check_leaf, leaf, with_leaf
+from ..scene.shown import told_in_table
+from ..scene.units import with_units
 from ._carrier import steps_of
 from ._shooting import Shooting
 from ._solve import advance as solved
 from ._solve import jacobian_at, orbit_of, tangent_at
 from ._symmetry import images, may_be_symmetric
-from .curve import Step, check_walk, walk
+from .curve import INTERRUPTED, Step, Walk, check_walk, walk
 from .results import Orbit
 from .special import DOUBLING, FOLD, GRAZING, SYMMETRY, SpecialPoint
+
+if TYPE_CHECKING:
+    import xarray as xr
+else:
+    xr = lazy("xarray")
 
 # What lies below zero by no more than this is zero to rounding.
 _NOISE = 1e-9
@@ -26,7 +36,8 @@ _NOISE = 1e-9
 
 @dataclasses.dataclass(frozen=True)
 class Boundary:
-    """A curve in two parameters along which an orbit bifurcates: host arrays, a row a point."""
+    """A curve in two parameters along which an orbit bifurcates: host arrays, a row a point, in the
+    machine's units (see `AbstractScene.units`)."""
 
     kind: str
     """"fold", "period-doubling", "symmetry-breaking" or "grazing"."""
@@ -35,22 +46,41 @@ class Boundary:
     parameters: np.ndarray
     """Their values; (points, 2)."""
     y_min: np.ndarray
-    """Smallest Y (unit: a)."""
+    """Smallest position (of the first coordinate)."""
     multipliers: np.ndarray
     """Floquet multipliers over the period; (points, states)."""
     impact_speed: np.ndarray
-    """V⁻ of each impact (unit: a ω); (points, impacts)."""
+    """V⁻ of each impact; (points, impacts)."""
     clearance: np.ndarray
-    """Smallest distance to a stop at a turn that does not touch it (unit: a)."""
+    """Smallest distance to a stop at a turn that does not touch it."""
     ends: tuple[str, str]
     """Why the curve ends on each side: "bounds", "grazing" (an impact more or less), "stalled",
-    "max_points"."""
+    "max_points", "interrupted"."""
     problem: Shooting = dataclasses.field(repr=False)
     steps: list[Step] = dataclasses.field(repr=False)
 
     def orbit(self, index: int) -> Orbit:
         """The motion at one point."""
         return orbit_of(self.problem, self.steps[index])
+
+    def to_xarray(self, *, along: str | None = None) -> "xr.Dataset":
+        """The curve as an `xarray.Dataset` over its points, the two parameters by their names.
+
+        **Arguments:** `along`, to keep only what is told along one dimension: `"point"`, `"impact"`
+        or `"state"` (the multipliers), which then makes a table without repetitions.
+
+        **Raises:** `ValueError` if there is no such dimension.
+        """
+        data: dict[str, Any] = {
+            name: ("point", x) for name, x in zip(self.names, self.parameters.T, strict=True)
+        }
+        data |= {name: ("point", getattr(self, name)) for name in ("y_min", "clearance")}
+        data["impact_speed"] = ("point", "impact"), self.impact_speed
+        data["multipliers"] = ("point", "state"), self.multipliers
+        about = {"kind": self.kind, "ends": list(self.ends)}
+        found = xr.Dataset(data, attrs={**about, "period_in_cycles": self.problem.cycles})
+        found = with_units(found, self.problem.scene.units, {name: name for name in self.names})
+        return tidy(found, along)
 
     def __str__(self) -> str:
         low, high = self.parameters.min(axis=0), self.parameters.max(axis=0)
@@ -59,6 +89,11 @@ class Boundary:
             f"[{low[0]:.6g}, {high[0]:.6g}], {self.names[1]} in [{low[1]:.6g}, {high[1]:.6g}]; "
             f"ends: {self.ends[0]}, {self.ends[1]}"
         )
+
+    __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        return told_in_table(str(self), self.y_min)
 
 
 def boundary(
@@ -86,7 +121,7 @@ def boundary(
     **Returns:** a `Boundary`. It ends where the motion ceases to be one (another impact grazes).
 
     **Raises:** `ValueError` if the point is of another kind, outside the bounds, or the name
-    unknown or the same.
+    unknown or the same; on Ctrl-C `Interrupted`, whose `partial` is the curve so far.
     """
     settings = check_walk(step=step, max_step=max_step, max_points=max_points)
     if not isinstance(point, SpecialPoint):
@@ -171,9 +206,11 @@ def boundary(
         return None
 
     forward = walk(advance, start, stop=stop, **settings)
-    backward = walk(advance, start._replace(tangent=-start.tangent), stop=stop, **settings)
+    backward = Walk([start], INTERRUPTED)
+    if forward.end != INTERRUPTED:
+        backward = walk(advance, start._replace(tangent=-start.tangent), stop=stop, **settings)
     path = [*reversed(backward.steps[1:]), *forward.steps]
-    return Boundary(
+    curve = Boundary(
         kind=point.kind,
         names=names,
         parameters=np.stack([step.x[-2:] for step in path]),
@@ -185,6 +222,9 @@ def boundary(
         problem=problem,
         steps=path,
     )
+    if INTERRUPTED in curve.ends:
+        raise Interrupted("walk along the boundary", curve)
+    return curve
 
 
 class _Lone(eqx.Module):

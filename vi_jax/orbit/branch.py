@@ -1,7 +1,6 @@
 """`continue_orbit`: a branch of periodic motions in one parameter, and why it changes."""
 
 import dataclasses
-import itertools
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -9,13 +8,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._checks import interval
+from .._interrupted import Interrupted
 from .._lazy import lazy
+from ..flow.labelled import tidy
 from ..flow.methods import MethodLike
 from ..scene.numbers import check_again, check_leaf, leaf, with_leaf
+from ..scene.shown import told_in_table
+from ..scene.units import in_unit, with_units
 from ._follow import Follower
+from ._rest import rests
 from ._shooting import Shooting
 from ._solve import advance, located, orbit_of, problem_of, tangent_at
-from .curve import Step, check_walk, walk
+from .curve import INTERRUPTED, Step, check_walk, walk
+from .floquet import NEUTRAL
 from .results import ORBIT_RESULTS, Orbit, impacts_in_words
 from .special import SpecialPoint
 
@@ -28,35 +33,42 @@ else:
 # that rests on a stop does not.
 _SAME = 1e-3
 
+# A point lies at a value of the parameter if it is no further from it (in the parameter's scale).
+_ROUNDING = 1e-12
+
 
 @dataclasses.dataclass(frozen=True)
 class Branch:
-    """A branch of periodic motions: host arrays with one row for each point, in their order."""
+    """A branch of periodic motions: host arrays with one row for each point, in their order, in
+    the machine's units (see `AbstractScene.units`)."""
 
     name: str
     """Name of the parameter."""
     parameter: np.ndarray
     y_min: np.ndarray
-    """Smallest Y (unit: a)."""
+    """Smallest position (of the first coordinate), in the machine's unit (of a `Scene` a)."""
     y_max: np.ndarray
-    """Largest Y (unit: a)."""
+    """Largest position over the period, in the same unit."""
     multipliers: np.ndarray
     """Floquet multipliers over the period, the largest modulus first; (points, states)."""
     impact_phase: np.ndarray
-    """Clock of each impact since the section (radians of crank angle); (points, impacts)."""
+    """Clock of each impact since the section, in the machine's units (of a `Scene` the crank angle
+    in radians); (points, impacts)."""
     impact_speed: np.ndarray
-    """V⁻ of each impact (unit: a ω); (points, impacts)."""
+    """V⁻ of each impact, in the machine's unit (of a `Scene` a ω); (points, impacts)."""
     clearance: np.ndarray
-    """Smallest distance to a stop at a turn that does not touch it (unit: a)."""
+    """Smallest distance to a stop at a turn that does not touch it, in the unit of positions."""
     frequency_ratio: np.ndarray
-    """ζ: mean crank speed (unit: ω), NaN for scenes that are not driven."""
+    """ζ: mean speed of the drive, NaN for scenes that are not driven."""
     cycles: int
     """Period in drive cycles."""
     special: list[SpecialPoint]
     ends: tuple[str, str]
     """Why the branch ends on each side: "bounds", "grazing" (an impact is lost or a stop touched),
     "period-doubling" (it springs there from a motion of half its period), "symmetry-breaking" (from
-    a symmetric one), "hopf" (it shrinks to rest), "closed", "stalled", "max_points"."""
+    a symmetric one), "hopf" (it shrinks to rest), "closed", "stalled", "max_points",
+    "interrupted", "long" (an autonomous motion takes four times as long as that from which the
+    branch began, for which its steps are: begin another one there)."""
     problem: Shooting = dataclasses.field(repr=False)
     steps: list[Step] = dataclasses.field(repr=False)
     scale: np.ndarray = dataclasses.field(repr=False)
@@ -78,23 +90,38 @@ class Branch:
 
     def at(self, value: float) -> list[Orbit]:
         """The branch's motions at a value of the parameter, solved for; in the branch's order."""
-        found = []
-        for here, new in itertools.pairwise(self.steps):
-            # Steps follow the branch's sense, except in its backward half, which is turned.
-            if (here.x[-1] - value) * (new.x[-1] - value) > 0 or new.x[-1] == value:
-                continue
-            if float(np.dot(here.tangent, (new.x - here.x) / self.scale)) < 0:
-                here, new = new, here
-            step = located(
-                self.problem, here, new, self.scale, lambda step: float(step.x[-1]) - value
-            )
-            if step is not None:
-                found.append(orbit_of(self.problem, step))
-        return found
 
-    def to_xarray(self) -> "xr.Dataset":
-        """The branch as an `xarray.Dataset` over its points."""
-        units = {"y_min": "a", "y_max": "a", "clearance": "a", "impact_speed": "a ω"}
+        def apart(step: Step) -> float:
+            # Points are put on a value, such as a bound, to rounding.
+            by = float(step.x[-1]) - value
+            return by if abs(by) > _ROUNDING * float(self.scale[-1]) else 0.0
+
+        found = []
+        following: list[Step | None] = [*self.steps[1:], None]
+        if "closed" in self.ends:
+            following[-1] = self.steps[0]
+        for here, new in zip(self.steps, following, strict=True):
+            if not apart(here):
+                found.append(here)
+            elif new is not None and apart(here) * apart(new) < 0:
+                found.append(self._between(here, new, apart))
+        return [orbit_of(self.problem, step) for step in found if step is not None]
+
+    def _between(self, here: Step, new: Step, test: Callable[[Step], float]) -> Step | None:
+        """The point at which a test is zero, between two that follow each other."""
+        # Steps follow the branch's sense, except in its backward half, which is turned.
+        if float(np.dot(here.tangent, (new.x - here.x) / self.scale)) < 0:
+            here, new = new, here
+        return located(self.problem, here, new, self.scale, test)
+
+    def to_xarray(self, *, along: str | None = None) -> "xr.Dataset":
+        """The branch as an `xarray.Dataset` over its points.
+
+        **Arguments:** `along`, to keep only what is told along one dimension: `"point"`, `"impact"`
+        or `"state"` (the multipliers), which then makes a table without repetitions.
+
+        **Raises:** `ValueError` if there is no such dimension.
+        """
         data = {
             name: ("point", getattr(self, name))
             for name in ("parameter", "y_min", "y_max", "clearance", "frequency_ratio", "stable")
@@ -105,21 +132,27 @@ class Branch:
             "multipliers": (("point", "state"), self.multipliers),
         }
         found = xr.Dataset(data, attrs={"parameter": self.name, "period_in_cycles": self.cycles})
-        for name, unit in units.items():
-            found[name].attrs["units"] = unit
-        return found
+        found = with_units(found, self.problem.scene.units, {"parameter": self.name})
+        return tidy(found, along)
 
     def __str__(self) -> str:
         low, high = self.parameter.min(), self.parameter.max()
-        period = self.problem.scene.period_of(self.cycles)
+        scene = self.problem.scene
+        period, span = scene.period_of(self.cycles), f"[{low:.6g}, {high:.6g}]"
+        span = in_unit(span, scene.units, self.name)
         lines = [
             f"Branch of {len(self.parameter)} motions of period {period} with "
             f"{impacts_in_words(self.impact_speed.shape[1])}, "
-            f"{self.name} in [{low:.6g}, {high:.6g}], "
+            f"{self.name} in {span}, "
             f"{int(self.stable.sum())} of them stable; ends: {self.ends[0]}, {self.ends[1]}",
             *(f"  {point}" for point in self.special),
         ]
         return "\n".join(lines)
+
+    __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        return told_in_table(str(self), self.y_min)
 
 
 def continue_orbit(
@@ -146,15 +179,18 @@ def continue_orbit(
     - `parameter`: name of a number of the scene: `"drive.frequency_ratio"`, `"stops.0.gap"`,
       `"oscillator.damping_ratio"`, …
     - `bounds`: the interval of the parameter.
-    - `step`, `max_step`: first and longest step along the branch, in the norm of the unknowns
-      (positions in a, velocities in a ω, clocks in radians, the parameter in half its interval).
+    - `step`, `max_step`: first and longest step along the branch, in the norm of the unknowns: the
+      state and the clock of each impact in the machine's own units (of a `Scene`: positions in a,
+      velocities in a ω, crank angles in radians), the parameter in half its interval.
     - `max_points`: points in each direction at most.
     - `method`: how the scene is carried, of fixed steps: by default `ExactFlight()` where it
       applies, else 20 steps of `Verner9` a cycle.
 
     **Returns:** a `Branch`.
 
-    **Raises:** `ValueError` if the orbit is none, lies outside the bounds, or the name is unknown.
+    **Raises:** `ValueError` if the orbit is none, rests on a stop, does not list all its impacts,
+    or lies outside the bounds, or if the name is unknown; on Ctrl-C `Interrupted`, whose `partial`
+    is the branch so far.
     """
     settings = check_walk(step=step, max_step=max_step, max_points=max_points)
     if not isinstance(orbit, Orbit) or orbit.residual.ndim:
@@ -162,6 +198,11 @@ def continue_orbit(
     if not bool(orbit.successful):
         reason = ORBIT_RESULTS[orbit.result]
         raise ValueError(f"Argument `orbit` must be an orbit, but is: {reason}")
+    if rests(orbit):
+        raise ValueError(
+            "Argument `orbit` must not rest on a stop, but does: such a motion can be simulated, "
+            "swept and found, but not followed as a branch."
+        )
     check_leaf(orbit.scene, parameter)
     low, high = interval("bounds", bounds)
     value = float(leaf(orbit.scene, parameter))
@@ -180,25 +221,33 @@ def continue_orbit(
     start, moved = _refined(problem, x, np.eye(problem.size)[-1], scale)
     if moved > _SAME:
         start, moved = _refined(problem, x, tangent_at(problem, x, scale), scale)
+    if moved > _SAME and float(np.abs(np.asarray(orbit.multipliers) - 1).min()) < NEUTRAL:
+        raise ValueError(
+            "Argument `orbit` must be alone at its parameter, but one of its multipliers is 1: "
+            "branches cross there, or something in its state is neutral, as a place that is free "
+            "or a number carried along. Leave that out of the state to follow it."
+        )
     if moved > _SAME:
         raise ValueError(
             "Argument `orbit` could not be refined from impact to impact (last correction "
-            f"{max(moved, float(start.size)):.2g}): branches cross there, it is no orbit of this "
-            "scene, or its body comes to rest on a stop, which cannot be followed from impact to "
-            "impact."
+            f"{max(moved, float(start.size)):.2g}): branches cross there, or it is no orbit of "
+            "this scene."
         )
     ahead = Follower(problem, scale, (low, high))
     forward = walk(ahead.advance, start, stop=ahead.stop, **settings)
     back = Follower(problem, scale, (low, high))
     turned = start._replace(tangent=-start.tangent)
-    if forward.end == "closed":
-        backward_steps, ends = [], ("closed", "closed")
+    if forward.end in ("closed", INTERRUPTED):
+        backward_steps, ends = [], (forward.end, forward.end)
     else:
         backward = walk(back.advance, turned, stop=back.stop, **settings)
         backward_steps, ends = back.path(backward.steps[1:]), (backward.end, forward.end)
     special = [*reversed(back.special), *ahead.special]
     steps = [*reversed(backward_steps), *ahead.path(forward.steps)]
-    return _branch(problem, parameter, steps, special, ends, scale)
+    branch = _branch(problem, parameter, steps, special, ends, scale)
+    if INTERRUPTED in ends:
+        raise Interrupted("walk along the branch", branch)
+    return branch
 
 
 def _refined(problem: Shooting, x, tangent, scale) -> tuple[Step, float]:

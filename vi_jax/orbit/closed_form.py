@@ -19,14 +19,15 @@ the printed Eq. 21 lacks the factor ζ of the cosine and so misses the boundary 
 from math import pi
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Complex, Float
+from jaxtyping import Array, Bool, Complex, Float, Int
 
 from .._checks import count
 from .._programs import compiled
-from ..scene import CosineCrank, IdealDrive, Scene
+from ..flow.methods.exact import lack_of_closed_form
+from ..scene import IdealDrive, Scene
+from ..scene.shown import Shown
 from .floquet import eigenvalues
 
 Scalar = Float[Array, ""]
@@ -35,7 +36,7 @@ Scalar = Float[Array, ""]
 _POINTS = 256
 
 
-class ClosedFormOrbits(eqx.Module):
+class ClosedFormOrbits(Shown):
     """Motions with one impact per n cycles, two places long: admissible ones come first, then
     faster impacts. Places without a motion hold NaN. Lengths in units of a, velocities of a ω.
     """
@@ -63,7 +64,7 @@ class ClosedFormOrbits(eqx.Module):
     """The equations have this real solution and its body approaches the stop (v > 0)."""
 
 
-def closed_form_orbits(scene: Scene, *, cycles: int = 1) -> ClosedFormOrbits:
+def closed_form_orbits(scene: Scene, *, cycles: int | Int[Array, ""] = 1) -> ClosedFormOrbits:
     """All motions of an ideal scene with one impact per `cycles` drive cycles (Eq. 14 to 21).
 
     **Arguments:** a `Scene` with an `IdealDrive`, a `CosineCrank` and one stop on the right,
@@ -84,25 +85,20 @@ def closed_form_orbits(scene: Scene, *, cycles: int = 1) -> ClosedFormOrbits:
 
     **Raises:** `ValueError` if the scene has no such closed form or `cycles` < 1.
     """
-    if not isinstance(scene, Scene) or not isinstance(scene.drive, IdealDrive):
-        came = type(scene.drive if isinstance(scene, Scene) else scene).__name__
-        raise ValueError(
-            f"Argument `scene` must be a `Scene` with an `IdealDrive`, but got a `{came}`."
-        )
-    if not isinstance(scene.crank, CosineCrank):
-        raise ValueError(
-            f"Argument `scene` must have a `CosineCrank`, but has a `{type(scene.crank).__name__}`."
-        )
+    lack = lack_of_closed_form(scene)
+    if lack is not None:
+        raise ValueError(f"Argument `scene` must be one with a closed form, a {lack}.")
     sides = [stop.side for stop in scene.stops]
     if sides != ["right"]:
         raise ValueError(
             f"Argument `scene` must have exactly one stop, on the right, but has stops {sides}."
         )
     stop = scene.stops[0]
-    if callable(stop.restitution) or scene.soft_stops:
+    assert isinstance(scene.drive, IdealDrive)
+    if not stop.is_one_number:
         raise ValueError(
-            "Argument `scene` must have a stop with one number as its restitution, and no soft "
-            f"stops, but has {stop!r} and {len(scene.soft_stops)} soft stops."
+            "Argument `scene` must have a stop with one number as its restitution, but has a law "
+            f"of its own: {stop!r}."
         )
     numbers = (scene.drive.frequency_ratio, scene.damping_ratio, stop.restitution, stop.gap)
     shapes = [jnp.shape(number) for number in numbers]

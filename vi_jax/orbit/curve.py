@@ -100,6 +100,10 @@ def check_walk(*, step: Any, max_step: Any, max_points: Any) -> dict[str, Any]:
     }
 
 
+# Why a walk ended on which Ctrl-C was pressed.
+INTERRUPTED = "interrupted"
+
+
 class Walk(NamedTuple):
     """Points met on the way in one direction, the first one included."""
 
@@ -122,28 +126,37 @@ def walk(
     **Arguments:** `advance`, the compiled corrector; `stop`, asked after each step, which may name
     a reason to end and the last point; the first and the longest step length.
     """
-    steps, length = [start], step
-    while len(steps) < max_points:
+    steps = [start]
+    try:
+        end = _walked(advance, steps, stop, step, max_step, max_points)
+    except KeyboardInterrupt:
+        end = INTERRUPTED
+    return Walk(steps, end)
+
+
+def _walked(advance, steps: list[Step], stop, length: float, max_step: float, most: int) -> str:
+    """Adds the points to the first one, and says why there are no more."""
+    while len(steps) < most:
         here = steps[-1]
         new = advance(here.x, here.tangent, length)
         turn = float(np.dot(np.asarray(new.tangent), np.asarray(here.tangent)))
         if not bool(new.good) or turn < 0.9:
             length *= 0.4
             if length < 1e-9:
-                return Walk(steps, "stalled")
+                return "stalled"
             continue
         ending = stop(here, new)
         if ending is not None:
             last, reason = ending
             if last is not here:
                 steps.append(last)
-            return Walk(steps, reason)
+            return reason
         steps.append(new)
         if turn > 0.99 and int(new.iterations) <= 6:
             length = min(1.4 * length, max_step)
         elif turn < 0.97:
             length *= 0.7
-    return Walk(steps, "max_points")
+    return "max_points"
 
 
 def array_of(tree: Any) -> Any:

@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from .._checks import count
-from ..flow import AbstractMethod, Adaptive, simulate
-from ..flow.arguments import as_floats
-from ..flow.methods import MethodLike, chosen
-from ..scene import AbstractScene, Scene
+from ..flow import AbstractMethod, Adaptive, FixedStep, simulate
+from ..flow.arguments import as_floats, check_period, check_reals, machine_of
+from ..flow.methods import MethodLike, chosen, preset
+from ..scene import AbstractScene, ShaftScene
 from ._columns import by_columns
 
 
@@ -62,7 +62,7 @@ def _end(cycle_map: CycleMap, state: Any) -> Any:
 
 def cycle_map(
     scene: AbstractScene,
-    cycles: int = 1,
+    cycles: int | Int[Array, ""] = 1,
     *,
     method: MethodLike = None,
     section: Any = None,
@@ -72,26 +72,25 @@ def cycle_map(
     **Arguments:**
 
     - `scene`: a `Scene` with an ideal drive (2 states) or a motor (3 states), or one of your own
-      whose independent variable counts its cycles.
+      whose independent variable counts its cycles. One in the time clock is taken by the angle of
+      its shaft.
     - `cycles`: number of drive cycles n, at least 1; static.
-    - `method`: how the scene is carried: by default `ExactFlight()` where it applies, else
-      `Adaptive(Tsit5(), rtol=1e-11)`, which compiles in half the time of the default solver.
+    - `method`: how the scene is carried: by default as by `simulate`, with the `"standard"`
+      preset; but a `Scene` with a motor, whose preset has fixed steps, with
+      `Adaptive(Tsit5(), rtol=1e-11)`.
     - `section`: crank angle of the section (radians) instead of the scene's own, which is 0.
 
     **Returns:** a `CycleMap`: call it on a state from `scene.start(...)`.
 
     **Raises:** `ValueError` or `TypeError` for arguments that cannot be used.
     """
-    if not isinstance(scene, AbstractScene):
-        raise TypeError(
-            f"Argument `scene` must be a `Scene` or an `AbstractScene`, but got {scene!r}."
-        )
-    if isinstance(scene, Scene):
-        # In time the section would be an event of its own, and the crank angle a fourth state.
+    scene = machine_of(scene)
+    if isinstance(scene, ShaftScene):
+        # In time the section would be an event of its own, and the shaft's angle one more state.
         scene = scene.in_clock("phase")
     if section is not None:
         scene = scene.at_section(section)
-    method = chosen(scene, method, Adaptive(diffrax.Tsit5(), rtol=1e-11))
+    method = chosen(scene, method, _usual(scene))
     method.check(scene)
     # Tolerances are numbers: another one must not be another program.
     carried: AbstractMethod = jtu.tree_map(
@@ -100,12 +99,23 @@ def cycle_map(
     return CycleMap(scene, carried, count("cycles", cycles, least=1), scene.may_rest())
 
 
-def adopted(scene: AbstractScene, state: Any) -> Any:
-    """`state` as the scene needs it, in floating-point arrays of one type."""
+def _usual(scene: AbstractScene) -> AbstractMethod:
+    """The preset, unless its steps are fixed: they err more than an orbit should."""
+    usual = preset(scene)
+    return Adaptive(diffrax.Tsit5(), rtol=1e-11) if isinstance(usual, FixedStep) else usual
+
+
+def adopted(scene: AbstractScene, state: Any, name: str = "state") -> Any:
+    """The state in the argument of this name as a cycle map needs it, in floating-point arrays of
+    one type."""
+    if isinstance(scene, ShaftScene):
+        state = scene.by_phase(name, state)
     state = scene.adopt(state)
+    check_reals(name, state)
     if scene.clock(state) is not None:
         raise ValueError(
             "Argument `scene` must count its cycles by its independent variable, but its state "
             "has a clock."
         )
+    check_period(scene, state)
     return as_floats(scene, state)

@@ -5,7 +5,9 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .._checks import given_number
-from .results import Orbit, impacts_in_words, span_in_words, state_in_words, trimmed
+from ..scene.numbers import state_in_words
+from ..scene.shown import told_in_table
+from .results import Orbit, impacts_in_words, span_in_words, trimmed
 
 
 class Orbits(list[Orbit]):
@@ -18,13 +20,16 @@ class Orbits(list[Orbit]):
 
     __repr__ = __str__
 
+    def _repr_html_(self) -> str:
+        return told_in_table(str(self))
+
 
 def _in_words(orbit: Orbit) -> str:
     """A motion in one line."""
     cycles = int(orbit.cycles)
     period = orbit.scene.period_of(cycles)
     stable = "stable" if bool(orbit.stable) else "unstable"
-    where, span = state_in_words(orbit.state, 6), span_in_words(orbit, 6)
+    where, span = state_in_words(orbit.state, 6, orbit.scene.units), span_in_words(orbit, 6)
     size = f"greatest multiplier {np.abs(orbit.multipliers).max():.6g}"
     return f"  {period}, {impacts_in_words(int(orbit.impacts))}, {stable}: {where}; {span}; {size}"
 

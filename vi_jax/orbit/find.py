@@ -1,5 +1,6 @@
 """`find_orbit`: from a guess to a periodic motion that is judged and differentiable."""
 
+import contextlib
 import dataclasses
 from math import pi
 from typing import Any, NamedTuple
@@ -12,12 +13,15 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
-from .._checks import concrete, count, flag
+from .._checks import count, flag
+from .._numbers import concrete
 from .._programs import compiled
 from ..flow import Run, simulate
+from ..flow.arguments import check_leaves, refuse_arrays
 from ..flow.methods import MethodLike
 from ..scene import AbstractScene, Scene
 from ._columns import by_columns
+from ._neutral import neutral
 from ._root import root_of, shooting_matrix
 from .cycle_map import CycleMap, adopted, cycle_map
 from .floquet import multipliers_of
@@ -34,11 +38,14 @@ _BATCH = 512
 # grazing: there the map's derivative is of the order of 1/V⁻ and jumps.
 _SLOW = 0.02
 
+# A motion drifts if so much of what it lacks to be periodic is what no other start would change.
+_DRIFTS = 0.5
+
 
 def find_orbit(
     scene: AbstractScene,
     guess: Any,
-    cycles: int = 1,
+    cycles: int | Int[Array, ""] = 1,
     *,
     root_finder: AbstractSearch | None = None,
     method: MethodLike = None,
@@ -60,8 +67,9 @@ def find_orbit(
       one leading axis in it, every guess is searched from in one compiled call.
     - `cycles`: period in drive cycles; static.
     - `root_finder`: `Newton()` (default) or `Gradient(optax_optimiser)`.
-    - `method`: how the scene is carried: by default `ExactFlight()` where it applies, else
-      `Adaptive(Tsit5(), rtol=1e-11)`, which compiles in half the time of the default solver.
+    - `method`: how the scene is carried: by default as by `simulate`, with the `"standard"`
+      preset; but a `Scene` with a motor, whose preset has fixed steps, with
+      `Adaptive(Tsit5(), rtol=1e-11)`.
     - `section`: crank angle of the section (radians) instead of the scene's own, which is 0. The
       guess and the orbit's states are on it; the search itself is done in eighths of a cycle
       away from it, where the guess's motion is farthest from its impacts, because the map jumps
@@ -70,7 +78,10 @@ def find_orbit(
     - `throw`: raise an error if no orbit is found, instead of only saying so in `result`.
 
     **Returns:** an `Orbit`. Its `result` tells an orbit of a smaller period, a search that found
-    none, one that ended at a grazing and a guess that cannot be simulated from each other.
+    none, one that ended at a grazing, a motion that drifts and a guess that cannot be simulated
+    from each other. Where something in the state is neutral (a multiplier is exactly 1), as the
+    place of a body that slides freely or a number that is carried along, the orbits are a family:
+    the one nearest to the guess is found, and derivatives are those across the family.
 
     **Raises:** `ValueError` or `TypeError` for arguments that cannot be used, before any work.
     """
@@ -87,21 +98,27 @@ def find_orbit(
             "Argument `root_finder` must have a number of arcs that divides the "
             f"{cycles} cycles, but has {root_finder.arcs} arcs."
         )
-    state = adopted(the_map.scene, guess.state if isinstance(guess, Orbit) else guess)
-    shapes = {jnp.shape(leaf) for leaf in jtu.tree_leaves(state)}
-    if len(shapes) > 1 or len(next(iter(shapes))) > 1:
-        raise ValueError(
-            "Argument `guess` must hold scalars, or arrays of one length, but holds shapes "
-            f"{sorted(shapes)}."
-        )
-    _check_finite(state)
+    guess = guess.state if isinstance(guess, Orbit) else guess
+    state = adopted(the_map.scene, guess, "guess")
+    _check_guess(the_map.scene, state)
     orbit = _find(the_map, state, root_finder, impact_log)
     if throw:
         orbit = eqx.error_if(orbit, ~orbit.successful, "No orbit was found; see `Orbit.result`.")
     return trimmed(orbit)
 
 
-def _check_finite(state: Any) -> None:
+def _check_guess(scene: AbstractScene, state: Any) -> None:
+    """**Raises:** `ValueError` unless these are numbers, or rows of them for as many guesses."""
+    check_leaves("guess", state)
+    with contextlib.suppress(AttributeError, TypeError, LookupError):  # which `simulate` explains
+        if not jnp.ndim(scene.position(state)):
+            refuse_arrays("guess", "find_orbit", state)
+    shapes = {jnp.shape(leaf) for leaf in jtu.tree_leaves(state)}
+    if len(shapes) > 1 or len(next(iter(shapes))) > 1:
+        raise ValueError(
+            "Argument `guess` must hold scalars, or arrays of one length for as many guesses, but "
+            f"holds shapes {sorted(shapes)}."
+        )
     for path, leaf in jtu.tree_leaves_with_path(state):
         numbers = concrete(leaf)
         if numbers is not None and numbers.ndim == 0 and not np.isfinite(numbers):
@@ -220,8 +237,10 @@ def _judged(the_map: CycleMap, guess: Any, root_finder: AbstractSearch, impact_l
         passed = jacobians[-1][-1]
     jacobians = jnp.concatenate(jacobians)
     missing = seen.states[:, -1, -1] - jnp.roll(x, -1, axis=0)
-    step = jnp.linalg.solve(shooting_matrix(seen.jacobians[:, -1]), missing.ravel())
-    error = jnp.max(jnp.abs(step))
+    missing, ahead = missing.ravel(), shooting_matrix(seen.jacobians[:, -1])
+    lost = neutral(ahead)
+    error = jnp.max(jnp.abs(jnp.linalg.solve(ahead + lost.filled, missing)))
+    drifts = jnp.linalg.norm(lost.unmet @ missing) > _DRIFTS * jnp.linalg.norm(missing)
     seen = jtu.tree_map(lambda a: a.reshape(cycles, *a.shape[2:]), seen)
 
     # Back on the section asked for, of which the last one met is the guess's.
@@ -270,7 +289,7 @@ def _judged(the_map: CycleMap, guess: Any, root_finder: AbstractSearch, impact_l
         error=error,
         iterations=root.steps.astype(jnp.int32),
         history=root.history,
-        result=_verdict(found, least < cycles, near, jnp.isnan(root.residual)),
+        result=_verdict(found, least < cycles, near, drifts, jnp.isnan(root.residual)),
     )
 
 
@@ -287,8 +306,11 @@ def _least_period(sections: Float[Array, "cycles states"], error: Array) -> Arra
     return least
 
 
-def _verdict(found: Array, smaller: Array, near_grazing: Array, no_run: Array) -> ORBIT_RESULTS:
+def _verdict(
+    found: Array, smaller: Array, near_grazing: Array, drifts: Array, no_run: Array
+) -> ORBIT_RESULTS:
     where, results = ORBIT_RESULTS.where, ORBIT_RESULTS
     missed = where(near_grazing, results.grazing, results.no_orbit)
+    missed = where(drifts, results.drifts, missed)
     missed = where(no_run, results.not_simulated, missed)
-    return where(found, where(smaller, results.smaller_period, results.converged), missed)
+    return where(found, where(smaller, results.smaller_period, results.successful), missed)

@@ -1,21 +1,26 @@
 """Floquet multipliers and what they say about a periodic motion."""
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
+from ..flow.enumeration import NamedEnumeration
 
-class STABILITY(eqx.Enumeration):
+
+class STABILITY(NamedEnumeration):
     """Whether a periodic motion is stable, or how it lost its stability."""
 
     stable = "stable"
     fold = "unstable: a real multiplier above 1 (past a fold or where branches cross)"
     period_doubling = "unstable: a real multiplier below -1 (past a period doubling)"
     neimark_sacker = "unstable: a complex pair outside the unit circle (past a Neimark–Sacker)"
+    neutral = "neutral: neither stable nor unstable to rounding, a multiplier has modulus 1"
     unknown = "unknown: no orbit was found"
 
 
-STABILITY_NAMES = ("stable", "fold", "period_doubling", "neimark_sacker", "unknown")
+STABILITY_NAMES = ("stable", "fold", "period_doubling", "neimark_sacker", "neutral", "unknown")
+
+# A modulus is 1 within this, in double precision.
+NEUTRAL = 1e-9
 
 
 def multipliers_of(monodromy: Float[Array, "n n"]) -> Complex[Array, " n"]:
@@ -45,11 +50,13 @@ def stability_of(multipliers: Complex[Array, " n"]) -> STABILITY:
     """The verdict of a set of multipliers: that of the largest."""
     largest = multipliers[jnp.argmax(jnp.abs(multipliers))]
     size = jnp.abs(largest)
-    real = jnp.abs(largest.imag) <= 1e-9 * size
+    real = jnp.abs(largest.imag) <= NEUTRAL * size
     how = STABILITY.where(
         real & (largest.real > 0),
         STABILITY.fold,
         STABILITY.where(real, STABILITY.period_doubling, STABILITY.neimark_sacker),
     )
     verdict = STABILITY.where(size < 1, STABILITY.stable, how)
+    rounding = max(NEUTRAL, 100 * float(jnp.finfo(size.dtype).eps))
+    verdict = STABILITY.where(jnp.abs(size - 1) <= rounding, STABILITY.neutral, verdict)
     return STABILITY.where(jnp.isnan(size), STABILITY.unknown, verdict)

@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -13,9 +12,12 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from ..flow import AbstractMethod, Run, simulate
-from ..flow.labelled import batch_names, in_names, present, states
+from ..flow.enumeration import NamedEnumeration
+from ..flow.labelled import batch_names, in_names, present, states, tidy
 from ..scene import AbstractScene
-from ..scene.numbers import by_name
+from ..scene.numbers import plain, state_in_words
+from ..scene.shown import Told
+from ..scene.units import in_unit, name_in, with_units
 from .floquet import STABILITY, STABILITY_NAMES, stability_of
 
 
@@ -24,10 +26,10 @@ def impacts_in_words(count: int) -> str:
     return f"{count} impact{'' if count == 1 else 's'}"
 
 
-class ORBIT_RESULTS(eqx.Enumeration):
+class ORBIT_RESULTS(NamedEnumeration):
     """How a search for a periodic motion ended; `find_orbit` gives one to each guess."""
 
-    converged = ""
+    successful = ""
     smaller_period = "The motion found has a smaller period than was asked for; see `Orbit.cycles`."
     inadmissible = "The motion found would pass through a stop."
     no_orbit = "The residual did not fall below the tolerance: no orbit was found from this guess."
@@ -35,26 +37,32 @@ class ORBIT_RESULTS(eqx.Enumeration):
         "No orbit was found: the search ended beside a grazing, where the cycle map has no "
         "derivative."
     )
+    drifts = (
+        "No orbit was found: something in the state is neutral (a multiplier is 1) and drifts from "
+        "cycle to cycle. What is counted by the cycle is set back by the machine's `renewed`."
+    )
     not_simulated = "The guess cannot be simulated: see `simulate(...).result` for the reason."
 
 
 _RESULT_NAMES = (
-    "converged", "smaller_period", "inadmissible", "no_orbit", "grazing", "not_simulated",
+    "successful", "smaller_period", "inadmissible", "no_orbit", "grazing", "drifts",
+    "not_simulated",
 )  # fmt: skip
 
 
-class Orbit(eqx.Module):
+class Orbit(Told):
     """A periodic motion, from `find_orbit`; look at `result` before you use it.
 
     Under `vmap` every array has the batch axes in front, and the impact arrays are padded with
-    NaN (stops: -1).
+    NaN (stops: -1). Numbers are in the machine's units (see `AbstractScene.units`): those of a
+    `Scene` in a and ω.
     """
 
     scene: AbstractScene
     """What moves; in the phase clock."""
     method: AbstractMethod
     state: Any
-    """State on the section, a pytree like a start (Y in a, V in a ω, W in ω)."""
+    """State on the section, a pytree like a start."""
     sections: Any
     """States on the sections of the cycles that were asked for; leaves (cycles,)."""
     cycles: Int[Array, "..."]
@@ -62,22 +70,22 @@ class Orbit(eqx.Module):
     duration: Float[Array, "..."]
     """Least period in time τ."""
     frequency_ratio: Float[Array, "..."] | None
-    """ζ: mean crank speed over the period (unit: ω); `None` for scenes that are not driven."""
+    """ζ: mean speed of the drive over the period; `None` for scenes that are not driven."""
     impact_phase: Float[Array, "... impacts"]
-    """Crank angle of each impact (radians), rising from the section on; clock of the period for
-    scenes of your own."""
+    """Clock of each impact, rising from the section on, in the machine's units: the crank angle in
+    radians for a `Scene`, what counts the cycles for any other."""
     impact_speed: Float[Array, "... impacts"]
-    """V⁻, speed of approach just before each impact (unit: a ω)."""
+    """V⁻, speed of approach just before each impact, in the machine's unit (of a `Scene` a ω)."""
     impact_stop: Int[Array, "... impacts"]
     """Index into `scene.stops` of each impact."""
     impacts: Int[Array, "..."]
     """Number of impacts in the period."""
     y_min: Float[Array, "..."]
-    """Smallest Y of the period (unit: a)."""
+    """Smallest position of the period (of the first coordinate)."""
     y_max: Float[Array, "..."]
-    """Largest Y of the period (unit: a)."""
+    """Largest position of the period."""
     clearance: Float[Array, "..."]
-    """Smallest distance to a stop at which the body turns back without touching it (unit: a);
+    """Smallest distance to a stop at which the body turns back without touching it;
     infinite if it never does, negative where it would pass through the stop."""
     monodromy: Float[Array, "... states states"]
     """Derivative of the map over the period, in the order of the state's leaves; on the section on
@@ -98,18 +106,18 @@ class Orbit(eqx.Module):
     @property
     def successful(self) -> Bool[Array, "..."]:
         """Whether this is an orbit, of the period asked for or a smaller one."""
-        return (self.result == ORBIT_RESULTS.converged) | (
+        return (self.result == ORBIT_RESULTS.successful) | (
             self.result == ORBIT_RESULTS.smaller_period
         )
 
     @property
     def stable(self) -> Bool[Array, "..."]:
-        """Whether all multipliers lie inside the unit circle."""
-        return self.successful & (jnp.max(jnp.abs(self.multipliers), axis=-1) < 1)
+        """Whether all multipliers lie inside the unit circle, by more than rounding."""
+        return self.stability == STABILITY.stable
 
     @property
     def stability(self) -> STABILITY:
-        """Stable, or how stability was lost: fold, period doubling or Neimark–Sacker."""
+        """Stable, neutral, or how stability was lost: fold, period doubling or Neimark–Sacker."""
 
         def verdict(successful, multipliers):
             return STABILITY.where(successful, stability_of(multipliers), STABILITY.unknown)
@@ -120,7 +128,7 @@ class Orbit(eqx.Module):
 
     @property
     def slowest_impact(self) -> Float[Array, "..."]:
-        """Smallest V⁻, the distance to a grazing by losing an impact (unit: a ω); infinite without
+        """Smallest V⁻, the distance to a grazing by losing an impact; infinite without
         impacts. The other distance is `clearance`."""
         speed = jnp.where(jnp.isnan(self.impact_speed), jnp.inf, self.impact_speed)
         return jnp.min(speed, axis=-1, initial=jnp.inf)
@@ -160,15 +168,18 @@ class Orbit(eqx.Module):
             impact_log=impact_log,
         )  # fmt: skip
 
-    def to_xarray(self, dims: Sequence[str] | None = None) -> Any:
+    def to_xarray(self, dims: Sequence[str] | None = None, *, along: str | None = None) -> Any:
         """This orbit, or a batch of them, as an `xarray.Dataset`.
 
         Section states become a variable for each component (`section_Y`), multipliers complex
         ones; `result` and `stability` are words. Host-side: not to be traced.
 
-        **Arguments:** names of the batch axes; by default `lane`.
+        **Arguments:** names of the batch axes, by default `lane`; `along`, to keep only what is
+        told along one dimension (`"section"`, `"impact"`, `"multiplier"`, `"column"` of the
+        monodromy matrix, or a batch axis), which then makes a table without repetitions.
 
-        **Raises:** `ValueError` if these are not as many as there are batch axes.
+        **Raises:** `ValueError` if these are not as many as there are batch axes, or there is no
+        such dimension.
         """
         import xarray as xr  # slow to load
 
@@ -185,11 +196,11 @@ class Orbit(eqx.Module):
             "result": in_names(self.result, ORBIT_RESULTS, _RESULT_NAMES),
             "stability": in_names(self.stability, STABILITY, STABILITY_NAMES),
         }
-        return xr.Dataset(variables | present(words, batch))
+        data = xr.Dataset(variables | present(words, batch))
+        return tidy(with_units(data, self.scene.units), along)
 
-    def __str__(self) -> str:
-        if isinstance(self.residual, Tracer):
-            return repr(self)
+    def told(self) -> str:
+        """The motion, its impacts and its multipliers."""
         if self.residual.ndim:
             found, stable = int(jnp.sum(self.successful)), int(jnp.sum(self.stable))
             return (
@@ -199,11 +210,11 @@ class Orbit(eqx.Module):
         if not bool(self.successful):
             reason = ORBIT_RESULTS[self.result]
             return f"No orbit: {reason} Residual {float(self.residual):.3g}."
-        count, cycles = int(self.impacts), int(self.cycles)
+        count, cycles, units = int(self.impacts), int(self.cycles), self.scene.units
         period = self.scene.period_of(cycles)
         lines = [
             f"Orbit of period {period} with {impacts_in_words(count)}, {STABILITY[self.stability]}",
-            f"  section: {state_in_words(self.state, 9)}",
+            f"  section: {state_in_words(self.state, 9, units)}",
             f"  {span_in_words(self, 9)}",
         ]
         for phase, speed, stop in zip(
@@ -211,15 +222,15 @@ class Orbit(eqx.Module):
         ):
             if stop >= 0:
                 name = self.scene.stops[int(stop)].side
-                lines.append(
-                    f"  impact: {name} stop at phase {float(phase):.6f}, V⁻ = {float(speed):.9g}"
-                )
+                fast = in_unit(f"{float(speed):.9g}", units, "velocity")
+                lines.append(f"  impact: {name} stop at phase {float(phase):.6f}, V⁻ = {fast}")
         listed = int(jnp.sum(self.impact_stop >= 0))
         if listed < count:
             lines.append(f"  only {listed} of {count} impacts are listed: see `impact_log`")
         values = ", ".join(complex_in_words(m, 7, 1e-12) for m in np.asarray(self.multipliers))
         lines.append(f"  multipliers: {values}")
-        lines.append(f"  clearance: {float(self.clearance):.4g}")
+        room = in_unit(f"{float(self.clearance):.4g}", units, "position")
+        lines.append(f"  clearance: {room}")
         lines.append(
             f"  residual {float(self.residual):.2g} after {int(self.iterations)} steps, estimated "
             f"error {float(self.error):.2g}"
@@ -228,22 +239,11 @@ class Orbit(eqx.Module):
         return "\n".join([*lines, f"  note: {reason}"] if reason else lines)
 
 
-def state_in_words(state: Any, digits: int) -> str:
-    """The components of a state of any kind."""
-    parts = by_name(state).items()
-    return ", ".join(f"{name} = {_plain(x):.{digits}g}" for name, x in parts)
-
-
 def span_in_words(orbit: Orbit, digits: int) -> str:
     """The interval of the first coordinate, by the name that pictures give it."""
-    name = orbit.scene.labels[0].split(" ")[0]
-    low, high = (f"{_plain(x):.{digits}g}" for x in (orbit.y_min, orbit.y_max))
-    return f"{name} in [{low}, {high}]"
-
-
-def _plain(x: Any) -> float:
-    """A number for print, where zero has no sign."""
-    return float(x) + 0.0
+    low, high = (plain(x, digits) for x in (orbit.y_min, orbit.y_max))
+    span = in_unit(f"[{low}, {high}]", orbit.scene.units, "position")
+    return f"{name_in(orbit.scene.labels[0])} in {span}"
 
 
 def complex_in_words(z: complex, digits: int, rounding: float) -> str:

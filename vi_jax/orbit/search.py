@@ -7,11 +7,14 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import lineax as lx
 import optax
 import optimistix as optx
 from jaxtyping import Array, Float, Int
 
-from .._checks import count, instance_of, number, require
+from .._checks import count, instance_of, require
+from .._numbers import number
+from ._neutral import rounding
 
 Unknowns = Float[Array, "..."]
 Residual = Callable[[Any], Any]
@@ -71,19 +74,21 @@ class Newton(AbstractSearch):
     def __check_init__(self):
         _check(self)
 
-    @property
-    def _solver(self):
-        return optx.Dogleg(rtol=1e-15, atol=1e-15)
+    def _solver(self, dtype):
+        # Where something is neutral, of all steps the smallest.
+        least = lx.SVD(rcond=rounding(dtype))
+        return optx.Dogleg(rtol=1e-15, atol=1e-15, linear_solver=least)
 
     def init(self, residual, x):
         """The dogleg's state."""
         fn = _with_aux(residual)
         shapes, aux = eqx.filter_eval_shape(fn, x, None)
-        return self._solver.init(fn, x, None, {}, shapes, aux, frozenset())
+        return self._solver(x.dtype).init(fn, x, None, {}, shapes, aux, frozenset())
 
     def step(self, residual, x, memory):
         """One dogleg step, tried; the place moves only if the residual falls."""
-        x, memory, _ = self._solver.step(_with_aux(residual), x, None, {}, memory, frozenset())
+        solver, fn = self._solver(x.dtype), _with_aux(residual)
+        x, memory, _ = solver.step(fn, x, None, {}, memory, frozenset())
         return x, memory, x, _largest(memory.f_info.residual)
 
     @property

@@ -7,6 +7,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from .._checks import given_number
+from ..scene.shown import told_in_table
 from ._events import Event
 from ._shooting import Shooting
 from ._solve import advance, jacobian_at, orbit_of, state_at, tangent_at
@@ -71,6 +72,11 @@ class SpecialPoint:
 
     def __str__(self) -> str:
         return f"{self.kind} at {self.parameter:.10g}: {self.detail}"
+
+    __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        return told_in_table(str(self))
 
 
 def _along(point: SpecialPoint, distance: float) -> Orbit:

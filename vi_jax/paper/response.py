@@ -17,7 +17,7 @@ from ..orbit import (
     continue_orbit,
     find_orbit,
 )
-from ..scan import Sweep, lyapunov, sweep
+from ..scan import REGIMES, Sweep, lyapunov, sweep
 from ..scene import RigidStop, Scene
 from ..scene.numbers import with_leaf
 from .motions import GAP, table_damping_ratio
@@ -205,13 +205,15 @@ def _sweeps(
     flat = jtu.tree_map(lambda x: np.array(x).reshape(-1, *x.shape[2:]), found)
     pairs, values = np.repeat(pairs, len(ratios), axis=0), values.ravel()
     for _ in range(2):
-        _again(scene, flat, pairs, values, np.flatnonzero((flat.period == 0) | (flat.period > 2)))
+        unclear = (flat.period == REGIMES.unsettled) | (flat.period > 2)
+        _again(scene, flat, pairs, values, np.flatnonzero(unclear))
     exponents = np.full(len(values), np.nan)
-    for some in _chunks(np.flatnonzero(flat.period == 0)):
+    for some in _chunks(np.flatnonzero(flat.period == REGIMES.unsettled)):
         ends = jtu.tree_map(lambda x, some=some: x[some, -1], flat.sections)
         exponents[some] = _exponents(scene, pairs[some], values[some], ends)
     for _ in range(6):  # near a bifurcation motions come to rest slowly
-        _again(scene, flat, pairs, values, np.flatnonzero((flat.period == 0) & (exponents < 0.002)))
+        quiet = (flat.period == REGIMES.unsettled) & (exponents < 0.002)
+        _again(scene, flat, pairs, values, np.flatnonzero(quiet))
     exponents[flat.period > 0] = np.nan
     results = []
     for i in range(len(numbers)):

@@ -114,7 +114,9 @@ def _frames(run: Run, scene: AbstractScene, path: Any, good: np.ndarray, number:
     at = np.interp(np.linspace(ends[0], ends[1], number), time[inside], cycles[inside])
 
     def between(x: Any) -> np.ndarray:
-        return np.interp(at, cycles[inside], np.asarray(x, float)[inside])
+        x = np.asarray(x, float)[inside]
+        rows = [np.interp(at, cycles[inside], row) for row in x.reshape(len(x), -1).T]
+        return np.stack(rows, axis=-1).reshape(-1, *x.shape[1:])
 
     states = jax.tree_util.tree_map(between, samples.state)
     # The corners of the path at its impacts, which no samples have.

@@ -1,6 +1,7 @@
 """Pictures of branches, sweeps and boundaries, in the field's conventions."""
 
 import itertools
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -8,10 +9,15 @@ from matplotlib.axes import Axes
 
 from .._checks import instance_of, one_of
 from ..orbit import Boundary, Branch
+from ..orbit.results import impacts_in_words
 from ..scan import Sweep
-from ..scene import LABELS
+from ..scene.units import in_brackets, name_in, quantity_of, unit_of
 from .colors import DASHES, MARKS, color_of, mark_style, once
 from .motion import new_axes
+
+# What a legend says of lines, and where dots lie: above lines and below the marks.
+_STABLE, _UNSTABLE = "stable", "unstable"
+_DOTS = 3
 
 
 def plot_branch(
@@ -26,14 +32,15 @@ def plot_branch(
 ) -> Axes:
     """A branch: stable parts solid, unstable ones dashed, special points marked.
 
-    Its colour is that of its period, as in all pictures; a 4π motion with several impacts has
-    another than one with a single impact.
+    Its colour is that of its period, as in all pictures; a motion of two cycles with several
+    impacts has another than one with a single impact.
 
     **Arguments:** the branch; `ax`, a new figure if left out; `y` and `x`, names of the branch's
     arrays with a number for each point (`y` is by default the first of `"y_min"`, `"y_max"` that a
     stop does not hold where it is); `special`, whether to mark the special points (where `y` is a
-    number of an orbit); `legend`, whether to draw one, which names the marks and, given `label`,
-    the branch; options of `Axes.plot`.
+    number of an orbit); `legend`, whether to draw one, which tells whose period and impacts a
+    colour stands for, or the branch's `label`, then what solid and dashed lines are, and the marks;
+    options of `Axes.plot`.
 
     **Returns:** the axes.
 
@@ -47,15 +54,19 @@ def plot_branch(
     inside = np.abs(branch.multipliers).max(axis=1) < 1 + 1e-6
     stable = inside[1:] & inside[:-1]
     label = style.pop("label", None)
-    own = color_of(branch.cycles, branch.impact_speed.shape[1])
-    look = {"color": own, "lw": 1.6, **style}
+    impacts = branch.impact_speed.shape[1]
+    look = {"color": color_of(branch.cycles, impacts), "lw": 1.6, **style}
     if label is not None:
         ax.plot([], [], label=label, **{"ls": "-", **look})
     for start, end, solid in _stretches(stable):
         part = slice(start, end)
         ax.plot(across[part], up[part], **{"ls": "-" if solid else "--", **look})
-    if not stable.all():
-        ax.plot([], [], "--", color="0.3", lw=look["lw"], label=once(ax, "unstable"))
+    if label is None and legend:
+        motion = f"{branch.problem.scene.period_of(branch.cycles)}, {impacts_in_words(impacts)}"
+        ax.plot([], [], label=once(ax, motion), **{"ls": "-", **look})
+    for word, line, drawn in ((_STABLE, "-", stable.any()), (_UNSTABLE, "--", not stable.all())):
+        if drawn:
+            ax.plot([], [], line, color="0.3", lw=look["lw"], label=once(ax, word))
     if special and x == "parameter":
         for point in branch.special:
             value = getattr(point.orbit, y, None)
@@ -64,8 +75,9 @@ def plot_branch(
                 ax.plot(point.parameter, float(value), **mark)
     if legend:
         _legend(ax)
-    ax.set_xlabel("ζ" if x == "frequency_ratio" else axis_name(branch.name))
-    ax.set_ylabel(extreme_name(y, branch.problem.scene.labels))
+    scene = branch.problem.scene
+    ax.set_xlabel("ζ" if x == "frequency_ratio" else axis_name(branch.name, scene.units))
+    ax.set_ylabel(extreme_name(y, scene.labels, scene.units))
     return ax
 
 
@@ -87,9 +99,9 @@ def _array(found: Branch | Sweep, argument: str, name: str) -> np.ndarray:
 
 
 def _legend(ax: Axes) -> None:
-    """Branches first, then what is common to all."""
+    """Branches first, then their lines, then the marks."""
     named = list(zip(*ax.get_legend_handles_labels(), strict=True))
-    named.sort(key=lambda x: x[1] in MARKS or x[1] == "unstable")
+    named.sort(key=lambda x: 2 if x[1] in MARKS else x[1] in (_STABLE, _UNSTABLE))
     if named:
         handles, labels = zip(*named, strict=True)
         ax.legend(handles, labels, fontsize="small", frameon=False)
@@ -104,7 +116,7 @@ def _stretches(stable: np.ndarray) -> list[tuple[int, int, bool]]:
 def plot_sweep(
     sweep: Sweep, *, ax: Axes | None = None, y: str | None = None, x: str = "values", **style: Any
 ) -> Axes:
-    """A sweep as dots, one for each value.
+    """A sweep as dots, one for each value, above the branches in the same axes.
 
     **Arguments:** one sweep; `ax`; names of its arrays with a number for each value, as for
     `plot_branch`; options of `Axes.plot`.
@@ -117,9 +129,11 @@ def plot_sweep(
     y = _moving(sweep) if y is None else y
     across, up = _array(sweep, "x", x), _array(sweep, "y", y)
     ax = new_axes(ax)
-    ax.plot(across, up, **{"marker": ".", "ms": 3, "ls": "none", "color": "0.3", **style})
-    ax.set_xlabel(axis_name(sweep.parameter if x == "values" else x))
-    ax.set_ylabel(extreme_name(y, sweep.labels))
+    look = {"marker": ".", "ms": 3, "ls": "none", "color": "0.3", "zorder": _DOTS, **style}
+    ax.plot(across, up, **look)
+    units = dict(sweep.units)
+    ax.set_xlabel(axis_name(sweep.parameter if x == "values" else x, units))
+    ax.set_ylabel(extreme_name(y, sweep.labels, units))
     return ax
 
 
@@ -139,27 +153,33 @@ def plot_boundary(curve: Boundary, *, ax: Axes | None = None, **style: Any) -> A
         look.pop("ls")
     color = color_of(curve.problem.cycles, curve.impact_speed.shape[1])
     ax.plot(*curve.parameters.T, **{"color": color, **look, **style})
-    ax.set_xlabel(axis_name(curve.names[0]))
-    ax.set_ylabel(axis_name(curve.names[1]))
+    units = curve.problem.scene.units
+    ax.set_xlabel(axis_name(curve.names[0], units))
+    ax.set_ylabel(axis_name(curve.names[1], units))
     return ax
 
 
-def extreme_name(name: str, labels: tuple[str, str]) -> str:
+def extreme_name(name: str, labels: tuple[str, str], units: Mapping[str, str]) -> str:
     """What an axis of smallest or greatest positions says, in the words of a scene."""
     least = {"y_min": "min", "y_max": "max"}.get(name)
     if least is None:
-        return "mean frequency ratio ζ" if name == "frequency_ratio" else name
-    return f"{least} Y (a)" if labels == LABELS else f"{least} {labels[0]}"
+        if name == "frequency_ratio":
+            return "mean frequency ratio ζ"
+        quantity = quantity_of(name)
+        return name if quantity is None else in_brackets(name, unit_of(units, quantity))
+    return in_brackets(f"{least} {name_in(labels[0])}", unit_of(units, "position"))
 
 
-def axis_name(name: str) -> str:
-    """The field's symbol for a number of a scene."""
+def axis_name(name: str, units: Mapping[str, str]) -> str:
+    """The field's symbol for a number of a scene, with its unit unless it is a ratio."""
     symbols = {
         "frequency_ratio": "frequency ratio ζ",
         "restitution": "restitution k",
-        "gap": "gap d (a)",
+        "gap": "gap d",
         "damping_ratio": "damping ratio ξ",
         "control": "motor control κ",
         "strength": "motor strength τ0",
     }
-    return symbols.get(name.split(".")[-1], name)
+    last = name.split(".")[-1]
+    unit = "" if last == "frequency_ratio" else unit_of(units, name)
+    return in_brackets(symbols.get(last, name), unit)

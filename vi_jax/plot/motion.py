@@ -6,7 +6,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, MultipleLocator
 
 from ..flow import Run, Samples
-from ..scene import LABELS, AbstractScene
+from ..scene import AbstractScene
 from .colors import BLUE, STOP, once
 from .path import motion_path
 
@@ -58,13 +58,20 @@ def plot_history(
     ax.plot(factor * (path.cycles + shift), path.Y, **{"color": BLUE, "lw": 1.3, **style})
     if stops and scene is not None:
         for stop in scene.stops:
-            ax.axhline(stop.sign * float(stop.gap), color=STOP, lw=1.8, label=once(ax, "stop"))
-    ax.set_ylabel((LABELS if scene is None else scene.labels)[0])
+            ax.axhline(float(stop.place), color=STOP, lw=1.8, label=once(ax, "stop"))
+    ax.set_ylabel(_labels(motion, scene)[0])
     if unit == "cycles":
         ax.set_xlabel("drive cycles φ/(2π)" if turning else "cycles since the start")
     else:
         angle_axis(ax)
     return ax
+
+
+def _labels(motion: Run | Samples, scene: AbstractScene | None) -> tuple[str, str]:
+    """What position and velocity are called; samples alone do not know their machine."""
+    if scene is not None:
+        return scene.labels
+    return motion.labels if isinstance(motion, Run) else ("Y", "V")
 
 
 def angle_axis(ax: Axes, *, every: int = 1) -> None:
@@ -107,8 +114,8 @@ def plot_phase_portrait(
         ax.plot(samples.Y[whole], samples.V[whole], "o", **dots)
     if scene is not None:
         for stop in scene.stops:
-            ax.axvline(stop.sign * float(stop.gap), color=STOP, lw=1.8, label=once(ax, "stop"))
-    position, velocity = LABELS if scene is None else scene.labels
+            ax.axvline(float(stop.place), color=STOP, lw=1.8, label=once(ax, "stop"))
+    position, velocity = _labels(motion, scene)
     ax.set_xlabel(position)
     ax.set_ylabel(velocity)
     return ax

@@ -41,7 +41,8 @@ def motion_path(
     impacts logged (`impact_log=...`) enter as two points each, before and after the impact, so
     that a corner at the stop is drawn where it is; `window`, the first and the last cycle to keep.
 
-    **Raises:** `ValueError` if the run has no samples or is a batch.
+    **Raises:** `ValueError` if the run has no samples or is a batch, or its states lack `Y` and `V`
+    and no scene says what stands for them.
     """
     if isinstance(motion, Orbit):
         raise TypeError("Argument `motion` must be a `Run`: give `orbit.trajectory()` of an orbit.")
@@ -53,9 +54,15 @@ def motion_path(
         raise ValueError(
             f"Argument `motion` must be one motion, but is a batch of shape {cycles.shape[:-1]}."
         )
-    path = MotionPath(
-        cycles, *(np.asarray(read(samples.state), float) for read in _coordinates(scene))
-    )
+    try:
+        path = MotionPath(
+            cycles, *(np.asarray(read(samples.state), float) for read in _coordinates(scene))
+        )
+    except AttributeError:
+        raise ValueError(
+            "Argument `scene` must be given, which says what is the position in a state without "
+            "`Y` and `V`."
+        ) from None
     if isinstance(motion, Run) and motion.impact_log is not None and scene is not None:
         path = _with_impacts(path, motion, scene)
     if window is not None:

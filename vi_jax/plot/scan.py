@@ -12,12 +12,14 @@ from matplotlib.colors import ListedColormap, to_rgb
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from .._checks import flag
 from ..orbit.results import impacts_in_words
 from ..scan import REGIMES, Basins
-from ..scan.regime import LABELS
+from ..scan.regime import periods_of
 from ..scan.store import NOT_COMPUTED
 from ..scene import AbstractScene, Scene
 from ..scene.numbers import by_name
+from ..scene.units import in_brackets, unit_of
 from . import colors as look
 from .branch import axis_name
 from .colors import IRREGULAR, PERIODS, color_of, shades
@@ -44,6 +46,7 @@ def plot_regimes(
     ax: Axes | None = None,
     x: str | None = None,
     y: str | None = None,
+    legend: bool = True,
 ) -> Axes:
     """A map of the regimes of motion over two axes of a scan.
 
@@ -55,18 +58,19 @@ def plot_regimes(
     **Arguments:** the data of a scan that measured `"regime"`; `scene`, whose words name the
     periods (left out: 2π and so on for a `Scene`, cycles for any other machine); `ax`, axes to draw
     into, a new figure if left out; `x` and `y`, the names of the axes to draw along, the first and
-    the second of the scan if left out.
+    the second of the scan if left out; `legend`, whether to draw one, on the right of the axes.
 
     **Returns:** the axes.
 
     **Raises:** `ValueError` if there is no period in the data, or not over two axes.
     """
+    legend = flag("legend", legend)
     if "period" not in data:
         raise ValueError('Argument `data` must hold `period`: scan with measure="regime".')
     period = data["period"]
     x, y = _two_axes([str(name) for name in period.dims], x, y)
     period = period.transpose(y, x)
-    codes = np.clip(np.asarray(period).astype(int), _LEAST + 1, len(PERIODS))
+    codes = np.clip(periods_of(period), _LEAST + 1, len(PERIODS))
     if "impacts" in data:
         impacts = np.asarray(data["impacts"].transpose(y, x), float)
         free, two = (codes > 0) & (impacts < 0.5), (codes == 2) & (impacts >= 0.5)
@@ -81,9 +85,10 @@ def plot_regimes(
     shown = np.searchsorted(np.sort(present), codes)
     order = np.argsort(present)
     _image(ax, across, up, shown, [colors[i] for i in order])
-    _legend(ax, list(zip(names, colors, strict=True)))
-    ax.set_xlabel(axis_name(x))
-    ax.set_ylabel(axis_name(y))
+    if legend:
+        _legend(ax, list(zip(names, colors, strict=True)))
+    for name, told in ((x, ax.set_xlabel), (y, ax.set_ylabel)):
+        told(axis_name(name, {name: data[name].attrs.get("units", "")}))
     return ax
 
 
@@ -135,7 +140,7 @@ def plot_basins(found: Basins, *, ax: Axes | None = None) -> Axes:
     x, y = _two_axes(names, None, None)
     ax = new_axes(ax)
     across, up = np.asarray(found.data[x], float), np.asarray(found.data[y], float)
-    colors, irregular = _basin_colors(found), len(LABELS)
+    colors, irregular = _basin_colors(found), len(REGIMES)
     if label.dims == ("sample",):
         ax.scatter(across, up, c=[colors[i + irregular] for i in np.asarray(label)], s=6, lw=0)
     else:
@@ -152,7 +157,7 @@ def plot_basins(found: Basins, *, ax: Axes | None = None) -> Axes:
         rest = sum(a.fraction for a in found.attractors[_NAMED:])
         further = (f"{len(entries) - _NAMED} further: {100 * rest:.1f} %", "none")
         entries = [*entries[:_NAMED], further]
-    for regime in LABELS:
+    for regime in REGIMES:
         part = found.irregular[regime.name]
         if part:
             entries.append((f"{regime.meaning}: {100 * part:.1f} %", IRREGULAR[regime]))
@@ -170,8 +175,7 @@ def _start_name(scene: AbstractScene | None, name: str) -> str:
     velocity; else the name alone."""
     name = name.removeprefix("start.")
     if isinstance(scene, Scene):
-        unit = {"Y": " (a)", "V": " (a ω)", "W": " (ω)"}.get(name, "")
-        return f"{name} at the start{unit}"
+        return in_brackets(f"{name} at the start", unit_of(scene.units, name))
     try:
         start = None if scene is None else scene.start()
     except ValueError:  # a scene that has no start of its own
@@ -188,7 +192,7 @@ def _start_name(scene: AbstractScene | None, name: str) -> str:
 
 def _basin_colors(found: Basins) -> list[str]:
     """Colours of the labels, the least first."""
-    irregular = [IRREGULAR[regime] for regime in sorted(LABELS, key=LABELS.__getitem__)]
+    irregular = [IRREGULAR[regime] for regime in sorted(REGIMES)]
     kinds: dict[str, Iterator[str]] = {}
     colors = {}
     for a in found.attractors:

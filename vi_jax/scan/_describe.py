@@ -3,7 +3,6 @@
 import hashlib
 import json
 import re
-from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import equinox as eqx
@@ -11,10 +10,13 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
+from .._version import installed_version
 from ..scene.numbers import leaf, leaf_names
 from ._identity import Unverifiable, identity
 from .grid import Blocks
 from .job import Job
+from .measures import Regime
+from .regime import CODES
 from .store import UNVERIFIABLE
 
 
@@ -39,7 +41,7 @@ def description_of(job: Job, blocks: Blocks) -> dict[str, Any]:
     start: Any = "the scene's own"
     if job.start is not None:
         start = {name: _described(leaf(job.start, name)) for name in leaf_names(job.start)}
-    return {
+    about: dict[str, Any] = {
         "scene": scene,
         "start": start,
         "paired": blocks.paired,
@@ -64,6 +66,10 @@ def description_of(job: Job, blocks: Blocks) -> dict[str, Any]:
         "precision": str(jnp.result_type(float)),
         "code of": _codes(job),
     }
+    if any(isinstance(measure, Regime) for measure in job.measures):
+        # A store of an earlier release has other numbers for them, not to be mixed with these.
+        about["regimes"] = dict(CODES)
+    return about
 
 
 def _lasting(text: str) -> str:
@@ -96,12 +102,8 @@ def _described(x: Any) -> Any:
 
 def attributes_of(about: dict[str, Any]) -> dict[str, Any]:
     """The attributes of a scan's data, from its description."""
-    try:
-        number = version("vi-jax")
-    except PackageNotFoundError:
-        number = "not installed"
     return {
-        "vi_jax": number,
+        "vi_jax": installed_version(),
         "method": about["method"],
         "settle": about["settle"],
         "cycles": about["cycles"],

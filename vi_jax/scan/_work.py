@@ -3,7 +3,13 @@
 import functools
 import math
 from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    CancelledError,
+    Future,
+    ThreadPoolExecutor,
+    wait,
+)
 from typing import Any
 
 import equinox as eqx
@@ -60,7 +66,7 @@ def rounded(lanes: int, total: int, devices: int) -> int:
 @functools.cache
 def _compiled(devices: int) -> Callable[..., dict[str, Array]]:
     if devices == 1:
-        return Program(lambda job, values, wanted: job(values, wanted), PLAIN, **compiling())
+        return _program(lambda job, values, wanted: job(values, wanted))
     mesh = Mesh(np.asarray(jax.local_devices()[:devices]), ("lanes",))
     whole, split = PartitionSpec(), PartitionSpec("lanes")
 
@@ -74,7 +80,11 @@ def _compiled(devices: int) -> Callable[..., dict[str, Array]]:
             here, mesh=mesh, in_specs=(whole, split, split), out_specs=split, check_vma=False
         )(numbers, values, wanted)
 
-    return Program(spread, PLAIN, **compiling())
+    return _program(spread)
+
+
+def _program(function: Callable[..., Any]) -> Program:
+    return Program(function, PLAIN, **compiling())
 
 
 def compute(
@@ -129,10 +139,16 @@ def run_here(
         pool.shutdown(wait=True, cancel_futures=True)
 
 
+class ClusterLost(Exception):
+    """The scheduler of a cluster does not answer."""
+
+
 def run_on_cluster(job: Job, blocks: Blocks, todo: list, client: Any) -> Iterator[Any]:
-    """Blocks as Dask tasks, as they are done."""
+    """Blocks as Dask tasks, as they are done. **Raises:** `ClusterLost`; what a task raises."""
     from dask.distributed import as_completed
 
+    if client.status != "running":
+        raise ClusterLost
     x64 = _x64()
     # Small enough to go with every task: data that are shared would die with their worker.
     parcel = _Parcel(job)
@@ -144,9 +160,16 @@ def run_on_cluster(job: Job, blocks: Blocks, todo: list, client: Any) -> Iterato
     }
     try:
         for future in as_completed(list(where_of)):
-            yield where_of.pop(future), future.result()
+            try:
+                found = future.result()
+            except (CancelledError, OSError) as error:
+                if future.status == "error":  # a task's own
+                    raise
+                raise ClusterLost from error
+            yield where_of.pop(future), found
     finally:
-        client.cancel(list(where_of))
+        if client.status == "running":  # else it would wait for an answer
+            client.cancel(list(where_of))
 
 
 def _x64() -> bool:

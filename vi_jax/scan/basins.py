@@ -13,22 +13,24 @@ import numpy as np
 from .._checks import count, fits_records, given_number
 from .._lazy import lazy
 from ..flow import simulate
+from ..flow.arguments import machine_of
+from ..flow.labelled import tidy
 from ..flow.methods import MethodLike, chosen
 from ..orbit.results import impacts_in_words
 from ..scene import AbstractScene
-from ..scene.numbers import by_name, with_leaf
+from ..scene.numbers import by_name, state_in_words, with_leaf
+from ..scene.shown import told_in_table
+from ..scene.units import attributes, unit_of
 from .grid import axes_of
 from .job import START
 from .measures import AbstractMeasure, Regime
-from .regime import LABELS, REGIMES, flags
-from .scan import scan
+from .regime import CODES, REGIMES, flags
+from .scan import ScanInterrupted, scan
 
 if TYPE_CHECKING:
     import xarray as xr
 else:
     xr = lazy("xarray")
-
-_IRREGULAR = {regime.name: label for regime, label in LABELS.items()}
 
 
 class Attractor(NamedTuple):
@@ -69,11 +71,36 @@ class Basins(NamedTuple):
         """A duration of so many cycles, in the words of the scene."""
         return f"{2 * cycles}π" if self.scene is None else self.scene.period_of(cycles)
 
+    def to_xarray(self, *, along: str | None = None) -> "xr.Dataset":
+        """These basins as an `xarray.Dataset`: `data`, and of each motion `motion_period`,
+        `motion_impacts`, `motion_starts`, `motion_fraction`, `motion_error` and its section states
+        (`motion_Y`, NaN beyond its period). A `label` from 0 on is a place along `motion`.
+
+        **Arguments:** `along`, to keep only what is told along one dimension: `"motion"`, `"cycle"`
+        (their section states), or the last axis of the starts for `data`.
+
+        **Raises:** `ValueError` if there is no such dimension.
+        """
+        variables = {}
+        for name in ("period", "impacts", "starts", "fraction", "error"):
+            values = [getattr(a, name) for a in self.attractors]
+            variables[f"motion_{name}"] = "motion", np.asarray(values)
+        longest = max((a.period for a in self.attractors), default=0)
+        units = {} if self.scene is None else self.scene.units
+        for name in self.attractors[0].sections if self.attractors else ():
+            rows = np.full((len(self.attractors), longest), np.nan)
+            for row, a in zip(rows, self.attractors, strict=True):
+                row[: a.period] = a.sections[name]
+            about = attributes(unit_of(units, name))
+            variables[f"motion_{name}"] = ("motion", "cycle"), rows, about
+        return tidy(self.data.assign(variables), along)
+
     def __str__(self) -> str:
         many = "" if len(self.attractors) == 1 else "s"
+        units = {} if self.scene is None else self.scene.units
         lines = [f"Basins of {len(self.attractors)} periodic motion{many}"]
         for a in self.attractors:
-            where = ", ".join(f"{name} = {x[0]:.6g}" for name, x in a.sections.items())
+            where = state_in_words({name: x[0] for name, x in a.sections.items()}, 6, units)
             lines.append(
                 f"  {a.label}: period {self.period_of(a.period)}, "
                 f"{impacts_in_words(round(a.impacts))}, {where}: "
@@ -82,11 +109,20 @@ class Basins(NamedTuple):
         lines += [f"  {name}: {100 * x:.2f} %" for name, x in self.irregular.items() if x]
         return "\n".join(lines)
 
+    __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        return told_in_table(str(self))
+
 
 class _Mark(AbstractMeasure):
     """Of the last section states that of greatest position, the same for all lanes on a motion."""
 
     longest: int = eqx.field(static=True)
+
+    def described(self, start):
+        """Each component of the state."""
+        return {name: {"unit_of": name} for name in by_name(start)}
 
     @property
     def cycles(self):
@@ -109,7 +145,7 @@ def basins(
     seed: int = 0,
     settle: int = 400,
     longest: int = 64,
-    tolerance: float = 1e-6,
+    tolerance: float | None = None,
     apart: float = 1e-3,
     method: MethodLike = None,
     start: Any = None,
@@ -136,10 +172,10 @@ def basins(
 
     **Returns:** `Basins`.
 
-    **Raises:** as `scan`.
+    **Raises:** as `scan`; on Ctrl-C `ScanInterrupted`, whose `data` says of each start that was
+    followed where it ended (`period`, and a section state).
     """
-    if not isinstance(scene, AbstractScene):
-        raise TypeError(f"Argument `scene` must be a `Scene`, but got {scene!r}.")
+    scene = machine_of(scene)
     for name in ("measure", "paired", "cycles", "derivatives"):
         if name in options:
             raise TypeError(f"Argument `{name}` is `scan`'s, and not to be given to `basins`.")
@@ -198,10 +234,13 @@ def basins(
             [np.asarray(x)[1 : cycles + 1] for x in by_name(run.sections).values()], axis=1
         )
 
-    label, motions = _sorted_out(period, states, apart, followed)
+    try:
+        label, motions = _sorted_out(period, states, apart, followed)
+    except KeyboardInterrupt:
+        raise ScanInterrupted(data, options.get("store")) from None
     attractors = []
     order = np.argsort([-np.sum(label == i) for i in range(len(motions))], kind="stable")
-    irregular = list(_IRREGULAR.values())
+    irregular = list(CODES.values())
     place = np.empty(len(order) + len(irregular), int)
     place[order] = np.arange(len(order))
     place[irregular] = irregular
@@ -220,8 +259,8 @@ def basins(
                 error=math.sqrt(p * (1 - p) / label.size),
             )
         )
-    parts = {name: float(np.mean(label == number)) for name, number in _IRREGULAR.items()}
-    about = {"long_name": "motion that the start settles on", **flags(_IRREGULAR)}
+    parts = {name: float(np.mean(label == number)) for name, number in CODES.items()}
+    about = {"long_name": "motion that the start settles on", **flags(CODES)}
     dims = data["period"].dims
     kind = np.min_scalar_type(-max(4, len(order)))
     data = data.assign(label=(dims, label.astype(kind).reshape(data["period"].shape), about))
@@ -235,9 +274,7 @@ def _sorted_out(
     followed: Callable[[np.ndarray, int], np.ndarray],
 ) -> tuple[np.ndarray, list[np.ndarray]]:
     """A label for each lane, and the section states of each motion."""
-    label = np.full(period.size, LABELS[REGIMES.failed])
-    for regime, number in LABELS.items():
-        label[period == regime] = number
+    label = np.where(np.isin(period, list(REGIMES)), period, int(REGIMES.failed)).astype(int)
     settled = np.flatnonzero(period > 0)
     if not settled.size:
         return label, []

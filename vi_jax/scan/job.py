@@ -13,14 +13,17 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._checks import count, tuple_of
+from .._numbers import strongly_typed
 from ..flow import AbstractMethod
+from ..flow.arguments import check_period, check_reals, machine_of, refuse_arrays
 from ..flow.methods import MethodLike, chosen
 from ..flow.results import number_of
 from ..flow.simulate import simulate_pool
 from ..scene import AbstractScene
 from ..scene.numbers import check_again, check_name, leaf, leaf_names, with_leaf
+from ._asked import measures_of
 from .grid import Blocks
-from .measures import AbstractMeasure, Numbers, measures_of
+from .measures import AbstractMeasure, Numbers
 
 START = "start."
 
@@ -74,6 +77,10 @@ class Job(eqx.Module):
             if name.startswith(START):
                 start = with_leaf(start, name.removeprefix(START), value)
         return scene, self._nudged(start, START, nudge)
+
+    def first(self, blocks: Blocks) -> tuple[AbstractScene, Any]:
+        """Scene and start of the first lane."""
+        return self.lane({name: jnp.asarray(x[0]) for name, x in blocks.axes.items()})
 
     def _nudged(self, tree: Any, prefix: str, nudge: Any) -> Any:
         """`tree` with the numbers moved that derivatives are asked for."""
@@ -182,8 +189,8 @@ def make_job(
     settle = count("settle", settle)
     derivatives = (derivatives,) if isinstance(derivatives, str) else derivatives
     if isinstance(scene, AbstractScene):
-        template, build, rests = scene, None, True
-        method = chosen(scene, method)
+        template, build, rests = machine_of(scene), None, True
+        method = chosen(template, method)
     elif callable(scene):
         template, build = None, scene
         own = [name for name in names if not name.startswith(START)]
@@ -194,10 +201,15 @@ def make_job(
             "Argument `scene` must be a `Scene`, an `AbstractScene` or a function that makes one, "
             f"but got {scene!r}."
         )
+    first = start
+    if template is not None and start is None:
+        first = template.start()
+    if first is not None:
+        refuse_arrays("start", "scan", first)
     if template is not None:
-        first = template.start() if start is None else start
         for name in names:
             _check_name(template, first, name, "axes")
+    measures = tuple(measure.under(method) for measure in measures)
     return Job(
         scene=_as_arrays(template),
         build=build,
@@ -258,7 +270,9 @@ def _check_variables(measure: AbstractMeasure, new: Iterable[str], taken: list[s
 
 def _as_arrays(tree: Any) -> Any:
     """Numbers as arrays, so that others are not another program."""
-    return jtu.tree_map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray | float) else x, tree)
+    return jtu.tree_map(
+        lambda x: strongly_typed(jnp.asarray(x) if isinstance(x, np.ndarray | float) else x), tree
+    )
 
 
 def _check_name(scene: AbstractScene, start: Any, name: str, argument: str) -> None:
@@ -297,5 +311,8 @@ def check_corners(job: Job, blocks: Blocks) -> Job:
         for name in job.derivatives:
             _check_name(scene, start, name, "derivatives")
         job.method.check(scene)
-        scene.adopt(start)
+        start = scene.adopt(start)
+        check_reals("start", start)
+        check_period(scene, start)
+        refuse_arrays("start", "scan", start)
     return job if job.build is not None else dataclasses.replace(job, rests=rests)

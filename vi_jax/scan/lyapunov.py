@@ -1,49 +1,85 @@
 """Lyapunov exponents, through the impacts."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
 from .._checks import count, flag
 from .._programs import compiled
 from ..flow import RESULTS, has_fixed_cycle, simulate
+from ..flow.labelled import batch_names, in_names, present, states, tidy
 from ..flow.methods import MethodLike, chosen
+from ..flow.results import REASON_NAMES
 from ..orbit.cycle_map import CycleMap, adopted, cycle_map
-from ..scene import AbstractScene, Scene
+from ..scene import AbstractScene
+from ..scene.base import renews
+from ..scene.shown import Told, number_in_words
+from ..scene.units import attributes, unit_of, with_unit
 
 
-class Lyapunov(eqx.Module):
+class Lyapunov(Told):
     """Lyapunov exponents of a motion. Under `vmap` batch axes come first."""
 
     exponents: Float[Array, "... states"]
-    """The spectrum, greatest first: mean growth rates in time τ (unit: ω)."""
+    """The spectrum, greatest first: mean growth rates in time, as the machine counts it (`unit`;
+    for a `Scene` ω)."""
     per_cycle: Float[Array, "... states"]
     """The same per drive cycle (dimensionless): ln|multipliers|/n on an orbit of n cycles. Of an
     autonomous machine per usual `cycle`, at which it is observed."""
     spread: Float[Array, "..."]
-    """Difference of the greatest exponent between the two halves of the run (unit: ω)."""
+    """Difference of the greatest exponent between the two halves of the run."""
     state: Any
     """Section state at the end."""
     result: RESULTS
     """Whether the run was simulated to its end; if not, the numbers are NaN."""
+    unit: str = eqx.field(static=True, default="")
+    """Of the exponents, as the machine states it; "" if it does not."""
 
     @property
     def successful(self) -> Bool[Array, "..."]:
         """Whether the run was simulated to its end."""
         return self.result == RESULTS.successful
 
-    def __str__(self) -> str:
-        if isinstance(self.exponents, Tracer) or self.exponents.ndim > 1:
-            return repr(self)
+    def to_xarray(self, dims: Sequence[str] | None = None, *, along: str | None = None) -> Any:
+        """These exponents, or a batch of them, as an `xarray.Dataset`.
+
+        The state at the end becomes a variable for each component (`state_Y`), and `result` is the
+        reason's name. Host-side: not to be traced.
+
+        **Arguments:** names of the batch axes, by default `lane`; `along`, to keep only what is
+        told along one dimension: `"exponent"`, or a batch axis.
+
+        **Raises:** `ValueError` if these are not as many as there are batch axes, or there is no
+        such dimension.
+        """
+        import xarray as xr  # slow to load
+
+        batch = batch_names(dims, self.exponents.ndim - 1)
+        each = *batch, "exponent"
+        variables = present({"exponents": self.exponents, "per_cycle": self.per_cycle}, each)
+        variables |= states("state", self.state, batch)
+        alone = {"spread": self.spread, "result": in_names(self.result, RESULTS, REASON_NAMES)}
+        data = xr.Dataset(variables | present(alone, batch))
+        for name in ("exponents", "spread"):
+            data[name].attrs |= attributes(self.unit)
+        return tidy(data, along)
+
+    def told(self) -> str:
+        """The exponents; of a batch the range of the greatest."""
+        if self.exponents.ndim > 1:
+            lanes, good = self.spread.shape, int(jnp.sum(self.successful))
+            greatest = number_in_words(self.exponents[..., 0].ravel(), self.unit)
+            return f"Lyapunov exponents of lanes {lanes}, {good} successful; greatest: {greatest}"
         numbers = ", ".join(f"{x:.9g}" for x in self.exponents)
         ended = "" if bool(self.successful) else f"; ended: {RESULTS[self.result]}"
-        return f"Lyapunov exponents {numbers} ω (halves differ by {self.spread:.1g}){ended}"
+        numbers = with_unit(numbers, self.unit)
+        return f"Lyapunov exponents {numbers} (halves differ by {self.spread:.1g}){ended}"
 
 
 def lyapunov(
@@ -79,19 +115,23 @@ def lyapunov(
 
     **Returns:** a `Lyapunov`.
 
-    **Raises:** as `simulate`.
+    **Raises:** as `simulate`; `ValueError` for a machine with both a `section` and a `renewed`.
     """
     cycles = count("cycles", cycles, least=8)
-    if isinstance(scene, Scene):
-        start = scene.by_phase(start)
     if scene.section(start) is not None:
+        if renews(scene):
+            raise ValueError(
+                "Argument `scene` must not have both a `section` and a `renewed`, as a "
+                f"{type(scene).__name__} has: at equal intervals it would be renewed there. The "
+                "exponents of its periodic motions are ln|multiplier|/duration of an `Orbit`."
+            )
         # On its section the exponent 0 along the motion could not be seen.
         scene = scene.observed_every(scene.cycle)
     method = chosen(scene, method)
     carried = cycle_map(scene, method=method)
     if rests is not None:
         carried = dataclasses.replace(carried, rests=flag("rests", rests))
-    start = adopted(carried.scene, start)
+    start = adopted(carried.scene, start, "start")
     states = ravel_pytree(start)[0].size
     number = states if number is None else count("number", number, least=1)
     if number > states:
@@ -147,6 +187,7 @@ def _lyapunov(the_map: CycleMap, start, cycles: int, settle, number: int) -> Lya
         spread=jnp.where(halves[0] == halves[1], 0.0, jnp.abs(halves[0] - halves[1])),
         state=unravel(x),
         result=result,
+        unit=unit_of(scene.units, "rate"),
     )
 
 

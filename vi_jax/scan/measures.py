@@ -1,8 +1,8 @@
 """Measures: what a scan keeps of each motion."""
 
 import abc
-import difflib
-from collections.abc import Callable, Iterable, Mapping
+import dataclasses
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -15,7 +15,7 @@ from ..flow import AbstractMethod, Run
 from ..scene import AbstractScene
 from ..scene.numbers import by_name
 from .lyapunov import lyapunov
-from .regime import REGIMES, flags, impacts_of, least_period
+from .regime import CODES, REGIMES, flags, impacts_of, least_period
 
 Numbers = dict[str, Array]
 About = Mapping[str, Mapping[str, Any]]
@@ -30,16 +30,25 @@ class AbstractMeasure(eqx.Module):
 
     attributes: ClassVar[About] = {}
     """Attributes of the variables by name, such as `units` and `long_name`; `dims` names the axes
-    of one that is an array."""
+    of one that is an array, and `unit_of` a quantity in whose unit a variable is, which the machine
+    states (see `AbstractScene.units`)."""
 
     record: ClassVar[str] = "motion"
     """What it must see of them, as in `simulate`: `"motion"`, or only `"sections"` and the numbers
     of impacts and steps."""
 
+    def described(self, start: Any) -> About:
+        """The same for states like `start`."""
+        return self.attributes
+
     @property
     def cycles(self) -> int:
         """The fewest cycles that it must see."""
         return 1
+
+    def under(self, method: AbstractMethod) -> "AbstractMeasure":
+        """This measure for motions that are carried by a method; itself, if it is no matter how."""
+        return self
 
     @abc.abstractmethod
     def __call__(self, scene: AbstractScene, run: Run) -> Numbers:
@@ -72,9 +81,9 @@ class Extremes(AbstractMeasure):
     """`y_min`, `y_max` and the greatest impact speed `impact_speed` over the cycles observed."""
 
     attributes: ClassVar[About] = {
-        "y_min": {"units": "a", "long_name": "smallest Y"},
-        "y_max": {"units": "a", "long_name": "greatest Y"},
-        "impact_speed": {"units": "a ω", "long_name": "greatest V⁻"},
+        "y_min": {"unit_of": "position", "long_name": "smallest position"},
+        "y_max": {"unit_of": "position", "long_name": "greatest position"},
+        "impact_speed": {"unit_of": "velocity", "long_name": "greatest V⁻"},
     }
 
     def __call__(self, scene, run):
@@ -91,7 +100,7 @@ class FrequencyRatio(AbstractMeasure):
     """`frequency_ratio`, the mean crank speed over the cycles observed."""
 
     attributes: ClassVar[About] = {
-        "frequency_ratio": {"units": "ω", "long_name": "mean crank speed ζ"}
+        "frequency_ratio": {"unit_of": "frequency_ratio", "long_name": "mean speed of the drive"}
     }
 
     def __call__(self, scene, run):
@@ -106,9 +115,7 @@ class FrequencyRatio(AbstractMeasure):
 class Power(AbstractMeasure):
     """`power`, the mean rate at which impacts take up energy."""
 
-    attributes: ClassVar[About] = {
-        "power": {"units": "m_C a² ω³", "long_name": "mean impact power"}
-    }
+    attributes: ClassVar[About] = {"power": {"unit_of": "power", "long_name": "mean impact power"}}
 
     def __call__(self, scene, run):
         """Of one lane."""
@@ -121,14 +128,16 @@ class Sections(AbstractMeasure):
 
     number: int = eqx.field(static=True, default=16)
     record = "sections"
-    attributes: ClassVar[About] = {
-        "Y": {"units": "a", "long_name": "Y on the section", "dims": ("cycle",)},
-        "V": {"units": "a ω", "long_name": "V on the section", "dims": ("cycle",)},
-        "W": {"units": "ω", "long_name": "crank speed on the section", "dims": ("cycle",)},
-    }
 
     def __check_init__(self):
         count("number", self.number, least=1)
+
+    def described(self, start):
+        """Each component of the state."""
+        return {
+            name: {"unit_of": name, "long_name": f"{name} on the section", "dims": ("cycle",)}
+            for name in by_name(start)
+        }
 
     @property
     def cycles(self):
@@ -173,7 +182,7 @@ class Exponent(AbstractMeasure):
     observed: int = eqx.field(static=True, default=128)
     record = "sections"
     attributes: ClassVar[About] = {
-        "exponent": {"units": "ω", "long_name": "greatest Lyapunov exponent"}
+        "exponent": {"unit_of": "rate", "long_name": "greatest Lyapunov exponent"}
     }
 
     def __check_init__(self):
@@ -198,13 +207,15 @@ class Exponent(AbstractMeasure):
 class Regime(AbstractMeasure):
     """`period` in drive cycles and `impacts` in a period; motions without a period by kind.
 
-    A motion has the least period p ≤ `longest` after which its sections repeat within
-    `tolerance` (relative to 1 + |state|; see `least_period` for one that still spirals in). One
-    that does not repeat is looked at for another `observed` cycles. Unless its greatest Lyapunov
-    exponent exceeds `threshold` (unit: ω) there, it is unsettled or quasi-periodic. If it does, the
-    motion is continued for `lasting` cycles and observed once more: it is chaotic if its exponent
-    exceeds `threshold` again, else transiently chaotic: it has settled on something else
-    meanwhile, or is about to. `REGIMES` has the numbers that stand for these in `period`.
+    A motion has the least period p ≤ `longest` after which its sections repeat within `tolerance`
+    (relative to 1 + |state|; by default 1e-6, or ten tolerances of a method that sizes its steps by
+    one) and as many impacts come in each cycle; see `least_period` for one that still spirals in.
+    One that does not repeat is looked at for another `observed` cycles. Unless its greatest
+    Lyapunov exponent exceeds `threshold` there (in the machine's own unit of rates), it is
+    unsettled or quasi-periodic. If it does, the motion is continued for `lasting` cycles and
+    observed once more: it is chaotic if its exponent exceeds `threshold` again, else transiently
+    chaotic: it has settled on something else meanwhile, or is about to. `REGIMES` has the numbers
+    that stand for these in `period`.
 
     While a chaotic transient lasts, nothing tells it from chaos; what is called chaotic may leave
     off later still. The longer `lasting`, the fewer do, and the more the chaotic lanes cost; 0
@@ -213,15 +224,17 @@ class Regime(AbstractMeasure):
 
     longest: int = eqx.field(static=True, default=64)
     observed: int = eqx.field(static=True, default=256)
-    tolerance: float = eqx.field(default=1e-6)
+    tolerance: float | None = eqx.field(default=None)
     threshold: float = eqx.field(default=2e-3)
     lasting: int = eqx.field(static=True, default=4000)
+    wander: Any = eqx.field(default=0.0, kw_only=True)
+    """What sections wander by under the method; a scan puts its own method's here."""
     record = "sections"
     attributes: ClassVar[About] = {
         "period": {
             "units": "cycles",
             "long_name": "least period",
-            **flags({regime.name: int(regime) for regime in sorted(REGIMES)}),
+            **flags(CODES),
         },
         "impacts": {
             "units": "1",
@@ -232,9 +245,14 @@ class Regime(AbstractMeasure):
     def __check_init__(self):
         count("longest", self.longest, least=1)
         count("observed", self.observed, least=8)
-        require("tolerance", self.tolerance, low=0.0, open_low=True)
+        if self.tolerance is not None:
+            require("tolerance", self.tolerance, low=0.0, open_low=True)
         require("threshold", self.threshold)
         count("lasting", self.lasting)
+
+    def under(self, method):
+        """With what sections wander by under it."""
+        return dataclasses.replace(self, wander=method.wander)
 
     @property
     def cycles(self):
@@ -249,7 +267,10 @@ class Regime(AbstractMeasure):
     def __call__(self, scene, run):
         """Of one lane; chaos is not yet looked for."""
         sections = {name: x[1:] for name, x in by_name(run.sections).items()}
-        period = least_period(sections, longest=self.longest, tolerance=self.tolerance)
+        period = least_period(
+            sections, run.impacts, longest=self.longest, tolerance=self.tolerance,
+            wander=self.wander,
+        )  # fmt: skip
         return {
             "period": jnp.where(run.successful, period, REGIMES.failed).astype(jnp.int16),
             "impacts": impacts_of(run.impacts.astype(_dtype(run)), period),
@@ -273,71 +294,3 @@ class Regime(AbstractMeasure):
         return {
             "period": jnp.where(chaotic, REGIMES.chaotic, otherwise).astype(found["period"].dtype)
         }
-
-
-class Custom(AbstractMeasure):
-    """A user's own function of one lane's scene and run."""
-
-    function: Callable[..., Any] = eqx.field(static=True)
-
-    def __call__(self, scene, run):
-        """Of one lane."""
-        found = self.function(scene, run)
-        if not isinstance(found, Mapping):
-            raise TypeError(
-                "A function in argument `measure` must return a mapping of names to numbers, but "
-                f"returned {type(found).__name__}."
-            )
-        numbers = {}
-        for name, value in found.items():
-            try:
-                numbers[name] = jnp.asarray(value)
-            except (TypeError, ValueError):
-                raise TypeError(
-                    "A function in argument `measure` must return numbers, but its "
-                    f"{name!r} is {value!r}."
-                ) from None
-        return numbers
-
-
-MEASURES: Mapping[str, Callable[[], AbstractMeasure]] = {
-    "extremes": Extremes,
-    "regime": Regime,
-    "frequency_ratio": FrequencyRatio,
-    "power": Power,
-    "impact_rate": ImpactRate,
-    "sections": Sections,
-    "exponent": Exponent,
-    "steps": Steps,
-}
-
-
-def measures_of(measure: Any) -> tuple[AbstractMeasure, ...]:
-    """Measures by name, as objects, or functions of a scene and a run; one or several.
-
-    **Raises:** `ValueError` for an unknown name, `TypeError` for anything else.
-    """
-    if isinstance(measure, str | AbstractMeasure) or callable(measure):
-        measure = (measure,)
-    if not isinstance(measure, Iterable):
-        raise TypeError(f"Argument `measure` must be a name or a function, but got {measure!r}.")
-    found = tuple(_measure(one) for one in measure)
-    if not found:
-        raise ValueError("Argument `measure` must name at least one measure, but is empty.")
-    return found
-
-
-def _measure(one: Any) -> AbstractMeasure:
-    if isinstance(one, AbstractMeasure):
-        return one
-    if isinstance(one, str):
-        if one in MEASURES:
-            return MEASURES[one]()
-        near = difflib.get_close_matches(one, MEASURES, n=2, cutoff=0.4) or list(MEASURES)
-        raise ValueError(
-            f"Argument `measure` must name a measure, but got {one!r}; near names: "
-            f"{', '.join(near)}."
-        )
-    if callable(one):
-        return Custom(one)
-    raise TypeError(f"Argument `measure` must be a name or a function, but got {one!r}.")

@@ -7,18 +7,27 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array, Float, Int
 
-_SLACK = 100.0
+Number = Float[Array, ""] | float
+
+# How far sections a period apart may differ; so many times that, if a longer period fits within it;
+# and so many times what the longer one differs by.
+_TOLERANCE, _SLACK, _WORSE = 1e-6, 100.0, 1e4
+
+# The least that sections are held to: so many times what they wander by, and so many roundings.
+_WANDERS, _ROUNDINGS = 10.0, 64.0
 
 
 class REGIMES(IntEnum):
-    """What stands in `period` for a motion that has none: numbers that are no periods."""
+    """What stands in `period` for a motion that has none, and in the `label` of basins for a start
+    that ends on none: numbers below zero, which are no periods and no motions."""
 
-    unsettled = 0, "unsettled"
     chaotic = -1, "chaotic"
-    failed = -2, "failed"
-    transient = -3, "transiently chaotic"
+    unsettled = -2, "unsettled"
+    failed = -3, "failed"
+    transient = -4, "transiently chaotic"
 
     meaning: str
 
@@ -29,13 +38,8 @@ class REGIMES(IntEnum):
         return self
 
 
-LABELS = {
-    regime: -1 - place
-    for place, regime in enumerate(
-        (REGIMES.chaotic, REGIMES.unsettled, REGIMES.failed, REGIMES.transient)
-    )
-}
-"""The same as labels of basins, where 0 is a motion."""
+CODES = {regime.name: int(regime) for regime in sorted(REGIMES)}
+"""The numbers of the regimes by name, the least first."""
 
 
 def flags(codes: Mapping[str, int]) -> dict[str, Any]:
@@ -43,34 +47,62 @@ def flags(codes: Mapping[str, int]) -> dict[str, Any]:
     return {"flag_values": list(codes.values()), "flag_meanings": " ".join(codes)}
 
 
+def periods_of(period: Any) -> np.ndarray:
+    """Periods in a data set, with the numbers of `REGIMES` for what has none: in a store of an
+    earlier release others may stand for them, as its attributes say."""
+    found = np.asarray(period).astype(int)
+    meanings = str(period.attrs.get("flag_meanings", "")).split()
+    values = np.atleast_1d(period.attrs.get("flag_values", ()))
+    stated = dict(zip(meanings, values.tolist(), strict=False))
+    places = [(found == stated[name], code) for name, code in CODES.items() if name in stated]
+    for place, code in places:
+        found[place] = code
+    return found
+
+
 def least_period(
-    sections: Any, *, longest: int, tolerance: Float[Array, ""] | float = 1e-6
+    sections: Any,
+    impacts: Int[Array, " cycles"],
+    *,
+    longest: int,
+    tolerance: Number | None = None,
+    wander: Number = 0.0,
 ) -> Int[Array, ""]:
-    """The fewest drive cycles after which a motion repeats, or 0 if it does not.
+    """The fewest drive cycles after which a motion repeats, its impacts too, or
+    `REGIMES.unsettled`.
 
     A motion that still spirals in may repeat better after several turns of the spiral than after
     its period. So it counts as settled if some period fits within the tolerance, and of the
-    periods that fit within a hundred times the tolerance the least is taken.
+    periods that fit within a hundred times the tolerance the least is taken; but none that fits ten
+    thousand times worse than another, for no spiral does so. A period fits only if as many impacts
+    come in each cycle: beside a grazing these tell apart what sections hardly do.
 
     **Arguments:** section states one after the other, a pytree with leaves (cycles,), more than
-    `longest` of them; the longest period looked for; how far sections a period apart may differ
-    (relative to 1 + |state|).
+    `longest` of them; the impacts of the cycle that ends at each; the longest period looked for;
+    how far sections a period apart may differ (relative to 1 + |state|), by default 1e-6 or, if
+    that is more, ten times what they wander by; what the sections of a motion that repeats wander
+    by under its method (`AbstractMethod.wander`).
     """
     states = jnp.stack(jtu.tree_leaves(sections))
+    if tolerance is None:
+        tolerance = jnp.maximum(_TOLERANCE, _WANDERS * jnp.asarray(wander, states.dtype))
+    rows = jnp.concatenate([states, impacts[None].astype(states.dtype)])
     size = states.shape[1] - longest
-    last = states[:, longest:]
-    scale = 1 + jnp.abs(last)
+    last = rows[:, longest:]
+    scale = 1 + jnp.abs(last[:-1])
 
-    def compared(carry, p):
-        period, least = carry
-        before = jax.lax.dynamic_slice_in_dim(states, longest - p, size, axis=1)
-        apart = jnp.max(jnp.abs(last - before) / scale)
-        return (jnp.where(apart <= _SLACK * tolerance, p, period), jnp.minimum(apart, least)), None
+    def compared(_, p):
+        before = jax.lax.dynamic_slice_in_dim(rows, longest - p, size, axis=1)
+        apart = jnp.abs(last - before)
+        return _, jnp.where(jnp.any(apart[-1] > 0), jnp.inf, jnp.max(apart[:-1] / scale))
 
-    periods = jnp.arange(longest, 0, -1, dtype=jnp.int32)
-    begin = jnp.zeros((), jnp.int32), jnp.full((), jnp.inf, states.dtype)
-    (period, least), _ = jax.lax.scan(compared, begin, periods)
-    return jnp.where(least <= tolerance, period, 0)
+    periods = jnp.arange(1, longest + 1, dtype=jnp.int32)
+    _, apart = jax.lax.scan(compared, None, periods)
+    least = jnp.min(apart)
+    noise = jnp.maximum(wander, _ROUNDINGS * float(jnp.finfo(states.dtype).eps))
+    most = jnp.minimum(_SLACK * tolerance, _WORSE * jnp.maximum(least, noise))
+    period = jnp.min(jnp.where(apart <= most, periods, longest))
+    return jnp.where(least <= tolerance, period, REGIMES.unsettled)
 
 
 def impacts_of(impacts: Float[Array, " cycles"], period: Int[Array, ""]) -> Float[Array, ""]:

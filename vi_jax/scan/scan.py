@@ -16,15 +16,26 @@ import numpy as np
 from tqdm import tqdm
 
 from .._checks import count, fits_memory, fits_records, flag, instance_of
+from .._interrupted import Interrupted
 from .._lazy import lazy
 from ..flow import AbstractMethod
 from ..flow.methods import MethodLike, preset
 from ..flow.results import REASON_NAMES
 from ..scene import AbstractScene
+from ..scene.units import attributes as units_of
+from ..scene.units import unit_of
 from ._describe import attributes_of, description_of
-from ._work import block_size, rounded, run_here, run_on_cluster, size_of, worker_count
+from ._work import (
+    ClusterLost,
+    block_size,
+    rounded,
+    run_here,
+    run_on_cluster,
+    size_of,
+    worker_count,
+)
 from .grid import Blocks, axes_of
-from .job import Job, check_corners, make_job
+from .job import START, Job, check_corners, make_job
 from .regime import flags
 from .store import (
     NOT_COMPUTED,
@@ -41,17 +52,15 @@ if TYPE_CHECKING:
 else:
     xr = lazy("xarray")
 
-_UNITS = {"Y": "a", "V": "a ω", "W": "ω", "phase": "rad", "frequency_ratio": "ω", "gap": "a"}
 
-
-class ScanInterrupted(KeyboardInterrupt):
-    """Raised when a scan is interrupted: what was computed is not lost."""
+class ScanInterrupted(Interrupted):
+    """Raised when a scan is interrupted: what was computed is not lost, but in `data`."""
 
     def __init__(self, data: "xr.Dataset", store: str | Path | None):
         kept = "what was computed is in `.data`"
         if store is not None:
             kept = f"what was computed is in {store}, and the same call goes on from there"
-        super().__init__(f"the scan was interrupted; {kept}")
+        super().__init__("scan", data, kept)
         self.data = data
 
 
@@ -112,7 +121,8 @@ def scan(
     - `lanes`: lanes in a block (a multiple of 256); memory grows with it and with `cycles`.
     - `workers`: blocks at work at the same time on a CPU, by default as many as it has cores.
     - `devices`: local devices over which a block is spread; all by default.
-    - `cluster`: a `dask.distributed.Client`, to compute the blocks there instead of here.
+    - `cluster`: a `dask.distributed.Client`, to compute the blocks there instead of here. If its
+      scheduler is lost, a `ConnectionError` says what is kept and how to go on.
     - `progress`: show a bar with rate and time left (in a terminal or notebook).
 
     **Returns:** an `xarray.Dataset` over the axes, with units; `result` says of each lane how it
@@ -173,11 +183,12 @@ def scan(
         else:
             data = open_dataset(kept.path)
         for name in grid:
-            data[name].attrs["units"] = _UNITS.get(name.split(".")[-1], "1")
+            data[name].attrs |= units_of(_unit_on_axis(job, blocks, name))
         data.attrs = attributes
         return data
 
     open_blocks = kept.open_blocks()
+    _ = xr.Dataset  # loaded now: after an interrupt nobody waits for that
     try:
         with tqdm(
             total=total,
@@ -196,6 +207,8 @@ def scan(
                 bar.update(size_of(where))
     except KeyboardInterrupt:
         raise ScanInterrupted(collected(), store) from None
+    except ClusterLost as lost:
+        raise ConnectionError(_how_to_go_on(kept)) from lost
     data = collected()
     if verify:
         again = functools.partial(
@@ -203,9 +216,25 @@ def scan(
             method=_better(job), clock=clock, paired=True, max_impacts=max_impacts,
             max_steps=max_steps, workers=workers, devices=devices, cluster=cluster, progress=False,
         )  # fmt: skip
-        data.attrs |= _verified(data, blocks, min(verify, total), again)
+        try:
+            data.attrs |= _verified(data, blocks, min(verify, total), again)
+        except KeyboardInterrupt:
+            raise ScanInterrupted(data, store) from None
     _tell_failures(data)
     return data
+
+
+def _how_to_go_on(kept: MemoryStore | ZarrStore) -> str:
+    """What is left of a scan whose cluster is lost."""
+    how = "Nothing is kept: give the scan a `store`, from which the same call goes on."
+    if isinstance(kept, ZarrStore):
+        number = len(kept.blocks)
+        done = number - len(kept.open_blocks())
+        how = (
+            f"{done:,} of {number:,} blocks are computed and kept in {kept.path}: the same call "
+            "goes on from there, with a new client or without `cluster`."
+        )
+    return f"The scheduler of the Dask cluster was lost. {how}"
 
 
 def _better(job: Job) -> AbstractMethod:
@@ -252,13 +281,16 @@ def variables_of(job: Job, blocks: Blocks) -> dict[str, Variable]:
             **flags({"not_computed": NOT_COMPUTED} | {n: i for i, n in enumerate(REASON_NAMES)}),
         }
     }
+    scene, start = job.first(blocks)
     for measure in job.measures:
-        known |= measure.attributes
+        known |= measure.described(start)
     found = {}
     for name, shape in shapes.items():
         by = name.startswith("d_") and name not in known and bool(job.derivatives)
         about = dict(known.get(name.removeprefix("d_") if by else name, {}))
         dims = tuple(about.pop("dims", ()))
+        if "unit_of" in about:
+            about |= units_of(unit_of(scene.units, about.pop("unit_of")))
         if by:
             dims = ("by", *dims)
             about = {
@@ -275,6 +307,13 @@ def variables_of(job: Job, blocks: Blocks) -> dict[str, Variable]:
             )
         found[name] = Variable(dims, tuple(sizes), np.dtype(shape.dtype), about)
     return found
+
+
+def _unit_on_axis(job: Job, blocks: Blocks, name: str) -> str:
+    """What a function that makes the scene takes is in units of its own."""
+    if job.build is not None and not name.startswith(START):
+        return ""
+    return unit_of(job.first(blocks)[0].units, name)
 
 
 def _tell_failures(data: "xr.Dataset") -> None:

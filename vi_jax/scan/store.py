@@ -26,8 +26,13 @@ NOT_COMPUTED = -1
 
 UNVERIFIABLE = "it cannot be looked at: "
 
-# Where the check sums lie: a row for each block, a column for each variable. They are written last.
-_SUMS = "check/sums"
+# What lies in the store, not what it was made with: a file may have been lost since.
+_AS_IT_IS: dict[str, Any] = {"use_consolidated": False}
+
+# Where the check sums lie: a row for each block, a column for each variable. They are written last,
+# and are in a group of their own, so that they are no variable of the data set.
+_CHECK = "check"
+_SUMS = f"{_CHECK}/sums"
 
 
 class Variable(NamedTuple):
@@ -91,7 +96,7 @@ class ZarrStore:
                 )
             _make(self.path, description, blocks, variables)
         try:
-            self.group = zarr.open_group(str(self.path), mode="r+", zarr_format=3)
+            self.group = zarr.open_group(str(self.path), mode="r+", zarr_format=3, **_AS_IT_IS)
         except Exception as error:
             raise ValueError(
                 f"Argument `store` must be the store of a scan, but {self.path / 'zarr.json'} "
@@ -112,6 +117,11 @@ class ZarrStore:
             if not isinstance(there, np.ndarray) or not np.array_equal(there, x):
                 self.lost.append(name)
                 _add_axis(self.group, name, x, self.blocks)
+        if not isinstance(_tried(lambda: self.group[_CHECK]), zarr.Group):
+            # Only its head is made again: the sums below it may be whole.
+            self.lost.append(f"{_CHECK}/zarr.json")
+            (self.path / _CHECK / "zarr.json").unlink(missing_ok=True)
+            self.group.require_group(_CHECK)
         shape = (len(self.blocks), len(self.names))
         if getattr(_tried(lambda: self.group[_SUMS]), "shape", None) != shape:
             self.lost.append(_SUMS)
@@ -190,6 +200,10 @@ def _make(
         for name, v in variables.items():
             _add_variable(group, name, v, blocks)
         _add_sums(group, (len(blocks), len(variables)))
+        with warnings.catch_warnings():
+            # By it others open the store at once, and without a warning that it is not there.
+            warnings.filterwarnings("ignore", "Consolidated metadata")
+            zarr.consolidate_metadata(str(made), zarr_format=3)
         try:
             made.rename(path)
         except OSError:
@@ -218,7 +232,6 @@ def _add_variable(group: Any, name: str, v: Variable, blocks: Blocks) -> None:
 
 
 def _add_sums(group: Any, shape: tuple[int, int]) -> None:
-    # In a group of its own, so that it is no variable of the data set.
     group.create_array(
         _SUMS, shape=shape, chunks=(1, shape[1]), dtype="uint32", fill_value=0, overwrite=True
     )

@@ -1,5 +1,6 @@
 """`sweep`: a parameter changed little by little, the motion carried from value to value."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -7,59 +8,102 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
-from .._checks import concrete, count, fits_records, instance_of, number, require
-from .._programs import compiled
+from .._checks import count, fits_records, require
+from .._interrupted import Interrupted
+from .._numbers import concrete, number
+from .._programs import compiled, is_outermost
 from ..flow import RESULTS, simulate
-from ..flow.arguments import check_start
+from ..flow.arguments import check_reals, check_start, machine_of, refuse_arrays
+from ..flow.labelled import batch_names, in_names, present, states, tidy
 from ..flow.methods import MethodLike, chosen
+from ..flow.results import REASON_NAMES
 from ..orbit.results import impacts_in_words
-from ..scene import LABELS, AbstractScene
+from ..scene import AbstractScene
 from ..scene.numbers import check_again, check_leaf, with_leaf
-from .regime import REGIMES, impacts_of, least_period
+from ..scene.shown import Told
+from ..scene.units import PLAIN, Stated, name_in, stated, unit_of, with_unit, with_units
+from .regime import CODES, REGIMES, flags, impacts_of, least_period
 
 # A jump is so many times the change at the values beside it, and this part of 1 + |number|.
 _JUMP, _NOTED = 3.0, 0.01
 
+# Values of one call: few, so that an interrupt loses little, but more than a call costs.
+_AT_ONCE = 16
 
-class Sweep(eqx.Module):
-    """What a sweep settled on at each value, in their order. Under `vmap` batch axes come first."""
+
+class Sweep(Told):
+    """What a sweep settled on at each value, in their order, in the machine's units (see
+    `AbstractScene.units`). Under `vmap` batch axes come first."""
 
     parameter: str = eqx.field(static=True)
     """Name of the number that was changed."""
     values: Float[Array, "..."]
     """Its values."""
     y_min: Float[Array, "..."]
-    """Smallest Y over the cycles observed (unit: a)."""
+    """Smallest position (of the first coordinate) over the cycles observed."""
     y_max: Float[Array, "..."]
-    """Largest Y over the cycles observed (unit: a)."""
+    """Largest position over the cycles observed."""
     period: Int[Array, "..."]
     """Period in drive cycles, or `REGIMES.unsettled` if none was found, or `REGIMES.failed`."""
     impacts: Float[Array, "..."]
     """Impacts in a period; in a cycle, on average, where there is no period."""
     frequency_ratio: Float[Array, "..."] | None
-    """ζ: mean crank speed (unit: ω); `None` for scenes that are not driven."""
+    """ζ: mean speed of the drive; `None` for scenes that are not driven."""
     impact_speed: Float[Array, "..."]
-    """Greatest V⁻ over the cycles observed (unit: a ω)."""
+    """Greatest V⁻ over the cycles observed."""
     sections: Any
     """Section states of the cycles observed; leaves (values, cycles)."""
     result: RESULTS
     """Whether each value was simulated to its end."""
-    labels: tuple[str, str] = eqx.field(static=True, default=LABELS)
+    labels: tuple[str, str] = eqx.field(static=True, default=PLAIN)
     """What pictures write beside position and velocity, in the scene's words."""
     periods: tuple[str, ...] = eqx.field(static=True, default=())
     """Names of the periods of 1, 2, ... cycles, in the scene's words."""
+    units: Stated = eqx.field(static=True, default=())
+    """In which units its quantities are, as the machine states it."""
 
     @property
     def successful(self) -> Bool[Array, "..."]:
         """Whether each value was simulated to its end."""
         return self.result == RESULTS.successful
 
-    def __str__(self) -> str:
-        if isinstance(self.values, Tracer) or self.values.ndim != 1:
-            return repr(self)
+    def to_xarray(self, dims: Sequence[str] | None = None, *, along: str | None = None) -> Any:
+        """This sweep, or a batch of them, as an `xarray.Dataset` over its values.
+
+        The values are the coordinate that has the parameter's name, section states a variable for
+        each component (`section_Y`), and `result` is the reason's name. Not to be traced.
+
+        **Arguments:** names of the batch axes, by default `lane`; `along`, to keep only what is
+        told along one dimension: `"value"`, or `"cycle"` (the sections).
+
+        **Raises:** `ValueError` if these are not as many as there are batch axes, or there is no
+        such dimension.
+        """
+        import xarray as xr  # slow to load
+
+        each = (*batch_names(dims, self.values.ndim - 1), "value")
+        names = ("y_min", "y_max", "period", "impacts", "frequency_ratio", "impact_speed")
+        variables = present({name: getattr(self, name) for name in names}, each)
+        variables |= states("section", self.sections, (*each, "cycle"))
+        variables["result"] = each, in_names(self.result, RESULTS, REASON_NAMES)
+        data = xr.Dataset(variables, {self.parameter: (each, np.asarray(self.values))})
+        data["period"].attrs |= flags(CODES)
+        return tidy(with_units(data, dict(self.units), {self.parameter: self.parameter}), along)
+
+    def drawn(self) -> Any:
+        """The smallest position at each value."""
+        return self.y_min if self.values.ndim == 1 else None
+
+    def told(self) -> str:
+        """The motions in the order of the values, and where one gives way to another."""
+        if self.values.ndim != 1:
+            good = int(jnp.sum(self.successful))
+            return (
+                f"Sweeps of {self.parameter}, shape {self.values.shape} with the values last; "
+                f"{good} of {self.values.size} successful"
+            )
         values, lines = np.asarray(self.values), []
         kinds, jumps = self._kinds(), self._jumps()
         for i, value in enumerate(values):
@@ -92,10 +136,15 @@ class Sweep(eqx.Module):
 
         Not looked for within motions without a period, whose extremes differ by chance.
         """
-        numbers = {"min Y": self.y_min, "max Y": self.y_max, "ζ": self.frequency_ratio}
+        name, units = name_in(self.labels[0]), dict(self.units)
+        numbers = {
+            f"min {name}": (self.y_min, unit_of(units, "position")),
+            f"max {name}": (self.y_max, unit_of(units, "position")),
+            "ζ": (self.frequency_ratio, unit_of(units, "frequency_ratio")),
+        }
         period = np.asarray(self.period)
         found: list[list[str]] = [[] for _ in period]
-        for name, x in numbers.items():
+        for name, (x, unit) in numbers.items():
             if x is None:
                 continue
             x = np.asarray(x)
@@ -106,7 +155,7 @@ class Sweep(eqx.Module):
             far = (steps > _JUMP * usual) & (steps > _NOTED * scale)
             far &= (period[1:] > 0) | (period[:-1] > 0)
             for i in np.flatnonzero(far) + 1:
-                found[i].append(f"{name} {x[i - 1]:.6g} → {x[i]:.6g}")
+                found[i].append(with_unit(f"{name} {x[i - 1]:.6g} → {x[i]:.6g}", unit))
         return found
 
 
@@ -120,7 +169,7 @@ def sweep(
     cycles: int = 32,
     method: MethodLike = None,
     clock: str | None = None,
-    tolerance: float = 1e-6,
+    tolerance: float | None = None,
     max_steps: int | None = None,
 ) -> Sweep:
     """Quasi-static sweep: run-up with rising values, close-down with falling ones.
@@ -137,14 +186,15 @@ def sweep(
     - `start`: state at the first value; by default at rest (a motor at its no-load speed).
     - `settle`, `cycles`: drive cycles at each value before observing, and observed; static.
     - `method`, `clock`: as for `simulate`; by default the `"standard"` preset.
-    - `tolerance`: how closely sections must repeat for a period.
+    - `tolerance`: how closely sections must repeat for a period, as in `Regime`.
     - `max_steps`: steps at each value beyond which it counts as failed.
 
     **Returns:** a `Sweep`. A value that fails is NaN, and the next goes on from the one before it.
 
-    **Raises:** `ValueError` or `TypeError` for an unknown name or values that are no numbers.
+    **Raises:** `ValueError` or `TypeError` for an unknown name or values that are no numbers; on
+    Ctrl-C `Interrupted`, whose `partial` is the sweep so far.
     """
-    instance_of("scene", scene, AbstractScene, "a `Scene` or an `AbstractScene`")
+    scene = machine_of(scene)
     check_leaf(scene, parameter)
     settle, cycles = count("settle", settle), count("cycles", cycles, least=2)
     values = number("values", values).astype(jnp.result_type(float))
@@ -152,7 +202,8 @@ def sweep(
     if max_steps is not None:
         max_steps = count("max_steps", max_steps, least=1)
     fits_records("cycles", values.size * cycles, 4)
-    require("tolerance", tolerance, low=0.0, open_low=True)
+    if tolerance is not None:
+        require("tolerance", tolerance, low=0.0, open_low=True)
     if values.ndim != 1 or not values.size or not _finite(numbers):
         infinite = values.ndim == 1 and values.size
         raise ValueError(
@@ -171,12 +222,38 @@ def sweep(
     if clock is not None:
         scene = scene.in_clock(clock)
     start = scene.adopt(start)
+    refuse_arrays("start", "sweep", start)
+    check_reals("start", start)
     start = jtu.tree_map(lambda x: jnp.asarray(x, values.dtype), start)
     if numbers is not None:
         check_start(with_leaf(scene, parameter, numbers[0]), start)
-    return _sweep(
-        scene, parameter, values, start, settle, cycles, method, rests, tolerance, max_steps
-    )
+    options = (settle, cycles, method, rests, tolerance, max_steps)
+    if not is_outermost(scene, values, start, tolerance):
+        return _sweep(scene, parameter, values, start, *options)[1]
+    return _in_parts(scene, parameter, values, start, *options)
+
+
+def _in_parts(scene, parameter, values, start, *options) -> Sweep:
+    """Some values at a time, all by one program, so that an interrupt loses few of them."""
+    if values.size <= _AT_ONCE:
+        return _sweep(scene, parameter, values, start, *options)[1]
+    missing = -values.size % _AT_ONCE  # filled up by what ends at once
+    rows = np.append(np.asarray(values), np.full(missing, np.nan)).reshape(-1, _AT_ONCE)
+    parts: list[Sweep] = []
+    try:
+        for row in rows:
+            start, part = _sweep(scene, parameter, jnp.asarray(row), start, *options)
+            parts.append(jax.block_until_ready(part))
+    except KeyboardInterrupt:
+        if not parts:
+            raise
+        raise Interrupted("sweep", _row(parts, values.size)) from None
+    return _row(parts, values.size)
+
+
+def _row(parts: list[Sweep], size: int) -> Sweep:
+    """The first values of all parts, put together by NumPy: hundreds of them would be a program."""
+    return jtu.tree_map(lambda *x: jnp.asarray(np.concatenate(x)[:size]), *parts)
 
 
 def _finite(numbers: np.ndarray | None) -> bool:
@@ -197,7 +274,9 @@ def taken_along(scene: AbstractScene, state: Any) -> Any:
 @compiled
 def _sweep(
     scene, parameter, values, start, settle, cycles, method, rests, tolerance, max_steps
-) -> Sweep:
+) -> tuple[Any, Sweep]:
+    """The state after the last value, and what was found at each."""
+
     def one(state, value):
         here = with_leaf(scene, parameter, value)
         state = taken_along(here, state)
@@ -208,7 +287,9 @@ def _sweep(
         state = jtu.tree_map(lambda a, b: jnp.where(run.successful, a, b), run.last, state)
         assert run.y_min is not None and run.y_max is not None
         assert run.impact_speed is not None and run.duration is not None
-        period = least_period(sections, longest=cycles // 2, tolerance=tolerance)
+        period = least_period(
+            sections, run.impacts, longest=cycles // 2, tolerance=tolerance, wander=method.wander
+        )
         impacts = impacts_of(run.impacts.astype(value.dtype), period)
         return state, Sweep(
             parameter=parameter,
@@ -222,7 +303,8 @@ def _sweep(
             sections=sections,
             result=run.result,
             labels=scene.labels,
+            units=stated(scene),
             periods=tuple(scene.period_of(n) for n in range(1, cycles // 2 + 1)),
         )
 
-    return jax.lax.scan(one, start, values)[1]
+    return jax.lax.scan(one, start, values)

@@ -10,7 +10,6 @@ from .drive import IdealDrive as IdealDrive
 from .drive import Motor as Motor
 from .friction import DryFriction as DryFriction
 from .parameters import Parameters as Parameters
-from .scene import LABELS as LABELS
 from .scene import Oscillator as Oscillator
 from .scene import Scene as Scene
 from .shaft import ShaftScene as ShaftScene

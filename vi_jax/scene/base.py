@@ -1,19 +1,24 @@
 """What `simulate` asks of a scene. A class of your own with these few methods runs like ours."""
 
 import abc
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float
 
 from .._checks import in_range
+from .shown import Shown
 from .stop import RigidStop
 from .switch import AbstractSwitch
+from .units import PLAIN, unit_in
 
 State = Any
-"""A pytree of scalars; the defaults below expect the fields `Y` and `V`."""
+"""A pytree of numbers (or arrays, which not every verb takes); the defaults below expect the fields
+`Y` and `V`."""
 
 
 class Coordinate(NamedTuple):
@@ -28,7 +33,28 @@ class Coordinate(NamedTuple):
     """What an impact acts on, in the machine's unit of mass: of two bodies the reduced mass."""
 
 
-class AbstractScene(eqx.Module):
+def _position(machine: Any, state: State) -> Float[Array, ""]:
+    return state.Y if machine.stops or hasattr(state, "Y") else jtu.tree_leaves(state)[0]
+
+
+def _velocity(machine: Any, state: State) -> Float[Array, ""]:
+    return state.V if machine.has_velocity(state) else jtu.tree_leaves(state)[:2][-1]
+
+
+def _placed(machine: Any, state: State, Y: Float[Array, ""], V: Float[Array, ""]) -> State:
+    if machine.has_velocity(state):
+        return eqx.tree_at(lambda x: (x.Y, x.V), state, (Y, V))
+    leaves, structure = jtu.tree_flatten(state)
+    return jtu.tree_unflatten(structure, [Y, V, *leaves[2:]][-len(leaves) :])
+
+
+# Of a state with the fields `Y` and `V`, or of a machine without stops.
+_DEFAULTS: dict[str, Callable[..., Any]] = {
+    "position": _position, "velocity": _velocity, "placed": _placed,
+}  # fmt: skip
+
+
+class AbstractScene(Shown):
     """A machine: smooth motion between events, observed cycle by cycle.
 
     Its independent variable is called `s`. The machine is driven, and its field periodic in `s`
@@ -37,7 +63,8 @@ class AbstractScene(eqx.Module):
 
     To write a machine of your own, give it `stops`, `cycle` and `field`, and `start` if there is a
     state to begin from where none is given. All else has a default; those below suit a state with
-    the fields `Y` and `V` whose independent variable is time.
+    the fields `Y` and `V` whose independent variable is time. A machine without stops needs
+    neither: extremes are those of the first number of its state then.
 
     | a machine must say | |
     |---|---|
@@ -58,7 +85,7 @@ class AbstractScene(eqx.Module):
     | `step_limit`, `relaxation` | steps that fit time scales shorter than the cycle |
     | `may_rest` | programs without rest on a stop |
     | `mirrored` | branches that name a loss of symmetry |
-    | `labels`, `period_of`, `place_of` | pictures and messages in its own words |
+    | `labels`, `units`, `period_of`, `place_of` | pictures and messages in its own words |
     | `in_range`, `check_start`, `alive` | its own limits, checked before and while it runs |
 
     Ready machines, each written in this way, are in `vi_jax.machines`.
@@ -95,27 +122,44 @@ class AbstractScene(eqx.Module):
             raise ValueError(f"A {name} is driven: its cycle is its drive's.")
         raise ValueError(
             f"A {name} has a `section` but no `observed_every`: give it this method, which returns "
-            "the same machine with `interval` as its cycle and `None` as its section."
+            "the same machine with `interval` as its cycle and `None` as its section (and without "
+            "a `renewed` that belongs to the section)."
         )
 
     @property
     def coordinates(self) -> tuple[Coordinate, ...]:
         """What stops limit; extremes are recorded of the first."""
-        return (Coordinate(self.position, self.velocity, self.placed),)
+        return (Coordinate(*(self._said(name) for name in ("position", "velocity", "placed"))),)
+
+    def _said(self, name: str) -> Callable[..., Any]:
+        """A method of the machine's own; else the default for a state with `Y` and `V`, which does
+        not ask `coordinates` again where these ask their `super()`."""
+        default = getattr(AbstractScene, name)
+        if self._has_coordinates and getattr(type(self), name) is default:
+            return partial(_DEFAULTS[name], self)
+        return getattr(self, name)
 
     def position(self, state: State) -> Float[Array, ""]:
-        """The coordinate that stops limit: by default the first of `coordinates`, or `state.Y`."""
-        return self.coordinates[0].position(state) if self._has_coordinates else state.Y
+        """The coordinate that stops limit: by default the first of `coordinates`, or `state.Y`; of
+        a machine without stops whose state has no `Y` what extremes are of, its first number."""
+        first = self.coordinates[0].position if self._has_coordinates else partial(_position, self)
+        return first(state)
 
     def velocity(self, state: State) -> Float[Array, ""]:
-        """The velocity that an impact reverses; of the sign of d(position)/ds."""
-        return self.coordinates[0].velocity(state) if self._has_coordinates else state.V
+        """The velocity that an impact reverses; of the sign of d(position)/ds. Of a machine without
+        stops whose state has no `V`, what pictures draw over the position: its second number."""
+        first = self.coordinates[0].velocity if self._has_coordinates else partial(_velocity, self)
+        return first(state)
 
     def placed(self, state: State, Y: Float[Array, ""], V: Float[Array, ""]) -> State:
         """`state` with this position and velocity: how a landing and a rebound are applied."""
-        if self._has_coordinates:
-            return self.coordinates[0].placed(state, Y, V)
-        return eqx.tree_at(lambda x: (x.Y, x.V), state, (Y, V))
+        first = self.coordinates[0].placed if self._has_coordinates else partial(_placed, self)
+        return first(state, Y, V)
+
+    def has_velocity(self, state: State) -> bool:
+        """Whether `velocity` is one; it need not be where there is nothing to meet."""
+        own = type(self).velocity is not AbstractScene.velocity or self._has_coordinates
+        return own or bool(self.stops) or hasattr(state, "V")
 
     @property
     def _has_coordinates(self) -> bool:
@@ -131,7 +175,10 @@ class AbstractScene(eqx.Module):
 
         **Raises:** `ValueError` where this scene has none.
         """
-        raise ValueError("Argument `start` must be given for a scene of your own.")
+        raise ValueError(
+            f"Argument `start` must be given for a {type(self).__name__}, which has no `start` of "
+            "its own."
+        )
 
     def adopt(self, start: Any) -> State:
         """A start as this scene needs it. **Raises:** `TypeError` if it is none."""
@@ -140,14 +187,14 @@ class AbstractScene(eqx.Module):
     def in_clock(self, clock: str) -> "AbstractScene":
         """The same scene with another independent variable, for one that has several."""
         raise ValueError(
-            "Argument `clock` must be left out for a scene of your own, which has its own clock, "
-            f"but got {clock!r}."
+            f"Argument `clock` must be left out for a {type(self).__name__}, which has its own "
+            f"clock, but got {clock!r}."
         )
 
     def at_section(self, phase: Any) -> "AbstractScene":
         """The same scene observed elsewhere in its cycle, for one that can be."""
         raise ValueError(
-            "Argument `section` must be left out for a scene of your own, which has its own "
+            f"Argument `section` must be left out for a {type(self).__name__}, which has its own "
             f"section, but got {phase!r}."
         )
 
@@ -171,7 +218,16 @@ class AbstractScene(eqx.Module):
     @property
     def labels(self) -> tuple[str, str]:
         """What pictures write beside position and velocity, with units."""
-        return "position", "velocity"
+        return PLAIN
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """The units of its quantities by their names: `position`, `velocity`, `time`, `rate` (of
+        what grows in time, as exponents do), `energy`, `power`, and each number and component of a
+        state by its own name. "1" is without unit; the name "" stands for all that is not named,
+        and what is not stated is told without. By default what the `labels` say in brackets."""
+        found = map(unit_in, self.labels)
+        return {x: unit for x, unit in zip(("position", "velocity"), found, strict=True) if unit}
 
     @property
     def turn(self) -> Float[Array, ""] | float:
@@ -226,8 +282,13 @@ class AbstractScene(eqx.Module):
     def in_range(self, start: State) -> Bool[Array, ""]:
         """Whether the numbers of this scene, traced ones too, are such that it can be run from
         `start`; asked once, when a lane begins. By default what its parts say (`ranges`)."""
-        return in_range(self)
+        return in_range((self, self.stops, self.switches))
 
     def check_start(self, start: State) -> None:
         """Raise a `ValueError` if the concrete `start` cannot be simulated (stops apart)."""
         return None
+
+
+def renews(machine: AbstractScene) -> bool:
+    """Whether a machine begins each cycle with something set back."""
+    return type(machine).renewed is not AbstractScene.renewed

@@ -6,7 +6,9 @@ from typing import ClassVar, NamedTuple
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from .._checks import Range, real, require_ranges
+from .._checks import Range, require_ranges
+from .._numbers import real
+from .shown import Shown
 from .trig import sincos
 
 
@@ -18,7 +20,7 @@ class Slide(NamedTuple):
     U_phiphi: Float[Array, "..."]
 
 
-class AbstractCrank(eqx.Module):
+class AbstractCrank(Shown):
     """A crank asks for one method, `slide(phase)`."""
 
     @abc.abstractmethod

@@ -6,11 +6,13 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import NOT_NEGATIVE, POSITIVE, REAL, real, require_ranges
+from .._checks import NOT_NEGATIVE, POSITIVE, REAL, require_ranges
+from .._numbers import real
 from .crank import Slide
+from .shown import Shown
 
 
-class IdealDrive(eqx.Module):
+class IdealDrive(Shown):
     """A drive of unlimited power: the crank turns at a constant rate."""
 
     frequency_ratio: Float[Array, "..."] = eqx.field(converter=real("frequency_ratio"))
@@ -21,7 +23,7 @@ class IdealDrive(eqx.Module):
         require_ranges(self)
 
 
-class Motor(eqx.Module):
+class Motor(Shown):
     """A DC motor of limited power with a straight torque-speed line (Eq. 3 of the paper).
 
     (1 + μ U_φ²) φ'' + μ U_φ U_φφ φ'² = τ0 (κ - φ'/w0) + ε U_φ (Y - U)

@@ -7,7 +7,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import NOT_NEGATIVE, Range, real, require_ranges
+from .._checks import NOT_NEGATIVE, Range, require_ranges
+from .._numbers import real
 from .switch import AbstractSwitch
 
 
@@ -41,6 +42,11 @@ class DryFriction(AbstractSwitch):
 
     def __check_init__(self):
         require_ranges(self)
+
+    @property
+    def may_slide(self) -> bool:
+        """Never along its own surface: where both sides point at it, the body sticks."""
+        return False
 
     def resistance(self, mode: Any, force: Any) -> Any:
         """What friction takes from the force on the body."""

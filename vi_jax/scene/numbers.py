@@ -1,12 +1,16 @@
 """Numbers of a scene by name: `"drive.frequency_ratio"`, `"stops.0.gap"`, …"""
 
 import difflib
+from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array, Float
+
+from .units import in_unit
 
 
 def leaf_names(tree: Any) -> list[str]:
@@ -20,6 +24,28 @@ def by_name(tree: Any) -> dict[str, Any]:
     return dict(_named(tree))
 
 
+def components(state: Any, lead: int = 0) -> dict[str, Any]:
+    """All numbers of a state by their names, those of an array `name[i]`; of several states beside
+    each other, which have `lead` axes in front, rows of them."""
+    found = {}
+    for name, x in by_name(state).items():
+        for place in np.ndindex(*jnp.shape(x)[lead:]):
+            inner = str(list(place)) if place else ""
+            found[name + inner] = x[(..., *place)] if place else x
+    return found
+
+
+def state_in_words(state: Any, digits: int, units: Mapping[str, str]) -> str:
+    """The numbers of a state of any kind, in their units."""
+    parts = components(state).items()
+    return ", ".join(f"{name} = {in_unit(plain(x, digits), units, name)}" for name, x in parts)
+
+
+def plain(x: Any, digits: int) -> str:
+    """A number for print, where zero has no sign."""
+    return f"{float(x) + 0.0:.{digits}g}"
+
+
 def leaf(tree: Any, name: str) -> Float[Array, "..."]:
     """The number of that name. **Raises:** `ValueError` that lists the near names."""
     return jnp.asarray(by_name(tree)[check_leaf(tree, name)])
@@ -31,7 +57,10 @@ def with_leaf(tree: Any, name: str, value: Any) -> Any:
     leaves, treedef = jtu.tree_flatten(tree)
     arrays = [i for i, x in enumerate(leaves) if eqx.is_array_like(x)]
     old = leaves[arrays[index]]
-    leaves[arrays[index]] = jnp.asarray(value, jnp.result_type(old))
+    kind = jnp.result_type(old)
+    if jnp.issubdtype(kind, jnp.integer) and jnp.issubdtype(jnp.result_type(value), jnp.floating):
+        kind = jnp.result_type(float)  # or else it would be cut off
+    leaves[arrays[index]] = jnp.asarray(value, kind)
     return jtu.tree_unflatten(treedef, leaves)
 
 

@@ -1,30 +1,26 @@
 """Table 1 of the paper in SI units, and the way from there to a dimensionless scene and back."""
 
+import dataclasses
 from math import pi
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from .._checks import (
-    NOT_NEGATIVE,
-    POSITIVE,
-    REAL,
-    SHARE,
-    concrete,
-    in_range,
-    one_of,
-    optional_real,
-    real,
-    require_ranges,
-)
+from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, in_range, one_of, require_ranges
+from .._numbers import concrete, optional_real, real, warn
 from .crank import CosineCrank, SliderCrank
 from .drive import DCMotor, IdealDrive, Motor
 from .scene import Oscillator, Scene
+from .shown import Shown
 from .stop import RigidStop
+
+# Crank radii from which a length is taken to be in another unit than metres.
+_LONG = 1000.0
 
 # A plain number is taken as well as an array of them to `vmap` over.
 Number = Float[Array, "..."] | float
@@ -34,7 +30,10 @@ def _si(name: str, unit: str, default: float | None) -> Any:
     """A number in this unit, or a quantity of `pint` that can be given in it."""
     convert = real(name) if default is not None else optional_real(name)
     return eqx.field(
-        default=default, converter=lambda x: convert(_magnitude(name, unit, x)), kw_only=True
+        default=default,
+        converter=lambda x: convert(_magnitude(name, unit, x)),
+        kw_only=True,
+        metadata={"unit": unit},
     )
 
 
@@ -50,7 +49,7 @@ def _magnitude(name: str, unit: str, value: Any) -> Any:
         ) from error
 
 
-class Parameters(eqx.Module):
+class Parameters(Shown):
     """The machine in SI units; the defaults are Table 1 of the paper (T0 = 10 N·m, κ = 0.9).
 
     Each number may be a quantity of `pint`, in any unit of its kind.
@@ -107,6 +106,28 @@ class Parameters(eqx.Module):
 
     def __check_init__(self):
         require_ranges(self)
+        for name in ("gap", "rod_length"):
+            self._warn_if_long(name)
+
+    def _warn_if_long(self, name: str) -> None:
+        """Millimetres for metres are in range, and make a machine that never meets its stop."""
+        length, radius = concrete(getattr(self, name)), concrete(self.crank_radius)
+        if length is None or radius is None:
+            return
+        lengths, radii = np.broadcast_arrays(length, radius)
+        long = abs(lengths) >= _LONG * radii
+        if long.any():
+            length, radius = lengths[long][0], radii[long][0]
+            warn(
+                f"Argument `{name}` is {length:g} m, {length / radius:.0f} times the crank radius "
+                f"of {radius:g} m: lengths are in metres."
+            )
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Of each number, in SI."""
+        written = ((f.name, f.metadata["unit"]) for f in dataclasses.fields(self))
+        return {name: unit.replace("**2", "²").replace("*", "·") for name, unit in written}
 
     @property
     def natural_frequency(self) -> Number:

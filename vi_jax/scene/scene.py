@@ -9,24 +9,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .._checks import (
-    NOT_NEGATIVE,
-    Range,
-    concrete,
-    instance_of,
-    number,
-    optional_real,
-    real,
-    require,
-    require_ranges,
-    tuple_of,
-)
+from .._checks import NOT_NEGATIVE, Range, instance_of, require, require_ranges, tuple_of
+from .._numbers import concrete, number, optional_real, real
 from .crank import AbstractCrank, CosineCrank
 from .drive import DCMotor, IdealDrive, Motor
 from .shaft import ShaftScene
+from .shown import Shown
 from .soft import SoftStop
 from .states import (
     TIMED,
+    UNITS,
     DCMotorState,
     MotorState,
     OscillatorState,
@@ -35,11 +27,8 @@ from .states import (
 )
 from .stop import RigidStop
 
-# What pictures write beside Y and V.
-LABELS = "Y = y/a", "V = dY/dτ"
 
-
-class Oscillator(eqx.Module):
+class Oscillator(Shown):
     """The body C on its spring, in units of its natural frequency."""
 
     damping_ratio: Float[Array, "..."] = eqx.field(default=0.0, converter=real("damping_ratio"))
@@ -79,6 +68,7 @@ class Scene(ShaftScene):
     """Compliant stops; their stiffness in units of the body's own spring."""
     ranges: ClassVar = {"section_phase": Range(-2 * pi, 2 * pi)}
     timed_states: ClassVar = TIMED
+    units: ClassVar = UNITS  # pyright: ignore[reportAssignmentType, reportIncompatibleMethodOverride]
 
     def __check_init__(self):
         instance_of("oscillator", self.oscillator, Oscillator, "an `Oscillator`")
@@ -151,7 +141,7 @@ class Scene(ShaftScene):
     @property
     def labels(self) -> tuple[str, str]:
         """In the paper's units."""
-        return LABELS
+        return "Y = y/a", "V = dY/dτ"
 
     @property
     def turn(self) -> float:
@@ -206,12 +196,6 @@ class Scene(ShaftScene):
         if isinstance(self.drive, IdealDrive):
             return OscillatorState
         return DCMotorState if isinstance(self.drive, DCMotor) else MotorState
-
-    def by_phase(self, start: Any) -> Any:
-        """A start made for the time clock without its crank angle; any other as it is."""
-        if self.is_timed(start):
-            return self.state_type(*list(vars(start).values())[:-1])
-        return start
 
     @property
     def switches(self) -> tuple[SoftStop, ...]:

@@ -8,10 +8,14 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .._checks import concrete, one_of, state_of_numbers
+from .._checks import one_of, state_of_numbers
+from .._numbers import concrete
 from .base import AbstractScene
 
 Machine = TypeVar("Machine", bound="ShaftScene")
+
+# A state that was carried to the section lies on it to rounding, in single precision too.
+_ON_SECTION = 1e-5
 
 
 class ShaftScene(AbstractScene):
@@ -61,6 +65,22 @@ class ShaftScene(AbstractScene):
                 f"`start(...)`), but got a `{type(start).__name__}`."
             )
         return state_of_numbers("start", start)
+
+    def by_phase(self, name: str, state: Any) -> Any:
+        """A state on the section that was made for the time clock, without the angle of the shaft;
+        any other as it is.
+
+        **Raises:** `ValueError` that names the argument if the angle is known and not 0.
+        """
+        if not self.is_timed(state):
+            return state
+        phase = concrete(state.phase)
+        if phase is not None and not (abs(phase) <= _ON_SECTION).all():
+            raise ValueError(
+                f"Argument `{name}` must lie on the section, where its phase is 0, but has "
+                f"{abs(phase).max():g}."
+            )
+        return self.state_type(*list(vars(state).values())[:-1])
 
     def clock(self, state: Any) -> Float[Array, ""] | None:
         """The angle of the shaft, where time is the independent variable."""

@@ -7,7 +7,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import NOT_NEGATIVE, POSITIVE, REAL, count, number, one_of, require, require_ranges
+from .._checks import NOT_NEGATIVE, POSITIVE, REAL, count, one_of, require, require_ranges
+from .._numbers import number
 from .stop import Wall
 from .switch import AbstractSwitch
 
@@ -102,6 +103,12 @@ class SoftStop(Wall, AbstractSwitch):
     def analytic(self) -> bool:
         """Of a force that is straight in the depth; others have a kink or a root at first touch."""
         return self.exponent == 1
+
+    @property
+    def may_slide(self) -> bool:
+        """Only at a prestressed contact, whose force jumps as it is touched: else the force on a
+        body that goes in is that on one that comes out."""
+        return self.prestress is not None
 
     def depth(self, machine: Any, state: Any) -> tuple[Any, Any]:
         """δ and δ' (by time); δ is negative apart from the stop."""

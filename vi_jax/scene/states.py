@@ -1,13 +1,26 @@
 """States of the paper's scene."""
 
-import equinox as eqx
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import ClassVar
+
 from jaxtyping import Array, Float
+
+from .shown import Shown
+
+# The units of the paper's scene, by names of quantities, of components of a state and of numbers.
+UNITS: Mapping[str, str] = MappingProxyType({
+    "position": "a", "velocity": "a ω", "time": "1/ω", "rate": "ω", "energy": "m_C a² ω²",
+    "power": "m_C a² ω³", "Y": "a", "V": "a ω", "W": "ω", "M": "J ω²", "phase": "rad",
+    "gap": "a", "frequency_ratio": "ω", "no_load_speed": "ω", "electrical_time": "1/ω",
+    "section_phase": "rad", "": "1",
+})  # fmt: skip
 
 Number = Float[Array, "..."]
 
 
-class OscillatorState(eqx.Module):
-    """State of an ideally driven scene."""
+class OscillatorState(Shown):
+    """State of an ideally driven scene, or of another machine, whose units are its own."""
 
     Y: Number
     """Position of the body (unit: a)."""
@@ -18,6 +31,7 @@ class OscillatorState(eqx.Module):
 class MotorState(OscillatorState):
     """State of a motor scene whose independent variable is the crank angle."""
 
+    units: ClassVar = UNITS
     W: Number
     """Speed of the crank dφ/dτ (unit: ω)."""
 

@@ -9,14 +9,16 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._checks import REAL, SHARE, concrete, count, number, one_of, real, require_ranges
+from .._checks import REAL, SHARE, count, one_of, require_ranges
+from .._numbers import concrete, number, real
+from .shown import Shown
 
 
 def _restitution(x: Any) -> Any:
     return x if callable(x) else number("restitution", x)
 
 
-class Wall(eqx.Module):
+class Wall(Shown):
     """Where a stop stands, rigid or compliant: at `gap` on its `side`."""
 
     gap: eqx.AbstractVar[Float[Array, "..."]]
@@ -76,6 +78,11 @@ class RigidStop(Wall):
         one_of("side", self.side, ("right", "left"))
         count("coordinate", self.coordinate)
 
+    @property
+    def is_one_number(self) -> bool:
+        """Whether the law is Newton's with one number, so that its range is known beforehand."""
+        return type(self) is RigidStop and not callable(self.restitution)
+
     def coefficient(self, approach: Any) -> Any:
         """k at this speed of approach."""
         return self.restitution(approach) if callable(self.restitution) else self.restitution
@@ -84,9 +91,17 @@ class RigidStop(Wall):
         """The velocity after an impact with this one (Eq. 17 of the paper)."""
         return -self.coefficient(self.approach(V)) * V
 
+    def share(self, approach: Any) -> Any:
+        """The share of a speed of approach that is left after the impact: k, or what a `rebound` of
+        one's own makes of it."""
+        if type(self).rebound is RigidStop.rebound:
+            return self.coefficient(approach)
+        left = -self.approach(self.rebound(self.sign * approach))
+        return left / jnp.where(approach > 0, approach, 1.0)
+
     def loss(self, approach: Any) -> Any:
         """Energy lost in an impact, per unit of mass: ½(1 - k²) V⁻²."""
-        return 0.5 * (1 - self.coefficient(approach) ** 2) * approach**2
+        return 0.5 * (1 - self.share(approach) ** 2) * approach**2
 
     def remaining(self, approach: Any, pressing: Any) -> Any:
         """Time from an impact to rest: Σ 2 kⁿ V⁻ / a = 2 k V⁻ / (a (1 - k)).
@@ -95,7 +110,7 @@ class RigidStop(Wall):
         is not pressed on, or loses nothing. A coefficient that depends on the speed is taken as it
         is at this impact.
         """
-        k = self.coefficient(approach)
+        k = self.share(approach)
         force = pressing * (1 - k)
         ends = force > 0
         return jnp.where(ends, 2 * k * approach / jnp.where(ends, force, 1.0), jnp.inf)

@@ -13,10 +13,12 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .shown import Shown
+
 Scalar = Float[Array, ""]
 
 
-class AbstractSwitch(eqx.Module):
+class AbstractSwitch(Shown):
     """A mode, and the event that changes it.
 
     The first argument of each method is the machine. A hump of the guard within one step is seen if
@@ -27,6 +29,12 @@ class AbstractSwitch(eqx.Module):
     @property
     def analytic(self) -> bool:
         """Whether what a mode adds to the field has power series up to the event that ends it."""
+        return True
+
+    @property
+    def may_slide(self) -> bool:
+        """Whether the field may point at the guard's surface from both sides, so that a motion has
+        to slide along it, which is no mode yet: a lane that would ends, and says so."""
         return True
 
     @abc.abstractmethod

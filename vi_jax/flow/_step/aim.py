@@ -97,7 +97,7 @@ def _aimed(plan: Plan, lane: Lane, trial: Trial) -> tuple[Flag, Scalar, Scalar]:
     # The earliest of several events is met first. The chord tells well enough which that is: a
     # landing that lies beyond another event is not accepted.
     first, target = jnp.full_like(h, jnp.inf), jnp.full_like(h, FREE)
-    polynomial, crossed, landed = None, none, none
+    polynomial, crossed, landed, at_once = None, none, none, none
     facing_stop = [none for _ in trial.paths]
     for c in trial.crossings:
         over = trial.good & beyond(c)
@@ -109,6 +109,10 @@ def _aimed(plan: Plan, lane: Lane, trial: Trial) -> tuple[Flag, Scalar, Scalar]:
         target = jnp.where(sooner, c.name, target)
         first = jnp.where(sooner, place, first)
         crossed, landed = crossed | over, landed | c.landed
+        if c.slack is not None:
+            # At rest on a surface and on its way through: the event is where the step begins.
+            still = (jnp.abs(c.begin.x) <= c.slack) & (c.begin.v == 0) & (c.begin.a > 0)
+            at_once = jnp.where(sooner, over & still, at_once)
         if c.kind == "stop":
             stop = plan.scene.stops[c.number]
             k = stop.coordinate
@@ -117,7 +121,8 @@ def _aimed(plan: Plan, lane: Lane, trial: Trial) -> tuple[Flag, Scalar, Scalar]:
     everything, soonest = plan.meets_turns(lane.done), jnp.full_like(h, jnp.inf)
     several = len(trial.paths) > 1
     exactly = exact(plan.scene, lane.state)
-    now = 4 * float(jnp.finfo(h.dtype).eps) * (1 + stop_gradient(trial.s))
+    eps = float(jnp.finfo(h.dtype).eps)
+    now = 4 * eps * (1 + stop_gradient(trial.s))
     for k, path in enumerate(trial.paths):
         curves.append(quintic(path.begin, path.end, h))
         facing = tuple(-lane.direction[k] * c for c in slope(curves[k]))
@@ -127,8 +132,10 @@ def _aimed(plan: Plan, lane: Lane, trial: Trial) -> tuple[Flag, Scalar, Scalar]:
         turned = turned & ~path.at_turn & ~facing_stop[k]
         if not exactly:
             # One that is closer than the clock can tell, as of a body that a rounded difference
-            # has all but stopped, has nothing before it that could be stepped to.
-            turned = turned & (jnp.abs(to_turn(path.end)) > now)
+            # has all but stopped, has nothing before it that could be stepped to. Nor is it one if
+            # all that moves is rounding, as between bodies that go on together.
+            moves = jnp.abs(path.end.v) * h > eps * (1 + jnp.abs(path.end.x))
+            turned = turned & (jnp.abs(to_turn(path.end)) > now) & moves
         ahead = turned
         if several:  # of their turns that matter the earliest comes first
             place = rising_root(stop_gradient(facing))
@@ -139,9 +146,11 @@ def _aimed(plan: Plan, lane: Lane, trial: Trial) -> tuple[Flag, Scalar, Scalar]:
             soonest = jnp.where(ahead, place, soonest)
         turns.append(turned)
         polynomial = facing if polynomial is None else select(ahead, facing, polynomial)
-        target = jnp.where(ahead, to_turn_of(k), target)
+        target, at_once = jnp.where(ahead, to_turn_of(k), target), at_once & ~ahead
     assert polynomial is not None
     theta = pin(rising_root(stop_gradient(polynomial)))
+    if any(c.slack is not None for c in trial.crossings):
+        theta = jnp.where(at_once, 0.0, theta)
     goal = _Goal(crossed & ~landed, none, none, theta * h, target)
     for k, path in enumerate(trial.paths):
         turn = turns[k]

@@ -9,13 +9,16 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
 from ...lanes import pin, pin_flag
-from .._lane import Lane, Plan, Record, to_stop, to_turn_of
+from .. import results
+from .._lane import CHANGES, HIT, LEAVES, RESTS, Lane, Plan, Record, to_stop, to_turn_of
 from ..drift import drifted, height_of_turn, met_after, unmoved
 from ..events import Rates, to_turn
-from ..moving import struck_modes
+from ..moving import exact, struck_modes
 from .aim import select
+from .faults import comes_back, gains, may_end, undecided
+from .log import clock_at, logged, noted
 from .rest import Release, settled
-from .trial import Crossing, Trial, held
+from .trial import Crossing, Trial, furthest_landing, held
 from .way import Way
 
 Scalar = Float[Array, ""]
@@ -39,8 +42,11 @@ class Arrival(NamedTuple):
     loss: Scalar | None
     rests: Scalar | None
     log: Any
+    events: Any
     completed: Flag
     """Whether the interval is complete."""
+    fault: Scalar | None
+    """As in `Lane`; absent where no event can end it."""
 
 
 def arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Flag]:
@@ -63,7 +69,8 @@ def arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Fla
     arrival = Arrival(
         trial.s, trial.state, plan.scene.position(trial.state), trial.time, tuple(direction),
         lane.contact, lane.modes,
-        old.impacts, old.speed, old.loss, old.rests, old.log, trial.ends_interval,
+        old.impacts, old.speed, old.loss, old.rests, old.log, old.events, trial.ends_interval,
+        lane.fault if may_end(plan.scene) else None,
     )  # fmt: skip
     way = Way(plan, trial.holding, lane.part, (trial.s, trial.state, trial.time))
     if trial.crossings:
@@ -89,9 +96,10 @@ def arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Fla
         contact=select(taken, arrival.contact, lane.contact),
         modes=select(taken, arrival.modes, lane.modes),
         below=_below(lane, trial, taken, arrival.completed),
+        fault=lane.fault if arrival.fault is None else jnp.where(taken, arrival.fault, lane.fault),
         record=Record(
             time, y_max, y_min, arrival.impacts, arrival.speed, arrival.loss, arrival.rests,
-            arrival.log, clearance,
+            arrival.log, clearance, arrival.events,
         ),
     )  # fmt: skip
     return there, taken & arrival.completed
@@ -104,7 +112,9 @@ def _met(plan: Plan, lane: Lane, trial: Trial, taken: Flag, way: Way, arrival: A
     section.
     """
     for c in trial.crossings:
-        offset = stop_gradient(jnp.where(c.landed, c.offset, 0.0))
+        # Of a motion so flat that the event's place is known worse than its surface, it is here.
+        near = c.landed & (jnp.abs(c.offset) <= furthest_landing(trial.h))
+        offset = stop_gradient(jnp.where(near, c.offset, 0.0))
         if c.kind != "section" and plan.ticks(lane.state):
             # Met on the section it is not beyond it.
             beyond = trial.s + offset - plan.end(lane.part)
@@ -125,7 +135,7 @@ def _met(plan: Plan, lane: Lane, trial: Trial, taken: Flag, way: Way, arrival: A
             arrival = _impact(plan, lane, trial, taken, arrival, c, there)
     for k, path in enumerate(trial.paths):
         if path.leaves is not None:
-            arrival = _released(lane, arrival, way, k, path.leaves)
+            arrival = _released(plan, lane, taken, arrival, way, k, path.leaves)
     arrival = arrival._replace(place=plan.scene.position(arrival.state))
     # Where a switch is met the field may have an infinite slope (Hertz's damper as it is touched),
     # which only derivatives along with the event do not see.
@@ -146,15 +156,26 @@ def _at_fixed_clock(plan: Plan, lane: Lane, trial: Trial, arrival: Arrival) -> A
     return arrival._replace(s=s, state=state, time=time)
 
 
-def _released(lane: Lane, arrival: Arrival, way: Way, k: int, leaves: Release) -> Arrival:
+def _released(
+    plan: Plan, lane: Lane, taken: Flag, arrival: Arrival, way: Way, k: int, leaves: Release
+) -> Arrival:
     """Coordinate number k free again."""
     assert arrival.contact is not None
     free, offset = leaves.landed, stop_gradient(leaves.offset)
     offset = met_after(way.rate, way.force(k), offset, way.moving, way.fixed, way.rest)
     moving = arrival.s, arrival.state, arrival.time
     _, state, time = drifted(way.rate, offset, moving, way.fixed, way.rest)
+    if not exact(plan.scene, state):
+        # While it was held its place was kept to the method's error.
+        contact, zero = arrival.contact[k], jnp.zeros_like(arrival.contact[k])
+        put = plan.scene.coordinates[k].placed(state, plan.place(k, contact, zero), zero)
+        state = select(contact > 0, put, state)
     direction = jnp.where(free, -lane.direction[k], arrival.direction[k])
+    clock = clock_at(plan, arrival.s + jnp.where(free, offset, 0.0), state)
+    stop = arrival.contact[k] - to_stop(0)
+    events = noted(arrival.events, taken & free, clock, LEAVES, stop, jnp.nan)
     return arrival._replace(
+        events=events,
         s=arrival.s + jnp.where(free, offset, 0.0),
         state=select(free, state, arrival.state),
         time=select(free, time, arrival.time),
@@ -180,21 +201,31 @@ def _switched(
     scene, j = plan.scene, c.number
     state, mode = scene.switches[j].after(scene, arrival.s, there, lane.modes[j])
     mode = stop_gradient(jnp.asarray(mode, arrival.s.dtype))
-    log = arrival.log
+    modes = _put(arrival.modes, j, jnp.where(c.landed, mode, arrival.modes[j]))
+    slides = comes_back(plan.scene, j, modes, arrival.s, state)
+    arrival = _ended(arrival, c, slides, results.SLIDING)
+    log, clock = arrival.log, clock_at(plan, arrival.s, there)
+    events = noted(arrival.events, taken & c.landed, clock, CHANGES, j, mode)
     if plan.log_switches:
-        clock = scene.clock(there)
-        log = _logged(
-            log, taken & c.landed, arrival.impacts, arrival.s if clock is None else clock,
-            jnp.zeros_like(arrival.s), len(scene.stops) + j,
-        )  # fmt: skip
+        zero = jnp.zeros_like(arrival.s)
+        number = len(scene.stops) + j
+        log = logged(log, taken & c.landed, arrival.impacts, clock, zero, number)
         # Listed as an impact is, and so counted.
         count = jnp.where(taken & c.landed, 1.0, 0.0)
         arrival = arrival._replace(impacts=arrival.impacts + count)
     return arrival._replace(
         state=select(c.landed, state, arrival.state),
-        modes=_put(arrival.modes, j, jnp.where(c.landed, mode, arrival.modes[j])),
+        modes=modes,
         log=log,
+        events=events,
     )
+
+
+def _ended(arrival: Arrival, c: Crossing, when: Flag | None, reason: int) -> Arrival:
+    """With this reason to end, where that holds of what was met; `None` where it cannot."""
+    if when is None or arrival.fault is None:
+        return arrival
+    return arrival._replace(fault=jnp.where(c.landed & when, float(reason), arrival.fault))
 
 
 def _impact(
@@ -206,18 +237,25 @@ def _impact(
     k = stop.coordinate
     body = scene.coordinates[k]
     s, state, time, direction = arrival.s, arrival.state, arrival.time, arrival.direction[k]
-    contact, rests, met = arrival.contact, arrival.rests, s
+    contact, rests, met = arrival.contact, arrival.rests, clock_at(plan, s, there)
     approach = jnp.maximum(stop.approach(body.velocity(there)), 0.0)
     # A speed whose square is no number ends here: a body may die out on a stop.
     least = 100 * float(jnp.finfo(s.dtype).tiny) ** 0.5
     rebound = stop.rebound(stop.sign * jnp.where(approach > least, approach, 0.0))
-    state = select(c.landed, body.placed(there, stop.place, rebound), state)
+    arrival = _ended(arrival, c, gains(stop, approach, rebound), results.BAD_IMPACT)
+    struck = body.placed(there, stop.place, rebound)
+    clashes = undecided(scene, c.number, there, struck)
+    arrival = _ended(arrival, c, clashes, results.SIMULTANEOUS)
+    state = select(c.landed, struck, state)
     direction = jnp.where(c.landed, -float(stop.sign), direction)
     hit = taken & c.landed
     lost = stop.loss(approach)
+    events = noted(arrival.events, hit, met, HIT, c.number, approach)
     if contact is not None:
         arriving = stop.approach(trial.paths[k].end.v)
-        last, left = settled(plan, lane, trial.alone[k], stop, arriving, s, there)
+        surge = trial.paths[k].surge
+        assert surge is not None  # as `contact` is there
+        last, left = settled(plan, lane, trial.alone[k], stop, arriving, surge[1], s, there)
         ends = pin_flag(c.landed & last, s)
         lost = jnp.where(ends, 0.5 * approach**2, lost)
         wait = pin(jnp.where(ends, left, 0.0))
@@ -227,6 +265,8 @@ def _impact(
         way = Way(plan, resting, lane.part, (s, still, time))
         later, still, passed = drifted(way.rate, wait, way.moving, way.fixed, way.rest)
         s, state, time = select(ends, (later, still, passed), (s, state, time))
+        clock = clock_at(plan, s, state)
+        events = noted(events, taken & ends, clock, RESTS, c.number, approach)
         direction = jnp.where(ends, float(stop.sign), direction)
         if rests is not None:
             rests = rests + jnp.where(taken & ends, 1.0, 0.0)
@@ -236,18 +276,16 @@ def _impact(
     for j, other in enumerate(scene.coordinates):
         if j != k:  # it may share a body with the one that was hit
             v = stop_gradient(other.velocity(state))
-            struck = c.landed & (v != 0)
-            turned = jnp.where(struck, jnp.sign(v), directions[j])
+            moved = c.landed & (v != 0)
+            turned = jnp.where(moved, jnp.sign(v), directions[j])
             directions = _put(directions, j, turned)
             if contact is not None:
-                contact = _put(contact, j, jnp.where(struck, 0.0, contact[j]))
+                contact = _put(contact, j, jnp.where(moved, 0.0, contact[j]))
     modes = arrival.modes
     if modes:
         modes = select(c.landed, struck_modes(scene, s, state, modes), modes)
-    clock, speed, loss = scene.clock(there), arrival.speed, arrival.loss
-    log = _logged(
-        arrival.log, hit, arrival.impacts, met if clock is None else clock, approach, c.number
-    )
+    speed, loss = arrival.speed, arrival.loss
+    log = logged(arrival.log, hit, arrival.impacts, met, approach, c.number)
     return arrival._replace(
         s=s,
         state=state,
@@ -260,6 +298,7 @@ def _impact(
         loss=None if loss is None else loss + jnp.where(hit, lost, 0.0),
         rests=rests,
         log=log,
+        events=events,
     )
 
 
@@ -298,12 +337,3 @@ def _top(trial: Trial, k: int, way: Way) -> Scalar:
     return height_of_turn(
         way.rate, way.place(k), height, path.at_turn, to_turn(end), way.moving, way.fixed, way.rest
     )
-
-
-def _logged(log: Any, hit: Flag, place: Scalar, clock: Scalar, approach: Scalar, stop: int) -> Any:
-    """The log with this impact, the `place`-th of its interval."""
-    if log is None:
-        return None
-    here = hit & (jnp.arange(log.shape[1], dtype=log.dtype) == place)
-    entry = jnp.stack([clock, approach, jnp.full_like(clock, stop)])
-    return jnp.where(here, entry[:, None], log)

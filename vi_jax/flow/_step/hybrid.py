@@ -21,23 +21,18 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
 from ...lanes import pin_flag
-from .. import results
-from .._lane import FREE, Lane, Plan, Record, total
+from .._lane import FREE, Lane, Plan, Record
+from ..events import rates
 from ..methods import Taylor
+from ..moving import rounding
 from .ahead import ahead
 from .aim import aim_at, select
 from .arrive import arrive
+from .faults import faults
 from .trial import Trial, attempt, held, timing
 
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]
-
-# A lane that has aimed this often without landing is lost; after so many impacts in one interval
-# it was chattering.
-_LOST, _MANY = 64.0, 16.0
-
-# Nothing that a lane could do in one interval takes so many steps.
-_STUCK = 65536.0
 
 
 class Step(NamedTuple):
@@ -79,6 +74,7 @@ def iterate(plan: Plan, lane: Lane) -> Step:
         state = select(turned, plan.scene.rewound(state), state)
     renewed = plan.scene.renewed(state)
     if renewed is not state:
+        there = _renewed(plan, there, turned, state, renewed)
         state = select(turned, renewed, state)
     of_interval = record
     record = select(completed, plan.fresh(state), record)
@@ -86,11 +82,13 @@ def iterate(plan: Plan, lane: Lane) -> Step:
     steps = lane.steps + jnp.where(active, 1.0, 0.0)
     # Counted anew in each interval: in single precision the sum of all stands still at 2²⁴.
     spent = jnp.where(completed, 0.0, lane.spent + 1.0)
-    fault = lane.fault
+    fault = there.fault
     aims = jnp.where(aim, lane.aims + 1, 0.0)
-    for condition, code in _faults(plan, lane, trial, rejected, length, record, steps, spent, aims):
+    for condition, code in faults(
+        plan, lane, trial, rejected, length, record, steps, spent, aims, target
+    ):
         stops_here = active & (fault == 0) & condition & (done < plan.intervals)
-        fault = jnp.where(stops_here, float(code), fault)
+        fault = jnp.where(stops_here, code, fault)
     new = dataclasses.replace(
         there,
         s=s,
@@ -110,6 +108,30 @@ def iterate(plan: Plan, lane: Lane) -> Step:
     return Step(new, completed, state, of_interval)
 
 
+def _renewed(plan: Plan, lane: Lane, turned: Flag, old: Any, new: Any) -> Lane:
+    """Which way the motion goes on behind a state that was put in place of another, and what of it
+    still rests: only what was not moved."""
+    directions, contacts = list(lane.direction), list(lane.contact or ())
+    slack = rounding(plan.scene, new)
+    for k, coordinate in enumerate(plan.scene.coordinates):
+        (place, before), (there, after) = (
+            (coordinate.position(x), coordinate.velocity(x)) for x in (old, new)
+        )
+        if contacts and not (there is place and after is before):
+            moved = (jnp.abs(there - place) > slack) | (jnp.abs(after - before) > slack)
+            contacts[k] = jnp.where(turned & stop_gradient(moved), 0.0, contacts[k])
+    if contacts:
+        lane = dataclasses.replace(lane, contact=tuple(contacts))
+    for k, coordinate in enumerate(plan.scene.coordinates):
+        after = coordinate.velocity(new)
+        if after is not coordinate.velocity(old):
+            machine = held(plan, lane)
+            bend = rates(machine.field, coordinate.position, jnp.zeros_like(lane.s), new).a
+            after = stop_gradient(jnp.where(after == 0, bend, after))
+            directions[k] = jnp.where(turned & (after != 0), jnp.sign(after), directions[k])
+    return dataclasses.replace(lane, direction=tuple(directions))
+
+
 def _resized(plan: Plan, lane: Lane, trial: Trial, taken: Flag, rejected: Flag) -> Scalar:
     """The length proposed for the next ordinary step."""
     if not plan.method.adaptive:
@@ -120,35 +142,3 @@ def _resized(plan: Plan, lane: Lane, trial: Trial, taken: Flag, rejected: Flag) 
     grown = jnp.where(h < lane.length, jnp.maximum(lane.length, h * factor), h * factor)
     shrunk = h * jnp.where(trial.error > 1, jnp.minimum(factor, 0.7), 0.2)
     return jnp.where(taken, grown, jnp.where(rejected, shrunk, lane.length))
-
-
-def _faults(
-    plan: Plan,
-    lane: Lane,
-    trial: Trial,
-    rejected: Flag,
-    length: Scalar,
-    record: Record,
-    steps: Scalar,
-    spent: Scalar,
-    aims: Scalar,
-) -> list[tuple[Flag, int]]:
-    """What ends a lane, the first that holds being the reason."""
-    broken = results.NOT_FINITE
-    if plan.scene.alive(trial.state) is not None:
-        # A clock that breaks down makes the steps shrink to nothing.
-        broken = results.STALLED
-    ends = [
-        (record.impacts > plan.max_impacts, results.CHATTER),
-        (((aims >= _LOST) | (spent >= _STUCK)) & (record.impacts > _MANY), results.CHATTER),
-        (aims >= _LOST, results.UNRESOLVED),
-        (steps >= plan.max_steps, results.MAX_STEPS),
-        (spent >= _STUCK, results.MAX_STEPS),
-    ]
-    if not plan.method.adaptive:
-        return [(rejected, broken), *ends]
-    eps = float(jnp.finfo(length.dtype).eps)
-    gone = rejected & (length < 4 * eps * jnp.maximum(1.0, plan.scene.cycle))
-    numeric = jnp.isfinite(total(trial.state, length))
-    tiny = results.UNDERFLOW if broken == results.NOT_FINITE else broken
-    return [(gone & ~numeric, broken), (gone, tiny), *ends]

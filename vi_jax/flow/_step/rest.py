@@ -45,13 +45,13 @@ def _allowed(s: Scalar) -> _Precision:
 
 
 def settled(
-    plan: Plan, lane: Lane, free: AbstractScene, stop: RigidStop, speed: Scalar, s: Scalar,
-    there: Any,
+    plan: Plan, lane: Lane, free: AbstractScene, stop: RigidStop, speed: Scalar, growth: Scalar,
+    s: Scalar, there: Any,
 ) -> tuple[Flag, Scalar]:  # fmt: skip
     """Whether an impact is one of the endless last ones before rest, and the time they take.
 
-    **Arguments:** the machine with nothing held, the stop, the speed of approach by s, and s and
-    the state of the impact.
+    **Arguments:** the machine with nothing held, the stop, the speed of approach by s, how fast the
+    force on the body grows, and s and the state of the impact.
     """
     coordinate = plan.scene.coordinates[stop.coordinate]
     # What presses a body at rest on: with its velocity goes its damping.
@@ -61,12 +61,31 @@ def settled(
     left = stop.remaining(speed, pressing)
     limit = stop_gradient(jnp.asarray(plan.scene.step_limit(s, there), s.dtype))
     # Hops no higher than rounding cannot be followed, however long they last.
-    height = (stop.coefficient(speed) * speed) ** 2 / jnp.where(pressing > 0, 2 * pressing, 1.0)
+    rebound = stop.share(speed) * speed
+    height = rebound**2 / jnp.where(pressing > 0, 2 * pressing, 1.0)
+    height, left = _before_it_presses(rebound, pressing, stop.sign * growth, (height, left))
     flat = height <= 16 * float(jnp.finfo(s.dtype).eps) * (1 + jnp.abs(stop.gap))
     ends = stop_gradient(left <= jnp.where(flat, 0.1, _allowed(s).brief) * limit)
     if plan.ticks(lane.state):
         ends = ends & (stop_gradient(s + left) < stop_gradient(plan.end(lane.part)))
     return ends, left
+
+
+def _before_it_presses(
+    rebound: Scalar, pressing: Scalar, growth: Scalar, pressed: tuple[Scalar, Scalar]
+) -> tuple[Scalar, Scalar]:
+    """Height of the next hop, and the time until the body is pressed on, where it is not yet but
+    will be, since its force grows; else those of a body that is `pressed` on.
+
+    A hop that begins against a force f, growing at the rate j, is over within 3 |f|/j + √(6 v/j).
+    """
+    v, pull, grows = stop_gradient((rebound, -pressing, growth))
+    not_yet = (pull >= 0) & (grows > 0)
+    rate = jnp.where(not_yet, grows, 1.0)
+    wait = jnp.where(not_yet, pull, 0.0) / rate
+    hop = 3 * wait + jnp.sqrt(6 * jnp.where(not_yet, v, 0.0) / rate)
+    height = v * hop + 0.5 * pull * hop * hop
+    return jnp.where(not_yet, height, pressed[0]), jnp.where(not_yet, wait, pressed[1])
 
 
 class Release(NamedTuple):

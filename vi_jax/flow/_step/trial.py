@@ -34,8 +34,9 @@ class Crossing(NamedTuple):
     """"stop", "switch" or "section"."""
     number: int
     """Of the stop or switch."""
-    lingers: bool
-    """Whether a step may begin beyond it, to rounding."""
+    slack: Scalar | None
+    """By so much, which is rounding's, a step may begin or end beyond it; `None` where places on it
+    are exact."""
     begin: Rates
     end: Rates
     offset: Scalar
@@ -155,7 +156,8 @@ def attempt(
     # ends; other events can be.
     together = scene.switches or scene.section(lane.state) is not None
     if together or not exact(scene, lane.state):
-        guards = [guard._replace(lingers=True) for guard in guards]
+        eps = float(jnp.finfo(h.dtype).eps)
+        guards = [guard._replace(slack=4 * eps * guard.scale) for guard in guards]
     seen = tuple(_seen(lane, good & last, good, h, each, guards) for each in guards)
     return Trial(
         s1, h, new, time, error, good, last, seen, tuple(paths), each_alone, holding, below
@@ -173,10 +175,7 @@ def _path(
     if lane.contact is not None and not exact(plan.scene, lane.state):
         # Of a body at rest place and velocity are known better than the state tells them, where
         # the coordinate is a difference. Its force is that on a free body.
-        rests, place = lane.contact[k] > 0, begin.x
-        for i, stop in enumerate(plan.scene.stops):
-            if stop.coordinate == k:
-                place = jnp.where(lane.contact[k] == to_stop(i), stop.place, place)
+        rests, place = lane.contact[k] > 0, plan.place(k, lane.contact[k], begin.x)
         begin, end = (
             Rates(jnp.where(rests, place, r.x), jnp.where(rests, 0.0, r.v), r.a)
             for r in (begin, end)
@@ -213,7 +212,7 @@ class _Guard(NamedTuple):
     """Of g, for its rounding."""
     coordinate: int | None = None
     """That a stop limits."""
-    lingers: bool = False
+    slack: Scalar | None = None
 
 
 def _stops(scene: AbstractScene, paths: list[Path]) -> list[_Guard]:
@@ -268,7 +267,8 @@ def _section(
     # From the section it rises: it ends the next cycle only once it has been below, where one that
     # is started on the section and falls already is.
     assert lane.below is not None
-    rounding = 1e4 * float(jnp.finfo(end.x.dtype).eps) * scale
+    # On it is also what a search's step left so close to it: a cycle is no shorter.
+    rounding = float(jnp.finfo(end.x.dtype).eps) ** 0.5 * scale
     here = stop_gradient(begin)
     falls = (here.x <= rounding) & (here.v < 0)
     armed = (lane.below > 0) | (here.x < -rounding) | falls
@@ -282,11 +282,12 @@ def _section(
 
 def beyond(event: _Guard | Crossing) -> Flag:
     """Whether a step ends beyond an event. One that begins there to rounding, after the event
-    before, and still falls has not met it: it may end at once, at a turning point."""
+    before, and still falls has not met it: it may end at once, at a turning point. Nor has one that
+    stays there to rounding, as of bodies that touch at rest."""
     begin, end = event.begin, event.end
-    if not event.lingers:
+    if event.slack is None:
         return end.x > 0
-    return (end.x > 0) & ~((begin.v < 0) & (end.v < 0) & (begin.x >= end.x))
+    return (end.x > event.slack) & ~((begin.v < 0) & (end.v < 0) & (begin.x >= end.x))
 
 
 def _seen(
@@ -306,23 +307,24 @@ def _seen(
         # What lies beyond another event was not reached. Events may come together, but for the
         # stops of one coordinate: then one is met after the other.
         alone = guard.coordinate is not None and guard.coordinate == other.coordinate
-        if alone or not other.lingers:
+        if alone or other.slack is None:
             aimed = aimed & ~beyond(other)
         else:
-            aimed = aimed & ((other.end.x <= 16 * eps * other.scale) | ~beyond(other))
+            reached = (other.end.x <= 4 * other.slack) | ~beyond(other)
+            aimed, ends = aimed & reached, ends & reached
     offset, square = landing(end)
     size = stop_gradient(jnp.abs(offset))
     # Two ways of being there to rounding: in place along the path, or, near grazing, in position.
     close = size <= _landing_tolerance(h) * _leniency(lane)
-    there = jnp.abs(end.x) <= 4 * eps * guard.scale
-    close = close | (there & (end.v >= 0))
+    there = (jnp.abs(end.x) <= 4 * eps * guard.scale) & (end.v >= 0)
     real = stop_gradient(square) > 0
-    landed = pin_flag(aimed & close & real, h)
-    again = aimed & ~close & real & (size < 0.25 * h)
-    again = again | ends & there & (end.v > 0)
-    return Crossing(
-        name, guard.kind, guard.number, guard.lingers, begin, end, offset, landed, again
-    )
+    # One that is there may have no way left along a parabola: a body that is at rest on a surface.
+    landed = pin_flag(aimed & (close & real | there), h)
+    again = aimed & ~landed & real & (size < 0.25 * h)
+    # Where bodies touch at rest, what is left of their speed is rounding.
+    rises = end.v > 0 if guard.slack is None else end.v * h > guard.slack
+    again = again | ends & there & close & rises
+    return Crossing(name, guard.kind, guard.number, guard.slack, begin, end, offset, landed, again)
 
 
 def _leniency(lane: Lane) -> Scalar:
@@ -332,6 +334,11 @@ def _leniency(lane: Lane) -> Scalar:
 def _landing_tolerance(x: Scalar) -> float:
     """Largest accepted |δ|: a derivative's error is of its order, the state's of its square."""
     return 1e-9 if x.dtype == jnp.float64 else 1e-4
+
+
+def furthest_landing(x: Scalar) -> float:
+    """Largest |δ| that is believed: one near grazing, or accepted after many aims."""
+    return max(_turn_tolerance(x), 1e3 * _landing_tolerance(x))
 
 
 def _turn_tolerance(x: Scalar) -> float:

@@ -13,14 +13,9 @@ import jax.tree_util as jtu
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
+from ...lanes import CALLS
 from ._coefficients import Coefficient, NoSeries, Series, nth, plus
 from ._recurrences import RULES
-
-_CALLS = {
-    "jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr",
-    "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "remat": "jaxpr",
-    "checkpoint": "jaxpr", "remat2": "jaxpr",
-}  # fmt: skip
 
 
 def expand(
@@ -95,8 +90,8 @@ class _Flow:
         for eqn in jaxpr.eqns:
             operands = [read(a) for a in eqn.invars]
             name = eqn.primitive.name
-            if name in _CALLS:
-                inner = eqn.params[_CALLS[name]]
+            if name in CALLS:
+                inner = eqn.params[CALLS[name]]
                 own = inner if isinstance(inner, Jaxpr) else inner.jaxpr
                 held = [] if isinstance(inner, Jaxpr) else list(inner.consts)
                 names.update(zip(eqn.outvars, self._inline(own, held, operands), strict=True))

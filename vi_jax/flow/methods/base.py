@@ -27,6 +27,12 @@ class AbstractMethod(eqx.Module):
         return False
 
     @property
+    def wander(self) -> Any:
+        """How far the states of a motion that repeats differ from one period to the next (relative
+        to 1 + |state|): by rounding, written 0, where the steps are the same each time."""
+        return 0.0
+
+    @property
     def sees_ahead(self) -> bool:
         """Whether it knows the motion before a step is taken (see `Taylor`)."""
         return False

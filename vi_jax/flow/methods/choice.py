@@ -74,8 +74,8 @@ def chosen(
         return _named(scene, method, argument)
     if not isinstance(method, AbstractMethod):
         raise TypeError(
-            f"Argument `{argument}` must be `Adaptive(...)`, `FixedStep(...)`, `ExactFlight()` or "
-            f"the name of a preset, but got {method!r}."
+            f"Argument `{argument}` must be `Adaptive(...)`, `FixedStep(...)`, `Taylor(...)`, "
+            f"`ExactFlight()` or the name of a preset, but got {method!r}."
         )
     return method
 

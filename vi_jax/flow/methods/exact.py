@@ -54,23 +54,9 @@ class ExactFlight(AbstractMethod):
 
     def check(self, scene):
         """Refuse scenes whose flight has no closed form."""
-        if not isinstance(scene, Scene) or not isinstance(scene.drive, IdealDrive):
-            drive = type(scene.drive if isinstance(scene, Scene) else scene).__name__
-            raise ValueError(
-                "Method `ExactFlight` needs a `Scene` with an `IdealDrive`, but got a "
-                f"`{drive}`. Use `Adaptive` or `FixedStep`."
-            )
-        if not isinstance(scene.crank, CosineCrank):
-            raise ValueError(
-                "Method `ExactFlight` needs a `CosineCrank`, but the scene has a "
-                f"`{type(scene.crank).__name__}`. Use `Adaptive` or `FixedStep`."
-            )
-
-        if scene.soft_stops:
-            raise ValueError(
-                "Method `ExactFlight` needs a scene without soft stops, but it has "
-                f"{len(scene.soft_stops)}. Use `Adaptive` or `FixedStep`."
-            )
+        lack = lack_of_closed_form(scene)
+        if lack is not None:
+            raise ValueError(f"Method `ExactFlight` needs a {lack}. Use `Adaptive` or `FixedStep`.")
 
     def step(self, scene, s0, s1, state, time):
         """The flight from `s0` to `s1`, exact to rounding."""
@@ -80,6 +66,22 @@ class ExactFlight(AbstractMethod):
         phase = scene.phase_at(s0 if in_phase else zeta * s0)
         Y, V = flight(zeta, xi, phase, state.Y, state.V, tau)
         return OscillatorState(Y, V), time, jnp.zeros_like(s0)
+
+
+def lack_of_closed_form(scene: AbstractScene) -> str | None:
+    """What a scene should be for its flight to be the closed form, and what it is instead, in
+    words; `None` if it is that."""
+    if not isinstance(scene, Scene) or not isinstance(scene.drive, IdealDrive):
+        drive = type(scene.drive if isinstance(scene, Scene) else scene).__name__
+        return f"`Scene` with an `IdealDrive`, but got a `{drive}`"
+    crank = type(scene.crank)
+    if not issubclass(crank, CosineCrank) or crank.slide is not CosineCrank.slide:
+        return f"`CosineCrank`, but the scene has a `{crank.__name__}`"
+    if type(scene).field is not Scene.field:
+        return f"`Scene` with its own field, but a `{type(scene).__name__}` has another `field`"
+    if scene.switches:
+        return f"scene without soft stops, but it has {len(scene.switches)}"
+    return None
 
 
 def _numbers(scene: AbstractScene) -> tuple[Scalar, Scalar, bool]:

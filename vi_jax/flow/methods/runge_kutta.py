@@ -72,6 +72,11 @@ class Adaptive(AbstractMethod):
         """True."""
         return True
 
+    @property
+    def wander(self):
+        """Within the tolerances, by which each step is sized anew."""
+        return self.rtol if self.atol is None else jnp.maximum(self.rtol, self.atol)
+
     def longest(self, scene, s, state):
         """As for all methods; of an implicit solver nothing that fades limits it."""
         if self.solver.implicit:

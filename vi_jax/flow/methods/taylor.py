@@ -85,6 +85,11 @@ class Taylor(AbstractMethod):
         """True: events are found before a step is taken."""
         return True
 
+    @property
+    def wander(self):
+        """Within the tolerance, if there is one."""
+        return 0.0 if self.rtol is None else self.rtol
+
     def tighter(self):
         """Twice the steps, or a hundredth of the tolerance."""
         if self.rtol is None:

@@ -1,0 +1,176 @@
+"""Arrays in a state, beside the same machine in a state of numbers."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+from vi_jax.cli.output import cycle_columns
+
+PI = np.pi
+
+
+class Rows(eqx.Module):
+    q: Any
+    v: Any
+
+
+class Numbers(eqx.Module):
+    x: Any
+    y: Any
+    u: Any
+    w: Any
+
+
+def rows(x, y, u, w):
+    return Rows(jnp.stack([x, y]), jnp.stack([u, w]))
+
+
+def one_array(x, y, u, w):
+    return jnp.stack([x, y, u, w])
+
+
+class Chain(vi.AbstractScene):
+    """Two bodies on springs, the first of which is driven against a wall."""
+
+    made: Any = eqx.field(static=True)
+    gap: Any = 0.6
+
+    def parts(self, state):
+        return jnp.concatenate([jnp.atleast_1d(x) for x in jax.tree.leaves(state)])
+
+    def position(self, state):
+        return self.parts(state)[0]
+
+    def velocity(self, state):
+        return self.parts(state)[2]
+
+    def placed(self, state, Y, V):
+        _, y, _, w = self.parts(state)
+        return self.made(Y, y, V, w)
+
+    @property
+    def stops(self):
+        return (vi.RigidStop(self.gap, 0.7),)
+
+    @property
+    def cycle(self):
+        return 2 * PI / 0.8
+
+    def field(self, s, state):
+        x, y, u, w = self.parts(state)
+        force = jnp.cos(0.8 * s) - 0.1 * u
+        return self.made(u, w, force - x + 0.5 * (y - x), -0.1 * w - y + 0.5 * (x - y))
+
+    def start(self):
+        return self.made(*map(jnp.asarray, (0.1, -0.2, 0.3, 0.0)))
+
+
+def table(state):
+    """The numbers of states in a row, one state in a line."""
+    return np.stack([np.asarray(x) for x in jax.tree.leaves(state)], axis=-1)
+
+
+@pytest.fixture(scope="module")
+def plain():
+    machine = Chain(Numbers)
+    return machine, vi.simulate(machine, machine.start(), 3, samples=4, estimate=True)
+
+
+@pytest.mark.parametrize("made", [rows, one_array])
+def test_a_run_is_that_of_numbers(made, plain):
+    machine, wanted = Chain(made), plain[1]
+    run = vi.simulate(machine, machine.start(), 3, samples=4, estimate=True)
+
+    def flat(state):
+        return np.concatenate([np.asarray(x) for x in jax.tree.leaves(state)], axis=-1)
+
+    last = table(wanted.last)
+    assert int(wanted.impacts.sum()) > 2
+    np.testing.assert_allclose(flat(run.last), last, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(flat(run.sections), table(wanted.sections), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(flat(run.samples.state), table(wanted.samples.state), atol=1e-12)
+    data = run.to_xarray()
+    names = ("section_q", "section_v") if made is rows else ("section_state",)
+    assert all(data[name].dims[0] == "section" and data[name].ndim == 2 for name in names)
+    found = np.concatenate([data[name] for name in names], axis=1)
+    np.testing.assert_array_equal(found, flat(run.sections))
+    word = "q[1] = " if made is rows else "[1] = "
+    assert f"{word}{last[1]:.9g}" in str(run)
+    columns = cycle_columns(run)["q[1]" if made is rows else "[1]"]
+    np.testing.assert_array_equal(columns, flat(run.sections)[1:, 1])
+
+
+def test_lanes_beside_each_other(plain):
+    gaps = jnp.asarray([0.5, 0.6, 0.9])
+
+    def last(made):
+        def one(gap):
+            return vi.simulate(Chain(made, gap), Chain(made).start(), 3)
+
+        return vi.jit(jax.vmap(one))(gaps)
+
+    run, wanted = last(rows), table(last(Numbers).last)
+    assert run.last.q.shape == run.last.v.shape == (3, 2)
+    np.testing.assert_allclose(np.concatenate([run.last.q, run.last.v], axis=1), wanted, atol=1e-12)
+    np.testing.assert_allclose(wanted[1], table(plain[1].last), atol=1e-12)
+    assert dict(run.to_xarray(["gap"]).sizes) == {
+        "gap": 3, "section": 4, "q_0": 2, "v_0": 2, "cycle": 3,
+    }  # fmt: skip
+
+
+def test_the_cycle_map_and_its_exponents(plain):
+    machine = Chain(rows)
+    the_map = vi.cycle_map(machine)
+    end = the_map(machine.start())
+    wanted = table(plain[1].sections)[1]
+    np.testing.assert_allclose(np.concatenate([end.q, end.v]), wanted, atol=1e-9)
+    # Damping takes exp(-0.2 T) of the volume, and each impact k².
+    volume = -0.2 * machine.cycle + 2 * np.log(0.7) * int(plain[1].impacts[0])
+    _, grown = np.linalg.slogdet(the_map.jacobian(machine.start()))
+    assert grown == pytest.approx(volume, abs=1e-8)
+    impacts = np.asarray(vi.simulate(machine, machine.start(), 16, settle=200).impacts)
+    assert np.ptp(impacts) == 0
+    found = vi.lyapunov(machine, machine.start(), 16, settle=200)
+    volume = -0.2 * machine.cycle + 2 * np.log(0.7) * impacts[0]
+    assert found.exponents.shape == (4,) and float(found.per_cycle.sum()) == pytest.approx(volume)
+
+
+MACHINE = Chain(rows)
+
+
+@pytest.mark.parametrize(
+    ("argument", "call"),
+    [
+        ("guess", lambda: vi.find_orbit(MACHINE, MACHINE.start())),
+        ("start", lambda: vi.sweep(MACHINE, "gap", [0.5, 0.6])),
+        ("start", lambda: vi.scan(MACHINE, {"gap": [0.5, 0.6]}, progress=False)),
+        ("start", lambda: vi.scan(lambda gap: Chain(rows, gap), {"gap": [0.5, 0.6]})),
+        ("start", lambda: vi.basins(MACHINE, {"start.q": (0.0, 0.1)}, progress=False)),
+    ],
+    ids=["find_orbit", "sweep", "scan", "scan of a function", "basins"],
+)
+def test_verbs_that_take_none_say_so(argument, call):
+    with pytest.raises(ValueError, match=rf"`{argument}` must hold scalars.*its q has shape \(2,"):
+        call()
+
+
+def test_what_is_no_state():
+    empty = Rows(jnp.zeros(2), jnp.zeros((2, 0)))
+    for call in (vi.simulate, vi.find_orbit):
+        with pytest.raises(ValueError, match=r"must hold numbers, but its v has shape \(2, 0\)"):
+            call(MACHINE, empty, 3)
+    many = Numbers(*jnp.zeros((4, 5)))
+
+    class Apart(Chain):
+        def position(self, state):
+            return state.x
+
+        def velocity(self, state):
+            return state.u
+
+    with pytest.raises(ValueError, match=r"`start` must be one state .* shape \(5,\)"):
+        vi.simulate(Apart(Numbers), many, 3)

@@ -1,0 +1,138 @@
+"""Motions that begin or end at rest on a surface, rigid or soft, with no force there yet."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+from scipy.integrate import solve_ivp
+
+
+class Body(vi.AbstractScene):
+    """A body of mass one under a force a + b s + c sin s, with drag."""
+
+    force: Any = eqx.field(converter=lambda x: jnp.asarray(x, float))
+    stops: tuple[vi.RigidStop, ...] = ()
+    soft: tuple[vi.SoftStop, ...] = ()
+    drag: Any = eqx.field(default=0.0, converter=lambda x: jnp.asarray(x, float))
+
+    @property
+    def switches(self):
+        return self.soft
+
+    @property
+    def cycle(self):
+        return 2 * jnp.pi
+
+    def field(self, s, state, *modes):
+        a, b, c = self.force
+        pull = a + b * s + c * jnp.sin(s) - self.drag * state.V
+        for stop, mode in zip(self.soft, modes, strict=True):
+            pull = pull + stop.push(self, state, mode)
+        return vi.OscillatorState(state.V, pull)
+
+
+def at(Y, V):
+    return vi.OscillatorState(jnp.asarray(float(Y)), jnp.asarray(float(V)))
+
+
+@pytest.mark.parametrize("gap", [0.0, 1e-12])
+@pytest.mark.parametrize("force", [(1.0, 0, 0), (0, 0, 1.0), (-1.0, 0, 0)],
+                         ids=["pressed", "about to be", "pulled"])  # fmt: skip
+def test_a_soft_stop_touched_at_rest(gap, force):
+    spring = vi.SoftStop(gap, 50.0, restitution=0.6)
+    body = Body(jnp.asarray(force), soft=(spring,), drag=0.1)
+    run = vi.simulate(body, at(0, 0), 1)
+    damper = float(spring.damping) * np.sqrt(50.0)
+
+    def rate(s, x):
+        a, b, c = force
+        push = 50 * (x[0] - gap) + damper * x[1] if x[0] > gap else 0.0
+        return x[1], a + b * s + c * np.sin(s) - 0.1 * x[1] - push
+
+    truth = solve_ivp(rate, (0, 2 * np.pi), (0, 0), rtol=1e-11, atol=1e-13, max_step=1e-2).y[:, -1]
+    assert bool(run.successful)
+    np.testing.assert_allclose([run.last.Y, run.last.V], truth, atol=1e-6)
+
+
+@pytest.mark.parametrize("restitution", [0.0, 0.3, 0.8])
+def test_a_body_rests_while_the_force_that_will_press_it_on_grows(restitution):
+    """Under sin s it is held for half a cycle, and leaves then."""
+    body = Body(jnp.asarray((0, 0, 1.0)), (vi.RigidStop(0.0, restitution),))
+    run = vi.simulate(body, at(0, 0), 1, event_log=4)
+    assert bool(run.successful) and int(run.impacts[0]) == 0
+    np.testing.assert_allclose([run.last.Y, run.last.V], [-np.pi, -2.0], atol=1e-9)
+    assert vi.EVENTS[run.event_log.kind[0, 0]] == "release"
+    np.testing.assert_allclose(run.event_log.phase[0, 0], np.pi, atol=1e-9)
+
+
+def test_an_impact_without_restitution_as_the_force_turns():
+    """The force is s - 1, the body meets the stop at s = 1: there it stays, by one impact."""
+    speed, place = 0.5 + 0.5, -(0.5 - 1 / 3) - 0.5  # at s = 0, so that it is 0.5 and 0 at s = 1
+    body = Body(jnp.asarray((-1.0, 1.0, 0)), (vi.RigidStop(0.0, 0.0),))
+    run = vi.simulate(body, at(place, speed), 1, impact_log=4)
+    assert bool(run.successful) and int(run.impacts[0]) == 1 and int(run.rests[0]) == 1
+    np.testing.assert_allclose(run.impact_log.speed[0, 0], 0.5, rtol=1e-9)
+    assert float(run.last.Y) == 0.0 and float(run.last.V) == 0.0
+
+
+def test_every_event_is_logged_in_its_order():
+    """A ball pressed for half of each cycle on a stop and let go of; without the log, the same."""
+    body = Body(jnp.asarray((0.3, 0, 1.0)), (vi.RigidStop(0.0, 0.4),), drag=0.1)
+    plain = vi.simulate(body, at(-0.2, 0), 4, impact_log=40)
+    run = vi.simulate(body, at(-0.2, 0), 4, impact_log=40, event_log=60)
+    split = vi.simulate(body, at(-0.2, 0), 4, samples=7, event_log=60)
+    log = run.event_log
+    kinds = np.asarray(log.kind)
+    for i in range(4):
+        count, hits = int(plain.impacts[i]), kinds[i] == 0
+        assert hits.sum() == count and (kinds[i] == 1).sum() == run.rests[i]
+        np.testing.assert_array_equal(log.phase[i, hits], plain.impact_log.phase[i, :count])
+        np.testing.assert_array_equal(log.value[i, hits], plain.impact_log.speed[i, :count])
+        used = kinds[i] >= 0
+        assert (np.diff(log.phase[i, used]) >= 0).all() and used.argmin() == used.sum()
+    # It leaves where the force turns: sin s = -0.3.
+    leaves = np.asarray(log.phase)[kinds == 2]
+    assert run.rests.sum() == len(leaves) > 1
+    np.testing.assert_allclose(leaves, np.pi + np.arcsin(0.3), atol=1e-9)
+    assert (np.asarray(log.number)[kinds >= 0] == 0).all()
+    table = run.to_xarray(along="event").to_dataframe()
+    assert table.event_kind.tolist() == [vi.EVENTS[k] for k in kinds[kinds >= 0]]
+    assert (table.cycle == 1 + np.nonzero(kinds >= 0)[0]).all()
+    np.testing.assert_array_equal(split.event_log.kind, kinds)
+    np.testing.assert_allclose(split.event_log.phase, log.phase, atol=1e-7)
+
+
+class Rubbing(vi.AbstractScene):
+    """A body on a spring and on rough ground."""
+
+    stops: tuple = ()
+
+    @property
+    def switches(self):
+        return (
+            vi.DryFriction(
+                1.0,
+                velocity=lambda machine, x: x.V,
+                force=lambda machine, s, x: -x.Y,
+                stopped=lambda machine, x: vi.OscillatorState(x.Y, jnp.zeros_like(x.V)),
+            ),
+        )
+
+    @property
+    def cycle(self):
+        return 7.0
+
+    def field(self, s, state, mode):
+        return vi.OscillatorState(state.V, -state.Y - self.switches[0].resistance(mode, -state.Y))
+
+
+def test_changes_of_mode_are_logged():
+    """x'' = -x - sgn x': from 4.2 it turns at -2.2, and sticks at 0.2."""
+    run = vi.simulate(Rubbing(), at(4.2, 0), 2, event_log=6)
+    log = run.event_log
+    assert [vi.EVENTS[k] for k in log.kind[0] if k >= 0] == ["mode"] * 2
+    np.testing.assert_allclose(log.phase[0, :2], [np.pi, 2 * np.pi], atol=1e-7)
+    assert log.value[0, :2].tolist() == [1.0, 0.0]

@@ -1,0 +1,134 @@
+"""Numbers of a machine are no part of its programs, however they were written."""
+
+import importlib
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+from vi_jax.scene.numbers import by_name, with_leaf
+
+NUMBERS = [
+    *map(float, np.linspace(1.05, 1.15, 7)),
+    np.float64(1.16),
+    jnp.asarray(1.17),
+    np.array(1.18),
+]
+
+
+class Law(eqx.Module):
+    """A restitution that falls with speed."""
+
+    slope: float
+
+    def __call__(self, approach):
+        return 0.8 / (1 + self.slope * approach)
+
+
+class Shaken(vi.AbstractScene):
+    """A body on a spring under a number of harmonics; the field loops over what is whole."""
+
+    shaking: jax.Array | float = 1.0
+    law: Any = 0.5
+    harmonics: int = 2
+    softening: bool = False
+
+    @property
+    def stops(self):
+        return (vi.RigidStop(1.5, self.law),)
+
+    @property
+    def cycle(self):
+        return 2 * np.pi
+
+    def field(self, s, state):
+        push = sum(self.shaking * jnp.cos(n * s) / n for n in range(1, 1 + self.harmonics))
+        spring = 1.0 if self.softening else 2.0
+        return vi.OscillatorState(state.V, push - 0.3 * state.V - spring * state.Y)
+
+    def start(self):
+        return vi.OscillatorState(jnp.asarray(0.1), jnp.asarray(0.0))
+
+
+MACHINES: dict[str, Callable[[Any], vi.AbstractScene]] = {
+    "own": lambda x: Shaken(shaking=x),
+    "law": lambda x: Shaken(shaking=3.0, law=Law(x)),
+    "pair": lambda x: vi.machines.ImpactPair(half_gap=x, restitution=0.5),
+    "paper": lambda x: vi.Scene.ideal(frequency_ratio=x, damping_ratio=0.1, gap=1.2),
+}
+
+
+@pytest.fixture
+def traces(monkeypatch):
+    """How often each of the verbs was traced."""
+    counts = {"simulate": 0, "find_orbit": 0}
+
+    def counted(verb, module, name):
+        room = importlib.import_module(module)
+        function = getattr(room, name)
+
+        def wrapper(*args, **options):
+            counts[verb] += 1
+            return function(*args, **options)
+
+        monkeypatch.setattr(room, name, wrapper)
+
+    counted("simulate", "vi_jax.flow.simulate", "collect")
+    counted("find_orbit", "vi_jax.orbit.find", "_judged")
+    return counts
+
+
+@pytest.mark.parametrize("name", ["own", "law", "pair", "paper"])
+def test_ten_numbers_are_one_program(traces, name):
+    """From `with_leaf` too, and the same numbers make the same motion."""
+    cycles = 5 + sorted(MACHINES).index(name)  # a program that no other test has
+    found = {}
+    for x in NUMBERS:
+        machine = MACHINES[name](x)
+        found[float(x)] = vi.simulate(machine, machine.start(), cycles).last
+    assert traces["simulate"] == 1
+    first = MACHINES[name](1.0)
+    other = by_name(MACHINES[name](2.0))
+    (changed,) = (n for n, x in by_name(first).items() if float(x) != float(other[n]))
+    again = vi.simulate(with_leaf(first, changed, 1.05), first.start(), cycles).last
+    assert traces["simulate"] == 1
+    np.testing.assert_array_equal(*map(jax.tree.leaves, (again, found[1.05])))
+    assert len({float(jax.tree.leaves(x)[0]) for x in found.values()}) == len(NUMBERS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["own", "pair", "paper"])
+def test_ten_numbers_are_one_program_to_find_orbits(traces, name):
+    for x in NUMBERS:
+        machine = MACHINES[name](x)
+        vi.find_orbit(machine, machine.start(), impact_log=11)  # a program that no other test has
+    assert traces["find_orbit"] == 1
+
+
+def test_what_is_whole_is_a_part_of_the_program(traces):
+    two, three = Shaken(), Shaken(harmonics=3)
+    last = {float(vi.simulate(m, m.start(), 11).last.Y) for m in (two, three)}
+    assert traces["simulate"] == 2 and len(last) == 2
+
+
+def test_a_number_written_as_a_whole_one_is_not_cut_off():
+    machine = with_leaf(Shaken(shaking=1), "shaking", 1.5)
+    same = replace(machine, shaking=1.5)
+    a, b = (vi.simulate(m, m.start(), 11).last.Y for m in (machine, same))
+    assert float(machine.shaking) == 1.5 and float(a) == float(b)
+
+
+def test_derivatives_by_a_number_that_was_a_float():
+    def last(x):
+        machine = Shaken(shaking=x)
+        return vi.simulate(machine, machine.start(), 11).last.Y
+
+    slope = (last(1.05 + 1e-5) - last(1.05 - 1e-5)) / 2e-5
+    np.testing.assert_allclose(jax.grad(last)(1.05), slope, rtol=1e-6)
+    many = jax.vmap(last)(jnp.array([1.05, 1.06]))
+    np.testing.assert_allclose(many, [last(1.05), last(1.06)], rtol=1e-12)

@@ -1,0 +1,150 @@
+"""Lanes that end before their time: each by a reason that names what it is about."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+
+
+class Bounce(vi.AbstractScene):
+    """A body pressed on a stop of any law, and of any kind."""
+
+    law: Any
+    strength: Any = 1.0
+    kind: Any = eqx.field(default=vi.RigidStop, static=True)
+
+    @property
+    def stops(self):
+        return (self.kind(0.0, self.law),)
+
+    @property
+    def cycle(self):
+        return 2 * jnp.pi
+
+    def field(self, s, state):
+        return vi.OscillatorState(state.V, self.strength + 0 * state.V)
+
+
+START = vi.OscillatorState(jnp.asarray(-1.0), jnp.asarray(0.0))
+
+
+class Law(eqx.Module):
+    """k = slow up to the speed of one, fast beyond."""
+
+    slow: Any
+    fast: Any
+
+    def __call__(self, speed):
+        return jnp.where(speed > 1, self.fast, self.slow)
+
+
+def test_a_law_out_of_range_ends_the_lane_that_meets_it():
+    """The body comes at √2, then at √2 times the coefficient."""
+    laws = Law(jnp.array([0.5, 0.5, 1.2, -0.1, 0.5]), jnp.array([0.9, 1.2, 0.5, 1.0, -0.5]))
+    run = jax.vmap(lambda law: vi.simulate(Bounce(law), START, 2))(laws)
+    bad = run.result == vi.RESULTS.bad_impact
+    # The fourth stays above the speed at which its law would fail.
+    assert bad.tolist() == [False, True, True, False, True]
+    assert bool(run.successful[0] & run.successful[3])
+    assert not np.isfinite(run.last.Y[bad]).any()
+
+
+class Faster(vi.RigidStop):
+    """A stop that gives energy."""
+
+    def rebound(self, V):
+        return -1.1 * V
+
+
+def test_a_rebound_of_ones_own_that_gains_energy():
+    assert bool(vi.simulate(Bounce(0.5, kind=Faster), START, 1).result == vi.RESULTS.bad_impact)
+
+
+@pytest.mark.parametrize(
+    ("law", "words"),
+    [
+        (lambda v: 0.9 if v < 1 else 0.1, "`jnp.where`, not `if`"),
+        (lambda v: np.exp(-v), "not with those of `numpy`"),
+        (lambda v: jnp.array([0.1, 0.2]) * v, r"shape \(2,\)"),
+        (lambda v, w: v, "function of the speed of approach"),
+    ],
+)
+def test_a_law_that_is_none(law, words):
+    with pytest.raises(TypeError, match=words):
+        vi.simulate(Bounce(law), START, 1)
+
+
+class Softer(vi.RigidStop):
+    """A stop whose law is its `rebound`."""
+
+    def rebound(self, V):
+        return -0.3 * V
+
+
+def test_rest_and_losses_follow_a_rebound_of_ones_own():
+    """As with 0.3 as the restitution, in which alone they differ."""
+    machines = Bounce(0.9, kind=Softer), Bounce(0.3)
+    own, plain = (vi.simulate(machine, START, 2) for machine in machines)
+    assert own.impacts.tolist() == plain.impacts.tolist() and own.rests.tolist() == [1, 0]
+    np.testing.assert_allclose(own.impact_energy, plain.impact_energy, rtol=1e-12)
+    np.testing.assert_allclose(own.impact_energy.sum(), 1.0, rtol=1e-9)  # all that it fell with
+
+
+class Pushed(vi.AbstractScene):
+    """Forces on both sides of a line point at it."""
+
+    stops: tuple = ()
+
+    @property
+    def switches(self):
+        return (vi.Switch(lambda machine, s, x: x.Y + x.V),)
+
+    @property
+    def cycle(self):
+        return 2 * jnp.pi
+
+    def field(self, s, state, mode):
+        return vi.OscillatorState(state.V, -2.0 * mode + 0.1 * jnp.cos(s))
+
+
+def test_a_sliding_mode_has_its_own_reason():
+    for Y, V in ((1.0, 0.0), (1.0, -1.0)):  # it comes there; it begins there
+        run = vi.simulate(Pushed(), vi.OscillatorState(jnp.asarray(Y), jnp.asarray(V)), 2)
+        assert bool(run.result == vi.RESULTS.sliding)
+        assert "slide" in str(run)
+
+
+class Turned(vi.AbstractScene):
+    """A spring whose body is turned round as each cycle begins."""
+
+    stops: tuple = ()
+
+    @property
+    def cycle(self):
+        return 1.0
+
+    def field(self, s, state):
+        return vi.OscillatorState(state.V, -state.Y)
+
+    def renewed(self, state):
+        return vi.OscillatorState(state.Y, -state.V)
+
+
+def test_a_velocity_that_is_turned_round_as_a_cycle_begins():
+    """Back the way it came: every second section is the first again, the extremes those of arcs."""
+    run = vi.simulate(Turned(), vi.OscillatorState(jnp.asarray(1.0), jnp.asarray(0.5)), 4)
+    first, top = np.arctan2(-0.5, 1.0), np.hypot(1.0, 0.5)
+    places = top * np.cos(first + np.linspace(0, 1, 10001))
+    assert bool(run.successful)
+    np.testing.assert_allclose(run.sections.Y[::2], 1.0, atol=1e-9)
+    np.testing.assert_allclose(run.y_max, top, atol=1e-9)
+    np.testing.assert_allclose(run.y_min, places.min(), atol=1e-9)
+
+
+def test_a_traced_restitution_out_of_range_is_a_bad_start_wherever_its_stop_is_made():
+    run = jax.vmap(lambda k: vi.simulate(Bounce(k), START, 2))(jnp.array([0.5, 1.2, -0.1]))
+    assert (run.result == vi.RESULTS.bad_start).tolist() == [False, True, True]

@@ -1,0 +1,98 @@
+"""What is printed, and shown at the end of a notebook's cell: numbers, units and names."""
+
+import pickle
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+from vi_jax.scene.numbers import by_name
+from vi_jax.scene.units import unit_of
+
+M = vi.machines
+MACHINES = [
+    vi.Scene.ideal(frequency_ratio=0.9, gap=1.25, damping_ratio=0.0625),
+    vi.Parameters(electrical_time=0.01).scene(crank="slider"),
+    M.BouncingBall(), M.ImpactPair(mass_ratio=0.2), M.Duffing(), M.ReliefValve(), M.Capsule(),
+    M.UnbalancedRotor(gap=1.0), vi.SoftStop(1.5, stiffness=30.0), vi.Parameters(),
+]  # fmt: skip
+SCENE = MACHINES[0]
+
+
+@pytest.mark.parametrize("thing", MACHINES, ids=lambda x: type(x).__name__)
+def test_numbers_are_shown_with_their_units(thing):
+    shown = [thing, thing.start()] if isinstance(thing, vi.AbstractScene) else [thing]
+    for x in shown:
+        units = getattr(x, "units", {})
+        text, page = repr(x), x._repr_html_()
+        assert str(x) == text and text.startswith(f"{type(x).__name__}(") and "f64[" not in text
+        for name, number in by_name(x).items():
+            unit = unit_of(units, name)
+            told = f"{float(number):.9g}{'' if unit in ('', '1') else ' ' + unit}"
+            assert f"{name.split('.')[-1]}={told}" in text
+            assert f">{name}</td><td style=text-align:left>{float(number):.9g}</td>" in page
+
+
+def test_what_is_not_known_is_shown_as_before():
+    told = []
+
+    @jax.jit
+    def traced(scene, state):
+        told.extend([repr(scene), str(state), scene._repr_html_(), repr(vi.Oscillator(state.Y))])
+        return vi.simulate(scene, state, 2)
+
+    shapes = jax.eval_shape(traced, SCENE, SCENE.start())
+    assert all("f64[]" in text for text in told)
+    assert "Run(" in repr(shapes) and "RESULTS<unknown>" in repr(shapes)
+    many = vi.Scene.ideal(frequency_ratio=0.9, gap=jnp.linspace(1.0, 2.0, 12))
+    assert "gap=1 … 2 a (12), " in repr(many)
+    assert "gap=[1, 1.5] a, " in repr(vi.Scene.ideal(frequency_ratio=0.9, gap=[1.0, 1.5]))
+
+
+def test_results_are_shown_as_they_print():
+    run = vi.simulate(SCENE, SCENE.start(), 5)
+    assert repr(run) == str(run) and f"V = {float(run.last.V):.9g} a ω" in repr(run)
+    assert f"{float(run.y_max[-1]):.6g}] a" in repr(run)
+    page = run._repr_html_()
+    assert "<table>" in page and "<polyline" in page and f"{float(run.last.Y):.9g}" in page
+    both = jax.tree.map(lambda x: jnp.stack([x, x]), run)
+    assert repr(both) == "Run of 2 lanes (2,), 2 successful" and "2 lanes" in both._repr_html_()
+    rates = vi.Lyapunov(
+        jnp.asarray([0.1, -0.3]), jnp.asarray([0.2, -0.6]), jnp.asarray(0.01), run.last,
+        run.result, unit="ω",
+    )  # fmt: skip
+    assert "0.1, -0.3 ω" in repr(rates) and "0.1, -0.3 ω" in rates._repr_html_()
+    more = jax.tree.map(lambda x: jnp.stack([x, 2 * x]), rates)
+    assert "lanes (2,), 2 successful; greatest: [0.1, 0.2] ω" in repr(more)
+
+
+def test_reasons_print_their_names():
+    def one(gap):
+        scene = vi.Scene.ideal(frequency_ratio=0.9, gap=gap, damping_ratio=0.05)
+        return vi.simulate(scene, scene.start(), 1).result
+
+    found = jax.vmap(one)(jnp.asarray([1.0, -1.0]))
+    assert str(found) == "RESULTS[successful, bad_start]"
+    first = jax.tree.map(lambda x: x[0], found)
+    assert repr(first) == repr(vi.RESULTS.successful) == "RESULTS.successful"
+    assert str(pickle.loads(pickle.dumps(first))) == "RESULTS.successful"
+    np.testing.assert_array_equal(found == vi.RESULTS.bad_start, [False, True])
+    many = jax.tree.map(lambda x: jnp.tile(x, (20, 1)), found)
+    assert str(many) == "RESULTS[20 bad_start, 20 successful; shape (20, 2)]"
+    chosen = jax.jit(lambda x: vi.RESULTS.where(x, vi.RESULTS.stalled, vi.RESULTS.chatter))
+    assert str(chosen(True)) == "RESULTS.stalled" and "chatter" in vi.RESULTS[chosen(False)]
+    told = []
+    jax.jit(lambda x: told.append(str(x)) or x)(first)
+    assert told == ["RESULTS<traced>"] and isinstance(first, vi.RESULTS)
+    assert str(vi.STABILITY.fold) == "STABILITY.fold"
+
+
+@pytest.mark.parametrize("kind", [vi.RESULTS, vi.ORBIT_RESULTS])
+def test_a_misspelt_reason_names_the_near_ones(kind):
+    assert kind[kind.successful] == "" and "successful" in dir(kind)
+    with pytest.raises(AttributeError, match=r"has no member 'succesful'; near names: successful"):
+        _ = kind.succesful
+    with pytest.raises(AttributeError, match="its members: successful, "):
+        _ = kind.xyzzy
+    assert not hasattr(kind, "__wrapped__")

@@ -1,0 +1,81 @@
+"""Ctrl-C ends lanes wherever they run, and lanes that were not run are no success."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+from vi_jax.lanes import machine
+
+SCENE = vi.Scene.ideal(frequency_ratio=0.9)
+
+
+@pytest.mark.parametrize("number", [0, -1, 1025, 10**30])
+def test_threads_are_at_least_one(number):
+    with pytest.raises(ValueError, match="`number` must be from 1 to 1024, but got"):
+        vi.threads(number)
+
+
+@pytest.mark.parametrize("number", [False, True, "a", 1.5, None, jnp.asarray(2)])
+def test_threads_are_a_number(number):
+    with pytest.raises(TypeError, match="`number` must be an integer, but got"):
+        vi.threads(number)
+
+
+def test_two_threads_may_come_to_lanes_first():
+    """What XLA is told to call must stay, whichever of them made it."""
+    script = Path(__file__).with_name("first_use.py")
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["1"]
+
+
+def test_lanes_that_were_not_run_are_no_success(monkeypatch):
+    """Their results would be what the memory held."""
+    lanes = jax.jit(jax.vmap(lambda V: vi.simulate(SCENE, SCENE.start(V=V), 3).impacts))
+    starts = jnp.linspace(0.0, 0.5, 24)
+    whole = np.asarray(lanes(starts))
+    with vi.threads(np.int64(2)):
+        np.testing.assert_array_equal(lanes(starts), whole)
+    monkeypatch.setattr(machine, "thread_count", lambda: 0)
+    with pytest.raises(Exception, match="Not all lanes were run"):
+        np.asarray(lanes(starts))
+    monkeypatch.undo()
+    turn = machine.Work._turn
+    monkeypatch.setattr(
+        machine.Work, "_turn", lambda self: setattr(self.stop, "value", 1) or turn(self)
+    )
+    with pytest.raises(Exception, match="interrupted before all of them had ended"):
+        np.asarray(lanes(starts))
+
+
+def _printed(script, *arguments):
+    done = subprocess.run(
+        [sys.executable, Path(__file__).parent / script, *arguments],
+        capture_output=True, text=True, timeout=300,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done
+
+
+@pytest.mark.parametrize(
+    "ways", [("jit",), pytest.param(("simulate", "vi.jit", "vmap", "grad", "sweep"),
+                                    marks=pytest.mark.slow)],
+)  # fmt: skip
+def test_each_way_into_a_kernel_hears_an_interrupt(ways):
+    done = _printed("interrupted_ways.py", *ways)
+    assert "swallowed" not in done.stderr
+    for line, way in zip(done.stdout.splitlines(), ways, strict=True):
+        name, *seconds = line.split()
+        assert name == way and all(float(s) < 2 for s in seconds), line
+
+
+def test_a_loop_hears_every_interrupt_and_keeps_its_numbers():
+    """Wherever between two instructions it comes, also as XLA calls into Python."""
+    done = _printed("interrupted_loop.py")
+    words = done.stdout.split()
+    assert words[2:] == ["lost", "0", "wrong", "0", "errors", "0"] and int(words[1]) >= 120, words

@@ -1,0 +1,196 @@
+"""Branches of machines without a drive: a walker on its slope, a body on a belt."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
+
+from rimless_wheel import MULTIPLIER, Wheel
+
+
+class Legs(eqx.Module):
+    """Angles of the leg that stands and between both, with their rates."""
+
+    stance: jax.Array
+    turning: jax.Array
+    between: jax.Array
+    swinging: jax.Array
+
+
+class Walker(vi.AbstractScene):
+    """The simplest walker (Garcia, Chatterjee, Ruina and Coleman, J. Biomech. Eng. 120, 1998): a
+    cycle ends with the heel strike, after which the legs change their parts."""
+
+    slope: jax.Array = eqx.field(converter=jnp.asarray)
+    stops: tuple = ()
+
+    @property
+    def cycle(self):
+        return 4.0
+
+    def section(self, x):
+        return x.between - 2 * x.stance
+
+    def renewed(self, x):
+        stance, turning = -x.stance, x.turning * jnp.cos(2 * x.stance)
+        return Legs(stance, turning, 2 * stance, turning * (1 - jnp.cos(2 * stance)))
+
+    def field(self, s, x):
+        falls = jnp.sin(x.stance - self.slope)
+        pull = (x.turning**2 - jnp.cos(x.stance - self.slope)) * jnp.sin(x.between)
+        return Legs(x.turning, falls, x.swinging, falls + pull)
+
+    def position(self, x):
+        return x.stance
+
+    def velocity(self, x):
+        return x.turning
+
+
+def legs(stance, turning):
+    swinging = turning * (1 - np.cos(2 * stance))
+    return Legs(*map(jnp.asarray, (stance, turning, 2 * stance, swinging)))
+
+
+def strode(slope, stance, turning):
+    """The next step of a walker, by SciPy."""
+
+    def field(_, x):
+        falls = np.sin(x[0] - slope)
+        pull = (x[1] ** 2 - np.cos(x[0] - slope)) * np.sin(x[2])
+        return [x[1], falls, x[3], falls + pull]
+
+    def strikes(_, x):
+        return x[2] - 2 * x[0]
+
+    strikes.terminal, strikes.direction = True, 1
+    options = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-14}
+    x = [stance, turning, 2 * stance, turning * (1 - np.cos(2 * stance))]
+    x = solve_ivp(field, (0, 1), x, **options).y[:, -1]  # past the start, which is on the section
+    x = solve_ivp(field, (1, 10), x, events=strikes, **options).y[:, -1]
+    return np.array([-x[0], x[1] * np.cos(2 * x[0])])
+
+
+@pytest.mark.slow
+def test_a_walker_doubles_its_step():
+    """On a branch whose cycles begin with a jump of the first coordinate."""
+    orbit = vi.find_orbit(Walker(0.009), legs(0.2003, -0.1998))
+    assert float(orbit.duration) == pytest.approx(3.88246375285, abs=1e-9)
+    branch = vi.continue_orbit(orbit, parameter="slope", bounds=(0.008, 0.017))
+    stance = np.array([float(branch.orbit(i).state.stance) for i in (0, -1)])
+    np.testing.assert_allclose(branch.y_min[[0, -1]], -stance, atol=1e-12)
+    np.testing.assert_allclose(branch.y_max[[0, -1]], stance, atol=1e-12)
+    (doubling,) = branch.special
+    assert doubling.kind == "period-doubling"
+    at = [float(doubling.orbit.state.stance), float(doubling.orbit.state.turning)]
+    np.testing.assert_allclose(strode(doubling.parameter, *at), at, atol=1e-10)
+    h = 2e-6
+    ends = [[strode(doubling.parameter, *(np.array(at) + sign * h * e)) for sign in (1, -1)]
+            for e in np.eye(2)]  # fmt: skip
+    jacobian = np.array([(up - down) / (2 * h) for up, down in ends]).T
+    assert np.linalg.eigvals(jacobian).real.min() == pytest.approx(-1, abs=3e-7)
+
+
+class Belt(vi.AbstractScene):
+    """A body on a spring, on a belt whose friction falls with the speed of sliding; a cycle ends
+    where the body is farthest back."""
+
+    speed: jax.Array = eqx.field(converter=jnp.asarray)
+    stops: tuple = ()
+
+    @property
+    def cycle(self):
+        return 2 * np.pi
+
+    @property
+    def switches(self):
+        return (vi.DryFriction(1.0, velocity=_sliding, force=_pull, stopped=_stuck),)
+
+    def section(self, x):
+        return x.V
+
+    def field(self, s, x, mode):
+        rub = mode * (0.5 + 0.5 * jnp.exp(-2 * jnp.abs(_sliding(self, x))))
+        return vi.OscillatorState(x.V, jnp.where(mode == 0, 0.0, _pull(self, s, x) - rub))
+
+
+def _sliding(machine, x):
+    return x.V - machine.speed
+
+
+def _pull(machine, s, x):
+    return -x.Y - 0.1 * x.V
+
+
+def _stuck(machine, x):
+    return vi.OscillatorState(x.Y, machine.speed + 0 * x.V)
+
+
+def on_belt(Y, V=0.0):
+    return vi.OscillatorState(jnp.asarray(Y), jnp.asarray(V))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("start", [0.5249 - 1.1748, 0.5249 - 1.17])
+def test_a_cycle_shrinks_to_rest_where_its_equilibrium_turns_stable(start):
+    """Friction pushes with 0.5 + 0.5 exp(-2v) where the body stands; its slope, exp(-2v), is the
+    damping 0.1 at v = ½ ln 10."""
+    orbit = vi.find_orbit(Belt(1.5), on_belt(start))
+    branch = vi.continue_orbit(orbit, parameter="speed", bounds=(1.1, 1.9))
+    assert branch.ends == ("hopf", "grazing")
+    hopf = branch.special[0]
+    assert hopf.kind == "hopf"
+    assert hopf.parameter == pytest.approx(0.5 * np.log(10), abs=1e-13)
+    assert float(hopf.orbit.state.Y) == pytest.approx(0.55, abs=1e-5)
+    assert float(hopf.orbit.duration) == pytest.approx(2 * np.pi, abs=1e-12)
+    assert abs(hopf.orbit.multipliers[0]) == pytest.approx(1, abs=1e-6)
+
+
+def short_of_belt(speed):
+    """By how much a body that the belt has just let go misses the belt's speed when it is next as
+    fast as it gets, by SciPy."""
+
+    def field(_, x):
+        return [x[1], -x[0] - 0.1 * x[1] + 0.5 + 0.5 * np.exp(-2 * abs(speed - x[1]))]
+
+    def turns(t, x):
+        return field(t, x)[1]
+
+    turns.terminal, turns.direction = True, -1
+    options = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-14}
+    x = solve_ivp(field, (0, 1), [1 - 0.1 * speed, speed], **options).y[:, -1]
+    return solve_ivp(field, (1, 30), x, events=turns, **options).y[1, -1] - speed
+
+
+class Ahead(Belt):
+    """Observed where the body is farthest ahead."""
+
+    def section(self, x):
+        return -x.V
+
+
+@pytest.mark.slow
+def test_cycles_with_sticking_end_where_the_belt_is_only_just_reached():
+    """Wherever the branch begins and whatever its steps; and so do those that only slide."""
+    ending = brentq(short_of_belt, 1.7, 1.9, xtol=1e-13)
+    sticking = vi.simulate(Ahead(1.5), on_belt(0.0, 1.5), 1, settle=40).last
+    for start in (sticking, on_belt(0.5249 + 1.1748)):
+        orbit = vi.find_orbit(Ahead(1.5), start)
+        for bounds, max_step in (((1.3, 1.9), 0.1), ((1.3, 1.9), 0.03), ((0.05, 2.0), 0.1)):
+            branch = vi.continue_orbit(orbit, parameter="speed", bounds=bounds, max_step=max_step)
+            assert branch.ends[1] == "grazing"
+            assert branch.parameter[-1] == pytest.approx(ending, abs=1e-10)
+
+
+@pytest.mark.slow
+def test_a_branch_towards_a_homoclinic_motion_ends_before_its_steps_are_too_long():
+    """A rimless wheel on ever gentler slopes comes to rest upright in the end."""
+    wheel = Wheel()
+    orbit = vi.find_orbit(wheel, vi.simulate(wheel, wheel.start(), 40).last)
+    branch = vi.continue_orbit(orbit, parameter="slope", bounds=(0.02, 0.2))
+    assert branch.ends == ("long", "bounds") and 0.0289 < branch.parameter.min() < 0.03
+    np.testing.assert_allclose(np.abs(branch.multipliers[:, 0]), MULTIPLIER, atol=1e-10)

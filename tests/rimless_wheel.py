@@ -1,0 +1,37 @@
+"""A rimless wheel that walks down a slope, for the tests of several rooms."""
+
+import jax.numpy as jnp
+import numpy as np
+import vi_jax as vi
+
+ALPHA = 0.3
+"""Half the angle between two spokes."""
+
+MULTIPLIER = np.cos(2 * ALPHA) ** 2
+"""Of its step, at any slope: what a heel strike leaves of the energy."""
+
+
+class Wheel(vi.AbstractScene):
+    """An inverted pendulum; a step ends where the next spoke comes down."""
+
+    slope: float = 0.08
+    stops: tuple = ()
+
+    @property
+    def cycle(self):
+        return 1.4
+
+    def section(self, state):
+        return state.Y - self.slope - ALPHA
+
+    def renewed(self, state):
+        return vi.OscillatorState(state.Y - 2 * ALPHA, jnp.cos(2 * ALPHA) * state.V)
+
+    def field(self, s, state):
+        return vi.OscillatorState(state.V, jnp.sin(state.Y))
+
+    def start(self):
+        return vi.OscillatorState(jnp.array(self.slope - ALPHA), jnp.array(0.5))
+
+    def observed_every(self, interval):
+        return self

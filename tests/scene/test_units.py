@@ -1,0 +1,115 @@
+"""Numbers are told in the units of their machine, which states them; nothing is the paper's."""
+
+import jax
+import jax.numpy as jnp
+import matplotlib
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+import vi_jax as vi
+from vi_jax.scan.grid import Blocks
+from vi_jax.scan.job import make_job
+from vi_jax.scan.scan import variables_of
+from vi_jax.scene.numbers import leaf_names
+from vi_jax.scene.units import unit_of
+
+from differences import quick
+
+matplotlib.use("Agg")
+M = vi.machines
+
+# Of each machine: what the position is called, and the units of position, velocity and exponents,
+# as its class says.
+MACHINES = {
+    "paper": (vi.Scene.ideal(frequency_ratio=0.9, damping_ratio=0.05), "Y", "a", "a ω", "ω"),
+    "ball": (M.BouncingBall(), "height", "g/ω²", "g/ω", "ω"),
+    "pair": (M.ImpactPair(), "place in the box", "a", "a ω", "ω"),
+    "free pair": (M.ImpactPair(mass_ratio=0.2), "place in the box", "a", "a ω", "ω"),
+    "duffing": (M.Duffing(), "x", "1", "1", "1"),
+    "valve": (M.ReliefValve(interval=1.5), "lift", "1", "1", "1"),
+    "capsule": (M.Capsule(), "place in the capsule", "F/k", "F/√(k m)", "√(k/m)"),
+    "rotor": (M.UnbalancedRotor(gap=1.0), "Y", "m r/M", "m r ω/M", "ω"),
+}
+
+
+def zeros(call):
+    """What a call would return, computed from nothing."""
+    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(call))
+
+
+@pytest.fixture(params=MACHINES)
+def case(request):
+    return MACHINES[request.param]
+
+
+def test_every_number_has_a_unit(case):
+    machine, _, position, velocity, rate = case
+    units, start = machine.units, machine.start()
+    for name, unit in (("position", position), ("velocity", velocity), ("rate", rate)):
+        assert unit_of(units, name) == unit
+    for name in (*leaf_names(machine), *leaf_names(start), "time", "energy", "power"):
+        assert unit_of(units, name)
+    # The components that are position and velocity are in the units of these.
+    names = leaf_names(start)
+    probe = jax.tree.unflatten(jax.tree.structure(start), list(jnp.arange(float(len(names)))))
+    assert unit_of(units, names[int(machine.position(probe))]) == position
+    assert unit_of(units, names[int(machine.velocity(probe))]) == velocity
+
+
+@pytest.mark.parametrize("name", quick(MACHINES, "capsule"))
+def test_runs_and_rates_say_their_units(name):
+    machine, _, position, _, rate = MACHINES[name]
+    run = jax.eval_shape(lambda: vi.simulate(machine, machine.start(), 2, impact_log=2))
+    assert unit_of(dict(run.units), "position") == position
+    found = zeros(lambda: vi.lyapunov(machine, machine.start(), 8, settle=0, number=1))
+    assert found.unit == rate
+    assert f"0{'' if rate == '1' else ' ' + rate} (halves" in str(found)
+
+
+def test_scans_and_sweeps_say_their_units(case):
+    machine, called, position, velocity, rate = case
+    name, start = leaf_names(machine)[0], leaf_names(machine.start())[0]
+    axes = {name: np.linspace(0.5, 0.6, 2), f"start.{start}": np.linspace(0.1, 0.2, 2)}
+    job = make_job(machine, tuple(axes), measure=("extremes", "power", "sections", "exponent"))
+    found = variables_of(job, Blocks(axes, 4, paired=False))
+    assert found["y_min"].attributes["units"] == found["y_max"].attributes["units"] == position
+    assert found["impact_speed"].attributes["units"] == velocity
+    assert found["exponent"].attributes["units"] == rate
+    assert found["power"].attributes["units"] == machine.units.get("power", "1")
+    assert found[start].attributes["units"] == unit_of(machine.units, start)
+    values = jnp.linspace(0.5, 0.6, 3)
+    ax = vi.plot_sweep(zeros(lambda: vi.sweep(machine, name, values, settle=0, cycles=4)))
+    wanted = "" if position == "1" else f" ({position})"
+    assert ax.get_ylabel() == f"min {called}{wanted}"
+    plt.close("all")
+
+
+def test_a_machine_that_states_nothing_is_told_without_units():
+    class Own(vi.AbstractScene):
+        gap: float = 0.5
+
+        @property
+        def stops(self):
+            return (vi.RigidStop(self.gap, 0.6),)
+
+        @property
+        def cycle(self):
+            return 2 * np.pi
+
+        @property
+        def labels(self):
+            return "lift (mm)", "speed (mm/s)"
+
+        def field(self, s, x):
+            return vi.OscillatorState(x.V, jnp.cos(s) - x.Y)
+
+    start = vi.OscillatorState(jnp.asarray(0.0), jnp.asarray(0.1))
+    data = vi.scan(
+        Own(), {"gap": [0.5, 0.6], "start.V": [0.1]}, start=start, settle=0, cycles=2,
+        measure="extremes", progress=False,
+    )  # fmt: skip
+    assert data.y_min.attrs["units"] == "mm" and data.impact_speed.attrs["units"] == "mm/s"
+    assert "units" not in data["gap"].attrs and "units" not in data["start.V"].attrs
+    run = vi.simulate(Own(), start, 2)
+    assert "lift in [" in str(run) and str(run).count(" mm\n") == 1 and " a" not in str(run)[90:]
+    assert run.to_xarray().impact_speed.attrs["units"] == "mm/s"

@@ -1,0 +1,159 @@
+"""What is checked of a machine that a user wrote, in words that name it."""
+
+import contextlib
+import functools
+import inspect
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from .._numbers import warn
+from ..scene import AbstractScene
+from ._by_numpy import by_numpy
+from .moving import begin_modes
+
+Scalar = Float[Array, ""]
+
+_NO_NUMBERS = (
+    jax.errors.ConcretizationTypeError,
+    jax.errors.TracerArrayConversionError,
+    jax.errors.TracerIntegerConversionError,
+)
+
+# A field that differs by more than this at the ends of its cycle has another period; with a period
+# of five digits it differs by less.
+_APART = 1e-4
+
+
+def check_field(scene: AbstractScene, s: Scalar, state: Any, modes: tuple[Scalar, ...]) -> None:
+    """**Raises:** `TypeError` for a field (or a section) that cannot be traced, takes other
+    arguments or returns no state; while the loop is traced, and at no cost where it runs."""
+    whose = f"`field` of a {type(scene).__name__}"
+    _check_arguments(scene, whose, s, state, modes)
+    try:
+        with _in_words(whose):
+            flow = jax.eval_shape(scene.field, s, state, *modes)
+    except (AttributeError, TypeError, LookupError):
+        if _runs(scene.field, state, s, *modes):
+            raise TypeError(
+                f"{whose} must take `s` first and then the state, but takes them the other way "
+                "round."
+            ) from None
+        raise
+    wanted, got = (jtu.tree_map(jnp.shape, x) for x in (state, flow))
+    if jtu.tree_structure(state) != jtu.tree_structure(flow) or wanted != got:
+        raise TypeError(
+            f"{whose} must return what is like its state, {_in_short(state)}, but returned "
+            f"{_in_short(flow)}."
+        )
+    with _in_words(f"`section` of a {type(scene).__name__}"):
+        jax.eval_shape(scene.section, state)
+
+
+def _in_short(tree: Any) -> str:
+    """The structure of a tree, with types and shapes for numbers."""
+    tree = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), tree)
+    return eqx.tree_pformat(tree, width=1000)
+
+
+def _check_arguments(scene: AbstractScene, whose: str, s: Scalar, state: Any, modes: Any) -> None:
+    try:
+        inspect.signature(scene.field).bind(s, state, *modes)
+    except TypeError as error:
+        more = f" and the mode of each of its {len(modes)} switches" if modes else ""
+        raise TypeError(f"{whose} must take `s`, the state{more}: {error}.") from None
+
+
+def _runs(function: Callable[..., Any], *arguments: Any) -> bool:
+    try:
+        jax.eval_shape(function, *arguments)
+    except Exception:
+        return False
+    return True
+
+
+@contextlib.contextmanager
+def _in_words(whose: str) -> Iterator[None]:
+    """JAX's errors about traced numbers as one sentence that says what to write instead."""
+    try:
+        yield
+    except jax.errors.TracerBoolConversionError as error:
+        raise TypeError(
+            f"{whose} must be written for numbers that are traced: `jnp.where`, not `if`."
+        ) from error
+    except _NO_NUMBERS as error:
+        raise TypeError(
+            f"{whose} must be written for numbers that are traced: with the functions of "
+            "`jax.numpy`, not with those of `numpy` or `math`, `float` or `int`."
+        ) from error
+
+
+def check_laws(scene: AbstractScene, speed: Scalar) -> None:
+    """**Raises:** `TypeError` for a restitution law that cannot be traced or gives no number; as
+    `check_field`."""
+    for i, stop in enumerate(scene.stops):
+        if stop.is_one_number:
+            continue
+        whose = f"The restitution law of stop {i} of a {type(scene).__name__}"
+        try:
+            with _in_words(whose):
+                got = jax.eval_shape(stop.rebound, speed)
+        except TypeError as error:
+            if str(error).startswith(whose):
+                raise
+            raise TypeError(
+                f"{whose} must be a function of the speed of approach that returns a number in "
+                f"[0, 1], but: {error}"
+            ) from error
+        if jnp.shape(got) != ():
+            raise TypeError(
+                f"{whose} must return one number, but gives an array of shape {got.shape}."
+            )
+
+
+def check_period(scene: AbstractScene, start: Any) -> None:
+    """Warn once of a field that is not the same at both ends of its cycle.
+
+    Machines whose numbers are traced are not looked at, nor are ours, nor those whose cycles
+    something else than `s` counts.
+    """
+    kind, numbers = type(scene), jtu.tree_leaves((scene, start))
+    counts = kind.section is AbstractScene.section and kind.clock is AbstractScene.clock
+    ours = kind.__module__.partition(".")[0] == __name__.partition(".")[0]
+    if ours or not counts or any(isinstance(x, Tracer) for x in numbers):
+        return
+    try:
+        cycle, *ends = by_numpy(_ends, scene, start)
+        each = list(zip(jtu.tree_leaves_with_path(start), *ends, strict=True))
+    except Exception:  # told in words where the field is traced
+        return
+    for (path, _), first, last in each:
+        apart = np.max(abs(first - last) / (1e-3 + abs(first) + abs(last)))
+        if apart > _APART:
+            _warn_of_period(kind, jtu.keystr(path).lstrip("."), cycle.item())
+            return
+
+
+def _ends(scene: AbstractScene, start: Any) -> tuple[Any, list[Any], list[Any]]:
+    """The cycle, and the field where it begins and where it ends, in one state."""
+    zero = jnp.zeros_like(scene.position(start))
+    modes = begin_modes(scene, zero, start)
+    cycle = zero + scene.cycle
+    first, last = (scene.field(s, start, *modes) for s in (zero, cycle))
+    return cycle, jtu.tree_leaves(first), jtu.tree_leaves(last)
+
+
+@functools.lru_cache(maxsize=64)
+def _warn_of_period(kind: type, name: str, cycle: float) -> None:
+    warn(
+        f"The `field` of a {kind.__name__} is not the same at `s` = 0 and at `s` = `cycle` = "
+        f"{cycle:.6g}: the rate of its {name} differs. `s` begins again from 0 with each cycle, so "
+        "that `cycle` must be a period of the field, unless it is meant to jump there."
+    )

@@ -1,0 +1,130 @@
+"""Why a lane ends before its time: by what its steps come to, or by an event that has no answer."""
+
+from typing import Any
+
+import jax.numpy as jnp
+from jax.lax import stop_gradient
+from jaxtyping import Array, Bool, Float
+
+from ...scene import AbstractScene, RigidStop
+from .. import results
+from .._lane import SECTION, Lane, Plan, Record, to_switch, total
+from ..events import guard_rates
+from ..moving import in_modes
+from .trial import Trial
+
+Scalar = Float[Array, ""]
+Flag = Bool[Array, ""]
+
+# A lane that has aimed this often without landing is lost; after so many impacts in one interval
+# it was chattering.
+_LOST, _MANY = 64.0, 16.0
+
+# Nothing that a lane could do in one interval takes so many steps.
+_STUCK = 65536.0
+
+# By so many roundings a rebound may be faster than the approach. By this share another contact's
+# speed may change, and it is none if it has no more of the speed of the impact.
+_FASTER, _ROUNDING = 16.0, 1e-6
+
+
+def faults(
+    plan: Plan,
+    lane: Lane,
+    trial: Trial,
+    rejected: Flag,
+    length: Scalar,
+    record: Record,
+    steps: Scalar,
+    spent: Scalar,
+    aims: Scalar,
+    target: Scalar,
+) -> list[tuple[Flag, Any]]:
+    """What ends a lane, the first that holds being the reason."""
+    broken = results.NOT_FINITE
+    if plan.scene.alive(trial.state) is not None:
+        # A clock that breaks down makes the steps shrink to nothing.
+        broken = results.STALLED
+    ends = [
+        (record.impacts > plan.max_impacts, float(results.CHATTER)),
+        (((aims >= _LOST) | (spent >= _STUCK)) & (record.impacts > _MANY), float(results.CHATTER)),
+        (aims >= _LOST, _lost(plan, lane, target)),
+        (steps >= plan.max_steps, float(results.MAX_STEPS)),
+        (spent >= _STUCK, float(results.MAX_STEPS)),
+    ]
+    if not plan.method.adaptive:
+        return [(rejected, float(broken)), *ends]
+    eps = float(jnp.finfo(length.dtype).eps)
+    gone = rejected & (length < 4 * eps * jnp.maximum(1.0, plan.scene.cycle))
+    numeric = jnp.isfinite(total(trial.state, length))
+    tiny = results.UNDERFLOW if broken == results.NOT_FINITE else broken
+    return [(gone & ~numeric, float(broken)), (gone, float(tiny)), *ends]
+
+
+def _lost(plan: Plan, lane: Lane, target: Scalar) -> Scalar | float:
+    """The reason of a lane that has aimed too often, by what it aimed at."""
+    scene, reason = plan.scene, float(results.UNRESOLVED)
+    if plan.motion or scene.stops:
+        reason = jnp.where(target < SECTION, float(results.TURN_UNRESOLVED), reason)
+    if not plan.ticks(lane.state):
+        reason = jnp.where(target == SECTION, float(results.SECTION_UNRESOLVED), reason)
+    if scene.switches:
+        reason = jnp.where(target >= to_switch(0), float(results.SWITCH_UNRESOLVED), reason)
+    return reason
+
+
+def may_end(scene: AbstractScene) -> bool:
+    """Whether an event may end a lane; static."""
+    laws = any(not stop.is_one_number for stop in scene.stops)
+    slides = any(switch.may_slide for switch in scene.switches)
+    return laws or slides or (bool(scene.stops) and len(scene.coordinates) > 1)
+
+
+def gains(stop: RigidStop, approach: Scalar, rebound: Scalar) -> Flag | None:
+    """Whether an impact leaves faster than it came, or goes on into the stop; `None` where the law
+    is one number, whose range is known."""
+    if stop.is_one_number:
+        return None
+    leaves = stop_gradient(-stop.sign * rebound)
+    most = (1 + _FASTER * float(jnp.finfo(leaves.dtype).eps)) * stop_gradient(approach)
+    return ~((leaves >= 0) & (leaves <= most))
+
+
+def undecided(scene: AbstractScene, i: int, there: Any, struck: Any) -> Flag | None:
+    """Whether stop number i is struck at the instant at which another is, whose approach changes by
+    it: what follows then depends on which goes first.
+
+    **Arguments:** the states before and after the impact.
+    """
+    stop, found = scene.stops[i], None
+    speed = stop_gradient(stop.approach(scene.coordinates[stop.coordinate].velocity(there)))
+    for other in scene.stops:
+        if other.coordinate == stop.coordinate:
+            continue
+        body = scene.coordinates[other.coordinate]
+        depth = stop_gradient(other.beyond(body.position(there)))
+        before, after = (stop_gradient(other.approach(body.velocity(x))) for x in (there, struck))
+        slack = 256 * float(jnp.finfo(depth.dtype).eps) * (1 + jnp.abs(stop_gradient(other.gap)))
+        together = (jnp.abs(depth) <= slack) & (before > _ROUNDING * speed)
+        together = together & (jnp.abs(after - before) > _ROUNDING * before)
+        found = together if found is None else found | together
+    return found
+
+
+def comes_back(scene: AbstractScene, j: int, modes: tuple, s: Scalar, state: Any) -> Flag | None:
+    """Whether the field behind switch number j points back at its surface, as that before it did:
+    the motion would slide along it. `None` for a kind of switch whose motion cannot.
+
+    **Arguments:** the modes, s and the state behind the event.
+    """
+    switch = scene.switches[j]
+    if not switch.may_slide:
+        return None
+    machine = in_modes(scene, modes)
+
+    def guard(s: Scalar, state: Any) -> Scalar:
+        return switch.guard(scene, s, state, modes[j])
+
+    here = stop_gradient(guard_rates(machine.field, guard, s, state))
+    slack = 1e4 * float(jnp.finfo(s.dtype).eps) * (1 + jnp.abs(here.v))
+    return (jnp.abs(here.x) <= slack) & (here.v > slack)

@@ -1,0 +1,39 @@
+"""What is listed of the events that a lane has met."""
+
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from .._lane import Plan
+
+Scalar = Float[Array, ""]
+Flag = Bool[Array, ""]
+
+
+def clock_at(plan: Plan, s: Scalar, state: Any) -> Scalar:
+    """What counts the cycles, `s` itself or the machine's clock."""
+    clock = plan.scene.clock(state)
+    return s if clock is None else clock
+
+
+def logged(log: Any, hit: Flag, place: Scalar, clock: Scalar, approach: Scalar, stop: int) -> Any:
+    """The log with this impact, the `place`-th of its interval."""
+    if log is None:
+        return None
+    return _written(log, hit, place, clock, approach, stop)
+
+
+def noted(events: Any, when: Flag, clock: Scalar, kind: float, number: Any, value: Any) -> Any:
+    """The log of all events with this one behind those that it holds, if there is room."""
+    if events is None:
+        return None
+    place = jnp.sum(jnp.where(jnp.isnan(events[1]), 0.0, 1.0))
+    return _written(events, when, place, clock, kind, number, value)
+
+
+def _written(log: Any, when: Flag, place: Scalar, *entry: Any) -> Any:
+    """A log with an entry at this place, if it has one."""
+    here = when & (jnp.arange(log.shape[1], dtype=log.dtype) == place)
+    column = jnp.stack([jnp.asarray(x, log.dtype) for x in entry])
+    return jnp.where(here, column[:, None], log)

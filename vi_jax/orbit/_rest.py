@@ -1,0 +1,32 @@
+"""Whether a periodic motion rests on a stop, of which the equations of its impacts know nothing."""
+
+import numpy as np
+
+from ..flow import simulate
+from .results import Orbit
+
+
+def rests(orbit: Orbit) -> bool:
+    """Whether a body rests on a stop in the course of a motion, or all the time."""
+    return orbit.scene.may_rest() and _forgets(orbit) and (_rests_now(orbit) or _comes_to(orbit))
+
+
+def _forgets(orbit: Orbit) -> bool:
+    """Whether a multiplier is 0, as it is after a rest: only then the motion need be looked at."""
+    multipliers = np.abs(np.asarray(orbit.multipliers))
+    return bool(multipliers.min() < np.sqrt(np.finfo(multipliers.dtype).eps))
+
+
+def _rests_now(orbit: Orbit) -> bool:
+    """Whether a body lies still on a stop on the section."""
+    for stop in orbit.scene.stops:
+        body = orbit.scene.coordinates[stop.coordinate]
+        if stop.beyond(body.position(orbit.state)) >= 0 and body.velocity(orbit.state) == 0:
+            return True
+    return False
+
+
+def _comes_to(orbit: Orbit) -> bool:
+    """Whether a body comes to rest within the period."""
+    run = simulate(orbit.scene, orbit.state, int(orbit.cycles), method=orbit.method)
+    return run.rests is not None and bool(run.rests.sum() > 0)
