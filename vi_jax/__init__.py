@@ -60,7 +60,9 @@ from .scan import basins as basins
 from .scan import lyapunov as lyapunov
 from .scan import scan as scan
 from .scan import sweep as sweep
+from .scene import AbstractContactLaw as AbstractContactLaw
 from .scene import AbstractCrank as AbstractCrank
+from .scene import AbstractDrive as AbstractDrive
 from .scene import AbstractScene as AbstractScene
 from .scene import AbstractSwitch as AbstractSwitch
 from .scene import Coordinate as Coordinate
@@ -68,12 +70,14 @@ from .scene import CosineCrank as CosineCrank
 from .scene import DCMotor as DCMotor
 from .scene import DCMotorState as DCMotorState
 from .scene import DryFriction as DryFriction
+from .scene import HuntCrossley as HuntCrossley
 from .scene import IdealDrive as IdealDrive
 from .scene import Motor as Motor
 from .scene import MotorState as MotorState
 from .scene import Oscillator as Oscillator
 from .scene import OscillatorState as OscillatorState
 from .scene import Parameters as Parameters
+from .scene import PowerLaw as PowerLaw
 from .scene import RigidStop as RigidStop
 from .scene import Scene as Scene
 from .scene import SliderCrank as SliderCrank

@@ -30,7 +30,7 @@ class Body(vi.AbstractScene):
         a, b, c = self.force
         pull = a + b * s + c * jnp.sin(s) - self.drag * state.V
         for stop, mode in zip(self.soft, modes, strict=True):
-            pull = pull + stop.push(self, state, mode)
+            pull = pull + stop.contribution(self, s, state, mode)
         return vi.OscillatorState(state.V, pull)
 
 
@@ -126,7 +126,9 @@ class Rubbing(vi.AbstractScene):
         return 7.0
 
     def field(self, s, state, mode):
-        return vi.OscillatorState(state.V, -state.Y - self.switches[0].resistance(mode, -state.Y))
+        return vi.OscillatorState(
+            state.V, -state.Y + self.switches[0].contribution(self, s, state, mode)
+        )
 
 
 def test_changes_of_mode_are_logged():

@@ -108,7 +108,9 @@ class Belt(vi.AbstractScene):
 
     def field(self, s, state, mode):
         pull = self.pull(state)
-        return vi.OscillatorState(state.V, pull - self.switches[0].resistance(mode, pull))
+        return vi.OscillatorState(
+            state.V, pull + self.switches[0].contribution(self, s, state, mode)
+        )
 
     def start(self):
         return vi.OscillatorState(jnp.array(0.0), jnp.array(0.0))
@@ -147,7 +149,7 @@ class Block(vi.AbstractScene):
 
     def field(self, s, state, mode):
         pull = self.pull(s, state)
-        rate = pull - self.switches[0].resistance(mode, pull)
+        rate = pull + self.switches[0].contribution(self, s, state, mode)
         return vi.OscillatorState(state.V / self.omega, rate / self.omega)
 
     def start(self):

@@ -108,14 +108,18 @@ class Belt(vi.AbstractScene):
 
     @property
     def switches(self):
-        return (vi.DryFriction(1.0, velocity=_sliding, force=_pull, stopped=_stuck),)
+        return (vi.DryFriction(_stribeck, velocity=_sliding, force=_pull, stopped=_stuck),)
 
     def section(self, x):
         return x.V
 
     def field(self, s, x, mode):
-        rub = mode * (0.5 + 0.5 * jnp.exp(-2 * jnp.abs(_sliding(self, x))))
-        return vi.OscillatorState(x.V, jnp.where(mode == 0, 0.0, _pull(self, s, x) - rub))
+        pull = _pull(self, s, x)
+        return vi.OscillatorState(x.V, pull + self.switches[0].contribution(self, s, x, mode))
+
+
+def _stribeck(speed):
+    return 0.5 + 0.5 * jnp.exp(-2 * speed)
 
 
 def _sliding(machine, x):

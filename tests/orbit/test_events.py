@@ -46,7 +46,7 @@ class Rubbing(vi.AbstractScene):
 
     def field(self, s, state, mode):
         force = _force(self, s, state)
-        acceleration = force - self.switches[0].resistance(mode, force)
+        acceleration = force + self.switches[0].contribution(self, s, state, mode)
         return Slider(state.v / self.omega, acceleration / self.omega)
 
     def position(self, state):

@@ -56,9 +56,9 @@ class Rubbing(vi.AbstractScene):
 
     def field(self, s, x, mode):
         pull = self.pull(s, x)
-        rub = self.switches[0].resistance(mode, pull)
+        rub = self.switches[0].contribution(self, s, x, mode)
         slides = jnp.where(mode == 0, 0.0, self.level * mode)
-        rates = Books(x.V, pull - rub, self.amplitude * jnp.cos(s) * x.V, slides * x.V)
+        rates = Books(x.V, pull + rub, self.amplitude * jnp.cos(s) * x.V, slides * x.V)
         return jax.tree.map(lambda rate: rate / self.frequency, rates)
 
     def step_limit(self, s, x):
@@ -213,7 +213,7 @@ class OnABelt(vi.AbstractScene):
 
     def field(self, s, x, mode):
         zero, pull = jnp.zeros_like(s), self.pull(s, x)
-        return Books(x.V, pull - self.switches[0].resistance(mode, pull), zero, zero)
+        return Books(x.V, pull + self.switches[0].contribution(self, s, x, mode), zero, zero)
 
 
 @pytest.mark.parametrize("method", [CLOSE, vi.FixedStep(steps_per_cycle=64), vi.Taylor()],

@@ -34,7 +34,7 @@ class Thrown(vi.AbstractScene):
         return self.length
 
     def field(self, s, state, mode):
-        return Body(state.V, self.stop.push(self, state, mode))
+        return Body(state.V, self.stop.contribution(self, s, state, mode))
 
     def step_limit(self, s, state):
         return jnp.minimum(self.length / 5, self.stop.longest_step(self, state))

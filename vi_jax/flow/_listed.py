@@ -23,7 +23,7 @@ def listed(what: str, used: Any, word: Callable[[int, int], str]) -> str:
     some = np.flatnonzero(used.any(axis=1))
     for i in some[:_CYCLES]:
         places = np.flatnonzero(used[i])
-        words = [word(i, j) for j in places[:_EVENTS]]
+        words = [word(int(i), int(j)) for j in places[:_EVENTS]]
         more = [f"and {len(places) - _EVENTS} more"] * (len(places) > _EVENTS)
         lines.append(f"  cycle {i + 1}: {', '.join([*words, *more])}")
     if len(some) > _CYCLES:

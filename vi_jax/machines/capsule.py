@@ -125,8 +125,8 @@ class Capsule(PhaseMachine):
         """By phase."""
         (ground,) = self.switches
         pull = self.pull(state)
-        rubs = ground.resistance(mode, _force_on_capsule(self, s, state))
-        capsule = (pull - rubs) / self.mass_ratio
+        rubs = ground.contribution(self, s, state, mode)
+        capsule = (pull + rubs) / self.mass_ratio
         relative = self.amplitude * jnp.cos(s) - pull - capsule
         pace = 1 / self.frequency
         return CapsuleState(

@@ -94,7 +94,6 @@ class UnbalancedRotor(ShaftScene, PhaseMachine):
         "coupling": Range(0.0, 1.0, open_high=True), "damping_ratio": NOT_NEGATIVE,
         "gap": POSITIVE, "restitution": SHARE,
     }  # fmt: skip
-    timed_states: ClassVar = {RotorState: TimedRotorState}
 
     @property
     def stops(self) -> tuple[RigidStop, ...]:  # pyright: ignore
@@ -165,6 +164,11 @@ class UnbalancedRotor(ShaftScene, PhaseMachine):
     def state_type(self) -> Any:
         """Of a state in the phase clock."""
         return RotorState
+
+    @property
+    def timed_states(self) -> dict[type, type]:
+        """By angle and by time."""
+        return {RotorState: TimedRotorState}
 
     def section_speed(self, state: Any) -> Any:
         """The momentum of the shaft is its speed where φ = 0."""

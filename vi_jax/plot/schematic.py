@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 
 from .._checks import instance_of
 from ..machines import BouncingBall, Duffing, ImpactPair, UnbalancedRotor
-from ..scene import AbstractScene, IdealDrive, Motor, Scene, SliderCrank
+from ..scene import AbstractScene, Scene
 from .colors import GREEN, RED
 from .motion import new_axes
 from .pen import Pen
@@ -98,7 +98,7 @@ def _drawn(machine: AbstractScene, pen: Pen, state: Any, phase: float) -> None:
 @_drawn.register
 def _(machine: Scene, pen: Pen, state: Any, phase: float) -> None:
     crank, size = machine.crank, pen.size
-    rod = 1 / float(crank.ratio) if isinstance(crank, SliderCrank) else 3.0
+    rod = float(crank.drawn_rod)
     pin = cos(phase), sin(phase)
     slider = rod + float(crank.slide(jnp.asarray(phase)).U)
     spring = pen.reach + 1.0 + size + 0.5  # never shorter than half a crank in this motion
@@ -149,12 +149,7 @@ def _crank(machine: Scene, pen: Pen, pin: tuple[float, float], slider: float) ->
     pen.label(pin[0] / 2 - 0.18, pin[1] / 2 + 0.12, "$a$")
     pen.label((pin[0] + slider) / 2, pin[1] / 2 + 0.28, "$l$")
     pen.arrow((-0.15, 1.2), (-0.95, 0.75), bend=0.3)
-    if isinstance(machine.drive, IdealDrive):
-        drive = "$\\varphi' = \\Omega$"
-    else:
-        assert isinstance(machine.drive, Motor)
-        drive = "motor, $J$"
-    pen.label(0.1, 1.45, drive)
+    pen.label(0.1, 1.45, machine.drive.caption)
 
 
 def _stop(pen: Pen, stop: Any, rest: float, size: float, *, rigid: bool) -> None:

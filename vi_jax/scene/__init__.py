@@ -5,10 +5,14 @@ from .base import Coordinate as Coordinate
 from .crank import AbstractCrank as AbstractCrank
 from .crank import CosineCrank as CosineCrank
 from .crank import SliderCrank as SliderCrank
-from .drive import DCMotor as DCMotor
+from .dc_motor import DCMotor as DCMotor
+from .drive import AbstractDrive as AbstractDrive
 from .drive import IdealDrive as IdealDrive
-from .drive import Motor as Motor
 from .friction import DryFriction as DryFriction
+from .law import AbstractContactLaw as AbstractContactLaw
+from .law import HuntCrossley as HuntCrossley
+from .law import PowerLaw as PowerLaw
+from .motor import Motor as Motor
 from .parameters import Parameters as Parameters
 from .scene import Oscillator as Oscillator
 from .scene import Scene as Scene

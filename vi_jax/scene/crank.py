@@ -23,6 +23,16 @@ class Slide(NamedTuple):
 class AbstractCrank(Shown):
     """A crank asks for one method, `slide(phase)`."""
 
+    @property
+    def is_odd(self) -> bool:
+        """Whether the slider half a turn later is where its image is: U(φ + π) = -U(φ)."""
+        return False
+
+    @property
+    def drawn_rod(self) -> Float[Array, ""] | float:
+        """Length of the rod in pictures (unit: a)."""
+        return 3.0
+
     @abc.abstractmethod
     def slide(self, phase: Float[Array, "..."]) -> Slide:
         """The slider's displacement at crank angle `phase` (radians), in units of the crank a."""
@@ -30,6 +40,11 @@ class AbstractCrank(Shown):
 
 class CosineCrank(AbstractCrank):
     """The first approximation of the paper (Eq. 4): U = cos φ."""
+
+    @property
+    def is_odd(self):
+        """True, unless a subclass has another `slide`."""
+        return type(self).slide is CosineCrank.slide
 
     def slide(self, phase: Float[Array, "..."]) -> Slide:
         """U = cos φ and its derivatives (dimensionless)."""
@@ -46,6 +61,11 @@ class SliderCrank(AbstractCrank):
 
     def __check_init__(self):
         require_ranges(self)
+
+    @property
+    def drawn_rod(self):
+        """1/λ."""
+        return 1 / self.ratio
 
     def slide(self, phase: Float[Array, "..."]) -> Slide:
         """Exact U and its derivatives (dimensionless)."""

@@ -14,7 +14,9 @@ from jaxtyping import Array, Float
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, in_range, one_of, require_ranges
 from .._numbers import concrete, optional_real, real, warn
 from .crank import CosineCrank, SliderCrank
-from .drive import DCMotor, IdealDrive, Motor
+from .dc_motor import DCMotor
+from .drive import IdealDrive
+from .motor import Motor
 from .scene import Oscillator, Scene
 from .shown import Shown
 from .stop import RigidStop

@@ -1,6 +1,7 @@
 """The scene of the paper: oscillator, crank, drive and stops, in the phase or the time clock."""
 
 import dataclasses
+from collections.abc import Iterable
 from math import pi
 from typing import Any, ClassVar
 
@@ -12,19 +13,11 @@ from jaxtyping import Array, Bool, Float
 from .._checks import NOT_NEGATIVE, Range, instance_of, require, require_ranges, tuple_of
 from .._numbers import concrete, number, optional_real, real
 from .crank import AbstractCrank, CosineCrank
-from .drive import DCMotor, IdealDrive, Motor
+from .drive import AbstractDrive, IdealDrive
 from .shaft import ShaftScene
 from .shown import Shown
 from .soft import SoftStop
-from .states import (
-    TIMED,
-    UNITS,
-    DCMotorState,
-    MotorState,
-    OscillatorState,
-    TimedDCMotorState,
-    TimedMotorState,
-)
+from .states import UNITS
 from .stop import RigidStop
 
 
@@ -51,7 +44,7 @@ class Scene(ShaftScene):
     """
 
     oscillator: Oscillator
-    drive: IdealDrive | Motor
+    drive: AbstractDrive
     stops: tuple[RigidStop, ...] = eqx.field(
         default=(), converter=lambda x: tuple_of("stops", x, RigidStop)
     )
@@ -67,16 +60,12 @@ class Scene(ShaftScene):
     )
     """Compliant stops; their stiffness in units of the body's own spring."""
     ranges: ClassVar = {"section_phase": Range(-2 * pi, 2 * pi)}
-    timed_states: ClassVar = TIMED
     units: ClassVar = UNITS  # pyright: ignore[reportAssignmentType, reportIncompatibleMethodOverride]
 
     def __check_init__(self):
         instance_of("oscillator", self.oscillator, Oscillator, "an `Oscillator`")
         instance_of("crank", self.crank, AbstractCrank, "a `CosineCrank()` or another crank")
-        if not isinstance(self.drive, IdealDrive | Motor):
-            raise TypeError(
-                f"Argument `drive` must be an `IdealDrive` or a `Motor`, but got {self.drive!r}."
-            )
+        instance_of("drive", self.drive, AbstractDrive, "an `IdealDrive` or a `Motor`")
         for stop in self.stops:
             if not isinstance(stop, RigidStop):
                 raise TypeError(f"Argument `stops` must hold `RigidStop`s, but holds {stop!r}.")
@@ -119,16 +108,13 @@ class Scene(ShaftScene):
     @property
     def cycle(self) -> Float[Array, ""] | float:
         """2π of crank angle; in the time clock of an ideal drive 2π/ζ of time τ."""
-        if self.clock_name == "time" and isinstance(self.drive, IdealDrive):
-            return 2 * pi / self.drive.frequency_ratio
-        return 2 * pi
+        return self.period if self.clock_name == "time" else 2 * pi
 
     @property
     def period(self) -> Float[Array, ""] | float:
-        """2π/ζ of time τ for an ideal drive."""
-        if isinstance(self.drive, IdealDrive):
-            return 2 * pi / self.drive.frequency_ratio
-        return 2 * pi
+        """2π/ζ of time τ for an ideal drive; of another a turn of the crank."""
+        duration = self.drive.duration()
+        return 2 * pi if duration is None else duration
 
     def period_of(self, cycles: int) -> str:
         """In crank angle: 2π, 4π, …"""
@@ -156,11 +142,9 @@ class Scene(ShaftScene):
         """Crank angle from the one counted since the section."""
         return since_section if self.section_phase is None else since_section + self.section_phase
 
-    def start(
-        self, *, Y: Any = 0.0, V: Any = 0.0, W: Any = None, M: Any = None
-    ) -> OscillatorState | MotorState | TimedMotorState | DCMotorState | TimedDCMotorState:
+    def start(self, *, Y: Any = 0.0, V: Any = 0.0, W: Any = None, M: Any = None, **others) -> Any:
         """A state on the section: position (unit: a), velocity (a ω), crank speed (ω) and the
-        torque of a `DCMotor` (J ω²).
+        torque of a `DCMotor` (J ω²); `others` are what a drive of one's own has besides.
 
         `W` belongs to motor scenes and defaults to the motor's no-load speed κ w0. `M` defaults to
         the steady torque at that speed; a motor that is being switched on has `W=0, M=0`.
@@ -170,32 +154,19 @@ class Scene(ShaftScene):
         Y, V = number("Y", Y), number("V", V)
         require("Y", Y)
         require("V", V)
-        if M is not None and not isinstance(self.drive, DCMotor):
-            raise ValueError(
-                "Argument `M` must be left out: only a `DCMotor` has a torque of its own, but got "
-                f"M={M!r}."
-            )
-        if isinstance(self.drive, IdealDrive):
-            if W is not None:
-                raise ValueError(
-                    "Argument `W` must be left out: an ideal drive turns at its frequency ratio, "
-                    f"but got W={W!r}."
-                )
-            return OscillatorState(Y, V)
-        W = number("W", self.drive.control * self.drive.no_load_speed if W is None else W)
-        require("W", W)
-        parts = [Y, V, W]
-        if isinstance(self.drive, DCMotor):
-            parts.append(number("M", self.drive.line(W) if M is None else M))
-            require("M", parts[-1])
-        return self.adopt(self.state_type(*parts))
+        own = self.drive.begin(M=M, W=W, **others)
+        return self.adopt(self.state_type(Y, V, *own.values()))
 
     @property
     def state_type(self) -> Any:
         """Of a state in the phase clock."""
-        if isinstance(self.drive, IdealDrive):
-            return OscillatorState
-        return DCMotorState if isinstance(self.drive, DCMotor) else MotorState
+        return self.drive.state
+
+    @property
+    def timed_states(self) -> dict[type, type]:
+        """The drive's."""
+        timed = self.drive.timed_state
+        return {} if timed is None else {self.drive.state: timed}
 
     @property
     def switches(self) -> tuple[SoftStop, ...]:
@@ -204,52 +175,24 @@ class Scene(ShaftScene):
 
     def field(self, s: Float[Array, ""], state: Any, *modes: Float[Array, ""]) -> Any:
         """d(state)/ds: by crank angle (Eq. 8 to 9 of the paper) or by time τ (Eq. 5 to 7)."""
-        drive = self.drive
-        if isinstance(drive, IdealDrive):
-            zeta = drive.frequency_ratio
-            if self.clock_name == "time":
-                slide = self.crank.slide(self.phase_at(zeta * s))
-                pull = self._pull(slide.U - state.Y, state.V, self._pushes(state, modes))
-                return OscillatorState(state.V, pull)
-            slide = self.crank.slide(self.phase_at(s))
-            pull = self._pull(slide.U - state.Y, state.V, self._pushes(state, modes))
-            return OscillatorState(state.V / zeta, pull / zeta)
-        by_angle = self.clock_name == "phase"
-        slide = self.crank.slide(self.phase_at(s if by_angle else state.phase))
-        # By angle all is divided by W. Products with 1/W are shared: a power series pays for each.
-        pace = 1 / state.W if by_angle else None
+        return self.drive.field(self, s, state, self._pushes(s, state, modes))
 
-        def paced(x):
-            return x if pace is None else pace * x
-
-        speed, stretch = paced(state.V), paced(slide.U - state.Y)
-        pull = self._pull(stretch, speed, map(paced, self._pushes(state, modes)))
-        if isinstance(drive, DCMotor):
-            torque, more = paced(state.M), (paced(drive.build_up(state.W, state.M)),)
-        else:
-            torque, more = drive.line(state.W, pace), ()
-        square = state.W if by_angle else state.W * state.W
-        shaft = drive.shaft(slide, torque, stretch, square)
-        clock = () if by_angle else (state.W,)
-        return type(state)(speed, pull, shaft, *more, *clock)
-
-    def _pull(self, stretch, speed, pushes):
+    def pull(self, stretch: Any, speed: Any, pushes: Iterable[Any]) -> Any:
         """d²Y/dτ² from U - Y, V and what pushes; divided by W they give dV/dφ."""
         pull = stretch - 2 * self.damping_ratio * speed
         for push in pushes:
             pull = pull + push
         return pull
 
-    def _pushes(self, state, modes):
+    def _pushes(self, s, state, modes):
         """What each compliant stop adds to d²Y/dτ²."""
         for stop, mode in zip(self.soft_stops, modes, strict=True):
-            yield stop.push(self, state, mode)
+            yield stop.contribution(self, s, state, mode)
 
     def as_logged(self, clock: Float[Array, "..."]) -> Float[Array, "..."]:
         """The crank angle since the section, where time counts the cycles of an ideal drive."""
-        if isinstance(self.drive, IdealDrive) and self.clock_name == "time":
-            return self.drive.frequency_ratio * clock
-        return clock
+        speed = self.drive.fixed_speed
+        return clock if speed is None or self.clock_name == "phase" else speed * clock
 
     def pace(self, s: Float[Array, ""], state: Any) -> Float[Array, ""] | None:
         """dτ/dφ = 1/W in the phase clock of a motor."""
@@ -257,38 +200,34 @@ class Scene(ShaftScene):
 
     def frequency_ratio(self, duration: Float[Array, "..."]) -> Float[Array, "..."]:
         """ζ: mean crank speed over cycles of these durations (unit: ω)."""
-        if isinstance(self.drive, IdealDrive):
-            return jnp.broadcast_to(self.drive.frequency_ratio, duration.shape)
-        return super().frequency_ratio(duration)
+        speed = self.drive.fixed_speed
+        if speed is None:
+            return super().frequency_ratio(duration)
+        return jnp.broadcast_to(speed, duration.shape)
 
     def step_limit(self, s: Float[Array, ""], state: Any) -> Float[Array, ""]:
         """A fifth of the shorter of the drive's turn and the body's natural period."""
-        speed = self._speed(state)
+        speed = self.drive.speed(state)
         turn = 0.4 * pi / jnp.maximum(1.0, speed)
         for stop in self.soft_stops:
             turn = jnp.minimum(turn, stop.longest_step(self, state))
         return turn * speed if self.clock_name == "phase" else turn
 
     def relaxation(self, s: Float[Array, ""], state: Any) -> Float[Array, ""]:
-        """1/2ξ of a strongly damped body, or what the motor says: the time w0/τ0 in which it is
-        back at speed, or in which the current of a `DCMotor` settles."""
-        rate = 2 * self.damping_ratio
-        if isinstance(self.drive, Motor):
-            rate = jnp.maximum(rate, self.drive.rate())
-        pace = self._speed(state) if self.clock_name == "phase" else 1.0
+        """1/2ξ of a strongly damped body, or what the drive says: the time w0/τ0 in which a motor
+        is back at speed, or in which the current of a `DCMotor` settles."""
+        rate, of_drive = 2 * self.damping_ratio, self.drive.rate()
+        if of_drive is not None:
+            rate = jnp.maximum(rate, of_drive)
+        pace = self.drive.speed(state) if self.clock_name == "phase" else 1.0
         return pace / jnp.maximum(rate, 1e-6)
 
-    def _speed(self, state: Any) -> Float[Array, "..."]:
-        """Of the crank, without its sign."""
-        drive = self.drive
-        return drive.frequency_ratio if isinstance(drive, IdealDrive) else jnp.abs(state.W)
-
     def mirrored(self, state: Any) -> Any:
-        """Y → -Y half a turn later, if both sides have the same stops and the crank the cosine."""
+        """Y → -Y half a turn later, if both sides have the same stops and the crank is odd."""
         for stops in (self.stops, self.soft_stops):
             if not all(any(stop.mirrors(other) for other in stops) for stop in stops):
                 return None
-        if type(self.crank) is not CosineCrank:
+        if not self.crank.is_odd:
             return None
         return dataclasses.replace(state, Y=-state.Y, V=-state.V)
 

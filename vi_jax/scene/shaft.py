@@ -2,7 +2,7 @@
 
 import dataclasses
 from math import pi
-from typing import Any, ClassVar, TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -27,8 +27,6 @@ class ShaftScene(AbstractScene):
     """
 
     clock_name: eqx.AbstractVar[str]
-    timed_states: ClassVar[dict[type, type]]
-    """Of the states with a speed of the shaft: what they are by time, with `phase` at the end."""
 
     def __check_init__(self):
         one_of("clock_name", self.clock_name, ("phase", "time"))
@@ -36,6 +34,12 @@ class ShaftScene(AbstractScene):
     @property
     def state_type(self) -> Any:
         """Of a state in the phase clock."""
+        raise NotImplementedError
+
+    @property
+    def timed_states(self) -> dict[type, type]:
+        """Of the states with a speed of the shaft: what they are by time, with `phase` at the
+        end."""
         raise NotImplementedError
 
     def is_timed(self, state: Any) -> bool:

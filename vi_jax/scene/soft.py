@@ -1,14 +1,23 @@
 """Compliant stops: a force while the body penetrates, no jump."""
 
-from math import pi, sqrt
+from math import pi
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import NOT_NEGATIVE, POSITIVE, REAL, count, one_of, require, require_ranges
+from .._checks import (
+    NOT_NEGATIVE,
+    POSITIVE,
+    REAL,
+    count,
+    instance_of,
+    one_of,
+    require_ranges,
+)
 from .._numbers import number
+from .law import AbstractContactLaw, HuntCrossley, PowerLaw
 from .stop import Wall
 from .switch import AbstractSwitch
 
@@ -17,6 +26,9 @@ Scalar = Float[Array, ""]
 # Modes: the body touches; it has been let go of, but has not yet come out; it is apart.
 TOUCHING, RELEASED, APART = 1.0, 0.0, -1.0
 
+# Laws that may be asked for by their names.
+_LAWS: dict[str, type[AbstractContactLaw]] = {"power": PowerLaw, "hunt-crossley": HuntCrossley}
+
 # A body is near enough for the contact's time scale to matter (unit: that of the coordinate).
 _NEAR = 1e-6
 
@@ -24,11 +36,10 @@ _NEAR = 1e-6
 class SoftStop(Wall, AbstractSwitch):
     """A compliant stop: pushes the body back while it penetrates by δ > 0.
 
-    With unit mass the force is F0 + K δᵖ + α √K δ^((p-1)/2) δ' under `law="power"`: p = 1 is a
-    spring with a dashpot, p = 3/2 Hertz's contact. Its coefficient of restitution does not depend
-    on the speed, α = √(2(p+1)) (-ln e)/√(π² + ln² e) (Feng, arXiv 2603.27764), so that
-    `restitution` may be given instead of `damping`. Under `law="hunt-crossley"` it is
-    F0 + K δᵖ (1 + α δ'), whose restitution falls with speed.
+    With unit mass the force is F0 plus that of its law, by default `PowerLaw`: K δᵖ + α √K
+    δ^((p-1)/2) δ', p = 1 being a spring with a dashpot, p = 3/2 Hertz's contact. Its coefficient of
+    restitution does not depend on the speed, so that `restitution` may be given instead of
+    `damping`. That of `HuntCrossley`, K δᵖ (1 + α δ'), falls with speed.
 
     With p > 1 the power law's force has a steep start and, where it may pull, a steep end, of the
     order δ^((p-1)/2); steps sized by their error (`Adaptive`) follow it, fixed ones lose their
@@ -42,8 +53,8 @@ class SoftStop(Wall, AbstractSwitch):
     - `gap`: distance of the stop from the coordinate's zero (its unit); the body touches beyond.
     - `stiffness` K per unit of mass, positive (for a `Scene`: in units of the body's own spring).
     - `restitution` e in (0, 1], or `damping` α, not negative; neither: no damping.
-    - `exponent` p, at least 1; static.
-    - `law`: `"power"` or `"hunt-crossley"`; static.
+    - `law`: `"power"` or `"hunt-crossley"`, and `exponent` p, at least 1 (1 by default); or any
+      `AbstractContactLaw`, which has its own.
     - `prestress` F0: the force at first touch, not negative; none by default.
     - `adhesive`: whether the dashpot may pull at the end of its stroke; `False` lets the body go
       where the force falls to zero. Static.
@@ -56,8 +67,7 @@ class SoftStop(Wall, AbstractSwitch):
     stiffness: Float[Array, "..."]
     damping: Float[Array, "..."]
     prestress: Float[Array, "..."] | None
-    exponent: float = eqx.field(static=True)
-    law: str = eqx.field(static=True)
+    law: AbstractContactLaw
     adhesive: bool = eqx.field(static=True)
     side: str = eqx.field(static=True)
     coordinate: int = eqx.field(static=True)
@@ -72,24 +82,17 @@ class SoftStop(Wall, AbstractSwitch):
         *,
         restitution: Any = None,
         damping: Any = None,
-        exponent: float = 1.0,
-        law: str = "power",
+        exponent: float | None = None,
+        law: str | AbstractContactLaw = "power",
         prestress: Any = None,
         adhesive: bool = True,
         side: str = "right",
         coordinate: int = 0,
     ):
-        require("exponent", exponent, low=1.0)
-        self.exponent = float(exponent)
-        self.law = one_of("law", law, ("power", "hunt-crossley"))
+        self.law = _law(law, exponent)
         if restitution is not None:
-            if damping is not None or law != "power":
-                raise ValueError(
-                    "Argument `restitution` must be given without `damping`, and for the law "
-                    f'"power", whose restitution is one number, but got {restitution!r} with '
-                    f"damping={damping!r} and law={law!r}."
-                )
-            damping = damping_of(restitution, exponent)
+            given = f"{restitution!r} with damping={damping!r} and law={law!r}"
+            damping = _damping_of(self.law, restitution, damping, given)
         self.gap = number("gap", gap)
         self.stiffness = number("stiffness", stiffness)
         self.damping = number("damping", 0.0 if damping is None else damping)
@@ -102,7 +105,7 @@ class SoftStop(Wall, AbstractSwitch):
     @property
     def analytic(self) -> bool:
         """Of a force that is straight in the depth; others have a kink or a root at first touch."""
-        return self.exponent == 1
+        return self.law.is_analytic
 
     @property
     def may_slide(self) -> bool:
@@ -117,15 +120,10 @@ class SoftStop(Wall, AbstractSwitch):
 
     def force(self, depth: Any, rate: Any) -> Any:
         """Force away from the stop, per unit of mass, of a body that touches."""
-        p = self.exponent
-        spring = self.stiffness * _power(depth, p)
-        if self.law == "power":
-            resist = self.damping * jnp.sqrt(self.stiffness) * _power(depth, 0.5 * (p - 1)) * rate
-        else:
-            resist = self.damping * spring * rate
-        return spring + resist if self.prestress is None else self.prestress + spring + resist
+        force = self.law.force(self.stiffness, self.damping, depth, rate)
+        return force if self.prestress is None else self.prestress + force
 
-    def push(self, machine: Any, state: Any, mode: Any) -> Any:
+    def contribution(self, machine, s, state, mode):
         """What the stop adds to the coordinate's acceleration."""
         return jnp.where(mode > 0, -self.sign * self.force(*self.depth(machine, state)), 0.0)
 
@@ -160,39 +158,34 @@ class SoftStop(Wall, AbstractSwitch):
 
     def longest_step(self, machine: Any, state: Any) -> Any:
         """A fifth of the period in which a body oscillates on the stop; infinite apart from it."""
-        p = self.exponent
         depth, rate = self.depth(machine, state)
-        deepest = jnp.maximum(depth, 1e-12)
-        if p > 1:
-            reach = (0.5 * (p + 1) * rate**2 / self.stiffness + 1e-30) ** (1 / (p + 1))
-            deepest = jnp.maximum(deepest, reach)
-        frequency = jnp.sqrt(p * self.stiffness * _power(deepest, p - 1))
+        frequency = self.law.frequency(self.stiffness, depth, rate)
         return jnp.where(depth > -_NEAR, 0.4 * pi / frequency, jnp.inf)
 
     def _pulls(self, depth: Any, rate: Any) -> Any:
-        """Of the sign of the force, turned: positive where it would pull; smooth at first touch."""
-        if self.law == "power":
-            root = _power(depth, 0.5 * (self.exponent + 1))
-            pull = -self.stiffness * root - self.damping * jnp.sqrt(self.stiffness) * rate
-            flat = _power(depth, 0.5 * (self.exponent - 1))
-            return pull if self.prestress is None else pull * flat - self.prestress
-        if self.prestress is None:
-            return -(1 + self.damping * rate)
-        return -self.force(depth, rate)
+        return self.law.pulls(self.stiffness, self.damping, self.prestress, depth, rate)
 
 
-def damping_of(restitution: Any, exponent: float = 1.0) -> Any:
-    """α of the power law from its coefficient of restitution (Feng, arXiv 2603.27764)."""
-    require("restitution", restitution, low=0.0, high=1.0, open_low=True)
-    drop = -jnp.log(jnp.asarray(restitution, float))
-    return sqrt(2 * (exponent + 1)) * drop / jnp.sqrt(pi**2 + drop**2)
+def _law(law: str | AbstractContactLaw, exponent: float | None) -> AbstractContactLaw:
+    """A law by its name and exponent, or as it is."""
+    if isinstance(law, str):
+        one_of("law", law, tuple(_LAWS))
+        return _LAWS[law](1.0 if exponent is None else exponent)
+    instance_of("law", law, AbstractContactLaw, f"one of {list(_LAWS)} or an `AbstractContactLaw`")
+    if exponent is not None:
+        raise ValueError(
+            f"Argument `exponent` must be left out where `law` is an object, which has its own, "
+            f"but got {exponent!r} beside {law!r}."
+        )
+    return law
 
 
-def _power(x: Any, n: float) -> Any:
-    """xⁿ inside; for n = 0 and 1 continued smoothly to where a step may look beyond the surface."""
-    if n == 0:
-        return jnp.ones_like(x)
-    if n == 1:
-        return x
-    inside = x > 0
-    return jnp.where(inside, jnp.where(inside, x, 1.0) ** n, 0.0)
+def _damping_of(law: AbstractContactLaw, restitution: Any, damping: Any, given: str) -> Any:
+    """α from a restitution that was `given` in its place."""
+    found = law.damping_of(restitution) if damping is None else None
+    if found is None:
+        raise ValueError(
+            "Argument `restitution` must be given without `damping`, and for a law such as "
+            f'"power", whose restitution is one number, but got {given}.'
+        )
+    return found

@@ -55,7 +55,3 @@ class TimedDCMotorState(DCMotorState):
 
     phase: Number
     """Crank angle since the last section (radians)."""
-
-
-# The states of motors, and what they are called where time is the independent variable.
-TIMED = {MotorState: TimedMotorState, DCMotorState: TimedDCMotorState}

@@ -50,6 +50,11 @@ class AbstractSwitch(Shown):
         """State and mode after the event. The state may be put right by what is below rounding
         (a velocity set to zero where it vanishes), and must not jump."""
 
+    def contribution(self, machine: Any, s: Scalar, state: Any, mode: Scalar) -> Any:
+        """What it adds to the machine's field in this mode, where it knows: of a soft stop the
+        acceleration of its coordinate, of dry friction the force on the body that rubs."""
+        raise NotImplementedError(f"A {type(self).__name__} has no `contribution`.")
+
     def struck(self, machine: Any, s: Scalar, state: Any, mode: Scalar) -> Scalar:
         """The mode after an impact elsewhere in the machine; by default that of a new motion."""
         return self.begin(machine, s, state)

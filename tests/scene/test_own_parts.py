@@ -1,0 +1,209 @@
+"""Parts of a machine that stand in a file of one's own: a drive, a contact law, a friction law."""
+
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+from scipy.integrate import solve_ivp
+
+CLOSE = vi.Adaptive(rtol=1e-12)
+REACH, XI = 1.3, 0.05
+
+
+class ClockworkState(vi.MotorState):
+    """By crank angle, with what is left of the winding."""
+
+    wound: jax.Array
+
+
+class TimedClockworkState(ClockworkState):
+    """By time."""
+
+    phase: jax.Array
+
+
+class Clockwork(vi.AbstractDrive):
+    """A wound spring that turns the crank, braked by a fan: W' = q T - b W + e U_φ (Y - U),
+    T' = -W."""
+
+    stiffness: jax.Array = eqx.field(converter=jnp.asarray)
+    fan: jax.Array = eqx.field(converter=jnp.asarray)
+    coupling: jax.Array = eqx.field(converter=jnp.asarray)
+    state: ClassVar = ClockworkState
+    timed_state: ClassVar = TimedClockworkState
+
+    def field(self, scene, s, state, pushes):
+        timed = scene.clock_name == "time"
+        slide = scene.crank.slide(scene.phase_at(state.phase if timed else s))
+        stretch = slide.U - state.Y
+        turns = self.stiffness * state.wound - self.fan * state.W
+        shaft = turns - self.coupling * slide.U_phi * stretch
+        rates = [state.V, scene.pull(stretch, state.V, pushes), shaft, -state.W]
+        if timed:
+            return TimedClockworkState(*rates, state.W)
+        return ClockworkState(*(x / state.W for x in rates))
+
+    def usual(self, name, known):
+        return 1.0 if name == "W" else 400.0
+
+    def rate(self):
+        return self.fan
+
+
+def clockwork(**options):
+    return vi.Scene(
+        oscillator=vi.Oscillator(XI), drive=Clockwork(0.004, 1.5, 0.05),
+        stops=(vi.RigidStop(REACH, 0.6),), **options,
+    )  # fmt: skip
+
+
+def wound_down(turns):
+    """The same by SciPy, by time, impact by impact: the state after so many turns."""
+
+    def field(_, x):
+        Y, V, W, T, phase = x
+        stretch = np.cos(phase) - Y
+        shaft = 0.004 * T - 1.5 * W + 0.05 * np.sin(phase) * stretch
+        return [V, stretch - 2 * XI * V, shaft, -W, W]
+
+    def meets(_, x):
+        return x[0] - REACH
+
+    def ends(_, x):
+        return x[4] - 2 * np.pi * turns
+
+    for event in (meets, ends):
+        event.terminal, event.direction = True, 1
+    t, x = 0.0, np.array([0.3, 0.0, 1.0, 380.0, 0.0])
+    for _ in range(1000):
+        found = solve_ivp(
+            field, (t, 1e4), x, method="DOP853", events=(meets, ends), rtol=1e-12, atol=1e-13
+        )
+        t, x = found.t[-1], found.y[:, -1]
+        if len(found.t_events[1]):
+            return x
+        x[0], x[1] = REACH, -0.6 * x[1]
+    raise AssertionError
+
+
+@pytest.mark.parametrize("clock", ["phase", "time"])
+def test_a_drive_of_ones_own(clock):
+    scene = clockwork()
+    start = scene.start(Y=0.3, wound=380.0)
+    assert float(start.W) == 1 and isinstance(start, ClockworkState)
+    run = vi.simulate(scene, start, 6, clock=clock, method=CLOSE)
+    assert int(run.impacts.sum()) > 3
+    last, truth = run.last, wound_down(6)
+    np.testing.assert_allclose([last.Y, last.V, last.W, last.wound], truth[:4], rtol=1e-9)
+    vi.plot_sketch(scene, start)
+
+
+def test_what_such_a_drive_has_is_told():
+    with pytest.raises(ValueError, match=r"`M` must be left out: only a `DCMotor`"):
+        clockwork().start(M=1.0)
+    with pytest.raises(ValueError, match=r"`torque` must be left out: the state of this drive has"):
+        clockwork().start(torque=1.0)
+    with pytest.raises(TypeError, match="drive"):
+        vi.Scene(vi.Oscillator(0.1), "motor")
+
+
+class Hardening(vi.AbstractContactLaw):
+    """K δ + β δ³, without damping."""
+
+    cubic: jax.Array = eqx.field(kw_only=True, converter=jnp.asarray)
+
+    def force(self, stiffness, damping, depth, rate):
+        return stiffness * depth + self.cubic * depth**3
+
+
+class Thrown(vi.AbstractScene):
+    """A body without other forces against a soft stop."""
+
+    stop: vi.SoftStop
+    stops: tuple = ()
+
+    @property
+    def switches(self):
+        return (self.stop,)
+
+    @property
+    def cycle(self):
+        return 1.0
+
+    def field(self, s, state, mode):
+        return vi.OscillatorState(state.V, self.stop.contribution(self, s, state, mode))
+
+    def step_limit(self, s, state):
+        return jnp.minimum(0.2, self.stop.longest_step(self, state))
+
+
+@pytest.mark.parametrize("cubic", [0.0, 3e4])
+def test_a_contact_law_of_ones_own_keeps_energy(cubic):
+    law = Hardening(cubic=cubic)
+    machine = Thrown(vi.SoftStop(0.2, 100.0, law=law))
+    start = vi.OscillatorState(jnp.asarray(0.0), jnp.asarray(2.0))
+    run = vi.simulate(machine, start, 1, method=CLOSE)
+    depth = float(run.y_max[0]) - 0.2
+    assert 0.5 * 2.0**2 == pytest.approx(50 * depth**2 + 0.25 * cubic * depth**4, rel=1e-9)
+    assert float(run.last.V) == pytest.approx(-2.0, rel=1e-9)
+    steeper = eqx.tree_at(lambda m: m.stop.law.cubic, machine, cubic + 1.0)
+    assert float(vi.simulate(steeper, start, 1, method=CLOSE).y_max[0]) - 0.2 < depth
+
+
+def test_laws_that_cannot_be_are_refused():
+    law = Hardening(cubic=1.0)
+    with pytest.raises(ValueError, match="`restitution` must be given without `damping`"):
+        vi.SoftStop(0.2, 100.0, law=law, restitution=0.5)
+    with pytest.raises(ValueError, match="`exponent` must be left out"):
+        vi.SoftStop(0.2, 100.0, law=law, exponent=1.5)
+    with pytest.raises(TypeError, match="law"):
+        vi.SoftStop(0.2, 100.0, law=lambda depth: depth)  # pyright: ignore
+
+
+class Pressed(vi.AbstractScene):
+    """x'' = -x - friction under a load that varies, μ (1 + c cos 2s); by time."""
+
+    varies: jax.Array = eqx.field(converter=jnp.asarray)
+    stops: tuple = ()
+
+    @property
+    def switches(self):
+        return (
+            vi.DryFriction(
+                0.1,
+                load=lambda machine, s, x: 1 + machine.varies * jnp.cos(2 * s),
+                velocity=lambda machine, x: x.V,
+                force=lambda machine, s, x: -x.Y,
+                stopped=lambda machine, x: vi.OscillatorState(x.Y, 0 * x.V),
+            ),
+        )
+
+    @property
+    def cycle(self):
+        return 2 * jnp.pi
+
+    def field(self, s, x, mode):
+        return vi.OscillatorState(x.V, -x.Y + self.switches[0].contribution(self, s, x, mode))
+
+
+@pytest.mark.parametrize("varies", [-0.5, 0.8])
+def test_friction_follows_its_load(varies):
+    """From 1 at rest x = μ (1 - (c/3) cos 2s) + A cos s until it stops, half a turn later."""
+    start = vi.OscillatorState(jnp.asarray(1.0), jnp.asarray(0.0))
+    run = vi.simulate(Pressed(varies), start, 1, method=CLOSE, event_log=2)
+    assert float(run.event_log.phase[0, 0]) == pytest.approx(np.pi, rel=1e-9)
+    place = 0.2 - 1 - 0.2 * varies / 3
+    assert float(run.y_min[0]) == pytest.approx(place, rel=1e-9)
+    assert float(run.event_log.value[0, 0]) == 1.0  # pulled harder than friction holds
+
+
+def test_friction_that_holds_lets_go_as_its_load_falls():
+    """Pulled with 0.12 where friction holds from 0.02 to 0.18."""
+    start = vi.OscillatorState(jnp.asarray(-0.12), jnp.asarray(0.0))
+    run = vi.simulate(Pressed(0.8), start, 1, method=CLOSE, event_log=1)
+    # 0.1 (1 + 0.8 cos 2s) = 0.12
+    assert float(run.event_log.phase[0, 0]) == pytest.approx(0.5 * np.arccos(0.25), rel=1e-9)

@@ -1,0 +1,106 @@
+"""Contact laws: the force with which a compliant stop answers a depth and its rate."""
+
+import abc
+from math import pi, sqrt
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from .._checks import require
+from .shown import Shown
+
+
+class AbstractContactLaw(Shown):
+    """Force away from a `SoftStop`, per unit of mass, by the depth δ > 0 and its rate δ'.
+
+    A law of one's own is a subclass with `force`. Its numbers may be those of the stop, stiffness K
+    and damping α, or its own leaves.
+    """
+
+    exponent: float = eqx.field(static=True, default=1.0, converter=float)
+    """p, of the depth in the spring's force, at least 1; by it steps are sized. Static."""
+
+    def __check_init__(self):
+        require("exponent", self.exponent, low=1.0)
+
+    @property
+    def is_analytic(self) -> bool:
+        """Whether the force has a power series at first touch."""
+        return self.exponent == 1
+
+    @abc.abstractmethod
+    def force(self, stiffness: Any, damping: Any, depth: Any, rate: Any) -> Any:
+        """Of a body that touches, without prestress; it may pull."""
+
+    def pulls(self, stiffness: Any, damping: Any, prestress: Any, depth: Any, rate: Any) -> Any:
+        """Of the sign of the force, turned: positive where it would pull. It ends a contact that
+        may not pull, and should be smooth at first touch; `prestress` is `None` where there is
+        none."""
+        force = self.force(stiffness, damping, depth, rate)
+        return -force if prestress is None else -(prestress + force)
+
+    def damping_of(self, restitution: Any) -> Any:
+        """α that gives this restitution whatever the speed; `None` for a law whose restitution
+        depends on it."""
+        return None
+
+    def frequency(self, stiffness: Any, depth: Any, rate: Any) -> Any:
+        """With which a body oscillates on the stop, at the depth that it will reach."""
+        p, deepest = self.exponent, jnp.maximum(depth, 1e-12)
+        if p > 1:
+            reach = (0.5 * (p + 1) * rate**2 / stiffness + 1e-30) ** (1 / (p + 1))
+            deepest = jnp.maximum(deepest, reach)
+        return jnp.sqrt(p * stiffness * power(deepest, p - 1))
+
+
+class PowerLaw(AbstractContactLaw):
+    """K δᵖ + α √K δ^((p-1)/2) δ': p = 1 is a spring with a dashpot, p = 3/2 Hertz's contact.
+
+    Its coefficient of restitution does not depend on the speed,
+    α = √(2(p+1)) (-ln e)/√(π² + ln² e) (Feng, arXiv 2603.27764).
+    """
+
+    def force(self, stiffness, damping, depth, rate):
+        """Of spring and dashpot."""
+        p = self.exponent
+        resist = damping * jnp.sqrt(stiffness) * power(depth, 0.5 * (p - 1)) * rate
+        return stiffness * power(depth, p) + resist
+
+    def pulls(self, stiffness, damping, prestress, depth, rate):
+        """By the force over δ^((p-1)/2)."""
+        root = power(depth, 0.5 * (self.exponent + 1))
+        pull = -stiffness * root - damping * jnp.sqrt(stiffness) * rate
+        flat = power(depth, 0.5 * (self.exponent - 1))
+        return pull if prestress is None else pull * flat - prestress
+
+    def damping_of(self, restitution):
+        """α from e in (0, 1]."""
+        require("restitution", restitution, low=0.0, high=1.0, open_low=True)
+        drop = -jnp.log(jnp.asarray(restitution, float))
+        return sqrt(2 * (self.exponent + 1)) * drop / jnp.sqrt(pi**2 + drop**2)
+
+
+class HuntCrossley(AbstractContactLaw):
+    """K δᵖ (1 + α δ'), whose restitution falls with the speed."""
+
+    def force(self, stiffness, damping, depth, rate):
+        """Damped in proportion to the spring's force."""
+        spring = stiffness * power(depth, self.exponent)
+        return spring + damping * spring * rate
+
+    def pulls(self, stiffness, damping, prestress, depth, rate):
+        """By what the spring's force is multiplied with."""
+        if prestress is None:
+            return -(1 + damping * rate)
+        return super().pulls(stiffness, damping, prestress, depth, rate)
+
+
+def power(x: Any, n: float) -> Any:
+    """xⁿ inside; for n = 0 and 1 continued smoothly to where a step may look beyond the surface."""
+    if n == 0:
+        return jnp.ones_like(x)
+    if n == 1:
+        return x
+    inside = x > 0
+    return jnp.where(inside, jnp.where(inside, x, 1.0) ** n, 0.0)
