@@ -54,7 +54,7 @@ def share(error):
 VERBS = {
     "sweep": (sweep, 4.0),
     # Many short blocks, and then one long one.
-    "basins": (lambda: basins(3_000), 14.0),
+    "basins": (lambda: basins(20_000), 14.0),
     "long basins": (lambda: basins(10**8), 4.0),
     "branch": (branch, 9.0),
 }

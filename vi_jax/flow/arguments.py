@@ -259,13 +259,14 @@ def check_start(scene: AbstractScene, start: Any) -> None:
             name = jtu.keystr(path).lstrip(".")
             raise ValueError(f"Argument `start` must be finite, but its {name} is {numbers}.")
     scene.check_start(start)
+    slack = concrete(rounding(scene, start))
     for i, stop in enumerate(scene.stops):
         gap = concrete(stop.gap)
         Y = concrete(scene.coordinates[stop.coordinate].position(start))
-        if Y is None or gap is None:
+        if Y is None or gap is None or slack is None:
             continue
         depth = np.max(stop.sign * Y - gap)
-        if depth > np.max(rounding(scene, start)):
+        if depth > np.max(slack):
             raise ValueError(
                 f"Argument `start` must not lie beyond a stop, but lies {depth:g} beyond stop {i} "
                 f"({stop.side}, gap {gap})."
