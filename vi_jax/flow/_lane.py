@@ -9,36 +9,32 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
 from ..scene import AbstractScene
+from ..scene.event import begin_modes, events_of
 from . import results
 from ._own import check_field, check_laws
 from .events import Rates, force_rate, rates
 from .methods import AbstractMethod
-from .moving import begin_modes, in_modes, rounding
+from .moving import in_modes, rounding
 
 Scalar = Float[Array, ""]
 
-# What the next step aims at: nothing, the section, or one of those below.
-FREE, SECTION = 0.0, -1.0
+# What the next step aims at: nothing, or one of those below. Numbers, which the loop carries.
+FREE = 0.0
 
 
-def to_stop(i: int) -> float:
-    """Name of the impact on stop number i."""
-    return 1.0 + i
-
-
-def to_switch(j: int) -> float:
-    """Name of the event of switch number j."""
-    return 101.0 + j
+def to_event(number: int) -> float:
+    """Event of this number among the machine's (see `events_of`); all others are negative."""
+    return 1.0 + number
 
 
 def to_turn_of(k: int) -> float:
-    """Name of a turning point of coordinate number k."""
-    return -2.0 - 2 * k
+    """A turning point of coordinate number k."""
+    return -1.0 - 2 * k
 
 
 def to_release(k: int) -> float:
-    """Name of the release of coordinate number k from the stop on which it rests."""
-    return -3.0 - 2 * k
+    """The release of coordinate number k from the stop on which it rests."""
+    return -2.0 - 2 * k
 
 
 # Kinds of events as the log of all of them lists them: their places in `results.EVENTS`.
@@ -156,6 +152,11 @@ class Plan(eqx.Module):
         """Iterations in which a lane completes at most one interval, its steps being so short."""
         return max(1, self.method.steps_per_cycle // self.parts)
 
+    @property
+    def to_section(self) -> float:
+        """The end of a cycle, where an event is it."""
+        return to_event(len(events_of(self.scene)) - 1)
+
     def end(self, part: Scalar) -> Scalar:
         """Clock reading at the end of the `part`-th interval of a cycle."""
         cycle = jnp.asarray(self.scene.cycle, part.dtype)
@@ -210,7 +211,7 @@ class Plan(eqx.Module):
             bad = bad | (stop.beyond(scene.coordinates[stop.coordinate].position(start)) > slack)
         bad = jax.lax.stop_gradient(bad)
         zero = jnp.zeros_like(Y)
-        modes = jax.lax.stop_gradient(begin_modes(scene, zero, start))
+        modes = begin_modes(scene, zero, start)
         check_field(scene, zero, start, modes)
         check_laws(scene, zero)
         free = in_modes(scene, modes)
@@ -229,7 +230,7 @@ class Plan(eqx.Module):
             for i, stop in enumerate(scene.stops):
                 # A little off the stop it would come to rest there: no derivative by the start.
                 at = scene.coordinates[stop.coordinate].placed(start, stop.place, zero)
-                rests = contact[stop.coordinate] == to_stop(i)
+                rests = contact[stop.coordinate] == to_event(i)
                 start = jtu.tree_map(lambda a, b, rests=rests: jnp.where(rests, a, b), at, start)
         length = zero + jax.lax.stop_gradient(scene.cycle) / self.method.steps_per_cycle
         if self.method.adaptive:
@@ -259,7 +260,7 @@ class Plan(eqx.Module):
         place = otherwise
         for i, stop in enumerate(self.scene.stops):
             if stop.coordinate == k:
-                place = jnp.where(contact == to_stop(i), stop.place, place)
+                place = jnp.where(contact == to_event(i), stop.place, place)
         return place
 
     def _rests_on(self, k: int, here: Rates, growth: Scalar, slack: Any) -> Scalar:
@@ -270,5 +271,5 @@ class Plan(eqx.Module):
             if stop.coordinate == k:
                 pressed = (stop.sign * here.a > 0) | (here.a == 0) & (stop.sign * growth > 0)
                 rests = (stop.beyond(here.x) >= -slack) & (jnp.abs(here.v) <= slack) & pressed
-                contact = jnp.where(rests, to_stop(i), contact)
+                contact = jnp.where(rests, to_event(i), contact)
         return contact

@@ -16,8 +16,8 @@ from jaxtyping import Array, Float
 
 from .._numbers import warn
 from ..scene import AbstractScene
+from ..scene.event import begin_modes
 from ._by_numpy import by_numpy
-from .moving import begin_modes
 
 Scalar = Float[Array, ""]
 

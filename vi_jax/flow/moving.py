@@ -109,21 +109,6 @@ def in_modes(scene: AbstractScene, modes: tuple[Scalar, ...]) -> AbstractScene:
     return Moving(scene=scene, modes=modes, held=(), stops=scene.stops) if modes else scene
 
 
-def begin_modes(scene: AbstractScene, s: Scalar, state: Any) -> tuple[Scalar, ...]:
-    """The modes of a motion that begins in `state`."""
-    return tuple(
-        jnp.asarray(switch.begin(scene, s, state), jnp.result_type(s)) for switch in scene.switches
-    )
-
-
-def struck_modes(
-    scene: AbstractScene, s: Scalar, state: Any, modes: tuple[Scalar, ...]
-) -> tuple[Scalar, ...]:
-    """The modes after an impact."""
-    new = (x.struck(scene, s, state, m) for x, m in zip(scene.switches, modes, strict=True))
-    return tuple(stop_gradient(jnp.asarray(mode, jnp.result_type(s))) for mode in new)
-
-
 def exact(scene: AbstractScene, state: Any) -> bool:
     """Whether one number of the state is all that stops limit, so that it can be put on a stop
     without rounding; known while a step is traced."""

@@ -1,55 +1,37 @@
-"""The events of a periodic motion, and what they do to its state."""
+"""The events of a periodic motion, in their order."""
 
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from ..scene import AbstractScene, Coordinate, RigidStop
+from ..scene import AbstractEvent, AbstractScene
+from ..scene.event import events_of, guard_of
 
 
 class Event(NamedTuple):
-    """What begins a flight: an impact, a switch, or a section that counts for the motion."""
+    """What begins a flight: one of the machine's events."""
 
-    kind: str
-    """"stop", "switch" or "section"."""
     number: int
-    """Of the stop or switch; of the cycle that a section begins."""
+    """Its place in `events_of(machine)`."""
+    cycle: int | None = None
+    """Number of the cycle that it begins, if it begins one."""
+
+    def later(self, cycles: int) -> "Event":
+        """The same so many cycles later."""
+        return self if self.cycle is None else self._replace(cycle=self.cycle + cycles)
+
+    def of(self, scene: AbstractScene) -> AbstractEvent:
+        """The event itself."""
+        return events_of(scene)[self.number]
 
 
-def jump(
-    scene: AbstractScene, event: Event, s: Any, state: Any, mode: Any, *, landed: bool = True
-) -> Any:
-    """The state after an event, from that in which it is met; without `landed` from one beside it,
-    whose position, or what a switch puts right, is left as it is."""
-    if event.kind == "stop":
-        stop, body = _met(scene, event)
-        place = stop.place if landed else body.position(state)
-        return body.placed(state, place, stop.rebound(body.velocity(state)))
-    if event.kind == "switch":
-        return scene.switches[event.number].after(scene, s, state, mode)[0] if landed else state
-    return scene.renewed(state)
+def section_of(scene: AbstractScene, cycle: int) -> Event:
+    """The section with which a cycle begins."""
+    return Event(len(events_of(scene)) - 1, cycle)
 
 
-def _met(scene: AbstractScene, event: Event) -> tuple[RigidStop, Coordinate]:
-    """The stop of an impact, and what meets it."""
-    stop = scene.stops[event.number]
-    return stop, scene.coordinates[stop.coordinate]
-
-
-def approach_of(scene: AbstractScene, event: Event, state: Any, rate: Any) -> Any:
-    """V⁻ of an impact; of another event how fast its guard rises."""
-    if event.kind == "stop":
-        stop, body = _met(scene, event)
-        return stop.approach(body.velocity(state))
-    return rate
-
-
-def guard_of(scene: AbstractScene, event: Event, s: Any, state: Any, mode: Any) -> Any:
-    """What is zero at an event, and rises there."""
-    if event.kind == "stop":
-        stop, body = _met(scene, event)
-        return stop.beyond(body.position(state))
-    if event.kind == "switch":
-        return scene.switches[event.number].guard(scene, s, state, mode)
-    rises = scene.section(state)
-    return s - jnp.asarray(scene.cycle, s.dtype) * event.number if rises is None else rises
+def guard_at(scene: AbstractScene, event: Event, s: Any, state: Any, modes: Any) -> Any:
+    """What is zero at an event, and rises there; `s` counts from the first cycle on."""
+    if event.cycle is not None:
+        s = s - jnp.asarray(scene.cycle, s.dtype) * (event.cycle - 1)
+    return guard_of(scene, event.number, s, state, modes)

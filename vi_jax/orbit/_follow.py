@@ -6,6 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from ..scene.event import events_of
 from ..scene.numbers import with_leaf
 from ._hopf import hopf_between, size_of
 from ._origin import halves, origin
@@ -42,8 +43,6 @@ _DETAILS = {
     _REORDERED: "two of its events fall together, and come in another order beyond",
     _ANEW: "a switch goes into another mode: the motion sticks or slips anew",
 }
-
-_NAMES = {"stop": "impact", "switch": "switch", "section": "section"}
 
 # Halves of a period that differ by less than this are those of a motion of half the period.
 _ALIKE = 1e-3
@@ -141,7 +140,7 @@ class Follower:
 
         for i in range(len(self.problem.events)):
             if new.seen.approach[i] <= 0 < here.seen.approach[i]:
-                if self.problem.events[i].kind == "section":
+                if self.problem.events[i].cycle is not None:
                     hopf = hopf_between(self.problem, here, new)
                     if hopf is not None:
                         found.append((hopf, _RESTS))
@@ -169,13 +168,14 @@ class Follower:
         if impact == _RESTS:
             return self._point(HOPF, at, "the motion shrinks to rest", 0)
         if impact is None:
-            touched = int(at.seen.touched) - len(self.problem.scene.stops)
-            what = "a stop" if touched < 0 else f"the guard of switch {touched}"
+            scene, touched = self.problem.scene, int(at.seen.touched)
+            number, word = touched - len(scene.stops), events_of(scene)[touched].word
+            what = "a stop" if number < 0 else f"the guard of {word} {number}"
             detail = f"touches {what} at {self._place(at, float(at.seen.touch))}"
         else:
             clock = float(np.asarray(self.problem.parts(jnp.asarray(at.x))[0])[impact])
-            kind = self.problem.events[impact].kind
-            detail = f"the {_NAMES[kind]} at {self._place(at, clock)} is lost"
+            word = self.problem.events[impact].of(self.problem.scene).word
+            detail = f"the {word} at {self._place(at, clock)} is lost"
         return self._point(GRAZING, at, detail, impact)
 
     def _place(self, at: Step, clock: float) -> str:

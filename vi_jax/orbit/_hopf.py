@@ -15,7 +15,7 @@ from jax.flatten_util import ravel_pytree
 
 from .._programs import compiled
 from ..scene.base import renews
-from ._events import Event
+from ._events import section_of
 from ._shooting import Shooting
 from ._solve import observe
 from .curve import Step
@@ -66,7 +66,7 @@ def hopf_between(problem: Shooting, here: Step, new: Step) -> Step | None:
     **Returns:** a motion of hardly any size about the equilibrium whose eigenvalues ±iω are
     imaginary. One of its multipliers is 1, which is checked.
     """
-    if problem.events != (Event("section", 0),) or renews(problem.scene):
+    if problem.events != (section_of(problem.scene, 0),) or renews(problem.scene):
         return None
     rates = [_flow_at(problem, step.x, _state(problem, step.x))[0] for step in (here, new)]
     if np.dot(*rates) >= 0:

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
 from ..scene import AbstractScene
+from ..scene.event import events_of, guard_of
 from ._events import Event
 
 
@@ -20,12 +21,12 @@ class Observed(NamedTuple):
     y_min: Float[Array, ""]
     y_max: Float[Array, ""]
     clearance: Float[Array, ""]
-    """Distance to the stop at the turn nearest to one, or of a switch's guard below zero where it
-    is greatest; negative where it is passed through."""
+    """Distance to the stop at the turn nearest to one, or of another guard below zero where it is
+    greatest; negative where it is passed through."""
     touch: Float[Array, ""]
     """Clock of that turn."""
     touched: Float[Array, ""]
-    """The stop there, or the switch, counted after the stops."""
+    """The number of that event."""
     order: Float[Array, ""]
     """1 where each switch goes into the mode that is its next one here, else -1."""
     apart: Float[Array, ""]
@@ -42,8 +43,8 @@ def apart(
     states: list[Any],
 ) -> Float[Array, ""]:
     """How far the events are from coming in another order: the least time between two that follow
-    each other, or the least distance, where one is met, of the stops and the switches that are not
-    met there. Negative where the motion is none of the machine's.
+    each other, or the least distance, where one is met, of those that are not met there. Negative
+    where the motion is none of the machine's.
 
     **Arguments:** the machine; its events in their order, the modes of the flight that each begins,
     its clock, the time to the next one, and the state just before it.
@@ -51,12 +52,8 @@ def apart(
     least = jnp.asarray(jnp.inf, clock.dtype)
     for i, event in enumerate(events):
         least = jnp.minimum(least, lengths[i])
-        for number, stop in enumerate(scene.stops):
-            if (event.kind, event.number) != ("stop", number):
-                body = scene.coordinates[stop.coordinate]
-                least = jnp.minimum(least, -stop.beyond(body.position(states[i])))
-        for number, switch in enumerate(scene.switches):
-            if (event.kind, event.number) != ("switch", number):
-                mode = jnp.asarray(modes[i - 1][number], clock.dtype)
-                least = jnp.minimum(least, -switch.guard(scene, clock[i], states[i], mode))
+        before = tuple(jnp.asarray(mode, clock.dtype) for mode in modes[i - 1])
+        for number, other in enumerate(events_of(scene)):
+            if number != event.number and not other.ends_cycle:
+                least = jnp.minimum(least, -guard_of(scene, number, clock[i], states[i], before))
     return least

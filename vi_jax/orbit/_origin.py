@@ -33,11 +33,7 @@ def halves(problem: Shooting, x: Any) -> np.ndarray:
 def _alike(events: tuple[Event, ...], cycles: int) -> bool:
     """Whether both halves of a period have the same events."""
     half = len(events) // 2
-    later = [
-        event._replace(number=event.number - cycles // 2) if event.kind == "section" else event
-        for event in events[half:]
-    ]
-    return list(events[:half]) == later
+    return events[:half] == tuple(event.later(-(cycles // 2)) for event in events[half:])
 
 
 def origin(problem: Shooting, at: Step, scale: np.ndarray) -> tuple[Step, Shooting, Step]:

@@ -22,8 +22,9 @@ from jaxtyping import Array, Float
 from ..flow import AbstractMethod
 from ..scene import AbstractScene
 from ..scene.base import renews
+from ..scene.event import after_event, jump_of, mode_number
 from ..scene.numbers import with_leaf
-from ._events import Event, approach_of, guard_of, jump
+from ._events import Event, guard_at
 from ._flight import Flight
 from ._observed import Observed, apart
 from ._turns import Turns, turns_of
@@ -77,7 +78,8 @@ class Shooting(eqx.Module):
     @property
     def impacts(self) -> tuple[int, ...]:
         """Which of the events are impacts."""
-        return tuple(i for i, event in enumerate(self.events) if event.kind == "stop")
+        stops = len(self.scene.stops)
+        return tuple(i for i, event in enumerate(self.events) if event.number < stops)
 
     def at(self, x: Vector) -> AbstractScene:
         """The scene with the parameters of `x`."""
@@ -117,8 +119,10 @@ class Shooting(eqx.Module):
 
     def _modes_in(self, leg: Any) -> tuple[Array, ...]:
         """Of each switch, in a leg whose number may be traced."""
+        if not self.modes[0]:
+            return ()
         modes = jnp.asarray(self.modes, jnp.result_type(float))[leg]
-        return tuple(modes[j] for j in range(len(self.scene.switches)))
+        return tuple(modes[j] for j in range(len(self.modes[0])))
 
     def _each(self, leg: Any, of_event: Callable[[Event], Callable[..., Any]], *inputs: Any) -> Any:
         """A function that depends on the event of a leg, whose number may be traced."""
@@ -133,8 +137,10 @@ class Shooting(eqx.Module):
 
         def of(event: Event) -> Callable[..., Vector]:
             def new(s, u):
-                mode = self._mode_before(leg, event)
-                return ravel_pytree(jump(scene, event, s, self.unravel(u), mode))[0]
+                modes = self._modes_in(leg - 1)
+                return ravel_pytree(after_event(scene, event.number, s, self.unravel(u), modes)[0])[
+                    0
+                ]
 
             return new
 
@@ -145,16 +151,11 @@ class Shooting(eqx.Module):
 
         def of(event: Event) -> Callable[..., Array]:
             def value(s, u):
-                mode = self._mode_before(leg, event)
-                return guard_of(scene, event, s, self.unravel(u), mode)
+                return guard_at(scene, event, s, self.unravel(u), self._modes_in(leg - 1))
 
             return value
 
         return self._each(leg, of, s, u)
-
-    def _mode_before(self, leg: Any, event: Event) -> Any:
-        """The mode of a switch before the event that begins a leg."""
-        return self._modes_in(leg - 1)[event.number] if event.kind == "switch" else None
 
     def ends(self, clock: Float[Array, " legs"], period: Any) -> Float[Array, " legs"]:
         """Clock at the end of each leg."""
@@ -162,8 +163,7 @@ class Shooting(eqx.Module):
 
     def flight(self, scene: AbstractScene, leg: Any) -> Flight:
         """The flight of a leg, whose number may be traced."""
-        modes = self._modes_in(leg) if scene.switches else ()
-        return Flight(scene, modes, self.method, self.like)
+        return Flight(scene, self._modes_in(leg), self.method, self.like)
 
     def residual(self, x: Vector) -> Vector:
         """What the flights from event to event lack; zero for a periodic motion."""
@@ -232,7 +232,7 @@ class Shooting(eqx.Module):
 
     def _reached(self, scene: AbstractScene, states: Array) -> Array:
         """The states at the events, on both sides of those that may move the first coordinate."""
-        sections = [i for i, event in enumerate(self.events) if event.kind == "section"]
+        sections = [i for i, event in enumerate(self.events) if event.of(scene).ends_cycle]
         if not sections or not renews(scene):
             return states
         renewed = [scene.renewed(self.unravel(states[i])) for i in sections]
@@ -250,8 +250,9 @@ class Shooting(eqx.Module):
 
         def reset(u):
             def of(event: Event) -> Callable[..., Vector]:
+                modes = self._modes_in(leg - 1)
                 return lambda u: ravel_pytree(
-                    jump(scene, event, s, self.unravel(u), None, landed=False)
+                    jump_of(scene, event.number, s, self.unravel(u), modes)
                 )[0]
 
             return self._each(leg, of, u)
@@ -260,13 +261,13 @@ class Shooting(eqx.Module):
         before, after = field(old, u), field(new, reset(u))
         if self.autonomous:
             # From the section on the clock counts anew, so that what lies along the motion is gone.
-            goes_on = [float(event.kind != "section") for event in self.events]
+            goes_on = [float(not event.of(scene).ends_cycle) for event in self.events]
             after = jnp.asarray(goes_on, u.dtype)[leg] * after
         gained, slope = jax.grad(lambda s, u: self.guard(scene, leg, s, u), argnums=(0, 1))(s, u)
         rate = gained + jnp.dot(slope, before)
 
         def met(event: Event) -> Callable[..., Array]:
-            return lambda u, rate: approach_of(scene, event, self.unravel(u), rate)
+            return lambda u, rate: event.of(scene).speed(scene, self.unravel(u), rate)
 
         approach = self._each(leg, met, u, rate)
         return jacobian + jnp.outer(after - jacobian @ before, slope) / rate, approach
@@ -281,10 +282,10 @@ class Shooting(eqx.Module):
         """Whether a switch goes into the mode of the flight that begins with its event: 1 or -1."""
 
         def order(s, u):
-            if event.kind != "switch":
+            if not event.of(scene).holds_mode:
                 return jnp.ones_like(s)
-            j, before = event.number, self._mode_before(leg, event)
-            mode = scene.switches[j].after(scene, s, self.unravel(u), before)[1]
+            j, before = mode_number(scene, event.number), self._modes_in(leg - 1)
+            mode = after_event(scene, event.number, s, self.unravel(u), before)[1][j]
             wanted = self._modes_in(leg)[j]
             return jnp.where(mode == wanted, 1.0, -1.0).astype(s.dtype)
 

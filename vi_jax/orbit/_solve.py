@@ -14,13 +14,13 @@ from .._programs import compiled
 from ..flow.arguments import planned
 from ..flow.loop import run_lane
 from ..flow.methods import MethodLike
-from ..flow.moving import begin_modes, struck_modes
 from ..flow.simulate import collect
 from ..scene import Scene
 from ..scene.base import renews
+from ..scene.event import after_event, begin_modes
 from ..scene.numbers import leaf, with_leaf
 from ._carrier import carrier, steps_of
-from ._events import Event, jump
+from ._events import Event, section_of
 from ._flight import Flight
 from ._shooting import Shooting
 from ._symmetry import images
@@ -103,25 +103,20 @@ class _Way(NamedTuple):
 
 def _followed(blank: Shooting, state: Any, found: list[tuple[float, Event]], period: float) -> _Way:
     scene = blank.scene
-    modes = list(begin_modes(scene, jnp.zeros(()), state))
+    modes = begin_modes(scene, jnp.zeros(()), state)
     u, s = ravel_pytree(state)[0], 0.0
     states, in_flight = [], []
     for place, event in found:
         if place > s:
-            u = _carry(blank, tuple(modes), s, place, u)
+            u = _carry(blank, modes, s, place, u)
         states.append(np.asarray(u))
-        here, clock = blank.unravel(u), jnp.asarray(place)
-        mode = modes[event.number] if event.kind == "switch" else None
-        if mode is not None:
-            modes[event.number] = scene.switches[event.number].after(scene, clock, here, mode)[1]
-        if (place, event.kind) != (0.0, "section"):  # after which an orbit's state is
-            here = jump(scene, event, clock, here, mode)
-        if event.kind == "stop":
-            modes = list(struck_modes(scene, clock, here, tuple(modes)))
+        here = blank.unravel(u)
+        if (place, event.cycle) != (0.0, 0):  # after which an orbit's state is
+            here, modes = after_event(scene, event.number, jnp.asarray(place), here, modes)
         in_flight.append(tuple(float(m) for m in modes))
         u, s = ravel_pytree(here)[0], place
-    states.append(np.asarray(_carry(blank, tuple(modes), s, period, u)))
-    if found and found[0] == (0.0, Event("section", 0)) and renews(scene):
+    states.append(np.asarray(_carry(blank, modes, s, period, u)))
+    if found and found[0] == (0.0, section_of(scene, 0)) and renews(scene):
         states[0] = states[-1]
     return _Way(np.stack(states), tuple(in_flight) or (tuple(float(m) for m in modes),))
 
@@ -132,15 +127,15 @@ def events_of(orbit: Orbit) -> list[tuple[float, Event]]:
     autonomous = scene.section(orbit.state) is not None
     clock = np.asarray(orbit.impact_phase) - float(scene.phase_at(0.0))
     stops = np.asarray(orbit.impact_stop)
-    found = [(float(s), Event("stop", int(i))) for s, i in zip(clock, stops, strict=True) if i >= 0]
+    found = [(float(s), Event(int(i))) for s, i in zip(clock, stops, strict=True) if i >= 0]
     begins = float(scene.cycle) * np.arange(cycles)
     if scene.switches or (autonomous and cycles > 1):
         begins, listed = _listed_events(orbit)
         found = listed if scene.switches else found
     if autonomous or renews(scene):
-        found += [(float(begins[n]), Event("section", n)) for n in range(cycles)]
+        found += [(float(begins[n]), section_of(scene, n)) for n in range(cycles)]
     # What is met with a section belongs to the cycle that ends there.
-    return sorted(found, key=lambda f: (f[0], f[1].kind == "section"))
+    return sorted(found, key=lambda f: (f[0], f[1].cycle is not None))
 
 
 def _listed_events(orbit: Orbit) -> tuple[np.ndarray, list[tuple[float, Event]]]:
@@ -155,11 +150,10 @@ def _listed_events(orbit: Orbit) -> tuple[np.ndarray, list[tuple[float, Event]]]
             f"Argument `orbit` must have at most {_LISTED} events in a cycle, but has "
             f"{int(counts.max())}."
         )
-    found, stops = [], len(orbit.scene.stops)
+    found = []
     for begin, clock, number in zip(begins, log[0], log[1], strict=False):
         for s, i in zip(clock[number >= 0], number[number >= 0].astype(int), strict=True):
-            event = Event("stop", int(i)) if i < stops else Event("switch", int(i) - stops)
-            found.append((float(begin + s), event))
+            found.append((float(begin + s), Event(int(i))))
     return begins, found
 
 
@@ -303,7 +297,7 @@ def orbit_of(problem: Shooting, step: Step) -> Orbit:
     scene = problem.at(x)
     clock = np.asarray(problem.parts(x)[0])[: len(problem.events)]
     period = float(problem.period(x))
-    begins = [i for i, event in enumerate(problem.events) if event.kind == "section"]
+    begins = [i for i, event in enumerate(problem.events) if event.cycle is not None]
     if begins:
         places, legs = clock[begins], np.asarray(begins)
     else:

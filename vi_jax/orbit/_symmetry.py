@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from ..scene import AbstractScene
+from ..scene import AbstractScene, RigidStop
 from ._events import Event
 from ._shooting import Shooting
 
@@ -28,10 +28,10 @@ def may_be_symmetric(problem: Shooting, scenes: Iterable[AbstractScene]) -> bool
 
 
 def _are_images(scene: AbstractScene, one: Event, other: Event) -> bool:
-    if one.kind == other.kind == "stop":
-        left, right = scene.stops[one.number], scene.stops[other.number]
+    left, right = one.of(scene), other.of(scene)
+    if isinstance(left, RigidStop) and isinstance(right, RigidStop):
         return left.coordinate == right.coordinate and left.sign == -right.sign
-    return one.kind == other.kind == "switch"
+    return left.holds_mode and right.holds_mode
 
 
 def images(problem: Shooting, x: Float[Array, " unknowns"]) -> Float[Array, " differences"]:

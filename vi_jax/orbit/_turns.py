@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..flow.events import Rates, guard_rates
 from ..scene import AbstractScene
+from ..scene.event import events_of, guard_of
 from ._flight import Flight
 
 Scalar = Float[Array, ""]
@@ -27,11 +28,11 @@ class Turns(NamedTuple):
     """The least Y at one."""
     high: Scalar
     room: Scalar
-    """The smallest distance to a stop at one, or of a switch's guard below zero."""
+    """The smallest distance to a stop at one, or of another guard below zero."""
     touch: Scalar
     """Clock there."""
     touched: Scalar
-    """The stop there, or the switch, counted after the stops."""
+    """The number of that event."""
 
 
 class _Found(NamedTuple):
@@ -45,24 +46,17 @@ class _Found(NamedTuple):
     """The function's rate, or one of its sign, at the start of the step."""
 
 
-class _Watched(NamedTuple):
-    """What turns: a coordinate, or the guard of a switch."""
+class _Guard(NamedTuple):
+    """What turns: the guard of an event."""
 
-    kind: str
     number: int
 
     def value(self, flight: Flight, s: Any, state: Any) -> Any:
         """Of it."""
-        if self.kind == "coordinate":
-            return flight.scene.coordinates[self.number].position(state)
-        mode = flight.modes[self.number]
-        return flight.scene.switches[self.number].guard(flight.scene, s, state, mode)
+        return guard_of(flight.scene, self.number, s, state, flight.modes)
 
     def rate(self, flight: Flight, s: Any, u: Any) -> Any:
         """Its rate, or one of its sign."""
-        state = flight.unravel(u)
-        if self.kind == "coordinate" and flight.scene.has_velocity(state):
-            return flight.scene.coordinates[self.number].velocity(state)
         return self.rates(flight, flight.moving, s, u).v
 
     def rates(self, flight: Flight, moving: AbstractScene, s: Any, u: Any) -> Rates:
@@ -72,6 +66,19 @@ class _Watched(NamedTuple):
             return self.value(flight, s, state)
 
         return guard_rates(moving.field, guard, s, flight.unravel(u))
+
+
+class _Body(_Guard):
+    """A coordinate of the machine."""
+
+    def value(self, flight, s, state):
+        return flight.scene.coordinates[self.number].position(state)
+
+    def rate(self, flight, s, u):
+        state = flight.unravel(u)
+        if flight.scene.has_velocity(state):
+            return flight.scene.coordinates[self.number].velocity(state)
+        return super().rate(flight, s, u)
 
 
 def turns_of(
@@ -88,22 +95,23 @@ def turns_of(
     # The end of the last step is the next event: its velocity is that of a further step.
     last = flight.once(_stepped, (places[-1], h, states[-1]))
 
-    def found(kind: str, number: int) -> _Found:
-        watched = _Watched(kind, number)
+    def found(watched: _Guard) -> _Found:
         v = jax.vmap(partial(watched.rate, flight))(places, states)
         v1 = jnp.concatenate([v[1:], watched.rate(flight, places[-1] + h, last)[None]])
         return jax.vmap(lambda *x: flight.once(partial(_turn, watched), (h, *x)))(
             places, states, v, v1
         )
 
-    bodies = [found("coordinate", k) for k in range(len(scene.coordinates))]
+    bodies = [found(_Body(k)) for k in range(len(scene.coordinates))]
     rooms = []
     for stop in scene.stops:
         at = bodies[stop.coordinate]
         facing = at.turns & (stop.sign * at.before > 0)
         rooms.append((jnp.where(facing, -stop.beyond(at.height), jnp.inf), at.place))
-    for j in range(len(scene.switches)):
-        at = found("switch", j)
+    for number, event in enumerate(events_of(scene)):
+        if number < len(scene.stops) or event.ends_cycle:
+            continue
+        at = found(_Guard(number))
         # A body that friction lets go begins to slide with velocity and acceleration zero.
         away = at.place > begin + _TURNED * h
         facing = at.turns & (at.before > 0) & away
@@ -125,7 +133,7 @@ def _stepped(flight: Flight, inputs: Any) -> Vector:
     return flight.step(s, s + h, u, jnp.zeros_like(s))[0]
 
 
-def _turn(watched: _Watched, flight: Flight, inputs: Any) -> _Found:
+def _turn(watched: _Guard, flight: Flight, inputs: Any) -> _Found:
     """Where it changes sign within a step, Newton's method from the step's start."""
     h, s, u, v0, v1 = inputs
     # A turn may fall on the end of a step.

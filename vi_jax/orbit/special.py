@@ -100,7 +100,7 @@ def _doubled(point: SpecialPoint, distance: float) -> Orbit:
     events, modes = old.events, old.modes
     if events:
         clock, states = np.concatenate([clock, clock + turn]), np.concatenate([states, states])
-        events, modes = (*events, *(_later(event, old.cycles) for event in events)), modes * 2
+        events, modes = (*events, *(event.later(old.cycles) for event in events)), modes * 2
     new = dataclasses.replace(
         old, cycles=2 * old.cycles, events=events, modes=modes, steps=2 * old.steps
     )
@@ -117,11 +117,6 @@ def _doubled(point: SpecialPoint, distance: float) -> Orbit:
             f"No motion of twice the period was found at distance {distance:g}; try another."
         )
     return orbit_of(new, step)
-
-
-def _later(event: Event, cycles: int) -> Event:
-    """The same event so many cycles later."""
-    return event._replace(number=event.number + cycles) if event.kind == "section" else event
 
 
 def _crossed(point: SpecialPoint, distance: float) -> Orbit:
@@ -155,7 +150,7 @@ def _beyond_grazing(point: SpecialPoint, distance: float) -> Orbit:
             f"`switch` at a grazing needs something that is touched, but there {point.detail}: "
             "find the motion beyond it with `find_orbit`."
         )
-    if point.impact is not None and old.events[point.impact].kind == "section":
+    if point.impact is not None and old.events[point.impact].cycle is not None:
         raise ValueError(
             "`switch` needs an impact that grazes, but here the section of the machine is touched: "
             "beyond it the motion has another number of cycles. Find it with `find_orbit`."
@@ -175,7 +170,7 @@ def _beyond_grazing(point: SpecialPoint, distance: float) -> Orbit:
         touch = float(step.seen.touch)
         leg = max(0, int(np.searchsorted(clock, touch, side="right")) - 1) if events else 0
         there = state_at(old, x, jnp.asarray(leg), jnp.asarray(touch))
-        u, hit = np.asarray(ravel_pytree(there)[0])[None], Event("stop", int(step.seen.touched))
+        u, hit = np.asarray(ravel_pytree(there)[0])[None], Event(int(step.seen.touched))
         if not events:
             clock, states, events = np.array([touch]), u, [hit]
         else:

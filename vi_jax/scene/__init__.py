@@ -8,6 +8,8 @@ from .crank import SliderCrank as SliderCrank
 from .dc_motor import DCMotor as DCMotor
 from .drive import AbstractDrive as AbstractDrive
 from .drive import IdealDrive as IdealDrive
+from .event import AbstractEvent as AbstractEvent
+from .event import AbstractSwitch as AbstractSwitch
 from .friction import DryFriction as DryFriction
 from .law import AbstractContactLaw as AbstractContactLaw
 from .law import HuntCrossley as HuntCrossley
@@ -24,5 +26,4 @@ from .states import OscillatorState as OscillatorState
 from .states import TimedDCMotorState as TimedDCMotorState
 from .states import TimedMotorState as TimedMotorState
 from .stop import RigidStop as RigidStop
-from .switch import AbstractSwitch as AbstractSwitch
 from .switch import Switch as Switch

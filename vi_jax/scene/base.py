@@ -11,9 +11,9 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float
 
 from .._checks import in_range
+from .event import AbstractSwitch
 from .shown import Shown
 from .stop import RigidStop
-from .switch import AbstractSwitch
 from .units import PLAIN, unit_in
 
 State = Any

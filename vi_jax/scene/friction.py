@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from .._checks import NOT_NEGATIVE, Range, require_ranges
 from .._numbers import number, real
-from .switch import AbstractSwitch
+from .event import AbstractSwitch
 
 
 def _level(x: Any) -> Any:
@@ -58,20 +58,21 @@ class DryFriction(AbstractSwitch):
         """Never along its own surface: where both sides point at it, the body sticks."""
         return False
 
-    def sliding(self, machine: Any, s: Any, state: Any, speed: Any) -> Any:
-        """The friction on a body that slides at this speed."""
-        level = self.level(speed) if callable(self.level) else self.level
+    def sliding(self, machine: Any, s: Any, state: Any, mode: Any) -> Any:
+        """The friction on a body that slides forward or backward; that on one at rest (mode 0)
+        which begins to."""
+        level = self.level
+        if callable(level):
+            level = level(mode * self.velocity(machine, state))
         return level if self.load is None else level * self.load(machine, s, state)
 
     def sticking(self, machine: Any, s: Any, state: Any) -> Any:
         """The most that friction holds."""
-        at_rest = self.sliding(machine, s, state, jnp.zeros_like(s))
-        return at_rest * self.static_ratio
+        return self.sliding(machine, s, state, jnp.zeros_like(s)) * self.static_ratio
 
     def contribution(self, machine, s, state, mode):
         """What friction adds to the force on the body."""
-        speed = mode * self.velocity(machine, state)
-        slides = self.sliding(machine, s, state, speed) * mode
+        slides = self.sliding(machine, s, state, mode) * mode
         return -jnp.where(mode == 0, self.force(machine, s, state), slides)
 
     def begin(self, machine, s, state):

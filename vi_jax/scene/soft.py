@@ -17,9 +17,9 @@ from .._checks import (
     require_ranges,
 )
 from .._numbers import number
+from .event import AbstractSwitch
 from .law import AbstractContactLaw, HuntCrossley, PowerLaw
 from .stop import Wall
-from .switch import AbstractSwitch
 
 Scalar = Float[Array, ""]
 

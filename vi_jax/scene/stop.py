@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from .._checks import REAL, SHARE, count, one_of, require_ranges
 from .._numbers import concrete, number, real
+from .event import AbstractEvent, struck_modes
 from .shown import Shown
 
 
@@ -53,7 +54,7 @@ class Wall(Shown):
         return all(a is None or b is None or np.array_equal(a, b) for a, b in pairs)
 
 
-class RigidStop(Wall):
+class RigidStop(Wall, AbstractEvent):
     """A rigid wall with Newton's restitution law: at contact and approaching, V ← -k V.
 
     A stop on the right keeps Y ≤ gap, one on the left keeps Y ≥ -gap. The gap may be zero or
@@ -72,11 +73,31 @@ class RigidStop(Wall):
     coordinate: int = eqx.field(static=True, default=0, kw_only=True)
     """Index into the machine's `coordinates`."""
     ranges: ClassVar = {"gap": REAL, "restitution": SHARE}
+    word: ClassVar = "impact"
 
     def __check_init__(self):
         require_ranges(self)
         one_of("side", self.side, ("right", "left"))
         count("coordinate", self.coordinate)
+
+    def guard(self, machine, s, state, *modes):
+        """How far the coordinate is beyond the stop."""
+        return self.beyond(machine.coordinates[self.coordinate].position(state))
+
+    def after(self, machine, s, state, *modes):
+        """The rebound, on the stop; switches are in the modes that they have behind an impact."""
+        body = machine.coordinates[self.coordinate]
+        state = body.placed(state, self.place, self.rebound(body.velocity(state)))
+        return state, struck_modes(machine, s, state, modes)
+
+    def jump(self, machine, s, state, *modes):
+        """The rebound where the body is."""
+        body = machine.coordinates[self.coordinate]
+        return body.placed(state, body.position(state), self.rebound(body.velocity(state)))
+
+    def speed(self, machine, state, rate):
+        """V⁻, the speed of approach."""
+        return self.approach(machine.coordinates[self.coordinate].velocity(state))
 
     @property
     def is_one_number(self) -> bool:

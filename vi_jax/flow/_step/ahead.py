@@ -9,7 +9,7 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
 from ...scene.trig import horner
-from .._lane import FREE, SECTION, Lane, Plan, to_stop, to_turn_of
+from .._lane import FREE, Lane, Plan, to_event, to_turn_of
 from ..events import Rates, rising_root, slope
 from ..methods._series import Series, at
 from .aim import MARGIN, may_matter, select
@@ -57,7 +57,7 @@ def look(plan: Plan, lane: Lane, motion: Any, h: Scalar) -> tuple[Scalar, Scalar
     """
     scene = plan.scene
     zero, none = jnp.zeros_like(h), jnp.zeros_like(h, bool)
-    events: list[tuple[float, Series]] = []
+    events: list[tuple[float, int | None, Series]] = []
     paths, speeds, turns = [], [], []
     if plan.motion or scene.stops:
         for k, coordinate in enumerate(scene.coordinates):
@@ -69,14 +69,14 @@ def look(plan: Plan, lane: Lane, motion: Any, h: Scalar) -> tuple[Scalar, Scalar
             turns.append(turn if lane.contact is None else turn & (lane.contact[k] == 0))
         for i, stop in enumerate(scene.stops):
             along, gap = paths[stop.coordinate], stop_gradient(stop.gap)
-            events.append((to_stop(i), _shifted(along, float(stop.sign), gap)))
+            events.append((to_event(i), i, _shifted(along, float(stop.sign), gap)))
     if scene.clock(lane.state) is not None:
         bound = stop_gradient(plan.end(lane.part))
-        events.append((SECTION, _shifted(motion.of(scene.clock), 1.0, bound)))
+        events.append((plan.to_section, None, _shifted(motion.of(scene.clock), 1.0, bound)))
     if not events and not turns:
         return h, jnp.full_like(h, FREE)
     crossed, turned = none, none
-    for _, series in events:
+    for *_, series in events:
         crossed = crossed | (_sum(series, h, zero) > 0)
     for turn in turns:
         turned = turned | turn
@@ -86,7 +86,7 @@ def look(plan: Plan, lane: Lane, motion: Any, h: Scalar) -> tuple[Scalar, Scalar
         # beyond a turn is met from there.
         first, target, polynomial = jnp.full_like(h, jnp.inf), zero + FREE, None
         facing_stop = [none for _ in paths]
-        for name, series in events:
+        for name, number, series in events:
             begin, end = _sum(series[:1], h, zero), _sum(series, h, zero)
             over = end > 0
             place = jnp.maximum(-begin, 0.0) / jnp.where(over, end - begin, 1.0)
@@ -95,8 +95,8 @@ def look(plan: Plan, lane: Lane, motion: Any, h: Scalar) -> tuple[Scalar, Scalar
             polynomial = curve if polynomial is None else select(sooner, curve, polynomial)
             target = jnp.where(sooner, name, target)
             first = jnp.where(sooner, place, first)
-            if name != SECTION:
-                stop = scene.stops[int(name - to_stop(0))]
+            if number is not None:
+                stop = scene.stops[number]
                 k = stop.coordinate
                 facing_stop[k] = facing_stop[k] | over & (lane.direction[k] == stop.sign)
         cut, soonest = jnp.isfinite(first), jnp.full_like(h, jnp.inf)

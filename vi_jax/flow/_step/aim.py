@@ -12,7 +12,8 @@ from ...lanes import pin
 from .._lane import FREE, Lane, Plan, to_release, to_turn_of
 from ..events import Rates, highest, quintic, rising_root, slope, to_turn
 from ..moving import exact
-from .trial import Crossing, Path, Trial, beyond
+from .guards import Crossing, beyond
+from .trial import Path, Trial
 
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]
@@ -28,8 +29,8 @@ _WIDER = 1.001
 
 
 def select(condition: Flag, a: Any, b: Any) -> Any:
-    """`jnp.where` for pytrees."""
-    return jtu.tree_map(lambda x, y: jnp.where(condition, x, y), a, b)
+    """`jnp.where` for pytrees; what is the same in both is left as it is."""
+    return jtu.tree_map(lambda x, y: x if x is y else jnp.where(condition, x, y), a, b)
 
 
 def aim_at(plan: Plan, lane: Lane, trial: Trial) -> tuple[Flag, Scalar, Scalar]:
@@ -49,7 +50,7 @@ def _met_something(plan: Plan, lane: Lane, trial: Trial) -> Flag:
     met = trial.good & (lane.target != FREE) & ~at_a_turn(trial)
     for c in trial.crossings:
         met = met | trial.good & beyond(c) & ~c.landed | c.again
-        if c.kind == "switch":
+        if c.event.holds_mode:
             met = met | trial.good & _hump(c, stop_gradient(trial.h))[0]
     for k, (path, direction) in enumerate(zip(trial.paths, lane.direction, strict=False)):
         begin, end = stop_gradient((path.begin, path.end))
@@ -113,10 +114,9 @@ def _aimed(plan: Plan, lane: Lane, trial: Trial) -> tuple[Flag, Scalar, Scalar]:
             # At rest on a surface and on its way through: the event is where the step begins.
             still = (jnp.abs(c.begin.x) <= c.slack) & (c.begin.v == 0) & (c.begin.a > 0)
             at_once = jnp.where(sooner, over & still, at_once)
-        if c.kind == "stop":
-            stop = plan.scene.stops[c.number]
-            k = stop.coordinate
-            facing_stop[k] = facing_stop[k] | (over & (lane.direction[k] == stop.sign))
+        if c.coordinate is not None:
+            k, sign = c.coordinate, plan.scene.stops[c.number].sign
+            facing_stop[k] = facing_stop[k] | (over & (lane.direction[k] == sign))
     turns, curves = [], []
     everything, soonest = plan.meets_turns(lane.done), jnp.full_like(h, jnp.inf)
     several = len(trial.paths) > 1
@@ -174,7 +174,7 @@ def _aimed(plan: Plan, lane: Lane, trial: Trial) -> tuple[Flag, Scalar, Scalar]:
         goal = goal.instead(again, h + stop_gradient(c.offset), c.name, aim=goal.aim | again)
     goal = goal.instead(goal.shorter, 0.5 * h, FREE)
     for c in trial.crossings:
-        if c.kind == "switch":
+        if c.event.holds_mode:
             above, place = _hump(c, h)
             above = above & trial.good & ~(goal.aim | goal.shorter | landed)
             goal = goal.instead(

@@ -9,16 +9,18 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
 from ...lanes import pin, pin_flag
+from ...scene.event import after_event, mode_number, struck_modes
 from .. import results
-from .._lane import CHANGES, HIT, LEAVES, RESTS, Lane, Plan, Record, to_stop, to_turn_of
+from .._lane import CHANGES, HIT, LEAVES, RESTS, Lane, Plan, Record, to_event, to_turn_of
 from ..drift import drifted, height_of_turn, met_after, unmoved
 from ..events import Rates, to_turn
-from ..moving import exact, struck_modes
+from ..moving import exact
 from .aim import select
 from .faults import comes_back, gains, may_end, undecided
+from .guards import Crossing, furthest_landing
 from .log import clock_at, logged, noted
 from .rest import Release, settled
-from .trial import Crossing, Trial, furthest_landing, held
+from .trial import Trial, held
 from .way import Way
 
 Scalar = Float[Array, ""]
@@ -115,7 +117,7 @@ def _met(plan: Plan, lane: Lane, trial: Trial, taken: Flag, way: Way, arrival: A
         # Of a motion so flat that the event's place is known worse than its surface, it is here.
         near = c.landed & (jnp.abs(c.offset) <= furthest_landing(trial.h))
         offset = stop_gradient(jnp.where(near, c.offset, 0.0))
-        if c.kind != "section" and plan.ticks(lane.state):
+        if plan.ticks(lane.state):
             # Met on the section it is not beyond it.
             beyond = trial.s + offset - plan.end(lane.part)
             offset = offset - jnp.maximum(stop_gradient(beyond), 0.0)
@@ -124,13 +126,13 @@ def _met(plan: Plan, lane: Lane, trial: Trial, taken: Flag, way: Way, arrival: A
         _, there, passed = drifted(way.rate, offset, way.moving, way.fixed, way.rest)
         s = arrival.s + jnp.where(c.landed, offset, 0.0)
         arrival = arrival._replace(s=s, time=select(c.landed, passed, arrival.time))
-        if c.kind == "section":
+        if c.event.ends_cycle:
             arrival = arrival._replace(
                 completed=arrival.completed | c.landed,
                 state=select(c.landed, there, arrival.state),
             )
-        elif c.kind == "switch":
-            arrival = _switched(plan, lane, trial, taken, arrival, c, there)
+        elif c.event.holds_mode:
+            arrival = _switched(plan, taken, arrival, c, there)
         else:
             arrival = _impact(plan, lane, trial, taken, arrival, c, there)
     for k, path in enumerate(trial.paths):
@@ -172,7 +174,7 @@ def _released(
         state = select(contact > 0, put, state)
     direction = jnp.where(free, -lane.direction[k], arrival.direction[k])
     clock = clock_at(plan, arrival.s + jnp.where(free, offset, 0.0), state)
-    stop = arrival.contact[k] - to_stop(0)
+    stop = arrival.contact[k] - to_event(0)
     events = noted(arrival.events, taken & free, clock, LEAVES, stop, jnp.nan)
     return arrival._replace(
         events=events,
@@ -194,22 +196,19 @@ def _put(values: tuple, k: int, value: Any) -> tuple:
     return (*values[:k], value, *values[k + 1 :])
 
 
-def _switched(
-    plan: Plan, lane: Lane, trial: Trial, taken: Flag, arrival: Arrival, c: Crossing, there: Any
-) -> Arrival:
+def _switched(plan: Plan, taken: Flag, arrival: Arrival, c: Crossing, there: Any) -> Arrival:
     """The next mode of a switch that changed in the state `there`."""
-    scene, j = plan.scene, c.number
-    state, mode = scene.switches[j].after(scene, arrival.s, there, lane.modes[j])
-    mode = stop_gradient(jnp.asarray(mode, arrival.s.dtype))
-    modes = _put(arrival.modes, j, jnp.where(c.landed, mode, arrival.modes[j]))
-    slides = comes_back(plan.scene, j, modes, arrival.s, state)
+    scene = plan.scene
+    state, after = after_event(scene, c.number, arrival.s, there, arrival.modes)
+    modes = select(c.landed, after, arrival.modes)
+    slides = comes_back(plan.scene, c.number, modes, arrival.s, state)
     arrival = _ended(arrival, c, slides, results.SLIDING)
-    log, clock = arrival.log, clock_at(plan, arrival.s, there)
-    events = noted(arrival.events, taken & c.landed, clock, CHANGES, j, mode)
+    log, clock, mode = arrival.log, clock_at(plan, arrival.s, there), mode_number(scene, c.number)
+    number = c.number - len(scene.stops)
+    events = noted(arrival.events, taken & c.landed, clock, CHANGES, number, after[mode])
     if plan.log_switches:
         zero = jnp.zeros_like(arrival.s)
-        number = len(scene.stops) + j
-        log = logged(log, taken & c.landed, arrival.impacts, clock, zero, number)
+        log = logged(log, taken & c.landed, arrival.impacts, clock, zero, c.number)
         # Listed as an impact is, and so counted.
         count = jnp.where(taken & c.landed, 1.0, 0.0)
         arrival = arrival._replace(impacts=arrival.impacts + count)
@@ -259,7 +258,7 @@ def _impact(
         ends = pin_flag(c.landed & last, s)
         lost = jnp.where(ends, 0.5 * approach**2, lost)
         wait = pin(jnp.where(ends, left, 0.0))
-        contact = _put(contact, k, jnp.where(ends, to_stop(c.number), contact[k]))
+        contact = _put(contact, k, jnp.where(ends, to_event(c.number), contact[k]))
         resting = held(plan, dataclasses.replace(lane, contact=contact, modes=arrival.modes))
         still = body.placed(state, stop.place, jnp.zeros_like(s))
         way = Way(plan, resting, lane.part, (s, still, time))

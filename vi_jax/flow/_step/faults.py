@@ -7,8 +7,9 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
 from ...scene import AbstractScene, RigidStop
+from ...scene.event import events_of, guard_of
 from .. import results
-from .._lane import SECTION, Lane, Plan, Record, to_switch, total
+from .._lane import FREE, Lane, Plan, Record, to_event, total
 from ..events import guard_rates
 from ..moving import in_modes
 from .trial import Trial
@@ -65,11 +66,13 @@ def _lost(plan: Plan, lane: Lane, target: Scalar) -> Scalar | float:
     """The reason of a lane that has aimed too often, by what it aimed at."""
     scene, reason = plan.scene, float(results.UNRESOLVED)
     if plan.motion or scene.stops:
-        reason = jnp.where(target < SECTION, float(results.TURN_UNRESOLVED), reason)
-    if not plan.ticks(lane.state):
-        reason = jnp.where(target == SECTION, float(results.SECTION_UNRESOLVED), reason)
+        reason = jnp.where(target < FREE, float(results.TURN_UNRESOLVED), reason)
     if scene.switches:
-        reason = jnp.where(target >= to_switch(0), float(results.SWITCH_UNRESOLVED), reason)
+        others = target >= to_event(len(scene.stops))
+        reason = jnp.where(others, float(results.SWITCH_UNRESOLVED), reason)
+    if not plan.ticks(lane.state):
+        ends = target == plan.to_section
+        reason = jnp.where(ends, float(results.SECTION_UNRESOLVED), reason)
     return reason
 
 
@@ -111,19 +114,19 @@ def undecided(scene: AbstractScene, i: int, there: Any, struck: Any) -> Flag | N
     return found
 
 
-def comes_back(scene: AbstractScene, j: int, modes: tuple, s: Scalar, state: Any) -> Flag | None:
-    """Whether the field behind switch number j points back at its surface, as that before it did:
-    the motion would slide along it. `None` for a kind of switch whose motion cannot.
+def comes_back(scene: AbstractScene, i: int, modes: tuple, s: Scalar, state: Any) -> Flag | None:
+    """Whether the field behind a switch points back at its surface, as that before it did: the
+    motion would slide along it. `None` for a kind of switch whose motion cannot.
 
-    **Arguments:** the modes, s and the state behind the event.
+    **Arguments:** the number of the event; the modes, s and the state behind it.
     """
-    switch = scene.switches[j]
+    switch: Any = events_of(scene)[i]
     if not switch.may_slide:
         return None
     machine = in_modes(scene, modes)
 
     def guard(s: Scalar, state: Any) -> Scalar:
-        return switch.guard(scene, s, state, modes[j])
+        return guard_of(scene, i, s, state, modes)
 
     here = stop_gradient(guard_rates(machine.field, guard, s, state))
     slack = 1e4 * float(jnp.finfo(s.dtype).eps) * (1 + jnp.abs(here.v))

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from ...lanes import pin, pin_flag
 from ...scene import AbstractScene, RigidStop
-from .._lane import Lane, Plan, to_release, to_stop
+from .._lane import Lane, Plan, to_event, to_release
 from ..events import Rates, rates
 
 Scalar = Float[Array, ""]
@@ -113,7 +113,7 @@ def release(
     sign = jnp.zeros_like(h)
     for i, stop in enumerate(stops):
         if stop.coordinate == k:
-            sign = jnp.where(lane.contact[k] == to_stop(i), float(stop.sign), sign)
+            sign = jnp.where(lane.contact[k] == to_event(i), float(stop.sign), sign)
     before, after = pin((-sign * begin.a, -sign * end.a))
     rise = stop_gradient(after - before)
     held = good & (sign != 0)

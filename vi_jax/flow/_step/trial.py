@@ -9,41 +9,18 @@ from jaxtyping import Array, Bool, Float
 
 from ...lanes import pin, pin_flag
 from ...scene import AbstractScene
-from .._lane import FREE, SECTION, Lane, Plan, to_stop, to_switch, to_turn_of, total
-from ..events import Rates, force_rate, guard_rates, landing, rates, turns_within
+from .._lane import FREE, Lane, Plan, to_event, to_turn_of, total
+from ..events import Rates, force_rate, rates, turns_within
 from ..methods.taylor import Expansion
 from ..moving import Moving, exact, in_modes
+from .guards import Crossing, crossings, leniency, turn_tolerance
 from .rest import Release, release
 
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]
 
-# Newton's method on a smooth flow needs two or three aims. Where rounding keeps it from gaining
-# more, a lane that has aimed this often accepts a thousand times the tolerance.
-_PATIENCE = 12.0
-
 # A window of force shorter than this share of the longest step moves the body by its third power.
 _SLIVER = 1e-3
-
-
-class Crossing(NamedTuple):
-    """An event g = 0 seen by a step: g at both ends, and how a step aimed at it landed."""
-
-    name: float
-    kind: str
-    """"stop", "switch" or "section"."""
-    number: int
-    """Of the stop or switch."""
-    slack: Scalar | None
-    """By so much, which is rounding's, a step may begin or end beyond it; `None` where places on it
-    are exact."""
-    begin: Rates
-    end: Rates
-    offset: Scalar
-    """δ to the event from the step's end."""
-    landed: Flag
-    again: Flag
-    """The step was aimed at it and has to be corrected by δ."""
 
 
 class Trial(NamedTuple):
@@ -150,15 +127,7 @@ def attempt(
     if plan.motion or scene.stops:
         for k, one in enumerate(each_alone):
             paths.append(_path(plan, lane, k, one, holding, (s1, new, h, limit), good))
-    section, below = _section(plan, lane, holding, s1, new)
-    guards = [*_stops(scene, paths), *_switches(lane, scene, holding, s1, new), *section]
-    # The stops of one coordinate and a clock are never met together but on a section, where a step
-    # ends; other events can be.
-    together = scene.switches or scene.section(lane.state) is not None
-    if together or not exact(scene, lane.state):
-        eps = float(jnp.finfo(h.dtype).eps)
-        guards = [guard._replace(slack=4 * eps * guard.scale) for guard in guards]
-    seen = tuple(_seen(lane, good & last, good, h, each, guards) for each in guards)
+    seen, below = crossings(plan, lane, holding, paths, (s1, h, new), (good, last))
     return Trial(
         s1, h, new, time, error, good, last, seen, tuple(paths), each_alone, holding, below
     )
@@ -180,14 +149,13 @@ def _path(
             Rates(jnp.where(rests, place, r.x), jnp.where(rests, 0.0, r.v), r.a)
             for r in (begin, end)
         )
-    met = turns_within(_turn_tolerance(h) * _leniency(lane), end)
+    met = turns_within(turn_tolerance(h) * leniency(lane), end)
     aimed = lane.target == to_turn_of(k)
     for j in range(len(plan.scene.coordinates)):  # several may turn at once
         aimed = aimed if j == k else aimed | (lane.target == to_turn_of(j))
-    if plan.scene.switches:  # such an event may be a turning point as well
-        aimed = aimed | (lane.target >= to_switch(0))
-    if plan.scene.section(lane.state) is not None:
-        aimed = aimed | (lane.target == SECTION)
+    if plan.scene.switches or plan.scene.section(lane.state) is not None:
+        # Such an event may be a turning point as well.
+        aimed = aimed | (lane.target >= to_event(len(plan.scene.stops)))
     at_turn = good & aimed & met
     leaves, surge = None, None
     if lane.contact is not None:
@@ -198,149 +166,3 @@ def _path(
             stop_gradient(_SLIVER * limit + jnp.zeros_like(h)),
         )
     return Path(begin, end, at_turn, leaves, surge)
-
-
-class _Guard(NamedTuple):
-    """An event g = 0: g at both ends of a step."""
-
-    name: float
-    kind: str
-    number: int
-    begin: Rates
-    end: Rates
-    scale: Any
-    """Of g, for its rounding."""
-    coordinate: int | None = None
-    """That a stop limits."""
-    slack: Scalar | None = None
-
-
-def _stops(scene: AbstractScene, paths: list[Path]) -> list[_Guard]:
-    found = []
-    for i, stop in enumerate(scene.stops):
-        path = paths[stop.coordinate]
-        begin, end = (x.scaled(stop.sign, stop.gap) for x in (path.begin, path.end))
-        scale = 1 + jnp.abs(stop.gap)
-        found.append(_Guard(to_stop(i), "stop", i, begin, end, scale, stop.coordinate))
-    return found
-
-
-def _switches(lane: Lane, scene: AbstractScene, moving: Any, s1: Scalar, new: Any) -> list[_Guard]:
-    found = []
-    for j, (switch, mode) in enumerate(zip(scene.switches, lane.modes, strict=True)):
-
-        def guard(s: Scalar, state: Any, switch=switch, mode=mode) -> Scalar:
-            return switch.guard(scene, s, state, mode)
-
-        begin = guard_rates(moving.field, guard, lane.s, lane.state)
-        end = guard_rates(moving.field, guard, s1, new)
-        scale = 1 + stop_gradient(jnp.abs(end.v))
-        found.append(_Guard(to_switch(j), "switch", j, begin, end, scale))
-    return found
-
-
-def _section(
-    plan: Plan, lane: Lane, moving: Any, s1: Scalar, new: Any
-) -> tuple[list[_Guard], Scalar | None]:
-    """What ends a cycle, unless `s` itself does; and `Lane.below`."""
-    scene = plan.scene
-    if plan.ticks(lane.state):
-        return [], None
-    if scene.section(lane.state) is None:
-        bound = plan.end(lane.part)
-
-        def clock(state: Any) -> Scalar:
-            return jnp.asarray(scene.clock(state))
-
-        ends = (
-            rates(moving.field, clock, lane.s, lane.state).scaled(1, bound),
-            rates(moving.field, clock, s1, new).scaled(1, bound),
-        )
-        return [_Guard(SECTION, "section", 0, *ends, bound)], None
-
-    def section(state: Any) -> Scalar:
-        return jnp.asarray(scene.section(state))
-
-    begin = rates(moving.field, section, lane.s, lane.state)
-    end = rates(moving.field, section, s1, new)
-    scale = 1 + stop_gradient(jnp.abs(end.v))
-    # From the section it rises: it ends the next cycle only once it has been below, where one that
-    # is started on the section and falls already is.
-    assert lane.below is not None
-    # On it is also what a search's step left so close to it: a cycle is no shorter.
-    rounding = float(jnp.finfo(end.x.dtype).eps) ** 0.5 * scale
-    here = stop_gradient(begin)
-    falls = (here.x <= rounding) & (here.v < 0)
-    armed = (lane.below > 0) | (here.x < -rounding) | falls
-    below = jnp.where(armed | (stop_gradient(end.x) < -rounding), 1.0, lane.below)
-    begin, end = (
-        Rates(jnp.where(armed, r.x, -1.0), *(jnp.where(armed, x, 0.0) for x in (r.v, r.a)))
-        for r in (begin, end)
-    )
-    return [_Guard(SECTION, "section", 0, begin, end, scale)], below
-
-
-def beyond(event: _Guard | Crossing) -> Flag:
-    """Whether a step ends beyond an event. One that begins there to rounding, after the event
-    before, and still falls has not met it: it may end at once, at a turning point. Nor has one that
-    stays there to rounding, as of bodies that touch at rest."""
-    begin, end = event.begin, event.end
-    if event.slack is None:
-        return end.x > 0
-    return (end.x > event.slack) & ~((begin.v < 0) & (end.v < 0) & (begin.x >= end.x))
-
-
-def _seen(
-    lane: Lane, ends: Flag, good: Flag, h: Scalar, guard: _Guard, all_of_them: list[_Guard]
-) -> Crossing:
-    """Whether a step that was aimed at this event met it.
-
-    A step that ends an interval as it meets a stop, to rounding, is aimed at it: an impact on the
-    section belongs to the cycle that ends there, so that it is not now in one, now in the next.
-    """
-    name, begin, end = guard.name, guard.begin, guard.end
-    aimed = good & (lane.target == name)
-    eps = float(jnp.finfo(h.dtype).eps)
-    for other in all_of_them:
-        if other.name == name:
-            continue
-        # What lies beyond another event was not reached. Events may come together, but for the
-        # stops of one coordinate: then one is met after the other.
-        alone = guard.coordinate is not None and guard.coordinate == other.coordinate
-        if alone or other.slack is None:
-            aimed = aimed & ~beyond(other)
-        else:
-            reached = (other.end.x <= 4 * other.slack) | ~beyond(other)
-            aimed, ends = aimed & reached, ends & reached
-    offset, square = landing(end)
-    size = stop_gradient(jnp.abs(offset))
-    # Two ways of being there to rounding: in place along the path, or, near grazing, in position.
-    close = size <= _landing_tolerance(h) * _leniency(lane)
-    there = (jnp.abs(end.x) <= 4 * eps * guard.scale) & (end.v >= 0)
-    real = stop_gradient(square) > 0
-    # One that is there may have no way left along a parabola: a body that is at rest on a surface.
-    landed = pin_flag(aimed & (close & real | there), h)
-    again = aimed & ~landed & real & (size < 0.25 * h)
-    # Where bodies touch at rest, what is left of their speed is rounding.
-    rises = end.v > 0 if guard.slack is None else end.v * h > guard.slack
-    again = again | ends & there & close & rises
-    return Crossing(name, guard.kind, guard.number, guard.slack, begin, end, offset, landed, again)
-
-
-def _leniency(lane: Lane) -> Scalar:
-    return jnp.where(lane.aims >= _PATIENCE, 1e3, jnp.ones_like(lane.aims))
-
-
-def _landing_tolerance(x: Scalar) -> float:
-    """Largest accepted |δ|: a derivative's error is of its order, the state's of its square."""
-    return 1e-9 if x.dtype == jnp.float64 else 1e-4
-
-
-def furthest_landing(x: Scalar) -> float:
-    """Largest |δ| that is believed: one near grazing, or accepted after many aims."""
-    return max(_turn_tolerance(x), 1e3 * _landing_tolerance(x))
-
-
-def _turn_tolerance(x: Scalar) -> float:
-    """Largest accepted offset from a turning point, whose height it enters in third order."""
-    return 1e-5 if x.dtype == jnp.float64 else 1e-2

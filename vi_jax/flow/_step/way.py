@@ -9,10 +9,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ...scene.event import guard_of
 from .._lane import Plan
 from ..events import rates
 from ..moving import Moving
-from .trial import Crossing
+from .guards import Crossing
 
 Scalar = Float[Array, ""]
 
@@ -42,14 +43,12 @@ class Way:
 
         def event(moving, fixed, rest):
             (machine, bound), (s, state, _) = self._whole(fixed, rest), moving
-            scene = _scene(machine)
-            if c.kind == "stop":
-                stop = scene.stops[c.number]
-                return stop.beyond(scene.coordinates[stop.coordinate].position(state))
-            if c.kind == "switch":
-                return scene.switches[c.number].guard(scene, s, state, machine.modes[c.number])
-            section: Any = scene.section(state)
-            return scene.clock(state) - bound if section is None else section
+            scene, modes = machine, ()
+            if isinstance(machine, Moving):
+                scene, modes = machine.scene, machine.modes
+            if c.event.ends_cycle and scene.section(state) is None:
+                return scene.clock(state) - bound  # which may be that of a part of a cycle
+            return guard_of(scene, c.number, s, state, modes)
 
         return self._pure(event)
 

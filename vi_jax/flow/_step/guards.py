@@ -1,0 +1,216 @@
+"""The events of a machine as a step sees them."""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax.lax import stop_gradient
+from jaxtyping import Array, Bool, Float
+
+from ...lanes import pin_flag
+from ...scene import AbstractEvent, AbstractScene
+from ...scene.event import events_of, guard_of
+from .._lane import Lane, Plan, to_event
+from ..events import Rates, guard_rates, landing, rates
+from ..moving import exact
+
+Scalar = Float[Array, ""]
+Flag = Bool[Array, ""]
+
+# Newton's method on a smooth flow needs two or three aims. Where rounding keeps it from gaining
+# more, a lane that has aimed this often accepts a thousand times the tolerance.
+_PATIENCE = 12.0
+
+
+class Crossing(NamedTuple):
+    """An event g = 0 seen by a step: g at both ends, and how a step aimed at it landed."""
+
+    event: AbstractEvent
+    number: int
+    """Its place among the machine's events."""
+    coordinate: int | None
+    """That it limits, as stops do."""
+    slack: Scalar | None
+    """By so much, which is rounding's, a step may begin or end beyond it; `None` where places on it
+    are exact."""
+    begin: Rates
+    end: Rates
+    offset: Scalar
+    """δ to the event from the step's end."""
+    landed: Flag
+    again: Flag
+    """The step was aimed at it and has to be corrected by δ."""
+
+    @property
+    def name(self) -> float:
+        """As the loop carries it."""
+        return to_event(self.number)
+
+
+def crossings(
+    plan: Plan, lane: Lane, holding: Any, paths: list[Any], there: tuple, ends: tuple[Flag, Flag]
+) -> tuple[tuple[Crossing, ...], Scalar | None]:
+    """The events that a step saw, and `Lane.below` at its end.
+
+    **Arguments:** the machine as the step saw it; what it saw of each coordinate; s, its length and
+    the state at its end; whether it was good, and whether it ends an interval.
+    """
+    scene, (s1, h, new), (good, last) = plan.scene, there, ends
+    section, below = _section(plan, lane, holding, s1, new)
+    guards = [*_stops(scene, paths), *_others(lane, scene, holding, s1, new), *section]
+    # The stops of one coordinate and a clock are never met together but on a section, where a step
+    # ends; other events can be.
+    together = scene.switches or scene.section(lane.state) is not None
+    if together or not exact(scene, lane.state):
+        eps = float(jnp.finfo(h.dtype).eps)
+        guards = [guard._replace(slack=4 * eps * guard.scale) for guard in guards]
+    return tuple(_seen(lane, good & last, good, h, each, guards) for each in guards), below
+
+
+class _Guard(NamedTuple):
+    """An event g = 0: g at both ends of a step."""
+
+    event: AbstractEvent
+    number: int
+    begin: Rates
+    end: Rates
+    scale: Any
+    """Of g, for its rounding."""
+    coordinate: int | None = None
+    slack: Scalar | None = None
+
+
+def _stops(scene: AbstractScene, paths: list[Any]) -> list[_Guard]:
+    found = []
+    for i, stop in enumerate(scene.stops):
+        path = paths[stop.coordinate]
+        begin, end = (x.scaled(stop.sign, stop.gap) for x in (path.begin, path.end))
+        scale = 1 + jnp.abs(stop.gap)
+        found.append(_Guard(stop, i, begin, end, scale, stop.coordinate))
+    return found
+
+
+def _others(lane: Lane, scene: AbstractScene, moving: Any, s1: Scalar, new: Any) -> list[_Guard]:
+    """Of the events that are neither stops nor the end of a cycle."""
+    found = []
+    for number, event in enumerate(events_of(scene)):
+        if number < len(scene.stops) or event.ends_cycle:
+            continue
+
+        def guard(s: Scalar, state: Any, number=number) -> Scalar:
+            return guard_of(scene, number, s, state, lane.modes)
+
+        begin = guard_rates(moving.field, guard, lane.s, lane.state)
+        end = guard_rates(moving.field, guard, s1, new)
+        scale = 1 + stop_gradient(jnp.abs(end.v))
+        found.append(_Guard(event, number, begin, end, scale))
+    return found
+
+
+def _section(
+    plan: Plan, lane: Lane, moving: Any, s1: Scalar, new: Any
+) -> tuple[list[_Guard], Scalar | None]:
+    """What ends a cycle, unless `s` itself does; and `Lane.below`."""
+    scene = plan.scene
+    if plan.ticks(lane.state):
+        return [], None
+    number = len(events_of(scene)) - 1
+    event = events_of(scene)[number]
+    if scene.section(lane.state) is None:
+        bound = plan.end(lane.part)
+
+        def clock(state: Any) -> Scalar:
+            return jnp.asarray(scene.clock(state))
+
+        ends = (
+            rates(moving.field, clock, lane.s, lane.state).scaled(1, bound),
+            rates(moving.field, clock, s1, new).scaled(1, bound),
+        )
+        return [_Guard(event, number, *ends, bound)], None
+
+    def section(state: Any) -> Scalar:
+        return jnp.asarray(scene.section(state))
+
+    begin = rates(moving.field, section, lane.s, lane.state)
+    end = rates(moving.field, section, s1, new)
+    scale = 1 + stop_gradient(jnp.abs(end.v))
+    # From the section it rises: it ends the next cycle only once it has been below, where one that
+    # is started on the section and falls already is.
+    assert lane.below is not None
+    # On it is also what a search's step left so close to it: a cycle is no shorter.
+    rounding = float(jnp.finfo(end.x.dtype).eps) ** 0.5 * scale
+    here = stop_gradient(begin)
+    falls = (here.x <= rounding) & (here.v < 0)
+    armed = (lane.below > 0) | (here.x < -rounding) | falls
+    below = jnp.where(armed | (stop_gradient(end.x) < -rounding), 1.0, lane.below)
+    begin, end = (
+        Rates(jnp.where(armed, r.x, -1.0), *(jnp.where(armed, x, 0.0) for x in (r.v, r.a)))
+        for r in (begin, end)
+    )
+    return [_Guard(event, number, begin, end, scale)], below
+
+
+def beyond(event: _Guard | Crossing) -> Flag:
+    """Whether a step ends beyond an event. One that begins there to rounding, after the event
+    before, and still falls has not met it: it may end at once, at a turning point. Nor has one that
+    stays there to rounding, as of bodies that touch at rest."""
+    begin, end = event.begin, event.end
+    if event.slack is None:
+        return end.x > 0
+    return (end.x > event.slack) & ~((begin.v < 0) & (end.v < 0) & (begin.x >= end.x))
+
+
+def _seen(
+    lane: Lane, ends: Flag, good: Flag, h: Scalar, guard: _Guard, all_of_them: list[_Guard]
+) -> Crossing:
+    """Whether a step that was aimed at this event met it.
+
+    A step that ends an interval as it meets a stop, to rounding, is aimed at it: an impact on the
+    section belongs to the cycle that ends there, so that it is not now in one, now in the next.
+    """
+    begin, end = guard.begin, guard.end
+    aimed = good & (lane.target == to_event(guard.number))
+    eps = float(jnp.finfo(h.dtype).eps)
+    for other in all_of_them:
+        if other.number == guard.number:
+            continue
+        # What lies beyond another event was not reached. Events may come together, but for the
+        # stops of one coordinate: then one is met after the other.
+        alone = guard.coordinate is not None and guard.coordinate == other.coordinate
+        if alone or other.slack is None:
+            aimed = aimed & ~beyond(other)
+        else:
+            reached = (other.end.x <= 4 * other.slack) | ~beyond(other)
+            aimed, ends = aimed & reached, ends & reached
+    offset, square = landing(end)
+    size = stop_gradient(jnp.abs(offset))
+    # Two ways of being there to rounding: in place along the path, or, near grazing, in position.
+    close = size <= _landing_tolerance(h) * leniency(lane)
+    there = (jnp.abs(end.x) <= 4 * eps * guard.scale) & (end.v >= 0)
+    real = stop_gradient(square) > 0
+    # One that is there may have no way left along a parabola: a body that is at rest on a surface.
+    landed = pin_flag(aimed & (close & real | there), h)
+    again = aimed & ~landed & real & (size < 0.25 * h)
+    # Where bodies touch at rest, what is left of their speed is rounding.
+    rises = end.v > 0 if guard.slack is None else end.v * h > guard.slack
+    again = again | ends & there & close & rises
+    known = guard.event, guard.number, guard.coordinate, guard.slack
+    return Crossing(*known, begin, end, offset, landed, again)
+
+
+def leniency(lane: Lane) -> Scalar:
+    return jnp.where(lane.aims >= _PATIENCE, 1e3, jnp.ones_like(lane.aims))
+
+
+def _landing_tolerance(x: Scalar) -> float:
+    """Largest accepted |δ|: a derivative's error is of its order, the state's of its square."""
+    return 1e-9 if x.dtype == jnp.float64 else 1e-4
+
+
+def furthest_landing(x: Scalar) -> float:
+    """Largest |δ| that is believed: one near grazing, or accepted after many aims."""
+    return max(turn_tolerance(x), 1e3 * _landing_tolerance(x))
+
+
+def turn_tolerance(x: Scalar) -> float:
+    """Largest accepted offset from a turning point, whose height it enters in third order."""
+    return 1e-5 if x.dtype == jnp.float64 else 1e-2

@@ -1,0 +1,191 @@
+"""Events: a guard, and what happens where it rises through zero."""
+
+import abc
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+from jax.lax import stop_gradient
+from jaxtyping import Array, Float
+
+from .shown import Shown
+
+Scalar = Float[Array, ""]
+Modes = tuple[Scalar, ...]
+
+
+class AbstractEvent(Shown):
+    """A guard, a function that rises through zero where the event happens, and what happens then.
+
+    The first argument of each method is the machine. An event that holds a mode (`holds_mode`) gets
+    that mode behind the state, and returns it; another gets all modes of the machine, as its field
+    does, and returns them all.
+    """
+
+    word: ClassVar[str] = "event"
+    """What messages call it."""
+
+    @property
+    def holds_mode(self) -> bool:
+        """Whether one of the machine's modes is this event's."""
+        return False
+
+    @property
+    def ends_cycle(self) -> bool:
+        """Whether a cycle ends with it."""
+        return False
+
+    @abc.abstractmethod
+    def guard(self, *args: Any, **kwargs: Any) -> Scalar:
+        """`guard(machine, s, state, *modes)`: what rises through zero at the event."""
+
+    @abc.abstractmethod
+    def after(self, *args: Any, **kwargs: Any) -> tuple[Any, Any]:
+        """`after(machine, s, state, *modes)`: state and modes after the event."""
+
+    def jump(self, *args: Any, **kwargs: Any) -> Any:
+        """`jump(machine, s, state, *modes)`: the state after the event as a smooth function of that
+        before it, also of one beside the event: what `after` only puts right to rounding is left as
+        it is."""
+        return self.after(*args, **kwargs)[0]
+
+    def speed(self, machine: Any, state: Any, rate: Any) -> Any:
+        """How fast it is met, in the machine's words: by default how fast the guard rises by s,
+        which is the `rate`."""
+        return rate
+
+
+class AbstractSwitch(AbstractEvent):
+    """A mode, and the event that changes it without a jump.
+
+    Within a step the mode is constant, so that what a method integrates is smooth; the step ends
+    where the guard rises through zero, and there the mode changes. That is how a method keeps its
+    order across a kink, and how a body can stick.
+
+    A hump of the guard within one step is seen if the guard is as smooth as the machine's first
+    coordinate; shorter ones are passed by, as by every method of steps (`step_limit` bounds them).
+    """
+
+    word: ClassVar = "switch"
+
+    @property
+    def holds_mode(self) -> bool:
+        """True."""
+        return True
+
+    @property
+    def analytic(self) -> bool:
+        """Whether what a mode adds to the field has power series up to the event that ends it."""
+        return True
+
+    @property
+    def may_slide(self) -> bool:
+        """Whether the field may point at the guard's surface from both sides, so that a motion has
+        to slide along it, which is no mode yet: a lane that would ends, and says so."""
+        return True
+
+    @abc.abstractmethod
+    def begin(self, machine: Any, s: Scalar, state: Any) -> Scalar:
+        """The mode of a motion that begins in `state`."""
+
+    @abc.abstractmethod
+    def guard(self, machine: Any, s: Scalar, state: Any, mode: Scalar) -> Scalar:
+        """What rises through zero where this mode ends."""
+
+    @abc.abstractmethod
+    def after(self, machine: Any, s: Scalar, state: Any, mode: Scalar) -> tuple[Any, Scalar]:
+        """State and mode after the event. The state may be put right by what is below rounding
+        (a velocity set to zero where it vanishes), and must not jump."""
+
+    def jump(self, machine, s, state, mode):
+        """None."""
+        return state
+
+    def contribution(self, machine: Any, s: Scalar, state: Any, mode: Scalar) -> Any:
+        """What it adds to the machine's field in this mode, where it knows: of a soft stop the
+        acceleration of its coordinate, of dry friction the force on the body that rubs."""
+        raise NotImplementedError(f"A {type(self).__name__} has no `contribution`.")
+
+    def struck(self, machine: Any, s: Scalar, state: Any, mode: Scalar) -> Scalar:
+        """The mode after an impact elsewhere in the machine; by default that of a new motion."""
+        return self.begin(machine, s, state)
+
+
+class Section(AbstractEvent):
+    """The end of a cycle: where the machine's `section` rises through zero, or what counts its
+    cycles has come to their length."""
+
+    word: ClassVar = "section"
+
+    @property
+    def ends_cycle(self):
+        """True."""
+        return True
+
+    def guard(self, machine, s, state, *modes):
+        """The machine's `section`, or what is left to a full cycle."""
+        rises = machine.section(state)
+        if rises is not None:
+            return rises
+        clock = machine.clock(state)
+        return (s if clock is None else clock) - jnp.asarray(machine.cycle, jnp.result_type(s))
+
+    def after(self, machine, s, state, *modes):
+        """As the next cycle begins."""
+        return machine.renewed(state), modes
+
+
+def events_of(machine: Any) -> tuple[AbstractEvent, ...]:
+    """All events of a machine, by which number they go: its stops, its switches, its section."""
+    return (*machine.stops, *machine.switches, Section())
+
+
+def guard_of(machine: Any, number: int, s: Any, state: Any, modes: Modes) -> Scalar:
+    """What rises through zero at one of a machine's events, in these modes of it."""
+    event = events_of(machine)[number]
+    return event.guard(machine, s, state, *_for(machine, number, modes))
+
+
+def jump_of(machine: Any, number: int, s: Any, state: Any, modes: Modes) -> Any:
+    """The state after one of its events, also of one beside it."""
+    event = events_of(machine)[number]
+    return event.jump(machine, s, state, *_for(machine, number, modes))
+
+
+def after_event(machine: Any, number: int, s: Any, state: Any, modes: Modes) -> tuple[Any, Modes]:
+    """State and modes after one of its events."""
+    event = events_of(machine)[number]
+    state, new = event.after(machine, s, state, *_for(machine, number, modes))
+    if event.holds_mode:
+        own = mode_number(machine, number)
+        new = (*modes[:own], new, *modes[own + 1 :])
+    return state, settled_modes(new, s)
+
+
+def _for(machine: Any, number: int, modes: Modes) -> Modes:
+    """The modes that an event is given."""
+    if events_of(machine)[number].holds_mode:
+        own = mode_number(machine, number)
+        return modes[own : own + 1]
+    return modes
+
+
+def mode_number(machine: Any, number: int) -> int:
+    """Which mode an event holds that holds one."""
+    return sum(event.holds_mode for event in events_of(machine)[:number])
+
+
+def begin_modes(machine: Any, s: Scalar, state: Any) -> Modes:
+    """The modes of a motion that begins in `state`."""
+    return settled_modes([switch.begin(machine, s, state) for switch in machine.switches], s)
+
+
+def struck_modes(machine: Any, s: Scalar, state: Any, modes: Modes) -> Modes:
+    """The modes after an impact, which left this state."""
+    both = zip(machine.switches, modes, strict=True)
+    return settled_modes([switch.struck(machine, s, state, mode) for switch, mode in both], s)
+
+
+def settled_modes(modes: Sequence[Any], s: Any) -> Modes:
+    """Modes as the loop carries them: floats, which nothing is differentiated by."""
+    return tuple(stop_gradient(jnp.asarray(mode, jnp.result_type(s))) for mode in modes)
