@@ -63,6 +63,7 @@ from .scan import sweep as sweep
 from .scene import AbstractContactLaw as AbstractContactLaw
 from .scene import AbstractCrank as AbstractCrank
 from .scene import AbstractDrive as AbstractDrive
+from .scene import AbstractEvent as AbstractEvent
 from .scene import AbstractScene as AbstractScene
 from .scene import AbstractSwitch as AbstractSwitch
 from .scene import Coordinate as Coordinate
@@ -78,6 +79,7 @@ from .scene import Oscillator as Oscillator
 from .scene import OscillatorState as OscillatorState
 from .scene import Parameters as Parameters
 from .scene import PowerLaw as PowerLaw
+from .scene import Reset as Reset
 from .scene import RigidStop as RigidStop
 from .scene import Scene as Scene
 from .scene import SliderCrank as SliderCrank

@@ -9,7 +9,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
 from ..scene import AbstractScene
-from ..scene.event import begin_modes, events_of
+from ..scene.event import begin_modes, events_of, is_autonomous, met_by_guard
 from . import results
 from ._own import check_field, check_laws
 from .events import Rates, force_rate, rates
@@ -38,7 +38,7 @@ def to_release(k: int) -> float:
 
 
 # Kinds of events as the log of all of them lists them: their places in `results.EVENTS`.
-HIT, RESTS, LEAVES, CHANGES = 0.0, 1.0, 2.0, 3.0
+HIT, RESTS, LEAVES, CHANGES, RESETS = 0.0, 1.0, 2.0, 3.0, 4.0
 
 
 def total(tree: Any, start: Scalar) -> Scalar:
@@ -78,9 +78,9 @@ class Lane(eqx.Module):
     """Of each coordinate, 1 + i while it rests on stop number i, else 0; absent where none can."""
     modes: tuple[Scalar, ...]
     """Of each switch."""
-    below: Scalar | None
-    """1 once the section's guard has been below zero since the last section, else 0; absent where
-    the clock counts the cycles."""
+    below: tuple[Scalar, ...]
+    """Of each event that happens from below (see `AbstractEvent.from_below`), 1 once its guard has
+    been below zero since the last jump, else 0."""
     length: Scalar
     """Length proposed for an ordinary step."""
     attempt: Scalar
@@ -103,7 +103,7 @@ class Lane(eqx.Module):
 
 def ticks(scene: AbstractScene, state: Any) -> bool:
     """Whether the independent variable itself counts the cycles."""
-    return scene.clock(state) is None and scene.section(state) is None
+    return scene.clock(state) is None and not is_autonomous(scene, state)
 
 
 def has_fixed_cycle(scene: AbstractScene, state: Any) -> bool:
@@ -152,6 +152,15 @@ class Plan(eqx.Module):
         """Iterations in which a lane completes at most one interval, its steps being so short."""
         return max(1, self.method.steps_per_cycle // self.parts)
 
+    def others(self, state: Any) -> list[int]:
+        """The numbers of the events that are met by their guards, besides stops."""
+        return met_by_guard(self.scene, state)
+
+    def from_below(self, state: Any) -> list[int]:
+        """Of those the ones that happen from below."""
+        events = events_of(self.scene)
+        return [number for number in self.others(state) if events[number].from_below]
+
     @property
     def to_section(self) -> float:
         """The end of a cycle, where an event is it."""
@@ -178,7 +187,7 @@ class Plan(eqx.Module):
     def meets_turns(self, done: Scalar) -> Any:
         """Whether every turning point is met after so many intervals, or only those that are close
         to a stop: for extremes, and where something else may happen there."""
-        if self.scene.switches:
+        if self.scene.switches or self.scene.events:
             return True
         return (done >= self.settle) if self.motion else False
 
@@ -242,7 +251,7 @@ class Plan(eqx.Module):
             direction=jax.lax.stop_gradient(direction),
             contact=contact,
             modes=modes,
-            below=None if scene.section(start) is None else zero,
+            below=tuple(zero for _ in self.from_below(start)),
             length=length,
             attempt=length,
             target=zero,

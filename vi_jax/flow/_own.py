@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from .._numbers import warn
 from ..scene import AbstractScene
-from ..scene.event import begin_modes
+from ..scene.event import begin_modes, is_autonomous
 from ._by_numpy import by_numpy
 
 Scalar = Float[Array, ""]
@@ -125,11 +125,13 @@ def check_period(scene: AbstractScene, start: Any) -> None:
     something else than `s` counts.
     """
     kind, numbers = type(scene), jtu.tree_leaves((scene, start))
-    counts = kind.section is AbstractScene.section and kind.clock is AbstractScene.clock
+    counts = kind.clock is AbstractScene.clock
     ours = kind.__module__.partition(".")[0] == __name__.partition(".")[0]
     if ours or not counts or any(isinstance(x, Tracer) for x in numbers):
         return
     try:
+        if is_autonomous(scene, start):
+            return
         cycle, *ends = by_numpy(_ends, scene, start)
         each = list(zip(jtu.tree_leaves_with_path(start), *ends, strict=True))
     except Exception:  # told in words where the field is traced

@@ -13,6 +13,7 @@ from .. import lanes
 from .._checks import count, count_or_traced, fits_records, flag, instance_of, one_of, require_real
 from .._numbers import concrete, narrow, require_session, strongly_typed, warn, warn_of_narrow
 from ..scene import AbstractScene, RigidStop, Scene
+from ..scene.event import is_autonomous
 from ._lane import Plan
 from ._own import check_period as check_period
 from .methods import MethodLike, chosen
@@ -58,7 +59,7 @@ def planned(
     check_leaves("start", start)
     require_session("start", start)
     method.check(scene)
-    if samples and scene.section(start) is not None:
+    if samples and is_autonomous(scene, start):
         raise ValueError(
             "Argument `samples` must be 0 for a machine whose cycles end on a section, but got "
             f"{samples}: their lengths are not known beforehand. Observe it at equal intervals: "

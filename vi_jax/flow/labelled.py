@@ -11,9 +11,10 @@ from .._checks import one_of
 from ..scene.numbers import by_name
 from ..scene.units import with_units
 
-EVENTS = ("impact", "rest", "release", "mode")
+EVENTS = ("impact", "rest", "release", "mode", "reset")
 """What may happen to a motion, as `EventLog` lists it: an impact on a stop; a body that comes to
-rest on one; a body that leaves the stop on which it rested; a switch that changes its mode."""
+rest on one; a body that leaves the stop on which it rested; a switch that changes its mode; one of
+the machine's `events`."""
 
 Variables = dict[str, tuple[tuple[str, ...], np.ndarray]]
 

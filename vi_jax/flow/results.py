@@ -61,6 +61,8 @@ class RESULTS(NamedEnumeration):
         "The field on both sides of a switch points at its surface, so that the motion would have "
         "to slide along it, which is no mode of the machine."
     )
+    reset_unresolved = "The event of a reset could not be located within the step."
+    bad_reset = "A reset put a body beyond a stop."
 
 
 # The loop carries reasons as numbers; this is their order.
@@ -79,6 +81,8 @@ REASON_NAMES = (
     "bad_impact",
     "simultaneous",
     "sliding",
+    "reset_unresolved",
+    "bad_reset",
 )
 REASONS = tuple(getattr(RESULTS, name) for name in REASON_NAMES)
 (
@@ -96,6 +100,8 @@ REASONS = tuple(getattr(RESULTS, name) for name in REASON_NAMES)
     BAD_IMPACT,
     SIMULTANEOUS,
     SLIDING,
+    RESET_UNRESOLVED,
+    BAD_RESET,
 ) = range(len(REASONS))
 
 
@@ -158,18 +164,19 @@ class EventLog(Told):
     kind: Int[Array, "cycles size"]
     """What happened: an index into `EVENTS`."""
     number: Int[Array, "cycles size"]
-    """Index into the machine's `stops`, or for a mode into its `switches`."""
+    """Index into the machine's `stops`; for a mode into its `switches`, for a reset into its
+    `events`."""
     value: Float[Array, "cycles size"]
     """V⁻ of an impact, or of the impact that came to rest; the mode of a switch after its change;
-    NaN for a release."""
+    of a reset what its `value` says; NaN for a release."""
 
     def told(self) -> str:
-        """Events of the first cycles: what, of which stop or switch, where on the clock."""
+        """Events of the first cycles: what, of which stop, switch or event, where on the clock."""
 
         def word(i: int, j: int) -> str:
             kind = EVENTS[int(self.kind[i, j])]
             after = f" becomes {self.value[i, j]:g}" if kind == "mode" else ""
-            of = "switch" if kind == "mode" else "stop"
+            of = {"mode": "switch", "reset": "event"}.get(kind, "stop")
             return f"{kind} ({of} {self.number[i, j]}{after}) at {self.phase[i, j]:.6g}"
 
         return listed("event", self.number >= 0, word)

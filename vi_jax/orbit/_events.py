@@ -16,6 +16,13 @@ class Event(NamedTuple):
     cycle: int | None = None
     """Number of the cycle that it begins, if it begins one."""
 
+    def called(self, scene: AbstractScene) -> str:
+        """What messages call it: its name, or its kind and place among the machine's events of
+        that kind."""
+        event, events = self.of(scene), events_of(scene)
+        place = sum(other.word == event.word for other in events[: self.number])
+        return event.name or f"{event.word} {place}"
+
     def later(self, cycles: int) -> "Event":
         """The same so many cycles later."""
         return self if self.cycle is None else self._replace(cycle=self.cycle + cycles)

@@ -6,8 +6,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ..scene.event import events_of
 from ..scene.numbers import with_leaf
+from ._events import Event
 from ._hopf import hopf_between, size_of
 from ._origin import halves, origin
 from ._shooting import Shooting
@@ -169,12 +169,12 @@ class Follower:
             return self._point(HOPF, at, "the motion shrinks to rest", 0)
         if impact is None:
             scene, touched = self.problem.scene, int(at.seen.touched)
-            number, word = touched - len(scene.stops), events_of(scene)[touched].word
-            what = "a stop" if number < 0 else f"the guard of {word} {number}"
+            guard = f"the guard of {Event(touched).called(scene)}"
+            what = "a stop" if touched < len(scene.stops) else guard
             detail = f"touches {what} at {self._place(at, float(at.seen.touch))}"
         else:
             clock = float(np.asarray(self.problem.parts(jnp.asarray(at.x))[0])[impact])
-            word = self.problem.events[impact].of(self.problem.scene).word
+            word = self.problem.events[impact].of(self.problem.scene).called
             detail = f"the {word} at {self._place(at, clock)} is lost"
         return self._point(GRAZING, at, detail, impact)
 

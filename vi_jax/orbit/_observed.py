@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
 from ..scene import AbstractScene
-from ..scene.event import events_of, guard_of
+from ..scene.event import Section, events_of, guard_of
 from ._events import Event
 
 
@@ -54,6 +54,10 @@ def apart(
         least = jnp.minimum(least, lengths[i])
         before = tuple(jnp.asarray(mode, clock.dtype) for mode in modes[i - 1])
         for number, other in enumerate(events_of(scene)):
-            if number != event.number and not other.ends_cycle:
-                least = jnp.minimum(least, -guard_of(scene, number, clock[i], states[i], before))
+            if number == event.number or isinstance(other, Section):
+                continue
+            room = -guard_of(scene, number, clock[i], states[i], before)
+            if other.from_below:  # beyond it the motion may be, until it comes from below again
+                room = jnp.where(room > 0, room, jnp.inf)
+            least = jnp.minimum(least, room)
     return least

@@ -20,9 +20,9 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from ..flow import AbstractMethod
-from ..scene import AbstractScene
+from ..scene import AbstractScene, RigidStop
 from ..scene.base import renews
-from ..scene.event import after_event, jump_of, mode_number
+from ..scene.event import Section, after_event, is_autonomous, jump_of, mode_number
 from ..scene.numbers import with_leaf
 from ._events import Event, guard_at
 from ._flight import Flight
@@ -73,7 +73,7 @@ class Shooting(eqx.Module):
     @property
     def autonomous(self) -> bool:
         """Whether the period is an unknown."""
-        return self.scene.section(self.like) is not None
+        return is_autonomous(self.scene, self.like)
 
     @property
     def impacts(self) -> tuple[int, ...]:
@@ -232,11 +232,15 @@ class Shooting(eqx.Module):
 
     def _reached(self, scene: AbstractScene, states: Array) -> Array:
         """The states at the events, on both sides of those that may move the first coordinate."""
-        sections = [i for i, event in enumerate(self.events) if event.of(scene).ends_cycle]
-        if not sections or not renews(scene):
-            return states
-        renewed = [scene.renewed(self.unravel(states[i])) for i in sections]
-        return jnp.concatenate([states, jnp.stack([ravel_pytree(x)[0] for x in renewed])])
+        after = []
+        for leg, event in enumerate(self.events):
+            kind = event.of(scene)
+            still = isinstance(kind, RigidStop | Section) or kind.holds_mode
+            if not still or (event.cycle is not None and renews(scene)):
+                s, modes = jnp.zeros((), states.dtype), self._modes_in(leg - 1)
+                there = after_event(scene, event.number, s, self.unravel(states[leg]), modes)[0]
+                after.append(ravel_pytree(there)[0])
+        return jnp.concatenate([states, jnp.stack(after)]) if after else states
 
     def _saltation(self, scene, leg, s, u):
         """How a perturbation passes an event, R + (f⁺ - R f⁻) ∇g / ġ, and how fast it is met.

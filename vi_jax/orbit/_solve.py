@@ -17,7 +17,7 @@ from ..flow.methods import MethodLike
 from ..flow.simulate import collect
 from ..scene import Scene
 from ..scene.base import renews
-from ..scene.event import after_event, begin_modes
+from ..scene.event import after_event, begin_modes, events_of, is_autonomous
 from ..scene.numbers import leaf, with_leaf
 from ._carrier import carrier, steps_of
 from ._events import Event, section_of
@@ -69,7 +69,7 @@ def problem_of(
             f"{len(orbit.impact_stop)}: find it with a larger `impact_log`."
         )
     steps = steps_of(carried, corners, orbit.state, cycles)
-    found = events_of(orbit)
+    found = events_in(orbit)
     blank = Shooting(scene, carried, orbit.state, cycles, (), (), steps, (parameter,))
     period = float(scene.cycle) * cycles
     if blank.autonomous:
@@ -116,23 +116,25 @@ def _followed(blank: Shooting, state: Any, found: list[tuple[float, Event]], per
         in_flight.append(tuple(float(m) for m in modes))
         u, s = ravel_pytree(here)[0], place
     states.append(np.asarray(_carry(blank, modes, s, period, u)))
-    if found and found[0] == (0.0, section_of(scene, 0)) and renews(scene):
+    first = found[0][1] if found and found[0][1].cycle == 0 else None
+    if first is not None and (renews(scene) or first != section_of(scene, 0)):
         states[0] = states[-1]
     return _Way(np.stack(states), tuple(in_flight) or (tuple(float(m) for m in modes),))
 
 
-def events_of(orbit: Orbit) -> list[tuple[float, Event]]:
+def events_in(orbit: Orbit) -> list[tuple[float, Event]]:
     """The events of a motion, with the clock of each since the section, in their order."""
     scene, cycles = orbit.scene, int(orbit.cycles)
-    autonomous = scene.section(orbit.state) is not None
+    autonomous = is_autonomous(scene, orbit.state)
     clock = np.asarray(orbit.impact_phase) - float(scene.phase_at(0.0))
     stops = np.asarray(orbit.impact_stop)
     found = [(float(s), Event(int(i))) for s, i in zip(clock, stops, strict=True) if i >= 0]
     begins = float(scene.cycle) * np.arange(cycles)
-    if scene.switches or (autonomous and cycles > 1):
+    others = bool(scene.switches or scene.events or any(e.ends_cycle for e in scene.stops))
+    if others or (autonomous and cycles > 1):
         begins, listed = _listed_events(orbit)
-        found = listed if scene.switches else found
-    if autonomous or renews(scene):
+        found = listed if others else found
+    if scene.section(orbit.state) is not None or renews(scene):
         found += [(float(begins[n]), section_of(scene, n)) for n in range(cycles)]
     # What is met with a section belongs to the cycle that ends there.
     return sorted(found, key=lambda f: (f[0], f[1].cycle is not None))
@@ -150,10 +152,14 @@ def _listed_events(orbit: Orbit) -> tuple[np.ndarray, list[tuple[float, Event]]]
             f"Argument `orbit` must have at most {_LISTED} events in a cycle, but has "
             f"{int(counts.max())}."
         )
-    found = []
-    for begin, clock, number in zip(begins, log[0], log[1], strict=False):
+    found, events = [], events_of(orbit.scene)
+    for n, (clock, number) in enumerate(zip(log[0], log[1], strict=True)):
         for s, i in zip(clock[number >= 0], number[number >= 0].astype(int), strict=True):
-            found.append((float(begin + s), Event(int(i))))
+            if events[i].ends_cycle:
+                later = (n + 1) % len(log[0])
+                found.append((float(begins[later]), Event(int(i), later)))
+            else:
+                found.append((float(begins[n] + s), Event(int(i))))
     return begins, found
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..flow.events import Rates, guard_rates
 from ..scene import AbstractScene
-from ..scene.event import events_of, guard_of
+from ..scene.event import Section, events_of, guard_of, modes_for
 from ._flight import Flight
 
 Scalar = Float[Array, ""]
@@ -44,6 +44,8 @@ class _Found(NamedTuple):
     place: Float[Array, " steps"]
     before: Float[Array, " steps"]
     """The function's rate, or one of its sign, at the start of the step."""
+    happens: Bool[Array, " steps"]
+    """Whether an event would happen there."""
 
 
 class _Guard(NamedTuple):
@@ -55,9 +57,23 @@ class _Guard(NamedTuple):
         """Of it."""
         return guard_of(flight.scene, self.number, s, state, flight.modes)
 
+    def at(self, flight: Flight, s: Any, u: Any) -> Any:
+        """Of it, by the state's vector."""
+        return self.value(flight, s, flight.unravel(u))
+
     def rate(self, flight: Flight, s: Any, u: Any) -> Any:
         """Its rate, or one of its sign."""
         return self.rates(flight, flight.moving, s, u).v
+
+    def happens(self, flight: Flight, s: Any, u: Any, length: Any) -> Any:
+        """Whether the event would happen if it were met a length from here."""
+        event, scene = events_of(flight.scene)[self.number], flight.scene
+        if not event.from_below:
+            return jnp.ones((), bool)
+        there = flight.unravel(_stepped(flight, (s, length, u)))
+        modes = modes_for(scene, self.number, flight.modes)
+        when = event.happens(scene, s + length, there, *modes)
+        return jnp.ones((), bool) if when is None else when
 
     def rates(self, flight: Flight, moving: AbstractScene, s: Any, u: Any) -> Rates:
         """It and its first two derivatives."""
@@ -79,6 +95,9 @@ class _Body(_Guard):
         if flight.scene.has_velocity(state):
             return flight.scene.coordinates[self.number].velocity(state)
         return super().rate(flight, s, u)
+
+    def happens(self, flight, s, u, length):
+        return jnp.ones((), bool)
 
 
 def turns_of(
@@ -109,12 +128,15 @@ def turns_of(
         facing = at.turns & (stop.sign * at.before > 0)
         rooms.append((jnp.where(facing, -stop.beyond(at.height), jnp.inf), at.place))
     for number, event in enumerate(events_of(scene)):
-        if number < len(scene.stops) or event.ends_cycle:
+        if number < len(scene.stops) or isinstance(event, Section):
             continue
         at = found(_Guard(number))
         # A body that friction lets go begins to slide with velocity and acceleration zero.
         away = at.place > begin + _TURNED * h
         facing = at.turns & (at.before > 0) & away
+        if event.from_below:  # it touches nothing where it has not been below zero
+            value = jax.vmap(partial(_Guard(number).at, flight))(places, states)
+            facing = facing & at.happens & (jax.lax.cummin(value) < 0)
         rooms.append((jnp.where(facing, -at.height, jnp.inf), at.place))
     room, touch = jnp.full((), jnp.inf, h.dtype), jnp.zeros((), h.dtype)
     touched = touch
@@ -160,4 +182,5 @@ def _turn(watched: _Guard, flight: Flight, inputs: Any) -> _Found:
     # there.
     met = jnp.abs(here.v) <= jnp.abs(_TURNED * limit * bend)
     shift = jnp.where(met, here.v, 0.0) / bend
-    return _Found(turns, here.x - 0.5 * here.v * shift, s + length - shift, v0)
+    happens = watched.happens(flight, s, u, length)
+    return _Found(turns, here.x - 0.5 * here.v * shift, s + length - shift, v0, happens)

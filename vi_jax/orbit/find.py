@@ -20,6 +20,7 @@ from ..flow import Run, simulate
 from ..flow.arguments import check_leaves, refuse_arrays
 from ..flow.methods import MethodLike
 from ..scene import AbstractScene, Scene
+from ..scene.event import is_autonomous
 from ._columns import by_columns
 from ._neutral import neutral
 from ._root import root_of, shooting_matrix
@@ -149,7 +150,7 @@ def _run(the_map: CycleMap, state: Any, impact_log: int) -> Run:
 
 def _places(the_map: CycleMap, state: Any) -> int:
     """Places of a cycle that are looked at: of an autonomous machine only its section."""
-    return _PLACES if the_map.scene.section(state) is None else 1
+    return 1 if is_autonomous(the_map.scene, state) else _PLACES
 
 
 def _moved(the_map: CycleMap, guess: Any, impact_log: int) -> tuple[CycleMap, Any, Int[Array, ""]]:

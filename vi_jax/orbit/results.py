@@ -15,6 +15,7 @@ from ..flow import AbstractMethod, Run, simulate
 from ..flow.enumeration import NamedEnumeration
 from ..flow.labelled import batch_names, in_names, present, states, tidy
 from ..scene import AbstractScene
+from ..scene.event import is_autonomous
 from ..scene.numbers import plain, state_in_words
 from ..scene.shown import Told
 from ..scene.units import in_unit, name_in, with_units
@@ -159,7 +160,7 @@ class Orbit(Told):
         scene = self.scene
         if cycles is None:
             cycles = int(self.cycles)
-        if scene.section(self.state) is not None:
+        if is_autonomous(scene, self.state):
             # Its cycles need not be of one length: the whole motion is one interval.
             scene = scene.observed_every(self.duration * (cycles / self.cycles))
             samples, cycles = samples * cycles, 1

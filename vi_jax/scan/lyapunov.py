@@ -19,6 +19,7 @@ from ..flow.results import REASON_NAMES
 from ..orbit.cycle_map import CycleMap, adopted, cycle_map
 from ..scene import AbstractScene
 from ..scene.base import renews
+from ..scene.event import is_autonomous
 from ..scene.shown import Told, number_in_words
 from ..scene.units import attributes, unit_of, with_unit
 
@@ -118,7 +119,7 @@ def lyapunov(
     **Raises:** as `simulate`; `ValueError` for a machine with both a `section` and a `renewed`.
     """
     cycles = count("cycles", cycles, least=8)
-    if scene.section(start) is not None:
+    if is_autonomous(scene, start):
         if renews(scene):
             raise ValueError(
                 "Argument `scene` must not have both a `section` and a `renewed`, as a "

@@ -16,6 +16,7 @@ from .law import HuntCrossley as HuntCrossley
 from .law import PowerLaw as PowerLaw
 from .motor import Motor as Motor
 from .parameters import Parameters as Parameters
+from .reset import Reset as Reset
 from .scene import Oscillator as Oscillator
 from .scene import Scene as Scene
 from .shaft import ShaftScene as ShaftScene

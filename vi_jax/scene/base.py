@@ -11,7 +11,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float
 
 from .._checks import in_range
-from .event import AbstractSwitch
+from .event import AbstractEvent, AbstractSwitch
 from .shown import Shown
 from .stop import RigidStop
 from .units import PLAIN, unit_in
@@ -78,6 +78,8 @@ class AbstractScene(Shown):
     | `position`, `velocity`, `placed` | a state of any names; what else an impact changes |
     | `coordinates` | stops on several coordinates (`RigidStop(..., coordinate=1)`) |
     | `switches` | a field with modes, landed upon where they change: soft stops, dry friction |
+    | `events` | resets (`Reset`), cycles that any event ends, kinds of events of its own |
+    | `begin` | modes of its own, which any event may change |
     | `section` | an autonomous machine, whose cycles are counted by an event |
     | `observed_every` | its Lyapunov exponents, and samples of its orbits |
     | `renewed` | a drift, counted by the cycle |
@@ -103,12 +105,22 @@ class AbstractScene(Shown):
     def field(self, *args: Any, **kwargs: Any) -> State:
         """`field(s, state)`: d(state)/ds between events, a pytree like `state`.
 
-        With `switches` it is `field(s, state, mode, ...)`, which gets the mode of each.
+        With `switches`, or modes of its own, it is `field(s, state, mode, ...)`, which gets them.
         """
 
     @property
     def switches(self) -> tuple[AbstractSwitch, ...]:
         """Where the field changes without an impact."""
+        return ()
+
+    @property
+    def events(self) -> tuple[AbstractEvent, ...]:
+        """Events of other kinds: resets (`Reset`), and kinds of one's own."""
+        return ()
+
+    def begin(self, s: Float[Array, ""], state: State) -> tuple[Any, ...]:
+        """The machine's own modes in a motion that begins in `state`: numbers that its field gets
+        behind the state and behind the modes of its switches, and that events change."""
         return ()
 
     def section(self, state: State) -> Float[Array, ""] | None:

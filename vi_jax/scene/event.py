@@ -4,6 +4,7 @@ import abc
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
+import equinox as eqx
 import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float
@@ -20,20 +21,34 @@ class AbstractEvent(Shown):
     The first argument of each method is the machine. An event that holds a mode (`holds_mode`) gets
     that mode behind the state, and returns it; another gets all modes of the machine, as its field
     does, and returns them all.
+
+    A kind of one's own is a subclass with `guard` and `after`; a machine lists its events in
+    `events`. Simulations, orbits, branches, logs and pictures ask nothing else of it.
     """
 
     word: ClassVar[str] = "event"
-    """What messages call it."""
+    """What messages call it that has no `name`."""
+
+    ends_cycle: bool = eqx.field(static=True, kw_only=True, default=False, repr=False)
+    """Whether a cycle ends with it; static."""
+    name: str = eqx.field(static=True, kw_only=True, default="")
+    """What messages call it; static."""
+
+    @property
+    def called(self) -> str:
+        """Its name, or what it is."""
+        return self.name or self.word
 
     @property
     def holds_mode(self) -> bool:
-        """Whether one of the machine's modes is this event's."""
+        """Whether one of the machine's modes is this event's; then it has `begin` and `struck`."""
         return False
 
     @property
-    def ends_cycle(self) -> bool:
-        """Whether a cycle ends with it."""
-        return False
+    def from_below(self) -> bool:
+        """Whether it happens only once its guard has been below zero since the last jump. A guard
+        that is another one after the event need not ask for that."""
+        return True
 
     @abc.abstractmethod
     def guard(self, *args: Any, **kwargs: Any) -> Scalar:
@@ -48,6 +63,23 @@ class AbstractEvent(Shown):
         before it, also of one beside the event: what `after` only puts right to rounding is left as
         it is."""
         return self.after(*args, **kwargs)[0]
+
+    def happens(self, machine: Any, s: Any, state: Any, *modes: Any) -> Any:
+        """Whether the event happens where its guard has risen through zero; `None` if always."""
+        return None
+
+    def value(self, machine: Any, s: Any, state: Any, *modes: Any) -> Any:
+        """A number that the log of events keeps of it, of the state in which it is met."""
+        return jnp.nan
+
+    def begin(self, machine: Any, s: Scalar, state: Any) -> Scalar:
+        """The mode of a motion that begins in `state`, of an event that holds one."""
+        raise NotImplementedError(f"A {type(self).__name__} holds no mode.")
+
+    def struck(self, machine: Any, s: Scalar, state: Any, mode: Scalar) -> Scalar:
+        """Its mode after an impact or another jump of the state; by default that of a new
+        motion."""
+        return self.begin(machine, s, state)
 
     def speed(self, machine: Any, state: Any, rate: Any) -> Any:
         """How fast it is met, in the machine's words: by default how fast the guard rises by s,
@@ -72,6 +104,11 @@ class AbstractSwitch(AbstractEvent):
     def holds_mode(self) -> bool:
         """True."""
         return True
+
+    @property
+    def from_below(self) -> bool:
+        """False: behind the event the guard is that of another mode."""
+        return False
 
     @property
     def analytic(self) -> bool:
@@ -106,21 +143,13 @@ class AbstractSwitch(AbstractEvent):
         acceleration of its coordinate, of dry friction the force on the body that rubs."""
         raise NotImplementedError(f"A {type(self).__name__} has no `contribution`.")
 
-    def struck(self, machine: Any, s: Scalar, state: Any, mode: Scalar) -> Scalar:
-        """The mode after an impact elsewhere in the machine; by default that of a new motion."""
-        return self.begin(machine, s, state)
-
 
 class Section(AbstractEvent):
     """The end of a cycle: where the machine's `section` rises through zero, or what counts its
     cycles has come to their length."""
 
     word: ClassVar = "section"
-
-    @property
-    def ends_cycle(self):
-        """True."""
-        return True
+    ends_cycle: bool = eqx.field(static=True, kw_only=True, default=True, repr=False)
 
     def guard(self, machine, s, state, *modes):
         """The machine's `section`, or what is left to a full cycle."""
@@ -136,33 +165,47 @@ class Section(AbstractEvent):
 
 
 def events_of(machine: Any) -> tuple[AbstractEvent, ...]:
-    """All events of a machine, by which number they go: its stops, its switches, its section."""
-    return (*machine.stops, *machine.switches, Section())
+    """All events of a machine, by which number they go: its stops, its switches, those of other
+    kinds, its section."""
+    return (*machine.stops, *machine.switches, *machine.events, Section())
+
+
+def is_autonomous(machine: Any, state: Any) -> bool:
+    """Whether an event ends the cycles of a machine."""
+    ends = any(event.ends_cycle for event in events_of(machine)[:-1])
+    return ends or machine.section(state) is not None
+
+
+def met_by_guard(machine: Any, state: Any) -> list[int]:
+    """Of those events whose guard is looked at in each step, besides stops: their numbers."""
+    events, first = events_of(machine), len(machine.stops)
+    last = len(events) if machine.section(state) is not None else len(events) - 1
+    return list(range(first, last))
 
 
 def guard_of(machine: Any, number: int, s: Any, state: Any, modes: Modes) -> Scalar:
     """What rises through zero at one of a machine's events, in these modes of it."""
     event = events_of(machine)[number]
-    return event.guard(machine, s, state, *_for(machine, number, modes))
+    return event.guard(machine, s, state, *modes_for(machine, number, modes))
 
 
 def jump_of(machine: Any, number: int, s: Any, state: Any, modes: Modes) -> Any:
     """The state after one of its events, also of one beside it."""
     event = events_of(machine)[number]
-    return event.jump(machine, s, state, *_for(machine, number, modes))
+    return event.jump(machine, s, state, *modes_for(machine, number, modes))
 
 
 def after_event(machine: Any, number: int, s: Any, state: Any, modes: Modes) -> tuple[Any, Modes]:
     """State and modes after one of its events."""
     event = events_of(machine)[number]
-    state, new = event.after(machine, s, state, *_for(machine, number, modes))
+    state, new = event.after(machine, s, state, *modes_for(machine, number, modes))
     if event.holds_mode:
         own = mode_number(machine, number)
         new = (*modes[:own], new, *modes[own + 1 :])
     return state, settled_modes(new, s)
 
 
-def _for(machine: Any, number: int, modes: Modes) -> Modes:
+def modes_for(machine: Any, number: int, modes: Modes) -> Modes:
     """The modes that an event is given."""
     if events_of(machine)[number].holds_mode:
         own = mode_number(machine, number)
@@ -176,14 +219,22 @@ def mode_number(machine: Any, number: int) -> int:
 
 
 def begin_modes(machine: Any, s: Scalar, state: Any) -> Modes:
-    """The modes of a motion that begins in `state`."""
-    return settled_modes([switch.begin(machine, s, state) for switch in machine.switches], s)
+    """The modes of a motion that begins in `state`: those that events hold, in their order, then
+    the machine's own."""
+    held = [event.begin(machine, s, state) for event in events_of(machine) if event.holds_mode]
+    return settled_modes([*held, *machine.begin(s, state)], s)
 
 
-def struck_modes(machine: Any, s: Scalar, state: Any, modes: Modes) -> Modes:
-    """The modes after an impact, which left this state."""
-    both = zip(machine.switches, modes, strict=True)
-    return settled_modes([switch.struck(machine, s, state, mode) for switch, mode in both], s)
+def struck_modes(
+    machine: Any, s: Scalar, state: Any, modes: Modes, own: Sequence[Any] | None = None
+) -> Modes:
+    """The modes after a jump, which left this state; the machine's own are those given, or stay as
+    they are."""
+    holders = [event for event in events_of(machine) if event.holds_mode]
+    both = zip(holders, modes, strict=False)
+    held = [event.struck(machine, s, state, mode) for event, mode in both]
+    kept = modes[len(held) :] if own is None else own
+    return settled_modes([*held, *kept], s)
 
 
 def settled_modes(modes: Sequence[Any], s: Any) -> Modes:

@@ -84,7 +84,7 @@ def _parts(x: Any) -> tuple[str, list[tuple[str, Any]], str]:
     name = f"{type(x).__name__}("
     if dataclasses.is_dataclass(x) and not isinstance(x, type):
         values = [(f.name, getattr(x, f.name, None)) for f in dataclasses.fields(x) if f.repr]
-        left_out = (type(None), tuple)  # what is not there, and tuples that are empty
+        left_out = (type(None), tuple, str)  # what is not there, and what is empty
         there = [(k, part) for k, part in values if not isinstance(part, left_out) or part]
         return name, there, ")"
     fields = getattr(x, "_fields", None)

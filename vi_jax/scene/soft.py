@@ -88,6 +88,8 @@ class SoftStop(Wall, AbstractSwitch):
         adhesive: bool = True,
         side: str = "right",
         coordinate: int = 0,
+        ends_cycle: bool = False,
+        name: str = "",
     ):
         self.law = _law(law, exponent)
         if restitution is not None:
@@ -100,6 +102,7 @@ class SoftStop(Wall, AbstractSwitch):
         self.adhesive = bool(adhesive)
         self.side = one_of("side", side, ("right", "left"))
         self.coordinate = count("coordinate", coordinate)
+        self.ends_cycle, self.name = bool(ends_cycle), str(name)
         require_ranges(self)
 
     @property

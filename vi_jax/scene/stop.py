@@ -1,6 +1,7 @@
 """Rigid stops: the contact law, wherever it is asked for."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -72,6 +73,9 @@ class RigidStop(Wall, AbstractEvent):
     """"right" or "left"."""
     coordinate: int = eqx.field(static=True, default=0, kw_only=True)
     """Index into the machine's `coordinates`."""
+    modes: Callable[..., Any] | None = eqx.field(static=True, default=None, kw_only=True)
+    """`modes(machine, s, state, *modes)`: the machine's own modes after an impact in this state, a
+    tuple like that of its `begin`; they stay as they are if left out."""
     ranges: ClassVar = {"gap": REAL, "restitution": SHARE}
     word: ClassVar = "impact"
 
@@ -87,8 +91,13 @@ class RigidStop(Wall, AbstractEvent):
     def after(self, machine, s, state, *modes):
         """The rebound, on the stop; switches are in the modes that they have behind an impact."""
         body = machine.coordinates[self.coordinate]
-        state = body.placed(state, self.place, self.rebound(body.velocity(state)))
-        return state, struck_modes(machine, s, state, modes)
+        new = body.placed(state, self.place, self.rebound(body.velocity(state)))
+        return new, self.modes_after(machine, s, state, new, modes)
+
+    def modes_after(self, machine: Any, s: Any, before: Any, after: Any, modes: Any) -> Any:
+        """Those of the machine, from the states before and after an impact."""
+        own = None if self.modes is None else self.modes(machine, s, before, *modes)
+        return struck_modes(machine, s, after, modes, own)
 
     def jump(self, machine, s, state, *modes):
         """The rebound where the body is."""
@@ -98,6 +107,11 @@ class RigidStop(Wall, AbstractEvent):
     def speed(self, machine, state, rate):
         """V⁻, the speed of approach."""
         return self.approach(machine.coordinates[self.coordinate].velocity(state))
+
+    @property
+    def from_below(self):
+        """False: behind an impact the body goes away from the stop."""
+        return False
 
     @property
     def is_one_number(self) -> bool:

@@ -1,7 +1,7 @@
 """Where a step leads: rebounds, rest, changes of mode, and what is recorded of the way."""
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,15 +9,16 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
 from ...lanes import pin, pin_flag
-from ...scene.event import after_event, mode_number, struck_modes
+from ...scene.event import Section
 from .. import results
-from .._lane import CHANGES, HIT, LEAVES, RESTS, Lane, Plan, Record, to_event, to_turn_of
+from .._lane import HIT, LEAVES, RESTS, Lane, Plan, Record, to_event, to_turn_of
 from ..drift import drifted, height_of_turn, met_after, unmoved
 from ..events import Rates, to_turn
 from ..moving import exact
 from .aim import select
-from .faults import comes_back, gains, may_end, undecided
+from .faults import gains, may_end, undecided
 from .guards import Crossing, furthest_landing
+from .happen import Arrival, ended, happened
 from .log import clock_at, logged, noted
 from .rest import Release, settled
 from .trial import Trial, held
@@ -25,30 +26,6 @@ from .way import Way
 
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]
-
-
-class Arrival(NamedTuple):
-    """Where a step leads."""
-
-    s: Scalar
-    state: Any
-    place: Scalar
-    """Y there: on the stop, with the stop's derivatives, where one is met."""
-    time: Scalar | None
-    direction: tuple[Scalar, ...]
-    contact: tuple[Scalar, ...] | None
-    """The stops rested on."""
-    modes: tuple[Scalar, ...]
-    impacts: Scalar
-    speed: Scalar | None
-    loss: Scalar | None
-    rests: Scalar | None
-    log: Any
-    events: Any
-    completed: Flag
-    """Whether the interval is complete."""
-    fault: Scalar | None
-    """As in `Lane`; absent where no event can end it."""
 
 
 def arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Flag]:
@@ -61,15 +38,16 @@ def arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Fla
             turned = jnp.where(v == 0, along, jnp.sign(v))
             # At a turn the sign of the velocity is rounding's.
             away = -along
-            several = plan.scene.switches or len(trial.paths) > 1
-            if several or plan.scene.section(lane.state) is not None:
+            if plan.others(lane.state) or len(trial.paths) > 1:
                 # Where a turn is another event too, it may have been met before.
                 met_before = lane.target != to_turn_of(k)
                 away = jnp.where(met_before, stop_gradient(jnp.sign(trial.paths[k].end.a)), away)
             along = jnp.where(trial.paths[k].at_turn, away, turned)
         direction.append(along)
+    here = plan.scene.position(trial.state)
     arrival = Arrival(
-        trial.s, trial.state, plan.scene.position(trial.state), trial.time, tuple(direction),
+        trial.s, trial.state, here, here if plan.scene.events else None, trial.time,
+        tuple(direction),
         lane.contact, lane.modes,
         old.impacts, old.speed, old.loss, old.rests, old.log, old.events, trial.ends_interval,
         lane.fault if may_end(plan.scene) else None,
@@ -86,7 +64,7 @@ def arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Fla
         arrival = jax.lax.cond(
             met, lambda x: _met(plan, lane, trial, taken, way, x), lambda x: x, arrival
         )
-    y_max, y_min, clearance = _reached(plan, lane, trial, taken, way, arrival.place)
+    y_max, y_min, clearance = _reached(plan, lane, trial, taken, way, arrival)
     time = arrival.time
     if time is not None and old.time is not None:
         time = jnp.where(taken, time, old.time)
@@ -97,7 +75,7 @@ def arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Fla
         direction=select(taken, arrival.direction, lane.direction),
         contact=select(taken, arrival.contact, lane.contact),
         modes=select(taken, arrival.modes, lane.modes),
-        below=_below(lane, trial, taken, arrival.completed),
+        below=_below(plan, lane, trial, taken),
         fault=lane.fault if arrival.fault is None else jnp.where(taken, arrival.fault, lane.fault),
         record=Record(
             time, y_max, y_min, arrival.impacts, arrival.speed, arrival.loss, arrival.rests,
@@ -126,15 +104,14 @@ def _met(plan: Plan, lane: Lane, trial: Trial, taken: Flag, way: Way, arrival: A
         _, there, passed = drifted(way.rate, offset, way.moving, way.fixed, way.rest)
         s = arrival.s + jnp.where(c.landed, offset, 0.0)
         arrival = arrival._replace(s=s, time=select(c.landed, passed, arrival.time))
-        if c.event.ends_cycle:
-            arrival = arrival._replace(
-                completed=arrival.completed | c.landed,
-                state=select(c.landed, there, arrival.state),
-            )
-        elif c.event.holds_mode:
-            arrival = _switched(plan, taken, arrival, c, there)
-        else:
+        if c.coordinate is not None:
             arrival = _impact(plan, lane, trial, taken, arrival, c, there)
+        elif isinstance(c.event, Section):  # what begins anew with a cycle does so at its end
+            arrival = arrival._replace(state=select(c.landed, there, arrival.state))
+        else:
+            arrival = happened(plan, taken, arrival, c, there)
+        if c.event.ends_cycle:
+            arrival = arrival._replace(completed=arrival.completed | c.landed)
     for k, path in enumerate(trial.paths):
         if path.leaves is not None:
             arrival = _released(plan, lane, taken, arrival, way, k, path.leaves)
@@ -186,45 +163,21 @@ def _released(
     )
 
 
-def _below(lane: Lane, trial: Trial, taken: Flag, completed: Flag) -> Scalar | None:
-    if trial.below is None or lane.below is None:
-        return None
-    return jnp.where(taken, jnp.where(completed, 0.0, trial.below), lane.below)
+def _below(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Scalar, ...]:
+    """As in `Lane`: after a jump each guard is to come from below again."""
+    found = []
+    numbers = plan.from_below(lane.state)
+    for number, old, new in zip(numbers, lane.below, trial.below, strict=True):
+        for c in trial.crossings:
+            jumps = plan.scene.events and not c.event.holds_mode
+            if c.number == number or jumps:
+                new = jnp.where(c.landed, 0.0, new)
+        found.append(jnp.where(taken, new, old))
+    return tuple(found)
 
 
 def _put(values: tuple, k: int, value: Any) -> tuple:
     return (*values[:k], value, *values[k + 1 :])
-
-
-def _switched(plan: Plan, taken: Flag, arrival: Arrival, c: Crossing, there: Any) -> Arrival:
-    """The next mode of a switch that changed in the state `there`."""
-    scene = plan.scene
-    state, after = after_event(scene, c.number, arrival.s, there, arrival.modes)
-    modes = select(c.landed, after, arrival.modes)
-    slides = comes_back(plan.scene, c.number, modes, arrival.s, state)
-    arrival = _ended(arrival, c, slides, results.SLIDING)
-    log, clock, mode = arrival.log, clock_at(plan, arrival.s, there), mode_number(scene, c.number)
-    number = c.number - len(scene.stops)
-    events = noted(arrival.events, taken & c.landed, clock, CHANGES, number, after[mode])
-    if plan.log_switches:
-        zero = jnp.zeros_like(arrival.s)
-        log = logged(log, taken & c.landed, arrival.impacts, clock, zero, c.number)
-        # Listed as an impact is, and so counted.
-        count = jnp.where(taken & c.landed, 1.0, 0.0)
-        arrival = arrival._replace(impacts=arrival.impacts + count)
-    return arrival._replace(
-        state=select(c.landed, state, arrival.state),
-        modes=modes,
-        log=log,
-        events=events,
-    )
-
-
-def _ended(arrival: Arrival, c: Crossing, when: Flag | None, reason: int) -> Arrival:
-    """With this reason to end, where that holds of what was met; `None` where it cannot."""
-    if when is None or arrival.fault is None:
-        return arrival
-    return arrival._replace(fault=jnp.where(c.landed & when, float(reason), arrival.fault))
 
 
 def _impact(
@@ -241,10 +194,10 @@ def _impact(
     # A speed whose square is no number ends here: a body may die out on a stop.
     least = 100 * float(jnp.finfo(s.dtype).tiny) ** 0.5
     rebound = stop.rebound(stop.sign * jnp.where(approach > least, approach, 0.0))
-    arrival = _ended(arrival, c, gains(stop, approach, rebound), results.BAD_IMPACT)
+    arrival = ended(arrival, c, gains(stop, approach, rebound), results.BAD_IMPACT)
     struck = body.placed(there, stop.place, rebound)
     clashes = undecided(scene, c.number, there, struck)
-    arrival = _ended(arrival, c, clashes, results.SIMULTANEOUS)
+    arrival = ended(arrival, c, clashes, results.SIMULTANEOUS)
     state = select(c.landed, struck, state)
     direction = jnp.where(c.landed, -float(stop.sign), direction)
     hit = taken & c.landed
@@ -282,7 +235,7 @@ def _impact(
                 contact = _put(contact, j, jnp.where(moved, 0.0, contact[j]))
     modes = arrival.modes
     if modes:
-        modes = select(c.landed, struck_modes(scene, s, state, modes), modes)
+        modes = select(c.landed, stop.modes_after(scene, s, there, state, modes), modes)
     speed, loss = arrival.speed, arrival.loss
     log = logged(arrival.log, hit, arrival.impacts, met, approach, c.number)
     return arrival._replace(
@@ -306,7 +259,7 @@ def _is_one(mass: Any) -> bool:
 
 
 def _reached(
-    plan: Plan, lane: Lane, trial: Trial, taken: Flag, way: Way, place: Scalar
+    plan: Plan, lane: Lane, trial: Trial, taken: Flag, way: Way, arrival: Arrival
 ) -> tuple[Scalar | None, Scalar | None, Scalar | None]:
     """Greatest and smallest Y so far, and the smallest distance at a turn that met no stop."""
     record = lane.record
@@ -315,15 +268,16 @@ def _reached(
         return y_max, y_min, clearance
     tops = [_top(trial, k, way) for k in range(len(trial.paths))]
     at_turn = trial.paths[0].at_turn
-    reached = jnp.where(at_turn, tops[0], place)
+    reached = jnp.where(at_turn, tops[0], arrival.place)
     if clearance is not None:
         for stop in plan.scene.stops:
             k = stop.coordinate
             short = taken & trial.paths[k].at_turn & (lane.direction[k] == stop.sign)
             room = jnp.where(short, -stop.beyond(tops[k]), jnp.inf)
             clearance = jnp.minimum(clearance, room)
-    y_max = jnp.where(taken, jnp.maximum(y_max, reached), y_max)
-    y_min = jnp.where(taken, jnp.minimum(y_min, reached), y_min)
+    for place in (reached,) if arrival.before is None else (arrival.before, reached):
+        y_max = jnp.where(taken, jnp.maximum(y_max, place), y_max)
+        y_min = jnp.where(taken, jnp.minimum(y_min, place), y_min)
     return y_max, y_min, clearance
 
 

@@ -67,9 +67,13 @@ def _lost(plan: Plan, lane: Lane, target: Scalar) -> Scalar | float:
     scene, reason = plan.scene, float(results.UNRESOLVED)
     if plan.motion or scene.stops:
         reason = jnp.where(target < FREE, float(results.TURN_UNRESOLVED), reason)
+    first = len(scene.stops)
     if scene.switches:
-        others = target >= to_event(len(scene.stops))
+        others = target >= to_event(first)
         reason = jnp.where(others, float(results.SWITCH_UNRESOLVED), reason)
+    if scene.events:
+        others = target >= to_event(first + len(scene.switches))
+        reason = jnp.where(others, float(results.RESET_UNRESOLVED), reason)
     if not plan.ticks(lane.state):
         ends = target == plan.to_section
         reason = jnp.where(ends, float(results.SECTION_UNRESOLVED), reason)
@@ -79,8 +83,9 @@ def _lost(plan: Plan, lane: Lane, target: Scalar) -> Scalar | float:
 def may_end(scene: AbstractScene) -> bool:
     """Whether an event may end a lane; static."""
     laws = any(not stop.is_one_number for stop in scene.stops)
-    slides = any(switch.may_slide for switch in scene.switches)
-    return laws or slides or (bool(scene.stops) and len(scene.coordinates) > 1)
+    slides = any(getattr(event, "may_slide", False) for event in events_of(scene))
+    several = bool(scene.stops) and (len(scene.coordinates) > 1 or bool(scene.events))
+    return laws or slides or several
 
 
 def gains(stop: RigidStop, approach: Scalar, rebound: Scalar) -> Flag | None:
@@ -120,8 +125,7 @@ def comes_back(scene: AbstractScene, i: int, modes: tuple, s: Scalar, state: Any
 
     **Arguments:** the number of the event; the modes, s and the state behind it.
     """
-    switch: Any = events_of(scene)[i]
-    if not switch.may_slide:
+    if not getattr(events_of(scene)[i], "may_slide", False):
         return None
     machine = in_modes(scene, modes)
 

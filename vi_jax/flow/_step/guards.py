@@ -48,19 +48,18 @@ class Crossing(NamedTuple):
 
 def crossings(
     plan: Plan, lane: Lane, holding: Any, paths: list[Any], there: tuple, ends: tuple[Flag, Flag]
-) -> tuple[tuple[Crossing, ...], Scalar | None]:
+) -> tuple[tuple[Crossing, ...], tuple[Scalar, ...]]:
     """The events that a step saw, and `Lane.below` at its end.
 
     **Arguments:** the machine as the step saw it; what it saw of each coordinate; s, its length and
     the state at its end; whether it was good, and whether it ends an interval.
     """
     scene, (s1, h, new), (good, last) = plan.scene, there, ends
-    section, below = _section(plan, lane, holding, s1, new)
-    guards = [*_stops(scene, paths), *_others(lane, scene, holding, s1, new), *section]
+    others, below = _others(plan, lane, holding, s1, new)
+    guards = [*_stops(scene, paths), *others, *_clock(plan, lane, holding, s1, new)]
     # The stops of one coordinate and a clock are never met together but on a section, where a step
     # ends; other events can be.
-    together = scene.switches or scene.section(lane.state) is not None
-    if together or not exact(scene, lane.state):
+    if others or not exact(scene, lane.state):
         eps = float(jnp.finfo(h.dtype).eps)
         guards = [guard._replace(slack=4 * eps * guard.scale) for guard in guards]
     return tuple(_seen(lane, good & last, good, h, each, guards) for each in guards), below
@@ -89,64 +88,59 @@ def _stops(scene: AbstractScene, paths: list[Any]) -> list[_Guard]:
     return found
 
 
-def _others(lane: Lane, scene: AbstractScene, moving: Any, s1: Scalar, new: Any) -> list[_Guard]:
-    """Of the events that are neither stops nor the end of a cycle."""
-    found = []
-    for number, event in enumerate(events_of(scene)):
-        if number < len(scene.stops) or event.ends_cycle:
-            continue
+def _others(
+    plan: Plan, lane: Lane, moving: Any, s1: Scalar, new: Any
+) -> tuple[list[_Guard], tuple[Scalar, ...]]:
+    """Of the events besides stops; and `Lane.below` at the step's end."""
+    scene, found, below = plan.scene, [], []
+    for number in plan.others(lane.state):
 
         def guard(s: Scalar, state: Any, number=number) -> Scalar:
-            return guard_of(scene, number, s, state, lane.modes)
+            return jnp.asarray(guard_of(scene, number, s, state, lane.modes))
 
         begin = guard_rates(moving.field, guard, lane.s, lane.state)
         end = guard_rates(moving.field, guard, s1, new)
-        scale = 1 + stop_gradient(jnp.abs(end.v))
+        scale, event = 1 + stop_gradient(jnp.abs(end.v)), events_of(scene)[number]
+        if event.from_below:
+            begin, end, risen = _from_below(lane.below[len(below)], begin, end, scale)
+            below.append(risen)
         found.append(_Guard(event, number, begin, end, scale))
-    return found
+    return found, tuple(below)
 
 
-def _section(
-    plan: Plan, lane: Lane, moving: Any, s1: Scalar, new: Any
-) -> tuple[list[_Guard], Scalar | None]:
-    """What ends a cycle, unless `s` itself does; and `Lane.below`."""
-    scene = plan.scene
-    if plan.ticks(lane.state):
-        return [], None
-    number = len(events_of(scene)) - 1
-    event = events_of(scene)[number]
-    if scene.section(lane.state) is None:
-        bound = plan.end(lane.part)
-
-        def clock(state: Any) -> Scalar:
-            return jnp.asarray(scene.clock(state))
-
-        ends = (
-            rates(moving.field, clock, lane.s, lane.state).scaled(1, bound),
-            rates(moving.field, clock, s1, new).scaled(1, bound),
-        )
-        return [_Guard(event, number, *ends, bound)], None
-
-    def section(state: Any) -> Scalar:
-        return jnp.asarray(scene.section(state))
-
-    begin = rates(moving.field, section, lane.s, lane.state)
-    end = rates(moving.field, section, s1, new)
-    scale = 1 + stop_gradient(jnp.abs(end.v))
-    # From the section it rises: it ends the next cycle only once it has been below, where one that
-    # is started on the section and falls already is.
-    assert lane.below is not None
+def _from_below(
+    below: Scalar, begin: Rates, end: Rates, scale: Scalar
+) -> tuple[Rates, Rates, Scalar]:
+    """The rates of a guard that counts only once it has been below zero, where one that begins on
+    its surface and falls already is; and whether it has been at the step's end."""
     # On it is also what a search's step left so close to it: a cycle is no shorter.
     rounding = float(jnp.finfo(end.x.dtype).eps) ** 0.5 * scale
     here = stop_gradient(begin)
     falls = (here.x <= rounding) & (here.v < 0)
-    armed = (lane.below > 0) | (here.x < -rounding) | falls
-    below = jnp.where(armed | (stop_gradient(end.x) < -rounding), 1.0, lane.below)
+    armed = (below > 0) | (here.x < -rounding) | falls
+    risen = jnp.where(armed | (stop_gradient(end.x) < -rounding), 1.0, below)
     begin, end = (
         Rates(jnp.where(armed, r.x, -1.0), *(jnp.where(armed, x, 0.0) for x in (r.v, r.a)))
         for r in (begin, end)
     )
-    return [_Guard(event, number, begin, end, scale)], below
+    return begin, end, risen
+
+
+def _clock(plan: Plan, lane: Lane, moving: Any, s1: Scalar, new: Any) -> list[_Guard]:
+    """The end of an interval, where a clock in the state counts the cycles."""
+    scene = plan.scene
+    if scene.clock(lane.state) is None:
+        return []
+    number, bound = len(events_of(scene)) - 1, plan.end(lane.part)
+
+    def clock(state: Any) -> Scalar:
+        return jnp.asarray(scene.clock(state))
+
+    ends = (
+        rates(moving.field, clock, lane.s, lane.state).scaled(1, bound),
+        rates(moving.field, clock, s1, new).scaled(1, bound),
+    )
+    return [_Guard(events_of(scene)[number], number, *ends, bound)]
 
 
 def beyond(event: _Guard | Crossing) -> Flag:

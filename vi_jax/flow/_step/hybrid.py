@@ -22,13 +22,12 @@ from jaxtyping import Array, Bool, Float
 
 from ...lanes import pin_flag
 from .._lane import FREE, Lane, Plan, Record
-from ..events import rates
 from ..methods import Taylor
-from ..moving import rounding
 from .ahead import ahead
 from .aim import aim_at, select
 from .arrive import arrive
 from .faults import faults
+from .jump import Onward, after_jump
 from .trial import Trial, attempt, held, timing
 
 Scalar = Float[Array, ""]
@@ -74,7 +73,9 @@ def iterate(plan: Plan, lane: Lane) -> Step:
         state = select(turned, plan.scene.rewound(state), state)
     renewed = plan.scene.renewed(state)
     if renewed is not state:
-        there = _renewed(plan, there, turned, state, renewed)
+        onward = Onward(there.direction, there.contact, there.modes)
+        onward = after_jump(plan, onward, turned, state, renewed, jnp.zeros_like(s))
+        there = dataclasses.replace(there, **onward._asdict())
         state = select(turned, renewed, state)
     of_interval = record
     record = select(completed, plan.fresh(state), record)
@@ -106,30 +107,6 @@ def iterate(plan: Plan, lane: Lane) -> Step:
         rejected=lane.rejected + jnp.where(rejected, 1.0, 0.0),
     )
     return Step(new, completed, state, of_interval)
-
-
-def _renewed(plan: Plan, lane: Lane, turned: Flag, old: Any, new: Any) -> Lane:
-    """Which way the motion goes on behind a state that was put in place of another, and what of it
-    still rests: only what was not moved."""
-    directions, contacts = list(lane.direction), list(lane.contact or ())
-    slack = rounding(plan.scene, new)
-    for k, coordinate in enumerate(plan.scene.coordinates):
-        (place, before), (there, after) = (
-            (coordinate.position(x), coordinate.velocity(x)) for x in (old, new)
-        )
-        if contacts and not (there is place and after is before):
-            moved = (jnp.abs(there - place) > slack) | (jnp.abs(after - before) > slack)
-            contacts[k] = jnp.where(turned & stop_gradient(moved), 0.0, contacts[k])
-    if contacts:
-        lane = dataclasses.replace(lane, contact=tuple(contacts))
-    for k, coordinate in enumerate(plan.scene.coordinates):
-        after = coordinate.velocity(new)
-        if after is not coordinate.velocity(old):
-            machine = held(plan, lane)
-            bend = rates(machine.field, coordinate.position, jnp.zeros_like(lane.s), new).a
-            after = stop_gradient(jnp.where(after == 0, bend, after))
-            directions[k] = jnp.where(turned & (after != 0), jnp.sign(after), directions[k])
-    return dataclasses.replace(lane, direction=tuple(directions))
 
 
 def _resized(plan: Plan, lane: Lane, trial: Trial, taken: Flag, rejected: Flag) -> Scalar:

@@ -14,6 +14,7 @@ from ..events import Rates, force_rate, rates, turns_within
 from ..methods.taylor import Expansion
 from ..moving import Moving, exact, in_modes
 from .guards import Crossing, crossings, leniency, turn_tolerance
+from .jump import Onward, moving_on
 from .rest import Release, release
 
 Scalar = Float[Array, ""]
@@ -40,7 +41,7 @@ class Trial(NamedTuple):
     """Of each coordinate, the machine in its modes with the other bodies held that rest."""
     holding: Any
     """The machine as the step saw it: its bodies held where they rest."""
-    below: Scalar | None
+    below: tuple[Scalar, ...]
     """As in `Lane`, at the step's end."""
 
 
@@ -60,11 +61,7 @@ class Path(NamedTuple):
 
 def held(plan: Plan, lane: Lane) -> AbstractScene:
     """The machine in its modes, with the bodies held that rest."""
-    scene = plan.scene
-    if lane.contact is None:
-        return in_modes(scene, lane.modes)
-    rests = tuple(x > 0 for x in lane.contact)
-    return Moving(scene=scene, modes=lane.modes, held=rests, stops=scene.stops)
+    return moving_on(plan, Onward(lane.direction, lane.contact, lane.modes))
 
 
 def alone(plan: Plan, lane: Lane, k: int) -> AbstractScene:
@@ -153,7 +150,7 @@ def _path(
     aimed = lane.target == to_turn_of(k)
     for j in range(len(plan.scene.coordinates)):  # several may turn at once
         aimed = aimed if j == k else aimed | (lane.target == to_turn_of(j))
-    if plan.scene.switches or plan.scene.section(lane.state) is not None:
+    if plan.others(lane.state):
         # Such an event may be a turning point as well.
         aimed = aimed | (lane.target >= to_event(len(plan.scene.stops)))
     at_turn = good & aimed & met

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ...scene.event import guard_of
+from ...scene.event import events_of, guard_of
 from .._lane import Plan
 from ..events import rates
 from ..moving import Moving
@@ -27,7 +27,7 @@ class Way:
     """
 
     def __init__(self, plan: Plan, machine: Any, part: Scalar, moving: tuple):
-        self.moving = moving
+        self.plan, self.moving = plan, moving
         self._fixed, others = eqx.partition((machine, plan.end(part)), eqx.is_inexact_array)
         self.rest, self._static = eqx.partition(others, eqx.is_array)
         self._around: list[Any] = []
@@ -41,12 +41,15 @@ class Way:
     def guard(self, c: Crossing) -> Callable:
         """Of a crossing."""
 
+        scene = self.plan.scene
+        clocked = None if scene.clock(self.moving[1]) is None else len(events_of(scene)) - 1
+
         def event(moving, fixed, rest):
             (machine, bound), (s, state, _) = self._whole(fixed, rest), moving
             scene, modes = machine, ()
             if isinstance(machine, Moving):
                 scene, modes = machine.scene, machine.modes
-            if c.event.ends_cycle and scene.section(state) is None:
+            if c.number == clocked:
                 return scene.clock(state) - bound  # which may be that of a part of a cycle
             return guard_of(scene, c.number, s, state, modes)
 

@@ -1,0 +1,307 @@
+"""Jumps of the state by rules of one's own, modes that impacts change, cycles that events end."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm
+from scipy.optimize import brentq, fsolve
+
+from resets import (
+    A,
+    Excited,
+    Sliding,
+    StickSlip,
+    ThreeStates,
+    Toggled,
+    Walker,
+    legs,
+)
+
+CLOSE = vi.Adaptive(rtol=1e-12)
+# Of the walker on a slope of 0.009: by SciPy at 1e-13.
+STANCE, TURNING, STEP = 0.20031090054, -0.19983247300, 3.88246375285
+PAIR = -0.19009984 + 0.55759878j
+
+
+@pytest.fixture(scope="module")
+def walk():
+    return vi.find_orbit(Walker(0.009), legs(0.2003, -0.1998))
+
+
+def test_a_walker_walks(walk):
+    assert bool(walk.successful)
+    np.testing.assert_allclose(
+        [walk.state.stance, walk.state.turning, walk.duration], [STANCE, TURNING, STEP], atol=1e-10
+    )
+    greatest = walk.multipliers[jnp.argsort(-jnp.abs(walk.multipliers))]
+    np.testing.assert_allclose(np.sort_complex(greatest[:2]), [PAIR.conjugate(), PAIR], atol=1e-7)
+    assert float(jnp.abs(greatest[2:]).max()) < 1e-9
+    # Both sides of the jump are extremes.
+    np.testing.assert_allclose([walk.y_min, walk.y_max], [-STANCE, STANCE], atol=1e-10)
+    run = vi.simulate(walk.scene, walk.state, 2, event_log=2, method=CLOSE)
+    assert run.event_log.kind.tolist() == [[vi.EVENTS.index("reset"), -1]] * 2
+    np.testing.assert_allclose(run.event_log.phase[:, 0], STEP, atol=1e-8)
+
+
+class Strike(vi.AbstractEvent):
+    """The same event as a kind of its own."""
+
+    def guard(self, machine, s, x):
+        return x.between - 2 * x.stance
+
+    def after(self, machine, s, x):
+        return legs(-x.stance, x.turning * jnp.cos(2 * x.stance)), ()
+
+    def happens(self, machine, s, x):
+        return x.between < -0.05
+
+    def value(self, machine, s, x):
+        return x.turning
+
+
+class OwnWalker(Walker):
+    @property
+    def events(self):
+        return (Strike(ends_cycle=True, name="strike"),)
+
+
+def test_a_kind_of_event_of_ones_own(walk):
+    own = vi.find_orbit(OwnWalker(0.009), legs(0.2003, -0.1998))
+    np.testing.assert_allclose(own.state.stance, walk.state.stance, atol=1e-14)
+    np.testing.assert_allclose(own.multipliers, walk.multipliers, atol=1e-12)
+    run = vi.simulate(own.scene, own.state, 1, event_log=1)
+    # The leg turns as fast before as after, but for the cosine.
+    turning = float(own.state.turning) / np.cos(2 * STANCE)
+    assert float(run.event_log.value[0, 0]) == pytest.approx(turning, abs=1e-9)
+
+
+@pytest.mark.slow
+def test_a_walker_doubles_its_step(walk):
+    """As where a section and what begins anew with it say the same."""
+    branch = vi.continue_orbit(walk, parameter="slope", bounds=(0.008, 0.017))
+    (doubling,) = branch.special
+    assert doubling.kind == "period-doubling"
+    assert doubling.parameter == pytest.approx(0.01508843794, abs=1e-10)
+    np.testing.assert_allclose(branch.y_min, -branch.y_max, atol=1e-12)
+    twice = doubling.switch(distance=0.002)
+    assert int(twice.cycles) == 2 and bool(twice.successful)
+    again = vi.find_orbit(twice.scene, twice.state, cycles=2, method=CLOSE)
+    np.testing.assert_allclose(again.state.stance, twice.state.stance, atol=1e-9)
+
+
+def test_exponents_of_a_walk_are_its_multipliers(walk):
+    found = vi.lyapunov(Walker(0.009).observed_every(2.0), walk.state, 300, settle=20, number=3)
+    per_time = np.log(abs(PAIR)) / STEP
+    np.testing.assert_allclose(found.exponents, [0.0, per_time, per_time], atol=2e-3)
+
+
+def test_derivatives_pass_through_a_reset():
+    """Of the state after three steps by the slope: forward, backward and by differences."""
+
+    def last(slope):
+        run = vi.simulate(Walker(slope), legs(0.2003, -0.1998), 3, method=CLOSE)
+        return run.last.turning
+
+    forward, backward = jax.jacfwd(last)(0.009), jax.grad(last)(0.009)
+    h = 1e-6
+    by_differences = (last(0.009 + h) - last(0.009 - h)) / (2 * h)
+    assert float(forward) == pytest.approx(float(by_differences), rel=1e-6)
+    assert float(backward) == pytest.approx(float(forward), rel=1e-12)
+
+
+def slid(voltage, x, cycles):
+    """States of the impactor at the ends of its cycles, by SciPy."""
+
+    def field(t, x):
+        force = (voltage * np.sin(0.92 * t) / (1 - x[0])) ** 2 - 0.04 * x[1] - x[0]
+        if slides:
+            return [x[1], 3.17 + 1.2 * force, -3.17 - 0.2 * force]
+        return [x[1], force, -x[2]]
+
+    def hits(t, x):
+        return x[0] - 0.5
+
+    def holds(t, x):
+        return -x[2]
+
+    hits.terminal = holds.terminal = True
+    hits.direction = holds.direction = 1
+    t, slides, found = 0.0, False, []
+    options = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-14}
+    for n in range(1, cycles + 1):
+        while t < n * np.pi / 0.92:
+            events = (hits, holds) if slides else (hits,)
+            out = solve_ivp(field, (t, n * np.pi / 0.92), x, events=events, **options)
+            t, x = out.t[-1], out.y[:, -1]
+            if len(out.t_events[0]):
+                x, slides = np.array([0.5, -0.8 * x[1], 0.3 * x[1]]), True
+            elif slides and len(out.t_events[1]):
+                x, slides = np.array([x[0], x[1], 0.0]), False
+        found.append(x)
+    return np.array(found)
+
+
+def sliding(q, v):
+    return Sliding(*(jnp.asarray(x) for x in (q, v, 0.0)))
+
+
+def test_an_impact_sets_a_base_in_motion():
+    run = vi.simulate(StickSlip(0.57), sliding(0.1, 0.0), 8, method=CLOSE, event_log=8)
+    sections = jnp.stack([run.sections.q, run.sections.v, run.sections.u], axis=1)
+    np.testing.assert_allclose(sections[1:], slid(0.57, np.array([0.1, 0, 0]), 8), atol=1e-8)
+    kinds = np.asarray(run.event_log.number)
+    assert (kinds == 0).sum() == (kinds == 1).sum() > 2  # each impact is followed by sticking
+    speeds = run.event_log.value[kinds == 0]
+    assert float(speeds.min()) > 0 and np.isnan(run.event_log.value[kinds == 1]).all()
+
+
+@pytest.mark.slow
+def test_a_branch_ends_where_the_guard_of_a_reset_is_touched():
+    run = vi.simulate(StickSlip(0.4), sliding(0.1, 0.0), 1, settle=400, method=CLOSE)
+    orbit = vi.find_orbit(StickSlip(0.5), run.last)
+    branch = vi.continue_orbit(orbit, parameter="voltage", bounds=(0.45, 0.7))
+    assert branch.ends[1] == "grazing"
+    (touch,) = (point for point in branch.special if point.kind == "grazing")
+    assert touch.parameter == pytest.approx(0.58751625042, abs=1e-10)
+    assert "the guard of impact" in touch.detail
+
+
+def three(b):
+    """A cycle of `ThreeStates` by the matrix exponential: after its reset, and its length."""
+
+    def left(u):
+        x = expm(A * u[2]) @ np.array([1.0, u[0], u[1]])
+        v = A[0] @ x
+        return [x[0] - 1, x[1] - b * v - u[0], x[2] - 1.6 * v - u[1]]
+
+    return fsolve(left, [0.7955, 0.23435, 6.69907], xtol=1e-14)
+
+
+@pytest.fixture(scope="module")
+def cycle():
+    return vi.find_orbit(ThreeStates(1.8), tuple(map(jnp.asarray, (1.0, 0.7955, 0.2343))))
+
+
+def test_a_cycle_of_three_states_is_that_of_matrix_exponentials(cycle):
+    found = [cycle.state[1], cycle.state[2], cycle.duration]
+    np.testing.assert_allclose(found, three(1.8), atol=1e-10)
+
+
+@pytest.mark.slow
+def test_such_a_cycle_is_born_at_a_fold(cycle):
+    branch = vi.continue_orbit(cycle, parameter="b", bounds=(1.75, 1.95))
+    (fold,) = branch.special
+    assert fold.kind == "fold" and fold.parameter == pytest.approx(1.78192697901, abs=1e-10)
+    # At a fold all but the parameter is known to the root of its error.
+    assert float(fold.orbit.duration) == pytest.approx(5.846868672, abs=1e-6)
+
+
+def test_a_cycle_that_an_impact_ends():
+    """x = e^(0.1 t)(cos w t + B sin w t) from the stop to the stop."""
+    k, a = 0.6, 0.1
+    w = np.sqrt(1 - a * a)
+
+    def flight(speed):
+        B = (-speed - a) / w
+
+        def place(t):
+            return np.exp(a * t) * (np.cos(w * t) + B * np.sin(w * t)) - 1
+
+        times = np.linspace(0.5, 7.0, 200)
+        rises = np.flatnonzero(place(times) > 0)[0]
+        T = brentq(place, times[rises - 1], times[rises])
+        turned = a * np.exp(a * T) * (np.cos(w * T) + B * np.sin(w * T))
+        return T, turned + w * np.exp(a * T) * (B * np.cos(w * T) - np.sin(w * T))
+
+    speed = brentq(lambda u: k * flight(u)[1] - u, 0.05, 3.0)
+    orbit = vi.find_orbit(Excited(k), vi.OscillatorState(jnp.asarray(1.0), jnp.asarray(-speed)))
+    assert int(orbit.impacts) == 1 and bool(orbit.successful)
+    np.testing.assert_allclose(orbit.duration, flight(speed)[0], rtol=1e-10)
+    np.testing.assert_allclose(orbit.state.V, -speed, rtol=1e-10)
+    h = 1e-5
+    slope = k * (flight(speed + h)[1] - flight(speed - h)[1]) / (2 * h)
+    assert float(jnp.abs(orbit.multipliers).max()) == pytest.approx(abs(slope), rel=1e-7)
+    branch = vi.continue_orbit(orbit, parameter="restitution", bounds=(0.55, 0.65))
+    assert branch.ends == ("bounds", "bounds")
+    np.testing.assert_allclose(branch.at(0.6)[0].state.V, -speed, rtol=1e-9)
+
+
+def toggled(k, times):
+    """Speeds of approach of the body between its walls, from rest in the middle."""
+    speeds, speed = [], np.sqrt(2.0)
+    for _ in range(times):
+        speeds.append(speed)
+        speed = np.sqrt((k * speed) ** 2 + 4.0)
+    return speeds
+
+
+def test_an_impact_changes_a_mode():
+    start = vi.OscillatorState(jnp.asarray(0.0), jnp.asarray(0.0))
+    run = vi.simulate(Toggled(), start, 1, impact_log=6, method=CLOSE)
+    assert run.impact_log.stop[0].tolist() == [0, 1, 0, 1, 0, 1]
+    np.testing.assert_allclose(run.impact_log.speed[0], toggled(0.8, 6), rtol=1e-10)
+
+
+CASES = {
+    "walker": (lambda x: (Walker(0.009 + 1e-4 * x), legs(0.2003, -0.1998)), 3),
+    "stick and slip": (lambda x: (StickSlip(0.57), sliding(0.1 + 0.01 * x, 0.0)), 3),
+    "three states": (
+        lambda x: (ThreeStates(1.8), (jnp.ones_like(x), 0.7955 + 1e-3 * x, 0.2343 + 0 * x)), 3,
+    ),
+    "impact": (lambda x: (Excited(0.6 + 0.01 * x), vi.OscillatorState(x, 0.5 + 0 * x)), 3),
+    "mode": (lambda x: (Toggled(0.8 + 0.01 * x), vi.OscillatorState(0 * x, x)), 1),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_roads_agree(name):
+    make, cycles = CASES[name]
+
+    @jax.vmap
+    def lanes(x):
+        return vi.simulate(*make(x), cycles, method=vi.FixedStep(steps_per_cycle=20), event_log=4)
+
+    runs, at = [], jnp.linspace(-0.5, 0.5, 5)
+    for road in ("auto", "xla"):
+        with vi.road(road):
+            runs.append(jax.jit(lanes)(at))
+    fast, slow = runs
+    assert bool(fast.successful.all())
+    np.testing.assert_array_equal(fast.event_log.number, slow.event_log.number)
+    np.testing.assert_array_equal(fast.impacts, slow.impacts)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=0, atol=1e-12),
+        fast.sections, slow.sections,
+    )  # fmt: skip
+
+
+class Thrown(vi.AbstractScene):
+    """A body that is put beyond its stop."""
+
+    stops: tuple = (vi.RigidStop(2.0, 0.5),)
+
+    @property
+    def events(self):
+        return (
+            vi.Reset(
+                lambda machine, s, x: x.Y - 1.0,
+                lambda machine, s, x: vi.OscillatorState(x.Y + 1.5, x.V),
+            ),
+        )
+
+    @property
+    def cycle(self):
+        return 2.0
+
+    def field(self, s, x):
+        return vi.OscillatorState(x.V, 0 * x.V)
+
+
+def test_a_reset_beyond_a_stop_ends_the_lane():
+    start = vi.OscillatorState(jnp.asarray(0.0), jnp.asarray(1.0))
+    run = vi.simulate(Thrown(), start, 2)
+    assert bool(run.result == vi.RESULTS.bad_reset)
+    assert np.isfinite(run.sections.Y[0]) and not np.isfinite(run.last.Y)

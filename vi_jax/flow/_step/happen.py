@@ -1,0 +1,101 @@
+"""What an event that is no impact makes of a lane."""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ...scene.event import after_event, mode_number, modes_for
+from .. import results
+from .._lane import CHANGES, RESETS, Plan
+from ..moving import rounding
+from .aim import select
+from .faults import comes_back
+from .guards import Crossing
+from .jump import Onward, after_jump
+from .log import clock_at, logged, noted
+
+Scalar = Float[Array, ""]
+Flag = Bool[Array, ""]
+
+
+class Arrival(NamedTuple):
+    """Where a step leads."""
+
+    s: Scalar
+    state: Any
+    place: Scalar
+    """Y there: on the stop, with the stop's derivatives, where one is met."""
+    before: Scalar | None
+    """Y before a jump; absent where none can move it."""
+    time: Scalar | None
+    direction: tuple[Scalar, ...]
+    contact: tuple[Scalar, ...] | None
+    """The stops rested on."""
+    modes: tuple[Scalar, ...]
+    impacts: Scalar
+    speed: Scalar | None
+    loss: Scalar | None
+    rests: Scalar | None
+    log: Any
+    events: Any
+    completed: Flag
+    """Whether the interval is complete."""
+    fault: Scalar | None
+    """As in `Lane`; absent where no event can end it."""
+
+
+def ended(arrival: Arrival, c: Crossing, when: Flag | None, reason: int) -> Arrival:
+    """With this reason to end, where that holds of what was met; `None` where it cannot."""
+    if when is None or arrival.fault is None:
+        return arrival
+    return arrival._replace(fault=jnp.where(c.landed & when, float(reason), arrival.fault))
+
+
+def happened(plan: Plan, taken: Flag, arrival: Arrival, c: Crossing, there: Any) -> Arrival:
+    """State and modes after an event in the state `there` that is no impact."""
+    scene, event = plan.scene, c.event
+    given = scene, arrival.s, there, *modes_for(scene, c.number, arrival.modes)
+    when = event.happens(*given)
+    happens = c.landed if when is None else c.landed & when
+    new, modes = after_event(scene, c.number, arrival.s, there, arrival.modes)
+    modes = select(happens, modes, arrival.modes)
+    log, clock = arrival.log, clock_at(plan, arrival.s, there)
+    if event.holds_mode:
+        slides = comes_back(scene, c.number, modes, arrival.s, new)
+        arrival = ended(arrival, c, slides, results.SLIDING)
+        kind, number = CHANGES, c.number - len(scene.stops)
+        value = modes[mode_number(scene, c.number)]
+    else:
+        kind, number = RESETS, c.number - len(scene.stops) - len(scene.switches)
+        value = event.value(*given)
+    events = noted(arrival.events, taken & happens, clock, kind, number, value)
+    if plan.log_switches:
+        zero = jnp.zeros_like(arrival.s)
+        log = logged(log, taken & happens, arrival.impacts, clock, zero, c.number)
+        # Listed as an impact is, and so counted.
+        count = jnp.where(taken & happens, 1.0, 0.0)
+        arrival = arrival._replace(impacts=arrival.impacts + count)
+    if not event.holds_mode:
+        arrival = _jumped(plan, arrival, c, happens, there, new)
+    return arrival._replace(
+        state=select(happens, new, arrival.state), modes=modes, log=log, events=events
+    )
+
+
+def _jumped(
+    plan: Plan, arrival: Arrival, c: Crossing, happens: Flag, there: Any, new: Any
+) -> Arrival:
+    """Which way the motion goes on after a jump of the state, and what of it rests still; a lane
+    that was put beyond a stop ends."""
+    beyond = jnp.zeros_like(happens)
+    for stop in plan.scene.stops:
+        place = plan.scene.coordinates[stop.coordinate].position(new)
+        beyond = beyond | (stop.beyond(place) > rounding(plan.scene, new))
+    if plan.scene.stops:
+        arrival = ended(arrival, c, happens & beyond, results.BAD_RESET)
+    onward = Onward(arrival.direction, arrival.contact, arrival.modes)
+    onward = after_jump(plan, onward, happens, there, new, arrival.s)
+    assert arrival.before is not None  # as the machine has such events
+    before = jnp.where(c.landed, plan.scene.position(there), arrival.before)
+    return arrival._replace(direction=onward.direction, contact=onward.contact, before=before)
