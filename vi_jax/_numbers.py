@@ -67,6 +67,11 @@ def optional_real(name: str) -> Callable[[Any], jax.Array | None]:
     return lambda value: None if value is None else number(name, value)
 
 
+def real_or_law(name: str) -> Callable[[Any], Any]:
+    """The converter of a field that holds a real number, or a function that gives one."""
+    return lambda value: value if callable(value) else number(name, value)
+
+
 def _floating(name: str, array: jax.Array) -> jax.Array:
     if not (jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)):
         raise TypeError(

@@ -98,6 +98,12 @@ def test_exponents_of_a_walk_are_its_multipliers(walk):
     np.testing.assert_allclose(found.exponents, [0.0, per_time, per_time], atol=2e-3)
 
 
+def test_equal_times_are_asked_of_the_machine():
+    start = tuple(map(jnp.asarray, (1.0, 0.7955, 0.2343)))
+    with pytest.raises(ValueError, match="an event that ends its cycles but no `observed_every`"):
+        vi.lyapunov(ThreeStates(1.8).observed_every(1.0), start, 4)
+
+
 def test_derivatives_pass_through_a_reset():
     """Of the state after three steps by the slope: forward, backward and by differences."""
 
@@ -167,6 +173,8 @@ def test_a_branch_ends_where_the_guard_of_a_reset_is_touched():
     (touch,) = (point for point in branch.special if point.kind == "grazing")
     assert touch.parameter == pytest.approx(0.58751625042, abs=1e-10)
     assert "the guard of impact" in touch.detail
+    with pytest.raises(ValueError, match=r"needs a machine without .* `events`"):
+        touch.switch()
 
 
 def three(b):

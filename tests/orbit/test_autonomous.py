@@ -9,51 +9,23 @@ import vi_jax as vi
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
+import resets
+from resets import legs
 from rimless_wheel import MULTIPLIER, Wheel
 
 
-class Legs(eqx.Module):
-    """Angles of the leg that stands and between both, with their rates."""
-
-    stance: jax.Array
-    turning: jax.Array
-    between: jax.Array
-    swinging: jax.Array
-
-
-class Walker(vi.AbstractScene):
-    """The simplest walker (Garcia, Chatterjee, Ruina and Coleman, J. Biomech. Eng. 120, 1998): a
-    cycle ends with the heel strike, after which the legs change their parts."""
-
-    slope: jax.Array = eqx.field(converter=jnp.asarray)
-    stops: tuple = ()
+class Walker(resets.Walker):
+    """A cycle ends on a section, with which the legs change their parts."""
 
     @property
-    def cycle(self):
-        return 4.0
+    def events(self):
+        return ()
 
     def section(self, x):
         return x.between - 2 * x.stance
 
     def renewed(self, x):
-        stance, turning = -x.stance, x.turning * jnp.cos(2 * x.stance)
-        return Legs(stance, turning, 2 * stance, turning * (1 - jnp.cos(2 * stance)))
-
-    def field(self, s, x):
-        falls = jnp.sin(x.stance - self.slope)
-        pull = (x.turning**2 - jnp.cos(x.stance - self.slope)) * jnp.sin(x.between)
-        return Legs(x.turning, falls, x.swinging, falls + pull)
-
-    def position(self, x):
-        return x.stance
-
-    def velocity(self, x):
-        return x.turning
-
-
-def legs(stance, turning):
-    swinging = turning * (1 - np.cos(2 * stance))
-    return Legs(*map(jnp.asarray, (stance, turning, 2 * stance, swinging)))
+        return legs(-x.stance, x.turning * jnp.cos(2 * x.stance))
 
 
 def strode(slope, stance, turning):

@@ -10,6 +10,8 @@ import pytest
 import vi_jax as vi
 from scipy.integrate import solve_ivp
 
+from thrown import thrown
+
 CLOSE = vi.Adaptive(rtol=1e-12)
 REACH, XI = 1.3, 0.05
 
@@ -120,38 +122,17 @@ class Hardening(vi.AbstractContactLaw):
         return stiffness * depth + self.cubic * depth**3
 
 
-class Thrown(vi.AbstractScene):
-    """A body without other forces against a soft stop."""
-
-    stop: vi.SoftStop
-    stops: tuple = ()
-
-    @property
-    def switches(self):
-        return (self.stop,)
-
-    @property
-    def cycle(self):
-        return 1.0
-
-    def field(self, s, state, mode):
-        return vi.OscillatorState(state.V, self.stop.contribution(self, s, state, mode))
-
-    def step_limit(self, s, state):
-        return jnp.minimum(0.2, self.stop.longest_step(self, state))
-
-
 @pytest.mark.parametrize("cubic", [0.0, 3e4])
 def test_a_contact_law_of_ones_own_keeps_energy(cubic):
     law = Hardening(cubic=cubic)
-    machine = Thrown(vi.SoftStop(0.2, 100.0, law=law))
-    start = vi.OscillatorState(jnp.asarray(0.0), jnp.asarray(2.0))
-    run = vi.simulate(machine, start, 1, method=CLOSE)
+    speed, length = jnp.asarray(2.0), jnp.asarray(1.0)
+    stop = vi.SoftStop(0.2, 100.0, law=law)
+    run = thrown(stop, speed, length)
     depth = float(run.y_max[0]) - 0.2
     assert 0.5 * 2.0**2 == pytest.approx(50 * depth**2 + 0.25 * cubic * depth**4, rel=1e-9)
     assert float(run.last.V) == pytest.approx(-2.0, rel=1e-9)
-    steeper = eqx.tree_at(lambda m: m.stop.law.cubic, machine, cubic + 1.0)
-    assert float(vi.simulate(steeper, start, 1, method=CLOSE).y_max[0]) - 0.2 < depth
+    steeper = eqx.tree_at(lambda x: x.law.cubic, stop, cubic + 1.0)
+    assert float(thrown(steeper, speed, length).y_max[0]) - 0.2 < depth
 
 
 def test_laws_that_cannot_be_are_refused():

@@ -9,7 +9,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
 from ..scene import AbstractScene
-from ..scene.event import begin_modes, events_of, is_autonomous, met_by_guard
+from ..scene.event import begin_modes, events_of, is_autonomous, section_number
 from . import results
 from ._own import check_field, check_laws
 from .events import Rates, force_rate, rates
@@ -77,7 +77,7 @@ class Lane(eqx.Module):
     contact: tuple[Scalar, ...] | None
     """Of each coordinate, 1 + i while it rests on stop number i, else 0; absent where none can."""
     modes: tuple[Scalar, ...]
-    """Of each switch."""
+    """Of each switch, then the machine's own."""
     below: tuple[Scalar, ...]
     """Of each event that happens from below (see `AbstractEvent.from_below`), 1 once its guard has
     been below zero since the last jump, else 0."""
@@ -153,8 +153,9 @@ class Plan(eqx.Module):
         return max(1, self.method.steps_per_cycle // self.parts)
 
     def others(self, state: Any) -> list[int]:
-        """The numbers of the events that are met by their guards, besides stops."""
-        return met_by_guard(self.scene, state)
+        """The numbers of the events, besides stops, whose guards are looked at in each step."""
+        last = section_number(self.scene) + (self.scene.section(state) is not None)
+        return list(range(len(self.scene.stops), last))
 
     def from_below(self, state: Any) -> list[int]:
         """Of those the ones that happen from below."""
@@ -164,7 +165,7 @@ class Plan(eqx.Module):
     @property
     def to_section(self) -> float:
         """The end of a cycle, where an event is it."""
-        return to_event(len(events_of(self.scene)) - 1)
+        return to_event(section_number(self.scene))
 
     def end(self, part: Scalar) -> Scalar:
         """Clock reading at the end of the `part`-th interval of a cycle."""

@@ -109,6 +109,20 @@ def in_modes(scene: AbstractScene, modes: tuple[Scalar, ...]) -> AbstractScene:
     return Moving(scene=scene, modes=modes, held=(), stops=scene.stops) if modes else scene
 
 
+def holding(
+    scene: AbstractScene,
+    modes: tuple[Scalar, ...],
+    contact: tuple[Scalar, ...] | None,
+    but: int | None = None,
+) -> AbstractScene:
+    """The machine in its modes, with those bodies held that rest on a stop (see `Lane.contact`);
+    that of coordinate number `but` is free."""
+    if contact is None or (but is not None and len(contact) == 1):
+        return in_modes(scene, modes)
+    rests = tuple(x > 0 if but is None else (x > 0) & (j != but) for j, x in enumerate(contact))
+    return Moving(scene=scene, modes=modes, held=rests, stops=scene.stops)
+
+
 def exact(scene: AbstractScene, state: Any) -> bool:
     """Whether one number of the state is all that stops limit, so that it can be put on a stop
     without rounding; known while a step is traced."""

@@ -5,14 +5,14 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 
 from ..scene import AbstractEvent, AbstractScene
-from ..scene.event import events_of, guard_of
+from ..scene.event import events_of, guard_of, section_number
 
 
 class Event(NamedTuple):
     """What begins a flight: one of the machine's events."""
 
     number: int
-    """Its place in `events_of(machine)`."""
+    """By which it goes among the machine's events, in the order of `events_of(machine)`."""
     cycle: int | None = None
     """Number of the cycle that it begins, if it begins one."""
 
@@ -28,13 +28,13 @@ class Event(NamedTuple):
         return self if self.cycle is None else self._replace(cycle=self.cycle + cycles)
 
     def of(self, scene: AbstractScene) -> AbstractEvent:
-        """The event itself."""
+        """The machine's event of this number."""
         return events_of(scene)[self.number]
 
 
 def section_of(scene: AbstractScene, cycle: int) -> Event:
     """The section with which a cycle begins."""
-    return Event(len(events_of(scene)) - 1, cycle)
+    return Event(section_number(scene), cycle)
 
 
 def guard_at(scene: AbstractScene, event: Event, s: Any, state: Any, modes: Any) -> Any:

@@ -23,7 +23,7 @@ class Flight(eqx.Module):
 
     scene: AbstractScene
     modes: tuple[Scalar, ...]
-    """Of its switches."""
+    """In which it is all along."""
     method: AbstractMethod
     like: Any
     """A state, for its structure."""

@@ -174,8 +174,8 @@ class Follower:
             detail = f"touches {what} at {self._place(at, float(at.seen.touch))}"
         else:
             clock = float(np.asarray(self.problem.parts(jnp.asarray(at.x))[0])[impact])
-            word = self.problem.events[impact].of(self.problem.scene).called
-            detail = f"the {word} at {self._place(at, clock)} is lost"
+            lost = self.problem.events[impact].of(self.problem.scene)
+            detail = f"the {lost.name or lost.word} at {self._place(at, clock)} is lost"
         return self._point(GRAZING, at, detail, impact)
 
     def _place(self, at: Step, clock: float) -> str:

@@ -50,7 +50,7 @@ class Shooting(eqx.Module):
     events: tuple[Event, ...] = eqx.field(static=True)
     """In their order; each begins a flight."""
     modes: tuple[tuple[float, ...], ...] = eqx.field(static=True)
-    """Of the machine's switches, in each flight."""
+    """Of the machine, in each flight."""
     steps: int = eqx.field(static=True)
     """Steps of a flight."""
     parameters: tuple[str, ...] = eqx.field(static=True)
@@ -118,7 +118,7 @@ class Shooting(eqx.Module):
         return ravel_pytree(self.like)[1](u)
 
     def _modes_in(self, leg: Any) -> tuple[Array, ...]:
-        """Of each switch, in a leg whose number may be traced."""
+        """Of the machine, in a leg whose number may be traced."""
         if not self.modes[0]:
             return ()
         modes = jnp.asarray(self.modes, jnp.result_type(float))[leg]
@@ -137,10 +137,8 @@ class Shooting(eqx.Module):
 
         def of(event: Event) -> Callable[..., Vector]:
             def new(s, u):
-                modes = self._modes_in(leg - 1)
-                return ravel_pytree(after_event(scene, event.number, s, self.unravel(u), modes)[0])[
-                    0
-                ]
+                state, modes = self.unravel(u), self._modes_in(leg - 1)
+                return ravel_pytree(after_event(scene, event.number, s, state, modes)[0])[0]
 
             return new
 

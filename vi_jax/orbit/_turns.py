@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..flow.events import Rates, guard_rates
 from ..scene import AbstractScene
-from ..scene.event import Section, events_of, guard_of, modes_for
+from ..scene.event import Section, events_of, guard_of, happens_at
 from ._flight import Flight
 
 Scalar = Float[Array, ""]
@@ -67,12 +67,10 @@ class _Guard(NamedTuple):
 
     def happens(self, flight: Flight, s: Any, u: Any, length: Any) -> Any:
         """Whether the event would happen if it were met a length from here."""
-        event, scene = events_of(flight.scene)[self.number], flight.scene
-        if not event.from_below:
+        if not events_of(flight.scene)[self.number].from_below:
             return jnp.ones((), bool)
         there = flight.unravel(_stepped(flight, (s, length, u)))
-        modes = modes_for(scene, self.number, flight.modes)
-        when = event.happens(scene, s + length, there, *modes)
+        when = happens_at(flight.scene, self.number, s + length, there, flight.modes)
         return jnp.ones((), bool) if when is None else when
 
     def rates(self, flight: Flight, moving: AbstractScene, s: Any, u: Any) -> Rates:

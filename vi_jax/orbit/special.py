@@ -140,10 +140,10 @@ def _crossed(point: SpecialPoint, distance: float) -> Orbit:
 def _beyond_grazing(point: SpecialPoint, distance: float) -> Orbit:
     """The motion with the grazing impact less, or with the touch as an impact more."""
     old, step = point.problem, point.step
-    if old.scene.switches:
+    if old.modes[0] or old.scene.events:
         raise ValueError(
-            "`switch` at a grazing needs a machine without soft stops, friction or other switches: "
-            "find the motion beyond it with `find_orbit`."
+            "`switch` at a grazing needs a machine without soft stops, friction or other switches, "
+            "modes of its own and `events`: find the motion beyond it with `find_orbit`."
         )
     if not point.touches:
         raise ValueError(

@@ -130,12 +130,15 @@ class AbstractScene(Shown):
     def observed_every(self, interval: Any) -> "AbstractScene":
         """An autonomous machine observed at equal intervals of `s` instead of on its section."""
         name = type(self).__name__
+        what = "a `section`"
         if type(self).section is AbstractScene.section:
-            raise ValueError(f"A {name} is driven: its cycle is its drive's.")
+            if not any(x.ends_cycle for x in (*self.stops, *self.switches, *self.events)):
+                raise ValueError(f"A {name} is driven: its cycle is its drive's.")
+            what = "an event that ends its cycles"
         raise ValueError(
-            f"A {name} has a `section` but no `observed_every`: give it this method, which returns "
-            "the same machine with `interval` as its cycle and `None` as its section (and without "
-            "a `renewed` that belongs to the section)."
+            f"A {name} has {what} but no `observed_every`: give it this method, which returns "
+            "the same machine with `interval` as its cycle, `None` as its section and no event "
+            "that ends a cycle (and without a `renewed` that belongs to the section)."
         )
 
     @property

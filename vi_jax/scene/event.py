@@ -35,13 +35,14 @@ class AbstractEvent(Shown):
     """What messages call it; static."""
 
     @property
-    def called(self) -> str:
-        """Its name, or what it is."""
-        return self.name or self.word
-
-    @property
     def holds_mode(self) -> bool:
         """Whether one of the machine's modes is this event's; then it has `begin` and `struck`."""
+        return False
+
+    @property
+    def may_slide(self) -> bool:
+        """Whether the field may point at the guard's surface from both sides, so that a motion has
+        to slide along it, which is no mode yet: a lane that would ends, and says so."""
         return False
 
     @property
@@ -117,8 +118,7 @@ class AbstractSwitch(AbstractEvent):
 
     @property
     def may_slide(self) -> bool:
-        """Whether the field may point at the guard's surface from both sides, so that a motion has
-        to slide along it, which is no mode yet: a lane that would ends, and says so."""
+        """True: the mode is another on either side of the surface."""
         return True
 
     @abc.abstractmethod
@@ -176,46 +176,54 @@ def is_autonomous(machine: Any, state: Any) -> bool:
     return ends or machine.section(state) is not None
 
 
-def met_by_guard(machine: Any, state: Any) -> list[int]:
-    """Of those events whose guard is looked at in each step, besides stops: their numbers."""
-    events, first = events_of(machine), len(machine.stops)
-    last = len(events) if machine.section(state) is not None else len(events) - 1
-    return list(range(first, last))
+def section_number(machine: Any) -> int:
+    """The number of the section."""
+    return len(events_of(machine)) - 1
 
 
 def guard_of(machine: Any, number: int, s: Any, state: Any, modes: Modes) -> Scalar:
     """What rises through zero at one of a machine's events, in these modes of it."""
-    event = events_of(machine)[number]
-    return event.guard(machine, s, state, *modes_for(machine, number, modes))
+    event, own = _event(machine, number)
+    return event.guard(machine, s, state, *modes[own])
 
 
 def jump_of(machine: Any, number: int, s: Any, state: Any, modes: Modes) -> Any:
     """The state after one of its events, also of one beside it."""
-    event = events_of(machine)[number]
-    return event.jump(machine, s, state, *modes_for(machine, number, modes))
+    event, own = _event(machine, number)
+    return event.jump(machine, s, state, *modes[own])
+
+
+def happens_at(machine: Any, number: int, s: Any, state: Any, modes: Modes) -> Any:
+    """Whether one of its events happens where its guard has risen; `None` if always."""
+    event, own = _event(machine, number)
+    return event.happens(machine, s, state, *modes[own])
+
+
+def value_of(machine: Any, number: int, s: Any, state: Any, modes: Modes) -> Any:
+    """What the log of events keeps of one of its events."""
+    event, own = _event(machine, number)
+    return event.value(machine, s, state, *modes[own])
 
 
 def after_event(machine: Any, number: int, s: Any, state: Any, modes: Modes) -> tuple[Any, Modes]:
     """State and modes after one of its events."""
-    event = events_of(machine)[number]
-    state, new = event.after(machine, s, state, *modes_for(machine, number, modes))
+    event, own = _event(machine, number)
+    state, new = event.after(machine, s, state, *modes[own])
     if event.holds_mode:
-        own = mode_number(machine, number)
-        new = (*modes[:own], new, *modes[own + 1 :])
+        new = (*modes[: own.start], new, *modes[own.stop :])
     return state, settled_modes(new, s)
-
-
-def modes_for(machine: Any, number: int, modes: Modes) -> Modes:
-    """The modes that an event is given."""
-    if events_of(machine)[number].holds_mode:
-        own = mode_number(machine, number)
-        return modes[own : own + 1]
-    return modes
 
 
 def mode_number(machine: Any, number: int) -> int:
     """Which mode an event holds that holds one."""
-    return sum(event.holds_mode for event in events_of(machine)[:number])
+    return _event(machine, number)[1].start
+
+
+def _event(machine: Any, number: int) -> tuple[AbstractEvent, slice]:
+    """An event, and which of the machine's modes it is given: its own, or all."""
+    events = events_of(machine)
+    own = sum(event.holds_mode for event in events[:number])
+    return events[number], slice(own, own + 1) if events[number].holds_mode else slice(None)
 
 
 def begin_modes(machine: Any, s: Scalar, state: Any) -> Modes:

@@ -8,12 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._checks import NOT_NEGATIVE, Range, require_ranges
-from .._numbers import number, real
+from .._numbers import real, real_or_law
 from .event import AbstractSwitch
-
-
-def _level(x: Any) -> Any:
-    return x if callable(x) else number("level", x)
 
 
 class DryFriction(AbstractSwitch):
@@ -40,7 +36,7 @@ class DryFriction(AbstractSwitch):
     - `stopped(machine, state)`: the state with that velocity set to zero.
     """
 
-    level: Any = eqx.field(converter=_level)
+    level: Any = eqx.field(converter=real_or_law("level"))
     velocity: Callable[..., Any] = eqx.field(static=True, kw_only=True)
     force: Callable[..., Any] = eqx.field(static=True, kw_only=True)
     stopped: Callable[..., Any] = eqx.field(static=True, kw_only=True)

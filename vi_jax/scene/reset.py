@@ -67,5 +67,6 @@ class Reset(AbstractEvent):
 
     def value(self, machine, s, state, *modes):
         """As given, or none."""
-        none = super().value(machine, s, state, *modes)
-        return none if self._value is None else self._value(machine, s, state, *modes)
+        if self._value is None:
+            return super().value(machine, s, state, *modes)
+        return self._value(machine, s, state, *modes)

@@ -11,13 +11,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._checks import REAL, SHARE, count, one_of, require_ranges
-from .._numbers import concrete, number, real
+from .._numbers import concrete, real, real_or_law
 from .event import AbstractEvent, struck_modes
 from .shown import Shown
-
-
-def _restitution(x: Any) -> Any:
-    return x if callable(x) else number("restitution", x)
 
 
 class Wall(Shown):
@@ -67,7 +63,7 @@ class RigidStop(Wall, AbstractEvent):
 
     gap: Float[Array, "..."] = eqx.field(converter=real("gap"))
     """d, distance of the stop from the unstretched position (unit: a)."""
-    restitution: Any = eqx.field(converter=_restitution)
+    restitution: Any = eqx.field(converter=real_or_law("restitution"))
     """k, coefficient of restitution (dimensionless)."""
     side: str = eqx.field(static=True, default="right")
     """"right" or "left"."""

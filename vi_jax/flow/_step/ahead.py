@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
+from ...scene.event import section_number
 from ...scene.trig import horner
 from .._lane import FREE, Lane, Plan, to_event, to_turn_of
 from ..events import Rates, rising_root, slope
@@ -57,7 +58,7 @@ def look(plan: Plan, lane: Lane, motion: Any, h: Scalar) -> tuple[Scalar, Scalar
     """
     scene = plan.scene
     zero, none = jnp.zeros_like(h), jnp.zeros_like(h, bool)
-    events: list[tuple[float, int | None, Series]] = []
+    events: list[tuple[int, Series]] = []
     paths, speeds, turns = [], [], []
     if plan.motion or scene.stops:
         for k, coordinate in enumerate(scene.coordinates):
@@ -69,14 +70,14 @@ def look(plan: Plan, lane: Lane, motion: Any, h: Scalar) -> tuple[Scalar, Scalar
             turns.append(turn if lane.contact is None else turn & (lane.contact[k] == 0))
         for i, stop in enumerate(scene.stops):
             along, gap = paths[stop.coordinate], stop_gradient(stop.gap)
-            events.append((to_event(i), i, _shifted(along, float(stop.sign), gap)))
+            events.append((i, _shifted(along, float(stop.sign), gap)))
     if scene.clock(lane.state) is not None:
         bound = stop_gradient(plan.end(lane.part))
-        events.append((plan.to_section, None, _shifted(motion.of(scene.clock), 1.0, bound)))
+        events.append((section_number(scene), _shifted(motion.of(scene.clock), 1.0, bound)))
     if not events and not turns:
         return h, jnp.full_like(h, FREE)
     crossed, turned = none, none
-    for *_, series in events:
+    for _, series in events:
         crossed = crossed | (_sum(series, h, zero) > 0)
     for turn in turns:
         turned = turned | turn
@@ -86,16 +87,16 @@ def look(plan: Plan, lane: Lane, motion: Any, h: Scalar) -> tuple[Scalar, Scalar
         # beyond a turn is met from there.
         first, target, polynomial = jnp.full_like(h, jnp.inf), zero + FREE, None
         facing_stop = [none for _ in paths]
-        for name, number, series in events:
+        for number, series in events:
             begin, end = _sum(series[:1], h, zero), _sum(series, h, zero)
             over = end > 0
             place = jnp.maximum(-begin, 0.0) / jnp.where(over, end - begin, 1.0)
             place = jnp.where(over, place, jnp.inf)
             sooner, curve = place < first, _powers(series, h, zero)
             polynomial = curve if polynomial is None else select(sooner, curve, polynomial)
-            target = jnp.where(sooner, name, target)
+            target = jnp.where(sooner, to_event(number), target)
             first = jnp.where(sooner, place, first)
-            if number is not None:
+            if number < len(scene.stops):
                 stop = scene.stops[number]
                 k = stop.coordinate
                 facing_stop[k] = facing_stop[k] | over & (lane.direction[k] == stop.sign)

@@ -14,14 +14,14 @@ from .. import results
 from .._lane import HIT, LEAVES, RESTS, Lane, Plan, Record, to_event, to_turn_of
 from ..drift import drifted, height_of_turn, met_after, unmoved
 from ..events import Rates, to_turn
-from ..moving import exact
+from ..moving import exact, holding
 from .aim import select
 from .faults import gains, may_end, undecided
 from .guards import Crossing, furthest_landing
 from .happen import Arrival, ended, happened
 from .log import clock_at, logged, noted
 from .rest import Release, settled
-from .trial import Trial, held
+from .trial import Trial
 from .way import Way
 
 Scalar = Float[Array, ""]
@@ -125,7 +125,7 @@ def _met(plan: Plan, lane: Lane, trial: Trial, taken: Flag, way: Way, arrival: A
 def _at_fixed_clock(plan: Plan, lane: Lane, trial: Trial, arrival: Arrival) -> Arrival:
     """The same place, its derivatives those at this reading of the clock rather than at an event
     that comes sooner or later: so that the steps to come need none of `s`."""
-    machine = held(plan, dataclasses.replace(lane, contact=arrival.contact, modes=arrival.modes))
+    machine = holding(plan.scene, arrival.modes, arrival.contact)
     bound = plan.end(lane.part)
     # The end of the interval may depend on what is differentiated by.
     moved = jnp.where(trial.ends_interval, bound - stop_gradient(bound), 0.0)
@@ -212,7 +212,7 @@ def _impact(
         lost = jnp.where(ends, 0.5 * approach**2, lost)
         wait = pin(jnp.where(ends, left, 0.0))
         contact = _put(contact, k, jnp.where(ends, to_event(c.number), contact[k]))
-        resting = held(plan, dataclasses.replace(lane, contact=contact, modes=arrival.modes))
+        resting = holding(scene, arrival.modes, contact)
         still = body.placed(state, stop.place, jnp.zeros_like(s))
         way = Way(plan, resting, lane.part, (s, still, time))
         later, still, passed = drifted(way.rate, wait, way.moving, way.fixed, way.rest)

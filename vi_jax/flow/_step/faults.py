@@ -83,7 +83,7 @@ def _lost(plan: Plan, lane: Lane, target: Scalar) -> Scalar | float:
 def may_end(scene: AbstractScene) -> bool:
     """Whether an event may end a lane; static."""
     laws = any(not stop.is_one_number for stop in scene.stops)
-    slides = any(getattr(event, "may_slide", False) for event in events_of(scene))
+    slides = any(event.may_slide for event in events_of(scene))
     several = bool(scene.stops) and (len(scene.coordinates) > 1 or bool(scene.events))
     return laws or slides or several
 
@@ -125,7 +125,7 @@ def comes_back(scene: AbstractScene, i: int, modes: tuple, s: Scalar, state: Any
 
     **Arguments:** the number of the event; the modes, s and the state behind it.
     """
-    if not getattr(events_of(scene)[i], "may_slide", False):
+    if not events_of(scene)[i].may_slide:
         return None
     machine = in_modes(scene, modes)
 

@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float
 
 from ...lanes import pin_flag
 from ...scene import AbstractEvent, AbstractScene
-from ...scene.event import events_of, guard_of
+from ...scene.event import events_of, guard_of, section_number
 from .._lane import Lane, Plan, to_event
 from ..events import Rates, guard_rates, landing, rates
 from ..moving import exact
@@ -131,7 +131,7 @@ def _clock(plan: Plan, lane: Lane, moving: Any, s1: Scalar, new: Any) -> list[_G
     scene = plan.scene
     if scene.clock(lane.state) is None:
         return []
-    number, bound = len(events_of(scene)) - 1, plan.end(lane.part)
+    number, bound = section_number(scene), plan.end(lane.part)
 
     def clock(state: Any) -> Scalar:
         return jnp.asarray(scene.clock(state))

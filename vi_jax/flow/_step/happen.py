@@ -5,14 +5,14 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ...scene.event import after_event, mode_number, modes_for
+from ...scene.event import after_event, happens_at, mode_number, value_of
 from .. import results
 from .._lane import CHANGES, RESETS, Plan
 from ..moving import rounding
 from .aim import select
 from .faults import comes_back
 from .guards import Crossing
-from .jump import Onward, after_jump
+from .jump import after_jump
 from .log import clock_at, logged, noted
 
 Scalar = Float[Array, ""]
@@ -20,7 +20,7 @@ Flag = Bool[Array, ""]
 
 
 class Arrival(NamedTuple):
-    """Where a step leads."""
+    """The lane where a step leads, and what is kept of its way there."""
 
     s: Scalar
     state: Any
@@ -31,7 +31,7 @@ class Arrival(NamedTuple):
     time: Scalar | None
     direction: tuple[Scalar, ...]
     contact: tuple[Scalar, ...] | None
-    """The stops rested on."""
+    """As in `Lane`, the stops rested on."""
     modes: tuple[Scalar, ...]
     impacts: Scalar
     speed: Scalar | None
@@ -55,10 +55,10 @@ def ended(arrival: Arrival, c: Crossing, when: Flag | None, reason: int) -> Arri
 def happened(plan: Plan, taken: Flag, arrival: Arrival, c: Crossing, there: Any) -> Arrival:
     """State and modes after an event in the state `there` that is no impact."""
     scene, event = plan.scene, c.event
-    given = scene, arrival.s, there, *modes_for(scene, c.number, arrival.modes)
-    when = event.happens(*given)
+    met = scene, c.number, arrival.s, there, arrival.modes
+    when = happens_at(*met)
     happens = c.landed if when is None else c.landed & when
-    new, modes = after_event(scene, c.number, arrival.s, there, arrival.modes)
+    new, modes = after_event(*met)
     modes = select(happens, modes, arrival.modes)
     log, clock = arrival.log, clock_at(plan, arrival.s, there)
     if event.holds_mode:
@@ -68,7 +68,7 @@ def happened(plan: Plan, taken: Flag, arrival: Arrival, c: Crossing, there: Any)
         value = modes[mode_number(scene, c.number)]
     else:
         kind, number = RESETS, c.number - len(scene.stops) - len(scene.switches)
-        value = event.value(*given)
+        value = value_of(*met)
     events = noted(arrival.events, taken & happens, clock, kind, number, value)
     if plan.log_switches:
         zero = jnp.zeros_like(arrival.s)
@@ -94,8 +94,8 @@ def _jumped(
         beyond = beyond | (stop.beyond(place) > rounding(plan.scene, new))
     if plan.scene.stops:
         arrival = ended(arrival, c, happens & beyond, results.BAD_RESET)
-    onward = Onward(arrival.direction, arrival.contact, arrival.modes)
-    onward = after_jump(plan, onward, happens, there, new, arrival.s)
+    onward = arrival.direction, arrival.contact, arrival.modes
+    direction, contact = after_jump(plan, onward, happens, there, new, arrival.s)
     assert arrival.before is not None  # as the machine has such events
     before = jnp.where(c.landed, plan.scene.position(there), arrival.before)
-    return arrival._replace(direction=onward.direction, contact=onward.contact, before=before)
+    return arrival._replace(direction=direction, contact=contact, before=before)

@@ -23,12 +23,13 @@ from jaxtyping import Array, Bool, Float
 from ...lanes import pin_flag
 from .._lane import FREE, Lane, Plan, Record
 from ..methods import Taylor
+from ..moving import holding
 from .ahead import ahead
 from .aim import aim_at, select
 from .arrive import arrive
 from .faults import faults
-from .jump import Onward, after_jump
-from .trial import Trial, attempt, held, timing
+from .jump import after_jump
+from .trial import Trial, attempt, timing
 
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]
@@ -48,11 +49,11 @@ class Step(NamedTuple):
 def iterate(plan: Plan, lane: Lane) -> Step:
     """One step of one lane: advance, aim or land. A lane that has ended is left as it is."""
     active = (lane.done < plan.intervals) & (lane.fault == 0)
-    holding, motion = held(plan, lane), None
+    machine, motion = holding(plan.scene, lane.modes, lane.contact), None
     if isinstance(plan.method, Taylor):
-        motion = plan.method.expand(holding, lane.s, lane.state, timing(plan, lane))
+        motion = plan.method.expand(machine, lane.s, lane.state, timing(plan, lane))
         lane = ahead(plan, lane, motion)
-    trial = attempt(plan, lane, active, holding, motion)
+    trial = attempt(plan, lane, active, machine, motion)
     aim, goal, target = aim_at(plan, lane, trial)
     aim = pin_flag(active & aim, lane.s)
     taken = pin_flag(active & trial.good & ~aim, lane.s)
@@ -73,9 +74,9 @@ def iterate(plan: Plan, lane: Lane) -> Step:
         state = select(turned, plan.scene.rewound(state), state)
     renewed = plan.scene.renewed(state)
     if renewed is not state:
-        onward = Onward(there.direction, there.contact, there.modes)
+        onward = there.direction, there.contact, there.modes
         onward = after_jump(plan, onward, turned, state, renewed, jnp.zeros_like(s))
-        there = dataclasses.replace(there, **onward._asdict())
+        there = dataclasses.replace(there, direction=onward[0], contact=onward[1])
         state = select(turned, renewed, state)
     of_interval = record
     record = select(completed, plan.fresh(state), record)

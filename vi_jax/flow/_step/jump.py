@@ -1,6 +1,6 @@
 """How a motion goes on behind a state that was put in place of another."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 from jax.lax import stop_gradient
@@ -8,33 +8,24 @@ from jaxtyping import Array, Bool, Float
 
 from .._lane import Plan
 from ..events import rates
-from ..moving import Moving, in_modes, rounding
+from ..moving import holding, rounding
 
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]
 
 
-class Onward(NamedTuple):
-    """What a lane knows of its motion besides the state, as in `Lane`."""
-
-    direction: tuple[Scalar, ...]
-    contact: tuple[Scalar, ...] | None
-    modes: tuple[Scalar, ...]
-
-
-def moving_on(plan: Plan, onward: Onward) -> Any:
-    """The machine in its modes, with the bodies held that rest."""
-    scene = plan.scene
-    if onward.contact is None:
-        return in_modes(scene, onward.modes)
-    rests = tuple(x > 0 for x in onward.contact)
-    return Moving(scene=scene, modes=onward.modes, held=rests, stops=scene.stops)
-
-
-def after_jump(plan: Plan, onward: Onward, when: Flag, old: Any, new: Any, s: Scalar) -> Onward:
+def after_jump(
+    plan: Plan, onward: tuple, when: Flag, old: Any, new: Any, s: Scalar
+) -> tuple[tuple[Scalar, ...], tuple[Scalar, ...] | None]:
     """Which way the motion goes on, where a state was put in place of another, and what of it still
-    rests: only what was not moved."""
-    directions, contacts = list(onward.direction), list(onward.contact or ())
+    rests: only what was not moved.
+
+    **Arguments:** direction, contact (both are returned) and modes as in `Lane`; where the state is
+    another one; the states before and after, and s.
+    """
+    direction, contact, modes = onward
+    directions: list[Any] = list(direction)
+    contacts: list[Any] = list(contact or ())
     slack = rounding(plan.scene, new)
     for k, coordinate in enumerate(plan.scene.coordinates):
         (place, before), (there, after) = (
@@ -43,13 +34,12 @@ def after_jump(plan: Plan, onward: Onward, when: Flag, old: Any, new: Any, s: Sc
         if contacts and not (there is place and after is before):
             moved = (jnp.abs(there - place) > slack) | (jnp.abs(after - before) > slack)
             contacts[k] = jnp.where(when & stop_gradient(moved), 0.0, contacts[k])
-    if contacts:
-        onward = onward._replace(contact=tuple(contacts))
+    contact = None if contact is None else tuple(contacts)
     for k, coordinate in enumerate(plan.scene.coordinates):
         after = coordinate.velocity(new)
         if after is not coordinate.velocity(old):
-            machine = moving_on(plan, onward)
+            machine = holding(plan.scene, modes, contact)
             bend = rates(machine.field, coordinate.position, s, new).a
             after = stop_gradient(jnp.where(after == 0, bend, after))
             directions[k] = jnp.where(when & (after != 0), jnp.sign(after), directions[k])
-    return onward._replace(direction=tuple(directions))
+    return tuple(directions), contact

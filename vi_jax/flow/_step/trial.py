@@ -12,9 +12,8 @@ from ...scene import AbstractScene
 from .._lane import FREE, Lane, Plan, to_event, to_turn_of, total
 from ..events import Rates, force_rate, rates, turns_within
 from ..methods.taylor import Expansion
-from ..moving import Moving, exact, in_modes
+from ..moving import exact, holding
 from .guards import Crossing, crossings, leniency, turn_tolerance
-from .jump import Onward, moving_on
 from .rest import Release, release
 
 Scalar = Float[Array, ""]
@@ -59,20 +58,6 @@ class Path(NamedTuple):
     force; absent where the body cannot rest."""
 
 
-def held(plan: Plan, lane: Lane) -> AbstractScene:
-    """The machine in its modes, with the bodies held that rest."""
-    return moving_on(plan, Onward(lane.direction, lane.contact, lane.modes))
-
-
-def alone(plan: Plan, lane: Lane, k: int) -> AbstractScene:
-    """As `held`, but without a hold on coordinate number k."""
-    scene = plan.scene
-    if lane.contact is None or len(scene.coordinates) == 1:
-        return in_modes(scene, lane.modes)
-    rests = tuple((x > 0) & (j != k) for j, x in enumerate(lane.contact))
-    return Moving(scene=scene, modes=lane.modes, held=rests, stops=scene.stops)
-
-
 def timing(plan: Plan, lane: Lane) -> Scalar | None:
     """The elapsed time, where the method has to carry it along."""
     paced = plan.motion and plan.scene.pace(lane.s, lane.state) is not None
@@ -80,7 +65,7 @@ def timing(plan: Plan, lane: Lane) -> Scalar | None:
 
 
 def attempt(
-    plan: Plan, lane: Lane, active: Flag, holding: AbstractScene, motion: Expansion | None
+    plan: Plan, lane: Lane, active: Flag, machine: AbstractScene, motion: Expansion | None
 ) -> Trial:
     """Try the next step and see what it meets; of length zero for a lane that has ended."""
     scene, method = plan.scene, plan.method
@@ -102,7 +87,7 @@ def attempt(
     if motion is not None:
         (new, time), error = motion.at(h), jnp.zeros_like(h)
     else:
-        moved: Any = holding if method.uses_field else scene
+        moved: Any = machine if method.uses_field else scene
         new, time, error = method.step(moved, lane.s, s1, lane.state, time)
     if not paced and lane.record.time is not None:
         time = lane.record.time + h
@@ -119,19 +104,18 @@ def attempt(
         good = good & (error <= 1)
     good = pin_flag(good, h)
 
-    each_alone = tuple(alone(plan, lane, k) for k in range(len(scene.coordinates)))
+    bodies = range(len(scene.coordinates))
+    alone = tuple(holding(scene, lane.modes, lane.contact, but=k) for k in bodies)
     paths = []
     if plan.motion or scene.stops:
-        for k, one in enumerate(each_alone):
-            paths.append(_path(plan, lane, k, one, holding, (s1, new, h, limit), good))
-    seen, below = crossings(plan, lane, holding, paths, (s1, h, new), (good, last))
-    return Trial(
-        s1, h, new, time, error, good, last, seen, tuple(paths), each_alone, holding, below
-    )
+        for k, one in enumerate(alone):
+            paths.append(_path(plan, lane, k, one, machine, (s1, new, h, limit), good))
+    seen, below = crossings(plan, lane, machine, paths, (s1, h, new), (good, last))
+    return Trial(s1, h, new, time, error, good, last, seen, tuple(paths), alone, machine, below)
 
 
 def _path(
-    plan: Plan, lane: Lane, k: int, free: Any, holding: Any, there: tuple, good: Flag
+    plan: Plan, lane: Lane, k: int, free: Any, machine: Any, there: tuple, good: Flag
 ) -> Path:
     """What a step that ends `there` saw of coordinate number k."""
     s1, new, h, limit = there
@@ -158,8 +142,8 @@ def _path(
     if lane.contact is not None:
         leaves = release(lane, k, plan.scene.stops, begin, end, good, h)
         surge = (
-            force_rate(free, position, holding, lane.s, lane.state),
-            force_rate(free, position, holding, s1, new),
+            force_rate(free, position, machine, lane.s, lane.state),
+            force_rate(free, position, machine, s1, new),
             stop_gradient(_SLIVER * limit + jnp.zeros_like(h)),
         )
     return Path(begin, end, at_turn, leaves, surge)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ...scene.event import events_of, guard_of
+from ...scene.event import guard_of, section_number
 from .._lane import Plan
 from ..events import rates
 from ..moving import Moving
@@ -27,7 +27,7 @@ class Way:
     """
 
     def __init__(self, plan: Plan, machine: Any, part: Scalar, moving: tuple):
-        self.plan, self.moving = plan, moving
+        self.moving = moving
         self._fixed, others = eqx.partition((machine, plan.end(part)), eqx.is_inexact_array)
         self.rest, self._static = eqx.partition(others, eqx.is_array)
         self._around: list[Any] = []
@@ -41,15 +41,11 @@ class Way:
     def guard(self, c: Crossing) -> Callable:
         """Of a crossing."""
 
-        scene = self.plan.scene
-        clocked = None if scene.clock(self.moving[1]) is None else len(events_of(scene)) - 1
-
         def event(moving, fixed, rest):
             (machine, bound), (s, state, _) = self._whole(fixed, rest), moving
-            scene, modes = machine, ()
-            if isinstance(machine, Moving):
-                scene, modes = machine.scene, machine.modes
-            if c.number == clocked:
+            scene, modes = _parts(machine)
+            clocked = scene.clock(state) is not None
+            if clocked and c.number == section_number(scene):
                 return scene.clock(state) - bound  # which may be that of a part of a cycle
             return guard_of(scene, c.number, s, state, modes)
 
@@ -60,7 +56,7 @@ class Way:
 
         def coordinate(moving, fixed, rest):
             machine, _ = self._whole(fixed, rest)
-            return _scene(machine).coordinates[k].position(moving[1])
+            return _parts(machine)[0].coordinates[k].position(moving[1])
 
         return self._pure(coordinate)
 
@@ -93,5 +89,6 @@ class Way:
         return lambda moving, fixed, rest: written(moving, fixed[0], rest, *fixed[1][here])
 
 
-def _scene(machine: Any) -> Any:
-    return machine.scene if isinstance(machine, Moving) else machine
+def _parts(machine: Any) -> tuple[Any, tuple[Scalar, ...]]:
+    """The machine itself, and its modes."""
+    return (machine.scene, machine.modes) if isinstance(machine, Moving) else (machine, ())
