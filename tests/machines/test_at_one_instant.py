@@ -1,5 +1,4 @@
-"""Contacts that are met at one instant: in turn where one leads to the other, refused where nothing
-says which goes first."""
+"""Contacts that are met at one instant: the one that closes fastest first, equal ones together."""
 
 from typing import Any
 
@@ -9,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
+
+from chain import Balls, Chain, balls, dropped, passed
 
 
 class Three(eqx.Module):
@@ -84,9 +85,129 @@ def test_without_restitution_the_balls_go_on_together():
 
 
 @pytest.mark.parametrize("start", [(-1, 0, 1), (-1, 0, 0.5)])
-def test_blows_from_both_sides_at_once_end_with_a_reason(start):
-    run = vi.simulate(Cradle(0.9), at(*start), 1)
-    assert bool(run.result == vi.RESULTS.simultaneous)
+def test_blows_from_both_sides_at_once(start):
+    """All springs come to rest at once; a symmetric blow leaves a symmetric motion."""
+    run = vi.simulate(Cradle(0.9), at(*start), 1, impact_log=8)
+    assert bool(run.successful)
+    v, struck = passed((1.0, 0.0, -start[2]), 0.9, np.ones(3))
+    # Half a period later all meet again; a quarter later all are as far out as they are fast.
+    last, again = passed(-v, 0.9, np.ones(3))
+    assert run.impact_log.stop[0, : int(run.impacts[0])].tolist() == [*struck, *again]
+    np.testing.assert_allclose([run.last.x, run.last.y, run.last.z], last, atol=1e-8)
+    if start[2] == 1:
+        np.testing.assert_allclose(v, (-0.9, 0, 0.9), atol=1e-15)
+
+
+def flown(machine, x, v, cycles=1, **options):
+    run = vi.simulate(machine, balls(x, v), cycles, impact_log=160, **options)
+    assert bool(run.successful), run.result
+    stops = np.asarray(run.impact_log.stop)
+    return run, stops[stops >= 0]
+
+
+@pytest.mark.parametrize(("count", "k"), [(3, 1.0), (5, 1.0), (5, 0.9), (5, 0.5)])
+def test_newtons_cradle(count, k):
+    """One ball upon others that touch. Five with k = .9: the first keeps .0435250820."""
+    speeds = np.eye(count)[0]
+    run, stops = flown(Chain(k, (1.0,) * count), (-0.5,) + (0,) * (count - 1), speeds)
+    wanted, struck = passed(speeds, k, np.ones(count))
+    np.testing.assert_allclose(run.last.v, wanted, atol=1e-12)
+    assert stops.tolist() == struck
+    if (count, k) == (5, 0.9):
+        assert float(run.last.v[0]) == pytest.approx(0.0435250820, abs=1e-10)
+    lost = 0.5 * (1 - np.sum(wanted**2))
+    assert float(run.impact_energy[0]) == pytest.approx(lost, abs=1e-12)
+
+
+@pytest.mark.parametrize(("ratio", "impacts"), [(100.0, 31), (10_000.0, 314)])
+def test_a_light_ball_between_a_wall_and_a_heavy_one(ratio, impacts):
+    """Galperin's count of the digits of pi, all of it in one instant."""
+    run, _ = flown(Chain(1.0, (ratio, 1.0), 0.0), (-0.5, 0), (1, 0), max_impacts=400)
+    assert int(run.impacts[0]) == impacts
+    energy = 0.5 * (ratio * run.last.v[0] ** 2 + run.last.v[1] ** 2)
+    assert float(energy) == pytest.approx(0.5 * ratio, rel=1e-12)
+
+
+def test_without_an_end_a_sequence_goes_to_its_limit():
+    """Five balls that touch, without restitution, share the momentum; three upon a wall with little
+    of it stay there."""
+    run, _ = flown(Chain(0.0, (1.0,) * 5), (-0.5, 0, 0, 0, 0), (1, 0, 0, 0, 0))
+    np.testing.assert_allclose(run.last.v, 0.2, atol=1e-12)
+    assert float(run.impact_energy[0]) == pytest.approx(0.4, abs=1e-12)
+    stack = Chain(0.2, (1.0,) * 3, 0.0, force=1.0, length=3.0)
+    run, _ = flown(stack, (-0.5,) * 3, (0, 0, 0), 2)
+    np.testing.assert_allclose([*run.last.x, *run.last.v], 0.0, atol=1e-12)
+    assert float(run.impact_energy.sum()) == pytest.approx(1.5, abs=1e-10)
+    # By its height, through all these impacts: it lies at rest, whatever it was.
+
+    def last(height):
+        zero = jnp.zeros_like(height)
+        return vi.simulate(stack, Balls((-height,) * 3, (zero,) * 3), 1).last
+
+    slope = jax.jvp(last, (jnp.array(0.5),), (jnp.array(1.0),))[1]
+    np.testing.assert_allclose(jax.tree.leaves(slope), 0.0, atol=1e-9)
+
+
+def test_two_balls_before_a_wall():
+    """Equal balls at speeds 2 and 0, .01 apart, and .01 before a wall: 0 and -2 after .015."""
+    machine = Chain(1.0, (1.0, 1.0), 0.01, length=0.015)
+    run, stops = flown(machine, (-0.01, 0), (2, 0))
+    assert stops.tolist() == [0, 1, 0]
+    np.testing.assert_allclose([*run.last.x, *run.last.v], (0, 0, -2, 0), atol=1e-12)
+
+
+@pytest.mark.parametrize("k", [0.5, 0.8])
+def test_two_balls_bounce_to_rest_one_above_the_other(k):
+    """Of masses 1 and 2: as by flights in closed form, until they lie on each other."""
+    masses = (1.0, 2.0)
+    machine = Chain(k, masses, 0.0, force=1.0, length=2.0)
+    run = vi.simulate(machine, balls((-1, -0.5), (0, 0)), 8, impact_log=20)
+    assert bool(run.successful)
+    np.testing.assert_allclose([*run.last.x, *run.last.v], 0.0, atol=1e-12)
+    assert float(run.impact_energy.sum()) == pytest.approx(2.0, abs=1e-9)
+    wanted = dropped((1.0, 0.5), k, masses, 2.0 if k == 0.5 else 4.5)
+    phase, stops = np.asarray(run.impact_log.phase), np.asarray(run.impact_log.stop)
+    times = (phase + 2.0 * np.arange(8)[:, None])[stops >= 0]
+    number = len(wanted) - 1
+    assert number >= 4 and stops[stops >= 0][:number].tolist() == [i for _, i in wanted[:-1]]
+    np.testing.assert_allclose(times[:number], [t for t, _ in wanted[:-1]], atol=1e-9)
+
+
+class Table(vi.AbstractScene):
+    """Two balls on one table that is shaken, seen from it."""
+
+    shaking: Any = 2.0
+    stops: tuple = tuple(vi.RigidStop(0.0, 0.3, "left", coordinate=k) for k in range(2))
+
+    @property
+    def coordinates(self):
+        return tuple(
+            vi.Coordinate(
+                lambda z, k=k: z.x[k],
+                lambda z, k=k: z.v[k],
+                lambda z, Y, V, k=k: Balls(
+                    tuple(Y if i == k else x for i, x in enumerate(z.x)),
+                    tuple(V if i == k else v for i, v in enumerate(z.v)),
+                ),
+            )
+            for k in range(2)
+        )
+
+    @property
+    def cycle(self):
+        return 2 * jnp.pi
+
+    def field(self, s, z):
+        force = -1 + self.shaking * jnp.sin(s)
+        return Balls(z.v, tuple(force + 0 * v for v in z.v))
+
+
+def test_two_balls_are_let_go_of_together():
+    run = vi.simulate(Table(), balls((0, 0), (0, 0)), 3, event_log=40)
+    assert bool(run.successful)
+    leaves = np.asarray(run.event_log.phase)[np.asarray(run.event_log.kind) == 2]
+    np.testing.assert_allclose(leaves[:2], np.arcsin(0.5), atol=1e-9)
+    np.testing.assert_allclose(run.sections.x[0], run.sections.x[1], atol=1e-12)
 
 
 def test_energy_never_grows():

@@ -273,6 +273,17 @@ class Plan(eqx.Module):
                 place = jnp.where(contact == to_event(i), stop.place, place)
         return place
 
+    def wall(self, k: int, contact: Scalar) -> tuple[Any, Any]:
+        """Side and gap of the stop of coordinate number k that is named by `contact`; of its first
+        one if none is."""
+        mine = [(i, stop) for i, stop in enumerate(self.scene.stops) if stop.coordinate == k]
+        (_, first), others = mine[0], mine[1:]
+        sign, gap = float(first.sign), first.gap
+        for i, stop in others:
+            here = contact == to_event(i)
+            sign, gap = jnp.where(here, float(stop.sign), sign), jnp.where(here, stop.gap, gap)
+        return sign, gap
+
     def _rests_on(self, k: int, here: Rates, growth: Scalar, slack: Any) -> Scalar:
         """The stop that coordinate number k rests on as the motion begins: pressed on, or about to
         be by a force that grows; place and velocity are known to within `slack`."""

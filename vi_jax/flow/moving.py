@@ -9,6 +9,7 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
 from ..scene import AbstractScene, Coordinate, RigidStop
+from ..scene.contacts import added, forces, gained, push_of, shares
 
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]
@@ -65,43 +66,10 @@ def _held_together(held: list[tuple[Coordinate, Flag]], state: Any, flow: Any) -
     is, so that no velocity of a contact that rests changes, is a linear system as large as there
     are contacts.
     """
-    pushes, rates = [], []
-    for coordinate, _ in held:
-        place, velocity = coordinate.position(state), coordinate.velocity(state)
-        pushes.append(
-            jax.jvp(
-                lambda V, c=coordinate, Y=place: c.placed(state, Y, V),
-                (velocity,),
-                (jnp.ones_like(velocity),),
-            )[1]
-        )
-        rates.append(_rate_of(coordinate, state, flow))
-    rows = []
-    for j, (coordinate, rests) in enumerate(held):
-        row = []
-        for k, ((_, other), push) in enumerate(zip(held, pushes, strict=True)):
-            own = 1.0 if j == k else 0.0
-            row.append(jnp.where(rests & other, _rate_of(coordinate, state, push), own))
-        rows.append([*row, jnp.where(rests, rates[j], 0.0)])
-    for force, push in zip(_solved(rows), pushes, strict=True):
-        flow = jtu.tree_map(lambda a, b, force=force: a - force * b, flow, push)
-    return flow
-
-
-def _rate_of(coordinate: Coordinate, state: Any, flow: Any) -> Scalar:
-    return jax.jvp(coordinate.velocity, (state,), (flow,))[1]
-
-
-def _solved(rows: list[list[Scalar]]) -> list[Scalar]:
-    """The solution of a small linear system, its right side as the last column. Its matrix is that
-    of contacts' inverse masses, which needs no pivoting."""
-    rows, n = [list(row) for row in rows], len(rows)
-    for i in range(n):
-        rows[i] = [x / rows[i][i] for x in rows[i]]
-        for j in range(n):
-            if j != i:
-                rows[j] = [a - rows[j][i] * b for a, b in zip(rows[j], rows[i], strict=True)]
-    return [row[-1] for row in rows]
+    coordinates, rests = [x for x, _ in held], [x for _, x in held]
+    pushes = [push_of(coordinate, state) for coordinate in coordinates]
+    wanted = [-gained(coordinate, state, flow) for coordinate in coordinates]
+    return added(flow, forces(shares(coordinates, state, pushes), rests, wanted), pushes)
 
 
 def in_modes(scene: AbstractScene, modes: tuple[Scalar, ...]) -> AbstractScene:

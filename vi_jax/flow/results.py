@@ -54,8 +54,7 @@ class RESULTS(NamedEnumeration):
         "values in [0, 1]."
     )
     simultaneous = (
-        "Two impacts fell upon one instant, and what follows depends on which of them goes first, "
-        "which nothing says."
+        "The impacts of bodies that touch each other did not come to an end within one instant."
     )
     sliding = (
         "The field on both sides of a switch points at its surface, so that the motion would have "

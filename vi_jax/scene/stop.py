@@ -133,15 +133,3 @@ class RigidStop(Wall, AbstractEvent):
     def loss(self, approach: Any) -> Any:
         """Energy lost in an impact, per unit of mass: ½(1 - k²) V⁻²."""
         return 0.5 * (1 - self.share(approach) ** 2) * approach**2
-
-    def remaining(self, approach: Any, pressing: Any) -> Any:
-        """Time from an impact to rest: Σ 2 kⁿ V⁻ / a = 2 k V⁻ / (a (1 - k)).
-
-        **Arguments:** speed of approach and acceleration towards the stop. Infinite where the body
-        is not pressed on, or loses nothing. A coefficient that depends on the speed is taken as it
-        is at this impact.
-        """
-        k = self.share(approach)
-        force = pressing * (1 - k)
-        ends = force > 0
-        return jnp.where(ends, 2 * k * approach / jnp.where(ends, force, 1.0), jnp.inf)

@@ -8,19 +8,19 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
-from ...lanes import pin, pin_flag
-from ...scene.event import Section
-from .. import results
-from .._lane import HIT, LEAVES, RESTS, Lane, Plan, Record, to_event, to_turn_of
+from ...scene.event import Section, struck_modes
+from .._lane import LEAVES, Lane, Plan, Record, to_event, to_turn_of
 from ..drift import drifted, height_of_turn, met_after, unmoved
 from ..events import Rates, to_turn
 from ..moving import exact, holding
 from .aim import select
-from .faults import gains, may_end, undecided
+from .faults import may_end
 from .guards import Crossing, furthest_landing
-from .happen import Arrival, ended, happened
-from .log import clock_at, logged, noted
-from .rest import Release, settled
+from .happen import Arrival, happened
+from .impact import strike
+from .log import clock_at, noted
+from .rest import Release
+from .settle import settle
 from .trial import Trial
 from .way import Way
 
@@ -86,32 +86,28 @@ def arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Fla
 
 
 def _met(plan: Plan, lane: Lane, trial: Trial, taken: Flag, way: Way, arrival: Arrival) -> Arrival:
-    """What the event makes of a step that met one: the last part of its way, and the jump.
-
-    Of events met together the stops come first, in their order, then the switches, then the
-    section.
-    """
-    for c in trial.crossings:
-        # Of a motion so flat that the event's place is known worse than its surface, it is here.
-        near = c.landed & (jnp.abs(c.offset) <= furthest_landing(trial.h))
-        offset = stop_gradient(jnp.where(near, c.offset, 0.0))
-        if plan.ticks(lane.state):
-            # Met on the section it is not beyond it.
-            beyond = trial.s + offset - plan.end(lane.part)
-            offset = offset - jnp.maximum(stop_gradient(beyond), 0.0)
-        # With the derivatives of what is met, which mean nothing where nothing is.
-        offset = met_after(way.rate, way.guard(c), offset, way.moving, way.fixed, way.rest)
+    """What the event makes of a step that met one: the last part of its way, and the jump. A step
+    lands on one event; what is met with it is met by the next."""
+    landed = {c.number: c.landed for c in trial.crossings}
+    if landed:
+        offset = jnp.zeros_like(arrival.s)
+        for c in trial.crossings:
+            offset = jnp.where(c.landed, _offset(plan, lane, trial, way, c), offset)
         _, there, passed = drifted(way.rate, offset, way.moving, way.fixed, way.rest)
-        s = arrival.s + jnp.where(c.landed, offset, 0.0)
-        arrival = arrival._replace(s=s, time=select(c.landed, passed, arrival.time))
-        if c.coordinate is not None:
-            arrival = _impact(plan, lane, trial, taken, arrival, c, there)
-        elif isinstance(c.event, Section):  # what begins anew with a cycle does so at its end
-            arrival = arrival._replace(state=select(c.landed, there, arrival.state))
-        else:
-            arrival = happened(plan, taken, arrival, c, there)
-        if c.event.ends_cycle:
-            arrival = arrival._replace(completed=arrival.completed | c.landed)
+        met = jnp.zeros_like(taken)
+        for here in landed.values():
+            met = met | here
+        time = select(met, passed, arrival.time)
+        arrival = arrival._replace(s=arrival.s + jnp.where(met, offset, 0.0), time=time)
+        if plan.scene.stops:
+            arrival = _impact(plan, lane, trial, taken, arrival, landed, there)
+        for c in trial.crossings:
+            if isinstance(c.event, Section):  # what begins anew with a cycle does so at its end
+                arrival = arrival._replace(state=select(c.landed, there, arrival.state))
+            elif c.coordinate is None:
+                arrival = happened(plan, taken, arrival, c, there)
+            if c.event.ends_cycle:
+                arrival = arrival._replace(completed=arrival.completed | c.landed)
     for k, path in enumerate(trial.paths):
         if path.leaves is not None:
             arrival = _released(plan, lane, taken, arrival, way, k, path.leaves)
@@ -180,82 +176,51 @@ def _put(values: tuple, k: int, value: Any) -> tuple:
     return (*values[:k], value, *values[k + 1 :])
 
 
+def _offset(plan: Plan, lane: Lane, trial: Trial, way: Way, c: Crossing) -> Scalar:
+    """To the event from the step's end."""
+    # Of a motion so flat that the event's place is known worse than its surface, it is here.
+    near = c.landed & (jnp.abs(c.offset) <= furthest_landing(trial.h))
+    offset = stop_gradient(jnp.where(near, c.offset, 0.0))
+    if plan.ticks(lane.state):
+        # Met on the section it is not beyond it.
+        beyond = trial.s + offset - plan.end(lane.part)
+        offset = offset - jnp.maximum(stop_gradient(beyond), 0.0)
+    # With the derivatives of what is met, which mean nothing where nothing is.
+    return met_after(way.rate, way.guard(c), offset, way.moving, way.fixed, way.rest)
+
+
 def _impact(
     plan: Plan, lane: Lane, trial: Trial, taken: Flag, arrival: Arrival,
-    c: Crossing, there: Any,
+    landed: dict[int, Flag], there: Any,
 ) -> Arrival:  # fmt: skip
     """The rebound from a stop in `there`, the state of the impact; or coming to rest on it."""
-    scene, stop = plan.scene, plan.scene.stops[c.number]
-    k = stop.coordinate
-    body = scene.coordinates[k]
-    s, state, time, direction = arrival.s, arrival.state, arrival.time, arrival.direction[k]
-    contact, rests, met = arrival.contact, arrival.rests, clock_at(plan, s, there)
-    approach = jnp.maximum(stop.approach(body.velocity(there)), 0.0)
-    # A speed whose square is no number ends here: a body may die out on a stop.
-    least = 100 * float(jnp.finfo(s.dtype).tiny) ** 0.5
-    rebound = stop.rebound(stop.sign * jnp.where(approach > least, approach, 0.0))
-    arrival = ended(arrival, c, gains(stop, approach, rebound), results.BAD_IMPACT)
-    struck = body.placed(there, stop.place, rebound)
-    clashes = undecided(scene, c.number, there, struck)
-    arrival = ended(arrival, c, clashes, results.SIMULTANEOUS)
-    state = select(c.landed, struck, state)
-    direction = jnp.where(c.landed, -float(stop.sign), direction)
-    hit = taken & c.landed
-    lost = stop.loss(approach)
-    events = noted(arrival.events, hit, met, HIT, c.number, approach)
-    if contact is not None:
-        arriving = stop.approach(trial.paths[k].end.v)
-        surge = trial.paths[k].surge
-        assert surge is not None  # as `contact` is there
-        last, left = settled(plan, lane, trial.alone[k], stop, arriving, surge[1], s, there)
-        ends = pin_flag(c.landed & last, s)
-        lost = jnp.where(ends, 0.5 * approach**2, lost)
-        wait = pin(jnp.where(ends, left, 0.0))
-        contact = _put(contact, k, jnp.where(ends, to_event(c.number), contact[k]))
-        resting = holding(scene, arrival.modes, contact)
-        still = body.placed(state, stop.place, jnp.zeros_like(s))
-        way = Way(plan, resting, lane.part, (s, still, time))
-        later, still, passed = drifted(way.rate, wait, way.moving, way.fixed, way.rest)
-        s, state, time = select(ends, (later, still, passed), (s, state, time))
-        clock = clock_at(plan, s, state)
-        events = noted(events, taken & ends, clock, RESTS, c.number, approach)
-        direction = jnp.where(ends, float(stop.sign), direction)
-        if rests is not None:
-            rests = rests + jnp.where(taken & ends, 1.0, 0.0)
-    if not _is_one(body.mass):
-        lost = body.mass * lost
-    directions = _put(arrival.direction, k, direction)
-    for j, other in enumerate(scene.coordinates):
-        if j != k:  # it may share a body with the one that was hit
-            v = stop_gradient(other.velocity(state))
-            moved = c.landed & (v != 0)
-            turned = jnp.where(moved, jnp.sign(v), directions[j])
-            directions = _put(directions, j, turned)
-            if contact is not None:
-                contact = _put(contact, j, jnp.where(moved, 0.0, contact[j]))
+    scene, stops = plan.scene, range(len(plan.scene.stops))
+    landed = {number: landed[number] for number in stops}
+    arrival, blows = strike(plan, taken, arrival, landed, there)
+    arrival = settle(plan, lane, trial, taken, arrival, there, blows)
+    met = jnp.zeros_like(taken)
+    for here in landed.values():
+        met = met | here
+    direction = list(arrival.direction)
+    for k, body in enumerate(scene.coordinates):
+        v = stop_gradient(body.velocity(arrival.state))
+        if k not in blows or len(blows) > 1:  # it may share a body with one that was hit
+            direction[k] = jnp.where(met & (v != 0), jnp.sign(v), direction[k])
+        if k in blows:
+            struck, (sign, _) = blows[k].struck, plan.wall(k, blows[k].struck)
+            away = -sign if len(blows) == 1 else jnp.where(v != 0, jnp.sign(v), -sign)
+            if arrival.contact is not None:
+                away = jnp.where(arrival.contact[k] > 0, sign, away)
+            direction[k] = jnp.where(struck > 0, away, direction[k])
     modes = arrival.modes
-    if modes:
-        modes = select(c.landed, stop.modes_after(scene, s, there, state, modes), modes)
-    speed, loss = arrival.speed, arrival.loss
-    log = logged(arrival.log, hit, arrival.impacts, met, approach, c.number)
-    return arrival._replace(
-        s=s,
-        state=state,
-        time=time,
-        direction=directions,
-        contact=contact,
-        modes=modes,
-        impacts=arrival.impacts + jnp.where(hit, 1.0, 0.0),
-        speed=None if speed is None else jnp.where(hit, jnp.maximum(speed, approach), speed),
-        loss=None if loss is None else loss + jnp.where(hit, lost, 0.0),
-        rests=rests,
-        log=log,
-        events=events,
-    )
-
-
-def _is_one(mass: Any) -> bool:
-    return isinstance(mass, float) and mass == 1.0
+    if modes and len(blows) > 1:
+        new = struck_modes(scene, arrival.s, arrival.state, modes)
+        modes = select(met, new, modes)
+    elif modes:
+        for number, here in landed.items():
+            given = scene, arrival.s, there, arrival.state, modes
+            modes = select(here, scene.stops[number].modes_after(*given), modes)
+    return arrival._replace(direction=tuple(direction), modes=modes)
 
 
 def _reached(

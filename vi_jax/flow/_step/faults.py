@@ -24,9 +24,8 @@ _LOST, _MANY = 64.0, 16.0
 # Nothing that a lane could do in one interval takes so many steps.
 _STUCK = 65536.0
 
-# By so many roundings a rebound may be faster than the approach. By this share another contact's
-# speed may change, and it is none if it has no more of the speed of the impact.
-_FASTER, _ROUNDING = 16.0, 1e-6
+# By so many roundings a rebound may be faster than the approach.
+_FASTER = 16.0
 
 
 def faults(
@@ -96,27 +95,6 @@ def gains(stop: RigidStop, approach: Scalar, rebound: Scalar) -> Flag | None:
     leaves = stop_gradient(-stop.sign * rebound)
     most = (1 + _FASTER * float(jnp.finfo(leaves.dtype).eps)) * stop_gradient(approach)
     return ~((leaves >= 0) & (leaves <= most))
-
-
-def undecided(scene: AbstractScene, i: int, there: Any, struck: Any) -> Flag | None:
-    """Whether stop number i is struck at the instant at which another is, whose approach changes by
-    it: what follows then depends on which goes first.
-
-    **Arguments:** the states before and after the impact.
-    """
-    stop, found = scene.stops[i], None
-    speed = stop_gradient(stop.approach(scene.coordinates[stop.coordinate].velocity(there)))
-    for other in scene.stops:
-        if other.coordinate == stop.coordinate:
-            continue
-        body = scene.coordinates[other.coordinate]
-        depth = stop_gradient(other.beyond(body.position(there)))
-        before, after = (stop_gradient(other.approach(body.velocity(x))) for x in (there, struck))
-        slack = 256 * float(jnp.finfo(depth.dtype).eps) * (1 + jnp.abs(stop_gradient(other.gap)))
-        together = (jnp.abs(depth) <= slack) & (before > _ROUNDING * speed)
-        together = together & (jnp.abs(after - before) > _ROUNDING * before)
-        found = together if found is None else found | together
-    return found
 
 
 def comes_back(scene: AbstractScene, i: int, modes: tuple, s: Scalar, state: Any) -> Flag | None:

@@ -1,0 +1,309 @@
+"""The impacts of one instant: one blow on a stop, or one after the other between bodies that touch.
+
+Where bodies touch, a blow on one contact brings the next one together at the same instant. The
+contact that closes fastest is struck first, those that close equally fast together, so that what is
+symmetrical stays so; then the next, until none closes. A sequence that gets weaker without an end
+(several balls without restitution) goes to its limit: the contacts that are still being struck come
+to rest against each other.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax.lax import stop_gradient
+from jaxtyping import Array, Bool, Float
+
+from ...scene import Coordinate, RigidStop
+from ...scene.contacts import forces, push_of, shares
+from .. import results
+from .._lane import HIT, Plan, to_event
+from ..moving import rounding
+from .aim import select
+from .faults import gains
+from .happen import Arrival
+from .log import clock_at, logged, noted
+
+Scalar = Float[Array, ""]
+Flag = Bool[Array, ""]
+
+# A speed of approach is none that has no more than this share of the first one; a sequence that has
+# come down to the second is taken to its limit; what is struck then has speeds within this factor
+# of each other.
+_NONE, _WEAK, _ALIKE = 1e-12, 1e-7, 30.0
+
+# Speeds that differ by no more than this share are the same.
+_EQUAL = 1e-9
+
+# Contacts that share less than this of each other's velocity are struck each by itself.
+_APART = 1e-6
+
+# A ball between a wall and a body 100 times heavier is struck 31 times, one of 10,000 times 314.
+_ROUNDS = 4096.0
+
+
+class Blow(NamedTuple):
+    """What the impacts of an instant were to a coordinate that stops limit."""
+
+    struck: Scalar
+    """1 + i if stop number i was struck last, 0 if none was."""
+    approach: Scalar
+    """The greatest speed of approach."""
+    share: Scalar
+    """What is left of that speed."""
+
+
+def strike(
+    plan: Plan, taken: Flag, arrival: Arrival, landed: dict[int, Flag], there: Any
+) -> tuple[Arrival, dict[int, Blow]]:
+    """The impacts in the state `there` of those stops that a step has `landed` upon; and what they
+    were to each coordinate."""
+    limited = sorted({stop.coordinate for stop in plan.scene.stops})
+    if len(limited) == 1:
+        return _one_blow(plan, taken, arrival, landed, there, limited[0])
+    return _sequence(plan, taken, arrival, landed, there, limited)
+
+
+def _rebound(stop: RigidStop, approach: Scalar) -> Scalar:
+    # A speed whose square is no number ends here: a body may die out on a stop.
+    least = 100 * float(jnp.finfo(approach.dtype).tiny) ** 0.5
+    return stop.rebound(stop.sign * jnp.where(approach > least, approach, 0.0))
+
+
+def _one_blow(
+    plan: Plan, taken: Flag, arrival: Arrival, landed: dict[int, Flag], there: Any, k: int
+) -> tuple[Arrival, dict[int, Blow]]:
+    """Of the only coordinate that stops limit."""
+    scene, body = plan.scene, plan.scene.coordinates[k]
+    blow = Blow(*(jnp.zeros_like(arrival.s) for _ in range(3)))
+    velocity = body.velocity(there)
+    for number, met in landed.items():
+        stop = scene.stops[number]
+        approach = jnp.maximum(stop.approach(velocity), 0.0)
+        rebound = _rebound(stop, approach)
+        arrival = _failing(arrival, met, gains(stop, approach, rebound), results.BAD_IMPACT)
+        state = select(met, body.placed(there, stop.place, rebound), arrival.state)
+        arrival = _listed(plan, arrival._replace(state=state), there, taken & met, number, approach)
+        if arrival.loss is not None:
+            lost = stop.loss(approach)
+            lost = lost if _is_one(body.mass) else body.mass * lost
+            arrival = arrival._replace(loss=arrival.loss + jnp.where(taken & met, lost, 0.0))
+        new = Blow(jnp.where(met, to_event(number), 0.0), approach, stop.share(approach))
+        blow = new if len(landed) == 1 else select(met, new, blow)
+    return arrival, {k: blow}
+
+
+def _failing(arrival: Arrival, where: Flag, when: Flag | None, reason: int) -> Arrival:
+    """With this reason to end; `None` where it cannot be."""
+    if when is None or arrival.fault is None:
+        return arrival
+    return arrival._replace(fault=jnp.where(where & when, float(reason), arrival.fault))
+
+
+def _listed(
+    plan: Plan, arrival: Arrival, there: Any, hit: Flag, number: int, approach: Scalar
+) -> Arrival:
+    """With an impact counted and logged."""
+    clock, speed = clock_at(plan, arrival.s, there), arrival.speed
+    return arrival._replace(
+        impacts=arrival.impacts + jnp.where(hit, 1.0, 0.0),
+        speed=None if speed is None else jnp.where(hit, jnp.maximum(speed, approach), speed),
+        log=logged(arrival.log, hit, arrival.impacts, clock, approach, number),
+        events=noted(arrival.events, hit, clock, HIT, number, approach),
+    )
+
+
+def _is_one(mass: Any) -> bool:
+    return isinstance(mass, float) and mass == 1.0
+
+
+class _Round(NamedTuple):
+    """A sequence of impacts between two of them."""
+
+    arrival: Arrival
+    struck: tuple[Scalar, ...]
+    """Of each coordinate, as in `Blow`."""
+    approach: tuple[Scalar, ...]
+    most: Scalar
+    """The greatest speed of approach that there was."""
+    goes_on: Scalar
+    rounds: Scalar
+
+
+class _Instant(NamedTuple):
+    """What is known of an instant beforehand."""
+
+    plan: Plan
+    taken: Flag
+    met: Flag
+    """Whether any stop is landed upon."""
+    there: Any
+    """The state before."""
+    limited: list[int]
+    """The numbers of the coordinates that stops limit."""
+    bodies: list[Coordinate]
+    """Those coordinates."""
+    before: list[Scalar]
+    """Their velocities before."""
+    gains: list[list[Scalar]]
+    """What they gain by each other's force (see `scene.contacts`)."""
+    landed: dict[int, Flag]
+    touches: dict[int, Flag]
+    """Of each stop, whether its contact is closed."""
+    coupled: list[Flag]
+    """Of each coordinate, whether one of those landed upon acts on it."""
+    slack: Any
+    """What of a velocity is rounding."""
+
+
+def _sequence(
+    plan: Plan, taken: Flag, arrival: Arrival, landed: dict[int, Flag], there: Any,
+    limited: list[int],
+) -> tuple[Arrival, dict[int, Blow]]:  # fmt: skip
+    """Of machines with several coordinates that stops limit."""
+    instant = _instant(plan, taken, arrival, landed, there, limited)
+    zero = jnp.zeros_like(arrival.s)
+    nothing = tuple(zero for _ in limited)
+    # One that is landed upon without any speed, as of bodies let go of together, may come to rest.
+    touched = list(nothing)
+    for number, stop in enumerate(plan.scene.stops):
+        i = limited.index(stop.coordinate)
+        touched[i] = jnp.where(landed[number], to_event(number), touched[i])
+    first = select(instant.met, there, arrival.state)
+    begin = _Round(
+        arrival._replace(state=first), tuple(touched), nothing, zero,
+        jnp.where(instant.met, 1.0, zero), zero,
+    )  # fmt: skip
+    end = jax.lax.while_loop(
+        lambda x: (x.goes_on > 0) & (x.rounds < _ROUNDS), lambda x: _struck(instant, x), begin
+    )
+    endless = end.rounds >= _ROUNDS
+    arrival = _failing(end.arrival, instant.met, endless, results.SIMULTANEOUS)
+    blows = {}
+    for k, body, struck, fastest in zip(
+        limited, instant.bodies, end.struck, end.approach, strict=True
+    ):
+        leaves = -plan.wall(k, struck)[0] * body.velocity(arrival.state)
+        share = leaves / jnp.where(fastest > 0, fastest, 1.0)
+        blows[k] = Blow(struck, fastest, jnp.clip(share, 0.0, 1.0))
+    return arrival, blows
+
+
+def _instant(
+    plan: Plan, taken: Flag, arrival: Arrival, landed: dict[int, Flag], there: Any,
+    limited: list[int],
+) -> _Instant:  # fmt: skip
+    bodies = [plan.scene.coordinates[k] for k in limited]
+    gains_ = shares(bodies, there, [push_of(body, there) for body in bodies])
+    met = jnp.zeros_like(taken)
+    coupled = [met for _ in limited]
+    touches = {}
+    for number, stop in enumerate(plan.scene.stops):
+        at, here = limited.index(stop.coordinate), landed[number]
+        met = met | here
+        for i in range(len(limited)):
+            acts = jnp.abs(stop_gradient(gains_[i][at])) > _APART
+            coupled[i] = coupled[i] | here & (acts | (i == at))
+        depth = stop_gradient(stop.beyond(bodies[at].position(there)))
+        slack = 256 * float(jnp.finfo(depth.dtype).eps) * (1 + jnp.abs(stop_gradient(stop.gap)))
+        closed = here | (jnp.abs(depth) <= slack)
+        if arrival.contact is not None:
+            closed = closed | (arrival.contact[stop.coordinate] == to_event(number))
+        touches[number] = closed
+    before = [body.velocity(there) for body in bodies]
+    return _Instant(
+        plan, taken, met, there, limited, bodies, before, gains_, landed, touches, coupled,
+        rounding(plan.scene, there),
+    )  # fmt: skip
+
+
+def _struck(instant: _Instant, x: _Round) -> _Round:
+    """A sequence with its next impacts."""
+    plan, arrival = instant.plan, x.arrival
+    stops, state = plan.scene.stops, arrival.state
+    velocities = [body.velocity(state) for body in instant.bodies]
+    closing = _closing(instant, x, velocities)
+    fastest = stop_gradient(jnp.max(jnp.stack(list(closing.values()))))
+    most = jnp.maximum(x.most, fastest)
+    goes_on = fastest > _NONE * most
+    weak = goes_on & (fastest <= _WEAK * most)
+
+    on, wanted, places = [], [], []
+    hits, rebounds = {}, {}
+    for i, k in enumerate(instant.limited):
+        place, V = instant.bodies[i].position(state), velocities[i]
+        # In the limit what is still being struck comes to rest.
+        acts = weak & (x.struck[i] > 0) & (jnp.abs(stop_gradient(V)) <= _ALIKE * fastest)
+        aim = jnp.zeros_like(V)
+        for number, stop in enumerate(stops):
+            if stop.coordinate == k:
+                approach = closing[number]
+                hit = goes_on & ~weak & (stop_gradient(approach) >= (1 - _EQUAL) * fastest)
+                rebounds[number] = _rebound(stop, jnp.where(hit, approach, 0.0))
+                hits[number] = hit
+                acts, place = acts | hit, jnp.where(hit, stop.place, place)
+                aim = jnp.where(hit, rebounds[number], aim)
+        on, wanted, places = [*on, acts], [*wanted, aim - V], [*places, place]
+
+    amounts = forces(instant.gains, on, wanted)
+    new = state
+    for i, body in enumerate(instant.bodies):
+        moved = body.placed(state, places[i], velocities[i] + amounts[i])
+        new = jtu.tree_map(
+            lambda a, b, c, on=on[i]: a if c is b else a + jnp.where(on, c - b, 0.0),
+            new, state, moved,
+        )  # fmt: skip
+    after = [body.velocity(new) for body in instant.bodies]
+    arrival = _accounted(instant, arrival._replace(state=new), amounts, velocities, after)
+    struck, approaches = list(x.struck), list(x.approach)
+    for number, hit in hits.items():
+        stop, i = stops[number], instant.limited.index(stops[number].coordinate)
+        speed = jnp.maximum(closing[number], 0.0)
+        arrival = _failing(arrival, hit, gains(stop, speed, rebounds[number]), results.BAD_IMPACT)
+        arrival = _listed(plan, arrival, instant.there, instant.taken & hit, number, speed)
+        if stop.modes is not None:
+            given = plan.scene, arrival.s, state, new, arrival.modes
+            modes = select(hit, stop.modes_after(*given), arrival.modes)
+            arrival = arrival._replace(modes=modes)
+        struck[i] = jnp.where(hit, to_event(number), struck[i])
+        approaches[i] = jnp.where(hit, jnp.maximum(approaches[i], speed), approaches[i])
+    return _Round(
+        arrival, tuple(struck), tuple(approaches), most,
+        jnp.where(goes_on & ~weak, 1.0, 0.0), x.rounds + 1.0,
+    )  # fmt: skip
+
+
+def _closing(instant: _Instant, x: _Round, velocities: list[Scalar]) -> dict[int, Scalar]:
+    """Of each stop the speed of approach, of those whose turn it may be: negative for others.
+
+    Two bodies that meet their stops at one instant, of which neither feels the other, are two
+    instants to derivatives: only what a blow brought together, or acts on what is landed upon,
+    takes part.
+    """
+    found = {}
+    for number, stop in enumerate(instant.plan.scene.stops):
+        i = instant.limited.index(stop.coordinate)
+        speed = stop.approach(velocities[i])
+        size = stop_gradient(speed)
+        changed = jnp.abs(stop_gradient(velocities[i] - instant.before[i])) > _NONE * x.most
+        mine = instant.landed[number] | ((changed | instant.coupled[i]) & (size > instant.slack))
+        found[number] = jnp.where(mine & instant.touches[number] & (size > 0), speed, -1.0)
+    return found
+
+
+def _accounted(
+    instant: _Instant, arrival: Arrival, amounts: list[Scalar], before: list[Scalar],
+    after: list[Scalar],
+) -> Arrival:  # fmt: skip
+    """With the energy that the impacts have lost: the work of each force at the mean velocity of
+    its contact. A law that gains some ends the lane."""
+    lost, size = jnp.zeros_like(arrival.s), jnp.zeros_like(arrival.s)
+    for body, amount, V, left in zip(instant.bodies, amounts, before, after, strict=True):
+        lost = lost - body.mass * amount * 0.5 * (V + left)
+        size = size + body.mass * jnp.abs(amount) * (jnp.abs(V) + jnp.abs(left))
+    if arrival.loss is not None:
+        hit = instant.taken & instant.met
+        arrival = arrival._replace(loss=arrival.loss + jnp.where(hit, lost, 0.0))
+    wrong = stop_gradient(lost) < -1e-9 * stop_gradient(size)
+    return _failing(arrival, instant.met, wrong, results.BAD_IMPACT)

@@ -1,0 +1,235 @@
+"""How a body comes to rest on a stop.
+
+With small impact speeds and a force that presses the body on, impacts follow each other ever
+faster, their speeds a geometric series in k, and end in rest after a finite time (chatter):
+Σ 2 kⁿ V⁻/a = 2 k V⁻ / (a (1 - k)). The series is completed at once where what is left of it is
+brief.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.lax import stop_gradient
+from jaxtyping import Array, Bool, Float
+
+from ...lanes import pin, pin_flag
+from ...scene import AbstractScene
+from ...scene.contacts import forces, push_of, shares
+from .._lane import RESTS, Lane, Plan
+from ..drift import drifted
+from ..events import force_rate, rates
+from ..moving import holding, in_modes, rounding
+from .aim import select
+from .happen import Arrival
+from .impact import Blow
+from .log import clock_at, noted
+from .rest import allowed
+from .trial import Trial
+from .way import Way
+
+Scalar = Float[Array, ""]
+Flag = Bool[Array, ""]
+
+# A contact whose bodies leave each other with less than this share of the speed with which they
+# came stays closed while it is looked at what presses on it.
+_CLOSED = 1e-9
+
+
+def settle(
+    plan: Plan, lane: Lane, trial: Trial, taken: Flag, arrival: Arrival, there: Any,
+    blows: dict[int, Blow],
+) -> Arrival:  # fmt: skip
+    """The lane at rest on the stops whose impacts were the last before it.
+
+    **Arguments:** `there` is the state before the impacts, the arrival's that behind them.
+    """
+    contact = arrival.contact
+    if contact is None:
+        return arrival
+    if len(blows) == 1:
+        ((k, blow),) = blows.items()
+        sign, _ = plan.wall(k, blow.struck)
+        speed = blow.share * jnp.maximum(sign * trial.paths[k].end.v, 0.0)
+        ends, left = _ends(plan, lane, trial, trial.alone[k], k, blow, speed, (arrival.s, there))
+        rests = {k: pin_flag((blow.struck > 0) & ends, arrival.s)}
+        waits = {k: left}
+    else:
+        contact = _broken(plan, arrival, there, blows)
+        rests, waits = _together(plan, lane, trial, arrival, blows, contact)
+    return _held(plan, lane, taken, arrival._replace(contact=contact), rests, blows, waits)
+
+
+def _held(
+    plan: Plan, lane: Lane, taken: Flag, arrival: Arrival, rests: dict[int, Flag],
+    blows: dict[int, Blow], waits: dict[int, Scalar],
+) -> Arrival:  # fmt: skip
+    """The lane when the impacts are over, with those bodies held that come to rest."""
+    s, state, time, contact = arrival.s, arrival.state, arrival.time, arrival.contact
+    assert contact is not None
+    wait = jnp.zeros_like(s)
+    for k, ends in rests.items():
+        left = jnp.where(ends, waits[k], 0.0)
+        wait = left if len(rests) == 1 else jnp.maximum(wait, left)
+        contact = (*contact[:k], jnp.where(ends, blows[k].struck, contact[k]), *contact[k + 1 :])
+    resting = holding(plan.scene, arrival.modes, contact)
+    still, lost = _stilled(plan, state, rests, blows)
+    way = Way(plan, resting, lane.part, (s, still, time))
+    later, still, passed = drifted(way.rate, pin(wait), way.moving, way.fixed, way.rest)
+    if len(rests) > 1:  # another body may come upon this one before its impacts are over
+        clear = ~_beyond_any(plan, still)
+        rests = {k: ends & clear for k, ends in rests.items()}
+        contact = select(clear, contact, arrival.contact)
+    any_rests = jnp.zeros_like(taken)
+    for ends in rests.values():
+        any_rests = any_rests | ends
+    s, state, time = select(any_rests, (later, still, passed), (s, state, time))
+    events, count, loss = arrival.events, arrival.rests, arrival.loss
+    for k, ends in rests.items():
+        here, blow, clock = taken & ends, blows[k], clock_at(plan, s, state)
+        events = noted(events, here, clock, RESTS, blow.struck - 1.0, blow.approach)
+        count = None if count is None else count + jnp.where(here, 1.0, 0.0)
+    if loss is not None:
+        loss = loss + jnp.where(taken & any_rests, lost, 0.0)
+    return arrival._replace(
+        s=s, state=state, time=time, contact=contact, events=events, rests=count, loss=loss
+    )
+
+
+def _beyond_any(plan: Plan, state: Any) -> Flag:
+    """Whether a body is beyond a stop by more than rounding."""
+    found, slack = jnp.zeros((), bool), rounding(plan.scene, state)
+    for stop in plan.scene.stops:
+        place = plan.scene.coordinates[stop.coordinate].position(state)
+        found = found | (stop_gradient(stop.beyond(place)) > slack)
+    return found
+
+
+def _stilled(
+    plan: Plan, state: Any, rests: dict[int, Flag], blows: dict[int, Blow]
+) -> tuple[Any, Scalar]:
+    """The state with those contacts closed that rest, and the energy that goes with it."""
+    bodies = {k: plan.scene.coordinates[k] for k in rests}
+    velocities = {k: body.velocity(state) for k, body in bodies.items()}
+    changes = [-V for V in velocities.values()]
+    if len(rests) > 1:
+        coordinates = list(bodies.values())
+        gains = shares(coordinates, state, [push_of(body, state) for body in coordinates])
+        changes = forces(gains, list(rests.values()), changes)
+    new, lost = state, jnp.zeros_like(changes[0])
+    for (k, body), change in zip(bodies.items(), changes, strict=True):
+        sign, gap = plan.wall(k, blows[k].struck)
+        moved = body.placed(new, sign * gap, body.velocity(new) + change)
+        new = moved if len(rests) == 1 else select(rests[k], moved, new)
+        lost = lost - body.mass * change * 0.5 * velocities[k]
+    return new, lost
+
+
+def _ends(
+    plan: Plan, lane: Lane, trial: Trial, free: AbstractScene, k: int, blow: Blow, speed: Scalar,
+    at: tuple[Scalar, Any], several: bool = False,
+) -> tuple[Flag, Scalar]:  # fmt: skip
+    """Whether an impact is one of the endless last ones before rest, and the time they take.
+
+    **Arguments:** the machine with this body free; the number of its coordinate; the speed by s of
+    its rebound; s and a state of the impact; whether it was one of several in this instant.
+    """
+    (s, state), body, surge = at, plan.scene.coordinates[k], trial.paths[k].surge
+    assert surge is not None  # as bodies may rest
+    sign, gap = plan.wall(k, blow.struck)
+    # What presses a body at rest on: with its velocity goes its damping.
+    rested = body.placed(state, jnp.asarray(sign * gap), jnp.zeros_like(s))
+    pressing = sign * rates(free.field, body.position, s, rested).a
+    force = pressing * (1 - blow.share)
+    ends = force > 0
+    left = jnp.where(ends, 2 * speed / jnp.where(ends, force, 1.0), jnp.inf)
+    limit = stop_gradient(jnp.asarray(plan.scene.step_limit(s, state), s.dtype))
+    # Hops no higher than rounding cannot be followed, however long they last.
+    height = speed**2 / jnp.where(pressing > 0, 2 * pressing, 1.0)
+    growth = surge[1]
+    if several:  # another blow of this instant may have changed it
+        growth = force_rate(free, body.position, free, s, rested)
+    not_yet, hop, wait = _before_it_presses(speed, pressing, sign * growth)
+    height = jnp.where(not_yet, speed * hop - 0.5 * pressing * hop * hop, height)
+    flat = stop_gradient(height) <= 16 * float(jnp.finfo(s.dtype).eps) * (1 + jnp.abs(gap))
+    left = jnp.where(not_yet, wait, left)
+    brief = allowed(s).brief * limit
+    ends = stop_gradient(left) <= jnp.where(flat, 0.1 * limit, brief)
+    ends = ends & (flat | ~not_yet | (hop <= brief))
+    if plan.ticks(lane.state):
+        ends = ends & (stop_gradient(s + left) < stop_gradient(plan.end(lane.part)))
+    return ends, left
+
+
+def _before_it_presses(
+    rebound: Scalar, pressing: Scalar, growth: Scalar
+) -> tuple[Flag, Scalar, Scalar]:
+    """Whether a body is not pressed on yet but will be, since its force grows; then how long its
+    next hop lasts at most, and the time until it is pressed on.
+
+    A hop that begins against a force f, growing at the rate j, is over within 3 |f|/j + √(6 v/j).
+    """
+    v, pull, grows = stop_gradient((rebound, -pressing, growth))
+    not_yet = (pull >= 0) & (grows > 0)
+    rate = jnp.where(not_yet, grows, 1.0)
+    wait = jnp.where(not_yet, pull, 0.0) / rate
+    return not_yet, 3 * wait + jnp.sqrt(6 * jnp.where(not_yet, v, 0.0) / rate), wait
+
+
+def _broken(plan: Plan, arrival: Arrival, there: Any, blows: dict[int, Blow]) -> tuple[Scalar, ...]:
+    """As in `Lane`, without the contacts that were struck or pulled apart."""
+    assert arrival.contact is not None
+    contact = list(arrival.contact)
+    for k, blow in blows.items():
+        body = plan.scene.coordinates[k]
+        V, old = (stop_gradient(body.velocity(x)) for x in (arrival.state, there))
+        apart = (blow.struck > 0) | (jnp.abs(V - old) > _CLOSED * jnp.abs(V))
+        contact[k] = jnp.where(apart, 0.0, contact[k])
+    return tuple(contact)
+
+
+def _together(
+    plan: Plan, lane: Lane, trial: Trial, arrival: Arrival, blows: dict[int, Blow],
+    contact: tuple[Scalar, ...],
+) -> tuple[dict[int, Flag], dict[int, Scalar]]:  # fmt: skip
+    """Of each coordinate that was struck, whether it comes to rest, and the time that takes.
+
+    What presses on a body may be another one that comes to rest on it at the same instant: which of
+    them do is found by trying, those that rest being held while the others are looked at.
+    """
+    s, state = arrival.s, arrival.state
+    free = in_modes(plan.scene, arrival.modes)
+    speeds = {}
+    closed = list(contact)
+    for k, blow in blows.items():
+        sign, _ = plan.wall(k, blow.struck)
+        speeds[k] = jnp.maximum(
+            -sign * rates(free.field, plan.scene.coordinates[k].position, s, state).v, 0.0
+        )
+        stays = (blow.struck > 0) & (stop_gradient(blow.share) <= _CLOSED)
+        closed[k] = jnp.where(stays, blow.struck, contact[k])
+
+    def tried(found):
+        closed, _, _, count = found
+        new, waits = list(contact), []
+        for k, blow in blows.items():
+            alone = holding(plan.scene, arrival.modes, closed, but=k)
+            known = k, blow, speeds[k], (s, state)
+            ends, left = _ends(plan, lane, trial, alone, *known, several=True)
+            ends = (blow.struck > 0) & ends
+            new[k] = jnp.where(ends, blow.struck, contact[k])
+            waits.append(jnp.where(ends, left, 0.0))
+        changed = jnp.zeros((), bool)
+        for old, x in zip(closed, new, strict=True):
+            changed = changed | (old != x)
+        return tuple(new), tuple(waits), jnp.where(changed, 1.0, 0.0), count + 1.0
+
+    zero = jnp.zeros_like(s)
+    begin = tuple(closed), tuple(zero for _ in blows), zero + 1.0, zero
+    found, waits, _, _ = jax.lax.while_loop(
+        lambda x: (x[2] > 0) & (x[3] <= len(blows)), tried, begin
+    )
+    ends = {
+        k: pin_flag((blow.struck > 0) & (found[k] == blow.struck), s) for k, blow in blows.items()
+    }
+    return ends, dict(zip(blows, waits, strict=True))
