@@ -66,6 +66,7 @@ from .scene import AbstractDrive as AbstractDrive
 from .scene import AbstractEvent as AbstractEvent
 from .scene import AbstractScene as AbstractScene
 from .scene import AbstractSwitch as AbstractSwitch
+from .scene import ContactFriction as ContactFriction
 from .scene import Coordinate as Coordinate
 from .scene import CosineCrank as CosineCrank
 from .scene import DCMotor as DCMotor

@@ -9,7 +9,14 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
 from ..scene import AbstractScene
-from ..scene.event import begin_modes, events_of, is_autonomous, section_number
+from ..scene.event import (
+    begin_modes,
+    events_of,
+    is_autonomous,
+    rubs,
+    section_number,
+    struck_modes,
+)
 from . import results
 from ._own import check_field, check_laws
 from .events import Rates, force_rate, rates
@@ -242,6 +249,8 @@ class Plan(eqx.Module):
                 at = scene.coordinates[stop.coordinate].placed(start, stop.place, zero)
                 rests = contact[stop.coordinate] == to_event(i)
                 start = jtu.tree_map(lambda a, b, rests=rests: jnp.where(rests, a, b), at, start)
+            if rubs(scene):
+                modes = struck_modes(scene, zero, start, modes, contact=contact)
         length = zero + jax.lax.stop_gradient(scene.cycle) / self.method.steps_per_cycle
         if self.method.adaptive:
             length = length / 8

@@ -98,6 +98,7 @@ def _in_words(whose: str) -> Iterator[None]:
 def check_laws(scene: AbstractScene, speed: Scalar) -> None:
     """**Raises:** `TypeError` for a restitution law that cannot be traced or gives no number; as
     `check_field`."""
+    _check_frictions(scene)
     for i, stop in enumerate(scene.stops):
         if stop.is_one_number:
             continue
@@ -116,6 +117,21 @@ def check_laws(scene: AbstractScene, speed: Scalar) -> None:
             raise TypeError(
                 f"{whose} must return one number, but gives an array of shape {got.shape}."
             )
+
+
+def _check_frictions(scene: AbstractScene) -> None:
+    """**Raises:** `ValueError` for friction on a stop that there is not, or along a coordinate."""
+    known = {"stop": ("stop", len(scene.stops)), "along": ("coordinate", len(scene.coordinates))}
+    for switch in scene.switches:
+        if switch.rubs_on is None:
+            continue
+        for name, (what, count) in known.items():
+            number = getattr(switch, name)
+            if number >= count:
+                raise ValueError(
+                    f"Argument `{name}` of a ContactFriction must be the number of a {what} of the "
+                    f"{type(scene).__name__}, which has {count}, but got {number}."
+                )
 
 
 def check_period(scene: AbstractScene, start: Any) -> None:

@@ -9,7 +9,9 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
 from ..scene import AbstractScene, Coordinate, RigidStop
-from ..scene.contacts import added, forces, gained, push_of, shares
+from ..scene.contacts import held_flow
+from ..scene.event import rubs
+from ..scene.switch import field_in
 
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]
@@ -20,8 +22,8 @@ class Moving(AbstractScene):
 
     scene: AbstractScene
     modes: tuple[Scalar, ...]
-    held: tuple[Flag, ...]
-    """Of each coordinate, whether it rests on a stop; or none at all."""
+    contact: tuple[Scalar, ...]
+    """Of each coordinate, 1 + i while it rests on stop number i, else 0; or none at all."""
     stops: tuple[RigidStop, ...]
 
     @property
@@ -31,14 +33,14 @@ class Moving(AbstractScene):
 
     def field(self, s: Scalar, state: Any, *modes: Scalar) -> Any:
         """d(state)/ds, without motion of a body that is held."""
-        flow = self.scene.field(s, state, *self.modes)
-        limited = {stop.coordinate for stop in self.stops}
-        all_of_them = enumerate(zip(self.scene.coordinates, self.held, strict=False))
-        held = [(coordinate, rests) for k, (coordinate, rests) in all_of_them if k in limited]
-        if len(held) > 1:
-            return _held_together(held, state, flow)
-        for coordinate, rests in held:
-            still = _held_still(coordinate, state, flow)
+        flow = field_in(self.scene, s, state, self.modes)
+        limited = sorted({stop.coordinate for stop in self.stops})
+        if not self.contact:
+            return flow
+        if len(limited) > 1 or rubs(self.scene):
+            return held_flow(self.scene, flow, state, self.modes, self.contact)[0]
+        for k in limited:
+            still, rests = _held_still(self.scene.coordinates[k], state, flow), self.contact[k] > 0
             flow = jtu.tree_map(lambda a, b, rests=rests: jnp.where(rests, a, b), still, flow)
         return flow
 
@@ -57,24 +59,9 @@ def _held_still(coordinate: Coordinate, state: Any, flow: Any) -> Any:
     return jax.jvp(coordinate.placed, *along)[1]
 
 
-def _held_together(held: list[tuple[Coordinate, Flag]], state: Any, flow: Any) -> Any:
-    """The rate at which a state changes along `flow` while those coordinates that rest keep their
-    velocities, all at once: contacts that share a body are held by forces that depend on each
-    other.
-
-    A contact's force changes the state as `placed` does with the velocity. How much of each there
-    is, so that no velocity of a contact that rests changes, is a linear system as large as there
-    are contacts.
-    """
-    coordinates, rests = [x for x, _ in held], [x for _, x in held]
-    pushes = [push_of(coordinate, state) for coordinate in coordinates]
-    wanted = [-gained(coordinate, state, flow) for coordinate in coordinates]
-    return added(flow, forces(shares(coordinates, state, pushes), rests, wanted), pushes)
-
-
 def in_modes(scene: AbstractScene, modes: tuple[Scalar, ...]) -> AbstractScene:
     """The machine with its modes as they are; itself where it has none."""
-    return Moving(scene=scene, modes=modes, held=(), stops=scene.stops) if modes else scene
+    return Moving(scene=scene, modes=modes, contact=(), stops=scene.stops) if modes else scene
 
 
 def holding(
@@ -87,8 +74,8 @@ def holding(
     that of coordinate number `but` is free."""
     if contact is None or (but is not None and len(contact) == 1):
         return in_modes(scene, modes)
-    rests = tuple(x > 0 if but is None else (x > 0) & (j != but) for j, x in enumerate(contact))
-    return Moving(scene=scene, modes=modes, held=rests, stops=scene.stops)
+    others = (x if j != but else jnp.zeros_like(x) for j, x in enumerate(contact))
+    return Moving(scene=scene, modes=modes, contact=tuple(others), stops=scene.stops)
 
 
 def exact(scene: AbstractScene, state: Any) -> bool:

@@ -2,6 +2,7 @@
 
 from .base import AbstractScene as AbstractScene
 from .base import Coordinate as Coordinate
+from .contact_friction import ContactFriction as ContactFriction
 from .crank import AbstractCrank as AbstractCrank
 from .crank import CosineCrank as CosineCrank
 from .crank import SliderCrank as SliderCrank

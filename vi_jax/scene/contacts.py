@@ -6,7 +6,7 @@ of several contacts become what they are to be, is a linear system as large as t
 """
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -78,3 +78,91 @@ def added(state: Any, amounts: Sequence[Scalar], changes: Sequence[Any]) -> Any:
     for amount, change in zip(amounts, changes, strict=True):
         state = jtu.tree_map(lambda a, b, amount=amount: a + amount * b, state, change)
     return state
+
+
+class Rubbed(NamedTuple):
+    """An impact with friction."""
+
+    state: Any
+    pushed: Scalar
+    """How much of the contact's push there is, and of the push along it."""
+    dragged: Scalar
+
+
+def rubbed(machine: Any, number: int, friction: Any, before: Any, after: Any) -> Rubbed:
+    """An impact on stop `number` as Coulomb's friction has it: the body sticks, its velocity along
+    the stop reversed and scaled by the tangential restitution, if the impulse that this takes is at
+    most `level` times that of the stop; else it slips against that much.
+
+    **Arguments:** the friction on the stop; the states before the impact, and after one that is as
+    smooth as it is hard: the velocity towards the stop is that one's.
+    """
+    stop = machine.stops[number]
+    body, along = machine.coordinates[stop.coordinate], machine.coordinates[friction.along]
+    push, drag = push_of(body, before), push_of(along, before)
+    gains = shares((body, along), before, (push, drag))
+    across, slip = body.velocity(before), along.velocity(before)
+    wanted = body.velocity(after) - across
+    both = jnp.ones((), bool)
+    sticking = forces(gains, (both, both), (wanted, -(1 + friction.restitution) * slip))
+    level, away = friction.level * body.mass / along.mass, -float(stop.sign)
+    slips = jnp.abs(sticking[1]) > level * jnp.maximum(away * sticking[0], 0.0)
+    # Forward or backward, as it slips then: the stop's push drags along, too.
+    forward = _slipping(gains, wanted, -away * level)
+    backward = _slipping(gains, wanted, away * level)
+    left = slip + gains[1][0] * forward[0] + forward[1]
+    ahead = left > -friction.restitution * slip
+    pushed, dragged = (
+        jnp.where(slips, jnp.where(ahead, x, y), z)
+        for x, y, z in zip(forward, backward, sticking, strict=True)
+    )
+    place, speed = body.position(after), body.velocity(after)
+    moved = body.placed(added(before, (pushed, dragged), (push, drag)), place, speed)
+    return Rubbed(moved, pushed, dragged)
+
+
+def _slipping(gains: list[list[Scalar]], wanted: Scalar, ratio: Any) -> tuple[Scalar, Scalar]:
+    """How much of both pushes there is, so that the velocity towards the stop changes as wanted,
+    with so much of that along the stop for one of the other."""
+    pushed = wanted / (1 + ratio * gains[0][1])
+    return pushed, ratio * pushed
+
+
+def held_flow(
+    machine: Any, flow: Any, state: Any, modes: Sequence[Any], contact: Sequence[Any]
+) -> tuple[Any, dict[int, tuple[Scalar, Scalar]]]:
+    """The rate at which a state changes along `flow` while those coordinates that rest keep their
+    velocities, all at once: contacts that share a body are held by forces that depend on each
+    other, and on the friction there.
+
+    **Arguments:** the modes of the machine's switches, which come first; `contact` as in `Around`.
+
+    **Returns:** the rate, and of each friction on a stop, by its place among the switches, the
+    force along the stop and that which presses on it.
+    """
+    limited = sorted({stop.coordinate for stop in machine.stops})
+    bodies = [machine.coordinates[k] for k in limited]
+    pushes = [push_of(body, state) for body in bodies]
+    rests = [contact[k] > 0 for k in limited]
+    wanted = [-gained(body, state, flow) for body in bodies]
+    rubbing = [(i, x) for i, x in enumerate(machine.switches) if x.rubs_on is not None]
+    for i, friction in rubbing:
+        stop, at = machine.stops[friction.rubs_on], None
+        at = limited.index(stop.coordinate)
+        here = contact[stop.coordinate] == 1.0 + friction.rubs_on
+        along, body = machine.coordinates[friction.along], bodies[at]
+        drag = push_of(along, state)
+        # The stop pushes a body away from it, and friction against the way it slips.
+        ratio = modes[i] * friction.level * stop.sign * body.mass / along.mass
+        slips = jnp.where(here, ratio, 0.0)
+        pushes[at] = added(pushes[at], (slips,), (drag,))
+        bodies, pushes = [*bodies, along], [*pushes, drag]
+        rests, wanted = [*rests, here & (modes[i] == 0)], [*wanted, -gained(along, state, flow)]
+    amounts = forces(shares(bodies, state, pushes), rests, wanted)
+    found = {}
+    for place, (i, friction) in enumerate(rubbing, start=len(limited)):
+        stop = machine.stops[friction.rubs_on]
+        at = limited.index(stop.coordinate)
+        pressing = -stop.sign * amounts[at] * bodies[at].mass
+        found[i] = amounts[place] * bodies[place].mass, pressing
+    return added(flow, amounts, pushes), found

@@ -2,17 +2,34 @@
 
 import abc
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
+from .contacts import rubbed
 from .shown import Shown
 
 Scalar = Float[Array, ""]
 Modes = tuple[Scalar, ...]
+
+
+class Around(NamedTuple):
+    """What an event may have to know besides its own mode (see `AbstractEvent.sees_around`)."""
+
+    modes: Modes
+    """All modes of the machine."""
+    own: int
+    """Which of them is the event's."""
+    contact: tuple[Scalar, ...]
+    """Of each coordinate, 1 + i while it rests on stop number i, else 0; empty where none can."""
+
+    def instead(self, mode: Any) -> Modes:
+        """All modes, with another one in the place of the event's."""
+        mode = jnp.asarray(mode, jnp.result_type(self.modes[self.own]))
+        return (*self.modes[: self.own], mode, *self.modes[self.own + 1 :])
 
 
 class AbstractEvent(Shown):
@@ -37,6 +54,12 @@ class AbstractEvent(Shown):
     @property
     def holds_mode(self) -> bool:
         """Whether one of the machine's modes is this event's; then it has `begin` and `struck`."""
+        return False
+
+    @property
+    def sees_around(self) -> bool:
+        """Whether `guard`, `after` and `struck` of an event that holds a mode get a keyword
+        argument `around` as well, an `Around`."""
         return False
 
     @property
@@ -138,6 +161,18 @@ class AbstractSwitch(AbstractEvent):
         """None."""
         return state
 
+    @property
+    def rubs_on(self) -> int | None:
+        """The number of the stop that this is friction on, whose impacts rub too (see
+        `ContactFriction`)."""
+        return None
+
+    @property
+    def blends(self) -> bool:
+        """Whether in mode 0 the field is the mean of those of modes -1 and +1 that stays on the
+        surface where they meet (see `Switch`)."""
+        return False
+
     def contribution(self, machine: Any, s: Scalar, state: Any, mode: Scalar) -> Any:
         """What it adds to the machine's field in this mode, where it knows: of a soft stop the
         acceleration of its coordinate, of dry friction the force on the body that rubs."""
@@ -181,49 +216,82 @@ def section_number(machine: Any) -> int:
     return len(events_of(machine)) - 1
 
 
-def guard_of(machine: Any, number: int, s: Any, state: Any, modes: Modes) -> Scalar:
-    """What rises through zero at one of a machine's events, in these modes of it."""
-    event, own = _event(machine, number)
-    return event.guard(machine, s, state, *modes[own])
+def guard_of(
+    machine: Any, number: int, s: Any, state: Any, modes: Modes, contact: tuple[Any, ...] = ()
+) -> Scalar:
+    """What rises through zero at one of a machine's events, in these modes of it.
+
+    **Arguments:** `contact` as in `Around`.
+    """
+    event, own, more = _event(machine, number, modes, contact)
+    return event.guard(machine, s, state, *modes[own], **more)
 
 
 def jump_of(machine: Any, number: int, s: Any, state: Any, modes: Modes) -> Any:
     """The state after one of its events, also of one beside it."""
-    event, own = _event(machine, number)
-    return event.jump(machine, s, state, *modes[own])
+    event, own, _ = _event(machine, number, modes, ())
+    return _rubbed(machine, number, state, event.jump(machine, s, state, *modes[own]))
 
 
 def happens_at(machine: Any, number: int, s: Any, state: Any, modes: Modes) -> Any:
     """Whether one of its events happens where its guard has risen; `None` if always."""
-    event, own = _event(machine, number)
+    event, own, _ = _event(machine, number, modes, ())
     return event.happens(machine, s, state, *modes[own])
 
 
 def value_of(machine: Any, number: int, s: Any, state: Any, modes: Modes) -> Any:
     """What the log of events keeps of one of its events."""
-    event, own = _event(machine, number)
+    event, own, _ = _event(machine, number, modes, ())
     return event.value(machine, s, state, *modes[own])
 
 
-def after_event(machine: Any, number: int, s: Any, state: Any, modes: Modes) -> tuple[Any, Modes]:
-    """State and modes after one of its events."""
-    event, own = _event(machine, number)
-    state, new = event.after(machine, s, state, *modes[own])
+def after_event(
+    machine: Any, number: int, s: Any, state: Any, modes: Modes, contact: tuple[Any, ...] = ()
+) -> tuple[Any, Modes]:
+    """State and modes after one of its events.
+
+    **Arguments:** `contact` as in `Around`.
+    """
+    event, own, more = _event(machine, number, modes, contact)
+    new, changed = event.after(machine, s, state, *modes[own], **more)
     if event.holds_mode:
-        new = (*modes[: own.start], new, *modes[own.stop :])
-    return state, settled_modes(new, s)
+        changed = (*modes[: own.start], changed, *modes[own.stop :])
+    return _rubbed(machine, number, state, new), settled_modes(changed, s)
+
+
+def _rubbed(machine: Any, number: int, before: Any, after: Any) -> Any:
+    """The state after an impact on a stop with what friction makes of it."""
+    friction = rubbing_on(machine, number)
+    return after if friction is None else rubbed(machine, number, friction, before, after).state
+
+
+def rubbing_on(machine: Any, number: int) -> Any:
+    """The friction on stop number `number`, or `None`."""
+    if number >= len(machine.stops):
+        return None
+    return next((x for x in machine.switches if x.rubs_on == number), None)
+
+
+def rubs(machine: Any) -> bool:
+    """Whether there is friction on one of its stops."""
+    return any(x.rubs_on is not None for x in machine.switches)
 
 
 def mode_number(machine: Any, number: int) -> int:
     """Which mode an event holds that holds one."""
-    return _event(machine, number)[1].start
+    return sum(event.holds_mode for event in events_of(machine)[:number])
 
 
-def _event(machine: Any, number: int) -> tuple[AbstractEvent, slice]:
-    """An event, and which of the machine's modes it is given: its own, or all."""
-    events = events_of(machine)
-    own = sum(event.holds_mode for event in events[:number])
-    return events[number], slice(own, own + 1) if events[number].holds_mode else slice(None)
+def _event(
+    machine: Any, number: int, modes: Modes, contact: tuple[Any, ...]
+) -> tuple[AbstractEvent, slice, dict[str, Around]]:
+    """An event, which of the machine's modes it is given, its own or all, and what else."""
+    event = events_of(machine)[number]
+    if not event.holds_mode:
+        return event, slice(None), {}
+    own = mode_number(machine, number)
+    more = {"around": Around(modes, own, contact)} if event.sees_around else {}
+    return event, slice(own, own + 1), more
 
 
 def begin_modes(machine: Any, s: Scalar, state: Any) -> Modes:
@@ -234,13 +302,23 @@ def begin_modes(machine: Any, s: Scalar, state: Any) -> Modes:
 
 
 def struck_modes(
-    machine: Any, s: Scalar, state: Any, modes: Modes, own: Sequence[Any] | None = None
+    machine: Any,
+    s: Scalar,
+    state: Any,
+    modes: Modes,
+    own: Sequence[Any] | None = None,
+    contact: tuple[Any, ...] = (),
 ) -> Modes:
     """The modes after a jump, which left this state; the machine's own are those given, or stay as
-    they are."""
-    holders = [event for event in events_of(machine) if event.holds_mode]
-    both = zip(holders, modes, strict=False)
-    held = [event.struck(machine, s, state, mode) for event, mode in both]
+    they are.
+
+    **Arguments:** `contact` as in `Around`.
+    """
+    held = []
+    for number, event in enumerate(events_of(machine)):
+        if event.holds_mode:
+            _, place, more = _event(machine, number, modes, contact)
+            held.append(event.struck(machine, s, state, *modes[place], **more))
     kept = modes[len(held) :] if own is None else own
     return settled_modes([*held, *kept], s)
 

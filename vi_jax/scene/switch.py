@@ -4,9 +4,11 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 
-from .event import AbstractSwitch
+from .event import AbstractSwitch, Around
 
 
 class Switch(AbstractSwitch):
@@ -14,10 +16,32 @@ class Switch(AbstractSwitch):
 
     At zero it is the sign that the function is about to take by `rate(machine, s, state)`, if that
     is given, else +1.
+
+    Where the fields of both modes point at the surface on which the function vanishes, the motion
+    cannot leave it. With `slides=True` it slides along (mode 0) by Filippov's rule: its field is
+    that mean of the two, weighted between 0 and 1, which keeps the function at zero; it leaves
+    where one of the two points away. Without, such a lane ends as `RESULTS.sliding`. The machine's
+    field is never asked for mode 0.
     """
 
     function: Callable[..., Any] = eqx.field(static=True)
     rate: Callable[..., Any] | None = eqx.field(static=True, default=None)
+    slides: bool = eqx.field(static=True, default=False, kw_only=True)
+
+    @property
+    def may_slide(self) -> bool:
+        """Where it has no mode for that."""
+        return not self.slides
+
+    @property
+    def blends(self) -> bool:
+        """Where it slides."""
+        return self.slides
+
+    @property
+    def sees_around(self) -> bool:
+        """Where it slides: which way both fields point depends on the other modes."""
+        return self.slides
 
     def begin(self, machine, s, state):
         """The sign of the function."""
@@ -26,10 +50,60 @@ class Switch(AbstractSwitch):
         positive = (value > 0) | ((value == 0) & (rate >= 0))
         return jnp.where(positive, 1.0, -1.0).astype(value.dtype)
 
-    def guard(self, machine, s, state, mode):
-        """The function, falling from above or rising from below."""
-        return -mode * self.function(machine, s, state)
+    def struck(self, machine, s, state, mode, *, around: Around | None = None):
+        """The sign of the function."""
+        return self.begin(machine, s, state)
 
-    def after(self, machine, s, state, mode):
-        """On the other side."""
-        return state, -mode
+    def guard(self, machine, s, state, mode, *, around: Around | None = None):
+        """The function, falling from above or rising from below; while the motion slides, that
+        field which is the first to point away."""
+        value = -mode * self.function(machine, s, state)
+        if around is None:
+            return value
+        up, down = self._rates(machine, s, state, around)
+        return jnp.where(mode == 0, jnp.maximum(up, -down), value)
+
+    def after(self, machine, s, state, mode, *, around: Around | None = None):
+        """On the other side, or along the surface."""
+        if around is None:
+            return state, -mode
+        up, down = self._rates(machine, s, state, around)
+        slides = (mode != 0) & (up < 0) & (down > 0)
+        leaves = jnp.where(up > -down, 1.0, -1.0)
+        return state, jnp.where(slides, 0.0, jnp.where(mode == 0, leaves, -mode))
+
+    def _rates(self, machine: Any, s: Any, state: Any, around: Around) -> tuple[Any, Any]:
+        """How fast the function changes in modes +1 and -1."""
+        return tuple(
+            _rate(self, machine, s, state, field_in(machine, s, state, around.instead(mode)))
+            for mode in (1.0, -1.0)
+        )
+
+
+def _rate(switch: Switch, machine: Any, s: Any, state: Any, flow: Any) -> Any:
+    """How fast a switch's function changes along a flow."""
+    along = (s, state), (jnp.ones_like(s), flow)
+    return jax.jvp(lambda s, state: switch.function(machine, s, state), *along)[1]
+
+
+def field_in(machine: Any, s: Any, state: Any, modes: tuple[Any, ...], first: int = 0) -> Any:
+    """The machine's field in these modes; along the surfaces on which it slides the mean of those
+    on both sides.
+
+    **Arguments:** switches before number `first` are in mode +1 or -1.
+    """
+    found = [i for i, x in enumerate(machine.switches) if x.blends and i >= first]
+    if not found:
+        return machine.field(s, state, *modes)
+    i = found[0]
+    up, down = (
+        field_in(
+            machine, s, state, (*modes[:i], jnp.full_like(modes[i], m), *modes[i + 1 :]), i + 1
+        )
+        for m in (1.0, -1.0)
+    )
+    rises, falls = (_rate(machine.switches[i], machine, s, state, x) for x in (up, down))
+    apart = falls - rises
+    share = jnp.where(modes[i] == 0, falls / jnp.where(apart == 0, 1.0, apart), modes[i] > 0)
+    share = jnp.clip(share, 0.0, 1.0)
+    return jtu.tree_map(lambda a, b: b + share * (a - b), up, down)

@@ -17,7 +17,7 @@ from .aim import select
 from .faults import may_end
 from .guards import Crossing, furthest_landing
 from .happen import Arrival, happened
-from .impact import strike
+from .impact import is_compound, strike
 from .log import clock_at, noted
 from .rest import Release
 from .settle import settle
@@ -213,8 +213,9 @@ def _impact(
                 away = jnp.where(arrival.contact[k] > 0, sign, away)
             direction[k] = jnp.where(struck > 0, away, direction[k])
     modes = arrival.modes
-    if modes and len(blows) > 1:
-        new = struck_modes(scene, arrival.s, arrival.state, modes)
+    if modes and is_compound(scene):
+        contact = arrival.contact or ()
+        new = struck_modes(scene, arrival.s, arrival.state, modes, contact=contact)
         modes = select(met, new, modes)
     elif modes:
         for number, here in landed.items():

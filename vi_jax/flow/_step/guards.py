@@ -96,7 +96,8 @@ def _others(
     for number in plan.others(lane.state):
 
         def guard(s: Scalar, state: Any, number=number) -> Scalar:
-            return jnp.asarray(guard_of(scene, number, s, state, lane.modes))
+            contact = lane.contact or ()
+            return jnp.asarray(guard_of(scene, number, s, state, lane.modes, contact))
 
         begin = guard_rates(moving.field, guard, lane.s, lane.state)
         end = guard_rates(moving.field, guard, s1, new)

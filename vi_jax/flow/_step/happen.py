@@ -58,7 +58,7 @@ def happened(plan: Plan, taken: Flag, arrival: Arrival, c: Crossing, there: Any)
     met = scene, c.number, arrival.s, there, arrival.modes
     when = happens_at(*met)
     happens = c.landed if when is None else c.landed & when
-    new, modes = after_event(*met)
+    new, modes = after_event(*met, arrival.contact or ())
     modes = select(happens, modes, arrival.modes)
     log, clock = arrival.log, clock_at(plan, arrival.s, there)
     if event.holds_mode:

@@ -15,8 +15,9 @@ import jax.tree_util as jtu
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
-from ...scene import Coordinate, RigidStop
-from ...scene.contacts import forces, push_of, shares
+from ...scene import AbstractScene, Coordinate, RigidStop
+from ...scene.contacts import forces, push_of, rubbed, shares
+from ...scene.event import rubbing_on, rubs
 from .. import results
 from .._lane import HIT, Plan, to_event
 from ..moving import rounding
@@ -60,9 +61,14 @@ def strike(
     """The impacts in the state `there` of those stops that a step has `landed` upon; and what they
     were to each coordinate."""
     limited = sorted({stop.coordinate for stop in plan.scene.stops})
-    if len(limited) == 1:
+    if not is_compound(plan.scene):
         return _one_blow(plan, taken, arrival, landed, there, limited[0])
     return _sequence(plan, taken, arrival, landed, there, limited)
+
+
+def is_compound(scene: AbstractScene) -> bool:
+    """Whether several velocities change in an impact, across stops or along them; static."""
+    return len({stop.coordinate for stop in scene.stops}) > 1 or rubs(scene)
 
 
 def _rebound(stop: RigidStop, approach: Scalar) -> Scalar:
@@ -229,33 +235,20 @@ def _struck(instant: _Instant, x: _Round) -> _Round:
     goes_on = fastest > _NONE * most
     weak = goes_on & (fastest <= _WEAK * most)
 
-    on, wanted, places = [], [], []
-    hits, rebounds = {}, {}
-    for i, k in enumerate(instant.limited):
-        place, V = instant.bodies[i].position(state), velocities[i]
-        # In the limit what is still being struck comes to rest.
-        acts = weak & (x.struck[i] > 0) & (jnp.abs(stop_gradient(V)) <= _ALIKE * fastest)
-        aim = jnp.zeros_like(V)
-        for number, stop in enumerate(stops):
-            if stop.coordinate == k:
-                approach = closing[number]
-                hit = goes_on & ~weak & (stop_gradient(approach) >= (1 - _EQUAL) * fastest)
-                rebounds[number] = _rebound(stop, jnp.where(hit, approach, 0.0))
-                hits[number] = hit
-                acts, place = acts | hit, jnp.where(hit, stop.place, place)
-                aim = jnp.where(hit, rebounds[number], aim)
-        on, wanted, places = [*on, acts], [*wanted, aim - V], [*places, place]
-
-    amounts = forces(instant.gains, on, wanted)
-    new = state
-    for i, body in enumerate(instant.bodies):
-        moved = body.placed(state, places[i], velocities[i] + amounts[i])
-        new = jtu.tree_map(
-            lambda a, b, c, on=on[i]: a if c is b else a + jnp.where(on, c - b, 0.0),
-            new, state, moved,
-        )  # fmt: skip
-    after = [body.velocity(new) for body in instant.bodies]
-    arrival = _accounted(instant, arrival._replace(state=new), amounts, velocities, after)
+    hits, rebounds, found = {}, {}, jnp.zeros_like(goes_on)
+    for number, stop in enumerate(stops):
+        hit = goes_on & ~weak & (stop_gradient(closing[number]) >= (1 - _EQUAL) * fastest)
+        if rubs(plan.scene):  # with friction each by itself
+            hit, found = hit & ~found, found | hit
+        hits[number] = hit
+        rebounds[number] = _rebound(stop, jnp.where(hit, closing[number], 0.0))
+    # In the limit what is still being struck comes to rest.
+    slow = [
+        weak & (struck > 0) & (jnp.abs(stop_gradient(V)) <= _ALIKE * fastest)
+        for struck, V in zip(x.struck, velocities, strict=True)
+    ]
+    new, pushed = _thrown(instant, state, velocities, slow, hits, rebounds)
+    arrival = _accounted(instant, arrival._replace(state=new), state, pushed)
     struck, approaches = list(x.struck), list(x.approach)
     for number, hit in hits.items():
         stop, i = stops[number], instant.limited.index(stops[number].coordinate)
@@ -272,6 +265,42 @@ def _struck(instant: _Instant, x: _Round) -> _Round:
         arrival, tuple(struck), tuple(approaches), most,
         jnp.where(goes_on & ~weak, 1.0, 0.0), x.rounds + 1.0,
     )  # fmt: skip
+
+
+def _thrown(
+    instant: _Instant, state: Any, velocities: list[Scalar], slow: list[Flag],
+    hits: dict[int, Flag], rebounds: dict[int, Scalar],
+) -> tuple[Any, list[tuple[Coordinate, Scalar]]]:  # fmt: skip
+    """The state after the rebounds of those stops that are hit, with those coordinates at rest that
+    are so slow; and by how much each coordinate was pushed."""
+    scene = instant.plan.scene
+    on, wanted, places = list(slow), [-V for V in velocities], []
+    for i, body in enumerate(instant.bodies):
+        place = body.position(state)
+        for number, hit in hits.items():
+            if scene.stops[number].coordinate == instant.limited[i]:
+                on[i], place = on[i] | hit, jnp.where(hit, scene.stops[number].place, place)
+                wanted[i] = jnp.where(hit, rebounds[number] - velocities[i], wanted[i])
+        places.append(place)
+    amounts = forces(instant.gains, on, wanted)
+    new = state
+    for i, body in enumerate(instant.bodies):
+        moved = body.placed(state, places[i], velocities[i] + amounts[i])
+        new = jtu.tree_map(
+            lambda a, b, c, on=on[i]: a if c is b else a + jnp.where(on, c - b, 0.0),
+            new, state, moved,
+        )  # fmt: skip
+    pushed = []
+    for number, hit in hits.items():
+        friction = rubbing_on(scene, number)
+        if friction is not None:
+            i = instant.limited.index(scene.stops[number].coordinate)
+            rough = rubbed(scene, number, friction, state, new)
+            new = select(hit, rough.state, new)
+            amounts[i] = jnp.where(hit, rough.pushed, amounts[i])
+            along = scene.coordinates[friction.along]
+            pushed.append((along, jnp.where(hit, rough.dragged, 0.0)))
+    return new, [*pushed, *zip(instant.bodies, amounts, strict=True)]
 
 
 def _closing(instant: _Instant, x: _Round, velocities: list[Scalar]) -> dict[int, Scalar]:
@@ -293,13 +322,13 @@ def _closing(instant: _Instant, x: _Round, velocities: list[Scalar]) -> dict[int
 
 
 def _accounted(
-    instant: _Instant, arrival: Arrival, amounts: list[Scalar], before: list[Scalar],
-    after: list[Scalar],
-) -> Arrival:  # fmt: skip
+    instant: _Instant, arrival: Arrival, before: Any, pushed: list[tuple[Coordinate, Scalar]]
+) -> Arrival:
     """With the energy that the impacts have lost: the work of each force at the mean velocity of
     its contact. A law that gains some ends the lane."""
     lost, size = jnp.zeros_like(arrival.s), jnp.zeros_like(arrival.s)
-    for body, amount, V, left in zip(instant.bodies, amounts, before, after, strict=True):
+    for body, amount in pushed:
+        V, left = body.velocity(before), body.velocity(arrival.state)
         lost = lost - body.mass * amount * 0.5 * (V + left)
         size = size + body.mass * jnp.abs(amount) * (jnp.abs(V) + jnp.abs(left))
     if arrival.loss is not None:

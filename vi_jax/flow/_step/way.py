@@ -1,6 +1,5 @@
 """The last part of a way to an event, as `drift` asks for it."""
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -12,7 +11,7 @@ from jaxtyping import Array, Float
 from ...scene.event import guard_of, section_number
 from .._lane import Plan
 from ..events import rates
-from ..moving import Moving
+from ..moving import Moving, holding
 from .guards import Crossing
 
 Scalar = Float[Array, ""]
@@ -43,11 +42,11 @@ class Way:
 
         def event(moving, fixed, rest):
             (machine, bound), (s, state, _) = self._whole(fixed, rest), moving
-            scene, modes = _parts(machine)
+            scene, modes, contact = _parts(machine)
             clocked = scene.clock(state) is not None
             if clocked and c.number == section_number(scene):
                 return scene.clock(state) - bound  # which may be that of a part of a cycle
-            return guard_of(scene, c.number, s, state, modes)
+            return guard_of(scene, c.number, s, state, modes, contact)
 
         return self._pure(event)
 
@@ -65,8 +64,7 @@ class Way:
 
         def acceleration(moving, fixed, rest):
             (machine, _), (s, state, _) = self._whole(fixed, rest), moving
-            held = tuple(x & (j != k) for j, x in enumerate(machine.held))
-            free = dataclasses.replace(machine, held=held)
+            free = holding(machine.scene, machine.modes, machine.contact, but=k)
             return rates(free.field, machine.scene.coordinates[k].position, s, state).a
 
         return self._pure(acceleration)
@@ -89,6 +87,8 @@ class Way:
         return lambda moving, fixed, rest: written(moving, fixed[0], rest, *fixed[1][here])
 
 
-def _parts(machine: Any) -> tuple[Any, tuple[Scalar, ...]]:
-    """The machine itself, and its modes."""
-    return (machine.scene, machine.modes) if isinstance(machine, Moving) else (machine, ())
+def _parts(machine: Any) -> tuple[Any, tuple[Scalar, ...], tuple[Scalar, ...]]:
+    """The machine itself, its modes, and what of it rests on which stop."""
+    if isinstance(machine, Moving):
+        return machine.scene, machine.modes, machine.contact
+    return machine, (), ()

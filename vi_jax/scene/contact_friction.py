@@ -1,0 +1,122 @@
+"""Dry friction on a stop: in its impacts, and while a body rests on it."""
+
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax.lax import stop_gradient
+from jaxtyping import Array, Float
+
+from .._checks import NOT_NEGATIVE, SHARE, count, require_ranges
+from .._numbers import real
+from .contacts import held_flow
+from .event import AbstractSwitch, Around
+
+
+class ContactFriction(AbstractSwitch):
+    """Coulomb friction between a body and a stop that it hits, or rests on.
+
+    In an impact the body sticks or slips along the stop: it sticks, with its velocity along the
+    stop reversed and scaled by `restitution`, if that takes an impulse of no more than `level`
+    times the stop's, and slips against that much else. While it rests on the stop it slips forward
+    or backward (mode +1, -1) against `level` times the force that presses it on, or sticks (mode
+    0), which may jam it. That force follows from what else acts, other contacts included; the
+    machine's field says nothing of it, and gets the mode like those of all switches.
+
+    Newton's and Coulomb's laws together may gain energy where the velocities across and along a
+    stop are coupled (T. R. Kane): an impact that would ends its lane as `RESULTS.bad_impact`.
+
+    **Arguments:**
+
+    - `level`: μ, not negative.
+    - `stop`: the number of the stop among the machine's.
+    - `along`: the number of the coordinate that the body slips along, with its `mass`: no stop need
+      limit it, and of its position nothing is asked.
+    - `restitution`: along the stop, in [0, 1].
+    """
+
+    level: Float[Array, "..."] = eqx.field(converter=real("level"))
+    """μ (dimensionless)."""
+    stop: int = eqx.field(static=True, kw_only=True)
+    along: int = eqx.field(static=True, kw_only=True)
+    restitution: Float[Array, "..."] = eqx.field(
+        kw_only=True, default=0.0, converter=real("restitution")
+    )
+    """Tangential (dimensionless)."""
+    ranges: ClassVar = {"level": NOT_NEGATIVE, "restitution": SHARE}
+
+    def __check_init__(self):
+        require_ranges(self)
+        count("stop", self.stop)
+        count("along", self.along)
+
+    @property
+    def rubs_on(self) -> int:
+        """Its stop."""
+        return self.stop
+
+    @property
+    def sees_around(self) -> bool:
+        """True: it acts while its body rests on the stop."""
+        return True
+
+    @property
+    def may_slide(self) -> bool:
+        """Never along its own surface: where both sides point at it, the body sticks."""
+        return False
+
+    def begin(self, machine, s, state):
+        """The way that the body slips."""
+        return self._slip(machine, state)
+
+    def struck(self, machine, s, state, mode, *, around: Around | None = None):
+        """The way that the body slips, or would."""
+        slips = self._slip(machine, state)
+        return jnp.where(slips == 0, self._from_rest(machine, s, state, around), slips)
+
+    def guard(self, machine, s, state, mode, *, around: Around | None = None):
+        """The velocity along the stop coming to zero; or the force coming to what friction can
+        hold. Nothing happens where the body does not rest on the stop."""
+        if around is None or not around.contact:
+            return jnp.full_like(s, -1.0)
+        drag, pressing = self._forces(machine, s, state, around, mode)
+        velocity = machine.coordinates[self.along].velocity(state)
+        own = jnp.where(mode == 0, jnp.abs(drag) - self.level * pressing, -mode * velocity)
+        return jnp.where(self._rests(machine, around), own, -1.0)
+
+    def after(self, machine, s, state, mode, *, around: Around | None = None):
+        """Sticking, or slipping the way the force pulls."""
+        along = machine.coordinates[self.along]
+        # It vanishes to rounding.
+        velocity = jnp.zeros_like(along.velocity(state))
+        stopped = along.placed(state, along.position(state), velocity)
+        state = jtu.tree_map(lambda a, b: jnp.where(mode == 0, a, b), state, stopped)
+        return state, self._from_rest(machine, s, state, around, sticks=mode != 0)
+
+    def _rests(self, machine: Any, around: Around) -> Any:
+        return around.contact[machine.stops[self.stop].coordinate] == 1.0 + self.stop
+
+    def _slip(self, machine: Any, state: Any) -> Any:
+        """The sign of the velocity along the stop; zero where that is rounding."""
+        velocity = machine.coordinates[self.along].velocity(state)
+        size = sum((jnp.sum(jnp.abs(x)) for x in jtu.tree_leaves(state)), start=jnp.asarray(0.0))
+        least = stop_gradient(16 * jnp.finfo(velocity.dtype).eps * size)
+        return jnp.where(jnp.abs(velocity) <= least, 0.0, jnp.sign(velocity))
+
+    def _from_rest(
+        self, machine: Any, s: Any, state: Any, around: Around | None, sticks: Any = True
+    ) -> Any:
+        """Sticking, if it may, where the force is not too large; else the way that it pulls."""
+        if around is None or not around.contact:
+            return jnp.zeros_like(s)
+        drag, pressing = self._forces(machine, s, state, around, jnp.zeros_like(s))
+        holds = sticks & (jnp.abs(drag) <= self.level * pressing)
+        away = jnp.where(drag > 0, -1.0, 1.0)
+        return jnp.where(holds | ~self._rests(machine, around), 0.0, away)
+
+    def _forces(self, machine: Any, s: Any, state: Any, around: Around, mode: Any) -> Any:
+        """Those along and on the stop, in a mode of it."""
+        modes = around.instead(mode)
+        flow = machine.field(s, state, *modes)
+        return held_flow(machine, flow, state, modes, around.contact)[1][around.own]
