@@ -1,0 +1,250 @@
+"""Friction on a stop: in its impacts, and under the force of a body that rests on it."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+
+
+class Plane(eqx.Module):
+    x: Any
+    y: Any
+    u: Any
+    v: Any
+
+
+def at(*numbers):
+    return Plane(*(jnp.asarray(float(x)) for x in numbers))
+
+
+class Block(vi.AbstractScene):
+    """A particle above a floor at y = 0, pulled along it."""
+
+    friction: Any = 0.3
+    restitution: Any = 0.0
+    along: Any = 0.0
+    """Tangential restitution."""
+    pull: Any = 0.0
+    """Amplitude of a force cos s along the floor."""
+    lift: Any = 0.0
+    """Amplitude of a force sin 2s up."""
+
+    @property
+    def coordinates(self):
+        return (
+            vi.Coordinate(lambda z: z.y, lambda z: z.v, lambda z, Y, V: Plane(z.x, Y, z.u, V)),
+            vi.Coordinate(lambda z: z.x, lambda z: z.u, lambda z, Y, V: Plane(Y, z.y, V, z.v)),
+        )
+
+    @property
+    def stops(self):
+        return (vi.RigidStop(0.0, self.restitution, "left"),)
+
+    @property
+    def switches(self):
+        return (vi.ContactFriction(self.friction, stop=0, along=1, restitution=self.along),)
+
+    @property
+    def cycle(self):
+        return 2 * jnp.pi
+
+    def field(self, s, z, mode):
+        return Plane(z.u, z.v, self.pull * jnp.cos(s), -1 + self.lift * jnp.sin(2 * s))
+
+
+@pytest.mark.parametrize("along", [0.0, 0.5])
+def test_an_oblique_impact_slips_or_sticks(along):
+    """Closed form: the impulse along the floor is μ (1 + k) v of the speed v, or what sticking
+    takes."""
+    k, mu = 0.8, 0.3
+
+    def run(u, v):
+        zero = jnp.zeros_like(u)
+        block = Block(mu, k, along)
+        return vi.simulate(block, Plane(zero, zero + 0.5, u, -v), 1, impact_log=40)
+
+    u, v = (x.ravel() for x in jnp.meshgrid(jnp.linspace(-2, 2, 9), jnp.linspace(0, 2, 5)))
+    runs = jax.vmap(run)(u, v)
+    assert bool(runs.successful.all())
+    for i in range(len(u)):
+        slip, lost = float(u[i]), 0.0
+        for speed in runs.impact_log.speed[i, 0]:
+            if not np.isnan(speed):
+                most, sticks = mu * (1 + k) * speed, -(1 + along) * slip
+                new = slip + float(np.clip(sticks, -most, most))
+                lost += 0.5 * (slip**2 - new**2) + 0.5 * (1 - k * k) * float(speed) ** 2
+                slip = new
+        if int(runs.impacts[i, 0]) < 40 and runs.last.y[i] > 0:  # still bouncing
+            assert float(runs.last.u[i]) == pytest.approx(slip, abs=1e-9)
+            assert float(runs.impact_energy[i, 0]) == pytest.approx(lost, abs=1e-9)
+    # Some end at rest, some slipping, and none turns round but by its restitution.
+    assert along or bool((runs.last.u * u >= -1e-12).all())
+
+
+def test_a_block_slides_to_rest():
+    """It lands without restitution at speed 1 along the floor and √2·.1 down: loses μ of that, then
+    slides on v²/(2μ)."""
+    mu = 0.3
+    run = vi.simulate(Block(mu), at(0, 0.01, 1, 0), 1, event_log=6)
+    fall = np.sqrt(0.02)
+    speed = 1 - mu * fall
+    assert run.event_log.kind[0, :3].tolist() == [0, 1, 3]  # hit, rests, sticks
+    np.testing.assert_allclose(
+        run.event_log.phase[0, :3], [fall, fall, fall + speed / mu], atol=1e-9
+    )
+    np.testing.assert_allclose(float(run.last.x), fall + speed**2 / (2 * mu), atol=1e-9)
+    assert float(run.last.u) == 0.0
+
+
+def force(machine, s, z):
+    return machine.pull * jnp.cos(s)
+
+
+def pressing(machine, s, z):
+    return 1 - machine.lift * jnp.sin(2 * s)
+
+
+class Rubbing(vi.AbstractScene):
+    """The same block on a floor that it never leaves."""
+
+    friction: Any = 0.3
+    pull: Any = 0.0
+    lift: Any = 0.0
+    stops: tuple = ()
+
+    @property
+    def switches(self):
+        friction = vi.DryFriction(
+            self.friction,
+            velocity=lambda machine, z: z.V,
+            force=force,
+            stopped=lambda machine, z: vi.OscillatorState(z.Y, jnp.zeros_like(z.V)),
+            load=pressing,
+        )
+        return (friction,)
+
+    @property
+    def cycle(self):
+        return 2 * jnp.pi
+
+    def field(self, s, z, mode):
+        rub = self.switches[0].contribution(self, s, z, mode)
+        return vi.OscillatorState(z.V, force(self, s, z) + rub)
+
+
+@pytest.mark.parametrize("lift", [0.0, 0.6])
+def test_under_the_force_of_the_floor_friction_is_dry_friction(lift):
+    """Stick and slip of a block under a force that varies: beside friction under a given load; with
+    their derivatives."""
+
+    def ends(pull, one):
+        if one:
+            run = vi.simulate(Block(0.3, pull=pull, lift=lift), at(0, 0, 0.2, 0), 4)
+            return jnp.stack([run.last.x, run.last.u]), run.successful
+        start = vi.OscillatorState(jnp.array(0.0), jnp.array(0.2))
+        run = vi.simulate(Rubbing(0.3, pull, lift), start, 4)
+        return jnp.stack([run.last.Y, run.last.V]), run.successful
+
+    pulls = jnp.array([0.2, 0.5, 1.1])
+    for one, other in zip(
+        *(jax.vmap(jax.jacfwd(lambda x, w=w: ends(x, w), has_aux=True))(pulls) for w in (1, 0)),
+        strict=True,
+    ):
+        np.testing.assert_allclose(one, other, atol=1e-7)
+    one, other = (jax.vmap(lambda x, w=w: ends(x, w)[0])(pulls) for w in (1, 0))
+    np.testing.assert_allclose(one, other, atol=1e-8)
+
+
+class Coupled(vi.AbstractScene):
+    """Two coordinates that share their mass, as those of a rod whose end hits a floor do."""
+
+    coupling: Any = 0.7
+    friction: Any = 0.5
+    restitution: Any = 0.9
+
+    @property
+    def coordinates(self):
+        c = self.coupling
+
+        def across(z, Y, V):
+            return Plane(z.x - c * (Y - z.y), Y, z.u - c * (V - z.v), V)
+
+        def along(z, Y, V):
+            return Plane(Y, z.y - c * (Y - z.x), V, z.v - c * (V - z.u))
+
+        mass = 1 - c * c
+        return (
+            vi.Coordinate(lambda z: z.y, lambda z: z.v, across, mass),
+            vi.Coordinate(lambda z: z.x, lambda z: z.u, along, mass),
+        )
+
+    @property
+    def stops(self):
+        return (vi.RigidStop(0.0, self.restitution, "left"),)
+
+    @property
+    def switches(self):
+        return (vi.ContactFriction(self.friction, stop=0, along=1),)
+
+    @property
+    def cycle(self):
+        return 1.0
+
+    def field(self, s, z, mode):
+        return Plane(z.u, z.v, 0 * z.u, 0 * z.v)
+
+
+def test_a_law_that_would_gain_energy_is_refused():
+    """Newton's law across a stop and Coulomb's along it may add energy where both velocities are
+    coupled (Kane's paradox); the impulses beside the linear complementarity problem, solved by
+    trying its cases."""
+    machine = Coupled()
+    c, mu, k = 0.7, 0.5, 0.9
+    mass = np.array([[1, c], [c, 1]])  # of (x, y)
+    inverse = np.linalg.inv(mass)
+    slips = np.linspace(-3, 3, 25)
+
+    def last(u):
+        start = Plane(0 * u, 0 * u + 0.5, u, 0 * u - 1.0)
+        run = vi.simulate(machine, start, 1)
+        return run.last.u, run.last.v, run.successful, run.result == vi.RESULTS.bad_impact
+
+    u, v, good, bad = (np.asarray(x) for x in jax.vmap(last)(jnp.asarray(slips)))
+    gained = 0
+    for i, slip in enumerate(slips):
+        before = np.array([slip, -1.0])
+        found = []
+        stick = np.linalg.solve(inverse, np.array([0.0, k]) - before)
+        if stick[1] >= 0 and abs(stick[0]) <= mu * stick[1]:
+            found.append(before + inverse @ stick)
+        for way in (1, -1):
+            impulse = np.array([-way * mu, 1.0])
+            impulse = impulse * (1 + k) / (inverse @ impulse)[1]
+            after = before + inverse @ impulse
+            if impulse[1] >= 0 and way * after[0] > 0:
+                found.append(after)
+        assert len(found) == 1
+        after = found[0]
+        if after @ mass @ after > before @ mass @ before * (1 + 1e-9):
+            assert bad[i]
+            gained += 1
+        else:
+            assert good[i]
+            np.testing.assert_allclose([u[i], v[i]], after, atol=1e-10)
+    assert 0 < gained < 20
+
+
+def test_numbers_of_what_is_not_there_are_refused():
+    class Wrong(Block):
+        @property
+        def switches(self):
+            return (vi.ContactFriction(0.3, stop=1, along=1),)
+
+    with pytest.raises(ValueError, match=r"`stop` of a ContactFriction .* has 1, but got 1"):
+        vi.simulate(Wrong(), at(0, 1, 0, 0), 1)
+    with pytest.raises(ValueError, match="level"):
+        vi.ContactFriction(-0.1, stop=0, along=1)

@@ -1,0 +1,122 @@
+"""Motions that slide along a switch's surface, by Filippov's rule."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+from vi_jax import lanes
+
+
+def speed(machine, s, z):
+    return z.V
+
+
+class Oscillator(vi.AbstractScene):
+    """x'' = -x - sgn x'."""
+
+    stops: tuple = ()
+    switches: tuple = (vi.Switch(speed, slides=True),)
+
+    @property
+    def cycle(self):
+        return 2 * jnp.pi
+
+    def field(self, s, z, mode):
+        return vi.OscillatorState(z.V, -z.Y - mode)
+
+
+def test_an_oscillator_with_friction_sticks():
+    """From (12, 6) it turns at √205 - 1 and ends, 14 half turns later, at 15 - √205."""
+    start = vi.OscillatorState(jnp.array(12.0), jnp.array(6.0))
+    run = vi.simulate(Oscillator(), start, 9, event_log=8)
+    assert bool(run.successful)
+    assert float(run.last.Y) == pytest.approx(15 - np.sqrt(205), abs=1e-8)
+    assert abs(float(run.last.V)) < 1e-12
+    modes = np.asarray(run.event_log.value)[np.asarray(run.event_log.kind) == 3]
+    assert modes[-1] == 0 and (modes[:-1] != 0).all()
+
+
+class Pushed(eqx.Module):
+    x: Any
+    y: Any
+
+
+def place(machine, s, z):
+    return z.x
+
+
+class Relay(vi.AbstractScene):
+    """x' = a sin s - m, y' = m with m = sgn x: on x = 0 it slides while |a sin s| < 1."""
+
+    amplitude: Any = 0.5
+    stops: tuple = ()
+    slides: bool = eqx.field(static=True, default=True)
+
+    @property
+    def switches(self):
+        return (vi.Switch(place, slides=self.slides),)
+
+    @property
+    def cycle(self):
+        return 2 * jnp.pi
+
+    def field(self, s, z, mode):
+        return Pushed(self.amplitude * jnp.sin(s) - mode, mode)
+
+
+def at(x, y):
+    return Pushed(jnp.asarray(x), jnp.asarray(y))
+
+
+def test_it_slides_as_the_mean_that_stays_on_the_surface():
+    def last(amplitude, x):
+        run = vi.simulate(Relay(amplitude), at(x, 0.0), 1, event_log=8)
+        return (run.last.x, run.last.y), (run.event_log, run.successful)
+
+    (x, y), (log, good) = vi.jit(last)(0.5, 0.2)
+    assert bool(good) and abs(float(x)) < 1e-12
+    # It comes to the surface where .2 + .5 (1 - cos s) = s.
+    met = float(log.phase[0, 0])
+    assert 0.2 + 0.5 * (1 - np.cos(met)) == pytest.approx(met, abs=1e-9)
+    assert float(y) == pytest.approx(met + 0.5 * (np.cos(met) - 1), abs=1e-8)
+    # Derivatives by both numbers, through the event after which one of them is forgotten.
+    slope = jax.jacfwd(lambda p: jnp.stack(last(*p)[0]))(jnp.array([0.5, 0.2]))
+    h = 1e-4
+    for j in range(2):
+        step = h * np.eye(2)[j]
+        ahead, behind = (np.array(last(*(np.array([0.5, 0.2]) + d * step))[0]) for d in (1, -1))
+        np.testing.assert_allclose(slope[:, j], (ahead - behind) / (2 * h), atol=1e-7)
+
+
+@pytest.mark.parametrize("way", ["auto", "xla"])
+def test_it_leaves_where_one_side_points_away(way):
+    a = 1.5
+    with lanes.road(way):
+        run = vi.simulate(
+            Relay(a), at(-1e-3, 0.0), 1, event_log=12, method=vi.FixedStep(steps_per_cycle=48)
+        )
+    kinds, phases = np.asarray(run.event_log.kind[0]), np.asarray(run.event_log.phase[0])
+    modes = np.asarray(run.event_log.value[0])[kinds == 3]
+    assert bool(run.successful)
+    leaves = phases[kinds == 3][modes == 1.0]
+    np.testing.assert_allclose(leaves, [np.arcsin(1 / a)], atol=1e-8)
+    leaves = phases[kinds == 3][modes == -1.0]
+    np.testing.assert_allclose(leaves, [np.pi + np.arcsin(1 / a)], atol=1e-8)
+
+
+def test_a_cycle_that_slides_forgets():
+    """It forgets where it began."""
+    machine = Relay(1.5)
+    run = vi.simulate(machine, at(0.1, 0.0), 3)
+    assert float(run.sections.x[-1]) == pytest.approx(float(run.sections.x[-2]), abs=1e-9)
+    slope = jax.jacfwd(lambda x: vi.simulate(machine, at(x, 0.0), 1).last.x)(0.1)
+    assert abs(float(slope)) < 1e-9
+
+
+def test_without_a_mode_for_it_the_lane_says_so():
+    run = vi.simulate(Relay(0.5, slides=False), at(0.2, 0.0), 1)
+    assert bool(run.result == vi.RESULTS.sliding)
