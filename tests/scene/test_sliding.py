@@ -120,3 +120,55 @@ def test_a_cycle_that_slides_forgets():
 def test_without_a_mode_for_it_the_lane_says_so():
     run = vi.simulate(Relay(0.5, slides=False), at(0.2, 0.0), 1)
     assert bool(run.result == vi.RESULTS.sliding)
+
+
+def drive(machine, s, z):
+    return machine.amplitude * jnp.cos(s) - z.Y
+
+
+class Driven(vi.AbstractScene):
+    """A body on a spring and on a rough floor, driven slowly: it slides twice a cycle."""
+
+    amplitude: Any = 1.0
+    omega: Any = 0.3
+    level: Any = 0.4
+    dry: bool = eqx.field(static=True, default=False)
+    stops: tuple = ()
+
+    @property
+    def switches(self):
+        if not self.dry:
+            return (vi.Switch(speed, slides=True),)
+        return (
+            vi.DryFriction(
+                self.level,
+                velocity=lambda machine, z: z.V,
+                force=drive,
+                stopped=lambda machine, z: vi.OscillatorState(z.Y, jnp.zeros_like(z.V)),
+            ),
+        )
+
+    @property
+    def cycle(self):
+        return 2 * jnp.pi
+
+    def field(self, s, z, mode):
+        rub = -self.level * mode
+        if self.dry:
+            rub = self.switches[0].contribution(self, s, z, mode)
+        return vi.OscillatorState(z.V / self.omega, (drive(self, s, z) + rub) / self.omega)
+
+
+@pytest.mark.slow
+def test_sticking_is_sliding_along_the_surface_of_no_speed():
+    """Orbit, multipliers and branch beside those of `DryFriction`, whose mode says the same."""
+    found = []
+    for machine in (Driven(), Driven(dry=True)):
+        start = vi.OscillatorState(jnp.array(0.1), jnp.array(0.0))
+        orbit = vi.find_orbit(machine, vi.simulate(machine, start, 1, settle=20).last)
+        branch = vi.continue_orbit(orbit, parameter="level", bounds=(0.1, 0.6))
+        (graze,) = branch.special
+        assert graze.kind == "grazing"
+        multiplier = float(jnp.abs(orbit.multipliers).max())
+        found.append((float(orbit.state.Y), multiplier, float(graze.value)))
+    np.testing.assert_allclose(*found, atol=1e-8)

@@ -297,8 +297,12 @@ def _event(
 def begin_modes(machine: Any, s: Scalar, state: Any) -> Modes:
     """The modes of a motion that begins in `state`: those that events hold, in their order, then
     the machine's own."""
-    held = [event.begin(machine, s, state) for event in events_of(machine) if event.holds_mode]
-    return settled_modes([*held, *machine.begin(s, state)], s)
+    held = [event for event in events_of(machine) if event.holds_mode]
+    modes = [*(event.begin(machine, s, state) for event in held), *machine.begin(s, state)]
+    modes = settled_modes(modes, s)
+    if any(event.sees_around for event in held):  # which looks at the other modes
+        modes = struck_modes(machine, s, state, modes)
+    return modes
 
 
 def struck_modes(

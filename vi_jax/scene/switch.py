@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+from jax.lax import stop_gradient
 
 from .event import AbstractSwitch, Around
 
@@ -51,8 +52,14 @@ class Switch(AbstractSwitch):
         return jnp.where(positive, 1.0, -1.0).astype(value.dtype)
 
     def struck(self, machine, s, state, mode, *, around: Around | None = None):
-        """The sign of the function."""
-        return self.begin(machine, s, state)
+        """The sign of the function; 0 on a surface that both fields point at."""
+        side = self.begin(machine, s, state)
+        if around is None:
+            return side
+        up, down = stop_gradient(self._rates(machine, s, state, around))
+        rounding = 64 * float(jnp.finfo(up.dtype).eps) * (1 + jnp.abs(up) + jnp.abs(down))
+        here = jnp.abs(stop_gradient(self.function(machine, s, state))) <= rounding
+        return jnp.where(here & (up < 0) & (down > 0), 0.0, side)
 
     def guard(self, machine, s, state, mode, *, around: Around | None = None):
         """The function, falling from above or rising from below; while the motion slides, that
@@ -74,10 +81,8 @@ class Switch(AbstractSwitch):
 
     def _rates(self, machine: Any, s: Any, state: Any, around: Around) -> tuple[Any, Any]:
         """How fast the function changes in modes +1 and -1."""
-        return tuple(
-            _rate(self, machine, s, state, field_in(machine, s, state, around.instead(mode)))
-            for mode in (1.0, -1.0)
-        )
+        up, down = (field_in(machine, s, state, around.instead(mode)) for mode in (1.0, -1.0))
+        return _rate(self, machine, s, state, up), _rate(self, machine, s, state, down)
 
 
 def _rate(switch: Switch, machine: Any, s: Any, state: Any, flow: Any) -> Any:
@@ -105,5 +110,5 @@ def field_in(machine: Any, s: Any, state: Any, modes: tuple[Any, ...], first: in
     rises, falls = (_rate(machine.switches[i], machine, s, state, x) for x in (up, down))
     apart = falls - rises
     share = jnp.where(modes[i] == 0, falls / jnp.where(apart == 0, 1.0, apart), modes[i] > 0)
-    share = jnp.clip(share, 0.0, 1.0)
+    # Not kept within [0, 1]: a step ends where it leaves that, and sees a smooth field till then.
     return jtu.tree_map(lambda a, b: b + share * (a - b), up, down)
