@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from .. import lanes
 from ..flow import AbstractMethod
+from ..flow.beside import Beside
 from ..flow.moving import in_modes
 from ..scene import AbstractScene
 
@@ -41,8 +42,10 @@ class Flight(eqx.Module):
         """State and time after a step of the method."""
         moving, state = self.moving, self.unravel(u)
         paced = moving.pace(s0, state) is not None
-        new, after, _ = self.method.step(moving, s0, s1, state, time if paced else None)
-        return ravel_pytree(new)[0], time + (s1 - s0) if after is None else after
+        beside = Beside(time, {}) if paced else None
+        new, after, _ = self.method.step(moving, s0, s1, state, beside)
+        paced_time = None if after is None else after.time
+        return ravel_pytree(new)[0], time + (s1 - s0) if paced_time is None else paced_time
 
     def once(self, function: Callable[["Flight", Any], Any], inputs: Any) -> Any:
         """A function of the flight and of one lane's numbers as vector code."""
