@@ -15,51 +15,14 @@ import vi_jax as vi
 from scipy.integrate import solve_ivp
 
 from differences import quick
-
-
-class Shaken(vi.AbstractScene):
-    """By phase, so that time is another number than s."""
-
-    amplitude: jax.Array | float = 1.0
-    frequency: jax.Array | float = 0.8
-    gap: jax.Array | float = 0.5
-    restitution: jax.Array | float = 0.6
-
-    @property
-    def units(self):
-        return {"taken": "W", "energy": "J"}
-
-    @property
-    def stops(self):
-        return (vi.RigidStop(self.gap, self.restitution),)
-
-    @property
-    def cycle(self):
-        return 2 * jnp.pi
-
-    @property
-    def period(self):
-        return 2 * jnp.pi / self.frequency
-
-    def pace(self, s, state):
-        return 1 / self.frequency
-
-    def field(self, s, state):
-        push = self.amplitude * jnp.cos(s) - state.Y - 0.1 * state.V
-        return vi.OscillatorState(state.V / self.frequency, push / self.frequency)
-
-    def averages(self, s, state):
-        return {"taken": self.amplitude * jnp.cos(s) * state.V, "lost": 0.1 * state.V**2}
-
-    def quantities(self, s, state):
-        return {"energy": 0.5 * (state.V**2 + state.Y**2), "push": jnp.cos(s)}
+from shaken import Shaken
 
 
 class Flown(vi.Scene):
     """A ready machine with averages."""
 
     def averages(self, s, state):
-        turn = s if self.clock_name == "phase" else self.drive.frequency_ratio * s
+        turn = self.phase_at(s if self.clock_name == "phase" else self.drive.frequency_ratio * s)
         return {"taken": jnp.cos(turn) * state.V, "lost": 2 * self.damping_ratio * state.V**2}
 
     def quantities(self, s, state):

@@ -72,6 +72,7 @@ def sweep_columns(way: str, run: Sweep) -> dict[str, np.ndarray]:
     """One row for each value."""
     names = ("values", "y_min", "y_max", "period", "impacts", "frequency_ratio", "impact_speed")
     columns = {name: np.asarray(getattr(run, name)) for name in names}
+    columns |= {name: np.asarray(x) for name, x in run.averages.items()}
     results = np.array([_reason(int(code)) for code in number_of(run.result)])
     return {"direction": np.full(results.size, way), **columns, "result": results}
 
@@ -82,6 +83,7 @@ def sample_columns(samples: Any) -> dict[str, np.ndarray]:
         "cycles": np.asarray(samples.cycles),
         "time": np.asarray(samples.time),
         **{name: np.asarray(x) for name, x in components(samples.state, 1).items()},
+        **{name: np.asarray(x) for name, x in samples.quantities.items()},
     }
 
 
@@ -91,7 +93,9 @@ def cycle_columns(run: Any) -> dict[str, np.ndarray]:
     return {
         "cycle": np.arange(1, run.impacts.size + 1),
         **{name: np.asarray(x)[1:] for name, x in components(run.sections, 1).items()},
+        **{name: np.asarray(x)[1:] for name, x in run.quantities.items()},
         **{name: np.asarray(getattr(run, name)) for name in names},
+        **{name: np.asarray(x) for name, x in run.averages.items()},
     }
 
 

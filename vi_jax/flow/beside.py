@@ -41,11 +41,9 @@ def rate_beside(machine: Any, s: Scalar, state: Any, beside: Beside | None) -> B
     return Beside(time, integrals)
 
 
-def elapsed(old: Beside | None, carried: Beside | None, h: Scalar) -> Beside | None:
+def elapsed(old: Beside, carried: Beside | None, h: Scalar) -> Beside:
     """What has passed after a step of length h: what the method `carried` along, and the time,
     where that is s itself."""
-    if old is None:
-        return None
     time = None if carried is None else carried.time
     if time is None and old.time is not None:
         time = old.time + h

@@ -3,8 +3,10 @@
 from collections.abc import Mapping
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 from jaxtyping import Array
 
 from ..scene import AbstractScene
@@ -58,6 +60,24 @@ def quantity_names(scene: AbstractScene, start: Any) -> tuple[str, ...]:
         return ()
     zero = jnp.zeros((), jnp.result_type(scene.position(start)))
     return _names(scene, "quantities", scene.quantities, start, (zero, start))
+
+
+def quantities_on(scene: AbstractScene, sections: Any, lead: int = 0) -> dict[str, Array]:
+    """The machine's functions of its state on sections, which are in a row; by name. With `lead`
+    axes in front of scene and sections, as `vmap` gives them."""
+    if not has_quantities(scene):
+        return {}
+    dtype = jnp.result_type(*jtu.tree_leaves(sections))
+    numbers, rest = eqx.partition(scene, eqx.is_array)
+
+    def one(numbers: Any, state: Any) -> dict[str, Array]:
+        found = eqx.combine(numbers, rest).quantities(jnp.zeros((), dtype), state)
+        return {name: jnp.asarray(x, dtype) for name, x in found.items()}
+
+    one = jax.vmap(one, in_axes=(None, 0))
+    for _ in range(lead):
+        one = jax.vmap(one)
+    return one(numbers, sections)
 
 
 def _names(

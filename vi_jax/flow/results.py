@@ -271,6 +271,13 @@ class Run(Told):
         place = (*[slice(None)] * self.steps.ndim, -1)
         return jtu.tree_map(lambda x: x[place], self.sections)
 
+    def mean_averages(self) -> dict[str, Float[Array, ""]]:
+        """The machine's own averages over the time of all cycles, of one lane."""
+        if self.duration is None:
+            return {}
+        whole = jnp.sum(self.duration)
+        return {name: jnp.sum(x * self.duration) / whole for name, x in self.averages.items()}
+
     def to_xarray(self, dims: Sequence[str] | None = None, *, along: str | None = None) -> Any:
         """This run as an `xarray.Dataset`, labelled by cycle, section and sample.
 

@@ -91,7 +91,7 @@ def attempt(
         (new, beside), error = motion.at(h), jnp.zeros_like(h)
     else:
         new, beside, error = method.step(machine, lane.s, s1, lane.state, beside)
-    time = elapsed(lane.record.time, beside, h)
+    time = None if lane.record.time is None else elapsed(lane.record.time, beside, h)
     if lane.contact is not None and not method.uses_field:
         rests = lane.contact[0] > 0
         new = jtu.tree_map(lambda a, b: jnp.where(rests, a, b), lane.state, new)
