@@ -15,7 +15,7 @@ import vi_jax as vi
 from scipy.integrate import solve_ivp
 
 from differences import quick
-from shaken import Shaken
+from shaken_oscillator import Shaken
 
 
 class Flown(vi.Scene):

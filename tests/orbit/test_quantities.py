@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import vi_jax as vi
 
-from shaken import Shaken
+from shaken_oscillator import Shaken
 
 
 def missing(power, orbit):

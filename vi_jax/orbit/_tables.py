@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._lazy import lazy
-from ..flow.named import quantities_on
+from ..flow.named import average_names, quantities_on, quantity_names
+from ..scene import AbstractScene
 from ..scene.numbers import components
 from ..scene.units import with_units
 from ._shooting import Shooting
@@ -20,6 +21,19 @@ if TYPE_CHECKING:
     import xarray as xr
 else:
     xr = lazy("xarray")
+
+
+# What is a number at each point of every branch.
+COLUMNS = (
+    "parameter", "y_min", "y_max", "clearance", "frequency_ratio", "duration", "impacts",
+    "stable",
+)  # fmt: skip
+
+
+def column_names(scene: AbstractScene, like: Any) -> tuple[str, ...]:
+    """What is a number at each point of a branch of this machine, whose states are like this."""
+    inner = (*components(like), *quantity_names(scene, like))
+    return (*COLUMNS, *average_names(scene, like), *(f"section_{name}" for name in inner))
 
 
 def on_sections(problem: Shooting, steps: list[Step]) -> dict[str, np.ndarray]:

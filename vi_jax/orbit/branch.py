@@ -13,8 +13,7 @@ from .._interrupted import Interrupted
 from .._lazy import lazy
 from ..flow.labelled import tidy
 from ..flow.methods import MethodLike
-from ..flow.named import quantity_names
-from ..scene.numbers import check_again, check_leaf, components, leaf, with_leaf
+from ..scene.numbers import check_again, check_leaf, leaf, with_leaf
 from ..scene.shown import told_in_table
 from ..scene.units import in_unit, with_units
 from ._follow import Follower
@@ -22,7 +21,8 @@ from ._rest import rests
 from ._shooting import Shooting
 from ._solution import orbit_of
 from ._solve import advance, located, problem_of, tangent_at
-from ._tables import on_sections, table_of
+from ._tables import COLUMNS, on_sections, table_of
+from ._tables import column_names as column_names
 from .curve import INTERRUPTED, Step, check_walk, walk
 from .floquet import NEUTRAL
 from .results import ORBIT_RESULTS, Orbit, impacts_in_words
@@ -39,13 +39,6 @@ _SAME = 1e-3
 
 # A point lies at a value of the parameter if it is no further from it (in the parameter's scale).
 _ROUNDING = 1e-12
-
-
-# What is a number at each point of every branch.
-_COLUMNS = (
-    "parameter", "y_min", "y_max", "clearance", "frequency_ratio", "duration", "impacts",
-    "stable",
-)  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,9 +106,7 @@ class Branch:
     @property
     def column_names(self) -> tuple[str, ...]:
         """Names of all that is a number at each point, as pictures and tables take them."""
-        like = self.problem.like
-        inner = (*components(like), *quantity_names(self.problem.scene, like))
-        return (*_COLUMNS, *self.averages, *(f"section_{name}" for name in inner))
+        return column_names(self.problem.scene, self.problem.like)
 
     def column(self, name: str) -> np.ndarray:
         """A number at each point: one of the branch's arrays, one of the machine's averages, or a
@@ -126,7 +117,7 @@ class Branch:
         one_of("name", name, self.column_names)
         if name in self.averages:
             return self.averages[name]
-        if name in _COLUMNS:
+        if name in COLUMNS:
             return getattr(self, name)
         return self.sections[name.removeprefix("section_")]
 

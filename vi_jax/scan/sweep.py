@@ -29,6 +29,9 @@ from .regime import CODES, REGIMES, flags, impacts_of, least_period
 # A jump is so many times the change at the values beside it, and this part of 1 + |number|.
 _JUMP, _NOTED = 3.0, 0.01
 
+# What is a number at each value of every sweep.
+COLUMNS = "y_min", "y_max", "period", "impacts", "frequency_ratio", "impact_speed"
+
 # Values of one call: few, so that an interrupt loses little, but more than a call costs.
 _AT_ONCE = 16
 
@@ -87,8 +90,7 @@ class Sweep(Told):
         import xarray as xr  # slow to load
 
         each = (*batch_names(dims, self.values.ndim - 1), "value")
-        names = ("y_min", "y_max", "period", "impacts", "frequency_ratio", "impact_speed")
-        variables = present({name: getattr(self, name) for name in names} | self.averages, each)
+        variables = present({name: getattr(self, name) for name in COLUMNS} | self.averages, each)
         variables |= states("section", self.sections, (*each, "cycle"))
         variables["result"] = each, in_names(self.result, RESULTS, REASON_NAMES)
         data = xr.Dataset(variables, {self.parameter: (each, np.asarray(self.values))})
