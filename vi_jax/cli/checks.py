@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from .._checks import unwritable
+from ..orbit.branch import column_names
 from ..orbit.curve import check_walk
 from ..plot.save import ENDINGS
 from ..scan.grid import Blocks, axes_of
@@ -55,6 +56,13 @@ def check_paths(table: str, *, picture: str | None = None, output: str | None = 
             raise ConfigError(f"`{key}` in {table} cannot be written: {path}: {reason}")
 
 
+def check_quantity(name: str | None, place: str, known: Iterable[str]) -> None:
+    """**Raises:** `ConfigError` if a picture is asked for something that there is not."""
+    known = tuple(known)
+    if name is not None and name not in known:
+        raise ConfigError(f"{unknown('quantity', name, place, known)}; all: {', '.join(known)}")
+
+
 def check_map(axes: Mapping[str, Any], measure: Iterable[str] | None, *, paired: bool) -> None:
     """**Raises:** `ConfigError` if a scan cannot be drawn as a map of regimes."""
     if measure is not None and "regime" not in measure:
@@ -65,7 +73,7 @@ def check_map(axes: Mapping[str, Any], measure: Iterable[str] | None, *, paired:
         )
 
 
-def check_continuation(scene: AbstractScene, table: OrbitTable) -> None:
+def check_continuation(scene: AbstractScene, start: Any, table: OrbitTable) -> None:
     """**Raises:** `ConfigError` if the branch cannot begin, or its files not be written."""
     asked = table.continue_
     assert asked is not None
@@ -81,4 +89,5 @@ def check_continuation(scene: AbstractScene, table: OrbitTable) -> None:
     walk = {"step": 0.01, "max_step": 0.1, "max_points": 1000}
     with in_terms_of("[orbit.continue]"):
         check_walk(**{name: given(asked).get(name, usual) for name, usual in walk.items()})
+    check_quantity(asked.y, "`y` in [orbit.continue]", column_names(scene, start))
     check_paths("[orbit.continue]", picture=asked.picture, output=asked.output)

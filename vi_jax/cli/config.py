@@ -127,6 +127,7 @@ class SweepTable:
     tolerance: float | None = None
     max_steps: int | None = None
     up_and_down: bool = False
+    y: str | None = None
     picture: str | None = None
     output: str | None = None
 
@@ -140,6 +141,7 @@ class ContinueTable:
     step: float | None = None
     max_step: float | None = None
     max_points: int | None = None
+    y: str | None = None
     picture: str | None = None
     output: str | None = None
 

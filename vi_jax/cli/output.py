@@ -71,9 +71,15 @@ def ranges_in_words(data: xr.Dataset) -> list[str]:
 def sweep_columns(way: str, run: Sweep) -> dict[str, np.ndarray]:
     """One row for each value."""
     names = ("values", "y_min", "y_max", "period", "impacts", "frequency_ratio", "impact_speed")
-    columns = {name: np.asarray(getattr(run, name)) for name in names}
+    columns = _there(run, names) | {name: np.asarray(x) for name, x in run.averages.items()}
     results = np.array([_reason(int(code)) for code in number_of(run.result)])
     return {"direction": np.full(results.size, way), **columns, "result": results}
+
+
+def _there(run: Any, names: Iterable[str]) -> dict[str, np.ndarray]:
+    """Those of its arrays that it has: nothing says how fast the drive is where there is none."""
+    values = {name: getattr(run, name) for name in names}
+    return {name: np.asarray(x) for name, x in values.items() if x is not None}
 
 
 def sample_columns(samples: Any) -> dict[str, np.ndarray]:
@@ -82,6 +88,7 @@ def sample_columns(samples: Any) -> dict[str, np.ndarray]:
         "cycles": np.asarray(samples.cycles),
         "time": np.asarray(samples.time),
         **{name: np.asarray(x) for name, x in components(samples.state, 1).items()},
+        **{name: np.asarray(x) for name, x in samples.quantities.items()},
     }
 
 
@@ -91,7 +98,9 @@ def cycle_columns(run: Any) -> dict[str, np.ndarray]:
     return {
         "cycle": np.arange(1, run.impacts.size + 1),
         **{name: np.asarray(x)[1:] for name, x in components(run.sections, 1).items()},
-        **{name: np.asarray(getattr(run, name)) for name in names},
+        **{name: np.asarray(x)[1:] for name, x in run.quantities.items()},
+        **_there(run, names),
+        **{name: np.asarray(x) for name, x in run.averages.items()},
     }
 
 

@@ -120,13 +120,24 @@ def _joined(runs: list[Run], cycles: int, samples: int, steps: int) -> Run:
             lambda first, *others: _row([first, *(x[shared:] for x in others)])[:number], *parts
         )
 
-    apart = ("sections", "samples", "errors", "result", "steps", "rejected", "labels", "units")
+    apart = (
+        "sections",
+        "quantities",
+        "samples",
+        "errors",
+        "result",
+        "steps",
+        "rejected",
+        "labels",
+        "units",
+    )
     rows = {
         field.name: joined([getattr(run, field.name) for run in runs], done)
         for field in dataclasses.fields(Run)
         if field.name not in apart
     }
     sections = joined([run.sections for run in runs], done + 1, shared=1)
+    quantities = joined([run.quantities for run in runs], done + 1, shared=1)
     dense, sampled = None, [run.samples for run in runs if run.samples is not None]
     if sampled:
         times, passed = [], 0.0
@@ -138,6 +149,7 @@ def _joined(runs: list[Run], cycles: int, samples: int, steps: int) -> Run:
             cycles=jnp.arange(done * samples + 1, dtype=sampled[0].time.dtype) / samples,
             time=joined(times, done * samples + 1, shared=1),
             state=joined(states, done * samples + 1, shared=1),
+            quantities=joined([x.quantities for x in sampled], done * samples + 1, shared=1),
         )
     failed = next((run for run in runs if not bool(run.successful)), last)
     # What happened after the last cycle that was asked for is nobody's concern.
@@ -145,6 +157,7 @@ def _joined(runs: list[Run], cycles: int, samples: int, steps: int) -> Run:
     return Run(
         **rows,
         sections=sections,
+        quantities=quantities,
         samples=dense,
         errors=None,
         result=RESULTS.successful if whole else failed.result,

@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 
 from .._files import write_whole
 from ..flow import RESULTS, Run
+from ..flow.named import average_names
 from ..flow.results import number_of
 from ..orbit import Orbit, continue_orbit, find_orbit
 from ..plot import (
@@ -30,8 +31,16 @@ from ..plot.colors import BLUE, RED
 from ..scan import Sweep
 from ..scan import basins as find_basins
 from ..scan import scan as run_scan
+from ..scan.sweep import COLUMNS
 from ..scene import AbstractScene
-from .checks import check_continuation, check_map, check_names, check_paths, check_range
+from .checks import (
+    check_continuation,
+    check_map,
+    check_names,
+    check_paths,
+    check_quantity,
+    check_range,
+)
 from .config import Config, OrbitTable, SimulateTable, SweepTable, start_of
 from .output import (
     axes_in_words,
@@ -107,8 +116,10 @@ def sweep(config: Config, tell: Tell) -> Outcome:
     assert table is not None
     check_names(scene, [table.parameter], "[sweep]")
     check_range(scene, table.parameter, table.values, "`values` in [sweep]")
+    own = average_names(scene, scene.start() if start is None else start)
+    check_quantity(table.y, "`y` in [sweep]", (*COLUMNS, *own))
     check_paths("[sweep]", picture=table.picture, output=table.output)
-    options = given(table, "values", "up_and_down", "picture", "output")
+    options = given(table, "values", "up_and_down", "y", "picture", "output")
     there, back = ("up", "down") if table.values[0] <= table.values[-1] else ("down", "up")
     found: dict[str, Sweep] = {}
     with noted_interrupts() as interrupted:
@@ -141,7 +152,7 @@ def _describe_sweeps(found: Mapping[str, Sweep], table: SweepTable) -> Outcome:
         ax = new_axes()
         for way, run in found.items():
             look = {"color": BLUE, "ms": 6} if way == "up" else {"color": RED, "ms": 3}
-            plot_sweep(run, ax=ax, label=way, **look)
+            plot_sweep(run, ax=ax, y=table.y, label=way, **look)
         ax.legend(frameon=False)
         lines.append(saved(ax, table.picture))
     failed, good = failures(np.concatenate(codes), what="values")
@@ -187,7 +198,7 @@ def orbit(config: Config, tell: Tell) -> Outcome:
     assert table is not None
     check_paths("[orbit]", picture=table.picture)
     if table.continue_ is not None:
-        check_continuation(scene, table)
+        check_continuation(scene, scene.start() if start is None else start, table)
     guess = start
     if table.guess is not None:
         guess = start_of(scene, table.guess, "`guess` in [orbit]")
@@ -218,7 +229,7 @@ def _continued(found: Orbit, table: OrbitTable, tell: Tell) -> list[str]:
     assert asked is not None
     tell(f"following it in {asked.parameter}")
     with in_terms_of("[orbit.continue]"):
-        branch = continue_orbit(found, **given(asked, "picture", "output"))
+        branch = continue_orbit(found, **given(asked, "y", "picture", "output"))
     lines = [str(branch)]
     if asked.output is not None:
         data = branch.to_xarray()
@@ -227,7 +238,7 @@ def _continued(found: Orbit, table: OrbitTable, tell: Tell) -> list[str]:
         lines.append(f"  data: {asked.output}")
     if asked.picture is not None:
         ax = new_axes()
-        plot_branch(branch, ax=ax)
+        plot_branch(branch, ax=ax, y=asked.y)
         lines.append(saved(ax, asked.picture))
     return lines
 

@@ -19,6 +19,7 @@ from ..scene.event import (
 )
 from . import results
 from ._own import check_field, check_laws
+from .beside import Beside
 from .events import Rates, force_rate, rates
 from .methods import AbstractMethod
 from .moving import in_modes, rounding
@@ -58,7 +59,8 @@ def total(tree: Any, start: Scalar) -> Scalar:
 class Record(eqx.Module):
     """What is kept of an interval between two record points; `None` where it was not asked for."""
 
-    time: Scalar | None
+    time: Beside | None
+    """Elapsed time, and the integrals over it."""
     y_max: Scalar | None
     y_min: Scalar | None
     impacts: Scalar
@@ -134,6 +136,8 @@ class Plan(eqx.Module):
     """Whether the log lists switches too, as stops beyond the last, and counts them."""
     events: int = eqx.field(static=True)
     """Events of all kinds to log in each cycle."""
+    averages: tuple[str, ...] = eqx.field(static=True)
+    """Names of the machine's averages, if motion is recorded."""
     rests: bool = eqx.field(static=True)
     """Whether the body may come to rest on a stop."""
     road: str = eqx.field(static=True)
@@ -204,7 +208,7 @@ class Plan(eqx.Module):
         Y = self.scene.position(state)
         zero = jnp.zeros_like(Y)
         return Record(
-            time=zero if self.timed(state) else None,
+            time=self._beside(state, zero),
             y_max=Y if self.motion else None,
             y_min=Y if self.motion else None,
             impacts=zero,
@@ -215,6 +219,13 @@ class Plan(eqx.Module):
             clearance=jnp.full_like(Y, jnp.inf) if self.motion and self.log else None,
             events=jnp.full((4, self.events), jnp.nan, Y.dtype) if self.events else None,
         )
+
+    def _beside(self, state: Any, zero: Scalar) -> Beside | None:
+        """Time and integrals as an interval begins; `None` where neither is asked for."""
+        timed = self.timed(state)
+        if not timed and not self.averages:
+            return None
+        return Beside(zero if timed else None, {name: zero for name in self.averages})
 
     def launch(self, start: Any, wanted: Any = True) -> Lane:
         """A lane on its first section; one that cannot be run, or is not wanted, has ended."""

@@ -38,7 +38,7 @@ def check_field(scene: AbstractScene, s: Scalar, state: Any, modes: tuple[Scalar
     whose = f"`field` of a {type(scene).__name__}"
     _check_arguments(scene, whose, s, state, modes)
     try:
-        with _in_words(whose):
+        with in_words_of(whose):
             flow = jax.eval_shape(scene.field, s, state, *modes)
     except (AttributeError, TypeError, LookupError):
         if _runs(scene.field, state, s, *modes):
@@ -53,7 +53,7 @@ def check_field(scene: AbstractScene, s: Scalar, state: Any, modes: tuple[Scalar
             f"{whose} must return what is like its state, {_in_short(state)}, but returned "
             f"{_in_short(flow)}."
         )
-    with _in_words(f"`section` of a {type(scene).__name__}"):
+    with in_words_of(f"`section` of a {type(scene).__name__}"):
         jax.eval_shape(scene.section, state)
 
 
@@ -80,7 +80,7 @@ def _runs(function: Callable[..., Any], *arguments: Any) -> bool:
 
 
 @contextlib.contextmanager
-def _in_words(whose: str) -> Iterator[None]:
+def in_words_of(whose: str) -> Iterator[None]:
     """JAX's errors about traced numbers as one sentence that says what to write instead."""
     try:
         yield
@@ -104,7 +104,7 @@ def check_laws(scene: AbstractScene, speed: Scalar) -> None:
             continue
         whose = f"The restitution law of stop {i} of a {type(scene).__name__}"
         try:
-            with _in_words(whose):
+            with in_words_of(whose):
                 got = jax.eval_shape(stop.rebound, speed)
         except TypeError as error:
             if str(error).startswith(whose):

@@ -13,11 +13,12 @@ from .. import lanes
 from .._checks import count, count_or_traced, fits_records, flag, instance_of, one_of, require_real
 from .._numbers import concrete, narrow, require_session, strongly_typed, warn, warn_of_narrow
 from ..scene import AbstractScene, RigidStop, Scene
-from ..scene.event import is_autonomous
+from ..scene.event import begin_modes, is_autonomous
 from ._lane import Plan
 from ._own import check_period as check_period
 from .methods import MethodLike, chosen
 from .moving import rounding
+from .named import average_names
 
 
 def planned(
@@ -68,13 +69,15 @@ def planned(
     if isinstance(scene, Scene):
         _check_scalars(scene=scene, start=start)
     check_start(scene, start)
-    fits_records("cycles", cycles * max(1, samples), 12 + 3 * impact_log + 4 * event_log)
+    scene, start = of_one_type(scene, start)
+    averages = average_names(scene, start) if record == "motion" else ()
+    columns = 12 + 3 * impact_log + 4 * event_log + len(averages)
+    fits_records("cycles", cycles * max(1, samples), columns)
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         warn(
             "vi_jax is running in single precision: errors near 1e-6 and tolerances to match. For "
             'double precision call `jax.config.update("jax_enable_x64", True)` first.'
         )
-    scene, start = of_one_type(scene, start)
     dtype = scene.position(start).dtype
     for name, value in (("max_impacts", max_impacts), ("max_steps", max_steps)):
         if value is not None and value > _most(dtype):
@@ -91,6 +94,7 @@ def planned(
         log=impact_log,
         log_switches=log_switches,
         events=event_log,
+        averages=averages,
         rests=(scene.may_rest() if rests is None else rests) and bool(scene.stops),
         road=lanes.current_road(),
         settle=_countable(cycles, settle, max(1, samples), dtype),
@@ -195,8 +199,9 @@ def _check_scalars(**arguments: Any) -> None:
 def _check_flow(scene: AbstractScene, start: Any) -> None:
     """**Raises:** `TypeError` for what is no state, where only the field says what one is."""
     try:
-        zero = jnp.zeros(())
-        jax.eval_shape(scene.field, zero, start, *[zero for _ in scene.switches])
+        jax.eval_shape(
+            lambda s, x: scene.field(s, x, *begin_modes(scene, s, x)), jnp.zeros(()), start
+        )
     except (AttributeError, TypeError, ValueError, LookupError) as error:
         raise TypeError(
             f"Argument `start` must be a state of this scene, but got {start!r}, of which its "

@@ -88,7 +88,8 @@ def run_dataset(run: Any, dims: Sequence[str] | None, result: np.ndarray, along:
     names = ("y_max", "y_min", "impacts", "impact_speed", "rests", "impact_energy", "clearance",
              "duration", "frequency_ratio")  # fmt: skip
     variables = states("section", run.sections, section)
-    variables |= present({name: getattr(run, name) for name in names}, cycle)
+    variables |= present({name: getattr(run, name) for name in names} | run.averages, cycle)
+    variables |= states("section", run.quantities, section)
     count = run.impacts.shape[-1]
     coordinates: dict[str, Any] = {
         "cycle": np.arange(1, count + 1), "section": np.arange(count + 1),
@@ -96,6 +97,7 @@ def run_dataset(run: Any, dims: Sequence[str] | None, result: np.ndarray, along:
     if run.samples is not None:
         sample = (*batch, "sample")
         variables |= states("sample", run.samples.state, sample)
+        variables |= states("sample", run.samples.quantities, sample)
         variables["sample_time"] = sample, np.asarray(run.samples.time)
         place = np.asarray(run.samples.cycles)
         coordinates["sample"] = place.reshape(-1, place.shape[-1])[0]
@@ -113,5 +115,6 @@ def run_dataset(run: Any, dims: Sequence[str] | None, result: np.ndarray, along:
         kept = {f"error_{name}": getattr(run.errors, name) for name in ("y_max", "y_min")}
         variables |= present(kept, cycle)
     variables |= present({"result": result, "steps": run.steps, "rejected": run.rejected}, batch)
-    data = tidy(with_units(xr.Dataset(variables, coordinates), dict(run.units)), along)
+    own = {name: name for name in run.averages}
+    data = tidy(with_units(xr.Dataset(variables, coordinates), dict(run.units), own), along)
     return _met(data, _LISTED[along]) if along in _LISTED else data

@@ -48,6 +48,10 @@ class Moving(AbstractScene):
         """That of the machine."""
         return self.scene.pace(s, state)
 
+    def averages(self, s: Scalar, state: Any) -> dict[str, Any]:
+        """Those of the machine."""
+        return self.scene.averages(s, state, *self.modes)
+
 
 def _held_still(coordinate: Coordinate, state: Any, flow: Any) -> Any:
     """The rate at which a state changes along `flow` while this coordinate keeps its place and

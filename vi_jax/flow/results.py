@@ -126,6 +126,8 @@ class Samples(Shown):
     """Time τ since the start (in units of `s` for scenes of your own)."""
     state: Any
     """The states, a pytree like the start."""
+    quantities: dict[str, Float[Array, " points"]] = eqx.field(default_factory=dict)
+    """The machine's own quantities there, by name (see `AbstractScene.quantities`)."""
 
 
 class ImpactLog(Told):
@@ -245,6 +247,11 @@ class Run(Told):
     precision no more than 2²⁴ are seen)."""
     rejected: Int[Array, ""]
     """Steps rejected on their error estimate."""
+    averages: dict[str, Float[Array, " cycles"]] = eqx.field(default_factory=dict)
+    """The machine's own averages over the time of each cycle, by name (see
+    `AbstractScene.averages`)."""
+    quantities: dict[str, Float[Array, " sections"]] = eqx.field(default_factory=dict)
+    """The machine's own functions of its state on the sections, by name; (cycles + 1,)."""
     labels: tuple[str, str] = eqx.field(static=True, default=PLAIN)
     """What position and velocity are called, in the machine's words."""
     units: Stated = eqx.field(static=True, default=())
@@ -263,13 +270,21 @@ class Run(Told):
         place = (*[slice(None)] * self.steps.ndim, -1)
         return jtu.tree_map(lambda x: x[place], self.sections)
 
+    def mean_averages(self) -> dict[str, Float[Array, ""]]:
+        """The machine's own averages over the time of all cycles, of one lane."""
+        if self.duration is None:
+            return {}
+        whole = jnp.sum(self.duration)
+        return {name: jnp.sum(x * self.duration) / whole for name, x in self.averages.items()}
+
     def to_xarray(self, dims: Sequence[str] | None = None, *, along: str | None = None) -> Any:
         """This run as an `xarray.Dataset`, labelled by cycle, section and sample.
 
         States become a variable for each component: `section_Y` (cycles + 1), `sample_Y`; an array
         in the state keeps its axes, as `q_0`, and a state that is one array is `section_state`. The
         impact log becomes `log_phase`, `log_speed` and `log_stop`; that of all events
-        `event_phase`, `event_kind` in words, `event_number` and `event_value`; all else keeps its
+        `event_phase`, `event_kind` in words, `event_number` and `event_value`; the machine's own
+        quantities are `section_lift` and `sample_lift`; all else, its averages among it, keeps its
         name, and `result` is the reason's. Host-side: not to be traced.
 
         As a table, everything together would have a row for each combination of a cycle, a section,
@@ -301,6 +316,8 @@ class Run(Told):
             span = f"[{self.y_min[-1]:.6g}, {self.y_max[-1]:.6g}]"
             span = in_unit(span, units, "position")
             lines.append(f"  last cycle: {name_in(self.labels[0])} in {span}")
+        for name, x in self.averages.items():
+            lines.append(f"    mean {name}: {in_unit(f'{x[-1]:.6g}', units, name)}")
         if self.errors is not None:
             worst = max(float(jnp.max(x)) for x in jtu.tree_leaves(self.errors.sections))
             lines.append(f"  error of the sections, estimated: {worst:.2g}")

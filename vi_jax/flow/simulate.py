@@ -18,8 +18,10 @@ from ..scene.units import stated
 from ._lane import Plan, Record
 from ._spoil import spoiled
 from .arguments import planned
+from .beside import means
 from .loop import Ends, run_lane
 from .methods import MethodLike
+from .named import has_quantities
 from .results import Errors, EventLog, ImpactLog, Run, Samples, reason
 
 
@@ -154,19 +156,29 @@ def collect(plan: Plan, sampled: bool, lane: Ends, points: Any, records: Record)
     def per_cycle(values, reduce):
         return None if values is None else reduce(values.reshape(plan.cycles, parts), axis=1)
 
+    passed = records.time
+    times = None if passed is None else passed.time
+
     def whole(values):
         return jnp.where(jnp.isfinite(values), values, 0.0).astype(jnp.int32)
 
     period = jnp.broadcast_to(scene.period, (plan.cycles,)).astype(lane.done.dtype)
     duration = None
     if plan.motion:
-        duration = period if records.time is None else per_cycle(records.time, jnp.sum)
+        duration = period if times is None else per_cycle(times, jnp.sum)
+    averages = {}
+    if passed is not None and passed.integrals:
+        # Where s does not measure time but is in proportion to it, the integrals are over s.
+        length = jnp.asarray(scene.cycle, period.dtype) if times is None else duration
+        sums = {name: per_cycle(x, jnp.sum) for name, x in passed.integrals.items()}
+        averages = means(sums, length)
+    quantities = _quantities(plan, points)
     dense = None
     if sampled:
-        interval = jnp.repeat(period / parts, parts) if records.time is None else records.time
+        interval = jnp.repeat(period / parts, parts) if times is None else times
         time = jnp.concatenate([jnp.zeros_like(interval[:1]), jnp.cumsum(interval)])
         place = jnp.arange(plan.kept + 1, dtype=time.dtype) / parts
-        dense = Samples(place, time, points)
+        dense = Samples(place, time, points, quantities)
     log = None
     if plan.log:
         log = _log(plan, records.log)
@@ -188,9 +200,25 @@ def collect(plan: Plan, sampled: bool, lane: Ends, points: Any, records: Record)
         result=reason(lane.fault),
         steps=lane.steps.astype(jnp.int32),
         rejected=lane.rejected.astype(jnp.int32),
+        averages=averages,
+        quantities={name: x[::parts] for name, x in quantities.items()},
         labels=scene.labels,
         units=stated(scene),
     )
+
+
+def _quantities(plan: Plan, points: Any) -> dict[str, Any]:
+    """The machine's functions of its state at the points recorded."""
+    scene = plan.scene
+    if not has_quantities(scene):
+        return {}
+    first = jtu.tree_map(lambda x: x[0], points)
+    parts = jnp.arange(plan.kept + 1) % plan.parts
+    s = parts.astype(scene.position(first).dtype) * (jnp.asarray(scene.cycle) / plan.parts)
+    if not plan.ticks(first):
+        s = jnp.zeros_like(s)
+    found = jax.vmap(scene.quantities)(s, points)
+    return {name: jnp.asarray(x, s.dtype) for name, x in found.items()}
 
 
 def _log(plan: Plan, entries: Any) -> ImpactLog:

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from .. import lanes
 from ..flow import AbstractMethod
+from ..flow.beside import Beside, elapsed
 from ..flow.moving import in_modes
 from ..scene import AbstractScene
 
@@ -37,12 +38,14 @@ class Flight(eqx.Module):
         """A state from its vector."""
         return ravel_pytree(self.like)[1](u)
 
-    def step(self, s0: Scalar, s1: Scalar, u: Vector, time: Scalar) -> tuple[Vector, Scalar]:
-        """State and time after a step of the method."""
+    def step(self, s0: Scalar, s1: Scalar, u: Vector, passed: Beside) -> tuple[Vector, Beside]:
+        """State, and time and integrals beside it, after a step of the method."""
         moving, state = self.moving, self.unravel(u)
-        paced = moving.pace(s0, state) is not None
-        new, after, _ = self.method.step(moving, s0, s1, state, time if paced else None)
-        return ravel_pytree(new)[0], time + (s1 - s0) if after is None else after
+        paced, beside = moving.pace(s0, state) is not None, None
+        if paced or passed.integrals:
+            beside = Beside(passed.time if paced else None, passed.integrals)
+        new, after, _ = self.method.step(moving, s0, s1, state, beside)
+        return ravel_pytree(new)[0], elapsed(passed, after, s1 - s0)
 
     def once(self, function: Callable[["Flight", Any], Any], inputs: Any) -> Any:
         """A function of the flight and of one lane's numbers as vector code."""
@@ -50,33 +53,36 @@ class Flight(eqx.Module):
         return lanes.once(partial(_of_flight, rest, function), (numbers, inputs))
 
     def fly(
-        self, s0: Scalar, s1: Scalar, u: Vector, steps: int
-    ) -> tuple[Vector, Scalar, tuple[Float[Array, " steps"], Float[Array, "steps states"]]]:
-        """State and elapsed time after so many steps, and clock and state before each of them."""
+        self, s0: Scalar, s1: Scalar, u: Vector, steps: int, averages: tuple[str, ...] = ()
+    ) -> tuple[Vector, Beside, tuple[Float[Array, " steps"], Float[Array, "steps states"]]]:
+        """State, elapsed time and the integrals of the averages named after so many steps, and
+        clock and state before each of them."""
         numbers, rest = eqx.partition(self, eqx.is_array)
-        (u, time), path = lanes.run(
-            _begin, partial(_step, rest, steps), _end, (numbers, s0, (s1 - s0) / steps, u),
-            rows=steps,
+        (u, passed), path = lanes.run(
+            partial(_begin, averages), partial(_step, rest, steps), _end,
+            (numbers, s0, (s1 - s0) / steps, u), rows=steps,
         )  # fmt: skip
-        return u, time, path
+        return u, passed, path
 
 
 def _of_flight(rest: Flight, function: Callable[[Flight, Any], Any], inputs: Any) -> Any:
     return function(eqx.combine(inputs[0], rest), inputs[1])
 
 
-def _begin(inputs: Any) -> tuple[Any, lanes.Emitted]:
+def _begin(averages: tuple[str, ...], inputs: Any) -> tuple[Any, lanes.Emitted]:
     _, s0, _, u = inputs
     zero = jnp.zeros_like(s0)
-    return (u, zero, zero), lanes.Emitted(True, True, (s0, u))
+    return (u, Beside(zero, {name: zero for name in averages}), zero), lanes.Emitted(
+        True, True, (s0, u)
+    )
 
 
 def _step(rest: Flight, steps: int, inputs: Any, carry: Any) -> tuple[Any, lanes.Emitted]:
-    (numbers, s0, h, _), (u, time, i) = inputs, carry
+    (numbers, s0, h, _), (u, passed, i) = inputs, carry
     s = s0 + i * h
-    u, time = eqx.combine(numbers, rest).step(s, s + h, u, time)
+    u, passed = eqx.combine(numbers, rest).step(s, s + h, u, passed)
     i = i + 1
-    return (u, time, i), lanes.Emitted(i < steps, True, (s0 + i * h, u))
+    return (u, passed, i), lanes.Emitted(i < steps, True, (s0 + i * h, u))
 
 
 def _end(inputs: Any, carry: Any) -> Any:

@@ -11,7 +11,8 @@ from ._events import Event
 from ._hopf import hopf_between, size_of
 from ._origin import halves, origin
 from ._shooting import Shooting
-from ._solve import advance, images_at, located, observe, orbit_of
+from ._solution import orbit_of
+from ._solve import advance, images_at, located, observe
 from ._symmetry import may_be_symmetric
 from .curve import Step
 from .special import CROSSING, DOUBLING, FOLD, GRAZING, HOPF, SYMMETRY, TORUS, SpecialPoint
@@ -307,9 +308,8 @@ class Follower:
             return np.stack([through(x)(place) for x in zip(*map(get, beside), strict=True)])
 
         x, tangent = there(lambda step: step.x), there(lambda step: step.tangent)
-        return at._replace(
-            x=x, tangent=tangent / np.linalg.norm(tangent), seen=observe(self.problem, x)
-        )
+        unit = tangent / np.linalg.norm(tangent)
+        return at._replace(x=x, tangent=unit, seen=observe(self.problem, x))
 
     def _images(self, step: Step) -> np.ndarray:
         """How far the motion is from being its own image; empty if it cannot be."""

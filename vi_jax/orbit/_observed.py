@@ -32,6 +32,8 @@ class Observed(NamedTuple):
     apart: Float[Array, ""]
     """How far its events are from coming in another order; see `apart`."""
     duration: Float[Array, ""]
+    averages: dict[str, Float[Array, ""]]
+    """The machine's own, over the period."""
 
 
 def apart(

@@ -20,6 +20,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from ..flow import AbstractMethod
+from ..flow.beside import means
+from ..flow.named import average_names
 from ..scene import AbstractScene, RigidStop
 from ..scene.base import renews
 from ..scene.event import Section, after_event, is_autonomous, jump_of, mode_number
@@ -184,28 +186,31 @@ class Shooting(eqx.Module):
         """Multipliers, extremes and the distances to grazing of a solution."""
         scene = self.at(x)
         clock, states = self.parts(x)
+        averages = average_names(scene, self.unravel(states[0]))
 
         def follow(leg, s0, s1, u):
             def end(u):
-                end, time, path = self.flight(scene, leg).fly(s0, s1, u, self.steps)
-                return end, (time, path)
+                flight = self.flight(scene, leg)
+                end, passed, path = flight.fly(s0, s1, u, self.steps, averages)
+                return end, (passed, path)
 
-            carried, (time, path) = jax.jacfwd(end, has_aux=True)(self.after(scene, leg, s0, u))
+            carried, (passed, path) = jax.jacfwd(end, has_aux=True)(self.after(scene, leg, s0, u))
             approach, order = jnp.zeros((0,), x.dtype), jnp.ones((), x.dtype)
             if self.events:
                 saltation, rises = self._saltation(scene, leg, s0, u)
                 carried, approach = carried @ saltation, rises[None]
                 order = self._each(leg, partial(self._order, scene, leg), s0, u)
-            return carried, time, approach, order, self._turns(scene, leg, s1, path)
+            return carried, passed, approach, order, self._turns(scene, leg, s1, path)
 
         legs = jnp.arange(len(states))
         ends = self.ends(clock, self.period(x))
-        carried, time, approach, order, turns = jax.vmap(follow)(legs, clock, ends, states)
+        carried, passed, approach, order, turns = jax.vmap(follow)(legs, clock, ends, states)
         monodromy = jnp.eye(self.states, dtype=x.dtype)
         for leg in range(len(states)):
             monodromy = carried[leg] @ monodromy
         Y = jax.vmap(lambda u: scene.position(self.unravel(u)))(self._reached(scene, states))
         nearest = jnp.argmin(turns.room)
+        time, integrals = jax.tree.map(jnp.sum, passed)
         timed = self.autonomous or scene.pace(clock[0], self.unravel(states[0])) is not None
         return Observed(
             multipliers=multipliers_of(monodromy),
@@ -225,7 +230,8 @@ class Shooting(eqx.Module):
                 ends - clock,
                 [self.unravel(u) for u in states],
             ),
-            duration=jnp.sum(time) if timed else jnp.asarray(scene.period, x.dtype) * self.cycles,
+            duration=time if timed else jnp.asarray(scene.period, x.dtype) * self.cycles,
+            averages=means(integrals, time),
         )
 
     def _reached(self, scene: AbstractScene, states: Array) -> Array:

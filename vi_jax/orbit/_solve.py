@@ -25,7 +25,7 @@ from ._flight import Flight
 from ._shooting import Shooting
 from ._symmetry import images
 from .curve import Step, array_of, corrected, first_tangent
-from .results import ORBIT_RESULTS, Orbit
+from .results import Orbit
 
 # Events of a cycle that can be followed, of a machine with switches or a section of its own.
 _LISTED = 32
@@ -289,58 +289,3 @@ def located(
         return abs(told), bool(told * begin < 0), abs(place[0] - root)
 
     return min(good, key=off)[1] if good else None
-
-
-@compiled
-def _compiled_sections(problem, x, legs, places):
-    states = jax.vmap(lambda leg, s: problem.state_at(x, leg, s))(legs, places)
-    return states, jnp.max(jnp.abs(problem.residual(x)))
-
-
-def orbit_of(problem: Shooting, step: Step) -> Orbit:
-    """The solution at a step as an `Orbit`."""
-    x, seen = jnp.asarray(step.x), step.seen
-    scene = problem.at(x)
-    clock = np.asarray(problem.parts(x)[0])[: len(problem.events)]
-    period = float(problem.period(x))
-    begins = [i for i, event in enumerate(problem.events) if event.cycle is not None]
-    if begins:
-        places, legs = clock[begins], np.asarray(begins)
-    else:
-        places = float(scene.cycle) * np.arange(problem.cycles)
-        legs = np.zeros(problem.cycles, int)
-        if len(clock):
-            places = clock[0] + np.mod(places - clock[0], period)
-            legs = np.searchsorted(clock, places, side="right") - 1
-    sections, residual = _compiled_sections(problem, x, jnp.asarray(legs), jnp.asarray(places))
-    admissible = seen.clearance >= -1e-9 and min(seen.approach, default=1.0) > -1e-9
-    # Along a branch an impact may move past the section: an orbit's clocks lie within its period.
-    impacts = np.asarray(problem.impacts, int)
-    within = np.mod(clock[impacts], period)
-    order = np.argsort(within)
-    stops = np.asarray([problem.events[i].number for i in impacts], np.int32)
-    since = scene.phase_at(within[order])
-    duration = jnp.asarray(seen.duration)
-    return Orbit(
-        scene=scene,
-        method=problem.method,
-        state=jax.tree.map(lambda x: x[0], sections),
-        sections=sections,
-        cycles=jnp.asarray(problem.cycles, jnp.int32),
-        duration=duration,
-        frequency_ratio=scene.frequency_ratio(duration / problem.cycles),
-        impact_phase=jnp.asarray(since),
-        impact_speed=jnp.asarray(np.asarray(seen.approach)[impacts][order]),
-        impact_stop=jnp.asarray(stops[order]),
-        impacts=jnp.asarray(len(impacts), jnp.int32),
-        y_min=jnp.asarray(seen.y_min),
-        y_max=jnp.asarray(seen.y_max),
-        clearance=jnp.asarray(seen.clearance),
-        monodromy=jnp.asarray(seen.monodromy),
-        multipliers=jnp.asarray(seen.multipliers),
-        residual=residual,
-        error=jnp.asarray(step.size),
-        iterations=jnp.asarray(step.iterations, jnp.int32),
-        history=jnp.zeros((0,)),
-        result=ORBIT_RESULTS.successful if admissible else ORBIT_RESULTS.inadmissible,
-    )

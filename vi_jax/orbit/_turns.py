@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
+from ..flow.beside import Beside
 from ..flow.events import Rates, guard_rates
 from ..scene import AbstractScene
 from ..scene.event import Section, events_of, guard_of, happens_at
@@ -150,7 +151,7 @@ def turns_of(
 
 def _stepped(flight: Flight, inputs: Any) -> Vector:
     s, h, u = inputs
-    return flight.step(s, s + h, u, jnp.zeros_like(s))[0]
+    return flight.step(s, s + h, u, Beside(jnp.zeros_like(s), {}))[0]
 
 
 def _turn(watched: _Guard, flight: Flight, inputs: Any) -> _Found:

@@ -18,8 +18,9 @@ from ..scene.shown import told_in_table
 from ..scene.units import with_units
 from ._carrier import steps_of
 from ._shooting import Shooting
+from ._solution import orbit_of
 from ._solve import advance as solved
-from ._solve import jacobian_at, orbit_of, tangent_at
+from ._solve import jacobian_at, tangent_at
 from ._symmetry import images, may_be_symmetric
 from .curve import INTERRUPTED, Step, Walk, check_walk, walk
 from .results import Orbit

@@ -2,12 +2,13 @@
 
 import dataclasses
 from collections.abc import Callable
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 import numpy as np
 
-from .._checks import interval
+from .._checks import interval, one_of
 from .._interrupted import Interrupted
 from .._lazy import lazy
 from ..flow.labelled import tidy
@@ -18,7 +19,10 @@ from ..scene.units import in_unit, with_units
 from ._follow import Follower
 from ._rest import rests
 from ._shooting import Shooting
-from ._solve import advance, located, orbit_of, problem_of, tangent_at
+from ._solution import orbit_of
+from ._solve import advance, located, problem_of, tangent_at
+from ._tables import COLUMNS, on_sections, table_of
+from ._tables import column_names as column_names
 from .curve import INTERRUPTED, Step, check_walk, walk
 from .floquet import NEUTRAL
 from .results import ORBIT_RESULTS, Orbit, impacts_in_words
@@ -60,6 +64,10 @@ class Branch:
     """Smallest distance to a stop at a turn that does not touch it, in the unit of positions."""
     frequency_ratio: np.ndarray
     """ζ: mean speed of the drive, NaN for scenes that are not driven."""
+    duration: np.ndarray
+    """Least period in time."""
+    averages: dict[str, np.ndarray]
+    """The machine's own averages over the period, by name (see `AbstractScene.averages`)."""
     cycles: int
     """Period in drive cycles."""
     special: list[SpecialPoint]
@@ -83,6 +91,47 @@ class Branch:
         """Whether the motion stays inside the gap and approaches each impact, at each point."""
         slow = self.impact_speed.min(axis=1, initial=np.inf)
         return (self.clearance > -1e-9) & (slow > -1e-9)
+
+    @property
+    def impacts(self) -> np.ndarray:
+        """Number of impacts in the period, at each point."""
+        return np.full(len(self.parameter), self.impact_speed.shape[1])
+
+    @cached_property
+    def sections(self) -> dict[str, np.ndarray]:
+        """The state on the section and the machine's own quantities there, by name; solved for
+        when it is first asked for."""
+        return on_sections(self.problem, self.steps)
+
+    @property
+    def column_names(self) -> tuple[str, ...]:
+        """Names of all that is a number at each point, as pictures and tables take them."""
+        return column_names(self.problem.scene, self.problem.like)
+
+    def column(self, name: str) -> np.ndarray:
+        """A number at each point: one of the branch's arrays, one of the machine's averages, or a
+        part of the state or a quantity on the section, as `section_Y`.
+
+        **Raises:** `ValueError` that lists the names there are.
+        """
+        one_of("name", name, self.column_names)
+        if name in self.averages:
+            return self.averages[name]
+        if name in COLUMNS:
+            return getattr(self, name)
+        return self.sections[name.removeprefix("section_")]
+
+    def table(self, function: Callable[[Orbit], Any]) -> "xr.Dataset":
+        """What a function makes of the orbit at each point, as an `xarray.Dataset` over the points
+        beside the parameter; `.to_dataframe()` makes it a table.
+
+        **Arguments:** a function of an `Orbit` that returns numbers by name; or one number or
+        array, which is called `value` then. An array has axes of its own.
+
+        **Raises:** `TypeError` for a function that returns no numbers, or others at another point.
+        """
+        orbits = (self.orbit(i) for i in range(len(self.steps)))
+        return table_of(function, orbits, self.name, self.parameter, self.problem.scene.units)
 
     def orbit(self, index: int) -> Orbit:
         """The motion at one point."""
@@ -122,17 +171,15 @@ class Branch:
 
         **Raises:** `ValueError` if there is no such dimension.
         """
-        data = {
-            name: ("point", getattr(self, name))
-            for name in ("parameter", "y_min", "y_max", "clearance", "frequency_ratio", "stable")
-        }
+        data = {name: ("point", self.column(name)) for name in self.column_names}
         data |= {
             "impact_phase": (("point", "impact"), self.impact_phase),
             "impact_speed": (("point", "impact"), self.impact_speed),
             "multipliers": (("point", "state"), self.multipliers),
         }
         found = xr.Dataset(data, attrs={"parameter": self.name, "period_in_cycles": self.cycles})
-        found = with_units(found, self.problem.scene.units, {"parameter": self.name})
+        own = {name: name for name in self.averages} | {"parameter": self.name}
+        found = with_units(found, self.problem.scene.units, own)
         return tidy(found, along)
 
     def __str__(self) -> str:
@@ -277,6 +324,11 @@ def _branch(problem, name, steps, special, ends, scale) -> Branch:
         impact_speed=column(lambda seen: np.asarray(seen.approach)[impacts]),
         clearance=column(lambda seen: seen.clearance),
         frequency_ratio=np.full(len(xs), np.nan) if ratio is None else np.asarray(ratio),
+        duration=duration,
+        averages={
+            name: column(lambda seen, name=name: seen.averages[name])
+            for name in steps[0].seen.averages
+        },
         cycles=problem.cycles,
         special=special,
         ends=ends,

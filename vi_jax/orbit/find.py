@@ -18,6 +18,7 @@ from .._numbers import concrete
 from .._programs import compiled
 from ..flow import Run, simulate
 from ..flow.arguments import check_leaves, refuse_arrays
+from ..flow.beside import means
 from ..flow.methods import MethodLike
 from ..scene import AbstractScene, Scene
 from ..scene.event import is_autonomous
@@ -189,6 +190,8 @@ class _Seen(NamedTuple):
     clearance: Float[Array, " cycles"]
     duration: Float[Array, " cycles"]
     impacts: Float[Array, " cycles"]
+    integrals: dict[str, Float[Array, " cycles"]]
+    """Of the machine's averages, over the time of each cycle."""
     phase: Float[Array, "cycles log"]
     speed: Float[Array, "cycles log"]
     stop: Float[Array, "cycles log"]
@@ -217,7 +220,9 @@ def _follow(arc: CycleMap, state: Any, impact_log: int) -> _Seen:
         assert run.clearance is not None and run.duration is not None
         return _Seen(
             places, jacobians, run.y_min, run.y_max, run.clearance, run.duration,
-            run.impacts.astype(x.dtype), log.phase, log.speed, log.stop.astype(x.dtype),
+            run.impacts.astype(x.dtype),
+            {name: mean * run.duration for name, mean in run.averages.items()},
+            log.phase, log.speed, log.stop.astype(x.dtype),
         )  # fmt: skip
 
     return seen(arc, state)
@@ -265,6 +270,7 @@ def _judged(the_map: CycleMap, guess: Any, root_finder: AbstractSearch, impact_l
     )
     phase = scene.phase_at(phase)
     duration = jnp.sum(jnp.where(within, seen.duration, 0.0))
+    sums = {name: jnp.sum(jnp.where(within, a, 0.0)) for name, a in seen.integrals.items()}
     clearance = jnp.min(jnp.where(within, seen.clearance, jnp.inf))
     found = (root.converged > 0) & (error < jnp.sqrt(jnp.finfo(x.dtype).eps) * 100)
     slowest = jnp.min(jnp.where(hit, seen.speed, jnp.inf))
@@ -290,6 +296,7 @@ def _judged(the_map: CycleMap, guess: Any, root_finder: AbstractSearch, impact_l
         error=error,
         iterations=root.steps.astype(jnp.int32),
         history=root.history,
+        averages=means(sums, duration),
         result=_verdict(found, least < cycles, near, drifts, jnp.isnan(root.residual)),
     )
 

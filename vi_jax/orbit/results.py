@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -14,6 +15,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from ..flow import AbstractMethod, Run, simulate
 from ..flow.enumeration import NamedEnumeration
 from ..flow.labelled import batch_names, in_names, present, states, tidy
+from ..flow.named import quantities_on
 from ..scene import AbstractScene
 from ..scene.event import is_autonomous
 from ..scene.numbers import plain, state_in_words
@@ -103,6 +105,9 @@ class Orbit(Told):
     """Residual after each step of the search, NaN beyond the last."""
     result: ORBIT_RESULTS
     """Whether an orbit was found, or why not."""
+    averages: dict[str, Float[Array, "..."]] = eqx.field(default_factory=dict)
+    """The machine's own averages over the time of the period, by name (see
+    `AbstractScene.averages`)."""
 
     @property
     def successful(self) -> Bool[Array, "..."]:
@@ -126,6 +131,12 @@ class Orbit(Told):
         for _ in range(self.multipliers.ndim - 1):
             verdict = jax.vmap(verdict)
         return verdict(self.successful, self.multipliers)
+
+    @property
+    def quantities(self) -> dict[str, Float[Array, "... cycles"]]:
+        """The machine's own functions of its state on the sections, by name (see
+        `AbstractScene.quantities`)."""
+        return quantities_on(self.scene, self.sections, self.residual.ndim)
 
     @property
     def slowest_impact(self) -> Float[Array, "..."]:
@@ -189,7 +200,8 @@ class Orbit(Told):
                  "residual", "error", "iterations")  # fmt: skip
         each = ("impact_phase", "impact_speed", "impact_stop")
         variables = states("section", self.sections, (*batch, "section"))
-        variables |= present({name: getattr(self, name) for name in alone}, batch)
+        variables |= states("section", self.quantities, (*batch, "section"))
+        variables |= present({name: getattr(self, name) for name in alone} | self.averages, batch)
         variables |= present({name: getattr(self, name) for name in each}, (*batch, "impact"))
         variables |= present({"multipliers": self.multipliers}, (*batch, "multiplier"))
         variables |= present({"monodromy": self.monodromy}, (*batch, "row", "column"))
@@ -198,7 +210,8 @@ class Orbit(Told):
             "stability": in_names(self.stability, STABILITY, STABILITY_NAMES),
         }
         data = xr.Dataset(variables | present(words, batch))
-        return tidy(with_units(data, self.scene.units), along)
+        own = {name: name for name in self.averages}
+        return tidy(with_units(data, self.scene.units, own), along)
 
     def told(self) -> str:
         """The motion, its impacts and its multipliers."""
@@ -225,6 +238,8 @@ class Orbit(Told):
                 name = self.scene.stops[int(stop)].side
                 fast = in_unit(f"{float(speed):.9g}", units, "velocity")
                 lines.append(f"  impact: {name} stop at phase {float(phase):.6f}, V⁻ = {fast}")
+        for name, x in self.averages.items():
+            lines.append(f"  mean {name}: {in_unit(f'{float(x):.9g}', units, name)}")
         listed = int(jnp.sum(self.impact_stop >= 0))
         if listed < count:
             lines.append(f"  only {listed} of {count} impacts are listed: see `impact_log`")

@@ -10,7 +10,8 @@ from .._checks import given_number
 from ..scene.shown import told_in_table
 from ._events import Event
 from ._shooting import Shooting
-from ._solve import advance, jacobian_at, orbit_of, state_at, tangent_at
+from ._solution import orbit_of
+from ._solve import advance, jacobian_at, state_at, tangent_at
 from .curve import Step
 from .results import Orbit
 

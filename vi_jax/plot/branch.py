@@ -35,11 +35,12 @@ def plot_branch(
     Its colour is that of its period, as in all pictures; a motion of two cycles with several
     impacts has another than one with a single impact.
 
-    **Arguments:** the branch; `ax`, a new figure if left out; `y` and `x`, names of the branch's
-    arrays with a number for each point (`y` is by default the first of `"y_min"`, `"y_max"` that a
-    stop does not hold where it is); `special`, whether to mark the special points (where `y` is a
-    number of an orbit); `legend`, whether to draw one, which tells whose period and impacts a
-    colour stands for, or the branch's `label`, then what solid and dashed lines are, and the marks;
+    **Arguments:** the branch; `ax`, a new figure if left out; `y` and `x`, names of what is a
+    number at each point, `Branch.column_names`: `"duration"`, `"section_Y"`, or an average of the
+    machine's such as `"power"` (`y` is by default the first of `"y_min"`, `"y_max"` that a stop
+    does not hold where it is); `special`, whether to mark the special points (where `y` is a number
+    of an orbit); `legend`, whether to draw one, which tells whose period and impacts a colour
+    stands for, or the branch's `label`, then what solid and dashed lines are, and the marks;
     options of `Axes.plot`.
 
     **Returns:** the axes.
@@ -69,7 +70,7 @@ def plot_branch(
             ax.plot([], [], line, color="0.3", lw=look["lw"], label=once(ax, word))
     if special and x == "parameter":
         for point in branch.special:
-            value = getattr(point.orbit, y, None)
+            value = point.orbit.averages.get(y, getattr(point.orbit, y, None))
             if value is not None and np.ndim(value) == 0:
                 mark = {**mark_style(point.kind), "zorder": 4, "label": once(ax, point.kind)}
                 ax.plot(point.parameter, float(value), **mark)
@@ -77,7 +78,7 @@ def plot_branch(
         _legend(ax)
     scene = branch.problem.scene
     ax.set_xlabel("ζ" if x == "frequency_ratio" else axis_name(branch.name, scene.units))
-    ax.set_ylabel(extreme_name(y, scene.labels, scene.units))
+    ax.set_ylabel(extreme_name(y, scene.labels, scene.units, branch.averages))
     return ax
 
 
@@ -90,9 +91,11 @@ def _moving(found: Branch | Sweep) -> str:
 
 def _array(found: Branch | Sweep, argument: str, name: str) -> np.ndarray:
     """An array with a number for each point. **Raises:** `ValueError` that lists them."""
+    if isinstance(found, Branch):
+        return found.column(one_of(argument, name, found.column_names))
     arrays = {
         name: x
-        for name, x in vars(found).items()
+        for name, x in {**vars(found), **found.averages}.items()
         if hasattr(x, "dtype") and x.shape == found.y_min.shape
     }
     return np.asarray(arrays[one_of(argument, name, tuple(arrays))])
@@ -133,7 +136,7 @@ def plot_sweep(
     ax.plot(across, up, **look)
     units = dict(sweep.units)
     ax.set_xlabel(axis_name(sweep.parameter if x == "values" else x, units))
-    ax.set_ylabel(extreme_name(y, sweep.labels, units))
+    ax.set_ylabel(extreme_name(y, sweep.labels, units, sweep.averages))
     return ax
 
 
@@ -159,13 +162,19 @@ def plot_boundary(curve: Boundary, *, ax: Axes | None = None, **style: Any) -> A
     return ax
 
 
-def extreme_name(name: str, labels: tuple[str, str], units: Mapping[str, str]) -> str:
-    """What an axis of smallest or greatest positions says, in the words of a scene."""
+def extreme_name(
+    name: str, labels: tuple[str, str], units: Mapping[str, str], averages: Any = ()
+) -> str:
+    """What an axis of smallest or greatest positions says, in the words of a scene; or one of the
+    machine's own averages."""
+    if name in averages:
+        return in_brackets(f"mean {name}", unit_of(units, name))
     least = {"y_min": "min", "y_max": "max"}.get(name)
     if least is None:
         if name == "frequency_ratio":
             return "mean frequency ratio ζ"
         quantity = quantity_of(name)
+        name = f"{name.removeprefix('section_')} on the section" if "section_" in name else name
         return name if quantity is None else in_brackets(name, unit_of(units, quantity))
     return in_brackets(f"{least} {name_in(labels[0])}", unit_of(units, "position"))
 

@@ -1,7 +1,7 @@
 """What a scan is asked to measure: by name, by a measure, or by a function of one's own."""
 
 import difflib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 from .measures import (
     AbstractMeasure,
+    Average,
     Exponent,
     Extremes,
     FrequencyRatio,
@@ -57,8 +58,9 @@ MEASURES: Mapping[str, Callable[[], AbstractMeasure]] = {
 }
 
 
-def measures_of(measure: Any) -> tuple[AbstractMeasure, ...]:
-    """Measures by name, as objects, or functions of a scene and a run; one or several.
+def measures_of(measure: Any, averages: Sequence[str] = ()) -> tuple[AbstractMeasure, ...]:
+    """Measures by name, as objects, or functions of a scene and a run; one or several. A name may
+    be that of one of the machine's own `averages`, which comes first.
 
     **Raises:** `ValueError` for an unknown name, `TypeError` for anything else.
     """
@@ -66,19 +68,22 @@ def measures_of(measure: Any) -> tuple[AbstractMeasure, ...]:
         measure = (measure,)
     if not isinstance(measure, Iterable):
         raise TypeError(f"Argument `measure` must be a name or a function, but got {measure!r}.")
-    found = tuple(_measure(one) for one in measure)
+    found = tuple(_measure(one, averages) for one in measure)
     if not found:
         raise ValueError("Argument `measure` must name at least one measure, but is empty.")
     return found
 
 
-def _measure(one: Any) -> AbstractMeasure:
+def _measure(one: Any, averages: Sequence[str]) -> AbstractMeasure:
     if isinstance(one, AbstractMeasure):
         return one
     if isinstance(one, str):
+        if one in averages:
+            return Average(one)
         if one in MEASURES:
             return MEASURES[one]()
-        near = difflib.get_close_matches(one, MEASURES, n=2, cutoff=0.4) or list(MEASURES)
+        names = [*averages, *MEASURES]
+        near = difflib.get_close_matches(one, names, n=2, cutoff=0.4) or names
         raise ValueError(
             f"Argument `measure` must name a measure, but got {one!r}; near names: "
             f"{', '.join(near)}."

@@ -1,5 +1,6 @@
 """What a scan computes of its lanes: a pytree that is compiled once and can be sent away."""
 
+import contextlib
 import dataclasses
 import inspect
 from collections.abc import Callable, Iterable
@@ -17,6 +18,7 @@ from .._numbers import strongly_typed
 from ..flow import AbstractMethod
 from ..flow.arguments import check_period, check_reals, machine_of, refuse_arrays
 from ..flow.methods import MethodLike, chosen
+from ..flow.named import average_names, has_averages
 from ..flow.results import number_of
 from ..flow.simulate import simulate_pool
 from ..scene import AbstractScene
@@ -178,7 +180,7 @@ def make_job(
     max_steps: int | None = None,
 ) -> Job:
     """The work for each lane, its arguments checked as far as they can be without the axes."""
-    measures = measures_of(measure)
+    measures = measures_of(measure, _averages_of(scene, names, start))
     needed = max(m.cycles for m in measures)
     cycles = max(32, needed) if cycles is None else count("cycles", cycles, least=1)
     if cycles < needed:
@@ -224,6 +226,27 @@ def make_job(
         max_steps=None if max_steps is None else count("max_steps", max_steps, least=1),
         rests=rests,
     )
+
+
+def _averages_of(scene: Any, axes: Iterable[str], start: Any) -> tuple[str, ...]:
+    """The names of the averages of a machine, or of those that a function makes."""
+    if isinstance(scene, AbstractScene):
+        return _names_of(scene, start)
+    found: list[tuple[str, ...]] = []
+
+    def made(values):
+        found.append(_names_of(scene(**values), start))
+
+    # What cannot be made is told where the method is looked for.
+    with contextlib.suppress(Exception):
+        jax.eval_shape(made, {x: jnp.zeros(()) for x in axes if not x.startswith(START)})
+    return found[0] if found else ()
+
+
+def _names_of(scene: Any, start: Any) -> tuple[str, ...]:
+    if not isinstance(scene, AbstractScene) or not has_averages(scene):
+        return ()
+    return average_names(scene, scene.start() if start is None else scene.adopt(start))
 
 
 def _suited(

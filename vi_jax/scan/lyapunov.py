@@ -13,15 +13,17 @@ from jaxtyping import Array, Bool, Float
 from .._checks import count, flag
 from .._programs import compiled
 from ..flow import RESULTS, has_fixed_cycle, simulate
+from ..flow.beside import means
 from ..flow.labelled import batch_names, in_names, present, states, tidy
 from ..flow.methods import MethodLike, chosen
+from ..flow.named import has_averages
 from ..flow.results import REASON_NAMES
 from ..orbit.cycle_map import CycleMap, adopted, cycle_map
 from ..scene import AbstractScene
 from ..scene.base import renews
 from ..scene.event import is_autonomous
 from ..scene.shown import Told, number_in_words
-from ..scene.units import attributes, unit_of, with_unit
+from ..scene.units import Stated, attributes, in_unit, stated, unit_of, with_unit, with_units
 
 
 class Lyapunov(Told):
@@ -39,6 +41,10 @@ class Lyapunov(Told):
     """Section state at the end."""
     result: RESULTS
     """Whether the run was simulated to its end; if not, the numbers are NaN."""
+    averages: dict[str, Float[Array, "..."]] = eqx.field(default_factory=dict)
+    """The machine's own averages over the time of the cycles observed, by name."""
+    units: Stated = eqx.field(static=True, default=())
+    """In which units they are, as the machine states it."""
     unit: str = eqx.field(static=True, default="")
     """Of the exponents, as the machine states it; "" if it does not."""
 
@@ -65,11 +71,13 @@ class Lyapunov(Told):
         each = *batch, "exponent"
         variables = present({"exponents": self.exponents, "per_cycle": self.per_cycle}, each)
         variables |= states("state", self.state, batch)
+        variables |= present(self.averages, batch)
         alone = {"spread": self.spread, "result": in_names(self.result, RESULTS, REASON_NAMES)}
         data = xr.Dataset(variables | present(alone, batch))
         for name in ("exponents", "spread"):
             data[name].attrs |= attributes(self.unit)
-        return tidy(data, along)
+        own = {name: name for name in self.averages}
+        return tidy(with_units(data, dict(self.units), own) if own else data, along)
 
     def told(self) -> str:
         """The exponents; of a batch the range of the greatest."""
@@ -80,7 +88,12 @@ class Lyapunov(Told):
         numbers = ", ".join(f"{x:.9g}" for x in self.exponents)
         ended = "" if bool(self.successful) else f"; ended: {RESULTS[self.result]}"
         numbers = with_unit(numbers, self.unit)
-        return f"Lyapunov exponents {numbers} (halves differ by {self.spread:.1g}){ended}"
+        told = f"Lyapunov exponents {numbers} (halves differ by {self.spread:.1g}){ended}"
+        lines = (
+            f"  mean {name}: {in_unit(f'{float(x):.6g}', dict(self.units), name)}"
+            for name, x in self.averages.items()
+        )
+        return "\n".join([told, *lines])
 
 
 def lyapunov(
@@ -150,7 +163,8 @@ def _lyapunov(the_map: CycleMap, start, cycles: int, settle, number: int) -> Lya
     x, unravel = ravel_pytree(before.last)
 
     # Where all cycles last alike, turning points need not be met for the sake of durations.
-    record = "sections" if has_fixed_cycle(scene, before.last) else "motion"
+    plain = has_fixed_cycle(scene, before.last) and not has_averages(scene)
+    record = "sections" if plain else "motion"
 
     # One direction alone need not be kept apart from others after every cycle.
     window = _window(cycles) if number == 1 else 1
@@ -161,7 +175,8 @@ def _lyapunov(the_map: CycleMap, start, cycles: int, settle, number: int) -> Lya
         if duration is None:
             duration = jnp.full(window, scene.period, x.dtype)
         sections = jax.vmap(lambda state: ravel_pytree(state)[0])(run.sections)
-        return sections[1:], (duration, run.result)
+        integrals = {name: x * duration for name, x in run.averages.items()}
+        return sections[1:], (duration, integrals, run.result)
 
     def observe(carry, _):
         x, frame, result = carry
@@ -169,17 +184,23 @@ def _lyapunov(the_map: CycleMap, start, cycles: int, settle, number: int) -> Lya
         def along(direction):
             return jax.jvp(image, (x,), (direction,), has_aux=True)
 
-        new, grown, (duration, ended) = jax.vmap(along, in_axes=1, out_axes=(None, 2, None))(frame)
+        new, grown, (duration, integrals, ended) = jax.vmap(
+            along, in_axes=1, out_axes=(None, 2, None)
+        )(frame)
         frame, sizes = _orthogonal(grown[-1])
         rates = _growth(grown[..., 0])[:, None] if number == 1 else jnp.log(sizes)[None]
         result = RESULTS.where(result == RESULTS.successful, ended, result)
-        return (new[-1], frame, result), (rates, duration)
+        return (new[-1], frame, result), (rates, duration, integrals)
 
     frame = jnp.eye(x.size, number, dtype=x.dtype)
     carry = (x, frame, before.result)
-    carry, (rates, duration) = jax.lax.scan(observe, carry, length=cycles // window)
+    carry, (rates, duration, integrals) = jax.lax.scan(observe, carry, length=cycles // window)
     (x, _, result), rates, duration = carry, rates.reshape(cycles, number), duration.ravel()
     mean, halves = _weighted(rates, duration)
+
+    def good_sum(x):
+        return jnp.where(result == RESULTS.successful, jnp.sum(x), jnp.nan)
+
     mean = jnp.where(result == RESULTS.successful, mean, jnp.nan)
     exponents = jnp.sort(mean, descending=True)
     return Lyapunov(
@@ -188,7 +209,9 @@ def _lyapunov(the_map: CycleMap, start, cycles: int, settle, number: int) -> Lya
         spread=jnp.where(halves[0] == halves[1], 0.0, jnp.abs(halves[0] - halves[1])),
         state=unravel(x),
         result=result,
+        averages=means(jax.tree.map(good_sum, integrals), jnp.sum(duration)),
         unit=unit_of(scene.units, "rate"),
+        units=stated(scene),
     )
 
 

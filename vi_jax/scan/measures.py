@@ -123,6 +123,27 @@ class Power(AbstractMeasure):
         return {"power": jnp.sum(run.impact_energy) / jnp.sum(run.duration)}
 
 
+class Average(AbstractMeasure):
+    """One of the machine's own averages, over the time of the cycles observed (see
+    `AbstractScene.averages`). Every verb that takes names of measures takes its name alone."""
+
+    name: str = eqx.field(static=True)
+
+    def described(self, start):
+        """In the unit that the machine states for it."""
+        return {self.name: {"unit_of": self.name, "long_name": f"mean {self.name}"}}
+
+    def __call__(self, scene, run):
+        """Of one lane."""
+        found = run.mean_averages()
+        if self.name not in found:
+            raise ValueError(
+                f"Measure `Average` must name one of the averages of a {type(scene).__name__} "
+                f"({', '.join(found) or 'it has none'}), but got {self.name!r}."
+            )
+        return {self.name: found[self.name]}
+
+
 class Sections(AbstractMeasure):
     """The section states of the last `number` cycles, one variable for each part of the state."""
 

@@ -100,7 +100,8 @@ def scan(
       or of the start (`"start.Y"`), each with a row of values.
     - `measure`: what is kept: names out of `"extremes"`, `"regime"`, `"frequency_ratio"`,
       `"power"`, `"impact_rate"`, `"sections"`, `"exponent"`, `"steps"`; `AbstractMeasure`s;
-      functions of a lane's scene and `Run` that return named numbers.
+      functions of a lane's scene and `Run` that return named numbers; or the name of one of the
+      machine's own `averages` (one called `"power"` stands in place of ours).
     - `start`: the first state; by default the scene's own start at rest.
     - `settle`, `cycles`: drive cycles before observing (any number), and observed (static; by
       default as many as the measures need, at least 32).

@@ -29,6 +29,9 @@ from .regime import CODES, REGIMES, flags, impacts_of, least_period
 # A jump is so many times the change at the values beside it, and this part of 1 + |number|.
 _JUMP, _NOTED = 3.0, 0.01
 
+# What is a number at each value of every sweep.
+COLUMNS = "y_min", "y_max", "period", "impacts", "frequency_ratio", "impact_speed"
+
 # Values of one call: few, so that an interrupt loses little, but more than a call costs.
 _AT_ONCE = 16
 
@@ -57,6 +60,9 @@ class Sweep(Told):
     """Section states of the cycles observed; leaves (values, cycles)."""
     result: RESULTS
     """Whether each value was simulated to its end."""
+    averages: dict[str, Float[Array, "..."]] = eqx.field(default_factory=dict)
+    """The machine's own averages over the time of the cycles observed, by name (see
+    `AbstractScene.averages`)."""
     labels: tuple[str, str] = eqx.field(static=True, default=PLAIN)
     """What pictures write beside position and velocity, in the scene's words."""
     periods: tuple[str, ...] = eqx.field(static=True, default=())
@@ -84,13 +90,13 @@ class Sweep(Told):
         import xarray as xr  # slow to load
 
         each = (*batch_names(dims, self.values.ndim - 1), "value")
-        names = ("y_min", "y_max", "period", "impacts", "frequency_ratio", "impact_speed")
-        variables = present({name: getattr(self, name) for name in names}, each)
+        variables = present({name: getattr(self, name) for name in COLUMNS} | self.averages, each)
         variables |= states("section", self.sections, (*each, "cycle"))
         variables["result"] = each, in_names(self.result, RESULTS, REASON_NAMES)
         data = xr.Dataset(variables, {self.parameter: (each, np.asarray(self.values))})
         data["period"].attrs |= flags(CODES)
-        return tidy(with_units(data, dict(self.units), {self.parameter: self.parameter}), along)
+        own = {name: name for name in (*self.averages, self.parameter)}
+        return tidy(with_units(data, dict(self.units), own), along)
 
     def drawn(self) -> Any:
         """The smallest position at each value."""
@@ -302,6 +308,7 @@ def _sweep(
             impact_speed=jnp.max(run.impact_speed),
             sections=sections,
             result=run.result,
+            averages=run.mean_averages(),
             labels=scene.labels,
             units=stated(scene),
             periods=tuple(scene.period_of(n) for n in range(1, cycles // 2 + 1)),

@@ -82,6 +82,8 @@ class AbstractScene(Shown):
     | `begin` | modes of its own, which any event may change |
     | `section` | an autonomous machine, whose cycles are counted by an event |
     | `observed_every` | its Lyapunov exponents, and samples of its orbits |
+    | `averages` | means over a cycle, integrated beside its state: a power, a mean force |
+    | `quantities` | functions of its state, by name, where results show the state |
     | `renewed` | a drift, counted by the cycle |
     | `clock`, `rewound`, `pace` | another variable than `s` that counts cycles or measures time |
     | `step_limit`, `relaxation` | steps that fit time scales shorter than the cycle |
@@ -265,6 +267,22 @@ class AbstractScene(Shown):
     def pace(self, s: Float[Array, ""], state: State) -> Float[Array, ""] | None:
         """d(time)/ds where it varies along the motion, or `None` where `s` measures time."""
         return None
+
+    def averages(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
+        """`averages(s, state)`: what is averaged over time between events, by name.
+
+        Each is integrated beside the state with the method's own accuracy and divided by the time
+        that it took: `Run.averages` of each cycle, `Orbit.averages` and columns of a `Branch` over
+        the period. What jumps with an impact is not in it. Its name must be its own, its unit is
+        that of the same name in `units`. As the field, it gets the modes of a machine that has
+        some; nothing is integrated where no motion is recorded (`record="sections"`)."""
+        return {}
+
+    def quantities(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
+        """`quantities(s, state)`: functions of the state, by name, which results tell beside it: on
+        sections, in samples, along branches. `s` counts from the section; it is 0 where the state
+        has a clock of its own and for autonomous machines."""
+        return {}
 
     @property
     def period(self) -> Float[Array, ""] | float:

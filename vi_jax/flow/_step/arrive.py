@@ -65,9 +65,7 @@ def arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Fla
             met, lambda x: _met(plan, lane, trial, taken, way, x), lambda x: x, arrival
         )
     y_max, y_min, clearance = _reached(plan, lane, trial, taken, way, arrival)
-    time = arrival.time
-    if time is not None and old.time is not None:
-        time = jnp.where(taken, time, old.time)
+    time = select(taken, arrival.time, old.time)
     there = dataclasses.replace(
         lane,
         s=jnp.where(taken, arrival.s, lane.s),

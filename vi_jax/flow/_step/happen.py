@@ -8,6 +8,7 @@ from jaxtyping import Array, Bool, Float
 from ...scene.event import after_event, happens_at, mode_number, value_of
 from .. import results
 from .._lane import CHANGES, RESETS, Plan
+from ..beside import Beside
 from ..moving import rounding
 from .aim import select
 from .faults import comes_back
@@ -28,7 +29,7 @@ class Arrival(NamedTuple):
     """Y there: on the stop, with the stop's derivatives, where one is met."""
     before: Scalar | None
     """Y before a jump; absent where none can move it."""
-    time: Scalar | None
+    time: Beside | None
     direction: tuple[Scalar, ...]
     contact: tuple[Scalar, ...] | None
     """As in `Lane`, the stops rested on."""

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float
 from ...lanes import pin, pin_flag
 from ...scene import AbstractScene
 from .._lane import FREE, Lane, Plan, to_event, to_turn_of, total
+from ..beside import Beside, elapsed
 from ..events import Rates, force_rate, rates, turns_within
 from ..methods.taylor import Expansion
 from ..moving import exact, holding
@@ -29,7 +30,7 @@ class Trial(NamedTuple):
     s: Scalar
     h: Scalar
     state: Any
-    time: Scalar | None
+    time: Beside | None
     error: Scalar
     good: Flag
     ends_interval: Flag
@@ -58,10 +59,13 @@ class Path(NamedTuple):
     force; absent where the body cannot rest."""
 
 
-def timing(plan: Plan, lane: Lane) -> Scalar | None:
-    """The elapsed time, where the method has to carry it along."""
+def timing(plan: Plan, lane: Lane) -> Beside | None:
+    """Elapsed time and integrals, where the method has to carry them along."""
+    passed = lane.record.time
     paced = plan.motion and plan.scene.pace(lane.s, lane.state) is not None
-    return lane.record.time if paced else None
+    if passed is None or not (paced or passed.integrals):
+        return None
+    return Beside(passed.time if paced else None, passed.integrals)
 
 
 def attempt(
@@ -82,15 +86,12 @@ def attempt(
     s1 = pin(s1)
     h = s1 - lane.s
 
-    time = timing(plan, lane)
-    paced = time is not None
+    beside = timing(plan, lane)
     if motion is not None:
-        (new, time), error = motion.at(h), jnp.zeros_like(h)
+        (new, beside), error = motion.at(h), jnp.zeros_like(h)
     else:
-        moved: Any = machine if method.uses_field else scene
-        new, time, error = method.step(moved, lane.s, s1, lane.state, time)
-    if not paced and lane.record.time is not None:
-        time = lane.record.time + h
+        new, beside, error = method.step(machine, lane.s, s1, lane.state, beside)
+    time = None if lane.record.time is None else elapsed(lane.record.time, beside, h)
     if lane.contact is not None and not method.uses_field:
         rests = lane.contact[0] > 0
         new = jtu.tree_map(lambda a, b: jnp.where(rests, a, b), lane.state, new)

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from ...scene.event import guard_of, section_number
 from .._lane import Plan
+from ..beside import rate_beside
 from ..events import rates
 from ..moving import Moving, holding
 from .guards import Crossing
@@ -18,8 +19,8 @@ Scalar = Float[Array, ""]
 
 
 class Way:
-    """The way that a machine goes on from `moving`: s, its state, and the time where it is asked
-    for.
+    """The way that a machine goes on from `moving`: s, its state, and the time and the integrals
+    where they are asked for.
 
     Its functions close over no number: everything that may have a derivative is an argument, in
     `fixed`.
@@ -71,10 +72,7 @@ class Way:
 
     def _rate(self, moving, fixed, rest):
         (machine, _), (s, state, time) = self._whole(fixed, rest), moving
-        pace = None if time is None else machine.pace(s, state)
-        if time is not None and pace is None:
-            pace = jnp.ones_like(s)
-        return jnp.ones_like(s), machine.field(s, state), pace
+        return jnp.ones_like(s), machine.field(s, state), rate_beside(machine, s, state, time)
 
     def _whole(self, fixed: Any, rest: Any) -> Any:
         return eqx.combine(fixed, rest, self._static)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ...scene import AbstractScene
+from ..beside import Beside
 
 Scalar = Float[Array, ""]
 
@@ -65,12 +66,14 @@ class AbstractMethod(eqx.Module):
         s0: Scalar,
         s1: Scalar,
         state: Any,
-        time: Scalar | None,
-    ) -> tuple[Any, Scalar | None, Scalar]:
-        """State and elapsed time at `s1` from those at `s0`, and the step's error.
+        beside: Beside | None,
+    ) -> tuple[Any, Beside | None, Scalar]:
+        """State, and what is integrated `beside` it, at `s1` from those at `s0`, and the step's
+        error.
 
         The error is relative to the tolerance (a step is accepted up to 1); it is 0 for methods
-        that are not adaptive. `time` is `None` unless the scene has a pace that is asked for.
+        that are not adaptive. `beside` is `None` unless the elapsed time of a scene with a `pace`,
+        or averages, are asked for; its rate is `rate_beside`.
         """
 
     @abc.abstractmethod

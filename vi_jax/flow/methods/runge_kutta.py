@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from ..._checks import count, require
 from ...lanes import pin
 from ...scene import AbstractScene
+from ..beside import rate_beside
 from .base import AbstractMethod
 from .unrolled import Unrolled
 from .verner import Verner9
@@ -24,16 +25,20 @@ def _unrolled(solver: Any) -> Unrolled:
     return solver if isinstance(solver, Unrolled) else Unrolled(solver)
 
 
-def _runge_kutta(solver: Unrolled, scene: AbstractScene, s0, s1, state, time):
+def _runge_kutta(solver: Unrolled, scene: AbstractScene, s0, s1, state, beside):
     def field(s, y, args):
-        state, time = y
-        pace = None if time is None else scene.pace(s, state)
-        return pin((scene.field(s, state), pace))
+        state, beside = y
+        return pin((scene.field(s, state), rate_beside(scene, s, state, beside)))
 
     y1, error, *_ = solver.step(
-        diffrax.ODETerm(field), s0, s1, (state, time), None, None, made_jump=True
+        diffrax.ODETerm(field), s0, s1, (state, beside), None, None, made_jump=True
     )
-    return *y1, error[0]
+    return *y1, error
+
+
+def _told(state: Any, beside: Any) -> tuple[Any, Any]:
+    """What sizes a step: the state and the integrals, but not the elapsed time."""
+    return state, None if beside is None else beside.integrals
 
 
 class Adaptive(AbstractMethod):
@@ -83,23 +88,25 @@ class Adaptive(AbstractMethod):
             return scene.step_limit(s, state)
         return super().longest(scene, s, state)
 
-    def step(self, scene, s0, s1, state, time):
-        """One Runge–Kutta step and its error norm (root mean square over the components)."""
+    def step(self, scene, s0, s1, state, beside):
+        """One Runge–Kutta step and its error norm (root mean square over the components of the
+        state and the integrals of averages)."""
         # Below the precision's own rounding a tolerance would only be rejected for ever.
         floor = 8 * jnp.finfo(s0.dtype).eps
         rtol = jnp.maximum(jnp.asarray(self.rtol, s0.dtype), floor)
         solver = self.solver
         if solver.implicit:
             solver = Unrolled(solver.solver, tolerance=jnp.maximum(0.01 * rtol, floor))
-        new, time, error = _runge_kutta(solver, scene, s0, s1, state, time)
+        new, after, errors = _runge_kutta(solver, scene, s0, s1, state, beside)
+        old, there, error = (_told(*x) for x in ((state, beside), (new, after), errors))
         atol = rtol if self.atol is None else jnp.maximum(jnp.asarray(self.atol, s0.dtype), floor)
         scaled = jtu.tree_map(
             lambda e, a, b: (e / (atol + rtol * jnp.maximum(jnp.abs(a), jnp.abs(b)))) ** 2,
-            error, state, new,
+            error, old, there,
         )  # fmt: skip
         parts = jtu.tree_leaves(scaled)
         number = sum(x.size for x in parts)
-        return new, time, jnp.sqrt(jax.lax.stop_gradient(sum(map(jnp.sum, parts)) / number))
+        return new, after, jnp.sqrt(jax.lax.stop_gradient(sum(map(jnp.sum, parts)) / number))
 
     def tighter(self):
         """A hundredth of the tolerances.
@@ -147,10 +154,10 @@ class FixedStep(AbstractMethod):
                 f"but got {self.solver.solver!r}. Use `Adaptive`."
             )
 
-    def step(self, scene, s0, s1, state, time):
+    def step(self, scene, s0, s1, state, beside):
         """One Runge–Kutta step; its error is not asked for."""
-        new, time, _ = _runge_kutta(self.solver, scene, s0, s1, state, time)
-        return new, time, jnp.zeros_like(s0)
+        new, beside, _ = _runge_kutta(self.solver, scene, s0, s1, state, beside)
+        return new, beside, jnp.zeros_like(s0)
 
     def tighter(self):
         """Twice the steps."""

@@ -10,6 +10,7 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
 from ..._checks import count, require
+from ..beside import Beside, rate_beside
 from . import _series as power_series
 from ._series import NoSeries, Series
 from .base import AbstractMethod
@@ -21,11 +22,11 @@ class Expansion(NamedTuple):
     """A motion about a point, in powers of s - s0."""
 
     treedef: Any
-    """Of the state and the elapsed time."""
+    """Of the state and what is integrated beside it."""
     series: list[Series]
 
-    def at(self, h: Scalar) -> tuple[Any, Scalar | None]:
-        """State and elapsed time a length h away."""
+    def at(self, h: Scalar) -> tuple[Any, Beside | None]:
+        """State, and what is integrated beside it, a length h away."""
         return jtu.tree_unflatten(self.treedef, [power_series.at(x, h) for x in self.series])
 
     def of(self, function: Any) -> Series:
@@ -112,19 +113,19 @@ class Taylor(AbstractMethod):
             return super().longest(scene, s, state)
         return scene.step_limit(s, state) * (5 / self.steps_per_cycle)
 
-    def expand(self, scene: Any, s: Scalar, state: Any, time: Scalar | None) -> Expansion:
-        """The motion about (s, state)."""
+    def expand(self, scene: Any, s: Scalar, state: Any, beside: Beside | None) -> Expansion:
+        """The motion about (s, state), and what is integrated beside it."""
 
         def field(s, y):
-            state, time = y
-            return scene.field(s, state), None if time is None else scene.pace(s, state)
+            state, beside = y
+            return scene.field(s, state), rate_beside(scene, s, state, beside)
 
         try:
-            treedef, series = power_series.expand(field, s, (state, time), self.order)
+            treedef, series = power_series.expand(field, s, (state, beside), self.order)
         except NoSeries as error:
             raise NotImplementedError(
                 f"Method `Taylor` has no recursion for the primitive `{error}` in the scene's "
-                "field. Use `Adaptive` or `FixedStep`."
+                "field or averages. Use `Adaptive` or `FixedStep`."
             ) from None
         return Expansion(treedef, series)
 
@@ -136,7 +137,7 @@ class Taylor(AbstractMethod):
         tolerance = jnp.maximum(jnp.asarray(self.rtol, limit.dtype), floor)
         return jnp.minimum(limit, motion.reach(tolerance))
 
-    def step(self, scene, s0, s1, state, time):
+    def step(self, scene, s0, s1, state, beside):
         """The sum of the series at `s1`."""
-        new, time = self.expand(scene, s0, state, time).at(s1 - s0)
-        return new, time, jnp.zeros_like(s0)
+        new, beside = self.expand(scene, s0, state, beside).at(s1 - s0)
+        return new, beside, jnp.zeros_like(s0)

@@ -1,0 +1,223 @@
+"""Averages and quantities that a machine names: energy that goes in and comes out, by each method.
+
+Over any cycle of a driven oscillator the work taken is the work lost to damping, that lost in
+impacts, and what its energy has grown by.
+"""
+
+from typing import NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+from scipy.integrate import solve_ivp
+
+from differences import quick
+from shaken_oscillator import Shaken
+
+
+class Flown(vi.Scene):
+    """A ready machine with averages."""
+
+    def averages(self, s, state):
+        turn = self.phase_at(s if self.clock_name == "phase" else self.drive.frequency_ratio * s)
+        return {"taken": jnp.cos(turn) * state.V, "lost": 2 * self.damping_ratio * state.V**2}
+
+    def quantities(self, s, state):
+        return {"energy": 0.5 * (state.V**2 + state.Y**2)}
+
+
+class Driven(vi.Scene):
+    """A motor whose mean speed is known: one turn in each cycle."""
+
+    def averages(self, s, state):
+        return {"speed": state.W}
+
+
+def flown(ratio=0.7, gap=1.3):
+    stop = vi.RigidStop(gap, 0.5)
+    return Flown(oscillator=vi.Oscillator(0.05), drive=vi.IdealDrive(ratio), stops=(stop,))
+
+
+def motor():
+    ready = vi.Parameters(torque=10.0, restitution=0.5, gap=0.05, control=1.2).scene()
+    return Driven(
+        oscillator=ready.oscillator, drive=ready.drive, stops=ready.stops, crank=ready.crank
+    )
+
+
+def begin(gap=0.5):
+    return vi.OscillatorState(jnp.asarray(min(0.1, gap)), jnp.asarray(0.2))
+
+
+def unbalanced(run):
+    """What is missing of the energy in each cycle."""
+    work = (run.averages["taken"] - run.averages["lost"]) * run.duration
+    return work - run.impact_energy - jnp.diff(run.quantities["energy"])
+
+
+# Method, and how exactly energy is balanced with it.
+METHODS = {
+    "fixed": (vi.FixedStep(), 3e-8),
+    "adaptive": (vi.Adaptive(), 1e-9),
+    "implicit": (vi.Adaptive(diffrax.Kvaerno5(), rtol=1e-8), 1e-6),
+    "series": (vi.Taylor(), 1e-10),
+    "sized series": (vi.Taylor(rtol=1e-12), 1e-12),
+}
+
+
+@pytest.mark.parametrize("gap", [0.5, -0.3], ids=["impacts", "chatter and rest"])
+@pytest.mark.parametrize("name", quick(METHODS, "adaptive", "series"))
+def test_energy_is_balanced_by_every_method(name, gap):
+    method, close = METHODS[name]
+    run = vi.simulate(Shaken(gap=gap), begin(gap), 12, method=method)
+    assert int(run.impacts.sum()) > 20 and int(run.rests.sum()) == (gap < 0)
+    np.testing.assert_allclose(unbalanced(run), 0.0, atol=close)
+
+
+@pytest.mark.parametrize("clock", ["phase", pytest.param("time", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("gap", [1.3, 0.1], ids=["impacts", "chatter and rest"])
+def test_energy_is_balanced_along_flights_in_closed_form(gap, clock):
+    scene = flown(gap=gap)
+    run = vi.simulate(scene, scene.start(Y=0.05), 12, clock=clock)
+    assert int(run.impacts.sum()) > 10 and (run.rests is not None) == (gap < 1)
+    np.testing.assert_allclose(unbalanced(run), 0.0, atol=1e-13)
+
+
+@pytest.mark.parametrize("clock", ["phase", pytest.param("time", marks=pytest.mark.slow)])
+def test_mean_speed_of_a_motor_is_one_turn_in_a_cycle(clock):
+    scene = motor()
+    run = vi.simulate(scene, scene.start(), 8, clock=clock)
+    assert int(run.impacts.sum()) > 5
+    np.testing.assert_allclose(run.averages["speed"], 2 * np.pi / run.duration, rtol=1e-14)
+
+
+def test_beside_scipy_with_samples_between():
+    """The integrals go on from sample to sample."""
+    machine = Shaken(gap=50.0)
+
+    def field(s, x):
+        pace = 1 / 0.8
+        push = np.cos(s) - x[0] - 0.1 * x[1]
+        return np.array([x[1], push, np.cos(s) * x[1], 0.1 * x[1] ** 2]) * pace
+
+    beside = solve_ivp(field, (0, 2 * np.pi), [0.1, 0.2, 0, 0], rtol=1e-12, atol=1e-12)
+    run = vi.simulate(machine, begin(), 1, method=vi.Taylor(), samples=8)
+    lengths = beside.y[2:, -1] * 0.8 / (2 * np.pi)
+    np.testing.assert_allclose([run.averages[x][0] for x in ("taken", "lost")], lengths, atol=1e-9)
+    assert run.samples is not None
+    np.testing.assert_allclose(
+        run.samples.quantities["push"], np.cos(np.arange(9) * np.pi / 4), atol=1e-12
+    )
+
+
+def test_derivatives_through_impacts():
+    """Beside finite differences; and with them energy stays balanced, to the last bit or so."""
+
+    def power(x):
+        machine = Shaken(amplitude=x[0], frequency=x[1], gap=x[2], restitution=x[3])
+        run = vi.simulate(machine, begin(), 6, method=vi.Taylor())
+        return run.averages["taken"], unbalanced(run)
+
+    at, alone = jnp.array([1.0, 0.8, 0.5, 0.6]), vi.jit(lambda x: power(x)[0])
+    slopes, left = vi.jit(jax.jacfwd(power))(at)
+    np.testing.assert_allclose(left, 0.0, atol=1e-8)
+    for i, h in enumerate(1e-6 * jnp.eye(4)):
+        between = (alone(at + h) - alone(at - h)) / 2e-6
+        np.testing.assert_allclose(slopes[:, i], between, rtol=2e-6, atol=2e-7)
+    back = vi.jit(jax.grad(lambda x: power(x)[0][-1]))(at)
+    np.testing.assert_allclose(back, slopes[-1], rtol=1e-11)
+
+
+def test_lanes_are_alike_on_both_roads_and_alone():
+    def lane(ratio):
+        scene = flown(ratio)
+        run = vi.simulate(scene, scene.start(Y=0.1, V=0.2), 6)
+        return run.averages, run.quantities, run.successful
+
+    ratios = jnp.linspace(0.7, 1.3, 11)
+    found = []
+    for road in ("auto", "xla"):
+        with vi.road(road):
+            found.append(jax.jit(jax.vmap(lane))(ratios))
+    assert bool(found[0][2].all())
+    alone = lane(ratios[3])
+    for a, b, c in zip(*(jax.tree.leaves(x) for x in (*found, alone)), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-12)
+        np.testing.assert_allclose(a[3], c, atol=1e-12)
+
+
+class Rubbed(NamedTuple):
+    place: jax.Array
+
+
+class Switching(vi.AbstractScene):
+    """A clock with a mode: ±1, by the sign of a sawtooth, which a reset begins anew."""
+
+    stops = ()
+
+    @property
+    def cycle(self):
+        return 3.0
+
+    @property
+    def events(self):
+        return (vi.Reset(lambda m, s, x, mode: x.place - 1.0, self._again, modes=self._other),)
+
+    @staticmethod
+    def _again(machine, s, state, mode):
+        return Rubbed(jnp.zeros_like(state.place))
+
+    @staticmethod
+    def _other(machine, s, state, mode):
+        return (-mode,)
+
+    def begin(self, s, state):
+        return (1.0,)
+
+    def field(self, s, state, mode):
+        return Rubbed(jnp.ones_like(state.place))
+
+    def averages(self, s, state, mode):
+        return {"upward": 0.5 * (1 + mode), "height": state.place}
+
+
+def test_modes_and_resets():
+    """A sawtooth of height 1: 1.25 of each 3 s in the first mode, by turns."""
+    run = vi.simulate(Switching(), Rubbed(jnp.asarray(0.25)), 2)
+    np.testing.assert_allclose(run.averages["upward"], [1.75 / 3, 1.25 / 3], atol=1e-12)
+    height = (0.5 - 0.25**2 / 2 + 0.5 + 0.5 + 0.25**2 / 2) / 3
+    np.testing.assert_allclose(run.averages["height"], [height, height], atol=1e-9)
+
+
+def test_what_a_run_tells_of_them():
+    run = vi.simulate(Shaken(), begin(), 2, samples=2)
+    assert "mean taken: " in repr(run) and f"{run.averages['taken'][-1]:.6g} W" in repr(run)
+    data = run.to_xarray()
+    assert data.taken.dims == ("cycle",) and data.taken.attrs["units"] == "W"
+    assert data.section_energy.dims == ("section",) and data.sample_energy.attrs["units"] == "J"
+    assert vi.simulate(Shaken(), begin(), 2, record="sections").averages == {}
+
+
+@pytest.mark.parametrize(
+    ("said", "kind", "match"),
+    [
+        ({"impacts": 1.0}, ValueError, "'impacts' is taken"),
+        ({"Y": 1.0}, ValueError, "'Y' is taken"),
+        ({"gap": 1.0}, ValueError, "'gap' is taken"),
+        ({"energy": 1.0}, ValueError, "one of its `quantities` too"),
+        ({"a b": 1.0}, ValueError, "identifiers, but got 'a b'"),
+        ({"pair": jnp.zeros(2)}, TypeError, r"'pair' is an array of shape \(2,\)"),
+        ({"word": "high"}, TypeError, "'word' is 'high'"),
+        (3.0, TypeError, "mapping of names to numbers, but returned float"),
+    ],
+)
+def test_names_are_checked_before_any_work(said, kind, match):
+    class Named(Shaken):
+        def averages(self, s, state):
+            return said
+
+    with pytest.raises(kind, match=match):
+        vi.simulate(Named(), begin(), 1)

@@ -1,0 +1,95 @@
+"""A machine's own averages and quantities along orbits and branches."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+
+from shaken_oscillator import Shaken
+
+
+def missing(power, orbit):
+    """Of the power taken what is neither lost in damping nor in impacts; zero for an orbit."""
+    dissipated = 0.5 * (1 - 0.6**2) * jnp.nansum(orbit.impact_speed**2) / orbit.duration
+    return power["taken"] - power["lost"] - dissipated
+
+
+@pytest.fixture(scope="module")
+def orbit():
+    machine = Shaken()
+    settled = vi.simulate(machine, machine.start(), 1, settle=100)
+    return vi.find_orbit(machine, settled.last)
+
+
+@pytest.fixture(scope="module")
+def branch(orbit):
+    return vi.continue_orbit(orbit, parameter="frequency", bounds=(0.75, 0.85))
+
+
+def test_an_orbit_takes_the_power_that_it_loses(orbit):
+    assert bool(orbit.successful)
+    np.testing.assert_allclose(missing(orbit.averages, orbit), 0.0, atol=1e-8)
+    assert f"mean taken: {float(orbit.averages['taken']):.9g} W" in repr(orbit)
+    data = orbit.to_xarray()
+    assert data.taken.attrs["units"] == "W" and data.section_energy.dims == ("section",)
+    np.testing.assert_allclose(
+        orbit.quantities["energy"], 0.5 * (orbit.sections.V**2 + orbit.sections.Y**2)
+    )
+
+
+def test_along_a_branch(branch, orbit):
+    assert len(branch.parameter) > 3
+    here = branch.at(0.8)[0]
+    np.testing.assert_allclose(here.averages["taken"], orbit.averages["taken"], atol=1e-8)
+    balance = branch.table(lambda at: {"missing": missing(at.averages, at), "Y": at.state.Y})
+    np.testing.assert_allclose(balance.missing, 0.0, atol=1e-9)
+    np.testing.assert_array_equal(balance.parameter, branch.parameter)
+    np.testing.assert_allclose(branch.column("section_Y"), balance.Y, atol=1e-14)
+    np.testing.assert_allclose(branch.column("duration"), 2 * np.pi / branch.parameter)
+    assert (branch.column("impacts") == 2).all() == (branch.impact_speed.shape[1] == 2)
+    data = branch.to_xarray(along="point")
+    assert data.taken.attrs["units"] == "W" and data.section_energy.attrs["units"] == "J"
+    assert set(data) >= {"duration", "impacts", "lost", "section_V", "section_push"}
+    frame = branch.table(lambda at: at.impact_speed)
+    assert frame.value.shape == branch.impact_speed.shape
+
+
+def test_pictures_by_name(branch):
+    ax = vi.plot_branch(branch, y="taken")
+    assert ax.get_ylabel() == "mean taken (W)"
+    drawn = ax.lines[0].get_ydata()  # the first of its parts, stable or not
+    np.testing.assert_array_equal(drawn, branch.averages["taken"][: len(drawn)])
+    assert len(drawn) > 5
+    with pytest.raises(ValueError, match=r"lost.*section_push.*'power'"):
+        vi.plot_branch(branch, y="power")
+
+
+def test_tables_are_checked(branch):
+    with pytest.raises(TypeError, match="'word' is 'high'"):
+        branch.table(lambda at: {"word": "high"})
+    counts = itertools.count()
+    with pytest.raises(TypeError, match="same names and shapes"):
+        branch.table(lambda at: np.zeros(next(counts)))
+    with pytest.raises(TypeError, match="call no number `parameter`"):
+        branch.table(lambda at: {"parameter": 0.0})
+
+
+@pytest.mark.slow
+def test_derivatives_of_an_orbit(branch):
+    """By the implicit function theorem; beside the branch's own slope, and for several guesses."""
+
+    def power(frequency, guess):
+        found = vi.find_orbit(Shaken(frequency=frequency), guess, method=vi.Taylor())
+        return found.averages["taken"], found.quantities["energy"]
+
+    at = branch.at(0.8)[0]
+    (_, slope) = jax.jvp(lambda f: power(f, at.state)[0], (0.8,), (1.0,))
+    beside = [float(branch.at(0.8 + h)[0].averages["taken"]) for h in (2e-5, -2e-5)]
+    np.testing.assert_allclose(slope, (beside[0] - beside[1]) / 4e-5, rtol=1e-6)
+    guesses = jax.tree.map(lambda x: jnp.stack([x, x + 1e-3]), at.state)
+    taken, energy = power(0.8, guesses)
+    np.testing.assert_allclose(taken, at.averages["taken"], atol=1e-8)
+    assert energy.shape == (2, 1)

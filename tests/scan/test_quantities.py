@@ -1,0 +1,70 @@
+"""A machine's own averages in scans, sweeps and reports of exponents."""
+
+import numpy as np
+import pytest
+import vi_jax as vi
+from vi_jax import cli
+
+from shaken_oscillator import Shaken
+
+FREQUENCIES = np.array([0.76, 0.77, 0.78])
+OBSERVED = {"settle": 60, "cycles": 8}
+
+
+@pytest.fixture(scope="module")
+def runs():
+    """Each frequency by itself."""
+    found = []
+    for frequency in FREQUENCIES:
+        machine = Shaken(frequency=frequency)
+        found.append(vi.simulate(machine, machine.start(), 8, settle=60))
+    return found
+
+
+def test_a_scan_measures_an_average_by_its_name(runs):
+    wanted = [run.averages["taken"].mean() for run in runs]
+    for machine in (Shaken(), lambda frequency: Shaken(frequency=frequency)):
+        data = vi.scan(
+            machine, {"frequency": FREQUENCIES}, measure=("taken", "power"), start=Shaken().start(),
+            progress=False, **OBSERVED,
+        )  # fmt: skip
+        np.testing.assert_allclose(data.taken, wanted, rtol=1e-9)
+        assert data.taken.attrs["units"] == "W" and "power" in data
+    with pytest.raises(ValueError, match="near names: taken"):
+        vi.scan(Shaken(), {"frequency": FREQUENCIES}, measure="takes")
+
+
+def test_a_sweep_shows_it(runs):
+    swept = vi.sweep(Shaken(), "frequency", FREQUENCIES[:1], **OBSERVED)
+    np.testing.assert_allclose(swept.averages["taken"][0], runs[0].averages["taken"].mean())
+    assert swept.to_xarray().taken.attrs["units"] == "W"
+    ax = vi.plot_sweep(swept, y="taken")
+    assert ax.get_ylabel() == "mean taken (W)"
+    with pytest.raises(ValueError, match="'lost', 'taken'"):
+        vi.plot_sweep(swept, y="given")
+
+
+def test_exponents_tell_it(runs):
+    machine = Shaken(frequency=FREQUENCIES[0])
+    found = vi.lyapunov(machine, runs[0].last, 8, settle=0, number=1)
+    np.testing.assert_allclose(found.averages["taken"], runs[0].averages["taken"][-1], rtol=1e-6)
+    assert "mean taken: " in repr(found) and found.to_xarray().taken.attrs["units"] == "W"
+
+
+def test_on_the_command_line(tmp_path, monkeypatch, capsys):
+    """By name in files, and a wrong name is told with those there are, before any work."""
+    monkeypatch.chdir(tmp_path)
+    asked = "[sweep]\nparameter = 'frequency'\nvalues = [0.76, 0.77]\nsettle = 5\ncycles = 4\n"
+    name = ["--machine", "shaken_oscillator:Shaken"]
+    (tmp_path / "good.toml").write_text(f"{asked}y = 'taken'\noutput = 'a.csv'\npicture = 'a.png'")
+    assert cli.main(["sweep", "good.toml", *name]) == 0
+    header = (tmp_path / "a.csv").read_text(encoding="utf-8").splitlines()[0]
+    assert {"lost", "taken"} <= set(header.split(",")) and (tmp_path / "a.png").exists()
+    (tmp_path / "run.toml").write_text("[simulate]\ncycles = 2\noutput = 'run.csv'")
+    assert cli.main(["simulate", "run.toml", *name]) == 0
+    header = (tmp_path / "run.csv").read_text(encoding="utf-8").splitlines()[0]
+    assert {"energy", "taken"} <= set(header.split(","))
+    capsys.readouterr()
+    (tmp_path / "bad.toml").write_text(f"{asked}y = 'power'")
+    assert cli.main(["sweep", "bad.toml", *name]) == 2
+    assert "impact_speed, lost, taken" in capsys.readouterr().err

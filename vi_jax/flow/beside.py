@@ -1,0 +1,55 @@
+"""What is integrated beside the state: the elapsed time, and the machine's averages over it.
+
+Neither is part of the state, and nothing that moves depends on them; but a method carries them with
+its own accuracy, and an event that is landed upon ends them with its derivatives.
+"""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+Scalar = Float[Array, ""]
+
+
+class Beside(NamedTuple):
+    """What has passed since the last record point."""
+
+    time: Scalar | None
+    """Elapsed time; absent where every cycle takes the same."""
+    integrals: dict[str, Scalar]
+    """Of each of the machine's averages, by name, its integral over time; where the machine has no
+    `pace`, over s."""
+
+
+def rate_beside(machine: Any, s: Scalar, state: Any, beside: Beside | None) -> Beside | None:
+    """How fast by s that changes which is integrated beside the state; `None` for nothing.
+
+    **Arguments:** the machine in its modes (so that its averages are asked with these); s and
+    state; what is integrated, for its structure.
+    """
+    if beside is None:
+        return None
+    pace, integrals = machine.pace(s, state), {}
+    if beside.integrals:
+        for name, value in machine.averages(s, state).items():
+            value = jnp.asarray(value, s.dtype)
+            integrals[name] = value if pace is None else pace * value
+    time = beside.time
+    if time is not None:
+        time = jnp.ones_like(s) if pace is None else pace
+    return Beside(time, integrals)
+
+
+def elapsed(old: Beside, carried: Beside | None, h: Scalar) -> Beside:
+    """What has passed after a step of length h: what the method `carried` along, and the time,
+    where that is s itself."""
+    time = None if carried is None else carried.time
+    if time is None and old.time is not None:
+        time = old.time + h
+    return Beside(time, {} if carried is None else carried.integrals)
+
+
+def means(integrals: dict[str, Any], duration: Any) -> dict[str, Any]:
+    """The averages of the integrals over this duration."""
+    return {name: x / duration for name, x in integrals.items()}

@@ -1,0 +1,79 @@
+"""A solution of an orbit's equations as data."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._programs import compiled
+from ._shooting import Shooting
+from .curve import Step
+from .results import ORBIT_RESULTS, Orbit
+
+
+@compiled
+def _compiled_sections(problem, x, legs, places):
+    states = jax.vmap(lambda leg, s: problem.state_at(x, leg, s))(legs, places)
+    return states, jnp.max(jnp.abs(problem.residual(x)))
+
+
+def _clock_of(problem: Shooting, x: Any) -> tuple[np.ndarray, float]:
+    """Clock of each event, and the period by the clock."""
+    return np.asarray(problem.parts(x)[0])[: len(problem.events)], float(problem.period(x))
+
+
+def sections_of(problem: Shooting, x: Any) -> tuple[Any, Any]:
+    """The states on the sections of a solution, and what it lacks to be one."""
+    x = jnp.asarray(x)
+    clock, period = _clock_of(problem, x)
+    begins = [i for i, event in enumerate(problem.events) if event.cycle is not None]
+    if begins:
+        places, legs = clock[begins], np.asarray(begins)
+    else:
+        places = float(problem.at(x).cycle) * np.arange(problem.cycles)
+        legs = np.zeros(problem.cycles, int)
+        if len(clock):
+            places = clock[0] + np.mod(places - clock[0], period)
+            legs = np.searchsorted(clock, places, side="right") - 1
+    return _compiled_sections(problem, x, jnp.asarray(legs), jnp.asarray(places))
+
+
+def orbit_of(problem: Shooting, step: Step) -> Orbit:
+    """The solution at a step as an `Orbit`."""
+    x, seen = jnp.asarray(step.x), step.seen
+    scene = problem.at(x)
+    clock, period = _clock_of(problem, x)
+    sections, residual = sections_of(problem, x)
+    admissible = seen.clearance >= -1e-9 and min(seen.approach, default=1.0) > -1e-9
+    # Along a branch an impact may move past the section: an orbit's clocks lie within its period.
+    impacts = np.asarray(problem.impacts, int)
+    within = np.mod(clock[impacts], period)
+    order = np.argsort(within)
+    stops = np.asarray([problem.events[i].number for i in impacts], np.int32)
+    since = scene.phase_at(within[order])
+    duration = jnp.asarray(seen.duration)
+    return Orbit(
+        scene=scene,
+        method=problem.method,
+        state=jax.tree.map(lambda x: x[0], sections),
+        sections=sections,
+        cycles=jnp.asarray(problem.cycles, jnp.int32),
+        duration=duration,
+        frequency_ratio=scene.frequency_ratio(duration / problem.cycles),
+        impact_phase=jnp.asarray(since),
+        impact_speed=jnp.asarray(np.asarray(seen.approach)[impacts][order]),
+        impact_stop=jnp.asarray(stops[order]),
+        impacts=jnp.asarray(len(impacts), jnp.int32),
+        y_min=jnp.asarray(seen.y_min),
+        y_max=jnp.asarray(seen.y_max),
+        clearance=jnp.asarray(seen.clearance),
+        monodromy=jnp.asarray(seen.monodromy),
+        multipliers=jnp.asarray(seen.multipliers),
+        residual=residual,
+        error=jnp.asarray(step.size),
+        iterations=jnp.asarray(step.iterations, jnp.int32),
+        history=jnp.zeros((0,)),
+        result=ORBIT_RESULTS.successful if admissible else ORBIT_RESULTS.inadmissible,
+        averages={name: jnp.asarray(x) for name, x in seen.averages.items()},
+    )

@@ -1,0 +1,90 @@
+"""What is told of a branch, point by point."""
+
+from collections.abc import Callable, Iterable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._lazy import lazy
+from ..flow.named import average_names, quantities_on, quantity_names
+from ..scene import AbstractScene
+from ..scene.numbers import components
+from ..scene.units import with_units
+from ._shooting import Shooting
+from ._solution import sections_of
+from .curve import Step
+from .results import Orbit
+
+if TYPE_CHECKING:
+    import xarray as xr
+else:
+    xr = lazy("xarray")
+
+
+# What is a number at each point of every branch.
+COLUMNS = (
+    "parameter", "y_min", "y_max", "clearance", "frequency_ratio", "duration", "impacts",
+    "stable",
+)  # fmt: skip
+
+
+def column_names(scene: AbstractScene, like: Any) -> tuple[str, ...]:
+    """What is a number at each point of a branch of this machine, whose states are like this."""
+    inner = (*components(like), *quantity_names(scene, like))
+    return (*COLUMNS, *average_names(scene, like), *(f"section_{name}" for name in inner))
+
+
+def on_sections(problem: Shooting, steps: list[Step]) -> dict[str, np.ndarray]:
+    """State and quantities on the first section of each solution, by name; each (points,)."""
+    rows = []
+    for step in steps:
+        states, _ = sections_of(problem, step.x)
+        first = jax.tree.map(lambda x: x[:1], states)
+        own = quantities_on(problem.at(jnp.asarray(step.x)), first)
+        rows.append(components(first, 1) | own)
+    return {name: np.concatenate([np.asarray(row[name]) for row in rows]) for name in rows[0]}
+
+
+def table_of(
+    function: Callable[[Orbit], Any],
+    orbits: Iterable[Orbit],
+    parameter: str,
+    values: np.ndarray,
+    units: Mapping[str, str],
+) -> "xr.Dataset":
+    """What the function makes of each orbit, beside the values of the parameter (see
+    `Branch.table`)."""
+    rows = [_numbers(function(orbit)) for orbit in orbits]
+    shapes = {name: x.shape for name, x in rows[0].items()}
+    for i, row in enumerate(rows):
+        here = {name: x.shape for name, x in row.items()}
+        if here != shapes:
+            raise TypeError(
+                "Argument `function` must return numbers of the same names and shapes at each "
+                f"point, but gave {shapes} at point 0 and {here} at point {i}."
+            )
+    if "parameter" in shapes:
+        raise TypeError(
+            "Argument `function` must call no number `parameter`, which is the branch's own."
+        )
+    data: dict[str, Any] = {"parameter": ("point", values)}
+    for name, shape in shapes.items():
+        axes = (f"{name}_{k}" for k in range(len(shape)))
+        data[name] = ("point", *axes), np.stack([row[name] for row in rows])
+    named = {name: name for name in shapes} | {"parameter": parameter}
+    return with_units(xr.Dataset(data, attrs={"parameter": parameter}), units, named)
+
+
+def _numbers(found: Any) -> dict[str, np.ndarray]:
+    """Numbers by name, of what a function of an orbit returned."""
+    named = found if isinstance(found, Mapping) else {"value": found}
+    numbers = {str(name): np.asarray(x) for name, x in named.items()}
+    for name, x in numbers.items():
+        if x.dtype.kind not in "biufc":
+            raise TypeError(
+                "Argument `function` must return a number, or numbers by name, but its "
+                f"{name!r} is {named[name]!r}."
+            )
+    return numbers
