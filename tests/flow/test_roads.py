@@ -11,7 +11,9 @@ import pytest
 import vi_jax as vi
 from vi_jax.scene.base import AbstractScene
 
+from chain import Chain, balls
 from differences import quick
+from rough_block import Block, on_plane
 
 IDEAL = vi.Oscillator(0.05)
 ONE, TWO = (vi.RigidStop(1.3, 0.6),), (vi.RigidStop(1.3, 0.6), vi.RigidStop(1.5, 0.4, "left"))
@@ -65,6 +67,36 @@ def test_roads_agree(name):
     for a, b in zip(jax.tree.leaves(fast), jax.tree.leaves(slow), strict=True):
         if a.dtype == jnp.float64:
             np.testing.assert_allclose(a, b, rtol=0, atol=close)
+
+
+def falling(k):
+    """Three balls that touch, dropped on a floor."""
+    return Chain(k, (1.0, 2.0, 1.0), 0.0, force=1.0, length=2.0), balls(
+        (-0.6, -0.5, -0.4), (0,) * 3
+    )
+
+
+def sliding(pull):
+    """A block that falls on a rough floor, and is pulled along it."""
+    return Block(0.3, 0.5, pull=pull), on_plane(0, 0.02, 1, 0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [falling, sliding])
+def test_roads_agree_where_contacts_act_together(make):
+    method = vi.FixedStep(steps_per_cycle=24)
+    numbers = jnp.linspace(0.1, 0.7, 5)
+    runs = []
+    for road in ("auto", "xla"):
+        with vi.road(road):
+            lane = jax.vmap(lambda x: vi.simulate(*make(x), 3, method=method, impact_log=60))
+            runs.append(jax.jit(lane)(numbers))
+    fast, slow = runs
+    assert bool(fast.successful.all())
+    np.testing.assert_array_equal(fast.impacts, slow.impacts)
+    np.testing.assert_array_equal(fast.impact_log.stop, slow.impact_log.stop)
+    for a, b in zip(jax.tree.leaves(fast.sections), jax.tree.leaves(slow.sections), strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", quick(CASES, "exact flight", "motor"))

@@ -2,58 +2,14 @@
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
 
-
-class Plane(eqx.Module):
-    x: Any
-    y: Any
-    u: Any
-    v: Any
-
-
-def at(*numbers):
-    return Plane(*(jnp.asarray(float(x)) for x in numbers))
-
-
-class Block(vi.AbstractScene):
-    """A particle above a floor at y = 0, pulled along it."""
-
-    friction: Any = 0.3
-    restitution: Any = 0.0
-    along: Any = 0.0
-    """Tangential restitution."""
-    pull: Any = 0.0
-    """Amplitude of a force cos s along the floor."""
-    lift: Any = 0.0
-    """Amplitude of a force sin 2s up."""
-
-    @property
-    def coordinates(self):
-        return (
-            vi.Coordinate(lambda z: z.y, lambda z: z.v, lambda z, Y, V: Plane(z.x, Y, z.u, V)),
-            vi.Coordinate(lambda z: z.x, lambda z: z.u, lambda z, Y, V: Plane(Y, z.y, V, z.v)),
-        )
-
-    @property
-    def stops(self):
-        return (vi.RigidStop(0.0, self.restitution, "left"),)
-
-    @property
-    def switches(self):
-        return (vi.ContactFriction(self.friction, stop=0, along=1, restitution=self.along),)
-
-    @property
-    def cycle(self):
-        return 2 * jnp.pi
-
-    def field(self, s, z, mode):
-        return Plane(z.u, z.v, self.pull * jnp.cos(s), -1 + self.lift * jnp.sin(2 * s))
+from rough_block import Block, Plane
+from rough_block import on_plane as at
 
 
 @pytest.mark.parametrize("along", [0.0, 0.5])

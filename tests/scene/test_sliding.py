@@ -170,5 +170,5 @@ def test_sticking_is_sliding_along_the_surface_of_no_speed():
         (graze,) = branch.special
         assert graze.kind == "grazing"
         multiplier = float(jnp.abs(orbit.multipliers).max())
-        found.append((float(orbit.state.Y), multiplier, float(graze.value)))
+        found.append((float(orbit.state.Y), multiplier, graze.parameter))
     np.testing.assert_allclose(*found, atol=1e-8)

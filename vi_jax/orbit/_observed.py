@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
 from ..scene import AbstractScene
-from ..scene.event import Section, events_of, guard_of
+from ..scene.event import events_of, guard_of, section_number
 from ._events import Event
 
 
@@ -56,7 +56,7 @@ def apart(
         least = jnp.minimum(least, lengths[i])
         before = tuple(jnp.asarray(mode, clock.dtype) for mode in modes[i - 1])
         for number, other in enumerate(events_of(scene)):
-            if number == event.number or isinstance(other, Section):
+            if number == event.number or number == section_number(scene):
                 continue
             room = -guard_of(scene, number, clock[i], states[i], before)
             if other.from_below:  # beyond it the motion may be, until it comes from below again

@@ -22,9 +22,8 @@ from jaxtyping import Array, Float
 from ..flow import AbstractMethod
 from ..flow.beside import means
 from ..flow.named import average_names
-from ..scene import AbstractScene, RigidStop
-from ..scene.base import renews
-from ..scene.event import Section, after_event, is_autonomous, jump_of, mode_number
+from ..scene import AbstractScene
+from ..scene.event import after_event, is_autonomous, jump_of, mode_number
 from ..scene.numbers import with_leaf
 from ._events import Event, guard_at
 from ._flight import Flight
@@ -194,21 +193,24 @@ class Shooting(eqx.Module):
                 end, passed, path = flight.fly(s0, s1, u, self.steps, averages)
                 return end, (passed, path)
 
-            carried, (passed, path) = jax.jacfwd(end, has_aux=True)(self.after(scene, leg, s0, u))
+            after = self.after(scene, leg, s0, u)
+            carried, (passed, path) = jax.jacfwd(end, has_aux=True)(after)
             approach, order = jnp.zeros((0,), x.dtype), jnp.ones((), x.dtype)
             if self.events:
                 saltation, rises = self._saltation(scene, leg, s0, u)
                 carried, approach = carried @ saltation, rises[None]
                 order = self._each(leg, partial(self._order, scene, leg), s0, u)
-            return carried, passed, approach, order, self._turns(scene, leg, s1, path)
+            places = [scene.position(self.unravel(x)) for x in (u, after)]
+            return carried, passed, approach, order, self._turns(scene, leg, s1, path), places
 
         legs = jnp.arange(len(states))
         ends = self.ends(clock, self.period(x))
-        carried, passed, approach, order, turns = jax.vmap(follow)(legs, clock, ends, states)
+        found = jax.vmap(follow)(legs, clock, ends, states)
+        carried, passed, approach, order, turns, places = found
         monodromy = jnp.eye(self.states, dtype=x.dtype)
         for leg in range(len(states)):
             monodromy = carried[leg] @ monodromy
-        Y = jax.vmap(lambda u: scene.position(self.unravel(u)))(self._reached(scene, states))
+        Y = jnp.concatenate(places)
         nearest = jnp.argmin(turns.room)
         time, integrals = jax.tree.map(jnp.sum, passed)
         timed = self.autonomous or scene.pace(clock[0], self.unravel(states[0])) is not None
@@ -233,18 +235,6 @@ class Shooting(eqx.Module):
             duration=time if timed else jnp.asarray(scene.period, x.dtype) * self.cycles,
             averages=means(integrals, time),
         )
-
-    def _reached(self, scene: AbstractScene, states: Array) -> Array:
-        """The states at the events, on both sides of those that may move the first coordinate."""
-        after = []
-        for leg, event in enumerate(self.events):
-            kind = event.of(scene)
-            still = isinstance(kind, RigidStop | Section) or kind.holds_mode
-            if not still or (event.cycle is not None and renews(scene)):
-                s, modes = jnp.zeros((), states.dtype), self._modes_in(leg - 1)
-                there = after_event(scene, event.number, s, self.unravel(states[leg]), modes)[0]
-                after.append(ravel_pytree(there)[0])
-        return jnp.concatenate([states, jnp.stack(after)]) if after else states
 
     def _saltation(self, scene, leg, s, u):
         """How a perturbation passes an event, R + (f⁺ - R f⁻) ∇g / ġ, and how fast it is met.

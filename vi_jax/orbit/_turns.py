@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 from ..flow.beside import Beside
 from ..flow.events import Rates, guard_rates
 from ..scene import AbstractScene
-from ..scene.event import Section, events_of, guard_of, happens_at
+from ..scene.event import events_of, guard_of, happens_at, section_number
 from ._flight import Flight
 
 Scalar = Float[Array, ""]
@@ -127,7 +127,7 @@ def turns_of(
         facing = at.turns & (stop.sign * at.before > 0)
         rooms.append((jnp.where(facing, -stop.beyond(at.height), jnp.inf), at.place))
     for number, event in enumerate(events_of(scene)):
-        if number < len(scene.stops) or isinstance(event, Section):
+        if number < len(scene.stops) or number == section_number(scene):
             continue
         at = found(_Guard(number))
         # A body that friction lets go begins to slide with velocity and acceleration zero.

@@ -87,7 +87,7 @@ class RigidStop(Wall, AbstractEvent):
     def after(self, machine, s, state, *modes):
         """The rebound, on the stop; switches are in the modes that they have behind an impact."""
         body = machine.coordinates[self.coordinate]
-        new = body.placed(state, self.place, self.rebound(body.velocity(state)))
+        new = body.placed(state, self.place, self.leaving(body.velocity(state)))
         return new, self.modes_after(machine, s, state, new, modes)
 
     def modes_after(self, machine: Any, s: Any, before: Any, after: Any, modes: Any) -> Any:
@@ -98,7 +98,7 @@ class RigidStop(Wall, AbstractEvent):
     def jump(self, machine, s, state, *modes):
         """The rebound where the body is."""
         body = machine.coordinates[self.coordinate]
-        return body.placed(state, body.position(state), self.rebound(body.velocity(state)))
+        return body.placed(state, body.position(state), self.leaving(body.velocity(state)))
 
     def speed(self, machine, state, rate):
         """V⁻, the speed of approach."""
@@ -121,6 +121,12 @@ class RigidStop(Wall, AbstractEvent):
     def rebound(self, V: Any) -> Any:
         """The velocity after an impact with this one (Eq. 17 of the paper)."""
         return -self.coefficient(self.approach(V)) * V
+
+    def leaving(self, V: Any) -> Any:
+        """The velocity after an impact with this one: the rebound from what is more than nothing. A
+        speed whose square is no number ends here, as a body may die out on a stop."""
+        least = 100 * float(jnp.finfo(jnp.result_type(V)).tiny) ** 0.5
+        return self.rebound(jnp.where(jnp.abs(V) > least, V, 0.0))
 
     def share(self, approach: Any) -> Any:
         """The share of a speed of approach that is left after the impact: k, or what a `rebound` of

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
-from ...scene.event import Section, struck_modes
+from ...scene.event import section_number, struck_modes
 from .._lane import LEAVES, Lane, Plan, Record, to_event, to_turn_of
 from ..drift import drifted, height_of_turn, met_after, unmoved
 from ..events import Rates, to_turn
@@ -100,7 +100,9 @@ def _met(plan: Plan, lane: Lane, trial: Trial, taken: Flag, way: Way, arrival: A
         if plan.scene.stops:
             arrival = _impact(plan, lane, trial, taken, arrival, landed, there)
         for c in trial.crossings:
-            if isinstance(c.event, Section):  # what begins anew with a cycle does so at its end
+            if c.number == section_number(
+                plan.scene
+            ):  # what begins anew with a cycle does so at its end
                 arrival = arrival._replace(state=select(c.landed, there, arrival.state))
             elif c.coordinate is None:
                 arrival = happened(plan, taken, arrival, c, there)

@@ -15,7 +15,7 @@ import jax.tree_util as jtu
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
-from ...scene import AbstractScene, Coordinate, RigidStop
+from ...scene import AbstractScene, Coordinate
 from ...scene.contacts import forces, push_of, rubbed, shares
 from ...scene.event import rubbing_on, rubs
 from .. import results
@@ -71,12 +71,6 @@ def is_compound(scene: AbstractScene) -> bool:
     return len({stop.coordinate for stop in scene.stops}) > 1 or rubs(scene)
 
 
-def _rebound(stop: RigidStop, approach: Scalar) -> Scalar:
-    # A speed whose square is no number ends here: a body may die out on a stop.
-    least = 100 * float(jnp.finfo(approach.dtype).tiny) ** 0.5
-    return stop.rebound(stop.sign * jnp.where(approach > least, approach, 0.0))
-
-
 def _one_blow(
     plan: Plan, taken: Flag, arrival: Arrival, landed: dict[int, Flag], there: Any, k: int
 ) -> tuple[Arrival, dict[int, Blow]]:
@@ -87,7 +81,7 @@ def _one_blow(
     for number, met in landed.items():
         stop = scene.stops[number]
         approach = jnp.maximum(stop.approach(velocity), 0.0)
-        rebound = _rebound(stop, approach)
+        rebound = stop.leaving(stop.sign * approach)
         arrival = _failing(arrival, met, gains(stop, approach, rebound), results.BAD_IMPACT)
         state = select(met, body.placed(there, stop.place, rebound), arrival.state)
         arrival = _listed(plan, arrival._replace(state=state), there, taken & met, number, approach)
@@ -241,7 +235,7 @@ def _struck(instant: _Instant, x: _Round) -> _Round:
         if rubs(plan.scene):  # with friction each by itself
             hit, found = hit & ~found, found | hit
         hits[number] = hit
-        rebounds[number] = _rebound(stop, jnp.where(hit, closing[number], 0.0))
+        rebounds[number] = stop.leaving(stop.sign * jnp.where(hit, closing[number], 0.0))
     # In the limit what is still being struck comes to rest.
     slow = [
         weak & (struck > 0) & (jnp.abs(stop_gradient(V)) <= _ALIKE * fastest)

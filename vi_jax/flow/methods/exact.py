@@ -93,8 +93,8 @@ def _integrated(
     total = beside
     for node, weight in zip(_NODES, _WEIGHTS, strict=True):
         there = along(float(node))
-        if isinstance(machine, Moving) and machine.held:
-            rests = machine.held[0]
+        if isinstance(machine, Moving) and machine.contact:
+            rests = machine.contact[0] > 0
             there = jtu.tree_map(lambda a, b, rests=rests: jnp.where(rests, a, b), state, there)
         rate = rate_beside(machine, s0 + float(node) * (s1 - s0), there, beside)
         share = float(weight) * (s1 - s0)
