@@ -22,13 +22,12 @@ from jaxtyping import Array, Bool, Float
 
 from ...lanes import pin_flag
 from .._lane import FREE, Lane, Plan, Record
-from ..methods import Taylor
 from ..moving import holding
-from .ahead import ahead
-from .aim import aim_at, select
+from .aim import aim_ahead, aim_at
 from .arrive import arrive
 from .faults import faults
 from .jump import after_jump
+from .search import select
 from .trial import Trial, attempt, timing
 
 Scalar = Float[Array, ""]
@@ -49,12 +48,12 @@ class Step(NamedTuple):
 def iterate(plan: Plan, lane: Lane) -> Step:
     """One step of one lane: advance, aim or land. A lane that has ended is left as it is."""
     active = (lane.done < plan.intervals) & (lane.fault == 0)
-    machine, motion = holding(plan.scene, lane.modes, lane.contact), None
-    if isinstance(plan.method, Taylor):
-        motion = plan.method.expand(machine, lane.s, lane.state, timing(plan, lane))
-        lane = ahead(plan, lane, motion)
+    machine = holding(plan.scene, lane.modes, lane.contact)
+    motion = plan.method.foresee(machine, lane.s, lane.state, timing(plan, lane))
+    if motion is not None:
+        lane = aim_ahead(plan, lane, motion)
     trial = attempt(plan, lane, active, machine, motion)
-    aim, goal, target = aim_at(plan, lane, trial)
+    aim, goal, target = aim_at(plan, lane, trial, foreseen=motion is not None)
     aim = pin_flag(active & aim, lane.s)
     taken = pin_flag(active & trial.good & ~aim, lane.s)
     rejected = active & ~trial.good

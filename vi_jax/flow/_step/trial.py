@@ -11,7 +11,7 @@ from ...lanes import pin, pin_flag
 from ...scene import AbstractScene
 from .._lane import FREE, Lane, Plan, to_event, to_turn_of, total
 from ..events import Rates, force_rate, rates, turns_within
-from ..methods.taylor import Expansion
+from ..methods import Foreseen
 from ..moving import exact, holding
 from .guards import Crossing, crossings, leniency, turn_tolerance
 from .rest import Release, release
@@ -65,7 +65,7 @@ def timing(plan: Plan, lane: Lane) -> Scalar | None:
 
 
 def attempt(
-    plan: Plan, lane: Lane, active: Flag, machine: AbstractScene, motion: Expansion | None
+    plan: Plan, lane: Lane, active: Flag, machine: AbstractScene, motion: Foreseen | None
 ) -> Trial:
     """Try the next step and see what it meets; of length zero for a lane that has ended."""
     scene, method = plan.scene, plan.method

@@ -2,15 +2,33 @@
 
 import abc
 from math import pi
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ...scene import AbstractScene
+from ._series import Along
 
 Scalar = Float[Array, ""]
+
+
+@runtime_checkable
+class Foreseen(Protocol):
+    """A motion that is known before a step is taken."""
+
+    def at(self, h: Scalar) -> tuple[Any, Scalar | None]:
+        """State and elapsed time a length h away."""
+        ...
+
+    def of(self, function: Any) -> Along:
+        """A scalar function of the state along it, as a power series."""
+        ...
+
+    def reach(self, limit: Scalar) -> Scalar:
+        """How far it is known well enough, up to this limit."""
+        ...
 
 
 class AbstractMethod(eqx.Module):
@@ -31,11 +49,6 @@ class AbstractMethod(eqx.Module):
         """How far the states of a motion that repeats differ from one period to the next (relative
         to 1 + |state|): by rounding, written 0, where the steps are the same each time."""
         return 0.0
-
-    @property
-    def sees_ahead(self) -> bool:
-        """Whether it knows the motion before a step is taken (see `Taylor`)."""
-        return False
 
     @property
     def uses_field(self) -> bool:
@@ -72,6 +85,13 @@ class AbstractMethod(eqx.Module):
         The error is relative to the tolerance (a step is accepted up to 1); it is 0 for methods
         that are not adaptive. `time` is `None` unless the scene has a pace that is asked for.
         """
+
+    def foresee(
+        self, scene: AbstractScene, s: Scalar, state: Any, time: Scalar | None
+    ) -> Foreseen | None:
+        """The motion from here, of a method that knows it before a step is taken (see `Taylor`): a
+        step then ends at the first event on it, and is `Foreseen.at` instead of `step`."""
+        return None
 
     @abc.abstractmethod
     def tighter(self) -> "AbstractMethod":
