@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
+from vi_jax.flow.methods import AbstractMethod
 from vi_jax.flow.methods import _series as power_series
 
 RULES = {
@@ -95,6 +96,32 @@ def test_two_stops_and_the_exact_crank():
     truth = last(scene, start, "reference")
     np.testing.assert_array_equal(mine.impacts, truth.impacts)
     np.testing.assert_allclose(mine.sections.Y, truth.sections.Y, atol=1e-9)
+
+
+class Own(AbstractMethod):
+    """A method that foresees a motion, and is no `Taylor`."""
+
+    series: vi.Taylor
+
+    @property
+    def steps_per_cycle(self):
+        return self.series.steps_per_cycle
+
+    def foresee(self, scene, s, state, time):
+        return self.series.foresee(scene, s, state, time)
+
+    def step(self, scene, s0, s1, state, time):
+        raise AssertionError("A motion that is foreseen is not stepped.")
+
+    def tighter(self):
+        return Own(self.series.tighter())
+
+
+def test_a_method_of_ones_own_foresees():
+    scene = vi.Scene.ideal(frequency_ratio=0.8, restitution=0.5, gap=1.2)
+    mine, other = (last(scene, scene.start(), m) for m in (Own(vi.Taylor()), vi.Taylor()))
+    np.testing.assert_array_equal(mine.sections.Y, other.sections.Y)
+    np.testing.assert_array_equal(mine.steps, other.steps)
 
 
 def test_more_orders_and_shorter_steps_are_better():

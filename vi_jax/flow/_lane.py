@@ -56,6 +56,11 @@ def total(tree: Any, start: Scalar) -> Scalar:
     return start
 
 
+def select(condition: Any, a: Any, b: Any) -> Any:
+    """`jnp.where` for pytrees; what is the same in both is left as it is."""
+    return jtu.tree_map(lambda x, y: x if x is y else jnp.where(condition, x, y), a, b)
+
+
 class Record(eqx.Module):
     """What is kept of an interval between two record points; `None` where it was not asked for."""
 

@@ -9,20 +9,20 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
 from ...scene.event import section_number, struck_modes
-from .._lane import LEAVES, Lane, Plan, Record, to_event, to_turn_of
+from .._arrival import Arrival
+from .._contact.impact import is_compound, strike
+from .._contact.rest import Release
+from .._contact.settle import Approach, settle
+from .._lane import LEAVES, Lane, Plan, Record, select, to_event, to_turn_of
+from .._log import clock_at, noted
+from .._way import Way
 from ..drift import drifted, height_of_turn, met_after, unmoved
 from ..events import Rates, to_turn
 from ..moving import exact, holding
-from .aim import select
 from .faults import may_end
 from .guards import Crossing, furthest_landing
-from .happen import Arrival, happened
-from .impact import is_compound, strike
-from .log import clock_at, noted
-from .rest import Release
-from .settle import settle
+from .happen import happened
 from .trial import Trial
-from .way import Way
 
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]
@@ -186,7 +186,7 @@ def _offset(plan: Plan, lane: Lane, trial: Trial, way: Way, c: Crossing) -> Scal
         beyond = trial.s + offset - plan.end(lane.part)
         offset = offset - jnp.maximum(stop_gradient(beyond), 0.0)
     # With the derivatives of what is met, which mean nothing where nothing is.
-    return met_after(way.rate, way.guard(c), offset, way.moving, way.fixed, way.rest)
+    return met_after(way.rate, way.guard(c.number), offset, way.moving, way.fixed, way.rest)
 
 
 def _impact(
@@ -197,7 +197,12 @@ def _impact(
     scene, stops = plan.scene, range(len(plan.scene.stops))
     landed = {number: landed[number] for number in stops}
     arrival, blows = strike(plan, taken, arrival, landed, there)
-    arrival = settle(plan, lane, trial, taken, arrival, there, blows)
+    both = enumerate(zip(trial.paths, trial.alone, strict=True))
+    approaches = {
+        k: Approach(path.end.v, None if path.surge is None else path.surge[1], alone)
+        for k, (path, alone) in both
+    }
+    arrival = settle(plan, lane, approaches, taken, arrival, there, blows)
     met = jnp.zeros_like(taken)
     for here in landed.values():
         met = met | here

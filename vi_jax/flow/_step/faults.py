@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
-from ...scene import AbstractScene, RigidStop
+from ...scene import AbstractScene
 from ...scene.event import events_of, guard_of
 from .. import results
 from .._lane import FREE, Lane, Plan, Record, to_event, total
@@ -23,9 +23,6 @@ _LOST, _MANY = 64.0, 16.0
 
 # Nothing that a lane could do in one interval takes so many steps.
 _STUCK = 65536.0
-
-# By so many roundings a rebound may be faster than the approach.
-_FASTER = 16.0
 
 
 def faults(
@@ -85,16 +82,6 @@ def may_end(scene: AbstractScene) -> bool:
     slides = any(event.may_slide for event in events_of(scene))
     several = bool(scene.stops) and (len(scene.coordinates) > 1 or bool(scene.events))
     return laws or slides or several
-
-
-def gains(stop: RigidStop, approach: Scalar, rebound: Scalar) -> Flag | None:
-    """Whether an impact leaves faster than it came, or goes on into the stop; `None` where the law
-    is one number, whose range is known."""
-    if stop.is_one_number:
-        return None
-    leaves = stop_gradient(-stop.sign * rebound)
-    most = (1 + _FASTER * float(jnp.finfo(leaves.dtype).eps)) * stop_gradient(approach)
-    return ~((leaves >= 0) & (leaves <= most))
 
 
 def comes_back(scene: AbstractScene, i: int, modes: tuple, s: Scalar, state: Any) -> Flag | None:

@@ -1,5 +1,6 @@
 """The events of a machine as a step sees them."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ from ...lanes import pin_flag
 from ...scene import AbstractEvent, AbstractScene
 from ...scene.event import events_of, guard_of, section_number
 from .._lane import Lane, Plan, to_event
-from ..events import Rates, guard_rates, landing, rates
+from ..events import Rates, guard_rates, landing
 from ..moving import exact
 
 Scalar = Float[Array, ""]
@@ -27,23 +28,27 @@ class Crossing(NamedTuple):
     event: AbstractEvent
     number: int
     """Its place among the machine's events."""
-    coordinate: int | None
-    """That it limits, as stops do."""
-    slack: Scalar | None
-    """By so much, which is rounding's, a step may begin or end beyond it; `None` where places on it
-    are exact."""
     begin: Rates
     end: Rates
-    offset: Scalar
-    """δ to the event from the step's end."""
-    landed: Flag
-    again: Flag
+    scale: Any
+    """Of g, for its rounding."""
+    coordinate: int | None = None
+    """That it limits, as stops do."""
+    slack: Scalar | None = None
+    """By so much, which is rounding's, a step may begin or end beyond it; `None` where places on it
+    are exact."""
+    offset: Any = None
+    """δ to the event from the step's end, where it was tried."""
+    landed: Any = None
+    again: Any = None
     """The step was aimed at it and has to be corrected by δ."""
 
     @property
-    def name(self) -> float:
-        """As the loop carries it."""
-        return to_event(self.number)
+    def at_once(self) -> Flag | None:
+        """Whether the step begins at rest on its surface, on its way through; `None` where nothing
+        is on it but exactly."""
+        x, v, a = stop_gradient(self.begin)
+        return None if self.slack is None else (jnp.abs(x) <= self.slack) & (v == 0) & (a > 0)
 
 
 def crossings(
@@ -56,56 +61,48 @@ def crossings(
     """
     scene, (s1, h, new), (good, last) = plan.scene, there, ends
     others, below = _others(plan, lane, holding, s1, new)
-    guards = [*_stops(scene, paths), *others, *_clock(plan, lane, holding, s1, new)]
+    guards = [*at_stops(scene, [(path.begin, path.end) for path in paths]), *others]
     # The stops of one coordinate and a clock are never met together but on a section, where a step
     # ends; other events can be.
-    if others or not exact(scene, lane.state):
+    if plan.others(lane.state) or not exact(scene, lane.state):
         eps = float(jnp.finfo(h.dtype).eps)
         guards = [guard._replace(slack=4 * eps * guard.scale) for guard in guards]
     return tuple(_seen(lane, good & last, good, h, each, guards) for each in guards), below
 
 
-class _Guard(NamedTuple):
-    """An event g = 0: g at both ends of a step."""
-
-    event: AbstractEvent
-    number: int
-    begin: Rates
-    end: Rates
-    scale: Any
-    """Of g, for its rounding."""
-    coordinate: int | None = None
-    slack: Scalar | None = None
-
-
-def _stops(scene: AbstractScene, paths: list[Any]) -> list[_Guard]:
+def at_stops(scene: AbstractScene, ends: list[tuple[Rates, Rates]]) -> list[Crossing]:
+    """Of the stops, from the rates of each coordinate at both ends of a step."""
     found = []
     for i, stop in enumerate(scene.stops):
-        path = paths[stop.coordinate]
-        begin, end = (x.scaled(stop.sign, stop.gap) for x in (path.begin, path.end))
-        scale = 1 + jnp.abs(stop.gap)
-        found.append(_Guard(stop, i, begin, end, scale, stop.coordinate))
+        begin, end = (x.scaled(stop.sign, stop.gap) for x in ends[stop.coordinate])
+        found.append(Crossing(stop, i, begin, end, 1 + jnp.abs(stop.gap), stop.coordinate))
     return found
 
 
 def _others(
     plan: Plan, lane: Lane, moving: Any, s1: Scalar, new: Any
-) -> tuple[list[_Guard], tuple[Scalar, ...]]:
-    """Of the events besides stops; and `Lane.below` at the step's end."""
+) -> tuple[list[Crossing], tuple[Scalar, ...]]:
+    """Of the events besides stops, and of a clock in the state, which counts the cycles; and
+    `Lane.below` at the step's end."""
     scene, found, below = plan.scene, [], []
-    for number in plan.others(lane.state):
 
-        def guard(s: Scalar, state: Any, number=number) -> Scalar:
-            contact = lane.contact or ()
-            return jnp.asarray(guard_of(scene, number, s, state, lane.modes, contact))
-
+    def ends(guard: Callable[[Scalar, Any], Any]) -> tuple[Rates, Rates]:
         begin = guard_rates(moving.field, guard, lane.s, lane.state)
-        end = guard_rates(moving.field, guard, s1, new)
-        scale, event = 1 + stop_gradient(jnp.abs(end.v)), events_of(scene)[number]
+        return begin, guard_rates(moving.field, guard, s1, new)
+
+    around = lane.modes, lane.contact or ()
+    for number in plan.others(lane.state):
+        event = events_of(scene)[number]
+        begin, end = ends(lambda s, x, i=number: jnp.asarray(guard_of(scene, i, s, x, *around)))
+        scale = 1 + stop_gradient(jnp.abs(end.v))
         if event.from_below:
             begin, end, risen = _from_below(lane.below[len(below)], begin, end, scale)
             below.append(risen)
-        found.append(_Guard(event, number, begin, end, scale))
+        found.append(Crossing(event, number, begin, end, scale))
+    if scene.clock(lane.state) is not None:
+        number, bound = section_number(scene), plan.end(lane.part)
+        begin, end = ends(lambda _, x: jnp.asarray(scene.clock(x)) - bound)
+        found.append(Crossing(events_of(scene)[number], number, begin, end, bound))
     return found, tuple(below)
 
 
@@ -127,24 +124,7 @@ def _from_below(
     return begin, end, risen
 
 
-def _clock(plan: Plan, lane: Lane, moving: Any, s1: Scalar, new: Any) -> list[_Guard]:
-    """The end of an interval, where a clock in the state counts the cycles."""
-    scene = plan.scene
-    if scene.clock(lane.state) is None:
-        return []
-    number, bound = section_number(scene), plan.end(lane.part)
-
-    def clock(state: Any) -> Scalar:
-        return jnp.asarray(scene.clock(state))
-
-    ends = (
-        rates(moving.field, clock, lane.s, lane.state).scaled(1, bound),
-        rates(moving.field, clock, s1, new).scaled(1, bound),
-    )
-    return [_Guard(events_of(scene)[number], number, *ends, bound)]
-
-
-def beyond(event: _Guard | Crossing) -> Flag:
+def beyond(event: Crossing) -> Flag:
     """Whether a step ends beyond an event. One that begins there to rounding, after the event
     before, and still falls has not met it: it may end at once, at a turning point. Nor has one that
     stays there to rounding, as of bodies that touch at rest."""
@@ -155,14 +135,14 @@ def beyond(event: _Guard | Crossing) -> Flag:
 
 
 def _seen(
-    lane: Lane, ends: Flag, good: Flag, h: Scalar, guard: _Guard, all_of_them: list[_Guard]
+    lane: Lane, ends: Flag, good: Flag, h: Scalar, guard: Crossing, all_of_them: list[Crossing]
 ) -> Crossing:
     """Whether a step that was aimed at this event met it.
 
     A step that ends an interval as it meets a stop, to rounding, is aimed at it: an impact on the
     section belongs to the cycle that ends there, so that it is not now in one, now in the next.
     """
-    begin, end = guard.begin, guard.end
+    end = guard.end
     aimed = good & (lane.target == to_event(guard.number))
     eps = float(jnp.finfo(h.dtype).eps)
     for other in all_of_them:
@@ -188,8 +168,7 @@ def _seen(
     # Where bodies touch at rest, what is left of their speed is rounding.
     rises = end.v > 0 if guard.slack is None else end.v * h > guard.slack
     again = again | ends & there & close & rises
-    known = guard.event, guard.number, guard.coordinate, guard.slack
-    return Crossing(*known, begin, end, offset, landed, again)
+    return guard._replace(offset=offset, landed=landed, again=again)
 
 
 def leniency(lane: Lane) -> Scalar:

@@ -1,56 +1,22 @@
 """What an event that is no impact makes of a lane."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ...scene.event import after_event, happens_at, mode_number, value_of
 from .. import results
-from .._lane import CHANGES, RESETS, Plan
-from ..beside import Beside
+from .._arrival import Arrival, ended
+from .._lane import CHANGES, RESETS, Plan, select
+from .._log import clock_at, logged, noted
 from ..moving import rounding
-from .aim import select
 from .faults import comes_back
 from .guards import Crossing
 from .jump import after_jump
-from .log import clock_at, logged, noted
 
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]
-
-
-class Arrival(NamedTuple):
-    """The lane where a step leads, and what is kept of its way there."""
-
-    s: Scalar
-    state: Any
-    place: Scalar
-    """Y there: on the stop, with the stop's derivatives, where one is met."""
-    before: Scalar | None
-    """Y before a jump; absent where none can move it."""
-    time: Beside | None
-    direction: tuple[Scalar, ...]
-    contact: tuple[Scalar, ...] | None
-    """As in `Lane`, the stops rested on."""
-    modes: tuple[Scalar, ...]
-    impacts: Scalar
-    speed: Scalar | None
-    loss: Scalar | None
-    rests: Scalar | None
-    log: Any
-    events: Any
-    completed: Flag
-    """Whether the interval is complete."""
-    fault: Scalar | None
-    """As in `Lane`; absent where no event can end it."""
-
-
-def ended(arrival: Arrival, c: Crossing, when: Flag | None, reason: int) -> Arrival:
-    """With this reason to end, where that holds of what was met; `None` where it cannot."""
-    if when is None or arrival.fault is None:
-        return arrival
-    return arrival._replace(fault=jnp.where(c.landed & when, float(reason), arrival.fault))
 
 
 def happened(plan: Plan, taken: Flag, arrival: Arrival, c: Crossing, there: Any) -> Arrival:
@@ -64,7 +30,7 @@ def happened(plan: Plan, taken: Flag, arrival: Arrival, c: Crossing, there: Any)
     log, clock = arrival.log, clock_at(plan, arrival.s, there)
     if event.holds_mode:
         slides = comes_back(scene, c.number, modes, arrival.s, new)
-        arrival = ended(arrival, c, slides, results.SLIDING)
+        arrival = ended(arrival, c.landed, slides, results.SLIDING)
         kind, number = CHANGES, c.number - len(scene.stops)
         value = modes[mode_number(scene, c.number)]
     else:
@@ -94,7 +60,7 @@ def _jumped(
         place = plan.scene.coordinates[stop.coordinate].position(new)
         beyond = beyond | (stop.beyond(place) > rounding(plan.scene, new))
     if plan.scene.stops:
-        arrival = ended(arrival, c, happens & beyond, results.BAD_RESET)
+        arrival = ended(arrival, c.landed, happens & beyond, results.BAD_RESET)
     onward = arrival.direction, arrival.contact, arrival.modes
     direction, contact = after_jump(plan, onward, happens, there, new, arrival.s)
     assert arrival.before is not None  # as the machine has such events

@@ -21,11 +21,9 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
 from ...lanes import pin_flag
-from .._lane import FREE, Lane, Plan, Record
-from ..methods import Taylor
+from .._lane import FREE, Lane, Plan, Record, select
 from ..moving import holding
-from .ahead import ahead
-from .aim import aim_at, select
+from .aim import aim_ahead, aim_at
 from .arrive import arrive
 from .faults import faults
 from .jump import after_jump
@@ -49,27 +47,55 @@ class Step(NamedTuple):
 def iterate(plan: Plan, lane: Lane) -> Step:
     """One step of one lane: advance, aim or land. A lane that has ended is left as it is."""
     active = (lane.done < plan.intervals) & (lane.fault == 0)
-    machine, motion = holding(plan.scene, lane.modes, lane.contact), None
-    if isinstance(plan.method, Taylor):
-        motion = plan.method.expand(machine, lane.s, lane.state, timing(plan, lane))
-        lane = ahead(plan, lane, motion)
+    machine = holding(plan.scene, lane.modes, lane.contact)
+    motion = plan.method.foresee(machine, lane.s, lane.state, timing(plan, lane))
+    if motion is not None:
+        lane = aim_ahead(plan, lane, motion)
     trial = attempt(plan, lane, active, machine, motion)
-    aim, goal, target = aim_at(plan, lane, trial)
+    aim, goal, target = aim_at(plan, lane, trial, foreseen=motion is not None)
     aim = pin_flag(active & aim, lane.s)
     taken = pin_flag(active & trial.good & ~aim, lane.s)
     rejected = active & ~trial.good
     length = _resized(plan, lane, trial, taken, rejected)
     there, completed = arrive(plan, lane, trial, taken)
     completed = pin_flag(completed, lane.s)
-    s, state, record = there.s, there.state, there.record
+    done = lane.done + jnp.where(completed, 1.0, 0.0)
+    new = _onward(plan, there, completed, done)
 
-    done, part = lane.done + jnp.where(completed, 1.0, 0.0), lane.part
-    turned = completed
+    steps = lane.steps + jnp.where(active, 1.0, 0.0)
+    # Counted anew in each interval: in single precision the sum of all stands still at 2²⁴.
+    spent = jnp.where(completed, 0.0, lane.spent + 1.0)
+    fault = there.fault
+    aims = jnp.where(aim, lane.aims + 1, 0.0)
+    for condition, code in faults(
+        plan, lane, trial, rejected, length, new.record, steps, spent, aims, target
+    ):
+        stops_here = active & (fault == 0) & condition & (done < plan.intervals)
+        fault = jnp.where(stops_here, code, fault)
+    new = dataclasses.replace(
+        new,
+        length=length,
+        attempt=jnp.where(aim, goal, length),
+        target=jnp.where(aim, target, FREE),
+        aims=aims,
+        done=done,
+        fault=fault,
+        steps=steps,
+        spent=spent,
+        rejected=lane.rejected + jnp.where(rejected, 1.0, 0.0),
+    )
+    return Step(new, completed, new.state, there.record)
+
+
+def _onward(plan: Plan, there: Lane, completed: Flag, done: Scalar) -> Lane:
+    """The lane as its next interval begins, where one was completed, and its next cycle, where the
+    last of one was; so many are done."""
+    turned, part, state = completed, there.part, there.state
     if plan.parts > 1:
         part = part + jnp.where(completed, 1.0, 0.0)
         turned = completed & (part >= plan.parts)
         part = jnp.where(turned, plan.first_part(done), part)
-    s = jnp.where(turned, 0.0, s)
+    s = jnp.where(turned, 0.0, there.s)
     if not plan.ticks(state):
         state = select(turned, plan.scene.rewound(state), state)
     renewed = plan.scene.renewed(state)
@@ -78,36 +104,8 @@ def iterate(plan: Plan, lane: Lane) -> Step:
         onward = after_jump(plan, onward, turned, state, renewed, jnp.zeros_like(s))
         there = dataclasses.replace(there, direction=onward[0], contact=onward[1])
         state = select(turned, renewed, state)
-    of_interval = record
-    record = select(completed, plan.fresh(state), record)
-
-    steps = lane.steps + jnp.where(active, 1.0, 0.0)
-    # Counted anew in each interval: in single precision the sum of all stands still at 2²⁴.
-    spent = jnp.where(completed, 0.0, lane.spent + 1.0)
-    fault = there.fault
-    aims = jnp.where(aim, lane.aims + 1, 0.0)
-    for condition, code in faults(
-        plan, lane, trial, rejected, length, record, steps, spent, aims, target
-    ):
-        stops_here = active & (fault == 0) & condition & (done < plan.intervals)
-        fault = jnp.where(stops_here, code, fault)
-    new = dataclasses.replace(
-        there,
-        s=s,
-        state=state,
-        record=record,
-        length=length,
-        attempt=jnp.where(aim, goal, length),
-        target=jnp.where(aim, target, FREE),
-        aims=aims,
-        part=part,
-        done=done,
-        fault=fault,
-        steps=steps,
-        spent=spent,
-        rejected=lane.rejected + jnp.where(rejected, 1.0, 0.0),
-    )
-    return Step(new, completed, state, of_interval)
+    record = select(completed, plan.fresh(state), there.record)
+    return dataclasses.replace(there, s=s, state=state, part=part, record=record)
 
 
 def _resized(plan: Plan, lane: Lane, trial: Trial, taken: Flag, rejected: Flag) -> Scalar:

@@ -9,13 +9,13 @@ from jaxtyping import Array, Bool, Float
 
 from ...lanes import pin, pin_flag
 from ...scene import AbstractScene
+from .._contact.rest import Release, release
 from .._lane import FREE, Lane, Plan, to_event, to_turn_of, total
 from ..beside import Beside, elapsed
 from ..events import Rates, force_rate, rates, turns_within
-from ..methods.taylor import Expansion
+from ..methods import Foreseen
 from ..moving import exact, holding
 from .guards import Crossing, crossings, leniency, turn_tolerance
-from .rest import Release, release
 
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]
@@ -69,7 +69,7 @@ def timing(plan: Plan, lane: Lane) -> Beside | None:
 
 
 def attempt(
-    plan: Plan, lane: Lane, active: Flag, machine: AbstractScene, motion: Expansion | None
+    plan: Plan, lane: Lane, active: Flag, machine: AbstractScene, motion: Foreseen | None
 ) -> Trial:
     """Try the next step and see what it meets; of length zero for a lane that has ended."""
     scene, method = plan.scene, plan.method

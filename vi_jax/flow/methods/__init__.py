@@ -1,6 +1,7 @@
 """How a scene is carried over one step: Runge–Kutta, power series, closed form; which to take."""
 
 from .base import AbstractMethod as AbstractMethod
+from .base import Foreseen as Foreseen
 from .choice import MethodLike as MethodLike
 from .choice import chosen as chosen
 from .choice import preset as preset

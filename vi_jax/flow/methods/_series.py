@@ -5,7 +5,7 @@ of its result.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from ...lanes import CALLS
+from ..events import Rates
 from ._coefficients import Coefficient, NoSeries, Series, nth, plus
 from ._recurrences import RULES
 
@@ -45,15 +46,15 @@ def expand(
     return treedef, series
 
 
-def along(function: Callable[[Any], Any], treedef: Any, series: list[Series]) -> Series:
-    """The series of a scalar function of the state."""
+def along(function: Callable[[Any], Any], treedef: Any, series: list[Series]) -> "Along":
+    """A scalar function of the state."""
 
     def flat(*leaves):
         return jtu.tree_leaves(function(jtu.tree_unflatten(treedef, leaves)))
 
     closed = jax.make_jaxpr(flat)(*(x[0] for x in series))
     flow = _Flow(closed, series)
-    return [flow.next(n)[0] for n in range(len(series[0]))]
+    return Along([flow.next(n)[0] for n in range(len(series[0]))])
 
 
 def at(series: Series, h: Any) -> Any:
@@ -64,6 +65,36 @@ def at(series: Series, h: Any) -> Any:
             total = total * h
         total = plus(total, c)
     return total
+
+
+def _slope(series: Series) -> Series:
+    return [None if c is None else c * float(n) for n, c in enumerate(series)][1:]
+
+
+class Along(NamedTuple):
+    """A number along a motion, by its series; a constant for differentiation."""
+
+    series: Series
+
+    def ends(self, h: Any) -> tuple[Rates, Rates]:
+        """Its rates at both ends of a step of this length."""
+        slope, zero = _slope(self.series), jnp.zeros_like(h)
+        each = self.series, slope, _slope(slope)
+
+        def rates(place: Callable[[Series], Any]) -> Rates:
+            return Rates(*(zero if (x := place(c)) is None else x for c in each))
+
+        return rates(lambda c: c[0]), rates(lambda c: at(c, h))
+
+    def over(self, h: Any, factor: int = 1, offset: Any = None) -> tuple[Any, ...]:
+        """Coefficients of factor·x - offset in θ, which goes from 0 to 1 along such a step."""
+        found, power = [], None
+        for c in self.series:
+            found.append(jnp.zeros_like(h) if c is None else c if power is None else c * power)
+            power = h if power is None else power * h
+        if factor != 1:
+            found = [factor * c for c in found]
+        return tuple(found) if offset is None else (found[0] - offset, *found[1:])
 
 
 class _Flow:

@@ -2,7 +2,7 @@
 
 import abc
 from math import pi
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,8 +10,26 @@ from jaxtyping import Array, Float
 
 from ...scene import AbstractScene
 from ..beside import Beside
+from ._series import Along
 
 Scalar = Float[Array, ""]
+
+
+@runtime_checkable
+class Foreseen(Protocol):
+    """A motion that is known before a step is taken."""
+
+    def at(self, h: Scalar) -> tuple[Any, Beside | None]:
+        """State, and what is integrated beside it, a length h away."""
+        ...
+
+    def of(self, function: Any) -> Along:
+        """A scalar function of the state along it, as a power series."""
+        ...
+
+    def reach(self, limit: Scalar) -> Scalar:
+        """How far it is known well enough, up to this limit."""
+        ...
 
 
 class AbstractMethod(eqx.Module):
@@ -32,11 +50,6 @@ class AbstractMethod(eqx.Module):
         """How far the states of a motion that repeats differ from one period to the next (relative
         to 1 + |state|): by rounding, written 0, where the steps are the same each time."""
         return 0.0
-
-    @property
-    def sees_ahead(self) -> bool:
-        """Whether it knows the motion before a step is taken (see `Taylor`)."""
-        return False
 
     @property
     def uses_field(self) -> bool:
@@ -75,6 +88,13 @@ class AbstractMethod(eqx.Module):
         that are not adaptive. `beside` is `None` unless the elapsed time of a scene with a `pace`,
         or averages, are asked for; its rate is `rate_beside`.
         """
+
+    def foresee(
+        self, scene: AbstractScene, s: Scalar, state: Any, beside: Beside | None
+    ) -> Foreseen | None:
+        """The motion from here, of a method that knows it before a step is taken (see `Taylor`): a
+        step then ends at the first event on it, and is `Foreseen.at` instead of `step`."""
+        return None
 
     @abc.abstractmethod
     def tighter(self) -> "AbstractMethod":

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from ..._checks import count, require
 from ..beside import Beside, rate_beside
 from . import _series as power_series
-from ._series import NoSeries, Series
+from ._series import Along, NoSeries, Series
 from .base import AbstractMethod
 
 Scalar = Float[Array, ""]
@@ -24,22 +24,26 @@ class Expansion(NamedTuple):
     treedef: Any
     """Of the state and what is integrated beside it."""
     series: list[Series]
+    tolerance: Any
+    """By which its reach is measured; `None` where it reaches as far as is asked."""
 
     def at(self, h: Scalar) -> tuple[Any, Beside | None]:
         """State, and what is integrated beside it, a length h away."""
         return jtu.tree_unflatten(self.treedef, [power_series.at(x, h) for x in self.series])
 
-    def of(self, function: Any) -> Series:
-        """The series of a scalar function of the state, a constant for differentiation."""
+    def of(self, function: Any) -> Along:
+        """A scalar function of the state along it, a constant for differentiation."""
         still = [[None if c is None else stop_gradient(c) for c in x] for x in self.series]
         return power_series.along(lambda y: function(y[0]), self.treedef, still)
 
-    def reach(self, tolerance: Any) -> Scalar:
+    def reach(self, limit: Scalar) -> Scalar:
         """The length at which the last two terms are as small as the tolerance, relative to the
-        state (Jorba and Zou, Experimental Mathematics 14, 2005)."""
-        shortest = None
+        state (Jorba and Zou, Experimental Mathematics 14, 2005), up to this limit."""
+        if self.tolerance is None:
+            return limit
+        floor = 8 * jnp.finfo(limit.dtype).eps
         size = jnp.asarray(sum(jnp.sum(jnp.abs(stop_gradient(x[0]))) for x in self.series))
-        allowed = tolerance * (1 + size)
+        allowed = jnp.maximum(jnp.asarray(self.tolerance, limit.dtype), floor) * (1 + size)
         for n in (len(self.series[0]) - 2, len(self.series[0]) - 1):
             there = [stop_gradient(x[n]) for x in self.series if x[n] is not None]
             terms = [jnp.sum(jnp.abs(x)) for x in there]
@@ -48,10 +52,8 @@ class Expansion(NamedTuple):
             term = jnp.maximum(sum(terms), jnp.finfo(size.dtype).tiny)
             # A length needs no double precision, and single precision powers vectorise.
             ratio = jnp.clip(allowed / term, 1e-30, 1e30).astype(jnp.float32)
-            length = (ratio ** (1.0 / n)).astype(size.dtype)
-            shortest = length if shortest is None else jnp.minimum(shortest, length)
-        assert shortest is not None
-        return shortest
+            limit = jnp.minimum(limit, (ratio ** (1.0 / n)).astype(size.dtype))
+        return limit
 
 
 class Taylor(AbstractMethod):
@@ -82,11 +84,6 @@ class Taylor(AbstractMethod):
             require("rtol", self.rtol, low=0.0, high=1.0, open_low=True)
 
     @property
-    def sees_ahead(self) -> bool:
-        """True: events are found before a step is taken."""
-        return True
-
-    @property
     def wander(self):
         """Within the tolerance, if there is one."""
         return 0.0 if self.rtol is None else self.rtol
@@ -113,8 +110,8 @@ class Taylor(AbstractMethod):
             return super().longest(scene, s, state)
         return scene.step_limit(s, state) * (5 / self.steps_per_cycle)
 
-    def expand(self, scene: Any, s: Scalar, state: Any, beside: Beside | None) -> Expansion:
-        """The motion about (s, state), and what is integrated beside it."""
+    def foresee(self, scene: Any, s: Scalar, state: Any, beside: Beside | None) -> Expansion:
+        """Its power series about (s, state), and what is integrated beside it."""
 
         def field(s, y):
             state, beside = y
@@ -127,17 +124,9 @@ class Taylor(AbstractMethod):
                 f"Method `Taylor` has no recursion for the primitive `{error}` in the scene's "
                 "field or averages. Use `Adaptive` or `FixedStep`."
             ) from None
-        return Expansion(treedef, series)
-
-    def reach(self, motion: Expansion, limit: Scalar) -> Scalar:
-        """The longest step from there."""
-        if self.rtol is None:
-            return limit
-        floor = 8 * jnp.finfo(limit.dtype).eps
-        tolerance = jnp.maximum(jnp.asarray(self.rtol, limit.dtype), floor)
-        return jnp.minimum(limit, motion.reach(tolerance))
+        return Expansion(treedef, series, self.rtol)
 
     def step(self, scene, s0, s1, state, beside):
         """The sum of the series at `s1`."""
-        new, beside = self.expand(scene, s0, state, beside).at(s1 - s0)
+        new, beside = self.foresee(scene, s0, state, beside).at(s1 - s0)
         return new, beside, jnp.zeros_like(s0)

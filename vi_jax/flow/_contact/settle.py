@@ -6,7 +6,7 @@ faster, their speeds a geometric series in k, and end in rest after a finite tim
 brief.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,17 +16,15 @@ from jaxtyping import Array, Bool, Float
 from ...lanes import pin, pin_flag
 from ...scene import AbstractScene
 from ...scene.contacts import forces, push_of, shares
-from .._lane import RESTS, Lane, Plan
+from .._arrival import Arrival
+from .._lane import RESTS, Lane, Plan, select
+from .._log import clock_at, noted
+from .._way import Way
 from ..drift import drifted
 from ..events import force_rate, rates
 from ..moving import holding, in_modes, rounding
-from .aim import select
-from .happen import Arrival
 from .impact import Blow
-from .log import clock_at, noted
 from .rest import allowed
-from .trial import Trial
-from .way import Way
 
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]
@@ -36,13 +34,25 @@ Flag = Bool[Array, ""]
 _CLOSED = 1e-9
 
 
+class Approach(NamedTuple):
+    """What a step knew of a coordinate when it met a stop."""
+
+    speed: Scalar
+    """Its rate by s."""
+    growth: Scalar | None
+    """That of the force on it; absent where nothing can rest."""
+    alone: Any
+    """The machine in its modes with the other bodies held that rest."""
+
+
 def settle(
-    plan: Plan, lane: Lane, trial: Trial, taken: Flag, arrival: Arrival, there: Any,
-    blows: dict[int, Blow],
+    plan: Plan, lane: Lane, approaches: dict[int, Approach], taken: Flag, arrival: Arrival,
+    there: Any, blows: dict[int, Blow],
 ) -> Arrival:  # fmt: skip
     """The lane at rest on the stops whose impacts were the last before it.
 
-    **Arguments:** `there` is the state before the impacts, the arrival's that behind them.
+    **Arguments:** `approaches` of each coordinate; `there` is the state before the impacts, the
+    arrival's that behind them.
     """
     contact = arrival.contact
     if contact is None:
@@ -50,13 +60,14 @@ def settle(
     if len(blows) == 1:
         ((k, blow),) = blows.items()
         sign, _ = plan.wall(k, blow.struck)
-        speed = blow.share * jnp.maximum(sign * trial.paths[k].end.v, 0.0)
-        ends, left = _ends(plan, lane, trial, trial.alone[k], k, blow, speed, (arrival.s, there))
+        speed = blow.share * jnp.maximum(sign * approaches[k].speed, 0.0)
+        known = k, blow, speed, (arrival.s, there), approaches[k].growth
+        ends, left = _ends(plan, lane, approaches[k].alone, *known)
         rests = {k: pin_flag((blow.struck > 0) & ends, arrival.s)}
         waits = {k: left}
     else:
         contact = _broken(plan, arrival, there, blows)
-        rests, waits = _together(plan, lane, trial, arrival, blows, contact)
+        rests, waits = _together(plan, lane, arrival, blows, contact)
     return _held(plan, lane, taken, arrival._replace(contact=contact), rests, blows, waits)
 
 
@@ -126,16 +137,16 @@ def _stilled(
 
 
 def _ends(
-    plan: Plan, lane: Lane, trial: Trial, free: AbstractScene, k: int, blow: Blow, speed: Scalar,
-    at: tuple[Scalar, Any], several: bool = False,
+    plan: Plan, lane: Lane, free: AbstractScene, k: int, blow: Blow, speed: Scalar,
+    at: tuple[Scalar, Any], growth: Scalar | None = None,
 ) -> tuple[Flag, Scalar]:  # fmt: skip
     """Whether an impact is one of the endless last ones before rest, and the time they take.
 
     **Arguments:** the machine with this body free; the number of its coordinate; the speed by s of
-    its rebound; s and a state of the impact; whether it was one of several in this instant.
+    its rebound; s and a state of the impact; how fast the force on the body grows, where that is
+    known.
     """
-    (s, state), body, surge = at, plan.scene.coordinates[k], trial.paths[k].surge
-    assert surge is not None  # as bodies may rest
+    (s, state), body = at, plan.scene.coordinates[k]
     sign, gap = plan.wall(k, blow.struck)
     # What presses a body at rest on: with its velocity goes its damping.
     rested = body.placed(state, jnp.asarray(sign * gap), jnp.zeros_like(s))
@@ -146,8 +157,7 @@ def _ends(
     limit = stop_gradient(jnp.asarray(plan.scene.step_limit(s, state), s.dtype))
     # Hops no higher than rounding cannot be followed, however long they last.
     height = speed**2 / jnp.where(pressing > 0, 2 * pressing, 1.0)
-    growth = surge[1]
-    if several:  # another blow of this instant may have changed it
+    if growth is None:  # another blow of this instant may have changed it
         growth = force_rate(free, body.position, free, s, rested)
     not_yet, hop, wait = _before_it_presses(speed, pressing, sign * growth)
     height = jnp.where(not_yet, speed * hop - 0.5 * pressing * hop * hop, height)
@@ -189,7 +199,7 @@ def _broken(plan: Plan, arrival: Arrival, there: Any, blows: dict[int, Blow]) ->
 
 
 def _together(
-    plan: Plan, lane: Lane, trial: Trial, arrival: Arrival, blows: dict[int, Blow],
+    plan: Plan, lane: Lane, arrival: Arrival, blows: dict[int, Blow],
     contact: tuple[Scalar, ...],
 ) -> tuple[dict[int, Flag], dict[int, Scalar]]:  # fmt: skip
     """Of each coordinate that was struck, whether it comes to rest, and the time that takes.
@@ -214,8 +224,7 @@ def _together(
         new, waits = list(contact), []
         for k, blow in blows.items():
             alone = holding(plan.scene, arrival.modes, closed, but=k)
-            known = k, blow, speeds[k], (s, state)
-            ends, left = _ends(plan, lane, trial, alone, *known, several=True)
+            ends, left = _ends(plan, lane, alone, k, blow, speeds[k], (s, state))
             ends = (blow.struck > 0) & ends
             new[k] = jnp.where(ends, blow.struck, contact[k])
             waits.append(jnp.where(ends, left, 0.0))

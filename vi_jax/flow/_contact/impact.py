@@ -15,16 +15,14 @@ import jax.tree_util as jtu
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
-from ...scene import AbstractScene, Coordinate
+from ...scene import AbstractScene, Coordinate, RigidStop
 from ...scene.contacts import forces, push_of, rubbed, shares
 from ...scene.event import rubbing_on, rubs
 from .. import results
-from .._lane import HIT, Plan, to_event
+from .._arrival import Arrival, ended
+from .._lane import HIT, Plan, select, to_event
+from .._log import clock_at, logged, noted
 from ..moving import rounding
-from .aim import select
-from .faults import gains
-from .happen import Arrival
-from .log import clock_at, logged, noted
 
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]
@@ -42,6 +40,10 @@ _APART = 1e-6
 
 # A ball between a wall and a body 100 times heavier is struck 31 times, one of 10,000 times 314.
 _ROUNDS = 4096.0
+
+
+# By so many roundings a rebound may be faster than the approach.
+_FASTER = 16.0
 
 
 class Blow(NamedTuple):
@@ -82,7 +84,7 @@ def _one_blow(
         stop = scene.stops[number]
         approach = jnp.maximum(stop.approach(velocity), 0.0)
         rebound = stop.leaving(stop.sign * approach)
-        arrival = _failing(arrival, met, gains(stop, approach, rebound), results.BAD_IMPACT)
+        arrival = ended(arrival, met, _gains(stop, approach, rebound), results.BAD_IMPACT)
         state = select(met, body.placed(there, stop.place, rebound), arrival.state)
         arrival = _listed(plan, arrival._replace(state=state), there, taken & met, number, approach)
         if arrival.loss is not None:
@@ -94,11 +96,14 @@ def _one_blow(
     return arrival, {k: blow}
 
 
-def _failing(arrival: Arrival, where: Flag, when: Flag | None, reason: int) -> Arrival:
-    """With this reason to end; `None` where it cannot be."""
-    if when is None or arrival.fault is None:
-        return arrival
-    return arrival._replace(fault=jnp.where(where & when, float(reason), arrival.fault))
+def _gains(stop: RigidStop, approach: Scalar, rebound: Scalar) -> Flag | None:
+    """Whether an impact leaves faster than it came, or goes on into the stop; `None` where the law
+    is one number, whose range is known."""
+    if stop.is_one_number:
+        return None
+    leaves = stop_gradient(-stop.sign * rebound)
+    most = (1 + _FASTER * float(jnp.finfo(leaves.dtype).eps)) * stop_gradient(approach)
+    return ~((leaves >= 0) & (leaves <= most))
 
 
 def _listed(
@@ -179,7 +184,7 @@ def _sequence(
         lambda x: (x.goes_on > 0) & (x.rounds < _ROUNDS), lambda x: _struck(instant, x), begin
     )
     endless = end.rounds >= _ROUNDS
-    arrival = _failing(end.arrival, instant.met, endless, results.SIMULTANEOUS)
+    arrival = ended(end.arrival, instant.met, endless, results.SIMULTANEOUS)
     blows = {}
     for k, body, struck, fastest in zip(
         limited, instant.bodies, end.struck, end.approach, strict=True
@@ -247,7 +252,7 @@ def _struck(instant: _Instant, x: _Round) -> _Round:
     for number, hit in hits.items():
         stop, i = stops[number], instant.limited.index(stops[number].coordinate)
         speed = jnp.maximum(closing[number], 0.0)
-        arrival = _failing(arrival, hit, gains(stop, speed, rebounds[number]), results.BAD_IMPACT)
+        arrival = ended(arrival, hit, _gains(stop, speed, rebounds[number]), results.BAD_IMPACT)
         arrival = _listed(plan, arrival, instant.there, instant.taken & hit, number, speed)
         if stop.modes is not None:
             given = plan.scene, arrival.s, state, new, arrival.modes
@@ -329,4 +334,4 @@ def _accounted(
         hit = instant.taken & instant.met
         arrival = arrival._replace(loss=arrival.loss + jnp.where(hit, lost, 0.0))
     wrong = stop_gradient(lost) < -1e-9 * stop_gradient(size)
-    return _failing(arrival, instant.met, wrong, results.BAD_IMPACT)
+    return ended(arrival, instant.met, wrong, results.BAD_IMPACT)

@@ -8,12 +8,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ...scene.event import guard_of, section_number
-from .._lane import Plan
-from ..beside import rate_beside
-from ..events import rates
-from ..moving import Moving, holding
-from .guards import Crossing
+from ..scene.event import guard_of, section_number
+from ._lane import Plan
+from .beside import rate_beside
+from .events import rates
+from .moving import Moving, holding
 
 Scalar = Float[Array, ""]
 
@@ -38,16 +37,16 @@ class Way:
         """The machine's numbers, and those around what it was written as."""
         return self._fixed, tuple(self._around)
 
-    def guard(self, c: Crossing) -> Callable:
-        """Of a crossing."""
+    def guard(self, number: int) -> Callable:
+        """Of one of the machine's events."""
 
         def event(moving, fixed, rest):
             (machine, bound), (s, state, _) = self._whole(fixed, rest), moving
             scene, modes, contact = _parts(machine)
             clocked = scene.clock(state) is not None
-            if clocked and c.number == section_number(scene):
+            if clocked and number == section_number(scene):
                 return scene.clock(state) - bound  # which may be that of a part of a cycle
-            return guard_of(scene, c.number, s, state, modes, contact)
+            return guard_of(scene, number, s, state, modes, contact)
 
         return self._pure(event)
 

@@ -5,7 +5,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .._lane import Plan
+from ._lane import Plan
 
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]

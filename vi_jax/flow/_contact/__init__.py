@@ -1,0 +1,1 @@
+"""What happens on stops: impacts, coming to rest, release."""

@@ -1,0 +1,86 @@
+"""What a step may have met twice, so that its ends do not show it: bounds by their tangents."""
+
+import jax.numpy as jnp
+from jax.lax import stop_gradient
+from jaxtyping import Array, Bool, Float
+
+from .._lane import Lane
+from .guards import Crossing
+from .trial import Path
+
+Scalar = Float[Array, ""]
+Flag = Bool[Array, ""]
+
+# A hump of a guard this close to an end of a step (as a share of it) is seen from there.
+_BRIEF = 1e-3
+
+
+def _corner(
+    begin: tuple[Scalar, Scalar], end: tuple[Scalar, Scalar], h: Scalar, bent: Flag
+) -> tuple[Scalar, Scalar, Scalar]:
+    """How far from its begin the tangents at both ends of a step meet, and how high: no curve that
+    is bent one way goes beyond. And where it is greatest, if its slope changes evenly.
+
+    **Arguments:** value and slope at either end; the step's length; where it is bent.
+    """
+    (x0, v0), (x1, v1) = begin, end
+    fall = jnp.where(bent, v0 - v1, 1.0)
+    place = (x1 - v1 * h - x0) / fall
+    return place, x0 + v0 * place, h * v0 / fall
+
+
+def hump(c: Crossing, h: Scalar) -> tuple[Flag, Scalar]:
+    """Whether a guard that is negative at both ends may have been positive in between, and where
+    it was greatest."""
+    begin, end = stop_gradient((c.begin, c.end))
+    rises = (begin.x < 0) & (end.x < 0) & (begin.v > 0) & (end.v < 0)
+    _, bound, place = _corner((begin.x, begin.v), (end.x, end.v), h, rises)
+    brief = _BRIEF * h
+    return rises & (bound > 0) & (place > brief) & (h - place > brief), place
+
+
+def may_turn_twice(direction: Scalar, path: Path, h: Scalar) -> Flag:
+    """Whether the velocity, of one sign at both ends, dips so deep that it may have been zero.
+
+    Such a step is halved until the turns lie apart or the dip is too short to matter. Where the
+    force's rate of change is known, a force that sags between the ends is not taken for straight.
+    """
+    begin, end = path.begin, path.end
+    a0, a1 = direction * begin.a, direction * end.a
+    dips = (a0 < 0) & (a1 > 0) & (h > 1e-3)
+    if path.surge is None:
+        # lowest < 0.1 (v0 + v1), times a1 - a0: without a division in each step.
+        room = direction * (begin.v - 0.1 * (begin.v + end.v))
+        return dips & (room * (a1 - a0) < 0.5 * h * a0 * a0)
+    drop = 0.5 * h * a0 * (a0 / jnp.where(dips, a0 - a1, 1.0))
+    j0, j1 = direction * path.surge[0], direction * path.surge[1]
+    sags = dips & (j0 * h < a1 - a0) & (a1 - a0 < j1 * h)
+    corner, low, _ = _corner((a0, j0), (a1, j1), h, sags)
+    deep = 0.5 * corner * (a0 + low) - 0.5 * low * low / jnp.where(sags, j1, 1.0)
+    flat = -0.5 * a0 * a0 / jnp.where(sags & (low >= 0), j0, 1.0)
+    drop = jnp.where(sags, jnp.where(low < 0, deep, flat), drop)
+    lowest = direction * begin.v + drop
+    return dips & (lowest < 0.1 * direction * (begin.v + end.v))
+
+
+def force_may_turn(lane: Lane, k: int, path: Path, h: Scalar) -> tuple[Flag, Scalar]:
+    """Whether the force, of one sign at both ends, may have had the other in between for a body
+    that is slow enough to notice, and where it turned.
+
+    It releases a body at rest for a moment, or turns one twice that has just left the stop.
+    """
+    assert path.surge is not None
+    begin, end, (rate0, rate1, brief) = path.begin, path.end, path.surge
+    a0, a1 = begin.a, end.a
+    bent = rate0 * rate1 < 0
+    _, bound, place = _corner((a0, rate0), (a1, rate1), h, bent)
+    turns = bent & (place > brief) & (h - place > brief)
+    hidden = turns & (a0 * a1 >= 0) & (bound * (a0 + a1) < 0)
+    if lane.contact is not None:
+        # At rest the step may begin, to rounding, where the window does.
+        direction = lane.direction[k]
+        pressed = (lane.contact[k] > 0) & (direction * a1 >= 0) & (direction * bound < 0)
+        hidden = hidden | (turns & pressed)
+    largest = jnp.maximum(jnp.maximum(jnp.abs(a0), jnp.abs(a1)), jnp.abs(bound))
+    slow = jnp.minimum(jnp.abs(begin.v), jnp.abs(end.v)) <= largest * h
+    return hidden & slow, place
