@@ -92,7 +92,7 @@ def test_it_slides_as_the_mean_that_stays_on_the_surface():
         np.testing.assert_allclose(slope[:, j], (ahead - behind) / (2 * h), atol=1e-7)
 
 
-@pytest.mark.parametrize("way", ["auto", "xla"])
+@pytest.mark.parametrize("way", ["auto", pytest.param("xla", marks=pytest.mark.slow)])
 def test_it_leaves_where_one_side_points_away(way):
     a = 1.5
     with lanes.road(way):

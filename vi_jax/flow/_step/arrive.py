@@ -100,9 +100,8 @@ def _met(plan: Plan, lane: Lane, trial: Trial, taken: Flag, way: Way, arrival: A
         if plan.scene.stops:
             arrival = _impact(plan, lane, trial, taken, arrival, landed, there)
         for c in trial.crossings:
-            if c.number == section_number(
-                plan.scene
-            ):  # what begins anew with a cycle does so at its end
+            if c.number == section_number(plan.scene):
+                # What begins anew with a cycle does so at its end.
                 arrival = arrival._replace(state=select(c.landed, there, arrival.state))
             elif c.coordinate is None:
                 arrival = happened(plan, taken, arrival, c, there)
