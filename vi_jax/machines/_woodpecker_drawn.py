@@ -66,7 +66,7 @@ def _sleeve(pen: Any, size: dict[str, float], middle: Any, tilt: float, hang: An
     aside = np.array([0.0, *np.tile([1.0, -1.0], 6), 0.0]) * 0.22 * half
     normal = np.array([-way[1], way[0]]) / max(float(np.hypot(*way)), 1e-12)
     coil = root + along[:, None] * way + aside[:, None] * normal
-    pen.line(*coil, lw=1.3, zorder=3)
+    pen.line(*((float(x), float(y)) for x, y in coil), lw=1.3, zorder=3)
 
 
 def _bird(pen: Any, size: dict[str, float], hang: Any, lean: float) -> None:
@@ -96,8 +96,9 @@ def _bird(pen: Any, size: dict[str, float], hang: Any, lean: float) -> None:
     put(_oval(eye, 0.14 * round_, 0.14 * round_, 0.0), "white", lw=0.8)
     # What holds it: from its breast to the end of the spring, the origin of its own axes.
     breast = hang + _turned([centre + 0.3 * long * aside], lean)[0]
-    pen.line(tuple(hang), tuple(breast), lw=3.0, color=INK, zorder=1)
-    pen.pin(*hang)
+    (x, y), end = map(float, hang), (float(breast[0]), float(breast[1]))
+    pen.line((x, y), end, lw=3.0, color=INK, zorder=1)
+    pen.pin(x, y)
 
 
 def _names(pen: Any, size: dict[str, float], middle: Any, hang: Any) -> None:
