@@ -39,7 +39,7 @@ WEIGHT = (3e-4 + 4.5e-3) * 9.81
 
 # %%
 def settled(friction: Any) -> Any:
-    toy = vi.machines.Woodpecker(friction=friction)
+    toy = vi.machines.Woodpecker(friction=friction)  # pyright: ignore[reportCallIssue]
     run = vi.simulate(toy, toy.start(), SEEN, settle=SETTLE, event_log=16)
     ended = jnp.stack([run.result == why for why in ENDS])
     return run.duration, run.sections, run.impact_energy, run.event_log, run.successful, ended
@@ -120,7 +120,7 @@ print(table)
 
 # %%
 def returned(friction: Any, begins: Any) -> Any:
-    toy = vi.machines.Woodpecker(friction=friction)
+    toy = vi.machines.Woodpecker(friction=friction)  # pyright: ignore[reportCallIssue]
     run = vi.simulate(
         toy, toy.start(speed=begins[0], bird_rate=begins[1]), 1, method=vi.Adaptive(rtol=1e-12)
     )

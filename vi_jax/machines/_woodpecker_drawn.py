@@ -108,5 +108,4 @@ def _names(pen: Any, size: dict[str, float], middle: Any, hang: Any) -> None:
     pen.label(left, up + 1.2 * size["beak_height"], "pole, $\\mu$", ha="right")
     right = float(hang[0]) + 1.6 * size["bird_arm"]
     pen.label(right, float(hang[1]), "bird, $\\varphi_S$", ha="left")
-    pen.label(float(hang[0]) - 0.1 * size["bird_arm"], float(hang[1]) - 0.6 * size["bird_arm"],
-              "spring, $c$")  # fmt: skip
+    pen.label(1.3 * size["sleeve_radius"], up - 1.7 * size["bird_arm"], "spring, $c$", ha="left")
