@@ -396,6 +396,41 @@ def relief_valve() -> Expected:
     }
 
 
+def woodpecker(kept: dict[str, float]) -> Expected:
+    """Of cycles beside each other, whose differences give Newton's steps and multipliers."""
+
+    def returned(friction: Any, begins: Any) -> Any:
+        toy = vi.machines.Woodpecker(friction=friction)
+        start = toy.start(speed=begins[0], bird_rate=begins[1])
+        run = vi.simulate(toy, start, 1, settle=0, method=vi.Adaptive(rtol=1e-12))
+        last = run.last
+        return jnp.stack([last.speed, last.bird_rate, run.duration[0], last.drop])
+
+    steps = np.array([2e-5, 5e-4])
+    moves = np.concatenate([np.zeros((1, 2)), np.diag(steps), -np.diag(steps)])
+    lanes = vi.jit(jax.vmap(jax.vmap(returned, (None, 0))))
+    doubles = "period doubles, μ"
+    beside = kept[doubles] + np.array([-1e-4, 1e-4])
+    frictions = np.array([0.3, 0.6, 0.8, 1.0, *beside])
+    guesses = [(-0.34, -7.46), (-0.0, -11.0), (-0.0, -11.0), (-0.0, -11.0)]
+    x = np.array([*guesses, (-0.29, -7.46), (-0.29, -7.46)])
+    ends, slopes = np.zeros(0), np.zeros(0)
+    # Some cycles first, by which guesses come near.
+    for turn in range(70):
+        ends = np.asarray(lanes(jnp.asarray(frictions), jnp.asarray(x[:, None] + moves)))
+        slopes = ((ends[:, 1:3, :2] - ends[:, 3:5, :2]) / (2 * steps[:, None])).transpose(0, 2, 1)
+        newton = np.linalg.solve(np.eye(2) - slopes, (ends[:, 0, :2] - x)[..., None])[..., 0]
+        x = ends[:, 0, :2] if turn < 60 else x + newton
+    numbers: Expected = {}
+    for i, value in enumerate(frictions[:4]):
+        numbers[f"period at μ = {value:g}, ms"] = (1e3 * float(ends[i, 0, 2]), 1e-6)
+        numbers[f"drop at μ = {value:g}, mm"] = (1e3 * float(ends[i, 0, 3]), 1e-6)
+    multipliers = np.linalg.eigvals(slopes).real.min(axis=1)
+    numbers["multiplier at μ = 0.3"] = (float(multipliers[0]), 1e-6)
+    numbers[doubles] = (float(np.interp(1.0, -multipliers[4:], beside)), 2e-6)
+    return numbers
+
+
 def sommerfeld() -> Expected:
     """Where the averaged κ = ζ + ε ξ ζ⁵/(τ0 D) turns; the motion's own folds lie beside it."""
     numbers: Expected = {}

@@ -13,3 +13,5 @@ from .relief_valve import ValveState as ValveState
 from .unbalanced_rotor import RotorState as RotorState
 from .unbalanced_rotor import TimedRotorState as TimedRotorState
 from .unbalanced_rotor import UnbalancedRotor as UnbalancedRotor
+from .woodpecker import Woodpecker as Woodpecker
+from .woodpecker import WoodpeckerState as WoodpeckerState

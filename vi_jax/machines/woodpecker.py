@@ -1,0 +1,250 @@
+"""The woodpecker toy: a bird on a spring that pecks its way down a pole, jamming and slipping."""
+
+from collections.abc import Mapping
+from math import pi
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE
+from .._numbers import concrete, number, real
+from ..scene import ContactFriction, Coordinate, RigidStop
+from ..scene.shown import Shown
+from ._base import AutonomousMachine
+from ._levers import by_levers, dot, response
+from ._woodpecker_drawn import draw_woodpecker
+
+Scalar = Float[Array, ""]
+
+
+def _real(name: str, default: float) -> Any:
+    """A field that holds a real number."""
+    return eqx.field(kw_only=True, default=default, converter=real(name))
+
+
+class WoodpeckerState(Shown):
+    """Sleeve and bird; angles counterclockwise, with the bird on the right of the pole."""
+
+    units: ClassVar = {
+        **dict.fromkeys(("height", "drop"), "m"), "speed": "m/s",
+        **dict.fromkeys(("sleeve_angle", "bird_angle"), "rad"),
+        **dict.fromkeys(("sleeve_rate", "bird_rate"), "rad/s"),
+    }  # fmt: skip
+
+    height: Scalar
+    """Of the sleeve's middle, from where the cycle began (m)."""
+    sleeve_angle: Scalar
+    """φM of the sleeve against the pole (rad)."""
+    bird_angle: Scalar
+    """φS of the bird (rad)."""
+    speed: Scalar
+    """Of the sleeve's middle, upward (m/s)."""
+    sleeve_rate: Scalar
+    """dφM/dt (rad/s)."""
+    bird_rate: Scalar
+    """dφS/dt (rad/s)."""
+    drop: Scalar
+    """How far the sleeve came down in the cycle before (m)."""
+
+
+class Woodpecker(AutonomousMachine):
+    """A sleeve with some play on a pole, and a bird on a spring at it that pecks the pole.
+
+    The sleeve tilts until its edge jams on the pole by friction; the bird swings on, lifts the edge
+    off, the sleeve slides down and jams the other way, the beak hits the pole, and back it swings.
+    Its three coordinates are the height y, the sleeve's φM and the bird's φS, angles small:
+
+        T = ½ m_M y'² + ½ J_M φM'² + ½ J_S φS'² + ½ m_S (y' + l_M φM' + l_G φS')²
+        U = ½ c (φM - φS)² + m_M g y + m_S g (y + l_M φM + l_G φS)
+
+    Three contacts, with Newton's restitution and Coulomb's friction μ in impacts and between them:
+    the lower and the upper edge of the sleeve, r_M - r_O ± h_M φM ≥ 0, which slip with
+    y' + r_M φM'; and the beak, l_M + l_G - l_S - r_O - h_S φS ≥ 0, which slips with
+    y' + l_M φM' + (l_G - l_S) φS' (Ch. Glocker, Dynamik von Starrkörpersystemen mit Reibung und
+    Stößen, 1995; F. Pfeiffer and Ch. Glocker, Multibody Dynamics with Unilateral Contacts, 1996;
+    numbers as in the example of the Siconos software). What slips sticks after an impact if the
+    cone of friction lets it.
+
+    Nothing drives it but its weight: a cycle ends where φS falls through `section_angle`, and takes
+    a time of its own; how far the toy came down in it is told as `drop`. Time is the independent
+    variable. Numbers are in SI units. The stops are, in this order, `LOWER` and `UPPER` edge of the
+    sleeve and `BEAK`, and the switches the friction on each.
+
+    **Arguments:**
+
+    - `friction` μ, not negative; `sleeve_restitution`, `beak_restitution` in [0, 1].
+    - `sleeve_mass` m_M, `bird_mass` m_S (kg), `sleeve_inertia` J_M, `bird_inertia` J_S (kg m²),
+      `stiffness` c of the spring (N m/rad), `gravity` g (m/s²), all positive.
+    - `sleeve_arm` l_M, from the pole's axis to the spring, `bird_arm` l_G, from there to the bird's
+      centre of mass, `beak_arm` l_S, from there back to the tip of its beak, which is `beak_height`
+      h_S above; `sleeve_height` h_M, half of the sleeve's; `sleeve_radius` r_M inside, greater than
+      `pole_radius` r_O (all in m, positive).
+    - `section_angle` (rad), any number that the bird swings through.
+    - `interval` of time between observations (s), positive, for one observed at equal times.
+    """
+
+    friction: Scalar = _real("friction", 0.3)
+    sleeve_restitution: Scalar = _real("sleeve_restitution", 0.0)
+    beak_restitution: Scalar = _real("beak_restitution", 0.5)
+    sleeve_mass: Scalar = _real("sleeve_mass", 3e-4)
+    bird_mass: Scalar = _real("bird_mass", 4.5e-3)
+    sleeve_inertia: Scalar = _real("sleeve_inertia", 5e-9)
+    bird_inertia: Scalar = _real("bird_inertia", 7e-7)
+    stiffness: Scalar = _real("stiffness", 0.0056)
+    gravity: Scalar = _real("gravity", 9.81)
+    sleeve_arm: Scalar = _real("sleeve_arm", 0.010)
+    bird_arm: Scalar = _real("bird_arm", 0.015)
+    beak_arm: Scalar = _real("beak_arm", 0.0201)
+    sleeve_height: Scalar = _real("sleeve_height", 0.0058)
+    beak_height: Scalar = _real("beak_height", 0.02)
+    sleeve_radius: Scalar = _real("sleeve_radius", 0.0031)
+    pole_radius: Scalar = _real("pole_radius", 0.0025)
+    section_angle: Scalar = _real("section_angle", -0.2788)
+    ranges: ClassVar[dict[str, Any]] = {
+        "friction": NOT_NEGATIVE, "sleeve_restitution": SHARE, "beak_restitution": SHARE,
+        "section_angle": REAL,
+        **dict.fromkeys(
+            ("sleeve_mass", "bird_mass", "sleeve_inertia", "bird_inertia", "stiffness", "gravity",
+             "sleeve_arm", "bird_arm", "beak_arm", "sleeve_height", "beak_height", "sleeve_radius",
+             "pole_radius", "interval"),
+            POSITIVE,
+        ),
+    }  # fmt: skip
+    LOWER: ClassVar[int] = 0
+    UPPER: ClassVar[int] = 1
+    BEAK: ClassVar[int] = 2
+
+    def __check_init__(self):
+        super().__check_init__()
+        play = concrete(self.play)
+        if play is not None and not (play > 0).all():
+            raise ValueError(
+                "Argument `sleeve_radius` must be greater than `pole_radius`, but the play between "
+                f"them is {play.min():g} m."
+            )
+
+    @property
+    def play(self) -> Scalar:
+        """r_M - r_O, between the sleeve upright and the pole (m)."""
+        return self.sleeve_radius - self.pole_radius
+
+    @property
+    def reach(self) -> Scalar:
+        """l_M + l_G - l_S - r_O, from the pole to the beak of a bird upright (m)."""
+        return self.sleeve_arm + self.bird_arm - self.beak_arm - self.pole_radius
+
+    @property
+    def stops(self) -> tuple[RigidStop, ...]:  # pyright: ignore
+        """The pole for the lower and the upper edge of the sleeve, and for the beak."""
+        lower, upper = (
+            RigidStop(self.play, self.sleeve_restitution, side, coordinate=1)
+            for side in ("left", "right")
+        )
+        return lower, upper, RigidStop(self.reach, self.beak_restitution, "right")
+
+    @property
+    def switches(self) -> tuple[ContactFriction, ...]:
+        """Friction on each of the stops."""
+        along = enumerate((2, 2, 3))
+        return tuple(ContactFriction(self.friction, stop=i, along=k) for i, k in along)
+
+    @property
+    def coordinates(self) -> tuple[Coordinate, ...]:
+        """How far the beak and the sleeve's upper edge have come towards the pole, and along it how
+        high an edge of the sleeve and the beak are: all in metres, so that all forces are in N."""
+        inertia, beak = self._inertia(), self.bird_arm - self.beak_arm
+        return tuple(
+            by_levers(row, inertia)
+            for row in (
+                (None, None, self.beak_height),
+                (None, self.sleeve_height, None),
+                (1, self.sleeve_radius, None),
+                (1, self.sleeve_arm, beak),
+            )
+        )
+
+    def _inertia(self) -> tuple[Any, ...]:
+        """What forces are divided by, and the bird's levers over that, and what these add up to.
+        The matrix of masses is a diagonal one and m_S times the product of the levers with
+        themselves; its inverse is that of Sherman and Morrison."""
+        levers = 1, self.sleeve_arm, self.bird_arm
+        own = self.sleeve_mass, self.sleeve_inertia, self.bird_inertia
+        by = tuple(a / m for a, m in zip(levers, own, strict=True))
+        return own, by, 1 / self.bird_mass + dot(levers, by)
+
+    def field(self, s: Scalar, state: WoodpeckerState, *modes: Scalar) -> WoodpeckerState:
+        """Free fall under the spring's moment, by time; what the pole does is said by stops and
+        switches."""
+        moment = self.stiffness * (state.sleeve_angle - state.bird_angle)
+        y, sleeve, bird = (moment * x for x in response((None, -1, 1), self._inertia()))
+        rates = state.speed, state.sleeve_rate, state.bird_rate
+        return WoodpeckerState(*rates, y - self.gravity, sleeve, bird, jnp.zeros_like(s))
+
+    @property
+    def labels(self) -> tuple[str, str]:
+        """Of pictures."""
+        return "beak towards the pole (m)", "its speed (m/s)"
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """SI."""
+        own = dict.fromkeys(
+            ("sleeve_arm", "bird_arm", "beak_arm", "sleeve_height", "beak_height", "sleeve_radius",
+             "pole_radius", "play", "reach", "gap"),
+            "m",
+        )  # fmt: skip
+        own |= {"sleeve_mass": "kg", "bird_mass": "kg", "sleeve_inertia": "kg m²"}
+        own |= {"bird_inertia": "kg m²", "stiffness": "N m/rad", "gravity": "m/s²"}
+        own |= {"section_angle": "rad", "interval": "s", "phase": "s"}
+        rates = {"rate": "1/s", "time": "s", "energy": "J", "power": "W"}
+        return {**super().units, **WoodpeckerState.units, **own, **rates, "": "1"}
+
+    @property
+    def usual(self) -> Scalar:
+        """The period of the bird on its spring, while the sleeve is jammed: 2π √(J/c) with
+        J = J_S + m_S l_G²."""
+        inertia = self.bird_inertia + self.bird_mass * self.bird_arm**2
+        return 2 * pi * jnp.sqrt(inertia / self.stiffness)
+
+    def step_limit(self, s: Scalar, state: Any) -> Scalar:
+        """A fifth of the period of the sleeve and the bird in free fall, which swing against each
+        other."""
+        _, sleeve, bird = response((None, -1, 1), self._inertia())
+        limit = 0.4 * pi / jnp.sqrt(self.stiffness * (bird - sleeve))
+        return limit if self.interval is None else jnp.minimum(limit, self.interval / 5)
+
+    def event(self, state: WoodpeckerState) -> Scalar:
+        """How far φS has fallen below the section's."""
+        return self.section_angle - state.bird_angle
+
+    def renewed(self, state: WoodpeckerState) -> WoodpeckerState:
+        """The way down in a cycle is its drop; observed at equal times, the height goes on."""
+        if self.interval is not None:
+            return state
+        at = jnp.zeros_like(state.height)
+        return eqx.tree_at(lambda x: (x.height, x.drop), state, (at, -state.height))
+
+    def start(
+        self, *, height: Any = 0.0, sleeve_angle: Any = None, bird_angle: Any = None,
+        speed: Any = -0.34, sleeve_rate: Any = 0.0, bird_rate: Any = -7.5,
+    ) -> WoodpeckerState:  # fmt: skip
+        """On the section by default, the sleeve on its lower edge and sliding down, the bird
+        swinging away: near to the cycle of the default numbers."""
+        jammed = -self.play / self.sleeve_height
+        given = {
+            "height": height, "sleeve_angle": jammed if sleeve_angle is None else sleeve_angle,
+            "bird_angle": self.section_angle if bird_angle is None else bird_angle,
+            "speed": speed, "sleeve_rate": sleeve_rate, "bird_rate": bird_rate,
+        }  # fmt: skip
+        numbers = {name: number(name, value) for name, value in given.items()}
+        return WoodpeckerState(**numbers, drop=jnp.zeros_like(numbers["height"]))
+
+    def in_range(self, start: WoodpeckerState) -> Bool[Array, ""]:
+        """As its numbers say, and with play."""
+        return super().in_range(start) & (self.play > 0)
+
+    def sketch(self, pen: Any, state: WoodpeckerState, phase: float) -> None:
+        """Pole, sleeve, spring and bird, as large as they are."""
+        draw_woodpecker(self, pen, state)
