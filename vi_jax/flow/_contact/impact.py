@@ -157,7 +157,8 @@ class _Instant(NamedTuple):
     touches: dict[int, Flag]
     """Of each stop, whether its contact is closed."""
     coupled: list[Flag]
-    """Of each coordinate, whether one of those landed upon acts on it."""
+    """Of each coordinate, whether one of those landed upon acts on it, through contacts that are
+    closed."""
     slack: Any
     """What of a velocity is rounding."""
 
@@ -206,21 +207,39 @@ def _instant(
     touches = {}
     for number, stop in enumerate(plan.scene.stops):
         at, here = limited.index(stop.coordinate), landed[number]
-        met = met | here
-        for i in range(len(limited)):
-            acts = jnp.abs(stop_gradient(gains_[i][at])) > _APART
-            coupled[i] = coupled[i] | here & (acts | (i == at))
+        met, coupled[at] = met | here, coupled[at] | here
         depth = stop_gradient(stop.beyond(bodies[at].position(there)))
         slack = 256 * float(jnp.finfo(depth.dtype).eps) * (1 + jnp.abs(stop_gradient(stop.gap)))
         closed = here | (jnp.abs(depth) <= slack)
         if arrival.contact is not None:
             closed = closed | (arrival.contact[stop.coordinate] == to_event(number))
         touches[number] = closed
+    coupled = _coupled(plan, limited, gains_, touches, coupled)
     before = [body.velocity(there) for body in bodies]
     return _Instant(
         plan, taken, met, there, limited, bodies, before, gains_, landed, touches, coupled,
         rounding(plan.scene, there),
     )  # fmt: skip
+
+
+def _coupled(
+    plan: Plan, limited: list[int], gains: list[list[Scalar]], touches: dict[int, Flag],
+    coupled: list[Flag],
+) -> list[Flag]:  # fmt: skip
+    """Of each coordinate, whether one of those marked in `coupled` acts on it."""
+    closed = [jnp.zeros((), bool) for _ in limited]
+    for number, stop in enumerate(plan.scene.stops):
+        i = limited.index(stop.coordinate)
+        closed[i] = closed[i] | touches[number]
+    size, coupled = len(limited), list(coupled)
+    # There and back is enough for a row; so much more for any other arrangement of a few.
+    for _ in range(max(1, size.bit_length() - 1)):
+        for i in (*range(size), *reversed(range(size - 1))):
+            for j in range(size):
+                if j != i:
+                    acts = jnp.abs(stop_gradient(gains[i][j])) > _APART
+                    coupled[i] = coupled[i] | (closed[i] & coupled[j] & acts)
+    return coupled
 
 
 def _struck(instant: _Instant, x: _Round) -> _Round:
@@ -234,13 +253,15 @@ def _struck(instant: _Instant, x: _Round) -> _Round:
     goes_on = fastest > _NONE * most
     weak = goes_on & (fastest <= _WEAK * most)
 
-    hits, rebounds, found = {}, {}, jnp.zeros_like(goes_on)
+    hits, rebounds = {}, {}
     for number, stop in enumerate(stops):
         hit = goes_on & ~weak & (stop_gradient(closing[number]) >= (1 - _EQUAL) * fastest)
-        if rubs(plan.scene):  # with friction each by itself
-            hit, found = hit & ~found, found | hit
         hits[number] = hit
         rebounds[number] = stop.leaving(stop.sign * jnp.where(hit, closing[number], 0.0))
+    alone = _each_by_itself(instant, velocities, hits, rebounds)
+    found = jnp.zeros_like(goes_on)
+    for number, hit in hits.items():
+        hits[number], found = hit & ~(alone & found), found | hit
     # In the limit what is still being struck comes to rest.
     slow = [
         weak & (struck > 0) & (jnp.abs(stop_gradient(V)) <= _ALIKE * fastest)
@@ -264,6 +285,32 @@ def _struck(instant: _Instant, x: _Round) -> _Round:
         arrival, tuple(struck), tuple(approaches), most,
         jnp.where(goes_on & ~weak, 1.0, 0.0), x.rounds + 1.0,
     )  # fmt: skip
+
+
+def _each_by_itself(
+    instant: _Instant, velocities: list[Scalar], hits: dict[int, Flag], rebounds: dict[int, Scalar]
+) -> Flag:
+    """Whether contacts that close equally fast are struck one after the other all the same, in
+    their order: with friction, where one would have to pull, and where laws that differ would gain
+    energy together."""
+    if rubs(instant.plan.scene):
+        return jnp.ones((), bool)
+    size = range(len(instant.bodies))
+    on, wanted = [jnp.zeros((), bool) for _ in size], [jnp.zeros_like(V) for V in velocities]
+    signs = list(wanted)
+    for number, hit in hits.items():
+        stop = instant.plan.scene.stops[number]
+        i = instant.limited.index(stop.coordinate)
+        on[i] = on[i] | hit
+        wanted[i] = jnp.where(hit, rebounds[number] - velocities[i], wanted[i])
+        signs[i] = jnp.where(hit, float(stop.sign), signs[i])
+    amounts = stop_gradient(forces(instant.gains, on, wanted))
+    gained, size_of, pulls = jnp.zeros(()), jnp.zeros(()), jnp.zeros((), bool)
+    for i, body in enumerate(instant.bodies):
+        work = body.mass * amounts[i] * (velocities[i] + 0.5 * wanted[i])
+        gained, size_of = gained + work, size_of + jnp.abs(work)
+        pulls = pulls | (amounts[i] * signs[i] > _EQUAL * jnp.abs(wanted[i]))
+    return stop_gradient(pulls | (gained > _EQUAL * size_of))
 
 
 def _thrown(
