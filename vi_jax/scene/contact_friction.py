@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from .._checks import NOT_NEGATIVE, SHARE, count, require_ranges
 from .._numbers import real
-from .contacts import held_flow
+from .contacts import added, forces, held_flow, push_of, shares
 from .event import AbstractSwitch, Around
 
 
@@ -87,14 +87,19 @@ class ContactFriction(AbstractSwitch):
 
     def after(self, machine, s, state, mode, *, around: Around | None = None):
         """Sticking, or slipping the way the force pulls."""
-        along = machine.coordinates[self.along]
-        # It vanishes to rounding.
-        velocity = jnp.zeros_like(along.velocity(state))
-        stopped = along.placed(state, along.position(state), velocity)
-        state = jtu.tree_map(lambda a, b: jnp.where(mode == 0, a, b), state, stopped)
+        # It vanishes to rounding; and with it what that would give to the velocity on the stop.
+        stop, along = machine.stops[self.stop], machine.coordinates[self.along]
+        both = (machine.coordinates[stop.coordinate], along)
+        pushes = [push_of(body, state) for body in both]
+        stops = [jnp.zeros((), bool) if around is None else self._rests(machine, around), mode != 0]
+        wanted = [-body.velocity(state) for body in both]
+        amounts = forces(shares(both, state, pushes), stops, wanted)
+        state = added(state, amounts, pushes)
         return state, self._from_rest(machine, s, state, around, sticks=mode != 0)
 
     def _rests(self, machine: Any, around: Around) -> Any:
+        if not around.contact:
+            return jnp.zeros((), bool)
         return around.contact[machine.stops[self.stop].coordinate] == 1.0 + self.stop
 
     def _slip(self, machine: Any, state: Any) -> Any:

@@ -47,12 +47,12 @@ class Approach(NamedTuple):
 
 def settle(
     plan: Plan, lane: Lane, approaches: dict[int, Approach], taken: Flag, arrival: Arrival,
-    there: Any, blows: dict[int, Blow],
+    there: Any, met: Flag, blows: dict[int, Blow],
 ) -> Arrival:  # fmt: skip
     """The lane at rest on the stops whose impacts were the last before it.
 
-    **Arguments:** `approaches` of each coordinate; `there` is the state before the impacts, the
-    arrival's that behind them.
+    **Arguments:** `approaches` of each coordinate; `there` is the state before the impacts, if any
+    are `met`, the arrival's that behind them.
     """
     contact = arrival.contact
     if contact is None:
@@ -66,7 +66,7 @@ def settle(
         rests = {k: pin_flag((blow.struck > 0) & ends, arrival.s)}
         waits = {k: left}
     else:
-        contact = _broken(plan, arrival, there, blows)
+        contact = _broken(plan, arrival, there, met, blows)
         rests, waits = _together(plan, lane, arrival, blows, contact)
     return _held(plan, lane, taken, arrival._replace(contact=contact), rests, blows, waits)
 
@@ -186,14 +186,16 @@ def _before_it_presses(
     return not_yet, 3 * wait + jnp.sqrt(6 * jnp.where(not_yet, v, 0.0) / rate), wait
 
 
-def _broken(plan: Plan, arrival: Arrival, there: Any, blows: dict[int, Blow]) -> tuple[Scalar, ...]:
-    """As in `Lane`, without the contacts that were struck or pulled apart."""
+def _broken(
+    plan: Plan, arrival: Arrival, there: Any, met: Flag, blows: dict[int, Blow]
+) -> tuple[Scalar, ...]:
+    """As in `Lane`, without the contacts that were struck or pulled apart by the impacts `met`."""
     assert arrival.contact is not None
-    contact = list(arrival.contact)
+    contact, slack = list(arrival.contact), rounding(plan.scene, there)
     for k, blow in blows.items():
         body = plan.scene.coordinates[k]
         V, old = (stop_gradient(body.velocity(x)) for x in (arrival.state, there))
-        apart = (blow.struck > 0) | (jnp.abs(V - old) > _CLOSED * jnp.abs(V))
+        apart = met & ((blow.struck > 0) | (jnp.abs(V - old) > slack))
         contact[k] = jnp.where(apart, 0.0, contact[k])
     return tuple(contact)
 

@@ -201,21 +201,21 @@ def _impact(
         k: Approach(path.end.v, None if path.surge is None else path.surge[1], alone)
         for k, (path, alone) in both
     }
-    arrival = settle(plan, lane, approaches, taken, arrival, there, blows)
     met = jnp.zeros_like(taken)
     for here in landed.values():
         met = met | here
+    arrival = settle(plan, lane, approaches, taken, arrival, there, met, blows)
     direction = list(arrival.direction)
     for k, body in enumerate(scene.coordinates):
-        v = stop_gradient(body.velocity(arrival.state))
         if k not in blows or len(blows) > 1:  # it may share a body with one that was hit
+            v = stop_gradient(body.velocity(arrival.state))
             direction[k] = jnp.where(met & (v != 0), jnp.sign(v), direction[k])
-        if k in blows:
-            struck, (sign, _) = blows[k].struck, plan.wall(k, blows[k].struck)
-            away = -sign if len(blows) == 1 else jnp.where(v != 0, jnp.sign(v), -sign)
+        if k in blows:  # what is left of an approach is rounding
+            sign, _ = plan.wall(k, blows[k].struck)
+            away = -sign
             if arrival.contact is not None:
                 away = jnp.where(arrival.contact[k] > 0, sign, away)
-            direction[k] = jnp.where(struck > 0, away, direction[k])
+            direction[k] = jnp.where(blows[k].struck > 0, away, direction[k])
     modes = arrival.modes
     if modes and is_compound(scene):
         contact = arrival.contact or ()
