@@ -214,8 +214,8 @@ all from one start; {SEEN} cycles after {SETTLE}. A cycle ends where φS falls t
   impact in which the laws of Newton and Coulomb together would gain energy
   (`RESULTS.bad_impact`).
 
-Frictions are {FRICTIONS[1] - FRICTIONS[0]:.2g} apart; of {between.sum()} toys that peck {others}
-ended for another reason, and are left out.
+Frictions are {FRICTIONS[1] - FRICTIONS[0]:.2g} apart; of the {between.sum()} toys between these two
+{others or "none"} ended for another reason.
 
 {table}
 
