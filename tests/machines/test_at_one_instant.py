@@ -1,5 +1,6 @@
 """Contacts that are met at one instant: the one that closes fastest first, equal ones together."""
 
+import warnings
 from typing import Any
 
 import equinox as eqx
@@ -8,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
+from scipy.integrate import solve_ivp
 
 from chain import Balls, Chain, balls, dropped, passed
 
@@ -129,6 +131,41 @@ def test_a_light_ball_between_a_wall_and_a_heavy_one(ratio, impacts):
     assert int(run.impacts[0]) == impacts
     energy = 0.5 * (ratio * run.last.v[0] ** 2 + run.last.v[1] ** 2)
     assert float(energy) == pytest.approx(0.5 * ratio, rel=1e-12)
+
+
+class Shaken(Chain):
+    """Balls on springs, one above the other on a table that is shaken, seen from it."""
+
+    springs: Any = (0.5, 1.0)
+
+    def field(self, s, z):
+        force = 1 + 1.5 * jnp.sin(s)
+        pull = (force - w * x for w, x in zip(self.springs, z.x, strict=True))
+        return Balls(z.v, tuple(pull))
+
+
+def test_a_stack_is_let_go_of_as_one():
+    """Its bodies part by what grows with the third power of the time; beside SciPy."""
+    masses = 0.78, 2.46
+
+    def run(springs):
+        machine = Shaken(0.0, masses, 0.0, length=5.0, springs=springs)
+        return vi.simulate(machine, balls((0, 0), (0, 0)), 1)
+
+    with warnings.catch_warnings():  # the field jumps where its cycle begins again
+        warnings.simplefilter("ignore")
+        springs = jnp.array([(0.5, 1.0), (0.0, 1.0), (0.2, 0.7)])
+        runs = jax.vmap(lambda x: run(tuple(x)))(springs)
+    assert bool(runs.successful.all())
+    begin = np.pi + np.arcsin(2 / 3)
+    for i, pair in enumerate(springs):
+        for x, w in zip(runs.last.x, pair, strict=True):
+
+            def rate(s, z, w=float(w)):
+                return z[1], 1 + 1.5 * np.sin(s) - w * z[0]
+
+            there = solve_ivp(rate, (begin, 5.0), (0.0, 0.0), rtol=1e-11, atol=1e-13).y[0, -1]
+            assert float(x[i]) == pytest.approx(there, abs=1e-8)
 
 
 @pytest.mark.slow

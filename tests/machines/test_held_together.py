@@ -75,6 +75,38 @@ def test_a_stack_pressed_on_a_wall_stays_there(wall_first):
     np.testing.assert_allclose([runs.last.x[2], runs.last.u[2]], there, atol=1e-8)
 
 
+class Thrown(Stack):
+    """The first one twice as heavy, both thrown off the wall by one and the same acceleration."""
+
+    @property
+    def coordinates(self):
+        def met(z, Y, V):
+            far, fast = (Y - (z.x - z.y)) / 3, (V - (z.u - z.v)) / 3
+            return Pair(z.x + far, z.u + fast, z.y - 2 * far, z.v - 2 * fast)
+
+        between = vi.Coordinate(lambda z: z.x - z.y, lambda z: z.u - z.v, met, 2 / 3)
+        return between, super().coordinates[1]
+
+    def field(self, s, z):
+        force = self.forces[0] + self.forces[2] * jnp.cos(s)
+        return Pair(z.u, force, z.v, force)
+
+
+def test_a_stack_is_thrown_off_as_one_and_comes_back():
+    """As one body, which leaves where 1 + 2 cos s = 0, flies, and bounces to rest or goes on."""
+    run = vi.simulate(Thrown((1.0, 1.0, 2.0)), AT_REST, 3, event_log=12, max_impacts=2000)
+    assert bool(run.successful)
+    leaves = run.event_log.phase[0][run.event_log.kind[0] == 2]
+    begin = 2 * np.pi / 3
+    np.testing.assert_allclose(leaves, begin, atol=1e-8)
+    for numbers in ((run.sections.x, run.sections.y), (run.sections.u, run.sections.v)):
+        np.testing.assert_allclose(*numbers, atol=1e-9)
+    long = 2 * np.pi - begin
+    flight = long**2 / 2 - 2 * (1 - np.cos(begin)) - 2 * np.sin(begin) * long
+    assert flight < 0 and float(run.sections.y[1]) == pytest.approx(flight, abs=1e-8)
+    assert int(run.impacts.sum()) > 2 and float(jnp.max(run.sections.y)) <= 1e-12
+
+
 class Put(vi.AbstractScene):
     """A body pressed on a stop with unit force, that is moved as each cycle begins."""
 

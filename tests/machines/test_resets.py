@@ -1,5 +1,8 @@
 """Jumps of the state by rules of one's own, modes that impacts change, cycles that events end."""
 
+from typing import Any
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -314,3 +317,33 @@ def test_a_reset_beyond_a_stop_ends_the_lane():
     run = vi.simulate(Thrown(), start, 2)
     assert bool(run.result == vi.RESULTS.bad_reset)
     assert np.isfinite(run.sections.Y[0]) and not np.isfinite(run.last.Y)
+
+
+class Unnamed(eqx.Module):
+    a: Any
+    c: Any
+    b: Any
+
+
+class Bounced(vi.AbstractScene):
+    """a'' = -a, thrown back at .5, in a state whose second number is no velocity."""
+
+    stops: tuple = ()
+
+    @property
+    def cycle(self):
+        return 2 * jnp.pi
+
+    @property
+    def events(self):
+        return (vi.Reset(lambda m, s, x: x.a - 0.5, lambda m, s, x: Unnamed(x.a, x.c, -x.b)),)
+
+    def field(self, s, x):
+        return Unnamed(x.b, x.a, -x.a)
+
+
+def test_a_reset_of_a_state_without_names():
+    run = vi.simulate(Bounced(), Unnamed(*(jnp.array(x) for x in (-1.0, 0.3, 0.1))), 3)
+    assert bool(run.successful)
+    np.testing.assert_allclose(run.y_max, 0.5, atol=1e-9)
+    np.testing.assert_allclose(run.y_min, -np.hypot(1, 0.1), atol=1e-8)

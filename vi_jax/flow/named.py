@@ -88,7 +88,7 @@ def _names(
         found = jax.eval_shape(lambda *x: _as_arrays(whose, function(*x)), *arguments)
     taken = _TAKEN | set(leaf_names(scene)) | set(components(start))
     for name, value in found.items():
-        if name in taken:
+        if name in taken or name.startswith("section_"):  # as columns of a branch are called
             raise ValueError(f"{whose} must have names of their own, but {name!r} is taken.")
         if value.shape:
             raise TypeError(

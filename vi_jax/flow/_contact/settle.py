@@ -84,7 +84,8 @@ def _held(
         wait = left if len(rests) == 1 else jnp.maximum(wait, left)
         contact = (*contact[:k], jnp.where(ends, blows[k].struck, contact[k]), *contact[k + 1 :])
     resting = holding(plan.scene, arrival.modes, contact)
-    still, lost = _stilled(plan, state, rests, blows)
+    walls = {k: blow.struck for k, blow in blows.items()}
+    still, lost = stilled(plan, state, rests, walls)
     way = Way(plan, resting, lane.part, (s, still, time))
     later, still, passed = drifted(way.rate, pin(wait), way.moving, way.fixed, way.rest)
     if len(rests) > 1:  # another body may come upon this one before its impacts are over
@@ -116,23 +117,33 @@ def _beyond_any(plan: Plan, state: Any) -> Flag:
     return found
 
 
-def _stilled(
-    plan: Plan, state: Any, rests: dict[int, Flag], blows: dict[int, Blow]
+def stilled(
+    plan: Plan, state: Any, rests: dict[int, Flag], walls: dict[int, Scalar]
 ) -> tuple[Any, Scalar]:
-    """The state with those contacts closed that rest, and the energy that goes with it."""
+    """The state with those coordinates put on their stops that rest, without velocity, all at once;
+    and the energy that goes with it.
+
+    **Arguments:** of each coordinate whether it rests, and the stop as in `Lane.contact`.
+    """
     bodies = {k: plan.scene.coordinates[k] for k in rests}
-    velocities = {k: body.velocity(state) for k, body in bodies.items()}
-    changes = [-V for V in velocities.values()]
+    velocities = [body.velocity(state) for body in bodies.values()]
+    slower, shifts = [-V for V in velocities], []
+    for k, body in bodies.items():
+        sign, gap = plan.wall(k, walls[k])
+        shifts.append(sign * gap - body.position(state))
     if len(rests) > 1:
-        coordinates = list(bodies.values())
+        coordinates, on = list(bodies.values()), list(rests.values())
         gains = shares(coordinates, state, [push_of(body, state) for body in coordinates])
-        changes = forces(gains, list(rests.values()), changes)
-    new, lost = state, jnp.zeros_like(changes[0])
-    for (k, body), change in zip(bodies.items(), changes, strict=True):
-        sign, gap = plan.wall(k, blows[k].struck)
-        moved = body.placed(new, sign * gap, body.velocity(new) + change)
+        slower, shifts = forces(gains, on, slower), forces(gains, on, shifts)
+    new, lost = state, jnp.zeros_like(slower[0])
+    for (k, body), change, shift, V in zip(bodies.items(), slower, shifts, velocities, strict=True):
+        place, speed = body.position(new) + shift, body.velocity(new) + change
+        if len(rests) == 1:
+            sign, gap = plan.wall(k, walls[k])
+            place, speed = sign * gap, jnp.zeros_like(V)
+        moved = body.placed(new, place, speed)
         new = moved if len(rests) == 1 else select(rests[k], moved, new)
-        lost = lost - body.mass * change * 0.5 * velocities[k]
+        lost = lost - body.mass * change * 0.5 * V
     return new, lost
 
 

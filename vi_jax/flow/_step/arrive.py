@@ -12,7 +12,7 @@ from ...scene.event import section_number, struck_modes
 from .._arrival import Arrival
 from .._contact.impact import is_compound, strike
 from .._contact.rest import Release
-from .._contact.settle import Approach, settle
+from .._contact.settle import Approach, settle, stilled
 from .._lane import LEAVES, Lane, Plan, Record, select, to_event, to_turn_of
 from .._log import clock_at, noted
 from .._way import Way
@@ -140,10 +140,11 @@ def _released(
     moving = arrival.s, arrival.state, arrival.time
     _, state, time = drifted(way.rate, offset, moving, way.fixed, way.rest)
     if not exact(plan.scene, state):
-        # While it was held its place was kept to the method's error.
-        contact, zero = arrival.contact[k], jnp.zeros_like(arrival.contact[k])
-        put = plan.scene.coordinates[k].placed(state, plan.place(k, contact, zero), zero)
-        state = select(contact > 0, put, state)
+        # While they were held their places were kept to the method's error.
+        limited = sorted({stop.coordinate for stop in plan.scene.stops})
+        walls = {i: arrival.contact[i] for i in limited}
+        put, _ = stilled(plan, state, {i: walls[i] > 0 for i in limited}, walls)
+        state = select(walls[k] > 0, put, state)
     direction = jnp.where(free, -lane.direction[k], arrival.direction[k])
     clock = clock_at(plan, arrival.s + jnp.where(free, offset, 0.0), state)
     stop = arrival.contact[k] - to_event(0)

@@ -36,10 +36,12 @@ def after_jump(
             contacts[k] = jnp.where(when & stop_gradient(moved), 0.0, contacts[k])
     contact = None if contact is None else tuple(contacts)
     for k, coordinate in enumerate(plan.scene.coordinates):
-        after = coordinate.velocity(new)
-        if after is not coordinate.velocity(old):
+        after, known = coordinate.velocity(new), plan.scene.has_velocity(new)
+        if not known or after is not coordinate.velocity(old):
             machine = holding(plan.scene, modes, contact)
-            bend = rates(machine.field, coordinate.position, s, new).a
-            after = stop_gradient(jnp.where(after == 0, bend, after))
+            here = rates(machine.field, coordinate.position, s, new)
+            # The second number of a state without velocities may be anything.
+            after = after if known else here.v
+            after = stop_gradient(jnp.where(after == 0, here.a, after))
             directions[k] = jnp.where(when & (after != 0), jnp.sign(after), directions[k])
     return tuple(directions), contact
