@@ -23,7 +23,7 @@ from .._way import Way
 from ..drift import drifted
 from ..events import force_rate, rates
 from ..moving import holding, in_modes, rounding
-from .impact import Blow
+from .blow import Blow
 from .rest import allowed
 
 Scalar = Float[Array, ""]

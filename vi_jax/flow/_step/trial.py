@@ -140,7 +140,8 @@ def _path(
         aimed = aimed | (lane.target >= to_event(len(plan.scene.stops)))
     at_turn = good & aimed & met
     leaves, surge = None, None
-    if lane.contact is not None:
+    limited = any(stop.coordinate == k for stop in plan.scene.stops)
+    if lane.contact is not None and limited:
         leaves = release(lane, k, plan.scene.stops, begin, end, good, h)
         surge = (
             force_rate(free, position, machine, lane.s, lane.state),

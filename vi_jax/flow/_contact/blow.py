@@ -1,0 +1,52 @@
+"""What one blow on a stop is, and what is written down of it."""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax.lax import stop_gradient
+from jaxtyping import Array, Bool, Float
+
+from ...scene import RigidStop
+from .._arrival import Arrival
+from .._lane import HIT, Plan
+from .._log import clock_at, logged, noted
+
+Scalar = Float[Array, ""]
+Flag = Bool[Array, ""]
+
+# By so many roundings a rebound may be faster than the approach.
+_FASTER = 16.0
+
+
+class Blow(NamedTuple):
+    """What the impacts of an instant were to a coordinate that stops limit."""
+
+    struck: Scalar
+    """1 + i if stop number i was struck last, 0 if none was."""
+    approach: Scalar
+    """The greatest speed of approach."""
+    share: Scalar
+    """What is left of that speed."""
+
+
+def gains_speed(stop: RigidStop, approach: Scalar, rebound: Scalar) -> Flag | None:
+    """Whether an impact leaves faster than it came, or goes on into the stop; `None` where the law
+    is one number, whose range is known."""
+    if stop.is_one_number:
+        return None
+    leaves = stop_gradient(-stop.sign * rebound)
+    most = (1 + _FASTER * float(jnp.finfo(leaves.dtype).eps)) * stop_gradient(approach)
+    return ~((leaves >= 0) & (leaves <= most))
+
+
+def listed(
+    plan: Plan, arrival: Arrival, there: Any, hit: Flag, number: int, approach: Scalar
+) -> Arrival:
+    """With an impact counted and logged."""
+    clock, speed = clock_at(plan, arrival.s, there), arrival.speed
+    return arrival._replace(
+        impacts=arrival.impacts + jnp.where(hit, 1.0, 0.0),
+        speed=None if speed is None else jnp.where(hit, jnp.maximum(speed, approach), speed),
+        log=logged(arrival.log, hit, arrival.impacts, clock, approach, number),
+        events=noted(arrival.events, hit, clock, HIT, number, approach),
+    )

@@ -1,0 +1,305 @@
+"""Blows one after the other at one instant.
+
+Where bodies touch, a blow on one contact brings the next one together at the same instant. The
+contact that closes fastest is struck first, those that close equally fast together, so that what is
+symmetrical stays so; then the next, until none closes. A sequence that gets weaker without an end
+(several balls without restitution) goes to its limit: the contacts that are still being struck come
+to rest against each other.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax.lax import stop_gradient
+from jaxtyping import Array, Bool, Float
+
+from ...scene import Coordinate
+from ...scene.contacts import forces, push_of, rubbed, shares
+from ...scene.event import rubbing_on, rubs
+from .. import results
+from .._arrival import Arrival, ended
+from .._lane import Plan, select, to_event
+from ..moving import rounding
+from .blow import Blow, gains_speed, listed
+
+Scalar = Float[Array, ""]
+Flag = Bool[Array, ""]
+
+# A speed of approach is none that has no more than this share of the first one; a sequence that has
+# come down to the second is taken to its limit; what is struck then has speeds within this factor
+# of each other.
+_NONE, _WEAK, _ALIKE = 1e-12, 1e-7, 30.0
+
+# Speeds that differ by no more than this share are the same.
+_EQUAL = 1e-9
+
+# Contacts that share less than this of each other's velocity are struck each by itself.
+_APART = 1e-6
+
+# A ball between a wall and a body 100 times heavier is struck 31 times, one of 10,000 times 314.
+_ROUNDS = 4096.0
+
+
+class _Round(NamedTuple):
+    """A sequence of impacts between two of them."""
+
+    arrival: Arrival
+    struck: tuple[Scalar, ...]
+    """Of each coordinate, as in `Blow`."""
+    approach: tuple[Scalar, ...]
+    most: Scalar
+    """The greatest speed of approach that there was."""
+    goes_on: Scalar
+    rounds: Scalar
+
+
+class _Instant(NamedTuple):
+    """What is known of an instant beforehand."""
+
+    plan: Plan
+    taken: Flag
+    met: Flag
+    """Whether any stop is landed upon."""
+    there: Any
+    """The state before."""
+    limited: list[int]
+    """The numbers of the coordinates that stops limit."""
+    bodies: list[Coordinate]
+    """Those coordinates."""
+    before: list[Scalar]
+    """Their velocities before."""
+    gains: list[list[Scalar]]
+    """What they gain by each other's force (see `scene.contacts`)."""
+    landed: dict[int, Flag]
+    touches: dict[int, Flag]
+    """Of each stop, whether its contact is closed."""
+    coupled: list[Flag]
+    """Of each coordinate, whether one of those landed upon acts on it, through contacts that are
+    closed."""
+    slack: Any
+    """What of a velocity is rounding."""
+
+
+def strike_in_turn(
+    plan: Plan, taken: Flag, arrival: Arrival, landed: dict[int, Flag], there: Any,
+    limited: list[int],
+) -> tuple[Arrival, dict[int, Blow]]:  # fmt: skip
+    """Of machines with several coordinates that stops limit."""
+    instant = _instant(plan, taken, arrival, landed, there, limited)
+    zero = jnp.zeros_like(arrival.s)
+    nothing = tuple(zero for _ in limited)
+    # One that is landed upon without any speed, as of bodies let go of together, may come to rest.
+    touched = list(nothing)
+    for number, stop in enumerate(plan.scene.stops):
+        i = limited.index(stop.coordinate)
+        touched[i] = jnp.where(landed[number], to_event(number), touched[i])
+    first = select(instant.met, there, arrival.state)
+    begin = _Round(
+        arrival._replace(state=first), tuple(touched), nothing, zero,
+        jnp.where(instant.met, 1.0, zero), zero,
+    )  # fmt: skip
+    end = jax.lax.while_loop(
+        lambda x: (x.goes_on > 0) & (x.rounds < _ROUNDS), lambda x: _struck(instant, x), begin
+    )
+    endless = end.rounds >= _ROUNDS
+    arrival = ended(end.arrival, instant.met, endless, results.SIMULTANEOUS)
+    blows = {}
+    for k, body, struck, fastest in zip(
+        limited, instant.bodies, end.struck, end.approach, strict=True
+    ):
+        leaves = -plan.wall(k, struck)[0] * body.velocity(arrival.state)
+        share = leaves / jnp.where(fastest > 0, fastest, 1.0)
+        blows[k] = Blow(struck, fastest, jnp.clip(share, 0.0, 1.0))
+    return arrival, blows
+
+
+def _instant(
+    plan: Plan, taken: Flag, arrival: Arrival, landed: dict[int, Flag], there: Any,
+    limited: list[int],
+) -> _Instant:  # fmt: skip
+    bodies = [plan.scene.coordinates[k] for k in limited]
+    gains_ = shares(bodies, there, [push_of(body, there) for body in bodies])
+    met = jnp.zeros_like(taken)
+    coupled = [met for _ in limited]
+    touches = {}
+    for number, stop in enumerate(plan.scene.stops):
+        at, here = limited.index(stop.coordinate), landed[number]
+        met, coupled[at] = met | here, coupled[at] | here
+        depth = stop_gradient(stop.beyond(bodies[at].position(there)))
+        slack = 256 * float(jnp.finfo(depth.dtype).eps) * (1 + jnp.abs(stop_gradient(stop.gap)))
+        closed = here | (jnp.abs(depth) <= slack)
+        if arrival.contact is not None:
+            closed = closed | (arrival.contact[stop.coordinate] == to_event(number))
+        touches[number] = closed
+    coupled = _coupled(plan, limited, gains_, touches, coupled)
+    before = [body.velocity(there) for body in bodies]
+    return _Instant(
+        plan, taken, met, there, limited, bodies, before, gains_, landed, touches, coupled,
+        rounding(plan.scene, there),
+    )  # fmt: skip
+
+
+def _coupled(
+    plan: Plan, limited: list[int], gains: list[list[Scalar]], touches: dict[int, Flag],
+    coupled: list[Flag],
+) -> list[Flag]:  # fmt: skip
+    """Of each coordinate, whether one of those marked in `coupled` acts on it."""
+    closed = [jnp.zeros((), bool) for _ in limited]
+    for number, stop in enumerate(plan.scene.stops):
+        i = limited.index(stop.coordinate)
+        closed[i] = closed[i] | touches[number]
+    size, coupled = len(limited), list(coupled)
+    # There and back is enough for a row; so much more for any other arrangement of a few.
+    for _ in range(max(1, size.bit_length() - 1)):
+        for i in (*range(size), *reversed(range(size - 1))):
+            for j in range(size):
+                if j != i:
+                    acts = jnp.abs(stop_gradient(gains[i][j])) > _APART
+                    coupled[i] = coupled[i] | (closed[i] & coupled[j] & acts)
+    return coupled
+
+
+def _struck(instant: _Instant, x: _Round) -> _Round:
+    """A sequence with its next impacts."""
+    plan, arrival = instant.plan, x.arrival
+    stops, state = plan.scene.stops, arrival.state
+    velocities = [body.velocity(state) for body in instant.bodies]
+    closing = _closing(instant, x, velocities)
+    fastest = stop_gradient(jnp.max(jnp.stack(list(closing.values()))))
+    most = jnp.maximum(x.most, fastest)
+    goes_on = fastest > _NONE * most
+    weak = goes_on & (fastest <= _WEAK * most)
+
+    hits, rebounds = {}, {}
+    for number, stop in enumerate(stops):
+        hit = goes_on & ~weak & (stop_gradient(closing[number]) >= (1 - _EQUAL) * fastest)
+        hits[number] = hit
+        rebounds[number] = stop.leaving(stop.sign * jnp.where(hit, closing[number], 0.0))
+    alone = _each_by_itself(instant, velocities, hits, rebounds)
+    found = jnp.zeros_like(goes_on)
+    for number, hit in hits.items():
+        hits[number], found = hit & ~(alone & found), found | hit
+    # In the limit what is still being struck comes to rest.
+    slow = [
+        weak & (struck > 0) & (jnp.abs(stop_gradient(V)) <= _ALIKE * fastest)
+        for struck, V in zip(x.struck, velocities, strict=True)
+    ]
+    new, pushed = _thrown(instant, state, velocities, slow, hits, rebounds)
+    arrival = _accounted(instant, arrival._replace(state=new), state, pushed)
+    struck, approaches = list(x.struck), list(x.approach)
+    for number, hit in hits.items():
+        stop, i = stops[number], instant.limited.index(stops[number].coordinate)
+        speed = jnp.maximum(closing[number], 0.0)
+        arrival = ended(
+            arrival, hit, gains_speed(stop, speed, rebounds[number]), results.BAD_IMPACT
+        )
+        arrival = listed(plan, arrival, instant.there, instant.taken & hit, number, speed)
+        if stop.modes is not None:
+            given = plan.scene, arrival.s, state, new, arrival.modes
+            modes = select(hit, stop.modes_after(*given), arrival.modes)
+            arrival = arrival._replace(modes=modes)
+        struck[i] = jnp.where(hit, to_event(number), struck[i])
+        approaches[i] = jnp.where(hit, jnp.maximum(approaches[i], speed), approaches[i])
+    return _Round(
+        arrival, tuple(struck), tuple(approaches), most,
+        jnp.where(goes_on & ~weak, 1.0, 0.0), x.rounds + 1.0,
+    )  # fmt: skip
+
+
+def _each_by_itself(
+    instant: _Instant, velocities: list[Scalar], hits: dict[int, Flag], rebounds: dict[int, Scalar]
+) -> Flag:
+    """Whether contacts that close equally fast are struck one after the other all the same, in
+    their order: with friction, where one would have to pull, and where laws that differ would gain
+    energy together."""
+    if rubs(instant.plan.scene):
+        return jnp.ones((), bool)
+    size = range(len(instant.bodies))
+    on, wanted = [jnp.zeros((), bool) for _ in size], [jnp.zeros_like(V) for V in velocities]
+    signs = list(wanted)
+    for number, hit in hits.items():
+        stop = instant.plan.scene.stops[number]
+        i = instant.limited.index(stop.coordinate)
+        on[i] = on[i] | hit
+        wanted[i] = jnp.where(hit, rebounds[number] - velocities[i], wanted[i])
+        signs[i] = jnp.where(hit, float(stop.sign), signs[i])
+    amounts = stop_gradient(forces(instant.gains, on, wanted))
+    gained, size_of, pulls = jnp.zeros(()), jnp.zeros(()), jnp.zeros((), bool)
+    for i, body in enumerate(instant.bodies):
+        work = body.mass * amounts[i] * (velocities[i] + 0.5 * wanted[i])
+        gained, size_of = gained + work, size_of + jnp.abs(work)
+        pulls = pulls | (amounts[i] * signs[i] > _EQUAL * jnp.abs(wanted[i]))
+    return stop_gradient(pulls | (gained > _EQUAL * size_of))
+
+
+def _thrown(
+    instant: _Instant, state: Any, velocities: list[Scalar], slow: list[Flag],
+    hits: dict[int, Flag], rebounds: dict[int, Scalar],
+) -> tuple[Any, list[tuple[Coordinate, Scalar]]]:  # fmt: skip
+    """The state after the rebounds of those stops that are hit, with those coordinates at rest that
+    are so slow; and by how much each coordinate was pushed."""
+    scene = instant.plan.scene
+    on, wanted, places = list(slow), [-V for V in velocities], []
+    for i, body in enumerate(instant.bodies):
+        place = body.position(state)
+        for number, hit in hits.items():
+            if scene.stops[number].coordinate == instant.limited[i]:
+                on[i], place = on[i] | hit, jnp.where(hit, scene.stops[number].place, place)
+                wanted[i] = jnp.where(hit, rebounds[number] - velocities[i], wanted[i])
+        places.append(place)
+    amounts = forces(instant.gains, on, wanted)
+    new = state
+    for i, body in enumerate(instant.bodies):
+        moved = body.placed(state, places[i], velocities[i] + amounts[i])
+        new = jtu.tree_map(
+            lambda a, b, c, on=on[i]: a if c is b else a + jnp.where(on, c - b, 0.0),
+            new, state, moved,
+        )  # fmt: skip
+    pushed = []
+    for number, hit in hits.items():
+        friction = rubbing_on(scene, number)
+        if friction is not None:
+            i = instant.limited.index(scene.stops[number].coordinate)
+            rough = rubbed(scene, number, friction, state, new)
+            new = select(hit, rough.state, new)
+            amounts[i] = jnp.where(hit, rough.pushed, amounts[i])
+            along = scene.coordinates[friction.along]
+            pushed.append((along, jnp.where(hit, rough.dragged, 0.0)))
+    return new, [*pushed, *zip(instant.bodies, amounts, strict=True)]
+
+
+def _closing(instant: _Instant, x: _Round, velocities: list[Scalar]) -> dict[int, Scalar]:
+    """Of each stop the speed of approach, of those whose turn it may be: negative for others.
+
+    Two bodies that meet their stops at one instant, of which neither feels the other, are two
+    instants to derivatives: only what a blow brought together, or acts on what is landed upon,
+    takes part.
+    """
+    found = {}
+    for number, stop in enumerate(instant.plan.scene.stops):
+        i = instant.limited.index(stop.coordinate)
+        speed = stop.approach(velocities[i])
+        size = stop_gradient(speed)
+        changed = jnp.abs(stop_gradient(velocities[i] - instant.before[i])) > _NONE * x.most
+        mine = instant.landed[number] | ((changed | instant.coupled[i]) & (size > instant.slack))
+        found[number] = jnp.where(mine & instant.touches[number] & (size > 0), speed, -1.0)
+    return found
+
+
+def _accounted(
+    instant: _Instant, arrival: Arrival, before: Any, pushed: list[tuple[Coordinate, Scalar]]
+) -> Arrival:
+    """With the energy that the impacts have lost: the work of each force at the mean velocity of
+    its contact. A law that gains some ends the lane."""
+    lost, size = jnp.zeros_like(arrival.s), jnp.zeros_like(arrival.s)
+    for body, amount in pushed:
+        V, left = body.velocity(before), body.velocity(arrival.state)
+        lost = lost - body.mass * amount * 0.5 * (V + left)
+        size = size + body.mass * jnp.abs(amount) * (jnp.abs(V) + jnp.abs(left))
+    if arrival.loss is not None:
+        hit = instant.taken & instant.met
+        arrival = arrival._replace(loss=arrival.loss + jnp.where(hit, lost, 0.0))
+    wrong = stop_gradient(lost) < -1e-9 * stop_gradient(size)
+    return ended(arrival, instant.met, wrong, results.BAD_IMPACT)
