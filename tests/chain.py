@@ -19,7 +19,7 @@ def balls(x, v):
     return Balls(*(tuple(jnp.asarray(float(a)) for a in each) for each in (x, v)))
 
 
-class Chain(vi.AbstractScene):
+class Chain(vi.AbstractMachine):
     """Balls without size, each to be left of the next, and the last one of a wall; a constant force
     per mass presses them to the right."""
 

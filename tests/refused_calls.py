@@ -21,7 +21,7 @@ AXES = {ZETA: [0.8, 0.9]}
 REGION = {"start.Y": (0.0, 1.0)}
 
 
-class Own(vi.AbstractScene):
+class Own(vi.AbstractMachine):
     """A body on a spring, alone."""
 
     stops: tuple = ()

@@ -22,7 +22,7 @@ def legs(stance, turning):
     return Legs(*map(jnp.asarray, (stance, turning, 2 * stance, swinging)))
 
 
-class Walker(vi.AbstractScene):
+class Walker(vi.AbstractMachine):
     """The simplest walker (Garcia, Chatterjee, Ruina and Coleman, J. Biomech. Eng. 120, 1998): with
     a heel strike, which ends a cycle, the legs change their parts. The foot that swings scuffs the
     ground as it passes the other."""
@@ -73,7 +73,7 @@ class Sliding(eqx.Module):
     u: jax.Array
 
 
-class StickSlip(vi.AbstractScene):
+class StickSlip(vi.AbstractMachine):
     """An impactor drawn by a voltage (COCO's example of impacts with stick and slip, Dankowicz and
     Schilder, Recipes for Continuation, 2013): an impact makes the base slide until friction holds
     it. The mode is 1 while it slides."""
@@ -126,7 +126,7 @@ ROOTS = (-0.1 + 0.2j, -0.1 - 0.2j, -0.5)
 A = np.column_stack([-np.poly(ROOTS).real[1:], [1, 0, 0], [0, 1, 0]])
 
 
-class ThreeStates(vi.AbstractScene):
+class ThreeStates(vi.AbstractMachine):
     """x' = A x, and where x1 falls through 1 at the speed v: x2 -= b v, x3 -= 1.6 v."""
 
     b: jax.Array = eqx.field(converter=jnp.asarray)
@@ -151,7 +151,7 @@ class ThreeStates(vi.AbstractScene):
         return A[0, 0] * x[0] + x[1]
 
 
-class Excited(vi.AbstractScene):
+class Excited(vi.AbstractMachine):
     """x'' = 0.2 x' - x against a stop; a cycle ends with an impact."""
 
     restitution: jax.Array = eqx.field(default=0.6, converter=jnp.asarray)
@@ -168,7 +168,7 @@ class Excited(vi.AbstractScene):
         return vi.OscillatorState(x.V, 0.2 * x.V - x.Y)
 
 
-class Toggled(vi.AbstractScene):
+class Toggled(vi.AbstractMachine):
     """A body between two walls, drawn to the one that it did not hit last; by time."""
 
     restitution: jax.Array = eqx.field(default=0.8, converter=jnp.asarray)

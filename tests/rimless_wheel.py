@@ -11,7 +11,7 @@ MULTIPLIER = np.cos(2 * ALPHA) ** 2
 """Of its step, at any slope: what a heel strike leaves of the energy."""
 
 
-class Wheel(vi.AbstractScene):
+class Wheel(vi.AbstractMachine):
     """An inverted pendulum; a step ends where the next spoke comes down."""
 
     slope: float = 0.08

@@ -19,7 +19,7 @@ def on_plane(*numbers):
     return Plane(*(jnp.asarray(float(x)) for x in numbers))
 
 
-class Block(vi.AbstractScene):
+class Block(vi.AbstractMachine):
     """A particle above a floor at y = 0, pulled along it."""
 
     friction: Any = 0.3

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import vi_jax as vi
 
 
-class Shaken(vi.AbstractScene):
+class Shaken(vi.AbstractMachine):
     """By phase, so that time is another number than s."""
 
     amplitude: jax.Array | float = 1.0

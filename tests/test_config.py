@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from vi_jax import cli
 from vi_jax.cli import checks, config, verbs
 from vi_jax.cli.toml import ConfigError, keys_of, read_toml
-from vi_jax.scene.numbers import leaf, leaf_names
+from vi_jax.machine.numbers import leaf, leaf_names
 
 READY = sorted((Path(__file__).parents[1] / "experiments").glob("*.toml"))
 

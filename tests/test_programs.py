@@ -14,7 +14,7 @@ SCENE = vi.Scene.ideal(frequency_ratio=0.9, gap=None)
 
 
 def section(cycles):
-    with vi.road("xla"):  # whose programs take hundreds of maps
+    with vi.backend("xla"):  # whose programs take hundreds of maps
         return vi.simulate(SCENE, SCENE.start(Y=0.1), cycles, record="sections").sections.Y
 
 
@@ -77,7 +77,7 @@ def test_elsewhere_nothing_is_looked_at(watch, monkeypatch, tmp_path):
         section(1)
 
 
-class Table(vi.AbstractScene):
+class Table(vi.AbstractMachine):
     """A spring pushed by a table, whose look-up has no vector form, or by a cosine."""
 
     looked_up: bool
@@ -109,7 +109,7 @@ def test_what_has_no_vector_form_is_compiled_in_full(monkeypatch):
     )
     last = function(Table(False))
     assert made == [function] and function._may_be_quick
-    with pytest.warns(UserWarning, match="slower road"):
+    with pytest.warns(UserWarning, match="slower backend"):
         there = function(Table(True))
     assert made == [function, function] and not function._may_be_quick
     function(Table(False))
@@ -133,13 +133,13 @@ def test_compiler_options_that_xla_does_not_know_are_left_out():
     assert float(_programs.Program(lambda x: x + 1, options)(jnp.asarray(1.0))) == 2.0
 
 
-@pytest.mark.parametrize("road", ["auto", pytest.param("xla", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("backend", ["auto", pytest.param("xla", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("derivative", [jax.jacfwd, pytest.param(jax.grad, marks=pytest.mark.slow)])
-def test_a_field_may_close_over_what_is_differentiated(derivative, road):
+def test_a_field_may_close_over_what_is_differentiated(derivative, backend):
     """A machine written within a function of its numbers, through impacts and turns."""
 
     def last(numbers):
-        class Shaken(vi.AbstractScene):
+        class Shaken(vi.AbstractMachine):
             stops: tuple = (vi.RigidStop(0.8, 0.7),)
 
             @property
@@ -155,7 +155,7 @@ def test_a_field_may_close_over_what_is_differentiated(derivative, road):
         return run.last.Y + run.y_min[0]
 
     at = jnp.array([1.2, 1.5, 0.1, 0.2])
-    with vi.road(road):
+    with vi.backend(backend):
         found = derivative(last)(at)
     steps = 1e-5 * jnp.eye(4)
     truth = [(last(at + h) - last(at - h)) / 2e-5 for h in steps]

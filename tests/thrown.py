@@ -13,7 +13,7 @@ class Body(eqx.Module):
     V: jax.Array
 
 
-class Thrown(vi.AbstractScene):
+class Thrown(vi.AbstractMachine):
     """A body on which nothing acts but its stop."""
 
     stop: vi.SoftStop

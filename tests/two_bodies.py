@@ -15,7 +15,7 @@ class Pair(eqx.Module):
     v2: jax.Array
 
 
-class TwoBodies(vi.AbstractScene):
+class TwoBodies(vi.AbstractMachine):
     """Two bodies on springs, the first shaken: it has a wall on its right, the second one on its
     left, and they hit each other where they are 0.4 apart."""
 

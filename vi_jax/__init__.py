@@ -8,6 +8,7 @@ import typing
 from . import _version
 from . import machines as machines
 from ._interrupted import Interrupted as Interrupted
+from ._renamed import NAMES as NEW_NAMES
 from .flow import EVENTS as EVENTS
 from .flow import RESULTS as RESULTS
 from .flow import AbstractMethod as AbstractMethod
@@ -27,11 +28,39 @@ from .flow import jit as jit
 from .flow import preset as preset
 from .flow import simulate as simulate
 from .flow import suggest_method as suggest_method
-from .lanes import road as road
+from .lanes import backend as backend
 from .lanes import threads as threads
+from .machine import AbstractContactLaw as AbstractContactLaw
+from .machine import AbstractCrank as AbstractCrank
+from .machine import AbstractDrive as AbstractDrive
+from .machine import AbstractEvent as AbstractEvent
+from .machine import AbstractMachine as AbstractMachine
+from .machine import AbstractSwitch as AbstractSwitch
+from .machine import ContactFriction as ContactFriction
+from .machine import Coordinate as Coordinate
+from .machine import CosineCrank as CosineCrank
+from .machine import DCMotor as DCMotor
+from .machine import DCMotorState as DCMotorState
+from .machine import DryFriction as DryFriction
+from .machine import HuntCrossley as HuntCrossley
+from .machine import IdealDrive as IdealDrive
+from .machine import Motor as Motor
+from .machine import MotorState as MotorState
+from .machine import Oscillator as Oscillator
+from .machine import OscillatorState as OscillatorState
+from .machine import Parameters as Parameters
+from .machine import PowerLaw as PowerLaw
+from .machine import Reset as Reset
+from .machine import RigidStop as RigidStop
+from .machine import Scene as Scene
+from .machine import SliderCrank as SliderCrank
+from .machine import SoftStop as SoftStop
+from .machine import Switch as Switch
+from .machine import TimedDCMotorState as TimedDCMotorState
+from .machine import TimedMotorState as TimedMotorState
 from .orbit import ORBIT_RESULTS as ORBIT_RESULTS
 from .orbit import STABILITY as STABILITY
-from .orbit import AbstractSearch as AbstractSearch
+from .orbit import AbstractRootFinder as AbstractRootFinder
 from .orbit import Boundary as Boundary
 from .orbit import Branch as Branch
 from .orbit import ClosedFormOrbits as ClosedFormOrbits
@@ -60,34 +89,6 @@ from .scan import basins as basins
 from .scan import lyapunov as lyapunov
 from .scan import scan as scan
 from .scan import sweep as sweep
-from .scene import AbstractContactLaw as AbstractContactLaw
-from .scene import AbstractCrank as AbstractCrank
-from .scene import AbstractDrive as AbstractDrive
-from .scene import AbstractEvent as AbstractEvent
-from .scene import AbstractScene as AbstractScene
-from .scene import AbstractSwitch as AbstractSwitch
-from .scene import ContactFriction as ContactFriction
-from .scene import Coordinate as Coordinate
-from .scene import CosineCrank as CosineCrank
-from .scene import DCMotor as DCMotor
-from .scene import DCMotorState as DCMotorState
-from .scene import DryFriction as DryFriction
-from .scene import HuntCrossley as HuntCrossley
-from .scene import IdealDrive as IdealDrive
-from .scene import Motor as Motor
-from .scene import MotorState as MotorState
-from .scene import Oscillator as Oscillator
-from .scene import OscillatorState as OscillatorState
-from .scene import Parameters as Parameters
-from .scene import PowerLaw as PowerLaw
-from .scene import Reset as Reset
-from .scene import RigidStop as RigidStop
-from .scene import Scene as Scene
-from .scene import SliderCrank as SliderCrank
-from .scene import SoftStop as SoftStop
-from .scene import Switch as Switch
-from .scene import TimedDCMotorState as TimedDCMotorState
-from .scene import TimedMotorState as TimedMotorState
 
 if typing.TYPE_CHECKING:
     __version__: str
@@ -111,6 +112,8 @@ def __getattr__(name: str):
     if name == "plot" or name.startswith("plot_") or name in ("animate", "save_picture"):
         plot = importlib.import_module(".plot", __name__)
         return plot if name == "plot" else getattr(plot, name)
+    if name in NEW_NAMES:
+        raise AttributeError(f"`vi_jax.{name}` is called `vi_jax.{NEW_NAMES[name]}` now.")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

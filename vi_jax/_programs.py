@@ -19,7 +19,7 @@ import jax
 import jax.tree_util as jtu
 from jax.core import Tracer
 
-from .lanes import Unsupported, current_road, vector_only
+from .lanes import Unsupported, current_backend, vector_only
 
 # With these XLA compiles two to three times faster. What runs for long is in the lanes, whose code
 # is not XLA's; of a program that does much besides, the first alone saves half of that and costs it
@@ -136,7 +136,7 @@ class Program:
     def __call__(self, *arguments: Any, **keywords: Any) -> Any:
         """As the function."""
         _watch.called(self)
-        if self._may_be_quick and current_road() != "xla" and is_outermost(arguments, keywords):
+        if self._may_be_quick and current_backend() != "xla" and is_outermost(arguments, keywords):
             try:
                 with vector_only():
                     return self._quick(*arguments, **keywords)

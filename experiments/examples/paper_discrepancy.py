@@ -23,7 +23,7 @@ for ax, (title, xi) in zip(axes, damping.items(), strict=True):
     scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=xi)
     run = vi.simulate(scene, scene.start(Y=0.0, V=0.0), cycles=cycles, samples=64, impact_log=4)
     assert run.y_min is not None
-    vi.plot_history(run, scene=scene, ax=ax, unit="cycles", lw=0.8, color="#0072b2")
+    vi.plot_history(run, machine=scene, ax=ax, unit="cycles", lw=0.8, color="#0072b2")
     ax.plot(np.arange(cycles) + 0.5, run.y_min, "v", color="#d55e00", ms=4)
     ax.set(title=title, ylabel="position Y (a)", ylim=(-4.4, 2.4))
     print(f"{title}: last minima {run.y_min[-2]:.4f}, {run.y_min[-1]:.4f}")

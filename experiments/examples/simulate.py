@@ -26,7 +26,7 @@ print(f"hits the stop at {speed:.2f} m/s")
 
 # %%
 figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
-vi.plot_history(run, scene=scene, ax=left)
+vi.plot_history(run, machine=scene, ax=left)
 vi.plot_phase_portrait(run, scene, ax=right)
 left.set_title("position over the crank angle; green: the stop")
 right.set_title("phase portrait; dots: after each cycle")

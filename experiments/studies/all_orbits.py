@@ -281,7 +281,7 @@ for j, (panel, kind) in enumerate(zip(panels, kinds, strict=False)):
     run = kind.orbit.trajectory()
     good = bool(kind.orbit.stable)
     vi.plot_phase_portrait(
-        run, kind.orbit.scene, ax=panel, color=COLORS[j], lw=1.4, ls="-" if good else "--"
+        run, kind.orbit.machine, ax=panel, color=COLORS[j], lw=1.4, ls="-" if good else "--"
     )
     cycles = len(kind.path)
     panel.set_title(f"{chr(65 + j)}: {2 * cycles}π, |μ| = {kind.size:.3f}", fontsize=10)

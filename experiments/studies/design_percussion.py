@@ -372,11 +372,11 @@ modulus_axes.set(xlabel="step", ylabel="largest |μ| (dimensionless)", ylim=(0.3
 orbits = {"start": before.orbit, "A": ascents["A"].end.orbit, "C": ascents["C"].end.orbit}
 for name, orbit in orbits.items():
     motion = vi.simulate(
-        orbit.scene, orbit.state, 1, method=vi.ExactFlight(), samples=200, impact_log=4
+        orbit.machine, orbit.state, 1, method=vi.ExactFlight(), samples=200, impact_log=4
     )  # fmt: skip
-    path = motion_path(motion, scene=orbit.scene)
+    path = motion_path(motion, machine=orbit.machine)
     portrait.plot(path.Y, path.V, color=colours[name], lw=1.3)
-    gap = float(orbit.scene.stops[0].gap)
+    gap = float(orbit.machine.stops[0].gap)
     portrait.axvline(gap, color=colours[name], lw=2.0, ls=(0, (4, 1.5)))
     portrait.text(
         gap, 0.98, f"stop of {name} ", transform=portrait.get_xaxis_transform(), rotation=90,

@@ -128,7 +128,7 @@ def stays(branch: vi.Branch) -> float:
     """How far a run of 400 cycles from the middle of the stable part ends from its minimum."""
     index = np.flatnonzero(branch.stable)
     orbit = branch.orbit(int(index[len(index) // 2]))
-    run = vi.simulate(orbit.scene, orbit.state, 400)
+    run = vi.simulate(orbit.machine, orbit.state, 400)
     assert run.y_min is not None
     last = np.asarray(run.y_min)[-branch.cycles :]
     return float(abs(last.min() - orbit.y_min))

@@ -77,7 +77,7 @@ def flow(scene: vi.Scene) -> vi.AbstractMethod:
     )
 
 
-def search(scene: vi.Scene, guess: Any, method: vi.AbstractSearch, section=0.0) -> vi.Orbit:
+def search(scene: vi.Scene, guess: Any, method: vi.AbstractRootFinder, section=0.0) -> vi.Orbit:
     """A search for the 4π motion."""
     return vi.find_orbit(
         scene, guess, cycles=2, root_finder=method, method=flow(scene), section=section

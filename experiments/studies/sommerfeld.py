@@ -34,7 +34,7 @@ VALUES, SETTLE = (31, 200) if QUICK else (161, 400)
 LOW, HIGH = 0.6, 1.8
 
 
-def machine(strength: float, control: float = 0.8, *, stop: bool = False) -> vi.AbstractScene:
+def machine(strength: float, control: float = 0.8, *, stop: bool = False) -> vi.AbstractMachine:
     gap = GAP if stop else None
     return vi.machines.UnbalancedRotor(  # pyright: ignore[reportCallIssue]
         strength=strength, control=control, coupling=EPSILON, damping_ratio=XI, gap=gap

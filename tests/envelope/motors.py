@@ -49,7 +49,7 @@ def stalling() -> Found:
     return found
 
 
-class Watched(vi.AbstractScene):
+class Watched(vi.AbstractMachine):
     """A motor scene observed once in a time of 2π, wherever its crank is."""
 
     scene: vi.Scene

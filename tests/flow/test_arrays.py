@@ -33,7 +33,7 @@ def one_array(x, y, u, w):
     return jnp.stack([x, y, u, w])
 
 
-class Chain(vi.AbstractScene):
+class Chain(vi.AbstractMachine):
     """Two bodies on springs, the first of which is driven against a wall."""
 
     made: Any = eqx.field(static=True)

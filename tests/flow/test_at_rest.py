@@ -10,7 +10,7 @@ import vi_jax as vi
 from scipy.integrate import solve_ivp
 
 
-class Body(vi.AbstractScene):
+class Body(vi.AbstractMachine):
     """A body of mass one under a force a + b s + c sin s, with drag."""
 
     force: Any = eqx.field(converter=lambda x: jnp.asarray(x, float))
@@ -105,7 +105,7 @@ def test_every_event_is_logged_in_its_order():
     np.testing.assert_allclose(split.event_log.phase, log.phase, atol=1e-7)
 
 
-class Rubbing(vi.AbstractScene):
+class Rubbing(vi.AbstractMachine):
     """A body on a spring and on rough ground."""
 
     stops: tuple = ()

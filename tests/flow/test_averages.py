@@ -139,8 +139,8 @@ def test_lanes_are_alike_on_both_roads_and_alone():
 
     ratios = jnp.linspace(0.7, 1.3, 11)
     found = []
-    for road in ("auto", "xla"):
-        with vi.road(road):
+    for backend in ("auto", "xla"):
+        with vi.backend(backend):
             found.append(jax.jit(jax.vmap(lane))(ratios))
     assert bool(found[0][2].all())
     alone = lane(ratios[3])
@@ -153,7 +153,7 @@ class Rubbed(NamedTuple):
     place: jax.Array
 
 
-class Switching(vi.AbstractScene):
+class Switching(vi.AbstractMachine):
     """A clock with a mode: ±1, by the sign of a sawtooth, which a reset begins anew."""
 
     stops = ()

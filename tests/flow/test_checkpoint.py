@@ -71,6 +71,6 @@ def test_a_checkpoint_around_an_orbit():
 
 @pytest.mark.slow
 def test_a_checkpoint_on_the_other_road():
-    with vi.road("xla"):
+    with vi.backend("xla"):
         found = jax.grad(jax.checkpoint(lambda V: last(V)))(0.1)  # traced anew
     np.testing.assert_allclose(found, slope_of(last, 0.1), rtol=1e-5)

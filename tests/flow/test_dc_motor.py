@@ -163,7 +163,7 @@ class Books(eqx.Module):
     damped: Any
 
 
-class Booked(vi.AbstractScene):
+class Booked(vi.AbstractMachine):
     """A scene that keeps books of its energy."""
 
     scene: vi.Scene

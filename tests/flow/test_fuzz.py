@@ -20,7 +20,7 @@ class Flow(eqx.Module):
     E: jax.Array
 
 
-class Budget(vi.AbstractScene):
+class Budget(vi.AbstractMachine):
     """The ideally driven oscillator in time, with its energy on the books."""
 
     zeta: jax.Array

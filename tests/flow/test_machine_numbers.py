@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-from vi_jax.scene.numbers import by_name, with_leaf
+from vi_jax.machine.numbers import by_name, with_leaf
 
 NUMBERS = [
     *map(float, np.linspace(1.05, 1.15, 7)),
@@ -30,7 +30,7 @@ class Law(eqx.Module):
         return 0.8 / (1 + self.slope * approach)
 
 
-class Shaken(vi.AbstractScene):
+class Shaken(vi.AbstractMachine):
     """A body on a spring under a number of harmonics; the field loops over what is whole."""
 
     shaking: jax.Array | float = 1.0
@@ -55,7 +55,7 @@ class Shaken(vi.AbstractScene):
         return vi.OscillatorState(jnp.asarray(0.1), jnp.asarray(0.0))
 
 
-MACHINES: dict[str, Callable[[Any], vi.AbstractScene]] = {
+MACHINES: dict[str, Callable[[Any], vi.AbstractMachine]] = {
     "own": lambda x: Shaken(shaking=x),
     "law": lambda x: Shaken(shaking=3.0, law=Law(x)),
     "pair": lambda x: vi.machines.ImpactPair(half_gap=x, restitution=0.5),

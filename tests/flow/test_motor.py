@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-from vi_jax.scene.trig import sincos
+from vi_jax.machine.trig import sincos
 
 
 @pytest.mark.parametrize("crank", ["cosine", "slider"])

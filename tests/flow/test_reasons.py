@@ -10,7 +10,7 @@ import pytest
 import vi_jax as vi
 
 
-class Bounce(vi.AbstractScene):
+class Bounce(vi.AbstractMachine):
     """A body pressed on a stop of any law, and of any kind."""
 
     law: Any
@@ -94,7 +94,7 @@ def test_rest_and_losses_follow_a_rebound_of_ones_own():
     np.testing.assert_allclose(own.impact_energy.sum(), 1.0, rtol=1e-9)  # all that it fell with
 
 
-class Pushed(vi.AbstractScene):
+class Pushed(vi.AbstractMachine):
     """Forces on both sides of a line point at it."""
 
     stops: tuple = ()
@@ -118,7 +118,7 @@ def test_a_sliding_mode_has_its_own_reason():
         assert "slide" in str(run)
 
 
-class Turned(vi.AbstractScene):
+class Turned(vi.AbstractMachine):
     """A spring whose body is turned round as each cycle begins."""
 
     stops: tuple = ()

@@ -25,7 +25,7 @@ class Ball(eqx.Module):
     T: jax.Array
 
 
-class Ground(vi.AbstractScene):
+class Ground(vi.AbstractMachine):
     """A ball on the ground, and a clock that goes as the square of its speed changes."""
 
     gravity: jax.Array

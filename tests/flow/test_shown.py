@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-from vi_jax.scene.numbers import by_name
-from vi_jax.scene.units import unit_of
+from vi_jax.machine.numbers import by_name
+from vi_jax.machine.units import unit_of
 
 M = vi.machines
 MACHINES = [
@@ -22,7 +22,7 @@ SCENE = MACHINES[0]
 
 @pytest.mark.parametrize("thing", MACHINES, ids=lambda x: type(x).__name__)
 def test_numbers_are_shown_with_their_units(thing):
-    shown = [thing, thing.start()] if isinstance(thing, vi.AbstractScene) else [thing]
+    shown = [thing, thing.start()] if isinstance(thing, vi.AbstractMachine) else [thing]
     for x in shown:
         units = getattr(x, "units", {})
         text, page = repr(x), x._repr_html_()

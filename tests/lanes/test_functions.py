@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from vi_jax import lanes
-from vi_jax.lanes import machine
+from vi_jax.lanes import runtime
 from vi_jax.lanes._kernel import kernel_text
 
 X = np.concatenate(
@@ -18,7 +18,7 @@ X = np.concatenate(
 Y = np.random.default_rng(2).permutation(X)
 
 
-def once(function, *args, road):
+def once(function, *args, backend):
     """`function` of every lane, by a loop of one step."""
 
     def lane(*args):
@@ -28,7 +28,9 @@ def once(function, *args, road):
         def end(args, carry):
             return function(*args)
 
-        return lanes.run(begin, lambda args, carry: begin(args), end, args, rows=0, road=road)[0]
+        return lanes.run(
+            begin, lambda args, carry: begin(args), end, args, rows=0, backend=backend
+        )[0]
 
     return jax.jit(jax.vmap(lane))(*args)
 
@@ -94,7 +96,7 @@ def elementwise(request):
     def all_of(numbers):
         return {name: FUNCTIONS[name][0](*pair) for name, pair in numbers.items()}
 
-    mine = once(all_of, numbers, road="auto")
+    mine = once(all_of, numbers, backend="auto")
     wanted = {name: FUNCTIONS[name][0](*map(jnp.asarray, pair)) for name, pair in numbers.items()}
     return dtype, mine, wanted
 
@@ -115,13 +117,13 @@ def test_elementwise(name, elementwise):
 
 def test_exponential_is_right_to_rounding():
     x = np.linspace(-700, 700, 4001)
-    value = once(lambda x: jnp.exp(x), x, road="auto")
+    value = once(lambda x: jnp.exp(x), x, backend="auto")
     np.testing.assert_allclose(value, np.exp(x), rtol=4e-16)
 
 
 def test_circle_is_right_to_rounding():
     x = np.linspace(-40, 40, 8001)
-    sine, cosine = once(lambda x: lanes.sincos(x), x, road="auto")
+    sine, cosine = once(lambda x: lanes.sincos(x), x, backend="auto")
     np.testing.assert_allclose(sine, np.sin(x), atol=3e-16, rtol=0)
     np.testing.assert_allclose(cosine, np.cos(x), atol=3e-16, rtol=0)
 
@@ -153,7 +155,7 @@ def arrays():
     def all_of(x, y):
         return {name: function(x, y) for name, function in ARRAYS.items()}
 
-    return once(all_of, x, y, road="auto"), jax.vmap(all_of)(x, y)
+    return once(all_of, x, y, backend="auto"), jax.vmap(all_of)(x, y)
 
 
 @pytest.mark.parametrize("name", ARRAYS)
@@ -185,7 +187,7 @@ def branches(x, y):
 
 def test_control_flow():
     x, y = np.random.default_rng(4).normal(0, 2, (2, 203))
-    for a, b in zip(once(branches, x, y, road="auto"), jax.vmap(branches)(x, y), strict=True):
+    for a, b in zip(once(branches, x, y, backend="auto"), jax.vmap(branches)(x, y), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-14, atol=1e-15)
 
 
@@ -198,8 +200,8 @@ def quotients(x, y):
     return x / y + 1 / y - x / 2 + inner(y) + branch + loop + rows.sum()
 
 
-@pytest.mark.parametrize("road", ["auto", "xla"])
-def test_derivatives_of_quotients(road):
+@pytest.mark.parametrize("backend", ["auto", "xla"])
+def test_derivatives_of_quotients(backend):
     rng = np.random.default_rng(4)
     x, y = rng.normal(0, 3, 50), rng.uniform(0.5, 3, 50) * rng.choice([-1, 1], 50)
 
@@ -208,7 +210,7 @@ def test_derivatives_of_quotients(road):
         return function, first, jax.jacfwd(first, (0, 1))
 
     def here(x, y):
-        return once(lambda x, y: (quotients(x, y),), x[None], y[None], road=road)[0][0]
+        return once(lambda x, y: (quotients(x, y),), x[None], y[None], backend=backend)[0][0]
 
     for lanes_, plain in zip(derivatives(here), derivatives(quotients), strict=True):
         found, wanted = jax.jit(jax.vmap(lanes_))(x, y), jax.jit(jax.vmap(plain))(x, y)
@@ -223,13 +225,13 @@ def test_directions_share_divisions(monkeypatch):
         texts.append(kernel_text(*args))
         return texts[-1]
 
-    monkeypatch.setattr(machine, "kernel_text", kept)
+    monkeypatch.setattr(runtime, "kernel_text", kept)
 
     def divisions(directions):
         def lane(x, y, slopes):
             def along(slope):
                 return jax.jvp(
-                    lambda y: once(lambda x, y: (x / y,), x, y, road=None), (y,), (slope,)
+                    lambda y: once(lambda x, y: (x / y,), x, y, backend=None), (y,), (slope,)
                 )
 
             return jax.vmap(along)(slopes)[1]

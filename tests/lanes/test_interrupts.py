@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-from vi_jax.lanes import machine
+from vi_jax.lanes import runtime
 
 SCENE = vi.Scene.ideal(frequency_ratio=0.9)
 
@@ -41,13 +41,13 @@ def test_lanes_that_were_not_run_are_no_success(monkeypatch):
     whole = np.asarray(lanes(starts))
     with vi.threads(np.int64(2)):
         np.testing.assert_array_equal(lanes(starts), whole)
-    monkeypatch.setattr(machine, "thread_count", lambda: 0)
+    monkeypatch.setattr(runtime, "thread_count", lambda: 0)
     with pytest.raises(Exception, match="Not all lanes were run"):
         np.asarray(lanes(starts))
     monkeypatch.undo()
-    turn = machine.Work._turn
+    turn = runtime.Work._turn
     monkeypatch.setattr(
-        machine.Work, "_turn", lambda self: setattr(self.stop, "value", 1) or turn(self)
+        runtime.Work, "_turn", lambda self: setattr(self.stop, "value", 1) or turn(self)
     )
     with pytest.raises(Exception, match="interrupted before all of them had ended"):
         np.asarray(lanes(starts))

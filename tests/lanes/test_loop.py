@@ -16,12 +16,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from vi_jax import lanes
 from vi_jax.lanes import _code, _primitive, machine
-from vi_jax.lanes.machine import thread_count
+from vi_jax.lanes.runtime import thread_count
 
 ROWS = 12
 
 
-def logistic(x, r, n, *, road=None):
+def logistic(x, r, n, *, backend=None):
     """n steps of x ← r x (1 - x) with a rare branch; a row for every step."""
 
     def begin(inputs):
@@ -40,10 +40,10 @@ def logistic(x, r, n, *, road=None):
     def end(inputs, carry):
         return carry[0], carry[1].astype(jnp.int32)
 
-    return lanes.run(begin, step, end, (x, r, n), rows=ROWS, road=road)
+    return lanes.run(begin, step, end, (x, r, n), rows=ROWS, backend=backend)
 
 
-def fall(height, gravity, h=0.05, *, road=None):
+def fall(height, gravity, h=0.05, *, backend=None):
     """A ball falls in steps of h until an event: time and speed when it hits the floor."""
 
     def begin(inputs):
@@ -65,7 +65,7 @@ def fall(height, gravity, h=0.05, *, road=None):
     def end(inputs, carry):
         return carry[2], carry[1]
 
-    return lanes.run(begin, step, end, (height, gravity), rows=1, road=road)
+    return lanes.run(begin, step, end, (height, gravity), rows=1, backend=backend)
 
 
 MANY = jax.jit(jax.vmap(logistic))
@@ -104,16 +104,16 @@ def test_every_batch(size):
 def test_roads_agree():
     for size in (1, 7, 600):
         values = batch(size)
-        other = jax.jit(jax.vmap(lambda *a: logistic(*a, road="xla")))(*values)
+        other = jax.jit(jax.vmap(lambda *a: logistic(*a, backend="xla")))(*values)
         for a, b in zip(jax.tree.leaves(MANY(*values)), jax.tree.leaves(other), strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-13)
 
 
 def test_the_road_of_the_context():
-    with lanes.road("xla"):
+    with lanes.backend("xla"):
         jaxpr = jax.make_jaxpr(lambda x: logistic(x, 3.0, 4.0))(0.5)
-    assert "road=xla" in str(jaxpr)
-    with pytest.raises(ValueError, match="name"), lanes.road("motorway"):
+    assert "backend=xla" in str(jaxpr)
+    with pytest.raises(ValueError, match="name"), lanes.backend("motorway"):
         pass
 
 
@@ -178,7 +178,9 @@ def test_forward_derivatives():
     many = jax.vmap(jax.jacfwd(time, (0, 1)), (0, None))(np.linspace(1, 2, 11), g)
     np.testing.assert_allclose(many[0], 0.5 * np.sqrt(2 / np.linspace(1, 2, 11) / g))
     one = jax.jit(lambda x: jax.jvp(lambda x: logistic(x, 3.7, 6.0), (x,), (1.0,)))(0.3)
-    two = jax.jit(lambda x: jax.jvp(lambda x: logistic(x, 3.7, 6.0, road="xla"), (x,), (1.0,)))(0.3)
+    two = jax.jit(lambda x: jax.jvp(lambda x: logistic(x, 3.7, 6.0, backend="xla"), (x,), (1.0,)))(
+        0.3
+    )
     for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True):
         if a.dtype != jax.dtypes.float0:
             np.testing.assert_allclose(a, b, rtol=1e-12)
@@ -186,7 +188,7 @@ def test_forward_derivatives():
 
 def test_directions_share_one_motion():
     """Six directions make one program whose primal part is there once."""
-    rows = jax.make_jaxpr(jax.jacfwd(lambda x: logistic(*x, road="xla")[1]["x"]))(
+    rows = jax.make_jaxpr(jax.jacfwd(lambda x: logistic(*x, backend="xla")[1]["x"]))(
         jnp.asarray([0.3, 3.7, 6.0])
     )
     equations = [e for e in rows.jaxpr.eqns if e.primitive.name == "lanes"]
@@ -234,15 +236,15 @@ def test_derivatives_of_a_step_that_holds(name):
 def test_reverse_mode_is_the_forward_one_transposed():
     """Of results and rows, of all inputs or some, of numbers of a lane's own and of common ones."""
 
-    def sums(x, r, road=None):
-        (last, *_), rows = jax.vmap(lambda x: logistic(x, r, 6.0, road=road))(x)
+    def sums(x, r, backend=None):
+        (last, *_), rows = jax.vmap(lambda x: logistic(x, r, 6.0, backend=backend))(x)
         return jnp.stack([jnp.sum(jnp.sin(last)), jnp.sum(rows["x"][:, :3] ** 2)])
 
     x = jnp.linspace(0.1, 0.9, 11)
-    for road in (None, "xla"):
+    for backend in (None, "xla"):
         for which in (0, 1):
-            forward = jax.jacfwd(sums, which)(x, 3.7, road)
-            backward = jax.jacrev(sums, which)(x, 3.7, road)
+            forward = jax.jacfwd(sums, which)(x, 3.7, backend)
+            backward = jax.jacrev(sums, which)(x, 3.7, backend)
             np.testing.assert_allclose(backward, forward, rtol=1e-12, atol=1e-12)
     many = jnp.linspace(0.1, 0.9, 20)
     slope = jax.grad(lambda w: jnp.sum(jnp.sin(logistic(w @ many, 3.7, 6.0)[0][0])))(
@@ -312,14 +314,14 @@ def test_lesser_processors(cpu):
         np.testing.assert_allclose(a, b, rtol=1e-9)
 
 
-def sorting(x, *, road=None):
+def sorting(x, *, backend=None):
     def begin(x):
         return x, lanes.Emitted(True, False, None)
 
     def step(x, carry):
         return jnp.sort(jnp.stack([carry, 1.0]))[0], lanes.Emitted(False, False, None)
 
-    return lanes.run(begin, step, lambda x, carry: carry, x, rows=0, road=road)[0]
+    return lanes.run(begin, step, lambda x, carry: carry, x, rows=0, backend=backend)[0]
 
 
 def test_shards_of_a_batch_take_the_same_road():
@@ -352,7 +354,7 @@ def test_what_has_no_vector_form_takes_the_other_road_and_says_so():
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # once
         jax.vmap(sorting)(jnp.asarray([0.5, 3.0, 4.0]))
-        jax.vmap(lambda x: sorting(x, road="xla"))(jnp.asarray([0.5, 3.0]))
+        jax.vmap(lambda x: sorting(x, backend="xla"))(jnp.asarray([0.5, 3.0]))
 
 
 def failing(*_):
@@ -385,7 +387,7 @@ def test_a_program_that_llvm_cannot_compile(monkeypatch):
 
     _code.llvm()  # which it can do at first
     monkeypatch.setattr(_code, "compiled", failing)
-    with pytest.raises(jax.errors.JaxRuntimeError, match=r"LLVM: no such.*road\(.xla.\)"):
+    with pytest.raises(jax.errors.JaxRuntimeError, match=r"LLVM: no such.*backend\(.xla.\)"):
         jax.block_until_ready(lanes.run(begin, step, lambda x, carry: carry, 1.0, rows=0)[0])
 
 
@@ -444,7 +446,7 @@ def test_programs_are_not_kept_for_ever():
         return lanes.run(begin, step, lambda x, carry: carry, 1.0, rows=0)[0]
 
     def kernels(numbers):
-        from vi_jax.lanes.machine import kernel_of
+        from vi_jax.lanes.runtime import kernel_of
 
         for number in numbers:
             jaxpr = jax.make_jaxpr(lambda: one(float(number)))().jaxpr  # noqa: B023

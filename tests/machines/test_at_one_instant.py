@@ -23,7 +23,7 @@ class Three(eqx.Module):
     w: Any
 
 
-class Cradle(vi.AbstractScene):
+class Cradle(vi.AbstractMachine):
     """Newton's: three equal masses, each on its own spring; they touch at the springs' rest."""
 
     restitution: Any = eqx.field(default=1.0, converter=lambda x: jnp.asarray(x, float))
@@ -185,7 +185,7 @@ class Feet(eqx.Module):
     turn: Any
 
 
-class Rod(vi.AbstractScene):
+class Rod(vi.AbstractMachine):
     """A rod of unit mass that falls flat on feet at `places` along it (inertia .3)."""
 
     restitution: tuple[float, ...]
@@ -290,7 +290,7 @@ def test_two_balls_bounce_to_rest_one_above_the_other(k):
     np.testing.assert_allclose(times[:number], [t for t, _ in wanted[:-1]], atol=1e-9)
 
 
-class Table(vi.AbstractScene):
+class Table(vi.AbstractMachine):
     """Two balls on one table that is shaken, seen from it."""
 
     shaking: Any = 2.0

@@ -215,7 +215,7 @@ class Plain:
     v: Any
 
 
-class Own(vi.AbstractScene):
+class Own(vi.AbstractMachine):
     """A body on a spring before a wall, in a state of some kind."""
 
     kind: Any = eqx.field(static=True)
@@ -264,7 +264,7 @@ def test_a_state_of_any_kind(kind):
     np.testing.assert_array_equal(machine.position(run.sections), wanted.sections.y)
     np.testing.assert_array_equal(machine.velocity(run.samples.state), wanted.samples.state.v)
     assert "y = " in str(run) and "v = " in str(run)
-    vi.plot_history(run, scene=machine)
+    vi.plot_history(run, machine=machine)
     vi.plot_phase_portrait(run, machine)
     slope = jax.grad(
         lambda a: machine.position(vi.simulate(Own(kind, a), machine.start(), 1).last)

@@ -22,7 +22,7 @@ class Pair(eqx.Module):
     v: Any
 
 
-class Pressed(vi.AbstractScene):
+class Pressed(vi.AbstractMachine):
     """Two balls of a radius, driven and pressed together."""
 
     radius: Any = number(0.25)
@@ -71,7 +71,7 @@ class Ball(eqx.Module):
     phase: Any
 
 
-class Table(vi.AbstractScene):
+class Table(vi.AbstractMachine):
     """A ball on a shaken table, seen from the laboratory, with the table's phase in the state."""
 
     strength: Any = number(0.9)

@@ -18,7 +18,7 @@ class Pair(eqx.Module):
     v: Any
 
 
-class Stack(vi.AbstractScene):
+class Stack(vi.AbstractMachine):
     """Two equal bodies, one against the other and that one against a wall at y = 0."""
 
     forces: Any = eqx.field(converter=lambda x: jnp.asarray(x, float))
@@ -107,7 +107,7 @@ def test_a_stack_is_thrown_off_as_one_and_comes_back():
     assert int(run.impacts.sum()) > 2 and float(jnp.max(run.sections.y)) <= 1e-12
 
 
-class Put(vi.AbstractScene):
+class Put(vi.AbstractMachine):
     """A body pressed on a stop with unit force, that is moved as each cycle begins."""
 
     by: Any
@@ -151,7 +151,7 @@ class Point(eqx.Module):
     v: Any
 
 
-class Dome(vi.AbstractScene):
+class Dome(vi.AbstractMachine):
     """A particle on a smooth dome of radius one, under gravity."""
 
     stops: tuple = (vi.RigidStop(-1.0, 0.3, "left"),)

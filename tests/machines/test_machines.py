@@ -59,7 +59,7 @@ def test_a_bounce_of_twice_the_period(bounces):
     doubling = next(p for p in bounces.special if p.kind == "period-doubling")
     twice = doubling.switch()
     assert int(twice.cycles) == 2 and int(twice.impacts) == 2 and "2 cycles" in str(twice)
-    run = vi.simulate(twice.scene, twice.state, 4, method="reference")
+    run = vi.simulate(twice.machine, twice.state, 4, method="reference")
     np.testing.assert_allclose(run.sections.height[2:], run.sections.height[:-2], atol=1e-9)
 
 

@@ -25,7 +25,7 @@ class TwoBodies(eqx.Module):
     v: Any
 
 
-class Meeting(vi.AbstractScene):
+class Meeting(vi.AbstractMachine):
     """Two bodies on springs that meet where x - y = gap; the second has a wall at y = wall."""
 
     omega: Any = field(1.3)
@@ -76,7 +76,7 @@ class Meeting(vi.AbstractScene):
         return TwoBodies(z.u, first, z.v, (-self.spring * z.y - 0.1 * z.v) / self.mass)
 
 
-class Belt(vi.AbstractScene):
+class Belt(vi.AbstractMachine):
     """A body on a spring and on a belt that drags it: a self-excited oscillation."""
 
     speed: Any = field(0.5)
@@ -116,7 +116,7 @@ class Belt(vi.AbstractScene):
         return vi.OscillatorState(jnp.array(0.0), jnp.array(0.0))
 
 
-class Block(vi.AbstractScene):
+class Block(vi.AbstractMachine):
     """A block on a spring and on rough ground, driven; by phase."""
 
     omega: Any = field(0.4)
@@ -184,7 +184,7 @@ class Tanks(NamedTuple):
     heat: Any
 
 
-class Filter(vi.AbstractScene):
+class Filter(vi.AbstractMachine):
     rate: jax.Array
     stops = ()
 
@@ -277,7 +277,7 @@ def test_a_block_is_followed_while_it_sticks():
     assert change.kind == "grazing" and "another mode" in change.detail
     # Where it comes to a stop the force is what friction just holds.
     where = change.orbit
-    run = vi.simulate(where.scene, where.state, 1, method=vi.Adaptive(rtol=1e-11), samples=2048)
+    run = vi.simulate(where.machine, where.state, 1, method=vi.Adaptive(rtol=1e-11), samples=2048)
     s, Y, V = 2 * PI * run.samples.cycles, run.samples.state.Y, run.samples.state.V
     still = np.argmin(np.abs(np.asarray(V)))
     assert abs(float(np.cos(s[still]) - Y[still])) == pytest.approx(0.5, abs=0.02)
@@ -302,7 +302,7 @@ class Pushed(eqx.Module):
     v: Any
 
 
-class Cage(vi.AbstractScene):
+class Cage(vi.AbstractMachine):
     """A body in a cage that is shaken, told by places or by what the other's differ from them."""
 
     restitution: Any = field(0.3)

@@ -44,7 +44,7 @@ def test_a_walker_walks(walk):
     assert float(jnp.abs(greatest[2:]).max()) < 1e-9
     # Both sides of the jump are extremes.
     np.testing.assert_allclose([walk.y_min, walk.y_max], [-STANCE, STANCE], atol=1e-10)
-    run = vi.simulate(walk.scene, walk.state, 2, event_log=2, method=CLOSE)
+    run = vi.simulate(walk.machine, walk.state, 2, event_log=2, method=CLOSE)
     assert run.event_log.kind.tolist() == [[vi.EVENTS.index("reset"), -1]] * 2
     np.testing.assert_allclose(run.event_log.phase[:, 0], STEP, atol=1e-8)
 
@@ -75,7 +75,7 @@ def test_a_kind_of_event_of_ones_own(walk):
     own = vi.find_orbit(OwnWalker(0.009), legs(0.2003, -0.1998))
     np.testing.assert_allclose(own.state.stance, walk.state.stance, atol=1e-14)
     np.testing.assert_allclose(own.multipliers, walk.multipliers, atol=1e-12)
-    run = vi.simulate(own.scene, own.state, 1, event_log=1)
+    run = vi.simulate(own.machine, own.state, 1, event_log=1)
     # The leg turns as fast before as after, but for the cosine.
     turning = float(own.state.turning) / np.cos(2 * STANCE)
     assert float(run.event_log.value[0, 0]) == pytest.approx(turning, abs=1e-9)
@@ -91,7 +91,7 @@ def test_a_walker_doubles_its_step(walk):
     np.testing.assert_allclose(branch.y_min, -branch.y_max, atol=1e-12)
     twice = doubling.switch(distance=0.002)
     assert int(twice.cycles) == 2 and bool(twice.successful)
-    again = vi.find_orbit(twice.scene, twice.state, cycles=2, method=CLOSE)
+    again = vi.find_orbit(twice.machine, twice.state, cycles=2, method=CLOSE)
     np.testing.assert_allclose(again.state.stance, twice.state.stance, atol=1e-9)
 
 
@@ -277,8 +277,8 @@ def test_roads_agree(name):
         return vi.simulate(*make(x), cycles, method=vi.FixedStep(steps_per_cycle=20), event_log=4)
 
     runs, at = [], jnp.linspace(-0.5, 0.5, 5)
-    for road in ("auto", "xla"):
-        with vi.road(road):
+    for backend in ("auto", "xla"):
+        with vi.backend(backend):
             runs.append(jax.jit(lanes)(at))
     fast, slow = runs
     assert bool(fast.successful.all())
@@ -290,7 +290,7 @@ def test_roads_agree(name):
     )  # fmt: skip
 
 
-class Thrown(vi.AbstractScene):
+class Thrown(vi.AbstractMachine):
     """A body that is put beyond its stop."""
 
     stops: tuple = (vi.RigidStop(2.0, 0.5),)
@@ -325,7 +325,7 @@ class Unnamed(eqx.Module):
     b: Any
 
 
-class Bounced(vi.AbstractScene):
+class Bounced(vi.AbstractMachine):
     """a'' = -a, thrown back at .5, in a state whose second number is no velocity."""
 
     stops: tuple = ()

@@ -116,12 +116,12 @@ def test_simulate(case, orbit):
     np.testing.assert_allclose(run.y_max[1:], orbit.y_max, atol=1e-5)
     vi.plot_sketch(case.machine)
     if driven:
-        vi.plot_history(run, scene=case.machine)
+        vi.plot_history(run, machine=case.machine)
         vi.plot_phase_portrait(run, case.machine)
         assert len(vi.animate(run, case.machine, seconds=0.3, fps=10)) == 3
     else:  # between its sections only a machine observed at equal times is seen
         with pytest.raises(ValueError, match="samples"):
-            vi.plot_history(run, scene=case.machine)
+            vi.plot_history(run, machine=case.machine)
 
 
 def test_find_orbit(case, orbit):
@@ -203,7 +203,7 @@ def test_scan(case, orbit):
     )  # fmt: skip
     assert (np.asarray(data["period"]) == 1).all() and (np.asarray(data["result"]) == 0).all()
     np.testing.assert_allclose(data["y_max"][0], orbit.y_max, atol=1e-5)
-    vi.plot_regimes(data, scene=case.machine)
+    vi.plot_regimes(data, machine=case.machine)
 
 
 def test_basins(case, orbit):

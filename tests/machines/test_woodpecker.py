@@ -1,4 +1,4 @@
-"""The woodpecker toy: its known cycle, beside SciPy, its energy, derivatives, methods and roads."""
+"""The woodpecker toy: its known cycle, beside SciPy, energy, derivatives, methods and backends."""
 
 import dataclasses
 

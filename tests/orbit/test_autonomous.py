@@ -67,7 +67,7 @@ def test_a_walker_doubles_its_step():
     assert np.linalg.eigvals(jacobian).real.min() == pytest.approx(-1, abs=3e-7)
 
 
-class Belt(vi.AbstractScene):
+class Belt(vi.AbstractMachine):
     """A body on a spring, on a belt whose friction falls with the speed of sliding; a cycle ends
     where the body is farthest back."""
 

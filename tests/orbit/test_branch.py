@@ -135,7 +135,7 @@ def test_sweeps_lie_on_stable_points(short, long, restitution):
         if inside:
             continue  # near a bifurcation the transient outlasts any sweep
         (orbit,) = (orbit for orbit in branch.at(zeta) if orbit.stable)
-        assert float(orbit.scene.drive.frequency_ratio) == pytest.approx(zeta, abs=1e-12)
+        assert float(orbit.machine.drive.frequency_ratio) == pytest.approx(zeta, abs=1e-12)
         assert float(orbit.y_min) == pytest.approx(float(y_min), abs=1e-6)
 
 
@@ -175,7 +175,7 @@ def test_grazing_of_the_classic_impact_oscillator():
     gained = grazing.switch()
     assert int(gained.impacts) == 1 and float(gained.impact_speed[0]) > 0
     there = vi.Scene.ideal(
-        frequency_ratio=gained.scene.drive.frequency_ratio, restitution=0.8, gap=gap,
+        frequency_ratio=gained.machine.drive.frequency_ratio, restitution=0.8, gap=gap,
         damping_ratio=xi,
     )  # fmt: skip
     closed = vi.closed_form_orbits(there)
@@ -187,7 +187,7 @@ def test_grazing_of_the_classic_impact_oscillator():
     assert np.ptp(d) > 1
 
 
-class Duffing(vi.AbstractScene):
+class Duffing(vi.AbstractMachine):
     """Y'' + 2ξY' + Y + γY³ = F cos(Ωt), over the cycles of its force."""
 
     stops: tuple[vi.RigidStop, ...]
@@ -273,7 +273,7 @@ def test_the_motions_at_its_bounds_and_ends(short, restitution):
     assert branch.ends == ("bounds", "bounds")
     for value in (low, 0.9, high):
         (orbit,) = branch.at(value)
-        assert float(orbit.scene.drive.frequency_ratio) == pytest.approx(value, abs=1e-13)
+        assert float(orbit.machine.drive.frequency_ratio) == pytest.approx(value, abs=1e-13)
         closed = vi.closed_form_orbits(scene_at(value, restitution))
         assert float(orbit.impact_speed[0]) == pytest.approx(
             float(closed.impact_speed[0]), abs=1e-9

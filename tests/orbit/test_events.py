@@ -28,7 +28,7 @@ def _stopped(machine, state):
     return Slider(state.x, jnp.zeros_like(state.v))
 
 
-class Rubbing(vi.AbstractScene):
+class Rubbing(vi.AbstractMachine):
     """A driven oscillator with dry friction: x'' + x = A cos ωt - f sign x', by the phase ωt."""
 
     amplitude: jnp.ndarray = eqx.field(converter=jnp.asarray)
@@ -98,9 +98,11 @@ def test_a_branch_agrees_with_a_search(followed):
     (there,) = branch.at(value)
     parts = name.split(".")
     if parts[0] == "soft_stops":
-        machine = eqx.tree_at(lambda m: m.soft_stops[0].stiffness, orbit.scene, jnp.asarray(value))
+        machine = eqx.tree_at(
+            lambda m: m.soft_stops[0].stiffness, orbit.machine, jnp.asarray(value)
+        )
     else:
-        machine = eqx.tree_at(lambda m: getattr(m, name), orbit.scene, jnp.asarray(value))
+        machine = eqx.tree_at(lambda m: getattr(m, name), orbit.machine, jnp.asarray(value))
     found = vi.find_orbit(machine, there, int(there.cycles))
     assert bool(found.successful), str(found)
     for a, b in zip(vars(there.state).values(), vars(found.state).values(), strict=True):

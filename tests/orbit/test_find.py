@@ -56,7 +56,7 @@ def test_the_cycles_of_an_orbit_are_taken_as_a_number():
         jax.jit(lambda n: vi.find_orbit(UNDAMPED, orbit.state, cycles=n).state)(1)
 
 
-class VanDerPol(vi.AbstractScene):
+class VanDerPol(vi.AbstractMachine):
     """Y'' - μ(1 - Y²)Y' + Y = 0, observed where Y and Y' have risen, by a guard with a kink."""
 
     mu: jax.Array
@@ -189,7 +189,9 @@ def test_many_guesses_in_one_program():
         assert counts.sum() == int(batch.successful.sum()) > 1500
         for orbit in orbits:
             closed = vi.closed_form_orbits(
-                vi.Scene.ideal(frequency_ratio=orbit.scene.drive.frequency_ratio, restitution=0.8),
+                vi.Scene.ideal(
+                    frequency_ratio=orbit.machine.drive.frequency_ratio, restitution=0.8
+                ),
                 cycles=int(orbit.cycles),
             )
             assert float(orbit.y_min) == pytest.approx(float(closed.y_min[0]), abs=1e-9)
@@ -313,7 +315,7 @@ class Sledges(eqx.Module):
     w: jax.Array
 
 
-class Coupled(vi.AbstractScene):
+class Coupled(vi.AbstractMachine):
     """Two bodies on a spring that nothing else holds: x'' = y - x - c x' + cos s, y'' = x - y -
     c y' + push; where they are as a pair is free."""
 

@@ -76,7 +76,7 @@ def test_a_curve_of_lost_symmetry_of_a_scene(whole):
     assert abs(curve.multipliers - 1).min(axis=1).max() < 1e-8
     for i in (0, -1):
         orbit = curve.orbit(i)
-        run = vi.simulate(orbit.scene, orbit.state, 1, samples=2, method="reference")
+        run = vi.simulate(orbit.machine, orbit.state, 1, samples=2, method="reference")
         half = jax.tree.map(lambda x: float(x[1]), run.samples.state)
         assert half.Y == pytest.approx(-float(orbit.state.Y), abs=1e-9)
         assert half.V == pytest.approx(-float(orbit.state.V), abs=1e-9)

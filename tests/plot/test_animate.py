@@ -34,7 +34,7 @@ MACHINES = {
 }  # fmt: skip
 
 
-class Own(vi.AbstractScene):
+class Own(vi.AbstractMachine):
     """A body on a spring between two stops."""
 
     stops: tuple = (vi.RigidStop(1.0, 0.5), vi.RigidStop(1.0, 0.5, "left"))

@@ -161,7 +161,7 @@ def test_maps_of_a_machine_speak_its_words():
     ball = vi.machines.BouncingBall(restitution=0.5, acceleration=3.0)
     dims, starts = ("start.Y", "start.V"), {"start.Y": [0.0, 1.0], "start.V": [0.0, 1.0]}
     found = _basins([[0, 1], [1, 0]], dims, **starts)
-    paper = found._replace(scene=vi.Scene.ideal(frequency_ratio=0.9))
+    paper = found._replace(machine=vi.Scene.ideal(frequency_ratio=0.9))
     ax = vi.plot_basins(paper, ax=_axes())
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("Y at the start (a)", "V at the start (a ω)")
     names = {"Y": "height", "V": "speed"}
@@ -170,12 +170,12 @@ def test_maps_of_a_machine_speak_its_words():
         for a in found.attractors
     ]
     data = found.data.rename({f"start.{key}": f"start.{name}" for key, name in names.items()})
-    found = found._replace(scene=ball, attractors=renamed, data=data)
+    found = found._replace(machine=ball, attractors=renamed, data=data)
     ax = vi.plot_basins(found, ax=_axes())
     assert next(iter(_legend(ax))).startswith("1 cycle, 1 impact")
     assert "period 1 cycle" in str(found) and "π" not in str(found)
     assert ax.get_xlabel() == "height (g/ω²) at the start"
-    named = _legend(vi.plot_regimes(_data(), scene=ball, ax=_axes()))
+    named = _legend(vi.plot_regimes(_data(), machine=ball, ax=_axes()))
     assert "1 cycle" in named and "> 8 cycles" in named
     data = vi.scan(
         ball, {"start.height": [1.0, 2.0], "start.speed": [0.0, 1.0]}, measure="regime",

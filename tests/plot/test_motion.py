@@ -29,7 +29,7 @@ def _axes():
 
 
 def test_path_holds_the_samples_and_the_impacts(scene, run):
-    path = motion_path(run, scene=scene)
+    path = motion_path(run, machine=scene)
     impacts = int(run.impacts.sum())
     assert impacts > 0
     assert path.Y.size == 6 * 32 + 1 + 2 * impacts
@@ -44,7 +44,7 @@ def test_path_holds_the_samples_and_the_impacts(scene, run):
 
 
 def test_impacts_lie_on_the_path_of_their_neighbours(scene, run):
-    path = motion_path(run, scene=scene)
+    path = motion_path(run, machine=scene)
     step = np.abs(np.diff(path.Y))
     # No jump in position: a misplaced impact would make one of several tenths.
     assert step.max() < 1.05 * np.abs(path.V).max() * 2 * np.pi / 0.9 / 32
@@ -57,7 +57,7 @@ def test_stop_on_the_left(run):
         stops=(vi.RigidStop(1.0, 0.7, side="left"),),
     )
     run = vi.simulate(left, left.start(), 6, samples=32, impact_log=4)
-    path = motion_path(run, scene=left)
+    path = motion_path(run, machine=left)
     at = np.flatnonzero(path.Y == -1.0)
     assert at.size == 2 * int(run.impacts.sum()) > 0
     assert (path.V[at[::2]] < 0).all() and (path.V[at[1::2]] > 0).all()
@@ -65,7 +65,7 @@ def test_stop_on_the_left(run):
 
 def test_history_axis_and_stop(scene, run):
     ax = _axes()
-    assert plot_history(run, scene=scene, ax=ax, window=(2, 4), shift=1) is ax
+    assert plot_history(run, machine=scene, ax=ax, window=(2, 4), shift=1) is ax
     line, stop = ax.lines
     x = line.get_xdata()
     # Crank angle in units of π: two for each cycle.
@@ -81,7 +81,7 @@ def test_history_axis_and_stop(scene, run):
 def test_history_of_a_machine_counts_its_own_cycles():
     ball = vi.machines.BouncingBall(restitution=0.5, acceleration=3.0)
     run = vi.simulate(ball, ball.start(), 3, samples=16)
-    ax = plot_history(run, scene=ball, ax=_axes())
+    ax = plot_history(run, machine=ball, ax=_axes())
     assert ax.get_xlabel() == "cycles since the start" and ax.get_ylabel() == "height (g/ω²)"
     assert ax.lines[0].get_xdata().max() == pytest.approx(3.0)
 

@@ -5,7 +5,7 @@ import pytest
 import vi_jax as vi
 from vi_jax.scan._describe import description_of
 from vi_jax.scan.grid import Blocks
-from vi_jax.scan.job import make_job
+from vi_jax.scan.program import make_program
 
 # Several motions live side by side here; see `experiments/studies/all_orbits.py`.
 SCENE = vi.Scene.ideal(frequency_ratio=3.2, restitution=0.9, gap=1.05, damping_ratio=0.01)
@@ -93,6 +93,8 @@ def test_bad_regions():
 def test_a_store_with_other_numbers_for_regimes_is_another_scan():
     axes = {"start.Y": np.linspace(-1.0, 1.0, 4)}
     blocks = Blocks(axes, 256, paired=False)
-    about = description_of(make_job(SCENE, tuple(axes), measure="regime"), blocks)
+    about = description_of(make_program(SCENE, tuple(axes), measure="regime"), blocks)
     assert about["regimes"] == {regime.name: int(regime) for regime in vi.REGIMES}
-    assert "regimes" not in description_of(make_job(SCENE, tuple(axes), measure="steps"), blocks)
+    assert "regimes" not in description_of(
+        make_program(SCENE, tuple(axes), measure="steps"), blocks
+    )

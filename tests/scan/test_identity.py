@@ -41,7 +41,7 @@ class Depth(vi.AbstractMeasure):
     def scaled(self, x):
         return helper(x)
 
-class Ball(vi.AbstractScene):
+class Ball(vi.AbstractMachine):
     stops: tuple = ()
     cycle: float = 1.0
 

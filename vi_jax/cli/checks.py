@@ -6,19 +6,19 @@ from pathlib import Path
 from typing import Any
 
 from .._checks import unwritable
+from ..machine import AbstractMachine
+from ..machine.numbers import leaf, leaf_names
 from ..orbit.branch import column_names
 from ..orbit.curve import check_walk
 from ..plot.save import ENDINGS
 from ..scan.grid import Blocks, axes_of
-from ..scan.job import check_corners, make_job
-from ..scene import AbstractScene
-from ..scene.numbers import leaf, leaf_names
+from ..scan.program import check_corners, make_program
 from .config import OrbitTable
 from .toml import ConfigError, given, in_terms_of, unknown
 
 
 def check_names(
-    scene: AbstractScene, names: Iterable[str], place: str, *, start: bool = False
+    scene: AbstractMachine, names: Iterable[str], place: str, *, start: bool = False
 ) -> None:
     """**Raises:** `ConfigError` for a name that no number of the scene (or the start) has."""
     known = leaf_names(scene)
@@ -29,11 +29,11 @@ def check_names(
         raise ConfigError(*wrong)
 
 
-def check_range(scene: AbstractScene, name: str, values: Sequence[float], place: str) -> None:
+def check_range(scene: AbstractMachine, name: str, values: Sequence[float], place: str) -> None:
     """**Raises:** `ConfigError` if the scene refuses the least or the greatest of these values."""
     with in_terms_of(place, keys=()):
         axes = axes_of({name: values})
-        check_corners(make_job(scene, (name,), measure="extremes"), Blocks(axes, 1))
+        check_corners(make_program(scene, (name,), measure="extremes"), Blocks(axes, 1))
 
 
 def check_paths(table: str, *, picture: str | None = None, output: str | None = None) -> None:
@@ -73,7 +73,7 @@ def check_map(axes: Mapping[str, Any], measure: Iterable[str] | None, *, paired:
         )
 
 
-def check_continuation(scene: AbstractScene, start: Any, table: OrbitTable) -> None:
+def check_continuation(scene: AbstractMachine, start: Any, table: OrbitTable) -> None:
     """**Raises:** `ConfigError` if the branch cannot begin, or its files not be written."""
     asked = table.continue_
     assert asked is not None

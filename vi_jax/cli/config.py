@@ -31,8 +31,8 @@ import diffrax
 from attrs import field, frozen
 
 from ..flow import AbstractMethod, Adaptive, ExactFlight, FixedStep, Taylor, Verner9
-from ..orbit import AbstractSearch, Gradient, Newton
-from ..scene import AbstractScene
+from ..machine import AbstractMachine
+from ..orbit import AbstractRootFinder, Gradient, Newton
 from .machine import MachineTable, ModelTable, SceneTable, machine_named, start_of
 from .toml import ConfigError as ConfigError
 from .toml import Row, given, in_terms_of, read_toml, unknown
@@ -159,7 +159,7 @@ class OrbitTable:
     picture: str | None = None
     continue_: ContinueTable | None = None
 
-    def search(self) -> AbstractSearch:
+    def search(self) -> AbstractRootFinder:
         """The search for the motion."""
         options = given(self, "cycles", "guess", "root_finder", "picture", "continue_")
         with in_terms_of("[orbit]"):
@@ -195,10 +195,10 @@ class Config:
     orbit: OrbitTable | None = None
     simulate: SimulateTable | None = None
 
-    own: AbstractScene | None = field(init=False, default=None)
+    own: AbstractMachine | None = field(init=False, default=None)
     """A machine that the command line names, not the file."""
 
-    def build(self) -> tuple[AbstractScene, Any, AbstractMethod | str | None]:
+    def build(self) -> tuple[AbstractMachine, Any, AbstractMethod | str | None]:
         """Scene, start and method; `None` for what the file leaves out."""
         names = [name for name in ("scene", "machine", "model") if getattr(self, name) is not None]
         held = " and ".join(f"[{name}]" for name in names) or "none of them"

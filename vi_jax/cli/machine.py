@@ -11,8 +11,8 @@ from typing import Any, Literal
 from attrs import field, frozen
 
 from .. import machines
-from ..scene import (
-    AbstractScene,
+from ..machine import (
+    AbstractMachine,
     DCMotor,
     IdealDrive,
     Motor,
@@ -85,7 +85,7 @@ class ModelTable:
     name: str
     numbers: dict[str, float] = field(factory=dict)
 
-    def build(self) -> AbstractScene:
+    def build(self) -> AbstractMachine:
         """The machine."""
         kinds = {name: x for name, x in vars(machines).items() if _is_machine(x)}
         if self.name not in kinds:
@@ -99,7 +99,7 @@ class ModelTable:
 
 
 def _is_machine(kind: Any) -> bool:
-    return isinstance(kind, type) and issubclass(kind, AbstractScene)
+    return isinstance(kind, type) and issubclass(kind, AbstractMachine)
 
 
 @frozen(kw_only=True)
@@ -171,7 +171,7 @@ class SceneTable:
             raise ConfigError('`crank_ratio` in [scene] must stand beside crank = "slider"')
 
 
-def start_of(scene: AbstractScene, numbers: Mapping[str, float], place: str) -> Any:
+def start_of(scene: AbstractMachine, numbers: Mapping[str, float], place: str) -> Any:
     """A state on the section, from `[start]` or a guess."""
     known = list(inspect.signature(scene.start).parameters)
     wrong = [unknown("key", name, place, known) for name in numbers if name not in known]
@@ -181,7 +181,7 @@ def start_of(scene: AbstractScene, numbers: Mapping[str, float], place: str) -> 
         return scene.start(**numbers)
 
 
-def machine_named(name: str) -> AbstractScene:
+def machine_named(name: str) -> AbstractMachine:
     """The machine that a function of this name returns."""
     module, _, function = name.partition(":")
     if not module or not function:
@@ -199,7 +199,7 @@ def machine_named(name: str) -> AbstractScene:
             found = make()
         except (Exception, SystemExit) as error:
             raise _raised(name, error) from error
-    if not isinstance(found, AbstractScene):
+    if not isinstance(found, AbstractMachine):
         raise ConfigError(f"--machine {name} must return a machine, but returned {found!r}")
     return found
 

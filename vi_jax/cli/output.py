@@ -13,11 +13,11 @@ from matplotlib.figure import Figure
 from .._files import write_whole
 from ..flow import RESULTS
 from ..flow.results import REASONS, number_of
+from ..machine.numbers import components
 from ..plot import save_picture
 from ..scan import Sweep
 from ..scan.regime import REGIMES, periods_of
 from ..scan.store import NOT_COMPUTED
-from ..scene.numbers import components
 
 
 def failures(codes: np.ndarray, *, what: str = "motions") -> tuple[list[str], bool]:

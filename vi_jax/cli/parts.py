@@ -18,9 +18,9 @@ import numpy as np
 from ..flow import RESULTS, Run, Samples
 from ..flow.arguments import planned
 from ..flow.simulate import simulate
+from ..machine import AbstractMachine
+from ..machine.numbers import with_leaf
 from ..scan.sweep import Sweep, sweep, taken_along
-from ..scene import AbstractScene
-from ..scene.numbers import with_leaf
 
 # Intervals (samples, or cycles as so many) of one part: a fraction of a second. Each other length
 # is another program, so that it is chosen before the time is known.
@@ -51,7 +51,7 @@ def noted_interrupts() -> Iterator[Callable[[], bool]]:
 
 
 def simulate_in_parts(
-    scene: AbstractScene,
+    scene: AbstractMachine,
     start: Any,
     cycles: int,
     *,
@@ -169,7 +169,7 @@ def _joined(runs: list[Run], cycles: int, samples: int, steps: int) -> Run:
 
 
 def sweep_in_parts(
-    scene: AbstractScene,
+    scene: AbstractMachine,
     parameter: str,
     values: Any,
     *,

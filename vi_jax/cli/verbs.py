@@ -18,6 +18,7 @@ from .._files import write_whole
 from ..flow import RESULTS, Run
 from ..flow.named import average_names
 from ..flow.results import number_of
+from ..machine import AbstractMachine
 from ..orbit import Orbit, continue_orbit, find_orbit
 from ..plot import (
     plot_basins,
@@ -32,7 +33,6 @@ from ..scan import Sweep
 from ..scan import basins as find_basins
 from ..scan import scan as run_scan
 from ..scan.sweep import COLUMNS
-from ..scene import AbstractScene
 from .checks import (
     check_continuation,
     check_map,
@@ -246,7 +246,7 @@ def _continued(found: Orbit, table: OrbitTable, tell: Tell) -> list[str]:
 def _portrait(found: Orbit) -> Axes:
     """The phase portrait of a periodic motion."""
     ax = new_axes()
-    plot_phase_portrait(found.trajectory(), found.scene, ax=ax)
+    plot_phase_portrait(found.trajectory(), found.machine, ax=ax)
     return ax
 
 
@@ -273,7 +273,7 @@ def simulate(config: Config, tell: Tell) -> Outcome:
         return outcome
 
 
-def _describe_run(scene: AbstractScene, run: Run, table: SimulateTable) -> Outcome:
+def _describe_run(scene: AbstractMachine, run: Run, table: SimulateTable) -> Outcome:
     lines = [str(run)]
     if table.output is not None:
         columns = sample_columns(run.samples) if table.samples else cycle_columns(run)
@@ -282,7 +282,7 @@ def _describe_run(scene: AbstractScene, run: Run, table: SimulateTable) -> Outco
     if table.picture is not None:
         figure = Figure(figsize=(11, 3.6), layout="constrained")
         left, right = figure.subplots(1, 2, width_ratios=(2, 1))
-        plot_history(run, scene=scene, ax=left, unit="cycles")
+        plot_history(run, machine=scene, ax=left, unit="cycles")
         plot_phase_portrait(run, scene, ax=right)
         lines.append(saved(left, table.picture))
     return Outcome("\n".join(lines), bool(run.successful))

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from math import isfinite
 from typing import Any, NamedTuple
 
-from ..scene import Parameters, Scene
+from ..machine import Parameters, Scene
 
 
 class Control(NamedTuple):

@@ -13,6 +13,7 @@ import numpy as np
 from .._programs import compiled
 from ..flow import RESULTS, Run, simulate
 from ..flow.methods import chosen
+from ..machine import AbstractMachine
 from ..orbit import STABILITY
 from ..orbit.cycle_map import cycle_map
 from ..orbit.floquet import stability_of
@@ -21,7 +22,6 @@ from ..plot.path import MotionPath, motion_path
 from ..scan import REGIMES, lyapunov
 from ..scan.measures import Regime
 from ..scan.sweep import taken_along
-from ..scene import AbstractScene
 
 WINDOW = 8
 """Drive cycles drawn as a motion."""
@@ -95,7 +95,7 @@ class Motion(NamedTuple):
         return f"multipliers {values}: {verdict}"
 
 
-def look(scene: AbstractScene, start: Any, settle: int = 1000) -> Motion:
+def look(scene: AbstractMachine, start: Any, settle: int = 1000) -> Motion:
     """The motion of a scene after `settle` cycles, by its standard method.
 
     A start beyond a stop is put on it.
@@ -120,7 +120,7 @@ def look(scene: AbstractScene, start: Any, settle: int = 1000) -> Motion:
     met = np.asarray(log.stop) >= 0
     good = bool(run.successful)
     return Motion(
-        path=motion_path(window, scene=scene),
+        path=motion_path(window, machine=scene),
         sections=jtu.tree_map(np.asarray, run.sections),
         impact_phase=np.asarray(log.phase)[met],
         impact_speed=np.asarray(log.speed)[met],
@@ -134,7 +134,7 @@ def look(scene: AbstractScene, start: Any, settle: int = 1000) -> Motion:
     )
 
 
-def prepare(scene: AbstractScene, start: Any) -> Motion:
+def prepare(scene: AbstractMachine, start: Any) -> Motion:
     """Compile what `look` needs for scenes of this structure; the motion that it sees."""
     found = look(scene, start, 0)
     _exponent(scene, jtu.tree_map(lambda x: jnp.asarray(x[-1]), found.sections))
@@ -142,7 +142,7 @@ def prepare(scene: AbstractScene, start: Any) -> Motion:
 
 
 @compiled
-def _seen(scene: AbstractScene, start: Any, settle: Any) -> tuple[Run, Run, Any, Any]:
+def _seen(scene: AbstractMachine, start: Any, settle: Any) -> tuple[Run, Run, Any, Any]:
     """The run observed, its first cycles sampled, its regime, and the derivative of its map."""
     method = chosen(scene, None)
     options = {"method": method, "max_steps": _MOST_STEPS}
@@ -154,7 +154,7 @@ def _seen(scene: AbstractScene, start: Any, settle: Any) -> tuple[Run, Run, Any,
     return run, window, found, _monodromy(scene, run, found["period"], method)
 
 
-def _monodromy(scene: AbstractScene, run: Run, period: Any, method: Any) -> jax.Array:
+def _monodromy(scene: AbstractMachine, run: Run, period: Any, method: Any) -> jax.Array:
     """Derivative of the map over the last `period` cycles, cycle by cycle."""
     the_map = cycle_map(scene, method=method)
     cycles = jnp.maximum(period, 0).astype(jnp.int32)
@@ -168,6 +168,6 @@ def _monodromy(scene: AbstractScene, run: Run, period: Any, method: Any) -> jax.
 
 
 @compiled
-def _exponent(scene: AbstractScene, state: Any) -> jax.Array:
+def _exponent(scene: AbstractMachine, state: Any) -> jax.Array:
     out = lyapunov(scene, state, _REGIME.observed, settle=0, number=1)
     return out.exponents[0]

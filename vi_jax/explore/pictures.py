@@ -13,9 +13,9 @@ from matplotlib.lines import Line2D
 from matplotlib.text import Text
 from PIL import Image
 
+from ..machine.states import UNITS
 from ..plot.branch import axis_name
 from ..plot.colors import BLUE, GREEN, RED
-from ..scene.states import UNITS
 from .diagram import SHOWN, Diagram
 from .motion import WINDOW, Motion
 

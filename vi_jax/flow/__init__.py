@@ -1,4 +1,4 @@
-"""How a scene moves: methods, the hybrid step, the closed-form flight, `simulate`, results."""
+"""How a machine moves: methods, the hybrid step, the closed-form flight, `simulate`, results."""
 
 from ._lane import has_fixed_cycle as has_fixed_cycle
 from .fusion import jit as jit

@@ -3,12 +3,9 @@
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
 
+from .._types import Flag, Scalar
 from .beside import Beside
-
-Scalar = Float[Array, ""]
-Flag = Bool[Array, ""]
 
 
 class Arrival(NamedTuple):

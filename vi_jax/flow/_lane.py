@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
-from ..scene import AbstractScene
-from ..scene.event import (
+from .._types import Scalar
+from ..machine import AbstractMachine
+from ..machine.event import (
     begin_modes,
     events_of,
     is_autonomous,
@@ -22,9 +23,7 @@ from ._own import check_field, check_laws
 from .beside import Beside
 from .events import Rates, force_rate, rates
 from .methods import AbstractMethod
-from .moving import in_modes, rounding
-
-Scalar = Float[Array, ""]
+from .smooth import in_modes, rounding
 
 # What the next step aims at: nothing, or one of those below. Numbers, which the loop carries.
 FREE = 0.0
@@ -115,20 +114,23 @@ class Lane(eqx.Module):
     rejected: Scalar
 
 
-def ticks(scene: AbstractScene, state: Any) -> bool:
+def ticks(machine: AbstractMachine, state: Any) -> bool:
     """Whether the independent variable itself counts the cycles."""
-    return scene.clock(state) is None and not is_autonomous(scene, state)
+    return machine.clock(state) is None and not is_autonomous(machine, state)
 
 
-def has_fixed_cycle(scene: AbstractScene, state: Any) -> bool:
-    """Whether all cycles have the same duration, `scene.period`."""
-    return ticks(scene, state) and scene.pace(jnp.zeros_like(scene.position(state)), state) is None
+def has_fixed_cycle(machine: AbstractMachine, state: Any) -> bool:
+    """Whether all cycles have the same duration, `machine.period`."""
+    return (
+        ticks(machine, state)
+        and machine.pace(jnp.zeros_like(machine.position(state)), state) is None
+    )
 
 
 class Plan(eqx.Module):
     """What is asked of the loop."""
 
-    scene: AbstractScene
+    machine: AbstractMachine
     method: AbstractMethod
     cycles: int = eqx.field(static=True)
     """Cycles to record."""
@@ -145,8 +147,8 @@ class Plan(eqx.Module):
     """Names of the machine's averages, if motion is recorded."""
     rests: bool = eqx.field(static=True)
     """Whether the body may come to rest on a stop."""
-    road: str = eqx.field(static=True)
-    """Which compiler runs it (see `lanes.road`)."""
+    backend: str = eqx.field(static=True)
+    """Which compiler runs it (see `lanes.backend`)."""
     # Numbers that are no part of the program, so that others are not another one.
     settle: Scalar
     """Cycles before the first one recorded."""
@@ -170,22 +172,22 @@ class Plan(eqx.Module):
 
     def others(self, state: Any) -> list[int]:
         """The numbers of the events, besides stops, whose guards are looked at in each step."""
-        last = section_number(self.scene) + (self.scene.section(state) is not None)
-        return list(range(len(self.scene.stops), last))
+        last = section_number(self.machine) + (self.machine.section(state) is not None)
+        return list(range(len(self.machine.stops), last))
 
     def from_below(self, state: Any) -> list[int]:
         """Of those the ones that happen from below."""
-        events = events_of(self.scene)
+        events = events_of(self.machine)
         return [number for number in self.others(state) if events[number].from_below]
 
     @property
     def to_section(self) -> float:
         """The end of a cycle, where an event is it."""
-        return to_event(section_number(self.scene))
+        return to_event(section_number(self.machine))
 
     def end(self, part: Scalar) -> Scalar:
         """Clock reading at the end of the `part`-th interval of a cycle."""
-        cycle = jnp.asarray(self.scene.cycle, part.dtype)
+        cycle = jnp.asarray(self.machine.cycle, part.dtype)
         return cycle * (part + 1) / self.parts if self.parts > 1 else cycle
 
     def first_part(self, done: Scalar) -> Scalar:
@@ -195,22 +197,22 @@ class Plan(eqx.Module):
 
     def ticks(self, state: Any) -> bool:
         """Whether `s` itself counts the cycles."""
-        return ticks(self.scene, state)
+        return ticks(self.machine, state)
 
     def timed(self, state: Any) -> bool:
         """Whether the duration of a cycle is recorded, which only a fixed one need not be."""
-        return self.motion and not has_fixed_cycle(self.scene, state)
+        return self.motion and not has_fixed_cycle(self.machine, state)
 
     def meets_turns(self, done: Scalar) -> Any:
         """Whether every turning point is met after so many intervals, or only those that are close
         to a stop: for extremes, and where something else may happen there."""
-        if self.scene.switches or self.scene.events:
+        if self.machine.switches or self.machine.events:
             return True
         return (done >= self.settle) if self.motion else False
 
     def fresh(self, state: Any) -> Record:
         """The record of an interval that begins in `state`."""
-        Y = self.scene.position(state)
+        Y = self.machine.position(state)
         zero = jnp.zeros_like(Y)
         return Record(
             time=self._beside(state, zero),
@@ -234,40 +236,40 @@ class Plan(eqx.Module):
 
     def launch(self, start: Any, wanted: Any = True) -> Lane:
         """A lane on its first section; one that cannot be run, or is not wanted, has ended."""
-        scene = self.scene
-        Y = scene.position(start)
-        numbers = jtu.tree_leaves((start, eqx.filter(scene, eqx.is_inexact_array)))
+        machine = self.machine
+        Y = machine.position(start)
+        numbers = jtu.tree_leaves((start, eqx.filter(machine, eqx.is_inexact_array)))
         bad = ~jnp.isfinite(total(numbers, self.settle)) | ~jnp.asarray(wanted)
-        bad = bad | ~scene.in_range(start)
-        slack = rounding(scene, start)
-        for stop in scene.stops:
-            bad = bad | (stop.beyond(scene.coordinates[stop.coordinate].position(start)) > slack)
+        bad = bad | ~machine.in_range(start)
+        slack = rounding(machine, start)
+        for stop in machine.stops:
+            bad = bad | (stop.beyond(machine.coordinates[stop.coordinate].position(start)) > slack)
         bad = jax.lax.stop_gradient(bad)
         zero = jnp.zeros_like(Y)
-        modes = begin_modes(scene, zero, start)
-        check_field(scene, zero, start, modes)
-        check_laws(scene, zero)
-        free = in_modes(scene, modes)
-        here = [rates(free.field, x.position, zero, start) for x in scene.coordinates]
+        modes = begin_modes(machine, zero, start)
+        check_field(machine, zero, start, modes)
+        check_laws(machine, zero)
+        free = in_modes(machine, modes)
+        here = [rates(free.field, x.position, zero, start) for x in machine.coordinates]
         # At rest the acceleration says which way the motion goes.
         direction = tuple(jnp.where(x.v == 0, jnp.sign(x.a), jnp.sign(x.v)) for x in here)
         contact = None
         if self.rests:
-            growth = [force_rate(free, x.position, free, zero, start) for x in scene.coordinates]
+            growth = [force_rate(free, x.position, free, zero, start) for x in machine.coordinates]
             both = enumerate(zip(here, growth, strict=True))
             contact = tuple(self._rests_on(k, *x, slack) for k, x in both)
             direction = tuple(
                 jnp.where((x.v == 0) & (x.a == 0), jnp.sign(j), along)
                 for x, j, along in zip(here, growth, direction, strict=True)
             )
-            for i, stop in enumerate(scene.stops):
+            for i, stop in enumerate(machine.stops):
                 # A little off the stop it would come to rest there: no derivative by the start.
-                at = scene.coordinates[stop.coordinate].placed(start, stop.place, zero)
+                at = machine.coordinates[stop.coordinate].placed(start, stop.place, zero)
                 rests = contact[stop.coordinate] == to_event(i)
                 start = jtu.tree_map(lambda a, b, rests=rests: jnp.where(rests, a, b), at, start)
-            if rubs(scene):
-                modes = struck_modes(scene, zero, start, modes, contact=contact)
-        length = zero + jax.lax.stop_gradient(scene.cycle) / self.method.steps_per_cycle
+            if rubs(machine):
+                modes = struck_modes(machine, zero, start, modes, contact=contact)
+        length = zero + jax.lax.stop_gradient(machine.cycle) / self.method.steps_per_cycle
         if self.method.adaptive:
             length = length / 8
         return Lane(
@@ -293,7 +295,7 @@ class Plan(eqx.Module):
     def place(self, k: int, contact: Scalar, otherwise: Scalar) -> Scalar:
         """Where coordinate number k is that rests on the stop named by `contact`."""
         place = otherwise
-        for i, stop in enumerate(self.scene.stops):
+        for i, stop in enumerate(self.machine.stops):
             if stop.coordinate == k:
                 place = jnp.where(contact == to_event(i), stop.place, place)
         return place
@@ -301,7 +303,7 @@ class Plan(eqx.Module):
     def wall(self, k: int, contact: Scalar) -> tuple[Any, Any]:
         """Side and gap of the stop of coordinate number k that is named by `contact`; of its first
         one if none is."""
-        mine = [(i, stop) for i, stop in enumerate(self.scene.stops) if stop.coordinate == k]
+        mine = [(i, stop) for i, stop in enumerate(self.machine.stops) if stop.coordinate == k]
         (_, first), others = mine[0], mine[1:]
         sign, gap = float(first.sign), first.gap
         for i, stop in others:
@@ -313,7 +315,7 @@ class Plan(eqx.Module):
         """The stop that coordinate number k rests on as the motion begins: pressed on, or about to
         be by a force that grows; place and velocity are known to within `slack`."""
         contact = jnp.zeros_like(here.x)
-        for i, stop in enumerate(self.scene.stops):
+        for i, stop in enumerate(self.machine.stops):
             if stop.coordinate == k:
                 pressed = (stop.sign * here.a > 0) | (here.a == 0) & (stop.sign * growth > 0)
                 rests = (stop.beyond(here.x) >= -slack) & (jnp.abs(here.v) <= slack) & pressed

@@ -3,17 +3,14 @@
 from typing import Any
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
 
+from .._types import Flag, Scalar
 from ._lane import Plan
-
-Scalar = Float[Array, ""]
-Flag = Bool[Array, ""]
 
 
 def clock_at(plan: Plan, s: Scalar, state: Any) -> Scalar:
     """What counts the cycles, `s` itself or the machine's clock."""
-    clock = plan.scene.clock(state)
+    clock = plan.machine.clock(state)
     return s if clock is None else clock
 
 

@@ -12,14 +12,12 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float
 
 from .._numbers import warn
-from ..scene import AbstractScene
-from ..scene.event import begin_modes, is_autonomous
+from .._types import Scalar
+from ..machine import AbstractMachine
+from ..machine.event import begin_modes, is_autonomous
 from ._by_numpy import by_numpy
-
-Scalar = Float[Array, ""]
 
 _NO_NUMBERS = (
     jax.errors.ConcretizationTypeError,
@@ -32,16 +30,16 @@ _NO_NUMBERS = (
 _APART = 1e-4
 
 
-def check_field(scene: AbstractScene, s: Scalar, state: Any, modes: tuple[Scalar, ...]) -> None:
+def check_field(machine: AbstractMachine, s: Scalar, state: Any, modes: tuple[Scalar, ...]) -> None:
     """**Raises:** `TypeError` for a field (or a section) that cannot be traced, takes other
     arguments or returns no state; while the loop is traced, and at no cost where it runs."""
-    whose = f"`field` of a {type(scene).__name__}"
-    _check_arguments(scene, whose, s, state, modes)
+    whose = f"`field` of a {type(machine).__name__}"
+    _check_arguments(machine, whose, s, state, modes)
     try:
         with in_words_of(whose):
-            flow = jax.eval_shape(scene.field, s, state, *modes)
+            flow = jax.eval_shape(machine.field, s, state, *modes)
     except (AttributeError, TypeError, LookupError):
-        if _runs(scene.field, state, s, *modes):
+        if _runs(machine.field, state, s, *modes):
             raise TypeError(
                 f"{whose} must take `s` first and then the state, but takes them the other way "
                 "round."
@@ -53,8 +51,8 @@ def check_field(scene: AbstractScene, s: Scalar, state: Any, modes: tuple[Scalar
             f"{whose} must return what is like its state, {_in_short(state)}, but returned "
             f"{_in_short(flow)}."
         )
-    with in_words_of(f"`section` of a {type(scene).__name__}"):
-        jax.eval_shape(scene.section, state)
+    with in_words_of(f"`section` of a {type(machine).__name__}"):
+        jax.eval_shape(machine.section, state)
 
 
 def _in_short(tree: Any) -> str:
@@ -63,9 +61,11 @@ def _in_short(tree: Any) -> str:
     return eqx.tree_pformat(tree, width=1000)
 
 
-def _check_arguments(scene: AbstractScene, whose: str, s: Scalar, state: Any, modes: Any) -> None:
+def _check_arguments(
+    machine: AbstractMachine, whose: str, s: Scalar, state: Any, modes: Any
+) -> None:
     try:
-        inspect.signature(scene.field).bind(s, state, *modes)
+        inspect.signature(machine.field).bind(s, state, *modes)
     except TypeError as error:
         more = f" and the mode of each of its {len(modes)} switches" if modes else ""
         raise TypeError(f"{whose} must take `s`, the state{more}: {error}.") from None
@@ -95,14 +95,14 @@ def in_words_of(whose: str) -> Iterator[None]:
         ) from error
 
 
-def check_laws(scene: AbstractScene, speed: Scalar) -> None:
+def check_laws(machine: AbstractMachine, speed: Scalar) -> None:
     """**Raises:** `TypeError` for a restitution law that cannot be traced or gives no number; as
     `check_field`."""
-    _check_frictions(scene)
-    for i, stop in enumerate(scene.stops):
+    _check_frictions(machine)
+    for i, stop in enumerate(machine.stops):
         if stop.is_one_number:
             continue
-        whose = f"The restitution law of stop {i} of a {type(scene).__name__}"
+        whose = f"The restitution law of stop {i} of a {type(machine).__name__}"
         try:
             with in_words_of(whose):
                 got = jax.eval_shape(stop.rebound, speed)
@@ -119,10 +119,13 @@ def check_laws(scene: AbstractScene, speed: Scalar) -> None:
             )
 
 
-def _check_frictions(scene: AbstractScene) -> None:
+def _check_frictions(machine: AbstractMachine) -> None:
     """**Raises:** `ValueError` for friction on a stop that there is not, or along a coordinate."""
-    known = {"stop": ("stop", len(scene.stops)), "along": ("coordinate", len(scene.coordinates))}
-    for switch in scene.switches:
+    known = {
+        "stop": ("stop", len(machine.stops)),
+        "along": ("coordinate", len(machine.coordinates)),
+    }
+    for switch in machine.switches:
         if switch.rubs_on is None:
             continue
         for name, (what, count) in known.items():
@@ -130,25 +133,25 @@ def _check_frictions(scene: AbstractScene) -> None:
             if number >= count:
                 raise ValueError(
                     f"Argument `{name}` of a ContactFriction must be the number of a {what} of the "
-                    f"{type(scene).__name__}, which has {count}, but got {number}."
+                    f"{type(machine).__name__}, which has {count}, but got {number}."
                 )
 
 
-def check_period(scene: AbstractScene, start: Any) -> None:
+def check_period(machine: AbstractMachine, start: Any) -> None:
     """Warn once of a field that is not the same at both ends of its cycle.
 
     Machines whose numbers are traced are not looked at, nor are ours, nor those whose cycles
     something else than `s` counts.
     """
-    kind, numbers = type(scene), jtu.tree_leaves((scene, start))
-    counts = kind.clock is AbstractScene.clock
+    kind, numbers = type(machine), jtu.tree_leaves((machine, start))
+    counts = kind.clock is AbstractMachine.clock
     ours = kind.__module__.partition(".")[0] == __name__.partition(".")[0]
     if ours or not counts or any(isinstance(x, Tracer) for x in numbers):
         return
     try:
-        if is_autonomous(scene, start):
+        if is_autonomous(machine, start):
             return
-        cycle, *ends = by_numpy(_ends, scene, start)
+        cycle, *ends = by_numpy(_ends, machine, start)
         each = list(zip(jtu.tree_leaves_with_path(start), *ends, strict=True))
     except Exception:  # told in words where the field is traced
         return
@@ -159,12 +162,12 @@ def check_period(scene: AbstractScene, start: Any) -> None:
             return
 
 
-def _ends(scene: AbstractScene, start: Any) -> tuple[Any, list[Any], list[Any]]:
+def _ends(machine: AbstractMachine, start: Any) -> tuple[Any, list[Any], list[Any]]:
     """The cycle, and the field where it begins and where it ends, in one state."""
-    zero = jnp.zeros_like(scene.position(start))
-    modes = begin_modes(scene, zero, start)
-    cycle = zero + scene.cycle
-    first, last = (scene.field(s, start, *modes) for s in (zero, cycle))
+    zero = jnp.zeros_like(machine.position(start))
+    modes = begin_modes(machine, zero, start)
+    cycle = zero + machine.cycle
+    first, last = (machine.field(s, start, *modes) for s in (zero, cycle))
     return cycle, jtu.tree_leaves(first), jtu.tree_leaves(last)
 
 

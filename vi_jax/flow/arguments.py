@@ -12,17 +12,17 @@ from jaxtyping import Array, Int
 from .. import lanes
 from .._checks import count, count_or_traced, fits_records, flag, instance_of, one_of, require_real
 from .._numbers import concrete, narrow, require_session, strongly_typed, warn, warn_of_narrow
-from ..scene import AbstractScene, RigidStop, Scene
-from ..scene.event import begin_modes, is_autonomous
+from ..machine import AbstractMachine, RigidStop, Scene
+from ..machine.event import begin_modes, is_autonomous
 from ._lane import Plan
 from ._own import check_period as check_period
 from .methods import MethodLike, chosen
-from .moving import rounding
 from .named import average_names
+from .smooth import rounding
 
 
 def planned(
-    scene: AbstractScene,
+    machine: AbstractMachine,
     start: Any,
     cycles: int | Int[Array, ""],
     *,
@@ -39,9 +39,9 @@ def planned(
     log_switches: bool = False,
 ) -> tuple[Plan, Any]:
     """The arguments of `simulate`, checked and put in the form in which the loop needs them."""
-    scene = machine_of(scene)
-    _check_parts(scene)
-    method = chosen(scene, method)
+    machine = machine_of(machine)
+    _check_parts(machine)
+    method = chosen(machine, method)
     cycles = count("cycles", cycles, least=1)
     samples = count("samples", samples)
     impact_log = count("impact_log", impact_log)
@@ -54,23 +54,23 @@ def planned(
         max_steps = count("max_steps", max_steps, least=1)
     one_of("record", record, ("motion", "sections"))
     if clock is not None:
-        scene = scene.in_clock(clock)
-    require_session("scene", scene)
-    start = scene.adopt(start)
+        machine = machine.in_clock(clock)
+    require_session("machine", machine)
+    start = machine.adopt(start)
     check_leaves("start", start)
     require_session("start", start)
-    method.check(scene)
-    if samples and is_autonomous(scene, start):
+    method.check(machine)
+    if samples and is_autonomous(machine, start):
         raise ValueError(
             "Argument `samples` must be 0 for a machine whose cycles end on a section, but got "
             f"{samples}: their lengths are not known beforehand. Observe it at equal intervals: "
-            "`simulate(scene.observed_every(interval), ...)`."
+            "`simulate(machine.observed_every(interval), ...)`."
         )
-    if isinstance(scene, Scene):
-        _check_scalars(scene=scene, start=start)
-    check_start(scene, start)
-    scene, start = of_one_type(scene, start)
-    averages = average_names(scene, start) if record == "motion" else ()
+    if isinstance(machine, Scene):
+        _check_scalars(machine=machine, start=start)
+    check_start(machine, start)
+    machine, start = of_one_type(machine, start)
+    averages = average_names(machine, start) if record == "motion" else ()
     columns = 12 + 3 * impact_log + 4 * event_log + len(averages)
     fits_records("cycles", cycles * max(1, samples), columns)
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
@@ -78,7 +78,7 @@ def planned(
             "vi_jax is running in single precision: errors near 1e-6 and tolerances to match. For "
             'double precision call `jax.config.update("jax_enable_x64", True)` first.'
         )
-    dtype = scene.position(start).dtype
+    dtype = machine.position(start).dtype
     for name, value in (("max_impacts", max_impacts), ("max_steps", max_steps)):
         if value is not None and value > _most(dtype):
             raise ValueError(
@@ -86,7 +86,7 @@ def planned(
                 f"{dtype} count, but got {value}."
             )
     plan = Plan(
-        scene=scene,
+        machine=machine,
         method=method,
         cycles=cycles,
         parts=max(1, samples),
@@ -95,8 +95,8 @@ def planned(
         log_switches=log_switches,
         events=event_log,
         averages=averages,
-        rests=(scene.may_rest() if rests is None else rests) and bool(scene.stops),
-        road=lanes.current_road(),
+        rests=(machine.may_rest() if rests is None else rests) and bool(machine.stops),
+        backend=lanes.current_backend(),
         settle=_countable(cycles, settle, max(1, samples), dtype),
         max_steps=jnp.asarray(jnp.inf if max_steps is None else max_steps, dtype),
         max_impacts=jnp.asarray(max_impacts, dtype),
@@ -104,28 +104,28 @@ def planned(
     return plan, start
 
 
-def machine_of(scene: Any) -> AbstractScene:
+def machine_of(machine: Any) -> AbstractMachine:
     """The machine as every verb takes it, so that other numbers are not another program: each
     number that is a `float` is an array. Whole numbers, truth values and words stay what they are,
     and a part of the program.
 
     **Raises:** `TypeError` if it is none.
     """
-    instance_of("scene", scene, AbstractScene, "a `Scene` or an `AbstractScene`")
-    return jtu.tree_map(strongly_typed, scene)
+    instance_of("machine", machine, AbstractMachine, "a `Scene` or an `AbstractMachine`")
+    return jtu.tree_map(strongly_typed, machine)
 
 
-def _check_parts(scene: AbstractScene) -> None:
+def _check_parts(machine: AbstractMachine) -> None:
     """**Raises:** `TypeError` or `ValueError` for a machine whose parts are not what they must."""
-    name, stops = type(scene).__name__, scene.stops
+    name, stops = type(machine).__name__, machine.stops
     if not isinstance(stops, tuple) or not all(isinstance(stop, RigidStop) for stop in stops):
         raise TypeError(f"`stops` of a {name} must be a tuple of `RigidStop`s, but is {stops!r}.")
-    if callable(scene.cycle):
+    if callable(machine.cycle):
         raise TypeError(f"`cycle` of a {name} must be a number, or a property that gives one.")
-    cycle = concrete(scene.cycle)
+    cycle = concrete(machine.cycle)
     if cycle is not None and not (np.isfinite(cycle) & (cycle > 0)).all():
         raise ValueError(f"`cycle` of a {name} must be positive, but is {cycle}.")
-    many = len(scene.coordinates)
+    many = len(machine.coordinates)
     for i, stop in enumerate(stops):
         if stop.coordinate >= many:
             raise ValueError(
@@ -159,29 +159,29 @@ def _countable(cycles: int, settle: Any, parts: int, dtype: Any) -> jax.Array:
     return jnp.where(counts, settle.astype(dtype), jnp.nan)
 
 
-def as_floats(scene: AbstractScene, state: Any) -> Any:
-    """`state` in arrays of the one floating-point type that it and the scene's numbers ask for."""
-    dtype = _type_of(scene, state)
+def as_floats(machine: AbstractMachine, state: Any) -> Any:
+    """`state` in arrays of the one floating-point type that it and the machine ask for."""
+    dtype = _type_of(machine, state)
     return jtu.tree_map(lambda x: jnp.asarray(x, dtype), state)
 
 
-def of_one_type(scene: AbstractScene, start: Any) -> tuple[AbstractScene, Any]:
+def of_one_type(machine: AbstractMachine, start: Any) -> tuple[AbstractMachine, Any]:
     """Scene and start with all their floating-point numbers of one type, the widest among them.
 
-    Numbers of a scene made before double precision was switched on are promoted, with a warning.
+    Numbers of a machine made before double precision was switched on are promoted, with a warning.
     """
-    dtype = _type_of(scene, start)
-    for name, tree in {"scene": scene, "start": start}.items():
+    dtype = _type_of(machine, start)
+    for name, tree in {"machine": machine, "start": start}.items():
         short = [path for path, x in jtu.tree_leaves_with_path(tree) if narrow(x)]
         if short:
             names = ", ".join(jtu.keystr(path).lstrip(".") for path in short)
             warn_of_narrow(f"Argument `{name}` has numbers ({names})")
-    scene = jtu.tree_map(lambda x: x.astype(dtype) if narrow(x) else x, scene)
-    return scene, as_floats(scene, start)
+    machine = jtu.tree_map(lambda x: x.astype(dtype) if narrow(x) else x, machine)
+    return machine, as_floats(machine, start)
 
 
-def _type_of(scene: AbstractScene, state: Any) -> Any:
-    numbers = jtu.tree_leaves(eqx.filter((scene, state), eqx.is_array_like))
+def _type_of(machine: AbstractMachine, state: Any) -> Any:
+    numbers = jtu.tree_leaves(eqx.filter((machine, state), eqx.is_array_like))
     return jnp.result_type(jnp.result_type(float), *numbers)
 
 
@@ -196,15 +196,15 @@ def _check_scalars(**arguments: Any) -> None:
                 )
 
 
-def _check_flow(scene: AbstractScene, start: Any) -> None:
+def _check_flow(machine: AbstractMachine, start: Any) -> None:
     """**Raises:** `TypeError` for what is no state, where only the field says what one is."""
     try:
         jax.eval_shape(
-            lambda s, x: scene.field(s, x, *begin_modes(scene, s, x)), jnp.zeros(()), start
+            lambda s, x: machine.field(s, x, *begin_modes(machine, s, x)), jnp.zeros(()), start
         )
     except (AttributeError, TypeError, ValueError, LookupError) as error:
         raise TypeError(
-            f"Argument `start` must be a state of this scene, but got {start!r}, of which its "
+            f"Argument `start` must be a state of this machine, but got {start!r}, of which its "
             f"`field` says: {error}"
         ) from None
 
@@ -240,14 +240,14 @@ def check_reals(name: str, state: Any) -> None:
         require_real(name, jtu.keystr(path).lstrip(".") or "value", leaf)
 
 
-def check_start(scene: AbstractScene, start: Any) -> None:
+def check_start(machine: AbstractMachine, start: Any) -> None:
     """Warns of a field of another period. **Raises:** `ValueError` or `TypeError` if a concrete
     start cannot be simulated."""
     try:
-        shape = jnp.shape(scene.position(start)) or jnp.shape(scene.velocity(start))
+        shape = jnp.shape(machine.position(start)) or jnp.shape(machine.velocity(start))
     except (AttributeError, TypeError, LookupError):
         raise TypeError(
-            f"Argument `start` must be a state of this scene, but got {start!r}. Of a state "
+            f"Argument `start` must be a state of this machine, but got {start!r}. Of a state "
             "without `Y` and `V` a machine of your own with stops says by `position`, `velocity` "
             "and `placed`, or by `coordinates`, what they limit."
         ) from None
@@ -257,18 +257,18 @@ def check_start(scene: AbstractScene, start: Any) -> None:
             "Argument `start` must be one state (use `jax.vmap` for a batch), in which position "
             f"and velocity are numbers, but there they have shape {shape}."
         )
-    if not scene.has_velocity(start):
-        _check_flow(scene, start)
+    if not machine.has_velocity(start):
+        _check_flow(machine, start)
     for path, leaf in jtu.tree_leaves_with_path(start):
         numbers = concrete(leaf)
         if numbers is not None and not np.isfinite(numbers).all():
             name = jtu.keystr(path).lstrip(".")
             raise ValueError(f"Argument `start` must be finite, but its {name} is {numbers}.")
-    scene.check_start(start)
-    slack = concrete(rounding(scene, start))
-    for i, stop in enumerate(scene.stops):
+    machine.check_start(start)
+    slack = concrete(rounding(machine, start))
+    for i, stop in enumerate(machine.stops):
         gap = concrete(stop.gap)
-        Y = concrete(scene.coordinates[stop.coordinate].position(start))
+        Y = concrete(machine.coordinates[stop.coordinate].position(start))
         if Y is None or gap is None or slack is None:
             continue
         depth = np.max(stop.sign * Y - gap)
@@ -277,4 +277,4 @@ def check_start(scene: AbstractScene, start: Any) -> None:
                 f"Argument `start` must not lie beyond a stop, but lies {depth:g} beyond stop {i} "
                 f"({stop.side}, gap {gap})."
             )
-    check_period(scene, start)
+    check_period(machine, start)

@@ -7,9 +7,8 @@ its own accuracy, and an event that is landed upon ends them with its derivative
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
-Scalar = Float[Array, ""]
+from .._types import Scalar
 
 
 class Beside(NamedTuple):
@@ -22,7 +21,7 @@ class Beside(NamedTuple):
     `pace`, over s."""
 
 
-def rate_beside(machine: Any, s: Scalar, state: Any, beside: Beside | None) -> Beside | None:
+def rate_beside(smooth: Any, s: Scalar, state: Any, beside: Beside | None) -> Beside | None:
     """How fast by s that changes which is integrated beside the state; `None` for nothing.
 
     **Arguments:** the machine in its modes (so that its averages are asked with these); s and
@@ -30,9 +29,9 @@ def rate_beside(machine: Any, s: Scalar, state: Any, beside: Beside | None) -> B
     """
     if beside is None:
         return None
-    pace, integrals = machine.pace(s, state), {}
+    pace, integrals = smooth.pace(s, state), {}
     if beside.integrals:
-        for name, value in machine.averages(s, state).items():
+        for name, value in smooth.averages(s, state).items():
             value = jnp.asarray(value, s.dtype)
             integrals[name] = value if pace is None else pace * value
     time = beside.time

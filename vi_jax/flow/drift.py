@@ -18,10 +18,8 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Array, Bool, Float
 
-Scalar = Float[Array, ""]
-Flag = Bool[Array, ""]
+from .._types import Flag, Scalar
 
 
 def _numbers(tangents: Any) -> tuple[tuple[bool, ...], list[Any]]:

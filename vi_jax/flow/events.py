@@ -10,12 +10,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
 
-from ..scene.trig import horner
-
-Scalar = Float[Array, ""]
-Flag = Bool[Array, ""]
+from .._types import Flag, Scalar
+from ..machine.trig import horner
 
 
 class Rates(NamedTuple):
@@ -53,7 +50,7 @@ def guard_rates(
     return Rates(x, v, a)
 
 
-def force_rate(scene: Any, position: Any, holding: Any, s: Scalar, state: Any) -> Scalar:
+def force_rate(machine: Any, position: Any, holding: Any, s: Scalar, state: Any) -> Scalar:
     """d/ds of the acceleration that a free body would have, along the flow of `holding`.
 
     A constant for differentiation: it tells where to look.
@@ -61,7 +58,7 @@ def force_rate(scene: Any, position: Any, holding: Any, s: Scalar, state: Any) -
     s, state = jax.lax.stop_gradient((s, state))
 
     def force(s, state):
-        return rates(scene.field, position, s, state).a
+        return rates(machine.field, position, s, state).a
 
     flow = holding.field(s, state)
     return jax.lax.stop_gradient(jax.jvp(force, (s, state), (jnp.ones_like(s), flow))[1])

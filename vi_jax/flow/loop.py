@@ -41,7 +41,7 @@ def run_lane(plan: Plan, start: Any, wanted: Any = True) -> tuple[Ends, Any, Rec
     numbers, rest = eqx.partition(plan, eqx.is_array)
     ends, (states, records) = lanes.run(
         partial(_begin, rest), partial(_step, rest), _end, (numbers, start, jnp.asarray(wanted)),
-        rows=plan.kept + 1, block=plan.block, road=plan.road,
+        rows=plan.kept + 1, block=plan.block, backend=plan.backend,
     )  # fmt: skip
     return ends, states, records
 

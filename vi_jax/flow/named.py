@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array
 
-from ..scene import AbstractScene
-from ..scene.event import begin_modes
-from ..scene.numbers import components, leaf_names
+from ..machine import AbstractMachine
+from ..machine.event import begin_modes
+from ..machine.numbers import components, leaf_names
 from ._own import in_words_of
 
 # What results have by these names already: columns of runs, orbits, branches and scans, and axes.
@@ -24,51 +24,51 @@ _TAKEN = frozenset(
 )
 
 
-def has_averages(scene: AbstractScene) -> bool:
+def has_averages(machine: AbstractMachine) -> bool:
     """Whether a machine names averages at all."""
-    return type(scene).averages is not AbstractScene.averages
+    return type(machine).averages is not AbstractMachine.averages
 
 
-def has_quantities(scene: AbstractScene) -> bool:
+def has_quantities(machine: AbstractMachine) -> bool:
     """Whether a machine names functions of its state."""
-    return type(scene).quantities is not AbstractScene.quantities
+    return type(machine).quantities is not AbstractMachine.quantities
 
 
-def average_names(scene: AbstractScene, start: Any) -> tuple[str, ...]:
+def average_names(machine: AbstractMachine, start: Any) -> tuple[str, ...]:
     """The names of a machine's averages in their order, by name.
 
     **Raises:** `TypeError` for averages that are no numbers by name; `ValueError` for a name that
     something else has.
     """
-    if not has_averages(scene):
+    if not has_averages(machine):
         return ()
-    zero = jnp.zeros((), jnp.result_type(scene.position(start)))
-    modes = begin_modes(scene, zero, start)
-    names = _names(scene, "averages", scene.averages, start, (zero, start, *modes))
-    both = sorted(set(names) & set(quantity_names(scene, start)))
+    zero = jnp.zeros((), jnp.result_type(machine.position(start)))
+    modes = begin_modes(machine, zero, start)
+    names = _names(machine, "averages", machine.averages, start, (zero, start, *modes))
+    both = sorted(set(names) & set(quantity_names(machine, start)))
     if both:
         raise ValueError(
-            f"`averages` of a {type(scene).__name__} must have names of their own, but "
+            f"`averages` of a {type(machine).__name__} must have names of their own, but "
             f"{both[0]!r} is one of its `quantities` too."
         )
     return names
 
 
-def quantity_names(scene: AbstractScene, start: Any) -> tuple[str, ...]:
+def quantity_names(machine: AbstractMachine, start: Any) -> tuple[str, ...]:
     """The names of the functions of a machine's state. **Raises:** as `average_names`."""
-    if not has_quantities(scene):
+    if not has_quantities(machine):
         return ()
-    zero = jnp.zeros((), jnp.result_type(scene.position(start)))
-    return _names(scene, "quantities", scene.quantities, start, (zero, start))
+    zero = jnp.zeros((), jnp.result_type(machine.position(start)))
+    return _names(machine, "quantities", machine.quantities, start, (zero, start))
 
 
-def quantities_on(scene: AbstractScene, sections: Any, lead: int = 0) -> dict[str, Array]:
+def quantities_on(machine: AbstractMachine, sections: Any, lead: int = 0) -> dict[str, Array]:
     """The machine's functions of its state on sections, which are in a row; by name. With `lead`
-    axes in front of scene and sections, as `vmap` gives them."""
-    if not has_quantities(scene):
+    axes in front of machine and sections, as `vmap` gives them."""
+    if not has_quantities(machine):
         return {}
     dtype = jnp.result_type(*jtu.tree_leaves(sections))
-    numbers, rest = eqx.partition(scene, eqx.is_array)
+    numbers, rest = eqx.partition(machine, eqx.is_array)
 
     def one(numbers: Any, state: Any) -> dict[str, Array]:
         found = eqx.combine(numbers, rest).quantities(jnp.zeros((), dtype), state)
@@ -81,12 +81,12 @@ def quantities_on(scene: AbstractScene, sections: Any, lead: int = 0) -> dict[st
 
 
 def _names(
-    scene: AbstractScene, which: str, function: Any, start: Any, arguments: tuple
+    machine: AbstractMachine, which: str, function: Any, start: Any, arguments: tuple
 ) -> tuple[str, ...]:
-    whose = f"`{which}` of a {type(scene).__name__}"
+    whose = f"`{which}` of a {type(machine).__name__}"
     with in_words_of(whose):
         found = jax.eval_shape(lambda *x: _as_arrays(whose, function(*x)), *arguments)
-    taken = _TAKEN | set(leaf_names(scene)) | set(components(start))
+    taken = _TAKEN | set(leaf_names(machine)) | set(components(start))
     for name, value in found.items():
         if name in taken or name.startswith("section_"):  # as columns of a branch are called
             raise ValueError(f"{whose} must have names of their own, but {name!r} is taken.")

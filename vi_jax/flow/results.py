@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float, Int
 
-from ..scene.numbers import state_in_words
-from ..scene.shown import Shown, Told
-from ..scene.units import PLAIN, Stated, in_unit, name_in
+from ..machine.numbers import state_in_words
+from ..machine.shown import Shown, Summarized
+from ..machine.units import PLAIN, Stated, in_unit, name_in
 from ._listed import listed
 from .enumeration import NamedEnumeration
 from .labelled import EVENTS as EVENTS
@@ -23,7 +23,7 @@ class RESULTS(NamedEnumeration):
 
     successful = ""
     bad_start = (
-        "The start or a number of the scene is not finite or out of its range, or the start lies "
+        "The start or a number of the machine is not finite or out of its range, or the start lies "
         "beyond a stop."
     )
     stalled = (
@@ -123,14 +123,14 @@ class Samples(Shown):
     cycles: Float[Array, " points"]
     """Place of the sample on the drive's clock, in cycles since the start."""
     time: Float[Array, " points"]
-    """Time τ since the start (in units of `s` for scenes of your own)."""
+    """Time τ since the start (in units of `s` for machines of your own)."""
     state: Any
     """The states, a pytree like the start."""
     quantities: dict[str, Float[Array, " points"]] = eqx.field(default_factory=dict)
-    """The machine's own quantities there, by name (see `AbstractScene.quantities`)."""
+    """The machine's own quantities there, by name (see `AbstractMachine.quantities`)."""
 
 
-class ImpactLog(Told):
+class ImpactLog(Summarized):
     """The first impacts of each cycle in their order; arrays have shape (cycles, size).
 
     Unused places hold NaN, and -1 in `stop`.
@@ -142,9 +142,9 @@ class ImpactLog(Told):
     speed: Float[Array, "cycles size"]
     """V⁻, speed of approach just before the impact."""
     stop: Int[Array, "cycles size"]
-    """Index into `scene.stops`."""
+    """Index into `machine.stops`."""
 
-    def told(self) -> str:
+    def summary(self) -> str:
         """Impacts of the first cycles: where on the clock, on which stop, and how fast."""
 
         def word(i: int, j: int) -> str:
@@ -153,7 +153,7 @@ class ImpactLog(Told):
         return listed("impact", self.stop >= 0, word)
 
 
-class EventLog(Told):
+class EventLog(Summarized):
     """The first events of each cycle, of all kinds, in their order; arrays have shape (cycles,
     size).
 
@@ -171,7 +171,7 @@ class EventLog(Told):
     """V⁻ of an impact, or of the impact that came to rest; the mode of a switch after its change;
     of a reset what its `value` says; NaN for a release."""
 
-    def told(self) -> str:
+    def summary(self) -> str:
         """Events of the first cycles: what, of which stop, switch or event, where on the clock."""
 
         def word(i: int, j: int) -> str:
@@ -200,11 +200,11 @@ class Errors(Shown):
     """Difference of the impact counts in each cycle."""
 
 
-class Run(Told):
+class Run(Summarized):
     """What `simulate` returns, cycle by cycle. After a failure the rest is NaN (counts: 0).
 
     Under `vmap` every array has the batch axes in front. Numbers are in the machine's units (see
-    `AbstractScene.units`): those of a `Scene` in a, ω and m_C.
+    `AbstractMachine.units`): those of a `Scene` in a, ω and m_C.
     """
 
     sections: Any
@@ -249,7 +249,7 @@ class Run(Told):
     """Steps rejected on their error estimate."""
     averages: dict[str, Float[Array, " cycles"]] = eqx.field(default_factory=dict)
     """The machine's own averages over the time of each cycle, by name (see
-    `AbstractScene.averages`)."""
+    `AbstractMachine.averages`)."""
     quantities: dict[str, Float[Array, " sections"]] = eqx.field(default_factory=dict)
     """The machine's own functions of its state on the sections, by name; (cycles + 1,)."""
     labels: tuple[str, str] = eqx.field(static=True, default=PLAIN)
@@ -303,7 +303,7 @@ class Run(Told):
         """The smallest position in each cycle."""
         return None if self.steps.ndim else self.y_min
 
-    def told(self) -> str:
+    def summary(self) -> str:
         """The last section and cycle, and how the run ended."""
         if self.steps.ndim:
             good = int(jnp.sum(self.successful))

@@ -1,4 +1,4 @@
-"""`simulate`: a scene, a start, a number of cycles and a method give a run."""
+"""`simulate`: a machine, a start, a number of cycles and a method give a run."""
 
 import dataclasses
 from collections.abc import Callable
@@ -13,10 +13,11 @@ from jaxtyping import Array, Int
 from .. import lanes
 from .._checks import flag
 from .._programs import compiled
-from ..scene import AbstractScene
-from ..scene.units import stated
+from .._renamed import renamed
+from ..machine import AbstractMachine
+from ..machine.units import stated
+from ._failed_derivatives import failed_derivatives
 from ._lane import Plan, Record
-from ._spoil import spoiled
 from .arguments import planned
 from .beside import means
 from .loop import Ends, run_lane
@@ -25,8 +26,9 @@ from .named import has_quantities
 from .results import Errors, EventLog, ImpactLog, Run, Samples, reason
 
 
+@renamed(scene="machine")
 def simulate(
-    scene: AbstractScene,
+    machine: AbstractMachine,
     start: Any,
     cycles: int | Int[Array, ""],
     *,
@@ -43,9 +45,9 @@ def simulate(
     max_steps: int | None = None,
     throw: bool = False,
 ) -> Run:
-    """Simulate `scene` from `start` for a number of drive cycles.
+    """Simulate `machine` from `start` for a number of drive cycles.
 
-    Works under `jit`, under `vmap` over any leaf of the scene and the start, and is differentiable
+    Works under `jit`, under `vmap` over any leaf of machine and start, and is differentiable
     through impacts to any order: forward, and in reverse, which runs forward along each number that
     is differentiated (a reverse pass would take the steps again, and might decide otherwise about
     an event) and so costs the more, the more of them there are. Outside of a transformation it
@@ -53,14 +55,14 @@ def simulate(
 
     **Arguments:**
 
-    - `scene`: a `Scene`, or an `AbstractScene` of your own.
-    - `start`: the state on the first section, from `scene.start(...)`.
+    - `machine`: a `Scene`, or an `AbstractMachine` of your own.
+    - `start`: the state on the first section, from `machine.start(...)`.
     - `cycles`: number of drive cycles to record, at least 1; static.
     - `settle`: drive cycles before them, of which nothing is kept; another number is not another
       program.
     - `method`: `Adaptive(...)`, `FixedStep(...)`, `Taylor(...)`, `ExactFlight()`, or the name of a
       `preset`, by default `"standard"`.
-    - `clock`: `"phase"` or `"time"`; `None` leaves the scene's own. The phase clock needs a crank
+    - `clock`: `"phase"` or `"time"`; `None` leaves the machine's own. The phase clock needs a crank
       that turns forward; the time clock carries a start from rest and a stall.
     - `samples`: dense samples per cycle, evenly spaced on the drive's clock. Steps end on them, so
       that they have the method's own accuracy.
@@ -88,7 +90,7 @@ def simulate(
     """
     estimate, throw = flag("estimate", estimate), flag("throw", throw)
     plan, start = planned(
-        scene, start, cycles, settle=settle, method=method, clock=clock, samples=samples,
+        machine, start, cycles, settle=settle, method=method, clock=clock, samples=samples,
         impact_log=impact_log, event_log=event_log, record=record, rests=rests,
         max_impacts=max_impacts, max_steps=max_steps,
     )  # fmt: skip
@@ -106,7 +108,7 @@ def simulate(
 
 @compiled
 def _simulate(plan: Plan, start: Any, sampled: bool) -> Run:
-    return spoiled(collect(plan, sampled, *run_lane(plan, start)))
+    return failed_derivatives(collect(plan, sampled, *run_lane(plan, start)))
 
 
 def _errors(run: Run, tighter: Run) -> Errors:
@@ -125,7 +127,7 @@ def _errors(run: Run, tighter: Run) -> Errors:
 
 
 def simulate_pool(
-    lane_of: Callable[[Any], tuple[AbstractScene, Any]],
+    lane_of: Callable[[Any], tuple[AbstractMachine, Any]],
     values: Any,
     cycles: int,
     *,
@@ -134,14 +136,14 @@ def simulate_pool(
 ) -> Run:
     """As `simulate` under `vmap`, for lanes some of which are not wanted; forward mode only.
 
-    **Arguments:** scene and start of one lane from its values; the values of all lanes, a pytree
+    **Arguments:** machine and start of one lane from its values; the values of all lanes, a pytree
     with one leading axis; flags of the lanes that are wanted (the others are not run and come
     back as failed); `options` as for `simulate`.
     """
 
     def one(value, wanted):
         plan, start = planned(*lane_of(value), cycles, **options)
-        return spoiled(collect(plan, False, *run_lane(plan, start, wanted)))
+        return failed_derivatives(collect(plan, False, *run_lane(plan, start, wanted)))
 
     if wanted is None:
         wanted = jnp.ones(jtu.tree_leaves(values)[0].shape[0], bool)
@@ -150,7 +152,7 @@ def simulate_pool(
 
 def collect(plan: Plan, sampled: bool, lane: Ends, points: Any, records: Record) -> Run:
     """The run from what the loop stored for each interval."""
-    scene, parts = plan.scene, plan.parts
+    machine, parts = plan.machine, plan.parts
     records = jtu.tree_map(lambda x: x[1:], records)
 
     def per_cycle(values, reduce):
@@ -162,14 +164,14 @@ def collect(plan: Plan, sampled: bool, lane: Ends, points: Any, records: Record)
     def whole(values):
         return jnp.where(jnp.isfinite(values), values, 0.0).astype(jnp.int32)
 
-    period = jnp.broadcast_to(scene.period, (plan.cycles,)).astype(lane.done.dtype)
+    period = jnp.broadcast_to(machine.period, (plan.cycles,)).astype(lane.done.dtype)
     duration = None
     if plan.motion:
         duration = period if times is None else per_cycle(times, jnp.sum)
     averages = {}
     if passed is not None and passed.integrals:
         # Where s does not measure time but is in proportion to it, the integrals are over s.
-        length = jnp.asarray(scene.cycle, period.dtype) if times is None else duration
+        length = jnp.asarray(machine.cycle, period.dtype) if times is None else duration
         sums = {name: per_cycle(x, jnp.sum) for name, x in passed.integrals.items()}
         averages = means(sums, length)
     quantities = _quantities(plan, points)
@@ -192,7 +194,7 @@ def collect(plan: Plan, sampled: bool, lane: Ends, points: Any, records: Record)
         impact_energy=per_cycle(records.loss, jnp.sum),
         clearance=per_cycle(records.clearance, jnp.min),
         duration=duration,
-        frequency_ratio=None if duration is None else scene.frequency_ratio(duration),
+        frequency_ratio=None if duration is None else machine.frequency_ratio(duration),
         samples=dense,
         impact_log=log,
         event_log=_events(plan, records.events) if plan.events else None,
@@ -202,35 +204,35 @@ def collect(plan: Plan, sampled: bool, lane: Ends, points: Any, records: Record)
         rejected=lane.rejected.astype(jnp.int32),
         averages=averages,
         quantities={name: x[::parts] for name, x in quantities.items()},
-        labels=scene.labels,
-        units=stated(scene),
+        labels=machine.labels,
+        units=stated(machine),
     )
 
 
 def _quantities(plan: Plan, points: Any) -> dict[str, Any]:
     """The machine's functions of its state at the points recorded."""
-    scene = plan.scene
-    if not has_quantities(scene):
+    machine = plan.machine
+    if not has_quantities(machine):
         return {}
     first = jtu.tree_map(lambda x: x[0], points)
     parts = jnp.arange(plan.kept + 1) % plan.parts
-    s = parts.astype(scene.position(first).dtype) * (jnp.asarray(scene.cycle) / plan.parts)
+    s = parts.astype(machine.position(first).dtype) * (jnp.asarray(machine.cycle) / plan.parts)
     if not plan.ticks(first):
         s = jnp.zeros_like(s)
-    found = jax.vmap(scene.quantities)(s, points)
+    found = jax.vmap(machine.quantities)(s, points)
     return {name: jnp.asarray(x, s.dtype) for name, x in found.items()}
 
 
 def _log(plan: Plan, entries: Any) -> ImpactLog:
     """The first `plan.log` impacts of each cycle, from those of its intervals."""
     phase, speed, stop = _by_cycle(plan, entries, used=2)
-    return ImpactLog(plan.scene.as_logged(phase), speed, _numbers(stop))
+    return ImpactLog(plan.machine.as_logged(phase), speed, _numbers(stop))
 
 
 def _events(plan: Plan, entries: Any) -> EventLog:
     """The first `plan.events` events of each cycle, from those of its intervals."""
     phase, code, number, value = _by_cycle(plan, entries, used=1)
-    return EventLog(plan.scene.as_logged(phase), _numbers(code), _numbers(number), value)
+    return EventLog(plan.machine.as_logged(phase), _numbers(code), _numbers(number), value)
 
 
 def _by_cycle(plan: Plan, entries: Any, *, used: int) -> list[Any]:

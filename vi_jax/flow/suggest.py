@@ -1,4 +1,4 @@
-"""`suggest_method`: the fastest method for an error, measured on the user's own scene."""
+"""`suggest_method`: the fastest method for an error, measured on the user's own machine."""
 
 import time
 from collections.abc import Callable
@@ -13,7 +13,8 @@ import numpy as np
 from jax.core import Tracer
 
 from .._checks import count, one_of, require
-from ..scene import AbstractScene
+from .._renamed import renamed
+from ..machine import AbstractMachine
 from .arguments import check_start, machine_of
 from .fusion import jit
 from .methods import AbstractMethod, Adaptive, ExactFlight, FixedStep, Taylor, Verner9, preset
@@ -25,7 +26,8 @@ _STEPS = (5, 6, 7, 8, 10, 12, 16, 20, 24, 32, 48, 64)
 _TOLERANCES = tuple(10.0**-n for n in range(3, 15))
 _ROUNDS = 5
 
-# A scene is stiff if what fades fastest in it asks for steps so many times shorter than its motion.
+# Stiff is a machine in which what fades fastest asks for steps so many times shorter than its
+# motion.
 _STIFF = 20.0
 
 
@@ -60,8 +62,9 @@ class Suggestion(NamedTuple):
         return "\n".join(lines)
 
 
+@renamed(scene="machine")
 def suggest_method(
-    scene: AbstractScene,
+    machine: AbstractMachine,
     *,
     error: float = 1e-6,
     quantity: str = "state",
@@ -69,21 +72,21 @@ def suggest_method(
     cycles: int = 20,
     lanes: int = 256,
 ) -> Suggestion:
-    """The fastest method that keeps to an error, from a short calibration on the scene itself.
+    """The fastest method that keeps to an error, from a short calibration on the machine itself.
 
     Takes a few seconds, most of it compiling. Of a few methods of each kind it measures the
     error against `ExactFlight` where that applies and else against `Adaptive` at its tightest, and
-    the time of those that keep to it, on lanes that differ in their first velocity. Where the scene
-    is stiff implicit ones are tried instead of those of fixed steps.
+    the time of those that keep to it, on lanes that differ in their first velocity. Where the
+    machine is stiff implicit ones are tried instead of those of fixed steps.
 
     **Arguments:**
 
-    - `scene`: the scene, its numbers known.
+    - `machine`: the machine, its numbers known.
     - `error`: the error asked for, relative to 1 + |x|, for 95 of 100 lanes.
     - `quantity`: of what: `"state"` (on the last section), `"extremes"` (in each cycle),
       `"impacts"` (phase and speed of the first 32 in each cycle; a missed one is an infinite
       error) or `"derivative"` (of the last section state by the first velocity).
-    - `start`: the first state; by default the scene's own.
+    - `start`: the first state; by default the machine's own.
     - `cycles`: drive cycles of the calibration; in a chaotic motion errors grow with them.
     - `lanes`: lanes of a batch such as it will be used in; 1 for a single motion.
 
@@ -96,20 +99,20 @@ def suggest_method(
     require("error", error, low=0.0, open_low=True)
     one_of("quantity", quantity, QUANTITIES)
     cycles, lanes = count("cycles", cycles, least=1), count("lanes", lanes, least=1)
-    scene = machine_of(scene)
-    if any(isinstance(x, Tracer) for x in jtu.tree_leaves((scene, start))):
+    machine = machine_of(machine)
+    if any(isinstance(x, Tracer) for x in jtu.tree_leaves((machine, start))):
         raise TypeError(
-            "Arguments `scene` and `start` must hold known numbers, but are being traced: call "
+            "Arguments `machine` and `start` must hold known numbers, but are being traced: call "
             "`suggest_method` outside of `jit`, `vmap` and `grad`."
         )
     if start is None:
-        start = scene.start()
-    start = scene.adopt(start)
-    check_start(scene, start)
-    bench = _Bench(scene, start, quantity, cycles, lanes)
-    best = preset(scene, "reference")
+        start = machine.start()
+    start = machine.adopt(start)
+    check_start(machine, start)
+    bench = _Bench(machine, start, quantity, cycles, lanes)
+    best = preset(machine, "reference")
     exact = isinstance(best, ExactFlight)
-    stiff = not exact and _is_stiff(scene, start)
+    stiff = not exact and _is_stiff(machine, start)
     if exact:
         truth = best.tighter()
     elif stiff:
@@ -120,8 +123,8 @@ def suggest_method(
     failed = int(np.sum(~np.isfinite(bench.truth[:, 0])))
     if failed:
         raise ValueError(
-            f"Argument `scene` must be one that runs for {cycles} cycles, but {failed} of {lanes} "
-            "lanes of the calibration failed: look at `simulate(...).result` for the reason."
+            f"Argument `machine` must be one that runs for {cycles} cycles, but {failed} of "
+            f"{lanes} lanes of the calibration failed: look at `simulate(...).result` for why."
         )
     if exact:
         tried = [bench.tried(best, "ExactFlight()")]
@@ -140,11 +143,11 @@ def suggest_method(
     return Suggestion(found.method, bool(timed), found.error, tuple(tried))
 
 
-def _is_stiff(scene: AbstractScene, start: Any) -> bool:
+def _is_stiff(machine: AbstractMachine, start: Any) -> bool:
     """Whether something fades much faster than the motion goes, at its start."""
     s = jnp.zeros(())
-    fading = scene.relaxation(s, start)
-    return fading is not None and bool(scene.step_limit(s, start) > _STIFF * fading)
+    fading = machine.relaxation(s, start)
+    return fading is not None and bool(machine.step_limit(s, start) > _STIFF * fading)
 
 
 def _adaptive(bench: "_Bench", error: float, solver: Any) -> list[Tried]:
@@ -195,24 +198,26 @@ class _Bench:
 
     truth: np.ndarray
 
-    def __init__(self, scene: AbstractScene, start: Any, quantity: str, cycles: int, lanes: int):
-        self.scene, self.start, self.quantity, self.cycles = scene, start, quantity, cycles
+    def __init__(
+        self, machine: AbstractMachine, start: Any, quantity: str, cycles: int, lanes: int
+    ):
+        self.machine, self.start, self.quantity, self.cycles = machine, start, quantity, cycles
         # Nothing but the velocity is free of stops.
         self.nudges = jnp.linspace(-0.1, 0.1, lanes) if lanes > 1 else jnp.zeros(1)
         self.compiled: dict[Any, Callable] = {}
 
     def lane(self, method: AbstractMethod, nudge: Any) -> Any:
         """What is looked at, of one lane."""
-        scene = self.scene
+        machine = self.machine
 
         def looked_at(nudge):
-            body = scene.coordinates[0]
+            body = machine.coordinates[0]
             velocity = body.velocity(self.start) + nudge
             start = body.placed(self.start, body.position(self.start), velocity)
             options: dict[str, Any] = {"record": "sections"}
             if self.quantity in ("extremes", "impacts"):
                 options = {"impact_log": 32 if self.quantity == "impacts" else 0}
-            run = simulate(scene, start, self.cycles, method=method, **options)
+            run = simulate(machine, start, self.cycles, method=method, **options)
             found: Any = run.last
             if self.quantity == "extremes":
                 found = run.y_min, run.y_max

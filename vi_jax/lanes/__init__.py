@@ -9,10 +9,10 @@ from .elementary import pin as pin
 from .elementary import pin_flag as pin_flag
 from .elementary import sincos as sincos
 from .loop import Emitted as Emitted
-from .loop import current_road as current_road
+from .loop import backend as backend
+from .loop import current_backend as current_backend
 from .loop import once as once
-from .loop import road as road
 from .loop import run as run
-from .machine import cores as cores
-from .machine import processor as processor
-from .machine import threads as threads
+from .runtime import cores as cores
+from .runtime import processor as processor
+from .runtime import threads as threads

@@ -26,7 +26,7 @@ def llvm() -> Any:
     binding.initialize_native_target()
     binding.initialize_native_asmprinter()
     try:
-        # Once, so that a program can be sent the other road before any is under way.
+        # Once, so that a program can be sent the other backend before any is under way.
         _loaded(binding, compiled(binding, "define void @kernel() { ret void }", None))
     except RuntimeError as error:
         raise Unsupported(f"LLVM: {error}") from None

@@ -7,12 +7,12 @@ from typing import Any
 import jax
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
-from ._program import Program, Spread, spread
+from ._program import LaneProgram, Spread, spread
 from ._quotient import with_quotients
 
 
 @functools.lru_cache(maxsize=64)
-def forward(program: Program, moving: tuple[bool, ...]) -> tuple[Program, tuple[bool, ...]]:
+def forward(program: LaneProgram, moving: tuple[bool, ...]) -> tuple[LaneProgram, tuple[bool, ...]]:
     """The program of value and derivative, and which results and parts of the rows have one.
 
     **Arguments:** the program; which inputs have a derivative. Theirs follow the inputs, those of
@@ -24,7 +24,7 @@ def forward(program: Program, moving: tuple[bool, ...]) -> tuple[Program, tuple[
     both, rows = (*moving, *there.carry), there.rows
     wanted, groups = (*there.carry, False, False, *rows), (n, 2, len(rows))
     slopes = program.slopes or (False,) * len(moving)
-    derived = Program(
+    derived = LaneProgram(
         begin=_derived(program.begin, moving, wanted, groups),
         step=_derived(program.step, both, wanted, groups, len(moving)),
         end=_derived(program.end, both, there.outs, (len(there.outs),), len(moving)),
@@ -80,7 +80,9 @@ def _derived(
 
 
 @functools.lru_cache(maxsize=64)
-def widened(program: Program, many: tuple[bool, ...], number: int) -> tuple[Program, Spread]:
+def widened(
+    program: LaneProgram, many: tuple[bool, ...], number: int
+) -> tuple[LaneProgram, Spread]:
     """The program with `number` of some of its inputs in one lane, and what there are so many of.
 
     All that does not depend on them is computed once, so that several directions of a derivative
@@ -104,7 +106,7 @@ def widened(program: Program, many: tuple[bool, ...], number: int) -> tuple[Prog
     base = program.base
     if base is not None and any(many[: len(base.in_avals)]):
         base = None
-    wide = Program(
+    wide = LaneProgram(
         begin=over(program.begin, many, flags),
         step=over(program.step, (*many, *there.carry), flags),
         end=over(program.end, (*many, *there.carry), there.outs),

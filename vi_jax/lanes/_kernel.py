@@ -13,7 +13,7 @@ from jax.extend.core import ClosedJaxpr
 
 from ._arrays import Values
 from ._operations import kind_of
-from ._program import Program
+from ._program import LaneProgram
 from ._text import RARE, Text, Value, is_float
 from ._vector import write
 
@@ -26,7 +26,7 @@ entry:
 """
 
 
-def kernel_text(program: Program, width: int, bits: int) -> str:
+def kernel_text(program: LaneProgram, width: int, bits: int) -> str:
     """LLVM's text of a program, for groups of `width` lanes in registers of `bits` bits."""
     return _Writer(program, width).text(bits)
 
@@ -34,7 +34,7 @@ def kernel_text(program: Program, width: int, bits: int) -> str:
 class _Writer:
     """A kernel under way."""
 
-    def __init__(self, program: Program, width: int):
+    def __init__(self, program: LaneProgram, width: int):
         self.program = program
         self.t = Text(width)
         self.n_out = len(program.out_avals)

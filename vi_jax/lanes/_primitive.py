@@ -1,4 +1,4 @@
-"""The JAX primitive behind `run`: batched, differentiated forward, and lowered on either road."""
+"""The JAX primitive behind `run`: batched, differentiated forward, lowered for either backend."""
 
 import functools
 import math
@@ -16,10 +16,10 @@ from jax.interpreters import ad, batching, mlir, partial_eval
 from . import _xla as xla
 from ._context import within
 from ._derivative import forward, widened
-from ._program import Program, spread
+from ._program import LaneProgram, spread
 from ._vector import Unsupported
 from .call import header, registered
-from .machine import kernel_of
+from .runtime import kernel_of
 
 _strict: ContextVar[bool] = ContextVar("strict", default=False)
 
@@ -35,7 +35,7 @@ lanes_p.multiple_results = True
 
 
 @lanes_p.def_abstract_eval
-def _(*args, program: Program, road: str):
+def _(*args, program: LaneProgram, backend: str):
     batch = program.batch([a.shape for a in args])
     rows = [(*batch, program.rows, *a.shape) for a in program.row_avals]
     outs = [(*batch, *a.shape) for a in program.out_avals]
@@ -44,15 +44,15 @@ def _(*args, program: Program, road: str):
 
 
 @lanes_p.def_impl
-def _(*args, program: Program, road: str):
-    return jax.jit(functools.partial(lanes_p.bind, program=program, road=road))(*args)
+def _(*args, program: LaneProgram, backend: str):
+    return jax.jit(functools.partial(lanes_p.bind, program=program, backend=backend))(*args)
 
 
 # Directions of a derivative that one lane carries along.
 _DIRECTIONS = 8
 
 
-def _batched(args, dims, *, program: Program, road: str):
+def _batched(args, dims, *, program: LaneProgram, backend: str):
     args = [jnp.asarray(x) for x in args]
     size = next(x.shape[d] for x, d in zip(args, dims, strict=True) if d is not None)
     many = tuple(d is not None for d in dims)
@@ -63,7 +63,7 @@ def _batched(args, dims, *, program: Program, road: str):
     inner = program.batch(shapes)
     slopes = program.slopes or (False,) * len(many)
     if all(s or not m for s, m in zip(slopes, many, strict=True)) and 1 < size <= _DIRECTIONS:
-        return _directions(args, dims, inner, many, size, program, road)
+        return _directions(args, dims, inner, many, size, program, backend)
     moved = []
     for x, d, shape, aval in zip(args, dims, shapes, program.in_avals, strict=True):
         if d is None and len(shape) == aval.ndim:
@@ -73,7 +73,7 @@ def _batched(args, dims, *, program: Program, road: str):
         if len(shape) == aval.ndim:
             x = x.reshape(x.shape[0], *(1 for _ in inner), *aval.shape)
         moved.append(jnp.broadcast_to(x, (size, *inner, *aval.shape)))
-    out = lanes_p.bind(*moved, program=program, road=road)
+    out = lanes_p.bind(*moved, program=program, backend=backend)
     there = spread(program, many, smooth=False)
     wide = [there.control or w for w in (*there.outs, *there.rows)]
     # What is the same in all lanes is one, as `vmap` has it for what does not depend on its axis.
@@ -82,7 +82,7 @@ def _batched(args, dims, *, program: Program, road: str):
     ]
 
 
-def _directions(args, dims, inner: tuple, many, size: int, program: Program, road: str):
+def _directions(args, dims, inner: tuple, many, size: int, program: LaneProgram, backend: str):
     """Tangents in several directions go along with one motion."""
     wide, there = widened(program, many, size)
     axes, moved = len(inner), []
@@ -90,7 +90,7 @@ def _directions(args, dims, inner: tuple, many, size: int, program: Program, roa
         # Behind the axes of the lanes, before those of the number itself.
         own = 0 if d is None or x.ndim - 1 == aval.ndim else axes
         moved.append(x if d is None else jnp.moveaxis(x, d, own))
-    out = lanes_p.bind(*moved, program=wide, road=road)
+    out = lanes_p.bind(*moved, program=wide, backend=backend)
     places = [axes if w else None for w in there.outs]
     places += [axes + 1 if w else None for w in there.rows]
     return out, places
@@ -99,11 +99,11 @@ def _directions(args, dims, inner: tuple, many, size: int, program: Program, roa
 batching.primitive_batchers[lanes_p] = _batched
 
 
-def _jvp(primals, tangents, *, program: Program, road: str):
+def _jvp(primals, tangents, *, program: LaneProgram, backend: str):
     moving = tuple(type(t) is not ad.Zero for t in tangents)
     derived, has = forward(program, moving)
     changes = [t for t in tangents if type(t) is not ad.Zero]
-    out = iter(lanes_p.bind(*primals, *changes, program=derived, road=road))
+    out = iter(lanes_p.bind(*primals, *changes, program=derived, backend=backend))
     values, slopes = [], []
     # The results and their derivatives, then the rows and theirs.
     for part in (has[: _outs(program)], has[_outs(program) :]):
@@ -115,17 +115,19 @@ def _jvp(primals, tangents, *, program: Program, road: str):
     ]
 
 
-def _partial(trace, *tracers, program: Program, road: str):
+def _partial(trace, *tracers, program: LaneProgram, backend: str):
     """Where tangents are not known yet, as in `jax.linearize` and `jax.grad`, the values are: what
     is computed along with such tangents is not known either, and the values are computed alone."""
     unknown = [not t.is_known() for t in tracers]
     alone = program.values_without(unknown, [t.aval.shape for t in tracers])
-    later = trace.default_process_primitive(lanes_p, tracers, {"program": program, "road": road})
+    later = trace.default_process_primitive(
+        lanes_p, tracers, {"program": program, "backend": backend}
+    )
     if alone is None or not any(unknown):
         return later
     smaller, there = alone
     given = [t.pval.get_known() for t in tracers[: len(smaller.in_avals)]]
-    values = iter(lanes_p.bind(*given, program=smaller, road=road))
+    values = iter(lanes_p.bind(*given, program=smaller, backend=backend))
     return [next(values) if known else x for known, x in zip(there, later, strict=True)]
 
 
@@ -160,7 +162,7 @@ def _saved(policy: Any) -> bool:
     return policy is True or type(policy).__name__.startswith("Saveable")
 
 
-def _transposed(cotangents, *args, program: Program, road: str):
+def _transposed(cotangents, *args, program: LaneProgram, backend: str):
     """By columns: the program is run along every number of the tangents asked for, several of them
     with one motion, and what comes of each is weighed.
 
@@ -179,7 +181,7 @@ def _transposed(cotangents, *args, program: Program, road: str):
     size = min(number, _DIRECTIONS)
     units = jnp.eye(-(-number // size) * size, number)  # filled up: one program for all
     along = jax.vmap(
-        functools.partial(lanes_p.bind, program=program, road=road),
+        functools.partial(lanes_p.bind, program=program, backend=backend),
         [0 if i in places else None for i in range(len(args))],
         axis_size=size,
     )
@@ -208,7 +210,7 @@ def _weighed(column, weight, kept: int):
     return jnp.sum(product, axis=tuple(range(kept, product.ndim)))
 
 
-def _outs(program: Program) -> int:
+def _outs(program: LaneProgram) -> int:
     return len(program.out_avals)
 
 
@@ -219,28 +221,28 @@ ad.primitive_transposes[lanes_p] = _transposed
 
 
 _on_xla = mlir.lower_fun(
-    lambda *args, program, road: xla.run(program, *args), multiple_results=True
+    lambda *args, program, backend: xla.run(program, *args), multiple_results=True
 )
 
 
-def _lowered(ctx, *args, program: Program, road: str):
-    if road == "xla":
+def _lowered(ctx, *args, program: LaneProgram, backend: str):
+    if backend == "xla":
         if _strict.get():
-            raise Unsupported("the other road")
-        return _on_xla(ctx, *args, program=program, road=road)
+            raise Unsupported("the other backend")
+        return _on_xla(ctx, *args, program=program, backend=backend)
     try:
         kernel = kernel_of(program, _count(program, ctx.avals_in))
     except Unsupported as reason:
         if _strict.get():
             raise
         _tell(str(reason))
-        return _on_xla(ctx, *args, program=program, road=road)
+        return _on_xla(ctx, *args, program=program, backend=backend)
     ctx.module_context.add_keepalive(kernel)
     call = functools.partial(_called, kernel, program, ctx.avals_out)
     return mlir.lower_fun(call, multiple_results=True)(ctx, *args)
 
 
-def _called(kernel, program: Program, avals, *args):
+def _called(kernel, program: LaneProgram, avals, *args):
     strides = [
         aval.size if x.ndim > aval.ndim else 0
         for x, aval in zip(args, program.in_avals, strict=True)
@@ -250,14 +252,14 @@ def _called(kernel, program: Program, avals, *args):
     return jax.ffi.ffi_call(registered(), results)(head, *args)
 
 
-def _count(program: Program, args) -> int:
+def _count(program: LaneProgram, args) -> int:
     return math.prod(program.batch([x.shape for x in args]))
 
 
 @functools.cache
 def _tell(reason: str) -> None:
     warnings.warn(
-        f"Lanes run on XLA's slower road, because this program needs {reason}.", stacklevel=2
+        f"Lanes run on XLA's slower backend, because this program needs {reason}.", stacklevel=2
     )
 
 

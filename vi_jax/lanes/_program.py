@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 
-class Program(eqx.Module):
+class LaneProgram(eqx.Module):
     """A lane's loop as jaxprs of flat arguments; hashable, as a primitive's parameter must be.
 
     `begin(inputs)` and `step(inputs, carry)` give the carry, whether the lane goes on, whether a
@@ -25,7 +25,7 @@ class Program(eqx.Module):
     slopes: tuple[bool, ...] = eqx.field(static=True, default=())
     """Which inputs are tangents; none may steer the loop."""
 
-    base: "Program | None" = eqx.field(static=True, default=None)
+    base: "LaneProgram | None" = eqx.field(static=True, default=None)
     """Of a program of values and derivatives that of the values alone, whose inputs come first."""
 
     __hash__ = object.__hash__
@@ -53,7 +53,7 @@ class Program(eqx.Module):
 
     def values_without(
         self, gone: Sequence[bool], shapes: Sequence[tuple[int, ...]]
-    ) -> "tuple[Program, list[bool]] | None":
+    ) -> "tuple[LaneProgram, list[bool]] | None":
         """The program of what is known without some of the tangents, and which results and rows
         of this one it gives, in their order; `None` if there is none.
 
@@ -85,7 +85,7 @@ class Program(eqx.Module):
         return self.begin.out_avals[len(self.carry_avals) + 2 :]
 
 
-def spread(program: Program, sources: tuple[bool, ...], *, smooth: bool) -> "Spread":
+def spread(program: LaneProgram, sources: tuple[bool, ...], *, smooth: bool) -> "Spread":
     """Which parts of a program depend on these inputs; if `smooth`, differentiably."""
     n = len(program.carry_avals)
     begun = reached(program.begin.jaxpr, sources, smooth=smooth)

@@ -13,7 +13,7 @@ import numpy as np
 from jax.core import Tracer, eval_jaxpr
 from jax.extend.core import ClosedJaxpr
 
-from ._program import Program
+from ._program import LaneProgram
 from ._recent import Recent
 
 
@@ -28,7 +28,7 @@ class Functions(NamedTuple):
 class Traced(NamedTuple):
     """The program of a lane."""
 
-    program: Program
+    program: LaneProgram
     consts: list[Any]
     """Arrays that the functions close over: further inputs."""
     out: Any
@@ -43,7 +43,7 @@ _recent: "Recent[Any, Traced]" = Recent(64)
 def traced(functions: Functions, treedef: Any, leaves: Sequence[Any], **options: int) -> Traced:
     """The program for inputs of this structure and of these leaves' shapes and types.
 
-    **Arguments:** `options` of the `Program`.
+    **Arguments:** `options` of the `LaneProgram`.
     """
     shapes = [one(x) for x in leaves]
     try:
@@ -145,7 +145,7 @@ def _traced(functions: Functions, treedef: Any, leaves: list[Any], options: Any)
     both = [*leaves, *map(one, carried)]
     jaxprs = [begin, jax.make_jaxpr(stepped)(*both), jax.make_jaxpr(ended)(*both)]
     (begin, step, end), consts = _without_consts(jaxprs, n)
-    program = Program(begin=begin, step=step, end=end, **options)
+    program = LaneProgram(begin=begin, step=step, end=end, **options)
     return Traced(program, consts, told["out"], told["row"])
 
 

@@ -1,4 +1,4 @@
-"""The other road: the same loop by XLA, for any device and any primitive.
+"""The other backend: the same loop by XLA, for any device and any primitive.
 
 Lanes of a batch advance together. Where they are many, a few places take up lane after lane, so
 that one of ten times the steps holds up nobody and what is under way fits the processor's cache.
@@ -11,13 +11,13 @@ import jax
 import jax.numpy as jnp
 from jax.extend.core import jaxpr_as_fun
 
-from ._program import Program
+from ._program import LaneProgram
 
 # Lanes under way at once on a CPU; an accelerator takes all of them.
 _PLACES = 256
 
 
-def run(program: Program, *args: Any) -> list[Any]:
+def run(program: LaneProgram, *args: Any) -> list[Any]:
     """Results and rows of a batch of lanes: what the primitive gives."""
     batch = program.batch([x.shape for x in args])
     lanes = math.prod(batch)
@@ -38,7 +38,9 @@ def run(program: Program, *args: Any) -> list[Any]:
 class _Pool:
     """Lanes through places; every method is traced once."""
 
-    def __init__(self, program: Program, args: list, shared: list[bool], lanes: int, places: int):
+    def __init__(
+        self, program: LaneProgram, args: list, shared: list[bool], lanes: int, places: int
+    ):
         self.program, self.args, self.shared = program, args, shared
         self.lanes, self.places = lanes, places
         self.n = len(program.carry_avals)

@@ -14,7 +14,7 @@ import numpy as np
 
 from ._interrupts import WELL, Out, guard, raises, watch
 from ._recent import once
-from .machine import Work, living
+from .runtime import Work, living
 
 TARGET = "vi_jax_lanes"
 

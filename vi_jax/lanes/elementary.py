@@ -1,4 +1,4 @@
-"""Functions that either road has its own best form of."""
+"""Functions that either backend has its own best form of."""
 
 from collections.abc import Callable
 from math import factorial, pi
@@ -32,7 +32,7 @@ def sincos(phase: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array
     """Sine and cosine of `phase` (radians, any shape; best within a few turns of zero).
 
     The absolute error is a few units of rounding. Differentiable to any order. XLA's CPU backend
-    calls the scalar library for float64 `sin` and `cos`; these are polynomials on either road.
+    calls the scalar library for float64 `sin` and `cos`; these are polynomials on either backend.
     """
     sine, cosine = sincos_p.bind(jnp.asarray(phase))
     return sine, cosine
@@ -76,7 +76,7 @@ def pin(tree: Any) -> Any:
     """The same values, which XLA's CPU backend computes once.
 
     When it fuses it copies cheap producers into each of their consumers, which multiplies the work
-    of a long step; it does not copy divisions. So on that road this is a division by one.
+    of a long step; it does not copy divisions. So on that backend this is a division by one.
     """
     return jtu.tree_map(pin_p.bind, tree)
 

@@ -13,9 +13,9 @@ from ._context import within
 from ._primitive import lanes_p
 from ._trace import Functions, traced
 
-ROADS = ("auto", "xla")
+BACKENDS = ("auto", "xla")
 
-_road: ContextVar[str] = ContextVar("road", default="auto")
+_backend: ContextVar[str] = ContextVar("backend", default="auto")
 
 
 class Emitted(NamedTuple):
@@ -29,19 +29,19 @@ class Emitted(NamedTuple):
     """The row, a pytree."""
 
 
-def road(name: str) -> AbstractContextManager:
+def backend(name: str) -> AbstractContextManager:
     """Trace lanes for `"xla"` within this context, or for what suits the machine (`"auto"`).
 
-    What is compiled already keeps its road.
+    What is compiled already keeps its backend.
     """
-    if name not in ROADS:
-        raise ValueError(f"Argument `name` must be one of {ROADS}, but got {name!r}.")
-    return within(_road, name)
+    if name not in BACKENDS:
+        raise ValueError(f"Argument `name` must be one of {BACKENDS}, but got {name!r}.")
+    return within(_backend, name)
 
 
-def current_road() -> str:
-    """The road that this context asks for."""
-    return _road.get()
+def current_backend() -> str:
+    """The backend that this context asks for."""
+    return _backend.get()
 
 
 def run(
@@ -52,7 +52,7 @@ def run(
     *,
     rows: int,
     block: int = 1,
-    road: str | None = None,
+    backend: str | None = None,
 ) -> tuple[Any, Any]:
     """One lane's loop to its end: begin, step while it is active, end.
 
@@ -70,7 +70,7 @@ def run(
     - `rows`: room for rows; they are stored in the order in which they are completed, and what a
       lane does not come to is not a number (0 for integers);
     - `block`: steps in which a lane is sure to complete at most one row (for XLA);
-    - `road`: `"xla"` or `"auto"`; by default what the context says.
+    - `backend`: `"xla"` or `"auto"`; by default what the context says.
 
     **Returns:** the results, and the rows with a leading axis of length `rows`.
     """
@@ -79,8 +79,8 @@ def run(
     program, consts, *structures = traced(
         Functions(begin, step, end), treedef, leaves, rows=rows, block=block
     )
-    road = current_road() if road is None else road
-    found = lanes_p.bind(*leaves, *consts, program=program, road=road)
+    backend = current_backend() if backend is None else backend
+    found = lanes_p.bind(*leaves, *consts, program=program, backend=backend)
     n = len(program.out_avals)
     results, row = map(jtu.tree_unflatten, structures, (found[:n], found[n:]))
     return results, row

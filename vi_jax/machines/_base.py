@@ -6,16 +6,14 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from .._checks import require, require_ranges
 from .._numbers import number, optional_real
-from ..scene import AbstractScene
+from .._types import Scalar
+from ..machine import AbstractMachine
 
-Scalar = Float[Array, ""]
 
-
-class PhaseMachine(AbstractScene):
+class PhaseMachine(AbstractMachine):
     """A machine whose independent variable is the phase of its drive, and whose numbers are in
     their `ranges`."""
 
@@ -30,7 +28,7 @@ class PhaseMachine(AbstractScene):
         return 2 * pi
 
 
-class AutonomousMachine(AbstractScene):
+class AutonomousMachine(AbstractMachine):
     """A machine without a drive, whose independent variable is time, and whose numbers are in their
     `ranges`. A cycle ends where `event` rises through zero; if `interval` is given (positive), at
     equal times instead."""

@@ -6,11 +6,8 @@ from functools import reduce
 from operator import add
 from typing import Any
 
-from jaxtyping import Array, Float
-
-from ..scene import Coordinate
-
-Scalar = Float[Array, ""]
+from .._types import Scalar
+from ..machine import Coordinate
 
 Row = tuple[Any, Any, Any]
 """By how much y, φM and φS each enter: a number, or `None` where one does not."""

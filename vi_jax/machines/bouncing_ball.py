@@ -5,15 +5,13 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from .._checks import NOT_NEGATIVE, SHARE
 from .._numbers import number, real
-from ..scene import RigidStop
-from ..scene.shown import Shown
+from .._types import Scalar
+from ..machine import RigidStop
+from ..machine.shown import Shown
 from ._base import PhaseMachine
-
-Scalar = Float[Array, ""]
 
 
 class BallState(Shown):

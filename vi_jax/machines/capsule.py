@@ -6,15 +6,13 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Range
 from .._numbers import number, real
-from ..scene import Coordinate, DryFriction, RigidStop
-from ..scene.shown import Shown
+from .._types import Scalar
+from ..machine import Coordinate, DryFriction, RigidStop
+from ..machine.shown import Shown
 from ._base import PhaseMachine
-
-Scalar = Float[Array, ""]
 
 
 class CapsuleState(Shown):

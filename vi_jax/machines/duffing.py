@@ -6,14 +6,12 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE
 from .._numbers import number, real
-from ..scene import OscillatorState, RigidStop
+from .._types import Scalar
+from ..machine import OscillatorState, RigidStop
 from ._base import PhaseMachine
-
-Scalar = Float[Array, ""]
 
 
 class Duffing(PhaseMachine):

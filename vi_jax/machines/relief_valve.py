@@ -6,15 +6,14 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
 from .._checks import NOT_NEGATIVE, POSITIVE, SHARE
 from .._numbers import concrete, number, real
-from ..scene import RigidStop
-from ..scene.shown import Shown
+from .._types import Scalar
+from ..machine import RigidStop
+from ..machine.shown import Shown
 from ._base import AutonomousMachine
-
-Scalar = Float[Array, ""]
 
 
 class ValveState(Shown):

@@ -12,11 +12,10 @@ from jaxtyping import Array, Float
 
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Range, require
 from .._numbers import number, optional_real, real
-from ..scene import RigidStop, ShaftScene
-from ..scene.shown import Shown
+from .._types import Scalar
+from ..machine import RigidStop, ShaftMachine
+from ..machine.shown import Shown
 from ._base import PhaseMachine
-
-Scalar = Float[Array, ""]
 
 
 class RotorState(Shown):
@@ -40,7 +39,7 @@ class TimedRotorState(RotorState):
     """Angle of the rotor since the last section (radians)."""
 
 
-class UnbalancedRotor(ShaftScene, PhaseMachine):
+class UnbalancedRotor(ShaftMachine, PhaseMachine):
     """A body of mass M on a spring k and a damper c, on which a motor of limited power turns a
     rotor with an unbalance m at the radius r; if `gap` is given, between stops.
 

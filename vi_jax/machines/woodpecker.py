@@ -6,17 +6,16 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE
 from .._numbers import concrete, number, real
-from ..scene import ContactFriction, Coordinate, RigidStop
-from ..scene.shown import Shown
+from .._types import Scalar
+from ..machine import ContactFriction, Coordinate, RigidStop
+from ..machine.shown import Shown
 from ._base import AutonomousMachine
 from ._levers import by_levers, dot, response
 from ._woodpecker_drawn import draw_woodpecker
-
-Scalar = Float[Array, ""]
 
 
 def _real(name: str, default: float) -> Any:

@@ -13,7 +13,7 @@ from .find import find_orbit as find_orbit
 from .floquet import STABILITY as STABILITY
 from .results import ORBIT_RESULTS as ORBIT_RESULTS
 from .results import Orbit as Orbit
-from .search import AbstractSearch as AbstractSearch
-from .search import Gradient as Gradient
-from .search import Newton as Newton
+from .root_finders import AbstractRootFinder as AbstractRootFinder
+from .root_finders import Gradient as Gradient
+from .root_finders import Newton as Newton
 from .special import SpecialPoint as SpecialPoint

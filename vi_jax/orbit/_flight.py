@@ -10,19 +10,17 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from .. import lanes
+from .._types import Scalar, Vector
 from ..flow import AbstractMethod
 from ..flow.beside import Beside, elapsed
-from ..flow.moving import in_modes
-from ..scene import AbstractScene
-
-Scalar = Float[Array, ""]
-Vector = Float[Array, " _"]
+from ..flow.smooth import SmoothMachine, in_modes
+from ..machine import AbstractMachine
 
 
 class Flight(eqx.Module):
     """A machine between two events, and how it is carried."""
 
-    scene: AbstractScene
+    machine: AbstractMachine
     modes: tuple[Scalar, ...]
     """In which it is all along."""
     method: AbstractMethod
@@ -30,9 +28,9 @@ class Flight(eqx.Module):
     """A state, for its structure."""
 
     @property
-    def moving(self) -> AbstractScene:
+    def smooth(self) -> SmoothMachine:
         """The machine in its modes."""
-        return in_modes(self.scene, self.modes)
+        return in_modes(self.machine, self.modes)
 
     def unravel(self, u: Vector) -> Any:
         """A state from its vector."""
@@ -40,11 +38,11 @@ class Flight(eqx.Module):
 
     def step(self, s0: Scalar, s1: Scalar, u: Vector, passed: Beside) -> tuple[Vector, Beside]:
         """State, and time and integrals beside it, after a step of the method."""
-        moving, state = self.moving, self.unravel(u)
-        paced, beside = moving.pace(s0, state) is not None, None
+        smooth, state = self.smooth, self.unravel(u)
+        paced, beside = smooth.pace(s0, state) is not None, None
         if paced or passed.integrals:
             beside = Beside(passed.time if paced else None, passed.integrals)
-        new, after, _ = self.method.step(moving, s0, s1, state, beside)
+        new, after, _ = self.method.step(smooth, s0, s1, state, beside)
         return ravel_pytree(new)[0], elapsed(passed, after, s1 - s0)
 
     def once(self, function: Callable[["Flight", Any], Any], inputs: Any) -> Any:

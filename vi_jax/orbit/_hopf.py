@@ -14,7 +14,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from .._programs import compiled
-from ..scene.base import renews
+from ..machine.base import renews
 from ._events import section_of
 from ._shooting import Shooting
 from ._solve import observe
@@ -35,22 +35,22 @@ _ONE = 1e-6
 
 @compiled
 def _size(problem: Shooting, x):
-    scene = problem.at(x)
-    u = problem.after(scene, 0, jnp.zeros((), x.dtype), problem.parts(x)[1][0])
-    return jnp.linalg.norm(_rate(problem, scene, u)) * problem.period(x)
+    machine = problem.at(x)
+    u = problem.after(machine, 0, jnp.zeros((), x.dtype), problem.parts(x)[1][0])
+    return jnp.linalg.norm(_rate(problem, machine, u)) * problem.period(x)
 
 
 @compiled
 def _flow(problem: Shooting, x, u):
     """Field and section in a state, each with its derivatives."""
-    scene = problem.at(x)
-    section, slope = jax.value_and_grad(lambda u: scene.section(problem.unravel(u)))(u)
-    jacobian = jax.jacfwd(lambda u: _rate(problem, scene, u))(u)
-    return _rate(problem, scene, u), jacobian, section, slope
+    machine = problem.at(x)
+    section, slope = jax.value_and_grad(lambda u: machine.section(problem.unravel(u)))(u)
+    jacobian = jax.jacfwd(lambda u: _rate(problem, machine, u))(u)
+    return _rate(problem, machine, u), jacobian, section, slope
 
 
-def _rate(problem: Shooting, scene: Any, u: Any) -> Any:
-    moving = problem.flight(scene, 0).moving
+def _rate(problem: Shooting, machine: Any, u: Any) -> Any:
+    moving = problem.flight(machine, 0).smooth
     return ravel_pytree(moving.field(jnp.zeros((), u.dtype), problem.unravel(u)))[0]
 
 
@@ -66,7 +66,7 @@ def hopf_between(problem: Shooting, here: Step, new: Step) -> Step | None:
     **Returns:** a motion of hardly any size about the equilibrium whose eigenvalues ±iω are
     imaginary. One of its multipliers is 1, which is checked.
     """
-    if problem.events != (section_of(problem.scene, 0),) or renews(problem.scene):
+    if problem.events != (section_of(problem.machine, 0),) or renews(problem.machine):
         return None
     rates = [_flow_at(problem, step.x, _state(problem, step.x))[0] for step in (here, new)]
     if np.dot(*rates) >= 0:

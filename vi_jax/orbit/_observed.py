@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
-from ..scene import AbstractScene
-from ..scene.event import events_of, guard_of, section_number
+from ..machine import AbstractMachine
+from ..machine.event import events_of, guard_of, section_number
 from ._events import Event
 
 
@@ -37,7 +37,7 @@ class Observed(NamedTuple):
 
 
 def apart(
-    scene: AbstractScene,
+    machine: AbstractMachine,
     events: tuple[Event, ...],
     modes: tuple[tuple[float, ...], ...],
     clock: Float[Array, " legs"],
@@ -55,10 +55,10 @@ def apart(
     for i, event in enumerate(events):
         least = jnp.minimum(least, lengths[i])
         before = tuple(jnp.asarray(mode, clock.dtype) for mode in modes[i - 1])
-        for number, other in enumerate(events_of(scene)):
-            if number == event.number or number == section_number(scene):
+        for number, other in enumerate(events_of(machine)):
+            if number == event.number or number == section_number(machine):
                 continue
-            room = -guard_of(scene, number, clock[i], states[i], before)
+            room = -guard_of(machine, number, clock[i], states[i], before)
             if other.from_below:  # beyond it the motion may be, until it comes from below again
                 room = jnp.where(room > 0, room, jnp.inf)
             least = jnp.minimum(least, room)

@@ -8,7 +8,7 @@ from .results import Orbit
 
 def rests(orbit: Orbit) -> bool:
     """Whether a body rests on a stop in the course of a motion, or all the time."""
-    return orbit.scene.may_rest() and _forgets(orbit) and (_rests_now(orbit) or _comes_to(orbit))
+    return orbit.machine.may_rest() and _forgets(orbit) and (_rests_now(orbit) or _comes_to(orbit))
 
 
 def _forgets(orbit: Orbit) -> bool:
@@ -19,8 +19,8 @@ def _forgets(orbit: Orbit) -> bool:
 
 def _rests_now(orbit: Orbit) -> bool:
     """Whether a body lies still on a stop on the section."""
-    for stop in orbit.scene.stops:
-        body = orbit.scene.coordinates[stop.coordinate]
+    for stop in orbit.machine.stops:
+        body = orbit.machine.coordinates[stop.coordinate]
         if stop.beyond(body.position(orbit.state)) >= 0 and body.velocity(orbit.state) == 0:
             return True
     return False
@@ -28,5 +28,5 @@ def _rests_now(orbit: Orbit) -> bool:
 
 def _comes_to(orbit: Orbit) -> bool:
     """Whether a body comes to rest within the period."""
-    run = simulate(orbit.scene, orbit.state, int(orbit.cycles), method=orbit.method)
+    run = simulate(orbit.machine, orbit.state, int(orbit.cycles), method=orbit.method)
     return run.rests is not None and bool(run.rests.sum() > 0)

@@ -1,4 +1,4 @@
-"""The root of the cycle map's residual, and how it moves with the numbers of the scene."""
+"""The root of the cycle map's residual, and how it moves with the numbers of the machine."""
 
 from typing import Any, NamedTuple
 
@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from ..flow import simulate
 from ._neutral import least
 from .cycle_map import CycleMap
-from .search import AbstractSearch, search
+from .root_finders import AbstractRootFinder, search
 
 
 class Root(NamedTuple):
@@ -33,13 +33,13 @@ def _missing(arc: CycleMap, arcs: Float[Array, "arcs states"], unravel: Any) -> 
 
 
 @eqx.filter_custom_jvp
-def root_of(arc: CycleMap, guess: Any, root_finder: AbstractSearch) -> Root:
+def root_of(arc: CycleMap, guess: Any, root_finder: AbstractRootFinder) -> Root:
     """Where the search from a guess ends; differentiated by the implicit function theorem."""
     x, unravel = ravel_pytree(guess)
     arcs = x[None]
     if root_finder.arcs > 1:
         run = simulate(
-            arc.scene, guess, arc.cycles * root_finder.arcs, method=arc.method, rests=arc.rests
+            arc.machine, guess, arc.cycles * root_finder.arcs, method=arc.method, rests=arc.rests
         )
         sections = jnp.stack(jtu.tree_leaves(run.sections), axis=-1)[: -1 : arc.cycles]
         arcs = jnp.where(jnp.isfinite(sections), sections, x)

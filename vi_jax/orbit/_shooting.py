@@ -19,19 +19,18 @@ import jax.tree_util as jtu
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from .._types import Vector
 from ..flow import AbstractMethod
 from ..flow.beside import means
 from ..flow.named import average_names
-from ..scene import AbstractScene
-from ..scene.event import after_event, is_autonomous, jump_of, mode_number
-from ..scene.numbers import with_leaf
+from ..machine import AbstractMachine
+from ..machine.event import after_event, is_autonomous, jump_of, mode_number
+from ..machine.numbers import with_leaf
 from ._events import Event, guard_at
 from ._flight import Flight
 from ._observed import Observed, apart
 from ._turns import Turns, turns_of
 from .floquet import multipliers_of
-
-Vector = Float[Array, " _"]
 
 
 class Shooting(eqx.Module):
@@ -43,7 +42,7 @@ class Shooting(eqx.Module):
     place of its clock.
     """
 
-    scene: AbstractScene
+    machine: AbstractMachine
     method: AbstractMethod
     like: Any
     """A state, for its structure."""
@@ -74,21 +73,21 @@ class Shooting(eqx.Module):
     @property
     def autonomous(self) -> bool:
         """Whether the period is an unknown."""
-        return is_autonomous(self.scene, self.like)
+        return is_autonomous(self.machine, self.like)
 
     @property
     def impacts(self) -> tuple[int, ...]:
         """Which of the events are impacts."""
-        stops = len(self.scene.stops)
+        stops = len(self.machine.stops)
         return tuple(i for i, event in enumerate(self.events) if event.number < stops)
 
-    def at(self, x: Vector) -> AbstractScene:
-        """The scene with the parameters of `x`."""
-        scene = self.scene
+    def at(self, x: Vector) -> AbstractMachine:
+        """The machine with the parameters of `x`."""
+        machine = self.machine
         count = len(self.parameters)
         for i, name in enumerate(self.parameters):
-            scene = with_leaf(scene, name, x[x.shape[0] - count + i])
-        return scene
+            machine = with_leaf(machine, name, x[x.shape[0] - count + i])
+        return machine
 
     def parts(self, x: Vector) -> tuple[Float[Array, " legs"], Float[Array, "legs states"]]:
         """Clock and state at the start of each leg (before its event)."""
@@ -131,7 +130,7 @@ class Shooting(eqx.Module):
         which = jnp.asarray([kinds.index(event) for event in self.events])[leg]
         return jax.lax.switch(which, [of_event(kind) for kind in kinds], *inputs)
 
-    def after(self, scene: AbstractScene, leg: Any, s: Any, u: Vector) -> Vector:
+    def after(self, machine: AbstractMachine, leg: Any, s: Any, u: Vector) -> Vector:
         """The state after the event that begins a leg."""
         if not self.events:
             return u
@@ -139,18 +138,18 @@ class Shooting(eqx.Module):
         def of(event: Event) -> Callable[..., Vector]:
             def new(s, u):
                 state, modes = self.unravel(u), self._modes_in(leg - 1)
-                return ravel_pytree(after_event(scene, event.number, s, state, modes)[0])[0]
+                return ravel_pytree(after_event(machine, event.number, s, state, modes)[0])[0]
 
             return new
 
         return self._each(leg, of, s, u)
 
-    def guard(self, scene: AbstractScene, leg: Any, s: Any, u: Vector) -> Array:
+    def guard(self, machine: AbstractMachine, leg: Any, s: Any, u: Vector) -> Array:
         """What is zero at the event that begins a leg, and rises there."""
 
         def of(event: Event) -> Callable[..., Array]:
             def value(s, u):
-                return guard_at(scene, event, s, self.unravel(u), self._modes_in(leg - 1))
+                return guard_at(machine, event, s, self.unravel(u), self._modes_in(leg - 1))
 
             return value
 
@@ -160,21 +159,21 @@ class Shooting(eqx.Module):
         """Clock at the end of each leg."""
         return jnp.concatenate([clock[1:], clock[:1] + period])
 
-    def flight(self, scene: AbstractScene, leg: Any) -> Flight:
+    def flight(self, machine: AbstractMachine, leg: Any) -> Flight:
         """The flight of a leg, whose number may be traced."""
-        return Flight(scene, self._modes_in(leg), self.method, self.like)
+        return Flight(machine, self._modes_in(leg), self.method, self.like)
 
     def residual(self, x: Vector) -> Vector:
         """What the flights from event to event lack; zero for a periodic motion."""
-        scene = self.at(x)
+        machine = self.at(x)
         clock, states = self.parts(x)
 
         def arrive(leg, s0, s1, u):
-            after = self.after(scene, leg, s0, u)
-            end, _, _ = self.flight(scene, leg).fly(s0, s1, after, self.steps)
+            after = self.after(machine, leg, s0, u)
+            end, _, _ = self.flight(machine, leg).fly(s0, s1, after, self.steps)
             if not self.events:
                 return end, jnp.zeros((0,), x.dtype)
-            return end, self.guard(scene, leg, s0, u)[None]
+            return end, self.guard(machine, leg, s0, u)[None]
 
         legs = jnp.arange(len(states))
         ends = self.ends(clock, self.period(x))
@@ -183,25 +182,25 @@ class Shooting(eqx.Module):
 
     def observe(self, x: Vector) -> Observed:
         """Multipliers, extremes and the distances to grazing of a solution."""
-        scene = self.at(x)
+        machine = self.at(x)
         clock, states = self.parts(x)
-        averages = average_names(scene, self.unravel(states[0]))
+        averages = average_names(machine, self.unravel(states[0]))
 
         def follow(leg, s0, s1, u):
             def end(u):
-                flight = self.flight(scene, leg)
+                flight = self.flight(machine, leg)
                 end, passed, path = flight.fly(s0, s1, u, self.steps, averages)
                 return end, (passed, path)
 
-            after = self.after(scene, leg, s0, u)
+            after = self.after(machine, leg, s0, u)
             carried, (passed, path) = jax.jacfwd(end, has_aux=True)(after)
             approach, order = jnp.zeros((0,), x.dtype), jnp.ones((), x.dtype)
             if self.events:
-                saltation, rises = self._saltation(scene, leg, s0, u)
+                saltation, rises = self._saltation(machine, leg, s0, u)
                 carried, approach = carried @ saltation, rises[None]
-                order = self._each(leg, partial(self._order, scene, leg), s0, u)
-            places = [scene.position(self.unravel(x)) for x in (u, after)]
-            return carried, passed, approach, order, self._turns(scene, leg, s1, path), places
+                order = self._each(leg, partial(self._order, machine, leg), s0, u)
+            places = [machine.position(self.unravel(x)) for x in (u, after)]
+            return carried, passed, approach, order, self._turns(machine, leg, s1, path), places
 
         legs = jnp.arange(len(states))
         ends = self.ends(clock, self.period(x))
@@ -213,7 +212,7 @@ class Shooting(eqx.Module):
         Y = jnp.concatenate(places)
         nearest = jnp.argmin(turns.room)
         time, integrals = jax.tree.map(jnp.sum, passed)
-        timed = self.autonomous or scene.pace(clock[0], self.unravel(states[0])) is not None
+        timed = self.autonomous or machine.pace(clock[0], self.unravel(states[0])) is not None
         return Observed(
             multipliers=multipliers_of(monodromy),
             monodromy=monodromy,
@@ -225,32 +224,32 @@ class Shooting(eqx.Module):
             touched=turns.touched[nearest],
             order=jnp.min(order),
             apart=apart(
-                scene,
+                machine,
                 self.events,
                 self.modes,
                 clock,
                 ends - clock,
                 [self.unravel(u) for u in states],
             ),
-            duration=time if timed else jnp.asarray(scene.period, x.dtype) * self.cycles,
+            duration=time if timed else jnp.asarray(machine.period, x.dtype) * self.cycles,
             averages=means(integrals, time),
         )
 
-    def _saltation(self, scene, leg, s, u):
+    def _saltation(self, machine, leg, s, u):
         """How a perturbation passes an event, R + (f⁺ - R f⁻) ∇g / ġ, and how fast it is met.
 
         R is the jump as a function of the state; ġ counts what the guard gains by the clock.
         """
-        old, new = (self.flight(scene, x).moving for x in (leg - 1, leg))
+        old, new = (self.flight(machine, x).smooth for x in (leg - 1, leg))
 
-        def field(scene, u):
-            return ravel_pytree(scene.field(s, self.unravel(u)))[0]
+        def field(machine, u):
+            return ravel_pytree(machine.field(s, self.unravel(u)))[0]
 
         def reset(u):
             def of(event: Event) -> Callable[..., Vector]:
                 modes = self._modes_in(leg - 1)
                 return lambda u: ravel_pytree(
-                    jump_of(scene, event.number, s, self.unravel(u), modes)
+                    jump_of(machine, event.number, s, self.unravel(u), modes)
                 )[0]
 
             return self._each(leg, of, u)
@@ -259,31 +258,31 @@ class Shooting(eqx.Module):
         before, after = field(old, u), field(new, reset(u))
         if self.autonomous:
             # From the section on the clock counts anew, so that what lies along the motion is gone.
-            goes_on = [float(not event.of(scene).ends_cycle) for event in self.events]
+            goes_on = [float(not event.of(machine).ends_cycle) for event in self.events]
             after = jnp.asarray(goes_on, u.dtype)[leg] * after
-        gained, slope = jax.grad(lambda s, u: self.guard(scene, leg, s, u), argnums=(0, 1))(s, u)
+        gained, slope = jax.grad(lambda s, u: self.guard(machine, leg, s, u), argnums=(0, 1))(s, u)
         rate = gained + jnp.dot(slope, before)
 
         def met(event: Event) -> Callable[..., Array]:
-            return lambda u, rate: event.of(scene).speed(scene, self.unravel(u), rate)
+            return lambda u, rate: event.of(machine).speed(machine, self.unravel(u), rate)
 
         approach = self._each(leg, met, u, rate)
         return jacobian + jnp.outer(after - jacobian @ before, slope) / rate, approach
 
-    def _turns(self, scene: AbstractScene, leg: Any, s1: Array, path: Any) -> Turns:
+    def _turns(self, machine: AbstractMachine, leg: Any, s1: Array, path: Any) -> Turns:
         """The turning points of a leg."""
         places, states = path
         h = (s1 - places[0]) / self.steps
-        return turns_of(self.flight(scene, leg), places, states, h)
+        return turns_of(self.flight(machine, leg), places, states, h)
 
-    def _order(self, scene: AbstractScene, leg: Any, event: Event) -> Callable[..., Array]:
+    def _order(self, machine: AbstractMachine, leg: Any, event: Event) -> Callable[..., Array]:
         """Whether a switch goes into the mode of the flight that begins with its event: 1 or -1."""
 
         def order(s, u):
-            if not event.of(scene).holds_mode:
+            if not event.of(machine).holds_mode:
                 return jnp.ones_like(s)
-            j, before = mode_number(scene, event.number), self._modes_in(leg - 1)
-            mode = after_event(scene, event.number, s, self.unravel(u), before)[1][j]
+            j, before = mode_number(machine, event.number), self._modes_in(leg - 1)
+            mode = after_event(machine, event.number, s, self.unravel(u), before)[1][j]
             wanted = self._modes_in(leg)[j]
             return jnp.where(mode == wanted, 1.0, -1.0).astype(s.dtype)
 
@@ -291,7 +290,7 @@ class Shooting(eqx.Module):
 
     def state_at(self, x: Vector, leg: Any, s: Array) -> Any:
         """The state at clock `s`, which lies in leg number `leg`."""
-        scene = self.at(x)
+        machine = self.at(x)
         clock, states = self.parts(x)
-        u = self.after(scene, leg, clock[leg], states[leg])
-        return self.unravel(self.flight(scene, leg).fly(clock[leg], s, u, self.steps)[0])
+        u = self.after(machine, leg, clock[leg], states[leg])
+        return self.unravel(self.flight(machine, leg).fly(clock[leg], s, u, self.steps)[0])

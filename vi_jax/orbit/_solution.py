@@ -42,7 +42,7 @@ def sections_of(problem: Shooting, x: Any) -> tuple[Any, Any]:
 def orbit_of(problem: Shooting, step: Step) -> Orbit:
     """The solution at a step as an `Orbit`."""
     x, seen = jnp.asarray(step.x), step.seen
-    scene = problem.at(x)
+    machine = problem.at(x)
     clock, period = _clock_of(problem, x)
     sections, residual = sections_of(problem, x)
     admissible = seen.clearance >= -1e-9 and min(seen.approach, default=1.0) > -1e-9
@@ -51,16 +51,16 @@ def orbit_of(problem: Shooting, step: Step) -> Orbit:
     within = np.mod(clock[impacts], period)
     order = np.argsort(within)
     stops = np.asarray([problem.events[i].number for i in impacts], np.int32)
-    since = scene.phase_at(within[order])
+    since = machine.phase_at(within[order])
     duration = jnp.asarray(seen.duration)
     return Orbit(
-        scene=scene,
+        machine=machine,
         method=problem.method,
         state=jax.tree.map(lambda x: x[0], sections),
         sections=sections,
         cycles=jnp.asarray(problem.cycles, jnp.int32),
         duration=duration,
-        frequency_ratio=scene.frequency_ratio(duration / problem.cycles),
+        frequency_ratio=machine.frequency_ratio(duration / problem.cycles),
         impact_phase=jnp.asarray(since),
         impact_speed=jnp.asarray(np.asarray(seen.approach)[impacts][order]),
         impact_stop=jnp.asarray(stops[order]),

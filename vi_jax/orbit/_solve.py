@@ -15,12 +15,12 @@ from ..flow.arguments import planned
 from ..flow.loop import run_lane
 from ..flow.methods import MethodLike
 from ..flow.simulate import collect
-from ..scene import Scene
-from ..scene.base import renews
-from ..scene.event import after_event, begin_modes, events_of, is_autonomous
-from ..scene.numbers import leaf, with_leaf
-from ._carrier import carrier, steps_of
+from ..machine import Scene
+from ..machine.base import renews
+from ..machine.event import after_event, begin_modes, events_of, is_autonomous
+from ..machine.numbers import leaf, with_leaf
 from ._events import Event, section_of
+from ._fixed_step_method import fixed_step_method, steps_of
 from ._flight import Flight
 from ._shooting import Shooting
 from ._symmetry import images
@@ -59,9 +59,9 @@ def problem_of(
     orbit: Orbit, parameter: str, bounds: tuple[float, float], method: MethodLike
 ) -> tuple[Shooting, np.ndarray]:
     """The equations of an orbit from impact to impact, and the unknowns it gives."""
-    scene = orbit.scene
-    carried = carrier(method, orbit.method, scene)
-    corners = [with_leaf(scene, parameter, end) for end in bounds]
+    machine = orbit.machine
+    carried = fixed_step_method(method, orbit.method, machine)
+    corners = [with_leaf(machine, parameter, end) for end in bounds]
     cycles = int(orbit.cycles)
     if int(np.sum(np.asarray(orbit.impact_stop) >= 0)) != int(orbit.impacts):
         raise ValueError(
@@ -70,12 +70,12 @@ def problem_of(
         )
     steps = steps_of(carried, corners, orbit.state, cycles)
     found = events_in(orbit)
-    blank = Shooting(scene, carried, orbit.state, cycles, (), (), steps, (parameter,))
-    period = float(scene.cycle) * cycles
+    blank = Shooting(machine, carried, orbit.state, cycles, (), (), steps, (parameter,))
+    period = float(machine.cycle) * cycles
     if blank.autonomous:
         period = float(orbit.duration)
     way = _followed(blank, orbit.state, found, period)
-    known = isinstance(scene, Scene) and not scene.soft_stops  # steps that are enough
+    known = isinstance(machine, Scene) and not machine.soft_stops  # steps that are enough
     while not known:
         finer = dataclasses.replace(blank, steps=2 * blank.steps)
         again = _followed(finer, orbit.state, found, period)
@@ -87,7 +87,7 @@ def problem_of(
             break
     problem = dataclasses.replace(blank, events=tuple(event for _, event in found), modes=way.modes)
     states = way.states[:-1] if found else way.states
-    value = leaf(scene, parameter)
+    value = leaf(machine, parameter)
     x = problem.pack([place for place, _ in found], states, [value], period)
     return problem, np.asarray(x)
 
@@ -102,8 +102,8 @@ class _Way(NamedTuple):
 
 
 def _followed(blank: Shooting, state: Any, found: list[tuple[float, Event]], period: float) -> _Way:
-    scene = blank.scene
-    modes = begin_modes(scene, jnp.zeros(()), state)
+    machine = blank.machine
+    modes = begin_modes(machine, jnp.zeros(()), state)
     u, s = ravel_pytree(state)[0], 0.0
     states, in_flight = [], []
     for place, event in found:
@@ -112,30 +112,30 @@ def _followed(blank: Shooting, state: Any, found: list[tuple[float, Event]], per
         states.append(np.asarray(u))
         here = blank.unravel(u)
         if (place, event.cycle) != (0.0, 0):  # after which an orbit's state is
-            here, modes = after_event(scene, event.number, jnp.asarray(place), here, modes)
+            here, modes = after_event(machine, event.number, jnp.asarray(place), here, modes)
         in_flight.append(tuple(float(m) for m in modes))
         u, s = ravel_pytree(here)[0], place
     states.append(np.asarray(_carry(blank, modes, s, period, u)))
     first = found[0][1] if found and found[0][1].cycle == 0 else None
-    if first is not None and (renews(scene) or first != section_of(scene, 0)):
+    if first is not None and (renews(machine) or first != section_of(machine, 0)):
         states[0] = states[-1]
     return _Way(np.stack(states), tuple(in_flight) or (tuple(float(m) for m in modes),))
 
 
 def events_in(orbit: Orbit) -> list[tuple[float, Event]]:
     """The events of a motion, with the clock of each since the section, in their order."""
-    scene, cycles = orbit.scene, int(orbit.cycles)
-    autonomous = is_autonomous(scene, orbit.state)
-    clock = np.asarray(orbit.impact_phase) - float(scene.phase_at(0.0))
+    machine, cycles = orbit.machine, int(orbit.cycles)
+    autonomous = is_autonomous(machine, orbit.state)
+    clock = np.asarray(orbit.impact_phase) - float(machine.phase_at(0.0))
     stops = np.asarray(orbit.impact_stop)
     found = [(float(s), Event(int(i))) for s, i in zip(clock, stops, strict=True) if i >= 0]
-    begins = float(scene.cycle) * np.arange(cycles)
-    others = bool(scene.switches or scene.events or any(e.ends_cycle for e in scene.stops))
+    begins = float(machine.cycle) * np.arange(cycles)
+    others = bool(machine.switches or machine.events or any(e.ends_cycle for e in machine.stops))
     if others or (autonomous and cycles > 1):
         begins, listed = _listed_events(orbit)
         found = listed if others else found
-    if scene.section(orbit.state) is not None or renews(scene):
-        found += [(float(begins[n]), section_of(scene, n)) for n in range(cycles)]
+    if machine.section(orbit.state) is not None or renews(machine):
+        found += [(float(begins[n]), section_of(machine, n)) for n in range(cycles)]
     # What is met with a section belongs to the cycle that ends there.
     return sorted(found, key=lambda f: (f[0], f[1].cycle is not None))
 
@@ -143,7 +143,7 @@ def events_in(orbit: Orbit) -> list[tuple[float, Event]]:
 def _listed_events(orbit: Orbit) -> tuple[np.ndarray, list[tuple[float, Event]]]:
     """When each cycle of a motion begins, and its impacts and switches, by a simulation."""
     plan, start = planned(
-        orbit.scene, orbit.state, int(orbit.cycles), method=orbit.method, impact_log=_LISTED,
+        orbit.machine, orbit.state, int(orbit.cycles), method=orbit.method, impact_log=_LISTED,
         log_switches=True,
     )  # fmt: skip
     log, begins, counts = (np.asarray(a) for a in _listed(plan, start))
@@ -152,7 +152,7 @@ def _listed_events(orbit: Orbit) -> tuple[np.ndarray, list[tuple[float, Event]]]
             f"Argument `orbit` must have at most {_LISTED} events in a cycle, but has "
             f"{int(counts.max())}."
         )
-    found, events = [], events_of(orbit.scene)
+    found, events = [], events_of(orbit.machine)
     for n, (clock, number) in enumerate(zip(log[0], log[1], strict=True)):
         for s, i in zip(clock[number >= 0], number[number >= 0].astype(int), strict=True):
             if events[i].ends_cycle:
@@ -170,7 +170,7 @@ def _listed(plan, start):
     assert run.impact_log is not None and run.duration is not None
     begins = jnp.concatenate([jnp.zeros((1,)), jnp.cumsum(run.duration)])
     if plan.ticks(start):
-        begins = jnp.asarray(plan.scene.cycle) * jnp.arange(plan.cycles + 1)
+        begins = jnp.asarray(plan.machine.cycle) * jnp.arange(plan.cycles + 1)
     events = run.impact_log
     log = jnp.stack([events.phase, events.stop.astype(events.phase.dtype)])
     return log, begins, run.impacts
@@ -178,7 +178,7 @@ def _listed(plan, start):
 
 @compiled
 def _carry(blank: Shooting, modes, s0, s1, u):
-    flight = Flight(blank.scene, modes, blank.method, blank.like)
+    flight = Flight(blank.machine, modes, blank.method, blank.like)
     return flight.fly(jnp.asarray(s0), jnp.asarray(s1), u, blank.steps)[0]
 
 

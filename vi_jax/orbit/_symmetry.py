@@ -7,12 +7,12 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from ..scene import AbstractScene, RigidStop
+from ..machine import AbstractMachine, RigidStop
 from ._events import Event
 from ._shooting import Shooting
 
 
-def may_be_symmetric(problem: Shooting, scenes: Iterable[AbstractScene]) -> bool:
+def may_be_symmetric(problem: Shooting, machines: Iterable[AbstractMachine]) -> bool:
     """Whether a motion with these events can be its own image, on each of these machines.
 
     A machine that is driven is its own image after half a drive cycle, so that only periods of an
@@ -21,14 +21,14 @@ def may_be_symmetric(problem: Shooting, scenes: Iterable[AbstractScene]) -> bool
     events, half = problem.events, len(problem.events) // 2
     if problem.cycles % 2 == 0 or problem.autonomous or len(events) % 2:
         return False
-    if any(scene.mirrored(problem.like) is None for scene in scenes):
+    if any(machine.mirrored(problem.like) is None for machine in machines):
         return False
     pairs = zip(events[:half], events[half:], strict=True)
-    return all(_are_images(problem.scene, one, other) for one, other in pairs)
+    return all(_are_images(problem.machine, one, other) for one, other in pairs)
 
 
-def _are_images(scene: AbstractScene, one: Event, other: Event) -> bool:
-    left, right = one.of(scene), other.of(scene)
+def _are_images(machine: AbstractMachine, one: Event, other: Event) -> bool:
+    left, right = one.of(machine), other.of(machine)
     if isinstance(left, RigidStop) and isinstance(right, RigidStop):
         return left.coordinate == right.coordinate and left.sign == -right.sign
     return left.holds_mode and right.holds_mode
@@ -40,7 +40,7 @@ def images(problem: Shooting, x: Float[Array, " unknowns"]) -> Float[Array, " di
     half, turn = len(problem.events) // 2, 0.5 * problem.period(x)
 
     def image(u):
-        return ravel_pytree(problem.scene.mirrored(problem.unravel(u)))[0]
+        return ravel_pytree(problem.machine.mirrored(problem.unravel(u)))[0]
 
     if not half:
         middle = ravel_pytree(problem.state_at(x, 0, turn))[0]

@@ -9,9 +9,9 @@ import numpy as np
 
 from .._lazy import lazy
 from ..flow.named import average_names, quantities_on, quantity_names
-from ..scene import AbstractScene
-from ..scene.numbers import components
-from ..scene.units import with_units
+from ..machine import AbstractMachine
+from ..machine.numbers import components
+from ..machine.units import with_units
 from ._shooting import Shooting
 from ._solution import sections_of
 from .curve import Step
@@ -30,10 +30,10 @@ COLUMNS = (
 )  # fmt: skip
 
 
-def column_names(scene: AbstractScene, like: Any) -> tuple[str, ...]:
+def column_names(machine: AbstractMachine, like: Any) -> tuple[str, ...]:
     """What is a number at each point of a branch of this machine, whose states are like this."""
-    inner = (*components(like), *quantity_names(scene, like))
-    return (*COLUMNS, *average_names(scene, like), *(f"section_{name}" for name in inner))
+    inner = (*components(like), *quantity_names(machine, like))
+    return (*COLUMNS, *average_names(machine, like), *(f"section_{name}" for name in inner))
 
 
 def on_sections(problem: Shooting, steps: list[Step]) -> dict[str, np.ndarray]:

@@ -9,14 +9,12 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
+from .._types import Scalar, Vector
 from ..flow.beside import Beside
 from ..flow.events import Rates, guard_rates
-from ..scene import AbstractScene
-from ..scene.event import events_of, guard_of, happens_at, section_number
+from ..flow.smooth import SmoothMachine
+from ..machine.event import events_of, guard_of, happens_at, section_number
 from ._flight import Flight
-
-Scalar = Float[Array, ""]
-Vector = Float[Array, " _"]
 
 # Newton's method has met a turn if it ends this close to it (as a share of the step).
 _TURNED = 1e-3
@@ -56,7 +54,7 @@ class _Guard(NamedTuple):
 
     def value(self, flight: Flight, s: Any, state: Any) -> Any:
         """Of it."""
-        return guard_of(flight.scene, self.number, s, state, flight.modes)
+        return guard_of(flight.machine, self.number, s, state, flight.modes)
 
     def at(self, flight: Flight, s: Any, u: Any) -> Any:
         """Of it, by the state's vector."""
@@ -64,35 +62,35 @@ class _Guard(NamedTuple):
 
     def rate(self, flight: Flight, s: Any, u: Any) -> Any:
         """Its rate, or one of its sign."""
-        return self.rates(flight, flight.moving, s, u).v
+        return self.rates(flight, flight.smooth, s, u).v
 
     def happens(self, flight: Flight, s: Any, u: Any, length: Any) -> Any:
         """Whether the event would happen if it were met a length from here."""
-        if not events_of(flight.scene)[self.number].from_below:
+        if not events_of(flight.machine)[self.number].from_below:
             return jnp.ones((), bool)
         there = flight.unravel(_stepped(flight, (s, length, u)))
-        when = happens_at(flight.scene, self.number, s + length, there, flight.modes)
+        when = happens_at(flight.machine, self.number, s + length, there, flight.modes)
         return jnp.ones((), bool) if when is None else when
 
-    def rates(self, flight: Flight, moving: AbstractScene, s: Any, u: Any) -> Rates:
+    def rates(self, flight: Flight, smooth: SmoothMachine, s: Any, u: Any) -> Rates:
         """It and its first two derivatives."""
 
         def guard(s, state):
             return self.value(flight, s, state)
 
-        return guard_rates(moving.field, guard, s, flight.unravel(u))
+        return guard_rates(smooth.field, guard, s, flight.unravel(u))
 
 
 class _Body(_Guard):
     """A coordinate of the machine."""
 
     def value(self, flight, s, state):
-        return flight.scene.coordinates[self.number].position(state)
+        return flight.machine.coordinates[self.number].position(state)
 
     def rate(self, flight, s, u):
         state = flight.unravel(u)
-        if flight.scene.has_velocity(state):
-            return flight.scene.coordinates[self.number].velocity(state)
+        if flight.machine.has_velocity(state):
+            return flight.machine.coordinates[self.number].velocity(state)
         return super().rate(flight, s, u)
 
     def happens(self, flight, s, u, length):
@@ -109,7 +107,7 @@ def turns_of(
 
     **Arguments:** the flight; clock and state at the start of each step, and its length.
     """
-    scene, begin = flight.scene, places[0]
+    machine, begin = flight.machine, places[0]
     # The end of the last step is the next event: its velocity is that of a further step.
     last = flight.once(_stepped, (places[-1], h, states[-1]))
 
@@ -120,14 +118,14 @@ def turns_of(
             places, states, v, v1
         )
 
-    bodies = [found(_Body(k)) for k in range(len(scene.coordinates))]
+    bodies = [found(_Body(k)) for k in range(len(machine.coordinates))]
     rooms = []
-    for stop in scene.stops:
+    for stop in machine.stops:
         at = bodies[stop.coordinate]
         facing = at.turns & (stop.sign * at.before > 0)
         rooms.append((jnp.where(facing, -stop.beyond(at.height), jnp.inf), at.place))
-    for number, event in enumerate(events_of(scene)):
-        if number < len(scene.stops) or number == section_number(scene):
+    for number, event in enumerate(events_of(machine)):
+        if number < len(machine.stops) or number == section_number(machine):
             continue
         at = found(_Guard(number))
         # A body that friction lets go begins to slide with velocity and acceleration zero.
@@ -162,7 +160,7 @@ def _turn(watched: _Guard, flight: Flight, inputs: Any) -> _Found:
 
     def at(moved: Flight, s: Scalar, u: Vector, length: Scalar) -> Rates:
         after = _stepped(moved, (s, length, u))
-        return watched.rates(flight, moved.moving, s + length, after)
+        return watched.rates(flight, moved.smooth, s + length, after)
 
     held = stop_gradient((eqx.filter(flight, eqx.is_array), s, u))
     still = eqx.combine(held[0], flight)

@@ -13,10 +13,10 @@ from .._checks import interval
 from .._interrupted import Interrupted
 from .._lazy import lazy
 from ..flow.labelled import tidy
-from ..scene.numbers import check_again, check_leaf, leaf, with_leaf
-from ..scene.shown import told_in_table
-from ..scene.units import with_units
-from ._carrier import steps_of
+from ..machine.numbers import check_again, check_leaf, leaf, with_leaf
+from ..machine.shown import summary_table
+from ..machine.units import with_units
+from ._fixed_step_method import steps_of
 from ._shooting import Shooting
 from ._solution import orbit_of
 from ._solve import advance as solved
@@ -38,7 +38,7 @@ _NOISE = 1e-9
 @dataclasses.dataclass(frozen=True)
 class Boundary:
     """A curve in two parameters along which an orbit bifurcates: host arrays, a row a point, in the
-    machine's units (see `AbstractScene.units`)."""
+    machine's units (see `AbstractMachine.units`)."""
 
     kind: str
     """"fold", "period-doubling", "symmetry-breaking" or "grazing"."""
@@ -80,7 +80,7 @@ class Boundary:
         data["multipliers"] = ("point", "state"), self.multipliers
         about = {"kind": self.kind, "ends": list(self.ends)}
         found = xr.Dataset(data, attrs={**about, "period_in_cycles": self.problem.cycles})
-        found = with_units(found, self.problem.scene.units, {name: name for name in self.names})
+        found = with_units(found, self.problem.machine.units, {name: name for name in self.names})
         return tidy(found, along)
 
     def __str__(self) -> str:
@@ -94,7 +94,7 @@ class Boundary:
     __repr__ = __str__
 
     def _repr_html_(self) -> str:
-        return told_in_table(str(self), self.y_min)
+        return summary_table(str(self), self.y_min)
 
 
 def boundary(
@@ -140,7 +140,7 @@ def boundary(
             f"{point.detail}."
         )
     old = point.problem
-    check_leaf(old.scene, parameter)
+    check_leaf(old.machine, parameter)
     names = (old.parameters[0], parameter)
     if names[0] == names[1]:
         raise ValueError(f"Argument `parameter` must be another one than {names[0]}.")
@@ -152,7 +152,7 @@ def boundary(
             f"{bounds!r}."
         ) from None
     bounds = (interval("bounds", first), interval("bounds", second))
-    values = (point.parameter, float(leaf(old.scene, parameter)))
+    values = (point.parameter, float(leaf(old.machine, parameter)))
     for name, value, (low, high) in zip(names, values, bounds, strict=True):
         if not low <= value <= high:
             raise ValueError(
@@ -160,7 +160,7 @@ def boundary(
                 f"({low:g}, {high:g})."
             )
         for bound in (low, high):
-            check_again(with_leaf(old.scene, name, bound))
+            check_again(with_leaf(old.machine, name, bound))
     corners = []
     for a in bounds[0]:
         for b in bounds[1]:
@@ -228,7 +228,7 @@ def boundary(
     return curve
 
 
-class _Lone(eqx.Module):
+class SymmetryCondition(eqx.Module):
     """What keeps a symmetric motion symmetric.
 
     Where it loses its symmetry the equations cannot be solved for it: a departure along the
@@ -247,12 +247,12 @@ class _Lone(eqx.Module):
         return missing + self.left * (departs - self.left @ missing)
 
 
-def _lone(problem: Shooting, x: np.ndarray) -> _Lone:
+def _lone(problem: Shooting, x: np.ndarray) -> SymmetryCondition:
     count = len(problem.parameters)
     left, _, right = np.linalg.svd(np.asarray(jacobian_at(problem, jnp.asarray(x)))[:, :-count])
     direction = jnp.append(jnp.asarray(right[-1]), jnp.zeros(count))
     told = jax.jvp(lambda x: images(problem, x), (jnp.asarray(x),), (direction,))[1]
-    return _Lone(jnp.asarray(left[:, -1]), told / (told @ told))
+    return SymmetryCondition(jnp.asarray(left[:, -1]), told / (told @ told))
 
 
 class _Condition(eqx.Module):
@@ -261,7 +261,7 @@ class _Condition(eqx.Module):
     problem: Shooting
     kind: str = eqx.field(static=True)
     impact: int | None = eqx.field(static=True)
-    lone: "_Lone | None" = None
+    lone: "SymmetryCondition | None" = None
 
     def residual(self, x):
         missing, seen = self.problem.residual(x), self.problem.observe(x)

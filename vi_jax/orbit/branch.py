@@ -13,10 +13,10 @@ from .._interrupted import Interrupted
 from .._lazy import lazy
 from ..flow.labelled import tidy
 from ..flow.methods import MethodLike
-from ..scene.numbers import check_again, check_leaf, leaf, with_leaf
-from ..scene.shown import told_in_table
-from ..scene.units import in_unit, with_units
-from ._follow import Follower
+from ..machine.numbers import check_again, check_leaf, leaf, with_leaf
+from ..machine.shown import summary_table
+from ..machine.units import in_unit, with_units
+from ._monitor import BranchMonitor
 from ._rest import rests
 from ._shooting import Shooting
 from ._solution import orbit_of
@@ -44,7 +44,7 @@ _ROUNDING = 1e-12
 @dataclasses.dataclass(frozen=True)
 class Branch:
     """A branch of periodic motions: host arrays with one row for each point, in their order, in
-    the machine's units (see `AbstractScene.units`)."""
+    the machine's units (see `AbstractMachine.units`)."""
 
     name: str
     """Name of the parameter."""
@@ -63,11 +63,11 @@ class Branch:
     clearance: np.ndarray
     """Smallest distance to a stop at a turn that does not touch it, in the unit of positions."""
     frequency_ratio: np.ndarray
-    """ζ: mean speed of the drive, NaN for scenes that are not driven."""
+    """ζ: mean speed of the drive, NaN for machines that are not driven."""
     duration: np.ndarray
     """Least period in time."""
     averages: dict[str, np.ndarray]
-    """The machine's own averages over the period, by name (see `AbstractScene.averages`)."""
+    """The machine's own averages over the period, by name (see `AbstractMachine.averages`)."""
     cycles: int
     """Period in drive cycles."""
     special: list[SpecialPoint]
@@ -106,7 +106,7 @@ class Branch:
     @property
     def column_names(self) -> tuple[str, ...]:
         """Names of all that is a number at each point, as pictures and tables take them."""
-        return column_names(self.problem.scene, self.problem.like)
+        return column_names(self.problem.machine, self.problem.like)
 
     def column(self, name: str) -> np.ndarray:
         """A number at each point: one of the branch's arrays, one of the machine's averages, or a
@@ -131,7 +131,7 @@ class Branch:
         **Raises:** `TypeError` for a function that returns no numbers, or others at another point.
         """
         orbits = (self.orbit(i) for i in range(len(self.steps)))
-        return table_of(function, orbits, self.name, self.parameter, self.problem.scene.units)
+        return table_of(function, orbits, self.name, self.parameter, self.problem.machine.units)
 
     def orbit(self, index: int) -> Orbit:
         """The motion at one point."""
@@ -179,14 +179,14 @@ class Branch:
         }
         found = xr.Dataset(data, attrs={"parameter": self.name, "period_in_cycles": self.cycles})
         own = {name: name for name in self.averages} | {"parameter": self.name}
-        found = with_units(found, self.problem.scene.units, own)
+        found = with_units(found, self.problem.machine.units, own)
         return tidy(found, along)
 
     def __str__(self) -> str:
         low, high = self.parameter.min(), self.parameter.max()
-        scene = self.problem.scene
-        period, span = scene.period_of(self.cycles), f"[{low:.6g}, {high:.6g}]"
-        span = in_unit(span, scene.units, self.name)
+        machine = self.problem.machine
+        period, span = machine.period_of(self.cycles), f"[{low:.6g}, {high:.6g}]"
+        span = in_unit(span, machine.units, self.name)
         lines = [
             f"Branch of {len(self.parameter)} motions of period {period} with "
             f"{impacts_in_words(self.impact_speed.shape[1])}, "
@@ -199,7 +199,7 @@ class Branch:
     __repr__ = __str__
 
     def _repr_html_(self) -> str:
-        return told_in_table(str(self), self.y_min)
+        return summary_table(str(self), self.y_min)
 
 
 def continue_orbit(
@@ -212,7 +212,7 @@ def continue_orbit(
     max_points: int = 1000,
     method: MethodLike = None,
 ) -> Branch:
-    """Follow a periodic motion in one number of its scene, both ways, through folds.
+    """Follow a periodic motion in one number of its machine, both ways, through folds.
 
     Pseudo-arclength on the equations from impact to impact, which stay smooth at a grazing. Folds,
     period doublings, Neimark–Sacker bifurcations, crossings of branches and grazings are located
@@ -223,14 +223,14 @@ def continue_orbit(
     **Arguments:**
 
     - `orbit`: from `find_orbit`, or from another branch.
-    - `parameter`: name of a number of the scene: `"drive.frequency_ratio"`, `"stops.0.gap"`,
+    - `parameter`: name of a number of the machine: `"drive.frequency_ratio"`, `"stops.0.gap"`,
       `"oscillator.damping_ratio"`, …
     - `bounds`: the interval of the parameter.
     - `step`, `max_step`: first and longest step along the branch, in the norm of the unknowns: the
       state and the clock of each impact in the machine's own units (of a `Scene`: positions in a,
       velocities in a ω, crank angles in radians), the parameter in half its interval.
     - `max_points`: points in each direction at most.
-    - `method`: how the scene is carried, of fixed steps: by default `ExactFlight()` where it
+    - `method`: how the machine is carried, of fixed steps: by default `ExactFlight()` where it
       applies, else 20 steps of `Verner9` a cycle.
 
     **Returns:** a `Branch`.
@@ -250,16 +250,16 @@ def continue_orbit(
             "Argument `orbit` must not rest on a stop, but does: such a motion can be simulated, "
             "swept and found, but not followed as a branch."
         )
-    check_leaf(orbit.scene, parameter)
+    check_leaf(orbit.machine, parameter)
     low, high = interval("bounds", bounds)
-    value = float(leaf(orbit.scene, parameter))
+    value = float(leaf(orbit.machine, parameter))
     if not low <= value <= high:
         raise ValueError(
             f"Argument `bounds` must hold the orbit's {parameter} = {value:g}, but is "
             f"({low:g}, {high:g})."
         )
     for bound in (low, high):
-        check_again(with_leaf(orbit.scene, parameter, bound))
+        check_again(with_leaf(orbit.machine, parameter, bound))
     problem, x = problem_of(orbit, parameter, (low, high), method)
     scale = np.ones(problem.size)
     scale[-1] = 0.5 * (high - low)
@@ -278,11 +278,11 @@ def continue_orbit(
         raise ValueError(
             "Argument `orbit` could not be refined from impact to impact (last correction "
             f"{max(moved, float(start.size)):.2g}): branches cross there, or it is no orbit of "
-            "this scene."
+            "this machine."
         )
-    ahead = Follower(problem, scale, (low, high))
+    ahead = BranchMonitor(problem, scale, (low, high))
     forward = walk(ahead.advance, start, stop=ahead.stop, **settings)
-    back = Follower(problem, scale, (low, high))
+    back = BranchMonitor(problem, scale, (low, high))
     turned = start._replace(tangent=-start.tangent)
     if forward.end in ("closed", INTERRUPTED):
         backward_steps, ends = [], (forward.end, forward.end)
@@ -311,7 +311,7 @@ def _branch(problem, name, steps, special, ends, scale) -> Branch:
         return np.stack([np.asarray(get(step.seen)) for step in steps])
 
     duration = column(lambda seen: seen.duration)
-    ratio = problem.scene.frequency_ratio(jnp.asarray(duration / problem.cycles))
+    ratio = problem.machine.frequency_ratio(jnp.asarray(duration / problem.cycles))
     if ratio is not None and name == "drive.frequency_ratio":
         ratio = xs[:, -1]
     return Branch(

@@ -25,12 +25,11 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from .._checks import count
 from .._programs import compiled
+from .._types import Scalar
 from ..flow.methods.exact import lack_of_closed_form
-from ..scene import IdealDrive, Scene
-from ..scene.shown import Shown
+from ..machine import IdealDrive, Scene
+from ..machine.shown import Shown
 from .floquet import eigenvalues
-
-Scalar = Float[Array, ""]
 
 # Grid points per drive cycle on which turning points are bracketed.
 _POINTS = 256

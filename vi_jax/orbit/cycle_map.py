@@ -12,21 +12,22 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from .._checks import count
+from .._renamed import renamed
 from ..flow import AbstractMethod, Adaptive, FixedStep, simulate
 from ..flow.arguments import as_floats, check_period, check_reals, machine_of
 from ..flow.methods import MethodLike, chosen, preset
-from ..scene import AbstractScene, ShaftScene
-from ._columns import by_columns
+from ..machine import AbstractMachine, ShaftMachine
+from ._forward_jacobian import forward_jacobian
 
 
 class CycleMap(eqx.Module):
     """The Poincaré map over `cycles` drive cycles; made by `cycle_map`.
 
     Differentiable in forward and in reverse mode, to any order, by the state and by every leaf of
-    the scene; clean under `jit` and `vmap`. Where a run fails the values are NaN.
+    the machine; clean under `jit` and `vmap`. Where a run fails the values are NaN.
     """
 
-    scene: AbstractScene
+    machine: AbstractMachine
     """In the phase clock; a `Scene` carries the section phase."""
     method: AbstractMethod
     cycles: int = eqx.field(static=True)
@@ -35,11 +36,11 @@ class CycleMap(eqx.Module):
 
     def __call__(self, state: Any) -> Any:
         """The state `cycles` drive cycles after `state`."""
-        return _end(self, adopted(self.scene, state))
+        return _end(self, adopted(self.machine, state))
 
     def residual(self, state: Any) -> Any:
         """What the motion from `state` lacks to be periodic: the mapped state less `state`."""
-        state = adopted(self.scene, state)
+        state = adopted(self.machine, state)
         return jtu.tree_map(lambda a, b: a - b, _end(self, state), state)
 
     def jacobian(self, state: Any) -> Float[Array, "states states"]:
@@ -47,75 +48,76 @@ class CycleMap(eqx.Module):
 
         Rows and columns are in the order of the state's leaves: Y, V, and W for a motor.
         """
-        x, unravel = ravel_pytree(adopted(self.scene, state))
+        x, unravel = ravel_pytree(adopted(self.machine, state))
         return jax.jacfwd(lambda x: ravel_pytree(_end(self, unravel(x)))[0])(x)
 
 
-@by_columns
+@forward_jacobian
 def _end(cycle_map: CycleMap, state: Any) -> Any:
     run = simulate(
-        cycle_map.scene, state, cycle_map.cycles, method=cycle_map.method, record="sections",
+        cycle_map.machine, state, cycle_map.cycles, method=cycle_map.method, record="sections",
         rests=cycle_map.rests,
     )  # fmt: skip
     return run.last
 
 
+@renamed(scene="machine")
 def cycle_map(
-    scene: AbstractScene,
+    machine: AbstractMachine,
     cycles: int | Int[Array, ""] = 1,
     *,
     method: MethodLike = None,
     section: Any = None,
 ) -> CycleMap:
-    """The Poincaré map of `scene` over a number of drive cycles.
+    """The Poincaré map of `machine` over a number of drive cycles.
 
     **Arguments:**
 
-    - `scene`: a `Scene` with an ideal drive (2 states) or a motor (3 states), or one of your own
+    - `machine`: a `Scene` with an ideal drive (2 states) or a motor (3 states), or one of your own
       whose independent variable counts its cycles. One in the time clock is taken by the angle of
       its shaft.
     - `cycles`: number of drive cycles n, at least 1; static.
-    - `method`: how the scene is carried: by default as by `simulate`, with the `"standard"`
+    - `method`: how the machine is carried: by default as by `simulate`, with the `"standard"`
       preset; but a `Scene` with a motor, whose preset has fixed steps, with
       `Adaptive(Tsit5(), rtol=1e-11)`.
-    - `section`: crank angle of the section (radians) instead of the scene's own, which is 0.
+    - `section`: crank angle of the section (radians) instead of the machine's own, which is 0.
 
-    **Returns:** a `CycleMap`: call it on a state from `scene.start(...)`.
+    **Returns:** a `CycleMap`: call it on a state from `machine.start(...)`.
 
     **Raises:** `ValueError` or `TypeError` for arguments that cannot be used.
     """
-    scene = machine_of(scene)
-    if isinstance(scene, ShaftScene):
+    machine = machine_of(machine)
+    if isinstance(machine, ShaftMachine):
         # In time the section would be an event of its own, and the shaft's angle one more state.
-        scene = scene.in_clock("phase")
+        machine = machine.in_clock("phase")
     if section is not None:
-        scene = scene.at_section(section)
-    method = chosen(scene, method, _usual(scene))
-    method.check(scene)
+        machine = machine.at_section(section)
+    method = chosen(machine, method, _usual(machine))
+    method.check(machine)
     # Tolerances are numbers: another one must not be another program.
     carried: AbstractMethod = jtu.tree_map(
         lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, method
     )
-    return CycleMap(scene, carried, count("cycles", cycles, least=1), scene.may_rest())
+    return CycleMap(machine, carried, count("cycles", cycles, least=1), machine.may_rest())
 
 
-def _usual(scene: AbstractScene) -> AbstractMethod:
+def _usual(machine: AbstractMachine) -> AbstractMethod:
     """The preset, unless its steps are fixed: they err more than an orbit should."""
-    usual = preset(scene)
+    usual = preset(machine)
     return Adaptive(diffrax.Tsit5(), rtol=1e-11) if isinstance(usual, FixedStep) else usual
 
 
-def adopted(scene: AbstractScene, state: Any, name: str = "state") -> Any:
+def adopted(machine: AbstractMachine, state: Any, name: str = "state") -> Any:
     """The state in the argument of this name as a cycle map needs it, in floating-point arrays of
     one type."""
-    if isinstance(scene, ShaftScene):
-        state = scene.by_phase(name, state)
-    state = scene.adopt(state)
+    if isinstance(machine, ShaftMachine):
+        state = machine.by_phase(name, state)
+    state = machine.adopt(state)
     check_reals(name, state)
-    if scene.clock(state) is not None:
+    if machine.clock(state) is not None:
         raise ValueError(
-            "Argument `scene` must count its cycles by its independent variable, but its state "
+            "Argument `machine` must count its cycles by its independent variable, but its state "
             "has a clock."
         )
-    check_period(scene, state)
-    return as_floats(scene, state)
+    check_period(machine, state)
+    return as_floats(machine, state)

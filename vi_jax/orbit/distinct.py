@@ -5,8 +5,8 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .._checks import given_number
-from ..scene.numbers import state_in_words
-from ..scene.shown import told_in_table
+from ..machine.numbers import state_in_words
+from ..machine.shown import summary_table
 from .results import Orbit, impacts_in_words, span_in_words, trimmed
 
 
@@ -21,15 +21,15 @@ class Orbits(list[Orbit]):
     __repr__ = __str__
 
     def _repr_html_(self) -> str:
-        return told_in_table(str(self))
+        return summary_table(str(self))
 
 
 def _in_words(orbit: Orbit) -> str:
     """A motion in one line."""
     cycles = int(orbit.cycles)
-    period = orbit.scene.period_of(cycles)
+    period = orbit.machine.period_of(cycles)
     stable = "stable" if bool(orbit.stable) else "unstable"
-    where, span = state_in_words(orbit.state, 6, orbit.scene.units), span_in_words(orbit, 6)
+    where, span = state_in_words(orbit.state, 6, orbit.machine.units), span_in_words(orbit, 6)
     size = f"greatest multiplier {np.abs(orbit.multipliers).max():.6g}"
     return f"  {period}, {impacts_in_words(int(orbit.impacts))}, {stable}: {where}; {span}; {size}"
 

@@ -16,19 +16,20 @@ from jaxtyping import Array, Float, Int
 from .._checks import count, flag
 from .._numbers import concrete
 from .._programs import compiled
+from .._renamed import renamed
 from ..flow import Run, simulate
 from ..flow.arguments import check_leaves, refuse_arrays
 from ..flow.beside import means
 from ..flow.methods import MethodLike
-from ..scene import AbstractScene, Scene
-from ..scene.event import is_autonomous
-from ._columns import by_columns
+from ..machine import AbstractMachine, Scene
+from ..machine.event import is_autonomous
+from ._forward_jacobian import forward_jacobian
 from ._neutral import neutral
 from ._root import root_of, shooting_matrix
 from .cycle_map import CycleMap, adopted, cycle_map
 from .floquet import multipliers_of
 from .results import ORBIT_RESULTS, Orbit, trimmed
-from .search import AbstractSearch, Newton
+from .root_finders import AbstractRootFinder, Newton
 
 # Places in a cycle at which an orbit can be searched.
 _PLACES = 8
@@ -44,35 +45,36 @@ _SLOW = 0.02
 _DRIFTS = 0.5
 
 
+@renamed(scene="machine")
 def find_orbit(
-    scene: AbstractScene,
+    machine: AbstractMachine,
     guess: Any,
     cycles: int | Int[Array, ""] = 1,
     *,
-    root_finder: AbstractSearch | None = None,
+    root_finder: AbstractRootFinder | None = None,
     method: MethodLike = None,
     section: Any = None,
     impact_log: int = 8,
     throw: bool = False,
 ) -> Orbit:
-    """Find the periodic motion of `scene` near `guess`.
+    """Find the periodic motion of `machine` near `guess`.
 
     Works under `jit` and `vmap`. Everything in the orbit is differentiable by every leaf of the
-    scene, in either mode and to any order, by the implicit function theorem: the search is not
+    machine, in either mode and to any order, by the implicit function theorem: the search is not
     differentiated. Where no orbit was found the derivatives are NaN.
 
     **Arguments:**
 
-    - `scene`: a `Scene` (ideal drive or motor, any crank, any stops), or one of your own whose
+    - `machine`: a `Scene` (ideal drive or motor, any crank, any stops), or one of your own whose
       independent variable counts its cycles.
-    - `guess`: a state on the section from `scene.start(...)`, or another `Orbit`. With arrays of
+    - `guess`: a state on the section from `machine.start(...)`, or another `Orbit`. With arrays of
       one leading axis in it, every guess is searched from in one compiled call.
     - `cycles`: period in drive cycles; static.
     - `root_finder`: `Newton()` (default) or `Gradient(optax_optimiser)`.
-    - `method`: how the scene is carried: by default as by `simulate`, with the `"standard"`
+    - `method`: how the machine is carried: by default as by `simulate`, with the `"standard"`
       preset; but a `Scene` with a motor, whose preset has fixed steps, with
       `Adaptive(Tsit5(), rtol=1e-11)`.
-    - `section`: crank angle of the section (radians) instead of the scene's own, which is 0. The
+    - `section`: crank angle of the section (radians) instead of the machine's own, which is 0. The
       guess and the orbit's states are on it; the search itself is done in eighths of a cycle
       away from it, where the guess's motion is farthest from its impacts, because the map jumps
       where an impact falls on the section.
@@ -88,32 +90,32 @@ def find_orbit(
     **Raises:** `ValueError` or `TypeError` for arguments that cannot be used, before any work.
     """
     root_finder = Newton() if root_finder is None else root_finder
-    if not isinstance(root_finder, AbstractSearch):
+    if not isinstance(root_finder, AbstractRootFinder):
         raise TypeError(
             f"Argument `root_finder` must be `Newton(...)` or `Gradient(...)`, but got "
             f"{root_finder!r}. The integrator is the argument `method`."
         )
     impact_log, throw = count("impact_log", impact_log, least=1), flag("throw", throw)
-    the_map = cycle_map(scene, cycles, method=method, section=section)
+    the_map = cycle_map(machine, cycles, method=method, section=section)
     if the_map.cycles % root_finder.arcs:
         raise ValueError(
             "Argument `root_finder` must have a number of arcs that divides the "
             f"{cycles} cycles, but has {root_finder.arcs} arcs."
         )
     guess = guess.state if isinstance(guess, Orbit) else guess
-    state = adopted(the_map.scene, guess, "guess")
-    _check_guess(the_map.scene, state)
+    state = adopted(the_map.machine, guess, "guess")
+    _check_guess(the_map.machine, state)
     orbit = _find(the_map, state, root_finder, impact_log)
     if throw:
         orbit = eqx.error_if(orbit, ~orbit.successful, "No orbit was found; see `Orbit.result`.")
     return trimmed(orbit)
 
 
-def _check_guess(scene: AbstractScene, state: Any) -> None:
+def _check_guess(machine: AbstractMachine, state: Any) -> None:
     """**Raises:** `ValueError` unless these are numbers, or rows of them for as many guesses."""
     check_leaves("guess", state)
     with contextlib.suppress(AttributeError, TypeError, LookupError):  # which `simulate` explains
-        if not jnp.ndim(scene.position(state)):
+        if not jnp.ndim(machine.position(state)):
             refuse_arrays("guess", "find_orbit", state)
     shapes = {jnp.shape(leaf) for leaf in jtu.tree_leaves(state)}
     if len(shapes) > 1 or len(next(iter(shapes))) > 1:
@@ -129,7 +131,7 @@ def _check_guess(scene: AbstractScene, state: Any) -> None:
 
 
 @compiled
-def _find(the_map: CycleMap, guess: Any, root_finder: AbstractSearch, impact_log: int) -> Orbit:
+def _find(the_map: CycleMap, guess: Any, root_finder: AbstractRootFinder, impact_log: int) -> Orbit:
     def one(guess):
         return _judged(the_map, guess, root_finder, impact_log)
 
@@ -144,14 +146,14 @@ def _run(the_map: CycleMap, state: Any, impact_log: int) -> Run:
     where they are as long."""
     places = _places(the_map, state)
     return simulate(
-        the_map.scene, state, the_map.cycles, method=the_map.method,
+        the_map.machine, state, the_map.cycles, method=the_map.method,
         samples=0 if places == 1 else places, impact_log=impact_log, rests=the_map.rests,
     )  # fmt: skip
 
 
 def _places(the_map: CycleMap, state: Any) -> int:
     """Places of a cycle that are looked at: of an autonomous machine only its section."""
-    return 1 if is_autonomous(the_map.scene, state) else _PLACES
+    return 1 if is_autonomous(the_map.machine, state) else _PLACES
 
 
 def _moved(the_map: CycleMap, guess: Any, impact_log: int) -> tuple[CycleMap, Any, Int[Array, ""]]:
@@ -160,8 +162,8 @@ def _moved(the_map: CycleMap, guess: Any, impact_log: int) -> tuple[CycleMap, An
     The map jumps where an impact falls on its section, and no search gets across; so it is done
     where the guess's motion is farthest from its impacts.
     """
-    scene = the_map.scene
-    if not isinstance(scene, Scene):
+    machine = the_map.machine
+    if not isinstance(machine, Scene):
         return the_map, guess, jnp.zeros((), jnp.int32)
     run = _run(the_map, guess, impact_log)
     assert run.samples is not None and run.impact_log is not None
@@ -173,9 +175,9 @@ def _moved(the_map: CycleMap, guess: Any, impact_log: int) -> tuple[CycleMap, An
     lost = ~jnp.isfinite(sum(jtu.tree_leaves(there)))
     place = jnp.where(lost, 0, place)
     there = jtu.tree_map(lambda a, b: jnp.where(lost, a, b), guess, there)
-    angle = scene.phase_at(jnp.asarray(step, phase.dtype) * place)
-    moved = scene.at_section(jnp.where(angle > 2 * pi, angle - 2 * pi, angle))
-    return dataclasses.replace(the_map, scene=moved), there, place
+    angle = machine.phase_at(jnp.asarray(step, phase.dtype) * place)
+    moved = machine.at_section(jnp.where(angle > 2 * pi, angle - 2 * pi, angle))
+    return dataclasses.replace(the_map, machine=moved), there, place
 
 
 class _Seen(NamedTuple):
@@ -198,13 +200,13 @@ class _Seen(NamedTuple):
 
 
 def _follow(arc: CycleMap, state: Any, impact_log: int) -> _Seen:
-    @by_columns
+    @forward_jacobian
     def seen(arc, state):
         x, unravel = ravel_pytree(state)
 
         def states(x):
             run = simulate(
-                arc.scene, unravel(x), arc.cycles, method=arc.method, record="sections",
+                arc.machine, unravel(x), arc.cycles, method=arc.method, record="sections",
                 rests=arc.rests,
             )  # fmt: skip
             return jnp.stack(jtu.tree_leaves(run.sections), axis=-1)[1:]
@@ -228,9 +230,11 @@ def _follow(arc: CycleMap, state: Any, impact_log: int) -> _Seen:
     return seen(arc, state)
 
 
-def _judged(the_map: CycleMap, guess: Any, root_finder: AbstractSearch, impact_log: int) -> Orbit:
+def _judged(
+    the_map: CycleMap, guess: Any, root_finder: AbstractRootFinder, impact_log: int
+) -> Orbit:
     """The orbit found from one guess, with all that is said about it."""
-    scene, arcs, cycles = the_map.scene, root_finder.arcs, the_map.cycles
+    machine, arcs, cycles = the_map.machine, root_finder.arcs, the_map.cycles
     moved, start, place = _moved(the_map, jax.lax.stop_gradient(guess), impact_log)
     arc = dataclasses.replace(moved, cycles=cycles // arcs)
     root = root_of(arc, start, root_finder)
@@ -255,7 +259,7 @@ def _judged(the_map: CycleMap, guess: Any, root_finder: AbstractSearch, impact_l
     least = _least_period(sections, error)
     monodromy = jacobians[least - 1]
     within = jnp.arange(cycles) < least
-    turn = jnp.asarray(scene.cycle, x.dtype)
+    turn = jnp.asarray(machine.cycle, x.dtype)
     hit = (seen.stop >= 0) & within[:, None]
     if last:
         phase = seen.phase + turn * (jnp.arange(cycles)[:, None] + place / _PLACES)
@@ -268,7 +272,7 @@ def _judged(the_map: CycleMap, guess: Any, root_finder: AbstractSearch, impact_l
         jnp.where(hit.ravel(), a.ravel(), none)[order]
         for a, none in ((phase, jnp.nan), (seen.speed, jnp.nan), (seen.stop, -1.0))
     )
-    phase = scene.phase_at(phase)
+    phase = machine.phase_at(phase)
     duration = jnp.sum(jnp.where(within, seen.duration, 0.0))
     sums = {name: jnp.sum(jnp.where(within, a, 0.0)) for name, a in seen.integrals.items()}
     clearance = jnp.min(jnp.where(within, seen.clearance, jnp.inf))
@@ -276,13 +280,13 @@ def _judged(the_map: CycleMap, guess: Any, root_finder: AbstractSearch, impact_l
     slowest = jnp.min(jnp.where(hit, seen.speed, jnp.inf))
     near = jnp.minimum(slowest, jnp.sqrt(2 * jnp.maximum(clearance, 0))) < _SLOW
     return Orbit(
-        scene=scene,
+        machine=machine,
         method=the_map.method,
         state=unravel(sections[0]),
         sections=jax.vmap(unravel)(sections),
         cycles=least,
         duration=duration,
-        frequency_ratio=scene.frequency_ratio(duration / least),
+        frequency_ratio=machine.frequency_ratio(duration / least),
         impact_phase=phase,
         impact_speed=speed,
         impact_stop=stop.astype(jnp.int32),

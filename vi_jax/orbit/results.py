@@ -12,15 +12,16 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Complex, Float, Int
 
+from .._renamed import refuse_attribute
 from ..flow import AbstractMethod, Run, simulate
 from ..flow.enumeration import NamedEnumeration
 from ..flow.labelled import batch_names, in_names, present, states, tidy
 from ..flow.named import quantities_on
-from ..scene import AbstractScene
-from ..scene.event import is_autonomous
-from ..scene.numbers import plain, state_in_words
-from ..scene.shown import Told
-from ..scene.units import in_unit, name_in, with_units
+from ..machine import AbstractMachine
+from ..machine.event import is_autonomous
+from ..machine.numbers import plain, state_in_words
+from ..machine.shown import Summarized
+from ..machine.units import in_unit, name_in, with_units
 from .floquet import STABILITY, STABILITY_NAMES, stability_of
 
 
@@ -53,15 +54,15 @@ _RESULT_NAMES = (
 )  # fmt: skip
 
 
-class Orbit(Told):
+class Orbit(Summarized):
     """A periodic motion, from `find_orbit`; look at `result` before you use it.
 
     Under `vmap` every array has the batch axes in front, and the impact arrays are padded with
-    NaN (stops: -1). Numbers are in the machine's units (see `AbstractScene.units`): those of a
+    NaN (stops: -1). Numbers are in the machine's units (see `AbstractMachine.units`): those of a
     `Scene` in a and ω.
     """
 
-    scene: AbstractScene
+    machine: AbstractMachine
     """What moves; in the phase clock."""
     method: AbstractMethod
     state: Any
@@ -73,14 +74,14 @@ class Orbit(Told):
     duration: Float[Array, "..."]
     """Least period in time τ."""
     frequency_ratio: Float[Array, "..."] | None
-    """ζ: mean speed of the drive over the period; `None` for scenes that are not driven."""
+    """ζ: mean speed of the drive over the period; `None` for machines that are not driven."""
     impact_phase: Float[Array, "... impacts"]
     """Clock of each impact, rising from the section on, in the machine's units: the crank angle in
     radians for a `Scene`, what counts the cycles for any other."""
     impact_speed: Float[Array, "... impacts"]
     """V⁻, speed of approach just before each impact, in the machine's unit (of a `Scene` a ω)."""
     impact_stop: Int[Array, "... impacts"]
-    """Index into `scene.stops` of each impact."""
+    """Index into `machine.stops` of each impact."""
     impacts: Int[Array, "..."]
     """Number of impacts in the period."""
     y_min: Float[Array, "..."]
@@ -107,7 +108,10 @@ class Orbit(Told):
     """Whether an orbit was found, or why not."""
     averages: dict[str, Float[Array, "..."]] = eqx.field(default_factory=dict)
     """The machine's own averages over the time of the period, by name (see
-    `AbstractScene.averages`)."""
+    `AbstractMachine.averages`)."""
+
+    def __getattr__(self, name: str) -> Any:
+        raise refuse_attribute(self, name, {"scene": "machine"})
 
     @property
     def successful(self) -> Bool[Array, "..."]:
@@ -135,8 +139,8 @@ class Orbit(Told):
     @property
     def quantities(self) -> dict[str, Float[Array, "... cycles"]]:
         """The machine's own functions of its state on the sections, by name (see
-        `AbstractScene.quantities`)."""
-        return quantities_on(self.scene, self.sections, self.residual.ndim)
+        `AbstractMachine.quantities`)."""
+        return quantities_on(self.machine, self.sections, self.residual.ndim)
 
     @property
     def slowest_impact(self) -> Float[Array, "..."]:
@@ -150,7 +154,7 @@ class Orbit(Told):
         """Whether the motion stays inside the gap and every impact approaches its stop."""
         slack = 1e4 * jnp.finfo(self.y_max.dtype).eps
         inside = self.clearance >= 0
-        for stop in self.scene.stops:
+        for stop in self.machine.stops:
             if stop.coordinate:
                 continue  # the extremes are those of the first coordinate
             reach = self.y_max if stop.sign > 0 else -self.y_min
@@ -168,15 +172,15 @@ class Orbit(Told):
             raise ValueError(
                 f"`trajectory` needs one orbit, but this is a batch of shape {self.residual.shape}."
             )
-        scene = self.scene
+        machine = self.machine
         if cycles is None:
             cycles = int(self.cycles)
-        if is_autonomous(scene, self.state):
+        if is_autonomous(machine, self.state):
             # Its cycles need not be of one length: the whole motion is one interval.
-            scene = scene.observed_every(self.duration * (cycles / self.cycles))
+            machine = machine.observed_every(self.duration * (cycles / self.cycles))
             samples, cycles = samples * cycles, 1
         return simulate(
-            scene, self.state, cycles, method=self.method, samples=samples,
+            machine, self.state, cycles, method=self.method, samples=samples,
             impact_log=impact_log,
         )  # fmt: skip
 
@@ -211,9 +215,9 @@ class Orbit(Told):
         }
         data = xr.Dataset(variables | present(words, batch))
         own = {name: name for name in self.averages}
-        return tidy(with_units(data, self.scene.units, own), along)
+        return tidy(with_units(data, self.machine.units, own), along)
 
-    def told(self) -> str:
+    def summary(self) -> str:
         """The motion, its impacts and its multipliers."""
         if self.residual.ndim:
             found, stable = int(jnp.sum(self.successful)), int(jnp.sum(self.stable))
@@ -224,8 +228,8 @@ class Orbit(Told):
         if not bool(self.successful):
             reason = ORBIT_RESULTS[self.result]
             return f"No orbit: {reason} Residual {float(self.residual):.3g}."
-        count, cycles, units = int(self.impacts), int(self.cycles), self.scene.units
-        period = self.scene.period_of(cycles)
+        count, cycles, units = int(self.impacts), int(self.cycles), self.machine.units
+        period = self.machine.period_of(cycles)
         lines = [
             f"Orbit of period {period} with {impacts_in_words(count)}, {STABILITY[self.stability]}",
             f"  section: {state_in_words(self.state, 9, units)}",
@@ -235,7 +239,7 @@ class Orbit(Told):
             self.impact_phase, self.impact_speed, self.impact_stop, strict=True
         ):
             if stop >= 0:
-                name = self.scene.stops[int(stop)].side
+                name = self.machine.stops[int(stop)].side
                 fast = in_unit(f"{float(speed):.9g}", units, "velocity")
                 lines.append(f"  impact: {name} stop at phase {float(phase):.6f}, V⁻ = {fast}")
         for name, x in self.averages.items():
@@ -258,8 +262,8 @@ class Orbit(Told):
 def span_in_words(orbit: Orbit, digits: int) -> str:
     """The interval of the first coordinate, by the name that pictures give it."""
     low, high = (plain(x, digits) for x in (orbit.y_min, orbit.y_max))
-    span = in_unit(f"[{low}, {high}]", orbit.scene.units, "position")
-    return f"{name_in(orbit.scene.labels[0])} in {span}"
+    span = in_unit(f"[{low}, {high}]", orbit.machine.units, "position")
+    return f"{name_in(orbit.machine.labels[0])} in {span}"
 
 
 def complex_in_words(z: complex, digits: int, rounding: float) -> str:

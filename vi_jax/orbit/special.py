@@ -7,7 +7,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from .._checks import given_number
-from ..scene.shown import told_in_table
+from ..machine.shown import summary_table
 from ._events import Event
 from ._shooting import Shooting
 from ._solution import orbit_of
@@ -77,7 +77,7 @@ class SpecialPoint:
     __repr__ = __str__
 
     def _repr_html_(self) -> str:
-        return told_in_table(str(self))
+        return summary_table(str(self))
 
 
 def _along(point: SpecialPoint, distance: float) -> Orbit:
@@ -141,7 +141,7 @@ def _crossed(point: SpecialPoint, distance: float) -> Orbit:
 def _beyond_grazing(point: SpecialPoint, distance: float) -> Orbit:
     """The motion with the grazing impact less, or with the touch as an impact more."""
     old, step = point.problem, point.step
-    if old.modes[0] or old.scene.events:
+    if old.modes[0] or old.machine.events:
         raise ValueError(
             "`switch` at a grazing needs a machine without soft stops, friction or other switches, "
             "modes of its own and `events`: find the motion beyond it with `find_orbit`."

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from ..flow import simulate
-from ..scene import Parameters, Scene, SliderCrank
+from ..machine import Parameters, Scene, SliderCrank
 from .claims import CONFIRMED, CONTRADICTED, PARTLY, Claim
 from .motions import CYCLES, FREQUENCY_RATIO, GAP, RESTITUTION, Case, run_of, sampled
 from .motors import Motors

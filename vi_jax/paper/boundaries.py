@@ -11,9 +11,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from scipy.interpolate import CubicSpline
 
+from ..machine import Parameters, Scene
 from ..orbit import Boundary, Branch, SpecialPoint, boundary, continue_orbit, find_orbit
 from ..plot.colors import DASHES, color_of, paler
-from ..scene import Parameters, Scene
 from .motions import FREQUENCY_RATIO, GAP, RESTITUTION, orbits, table_damping_ratio
 from .response import RANGE, RATIO
 
@@ -95,7 +95,7 @@ def boundary_curves(branches: Sequence[Branch] = (), *, quick: bool = False) -> 
 def _branch(cycles: int, k: float, known: Sequence[Branch]) -> Branch:
     """The undamped branch in ζ with one impact in `cycles` cycles: a known one, or a new one."""
     for branch in known:
-        scene = branch.problem.scene
+        scene = branch.problem.machine
         if (
             (branch.name, branch.cycles, branch.impact_speed.shape[1]) == (RATIO, cycles, 1)
             and isinstance(scene, Scene)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..flow import simulate
-from ..scene import Parameters
+from ..machine import Parameters
 from .motions import FREQUENCY_RATIO, GAP, RESTITUTION, figure_scene, orbits
 from .printed import energy_drift, eq21_misses
 

@@ -85,7 +85,7 @@ def _draw_row(number: int, case: Case, axes: list[Axes]) -> None:
 def _panel(ax: Axes, number: int, case: Case, run: Run, window: tuple[int, int]) -> None:
     """A few cycles of the run with the closed forms on top."""
     plot_history(
-        run, scene=case.scene, ax=ax, window=window, stops=False, lw=3.2,
+        run, machine=case.scene, ax=ax, window=window, stops=False, lw=3.2,
         color=_INK, alpha=0.55, label="simulation",
     )  # fmt: skip
     for period, dash in ((1, (4, 2)), (2, (5, 3))):
@@ -106,7 +106,7 @@ def _tiled(
 ) -> tuple[np.ndarray, np.ndarray]:
     """A closed form over the cycles of a window, corners at the impacts included."""
     run = case.on_short if period == 1 else case.from_long
-    one = motion_path(run, scene=case.scene, window=(0, period))
+    one = motion_path(run, machine=case.scene, window=(0, period))
     starts = range(window[0] - 2 * period + shift % period, window[1] + period)
     starts = [start for start in starts if (start - shift) % period == 0]
     place = np.concatenate([one.cycles + start for start in starts])

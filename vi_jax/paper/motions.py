@@ -6,8 +6,8 @@ import jax
 import numpy as np
 
 from ..flow import ExactFlight, Run, simulate
+from ..machine import Parameters, Scene
 from ..orbit import ClosedFormOrbits
-from ..scene import Parameters, Scene
 from .orbits import fit_long
 from .orbits import orbits as orbits
 

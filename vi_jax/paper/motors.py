@@ -11,11 +11,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ..flow import Run, simulate
+from ..machine import Parameters, Scene
 from ..orbit import Orbit, find_orbit
 from ..orbit.results import trimmed
 from ..plot.colors import STOP, color_of
 from ..plot.motion import angle_axis
-from ..scene import Parameters, Scene
 from .motions import CYCLES, FREQUENCY_RATIO, RESTITUTION, SAMPLES, figure_scene
 from .orbits import TableRow, orbits
 

@@ -5,8 +5,8 @@ from typing import NamedTuple
 import equinox as eqx
 import optax
 
+from ..machine import Scene
 from ..orbit import Gradient, Orbit, closed_form_orbits, find_orbit
-from ..scene import Scene
 
 # How wrong the fit's guess is, and how well it must do: no transient is to be seen afterwards.
 _WRONG, _FITTED = 0.05, 1e-10

@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..flow import Adaptive, simulate
-from ..scene import AbstractScene, RigidStop, TimedMotorState
+from ..machine import AbstractMachine, RigidStop, TimedMotorState
 
 
-class CoastingScene(AbstractScene):
+class CoastingScene(AbstractMachine):
     """The machine without motor, damping and loss at the stop (T0 = 0, c = 0, k = 1), in time τ.
 
     Its drive equation is Eq. 1 for u = cos φ with two switches, so that the right form and the

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 from matplotlib.figure import Figure
 
 from .._files import write_whole
+from ..machine import Scene
 from ..plot import save_picture
-from ..scene import Scene
 from .assumptions import check_assumptions
 from .boundaries import boundary_curves, describe_boundaries, draw_boundaries
 from .claims import Claim, check_claims

@@ -10,6 +10,8 @@ import jax.tree_util as jtu
 import numpy as np
 
 from ..flow import jit
+from ..machine import RigidStop, Scene
+from ..machine.numbers import with_leaf
 from ..orbit import (
     Branch,
     ClosedFormOrbits,
@@ -18,8 +20,6 @@ from ..orbit import (
     find_orbit,
 )
 from ..scan import REGIMES, Sweep, lyapunov, sweep
-from ..scene import RigidStop, Scene
-from ..scene.numbers import with_leaf
 from .motions import GAP, table_damping_ratio
 
 RESTITUTIONS = (0.8, 0.5)

@@ -5,8 +5,8 @@ from math import cos, pi, sin, sqrt
 import numpy as np
 from matplotlib.figure import Figure
 
+from ..machine import Parameters
 from ..plot.pen import Pen
-from ..scene import Parameters
 
 
 def draw_sketch() -> Figure:

@@ -18,9 +18,10 @@ from PIL import Image
 
 from .._checks import count, flag, given_number, instance_of, unwritable
 from .._files import write_whole
+from .._renamed import renamed
 from ..flow import Run
+from ..machine import AbstractMachine, Scene
 from ..orbit import Orbit
-from ..scene import AbstractScene, Scene
 from .colors import BLUE, RED
 from .motion import plot_history
 from .path import motion_path
@@ -44,9 +45,10 @@ class _Frames(NamedTuple):
     positions: np.ndarray
 
 
+@renamed(scene="machine")
 def animate(
     motion: Run | Orbit,
-    scene: AbstractScene | None = None,
+    machine: AbstractMachine | None = None,
     *,
     window: tuple[float | int, float | int] | None = None,
     seconds: float | int | None = None,
@@ -62,8 +64,8 @@ def animate(
 
     - `motion`: a `Run` simulated with `samples=...` (and `impact_log=...`, so that impacts are met
       where they are), or an `Orbit`, of which one period is drawn.
-    - `scene`: the machine; needed for a run, and left out for an orbit, which knows its own. How it
-      is drawn is told at `plot_sketch`.
+    - `machine`: the machine; needed for a run, and left out for an orbit, which knows its own. How
+      it is drawn is told at `plot_sketch`.
     - `window`: the first and the last cycle to draw.
     - `seconds`: how long it lasts; by default 2.5 s a cycle, up to 12 s.
     - `fps`: frames a second.
@@ -80,15 +82,15 @@ def animate(
     fps = count("fps", fps, least=1, most=100)
     history = flag("history", history)
     if isinstance(motion, Orbit):
-        if scene is not None:
-            raise ValueError("Argument `scene` must be left out: an orbit has its own.")
+        if machine is not None:
+            raise ValueError("Argument `machine` must be left out: an orbit has its own.")
         if not motion.residual.ndim and not bool(motion.successful):
             raise ValueError("Argument `motion` must be an orbit that was found, but is none.")
-        scene, motion = motion.scene, motion.trajectory(samples=_SAMPLES)
-    if scene is None:
-        raise ValueError("Argument `scene` must be given for a `Run`: it says what to draw.")
-    instance_of("scene", scene, AbstractScene, "a `Scene` or an `AbstractScene`")
-    path = motion_path(motion, scene=scene, window=window)
+        machine, motion = motion.machine, motion.trajectory(samples=_SAMPLES)
+    if machine is None:
+        raise ValueError("Argument `machine` must be given for a `Run`: it says what to draw.")
+    instance_of("machine", machine, AbstractMachine, "a `Scene` or an `AbstractMachine`")
+    path = motion_path(motion, machine=machine, window=window)
     good = np.isfinite(path.Y)
     if np.sum(good) < 2:
         raise ValueError(
@@ -99,11 +101,13 @@ def animate(
     if seconds is None:
         seconds = min(_LONGEST, _UNHURRIED * shown)
     seconds = given_number("seconds", seconds, low=0.0, high=3600.0, open_low=True)
-    frames = _frames(motion, scene, path, good, max(2, ceil(seconds * fps)))
-    return MotionAnimation(figure, scene, motion, frames, fps, history)
+    frames = _frames(motion, machine, path, good, max(2, ceil(seconds * fps)))
+    return MotionAnimation(figure, machine, motion, frames, fps, history)
 
 
-def _frames(run: Run, scene: AbstractScene, path: Any, good: np.ndarray, number: int) -> _Frames:
+def _frames(
+    run: Run, machine: AbstractMachine, path: Any, good: np.ndarray, number: int
+) -> _Frames:
     """Frames evenly spaced in time, states in between samples by interpolation."""
     samples = run.samples
     assert samples is not None
@@ -121,8 +125,8 @@ def _frames(run: Run, scene: AbstractScene, path: Any, good: np.ndarray, number:
     states = jax.tree_util.tree_map(between, samples.state)
     # The corners of the path at its impacts, which no samples have.
     Y, V = (np.interp(at, path.cycles[good], x[good]) for x in (path.Y, path.V))
-    states = jax.vmap(scene.coordinates[0].placed)(states, Y, V)
-    places = [np.asarray(jax.vmap(c.position)(states), float) for c in scene.coordinates]
+    states = jax.vmap(machine.coordinates[0].placed)(states, Y, V)
+    places = [np.asarray(jax.vmap(c.position)(states), float) for c in machine.coordinates]
     return _Frames(at, states, np.stack(places))
 
 
@@ -133,13 +137,13 @@ class MotionAnimation(animation.FuncAnimation):
     """
 
     def __init__(
-        self, figure: Figure | None, scene: AbstractScene, run: Run, frames: _Frames, fps: int,
+        self, figure: Figure | None, machine: AbstractMachine, run: Run, frames: _Frames, fps: int,
         history: bool,
     ):  # fmt: skip
         self.fps = fps
         """Frames a second."""
-        self._scene, self._frames = scene, frames
-        self._reach = reach_of(scene, frames.positions)
+        self._scene, self._frames = machine, frames
+        self._reach = reach_of(machine, frames.positions)
         self._above = Figure().subplots()
         self._limits = self._measured()
         (left, right), (low, high) = self._limits
@@ -153,7 +157,7 @@ class MotionAnimation(animation.FuncAnimation):
         figure.subplots_adjust(left=0.09, right=0.98, top=0.98, bottom=0.55 / (tall + _BELOW))
         if not history:
             figure.subplots_adjust(bottom=0.02)
-        self._below = _History(below[0], run, scene, frames) if history else None
+        self._below = _History(below[0], run, machine, frames) if history else None
         super().__init__(
             figure, self._draw, frames=len(frames.cycles), interval=1000 / fps, repeat=True
         )
@@ -181,12 +185,12 @@ class MotionAnimation(animation.FuncAnimation):
         return []
 
     def _sketched(self, index: int) -> None:
-        scene, frames = self._scene, self._frames
+        machine, frames = self._scene, self._frames
         state = jax.tree_util.tree_map(lambda x: jnp.asarray(x[index]), frames.states)
-        turn = float(scene.turn)
-        phase = float(scene.phase_at((frames.cycles[index] % 1.0) * turn))
-        pen = Pen(self._above, reach=self._reach, size=size_of(scene, self._reach))
-        sketch(scene, pen, state, phase)
+        turn = float(machine.turn)
+        phase = float(machine.phase_at((frames.cycles[index] % 1.0) * turn))
+        pen = Pen(self._above, reach=self._reach, size=size_of(machine, self._reach))
+        sketch(machine, pen, state, phase)
 
     def _measured(self) -> tuple[tuple[float, float], tuple[float, float]]:
         """The room that all frames take, so that none of them moves the others."""
@@ -259,15 +263,15 @@ class MotionAnimation(animation.FuncAnimation):
 class _History:
     """The time history with what has passed drawn over it."""
 
-    def __init__(self, ax: Axes, run: Run, scene: AbstractScene, frames: _Frames):
-        unit = "angle" if isinstance(scene, Scene) else "cycles"
+    def __init__(self, ax: Axes, run: Run, machine: AbstractMachine, frames: _Frames):
+        unit = "angle" if isinstance(machine, Scene) else "cycles"
         ends = float(frames.cycles[0]), float(frames.cycles[-1])
         window = ends[0] - 1e-9, ends[1] + 1e-9
-        plot_history(run, scene=scene, ax=ax, window=window, unit=unit, color="0.75", lw=1.2)
+        plot_history(run, machine=machine, ax=ax, window=window, unit=unit, color="0.75", lw=1.2)
         if unit == "cycles":
             ax.set_xlabel("drive cycles")
         self._factor = 2.0 if unit == "angle" else 1.0
-        path = motion_path(run, scene=scene, window=window)
+        path = motion_path(run, machine=machine, window=window)
         self._place, self._Y = self._factor * path.cycles, path.Y
         self._frames = frames
         (self._line,) = ax.plot([], [], color=BLUE, lw=1.6)

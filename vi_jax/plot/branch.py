@@ -8,10 +8,10 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from .._checks import instance_of, one_of
+from ..machine.units import in_brackets, name_in, quantity_of, unit_of
 from ..orbit import Boundary, Branch
 from ..orbit.results import impacts_in_words
 from ..scan import Sweep
-from ..scene.units import in_brackets, name_in, quantity_of, unit_of
 from .colors import DASHES, MARKS, color_of, mark_style, once
 from .motion import new_axes
 
@@ -63,7 +63,7 @@ def plot_branch(
         part = slice(start, end)
         ax.plot(across[part], up[part], **{"ls": "-" if solid else "--", **look})
     if label is None and legend:
-        motion = f"{branch.problem.scene.period_of(branch.cycles)}, {impacts_in_words(impacts)}"
+        motion = f"{branch.problem.machine.period_of(branch.cycles)}, {impacts_in_words(impacts)}"
         ax.plot([], [], label=once(ax, motion), **{"ls": "-", **look})
     for word, line, drawn in ((_STABLE, "-", stable.any()), (_UNSTABLE, "--", not stable.all())):
         if drawn:
@@ -76,9 +76,9 @@ def plot_branch(
                 ax.plot(point.parameter, float(value), **mark)
     if legend:
         _legend(ax)
-    scene = branch.problem.scene
-    ax.set_xlabel("ζ" if x == "frequency_ratio" else axis_name(branch.name, scene.units))
-    ax.set_ylabel(extreme_name(y, scene.labels, scene.units, branch.averages))
+    machine = branch.problem.machine
+    ax.set_xlabel("ζ" if x == "frequency_ratio" else axis_name(branch.name, machine.units))
+    ax.set_ylabel(extreme_name(y, machine.labels, machine.units, branch.averages))
     return ax
 
 
@@ -156,7 +156,7 @@ def plot_boundary(curve: Boundary, *, ax: Axes | None = None, **style: Any) -> A
         look.pop("ls")
     color = color_of(curve.problem.cycles, curve.impact_speed.shape[1])
     ax.plot(*curve.parameters.T, **{"color": color, **look, **style})
-    units = curve.problem.scene.units
+    units = curve.problem.machine.units
     ax.set_xlabel(axis_name(curve.names[0], units))
     ax.set_ylabel(axis_name(curve.names[1], units))
     return ax
@@ -165,7 +165,7 @@ def plot_boundary(curve: Boundary, *, ax: Axes | None = None, **style: Any) -> A
 def extreme_name(
     name: str, labels: tuple[str, str], units: Mapping[str, str], averages: Any = ()
 ) -> str:
-    """What an axis of smallest or greatest positions says, in the words of a scene; or one of the
+    """What an axis of smallest or greatest positions says, in the words of a machine; or one of the
     machine's own averages."""
     if name in averages:
         return in_brackets(f"mean {name}", unit_of(units, name))
@@ -180,7 +180,7 @@ def extreme_name(
 
 
 def axis_name(name: str, units: Mapping[str, str]) -> str:
-    """The field's symbol for a number of a scene, with its unit unless it is a ratio."""
+    """The field's symbol for a number of a machine, with its unit unless it is a ratio."""
     symbols = {
         "frequency_ratio": "frequency ratio ζ",
         "restitution": "restitution k",

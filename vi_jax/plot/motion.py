@@ -5,8 +5,9 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, MultipleLocator
 
+from .._renamed import renamed
 from ..flow import Run, Samples
-from ..scene import AbstractScene
+from ..machine import AbstractMachine
 from .colors import BLUE, STOP, once
 from .path import motion_path
 
@@ -20,10 +21,11 @@ def new_axes(ax: Axes | None) -> Axes:
     return plt.subplots(figsize=(7, 3.5), layout="constrained")[1]
 
 
+@renamed(scene="machine")
 def plot_history(
     motion: Run | Samples,
     *,
-    scene: AbstractScene | None = None,
+    machine: AbstractMachine | None = None,
     ax: Axes | None = None,
     window: tuple[float | int, float | int] | None = None,
     shift: float | int = 0,
@@ -31,35 +33,35 @@ def plot_history(
     stops: bool = True,
     **style: Any,
 ) -> Axes:
-    """Position over the drive's clock, with the stops of `scene` as green lines.
+    """Position over the drive's clock, with the stops of `machine` as green lines.
 
     **Arguments:**
 
     - `motion`: a `Run` simulated with `samples=...`, or its `Samples`.
-    - `scene`: the scene, for its stops and for impacts logged in the run.
+    - `machine`: the machine, for its stops and for impacts logged in the run.
     - `ax`: axes to draw into; a new figure if left out.
     - `window`: the first and the last cycle to draw.
     - `shift`: cycles to move the motion by along the axis.
     - `unit`: `"angle"` (crank angle φ in units of π) or `"cycles"`; by default the clock of the
-      `scene`, which is the angle for the paper's machine and where no scene is given.
+      `machine`, which is the angle for the paper's machine and where no machine is given.
     - `stops`: whether to draw the stops.
     - `style`: options of `Axes.plot`.
 
     **Returns:** the axes.
     """
-    turning = scene is None or scene.period_of(1) == "2π"
+    turning = machine is None or machine.period_of(1) == "2π"
     if unit is None:
         unit = "angle" if turning else "cycles"
     if unit not in ("angle", "cycles"):
         raise ValueError(f"Argument `unit` must be 'angle' or 'cycles', but got {unit!r}.")
     ax = new_axes(ax)
-    path = motion_path(motion, scene=scene, window=window)
+    path = motion_path(motion, machine=machine, window=window)
     factor = 2.0 if unit == "angle" else 1.0
     ax.plot(factor * (path.cycles + shift), path.Y, **{"color": BLUE, "lw": 1.3, **style})
-    if stops and scene is not None:
-        for stop in scene.stops:
+    if stops and machine is not None:
+        for stop in machine.stops:
             ax.axhline(float(stop.place), color=STOP, lw=1.8, label=once(ax, "stop"))
-    ax.set_ylabel(_labels(motion, scene)[0])
+    ax.set_ylabel(_labels(motion, machine)[0])
     if unit == "cycles":
         ax.set_xlabel("drive cycles φ/(2π)" if turning else "cycles since the start")
     else:
@@ -67,10 +69,10 @@ def plot_history(
     return ax
 
 
-def _labels(motion: Run | Samples, scene: AbstractScene | None) -> tuple[str, str]:
+def _labels(motion: Run | Samples, machine: AbstractMachine | None) -> tuple[str, str]:
     """What position and velocity are called; samples alone do not know their machine."""
-    if scene is not None:
-        return scene.labels
+    if machine is not None:
+        return machine.labels
     return motion.labels if isinstance(motion, Run) else ("Y", "V")
 
 
@@ -86,9 +88,10 @@ def _multiple_of_pi(value: float | int, _: int | None = None) -> str:
     return {0: "0", 1: "π", -1: "-π"}.get(whole, f"{whole}π")
 
 
+@renamed(scene="machine")
 def plot_phase_portrait(
     motion: Run | Samples,
-    scene: AbstractScene | None = None,
+    machine: AbstractMachine | None = None,
     *,
     ax: Axes | None = None,
     window: tuple[float | int, float | int] | None = None,
@@ -103,19 +106,19 @@ def plot_phase_portrait(
     **Returns:** the axes.
     """
     ax = new_axes(ax)
-    path = motion_path(motion, scene=scene, window=window)
+    path = motion_path(motion, machine=machine, window=window)
     (line,) = ax.plot(path.Y, path.V, **{"color": BLUE, "lw": 1.0, **style})
     if sections:
         only = motion.samples if isinstance(motion, Run) else motion  # without the impacts
         assert only is not None
-        samples = motion_path(only, scene=scene, window=window)
+        samples = motion_path(only, machine=machine, window=window)
         whole = abs(samples.cycles - samples.cycles.round()) < 1e-9
         dots = {"ms": 4, "color": line.get_color(), "zorder": 3, "label": once(ax, "section")}
         ax.plot(samples.Y[whole], samples.V[whole], "o", **dots)
-    if scene is not None:
-        for stop in scene.stops:
+    if machine is not None:
+        for stop in machine.stops:
             ax.axvline(float(stop.place), color=STOP, lw=1.8, label=once(ax, "stop"))
-    position, velocity = _labels(motion, scene)
+    position, velocity = _labels(motion, machine)
     ax.set_xlabel(position)
     ax.set_ylabel(velocity)
     return ax

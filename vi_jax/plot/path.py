@@ -6,15 +6,16 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from .._renamed import renamed
 from ..flow import Run, Samples
+from ..machine import AbstractMachine
 from ..orbit import Orbit
-from ..scene import AbstractScene
 
 
-def _coordinates(scene: AbstractScene | None) -> tuple[Callable[[Any], Any], ...]:
+def _coordinates(machine: AbstractMachine | None) -> tuple[Callable[[Any], Any], ...]:
     """What the stops limit and its velocity, of a state; by default the names of the paper."""
-    if scene is not None:
-        return jax.vmap(scene.position), jax.vmap(scene.velocity)
+    if machine is not None:
+        return jax.vmap(machine.position), jax.vmap(machine.velocity)
     return (lambda state: state.Y), (lambda state: state.V)
 
 
@@ -29,20 +30,21 @@ class MotionPath(NamedTuple):
     """dY/dτ (unit: a ω)."""
 
 
+@renamed(scene="machine")
 def motion_path(
     motion: Run | Samples,
     *,
-    scene: AbstractScene | None = None,
+    machine: AbstractMachine | None = None,
     window: tuple[float | int, float | int] | None = None,
 ) -> MotionPath:
     """The path of one sampled motion.
 
-    **Arguments:** a `Run` simulated with `samples=...` (or its `Samples`); with the `scene`, the
+    **Arguments:** a `Run` simulated with `samples=...` (or its `Samples`); with the `machine`, the
     impacts logged (`impact_log=...`) enter as two points each, before and after the impact, so
     that a corner at the stop is drawn where it is; `window`, the first and the last cycle to keep.
 
     **Raises:** `ValueError` if the run has no samples or is a batch, or its states lack `Y` and `V`
-    and no scene says what stands for them.
+    and no machine says what stands for them.
     """
     if isinstance(motion, Orbit):
         raise TypeError("Argument `motion` must be a `Run`: give `orbit.trajectory()` of an orbit.")
@@ -56,22 +58,22 @@ def motion_path(
         )
     try:
         path = MotionPath(
-            cycles, *(np.asarray(read(samples.state), float) for read in _coordinates(scene))
+            cycles, *(np.asarray(read(samples.state), float) for read in _coordinates(machine))
         )
     except AttributeError:
         raise ValueError(
-            "Argument `scene` must be given, which says what is the position in a state without "
+            "Argument `machine` must be given, which says what is the position in a state without "
             "`Y` and `V`."
         ) from None
-    if isinstance(motion, Run) and motion.impact_log is not None and scene is not None:
-        path = _with_impacts(path, motion, scene)
+    if isinstance(motion, Run) and motion.impact_log is not None and machine is not None:
+        path = _with_impacts(path, motion, machine)
     if window is not None:
         keep = (path.cycles >= window[0]) & (path.cycles <= window[1])
         path = MotionPath(*(x[keep] for x in path))
     return path
 
 
-def _with_impacts(path: MotionPath, run: Run, scene: AbstractScene) -> MotionPath:
+def _with_impacts(path: MotionPath, run: Run, machine: AbstractMachine) -> MotionPath:
     log = run.impact_log
     assert log is not None
     stop = np.asarray(log.stop)
@@ -80,9 +82,9 @@ def _with_impacts(path: MotionPath, run: Run, scene: AbstractScene) -> MotionPat
     if not stop.size:
         return path
     logged = np.asarray(log.stop) >= 0
-    at = cycle + np.asarray(log.phase)[logged] / float(scene.turn)
+    at = cycle + np.asarray(log.phase)[logged] / float(machine.turn)
     speed = np.asarray(log.speed)[logged]
-    hit = [scene.stops[i] for i in stop]
+    hit = [machine.stops[i] for i in stop]
     before = np.array([s.sign for s in hit]) * speed
     after = [float(s.rebound(v)) for s, v in zip(hit, before, strict=True)]
     extra = MotionPath(

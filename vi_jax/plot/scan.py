@@ -13,13 +13,14 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from .._checks import flag
+from .._renamed import renamed
+from ..machine import AbstractMachine, Scene
+from ..machine.numbers import by_name
+from ..machine.units import in_brackets, unit_of
 from ..orbit.results import impacts_in_words
 from ..scan import REGIMES, Basins
 from ..scan.regime import periods_of
 from ..scan.store import NOT_COMPUTED
-from ..scene import AbstractScene, Scene
-from ..scene.numbers import by_name
-from ..scene.units import in_brackets, unit_of
 from . import colors as look
 from .branch import axis_name
 from .colors import IRREGULAR, PERIODS, color_of, shades
@@ -39,10 +40,11 @@ _NONE, _ONE, _MORE = 100, 200, 300
 _NAMED = 12
 
 
+@renamed(scene="machine")
 def plot_regimes(
     data: xr.Dataset,
     *,
-    scene: AbstractScene | None = None,
+    machine: AbstractMachine | None = None,
     ax: Axes | None = None,
     x: str | None = None,
     y: str | None = None,
@@ -55,7 +57,7 @@ def plot_regimes(
     motions without any are paler, and motions of two cycles with one impact and with more are
     told apart. The legend names what is there.
 
-    **Arguments:** the data of a scan that measured `"regime"`; `scene`, whose words name the
+    **Arguments:** the data of a scan that measured `"regime"`; `machine`, whose words name the
     periods (left out: 2π and so on for a `Scene`, cycles for any other machine); `ax`, axes to draw
     into, a new figure if left out; `x` and `y`, the names of the axes to draw along, the first and
     the second of the scan if left out; `legend`, whether to draw one, on the right of the axes.
@@ -77,7 +79,7 @@ def plot_regimes(
         codes = codes + _NONE * free + np.where(impacts > 1.5, _MORE, _ONE) * two
     if "result" in data:
         codes[np.asarray(data["result"].transpose(y, x)) == NOT_COMPUTED] = _LEAST
-    word = _word_of(data) if scene is None else scene.period_of
+    word = _word_of(data) if machine is None else machine.period_of
     ax = new_axes(ax)
     across, up = np.asarray(data[x], float), np.asarray(data[y], float)
     present = sorted({int(code) for code in codes.flat}, key=_place)
@@ -115,8 +117,8 @@ def _named(code: int, word: Callable[[int], str]) -> tuple[str, str]:
 
 
 def _word_of(data: xr.Dataset) -> Callable[[int], str]:
-    """How to call periods in these data, whose attributes tell the class of the scene."""
-    about = str(data.attrs.get("scene", ""))
+    """How to call periods in these data, whose attributes tell the class of the machine."""
+    about = str(data.attrs.get("machine", ""))
     if "CustomNode(" in about and "CustomNode(Scene[" not in about:
         return lambda cycles: f"{cycles} cycle{'' if cycles == 1 else 's'}"
     return lambda cycles: f"{2 * cycles}π"
@@ -165,26 +167,26 @@ def plot_basins(found: Basins, *, ax: Axes | None = None) -> Axes:
     named = [Line2D([], [], label="sections of the motions", **points)]
     _legend(ax, entries, named if found.attractors else [])
     ax.set(xlim=region[0], ylim=region[1])  # section points beyond the region stay outside
-    ax.set_xlabel(_start_name(found.scene, x))
-    ax.set_ylabel(_start_name(found.scene, y))
+    ax.set_xlabel(_start_name(found.machine, x))
+    ax.set_ylabel(_start_name(found.machine, y))
     return ax
 
 
-def _start_name(scene: AbstractScene | None, name: str) -> str:
-    """What an axis of starts says: the scene's words, with units, for what is a position or a
+def _start_name(machine: AbstractMachine | None, name: str) -> str:
+    """What an axis of starts says: the machine's words, with units, for what is a position or a
     velocity; else the name alone."""
     name = name.removeprefix("start.")
-    if isinstance(scene, Scene):
-        return in_brackets(f"{name} at the start", unit_of(scene.units, name))
+    if isinstance(machine, Scene):
+        return in_brackets(f"{name} at the start", unit_of(machine.units, name))
     try:
-        start = None if scene is None else scene.start()
-    except ValueError:  # a scene that has no start of its own
+        start = None if machine is None else machine.start()
+    except ValueError:  # a machine that has no start of its own
         start = None
-    if scene is not None and start is not None:
+    if machine is not None and start is not None:
         values = {key: float(i) + 2.5 for i, key in enumerate(by_name(start))}
         leaves = [jnp.asarray(value) for value in values.values()]
         probe = jtu.tree_unflatten(jtu.tree_structure(start), leaves)
-        for read, words in zip((scene.position, scene.velocity), scene.labels, strict=True):
+        for read, words in zip((machine.position, machine.velocity), machine.labels, strict=True):
             if float(read(probe)) == values[name]:
                 return f"{words} at the start"
     return f"{name} at the start"

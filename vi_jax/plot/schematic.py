@@ -9,14 +9,15 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from .._checks import instance_of
+from .._renamed import renamed
+from ..machine import AbstractMachine, Scene
 from ..machines import BouncingBall, Duffing, ImpactPair, UnbalancedRotor
-from ..scene import AbstractScene, Scene
 from .colors import GREEN, RED
 from .motion import new_axes
 from .pen import Pen
 
 
-def sketch(machine: AbstractScene, pen: Pen, state: Any, phase: float) -> None:
+def sketch(machine: AbstractMachine, pen: Pen, state: Any, phase: float) -> None:
     """Draw a machine in a state: as its own `sketch(pen, state, phase)` says, if it has one."""
     own = getattr(machine, "sketch", None)
     if own is not None:
@@ -25,8 +26,9 @@ def sketch(machine: AbstractScene, pen: Pen, state: Any, phase: float) -> None:
         _drawn(machine, pen, state, phase)
 
 
+@renamed(scene="machine")
 def plot_sketch(
-    scene: AbstractScene, state: Any = None, *, phase: Any = None, ax: Axes | None = None
+    machine: AbstractMachine, state: Any = None, *, phase: Any = None, ax: Axes | None = None
 ) -> Axes:
     """A schematic of a machine with the names of its parts.
 
@@ -36,20 +38,20 @@ def plot_sketch(
 
     **Arguments:**
 
-    - `scene`: the machine.
+    - `machine`: the machine.
     - `state`: the state to draw; by default its own start.
     - `phase`: the reading of its clock; for a `Scene` the crank angle φ, by default 0.3π.
     - `ax`: axes to draw into; a new figure if left out.
 
     **Returns:** the axes.
     """
-    instance_of("scene", scene, AbstractScene, "a `Scene` or an `AbstractScene`")
-    state = scene.start() if state is None else scene.adopt(state)
+    instance_of("machine", machine, AbstractMachine, "a `Scene` or an `AbstractMachine`")
+    state = machine.start() if state is None else machine.adopt(state)
     if phase is None:
-        phase = 0.3 * pi if isinstance(scene, Scene | UnbalancedRotor) else 0.0
+        phase = 0.3 * pi if isinstance(machine, Scene | UnbalancedRotor) else 0.0
     ax = new_axes(ax)
-    reach = reach_of(scene, _positions(scene, state))
-    sketch(scene, Pen(ax, reach=reach, size=size_of(scene, reach), labels=True), state, phase)
+    reach = reach_of(machine, _positions(machine, state))
+    sketch(machine, Pen(ax, reach=reach, size=size_of(machine, reach), labels=True), state, phase)
     frame_axes(ax)
     return ax
 
@@ -61,24 +63,24 @@ def frame_axes(ax: Axes) -> None:
     ax.margins(0.06)
 
 
-def _positions(scene: AbstractScene, state: Any) -> np.ndarray:
-    return np.array([float(c.position(state)) for c in scene.coordinates])
+def _positions(machine: AbstractMachine, state: Any) -> np.ndarray:
+    return np.array([float(c.position(state)) for c in machine.coordinates])
 
 
-def reach_of(scene: AbstractScene, positions: np.ndarray) -> float:
+def reach_of(machine: AbstractMachine, positions: np.ndarray) -> float:
     """The largest distance from zero of these positions and of the stops."""
-    soft = scene.soft_stops if isinstance(scene, Scene) else ()
-    stops = [abs(float(stop.place)) for stop in (*scene.stops, *soft)]
+    soft = machine.soft_stops if isinstance(machine, Scene) else ()
+    stops = [abs(float(stop.place)) for stop in (*machine.stops, *soft)]
     return max(0.0, *map(float, np.abs(positions).ravel()), *stops) or 1.0
 
 
-def size_of(scene: AbstractScene, reach: float) -> float:
-    """A good size for a body: the crank's for a scene, a share of the motion for others."""
-    return max(0.8, 0.25 * reach) if isinstance(scene, Scene) else 0.35 * reach
+def size_of(machine: AbstractMachine, reach: float) -> float:
+    """A good size for a body: the crank's for a machine, a share of the motion for others."""
+    return max(0.8, 0.25 * reach) if isinstance(machine, Scene) else 0.35 * reach
 
 
 @singledispatch
-def _drawn(machine: AbstractScene, pen: Pen, state: Any, phase: float) -> None:
+def _drawn(machine: AbstractMachine, pen: Pen, state: Any, phase: float) -> None:
     """Every coordinate as a body between its stops, one below the other."""
     size = pen.size
     for i, place in enumerate(_positions(machine, state)):
@@ -209,7 +211,7 @@ def _(machine: ImpactPair, pen: Pen, state: Any, phase: float) -> None:
     pen.label(box, height / 2 + 0.2 * pen.size, "$e$")
 
 
-def _supported(machine: AbstractScene, pen: Pen, place: float) -> float:
+def _supported(machine: AbstractMachine, pen: Pen, place: float) -> float:
     """A body between its stops, on a spring and a damper from a post, which is told."""
     size = pen.size
     post, back = -pen.reach - 2.6 * size, place - size / 2

@@ -22,13 +22,13 @@ from .measures import (
 
 
 class Custom(AbstractMeasure):
-    """A user's own function of one lane's scene and run."""
+    """A user's own function of one lane's machine and run."""
 
     function: Callable[..., Any] = eqx.field(static=True)
 
-    def __call__(self, scene, run):
+    def __call__(self, machine, run):
         """What the function names of one lane, as arrays."""
-        found = self.function(scene, run)
+        found = self.function(machine, run)
         if not isinstance(found, Mapping):
             raise TypeError(
                 "A function in argument `measure` must return a mapping of names to numbers, but "
@@ -59,7 +59,7 @@ MEASURES: Mapping[str, Callable[[], AbstractMeasure]] = {
 
 
 def measures_of(measure: Any, averages: Sequence[str] = ()) -> tuple[AbstractMeasure, ...]:
-    """Measures by name, as objects, or functions of a scene and a run; one or several. A name may
+    """Measures by name, as objects, or functions of a machine and a run; one or several. A name may
     be that of one of the machine's own `averages`, which comes first.
 
     **Raises:** `ValueError` for an unknown name, `TypeError` for anything else.

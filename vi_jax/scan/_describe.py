@@ -11,38 +11,38 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .._version import installed_version
-from ..scene.numbers import leaf, leaf_names
+from ..machine.numbers import leaf, leaf_names
 from ._identity import Unverifiable, identity
 from .grid import Blocks
-from .job import Job
 from .measures import Regime
+from .program import ScanProgram
 from .regime import CODES
 from .store import UNVERIFIABLE
 
 
-def description_of(job: Job, blocks: Blocks) -> dict[str, Any]:
+def description_of(job: ScanProgram, blocks: Blocks) -> dict[str, Any]:
     """What makes two scans the same, in words and numbers that JSON can hold."""
 
     def described(tree: Any) -> str:
         return _lasting(eqx.tree_pformat(tree, short_arrays=False, width=10**6))
 
-    scene: dict[str, Any]
-    if job.scene is not None:
-        scene = {name: _described(leaf(job.scene, name)) for name in leaf_names(job.scene)}
-        scene["structure"] = _lasting(str(jtu.tree_structure(job.scene)))
+    machine: dict[str, Any]
+    if job.machine is not None:
+        machine = {name: _described(leaf(job.machine, name)) for name in leaf_names(job.machine)}
+        machine["structure"] = _lasting(str(jtu.tree_structure(job.machine)))
     else:  # a function is known by what it makes
-        scene = {"made by": _lasting(getattr(job.build, "__qualname__", repr(job.build)))}
+        machine = {"made by": _lasting(getattr(job.build, "__qualname__", repr(job.build)))}
         for name, place in (("first", 0), ("last", -1)):
             made, _ = job.lane(_lane(blocks, place))
-            scene |= {
+            machine |= {
                 f"{name} {leaf_}": _described(leaf(made, leaf_)) for leaf_ in leaf_names(made)
             }
-            scene[f"{name} structure"] = _lasting(str(jtu.tree_structure(made)))
-    start: Any = "the scene's own"
+            machine[f"{name} structure"] = _lasting(str(jtu.tree_structure(made)))
+    start: Any = "the machine's own"
     if job.start is not None:
         start = {name: _described(leaf(job.start, name)) for name in leaf_names(job.start)}
     about: dict[str, Any] = {
-        "scene": scene,
+        "machine": machine,
         "start": start,
         "paired": blocks.paired,
         "axis": {
@@ -81,9 +81,9 @@ def _lane(blocks: Blocks, place: int) -> dict[str, Any]:
     return {name: jnp.asarray(x[place]) for name, x in blocks.axes.items()}
 
 
-def _codes(job: Job) -> dict[str, str]:
+def _codes(job: ScanProgram) -> dict[str, str]:
     """What tells the user's own functions and classes from others of the same name."""
-    parts: dict[str, Any] = {"scene": job.scene if job.build is None else job.build}
+    parts: dict[str, Any] = {"machine": job.machine if job.build is None else job.build}
     parts |= {"start": job.start, "method": job.method}
     for i, measure in enumerate(job.measures):
         parts[f"measure {i + 1}"] = measure
@@ -107,7 +107,7 @@ def attributes_of(about: dict[str, Any]) -> dict[str, Any]:
         "method": about["method"],
         "settle": about["settle"],
         "cycles": about["cycles"],
-        "scene": json.dumps(about["scene"]),
+        "machine": json.dumps(about["machine"]),
         "start": json.dumps(about["start"]),
         "precision": about["precision"],
     }

@@ -25,7 +25,7 @@ from .._checks import count
 from .._programs import PLAIN, Program
 from ..flow.fusion import compiling
 from .grid import Blocks
-from .job import Job
+from .program import ScanProgram
 
 # Lanes of a block on a CPU and on an accelerator.
 _MOST, _ON_ACCELERATOR = 4096, 65536
@@ -88,7 +88,12 @@ def _program(function: Callable[..., Any]) -> Program:
 
 
 def compute(
-    job: Job, values: dict[str, np.ndarray], lanes: int, devices: int = 1, *, dry: bool = False
+    job: ScanProgram,
+    values: dict[str, np.ndarray],
+    lanes: int,
+    devices: int = 1,
+    *,
+    dry: bool = False,
 ) -> dict[str, np.ndarray]:
     """The numbers of a block of lanes, filled up to `lanes` so that every block is one program.
 
@@ -105,7 +110,7 @@ def compute(
 
 
 def run_here(
-    job: Job, blocks: Blocks, todo: list, workers: int, devices: int
+    job: ScanProgram, blocks: Blocks, todo: list, workers: int, devices: int
 ) -> Iterator[tuple[tuple[slice, ...], dict[str, np.ndarray]]]:
     """Blocks as they are done. Each runs on one core; several at a time keep all of them busy."""
     if devices > 1 or jax.default_backend() != "cpu":
@@ -143,7 +148,7 @@ class ClusterLost(Exception):
     """The scheduler of a cluster does not answer."""
 
 
-def run_on_cluster(job: Job, blocks: Blocks, todo: list, client: Any) -> Iterator[Any]:
+def run_on_cluster(job: ScanProgram, blocks: Blocks, todo: list, client: Any) -> Iterator[Any]:
     """Blocks as Dask tasks, as they are done. **Raises:** `ClusterLost`; what a task raises."""
     from dask.distributed import as_completed
 
@@ -151,7 +156,7 @@ def run_on_cluster(job: Job, blocks: Blocks, todo: list, client: Any) -> Iterato
         raise ClusterLost
     x64 = _x64()
     # Small enough to go with every task: data that are shared would die with their worker.
-    parcel = _Parcel(job)
+    parcel = PicklableProgram(job)
     where_of = {
         client.submit(
             _remote, parcel, blocks.values(where), blocks.lanes, x64, pure=False, retries=3
@@ -176,14 +181,14 @@ def _x64() -> bool:
     return jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
 
 
-class _Parcel:
+class PicklableProgram:
     """A job on its way to another process, its arrays as numpy ones."""
 
-    def __init__(self, job: Job):
+    def __init__(self, job: ScanProgram):
         self.job = jtu.tree_map(lambda x: np.asarray(x) if eqx.is_array(x) else x, job)
 
 
-def _remote(parcel: _Parcel, values: dict, lanes: int, x64: bool) -> dict[str, np.ndarray]:
+def _remote(parcel: PicklableProgram, values: dict, lanes: int, x64: bool) -> dict[str, np.ndarray]:
     with jax.enable_x64(x64):
         job = jtu.tree_map(lambda x: jnp.asarray(x) if eqx.is_array_like(x) else x, parcel.job)
         return compute(job, values, lanes)

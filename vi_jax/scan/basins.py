@@ -12,18 +12,19 @@ import numpy as np
 
 from .._checks import count, fits_records, given_number
 from .._lazy import lazy
+from .._renamed import renamed
 from ..flow import simulate
 from ..flow.arguments import machine_of
 from ..flow.labelled import tidy
 from ..flow.methods import MethodLike, chosen
+from ..machine import AbstractMachine
+from ..machine.numbers import by_name, state_in_words, with_leaf
+from ..machine.shown import summary_table
+from ..machine.units import attributes, unit_of
 from ..orbit.results import impacts_in_words
-from ..scene import AbstractScene
-from ..scene.numbers import by_name, state_in_words, with_leaf
-from ..scene.shown import told_in_table
-from ..scene.units import attributes, unit_of
 from .grid import axes_of
-from .job import START
 from .measures import AbstractMeasure, Regime
+from .program import START
 from .regime import CODES, REGIMES, flags
 from .scan import ScanInterrupted, scan
 
@@ -64,12 +65,12 @@ class Basins(NamedTuple):
     irregular: dict[str, float]
     """Fractions of the starts that ended on no periodic motion: chaotic, unsettled, failed,
     transient (transiently chaotic, see `Regime`)."""
-    scene: AbstractScene | None = None
+    machine: AbstractMachine | None = None
     """What moves; its words name the periods."""
 
     def period_of(self, cycles: int) -> str:
-        """A duration of so many cycles, in the words of the scene."""
-        return f"{2 * cycles}π" if self.scene is None else self.scene.period_of(cycles)
+        """A duration of so many cycles, in the words of the machine."""
+        return f"{2 * cycles}π" if self.machine is None else self.machine.period_of(cycles)
 
     def to_xarray(self, *, along: str | None = None) -> "xr.Dataset":
         """These basins as an `xarray.Dataset`: `data`, and of each motion `motion_period`,
@@ -86,7 +87,7 @@ class Basins(NamedTuple):
             values = [getattr(a, name) for a in self.attractors]
             variables[f"motion_{name}"] = "motion", np.asarray(values)
         longest = max((a.period for a in self.attractors), default=0)
-        units = {} if self.scene is None else self.scene.units
+        units = {} if self.machine is None else self.machine.units
         for name in self.attractors[0].sections if self.attractors else ():
             rows = np.full((len(self.attractors), longest), np.nan)
             for row, a in zip(rows, self.attractors, strict=True):
@@ -97,7 +98,7 @@ class Basins(NamedTuple):
 
     def __str__(self) -> str:
         many = "" if len(self.attractors) == 1 else "s"
-        units = {} if self.scene is None else self.scene.units
+        units = {} if self.machine is None else self.machine.units
         lines = [f"Basins of {len(self.attractors)} periodic motion{many}"]
         for a in self.attractors:
             where = state_in_words({name: x[0] for name, x in a.sections.items()}, 6, units)
@@ -112,7 +113,7 @@ class Basins(NamedTuple):
     __repr__ = __str__
 
     def _repr_html_(self) -> str:
-        return told_in_table(str(self))
+        return summary_table(str(self))
 
 
 class _Mark(AbstractMeasure):
@@ -129,15 +130,16 @@ class _Mark(AbstractMeasure):
         """As many as are compared."""
         return self.longest
 
-    def __call__(self, scene, run):
+    def __call__(self, machine, run):
         """Of one lane."""
         states = {name: x[-self.longest :] for name, x in by_name(run.sections).items()}
-        highest = jnp.argmax(jax.vmap(scene.position)(run.sections)[-self.longest :])
+        highest = jnp.argmax(jax.vmap(machine.position)(run.sections)[-self.longest :])
         return {name: x[highest] for name, x in states.items()}
 
 
+@renamed(scene="machine")
 def basins(
-    scene: AbstractScene,
+    machine: AbstractMachine,
     region: Mapping[str, tuple[float, float]],
     *,
     resolution: int | tuple[int, ...] = 128,
@@ -159,7 +161,7 @@ def basins(
 
     **Arguments:**
 
-    - `scene`: the scene.
+    - `machine`: the machine.
     - `region`: ranges of parts of the start, such as `{"start.Y": (-4, 2), "start.V": (-4, 4)}`.
     - `resolution`: starts along each of them, on a grid that fills the range (cell centres).
     - `samples`: instead of the grid so many random starts, uniform in the region (with `seed`),
@@ -175,7 +177,7 @@ def basins(
     **Raises:** as `scan`; on Ctrl-C `ScanInterrupted`, whose `data` says of each start that was
     followed where it ended (`period`, and a section state).
     """
-    scene = machine_of(scene)
+    machine = machine_of(machine)
     for name in ("measure", "paired", "cycles", "derivatives"):
         if name in options:
             raise TypeError(f"Argument `{name}` is `scan`'s, and not to be given to `basins`.")
@@ -209,16 +211,16 @@ def basins(
         fits_records("samples", samples, len(ranges))
         rng = np.random.default_rng(seed)
         axes = {name: rng.uniform(low, high, samples) for name, (low, high) in ranges.items()}
-    method = chosen(scene, method)
+    method = chosen(machine, method)
     measure = (Regime(longest=longest, tolerance=tolerance), _Mark(longest))
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "[0-9,]+ of [0-9,]+ lanes failed")
         data = scan(
-            scene, axes, measure=measure, start=start, settle=settle, method=method,
+            machine, axes, measure=measure, start=start, settle=settle, method=method,
             paired=samples is not None, **options,
         )  # fmt: skip
     if start is None:
-        start = scene.start()
+        start = machine.start()
     names = list(by_name(start))
     period = np.asarray(data["period"]).ravel()
     impacts = np.asarray(data["impacts"]).ravel()
@@ -229,7 +231,7 @@ def basins(
         for name, value in zip(names, state, strict=True):
             begin = with_leaf(begin, name, value)
         # Always as many cycles, so that another period is not another program.
-        run = simulate(scene, begin, longest, method=method)
+        run = simulate(machine, begin, longest, method=method)
         return np.stack(
             [np.asarray(x)[1 : cycles + 1] for x in by_name(run.sections).values()], axis=1
         )
@@ -264,7 +266,7 @@ def basins(
     dims = data["period"].dims
     kind = np.min_scalar_type(-max(4, len(order)))
     data = data.assign(label=(dims, label.astype(kind).reshape(data["period"].shape), about))
-    return Basins(data, attractors, parts, scene)
+    return Basins(data, attractors, parts, machine)
 
 
 def _sorted_out(

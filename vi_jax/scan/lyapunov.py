@@ -12,21 +12,22 @@ from jaxtyping import Array, Bool, Float
 
 from .._checks import count, flag
 from .._programs import compiled
+from .._renamed import renamed
 from ..flow import RESULTS, has_fixed_cycle, simulate
 from ..flow.beside import means
 from ..flow.labelled import batch_names, in_names, present, states, tidy
 from ..flow.methods import MethodLike, chosen
 from ..flow.named import has_averages
 from ..flow.results import REASON_NAMES
+from ..machine import AbstractMachine
+from ..machine.base import renews
+from ..machine.event import is_autonomous
+from ..machine.shown import Summarized, number_in_words
+from ..machine.units import Stated, attributes, in_unit, stated, unit_of, with_unit, with_units
 from ..orbit.cycle_map import CycleMap, adopted, cycle_map
-from ..scene import AbstractScene
-from ..scene.base import renews
-from ..scene.event import is_autonomous
-from ..scene.shown import Told, number_in_words
-from ..scene.units import Stated, attributes, in_unit, stated, unit_of, with_unit, with_units
 
 
-class Lyapunov(Told):
+class Lyapunov(Summarized):
     """Lyapunov exponents of a motion. Under `vmap` batch axes come first."""
 
     exponents: Float[Array, "... states"]
@@ -79,7 +80,7 @@ class Lyapunov(Told):
         own = {name: name for name in self.averages}
         return tidy(with_units(data, dict(self.units), own) if own else data, along)
 
-    def told(self) -> str:
+    def summary(self) -> str:
         """The exponents; of a batch the range of the greatest."""
         if self.exponents.ndim > 1:
             lanes, good = self.spread.shape, int(jnp.sum(self.successful))
@@ -96,8 +97,9 @@ class Lyapunov(Told):
         return "\n".join([told, *lines])
 
 
+@renamed(scene="machine")
 def lyapunov(
-    scene: AbstractScene,
+    machine: AbstractMachine,
     start: Any,
     cycles: int = 400,
     *,
@@ -119,7 +121,7 @@ def lyapunov(
 
     **Arguments:**
 
-    - `scene`, `start`: as for `simulate`; runs in the phase clock.
+    - `machine`, `start`: as for `simulate`; runs in the phase clock.
     - `cycles`: drive cycles observed, at least 8; static.
     - `settle`: drive cycles before that.
     - `number`: how many exponents, the greatest ones; all by default. Each costs about as much
@@ -132,25 +134,25 @@ def lyapunov(
     **Raises:** as `simulate`; `ValueError` for a machine with both a `section` and a `renewed`.
     """
     cycles = count("cycles", cycles, least=8)
-    if is_autonomous(scene, start):
-        if renews(scene):
+    if is_autonomous(machine, start):
+        if renews(machine):
             raise ValueError(
-                "Argument `scene` must not have both a `section` and a `renewed`, as a "
-                f"{type(scene).__name__} has: at equal intervals it would be renewed there. The "
+                "Argument `machine` must not have both a `section` and a `renewed`, as a "
+                f"{type(machine).__name__} has: at equal intervals it would be renewed there. The "
                 "exponents of its periodic motions are ln|multiplier|/duration of an `Orbit`."
             )
         # On its section the exponent 0 along the motion could not be seen.
-        scene = scene.observed_every(scene.cycle)
-    method = chosen(scene, method)
-    carried = cycle_map(scene, method=method)
+        machine = machine.observed_every(machine.cycle)
+    method = chosen(machine, method)
+    carried = cycle_map(machine, method=method)
     if rests is not None:
         carried = dataclasses.replace(carried, rests=flag("rests", rests))
-    start = adopted(carried.scene, start, "start")
+    start = adopted(carried.machine, start, "start")
     states = ravel_pytree(start)[0].size
     number = states if number is None else count("number", number, least=1)
     if number > states:
         raise ValueError(
-            f"Argument `number` must be at most {states}, the states of this scene, but got "
+            f"Argument `number` must be at most {states}, the states of this machine, but got "
             f"{number}."
         )
     return _lyapunov(carried, start, cycles, settle, number)
@@ -158,22 +160,24 @@ def lyapunov(
 
 @compiled
 def _lyapunov(the_map: CycleMap, start, cycles: int, settle, number: int) -> Lyapunov:
-    scene, method, rests = the_map.scene, the_map.method, the_map.rests
-    before = simulate(scene, start, 1, settle=settle, method=method, rests=rests, record="sections")
+    machine, method, rests = the_map.machine, the_map.method, the_map.rests
+    before = simulate(
+        machine, start, 1, settle=settle, method=method, rests=rests, record="sections"
+    )
     x, unravel = ravel_pytree(before.last)
 
     # Where all cycles last alike, turning points need not be met for the sake of durations.
-    plain = has_fixed_cycle(scene, before.last) and not has_averages(scene)
+    plain = has_fixed_cycle(machine, before.last) and not has_averages(machine)
     record = "sections" if plain else "motion"
 
     # One direction alone need not be kept apart from others after every cycle.
     window = _window(cycles) if number == 1 else 1
 
     def image(x):
-        run = simulate(scene, unravel(x), window, method=method, rests=rests, record=record)
+        run = simulate(machine, unravel(x), window, method=method, rests=rests, record=record)
         duration = run.duration
         if duration is None:
-            duration = jnp.full(window, scene.period, x.dtype)
+            duration = jnp.full(window, machine.period, x.dtype)
         sections = jax.vmap(lambda state: ravel_pytree(state)[0])(run.sections)
         integrals = {name: x * duration for name, x in run.averages.items()}
         return sections[1:], (duration, integrals, run.result)
@@ -210,8 +214,8 @@ def _lyapunov(the_map: CycleMap, start, cycles: int, settle, number: int) -> Lya
         state=unravel(x),
         result=result,
         averages=means(jax.tree.map(good_sum, integrals), jnp.sum(duration)),
-        unit=unit_of(scene.units, "rate"),
-        units=stated(scene),
+        unit=unit_of(machine.units, "rate"),
+        units=stated(machine),
     )
 
 

@@ -12,8 +12,8 @@ from jaxtyping import Array, Bool
 
 from .._checks import count, require
 from ..flow import AbstractMethod, Run
-from ..scene import AbstractScene
-from ..scene.numbers import by_name
+from ..machine import AbstractMachine
+from ..machine.numbers import by_name
 from .lyapunov import lyapunov
 from .regime import CODES, REGIMES, flags, impacts_of, least_period
 
@@ -31,7 +31,7 @@ class AbstractMeasure(eqx.Module):
     attributes: ClassVar[About] = {}
     """Attributes of the variables by name, such as `units` and `long_name`; `dims` names the axes
     of one that is an array, and `unit_of` a quantity in whose unit a variable is, which the machine
-    states (see `AbstractScene.units`)."""
+    states (see `AbstractMachine.units`)."""
 
     record: ClassVar[str] = "motion"
     """What it must see of them, as in `simulate`: `"motion"`, or only `"sections"` and the numbers
@@ -51,29 +51,29 @@ class AbstractMeasure(eqx.Module):
         return self
 
     @abc.abstractmethod
-    def __call__(self, scene: AbstractScene, run: Run) -> Numbers:
+    def __call__(self, machine: AbstractMachine, run: Run) -> Numbers:
         """Named numbers (or short arrays) of one lane."""
 
     @property
-    def looks(self) -> int:
+    def passes(self) -> int:
         """How often `later` may be needed for a lane."""
         return 1
 
-    def unclear(self, found: Numbers, look: Any = 0) -> Bool[Array, ""] | None:
-        """Whether `later` is needed for a lane, at look number `look`; `None` if for none."""
+    def needs_refinement(self, found: Numbers, pass_number: Any = 0) -> Bool[Array, ""] | None:
+        """Whether a lane needs `refine`, at pass number `pass_number`; `None` if none ever does."""
         return None
 
-    def later(
+    def refine(
         self,
-        scene: AbstractScene,
+        machine: AbstractMachine,
         state: Any,
         method: AbstractMethod,
         found: Numbers,
-        look: Any = 0,
+        pass_number: Any = 0,
         rests: bool | None = None,
     ) -> Numbers:
-        """Costlier numbers, only for lanes that are unclear; they replace those found. `state` is
-        that after the cycles observed, at every look; `rests` is as for `simulate`."""
+        """Costlier numbers, only for lanes that need them; they replace those found. `state` is
+        that after the cycles observed, at every pass; `rests` is as for `simulate`."""
         return {}
 
 
@@ -86,7 +86,7 @@ class Extremes(AbstractMeasure):
         "impact_speed": {"unit_of": "velocity", "long_name": "greatest V⁻"},
     }
 
-    def __call__(self, scene, run):
+    def __call__(self, machine, run):
         """Of one lane."""
         assert run.y_min is not None and run.y_max is not None and run.impact_speed is not None
         return {
@@ -103,12 +103,12 @@ class FrequencyRatio(AbstractMeasure):
         "frequency_ratio": {"unit_of": "frequency_ratio", "long_name": "mean speed of the drive"}
     }
 
-    def __call__(self, scene, run):
+    def __call__(self, machine, run):
         """Of one lane."""
         assert run.duration is not None
-        ratio = scene.frequency_ratio(jnp.mean(run.duration))
+        ratio = machine.frequency_ratio(jnp.mean(run.duration))
         if ratio is None:
-            raise ValueError("Measure `frequency_ratio` needs a scene that is driven.")
+            raise ValueError("Measure `frequency_ratio` needs a machine that is driven.")
         return {"frequency_ratio": ratio}
 
 
@@ -117,7 +117,7 @@ class Power(AbstractMeasure):
 
     attributes: ClassVar[About] = {"power": {"unit_of": "power", "long_name": "mean impact power"}}
 
-    def __call__(self, scene, run):
+    def __call__(self, machine, run):
         """Of one lane."""
         assert run.duration is not None and run.impact_energy is not None
         return {"power": jnp.sum(run.impact_energy) / jnp.sum(run.duration)}
@@ -125,7 +125,7 @@ class Power(AbstractMeasure):
 
 class Average(AbstractMeasure):
     """One of the machine's own averages, over the time of the cycles observed (see
-    `AbstractScene.averages`). Every verb that takes names of measures takes its name alone."""
+    `AbstractMachine.averages`). Every verb that takes names of measures takes its name alone."""
 
     name: str = eqx.field(static=True)
 
@@ -133,12 +133,12 @@ class Average(AbstractMeasure):
         """In the unit that the machine states for it."""
         return {self.name: {"unit_of": self.name, "long_name": f"mean {self.name}"}}
 
-    def __call__(self, scene, run):
+    def __call__(self, machine, run):
         """Of one lane."""
         found = run.mean_averages()
         if self.name not in found:
             raise ValueError(
-                f"Measure `Average` must name one of the averages of a {type(scene).__name__} "
+                f"Measure `Average` must name one of the averages of a {type(machine).__name__} "
                 f"({', '.join(found) or 'it has none'}), but got {self.name!r}."
             )
         return {self.name: found[self.name]}
@@ -165,7 +165,7 @@ class Sections(AbstractMeasure):
         """As many as are kept."""
         return self.number
 
-    def __call__(self, scene, run):
+    def __call__(self, machine, run):
         """Of one lane, arrays of shape (number,)."""
         return {name: x[-self.number :] for name, x in by_name(run.sections).items()}
 
@@ -178,7 +178,7 @@ class ImpactRate(AbstractMeasure):
         "impact_rate": {"units": "1/cycle", "long_name": "impacts per drive cycle"}
     }
 
-    def __call__(self, scene, run):
+    def __call__(self, machine, run):
         """Of one lane."""
         return {"impact_rate": jnp.mean(run.impacts.astype(_dtype(run)))}
 
@@ -192,7 +192,7 @@ class Steps(AbstractMeasure):
         "rejected": {"long_name": "steps rejected"},
     }
 
-    def __call__(self, scene, run):
+    def __call__(self, machine, run):
         """Of one lane."""
         return {"steps": run.steps, "rejected": run.rejected}
 
@@ -209,18 +209,18 @@ class Exponent(AbstractMeasure):
     def __check_init__(self):
         count("observed", self.observed, least=8)
 
-    def __call__(self, scene, run):
+    def __call__(self, machine, run):
         """Not yet known."""
         return {"exponent": jnp.full((), jnp.nan, _dtype(run))}
 
-    def unclear(self, found, look=0):
+    def needs_refinement(self, found, pass_number=0):
         """Always."""
         return jnp.asarray(True)
 
-    def later(self, scene, state, method, found, look=0, rests=None):
+    def refine(self, machine, state, method, found, pass_number=0, rests=None):
         """Of one lane."""
         found_out = lyapunov(
-            scene, state, self.observed, settle=0, number=1, method=method, rests=rests
+            machine, state, self.observed, settle=0, number=1, method=method, rests=rests
         )
         return {"exponent": found_out.exponents[0]}
 
@@ -240,7 +240,7 @@ class Regime(AbstractMeasure):
 
     While a chaotic transient lasts, nothing tells it from chaos; what is called chaotic may leave
     off later still. The longer `lasting`, the fewer do, and the more the chaotic lanes cost; 0
-    leaves the second look out.
+    leaves the second pass out.
     """
 
     longest: int = eqx.field(static=True, default=64)
@@ -281,11 +281,11 @@ class Regime(AbstractMeasure):
         return 2 * self.longest
 
     @property
-    def looks(self):
+    def passes(self):
         """One at what does not repeat, and one at what is chaotic."""
         return 2 if self.lasting else 1
 
-    def __call__(self, scene, run):
+    def __call__(self, machine, run):
         """Of one lane; chaos is not yet looked for."""
         sections = {name: x[1:] for name, x in by_name(run.sections).items()}
         period = least_period(
@@ -297,21 +297,23 @@ class Regime(AbstractMeasure):
             "impacts": impacts_of(run.impacts.astype(_dtype(run)), period),
         }
 
-    def unclear(self, found, look=0):
-        """Where it does not repeat; at the second look, where it is chaotic."""
+    def needs_refinement(self, found, pass_number=0):
+        """Where it does not repeat; at the second pass, where it is chaotic."""
         return found["period"] == jnp.where(
-            jnp.asarray(look) == 0, REGIMES.unsettled, REGIMES.chaotic
+            jnp.asarray(pass_number) == 0, REGIMES.unsettled, REGIMES.chaotic
         )
 
-    def later(self, scene, state, method, found, look=0, rests=None):
-        """Chaotic or not; at the second look, still or not."""
-        settle = look * (self.observed + self.lasting)
+    def refine(self, machine, state, method, found, pass_number=0, rests=None):
+        """Chaotic or not; at the second pass, still or not."""
+        settle = pass_number * (self.observed + self.lasting)
         out = lyapunov(
-            scene, state, self.observed, settle=settle, number=1, method=method, rests=rests
+            machine, state, self.observed, settle=settle, number=1, method=method, rests=rests
         )
         chaotic = out.exponents[0] > self.threshold
         # What cannot be continued is left as it was.
-        otherwise = jnp.where(out.successful & (look > 0), REGIMES.transient, found["period"])
+        otherwise = jnp.where(
+            out.successful & (pass_number > 0), REGIMES.transient, found["period"]
+        )
         return {
             "period": jnp.where(chaotic, REGIMES.chaotic, otherwise).astype(found["period"].dtype)
         }

@@ -18,12 +18,13 @@ from tqdm import tqdm
 from .._checks import count, fits_memory, fits_records, flag, instance_of
 from .._interrupted import Interrupted
 from .._lazy import lazy
+from .._renamed import renamed
 from ..flow import AbstractMethod
 from ..flow.methods import MethodLike, preset
 from ..flow.results import REASON_NAMES
-from ..scene import AbstractScene
-from ..scene.units import attributes as units_of
-from ..scene.units import unit_of
+from ..machine import AbstractMachine
+from ..machine.units import attributes as units_of
+from ..machine.units import unit_of
 from ._describe import attributes_of, description_of
 from ._work import (
     ClusterLost,
@@ -35,7 +36,7 @@ from ._work import (
     worker_count,
 )
 from .grid import Blocks, axes_of
-from .job import START, Job, check_corners, make_job
+from .program import START, ScanProgram, check_corners, make_program
 from .regime import flags
 from .store import (
     NOT_COMPUTED,
@@ -64,8 +65,9 @@ class ScanInterrupted(Interrupted):
         self.data = data
 
 
+@renamed(scene="machine")
 def scan(
-    scene: AbstractScene | Callable[..., AbstractScene],
+    machine: AbstractMachine | Callable[..., AbstractMachine],
     axes: Mapping[str, Any],
     *,
     measure: Any = ("extremes", "regime"),
@@ -90,19 +92,19 @@ def scan(
 
     The grid is computed in blocks of lanes, several at a time, all by one compiled program.
     Inside a block a lane that has ended makes room for the next. Other numbers on the axes, in the
-    scene or in `settle` compile nothing again.
+    machine or in `settle` compile nothing again.
 
     **Arguments:**
 
-    - `scene`: the scene, or a function of the axes' values by name that makes it (then define the
-      function once: another one is another program).
-    - `axes`: names of numbers of the scene (`"drive.frequency_ratio"`, `"stops.0.restitution"`)
+    - `machine`: the machine, or a function of the axes' values by name that makes it (then define
+      the function once: another one is another program).
+    - `axes`: names of numbers of the machine (`"drive.frequency_ratio"`, `"stops.0.restitution"`)
       or of the start (`"start.Y"`), each with a row of values.
     - `measure`: what is kept: names out of `"extremes"`, `"regime"`, `"frequency_ratio"`,
       `"power"`, `"impact_rate"`, `"sections"`, `"exponent"`, `"steps"`; `AbstractMeasure`s;
-      functions of a lane's scene and `Run` that return named numbers; or the name of one of the
+      functions of a lane's machine and `Run` that return named numbers; or the name of one of the
       machine's own `averages` (one called `"power"` stands in place of ours).
-    - `start`: the first state; by default the scene's own start at rest.
+    - `start`: the first state; by default the machine's own start at rest.
     - `settle`, `cycles`: drive cycles before observing (any number), and observed (static; by
       default as many as the measures need, at least 32).
     - `method`, `clock`, `max_impacts`, `max_steps`: as for `simulate`; by default the
@@ -145,8 +147,8 @@ def scan(
             "Argument `axes` must hold rows of one length if they are `paired`, but they have "
             f"{[x.size for x in grid.values()]}."
         )
-    job = make_job(
-        scene, tuple(grid), measure=measure, start=start, settle=settle, cycles=cycles,
+    job = make_program(
+        machine, tuple(grid), measure=measure, start=start, settle=settle, cycles=cycles,
         method=method, clock=clock, derivatives=derivatives, max_impacts=max_impacts,
         max_steps=max_steps,
     )  # fmt: skip
@@ -213,7 +215,7 @@ def scan(
     data = collected()
     if verify:
         again = functools.partial(
-            scan, scene, measure=measure, start=start, settle=settle, cycles=cycles,
+            scan, machine, measure=measure, start=start, settle=settle, cycles=cycles,
             method=_better(job), clock=clock, paired=True, max_impacts=max_impacts,
             max_steps=max_steps, workers=workers, devices=devices, cluster=cluster, progress=False,
         )  # fmt: skip
@@ -238,9 +240,9 @@ def _how_to_go_on(kept: MemoryStore | ZarrStore) -> str:
     return f"The scheduler of the Dask cluster was lost. {how}"
 
 
-def _better(job: Job) -> AbstractMethod:
+def _better(job: ScanProgram) -> AbstractMethod:
     """A method to verify the job's by."""
-    best, mine = preset(job.scene, "reference"), job.method
+    best, mine = preset(job.machine, "reference"), job.method
     same = type(best) is type(mine) and best.steps_per_cycle <= mine.steps_per_cycle
     return mine.tighter() if same else best
 
@@ -272,7 +274,7 @@ def _verified(
     return found
 
 
-def variables_of(job: Job, blocks: Blocks) -> dict[str, Variable]:
+def variables_of(job: ScanProgram, blocks: Blocks) -> dict[str, Variable]:
     """What the job computes, found without computing it."""
     values = {name: jnp.zeros(4) + x[0] for name, x in blocks.axes.items()}
     shapes = eqx.filter_eval_shape(job, values, jnp.ones(4, bool))
@@ -282,7 +284,7 @@ def variables_of(job: Job, blocks: Blocks) -> dict[str, Variable]:
             **flags({"not_computed": NOT_COMPUTED} | {n: i for i, n in enumerate(REASON_NAMES)}),
         }
     }
-    scene, start = job.first(blocks)
+    machine, start = job.first(blocks)
     for measure in job.measures:
         known |= measure.described(start)
     found = {}
@@ -291,7 +293,7 @@ def variables_of(job: Job, blocks: Blocks) -> dict[str, Variable]:
         about = dict(known.get(name.removeprefix("d_") if by else name, {}))
         dims = tuple(about.pop("dims", ()))
         if "unit_of" in about:
-            about |= units_of(unit_of(scene.units, about.pop("unit_of")))
+            about |= units_of(unit_of(machine.units, about.pop("unit_of")))
         if by:
             dims = ("by", *dims)
             about = {
@@ -310,8 +312,8 @@ def variables_of(job: Job, blocks: Blocks) -> dict[str, Variable]:
     return found
 
 
-def _unit_on_axis(job: Job, blocks: Blocks, name: str) -> str:
-    """What a function that makes the scene takes is in units of its own."""
+def _unit_on_axis(job: ScanProgram, blocks: Blocks, name: str) -> str:
+    """What a function that makes the machine takes is in units of its own."""
     if job.build is not None and not name.startswith(START):
         return ""
     return unit_of(job.first(blocks)[0].units, name)

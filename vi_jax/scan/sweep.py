@@ -14,16 +14,17 @@ from .._checks import count, fits_records, require
 from .._interrupted import Interrupted
 from .._numbers import concrete, number
 from .._programs import compiled, is_outermost
+from .._renamed import renamed
 from ..flow import RESULTS, simulate
 from ..flow.arguments import check_reals, check_start, machine_of, refuse_arrays
 from ..flow.labelled import batch_names, in_names, present, states, tidy
 from ..flow.methods import MethodLike, chosen
 from ..flow.results import REASON_NAMES
+from ..machine import AbstractMachine
+from ..machine.numbers import check_again, check_leaf, with_leaf
+from ..machine.shown import Summarized
+from ..machine.units import PLAIN, Stated, name_in, stated, unit_of, with_unit, with_units
 from ..orbit.results import impacts_in_words
-from ..scene import AbstractScene
-from ..scene.numbers import check_again, check_leaf, with_leaf
-from ..scene.shown import Told
-from ..scene.units import PLAIN, Stated, name_in, stated, unit_of, with_unit, with_units
 from .regime import CODES, REGIMES, flags, impacts_of, least_period
 
 # A jump is so many times the change at the values beside it, and this part of 1 + |number|.
@@ -36,9 +37,9 @@ COLUMNS = "y_min", "y_max", "period", "impacts", "frequency_ratio", "impact_spee
 _AT_ONCE = 16
 
 
-class Sweep(Told):
+class Sweep(Summarized):
     """What a sweep settled on at each value, in their order, in the machine's units (see
-    `AbstractScene.units`). Under `vmap` batch axes come first."""
+    `AbstractMachine.units`). Under `vmap` batch axes come first."""
 
     parameter: str = eqx.field(static=True)
     """Name of the number that was changed."""
@@ -53,7 +54,7 @@ class Sweep(Told):
     impacts: Float[Array, "..."]
     """Impacts in a period; in a cycle, on average, where there is no period."""
     frequency_ratio: Float[Array, "..."] | None
-    """ζ: mean speed of the drive; `None` for scenes that are not driven."""
+    """ζ: mean speed of the drive; `None` for machines that are not driven."""
     impact_speed: Float[Array, "..."]
     """Greatest V⁻ over the cycles observed."""
     sections: Any
@@ -62,11 +63,11 @@ class Sweep(Told):
     """Whether each value was simulated to its end."""
     averages: dict[str, Float[Array, "..."]] = eqx.field(default_factory=dict)
     """The machine's own averages over the time of the cycles observed, by name (see
-    `AbstractScene.averages`)."""
+    `AbstractMachine.averages`)."""
     labels: tuple[str, str] = eqx.field(static=True, default=PLAIN)
-    """What pictures write beside position and velocity, in the scene's words."""
+    """What pictures write beside position and velocity, in the machine's words."""
     periods: tuple[str, ...] = eqx.field(static=True, default=())
-    """Names of the periods of 1, 2, ... cycles, in the scene's words."""
+    """Names of the periods of 1, 2, ... cycles, in the machine's words."""
     units: Stated = eqx.field(static=True, default=())
     """In which units its quantities are, as the machine states it."""
 
@@ -102,7 +103,7 @@ class Sweep(Told):
         """The smallest position at each value."""
         return self.y_min if self.values.ndim == 1 else None
 
-    def told(self) -> str:
+    def summary(self) -> str:
         """The motions in the order of the values, and where one gives way to another."""
         if self.values.ndim != 1:
             good = int(jnp.sum(self.successful))
@@ -165,8 +166,9 @@ class Sweep(Told):
         return found
 
 
+@renamed(scene="machine")
 def sweep(
-    scene: AbstractScene,
+    machine: AbstractMachine,
     parameter: str,
     values: Any,
     *,
@@ -186,7 +188,7 @@ def sweep(
 
     **Arguments:**
 
-    - `scene`, `parameter`: the scene and the name of the number that is changed, such as
+    - `machine`, `parameter`: the machine and the name of the number that is changed, such as
       `"drive.frequency_ratio"`.
     - `values`: its values in the order of the sweep.
     - `start`: state at the first value; by default at rest (a motor at its no-load speed).
@@ -200,8 +202,8 @@ def sweep(
     **Raises:** `ValueError` or `TypeError` for an unknown name or values that are no numbers; on
     Ctrl-C `Interrupted`, whose `partial` is the sweep so far.
     """
-    scene = machine_of(scene)
-    check_leaf(scene, parameter)
+    machine = machine_of(machine)
+    check_leaf(machine, parameter)
     settle, cycles = count("settle", settle), count("cycles", cycles, least=2)
     values = number("values", values).astype(jnp.result_type(float))
     numbers = concrete(values)
@@ -218,37 +220,37 @@ def sweep(
         )
     rests = True
     if numbers is not None:
-        ends = [with_leaf(scene, parameter, value) for value in {numbers.min(), numbers.max()}]
+        ends = [with_leaf(machine, parameter, value) for value in {numbers.min(), numbers.max()}]
         for end in ends:
             check_again(end)
         rests = any(end.may_rest() for end in ends)
     if start is None:
-        start = with_leaf(scene, parameter, values[0]).start()
-    method = chosen(scene, method)
+        start = with_leaf(machine, parameter, values[0]).start()
+    method = chosen(machine, method)
     if clock is not None:
-        scene = scene.in_clock(clock)
-    start = scene.adopt(start)
+        machine = machine.in_clock(clock)
+    start = machine.adopt(start)
     refuse_arrays("start", "sweep", start)
     check_reals("start", start)
     start = jtu.tree_map(lambda x: jnp.asarray(x, values.dtype), start)
     if numbers is not None:
-        check_start(with_leaf(scene, parameter, numbers[0]), start)
+        check_start(with_leaf(machine, parameter, numbers[0]), start)
     options = (settle, cycles, method, rests, tolerance, max_steps)
-    if not is_outermost(scene, values, start, tolerance):
-        return _sweep(scene, parameter, values, start, *options)[1]
-    return _in_parts(scene, parameter, values, start, *options)
+    if not is_outermost(machine, values, start, tolerance):
+        return _sweep(machine, parameter, values, start, *options)[1]
+    return _in_parts(machine, parameter, values, start, *options)
 
 
-def _in_parts(scene, parameter, values, start, *options) -> Sweep:
+def _in_parts(machine, parameter, values, start, *options) -> Sweep:
     """Some values at a time, all by one program, so that an interrupt loses few of them."""
     if values.size <= _AT_ONCE:
-        return _sweep(scene, parameter, values, start, *options)[1]
+        return _sweep(machine, parameter, values, start, *options)[1]
     missing = -values.size % _AT_ONCE  # filled up by what ends at once
     rows = np.append(np.asarray(values), np.full(missing, np.nan)).reshape(-1, _AT_ONCE)
     parts: list[Sweep] = []
     try:
         for row in rows:
-            start, part = _sweep(scene, parameter, jnp.asarray(row), start, *options)
+            start, part = _sweep(machine, parameter, jnp.asarray(row), start, *options)
             parts.append(jax.block_until_ready(part))
     except KeyboardInterrupt:
         if not parts:
@@ -266,10 +268,10 @@ def _finite(numbers: np.ndarray | None) -> bool:
     return numbers is None or bool(np.isfinite(numbers).all())
 
 
-def taken_along(scene: AbstractScene, state: Any) -> Any:
+def taken_along(machine: AbstractMachine, state: Any) -> Any:
     """The state, the body taken along by a stop that has come nearer."""
-    for stop in scene.stops:
-        body = scene.coordinates[stop.coordinate]
+    for stop in machine.stops:
+        body = machine.coordinates[stop.coordinate]
         Y = body.position(state)
         beyond = stop.beyond(Y) > 0
         moved = body.placed(state, stop.place, jnp.zeros_like(Y))
@@ -279,12 +281,12 @@ def taken_along(scene: AbstractScene, state: Any) -> Any:
 
 @compiled
 def _sweep(
-    scene, parameter, values, start, settle, cycles, method, rests, tolerance, max_steps
+    machine, parameter, values, start, settle, cycles, method, rests, tolerance, max_steps
 ) -> tuple[Any, Sweep]:
     """The state after the last value, and what was found at each."""
 
     def one(state, value):
-        here = with_leaf(scene, parameter, value)
+        here = with_leaf(machine, parameter, value)
         state = taken_along(here, state)
         run = simulate(
             here, state, cycles, settle=settle, method=method, rests=rests, max_steps=max_steps
@@ -309,9 +311,9 @@ def _sweep(
             sections=sections,
             result=run.result,
             averages=run.mean_averages(),
-            labels=scene.labels,
-            units=stated(scene),
-            periods=tuple(scene.period_of(n) for n in range(1, cycles // 2 + 1)),
+            labels=machine.labels,
+            units=stated(machine),
+            periods=tuple(machine.period_of(n) for n in range(1, cycles // 2 + 1)),
         )
 
     return jax.lax.scan(one, start, values)

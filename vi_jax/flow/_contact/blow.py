@@ -4,15 +4,12 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax.lax import stop_gradient
-from jaxtyping import Array, Bool, Float
 
-from ...scene import RigidStop
+from ..._types import Flag, Scalar
+from ...machine import RigidStop
 from .._arrival import Arrival
 from .._lane import HIT, Plan
 from .._log import clock_at, logged, noted
-
-Scalar = Float[Array, ""]
-Flag = Bool[Array, ""]
 
 # By so many roundings a rebound may be faster than the approach.
 _FASTER = 16.0

@@ -3,18 +3,15 @@
 from typing import Any
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
 
-from ...scene import AbstractScene
-from ...scene.event import rubs
+from ..._types import Flag
+from ...machine import AbstractMachine
+from ...machine.event import rubs
 from .. import results
 from .._arrival import Arrival, ended
 from .._lane import Plan, select, to_event
 from .blow import Blow, gains_speed, listed
 from .sequence import strike_in_turn
-
-Scalar = Float[Array, ""]
-Flag = Bool[Array, ""]
 
 
 def strike(
@@ -22,26 +19,26 @@ def strike(
 ) -> tuple[Arrival, dict[int, Blow]]:
     """The impacts in the state `there` of those stops that a step has `landed` upon; and what they
     were to each coordinate."""
-    limited = sorted({stop.coordinate for stop in plan.scene.stops})
-    if not is_compound(plan.scene):
+    limited = sorted({stop.coordinate for stop in plan.machine.stops})
+    if not is_compound(plan.machine):
         return _one_blow(plan, taken, arrival, landed, there, limited[0])
     return strike_in_turn(plan, taken, arrival, landed, there, limited)
 
 
-def is_compound(scene: AbstractScene) -> bool:
+def is_compound(machine: AbstractMachine) -> bool:
     """Whether several velocities change in an impact, across stops or along them; static."""
-    return len({stop.coordinate for stop in scene.stops}) > 1 or rubs(scene)
+    return len({stop.coordinate for stop in machine.stops}) > 1 or rubs(machine)
 
 
 def _one_blow(
     plan: Plan, taken: Flag, arrival: Arrival, landed: dict[int, Flag], there: Any, k: int
 ) -> tuple[Arrival, dict[int, Blow]]:
     """Of the only coordinate that stops limit."""
-    scene, body = plan.scene, plan.scene.coordinates[k]
+    machine, body = plan.machine, plan.machine.coordinates[k]
     blow = Blow(*(jnp.zeros_like(arrival.s) for _ in range(3)))
     velocity = body.velocity(there)
     for number, met in landed.items():
-        stop = scene.stops[number]
+        stop = machine.stops[number]
         approach = jnp.maximum(stop.approach(velocity), 0.0)
         rebound = stop.leaving(stop.sign * approach)
         arrival = ended(arrival, met, gains_speed(stop, approach, rebound), results.BAD_IMPACT)

@@ -8,14 +8,11 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax.lax import stop_gradient
-from jaxtyping import Array, Bool, Float
 
+from ..._types import Flag, Scalar
 from ...lanes import pin, pin_flag
 from .._lane import Lane, to_event, to_release
 from ..events import Rates
-
-Scalar = Float[Array, ""]
-Flag = Bool[Array, ""]
 
 
 class _Precision(NamedTuple):

@@ -13,19 +13,16 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.lax import stop_gradient
-from jaxtyping import Array, Bool, Float
 
-from ...scene import Coordinate
-from ...scene.contacts import forces, push_of, rubbed, shares
-from ...scene.event import rubbing_on, rubs
+from ..._types import Flag, Scalar
+from ...machine import Coordinate
+from ...machine.contacts import forces, push_of, rubbed, shares
+from ...machine.event import rubbing_on, rubs
 from .. import results
 from .._arrival import Arrival, ended
 from .._lane import Plan, select, to_event
-from ..moving import rounding
+from ..smooth import rounding
 from .blow import Blow, gains_speed, listed
-
-Scalar = Float[Array, ""]
-Flag = Bool[Array, ""]
 
 # A speed of approach is none that has no more than this share of the first one; a sequence that has
 # come down to the second is taken to its limit; what is struck then has speeds within this factor
@@ -71,7 +68,7 @@ class _Instant(NamedTuple):
     before: list[Scalar]
     """Their velocities before."""
     gains: list[list[Scalar]]
-    """What they gain by each other's force (see `scene.contacts`)."""
+    """What they gain by each other's force (see `machine.contacts`)."""
     landed: dict[int, Flag]
     touches: dict[int, Flag]
     """Of each stop, whether its contact is closed."""
@@ -92,7 +89,7 @@ def strike_in_turn(
     nothing = tuple(zero for _ in limited)
     # One that is landed upon without any speed, as of bodies let go of together, may come to rest.
     touched = list(nothing)
-    for number, stop in enumerate(plan.scene.stops):
+    for number, stop in enumerate(plan.machine.stops):
         i = limited.index(stop.coordinate)
         touched[i] = jnp.where(landed[number], to_event(number), touched[i])
     first = select(instant.met, there, arrival.state)
@@ -119,12 +116,12 @@ def _instant(
     plan: Plan, taken: Flag, arrival: Arrival, landed: dict[int, Flag], there: Any,
     limited: list[int],
 ) -> _Instant:  # fmt: skip
-    bodies = [plan.scene.coordinates[k] for k in limited]
+    bodies = [plan.machine.coordinates[k] for k in limited]
     gains_ = shares(bodies, there, [push_of(body, there) for body in bodies])
     met = jnp.zeros_like(taken)
     coupled = [met for _ in limited]
     touches = {}
-    for number, stop in enumerate(plan.scene.stops):
+    for number, stop in enumerate(plan.machine.stops):
         at, here = limited.index(stop.coordinate), landed[number]
         met, coupled[at] = met | here, coupled[at] | here
         depth = stop_gradient(stop.beyond(bodies[at].position(there)))
@@ -137,7 +134,7 @@ def _instant(
     before = [body.velocity(there) for body in bodies]
     return _Instant(
         plan, taken, met, there, limited, bodies, before, gains_, landed, touches, coupled,
-        rounding(plan.scene, there),
+        rounding(plan.machine, there),
     )  # fmt: skip
 
 
@@ -147,7 +144,7 @@ def _coupled(
 ) -> list[Flag]:  # fmt: skip
     """Of each coordinate, whether one of those marked in `coupled` acts on it."""
     closed = [jnp.zeros((), bool) for _ in limited]
-    for number, stop in enumerate(plan.scene.stops):
+    for number, stop in enumerate(plan.machine.stops):
         i = limited.index(stop.coordinate)
         closed[i] = closed[i] | touches[number]
     size, coupled = len(limited), list(coupled)
@@ -164,7 +161,7 @@ def _coupled(
 def _struck(instant: _Instant, x: _Round) -> _Round:
     """A sequence with its next impacts."""
     plan, arrival = instant.plan, x.arrival
-    stops, state = plan.scene.stops, arrival.state
+    stops, state = plan.machine.stops, arrival.state
     velocities = [body.velocity(state) for body in instant.bodies]
     closing = _closing(instant, x, velocities)
     fastest = stop_gradient(jnp.max(jnp.stack(list(closing.values()))))
@@ -197,7 +194,7 @@ def _struck(instant: _Instant, x: _Round) -> _Round:
         )
         arrival = listed(plan, arrival, instant.there, instant.taken & hit, number, speed)
         if stop.modes is not None:
-            given = plan.scene, arrival.s, state, new, arrival.modes
+            given = plan.machine, arrival.s, state, new, arrival.modes
             modes = select(hit, stop.modes_after(*given), arrival.modes)
             arrival = arrival._replace(modes=modes)
         struck[i] = jnp.where(hit, to_event(number), struck[i])
@@ -214,13 +211,13 @@ def _each_by_itself(
     """Whether contacts that close equally fast are struck one after the other all the same, in
     their order: with friction, where one would have to pull, and where laws that differ would gain
     energy together."""
-    if rubs(instant.plan.scene):
+    if rubs(instant.plan.machine):
         return jnp.ones((), bool)
     size = range(len(instant.bodies))
     on, wanted = [jnp.zeros((), bool) for _ in size], [jnp.zeros_like(V) for V in velocities]
     signs = list(wanted)
     for number, hit in hits.items():
-        stop = instant.plan.scene.stops[number]
+        stop = instant.plan.machine.stops[number]
         i = instant.limited.index(stop.coordinate)
         on[i] = on[i] | hit
         wanted[i] = jnp.where(hit, rebounds[number] - velocities[i], wanted[i])
@@ -240,13 +237,13 @@ def _thrown(
 ) -> tuple[Any, list[tuple[Coordinate, Scalar]]]:  # fmt: skip
     """The state after the rebounds of those stops that are hit, with those coordinates at rest that
     are so slow; and by how much each coordinate was pushed."""
-    scene = instant.plan.scene
+    machine = instant.plan.machine
     on, wanted, places = list(slow), [-V for V in velocities], []
     for i, body in enumerate(instant.bodies):
         place = body.position(state)
         for number, hit in hits.items():
-            if scene.stops[number].coordinate == instant.limited[i]:
-                on[i], place = on[i] | hit, jnp.where(hit, scene.stops[number].place, place)
+            if machine.stops[number].coordinate == instant.limited[i]:
+                on[i], place = on[i] | hit, jnp.where(hit, machine.stops[number].place, place)
                 wanted[i] = jnp.where(hit, rebounds[number] - velocities[i], wanted[i])
         places.append(place)
     amounts = forces(instant.gains, on, wanted)
@@ -259,13 +256,13 @@ def _thrown(
         )  # fmt: skip
     pushed = []
     for number, hit in hits.items():
-        friction = rubbing_on(scene, number)
+        friction = rubbing_on(machine, number)
         if friction is not None:
-            i = instant.limited.index(scene.stops[number].coordinate)
-            rough = rubbed(scene, number, friction, state, new)
+            i = instant.limited.index(machine.stops[number].coordinate)
+            rough = rubbed(machine, number, friction, state, new)
             new = select(hit, rough.state, new)
             amounts[i] = jnp.where(hit, rough.pushed, amounts[i])
-            along = scene.coordinates[friction.along]
+            along = machine.coordinates[friction.along]
             pushed.append((along, jnp.where(hit, rough.dragged, 0.0)))
     return new, [*pushed, *zip(instant.bodies, amounts, strict=True)]
 
@@ -278,7 +275,7 @@ def _closing(instant: _Instant, x: _Round, velocities: list[Scalar]) -> dict[int
     takes part.
     """
     found = {}
-    for number, stop in enumerate(instant.plan.scene.stops):
+    for number, stop in enumerate(instant.plan.machine.stops):
         i = instant.limited.index(stop.coordinate)
         speed = stop.approach(velocities[i])
         size = stop_gradient(speed)

@@ -11,23 +11,19 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
-from jaxtyping import Array, Bool, Float
 
+from ..._types import Flag, Scalar
 from ...lanes import pin, pin_flag
-from ...scene import AbstractScene
-from ...scene.contacts import forces, push_of, shares
+from ...machine.contacts import forces, push_of, shares
 from .._arrival import Arrival
+from .._flow_to_event import FlowToEvent
 from .._lane import RESTS, Lane, Plan, select
 from .._log import clock_at, noted
-from .._way import Way
 from ..drift import drifted
 from ..events import force_rate, rates
-from ..moving import holding, in_modes, rounding
+from ..smooth import SmoothMachine, holding, in_modes, rounding
 from .blow import Blow
 from .rest import allowed
-
-Scalar = Float[Array, ""]
-Flag = Bool[Array, ""]
 
 # A contact whose bodies leave each other with less than this share of the speed with which they
 # came stays closed while it is looked at what presses on it.
@@ -83,10 +79,10 @@ def _held(
         left = jnp.where(ends, waits[k], 0.0)
         wait = left if len(rests) == 1 else jnp.maximum(wait, left)
         contact = (*contact[:k], jnp.where(ends, blows[k].struck, contact[k]), *contact[k + 1 :])
-    resting = holding(plan.scene, arrival.modes, contact)
+    resting = holding(plan.machine, arrival.modes, contact)
     walls = {k: blow.struck for k, blow in blows.items()}
     still, lost = stilled(plan, state, rests, walls)
-    way = Way(plan, resting, lane.part, (s, still, time))
+    way = FlowToEvent(plan, resting, lane.part, (s, still, time))
     later, still, passed = drifted(way.rate, pin(wait), way.moving, way.fixed, way.rest)
     if len(rests) > 1:  # another body may come upon this one before its impacts are over
         clear = ~_beyond_any(plan, still)
@@ -110,9 +106,9 @@ def _held(
 
 def _beyond_any(plan: Plan, state: Any) -> Flag:
     """Whether a body is beyond a stop by more than rounding."""
-    found, slack = jnp.zeros((), bool), rounding(plan.scene, state)
-    for stop in plan.scene.stops:
-        place = plan.scene.coordinates[stop.coordinate].position(state)
+    found, slack = jnp.zeros((), bool), rounding(plan.machine, state)
+    for stop in plan.machine.stops:
+        place = plan.machine.coordinates[stop.coordinate].position(state)
         found = found | (stop_gradient(stop.beyond(place)) > slack)
     return found
 
@@ -125,7 +121,7 @@ def stilled(
 
     **Arguments:** of each coordinate whether it rests, and the stop as in `Lane.contact`.
     """
-    bodies = {k: plan.scene.coordinates[k] for k in rests}
+    bodies = {k: plan.machine.coordinates[k] for k in rests}
     velocities = [body.velocity(state) for body in bodies.values()]
     slower, shifts = [-V for V in velocities], []
     for k, body in bodies.items():
@@ -148,7 +144,7 @@ def stilled(
 
 
 def _ends(
-    plan: Plan, lane: Lane, free: AbstractScene, k: int, blow: Blow, speed: Scalar,
+    plan: Plan, lane: Lane, free: SmoothMachine, k: int, blow: Blow, speed: Scalar,
     at: tuple[Scalar, Any], growth: Scalar | None = None,
 ) -> tuple[Flag, Scalar]:  # fmt: skip
     """Whether an impact is one of the endless last ones before rest, and the time they take.
@@ -157,7 +153,7 @@ def _ends(
     its rebound; s and a state of the impact; how fast the force on the body grows, where that is
     known.
     """
-    (s, state), body = at, plan.scene.coordinates[k]
+    (s, state), body = at, plan.machine.coordinates[k]
     sign, gap = plan.wall(k, blow.struck)
     # What presses a body at rest on: with its velocity goes its damping.
     rested = body.placed(state, jnp.asarray(sign * gap), jnp.zeros_like(s))
@@ -165,7 +161,7 @@ def _ends(
     force = pressing * (1 - blow.share)
     ends = force > 0
     left = jnp.where(ends, 2 * speed / jnp.where(ends, force, 1.0), jnp.inf)
-    limit = stop_gradient(jnp.asarray(plan.scene.step_limit(s, state), s.dtype))
+    limit = stop_gradient(jnp.asarray(plan.machine.step_limit(s, state), s.dtype))
     # Hops no higher than rounding cannot be followed, however long they last.
     height = speed**2 / jnp.where(pressing > 0, 2 * pressing, 1.0)
     if growth is None:  # another blow of this instant may have changed it
@@ -202,9 +198,9 @@ def _broken(
 ) -> tuple[Scalar, ...]:
     """As in `Lane`, without the contacts that were struck or pulled apart by the impacts `met`."""
     assert arrival.contact is not None
-    contact, slack = list(arrival.contact), rounding(plan.scene, there)
+    contact, slack = list(arrival.contact), rounding(plan.machine, there)
     for k, blow in blows.items():
-        body = plan.scene.coordinates[k]
+        body = plan.machine.coordinates[k]
         V, old = (stop_gradient(body.velocity(x)) for x in (arrival.state, there))
         apart = met & ((blow.struck > 0) | (jnp.abs(V - old) > slack))
         contact[k] = jnp.where(apart, 0.0, contact[k])
@@ -221,13 +217,13 @@ def _together(
     them do is found by trying, those that rest being held while the others are looked at.
     """
     s, state = arrival.s, arrival.state
-    free = in_modes(plan.scene, arrival.modes)
+    free = in_modes(plan.machine, arrival.modes)
     speeds = {}
     closed = list(contact)
     for k, blow in blows.items():
         sign, _ = plan.wall(k, blow.struck)
         speeds[k] = jnp.maximum(
-            -sign * rates(free.field, plan.scene.coordinates[k].position, s, state).v, 0.0
+            -sign * rates(free.field, plan.machine.coordinates[k].position, s, state).v, 0.0
         )
         stays = (blow.struck > 0) & (stop_gradient(blow.share) <= _CLOSED)
         closed[k] = jnp.where(stays, blow.struck, contact[k])
@@ -236,7 +232,7 @@ def _together(
         closed, _, _, count = found
         new, waits = list(contact), []
         for k, blow in blows.items():
-            alone = holding(plan.scene, arrival.modes, closed, but=k)
+            alone = holding(plan.machine, arrival.modes, closed, but=k)
             ends, left = _ends(plan, lane, alone, k, blow, speeds[k], (s, state))
             ends = (blow.struck > 0) & ends
             new[k] = jnp.where(ends, blow.struck, contact[k])

@@ -8,21 +8,18 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
-from jaxtyping import Array, Bool, Float
 
+from ..._types import Flag, Scalar
 from ...lanes import pin
-from ...scene.event import events_of, section_number
+from ...machine.event import events_of, section_number
 from .._lane import FREE, Lane, Plan, select, to_event, to_release, to_turn_of
 from ..events import quintic, to_turn
 from ..methods import Foreseen
-from ..moving import exact
+from ..smooth import exact
 from .guards import Crossing, at_stops, beyond
 from .hidden import force_may_turn, hump, may_turn_twice
 from .search import Course, Passed, first_event, may_matter
 from .trial import Trial
-
-Scalar = Float[Array, ""]
-Flag = Bool[Array, ""]
 
 
 def aim_ahead(plan: Plan, lane: Lane, motion: Foreseen) -> Lane:
@@ -31,7 +28,7 @@ def aim_ahead(plan: Plan, lane: Lane, motion: Foreseen) -> Lane:
     Of the events that `aim_at` looks for in the step then tried: stops and a clock in the state. It
     lands on what it aims at.
     """
-    limit = stop_gradient(jnp.asarray(plan.method.longest(plan.scene, lane.s, lane.state)))
+    limit = stop_gradient(jnp.asarray(plan.method.longest(plan.machine, lane.s, lane.state)))
     h = jnp.minimum(lane.attempt, motion.reach(limit))
     if plan.ticks(lane.state):
         h = jnp.minimum(h, plan.end(lane.part) - lane.s)
@@ -60,9 +57,9 @@ def _foreseen(
     plan: Plan, lane: Lane, motion: Foreseen, h: Scalar
 ) -> tuple[list[Passed], list[Course]]:
     """What `first_event` asks about a step of length h along `motion`."""
-    scene, courses, ends, paths = plan.scene, [], [], []
-    if plan.motion or scene.stops:
-        paths = [motion.of(coordinate.position) for coordinate in scene.coordinates]
+    machine, courses, ends, paths = plan.machine, [], [], []
+    if plan.motion or machine.stops:
+        paths = [motion.of(coordinate.position) for coordinate in machine.coordinates]
     for k, path in enumerate(paths):
         begin, end = path.ends(h)
         turned = (lane.direction[k] * end.v < 0) & may_matter(plan, lane, k, begin, end, h)
@@ -71,14 +68,14 @@ def _foreseen(
         courses.append((turned, partial(path.over, h)))
         ends.append((begin, end))
     guards = []
-    for guard in at_stops(scene, ends):
-        stop = scene.stops[guard.number]
+    for guard in at_stops(machine, ends):
+        stop = machine.stops[guard.number]
         curve = partial(paths[stop.coordinate].over, h, stop.sign, stop_gradient(stop.gap))
         guards.append((guard, guard.end.x > 0, curve))
-    if scene.clock(lane.state) is not None:
-        clock, bound = motion.of(scene.clock), stop_gradient(plan.end(lane.part))
+    if machine.clock(lane.state) is not None:
+        clock, bound = motion.of(machine.clock), stop_gradient(plan.end(lane.part))
         begin, end = (x.scaled(1, bound) for x in clock.ends(h))
-        guard = Crossing(events_of(scene)[-1], section_number(scene), begin, end, bound)
+        guard = Crossing(events_of(machine)[-1], section_number(machine), begin, end, bound)
         guards.append((guard, guard.end.x > 0, partial(clock.over, h, 1, bound)))
     return guards, courses
 
@@ -195,7 +192,7 @@ def _seen(plan: Plan, lane: Lane, trial: Trial) -> _Seen:
         if c.event.holds_mode:
             above, place = hump(c, h)
             humps.append((good & above, place))
-    exactly, twice = exact(plan.scene, lane.state), jnp.zeros_like(good)
+    exactly, twice = exact(plan.machine, lane.state), jnp.zeros_like(good)
     eps = float(jnp.finfo(h.dtype).eps)
     for k, path in enumerate(trial.paths):
         end, twice = path.end, twice | may_turn_twice(lane.direction[k], path, h)

@@ -6,26 +6,23 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
-from jaxtyping import Array, Bool, Float
 
-from ...scene.event import section_number, struck_modes
+from ..._types import Flag, Scalar
+from ...machine.event import section_number, struck_modes
 from .._arrival import Arrival
 from .._contact.impact import is_compound, strike
 from .._contact.rest import Release
 from .._contact.settle import Approach, settle, stilled
+from .._flow_to_event import FlowToEvent
 from .._lane import LEAVES, Lane, Plan, Record, select, to_event, to_turn_of
 from .._log import clock_at, noted
-from .._way import Way
 from ..drift import drifted, height_of_turn, met_after, unmoved
 from ..events import Rates, to_turn
-from ..moving import exact, holding
+from ..smooth import exact, holding
 from .faults import may_end
 from .guards import Crossing, furthest_landing
 from .happen import happened
 from .trial import Trial
-
-Scalar = Float[Array, ""]
-Flag = Bool[Array, ""]
 
 
 def arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Flag]:
@@ -44,15 +41,15 @@ def arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Fla
                 away = jnp.where(met_before, stop_gradient(jnp.sign(trial.paths[k].end.a)), away)
             along = jnp.where(trial.paths[k].at_turn, away, turned)
         direction.append(along)
-    here = plan.scene.position(trial.state)
+    here = plan.machine.position(trial.state)
     arrival = Arrival(
-        trial.s, trial.state, here, here if plan.scene.events else None, trial.time,
+        trial.s, trial.state, here, here if plan.machine.events else None, trial.time,
         tuple(direction),
         lane.contact, lane.modes,
         old.impacts, old.speed, old.loss, old.rests, old.log, old.events, trial.ends_interval,
-        lane.fault if may_end(plan.scene) else None,
+        lane.fault if may_end(plan.machine) else None,
     )  # fmt: skip
-    way = Way(plan, trial.holding, lane.part, (trial.s, trial.state, trial.time))
+    way = FlowToEvent(plan, trial.smooth, lane.part, (trial.s, trial.state, trial.time))
     if trial.crossings:
         met = jnp.zeros_like(taken)
         for c in trial.crossings:
@@ -83,7 +80,9 @@ def arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Fla
     return there, taken & arrival.completed
 
 
-def _met(plan: Plan, lane: Lane, trial: Trial, taken: Flag, way: Way, arrival: Arrival) -> Arrival:
+def _met(
+    plan: Plan, lane: Lane, trial: Trial, taken: Flag, way: FlowToEvent, arrival: Arrival
+) -> Arrival:
     """What the event makes of a step that met one: the last part of its way, and the jump. A step
     lands on one event; what is met with it is met by the next."""
     landed = {c.number: c.landed for c in trial.crossings}
@@ -97,10 +96,10 @@ def _met(plan: Plan, lane: Lane, trial: Trial, taken: Flag, way: Way, arrival: A
             met = met | here
         time = select(met, passed, arrival.time)
         arrival = arrival._replace(s=arrival.s + jnp.where(met, offset, 0.0), time=time)
-        if plan.scene.stops:
+        if plan.machine.stops:
             arrival = _impact(plan, lane, trial, taken, arrival, landed, there)
         for c in trial.crossings:
-            if c.number == section_number(plan.scene):
+            if c.number == section_number(plan.machine):
                 # What begins anew with a cycle does so at its end.
                 arrival = arrival._replace(state=select(c.landed, there, arrival.state))
             elif c.coordinate is None:
@@ -110,28 +109,28 @@ def _met(plan: Plan, lane: Lane, trial: Trial, taken: Flag, way: Way, arrival: A
     for k, path in enumerate(trial.paths):
         if path.leaves is not None:
             arrival = _released(plan, lane, taken, arrival, way, k, path.leaves)
-    arrival = arrival._replace(place=plan.scene.position(arrival.state))
+    arrival = arrival._replace(place=plan.machine.position(arrival.state))
     # Where a switch is met the field may have an infinite slope (Hertz's damper as it is touched),
     # which only derivatives along with the event do not see.
-    fixed = plan.ticks(lane.state) and not plan.scene.switches
+    fixed = plan.ticks(lane.state) and not plan.machine.switches
     return _at_fixed_clock(plan, lane, trial, arrival) if fixed else arrival
 
 
 def _at_fixed_clock(plan: Plan, lane: Lane, trial: Trial, arrival: Arrival) -> Arrival:
     """The same place, its derivatives those at this reading of the clock rather than at an event
     that comes sooner or later: so that the steps to come need none of `s`."""
-    machine = holding(plan.scene, arrival.modes, arrival.contact)
+    smooth = holding(plan.machine, arrival.modes, arrival.contact)
     bound = plan.end(lane.part)
     # The end of the interval may depend on what is differentiated by.
     moved = jnp.where(trial.ends_interval, bound - stop_gradient(bound), 0.0)
     s = stop_gradient(arrival.s) + moved
-    way = Way(plan, machine, lane.part, (arrival.s, arrival.state, arrival.time))
+    way = FlowToEvent(plan, smooth, lane.part, (arrival.s, arrival.state, arrival.time))
     _, state, time = unmoved(way.rate, s - arrival.s, way.moving, way.fixed, way.rest)
     return arrival._replace(s=s, state=state, time=time)
 
 
 def _released(
-    plan: Plan, lane: Lane, taken: Flag, arrival: Arrival, way: Way, k: int, leaves: Release
+    plan: Plan, lane: Lane, taken: Flag, arrival: Arrival, way: FlowToEvent, k: int, leaves: Release
 ) -> Arrival:
     """Coordinate number k free again."""
     assert arrival.contact is not None
@@ -139,9 +138,9 @@ def _released(
     offset = met_after(way.rate, way.force(k), offset, way.moving, way.fixed, way.rest)
     moving = arrival.s, arrival.state, arrival.time
     _, state, time = drifted(way.rate, offset, moving, way.fixed, way.rest)
-    if not exact(plan.scene, state):
+    if not exact(plan.machine, state):
         # While they were held their places were kept to the method's error.
-        limited = sorted({stop.coordinate for stop in plan.scene.stops})
+        limited = sorted({stop.coordinate for stop in plan.machine.stops})
         walls = {i: arrival.contact[i] for i in limited}
         put, _ = stilled(plan, state, {i: walls[i] > 0 for i in limited}, walls)
         state = select(walls[k] > 0, put, state)
@@ -165,7 +164,7 @@ def _below(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Scalar, .
     numbers = plan.from_below(lane.state)
     for number, old, new in zip(numbers, lane.below, trial.below, strict=True):
         for c in trial.crossings:
-            jumps = plan.scene.events and not c.event.holds_mode
+            jumps = plan.machine.events and not c.event.holds_mode
             if c.number == number or jumps:
                 new = jnp.where(c.landed, 0.0, new)
         found.append(jnp.where(taken, new, old))
@@ -176,7 +175,7 @@ def _put(values: tuple, k: int, value: Any) -> tuple:
     return (*values[:k], value, *values[k + 1 :])
 
 
-def _offset(plan: Plan, lane: Lane, trial: Trial, way: Way, c: Crossing) -> Scalar:
+def _offset(plan: Plan, lane: Lane, trial: Trial, way: FlowToEvent, c: Crossing) -> Scalar:
     """To the event from the step's end."""
     # Of a motion so flat that the event's place is known worse than its surface, it is here.
     near = c.landed & (jnp.abs(c.offset) <= furthest_landing(trial.h))
@@ -194,7 +193,7 @@ def _impact(
     landed: dict[int, Flag], there: Any,
 ) -> Arrival:  # fmt: skip
     """The rebound from a stop in `there`, the state of the impact; or coming to rest on it."""
-    scene, stops = plan.scene, range(len(plan.scene.stops))
+    machine, stops = plan.machine, range(len(plan.machine.stops))
     landed = {number: landed[number] for number in stops}
     arrival, blows = strike(plan, taken, arrival, landed, there)
     both = enumerate(zip(trial.paths, trial.alone, strict=True))
@@ -207,7 +206,7 @@ def _impact(
         met = met | here
     arrival = settle(plan, lane, approaches, taken, arrival, there, met, blows)
     direction = list(arrival.direction)
-    for k, body in enumerate(scene.coordinates):
+    for k, body in enumerate(machine.coordinates):
         if k not in blows or len(blows) > 1:  # it may share a body with one that was hit
             v = stop_gradient(body.velocity(arrival.state))
             direction[k] = jnp.where(met & (v != 0), jnp.sign(v), direction[k])
@@ -218,19 +217,19 @@ def _impact(
                 away = jnp.where(arrival.contact[k] > 0, sign, away)
             direction[k] = jnp.where(blows[k].struck > 0, away, direction[k])
     modes = arrival.modes
-    if modes and is_compound(scene):
+    if modes and is_compound(machine):
         contact = arrival.contact or ()
-        new = struck_modes(scene, arrival.s, arrival.state, modes, contact=contact)
+        new = struck_modes(machine, arrival.s, arrival.state, modes, contact=contact)
         modes = select(met, new, modes)
     elif modes:
         for number, here in landed.items():
-            given = scene, arrival.s, there, arrival.state, modes
-            modes = select(here, scene.stops[number].modes_after(*given), modes)
+            given = machine, arrival.s, there, arrival.state, modes
+            modes = select(here, machine.stops[number].modes_after(*given), modes)
     return arrival._replace(direction=tuple(direction), modes=modes)
 
 
 def _reached(
-    plan: Plan, lane: Lane, trial: Trial, taken: Flag, way: Way, arrival: Arrival
+    plan: Plan, lane: Lane, trial: Trial, taken: Flag, way: FlowToEvent, arrival: Arrival
 ) -> tuple[Scalar | None, Scalar | None, Scalar | None]:
     """Greatest and smallest Y so far, and the smallest distance at a turn that met no stop."""
     record = lane.record
@@ -241,7 +240,7 @@ def _reached(
     at_turn = trial.paths[0].at_turn
     reached = jnp.where(at_turn, tops[0], arrival.place)
     if clearance is not None:
-        for stop in plan.scene.stops:
+        for stop in plan.machine.stops:
             k = stop.coordinate
             short = taken & trial.paths[k].at_turn & (lane.direction[k] == stop.sign)
             room = jnp.where(short, -stop.beyond(tops[k]), jnp.inf)
@@ -252,7 +251,7 @@ def _reached(
     return y_max, y_min, clearance
 
 
-def _top(trial: Trial, k: int, way: Way) -> Scalar:
+def _top(trial: Trial, k: int, way: FlowToEvent) -> Scalar:
     """Coordinate number k at the turning point that a step was aimed at, or else at its end."""
     path = trial.paths[k]
     end: Rates = stop_gradient(path.end)

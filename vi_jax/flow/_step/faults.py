@@ -4,18 +4,15 @@ from typing import Any
 
 import jax.numpy as jnp
 from jax.lax import stop_gradient
-from jaxtyping import Array, Bool, Float
 
-from ...scene import AbstractScene
-from ...scene.event import events_of, guard_of
+from ..._types import Flag, Scalar
+from ...machine import AbstractMachine
+from ...machine.event import events_of, guard_of
 from .. import results
 from .._lane import FREE, Lane, Plan, Record, to_event, total
 from ..events import guard_rates
-from ..moving import in_modes
+from ..smooth import in_modes
 from .trial import Trial
-
-Scalar = Float[Array, ""]
-Flag = Bool[Array, ""]
 
 # A lane that has aimed this often without landing is lost; after so many impacts in one interval
 # it was chattering.
@@ -39,7 +36,7 @@ def faults(
 ) -> list[tuple[Flag, Any]]:
     """What ends a lane, the first that holds being the reason."""
     broken = results.NOT_FINITE
-    if plan.scene.alive(trial.state) is not None:
+    if plan.machine.alive(trial.state) is not None:
         # A clock that breaks down makes the steps shrink to nothing.
         broken = results.STALLED
     ends = [
@@ -52,7 +49,7 @@ def faults(
     if not plan.method.adaptive:
         return [(rejected, float(broken)), *ends]
     eps = float(jnp.finfo(length.dtype).eps)
-    gone = rejected & (length < 4 * eps * jnp.maximum(1.0, plan.scene.cycle))
+    gone = rejected & (length < 4 * eps * jnp.maximum(1.0, plan.machine.cycle))
     numeric = jnp.isfinite(total(trial.state, length))
     tiny = results.UNDERFLOW if broken == results.NOT_FINITE else broken
     return [(gone & ~numeric, float(broken)), (gone, float(tiny)), *ends]
@@ -60,15 +57,15 @@ def faults(
 
 def _lost(plan: Plan, lane: Lane, target: Scalar) -> Scalar | float:
     """The reason of a lane that has aimed too often, by what it aimed at."""
-    scene, reason = plan.scene, float(results.UNRESOLVED)
-    if plan.motion or scene.stops:
+    machine, reason = plan.machine, float(results.UNRESOLVED)
+    if plan.motion or machine.stops:
         reason = jnp.where(target < FREE, float(results.TURN_UNRESOLVED), reason)
-    first = len(scene.stops)
-    if scene.switches:
+    first = len(machine.stops)
+    if machine.switches:
         others = target >= to_event(first)
         reason = jnp.where(others, float(results.SWITCH_UNRESOLVED), reason)
-    if scene.events:
-        others = target >= to_event(first + len(scene.switches))
+    if machine.events:
+        others = target >= to_event(first + len(machine.switches))
         reason = jnp.where(others, float(results.RESET_UNRESOLVED), reason)
     if not plan.ticks(lane.state):
         ends = target == plan.to_section
@@ -76,27 +73,29 @@ def _lost(plan: Plan, lane: Lane, target: Scalar) -> Scalar | float:
     return reason
 
 
-def may_end(scene: AbstractScene) -> bool:
+def may_end(machine: AbstractMachine) -> bool:
     """Whether an event may end a lane; static."""
-    laws = any(not stop.is_one_number for stop in scene.stops)
-    slides = any(event.may_slide for event in events_of(scene))
-    several = bool(scene.stops) and (len(scene.coordinates) > 1 or bool(scene.events))
+    laws = any(not stop.is_one_number for stop in machine.stops)
+    slides = any(event.may_slide for event in events_of(machine))
+    several = bool(machine.stops) and (len(machine.coordinates) > 1 or bool(machine.events))
     return laws or slides or several
 
 
-def comes_back(scene: AbstractScene, i: int, modes: tuple, s: Scalar, state: Any) -> Flag | None:
+def comes_back(
+    machine: AbstractMachine, i: int, modes: tuple, s: Scalar, state: Any
+) -> Flag | None:
     """Whether the field behind a switch points back at its surface, as that before it did: the
     motion would slide along it. `None` for a kind of switch whose motion cannot.
 
     **Arguments:** the number of the event; the modes, s and the state behind it.
     """
-    if not events_of(scene)[i].may_slide:
+    if not events_of(machine)[i].may_slide:
         return None
-    machine = in_modes(scene, modes)
+    smooth = in_modes(machine, modes)
 
     def guard(s: Scalar, state: Any) -> Scalar:
-        return guard_of(scene, i, s, state, modes)
+        return guard_of(machine, i, s, state, modes)
 
-    here = stop_gradient(guard_rates(machine.field, guard, s, state))
+    here = stop_gradient(guard_rates(smooth.field, guard, s, state))
     slack = 1e4 * float(jnp.finfo(s.dtype).eps) * (1 + jnp.abs(here.v))
     return (jnp.abs(here.x) <= slack) & (here.v > slack)

@@ -5,17 +5,14 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax.lax import stop_gradient
-from jaxtyping import Array, Bool, Float
 
+from ..._types import Flag, Scalar
 from ...lanes import pin_flag
-from ...scene import AbstractEvent, AbstractScene
-from ...scene.event import events_of, guard_of, section_number
+from ...machine import AbstractEvent, AbstractMachine
+from ...machine.event import events_of, guard_of, section_number
 from .._lane import Lane, Plan, to_event
 from ..events import Rates, guard_rates, landing
-from ..moving import exact
-
-Scalar = Float[Array, ""]
-Flag = Bool[Array, ""]
+from ..smooth import exact
 
 # Newton's method on a smooth flow needs two or three aims. Where rounding keeps it from gaining
 # more, a lane that has aimed this often accepts a thousand times the tolerance.
@@ -59,21 +56,21 @@ def crossings(
     **Arguments:** the machine as the step saw it; what it saw of each coordinate; s, its length and
     the state at its end; whether it was good, and whether it ends an interval.
     """
-    scene, (s1, h, new), (good, last) = plan.scene, there, ends
+    machine, (s1, h, new), (good, last) = plan.machine, there, ends
     others, below = _others(plan, lane, holding, s1, new)
-    guards = [*at_stops(scene, [(path.begin, path.end) for path in paths]), *others]
+    guards = [*at_stops(machine, [(path.begin, path.end) for path in paths]), *others]
     # The stops of one coordinate and a clock are never met together but on a section, where a step
     # ends; other events can be.
-    if plan.others(lane.state) or not exact(scene, lane.state):
+    if plan.others(lane.state) or not exact(machine, lane.state):
         eps = float(jnp.finfo(h.dtype).eps)
         guards = [guard._replace(slack=4 * eps * guard.scale) for guard in guards]
     return tuple(_seen(lane, good & last, good, h, each, guards) for each in guards), below
 
 
-def at_stops(scene: AbstractScene, ends: list[tuple[Rates, Rates]]) -> list[Crossing]:
+def at_stops(machine: AbstractMachine, ends: list[tuple[Rates, Rates]]) -> list[Crossing]:
     """Of the stops, from the rates of each coordinate at both ends of a step."""
     found = []
-    for i, stop in enumerate(scene.stops):
+    for i, stop in enumerate(machine.stops):
         begin, end = (x.scaled(stop.sign, stop.gap) for x in ends[stop.coordinate])
         found.append(Crossing(stop, i, begin, end, 1 + jnp.abs(stop.gap), stop.coordinate))
     return found
@@ -84,7 +81,7 @@ def _others(
 ) -> tuple[list[Crossing], tuple[Scalar, ...]]:
     """Of the events besides stops, and of a clock in the state, which counts the cycles; and
     `Lane.below` at the step's end."""
-    scene, found, below = plan.scene, [], []
+    machine, found, below = plan.machine, [], []
 
     def ends(guard: Callable[[Scalar, Any], Any]) -> tuple[Rates, Rates]:
         begin = guard_rates(moving.field, guard, lane.s, lane.state)
@@ -92,17 +89,17 @@ def _others(
 
     around = lane.modes, lane.contact or ()
     for number in plan.others(lane.state):
-        event = events_of(scene)[number]
-        begin, end = ends(lambda s, x, i=number: jnp.asarray(guard_of(scene, i, s, x, *around)))
+        event = events_of(machine)[number]
+        begin, end = ends(lambda s, x, i=number: jnp.asarray(guard_of(machine, i, s, x, *around)))
         scale = 1 + stop_gradient(jnp.abs(end.v))
         if event.from_below:
             begin, end, risen = _from_below(lane.below[len(below)], begin, end, scale)
             below.append(risen)
         found.append(Crossing(event, number, begin, end, scale))
-    if scene.clock(lane.state) is not None:
-        number, bound = section_number(scene), plan.end(lane.part)
-        begin, end = ends(lambda _, x: jnp.asarray(scene.clock(x)) - bound)
-        found.append(Crossing(events_of(scene)[number], number, begin, end, bound))
+    if machine.clock(lane.state) is not None:
+        number, bound = section_number(machine), plan.end(lane.part)
+        begin, end = ends(lambda _, x: jnp.asarray(machine.clock(x)) - bound)
+        found.append(Crossing(events_of(machine)[number], number, begin, end, bound))
     return found, tuple(below)
 
 

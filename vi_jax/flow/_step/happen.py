@@ -3,38 +3,35 @@
 from typing import Any
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
 
-from ...scene.event import after_event, happens_at, mode_number, value_of
+from ..._types import Flag
+from ...machine.event import after_event, happens_at, mode_number, value_of
 from .. import results
 from .._arrival import Arrival, ended
 from .._lane import CHANGES, RESETS, Plan, select
 from .._log import clock_at, logged, noted
-from ..moving import rounding
+from ..smooth import rounding
 from .faults import comes_back
 from .guards import Crossing
 from .jump import after_jump
 
-Scalar = Float[Array, ""]
-Flag = Bool[Array, ""]
-
 
 def happened(plan: Plan, taken: Flag, arrival: Arrival, c: Crossing, there: Any) -> Arrival:
     """State and modes after an event in the state `there` that is no impact."""
-    scene, event = plan.scene, c.event
-    met = scene, c.number, arrival.s, there, arrival.modes
+    machine, event = plan.machine, c.event
+    met = machine, c.number, arrival.s, there, arrival.modes
     when = happens_at(*met)
     happens = c.landed if when is None else c.landed & when
     new, modes = after_event(*met, arrival.contact or ())
     modes = select(happens, modes, arrival.modes)
     log, clock = arrival.log, clock_at(plan, arrival.s, there)
     if event.holds_mode:
-        slides = comes_back(scene, c.number, modes, arrival.s, new)
+        slides = comes_back(machine, c.number, modes, arrival.s, new)
         arrival = ended(arrival, c.landed, slides, results.SLIDING)
-        kind, number = CHANGES, c.number - len(scene.stops)
-        value = modes[mode_number(scene, c.number)]
+        kind, number = CHANGES, c.number - len(machine.stops)
+        value = modes[mode_number(machine, c.number)]
     else:
-        kind, number = RESETS, c.number - len(scene.stops) - len(scene.switches)
+        kind, number = RESETS, c.number - len(machine.stops) - len(machine.switches)
         value = value_of(*met)
     events = noted(arrival.events, taken & happens, clock, kind, number, value)
     if plan.log_switches:
@@ -56,13 +53,13 @@ def _jumped(
     """Which way the motion goes on after a jump of the state, and what of it rests still; a lane
     that was put beyond a stop ends."""
     beyond = jnp.zeros_like(happens)
-    for stop in plan.scene.stops:
-        place = plan.scene.coordinates[stop.coordinate].position(new)
-        beyond = beyond | (stop.beyond(place) > rounding(plan.scene, new))
-    if plan.scene.stops:
+    for stop in plan.machine.stops:
+        place = plan.machine.coordinates[stop.coordinate].position(new)
+        beyond = beyond | (stop.beyond(place) > rounding(plan.machine, new))
+    if plan.machine.stops:
         arrival = ended(arrival, c.landed, happens & beyond, results.BAD_RESET)
     onward = arrival.direction, arrival.contact, arrival.modes
     direction, contact = after_jump(plan, onward, happens, there, new, arrival.s)
     assert arrival.before is not None  # as the machine has such events
-    before = jnp.where(c.landed, plan.scene.position(there), arrival.before)
+    before = jnp.where(c.landed, plan.machine.position(there), arrival.before)
     return arrival._replace(direction=direction, contact=contact, before=before)

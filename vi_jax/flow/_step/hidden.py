@@ -2,14 +2,11 @@
 
 import jax.numpy as jnp
 from jax.lax import stop_gradient
-from jaxtyping import Array, Bool, Float
 
+from ..._types import Flag, Scalar
 from .._lane import Lane
 from .guards import Crossing
 from .trial import Path
-
-Scalar = Float[Array, ""]
-Flag = Bool[Array, ""]
 
 # A hump of a guard this close to an end of a step (as a share of it) is seen from there.
 _BRIEF = 1e-3

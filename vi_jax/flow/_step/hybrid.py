@@ -18,19 +18,16 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax.lax import stop_gradient
-from jaxtyping import Array, Bool, Float
 
+from ..._types import Flag, Scalar
 from ...lanes import pin_flag
 from .._lane import FREE, Lane, Plan, Record, select
-from ..moving import holding
+from ..smooth import holding
 from .aim import aim_ahead, aim_at
 from .arrive import arrive
 from .faults import faults
 from .jump import after_jump
 from .trial import Trial, attempt, timing
-
-Scalar = Float[Array, ""]
-Flag = Bool[Array, ""]
 
 
 class Step(NamedTuple):
@@ -47,11 +44,11 @@ class Step(NamedTuple):
 def iterate(plan: Plan, lane: Lane) -> Step:
     """One step of one lane: advance, aim or land. A lane that has ended is left as it is."""
     active = (lane.done < plan.intervals) & (lane.fault == 0)
-    machine = holding(plan.scene, lane.modes, lane.contact)
-    motion = plan.method.foresee(machine, lane.s, lane.state, timing(plan, lane))
+    smooth = holding(plan.machine, lane.modes, lane.contact)
+    motion = plan.method.foresee(smooth, lane.s, lane.state, timing(plan, lane))
     if motion is not None:
         lane = aim_ahead(plan, lane, motion)
-    trial = attempt(plan, lane, active, machine, motion)
+    trial = attempt(plan, lane, active, smooth, motion)
     aim, goal, target = aim_at(plan, lane, trial, foreseen=motion is not None)
     aim = pin_flag(active & aim, lane.s)
     taken = pin_flag(active & trial.good & ~aim, lane.s)
@@ -97,8 +94,8 @@ def _onward(plan: Plan, there: Lane, completed: Flag, done: Scalar) -> Lane:
         part = jnp.where(turned, plan.first_part(done), part)
     s = jnp.where(turned, 0.0, there.s)
     if not plan.ticks(state):
-        state = select(turned, plan.scene.rewound(state), state)
-    renewed = plan.scene.renewed(state)
+        state = select(turned, plan.machine.rewound(state), state)
+    renewed = plan.machine.renewed(state)
     if renewed is not state:
         onward = there.direction, there.contact, there.modes
         onward = after_jump(plan, onward, turned, state, renewed, jnp.zeros_like(s))

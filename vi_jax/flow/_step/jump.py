@@ -4,14 +4,11 @@ from typing import Any
 
 import jax.numpy as jnp
 from jax.lax import stop_gradient
-from jaxtyping import Array, Bool, Float
 
+from ..._types import Flag, Scalar
 from .._lane import Plan
 from ..events import rates
-from ..moving import holding, rounding
-
-Scalar = Float[Array, ""]
-Flag = Bool[Array, ""]
+from ..smooth import holding, rounding
 
 
 def after_jump(
@@ -26,8 +23,8 @@ def after_jump(
     direction, contact, modes = onward
     directions: list[Any] = list(direction)
     contacts: list[Any] = list(contact or ())
-    slack = rounding(plan.scene, new)
-    for k, coordinate in enumerate(plan.scene.coordinates):
+    slack = rounding(plan.machine, new)
+    for k, coordinate in enumerate(plan.machine.coordinates):
         (place, before), (there, after) = (
             (coordinate.position(x), coordinate.velocity(x)) for x in (old, new)
         )
@@ -35,11 +32,11 @@ def after_jump(
             moved = (jnp.abs(there - place) > slack) | (jnp.abs(after - before) > slack)
             contacts[k] = jnp.where(when & stop_gradient(moved), 0.0, contacts[k])
     contact = None if contact is None else tuple(contacts)
-    for k, coordinate in enumerate(plan.scene.coordinates):
-        after, known = coordinate.velocity(new), plan.scene.has_velocity(new)
+    for k, coordinate in enumerate(plan.machine.coordinates):
+        after, known = coordinate.velocity(new), plan.machine.has_velocity(new)
         if not known or after is not coordinate.velocity(old):
-            machine = holding(plan.scene, modes, contact)
-            here = rates(machine.field, coordinate.position, s, new)
+            smooth = holding(plan.machine, modes, contact)
+            here = rates(smooth.field, coordinate.position, s, new)
             # The second number of a state without velocities may be anything.
             after = after if known else here.v
             after = stop_gradient(jnp.where(after == 0, here.a, after))

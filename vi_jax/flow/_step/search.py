@@ -5,16 +5,13 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax.lax import stop_gradient
-from jaxtyping import Array, Bool, Float
 
-from ...scene import RigidStop
-from ...scene.trig import horner
+from ..._types import Flag, Scalar
+from ...machine import RigidStop
+from ...machine.trig import horner
 from .._lane import Lane, Plan, select, to_event, to_turn_of
 from ..events import Rates, highest, rising_root, slope
 from .guards import Crossing
-
-Scalar = Float[Array, ""]
-Flag = Bool[Array, ""]
 
 # Coefficients in θ, which goes from 0 to 1 along a step.
 Curve = tuple[Scalar, ...]
@@ -123,7 +120,7 @@ def _through_a_stop(plan: Plan, lane: Lane, guards: list[Passed], k: int) -> Fla
     through = jnp.zeros_like(lane.s, bool)
     for guard, over, _ in guards:
         if guard.coordinate == k:
-            sign = plan.scene.stops[guard.number].sign
+            sign = plan.machine.stops[guard.number].sign
             through = through | over & (lane.direction[k] == sign)
     return through
 
@@ -164,7 +161,7 @@ def _has_to_be_met(
     if everything is True:
         return jnp.ones_like(lane.s, bool)
     close = jnp.zeros_like(lane.s, bool) if everything is False else everything
-    for stop in plan.scene.stops:
+    for stop in plan.machine.stops:
         if stop.coordinate == k:
             close = close | (depth(stop) > -margin)
     return close

@@ -5,20 +5,16 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.lax import stop_gradient
-from jaxtyping import Array, Bool, Float
 
+from ..._types import Flag, Scalar
 from ...lanes import pin, pin_flag
-from ...scene import AbstractScene
 from .._contact.rest import Release, release
 from .._lane import FREE, Lane, Plan, to_event, to_turn_of, total
 from ..beside import Beside, elapsed
 from ..events import Rates, force_rate, rates, turns_within
 from ..methods import Foreseen
-from ..moving import exact, holding
+from ..smooth import SmoothMachine, exact, holding
 from .guards import Crossing, crossings, leniency, turn_tolerance
-
-Scalar = Float[Array, ""]
-Flag = Bool[Array, ""]
 
 # A window of force shorter than this share of the longest step moves the body by its third power.
 _SLIVER = 1e-3
@@ -37,9 +33,9 @@ class Trial(NamedTuple):
     crossings: tuple[Crossing, ...]
     paths: tuple["Path", ...]
     """Of each coordinate; none where nothing asks for it."""
-    alone: tuple[Any, ...]
+    alone: tuple[SmoothMachine, ...]
     """Of each coordinate, the machine in its modes with the other bodies held that rest."""
-    holding: Any
+    smooth: SmoothMachine
     """The machine as the step saw it: its bodies held where they rest."""
     below: tuple[Scalar, ...]
     """As in `Lane`, at the step's end."""
@@ -62,20 +58,20 @@ class Path(NamedTuple):
 def timing(plan: Plan, lane: Lane) -> Beside | None:
     """Elapsed time and integrals, where the method has to carry them along."""
     passed = lane.record.time
-    paced = plan.motion and plan.scene.pace(lane.s, lane.state) is not None
+    paced = plan.motion and plan.machine.pace(lane.s, lane.state) is not None
     if passed is None or not (paced or passed.integrals):
         return None
     return Beside(passed.time if paced else None, passed.integrals)
 
 
 def attempt(
-    plan: Plan, lane: Lane, active: Flag, machine: AbstractScene, motion: Foreseen | None
+    plan: Plan, lane: Lane, active: Flag, smooth: SmoothMachine, motion: Foreseen | None
 ) -> Trial:
     """Try the next step and see what it meets; of length zero for a lane that has ended."""
-    scene, method = plan.scene, plan.method
+    machine, method = plan.machine, plan.method
     free = lane.target == FREE
     bound = plan.end(lane.part)
-    limit = method.longest(scene, lane.s, lane.state)
+    limit = method.longest(machine, lane.s, lane.state)
     h = stop_gradient(jnp.where(free, jnp.minimum(lane.attempt, limit), lane.attempt))
     s1, last = lane.s + h, jnp.zeros_like(free)
     if plan.ticks(lane.state):
@@ -90,14 +86,14 @@ def attempt(
     if motion is not None:
         (new, beside), error = motion.at(h), jnp.zeros_like(h)
     else:
-        new, beside, error = method.step(machine, lane.s, s1, lane.state, beside)
+        new, beside, error = method.step(smooth, lane.s, s1, lane.state, beside)
     time = None if lane.record.time is None else elapsed(lane.record.time, beside, h)
     if lane.contact is not None and not method.uses_field:
         rests = lane.contact[0] > 0
         new = jtu.tree_map(lambda a, b: jnp.where(rests, a, b), lane.state, new)
     new = pin(new)
     good = jnp.isfinite(total(new, jnp.zeros_like(h)))
-    alive = scene.alive(new)
+    alive = machine.alive(new)
     if alive is not None:
         good = good & alive
     if method.adaptive:
@@ -105,25 +101,31 @@ def attempt(
         good = good & (error <= 1)
     good = pin_flag(good, h)
 
-    bodies = range(len(scene.coordinates))
-    alone = tuple(holding(scene, lane.modes, lane.contact, but=k) for k in bodies)
+    bodies = range(len(machine.coordinates))
+    alone = tuple(holding(machine, lane.modes, lane.contact, but=k) for k in bodies)
     paths = []
-    if plan.motion or scene.stops:
+    if plan.motion or machine.stops:
         for k, one in enumerate(alone):
-            paths.append(_path(plan, lane, k, one, machine, (s1, new, h, limit), good))
-    seen, below = crossings(plan, lane, machine, paths, (s1, h, new), (good, last))
-    return Trial(s1, h, new, time, error, good, last, seen, tuple(paths), alone, machine, below)
+            paths.append(_path(plan, lane, k, one, smooth, (s1, new, h, limit), good))
+    seen, below = crossings(plan, lane, smooth, paths, (s1, h, new), (good, last))
+    return Trial(s1, h, new, time, error, good, last, seen, tuple(paths), alone, smooth, below)
 
 
 def _path(
-    plan: Plan, lane: Lane, k: int, free: Any, machine: Any, there: tuple, good: Flag
+    plan: Plan,
+    lane: Lane,
+    k: int,
+    free: SmoothMachine,
+    smooth: SmoothMachine,
+    there: tuple,
+    good: Flag,
 ) -> Path:
     """What a step that ends `there` saw of coordinate number k."""
     s1, new, h, limit = there
-    position = plan.scene.coordinates[k].position
+    position = plan.machine.coordinates[k].position
     begin = rates(free.field, position, lane.s, lane.state)
     end = rates(free.field, position, s1, new)
-    if lane.contact is not None and not exact(plan.scene, lane.state):
+    if lane.contact is not None and not exact(plan.machine, lane.state):
         # Of a body at rest place and velocity are known better than the state tells them, where
         # the coordinate is a difference. Its force is that on a free body.
         rests, place = lane.contact[k] > 0, plan.place(k, lane.contact[k], begin.x)
@@ -133,19 +135,19 @@ def _path(
         )
     met = turns_within(turn_tolerance(h) * leniency(lane), end)
     aimed = lane.target == to_turn_of(k)
-    for j in range(len(plan.scene.coordinates)):  # several may turn at once
+    for j in range(len(plan.machine.coordinates)):  # several may turn at once
         aimed = aimed if j == k else aimed | (lane.target == to_turn_of(j))
     if plan.others(lane.state):
         # Such an event may be a turning point as well.
-        aimed = aimed | (lane.target >= to_event(len(plan.scene.stops)))
+        aimed = aimed | (lane.target >= to_event(len(plan.machine.stops)))
     at_turn = good & aimed & met
     leaves, surge = None, None
-    limited = any(stop.coordinate == k for stop in plan.scene.stops)
+    limited = any(stop.coordinate == k for stop in plan.machine.stops)
     if lane.contact is not None and limited:
-        leaves = release(lane, k, plan.scene.stops, begin, end, good, h)
+        leaves = release(lane, k, plan.machine.stops, begin, end, good, h)
         surge = (
-            force_rate(free, position, machine, lane.s, lane.state),
-            force_rate(free, position, machine, s1, new),
+            force_rate(free, position, smooth, lane.s, lane.state),
+            force_rate(free, position, smooth, s1, new),
             stop_gradient(_SLIVER * limit + jnp.zeros_like(h)),
         )
     return Path(begin, end, at_turn, leaves, surge)

@@ -1,4 +1,4 @@
-"""How a scene is carried over one step: Runge–Kutta, power series, closed form; which to take."""
+"""How a machine is carried over one step: Runge–Kutta, power series, closed form; which to take."""
 
 from .base import AbstractMethod as AbstractMethod
 from .base import Foreseen as Foreseen

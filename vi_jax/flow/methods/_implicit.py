@@ -11,8 +11,9 @@ import numpy as np
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
+from ..._types import Scalar
+
 Vector = Float[Array, " n"]
-Scalar = Float[Array, ""]
 
 # Newton's steps after which a stage is given up, so that the step is tried again shorter.
 _MOST = 12

@@ -6,13 +6,12 @@ from typing import Any, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
-from ...scene import AbstractScene
+from ..._types import Scalar
+from ...machine import AbstractMachine
 from ..beside import Beside
+from ..smooth import SmoothMachine
 from ._series import Along
-
-Scalar = Float[Array, ""]
 
 
 @runtime_checkable
@@ -53,21 +52,21 @@ class AbstractMethod(eqx.Module):
 
     @property
     def uses_field(self) -> bool:
-        """Whether a step evaluates the scene's field, and so holds what the field holds."""
+        """Whether a step evaluates the machine's field, and so holds what the field holds."""
         return True
 
-    def check(self, scene: AbstractScene) -> None:
-        """Raise a `ValueError` if this method cannot move `scene`."""
+    def check(self, machine: AbstractMachine) -> None:
+        """Raise a `ValueError` if this method cannot move `machine`."""
         return None
 
-    def longest(self, scene: AbstractScene, s: Any, state: Any) -> Any:
+    def longest(self, machine: AbstractMachine, s: Any, state: Any) -> Any:
         """The longest step from here.
 
         A method of so many steps in a drive cycle takes as many in a natural period, where that is
         shorter. With the fewest, five, a step may be as long as 0.8π relaxation times: up to there
         explicit Runge–Kutta methods are stable, and the series of `ExactFlight` exact.
         """
-        limit, fading = scene.step_limit(s, state), scene.relaxation(s, state)
+        limit, fading = machine.step_limit(s, state), machine.relaxation(s, state)
         if fading is not None:
             limit = jnp.minimum(limit, 0.8 * pi * fading)
         return limit * (5 / self.steps_per_cycle)
@@ -75,7 +74,7 @@ class AbstractMethod(eqx.Module):
     @abc.abstractmethod
     def step(
         self,
-        scene: AbstractScene,
+        smooth: SmoothMachine,
         s0: Scalar,
         s1: Scalar,
         state: Any,
@@ -85,12 +84,12 @@ class AbstractMethod(eqx.Module):
         error.
 
         The error is relative to the tolerance (a step is accepted up to 1); it is 0 for methods
-        that are not adaptive. `beside` is `None` unless the elapsed time of a scene with a `pace`,
-        or averages, are asked for; its rate is `rate_beside`.
+        that are not adaptive. `beside` is `None` unless averages, or the elapsed time of a machine
+        with a `pace`, are asked for; its rate is `rate_beside`.
         """
 
     def foresee(
-        self, scene: AbstractScene, s: Scalar, state: Any, beside: Beside | None
+        self, smooth: SmoothMachine, s: Scalar, state: Any, beside: Beside | None
     ) -> Foreseen | None:
         """The motion from here, of a method that knows it before a step is taken (see `Taylor`): a
         step then ends at the first event on it, and is `Foreseen.at` instead of `step`."""

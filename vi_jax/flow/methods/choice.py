@@ -1,9 +1,10 @@
-"""Which method moves a scene: one that is given, a preset by its name, or the default."""
+"""Which method moves a machine: one that is given, a preset by its name, or the default."""
 
 from typing import Any
 
 from ..._checks import one_of
-from ...scene import AbstractScene, Scene
+from ..._renamed import renamed
+from ...machine import AbstractMachine, Scene
 from .base import AbstractMethod
 from .exact import ExactFlight
 from .runge_kutta import Adaptive, FixedStep
@@ -11,15 +12,16 @@ from .runge_kutta import Adaptive, FixedStep
 MethodLike = AbstractMethod | str | None
 """What an argument `method` takes: a method, the name of a preset, or `None` for the default."""
 
-# Steps a cycle of a `Scene`, and the tolerance for a scene of one's own, whose time scales are not
-# known. Chosen from the front that `experiments/benchmarks/speed_accuracy.py` measures.
+# Steps a cycle of a `Scene`, and the tolerance for a machine of one's own, whose time scales are
+# not known. Chosen from the front that `experiments/benchmarks/speed_accuracy.py` measures.
 _PRESETS = {"draft": (6, 1e-6), "standard": (10, 1e-9), "reference": (30, 1e-13)}
 
 
-def preset(scene: AbstractScene | None, name: str = "standard") -> AbstractMethod:
-    """The method of this name for a scene; every argument `method` takes the name itself.
+@renamed(scene="machine")
+def preset(machine: AbstractMachine | None, name: str = "standard") -> AbstractMethod:
+    """The method of this name for a machine; every argument `method` takes the name itself.
 
-    **Arguments:** the scene (`None` if it is not known yet), and `"draft"`, `"standard"` or
+    **Arguments:** the machine (`None` if it is not known yet), and `"draft"`, `"standard"` or
     `"reference"`.
 
     An ideal drive with a `CosineCrank` is carried by `ExactFlight` under each name: nothing is
@@ -36,25 +38,25 @@ def preset(scene: AbstractScene | None, name: str = "standard") -> AbstractMetho
     Of 1,024 settled motions none got a wrong regime under any of the first two.
 
     Shorter steps where damping is strong (ξ > 0.5) or the motor (τ0 > 1) keep the errors small
-    there too. A scene of your own, whose time scales are not known, gets `Adaptive` with the
+    there too. A machine of your own, whose time scales are not known, gets `Adaptive` with the
     tolerances 1e-6, 1e-9 and 1e-13.
 
     **Raises:** `ValueError` for another name.
     """
-    return _named(scene, name, "name")
+    return _named(machine, name, "name")
 
 
-def _named(scene: AbstractScene | None, name: str, argument: str) -> AbstractMethod:
+def _named(machine: AbstractMachine | None, name: str, argument: str) -> AbstractMethod:
     steps, tolerance = _PRESETS[one_of(argument, name, tuple(_PRESETS))]
-    if scene is not None and _flies(scene):
+    if machine is not None and _flies(machine):
         return ExactFlight()
-    if scene is None or (isinstance(scene, Scene) and not scene.soft_stops):
+    if machine is None or (isinstance(machine, Scene) and not machine.soft_stops):
         return FixedStep(steps_per_cycle=steps)
     return Adaptive(rtol=tolerance)
 
 
 def chosen(
-    scene: AbstractScene | None,
+    machine: AbstractMachine | None,
     method: Any,
     otherwise: AbstractMethod | None = None,
     *,
@@ -64,14 +66,14 @@ def chosen(
     else `otherwise`, by default the `"standard"` preset.
 
     **Raises:** `TypeError` for what is no method, `ValueError` for a name that is no preset's.
-    Whether the method can move the scene is not looked at: `AbstractMethod.check` says so.
+    Whether the method can move the machine is not looked at: `AbstractMethod.check` says so.
     """
     if method is None:
-        if otherwise is None or (scene is not None and _flies(scene)):
-            return preset(scene)
+        if otherwise is None or (machine is not None and _flies(machine)):
+            return preset(machine)
         return otherwise
     if isinstance(method, str):
-        return _named(scene, method, argument)
+        return _named(machine, method, argument)
     if not isinstance(method, AbstractMethod):
         raise TypeError(
             f"Argument `{argument}` must be `Adaptive(...)`, `FixedStep(...)`, `Taylor(...)`, "
@@ -80,9 +82,9 @@ def chosen(
     return method
 
 
-def _flies(scene: AbstractScene) -> bool:
+def _flies(machine: AbstractMachine) -> bool:
     try:
-        ExactFlight().check(scene)
+        ExactFlight().check(machine)
     except ValueError:
         return False
     return True

@@ -8,17 +8,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Float
 from numpy.polynomial.legendre import leggauss
 
 from ..._checks import count
-from ...scene import AbstractScene, CosineCrank, IdealDrive, OscillatorState, Scene
-from ...scene.trig import horner, sincos
+from ..._types import Scalar
+from ...machine import AbstractMachine, CosineCrank, IdealDrive, OscillatorState, Scene
+from ...machine.trig import horner, sincos
 from ..beside import Beside, rate_beside
-from ..moving import Moving
+from ..smooth import SmoothMachine
 from .base import AbstractMethod
-
-Scalar = Float[Array, ""]
 
 _COS = tuple((-1) ** n / factorial(2 * n) for n in range(10))
 _SINC = tuple((-1) ** n / factorial(2 * n + 1) for n in range(10))
@@ -62,66 +60,65 @@ class ExactFlight(AbstractMethod):
         """False: the flight is written out."""
         return False
 
-    def check(self, scene):
-        """Refuse scenes whose flight has no closed form."""
-        lack = lack_of_closed_form(scene)
+    def check(self, machine):
+        """Refuse machines whose flight has no closed form."""
+        lack = lack_of_closed_form(machine)
         if lack is not None:
             raise ValueError(f"Method `ExactFlight` needs a {lack}. Use `Adaptive` or `FixedStep`.")
 
-    def step(self, scene, s0, s1, state, beside):
+    def step(self, smooth, s0, s1, state, beside):
         """The flight from `s0` to `s1`, exact to rounding; averages by quadrature along it."""
-        machine, scene = scene, scene.scene if isinstance(scene, Moving) else scene
-        assert isinstance(scene, Scene)
-        zeta, xi, in_phase = _numbers(scene)
+        machine = smooth.machine
+        zeta, xi, in_phase = _numbers(machine)
         tau = (s1 - s0) / zeta if in_phase else s1 - s0
-        phase = scene.phase_at(s0 if in_phase else zeta * s0)
+        phase = machine.phase_at(s0 if in_phase else zeta * s0)
 
         def along(share: float | None) -> OscillatorState:
             part = tau if share is None else share * tau
             return OscillatorState(*flight(zeta, xi, phase, state.Y, state.V, part))
 
         if beside is not None:
-            beside = _integrated(machine, s0, s1, state, along, beside)
+            beside = _integrated(smooth, s0, s1, state, along, beside)
         return along(None), beside, jnp.zeros_like(s0)
 
 
 def _integrated(
-    machine: AbstractScene, s0: Scalar, s1: Scalar, state: Any, along: Callable, beside: Beside
+    smooth: SmoothMachine, s0: Scalar, s1: Scalar, state: Any, along: Callable, beside: Beside
 ) -> Beside:
     """Integrals beside a flight, which is known `along` the shares of its length; where a body is
     held it stays in `state`."""
     total = beside
     for node, weight in zip(_NODES, _WEIGHTS, strict=True):
         there = along(float(node))
-        if isinstance(machine, Moving) and machine.contact:
-            rests = machine.contact[0] > 0
+        if smooth.contact:
+            rests = smooth.contact[0] > 0
             there = jtu.tree_map(lambda a, b, rests=rests: jnp.where(rests, a, b), state, there)
-        rate = rate_beside(machine, s0 + float(node) * (s1 - s0), there, beside)
+        rate = rate_beside(smooth, s0 + float(node) * (s1 - s0), there, beside)
         share = float(weight) * (s1 - s0)
         total = jtu.tree_map(lambda x, v, share=share: x + share * v, total, rate)
     return total
 
 
-def lack_of_closed_form(scene: AbstractScene) -> str | None:
-    """What a scene should be for its flight to be the closed form, and what it is instead, in
+def lack_of_closed_form(machine: AbstractMachine) -> str | None:
+    """What a machine should be for its flight to be the closed form, and what it is instead, in
     words; `None` if it is that."""
-    if not isinstance(scene, Scene) or not isinstance(scene.drive, IdealDrive):
-        drive = type(scene.drive if isinstance(scene, Scene) else scene).__name__
+    if not isinstance(machine, Scene) or not isinstance(machine.drive, IdealDrive):
+        drive = type(machine.drive if isinstance(machine, Scene) else machine).__name__
         return f"`Scene` with an `IdealDrive`, but got a `{drive}`"
-    crank = type(scene.crank)
+    crank = type(machine.crank)
     if not issubclass(crank, CosineCrank) or crank.slide is not CosineCrank.slide:
-        return f"`CosineCrank`, but the scene has a `{crank.__name__}`"
-    if type(scene).field is not Scene.field:
-        return f"`Scene` with its own field, but a `{type(scene).__name__}` has another `field`"
-    if scene.switches:
-        return f"scene without soft stops, but it has {len(scene.switches)}"
+        return f"`CosineCrank`, but the machine has a `{crank.__name__}`"
+    if type(machine).field is not Scene.field:
+        return f"`Scene` with its own field, but a `{type(machine).__name__}` has another `field`"
+    if machine.switches:
+        return f"machine without soft stops, but it has {len(machine.switches)}"
     return None
 
 
-def _numbers(scene: AbstractScene) -> tuple[Scalar, Scalar, bool]:
-    """ζ, ξ and whether the scene is in the phase clock."""
-    assert isinstance(scene, Scene) and isinstance(scene.drive, IdealDrive)
-    return scene.drive.frequency_ratio, scene.damping_ratio, scene.clock_name == "phase"
+def _numbers(machine: AbstractMachine) -> tuple[Scalar, Scalar, bool]:
+    """ζ, ξ and whether the machine is in the phase clock."""
+    assert isinstance(machine, Scene) and isinstance(machine.drive, IdealDrive)
+    return machine.drive.frequency_ratio, machine.damping_ratio, machine.clock_name == "phase"
 
 
 def flight(

@@ -8,27 +8,24 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Float
 
 from ..._checks import count, require
 from ...lanes import pin
-from ...scene import AbstractScene
 from ..beside import rate_beside
+from ..smooth import SmoothMachine
 from .base import AbstractMethod
 from .unrolled import Unrolled
 from .verner import Verner9
-
-Scalar = Float[Array, ""]
 
 
 def _unrolled(solver: Any) -> Unrolled:
     return solver if isinstance(solver, Unrolled) else Unrolled(solver)
 
 
-def _runge_kutta(solver: Unrolled, scene: AbstractScene, s0, s1, state, beside):
+def _runge_kutta(solver: Unrolled, smooth: SmoothMachine, s0, s1, state, beside):
     def field(s, y, args):
         state, beside = y
-        return pin((scene.field(s, state), rate_beside(scene, s, state, beside)))
+        return pin((smooth.field(s, state), rate_beside(smooth, s, state, beside)))
 
     y1, error, *_ = solver.step(
         diffrax.ODETerm(field), s0, s1, (state, beside), None, None, made_jump=True
@@ -48,7 +45,7 @@ class Adaptive(AbstractMethod):
     the rest moves, such as a strong motor: its steps need not follow what has faded.
 
     **Arguments:** `solver` (default `Verner9()`, the fastest measured from 1e-7 on); `rtol`
-    and `atol`, tolerances relative to each state component and absolute (in the scene's
+    and `atol`, tolerances relative to each state component and absolute (in the machine's
     dimensionless units; `atol` defaults to `rtol`).
 
     **Raises:** `TypeError` if the solver is neither explicit nor diagonally implicit Runge–Kutta,
@@ -82,13 +79,13 @@ class Adaptive(AbstractMethod):
         """Within the tolerances, by which each step is sized anew."""
         return self.rtol if self.atol is None else jnp.maximum(self.rtol, self.atol)
 
-    def longest(self, scene, s, state):
+    def longest(self, machine, s, state):
         """As for all methods; of an implicit solver nothing that fades limits it."""
         if self.solver.implicit:
-            return scene.step_limit(s, state)
-        return super().longest(scene, s, state)
+            return machine.step_limit(s, state)
+        return super().longest(machine, s, state)
 
-    def step(self, scene, s0, s1, state, beside):
+    def step(self, smooth, s0, s1, state, beside):
         """One Runge–Kutta step and its error norm (root mean square over the components of the
         state and the integrals of averages)."""
         # Below the precision's own rounding a tolerance would only be rejected for ever.
@@ -97,7 +94,7 @@ class Adaptive(AbstractMethod):
         solver = self.solver
         if solver.implicit:
             solver = Unrolled(solver.solver, tolerance=jnp.maximum(0.01 * rtol, floor))
-        new, after, errors = _runge_kutta(solver, scene, s0, s1, state, beside)
+        new, after, errors = _runge_kutta(solver, smooth, s0, s1, state, beside)
         old, there, error = (_told(*x) for x in ((state, beside), (new, after), errors))
         atol = rtol if self.atol is None else jnp.maximum(jnp.asarray(self.atol, s0.dtype), floor)
         scaled = jtu.tree_map(
@@ -154,9 +151,9 @@ class FixedStep(AbstractMethod):
                 f"but got {self.solver.solver!r}. Use `Adaptive`."
             )
 
-    def step(self, scene, s0, s1, state, beside):
+    def step(self, smooth, s0, s1, state, beside):
         """One Runge–Kutta step; its error is not asked for."""
-        new, beside, _ = _runge_kutta(self.solver, scene, s0, s1, state, beside)
+        new, beside, _ = _runge_kutta(self.solver, smooth, s0, s1, state, beside)
         return new, beside, jnp.zeros_like(s0)
 
     def tighter(self):

@@ -7,15 +7,14 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax.lax import stop_gradient
-from jaxtyping import Array, Float
 
 from ..._checks import count, require
+from ..._types import Scalar
 from ..beside import Beside, rate_beside
+from ..smooth import SmoothMachine
 from . import _series as power_series
 from ._series import Along, NoSeries, Series
 from .base import AbstractMethod
-
-Scalar = Float[Array, ""]
 
 
 class Expansion(NamedTuple):
@@ -57,7 +56,7 @@ class Expansion(NamedTuple):
 
 
 class Taylor(AbstractMethod):
-    """Power series of the motion, their coefficients by recursion over the scene's own field.
+    """Power series of the motion, their coefficients by recursion over the machine's own field.
 
     A step knows the motion all along it, so that an event is found where it lies and met at once.
     The method of choice for smooth fields at small errors; `NotImplementedError` names what a field
@@ -94,9 +93,9 @@ class Taylor(AbstractMethod):
             return Taylor(self.order, 2 * self.steps_per_cycle)
         return Taylor(self.order + 4, self.steps_per_cycle, rtol=self.rtol / 100)
 
-    def check(self, scene):
+    def check(self, machine):
         """**Raises:** `ValueError` for a soft stop whose force has no series at first touch."""
-        for i, switch in enumerate(scene.switches):
+        for i, switch in enumerate(machine.switches):
             if not switch.analytic:
                 raise ValueError(
                     f"Method `Taylor` cannot carry switch {i}, {type(switch).__name__}: at first "
@@ -104,29 +103,31 @@ class Taylor(AbstractMethod):
                     "Use `Adaptive`."
                 )
 
-    def longest(self, scene, s, state):
-        """As for every method of fixed steps; as long as the scene allows where they are sized."""
+    def longest(self, machine, s, state):
+        """As for every method of fixed steps; as long as it allows where they are sized."""
         if self.rtol is None:
-            return super().longest(scene, s, state)
-        return scene.step_limit(s, state) * (5 / self.steps_per_cycle)
+            return super().longest(machine, s, state)
+        return machine.step_limit(s, state) * (5 / self.steps_per_cycle)
 
-    def foresee(self, scene: Any, s: Scalar, state: Any, beside: Beside | None) -> Expansion:
+    def foresee(
+        self, smooth: SmoothMachine, s: Scalar, state: Any, beside: Beside | None
+    ) -> Expansion:
         """Its power series about (s, state), and what is integrated beside it."""
 
         def field(s, y):
             state, beside = y
-            return scene.field(s, state), rate_beside(scene, s, state, beside)
+            return smooth.field(s, state), rate_beside(smooth, s, state, beside)
 
         try:
             treedef, series = power_series.expand(field, s, (state, beside), self.order)
         except NoSeries as error:
             raise NotImplementedError(
-                f"Method `Taylor` has no recursion for the primitive `{error}` in the scene's "
+                f"Method `Taylor` has no recursion for the primitive `{error}` in the machine's "
                 "field or averages. Use `Adaptive` or `FixedStep`."
             ) from None
         return Expansion(treedef, series, self.rtol)
 
-    def step(self, scene, s0, s1, state, beside):
+    def step(self, smooth, s0, s1, state, beside):
         """The sum of the series at `s1`."""
-        new, beside = self.foresee(scene, s0, state, beside).at(s1 - s0)
+        new, beside = self.foresee(smooth, s0, state, beside).at(s1 - s0)
         return new, beside, jnp.zeros_like(s0)

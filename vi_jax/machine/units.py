@@ -22,9 +22,9 @@ def unit_of(units: Mapping[str, str], name: str) -> str:
     return ""
 
 
-def stated(scene: Any) -> Stated:
+def stated(machine: Any) -> Stated:
     """The units of a machine."""
-    return tuple(scene.units.items())
+    return tuple(machine.units.items())
 
 
 def attributes(unit: str) -> dict[str, str]:

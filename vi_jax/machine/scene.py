@@ -14,7 +14,7 @@ from .._checks import NOT_NEGATIVE, Range, instance_of, require, require_ranges,
 from .._numbers import concrete, number, optional_real, real
 from .crank import AbstractCrank, CosineCrank
 from .drive import AbstractDrive, IdealDrive
-from .shaft import ShaftScene
+from .shaft import ShaftMachine
 from .shown import Shown
 from .soft import SoftStop
 from .states import UNITS
@@ -32,7 +32,7 @@ class Oscillator(Shown):
         require_ranges(self)
 
 
-class Scene(ShaftScene):
+class Scene(ShaftMachine):
     """A body on a spring, shaken by a crank, with stops: Y'' + 2ξY' + Y = U(φ).
 
     Every number is a leaf, so that any of them can be a `vmap` axis or be differentiated; what is

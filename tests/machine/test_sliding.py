@@ -15,7 +15,7 @@ def speed(machine, s, z):
     return z.V
 
 
-class Oscillator(vi.AbstractScene):
+class Oscillator(vi.AbstractMachine):
     """x'' = -x - sgn x'."""
 
     stops: tuple = ()
@@ -49,7 +49,7 @@ def place(machine, s, z):
     return z.x
 
 
-class Relay(vi.AbstractScene):
+class Relay(vi.AbstractMachine):
     """x' = a sin s - m, y' = m with m = sgn x: on x = 0 it slides while |a sin s| < 1."""
 
     amplitude: Any = 0.5
@@ -95,7 +95,7 @@ def test_it_slides_as_the_mean_that_stays_on_the_surface():
 @pytest.mark.parametrize("way", ["auto", pytest.param("xla", marks=pytest.mark.slow)])
 def test_it_leaves_where_one_side_points_away(way):
     a = 1.5
-    with lanes.road(way):
+    with lanes.backend(way):
         run = vi.simulate(
             Relay(a), at(-1e-3, 0.0), 1, event_log=12, method=vi.FixedStep(steps_per_cycle=48)
         )
@@ -126,7 +126,7 @@ def drive(machine, s, z):
     return machine.amplitude * jnp.cos(s) - z.Y
 
 
-class Driven(vi.AbstractScene):
+class Driven(vi.AbstractMachine):
     """A body on a spring and on a rough floor, driven slowly: it slides twice a cycle."""
 
     amplitude: Any = 1.0

@@ -64,7 +64,7 @@ def pressing(machine, s, z):
     return 1 - machine.lift * jnp.sin(2 * s)
 
 
-class Rubbing(vi.AbstractScene):
+class Rubbing(vi.AbstractMachine):
     """The same block on a floor that it never leaves."""
 
     friction: Any = 0.3
@@ -118,7 +118,7 @@ def test_and_has_its_derivatives(lift):
     np.testing.assert_allclose(*each, atol=1e-7)
 
 
-class Coupled(vi.AbstractScene):
+class Coupled(vi.AbstractMachine):
     """Two coordinates that share their mass, as those of a rod whose end hits a floor do."""
 
     coupling: Any = 0.7

@@ -145,7 +145,7 @@ def test_laws_that_cannot_be_are_refused():
         vi.SoftStop(0.2, 100.0, law=lambda depth: depth)  # pyright: ignore
 
 
-class Pressed(vi.AbstractScene):
+class Pressed(vi.AbstractMachine):
     """x'' = -x - friction under a load that varies, μ (1 + c cos 2s); by time."""
 
     varies: jax.Array = eqx.field(converter=jnp.asarray)

@@ -7,12 +7,11 @@ from typing import Any, ClassVar, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 from jax.lax import stop_gradient
-from jaxtyping import Array, Float
 
+from .._types import Scalar
 from .contacts import rubbed
 from .shown import Shown
 
-Scalar = Float[Array, ""]
 Modes = tuple[Scalar, ...]
 
 

@@ -10,15 +10,15 @@ from jaxtyping import Array, Bool, Float
 
 from .._checks import one_of, state_of_numbers
 from .._numbers import concrete
-from .base import AbstractScene
+from .base import AbstractMachine
 
-Machine = TypeVar("Machine", bound="ShaftScene")
+Machine = TypeVar("Machine", bound="ShaftMachine")
 
 # A state that was carried to the section lies on it to rounding, in single precision too.
 _ON_SECTION = 1e-5
 
 
-class ShaftScene(AbstractScene):
+class ShaftMachine(AbstractMachine):
     """A machine driven by a shaft that turns once in a cycle.
 
     Its clock is `"phase"`, with the angle of the shaft as the independent variable, or `"time"`. A

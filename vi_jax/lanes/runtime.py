@@ -18,7 +18,7 @@ import numpy as np
 from ._code import begun, function_at, llvm
 from ._context import within
 from ._kernel import kernel_text
-from ._program import Program
+from ._program import LaneProgram
 from ._recent import Recent
 from ._vector import check
 
@@ -112,7 +112,7 @@ class Kernel:
         try:
             self._engine, address = self._code.result()
         except RuntimeError as error:
-            raise RuntimeError(f'LLVM: {error}; `vi_jax.road("xla")` does without it') from None
+            raise RuntimeError(f'LLVM: {error}; `vi_jax.backend("xla")` does without it') from None
         return function_at(address)
 
     def work(self, inputs: list[int], strides: list[int], outputs: list[int], lanes: int) -> "Work":
@@ -188,10 +188,10 @@ _recent: "Recent[int, Kernel]" = Recent(_KEPT)
 _lock = threading.Lock()
 
 # The keys of a program's texts, so that they need not be written again to be known.
-_keys: "weakref.WeakKeyDictionary[Program, dict[tuple, int]]" = weakref.WeakKeyDictionary()
+_keys: "weakref.WeakKeyDictionary[LaneProgram, dict[tuple, int]]" = weakref.WeakKeyDictionary()
 
 
-def kernel_of(program: Program, lanes: int) -> Kernel:
+def kernel_of(program: LaneProgram, lanes: int) -> Kernel:
     """The kernel of a program for so many lanes: the same for the same text, compiled once while it
     is in use.
 
@@ -210,7 +210,7 @@ def kernel_of(program: Program, lanes: int) -> Kernel:
     return kernel
 
 
-def _width(program: Program, lanes: int, bits: int) -> int:
+def _width(program: LaneProgram, lanes: int, bits: int) -> int:
     """Lanes of a group. The width changes no result."""
     avals = [*program.in_avals, *program.carry_avals]
     wide = any(np.dtype(a.dtype).itemsize == 8 for a in avals)
@@ -224,7 +224,7 @@ def _width(program: Program, lanes: int, bits: int) -> int:
     return 2 * full if many and sum(a.size for a in avals) <= _REGISTERS else full
 
 
-def _written(program: Program, cpu: str | None, width: int, bits: int) -> Kernel:
+def _written(program: LaneProgram, cpu: str | None, width: int, bits: int) -> Kernel:
     for jaxpr in program.jaxprs:
         check(jaxpr.jaxpr)
     text = kernel_text(program, width, bits)

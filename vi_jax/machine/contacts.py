@@ -12,10 +12,8 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.lax import stop_gradient
-from jaxtyping import Array, Bool, Float
 
-Scalar = Float[Array, ""]
-Flag = Bool[Array, ""]
+from .._types import Flag, Scalar
 
 # A pivot smaller than this (its row's begins as 1) is that of a contact whose velocity the others
 # have settled already, as that of the fourth leg of a table: it gets no force.

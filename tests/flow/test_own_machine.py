@@ -20,7 +20,7 @@ class Ball(eqx.Module):
     V: jax.Array
 
 
-class BouncingBall(vi.AbstractScene):
+class BouncingBall(vi.AbstractMachine):
     """Free fall on a floor at Y = 0, looked at once a second: all that `simulate` has to know."""
 
     gravity: jax.Array
@@ -290,7 +290,7 @@ def test_samples_cost_nothing_before_they_are_taken(clock):
     np.testing.assert_array_equal(settled.impacts, whole.impacts[30:])
 
 
-class Odd(vi.AbstractScene):
+class Odd(vi.AbstractMachine):
     """A machine of any cycle, whose field returns anything."""
 
     length: float

@@ -1,6 +1,6 @@
 """What is modelled: parameters, crank, drive, stops, and the scene that composes them."""
 
-from .base import AbstractScene as AbstractScene
+from .base import AbstractMachine as AbstractMachine
 from .base import Coordinate as Coordinate
 from .contact_friction import ContactFriction as ContactFriction
 from .crank import AbstractCrank as AbstractCrank
@@ -20,7 +20,7 @@ from .parameters import Parameters as Parameters
 from .reset import Reset as Reset
 from .scene import Oscillator as Oscillator
 from .scene import Scene as Scene
-from .shaft import ShaftScene as ShaftScene
+from .shaft import ShaftMachine as ShaftMachine
 from .soft import SoftStop as SoftStop
 from .states import DCMotorState as DCMotorState
 from .states import MotorState as MotorState

@@ -1,4 +1,4 @@
-"""What `simulate` asks of a scene. A class of your own with these few methods runs like ours."""
+"""What `simulate` asks of a machine. A class of your own with these few methods runs like ours."""
 
 import abc
 from collections.abc import Callable, Mapping
@@ -54,7 +54,7 @@ _DEFAULTS: dict[str, Callable[..., Any]] = {
 }  # fmt: skip
 
 
-class AbstractScene(Shown):
+class AbstractMachine(Shown):
     """A machine: smooth motion between events, observed cycle by cycle.
 
     Its independent variable is called `s`. The machine is driven, and its field periodic in `s`
@@ -129,11 +129,11 @@ class AbstractScene(Shown):
         """What rises through zero where a cycle ends; `None` where `s` or `clock` counts them."""
         return None
 
-    def observed_every(self, interval: Any) -> "AbstractScene":
+    def observed_every(self, interval: Any) -> "AbstractMachine":
         """An autonomous machine observed at equal intervals of `s` instead of on its section."""
         name = type(self).__name__
         what = "a `section`"
-        if type(self).section is AbstractScene.section:
+        if type(self).section is AbstractMachine.section:
             if not any(x.ends_cycle for x in (*self.stops, *self.switches, *self.events)):
                 raise ValueError(f"A {name} is driven: its cycle is its drive's.")
             what = "an event that ends its cycles"
@@ -151,7 +151,7 @@ class AbstractScene(Shown):
     def _said(self, name: str) -> Callable[..., Any]:
         """A method of the machine's own; else the default for a state with `Y` and `V`, which does
         not ask `coordinates` again where these ask their `super()`."""
-        default = getattr(AbstractScene, name)
+        default = getattr(AbstractMachine, name)
         if self._has_coordinates and getattr(type(self), name) is default:
             return partial(_DEFAULTS[name], self)
         return getattr(self, name)
@@ -175,13 +175,13 @@ class AbstractScene(Shown):
 
     def has_velocity(self, state: State) -> bool:
         """Whether `velocity` is one; it need not be where there is nothing to meet."""
-        own = type(self).velocity is not AbstractScene.velocity or self._has_coordinates
+        own = type(self).velocity is not AbstractMachine.velocity or self._has_coordinates
         return own or bool(self.stops) or hasattr(state, "V")
 
     @property
     def _has_coordinates(self) -> bool:
         """Whether a machine names its coordinates itself."""
-        return type(self).coordinates is not AbstractScene.coordinates
+        return type(self).coordinates is not AbstractMachine.coordinates
 
     def clock(self, state: State) -> Float[Array, ""] | None:
         """The state component that counts cycles, or `None` where `s` itself does."""
@@ -190,7 +190,7 @@ class AbstractScene(Shown):
     def start(self) -> State:
         """The state to begin from where none is given.
 
-        **Raises:** `ValueError` where this scene has none.
+        **Raises:** `ValueError` where this machine has none.
         """
         raise ValueError(
             f"Argument `start` must be given for a {type(self).__name__}, which has no `start` of "
@@ -198,18 +198,18 @@ class AbstractScene(Shown):
         )
 
     def adopt(self, start: Any) -> State:
-        """A start as this scene needs it. **Raises:** `TypeError` if it is none."""
+        """A start as this machine needs it. **Raises:** `TypeError` if it is none."""
         return start
 
-    def in_clock(self, clock: str) -> "AbstractScene":
-        """The same scene with another independent variable, for one that has several."""
+    def in_clock(self, clock: str) -> "AbstractMachine":
+        """The same machine with another independent variable, for one that has several."""
         raise ValueError(
             f"Argument `clock` must be left out for a {type(self).__name__}, which has its own "
             f"clock, but got {clock!r}."
         )
 
-    def at_section(self, phase: Any) -> "AbstractScene":
-        """The same scene observed elsewhere in its cycle, for one that can be."""
+    def at_section(self, phase: Any) -> "AbstractMachine":
+        """The same machine observed elsewhere in its cycle, for one that can be."""
         raise ValueError(
             f"Argument `section` must be left out for a {type(self).__name__}, which has its own "
             f"section, but got {phase!r}."
@@ -220,7 +220,7 @@ class AbstractScene(Shown):
         return since_section
 
     def mirrored(self, state: State) -> State | None:
-        """The image of a state under the symmetry of this scene, for one whose motions have an
+        """The image of a state under the symmetry of this machine, for one whose motions have an
         image among them half a cycle later; `None` for one without."""
         return None
 
@@ -309,11 +309,11 @@ class AbstractScene(Shown):
         return bool(self.stops)
 
     def alive(self, state: State) -> jax.Array | None:
-        """False where the clock of this scene breaks down; `None` where it cannot."""
+        """False where the clock of this machine breaks down; `None` where it cannot."""
         return None
 
     def in_range(self, start: State) -> Bool[Array, ""]:
-        """Whether the numbers of this scene, traced ones too, are such that it can be run from
+        """Whether the numbers of this machine, traced ones too, are such that it can be run from
         `start`; asked once, when a lane begins. By default what its parts say (`ranges`)."""
         return in_range((self, self.stops, self.switches))
 
@@ -322,6 +322,6 @@ class AbstractScene(Shown):
         return None
 
 
-def renews(machine: AbstractScene) -> bool:
+def renews(machine: AbstractMachine) -> bool:
     """Whether a machine begins each cycle with something set back."""
-    return type(machine).renewed is not AbstractScene.renewed
+    return type(machine).renewed is not AbstractMachine.renewed

@@ -6,7 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ..scene.numbers import with_leaf
+from ..machine.numbers import with_leaf
 from ._events import Event
 from ._hopf import hopf_between, size_of
 from ._origin import halves, origin
@@ -52,14 +52,14 @@ _ALIKE = 1e-3
 _NOISE = 1e-7
 
 
-class Follower:
+class BranchMonitor:
     """Looks at each step of a walk: locates what happens in it and says when to end."""
 
     def __init__(self, problem: Shooting, scale: np.ndarray, bounds: tuple[float, float]):
         self.problem, self.scale, self.bounds = problem, scale, bounds
-        scene, (name,) = problem.scene, problem.parameters
+        machine, (name,) = problem.machine, problem.parameters
         self.symmetric = may_be_symmetric(
-            problem, [scene, *(with_leaf(scene, name, bound) for bound in bounds)]
+            problem, [machine, *(with_leaf(machine, name, bound) for bound in bounds)]
         )
         self.special: list[SpecialPoint] = []
         self.between: dict[int, list[Step]] = {}
@@ -169,20 +169,20 @@ class Follower:
         if impact == _RESTS:
             return self._point(HOPF, at, "the motion shrinks to rest", 0)
         if impact is None:
-            scene, touched = self.problem.scene, int(at.seen.touched)
-            guard = f"the guard of {Event(touched).called(scene)}"
-            what = "a stop" if touched < len(scene.stops) else guard
+            machine, touched = self.problem.machine, int(at.seen.touched)
+            guard = f"the guard of {Event(touched).called(machine)}"
+            what = "a stop" if touched < len(machine.stops) else guard
             detail = f"touches {what} at {self._place(at, float(at.seen.touch))}"
         else:
             clock = float(np.asarray(self.problem.parts(jnp.asarray(at.x))[0])[impact])
-            lost = self.problem.events[impact].of(self.problem.scene)
+            lost = self.problem.events[impact].of(self.problem.machine)
             detail = f"the {lost.name or lost.word} at {self._place(at, clock)} is lost"
         return self._point(GRAZING, at, detail, impact)
 
     def _place(self, at: Step, clock: float) -> str:
         """A reading of the clock of impacts, in words, within one period from the section on."""
         period = float(self.problem.period(jnp.asarray(at.x)))
-        return self.problem.scene.place_of(clock % period, self.problem.cycles)
+        return self.problem.machine.place_of(clock % period, self.problem.cycles)
 
     def _bifurcations(self, here: Step, last: Step) -> Step | None:
         """Record what happens between two points; the point where the branch springs, if met.

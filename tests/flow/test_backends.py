@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-from vi_jax.scene.base import AbstractScene
+from vi_jax.machine.base import AbstractMachine
 
 from chain import Chain, balls
 from differences import quick
@@ -51,8 +51,8 @@ def test_roads_agree(name):
 
     ratios = jnp.linspace(0.7, 1.3, 11)
     runs = []
-    for road in ("auto", "xla"):
-        with vi.road(road):
+    for backend in ("auto", "xla"):
+        with vi.backend(backend):
             runs.append(jax.jit(jax.vmap(lane))(ratios))
     fast, slow = runs
     assert bool(jnp.all(fast.successful))
@@ -87,8 +87,8 @@ def test_roads_agree_where_contacts_act_together(make):
     method = vi.FixedStep(steps_per_cycle=24)
     numbers = jnp.linspace(0.1, 0.7, 5)
     runs = []
-    for road in ("auto", "xla"):
-        with vi.road(road):
+    for backend in ("auto", "xla"):
+        with vi.backend(backend):
             lane = jax.vmap(lambda x: vi.simulate(*make(x), 3, method=method, impact_log=60))
             runs.append(jax.jit(lane)(numbers))
     fast, slow = runs
@@ -131,8 +131,8 @@ def test_single_precision():
     runs = []
     with jax.enable_x64(False), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        for road in ("auto", "xla"):
-            with vi.road(road):
+        for backend in ("auto", "xla"):
+            with vi.backend(backend):
                 runs.append(jax.jit(jax.vmap(lane))(jnp.linspace(0.7, 1.3, 33)))
     assert runs[0].dtype == jnp.float32
     np.testing.assert_allclose(*runs, atol=2e-5)
@@ -146,7 +146,7 @@ class Place(NamedTuple):
     memory: Any
 
 
-class Odd(AbstractScene):
+class Odd(AbstractMachine):
     """A stop and a field of many kinds of functions, with a 3-vector in its state."""
 
     stiffness: Any
@@ -175,7 +175,7 @@ class Odd(AbstractScene):
 @pytest.mark.slow
 @pytest.mark.parametrize("table", [None, jnp.array([0.0, 0.4, -0.2, 0.1, 0.0])])
 def test_a_scene_of_ones_own(table):
-    """On the fast road, or told why not; right on either."""
+    """On the fast backend, or told why not; right on either."""
     start = Place(jnp.asarray(0.1), jnp.asarray(0.5), jnp.zeros(3))
 
     def lane(stiffness):
@@ -188,7 +188,7 @@ def test_a_scene_of_ones_own(table):
         fast = jax.jit(jax.vmap(lane))(values)
     if table is None:
         assert not warned
-    with vi.road("xla"):
+    with vi.backend("xla"):
         slow = jax.jit(jax.vmap(lane))(values)
     for a, b in zip(jax.tree.leaves(fast), jax.tree.leaves(slow), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-12)

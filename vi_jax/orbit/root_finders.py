@@ -20,7 +20,7 @@ Unknowns = Float[Array, "..."]
 Residual = Callable[[Any], Any]
 
 
-class AbstractSearch(eqx.Module):
+class AbstractRootFinder(eqx.Module):
     """A way to a zero of a residual."""
 
     tolerance: eqx.AbstractVar[Any]
@@ -47,14 +47,14 @@ def _tolerance(value: Any) -> Any:
     return None if value is None else number("tolerance", value)
 
 
-def _check(search: AbstractSearch) -> None:
+def _check(search: AbstractRootFinder) -> None:
     if search.tolerance is not None:
         require("tolerance", search.tolerance, low=0.0, open_low=True)
     count("max_steps", search.max_steps, least=1)
     count("arcs", search.arcs, least=1)
 
 
-class Newton(AbstractSearch):
+class Newton(AbstractRootFinder):
     """Newton's method, damped by a trust region (optimistix' dogleg): quadratic near the orbit.
 
     **Arguments:**
@@ -101,7 +101,7 @@ def _with_aux(residual: Residual) -> Callable[[Any, Any], tuple[Any, None]]:
     return lambda x, args: (residual(x), None)
 
 
-class Gradient(AbstractSearch):
+class Gradient(AbstractRootFinder):
     """Descent on half the squared residual with an optax optimiser.
 
     **Arguments:**
@@ -169,7 +169,7 @@ class Found(NamedTuple):
     """Largest residual component after each step, NaN beyond the last."""
 
 
-def search(method: AbstractSearch, residual: Residual, x: Unknowns) -> Found:
+def search(method: AbstractRootFinder, residual: Residual, x: Unknowns) -> Found:
     """Run `method` until the residual is within its tolerance and gains no more.
 
     A place where the residual is not finite is never taken for better than another.

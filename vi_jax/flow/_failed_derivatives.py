@@ -16,7 +16,7 @@ from jax.interpreters import ad, batching, mlir
 from .results import Run
 
 
-def spoiled(run: Run) -> Run:
+def failed_derivatives(run: Run) -> Run:
     """The same run, whose derivatives are NaN if it failed."""
     numbers, rest = eqx.partition(run, eqx.is_inexact_array)
     return eqx.combine(_marked(run.successful, numbers), rest)
@@ -30,12 +30,12 @@ def _marked(good: Any, numbers: Any) -> Any:
 @_marked.defjvp
 def _(primals, tangents):
     (good, numbers), (_, rates) = primals, tangents
-    return numbers, jtu.tree_map(lambda rate: _spoil.bind(good, rate, back=False), rates)
+    return numbers, jtu.tree_map(lambda rate: _fail.bind(good, rate, back=False), rates)
 
 
 # Linear as JAX understands it, with a transpose that arithmetic could not have: what asks for
 # nothing of a lane, as a loss that leaves failed ones out, gets nothing.
-_spoil = Primitive("spoil")
+_fail = Primitive("fail_derivatives")
 
 
 def _value(good, x, *, back: bool):
@@ -49,22 +49,22 @@ def _batched(args, dims, *, back: bool):
         jnp.broadcast_to(x, (size, *x.shape)) if d is None else jnp.moveaxis(x, d, 0)
         for x, d in zip(args, dims, strict=True)
     )
-    return _spoil.bind(good, x, back=back), 0
+    return _fail.bind(good, x, back=back), 0
 
 
 def _jvp(primals, tangents, *, back: bool):
     (good, x), (_, rate) = primals, tangents
-    out = _spoil.bind(good, x, back=back)
-    return out, rate if type(rate) is ad.Zero else _spoil.bind(good, rate, back=back)
+    out = _fail.bind(good, x, back=back)
+    return out, rate if type(rate) is ad.Zero else _fail.bind(good, rate, back=back)
 
 
 def _transposed(weight, good, _, *, back: bool):
-    return None, weight if type(weight) is ad.Zero else _spoil.bind(good, weight, back=not back)
+    return None, weight if type(weight) is ad.Zero else _fail.bind(good, weight, back=not back)
 
 
-_spoil.def_abstract_eval(lambda good, x, *, back: x)
-_spoil.def_impl(_value)
-batching.primitive_batchers[_spoil] = _batched
-ad.primitive_jvps[_spoil] = _jvp
-ad.primitive_transposes[_spoil] = _transposed
-mlir.register_lowering(_spoil, mlir.lower_fun(_value, multiple_results=False))
+_fail.def_abstract_eval(lambda good, x, *, back: x)
+_fail.def_impl(_value)
+batching.primitive_batchers[_fail] = _batched
+ad.primitive_jvps[_fail] = _jvp
+ad.primitive_transposes[_fail] = _transposed
+mlir.register_lowering(_fail, mlir.lower_fun(_value, multiple_results=False))

@@ -21,8 +21,6 @@ from .event import AbstractSwitch
 from .law import AbstractContactLaw, HuntCrossley, PowerLaw
 from .stop import Wall
 
-Scalar = Float[Array, ""]
-
 # Modes: the body touches; it has been let go of, but has not yet come out; it is apart.
 TOUCHING, RELEASED, APART = 1.0, 0.0, -1.0
 

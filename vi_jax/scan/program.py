@@ -21,8 +21,8 @@ from ..flow.methods import MethodLike, chosen
 from ..flow.named import average_names, has_averages
 from ..flow.results import number_of
 from ..flow.simulate import simulate_pool
-from ..scene import AbstractScene
-from ..scene.numbers import check_again, check_name, leaf, leaf_names, with_leaf
+from ..machine import AbstractMachine
+from ..machine.numbers import check_again, check_name, leaf, leaf_names, with_leaf
 from ._asked import measures_of
 from .grid import Blocks
 from .measures import AbstractMeasure, Numbers
@@ -30,14 +30,14 @@ from .measures import AbstractMeasure, Numbers
 START = "start."
 
 
-class Job(eqx.Module):
+class ScanProgram(eqx.Module):
     """What is computed of every lane of a scan."""
 
-    scene: AbstractScene | None
+    machine: AbstractMachine | None
     build: Callable[..., Any] | None = eqx.field(static=True)
-    """Makes the scene of the axes' values, in place of `scene`."""
+    """Makes the machine of the axes' values, in place of `machine`."""
     start: Any
-    """The first state, or `None` for the scene's own."""
+    """The first state, or `None` for the machine's own."""
     derivatives: tuple[str, ...] = eqx.field(static=True)
     measures: tuple[AbstractMeasure, ...]
     method: AbstractMethod
@@ -54,33 +54,33 @@ class Job(eqx.Module):
         """What the measures must see of the cycles."""
         return "motion" if any(m.record == "motion" for m in self.measures) else "sections"
 
-    def lane(self, values: dict[str, Any], nudge: Any = None) -> tuple[AbstractScene, Any]:
+    def lane(self, values: dict[str, Any], nudge: Any = None) -> tuple[AbstractMachine, Any]:
         """Scene and start of the lane with these values on the axes."""
         of_scene = {name: x for name, x in values.items() if not name.startswith(START)}
         if self.build is not None:
-            scene = self.build(**of_scene)
-            if not isinstance(scene, AbstractScene):
+            machine = self.build(**of_scene)
+            if not isinstance(machine, AbstractMachine):
                 raise TypeError(
-                    "Argument `scene` must be a function that returns a `Scene` or an "
-                    f"`AbstractScene`, but it returned {scene!r}."
+                    "Argument `machine` must be a function that returns a `Scene` or an "
+                    f"`AbstractMachine`, but it returned {machine!r}."
                 )
         else:
-            scene = self.scene
+            machine = self.machine
             for name, value in of_scene.items():
-                scene = with_leaf(scene, name, value)
-        assert scene is not None
-        scene = self._nudged(scene, "", nudge)
+                machine = with_leaf(machine, name, value)
+        assert machine is not None
+        machine = self._nudged(machine, "", nudge)
         if self.clock is not None:
-            scene = scene.in_clock(self.clock)
+            machine = machine.in_clock(self.clock)
         start = self.start
         if start is None:
-            start = scene.start()
+            start = machine.start()
         for name, value in values.items():
             if name.startswith(START):
                 start = with_leaf(start, name.removeprefix(START), value)
-        return scene, self._nudged(start, START, nudge)
+        return machine, self._nudged(start, START, nudge)
 
-    def first(self, blocks: Blocks) -> tuple[AbstractScene, Any]:
+    def first(self, blocks: Blocks) -> tuple[AbstractMachine, Any]:
         """Scene and start of the first lane."""
         return self.lane({name: jnp.asarray(x[0]) for name, x in blocks.axes.items()})
 
@@ -101,14 +101,14 @@ class Job(eqx.Module):
         found, state = self._first(values, wanted, None)
         out = dict(found)
         for measure in self.measures:
-            if measure.looks == 1:
+            if measure.passes == 1:
                 out = self._again(measure, values, wanted, state, out)
                 continue
 
-            def look(number, out, measure=measure):
+            def again(number, out, measure=measure):
                 return self._again(measure, values, wanted, state, out, number)
 
-            out = jax.lax.fori_loop(0, measure.looks, look, out)
+            out = jax.lax.fori_loop(0, measure.passes, again, out)
         if self.derivatives:
             basis = jnp.eye(len(self.derivatives), dtype=jtu.tree_leaves(values)[0].dtype)
 
@@ -132,10 +132,10 @@ class Job(eqx.Module):
         )  # fmt: skip
 
         def measured(values, run):
-            scene, _ = lane_of(values)
+            machine, _ = lane_of(values)
             found = {}
             for measure in self.measures:
-                new = measure(scene, run)
+                new = measure(machine, run)
                 _check_variables(measure, new, [*found, "result"])
                 found |= new
             for name, x in found.items():
@@ -147,26 +147,30 @@ class Job(eqx.Module):
         return jax.vmap(measured)(values, run), jax.vmap(lambda run: run.last)(run)
 
     def _again(
-        self, measure: AbstractMeasure, values, wanted, state, out: Numbers, *look: Array
+        self, measure: AbstractMeasure, values, wanted, state, out: Numbers, *pass_number: Array
     ) -> Numbers:
-        """`out` with what `measure` finds at another look, at the lanes that need it only."""
-        unclear = jax.vmap(lambda found: measure.unclear(found, *look))(out)
-        if unclear is None:
+        """`out` with what `measure` finds at another pass, at the lanes that need it only."""
+        needs_refinement = jax.vmap(lambda found: measure.needs_refinement(found, *pass_number))(
+            out
+        )
+        if needs_refinement is None:
             return out
 
-        def one(values, state, out, unclear):
-            scene, _ = self.lane(values)
+        def one(values, state, out, needs_refinement):
+            machine, _ = self.lane(values)
             # Another lane ends at once, its start being no number.
-            state = jtu.tree_map(lambda x: jnp.where(unclear, x, jnp.nan), state)
-            later = measure.later(scene, state, self.method, out, *look, rests=self.rests)
-            new = {**out, **later}
-            return jtu.tree_map(lambda a, b: jnp.where(unclear, a, b), new, out)
+            state = jtu.tree_map(lambda x: jnp.where(needs_refinement, x, jnp.nan), state)
+            refined = measure.refine(
+                machine, state, self.method, out, *pass_number, rests=self.rests
+            )
+            new = {**out, **refined}
+            return jtu.tree_map(lambda a, b: jnp.where(needs_refinement, a, b), new, out)
 
-        return jax.vmap(one)(values, state, out, unclear & wanted & (out["result"] == 0))
+        return jax.vmap(one)(values, state, out, needs_refinement & wanted & (out["result"] == 0))
 
 
-def make_job(
-    scene: Any,
+def make_program(
+    machine: Any,
     names: tuple[str, ...],
     *,
     measure: Any,
@@ -178,9 +182,9 @@ def make_job(
     derivatives: Iterable[str] = (),
     max_impacts: int = 1000,
     max_steps: int | None = None,
-) -> Job:
+) -> ScanProgram:
     """The work for each lane, its arguments checked as far as they can be without the axes."""
-    measures = measures_of(measure, _averages_of(scene, names, start))
+    measures = measures_of(measure, _averages_of(machine, names, start))
     needed = max(m.cycles for m in measures)
     cycles = max(32, needed) if cycles is None else count("cycles", cycles, least=1)
     if cycles < needed:
@@ -190,18 +194,18 @@ def make_job(
         )
     settle = count("settle", settle)
     derivatives = (derivatives,) if isinstance(derivatives, str) else derivatives
-    if isinstance(scene, AbstractScene):
-        template, build, rests = machine_of(scene), None, True
+    if isinstance(machine, AbstractMachine):
+        template, build, rests = machine_of(machine), None, True
         method = chosen(template, method)
-    elif callable(scene):
-        template, build = None, scene
+    elif callable(machine):
+        template, build = None, machine
         own = [name for name in names if not name.startswith(START)]
-        _check_names_of(scene, own)
+        _check_names_of(machine, own)
         method, rests = _suited(build, own, method)
     else:
         raise TypeError(
-            "Argument `scene` must be a `Scene`, an `AbstractScene` or a function that makes one, "
-            f"but got {scene!r}."
+            "Argument `machine` must be a `Scene`, an `AbstractMachine` or a function that makes "
+            f"one, but got {machine!r}."
         )
     first = start
     if template is not None and start is None:
@@ -212,8 +216,8 @@ def make_job(
         for name in names:
             _check_name(template, first, name, "axes")
     measures = tuple(measure.under(method) for measure in measures)
-    return Job(
-        scene=_as_arrays(template),
+    return ScanProgram(
+        machine=_as_arrays(template),
         build=build,
         start=_as_arrays(start),
         derivatives=tuple_of("derivatives", derivatives, str),
@@ -228,14 +232,14 @@ def make_job(
     )
 
 
-def _averages_of(scene: Any, axes: Iterable[str], start: Any) -> tuple[str, ...]:
+def _averages_of(machine: Any, axes: Iterable[str], start: Any) -> tuple[str, ...]:
     """The names of the averages of a machine, or of those that a function makes."""
-    if isinstance(scene, AbstractScene):
-        return _names_of(scene, start)
+    if isinstance(machine, AbstractMachine):
+        return _names_of(machine, start)
     found: list[tuple[str, ...]] = []
 
     def made(values):
-        found.append(_names_of(scene(**values), start))
+        found.append(_names_of(machine(**values), start))
 
     # What cannot be made is told where the method is looked for.
     with contextlib.suppress(Exception):
@@ -243,23 +247,23 @@ def _averages_of(scene: Any, axes: Iterable[str], start: Any) -> tuple[str, ...]
     return found[0] if found else ()
 
 
-def _names_of(scene: Any, start: Any) -> tuple[str, ...]:
-    if not isinstance(scene, AbstractScene) or not has_averages(scene):
+def _names_of(machine: Any, start: Any) -> tuple[str, ...]:
+    if not isinstance(machine, AbstractMachine) or not has_averages(machine):
         return ()
-    return average_names(scene, scene.start() if start is None else scene.adopt(start))
+    return average_names(machine, machine.start() if start is None else machine.adopt(start))
 
 
 def _suited(
     build: Callable[..., Any], names: list[str], method: MethodLike
 ) -> tuple[AbstractMethod, bool]:
-    """The method for the scenes that a function makes, and whether a body can come to rest in
+    """The method for the machines that a function makes, and whether a body can come to rest in
     them, whatever its values."""
     found: list[tuple[AbstractMethod, bool]] = []
 
     def made(values):
-        scene = build(**values)
-        if isinstance(scene, AbstractScene):
-            found.append((chosen(scene, method), scene.may_rest()))
+        machine = build(**values)
+        if isinstance(machine, AbstractMachine):
+            found.append((chosen(machine, method), machine.may_rest()))
         else:  # refused once there are lanes
             found.append((chosen(None, method), True))
 
@@ -268,12 +272,12 @@ def _suited(
 
 
 def _check_names_of(build: Callable[..., Any], names: list[str]) -> None:
-    """**Raises:** `ValueError` if the function that makes the scenes does not take these names."""
+    """**Raises:** `ValueError` if the function that makes machines does not take these names."""
     try:
         inspect.signature(build).bind(**dict.fromkeys(names))
     except TypeError as error:
         raise ValueError(
-            "Argument `axes` must give the function in argument `scene` what it takes, but: "
+            "Argument `axes` must give the function in argument `machine` what it takes, but: "
             f"{error}."
         ) from None
     except ValueError:
@@ -298,8 +302,8 @@ def _as_arrays(tree: Any) -> Any:
     )
 
 
-def _check_name(scene: AbstractScene, start: Any, name: str, argument: str) -> None:
-    names = leaf_names(scene) + [START + n for n in leaf_names(start)]
+def _check_name(machine: AbstractMachine, start: Any, name: str, argument: str) -> None:
+    names = leaf_names(machine) + [START + n for n in leaf_names(start)]
     check_name(names, name, argument)
 
 
@@ -313,29 +317,29 @@ def _corners(blocks: Blocks) -> np.ndarray:
     return np.stack(np.meshgrid(*corners, indexing="ij"), axis=-1).reshape(-1, len(rows))
 
 
-def check_corners(job: Job, blocks: Blocks) -> Job:
-    """The job, after the checks of scene, start and method on the corners of the grid.
+def check_corners(job: ScanProgram, blocks: Blocks) -> ScanProgram:
+    """The job, after the checks of machine, start and method on the corners of the grid.
 
-    What the corners say about the gaps holds for the grid, unless a function makes the scenes, of
+    What the corners say about the gaps holds for the grid, unless a function makes the machines, of
     which it is known already: if no body can rest, that is left out.
     """
     rests = False
-    if blocks.paired and job.scene is not None:
+    if blocks.paired and job.machine is not None:
         lanes = {name: jnp.asarray(x) for name, x in blocks.axes.items() if name[:6] != START}
-        scene = job.scene
+        machine = job.machine
         for name, x in lanes.items():
-            scene = with_leaf(scene, name, x)
-        check_again(scene)  # all lanes at a time
+            machine = with_leaf(machine, name, x)
+        check_again(machine)  # all lanes at a time
     for values in _corners(blocks):
         lane = {name: jnp.asarray(x) for name, x in zip(blocks.axes, values, strict=True)}
-        scene, start = job.lane(lane)
-        check_again(scene)
-        rests = rests or scene.may_rest()
+        machine, start = job.lane(lane)
+        check_again(machine)
+        rests = rests or machine.may_rest()
         for name in job.derivatives:
-            _check_name(scene, start, name, "derivatives")
-        job.method.check(scene)
-        start = scene.adopt(start)
+            _check_name(machine, start, name, "derivatives")
+        job.method.check(machine)
+        start = machine.adopt(start)
         check_reals("start", start)
-        check_period(scene, start)
+        check_period(machine, start)
         refuse_arrays("start", "scan", start)
     return job if job.build is not None else dataclasses.replace(job, rests=rests)

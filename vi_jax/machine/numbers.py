@@ -1,4 +1,4 @@
-"""Numbers of a scene by name: `"drive.frequency_ratio"`, `"stops.0.gap"`, …"""
+"""Numbers of a machine by name: `"drive.frequency_ratio"`, `"stops.0.gap"`, …"""
 
 import difflib
 from collections.abc import Mapping
@@ -14,12 +14,12 @@ from .units import in_unit
 
 
 def leaf_names(tree: Any) -> list[str]:
-    """Names of all numbers in a scene (or another pytree), in the order of its leaves."""
+    """Names of all numbers in a machine (or another pytree), in the order of its leaves."""
     return list(by_name(tree))
 
 
 def by_name(tree: Any) -> dict[str, Any]:
-    """All numbers of a scene, a state or another pytree by their names, in the order of its
+    """All numbers of a machine, a state or another pytree by their names, in the order of its
     leaves."""
     return dict(_named(tree))
 
@@ -52,7 +52,7 @@ def leaf(tree: Any, name: str) -> Float[Array, "..."]:
 
 
 def with_leaf(tree: Any, name: str, value: Any) -> Any:
-    """The same scene with another number in place of that name; traced values pass."""
+    """The same machine with another number in place of that name; traced values pass."""
     index = leaf_names(tree).index(check_leaf(tree, name))
     leaves, treedef = jtu.tree_flatten(tree)
     arrays = [i for i, x in enumerate(leaves) if eqx.is_array_like(x)]
@@ -65,7 +65,7 @@ def with_leaf(tree: Any, name: str, value: Any) -> Any:
 
 
 def check_leaf(tree: Any, name: str, *, argument: str = "parameter") -> str:
-    """`name`, if the scene has such a number."""
+    """`name`, if the machine has such a number."""
     return check_name(leaf_names(tree), name, argument)
 
 
@@ -78,14 +78,16 @@ def check_name(names: list[str], name: str, argument: str) -> str:
     near = list(dict.fromkeys(ending + near))
     hint = f"near names: {', '.join(near)}" if near else f"its names: {', '.join(names)}"
     raise ValueError(
-        f"Argument `{argument}` must be a number of the scene, but got {name!r}; {hint}."
+        f"Argument `{argument}` must be a number of the machine, but got {name!r}; {hint}."
     )
 
 
-def check_again(scene: Any) -> None:
-    """Run the scene's own checks: a number put in place of another has passed none."""
-    parts = jtu.tree_leaves(scene, is_leaf=lambda x: isinstance(x, eqx.Module) and x is not scene)
-    for part in [*parts, scene]:
+def check_again(machine: Any) -> None:
+    """Run the machine's own checks: a number put in place of another has passed none."""
+    parts = jtu.tree_leaves(
+        machine, is_leaf=lambda x: isinstance(x, eqx.Module) and x is not machine
+    )
+    for part in [*parts, machine]:
         check = getattr(part, "__check_init__", None)
         if check is not None:
             check()

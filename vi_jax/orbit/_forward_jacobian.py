@@ -10,7 +10,7 @@ import jax.tree_util as jtu
 from jax.flatten_util import ravel_pytree
 
 
-def by_columns(f: Callable[..., Any]) -> Callable[..., Any]:
+def forward_jacobian(f: Callable[..., Any]) -> Callable[..., Any]:
     """`f`, with a derivative that is its Jacobian, taken forward, times the tangent.
 
     Only leaves that are being differentiated make columns. Inside of another derivative, as that of
@@ -42,7 +42,7 @@ def by_columns(f: Callable[..., Any]) -> Callable[..., Any]:
             basis = jnp.eye(flat.size, dtype=flat.dtype)
             return jax.vmap(along, out_axes=(None, -1))(basis)
 
-        out, jacobian = by_columns(columns)(*primals)
+        out, jacobian = forward_jacobian(columns)(*primals)
         step, _ = ravel_pytree(tangents)
         return out, jtu.tree_map(lambda column: column @ step, jacobian)
 

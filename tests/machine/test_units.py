@@ -7,11 +7,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import vi_jax as vi
+from vi_jax.machine.numbers import leaf_names
+from vi_jax.machine.units import unit_of
 from vi_jax.scan.grid import Blocks
-from vi_jax.scan.job import make_job
+from vi_jax.scan.program import make_program
 from vi_jax.scan.scan import variables_of
-from vi_jax.scene.numbers import leaf_names
-from vi_jax.scene.units import unit_of
 
 from differences import quick
 
@@ -70,7 +70,7 @@ def test_scans_and_sweeps_say_their_units(case):
     machine, called, position, velocity, rate = case
     name, start = leaf_names(machine)[0], leaf_names(machine.start())[0]
     axes = {name: np.linspace(0.5, 0.6, 2), f"start.{start}": np.linspace(0.1, 0.2, 2)}
-    job = make_job(machine, tuple(axes), measure=("extremes", "power", "sections", "exponent"))
+    job = make_program(machine, tuple(axes), measure=("extremes", "power", "sections", "exponent"))
     found = variables_of(job, Blocks(axes, 4, paired=False))
     assert found["y_min"].attributes["units"] == found["y_max"].attributes["units"] == position
     assert found["impact_speed"].attributes["units"] == velocity
@@ -85,7 +85,7 @@ def test_scans_and_sweeps_say_their_units(case):
 
 
 def test_a_machine_that_states_nothing_is_told_without_units():
-    class Own(vi.AbstractScene):
+    class Own(vi.AbstractMachine):
         gap: float = 0.5
 
         @property

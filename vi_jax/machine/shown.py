@@ -34,10 +34,10 @@ class Shown(eqx.Module):
         return table(type(self).__name__, rows)
 
 
-class Told(eqx.Module):
+class Summarized(eqx.Module):
     """A result that says what it holds."""
 
-    def told(self) -> str:
+    def summary(self) -> str:
         """In words: a line, and further ones "name: value" that are indented."""
         raise NotImplementedError
 
@@ -46,10 +46,10 @@ class Told(eqx.Module):
         return None
 
     def __repr__(self) -> str:
-        return self.told() if known(self) else super().__repr__()
+        return self.summary() if known(self) else super().__repr__()
 
     def _repr_html_(self) -> str:
-        return told_in_table(repr(self), self.drawn() if known(self) else None)
+        return summary_table(repr(self), self.drawn() if known(self) else None)
 
 
 def known(tree: Any) -> bool:
@@ -122,7 +122,7 @@ def table(title: str, rows: Iterable[tuple[str, ...]], after: str = "") -> str:
     return f"<table>{caption}{cells}</table>{after}"
 
 
-def told_in_table(text: str, row: Any = None) -> str:
+def summary_table(text: str, row: Any = None) -> str:
     """A result in words as a table: its lines "name: value", the first one above."""
     first, *lines = text.splitlines()
     after = "" if row is None else sparkline(row)

@@ -22,7 +22,7 @@ def friction(speed):
     return 0.5 + 0.5 * np.exp(-2 * speed)
 
 
-class Belt(vi.AbstractScene):
+class Belt(vi.AbstractMachine):
     """x'' = -x - 0.1 x' + friction of a belt that runs at `speed`; a cycle ends where the body is
     furthest back."""
 

@@ -33,7 +33,7 @@ def on_a_belt(machine):
     )
 
 
-class Rubbing(vi.AbstractScene):
+class Rubbing(vi.AbstractMachine):
     """x'' + x = A cos ωt - friction; by phase."""
 
     amplitude: jax.Array
@@ -189,7 +189,7 @@ def test_sticking_and_sliding_beside_scipy():
     assert (np.diff(runs[0].sections.heat, axis=1) >= 0).all()
 
 
-class OnABelt(vi.AbstractScene):
+class OnABelt(vi.AbstractMachine):
     """A body on a spring, on a belt that moves on; a cycle ends where it comes along x = level."""
 
     speed: jax.Array
