@@ -51,7 +51,9 @@ def test_a_scene_that_outlived_double_precision_is_refused_by_that_name():
             lambda: vi.sweep(scene, *swept, *swept.values(), start=start),
             lambda: vi.scan(scene, swept, measure="extremes", cycles=2),
         ):
-            with pytest.raises(TypeError, match=r"`scene` must be of single precision, .* \(.*gap"):
+            with pytest.raises(
+                TypeError, match=r"`machine` must be of single precision, .*\(.*gap"
+            ):
                 call()
         early = vi.Scene.ideal(**NUMBERS)
         with pytest.raises(TypeError, match=r"`start` .* double precision \(Y, V\)"):

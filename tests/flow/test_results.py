@@ -77,7 +77,7 @@ def test_words():
     ],
 )
 def test_bad_input(change, error, message):
-    arguments = {"scene": SCENE, "start": SCENE.start(), "cycles": 3, **change}
+    arguments = {"machine": SCENE, "start": SCENE.start(), "cycles": 3, **change}
     # The run-time type checks of the tests may come first; they are `TypeError`s as well.
     with pytest.raises(error) as caught:
         vi.simulate(**arguments)

@@ -56,6 +56,26 @@ def test_a_block_slides_to_rest():
     assert float(run.last.u) == 0.0
 
 
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_a_block_bounces_to_rest_while_it_slides(way):
+    """By its momentum: the floor's impulses, those of endless last bounces included, add up to its
+    weight, and friction to μ of that."""
+    mu, restitution = 0.3, 0.5
+    run = vi.simulate(
+        Block(mu, restitution), at(0, 1, 15 * way, 0), 1, method="reference", max_impacts=100
+    )
+    assert int(run.rests[0]) == 1
+    assert float(run.last.u) == pytest.approx(way * (15 - mu * 2 * np.pi), abs=1e-12)
+    # What is lost in bounces, friction's work there included, and what is rubbed off afterwards.
+    falls = np.sqrt(2.0)
+    rests = falls * (1 + restitution) / (1 - restitution)
+    speed = 15 - mu * rests
+    lost = 1 + 0.5 * (15**2 - speed**2)
+    # In the last bounces, 8e-6 of the longest step, the body counts as held.
+    held = mu * 15 * 8e-6 * 2 * np.pi / 5
+    assert lost - held < float(run.impact_energy[0]) <= lost + 1e-9
+
+
 def force(machine, s, z):
     return machine.pull * jnp.cos(s)
 

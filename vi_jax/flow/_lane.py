@@ -20,6 +20,7 @@ from ..machine.event import (
 )
 from . import results
 from ._own import check_field, check_laws
+from ._own_parts import check_events
 from .beside import Beside
 from .events import Rates, force_rate, rates
 from .methods import AbstractMethod
@@ -249,6 +250,7 @@ class Plan(eqx.Module):
         modes = begin_modes(machine, zero, start)
         check_field(machine, zero, start, modes)
         check_laws(machine, zero)
+        check_events(machine, zero, start, modes)
         free = in_modes(machine, modes)
         here = [rates(free.field, x.position, zero, start) for x in machine.coordinates]
         # At rest the acceleration says which way the motion goes.

@@ -48,17 +48,20 @@ def check_field(machine: AbstractMachine, s: Scalar, state: Any, modes: tuple[Sc
     wanted, got = (jtu.tree_map(jnp.shape, x) for x in (state, flow))
     if jtu.tree_structure(state) != jtu.tree_structure(flow) or wanted != got:
         raise TypeError(
-            f"{whose} must return what is like its state, {_in_short(state)}, but returned "
-            f"{_in_short(flow)}."
+            f"{whose} must return what is like its state, {in_short(state)}, but returned "
+            f"{in_short(flow)}."
         )
     with in_words_of(f"`section` of a {type(machine).__name__}"):
         jax.eval_shape(machine.section, state)
 
 
-def _in_short(tree: Any) -> str:
+def in_short(tree: Any) -> str:
     """The structure of a tree, with types and shapes for numbers."""
-    tree = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), tree)
-    return eqx.tree_pformat(tree, width=1000)
+
+    def blank(x: Any) -> Any:
+        return jnp.zeros(x.shape, x.dtype) if hasattr(x, "shape") else x
+
+    return eqx.tree_pformat(jtu.tree_map(blank, tree), width=1000)
 
 
 def _check_arguments(
@@ -98,7 +101,6 @@ def in_words_of(whose: str) -> Iterator[None]:
 def check_laws(machine: AbstractMachine, speed: Scalar) -> None:
     """**Raises:** `TypeError` for a restitution law that cannot be traced or gives no number; as
     `check_field`."""
-    _check_frictions(machine)
     for i, stop in enumerate(machine.stops):
         if stop.is_one_number:
             continue
@@ -117,24 +119,6 @@ def check_laws(machine: AbstractMachine, speed: Scalar) -> None:
             raise TypeError(
                 f"{whose} must return one number, but gives an array of shape {got.shape}."
             )
-
-
-def _check_frictions(machine: AbstractMachine) -> None:
-    """**Raises:** `ValueError` for friction on a stop that there is not, or along a coordinate."""
-    known = {
-        "stop": ("stop", len(machine.stops)),
-        "along": ("coordinate", len(machine.coordinates)),
-    }
-    for switch in machine.switches:
-        if switch.rubs_on is None:
-            continue
-        for name, (what, count) in known.items():
-            number = getattr(switch, name)
-            if number >= count:
-                raise ValueError(
-                    f"Argument `{name}` of a ContactFriction must be the number of a {what} of the "
-                    f"{type(machine).__name__}, which has {count}, but got {number}."
-                )
 
 
 def check_period(machine: AbstractMachine, start: Any) -> None:

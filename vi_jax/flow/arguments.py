@@ -12,10 +12,11 @@ from jaxtyping import Array, Int
 from .. import lanes
 from .._checks import count, count_or_traced, fits_records, flag, instance_of, one_of, require_real
 from .._numbers import concrete, narrow, require_session, strongly_typed, warn, warn_of_narrow
-from ..machine import AbstractMachine, RigidStop, Scene
+from ..machine import AbstractMachine, Scene
 from ..machine.event import begin_modes, is_autonomous
 from ._lane import Plan
 from ._own import check_period as check_period
+from ._own_parts import check_parts
 from .methods import MethodLike, chosen
 from .named import average_names
 from .smooth import rounding
@@ -40,7 +41,7 @@ def planned(
 ) -> tuple[Plan, Any]:
     """The arguments of `simulate`, checked and put in the form in which the loop needs them."""
     machine = machine_of(machine)
-    _check_parts(machine)
+    check_parts(machine)
     method = chosen(machine, method)
     cycles = count("cycles", cycles, least=1)
     samples = count("samples", samples)
@@ -113,25 +114,6 @@ def machine_of(machine: Any) -> AbstractMachine:
     """
     instance_of("machine", machine, AbstractMachine, "a `Scene` or an `AbstractMachine`")
     return jtu.tree_map(strongly_typed, machine)
-
-
-def _check_parts(machine: AbstractMachine) -> None:
-    """**Raises:** `TypeError` or `ValueError` for a machine whose parts are not what they must."""
-    name, stops = type(machine).__name__, machine.stops
-    if not isinstance(stops, tuple) or not all(isinstance(stop, RigidStop) for stop in stops):
-        raise TypeError(f"`stops` of a {name} must be a tuple of `RigidStop`s, but is {stops!r}.")
-    if callable(machine.cycle):
-        raise TypeError(f"`cycle` of a {name} must be a number, or a property that gives one.")
-    cycle = concrete(machine.cycle)
-    if cycle is not None and not (np.isfinite(cycle) & (cycle > 0)).all():
-        raise ValueError(f"`cycle` of a {name} must be positive, but is {cycle}.")
-    many = len(machine.coordinates)
-    for i, stop in enumerate(stops):
-        if stop.coordinate >= many:
-            raise ValueError(
-                f"Stop {i} of a {name} limits coordinate {stop.coordinate}, but there are {many}: "
-                "name each in `coordinates`."
-            )
 
 
 def _most(dtype: Any) -> int:

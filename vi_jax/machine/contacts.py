@@ -126,6 +126,48 @@ def _slipping(gains: list[list[Scalar]], wanted: Scalar, ratio: Any) -> tuple[Sc
     return pushed, ratio * pushed
 
 
+class Held(NamedTuple):
+    """What holds the bodies that rest: a row for each coordinate that stops limit, in their order,
+    then one for each friction on a stop, in the order of the switches."""
+
+    coordinates: list[Any]
+    """Whose velocity is held; of a friction that along the stop."""
+    pushes: list[Any]
+    """How the state changes by its force; of a stop with the drag of a body that slips on it."""
+    acts: list[Flag]
+    """Whether it holds; a friction holds while the body sticks."""
+    rubbing: list[tuple[int, Any, int, Scalar]]
+    """Of each friction its place among the switches, itself, the row of its stop, and how much of
+    its own push goes with one of the stop's."""
+
+
+def held_by(machine: Any, state: Any, modes: Sequence[Any], contact: Sequence[Any]) -> Held:
+    """What holds the bodies that rest on stops.
+
+    **Arguments:** the modes of the machine's switches, which come first; `contact` as in `Around`.
+    """
+    limited = sorted({stop.coordinate for stop in machine.stops})
+    bodies = [machine.coordinates[k] for k in limited]
+    pushes, acts = [push_of(body, state) for body in bodies], [contact[k] > 0 for k in limited]
+    rubbing = []
+    for i, friction in enumerate(machine.switches):
+        if friction.rubs_on is None:
+            continue
+        stop = machine.stops[friction.rubs_on]
+        at = limited.index(stop.coordinate)
+        here = contact[stop.coordinate] == 1.0 + friction.rubs_on
+        along, body = machine.coordinates[friction.along], bodies[at]
+        drag = push_of(along, state)
+        # The stop pushes a body away from it, and friction against the way it slips.
+        ratio = modes[i] * friction.level * stop.sign * body.mass / along.mass
+        slips = jnp.where(here, ratio, 0.0)
+        pushes[at] = added(pushes[at], (slips,), (drag,))
+        bodies, pushes = [*bodies, along], [*pushes, drag]
+        acts = [*acts, here & (modes[i] == 0)]
+        rubbing.append((i, friction, at, slips))
+    return Held(bodies, pushes, acts, rubbing)
+
+
 def held_flow(
     machine: Any, flow: Any, state: Any, modes: Sequence[Any], contact: Sequence[Any]
 ) -> tuple[Any, dict[int, tuple[Scalar, Scalar]]]:
@@ -138,29 +180,12 @@ def held_flow(
     **Returns:** the rate, and of each friction on a stop, by its place among the switches, the
     force along the stop and that which presses on it.
     """
-    limited = sorted({stop.coordinate for stop in machine.stops})
-    bodies = [machine.coordinates[k] for k in limited]
-    pushes = [push_of(body, state) for body in bodies]
-    rests = [contact[k] > 0 for k in limited]
-    wanted = [-gained(body, state, flow) for body in bodies]
-    rubbing = [(i, x) for i, x in enumerate(machine.switches) if x.rubs_on is not None]
-    for i, friction in rubbing:
-        stop, at = machine.stops[friction.rubs_on], None
-        at = limited.index(stop.coordinate)
-        here = contact[stop.coordinate] == 1.0 + friction.rubs_on
-        along, body = machine.coordinates[friction.along], bodies[at]
-        drag = push_of(along, state)
-        # The stop pushes a body away from it, and friction against the way it slips.
-        ratio = modes[i] * friction.level * stop.sign * body.mass / along.mass
-        slips = jnp.where(here, ratio, 0.0)
-        pushes[at] = added(pushes[at], (slips,), (drag,))
-        bodies, pushes = [*bodies, along], [*pushes, drag]
-        rests, wanted = [*rests, here & (modes[i] == 0)], [*wanted, -gained(along, state, flow)]
-    amounts = forces(shares(bodies, state, pushes), rests, wanted)
-    found = {}
-    for place, (i, friction) in enumerate(rubbing, start=len(limited)):
-        stop = machine.stops[friction.rubs_on]
-        at = limited.index(stop.coordinate)
-        pressing = -stop.sign * amounts[at] * bodies[at].mass
-        found[i] = amounts[place] * bodies[place].mass, pressing
-    return added(flow, amounts, pushes), found
+    held = held_by(machine, state, modes, contact)
+    wanted = [-gained(body, state, flow) for body in held.coordinates]
+    amounts = forces(shares(held.coordinates, state, held.pushes), held.acts, wanted)
+    found, first = {}, len(held.coordinates) - len(held.rubbing)
+    for row, (i, friction, at, _) in enumerate(held.rubbing, start=first):
+        along, body = held.coordinates[row], held.coordinates[at]
+        pressing = -machine.stops[friction.rubs_on].sign * amounts[at] * body.mass
+        found[i] = amounts[row] * along.mass, pressing
+    return added(flow, amounts, held.pushes), found

@@ -57,7 +57,24 @@ class AbstractDrive(Shown):
 
     def usual(self, name: str, known: dict[str, Any]) -> Any:
         """A component of its own where a start does not give it; `known` are those before it."""
-        raise NotImplementedError
+        raise ValueError(
+            f"Argument `{name}` of `start` must be given for a `{type(self).__name__}`, which has "
+            "no `usual` for it."
+        )
+
+    def check(self) -> None:
+        """**Raises:** `TypeError` for a drive that lacks what a scene asks of it."""
+        kind, state = type(self), getattr(self, "state", None)
+        if not isinstance(state, type):
+            raise TypeError(
+                f"Drive `{kind.__name__}` must say in `state` of which class its states are."
+            )
+        if self.fixed_speed is None and not isinstance(kind.timed_state, type):
+            raise TypeError(
+                f"Drive `{kind.__name__}` has the speed of the crank in its state, as it has no "
+                "`fixed_speed`: it must say in `timed_state` of which class its states are by "
+                "time, with the crank angle `phase` as their last component."
+            )
 
     def begin(self, **given: Any) -> dict[str, Any]:
         """Its own components of a start, by name; what is not given, or `None`, is the `usual`.

@@ -222,25 +222,25 @@ def guard_of(
 
     **Arguments:** `contact` as in `Around`.
     """
-    event, own, more = _event(machine, number, modes, contact)
+    event, own, more = event_of(machine, number, modes, contact)
     return event.guard(machine, s, state, *modes[own], **more)
 
 
 def jump_of(machine: Any, number: int, s: Any, state: Any, modes: Modes) -> Any:
     """The state after one of its events, also of one beside it."""
-    event, own, _ = _event(machine, number, modes, ())
+    event, own, _ = event_of(machine, number, modes, ())
     return _rubbed(machine, number, state, event.jump(machine, s, state, *modes[own]))
 
 
 def happens_at(machine: Any, number: int, s: Any, state: Any, modes: Modes) -> Any:
     """Whether one of its events happens where its guard has risen; `None` if always."""
-    event, own, _ = _event(machine, number, modes, ())
+    event, own, _ = event_of(machine, number, modes, ())
     return event.happens(machine, s, state, *modes[own])
 
 
 def value_of(machine: Any, number: int, s: Any, state: Any, modes: Modes) -> Any:
     """What the log of events keeps of one of its events."""
-    event, own, _ = _event(machine, number, modes, ())
+    event, own, _ = event_of(machine, number, modes, ())
     return event.value(machine, s, state, *modes[own])
 
 
@@ -251,7 +251,7 @@ def after_event(
 
     **Arguments:** `contact` as in `Around`.
     """
-    event, own, more = _event(machine, number, modes, contact)
+    event, own, more = event_of(machine, number, modes, contact)
     new, changed = event.after(machine, s, state, *modes[own], **more)
     if event.holds_mode:
         changed = (*modes[: own.start], changed, *modes[own.stop :])
@@ -281,7 +281,7 @@ def mode_number(machine: Any, number: int) -> int:
     return sum(event.holds_mode for event in events_of(machine)[:number])
 
 
-def _event(
+def event_of(
     machine: Any, number: int, modes: Modes, contact: tuple[Any, ...]
 ) -> tuple[AbstractEvent, slice, dict[str, Around]]:
     """An event, which of the machine's modes it is given, its own or all, and what else."""
@@ -320,7 +320,7 @@ def struck_modes(
     held = []
     for number, event in enumerate(events_of(machine)):
         if event.holds_mode:
-            _, place, more = _event(machine, number, modes, contact)
+            _, place, more = event_of(machine, number, modes, contact)
             held.append(event.struck(machine, s, state, *modes[place], **more))
     kept = modes[len(held) :] if own is None else own
     return settled_modes([*held, *kept], s)

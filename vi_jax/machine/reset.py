@@ -61,6 +61,10 @@ class Reset(AbstractEvent):
         new = self._reset(machine, s, state, *modes)
         return new, struck_modes(machine, s, new, modes, own)
 
+    def jump(self, machine, s, state, *modes):
+        """As `reset` says."""
+        return self._reset(machine, s, state, *modes)
+
     def happens(self, machine, s, state, *modes):
         """As `when` says."""
         return None if self._when is None else self._when(machine, s, state, *modes)

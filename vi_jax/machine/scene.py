@@ -66,6 +66,7 @@ class Scene(ShaftMachine):
         instance_of("oscillator", self.oscillator, Oscillator, "an `Oscillator`")
         instance_of("crank", self.crank, AbstractCrank, "a `CosineCrank()` or another crank")
         instance_of("drive", self.drive, AbstractDrive, "an `IdealDrive` or a `Motor`")
+        self.drive.check()
         for stop in self.stops:
             if not isinstance(stop, RigidStop):
                 raise TypeError(f"Argument `stops` must hold `RigidStop`s, but holds {stop!r}.")

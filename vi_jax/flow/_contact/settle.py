@@ -14,7 +14,8 @@ from jax.lax import stop_gradient
 
 from ..._types import Flag, Scalar
 from ...lanes import pin, pin_flag
-from ...machine.contacts import forces, push_of, shares
+from ...machine.contacts import added, forces, held_by, push_of, shares
+from ...machine.event import rubs, struck_modes
 from .._arrival import Arrival
 from .._flow_to_event import FlowToEvent
 from .._lane import RESTS, Lane, Plan, select
@@ -79,9 +80,16 @@ def _held(
         left = jnp.where(ends, waits[k], 0.0)
         wait = left if len(rests) == 1 else jnp.maximum(wait, left)
         contact = (*contact[:k], jnp.where(ends, blows[k].struck, contact[k]), *contact[k + 1 :])
-    resting = holding(plan.machine, arrival.modes, contact)
-    walls = {k: blow.struck for k, blow in blows.items()}
-    still, lost = stilled(plan, state, rests, walls)
+    walls, modes = {k: blow.struck for k, blow in blows.items()}, arrival.modes
+    if rubs(plan.machine):
+        # Which way a body slips is known behind its impact.
+        modes = struck_modes(plan.machine, s, state, modes, contact=contact)
+        slowed, rubbed_away = _without_rebounds(plan, state, modes, rests, walls)
+        still, lost = stilled(plan, slowed, rests, walls)
+        lost = lost + rubbed_away
+    else:
+        still, lost = stilled(plan, state, rests, walls)
+    resting = holding(plan.machine, modes, contact)
     way = FlowToEvent(plan, resting, lane.part, (s, still, time))
     later, still, passed = drifted(way.rate, pin(wait), way.moving, way.fixed, way.rest)
     if len(rests) > 1:  # another body may come upon this one before its impacts are over
@@ -111,6 +119,35 @@ def _beyond_any(plan: Plan, state: Any) -> Flag:
         place = plan.machine.coordinates[stop.coordinate].position(state)
         found = found | (stop_gradient(stop.beyond(place)) > slack)
     return found
+
+
+def _without_rebounds(
+    plan: Plan, state: Any, modes: tuple[Scalar, ...], rests: dict[int, Flag],
+    walls: dict[int, Scalar],
+) -> tuple[Any, Scalar]:  # fmt: skip
+    """The state without the rebounds of those bodies that come to rest, and without the friction
+    that went with them: the weight of the hops that are left out rubs instead, while the body is
+    held. And the energy that goes with the rebounds.
+
+    **Arguments:** the modes behind the impacts; the others as in `stilled`.
+    """
+    machine, zero = plan.machine, jnp.zeros_like(modes[0])
+    contact = [zero for _ in machine.coordinates]
+    for k, ends in rests.items():
+        contact[k] = jnp.where(ends, walls[k], zero)
+    held = held_by(machine, state, modes, contact)
+    bodies = held.coordinates
+    before = [body.velocity(state) for body in bodies]
+    amounts = forces(
+        shares(bodies, state, held.pushes), held.acts, [-velocity for velocity in before]
+    )
+    new, pushed = added(state, amounts, held.pushes), list(amounts)
+    for row, (_, _, at, drag) in enumerate(held.rubbing, start=len(bodies) - len(held.rubbing)):
+        pushed[row] = pushed[row] + drag * amounts[at]
+    lost = zero
+    for body, amount, V in zip(bodies, pushed, before, strict=True):
+        lost = lost - body.mass * amount * 0.5 * (V + body.velocity(new))
+    return new, lost
 
 
 def stilled(

@@ -3,14 +3,16 @@
 from typing import Any
 
 import jax.numpy as jnp
+from jax.lax import stop_gradient
 
-from ..._types import Flag
+from ..._types import Flag, Scalar
 from ...machine.event import after_event, happens_at, mode_number, value_of
 from .. import results
 from .._arrival import Arrival, ended
-from .._lane import CHANGES, RESETS, Plan, select
+from .._lane import CHANGES, LEAVES, RESETS, Plan, select, to_event
 from .._log import clock_at, logged, noted
-from ..smooth import rounding
+from ..events import rates
+from ..smooth import holding, rounding
 from .faults import comes_back
 from .guards import Crossing
 from .jump import after_jump
@@ -42,9 +44,37 @@ def happened(plan: Plan, taken: Flag, arrival: Arrival, c: Crossing, there: Any)
         arrival = arrival._replace(impacts=arrival.impacts + count)
     if not event.holds_mode:
         arrival = _jumped(plan, arrival, c, happens, there, new)
-    return arrival._replace(
+    before = there, arrival.modes
+    arrival = arrival._replace(
         state=select(happens, new, arrival.state), modes=modes, log=log, events=events
     )
+    return _let_go(plan, arrival, taken, happens, before)
+
+
+def _let_go(
+    plan: Plan, arrival: Arrival, taken: Flag, when: Flag, before: tuple[Any, tuple[Scalar, ...]]
+) -> Arrival:
+    """With those bodies free that were pressed on their stops `before` the modes changed, and are
+    pulled away behind it: a force that jumps has no place where it passes zero."""
+    machine, contact, modes = plan.machine, arrival.contact, arrival.modes
+    if contact is None or not modes:
+        return arrival
+    old, modes_before = before
+    freed, direction, events = list(contact), list(arrival.direction), arrival.events
+    for k in sorted({stop.coordinate for stop in machine.stops}):
+
+        def pressing(modes: tuple[Scalar, ...], state: Any, k: int = k) -> Scalar:
+            free = holding(machine, modes, contact, but=k)
+            return rates(free.field, machine.coordinates[k].position, arrival.s, state).a
+
+        sign, _ = plan.wall(k, contact[k])
+        pressed, pulled = sign * pressing(modes_before, old), sign * pressing(modes, arrival.state)
+        goes = when & (contact[k] > 0) & stop_gradient((pressed >= 0) & (pulled < 0))
+        clock = clock_at(plan, arrival.s, arrival.state)
+        events = noted(events, taken & goes, clock, LEAVES, contact[k] - to_event(0), jnp.nan)
+        freed[k] = jnp.where(goes, 0.0, contact[k])
+        direction[k] = jnp.where(goes, -sign, direction[k])
+    return arrival._replace(contact=tuple(freed), direction=tuple(direction), events=events)
 
 
 def _jumped(

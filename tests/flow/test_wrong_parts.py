@@ -1,0 +1,143 @@
+"""Parts of a machine of one's own that are wrong: each mistake is answered by what to do."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import pytest
+import vi_jax as vi
+
+
+def guard(machine, s, state):
+    return state.Y - 0.5
+
+
+def back(machine, s, state):
+    return vi.OscillatorState(-state.Y, state.V)
+
+
+class Swing(vi.AbstractMachine):
+    """x'' = -x with a reset; its parts are replaced by wrong ones."""
+
+    stops: tuple = ()
+    event: tuple = eqx.field(static=True, default=())
+    parts: tuple = ()
+    cycle = 6.0
+
+    @property
+    def events(self):
+        return self.event
+
+    @property
+    def switches(self):
+        return self.parts
+
+    def field(self, s, state, *modes):
+        return vi.OscillatorState(state.V, -state.Y)
+
+
+START = vi.OscillatorState(jnp.asarray(0.0), jnp.asarray(1.0))
+
+
+class NoModes(vi.AbstractEvent):
+    def guard(self, machine, s, state, *modes):
+        return state.Y - 0.5
+
+    def after(self, machine, s, state, *modes):
+        return state
+
+
+@pytest.mark.parametrize(
+    ("event", "message"),
+    [
+        (vi.Reset(lambda m, s, x: jnp.stack([x.Y, x.V]), back), r"`guard` of event 0 .* one float"),
+        (vi.Reset(lambda m, s, x: x.Y > 0.5, back), r"`guard` of event 0 .* bool"),
+        (vi.Reset(guard, lambda m, s, x: (x.Y, x.V)), r"state after event 0 \(Reset\) of a Swing"),
+        (vi.Reset(guard, lambda m, s, x: None), r"state after event 0 .* but is None"),
+        (
+            vi.Reset(guard, lambda m, s, x: vi.OscillatorState(x.Y[None], x.V), name="kick"),
+            r"state after event 0 \(kick\) .*f64\[1\]",
+        ),
+        (
+            vi.Reset(guard, lambda m, s, x: jax.tree.map(lambda x: jnp.asarray(1), x)),
+            r"state after event 0 .*i64\[\]",
+        ),
+        (vi.Reset(guard, back, modes=lambda m, s, x: (1.0,)), "modes after event 0 .* must be 0"),
+        (NoModes(), r"event 0 \(NoModes\) of a Swing must return the state and the modes"),
+    ],
+)
+def test_events(event, message):
+    with pytest.raises(TypeError, match=message):
+        vi.simulate(Swing(event=(event,)), START, 1)
+
+
+def test_parts_are_tuples_of_their_kind():
+    with pytest.raises(TypeError, match="`events` of a Swing must be a tuple of `AbstractEvent`s"):
+        vi.simulate(Swing(event=vi.Reset(guard, back)), START, 1)
+    with pytest.raises(TypeError, match="`switches` of a Swing must be a tuple"):
+        vi.find_orbit(Swing(parts=(vi.RigidStop(1.0, 0.5),)), START)
+
+
+class Floor(vi.AbstractMachine):
+    """A block on a floor, with one number wrong."""
+
+    friction: jax.Array | float = 0.3
+    along: int = 1
+    tuples: bool = False
+    cycle = 6.0
+    stops: tuple = (vi.RigidStop(0.0, 0.5, "left"),)
+
+    @property
+    def coordinates(self):
+        def placed(state, Y, V):
+            return (Y, V) if self.tuples else vi.OscillatorState(Y, V)
+
+        one = vi.Coordinate(lambda x: x.Y, lambda x: x.V, placed)
+        return one, one
+
+    @property
+    def switches(self):
+        return (vi.ContactFriction(self.friction, stop=0, along=self.along),)
+
+    def field(self, s, state, mode):
+        return vi.OscillatorState(state.V, -1.0 + 0 * state.V)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "kind", "message"),
+    [
+        ({"along": 2}, ValueError, "`along` of a ContactFriction must be the number of a coord"),
+        ({"along": 0}, ValueError, "slips along the stop, but got 0, which stop 0 of the Floor"),
+        ({"friction": -0.3}, ValueError, "`level` must be .* but got -0.3"),
+        ({"tuples": True}, TypeError, "`placed` of coordinate 0 of a Floor must be like its state"),
+    ],
+)
+def test_contacts(wrong, kind, message):
+    with pytest.raises(kind, match=message):
+        vi.simulate(Floor(**wrong), START, 1)
+
+
+class Flywheel(vi.AbstractDrive):
+    """One that does not say by what its states are."""
+
+    def field(self, scene, s, state, pushes):
+        return state
+
+
+def test_drives():
+    ideal = vi.Scene.ideal(frequency_ratio=0.9)
+    with pytest.raises(TypeError, match="`Flywheel` must say in `state`"):
+        dataclasses.replace(ideal, drive=Flywheel())
+
+    class Timeless(Flywheel):
+        state = vi.MotorState
+
+    with pytest.raises(TypeError, match=r"`Timeless` has the speed .* say in `timed_state`"):
+        dataclasses.replace(ideal, drive=Timeless())
+
+    class Bare(Timeless):
+        timed_state = vi.TimedMotorState
+
+    with pytest.raises(ValueError, match="`W` of `start` must be given for a `Bare`"):
+        dataclasses.replace(ideal, drive=Bare()).start()

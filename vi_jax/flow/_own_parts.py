@@ -1,0 +1,146 @@
+"""What is checked of the parts of a machine that a user wrote: stops, coordinates, events."""
+
+from collections.abc import Iterable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+
+from .._numbers import concrete
+from .._types import Scalar
+from ..machine import AbstractEvent, AbstractMachine, AbstractSwitch, Reset, RigidStop
+from ..machine.event import event_of, events_of
+from ._own import in_short, in_words_of
+
+_KINDS = {
+    "stops": (RigidStop, "`RigidStop`s"),
+    "switches": (AbstractSwitch, "`AbstractSwitch`es, as `SoftStop` and `DryFriction` are"),
+    "events": (AbstractEvent, "`AbstractEvent`s, as `Reset` is"),
+}
+
+
+def check_parts(machine: AbstractMachine) -> None:
+    """**Raises:** `TypeError` or `ValueError` for a machine whose parts are not what they must be;
+    before anything is traced."""
+    name = type(machine).__name__
+    for what, (kind, words) in _KINDS.items():
+        parts = getattr(machine, what)
+        if not isinstance(parts, tuple) or not all(isinstance(part, kind) for part in parts):
+            raise TypeError(f"`{what}` of a {name} must be a tuple of {words}, but is {parts!r}.")
+    if callable(machine.cycle):
+        raise TypeError(f"`cycle` of a {name} must be a number, or a property that gives one.")
+    cycle = concrete(machine.cycle)
+    if cycle is not None and not (np.isfinite(cycle) & (cycle > 0)).all():
+        raise ValueError(f"`cycle` of a {name} must be positive, but is {cycle}.")
+    many = len(machine.coordinates)
+    for i, stop in enumerate(machine.stops):
+        if stop.coordinate >= many:
+            raise ValueError(
+                f"Stop {i} of a {name} limits coordinate {stop.coordinate}, but there are {many}: "
+                "name each in `coordinates`."
+            )
+    _check_frictions(machine)
+
+
+def _check_frictions(machine: AbstractMachine) -> None:
+    """**Raises:** `ValueError` for friction on a stop that there is not, or not along it."""
+    name = type(machine).__name__
+    known = {
+        "stop": ("stop", len(machine.stops)),
+        "along": ("coordinate", len(machine.coordinates)),
+    }
+    for switch in machine.switches:
+        if switch.rubs_on is None:
+            continue
+        for argument, (what, count) in known.items():
+            number = getattr(switch, argument)
+            if number >= count:
+                raise ValueError(
+                    f"Argument `{argument}` of a ContactFriction must be the number of a {what} of "
+                    f"the {name}, which has {count}, but got {number}."
+                )
+        across = machine.stops[switch.rubs_on].coordinate
+        if switch.along == across:  # pyright: ignore[reportAttributeAccessIssue]
+            raise ValueError(
+                f"Argument `along` of a ContactFriction must be the number of the coordinate that "
+                f"slips along the stop, but got {across}, which stop {switch.rubs_on} of the "
+                f"{name} limits."
+            )
+
+
+def check_events(
+    machine: AbstractMachine, s: Scalar, state: Any, modes: tuple[Scalar, ...]
+) -> None:
+    """**Raises:** `TypeError` for a coordinate or an event whose functions do not return what they
+    must; while the loop is traced, and at no cost where it runs."""
+    name = type(machine).__name__
+    for k, coordinate in enumerate(machine.coordinates if machine.stops else ()):
+        whose = f"`placed` of coordinate {k} of a {name}"
+        place, velocity = coordinate.position(state), coordinate.velocity(state)
+        with in_words_of(whose):
+            _check_state(whose, state, jax.eval_shape(coordinate.placed, state, place, velocity))
+    first = len(machine.stops)
+    for number, event in enumerate(events_of(machine)[first:-1], start=first):
+        _check_event(machine, number, event, (s, state, modes))
+
+
+def _check_event(
+    machine: AbstractMachine, number: int, event: AbstractEvent, at: tuple[Scalar, Any, Any]
+) -> None:
+    s, state, modes = at
+    switches, name = len(machine.switches), type(machine).__name__
+    i = number - len(machine.stops)
+    what, i = ("switch", i) if i < switches else ("event", i - switches)
+    whose = f"{what} {i} ({event.name or type(event).__name__}) of a {name}"
+    contact = tuple(jnp.zeros_like(s) for _ in machine.coordinates)
+    _, own, more = event_of(machine, number, modes, contact)
+    with in_words_of(f"`guard` of {whose}"):
+        guard = jax.eval_shape(lambda: event.guard(machine, s, state, *modes[own], **more))
+    if not _is_number(guard):
+        raise TypeError(
+            f"`guard` of {whose} must return one floating-point number, but returned "
+            f"{in_short(guard)}."
+        )
+    if isinstance(event, Reset):  # its modes are asked for in the state after it
+        with in_words_of(f"`reset` of {whose}"):
+            new = eqx.filter_eval_shape(lambda: event.jump(machine, s, state, *modes))
+        _check_state(f"The state after {whose}", state, new)
+    with in_words_of(f"`after` of {whose}"):
+        found = eqx.filter_eval_shape(lambda: event.after(machine, s, state, *modes[own], **more))
+    if type(found) is not tuple or len(found) != 2:
+        raise TypeError(
+            f"`after` of {whose} must return the state and the modes afterwards, but returned "
+            f"{in_short(found)}."
+        )
+    new, changed = found
+    _check_state(f"The state after {whose}", state, new)
+    if not event.holds_mode and _length(changed) != len(modes):
+        raise TypeError(
+            f"The modes after {whose} must be {len(modes)} in number, as many as the machine has "
+            f"(those of its switches, then those of its `begin`), but are {in_short(changed)}."
+        )
+
+
+def _is_number(x: Any) -> bool:
+    return getattr(x, "shape", None) == () and jnp.issubdtype(x.dtype, jnp.floating)
+
+
+def _length(modes: Any) -> int:
+    return len(modes) if isinstance(modes, Iterable) else -1
+
+
+def _check_state(whose: str, state: Any, found: Any) -> None:
+    """**Raises:** `TypeError` for what is no state like the one given."""
+
+    def kind(x: Any) -> Any:
+        floats = jnp.issubdtype(jnp.result_type(x), jnp.inexact)
+        return jnp.shape(x), floats
+
+    alike = jtu.tree_structure(state) == jtu.tree_structure(found)
+    if not alike or jtu.tree_map(kind, state) != jtu.tree_map(kind, found):
+        raise TypeError(
+            f"{whose} must be like its state, {in_short(state)}, but is {in_short(found)}."
+        )
