@@ -3,9 +3,29 @@
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from .._types import Flag, Scalar
 from .beside import Beside
+
+
+class Tally(NamedTuple):
+    """What is written down of the events of an interval; as in `Record`."""
+
+    impacts: Scalar
+    speed: Scalar | None
+    loss: Scalar | None
+    rests: Scalar | None
+    log: Float[Array, "3 size"] | None
+    events: Float[Array, "4 listed"] | None
+
+
+class Onward(NamedTuple):
+    """How a motion goes on; as in `Lane`."""
+
+    direction: tuple[Scalar, ...]
+    contact: tuple[Scalar, ...] | None
+    modes: tuple[Scalar, ...]
 
 
 class Arrival(NamedTuple):
@@ -13,25 +33,40 @@ class Arrival(NamedTuple):
 
     s: Scalar
     state: Any
+    time: Beside | None
     place: Scalar
     """Y there: on the stop, with the stop's derivatives, where one is met."""
     before: Scalar | None
     """Y before a jump; absent where none can move it."""
-    time: Beside | None
-    direction: tuple[Scalar, ...]
-    contact: tuple[Scalar, ...] | None
-    """As in `Lane`, the stops rested on."""
-    modes: tuple[Scalar, ...]
-    impacts: Scalar
-    speed: Scalar | None
-    loss: Scalar | None
-    rests: Scalar | None
-    log: Any
-    events: Any
+    onward: Onward
+    tally: Tally
     completed: Flag
     """Whether the interval is complete."""
     fault: Scalar | None
     """As in `Lane`; absent where no event can end it."""
+
+    @property
+    def direction(self) -> tuple[Scalar, ...]:
+        """As in `Lane`."""
+        return self.onward.direction
+
+    @property
+    def contact(self) -> tuple[Scalar, ...] | None:
+        """The stops rested on, as in `Lane`."""
+        return self.onward.contact
+
+    @property
+    def modes(self) -> tuple[Scalar, ...]:
+        """As in `Lane`."""
+        return self.onward.modes
+
+    def going(self, **onward: Any) -> "Arrival":
+        """With another direction, contact or modes."""
+        return self._replace(onward=self.onward._replace(**onward))
+
+    def counting(self, **tally: Any) -> "Arrival":
+        """With something else written down."""
+        return self._replace(tally=self.tally._replace(**tally))
 
 
 def ended(arrival: Arrival, where: Flag, when: Flag | None, reason: int) -> Arrival:

@@ -40,10 +40,10 @@ def listed(
     plan: Plan, arrival: Arrival, there: Any, hit: Flag, number: int, approach: Scalar
 ) -> Arrival:
     """With an impact counted and logged."""
-    clock, speed = clock_at(plan, arrival.s, there), arrival.speed
-    return arrival._replace(
-        impacts=arrival.impacts + jnp.where(hit, 1.0, 0.0),
+    clock, speed = clock_at(plan, arrival.s, there), arrival.tally.speed
+    return arrival.counting(
+        impacts=arrival.tally.impacts + jnp.where(hit, 1.0, 0.0),
         speed=None if speed is None else jnp.where(hit, jnp.maximum(speed, approach), speed),
-        log=logged(arrival.log, hit, arrival.impacts, clock, approach, number),
-        events=noted(arrival.events, hit, clock, HIT, number, approach),
+        log=logged(arrival.tally.log, hit, arrival.tally.impacts, clock, approach, number),
+        events=noted(arrival.tally.events, hit, clock, HIT, number, approach),
     )

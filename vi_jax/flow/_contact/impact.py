@@ -44,10 +44,10 @@ def _one_blow(
         arrival = ended(arrival, met, gains_speed(stop, approach, rebound), results.BAD_IMPACT)
         state = select(met, body.placed(there, stop.place, rebound), arrival.state)
         arrival = listed(plan, arrival._replace(state=state), there, taken & met, number, approach)
-        if arrival.loss is not None:
+        if arrival.tally.loss is not None:
             lost = stop.loss(approach)
             lost = lost if _is_one(body.mass) else body.mass * lost
-            arrival = arrival._replace(loss=arrival.loss + jnp.where(taken & met, lost, 0.0))
+            arrival = arrival.counting(loss=arrival.tally.loss + jnp.where(taken & met, lost, 0.0))
         new = Blow(jnp.where(met, to_event(number), 0.0), approach, stop.share(approach))
         blow = new if len(landed) == 1 else select(met, new, blow)
     return arrival, {k: blow}

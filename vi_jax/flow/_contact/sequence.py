@@ -196,7 +196,7 @@ def _struck(instant: _Instant, x: _Round) -> _Round:
         if stop.modes is not None:
             given = plan.machine, arrival.s, state, new, arrival.modes
             modes = select(hit, stop.modes_after(*given), arrival.modes)
-            arrival = arrival._replace(modes=modes)
+            arrival = arrival.going(modes=modes)
         struck[i] = jnp.where(hit, to_event(number), struck[i])
         approaches[i] = jnp.where(hit, jnp.maximum(approaches[i], speed), approaches[i])
     return _Round(
@@ -295,8 +295,8 @@ def _accounted(
         V, left = body.velocity(before), body.velocity(arrival.state)
         lost = lost - body.mass * amount * 0.5 * (V + left)
         size = size + body.mass * jnp.abs(amount) * (jnp.abs(V) + jnp.abs(left))
-    if arrival.loss is not None:
+    if arrival.tally.loss is not None:
         hit = instant.taken & instant.met
-        arrival = arrival._replace(loss=arrival.loss + jnp.where(hit, lost, 0.0))
+        arrival = arrival.counting(loss=arrival.tally.loss + jnp.where(hit, lost, 0.0))
     wrong = stop_gradient(lost) < -1e-9 * stop_gradient(size)
     return ended(arrival, instant.met, wrong, results.BAD_IMPACT)

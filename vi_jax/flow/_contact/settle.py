@@ -65,7 +65,7 @@ def settle(
     else:
         contact = _broken(plan, arrival, there, met, blows)
         rests, waits = _together(plan, lane, arrival, blows, contact)
-    return _held(plan, lane, taken, arrival._replace(contact=contact), rests, blows, waits)
+    return _held(plan, lane, taken, arrival.going(contact=contact), rests, blows, waits)
 
 
 def _held(
@@ -100,16 +100,15 @@ def _held(
     for ends in rests.values():
         any_rests = any_rests | ends
     s, state, time = select(any_rests, (later, still, passed), (s, state, time))
-    events, count, loss = arrival.events, arrival.rests, arrival.loss
+    _, _, loss, count, _, events = arrival.tally
     for k, ends in rests.items():
         here, blow, clock = taken & ends, blows[k], clock_at(plan, s, state)
         events = noted(events, here, clock, RESTS, blow.struck - 1.0, blow.approach)
         count = None if count is None else count + jnp.where(here, 1.0, 0.0)
     if loss is not None:
         loss = loss + jnp.where(taken & any_rests, lost, 0.0)
-    return arrival._replace(
-        s=s, state=state, time=time, contact=contact, events=events, rests=count, loss=loss
-    )
+    arrival = arrival._replace(s=s, state=state, time=time).going(contact=contact)
+    return arrival.counting(events=events, rests=count, loss=loss)
 
 
 def _beyond_any(plan: Plan, state: Any) -> Flag:

@@ -9,7 +9,7 @@ from jax.lax import stop_gradient
 
 from ..._types import Flag, Scalar
 from ...machine.event import section_number, struck_modes
-from .._arrival import Arrival
+from .._arrival import Arrival, Onward, Tally
 from .._contact.impact import is_compound, strike
 from .._contact.rest import Release
 from .._contact.settle import Approach, settle, stilled
@@ -43,11 +43,10 @@ def arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Fla
         direction.append(along)
     here = plan.machine.position(trial.state)
     arrival = Arrival(
-        trial.s, trial.state, here, here if plan.machine.events else None, trial.time,
-        tuple(direction),
-        lane.contact, lane.modes,
-        old.impacts, old.speed, old.loss, old.rests, old.log, old.events, trial.ends_interval,
-        lane.fault if may_end(plan.machine) else None,
+        trial.s, trial.state, trial.time, here, here if plan.machine.events else None,
+        Onward(tuple(direction), lane.contact, lane.modes),
+        Tally(old.impacts, old.speed, old.loss, old.rests, old.log, old.events),
+        trial.ends_interval, lane.fault if may_end(plan.machine) else None,
     )  # fmt: skip
     way = FlowToEvent(plan, trial.smooth, lane.part, (trial.s, trial.state, trial.time))
     if trial.crossings:
@@ -73,8 +72,7 @@ def arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Fla
         below=_below(plan, lane, trial, taken),
         fault=lane.fault if arrival.fault is None else jnp.where(taken, arrival.fault, lane.fault),
         record=Record(
-            time, y_max, y_min, arrival.impacts, arrival.speed, arrival.loss, arrival.rests,
-            arrival.log, clearance, arrival.events,
+            time=time, y_max=y_max, y_min=y_min, clearance=clearance, **arrival.tally._asdict()
         ),
     )  # fmt: skip
     return there, taken & arrival.completed
@@ -147,12 +145,13 @@ def _released(
     direction = jnp.where(free, -lane.direction[k], arrival.direction[k])
     clock = clock_at(plan, arrival.s + jnp.where(free, offset, 0.0), state)
     stop = arrival.contact[k] - to_event(0)
-    events = noted(arrival.events, taken & free, clock, LEAVES, stop, jnp.nan)
-    return arrival._replace(
-        events=events,
+    events = noted(arrival.tally.events, taken & free, clock, LEAVES, stop, jnp.nan)
+    arrival = arrival._replace(
         s=arrival.s + jnp.where(free, offset, 0.0),
         state=select(free, state, arrival.state),
         time=select(free, time, arrival.time),
+    )
+    return arrival.counting(events=events).going(
         direction=_put(arrival.direction, k, direction),
         contact=_put(arrival.contact, k, jnp.where(free, 0.0, arrival.contact[k])),
     )
@@ -225,7 +224,7 @@ def _impact(
         for number, here in landed.items():
             given = machine, arrival.s, there, arrival.state, modes
             modes = select(here, machine.stops[number].modes_after(*given), modes)
-    return arrival._replace(direction=tuple(direction), modes=modes)
+    return arrival.going(direction=tuple(direction), modes=modes)
 
 
 def _reached(

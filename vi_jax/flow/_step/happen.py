@@ -26,7 +26,7 @@ def happened(plan: Plan, taken: Flag, arrival: Arrival, c: Crossing, there: Any)
     happens = c.landed if when is None else c.landed & when
     new, modes = after_event(*met, arrival.contact or ())
     modes = select(happens, modes, arrival.modes)
-    log, clock = arrival.log, clock_at(plan, arrival.s, there)
+    clock = clock_at(plan, arrival.s, there)
     if event.holds_mode:
         slides = comes_back(machine, c.number, modes, arrival.s, new)
         arrival = ended(arrival, c.landed, slides, results.SLIDING)
@@ -35,20 +35,19 @@ def happened(plan: Plan, taken: Flag, arrival: Arrival, c: Crossing, there: Any)
     else:
         kind, number = RESETS, c.number - len(machine.stops) - len(machine.switches)
         value = value_of(*met)
-    events = noted(arrival.events, taken & happens, clock, kind, number, value)
+    events = noted(arrival.tally.events, taken & happens, clock, kind, number, value)
+    arrival = arrival.counting(events=events)
     if plan.log_switches:
         zero = jnp.zeros_like(arrival.s)
-        log = logged(log, taken & happens, arrival.impacts, clock, zero, c.number)
+        before, count = arrival.tally, jnp.where(taken & happens, 1.0, 0.0)
         # Listed as an impact is, and so counted.
-        count = jnp.where(taken & happens, 1.0, 0.0)
-        arrival = arrival._replace(impacts=arrival.impacts + count)
+        log = logged(before.log, taken & happens, before.impacts, clock, zero, c.number)
+        arrival = arrival.counting(log=log, impacts=before.impacts + count)
     if not event.holds_mode:
         arrival = _jumped(plan, arrival, c, happens, there, new)
-    before = there, arrival.modes
-    arrival = arrival._replace(
-        state=select(happens, new, arrival.state), modes=modes, log=log, events=events
-    )
-    return _let_go(plan, arrival, taken, happens, before)
+    modes_before = arrival.modes
+    arrival = arrival._replace(state=select(happens, new, arrival.state)).going(modes=modes)
+    return _let_go(plan, arrival, taken, happens, (there, modes_before))
 
 
 def _let_go(
@@ -60,7 +59,7 @@ def _let_go(
     if contact is None or not modes:
         return arrival
     old, modes_before = before
-    freed, direction, events = list(contact), list(arrival.direction), arrival.events
+    freed, direction, events = list(contact), list(arrival.direction), arrival.tally.events
     for k in sorted({stop.coordinate for stop in machine.stops}):
 
         def pressing(modes: tuple[Scalar, ...], state: Any, k: int = k) -> Scalar:
@@ -74,7 +73,8 @@ def _let_go(
         events = noted(events, taken & goes, clock, LEAVES, contact[k] - to_event(0), jnp.nan)
         freed[k] = jnp.where(goes, 0.0, contact[k])
         direction[k] = jnp.where(goes, -sign, direction[k])
-    return arrival._replace(contact=tuple(freed), direction=tuple(direction), events=events)
+    arrival = arrival.going(contact=tuple(freed), direction=tuple(direction))
+    return arrival.counting(events=events)
 
 
 def _jumped(
@@ -88,8 +88,7 @@ def _jumped(
         beyond = beyond | (stop.beyond(place) > rounding(plan.machine, new))
     if plan.machine.stops:
         arrival = ended(arrival, c.landed, happens & beyond, results.BAD_RESET)
-    onward = arrival.direction, arrival.contact, arrival.modes
-    direction, contact = after_jump(plan, onward, happens, there, new, arrival.s)
+    direction, contact = after_jump(plan, arrival.onward, happens, there, new, arrival.s)
     assert arrival.before is not None  # as the machine has such events
     before = jnp.where(c.landed, plan.machine.position(there), arrival.before)
-    return arrival._replace(direction=direction, contact=contact, before=before)
+    return arrival._replace(before=before).going(direction=direction, contact=contact)

@@ -21,6 +21,7 @@ from jax.lax import stop_gradient
 
 from ..._types import Flag, Scalar
 from ...lanes import pin_flag
+from .._arrival import Onward
 from .._lane import FREE, Lane, Plan, Record, select
 from ..smooth import holding
 from .aim import aim_ahead, aim_at
@@ -97,9 +98,9 @@ def _onward(plan: Plan, there: Lane, completed: Flag, done: Scalar) -> Lane:
         state = select(turned, plan.machine.rewound(state), state)
     renewed = plan.machine.renewed(state)
     if renewed is not state:
-        onward = there.direction, there.contact, there.modes
-        onward = after_jump(plan, onward, turned, state, renewed, jnp.zeros_like(s))
-        there = dataclasses.replace(there, direction=onward[0], contact=onward[1])
+        onward = Onward(there.direction, there.contact, there.modes)
+        direction, contact = after_jump(plan, onward, turned, state, renewed, jnp.zeros_like(s))
+        there = dataclasses.replace(there, direction=direction, contact=contact)
         state = select(turned, renewed, state)
     record = select(completed, plan.fresh(state), there.record)
     return dataclasses.replace(there, s=s, state=state, part=part, record=record)

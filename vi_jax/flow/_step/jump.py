@@ -6,18 +6,19 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 
 from ..._types import Flag, Scalar
+from .._arrival import Onward
 from .._lane import Plan
 from ..events import rates
 from ..smooth import holding, rounding
 
 
 def after_jump(
-    plan: Plan, onward: tuple, when: Flag, old: Any, new: Any, s: Scalar
+    plan: Plan, onward: Onward, when: Flag, old: Any, new: Any, s: Scalar
 ) -> tuple[tuple[Scalar, ...], tuple[Scalar, ...] | None]:
     """Which way the motion goes on, where a state was put in place of another, and what of it still
     rests: only what was not moved.
 
-    **Arguments:** direction, contact (both are returned) and modes as in `Lane`; where the state is
+    **Arguments:** how the motion went on (direction and contact are returned); where the state is
     another one; the states before and after, and s.
     """
     direction, contact, modes = onward
