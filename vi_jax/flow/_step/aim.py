@@ -86,7 +86,10 @@ def aim_at(plan: Plan, lane: Lane, trial: Trial, foreseen: bool) -> tuple[Flag, 
     **Arguments:** whether the motion was known before the step (see `aim_ahead`); static.
     """
     # What is found out here is only where to look.
-    trial = trial._replace(h=stop_gradient(trial.h), paths=stop_gradient(trial.paths))
+    trial = trial._replace(
+        h=stop_gradient(trial.h),
+        seen=trial.seen._replace(paths=stop_gradient(trial.paths)),
+    )
     nothing = jnp.zeros_like(trial.good), trial.h, jnp.full_like(trial.h, FREE)
     if not trial.paths and not trial.crossings:
         return nothing

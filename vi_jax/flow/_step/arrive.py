@@ -43,12 +43,12 @@ def arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Fla
         direction.append(along)
     here = plan.machine.position(trial.state)
     arrival = Arrival(
-        trial.s, trial.state, trial.time, here, here if plan.machine.events else None,
+        trial.s, trial.state, trial.end.time, here, here if plan.machine.events else None,
         Onward(tuple(direction), lane.contact, lane.modes),
         Tally(old.impacts, old.speed, old.loss, old.rests, old.log, old.events),
         trial.ends_interval, lane.fault if may_end(plan.machine) else None,
     )  # fmt: skip
-    way = FlowToEvent(plan, trial.smooth, lane.part, (trial.s, trial.state, trial.time))
+    way = FlowToEvent(plan, trial.smooth, lane.part, (trial.s, trial.state, trial.end.time))
     if trial.crossings:
         met = jnp.zeros_like(taken)
         for c in trial.crossings:
@@ -161,7 +161,7 @@ def _below(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Scalar, .
     """As in `Lane`: after a jump each guard is to come from below again."""
     found = []
     numbers = plan.from_below(lane.state)
-    for number, old, new in zip(numbers, lane.below, trial.below, strict=True):
+    for number, old, new in zip(numbers, lane.below, trial.seen.below, strict=True):
         for c in trial.crossings:
             jumps = plan.machine.events and not c.event.holds_mode
             if c.number == number or jumps:

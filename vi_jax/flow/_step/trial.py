@@ -20,27 +20,6 @@ from .guards import Crossing, crossings, leniency, turn_tolerance
 _SLIVER = 1e-3
 
 
-class Trial(NamedTuple):
-    """A step that was tried, and what it met."""
-
-    s: Scalar
-    h: Scalar
-    state: Any
-    time: Beside | None
-    error: Scalar
-    good: Flag
-    ends_interval: Flag
-    crossings: tuple[Crossing, ...]
-    paths: tuple["Path", ...]
-    """Of each coordinate; none where nothing asks for it."""
-    alone: tuple[SmoothMachine, ...]
-    """Of each coordinate, the machine in its modes with the other bodies held that rest."""
-    smooth: SmoothMachine
-    """The machine as the step saw it: its bodies held where they rest."""
-    below: tuple[Scalar, ...]
-    """As in `Lane`, at the step's end."""
-
-
 class Path(NamedTuple):
     """What a step saw of a coordinate."""
 
@@ -53,6 +32,65 @@ class Path(NamedTuple):
     surge: tuple[Scalar, Scalar, Scalar] | None
     """How fast the force changes at both ends, and the shortest step that is cut at a turn of the
     force; absent where the body cannot rest."""
+
+
+class End(NamedTuple):
+    """Where a step ends."""
+
+    s: Scalar
+    state: Any
+    time: Beside | None
+    """Elapsed time and integrals, where they are recorded."""
+
+
+class Seen(NamedTuple):
+    """What a step came by."""
+
+    crossings: tuple[Crossing, ...]
+    """The machine's events."""
+    paths: tuple[Path, ...]
+    """Of each coordinate; none where nothing asks for it."""
+    below: tuple[Scalar, ...]
+    """As in `Lane`, at the step's end."""
+
+
+class Trial(NamedTuple):
+    """A step that was tried."""
+
+    h: Scalar
+    """Its length."""
+    end: End
+    error: Scalar
+    """Relative to the tolerance, as the method says."""
+    good: Flag
+    """Its end is a number, and its error small enough."""
+    ends_interval: Flag
+    """Its end is that of an interval of `s`."""
+    seen: Seen
+    smooth: SmoothMachine
+    """The machine as the step saw it: its bodies held where they rest."""
+    alone: tuple[SmoothMachine, ...]
+    """Of each coordinate, the machine in its modes with the other bodies held that rest."""
+
+    @property
+    def s(self) -> Scalar:
+        """At its end."""
+        return self.end.s
+
+    @property
+    def state(self) -> Any:
+        """At its end."""
+        return self.end.state
+
+    @property
+    def crossings(self) -> tuple[Crossing, ...]:
+        """The events that it came by."""
+        return self.seen.crossings
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """Of each coordinate."""
+        return self.seen.paths
 
 
 def timing(plan: Plan, lane: Lane) -> Beside | None:
@@ -108,7 +146,8 @@ def attempt(
         for k, one in enumerate(alone):
             paths.append(_path(plan, lane, k, one, smooth, (s1, new, h, limit), good))
     seen, below = crossings(plan, lane, smooth, paths, (s1, h, new), (good, last))
-    return Trial(s1, h, new, time, error, good, last, seen, tuple(paths), alone, smooth, below)
+    end, found = End(s1, new, time), Seen(seen, tuple(paths), below)
+    return Trial(h, end, error, good, last, found, smooth, alone)
 
 
 def _path(
