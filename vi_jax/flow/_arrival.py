@@ -47,7 +47,7 @@ class Arrival(NamedTuple):
 
     @property
     def direction(self) -> tuple[Scalar, ...]:
-        """As in `Lane`."""
+        """Of each coordinate, the way that it goes on: the sign of its velocity."""
         return self.onward.direction
 
     @property
@@ -57,7 +57,7 @@ class Arrival(NamedTuple):
 
     @property
     def modes(self) -> tuple[Scalar, ...]:
-        """As in `Lane`."""
+        """The modes of the machine behind what was met, as in `Lane`."""
         return self.onward.modes
 
     def going(self, **onward: Any) -> "Arrival":

@@ -36,7 +36,7 @@ class FlowToEvent:
         return self._fixed, tuple(self._around)
 
     def guard(self, number: int) -> Callable:
-        """Of one of the machine's events."""
+        """The guard of the machine's event of this number, as a function of where the motion is."""
 
         def event(moving, fixed, rest):
             (smooth, bound), (s, state, _) = self._whole(fixed, rest), moving
@@ -49,7 +49,7 @@ class FlowToEvent:
         return self._pure(event)
 
     def place(self, k: int) -> Callable:
-        """Of coordinate number k."""
+        """The position of coordinate number k, as a function of where the motion is."""
 
         def coordinate(moving, fixed, rest):
             smooth, _ = self._whole(fixed, rest)

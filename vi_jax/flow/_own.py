@@ -137,7 +137,7 @@ def check_period(machine: AbstractMachine, start: Any) -> None:
             return
         cycle, *ends = by_numpy(_ends, machine, start)
         each = list(zip(jtu.tree_leaves_with_path(start), *ends, strict=True))
-    except Exception:  # told in words where the field is traced
+    except Exception:  # said in words where the field is traced
         return
     for (path, _), first, last in each:
         apart = np.max(abs(first - last) / (1e-3 + abs(first) + abs(last)))

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-# Of a batch no more than so many are told one by one.
-_TOLD = 8
+# Of a batch no more than so many are listed one by one.
+_LISTED = 8
 
 
 def _near(name: str, names: Any) -> str:
@@ -36,14 +36,14 @@ else:
                 return f"{kind.__name__}<traced>"
             if not isinstance(place, jnp.ndarray | np.ndarray):
                 return f"{kind.__name__}<unknown>"
-            told = names[np.asarray(place)]
-            if not told.ndim:
-                return f"{kind.__name__}.{told}"
-            if told.size <= _TOLD:
-                return f"{kind.__name__}{told.tolist()}".replace("'", "")
-            kinds, counts = np.unique(told, return_counts=True)
+            found = names[np.asarray(place)]
+            if not found.ndim:
+                return f"{kind.__name__}.{found}"
+            if found.size <= _LISTED:
+                return f"{kind.__name__}{found.tolist()}".replace("'", "")
+            kinds, counts = np.unique(found, return_counts=True)
             parts = (f"{count:,} {name}" for name, count in zip(kinds, counts, strict=True))
-            return f"{kind.__name__}[{', '.join(parts)}; shape {told.shape}]"
+            return f"{kind.__name__}[{', '.join(parts)}; shape {found.shape}]"
 
     class _Kind(type(eqx.Enumeration)):
         """What makes the class, with members of that kind."""

@@ -41,12 +41,12 @@ def states(prefix: str, state: Any, dims: tuple[str, ...]) -> Variables:
 
 
 def present(values: Mapping[str, Any], dims: tuple[str, ...]) -> Variables:
-    """Those that are there."""
+    """The entries that are not `None`."""
     return {name: (dims, np.asarray(x)) for name, x in values.items() if x is not None}
 
 
 def tidy(data: Any, along: str | None) -> Any:
-    """Of a data set what is told along one of its dimensions, so that it makes a table with one
+    """Of a data set what lies along one of its dimensions, so that it makes a table with one
     row for each of its places; all of it by default.
 
     **Raises:** `ValueError` if there is no such dimension.

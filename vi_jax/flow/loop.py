@@ -20,7 +20,7 @@ def _active(plan: Plan, lane: Lane) -> Bool[Array, ""]:
 
 
 class Ends(NamedTuple):
-    """How a lane ended."""
+    """What is kept of a lane when it has ended."""
 
     done: Any
     fault: Any

@@ -266,7 +266,7 @@ class Run(Summarized):
     def last(self) -> Any:
         """The state on the last section: a start to go on from, or a guess for `find_orbit`."""
         # Batch axes are in front, those of an array in the state behind; how many there are in
-        # front is told by a number for each lane.
+        # front is shown by a number for each lane.
         place = (*[slice(None)] * self.steps.ndim, -1)
         return jtu.tree_map(lambda x: x[place], self.sections)
 
@@ -291,7 +291,7 @@ class Run(Summarized):
         a sample and an impact. `to_xarray(along="cycle").to_dataframe()` has one for each cycle.
 
         **Arguments:** names of the batch axes of a run under `vmap`, by default `lane`; `along`, to
-        keep only what is told along one dimension: `"cycle"`, `"section"`, `"sample"`, `"impact"`
+        keep only what lies along one dimension: `"cycle"`, `"section"`, `"sample"`, `"impact"`
         or `"event"` (then a row for each that was met), or a batch axis.
 
         **Raises:** `ValueError` if these are not as many as there are batch axes, or there is no

@@ -39,7 +39,7 @@ class SmoothMachine(eqx.Module):
         return flow
 
     def pace(self, s: Scalar, state: Any) -> Scalar | None:
-        """d(time)/ds, as the machine's."""
+        """d(time)/ds of the machine, `None` where `s` measures time."""
         return self.machine.pace(s, state)
 
     def averages(self, s: Scalar, state: Any) -> dict[str, Any]:

@@ -42,7 +42,7 @@ class Tried(NamedTuple):
 
 
 class Suggestion(NamedTuple):
-    """What `suggest_method` found."""
+    """The method that `suggest_method` found, and what it measured of the others."""
 
     method: AbstractMethod
     """The fastest that keeps to the error, or the most accurate if none does."""
@@ -194,7 +194,7 @@ def _series(bench: "_Bench", error: float) -> list[Tried]:
 
 
 class _Bench:
-    """The calibration run."""
+    """The run that methods are compared on: some lanes, their truth and their start."""
 
     truth: np.ndarray
 

@@ -242,7 +242,7 @@ class AbstractMachine(Shown):
         """The units of its quantities by their names: `position`, `velocity`, `time`, `rate` (of
         what grows in time, as exponents do), `energy`, `power`, and each number and component of a
         state by its own name. "1" is without unit; the name "" stands for all that is not named,
-        and what is not stated is told without. By default what the `labels` say in brackets."""
+        and what is not stated is shown without. By default what the `labels` say in brackets."""
         found = map(unit_in, self.labels)
         return {x: unit for x, unit in zip(("position", "velocity"), found, strict=True) if unit}
 
@@ -261,7 +261,7 @@ class AbstractMachine(Shown):
 
     def renewed(self, state: State) -> State:
         """`state` as the next cycle begins, where something is counted by the cycle: a drift, say,
-        is told as the progress in the last cycle and begins again from zero."""
+        is given as the progress in the last cycle and begins again from zero."""
         return state
 
     def pace(self, s: Float[Array, ""], state: State) -> Float[Array, ""] | None:

@@ -37,13 +37,13 @@ class ContactFriction(AbstractSwitch):
     """
 
     level: Float[Array, "..."] = eqx.field(converter=real("level"))
-    """μ (dimensionless)."""
+    """μ, Coulomb's coefficient of friction (dimensionless)."""
     stop: int = eqx.field(static=True, kw_only=True)
     along: int = eqx.field(static=True, kw_only=True)
     restitution: Float[Array, "..."] = eqx.field(
         kw_only=True, default=0.0, converter=real("restitution")
     )
-    """Tangential (dimensionless)."""
+    """Coefficient of restitution along the stop (dimensionless)."""
     ranges: ClassVar = {"level": NOT_NEGATIVE, "restitution": SHARE}
 
     def __check_init__(self):
@@ -53,7 +53,7 @@ class ContactFriction(AbstractSwitch):
 
     @property
     def rubs_on(self) -> int:
-        """Its stop."""
+        """The number of the stop that it is friction on."""
         return self.stop
 
     @property

@@ -79,7 +79,7 @@ def added(state: Any, amounts: Sequence[Scalar], changes: Sequence[Any]) -> Any:
 
 
 class Rubbed(NamedTuple):
-    """An impact with friction."""
+    """The state behind an impact with friction, and the impulses of it."""
 
     state: Any
     pushed: Scalar

@@ -64,7 +64,7 @@ class SliderCrank(AbstractCrank):
 
     @property
     def drawn_rod(self):
-        """1/λ."""
+        """Length of the rod in radii of the crank, 1/λ, for drawings."""
         return 1 / self.ratio
 
     def slide(self, phase: Float[Array, "..."]) -> Slide:

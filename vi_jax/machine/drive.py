@@ -27,7 +27,7 @@ class AbstractDrive(Shown):
 
     A drive of one's own is a subclass that says how body and shaft move (`field`) and of which
     class its states are. Their components are `Y` and `V` of the body, then the drive's own: the
-    speed of the crank `W` is one of them, unless it is told by `fixed_speed`.
+    speed of the crank `W` is one of them, unless `fixed_speed` gives it.
     """
 
     state: ClassVar[type]
@@ -120,7 +120,7 @@ class IdealDrive(AbstractDrive):
 
     @property
     def fixed_speed(self):
-        """ζ."""
+        """ζ, the frequency ratio: an ideal drive turns at it whatever happens."""
         return self.frequency_ratio
 
     def field(self, scene, s, state, pushes):

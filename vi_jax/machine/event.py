@@ -125,7 +125,7 @@ class AbstractSwitch(AbstractEvent):
 
     @property
     def holds_mode(self) -> bool:
-        """True."""
+        """True: each switch has a mode of its own."""
         return True
 
     @property
@@ -153,11 +153,11 @@ class AbstractSwitch(AbstractEvent):
 
     @abc.abstractmethod
     def after(self, machine: Any, s: Scalar, state: Any, mode: Scalar) -> tuple[Any, Scalar]:
-        """State and mode after the event. The state may be put right by what is below rounding
+        """State and mode after the event. The state may be corrected by what is below rounding
         (a velocity set to zero where it vanishes), and must not jump."""
 
     def jump(self, machine, s, state, mode):
-        """None."""
+        """The state as it is: a switch changes a mode, not the state."""
         return state
 
     @property

@@ -62,7 +62,7 @@ class PowerLaw(AbstractContactLaw):
     """
 
     def force(self, stiffness, damping, depth, rate):
-        """Of spring and dashpot."""
+        """k δ^p of the spring and the damping of the dashpot, per unit of mass."""
         p = self.exponent
         resist = damping * jnp.sqrt(stiffness) * power(depth, 0.5 * (p - 1)) * rate
         return stiffness * power(depth, p) + resist

@@ -52,7 +52,7 @@ class Reset(AbstractEvent):
         self.ends_cycle, self.name = bool(ends_cycle), str(name)
 
     def guard(self, machine, s, state, *modes):
-        """As given."""
+        """The function `guard` of this state."""
         return self._guard(machine, s, state, *modes)
 
     def after(self, machine, s, state, *modes):
@@ -62,15 +62,15 @@ class Reset(AbstractEvent):
         return new, struck_modes(machine, s, new, modes, own)
 
     def jump(self, machine, s, state, *modes):
-        """As `reset` says."""
+        """The state that the function `reset` makes of this one."""
         return self._reset(machine, s, state, *modes)
 
     def happens(self, machine, s, state, *modes):
-        """As `when` says."""
+        """What the function `when` says of this state, `None` without one."""
         return None if self._when is None else self._when(machine, s, state, *modes)
 
     def value(self, machine, s, state, *modes):
-        """As given, or none."""
+        """The function `value` of this state, NaN without one."""
         if self._value is None:
             return super().value(machine, s, state, *modes)
         return self._value(machine, s, state, *modes)

@@ -103,7 +103,7 @@ class Scene(ShaftMachine):
 
     @property
     def damping_ratio(self) -> Float[Array, "..."]:
-        """ξ (dimensionless)."""
+        """ξ, the damping ratio of the body on its spring (dimensionless)."""
         return self.oscillator.damping_ratio
 
     @property
@@ -122,12 +122,12 @@ class Scene(ShaftMachine):
         return f"{2 * cycles}π"
 
     def place_of(self, since_section: float, cycles: int) -> str:
-        """In crank angle."""
+        """A reading of the clock in words, as a crank angle."""
         return f"crank angle φ = {float(self.phase_at(since_section)):.6g} of {2 * cycles}π"
 
     @property
     def labels(self) -> tuple[str, str]:
-        """In the paper's units."""
+        """Position and velocity in the paper's units, the crank radius a and the frequency ω."""
         return "Y = y/a", "V = dY/dτ"
 
     @property
@@ -165,13 +165,13 @@ class Scene(ShaftMachine):
 
     @property
     def timed_states(self) -> dict[type, type]:
-        """The drive's."""
+        """By the drive's state class, what its states are by time."""
         timed = self.drive.timed_state
         return {} if timed is None else {self.drive.state: timed}
 
     @property
     def switches(self) -> tuple[SoftStop, ...]:
-        """The compliant stops."""
+        """The compliant stops, each with contact as its mode."""
         return self.soft_stops
 
     def field(self, s: Float[Array, ""], state: Any, *modes: Float[Array, ""]) -> Any:

@@ -14,7 +14,7 @@ from jax.core import Tracer
 from .numbers import by_name
 from .units import NONE, unit_of, with_unit
 
-# Longer texts go over several lines; of longer arrays only the range is told.
+# Longer texts go over several lines; of longer arrays only the range is shown.
 _WIDTH, _LISTED = 88, 6
 
 
@@ -68,15 +68,15 @@ def in_words(x: Any, units: Mapping[str, str] = NONE, name: str = "", indent: in
     if eqx.is_array_like(x) and not isinstance(x, bool):
         return number_in_words(x, unit_of(units, name) if name else "")
     opened, parts, closed = _parts(x)
-    told = [
+    parts = [
         (f"{key}=" if key else "") + in_words(part, units, key or name, indent + 2)
         for key, part in parts
     ]
-    text = opened + ", ".join(told) + closed
+    text = opened + ", ".join(parts) + closed
     if "\n" not in text and indent + len(text) <= _WIDTH:
         return text
     margin, end = "\n" + " " * (indent + 2), "\n" + " " * indent
-    return opened + "".join(f"{margin}{part}," for part in told) + end + closed.lstrip(",")
+    return opened + "".join(f"{margin}{part}," for part in parts) + end + closed.lstrip(",")
 
 
 def _parts(x: Any) -> tuple[str, list[tuple[str, Any]], str]:

@@ -28,7 +28,7 @@ class Wall(Shown):
 
     @property
     def place(self) -> Float[Array, "..."]:
-        """Position of the stop."""
+        """Position of the stop, sign·gap (unit: that of the gap)."""
         return self.sign * self.gap
 
     def beyond(self, Y: Any) -> Any:
@@ -36,7 +36,7 @@ class Wall(Shown):
         return self.sign * Y - self.gap
 
     def approach(self, V: Any) -> Any:
-        """Speed towards the stop."""
+        """Speed towards the stop, sign·V; negative for a body that moves away."""
         return self.sign * V
 
     def mirrors(self, other: "Wall") -> bool:

@@ -36,7 +36,7 @@ class Switch(AbstractSwitch):
 
     @property
     def blends(self) -> bool:
-        """Where it slides."""
+        """Whether it slides: then mode 0 is the motion along its surface."""
         return self.slides
 
     @property

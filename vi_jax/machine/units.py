@@ -33,12 +33,12 @@ def attributes(unit: str) -> dict[str, str]:
 
 
 def in_unit(text: str, units: Mapping[str, str], name: str) -> str:
-    """A number of this name with its unit, if there is one to be told."""
+    """A number of this name with its unit, if it has one."""
     return with_unit(text, unit_of(units, name))
 
 
 def with_unit(text: str, unit: str) -> str:
-    """A number with its unit, if there is one to be told."""
+    """A number with its unit, if it has one."""
     return text if unit in ("", "1") else f"{text} {unit}"
 
 
@@ -73,7 +73,7 @@ def with_units(data: Any, units: Mapping[str, str], named: Mapping[str, str] = N
 
 
 def in_brackets(words: str, unit: str) -> str:
-    """The name of an axis with its unit, if there is one to be told."""
+    """The name of an axis with its unit, if it has one."""
     return words if unit in ("", "1") else f"{words} ({unit})"
 
 

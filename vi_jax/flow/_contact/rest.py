@@ -16,7 +16,7 @@ from ..events import Rates
 
 
 class _Precision(NamedTuple):
-    """What a precision allows."""
+    """Thresholds of coming to rest and of release, for one floating-point type."""
 
     # A release is approached by steps taken from the pressed side, each this share short of where
     # the last one says that it is, until one is so short that the force is straight over it; it is

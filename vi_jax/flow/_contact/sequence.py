@@ -64,7 +64,7 @@ class _Instant(NamedTuple):
     limited: list[int]
     """The numbers of the coordinates that stops limit."""
     bodies: list[Coordinate]
-    """Those coordinates."""
+    """The coordinates of these numbers."""
     before: list[Scalar]
     """Their velocities before."""
     gains: list[list[Scalar]]

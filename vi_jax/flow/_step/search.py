@@ -27,8 +27,8 @@ _MARGIN = 0.02
 # By so much a bound is wider, for what rounding makes of it.
 _WIDER = 1.001
 
-# A turn whose velocity is told no better than to this share of that at the step's ends.
-_UNTOLD = 1e-3
+# A turn whose velocity is known no better than to this share of that at the step's ends.
+_UNCERTAIN = 1e-3
 
 
 class First(NamedTuple):
@@ -70,12 +70,12 @@ def first_event(
     behind, everything = crossed | met, plan.meets_turns(lane.done)
     paths = [curve() for _, curve in courses]
 
-    def that_matter(k: int, turned: Flag, theta: Scalar, told: Flag | None) -> Flag:
+    def that_matter(k: int, turned: Flag, theta: Scalar, known: Flag | None) -> Flag:
         if everything is True:
             return turned
         height = horner(paths[k], theta)
         close = _has_to_be_met(plan, lane, k, lambda stop: stop.beyond(height), _MARGIN)
-        return turned & (behind | close if told is None else behind | ~told | close)
+        return turned & (behind | close if known is None else behind | ~known | close)
 
     for k, (turned, _) in enumerate(courses):
         facing = tuple(-lane.direction[k] * c for c in slope(paths[k]))
@@ -83,14 +83,14 @@ def first_event(
         # first: what lies beyond the turn is met from there.
         turned, place = turned & ~_through_a_stop(plan, lane, guards, k), -1.0
         if len(courses) > 1:  # of their turns that matter the earliest comes first
-            theta, told = _root(facing, corrections)
-            turned, place = that_matter(k, turned, theta, told), theta - 2
+            theta, known = _root(facing, corrections)
+            turned, place = that_matter(k, turned, theta, known), theta - 2
         found.append((jnp.where(turned, place, jnp.inf), to_turn_of(k), facing, None))
         any_turn = any_turn | turned
     target, curve, at_once = _earliest(lane, found)
-    theta, told = _root(curve, corrections)
+    theta, known = _root(curve, corrections)
     if len(courses) == 1:  # one root serves for the turn as well
-        any_turn = that_matter(0, any_turn, theta, told)
+        any_turn = that_matter(0, any_turn, theta, known)
     if at_once is not None:
         theta = jnp.where(at_once, 0.0, theta)
     return First(crossed, any_turn, theta, target)
@@ -126,8 +126,8 @@ def _through_a_stop(plan: Plan, lane: Lane, guards: list[Passed], k: int) -> Fla
 
 
 def _root(curve: Curve, corrections: int) -> tuple[Scalar, Flag | None]:
-    """Where a curve first rises through zero, and, where the root was corrected, whether it is told
-    well enough: by what was left before the last correction, beside the curve at its ends."""
+    """Where a curve first rises through zero; and, where the root was corrected, whether it is
+    known well enough: by what was left before the last correction, beside the curve at its ends."""
     # The low orders lead near the root; what is left is a correction.
     theta, value = rising_root(stop_gradient(curve[:7])), jnp.zeros_like(curve[0])
     if not corrections:
@@ -138,7 +138,7 @@ def _root(curve: Curve, corrections: int) -> tuple[Scalar, Flag | None]:
         better = theta - value / jnp.where(rate > 0, rate, 1.0)
         theta = jnp.where((rate > 0) & (better > 0) & (better <= 1), better, theta)
     ends = jnp.maximum(jnp.abs(curve[0]), jnp.abs(sum(curve[1:], curve[0])))
-    return theta, jnp.abs(value) <= _UNTOLD * ends
+    return theta, jnp.abs(value) <= _UNCERTAIN * ends
 
 
 def may_matter(plan: Plan, lane: Lane, k: int, begin: Rates, end: Rates, h: Scalar) -> Flag:

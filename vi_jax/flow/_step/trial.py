@@ -35,7 +35,7 @@ class Path(NamedTuple):
 
 
 class End(NamedTuple):
-    """Where a step ends."""
+    """Independent variable, state and elapsed time where a step ends."""
 
     s: Scalar
     state: Any
@@ -58,7 +58,7 @@ class Trial(NamedTuple):
     """A step that was tried."""
 
     h: Scalar
-    """Its length."""
+    """The step's length in `s`."""
     end: End
     error: Scalar
     """Relative to the tolerance, as the method says."""
@@ -74,12 +74,12 @@ class Trial(NamedTuple):
 
     @property
     def s(self) -> Scalar:
-        """At its end."""
+        """The independent variable where the step ends."""
         return self.end.s
 
     @property
     def state(self) -> Any:
-        """At its end."""
+        """The state where the step ends."""
         return self.end.state
 
     @property
@@ -89,7 +89,7 @@ class Trial(NamedTuple):
 
     @property
     def paths(self) -> tuple[Path, ...]:
-        """Of each coordinate."""
+        """Of each coordinate, what the step saw of it."""
         return self.seen.paths
 
 

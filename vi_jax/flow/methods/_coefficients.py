@@ -18,26 +18,26 @@ def nth(series: Series, n: int) -> Coefficient:
 
 
 def plus(a: Coefficient, b: Coefficient) -> Coefficient:
-    """a + b."""
+    """The sum a + b of two power series."""
     if a is None or b is None:
         return b if a is None else a
     return a + b
 
 
 def minus(a: Coefficient, b: Coefficient) -> Coefficient:
-    """a - b."""
+    """The difference a - b of two power series."""
     if b is None:
         return a
     return -b if a is None else a - b
 
 
 def times(a: Coefficient, b: Coefficient) -> Coefficient:
-    """a b."""
+    """The product a b of two power series, as far as both are known."""
     return None if a is None or b is None else a * b
 
 
 def scaled(c: float, a: Coefficient) -> Coefficient:
-    """c a."""
+    """The power series a times a number c."""
     return None if a is None else a if c == 1 else a * c
 
 

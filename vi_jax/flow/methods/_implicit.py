@@ -85,7 +85,7 @@ def weighted(weights: np.ndarray, stages: list, base: Any = None) -> Any:
 
 
 def dot(matrix: Float[Array, "n n"], vector: Vector) -> Vector:
-    """Their product."""
+    """The product of a small matrix and a vector, written out number by number."""
     return jnp.sum(matrix * vector, axis=1)
 
 

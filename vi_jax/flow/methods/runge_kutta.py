@@ -71,7 +71,7 @@ class Adaptive(AbstractMethod):
 
     @property
     def adaptive(self) -> bool:
-        """True."""
+        """True: steps are resized by their errors."""
         return True
 
     @property
@@ -157,5 +157,5 @@ class FixedStep(AbstractMethod):
         return new, beside, jnp.zeros_like(s0)
 
     def tighter(self):
-        """Twice the steps."""
+        """The same solver with twice as many steps a cycle."""
         return FixedStep(self.solver, 2 * self.steps_per_cycle)

@@ -91,5 +91,5 @@ class Verner9(diffrax.AbstractERK):
     interpolation_cls: ClassVar[Callable] = diffrax.ThirdOrderHermitePolynomialInterpolation.from_k
 
     def order(self, terms):
-        """Nine."""
+        """9, that of the solution that is carried on."""
         return 9
