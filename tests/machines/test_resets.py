@@ -269,7 +269,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_roads_agree(name):
+def test_backends_agree(name):
     make, cycles = CASES[name]
 
     @jax.vmap

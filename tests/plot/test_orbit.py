@@ -58,7 +58,7 @@ def test_branch_names_its_marks_and_begins_its_legend_solid(branch):
 
 
 def test_a_sweep_lies_above_branches_and_below_marks(branch):
-    sweep = vi.sweep(branch.orbit(0).scene, NAME, np.linspace(0.95, 1.0, 4), settle=10, cycles=8)
+    sweep = vi.sweep(branch.orbit(0).machine, NAME, np.linspace(0.95, 1.0, 4), settle=10, cycles=8)
     ax = vi.plot_sweep(sweep, ax=_axes())
     vi.plot_branch(branch, ax=ax)
     dots, *others = ax.lines
@@ -86,7 +86,7 @@ def test_given_axes_are_used(branch):
     ax = Figure().subplots()
     assert vi.plot_branch(branch, ax=ax, y="y_max", special=False) is ax
     assert vi.plot_multipliers(branch.orbit(0), ax=ax) is ax
-    sweep = vi.sweep(branch.orbit(0).scene, NAME, np.linspace(0.95, 1.0, 4), settle=10, cycles=8)
+    sweep = vi.sweep(branch.orbit(0).machine, NAME, np.linspace(0.95, 1.0, 4), settle=10, cycles=8)
     assert vi.plot_sweep(sweep, ax=ax) is ax
     assert len(ax.lines[-1].get_xdata()) == 4
 
