@@ -291,7 +291,7 @@ def test_backends_agree(name):
 
 
 class Thrown(vi.AbstractMachine):
-    """A body that is put beyond its stop."""
+    """A body that a reset moves beyond its stop."""
 
     stops: tuple = (vi.RigidStop(2.0, 0.5),)
 

@@ -162,7 +162,7 @@ def test_a_movie_is_written(run, tmp_path):
     assert (tmp_path / "motion.mp4").stat().st_size > 1000
 
 
-def test_what_cannot_be_written_is_told_before_any_drawing(run, tmp_path):
+def test_what_cannot_be_written_is_refused_before_any_drawing(run, tmp_path):
     shown = vi.animate(run, MACHINES["ideal"], seconds=0.4, fps=10)
     (tmp_path / "file").write_text("")
     with pytest.raises(ValueError, match=r"`filename` must be a file.*lies below a file"):

@@ -50,7 +50,7 @@ def test_branch_names_its_marks_and_begins_its_legend_solid(branch):
         assert handles["2π"].get_linestyle() == "-"
         assert handles["2π"].get_color() == color_of(1)
         assert [handles[word].get_linestyle() for word in named[1:3]] == ["-", "--"]
-        # Without a label the legend tells what the colour stands for, and nothing twice.
+        # Without a label the legend says what the colour stands for, and nothing twice.
         for _ in range(2):
             vi.plot_branch(branch, ax=ax)
             again = [t.get_text() for t in ax.get_legend().get_texts()]

@@ -73,7 +73,7 @@ class ReliefValve(AutonomousMachine):
         return pi / 2
 
     def field(self, s: Scalar, state: ValveState) -> ValveState:
-        """d(state)/dt between impacts."""
+        """d(state)/dt between impacts on the seat."""
         spring = state.lift + self.precompression
         force = state.pressure - self.damping * state.speed - spring
         leaves = state.lift * jnp.sqrt(state.pressure)

@@ -183,7 +183,7 @@ class Woodpecker(AutonomousMachine):
 
     @property
     def units(self) -> Mapping[str, str]:
-        """SI units."""
+        """SI units of its numbers and states."""
         own = dict.fromkeys(
             ("sleeve_arm", "bird_arm", "beak_arm", "sleeve_height", "beak_height", "sleeve_radius",
              "pole_radius", "play", "reach", "gap"),
