@@ -50,9 +50,9 @@ def energy(state: Any, *, coupling: float, slider_inertia: float) -> np.ndarray:
 
 def energy_drift(
     *, coupling: float, slider_inertia: float, printed_coupling: float | None = None,
-    printed_inertia: float = 0.0, cycles: int = 20,
+    printed_inertia: float = 0.0,
 ) -> float:  # fmt: skip
-    """Greatest |E/E(0) - 1| of a coasting run over some natural periods (k = 1, d = 2).
+    """Greatest |E/E(0) - 1| of a coasting run over 20 natural periods (k = 1, d = 2).
 
     **Arguments:** ε and μ of the machine, which make the energy; the coefficients that the drive
     equation is integrated with, if they are others.
@@ -66,7 +66,7 @@ def energy_drift(
     )
     start = TimedMotorState(*(jnp.asarray(x, float) for x in (0.0, 0.0, 0.9, 0.0)))
     run = simulate(
-        machine, start, cycles, method=Adaptive(rtol=1e-12), samples=16, throw=True,
+        machine, start, 20, method=Adaptive(rtol=1e-12), samples=16, throw=True,
         record="sections",
     )  # fmt: skip
     assert run.samples is not None
