@@ -8,7 +8,7 @@ import typing
 from . import _version
 from . import machines as machines
 from ._interrupted import Interrupted as Interrupted
-from ._renamed import NAMES as NEW_NAMES
+from ._renamed import NAMES as _NEW_NAMES
 from .flow import EVENTS as EVENTS
 from .flow import RESULTS as RESULTS
 from .flow import AbstractMethod as AbstractMethod
@@ -112,8 +112,8 @@ def __getattr__(name: str):
     if name == "plot" or name.startswith("plot_") or name in ("animate", "save_picture"):
         plot = importlib.import_module(".plot", __name__)
         return plot if name == "plot" else getattr(plot, name)
-    if name in NEW_NAMES:
-        raise AttributeError(f"`vi_jax.{name}` is called `vi_jax.{NEW_NAMES[name]}` now.")
+    if name in _NEW_NAMES:
+        raise AttributeError(f"`vi_jax.{name}` is called `vi_jax.{_NEW_NAMES[name]}` now.")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

@@ -68,7 +68,7 @@ PAGE = "127.0.0.1:8417"
 
 
 @pytest.mark.parametrize(
-    ("listening", "host", "origin", "told"),
+    ("listening", "host", "origin", "message"),
     [
         ("127.0.0.1", PAGE, None, None),
         ("127.0.0.1", "localhost:8417", "http://localhost:8417", None),
@@ -85,9 +85,9 @@ PAGE = "127.0.0.1:8417"
         ("127.0.0.1", "[::1", None, "for this machine only"),
     ],
 )
-def test_who_is_answered(listening, host, origin, told):
+def test_who_is_answered(listening, host, origin, message):
     reason = guard.refusal(listening, host, origin)
-    assert reason is None if told is None else told in str(reason)
+    assert reason is None if message is None else message in str(reason)
 
 
 @pytest.mark.parametrize("kind", ["http", "websocket"])
@@ -112,13 +112,13 @@ def test_a_guarded_app_is_asked_by_its_own_page_only(kind, origin):
         assert asked and answered[0]["headers"] == [(b"content-type", b"text/html")]
 
 
-def test_values_that_no_slider_has_are_told_in_a_sentence():
+def test_values_that_no_slider_has_are_refused_in_a_sentence():
     values = controls.beginning(controls.IDEAL)
     assert controls.fault(controls.IDEAL, values) is None
     assert controls.fault(controls.MOTOR, controls.beginning(controls.MOTOR)) is None
     for wrong in (1e9, -5.0, float("nan"), None, "0.9"):
-        told = controls.fault(controls.IDEAL, {**values, "settle": wrong})
-        assert told == f"The cycles before must be a number from 0 to 2000, but is {wrong!r}."
+        message = controls.fault(controls.IDEAL, {**values, "settle": wrong})
+        assert message == f"The cycles before must be a number from 0 to 2000, but is {wrong!r}."
     for control in controls.IDEAL.values():
         ends = (control.nearest(1e9), control.nearest(-1e9), control.nearest(float("nan")))
         assert all(control.holds(value) for value in ends)

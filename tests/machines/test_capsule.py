@@ -19,7 +19,7 @@ NAMES = ("amplitude", "frequency", "damping_ratio", "mass_ratio", "gap", "restit
 
 def flown(p, start, duration):
     """State (place, speed, capsule's speed and way) and impacts by SciPy's DOP853, the laws written
-    out again; `None` for a motion with impacts too weak to be told from rest."""
+    out again; `None` for a motion with impacts too weak to be distinguished from rest."""
     a, w, xi, gamma, gap, e, level, ratio = p
 
     def forces(t, x):
@@ -196,7 +196,7 @@ def test_how_far_it_goes():
 @pytest.mark.slow
 @each_mode
 def test_derivatives_of_a_capsule(mode):
-    """Through impacts, through sticking and through the change of what is told as progress."""
+    """Through impacts, sticking, and the section at which `progress` is counted anew."""
     numbers, starts = drawn(100)
     numbers, start = jnp.asarray(numbers[:, 3]), jnp.asarray(starts[:, 3])
     along = jnp.asarray(np.random.default_rng(4).normal(size=8))
@@ -210,7 +210,7 @@ def test_derivatives_of_a_capsule(mode):
 
 
 @pytest.mark.parametrize(
-    ("wrong", "told"),
+    ("wrong", "message"),
     [
         ({"mass_ratio": 0.0}, "`mass_ratio`"),
         ({"friction": -1.0}, "`friction`"),
@@ -220,6 +220,6 @@ def test_derivatives_of_a_capsule(mode):
         ({"damping_ratio": "x"}, "`damping_ratio`"),
     ],
 )
-def test_wrong_numbers_are_named(wrong, told):
-    with pytest.raises((ValueError, TypeError), match=told):
+def test_wrong_numbers_are_named(wrong, message):
+    with pytest.raises((ValueError, TypeError), match=message):
         CAPSULE(**wrong)

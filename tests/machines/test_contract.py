@@ -24,7 +24,7 @@ PI = np.pi
 
 def flown(gap, k, force, ratio, x, duration):
     """State, impacts and energy lost in them by SciPy's DOP853, the laws written out again; `None`
-    for a motion with impacts too weak to be told from rest."""
+    for a motion with impacts too weak to be distinguished from rest."""
 
     def rate(t, x):
         spring = 0.5 * (x[0] - x[2])

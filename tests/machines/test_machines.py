@@ -287,7 +287,7 @@ def test_derivatives_of_a_machine(name, mode):
 
 
 @pytest.mark.parametrize(
-    ("make", "told"),
+    ("make", "message"),
     [
         (lambda: BALL(acceleration=-1.0), "`acceleration`"),
         (lambda: BALL(restitution=1.5), "`restitution`"),
@@ -297,6 +297,6 @@ def test_derivatives_of_a_machine(name, mode):
         (lambda: DUFFING(frequency=0.0), "`frequency`"),
     ],
 )
-def test_wrong_numbers_are_named(make, told):
-    with pytest.raises(ValueError, match=told):
+def test_wrong_numbers_are_named(make, message):
+    with pytest.raises(ValueError, match=message):
         make()

@@ -303,7 +303,7 @@ class Pushed(eqx.Module):
 
 
 class Cage(vi.AbstractMachine):
-    """A body in a cage that is shaken, told by places or by what the other's differ from them."""
+    """A body in a cage that is shaken, described by places or by differences of places."""
 
     restitution: Any = field(0.3)
     relative: bool = eqx.field(static=True, default=False)
@@ -356,8 +356,8 @@ def test_a_body_rests_on_another_where_their_distance_is_a_difference(k):
     assert all(bool(run.successful) for run in runs)
     if k < 0.4:
         assert int(runs[0].rests.sum()) > 50
-    for told, other in zip(runs[0].sections.__dict__.values(), "xu", strict=False):
-        np.testing.assert_allclose(told[:6], getattr(runs[1].sections, other)[:6], atol=1e-6)
+    for kept, other in zip(runs[0].sections.__dict__.values(), "xu", strict=False):
+        np.testing.assert_allclose(kept[:6], getattr(runs[1].sections, other)[:6], atol=1e-6)
     np.testing.assert_array_equal(runs[0].impacts[:5], runs[1].impacts[:5])
     np.testing.assert_array_equal(runs[0].rests[:5], runs[1].rests[:5])
 

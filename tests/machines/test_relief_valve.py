@@ -17,7 +17,7 @@ CLOSE = vi.Adaptive(rtol=1e-12)
 
 def flown(q, start, cycles):
     """Sections, impacts and durations by SciPy's DOP853, the laws written out again; `None` for a
-    motion with impacts too weak to be told from rest."""
+    motion with impacts too weak to be distinguished from rest."""
 
     def rate(t, x):
         return [x[1], x[2] - 1.25 * x[1] - x[0] - 10, 20 * (q - x[0] * np.sqrt(x[2]))]

@@ -269,7 +269,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_roads_agree(name):
+def test_backends_agree(name):
     make, cycles = CASES[name]
 
     @jax.vmap
@@ -291,7 +291,7 @@ def test_roads_agree(name):
 
 
 class Thrown(vi.AbstractMachine):
-    """A body that is put beyond its stop."""
+    """A body that a reset moves beyond its stop."""
 
     stops: tuple = (vi.RigidStop(2.0, 0.5),)
 

@@ -218,7 +218,7 @@ def test_a_body_pressed_on_comes_to_rest_and_leaves():
 
 
 @pytest.mark.parametrize(
-    ("make", "told"),
+    ("make", "message"),
     [
         (lambda: ROTOR(coupling=1.0), r"`coupling`.*\[0, 1\).*1"),
         (lambda: ROTOR(strength=-1.0), "`strength`"),
@@ -232,8 +232,8 @@ def test_a_body_pressed_on_comes_to_rest_and_leaves():
         (lambda: ROTOR().start(Y=float("inf")), "`Y`"),
     ],
 )
-def test_wrong_numbers_are_named(make, told):
-    with pytest.raises(ValueError, match=told):
+def test_wrong_numbers_are_named(make, message):
+    with pytest.raises(ValueError, match=message):
         make()
 
 

@@ -27,9 +27,9 @@ class Case(NamedTuple):
     parameter: str
     bounds: tuple[float, float]
     special: tuple[str, ...]
-    """What comes along the branch."""
+    """Kinds of the special points along the branch."""
     curved: str
-    """Which of it is followed in another parameter."""
+    """Which of the special points is followed in another parameter."""
     second: str
     ends: tuple[float, float]
 

@@ -164,7 +164,7 @@ def test_its_words():
     toy = WOODPECKER()
     assert "stiffness=0.0056 N m/rad" in repr(toy)
     assert "bird_rate=-7.5 rad/s" in repr(toy.start())
-    # The height is told as a drop by the cycle, but goes on where it is observed at equal times.
+    # The height becomes the drop of a cycle, but continues where it is observed at equal times.
     state = toy.start(height=-0.02)
     assert (float(toy.renewed(state).height), float(toy.renewed(state).drop)) == (0.0, 0.02)
     by_time = toy.observed_every(0.1)

@@ -122,7 +122,7 @@ def test_an_orbit_knows_its_machine():
     orbit = vi.find_orbit(scene, scene.start(Y=1.9, V=1.4), throw=True)
     shown = vi.animate(orbit, seconds=0.2, fps=20, history=False)
     assert len(shown.draw(0).axes) == 1
-    with pytest.raises(ValueError, match="`scene` must be left out"):
+    with pytest.raises(ValueError, match="`machine` must be left out"):
         vi.animate(orbit, scene)
 
 
@@ -162,7 +162,7 @@ def test_a_movie_is_written(run, tmp_path):
     assert (tmp_path / "motion.mp4").stat().st_size > 1000
 
 
-def test_what_cannot_be_written_is_told_before_any_drawing(run, tmp_path):
+def test_what_cannot_be_written_is_refused_before_any_drawing(run, tmp_path):
     shown = vi.animate(run, MACHINES["ideal"], seconds=0.4, fps=10)
     (tmp_path / "file").write_text("")
     with pytest.raises(ValueError, match=r"`filename` must be a file.*lies below a file"):
@@ -176,7 +176,7 @@ def test_what_cannot_be_written_is_told_before_any_drawing(run, tmp_path):
 
 def test_wrong_arguments_are_named(run):
     scene = MACHINES["ideal"]
-    with pytest.raises(ValueError, match="`scene` must be given"):
+    with pytest.raises(ValueError, match="`machine` must be given"):
         vi.animate(run)
     with pytest.raises(ValueError, match="`motion` must have samples"):
         vi.animate(vi.simulate(scene, scene.start(), 2), scene)

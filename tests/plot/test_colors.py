@@ -1,4 +1,4 @@
-"""Colours of regimes are told apart with any colour vision."""
+"""Colours of regimes are distinct with any colour vision."""
 
 import itertools
 
@@ -46,7 +46,7 @@ def least(colors):
     )
 
 
-def test_regimes_are_told_apart():
+def test_regimes_are_distinct():
     # A green and a red of like lightness are 1.2 apart.
     assert least([*PERIODS, MORE_IMPACTS, *IRREGULAR.values(), NOT_COMPUTED]) > 5
     assert least([*PERIODS[:4], MORE_IMPACTS, *IRREGULAR.values(), NOT_COMPUTED]) > 7

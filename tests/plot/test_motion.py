@@ -119,5 +119,5 @@ def test_errors_name_the_argument(scene, run):
     with pytest.raises(ValueError, match="one motion"):
         motion_path(sweep)
     samples = vi.Samples(run.samples.cycles, run.samples.time, {"q": run.samples.state.Y})
-    with pytest.raises(ValueError, match="`scene` must be given"):
+    with pytest.raises(ValueError, match="`machine` must be given"):
         motion_path(samples)

@@ -50,7 +50,7 @@ def test_branch_names_its_marks_and_begins_its_legend_solid(branch):
         assert handles["2π"].get_linestyle() == "-"
         assert handles["2π"].get_color() == color_of(1)
         assert [handles[word].get_linestyle() for word in named[1:3]] == ["-", "--"]
-        # Without a label the legend tells what the colour stands for, and nothing twice.
+        # Without a label the legend says what the colour stands for, and nothing twice.
         for _ in range(2):
             vi.plot_branch(branch, ax=ax)
             again = [t.get_text() for t in ax.get_legend().get_texts()]
@@ -58,7 +58,7 @@ def test_branch_names_its_marks_and_begins_its_legend_solid(branch):
 
 
 def test_a_sweep_lies_above_branches_and_below_marks(branch):
-    sweep = vi.sweep(branch.orbit(0).scene, NAME, np.linspace(0.95, 1.0, 4), settle=10, cycles=8)
+    sweep = vi.sweep(branch.orbit(0).machine, NAME, np.linspace(0.95, 1.0, 4), settle=10, cycles=8)
     ax = vi.plot_sweep(sweep, ax=_axes())
     vi.plot_branch(branch, ax=ax)
     dots, *others = ax.lines
@@ -86,7 +86,7 @@ def test_given_axes_are_used(branch):
     ax = Figure().subplots()
     assert vi.plot_branch(branch, ax=ax, y="y_max", special=False) is ax
     assert vi.plot_multipliers(branch.orbit(0), ax=ax) is ax
-    sweep = vi.sweep(branch.orbit(0).scene, NAME, np.linspace(0.95, 1.0, 4), settle=10, cycles=8)
+    sweep = vi.sweep(branch.orbit(0).machine, NAME, np.linspace(0.95, 1.0, 4), settle=10, cycles=8)
     assert vi.plot_sweep(sweep, ax=ax) is ax
     assert len(ax.lines[-1].get_xdata()) == 4
 

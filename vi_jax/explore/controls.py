@@ -1,4 +1,4 @@
-"""The numbers that the page lets one change, and the scenes made of them."""
+"""The numbers that the page's sliders change, and the scenes made of them."""
 
 from collections.abc import Mapping
 from math import isfinite
@@ -8,17 +8,17 @@ from ..machine import Parameters, Scene
 
 
 class Control(NamedTuple):
-    """One slider."""
+    """One slider: its label, its range, its step and where it begins."""
 
     label: str
     low: float
     high: float
     step: float
     value: float
-    """Where it begins."""
+    """The value that it has when the page opens."""
 
     def nearest(self, value: float) -> float:
-        """The place of the slider next to a value; where it begins, of what is no number."""
+        """The place of the slider next to a value; for NaN the one where it begins."""
         if not isfinite(value):
             return self.value
         steps = round((min(max(value, self.low), self.high) - self.low) / self.step)
@@ -31,7 +31,7 @@ class Control(NamedTuple):
         return self.low - _ROUNDING <= value <= self.high + _ROUNDING
 
 
-# Of places reached in steps.
+# Rounding error of places reached in steps.
 _ROUNDING = 1e-9
 
 NUMBERS: Mapping[str, Control] = {
@@ -40,7 +40,7 @@ NUMBERS: Mapping[str, Control] = {
     "gap": Control("gap d (a)", 0.0, 5.0, 0.01, 2.0),
     "damping_ratio": Control("damping ratio ξ", 0.0, 0.2, 0.001, 0.01),
 }
-"""Numbers of `Scene.ideal`."""
+"""Sliders of the arguments of `Scene.ideal`."""
 
 _START = {
     "Y": Control("start Y (a)", -6.0, 5.0, 0.02, 0.0),
@@ -65,7 +65,7 @@ MOTOR: Mapping[str, Control] = {
 
 
 def beginning(controls: Mapping[str, Control]) -> dict[str, float]:
-    """Where the sliders begin."""
+    """The values of sliders when the page opens, by the names of the numbers."""
     return {name: control.value for name, control in controls.items()}
 
 

@@ -22,11 +22,11 @@ SHOWN = {
     "V on the section": "V",
     "greatest V⁻ in a cycle": "impact_speed",
 }
-"""What can be drawn upwards."""
+"""What can be drawn upwards: its name on the page, and the array of a `Diagram`."""
 
 
 class Diagram(NamedTuple):
-    """What starts like one another settle on, over one number; arrays (values, cycles)."""
+    """What motions from one start settle on, over one number; arrays of shape (values, cycles)."""
 
     parameter: str
     values: np.ndarray
@@ -45,14 +45,14 @@ def diagram(
 ) -> Diagram:
     """Bifurcation diagram of the ideal scene over one of its numbers, each value from one start.
 
-    **Arguments:** the numbers of `Scene.ideal`; the name of that which changes; its least and
+    **Arguments:** the numbers of `Scene.ideal`; the name of the one that changes; its least and
     greatest value; the start.
     """
     fixed = {name: float(value) for name, value in numbers.items() if name != parameter}
     return _diagram(tuple(fixed.items()), parameter, bounds, Y, V)
 
 
-@functools.lru_cache(maxsize=8)  # another choice along a diagram is no other diagram
+@functools.lru_cache(maxsize=8)  # moving the slider along the diagram needs no new one
 def _diagram(
     fixed: tuple[tuple[str, float], ...],
     parameter: str,

@@ -1,8 +1,8 @@
 """Who may ask the page's server: the browser that has its address, from the page itself.
 
-A page of somebody else that is open in the same browser can send requests to this machine, too, and
-by a name that it lets point here, it can even read the answers. Both tell of themselves by their
-headers `Origin` and `Host`.
+A page of somebody else that is open in the same browser can send requests to this computer too, and
+if it makes a host name point here (DNS rebinding), it can even read the answers. Both kinds of
+request are recognised by their headers `Origin` and `Host`.
 """
 
 import ipaddress
@@ -10,7 +10,7 @@ from collections.abc import Awaitable, Callable
 from typing import Any
 from urllib.parse import urlsplit
 
-# ASGI: what is asked, and how to hear more of it and to answer.
+# ASGI: the request, how to receive more of its body, and how to answer.
 Scope = dict[str, Any]
 Receive = Callable[[], Awaitable[dict[str, Any]]]
 Send = Callable[[dict[str, Any]], Awaitable[None]]
@@ -20,7 +20,7 @@ _LOCAL = {"localhost", "127.0.0.1", "::1"}
 
 
 class Guard:
-    """An ASGI app that lets through only what `refusal` has nothing against.
+    """An ASGI app that passes on only requests that `refusal` does not refuse.
 
     **Arguments:** the app; the address that it listens at.
     """
@@ -71,7 +71,7 @@ def _name_of(host: str) -> str | None:
 
 
 def _unshared(send: Send) -> Send:
-    """What is answered is for no other page, whatever the app says."""
+    """`send` without headers that would share the answer with other pages (CORS)."""
 
     async def without(message: dict[str, Any]) -> None:
         if "headers" in message:

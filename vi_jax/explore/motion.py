@@ -34,7 +34,7 @@ _REGIME = Regime(longest=32, observed=128, lasting=0)
 # Samples of a cycle; impacts of one that are drawn, and that enter the impact map.
 _SAMPLES, _DRAWN, _MAPPED = 48, 8, 4
 
-# Multipliers so near to 1 in size, or to the real axis, cannot be told from those on it.
+# Multipliers so near to 1 in size, or to the real axis, count as on it.
 _NEUTRAL = 1e-7
 
 # Steps beyond which a motion is given up, so that no slider waits for long.
@@ -45,13 +45,13 @@ class Motion(NamedTuple):
     """One motion as NumPy arrays and words."""
 
     path: MotionPath
-    """The motion over `WINDOW` cycles, the impacts put in."""
+    """The motion over `WINDOW` cycles, with its impacts."""
     sections: Any
     """Section states of all cycles observed, a state of NumPy arrays."""
     impact_phase: np.ndarray
     """Crank angle of each impact observed (radians)."""
     impact_speed: np.ndarray
-    """Speed V⁻ of each."""
+    """Speed V⁻ before each impact observed (unit: a ω)."""
     frequency_ratio: np.ndarray
     """ζ of each cycle observed."""
     extremes: tuple[float, float]
@@ -69,7 +69,7 @@ class Motion(NamedTuple):
 
     @property
     def regime(self) -> str:
-        """The regime in words."""
+        """The regime in words: its period and impacts, or what has no period."""
         if self.period > 0:
             impacts = impacts_in_words(round(self.impacts))
             return f"period {2 * self.period}π with {impacts}"
@@ -98,7 +98,7 @@ class Motion(NamedTuple):
 def look(scene: AbstractMachine, start: Any, settle: int = 1000) -> Motion:
     """The motion of a scene after `settle` cycles, by its standard method.
 
-    A start beyond a stop is put on it.
+    A start beyond a stop is moved onto it.
     """
     run, window, found, monodromy = _seen(scene, start, jnp.asarray(float(settle)))
     period = int(found["period"])
@@ -135,7 +135,7 @@ def look(scene: AbstractMachine, start: Any, settle: int = 1000) -> Motion:
 
 
 def prepare(scene: AbstractMachine, start: Any) -> Motion:
-    """Compile what `look` needs for scenes of this structure; the motion that it sees."""
+    """Compile what `look` needs for scenes of this structure, and return the motion."""
     found = look(scene, start, 0)
     _exponent(scene, jtu.tree_map(lambda x: jnp.asarray(x[-1]), found.sections))
     return found

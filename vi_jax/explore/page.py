@@ -1,4 +1,4 @@
-"""The page itself, a marimo app: what to show where. All that is computed comes from elsewhere."""
+"""The page itself, a marimo app: what to show where. The other files compute and draw."""
 
 import marimo  # pyright: ignore[reportMissingImports]
 
@@ -69,7 +69,7 @@ def _(mo):
 
 @app.cell
 def _(controls, mo):
-    # A click in the diagram is another beginning of the sliders.
+    # A click in the diagram moves the sliders.
     picked, pick = mo.state(controls.beginning(controls.IDEAL))
     return pick, picked
 

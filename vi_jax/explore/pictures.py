@@ -29,8 +29,8 @@ _FILLED = 0.5
 
 
 class MotionPicture:
-    """Four pictures of a motion in one: its course, phase portrait, map, and multipliers; with a
-    motor the crank's speed takes the place of the map."""
+    """Four pictures of a motion in one: its time history, phase portrait, map, and multipliers;
+    with a motor the crank's speed takes the place of the map."""
 
     def __init__(self, *, motor: bool = False):
         self._motor = motor

@@ -29,7 +29,7 @@ def missing() -> str | None:
 
 
 def compile_all(tell: Callable[[str], None]) -> None:
-    """Compile every program that a slider can ask for."""
+    """Compile every program that a slider can need."""
     tell("compiling the ideal drive")
     values = controls.beginning(controls.IDEAL)
     _ = prepare(*controls.ideal(values)).stability
@@ -44,10 +44,10 @@ def compile_all(tell: Callable[[str], None]) -> None:
 def serve(host: str, port: int, *, browser: bool, tell: Callable[[str], None]) -> None:
     """Serve the page until Ctrl-C, which ends the process.
 
-    Its address, which is told, holds a token without which nothing is answered.
+    Its address, which is reported, holds a token without which nothing is answered.
 
     **Arguments:** address and port to listen at (port 0: any that is free); whether to open a
-    browser; what is told of the progress.
+    browser; `tell`, called with lines about the progress.
 
     **Raises:** `OSError` if it cannot listen there.
     """
@@ -75,12 +75,12 @@ def serve(host: str, port: int, *, browser: bool, tell: Callable[[str], None]) -
 
 
 def _page(marimo: Any, port: int, token: str) -> Any:
-    """The page as an ASGI app that answers to who has the token."""
+    """The page as an ASGI app that answers only requests with the token."""
     page = str(Path(__file__).with_name("page.py"))
     made = marimo.create_asgi_app(quiet=True, token=token, skew_protection=True)
     app = made.with_app(path="", root=page).build()
-    # The cookie that stands for the token is named by the port: a browser keeps one of each name
-    # for all ports of a host, and two of these servers would shut each other out.
+    # The cookie with the token is named by the port: a browser keeps one cookie of each name for
+    # all ports of a host, so that two of these servers would overwrite each other's.
     for mounted in app.routes:
         mounted.app.state.port = port
     return app

@@ -1,4 +1,4 @@
-"""What the machines of this room share."""
+"""What the ready machines share: their fields, pairs of stops, and kinds of drive."""
 
 import dataclasses
 from math import pi
@@ -8,9 +8,22 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from .._checks import require, require_ranges
-from .._numbers import number, optional_real
+from .._numbers import number, optional_real, real
 from .._types import Scalar
-from ..machine import AbstractMachine
+from ..machine import AbstractMachine, RigidStop
+
+
+def number_field(name: str, default: float | None) -> Any:
+    """A field of a machine that holds a real number, given by keyword; where the default is `None`,
+    it may be left out."""
+    converter = real(name) if default is not None else optional_real(name)
+    return eqx.field(kw_only=True, default=default, converter=converter)
+
+
+def stops_at(gap: Scalar, restitution: Scalar, *, two_sided: bool = True) -> tuple[RigidStop, ...]:
+    """Equal stops at this distance from zero: on the right, and if two-sided then on the left."""
+    sides = ("right", "left") if two_sided else ("right",)
+    return tuple(RigidStop(gap, restitution, side) for side in sides)
 
 
 class PhaseMachine(AbstractMachine):
@@ -24,8 +37,24 @@ class PhaseMachine(AbstractMachine):
 
     @property
     def cycle(self) -> float:
-        """2π."""
+        """A cycle is 2π of the drive's phase."""
         return 2 * pi
+
+
+class ForcedMachine(PhaseMachine):
+    """A machine shaken at an angular frequency ω, its number `frequency`, with the phase ωt as the
+    independent variable."""
+
+    frequency: eqx.AbstractVar[Scalar]
+
+    @property
+    def period(self) -> Scalar:
+        """2π/ω, the time that a cycle takes."""
+        return 2 * pi / self.frequency
+
+    def pace(self, s: Scalar, state: Any) -> Scalar:
+        """dt/ds = 1/ω, the time that a unit of phase takes."""
+        return 1 / self.frequency
 
 
 class AutonomousMachine(AbstractMachine):
@@ -33,16 +62,14 @@ class AutonomousMachine(AbstractMachine):
     `ranges`. A cycle ends where `event` rises through zero; if `interval` is given (positive), at
     equal times instead."""
 
-    interval: Scalar | None = eqx.field(
-        kw_only=True, default=None, converter=optional_real("interval")
-    )
+    interval: Scalar | None = number_field("interval", None)
     ranges: ClassVar[dict[str, Any]]
 
     def __check_init__(self):
         require_ranges(self)
 
     def event(self, state: Any) -> Scalar:
-        """What rises through zero once in a cycle."""
+        """A function of the state that rises through zero once in a cycle."""
         raise NotImplementedError
 
     @property

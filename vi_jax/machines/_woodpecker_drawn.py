@@ -102,7 +102,7 @@ def _bird(pen: Any, size: dict[str, float], hang: Any, lean: float) -> None:
 
 
 def _names(pen: Any, size: dict[str, float], middle: Any, hang: Any) -> None:
-    """With labels only."""
+    """Write the names of the parts, where the pen writes labels."""
     left, up = -2.6 * size["sleeve_radius"], float(middle[1])
     pen.label(left, up, "sleeve, $\\varphi_M$", ha="right")
     pen.label(left, up + 1.2 * size["beak_height"], "pole, $\\mu$", ha="right")

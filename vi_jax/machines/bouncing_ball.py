@@ -3,15 +3,14 @@
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-import equinox as eqx
 import jax.numpy as jnp
 
 from .._checks import NOT_NEGATIVE, SHARE
-from .._numbers import number, real
+from .._numbers import number
 from .._types import Scalar
 from ..machine import RigidStop
 from ..machine.shown import Shown
-from ._base import PhaseMachine
+from ._base import PhaseMachine, number_field
 
 
 class BallState(Shown):
@@ -20,9 +19,9 @@ class BallState(Shown):
     units: ClassVar = {"height": "g/ω²", "speed": "g/ω"}
 
     height: Scalar
-    """Above the table (unit: g/ω²)."""
+    """Height above the table (unit: g/ω²)."""
     speed: Scalar
-    """Relative to the table, upward (unit: g/ω)."""
+    """Upward speed relative to the table (unit: g/ω)."""
 
 
 class BouncingBall(PhaseMachine):
@@ -37,8 +36,8 @@ class BouncingBall(PhaseMachine):
     `restitution` e in [0, 1].
     """
 
-    acceleration: Scalar = eqx.field(kw_only=True, default=1.2, converter=real("acceleration"))
-    restitution: Scalar = eqx.field(kw_only=True, default=0.5, converter=real("restitution"))
+    acceleration: Scalar = number_field("acceleration", 1.2)
+    restitution: Scalar = number_field("restitution", 0.5)
     ranges: ClassVar[dict[str, Any]] = {"acceleration": NOT_NEGATIVE, "restitution": SHARE}
 
     @property
@@ -48,7 +47,7 @@ class BouncingBall(PhaseMachine):
 
     @property
     def labels(self) -> tuple[str, str]:
-        """Of pictures."""
+        """Axis labels of position and velocity, with their units."""
         return "height (g/ω²)", "speed from the table (g/ω)"
 
     @property
@@ -59,7 +58,7 @@ class BouncingBall(PhaseMachine):
         return {**super().units, **own, **rates, "": "1"}
 
     def field(self, s: Scalar, state: BallState) -> BallState:
-        """Free fall less the table's acceleration."""
+        """d(state)/d(ωt): free fall less the table's acceleration."""
         return BallState(state.speed, -1 - self.acceleration * jnp.cos(s))
 
     def start(self, *, height: Any = 1.0, speed: Any = 0.0) -> BallState:
@@ -67,11 +66,11 @@ class BouncingBall(PhaseMachine):
         return BallState(number("height", height), number("speed", speed))
 
     def position(self, state: BallState) -> Scalar:
-        """The height."""
+        """Height of the ball above the table (unit: g/ω²)."""
         return state.height
 
     def velocity(self, state: BallState) -> Scalar:
-        """The relative speed."""
+        """Upward speed relative to the table (unit: g/ω)."""
         return state.speed
 
     def placed(self, state: BallState, Y: Scalar, V: Scalar) -> BallState:

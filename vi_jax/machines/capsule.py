@@ -8,11 +8,11 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Range
-from .._numbers import number, real
+from .._numbers import number
 from .._types import Scalar
 from ..machine import Coordinate, DryFriction, RigidStop
 from ..machine.shown import Shown
-from ._base import PhaseMachine
+from ._base import ForcedMachine, number_field
 
 
 class CapsuleState(Shown):
@@ -24,18 +24,18 @@ class CapsuleState(Shown):
     }
 
     place: Scalar
-    """Of the mass, from where its spring is relaxed (unit: F/k)."""
+    """Place of the mass, from where its spring is relaxed (unit: F/k)."""
     speed: Scalar
-    """Of the mass, relative to the capsule (unit: F/√(k m))."""
+    """Speed of the mass relative to the capsule (unit: F/√(k m))."""
     capsule_speed: Scalar
-    """Of the capsule on the ground (unit: F/√(k m))."""
+    """Speed of the capsule on the ground (unit: F/√(k m))."""
     travel: Scalar
-    """Of the capsule since the cycle began (unit: F/k)."""
+    """How far the capsule has moved since the cycle began (unit: F/k)."""
     progress: Scalar
-    """Of the capsule in the cycle before (unit: F/k)."""
+    """How far the capsule moved in the cycle before (unit: F/k)."""
 
 
-class Capsule(PhaseMachine):
+class Capsule(ForcedMachine):
     """A mass m on a spring k in a capsule of mass M, driven against a rigid stop of the capsule,
     which rubs on the ground and so moves along.
 
@@ -46,7 +46,8 @@ class Capsule(PhaseMachine):
 
     for the mass x1 and the capsule x2. At p = δ the relative speed is reversed and scaled by e and
     the momentum of both is kept. The independent variable is ωt, a cycle 2π. How far the capsule
-    goes is told cycle by cycle, as `progress`; where it stands is the sum of it.
+    went in the last cycle is the component `progress` of the state; where it stands is the sum of
+    these.
 
     **Arguments:** `amplitude` α of the force on the mass, any number; `frequency` ω, positive;
     `damping_ratio` ξ, not negative; `mass_ratio` γ = M/m, positive; `gap` δ, any number;
@@ -54,14 +55,14 @@ class Capsule(PhaseMachine):
     how much more it can be while it sticks, at least 1.
     """
 
-    amplitude: Scalar = eqx.field(kw_only=True, default=1.6, converter=real("amplitude"))
-    frequency: Scalar = eqx.field(kw_only=True, default=1.0, converter=real("frequency"))
-    damping_ratio: Scalar = eqx.field(kw_only=True, default=0.05, converter=real("damping_ratio"))
-    mass_ratio: Scalar = eqx.field(kw_only=True, default=5.0, converter=real("mass_ratio"))
-    gap: Scalar = eqx.field(kw_only=True, default=0.5, converter=real("gap"))
-    restitution: Scalar = eqx.field(kw_only=True, default=0.6, converter=real("restitution"))
-    friction: Scalar = eqx.field(kw_only=True, default=1.0, converter=real("friction"))
-    static_ratio: Scalar = eqx.field(kw_only=True, default=1.0, converter=real("static_ratio"))
+    amplitude: Scalar = number_field("amplitude", 1.6)
+    frequency: Scalar = number_field("frequency", 1.0)
+    damping_ratio: Scalar = number_field("damping_ratio", 0.05)
+    mass_ratio: Scalar = number_field("mass_ratio", 5.0)
+    gap: Scalar = number_field("gap", 0.5)
+    restitution: Scalar = number_field("restitution", 0.6)
+    friction: Scalar = number_field("friction", 1.0)
+    static_ratio: Scalar = number_field("static_ratio", 1.0)
     ranges: ClassVar[dict[str, Any]] = {
         "amplitude": REAL, "frequency": POSITIVE, "damping_ratio": NOT_NEGATIVE,
         "mass_ratio": POSITIVE, "gap": REAL, "restitution": SHARE, "friction": NOT_NEGATIVE,
@@ -94,7 +95,7 @@ class Capsule(PhaseMachine):
 
     @property
     def labels(self) -> tuple[str, str]:
-        """Of pictures."""
+        """Axis labels of position and velocity, with their units."""
         return "place in the capsule (F/k)", "speed in the capsule (F/√(k m))"
 
     @property
@@ -105,22 +106,13 @@ class Capsule(PhaseMachine):
         rates = {"rate": "√(k/m)", "time": "√(m/k)", "energy": "F²/k", "power": "F²/√(k m)"}
         return {**super().units, **own, **rates, "": "1"}
 
-    @property
-    def period(self) -> Scalar:
-        """2π/ω."""
-        return 2 * pi / self.frequency
-
-    def pace(self, s: Scalar, state: Any) -> Scalar:
-        """dt/ds = 1/ω."""
-        return 1 / self.frequency
-
     def step_limit(self, s: Scalar, state: Any) -> Scalar:
         """A fifth of the shorter of the drive's cycle and the period of the mass on its spring."""
         stiffness = jnp.sqrt(1 + 1 / self.mass_ratio)
         return 0.4 * pi * jnp.minimum(1.0, self.frequency / stiffness)
 
     def field(self, s: Scalar, state: CapsuleState, mode: Scalar) -> CapsuleState:
-        """By phase."""
+        """d(state)/d(ωt) between impacts; `mode` says whether the capsule sticks or slides."""
         (ground,) = self.switches
         pull = self.pull(state)
         rubs = ground.contribution(self, s, state, mode)
@@ -136,7 +128,7 @@ class Capsule(PhaseMachine):
         )
 
     def pull(self, state: CapsuleState) -> Scalar:
-        """What spring and dashpot pull the capsule with (unit: F)."""
+        """Force of spring and dashpot on the capsule (unit: F)."""
         return state.place + 2 * self.damping_ratio * state.speed
 
     def renewed(self, state: CapsuleState) -> CapsuleState:
@@ -155,7 +147,7 @@ class Capsule(PhaseMachine):
         return state.place
 
     def velocity(self, state: CapsuleState) -> Scalar:
-        """The relative speed."""
+        """Speed of the mass relative to the capsule."""
         return state.speed
 
     def placed(self, state: CapsuleState, Y: Scalar, V: Scalar) -> CapsuleState:

@@ -1,20 +1,19 @@
 """A Duffing oscillator between two stops; with no cubic term the classic impact oscillator."""
 
 from collections.abc import Mapping
-from math import pi
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE
-from .._numbers import number, real
+from .._numbers import number
 from .._types import Scalar
 from ..machine import OscillatorState, RigidStop
-from ._base import PhaseMachine
+from ._base import ForcedMachine, number_field, stops_at
 
 
-class Duffing(PhaseMachine):
+class Duffing(ForcedMachine):
     """x'' + δ x' + α x + β x³ = A cos ωt, between stops at ±gap or with one on the right alone.
 
     The independent variable is the phase ωt, a cycle 2π. A motion of small amplitude that stays off
@@ -25,13 +24,13 @@ class Duffing(PhaseMachine):
     there is a stop on the left as well; static.
     """
 
-    amplitude: Scalar = eqx.field(kw_only=True, default=0.3, converter=real("amplitude"))
-    frequency: Scalar = eqx.field(kw_only=True, default=1.0, converter=real("frequency"))
-    damping: Scalar = eqx.field(kw_only=True, default=0.1, converter=real("damping"))
-    stiffness: Scalar = eqx.field(kw_only=True, default=1.0, converter=real("stiffness"))
-    cubic: Scalar = eqx.field(kw_only=True, default=0.0, converter=real("cubic"))
-    gap: Scalar = eqx.field(kw_only=True, default=1.0, converter=real("gap"))
-    restitution: Scalar = eqx.field(kw_only=True, default=0.8, converter=real("restitution"))
+    amplitude: Scalar = number_field("amplitude", 0.3)
+    frequency: Scalar = number_field("frequency", 1.0)
+    damping: Scalar = number_field("damping", 0.1)
+    stiffness: Scalar = number_field("stiffness", 1.0)
+    cubic: Scalar = number_field("cubic", 0.0)
+    gap: Scalar = number_field("gap", 1.0)
+    restitution: Scalar = number_field("restitution", 0.8)
     two_sided: bool = eqx.field(kw_only=True, static=True, default=True)
     ranges: ClassVar[dict[str, Any]] = {
         "amplitude": REAL, "frequency": POSITIVE, "damping": NOT_NEGATIVE, "stiffness": REAL,
@@ -41,12 +40,11 @@ class Duffing(PhaseMachine):
     @property
     def stops(self) -> tuple[RigidStop, ...]:  # pyright: ignore
         """One on the right, and one on the left of a two-sided machine."""
-        sides = ("right", "left") if self.two_sided else ("right",)
-        return tuple(RigidStop(self.gap, self.restitution, side) for side in sides)
+        return stops_at(self.gap, self.restitution, two_sided=self.two_sided)
 
     @property
     def labels(self) -> tuple[str, str]:
-        """Of pictures."""
+        """Axis labels of position and velocity, with their units."""
         return "x", "dx/dt"
 
     @property
@@ -54,17 +52,8 @@ class Duffing(PhaseMachine):
         """None: its numbers are the equation's."""
         return {"": "1"}
 
-    @property
-    def period(self) -> Scalar:
-        """2π/ω."""
-        return 2 * pi / self.frequency
-
-    def pace(self, s: Scalar, state: Any) -> Scalar:
-        """dt/ds = 1/ω."""
-        return 1 / self.frequency
-
     def field(self, s: Scalar, state: OscillatorState) -> OscillatorState:
-        """By phase; V is dx/dt."""
+        """d(state)/d(ωt) between impacts; the state's V is dx/dt."""
         x, v = state.Y, state.V
         force = self.amplitude * jnp.cos(s) - self.damping * v
         force = force - x * (self.stiffness + self.cubic * x * x)

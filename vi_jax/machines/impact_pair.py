@@ -3,15 +3,14 @@
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-import equinox as eqx
 import jax.numpy as jnp
 
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE
-from .._numbers import number, optional_real, real
+from .._numbers import number
 from .._types import Scalar
 from ..machine import Coordinate, RigidStop
 from ..machine.shown import Shown
-from ._base import PhaseMachine
+from ._base import PhaseMachine, number_field, stops_at
 
 
 class PairState(Shown):
@@ -20,9 +19,9 @@ class PairState(Shown):
     units: ClassVar = {"place": "a", "speed": "a ω"}
 
     place: Scalar
-    """From the middle of the box (unit: a)."""
+    """Place of the ball, from the middle of the box (unit: a)."""
     speed: Scalar
-    """Relative to the box (unit: a ω)."""
+    """Speed of the ball relative to the box (unit: a ω)."""
 
 
 class FreePairState(Shown):
@@ -31,9 +30,9 @@ class FreePairState(Shown):
     units: ClassVar = {"place": "a", "speed": "a ω", "box": "a", "box_speed": "a ω"}
 
     place: Scalar
-    """Of the ball, from the middle of the box (unit: a)."""
+    """Place of the ball, from the middle of the box (unit: a)."""
     speed: Scalar
-    """Of the ball, relative to the box (unit: a ω)."""
+    """Speed of the ball relative to the box (unit: a ω)."""
     box: Scalar
     """Place of the box (unit: a)."""
     box_speed: Scalar
@@ -63,14 +62,12 @@ class ImpactPair(PhaseMachine):
       and `force` F (unit: M a ω²), of a box that is free.
     """
 
-    half_gap: Scalar = eqx.field(kw_only=True, default=1.6, converter=real("half_gap"))
-    restitution: Scalar = eqx.field(kw_only=True, default=0.5, converter=real("restitution"))
-    mass_ratio: Scalar | None = eqx.field(
-        kw_only=True, default=None, converter=optional_real("mass_ratio")
-    )
-    damping_ratio: Scalar = eqx.field(kw_only=True, default=0.05, converter=real("damping_ratio"))
-    frequency: Scalar = eqx.field(kw_only=True, default=1.0, converter=real("frequency"))
-    force: Scalar = eqx.field(kw_only=True, default=0.5, converter=real("force"))
+    half_gap: Scalar = number_field("half_gap", 1.6)
+    restitution: Scalar = number_field("restitution", 0.5)
+    mass_ratio: Scalar | None = number_field("mass_ratio", None)
+    damping_ratio: Scalar = number_field("damping_ratio", 0.05)
+    frequency: Scalar = number_field("frequency", 1.0)
+    force: Scalar = number_field("force", 0.5)
     ranges: ClassVar[dict[str, Any]] = {
         "half_gap": POSITIVE, "restitution": SHARE, "mass_ratio": NOT_NEGATIVE,
         "damping_ratio": NOT_NEGATIVE, "frequency": NOT_NEGATIVE, "force": REAL,
@@ -79,7 +76,7 @@ class ImpactPair(PhaseMachine):
     @property
     def stops(self) -> tuple[RigidStop, ...]:  # pyright: ignore
         """Both walls, the right one first."""
-        return tuple(RigidStop(self.half_gap, self.restitution, side) for side in ("right", "left"))
+        return stops_at(self.half_gap, self.restitution)
 
     @property
     def coordinates(self) -> tuple[Coordinate, ...]:
@@ -92,7 +89,7 @@ class ImpactPair(PhaseMachine):
 
     @property
     def labels(self) -> tuple[str, str]:
-        """Of pictures."""
+        """Axis labels of position and velocity, with their units."""
         return "place in the box (a)", "speed in the box (a ω)"
 
     @property
@@ -105,7 +102,7 @@ class ImpactPair(PhaseMachine):
         return {**super().units, **own, **rates, "": "1"}
 
     def field(self, s: Scalar, state: Any) -> Any:
-        """A ball on which nothing acts, seen from the box."""
+        """d(state)/ds between impacts: a ball on which nothing acts, seen from the box."""
         if self.mass_ratio is None:
             return PairState(state.speed, jnp.sin(s))
         omega, xi = self.frequency, self.damping_ratio
@@ -127,7 +124,7 @@ class ImpactPair(PhaseMachine):
         return state.place
 
     def velocity(self, state: Any) -> Scalar:
-        """The relative speed."""
+        """Speed of the ball relative to the box."""
         return state.speed
 
     def placed(self, state: Any, Y: Scalar, V: Scalar) -> Any:

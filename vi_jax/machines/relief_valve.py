@@ -4,27 +4,26 @@ from collections.abc import Mapping
 from math import pi
 from typing import Any, ClassVar
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from .._checks import NOT_NEGATIVE, POSITIVE, SHARE
-from .._numbers import concrete, number, real
+from .._numbers import concrete, number
 from .._types import Scalar
 from ..machine import RigidStop
 from ..machine.shown import Shown
-from ._base import AutonomousMachine
+from ._base import AutonomousMachine, number_field
 
 
 class ValveState(Shown):
     """The valve's body and the vessel under it; without units, as the numbers of `ReliefValve`."""
 
     lift: Scalar
-    """Of the body from its seat."""
+    """Distance of the body from its seat (without unit)."""
     speed: Scalar
-    """Of the body, opening."""
+    """Speed of the body, positive where the valve opens."""
     pressure: Scalar
-    """In the vessel, above the ambient; positive."""
+    """Pressure in the vessel above the ambient one; positive."""
 
 
 class ReliefValve(AutonomousMachine):
@@ -43,13 +42,11 @@ class ReliefValve(AutonomousMachine):
     time between observations, positive, for one that is not observed where its lift is greatest.
     """
 
-    flow_rate: Scalar = eqx.field(kw_only=True, default=3.0, converter=real("flow_rate"))
-    damping: Scalar = eqx.field(kw_only=True, default=1.25, converter=real("damping"))
-    precompression: Scalar = eqx.field(kw_only=True, default=10.0, converter=real("precompression"))
-    compressibility: Scalar = eqx.field(
-        kw_only=True, default=20.0, converter=real("compressibility")
-    )
-    restitution: Scalar = eqx.field(kw_only=True, default=0.8, converter=real("restitution"))
+    flow_rate: Scalar = number_field("flow_rate", 3.0)
+    damping: Scalar = number_field("damping", 1.25)
+    precompression: Scalar = number_field("precompression", 10.0)
+    compressibility: Scalar = number_field("compressibility", 20.0)
+    restitution: Scalar = number_field("restitution", 0.8)
     ranges: ClassVar[dict[str, Any]] = {
         "flow_rate": POSITIVE, "damping": NOT_NEGATIVE, "precompression": NOT_NEGATIVE,
         "compressibility": POSITIVE, "restitution": SHARE, "interval": POSITIVE,
@@ -62,7 +59,7 @@ class ReliefValve(AutonomousMachine):
 
     @property
     def labels(self) -> tuple[str, str]:
-        """Of pictures."""
+        """Axis labels of position and velocity, with their units."""
         return "lift", "speed of opening"
 
     @property
@@ -76,18 +73,18 @@ class ReliefValve(AutonomousMachine):
         return pi / 2
 
     def field(self, s: Scalar, state: ValveState) -> ValveState:
-        """By time."""
+        """d(state)/dt between impacts on the seat."""
         spring = state.lift + self.precompression
         force = state.pressure - self.damping * state.speed - spring
         leaves = state.lift * jnp.sqrt(state.pressure)
         return ValveState(state.speed, force, self.compressibility * (self.flow_rate - leaves))
 
     def event(self, state: ValveState) -> Scalar:
-        """The speed of closing."""
+        """The speed of closing, which rises through zero where the lift is greatest."""
         return -state.speed
 
     def relaxation(self, s: Scalar, state: ValveState) -> Scalar:
-        """Of the motion, or of the pressure under an open valve."""
+        """The shorter time constant: that of the motion, or of the pressure under an open valve."""
         drains = self.compressibility * jnp.abs(state.lift) / (2 * jnp.sqrt(state.pressure))
         return 1 / jnp.maximum(jnp.maximum(self.damping, drains), 1e-6)
 
@@ -110,11 +107,11 @@ class ReliefValve(AutonomousMachine):
             )
 
     def position(self, state: ValveState) -> Scalar:
-        """The lift."""
+        """Lift of the body from its seat."""
         return state.lift
 
     def velocity(self, state: ValveState) -> Scalar:
-        """The speed of opening."""
+        """Speed of the body, positive where the valve opens."""
         return state.speed
 
     def placed(self, state: ValveState, Y: Scalar, V: Scalar) -> ValveState:

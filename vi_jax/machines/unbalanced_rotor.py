@@ -11,15 +11,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Range, require
-from .._numbers import number, optional_real, real
+from .._numbers import number
 from .._types import Scalar
 from ..machine import RigidStop, ShaftMachine
 from ..machine.shown import Shown
-from ._base import PhaseMachine
+from ._base import PhaseMachine, number_field, stops_at
 
 
 class RotorState(Shown):
-    """Body and shaft, by the angle of the rotor."""
+    """Body and shaft, in the phase clock."""
 
     units: ClassVar = {"Y": "m r/M", "V": "m r ω/M", "P": "J ω", "phase": "rad"}
 
@@ -33,7 +33,7 @@ class RotorState(Shown):
 
 
 class TimedRotorState(RotorState):
-    """Body and shaft, by time."""
+    """Body and shaft, in the time clock."""
 
     phase: Scalar
     """Angle of the rotor since the last section (radians)."""
@@ -79,13 +79,13 @@ class UnbalancedRotor(ShaftMachine, PhaseMachine):
     - `clock_name`: `"phase"` or `"time"`; static.
     """
 
-    strength: Scalar = eqx.field(kw_only=True, default=0.1, converter=real("strength"))
-    control: Scalar = eqx.field(kw_only=True, default=0.9, converter=real("control"))
-    no_load_speed: Scalar = eqx.field(kw_only=True, default=1.0, converter=real("no_load_speed"))
-    coupling: Scalar = eqx.field(kw_only=True, default=0.01, converter=real("coupling"))
-    damping_ratio: Scalar = eqx.field(kw_only=True, default=0.05, converter=real("damping_ratio"))
-    gap: Scalar | None = eqx.field(kw_only=True, default=None, converter=optional_real("gap"))
-    restitution: Scalar = eqx.field(kw_only=True, default=0.5, converter=real("restitution"))
+    strength: Scalar = number_field("strength", 0.1)
+    control: Scalar = number_field("control", 0.9)
+    no_load_speed: Scalar = number_field("no_load_speed", 1.0)
+    coupling: Scalar = number_field("coupling", 0.01)
+    damping_ratio: Scalar = number_field("damping_ratio", 0.05)
+    gap: Scalar | None = number_field("gap", None)
+    restitution: Scalar = number_field("restitution", 0.5)
     two_sided: bool = eqx.field(kw_only=True, static=True, default=False)
     clock_name: str = eqx.field(kw_only=True, static=True, default="phase")
     ranges: ClassVar[dict[str, Any]] = {
@@ -99,12 +99,11 @@ class UnbalancedRotor(ShaftMachine, PhaseMachine):
         """None without `gap`; else one on the right, and one on the left if two-sided."""
         if self.gap is None:
             return ()
-        sides = ("right", "left") if self.two_sided else ("right",)
-        return tuple(RigidStop(self.gap, self.restitution, side) for side in sides)
+        return stops_at(self.gap, self.restitution, two_sided=self.two_sided)
 
     @property
     def labels(self) -> tuple[str, str]:
-        """Of pictures."""
+        """Axis labels of position and velocity, with their units."""
         return "Y (m r/M)", "dY/dτ (m r ω/M)"
 
     @property
@@ -129,7 +128,7 @@ class UnbalancedRotor(ShaftMachine, PhaseMachine):
         return jnp.asarray(speed) / self.no_load_speed + self.load(speed) / self.strength
 
     def field(self, s: Scalar, state: Any) -> Any:
-        """By the angle of the rotor, or by time."""
+        """d(state)/dφ, or d(state)/dτ of a state for the time clock, between impacts."""
         timed = self.is_timed(state)
         phase = state.phase if timed else s
         sine, cosine = jnp.sin(phase), jnp.cos(phase)
@@ -161,12 +160,12 @@ class UnbalancedRotor(ShaftMachine, PhaseMachine):
 
     @property
     def state_type(self) -> Any:
-        """Of a state in the phase clock."""
+        """Class of a state in the phase clock."""
         return RotorState
 
     @property
     def timed_states(self) -> dict[type, type]:
-        """By angle and by time."""
+        """Class of a state in the time clock, by that in the phase clock."""
         return {RotorState: TimedRotorState}
 
     def section_speed(self, state: Any) -> Any:
@@ -184,13 +183,13 @@ class UnbalancedRotor(ShaftMachine, PhaseMachine):
         return turn * speed if self.clock_name == "phase" else turn
 
     def relaxation(self, s: Scalar, state: Any) -> Scalar:
-        """Of a strongly damped body, or of a motor that is soon back at speed."""
+        """The shortest time constant: of a strongly damped body, or of a strong motor."""
         rate = jnp.maximum(2 * self.damping_ratio, self.strength / self.no_load_speed)
         pace = self._speed(s, state) if self.clock_name == "phase" else 1.0
         return pace * (1 - self.coupling) / jnp.maximum(rate, 1e-6)
 
     def _speed(self, s: Scalar, state: Any) -> Scalar:
-        """Of the rotor, without its sign."""
+        """Speed of the rotor without its sign (unit: ω)."""
         return jnp.abs(self.speed(state.phase if self.is_timed(state) else s, state))
 
     def alive(self, state: Any) -> jax.Array | None:

@@ -9,18 +9,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE
-from .._numbers import concrete, number, real
+from .._numbers import concrete, number
 from .._types import Scalar
 from ..machine import ContactFriction, Coordinate, RigidStop
 from ..machine.shown import Shown
-from ._base import AutonomousMachine
+from ._base import AutonomousMachine, number_field
 from ._levers import by_levers, dot, response
 from ._woodpecker_drawn import draw_woodpecker
-
-
-def _real(name: str, default: float) -> Any:
-    """A field that holds a real number."""
-    return eqx.field(kw_only=True, default=default, converter=real(name))
 
 
 class WoodpeckerState(Shown):
@@ -33,17 +28,17 @@ class WoodpeckerState(Shown):
     }  # fmt: skip
 
     height: Scalar
-    """Of the sleeve's middle, from where the cycle began (m)."""
+    """Height of the sleeve's middle above where the cycle began (m)."""
     sleeve_angle: Scalar
-    """φM of the sleeve against the pole (rad)."""
+    """φM, the angle between the sleeve and the pole (rad)."""
     bird_angle: Scalar
-    """φS of the bird (rad)."""
+    """φS, the angle of the bird (rad)."""
     speed: Scalar
-    """Of the sleeve's middle, upward (m/s)."""
+    """Upward speed of the sleeve's middle (m/s)."""
     sleeve_rate: Scalar
-    """dφM/dt (rad/s)."""
+    """dφM/dt of the sleeve (rad/s)."""
     bird_rate: Scalar
-    """dφS/dt (rad/s)."""
+    """dφS/dt of the bird (rad/s)."""
     drop: Scalar
     """How far the sleeve came down in the cycle before (m)."""
 
@@ -67,9 +62,9 @@ class Woodpecker(AutonomousMachine):
     cone of friction lets it.
 
     Nothing drives it but its weight: a cycle ends where φS falls through `section_angle`, and takes
-    a time of its own; how far the toy came down in it is told as `drop`. Time is the independent
-    variable. Numbers are in SI units. The stops are, in this order, `LOWER` and `UPPER` edge of the
-    sleeve and `BEAK`, and the switches the friction on each.
+    a time of its own; the component `drop` of the state is how far the toy came down in the last
+    one. Time is the independent variable. Numbers are in SI units. The stops are, in this order,
+    `LOWER` and `UPPER` edge of the sleeve and `BEAK`, and the switches the friction on each.
 
     **Arguments:**
 
@@ -84,23 +79,23 @@ class Woodpecker(AutonomousMachine):
     - `interval` of time between observations (s), positive, for one observed at equal times.
     """
 
-    friction: Scalar = _real("friction", 0.3)
-    sleeve_restitution: Scalar = _real("sleeve_restitution", 0.0)
-    beak_restitution: Scalar = _real("beak_restitution", 0.5)
-    sleeve_mass: Scalar = _real("sleeve_mass", 3e-4)
-    bird_mass: Scalar = _real("bird_mass", 4.5e-3)
-    sleeve_inertia: Scalar = _real("sleeve_inertia", 5e-9)
-    bird_inertia: Scalar = _real("bird_inertia", 7e-7)
-    stiffness: Scalar = _real("stiffness", 0.0056)
-    gravity: Scalar = _real("gravity", 9.81)
-    sleeve_arm: Scalar = _real("sleeve_arm", 0.010)
-    bird_arm: Scalar = _real("bird_arm", 0.015)
-    beak_arm: Scalar = _real("beak_arm", 0.0201)
-    sleeve_height: Scalar = _real("sleeve_height", 0.0058)
-    beak_height: Scalar = _real("beak_height", 0.02)
-    sleeve_radius: Scalar = _real("sleeve_radius", 0.0031)
-    pole_radius: Scalar = _real("pole_radius", 0.0025)
-    section_angle: Scalar = _real("section_angle", -0.2788)
+    friction: Scalar = number_field("friction", 0.3)
+    sleeve_restitution: Scalar = number_field("sleeve_restitution", 0.0)
+    beak_restitution: Scalar = number_field("beak_restitution", 0.5)
+    sleeve_mass: Scalar = number_field("sleeve_mass", 3e-4)
+    bird_mass: Scalar = number_field("bird_mass", 4.5e-3)
+    sleeve_inertia: Scalar = number_field("sleeve_inertia", 5e-9)
+    bird_inertia: Scalar = number_field("bird_inertia", 7e-7)
+    stiffness: Scalar = number_field("stiffness", 0.0056)
+    gravity: Scalar = number_field("gravity", 9.81)
+    sleeve_arm: Scalar = number_field("sleeve_arm", 0.010)
+    bird_arm: Scalar = number_field("bird_arm", 0.015)
+    beak_arm: Scalar = number_field("beak_arm", 0.0201)
+    sleeve_height: Scalar = number_field("sleeve_height", 0.0058)
+    beak_height: Scalar = number_field("beak_height", 0.02)
+    sleeve_radius: Scalar = number_field("sleeve_radius", 0.0031)
+    pole_radius: Scalar = number_field("pole_radius", 0.0025)
+    section_angle: Scalar = number_field("section_angle", -0.2788)
     ranges: ClassVar[dict[str, Any]] = {
         "friction": NOT_NEGATIVE, "sleeve_restitution": SHARE, "beak_restitution": SHARE,
         "section_angle": REAL,
@@ -183,12 +178,12 @@ class Woodpecker(AutonomousMachine):
 
     @property
     def labels(self) -> tuple[str, str]:
-        """Of pictures."""
+        """Axis labels of position and velocity, with their units."""
         return "beak towards the pole (m)", "its speed (m/s)"
 
     @property
     def units(self) -> Mapping[str, str]:
-        """SI."""
+        """SI units of its numbers and states."""
         own = dict.fromkeys(
             ("sleeve_arm", "bird_arm", "beak_arm", "sleeve_height", "beak_height", "sleeve_radius",
              "pole_radius", "play", "reach", "gap"),

@@ -7,7 +7,7 @@ import numpy as np
 from ..flow import simulate
 from ..machine import Parameters, Scene, SliderCrank
 from .claims import CONFIRMED, CONTRADICTED, PARTLY, Claim
-from .motions import CYCLES, FREQUENCY_RATIO, GAP, RESTITUTION, Case, run_of, sampled
+from .motions import CYCLES, FREQUENCY_RATIO, GAP, RESTITUTION, Case, last_minima, run_of, sampled
 from .motors import Motors
 from .orbits import mean_ratio
 
@@ -61,9 +61,8 @@ def _cosine(case: Case) -> Claim:
     run = simulate(scene, start, CYCLES, throw=True)
     Y = np.asarray(run.sections.Y)
     repeats = float(np.abs(Y[-1] - Y[-3]))
-    minima = sorted(np.asarray(run.y_min)[-2:].tolist())
+    minima, cosine = last_minima(run), last_minima(case.from_long)
     impacts = int(np.sum(np.asarray(run.impacts)[-2:]))
-    cosine = sorted(np.asarray(case.from_long.y_min)[-2:].tolist())
     return Claim(
         "the cosine in the crank's place (Eq. 4)",
         "Eq. 4",
@@ -86,7 +85,7 @@ def _motor(motors: Motors) -> Claim:
             "minimum": float(run.orbit.y_min),
             "largest_multiplier": float(abs(complex(run.orbit.multipliers[0]))),
             "minima_cycles_3_4_from_rest": minima[2:4].tolist(),
-            "last_minima_from_rest": sorted(minima[-2:].tolist()),
+            "last_minima_from_rest": last_minima(run.from_rest),
         }
     listed = "; ".join(
         f"T0 = {name} N·m, κ = {x['kappa']:.4f}: minimum {x['minimum']:.3f}, largest multiplier "

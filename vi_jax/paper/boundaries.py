@@ -41,7 +41,7 @@ class BoundaryCurves(NamedTuple):
     """Curves in the planes (ζ, k), undamped, and (ζ, ξ), with k = 0.5; d = 2 in both.
 
     The 2π motion has one impact per drive cycle, the 4π motion one in two. A curve that was not
-    asked for is `None`.
+    followed is `None`.
     """
 
     doubling_k: Boundary
@@ -245,11 +245,7 @@ def draw_boundaries(curves: BoundaryCurves) -> Figure:
 def _draw(ax: Axes, curves: BoundaryCurves, plane: str, zoom: bool) -> None:
     low, high = K_RANGE if plane == "k" else C_RANGE
     levels = np.linspace(low, high, 400)
-    short, long, fold = (
-        (curves.doubling_k, curves.touch_k, curves.fold_k)
-        if plane == "k"
-        else (curves.doubling_c, curves.touch_c, curves.fold_c)
-    )
+    short, long, fold = (getattr(curves, f"{x}_{plane}") for x in ("doubling", "touch", "fold"))
     birth = plane_points(curves.birth_c)
     if plane == "k":
         born = birth_without_damping(curves)

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..flow import Run
-from .motions import Case, closed_form, half_turn_states, run_of, sampled
+from .motions import Case, closed_form, half_turn_states, last_minima, run_of, sampled
 
 CONFIRMED, UNDAMPED_ONLY, CONTRADICTED = "confirmed", "confirmed undamped only", "contradicted"
 PARTLY = "confirmed in part"
@@ -189,8 +189,7 @@ def _settles(cases) -> Claim:
     case, damped = cases
     on_long = _settling(case.from_rest, case.from_long, 2, case.long_shift)
     on_short = _settling(damped.from_rest, damped.on_short, 1, 0)
-    minima = sorted(np.asarray(case.from_rest.y_min)[-2:].tolist())
-    last = sorted(np.asarray(damped.from_rest.y_min)[-2:].tolist())
+    minima, last = last_minima(case.from_rest), last_minima(damped.from_rest)
     return Claim(
         "settles on the 4π motion",
         "Fig. 3 b, c",
@@ -312,7 +311,7 @@ def _maximum(cases, panels: list[dict]) -> Claim:
 
 
 def _minimum(cases) -> Claim:
-    simulated = {case.name: float(np.asarray(case.from_rest.y_min)[-2:].min()) for case in cases}
+    simulated = {case.name: last_minima(case.from_rest)[0] for case in cases}
     analysis = {case.name: float(case.short.y_min[0]) for case in cases}
     apart = {name: abs(simulated[name] - analysis[name]) for name in simulated}
     return Claim(

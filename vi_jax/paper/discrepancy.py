@@ -24,7 +24,7 @@ class Row(NamedTuple):
     """One motion that a sweep keeps to over neighbouring ζ."""
 
     part: np.ndarray
-    """Indices into ζ."""
+    """Indices into the values of ζ."""
     cycles: int
     """Period in drive cycles; 0 for none found."""
     impacts: float
@@ -34,7 +34,7 @@ class Row(NamedTuple):
 
     @property
     def motion(self) -> str:
-        """In words."""
+        """Its period and impacts in words, or what it is without a period."""
         if not self.cycles:
             if self.exponent > _CHAOS:
                 return "chaotic"
@@ -122,6 +122,16 @@ def _panel(found: Response, system: System) -> dict[str, Any]:
         ],
         "sweeps": directions,
     }  # fmt: skip
+
+
+def shares(sweep: dict[str, Any]) -> tuple[float, float]:
+    """Which parts of a sweep of a panel are on the 4π motion with one impact, and on any of period
+    4π, each from 0 to 1."""
+    one, four = (
+        sum(m["values"] for m in sweep["motions"] if fits(m["motion"])) / sweep["values"]
+        for fits in (lambda x: x == "4π, 1 impact", lambda x: x.startswith("4π"))
+    )
+    return one, four
 
 
 def _motion(system: System, at: Sweep, ratios: np.ndarray, row: Row) -> dict[str, Any]:

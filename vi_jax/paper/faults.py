@@ -32,19 +32,17 @@ def check_faults() -> list[Fault]:
     ]  # fmt: skip
 
 
-def _groups() -> tuple[Parameters, float, float]:
-    table = Parameters()
-    drive: Any = table.scene().drive
-    return table, float(drive.coupling), float(drive.slider_inertia)
+def _groups() -> dict[str, float]:
+    """ε and μ of Table 1's machine, as arguments of `energy_drift`."""
+    drive: Any = Parameters().scene().drive
+    return {"coupling": float(drive.coupling), "slider_inertia": float(drive.slider_inertia)}
 
 
 def _inertia_term() -> Fault:
-    table, coupling, inertia = _groups()
-    a = float(table.crank_radius)
-    right = energy_drift(coupling=coupling, slider_inertia=inertia)
-    metres, radii = (
-        energy_drift(coupling=coupling, slider_inertia=inertia, printed_inertia=value)
-        for value in (inertia / a, inertia)
+    groups, a = _groups(), float(Parameters().crank_radius)
+    inertia = groups["slider_inertia"]
+    right, metres, radii = (
+        energy_drift(**groups, printed_inertia=value) for value in (0.0, inertia / a, inertia)
     )
     return Fault(
         1,
@@ -64,12 +62,10 @@ def _inertia_term() -> Fault:
 
 
 def _coupling() -> Fault:
-    table, coupling, inertia = _groups()
-    share = float(table.damping) / float(table.stiffness)
-    right = energy_drift(coupling=coupling, slider_inertia=inertia)
-    printed = energy_drift(
-        coupling=coupling, slider_inertia=inertia, printed_coupling=share * coupling
-    )
+    table, groups = Parameters(), _groups()
+    share, coupling = float(table.damping) / float(table.stiffness), groups["coupling"]
+    right = energy_drift(**groups)
+    printed = energy_drift(**groups, printed_coupling=share * coupling)
     return Fault(
         2,
         "Eq. 1, 5, 7, 9, drive equation",
@@ -165,9 +161,7 @@ def period_doubling_damping() -> float:
     """The damping c (N·s/m) at which a multiplier of the 2π motion of Figure 3 crosses -1."""
 
     def excess(c):
-        ratio = Parameters(damping=c).scene(drive="ideal").damping_ratio
-        multipliers = orbits(figure_scene(ratio), cycles=1).multipliers[0]
-        return jnp.min(multipliers.real) + 1  # negative while it is below -1
+        return jnp.min(_multipliers(c).real) + 1  # negative while it is below -1
 
     @jax.jit
     def bisect():
@@ -182,13 +176,15 @@ def period_doubling_damping() -> float:
     return float(bisect())
 
 
+def _multipliers(c: Any) -> Any:
+    """Those of the 2π motion of Figure 3 with the damping c (N·s/m)."""
+    ratio = Parameters(damping=c).scene(drive="ideal").damping_ratio
+    return orbits(figure_scene(ratio), cycles=1).multipliers[0]
+
+
 def _damping() -> Fault:
-    largest = {}
     table = float(Parameters().damping)
-    for c in (0.0, table):
-        ratio = float(Parameters(damping=c).scene(drive="ideal").damping_ratio)
-        multipliers = np.asarray(orbits(figure_scene(ratio), cycles=1).multipliers[0])
-        largest[f"{c:g}"] = float(np.abs(multipliers).max())
+    largest = {f"{c:g}": float(np.abs(np.asarray(_multipliers(c))).max()) for c in (0.0, table)}
     crossing = period_doubling_damping()
     with_zero, with_table = largest["0"], largest[f"{table:g}"]
     return Fault(

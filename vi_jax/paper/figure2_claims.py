@@ -3,20 +3,25 @@
 import numpy as np
 
 from .claims import CONFIRMED, CONTRADICTED, PARTLY, Claim
+from .discrepancy import shares
 from .response import Response
 
 
 def check_figure_2(found: Response, panels: list[dict]) -> list[Claim]:
     """Each claim about the whole of Figure 2.
 
-    **Arguments:** what was computed for the figure, and its panels as `describe` puts them.
+    **Arguments:** what was computed for the figure, and its panels as `describe` gives them.
     """
     return [_free(found), _everywhere(panels), _reason(panels), _wall(found.wall, panels)]
 
 
-def _named(panel: dict, sweep: str) -> str:
-    damping = "damped" if panel["damping_ratio"] else "undamped"
-    return f"k = {panel['restitution']:g}, {damping}, {sweep}"
+def _sweeps(panels: list[dict]) -> dict[str, dict]:
+    """The sweeps of all panels, by their panel and direction in words."""
+    return {
+        f"k = {panel['restitution']:g}, {'' if panel['damping_ratio'] else 'un'}damped, {name}": at
+        for panel in panels
+        for name, at in panel["sweeps"].items()
+    }
 
 
 def _free(found: Response) -> Claim:
@@ -46,11 +51,7 @@ def _free(found: Response) -> Claim:
 
 
 def _everywhere(panels: list[dict]) -> Claim:
-    apart = {
-        _named(panel, name): (at["apart"], at["values"])
-        for panel in panels
-        for name, at in panel["sweeps"].items()
-    }
+    apart = {name: (at["apart"], at["values"]) for name, at in _sweeps(panels).items()}
     some, all_ = (sum(x[i] for x in apart.values()) for i in (0, 1))
     lines = "; ".join(
         f"k = {panel['restitution']:g}, ξ = {panel['damping_ratio']:.3f}: "
@@ -71,14 +72,10 @@ def _everywhere(panels: list[dict]) -> Claim:
 
 def _reason(panels: list[dict]) -> Claim:
     numbers, described = {}, []
-    for panel in panels:
-        for name, at in panel["sweeps"].items():
-            one, four = (
-                sum(m["values"] for m in at["motions"] if fits(m["motion"])) / at["values"]
-                for fits in (lambda x: x == "4π, 1 impact", lambda x: x.startswith("4π"))
-            )
-            numbers[_named(panel, name)] = {"4pi_one_impact": one, "any_4pi": four}
-            described.append(f"{_named(panel, name)} {one:.0%} and {four:.0%}")
+    for name, at in _sweeps(panels).items():
+        one, four = shares(at)
+        numbers[name] = {"4pi_one_impact": one, "any_4pi": four}
+        described.append(f"{name} {one:.0%} and {four:.0%}")
     return Claim(
         "the reason is a motion of period 4π",
         "Results, conclusion",
@@ -92,13 +89,12 @@ def _reason(panels: list[dict]) -> Claim:
 
 def _wall(wall: float, panels: list[dict]) -> Claim:
     numbers = {
-        _named(panel, name): {
+        name: {
             "values": at["values"],
             "analysis_clear": at["analysis_clear_of_the_wall"],
             "sweep_reaches": at["sweep_reaches_the_wall"],
         }
-        for panel in panels
-        for name, at in panel["sweeps"].items()
+        for name, at in _sweeps(panels).items()
     }
     described = "; ".join(
         f"{name} {x['sweep_reaches']} of {x['values']}" for name, x in numbers.items()

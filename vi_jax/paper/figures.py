@@ -15,7 +15,7 @@ from ..plot.stamp import stamp
 from .motions import Case
 
 _DPI = 110
-# A simulated motion, whose regime is what the picture is to show.
+# Colour of a simulated motion: neutral, as its regime is what the picture is to show.
 _INK = "0.2"
 
 # Under this name a picture keeps what it shows.
@@ -35,16 +35,21 @@ def draw_figure(number: int, cases: tuple[Case, Case], path: Path) -> None:
     for row, case in zip(grid, cases, strict=True):
         _draw_row(number, case, list(row))
     figure.suptitle(_title(number), fontsize=13)
-    # The undamped panels have every curve.
-    named = [ax.get_legend_handles_labels() for ax in grid[0, :2]]
-    handles, labels = (list(named[0][i]) + list(named[1][i]) for i in (0, 1))
-    figure.legend(handles, labels, loc="outside lower center", ncols=7, frameon=False, fontsize=11)
+    common_legend(figure, grid[0, :2], ncols=7)  # the undamped panels have every curve
     save_picture(figure, path, dpi=_DPI, colors=64)
     stamp(path, DRAWN, json.dumps(drawn_numbers(number, cases)))
 
 
+def common_legend(figure: Figure, axes: np.ndarray, *, ncols: int) -> None:
+    """One legend below the figure with the entries of all these axes."""
+    named = [pair for ax in axes for pair in zip(*ax.get_legend_handles_labels(), strict=True)]
+    handles, labels = zip(*named, strict=True)
+    look = {"loc": "outside lower center", "frameon": False, "fontsize": 11}
+    figure.legend(handles, labels, ncols=ncols, **look)
+
+
 def drawn_numbers(number: int, cases: tuple[Case, Case]) -> dict[str, list[float]]:
-    """What tells a picture of other numbers: minima of the first cycles and of the closed forms."""
+    """What a picture is recognised by: minima of the first cycles and of the closed forms."""
     numbers = {}
     for case in cases:
         run = case.from_rest if number == 3 else case.from_fit

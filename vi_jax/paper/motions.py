@@ -113,6 +113,11 @@ def sampled(run: Run) -> tuple[np.ndarray, np.ndarray, int]:
     return Y, V, Y.shape[1]
 
 
+def last_minima(run: Run) -> list[float]:
+    """The smallest Y of each of the last two cycles, the smaller one first."""
+    return sorted(np.asarray(run.y_min)[-2:].tolist())
+
+
 def closed_form(case: Case, cycles: int, period: int) -> np.ndarray:
     """Y of the 2π (`period` 1) or 4π (2) closed form, sampled, tiled over cycles of Figure 3."""
     run, shift = (case.on_short, 0) if period == 1 else (case.from_long, case.long_shift)

@@ -16,6 +16,7 @@ from ..orbit import Orbit, find_orbit
 from ..orbit.results import trimmed
 from ..plot.colors import STOP, color_of
 from ..plot.motion import angle_axis
+from .figures import common_legend
 from .motions import CYCLES, FREQUENCY_RATIO, RESTITUTION, SAMPLES, figure_scene
 from .orbits import TableRow, orbits
 
@@ -33,11 +34,11 @@ class MotorRun(NamedTuple):
     """What the machine of Figures 3 and 4 does with one motor; lengths in units of a."""
 
     torque: float
-    """T0 (N·m)."""
+    """T0, the stall torque at κ = 1 (N·m)."""
     kappa: float
     """κ, tuned so that the 4π motion has ζ = 0.90."""
     orbit: Orbit
-    """That motion."""
+    """The 4π motion with this motor."""
     from_rest: Run
     """200 cycles from Y = V = 0 and the no-load speed."""
     from_long: Run
@@ -52,7 +53,7 @@ class MotorRun(NamedTuple):
 
 
 class Motors(NamedTuple):
-    """All that is measured with motors."""
+    """All that is measured with the motors of Table 1."""
 
     rows: list[TableRow]
     runs: list[MotorRun]
@@ -66,7 +67,7 @@ def _machine(torque: Any, kappa: Any, k: Any, c: Any) -> Scene:
 
 @eqx.filter_jit
 def _searched(cycles: int, lanes: Any, kappa: Any, guess: Any) -> Orbit:
-    """One search for each row of (T0, k, c)."""
+    """One orbit for each row of `lanes`, which holds (T0, k, c)."""
 
     def one(lane, kappa, guess):
         torque, k, c = lane
@@ -163,9 +164,7 @@ def draw_motors(motors: Sequence[MotorRun], ideal: Run) -> Figure:
             ax.grid(alpha=0.25, lw=0.5)
     grid[0, 0].set_ylabel("Y = y/a")
     grid[1, 0].set_ylabel("crank speed dφ/dτ (ω)")
-    named = [ax.get_legend_handles_labels() for ax in grid[:, 0]]
-    handles, labels = (list(named[0][i]) + list(named[1][i]) for i in (0, 1))
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False, fontsize=11)
+    common_legend(figure, grid[:, 0], ncols=4)
     figure.suptitle(
         f"Figures 3 and 4 with the motor: the last 8π of {CYCLES} cycles from rest "
         "(k = 0.50, undamped, Δ = 2a, mean ζ = 0.90)"

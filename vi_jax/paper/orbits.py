@@ -11,7 +11,7 @@ from ..orbit import Gradient, Orbit, closed_form_orbits, find_orbit
 # How wrong the fit's guess is, and how well it must do: no transient is to be seen afterwards.
 _WRONG, _FITTED = 0.05, 1e-10
 
-# Compiled once for each period; every number is one of the scene.
+# Compiled once for each period, as every number is one of the scene's.
 orbits = eqx.filter_jit(closed_form_orbits)
 
 

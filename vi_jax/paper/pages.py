@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 from ..orbit import ORBIT_RESULTS
 from .claims import Claim
+from .discrepancy import shares
 from .faults import Fault
 from .motions import FREQUENCY_RATIO, GAP, RESTITUTION, Case
 from .motors import Motors
@@ -12,7 +13,7 @@ from .orbits import TableRow, mean_ratio
 
 
 class Findings(NamedTuple):
-    """All that the report tells; what a quick one leaves out is `None`."""
+    """All that the report says; what a quick one leaves out is `None`."""
 
     cases: tuple[Case, Case]
     claims: list[Claim]
@@ -61,8 +62,13 @@ def _orbit(orbits) -> dict:
         "exists": True,
         "admissible": bool(orbits.admissible[0]),
         **{name: float(getattr(orbits, name)[0]) for name in names},
-        "multipliers": [[float(m.real), float(m.imag)] for m in orbits.multipliers[0]],
+        "multipliers": _pairs(orbits.multipliers[0]),
     }
+
+
+def _pairs(numbers) -> list[list[float]]:
+    """Real and imaginary part of each."""
+    return [[float(x.real), float(x.imag)] for x in numbers]
 
 
 def _found(row: TableRow) -> dict:
@@ -79,7 +85,7 @@ def _found(row: TableRow) -> dict:
         "y_min": float(orbit.y_min),
         "impact_phase": [float(x) for x in orbit.impact_phase],
         "impact_speed": [float(x) for x in orbit.impact_speed],
-        "multipliers": [[float(m.real), float(m.imag)] for m in orbit.multipliers],
+        "multipliers": _pairs(orbit.multipliers),
         "stable": bool(orbit.stable),
         "residual": float(orbit.residual),
     }
@@ -154,13 +160,8 @@ def _response(panels: dict[str, Any]) -> list[str]:
             )
             k, xi = panel["restitution"], panel["damping_ratio"]
             lines.append(f"| {k:g} | {xi:.4f} | {name} | {described} |")
-            one = sum(m["values"] for m in at["motions"] if m["motion"] == "4π, 1 impact")
-            four = sum(m["values"] for m in at["motions"] if m["motion"].startswith("4π"))
-            explained.append((k, xi, name, one / at["values"], four / at["values"]))
-    share = "; ".join(
-        f"k = {k:g}, ξ = {xi:.3f}, {name}: {one:.0%} and {four:.0%}"
-        for k, xi, name, one, four in explained
-    )
+            one, four = shares(at)
+            explained.append(f"k = {k:g}, ξ = {xi:.3f}, {name}: {one:.0%} and {four:.0%}")
     return [
         *lines,
         "",
@@ -168,7 +169,7 @@ def _response(panels: dict[str, Any]) -> list[str]:
         "the 2π motion is unstable, and over a part of the stretch the motion is the one of period "
         "4π with one impact that the paper names. Over the rest it has other impacts, other "
         "periods, or none. Shares of the stretch on the 4π motion with one impact, and on any of "
-        f"period 4π: {share}.",
+        f"period 4π: {'; '.join(explained)}.",
         "",
     ]
 

@@ -11,7 +11,7 @@ from ..flow import Adaptive, simulate
 from ..machine import AbstractMachine, RigidStop, TimedMotorState
 
 
-class CoastingScene(AbstractMachine):
+class CoastingMachine(AbstractMachine):
     """The machine without motor, damping and loss at the stop (T0 = 0, c = 0, k = 1), in time τ.
 
     Its drive equation is Eq. 1 for u = cos φ with two switches, so that the right form and the
@@ -22,7 +22,7 @@ class CoastingScene(AbstractMachine):
     coupling: Float[Array, "..."]
     """Coefficient of the spring's reaction in the drive equation (dimensionless)."""
     slider_inertia: Float[Array, "..."]
-    """μ (dimensionless)."""
+    """μ, the inertia of the slider over that of the shaft (dimensionless)."""
     printed_inertia: Float[Array, "..."]
     """Coefficient of φ'² u''(φ) in place of μ u'(φ) u''(φ); 0 for the right equation."""
 
@@ -32,7 +32,7 @@ class CoastingScene(AbstractMachine):
         return 2 * pi
 
     def field(self, s: Float[Array, ""], state: TimedMotorState) -> TimedMotorState:
-        """d(Y, V, W, φ)/dτ."""
+        """d(state)/dτ of the state (Y, V, W, φ)."""
         sine, cosine = jnp.sin(state.phase), jnp.cos(state.phase)
         right = self.slider_inertia * sine * cosine
         factor = jnp.where(self.printed_inertia > 0, -self.printed_inertia * cosine, right)
@@ -50,15 +50,15 @@ def energy(state: Any, *, coupling: float, slider_inertia: float) -> np.ndarray:
 
 def energy_drift(
     *, coupling: float, slider_inertia: float, printed_coupling: float | None = None,
-    printed_inertia: float = 0.0, cycles: int = 20,
+    printed_inertia: float = 0.0,
 ) -> float:  # fmt: skip
-    """Greatest |E/E(0) - 1| of a coasting run over some natural periods (k = 1, d = 2).
+    """Greatest |E/E(0) - 1| of a coasting run over 20 natural periods (k = 1, d = 2).
 
     **Arguments:** ε and μ of the machine, which make the energy; the coefficients that the drive
     equation is integrated with, if they are others.
     """
     coefficient = coupling if printed_coupling is None else printed_coupling
-    scene = CoastingScene(
+    machine = CoastingMachine(
         stops=(RigidStop(2.0, 1.0),),
         coupling=jnp.asarray(coefficient, float),
         slider_inertia=jnp.asarray(slider_inertia, float),
@@ -66,7 +66,7 @@ def energy_drift(
     )
     start = TimedMotorState(*(jnp.asarray(x, float) for x in (0.0, 0.0, 0.9, 0.0)))
     run = simulate(
-        scene, start, cycles, method=Adaptive(rtol=1e-12), samples=16, throw=True,
+        machine, start, 20, method=Adaptive(rtol=1e-12), samples=16, throw=True,
         record="sections",
     )  # fmt: skip
     assert run.samples is not None

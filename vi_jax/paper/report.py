@@ -64,8 +64,8 @@ def reproduce(
 
     **Arguments:** the folder to write into, made if it is missing; `quick` for fewer cycles and
     samples, without Figure 2, the boundaries and the motors; `progress`, called as each step
-    begins with its name and about how many seconds there are left, as far as those before it tell.
-    The numbers need double precision (`jax.config.update("jax_enable_x64", True)`), which the
+    begins with its name and about how many seconds there are left, estimated from the steps before
+    it. The numbers need double precision (`jax.config.update("jax_enable_x64", True)`), which the
     command line turns on.
 
     **Returns:** the claims, the faults, and the files in the order in which they were written:
@@ -86,7 +86,7 @@ def reproduce(
 
 
 def _countdown(quick: bool, progress: Progress | None) -> Callable[[str], None]:
-    """What tells that a step begins, and how long this machine will take from there on."""
+    """A function that reports the step that begins, and how long this computer takes from there."""
     steps = [step for step in _STEPS if not (quick and step in _NOT_QUICK)]
     begin = time.perf_counter()
 
@@ -103,7 +103,7 @@ def _countdown(quick: bool, progress: Progress | None) -> Callable[[str], None]:
 def _measured(
     out: Path, files: list[Path], motors: Future[Motors] | None, tell: Callable[[str], None]
 ) -> Findings:
-    """All work but the report's; without motors the quick one. Pictures are added to `files`."""
+    """All work but the report's; quick if `motors` is `None`. Pictures are added to `files`."""
 
     def keep(name: str, figure: Figure, **look: Any) -> None:
         files.append(save_picture(figure, out / name, **look))

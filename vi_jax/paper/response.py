@@ -1,9 +1,9 @@
 """Figure 2: smallest and largest Y over ζ, by closed form, by continuation and by sweeps."""
 
+import dataclasses
 from functools import partial
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -12,13 +12,7 @@ import numpy as np
 from ..flow import jit
 from ..machine import RigidStop, Scene
 from ..machine.numbers import with_leaf
-from ..orbit import (
-    Branch,
-    ClosedFormOrbits,
-    closed_form_orbits,
-    continue_orbit,
-    find_orbit,
-)
+from ..orbit import Branch, ClosedFormOrbits, closed_form_orbits, continue_orbit, find_orbit
 from ..scan import REGIMES, Sweep, lyapunov, sweep
 from .motions import GAP, table_damping_ratio
 
@@ -33,7 +27,7 @@ WALL = -2.5
 FINE = (0.695, 1.015)
 # Periods of more cycles than this are not looked for.
 LONGEST = 12
-# Lanes of the programs that look at single values again; another number would be another program.
+# Lanes of the programs that settle single values again; one number, so that there is one program.
 _LANES = 128
 
 
@@ -49,22 +43,22 @@ class System(NamedTuple):
     stretch: tuple[float, float]
     """ζ of BB' and CC': birth and period doubling of the 2π impact motion."""
     sweeps: dict[str, Sweep]
-    """"run-up" and "close-down"."""
+    """The sweeps of rising and of falling ζ, by the names "run-up" and "close-down"."""
     exponents: dict[str, np.ndarray]
     """Largest Lyapunov exponent per drive cycle where a sweep has no period, else NaN."""
 
 
 class Response(NamedTuple):
-    """Everything in Figure 2."""
+    """All curves and marks of Figure 2."""
 
     ratios: np.ndarray
-    """ζ, rising."""
+    """The values of ζ that were swept through, in rising order."""
     systems: list[System]
     """For each k of `RESTITUTIONS` the undamped one and the one with Table 1's damping."""
     wall: float
     """Y of the second stop below, which the paper only draws."""
     walled: list[System]
-    """The undamped sweeps again with that stop, for each k, where they were asked for."""
+    """The undamped sweeps again with that stop, for each k, if they were wanted."""
 
 
 def response(*, quick: bool = False, wall: float = WALL, walled: bool = False) -> Response:
@@ -94,14 +88,10 @@ def response(*, quick: bool = False, wall: float = WALL, walled: bool = False) -
         systems.append(System(k, xi, forms, branches, stretch, sweeps, exponents))
     fenced_off = []
     if walled:
-        fenced = eqx.tree_at(
-            lambda s: s.stops,
-            scene,
-            (*scene.stops, RigidStop(-wall, 0.5, side="left")),
-            is_leaf=lambda x: isinstance(x, tuple),
-        )
+        stops = (*scene.stops, RigidStop(-wall, 0.5, side="left"))
+        fenced = dataclasses.replace(scene, stops=stops)
         bare = [system for system in systems if not system.damping_ratio]
-        part = (ratios >= FINE[0]) & (ratios <= FINE[1])
+        part = stepped_finely(ratios)
         again = _sweeps(
             fenced, [(s.restitution, 0.0) for s in bare], ratios[part], [s.closed for s in bare],
             part=part,
@@ -110,6 +100,11 @@ def response(*, quick: bool = False, wall: float = WALL, walled: bool = False) -
             forms = {n: jtu.tree_map(lambda x: x[part], system.closed[n]) for n in system.closed}
             fenced_off.append(system._replace(closed=forms, sweeps=sweeps, exponents=exponents))
     return Response(ratios, systems, wall, fenced_off)
+
+
+def stepped_finely(ratios: np.ndarray) -> np.ndarray:
+    """Which of the ζ lie where it is stepped through more finely, as booleans."""
+    return (ratios >= FINE[0]) & (ratios <= FINE[1])
 
 
 def with_numbers(scene: Scene, k: Any, xi: Any, ratio: Any) -> Any:
@@ -205,8 +200,8 @@ def _sweeps(
     flat = jtu.tree_map(lambda x: np.array(x).reshape(-1, *x.shape[2:]), found)
     pairs, values = np.repeat(pairs, len(ratios), axis=0), values.ravel()
     for _ in range(2):
-        unclear = (flat.period == REGIMES.unsettled) | (flat.period > 2)
-        _again(scene, flat, pairs, values, np.flatnonzero(unclear))
+        unsure = (flat.period == REGIMES.unsettled) | (flat.period > 2)
+        _again(scene, flat, pairs, values, np.flatnonzero(unsure))
     exponents = np.full(len(values), np.nan)
     for some in _chunks(np.flatnonzero(flat.period == REGIMES.unsettled)):
         ends = jtu.tree_map(lambda x, some=some: x[some, -1], flat.sections)
@@ -227,9 +222,9 @@ def _sweeps(
     return results
 
 
-def _again(scene: Scene, flat: Sweep, pairs: np.ndarray, values: np.ndarray, going) -> None:
-    """Settle these values for another 1,000 cycles, in place."""
-    for some in _chunks(going):
+def _again(scene: Scene, flat: Sweep, pairs: np.ndarray, values: np.ndarray, which) -> None:
+    """Settle the values of these indices for another 1,000 cycles, and put the results in place."""
+    for some in _chunks(which):
         ends = jtu.tree_map(lambda x, some=some: x[some, -1], flat.sections)
         later = _carried(scene, pairs[some], values[some][:, None], ends, 1000)
 

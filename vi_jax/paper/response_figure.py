@@ -14,9 +14,9 @@ from ..plot.colors import MORE_IMPACTS, STOP, color_of, mark_of, paler
 from ..scan import REGIMES
 from .discrepancy import between, rows
 from .motions import GAP
-from .response import FINE, RANGE, RESTITUTIONS, Response, System
+from .response import RANGE, RESTITUTIONS, Response, System, stepped_finely
 
-# What `save_picture` makes a small file of it with.
+# Arguments with which `save_picture` makes a small file of it.
 LOOK = {"dpi": 72, "colors": 250}
 
 # Width of a closed form, which is seen on both sides of what lies on it.
@@ -47,9 +47,9 @@ def draw_response(found: Response) -> Figure:
             _zoom(grid[2 + row, column], found.ratios, system, colors, found.wall)
             grid[2 + row, column].set_title(f"k = {k:g}, {title}, enlarged", fontsize=11)
         if found.walled:
-            part = (found.ratios >= FINE[0]) & (found.ratios <= FINE[1])
             ax, system = grid[4, column], found.walled[column]
-            _zoom(ax, found.ratios[part], system, colors, found.wall, solid=True)
+            fine = found.ratios[stepped_finely(found.ratios)]
+            _zoom(ax, fine, system, colors, found.wall, solid=True)
             ax.set_title(f"k = {k:g}, undamped, second stop at Y = {found.wall:g}", fontsize=11)
     for ax, row in zip(grid.T.ravel(), list(range(count)) * 2, strict=True):
         ax.grid(alpha=0.25, lw=0.5)
@@ -93,7 +93,8 @@ def _colors(found: Response) -> dict[str, str]:
         "no period found": color_of(REGIMES.unsettled),
     }
     names = set()
-    for ratios, systems in ((found.ratios, found.systems), (_fine(found.ratios), found.walled)):
+    fine = found.ratios[stepped_finely(found.ratios)]
+    for ratios, systems in ((found.ratios, found.systems), (fine, found.walled)):
         for system in systems:
             for name in system.sweeps:
                 names |= {r.motion for r in rows(system, name, between(system, ratios))}
@@ -101,10 +102,6 @@ def _colors(found: Response) -> dict[str, str]:
         names.add("other period")
     names |= {"2π, 1 impact", "4π, 1 impact", "4π, 2 impacts"}  # the lines'
     return {name: color for name, color in fixed.items() if name in names}
-
-
-def _fine(ratios: np.ndarray) -> np.ndarray:
-    return ratios[(ratios >= FINE[0]) & (ratios <= FINE[1])]
 
 
 def _closed_curves(ax: Axes, ratios: np.ndarray, system: System) -> None:
@@ -134,7 +131,7 @@ def _free(ax: Axes, system: System) -> None:
 
 
 def _lines(ax: Axes, system: System) -> None:
-    """BB' and CC'."""
+    """Draw the lines BB' and CC', and their names."""
     for letter, place in zip("BC", system.stretch, strict=True):
         ax.axvline(place, color="0.25", lw=1.0, ls=(0, (6, 3)))
         ax.text(

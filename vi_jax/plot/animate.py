@@ -20,15 +20,15 @@ from .._checks import count, flag, given_number, instance_of, unwritable
 from .._files import write_whole
 from .._renamed import renamed
 from ..flow import Run
-from ..machine import AbstractMachine, Scene
+from ..machine import AbstractMachine
 from ..orbit import Orbit
 from .colors import BLUE, RED
-from .motion import plot_history
+from .motion import counts_by_angle, plot_history
 from .path import motion_path
 from .pen import Pen
 from .schematic import reach_of, size_of, sketch
 
-# Samples of a cycle that an orbit is drawn with, and how long a cycle takes to look at.
+# Samples of a cycle that an orbit is drawn with; seconds that a cycle takes, and most in all.
 _SAMPLES, _UNHURRIED, _LONGEST = 128, 2.5, 12.0
 # Frames by which the room that a drawing takes is measured.
 _MEASURED = 12
@@ -38,7 +38,7 @@ _ENDINGS = (".gif", ".mp4", ".html")
 
 
 class _Frames(NamedTuple):
-    """What is drawn, one row for each frame."""
+    """What is drawn, one row for each frame: cycles, states, and positions by coordinate."""
 
     cycles: np.ndarray
     states: Any
@@ -64,14 +64,14 @@ def animate(
 
     - `motion`: a `Run` simulated with `samples=...` (and `impact_log=...`, so that impacts are met
       where they are), or an `Orbit`, of which one period is drawn.
-    - `machine`: the machine; needed for a run, and left out for an orbit, which knows its own. How
-      it is drawn is told at `plot_sketch`.
+    - `machine`: the machine; needed for a run, and left out for an orbit, which has its own. How it
+      is drawn: see `plot_sketch`.
     - `window`: the first and the last cycle to draw.
-    - `seconds`: how long it lasts; by default 2.5 s a cycle, up to 12 s.
-    - `fps`: frames a second.
+    - `seconds`: how long it lasts; by default 2.5 s per cycle, up to 12 s.
+    - `fps`: frames per second.
     - `history`: whether to draw the time history below.
-    - `figure`: an empty figure to draw into, one of pyplot's to see it in a window; by default one
-      of its own.
+    - `figure`: an empty figure to draw into, one of pyplot's to see it in a window; by default a
+      new one.
 
     **Returns:** a `MotionAnimation`, which is one of matplotlib's.
 
@@ -141,8 +141,8 @@ class MotionAnimation(animation.FuncAnimation):
         history: bool,
     ):  # fmt: skip
         self.fps = fps
-        """Frames a second."""
-        self._scene, self._frames = machine, frames
+        """Frames per second."""
+        self._machine, self._frames = machine, frames
         self._reach = reach_of(machine, frames.positions)
         self._above = Figure().subplots()
         self._limits = self._measured()
@@ -161,7 +161,7 @@ class MotionAnimation(animation.FuncAnimation):
         super().__init__(
             figure, self._draw, frames=len(frames.cycles), interval=1000 / fps, repeat=True
         )
-        # One that nobody looked at is no mistake.
+        # matplotlib warns of an animation that is never shown; here that is no mistake.
         self._draw_was_started = True
 
     def __len__(self) -> int:
@@ -185,7 +185,7 @@ class MotionAnimation(animation.FuncAnimation):
         return []
 
     def _sketched(self, index: int) -> None:
-        machine, frames = self._scene, self._frames
+        machine, frames = self._machine, self._frames
         state = jax.tree_util.tree_map(lambda x: jnp.asarray(x[index]), frames.states)
         turn = float(machine.turn)
         phase = float(machine.phase_at((frames.cycles[index] % 1.0) * turn))
@@ -206,7 +206,7 @@ class MotionAnimation(animation.FuncAnimation):
         return (box.x0 - wide, box.x1 + wide), (box.y0 - tall, box.y1 + tall)
 
     def _repr_html_(self) -> str:
-        """What a notebook shows."""
+        """The animation as HTML with controls, for notebooks."""
         return self.to_jshtml(fps=self.fps)
 
     def save(self, filename: str | Path, *args: Any, **options: Any) -> None:  # pyright: ignore
@@ -264,7 +264,7 @@ class _History:
     """The time history with what has passed drawn over it."""
 
     def __init__(self, ax: Axes, run: Run, machine: AbstractMachine, frames: _Frames):
-        unit = "angle" if isinstance(machine, Scene) else "cycles"
+        unit = "angle" if counts_by_angle(machine) else "cycles"
         ends = float(frames.cycles[0]), float(frames.cycles[-1])
         window = ends[0] - 1e-9, ends[1] + 1e-9
         plot_history(run, machine=machine, ax=ax, window=window, unit=unit, color="0.75", lw=1.2)
@@ -280,7 +280,7 @@ class _History:
         ax.spines[["top", "right"]].set_visible(False)
 
     def move(self, index: int) -> None:
-        """To this frame."""
+        """Draw the course up to the frame of this index."""
         place, Y = self._factor * self._frames.cycles[index], self._frames.positions[0, index]
         passed = self._place <= place
         self._line.set_data([*self._place[passed], place], [*self._Y[passed], Y])

@@ -15,7 +15,7 @@ from ..scan import Sweep
 from .colors import DASHES, MARKS, color_of, mark_style, once
 from .motion import new_axes
 
-# What a legend says of lines, and where dots lie: above lines and below the marks.
+# Names of lines in a legend, and where dots lie: above lines and below the marks.
 _STABLE, _UNSTABLE = "stable", "unstable"
 _DOTS = 3
 
@@ -37,10 +37,10 @@ def plot_branch(
 
     **Arguments:** the branch; `ax`, a new figure if left out; `y` and `x`, names of what is a
     number at each point, `Branch.column_names`: `"duration"`, `"section_Y"`, or an average of the
-    machine's such as `"power"` (`y` is by default the first of `"y_min"`, `"y_max"` that a stop
-    does not hold where it is); `special`, whether to mark the special points (where `y` is a number
-    of an orbit); `legend`, whether to draw one, which tells whose period and impacts a colour
-    stands for, or the branch's `label`, then what solid and dashed lines are, and the marks;
+    machine's such as `"power"` (`y` is by default the first of `"y_min"`, `"y_max"` that is
+    not fixed by a stop); `special`, whether to mark the special points (where `y` is a number
+    of an orbit); `legend`, whether to draw one: the period and the impacts that the colour
+    stands for (or the branch's `label`), what solid and dashed lines are, and the marks;
     options of `Axes.plot`.
 
     **Returns:** the axes.
@@ -51,7 +51,7 @@ def plot_branch(
     y = _moving(branch) if y is None else y
     across, up = _array(branch, "x", x), _array(branch, "y", y)
     ax = new_axes(ax)
-    # The points where stability changes are among the branch's: there it is rounding's.
+    # Points where stability changes are points of the branch: there rounding decides.
     inside = np.abs(branch.multipliers).max(axis=1) < 1 + 1e-6
     stable = inside[1:] & inside[:-1]
     label = style.pop("label", None)
@@ -143,7 +143,7 @@ def plot_sweep(
 def plot_boundary(curve: Boundary, *, ax: Axes | None = None, **style: Any) -> Axes:
     """A boundary curve in the plane of its two parameters.
 
-    Its colour is that of the motion's period, its dash tells what happens there: solid a grazing,
+    Its colour is that of the motion's period, its dash shows what happens there: solid a grazing,
     dashed a period doubling, dash-dotted a fold, dotted a loss of symmetry.
 
     **Arguments:** the curve; `ax`; options of `Axes.plot`.
@@ -165,8 +165,8 @@ def plot_boundary(curve: Boundary, *, ax: Axes | None = None, **style: Any) -> A
 def extreme_name(
     name: str, labels: tuple[str, str], units: Mapping[str, str], averages: Any = ()
 ) -> str:
-    """What an axis of smallest or greatest positions says, in the words of a machine; or one of the
-    machine's own averages."""
+    """The label of an axis of smallest or greatest positions, in the machine's words, or of an
+    average of the machine's own."""
     if name in averages:
         return in_brackets(f"mean {name}", unit_of(units, name))
     least = {"y_min": "min", "y_max": "max"}.get(name)

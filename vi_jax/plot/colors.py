@@ -1,9 +1,9 @@
-"""The colours of all pictures, told apart with any colour vision; the marks of special points.
+"""The colours of all pictures, distinct with any colour vision; the marks of special points.
 
 A colour stands for a period, and for the same period everywhere; what has no period is grey. They
 are of the sets of Okabe and Ito and of Paul Tol, put in such an order that each differs from those
 before it, in lightness too, as seen with normal and with each kind of dichromatic vision (a test
-measures by how much). Bifurcations are told by mark and dash, so that they need no colour.
+measures by how much). Bifurcations differ by mark and dash, so that they need no colour.
 """
 
 from collections.abc import Iterator
@@ -81,7 +81,7 @@ def shades(color: str) -> Iterator[str]:
 
 
 def paler(color: str, part: float | int = 0.45) -> str:
-    """So much of the colour, the rest white."""
+    """The colour mixed with white; `part` is the share of the colour, from 0 to 1."""
     return _hex(part * np.array(to_rgb(color)) + 1 - part)
 
 

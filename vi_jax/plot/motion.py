@@ -21,6 +21,11 @@ def new_axes(ax: Axes | None) -> Axes:
     return plt.subplots(figsize=(7, 3.5), layout="constrained")[1]
 
 
+def counts_by_angle(machine: AbstractMachine | None) -> bool:
+    """Whether a machine states its periods in crank angle, as the paper's does (and none given)."""
+    return machine is None or machine.period_of(1) == "2π"
+
+
 @renamed(scene="machine")
 def plot_history(
     motion: Run | Samples,
@@ -41,7 +46,7 @@ def plot_history(
     - `machine`: the machine, for its stops and for impacts logged in the run.
     - `ax`: axes to draw into; a new figure if left out.
     - `window`: the first and the last cycle to draw.
-    - `shift`: cycles to move the motion by along the axis.
+    - `shift`: cycles by which to move the motion along the axis.
     - `unit`: `"angle"` (crank angle φ in units of π) or `"cycles"`; by default the clock of the
       `machine`, which is the angle for the paper's machine and where no machine is given.
     - `stops`: whether to draw the stops.
@@ -49,7 +54,7 @@ def plot_history(
 
     **Returns:** the axes.
     """
-    turning = machine is None or machine.period_of(1) == "2π"
+    turning = counts_by_angle(machine)
     if unit is None:
         unit = "angle" if turning else "cycles"
     if unit not in ("angle", "cycles"):

@@ -1,4 +1,4 @@
-"""A sampled run as a path to draw, with its impacts put in between the samples."""
+"""A sampled run as a path to draw, with its impacts inserted between the samples."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -13,7 +13,7 @@ from ..orbit import Orbit
 
 
 def _coordinates(machine: AbstractMachine | None) -> tuple[Callable[[Any], Any], ...]:
-    """What the stops limit and its velocity, of a state; by default the names of the paper."""
+    """Position and velocity of states; without a machine their components `Y` and `V`."""
     if machine is not None:
         return jax.vmap(machine.position), jax.vmap(machine.velocity)
     return (lambda state: state.Y), (lambda state: state.V)
@@ -25,9 +25,9 @@ class MotionPath(NamedTuple):
     cycles: np.ndarray
     """Place on the drive's clock, in cycles since the start (crank angle over 2π)."""
     Y: np.ndarray
-    """Position (unit: a)."""
+    """Position: what the stops limit (unit: the machine's; a for a `Scene`)."""
     V: np.ndarray
-    """dY/dτ (unit: a ω)."""
+    """Velocity: what an impact reverses (unit: the machine's; a ω for a `Scene`)."""
 
 
 @renamed(scene="machine")
@@ -62,7 +62,7 @@ def motion_path(
         )
     except AttributeError:
         raise ValueError(
-            "Argument `machine` must be given, which says what is the position in a state without "
+            "Argument `machine` must be given, which says what the position is in a state without "
             "`Y` and `V`."
         ) from None
     if isinstance(motion, Run) and motion.impact_log is not None and machine is not None:

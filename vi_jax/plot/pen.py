@@ -14,7 +14,8 @@ Point = tuple[float, float]
 
 
 class Pen:
-    """Draws the parts of a machine; a machine's own `sketch(pen, state, phase)` is given one.
+    """Draws the parts of a machine; the method `sketch(pen, state, phase)` of a machine
+    gets one.
 
     Lengths are those of the machine's coordinate. `x` runs to the right and `y` upwards; `size` is
     a good size for a body.
@@ -32,7 +33,7 @@ class Pen:
         """Whether names are written beside the parts."""
 
     def label(self, x: float, y: float, text: str, **look: Any) -> None:
-        """A name at a place, where names are asked for."""
+        """A name at a place, if `labels` is true."""
         if self.labels:
             look = {"ha": "center", "va": "center", "fontsize": 11, "color": INK, **look}
             self.ax.text(x, y, text, **look)
@@ -68,7 +69,7 @@ class Pen:
         self.pin(x, y, filled=True)
 
     def pin(self, x: float, y: float, *, filled: bool = False) -> None:
-        """A joint."""
+        """A joint between two parts, open or filled."""
         self.ax.plot(x, y, "o", color=INK if filled else "white", mec=INK, ms=6, zorder=4)
 
     def wall(
@@ -121,7 +122,7 @@ class Pen:
         )  # fmt: skip
 
     def length(self, left: float, right: float, y: float, text: str, *, down: float) -> None:
-        """A length between two places, told below (`down` < 0) or above; only with labels."""
+        """A length between two places, named below (`down` < 0) or above; only with labels."""
         if not self.labels:
             return
         look = {"arrowstyle": "<->", "color": "0.3", "lw": 1.0, "shrinkA": 0, "shrinkB": 0}

@@ -1,4 +1,4 @@
-"""Pictures as small files."""
+"""Figures written as small PNG, PDF or SVG files."""
 
 from io import BytesIO
 from pathlib import Path
@@ -16,8 +16,7 @@ from .._files import write_whole
 ENDINGS = (".png", ".pdf", ".svg")
 """What the name of a picture may end in."""
 
-# Words stay words, which can be searched, copied and set in another face; and the same figure is
-# the same file.
+# Text stays text, which can be searched and copied; and the same figure gives the same file.
 _VECTORS: dict[Any, Any] = {"pdf.fonttype": 42, "svg.fonttype": "none", "svg.hashsalt": "vi_jax"}
 _UNDATED = {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
 

@@ -14,7 +14,7 @@ from matplotlib.patches import Patch
 
 from .._checks import flag
 from .._renamed import renamed
-from ..machine import AbstractMachine, Scene
+from ..machine import AbstractMachine
 from ..machine.numbers import by_name
 from ..machine.units import in_brackets, unit_of
 from ..orbit.results import impacts_in_words
@@ -33,7 +33,7 @@ _OTHERS = {
     **{int(regime): (regime.meaning, color) for regime, color in IRREGULAR.items()},
     _LEAST: ("not computed", look.NOT_COMPUTED),
 }
-# Motions told apart by their impacts: without any, with one or more than one in two cycles.
+# Added to a period, by impacts: none, one in two cycles, more than one in two cycles.
 _NONE, _ONE, _MORE = 100, 200, 300
 
 # Motions named one by one in the legend; further ones share its last line.
@@ -54,8 +54,8 @@ def plot_regimes(
 
     Each cell has the colour of its period, up to 8 drive cycles and beyond; chaotic, transiently
     chaotic, unsettled and failed lanes have greys of their own. Where the data hold `impacts`,
-    motions without any are paler, and motions of two cycles with one impact and with more are
-    told apart. The legend names what is there.
+    motions without any are paler, and motions of two cycles with one impact and with more have
+    different colours. The legend names what is there.
 
     **Arguments:** the data of a scan that measured `"regime"`; `machine`, whose words name the
     periods (left out: 2π and so on for a `Scene`, cycles for any other machine); `ax`, axes to draw
@@ -89,13 +89,13 @@ def plot_regimes(
     _image(ax, across, up, shown, [colors[i] for i in order])
     if legend:
         _legend(ax, list(zip(names, colors, strict=True)))
-    for name, told in ((x, ax.set_xlabel), (y, ax.set_ylabel)):
-        told(axis_name(name, {name: data[name].attrs.get("units", "")}))
+    for name, set_label in ((x, ax.set_xlabel), (y, ax.set_ylabel)):
+        set_label(axis_name(name, {name: data[name].attrs.get("units", "")}))
     return ax
 
 
 def _place(code: int) -> tuple[int, int]:
-    """Of a code in the legend: by period, and by impacts within one."""
+    """Place of a code in the legend: by period, and by impacts within one."""
     if code <= 0:
         return 1, list(_OTHERS).index(code)
     return 0, 1000 * (code % 100) + code
@@ -117,7 +117,7 @@ def _named(code: int, word: Callable[[int], str]) -> tuple[str, str]:
 
 
 def _word_of(data: xr.Dataset) -> Callable[[int], str]:
-    """How to call periods in these data, whose attributes tell the class of the machine."""
+    """What to call periods in these data, whose attributes hold the class of the machine."""
     about = str(data.attrs.get("machine", ""))
     if "CustomNode(" in about and "CustomNode(Scene[" not in about:
         return lambda cycles: f"{cycles} cycle{'' if cycles == 1 else 's'}"
@@ -173,23 +173,24 @@ def plot_basins(found: Basins, *, ax: Axes | None = None) -> Axes:
 
 
 def _start_name(machine: AbstractMachine | None, name: str) -> str:
-    """What an axis of starts says: the machine's words, with units, for what is a position or a
-    velocity; else the name alone."""
+    """The label of an axis of starts: the machine's words, with units, for what is a position or a
+    velocity; else the name, with its unit if the machine states one."""
     name = name.removeprefix("start.")
-    if isinstance(machine, Scene):
-        return in_brackets(f"{name} at the start", unit_of(machine.units, name))
+    if machine is None:
+        return f"{name} at the start"
+    by_its_name = in_brackets(f"{name} at the start", unit_of(machine.units, name))
     try:
-        start = None if machine is None else machine.start()
+        start = machine.start()
     except ValueError:  # a machine that has no start of its own
         start = None
-    if machine is not None and start is not None:
+    if start is not None:
         values = {key: float(i) + 2.5 for i, key in enumerate(by_name(start))}
         leaves = [jnp.asarray(value) for value in values.values()]
         probe = jtu.tree_unflatten(jtu.tree_structure(start), leaves)
         for read, words in zip((machine.position, machine.velocity), machine.labels, strict=True):
-            if float(read(probe)) == values[name]:
+            if float(read(probe)) == values[name] and not words.startswith(f"{name} = "):
                 return f"{words} at the start"
-    return f"{name} at the start"
+    return by_its_name
 
 
 def _basin_colors(found: Basins) -> list[str]:

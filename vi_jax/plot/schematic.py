@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 
 from .._checks import instance_of
 from .._renamed import renamed
-from ..machine import AbstractMachine, Scene
+from ..machine import AbstractMachine, Scene, ShaftMachine, SoftStop
 from ..machines import BouncingBall, Duffing, ImpactPair, UnbalancedRotor
 from .colors import GREEN, RED
 from .motion import new_axes
@@ -18,7 +18,7 @@ from .pen import Pen
 
 
 def sketch(machine: AbstractMachine, pen: Pen, state: Any, phase: float) -> None:
-    """Draw a machine in a state: as its own `sketch(pen, state, phase)` says, if it has one."""
+    """Draw a machine in a state: by its own `sketch(pen, state, phase)`, if it has one."""
     own = getattr(machine, "sketch", None)
     if own is not None:
         own(pen, state, phase)
@@ -40,7 +40,8 @@ def plot_sketch(
 
     - `machine`: the machine.
     - `state`: the state to draw; by default its own start.
-    - `phase`: the reading of its clock; for a `Scene` the crank angle φ, by default 0.3π.
+    - `phase`: the reading of its clock, by default 0; where a shaft turns its angle, by default
+      0.3π.
     - `ax`: axes to draw into; a new figure if left out.
 
     **Returns:** the axes.
@@ -48,7 +49,7 @@ def plot_sketch(
     instance_of("machine", machine, AbstractMachine, "a `Scene` or an `AbstractMachine`")
     state = machine.start() if state is None else machine.adopt(state)
     if phase is None:
-        phase = 0.3 * pi if isinstance(machine, Scene | UnbalancedRotor) else 0.0
+        phase = _shown_phase(machine)
     ax = new_axes(ax)
     reach = reach_of(machine, _positions(machine, state))
     sketch(machine, Pen(ax, reach=reach, size=size_of(machine, reach), labels=True), state, phase)
@@ -69,14 +70,31 @@ def _positions(machine: AbstractMachine, state: Any) -> np.ndarray:
 
 def reach_of(machine: AbstractMachine, positions: np.ndarray) -> float:
     """The largest distance from zero of these positions and of the stops."""
-    soft = machine.soft_stops if isinstance(machine, Scene) else ()
+    soft = [switch for switch in machine.switches if isinstance(switch, SoftStop)]
     stops = [abs(float(stop.place)) for stop in (*machine.stops, *soft)]
     return max(0.0, *map(float, np.abs(positions).ravel()), *stops) or 1.0
 
 
+@singledispatch
 def size_of(machine: AbstractMachine, reach: float) -> float:
-    """A good size for a body: the crank's for a machine, a share of the motion for others."""
-    return max(0.8, 0.25 * reach) if isinstance(machine, Scene) else 0.35 * reach
+    """A good size for a body, in the unit of its coordinate: a share of its motion."""
+    return 0.35 * reach
+
+
+@size_of.register
+def _(machine: Scene, reach: float) -> float:
+    return max(0.8, 0.25 * reach)  # beside a crank of radius 1
+
+
+@singledispatch
+def _shown_phase(machine: AbstractMachine) -> float:
+    """The reading of its clock at which a machine is drawn by default."""
+    return 0.0
+
+
+@_shown_phase.register
+def _(machine: ShaftMachine) -> float:
+    return 0.3 * pi  # the crank or the rotor turned out of line
 
 
 @singledispatch
@@ -212,7 +230,7 @@ def _(machine: ImpactPair, pen: Pen, state: Any, phase: float) -> None:
 
 
 def _supported(machine: AbstractMachine, pen: Pen, place: float) -> float:
-    """A body between its stops, on a spring and a damper from a post, which is told."""
+    """Draw a body between stops, on a spring and a damper from a post; return the post's place."""
     size = pen.size
     post, back = -pen.reach - 2.6 * size, place - size / 2
     pen.floor(post, pen.reach + 1.4 * size, -0.5 * size)

@@ -1,4 +1,4 @@
-"""Words kept inside of a PNG, such as the numbers that were drawn."""
+"""Text kept inside of a PNG, such as the numbers that were drawn."""
 
 from pathlib import Path
 
