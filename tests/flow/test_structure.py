@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import pytest
 import vi_jax as vi
 from headlines.jaxprs import primitives
-from vi_jax.lanes._program import Program
+from vi_jax.lanes._program import LaneProgram
 
 
 def carried(jaxpr) -> int:
@@ -13,7 +13,7 @@ def carried(jaxpr) -> int:
     sizes = [0]
     for equation in jaxpr.eqns:
         for parameter in equation.params.values():
-            if isinstance(parameter, Program):
+            if isinstance(parameter, LaneProgram):
                 sizes.append(len(parameter.carry_avals))
             inner = getattr(parameter, "jaxpr", parameter)
             if hasattr(inner, "eqns"):

@@ -15,7 +15,7 @@ import vi_jax
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from vi_jax import lanes
-from vi_jax.lanes import _code, _primitive, machine
+from vi_jax.lanes import _code, _primitive, runtime
 from vi_jax.lanes.runtime import thread_count
 
 ROWS = 12
@@ -363,7 +363,7 @@ def failing(*_):
 
 @pytest.mark.parametrize("fault", ["missing", "broken"])
 def test_without_llvm(fault, monkeypatch):
-    for cached in (_primitive._tell, _code.llvm, machine._register_bits):
+    for cached in (_primitive._tell, _code.llvm, runtime._register_bits):
         cached.cache_clear()
     if fault == "missing":
         monkeypatch.setitem(sys.modules, "llvmlite.binding", None)
@@ -374,7 +374,7 @@ def test_without_llvm(fault, monkeypatch):
             out = jax.vmap(lambda x: fall(x, 9.8125)[0][0])(jnp.linspace(1.0, 2.0, 5))
     finally:
         _code.llvm.cache_clear()
-        machine._register_bits.cache_clear()
+        runtime._register_bits.cache_clear()
     np.testing.assert_allclose(out, np.sqrt(2 * np.linspace(1, 2, 5) / 9.8125), rtol=1e-12)
 
 
@@ -393,7 +393,7 @@ def test_a_program_that_llvm_cannot_compile(monkeypatch):
 
 def test_programs_are_kept_where_jax_keeps_its_own(monkeypatch, tmp_path):
     def fallen():
-        kernel = machine.Kernel("define void @kernel() { ret void }", None, 8)
+        kernel = runtime.Kernel("define void @kernel() { ret void }", None, 8)
         return kernel._call
 
     monkeypatch.setattr(_code, "_store", lambda: tmp_path)
@@ -459,7 +459,7 @@ def test_programs_are_not_kept_for_ever():
     kernels(range(80, 240))
     after = maps.read_bytes().count(b"\n") if maps.exists() else 0
     assert after - before < 160
-    assert len(machine._recent) <= machine._KEPT
+    assert len(runtime._recent) <= runtime._KEPT
 
 
 def test_the_room_stands_alone():

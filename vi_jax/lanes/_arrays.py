@@ -19,7 +19,8 @@ STRUCTURAL: dict[str, Rule] = {}
 structural = partial(into, STRUCTURAL)
 
 
-def _each(function: Callable, *arrays: Values) -> Values:
+def each(function: Callable, *arrays: Values) -> Values:
+    """A function of `Value`s, number by number; arrays of other shapes are broadcast."""
     arrays = np.broadcast_arrays(*arrays)
     out = np.empty(arrays[0].shape, object)
     for i in np.ndindex(out.shape):
@@ -73,7 +74,7 @@ def _(t, p, avals, x):
 def _(t, p, avals, *sizes):
     kind, shape = kind_of(p["dtype"]), tuple(p["shape"])
     places = np.indices(shape)[p["dimension"]] if shape else np.zeros((), int)
-    return _each(lambda n: t.constant(int(n), kind), places)
+    return each(lambda n: t.constant(int(n), kind), places)
 
 
 @structural("pad")
@@ -124,7 +125,7 @@ def _(t, p, avals, x):
     out = np.moveaxis(x, p["axis"], 0).copy()
     out = out[::-1] if p["reverse"] else out
     for i in range(1, len(out)):
-        out[i : i + 1] = _each(lambda a, b: add(t, a, b), out[i - 1 : i], out[i : i + 1])
+        out[i : i + 1] = each(lambda a, b: add(t, a, b), out[i - 1 : i], out[i : i + 1])
     return np.moveaxis(out[::-1] if p["reverse"] else out, 0, p["axis"])
 
 
@@ -170,7 +171,7 @@ def _(t, p, avals, x, *starts):
     out = None
     for corner, flag in _here(t, [s[()] for s in starts], sizes, x.shape):
         block = x[tuple(slice(i, i + m) for i, m in zip(corner, sizes, strict=True))]
-        out = block if out is None else _each(lambda a, b, f=flag: t.select(f, a, b), block, out)
+        out = block if out is None else each(lambda a, b, f=flag: t.select(f, a, b), block, out)
     return out
 
 
@@ -181,5 +182,5 @@ def _(t, p, avals, x, update, *starts):
         moved = x.copy()
         where = tuple(slice(i, i + m) for i, m in zip(corner, update.shape, strict=True))
         moved[where] = update
-        out = _each(lambda a, b, f=flag: a if a == b else t.select(f, a, b), moved, out)
+        out = each(lambda a, b, f=flag: a if a == b else t.select(f, a, b), moved, out)
     return out

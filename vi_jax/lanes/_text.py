@@ -1,6 +1,7 @@
 """Vector code as LLVM's text: values, operations on them, and blocks."""
 
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -179,5 +180,24 @@ class Text:
 
     def phi(self, kind: str, *ways: tuple[str, str]) -> Value:
         """The value that came with the block it was reached from."""
+        return self.value(self._phi(kind, ways), kind, merge=False)
+
+    def join(
+        self, names: list[Value], *ways: tuple[list[Value], str], at: int | None = None
+    ) -> None:
+        """Define names by phi instructions.
+
+        **Arguments:** the names; for each block from which this one is reached, the values that
+        come from there, and its label; the line where the phis are to stand, if not here. A loop's
+        head is written before its body, so that its phis are put there afterwards.
+        """
+        lines = []
+        for name, *values in zip(names, *(values for values, _ in ways), strict=True):
+            pairs = [(v.text, block) for v, (_, block) in zip(values, ways, strict=True)]
+            lines.append(f"  {name.text} = {self._phi(name.kind, pairs)}")
+        at = len(self.lines) if at is None else at
+        self.lines[at:at] = lines
+
+    def _phi(self, kind: str, ways: Sequence[tuple[str, str]]) -> str:
         pairs = ", ".join(f"[ {text}, %{block} ]" for text, block in ways)
-        return self.value(f"phi {self.vector(kind)} {pairs}", kind, merge=False)
+        return f"phi {self.vector(kind)} {pairs}"

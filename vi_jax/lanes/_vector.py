@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
-from ._arrays import STRUCTURAL, Values
+from ._arrays import STRUCTURAL, Values, each
 from ._operations import ELEMENTWISE, kind_of
 from ._program import CALLS, inner
 from ._text import Text, Value
@@ -176,7 +176,7 @@ def _skipped(t: Text, jaxpr, consts, args, mask: Value, otherwise) -> list[Value
         laid = found
     else:
         laid = [
-            _zipped(lambda a, b: t.select(mask, a, b), x, y)
+            each(lambda a, b: t.select(mask, a, b), x, y)
             for x, y in zip(found, otherwise, strict=True)
         ]
     end = t.block
@@ -184,20 +184,13 @@ def _skipped(t: Text, jaxpr, consts, args, mask: Value, otherwise) -> list[Value
     t.close()
     t.follow(after)
     return [
-        _zipped(lambda a, b: a if a == b else t.phi(a.kind, (a.text, end), (b.text, before)), x, y)
+        each(lambda a, b: a if a == b else t.phi(a.kind, (a.text, end), (b.text, before)), x, y)
         for x, y in zip(laid, otherwise, strict=True)
     ]
 
 
 def _like(t: Text, x: Values) -> Values:
-    return _zipped(lambda a: t.zero(a.kind), x)
-
-
-def _zipped(function, *arrays: Values) -> Values:
-    out = np.empty(arrays[0].shape, object)
-    for i in np.ndindex(out.shape):
-        out[i] = function(*(a[i] for a in arrays))
-    return out
+    return each(lambda a: t.zero(a.kind), x)
 
 
 def _while(t: Text, params: dict, args: list[Values], mask: Value) -> list[Values]:
@@ -209,7 +202,7 @@ def _while(t: Text, params: dict, args: list[Values], mask: Value) -> list[Value
     t.line(f"br label %{head}")
     t.open(head)
     place = len(t.lines)
-    carry = [_zipped(lambda a: Value(t.fresh(), a.kind), x) for x in first]
+    carry = [each(lambda a: Value(t.fresh(), a.kind), x) for x in first]
     live = Value(t.fresh(), "i1")
     jaxpr, consts = _inner(params["cond_jaxpr"])
     going = t.both(live, write(t, jaxpr, consts, [*cond_args, *carry], live)[0].item())
@@ -219,24 +212,20 @@ def _while(t: Text, params: dict, args: list[Values], mask: Value) -> list[Value
     jaxpr, consts = _inner(params["body_jaxpr"])
     new = write(t, jaxpr, consts, [*body_args, *carry], going)
     new = [
-        _zipped(lambda a, b: t.select(going, a, b), x, y) for x, y in zip(new, carry, strict=True)
+        each(lambda a, b: t.select(going, a, b), x, y) for x, y in zip(new, carry, strict=True)
     ]
     end = t.block
     t.line(f"br label %{head}")
     t.close()
     t.close()
-    phis = []
-    for old, here, back in zip([*first, mask], [*carry, live], [*new, going], strict=True):
-        for a, h, b in zip(*map(_flat, (old, here, back)), strict=True):
-            ways = f"[ {a.text}, %{before} ], [ {b.text}, %{end} ]"
-            phis.append(f"  {h.text} = phi {t.vector(h.kind)} {ways}")
-    t.lines[place:place] = phis
+    begun, back = ([*_flat(first), mask], before), ([*_flat(new), going], end)
+    t.join([*_flat(carry), live], begun, back, at=place)
     t.follow(after)
     return carry
 
 
-def _flat(x: Any) -> list[Value]:
-    return [x] if isinstance(x, Value) else list(x.ravel())
+def _flat(arrays: list[Values]) -> list[Value]:
+    return [value for x in arrays for value in x.ravel()]
 
 
 def _counts_only(params: dict, inputs: int, outputs: int) -> bool:
@@ -256,19 +245,15 @@ def _counted(t: Text, params: dict, args: list[Values], mask: Value) -> list[Val
     t.line(f"br label %{inside}")
     t.open(inside)
     place = len(t.lines)
-    carry = [_zipped(lambda a: Value(t.fresh(), a.kind), x) for x in first]
+    carry = [each(lambda a: Value(t.fresh(), a.kind), x) for x in first]
     count, following = t.fresh(), t.fresh()
     jaxpr, consts = _inner(params["jaxpr"])
     new = write(t, jaxpr, consts, [*fixed, *carry], mask)
     end = t.block
     t.line(f"{following} = add i64 {count}, 1")
     more = t.raw(f"icmp slt i64 {following}, {params['length']}")
-    phis = [f"  {count} = phi i64 [ 0, %{before} ], [ {following}, %{end} ]"]
-    for old, here, back in zip(first, carry, new, strict=True):
-        for a, h, b in zip(*map(_flat, (old, here, back)), strict=True):
-            ways = f"[ {a.text}, %{before} ], [ {b.text}, %{end} ]"
-            phis.append(f"  {h.text} = phi {t.vector(h.kind)} {ways}")
-    t.lines[place:place] = phis
+    t.join(_flat(carry), (_flat(first), before), (_flat(new), end), at=place)
+    t.lines.insert(place, f"  {count} = phi i64 [ 0, %{before} ], [ {following}, %{end} ]")
     t.fork(more, inside, after)
     t.close()
     t.follow(after)
