@@ -12,7 +12,17 @@ FILES = sorted(HOUSE.rglob("*.py"))
 
 # Each may import from those before it.
 ORDER = "lanes machine flow machines orbit scan plot paper explore cli".split()
-TOOLS = {"_checks", "_files", "_interrupted", "_lazy", "_numbers", "_programs", "_renamed", "_types", "_version"}
+TOOLS = {
+    "_checks",
+    "_files",
+    "_interrupted",
+    "_lazy",
+    "_numbers",
+    "_programs",
+    "_renamed",
+    "_types",
+    "_version",
+}
 
 
 def imports(path: Path) -> Iterator[tuple[list[str], str]]:
@@ -71,7 +81,9 @@ def test_a_room_hidden_by_a_verb_can_be_imported_from():
 
 def test_what_is_listed_is_what_is_offered():
     listed = dir(vi_jax)
-    assert not {"TYPE_CHECKING", "importlib", "lanes", "flow", "orbit", "machine", "sys"} & {*listed}
+    assert not {"TYPE_CHECKING", "importlib", "lanes", "flow", "orbit", "machine", "sys"} & {
+        *listed
+    }
     assert {"scan", "sweep", "machines", "plot", "__version__"} <= {*listed}
     for name in listed:
         value = getattr(vi_jax, name)

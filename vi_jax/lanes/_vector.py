@@ -211,9 +211,7 @@ def _while(t: Text, params: dict, args: list[Values], mask: Value) -> list[Value
     t.open(inside)
     jaxpr, consts = _inner(params["body_jaxpr"])
     new = write(t, jaxpr, consts, [*body_args, *carry], going)
-    new = [
-        each(lambda a, b: t.select(going, a, b), x, y) for x, y in zip(new, carry, strict=True)
-    ]
+    new = [each(lambda a, b: t.select(going, a, b), x, y) for x, y in zip(new, carry, strict=True)]
     end = t.block
     t.line(f"br label %{head}")
     t.close()
