@@ -41,10 +41,10 @@ class _Watch:
 
     def __init__(self):
         self.lock = threading.Lock()
-        self.programs: dict[Program, None] = {}
+        self.programs: dict[CompiledFunction, None] = {}
         self.next_look = 0.0
 
-    def called(self, program: "Program") -> None:
+    def called(self, program: "CompiledFunction") -> None:
         """Note a call. Now and then, look whether there is room for what it may compile."""
         if time.monotonic() < self.next_look and next(reversed(self.programs), None) is program:
             return
@@ -102,7 +102,7 @@ def maps_granted() -> int | None:
 _watch = _Watch()
 
 
-class Program:
+class CompiledFunction:
     """A function that is compiled as by `eqx.filter_jit`, and whose programs can be dropped.
 
     **Arguments:** the function; XLA's options where lanes are vector code, and further arguments
@@ -188,6 +188,6 @@ def _is_known(name: str, value: Any) -> bool:
     return False
 
 
-def compiled(function: Callable[..., Any]) -> Program:
+def compiled(function: Callable[..., Any]) -> CompiledFunction:
     """Decorator: the function, compiled, its programs dropped if the room for them runs out."""
-    return Program(function)
+    return CompiledFunction(function)

@@ -45,9 +45,9 @@ def test_lanes_that_were_not_run_are_no_success(monkeypatch):
     with pytest.raises(Exception, match="Not all lanes were run"):
         np.asarray(lanes(starts))
     monkeypatch.undo()
-    turn = runtime.Work._turn
+    turn = runtime.KernelCall._run_here
     monkeypatch.setattr(
-        runtime.Work, "_turn", lambda self: setattr(self.stop, "value", 1) or turn(self)
+        runtime.KernelCall, "_run_here", lambda self: setattr(self.stop, "value", 1) or turn(self)
     )
     with pytest.raises(Exception, match="interrupted before all of them had ended"):
         np.asarray(lanes(starts))

@@ -347,7 +347,7 @@ def test_shards_of_a_batch_take_the_same_road():
 
 def test_what_has_no_vector_form_takes_the_other_road_and_says_so():
 
-    _primitive._tell.cache_clear()
+    _primitive._warn.cache_clear()
     with pytest.warns(UserWarning, match="`sort`"):
         out = jax.vmap(sorting)(jnp.asarray([0.5, 3.0]))
     np.testing.assert_array_equal(out, [0.5, 1.0])
@@ -363,12 +363,12 @@ def failing(*_):
 
 @pytest.mark.parametrize("fault", ["missing", "broken"])
 def test_without_llvm(fault, monkeypatch):
-    for cached in (_primitive._tell, _code.llvm, runtime._register_bits):
+    for cached in (_primitive._warn, _code.llvm, runtime._register_bits):
         cached.cache_clear()
     if fault == "missing":
         monkeypatch.setitem(sys.modules, "llvmlite.binding", None)
     else:
-        monkeypatch.setattr(_code, "compiled", failing)
+        monkeypatch.setattr(_code, "object_code", failing)
     try:
         with pytest.warns(UserWarning, match="llvmlite" if fault == "missing" else "LLVM: no such"):
             out = jax.vmap(lambda x: fall(x, 9.8125)[0][0])(jnp.linspace(1.0, 2.0, 5))
@@ -386,7 +386,7 @@ def test_a_program_that_llvm_cannot_compile(monkeypatch):
         return carry + 0.15625, lanes.Emitted(False, False, None)
 
     _code.llvm()  # which it can do at first
-    monkeypatch.setattr(_code, "compiled", failing)
+    monkeypatch.setattr(_code, "object_code", failing)
     with pytest.raises(jax.errors.JaxRuntimeError, match=r"LLVM: no such.*backend\(.xla.\)"):
         jax.block_until_ready(lanes.run(begin, step, lambda x, carry: carry, 1.0, rows=0)[0])
 
@@ -396,12 +396,12 @@ def test_programs_are_kept_where_jax_keeps_its_own(monkeypatch, tmp_path):
         kernel = runtime.Kernel("define void @kernel() { ret void }", None, 8)
         return kernel._call
 
-    monkeypatch.setattr(_code, "_store", lambda: tmp_path)
+    monkeypatch.setattr(_code, "_cache_folder", lambda: tmp_path)
     fallen()
     (kept,) = tmp_path.rglob("*.o")
     content = kept.read_bytes()
     with monkeypatch.context() as patched:
-        patched.setattr(_code, "compiled", failing)
+        patched.setattr(_code, "object_code", failing)
         fallen()  # from the file
         kept.write_bytes(content[:-1])
         with pytest.raises(RuntimeError, match="LLVM: no such"):
@@ -414,9 +414,9 @@ def test_where_programs_are_kept(tmp_path):
     before = jax.config.jax_compilation_cache_dir  # pyright: ignore
     try:
         jax.config.update("jax_compilation_cache_dir", str(tmp_path))
-        assert _code._store() == tmp_path / "vi_jax_lanes"
+        assert _code._cache_folder() == tmp_path / "vi_jax_lanes"
         jax.config.update("jax_compilation_cache_dir", "gs://far/away")
-        assert _code._store() is None
+        assert _code._cache_folder() is None
     finally:
         jax.config.update("jax_compilation_cache_dir", before)
 
@@ -459,7 +459,7 @@ def test_programs_are_not_kept_for_ever():
     kernels(range(80, 240))
     after = maps.read_bytes().count(b"\n") if maps.exists() else 0
     assert after - before < 160
-    assert len(runtime._recent) <= runtime._KEPT
+    assert len(runtime._recent) <= runtime._MOST_KERNELS
 
 
 def test_the_room_stands_alone():

@@ -9,14 +9,14 @@ from functools import partial
 
 import numpy as np
 
-from ._operations import Rule, add, compare, extreme, into, kind_of, mul
+from ._operations import Rule, add, compare, extreme, kind_of, mul, register
 from ._text import Text, Value
 
 Values = np.ndarray
 """An object array of `Value`s, of the shape of the JAX array."""
 
 STRUCTURAL: dict[str, Rule] = {}
-structural = partial(into, STRUCTURAL)
+structural = partial(register, STRUCTURAL)
 
 
 def each(function: Callable, *arrays: Values) -> Values:
@@ -152,7 +152,7 @@ def _(t, p, avals, a, b):
     return out
 
 
-def _here(t: Text, starts: list[Value], sizes: list[int], shape: tuple[int, ...]):
+def _starts(t: Text, starts: list[Value], sizes: list[int], shape: tuple[int, ...]):
     """Every place at which a block of `sizes` may begin, and whether it does (clamped)."""
     for corner in np.ndindex(*(n - m + 1 for n, m in zip(shape, sizes, strict=True))):
         flag = t.constant(True, "i1")
@@ -169,7 +169,7 @@ def _here(t: Text, starts: list[Value], sizes: list[int], shape: tuple[int, ...]
 def _(t, p, avals, x, *starts):
     sizes = list(p["slice_sizes"])
     out = None
-    for corner, flag in _here(t, [s[()] for s in starts], sizes, x.shape):
+    for corner, flag in _starts(t, [s[()] for s in starts], sizes, x.shape):
         block = x[tuple(slice(i, i + m) for i, m in zip(corner, sizes, strict=True))]
         out = block if out is None else each(lambda a, b, f=flag: t.select(f, a, b), block, out)
     return out
@@ -178,7 +178,7 @@ def _(t, p, avals, x, *starts):
 @structural("dynamic_update_slice")
 def _(t, p, avals, x, update, *starts):
     out = x
-    for corner, flag in _here(t, [s[()] for s in starts], list(update.shape), x.shape):
+    for corner, flag in _starts(t, [s[()] for s in starts], list(update.shape), x.shape):
         moved = x.copy()
         where = tuple(slice(i, i + m) for i, m in zip(corner, update.shape, strict=True))
         moved[where] = update

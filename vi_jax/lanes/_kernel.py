@@ -144,7 +144,7 @@ class _Writer:
         t, end = self.t, self.program.end
         t.open("flush")
         present, ended = self._ended(group)
-        out = write(t, end.jaxpr, end.consts, group.arrays, present)
+        out = write(t, end, group.arrays, present)
         for pointer, x in zip(self.results, out, strict=True):
             base = t.binary("mul", group.lane, t.constant(x.size, "i64"))
             scatter(t, pointer, base, x, ended)
@@ -178,8 +178,7 @@ class _Writer:
         total = splat(t, "%lanes", "i64")
         new = t.both(free, t.binary("icmp slt", following, total, "i1"))
         lane = t.select(free, t.select(new, following, t.constant(-1, "i64")), old.lane)
-        some = t.any(new)
-        t.fork(some, "begin", "ready")
+        t.fork(t.any(new), "begin", "ready")
         return old._replace(lane=lane), new
 
     def _rank(self, flag: Value) -> Value:
@@ -237,7 +236,7 @@ class _Writer:
         self, jaxpr: ClosedJaxpr, args: list[Values], mask: Value
     ) -> tuple[list[Values], Value, Value, list[Values]]:
         """What `begin` or `step` gives: carry, whether the lane goes on, has a row, the row."""
-        out: list[Any] = write(self.t, jaxpr.jaxpr, jaxpr.consts, args, mask)
+        out: list[Any] = write(self.t, jaxpr, args, mask)
         n = len(self.program.carry_avals)
         return out[:n], out[n][()], out[n + 1][()], out[n + 2 :]
 

@@ -22,7 +22,7 @@ def _is_unsigned(dtype: Any) -> bool:
     return np.dtype(dtype).kind in "ub"
 
 
-def into(table: dict[str, Rule], *names: str) -> Callable[[Rule], Rule]:
+def register(table: dict[str, Rule], *names: str) -> Callable[[Rule], Rule]:
     """Put a rule into a table under these names of primitives."""
 
     def put(rule: Rule) -> Rule:
@@ -32,7 +32,7 @@ def into(table: dict[str, Rule], *names: str) -> Callable[[Rule], Rule]:
     return put
 
 
-elementwise = partial(into, ELEMENTWISE)
+elementwise = partial(register, ELEMENTWISE)
 
 
 # --- arithmetic

@@ -13,7 +13,7 @@ from jax.core import ShapedArray
 from jax.extend.core import ClosedJaxpr, Jaxpr, Primitive
 from jax.interpreters import ad, batching
 
-from ._program import RULED
+from ._program import OWN_DERIVATIVE
 from .elementary import jitted
 
 quotient_p = Primitive("quotient")
@@ -33,7 +33,7 @@ def _equation(eqn: Any) -> Any:
     name = eqn.primitive.name
     if name == "div" and jnp.issubdtype(eqn.outvars[0].aval.dtype, jnp.floating):
         return eqn.replace(primitive=quotient_p, params={})
-    if name in RULED:
+    if name in OWN_DERIVATIVE:
         return eqn
     return eqn.replace(params={key: _parameter(x) for key, x in eqn.params.items()})
 

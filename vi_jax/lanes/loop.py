@@ -88,16 +88,16 @@ def run(
 
 def once(function: Callable[[Any], Any], inputs: Any) -> Any:
     """`function` of one lane's numbers as vector code."""
-    return run(_nothing, _stays, functools.partial(_at_once, function), inputs, rows=0)[0]
+    return run(_begin_ended, _no_step, functools.partial(_end_with, function), inputs, rows=0)[0]
 
 
-def _nothing(inputs: Any) -> tuple[Any, Emitted]:
+def _begin_ended(inputs: Any) -> tuple[Any, Emitted]:
     return (), Emitted(False, False, ())
 
 
-def _stays(inputs: Any, carry: Any) -> tuple[Any, Emitted]:
+def _no_step(inputs: Any, carry: Any) -> tuple[Any, Emitted]:
     return carry, Emitted(False, False, ())
 
 
-def _at_once(function: Callable[[Any], Any], inputs: Any, carry: Any) -> Any:
+def _end_with(function: Callable[[Any], Any], inputs: Any, carry: Any) -> Any:
     return function(inputs)
