@@ -27,7 +27,7 @@ def test_threads_are_a_number(number):
 
 
 def test_two_threads_may_come_to_lanes_first():
-    """What XLA is told to call must stay, whichever of them made it."""
+    """The handler that XLA has must stay, whichever thread made it."""
     script = Path(__file__).with_name("first_use.py")
     done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

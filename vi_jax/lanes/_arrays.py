@@ -15,6 +15,8 @@ from ._text import Text, Value
 Values = np.ndarray
 """An object array of `Value`s, of the shape of the JAX array."""
 
+# Rules with the arguments `t`, the `Text`; `p`, the parameters of the equation; `avals`, the shapes
+# and types of its results; and `Values` for each argument. They return `Values`, or a tuple.
 STRUCTURAL: dict[str, Rule] = {}
 structural = partial(register, STRUCTURAL)
 

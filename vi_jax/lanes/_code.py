@@ -59,6 +59,8 @@ def _worker() -> ThreadPoolExecutor:
 def _load_or_compile(
     binding: Any, text: str, cpu: str | None, store: Path | None
 ) -> tuple[Any, int]:
+    """The engine with a text's code, from a file in the folder `store` if it has one, and the
+    address of `kernel`."""
     words = (text, cpu, *_host(binding), binding.llvm_version_info)
     name = f"{hashlib.blake2b(repr(words).encode(), digest_size=20).hexdigest()}.o"
     code = store and _read(store / name)

@@ -134,7 +134,7 @@ def inner(jaxpr: ClosedJaxpr | Jaxpr) -> Jaxpr:
     return jaxpr.jaxpr if isinstance(jaxpr, ClosedJaxpr) else jaxpr
 
 
-# Primitives that give floating-point numbers whose derivative is zero or is to be taken for zero.
+# Primitives with floating-point results whose derivative is zero, or is treated as zero.
 _ZERO_DERIVATIVE = ("stop_gradient", "sign", "round", "floor", "ceil")
 
 

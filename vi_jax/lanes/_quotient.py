@@ -1,8 +1,8 @@
 """Division whose derivative divides once, however many directions it is taken in.
 
-JAX divides each tangent of the dividend, and by the divisor's square for the tangent of the
-divisor. Products with one reciprocal do instead: in the derivatives of a machine's motion divisions
-would be what the processor waits for.
+JAX divides each tangent of the dividend by the divisor, and each of the divisor by its square. Here
+each is multiplied by one reciprocal: in the derivatives of a machine's motion the divisions would
+take most of the time.
 """
 
 import functools
@@ -30,6 +30,7 @@ def _rewritten(jaxpr: Jaxpr) -> Jaxpr:
 
 
 def _equation(eqn: Any) -> Any:
+    """An equation with divisions replaced, in inner jaxprs too."""
     name = eqn.primitive.name
     if name == "div" and jnp.issubdtype(eqn.outvars[0].aval.dtype, jnp.floating):
         return eqn.replace(primitive=quotient_p, params={})

@@ -85,7 +85,8 @@ def _function_key(function: Callable[..., Any]) -> tuple:
     if not isinstance(function, FunctionType):
         raise TypeError("no function")
     if function.__closure__ is not None:
-        # A decorated function closes over what it decorates: there is one of it in its module.
+        # A decorated function closes over what it decorates. If it is that of its module, there is
+        # only one.
         module = sys.modules.get(function.__module__)
         if getattr(module, function.__qualname__, None) is not function:
             raise TypeError("perhaps made for this call")

@@ -1,4 +1,4 @@
-"""A jaxpr of one lane's scalars written out as vector code for a group of lanes."""
+"""A jaxpr of one lane's scalars and small arrays as vector code for a group of lanes."""
 
 from typing import Any
 
@@ -10,10 +10,11 @@ from ._operations import ELEMENTWISE, kind_of
 from ._program import CALLS, inner
 from ._text import Text, Value
 
-# A loop of known length is written out if that makes no more operations than this.
+# The most operations of a loop of known length, all turns together, that are written one after the
+# other because it has rows; a sixteenth of that if it has none. A bound on the time of compilation.
 _MOST_UNROLLED = 4096
 
-# What is no more than this is computed without asking whether any lane needs it.
+# A branch of no more operations than this is computed whether any lane needs it or not.
 _CHEAP = 4
 
 
@@ -51,6 +52,7 @@ def check(jaxpr: Jaxpr) -> None:
 
 
 def _size(jaxpr: Jaxpr) -> int:
+    """The number of operations, those of inner jaxprs once."""
     total = 0
     for eqn in jaxpr.eqns:
         held = [x for v in eqn.params.values() for x in (v if isinstance(v, tuple) else (v,))]
@@ -60,7 +62,7 @@ def _size(jaxpr: Jaxpr) -> int:
 
 
 def constants(t: Text, array: Any) -> Values:
-    """A known array in every lane."""
+    """A known array, the same in every lane, as `Value`s."""
     array = np.asarray(array)
     kind = kind_of(array.dtype)
     out = np.empty(array.shape, object)
@@ -106,6 +108,7 @@ def _needed(jaxpr: Jaxpr) -> list[Any]:
 
 
 def _equation(t: Text, eqn: Any, args: list[Values], mask: Value) -> list[Values]:
+    """The values of an equation's results, by the rule of its primitive."""
     name, params = eqn.primitive.name, eqn.params
     if name in ELEMENTWISE:
         dtypes = [a.aval.dtype for a in eqn.invars]
@@ -125,6 +128,7 @@ def _equation(t: Text, eqn: Any, args: list[Values], mask: Value) -> list[Values
 
 
 def _elementwise(t: Text, name, params, dtypes, args, results: int) -> list[Values]:
+    """A rule of `ELEMENTWISE`, number by number."""
     args = np.broadcast_arrays(*args, subok=False)
     outs = [np.empty(args[0].shape, object) for _ in range(results)]
     for i in np.ndindex(args[0].shape):
@@ -135,7 +139,11 @@ def _elementwise(t: Text, name, params, dtypes, args, results: int) -> list[Valu
 
 
 def _cond(t: Text, branches: tuple, which: Value, args: list[Values], mask: Value) -> list[Values]:
-    """Each branch is skipped where no lane of the group takes it."""
+    """Each branch is skipped where no lane of the group takes it, but for a cheap one.
+
+    **Arguments:** the text; the branches' jaxprs; which of them each lane takes; their arguments;
+    which lanes need the results.
+    """
     last = len(branches) - 1
     taken = []
     for i in range(len(branches)):
@@ -145,7 +153,7 @@ def _cond(t: Text, branches: tuple, which: Value, args: list[Values], mask: Valu
         else:
             flag = t.binary(f"icmp {how}", which, t.constant(i, which.kind), "i1")
         taken.append(flag)
-    # The cheapest of them is the one that the others are laid over.
+    # The cheapest comes first: the results of the others replace its own in their lanes.
     order = sorted(range(len(branches)), key=lambda i: _size(inner(branches[i])))
     result: list[Values] | None = None
     for i in order:
@@ -158,7 +166,8 @@ def _cond(t: Text, branches: tuple, which: Value, args: list[Values], mask: Valu
 
 
 def _branch_if_any(t: Text, jaxpr, args, mask: Value, otherwise) -> list[Values]:
-    """The values of a jaxpr in the lanes of `mask`, laid over others; skipped if there are none."""
+    """The results of a jaxpr in the lanes of `mask`, and `otherwise` (or anything, if that is
+    `None`) in the others; skipped if `mask` has no lane."""
     inside, after = t.label(), t.label()
     before = t.block
     t.fork(t.any(mask), inside, after, rare=True)
@@ -183,7 +192,7 @@ def _branch_if_any(t: Text, jaxpr, args, mask: Value, otherwise) -> list[Values]
 
 
 def _while(t: Text, params: dict, args: list[Values], mask: Value) -> list[Values]:
-    """Until no lane of the group goes on; a lane that has ended keeps what it had."""
+    """Until no lane of `mask` goes on; a lane that has ended keeps its carry."""
     n, m = params["cond_nconsts"], params["body_nconsts"]
     cond_args, body_args, first = args[:n], args[n : n + m], args[n + m :]
     head, inside, after = t.label(), t.label(), t.label()
@@ -214,7 +223,10 @@ def _flat(arrays: list[Values]) -> list[Value]:
 
 
 def _has_no_rows(params: dict, inputs: int, outputs: int) -> bool:
-    """Whether a loop of known length carries numbers along and has no rows."""
+    """Whether a loop of known length has a carry only: no rows, neither given nor made.
+
+    **Arguments:** the parameters of `scan`; the numbers of its arguments and results.
+    """
     carried = params["num_carry"]
     return params["length"] > 0 and inputs == params["num_consts"] + carried == outputs + (
         inputs - carried
@@ -222,7 +234,7 @@ def _has_no_rows(params: dict, inputs: int, outputs: int) -> bool:
 
 
 def _counted_loop(t: Text, params: dict, args: list[Values], mask: Value) -> list[Values]:
-    """A loop of known length without rows, as a loop."""
+    """A loop of known length without rows, as a loop with a scalar counter."""
     n = params["num_consts"]
     fixed, first = args[:n], args[n:]
     inside, after = t.label(), t.label()
@@ -245,7 +257,7 @@ def _counted_loop(t: Text, params: dict, args: list[Values], mask: Value) -> lis
 
 
 def _scan(t: Text, params: dict, args: list[Values], mask: Value) -> list[Values]:
-    """A loop of known length: written out, unless it is long and has no rows."""
+    """A loop of known length: its turns one after the other, unless it is long and has no rows."""
     body = inner(params["jaxpr"])
     big = _size(body) * params["length"] > _MOST_UNROLLED // 16
     if big and _has_no_rows(params, len(args), len(body.outvars)):

@@ -1,7 +1,7 @@
 """XLA's backend: the same loop for any device and any primitive.
 
 Lanes of a batch advance together. Where they are many, a few slots take up lane after lane, so
-that one of ten times the steps holds up nobody and what is under way fits the processor's cache.
+that one of ten times the steps delays no other and what advances fits the processor's cache.
 """
 
 import math
@@ -130,7 +130,7 @@ class _Pool:
         coming = following + jnp.cumsum(over, dtype=index.dtype) - 1
         index = jnp.where(over, jnp.minimum(coming, self.lanes), index)
         following = following + jnp.sum(over, dtype=index.dtype)
-        if self.slots == self.lanes:  # nobody is waiting
+        if self.slots == self.lanes:  # no lane is waiting
             return inputs, carry, active, index, filled, following, outs, store
         new = over & (index < self.lanes)
         inputs = [

@@ -26,7 +26,7 @@ TARGET = "vi_jax_lanes"
 
 INTERRUPTED = "Lanes were interrupted before all of them had ended."
 
-# The version of the interface that is written out below.
+# The version of the interface whose structures follow.
 _MAJOR, _MINOR = 0, 3
 
 # `XLA_FFI_Extension_Metadata`, `XLA_FFI_ExecutionStage_EXECUTE`, two of `XLA_FFI_Error_Code`.

@@ -19,7 +19,7 @@ _backend: ContextVar[str] = ContextVar("backend", default="auto")
 
 
 class Emitted(NamedTuple):
-    """What `begin` and `step` say besides the carry."""
+    """What `begin` and `step` return besides the carry."""
 
     active: Any
     """Whether the lane goes on."""
@@ -87,7 +87,10 @@ def run(
 
 
 def once(function: Callable[[Any], Any], inputs: Any) -> Any:
-    """`function` of one lane's numbers as vector code."""
+    """`function(inputs)` as vector code, without a loop; batched by `vmap` as `run` is.
+
+    **Arguments:** a function of a pytree of scalars and small arrays; the pytree.
+    """
     return run(_begin_ended, _no_step, functools.partial(_end_with, function), inputs, rows=0)[0]
 
 
