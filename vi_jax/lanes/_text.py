@@ -184,7 +184,7 @@ class Text:
         self._seen.pop()
 
     def fork(self, condition: str, yes: str, no: str, *, rare: bool = False) -> None:
-        """End the block: go on at one of two labels. If `yes` is `rare`, `no` keeps the registers."""
+        """End the block: go on at one of two labels. If `yes` is `rare`, `no` is kept fast."""
         self.line(f"br i1 {condition}, label %{yes}, label %{no}{', !prof !0' if rare else ''}")
 
     def follow(self, label: str) -> None:
