@@ -52,7 +52,7 @@ def test_what_was_called_last_goes_last(watch, monkeypatch):
     dropped = []
 
     def program(name):
-        made = _programs.Program(lambda x: x + 1)
+        made = _programs.CompiledFunction(lambda x: x + 1)
         monkeypatch.setattr(made, "drop", lambda: dropped.append(name))
         return made
 
@@ -97,14 +97,16 @@ class Table(vi.AbstractMachine):
 @pytest.mark.slow
 def test_what_has_no_vector_form_is_compiled_in_full(monkeypatch):
     """A program is compiled quickly only if its loops are not XLA's."""
-    _primitive._tell.cache_clear()  # which may have been told in this process
+    _primitive._warn.cache_clear()  # which may have been told in this process
     made = []
-    original = _programs.Program._quick.func
+    original = _programs.CompiledFunction._quick.func
     monkeypatch.setattr(
-        _programs.Program, "_quick", property(lambda self: made.append(self) or original(self))
+        _programs.CompiledFunction,
+        "_quick",
+        property(lambda self: made.append(self) or original(self)),
     )
     zero = jnp.zeros(())
-    function = _programs.Program(
+    function = _programs.CompiledFunction(
         lambda scene: vi.simulate(scene, vi.OscillatorState(zero, zero), 3, method="draft").last
     )
     last = function(Table(False))
@@ -118,7 +120,7 @@ def test_what_has_no_vector_form_is_compiled_in_full(monkeypatch):
 
 
 def test_a_part_of_another_program_is_compiled_with_it():
-    function = _programs.Program(lambda x: jnp.sin(x) * x)
+    function = _programs.CompiledFunction(lambda x: jnp.sin(x) * x)
     x = jnp.asarray(0.7)
     alone = function(x)
     within = jax.jit(lambda y: function(x) + 0 * y)(x)  # what it is given is known there
@@ -130,7 +132,7 @@ def test_a_part_of_another_program_is_compiled_with_it():
 def test_compiler_options_that_xla_does_not_know_are_left_out():
     options = {"xla_no_such_option": 1, **_programs.PLAIN}
     assert _programs._known(options) == _programs.PLAIN
-    assert float(_programs.Program(lambda x: x + 1, options)(jnp.asarray(1.0))) == 2.0
+    assert float(_programs.CompiledFunction(lambda x: x + 1, options)(jnp.asarray(1.0))) == 2.0
 
 
 @pytest.mark.parametrize("backend", ["auto", pytest.param("xla", marks=pytest.mark.slow)])

@@ -1,4 +1,4 @@
-"""The compiled programs of this package, and the room that Linux grants a process for them.
+"""The compiled functions of this package, and the memory maps that Linux grants a process.
 
 A program takes some hundreds of memory maps; where a process has none left, the compiler dies with
 a segmentation fault. JAX keeps every program, so that a long script gets there.
@@ -22,8 +22,8 @@ from jax.core import Tracer
 from .lanes import Unsupported, current_backend, vector_only
 
 # With these XLA compiles two to three times faster. What runs for long is in the lanes, whose code
-# is not XLA's; of a program that does much besides, the first alone saves half of that and costs it
-# nothing.
+# is not XLA's. For programs that do much else, `PLAIN` alone saves half of that and costs nothing
+# at run time.
 PLAIN = {"xla_cpu_use_fusion_emitters": False}
 _QUICK = {**PLAIN, "xla_backend_optimization_level": 0}
 
@@ -32,20 +32,21 @@ _MAPS, _MOST = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
 # Parts of the maps beyond which programs are dropped, and down to which.
 _FULL, _ROOM = 0.6, 0.4
 
-# A look costs up to a tenth of a second: one in so many times what it took, and in half a second.
+# To count the maps takes up to a tenth of a second. So it is done at most once in `_SELDOM` times
+# the time that it took, and once in `_PAUSE` seconds.
 _SELDOM, _PAUSE = 50, 0.5
 
 
 class _Watch:
-    """Who was compiled, the least recently called first, and when the maps were last looked at."""
+    """The compiled functions, the least recently called first, and when to count the maps next."""
 
     def __init__(self):
         self.lock = threading.Lock()
-        self.programs: dict[Program, None] = {}
+        self.programs: dict[CompiledFunction, None] = {}
         self.next_look = 0.0
 
-    def called(self, program: "Program") -> None:
-        """Note a call. Now and then, look whether there is room for what it may compile."""
+    def called(self, program: "CompiledFunction") -> None:
+        """Note a call, and drop programs if the maps run out (see `_look`)."""
         if time.monotonic() < self.next_look and next(reversed(self.programs), None) is program:
             return
         with self.lock:
@@ -84,7 +85,7 @@ class _Watch:
 
 
 def maps_used() -> int | None:
-    """Memory maps of this process, or `None` where that is not to be known."""
+    """The number of memory maps of this process, or `None` where it cannot be known."""
     try:
         return _MAPS.read_bytes().count(b"\n")
     except OSError:
@@ -92,7 +93,7 @@ def maps_used() -> int | None:
 
 
 def maps_granted() -> int | None:
-    """The most that it may have, or `None`."""
+    """The most that it may have, or `None` where that cannot be known."""
     try:
         return int(_MOST.read_text())
     except (OSError, ValueError):
@@ -102,11 +103,13 @@ def maps_granted() -> int | None:
 _watch = _Watch()
 
 
-class Program:
+class CompiledFunction:
     """A function that is compiled as by `eqx.filter_jit`, and whose programs can be dropped.
 
-    **Arguments:** the function; XLA's options where lanes are vector code, and further arguments
-    of `eqx.filter_jit` where they are XLA's.
+    (A `LaneProgram` is another thing: the loop of a lane within such a function.)
+
+    **Arguments:** the function; XLA's compiler options where its lanes are vector code; further
+    arguments of `eqx.filter_jit` for where they run on XLA's backend.
     """
 
     def __init__(
@@ -126,8 +129,9 @@ class Program:
         return eqx.filter_jit(self._function, **options)
 
     def drop(self) -> None:
-        """Let go of what was compiled."""
-        # Equinox passes this on to nobody. To forget the wrapper would not do: JAX keeps the rest.
+        """Drop what was compiled; it is compiled again when it is called again."""
+        # Equinox (0.13.8) has no public way to JAX's `clear_cache`, and to drop the wrapper is not
+        # enough, since JAX keeps the programs (`tests/lanes/test_jax.py` notes a change).
         for made in (self._compiled, vars(self).get("_quick")):
             if made is not None:
                 cached = getattr(made, "_cached", None)
@@ -143,15 +147,17 @@ class Program:
             except Unsupported:
                 self._may_be_quick = False  # its loops would be XLA's, and slow
             except ValueError as error:
-                # An argument's function closes over what is being differentiated.
+                # Within another program, which `is_outermost` does not see where an argument's
+                # function closes over what is differentiated, JAX (0.10.2) refuses compiler options
+                # with a plain `ValueError` (its text: `tests/lanes/test_jax.py`).
                 if "compiler_options" not in str(error):
                     raise
         return self._compiled(*arguments, **keywords)
 
 
 def _uncollected(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function, which runs only to be traced, without a search for rubbish meanwhile: hardly
-    any is made then, and the many objects that stay have it search all again and again."""
+    """The function without garbage collection while it runs, which is only to be traced: tracing
+    makes hardly any garbage, and its many objects would make the collector run again and again."""
 
     @functools.wraps(function)
     def traced(*arguments: Any, **keywords: Any) -> Any:
@@ -188,6 +194,6 @@ def _is_known(name: str, value: Any) -> bool:
     return False
 
 
-def compiled(function: Callable[..., Any]) -> Program:
+def compiled(function: Callable[..., Any]) -> CompiledFunction:
     """Decorator: the function, compiled, its programs dropped if the room for them runs out."""
-    return Program(function)
+    return CompiledFunction(function)

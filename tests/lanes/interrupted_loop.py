@@ -1,4 +1,4 @@
-"""A loop of simulations that hears Ctrl-C again and again: prints what became of it."""
+"""A loop of simulations that is interrupted again and again: prints what became of it."""
 
 import gc
 import os
@@ -21,7 +21,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 # lost by Python itself, in any loop: it prints "Exception ignored in".
 gc.disable()
 
-STROKES = 120
+INTERRUPTS = 120
 SCENE = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.01)
 STARTS = jnp.linspace(-1.0, 1.0, 64)
 
@@ -41,7 +41,7 @@ heard, lost, wrong, errors, ended = [], [], [], [], threading.Event()
 
 def strike():
     draw = random.Random(0)
-    for _ in range(STROKES):
+    for _ in range(INTERRUPTS):
         time.sleep(draw.uniform(0, 2.5 * took))
         before, clock = len(heard), time.perf_counter()
         os.kill(os.getpid(), signal.SIGINT)
@@ -64,7 +64,7 @@ def work():
 
 
 def again(depth):
-    """A stroke may come while the one before is being noted."""
+    """An interrupt may come while the one before is being noted."""
     while not ended.is_set():
         try:
             again(depth - 1) if depth else work()

@@ -27,7 +27,7 @@ def test_threads_are_a_number(number):
 
 
 def test_two_threads_may_come_to_lanes_first():
-    """What XLA is told to call must stay, whichever of them made it."""
+    """The handler that XLA has must stay, whichever thread made it."""
     script = Path(__file__).with_name("first_use.py")
     done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -45,9 +45,9 @@ def test_lanes_that_were_not_run_are_no_success(monkeypatch):
     with pytest.raises(Exception, match="Not all lanes were run"):
         np.asarray(lanes(starts))
     monkeypatch.undo()
-    turn = runtime.Work._turn
+    turn = runtime.KernelCall._run_here
     monkeypatch.setattr(
-        runtime.Work, "_turn", lambda self: setattr(self.stop, "value", 1) or turn(self)
+        runtime.KernelCall, "_run_here", lambda self: setattr(self.stop, "value", 1) or turn(self)
     )
     with pytest.raises(Exception, match="interrupted before all of them had ended"):
         np.asarray(lanes(starts))

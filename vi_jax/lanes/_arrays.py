@@ -9,17 +9,20 @@ from functools import partial
 
 import numpy as np
 
-from ._operations import Rule, add, compare, extreme, into, kind_of, mul
+from ._operations import Rule, add, compare, extreme, kind_of, mul, register
 from ._text import Text, Value
 
 Values = np.ndarray
 """An object array of `Value`s, of the shape of the JAX array."""
 
+# Rules with the arguments `t`, the `Text`; `p`, the parameters of the equation; `avals`, the shapes
+# and types of its results; and `Values` for each argument. They return `Values`, or a tuple.
 STRUCTURAL: dict[str, Rule] = {}
-structural = partial(into, STRUCTURAL)
+structural = partial(register, STRUCTURAL)
 
 
-def _each(function: Callable, *arrays: Values) -> Values:
+def each(function: Callable, *arrays: Values) -> Values:
+    """A function of `Value`s, number by number; arrays of other shapes are broadcast."""
     arrays = np.broadcast_arrays(*arrays)
     out = np.empty(arrays[0].shape, object)
     for i in np.ndindex(out.shape):
@@ -73,7 +76,7 @@ def _(t, p, avals, x):
 def _(t, p, avals, *sizes):
     kind, shape = kind_of(p["dtype"]), tuple(p["shape"])
     places = np.indices(shape)[p["dimension"]] if shape else np.zeros((), int)
-    return _each(lambda n: t.constant(int(n), kind), places)
+    return each(lambda n: t.constant(int(n), kind), places)
 
 
 @structural("pad")
@@ -124,7 +127,7 @@ def _(t, p, avals, x):
     out = np.moveaxis(x, p["axis"], 0).copy()
     out = out[::-1] if p["reverse"] else out
     for i in range(1, len(out)):
-        out[i : i + 1] = _each(lambda a, b: add(t, a, b), out[i - 1 : i], out[i : i + 1])
+        out[i : i + 1] = each(lambda a, b: add(t, a, b), out[i - 1 : i], out[i : i + 1])
     return np.moveaxis(out[::-1] if p["reverse"] else out, 0, p["axis"])
 
 
@@ -151,7 +154,7 @@ def _(t, p, avals, a, b):
     return out
 
 
-def _here(t: Text, starts: list[Value], sizes: list[int], shape: tuple[int, ...]):
+def _starts(t: Text, starts: list[Value], sizes: list[int], shape: tuple[int, ...]):
     """Every place at which a block of `sizes` may begin, and whether it does (clamped)."""
     for corner in np.ndindex(*(n - m + 1 for n, m in zip(shape, sizes, strict=True))):
         flag = t.constant(True, "i1")
@@ -168,18 +171,18 @@ def _here(t: Text, starts: list[Value], sizes: list[int], shape: tuple[int, ...]
 def _(t, p, avals, x, *starts):
     sizes = list(p["slice_sizes"])
     out = None
-    for corner, flag in _here(t, [s[()] for s in starts], sizes, x.shape):
+    for corner, flag in _starts(t, [s[()] for s in starts], sizes, x.shape):
         block = x[tuple(slice(i, i + m) for i, m in zip(corner, sizes, strict=True))]
-        out = block if out is None else _each(lambda a, b, f=flag: t.select(f, a, b), block, out)
+        out = block if out is None else each(lambda a, b, f=flag: t.select(f, a, b), block, out)
     return out
 
 
 @structural("dynamic_update_slice")
 def _(t, p, avals, x, update, *starts):
     out = x
-    for corner, flag in _here(t, [s[()] for s in starts], list(update.shape), x.shape):
+    for corner, flag in _starts(t, [s[()] for s in starts], list(update.shape), x.shape):
         moved = x.copy()
         where = tuple(slice(i, i + m) for i, m in zip(corner, update.shape, strict=True))
         moved[where] = update
-        out = _each(lambda a, b, f=flag: a if a == b else t.select(f, a, b), moved, out)
+        out = each(lambda a, b, f=flag: a if a == b else t.select(f, a, b), moved, out)
     return out

@@ -7,88 +7,100 @@ from typing import Any
 import jax
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
-from ._program import LaneProgram, Spread, spread
+from ._program import DependentParts, LaneProgram, dependent_parts
 from ._quotient import with_quotients
 
 
 @functools.lru_cache(maxsize=64)
-def forward(program: LaneProgram, moving: tuple[bool, ...]) -> tuple[LaneProgram, tuple[bool, ...]]:
-    """The program of value and derivative, and which results and parts of the rows have one.
+def forward(program: LaneProgram, varied: tuple[bool, ...]) -> tuple[LaneProgram, tuple[bool, ...]]:
+    """The program of value and forward derivative.
 
-    **Arguments:** the program; which inputs have a derivative. Theirs follow the inputs, those of
-    the results follow the results, those of a row follow the row. What cannot depend on a moving
-    input is not differentiated.
+    The tangents follow the inputs, the derivatives of the results follow the results, those of a
+    row follow the row. What cannot depend on a varied input is not differentiated.
+
+    **Arguments:** the program; which inputs have a tangent.
+
+    **Returns:** the program of both; which results, and then which parts of a row, have a
+    derivative.
     """
     n = len(program.carry_avals)
-    there = spread(program, moving, smooth=True)
-    both, rows = (*moving, *there.carry), there.rows
-    wanted, groups = (*there.carry, False, False, *rows), (n, 2, len(rows))
-    slopes = program.slopes or (False,) * len(moving)
+    depend = dependent_parts(program, varied, smooth=True)
+    both, rows = (*varied, *depend.carry), depend.rows
+    wanted, groups = (*depend.carry, False, False, *rows), (n, 2, len(rows))
+    before = program.tangents or (False,) * len(varied)
     derived = LaneProgram(
-        begin=_derived(program.begin, moving, wanted, groups),
-        step=_derived(program.step, both, wanted, groups, len(moving)),
-        end=_derived(program.end, both, there.outs, (len(there.outs),), len(moving)),
+        begin=_with_derivatives(program.begin, varied, wanted, groups),
+        step=_with_derivatives(program.step, both, wanted, groups, len(varied)),
+        end=_with_derivatives(program.end, both, depend.outs, (len(depend.outs),), len(varied)),
         rows=program.rows,
         block=program.block,
-        slopes=(*slopes, *(True for m in moving if m)),
+        tangents=(*before, *(True for m in varied if m)),
         base=program,
     )
-    return derived, (*there.outs, *rows)
+    return derived, (*depend.outs, *rows)
 
 
-def _derived(
+def _with_derivatives(
     closed: ClosedJaxpr,
-    moving: tuple[bool, ...],
+    varied: tuple[bool, ...],
     wanted: tuple[bool, ...],
     groups: tuple[int, ...],
     split: int | None = None,
 ) -> ClosedJaxpr:
-    """A jaxpr with derivatives: after each group of results (inputs: before and from `split` on)
-    come those that are wanted (that move)."""
+    """A jaxpr of values and derivatives.
+
+    **Arguments:** the jaxpr; which arguments have a tangent, which results' derivatives are wanted;
+    the sizes of the groups of results, each of which is followed by its derivatives; the number of
+    arguments whose tangents come before the other arguments (none: all).
+    """
     function = jaxpr_as_fun(with_quotients(closed))
-    ends = [0, len(moving) if split is None else split, len(moving)]
+    ends = [0, len(varied) if split is None else split, len(varied)]
 
     def both(*args):
         given = iter(args)
         primals: list[Any] = []
         tangents: list[Any] = []
         for begin, end in pairwise(ends):
-            primals += [next(given) for _ in moving[begin:end]]
-            tangents += [next(given) for there in moving[begin:end] if there]
+            primals += [next(given) for _ in varied[begin:end]]
+            tangents += [next(given) for here in varied[begin:end] if here]
 
-        def of_moving(*changing):
+        def of_varied(*changing):
             given = iter(changing)
             return function(
-                *(next(given) if m else p for m, p in zip(moving, primals, strict=True))
+                *(next(given) if m else p for m, p in zip(varied, primals, strict=True))
             )
 
-        changing = [p for m, p in zip(moving, primals, strict=True) if m]
-        values, slopes = jax.jvp(of_moving, changing, tangents)
+        changing = [p for m, p in zip(varied, primals, strict=True) if m]
+        values, derivatives = jax.jvp(of_varied, changing, tangents)
         out, at = [], 0
         for size in groups:
             here = slice(at, at + size)
             out += values[here]
-            out += [s for s, want in zip(slopes[here], wanted[here], strict=True) if want]
+            out += [s for s, want in zip(derivatives[here], wanted[here], strict=True) if want]
             at += size
         return out
 
     shapes: list[Any] = []
     for begin, end in pairwise(ends):
         part = [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in closed.in_avals[begin:end]]
-        shapes += part + [s for s, m in zip(part, moving[begin:end], strict=True) if m]
+        shapes += part + [s for s, m in zip(part, varied[begin:end], strict=True) if m]
     return jax.make_jaxpr(both)(*shapes)
 
 
 @functools.lru_cache(maxsize=64)
 def widened(
-    program: LaneProgram, many: tuple[bool, ...], number: int
-) -> tuple[LaneProgram, Spread]:
-    """The program with `number` of some of its inputs in one lane, and what there are so many of.
+    program: LaneProgram, batched: tuple[bool, ...], number: int
+) -> tuple[LaneProgram, DependentParts]:
+    """The program with `number` values of some of its inputs in one lane.
 
     All that does not depend on them is computed once, so that several directions of a derivative
     share one motion.
+
+    **Arguments:** the program; which inputs have a leading axis of that length.
+
+    **Returns:** the widened program, and which of its parts have such an axis.
     """
-    there = spread(program, many, smooth=False)
+    depend = dependent_parts(program, batched, smooth=False)
 
     def over(closed: ClosedJaxpr, axes: tuple[bool, ...], wide: tuple[bool, ...]) -> ClosedJaxpr:
         def function(*args):
@@ -102,17 +114,17 @@ def widened(
         ]
         return jax.make_jaxpr(function)(*shapes)
 
-    flags = (*there.carry, False, False, *there.rows)
+    flags = (*depend.carry, False, False, *depend.rows)
     base = program.base
-    if base is not None and any(many[: len(base.in_avals)]):
+    if base is not None and any(batched[: len(base.in_avals)]):
         base = None
     wide = LaneProgram(
-        begin=over(program.begin, many, flags),
-        step=over(program.step, (*many, *there.carry), flags),
-        end=over(program.end, (*many, *there.carry), there.outs),
+        begin=over(program.begin, batched, flags),
+        step=over(program.step, (*batched, *depend.carry), flags),
+        end=over(program.end, (*batched, *depend.carry), depend.outs),
         rows=program.rows,
         block=program.block,
-        slopes=program.slopes,
+        tangents=program.tangents,
         base=base,
     )
-    return wide, there
+    return wide, depend

@@ -1,10 +1,12 @@
-"""Ctrl-C while lanes run, on whatever thread XLA runs them, and a way out that says so.
+"""Ctrl-C while lanes run, on whatever thread XLA runs them.
 
-Python hears a signal in its main thread alone, between two instructions of its own: not while that
-thread waits within XLA, nor on XLA's threads; and an exception that comes out of a function which C
-has called is lost. So a few lines of machine code stand before Python on both ways. One counts the
-signals as they come, and passes them on. The other passes XLA's calls on, and does not return to
-XLA before it has an answer.
+Python handles a signal only in its main thread, between two instructions of its own
+(https://docs.python.org/3/library/signal.html#execution-of-python-signal-handlers): not while that
+thread waits within XLA, nor on XLA's threads; and an exception that leaves a function which C has
+called through `ctypes` is printed and lost. So two functions of machine code are put between:
+`count_interrupt`, the process's handler of the signal, counts interrupts and calls the handler that
+was there before; `call_handler`, which XLA calls, calls the Python function until that has stored a
+result.
 """
 
 import atexit
@@ -17,32 +19,32 @@ from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 from ._code import engine_of
-from ._recent import Recent, once
+from ._recent import Recent, made_once
 
-# As `guarded` and `struck` below have it.
-WELL = 1
+# The answer of a handler that has no error to report; `call_handler` below compares with it.
+SUCCESS = 1
 
 _TEXT = """
-@strokes = global i32 0
-@before = global ptr null
-@python = global ptr null
-@again = global ptr null
+@count = global i32 0
+@previous = global ptr null
+@handler = global ptr null
+@interrupt_again = global ptr null
 
-define void @struck(i32 %signal) {
-  %old = atomicrmw add ptr @strokes, i32 1 seq_cst
-  %before = load ptr, ptr @before
-  call void %before(i32 %signal)
+define void @count_interrupt(i32 %signal) {
+  %old = atomicrmw add ptr @count, i32 1 seq_cst
+  %previous = load ptr, ptr @previous
+  call void %previous(i32 %signal)
   ret void
 }
 
-define ptr @guarded(ptr %frame) {
+define ptr @call_handler(ptr %frame) {
 entry:
-  %python = load ptr, ptr @python
+  %handler = load ptr, ptr @handler
   %out = alloca { ptr, i64, i64 }
   store { ptr, i64, i64 } zeroinitializer, ptr %out
   br label %ask
 ask:
-  call void %python(ptr %frame, ptr %out)
+  call void %handler(ptr %frame, ptr %out)
   %lost = getelementptr { ptr, i64, i64 }, ptr %out, i64 0, i32 2
   store i64 1, ptr %lost
   %answer = load ptr, ptr %out
@@ -55,8 +57,8 @@ answered:
   %is = icmp ne i32 %taken, 0
   br i1 %is, label %raise, label %end
 raise:
-  %again = load ptr, ptr @again
-  call void %again(i32 %taken)
+  %interrupt_again = load ptr, ptr @interrupt_again
+  call void %interrupt_again(i32 %taken)
   br label %end
 end:
   %well = icmp eq ptr %answer, inttoptr (i64 1 to ptr)
@@ -65,62 +67,67 @@ end:
 }
 """
 
-# How often those who run lanes are told of a stroke, and how long the one who tells them waits for
-# others to come (seconds).
-_LOOK, _LINGER = 0.05, 1.0
+# Seconds between two looks of `Watch`'s thread at the count, and until it ends without calls.
+_POLL, _LINGER = 0.05, 1.0
 
 
-class Out(ctypes.Structure):
-    """What the function behind `guard` tells, and is told."""
+class HandlerResult(ctypes.Structure):
+    """What the function behind `guard` stores for `call_handler`, whose `%out` it is."""
 
     _fields_ = [
-        ("answer", ctypes.c_void_p), ("signal", ctypes.c_int64), ("lost", ctypes.c_int64),
-    ]  # fmt: skip
+        ("answer", ctypes.c_void_p),  # null: none yet; SUCCESS; or the address of XLA's error
+        ("signal", ctypes.c_int64),  # to be raised again, or 0
+        ("lost", ctypes.c_int64),  # 1 if the function was called before and left without an answer
+    ]
 
 
 class _Native(NamedTuple):
-    """The machine code, what it keeps, and how Python tells it of signals."""
+    """The machine code, its global variables, and C's functions for signal handlers."""
 
     engine: Any
-    strokes: Any
-    before: Any
-    struck: int
+    count: Any
+    """How many interrupts there were."""
+    previous: Any
+    """The address of the handler that was there before."""
+    count_interrupt: int
+    """The address of the function that counts."""
     get: Any
-    """What C calls when a signal comes."""
+    """`PyOS_getsig(number)`: the address of a signal's handler."""
     put: Any
+    """`PyOS_setsig(number, address)`."""
 
 
-# Programs are lowered on several threads. Of two engines the first, whose code XLA may know by
-# then, would be dropped.
-@once
+# Programs are lowered on several threads. Of two engines the first would be dropped, although XLA
+# may have the address of its code.
+@made_once
 def _native() -> _Native:
     engine = engine_of(_TEXT)
     place, number = ctypes.c_void_p, ctypes.c_int
     return _Native(
         engine,
-        ctypes.c_int32.from_address(engine.get_global_value_address("strokes")),
-        place.from_address(engine.get_global_value_address("before")),
-        engine.get_function_address("struck"),
+        ctypes.c_int32.from_address(engine.get_global_value_address("count")),
+        place.from_address(engine.get_global_value_address("previous")),
+        engine.get_function_address("count_interrupt"),
         ctypes.PYFUNCTYPE(place, number)(("PyOS_getsig", ctypes.pythonapi)),
         ctypes.PYFUNCTYPE(place, number, place)(("PyOS_setsig", ctypes.pythonapi)),
     )
 
 
-def guard(python: Any) -> int:
+def guard(handler: Any) -> int:
     """The address of a handler for XLA that calls this function until it has an answer.
 
-    **Arguments:** `python(frame, out)`, made by `ctypes`, which puts into `out` the answer (`WELL`,
-    or the address of an error), and a signal that it took, which is then raised again. An exception
-    that comes out of it, such as a signal's between two instructions, leaves no answer: then it is
-    called again, with `out.lost`.
+    **Arguments:** `handler(frame, out)`, made by `ctypes`, which stores into `out`, a
+    `HandlerResult`, the answer, and a signal that it took, which is then raised again. An exception
+    that leaves it, such as a signal's between two instructions, leaves no answer: then it is called
+    again, with `out.lost`.
     """
     engine = _native().engine
     for name, function in {
-        "python": python, "again": ctypes.pythonapi.PyErr_SetInterruptEx,
+        "handler": handler, "interrupt_again": ctypes.pythonapi.PyErr_SetInterruptEx,
     }.items():  # fmt: skip
         address = engine.get_global_value_address(name)
         ctypes.c_void_p.from_address(address).value = _pointer(function)
-    return engine.get_function_address("guarded")
+    return engine.get_function_address("call_handler")
 
 
 def _pointer(function: Any) -> int:
@@ -129,47 +136,50 @@ def _pointer(function: Any) -> int:
     return found
 
 
-def listen() -> None:
-    """Count strokes of Ctrl-C from now on; what hears them already does so as before.
+def install_counter() -> None:
+    """Count interrupts from now on; the handler that is there is called as before.
 
-    Nothing is done where a program has a handler of its own, which may want the work to go on.
+    Nothing is done where a program has a handler of its own, which may want the lanes to go on.
     """
-    if not raises():
+    if not interrupt_raises():
         return
     native = _native()
     there = native.get(signal.SIGINT)
-    if there == native.struck or native.before.value not in (None, there):
+    if there == native.count_interrupt or native.previous.value not in (None, there):
         return
-    if native.before.value is None:
-        native.before.value = there
-        atexit.register(_deaf)
-    native.put(signal.SIGINT, native.struck)
+    if native.previous.value is None:
+        native.previous.value = there
+        atexit.register(_remove_counter)
+    native.put(signal.SIGINT, native.count_interrupt)
 
 
-def _deaf() -> None:
-    """The machine code goes with the process's memory."""
+def _remove_counter() -> None:
+    """At exit, when the machine code's memory is freed before the process ends."""
     native = _native()
-    if native.get(signal.SIGINT) == native.struck:
-        native.put(signal.SIGINT, native.before.value)
+    if native.get(signal.SIGINT) == native.count_interrupt:
+        native.put(signal.SIGINT, native.previous.value)
 
 
-def strokes() -> int:
-    """How many there have been."""
-    return _native().strokes.value
+def interrupt_count() -> int:
+    """How many interrupts there have been since `install_counter`."""
+    return _native().count.value
 
 
-def raises() -> bool:
-    """Whether Ctrl-C raises `KeyboardInterrupt`, and so ends what the main thread does."""
+def interrupt_raises() -> bool:
+    """Whether Ctrl-C raises `KeyboardInterrupt`, which ends what the main thread does."""
     return signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-# What was counted as each of XLA's runs came to its first lanes: a stroke between two of its calls
-# is meant for those that follow.
-_begun: "Recent[int, int]" = Recent(256)
+# The count when each of XLA's runs came to its first lanes, by the run's number: an interrupt
+# between two calls of one run is meant for those that follow.
+_counts_at_start: "Recent[int, int]" = Recent(256)
 
 
 class Watch:
-    """Tells those who run lanes of Ctrl-C, on threads that hear nothing of it."""
+    """Stops lanes at Ctrl-C that run on threads to which Python brings no signals.
+
+    One thread looks at the count as long as there are such calls.
+    """
 
     def __init__(self):
         self._lock = threading.Lock()
@@ -177,21 +187,24 @@ class Watch:
         self._thread: threading.Thread | None = None
 
     @contextmanager
-    def told(self, run: int, stop: Any) -> Iterator[None]:
-        """Within it `stop`, a number that C sees, becomes 1 if there is a stroke; at once if there
-        was one since this run of XLA's came to its first lanes."""
-        listen()
-        begun = _begun.get(run)
+    def stopping(self, run: int, stop: Any) -> Iterator[None]:
+        """Within this context an interrupt sets `stop` to 1; at once if there was one since this
+        run of XLA's came to its first lanes.
+
+        **Arguments:** XLA's number of the run; the `ctypes` number that the kernel reads.
+        """
+        install_counter()
+        begun = _counts_at_start.get(run)
         if begun is None:
-            begun = strokes()
-            _begun.put(run, begun)
-        if strokes() != begun and raises():
+            begun = interrupt_count()
+            _counts_at_start.put(run, begun)
+        if interrupt_count() != begun and interrupt_raises():
             stop.value = 1
         with self._lock:
             self._stops[id(stop)] = (begun, stop)
             if self._thread is None:
                 self._thread = threading.Thread(
-                    target=self._look, name="lanes-interrupts", daemon=True
+                    target=self._poll, name="lanes-interrupts", daemon=True
                 )
                 self._thread.start()
         try:
@@ -200,18 +213,18 @@ class Watch:
             with self._lock:
                 del self._stops[id(stop)]
 
-    def _look(self) -> None:
+    def _poll(self) -> None:
         last = time.monotonic()
         while True:
-            time.sleep(_LOOK)
+            time.sleep(_POLL)
             with self._lock:
                 if self._stops:
                     last = time.monotonic()
-                    counted = strokes()
-                    if any(counted != begun for begun, _ in self._stops.values()) and raises():
-                        for begun, stop in self._stops.values():
-                            if counted != begun:
-                                stop.value = 1
+                    counted = interrupt_count()
+                    late = [stop for begun, stop in self._stops.values() if counted != begun]
+                    if late and interrupt_raises():
+                        for stop in late:
+                            stop.value = 1
                 elif time.monotonic() - last > _LINGER:
                     self._thread = None
                     return

@@ -22,8 +22,14 @@ def _is_unsigned(dtype: Any) -> bool:
     return np.dtype(dtype).kind in "ub"
 
 
-def into(table: dict[str, Rule], *names: str) -> Callable[[Rule], Rule]:
-    """Put a rule into a table under these names of primitives."""
+def register(table: dict[str, Rule], *names: str) -> Callable[[Rule], Rule]:
+    """Decorator: put a rule into a table under these names of primitives.
+
+    A rule of `ELEMENTWISE` has the arguments `t`, the `Text`; `p`, the parameters of the equation;
+    `d`, the types of its arguments; and a `Value` for each argument. It returns a `Value`, or a
+    tuple of them. It must give the same bits in any slot, and not trap on any number, since slots
+    whose lane does not need it compute it too.
+    """
 
     def put(rule: Rule) -> Rule:
         table.update(dict.fromkeys(names, rule))
@@ -32,7 +38,7 @@ def into(table: dict[str, Rule], *names: str) -> Callable[[Rule], Rule]:
     return put
 
 
-elementwise = partial(into, ELEMENTWISE)
+elementwise = partial(register, ELEMENTWISE)
 
 
 # --- arithmetic
@@ -47,6 +53,8 @@ def mul(t: Text, a: Value, b: Value) -> Value:
 
 
 def _commuting(t: Text, a: Value, b: Value, neutral: int, real: str, whole: str) -> Value:
+    """A sum or product: by `real` for floating-point numbers, none if one is `neutral`; by `whole`
+    for integers."""
     if not is_float(a.kind):
         return t.binary(whole, a, b)
     if a.number == neutral:
@@ -81,6 +89,7 @@ def neg(t: Text, a: Value) -> Value:
 
 
 def compare(t: Text, how: str, a: Value, b: Value, unsigned: bool) -> Value:
+    """Whether a is `"lt"`, `"le"`, `"eq"`, … b; false where either is NaN, but for `"ne"`."""
     if is_float(a.kind):
         order = {"eq": "oeq", "ne": "une"}.get(how, "o" + how)
         return t.binary(f"fcmp {order}", a, b, "i1")
@@ -132,6 +141,7 @@ def _(t, p, d, a, b):
 
 
 def extreme(t: Text, how: str, a: Value, b: Value, unsigned: bool) -> Value:
+    """The larger (`"gt"`) or smaller (`"lt"`) of two; NaN if either is."""
     if a.kind == "i1":
         return t.binary("or" if how == "gt" else "and", a, b)
     if b.number is None and a.number is not None:
@@ -274,6 +284,7 @@ def _(t, p, d, a):
 
 
 def convert(t: Text, a: Value, kind: str, unsigned: bool) -> Value:
+    """A value in another type, as JAX converts it; `unsigned` says how its own is meant."""
     if a.kind == kind:
         return a
     if a.number is not None:

@@ -16,18 +16,18 @@ from jax.interpreters import ad, batching, mlir, partial_eval
 from . import _xla as xla
 from ._context import within
 from ._derivative import forward, widened
-from ._program import LaneProgram, spread
+from ._program import LaneProgram, dependent_parts
 from ._vector import Unsupported
 from .call import header, registered
 from .runtime import kernel_of
 
-_strict: ContextVar[bool] = ContextVar("strict", default=False)
+_vector_only: ContextVar[bool] = ContextVar("strict", default=False)
 
 
 def vector_only() -> AbstractContextManager:
     """Within this context a program with lanes that cannot be vector code is not compiled: it
     raises `Unsupported`."""
-    return within(_strict, True)
+    return within(_vector_only, True)
 
 
 lanes_p = Primitive("lanes")
@@ -48,11 +48,14 @@ def _(*args, program: LaneProgram, backend: str):
     return jax.jit(functools.partial(lanes_p.bind, program=program, backend=backend))(*args)
 
 
-# Directions of a derivative that one lane carries along.
+# The most directions of a derivative that one lane carries along. Six of them took 2.6 times as
+# long as lanes of their own (`docs/internals/lanes.md`).
 _DIRECTIONS = 8
 
 
 def _batched(args, dims, *, program: LaneProgram, backend: str):
+    """An axis of `jax.vmap`, which becomes one of lanes; up to `_DIRECTIONS` tangents of one lane
+    become directions instead."""
     args = [jnp.asarray(x) for x in args]
     size = next(x.shape[d] for x, d in zip(args, dims, strict=True) if d is not None)
     many = tuple(d is not None for d in dims)
@@ -61,9 +64,9 @@ def _batched(args, dims, *, program: LaneProgram, backend: str):
         for x, d in zip(args, dims, strict=True)
     ]
     inner = program.batch(shapes)
-    slopes = program.slopes or (False,) * len(many)
-    if all(s or not m for s, m in zip(slopes, many, strict=True)) and 1 < size <= _DIRECTIONS:
-        return _directions(args, dims, inner, many, size, program, backend)
+    tangents = program.tangents or (False,) * len(many)
+    if all(t or not m for t, m in zip(tangents, many, strict=True)) and 1 < size <= _DIRECTIONS:
+        return _batched_directions(args, dims, inner, many, size, program, backend)
     moved = []
     for x, d, shape, aval in zip(args, dims, shapes, program.in_avals, strict=True):
         if d is None and len(shape) == aval.ndim:
@@ -74,25 +77,27 @@ def _batched(args, dims, *, program: LaneProgram, backend: str):
             x = x.reshape(x.shape[0], *(1 for _ in inner), *aval.shape)
         moved.append(jnp.broadcast_to(x, (size, *inner, *aval.shape)))
     out = lanes_p.bind(*moved, program=program, backend=backend)
-    there = spread(program, many, smooth=False)
-    wide = [there.control or w for w in (*there.outs, *there.rows)]
+    depend = dependent_parts(program, many, smooth=False)
+    wide = [depend.control or w for w in (*depend.outs, *depend.rows)]
     # What is the same in all lanes is one, as `vmap` has it for what does not depend on its axis.
     return [x if w else x[0] for x, w in zip(out, wide, strict=True)], [
         0 if w else None for w in wide
     ]
 
 
-def _directions(args, dims, inner: tuple, many, size: int, program: LaneProgram, backend: str):
-    """Tangents in several directions go along with one motion."""
-    wide, there = widened(program, many, size)
+def _batched_directions(
+    args, dims, inner: tuple, many, size: int, program: LaneProgram, backend: str
+):
+    """Tangents in several directions are carried along with one motion (`widened`)."""
+    wide, depend = widened(program, many, size)
     axes, moved = len(inner), []
     for x, d, aval in zip(args, dims, program.in_avals, strict=True):
         # Behind the axes of the lanes, before those of the number itself.
         own = 0 if d is None or x.ndim - 1 == aval.ndim else axes
         moved.append(x if d is None else jnp.moveaxis(x, d, own))
     out = lanes_p.bind(*moved, program=wide, backend=backend)
-    places = [axes if w else None for w in there.outs]
-    places += [axes + 1 if w else None for w in there.rows]
+    places = [axes if w else None for w in depend.outs]
+    places += [axes + 1 if w else None for w in depend.rows]
     return out, places
 
 
@@ -100,24 +105,30 @@ batching.primitive_batchers[lanes_p] = _batched
 
 
 def _jvp(primals, tangents, *, program: LaneProgram, backend: str):
-    moving = tuple(type(t) is not ad.Zero for t in tangents)
-    derived, has = forward(program, moving)
+    """Values and derivatives by one program (`forward`)."""
+    varied = tuple(type(t) is not ad.Zero for t in tangents)
+    derived, has = forward(program, varied)
     changes = [t for t in tangents if type(t) is not ad.Zero]
     out = iter(lanes_p.bind(*primals, *changes, program=derived, backend=backend))
-    values, slopes = [], []
+    values, derivatives = [], []
     # The results and their derivatives, then the rows and theirs.
-    for part in (has[: _outs(program)], has[_outs(program) :]):
+    for part in (has[: _result_count(program)], has[_result_count(program) :]):
         values += [next(out) for _ in part]
-        slopes += [next(out) if there else None for there in part]
+        derivatives += [next(out) if here else None for here in part]
     return values, [
         ad.Zero(jax.typeof(v).to_tangent_aval()) if s is None else s
-        for v, s in zip(values, slopes, strict=True)
+        for v, s in zip(values, derivatives, strict=True)
     ]
 
 
-def _partial(trace, *tracers, program: LaneProgram, backend: str):
-    """Where tangents are not known yet, as in `jax.linearize` and `jax.grad`, the values are: what
-    is computed along with such tangents is not known either, and the values are computed alone."""
+def _partially_known(trace, *tracers, program: LaneProgram, backend: str):
+    """A rule for `jax.linearize` and `jax.grad`, where values are known and tangents are not yet.
+
+    JAX would leave the whole program for later, because some of its inputs are not known. Here the
+    values are computed at once by the program of the values alone, and that of both is left for
+    later. The tracers are those of `JaxprTrace` in JAX's `interpreters/partial_eval.py` (0.10.2);
+    `tests/lanes/test_jax.py` fails where they change.
+    """
     unknown = [not t.is_known() for t in tracers]
     alone = program.values_without(unknown, [t.aval.shape for t in tracers])
     later = trace.default_process_primitive(
@@ -125,15 +136,19 @@ def _partial(trace, *tracers, program: LaneProgram, backend: str):
     )
     if alone is None or not any(unknown):
         return later
-    smaller, there = alone
+    smaller, found = alone
     given = [t.pval.get_known() for t in tracers[: len(smaller.in_avals)]]
     values = iter(lanes_p.bind(*given, program=smaller, backend=backend))
-    return [next(values) if known else x for known, x in zip(there, later, strict=True)]
+    return [next(values) if known else x for known, x in zip(found, later, strict=True)]
 
 
-def _partial_equation(saveable, unknown, instantiated, equation):
-    """The same of an equation, for `jax.checkpoint`: what is computed now, and what later, when the
-    values are computed again along with their derivatives."""
+def _partially_known_equation(saveable, unknown, instantiated, equation):
+    """The same for an equation within `jax.checkpoint`, whose values are computed again along with
+    their derivatives, unless its policy saves them.
+
+    **Returns:** as JAX's `partial_eval_jaxpr_custom_rules` ask for: the equation that is computed
+    now, that which is computed later, which results of either are not known, and what is kept.
+    """
     program, outs = equation.params["program"], len(equation.outvars)
     shapes = [x.aval.shape for x in equation.invars]
     alone = program, [True] * outs
@@ -148,26 +163,28 @@ def _partial_equation(saveable, unknown, instantiated, equation):
     ]
     if alone is None:
         return None, equation, [True] * outs, [True] * outs, kept
-    smaller, there = alone
+    smaller, found = alone
     now = equation.replace(
         invars=equation.invars[: len(smaller.in_avals)],
-        outvars=[x for x, known in zip(equation.outvars, there, strict=True) if known],
+        outvars=[x for x, known in zip(equation.outvars, found, strict=True) if known],
         params={**equation.params, "program": smaller},
     )
-    return now, equation, [not known for known in there], [True] * outs, kept
+    return now, equation, [not known for known in found], [True] * outs, kept
 
 
 def _saved(policy: Any) -> bool:
-    """Whether a policy of `jax.checkpoint` says so, by a truth value or by a word of JAX's."""
+    """Whether a policy of `jax.checkpoint` says to save a value: by `True`, or by an instance of
+    JAX's `SaveableType` (0.10.2), which no public module has."""
     return policy is True or type(policy).__name__.startswith("Saveable")
 
 
 def _transposed(cotangents, *args, program: LaneProgram, backend: str):
-    """By columns: the program is run along every number of the tangents asked for, several of them
-    with one motion, and what comes of each is weighed.
+    """Reverse mode by columns: the program is run forward along every number that is
+    differentiated, `_DIRECTIONS` of them with one motion, and each derivative is weighted with the
+    cotangents.
 
-    A reverse pass would have to take the steps again, and rounding may have them decide otherwise
-    about an event than the first time.
+    A reverse pass would have to take the steps again, and rounding may then let them decide
+    otherwise about an event than the first time.
     """
     places: dict[int, slice] = {}  # of each tangent asked for, among all their numbers
     number = 0
@@ -193,7 +210,7 @@ def _transposed(cotangents, *args, program: LaneProgram, backend: str):
             some = units[first : first + size, place].astype(aval.dtype)
             given[i] = some.reshape(size, *aval.shape)
         columns = along(*given)
-        found.append(sum(_weighed(columns[k], ct, 1 + len(batch)) for k, ct in weights))
+        found.append(sum(_weighted(columns[k], ct, 1 + len(batch)) for k, ct in weights))
     each = jnp.concatenate(found)  # (numbers, *batch)
     out: list[Any] = [None] * len(args)
     for i, place in places.items():
@@ -204,19 +221,20 @@ def _transposed(cotangents, *args, program: LaneProgram, backend: str):
     return out
 
 
-def _weighed(column, weight, kept: int):
-    """Summed but for the first axes. What has no weight may be no number, as after a failure."""
+def _weighted(column, weight, kept: int):
+    """The weighted sum over all but the first `kept` axes. A value of weight 0 may be NaN, as
+    after a failure."""
     product = jnp.where(weight == 0, 0.0, column * weight)
     return jnp.sum(product, axis=tuple(range(kept, product.ndim)))
 
 
-def _outs(program: LaneProgram) -> int:
+def _result_count(program: LaneProgram) -> int:
     return len(program.out_avals)
 
 
 ad.primitive_jvps[lanes_p] = _jvp
-partial_eval.custom_partial_eval_rules[lanes_p] = _partial
-partial_eval.partial_eval_jaxpr_custom_rules[lanes_p] = _partial_equation
+partial_eval.custom_partial_eval_rules[lanes_p] = _partially_known
+partial_eval.partial_eval_jaxpr_custom_rules[lanes_p] = _partially_known_equation
 ad.primitive_transposes[lanes_p] = _transposed
 
 
@@ -226,38 +244,42 @@ _on_xla = mlir.lower_fun(
 
 
 def _lowered(ctx, *args, program: LaneProgram, backend: str):
+    """On a CPU: a call of the program's kernel; XLA's loop where that was asked for or there can be
+    no kernel."""
     if backend == "xla":
-        if _strict.get():
+        if _vector_only.get():
             raise Unsupported("the other backend")
         return _on_xla(ctx, *args, program=program, backend=backend)
     try:
-        kernel = kernel_of(program, _count(program, ctx.avals_in))
+        kernel = kernel_of(program, _lane_count(program, ctx.avals_in))
+        target = registered()
     except Unsupported as reason:
-        if _strict.get():
+        if _vector_only.get():
             raise
-        _tell(str(reason))
+        _warn(str(reason))
         return _on_xla(ctx, *args, program=program, backend=backend)
-    ctx.module_context.add_keepalive(kernel)
-    call = functools.partial(_called, kernel, program, ctx.avals_out)
+    ctx.module_context.add_keepalive(kernel)  # as long as the compiled program lives
+    call = functools.partial(_kernel_call, target, kernel, program, ctx.avals_out)
     return mlir.lower_fun(call, multiple_results=True)(ctx, *args)
 
 
-def _called(kernel, program: LaneProgram, avals, *args):
+def _kernel_call(target: str, kernel, program: LaneProgram, avals, *args):
+    """The kernel as a foreign function of XLA's: results of the shapes `avals`."""
     strides = [
         aval.size if x.ndim > aval.ndim else 0
         for x, aval in zip(args, program.in_avals, strict=True)
     ]
-    head = header(kernel.key, _count(program, args), strides)
+    head = header(kernel.key, _lane_count(program, args), strides)
     results = [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in avals]
-    return jax.ffi.ffi_call(registered(), results)(head, *args)
+    return jax.ffi.ffi_call(target, results)(head, *args)
 
 
-def _count(program: LaneProgram, args) -> int:
+def _lane_count(program: LaneProgram, args) -> int:
     return math.prod(program.batch([x.shape for x in args]))
 
 
 @functools.cache
-def _tell(reason: str) -> None:
+def _warn(reason: str) -> None:
     warnings.warn(
         f"Lanes run on XLA's slower backend, because this program needs {reason}.", stacklevel=2
     )

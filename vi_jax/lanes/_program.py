@@ -1,5 +1,6 @@
-"""What lanes run: a loop of one lane's numbers, traced once."""
+"""What lanes run: a loop of one lane's numbers, traced once; which of its parts depend on which."""
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -12,7 +13,8 @@ class LaneProgram(eqx.Module):
     """A lane's loop as jaxprs of flat arguments; hashable, as a primitive's parameter must be.
 
     `begin(inputs)` and `step(inputs, carry)` give the carry, whether the lane goes on, whether a
-    row is complete, and the row; `end(inputs, carry)` gives the results.
+    row is complete, and the row; `end(inputs, carry)` gives the results. `rows` is how many rows a
+    lane has room for. The shapes are those of one lane, without axes of a batch.
     """
 
     begin: ClosedJaxpr = eqx.field(static=True)
@@ -22,42 +24,49 @@ class LaneProgram(eqx.Module):
     block: int = eqx.field(static=True)
     """Steps in which a lane completes at most one row."""
 
-    slopes: tuple[bool, ...] = eqx.field(static=True, default=())
-    """Which inputs are tangents; none may steer the loop."""
+    tangents: tuple[bool, ...] = eqx.field(static=True, default=())
+    """Which inputs are tangents. How long a lane goes on must not depend on them."""
 
     base: "LaneProgram | None" = eqx.field(static=True, default=None)
-    """Of a program of values and derivatives that of the values alone, whose inputs come first."""
+    """Of a program of values and derivatives, that of the values alone. Its inputs come first."""
 
     __hash__ = object.__hash__
     __eq__ = object.__eq__
 
     @property
     def jaxprs(self) -> tuple[ClosedJaxpr, ...]:
-        """All of them."""
+        """The three jaxprs."""
         return self.begin, self.step, self.end
 
     @property
     def in_avals(self) -> list[Any]:
-        """Of one lane's inputs."""
+        """Shapes and types of one lane's inputs."""
         return self.begin.in_avals
 
     @property
     def carry_avals(self) -> list[Any]:
-        """Of one lane's carry."""
+        """Shapes and types of one lane's carry."""
         return self.step.in_avals[len(self.in_avals) :]
 
     @property
     def out_avals(self) -> list[Any]:
-        """Of one lane's results."""
+        """Shapes and types of one lane's results."""
         return self.end.out_avals
+
+    @property
+    def row_avals(self) -> list[Any]:
+        """Shapes and types of a row."""
+        return self.begin.out_avals[len(self.carry_avals) + 2 :]
 
     def values_without(
         self, gone: Sequence[bool], shapes: Sequence[tuple[int, ...]]
     ) -> "tuple[LaneProgram, list[bool]] | None":
-        """The program of what is known without some of the tangents, and which results and rows
-        of this one it gives, in their order; `None` if there is none.
+        """The program of the values that can be computed without some of the tangents.
 
-        **Arguments:** which inputs are missing, and the shapes of all.
+        **Arguments:** which inputs are missing, and the shapes of all, axes of a batch included.
+
+        **Returns:** that program, and which results and rows of this one it gives, in their order;
+        `None` if there is none.
         """
         found, base = [True] * (len(self.out_avals) + len(self.row_avals)), self.base
         program, batch = self, self.batch(shapes)
@@ -79,35 +88,36 @@ class LaneProgram(eqx.Module):
                 return shape[: len(shape) - aval.ndim]
         return ()
 
-    @property
-    def row_avals(self) -> list[Any]:
-        """Of a row."""
-        return self.begin.out_avals[len(self.carry_avals) + 2 :]
 
-
-def spread(program: LaneProgram, sources: tuple[bool, ...], *, smooth: bool) -> "Spread":
-    """Which parts of a program depend on these inputs; if `smooth`, differentiably."""
-    n = len(program.carry_avals)
-    begun = reached(program.begin.jaxpr, sources, smooth=smooth)
-    step = program.step.jaxpr
-    stepped = _settled(lambda c: reached(step, [*sources, *c], smooth=smooth), begun[:n])
-    carry = stepped[:n]
-    rest = [a or b for a, b in zip(begun[n:], stepped[n:], strict=True)]
-    outs = reached(program.end.jaxpr, (*sources, *carry), smooth=smooth)
-    return Spread(tuple(carry), any(rest[:2]), tuple(rest[2:]), tuple(outs))
-
-
-class Spread(NamedTuple):
-    """What depends on something."""
+class DependentParts(NamedTuple):
+    """Which parts of a program depend on some of its inputs, one truth value for each array."""
 
     carry: tuple[bool, ...]
     control: bool
-    """How long a lane goes on, or which rows it completes."""
+    """Whether how long a lane goes on, or which rows it completes, depends on them."""
     rows: tuple[bool, ...]
     outs: tuple[bool, ...]
 
 
-# Calls whose body stands for them, and the parameter that holds it.
+def dependent_parts(
+    program: LaneProgram, sources: tuple[bool, ...], *, smooth: bool
+) -> DependentParts:
+    """Which parts of a program depend on the inputs `sources`; if `smooth`, only dependence that
+    can have a derivative counts."""
+    n = len(program.carry_avals)
+    depends = functools.partial(dependent_results, smooth=smooth)
+    begun = depends(program.begin.jaxpr, sources)
+    step = program.step.jaxpr
+    stepped = _fixed_point(lambda carry: depends(step, [*sources, *carry]), begun[:n])
+    carry = stepped[:n]
+    rest = [a or b for a, b in zip(begun[n:], stepped[n:], strict=True)]
+    outs = depends(program.end.jaxpr, (*sources, *carry))
+    return DependentParts(tuple(carry), any(rest[:2]), tuple(rest[2:]), tuple(outs))
+
+
+# Primitives that call a jaxpr, and the parameter that holds it. JAX 0.8 to 0.10 gives them these
+# names (`tests/lanes/test_jax.py` fails where a later one gives others); "pjit", "remat",
+# "checkpoint" and "core_call" are older ones.
 CALLS = {
     "jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr",
     "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "remat": "jaxpr",
@@ -116,64 +126,67 @@ CALLS = {
 
 
 # Of these, what has a derivative of its own, of which its body says nothing.
-RULED = ("custom_jvp_call", "custom_vjp_call", "custom_lin")
+OWN_DERIVATIVE = ("custom_jvp_call", "custom_vjp_call", "custom_lin")
 
 
 def inner(jaxpr: ClosedJaxpr | Jaxpr) -> Jaxpr:
-    """Without what it closes over."""
+    """A jaxpr without the constants of a closed one."""
     return jaxpr.jaxpr if isinstance(jaxpr, ClosedJaxpr) else jaxpr
 
 
-def _dtype(var: Any) -> Any:
-    return var.aval.dtype
+# Primitives with floating-point results whose derivative is zero, or is treated as zero.
+_ZERO_DERIVATIVE = ("stop_gradient", "sign", "round", "floor", "ceil")
 
 
-# What has no derivative although it gives floating-point numbers.
-_FLAT = ("stop_gradient", "sign", "round", "floor", "ceil")
-
-
-def reached(jaxpr: Jaxpr, sources: Sequence[bool], *, smooth: bool) -> list[bool]:
-    """Which results may depend on these arguments; if `smooth`, differentiably."""
+def dependent_results(jaxpr: Jaxpr, sources: Sequence[bool], *, smooth: bool) -> list[bool]:
+    """Which results of a jaxpr may depend on its arguments `sources`; if `smooth`, only dependence
+    that can have a derivative counts."""
     found = {v for v, s in zip(jaxpr.invars, sources, strict=True) if s}
 
-    def touched(atom: Any) -> bool:
+    def depends(atom: Any) -> bool:
         return not isinstance(atom, Literal) and atom in found
 
     for eqn in jaxpr.eqns:
-        args = [touched(a) for a in eqn.invars]
-        if not any(args) or (smooth and eqn.primitive.name in _FLAT):
+        args = [depends(a) for a in eqn.invars]
+        if not any(args) or (smooth and eqn.primitive.name in _ZERO_DERIVATIVE):
             continue
-        for var, there in zip(eqn.outvars, _through(eqn, args, smooth=smooth), strict=True):
-            if there and not (smooth and not jnp.issubdtype(_dtype(var), jnp.inexact)):
+        for var, here in zip(eqn.outvars, _of_equation(eqn, args, smooth=smooth), strict=True):
+            aval: Any = var.aval
+            if here and not (smooth and not jnp.issubdtype(aval.dtype, jnp.inexact)):
                 found.add(var)
-    return [touched(a) for a in jaxpr.outvars]
+    return [depends(a) for a in jaxpr.outvars]
 
 
-def _through(eqn: Any, args: list[bool], *, smooth: bool) -> list[bool]:
-    """Which results of an equation depend on these of its arguments."""
+def _of_equation(eqn: Any, args: list[bool], *, smooth: bool) -> list[bool]:
+    """Which results of an equation depend on the arguments `args`."""
     name, params = eqn.primitive.name, eqn.params
-    if name in CALLS and not (smooth and name in RULED):
-        return reached(inner(params[CALLS[name]]), args, smooth=smooth)
+    depends = functools.partial(dependent_results, smooth=smooth)
+    if name in CALLS and not (smooth and name in OWN_DERIVATIVE):
+        return depends(inner(params[CALLS[name]]), args)
     if name == "cond" and (smooth or not args[0]):
-        ways = [reached(inner(b), args[1:], smooth=smooth) for b in params["branches"]]
+        ways = [depends(inner(b), args[1:]) for b in params["branches"]]
         return [any(way) for way in zip(*ways, strict=True)]
     if name == "scan":
         n, m = params["num_consts"], params["num_carry"]
         fixed, carry, rows = args[:n], args[n : n + m], args[n + m :]
         body = inner(params["jaxpr"])
-        return _settled(lambda c: reached(body, [*fixed, *c, *rows], smooth=smooth), carry)
+        return _fixed_point(lambda c: depends(body, [*fixed, *c, *rows]), carry)
     if name == "while":
         n, m = params["cond_nconsts"], params["body_nconsts"]
         asked, fixed, carry = args[:n], args[n : n + m], args[n + m :]
         body = inner(params["body_jaxpr"])
-        outs = _settled(lambda c: reached(body, [*fixed, *c], smooth=smooth), carry)
-        ends = reached(inner(params["cond_jaxpr"]), [*asked, *outs], smooth=smooth)
+        outs = _fixed_point(lambda c: depends(body, [*fixed, *c]), carry)
+        ends = depends(inner(params["cond_jaxpr"]), [*asked, *outs])
         return [True] * len(outs) if any(ends) else outs
     return [True] * len(eqn.outvars)
 
 
-def _settled(turn: Callable[[list[bool]], list[bool]], carry: list[bool]) -> list[bool]:
-    """What a loop's turn gives, carry first, once no more of the carry is reached."""
+def _fixed_point(turn: Callable[[list[bool]], list[bool]], carry: list[bool]) -> list[bool]:
+    """What one turn of a loop gives, carry first, once no more of the carry depends.
+
+    **Arguments:** which results of a turn depend where these parts of the carry do; those that do
+    before the first turn.
+    """
     while True:
         outs = turn(carry)
         grown = [a or b for a, b in zip(carry, outs, strict=False)]

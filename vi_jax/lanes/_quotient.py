@@ -1,8 +1,8 @@
 """Division whose derivative divides once, however many directions it is taken in.
 
-JAX divides each tangent of the dividend, and by the divisor's square for the tangent of the
-divisor. Products with one reciprocal do instead: in the derivatives of a machine's motion divisions
-would be what the processor waits for.
+JAX divides each tangent of the dividend by the divisor, and each of the divisor by its square. Here
+each is multiplied by one reciprocal: in the derivatives of a machine's motion the divisions would
+take most of the time.
 """
 
 import functools
@@ -13,7 +13,7 @@ from jax.core import ShapedArray
 from jax.extend.core import ClosedJaxpr, Jaxpr, Primitive
 from jax.interpreters import ad, batching
 
-from ._program import RULED
+from ._program import OWN_DERIVATIVE
 from .elementary import jitted
 
 quotient_p = Primitive("quotient")
@@ -30,10 +30,11 @@ def _rewritten(jaxpr: Jaxpr) -> Jaxpr:
 
 
 def _equation(eqn: Any) -> Any:
+    """An equation with divisions replaced, in inner jaxprs too."""
     name = eqn.primitive.name
     if name == "div" and jnp.issubdtype(eqn.outvars[0].aval.dtype, jnp.floating):
         return eqn.replace(primitive=quotient_p, params={})
-    if name in RULED:
+    if name in OWN_DERIVATIVE:
         return eqn
     return eqn.replace(params={key: _parameter(x) for key, x in eqn.params.items()})
 

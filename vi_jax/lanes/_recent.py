@@ -1,4 +1,4 @@
-"""What is kept of what was made, as long as it is in use."""
+"""Caches that all threads share: the values used last, and values that are made once."""
 
 import functools
 import threading
@@ -11,7 +11,7 @@ V = TypeVar("V")
 
 
 class Recent(Generic[K, V]):
-    """The most recently used of some values by their keys, shared by all threads."""
+    """The `most` values that were used last, by their keys; safe to use from several threads."""
 
     def __init__(self, most: int):
         self.most = most
@@ -22,12 +22,12 @@ class Recent(Generic[K, V]):
         return len(self._values)
 
     def clear(self) -> None:
-        """Let go of all."""
+        """Drop all."""
         with self._lock:
             self._values.clear()
 
     def get(self, key: K) -> V | None:
-        """What was put there, if it is still kept."""
+        """The value of a key, or `None`."""
         with self._lock:
             value = self._values.get(key)
             if value is not None:
@@ -35,7 +35,7 @@ class Recent(Generic[K, V]):
         return value
 
     def put(self, key: K, value: V) -> None:
-        """Keep it, and let go of the one used longest ago."""
+        """Keep a value, and drop the one used longest ago if there are more than `most`."""
         with self._lock:
             self._values[key] = value
             self._values.move_to_end(key)
@@ -43,9 +43,12 @@ class Recent(Generic[K, V]):
                 self._values.popitem(last=False)
 
 
-def once(make: Callable[[], V]) -> Callable[[], V]:
-    """A function that makes something the first time, whichever thread asks: of two that ask at
-    once `functools.cache` would let both make it, and drop one that may be in use."""
+def made_once(make: Callable[[], V]) -> Callable[[], V]:
+    """Decorator: the function is called once, whichever thread asks first, and its value kept.
+
+    `functools.cache` would let two threads that ask at the same time both call it, and drop one of
+    the values although it may be in use.
+    """
     lock, kept = threading.Lock(), functools.cache(make)
 
     @functools.wraps(make)

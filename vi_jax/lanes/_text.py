@@ -1,6 +1,7 @@
 """Vector code as LLVM's text: values, operations on them, and blocks."""
 
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,9 +14,9 @@ class Value:
 
     text: str
     kind: str
-    """`double`, `float`, `i1`, `i8` … `i64`."""
+    """LLVM's type: `double`, `float`, `i1`, `i8` … `i64`."""
     number: float | int | bool | None = None
-    """Of a constant."""
+    """The number of a constant; else `None`."""
 
 
 KINDS = {
@@ -25,8 +26,8 @@ KINDS = {
 }  # fmt: skip
 
 
-# What `Text.fork` says of a label that is gone to rarely. Without it LLVM takes both for equally
-# likely, and spills what every step needs for the sake of what few steps do (a tenth of the time).
+# The weights of a branch that `Text.fork` marks as rare. Without them LLVM takes both ways for
+# equally likely, and spills what every step needs for what few steps do (a tenth of the time).
 RARE = '!0 = !{!"branch_weights", i32 1, i32 200}'
 
 
@@ -35,7 +36,11 @@ def is_float(kind: str) -> bool:
 
 
 class Text:
-    """Lines of a function under way, with equal operations merged."""
+    """The body of a function while it is written, with equal operations merged.
+
+    A value may be used only in blocks that its own dominates. Scopes keep account of that: see
+    `open`, `close` and `follow`, and `docs/internals/lanes.md`. `width` is the lanes of a group.
+    """
 
     def __init__(self, width: int):
         self.width = width
@@ -43,13 +48,15 @@ class Text:
         self.declared: dict[str, str] = {}
         self.block = "entry"
         self._names = 0
-        # Operations seen, in the blocks that dominate the one under way.
+        # Operations written in blocks that dominate the current one, a table for each open scope.
         self._seen: list[dict[tuple, Value]] = [{}]
 
     def vector(self, kind: str) -> str:
+        """LLVM's type of one number of every lane."""
         return f"<{self.width} x {kind}>"
 
     def fresh(self) -> str:
+        """A new name of a value."""
         self._names += 1
         return f"%v{self._names}"
 
@@ -69,16 +76,22 @@ class Text:
         return self.constant(0, kind)
 
     def line(self, text: str) -> None:
+        """Append an instruction without a result."""
         self.lines.append("  " + text)
 
     def raw(self, operation: str) -> str:
-        """The name of a result that is no vector of the group."""
+        """Append an instruction; the name of its result. For results that are no vectors of the
+        group, and what must not be merged."""
         name = self.fresh()
         self.line(f"{name} = {operation}")
         return name
 
     def value(self, operation: str, kind: str, *, merge: bool = True) -> Value:
-        """The result of an operation; equal ones are done once."""
+        """Append an operation on vectors, unless an equal one was written in a block that dominates
+        this one.
+
+        **Arguments:** the operation in LLVM's words; the type of its result's numbers.
+        """
         key = (operation, kind)
         if merge:
             for seen in self._seen:
@@ -90,9 +103,11 @@ class Text:
         return result
 
     def binary(self, operation: str, a: Value, b: Value, kind: str | None = None) -> Value:
+        """An operation on two values of one type; `kind` is its result's type if another."""
         return self.value(f"{operation} {self.vector(a.kind)} {a.text}, {b.text}", kind or a.kind)
 
     def cast(self, operation: str, a: Value, kind: str) -> Value:
+        """A conversion (`fpext`, `zext`, `bitcast` …) to another type."""
         return self.value(
             f"{operation} {self.vector(a.kind)} {a.text} to {self.vector(kind)}", kind
         )
@@ -108,10 +123,11 @@ class Text:
         return self.value(f"select {flags}, {v} {a.text}, {v} {b.text}", a.kind)
 
     def suffix(self, kind: str) -> str:
+        """The vector type as in the names of intrinsics: `v8f64`."""
         return f"v{self.width}" + {"double": "f64", "float": "f32"}.get(kind, kind)
 
     def intrinsic(self, name: str, *args: Value, kind: str | None = None) -> Value:
-        """A vector intrinsic of LLVM on values of one type."""
+        """An intrinsic of LLVM on values of one type, such as `sqrt`; `kind` as in `binary`."""
         own = args[0].kind
         function = f"@llvm.{name}.{self.suffix(own)}"
         result = kind or own
@@ -139,6 +155,7 @@ class Text:
     # Flags
 
     def both(self, a: Value, b: Value) -> Value:
+        """a and b."""
         if a.number is not None:
             return b if a.number else a
         if b.number is not None:
@@ -146,6 +163,7 @@ class Text:
         return self.binary("and", a, b)
 
     def inverse(self, a: Value) -> Value:
+        """Not a."""
         return self.binary("xor", a, self.constant(True, "i1"))
 
     def any(self, a: Value) -> str:
@@ -156,28 +174,49 @@ class Text:
     # Blocks
 
     def open(self, label: str) -> None:
-        """Begin a block; what it computes is known in it alone until `close`."""
+        """Begin a block that the current one dominates, in a scope that lasts until `close`."""
         self.lines.append(f"{label}:")
         self.block = label
         self._seen.append({})
 
     def close(self) -> None:
+        """End the last scope: the blocks that follow do not see what was computed in it."""
         self._seen.pop()
 
     def fork(self, condition: str, yes: str, no: str, *, rare: bool = False) -> None:
-        """Go on at one of two labels; where `yes` is `rare`, the registers are kept for `no`."""
+        """End the block: go on at one of two labels. If `yes` is `rare`, `no` is kept fast."""
         self.line(f"br i1 {condition}, label %{yes}, label %{no}{', !prof !0' if rare else ''}")
 
     def follow(self, label: str) -> None:
-        """Go on in a block that everything computed so far dominates."""
+        """Begin a block that the blocks of all open scopes dominate, without a scope of its own."""
         self.lines.append(f"{label}:")
         self.block = label
 
     def label(self) -> str:
+        """A new name of a block."""
         self._names += 1
         return f"b{self._names}"
 
     def phi(self, kind: str, *ways: tuple[str, str]) -> Value:
         """The value that came with the block it was reached from."""
+        return self.value(self._phi(kind, ways), kind, merge=False)
+
+    def join(
+        self, names: list[Value], *ways: tuple[list[Value], str], at: int | None = None
+    ) -> None:
+        """Define names by phi instructions.
+
+        **Arguments:** the names; for each block from which this one is reached, the values that
+        come from there, and its label; the line where the phis are to stand, if not here. A loop's
+        head is written before its body, so that its phis are put there afterwards.
+        """
+        lines = []
+        for name, *values in zip(names, *(values for values, _ in ways), strict=True):
+            pairs = [(v.text, block) for v, (_, block) in zip(values, ways, strict=True)]
+            lines.append(f"  {name.text} = {self._phi(name.kind, pairs)}")
+        at = len(self.lines) if at is None else at
+        self.lines[at:at] = lines
+
+    def _phi(self, kind: str, ways: Sequence[tuple[str, str]]) -> str:
         pairs = ", ".join(f"[ {text}, %{block} ]" for text, block in ways)
-        return self.value(f"phi {self.vector(kind)} {pairs}", kind, merge=False)
+        return f"phi {self.vector(kind)} {pairs}"

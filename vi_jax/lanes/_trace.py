@@ -1,4 +1,4 @@
-"""A lane's functions as jaxprs of flat arguments, traced once for all that is alike."""
+"""A lane's functions as jaxprs of flat arguments, traced once for equal functions and inputs."""
 
 import functools
 import sys
@@ -18,7 +18,7 @@ from ._recent import Recent
 
 
 class Functions(NamedTuple):
-    """What a lane does."""
+    """The functions of a lane, as `run` takes them."""
 
     begin: Callable[..., Any]
     step: Callable[..., Any]
@@ -26,11 +26,11 @@ class Functions(NamedTuple):
 
 
 class Traced(NamedTuple):
-    """The program of a lane."""
+    """The program of a lane, and how its results are put together again."""
 
     program: LaneProgram
     consts: list[Any]
-    """Arrays that the functions close over: further inputs."""
+    """Arrays that the functions close over, which are further inputs."""
     out: Any
     """The structure of the results."""
     row: Any
@@ -41,22 +41,23 @@ _recent: "Recent[Any, Traced]" = Recent(64)
 
 
 def traced(functions: Functions, treedef: Any, leaves: Sequence[Any], **options: int) -> Traced:
-    """The program for inputs of this structure and of these leaves' shapes and types.
+    """The program for inputs of one structure, and of their leaves' shapes and types.
 
-    **Arguments:** `options` of the `LaneProgram`.
+    **Arguments:** the functions; the structure and the leaves of the inputs of one lane; `rows` and
+    `block` of the `LaneProgram`.
     """
-    shapes = [one(x) for x in leaves]
+    shapes = [shape_of(x) for x in leaves]
     try:
-        jax.eval_shape(_forgets, jax.ShapeDtypeStruct((), jnp.int32))
+        jax.eval_shape(_clear_with_jax, jax.ShapeDtypeStruct((), jnp.int32))
         key = (
-            *map(_name, functions),
+            *map(_function_key, functions),
             treedef,
             *((x.shape, x.dtype) for x in shapes),
             *options.items(),
             bool(jax.config.jax_enable_x64),  # pyright: ignore
         )
         found = _recent.get(key)
-    except (TypeError, ValueError):  # no hash, or no telling whether two are equal
+    except (TypeError, ValueError):  # no hash, or whether two are equal is not known
         return _traced(functions, treedef, shapes, options)
     if found is None:
         found = _traced(functions, treedef, shapes, options)
@@ -66,42 +67,44 @@ def traced(functions: Functions, treedef: Any, leaves: Sequence[Any], **options:
 
 
 @jax.jit
-def _forgets(x: Any) -> Any:
-    # Traced again after `jax.clear_caches()`: what is forgotten there is forgotten here.
+def _clear_with_jax(x: Any) -> Any:
+    # Traced again only after `jax.clear_caches()`, which has no public hook (JAX 0.10.2).
     _recent.clear()
     return x
 
 
-def _name(function: Callable[..., Any]) -> tuple:
-    """What is equal only for functions that do the same, as long as they are pure.
+def _function_key(function: Callable[..., Any]) -> tuple:
+    """A key that is equal only for functions that do the same, as long as they are pure.
 
-    **Raises:** `TypeError` where that is not to be known.
+    **Raises:** `TypeError` where that cannot be known.
     """
     if isinstance(function, functools.partial):
         if function.keywords:
             raise TypeError("no place in an order")
-        return (_name(function.func), *map(_bound, function.args))
+        return (_function_key(function.func), *map(_argument_key, function.args))
     if not isinstance(function, FunctionType):
         raise TypeError("no function")
     if function.__closure__ is not None:
-        # A decorated function closes over what it decorates: there is one of it in its module.
+        # A decorated function closes over what it decorates. If it is that of its module, there is
+        # only one.
         module = sys.modules.get(function.__module__)
         if getattr(module, function.__qualname__, None) is not function:
-            raise TypeError("made for this call, perhaps")
+            raise TypeError("perhaps made for this call")
     return (function,)
 
 
-def _bound(x: Any) -> tuple:
+def _argument_key(x: Any) -> tuple:
+    """The same for an argument that is bound by `functools.partial`: a function or a pytree."""
     if isinstance(x, FunctionType | functools.partial):
-        return _name(x)
+        return _function_key(x)
     leaves, treedef = jtu.tree_flatten(x)
-    return (treedef, *map(_constant, leaves))
+    return (treedef, *map(_constant_key, leaves))
 
 
-def _constant(x: Any) -> Any:
-    """What is equal only for equal constants, which 1, 1.0 and True or 0.0 and -0.0 are not.
+def _constant_key(x: Any) -> Any:
+    """A key that is equal only for equal constants: 1, 1.0 and True differ, and 0.0 and -0.0.
 
-    **Raises:** `TypeError` for what varies.
+    **Raises:** `TypeError` for what may vary.
     """
     if isinstance(x, jax.Array):
         raise TypeError("no constant")
@@ -115,42 +118,43 @@ def _constant(x: Any) -> Any:
 
 
 def _traced(functions: Functions, treedef: Any, leaves: list[Any], options: Any) -> Traced:
+    """As `traced`, without a look at what was traced before."""
     n = len(leaves)
-    told: dict[str, Any] = {}
+    structures: dict[str, Any] = {}
 
     def begun(*args):
         carry, (active, complete, row) = functions.begin(jtu.tree_unflatten(treedef, args))
-        found, told["carry"] = jtu.tree_flatten(carry)
-        rows, told["row"] = jtu.tree_flatten(row)
+        found, structures["carry"] = jtu.tree_flatten(carry)
+        rows, structures["row"] = jtu.tree_flatten(row)
         return [*found, _flag(active), _flag(complete), *rows]
 
     begin = jax.make_jaxpr(begun)(*leaves)
-    size = told["carry"].num_leaves
+    size = structures["carry"].num_leaves
     carried = begin.out_avals[:size]
 
     def stepped(*args):
-        carry = jtu.tree_unflatten(told["carry"], args[n:])
+        carry = jtu.tree_unflatten(structures["carry"], args[n:])
         inputs = jtu.tree_unflatten(treedef, args[:n])
         carry, (active, complete, row) = functions.step(inputs, carry)
-        found = _same("carry", told["carry"], carry, carried)
-        rows = _same("row", told["row"], row, begin.out_avals[size + 2 :])
+        found = _checked("carry", structures["carry"], carry, carried)
+        rows = _checked("row", structures["row"], row, begin.out_avals[size + 2 :])
         return [*found, _flag(active), _flag(complete), *rows]
 
     def ended(*args):
-        carry = jtu.tree_unflatten(told["carry"], args[n:])
+        carry = jtu.tree_unflatten(structures["carry"], args[n:])
         inputs = jtu.tree_unflatten(treedef, args[:n])
-        out, told["out"] = jtu.tree_flatten(functions.end(inputs, carry))
+        out, structures["out"] = jtu.tree_flatten(functions.end(inputs, carry))
         return out
 
-    both = [*leaves, *map(one, carried)]
+    both = [*leaves, *map(shape_of, carried)]
     jaxprs = [begin, jax.make_jaxpr(stepped)(*both), jax.make_jaxpr(ended)(*both)]
-    (begin, step, end), consts = _without_consts(jaxprs, n)
+    (begin, step, end), consts = _consts_as_inputs(jaxprs, n)
     program = LaneProgram(begin=begin, step=step, end=end, **options)
-    return Traced(program, consts, told["out"], told["row"])
+    return Traced(program, consts, structures["out"], structures["row"])
 
 
-def one(x: Any) -> jax.ShapeDtypeStruct:
-    """Shape and type of it."""
+def shape_of(x: Any) -> jax.ShapeDtypeStruct:
+    """The shape and type of an array or of an aval."""
     return jax.ShapeDtypeStruct(x.shape, x.dtype)
 
 
@@ -158,7 +162,11 @@ def _flag(x: Any) -> Any:
     return jnp.asarray(x, bool)
 
 
-def _same(what: str, treedef: Any, tree: Any, avals: list) -> list:
+def _checked(what: str, treedef: Any, tree: Any, avals: list) -> list:
+    """The leaves of what `step` gave, in the types that `begin` gave.
+
+    **Raises:** `TypeError` where structure or shapes differ.
+    """
     leaves, other = jtu.tree_flatten(tree)
     if other != treedef:
         raise TypeError(f"`step` must give a {what} of the structure {treedef}, but gave {other}.")
@@ -170,8 +178,9 @@ def _same(what: str, treedef: Any, tree: Any, avals: list) -> list:
     return [jnp.asarray(x, aval.dtype) for x, aval in zip(leaves, avals, strict=True)]
 
 
-def _without_consts(jaxprs: list[ClosedJaxpr], n: int) -> tuple[list[ClosedJaxpr], list]:
-    """The jaxprs with the arrays that they close over as further inputs, and these."""
+def _consts_as_inputs(jaxprs: list[ClosedJaxpr], n: int) -> tuple[list[ClosedJaxpr], list]:
+    """The jaxprs with the arrays that they close over as inputs behind the first `n`, and the
+    arrays."""
     consts: list[Any] = []
     for jaxpr in jaxprs:
         for x in jaxpr.consts:
@@ -192,7 +201,7 @@ def _without_consts(jaxprs: list[ClosedJaxpr], n: int) -> tuple[list[ClosedJaxpr
             own = (*args[:n], *args[n + len(consts) :])
             return eval_jaxpr(jaxpr.jaxpr, held, *own)
 
-        shapes = [*map(one, jaxpr.in_avals[:n]), *map(one, consts), *map(one, rest)]
+        shapes = [*map(shape_of, jaxpr.in_avals[:n]), *map(shape_of, consts), *map(shape_of, rest)]
         return jax.make_jaxpr(function)(*shapes)
 
     return [opened(jaxpr) for jaxpr in jaxprs], consts

@@ -1,30 +1,25 @@
-"""A jaxpr of one lane's scalars written out as vector code for a group of lanes."""
+"""A jaxpr of one lane's scalars and small arrays as vector code for a group of lanes."""
 
 from typing import Any
 
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
-from ._arrays import STRUCTURAL, Values
+from ._arrays import STRUCTURAL, Values, each
 from ._operations import ELEMENTWISE, kind_of
 from ._program import CALLS, inner
 from ._text import Text, Value
 
-# A loop of known length is written out if that makes no more operations than this.
-_WRITTEN_OUT = 4096
+# The most operations of a loop of known length, all turns together, that are written one after the
+# other because it has rows; a sixteenth of that if it has none. A bound on the time of compilation.
+_MOST_UNROLLED = 4096
 
-# What is no more than this is computed without asking whether any lane needs it.
+# A branch of no more operations than this is computed whether any lane needs it or not.
 _CHEAP = 4
 
 
 class Unsupported(Exception):
     """A program that has no vector form; the argument says what stopped it."""
-
-
-def _inner(value: Any) -> tuple[Jaxpr, list]:
-    if isinstance(value, ClosedJaxpr):
-        return value.jaxpr, list(value.consts)
-    return value, []
 
 
 def check(jaxpr: Jaxpr) -> None:
@@ -49,14 +44,15 @@ def check(jaxpr: Jaxpr) -> None:
         elif name == "scan":
             body = inner(eqn.params["jaxpr"])
             check(body)
-            plain = _counts_only(eqn.params, len(eqn.invars), len(eqn.outvars))
-            if not plain and _size(body) * eqn.params["length"] > _WRITTEN_OUT:
+            plain = _has_no_rows(eqn.params, len(eqn.invars), len(eqn.outvars))
+            if not plain and _size(body) * eqn.params["length"] > _MOST_UNROLLED:
                 raise Unsupported(f"the primitive `scan` of length {eqn.params['length']}")
         elif name not in ELEMENTWISE and name not in STRUCTURAL:
             raise Unsupported(f"the primitive `{name}`")
 
 
 def _size(jaxpr: Jaxpr) -> int:
+    """The number of operations, those of inner jaxprs once."""
     total = 0
     for eqn in jaxpr.eqns:
         held = [x for v in eqn.params.values() for x in (v if isinstance(v, tuple) else (v,))]
@@ -66,7 +62,7 @@ def _size(jaxpr: Jaxpr) -> int:
 
 
 def constants(t: Text, array: Any) -> Values:
-    """A known array in every lane."""
+    """A known array, the same in every lane, as `Value`s."""
     array = np.asarray(array)
     kind = kind_of(array.dtype)
     out = np.empty(array.shape, object)
@@ -75,9 +71,15 @@ def constants(t: Text, array: Any) -> Values:
     return out
 
 
-def write(t: Text, jaxpr: Jaxpr, consts: list, args: list[Values], mask: Value) -> list[Values]:
-    """The values of a jaxpr's results. `mask` says which lanes ask for them."""
-    env: dict[Any, Values] = {}
+def write(t: Text, closed: ClosedJaxpr | Jaxpr, args: list[Values], mask: Value) -> list[Values]:
+    """Append the operations of a jaxpr to a text.
+
+    **Arguments:** the text; the jaxpr; the values of its arguments, of their shapes; which lanes
+    need the results: what none of them needs may be skipped, and the others get any numbers.
+
+    **Returns:** the values of its results.
+    """
+    jaxpr, env = inner(closed), {}
 
     def read(atom: Any) -> Values:
         if isinstance(atom, Literal):
@@ -85,8 +87,8 @@ def write(t: Text, jaxpr: Jaxpr, consts: list, args: list[Values], mask: Value) 
             return constants(t, np.asarray(atom.val, aval.dtype))
         return env[atom]
 
-    for var, const in zip(jaxpr.constvars, consts, strict=True):
-        env[var] = const if _is_values(const) else constants(t, const)
+    for var, const in zip(jaxpr.constvars, getattr(closed, "consts", ()), strict=True):
+        env[var] = constants(t, const)
     env.update(zip(jaxpr.invars, args, strict=True))
     for eqn in _needed(jaxpr):
         outs = _equation(t, eqn, [read(a) for a in eqn.invars], mask)
@@ -105,11 +107,8 @@ def _needed(jaxpr: Jaxpr) -> list[Any]:
     return kept[::-1]
 
 
-def _is_values(x: Any) -> bool:
-    return isinstance(x, np.ndarray) and x.dtype == object
-
-
 def _equation(t: Text, eqn: Any, args: list[Values], mask: Value) -> list[Values]:
+    """The values of an equation's results, by the rule of its primitive."""
     name, params = eqn.primitive.name, eqn.params
     if name in ELEMENTWISE:
         dtypes = [a.aval.dtype for a in eqn.invars]
@@ -118,8 +117,7 @@ def _equation(t: Text, eqn: Any, args: list[Values], mask: Value) -> list[Values
         out = STRUCTURAL[name](t, params, [v.aval for v in eqn.outvars], *args)
         return list(out) if eqn.primitive.multiple_results else [out]
     if name in CALLS:
-        jaxpr, consts = _inner(params[CALLS[name]])
-        return write(t, jaxpr, consts, args, mask)
+        return write(t, params[CALLS[name]], args, mask)
     if name == "cond":
         return _cond(t, params["branches"], args[0].item(), args[1:], mask)
     if name == "while":
@@ -130,6 +128,7 @@ def _equation(t: Text, eqn: Any, args: list[Values], mask: Value) -> list[Values
 
 
 def _elementwise(t: Text, name, params, dtypes, args, results: int) -> list[Values]:
+    """A rule of `ELEMENTWISE`, number by number."""
     args = np.broadcast_arrays(*args, subok=False)
     outs = [np.empty(args[0].shape, object) for _ in range(results)]
     for i in np.ndindex(args[0].shape):
@@ -140,7 +139,11 @@ def _elementwise(t: Text, name, params, dtypes, args, results: int) -> list[Valu
 
 
 def _cond(t: Text, branches: tuple, which: Value, args: list[Values], mask: Value) -> list[Values]:
-    """Each branch is skipped where no lane of the group takes it."""
+    """Each branch is skipped where no lane of the group takes it, but for a cheap one.
+
+    **Arguments:** the text; the branches' jaxprs; which of them each lane takes; their arguments;
+    which lanes need the results.
+    """
     last = len(branches) - 1
     taken = []
     for i in range(len(branches)):
@@ -150,33 +153,32 @@ def _cond(t: Text, branches: tuple, which: Value, args: list[Values], mask: Valu
         else:
             flag = t.binary(f"icmp {how}", which, t.constant(i, which.kind), "i1")
         taken.append(flag)
-    # The cheapest of them is the one that the others are laid over.
+    # The cheapest comes first: the results of the others replace its own in their lanes.
     order = sorted(range(len(branches)), key=lambda i: _size(inner(branches[i])))
     result: list[Values] | None = None
     for i in order:
-        jaxpr, consts = _inner(branches[i])
-        if result is None and _size(jaxpr) <= _CHEAP:
-            result = write(t, jaxpr, consts, args, mask)
+        if result is None and _size(inner(branches[i])) <= _CHEAP:
+            result = write(t, branches[i], args, mask)
             continue
-        result = _skipped(t, jaxpr, consts, args, t.both(mask, taken[i]), result)
+        result = _branch_if_any(t, branches[i], args, t.both(mask, taken[i]), result)
     assert result is not None
     return result
 
 
-def _skipped(t: Text, jaxpr, consts, args, mask: Value, otherwise) -> list[Values]:
-    """The values of a jaxpr in the lanes of `mask`, laid over others; skipped if there are none."""
+def _branch_if_any(t: Text, jaxpr, args, mask: Value, otherwise) -> list[Values]:
+    """The results of a jaxpr in the lanes of `mask`, and `otherwise` (or anything, if that is
+    `None`) in the others; skipped if `mask` has no lane."""
     inside, after = t.label(), t.label()
     before = t.block
-    needed = t.any(mask)
-    t.fork(needed, inside, after, rare=True)
+    t.fork(t.any(mask), inside, after, rare=True)
     t.open(inside)
-    found = write(t, jaxpr, consts, args, mask)
+    found = write(t, jaxpr, args, mask)
     if otherwise is None:
-        otherwise = [_like(t, x) for x in found]
+        otherwise = [each(lambda a: t.zero(a.kind), x) for x in found]
         laid = found
     else:
         laid = [
-            _zipped(lambda a, b: t.select(mask, a, b), x, y)
+            each(lambda a, b: t.select(mask, a, b), x, y)
             for x, y in zip(found, otherwise, strict=True)
         ]
     end = t.block
@@ -184,24 +186,13 @@ def _skipped(t: Text, jaxpr, consts, args, mask: Value, otherwise) -> list[Value
     t.close()
     t.follow(after)
     return [
-        _zipped(lambda a, b: a if a == b else t.phi(a.kind, (a.text, end), (b.text, before)), x, y)
+        each(lambda a, b: a if a == b else t.phi(a.kind, (a.text, end), (b.text, before)), x, y)
         for x, y in zip(laid, otherwise, strict=True)
     ]
 
 
-def _like(t: Text, x: Values) -> Values:
-    return _zipped(lambda a: t.zero(a.kind), x)
-
-
-def _zipped(function, *arrays: Values) -> Values:
-    out = np.empty(arrays[0].shape, object)
-    for i in np.ndindex(out.shape):
-        out[i] = function(*(a[i] for a in arrays))
-    return out
-
-
 def _while(t: Text, params: dict, args: list[Values], mask: Value) -> list[Values]:
-    """Until no lane of the group goes on; a lane that has ended keeps what it had."""
+    """Until no lane of `mask` goes on; a lane that has ended keeps its carry."""
     n, m = params["cond_nconsts"], params["body_nconsts"]
     cond_args, body_args, first = args[:n], args[n : n + m], args[n + m :]
     head, inside, after = t.label(), t.label(), t.label()
@@ -209,46 +200,41 @@ def _while(t: Text, params: dict, args: list[Values], mask: Value) -> list[Value
     t.line(f"br label %{head}")
     t.open(head)
     place = len(t.lines)
-    carry = [_zipped(lambda a: Value(t.fresh(), a.kind), x) for x in first]
+    carry = [each(lambda a: Value(t.fresh(), a.kind), x) for x in first]
     live = Value(t.fresh(), "i1")
-    jaxpr, consts = _inner(params["cond_jaxpr"])
-    going = t.both(live, write(t, jaxpr, consts, [*cond_args, *carry], live)[0].item())
-    needed = t.any(going)
-    t.fork(needed, inside, after)
+    asked = write(t, params["cond_jaxpr"], [*cond_args, *carry], live)[0].item()
+    going = t.both(live, asked)
+    t.fork(t.any(going), inside, after)
     t.open(inside)
-    jaxpr, consts = _inner(params["body_jaxpr"])
-    new = write(t, jaxpr, consts, [*body_args, *carry], going)
-    new = [
-        _zipped(lambda a, b: t.select(going, a, b), x, y) for x, y in zip(new, carry, strict=True)
-    ]
+    new = write(t, params["body_jaxpr"], [*body_args, *carry], going)
+    new = [each(lambda a, b: t.select(going, a, b), x, y) for x, y in zip(new, carry, strict=True)]
     end = t.block
     t.line(f"br label %{head}")
     t.close()
     t.close()
-    phis = []
-    for old, here, back in zip([*first, mask], [*carry, live], [*new, going], strict=True):
-        for a, h, b in zip(*map(_flat, (old, here, back)), strict=True):
-            ways = f"[ {a.text}, %{before} ], [ {b.text}, %{end} ]"
-            phis.append(f"  {h.text} = phi {t.vector(h.kind)} {ways}")
-    t.lines[place:place] = phis
+    begun, back = ([*_flat(first), mask], before), ([*_flat(new), going], end)
+    t.join([*_flat(carry), live], begun, back, at=place)
     t.follow(after)
     return carry
 
 
-def _flat(x: Any) -> list[Value]:
-    return [x] if isinstance(x, Value) else list(x.ravel())
+def _flat(arrays: list[Values]) -> list[Value]:
+    return [value for x in arrays for value in x.ravel()]
 
 
-def _counts_only(params: dict, inputs: int, outputs: int) -> bool:
-    """Whether a loop of known length carries numbers along and has no rows."""
+def _has_no_rows(params: dict, inputs: int, outputs: int) -> bool:
+    """Whether a loop of known length has a carry only: no rows, neither given nor made.
+
+    **Arguments:** the parameters of `scan`; the numbers of its arguments and results.
+    """
     carried = params["num_carry"]
     return params["length"] > 0 and inputs == params["num_consts"] + carried == outputs + (
         inputs - carried
     )
 
 
-def _counted(t: Text, params: dict, args: list[Values], mask: Value) -> list[Values]:
-    """A loop of known length without rows, as a loop."""
+def _counted_loop(t: Text, params: dict, args: list[Values], mask: Value) -> list[Values]:
+    """A loop of known length without rows, as a loop with a scalar counter."""
     n = params["num_consts"]
     fixed, first = args[:n], args[n:]
     inside, after = t.label(), t.label()
@@ -256,19 +242,14 @@ def _counted(t: Text, params: dict, args: list[Values], mask: Value) -> list[Val
     t.line(f"br label %{inside}")
     t.open(inside)
     place = len(t.lines)
-    carry = [_zipped(lambda a: Value(t.fresh(), a.kind), x) for x in first]
+    carry = [each(lambda a: Value(t.fresh(), a.kind), x) for x in first]
     count, following = t.fresh(), t.fresh()
-    jaxpr, consts = _inner(params["jaxpr"])
-    new = write(t, jaxpr, consts, [*fixed, *carry], mask)
+    new = write(t, params["jaxpr"], [*fixed, *carry], mask)
     end = t.block
     t.line(f"{following} = add i64 {count}, 1")
     more = t.raw(f"icmp slt i64 {following}, {params['length']}")
-    phis = [f"  {count} = phi i64 [ 0, %{before} ], [ {following}, %{end} ]"]
-    for old, here, back in zip(first, carry, new, strict=True):
-        for a, h, b in zip(*map(_flat, (old, here, back)), strict=True):
-            ways = f"[ {a.text}, %{before} ], [ {b.text}, %{end} ]"
-            phis.append(f"  {h.text} = phi {t.vector(h.kind)} {ways}")
-    t.lines[place:place] = phis
+    t.join(_flat(carry), (_flat(first), before), (_flat(new), end), at=place)
+    t.lines.insert(place, f"  {count} = phi i64 [ 0, %{before} ], [ {following}, %{end} ]")
     t.fork(more, inside, after)
     t.close()
     t.follow(after)
@@ -276,20 +257,20 @@ def _counted(t: Text, params: dict, args: list[Values], mask: Value) -> list[Val
 
 
 def _scan(t: Text, params: dict, args: list[Values], mask: Value) -> list[Values]:
-    """A loop of known length: written out, unless it is long and has no rows."""
+    """A loop of known length: its turns one after the other, unless it is long and has no rows."""
     body = inner(params["jaxpr"])
-    big = _size(body) * params["length"] > _WRITTEN_OUT // 16
-    if big and _counts_only(params, len(args), len(body.outvars)):
-        return _counted(t, params, args, mask)
+    big = _size(body) * params["length"] > _MOST_UNROLLED // 16
+    if big and _has_no_rows(params, len(args), len(body.outvars)):
+        return _counted_loop(t, params, args, mask)
     n, m, length = params["num_consts"], params["num_carry"], params["length"]
     fixed, carry, rows = args[:n], args[n : n + m], args[n + m :]
-    jaxpr, consts = _inner(params["jaxpr"])
     order = range(length)[::-1] if params["reverse"] else range(length)
     kept: dict[int, list[Values]] = {}
     for i in order:
-        out = write(t, jaxpr, consts, [*fixed, *carry, *(x[i] for x in map(_rowwise, rows))], mask)
+        row = [x[i] for x in map(_rowwise, rows)]
+        out = write(t, params["jaxpr"], [*fixed, *carry, *row], mask)
         carry, kept[i] = out[:m], out[m:]
-    columns = [np.stack([kept[i][j] for i in range(length)]) for j in range(len(jaxpr.outvars) - m)]
+    columns = [np.stack([kept[i][j] for i in range(length)]) for j in range(len(body.outvars) - m)]
     return [*carry, *columns]
 
 

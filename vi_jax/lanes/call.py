@@ -1,6 +1,11 @@
 """The way from a compiled XLA program into a kernel: a foreign-function handler made by ctypes.
 
-The call frame is read as XLA's `ffi/api/c_api.h` lays it out, whose version the handler states.
+The structures are those of XLA's `xla/ffi/api/c_api.h`, version 0.3, as jaxlib 0.10.2 ships it in
+`jax.ffi.include_dir()`; the source is at
+https://github.com/openxla/xla/blob/main/xla/ffi/api/c_api.h. The handler states that version when
+XLA registers it, and XLA refuses versions that it does not support (it promises to support each for
+twelve months). It is also refused where XLA states other sizes for the structures that are read
+here. Programs then run on XLA's backend, after a warning.
 """
 
 import ctypes
@@ -12,23 +17,26 @@ from ctypes import POINTER, Structure, c_char_p, c_int, c_int32, c_int64, c_size
 import jax
 import numpy as np
 
-from ._interrupts import WELL, Out, guard, raises, watch
-from ._recent import once
-from .runtime import Work, living
+from ._interrupts import SUCCESS, HandlerResult, guard, interrupt_raises, watch
+from ._recent import made_once
+from ._vector import Unsupported
+from .runtime import KernelCall, kernel_by_key
 
 TARGET = "vi_jax_lanes"
 
 INTERRUPTED = "Lanes were interrupted before all of them had ended."
 
-# Of the interface that is written out below.
+# The version of the interface whose structures follow.
 _MAJOR, _MINOR = 0, 3
 
+# `XLA_FFI_Extension_Metadata`, `XLA_FFI_ExecutionStage_EXECUTE`, two of `XLA_FFI_Error_Code`.
 _METADATA, _EXECUTE, _CANCELLED, _INTERNAL = 1, 3, 1, 13
 
 
 @contextmanager
 def interruptible():
-    """An interrupt while lanes run, of which XLA makes an error, is a `KeyboardInterrupt` again."""
+    """Within this context XLA's error for lanes that were interrupted is raised as the
+    `KeyboardInterrupt` that it was."""
     try:
         yield
     except (ValueError, RuntimeError) as error:
@@ -80,7 +88,7 @@ class _ErrorArguments(Structure):
     ]  # fmt: skip
 
 
-# Functions of the interface between that which makes errors and that which tells runs apart.
+# Functions in `XLA_FFI_Api` between `XLA_FFI_Error_Create` and `XLA_FFI_RunId_Get`.
 _BETWEEN = 15
 
 
@@ -110,87 +118,100 @@ class _Frame(Structure):
     ]  # fmt: skip
 
 
-def _failed(frame: _Frame, message: str, code: int) -> int | None:
+def _error(frame: _Frame, message: str, code: int) -> int | None:
+    """The address of an error of XLA's, which XLA frees."""
     arguments = _ErrorArguments(
         ctypes.sizeof(_ErrorArguments), None, message.encode(errors="replace"), code
     )
     return frame.api.contents.error_create(ctypes.byref(arguments))
 
 
-# Of calls that are under way, by the address of XLA's frame.
-_works: dict[int, Work] = {}
+# The calls that run, by the address of XLA's frame.
+_running: dict[int, KernelCall] = {}
 
 
-@ctypes.CFUNCTYPE(None, POINTER(_Frame), POINTER(Out))
+@ctypes.CFUNCTYPE(None, POINTER(_Frame), POINTER(HandlerResult))
 def _handler(frame, out):
-    """Called until it has put an answer there (see `guard`)."""
+    """Called until it has stored an answer (see `guard`)."""
     out, frame = out.contents, frame.contents
-    out.answer = _answered(frame, out)  # the last that a signal can come before
+    # A signal before this assignment leaves no answer; after it, it is Python's own to raise.
+    out.answer = _answer_without_exceptions(frame, out)
 
 
-def _answered(frame: _Frame, out: Out) -> int | None:
+def _answer_without_exceptions(frame: _Frame, out: HandlerResult) -> int | None:
+    """What `_answer` gives, its exceptions as errors of XLA's, since none may pass through XLA."""
     try:
         if out.lost:
             raise KeyboardInterrupt
         return _answer(frame)
     except KeyboardInterrupt:
-        _left(frame)
-        if threading.current_thread() is threading.main_thread() and raises():
+        _abandon(frame)
+        if threading.current_thread() is threading.main_thread() and interrupt_raises():
             out.signal = signal.SIGINT
-        return _failed(frame, INTERRUPTED, _CANCELLED)
-    except BaseException as error:  # nothing may escape into XLA
-        _left(frame)
-        return _failed(frame, f"{type(error).__name__}: {error}", _INTERNAL)
+        return _error(frame, INTERRUPTED, _CANCELLED)
+    except BaseException as error:
+        _abandon(frame)
+        return _error(frame, f"{type(error).__name__}: {error}", _INTERNAL)
 
 
 def _answer(frame: _Frame) -> int | None:
+    """To XLA's question for metadata the version; else the kernel runs."""
     extension = frame.extension
     while extension:
         if extension.contents.type == _METADATA:
             metadata = ctypes.cast(extension, POINTER(_MetadataExtension)).contents.metadata
-            metadata.contents.version.major, metadata.contents.version.minor = _MAJOR, _MINOR
-            return WELL
+            version = metadata.contents.version
+            # XLA refuses a handler of version -1.
+            version.major, version.minor = (_MAJOR if _is_as_known(frame) else -1), _MINOR
+            return SUCCESS
         extension = extension.contents.next
-    return _run(frame) if frame.stage == _EXECUTE else WELL
+    return _run_kernel(frame) if frame.stage == _EXECUTE else SUCCESS
 
 
-def _left(frame: _Frame) -> None:
-    """Nothing of this call is under way any more."""
-    work = _works.get(ctypes.addressof(frame))
+def _is_as_known(frame: _Frame) -> bool:
+    """Whether XLA states the sizes that are known here, but for what follows in the frame."""
+    size = ctypes.sizeof(_Buffers)
+    sizes = frame.arguments.struct_size, frame.results.struct_size
+    return frame.struct_size >= ctypes.sizeof(_Frame) and sizes == (size, size)
+
+
+def _abandon(frame: _Frame) -> None:
+    """End this call's threads, if it has any."""
+    work = _running.get(ctypes.addressof(frame))
     if work is not None:
-        work.leave()
-        del _works[ctypes.addressof(frame)]
+        work.stop_and_wait()
+        del _running[ctypes.addressof(frame)]
 
 
-def _run(frame: _Frame) -> int | None:
+def _run_kernel(frame: _Frame) -> int | None:
+    """Run all lanes of a call. Its first argument is `header`, the others are the inputs."""
     arguments, results = frame.arguments, frame.results
     head = arguments.items[0].contents
-    # Which kernel, how many lanes, and the strides of the inputs, as pairs of 32 bits.
     numbers = np.ctypeslib.as_array(
         ctypes.cast(head.data, POINTER(c_int32)), (2 * (arguments.size + 1),)
     )
     key, lanes, *strides = (int(x) for x in numbers.view(np.int64))
-    kernel = living(key)
+    kernel = kernel_by_key(key)
     if kernel is None:
-        return _failed(frame, "The kernel of this program is not of this process.", _INTERNAL)
+        return _error(frame, "The kernel of this program is not of this process.", _INTERNAL)
     inputs = [arguments.items[i].contents.data or 0 for i in range(1, arguments.size)]
     outputs = [results.items[i].contents.data or 0 for i in range(results.size)]
-    work = _works[ctypes.addressof(frame)] = kernel.work(inputs, strides, outputs, lanes)
+    work = _running[ctypes.addressof(frame)] = kernel.call(inputs, strides, outputs, lanes)
     if threading.current_thread() is threading.main_thread():
-        well = work.run()
+        succeeded = work.run()
     else:
-        with watch.told(_run_of(frame), work.stop):
-            well = work.run()
-    del _works[ctypes.addressof(frame)]
-    if well:
-        return WELL
+        with watch.stopping(_run_number(frame), work.stop):
+            succeeded = work.run()
+    del _running[ctypes.addressof(frame)]
+    if succeeded:
+        return SUCCESS
     if work.stop.value:
-        return _failed(frame, INTERRUPTED, _CANCELLED)
-    return _failed(frame, "Not all lanes were run.", _INTERNAL)
+        return _error(frame, INTERRUPTED, _CANCELLED)
+    return _error(frame, "Not all lanes were run.", _INTERNAL)
 
 
-def _run_of(frame: _Frame) -> int:
-    """A number of XLA's run; 0 where XLA does not tell."""
+def _run_number(frame: _Frame) -> int:
+    """XLA's number of the run that a call is part of; 0 where this XLA does not give it."""
     api = frame.api.contents
     if api.struct_size < _Api.run_get.offset + ctypes.sizeof(c_void_p) or not api.run_get:
         return 0
@@ -199,14 +220,22 @@ def _run_of(frame: _Frame) -> int:
     return run.number
 
 
-@once
+@made_once
 def registered() -> str:
-    """The name by which XLA knows the handler; registered on first use, whichever thread's."""
-    handler = ctypes.c_void_p(guard(_handler))
-    jax.ffi.register_ffi_target(TARGET, jax.ffi.pycapsule(handler), platform="cpu", api_version=1)
+    """The name by which XLA knows the handler; registered on first use, whichever thread's.
+
+    **Raises:** `Unsupported` where this XLA refuses the handler's version.
+    """
+    handler = jax.ffi.pycapsule(ctypes.c_void_p(guard(_handler)))
+    try:
+        jax.ffi.register_ffi_target(TARGET, handler, platform="cpu", api_version=1)
+    except RuntimeError as error:  # `jax.errors.JaxRuntimeError`
+        raise Unsupported(f"version {_MAJOR}.{_MINOR} of XLA's call interface ({error})") from None
     return TARGET
 
 
 def header(key: int, lanes: int, strides: list[int]) -> np.ndarray:
-    """The first argument of a call; of 32 bits, since 64 may be switched off."""
+    """The first argument of a call: the kernel's key, the number of lanes, and of each input how
+    many numbers it has per lane (0 if it is shared). Pairs of 32 bits, since JAX may be set to have
+    no integers of 64."""
     return np.asarray([key, lanes, *strides], np.int64).view(np.int32)

@@ -19,7 +19,7 @@ _backend: ContextVar[str] = ContextVar("backend", default="auto")
 
 
 class Emitted(NamedTuple):
-    """What `begin` and `step` say besides the carry."""
+    """What `begin` and `step` return besides the carry."""
 
     active: Any
     """Whether the lane goes on."""
@@ -87,17 +87,20 @@ def run(
 
 
 def once(function: Callable[[Any], Any], inputs: Any) -> Any:
-    """`function` of one lane's numbers as vector code."""
-    return run(_nothing, _stays, functools.partial(_at_once, function), inputs, rows=0)[0]
+    """`function(inputs)` as vector code, without a loop; batched by `vmap` as `run` is.
+
+    **Arguments:** a function of a pytree of scalars and small arrays; the pytree.
+    """
+    return run(_begin_ended, _no_step, functools.partial(_end_with, function), inputs, rows=0)[0]
 
 
-def _nothing(inputs: Any) -> tuple[Any, Emitted]:
+def _begin_ended(inputs: Any) -> tuple[Any, Emitted]:
     return (), Emitted(False, False, ())
 
 
-def _stays(inputs: Any, carry: Any) -> tuple[Any, Emitted]:
+def _no_step(inputs: Any, carry: Any) -> tuple[Any, Emitted]:
     return carry, Emitted(False, False, ())
 
 
-def _at_once(function: Callable[[Any], Any], inputs: Any, carry: Any) -> Any:
+def _end_with(function: Callable[[Any], Any], inputs: Any, carry: Any) -> Any:
     return function(inputs)

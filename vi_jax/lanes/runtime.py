@@ -1,4 +1,4 @@
-"""From LLVM's text to machine code for this processor, and its call on several threads."""
+"""Kernels for this processor: their width, which of them are kept, and their call on threads."""
 
 import ctypes
 import functools
@@ -15,23 +15,24 @@ from typing import Any
 
 import numpy as np
 
-from ._code import begun, function_at, llvm
+from ._code import compile_in_background, function_at, llvm
 from ._context import within
 from ._kernel import kernel_text
 from ._program import LaneProgram
 from ._recent import Recent
 from ._vector import check
 
-_KEPT = 64
+# Kernels that are kept although no compiled program needs them any more.
+_MOST_KERNELS = 64
 
-# Of the vector unit; half as many where they are narrower, with half the lanes in each.
+# Vector registers of AVX-512. AVX2 has half as many, with half the lanes in each.
 _REGISTERS = 32
 
 # More than any machine has cores; a process may not be granted so many threads.
 _MOST_THREADS = 1024
 
-# Seconds between two looks at threads that are about to stop.
-_PATIENCE = 1e-3
+# Seconds between two looks at threads that are to stop.
+_POLL = 1e-3
 
 _threads: ContextVar[int | None] = ContextVar("threads", default=None)
 _entered: list[int] = []
@@ -90,7 +91,7 @@ def cores() -> int:
 
 @functools.cache
 def _register_bits(cpu: str | None) -> int:
-    """Width of the vector registers."""
+    """Width of the vector registers of a processor in LLVM's words, or of this one (`None`)."""
     if cpu is not None:
         return {"x86-64-v4": 512, "x86-64-v3": 256}.get(cpu, 128)
     features = llvm().get_host_cpu_features()
@@ -100,11 +101,16 @@ def _register_bits(cpu: str | None) -> int:
 
 
 class Kernel:
-    """Machine code of a program, perhaps still to come. It lives as long as this object."""
+    """The machine code of a program, which is compiled on another thread and lives as long as this
+    object.
+
+    **Arguments:** LLVM's text; the processor in LLVM's words, or `None` for this one; the lanes of
+    a group.
+    """
 
     def __init__(self, text: str, cpu: str | None, width: int):
         self.key, self.width = key_of(text, cpu), width
-        self._code = begun(text, cpu)
+        self._code = compile_in_background(text, cpu)
 
     @functools.cached_property
     def _call(self) -> Any:
@@ -115,13 +121,23 @@ class Kernel:
             raise RuntimeError(f'LLVM: {error}; `vi_jax.backend("xla")` does without it') from None
         return function_at(address)
 
-    def work(self, inputs: list[int], strides: list[int], outputs: list[int], lanes: int) -> "Work":
-        """All lanes, from and to the arrays at these addresses."""
-        return Work(self._call, self.width, inputs, strides, outputs, lanes)
+    def call(
+        self, inputs: list[int], strides: list[int], outputs: list[int], lanes: int
+    ) -> "KernelCall":
+        """A call that is to run all lanes.
+
+        **Arguments:** the addresses of the input arrays; the numbers that each has per lane, or 0
+        for one that all lanes share; the addresses of the output arrays; the number of lanes.
+        """
+        return KernelCall(self._call, self.width, inputs, strides, outputs, lanes)
 
 
-class Work:
-    """One call of a kernel: what its threads read and write, which must be kept until they end."""
+class KernelCall:
+    """One call of a kernel, which holds what its threads read and write until they end.
+
+    **Arguments:** the kernel as a function of `ctypes`, the lanes of a group, and those of
+    `Kernel.call`.
+    """
 
     def __init__(self, call: Any, width: int, inputs, strides, outputs, lanes: int):
         self._function, self._lanes = call, lanes
@@ -138,22 +154,24 @@ class Work:
         self._lock, self._inside = threading.Lock(), 0
 
     def run(self) -> bool:
-        """Whether all lanes have ended, and not been stopped.
+        """Run all lanes on as many threads as there is work for.
 
-        **Raises:** what a signal raises, in the main thread; then `leave` is to be called.
+        **Returns:** whether all have ended without being stopped.
+
+        **Raises:** what a signal raises, in the main thread; then `stop_and_wait` is to be called.
         """
         if self._number == 1 and threading.current_thread() is not threading.main_thread():
-            self._turn()
+            self._run_here()
         else:
-            # The main thread must stay free to hear an interrupt.
-            jobs = [_pool(self._number).submit(self._turn) for _ in range(self._number)]
+            # The main thread must stay free to handle an interrupt.
+            jobs = [_pool(self._number).submit(self._run_here) for _ in range(self._number)]
             for job in jobs:
                 job.result()
         # A thread takes lanes until none are left, and ends when its own have, if not stopped.
         return self._given.value >= self._lanes and not self.stop.value
 
-    def _turn(self) -> None:
-        """What one thread does: lanes until none are left, unless the work was stopped before."""
+    def _run_here(self) -> None:
+        """What one thread does: lanes until none are left, unless the call was stopped before."""
         with self._lock:
             if self.stop.value:
                 return
@@ -164,12 +182,12 @@ class Work:
             with self._lock:
                 self._inside -= 1
 
-    def leave(self) -> None:
-        """Stop, and wait until no thread is at work; to be called again if a signal comes."""
+    def stop_and_wait(self) -> None:
+        """Wait until the threads have ended; called again where a signal's exception ends it."""
         with self._lock:
             self.stop.value = 1
         while self._inside:
-            time.sleep(_PATIENCE)
+            time.sleep(_POLL)
 
 
 @functools.cache
@@ -178,21 +196,21 @@ def _pool(number: int) -> ThreadPoolExecutor:
 
 
 def key_of(text: str, cpu: str | None) -> int:
-    """A name of a program's text for a processor, the same in every process."""
+    """A number for a program's text and a processor, the same in every process."""
     digest = hashlib.blake2b((text + (cpu or "")).encode(), digest_size=7).digest()
     return int.from_bytes(digest, "little")
 
 
-_living: "weakref.WeakValueDictionary[int, Kernel]" = weakref.WeakValueDictionary()
-_recent: "Recent[int, Kernel]" = Recent(_KEPT)
+_in_use: "weakref.WeakValueDictionary[int, Kernel]" = weakref.WeakValueDictionary()
+_recent: "Recent[int, Kernel]" = Recent(_MOST_KERNELS)
 _lock = threading.Lock()
 
-# The keys of a program's texts, so that they need not be written again to be known.
+# The keys of a program's texts by processor and width, so that no text is written twice.
 _keys: "weakref.WeakKeyDictionary[LaneProgram, dict[tuple, int]]" = weakref.WeakKeyDictionary()
 
 
 def kernel_of(program: LaneProgram, lanes: int) -> Kernel:
-    """The kernel of a program for so many lanes: the same for the same text, compiled once while it
+    """The kernel of a program for a number of lanes: one for the same text, compiled once while it
     is in use.
 
     **Raises:** `Unsupported` if the program has no vector form, or LLVM cannot be had.
@@ -202,40 +220,45 @@ def kernel_of(program: LaneProgram, lanes: int) -> Kernel:
     width = _width(program, lanes, bits)
     with _lock:
         keys = _keys.setdefault(program, {})
-        kernel = _living.get(keys.get((cpu, width), -1))
+        kernel = _in_use.get(keys.get((cpu, width), -1))
     if kernel is None:
-        kernel = _written(program, cpu, width, bits)
+        kernel = _new_kernel(program, cpu, width, bits)
         keys[cpu, width] = kernel.key
     _recent.put(kernel.key, kernel)
     return kernel
 
 
 def _width(program: LaneProgram, lanes: int, bits: int) -> int:
-    """Lanes of a group. The width changes no result."""
+    """Lanes of a group: a power of two of at least 4. It changes no result.
+
+    **Arguments:** the program; the lanes of the batch; the bits of a vector register.
+    """
     avals = [*program.in_avals, *program.carry_avals]
     wide = any(np.dtype(a.dtype).itemsize == 8 for a in avals)
-    # Two registers' worth where they are narrow, to hide the arithmetic's latency.
+    # At least 4: two registers of 128 bits, to hide the arithmetic's latency.
     full = max(4, bits // (64 if wide else 32))
     if lanes <= full // 2:
-        return max(4, full // 2)  # short registers are quicker
-    # A step is a chain of operations that wait for each other: a second group fills the gaps, for a
-    # quarter less time where there are lanes enough, and no more numbers than registers.
+        return max(4, full // 2)  # half a register is quicker than a half empty one
+    # A step is a chain of operations that wait for each other: a second register in each of them
+    # takes a quarter less time, if there are lanes enough for all cores, and no more numbers in a
+    # lane than registers.
     many = bits >= 256 and lanes >= 4 * full * cores()
     return 2 * full if many and sum(a.size for a in avals) <= _REGISTERS else full
 
 
-def _written(program: LaneProgram, cpu: str | None, width: int, bits: int) -> Kernel:
+def _new_kernel(program: LaneProgram, cpu: str | None, width: int, bits: int) -> Kernel:
+    """The kernel of a program whose text was not written yet; compiled unless its text is known."""
     for jaxpr in program.jaxprs:
         check(jaxpr.jaxpr)
     text = kernel_text(program, width, bits)
     key = key_of(text, cpu)
     with _lock:
-        kernel = _living.get(key)
+        kernel = _in_use.get(key)
         if kernel is None:
-            kernel = _living[key] = Kernel(text, cpu, width)
+            kernel = _in_use[key] = Kernel(text, cpu, width)
     return kernel
 
 
-def living(key: int) -> Kernel | None:
-    """The kernel of this name, if it is in use."""
-    return _living.get(key)
+def kernel_by_key(key: int) -> Kernel | None:
+    """The kernel of this key (see `key_of`), if it is in use."""
+    return _in_use.get(key)

@@ -22,7 +22,7 @@ from jaxtyping import Array
 
 from .. import lanes
 from .._checks import count
-from .._programs import PLAIN, Program
+from .._programs import PLAIN, CompiledFunction
 from ..flow.fusion import compiling
 from .grid import Blocks
 from .program import ScanProgram
@@ -83,8 +83,8 @@ def _compiled(devices: int) -> Callable[..., dict[str, Array]]:
     return _program(spread)
 
 
-def _program(function: Callable[..., Any]) -> Program:
-    return Program(function, PLAIN, **compiling())
+def _program(function: Callable[..., Any]) -> CompiledFunction:
+    return CompiledFunction(function, PLAIN, **compiling())
 
 
 def compute(

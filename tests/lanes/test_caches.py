@@ -1,0 +1,158 @@
+"""What is kept: machine code in files, kernels, programs of functions that are alike."""
+
+from functools import partial, wraps
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from vi_jax import lanes
+from vi_jax.lanes import _code, runtime
+
+from lanes.toys import failing
+
+
+def test_programs_are_kept_where_jax_keeps_its_own(monkeypatch, tmp_path):
+    def fallen():
+        kernel = runtime.Kernel("define void @kernel() { ret void }", None, 8)
+        return kernel._call
+
+    monkeypatch.setattr(_code, "_cache_folder", lambda: tmp_path)
+    fallen()
+    (kept,) = tmp_path.rglob("*.o")
+    content = kept.read_bytes()
+    with monkeypatch.context() as patched:
+        patched.setattr(_code, "object_code", failing)
+        fallen()  # from the file
+        kept.write_bytes(content[:-1])
+        with pytest.raises(RuntimeError, match="LLVM: no such"):
+            fallen()
+    fallen()
+    assert kept.read_bytes() == content
+
+
+def test_where_programs_are_kept(tmp_path):
+    before = jax.config.jax_compilation_cache_dir  # pyright: ignore
+    try:
+        jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+        assert _code._cache_folder() == tmp_path / "vi_jax_lanes"
+        jax.config.update("jax_compilation_cache_dir", "gs://far/away")
+        assert _code._cache_folder() is None
+    finally:
+        jax.config.update("jax_compilation_cache_dir", before)
+
+
+def test_programs_are_dropped_in_time():
+    """Many programs in one process, each used once: memory maps and kernels stay few."""
+    maps = Path("/proc/self/maps")
+
+    def one(number):
+        def begin(x):
+            return x, lanes.Emitted(True, False, None)
+
+        def step(x, carry):
+            return carry + number, lanes.Emitted(False, False, None)
+
+        return lanes.run(begin, step, lambda x, carry: carry, 1.0, rows=0)[0]
+
+    def kernels(numbers):
+        from vi_jax.lanes.runtime import kernel_of
+
+        for number in numbers:
+            jaxpr = jax.make_jaxpr(lambda: one(float(number)))().jaxpr  # noqa: B023
+            kernel_of(
+                next(e for e in jaxpr.eqns if e.primitive.name == "lanes").params["program"], 1
+            )
+
+    kernels(range(80))
+    before = maps.read_bytes().count(b"\n") if maps.exists() else 0
+    kernels(range(80, 240))
+    after = maps.read_bytes().count(b"\n") if maps.exists() else 0
+    assert after - before < 160
+    assert len(runtime._recent) <= runtime._MOST_KERNELS
+
+
+def _sum(bound, x):
+    return x + bound["offset"] if isinstance(bound["offset"], float) else x - bound["offset"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("same", [True, False])
+def test_constants_bound_to_a_function_distinguish_programs(same):
+    """Equal constants make one program, and what only compares equal makes another."""
+
+    def found(offset):
+        jaxpr = jax.make_jaxpr(lambda x: lanes.once(partial(_sum, {"offset": offset}), x))(1.0)
+        (eqn,) = (e for e in jaxpr.jaxpr.eqns if e.primitive.name == "lanes")
+        return eqn.params["program"]
+
+    if same:
+        assert found(2.0) is found(2.0) and found(2) is found(2)
+        assert found(np.array([1.0, 2.0])[1]) is found(np.float64(2.0))
+        return
+    several = 1.0, 1, True, np.float32(1.0), 0.0, -0.0, 0, np.float32(-0.0), Metres(1.29)
+    programs = [found(x) for x in (*several, Metres(1.31), 0j, complex(0.0, -0.0))]
+    assert len(set(map(id, programs))) == len(programs)
+    x = jnp.asarray(3.0)
+    assert lanes.once(partial(_sum, {"offset": 1.0}), x) == 4.0
+    assert lanes.once(partial(_sum, {"offset": 1}), x) == 2.0
+
+
+class Metres(float):
+    """A number that shows less than it is."""
+
+    def __repr__(self):
+        return f"{float(self):.1f} m"
+
+
+FACTOR = 2.0
+
+
+def _scaled(x):
+    return FACTOR * x
+
+
+def test_clearing_the_caches_of_jax_clears_ours(monkeypatch):
+    x = jnp.asarray(3.0)
+    assert lanes.once(_scaled, x) == 6.0
+    monkeypatch.setitem(globals(), "FACTOR", 5.0)
+    jax.clear_caches()
+    assert lanes.once(_scaled, x) == 15.0
+
+
+def test_decorated_functions_are_distinguished_by_their_wrapper():
+    def times(box):
+        @wraps(_scaled)
+        def wrapper(x):
+            return box[0] * x
+
+        return wrapper
+
+    box, x = [2.0], jnp.asarray(3.0)
+    scaled = times(box)
+    assert lanes.once(scaled, x) == 6.0
+    box[0] = 5.0
+    assert lanes.once(scaled, x) == 15.0
+
+
+def test_what_is_traced_is_not_kept():
+    """A function bound as a constant may close over numbers that vary."""
+
+    def along(k):
+        return lanes.once(partial(_applied, Law(lambda x: k * x)), jnp.asarray(2.0))
+
+    np.testing.assert_allclose(jax.vmap(along)(jnp.arange(3.0)), [0.0, 2.0, 4.0])
+    np.testing.assert_allclose(jax.grad(along)(1.5), 2.0)
+    np.testing.assert_allclose([along(k) for k in (1.0, jnp.asarray(4.0))], [2.0, 8.0])
+
+
+class Law:
+    """A plain object that holds a function."""
+
+    def __init__(self, function):
+        self.function = function
+
+
+def _applied(law, x):
+    return law.function(x)

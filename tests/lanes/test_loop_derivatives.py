@@ -1,0 +1,107 @@
+"""Derivatives of loops: forward, of several directions with one motion, backward by columns."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from vi_jax import lanes
+
+from lanes.toys import fall, logistic
+
+
+def test_forward_derivatives():
+    """Through the event, in one direction and in several, of first and second order."""
+    time = lambda height, gravity: fall(height, gravity)[0][0]
+    h, g = 1.7, 9.81
+    slope = jax.jacfwd(time, (0, 1))(h, g)
+    np.testing.assert_allclose(slope, [0.5 * np.sqrt(2 / h / g), -0.5 * np.sqrt(2 * h / g**3)])
+    bend = jax.jacfwd(jax.jacfwd(time))(h, g)
+    np.testing.assert_allclose(bend, -0.25 * np.sqrt(2 / h**3 / g))
+    many = jax.vmap(jax.jacfwd(time, (0, 1)), (0, None))(np.linspace(1, 2, 11), g)
+    np.testing.assert_allclose(many[0], 0.5 * np.sqrt(2 / np.linspace(1, 2, 11) / g))
+    one = jax.jit(lambda x: jax.jvp(lambda x: logistic(x, 3.7, 6.0), (x,), (1.0,)))(0.3)
+    two = jax.jit(lambda x: jax.jvp(lambda x: logistic(x, 3.7, 6.0, backend="xla"), (x,), (1.0,)))(
+        0.3
+    )
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True):
+        if a.dtype != jax.dtypes.float0:
+            np.testing.assert_allclose(a, b, rtol=1e-12)
+
+
+def test_directions_share_one_motion():
+    """Six directions make one program whose primal part is there once."""
+    rows = jax.make_jaxpr(jax.jacfwd(lambda x: logistic(*x, backend="xla")[1]["x"]))(
+        jnp.asarray([0.3, 3.7, 6.0])
+    )
+    equations = [e for e in rows.jaxpr.eqns if e.primitive.name == "lanes"]
+    assert len(equations) == 1 and equations[0].outvars[0].aval.shape == ()
+
+
+INNER = {
+    "scan": lambda x: jax.lax.scan(lambda a, b: (a * b, a), x, jnp.stack([x, 2 * x]))[0],
+    "fori_loop": lambda x: jax.lax.fori_loop(0, 3, lambda i, a: a * a, x),
+    "while_loop": lambda x: jax.lax.while_loop(lambda a: a < 5, lambda a: a * a, x),
+    "cond": lambda x: jax.lax.cond(x > 1, lambda a: a * a, lambda a: a, x),
+    "checkpoint": lambda x: jax.checkpoint(jnp.sin)(x),
+    "custom_jvp": lambda x: with_its_own_derivative(x),
+}
+
+
+@jax.custom_jvp
+def with_its_own_derivative(x):
+    return jax.lax.stop_gradient(x)
+
+
+with_its_own_derivative.defjvps(lambda slope, out, x: 3 * x * slope)
+
+
+@pytest.mark.parametrize("name", INNER)
+def test_derivatives_of_a_step_that_holds(name):
+    def lane(x, y):
+        def begin(inputs):
+            return inputs[0], lanes.Emitted(True, False, None)
+
+        def step(inputs, carry):
+            return INNER[name](carry) * inputs[1], lanes.Emitted(False, False, None)
+
+        return lanes.run(begin, step, lambda inputs, carry: carry, (x, y), rows=0)[0]
+
+    def plain(x, y):
+        return INNER[name](x) * y
+
+    wanted = jax.jit(jax.jacfwd(plain, (0, 1)))(1.5, 2.5)
+    for along in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(jax.jit(along(lane, (0, 1)))(1.5, 2.5), wanted, rtol=1e-15)
+
+
+@pytest.mark.slow
+def test_reverse_mode_is_the_forward_one_transposed():
+    """Of results and rows, of all inputs or some, of numbers of a lane's own and of common ones."""
+
+    def sums(x, r, backend=None):
+        (last, *_), rows = jax.vmap(lambda x: logistic(x, r, 6.0, backend=backend))(x)
+        return jnp.stack([jnp.sum(jnp.sin(last)), jnp.sum(rows["x"][:, :3] ** 2)])
+
+    x = jnp.linspace(0.1, 0.9, 11)
+    for backend in (None, "xla"):
+        for which in (0, 1):
+            forward = jax.jacfwd(sums, which)(x, 3.7, backend)
+            backward = jax.jacrev(sums, which)(x, 3.7, backend)
+            np.testing.assert_allclose(backward, forward, rtol=1e-12, atol=1e-12)
+    many = jnp.linspace(0.1, 0.9, 20)
+    slope = jax.grad(lambda w: jnp.sum(jnp.sin(logistic(w @ many, 3.7, 6.0)[0][0])))(
+        jnp.ones(20) / 40
+    )
+    np.testing.assert_allclose(slope / many, slope[0] / many[0], rtol=1e-12)
+
+
+def test_values_beside_a_gradient_and_linear_parts():
+
+    def last(x):
+        return logistic(x, 3.7, 6.0)[0][0]
+
+    value, along = jax.linearize(last, 0.3)
+    np.testing.assert_allclose(value, last(0.3))
+    np.testing.assert_allclose(along(1.0), jax.jacfwd(last)(0.3))
+    slope = jax.grad(lambda x: x * jax.lax.stop_gradient(last(x)) + 0 * last(0.3 + 0 * x) ** 0)
+    np.testing.assert_allclose(slope(0.3), last(0.3))

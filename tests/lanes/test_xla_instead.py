@@ -1,0 +1,119 @@
+"""What runs on XLA's backend instead, with one warning; faults of LLVM's."""
+
+import sys
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from vi_jax import lanes
+from vi_jax.lanes import _code, _primitive, call, runtime
+
+from lanes.toys import failing, fall
+
+
+def sorting(x, *, backend=None):
+    def begin(x):
+        return x, lanes.Emitted(True, False, None)
+
+    def step(x, carry):
+        return jnp.sort(jnp.stack([carry, 1.0]))[0], lanes.Emitted(False, False, None)
+
+    return lanes.run(begin, step, lambda x, carry: carry, x, rows=0, backend=backend)[0]
+
+
+def test_shards_of_a_batch_are_vector_code_too():
+    """`shard_map` marks what lanes share, zeros of derivatives included; that is no computation."""
+    mesh = jax.sharding.Mesh(np.asarray(jax.devices()[:1]), ("lanes",))
+    split = jax.sharding.PartitionSpec("lanes")
+    heights = jnp.linspace(0.5, 2.0, 13)
+
+    def both(height):
+        return jax.jvp(lambda x: fall(x, 9.81)[0], (height,), (jnp.ones_like(height),))
+
+    def sharded(x):
+        return jax.shard_map(
+            jax.vmap(both), mesh=mesh, in_specs=split, out_specs=split, check_vma=False
+        )(x)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = jax.jit(sharded)(heights)
+    for a, b in zip(found, jax.vmap(both)(heights), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_what_has_no_vector_form_runs_on_xla_with_one_warning():
+
+    _primitive._warn.cache_clear()
+    with pytest.warns(UserWarning, match="`sort`"):
+        out = jax.vmap(sorting)(jnp.asarray([0.5, 3.0]))
+    np.testing.assert_array_equal(out, [0.5, 1.0])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # once
+        jax.vmap(sorting)(jnp.asarray([0.5, 3.0, 4.0]))
+        jax.vmap(lambda x: sorting(x, backend="xla"))(jnp.asarray([0.5, 3.0]))
+
+
+@pytest.mark.parametrize("fault", ["missing", "broken"])
+def test_without_llvm(fault, monkeypatch):
+    for cached in (_primitive._warn, _code.llvm, runtime._register_bits):
+        cached.cache_clear()
+    if fault == "missing":
+        monkeypatch.setitem(sys.modules, "llvmlite.binding", None)
+    else:
+        monkeypatch.setattr(_code, "object_code", failing)
+    try:
+        with pytest.warns(UserWarning, match="llvmlite" if fault == "missing" else "LLVM: no such"):
+            out = jax.vmap(lambda x: fall(x, 9.8125)[0][0])(jnp.linspace(1.0, 2.0, 5))
+    finally:
+        _code.llvm.cache_clear()
+        runtime._register_bits.cache_clear()
+    np.testing.assert_allclose(out, np.sqrt(2 * np.linspace(1, 2, 5) / 9.8125), rtol=1e-12)
+
+
+def test_a_program_that_llvm_cannot_compile(monkeypatch):
+    def begin(x):
+        return x, lanes.Emitted(True, False, None)
+
+    def step(x, carry):
+        return carry + 0.15625, lanes.Emitted(False, False, None)
+
+    _code.llvm()  # which it can do at first
+    monkeypatch.setattr(_code, "object_code", failing)
+    with pytest.raises(jax.errors.JaxRuntimeError, match=r"LLVM: no such.*backend\(.xla.\)"):
+        jax.block_until_ready(lanes.run(begin, step, lambda x, carry: carry, 1.0, rows=0)[0])
+
+
+def test_code_that_is_not_valid_is_refused():
+    """As where a value is used in a block that its own does not dominate."""
+    text = """define void @kernel(i1 %c) {
+      entry: br i1 %c, label %a, label %b
+      a: %x = add i32 1, 2
+         br label %b
+      b: %y = add i32 %x, 1
+         ret void
+    }"""
+    with pytest.raises(RuntimeError, match=r"(?s)not valid.* fault of vi_jax.*does not dominate"):
+        _code.object_code(_code.llvm(), text, None)
+
+
+@pytest.mark.parametrize("difference", ["version", "layout"])
+def test_another_version_of_the_calls_of_xla(difference, monkeypatch):
+    """XLA does not register a handler that states a version which it does not know. Where XLA's own
+    structures have other sizes, the handler states none that is known."""
+    if difference == "version":
+        monkeypatch.setattr(call, "_MINOR", 99)
+    else:
+        monkeypatch.setattr(call, "_Buffers", call._Frame)  # of another size
+    monkeypatch.setattr(call, "TARGET", f"vi_jax_lanes_of_another_{difference}")
+    monkeypatch.setattr(_primitive, "registered", call.registered.__wrapped__)
+    _primitive._warn.cache_clear()
+    heights = jnp.linspace(1.0, 2.0, 5)
+    words = r"version 0\.\d+ of XLA's call interface .* is incompatible"
+    with pytest.warns(UserWarning, match=words) as seen:
+        for gravity in (9.75, jnp.float32(9.5)):  # two programs
+            found = jax.jit(jax.vmap(lambda x, g: fall(x, g)[0][0], (0, None)))(heights, gravity)
+            np.testing.assert_allclose(found, np.sqrt(2 * heights / gravity), rtol=1e-6)
+    assert len(seen) == 1
