@@ -242,3 +242,23 @@ def test_directions_share_divisions(monkeypatch):
         return max(text.count("fdiv") for text in texts)
 
     assert divisions(2) == divisions(6) == 2  # the ratio and the divisor's reciprocal
+
+
+@pytest.mark.parametrize("kind", [jnp.int32, jnp.int64, jnp.uint32])
+@pytest.mark.parametrize("count", [3, 64])
+def test_integers_divided_by_what_varies(kind, count):
+    """As XLA has it, by zero and by -1 as well; three lanes leave empty slots in their group."""
+    rng = np.random.default_rng(5)
+    low = 0 if kind == jnp.uint32 else -4
+    info = jnp.iinfo(kind)
+    a = rng.integers(low, 100, count).astype(kind)
+    a[:2] = info.min, info.max
+    b = rng.integers(low, 4, count).astype(kind)
+    b[:3] = kind(-1) if low else 1, 0, 0
+
+    def both(a, b):
+        return jax.lax.div(a, b), jax.lax.rem(a, b)
+
+    mine = once(both, a, b, backend="auto")
+    for x, y in zip(mine, jax.jit(jax.vmap(both))(a, b), strict=True):
+        np.testing.assert_array_equal(x, y)

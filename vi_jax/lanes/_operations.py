@@ -76,8 +76,28 @@ def sub(t: Text, a: Value, b: Value) -> Value:
 
 def div(t: Text, a: Value, b: Value, *, unsigned: bool = False) -> Value:
     if not is_float(a.kind):
-        return t.binary("udiv" if unsigned else "sdiv", a, b)
+        return _of_integers(t, "div", a, b, unsigned)
     return a if b.number == 1 else t.binary("fdiv contract", a, b)
+
+
+def _of_integers(t: Text, what: str, a: Value, b: Value, unsigned: bool) -> Value:
+    """Quotient (`"div"`) or remainder (`"rem"`) of integers as XLA has them where a processor would
+    trap: by zero -1 and the dividend; by -1, which may overflow, -a and 0. A slot of a group in
+    which there is no lane holds zeros."""
+    operation = ("u" if unsigned else "s") + what
+    if b.number is not None and b.number not in (0, -1):
+        return t.binary(operation, a, b)
+    zero, one = t.zero(a.kind), t.constant(1, a.kind)
+    minus = t.binary("sub", zero, one)
+    by_zero = compare(t, "eq", b, zero, True)
+    divisor = t.select(by_zero, one, b)
+    if unsigned:
+        found = t.binary(operation, a, divisor)
+    else:
+        by_minus = compare(t, "eq", b, minus, True)
+        found = t.binary(operation, a, t.select(by_minus, one, divisor))
+        found = t.select(by_minus, neg(t, a) if what == "div" else zero, found)
+    return t.select(by_zero, minus if what == "div" else a, found)
 
 
 def neg(t: Text, a: Value) -> Value:
@@ -243,9 +263,7 @@ _LIBRARY = (
 for _name in _LIBRARY:
     ELEMENTWISE[_name] = lambda t, p, d, *args, name=_name: t.each(name, *args)
 ELEMENTWISE["rem"] = lambda t, p, d, a, b: (
-    t.each("fmod", a, b)
-    if is_float(a.kind)
-    else t.binary("urem" if _is_unsigned(d[0]) else "srem", a, b)
+    t.each("fmod", a, b) if is_float(a.kind) else _of_integers(t, "rem", a, b, _is_unsigned(d[0]))
 )
 
 
