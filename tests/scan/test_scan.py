@@ -238,7 +238,7 @@ def test_failing_lanes_are_counted_and_harm_no_other():
     "change, message",
     [
         ({"axes": {"drive.freqency_ratio": [1.0]}}, "near names: drive.frequency_ratio"),
-        ({"axes": {"start.W": [1.0]}}, "`axes` must be a number of the scene"),
+        ({"axes": {"start.W": [1.0]}}, "`axes` must be a number of the machine"),
         ({"axes": {"drive.frequency_ratio": [1.0, np.nan]}}, "finite"),
         ({"axes": {"stops.0.restitution": [0.5, 1.5]}}, r"`restitution`.*\[0, 1\]"),
         ({"axes": {}}, "`axes` must map"),
@@ -288,7 +288,7 @@ def test_a_store_is_resumed_and_guards_itself(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=r"axis start.Y is .*, and now it is"):
         vi.scan(SCENE, {**axes, "start.Y": np.linspace(-1, 1.1, 30)}, store=path, **options)
     other = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.1, damping_ratio=0.01)
-    with pytest.raises(ValueError, match=r"scene stops\.0\.gap is 2\.0, and now it is 2\.1"):
+    with pytest.raises(ValueError, match=r"machine stops\.0\.gap is 2\.0, and now it is 2\.1"):
         vi.scan(other, axes, store=path, **options)
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "letter.txt").write_text("mine")
@@ -314,7 +314,7 @@ def test_a_store_knows_functions_by_what_they_make(tmp_path):
 
     first = run(2.0, 1.0)
     np.testing.assert_array_equal(run(2.0, 1.0).depth, first.depth)
-    with pytest.raises(ValueError, match=r"scene first stops\.0\.gap is 2\.0, and now it is 1\.5"):
+    with pytest.raises(ValueError, match=r"first stops\.0\.gap is 2\.0, and now it is 1\.5"):
         run(1.5, 1.0)
     with pytest.raises(ValueError, match=r"code of measure 1 is \w+, and now it is"):
         run(2.0, 3.0)

@@ -11,8 +11,9 @@ from ..machine.numbers import leaf, leaf_names
 from ..orbit.branch import column_names
 from ..orbit.curve import check_walk
 from ..plot.save import ENDINGS
+from ..scan.corners import check_corners
 from ..scan.grid import Blocks, axes_of
-from ..scan.program import check_corners, make_program
+from ..scan.program import make_program
 from .config import OrbitTable
 from .toml import ConfigError, given, in_terms_of, unknown
 

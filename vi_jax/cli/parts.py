@@ -17,6 +17,7 @@ import numpy as np
 
 from ..flow import RESULTS, Run, Samples
 from ..flow.arguments import planned
+from ..flow.options import RunOptions
 from ..flow.simulate import simulate
 from ..machine import AbstractMachine
 from ..machine.numbers import with_leaf
@@ -67,7 +68,8 @@ def simulate_in_parts(
 
     **Raises:** `KeyboardInterrupt` if it was before anything was to be kept; as `simulate`.
     """
-    planned(scene, start, cycles, settle=settle, samples=samples, max_steps=max_steps, **options)
+    asked = RunOptions(settle=settle, samples=samples, max_steps=max_steps, **options)
+    planned(scene, start, cycles, asked)
     number = math.ceil(cycles * max(_PER_CYCLE, samples) / _INTERVALS)
     length = math.ceil(cycles / number)
     spent, runs = 0, []

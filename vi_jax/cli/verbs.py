@@ -32,6 +32,7 @@ from ..plot.colors import BLUE, RED
 from ..scan import Sweep
 from ..scan import basins as find_basins
 from ..scan import scan as run_scan
+from ..scan.scan import LanesFailed
 from ..scan.sweep import COLUMNS
 from .checks import (
     check_continuation,
@@ -88,7 +89,7 @@ def scan(config: Config, tell: Tell) -> Outcome:
         total = math.prod(len(row) for row in axes.values())
     tell(f"scanning {total:,} motions")
     with in_terms_of("[scan]", keys=keys_of(type(table))), warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "[0-9,]+ of [0-9,]+ lanes failed")
+        warnings.simplefilter("ignore", LanesFailed)
         data = run_scan(scene, axes, start=start, method=method, **options)
     lines = [f"Scan of {data['result'].size:,} motions over {axes_in_words(axes)}"]
     if "period" in data:

@@ -20,27 +20,29 @@ from .regime import CODES
 from .store import UNVERIFIABLE
 
 
-def description_of(job: ScanProgram, blocks: Blocks) -> dict[str, Any]:
+def description_of(program: ScanProgram, blocks: Blocks) -> dict[str, Any]:
     """What makes two scans the same, in words and numbers that JSON can hold."""
 
     def described(tree: Any) -> str:
         return _lasting(eqx.tree_pformat(tree, short_arrays=False, width=10**6))
 
     machine: dict[str, Any]
-    if job.machine is not None:
-        machine = {name: _described(leaf(job.machine, name)) for name in leaf_names(job.machine)}
-        machine["structure"] = _lasting(str(jtu.tree_structure(job.machine)))
+    if program.machine is not None:
+        machine = {
+            name: _described(leaf(program.machine, name)) for name in leaf_names(program.machine)
+        }
+        machine["structure"] = _lasting(str(jtu.tree_structure(program.machine)))
     else:  # a function is known by what it makes
-        machine = {"made by": _lasting(getattr(job.build, "__qualname__", repr(job.build)))}
+        machine = {"made by": _lasting(getattr(program.build, "__qualname__", repr(program.build)))}
         for name, place in (("first", 0), ("last", -1)):
-            made, _ = job.lane(_lane(blocks, place))
+            made, _ = program.lane(_lane(blocks, place))
             machine |= {
                 f"{name} {leaf_}": _described(leaf(made, leaf_)) for leaf_ in leaf_names(made)
             }
             machine[f"{name} structure"] = _lasting(str(jtu.tree_structure(made)))
     start: Any = "the machine's own"
-    if job.start is not None:
-        start = {name: _described(leaf(job.start, name)) for name in leaf_names(job.start)}
+    if program.start is not None:
+        start = {name: _described(leaf(program.start, name)) for name in leaf_names(program.start)}
     about: dict[str, Any] = {
         "machine": machine,
         "start": start,
@@ -54,19 +56,19 @@ def description_of(job: ScanProgram, blocks: Blocks) -> dict[str, Any]:
             }
             for name, x in blocks.axes.items()
         },
-        "measure": [described(m) for m in job.measures],
-        "method": described(job.method),
-        "clock": job.clock,
-        "settle": int(job.settle),
-        "cycles": job.cycles,
-        "derivatives": list(job.derivatives),
-        "max_impacts": job.max_impacts,
-        "max_steps": job.max_steps,
+        "measure": [described(m) for m in program.measures],
+        "method": described(program.method),
+        "clock": program.options.clock,
+        "settle": int(program.options.settle),
+        "cycles": program.cycles,
+        "derivatives": list(program.derivatives),
+        "max_impacts": program.options.max_impacts,
+        "max_steps": program.options.max_steps,
         "lanes": blocks.lanes,
         "precision": str(jnp.result_type(float)),
-        "code of": _codes(job),
+        "code of": _codes(program),
     }
-    if any(isinstance(measure, Regime) for measure in job.measures):
+    if any(isinstance(measure, Regime) for measure in program.measures):
         # A store of an earlier release has other numbers for them, not to be mixed with these.
         about["regimes"] = dict(CODES)
     return about
@@ -81,11 +83,11 @@ def _lane(blocks: Blocks, place: int) -> dict[str, Any]:
     return {name: jnp.asarray(x[place]) for name, x in blocks.axes.items()}
 
 
-def _codes(job: ScanProgram) -> dict[str, str]:
+def _codes(program: ScanProgram) -> dict[str, str]:
     """What tells the user's own functions and classes from others of the same name."""
-    parts: dict[str, Any] = {"machine": job.machine if job.build is None else job.build}
-    parts |= {"start": job.start, "method": job.method}
-    for i, measure in enumerate(job.measures):
+    parts: dict[str, Any] = {"machine": program.machine if program.build is None else program.build}
+    parts |= {"start": program.start, "method": program.method}
+    for i, measure in enumerate(program.measures):
         parts[f"measure {i + 1}"] = measure
     found = {}
     for name, part in parts.items():
