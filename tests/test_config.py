@@ -55,8 +55,8 @@ SI = sorted(field.name for field in dataclasses.fields(vi.Parameters))
 def test_any_machine_is_read_as_it_is_written(tmp_path_factory, machine):
     path = tmp_path_factory.mktemp("machine") / "file.toml"
     text = "".join(f"{key} = {value!r}\n" for key, value in machine.items())
-    path.write_text("[machine]\n" + text)
-    table = config.read(path).machine
+    path.write_text("[parameters]\n" + text)
+    table = config.read(path).parameters
     assert table is not None
     assert {name: getattr(table, name) for name in machine} == machine
     scene, wanted = table.build(), vi.Parameters(**machine).scene(drive="motor")
@@ -65,7 +65,7 @@ def test_any_machine_is_read_as_it_is_written(tmp_path_factory, machine):
 
 
 def test_the_machine_has_the_keys_of_parameters():
-    assert set(keys_of(config.MachineTable)) == {*SI, "drive", "crank", "clock"}
+    assert set(keys_of(config.ParametersTable)) == {*SI, "drive", "crank", "clock"}
 
 
 @settings(deadline=None, max_examples=30)
@@ -223,15 +223,18 @@ def test_what_cannot_be_read(here, text, sentence):
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("", "the file must hold [scene], [machine] or [model], but holds none of them"),
-        (IDEAL + "[machine]",
-         "the file must hold [scene], [machine] or [model], but holds [scene] and [machine]"),
-        ("[model]\nname = 'ImpactPear'",
-         "unknown machine `ImpactPear` in [model]; near names: ImpactPair"),
-        ("[model]\nname = 'ImpactPair'\nnumbers = {gap = 2.0}",
-         "unknown number `gap` in [model.numbers]; near names: half_gap"),
-        ("[model]\nname = 'ImpactPair'\nnumbers = {half_gap = -2.0}",
-         "`half_gap` in [model.numbers] must be finite and in (0, inf), but got -2.0"),
+        ("", "the file must hold [scene], [parameters] or [machine], but holds none of them"),
+        (IDEAL + "[parameters]", "the file must hold [scene], [parameters] or [machine], but holds "
+         "[scene] and [parameters]"),
+        ("[model]\nname = 'ImpactPair'", "[model] is called [machine] now"),
+        ("[machine]\ngap = 0.08\ntorque = 10", "`gap` in [machine]: the SI numbers of the "
+         "paper's machine are in [parameters] now"),
+        ("[machine]\nname = 'ImpactPear'",
+         "unknown machine `ImpactPear` in [machine]; near names: ImpactPair"),
+        ("[machine]\nname = 'ImpactPair'\nnumbers = {gap = 2.0}",
+         "unknown number `gap` in [machine.numbers]; near names: half_gap"),
+        ("[machine]\nname = 'ImpactPair'\nnumbers = {half_gap = -2.0}",
+         "`half_gap` in [machine.numbers] must be finite and in (0, inf), but got -2.0"),
         ("[scene]", 'missing key `frequency_ratio` in [scene]: drive = "ideal"'),
         ("[scene]\ndrive = 'motor'\nfrequency_ratio = 1",
          'unfitting key `frequency_ratio` in [scene]: drive = "motor"'),
@@ -242,14 +245,14 @@ def test_what_cannot_be_read(here, text, sentence):
          "`restitution` in [scene] must be finite and in [0, 1], but got 1.5"),
         (IDEAL + "[[scene.stops]]\ngap = nan",
          "`gap` in [[scene.stops]] number 1 must be finite and in (-inf, inf), but got nan"),
-        ("[machine]\ninertia = 0",
-         "`inertia` in [machine] must be finite and in (0, inf), but got 0.0"),
+        ("[parameters]\ninertia = 0",
+         "`inertia` in [parameters] must be finite and in (0, inf), but got 0.0"),
         (IDEAL + "[start]\nW = 1", "`W` in [start] must be left out: an ideal drive turns at its "
          "frequency ratio, but got W=1.0"),
         (IDEAL + "[start]\nM = 1", "`M` in [start] must be left out: only a `DCMotor` has a torque "
          "of its own, but got M=1.0"),
-        ("[machine]\nelectrical_time = 0",
-         "`electrical_time` in [machine] must be finite and in (0, inf), but got 0.0"),
+        ("[parameters]\nelectrical_time = 0",
+         "`electrical_time` in [parameters] must be finite and in (0, inf), but got 0.0"),
         (IDEAL + "[method]\nname = 'exact-flight'\nrtol = 1e-6",
          '`rtol` in [method] does not belong to name = "exact-flight"'),
         (IDEAL + "[method]\nname = 'adaptive'\nsolver = 'Dopri9'",
@@ -342,7 +345,7 @@ AXES = "[axes]\ndrive.frequency_ratio = [0.8, 0.9]\nstops.0.gap = [1, 2]\n"
         ("orbit", "[orbit]\ntolerance = -1", "`tolerance` in [orbit] must be finite"),
         ("orbit", "[orbit]\nguess = {W = 1}", "`W` in `guess` in [orbit] must be left out"),
         ("orbit", "[orbit.continue]\nparameter = 'drive.frequency_ratio'\nbounds = [1, 2]",
-         "must hold the scene's drive.frequency_ratio = 0.9"),
+         "must hold the machine's drive.frequency_ratio = 0.9"),
         ("simulate", "[simulate]\ncycles = 0", "`cycles` in [simulate] must be at least 1"),
         ("simulate", "[simulate]\ncycles = 1\n[start]\nY = 3",
          "[start] must not lie beyond a stop"),
@@ -426,7 +429,7 @@ SCAN = (
 def test_scan(here, capsys):
     out = ran(capsys, "scan", SCAN)
     assert "Scan of 6 motions over drive.frequency_ratio (2: 0.8 … 0.9), start.Y" in out
-    assert "failed: 2 of 6 motions" in out and "2: The start or a number of the scene" in out
+    assert "failed: 2 of 6 motions" in out and "2: The start or a number of the machine" in out
     assert "<xarray.Dataset>" in out and "Nothing was written" in out
     assert [path.name for path in here.iterdir()] == ["file.toml"]
     out = ran(capsys, "scan", SCAN + "store = 'new/s.zarr'\npicture = 's.png'")
@@ -535,7 +538,7 @@ def test_the_example_of_the_module_is_valid(here):
     text = "\n".join(line[4:] for line in lines if line.startswith("    "))
     tomllib.loads(text)
     file = read_toml(written(text.replace("[method]", "")), config.Config)
-    assert file.model is not None and file.model.build().half_gap == 2
+    assert file.machine is not None and file.machine.build().half_gap == 2
     assert file.axes is not None and list(file.axes) == ["stops.0.restitution"]
 
 
@@ -546,7 +549,9 @@ def test_a_ready_machine_and_one_of_ones_own(here, capsys):
     asked = written("[simulate]\ncycles = 3")
     assert cli.main(["simulate", str(asked), "--machine", "shaken:ball"]) == 0
     assert "Run of 3 cycles" in capsys.readouterr().out
-    ready = written("[model]\nname = 'BouncingBall'\n[start]\nspeed = 1.5\n[simulate]\ncycles = 3")
+    ready = written(
+        "[machine]\nname = 'BouncingBall'\n[start]\nspeed = 1.5\n[simulate]\ncycles = 3"
+    )
     assert cli.main(["simulate", str(ready)]) == 0
     for name, sentence in (
         ("shaken:bell", "cannot be found"),
