@@ -11,6 +11,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .._version import installed_version
+from ..machine import AbstractMachine
 from ..machine.numbers import leaf, leaf_names
 from ._identity import Unverifiable, identity
 from .grid import Blocks
@@ -102,10 +103,11 @@ def _described(x: Any) -> Any:
     return np.asarray(x, float).tolist()
 
 
-def attributes_of(about: dict[str, Any]) -> dict[str, Any]:
-    """The attributes of a scan's data, from its description."""
+def attributes_of(about: dict[str, Any], machine: AbstractMachine) -> dict[str, Any]:
+    """The attributes of a scan's data, from its description and one of its machines."""
     return {
         "vi_jax": installed_version(),
+        "machine_class": type(machine).__name__,
         "method": about["method"],
         "settle": about["settle"],
         "cycles": about["cycles"],

@@ -220,7 +220,7 @@ def _computed(
         data = kept.data()
         for name in grid:
             data[name].attrs |= units_of(unit_on_axis(program, blocks, name))
-        data.attrs = attributes_of(description)
+        data.attrs = attributes_of(description, program.first(blocks)[0])
         return data
 
     open_blocks = kept.open_blocks()
