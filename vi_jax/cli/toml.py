@@ -261,7 +261,7 @@ def _mapping(kind: Any) -> Callable[[Any, Any], dict[str, Any]]:
     def hook(value: Any, _: Any) -> dict[str, Any]:
         if not isinstance(value, dict):
             raise TypeError(f"must be a table, but is {_shown(value)}")
-        return _CONVERTER.structure(dict(_flat(value)), Mapping[str, item])
+        return dict(_CONVERTER.structure(dict(_flat(value)), Mapping[str, item]))
 
     return hook
 

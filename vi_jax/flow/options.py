@@ -47,14 +47,11 @@ class RunOptions:
 
         **Raises:** `TypeError` or `ValueError` that names the option.
         """
-        most = self.max_steps
+        most, counts = self.max_steps, ("samples", "impact_log", "event_log", "max_impacts")
         return dataclasses.replace(
             self,
+            **{name: count(name, getattr(self, name)) for name in counts},
             method=chosen(machine, self.method),
-            samples=count("samples", self.samples),
-            impact_log=count("impact_log", self.impact_log),
-            event_log=count("event_log", self.event_log),
-            max_impacts=count("max_impacts", self.max_impacts),
             settle=count_or_traced("settle", self.settle),
             rests=None if self.rests is None else flag("rests", self.rests),
             max_steps=None if most is None else count("max_steps", most, least=1),

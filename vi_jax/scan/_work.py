@@ -81,26 +81,20 @@ def rounded(lanes: int, total: int, devices: int) -> int:
 @functools.cache
 def _compiled(devices: int) -> Callable[..., dict[str, Array]]:
     """A program of a block of lanes, compiled for so many devices."""
-    if devices == 1:
-        return _program(lambda program, values, wanted: program(values, wanted))
     mesh = Mesh(np.asarray(jax.local_devices()[:devices]), ("lanes",))
     whole, split = PartitionSpec(), PartitionSpec("lanes")
 
+    def here(program, values, wanted):
+        return program(values, wanted)
+
     def over_devices(program, values, wanted):
         numbers, rest = eqx.partition(program, eqx.is_array)
-
-        def here(numbers, values, wanted):
-            return eqx.combine(numbers, rest)(values, wanted)
-
         return jax.shard_map(
-            here, mesh=mesh, in_specs=(whole, split, split), out_specs=split, check_vma=False
-        )(numbers, values, wanted)
+            lambda numbers, *lanes: here(eqx.combine(numbers, rest), *lanes),
+            mesh=mesh, in_specs=(whole, split, split), out_specs=split, check_vma=False,
+        )(numbers, values, wanted)  # fmt: skip
 
-    return _program(over_devices)
-
-
-def _program(function: Callable[..., Any]) -> Program:
-    return Program(function, PLAIN, **compiling())
+    return Program(here if devices == 1 else over_devices, PLAIN, **compiling())
 
 
 def compute(

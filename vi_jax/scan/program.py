@@ -30,7 +30,7 @@ from .measures import AbstractMeasure, Numbers
 
 START = "start."
 
-_USUAL = RunOptions(settle=200)
+_USUAL = RunOptions()
 
 
 class ScanProgram(eqx.Module):

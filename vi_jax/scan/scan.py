@@ -23,8 +23,7 @@ from ..flow.options import RunOptions
 from ..flow.results import REASON_NAMES
 from ..machine import AbstractMachine
 from ..machine.units import attributes as units_of
-from ._describe import attributes_of, description_of
-from ._variables import unit_on_axis, variables_of
+from ._describe import attributes_of, description_of, unit_on_axis, variables_of
 from ._work import (
     ClusterLost,
     block_size,
@@ -37,11 +36,7 @@ from ._work import (
 from .corners import check_corners
 from .grid import Blocks, axes_of
 from .program import ScanProgram, make_program
-from .store import (
-    MemoryStore,
-    ZarrStore,
-    check_writable,
-)
+from .store import MemoryStore, ZarrStore, check_writable
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -149,11 +144,12 @@ def scan(
     )
     program = make(options, derivatives=derivatives)
     place = _workplace(workers, devices, cluster)
-    data = _computed(program, grid, place, paired, store, lanes, progress=progress)
+    blocks = _blocks(program, grid, place, paired, store, lanes)
+    data = _computed(program, blocks, place, store, progress)
     if verify:
         better = make(dataclasses.replace(options, method=_better(program)))
         try:
-            data.attrs |= _verified(data, grid, paired, verify, better, place)
+            data.attrs |= _verified(data, blocks, verify, better, place)
         except KeyboardInterrupt:
             raise ScanInterrupted(data, store) from None
     _warn_of_failures(data)
@@ -190,20 +186,12 @@ def _workplace(workers: int | None, devices: int | None, cluster: Any) -> _Workp
 
 
 def _computed(
-    program: ScanProgram,
-    grid: Mapping[str, np.ndarray],
-    place: _Workplace,
-    paired: bool,
-    store: str | Path | None = None,
-    lanes: int | None = None,
-    *,
-    progress: bool = False,
+    program: ScanProgram, blocks: Blocks, place: _Workplace, store: Any = None, progress=False
 ) -> "xr.Dataset":
     """What a program finds on a grid, checked before any work.
 
     **Raises:** as `scan`.
     """
-    blocks = _blocks(program, grid, place, paired, store, lanes)
     program = check_corners(program, blocks)
     variables = variables_of(program, blocks)
     per_lane = sum(math.prod(v.sizes) * v.dtype.itemsize for v in variables.values())
@@ -218,7 +206,7 @@ def _computed(
 
     def collected() -> "xr.Dataset":
         data = kept.data()
-        for name in grid:
+        for name in blocks.axes:
             data[name].attrs |= units_of(unit_on_axis(program, blocks, name))
         data.attrs = attributes_of(description, program.first(blocks)[0])
         return data
@@ -253,8 +241,8 @@ def _blocks(
     grid: Mapping[str, np.ndarray],
     place: _Workplace,
     paired: bool,
-    store: str | Path | None,
-    lanes: int | None,
+    store: str | Path | None = None,
+    lanes: int | None = None,
 ) -> Blocks:
     """The grid in blocks of `lanes`: as in the store if there is one, or as suits the workplace.
 
@@ -293,22 +281,17 @@ def _better(program: ScanProgram) -> AbstractMethod:
 
 
 def _verified(
-    data: "xr.Dataset",
-    grid: Mapping[str, np.ndarray],
-    paired: bool,
-    lanes: int,
-    program: ScanProgram,
-    place: _Workplace,
+    data: "xr.Dataset", blocks: Blocks, lanes: int, program: ScanProgram, place: _Workplace
 ) -> dict[str, Any]:
     """How so many of the lanes, or all, come out by a better program; attributes by their names."""
     total = data["result"].size
     lanes = min(lanes, total)
     drawn = np.sort(np.random.default_rng(0).choice(total, lanes, replace=False))
     places = np.unravel_index(drawn, data["result"].shape)
-    if paired:
-        places = (drawn,) * len(grid)
-    axes = {name: x[where] for (name, x), where in zip(grid.items(), places, strict=True)}
-    better = _computed(program, axes, place, paired=True)
+    if blocks.paired:
+        places = (drawn,) * len(blocks.axes)
+    axes = {name: x[i] for (name, x), i in zip(blocks.axes.items(), places, strict=True)}
+    better = _computed(program, _blocks(program, axes, place, paired=True), place)
     found: dict[str, Any] = {"verified_lanes": lanes}
     for name in better:
         mine = np.asarray(data[name]).reshape(total, -1)[drawn]
