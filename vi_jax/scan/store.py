@@ -296,6 +296,9 @@ def _compare(
 
 def _in_new_words(description: Mapping[str, Any]) -> dict[str, Any]:
     """The description in a store of an earlier release, in which machines were called scenes."""
-    renamed = {"machine" if key == "scene" else key: x for key, x in description.items()}
-    codes = renamed.get("code of", {})
-    return renamed | {"code of": {"machine" if k == "scene" else k: x for k, x in codes.items()}}
+    found = {"machine" if key == "scene" else key: x for key, x in description.items()}
+    if isinstance(codes := found.get("code of"), dict):
+        found["code of"] = {"machine" if k == "scene" else k: x for k, x in codes.items()}
+    if found.get("start") == "the scene's own":
+        found["start"] = "the machine's own"
+    return found
