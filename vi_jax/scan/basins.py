@@ -77,7 +77,7 @@ class Basins(NamedTuple):
         `motion_impacts`, `motion_starts`, `motion_fraction`, `motion_error` and its section states
         (`motion_Y`, NaN beyond its period). A `label` from 0 on is a place along `motion`.
 
-        **Arguments:** `along`, to keep only what is given along one dimension: `"motion"`, `"cycle"`
+        **Arguments:** `along`, to keep only what lies along one dimension: `"motion"`, `"cycle"`
         (their section states), or the last axis of the starts for `data`.
 
         **Raises:** `ValueError` if there is no such dimension.
