@@ -103,7 +103,7 @@ CALLS = {
         np.array(["2020-01-01"], "M8[D]"), [[0.8]], [np.nan], "0.8", 0.8, [])},
     **{f"values of {x!r}": (sweep(values=x), "Argument `values` must be") for x in (
         ["0.8"], [True], [1j], np.array(["2020-01-01"], "M8[D]"), [np.nan], 0.8)},
-    "sweep of None": (sweep(None), "`scene` must be a `Scene`"),
+    "sweep of None": (sweep(None), "`machine` must be a `Scene`"),
     "sweep of no name": (sweep(parameter=None), "`parameter` must be"),
     **{f"tolerance={x!r}": (sweep(tolerance=x), "Argument `tolerance` must be") for x in (
         np.nan, np.float32("nan"), "1", True, 1j, 0.0)},

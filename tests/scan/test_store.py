@@ -1,6 +1,7 @@
 """Stores that were damaged, and functions that are no longer those of the store."""
 
 import importlib
+import json
 import shutil
 import warnings
 
@@ -14,9 +15,9 @@ SCENE = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ra
 AXES = {"start.Y": np.linspace(-1.0, 1.0, 600)}
 
 
-def scanned(path):
+def scanned(path, machine=SCENE):
     return vi.scan(
-        SCENE, AXES, measure="extremes", settle=5, cycles=4, lanes=256, workers=1, store=path
+        machine, AXES, measure="extremes", settle=5, cycles=4, lanes=256, workers=1, store=path
     )
 
 
@@ -149,7 +150,7 @@ def test_functions_that_differ_between_the_probed_lanes_are_refused(tmp_path, mo
             warnings.filterwarnings("ignore", "3 of 3 lanes failed .not_computed")
             vi.scan(scene, axes, measure=kept, settle=5, cycles=4, store=tmp_path / name)
 
-    for name, what in {"scene": "scene", "measure": "measure 1"}.items():
+    for name, what in {"scene": "machine", "measure": "measure 1"}.items():
         run(name)
         run(name)
         with pytest.raises(ValueError, match=rf"the code of {what} is \w+, and now it is \w+"):
@@ -159,3 +160,24 @@ def test_functions_that_differ_between_the_probed_lanes_are_refused(tmp_path, mo
     run("measure", hidden=opaque)
     with pytest.raises(ValueError, match=r"must be new, since it cannot be told .* measure 1"):
         run("measure", hidden=opaque)
+
+
+def test_a_store_in_which_machines_are_called_scenes_is_resumed(whole, tmp_path):
+    """As earlier releases wrote them."""
+    path = tmp_path / "store"
+    shutil.copytree(whole[0], path)
+    head = json.loads((path / "zarr.json").read_text())
+    about = head["attributes"]["scan"]
+    about["scene"], about["code of"]["scene"] = (
+        about.pop("machine"),
+        about["code of"].pop("machine"),
+    )
+    (path / "zarr.json").write_text(json.dumps(head))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = scanned(path)
+    np.testing.assert_array_equal(found.y_min, whole[1]["y_min"])
+    with pytest.raises(ValueError, match=r"machine stops\.0\.gap is 2\.0, and now it is 2\.1"):
+        scanned(
+            path, vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.1, damping_ratio=0.01)
+        )

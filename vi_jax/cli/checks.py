@@ -11,29 +11,30 @@ from ..machine.numbers import leaf, leaf_names
 from ..orbit.branch import column_names
 from ..orbit.curve import check_walk
 from ..plot.save import ENDINGS
+from ..scan.corners import check_corners
 from ..scan.grid import Blocks, axes_of
-from ..scan.program import check_corners, make_program
+from ..scan.program import make_program
 from .config import OrbitTable
 from .toml import ConfigError, given, in_terms_of, unknown
 
 
 def check_names(
-    scene: AbstractMachine, names: Iterable[str], place: str, *, start: bool = False
+    machine: AbstractMachine, names: Iterable[str], place: str, *, start: bool = False
 ) -> None:
-    """**Raises:** `ConfigError` for a name that no number of the scene (or the start) has."""
-    known = leaf_names(scene)
+    """**Raises:** `ConfigError` for a name that no number of the machine (or the start) has."""
+    known = leaf_names(machine)
     if start:
-        known += [f"start.{name}" for name in leaf_names(scene.start())]
+        known += [f"start.{name}" for name in leaf_names(machine.start())]
     wrong = [unknown("name", name, place, known) for name in names if name not in known]
     if wrong:
         raise ConfigError(*wrong)
 
 
-def check_range(scene: AbstractMachine, name: str, values: Sequence[float], place: str) -> None:
-    """**Raises:** `ConfigError` if the scene refuses the least or the greatest of these values."""
+def check_range(machine: AbstractMachine, name: str, values: Sequence[float], place: str) -> None:
+    """**Raises:** `ConfigError` if the machine refuses the least or greatest of these values."""
     with in_terms_of(place, keys=()):
         axes = axes_of({name: values})
-        check_corners(make_program(scene, (name,), measure="extremes"), Blocks(axes, 1))
+        check_corners(make_program(machine, (name,), measure="extremes"), Blocks(axes, 1))
 
 
 def check_paths(table: str, *, picture: str | None = None, output: str | None = None) -> None:
@@ -73,21 +74,21 @@ def check_map(axes: Mapping[str, Any], measure: Iterable[str] | None, *, paired:
         )
 
 
-def check_continuation(scene: AbstractMachine, start: Any, table: OrbitTable) -> None:
+def check_continuation(machine: AbstractMachine, start: Any, table: OrbitTable) -> None:
     """**Raises:** `ConfigError` if the branch cannot begin, or its files not be written."""
     asked = table.continue_
     assert asked is not None
-    check_names(scene, [asked.parameter], "[orbit.continue]")
+    check_names(machine, [asked.parameter], "[orbit.continue]")
     low, high = asked.bounds
-    value = float(leaf(scene, asked.parameter))
+    value = float(leaf(machine, asked.parameter))
     if not low <= value <= high or low == high:
         raise ConfigError(
-            f"`bounds` in [orbit.continue] must hold the scene's {asked.parameter} = {value:g}, "
+            f"`bounds` in [orbit.continue] must hold the machine's {asked.parameter} = {value:g}, "
             f"but is [{low:g}, {high:g}]"
         )
-    check_range(scene, asked.parameter, asked.bounds, "`bounds` in [orbit.continue]")
+    check_range(machine, asked.parameter, asked.bounds, "`bounds` in [orbit.continue]")
     walk = {"step": 0.01, "max_step": 0.1, "max_points": 1000}
     with in_terms_of("[orbit.continue]"):
         check_walk(**{name: given(asked).get(name, usual) for name, usual in walk.items()})
-    check_quantity(asked.y, "`y` in [orbit.continue]", column_names(scene, start))
+    check_quantity(asked.y, "`y` in [orbit.continue]", column_names(machine, start))
     check_paths("[orbit.continue]", picture=asked.picture, output=asked.output)

@@ -1,6 +1,6 @@
-"""Files for the command line: a scene, how it moves and what is asked of it, as TOML.
+"""Files for the command line: a machine, how it moves and what is asked of it, as TOML.
 
-    [scene]                         # dimensionless; or [machine], the keys of `Parameters` in SI
+    [scene]                         # the paper's machine without dimensions
     frequency_ratio = 0.9           # drive = "motor" takes [scene.motor], the keys of `Motor`,
                                     # or of `DCMotor` with its electrical_time
     restitution = 0.5
@@ -8,11 +8,13 @@
                                     # [[scene.soft_stops]], the arguments of `SoftStop`
     crank = "slider"                # with crank_ratio; "cosine" by default
 
-    [model]                         # instead: a machine of `vi_jax.machines`
+    [parameters]                    # instead: the same in SI units, the keys of `Parameters`
+
+    [machine]                       # instead: a machine of `vi_jax.machines`
     name = "ImpactPair"
     numbers = { half_gap = 2.0 }    # its arguments
 
-    [start]                         # Y, V and, for a motor, W (and M), or what the model's start
+    [start]                         # Y, V and, for a motor, W (and M), or what the machine's start
                                     # takes; at rest if left out
     [method]                        # name = "draft", "standard", "reference", or "exact-flight",
                                     # "adaptive", "fixed-step", "taylor" with their arguments
@@ -33,7 +35,14 @@ from attrs import field, frozen
 from ..flow import AbstractMethod, Adaptive, ExactFlight, FixedStep, Taylor, Verner9
 from ..machine import AbstractMachine
 from ..orbit import AbstractRootFinder, Gradient, Newton
-from .machine import MachineTable, ModelTable, SceneTable, machine_named, start_of
+from .machine import (
+    MachineTable,
+    ParametersTable,
+    SceneTable,
+    machine_named,
+    outdated,
+    start_of,
+)  # fmt: skip
 from .toml import ConfigError as ConfigError
 from .toml import Row, given, in_terms_of, read_toml, unknown
 
@@ -51,7 +60,7 @@ _SOLVERS = {
 
 @frozen(kw_only=True)
 class MethodTable:
-    """`[method]`: how the scene is carried."""
+    """`[method]`: what moves the machine."""
 
     name: Literal[
         "draft", "standard", "reference", "exact-flight", "adaptive", "fixed-step", "taylor"
@@ -183,9 +192,9 @@ class SimulateTable:
 class Config:
     """A whole file."""
 
-    machine: MachineTable | None = None
     scene: SceneTable | None = None
-    model: ModelTable | None = None
+    parameters: ParametersTable | None = None
+    machine: MachineTable | None = None
     start: dict[str, float] | None = None
     method: MethodTable | None = None
     axes: dict[str, Row] | None = None
@@ -199,24 +208,27 @@ class Config:
     """A machine that the command line names, not the file."""
 
     def build(self) -> tuple[AbstractMachine, Any, AbstractMethod | str | None]:
-        """Scene, start and method; `None` for what the file leaves out."""
-        names = [name for name in ("scene", "machine", "model") if getattr(self, name) is not None]
-        held = " and ".join(f"[{name}]" for name in names) or "none of them"
-        if self.own is not None and names:
+        """Machine, start and method; `None` for what the file leaves out."""
+        tables = {name: getattr(self, name) for name in ("scene", "parameters", "machine")}
+        tables = {f"[{name}]": table for name, table in tables.items() if table is not None}
+        held = " and ".join(tables) or "none of them"
+        if self.own is not None and tables:
             raise ConfigError(
                 f"the file must not describe a machine beside --machine, but has {held}"
             )
-        if self.own is None and len(names) != 1:
-            raise ConfigError(f"the file must hold [scene], [machine] or [model], but holds {held}")
-        scene = self.own or getattr(self, names[0]).build()
-        start = None if self.start is None else start_of(scene, self.start, "[start]")
-        return scene, start, self.method and self.method.build()
+        if self.own is None and len(tables) != 1:
+            raise ConfigError(
+                f"the file must hold [scene], [parameters] or [machine], but holds {held}"
+            )
+        machine = self.own or next(iter(tables.values())).build()
+        start = None if self.start is None else start_of(machine, self.start, "[start]")
+        return machine, start, self.method and self.method.build()
 
 
 def read(path: str | Path, *, machine: str | None = None) -> Config:
     """Read a file; with `machine`, a name `package.module:function`, for the machine that this
     function returns. **Raises:** `ConfigError` that names every fault with its place."""
-    config = read_toml(path, Config)
+    config = read_toml(path, Config, outdated)
     if machine is not None:
         object.__setattr__(config, "own", machine_named(machine))
     return config

@@ -83,7 +83,7 @@ def _explore(options: argparse.Namespace) -> int:
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_platforms", "cpu")  # the fastest for one motion
     try:
-        serve(options.host, options.port, browser=options.browser, tell=_tell)
+        serve(options.host, options.port, browser=options.browser, tell=_say)
     except KeyboardInterrupt:
         pass
     except OSError as error:
@@ -101,7 +101,7 @@ def _run_file(options: argparse.Namespace) -> int:
         if table is None:
             raise ConfigError(f"missing table [{verb}], which says what to do")
         store = getattr(table, "store", None)
-        found = VERBS[verb](config, _tell)
+        found = VERBS[verb](config, _say)
     except ConfigError as error:
         for problem in error.problems:
             _error(f"{options.file}: {problem}", 2)
@@ -165,8 +165,8 @@ def _parser() -> argparse.ArgumentParser:
         verb = commands.add_parser(
             name,
             help=f"{about}, as a file says",
-            description=f"Does what FILE says: {about}. The file holds [scene], [machine] or "
-            "[model], if need be [start] and [method]"
+            description=f"Does what FILE says: {about}. The file holds [scene], [parameters] "
+            "or [machine], if need be [start] and [method]"
             f"{', [axes]' if name == 'scan' else ''}, and [{name}].",
             epilog="; ".join(_keys(kind) for kind in tables),
         )
@@ -185,5 +185,5 @@ def _keys(kind: type) -> str:
     return f"keys of {name}: {', '.join(key.rstrip('_') for key in keys_of(kind))}"
 
 
-def _tell(step: str) -> None:
+def _say(step: str) -> None:
     print(f"{step} …", file=sys.stderr, flush=True)

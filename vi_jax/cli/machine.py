@@ -23,12 +23,12 @@ from ..machine import (
     SliderCrank,
     SoftStop,
 )
-from .toml import ConfigError, given, in_terms_of, unknown
+from .toml import ConfigError, Tables, given, in_terms_of, keys_of, unknown
 
 
 @frozen(kw_only=True)
-class MachineTable:
-    """`[machine]`: the numbers of `Parameters` in SI units."""
+class ParametersTable:
+    """`[parameters]`: the numbers of `Parameters` in SI units."""
 
     drive: Literal["motor", "ideal"] = "motor"
     crank: Literal["cosine", "slider"] = "cosine"
@@ -49,7 +49,7 @@ class MachineTable:
 
     def build(self) -> Scene:
         """The dimensionless scene."""
-        with in_terms_of("[machine]"):
+        with in_terms_of("[parameters]"):
             table = Parameters(**given(self, "drive", "crank", "clock"))
             return table.scene(drive=self.drive, crank=self.crank).in_clock(self.clock)
 
@@ -79,8 +79,8 @@ class SoftStopTable:
 
 
 @frozen(kw_only=True)
-class ModelTable:
-    """`[model]`: a ready machine by its name, and its numbers."""
+class MachineTable:
+    """`[machine]`: a ready machine by its name, and its numbers."""
 
     name: str
     numbers: dict[str, float] = field(factory=dict)
@@ -89,12 +89,12 @@ class ModelTable:
         """The machine."""
         kinds = {name: x for name, x in vars(machines).items() if _is_machine(x)}
         if self.name not in kinds:
-            raise ConfigError(unknown("machine", self.name, "[model]", sorted(kinds)))
+            raise ConfigError(unknown("machine", self.name, "[machine]", sorted(kinds)))
         known = list(inspect.signature(kinds[self.name]).parameters)
         wrong = [name for name in self.numbers if name not in known]
         if wrong:
-            raise ConfigError(*(unknown("number", x, "[model.numbers]", known) for x in wrong))
-        with in_terms_of("[model.numbers]"):
+            raise ConfigError(*(unknown("number", x, "[machine.numbers]", known) for x in wrong))
+        with in_terms_of("[machine.numbers]"):
             return kinds[self.name](**self.numbers)
 
 
@@ -171,14 +171,25 @@ class SceneTable:
             raise ConfigError('`crank_ratio` in [scene] must stand beside crank = "slider"')
 
 
-def start_of(scene: AbstractMachine, numbers: Mapping[str, float], place: str) -> Any:
+def outdated(tables: Tables) -> list[str]:
+    """Sentences about tables that have another name now: a ready machine's, and SI numbers'."""
+    found = ["[model] is called [machine] now"] if "model" in tables else []
+    inside = tables.get("machine")
+    old = [key for key in keys_of(ParametersTable) if isinstance(inside, dict) and key in inside]
+    if old:
+        words = "the SI numbers of the paper's machine are in [parameters] now"
+        found.append(f"`{old[0]}` in [machine]: {words}")
+    return found
+
+
+def start_of(machine: AbstractMachine, numbers: Mapping[str, float], place: str) -> Any:
     """A state on the section, from `[start]` or a guess."""
-    known = list(inspect.signature(scene.start).parameters)
+    known = list(inspect.signature(machine.start).parameters)
     wrong = [unknown("key", name, place, known) for name in numbers if name not in known]
     if wrong:
         raise ConfigError(*wrong)
     with in_terms_of(place):
-        return scene.start(**numbers)
+        return machine.start(**numbers)
 
 
 def machine_named(name: str) -> AbstractMachine:

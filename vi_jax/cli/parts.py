@@ -17,6 +17,7 @@ import numpy as np
 
 from ..flow import RESULTS, Run, Samples
 from ..flow.arguments import planned
+from ..flow.options import RunOptions
 from ..flow.simulate import simulate
 from ..machine import AbstractMachine
 from ..machine.numbers import with_leaf
@@ -51,7 +52,7 @@ def noted_interrupts() -> Iterator[Callable[[], bool]]:
 
 
 def simulate_in_parts(
-    scene: AbstractMachine,
+    machine: AbstractMachine,
     start: Any,
     cycles: int,
     *,
@@ -67,7 +68,8 @@ def simulate_in_parts(
 
     **Raises:** `KeyboardInterrupt` if it was before anything was to be kept; as `simulate`.
     """
-    planned(scene, start, cycles, settle=settle, samples=samples, max_steps=max_steps, **options)
+    asked = RunOptions(settle=settle, samples=samples, max_steps=max_steps, **options)
+    planned(machine, start, cycles, asked)
     number = math.ceil(cycles * max(_PER_CYCLE, samples) / _INTERVALS)
     length = math.ceil(cycles / number)
     spent, runs = 0, []
@@ -76,7 +78,7 @@ def simulate_in_parts(
         nonlocal spent
         left = None if max_steps is None else max(1, max_steps - spent)
         run = simulate(
-            scene, start, length, settle=settle, samples=samples, max_steps=left, **options
+            machine, start, length, settle=settle, samples=samples, max_steps=left, **options
         )
         spent += int(run.steps)
         return run
@@ -121,16 +123,9 @@ def _joined(runs: list[Run], cycles: int, samples: int, steps: int) -> Run:
         )
 
     apart = (
-        "sections",
-        "quantities",
-        "samples",
-        "errors",
-        "result",
-        "steps",
-        "rejected",
-        "labels",
+        "sections", "quantities", "samples", "errors", "result", "steps", "rejected", "labels",
         "units",
-    )
+    )  # fmt: skip
     rows = {
         field.name: joined([getattr(run, field.name) for run in runs], done)
         for field in dataclasses.fields(Run)
@@ -169,7 +164,7 @@ def _joined(runs: list[Run], cycles: int, samples: int, steps: int) -> Run:
 
 
 def sweep_in_parts(
-    scene: AbstractMachine,
+    machine: AbstractMachine,
     parameter: str,
     values: Any,
     *,
@@ -186,8 +181,8 @@ def sweep_in_parts(
     found = []
     for value in values:
         if start is not None and found:
-            start = taken_along(with_leaf(scene, parameter, value), start)
-        run = sweep(scene, parameter, jnp.asarray([value]), start=start, **options)
+            start = taken_along(with_leaf(machine, parameter, value), start)
+        run = sweep(machine, parameter, jnp.asarray([value]), start=start, **options)
         found.append(run)
         if bool(run.successful[0]):
             start = jtu.tree_map(lambda x: x[0, -1], run.sections)

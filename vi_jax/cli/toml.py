@@ -4,7 +4,7 @@ import difflib
 import math
 import re
 import tomllib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal, NewType, TypeVar, get_args, get_origin
@@ -19,6 +19,7 @@ _MOST, _LONGEST = 2**31 - 1, 10**7
 
 T = TypeVar("T")
 Place = tuple[str | int, ...]
+Tables = Mapping[str, Any]
 
 
 class ConfigError(ValueError):
@@ -38,8 +39,13 @@ class Row(tuple[float, ...]):
     __slots__ = ()
 
 
-def read_toml(path: str | Path, kind: type[T]) -> T:
+def read_toml(
+    path: str | Path, kind: type[T], outdated: Callable[[Tables], Sequence[str]] | None = None
+) -> T:
     """The file as an object of an attrs class; a trailing `_` of a field is not in its key.
+
+    **Arguments:** the file; the class; what finds sentences about an outdated use in its tables,
+    which is then refused with them alone.
 
     **Raises:** `ConfigError` that names every fault with its place.
     """
@@ -52,6 +58,8 @@ def read_toml(path: str | Path, kind: type[T]) -> T:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise ConfigError(f"the file cannot be read: {reason}") from None
+    if outdated is not None and (old := outdated(tables)):
+        raise ConfigError(*old)
     try:
         return _CONVERTER.structure(tables, kind)
     except RecursionError:
@@ -192,7 +200,7 @@ def _text(value: Any, _: Any = None) -> str:
 
 def _row(value: Any, _: Any = None) -> Row:
     if isinstance(value, list) and value:
-        return Row(_each(enumerate(value), Finite, Row).values())
+        return Row(_CONVERTER.structure(value, list[Finite]))
     if not isinstance(value, dict):
         raise TypeError(
             "must be a list of numbers or { from = …, to = …, count = … }, but is "
@@ -217,7 +225,7 @@ def _shown(value: Any) -> str:
 
 
 def _cut(text: str) -> str:
-    """No longer than a sentence bears."""
+    """The text, cut where it is too long for a sentence."""
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
@@ -242,7 +250,7 @@ def _list(kind: Any) -> Callable[[Any, Any], tuple[Any, ...]]:
             value = [value]  # one of several, without brackets
         if not isinstance(value, list) or len(value) != (size or len(value)):
             raise TypeError(f"must be a list of {size}, but is {_shown(value)}")
-        return tuple(_each(enumerate(value), item, kind).values())
+        return tuple(_CONVERTER.structure(value, list[item]))
 
     return hook
 
@@ -253,7 +261,7 @@ def _mapping(kind: Any) -> Callable[[Any, Any], dict[str, Any]]:
     def hook(value: Any, _: Any) -> dict[str, Any]:
         if not isinstance(value, dict):
             raise TypeError(f"must be a table, but is {_shown(value)}")
-        return _each(_flat(value), item, kind)
+        return dict(_CONVERTER.structure(dict(_flat(value)), Mapping[str, item]))
 
     return hook
 
@@ -265,21 +273,6 @@ def _flat(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any
             yield from _flat(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}", value
-
-
-def _each(items: Iterable[tuple[Any, Any]], item: Any, kind: Any) -> dict[Any, Any]:
-    note: Any = cattrs.IterableValidationNote
-    found, wrong = {}, []
-    for place, value in items:
-        try:
-            found[place] = _CONVERTER.structure(value, item)
-        except Exception as error:
-            error.add_note(note("", place, item))
-            wrong.append(error)
-    if wrong:
-        group: Any = cattrs.IterableValidationError
-        raise group("", wrong, kind)
-    return found
 
 
 def _class(kind: Any) -> Callable[[Any, Any], Any]:

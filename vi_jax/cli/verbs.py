@@ -32,6 +32,7 @@ from ..plot.colors import BLUE, RED
 from ..scan import Sweep
 from ..scan import basins as find_basins
 from ..scan import scan as run_scan
+from ..scan.scan import LanesFailed
 from ..scan.sweep import COLUMNS
 from .checks import (
     check_continuation,
@@ -73,12 +74,12 @@ class Outcome(NamedTuple):
 
 def scan(config: Config, tell: Tell) -> Outcome:
     """`vi-jax scan`."""
-    scene, start, method = config.build()
+    machine, start, method = config.build()
     table, axes = config.scan, config.axes
     assert table is not None
     if not axes:
         raise ConfigError("missing table [axes]: a scan needs at least one")
-    check_names(scene, axes, "[axes]", start=True)
+    check_names(machine, axes, "[axes]", start=True)
     if table.picture is not None:
         check_map(axes, table.measure, paired=table.paired)
     check_paths("[scan]", picture=table.picture)
@@ -88,8 +89,8 @@ def scan(config: Config, tell: Tell) -> Outcome:
         total = math.prod(len(row) for row in axes.values())
     tell(f"scanning {total:,} motions")
     with in_terms_of("[scan]", keys=keys_of(type(table))), warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "[0-9,]+ of [0-9,]+ lanes failed")
-        data = run_scan(scene, axes, start=start, method=method, **options)
+        warnings.simplefilter("ignore", LanesFailed)
+        data = run_scan(machine, axes, start=start, method=method, **options)
     lines = [f"Scan of {data['result'].size:,} motions over {axes_in_words(axes)}"]
     if "period" in data:
         lines += regimes_in_words(data)
@@ -111,12 +112,12 @@ def scan(config: Config, tell: Tell) -> Outcome:
 
 def sweep(config: Config, tell: Tell) -> Outcome:
     """`vi-jax sweep`."""
-    scene, start, method = config.build()
+    machine, start, method = config.build()
     table = config.sweep
     assert table is not None
-    check_names(scene, [table.parameter], "[sweep]")
-    check_range(scene, table.parameter, table.values, "`values` in [sweep]")
-    own = average_names(scene, scene.start() if start is None else start)
+    check_names(machine, [table.parameter], "[sweep]")
+    check_range(machine, table.parameter, table.values, "`values` in [sweep]")
+    own = average_names(machine, machine.start() if start is None else start)
     check_quantity(table.y, "`y` in [sweep]", (*COLUMNS, *own))
     check_paths("[sweep]", picture=table.picture, output=table.output)
     options = given(table, "values", "up_and_down", "y", "picture", "output")
@@ -126,12 +127,12 @@ def sweep(config: Config, tell: Tell) -> Outcome:
         with in_terms_of("[sweep]", keys=keys_of(type(table))):
             options |= {"method": method, "interrupted": interrupted}
             tell(f"sweeping {table.parameter} {there}, {len(table.values)} values")
-            found[there] = sweep_in_parts(scene, values=table.values, start=start, **options)
+            found[there] = sweep_in_parts(machine, values=table.values, start=start, **options)
             if table.up_and_down and not interrupted():
                 tell(f"sweeping {table.parameter} {back}")
                 last = _last_state(found[there], start)
                 back_again = table.values[::-1]
-                found[back] = sweep_in_parts(scene, values=back_again, start=last, **options)
+                found[back] = sweep_in_parts(machine, values=back_again, start=last, **options)
         outcome = _describe_sweeps(found, table)
         done = sum(run.values.size for run in found.values())
         wanted = len(table.values) * (2 if table.up_and_down else 1)
@@ -161,10 +162,10 @@ def _describe_sweeps(found: Mapping[str, Sweep], table: SweepTable) -> Outcome:
 
 def basins(config: Config, tell: Tell) -> Outcome:
     """`vi-jax basins`."""
-    scene, start, method = config.build()
+    machine, start, method = config.build()
     table = config.basins
     assert table is not None
-    check_names(scene, table.region, "[basins.region]", start=True)
+    check_names(machine, table.region, "[basins.region]", start=True)
     if table.picture is not None and len(table.region) != 2:
         raise ConfigError(
             "`picture` in [basins] needs a region of two parts of the start, but it has "
@@ -177,7 +178,7 @@ def basins(config: Config, tell: Tell) -> Outcome:
         options["resolution"] = table.resolution[0] if one else table.resolution
     tell("looking where the starts settle")
     with in_terms_of("[basins]", keys=keys_of(type(table))):
-        found = find_basins(scene, start=start, method=method, **options)
+        found = find_basins(machine, start=start, method=method, **options)
     lines = [str(found)]
     if table.output is not None:
         kept = found.data[["label", "period", "impacts"]]
@@ -193,23 +194,23 @@ def basins(config: Config, tell: Tell) -> Outcome:
 
 def orbit(config: Config, tell: Tell) -> Outcome:
     """`vi-jax orbit`."""
-    scene, start, method = config.build()
+    machine, start, method = config.build()
     table = config.orbit
     assert table is not None
     check_paths("[orbit]", picture=table.picture)
     if table.continue_ is not None:
-        check_continuation(scene, scene.start() if start is None else start, table)
+        check_continuation(machine, machine.start() if start is None else start, table)
     guess = start
     if table.guess is not None:
-        guess = start_of(scene, table.guess, "`guess` in [orbit]")
+        guess = start_of(machine, table.guess, "`guess` in [orbit]")
     tell(f"searching a motion of {table.cycles} cycle{'' if table.cycles == 1 else 's'}")
     named = {"root_finder": "[orbit]", "method": "[method]", "guess": "[start]"}
     if table.guess is not None:
         named["guess"] = "`guess` in [orbit]"
     with in_terms_of("[orbit]", keys=keys_of(type(table)), named=named):
         found = find_orbit(
-            scene,
-            scene.start() if guess is None else guess,
+            machine,
+            machine.start() if guess is None else guess,
             table.cycles,
             root_finder=table.search(),
             method=method,
@@ -252,7 +253,7 @@ def _portrait(found: Orbit) -> Axes:
 
 def simulate(config: Config, tell: Tell) -> Outcome:
     """`vi-jax simulate`."""
-    scene, start, method = config.build()
+    machine, start, method = config.build()
     table = config.simulate
     assert table is not None
     check_paths("[simulate]", picture=table.picture, output=table.output)
@@ -264,16 +265,18 @@ def simulate(config: Config, tell: Tell) -> Outcome:
     tell(f"simulating {table.cycles:,} cycles")
     with noted_interrupts() as interrupted:
         with in_terms_of("[simulate]", keys=keys_of(type(table))):
-            start = scene.start() if start is None else start
-            run = simulate_in_parts(scene, start, method=method, interrupted=interrupted, **options)
-        outcome = _describe_run(scene, run, table)
+            start = machine.start() if start is None else start
+            run = simulate_in_parts(
+                machine, start, method=method, interrupted=interrupted, **options
+            )
+        outcome = _describe_run(machine, run, table)
         done = run.impacts.size
         if interrupted() and done < table.cycles:
             return outcome._replace(interrupted=f"after {done:,} of {table.cycles:,} cycles")
         return outcome
 
 
-def _describe_run(scene: AbstractMachine, run: Run, table: SimulateTable) -> Outcome:
+def _describe_run(machine: AbstractMachine, run: Run, table: SimulateTable) -> Outcome:
     lines = [str(run)]
     if table.output is not None:
         columns = sample_columns(run.samples) if table.samples else cycle_columns(run)
@@ -282,8 +285,8 @@ def _describe_run(scene: AbstractMachine, run: Run, table: SimulateTable) -> Out
     if table.picture is not None:
         figure = Figure(figsize=(11, 3.6), layout="constrained")
         left, right = figure.subplots(1, 2, width_ratios=(2, 1))
-        plot_history(run, machine=scene, ax=left, unit="cycles")
-        plot_phase_portrait(run, scene, ax=right)
+        plot_history(run, machine=machine, ax=left, unit="cycles")
+        plot_phase_portrait(run, machine, ax=right)
         lines.append(saved(left, table.picture))
     return Outcome("\n".join(lines), bool(run.successful))
 

@@ -10,15 +10,16 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from .. import lanes
-from .._checks import count, count_or_traced, fits_records, flag, instance_of, one_of, require_real
+from .._checks import count, fits_records, instance_of, require_real
 from .._numbers import concrete, narrow, require_session, strongly_typed, warn, warn_of_narrow
 from ..machine import AbstractMachine, Scene
 from ..machine.event import begin_modes, is_autonomous
 from ._lane import Plan
 from ._own import check_period as check_period
 from ._own_parts import check_parts
-from .methods import MethodLike, chosen
+from .methods import AbstractMethod
 from .named import average_names
+from .options import RunOptions, largest_count
 from .smooth import rounding
 
 
@@ -26,36 +27,22 @@ def planned(
     machine: AbstractMachine,
     start: Any,
     cycles: int | Int[Array, ""],
-    *,
-    settle: Any = 0,
-    method: MethodLike = None,
-    clock: str | None = None,
-    samples: int = 0,
-    impact_log: int = 0,
-    event_log: int = 0,
-    record: str = "motion",
-    rests: bool | None = None,
-    max_impacts: int = 1000,
-    max_steps: int | None = None,
-    log_switches: bool = False,
+    options: RunOptions,
 ) -> tuple[Plan, Any]:
-    """The arguments of `simulate`, checked and put in the form in which the loop needs them."""
+    """What `simulate` was asked, checked and put in the form in which the loop needs it.
+
+    **Returns:** the plan, and the start as this machine has it.
+
+    **Raises:** as `simulate`.
+    """
     machine = machine_of(machine)
     check_parts(machine)
-    method = chosen(machine, method)
     cycles = count("cycles", cycles, least=1)
-    samples = count("samples", samples)
-    impact_log = count("impact_log", impact_log)
-    event_log = count("event_log", event_log)
-    max_impacts = count("max_impacts", max_impacts)
-    settle = count_or_traced("settle", settle)
-    if rests is not None:
-        rests = flag("rests", rests)
-    if max_steps is not None:
-        max_steps = count("max_steps", max_steps, least=1)
-    one_of("record", record, ("motion", "sections"))
-    if clock is not None:
-        machine = machine.in_clock(clock)
+    options = options.checked(machine)
+    method, samples = options.method, options.samples
+    assert isinstance(method, AbstractMethod)
+    if options.clock is not None:
+        machine = machine.in_clock(options.clock)
     require_session("machine", machine)
     start = machine.adopt(start)
     check_leaves("start", start)
@@ -71,38 +58,39 @@ def planned(
         _check_scalars(machine=machine, start=start)
     check_start(machine, start)
     machine, start = of_one_type(machine, start)
-    averages = average_names(machine, start) if record == "motion" else ()
-    columns = 12 + 3 * impact_log + 4 * event_log + len(averages)
-    fits_records("cycles", cycles * max(1, samples), columns)
+    parts, motion = max(1, samples), options.record == "motion"
+    averages = average_names(machine, start) if motion else ()
+    columns = 12 + 3 * options.impact_log + 4 * options.event_log + len(averages)
+    fits_records("cycles", cycles * parts, columns)
+    _warn_of_single_precision()
+    dtype = machine.position(start).dtype
+    options.check_limits(dtype)
+    most, rests = options.max_steps, options.rests
+    plan = Plan(
+        machine=machine,
+        method=method,
+        cycles=cycles,
+        parts=parts,
+        motion=motion,
+        log=options.impact_log,
+        log_switches=options.log_switches,
+        events=options.event_log,
+        averages=averages,
+        rests=(machine.may_rest() if rests is None else rests) and bool(machine.stops),
+        backend=lanes.current_backend(),
+        settle=_countable(cycles, options.settle, parts, dtype),
+        max_steps=jnp.asarray(jnp.inf if most is None else most, dtype),
+        max_impacts=jnp.asarray(options.max_impacts, dtype),
+    )
+    return plan, start
+
+
+def _warn_of_single_precision() -> None:
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         warn(
             "vi_jax is running in single precision: errors near 1e-6 and tolerances to match. For "
             'double precision call `jax.config.update("jax_enable_x64", True)` first.'
         )
-    dtype = machine.position(start).dtype
-    for name, value in (("max_impacts", max_impacts), ("max_steps", max_steps)):
-        if value is not None and value > _most(dtype):
-            raise ValueError(
-                f"Argument `{name}` must be at most {_most(dtype)}, up to which numbers of type "
-                f"{dtype} count, but got {value}."
-            )
-    plan = Plan(
-        machine=machine,
-        method=method,
-        cycles=cycles,
-        parts=max(1, samples),
-        motion=record == "motion",
-        log=impact_log,
-        log_switches=log_switches,
-        events=event_log,
-        averages=averages,
-        rests=(machine.may_rest() if rests is None else rests) and bool(machine.stops),
-        backend=lanes.current_backend(),
-        settle=_countable(cycles, settle, max(1, samples), dtype),
-        max_steps=jnp.asarray(jnp.inf if max_steps is None else max_steps, dtype),
-        max_impacts=jnp.asarray(max_impacts, dtype),
-    )
-    return plan, start
 
 
 def machine_of(machine: Any) -> AbstractMachine:
@@ -116,18 +104,13 @@ def machine_of(machine: Any) -> AbstractMachine:
     return jtu.tree_map(strongly_typed, machine)
 
 
-def _most(dtype: Any) -> int:
-    """The loop counts in floating-point numbers, which do so up to here."""
-    return round(2 / float(jnp.finfo(dtype).eps))
-
-
 def _countable(cycles: int, settle: Any, parts: int, dtype: Any) -> jax.Array:
     """`settle` as the loop needs it: NaN, with which no lane starts, if it is traced and no number
     of cycles that can be counted.
 
     **Raises:** `ValueError` if it is known and cannot be counted.
     """
-    most = _most(dtype) // parts
+    most = largest_count(dtype) // parts
     if concrete(settle) is not None:
         if settle + cycles > most:
             raise ValueError(

@@ -23,6 +23,7 @@ from .beside import means
 from .loop import Ends, run_lane
 from .methods import MethodLike
 from .named import has_quantities
+from .options import RunOptions
 from .results import Errors, EventLog, ImpactLog, Run, Samples, reason
 
 
@@ -89,11 +90,12 @@ def simulate(
     `RESULTS.bad_start` and harms no other.
     """
     estimate, throw = flag("estimate", estimate), flag("throw", throw)
-    plan, start = planned(
-        machine, start, cycles, settle=settle, method=method, clock=clock, samples=samples,
-        impact_log=impact_log, event_log=event_log, record=record, rests=rests,
-        max_impacts=max_impacts, max_steps=max_steps,
+    options = RunOptions(
+        settle=settle, method=method, clock=clock, samples=samples, impact_log=impact_log,
+        event_log=event_log, record=record, rests=rests, max_impacts=max_impacts,
+        max_steps=max_steps,
     )  # fmt: skip
+    plan, start = planned(machine, start, cycles, options)
     with lanes.interruptible():
         run = _simulate(plan, start, samples > 0)
     if estimate:
@@ -130,19 +132,18 @@ def simulate_pool(
     lane_of: Callable[[Any], tuple[AbstractMachine, Any]],
     values: Any,
     cycles: int,
-    *,
-    wanted: Any = None,
-    **options: Any,
+    options: RunOptions,
+    wanted: Array | None = None,
 ) -> Run:
     """As `simulate` under `vmap`, for lanes some of which are not wanted; forward mode only.
 
     **Arguments:** machine and start of one lane from its values; the values of all lanes, a pytree
-    with one leading axis; flags of the lanes that are wanted (the others are not run and come
-    back as failed); `options` as for `simulate`.
+    with one leading axis; the cycles to record; the options of each run; flags of the lanes that
+    are wanted, all by default (the others are not run and come back as failed).
     """
 
     def one(value, wanted):
-        plan, start = planned(*lane_of(value), cycles, **options)
+        plan, start = planned(*lane_of(value), cycles, options)
         return failed_derivatives(collect(plan, False, *run_lane(plan, start, wanted)))
 
     if wanted is None:

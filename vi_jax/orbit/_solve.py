@@ -14,6 +14,7 @@ from .._programs import compiled
 from ..flow.arguments import planned
 from ..flow.loop import run_lane
 from ..flow.methods import MethodLike
+from ..flow.options import RunOptions
 from ..flow.simulate import collect
 from ..machine import Scene
 from ..machine.base import renews
@@ -142,10 +143,8 @@ def events_in(orbit: Orbit) -> list[tuple[float, Event]]:
 
 def _listed_events(orbit: Orbit) -> tuple[np.ndarray, list[tuple[float, Event]]]:
     """When each cycle of a motion begins, and its impacts and switches, by a simulation."""
-    plan, start = planned(
-        orbit.machine, orbit.state, int(orbit.cycles), method=orbit.method, impact_log=_LISTED,
-        log_switches=True,
-    )  # fmt: skip
+    options = RunOptions(method=orbit.method, impact_log=_LISTED, log_switches=True)
+    plan, start = planned(orbit.machine, orbit.state, int(orbit.cycles), options)
     log, begins, counts = (np.asarray(a) for a in _listed(plan, start))
     if counts.max() > _LISTED:
         raise ValueError(

@@ -118,8 +118,7 @@ def _named(code: int, word: Callable[[int], str]) -> tuple[str, str]:
 
 def _word_of(data: xr.Dataset) -> Callable[[int], str]:
     """What to call periods in these data, whose attributes hold the class of the machine."""
-    about = str(data.attrs.get("machine", ""))
-    if "CustomNode(" in about and "CustomNode(Scene[" not in about:
+    if data.attrs.get("machine_class", "Scene") != "Scene":
         return lambda cycles: f"{cycles} cycle{'' if cycles == 1 else 's'}"
     return lambda cycles: f"{2 * cycles}π"
 

@@ -143,7 +143,7 @@ def _global(thing: Any, names: set[str], seen: dict[int, Any]) -> Iterator[str]:
 
 
 def _names(code: types.CodeType) -> set[str]:
-    """Globals and attributes that code names, the functions inside of it included."""
+    """Globals and attributes that code names, those of its inner functions included."""
     inner = (x for x in code.co_consts if isinstance(x, types.CodeType))
     return set(code.co_names).union(*(_names(x) for x in inner))
 

@@ -34,18 +34,30 @@ _MOST, _ON_ACCELERATOR = 4096, 65536
 _LEAST = 256
 
 
-def size_of(where: tuple[slice, ...]) -> int:
+# A block: where it lies on each axis of the grid.
+Where = tuple[slice, ...]
+
+
+def size_of(where: Where) -> int:
+    """Number of lanes in a block."""
     return math.prod(part.stop - part.start for part in where)
 
 
 def worker_count(workers: int | None) -> int:
+    """So many threads, or one for each core.
+
+    **Raises:** `TypeError` or `ValueError` for what is no count.
+    """
     if workers is not None:
         return count("workers", workers, least=1)
     return lanes.cores()
 
 
 def block_size(total: int, workers: int, devices: int) -> int:
-    """Few sizes, because each is a program of its own; small enough to occupy every core."""
+    """Lanes in a block of a grid of `total` lanes where the user names no number.
+
+    Few sizes, because each is a program of its own; small enough to occupy every core.
+    """
     if jax.default_backend() != "cpu":
         most, share = _ON_ACCELERATOR * devices, total
     else:
@@ -57,7 +69,10 @@ def block_size(total: int, workers: int, devices: int) -> int:
 
 
 def rounded(lanes: int, total: int, devices: int) -> int:
-    """As many lanes in a block, made full; no more than the grid has."""
+    """So many lanes in a block, but no more than the grid has, made a multiple of what it must be.
+
+    **Raises:** `TypeError` or `ValueError` for what is no count.
+    """
     lanes = min(count("lanes", lanes, least=1), total)
     step = _LEAST * devices
     return math.ceil(lanes / step) * step
@@ -65,65 +80,67 @@ def rounded(lanes: int, total: int, devices: int) -> int:
 
 @functools.cache
 def _compiled(devices: int) -> Callable[..., dict[str, Array]]:
-    if devices == 1:
-        return _program(lambda job, values, wanted: job(values, wanted))
+    """A program of a block of lanes, compiled for so many devices."""
     mesh = Mesh(np.asarray(jax.local_devices()[:devices]), ("lanes",))
     whole, split = PartitionSpec(), PartitionSpec("lanes")
 
-    def spread(job, values, wanted):
-        numbers, rest = eqx.partition(job, eqx.is_array)
+    def here(program, values, wanted):
+        return program(values, wanted)
 
-        def here(numbers, values, wanted):
-            return eqx.combine(numbers, rest)(values, wanted)
-
+    def over_devices(program, values, wanted):
+        numbers, rest = eqx.partition(program, eqx.is_array)
         return jax.shard_map(
-            here, mesh=mesh, in_specs=(whole, split, split), out_specs=split, check_vma=False
-        )(numbers, values, wanted)
+            lambda numbers, *lanes: here(eqx.combine(numbers, rest), *lanes),
+            mesh=mesh, in_specs=(whole, split, split), out_specs=split, check_vma=False,
+        )(numbers, values, wanted)  # fmt: skip
 
-    return _program(spread)
-
-
-def _program(function: Callable[..., Any]) -> CompiledFunction:
-    return CompiledFunction(function, PLAIN, **compiling())
+    return CompiledFunction(here if devices == 1 else over_devices, PLAIN, **compiling())
 
 
 def compute(
-    job: ScanProgram,
+    program: ScanProgram,
     values: dict[str, np.ndarray],
     lanes: int,
     devices: int = 1,
     *,
     dry: bool = False,
 ) -> dict[str, np.ndarray]:
-    """The numbers of a block of lanes, filled up to `lanes` so that every block is one program.
+    """The numbers of a block of lanes, by name, as the program finds them.
 
-    With several devices the lanes are dealt to them in turn, since neighbours take alike long.
-    `dry` wants none of them.
+    A block is filled up to `lanes`, so that all blocks are one program. With several devices the
+    lanes are dealt to them in turn, since neighbours take alike long. `dry` only compiles: none of
+    the lanes is run.
+
+    **Arguments:** the program; the axes' values of each lane; the size of a full block; over how
+    many local devices it is spread; whether to compile only.
     """
     size = next(iter(values.values())).size
     deal = np.arange(lanes).reshape(-1, devices).T.ravel()
     place = np.minimum(deal, size - 1)
     filled = {name: jnp.asarray(x[place]) for name, x in values.items()}
-    out = _compiled(devices)(job, filled, jnp.asarray((deal < size) & (not dry)))
+    out = _compiled(devices)(program, filled, jnp.asarray((deal < size) & (not dry)))
     back = np.argsort(deal)[:size]
     return {name: np.asarray(x)[back] for name, x in out.items()}
 
 
 def run_here(
-    job: ScanProgram, blocks: Blocks, todo: list, workers: int, devices: int
-) -> Iterator[tuple[tuple[slice, ...], dict[str, np.ndarray]]]:
-    """Blocks as they are done. Each runs on one core; several at a time keep all of them busy."""
+    program: ScanProgram, blocks: Blocks, todo: list[Where], workers: int, devices: int
+) -> Iterator[tuple[Where, dict[str, np.ndarray]]]:
+    """The blocks `todo` with their numbers, as they are done, each on one core, several at a time.
+
+    On an accelerator, or over several devices, one at a time.
+    """
     if devices > 1 or jax.default_backend() != "cpu":
         workers = 1
     if todo and workers > 1:
         # Compiled here, once and not in several threads at a time, by a block without lanes.
-        compute(job, blocks.values(todo[0]), blocks.lanes, devices, dry=True)
+        compute(program, blocks.values(todo[0]), blocks.lanes, devices, dry=True)
 
     x64 = _x64()
 
     def work(where):
         with jax.enable_x64(x64), lanes.threads(1):  # a thread has its own
-            return where, compute(job, blocks.values(where), blocks.lanes, devices)
+            return where, compute(program, blocks.values(where), blocks.lanes, devices)
 
     waiting = iter(todo)
     pool = ThreadPoolExecutor(workers)
@@ -148,7 +165,9 @@ class ClusterLost(Exception):
     """The scheduler of a cluster does not answer."""
 
 
-def run_on_cluster(job: ScanProgram, blocks: Blocks, todo: list, client: Any) -> Iterator[Any]:
+def run_on_cluster(
+    program: ScanProgram, blocks: Blocks, todo: list[Where], client: Any
+) -> Iterator[tuple[Where, dict[str, np.ndarray]]]:
     """Blocks as Dask tasks, as they are done. **Raises:** `ClusterLost`; what a task raises."""
     from dask.distributed import as_completed
 
@@ -156,7 +175,7 @@ def run_on_cluster(job: ScanProgram, blocks: Blocks, todo: list, client: Any) ->
         raise ClusterLost
     x64 = _x64()
     # Small enough to go with every task: data that are shared would die with their worker.
-    parcel = PicklableProgram(job)
+    parcel = PicklableProgram(program)
     where_of = {
         client.submit(
             _remote, parcel, blocks.values(where), blocks.lanes, x64, pure=False, retries=3
@@ -182,13 +201,17 @@ def _x64() -> bool:
 
 
 class PicklableProgram:
-    """A job on its way to another process, its arrays as numpy ones."""
+    """A scan's program on its way to another process, with NumPy's arrays in place of JAX's."""
 
-    def __init__(self, job: ScanProgram):
-        self.job = jtu.tree_map(lambda x: np.asarray(x) if eqx.is_array(x) else x, job)
+    def __init__(self, program: ScanProgram):
+        self.inner = jtu.tree_map(lambda x: np.asarray(x) if eqx.is_array(x) else x, program)
 
 
-def _remote(parcel: PicklableProgram, values: dict, lanes: int, x64: bool) -> dict[str, np.ndarray]:
+def _remote(
+    parcel: PicklableProgram, values: dict[str, np.ndarray], lanes: int, x64: bool
+) -> dict[str, np.ndarray]:
     with jax.enable_x64(x64):
-        job = jtu.tree_map(lambda x: jnp.asarray(x) if eqx.is_array_like(x) else x, parcel.job)
-        return compute(job, values, lanes)
+        program = jtu.tree_map(
+            lambda x: jnp.asarray(x) if eqx.is_array_like(x) else x, parcel.inner
+        )
+        return compute(program, values, lanes)

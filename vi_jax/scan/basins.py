@@ -26,7 +26,7 @@ from .grid import axes_of
 from .measures import AbstractMeasure, Regime
 from .program import START
 from .regime import CODES, REGIMES, flags
-from .scan import ScanInterrupted, scan
+from .scan import LanesFailed, ScanInterrupted, scan
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -77,7 +77,7 @@ class Basins(NamedTuple):
         `motion_impacts`, `motion_starts`, `motion_fraction`, `motion_error` and its section states
         (`motion_Y`, NaN beyond its period). A `label` from 0 on is a place along `motion`.
 
-        **Arguments:** `along`, to keep only what is told along one dimension: `"motion"`, `"cycle"`
+        **Arguments:** `along`, to keep only what lies along one dimension: `"motion"`, `"cycle"`
         (their section states), or the last axis of the starts for `data`.
 
         **Raises:** `ValueError` if there is no such dimension.
@@ -182,7 +182,52 @@ def basins(
         if name in options:
             raise TypeError(f"Argument `{name}` is `scan`'s, and not to be given to `basins`.")
     given_number("apart", apart, low=0.0, open_low=True)
-    seed = count("seed", seed)
+    axes = _starts_in(region, resolution, samples, count("seed", seed))
+    method = chosen(machine, method)
+    measure = (Regime(longest=longest, tolerance=tolerance), _Mark(longest))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", LanesFailed)
+        data = scan(
+            machine, axes, measure=measure, start=start, settle=settle, method=method,
+            paired=samples is not None, **options,
+        )  # fmt: skip
+    begin = machine.start() if start is None else start
+    names = list(by_name(begin))
+
+    def followed(state: np.ndarray, cycles: int) -> np.ndarray:
+        here = begin
+        for name, value in zip(names, state, strict=True):
+            here = with_leaf(here, name, value)
+        # Always as many cycles, so that another period is not another program.
+        run = simulate(machine, here, longest, method=method)
+        return np.stack(
+            [np.asarray(x)[1 : cycles + 1] for x in by_name(run.sections).values()], axis=1
+        )
+
+    try:
+        label, motions = _sorted_out(data, names, apart, followed)
+    except KeyboardInterrupt:
+        raise ScanInterrupted(data, options.get("store")) from None
+    impacts = np.asarray(data["impacts"]).ravel()
+    attractors = [_attractor(i, m, names, label, impacts) for i, m in enumerate(motions)]
+    parts = {name: float(np.mean(label == number)) for name, number in CODES.items()}
+    about = {"long_name": "motion that the start settles on", **flags(CODES)}
+    period = data["period"]
+    kind = np.min_scalar_type(-max(4, len(motions)))
+    data = data.assign(label=(period.dims, label.astype(kind).reshape(period.shape), about))
+    return Basins(data, attractors, parts, machine)
+
+
+def _starts_in(
+    region: Mapping[str, tuple[float, float]],
+    resolution: int | tuple[int, ...],
+    samples: int | None,
+    seed: int,
+) -> dict[str, np.ndarray]:
+    """The starts in a region, as axes of a scan: those of a grid, or random ones in pairs.
+
+    **Raises:** `ValueError` or `TypeError` that names the argument.
+    """
     ranges = axes_of(region, "region")
     for name, row in ranges.items():
         if not name.startswith(START):
@@ -195,87 +240,54 @@ def basins(
                 "Argument `region` must give ranges (low, high), low < high, of parts of the "
                 f'start, "start.Y" and such, but got {region[name]!r} for {name!r}.'
             )
-    if samples is None:
-        sizes = resolution if isinstance(resolution, tuple) else (resolution,) * len(ranges)
-        if len(sizes) != len(ranges):
-            raise ValueError(
-                f"Argument `resolution` must be one number or {len(ranges)}, but got "
-                f"{resolution!r}."
-            )
-        axes = {}
-        for (name, (low, high)), size in zip(ranges.items(), sizes, strict=True):
-            size = count("resolution", size, least=1)
-            axes[name] = low + (high - low) * (np.arange(size) + 0.5) / size
-    else:
+    if samples is not None:
         samples = count("samples", samples, least=1)
         fits_records("samples", samples, len(ranges))
         rng = np.random.default_rng(seed)
-        axes = {name: rng.uniform(low, high, samples) for name, (low, high) in ranges.items()}
-    method = chosen(machine, method)
-    measure = (Regime(longest=longest, tolerance=tolerance), _Mark(longest))
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "[0-9,]+ of [0-9,]+ lanes failed")
-        data = scan(
-            machine, axes, measure=measure, start=start, settle=settle, method=method,
-            paired=samples is not None, **options,
-        )  # fmt: skip
-    if start is None:
-        start = machine.start()
-    names = list(by_name(start))
-    period = np.asarray(data["period"]).ravel()
-    impacts = np.asarray(data["impacts"]).ravel()
-    states = np.stack([np.asarray(data[name]).ravel() for name in names], axis=1)
-
-    def followed(state: np.ndarray, cycles: int) -> np.ndarray:
-        begin = start
-        for name, value in zip(names, state, strict=True):
-            begin = with_leaf(begin, name, value)
-        # Always as many cycles, so that another period is not another program.
-        run = simulate(machine, begin, longest, method=method)
-        return np.stack(
-            [np.asarray(x)[1 : cycles + 1] for x in by_name(run.sections).values()], axis=1
+        return {name: rng.uniform(low, high, samples) for name, (low, high) in ranges.items()}
+    sizes = resolution if isinstance(resolution, tuple) else (resolution,) * len(ranges)
+    if len(sizes) != len(ranges):
+        raise ValueError(
+            f"Argument `resolution` must be one number or {len(ranges)}, but got {resolution!r}."
         )
+    axes = {}
+    for (name, (low, high)), size in zip(ranges.items(), sizes, strict=True):
+        size = count("resolution", size, least=1)
+        axes[name] = low + (high - low) * (np.arange(size) + 0.5) / size
+    return axes
 
-    try:
-        label, motions = _sorted_out(period, states, apart, followed)
-    except KeyboardInterrupt:
-        raise ScanInterrupted(data, options.get("store")) from None
-    attractors = []
-    order = np.argsort([-np.sum(label == i) for i in range(len(motions))], kind="stable")
-    irregular = list(CODES.values())
-    place = np.empty(len(order) + len(irregular), int)
-    place[order] = np.arange(len(order))
-    place[irregular] = irregular
-    label = place[label]
-    for i, old in enumerate(order):
-        here = label == i
-        p = float(np.mean(here))
-        attractors.append(
-            Attractor(
-                label=i,
-                period=len(motions[old]),
-                impacts=float(np.median(impacts[here])),
-                sections=dict(zip(names, motions[old].T, strict=True)),
-                starts=int(np.sum(here)),
-                fraction=p,
-                error=math.sqrt(p * (1 - p) / label.size),
-            )
-        )
-    parts = {name: float(np.mean(label == number)) for name, number in CODES.items()}
-    about = {"long_name": "motion that the start settles on", **flags(CODES)}
-    dims = data["period"].dims
-    kind = np.min_scalar_type(-max(4, len(order)))
-    data = data.assign(label=(dims, label.astype(kind).reshape(data["period"].shape), about))
-    return Basins(data, attractors, parts, machine)
+
+def _attractor(
+    number: int, motion: np.ndarray, names: list[str], label: np.ndarray, impacts: np.ndarray
+) -> Attractor:
+    """A motion, from its section states, the label of each start and what impacts each had."""
+    here = label == number
+    fraction = float(np.mean(here))
+    return Attractor(
+        label=number,
+        period=len(motion),
+        impacts=float(np.median(impacts[here])),
+        sections=dict(zip(names, motion.T, strict=True)),
+        starts=int(np.sum(here)),
+        fraction=fraction,
+        error=math.sqrt(fraction * (1 - fraction) / label.size),
+    )
 
 
 def _sorted_out(
-    period: np.ndarray,
-    states: np.ndarray,
+    data: "xr.Dataset",
+    names: list[str],
     apart: float,
     followed: Callable[[np.ndarray, int], np.ndarray],
 ) -> tuple[np.ndarray, list[np.ndarray]]:
-    """A label for each lane, and the section states of each motion."""
+    """A label for each lane, and the section states (period, components) of each motion, that of
+    the most lanes first.
+
+    **Arguments:** what the scan found; the names of a state's components; how far states of one
+    motion may differ; what gives the section states of a motion from one of them and its period.
+    """
+    period = np.asarray(data["period"]).ravel()
+    states = np.stack([np.asarray(data[name]).ravel() for name in names], axis=1)
     label = np.where(np.isin(period, list(REGIMES)), period, int(REGIMES.failed)).astype(int)
     settled = np.flatnonzero(period > 0)
     if not settled.size:
@@ -296,5 +308,7 @@ def _sorted_out(
         else:
             of_cell[i] = len(motions)
             motions.append(followed(state, p))
-    label[settled] = of_cell[inverse.ravel()]
-    return label, motions
+    found = of_cell[inverse.ravel()]
+    order = np.argsort(-np.bincount(found), kind="stable")
+    label[settled] = np.argsort(order)[found]
+    return label, [motions[i] for i in order]

@@ -61,7 +61,7 @@ class Lyapunov(Summarized):
         reason's name. Host-side: not to be traced.
 
         **Arguments:** names of the batch axes, by default `lane`; `along`, to keep only what is
-        told along one dimension: `"exponent"`, or a batch axis.
+        given along one dimension: `"exponent"`, or a batch axis.
 
         **Raises:** `ValueError` if these are not as many as there are batch axes, or there is no
         such dimension.
@@ -89,12 +89,12 @@ class Lyapunov(Summarized):
         numbers = ", ".join(f"{x:.9g}" for x in self.exponents)
         ended = "" if bool(self.successful) else f"; ended: {RESULTS[self.result]}"
         numbers = with_unit(numbers, self.unit)
-        told = f"Lyapunov exponents {numbers} (halves differ by {self.spread:.1g}){ended}"
+        first = f"Lyapunov exponents {numbers} (halves differ by {self.spread:.1g}){ended}"
         lines = (
             f"  mean {name}: {in_unit(f'{float(x):.6g}', dict(self.units), name)}"
             for name, x in self.averages.items()
         )
-        return "\n".join([told, *lines])
+        return "\n".join([first, *lines])
 
 
 @renamed(scene="machine")

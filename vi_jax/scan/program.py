@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import inspect
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -16,18 +16,21 @@ from jaxtyping import Array, Float
 from .._checks import count, tuple_of
 from .._numbers import strongly_typed
 from ..flow import AbstractMethod
-from ..flow.arguments import check_period, check_reals, machine_of, refuse_arrays
+from ..flow.arguments import machine_of, refuse_arrays
 from ..flow.methods import MethodLike, chosen
 from ..flow.named import average_names, has_averages
+from ..flow.options import RunOptions
 from ..flow.results import number_of
 from ..flow.simulate import simulate_pool
 from ..machine import AbstractMachine
-from ..machine.numbers import check_again, check_name, leaf, leaf_names, with_leaf
+from ..machine.numbers import check_name, leaf, leaf_names, with_leaf
 from ._asked import measures_of
 from .grid import Blocks
 from .measures import AbstractMeasure, Numbers
 
 START = "start."
+
+_USUAL = RunOptions()
 
 
 class ScanProgram(eqx.Module):
@@ -39,26 +42,32 @@ class ScanProgram(eqx.Module):
     start: Any
     """The first state, or `None` for the machine's own."""
     derivatives: tuple[str, ...] = eqx.field(static=True)
+    """Names of the numbers by which the variables are differentiated."""
     measures: tuple[AbstractMeasure, ...]
-    method: AbstractMethod
-    clock: str | None = eqx.field(static=True)
     cycles: int = eqx.field(static=True)
-    settle: Array
-    max_impacts: int = eqx.field(static=True)
-    max_steps: int | None = eqx.field(static=True)
-    rests: bool = eqx.field(static=True, default=True)
-    """Whether the body may come to rest on a stop."""
+    """Cycles observed."""
+    options: RunOptions
+    """How each lane is run, checked; its method is one, no name."""
 
     @property
-    def record(self) -> str:
-        """What the measures must see of the cycles."""
-        return "motion" if any(m.record == "motion" for m in self.measures) else "sections"
+    def method(self) -> AbstractMethod:
+        """What moves the machines."""
+        assert isinstance(self.options.method, AbstractMethod)
+        return self.options.method
 
-    def lane(self, values: dict[str, Any], nudge: Any = None) -> tuple[AbstractMachine, Any]:
-        """Scene and start of the lane with these values on the axes."""
-        of_scene = {name: x for name, x in values.items() if not name.startswith(START)}
+    def lane(
+        self, values: Mapping[str, Any], nudge: Array | None = None
+    ) -> tuple[AbstractMachine, Any]:
+        """Machine and start of the lane with these values on the axes, in the scan's clock.
+
+        **Arguments:** the values by the names of the axes; what is added to each of the numbers
+        that derivatives are asked for.
+
+        **Raises:** `TypeError` if the function that makes the machine makes something else.
+        """
+        of_machine = {name: x for name, x in values.items() if not name.startswith(START)}
         if self.build is not None:
-            machine = self.build(**of_scene)
+            machine = self.build(**of_machine)
             if not isinstance(machine, AbstractMachine):
                 raise TypeError(
                     "Argument `machine` must be a function that returns a `Scene` or an "
@@ -66,12 +75,12 @@ class ScanProgram(eqx.Module):
                 )
         else:
             machine = self.machine
-            for name, value in of_scene.items():
+            for name, value in of_machine.items():
                 machine = with_leaf(machine, name, value)
         assert machine is not None
         machine = self._nudged(machine, "", nudge)
-        if self.clock is not None:
-            machine = machine.in_clock(self.clock)
+        if self.options.clock is not None:
+            machine = machine.in_clock(self.options.clock)
         start = self.start
         if start is None:
             start = machine.start()
@@ -81,10 +90,10 @@ class ScanProgram(eqx.Module):
         return machine, self._nudged(start, START, nudge)
 
     def first(self, blocks: Blocks) -> tuple[AbstractMachine, Any]:
-        """Scene and start of the first lane."""
+        """Machine and start of the first lane."""
         return self.lane({name: jnp.asarray(x[0]) for name, x in blocks.axes.items()})
 
-    def _nudged(self, tree: Any, prefix: str, nudge: Any) -> Any:
+    def _nudged(self, tree: Any, prefix: str, nudge: Array | None) -> Any:
         """`tree` with the numbers moved that derivatives are asked for."""
         if nudge is None:
             return tree
@@ -124,12 +133,8 @@ class ScanProgram(eqx.Module):
         def lane_of(values):
             return self.lane(values, nudge)
 
-        run = simulate_pool(
-            lane_of, values, self.cycles,
-            wanted=wanted, method=self.method, settle=self.settle,
-            max_impacts=self.max_impacts, max_steps=self.max_steps, rests=self.rests,
-            record=self.record,
-        )  # fmt: skip
+        options = dataclasses.replace(self.options, clock=None)  # `lane` has seen to it
+        run = simulate_pool(lane_of, values, self.cycles, options, wanted)
 
         def measured(values, run):
             machine, _ = lane_of(values)
@@ -161,7 +166,7 @@ class ScanProgram(eqx.Module):
             # Another lane ends at once, its start being no number.
             state = jtu.tree_map(lambda x: jnp.where(needs_refinement, x, jnp.nan), state)
             refined = measure.refine(
-                machine, state, self.method, out, *pass_number, rests=self.rests
+                machine, state, self.method, out, *pass_number, rests=self.options.rests
             )
             new = {**out, **refined}
             return jtu.tree_map(lambda a, b: jnp.where(needs_refinement, a, b), new, out)
@@ -170,38 +175,33 @@ class ScanProgram(eqx.Module):
 
 
 def make_program(
-    machine: Any,
+    machine: AbstractMachine | Callable[..., AbstractMachine],
     names: tuple[str, ...],
+    options: RunOptions = _USUAL,
     *,
     measure: Any,
     start: Any = None,
-    settle: Any = 200,
     cycles: int | None = None,
-    method: MethodLike = None,
-    clock: str | None = None,
     derivatives: Iterable[str] = (),
-    max_impacts: int = 1000,
-    max_steps: int | None = None,
 ) -> ScanProgram:
-    """The work for each lane, its arguments checked as far as they can be without the axes."""
+    """The program of a scan, its arguments checked as far as they can be without the axes' values.
+
+    **Arguments:** `names` of the axes; the options of each run; all others as for `scan`.
+
+    **Raises:** `TypeError` or `ValueError`, as `scan`.
+    """
     measures = measures_of(measure, _averages_of(machine, names, start))
-    needed = max(m.cycles for m in measures)
-    cycles = max(32, needed) if cycles is None else count("cycles", cycles, least=1)
-    if cycles < needed:
-        who = next(type(m).__name__ for m in measures if m.cycles > cycles)
-        raise ValueError(
-            f"Argument `cycles` must be at least {needed} for the measure {who}, but got {cycles}."
-        )
-    settle = count("settle", settle)
+    cycles = _cycles_for(measures, cycles)
+    settle = count("settle", options.settle)
     derivatives = (derivatives,) if isinstance(derivatives, str) else derivatives
+    template, build, rests = None, None, True
     if isinstance(machine, AbstractMachine):
-        template, build, rests = machine_of(machine), None, True
-        method = chosen(template, method)
+        template = machine_of(machine)
+        method = chosen(template, options.method)
     elif callable(machine):
-        template, build = None, machine
-        own = [name for name in names if not name.startswith(START)]
-        _check_names_of(machine, own)
-        method, rests = _suited(build, own, method)
+        build, own = machine, [name for name in names if not name.startswith(START)]
+        _check_names_of(build, own)
+        method, rests = _suited(build, own, options.method)
     else:
         raise TypeError(
             "Argument `machine` must be a `Scene`, an `AbstractMachine` or a function that makes "
@@ -214,22 +214,37 @@ def make_program(
         refuse_arrays("start", "scan", first)
     if template is not None:
         for name in names:
-            _check_name(template, first, name, "axes")
+            check_leaf_name(template, first, name, "axes")
     measures = tuple(measure.under(method) for measure in measures)
+    motion = any(measure.record == "motion" for measure in measures)
+    options = dataclasses.replace(
+        options, settle=settle, method=method, rests=rests,
+        record="motion" if motion else "sections",
+    ).checked(template)  # fmt: skip
     return ScanProgram(
         machine=_as_arrays(template),
         build=build,
         start=_as_arrays(start),
         derivatives=tuple_of("derivatives", derivatives, str),
         measures=_as_arrays(measures),
-        method=_as_arrays(method),
-        clock=clock,
         cycles=cycles,
-        settle=jnp.asarray(settle),
-        max_impacts=count("max_impacts", max_impacts),
-        max_steps=None if max_steps is None else count("max_steps", max_steps, least=1),
-        rests=rests,
+        options=dataclasses.replace(_as_arrays(options), settle=jnp.asarray(settle)),
     )
+
+
+def _cycles_for(measures: Iterable[AbstractMeasure], cycles: int | None) -> int:
+    """The cycles to observe: those asked for, or as many as these measures need.
+
+    **Raises:** `ValueError` if they are too few for one of them.
+    """
+    needed = max(m.cycles for m in measures)
+    cycles = max(32, needed) if cycles is None else count("cycles", cycles, least=1)
+    if cycles < needed:
+        who = next(type(m).__name__ for m in measures if m.cycles > cycles)
+        raise ValueError(
+            f"Argument `cycles` must be at least {needed} for the measure {who}, but got {cycles}."
+        )
+    return cycles
 
 
 def _averages_of(machine: Any, axes: Iterable[str], start: Any) -> tuple[str, ...]:
@@ -241,7 +256,7 @@ def _averages_of(machine: Any, axes: Iterable[str], start: Any) -> tuple[str, ..
     def made(values):
         found.append(_names_of(machine(**values), start))
 
-    # What cannot be made is told where the method is looked for.
+    # What cannot be made is reported where the method is looked for.
     with contextlib.suppress(Exception):
         jax.eval_shape(made, {x: jnp.zeros(()) for x in axes if not x.startswith(START)})
     return found[0] if found else ()
@@ -302,44 +317,7 @@ def _as_arrays(tree: Any) -> Any:
     )
 
 
-def _check_name(machine: AbstractMachine, start: Any, name: str, argument: str) -> None:
+def check_leaf_name(machine: AbstractMachine, start: Any, name: str, argument: str) -> None:
+    """**Raises:** `ValueError` for a name that no number of the machine or of its start has."""
     names = leaf_names(machine) + [START + n for n in leaf_names(start)]
     check_name(names, name, argument)
-
-
-def _corners(blocks: Blocks) -> np.ndarray:
-    """The lanes in which the axes have their least and greatest values, one in a row."""
-    rows = list(blocks.axes.values())
-    if blocks.paired:
-        ends = {int(place) for x in rows for place in (x.argmin(), x.argmax())}
-        return np.stack([x[sorted(ends)] for x in rows], axis=-1)
-    corners: Any = [np.unique([x.min(), x.max()]) for x in rows]
-    return np.stack(np.meshgrid(*corners, indexing="ij"), axis=-1).reshape(-1, len(rows))
-
-
-def check_corners(job: ScanProgram, blocks: Blocks) -> ScanProgram:
-    """The job, after the checks of machine, start and method on the corners of the grid.
-
-    What the corners say about the gaps holds for the grid, unless a function makes the machines, of
-    which it is known already: if no body can rest, that is left out.
-    """
-    rests = False
-    if blocks.paired and job.machine is not None:
-        lanes = {name: jnp.asarray(x) for name, x in blocks.axes.items() if name[:6] != START}
-        machine = job.machine
-        for name, x in lanes.items():
-            machine = with_leaf(machine, name, x)
-        check_again(machine)  # all lanes at a time
-    for values in _corners(blocks):
-        lane = {name: jnp.asarray(x) for name, x in zip(blocks.axes, values, strict=True)}
-        machine, start = job.lane(lane)
-        check_again(machine)
-        rests = rests or machine.may_rest()
-        for name in job.derivatives:
-            _check_name(machine, start, name, "derivatives")
-        job.method.check(machine)
-        start = machine.adopt(start)
-        check_reals("start", start)
-        check_period(machine, start)
-        refuse_arrays("start", "scan", start)
-    return job if job.build is not None else dataclasses.replace(job, rests=rests)

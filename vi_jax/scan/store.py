@@ -12,6 +12,7 @@ import numpy as np
 
 from .._checks import unwritable
 from .._lazy import lazy
+from .._numbers import warn
 from .grid import Blocks
 
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ class MemoryStore:
         self.arrays = {
             name: np.full(blocks.shape + v.sizes, v.empty, v.dtype) for name, v in variables.items()
         }
-        self.blocks = blocks
+        self.blocks, self.variables = blocks, dict(variables)
 
     def open_blocks(self) -> list[tuple[slice, ...]]:
         """The blocks still to be computed: all."""
@@ -67,6 +68,16 @@ class MemoryStore:
         for name, x in numbers.items():
             array = self.arrays[name]
             array[where] = x.reshape(array[where].shape)
+
+    def data(self) -> "xr.Dataset":
+        """The arrays with their axes and attributes."""
+        return xr.Dataset(
+            {
+                name: ((*self.blocks.dims, *v.dims), self.arrays[name], dict(v.attributes))
+                for name, v in self.variables.items()
+            },
+            coords={name: (self.blocks.dims_of(name), x) for name, x in self.blocks.axes.items()},
+        )
 
 
 class ZarrStore:
@@ -132,10 +143,9 @@ class ZarrStore:
         found = [where for i, where in enumerate(self.blocks) if not self._done(i, where)]
         if self.lost:
             more = f" and {len(self.lost) - 5:,} more" if len(self.lost) > 5 else ""
-            warnings.warn(
+            warn(
                 f"In {self.path} what was computed is lost or damaged, and is computed again: "
-                f"{', '.join(self.lost[:5])}{more}.",
-                stacklevel=3,
+                f"{', '.join(self.lost[:5])}{more}."
             )
         return found
 
@@ -166,6 +176,10 @@ class ZarrStore:
             array[where] = numbers[name].reshape(shape)
             sums.append(_sum(numbers[name], array.dtype))
         self._array(_SUMS)[self.blocks.index(where)] = sums
+
+    def data(self) -> "xr.Dataset":
+        """The data of the store, read as they are looked at."""
+        return xr.open_zarr(str(self.path), consolidated=False, chunks=None, mask_and_scale=False)
 
     def _array(self, name: str) -> Any:
         return self.group[name]
@@ -260,6 +274,7 @@ def _compare(
             f"Argument `store` must be a new folder or the store of a scan, but {path} is another "
             "Zarr group."
         )
+    there = _in_new_words(there)
     for key in dict.fromkeys([*wanted, *there]):
         old, now = there.get(key), wanted.get(key)
         if old == now:
@@ -279,21 +294,11 @@ def _compare(
             )
 
 
-def open_dataset(path: Path) -> "xr.Dataset":
-    """The data of a store, read as they are looked at."""
-    return xr.open_zarr(str(path), consolidated=False, chunks=None, mask_and_scale=False)
-
-
-def dataset(
-    arrays: Mapping[str, np.ndarray],
-    blocks: Blocks,
-    variables: Mapping[str, Variable],
-) -> "xr.Dataset":
-    """Arrays with their axes and attributes."""
-    return xr.Dataset(
-        {
-            name: ((*blocks.dims, *v.dims), arrays[name], dict(v.attributes))
-            for name, v in variables.items()
-        },
-        coords={name: (blocks.dims_of(name), x) for name, x in blocks.axes.items()},
-    )
+def _in_new_words(description: Mapping[str, Any]) -> dict[str, Any]:
+    """The description in a store of an earlier release, in which machines were called scenes."""
+    found = {"machine" if key == "scene" else key: x for key, x in description.items()}
+    if isinstance(codes := found.get("code of"), dict):
+        found["code of"] = {"machine" if k == "scene" else k: x for k, x in codes.items()}
+    if found.get("start") == "the scene's own":
+        found["start"] = "the machine's own"
+    return found

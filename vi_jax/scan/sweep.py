@@ -83,7 +83,7 @@ class Sweep(Summarized):
         each component (`section_Y`), and `result` is the reason's name. Not to be traced.
 
         **Arguments:** names of the batch axes, by default `lane`; `along`, to keep only what is
-        told along one dimension: `"value"`, or `"cycle"` (the sections).
+        given along one dimension: `"value"`, or `"cycle"` (the sections).
 
         **Raises:** `ValueError` if these are not as many as there are batch axes, or there is no
         such dimension.

@@ -1,0 +1,144 @@
+"""Scans in other processes: killed, on several devices, on clusters."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import vi_jax as vi
+import xarray as xr
+from vi_jax.scan.store import ZarrStore
+
+SCRIPT = Path(__file__).with_name("long_scan.py")
+
+
+def _run(path, *options, **environment):
+    command = [sys.executable, str(SCRIPT), str(path), *options]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, **environment)
+
+
+def _stored(path):
+    data = xr.open_zarr(path, consolidated=False, chunks=None, mask_and_scale=False)
+    return {name: data[name].values for name in data.data_vars}
+
+
+def _finished(path, *options, **environment):
+    process = _run(path, *options, stderr=subprocess.STDOUT, **environment)
+    out, _ = process.communicate(timeout=300)
+    assert process.returncode == 0, out
+    return _stored(path)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory):
+    """The numbers of the scan, and how long it takes once its programs are compiled."""
+    folder = tmp_path_factory.mktemp("scan")
+    kept = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(folder / "programs")}
+    process = _under_way(folder / "whole", env=kept)
+    begin = time.perf_counter()
+    assert process.stdout.readline() == "ends\n"
+    lasts = time.perf_counter() - begin
+    assert process.wait() == 0
+    return _stored(folder / "whole"), lasts, kept
+
+
+@pytest.fixture
+def whole(undisturbed):
+    return undisturbed[0]
+
+
+def _under_way(path, **environment):
+    process = _run(path, **environment)
+    assert process.stdout.readline() == "begins\n"
+    return process
+
+
+def _same(found, whole):
+    for name, numbers in whole.items():
+        np.testing.assert_array_equal(found[name], numbers)
+
+
+@pytest.mark.slow
+def test_killed_again_and_again_the_store_ends_the_same(tmp_path, undisturbed):
+    """Every run goes on with what the killed ones left, and is killed itself until one ends."""
+    whole, lasts, kept = undisturbed
+    rng = np.random.default_rng(3)
+    killed, parts, path = 0, set(), tmp_path / "store"
+    for tries in range(40):
+        process = _under_way(path, env=kept)
+        try:
+            process.wait(timeout=0.5 * lasts * rng.uniform())
+        except subprocess.TimeoutExpired:
+            process.send_signal(signal.SIGKILL)
+            killed += process.wait() == -signal.SIGKILL
+        if process.wait() == 0:
+            _same(_stored(path), whole)
+            if killed >= 5 and len(parts) >= 3:
+                break
+            path = tmp_path / f"store{tries}"
+        elif path.exists():
+            done = (_stored(path)["result"] != -1).sum()
+            parts |= {done} - {0, whole["result"].size}
+    assert killed >= 5 and len(parts) >= 3, (killed, parts)
+
+
+@pytest.mark.slow
+def test_any_number_of_devices_gives_the_same_numbers(tmp_path, whole):
+    for n in ("2", "4"):
+        _same(_finished(tmp_path / n, "--devices", n), whole)
+
+
+@pytest.mark.slow
+def test_a_cluster_that_loses_a_worker_gives_the_same(tmp_path, whole):
+    _same(_finished(tmp_path / "cluster", "--cluster"), whole)
+
+
+@pytest.mark.slow
+def test_a_cluster_that_loses_its_scheduler_says_how_to_go_on(tmp_path, monkeypatch):
+    distributed = pytest.importorskip("dask.distributed")
+    known, store = tmp_path / "scheduler.json", tmp_path / "store"
+    parts = [
+        subprocess.Popen(
+            [sys.executable, "-m", "dask", *words, "--scheduler-file", str(known)],
+            stderr=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+        )
+        for words in (
+            ("scheduler", "--port", "0", "--no-dashboard"),
+            ("worker", "--nthreads", "1", "--no-nanny", "--no-dashboard"),
+        )
+    ]
+    scene = vi.Scene.ideal(frequency_ratio=0.9)
+    axes = {"start.Y": np.linspace(-1.0, 1.0, 3000)}
+    options: dict = {"measure": "extremes", "settle": 500, "cycles": 50, "lanes": 256}
+    write = ZarrStore.write
+
+    def written(self, where, numbers):
+        write(self, where, numbers)
+        parts[0].kill()
+
+    try:
+        client = distributed.Client(scheduler_file=str(known), timeout=60)
+        client.wait_for_workers(1, timeout=60)
+        with monkeypatch.context() as patched:
+            patched.setattr(ZarrStore, "write", written)
+            told = r"scheduler .* was lost. (\d+) of 12 blocks .* kept in .*store: the same call"
+            with pytest.raises(ConnectionError, match=told) as lost:
+                vi.scan(scene, axes, **options, cluster=client, store=store)
+        done = int(re.search(told, str(lost.value))[1])
+        assert 1 <= done < 12
+        assert (_stored(store)["result"] != -1).sum() in (256 * done, 256 * done - 72)
+        with pytest.raises(ConnectionError, match="Nothing is kept: give the scan a `store`"):
+            vi.scan(scene, axes, **options, cluster=client)
+        client.close(timeout=1)
+    finally:
+        for part in parts:
+            part.kill()
+            part.wait()
+    found = vi.scan(scene, axes, **options, store=store)  # goes on
+    np.testing.assert_array_equal(found["y_max"], vi.scan(scene, axes, **options)["y_max"])

@@ -1,0 +1,123 @@
+"""Regimes of a scan: periods, chaos, transients, and what does not settle."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+from vi_jax.scan.regime import least_period
+
+SCENE = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.01)
+
+
+def _regimes_of(lanes, settle):
+    zeta, k, xi = np.array(lanes).T
+    axes = {
+        "drive.frequency_ratio": zeta,
+        "stops.0.restitution": k,
+        "oscillator.damping_ratio": xi,
+    }
+    return vi.scan(SCENE, axes, measure="regime", settle=settle, paired=True)
+
+
+def test_regime_tells_periods_chaos_and_what_does_not_settle():
+    zetas = [0.65, 0.7, 0.9, 0.97, 1.1, 1.4]
+    data = _regimes_of([(zeta, 0.8, 0.0) for zeta in zetas], settle=3000)
+    period = dict(zip(zetas, np.asarray(data.period).tolist(), strict=True))
+    assert period[0.9] == 2 and period[1.1] == 1
+    assert period[0.7] == period[0.97] == vi.REGIMES.chaotic
+    # A free motion without damping, off resonance, has two frequencies and repeats never.
+    free = vi.Scene.ideal(frequency_ratio=0.77, gap=None)
+    quiet = vi.scan(free, {"start.Y": [0.3]}, measure="regime", settle=10)
+    assert int(quiet.period[0]) == vi.REGIMES.unsettled
+
+
+def test_a_chaotic_transient_is_not_called_chaos():
+    """Off the stop the motion is linear and fades at the rate ξ: nothing grows any more."""
+    lanes = [(0.69, 0.7, 0.001), (0.69, 0.5, 0.003), (0.7, 0.8, 0.0), (0.97, 0.8, 0.0)]
+    data = _regimes_of(lanes, settle=22)
+    assert np.asarray(data.period).tolist() == [-4, -4, -1, -1]
+    assert dict(
+        zip(
+            data.period.attrs["flag_meanings"].split(),
+            data.period.attrs["flag_values"],
+            strict=True,
+        )
+    ) == {x.name: int(x) for x in vi.REGIMES}
+
+    @jax.jit
+    @jax.vmap
+    def looked_at(zeta, k, xi):
+        scene = vi.Scene.ideal(frequency_ratio=zeta, restitution=k, damping_ratio=xi)
+        first = vi.lyapunov(scene, scene.start(), 256, settle=150, number=1).exponents[0]
+        # Rounding says when the chaos ends; from then on the motion fades by 0.9 % a cycle.
+        return first, vi.simulate(scene, scene.start(), 64, settle=12_000)
+
+    first, run = looked_at(*np.array(lanes).T)
+    assert (first > 5e-3).all()
+    assert (np.asarray(run.impacts.sum(axis=1)) == 0).tolist() == [True, True, False, False]
+    for (zeta, _, xi), Y in zip(lanes[:2], run.last.Y, strict=False):
+        steady = (1 / (1 - zeta**2 + 2j * xi * zeta)).real
+        assert float(Y) == pytest.approx(steady, abs=1e-9)
+
+
+@pytest.mark.slow
+def test_few_of_the_chaotic_lanes_are_transients():
+    """Of 48 × 48 lanes from rest without damping, those called chaotic, much later."""
+
+    def machine(zeta, k):
+        return vi.Scene.ideal(frequency_ratio=zeta, restitution=k, gap=2.0)
+
+    axes = {"zeta": np.linspace(0.5, 0.705, 48), "k": np.linspace(0.05, 0.95, 48)}
+    wrong, error = {}, {}
+    later = vi.scan(machine, axes, measure=vi.Regime(lasting=0), settle=12_000)
+    for lasting in (0, 4000):
+        found = vi.scan(machine, axes, measure=vi.Regime(lasting=lasting), settle=400)
+        chaotic = np.asarray(found.period) == vi.REGIMES.chaotic
+        share = wrong[lasting] = float(np.mean(np.asarray(later.period)[chaotic] != -1))
+        error[lasting] = np.sqrt(share * (1 - share) / chaotic.sum())
+    # Seen: 20 % of 1,392 lanes, and 9 % of 1,178.
+    assert wrong[0] - wrong[4000] > 3 * np.hypot(error[0], error[4000]), (wrong, error)
+    assert wrong[4000] < 0.087 + 4 * error[4000], (wrong, error)
+
+
+def test_windows_of_periods_beside_a_grazing():
+    """Beyond the grazing of a motion whose multiplier is 1/2 there are windows of longer and longer
+    periods with one impact, with chaos between (Chin, Ott, Nusse and Grebogi, Phys. Rev. E 50,
+    1994); the sections of a period differ by 1e-4 to 1e-6."""
+    xi, ratio = 5.05, 0.2 * np.pi / np.log(2)
+    amplitude = 1 / np.hypot(1 - ratio**2, 2 * xi * ratio)
+    scene = vi.Scene.ideal(frequency_ratio=ratio, restitution=0.8, damping_ratio=xi)
+    beyond = {7.1e-7: 8, 4.0e-6: 7, 1.5e-5: 6, 3.5e-5: vi.REGIMES.chaotic, 8.4e-5: 5}
+    gaps = amplitude / (1 + np.array([*beyond])[::-1])
+    data = vi.scan(scene, {"stops.0.gap": gaps}, measure=vi.Regime(lasting=0), settle=400)
+    assert data["period"].values[::-1].tolist() == [*beyond.values()]
+    periodic = data["period"] > 0
+    np.testing.assert_array_equal(data["impacts"].values[periodic], 1)
+    # The same seen value by value; short of the grazing it is the driven vibration.
+    values = [gaps[0], amplitude / (1 - 1e-5)]
+    assert vi.sweep(scene, "stops.0.gap", values, settle=400).period.tolist() == [5, 1]
+
+
+def test_what_repeats_and_what_spirals_in():
+    """Sections made by hand: how closely periods must fit, by what fits best and by the method."""
+    n, one = jnp.arange(256), jnp.ones(256, int)
+
+    judged = jax.jit(partial(least_period, longest=64))
+
+    def period(sections, impacts=one, wander=0.0, **options):
+        return int(judged({"Y": sections}, impacts, wander=wander, **options))
+
+    none, split = vi.REGIMES.unsettled, 1e-7 * (-1.0) ** n
+    spiral = 3e-5 * 0.999**n * jnp.cos(2 * jnp.pi * n / 7)
+    noise = 1e-7 * jax.random.normal(jax.random.key(0), (256,))
+    assert period(0.0 * n) == 1 and period(split) == 2
+    assert period(0.0 * n, impacts=n % 3) == 3
+    assert period(spiral) == 1
+    assert period(0.0 * n, impacts=jnp.where(n == 200, 2, 1)) == none
+    assert period(1e-4 * jnp.cos(n)) == none and period(noise) == 1 and period(100 * noise) == none
+    # Steps of a tolerance wander within it, which hides a split as small.
+    assert period(100 * noise, wander=1e-5) == 1 and period(split, wander=1e-8) == 1
+    assert period(noise, tolerance=1e-8) == none

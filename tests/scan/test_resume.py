@@ -1,0 +1,114 @@
+"""Scans that were interrupted go on; a store refuses another scan."""
+
+import importlib
+
+import numpy as np
+import pytest
+import vi_jax as vi
+import xarray as xr
+
+SCENE = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.01)
+
+
+def test_a_store_is_resumed_and_guards_itself(tmp_path, monkeypatch):
+    work = importlib.import_module("vi_jax.scan._work")
+    axes = {"drive.frequency_ratio": np.linspace(0.6, 1.4, 40), "start.Y": np.linspace(-1, 1, 30)}
+    options = {"settle": 20, "cycles": 128, "lanes": 256, "workers": 1}
+    whole = vi.scan(SCENE, axes, **options)
+    path = tmp_path / "new" / "store.zarr"
+    done = []
+    compute = work.compute
+
+    def interrupted(*arguments):
+        if len(done) == 2:
+            raise KeyboardInterrupt
+        done.append(1)
+        return compute(*arguments)
+
+    monkeypatch.setattr(work, "compute", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        vi.scan(SCENE, axes, store=path, **options)
+    half = xr.open_zarr(path, consolidated=False, chunks=None, mask_and_scale=False)
+    assert 0 < int((half.result == 0).sum()) < half.result.size
+    counted = []
+    monkeypatch.setattr(work, "compute", lambda *a: counted.append(1) or compute(*a))
+    rest = vi.scan(SCENE, axes, store=path, **options)
+    assert len(counted) == 5 - len(done)
+    for name in whole.data_vars:
+        np.testing.assert_array_equal(rest[name].values, whole[name].values)
+    with pytest.raises(ValueError, match="settle is 20, and now it is 21"):
+        vi.scan(SCENE, axes, store=path, **{**options, "settle": 21})
+    with pytest.raises(ValueError, match=r"axis start.Y is .*, and now it is"):
+        vi.scan(SCENE, {**axes, "start.Y": np.linspace(-1, 1.1, 30)}, store=path, **options)
+    other = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.1, damping_ratio=0.01)
+    with pytest.raises(ValueError, match=r"machine stops\.0\.gap is 2\.0, and now it is 2\.1"):
+        vi.scan(other, axes, store=path, **options)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "letter.txt").write_text("mine")
+    with pytest.raises(ValueError, match="neither"):
+        vi.scan(SCENE, axes, store=tmp_path / "full", **options)
+
+
+def test_a_store_knows_functions_by_what_they_make(tmp_path):
+    def maker(gap, factor):
+        def machine(zeta):
+            return vi.Scene.ideal(frequency_ratio=zeta, gap=gap, damping_ratio=0.02)
+
+        def measure(scene, run):
+            return {"depth": factor * run.y_min[-1]}
+
+        return machine, measure
+
+    def run(gap, factor, **options):
+        machine, measure = maker(gap, factor)
+        axes = {"zeta": [0.8, 1.2]}
+        store = tmp_path / "s"
+        return vi.scan(machine, axes, measure=measure, settle=5, cycles=4, store=store, **options)
+
+    first = run(2.0, 1.0)
+    np.testing.assert_array_equal(run(2.0, 1.0).depth, first.depth)
+    with pytest.raises(ValueError, match=r"first stops\.0\.gap is 2\.0, and now it is 1\.5"):
+        run(1.5, 1.0)
+    with pytest.raises(ValueError, match=r"code of measure 1 is \w+, and now it is"):
+        run(2.0, 3.0)
+    with pytest.raises(ValueError, match="paired is False, and now it is True"):
+        run(2.0, 1.0, paired=True)
+
+
+def test_a_store_is_made_whole_or_not_at_all(tmp_path, monkeypatch):
+    store = importlib.import_module("vi_jax.scan.store")
+    create = store.zarr.Group.create_array
+
+    def interrupted(group, name, **options):
+        if name == "y_min":
+            raise KeyboardInterrupt
+        return create(group, name, **options)
+
+    def run():
+        return vi.scan(SCENE, {"start.Y": [0.0, 0.1]}, settle=5, store=tmp_path / "store")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(store.zarr.Group, "create_array", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            run()
+    assert not list(tmp_path.iterdir())
+    assert bool((run().result == 0).all())
+    assert [path.name for path in tmp_path.iterdir()] == ["store"]
+
+
+def test_an_interrupted_scan_in_memory_gives_what_it_has(monkeypatch):
+    work = importlib.import_module("vi_jax.scan._work")
+    done = []
+    compute = work.compute
+
+    def interrupted(*arguments):
+        if done:
+            raise KeyboardInterrupt
+        done.append(1)
+        return compute(*arguments)
+
+    monkeypatch.setattr(work, "compute", interrupted)
+    with pytest.raises(vi.ScanInterrupted) as caught:
+        vi.scan(SCENE, {"start.Y": np.linspace(-1, 1, 600)}, settle=5, lanes=256, workers=1)
+    codes = np.asarray(caught.value.data.result)
+    assert (codes == 0).sum() == 256 and (codes == -1).sum() == 344
