@@ -15,7 +15,6 @@ from ..flow.arguments import planned
 from ..flow.loop import run_lane
 from ..flow.methods import MethodLike
 from ..flow.simulate import collect
-from ..machine import Scene
 from ..machine.base import renews
 from ..machine.event import after_event, begin_modes, events_of, is_autonomous
 from ..machine.numbers import leaf, with_leaf
@@ -75,8 +74,7 @@ def problem_of(
     if blank.autonomous:
         period = float(orbit.duration)
     way = _followed(blank, orbit.state, found, period)
-    known = isinstance(machine, Scene) and not machine.soft_stops  # steps that are enough
-    while not known:
+    while not machine.scales_known:
         finer = dataclasses.replace(blank, steps=2 * blank.steps)
         again = _followed(finer, orbit.state, found, period)
         apart = np.max(np.abs(again.states - way.states) / (1 + np.abs(again.states)))

@@ -230,8 +230,8 @@ def continue_orbit(
       state and the clock of each impact in the machine's own units (of a `Scene`: positions in a,
       velocities in a ω, crank angles in radians), the parameter in half its interval.
     - `max_points`: points in each direction at most.
-    - `method`: how the machine is carried, of fixed steps: by default `ExactFlight()` where it
-      applies, else 20 steps of `Verner9` a cycle.
+    - `method`: how the machine is carried, of fixed steps: by default that of the orbit if its
+      steps are, else `ExactFlight()` where it applies, else 20 steps of `Verner9` a cycle.
 
     **Returns:** a `Branch`.
 
