@@ -1,5 +1,11 @@
-"""The root of the cycle map's residual, and how it moves with the numbers of the machine."""
+"""The root of the cycle map's residual, and its derivative by the implicit function theorem.
 
+With F(x, p) = what the arcs that begin in x lack to end where the next one begins, and p the
+numbers of the machine, the root x(p) of F has dx/dp = -(∂F/∂x)⁻¹ ∂F/∂p: no step of the search is
+differentiated. How a root is searched for is in `root_finders.py`.
+"""
+
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -10,14 +16,15 @@ from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Float
 
+from .._types import Vector
 from ..flow import simulate
 from ._neutral import least
 from .cycle_map import CycleMap
-from .root_finders import AbstractRootFinder, search
+from .root_finders import AbstractRootFinder, find_root
 
 
 class Root(NamedTuple):
-    """Starting states of the arcs, as rows, and how the search went; all floats."""
+    """Starting states of the arcs, as rows, and how they were found; all floats, for `jvp`."""
 
     arcs: Float[Array, "arcs states"]
     residual: Float[Array, ""]
@@ -26,15 +33,21 @@ class Root(NamedTuple):
     history: Float[Array, " max_steps"]
 
 
-def _missing(arc: CycleMap, arcs: Float[Array, "arcs states"], unravel: Any) -> Array:
-    """What each arc lacks to end where the next one begins."""
+def _missing(
+    arc: CycleMap, arcs: Float[Array, "arcs states"], unravel: Callable[[Vector], Any]
+) -> Float[Array, "arcs states"]:
+    """F: what each arc lacks to end where the next one begins; after the last comes the first."""
     ends = jax.vmap(lambda x: ravel_pytree(arc(unravel(x)))[0])(arcs)
     return ends - jnp.roll(arcs, -1, axis=0)
 
 
 @eqx.filter_custom_jvp
 def root_of(arc: CycleMap, guess: Any, root_finder: AbstractRootFinder) -> Root:
-    """Where the search from a guess ends; differentiated by the implicit function theorem."""
+    """Where a root finder comes to from a guess; differentiated by the numbers of `arc`.
+
+    **Arguments:** the map over one arc; a state on its section, in which the first arc begins, the
+    others where the motion from there is then; the root finder, which says how many arcs there are.
+    """
     x, unravel = ravel_pytree(guess)
     arcs = x[None]
     if root_finder.arcs > 1:
@@ -43,7 +56,7 @@ def root_of(arc: CycleMap, guess: Any, root_finder: AbstractRootFinder) -> Root:
         )
         sections = jnp.stack(jtu.tree_leaves(run.sections), axis=-1)[: -1 : arc.cycles]
         arcs = jnp.where(jnp.isfinite(sections), sections, x)
-    found = search(root_finder, lambda arcs: _missing(arc, arcs, unravel), arcs)
+    found = find_root(root_finder, lambda arcs: _missing(arc, arcs, unravel), arcs)
     dtype = x.dtype
     return Root(
         found.x,
@@ -74,7 +87,8 @@ def _(primals, tangents):
 
 
 def shooting_matrix(jacobians: Float[Array, "arcs states states"]) -> Float[Array, "all all"]:
-    """Derivative of `_missing` by the arcs, from the derivative of each arc's end by its start."""
+    """∂F/∂x from the derivative Jᵢ of each arc's end by its start: Jᵢ on the diagonal, beside it
+    the -1 by which the next arc's start enters."""
     arcs, states, _ = jacobians.shape
     following = jnp.kron(jnp.roll(jnp.eye(arcs), 1, axis=1), jnp.eye(states))
     return block_diag(*jacobians) - following.astype(jacobians.dtype)

@@ -45,7 +45,7 @@ def orbit_of(problem: Shooting, step: Step) -> Orbit:
     machine = problem.at(x)
     clock, period = _clock_of(problem, x)
     sections, residual = sections_of(problem, x)
-    admissible = seen.clearance >= -1e-9 and min(seen.approach, default=1.0) > -1e-9
+    admissible = seen.nearest.room >= -1e-9 and min(seen.approach, default=1.0) > -1e-9
     # Along a branch an impact may move past the section: an orbit's clocks lie within its period.
     impacts = np.asarray(problem.impacts, int)
     within = np.mod(clock[impacts], period)
@@ -67,7 +67,7 @@ def orbit_of(problem: Shooting, step: Step) -> Orbit:
         impacts=jnp.asarray(len(impacts), jnp.int32),
         y_min=jnp.asarray(seen.y_min),
         y_max=jnp.asarray(seen.y_max),
-        clearance=jnp.asarray(seen.clearance),
+        clearance=jnp.asarray(seen.nearest.room),
         monodromy=jnp.asarray(seen.monodromy),
         multipliers=jnp.asarray(seen.multipliers),
         residual=residual,

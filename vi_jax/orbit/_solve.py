@@ -15,9 +15,10 @@ from ..flow.arguments import planned
 from ..flow.loop import run_lane
 from ..flow.methods import MethodLike
 from ..flow.simulate import collect
+from ..machine import AbstractMachine
 from ..machine.base import renews
 from ..machine.event import after_event, begin_modes, events_of, is_autonomous
-from ..machine.numbers import leaf, with_leaf
+from ..machine.numbers import check_again, leaf, with_leaf
 from ._events import Event, section_of
 from ._fixed_step_method import fixed_step_method, steps_of
 from ._flight import Flight
@@ -52,6 +53,21 @@ class Equations(Protocol):
     def observe(self, x: Any) -> Any:
         """What is seen of a solution."""
         ...
+
+
+def check_parameter(
+    machine: AbstractMachine, name: str, value: float, interval: tuple[float, float], whose: str
+) -> None:
+    """**Raises:** `ValueError` unless the interval of a machine's number holds its value, `whose`
+    in words, and the machine can be one with either end of it."""
+    low, high = interval
+    if not low <= value <= high:
+        raise ValueError(
+            f"Argument `bounds` must hold the {whose}'s {name} = {value:g}, but is "
+            f"({low:g}, {high:g})."
+        )
+    for end in interval:
+        check_again(with_leaf(machine, name, end))
 
 
 def problem_of(
@@ -283,7 +299,7 @@ def located(
     def off(place: tuple[float, Step]) -> tuple[float, bool, float]:
         """How far a point is from it; of a test that only jumps, the last one before the jump is
         closest."""
-        told = test(place[1])
-        return abs(told), bool(told * begin < 0), abs(place[0] - root)
+        left = test(place[1])
+        return abs(left), bool(left * begin < 0), abs(place[0] - root)
 
     return min(good, key=off)[1] if good else None

@@ -13,19 +13,18 @@ from .._interrupted import Interrupted
 from .._lazy import lazy
 from ..flow.labelled import tidy
 from ..flow.methods import MethodLike
-from ..machine.numbers import check_again, check_leaf, leaf, with_leaf
-from ..machine.shown import summary_table
+from ..machine.numbers import check_leaf, leaf
 from ..machine.units import in_unit, with_units
 from ._monitor import BranchMonitor
 from ._rest import rests
 from ._shooting import Shooting
 from ._solution import orbit_of
-from ._solve import advance, located, problem_of, tangent_at
+from ._solve import advance, check_parameter, located, problem_of, tangent_at
 from ._tables import COLUMNS, on_sections, table_of
 from ._tables import column_names as column_names
 from .curve import INTERRUPTED, Step, check_walk, walk
 from .floquet import NEUTRAL
-from .results import ORBIT_RESULTS, Orbit, impacts_in_words
+from .results import ORBIT_RESULTS, InWords, Orbit, impacts_in_words
 from .special import SpecialPoint
 
 if TYPE_CHECKING:
@@ -41,8 +40,8 @@ _SAME = 1e-3
 _ROUNDING = 1e-12
 
 
-@dataclasses.dataclass(frozen=True)
-class Branch:
+@dataclasses.dataclass(frozen=True, repr=False)
+class Branch(InWords):
     """A branch of periodic motions: host arrays with one row for each point, in their order, in
     the machine's units (see `AbstractMachine.units`)."""
 
@@ -166,8 +165,8 @@ class Branch:
     def to_xarray(self, *, along: str | None = None) -> "xr.Dataset":
         """The branch as an `xarray.Dataset` over its points.
 
-        **Arguments:** `along`, to keep only what is told along one dimension: `"point"`, `"impact"`
-        or `"state"` (the multipliers), which then makes a table without repetitions.
+        **Arguments:** `along`, to keep only what has one dimension: `"point"`, `"impact"` or
+        `"state"` (the multipliers), which then makes a table without repetitions.
 
         **Raises:** `ValueError` if there is no such dimension.
         """
@@ -195,11 +194,6 @@ class Branch:
             *(f"  {point}" for point in self.special),
         ]
         return "\n".join(lines)
-
-    __repr__ = __str__
-
-    def _repr_html_(self) -> str:
-        return summary_table(str(self), self.y_min)
 
 
 def continue_orbit(
@@ -240,6 +234,34 @@ def continue_orbit(
     is the branch so far.
     """
     settings = check_walk(step=step, max_step=max_step, max_points=max_points)
+    _check_orbit(orbit)
+    check_leaf(orbit.machine, parameter)
+    bounds = interval("bounds", bounds)
+    value = float(leaf(orbit.machine, parameter))
+    check_parameter(orbit.machine, parameter, value, bounds, "orbit")
+    problem, x = problem_of(orbit, parameter, bounds, method)
+    scale = np.ones(problem.size)
+    scale[-1] = 0.5 * (bounds[1] - bounds[0])
+    start = _first_point(problem, x, scale, orbit)
+    ahead = BranchMonitor(problem, scale, bounds)
+    forward = walk(ahead.advance, start, stop=ahead.stop, **settings)
+    back = BranchMonitor(problem, scale, bounds)
+    turned = start._replace(tangent=-start.tangent)
+    if forward.end in ("closed", INTERRUPTED):
+        backward_steps, ends = [], (forward.end, forward.end)
+    else:
+        backward = walk(back.advance, turned, stop=back.stop, **settings)
+        backward_steps, ends = back.path(backward.steps[1:]), (backward.end, forward.end)
+    special = [*reversed(back.special), *ahead.special]
+    steps = [*reversed(backward_steps), *ahead.path(forward.steps)]
+    branch = _branch(problem, parameter, steps, special, ends, scale)
+    if INTERRUPTED in ends:
+        raise Interrupted("walk along the branch", branch)
+    return branch
+
+
+def _check_orbit(orbit: Orbit) -> None:
+    """**Raises:** `ValueError` unless this is one orbit that does not rest on a stop."""
     if not isinstance(orbit, Orbit) or orbit.residual.ndim:
         raise ValueError("Argument `orbit` must be one `Orbit`, not a batch or a state.")
     if not bool(orbit.successful):
@@ -250,21 +272,16 @@ def continue_orbit(
             "Argument `orbit` must not rest on a stop, but does: such a motion can be simulated, "
             "swept and found, but not followed as a branch."
         )
-    check_leaf(orbit.machine, parameter)
-    low, high = interval("bounds", bounds)
-    value = float(leaf(orbit.machine, parameter))
-    if not low <= value <= high:
-        raise ValueError(
-            f"Argument `bounds` must hold the orbit's {parameter} = {value:g}, but is "
-            f"({low:g}, {high:g})."
-        )
-    for bound in (low, high):
-        check_again(with_leaf(orbit.machine, parameter, bound))
-    problem, x = problem_of(orbit, parameter, (low, high), method)
-    scale = np.ones(problem.size)
-    scale[-1] = 0.5 * (high - low)
-    # At a fixed parameter, unless the orbit lies at a fold: then across the branch, which takes a
-    # program of its own.
+
+
+def _first_point(problem: Shooting, x: np.ndarray, scale: np.ndarray, orbit: Orbit) -> Step:
+    """The orbit as a solution of its equations from event to event.
+
+    It is refined at its parameter, unless it lies at a fold: then across the branch, which takes a
+    program of its own.
+
+    **Raises:** `ValueError` where there is no solution close to it, or many.
+    """
     start, moved = _refined(problem, x, np.eye(problem.size)[-1], scale)
     if moved > _SAME:
         start, moved = _refined(problem, x, tangent_at(problem, x, scale), scale)
@@ -280,21 +297,7 @@ def continue_orbit(
             f"{max(moved, float(start.size)):.2g}): branches cross there, or it is no orbit of "
             "this machine."
         )
-    ahead = BranchMonitor(problem, scale, (low, high))
-    forward = walk(ahead.advance, start, stop=ahead.stop, **settings)
-    back = BranchMonitor(problem, scale, (low, high))
-    turned = start._replace(tangent=-start.tangent)
-    if forward.end in ("closed", INTERRUPTED):
-        backward_steps, ends = [], (forward.end, forward.end)
-    else:
-        backward = walk(back.advance, turned, stop=back.stop, **settings)
-        backward_steps, ends = back.path(backward.steps[1:]), (backward.end, forward.end)
-    special = [*reversed(back.special), *ahead.special]
-    steps = [*reversed(backward_steps), *ahead.path(forward.steps)]
-    branch = _branch(problem, parameter, steps, special, ends, scale)
-    if INTERRUPTED in ends:
-        raise Interrupted("walk along the branch", branch)
-    return branch
+    return start
 
 
 def _refined(problem: Shooting, x, tangent, scale) -> tuple[Step, float]:
@@ -322,7 +325,7 @@ def _branch(problem, name, steps, special, ends, scale) -> Branch:
         multipliers=column(lambda seen: seen.multipliers),
         impact_phase=xs[:, impacts],
         impact_speed=column(lambda seen: np.asarray(seen.approach)[impacts]),
-        clearance=column(lambda seen: seen.clearance),
+        clearance=column(lambda seen: seen.nearest.room),
         frequency_ratio=np.full(len(xs), np.nan) if ratio is None else np.asarray(ratio),
         duration=duration,
         averages={

@@ -20,7 +20,7 @@ from ..flow.named import quantities_on
 from ..machine import AbstractMachine
 from ..machine.event import is_autonomous
 from ..machine.numbers import plain, state_in_words
-from ..machine.shown import Summarized
+from ..machine.shown import Summarized, summary_table
 from ..machine.units import in_unit, name_in, with_units
 from .floquet import STABILITY, STABILITY_NAMES, stability_of
 
@@ -190,8 +190,8 @@ class Orbit(Summarized):
         Section states become a variable for each component (`section_Y`), multipliers complex
         ones; `result` and `stability` are words. Host-side: not to be traced.
 
-        **Arguments:** names of the batch axes, by default `lane`; `along`, to keep only what is
-        told along one dimension (`"section"`, `"impact"`, `"multiplier"`, `"column"` of the
+        **Arguments:** names of the batch axes, by default `lane`; `along`, to keep only what has
+        one dimension (`"section"`, `"impact"`, `"multiplier"`, `"column"` of the
         monodromy matrix, or a batch axis), which then makes a table without repetitions.
 
         **Raises:** `ValueError` if these are not as many as there are batch axes, or there is no
@@ -257,6 +257,16 @@ class Orbit(Summarized):
         )
         reason = ORBIT_RESULTS[self.result]
         return "\n".join([*lines, f"  note: {reason}"] if reason else lines)
+
+
+class InWords:
+    """What is shown by its `__str__`; in notebooks as a table, over a row of numbers drawn."""
+
+    def __repr__(self) -> str:
+        return str(self)
+
+    def _repr_html_(self) -> str:
+        return summary_table(str(self), getattr(self, "y_min", None))
 
 
 def span_in_words(orbit: Orbit, digits: int) -> str:
