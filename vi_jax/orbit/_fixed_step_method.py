@@ -59,10 +59,8 @@ def steps_of(
     its structure; the period in cycles.
     """
     # Turning points are looked for between steps: more of them than flying needs.
-    most = max(method.steps_per_cycle, 16)
-    for machine in machines:
-        most = max(most, ceil(1.02 * float(_fewest(method, machine, like))))
-    return most * cycles
+    fewest = (ceil(1.02 * float(_fewest(method, machine, like))) for machine in machines)
+    return max(method.steps_per_cycle, 16, *fewest) * cycles
 
 
 @compiled

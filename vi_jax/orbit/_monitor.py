@@ -37,10 +37,16 @@ _LONG = 4.0
 # Events that are to come together do so within this.
 _TOGETHER = 1e-9
 
-# Stand where the number of an impact does, for what is no event of its own.
+# Stand in the place of the number of an impact, for what grazes without being one.
 _REORDERED, _RESTS, _ANEW = -1, -2, -3
 
+# What is said of a special point, by its kind or by what stands for the impact.
 _DETAILS = {
+    FOLD: "a multiplier passes 1 and the branch turns back",
+    DOUBLING: "a multiplier passes -1",
+    CROSSING: "a multiplier passes 1 and another branch crosses",
+    SYMMETRY: "a multiplier passes 1 and the motion loses its symmetry",
+    TORUS: "a complex pair of multipliers leaves the unit circle",
     _REORDERED: "two of its events fall together, and come in another order beyond",
     _ANEW: "a switch goes into another mode: the motion sticks or slips anew",
 }
@@ -238,26 +244,17 @@ class BranchMonitor:
             if kind == CROSSING:
                 at = self._crossing(here, at, CROSSING)
             values = at.seen.multipliers
-            detail = {
-                FOLD: "a multiplier passes 1 and the branch turns back",
-                DOUBLING: "a multiplier passes -1",
-                CROSSING: "a multiplier passes 1 and another branch crosses",
-                TORUS: "a complex pair of multipliers leaves the unit circle",
-            }[kind]
-            on_circle = {
-                FOLD: np.abs(values - 1).min(),
-                DOUBLING: np.abs(values + 1).min(),
-                CROSSING: np.abs(values - 1).min(),
-                TORUS: np.abs(np.abs(values[np.abs(values.imag) > 1e-9]) - 1).min(initial=np.inf),
-            }[kind]
-            if on_circle < 1e-5:  # or else a pole of the determinant, or a real pair μ, 1/μ
-                found.append((float(np.dot(here.tangent, at.x - here.x)), kind, at, detail))
+            complex_ones = np.abs(values[np.abs(values.imag) > 1e-9])
+            off = {DOUBLING: values + 1, TORUS: complex_ones - 1}.get(kind, values - 1)
+            # Else it is a pole of the determinant, or a real pair μ, 1/μ.
+            if np.abs(off).min(initial=np.inf) < 1e-5:
+                found.append((float(np.dot(here.tangent, at.x - here.x)), kind, at))
         found.sort(key=lambda f: f[0])
-        for _, kind, at, detail in found:
+        for _, kind, at in found:
             if kind == CROSSING and self.symmetric and self._apart(at) < _ALIKE:
-                kind, detail = SYMMETRY, "a multiplier passes 1 and the motion loses its symmetry"
-            self.special.append(self._point(kind, at, detail))
-        return [at for _, _, at, _ in found]
+                kind = SYMMETRY
+            self.special.append(self._point(kind, at, _DETAILS[kind]))
+        return [at for _, _, at in found]
 
     def _shrinks(self, here: Step, at: Step, last: Step) -> bool:
         """Whether an autonomous motion is about to shrink to rest."""

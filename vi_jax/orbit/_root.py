@@ -6,7 +6,7 @@ differentiated. How a root is searched for is in `root_finders.py`.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -20,17 +20,7 @@ from .._types import Vector
 from ..flow import simulate
 from ._neutral import least
 from .cycle_map import CycleMap
-from .root_finders import AbstractRootFinder, find_root
-
-
-class Root(NamedTuple):
-    """Starting states of the arcs, as rows, and how they were found; all floats, for `jvp`."""
-
-    arcs: Float[Array, "arcs states"]
-    residual: Float[Array, ""]
-    converged: Float[Array, ""]
-    steps: Float[Array, ""]
-    history: Float[Array, " max_steps"]
+from .root_finders import AbstractRootFinder, Found, find_root
 
 
 def _missing(
@@ -42,11 +32,14 @@ def _missing(
 
 
 @eqx.filter_custom_jvp
-def root_of(arc: CycleMap, guess: Any, root_finder: AbstractRootFinder) -> Root:
+def root_of(arc: CycleMap, guess: Any, root_finder: AbstractRootFinder) -> Found:
     """Where a root finder comes to from a guess; differentiated by the numbers of `arc`.
 
     **Arguments:** the map over one arc; a state on its section, in which the first arc begins, the
     others where the motion from there is then; the root finder, which says how many arcs there are.
+
+    **Returns:** `Found`, all its numbers floats; its `x` are the states in which the arcs begin, as
+    rows.
     """
     x, unravel = ravel_pytree(guess)
     arcs = x[None]
@@ -57,14 +50,7 @@ def root_of(arc: CycleMap, guess: Any, root_finder: AbstractRootFinder) -> Root:
         sections = jnp.stack(jtu.tree_leaves(run.sections), axis=-1)[: -1 : arc.cycles]
         arcs = jnp.where(jnp.isfinite(sections), sections, x)
     found = find_root(root_finder, lambda arcs: _missing(arc, arcs, unravel), arcs)
-    dtype = x.dtype
-    return Root(
-        found.x,
-        found.residual,
-        found.converged.astype(dtype),
-        found.steps.astype(dtype),
-        found.history,
-    )
+    return jtu.tree_map(lambda a: a.astype(x.dtype), found)  # numbers all, for `jvp`
 
 
 @root_of.def_jvp
@@ -76,14 +62,14 @@ def _(primals, tangents):
     if not jtu.tree_leaves(tangents[0]):
         return root, still
 
-    jacobians = jax.vmap(lambda x: arc.jacobian(unravel(x)))(root.arcs)
+    jacobians = jax.vmap(lambda x: arc.jacobian(unravel(x)))(root.x)
     _, rate = eqx.filter_jvp(
-        lambda arc: _missing(arc, root.arcs, unravel).ravel(), (arc,), (tangents[0],)
+        lambda arc: _missing(arc, root.x, unravel).ravel(), (arc,), (tangents[0],)
     )
-    move = -least(shooting_matrix(jacobians), rate).reshape(root.arcs.shape)
+    move = -least(shooting_matrix(jacobians), rate).reshape(root.x.shape)
     # Where there is no orbit there is no derivative of one.
     # A product, since the transpose of a choice would be zero.
-    return root, still._replace(arcs=move * jnp.where(root.converged > 0, 1.0, jnp.nan))
+    return root, still._replace(x=move * jnp.where(root.converged > 0, 1.0, jnp.nan))
 
 
 def shooting_matrix(jacobians: Float[Array, "arcs states states"]) -> Float[Array, "all all"]:

@@ -139,7 +139,7 @@ def _judged(
     moved, start, place = moved_from_impacts(the_map, jax.lax.stop_gradient(guess), impact_log)
     arc = dataclasses.replace(moved, cycles=cycles // root_finder.arcs)
     root = root_of(arc, start, root_finder)
-    x, unravel = root.arcs, ravel_pytree(guess)[1]
+    x, unravel = root.x, ravel_pytree(guess)[1]
     seen = jax.vmap(lambda x: observe_arc(arc, unravel(x), impact_log))(x)
     jacobians = by_the_first_state(seen.jacobians)
     error, drifts = error_of(seen, x)

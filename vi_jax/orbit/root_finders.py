@@ -14,11 +14,10 @@ import jax.numpy as jnp
 import lineax as lx
 import optax
 import optimistix as optx
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from .._checks import count, instance_of, require
 from .._numbers import number
-from .._types import Flag
 from ._neutral import rounding
 
 Unknowns = Float[Array, "..."]
@@ -173,8 +172,10 @@ class Found(NamedTuple):
     """The place with the smallest residual that was met."""
     residual: Float[Array, ""]
     """Its largest component there."""
-    converged: Flag
-    steps: Int[Array, ""]
+    converged: Array
+    """Whether that is within its tolerance."""
+    steps: Array
+    """Their number."""
     history: Float[Array, " max_steps"]
     """Largest residual component after each step, NaN beyond the last."""
 

@@ -172,9 +172,8 @@ def _beyond_grazing(point: SpecialPoint, distance: float) -> Orbit:
     tangent = tangent_at(new, start, scale)
     for sense in (1.0, -1.0):
         found = advance(new, start, sense * tangent, scale, distance)
-        if not bool(found.good):
-            continue
-        if found.seen.nearest.room > 0 and min(found.seen.approach, default=1.0) > 0:
+        inside = found.seen.nearest.room > 0 and min(found.seen.approach, default=1.0) > 0
+        if bool(found.good) and inside:
             return orbit_of(new, found)
     raise ValueError(
         "Beyond this grazing there is no admissible motion with "
