@@ -131,9 +131,7 @@ def observe_arc(arc: CycleMap, state: Any, impact_log: int) -> ObservedArc:
     return seen(arc, state)
 
 
-def by_the_first_state(
-    jacobians: Float[Array, "arcs cycles states states"],
-) -> Float[Array, "all_cycles states states"]:
+def by_the_first_state(jacobians: Float[Array, "arcs cycles n n"]) -> Float[Array, "all n n"]:
     """Derivatives of the states after each cycle by the first state of the first arc, from those by
     the first state of their own arc: each after those of the arcs before."""
     passed, all_of_them = jnp.eye(jacobians.shape[-1], dtype=jacobians.dtype), []
@@ -167,8 +165,8 @@ def in_order(
     phase, cycles = seen.listed.phase, seen.duration.shape[0]
     if place is not None:
         turn = jnp.asarray(machine.cycle, phase.dtype)
-        phase = phase + turn * (jnp.arange(cycles)[:, None] + place / _PLACES)
-        phase = jnp.mod(phase, turn * least)
+        behind = jnp.arange(cycles)[:, None] + place / _PLACES
+        phase = jnp.mod(phase + turn * behind, turn * least)
     else:
         phase = phase + (jnp.cumsum(seen.duration) - seen.duration)[:, None]
     phase = jnp.where(hit, phase, jnp.inf).ravel()

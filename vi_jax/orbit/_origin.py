@@ -1,11 +1,11 @@
 """Where a branch springs from a motion of half the period of its own."""
 
 import dataclasses
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from jaxtyping import Array
 
 from ._events import Event
 from ._shooting import Shooting
@@ -13,7 +13,7 @@ from ._solve import advance, observe, state_at
 from .curve import Step
 
 
-def halves(problem: Shooting, x: Any) -> np.ndarray:
+def halves(problem: Shooting, x: np.ndarray | Array) -> np.ndarray:
     """How the second half of the period differs from the first; empty if it cannot be alike."""
     events, cycles = problem.events, problem.cycles
     legs = len(events)
@@ -36,7 +36,7 @@ def _alike(events: tuple[Event, ...], cycles: int) -> bool:
     return events[:half] == tuple(event.later(-(cycles // 2)) for event in events[half:])
 
 
-def repeated(problem: Shooting, x: Any, twice: Shooting) -> np.ndarray:
+def repeated(problem: Shooting, x: np.ndarray | Array, twice: Shooting) -> np.ndarray:
     """The unknowns of a motion that is gone through twice, as those of the problem `twice`."""
     clock, states = (np.asarray(a) for a in problem.parts(jnp.asarray(x)))
     turn = float(problem.period(jnp.asarray(x)))

@@ -214,7 +214,7 @@ class Shooting(eqx.Module):
                 carried, approach = carried @ saltation, rises[None]
                 order = self._order(machine, leg, s0, u)
             places = [machine.position(self.unravel(x)) for x in (u, after)]
-            turns = turns_of(self.flight(machine, leg), *path, (s1 - s0) / self.steps)
+            turns = turns_of(self.flight(machine, leg), path[0], path[1], (s1 - s0) / self.steps)
             return carried, passed, approach, order, turns, places
 
         legs = jnp.arange(len(states))

@@ -5,8 +5,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from .._programs import compiled
+from .._types import Scalar
 from ._shooting import Shooting
 from .curve import Step
 from .results import ORBIT_RESULTS, Orbit
@@ -18,13 +20,14 @@ def _compiled_sections(problem, x, legs, places):
     return states, jnp.max(jnp.abs(problem.residual(x)))
 
 
-def _clock_of(problem: Shooting, x: Any) -> tuple[np.ndarray, float]:
+def _clock_of(problem: Shooting, x: Array) -> tuple[np.ndarray, float]:
     """Clock of each event, and the period by the clock."""
     return np.asarray(problem.parts(x)[0])[: len(problem.events)], float(problem.period(x))
 
 
-def sections_of(problem: Shooting, x: Any) -> tuple[Any, Any]:
-    """The states on the sections of a solution, and what it lacks to be one."""
+def sections_of(problem: Shooting, x: np.ndarray | Array) -> tuple[Any, Scalar]:
+    """The states on the sections of a solution, leaves (cycles,), and the largest component of its
+    residual."""
     x = jnp.asarray(x)
     clock, period = _clock_of(problem, x)
     begins = [i for i, event in enumerate(problem.events) if event.cycle is not None]

@@ -161,12 +161,15 @@ def turns_of(
     return Turns(low, high, Nearest(room, touch, touched))
 
 
-def _stepped(flight: Flight, inputs: Any) -> Vector:
+def _stepped(flight: Flight, inputs: tuple[Scalar, Scalar, Vector]) -> Vector:
+    """The state after a step from clock, by a length, from a state."""
     s, h, u = inputs
     return flight.step(s, s + h, u, Beside(jnp.zeros_like(s), {}))[0]
 
 
-def _turn(watched: _Guard, flight: Flight, inputs: Any) -> _Found:
+def _turn(
+    watched: _Guard, flight: Flight, inputs: tuple[Scalar, Scalar, Vector, Scalar, Scalar]
+) -> _Found:
     """The turning point within a step, if the rate changes its sign: by Newton's method on the
     length from the step's start, each trial a step of the method itself.
 

@@ -218,7 +218,7 @@ def _curve(condition: "SpecialMotion", path: list[Step], ends: tuple[str, str]) 
     problem, seen = condition.problem, [step.seen for step in path]
     return Boundary(
         kind=condition.kind,
-        names=problem.parameters,
+        names=(problem.parameters[0], problem.parameters[1]),
         parameters=np.stack([step.x[-2:] for step in path]),
         y_min=np.array([at.y_min for at in seen]),
         multipliers=np.stack([at.multipliers for at in seen]),

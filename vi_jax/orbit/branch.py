@@ -16,6 +16,7 @@ from ..flow.methods import MethodLike
 from ..machine.numbers import check_leaf, leaf
 from ..machine.units import in_unit, with_units
 from ._monitor import BranchMonitor
+from ._observed import Observed
 from ._rest import rests
 from ._shooting import Shooting
 from ._solution import orbit_of
@@ -184,12 +185,11 @@ class Branch(InWords):
     def __str__(self) -> str:
         low, high = self.parameter.min(), self.parameter.max()
         machine = self.problem.machine
-        period, span = machine.period_of(self.cycles), f"[{low:.6g}, {high:.6g}]"
-        span = in_unit(span, machine.units, self.name)
+        period = machine.period_of(self.cycles)
+        span = in_unit(f"[{low:.6g}, {high:.6g}]", machine.units, self.name)
         lines = [
             f"Branch of {len(self.parameter)} motions of period {period} with "
-            f"{impacts_in_words(self.impact_speed.shape[1])}, "
-            f"{self.name} in {span}, "
+            f"{impacts_in_words(self.impact_speed.shape[1])}, {self.name} in {span}, "
             f"{int(self.stable.sum())} of them stable; ends: {self.ends[0]}, {self.ends[1]}",
             *(f"  {point}" for point in self.special),
         ]
@@ -300,17 +300,22 @@ def _first_point(problem: Shooting, x: np.ndarray, scale: np.ndarray, orbit: Orb
     return start
 
 
-def _refined(problem: Shooting, x, tangent, scale) -> tuple[Step, float]:
+def _refined(
+    problem: Shooting, x: np.ndarray, tangent: np.ndarray, scale: np.ndarray
+) -> tuple[Step, float]:
     """The solution in the plane across a tangent at `x`, and how far (scaled) it is from there."""
     start = advance(problem, x, tangent, scale, 0.0)
     return start, float(np.max(np.abs(start.x - x) / scale)) if bool(start.good) else np.inf
 
 
-def _branch(problem, name, steps, special, ends, scale) -> Branch:
+def _branch(
+    problem: Shooting, name: str, steps: list[Step], special: list[SpecialPoint],
+    ends: tuple[str, str], scale: np.ndarray,
+) -> Branch:  # fmt: skip
     xs = np.stack([step.x for step in steps])
     impacts = np.asarray(problem.impacts, int)
 
-    def column(get: Callable[[Any], Any]) -> np.ndarray:
+    def column(get: Callable[[Observed], Any]) -> np.ndarray:
         return np.stack([np.asarray(get(step.seen)) for step in steps])
 
     duration = column(lambda seen: seen.duration)

@@ -235,9 +235,8 @@ class Orbit(Summarized):
             f"  section: {state_in_words(self.state, 9, units)}",
             f"  {span_in_words(self, 9)}",
         ]
-        for phase, speed, stop in zip(
-            self.impact_phase, self.impact_speed, self.impact_stop, strict=True
-        ):
+        impacts = zip(self.impact_phase, self.impact_speed, self.impact_stop, strict=True)
+        for phase, speed, stop in impacts:
             if stop >= 0:
                 name = self.machine.stops[int(stop)].side
                 fast = in_unit(f"{float(speed):.9g}", units, "velocity")
@@ -288,11 +287,7 @@ def trimmed(orbit: Orbit) -> Orbit:
     if isinstance(orbit.residual, Tracer) or orbit.residual.ndim:
         return orbit
     keep = slice(int(orbit.impacts))
-    cut = {name: getattr(orbit, name)[keep] for name in ("impact_phase", "impact_speed")}
-    cycles = int(orbit.cycles)
-    return dataclasses.replace(
-        orbit,
-        **cut,
-        impact_stop=orbit.impact_stop[keep],
-        sections=jtu.tree_map(lambda x: x[:cycles], orbit.sections),
-    )
+    each = ("impact_phase", "impact_speed", "impact_stop")
+    cut = {name: getattr(orbit, name)[keep] for name in each}
+    sections = jtu.tree_map(lambda x: x[: int(orbit.cycles)], orbit.sections)
+    return dataclasses.replace(orbit, **cut, sections=sections)

@@ -204,15 +204,9 @@ def find_root(root_finder: AbstractRootFinder, residual: Residual, x: Unknowns) 
         x, memory, best, size, _, steps, history = carry
         x, memory, place, now = root_finder.step(residual, x, eqx.combine(memory, static))
         better = ~jnp.isnan(now) & ~(now >= size)
-        return (
-            x,
-            eqx.filter(memory, eqx.is_array),
-            jnp.where(better, place, best),
-            jnp.where(better, now, size),
-            size,
-            steps + 1,
-            history.at[steps].set(now),
-        )
+        best, smallest = jnp.where(better, place, best), jnp.where(better, now, size)
+        history = history.at[steps].set(now)
+        return x, eqx.filter(memory, eqx.is_array), best, smallest, size, steps + 1, history
 
     carry = (x, memory, x, nan, nan, jnp.zeros((), jnp.int32), history)
     _, _, best, size, _, steps, history = jax.lax.while_loop(going, body, carry)
