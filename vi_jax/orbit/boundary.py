@@ -303,12 +303,12 @@ class SpecialMotion(eqx.Module):
         others = [v + _NOISE for i, v in enumerate(step.seen.approach) if i != self.impact]
         # At a grazing the body turns on the stop, to rounding.
         touching = self.kind == GRAZING and self.impact is None
-        return min(others, default=1.0) <= 0 or (not touching and step.seen.nearest.room < -_NOISE)
+        passed = not touching and step.seen.nearest.room < -_NOISE
+        return bool(min(others, default=1.0) <= 0 or passed)
 
 
 def _inside(step: Step, bounds: Intervals) -> bool:
-    pairs = zip(step.x[-2:], bounds, strict=True)
-    return all(low <= value <= high for value, (low, high) in pairs)
+    return all(low <= x <= high for x, (low, high) in zip(step.x[-2:], bounds, strict=True))
 
 
 def _cut(advance: Any, here: Step, new: Step, bounds: Intervals, scale: np.ndarray) -> Step:
