@@ -201,9 +201,60 @@ def test_a_flow_has_a_zero_exponent():
     )
 
 
-def test_a_branch_refuses_steps_of_no_fixed_length():
+@pytest.mark.parametrize("method", [vi.Adaptive(), vi.Taylor(rtol=1e-12)])
+def test_a_branch_refuses_steps_of_no_fixed_length(method):
     """Rather than replacing them."""
     machine = vi.machines.ImpactPair(half_gap=2.0)
     orbit = vi.find_orbit(machine, machine.start(place=-1.137, speed=0.785))
     with pytest.raises(ValueError, match="`method` must be of fixed steps"):
-        vi.continue_orbit(orbit, parameter="half_gap", bounds=(1.5, 2.5), method=vi.Adaptive())
+        vi.continue_orbit(orbit, parameter="half_gap", bounds=(1.5, 2.5), method=method)
+
+
+class Counted(vi.AbstractMethod):
+    """A method of one's own, of so many equal steps in a cycle."""
+
+    steps_per_cycle: int = eqx.field(static=True, default=20)  # pyright: ignore
+
+    @property
+    def inner(self):
+        return vi.FixedStep(steps_per_cycle=self.steps_per_cycle)
+
+    def step(self, smooth, s0, s1, state, beside):
+        return self.inner.step(smooth, s0, s1, state, beside)
+
+    def tighter(self):
+        return Counted(2 * self.steps_per_cycle)
+
+
+DUFFING = vi.machines.Duffing(
+    amplitude=0.6, frequency=0.7, damping=0.05, stiffness=1.0, cubic=0.3, gap=0.8, restitution=0.6,
+)  # fmt: skip
+
+
+def duffing_orbit(method=None):
+    return vi.find_orbit(DUFFING, DUFFING.start(Y=0.709689275, V=0.323053158), method=method)
+
+
+def followed_by(wanted, orbit, asked=None):
+    """Checks that the branch of an orbit is followed by this method, and leads through the orbit
+    to rounding."""
+    branch = vi.continue_orbit(
+        orbit, parameter="frequency", bounds=(0.69, 0.71), max_points=2, method=asked
+    )  # fmt: skip
+    (same,) = branch.at(0.7)
+    assert branch.problem.method == wanted
+    assert float(same.state.Y) == pytest.approx(float(orbit.state.Y), abs=1e-12)
+    np.testing.assert_allclose(same.multipliers, orbit.multipliers, rtol=1e-9)
+
+
+@pytest.mark.parametrize("method", [Counted(60), vi.Taylor(20, 40)])
+def test_a_branch_takes_any_method_of_fixed_steps(method):
+    """One of one's own, and `Taylor` without a tolerance."""
+    known = duffing_orbit(vi.FixedStep(steps_per_cycle=60))
+    followed_by(method, known, asked=method)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", [Counted(60), vi.Taylor(20, 40)])
+def test_a_branch_is_followed_by_the_method_of_its_orbit_if_its_steps_are_fixed(method):
+    followed_by(method, duffing_orbit(method))

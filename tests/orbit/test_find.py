@@ -382,7 +382,7 @@ def test_says_what_is_wrong(arguments, message):
         vi.find_orbit(UNDAMPED, UNDAMPED.start(), **arguments)
 
 
-def test_says_what_is_wrong_with_guess_and_search():
+def test_says_what_is_wrong_with_guess_and_root_finder():
     with pytest.raises(ValueError, match="`guess` must be finite, but its V is nan"):
         vi.find_orbit(UNDAMPED, UNDAMPED.start().__class__(jnp.asarray(0.0), jnp.asarray(jnp.nan)))
     with pytest.raises(ValueError, match="arrays of one length"):

@@ -208,6 +208,18 @@ class AbstractMachine(Shown):
             f"clock, but got {clock!r}."
         )
 
+    def in_cycle_clock(self) -> "AbstractMachine":
+        """The same machine with what counts its cycles as its independent variable."""
+        return self
+
+    def in_cycle_state(self, name: str, state: Any) -> State:
+        """A state on the section, of any of its clocks, as the machine in that clock needs it."""
+        return state
+
+    def observed_later(self, since_section: Any) -> "AbstractMachine | None":
+        """The same machine with its section moved by so much of its clock; `None` if it cannot."""
+        return None
+
     def at_section(self, phase: Any) -> "AbstractMachine":
         """The same machine observed elsewhere in its cycle, for one that can be."""
         raise ValueError(
@@ -296,6 +308,11 @@ class AbstractMachine(Shown):
     def step_limit(self, s: Float[Array, ""], state: State) -> Float[Array, ""] | float:
         """The longest step that holds at most one extremum of the motion; at most `cycle`/5."""
         return self.cycle / 5
+
+    @property
+    def scales_known(self) -> bool:
+        """Whether the usual number of fixed steps in a cycle is known to be enough; static."""
+        return False
 
     def relaxation(self, s: Float[Array, ""], state: State) -> Float[Array, ""] | None:
         """The shortest time constant (in `s`) with which something fades, `None` if nothing does.

@@ -139,6 +139,11 @@ class Scene(ShaftMachine):
         """The same scene, observed where the crank angle is `phase` (radians) instead of 0."""
         return dataclasses.replace(self, section_phase=phase)
 
+    def observed_later(self, since_section: Any) -> "Scene":
+        """Observed so much crank angle (radians) after its own section."""
+        angle = self.phase_at(since_section)
+        return self.at_section(jnp.where(angle > 2 * pi, angle - 2 * pi, angle))
+
     def phase_at(self, since_section: Any) -> Any:
         """Crank angle from the one counted since the section."""
         return since_section if self.section_phase is None else since_section + self.section_phase
@@ -213,6 +218,11 @@ class Scene(ShaftMachine):
         for stop in self.soft_stops:
             turn = jnp.minimum(turn, stop.longest_step(self, state))
         return turn * speed if self.clock_name == "phase" else turn
+
+    @property
+    def scales_known(self) -> bool:
+        """Not with soft stops, whose contacts may be much briefer than a cycle."""
+        return not self.soft_stops
 
     def relaxation(self, s: Float[Array, ""], state: Any) -> Float[Array, ""]:
         """1/2ξ of a strongly damped body, or what the drive says: the time w0/τ0 in which a motor

@@ -70,7 +70,12 @@ class ShaftMachine(AbstractMachine):
             )
         return state_of_numbers("start", start)
 
-    def by_phase(self, name: str, state: Any) -> Any:
+    def in_cycle_clock(self: Machine) -> Machine:
+        """In the phase clock: by time the section would be an event of its own, and the angle of
+        the shaft one more state."""
+        return self.in_clock("phase")
+
+    def in_cycle_state(self, name: str, state: Any) -> Any:
         """A state on the section that was made for the time clock, without the angle of the shaft;
         any other as it is.
 

@@ -1,20 +1,22 @@
-"""The events of a periodic motion, in their order."""
+"""The events of a periodic motion, in their order: the unknowns of `Shooting` belong to them."""
 
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+from jaxtyping import Array
 
+from .._types import Scalar
 from ..machine import AbstractEvent, AbstractMachine
 from ..machine.event import events_of, guard_of, section_number
 
 
 class Event(NamedTuple):
-    """What begins a flight: one of the machine's events."""
+    """One of the machine's events, met in the course of a periodic motion."""
 
     number: int
-    """By which it goes among the machine's events, in the order of `events_of(machine)`."""
+    """Its place among the machine's events, in the order of `events_of(machine)`."""
     cycle: int | None = None
-    """Number of the cycle that it begins, if it begins one."""
+    """The number, from 0, of the cycle of the period that begins with it; `None` if none does."""
 
     def called(self, machine: AbstractMachine) -> str:
         """What messages call it: its name, or its kind and place among the machine's events of
@@ -24,7 +26,7 @@ class Event(NamedTuple):
         return event.name or f"{event.word} {place}"
 
     def later(self, cycles: int) -> "Event":
-        """The same so many cycles later."""
+        """The same event so many cycles later."""
         return self if self.cycle is None else self._replace(cycle=self.cycle + cycles)
 
     def of(self, machine: AbstractMachine) -> AbstractEvent:
@@ -37,8 +39,14 @@ def section_of(machine: AbstractMachine, cycle: int) -> Event:
     return Event(section_number(machine), cycle)
 
 
-def guard_at(machine: AbstractMachine, event: Event, s: Any, state: Any, modes: Any) -> Any:
-    """What is zero at an event, and rises there; `s` counts from the first cycle on."""
+def guard_at(
+    machine: AbstractMachine, event: Event, s: Scalar, state: Any, modes: tuple[Array, ...]
+) -> Scalar:
+    """What is zero at an event, and rises there.
+
+    **Arguments:** the clock `s` counts from the beginning of the period; the state there and the
+    modes before the event.
+    """
     if event.cycle is not None:
         s = s - jnp.asarray(machine.cycle, s.dtype) * (event.cycle - 1)
     return guard_of(machine, event.number, s, state, modes)

@@ -1,35 +1,51 @@
-"""The method that a smooth system of equations is solved with, and the steps of its flights."""
+"""The method by which a branch's motions are followed from event to event, and its steps.
+
+Newton's method on the equations of an orbit needs flights that depend smoothly on their unknowns.
+Steps that are sized by a tolerance do not: their number jumps.
+"""
 
 from math import ceil
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 
 from .._programs import compiled
-from ..flow import AbstractMethod, ExactFlight, FixedStep
+from .._types import Scalar
+from ..flow import AbstractMethod, FixedStep
 from ..flow.methods import MethodLike, chosen
 from ..machine import AbstractMachine
+
+
+def has_fixed_steps(method: AbstractMethod) -> bool:
+    """Whether a method takes the same steps along the same motion, sized by no tolerance."""
+    return not method.adaptive and not np.any(np.asarray(method.wander))
 
 
 def fixed_step_method(
     asked: MethodLike, found_with: AbstractMethod, machine: AbstractMachine
 ) -> AbstractMethod:
-    """A method of fixed steps, which a smooth system of equations needs: the one asked for, else
-    that of the orbit if it is one, else `ExactFlight` where it applies, else 20 steps of
-    `Verner9` a cycle, whose error is 1e-13.
+    """A method of fixed steps for the branch of an orbit.
 
-    **Raises:** `ValueError` if one is asked for that has no fixed steps.
+    **Arguments:** the method that the caller asked for, or `None`; the one with which the orbit
+    was found; the orbit's machine.
+
+    **Returns:** the one asked for; else that of the orbit, if its steps are fixed; else
+    `ExactFlight` where it applies; else 20 steps of `Verner9` a cycle, whose error is 1e-13.
+
+    **Raises:** `ValueError` if the one asked for sizes its steps by a tolerance.
     """
     if asked is not None:
         method = chosen(machine, asked)
-        if not isinstance(method, FixedStep | ExactFlight):
+        if not has_fixed_steps(method):
             raise ValueError(
-                "Argument `method` must be of fixed steps, `FixedStep(...)` or `ExactFlight()`, "
-                f"to follow an orbit, but got {method!r}."
+                "Argument `method` must be of fixed steps to follow an orbit, as `FixedStep(...)`, "
+                "`ExactFlight()` or a `Taylor(...)` without `rtol`, since steps sized by a "
+                f"tolerance do not depend smoothly on the motion, but got {method!r}."
             )
         method.check(machine)
         return method
-    if isinstance(found_with, FixedStep):
+    if has_fixed_steps(found_with):
         return found_with
     return chosen(machine, None, FixedStep(steps_per_cycle=20))
 
@@ -37,15 +53,17 @@ def fixed_step_method(
 def steps_of(
     method: AbstractMethod, machines: list[AbstractMachine], like: Any, cycles: int
 ) -> int:
-    """Steps that a flight over the whole period needs, in the most demanding of the machines."""
+    """Steps that a flight over the whole period needs, in the most demanding of the machines.
+
+    **Arguments:** the method; the machines at the ends of the interval of a parameter; a state, for
+    its structure; the period in cycles.
+    """
     # Turning points are looked for between steps: more of them than flying needs.
-    most = max(method.steps_per_cycle, 16)
-    for machine in machines:
-        most = max(most, ceil(1.02 * float(_fewest(method, machine, like))))
-    return most * cycles
+    fewest = (ceil(1.02 * float(_fewest(method, machine, like))) for machine in machines)
+    return max(method.steps_per_cycle, 16, *fewest) * cycles
 
 
 @compiled
-def _fewest(method: AbstractMethod, machine: AbstractMachine, like: Any) -> Any:
+def _fewest(method: AbstractMethod, machine: AbstractMachine, like: Any) -> Scalar | float:
     """Steps of a cycle where they are as long as they may be."""
     return machine.cycle / method.longest(machine, jnp.zeros(()), like)

@@ -18,11 +18,11 @@ from ..machine import AbstractMachine
 
 
 class Flight(eqx.Module):
-    """A machine between two events, and how it is carried."""
+    """The motion between two events: du/ds = f(s, u), the machine's field in its modes, which stay
+    as they are; solved with steps of one length by a method of fixed steps."""
 
     machine: AbstractMachine
     modes: tuple[Scalar, ...]
-    """In which it is all along."""
     method: AbstractMethod
     like: Any
     """A state, for its structure."""
@@ -53,8 +53,11 @@ class Flight(eqx.Module):
     def fly(
         self, s0: Scalar, s1: Scalar, u: Vector, steps: int, averages: tuple[str, ...] = ()
     ) -> tuple[Vector, Beside, tuple[Float[Array, " steps"], Float[Array, "steps states"]]]:
-        """State, elapsed time and the integrals of the averages named after so many steps, and
-        clock and state before each of them."""
+        """The flight from u at clock s0 to s1.
+
+        **Returns:** the state at s1; the time that passed and the integrals of the averages named;
+        clock and state before each of the steps.
+        """
         numbers, rest = eqx.partition(self, eqx.is_array)
         (u, passed), path = lanes.run(
             partial(_begin, averages), partial(_step, rest, steps), _end,

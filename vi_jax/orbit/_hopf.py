@@ -12,15 +12,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from jaxtyping import Array
 
 from .._programs import compiled
+from .._types import Scalar, Vector
+from ..machine import AbstractMachine
 from ..machine.base import renews
 from ._events import section_of
 from ._shooting import Shooting
 from ._solve import observe
 from .curve import Step
 
-# The motion that is told there has so much of the size of the one before it.
+# The motion that stands for the branch there has so much of the size of the one before it.
 _SMALL = 1e-5
 
 # By how much an eigenvalue's period may differ from that of the last motion, as a share of it.
@@ -34,27 +37,27 @@ _ONE = 1e-6
 
 
 @compiled
-def _size(problem: Shooting, x):
+def _size(problem: Shooting, x: Vector) -> Scalar:
     machine = problem.at(x)
     u = problem.after(machine, 0, jnp.zeros((), x.dtype), problem.parts(x)[1][0])
     return jnp.linalg.norm(_rate(problem, machine, u)) * problem.period(x)
 
 
 @compiled
-def _flow(problem: Shooting, x, u):
-    """Field and section in a state, each with its derivatives."""
+def _flow(problem: Shooting, x: Vector, u: Vector) -> tuple[Vector, Array, Scalar, Vector]:
+    """Field and section in the state u, each with its derivatives by it."""
     machine = problem.at(x)
     section, slope = jax.value_and_grad(lambda u: machine.section(problem.unravel(u)))(u)
     jacobian = jax.jacfwd(lambda u: _rate(problem, machine, u))(u)
     return _rate(problem, machine, u), jacobian, section, slope
 
 
-def _rate(problem: Shooting, machine: Any, u: Any) -> Any:
+def _rate(problem: Shooting, machine: AbstractMachine, u: Vector) -> Vector:
     moving = problem.flight(machine, 0).smooth
     return ravel_pytree(moving.field(jnp.zeros((), u.dtype), problem.unravel(u)))[0]
 
 
-def size_of(problem: Shooting, x: Any) -> float:
+def size_of(problem: Shooting, x: np.ndarray | Array) -> float:
     """How far an autonomous motion would get in its period as fast as it leaves the section."""
     return float(_size(problem, jnp.asarray(x)))
 
@@ -91,11 +94,11 @@ class _Equilibrium(NamedTuple):
     """Derivative of the section by the state."""
 
 
-def _state(problem: Shooting, x: Any) -> np.ndarray:
+def _state(problem: Shooting, x: np.ndarray | Array) -> np.ndarray:
     return np.asarray(x)[1 : 1 + problem.states]
 
 
-def _flow_at(problem: Shooting, x: Any, u: Any) -> list[np.ndarray]:
+def _flow_at(problem: Shooting, x: np.ndarray | Array, u: np.ndarray) -> list[np.ndarray]:
     return [np.asarray(a) for a in _flow(problem, jnp.asarray(x), jnp.asarray(u))]
 
 

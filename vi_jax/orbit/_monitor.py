@@ -37,10 +37,16 @@ _LONG = 4.0
 # Events that are to come together do so within this.
 _TOGETHER = 1e-9
 
-# Stand where the number of an impact does, for what is no event of its own.
+# Stand in the place of the number of an impact, for what grazes without being one.
 _REORDERED, _RESTS, _ANEW = -1, -2, -3
 
+# What is said of a special point, by its kind or by what stands for the impact.
 _DETAILS = {
+    FOLD: "a multiplier passes 1 and the branch turns back",
+    DOUBLING: "a multiplier passes -1",
+    CROSSING: "a multiplier passes 1 and another branch crosses",
+    SYMMETRY: "a multiplier passes 1 and the motion loses its symmetry",
+    TORUS: "a complex pair of multipliers leaves the unit circle",
     _REORDERED: "two of its events fall together, and come in another order beyond",
     _ANEW: "a switch goes into another mode: the motion sticks or slips anew",
 }
@@ -53,7 +59,11 @@ _NOISE = 1e-7
 
 
 class BranchMonitor:
-    """Looks at each step of a walk: locates what happens in it and says when to end."""
+    """Looks at each step of a walk along a branch: locates what happens in it and says when to end.
+
+    **Arguments:** the equations of the motions, with the parameter as their last unknown; the size
+    of each unknown; the interval of the parameter.
+    """
 
     def __init__(self, problem: Shooting, scale: np.ndarray, bounds: tuple[float, float]):
         self.problem, self.scale, self.bounds = problem, scale, bounds
@@ -76,7 +86,7 @@ class BranchMonitor:
         return new._replace(good=np.asarray(size_of(self.problem, new.x) > _STILL * self.size))
 
     def stop(self, here: Step, new: Step) -> tuple[Step, str] | None:
-        """The last point, and why the branch ends between these two; `None` if it does not."""
+        """The last point of the branch, and why it ends between these two; `None` if it goes on."""
         reason, last = None, new
         low, high = self.bounds
         if not low <= new.x[-1] <= high:
@@ -134,33 +144,28 @@ class BranchMonitor:
 
     def _grazing(self, here: Step, new: Step) -> SpecialPoint | None:
         """The first of the impacts lost and the stops touched between two points."""
-        found = []
+        found, tests = [], []
 
         def room(step: Step) -> float:
-            return float(np.clip(step.seen.clearance, -1.0, 1.0))
+            return float(np.clip(step.seen.nearest.room, -1.0, 1.0))
 
-        for i in range(len(self.problem.events)):
+        for i, event in enumerate(self.problem.events):
             if new.seen.approach[i] <= 0 < here.seen.approach[i]:
-                if self.problem.events[i].cycle is not None:
-                    hopf = hopf_between(self.problem, here, new)
-                    if hopf is not None:
-                        found.append((hopf, _RESTS))
-                        continue
-                at = self._where(here, new, lambda step, i=i: float(step.seen.approach[i]))
-                if at is not None:
-                    found.append((at, i))
+                hopf = None if event.cycle is None else hopf_between(self.problem, here, new)
+                if hopf is not None:
+                    found.append((hopf, _RESTS))
+                else:
+                    tests.append((lambda step, i=i: float(step.seen.approach[i]), i))
         if room(new) < 0 < room(here):
-            at = self._where(here, new, room)
-            if at is not None:
-                found.append((at, None))
+            tests.append((room, None))
         if new.seen.order < 0 < here.seen.order:
-            at = self._where(here, new, lambda step: float(step.seen.order))
-            if at is not None:
-                found.append((at, _ANEW))
+            tests.append((lambda step: float(step.seen.order), _ANEW))
         if new.seen.apart < -_TOGETHER < here.seen.apart:
-            at = self._where(here, new, lambda step: float(step.seen.apart) + _TOGETHER)
+            tests.append((lambda step: float(step.seen.apart) + _TOGETHER, _REORDERED))
+        for test, impact in tests:
+            at = self._where(here, new, test)
             if at is not None:
-                found.append((at, _REORDERED))
+                found.append((at, impact))
         if not found:
             return None
         at, impact = min(found, key=lambda f: float(np.dot(here.tangent, f[0].x - here.x)))
@@ -169,10 +174,10 @@ class BranchMonitor:
         if impact == _RESTS:
             return self._point(HOPF, at, "the motion shrinks to rest", 0)
         if impact is None:
-            machine, touched = self.problem.machine, int(at.seen.touched)
+            machine, touched = self.problem.machine, int(at.seen.nearest.event)
             guard = f"the guard of {Event(touched).called(machine)}"
             what = "a stop" if touched < len(machine.stops) else guard
-            detail = f"touches {what} at {self._place(at, float(at.seen.touch))}"
+            detail = f"touches {what} at {self._place(at, float(at.seen.nearest.clock))}"
         else:
             clock = float(np.asarray(self.problem.parts(jnp.asarray(at.x))[0])[impact])
             lost = self.problem.events[impact].of(self.problem.machine)
@@ -190,14 +195,16 @@ class BranchMonitor:
         There the two halves of the period become alike, or images of each other, and beyond it the
         same motions come again, observed half a period later or in the mirror.
         """
-        for kind, told in ((DOUBLING, self._halves), (SYMMETRY, self._images)):
-            apart = told(here)
-            if np.linalg.norm(apart) < _NOISE or np.dot(apart, told(last)) >= 0:
+        for kind, difference in ((DOUBLING, self._halves), (SYMMETRY, self._images)):
+            begin = difference(here)
+
+            def along(step: Step, begin=begin, difference=difference) -> float:
+                return float(np.dot(begin, difference(step)))
+
+            if np.linalg.norm(begin) < _NOISE or along(last) >= 0:
                 continue
-            at = self._where(
-                here, last, lambda step, a=apart, told=told: float(np.dot(a, told(step)))
-            )
-            if at is None or np.linalg.norm(told(at)) > _ALIKE:
+            at = self._where(here, last, along)
+            if at is None or np.linalg.norm(difference(at)) > _ALIKE:
                 continue
             if kind == DOUBLING:
                 at, point = self._sprung(at)
@@ -237,26 +244,17 @@ class BranchMonitor:
             if kind == CROSSING:
                 at = self._crossing(here, at, CROSSING)
             values = at.seen.multipliers
-            detail = {
-                FOLD: "a multiplier passes 1 and the branch turns back",
-                DOUBLING: "a multiplier passes -1",
-                CROSSING: "a multiplier passes 1 and another branch crosses",
-                TORUS: "a complex pair of multipliers leaves the unit circle",
-            }[kind]
-            on_circle = {
-                FOLD: np.abs(values - 1).min(),
-                DOUBLING: np.abs(values + 1).min(),
-                CROSSING: np.abs(values - 1).min(),
-                TORUS: np.abs(np.abs(values[np.abs(values.imag) > 1e-9]) - 1).min(initial=np.inf),
-            }[kind]
-            if on_circle < 1e-5:  # or else a pole of the determinant, or a real pair μ, 1/μ
-                found.append((float(np.dot(here.tangent, at.x - here.x)), kind, at, detail))
+            complex_ones = np.abs(values[np.abs(values.imag) > 1e-9])
+            off = {DOUBLING: values + 1, TORUS: complex_ones - 1}.get(kind, values - 1)
+            # Else it is a pole of the determinant, or a real pair μ, 1/μ.
+            if np.abs(off).min(initial=np.inf) < 1e-5:
+                found.append((float(np.dot(here.tangent, at.x - here.x)), kind, at))
         found.sort(key=lambda f: f[0])
-        for _, kind, at, detail in found:
+        for _, kind, at in found:
             if kind == CROSSING and self.symmetric and self._apart(at) < _ALIKE:
-                kind, detail = SYMMETRY, "a multiplier passes 1 and the motion loses its symmetry"
-            self.special.append(self._point(kind, at, detail))
-        return [at for _, _, at, _ in found]
+                kind = SYMMETRY
+            self.special.append(self._point(kind, at, _DETAILS[kind]))
+        return [at for _, _, at in found]
 
     def _shrinks(self, here: Step, at: Step, last: Step) -> bool:
         """Whether an autonomous motion is about to shrink to rest."""
@@ -267,8 +265,8 @@ class BranchMonitor:
 
     def _springs(self, here: Step, at: Step) -> bool:
         """Whether the branch springs there, as is seen by halves of a period becoming alike."""
-        halves, images = self._halves(at), self._images(at)
-        if halves.size and np.linalg.norm(halves) < _ALIKE:
+        apart, images = self._halves(at), self._images(at)
+        if apart.size and np.linalg.norm(apart) < _ALIKE:
             return True
         before = np.linalg.norm(self._images(here))
         close = np.linalg.norm(images) < min(_ALIKE, 0.5 * before)
@@ -317,6 +315,9 @@ class BranchMonitor:
             return np.zeros(0)
         return np.asarray(images_at(self.problem, jnp.asarray(step.x)))
 
+    def _halves(self, step: Step) -> np.ndarray:
+        return halves(self.problem, step.x)
+
     def _apart(self, step: Step) -> float:
         return float(np.linalg.norm(self._images(step)))
 
@@ -328,9 +329,6 @@ class BranchMonitor:
     def path(self, steps: list[Step]) -> list[Step]:
         """The steps of a walk with the bifurcations located between them."""
         return [step for new in steps for step in [*self.between.get(id(new), ()), new]]
-
-    def _halves(self, step: Step) -> np.ndarray:
-        return halves(self.problem, step.x)
 
 
 def _tests(step: Step) -> dict[str, float]:

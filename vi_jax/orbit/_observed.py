@@ -1,38 +1,39 @@
-"""What is seen of a periodic motion, its events' distance from another order among it."""
+"""What is observed of a periodic motion beside its unknowns, at each point of a branch."""
 
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
+from .._types import Scalar
 from ..machine import AbstractMachine
 from ..machine.event import events_of, guard_of, section_number
 from ._events import Event
+from ._turns import Nearest
 
 
 class Observed(NamedTuple):
-    """What is said about a solution."""
+    """What is said about a solution of the equations of an orbit, at one point of a branch."""
 
     multipliers: Complex[Array, " states"]
+    """Eigenvalues of the monodromy matrix, the largest modulus first."""
     monodromy: Float[Array, "states states"]
+    """Derivative by the state just before the first event of the state a period later."""
     approach: Float[Array, " events"]
     """V⁻ at each impact, and how fast the guard rises at each other event; negative where it has
     become impossible."""
-    y_min: Float[Array, ""]
-    y_max: Float[Array, ""]
-    clearance: Float[Array, ""]
-    """Distance to the stop at the turn nearest to one, or of another guard below zero where it is
-    greatest; negative where it is passed through."""
-    touch: Float[Array, ""]
-    """Clock of that turn."""
-    touched: Float[Array, ""]
-    """The number of that event."""
-    order: Float[Array, ""]
+    y_min: Scalar
+    """Smallest position of the first coordinate over the period."""
+    y_max: Scalar
+    nearest: Nearest
+    """Of all its turning points; its `room` is the clearance."""
+    order: Scalar
     """1 where each switch goes into the mode that is its next one here, else -1."""
-    apart: Float[Array, ""]
+    apart: Scalar
     """How far its events are from coming in another order; see `apart`."""
-    duration: Float[Array, ""]
-    averages: dict[str, Float[Array, ""]]
+    duration: Scalar
+    """The period in time."""
+    averages: dict[str, Scalar]
     """The machine's own, over the period."""
 
 
@@ -43,7 +44,7 @@ def apart(
     clock: Float[Array, " legs"],
     lengths: Float[Array, " legs"],
     states: list[Any],
-) -> Float[Array, ""]:
+) -> Scalar:
     """How far the events are from coming in another order: the least time between two that follow
     each other, or the least distance, where one is met, of those that are not met there. Negative
     where the motion is none of the machine's.

@@ -1,11 +1,11 @@
 """Where a branch springs from a motion of half the period of its own."""
 
 import dataclasses
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from jaxtyping import Array
 
 from ._events import Event
 from ._shooting import Shooting
@@ -13,7 +13,7 @@ from ._solve import advance, observe, state_at
 from .curve import Step
 
 
-def halves(problem: Shooting, x: Any) -> np.ndarray:
+def halves(problem: Shooting, x: np.ndarray | Array) -> np.ndarray:
     """How the second half of the period differs from the first; empty if it cannot be alike."""
     events, cycles = problem.events, problem.cycles
     legs = len(events)
@@ -34,6 +34,15 @@ def _alike(events: tuple[Event, ...], cycles: int) -> bool:
     """Whether both halves of a period have the same events."""
     half = len(events) // 2
     return events[:half] == tuple(event.later(-(cycles // 2)) for event in events[half:])
+
+
+def repeated(problem: Shooting, x: np.ndarray | Array, twice: Shooting) -> np.ndarray:
+    """The unknowns of a motion that is gone through twice, as those of the problem `twice`."""
+    clock, states = (np.asarray(a) for a in problem.parts(jnp.asarray(x)))
+    turn = float(problem.period(jnp.asarray(x)))
+    if problem.events:
+        clock, states = np.append(clock, clock + turn), np.concatenate([states, states])
+    return np.asarray(twice.pack(clock, states, x[-len(problem.parameters) :], 2 * turn))
 
 
 def origin(problem: Shooting, at: Step, scale: np.ndarray) -> tuple[Step, Shooting, Step]:
@@ -73,9 +82,5 @@ def origin(problem: Shooting, at: Step, scale: np.ndarray) -> tuple[Step, Shooti
     if not report.converged or not abs(shift) < 1e-2:
         return at, half, advance(half, mean, along, scale, 0.0)
     found = advance(half, mean, along, scale, float(shift))
-    clock, states = (np.asarray(a) for a in half.parts(jnp.asarray(found.x)))
-    turn = float(half.period(jnp.asarray(found.x)))
-    if legs:
-        clock, states = np.append(clock, clock + turn), np.concatenate([states, states])
-    x = np.asarray(problem.pack(clock, states, found.x[-count:], 2 * turn))
+    x = repeated(half, found.x, problem)
     return at._replace(x=x, size=found.size, seen=observe(problem, x)), half, found

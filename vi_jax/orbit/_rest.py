@@ -19,11 +19,9 @@ def _forgets(orbit: Orbit) -> bool:
 
 def _rests_now(orbit: Orbit) -> bool:
     """Whether a body lies still on a stop on the section."""
-    for stop in orbit.machine.stops:
-        body = orbit.machine.coordinates[stop.coordinate]
-        if stop.beyond(body.position(orbit.state)) >= 0 and body.velocity(orbit.state) == 0:
-            return True
-    return False
+    bodies = ((stop, orbit.machine.coordinates[stop.coordinate]) for stop in orbit.machine.stops)
+    x = orbit.state
+    return any(stop.beyond(y.position(x)) >= 0 and y.velocity(x) == 0 for stop, y in bodies)
 
 
 def _comes_to(orbit: Orbit) -> bool:

@@ -1,6 +1,12 @@
-"""The root of the cycle map's residual, and how it moves with the numbers of the machine."""
+"""The root of the cycle map's residual, and its derivative by the implicit function theorem.
 
-from typing import Any, NamedTuple
+With F(x, p) = what the arcs that begin in x lack to end where the next one begins, and p the
+numbers of the machine, the root x(p) of F has dx/dp = -(∂F/∂x)⁻¹ ∂F/∂p: no step of the search is
+differentiated. How a root is searched for is in `root_finders.py`.
+"""
+
+from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -10,31 +16,31 @@ from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Float
 
+from .._types import Vector
 from ..flow import simulate
 from ._neutral import least
 from .cycle_map import CycleMap
-from .root_finders import AbstractRootFinder, search
+from .root_finders import AbstractRootFinder, Found, find_root
 
 
-class Root(NamedTuple):
-    """Starting states of the arcs, as rows, and how the search went; all floats."""
-
-    arcs: Float[Array, "arcs states"]
-    residual: Float[Array, ""]
-    converged: Float[Array, ""]
-    steps: Float[Array, ""]
-    history: Float[Array, " max_steps"]
-
-
-def _missing(arc: CycleMap, arcs: Float[Array, "arcs states"], unravel: Any) -> Array:
-    """What each arc lacks to end where the next one begins."""
+def _missing(
+    arc: CycleMap, arcs: Float[Array, "arcs states"], unravel: Callable[[Vector], Any]
+) -> Float[Array, "arcs states"]:
+    """F: what each arc lacks to end where the next one begins; after the last comes the first."""
     ends = jax.vmap(lambda x: ravel_pytree(arc(unravel(x)))[0])(arcs)
     return ends - jnp.roll(arcs, -1, axis=0)
 
 
 @eqx.filter_custom_jvp
-def root_of(arc: CycleMap, guess: Any, root_finder: AbstractRootFinder) -> Root:
-    """Where the search from a guess ends; differentiated by the implicit function theorem."""
+def root_of(arc: CycleMap, guess: Any, root_finder: AbstractRootFinder) -> Found:
+    """Where a root finder comes to from a guess; differentiated by the numbers of `arc`.
+
+    **Arguments:** the map over one arc; a state on its section, in which the first arc begins, the
+    others where the motion from there is then; the root finder, which says how many arcs there are.
+
+    **Returns:** `Found`, all its numbers floats; its `x` are the states in which the arcs begin, as
+    rows.
+    """
     x, unravel = ravel_pytree(guess)
     arcs = x[None]
     if root_finder.arcs > 1:
@@ -43,15 +49,8 @@ def root_of(arc: CycleMap, guess: Any, root_finder: AbstractRootFinder) -> Root:
         )
         sections = jnp.stack(jtu.tree_leaves(run.sections), axis=-1)[: -1 : arc.cycles]
         arcs = jnp.where(jnp.isfinite(sections), sections, x)
-    found = search(root_finder, lambda arcs: _missing(arc, arcs, unravel), arcs)
-    dtype = x.dtype
-    return Root(
-        found.x,
-        found.residual,
-        found.converged.astype(dtype),
-        found.steps.astype(dtype),
-        found.history,
-    )
+    found = find_root(root_finder, lambda arcs: _missing(arc, arcs, unravel), arcs)
+    return jtu.tree_map(lambda a: a.astype(x.dtype), found)  # numbers all, for `jvp`
 
 
 @root_of.def_jvp
@@ -63,18 +62,19 @@ def _(primals, tangents):
     if not jtu.tree_leaves(tangents[0]):
         return root, still
 
-    jacobians = jax.vmap(lambda x: arc.jacobian(unravel(x)))(root.arcs)
+    jacobians = jax.vmap(lambda x: arc.jacobian(unravel(x)))(root.x)
     _, rate = eqx.filter_jvp(
-        lambda arc: _missing(arc, root.arcs, unravel).ravel(), (arc,), (tangents[0],)
+        lambda arc: _missing(arc, root.x, unravel).ravel(), (arc,), (tangents[0],)
     )
-    move = -least(shooting_matrix(jacobians), rate).reshape(root.arcs.shape)
+    move = -least(shooting_matrix(jacobians), rate).reshape(root.x.shape)
     # Where there is no orbit there is no derivative of one.
     # A product, since the transpose of a choice would be zero.
-    return root, still._replace(arcs=move * jnp.where(root.converged > 0, 1.0, jnp.nan))
+    return root, still._replace(x=move * jnp.where(root.converged > 0, 1.0, jnp.nan))
 
 
 def shooting_matrix(jacobians: Float[Array, "arcs states states"]) -> Float[Array, "all all"]:
-    """Derivative of `_missing` by the arcs, from the derivative of each arc's end by its start."""
+    """∂F/∂x from the derivative Jᵢ of each arc's end by its start: Jᵢ on the diagonal, beside it
+    the -1 by which the next arc's start enters."""
     arcs, states, _ = jacobians.shape
     following = jnp.kron(jnp.roll(jnp.eye(arcs), 1, axis=1), jnp.eye(states))
     return block_diag(*jacobians) - following.astype(jacobians.dtype)

@@ -19,7 +19,7 @@ import jax.tree_util as jtu
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from .._types import Vector
+from .._types import Scalar, Vector
 from ..flow import AbstractMethod
 from ..flow.beside import means
 from ..flow.named import average_names
@@ -29,35 +29,47 @@ from ..machine.numbers import with_leaf
 from ._events import Event, guard_at
 from ._flight import Flight
 from ._observed import Observed, apart
-from ._turns import Turns, turns_of
+from ._turns import turns_of
 from .floquet import multipliers_of
+
+# The number of a leg, which may be traced.
+Leg = int | Array
 
 
 class Shooting(eqx.Module):
-    """The equations of an orbit with given events.
+    """The equations of an orbit with given events: multiple shooting from each event to the next.
 
-    Unknowns, in one vector: the clock at each event, the state just before each, and then the
-    parameters named. A motion without events has its state at the clock's zero instead. Of an
-    autonomous machine the first event is a section, at the clock's zero; the period stands in the
-    place of its clock.
+    A *leg* is the motion from just before event i to just before event i + 1: the event's jump Rᵢ,
+    then the flight over the time in between. With sᵢ the clock at event i, uᵢ the state just before
+    it, gᵢ its guard, φ the flow in the modes of the leg and p the parameters, the equations are
+
+        φ(Rᵢ(uᵢ); sᵢ → sᵢ₊₁) - uᵢ₊₁ = 0,   gᵢ(sᵢ, uᵢ) = 0,   i = 1 … n, cyclically,
+
+    where after the last event comes the first one a period later. The unknowns, in one vector x,
+    are (s₁ … sₙ, u₁ … uₙ, p). Without events there is one leg, from the state at the clock's zero,
+    and x = (u, p). An autonomous machine's first event is a section, at the clock's zero; its
+    period is an unknown and stands in the place of s₁.
     """
 
     machine: AbstractMachine
     method: AbstractMethod
+    """Of fixed steps."""
     like: Any
     """A state, for its structure."""
     cycles: int = eqx.field(static=True)
+    """The period in cycles of the machine."""
     events: tuple[Event, ...] = eqx.field(static=True)
-    """In their order; each begins a flight."""
+    """In their order; each begins a leg."""
     modes: tuple[tuple[float, ...], ...] = eqx.field(static=True)
-    """Of the machine, in each flight."""
+    """The machine's modes in each leg."""
     steps: int = eqx.field(static=True)
-    """Steps of a flight."""
+    """Steps of the flight of a leg."""
     parameters: tuple[str, ...] = eqx.field(static=True)
+    """Names of the machine's numbers that are unknowns."""
 
     @property
     def legs(self) -> int:
-        """Number of flights."""
+        """Number of legs."""
         return max(1, len(self.events))
 
     @property
@@ -101,13 +113,17 @@ class Shooting(eqx.Module):
         return clock, x[legs:end].reshape(legs, self.states)
 
     def period(self, x: Vector) -> Array:
-        """By the clock."""
+        """The period by the clock."""
         if self.autonomous:
             return x[0]
         return jnp.asarray(self.at(x).cycle, x.dtype) * self.cycles
 
     def pack(self, clock: Any, states: Any, parameters: Any, period: Any = None) -> Vector:
-        """The vector of unknowns; of an autonomous machine with the period."""
+        """The vector of unknowns.
+
+        **Arguments:** clock (legs,) and state (legs, states) at each event, both as in `parts`; the
+        parameters' values; of an autonomous machine the period.
+        """
         clock = jnp.asarray(clock) if self.events else jnp.zeros((0,))
         if self.autonomous:
             clock = clock.at[0].set(period)
@@ -117,54 +133,48 @@ class Shooting(eqx.Module):
         """A state from its vector."""
         return ravel_pytree(self.like)[1](u)
 
-    def _modes_in(self, leg: Any) -> tuple[Array, ...]:
-        """Of the machine, in a leg whose number may be traced."""
+    def _modes_in(self, leg: Leg) -> tuple[Array, ...]:
+        """The machine's modes in a leg."""
         if not self.modes[0]:
             return ()
         modes = jnp.asarray(self.modes, jnp.result_type(float))[leg]
         return tuple(modes[j] for j in range(len(self.modes[0])))
 
-    def _each(self, leg: Any, of_event: Callable[[Event], Callable[..., Any]], *inputs: Any) -> Any:
-        """A function that depends on the event of a leg, whose number may be traced."""
+    def _each(self, leg: Leg, function: Callable[..., Any], *inputs: Any) -> Any:
+        """`function(event, *inputs)` of the event that begins a leg."""
         kinds = sorted(set(self.events))
         which = jnp.asarray([kinds.index(event) for event in self.events])[leg]
-        return jax.lax.switch(which, [of_event(kind) for kind in kinds], *inputs)
+        return jax.lax.switch(which, [partial(function, kind) for kind in kinds], *inputs)
 
-    def after(self, machine: AbstractMachine, leg: Any, s: Any, u: Vector) -> Vector:
-        """The state after the event that begins a leg."""
-        if not self.events:
-            return u
+    def after(self, machine: AbstractMachine, leg: Leg, s: Scalar, u: Vector) -> Vector:
+        """R(u), the state after the event that begins a leg."""
 
-        def of(event: Event) -> Callable[..., Vector]:
-            def new(s, u):
-                state, modes = self.unravel(u), self._modes_in(leg - 1)
-                return ravel_pytree(after_event(machine, event.number, s, state, modes)[0])[0]
+        def new(event, s, u):
+            state, modes = self.unravel(u), self._modes_in(leg - 1)
+            return ravel_pytree(after_event(machine, event.number, s, state, modes)[0])[0]
 
-            return new
+        return self._each(leg, new, s, u) if self.events else u
 
-        return self._each(leg, of, s, u)
+    def guard(self, machine: AbstractMachine, leg: Leg, s: Scalar, u: Vector) -> Scalar:
+        """g(s, u), which is zero at the event that begins a leg, and rises there."""
 
-    def guard(self, machine: AbstractMachine, leg: Any, s: Any, u: Vector) -> Array:
-        """What is zero at the event that begins a leg, and rises there."""
+        def value(event, s, u):
+            return guard_at(machine, event, s, self.unravel(u), self._modes_in(leg - 1))
 
-        def of(event: Event) -> Callable[..., Array]:
-            def value(s, u):
-                return guard_at(machine, event, s, self.unravel(u), self._modes_in(leg - 1))
+        return self._each(leg, value, s, u)
 
-            return value
-
-        return self._each(leg, of, s, u)
-
-    def ends(self, clock: Float[Array, " legs"], period: Any) -> Float[Array, " legs"]:
+    def ends(self, clock: Float[Array, " legs"], period: Scalar) -> Float[Array, " legs"]:
         """Clock at the end of each leg."""
         return jnp.concatenate([clock[1:], clock[:1] + period])
 
-    def flight(self, machine: AbstractMachine, leg: Any) -> Flight:
-        """The flight of a leg, whose number may be traced."""
+    def flight(self, machine: AbstractMachine, leg: Leg) -> Flight:
+        """The flight of a leg."""
         return Flight(machine, self._modes_in(leg), self.method, self.like)
 
     def residual(self, x: Vector) -> Vector:
-        """What the flights from event to event lack; zero for a periodic motion."""
+        """The left sides of the equations: what each leg lacks to end where the next one begins,
+        then the guards; zero for a periodic motion. Its Jacobian is taken forward (`jacobian_at`,
+        `curve.corrected`), so that each leg is carried along with its derivatives."""
         machine = self.at(x)
         clock, states = self.parts(x)
 
@@ -181,7 +191,11 @@ class Shooting(eqx.Module):
         return jnp.concatenate([(arrived - jnp.roll(states, -1, axis=0)).ravel(), away.ravel()])
 
     def observe(self, x: Vector) -> Observed:
-        """Multipliers, extremes and the distances to grazing of a solution."""
+        """Multipliers, extremes and the distances to grazing of a solution `x`.
+
+        The monodromy matrix is the product over the legs of a flight's derivative times the
+        saltation matrix of the event that begins it.
+        """
         machine = self.at(x)
         clock, states = self.parts(x)
         averages = average_names(machine, self.unravel(states[0]))
@@ -198,9 +212,10 @@ class Shooting(eqx.Module):
             if self.events:
                 saltation, rises = self._saltation(machine, leg, s0, u)
                 carried, approach = carried @ saltation, rises[None]
-                order = self._each(leg, partial(self._order, machine, leg), s0, u)
+                order = self._order(machine, leg, s0, u)
             places = [machine.position(self.unravel(x)) for x in (u, after)]
-            return carried, passed, approach, order, self._turns(machine, leg, s1, path), places
+            turns = turns_of(self.flight(machine, leg), path[0], path[1], (s1 - s0) / self.steps)
+            return carried, passed, approach, order, turns, places
 
         legs = jnp.arange(len(states))
         ends = self.ends(clock, self.period(x))
@@ -209,8 +224,8 @@ class Shooting(eqx.Module):
         monodromy = jnp.eye(self.states, dtype=x.dtype)
         for leg in range(len(states)):
             monodromy = carried[leg] @ monodromy
-        Y = jnp.concatenate(places)
-        nearest = jnp.argmin(turns.room)
+        Y, before = jnp.concatenate(places), [self.unravel(u) for u in states]
+        nearest = jnp.argmin(turns.nearest.room)
         time, integrals = jax.tree.map(jnp.sum, passed)
         timed = self.autonomous or machine.pace(clock[0], self.unravel(states[0])) is not None
         return Observed(
@@ -219,40 +234,33 @@ class Shooting(eqx.Module):
             approach=approach.ravel(),
             y_min=jnp.minimum(jnp.min(Y), jnp.min(turns.low)),
             y_max=jnp.maximum(jnp.max(Y), jnp.max(turns.high)),
-            clearance=turns.room[nearest],
-            touch=turns.touch[nearest],
-            touched=turns.touched[nearest],
+            nearest=jax.tree.map(lambda x: x[nearest], turns.nearest),
             order=jnp.min(order),
-            apart=apart(
-                machine,
-                self.events,
-                self.modes,
-                clock,
-                ends - clock,
-                [self.unravel(u) for u in states],
-            ),
+            apart=apart(machine, self.events, self.modes, clock, ends - clock, before),
             duration=time if timed else jnp.asarray(machine.period, x.dtype) * self.cycles,
             averages=means(integrals, time),
         )
 
-    def _saltation(self, machine, leg, s, u):
-        """How a perturbation passes an event, R + (f⁺ - R f⁻) ∇g / ġ, and how fast it is met.
+    def _saltation(
+        self, machine: AbstractMachine, leg: Leg, s: Scalar, u: Vector
+    ) -> tuple[Float[Array, "states states"], Scalar]:
+        """How a perturbation passes the event that begins a leg: the saltation matrix
+        DR + (f⁺ - DR f⁻) ∇g / ġ, with ġ = ∇g·f⁻ + ∂g/∂s; and how fast the event is met.
 
-        R is the jump as a function of the state; ġ counts what the guard gains by the clock.
+        The jump is differentiated where the body is, not put on its stop first (`jump_of`): it is
+        ∇g that says what comes of the time of the event.
         """
         old, new = (self.flight(machine, x).smooth for x in (leg - 1, leg))
 
         def field(machine, u):
             return ravel_pytree(machine.field(s, self.unravel(u)))[0]
 
-        def reset(u):
-            def of(event: Event) -> Callable[..., Vector]:
-                modes = self._modes_in(leg - 1)
-                return lambda u: ravel_pytree(
-                    jump_of(machine, event.number, s, self.unravel(u), modes)
-                )[0]
+        def jumped(event, u):
+            state, modes = self.unravel(u), self._modes_in(leg - 1)
+            return ravel_pytree(jump_of(machine, event.number, s, state, modes))[0]
 
-            return self._each(leg, of, u)
+        def reset(u):
+            return self._each(leg, jumped, u)
 
         jacobian = jax.jacfwd(reset)(u)
         before, after = field(old, u), field(new, reset(u))
@@ -263,22 +271,16 @@ class Shooting(eqx.Module):
         gained, slope = jax.grad(lambda s, u: self.guard(machine, leg, s, u), argnums=(0, 1))(s, u)
         rate = gained + jnp.dot(slope, before)
 
-        def met(event: Event) -> Callable[..., Array]:
-            return lambda u, rate: event.of(machine).speed(machine, self.unravel(u), rate)
+        def met(event, u, rate):
+            return event.of(machine).speed(machine, self.unravel(u), rate)
 
         approach = self._each(leg, met, u, rate)
         return jacobian + jnp.outer(after - jacobian @ before, slope) / rate, approach
 
-    def _turns(self, machine: AbstractMachine, leg: Any, s1: Array, path: Any) -> Turns:
-        """The turning points of a leg."""
-        places, states = path
-        h = (s1 - places[0]) / self.steps
-        return turns_of(self.flight(machine, leg), places, states, h)
+    def _order(self, machine: AbstractMachine, leg: Leg, s: Scalar, u: Vector) -> Scalar:
+        """Whether a switch goes into the mode of the leg that begins with its event: 1 or -1."""
 
-    def _order(self, machine: AbstractMachine, leg: Any, event: Event) -> Callable[..., Array]:
-        """Whether a switch goes into the mode of the flight that begins with its event: 1 or -1."""
-
-        def order(s, u):
+        def order(event, s, u):
             if not event.of(machine).holds_mode:
                 return jnp.ones_like(s)
             j, before = mode_number(machine, event.number), self._modes_in(leg - 1)
@@ -286,9 +288,9 @@ class Shooting(eqx.Module):
             wanted = self._modes_in(leg)[j]
             return jnp.where(mode == wanted, 1.0, -1.0).astype(s.dtype)
 
-        return order
+        return self._each(leg, order, s, u)
 
-    def state_at(self, x: Vector, leg: Any, s: Array) -> Any:
+    def state_at(self, x: Vector, leg: Leg, s: Scalar) -> Any:
         """The state at clock `s`, which lies in leg number `leg`."""
         machine = self.at(x)
         clock, states = self.parts(x)

@@ -5,8 +5,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from .._programs import compiled
+from .._types import Scalar
 from ._shooting import Shooting
 from .curve import Step
 from .results import ORBIT_RESULTS, Orbit
@@ -18,13 +20,14 @@ def _compiled_sections(problem, x, legs, places):
     return states, jnp.max(jnp.abs(problem.residual(x)))
 
 
-def _clock_of(problem: Shooting, x: Any) -> tuple[np.ndarray, float]:
+def _clock_of(problem: Shooting, x: Array) -> tuple[np.ndarray, float]:
     """Clock of each event, and the period by the clock."""
     return np.asarray(problem.parts(x)[0])[: len(problem.events)], float(problem.period(x))
 
 
-def sections_of(problem: Shooting, x: Any) -> tuple[Any, Any]:
-    """The states on the sections of a solution, and what it lacks to be one."""
+def sections_of(problem: Shooting, x: np.ndarray | Array) -> tuple[Any, Scalar]:
+    """The states on the sections of a solution, leaves (cycles,), and the largest component of its
+    residual."""
     x = jnp.asarray(x)
     clock, period = _clock_of(problem, x)
     begins = [i for i, event in enumerate(problem.events) if event.cycle is not None]
@@ -45,7 +48,7 @@ def orbit_of(problem: Shooting, step: Step) -> Orbit:
     machine = problem.at(x)
     clock, period = _clock_of(problem, x)
     sections, residual = sections_of(problem, x)
-    admissible = seen.clearance >= -1e-9 and min(seen.approach, default=1.0) > -1e-9
+    admissible = seen.nearest.room >= -1e-9 and min(seen.approach, default=1.0) > -1e-9
     # Along a branch an impact may move past the section: an orbit's clocks lie within its period.
     impacts = np.asarray(problem.impacts, int)
     within = np.mod(clock[impacts], period)
@@ -67,7 +70,7 @@ def orbit_of(problem: Shooting, step: Step) -> Orbit:
         impacts=jnp.asarray(len(impacts), jnp.int32),
         y_min=jnp.asarray(seen.y_min),
         y_max=jnp.asarray(seen.y_max),
-        clearance=jnp.asarray(seen.clearance),
+        clearance=jnp.asarray(seen.nearest.room),
         monodromy=jnp.asarray(seen.monodromy),
         multipliers=jnp.asarray(seen.multipliers),
         residual=residual,

@@ -9,20 +9,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from jaxtyping import Array
 
 from .._programs import compiled
+from .._types import Vector
 from ..flow.arguments import planned
 from ..flow.loop import run_lane
 from ..flow.methods import MethodLike
 from ..flow.options import RunOptions
 from ..flow.simulate import collect
-from ..machine import Scene
+from ..machine import AbstractMachine
 from ..machine.base import renews
 from ..machine.event import after_event, begin_modes, events_of, is_autonomous
-from ..machine.numbers import leaf, with_leaf
+from ..machine.numbers import check_again, leaf, with_leaf
 from ._events import Event, section_of
 from ._fixed_step_method import fixed_step_method, steps_of
 from ._flight import Flight
+from ._observed import Observed
 from ._shooting import Shooting
 from ._symmetry import images
 from .curve import Step, array_of, corrected, first_tangent
@@ -39,6 +42,10 @@ _SETTLED, _MOST = 1e-11, 4096
 _SHORT_OF = (1e-6, 1e-5, 1e-4, 1e-3)
 
 
+# Of an orbit, as numbers of the host or of a compiled call.
+Unknowns = np.ndarray | Array
+
+
 class _NoValueError(ArithmeticError):
     """A test has no value, because the corrector has no answer there."""
 
@@ -47,13 +54,28 @@ class _NoValueError(ArithmeticError):
 class Equations(Protocol):
     """What is solved here: an orbit's equations, or those with a condition beside them."""
 
-    def residual(self, x: Any) -> Any:
+    def residual(self, x: Vector) -> Vector:
         """What the unknowns `x` lack to be a solution."""
         ...
 
-    def observe(self, x: Any) -> Any:
-        """What is seen of a solution."""
+    def observe(self, x: Vector) -> Observed:
+        """What is observed of a solution."""
         ...
+
+
+def check_parameter(
+    machine: AbstractMachine, name: str, value: float, interval: tuple[float, float], whose: str
+) -> None:
+    """**Raises:** `ValueError` unless the interval of a machine's number holds its value, `whose`
+    in words, and the machine can be one with either end of it."""
+    low, high = interval
+    if not low <= value <= high:
+        raise ValueError(
+            f"Argument `bounds` must hold the {whose}'s {name} = {value:g}, but is "
+            f"({low:g}, {high:g})."
+        )
+    for end in interval:
+        check_again(with_leaf(machine, name, end))
 
 
 def problem_of(
@@ -72,12 +94,9 @@ def problem_of(
     steps = steps_of(carried, corners, orbit.state, cycles)
     found = events_in(orbit)
     blank = Shooting(machine, carried, orbit.state, cycles, (), (), steps, (parameter,))
-    period = float(machine.cycle) * cycles
-    if blank.autonomous:
-        period = float(orbit.duration)
+    period = float(orbit.duration) if blank.autonomous else float(machine.cycle) * cycles
     way = _followed(blank, orbit.state, found, period)
-    known = isinstance(machine, Scene) and not machine.soft_stops  # steps that are enough
-    while not known:
+    while not machine.scales_known:
         finer = dataclasses.replace(blank, steps=2 * blank.steps)
         again = _followed(finer, orbit.state, found, period)
         apart = np.max(np.abs(again.states - way.states) / (1 + np.abs(again.states)))
@@ -88,21 +107,22 @@ def problem_of(
             break
     problem = dataclasses.replace(blank, events=tuple(event for _, event in found), modes=way.modes)
     states = way.states[:-1] if found else way.states
-    value = leaf(machine, parameter)
-    x = problem.pack([place for place, _ in found], states, [value], period)
+    x = problem.pack([place for place, _ in found], states, [leaf(machine, parameter)], period)
     return problem, np.asarray(x)
 
 
 class _Way(NamedTuple):
-    """A motion followed from event to event."""
+    """A motion over one period, followed from event to event."""
 
     states: np.ndarray
-    """Just before each, and at the end of the period."""
+    """Just before each event, and at the end of the period; (events + 1, states)."""
     modes: tuple[tuple[float, ...], ...]
-    """Of each flight."""
+    """The machine's modes in each flight."""
 
 
 def _followed(blank: Shooting, state: Any, found: list[tuple[float, Event]], period: float) -> _Way:
+    """**Arguments:** the problem without events; the state on the section; clock and event of all
+    that is met within the period, in their order; the period by the clock."""
     machine = blank.machine
     modes = begin_modes(machine, jnp.zeros(()), state)
     u, s = ravel_pytree(state)[0], 0.0
@@ -189,8 +209,11 @@ def _compiled_advance(equations, x, tangent, scale, length) -> Step:
     return corrected(equations.residual, observe, x, tangent, scale, length)
 
 
-def advance(equations: Equations, x, tangent, scale, length) -> Step:
-    """The solution at this length along a tangent from `x` (scaled unknowns)."""
+def advance(
+    equations: Equations, x: Unknowns, tangent: Unknowns, scale: Unknowns, length: float | Array
+) -> Step:
+    """The solution at this length along a unit tangent from `x`, both measured in unknowns divided
+    by `scale` (see `curve.corrected`)."""
     arguments = (jnp.asarray(a) for a in (x, tangent, scale, length))
     return array_of(_compiled_advance(equations, *arguments))
 
@@ -200,8 +223,8 @@ def _compiled_observe(problem, x):
     return problem.observe(x)
 
 
-def observe(problem: Shooting, x: np.ndarray) -> Any:
-    """What is seen of a solution: multipliers, extremes, clearance, speeds of approach."""
+def observe(problem: Shooting, x: np.ndarray) -> Observed:
+    """What is observed of a solution: multipliers, extremes, clearance, speeds of approach."""
     return array_of(_compiled_observe(problem, jnp.asarray(x)))
 
 
@@ -284,7 +307,7 @@ def located(
     def off(place: tuple[float, Step]) -> tuple[float, bool, float]:
         """How far a point is from it; of a test that only jumps, the last one before the jump is
         closest."""
-        told = test(place[1])
-        return abs(told), bool(told * begin < 0), abs(place[0] - root)
+        left = test(place[1])
+        return abs(left), bool(left * begin < 0), abs(place[0] - root)
 
     return min(good, key=off)[1] if good else None

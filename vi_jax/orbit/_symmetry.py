@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from ..machine import AbstractMachine, RigidStop
+from ..machine import AbstractMachine
 from ._events import Event
 from ._shooting import Shooting
 
@@ -28,10 +28,11 @@ def may_be_symmetric(problem: Shooting, machines: Iterable[AbstractMachine]) -> 
 
 
 def _are_images(machine: AbstractMachine, one: Event, other: Event) -> bool:
-    left, right = one.of(machine), other.of(machine)
-    if isinstance(left, RigidStop) and isinstance(right, RigidStop):
+    stops = machine.stops
+    if max(one.number, other.number) < len(stops):  # stops come first among the events
+        left, right = stops[one.number], stops[other.number]
         return left.coordinate == right.coordinate and left.sign == -right.sign
-    return left.holds_mode and right.holds_mode
+    return one.of(machine).holds_mode and other.of(machine).holds_mode
 
 
 def images(problem: Shooting, x: Float[Array, " unknowns"]) -> Float[Array, " differences"]:

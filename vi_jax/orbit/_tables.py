@@ -1,4 +1,4 @@
-"""What is told of a branch, point by point."""
+"""What tables and pictures show of a branch, point by point."""
 
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any

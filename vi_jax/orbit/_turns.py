@@ -1,4 +1,8 @@
-"""Where a flight comes nearest to what it does not meet."""
+"""Where a flight turns, and how near it comes there to an event that it does not meet.
+
+A body turns where its velocity vanishes, the guard g of an event where dg/ds does. Along a branch
+such a turn grows until it touches: the motion ends there in a grazing.
+"""
 
 from functools import partial
 from typing import Any, NamedTuple
@@ -9,7 +13,7 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
-from .._types import Scalar, Vector
+from .._types import Flag, Scalar, Vector
 from ..flow.beside import Beside
 from ..flow.events import Rates, guard_rates
 from ..flow.smooth import SmoothMachine
@@ -20,27 +24,37 @@ from ._flight import Flight
 _TURNED = 1e-3
 
 
+class Nearest(NamedTuple):
+    """The turning point that is nearest to an event which does not happen there."""
+
+    room: Scalar
+    """Distance to the stop at a body's turn; of another event how far its guard stays below zero.
+    Negative where it is passed through, infinite if there is no such turn."""
+    clock: Scalar
+    """Clock of the turn."""
+    event: Scalar
+    """The number of the event."""
+
+
 class Turns(NamedTuple):
-    """What the turning points of a flight say."""
+    """What the turning points of a flight say of its extremes and of grazing."""
 
     low: Scalar
-    """The least Y at one."""
+    """The least position of the first coordinate at one; infinite if there is none."""
     high: Scalar
-    room: Scalar
-    """The smallest distance to a stop at one, or of another guard below zero."""
-    touch: Scalar
-    """Clock there."""
-    touched: Scalar
-    """The number of that event."""
+    """The greatest; -infinite if there is none."""
+    nearest: Nearest
 
 
 class _Found(NamedTuple):
-    """The turning points of a function of the state, one for each step."""
+    """The turning points of a function of the state along a flight, one for each step."""
 
     turns: Bool[Array, " steps"]
-    """Whether there is one."""
+    """Whether there is one within the step."""
     height: Float[Array, " steps"]
+    """The function there."""
     place: Float[Array, " steps"]
+    """Clock there."""
     before: Float[Array, " steps"]
     """The function's rate, or one of its sign, at the start of the step."""
     happens: Bool[Array, " steps"]
@@ -48,32 +62,32 @@ class _Found(NamedTuple):
 
 
 class _Guard(NamedTuple):
-    """What turns: the guard of an event."""
+    """What turns: the guard of an event, by the event's number; of a machine on a flight."""
 
     number: int
 
-    def value(self, flight: Flight, s: Any, state: Any) -> Any:
-        """Of it."""
+    def value(self, flight: Flight, s: Scalar, state: Any) -> Scalar:
+        """The guard in a state."""
         return guard_of(flight.machine, self.number, s, state, flight.modes)
 
-    def at(self, flight: Flight, s: Any, u: Any) -> Any:
-        """Of it, by the state's vector."""
+    def at(self, flight: Flight, s: Scalar, u: Vector) -> Scalar:
+        """The guard, by the state's vector."""
         return self.value(flight, s, flight.unravel(u))
 
-    def rate(self, flight: Flight, s: Any, u: Any) -> Any:
-        """Its rate, or one of its sign."""
+    def rate(self, flight: Flight, s: Scalar, u: Vector) -> Scalar:
+        """d/ds of the guard along the flight, or a number of its sign."""
         return self.rates(flight, flight.smooth, s, u).v
 
-    def happens(self, flight: Flight, s: Any, u: Any, length: Any) -> Any:
-        """Whether the event would happen if it were met a length from here."""
+    def happens(self, flight: Flight, s: Scalar, u: Vector, length: Scalar) -> Flag:
+        """Whether the event would happen if its guard were zero a length from here."""
         if not events_of(flight.machine)[self.number].from_below:
             return jnp.ones((), bool)
         there = flight.unravel(_stepped(flight, (s, length, u)))
         when = happens_at(flight.machine, self.number, s + length, there, flight.modes)
         return jnp.ones((), bool) if when is None else when
 
-    def rates(self, flight: Flight, smooth: SmoothMachine, s: Any, u: Any) -> Rates:
-        """It and its first two derivatives."""
+    def rates(self, flight: Flight, smooth: SmoothMachine, s: Scalar, u: Vector) -> Rates:
+        """The guard and its first two derivatives by s."""
 
         def guard(s, state):
             return self.value(flight, s, state)
@@ -82,7 +96,7 @@ class _Guard(NamedTuple):
 
 
 class _Body(_Guard):
-    """A coordinate of the machine."""
+    """What turns: a coordinate, by its number among the machine's."""
 
     def value(self, flight, s, state):
         return flight.machine.coordinates[self.number].position(state)
@@ -138,22 +152,30 @@ def turns_of(
     room, touch = jnp.full((), jnp.inf, h.dtype), jnp.zeros((), h.dtype)
     touched = touch
     for i, (values, place) in enumerate(rooms):
-        nearest = jnp.argmin(values)
-        touch = jnp.where(values[nearest] < room, place[nearest], touch)
-        touched = jnp.where(values[nearest] < room, float(i), touched)
-        room = jnp.minimum(room, values[nearest])
+        least = jnp.argmin(values)
+        touch = jnp.where(values[least] < room, place[least], touch)
+        touched = jnp.where(values[least] < room, float(i), touched)
+        room = jnp.minimum(room, values[least])
     low = jnp.min(jnp.where(bodies[0].turns, bodies[0].height, jnp.inf))
     high = jnp.max(jnp.where(bodies[0].turns, bodies[0].height, -jnp.inf))
-    return Turns(low, high, room, touch, touched)
+    return Turns(low, high, Nearest(room, touch, touched))
 
 
-def _stepped(flight: Flight, inputs: Any) -> Vector:
+def _stepped(flight: Flight, inputs: tuple[Scalar, Scalar, Vector]) -> Vector:
+    """The state after a step from clock, by a length, from a state."""
     s, h, u = inputs
     return flight.step(s, s + h, u, Beside(jnp.zeros_like(s), {}))[0]
 
 
-def _turn(watched: _Guard, flight: Flight, inputs: Any) -> _Found:
-    """Where it changes sign within a step, Newton's method from the step's start."""
+def _turn(
+    watched: _Guard, flight: Flight, inputs: tuple[Scalar, Scalar, Vector, Scalar, Scalar]
+) -> _Found:
+    """The turning point within a step, if the rate changes its sign: by Newton's method on the
+    length from the step's start, each trial a step of the method itself.
+
+    **Arguments:** what turns; the flight; length of the step, clock and state where it begins, and
+    the rate at both ends.
+    """
     h, s, u, v0, v1 = inputs
     # A turn may fall on the end of a step.
     turns = (v0 * v1 < 0) | ((v1 == 0) & (v0 != 0))

@@ -13,17 +13,16 @@ from .._checks import interval
 from .._interrupted import Interrupted
 from .._lazy import lazy
 from ..flow.labelled import tidy
-from ..machine.numbers import check_again, check_leaf, leaf, with_leaf
-from ..machine.shown import summary_table
+from ..machine.numbers import check_leaf, leaf
 from ..machine.units import with_units
 from ._fixed_step_method import steps_of
 from ._shooting import Shooting
 from ._solution import orbit_of
 from ._solve import advance as solved
-from ._solve import jacobian_at, tangent_at
+from ._solve import check_parameter, jacobian_at, tangent_at
 from ._symmetry import images, may_be_symmetric
 from .curve import INTERRUPTED, Step, Walk, check_walk, walk
-from .results import Orbit
+from .results import InWords, Orbit
 from .special import DOUBLING, FOLD, GRAZING, SYMMETRY, SpecialPoint
 
 if TYPE_CHECKING:
@@ -34,9 +33,12 @@ else:
 # What lies below zero by no more than this is zero to rounding.
 _NOISE = 1e-9
 
+# Of the first and of the second parameter.
+Intervals = tuple[tuple[float, float], tuple[float, float]]
 
-@dataclasses.dataclass(frozen=True)
-class Boundary:
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Boundary(InWords):
     """A curve in two parameters along which an orbit bifurcates: host arrays, a row a point, in the
     machine's units (see `AbstractMachine.units`)."""
 
@@ -67,8 +69,8 @@ class Boundary:
     def to_xarray(self, *, along: str | None = None) -> "xr.Dataset":
         """The curve as an `xarray.Dataset` over its points, the two parameters by their names.
 
-        **Arguments:** `along`, to keep only what is told along one dimension: `"point"`, `"impact"`
-        or `"state"` (the multipliers), which then makes a table without repetitions.
+        **Arguments:** `along`, to keep only what has one dimension: `"point"`, `"impact"` or
+        `"state"` (the multipliers), which then makes a table without repetitions.
 
         **Raises:** `ValueError` if there is no such dimension.
         """
@@ -90,11 +92,6 @@ class Boundary:
             f"[{low[0]:.6g}, {high[0]:.6g}], {self.names[1]} in [{low[1]:.6g}, {high[1]:.6g}]; "
             f"ends: {self.ends[0]}, {self.ends[1]}"
         )
-
-    __repr__ = __str__
-
-    def _repr_html_(self) -> str:
-        return summary_table(str(self), self.y_min)
 
 
 def boundary(
@@ -125,6 +122,40 @@ def boundary(
     unknown or the same; on Ctrl-C `Interrupted`, whose `partial` is the curve so far.
     """
     settings = check_walk(step=step, max_step=max_step, max_points=max_points)
+    _check_point(point)
+    bounds = _checked_bounds(point, parameter, bounds)
+    condition, x = _special_motion(point, parameter, bounds)
+    scale = np.ones(x.size)
+    scale[-2:] = [0.5 * (high - low) for low, high in bounds]
+
+    def advance(x: Any, tangent: Any, length: float) -> Step:
+        return solved(condition, x, tangent, scale, length)
+
+    start = advance(x, tangent_at(condition, x, scale), 0.0)
+    if not bool(start.good):
+        raise ValueError(
+            "Argument `point` could not be refined in two parameters (last correction "
+            f"{float(start.size):.2g})."
+        )
+
+    def stop(here: Step, new: Step) -> tuple[Step, str] | None:
+        if not _inside(new, bounds):
+            return _cut(advance, here, new, bounds, scale), "bounds"
+        return (here, "grazing") if condition.another_grazes(new) else None
+
+    forward = walk(advance, start, stop=stop, **settings)
+    backward = Walk([start], INTERRUPTED)
+    if forward.end != INTERRUPTED:
+        backward = walk(advance, start._replace(tangent=-start.tangent), stop=stop, **settings)
+    path = [*reversed(backward.steps[1:]), *forward.steps]
+    curve = _curve(condition, path, (backward.end, forward.end))
+    if INTERRUPTED in curve.ends:
+        raise Interrupted("walk along the boundary", curve)
+    return curve
+
+
+def _check_point(point: SpecialPoint) -> None:
+    """**Raises:** `TypeError` or `ValueError` unless this is a bifurcation that can be followed."""
     if not isinstance(point, SpecialPoint):
         raise TypeError(
             f"Argument `point` must be a `SpecialPoint`, from `Branch.special`, but got {point!r}."
@@ -139,11 +170,15 @@ def boundary(
             "Argument `point` must be a grazing at which something is touched, but there "
             f"{point.detail}."
         )
-    old = point.problem
-    check_leaf(old.machine, parameter)
-    names = (old.parameters[0], parameter)
-    if names[0] == names[1]:
-        raise ValueError(f"Argument `parameter` must be another one than {names[0]}.")
+
+
+def _checked_bounds(point: SpecialPoint, parameter: str, bounds: Any) -> Intervals:
+    """The intervals of both parameters. **Raises:** `ValueError` for what is none, or does not hold
+    the point."""
+    machine, name = point.problem.machine, point.problem.parameters[0]
+    check_leaf(machine, parameter)
+    if name == parameter:
+        raise ValueError(f"Argument `parameter` must be another one than {name}.")
     try:
         first, second = bounds
     except (TypeError, ValueError):
@@ -151,125 +186,108 @@ def boundary(
             "Argument `bounds` must be an interval for each of the two parameters, but got "
             f"{bounds!r}."
         ) from None
-    bounds = (interval("bounds", first), interval("bounds", second))
-    values = (point.parameter, float(leaf(old.machine, parameter)))
-    for name, value, (low, high) in zip(names, values, bounds, strict=True):
-        if not low <= value <= high:
-            raise ValueError(
-                f"Argument `bounds` must hold the point's {name} = {value:g}, but is "
-                f"({low:g}, {high:g})."
-            )
-        for bound in (low, high):
-            check_again(with_leaf(old.machine, name, bound))
-    corners = []
-    for a in bounds[0]:
-        for b in bounds[1]:
-            probe = dataclasses.replace(old, parameters=names)
-            corners.append(probe.at(jnp.asarray([a, b])))
+    first, second = interval("bounds", first), interval("bounds", second)
+    check_parameter(machine, name, point.parameter, first, "point")
+    check_parameter(machine, parameter, float(leaf(machine, parameter)), second, "point")
+    return first, second
+
+
+def _special_motion(
+    point: SpecialPoint, parameter: str, bounds: Intervals
+) -> tuple["SpecialMotion", np.ndarray]:
+    """The equations of the curve, and their unknowns at the point where it begins."""
+    old = point.problem
+    two = dataclasses.replace(old, parameters=(*old.parameters, parameter))
+    corners = [two.at(jnp.asarray([a, b])) for a in bounds[0] for b in bounds[1]]
     steps = max(old.steps, steps_of(old.method, corners, old.like, old.cycles))
-    problem = dataclasses.replace(old, parameters=names, steps=steps)
+    problem = dataclasses.replace(two, steps=steps)
+    values = point.parameter, float(leaf(old.machine, parameter))
     x = np.append(np.asarray(point.step.x)[:-1], values)
-    scale = np.ones(problem.size)
-    scale[-2:] = [0.5 * (high - low) for low, high in bounds]
-    lone = None
+    symmetry = None
     if point.kind == SYMMETRY:
         if not may_be_symmetric(problem, corners):
             raise ValueError(
                 "Argument `parameter` must leave the machine its symmetry, but with another "
                 f"{parameter} a motion is not its own image."
             )
-        lone = _lone(problem, x)
-    condition = _Condition(problem, point.kind, point.impact, lone)
-    tangent = tangent_at(condition, x, scale)
+        symmetry = _symmetry_condition(problem, x)
+    return SpecialMotion(problem, point.kind, point.impact, symmetry), x
 
-    def advance(x: Any, tangent: Any, length: float) -> Step:
-        return solved(condition, x, tangent, scale, length)
 
-    start = advance(x, tangent, 0.0)
-    if not bool(start.good):
-        raise ValueError(
-            "Argument `point` could not be refined in two parameters (last correction "
-            f"{float(start.size):.2g})."
-        )
-
-    def stop(here: Step, new: Step) -> tuple[Step, str] | None:
-        inside = all(
-            low <= value <= high for value, (low, high) in zip(new.x[-2:], bounds, strict=True)
-        )
-        if not inside:
-            return _cut(advance, here, new, bounds, scale), "bounds"
-        # In a symmetric motion another impact grazes as well, to rounding.
-        others = [v + _NOISE for i, v in enumerate(new.seen.approach) if i != condition.impact]
-        # At a grazing the body turns on the stop, to rounding.
-        touching = point.kind == GRAZING and condition.impact is None
-        if min(others, default=1.0) <= 0 or (not touching and new.seen.clearance < -_NOISE):
-            return here, "grazing"
-        return None
-
-    forward = walk(advance, start, stop=stop, **settings)
-    backward = Walk([start], INTERRUPTED)
-    if forward.end != INTERRUPTED:
-        backward = walk(advance, start._replace(tangent=-start.tangent), stop=stop, **settings)
-    path = [*reversed(backward.steps[1:]), *forward.steps]
-    curve = Boundary(
-        kind=point.kind,
-        names=names,
+def _curve(condition: "SpecialMotion", path: list[Step], ends: tuple[str, str]) -> Boundary:
+    problem, seen = condition.problem, [step.seen for step in path]
+    return Boundary(
+        kind=condition.kind,
+        names=(problem.parameters[0], problem.parameters[1]),
         parameters=np.stack([step.x[-2:] for step in path]),
-        y_min=np.array([step.seen.y_min for step in path]),
-        multipliers=np.stack([step.seen.multipliers for step in path]),
-        impact_speed=np.stack([step.seen.approach[list(problem.impacts)] for step in path]),
-        clearance=np.array([step.seen.clearance for step in path]),
-        ends=(backward.end, forward.end),
+        y_min=np.array([at.y_min for at in seen]),
+        multipliers=np.stack([at.multipliers for at in seen]),
+        impact_speed=np.stack([at.approach[list(problem.impacts)] for at in seen]),
+        clearance=np.array([at.nearest.room for at in seen]),
+        ends=ends,
         problem=problem,
         steps=path,
     )
-    if INTERRUPTED in curve.ends:
-        raise Interrupted("walk along the boundary", curve)
-    return curve
 
 
 class SymmetryCondition(eqx.Module):
-    """What keeps a symmetric motion symmetric.
+    """The condition that a motion is its own image under the symmetry of its machine, in the place
+    of one of its equations.
 
-    Where it loses its symmetry the equations cannot be solved for it: a departure along the
-    direction in which it does so is missed by none of them, and one combination of them is met by
-    every symmetric motion. That one gives way to the condition to be symmetric.
+    The motions x of the equations F(x, p) = 0 from event to event are symmetric where D(x), their
+    difference from their own image (`images`), vanishes. Where they lose their symmetry F cannot be
+    solved for x: its Jacobian J = ∂F/∂x has a null vector r, along which the motion departs from
+    its image, and a left null vector l, so that l·F = 0 is met by every symmetric motion close by
+    to first order. That combination of the equations gives way to w·D = 0, where w picks out of D
+    how far the motion has gone along r:
+
+        F + l (w·D - l·F) = 0,   w = DD r/|DD r|²,   DD the derivative of D by x.
+
+    These equations are regular, and the curve's own condition det(M - I) = 0 is added to them.
     """
 
     left: Float[Array, " equations"]
-    """That combination."""
+    """l."""
     weight: Float[Array, " differences"]
-    """Of what tells the motion from its image, as that direction does."""
+    """w."""
 
     def instead(self, problem: Shooting, missing: Array, x: Array) -> Array:
-        """What the equations lack, that one exchanged."""
+        """The equations' residual F, `missing`, with that combination exchanged."""
         departs = self.weight @ images(problem, x)
         return missing + self.left * (departs - self.left @ missing)
 
 
-def _lone(problem: Shooting, x: np.ndarray) -> SymmetryCondition:
+def _symmetry_condition(problem: Shooting, x: np.ndarray) -> SymmetryCondition:
+    """The condition at a motion that loses its symmetry, by the singular vectors of its Jacobian
+    without the columns of the parameters."""
     count = len(problem.parameters)
     left, _, right = np.linalg.svd(np.asarray(jacobian_at(problem, jnp.asarray(x)))[:, :-count])
     direction = jnp.append(jnp.asarray(right[-1]), jnp.zeros(count))
-    told = jax.jvp(lambda x: images(problem, x), (jnp.asarray(x),), (direction,))[1]
-    return SymmetryCondition(jnp.asarray(left[:, -1]), told / (told @ told))
+    change = jax.jvp(lambda x: images(problem, x), (jnp.asarray(x),), (direction,))[1]
+    return SymmetryCondition(jnp.asarray(left[:, -1]), change / (change @ change))
 
 
-class _Condition(eqx.Module):
-    """The equations of an orbit and what makes it special."""
+class SpecialMotion(eqx.Module):
+    """The equations of a motion that is special, in two parameters: the orbit's own, and one more.
+
+    With the monodromy matrix M that is det(M - I) = 0 at a fold or where a symmetry is lost,
+    det(M + I) = 0 at a period doubling; at a grazing V⁻ = 0 of the impact that is lost, or a
+    clearance of zero.
+    """
 
     problem: Shooting
     kind: str = eqx.field(static=True)
     impact: int | None = eqx.field(static=True)
-    lone: "SymmetryCondition | None" = None
+    """The event that grazes; `None` at a touch, and where nothing grazes."""
+    symmetry: SymmetryCondition | None = None
 
     def residual(self, x):
         missing, seen = self.problem.residual(x), self.problem.observe(x)
-        if self.lone is not None:
-            missing = self.lone.instead(self.problem, missing, x)
+        if self.symmetry is not None:
+            missing = self.symmetry.instead(self.problem, missing, x)
         identity = jnp.eye(seen.monodromy.shape[0], dtype=x.dtype)
         if self.kind == GRAZING:
-            extra = seen.clearance if self.impact is None else seen.approach[self.impact]
+            extra = seen.nearest.room if self.impact is None else seen.approach[self.impact]
         elif self.kind == DOUBLING:
             extra = jnp.linalg.det(seen.monodromy + identity)
         else:
@@ -279,17 +297,28 @@ class _Condition(eqx.Module):
     def observe(self, x):
         return self.problem.observe(x)
 
+    def another_grazes(self, step: Step) -> bool:
+        """Whether an impact beside the one that grazes here is lost, or a stop is touched."""
+        # In a symmetric motion another impact grazes as well, to rounding.
+        others = [v + _NOISE for i, v in enumerate(step.seen.approach) if i != self.impact]
+        # At a grazing the body turns on the stop, to rounding.
+        touching = self.kind == GRAZING and self.impact is None
+        passed = not touching and step.seen.nearest.room < -_NOISE
+        return bool(min(others, default=1.0) <= 0 or passed)
 
-def _cut(advance: Any, here: Step, new: Step, bounds: Any, scale: np.ndarray) -> Step:
+
+def _inside(step: Step, bounds: Intervals) -> bool:
+    return all(low <= x <= high for x, (low, high) in zip(step.x[-2:], bounds, strict=True))
+
+
+def _cut(advance: Any, here: Step, new: Step, bounds: Intervals, scale: np.ndarray) -> Step:
     """The last point inside the bounds, by halving the step."""
     low, high = 0.0, float(np.dot(here.tangent, (new.x - here.x) / scale))
     last = here
     for _ in range(30):
         middle = 0.5 * (low + high)
         step = advance(here.x, here.tangent, middle)
-        inside = bool(step.good) and all(
-            a <= value <= b for value, (a, b) in zip(step.x[-2:], bounds, strict=True)
-        )
+        inside = bool(step.good) and _inside(step, bounds)
         low, high = (middle, high) if inside else (low, middle)
         last = step if inside else last
     return last

@@ -13,19 +13,19 @@ from .._interrupted import Interrupted
 from .._lazy import lazy
 from ..flow.labelled import tidy
 from ..flow.methods import MethodLike
-from ..machine.numbers import check_again, check_leaf, leaf, with_leaf
-from ..machine.shown import summary_table
+from ..machine.numbers import check_leaf, leaf
 from ..machine.units import in_unit, with_units
 from ._monitor import BranchMonitor
+from ._observed import Observed
 from ._rest import rests
 from ._shooting import Shooting
 from ._solution import orbit_of
-from ._solve import advance, located, problem_of, tangent_at
+from ._solve import advance, check_parameter, located, problem_of, tangent_at
 from ._tables import COLUMNS, on_sections, table_of
 from ._tables import column_names as column_names
 from .curve import INTERRUPTED, Step, check_walk, walk
 from .floquet import NEUTRAL
-from .results import ORBIT_RESULTS, Orbit, impacts_in_words
+from .results import ORBIT_RESULTS, InWords, Orbit, impacts_in_words
 from .special import SpecialPoint
 
 if TYPE_CHECKING:
@@ -41,8 +41,8 @@ _SAME = 1e-3
 _ROUNDING = 1e-12
 
 
-@dataclasses.dataclass(frozen=True)
-class Branch:
+@dataclasses.dataclass(frozen=True, repr=False)
+class Branch(InWords):
     """A branch of periodic motions: host arrays with one row for each point, in their order, in
     the machine's units (see `AbstractMachine.units`)."""
 
@@ -166,8 +166,8 @@ class Branch:
     def to_xarray(self, *, along: str | None = None) -> "xr.Dataset":
         """The branch as an `xarray.Dataset` over its points.
 
-        **Arguments:** `along`, to keep only what is told along one dimension: `"point"`, `"impact"`
-        or `"state"` (the multipliers), which then makes a table without repetitions.
+        **Arguments:** `along`, to keep only what has one dimension: `"point"`, `"impact"` or
+        `"state"` (the multipliers), which then makes a table without repetitions.
 
         **Raises:** `ValueError` if there is no such dimension.
         """
@@ -185,21 +185,15 @@ class Branch:
     def __str__(self) -> str:
         low, high = self.parameter.min(), self.parameter.max()
         machine = self.problem.machine
-        period, span = machine.period_of(self.cycles), f"[{low:.6g}, {high:.6g}]"
-        span = in_unit(span, machine.units, self.name)
+        period = machine.period_of(self.cycles)
+        span = in_unit(f"[{low:.6g}, {high:.6g}]", machine.units, self.name)
         lines = [
             f"Branch of {len(self.parameter)} motions of period {period} with "
-            f"{impacts_in_words(self.impact_speed.shape[1])}, "
-            f"{self.name} in {span}, "
+            f"{impacts_in_words(self.impact_speed.shape[1])}, {self.name} in {span}, "
             f"{int(self.stable.sum())} of them stable; ends: {self.ends[0]}, {self.ends[1]}",
             *(f"  {point}" for point in self.special),
         ]
         return "\n".join(lines)
-
-    __repr__ = __str__
-
-    def _repr_html_(self) -> str:
-        return summary_table(str(self), self.y_min)
 
 
 def continue_orbit(
@@ -230,8 +224,8 @@ def continue_orbit(
       state and the clock of each impact in the machine's own units (of a `Scene`: positions in a,
       velocities in a ω, crank angles in radians), the parameter in half its interval.
     - `max_points`: points in each direction at most.
-    - `method`: how the machine is carried, of fixed steps: by default `ExactFlight()` where it
-      applies, else 20 steps of `Verner9` a cycle.
+    - `method`: how the machine is carried, of fixed steps: by default that of the orbit if its
+      steps are, else `ExactFlight()` where it applies, else 20 steps of `Verner9` a cycle.
 
     **Returns:** a `Branch`.
 
@@ -240,6 +234,34 @@ def continue_orbit(
     is the branch so far.
     """
     settings = check_walk(step=step, max_step=max_step, max_points=max_points)
+    _check_orbit(orbit)
+    check_leaf(orbit.machine, parameter)
+    bounds = interval("bounds", bounds)
+    value = float(leaf(orbit.machine, parameter))
+    check_parameter(orbit.machine, parameter, value, bounds, "orbit")
+    problem, x = problem_of(orbit, parameter, bounds, method)
+    scale = np.ones(problem.size)
+    scale[-1] = 0.5 * (bounds[1] - bounds[0])
+    start = _first_point(problem, x, scale, orbit)
+    ahead = BranchMonitor(problem, scale, bounds)
+    forward = walk(ahead.advance, start, stop=ahead.stop, **settings)
+    back = BranchMonitor(problem, scale, bounds)
+    turned = start._replace(tangent=-start.tangent)
+    if forward.end in ("closed", INTERRUPTED):
+        backward_steps, ends = [], (forward.end, forward.end)
+    else:
+        backward = walk(back.advance, turned, stop=back.stop, **settings)
+        backward_steps, ends = back.path(backward.steps[1:]), (backward.end, forward.end)
+    special = [*reversed(back.special), *ahead.special]
+    steps = [*reversed(backward_steps), *ahead.path(forward.steps)]
+    branch = _branch(problem, parameter, steps, special, ends, scale)
+    if INTERRUPTED in ends:
+        raise Interrupted("walk along the branch", branch)
+    return branch
+
+
+def _check_orbit(orbit: Orbit) -> None:
+    """**Raises:** `ValueError` unless this is one orbit that does not rest on a stop."""
     if not isinstance(orbit, Orbit) or orbit.residual.ndim:
         raise ValueError("Argument `orbit` must be one `Orbit`, not a batch or a state.")
     if not bool(orbit.successful):
@@ -250,21 +272,16 @@ def continue_orbit(
             "Argument `orbit` must not rest on a stop, but does: such a motion can be simulated, "
             "swept and found, but not followed as a branch."
         )
-    check_leaf(orbit.machine, parameter)
-    low, high = interval("bounds", bounds)
-    value = float(leaf(orbit.machine, parameter))
-    if not low <= value <= high:
-        raise ValueError(
-            f"Argument `bounds` must hold the orbit's {parameter} = {value:g}, but is "
-            f"({low:g}, {high:g})."
-        )
-    for bound in (low, high):
-        check_again(with_leaf(orbit.machine, parameter, bound))
-    problem, x = problem_of(orbit, parameter, (low, high), method)
-    scale = np.ones(problem.size)
-    scale[-1] = 0.5 * (high - low)
-    # At a fixed parameter, unless the orbit lies at a fold: then across the branch, which takes a
-    # program of its own.
+
+
+def _first_point(problem: Shooting, x: np.ndarray, scale: np.ndarray, orbit: Orbit) -> Step:
+    """The orbit as a solution of its equations from event to event.
+
+    It is refined at its parameter, unless it lies at a fold: then across the branch, which takes a
+    program of its own.
+
+    **Raises:** `ValueError` where there is no solution close to it, or many.
+    """
     start, moved = _refined(problem, x, np.eye(problem.size)[-1], scale)
     if moved > _SAME:
         start, moved = _refined(problem, x, tangent_at(problem, x, scale), scale)
@@ -280,34 +297,25 @@ def continue_orbit(
             f"{max(moved, float(start.size)):.2g}): branches cross there, or it is no orbit of "
             "this machine."
         )
-    ahead = BranchMonitor(problem, scale, (low, high))
-    forward = walk(ahead.advance, start, stop=ahead.stop, **settings)
-    back = BranchMonitor(problem, scale, (low, high))
-    turned = start._replace(tangent=-start.tangent)
-    if forward.end in ("closed", INTERRUPTED):
-        backward_steps, ends = [], (forward.end, forward.end)
-    else:
-        backward = walk(back.advance, turned, stop=back.stop, **settings)
-        backward_steps, ends = back.path(backward.steps[1:]), (backward.end, forward.end)
-    special = [*reversed(back.special), *ahead.special]
-    steps = [*reversed(backward_steps), *ahead.path(forward.steps)]
-    branch = _branch(problem, parameter, steps, special, ends, scale)
-    if INTERRUPTED in ends:
-        raise Interrupted("walk along the branch", branch)
-    return branch
+    return start
 
 
-def _refined(problem: Shooting, x, tangent, scale) -> tuple[Step, float]:
+def _refined(
+    problem: Shooting, x: np.ndarray, tangent: np.ndarray, scale: np.ndarray
+) -> tuple[Step, float]:
     """The solution in the plane across a tangent at `x`, and how far (scaled) it is from there."""
     start = advance(problem, x, tangent, scale, 0.0)
     return start, float(np.max(np.abs(start.x - x) / scale)) if bool(start.good) else np.inf
 
 
-def _branch(problem, name, steps, special, ends, scale) -> Branch:
+def _branch(
+    problem: Shooting, name: str, steps: list[Step], special: list[SpecialPoint],
+    ends: tuple[str, str], scale: np.ndarray,
+) -> Branch:  # fmt: skip
     xs = np.stack([step.x for step in steps])
     impacts = np.asarray(problem.impacts, int)
 
-    def column(get: Callable[[Any], Any]) -> np.ndarray:
+    def column(get: Callable[[Observed], Any]) -> np.ndarray:
         return np.stack([np.asarray(get(step.seen)) for step in steps])
 
     duration = column(lambda seen: seen.duration)
@@ -322,7 +330,7 @@ def _branch(problem, name, steps, special, ends, scale) -> Branch:
         multipliers=column(lambda seen: seen.multipliers),
         impact_phase=xs[:, impacts],
         impact_speed=column(lambda seen: np.asarray(seen.approach)[impacts]),
-        clearance=column(lambda seen: seen.clearance),
+        clearance=column(lambda seen: seen.nearest.room),
         frequency_ratio=np.full(len(xs), np.nan) if ratio is None else np.asarray(ratio),
         duration=duration,
         averages={

@@ -223,16 +223,16 @@ def _impacts(
     det = G[0, 0] * G[1, 1] - G[0, 1] * G[1, 0]
     p, q = _dot(adjugate, f), _dot(adjugate, g)
     size = jnp.sum(q * q)
-    spread = size - (f[0] * g[1] - f[1] * g[0]) ** 2
+    radicand = size - (f[0] * g[1] - f[1] * g[0]) ** 2
     # Guarded on both sides of `where`, so that no derivative is infinite at a fold or beyond it.
-    root = jnp.where(spread > 0, jnp.sqrt(jnp.where(spread > 0, spread, 1.0)), 0.0)
+    root = jnp.where(radicand > 0, jnp.sqrt(jnp.where(radicand > 0, radicand, 1.0)), 0.0)
     # A flight that is the identity to rounding (sin(nπ/ζ) = 0 with ξ = 0) decides nothing.
     noise = 16 * jnp.finfo(flight.dtype).eps * (1 + period)
     decided = size > noise**2
     v = (jnp.array([1.0, -1.0], det.dtype) * det * root - jnp.sum(p * q)) / jnp.where(
         decided, size, 1.0
     )
-    resolved = (spread >= 0) & decided
+    resolved = (radicand >= 0) & decided
     direction = (p[:, None] + q[:, None] * v) * jnp.where(det < 0, -1.0, 1.0)
     cosine = jnp.where(resolved, direction[0], 1.0)
     phase = jnp.mod(jnp.arctan2(jnp.where(resolved, direction[1], 0.0), cosine), 2 * pi)

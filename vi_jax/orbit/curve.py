@@ -18,13 +18,17 @@ class Step(NamedTuple):
     """A point of the curve, as one corrector finds it."""
 
     x: Vector
+    """The unknowns, the curve's parameter last."""
     tangent: Vector
     """Unit tangent in scaled unknowns, in the sense of the step."""
     size: Float[Array, ""]
     """Largest component of the last correction (scaled)."""
     iterations: Int[Array, ""]
+    """Corrections that it took."""
     good: Bool[Array, ""]
+    """Whether the corrector converged."""
     seen: Any
+    """What is observed there, an `Observed` of a branch."""
 
 
 def corrected(
@@ -105,7 +109,7 @@ INTERRUPTED = "interrupted"
 
 
 class Walk(NamedTuple):
-    """Points met on the way in one direction, the first one included."""
+    """The points of a curve in one direction from the first, which is included."""
 
     steps: list[Step]
     end: str

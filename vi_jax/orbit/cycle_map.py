@@ -16,7 +16,7 @@ from .._renamed import renamed
 from ..flow import AbstractMethod, Adaptive, FixedStep, simulate
 from ..flow.arguments import as_floats, check_period, check_reals, machine_of
 from ..flow.methods import MethodLike, chosen, preset
-from ..machine import AbstractMachine, ShaftMachine
+from ..machine import AbstractMachine
 from ._forward_jacobian import forward_jacobian
 
 
@@ -86,10 +86,7 @@ def cycle_map(
 
     **Raises:** `ValueError` or `TypeError` for arguments that cannot be used.
     """
-    machine = machine_of(machine)
-    if isinstance(machine, ShaftMachine):
-        # In time the section would be an event of its own, and the shaft's angle one more state.
-        machine = machine.in_clock("phase")
+    machine = machine_of(machine).in_cycle_clock()
     if section is not None:
         machine = machine.at_section(section)
     method = chosen(machine, method, _usual(machine))
@@ -110,9 +107,7 @@ def _usual(machine: AbstractMachine) -> AbstractMethod:
 def adopted(machine: AbstractMachine, state: Any, name: str = "state") -> Any:
     """The state in the argument of this name as a cycle map needs it, in floating-point arrays of
     one type."""
-    if isinstance(machine, ShaftMachine):
-        state = machine.by_phase(name, state)
-    state = machine.adopt(state)
+    state = machine.adopt(machine.in_cycle_state(name, state))
     check_reals(name, state)
     if machine.clock(state) is not None:
         raise ValueError(

@@ -6,22 +6,16 @@ import numpy as np
 
 from .._checks import given_number
 from ..machine.numbers import state_in_words
-from ..machine.shown import summary_table
-from .results import Orbit, impacts_in_words, span_in_words, trimmed
+from .results import InWords, Orbit, impacts_in_words, span_in_words, trimmed
 
 
-class Orbits(list[Orbit]):
+class Orbits(InWords, list[Orbit]):
     """Several periodic motions: a list that prints as a table, one motion a line."""
 
     def __str__(self) -> str:
         return "\n".join(
             [f"{len(self)} orbit{'' if len(self) == 1 else 's'}", *map(_in_words, self)]
         )
-
-    __repr__ = __str__
-
-    def _repr_html_(self) -> str:
-        return summary_table(str(self))
 
 
 def _in_words(orbit: Orbit) -> str:

@@ -2,8 +2,7 @@
 
 import contextlib
 import dataclasses
-from math import pi
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -17,22 +16,16 @@ from .._checks import count, flag
 from .._numbers import concrete
 from .._programs import compiled
 from .._renamed import renamed
-from ..flow import Run, simulate
 from ..flow.arguments import check_leaves, refuse_arrays
 from ..flow.beside import means
 from ..flow.methods import MethodLike
-from ..machine import AbstractMachine, Scene
-from ..machine.event import is_autonomous
-from ._forward_jacobian import forward_jacobian
-from ._neutral import neutral
-from ._root import root_of, shooting_matrix
+from ..machine import AbstractMachine
+from ._arcs import by_the_first_state, error_of, in_order, moved_from_impacts, observe_arc
+from ._root import root_of
 from .cycle_map import CycleMap, adopted, cycle_map
 from .floquet import multipliers_of
 from .results import ORBIT_RESULTS, Orbit, trimmed
 from .root_finders import AbstractRootFinder, Newton
-
-# Places in a cycle at which an orbit can be searched.
-_PLACES = 8
 
 # Lanes searched at once: a batch lasts as long as its slowest lane.
 _BATCH = 512
@@ -40,9 +33,6 @@ _BATCH = 512
 # A search that fails with an impact slower than this (or a turn that would be one) failed at a
 # grazing: there the map's derivative is of the order of 1/V⁻ and jumps.
 _SLOW = 0.02
-
-# A motion drifts if so much of what it lacks to be periodic is what no other start would change.
-_DRIFTS = 0.5
 
 
 @renamed(scene="machine")
@@ -141,116 +131,18 @@ def _find(the_map: CycleMap, guess: Any, root_finder: AbstractRootFinder, impact
     return jax.lax.map(one, guess, batch_size=min(_BATCH, first.shape[0]))
 
 
-def _run(the_map: CycleMap, state: Any, impact_log: int) -> Run:
-    """The motion with its impacts: one program for the look at the guess and for that at the orbit,
-    where they are as long."""
-    places = _places(the_map, state)
-    return simulate(
-        the_map.machine, state, the_map.cycles, method=the_map.method,
-        samples=0 if places == 1 else places, impact_log=impact_log, rests=the_map.rests,
-    )  # fmt: skip
-
-
-def _places(the_map: CycleMap, state: Any) -> int:
-    """Places of a cycle that are looked at: of an autonomous machine only its section."""
-    return 1 if is_autonomous(the_map.machine, state) else _PLACES
-
-
-def _moved(the_map: CycleMap, guess: Any, impact_log: int) -> tuple[CycleMap, Any, Int[Array, ""]]:
-    """Map, guess and their place (in eighths of a cycle) on the section to search on.
-
-    The map jumps where an impact falls on its section, and no search gets across; so it is done
-    where the guess's motion is farthest from its impacts.
-    """
-    machine = the_map.machine
-    if not isinstance(machine, Scene):
-        return the_map, guess, jnp.zeros((), jnp.int32)
-    run = _run(the_map, guess, impact_log)
-    assert run.samples is not None and run.impact_log is not None
-    step = 2 * pi / _PLACES
-    phase = run.impact_log.phase.ravel() - step * jnp.arange(_PLACES)[:, None]
-    apart = jnp.abs(jnp.mod(phase + pi, 2 * pi) - pi)
-    place = jnp.argmax(jnp.min(jnp.where(jnp.isnan(apart), pi, apart), axis=1))
-    there = jtu.tree_map(lambda x: x[place], run.samples.state)
-    lost = ~jnp.isfinite(sum(jtu.tree_leaves(there)))
-    place = jnp.where(lost, 0, place)
-    there = jtu.tree_map(lambda a, b: jnp.where(lost, a, b), guess, there)
-    angle = machine.phase_at(jnp.asarray(step, phase.dtype) * place)
-    moved = machine.at_section(jnp.where(angle > 2 * pi, angle - 2 * pi, angle))
-    return dataclasses.replace(the_map, machine=moved), there, place
-
-
-class _Seen(NamedTuple):
-    """One arc followed from its start; all floats, cycle by cycle."""
-
-    states: Float[Array, "cycles places states"]
-    """States at each place of each cycle, the start left out."""
-    jacobians: Float[Array, "cycles states states"]
-    """Derivatives by the start of the states after each cycle."""
-    y_min: Float[Array, " cycles"]
-    y_max: Float[Array, " cycles"]
-    clearance: Float[Array, " cycles"]
-    duration: Float[Array, " cycles"]
-    impacts: Float[Array, " cycles"]
-    integrals: dict[str, Float[Array, " cycles"]]
-    """Of the machine's averages, over the time of each cycle."""
-    phase: Float[Array, "cycles log"]
-    speed: Float[Array, "cycles log"]
-    stop: Float[Array, "cycles log"]
-
-
-def _follow(arc: CycleMap, state: Any, impact_log: int) -> _Seen:
-    @forward_jacobian
-    def seen(arc, state):
-        x, unravel = ravel_pytree(state)
-
-        def states(x):
-            run = simulate(
-                arc.machine, unravel(x), arc.cycles, method=arc.method, record="sections",
-                rests=arc.rests,
-            )  # fmt: skip
-            return jnp.stack(jtu.tree_leaves(run.sections), axis=-1)[1:]
-
-        # Apart from the motion: a program with second derivatives should hold no more than it must.
-        jacobians = jax.jacfwd(states)(x)
-        run = _run(arc, state, impact_log)
-        log = run.impact_log
-        assert log is not None and run.y_min is not None and run.y_max is not None
-        met = run.sections if run.samples is None else run.samples.state
-        places = jnp.stack(jtu.tree_leaves(met), axis=-1)[1:]
-        places = places.reshape(arc.cycles, _places(arc, state), -1)
-        assert run.clearance is not None and run.duration is not None
-        return _Seen(
-            places, jacobians, run.y_min, run.y_max, run.clearance, run.duration,
-            run.impacts.astype(x.dtype),
-            {name: mean * run.duration for name, mean in run.averages.items()},
-            log.phase, log.speed, log.stop.astype(x.dtype),
-        )  # fmt: skip
-
-    return seen(arc, state)
-
-
 def _judged(
     the_map: CycleMap, guess: Any, root_finder: AbstractRootFinder, impact_log: int
 ) -> Orbit:
     """The orbit found from one guess, with all that is said about it."""
-    machine, arcs, cycles = the_map.machine, root_finder.arcs, the_map.cycles
-    moved, start, place = _moved(the_map, jax.lax.stop_gradient(guess), impact_log)
-    arc = dataclasses.replace(moved, cycles=cycles // arcs)
+    machine, cycles = the_map.machine, the_map.cycles
+    moved, start, place = moved_from_impacts(the_map, jax.lax.stop_gradient(guess), impact_log)
+    arc = dataclasses.replace(moved, cycles=cycles // root_finder.arcs)
     root = root_of(arc, start, root_finder)
-    x, unravel = root.arcs, ravel_pytree(guess)[1]
-    seen = jax.vmap(lambda x: _follow(arc, unravel(x), impact_log))(x)
-    # Derivatives by the very first state: those within an arc after those of the arcs before.
-    passed, jacobians = jnp.eye(x.shape[1], dtype=x.dtype), []
-    for i in range(arcs):
-        jacobians.append(seen.jacobians[i] @ passed)
-        passed = jacobians[-1][-1]
-    jacobians = jnp.concatenate(jacobians)
-    missing = seen.states[:, -1, -1] - jnp.roll(x, -1, axis=0)
-    missing, ahead = missing.ravel(), shooting_matrix(seen.jacobians[:, -1])
-    lost = neutral(ahead)
-    error = jnp.max(jnp.abs(jnp.linalg.solve(ahead + lost.filled, missing)))
-    drifts = jnp.linalg.norm(lost.unmet @ missing) > _DRIFTS * jnp.linalg.norm(missing)
+    x, unravel = root.x, ravel_pytree(guess)[1]
+    seen = jax.vmap(lambda x: observe_arc(arc, unravel(x), impact_log))(x)
+    jacobians = by_the_first_state(seen.jacobians)
+    error, drifts = error_of(seen, x)
     seen = jtu.tree_map(lambda a: a.reshape(cycles, *a.shape[2:]), seen)
 
     # Back on the section asked for, of which the last one met is the guess's.
@@ -259,25 +151,13 @@ def _judged(
     least = _least_period(sections, error)
     monodromy = jacobians[least - 1]
     within = jnp.arange(cycles) < least
-    turn = jnp.asarray(machine.cycle, x.dtype)
-    hit = (seen.stop >= 0) & within[:, None]
-    if last:
-        phase = seen.phase + turn * (jnp.arange(cycles)[:, None] + place / _PLACES)
-        phase = jnp.mod(phase, turn * least)
-    else:  # each cycle as long as it lasts
-        phase = seen.phase + (jnp.cumsum(seen.duration) - seen.duration)[:, None]
-    phase = jnp.where(hit, phase, jnp.inf).ravel()
-    order = jnp.argsort(phase)
-    phase, speed, stop = (
-        jnp.where(hit.ravel(), a.ravel(), none)[order]
-        for a, none in ((phase, jnp.nan), (seen.speed, jnp.nan), (seen.stop, -1.0))
-    )
-    phase = machine.phase_at(phase)
+    hit = (seen.listed.stop >= 0) & within[:, None]
+    listed = in_order(seen, hit, least, machine, place if last else None)
     duration = jnp.sum(jnp.where(within, seen.duration, 0.0))
     sums = {name: jnp.sum(jnp.where(within, a, 0.0)) for name, a in seen.integrals.items()}
     clearance = jnp.min(jnp.where(within, seen.clearance, jnp.inf))
     found = (root.converged > 0) & (error < jnp.sqrt(jnp.finfo(x.dtype).eps) * 100)
-    slowest = jnp.min(jnp.where(hit, seen.speed, jnp.inf))
+    slowest = jnp.min(jnp.where(hit, seen.listed.speed, jnp.inf))
     near = jnp.minimum(slowest, jnp.sqrt(2 * jnp.maximum(clearance, 0))) < _SLOW
     return Orbit(
         machine=machine,
@@ -287,9 +167,9 @@ def _judged(
         cycles=least,
         duration=duration,
         frequency_ratio=machine.frequency_ratio(duration / least),
-        impact_phase=phase,
-        impact_speed=speed,
-        impact_stop=stop.astype(jnp.int32),
+        impact_phase=machine.phase_at(listed.phase),
+        impact_speed=listed.speed,
+        impact_stop=listed.stop.astype(jnp.int32),
         impacts=jnp.sum(jnp.where(within, seen.impacts, 0.0)).astype(jnp.int32),
         y_min=jnp.min(jnp.where(within, seen.y_min, jnp.inf)),
         y_max=jnp.max(jnp.where(within, seen.y_max, -jnp.inf)),

@@ -20,7 +20,7 @@ from ..flow.named import quantities_on
 from ..machine import AbstractMachine
 from ..machine.event import is_autonomous
 from ..machine.numbers import plain, state_in_words
-from ..machine.shown import Summarized
+from ..machine.shown import Summarized, summary_table
 from ..machine.units import in_unit, name_in, with_units
 from .floquet import STABILITY, STABILITY_NAMES, stability_of
 
@@ -190,8 +190,8 @@ class Orbit(Summarized):
         Section states become a variable for each component (`section_Y`), multipliers complex
         ones; `result` and `stability` are words. Host-side: not to be traced.
 
-        **Arguments:** names of the batch axes, by default `lane`; `along`, to keep only what is
-        told along one dimension (`"section"`, `"impact"`, `"multiplier"`, `"column"` of the
+        **Arguments:** names of the batch axes, by default `lane`; `along`, to keep only what has
+        one dimension (`"section"`, `"impact"`, `"multiplier"`, `"column"` of the
         monodromy matrix, or a batch axis), which then makes a table without repetitions.
 
         **Raises:** `ValueError` if these are not as many as there are batch axes, or there is no
@@ -235,9 +235,8 @@ class Orbit(Summarized):
             f"  section: {state_in_words(self.state, 9, units)}",
             f"  {span_in_words(self, 9)}",
         ]
-        for phase, speed, stop in zip(
-            self.impact_phase, self.impact_speed, self.impact_stop, strict=True
-        ):
+        impacts = zip(self.impact_phase, self.impact_speed, self.impact_stop, strict=True)
+        for phase, speed, stop in impacts:
             if stop >= 0:
                 name = self.machine.stops[int(stop)].side
                 fast = in_unit(f"{float(speed):.9g}", units, "velocity")
@@ -259,6 +258,16 @@ class Orbit(Summarized):
         return "\n".join([*lines, f"  note: {reason}"] if reason else lines)
 
 
+class InWords:
+    """What is shown by its `__str__`; in notebooks as a table, over a row of numbers drawn."""
+
+    def __repr__(self) -> str:
+        return str(self)
+
+    def _repr_html_(self) -> str:
+        return summary_table(str(self), getattr(self, "y_min", None))
+
+
 def span_in_words(orbit: Orbit, digits: int) -> str:
     """The interval of the first coordinate, by the name that pictures give it."""
     low, high = (plain(x, digits) for x in (orbit.y_min, orbit.y_max))
@@ -278,11 +287,7 @@ def trimmed(orbit: Orbit) -> Orbit:
     if isinstance(orbit.residual, Tracer) or orbit.residual.ndim:
         return orbit
     keep = slice(int(orbit.impacts))
-    cut = {name: getattr(orbit, name)[keep] for name in ("impact_phase", "impact_speed")}
-    cycles = int(orbit.cycles)
-    return dataclasses.replace(
-        orbit,
-        **cut,
-        impact_stop=orbit.impact_stop[keep],
-        sections=jtu.tree_map(lambda x: x[:cycles], orbit.sections),
-    )
+    each = ("impact_phase", "impact_speed", "impact_stop")
+    cut = {name: getattr(orbit, name)[keep] for name in each}
+    sections = jtu.tree_map(lambda x: x[: int(orbit.cycles)], orbit.sections)
+    return dataclasses.replace(orbit, **cut, sections=sections)

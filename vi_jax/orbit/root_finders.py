@@ -1,4 +1,8 @@
-"""Searches for a zero of the periodic-orbit residual: damped Newton, and optax descent."""
+"""Root finders, `Newton` and `Gradient`: how a zero of a residual is searched for, step by step.
+
+They know nothing of orbits. What they are run on, and how the root moves with the numbers of the
+machine, is in `_root.py`.
+"""
 
 import abc
 from collections.abc import Callable
@@ -10,7 +14,7 @@ import jax.numpy as jnp
 import lineax as lx
 import optax
 import optimistix as optx
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from .._checks import count, instance_of, require
 from .._numbers import number
@@ -21,7 +25,7 @@ Residual = Callable[[Any], Any]
 
 
 class AbstractRootFinder(eqx.Module):
-    """A way to a zero of a residual."""
+    """A way to a zero of a residual, taken in steps by `find_root`."""
 
     tolerance: eqx.AbstractVar[Any]
     max_steps: eqx.AbstractVar[int]
@@ -29,13 +33,17 @@ class AbstractRootFinder(eqx.Module):
 
     @abc.abstractmethod
     def init(self, residual: Residual, x: Unknowns) -> Any:
-        """What the search remembers between its steps."""
+        """What it remembers between its steps: any pytree."""
 
     @abc.abstractmethod
     def step(
         self, residual: Residual, x: Unknowns, memory: Any
     ) -> tuple[Unknowns, Any, Unknowns, Float[Array, ""]]:
-        """One step: where to go on from, the memory, and a place with its largest residual."""
+        """One step from `x`.
+
+        **Returns:** where to go on from; the memory; a place whose residual was computed, and the
+        largest component of that residual.
+        """
 
     @property
     @abc.abstractmethod
@@ -47,11 +55,11 @@ def _tolerance(value: Any) -> Any:
     return None if value is None else number("tolerance", value)
 
 
-def _check(search: AbstractRootFinder) -> None:
-    if search.tolerance is not None:
-        require("tolerance", search.tolerance, low=0.0, open_low=True)
-    count("max_steps", search.max_steps, least=1)
-    count("arcs", search.arcs, least=1)
+def _check(root_finder: AbstractRootFinder) -> None:
+    if root_finder.tolerance is not None:
+        require("tolerance", root_finder.tolerance, low=0.0, open_low=True)
+    count("max_steps", root_finder.max_steps, least=1)
+    count("arcs", root_finder.arcs, least=1)
 
 
 class Newton(AbstractRootFinder):
@@ -122,8 +130,8 @@ class Gradient(AbstractRootFinder):
     def __check_init__(self):
         _check(self)
         if self.optimiser is not None:
-            told = "an `optax.GradientTransformation`, such as `optax.adam(0.01)`"
-            instance_of("optimiser", self.optimiser, optax.GradientTransformation, told)
+            wanted = "an `optax.GradientTransformation`, such as `optax.adam(0.01)`"
+            instance_of("optimiser", self.optimiser, optax.GradientTransformation, wanted)
 
     @property
     def _optimiser(self) -> optax.GradientTransformation:
@@ -158,28 +166,31 @@ def _largest(missing: Array) -> Array:
 
 
 class Found(NamedTuple):
-    """Where a search ended."""
+    """Where a root finder ended."""
 
     x: Unknowns
     """The place with the smallest residual that was met."""
     residual: Float[Array, ""]
+    """Its largest component there."""
     converged: Array
-    steps: Int[Array, ""]
+    """Whether that is within its tolerance."""
+    steps: Array
+    """Their number."""
     history: Float[Array, " max_steps"]
     """Largest residual component after each step, NaN beyond the last."""
 
 
-def search(method: AbstractRootFinder, residual: Residual, x: Unknowns) -> Found:
-    """Run `method` until the residual is within its tolerance and gains no more.
+def find_root(root_finder: AbstractRootFinder, residual: Residual, x: Unknowns) -> Found:
+    """Run a root finder from `x` until the residual is within its tolerance and gains no more.
 
     A place where the residual is not finite is never taken for better than another.
     """
-    tolerance = method.tolerance
+    tolerance = root_finder.tolerance
     if tolerance is None:
-        tolerance = method.usual_tolerance if x.dtype == jnp.float64 else 1e-4
+        tolerance = root_finder.usual_tolerance if x.dtype == jnp.float64 else 1e-4
     nan = jnp.full((), jnp.nan, x.dtype)
-    memory, static = eqx.partition(method.init(residual, x), eqx.is_array)
-    history = jnp.full((method.max_steps,), jnp.nan, x.dtype)
+    memory, static = eqx.partition(root_finder.init(residual, x), eqx.is_array)
+    history = jnp.full((root_finder.max_steps,), jnp.nan, x.dtype)
 
     def going(carry):
         *_, size, last, steps, _ = carry
@@ -187,21 +198,15 @@ def search(method: AbstractRootFinder, residual: Residual, x: Unknowns) -> Found
         gaining = ~(size > 0.1 * last) & (size > 0)
         hopeless = (steps > 0) & jnp.isnan(size)
         done = hopeless | ((size <= tolerance) & ~gaining)
-        return ~done & (steps < method.max_steps)
+        return ~done & (steps < root_finder.max_steps)
 
     def body(carry):
         x, memory, best, size, _, steps, history = carry
-        x, memory, place, now = method.step(residual, x, eqx.combine(memory, static))
+        x, memory, place, now = root_finder.step(residual, x, eqx.combine(memory, static))
         better = ~jnp.isnan(now) & ~(now >= size)
-        return (
-            x,
-            eqx.filter(memory, eqx.is_array),
-            jnp.where(better, place, best),
-            jnp.where(better, now, size),
-            size,
-            steps + 1,
-            history.at[steps].set(now),
-        )
+        best, smallest = jnp.where(better, place, best), jnp.where(better, now, size)
+        history = history.at[steps].set(now)
+        return x, eqx.filter(memory, eqx.is_array), best, smallest, size, steps + 1, history
 
     carry = (x, memory, x, nan, nan, jnp.zeros((), jnp.int32), history)
     _, _, best, size, _, steps, history = jax.lax.while_loop(going, body, carry)

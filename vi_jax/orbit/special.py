@@ -7,13 +7,13 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from .._checks import given_number
-from ..machine.shown import summary_table
 from ._events import Event
+from ._origin import repeated
 from ._shooting import Shooting
 from ._solution import orbit_of
 from ._solve import advance, jacobian_at, state_at, tangent_at
 from .curve import Step
-from .results import Orbit
+from .results import InWords, Orbit
 
 FOLD, DOUBLING, TORUS = "fold", "period-doubling", "neimark-sacker"
 GRAZING, CROSSING, SYMMETRY = "grazing", "branch-point", "symmetry-breaking"
@@ -23,8 +23,8 @@ HOPF = "hopf"
 _TOUCHES = 1e-6
 
 
-@dataclasses.dataclass(frozen=True)
-class SpecialPoint:
+@dataclasses.dataclass(frozen=True, repr=False)
+class SpecialPoint(InWords):
     """A point of a branch at which something happens."""
 
     kind: str
@@ -46,7 +46,7 @@ class SpecialPoint:
     @property
     def touches(self) -> bool:
         """Whether at a grazing an impact is lost or a stop is touched, to rounding."""
-        return self.impact is not None or abs(float(self.step.seen.clearance)) <= _TOUCHES
+        return self.impact is not None or abs(float(self.step.seen.nearest.room)) <= _TOUCHES
 
     def switch(self, *, distance: float = 0.01) -> Orbit:
         """An orbit of the other branch that begins here, to be continued.
@@ -74,50 +74,41 @@ class SpecialPoint:
     def __str__(self) -> str:
         return f"{self.kind} at {self.parameter:.10g}: {self.detail}"
 
-    __repr__ = __str__
-
-    def _repr_html_(self) -> str:
-        return summary_table(str(self))
-
 
 def _along(point: SpecialPoint, distance: float) -> Orbit:
     """A motion further on the branch that the point's own problem is of."""
     x = np.asarray(point.step.x)
     tangent = tangent_at(point.problem, x, point.scale)
     step = advance(point.problem, x, tangent, point.scale, distance)
+    return _found(point.problem, step, "half the period", distance)
+
+
+def _found(problem: Shooting, step: Step, what: str, distance: float) -> Orbit:
+    """The motion at a step. **Raises:** `ValueError` if the corrector found none there."""
     if not bool(step.good):
-        raise ValueError(
-            f"No motion of half the period was found at distance {distance:g}; try another."
-        )
-    return orbit_of(point.problem, step)
+        raise ValueError(f"No motion of {what} was found at distance {distance:g}; try another.")
+    return orbit_of(problem, step)
 
 
 def _doubled(point: SpecialPoint, distance: float) -> Orbit:
     """A motion of twice the period, along what the multiplier -1 makes possible."""
     old = point.problem
     x = np.asarray(point.step.x)
-    clock, states = (np.asarray(a) for a in old.parts(jnp.asarray(x)))
-    turn = float(old.period(jnp.asarray(x)))
     events, modes = old.events, old.modes
     if events:
-        clock, states = np.concatenate([clock, clock + turn]), np.concatenate([states, states])
         events, modes = (*events, *(event.later(old.cycles) for event in events)), modes * 2
     new = dataclasses.replace(
         old, cycles=2 * old.cycles, events=events, modes=modes, steps=2 * old.steps
     )
     count = len(old.parameters)
-    twice = np.asarray(new.pack(clock, states, x[-count:], 2 * turn))
+    twice = repeated(old, x, new)
     scale = np.concatenate([np.ones(len(twice) - count), point.scale[-count:]])
     jacobian = np.asarray(jacobian_at(new, jnp.asarray(twice))) * scale
     # Without the parameter's column the equations have one null vector here: that of -1.
     tangent = np.zeros(len(twice))
     tangent[:-count] = np.linalg.svd(jacobian[:, :-count])[2][-1]
     step = advance(new, twice, tangent, scale, distance)
-    if not bool(step.good):
-        raise ValueError(
-            f"No motion of twice the period was found at distance {distance:g}; try another."
-        )
-    return orbit_of(new, step)
+    return _found(new, step, "twice the period", distance)
 
 
 def _crossed(point: SpecialPoint, distance: float) -> Orbit:
@@ -131,11 +122,7 @@ def _crossed(point: SpecialPoint, distance: float) -> Orbit:
     off = plane[0] * (plane[1] @ along) - plane[1] * (plane[0] @ along)
     off = off / np.linalg.norm(off)
     step = advance(problem, x, off, point.scale, distance)
-    if not bool(step.good):
-        raise ValueError(
-            f"No motion of the other branch was found at distance {distance:g}; try another."
-        )
-    return orbit_of(problem, step)
+    return _found(problem, step, "the other branch", distance)
 
 
 def _beyond_grazing(point: SpecialPoint, distance: float) -> Orbit:
@@ -168,10 +155,10 @@ def _beyond_grazing(point: SpecialPoint, distance: float) -> Orbit:
             section = state_at(old, x, jnp.asarray(0), jnp.asarray(period))
             clock, states = np.zeros(0), np.asarray(ravel_pytree(section)[0])[None]
     else:
-        touch = float(step.seen.touch)
+        touch = float(step.seen.nearest.clock)
         leg = max(0, int(np.searchsorted(clock, touch, side="right")) - 1) if events else 0
         there = state_at(old, x, jnp.asarray(leg), jnp.asarray(touch))
-        u, hit = np.asarray(ravel_pytree(there)[0])[None], Event(int(step.seen.touched))
+        u, hit = np.asarray(ravel_pytree(there)[0])[None], Event(int(step.seen.nearest.event))
         if not events:
             clock, states, events = np.array([touch]), u, [hit]
         else:
@@ -185,9 +172,8 @@ def _beyond_grazing(point: SpecialPoint, distance: float) -> Orbit:
     tangent = tangent_at(new, start, scale)
     for sense in (1.0, -1.0):
         found = advance(new, start, sense * tangent, scale, distance)
-        if not bool(found.good):
-            continue
-        if found.seen.clearance > 0 and min(found.seen.approach, default=1.0) > 0:
+        inside = found.seen.nearest.room > 0 and min(found.seen.approach, default=1.0) > 0
+        if bool(found.good) and inside:
             return orbit_of(new, found)
     raise ValueError(
         "Beyond this grazing there is no admissible motion with "

@@ -1,0 +1,175 @@
+"""The arcs of a shooting: followed from where they begin, and what is observed on them.
+
+`find_orbit` cuts the period of a motion into arcs of whole cycles (one, unless `Newton(arcs=...)`
+says otherwise). The unknowns are the states in which they begin; each has to end where the next one
+begins.
+"""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, Int
+
+from .._types import Flag, Scalar
+from ..flow import Run, simulate
+from ..machine import AbstractMachine
+from ..machine.event import is_autonomous
+from ._forward_jacobian import forward_jacobian
+from ._neutral import neutral
+from ._root import shooting_matrix
+from .cycle_map import CycleMap
+
+# Places in a cycle at which an orbit can be searched.
+_PLACES = 8
+
+# A motion drifts if so much of what it lacks to be periodic is what no other start would change.
+_DRIFTS = 0.5
+
+
+def _run(the_map: CycleMap, state: Any, impact_log: int) -> Run:
+    """The motion with its impacts: one program for the look at the guess and for that at the orbit,
+    where they are as long."""
+    places = _places(the_map, state)
+    return simulate(
+        the_map.machine, state, the_map.cycles, method=the_map.method,
+        samples=0 if places == 1 else places, impact_log=impact_log, rests=the_map.rests,
+    )  # fmt: skip
+
+
+def _places(the_map: CycleMap, state: Any) -> int:
+    """Places of a cycle that are looked at: of an autonomous machine only its section."""
+    return 1 if is_autonomous(the_map.machine, state) else _PLACES
+
+
+def moved_from_impacts(
+    the_map: CycleMap, guess: Any, impact_log: int
+) -> tuple[CycleMap, Any, Int[Array, ""]]:
+    """Map, guess and their place (in eighths of a cycle) on the section to search on.
+
+    The map jumps where an impact falls on its section, and no search gets across; so it is done
+    where the guess's motion is farthest from its impacts, if the machine's section can be moved.
+    """
+    machine = the_map.machine
+    if machine.observed_later(0.0) is None:
+        return the_map, guess, jnp.zeros((), jnp.int32)
+    run = _run(the_map, guess, impact_log)
+    assert run.samples is not None and run.impact_log is not None
+    step, half = machine.cycle / _PLACES, machine.cycle / 2
+    phase = run.impact_log.phase.ravel() - step * jnp.arange(_PLACES)[:, None]
+    apart = jnp.abs(jnp.mod(phase + half, machine.cycle) - half)
+    place = jnp.argmax(jnp.min(jnp.where(jnp.isnan(apart), half, apart), axis=1))
+    there = jtu.tree_map(lambda x: x[place], run.samples.state)
+    lost = ~jnp.isfinite(sum(jtu.tree_leaves(there)))
+    place = jnp.where(lost, 0, place)
+    there = jtu.tree_map(lambda a, b: jnp.where(lost, a, b), guess, there)
+    moved = machine.observed_later(jnp.asarray(step, phase.dtype) * place)
+    return dataclasses.replace(the_map, machine=moved), there, place
+
+
+class Impacts(NamedTuple):
+    """The impacts of each cycle in their order; all floats, NaN (of `stop` -1) beyond the last."""
+
+    phase: Float[Array, "cycles log"]
+    """Clock of each since its cycle began."""
+    speed: Float[Array, "cycles log"]
+    """V⁻ of each."""
+    stop: Float[Array, "cycles log"]
+    """Index into `machine.stops` of each."""
+
+
+class ObservedArc(NamedTuple):
+    """An arc of the shooting followed from its start, cycle by cycle; all floats."""
+
+    states: Float[Array, "cycles places states"]
+    """States at each place of each cycle, the start left out."""
+    jacobians: Float[Array, "cycles states states"]
+    """Derivatives by the start of the states after each cycle."""
+    listed: Impacts
+    impacts: Float[Array, " cycles"]
+    """Their number, those beyond the list included."""
+    y_min: Float[Array, " cycles"]
+    y_max: Float[Array, " cycles"]
+    clearance: Float[Array, " cycles"]
+    duration: Float[Array, " cycles"]
+    integrals: dict[str, Float[Array, " cycles"]]
+    """Of the machine's averages, over the time of each cycle."""
+
+
+def observe_arc(arc: CycleMap, state: Any, impact_log: int) -> ObservedArc:
+    """What an arc does from the `state` in which it begins; differentiated by columns."""
+
+    @forward_jacobian
+    def seen(arc, state):
+        x, unravel = ravel_pytree(state)
+
+        def states(x):
+            run = simulate(
+                arc.machine, unravel(x), arc.cycles, method=arc.method, record="sections",
+                rests=arc.rests,
+            )  # fmt: skip
+            return jnp.stack(jtu.tree_leaves(run.sections), axis=-1)[1:]
+
+        # Apart from the motion: a program with second derivatives should hold no more than it must.
+        jacobians = jax.jacfwd(states)(x)
+        run = _run(arc, state, impact_log)
+        log = run.impact_log
+        assert log is not None and run.y_min is not None and run.y_max is not None
+        met = run.sections if run.samples is None else run.samples.state
+        places = jnp.stack(jtu.tree_leaves(met), axis=-1)[1:]
+        places = places.reshape(arc.cycles, _places(arc, state), -1)
+        assert run.clearance is not None and run.duration is not None
+        return ObservedArc(
+            places, jacobians, Impacts(log.phase, log.speed, log.stop.astype(x.dtype)),
+            run.impacts.astype(x.dtype), run.y_min, run.y_max, run.clearance, run.duration,
+            {name: mean * run.duration for name, mean in run.averages.items()},
+        )  # fmt: skip
+
+    return seen(arc, state)
+
+
+def by_the_first_state(jacobians: Float[Array, "arcs cycles n n"]) -> Float[Array, "all n n"]:
+    """Derivatives of the states after each cycle by the first state of the first arc, from those by
+    the first state of their own arc: each after those of the arcs before."""
+    passed, all_of_them = jnp.eye(jacobians.shape[-1], dtype=jacobians.dtype), []
+    for own in jacobians:
+        all_of_them.append(own @ passed)
+        passed = all_of_them[-1][-1]
+    return jnp.concatenate(all_of_them)
+
+
+def error_of(seen: ObservedArc, x: Float[Array, "arcs states"]) -> tuple[Scalar, Flag]:
+    """The largest component of Newton's next step from the arcs' starts `x`, and whether the motion
+    drifts: most of what it lacks to be periodic is what no other start would change."""
+    missing = seen.states[:, -1, -1] - jnp.roll(x, -1, axis=0)
+    missing, ahead = missing.ravel(), shooting_matrix(seen.jacobians[:, -1])
+    lost = neutral(ahead)
+    error = jnp.max(jnp.abs(jnp.linalg.solve(ahead + lost.filled, missing)))
+    drifts = jnp.linalg.norm(lost.unmet @ missing) > _DRIFTS * jnp.linalg.norm(missing)
+    return error, drifts
+
+
+def in_order(
+    seen: ObservedArc, hit: Bool[Array, "cycles log"], least: Int[Array, ""],
+    machine: AbstractMachine, place: Int[Array, ""] | None,
+) -> Impacts:  # fmt: skip
+    """The impacts of a period, in one row and in their order from the section asked for.
+
+    **Arguments:** the motion, cycle by cycle; which entries of its list are impacts of the period;
+    the period in cycles; the machine; the eighths of a cycle by which the section searched on lies
+    behind the one asked for, `None` for an autonomous machine, whose cycles differ in length.
+    """
+    phase, cycles = seen.listed.phase, seen.duration.shape[0]
+    if place is not None:
+        turn = jnp.asarray(machine.cycle, phase.dtype)
+        behind = jnp.arange(cycles)[:, None] + place / _PLACES
+        phase = jnp.mod(phase + turn * behind, turn * least)
+    else:
+        phase = phase + (jnp.cumsum(seen.duration) - seen.duration)[:, None]
+    phase = jnp.where(hit, phase, jnp.inf).ravel()
+    order = jnp.argsort(phase)
+    columns = ((phase, jnp.nan), (seen.listed.speed, jnp.nan), (seen.listed.stop, -1.0))
+    return Impacts(*(jnp.where(hit.ravel(), a.ravel(), none)[order] for a, none in columns))
