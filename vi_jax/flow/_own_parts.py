@@ -1,6 +1,6 @@
 """What is checked of the parts of a machine that a user wrote: stops, coordinates, events."""
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -129,7 +129,7 @@ def _is_number(x: Any) -> bool:
 
 
 def _length(modes: Any) -> int:
-    return len(modes) if isinstance(modes, Iterable) else -1
+    return len(modes) if isinstance(modes, Sequence) else -1
 
 
 def _check_state(whose: str, state: Any, found: Any) -> None:

@@ -1,20 +1,20 @@
-"""What `simulate` asks of a machine. A class of your own with these few methods runs like ours."""
+"""What every verb asks of a machine. A class of your own with these few methods runs like ours."""
 
 import abc
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float
 
 from .._checks import in_range
+from .clocks import Clocked
 from .event import AbstractEvent, AbstractSwitch
-from .shown import Shown
+from .observing import Observed
 from .stop import RigidStop
-from .units import PLAIN, unit_in
+from .words import Worded
 
 State = Any
 """A pytree of numbers (or arrays, which not every verb takes); the defaults below expect the fields
@@ -54,7 +54,7 @@ _DEFAULTS: dict[str, Callable[..., Any]] = {
 }  # fmt: skip
 
 
-class AbstractMachine(Shown):
+class AbstractMachine(Clocked, Observed, Worded):
     """A machine: smooth motion between events, observed cycle by cycle.
 
     Its independent variable is called `s`. The machine is driven, and its field periodic in `s`
@@ -72,36 +72,41 @@ class AbstractMachine(Shown):
     | `cycle` | the length of a cycle in `s` |
     | `field` | how the state changes between events |
 
-    | it may say | and gets |
+    | how it moves and meets stops | |
     |---|---|
-    | `start` | verbs without an explicit start |
+    | `start`, `adopt` | verbs without an explicit start; starts of other classes |
     | `position`, `velocity`, `placed` | a state of any names; what else an impact changes |
     | `coordinates` | stops on several coordinates (`RigidStop(..., coordinate=1)`) |
     | `switches` | a field with modes, landed upon where they change: soft stops, dry friction |
     | `events` | resets (`Reset`), cycles that any event ends, kinds of events of its own |
     | `begin` | modes of its own, which any event may change |
+
+    | what is observed of it (`Observed`) | |
+    |---|---|
     | `section` | an autonomous machine, whose cycles are counted by an event |
     | `observed_every` | its Lyapunov exponents, and samples of its orbits |
     | `averages` | means over a cycle, integrated beside its state: a power, a mean force |
     | `quantities` | functions of its state, by name, where results show the state |
     | `renewed` | a drift, counted by the cycle |
-    | `clock`, `rewound`, `pace` | another variable than `s` that counts cycles or measures time |
-    | `step_limit`, `relaxation` | steps that fit time scales shorter than the cycle |
-    | `may_rest` | programs without rest on a stop |
     | `mirrored` | branches that name a loss of symmetry |
+    | `at_section`, `observed_later` | another place of the section |
+
+    | its clocks and time scales (`Clocked`) | |
+    |---|---|
+    | `clock`, `rewound`, `pace` | another variable than `s` that counts cycles or measures time |
+    | `in_clock`, `phase_at`, … | several clocks to choose from |
+    | `step_limit`, `relaxation` | steps that fit time scales shorter than the cycle |
+
+    | its words (`Worded`) and its limits | |
+    |---|---|
     | `labels`, `units`, `period_of`, `place_of` | pictures and messages in its own words |
     | `in_range`, `check_start`, `alive` | its own limits, checked before and while it runs |
+    | `may_rest` | programs without rest on a stop |
 
     Ready machines, each written in this way, are in `vi_jax.machines`.
     """
 
     stops: eqx.AbstractVar[tuple[RigidStop, ...]]
-
-    @property
-    @abc.abstractmethod
-    def cycle(self) -> Float[Array, ""] | float:
-        """Length of one cycle in `s` (or in `clock(state)`, where that is not `None`); where
-        `section` ends a cycle, its usual length, by which steps are sized."""
 
     @abc.abstractmethod
     def field(self, *args: Any, **kwargs: Any) -> State:
@@ -124,10 +129,6 @@ class AbstractMachine(Shown):
         """The machine's own modes in a motion that begins in `state`: numbers that its field gets
         behind the state and behind the modes of its switches, and that events change."""
         return ()
-
-    def section(self, state: State) -> Float[Array, ""] | None:
-        """What rises through zero where a cycle ends; `None` where `s` or `clock` counts them."""
-        return None
 
     def observed_every(self, interval: Any) -> "AbstractMachine":
         """An autonomous machine observed at equal intervals of `s` instead of on its section."""
@@ -183,10 +184,6 @@ class AbstractMachine(Shown):
         """Whether a machine names its coordinates itself."""
         return type(self).coordinates is not AbstractMachine.coordinates
 
-    def clock(self, state: State) -> Float[Array, ""] | None:
-        """The state component that counts cycles, or `None` where `s` itself does."""
-        return None
-
     def start(self) -> State:
         """The state to begin from where none is given.
 
@@ -201,131 +198,11 @@ class AbstractMachine(Shown):
         """A start as this machine needs it. **Raises:** `TypeError` if it is none."""
         return start
 
-    def in_clock(self, clock: str) -> "AbstractMachine":
-        """The same machine with another independent variable, for one that has several."""
-        raise ValueError(
-            f"Argument `clock` must be left out for a {type(self).__name__}, which has its own "
-            f"clock, but got {clock!r}."
-        )
-
-    def in_cycle_clock(self) -> "AbstractMachine":
-        """The same machine with what counts its cycles as its independent variable."""
-        return self
-
-    def in_cycle_state(self, name: str, state: Any) -> State:
-        """A state on the section, of any of its clocks, as the machine in that clock needs it."""
-        return state
-
-    def observed_later(self, since_section: Any) -> "AbstractMachine | None":
-        """The same machine with its section moved by so much of its clock; `None` if it cannot."""
-        return None
-
-    def at_section(self, phase: Any) -> "AbstractMachine":
-        """The same machine observed elsewhere in its cycle, for one that can be."""
-        raise ValueError(
-            f"Argument `section` must be left out for a {type(self).__name__}, which has its own "
-            f"section, but got {phase!r}."
-        )
-
-    def phase_at(self, since_section: Any) -> Any:
-        """What the clock reads, from what it counted since the section."""
-        return since_section
-
-    def mirrored(self, state: State) -> State | None:
-        """The image of a state under the symmetry of this machine, for one whose motions have an
-        image among them half a cycle later; `None` for one without."""
-        return None
-
-    def period_of(self, cycles: int) -> str:
-        """A duration of so many cycles, in words."""
-        return f"{cycles} cycle{'' if cycles == 1 else 's'}"
-
-    def place_of(self, since_section: float, cycles: int) -> str:
-        """A reading of the clock within a motion of so many cycles, in words."""
-        return f"clock {since_section:.6g} of its {self.period_of(cycles)}"
-
-    @property
-    def labels(self) -> tuple[str, str]:
-        """What pictures write beside position and velocity, with units."""
-        return PLAIN
-
-    @property
-    def units(self) -> Mapping[str, str]:
-        """The units of its quantities by their names: `position`, `velocity`, `time`, `rate` (of
-        what grows in time, as exponents do), `energy`, `power`, and each number and component of a
-        state by its own name. "1" is without unit; the name "" stands for all that is not named,
-        and what is not stated is shown without. By default what the `labels` say in brackets."""
-        found = map(unit_in, self.labels)
-        return {x: unit for x, unit in zip(("position", "velocity"), found, strict=True) if unit}
-
-    @property
-    def turn(self) -> Float[Array, ""] | float:
-        """What an impact log counts in one cycle."""
-        return self.cycle
-
-    def as_logged(self, clock: Float[Array, "..."]) -> Float[Array, "..."]:
-        """A reading of what counts the cycles, as the impact log tells it; by default itself."""
-        return clock
-
-    def rewound(self, state: State) -> State:
-        """`state` with its clock set back by one cycle (only asked where there is a clock)."""
-        return state
-
-    def renewed(self, state: State) -> State:
-        """`state` as the next cycle begins, where something is counted by the cycle: a drift, say,
-        is given as the progress in the last cycle and begins again from zero."""
-        return state
-
-    def pace(self, s: Float[Array, ""], state: State) -> Float[Array, ""] | None:
-        """d(time)/ds where it varies along the motion, or `None` where `s` measures time."""
-        return None
-
-    def averages(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
-        """`averages(s, state)`: what is averaged over time between events, by name.
-
-        Each is integrated beside the state with the method's own accuracy and divided by the time
-        that it took: `Run.averages` of each cycle, `Orbit.averages` and columns of a `Branch` over
-        the period. What jumps with an impact is not in it. Its name must be its own, its unit is
-        that of the same name in `units`. As the field, it gets the modes of a machine that has
-        some; nothing is integrated where no motion is recorded (`record="sections"`)."""
-        return {}
-
-    def quantities(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
-        """`quantities(s, state)`: functions of the state, by name, which results tell beside it: on
-        sections, in samples, along branches. `s` counts from the section; it is 0 where the state
-        has a clock of its own and for autonomous machines."""
-        return {}
-
-    @property
-    def period(self) -> Float[Array, ""] | float:
-        """Duration of a cycle, where it is fixed."""
-        return self.cycle
-
-    def frequency_ratio(self, duration: Float[Array, "..."]) -> Float[Array, "..."] | None:
-        """Mean drive speed over cycles of these durations, or `None` where nothing is driven."""
-        return None
-
-    def step_limit(self, s: Float[Array, ""], state: State) -> Float[Array, ""] | float:
-        """The longest step that holds at most one extremum of the motion; at most `cycle`/5."""
-        return self.cycle / 5
-
-    @property
-    def scales_known(self) -> bool:
-        """Whether the usual number of fixed steps in a cycle is known to be enough; static."""
-        return False
-
-    def relaxation(self, s: Float[Array, ""], state: State) -> Float[Array, ""] | None:
-        """The shortest time constant (in `s`) with which something fades, `None` if nothing does.
-
-        Explicit Runge–Kutta methods are unstable with steps much longer than this.
-        """
-        return None
-
     def may_rest(self) -> bool:
         """Whether the body can come to rest on a stop, as far as is known; static."""
         return bool(self.stops)
 
-    def alive(self, state: State) -> jax.Array | None:
+    def alive(self, state: State) -> Bool[Array, ""] | None:
         """False where the clock of this machine breaks down; `None` where it cannot."""
         return None
 

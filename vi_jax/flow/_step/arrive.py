@@ -131,7 +131,8 @@ def _released(
     plan: Plan, lane: Lane, taken: Flag, arrival: Arrival, way: FlowToEvent, k: int, leaves: Release
 ) -> Arrival:
     """Coordinate number k free again."""
-    assert arrival.contact is not None
+    contact = arrival.contact
+    assert contact is not None
     free, offset = leaves.landed, stop_gradient(leaves.offset)
     offset = met_after(way.rate, way.force(k), offset, way.moving, way.fixed, way.rest)
     moving = arrival.s, arrival.state, arrival.time
@@ -139,12 +140,12 @@ def _released(
     if not exact(plan.machine, state):
         # While they were held their places were kept to the method's error.
         limited = sorted({stop.coordinate for stop in plan.machine.stops})
-        walls = {i: arrival.contact[i] for i in limited}
+        walls = {i: contact[i] for i in limited}
         put, _ = stilled(plan, state, {i: walls[i] > 0 for i in limited}, walls)
         state = select(walls[k] > 0, put, state)
     direction = jnp.where(free, -lane.direction[k], arrival.direction[k])
     clock = clock_at(plan, arrival.s + jnp.where(free, offset, 0.0), state)
-    stop = arrival.contact[k] - to_event(0)
+    stop = contact[k] - to_event(0)
     events = noted(arrival.tally.events, taken & free, clock, LEAVES, stop, jnp.nan)
     arrival = arrival._replace(
         s=arrival.s + jnp.where(free, offset, 0.0),
@@ -153,7 +154,7 @@ def _released(
     )
     return arrival.counting(events=events).going(
         direction=_put(arrival.direction, k, direction),
-        contact=_put(arrival.contact, k, jnp.where(free, 0.0, arrival.contact[k])),
+        contact=_put(contact, k, jnp.where(free, 0.0, contact[k])),
     )
 
 

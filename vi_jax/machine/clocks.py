@@ -1,0 +1,85 @@
+"""What counts the cycles of a machine, and what measures time."""
+
+import abc
+from typing import Any, Self
+
+from jaxtyping import Array, Float
+
+from .shown import Shown
+
+State = Any
+
+
+class Clocked(Shown):
+    """The clocks of a machine: the independent variable `s`, what counts its cycles, and time."""
+
+    @property
+    @abc.abstractmethod
+    def cycle(self) -> Float[Array, ""] | float:
+        """Length of one cycle in `s` (or in `clock(state)`, where that is not `None`); where
+        `section` ends a cycle, its usual length, by which steps are sized."""
+
+    def clock(self, state: State) -> Float[Array, ""] | None:
+        """The state component that counts cycles, or `None` where `s` itself does."""
+        return None
+
+    def rewound(self, state: State) -> State:
+        """`state` with its clock set back by one cycle (only asked where there is a clock)."""
+        return state
+
+    def pace(self, s: Float[Array, ""], state: State) -> Float[Array, ""] | None:
+        """d(time)/ds where it varies along the motion, or `None` where `s` measures time."""
+        return None
+
+    @property
+    def period(self) -> Float[Array, ""] | float:
+        """Duration of a cycle, where it is fixed."""
+        return self.cycle
+
+    def frequency_ratio(self, duration: Float[Array, "..."]) -> Float[Array, "..."] | None:
+        """Mean drive speed over cycles of these durations, or `None` where nothing is driven."""
+        return None
+
+    def in_clock(self, clock: str) -> Self:
+        """The same machine with another independent variable, for one that has several."""
+        raise ValueError(
+            f"Argument `clock` must be left out for a {type(self).__name__}, which has its own "
+            f"clock, but got {clock!r}."
+        )
+
+    def in_cycle_clock(self) -> Self:
+        """The same machine with what counts its cycles as its independent variable."""
+        return self
+
+    def in_cycle_state(self, name: str, state: Any) -> State:
+        """A state on the section, of any of its clocks, as the machine in that clock needs it."""
+        return state
+
+    def phase_at(self, since_section: Any) -> Any:
+        """What the clock reads, from what it counted since the section."""
+        return since_section
+
+    @property
+    def turn(self) -> Float[Array, ""] | float:
+        """What an impact log counts in one cycle."""
+        return self.cycle
+
+    def as_logged(self, clock: Float[Array, "..."]) -> Float[Array, "..."]:
+        """A reading of what counts the cycles, as the impact log tells it; by default itself."""
+        return clock
+
+    def step_limit(self, s: Float[Array, ""], state: State) -> Float[Array, ""] | float:
+        """The longest step that holds at most one extremum of the motion; at most `cycle`/5."""
+        return self.cycle / 5
+
+    @property
+    def scales_known(self) -> bool:
+        """Whether the usual number of fixed steps in a cycle is known to be enough; static."""
+        return False
+
+    def relaxation(self, s: Float[Array, ""], state: State) -> Float[Array, ""] | None:
+        """The shortest time constant (in `s`) with which something fades, `None` if nothing does.
+
+        Explicit Runge–Kutta methods are unstable with steps much longer than this.
+        """
+        return None

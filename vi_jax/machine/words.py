@@ -1,0 +1,32 @@
+"""How pictures and messages speak of a machine."""
+
+from collections.abc import Mapping
+
+from .shown import Shown
+from .units import PLAIN, unit_in
+
+
+class Worded(Shown):
+    """The words of a machine: names and units for pictures and messages."""
+
+    @property
+    def labels(self) -> tuple[str, str]:
+        """What pictures write beside position and velocity, with units."""
+        return PLAIN
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """The units of its quantities by their names: `position`, `velocity`, `time`, `rate` (of
+        what grows in time, as exponents do), `energy`, `power`, and each number and component of a
+        state by its own name. "1" is without unit; the name "" stands for all that is not named,
+        and what is not stated is shown without. By default what the `labels` say in brackets."""
+        found = map(unit_in, self.labels)
+        return {x: unit for x, unit in zip(("position", "velocity"), found, strict=True) if unit}
+
+    def period_of(self, cycles: int) -> str:
+        """A duration of so many cycles, in words."""
+        return f"{cycles} cycle{'' if cycles == 1 else 's'}"
+
+    def place_of(self, since_section: float, cycles: int) -> str:
+        """A reading of the clock within a motion of so many cycles, in words."""
+        return f"clock {since_section:.6g} of its {self.period_of(cycles)}"
