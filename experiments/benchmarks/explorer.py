@@ -26,11 +26,9 @@ from vi_jax.explore.serve import compile_all
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/benchmarks")
-sys.path.insert(0, str(HERE.parent))
-from headlines import keep
+sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
+from tools.study import QUICK, write
 
-QUICK = "--quick" in sys.argv
 MOVES = 3 if QUICK else 50
 LIMIT = 0.2  # seconds, within which a redrawing seems immediate
 
@@ -116,5 +114,4 @@ numbers = {"lowest position where the sliders begin": low, "highest": high}
 figure = PICTURES["ideal"].figure
 for artist in figure.findobj():
     artist.set_animated(False)  # the page draws them over the frame
-if not QUICK:
-    keep(HERE, "explorer", TABLE, numbers, figure)
+write("explorer", TABLE, numbers, figure)

@@ -30,6 +30,7 @@ from peer_codes.contest import RESTITUTIONS, contest
 from peer_codes.entries import CYCLES, LANES, OURS, ROUNDS, SLOW_ROUNDS
 from peer_codes.pool import cores
 from peer_codes.task import PARAMETERS
+from tools.pictures import panels
 from tools.study import QUICK, write
 from tools.tables import table
 
@@ -125,11 +126,10 @@ LOOKS = {
 
 def picture(sections: dict[str, dict]) -> Figure:
     """Time against error at the first restitution, a panel for each drive and number of cores."""
-    figure = Figure(figsize=(9, 7), layout="constrained")
-    panels = figure.subplots(2, 2, sharex="row", sharey="row")
-    handles: dict[str, Any] = {}
+    figure, grid = panels(9, 7, 2, 2, sharex="row", sharey="row")
+        handles: dict[str, Any] = {}
     for axes, (drive, used) in zip(
-        panels.flat, ((d, u) for d in ("motor", "ideal") for u in ("one", "all")), strict=True
+        grid.flat, ((d, u) for d in ("motor", "ideal") for u in ("one", "all")), strict=True
     ):
         rows = sections[f"states, {drive}, {RESTITUTIONS[0]}, {used}"]["rows"]
         for family, (color, mark) in LOOKS.items():
@@ -145,9 +145,9 @@ def picture(sections: dict[str, dict]) -> Figure:
                 (handles[family],) = axes.loglog(*zip(*points, strict=True), **look)
         axes.set_title(f"{drive} drive, {used} core{'s' * (used == 'all')}", fontsize=10)
         axes.grid(alpha=0.3)
-    for axes in panels[:, 0]:
+    for axes in grid[:, 0]:
         axes.set_ylabel("1,024 lanes, 200 cycles: run time (s)")
-    for axes in panels[1]:
+    for axes in grid[1]:
         axes.set_xlabel("median error of the final state (a, a ω)")
     figure.legend(handles=handles.values(), loc="outside lower center", ncols=5, fontsize=8)
     return figure

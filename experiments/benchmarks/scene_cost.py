@@ -20,17 +20,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import vi_jax as vi
-from matplotlib.figure import Figure
 from vi_jax.plot.colors import BLUE
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/benchmarks")
-sys.path.insert(0, str(HERE.parent))
-from headlines import keep
+sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
 from headlines.jaxprs import primitives
+from tools.pictures import open_frames, panels
+from tools.study import QUICK, write
 
-QUICK = "--quick" in sys.argv
 LANES, CYCLES, ROUNDS = (32, 10, 3) if QUICK else (256, 200, 7)
 
 
@@ -142,12 +140,10 @@ print("\n".join(lines))
 # ## Figure
 
 # %%
-figure = Figure(figsize=(9, 4.6), layout="constrained")
-ax = figure.subplots()
+figure, ax = panels(9, 4.6)
 names = [made.name for made in SCENES][::-1]
 ax.barh(names, [cost[name] for name in names], color=BLUE)
 ax.set(xlabel="run time of a drive cycle of one lane (µs)")
-ax.spines[["top", "right"]].set_visible(False)
+open_frames([ax])
 numbers = {f"operations: {name}": float(count) for name, count in size.items()}
-if not QUICK:
-    keep(HERE, "scene_cost", "\n".join(lines), numbers, figure)
+write("scene_cost", "\n".join(lines), numbers, figure)

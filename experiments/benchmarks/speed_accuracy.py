@@ -28,8 +28,7 @@ jax.config.update("jax_enable_x64", True)
 warnings.filterwarnings("ignore", message="vi_jax is running in single precision")
 warnings.filterwarnings("ignore", message="[0-9,]+ of [0-9,]+ lanes failed")
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/benchmarks")
-sys.path.insert(0, str(HERE.parent))
+sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
 from benchmarks.accuracy.landing import landings
 from benchmarks.accuracy.measures import (
     FEW,

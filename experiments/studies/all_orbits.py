@@ -30,11 +30,9 @@ from vi_jax.plot.colors import STOP, color_of, paler
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
-sys.path.insert(0, str(HERE.parent))
-from headlines import keep
+sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
+from tools.study import QUICK, write
 
-QUICK = "--quick" in sys.argv
 GUESSES, GRID, SETTLE = (128, 12, 600) if QUICK else (4096, 96, 3000)
 PERIODS = range(1, 3) if QUICK else range(1, 7)
 ZETA, K, GAP, XI = 3.2, 0.9, 1.05, 0.002
@@ -299,5 +297,4 @@ if len(kinds) < len(panels):  # an empty panel: the axis of its column, and what
 for panel in panels[-2:]:
     panel.set_xlabel("Y = y/a")
 numbers = {f"largest multiplier of {chr(65 + j)}": kind.size for j, kind in enumerate(kinds)}
-if not QUICK:
-    keep(HERE, "all_orbits", f"# Periodic motions at one point\n\n{report}", numbers, figure)
+write("all_orbits", f"# Periodic motions at one point\n\n{report}", numbers, figure)

@@ -27,21 +27,14 @@ from matplotlib.figure import Figure
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
-sys.path.insert(0, str(HERE.parent))
-from headlines import keep
+sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
+from tools.study import QUICK, say, write
 
-QUICK = "--quick" in sys.argv
-BEGIN = time.perf_counter()
 # One size of block for all calls: one program. Impacts lie near φ = 0; look half a turn later.
 LANES, WORKERS, SECTION = (256, 2, np.pi) if QUICK else (4096, 2, np.pi)
 SAMPLES, AGAIN = (400, 100) if QUICK else (8192, 1000)
 # A whole number of periods of every motion found here.
 WATCHED = 600
-
-
-def say(text: object) -> None:
-    print(f"[{time.perf_counter() - BEGIN:5.1f} s] {text}", flush=True)
 
 
 class Case(NamedTuple):
@@ -223,6 +216,5 @@ numbers = {
     for found in everything
     for a, size in zip(found.grid.attractors, found.multipliers, strict=True)
 }
-if not QUICK:
-    keep(HERE, "basins_map", "\n".join(lines), numbers, figure, dpi=85)
+write("basins_map", "\n".join(lines), numbers, figure, dpi=85)
 say(f"done, {time.process_time():.0f} s of CPU time")

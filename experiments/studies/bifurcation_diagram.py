@@ -29,8 +29,7 @@ from vi_jax.plot.colors import color_of
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
-sys.path.insert(0, str(HERE.parent))
+sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
 from studies.parts.bifurcation_picture import Drawn, picture
 from studies.parts.bifurcation_runs import (
     CHUNK,

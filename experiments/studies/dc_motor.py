@@ -11,22 +11,19 @@
 # %%
 import sys
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import vi_jax as vi
-from matplotlib.figure import Figure
 from vi_jax.plot.colors import BLUE, GREEN, ORANGE, RED
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
-sys.path.insert(0, str(HERE.parent))
-from headlines import keep
+sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
+from tools.pictures import open_frames, panels
+from tools.study import QUICK, write
 
-QUICK = "--quick" in sys.argv
 TORQUES = (10.0,) if QUICK else (0.2, 2.0, 10.0, 100.0)
 KAPPAS = np.linspace(0.5, 1.9, 5 if QUICK else 57)
 TIMES = (0.1, 1.0) if QUICK else (0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
@@ -34,7 +31,7 @@ OMEGA = float(vi.Parameters().natural_frequency)
 TAU = 1 / (float(vi.Parameters().inertia) * OMEGA**2)  # τ0 of 1 N·m
 
 
-def machine(torque: Any, kappa: Any, time: Any = None) -> vi.Scene:
+def machine(torque, kappa, time=None) -> vi.Scene:
     """Table 1 at k = 0.5, with an armature of τe = `time` or without one."""
     lag = None if time is None else time / OMEGA
     return vi.Parameters(
@@ -133,8 +130,7 @@ print(table)
 worst = low / np.asarray(TIMES)[:, None]
 print(f"{lost} motions lost; min Y changes by at most {worst.max():.1e} τe")
 
-figure = Figure(figsize=(11, 4.2), layout="constrained")
-left, right = figure.subplots(1, 2)
+figure, (left, right) = panels(11, 4.2, 1, 2)
 colors = (GREEN, ORANGE, BLUE, RED)
 for j, torque in enumerate(TORQUES):
     left.loglog(
@@ -154,8 +150,7 @@ right.axhline(0.9, color="0.6", lw=0.8, ls=":", zorder=0, label="κ")
 right.set(xlabel="time τ (1/ω)", ylabel="crank speed φ'/ω", xlim=(0, 40))
 right.set_title(f"switched on at rest, T0 = {shown:g} N·m, κ = 0.9", fontsize=10)
 right.legend(frameon=False, fontsize=9, loc="lower right")
-for ax in (left, right):
-    ax.spines[["top", "right"]].set_visible(False)
+open_frames((left, right))
 
 # %%
 small = max(low[i].max() for i, x in enumerate(TIMES) if x <= 0.3)
@@ -196,5 +191,4 @@ numbers = {
     "T0 = 10 N·m, κ = 0.9, τe = 0.1: min Y": float(pair[1].y_min),
     "T0 = 10 N·m, κ = 0.9, τe = 0.1: ζ": float(pair[1].frequency_ratio),
 }
-if not QUICK:
-    keep(HERE, "dc_motor", text, numbers, figure)
+write("dc_motor", text, numbers, figure)

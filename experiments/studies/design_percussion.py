@@ -25,8 +25,7 @@ import vi_jax as vi
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
-sys.path.insert(0, str(HERE.parent))
+sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
 from studies.parts.percussion import (
     DESIGNS,
     FIRST,

@@ -27,11 +27,9 @@ jax.config.update("jax_enable_x64", True)
 # Single precision is one of the things compared here.
 warnings.filterwarnings("ignore", message="vi_jax is running in single precision")
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
-sys.path.insert(0, str(HERE.parent))
-from headlines import keep
+sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
+from tools.study import QUICK, write
 
-QUICK = "--quick" in sys.argv
 CYCLES, NEAR = 600, 0.05
 STYLE = {
     "displaced start": ("k", "x"),
@@ -308,5 +306,4 @@ numbers = {
         next(r for r in rows if r.setting == "1e-07" and r.group == "displaced start").cycles
     ),
 }
-if not QUICK:
-    keep(HERE, "escape_from_2pi", text, numbers, figure)
+write("escape_from_2pi", text, numbers, figure)

@@ -26,11 +26,9 @@ from vi_jax.paper.response_figure import LOOK, draw_response
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
-sys.path.insert(0, str(HERE.parent))
-from headlines import keep
+sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
+from tools.study import QUICK, write
 
-QUICK = "--quick" in sys.argv
 begin = time.perf_counter()
 found: Response = response(quick=QUICK, walled=True)
 print(f"closed forms, branches, sweeps: {time.perf_counter() - begin:.0f} s", flush=True)
@@ -289,6 +287,5 @@ for system, branch in ((s, b) for s in found.systems for b in s.branches):
     for point in sorted(branch.special, key=lambda p: p.parameter):
         name = f"{panel_name(system)}, {motion}: {point.kind} {point.parameter:.3f}"
         numbers[name] = point.parameter
-if not QUICK:
-    keep(HERE, "fig2_frequency_response", filled, numbers, figure, **LOOK)
+write("fig2_frequency_response", filled, numbers, figure, **LOOK)
 print(f"in all: {time.perf_counter() - begin:.0f} s")

@@ -21,16 +21,14 @@ import jax
 import numpy as np
 import optax
 import vi_jax as vi
-from matplotlib.figure import Figure
 from vi_jax.plot.colors import color_of
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
-sys.path.insert(0, str(HERE.parent))
-from headlines import keep
+sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
+from tools.pictures import panels
+from tools.study import QUICK, write
 
-QUICK = "--quick" in sys.argv
 KAPPA, TRANSIENT = 0.9, 1000
 # The rate falls from 0.02 to zero, as it does by default.
 NEWTON, ADAM = vi.Newton(), vi.Gradient(optax.adam(optax.cosine_decay_schedule(0.02, 1000)))
@@ -241,8 +239,7 @@ print(table)
 
 # %%
 COLORS = {"newton": "0.2", "adam": "#cc79a7"}
-figure = Figure(figsize=(11, 8), layout="constrained")
-(first, second), (bars, times) = figure.subplots(2, 2)
+figure, ((first, second), (bars, times)) = panels(11, 8, 2, 2)
 shown = [rows[0], next(r for r in rows if r["machine"] == SECOND and r["torque"] == 10.0)]
 for axes, row in zip((first, second), shown, strict=True):
     for name in SEARCHES:
@@ -325,5 +322,4 @@ numbers = {
     for row in rows
     if row["torque"] is None
 }
-if not QUICK:
-    keep(HERE, "fit_4pi_orbit", text, numbers, figure)
+write("fit_4pi_orbit", text, numbers, figure)

@@ -30,11 +30,9 @@ from vi_jax.plot.colors import BLUE, ORANGE, RED, STOP, paler
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
-sys.path.insert(0, str(HERE.parent))
-from headlines import keep
+sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
+from tools.study import QUICK, write
 
-QUICK = "--quick" in sys.argv
 RECORDS = 16 if QUICK else 256
 CYCLES, SAMPLES, DECIBELS = 10, 32, 30.0
 NAMES = ("k", "ξ", "d", "Y0", "V0")
@@ -229,5 +227,4 @@ axes[NAMES[2]].set_title(
 numbers = {f"{name}, first record": float(estimates[0, i]) for i, name in enumerate(NAMES)}
 numbers["k and ξ: correlation"] = float(correlation[0, 1])
 numbers["noise"] = noise
-if not QUICK:
-    keep(HERE, "identify", report.replace("\\\n", ""), numbers, figure)
+write("identify", report.replace("\\\n", ""), numbers, figure)

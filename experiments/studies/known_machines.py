@@ -17,16 +17,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import vi_jax as vi
-from matplotlib.figure import Figure
 from vi_jax.plot.colors import BLUE, GREEN, ORANGE, RED
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
-sys.path.insert(0, str(HERE.parent))
-from headlines import keep
+sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
+from tools.pictures import open_frames, panels
+from tools.study import QUICK, write
 
-QUICK = "--quick" in sys.argv
 RESTITUTIONS = (0.4, 0.6) if QUICK else (0.2, 0.8)
 PI = np.pi
 M = vi.machines
@@ -157,8 +155,7 @@ numbers = {
 table_text = "\n".join(rows)
 print(table_text)
 
-figure = Figure(figsize=(10, 7.2), layout="constrained")
-panels = figure.subplots(2, 2)
+figure, grid = panels(10, 7.2, 2, 2)
 
 
 def drawn(ax: Any, points: np.ndarray, known: Any, color: str, name: str) -> None:
@@ -170,7 +167,7 @@ def drawn(ax: Any, points: np.ndarray, known: Any, color: str, name: str) -> Non
     ax.plot(at, known(at), "o", ms=5, mfc="none", color=color, label=f"{name}, closed form")
 
 
-ball, box, oscillator, capsules = panels.flat
+ball, box, oscillator, capsules = grid.flat
 drawn(ball, born, CURVES[0][3], BLUE, "birth")
 drawn(ball, doubles, CURVES[1][3], RED, "period doubling")
 ball.set(
@@ -194,9 +191,9 @@ for point in branch.special:
     capsules.plot(point.parameter, at, "ok", ms=5, label=None)
 capsules.plot([], [], "ok", ms=5, label="its ends: events fall together")
 capsules.set(title="capsule", xlabel="amplitude α (F)", ylabel="progress in a cycle (F/k)")
-for ax in panels.flat:
+for ax in grid.flat:
     ax.legend(frameon=False, fontsize=8)
-    ax.spines[["top", "right"]].set_visible(False)
+open_frames(grid.flat)
 
 # %%
 text = f"""# Ready machines beside what is known of them
@@ -216,5 +213,4 @@ events fall together.
 - The capsule's branch of one impact a cycle runs from α = {branch.parameter.min():.6f} to
   {branch.parameter.max():.6f}, where it goes {along[np.argmax(branch.parameter)]:.4f} F/k a cycle.
 """
-if not QUICK:
-    keep(HERE, "known_machines", text, numbers, figure)
+write("known_machines", text, numbers, figure)

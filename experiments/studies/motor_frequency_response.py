@@ -22,8 +22,7 @@ import vi_jax as vi
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
-sys.path.insert(0, str(HERE.parent))
+sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
 from studies.parts.motor_forecast import HARD, ZETAS, forecast, misfit, weakest_without_fold
 from studies.parts.motor_picture import picture
 from studies.parts.motor_sweeps import (

@@ -32,11 +32,9 @@ from vi_jax.plot.colors import BLUE, ORANGE, STOP, paler
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
-sys.path.insert(0, str(HERE.parent))
-from headlines import keep
+sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
+from tools.study import QUICK, write
 
-QUICK = "--quick" in sys.argv
 RECORDS, WARM_UP, DRAWS = (8, 100, 100) if QUICK else (200, 300, 800)
 CYCLES, SAMPLES, NOISE = 4, 16, 0.05
 NAMES = ("restitution", "gap", "damping_ratio")
@@ -251,12 +249,11 @@ def page() -> str:
 
 figure = draw()
 print(f"{time.perf_counter() - BEGUN:.0f} s")
-if not QUICK:
-    slope = np.asarray(jax.jacfwd(positions)(truth[FIRST]))
-    numbers = {
-        "record of the picture": FIRST,
-        "its impacts": int(impacts[FIRST]),
-        "its least position": float(clean[FIRST].min()),
-        "its information on z": float(np.linalg.slogdet(slope.T @ slope)[1]),
-    }
-    keep(HERE, "posterior", page(), numbers, figure)
+slope = np.asarray(jax.jacfwd(positions)(truth[FIRST]))
+numbers = {
+    "record of the picture": FIRST,
+    "its impacts": int(impacts[FIRST]),
+    "its least position": float(clean[FIRST].min()),
+    "its information on z": float(np.linalg.slogdet(slope.T @ slope)[1]),
+}
+write("posterior", page(), numbers, figure)

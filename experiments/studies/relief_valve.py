@@ -17,16 +17,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import vi_jax as vi
-from matplotlib.figure import Figure
 from scipy.optimize import brentq
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
-sys.path.insert(0, str(HERE.parent))
-from headlines import keep
+sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
+from tools.pictures import open_frames, panels
+from tools.study import QUICK, write
 
-QUICK = "--quick" in sys.argv
 RATES = np.linspace(0.3, 8.48, 60 if QUICK else 600)
 SETTLE, SEEN = (100, 16) if QUICK else (600, 64)
 BOUNDS = (0.3, 9.0)
@@ -91,8 +89,7 @@ for branch in (free, hitting, *doubled):
 table = "\n".join(rows)
 print(table)
 
-figure = Figure(figsize=(11, 5.4), layout="constrained")
-upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
+figure, (upper, lower) = panels(11, 5.4, 2, 1, sharex=True, height_ratios=(3, 1))
 upper.plot(np.repeat(RATES, SEEN), lifts.ravel(), ",", color="0.45", rasterized=True)
 upper.plot([], [], ".", color="0.45", ms=3, label="what valves settle on")
 colors = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
@@ -117,8 +114,7 @@ upper.set_ylabel("lift at its maxima")
 upper.legend(frameon=False, fontsize=9, ncols=2, loc="upper left")
 lower.plot(RATES, impacts.mean(axis=1), ".", color="0.3", ms=2.5)
 lower.set(xlabel="flow rate q", ylabel="impacts in a cycle", xlim=(0, 9))
-for ax in (upper, lower):
-    ax.spines[["top", "right"]].set_visible(False)
+open_frames((upper, lower))
 
 # %%
 text = f"""# A relief valve, from rest to chatter
@@ -146,5 +142,4 @@ numbers = {
     "first doubling, q": min(p.parameter for p in doublings),
     "second doubling, q": max(p.parameter for p in doublings),
 }
-if not QUICK:
-    keep(HERE, "relief_valve", text, numbers, figure)
+write("relief_valve", text, numbers, figure)

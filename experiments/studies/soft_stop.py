@@ -19,18 +19,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import vi_jax as vi
-from matplotlib.figure import Figure
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 from vi_jax.plot.colors import BLUE, GREEN, RED
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
-sys.path.insert(0, str(HERE.parent))
-from headlines import keep
+sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
+from tools.pictures import panels
+from tools.study import QUICK, write
 
-QUICK = "--quick" in sys.argv
 STIFFNESS = np.logspace(1, 6, 11 if QUICK else 51)
 NEAR = np.logspace(1.8, 2.4, 6 if QUICK else 61)  # where the two motions part
 
@@ -228,8 +226,7 @@ print(table, runs, sep="\n")
 # ## Figure
 
 # %%
-figure = Figure(figsize=(10.5, 4.4), layout="constrained")
-left, right = figure.subplots(1, 2)
+figure, (left, right) = panels(10.5, 4.4, 1, 2)
 for law, colour in COLOURS.items():
     K, least = critical(law)
     left.semilogx(K, least, color=colour, label=law)
@@ -290,5 +287,4 @@ numbers["multiplier of the 2π motion at K = 1000, spring and dashpot"] = float(
     np.interp(3.0, np.log10(critical("spring and dashpot")[0]), critical("spring and dashpot")[1])
 )
 print(f"all: {time.perf_counter() - begin:.0f} s")
-if not QUICK:
-    keep(HERE, "soft_stop", text, numbers, figure)
+write("soft_stop", text, numbers, figure)

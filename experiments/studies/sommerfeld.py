@@ -18,16 +18,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import vi_jax as vi
-from matplotlib.figure import Figure
 from vi_jax.plot.colors import BLUE, GREEN, RED, once
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
-sys.path.insert(0, str(HERE.parent))
-from headlines import keep
+sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
+from tools.pictures import open_frames, panels
+from tools.study import QUICK, write
 
-QUICK = "--quick" in sys.argv
 STRENGTHS = (0.1, 0.2, 1.0)
 EPSILON, XI, GAP = 0.01, 0.05, 4.0
 VALUES, SETTLE = (31, 200) if QUICK else (161, 400)
@@ -124,8 +122,7 @@ for i, strength in enumerate(STRENGTHS):
 table = "\n".join(rows)
 print(table)
 
-figure = Figure(figsize=(11, 4.4), layout="constrained")
-left, right = figure.subplots(1, 2, sharex=True, sharey=True)
+figure, (left, right) = panels(11, 4.4, 1, 2, sharex=True, sharey=True)
 colors = (RED, BLUE, GREEN)
 for i, strength in enumerate(STRENGTHS):
     speeds, kappa, _ = averaged(strength)
@@ -150,7 +147,7 @@ for ax, title in ((left, "no stop"), (right, f"a stop at {GAP:g} m r/M")):
     ax.plot([LOW, HIGH], [LOW, HIGH], color="0.6", lw=0.8, ls=":", zorder=0, label="ζ = κ")
     ax.set(xlabel="motor control κ", ylabel="mean speed ζ (ω)", xlim=(LOW, HIGH), ylim=(LOW, HIGH))
     ax.set_title(title, fontsize=10)
-    ax.spines[["top", "right"]].set_visible(False)
+open_frames((left, right))
 right.set_ylabel("")
 left.legend(frameon=False, fontsize=8, loc="upper left")
 
@@ -175,5 +172,4 @@ the continued motion the thin one (unstable: dashed).
 
 {table}
 """
-if not QUICK:
-    keep(HERE, "sommerfeld", text, numbers, figure)
+write("sommerfeld", text, numbers, figure)

@@ -17,16 +17,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import vi_jax as vi
-from matplotlib.figure import Figure
 from vi_jax.plot.colors import BLUE, GREEN, RED
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
-sys.path.insert(0, str(HERE.parent))
-from headlines import keep
+sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
+from tools.pictures import open_frames, panels
+from tools.study import QUICK, write
 
-QUICK = "--quick" in sys.argv
 SETTLE, SEEN = (60, 8) if QUICK else (1500, 8)
 FRICTIONS = np.linspace(0.2, 1.1, 46 if QUICK else 361)
 # How runs end that do not go on: too many impacts in a cycle, an impact that would gain energy.
@@ -156,8 +154,7 @@ print(known, doubling)
 # ## Figure
 
 # %%
-figure = Figure(figsize=(11, 6.4), layout="constrained")
-axes = figure.subplots(3, 1, sharex=True, height_ratios=(2, 2, 1.3))
+figure, axes = panels(11, 6.4, 3, 1, sharex=True, height_ratios=(2, 2, 1.3))
 for ax, rows_of, name, reference, color in (
     (axes[0], time, "time of a cycle (ms)", 145.976, BLUE),
     (axes[1], drop, "drop in a cycle (mm)", 19.4454, RED),
@@ -173,7 +170,7 @@ axes[2].set_ylim(0, 40)
 for ax in axes:
     ax.axvspan(FRICTIONS[0], first, color="0.93", lw=0)
     ax.axvspan(last, FRICTIONS[-1], color="0.93", lw=0)
-    ax.spines[["top", "right"]].set_visible(False)
+open_frames(axes)
 for place, word in (((FRICTIONS[0] + first) / 2, "falls"), ((last + FRICTIONS[-1]) / 2, "no\nlaw")):
     axes[0].text(place, 0.5, word, ha="center", va="center", color="0.3",
                  transform=axes[0].get_xaxis_transform())  # fmt: skip
@@ -236,5 +233,4 @@ for value in (0.6, 0.8, 1.0):
     numbers[f"period at μ = {value:g}, ms"] = time[i, -1]
     numbers[f"drop at μ = {value:g}, mm"] = drop[i, -1]
 numbers |= {"multiplier at μ = 0.3": known, "period doubles, μ": doubling}
-if not QUICK:
-    keep(HERE, "woodpecker", text, numbers, figure)
+write("woodpecker", text, numbers, figure)

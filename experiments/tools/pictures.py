@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 
 def open_frames(panels: Iterable[Axes]) -> None:
@@ -26,3 +27,9 @@ def legend_below(figure: Any, handles: Iterable[Any], columns: int, **look: Any)
     """One legend for all panels, below them."""
     look = {"frameon": False, "fontsize": 9, **look}
     figure.legend(handles=list(handles), loc="outside lower center", ncols=columns, **look)
+
+
+def panels(width: float, height: float, *grid: int, **look: Any) -> tuple[Figure, Any]:
+    """A figure of a size in inches, and its panels as `Figure.subplots(*grid, **look)` gives them."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    return figure, figure.subplots(*grid, **look)

@@ -141,9 +141,7 @@ def measure(bench: Bench, task: Task, listed: list[Entry], truth, *, all_cores: 
     rows: list[dict[str, Any]] = []
     for job in jobs:
         found, right = job.result(), exact[job.lanes]
-        if (
-            found.ndim < right.ndim
-        ):  # the primal among derivatives has no such error
+        if found.ndim < right.ndim:  # the primal among derivatives has no such error
             error = np.full(len(found), np.nan)
         elif found.ndim == 3:
             error = np.abs(found - right).max(axis=(1, 2)) / np.abs(right).max(axis=(1, 2))

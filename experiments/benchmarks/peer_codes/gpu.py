@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import vi_jax as vi
 from tools.tables import table
+from vi_jax.flow.smooth import in_modes
 
 from .contest import note
 from .entries import CYCLES, QUICK
@@ -72,7 +73,7 @@ def _measured(drive: str, method: Any, dtype: str) -> list[list[str]]:
     def one_step(kappa):
         machine, start = _machine(task, kappa)
         one = jnp.ones_like(kappa)
-        return method.step(machine, 0 * one, 0.5 * one, start, None)[0]
+        return method.step(in_modes(machine, ()), 0 * one, 0.5 * one, start, None)[0]
 
     stepped = jax.jit(one_step).lower(jnp.asarray(0.9, dtype)).compile().cost_analysis()
     operations = float(stepped["flops"]) if stepped else float("nan")
