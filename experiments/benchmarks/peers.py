@@ -127,7 +127,7 @@ LOOKS = {
 def picture(sections: dict[str, dict]) -> Figure:
     """Time against error at the first restitution, a panel for each drive and number of cores."""
     figure, grid = panels(9, 7, 2, 2, sharex="row", sharey="row")
-        handles: dict[str, Any] = {}
+    handles: dict[str, Any] = {}
     for axes, (drive, used) in zip(
         grid.flat, ((d, u) for d in ("motor", "ideal") for u in ("one", "all")), strict=True
     ):

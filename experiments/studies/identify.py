@@ -199,7 +199,7 @@ for unknowns, name, style in (
     (jnp.asarray(estimates[0]), "fit", {"color": BLUE, "lw": 1.3}),
 ):
     vi.plot_history(
-        show(unknowns), scene=scene_of(unknowns), ax=history, label=name, stops=False, **style
+        show(unknowns), machine=scene_of(unknowns), ax=history, label=name, stops=False, **style
     )
 history.axhline(truth[2], color=STOP, lw=1.5, label="stop", zorder=0)
 history.set(xlim=(0, 2 * CYCLES), ylim=(-2.6, 2.1))

@@ -30,6 +30,6 @@ def legend_below(figure: Any, handles: Iterable[Any], columns: int, **look: Any)
 
 
 def panels(width: float, height: float, *grid: int, **look: Any) -> tuple[Figure, Any]:
-    """A figure of a size in inches, and its panels as `Figure.subplots(*grid, **look)` gives them."""
+    """A figure of a size in inches, and its panels as `Figure.subplots` gives them."""
     figure = Figure(figsize=(width, height), layout="constrained")
     return figure, figure.subplots(*grid, **look)
