@@ -13,9 +13,7 @@
 # Run with `python experiments/studies/basins_map.py` (`--quick` for coarse grids and few cycles).
 
 # %%
-import os
 import sys
-import time
 from pathlib import Path
 from typing import NamedTuple
 
@@ -29,6 +27,8 @@ jax.config.update("jax_enable_x64", True)
 
 sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
 from tools.study import QUICK, say, write
+from tools.tables import table
+from tools.timing import Clock
 
 # One size of block for all calls: one program. Impacts lie near φ = 0; look half a turn later.
 LANES, WORKERS, SECTION = (256, 2, np.pi) if QUICK else (4096, 2, np.pi)
@@ -92,8 +92,7 @@ def matched(one: vi.Basins, other: vi.Basins) -> dict[int, int]:
 class Found(NamedTuple):
     case: Case
     grid: vi.Basins
-    wall: float
-    cpu: float
+    clock: Clock
     random: vi.Basins
     other: int
     """Labels that `FixedStep` changed."""
@@ -107,11 +106,9 @@ for case in CASES:
     options = {"settle": case.settle, "workers": WORKERS, "progress": False}
     if not everything:  # so that the clock below does not count compiling
         vi.basins(machine, case.region, resolution=4, lanes=LANES, **{**options, "settle": 10})
-    begin = os.times()
-    grid = vi.basins(machine, case.region, resolution=case.side, lanes=LANES, **options)
-    end = os.times()
-    wall, cpu = end.elapsed - begin.elapsed, sum(end[:2]) - sum(begin[:2])
-    say(f"{case.title}: {wall:.1f} s, {cpu:.1f} s of CPU time\n{grid}")
+    with Clock() as clock:
+        grid = vi.basins(machine, case.region, resolution=case.side, lanes=LANES, **options)
+    say(f"{case.title}: {clock.wall:.1f} s, {clock.cpu:.1f} s of CPU time\n{grid}")
     random = vi.basins(machine, case.region, samples=SAMPLES, seed=1, lanes=LANES, **options)
     few = {"samples": AGAIN, "seed": 2, "lanes": 512}
     one = vi.basins(machine, case.region, **few, **options)
@@ -124,7 +121,7 @@ for case in CASES:
         start = machine.start(Y=a.sections["Y"][0], V=a.sections["V"][0])
         seen = vi.lyapunov(machine, start, WATCHED, settle=0, method=vi.ExactFlight())
         sizes.append(float(np.exp(a.period * seen.per_cycle[0])))
-    everything.append(Found(case, grid, wall, cpu, random, other, sizes))
+    everything.append(Found(case, grid, clock, random, other, sizes))
     say(f"random starts and FixedStep: {other} of {AGAIN} labels differ")
 
 # %% [markdown]
@@ -148,18 +145,7 @@ figure.suptitle("Which start settles on which motion; circles: the motions' sect
 # ## The table
 
 # %%
-lines = [
-    "# Basins of coexisting motions",
-    "",
-    "Ideal drive, section at φ = π. *Grid* and *random* are parts of all starts (grid: cell",
-    f"centres; random: {SAMPLES:,} starts with standard error); *off* is their difference in",
-    "standard errors of both together; *multiplier* the size of the greatest one over the period,",
-    f"from Lyapunov exponents over {WATCHED} cycles.",
-    "",
-    "| machine | period | impacts | section (Y, V) | grid, % | random, % | off | multiplier |",
-    "|---|---|---|---|---|---|---|---|",
-]
-times = []
+motions, times = [], []
 for found in everything:
     size = found.case.side**2
     pairs = {mine: theirs for theirs, mine in matched(found.grid, found.random).items()}
@@ -178,22 +164,26 @@ for found in everything:
         both = (p * (1 - p) * (1 / size + 1 / SAMPLES)) ** 0.5
         off = f"{(here - there) / both:+.1f}" if both else "–"
         shown = "–" if multiplier is None else f"{multiplier:.4f}"
-        lines.append(
-            f"| {found.case.title if i == 0 else ''} | {period} | {impacts} | {where} "
-            f"| {100 * here:.2f} | {100 * there:.2f} ± {100 * error:.2f} | {off} | {shown} |"
-        )
-    times.append(
-        f"| {found.case.title} | {found.case.side}² × {found.case.settle + 128:,} "
-        f"| {found.wall:.1f} | {found.cpu:.1f} | {found.other} of {AGAIN:,} |"
-    )
-lines += [
-    "",
-    "| machine | starts × cycles | wall, s | CPU, s | labels that `FixedStep` changes |",
-    "|---|---|---|---|---|",
-    *times,
-]
-lines.append(
-    """
+        title = "" if i else found.case.title
+        parts = (f"{100 * here:.2f}", f"{100 * there:.2f} ± {100 * error:.2f}")
+        motions.append((title, period, impacts, where, *parts, off, shown))
+    case, clock = found.case, found.clock
+    taken = (f"{clock.wall:.1f}", f"{clock.cpu:.1f}", f"{found.other} of {AGAIN:,}")
+    times.append((case.title, f"{case.side}² × {case.settle + 128:,}", *taken))
+heads = ["machine", "period", "impacts", "section (Y, V)", "grid, %", "random, %", "off"]
+motions = table([*heads, "multiplier"], motions)
+heads = ["machine", "starts × cycles", "wall, s", "CPU, s", "labels that `FixedStep` changes"]
+page = f"""# Basins of coexisting motions
+
+Ideal drive, section at φ = π. *Grid* and *random* are parts of all starts (grid: cell
+centres; random: {SAMPLES:,} starts with standard error); *off* is their difference in
+standard errors of both together; *multiplier* the size of the greatest one over the period,
+from Lyapunov exponents over {WATCHED} cycles.
+
+{motions}
+
+{table(heads, times)}
+
 - Nothing was listed beforehand. In the first machine `vi.basins` finds the four stable motions of
   `all_orbits.md` with their multipliers (0.9961, 0.8930, 0.8895, 0.7943), and one more, of 15
   cycles with 6 impacts, which that search for periods up to 6 could not find: it is what one in a
@@ -209,12 +199,11 @@ lines.append(
 - In the third machine the body of Table 1's machine, above resonance, keeps hitting the stop or
   swings free, by its start; from rest it swings free.
 """
-)
-print("\n".join(lines))
+print(page)
 numbers = {
     f"{found.case.title}: multiplier of the {2 * a.period}π motion, {a.impacts:g} impacts": size
     for found in everything
     for a, size in zip(found.grid.attractors, found.multipliers, strict=True)
 }
-write("basins_map", "\n".join(lines), numbers, figure, dpi=85)
-say(f"done, {time.process_time():.0f} s of CPU time")
+write("basins_map", page, numbers, figure, dpi=85)
+say("done")

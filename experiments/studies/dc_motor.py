@@ -23,6 +23,7 @@ jax.config.update("jax_enable_x64", True)
 sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
 from tools.pictures import open_frames, panels
 from tools.study import QUICK, write
+from tools.tables import table
 
 TORQUES = (10.0,) if QUICK else (0.2, 2.0, 10.0, 100.0)
 KAPPAS = np.linspace(0.5, 1.9, 5 if QUICK else 57)
@@ -112,21 +113,19 @@ swing = np.array([[ups[t, x].max() - ups[t, None].max() for t in TORQUES] for x 
 # ## Table and figure
 
 # %%
-rows = [
-    "| T0, N·m | τe | L/R, ms | τe τ0/w0 | min Y | max Y | ζ | largest multiplier | "
-    "speed from rest, at worst | its peak |",
-    "|" + "---|" * 10,
-]
+heads = [
+    "T0, N·m", "τe", "L/R, ms", "τe τ0/w0", "min Y", "max Y", "ζ", "largest multiplier",
+    "speed from rest, at worst", "its peak",
+]  # fmt: skip
+rows = []
 for j, torque in enumerate(TORQUES):
     for i, time in enumerate(TIMES):
         cells = [f"{x[i, j]:.1e}" for x in (low, high, ratio, slow)]
-        rows.append(
-            f"| {torque:g} | {time:g} | {1e3 * time / OMEGA:.3g} | {time * TAU * torque:.3g} | "
-            + " | ".join(cells)
-            + f" | {late[i, j]:.3f} | {swing[i, j]:+.3f} |"
-        )
-table = "\n".join(rows)
-print(table)
+        times = (f"{time:g}", f"{1e3 * time / OMEGA:.3g}", f"{time * TAU * torque:.3g}")
+        from_rest = (f"{late[i, j]:.3f}", f"{swing[i, j]:+.3f}")
+        rows.append([f"{torque:g}", *times, *cells, *from_rest])
+changes = table(heads, rows)
+print(changes)
 worst = low / np.asarray(TIMES)[:, None]
 print(f"{lost} motions lost; min Y changes by at most {worst.max():.1e} τe")
 
@@ -177,7 +176,7 @@ approached. *From rest*: both switched on at rest at κ = 0.9, the difference in
   19 ms (τe = 0.3) they are right to {small:.0e} of the crank. Where a run-up, a
   passage or the current itself matters, take `DCMotor`.
 
-{table}
+{changes}
 """
 pair = [
     vi.find_orbit(

@@ -32,6 +32,7 @@ jax.config.update("jax_enable_x64", True)
 
 sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
 from tools.study import QUICK, write
+from tools.tables import table
 
 RECORDS = 16 if QUICK else 256
 CYCLES, SAMPLES, DECIBELS = 10, 32, 30.0
@@ -120,20 +121,19 @@ found = scatter < 1.25 * noise
 units = ((estimates - truth) / errors)[found]
 covered = np.abs(units) < 1.96
 slack = 1.96 * np.sqrt(0.95 * 0.05 / found.sum())
-lines = [
-    "| | true | first guess | estimate, first record | its standard error | "
-    "mean of all estimates | their spread | mean standard error | within ±1.96 errors |",
-    "|---|---|---|---|---|---|---|---|---|",
-]
+heads = [
+    "", "true", "first guess", "estimate, first record", "its standard error",
+    "mean of all estimates", "their spread", "mean standard error", "within ±1.96 errors",
+]  # fmt: skip
+rows = []
 for i, name in enumerate(NAMES):
     one, all_ = estimates[0, i], estimates[found, i]
-    lines.append(
-        f"| {name} | {truth[i]:.5f} | {float(GUESS[i]):g} | {one:.5f} | {errors[0, i]:.5f} | "
-        f"{all_.mean():.5f} | {all_.std(ddof=1):.5f} | {errors[found, i].mean():.5f} | "
-        f"{covered[:, i].mean():.1%} |"
-    )
-table = "\n".join(lines)
-print(table)
+    mean, spread = all_.mean(), all_.std(ddof=1)
+    numbers = (one, errors[0, i], mean, spread, errors[found, i].mean())
+    cells = [f"{truth[i]:.5f}", f"{float(GUESS[i]):g}", *(f"{x:.5f}" for x in numbers)]
+    rows.append([name, *cells, f"{covered[:, i].mean():.1%}"])
+unknowns = table(heads, rows)
+print(unknowns)
 
 
 jacobian = np.asarray(jax.jit(jax.jacfwd(positions))(TRUTH))
@@ -164,7 +164,7 @@ left = float(np.min(np.asarray(again[2])[~near], initial=np.inf)) / noise
 worst = float(np.max(np.abs(covered.mean(axis=0) - 0.95)))
 report = f"""# Identifying a stop from a noisy record of the motion
 
-{table}
+{unknowns}
 
 Ideal drive, ζ = 0.9, {CYCLES} cycles with {impacts} impacts, {clean.size} positions with noise of \
 {noise:.4f} a ({DECIBELS:g} dB below the signal's standard deviation); lengths in units of a, \
@@ -227,4 +227,4 @@ axes[NAMES[2]].set_title(
 numbers = {f"{name}, first record": float(estimates[0, i]) for i, name in enumerate(NAMES)}
 numbers["k and ξ: correlation"] = float(correlation[0, 1])
 numbers["noise"] = noise
-write("identify", report.replace("\\\n", ""), numbers, figure)
+write("identify", report, numbers, figure)

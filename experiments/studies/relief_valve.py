@@ -24,6 +24,7 @@ jax.config.update("jax_enable_x64", True)
 sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
 from tools.pictures import open_frames, panels
 from tools.study import QUICK, write
+from tools.tables import table
 
 RATES = np.linspace(0.3, 8.48, 60 if QUICK else 600)
 SETTLE, SEEN = (100, 16) if QUICK else (600, 64)
@@ -79,15 +80,13 @@ rest_lost: Any = brentq(growth, 8.0, 9.0, xtol=1e-12)
 # ## Table and figure
 
 # %%
-rows = ["| q | what happens | period, in maxima of the lift | duration |", "|---|---|---|---|"]
+rows = []
 for branch in (free, hitting, *doubled):
     for point in branch.special:
-        rows.append(
-            f"| {point.parameter:.9f} | {point.kind}: {point.detail} | {int(point.orbit.cycles)} | "
-            f"{float(point.orbit.duration):.6f} |"
-        )
-table = "\n".join(rows)
-print(table)
+        what, duration = f"{point.kind}: {point.detail}", f"{float(point.orbit.duration):.6f}"
+        rows.append((f"{point.parameter:.9f}", what, int(point.orbit.cycles), duration))
+points = table(["q", "what happens", "period, in maxima of the lift", "duration"], rows)
+print(points)
 
 figure, (upper, lower) = panels(11, 5.4, 2, 1, sharex=True, height_ratios=(3, 1))
 upper.plot(np.repeat(RATES, SEEN), lifts.ravel(), ",", color="0.45", rasterized=True)
@@ -134,7 +133,7 @@ broken where they are unstable.
 - **Below, one impact a cycle** is stable between the period doublings at
   q = {min(p.parameter for p in doublings):.9f} and {max(p.parameter for p in doublings):.9f}.
 
-{table}
+{points}
 """
 numbers = {
     "Hopf, q": hopf.parameter,

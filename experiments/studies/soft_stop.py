@@ -28,6 +28,7 @@ jax.config.update("jax_enable_x64", True)
 sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
 from tools.pictures import panels
 from tools.study import QUICK, write
+from tools.tables import table
 
 STIFFNESS = np.logspace(1, 6, 11 if QUICK else 51)
 NEAR = np.logspace(1.8, 2.4, 6 if QUICK else 61)  # where the two motions part
@@ -201,10 +202,7 @@ def critical(law: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 MULTIPLIER = float(np.min(np.real(CLOSED[1].multipliers[0])))
-rows = [
-    "| law | 2π loses its stability at K | its depth there | slope of the change in Y by K |",
-    "|---|---|---|---|",
-]
+rows = []
 slopes = {}
 for law in LAWS:
     K = critical(law)[0]
@@ -213,14 +211,14 @@ for law in LAWS:
     slopes[law] = float(np.polyfit(np.log(K[K >= 1e4]), away[K >= 1e4], 1)[0])
     depths = [x.depth for x in orbits[law, 1]]
     depth = float(np.interp(np.log(limit[law]), np.log(K), depths))
-    rows.append(f"| {law} | {limit[law]:.4f} | {depth:.3f} | {slopes[law]:.3f} |")
-table = "\n".join(rows)
-names = " | ".join(f"K = {K:g}" for K in CHECKED)
-runs = "\n".join(
-    [f"| from rest | {names} |", "|---" * (len(CHECKED) + 1) + "|"]
-    + [f"| {law} | {' | '.join(seen(law, i) for i in range(len(CHECKED)))} |" for law in LAWS]
+    rows.append((law, f"{limit[law]:.4f}", f"{depth:.3f}", f"{slopes[law]:.3f}"))
+heads = ["law", "2π loses its stability at K", "its depth there", "slope of the change in Y by K"]
+doublings = table(heads, rows)
+runs = table(
+    ["from rest", *(f"K = {K:g}" for K in CHECKED)],
+    [(law, *(seen(law, i) for i in range(len(CHECKED)))) for law in LAWS],
 )
-print(table, runs, sep="\n")
+print(doublings, runs, sep="\n")
 
 # %% [markdown]
 # ## Figure
@@ -265,7 +263,7 @@ motion is unstable (least multiplier {MULTIPLIER:.6f}) and the 4π motion attrac
 
 ![multipliers and sections](../figures/soft_stop.png)
 
-{table}
+{doublings}
 
 - The rigid stop's result holds for stops stiffer than about {greatest:.0f} (in these units), by
   whichever law: the 2π motion is unstable there, the 4π motion exists and attracts. At the
