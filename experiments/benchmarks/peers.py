@@ -1,5 +1,5 @@
 # %% [markdown]
-# # vi_jax beside its peers: same scenes, same cores, same error
+# # vi_jax beside its peers: same machines, same cores, same error
 #
 # 1,024 lanes with Table 1's machine (T0 = 10 N·m, d = 2), 200 drive cycles, k = 0.5 and 0.8; κ of
 # the motor, or ζ of the ideal drive, from 0.5 to 1.9. Each code runs in its best configuration
@@ -78,7 +78,7 @@ def row_of(row: dict[str, Any], compared: list[dict]) -> list[str]:
 
 
 def section(key: str, found: dict[str, Any]) -> str:
-    """One scene on one core or on all."""
+    """One machine on one core or on all."""
     kind, drive, k, used = key.split(", ")
     rows = found["rows"]
     title = f"{drive.capitalize()} drive, k = {k}, {used} core{'s' * (used == 'all')}"

@@ -35,7 +35,7 @@ LANES, CYCLES, ROUNDS = (32, 10, 3) if QUICK else (256, 200, 7)
 
 # %%
 class Made(NamedTuple):
-    """A scene with what is asked of it."""
+    """A scene, and what a run is to record."""
 
     name: str
     run: Callable[[Any], Any]

@@ -2,10 +2,10 @@
 # # Speed against accuracy
 #
 # Every method on the same lanes: Table 1's machine (d = 2, k = 0.8; the motor with T0 = 10 N·m),
-# 256 values of ζ (ideal drive) or κ (motor) from 0.5 to 1.9, from rest. What a method costs is told
-# beside what it gets wrong: the state after few and after many cycles, impact times and counts,
-# extremes, orbits with their multipliers and derivatives, how soon it loses a chaotic motion, and
-# how often the *regime* comes out wrong, which is what a scan is for.
+# 256 values of ζ (ideal drive) or κ (motor) from 0.5 to 1.9, from rest. What a method costs
+# stands beside what it gets wrong: the state after few and after many cycles, impact times and
+# counts, extremes, orbits with their multipliers and derivatives, how soon it loses a chaotic
+# motion, and how often the *regime* comes out wrong, which is what a scan is for.
 #
 # Truth is `ExactFlight` for the ideal drive and 40 steps of Verner9 a cycle for the motor. Errors
 # are over the lanes that amplify a displacement of 1e-10 to no more than 1e-6 in 1,000 cycles. Run

@@ -78,7 +78,7 @@ rigid = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ra
 CLOSED = {cycles: vi.closed_form_orbits(rigid, cycles=cycles) for cycles in (1, 2)}
 
 
-def scene(law: str, stiffness: float) -> vi.Scene:
+def machine(law: str, stiffness: float) -> vi.Scene:
     """The machine with a compliant stop, its stiffness in units of the body's own spring."""
     stop = vi.SoftStop(2.0, stiffness, **LAWS[law])
     return vi.Scene(oscillator=vi.Oscillator(0.0), drive=vi.IdealDrive(0.9), soft_stops=(stop,))
@@ -107,7 +107,7 @@ def motions(law: str, cycles: int) -> list[Found]:
     for stiffness in STIFFNESS[::-1]:
         if cycles == 2 and stiffness < NEAR[-1]:
             break
-        orbit = vi.find_orbit(scene(law, stiffness), guess, cycles=cycles, throw=True)
+        orbit = vi.find_orbit(machine(law, stiffness), guess, cycles=cycles, throw=True)
         guess = orbit.state
         found.append(described(stiffness, orbit))
     return found[::-1]
@@ -124,7 +124,7 @@ def attracted(law: str) -> list[Found]:
     @jax.jit
     @jax.vmap
     def last(stiffness):
-        there = scene(law, stiffness)
+        there = machine(law, stiffness)
         run = vi.simulate(there, there.start(), 2, settle=1000, method="reference")
         # Of the two sections of the motion the one with the greater Y.
         place = jnp.argmax(run.sections.Y[:2])
@@ -133,7 +133,7 @@ def attracted(law: str) -> list[Found]:
     states, found = last(jnp.asarray(NEAR)), []
     for i, stiffness in enumerate(NEAR):
         guess = rigid.start(Y=float(states.Y[i]), V=float(states.V[i]))
-        orbit = vi.find_orbit(scene(law, stiffness), guess, cycles=2)
+        orbit = vi.find_orbit(machine(law, stiffness), guess, cycles=2)
         if bool(orbit.successful) and int(orbit.cycles) == 2:
             found.append(described(stiffness, orbit))
     return found
@@ -146,7 +146,7 @@ def doubling(law: str, found: list[Found]) -> float:
     guess = rigid.start(Y=found[place].state[0], V=found[place].state[1])
 
     def excess(exponent):
-        orbit = vi.find_orbit(scene(law, 10.0**exponent), guess, throw=True)
+        orbit = vi.find_orbit(machine(law, 10.0**exponent), guess, throw=True)
         return float(np.min(np.real(orbit.multipliers))) + 1
 
     low, high = (np.log10(found[i].stiffness) for i in (place, place + 1))
@@ -171,7 +171,7 @@ def from_rest(law: str, stiffness: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Whether a run from rest ends in a 2π motion, and whether it repeats after two cycles."""
 
     def one(stiffness):
-        there = scene(law, stiffness)
+        there = machine(law, stiffness)
         run = vi.simulate(there, there.start(), 4, settle=400, method="reference")
         far = [jnp.abs(run.sections.Y[n:] - run.sections.Y[:-n]).max() for n in (1, 2)]
         return run.successful & (far[0] < 1e-6), run.successful & (far[1] < 1e-6)

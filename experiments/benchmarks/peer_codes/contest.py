@@ -69,7 +69,7 @@ class Job:
         return np.concatenate(self.all("result", self.entry.name)[0])
 
     def timed(self) -> float:
-        """Seconds for all lanes of the scene."""
+        """Seconds for all lanes."""
         return self.all("run", self.entry.name)[1] * LANES / len(self.lanes)
 
 

@@ -49,7 +49,7 @@ def heyoka(tol: float, **options: Any) -> Entry:
 
 
 def entries(drive: str, all_cores: bool) -> list[Entry]:
-    """All codes for one scene."""
+    """All codes for one machine."""
     sparse = LANES // 8 if not all_cores else LANES // (8 if len(cores()) > 8 else 16)
     motor = [("FixedStep", n) for n in (5, 6, 8, 10, 12, 16, 20, 24)]
     motor += [("Taylor", n) for n in (14, 16, 18)] + [("Taylor", 1e-12), ("Taylor", 1e-13)]

@@ -130,7 +130,9 @@ def settled() -> Settled:
     compiled = _lanes.lower(*arguments).compile()
     say("compiled the brute-force program")
     with Clock() as clock:
-        found = [np.asarray(x) for x in compiled(*arguments)]
+        Y, V, speed, impacts, exponent, escaped = map(np.asarray, compiled(*arguments))
     say(f"{len(number)} lanes of {CHUNKS * CHUNK} cycles and more: {clock.wall:.1f} s")
     part = np.tile(np.repeat(list(PARTS), VALUES), 2)
-    return Settled(lanes[0], number, part, *found, clock)
+    return Settled(
+        lanes[0], number, part, Y, V, speed, impacts, exponent, escaped, clock
+    )  # fmt: skip

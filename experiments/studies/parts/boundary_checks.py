@@ -1,6 +1,6 @@
 """What `boundaries.py` checks of its curves, by the closed form and by simulations beside them."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -126,7 +126,7 @@ def beside(curve: Curve) -> Start:
         # Without damping it is highest on the section itself, and must not begin in the stop.
         Y = np.minimum(gain.real, GAP - 1e-6)
         return Start(x, Y, (1j * x[:, 0] * gain).real, ~on_right)
-    motion = closed_forms(x, curve.cycles)
+    motion: Any = closed_forms(x, curve.cycles)
     Y, V = motion.Y[:, 0].copy(), motion.V[:, 0].copy()
     if curve.cycles == 2:
         inside = Polygon(points / SPANS).contains_points(both / SPANS)

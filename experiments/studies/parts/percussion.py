@@ -1,4 +1,4 @@
-"""The machine of `design_percussion.py`, what is asked of it, and the ascent to its best design."""
+"""The machine of `design_percussion.py`: power, stability, and the ascent to a better design."""
 
 from typing import Any, NamedTuple
 
