@@ -26,11 +26,10 @@ from vi_jax.explore.serve import compile_all
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/benchmarks")
-sys.path.insert(0, str(HERE.parent))
-from headlines import keep
+sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
+from tools.study import QUICK, write
+from tools.tables import table
 
-QUICK = "--quick" in sys.argv
 MOVES = 3 if QUICK else 50
 LIMIT = 0.2  # seconds, within which a redrawing seems immediate
 
@@ -43,15 +42,15 @@ DIAGRAM = DiagramPicture()
 
 def ideal(values: Values) -> bytes:
     """The picture of a motion with the ideal drive."""
-    scene, start = controls.ideal(values)
-    return PICTURES["ideal"].draw(look(scene, start, int(values["settle"])), values["gap"])
+    machine, start = controls.ideal(values)
+    return PICTURES["ideal"].draw(look(machine, start, int(values["settle"])), values["gap"])
 
 
 def motor(values: Values) -> bytes:
     """The picture of a motion with the motor."""
-    scene, start = controls.motor(values)
-    motion = look(scene, start, int(values["settle"]))
-    return PICTURES["motor"].draw(motion, float(scene.stops[0].gap))
+    machine, start = controls.motor(values)
+    motion = look(machine, start, int(values["settle"]))
+    return PICTURES["motor"].draw(motion, float(machine.stops[0].gap))
 
 
 def bifurcations(values: Values) -> bytes:
@@ -91,23 +90,19 @@ rows = []
 for tab, (draw, sliders) in TABS.items():
     times = moved(draw, sliders)
     late = np.mean(times > LIMIT)
-    rows.append(
-        f"| {tab} | {times.size} | {1e3 * np.median(times):.0f} | {1e3 * times.max():.0f} "
-        f"| {100 * late:.1f} |"
-    )
+    median, worst = (f"{1e3 * x:.0f}" for x in (np.median(times), times.max()))
+    rows.append((tab, times.size, median, worst, f"{100 * late:.1f}"))
     print(rows[-1], flush=True)
 
 # %%
-TABLE = f"""# How quickly the explorer redraws
+page = f"""# How quickly the explorer redraws
 
 {MOVES} moves of each slider over its range: computing and drawing, in ms by the clock of an idle
 machine ({os.cpu_count()} cores, {platform.machine()}), without what the browser needs to show it.
 
 ![The motion where the sliders begin](../figures/explorer.png)
 
-| | moves | median | worst | later than {1e3 * LIMIT:.0f} ms, % |
-|---|---|---|---|---|
-""" + "\n".join(rows)
+{table(["", "moves", "median", "worst", f"later than {1e3 * LIMIT:.0f} ms, %"], rows)}"""
 
 values = controls.beginning(controls.IDEAL)
 ideal(values)
@@ -116,5 +111,4 @@ numbers = {"lowest position where the sliders begin": low, "highest": high}
 figure = PICTURES["ideal"].figure
 for artist in figure.findobj():
     artist.set_animated(False)  # the page draws them over the frame
-if not QUICK:
-    keep(HERE, "explorer", TABLE, numbers, figure)
+write("explorer", page, numbers, figure)

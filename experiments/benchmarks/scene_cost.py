@@ -3,7 +3,7 @@
 #
 # A scene models only what it needs. Here parts are added one by one to the smallest scene, and the
 # run time of a drive cycle of one lane (in a batch of 256, 200 cycles, one core) and the compile
-# time are told beside those without the part. That an absent part costs nothing is seen twice: in
+# time are set beside those without the part. That an absent part costs nothing is seen twice: in
 # the time, and in the number of operations of the compiled program's source (the jaxpr), which is
 # that of the smaller scene.
 #
@@ -18,25 +18,24 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import vi_jax as vi
-from matplotlib.figure import Figure
 from vi_jax.plot.colors import BLUE
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/benchmarks")
-sys.path.insert(0, str(HERE.parent))
-from headlines import keep
+sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
 from headlines.jaxprs import primitives
+from tools.pictures import open_frames, panels
+from tools.study import QUICK, write
+from tools.tables import table
+from tools.timing import side_by_side
 
-QUICK = "--quick" in sys.argv
 LANES, CYCLES, ROUNDS = (32, 10, 3) if QUICK else (256, 200, 7)
 
 
 # %%
 class Made(NamedTuple):
-    """A scene with what is asked of it."""
+    """A scene, and what a run is to record."""
 
     name: str
     run: Callable[[Any], Any]
@@ -104,50 +103,40 @@ for made in SCENES:
     programs[made.name] = vi.jit(jax.vmap(made.run)).lower(ratios).compile()
     compiling[made.name] = time.perf_counter() - begin
     size[made.name] = primitives(jax.make_jaxpr(made.run)(0.9).jaxpr).total()
-times: dict[str, list[float]] = {name: [] for name in programs}
 with vi.threads(1):
-    for _ in range(ROUNDS):
-        for name, program in programs.items():
-            begin = time.perf_counter()
-            jax.block_until_ready(program(ratios))
-            times[name].append(time.perf_counter() - begin)
-cost = {name: 1e6 * float(np.median(t)) / LANES / CYCLES for name, t in times.items()}
+    seconds = side_by_side([lambda run=run: run(ratios) for run in programs.values()], ROUNDS)
+cost = {name: 1e6 * x / LANES / CYCLES for name, x in zip(programs, seconds, strict=True)}
 
 # %% [markdown]
 # ## Table
 
 # %%
-lines = [
-    "# What each part of a scene costs",
-    "",
-    "10 steps of Verner9 a cycle unless it says exact flight; Table 1's damping, d = 2, k = 0.8, "
-    f"ζ or κ from 0.5 to 1.9. {LANES} lanes of {CYCLES} cycles on one core, medians of {ROUNDS} "
-    f"interleaved rounds; JAX {jax.__version__}. Operations are those of the program that JAX is "
-    "given.",
-    "",
-    "![Cost](../figures/scene_cost.png)",
-    "",
-    "| scene | µs a lane-cycle | beside | ratio | compile s | operations |",
-    "|---|---|---|---|---|---|",
-]
+heads = ["scene", "µs a lane-cycle", "beside", "ratio", "compile s", "operations"]
+rows = []
 for made in SCENES:
     ratio = f"{cost[made.name] / cost[made.beside]:.2f}" if made.beside else ""
-    lines.append(
-        f"| {made.name} | {cost[made.name]:.2f} | {made.beside} | {ratio} | "
-        f"{compiling[made.name]:.1f} | {size[made.name]:,} |"
-    )
-print("\n".join(lines))
+    of_program = (f"{compiling[made.name]:.1f}", f"{size[made.name]:,}")
+    rows.append((made.name, f"{cost[made.name]:.2f}", made.beside, ratio, *of_program))
+page = f"""# What each part of a scene costs
+
+10 steps of Verner9 a cycle unless it says exact flight; Table 1's damping, d = 2, k = 0.8, \
+ζ or κ from 0.5 to 1.9. {LANES} lanes of {CYCLES} cycles on one core, medians of {ROUNDS} \
+interleaved rounds; JAX {jax.__version__}. Operations are those of the program that JAX is given.
+
+![Cost](../figures/scene_cost.png)
+
+{table(heads, rows)}
+"""
+print(page)
 
 # %% [markdown]
 # ## Figure
 
 # %%
-figure = Figure(figsize=(9, 4.6), layout="constrained")
-ax = figure.subplots()
+figure, ax = panels(9, 4.6)
 names = [made.name for made in SCENES][::-1]
 ax.barh(names, [cost[name] for name in names], color=BLUE)
 ax.set(xlabel="run time of a drive cycle of one lane (µs)")
-ax.spines[["top", "right"]].set_visible(False)
+open_frames([ax])
 numbers = {f"operations: {name}": float(count) for name, count in size.items()}
-if not QUICK:
-    keep(HERE, "scene_cost", "\n".join(lines), numbers, figure)
+write("scene_cost", page, numbers, figure)

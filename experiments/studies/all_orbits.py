@@ -15,26 +15,20 @@
 # %%
 import sys
 import time
-from collections import Counter
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import vi_jax as vi
-from matplotlib import patheffects
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import ListedColormap
-from matplotlib.figure import Figure
-from vi_jax.plot.colors import STOP, color_of, paler
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
-sys.path.insert(0, str(HERE.parent))
-from headlines import keep
+sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
+from studies.parts.orbits_picture import Kind, picture
+from tools.study import QUICK, write
+from tools.tables import table
 
-QUICK = "--quick" in sys.argv
 GUESSES, GRID, SETTLE = (128, 12, 600) if QUICK else (4096, 96, 3000)
 PERIODS = range(1, 3) if QUICK else range(1, 7)
 ZETA, K, GAP, XI = 3.2, 0.9, 1.05, 0.002
@@ -44,7 +38,7 @@ LOW, HIGH = np.array([-3.5, -4.0]), np.array([GAP, 4.0])
 
 
 def ideal(zeta: float, k: float) -> vi.Scene:
-    """The scene at these numbers."""
+    """The machine at these numbers."""
     return vi.Scene.ideal(frequency_ratio=zeta, restitution=k, gap=GAP, damping_ratio=XI)
 
 
@@ -72,25 +66,6 @@ def searched(scene: vi.Scene, cycles: int) -> tuple[vi.Orbit, float]:
     )
     jax.block_until_ready(batch.residual)
     return batch, time.perf_counter() - begin
-
-
-class Kind:
-    """A motion of the merged list, with the number of guesses that led to it for each n."""
-
-    def __init__(self, orbit: vi.Orbit):
-        self.orbit = orbit
-        self.path = np.stack([np.asarray(orbit.sections.Y), np.asarray(orbit.sections.V)], axis=-1)
-        self.counts: Counter[int] = Counter()
-
-    def same(self, other: vi.Orbit) -> bool:
-        """Whether `other` runs through the same sections, from whichever of them it starts."""
-        start = np.array([float(other.state.Y), float(other.state.V)])
-        alike = int(other.cycles) == len(self.path)
-        return alike and bool(np.abs(self.path - start).max(axis=1).min() < 1e-6)
-
-    @property
-    def size(self) -> float:
-        return float(abs(self.orbit.multipliers[0]))
 
 
 kinds: list[Kind] = []
@@ -188,116 +163,60 @@ measured = [growth(paths[2 * j : 2 * j + 2], kind) for j, kind in enumerate(kind
 
 
 # %%
-def row(j: int, kind: Kind) -> str:
+def row(j: int, kind: Kind) -> list[str]:
     o = kind.orbit
     named = [f"{chr(65 + i)}" if i >= 0 else "none" for i in ends[2 * j : 2 * j + 2]]
     clear = float(o.clearance)
-    return (
-        f"| {chr(65 + j)} | {len(kind.path)} | {int(o.impacts)} "
-        f"| ({float(o.state.Y):.6f}, {float(o.state.V):.6f}) "
-        f"| {float(o.y_min):.4f} … {float(o.y_max):.4f} | {kind.size:.6f} | {measured[j]:.6f} "
-        f"| {vi.STABILITY[o.stability].split(':')[-1].strip()} "
-        f"| {'∞' if np.isinf(clear) else f'{clear:.3f}'} "
-        f"| {'–' if not int(o.impacts) else f'{float(o.slowest_impact):.3f}'} "
-        f"| {sum(kind.counts.values()):,} (n = {', '.join(map(str, sorted(kind.counts)))}) "
-        f"| {' / '.join(named)} | {100 * np.mean(basin == j):.1f} % |"
-    )
-
-
-report = "\n".join(
-    [
-        f"{GUESSES:,} guesses each, uniform over Y = {LOW[0]:g} … {HIGH[0]:g}, V = ±{HIGH[1]:g} at "
-        f"φ = π; ζ = {ZETA:g}, k = {K:g}, d = {GAP:g}, ξ = {XI:g}. Two cores.",
-        "",
-        "| motion | period, cycles | impacts | section (Y, V) at φ = π | Y over the period "
-        "| largest multiplier | simulated growth | stability | clearance | slowest V⁻ "
-        "| guesses that found it | disturbed start ends at | basin |",
-        "|" + "---|" * 13,
-        *[row(j, kind) for j, kind in enumerate(kinds)],
-        "",
-        "| n | searches that found an orbit | distinct orbits | call with its compilation, s |",
-        "|---|---|---|---|",
-        *[
-            f"| {n} | {found:,} of {GUESSES:,} | {many} | {seconds:.1f} |"
-            for n, found, many, seconds in search_rows
-        ],
-        "",
-        again,
-        "",
-        f"Basins: {GRID}² starts, {SETTLE:,} cycles each; {100 * np.mean(basin < 0):.1f} % "
-        "ended at none of the listed motions. They are on a fifth stable motion at least, with 6 "
-        "impacts in 15 cycles (30π), which `basins_map.md` names: the list holds the motions of 1 "
-        f"to {PERIODS[-1]} cycles that {GUESSES:,} random guesses for each period find, and "
-        "neither longer ones nor, surely, all of these.",
+    return [
+        chr(65 + j),
+        str(len(kind.path)),
+        str(int(o.impacts)),
+        f"({float(o.state.Y):.6f}, {float(o.state.V):.6f})",
+        f"{float(o.y_min):.4f} … {float(o.y_max):.4f}",
+        f"{kind.size:.6f}",
+        f"{measured[j]:.6f}",
+        vi.STABILITY[o.stability].split(":")[-1].strip(),
+        "∞" if np.isinf(clear) else f"{clear:.3f}",
+        "–" if not int(o.impacts) else f"{float(o.slowest_impact):.3f}",
+        f"{sum(kind.counts.values()):,} (n = {', '.join(map(str, sorted(kind.counts)))})",
+        " / ".join(named),
+        f"{100 * np.mean(basin == j):.1f} %",
     ]
+
+
+heads = [
+    "motion", "period, cycles", "impacts", "section (Y, V) at φ = π", "Y over the period",
+    "largest multiplier", "simulated growth", "stability", "clearance", "slowest V⁻",
+    "guesses that found it", "disturbed start ends at", "basin",
+]  # fmt: skip
+motions = table(heads, [row(j, kind) for j, kind in enumerate(kinds)])
+searches = table(
+    ["n", "searches that found an orbit", "distinct orbits", "call with its compilation, s"],
+    [
+        [n, f"{found:,} of {GUESSES:,}", many, f"{seconds:.1f}"]
+        for n, found, many, seconds in search_rows
+    ],
 )
+report = f"""{GUESSES:,} guesses each, uniform over Y = {LOW[0]:g} … {HIGH[0]:g}, V = ±{HIGH[1]:g} \
+at φ = π; ζ = {ZETA:g}, k = {K:g}, d = {GAP:g}, ξ = {XI:g}. Two cores.
+
+{motions}
+
+{searches}
+
+{again}
+
+Basins: {GRID}² starts, {SETTLE:,} cycles each; {100 * np.mean(basin < 0):.1f} % ended at none of \
+the listed motions. They are on a fifth stable motion at least, with 6 impacts in 15 cycles (30π), \
+which `basins_map.md` names: the list holds the motions of 1 to {PERIODS[-1]} cycles that \
+{GUESSES:,} random guesses for each period find, and neither longer ones nor, surely, all of \
+these."""
 print(report)
 
 # %% [markdown]
 # ## Figure: sections over the basins, and a phase portrait of each motion
 
 # %%
-COLORS = [color_of(len(kind.path), float(kind.orbit.impacts)) for kind in kinds]
-figure = Figure(figsize=(12.5, 6.6), layout="constrained")
-FigureCanvasAgg(figure)
-left, right = np.ravel(figure.subfigures(1, 2, width_ratios=(1, 1.15), squeeze=False))
-axes = left.subplots(1, 1, squeeze=False)[0, 0]
-stable = [j for j, kind in enumerate(kinds) if bool(kind.orbit.stable)]
-pale = [paler(COLORS[j], 0.45) for j in stable]
-axes.pcolormesh(
-    *side,
-    np.select([basin == j for j in stable], list(range(len(stable))), len(stable)),
-    cmap=ListedColormap([*pale, "white"]),
-    vmin=-0.5,
-    vmax=len(stable) + 0.5,
-)
-axes.set(xlabel="Y = y/a at φ = π", ylabel="V = dY/dτ at φ = π (a ω)")
-axes.set(xlim=(LOW[0], HIGH[0] + 0.2), ylim=(LOW[1], HIGH[1]))
-axes.axvline(GAP, color=STOP, lw=1.8, label="stop")
-everywhere = np.concatenate([kind.path for kind in kinds])
-ways = 0.17 * np.stack([f(np.arange(16) * np.pi / 8) for f in (np.cos, np.sin)], axis=1) * (1, 1.5)
-taken = everywhere.copy()
-for j, kind in enumerate(kinds):
-    good = bool(kind.orbit.stable)
-    look = {"color": COLORS[j], "mec": "k", "mew": 0.7, "ms": 6 if good else 7}
-    axes.plot(*kind.path.T, "o" if good else "X", **look)
-    for point in kind.path:  # a letter where there is most room
-        places = point + ways
-        far = np.abs((places[:, None] - taken) / (1, 1.5)).max(axis=2)
-        far = np.where(places[:, 0] > HIGH[0] + 0.1, 0.0, far.min(axis=1))
-        place = places[np.argmax(far)]
-        taken = np.concatenate([taken, [place]])
-        text = axes.text(*place, chr(65 + j), fontsize=10, ha="center", va="center")
-        text.set_path_effects([patheffects.withStroke(linewidth=2.2, foreground="w")])
-for j, color in zip(stable, pale, strict=True):
-    axes.plot([], [], "s", ms=10, color=color, mec="0.6", label=f"basin of {chr(65 + j)}")
-axes.plot([], [], "s", ms=10, color="white", mec="0.6", label="none of these")
-axes.plot([], [], "o", color="w", mec="k", label="stable orbit")
-axes.plot([], [], "X", color="w", mec="k", label="unstable orbit")
-left.legend(loc="outside upper center", ncols=4, fontsize=9)
-
-panels = right.subplots(-(-len(kinds) // 2), 2, sharex=True, sharey=True, squeeze=False).ravel()
-for j, (panel, kind) in enumerate(zip(panels, kinds, strict=False)):
-    run = kind.orbit.trajectory()
-    good = bool(kind.orbit.stable)
-    vi.plot_phase_portrait(
-        run, kind.orbit.machine, ax=panel, color=COLORS[j], lw=1.4, ls="-" if good else "--"
-    )
-    cycles = len(kind.path)
-    panel.set_title(f"{chr(65 + j)}: {2 * cycles}π, |μ| = {kind.size:.3f}", fontsize=10)
-    panel.set(xlim=(-3.4, 1.4), ylim=(-4, 4), ylabel="V (a ω)")
-    panel.label_outer()
-last = panels[-1]
-if len(kinds) < len(panels):  # an empty panel: the axis of its column, and what the lines are
-    last.spines[["left", "right", "top"]].set_visible(False)
-    last.tick_params(left=False)
-    last.plot([], [], color="k", lw=1.4, label="stable")
-    last.plot([], [], color="k", lw=1.4, ls="--", label="unstable")
-    last.plot([], [], "ko", ms=4, label="at φ = π")
-    last.plot([], [], color=STOP, lw=1.8, label="stop")
-    last.legend(loc="center", ncols=2, fontsize=9, frameon=False)
-for panel in panels[-2:]:
-    panel.set_xlabel("Y = y/a")
 numbers = {f"largest multiplier of {chr(65 + j)}": kind.size for j, kind in enumerate(kinds)}
-if not QUICK:
-    keep(HERE, "all_orbits", f"# Periodic motions at one point\n\n{report}", numbers, figure)
+figure = picture(kinds, basin, side)
+write("all_orbits", f"# Periodic motions at one point\n\n{report}", numbers, figure)

@@ -2,9 +2,9 @@
 # # Basins of coexisting motions
 #
 # Where several motions are stable at one parameter point, the start decides. `vi.basins` simulates
-# a grid of starts, finds the motions on the way and labels each start. Three scenes (ideal drive):
-# the lightly damped one of `all_orbits.py`, one in which motions of 2π and 6π share the starts, and
-# Table 1's machine above resonance, where the body may also swing free of the stop.
+# a grid of starts, finds the motions on the way and labels each start. Three machines (ideal
+# drive): the lightly damped one of `all_orbits.py`, one in which motions of 2π and 6π share the
+# starts, and Table 1's above resonance, where the body may also swing free of the stop.
 #
 # The fractions of the grid are held against those of random starts with their standard error, the
 # random starts' labels against `vi.FixedStep`, and the stability of each motion against its
@@ -13,9 +13,7 @@
 # Run with `python experiments/studies/basins_map.py` (`--quick` for coarse grids and few cycles).
 
 # %%
-import os
 import sys
-import time
 from pathlib import Path
 from typing import NamedTuple
 
@@ -27,21 +25,16 @@ from matplotlib.figure import Figure
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
-sys.path.insert(0, str(HERE.parent))
-from headlines import keep
+sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
+from tools.study import QUICK, say, write
+from tools.tables import table
+from tools.timing import Clock
 
-QUICK = "--quick" in sys.argv
-BEGIN = time.perf_counter()
 # One size of block for all calls: one program. Impacts lie near φ = 0; look half a turn later.
 LANES, WORKERS, SECTION = (256, 2, np.pi) if QUICK else (4096, 2, np.pi)
 SAMPLES, AGAIN = (400, 100) if QUICK else (8192, 1000)
 # A whole number of periods of every motion found here.
 WATCHED = 600
-
-
-def say(text: object) -> None:
-    print(f"[{time.perf_counter() - BEGIN:5.1f} s] {text}", flush=True)
 
 
 class Case(NamedTuple):
@@ -72,11 +65,11 @@ if QUICK:
     CASES = [case._replace(side=32, settle=400) for case in CASES]
 
 
-def scene_of(case: Case) -> vi.Scene:
-    scene = vi.Scene.ideal(
+def machine_of(case: Case) -> vi.Scene:
+    machine = vi.Scene.ideal(
         frequency_ratio=case.zeta, restitution=case.k, gap=case.gap, damping_ratio=case.xi
     )
-    return scene.at_section(SECTION)
+    return machine.at_section(SECTION)
 
 
 # %% [markdown]
@@ -99,8 +92,7 @@ def matched(one: vi.Basins, other: vi.Basins) -> dict[int, int]:
 class Found(NamedTuple):
     case: Case
     grid: vi.Basins
-    wall: float
-    cpu: float
+    clock: Clock
     random: vi.Basins
     other: int
     """Labels that `FixedStep` changed."""
@@ -110,28 +102,26 @@ class Found(NamedTuple):
 
 everything: list[Found] = []
 for case in CASES:
-    scene = scene_of(case)
+    machine = machine_of(case)
     options = {"settle": case.settle, "workers": WORKERS, "progress": False}
     if not everything:  # so that the clock below does not count compiling
-        vi.basins(scene, case.region, resolution=4, lanes=LANES, **{**options, "settle": 10})
-    begin = os.times()
-    grid = vi.basins(scene, case.region, resolution=case.side, lanes=LANES, **options)
-    end = os.times()
-    wall, cpu = end.elapsed - begin.elapsed, sum(end[:2]) - sum(begin[:2])
-    say(f"{case.title}: {wall:.1f} s, {cpu:.1f} s of CPU time\n{grid}")
-    random = vi.basins(scene, case.region, samples=SAMPLES, seed=1, lanes=LANES, **options)
+        vi.basins(machine, case.region, resolution=4, lanes=LANES, **{**options, "settle": 10})
+    with Clock() as clock:
+        grid = vi.basins(machine, case.region, resolution=case.side, lanes=LANES, **options)
+    say(f"{case.title}: {clock.wall:.1f} s, {clock.cpu:.1f} s of CPU time\n{grid}")
+    random = vi.basins(machine, case.region, samples=SAMPLES, seed=1, lanes=LANES, **options)
     few = {"samples": AGAIN, "seed": 2, "lanes": 512}
-    one = vi.basins(scene, case.region, **few, **options)
-    two = vi.basins(scene, case.region, **few, method=vi.FixedStep(), **options)
+    one = vi.basins(machine, case.region, **few, **options)
+    two = vi.basins(machine, case.region, **few, method=vi.FixedStep(), **options)
     names = {**matched(one, two), -1: -1, -2: -2, -3: -3}
     labels = np.array([names.get(int(x), -9) for x in two.data["label"].values])
     other = int(np.sum(labels != one.data["label"].values))
     sizes = []
     for a in grid.attractors:
-        start = scene.start(Y=a.sections["Y"][0], V=a.sections["V"][0])
-        seen = vi.lyapunov(scene, start, WATCHED, settle=0, method=vi.ExactFlight())
+        start = machine.start(Y=a.sections["Y"][0], V=a.sections["V"][0])
+        seen = vi.lyapunov(machine, start, WATCHED, settle=0, method=vi.ExactFlight())
         sizes.append(float(np.exp(a.period * seen.per_cycle[0])))
-    everything.append(Found(case, grid, wall, cpu, random, other, sizes))
+    everything.append(Found(case, grid, clock, random, other, sizes))
     say(f"random starts and FixedStep: {other} of {AGAIN} labels differ")
 
 # %% [markdown]
@@ -155,18 +145,7 @@ figure.suptitle("Which start settles on which motion; circles: the motions' sect
 # ## The table
 
 # %%
-lines = [
-    "# Basins of coexisting motions",
-    "",
-    "Ideal drive, section at φ = π. *Grid* and *random* are parts of all starts (grid: cell",
-    f"centres; random: {SAMPLES:,} starts with standard error); *off* is their difference in",
-    "standard errors of both together; *multiplier* the size of the greatest one over the period,",
-    f"from Lyapunov exponents over {WATCHED} cycles.",
-    "",
-    "| scene | period | impacts | section (Y, V) | grid, % | random, % | off | multiplier |",
-    "|---|---|---|---|---|---|---|---|",
-]
-times = []
+motions, times = [], []
 for found in everything:
     size = found.case.side**2
     pairs = {mine: theirs for theirs, mine in matched(found.grid, found.random).items()}
@@ -185,44 +164,46 @@ for found in everything:
         both = (p * (1 - p) * (1 / size + 1 / SAMPLES)) ** 0.5
         off = f"{(here - there) / both:+.1f}" if both else "–"
         shown = "–" if multiplier is None else f"{multiplier:.4f}"
-        lines.append(
-            f"| {found.case.title if i == 0 else ''} | {period} | {impacts} | {where} "
-            f"| {100 * here:.2f} | {100 * there:.2f} ± {100 * error:.2f} | {off} | {shown} |"
-        )
-    times.append(
-        f"| {found.case.title} | {found.case.side}² × {found.case.settle + 128:,} "
-        f"| {found.wall:.1f} | {found.cpu:.1f} | {found.other} of {AGAIN:,} |"
-    )
-lines += [
-    "",
-    "| scene | starts × cycles | wall, s | CPU, s | labels that `FixedStep` changes |",
-    "|---|---|---|---|---|",
-    *times,
-]
-lines.append(
-    """
-- Nothing was listed beforehand. In the first scene `vi.basins` finds the four stable motions of
+        title = "" if i else found.case.title
+        parts = (f"{100 * here:.2f}", f"{100 * there:.2f} ± {100 * error:.2f}")
+        motions.append((title, period, impacts, where, *parts, off, shown))
+    case, clock = found.case, found.clock
+    taken = (f"{clock.wall:.1f}", f"{clock.cpu:.1f}", f"{found.other} of {AGAIN:,}")
+    times.append((case.title, f"{case.side}² × {case.settle + 128:,}", *taken))
+heads = ["machine", "period", "impacts", "section (Y, V)", "grid, %", "random, %", "off"]
+motions = table([*heads, "multiplier"], motions)
+heads = ["machine", "starts × cycles", "wall, s", "CPU, s", "labels that `FixedStep` changes"]
+page = f"""# Basins of coexisting motions
+
+Ideal drive, section at φ = π. *Grid* and *random* are parts of all starts (grid: cell
+centres; random: {SAMPLES:,} starts with standard error); *off* is their difference in
+standard errors of both together; *multiplier* the size of the greatest one over the period,
+from Lyapunov exponents over {WATCHED} cycles.
+
+{motions}
+
+{table(heads, times)}
+
+- Nothing was listed beforehand. In the first machine `vi.basins` finds the four stable motions of
   `all_orbits.md` with their multipliers (0.9961, 0.8930, 0.8895, 0.7943), and one more, of 15
   cycles with 6 impacts, which that search for periods up to 6 could not find: it is what one in a
   hundred starts was missing there.
 - The basins of the 4π motion and of the free one have whole parts; elsewhere the basins are mixed
   down to single cells. There the label of a start depends on the last digits, and `FixedStep`
-  changes some labels while the fractions stay. In the other two scenes the borders are smooth and
+  changes some labels while the fractions stay. In the other two machines the borders are smooth and
   it changes none.
 - The multiplier of the free motion is e^(-2πξ/ζ): it is the slowest to be reached, and its late
   arrivals are what is called unsettled after 3,000 cycles.
 - Random starts agree with the grid within their error. A grid's own error is smaller than that of
   as many random starts, where the basins have whole parts.
-- In the third scene the body of Table 1's machine, above resonance, keeps hitting the stop or
+- In the third machine the body of Table 1's machine, above resonance, keeps hitting the stop or
   swings free, by its start; from rest it swings free.
 """
-)
-print("\n".join(lines))
+print(page)
 numbers = {
     f"{found.case.title}: multiplier of the {2 * a.period}π motion, {a.impacts:g} impacts": size
     for found in everything
     for a, size in zip(found.grid.attractors, found.multipliers, strict=True)
 }
-if not QUICK:
-    keep(HERE, "basins_map", "\n".join(lines), numbers, figure, dpi=85)
-say(f"done, {time.process_time():.0f} s of CPU time")
+write("basins_map", page, numbers, figure, dpi=85)
+say("done")

@@ -11,22 +11,20 @@
 # %%
 import sys
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import vi_jax as vi
-from matplotlib.figure import Figure
 from vi_jax.plot.colors import BLUE, GREEN, ORANGE, RED
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
-sys.path.insert(0, str(HERE.parent))
-from headlines import keep
+sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
+from tools.pictures import open_frames, panels
+from tools.study import QUICK, write
+from tools.tables import table
 
-QUICK = "--quick" in sys.argv
 TORQUES = (10.0,) if QUICK else (0.2, 2.0, 10.0, 100.0)
 KAPPAS = np.linspace(0.5, 1.9, 5 if QUICK else 57)
 TIMES = (0.1, 1.0) if QUICK else (0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
@@ -34,7 +32,7 @@ OMEGA = float(vi.Parameters().natural_frequency)
 TAU = 1 / (float(vi.Parameters().inertia) * OMEGA**2)  # τ0 of 1 N·m
 
 
-def machine(torque: Any, kappa: Any, time: Any = None) -> vi.Scene:
+def machine(torque, kappa, time=None) -> vi.Scene:
     """Table 1 at k = 0.5, with an armature of τe = `time` or without one."""
     lag = None if time is None else time / OMEGA
     return vi.Parameters(
@@ -115,26 +113,23 @@ swing = np.array([[ups[t, x].max() - ups[t, None].max() for t in TORQUES] for x 
 # ## Table and figure
 
 # %%
-rows = [
-    "| T0, N·m | τe | L/R, ms | τe τ0/w0 | min Y | max Y | ζ | largest multiplier | "
-    "speed from rest, at worst | its peak |",
-    "|" + "---|" * 10,
-]
+heads = [
+    "T0, N·m", "τe", "L/R, ms", "τe τ0/w0", "min Y", "max Y", "ζ", "largest multiplier",
+    "speed from rest, at worst", "its peak",
+]  # fmt: skip
+rows = []
 for j, torque in enumerate(TORQUES):
     for i, time in enumerate(TIMES):
         cells = [f"{x[i, j]:.1e}" for x in (low, high, ratio, slow)]
-        rows.append(
-            f"| {torque:g} | {time:g} | {1e3 * time / OMEGA:.3g} | {time * TAU * torque:.3g} | "
-            + " | ".join(cells)
-            + f" | {late[i, j]:.3f} | {swing[i, j]:+.3f} |"
-        )
-table = "\n".join(rows)
-print(table)
+        times = (f"{time:g}", f"{1e3 * time / OMEGA:.3g}", f"{time * TAU * torque:.3g}")
+        from_rest = (f"{late[i, j]:.3f}", f"{swing[i, j]:+.3f}")
+        rows.append([f"{torque:g}", *times, *cells, *from_rest])
+changes = table(heads, rows)
+print(changes)
 worst = low / np.asarray(TIMES)[:, None]
 print(f"{lost} motions lost; min Y changes by at most {worst.max():.1e} τe")
 
-figure = Figure(figsize=(11, 4.2), layout="constrained")
-left, right = figure.subplots(1, 2)
+figure, (left, right) = panels(11, 4.2, 1, 2)
 colors = (GREEN, ORANGE, BLUE, RED)
 for j, torque in enumerate(TORQUES):
     left.loglog(
@@ -154,8 +149,7 @@ right.axhline(0.9, color="0.6", lw=0.8, ls=":", zorder=0, label="κ")
 right.set(xlabel="time τ (1/ω)", ylabel="crank speed φ'/ω", xlim=(0, 40))
 right.set_title(f"switched on at rest, T0 = {shown:g} N·m, κ = 0.9", fontsize=10)
 right.legend(frameon=False, fontsize=9, loc="lower right")
-for ax in (left, right):
-    ax.spines[["top", "right"]].set_visible(False)
+open_frames((left, right))
 
 # %%
 small = max(low[i].max() for i, x in enumerate(TIMES) if x <= 0.3)
@@ -182,7 +176,7 @@ approached. *From rest*: both switched on at rest at κ = 0.9, the difference in
   19 ms (τe = 0.3) they are right to {small:.0e} of the crank. Where a run-up, a
   passage or the current itself matters, take `DCMotor`.
 
-{table}
+{changes}
 """
 pair = [
     vi.find_orbit(
@@ -196,5 +190,4 @@ numbers = {
     "T0 = 10 N·m, κ = 0.9, τe = 0.1: min Y": float(pair[1].y_min),
     "T0 = 10 N·m, κ = 0.9, τe = 0.1: ζ": float(pair[1].frequency_ratio),
 }
-if not QUICK:
-    keep(HERE, "dc_motor", text, numbers, figure)
+write("dc_motor", text, numbers, figure)

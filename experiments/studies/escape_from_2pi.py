@@ -11,41 +11,28 @@
 
 # %%
 import sys
-import time
 import warnings
 from pathlib import Path
-from typing import NamedTuple
 
 import diffrax
 import jax
 import numpy as np
 import vi_jax as vi
-from matplotlib.figure import Figure
-from vi_jax.plot.colors import BLUE, ORANGE, RED
 
 jax.config.update("jax_enable_x64", True)
 # Single precision is one of the things compared here.
 warnings.filterwarnings("ignore", message="vi_jax is running in single precision")
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
-sys.path.insert(0, str(HERE.parent))
-from headlines import keep
+sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
+from studies.parts.escape_picture import CYCLES, NEAR, STYLE, Escape, counted, picture
+from tools.study import QUICK, say, write
+from tools.tables import table
 
-QUICK = "--quick" in sys.argv
-CYCLES, NEAR = 600, 0.05
-STYLE = {
-    "displaced start": ("k", "x"),
-    "ExactFlight": (ORANGE, "*"),
-    "Adaptive Dopri8": (BLUE, "o"),
-    "Adaptive Tsit5": (RED, "o"),
-    "FixedStep Dopri8": (BLUE, "s"),
-    "FixedStep Tsit5": (RED, "s"),
-}
 SOLVERS = {"Dopri8": diffrax.Dopri8(), "Tsit5": diffrax.Tsit5()}
 
 
 def machine() -> vi.Scene:
-    """The scene in the precision that is switched on."""
+    """The machine in the precision that is switched on."""
     return vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.0)
 
 
@@ -96,25 +83,6 @@ def sharper_law(error: np.ndarray, every_cycle: bool) -> float:
 
 
 # %%
-class Escape(NamedTuple):
-    group: str
-    setting: str
-    tolerance: float
-    error: float
-    predicted: float
-    """Cycles by the sharper law."""
-    cycles: int
-    """First cycle that ends away from the motion; -1 if none does."""
-    repeats: bool
-    """Whether the last sections repeat to the last bit."""
-
-
-def counted(row: Escape) -> str:
-    if row.cycles >= 0:
-        return str(row.cycles)
-    return f"none in {CYCLES}" + (" (repeats bit for bit)" if row.repeats else "")
-
-
 def escape(
     group: str, setting: str, method: vi.AbstractMethod, tolerance=np.nan, shift=0.0, on=ON_ORBIT
 ):
@@ -160,7 +128,6 @@ def escapes(suffix: str, exponents: range, steps: tuple[int, ...]) -> list[Escap
 # how good the law itself is.
 
 # %%
-begin = time.perf_counter()
 rows = [
     escape("displaced start", f"{10.0**-n:.0e}", vi.ExactFlight(), shift=10.0**-n)
     for n in range(2, 13, 5 if QUICK else 1)
@@ -174,25 +141,24 @@ with jax.enable_x64(False):
     rows += escapes(
         ", float32", range(3, 8, 4) if QUICK else range(3, 8), (12,) if QUICK else (12, 24)
     )
-print(f"all runs: {time.perf_counter() - begin:.0f} s")
+say("all runs")
 
 # %% [markdown]
 # ## Table
 
 
 # %%
-lines = [
-    "| method | setting | one-cycle error | cycles counted | law | sharper law | "
-    "law of the tolerance |",
-    "|---|---|---|---|---|---|---|",
-]
-for row in rows:
+def cells(row: Escape) -> list[str]:
     by_tolerance = "–" if np.isnan(row.tolerance) else f"{law(row.tolerance):.0f}"
-    lines.append(
-        f"| {row.group} | {row.setting} | {row.error:.1e} | {counted(row)} | "
-        f"{law(row.error):.0f} | {row.predicted:.0f} | {by_tolerance} |"
-    )
-table = "\n".join(lines)
+    error, counts = f"{row.error:.1e}", (counted(row), f"{law(row.error):.0f}")
+    return [row.group, row.setting, error, *counts, f"{row.predicted:.0f}", by_tolerance]
+
+
+heads = [
+    "method", "setting", "one-cycle error", "cycles counted", "law", "sharper law",
+    "law of the tolerance",
+]  # fmt: skip
+runs = table(heads, map(cells, rows))
 
 
 def excess(pick) -> tuple[np.ndarray, np.ndarray]:
@@ -211,68 +177,15 @@ GROUPS = {
 spread = []
 for name, pick in GROUPS.items():
     chosen = [row for row in rows if pick(row)]
-    stayed = sum(row.cycles < 0 for row in chosen)
-    spread.append(f"| {name} | {len(chosen)} | {stayed} |")
-    for x in excess(pick):
-        spread[-1] += f" {np.median(x):.1f} ({x.min():.1f} … {x.max():.1f}) |"
-spread = "\n".join(
-    [
-        f"| group | runs | stayed all {CYCLES} cycles | cycles beyond the law: median (range) | "
-        "beyond the sharper law |",
-        "|---|---|---|---|---|",
-        *spread,
-    ]
-)
+    beyond = (f"{np.median(x):.1f} ({x.min():.1f} … {x.max():.1f})" for x in excess(pick))
+    spread.append([name, len(chosen), sum(row.cycles < 0 for row in chosen), *beyond])
+heads = [
+    "group", "runs", f"stayed all {CYCLES} cycles", "cycles beyond the law: median (range)",
+    "beyond the sharper law",
+]  # fmt: skip
+spread = table(heads, spread)
 print(spread)
 
-# %% [markdown]
-# ## Figure
-
-# %%
-figure = Figure(figsize=(10.5, 5.0), layout="constrained")
-figure.get_layout_engine().set(hspace=0.0, h_pad=0.02)  # pyright: ignore
-(above, beside), (left, right) = figure.subplots(
-    2, 2, sharex="col", sharey="row", height_ratios=(1, 8)
-)
-for row in rows:
-    name, _, precision = row.group.partition(", ")
-    color, marker = STYLE[name]
-    dots = {"color": color, "ls": "", "marker": marker, "ms": 6, "zorder": 3}
-    if marker == "*":
-        dots |= {"ms": 13, "zorder": 5}
-    if row.cycles < 0:
-        dots |= {"marker": "^", "ms": 8}
-    if precision:
-        dots["mfc"] = "none"
-    stayed = row.cycles < 0
-    height = CYCLES if stayed else row.cycles
-    (above if stayed else left).plot(row.error, height, **dots)
-    (beside if stayed else right).plot(row.tolerance, height, **dots)
-for name, (color, marker) in STYLE.items():
-    left.plot([], [], marker, color=color, ms=11 if marker == "*" else 6, label=name)
-left.plot([], [], "o", color="0.4", mfc="none", label="hollow: float32")
-left.plot([], [], "^", color="0.4", mfc="none", label=f"stayed all {CYCLES} cycles")
-for axes, label in ((left, "error of one cycle (a, a ω)"), (right, "rtol = atol")):
-    errors = np.logspace(-15, -2, 50)
-    axes.plot(errors, law(errors), color="0.5", lw=1.2, zorder=0, label="ln(0.05/error)/ln 1.166")
-    axes.set_xscale("log")
-    axes.set_xlabel(label)
-    axes.grid(alpha=0.3)
-left.set_ylabel("cycles within 0.05 of the unstable 2π motion")
-above.set_title("against the error measured")
-beside.set_title("against the tolerance asked for (Adaptive)")
-above.set_yticks([CYCLES], [f"{CYCLES}\n(all)"])
-above.set_ylim(CYCLES - 30, CYCLES + 30)
-left.set_ylim(0, 215)
-for top, bottom in ((above, left), (beside, right)):  # the break of the axis
-    top.spines.bottom.set_visible(False)
-    bottom.spines.top.set_visible(False)
-    top.tick_params(bottom=False, which="both")
-    top.grid(alpha=0.3)
-    cut = {"marker": [(-1, -0.5), (1, 0.5)], "ms": 9, "ls": "none", "color": "k", "clip_on": False}
-    top.plot([0, 1], [0, 0], transform=top.transAxes, **cut)
-    bottom.plot([0, 1], [1, 1], transform=bottom.transAxes, **cut)
-left.legend(fontsize=8.5, loc="lower left")
 exact = next(row for row in rows if row.group == "ExactFlight" and row.setting == "–")
 polished = next(row for row in rows if row.setting == "polished")
 locked = sum(row.repeats for row in rows if row.cycles < 0 and row.group not in STYLE)
@@ -300,7 +213,7 @@ same with only the error's part along the unstable direction, added up over the 
   error of one or two units in the last place that grows by a sixth can round back to itself. So
   staying is no proof of accuracy, and the law ends where the error is nothing but rounding.
 
-{table}
+{runs}
 """
 numbers = {
     "multiplier of the 2π motion": MULTIPLIER,
@@ -308,5 +221,4 @@ numbers = {
         next(r for r in rows if r.setting == "1e-07" and r.group == "displaced start").cycles
     ),
 }
-if not QUICK:
-    keep(HERE, "escape_from_2pi", text, numbers, figure)
+write("escape_from_2pi", text, numbers, picture(rows, law))

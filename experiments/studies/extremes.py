@@ -22,7 +22,10 @@ import numpy as np
 import vi_jax as vi
 
 HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
-sys.path.insert(0, str(HERE.parents[1] / "tests"))
+sys.path[:0] = [str(HERE.parent), str(HERE.parents[1] / "tests")]
+from tools.tables import table
+from tools.timing import repeated
+
 from envelope import CASES
 from envelope.case import QUICK
 from envelope.scenes import MOTOR, ideal, machine, sections
@@ -35,24 +38,20 @@ from envelope.scenes import MOTOR, ideal, machine, sections
 
 
 # %%
-def stiff() -> list[str]:
+def stiff() -> str:
     """A table: ten cycles of a motor without a stop, by three ways."""
 
     def clocked(run: Callable[[], Any]) -> tuple[Any, float]:
-        found, times = jax.block_until_ready(run()), []
-        for _ in range(5):
-            begin = time.perf_counter()
-            jax.block_until_ready(run())
-            times.append(time.perf_counter() - begin)
+        found, times = repeated(run)
         return found, float(np.median(times))
 
     still = ideal(0.9, 0.05, [])
     limit = sections(still, still.start(), 10, vi.ExactFlight())[-1]
-    lines = [
-        "| τ0 | Adaptive(1e-9): steps a cycle | ms | Kvaerno5(1e-9): steps a cycle | ms | they "
-        "differ by | ideal drive off by |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    heads = [
+        "τ0", "Adaptive(1e-9): steps a cycle", "ms", "Kvaerno5(1e-9): steps a cycle", "ms",
+        "they differ by", "ideal drive off by",
+    ]  # fmt: skip
+    rows = []
 
     @jax.jit
     def implicit(scene, start):
@@ -71,12 +70,10 @@ def stiff() -> list[str]:
         state = np.array([float(run.last.Y), float(run.last.V)])
         other = np.array([float(solved.ys.Y[-1]), float(solved.ys.V[-1])])
         count = int(solved.stats["num_steps"])
-        lines.append(
-            f"| {tau0:.0e} | {int(run.steps) / 10:.0f} | {1e3 * ours:.1f} | {count / 10:.0f} | "
-            f"{1e3 * theirs:.1f} | {np.abs(state - other).max():.0e} | "
-            f"{np.abs(state - limit).max():.0e} |"
-        )
-    return lines
+        apart = (f"{np.abs(state - x).max():.0e}" for x in (other, limit))
+        mine = (f"{int(run.steps) / 10:.0f}", f"{1e3 * ours:.1f}")
+        rows.append((f"{tau0:.0e}", *mine, f"{count / 10:.0f}", f"{1e3 * theirs:.1f}", *apart))
+    return table(heads, rows)
 
 
 # %% [markdown]
@@ -87,13 +84,7 @@ def stiff() -> list[str]:
 def main() -> None:
     """Measure every row and write the table."""
     jax.config.update("jax_enable_x64", True)
-    lines = [
-        "# The envelope",
-        "",
-        "| range | expected | method: measured (promised) | beyond |",
-        "|---|---|---|---|",
-    ]
-    broken = 0
+    rows, broken = [], 0
     for row in CASES:
         if QUICK and row.long:
             continue
@@ -107,14 +98,15 @@ def main() -> None:
         for name, promise in row.promise.items():
             broken += not found[name] <= promise
             measured.append(f"{name}: {found[name]:.1e} ({promise:.0e})")
-        cells = row.range, row.expected, "<br>".join(measured), row.beyond
-        lines.append("| " + " | ".join(cells) + " |")
+        rows.append((row.range, row.expected, "<br>".join(measured), row.beyond))
         took = time.perf_counter() - begin
         print(f"{took:6.1f} s  {row.range}: {'; '.join(measured)}", file=sys.stderr, flush=True)
-    lines += ["", f"Promises broken: {broken}.", "", "## Stiff motors, ten cycles", "", *stiff()]
-    print("\n".join(lines))
+    envelope = table(["range", "expected", "method: measured (promised)", "beyond"], rows)
+    page = f"# The envelope\n\n{envelope}\n\nPromises broken: {broken}.\n\n"
+    page += f"## Stiff motors, ten cycles\n\n{stiff()}\n"
+    print(page)
     if not QUICK:
-        (HERE / "extremes.md").write_text("\n".join(lines) + "\n")
+        (HERE / "extremes.md").write_text(page)
 
 
 if __name__ == "__main__":

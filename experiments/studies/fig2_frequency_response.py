@@ -13,9 +13,7 @@
 
 # %%
 import sys
-import time
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -26,14 +24,12 @@ from vi_jax.paper.response_figure import LOOK, draw_response
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
-sys.path.insert(0, str(HERE.parent))
-from headlines import keep
+sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
+from tools.study import QUICK, say, write
+from tools.tables import or_dash, table
 
-QUICK = "--quick" in sys.argv
-begin = time.perf_counter()
 found: Response = response(quick=QUICK, walled=True)
-print(f"closed forms, branches, sweeps: {time.perf_counter() - begin:.0f} s", flush=True)
+say("closed forms, branches, sweeps")
 figure = draw_response(found)
 panels = describe(found)["panels"]
 
@@ -114,14 +110,14 @@ def off_sweep(system: System, branch: vi.Branch) -> float | None:
     return min((abs(float(m.y_min) - float(at.y_min[index])) for m in motions), default=None)
 
 
-def ends_of(branch: vi.Branch) -> str:
+def ends_of(branch: vi.Branch) -> tuple[str, str]:
     """Where the stable part of a branch lies and what bounds it."""
     edges = np.flatnonzero(np.diff(np.r_[False, branch.stable, False].astype(int)))
     pairs = zip(edges[::2], edges[1::2], strict=True)
     spans = [sorted(branch.parameter[[a, b - 1]]) for a, b in pairs]
     listed = ", ".join(f"{low:.4f} … {high:.4f}" for low, high in spans) or "–"
     points = "; ".join(f"{p.kind} {p.parameter:.5f}" for p in branch.special)
-    return f"{listed} | {points}"
+    return listed, points
 
 
 def stays(branch: vi.Branch) -> float:
@@ -138,20 +134,7 @@ def stays(branch: vi.Branch) -> float:
 # ## Tables
 
 # %%
-parting = [
-    "| panel | BB' | CC' | sweep | values | apart from the 2π analysis | widest (at ζ) | "
-    "stable one-impact 4π: values | on it to 1e-6 | largest difference | not on it at ζ |",
-    "|---|---|---|---|---|---|---|---|---|---|---|",
-]
-motions = [
-    "| panel | sweep | ζ | values | motion | impacts per 2π | Lyapunov exponent per 2π | "
-    "min Y off the continued branch |",
-    "|---|---|---|---|---|---|---|---|",
-]
-
-
-def number(x: Any, form: str) -> str:
-    return "–" if x is None else format(x, form)
+parting, motions, branches, walls = [], [], [], []
 
 
 def runs(values: list[float]) -> str:
@@ -170,38 +153,26 @@ for system, panel in zip(found.systems, panels, strict=True):
         two = sum(n for motion, n in kinds if motion == "4π, 2 impacts") / seen["values"]
         shares.append(f"{panel_name(system)}, {name}: {one:.0%} and {two:.0%}")
         long = seen["on_the_4pi_curve"]
-        parting.append(
-            f"| {panel_name(system)} | {panel['BB']:.6f} | {panel['CC']:.6f} | {name} | "
-            f"{seen['values']} | {seen['apart']}: {number(seen['apart_from'], '.3f')} … "
-            f"{number(seen['apart_to'], '.3f')} | {seen['widest']:.3f} ({seen['widest_at']:.3f}) | "
-            f"{long['stable_values']} | {long['on_it']} | "
-            f"{number(long['largest_difference_on_it'], '.0e')} | {runs(long['elsewhere'])} |"
-        )
+        ends = (or_dash(seen[f"apart_{end}"], ".3f") for end in ("from", "to"))
+        parting.append((
+            panel_name(system), f"{panel['BB']:.6f}", f"{panel['CC']:.6f}", name, seen["values"],
+            f"{seen['apart']}: {' … '.join(ends)}",
+            f"{seen['widest']:.3f} ({seen['widest_at']:.3f})", long["stable_values"], long["on_it"],
+            or_dash(long["largest_difference_on_it"], ".0e"), runs(long["elsewhere"]),
+        ))  # fmt: skip
         for row in seen["motions"]:
-            motions.append(
-                f"| {panel_name(system)} | {name} | {row['from']:.3f} … {row['to']:.3f} | "
-                f"{row['values']} | {row['motion']} | {row['impacts_per_2pi']:.3f} | "
-                f"{number(row['exponent'], '.3f')} | {number(row['off_branch'], '.0e')} |"
-            )
-branches = [
-    "| panel | motion | stable points of the branch, ζ | special points | "
-    "stays on it, 400 cycles | sweep's min Y off it |",
-    "|---|---|---|---|---|---|",
-]
+            motions.append((
+                panel_name(system), name, f"{row['from']:.3f} … {row['to']:.3f}", row["values"],
+                row["motion"], f"{row['impacts_per_2pi']:.3f}", or_dash(row["exponent"], ".3f"),
+                or_dash(row["off_branch"], ".0e"),
+            ))  # fmt: skip
 everything = [(s, b) for s in found.systems for b in s.branches] + followings
 for system, branch in everything:
     off = off_sweep(system, branch)
     count = branch.impact_speed.shape[1]
     kept = f"{stays(branch):.0e}" if branch.stable.any() else "–"
-    branches.append(
-        f"| {panel_name(system)} | {2 * branch.cycles}π, {count} impact{'s' * (count > 1)} | "
-        f"{ends_of(branch)} | {kept} | {number(off, '.0e')} |"
-    )
-walls = [
-    f"| k | sweep | values between BB' and CC' | they reach Y = {WALL:g} | and did without it | "
-    "motions with the second stop (ζ) |",
-    "|---|---|---|---|---|---|",
-]
+    motion = f"{2 * branch.cycles}π, {count} impact{'s' * (count > 1)}"
+    branches.append((panel_name(system), motion, *ends_of(branch), kept, or_dash(off, ".0e")))
 fine = (found.ratios >= 0.695) & (found.ratios <= 1.015)
 for walled in found.walled:
     bare = next(
@@ -217,13 +188,40 @@ for walled in found.walled:
             for row in rows(walled, name, inside)
             if len(row.part) > 2
         )
-        walls.append(
-            f"| {walled.restitution:g} | {name} | {len(inside)} | {touched.sum()} | "
-            f"{passed.sum()} | {listed} |"
-        )
-tables = {"parting": parting, "motions": motions, "branches": branches, "walls": walls}
-for lines in tables.values():
-    print("\n".join(lines) + "\n")
+        counts = (len(inside), touched.sum(), passed.sum())
+        walls.append((f"{walled.restitution:g}", name, *counts, listed))
+tables = {
+    "parting": table(
+        [
+            "panel", "BB'", "CC'", "sweep", "values", "apart from the 2π analysis",
+            "widest (at ζ)", "stable one-impact 4π: values", "on it to 1e-6", "largest difference",
+            "not on it at ζ",
+        ],
+        parting,
+    ),
+    "motions": table(
+        [
+            "panel", "sweep", "ζ", "values", "motion", "impacts per 2π",
+            "Lyapunov exponent per 2π", "min Y off the continued branch",
+        ],
+        motions,
+    ),
+    "branches": table(
+        [
+            "panel", "motion", "stable points of the branch, ζ", "special points",
+            "stays on it, 400 cycles", "sweep's min Y off it",
+        ],
+        branches,
+    ),
+    "walls": table(
+        [
+            "k", "sweep", "values between BB' and CC'", f"they reach Y = {WALL:g}",
+            "and did without it", "motions with the second stop (ζ)",
+        ],
+        walls,
+    ),
+}  # fmt: skip
+print(*tables.values(), sep="\n\n")
 
 # %%
 text = """# Figure 2: frequency response for k = 0.8 and k = 0.5
@@ -269,11 +267,7 @@ Impacts are those on both stops; motions held over three values of ζ or more.
 
 {walls}
 """
-filled = text.format(
-    WALL=WALL,
-    shares="; ".join(shares),
-    **{name: "\n".join(lines) for name, lines in tables.items()},
-)
+filled = text.format(WALL=WALL, shares="; ".join(shares), **tables)
 numbers: dict[str, float] = {}
 for system in found.systems:
     numbers |= dict(
@@ -289,6 +283,5 @@ for system, branch in ((s, b) for s in found.systems for b in s.branches):
     for point in sorted(branch.special, key=lambda p: p.parameter):
         name = f"{panel_name(system)}, {motion}: {point.kind} {point.parameter:.3f}"
         numbers[name] = point.parameter
-if not QUICK:
-    keep(HERE, "fig2_frequency_response", filled, numbers, figure, **LOOK)
-print(f"in all: {time.perf_counter() - begin:.0f} s")
+write("fig2_frequency_response", filled, numbers, figure, **LOOK)
+say("done")

@@ -8,11 +8,10 @@
 # damping), each driven ideally at ζ = 0.9 and by motors of T0 = 100, 10 and 2 N·m at κ = 0.9; and,
 # because the transients of these are short, a third one that loses little (k = 0.95, undamped).
 #
-# Run with `python experiments/studies/fit_4pi_orbit.py` (`--quick` for two scenes and few guesses).
+# Run with `python experiments/studies/fit_4pi_orbit.py` (`--quick` for two of them, few guesses).
 
 # %%
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -21,16 +20,15 @@ import jax
 import numpy as np
 import optax
 import vi_jax as vi
-from matplotlib.figure import Figure
-from vi_jax.plot.colors import color_of
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
-sys.path.insert(0, str(HERE.parent))
-from headlines import keep
+sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
+from studies.parts.fit_picture import SEARCHES, kind, picture, same, title
+from tools.study import QUICK, say, write
+from tools.tables import table
+from tools.timing import repeated
 
-QUICK = "--quick" in sys.argv
 KAPPA, TRANSIENT = 0.9, 1000
 # The rate falls from 0.02 to zero, as it does by default.
 NEWTON, ADAM = vi.Newton(), vi.Gradient(optax.adam(optax.cosine_decay_schedule(0.02, 1000)))
@@ -38,7 +36,7 @@ NEWTON, ADAM = vi.Newton(), vi.Gradient(optax.adam(optax.cosine_decay_schedule(0
 GUESSES, ADAM_IDEAL, ADAM_MOTOR = (6, 3, 2) if QUICK else (48, 48, 6)
 
 # %% [markdown]
-# ## Scenes
+# ## Machines
 #
 # With a motor everything runs by `FixedStep` with 16 steps, one program for every torque. (With 12
 # the strongest motor's orbit is off by 1e-6, which `find_orbit` does not let pass after a descent.)
@@ -50,55 +48,44 @@ MACHINES = {
     "k = 0.95, undamped": {"restitution": 0.95, "damping": 0.0},
 }
 FIRST, SECOND, THIRD = MACHINES
-SCENES: list[tuple[str, float | None]] = [
+CASES: list[tuple[str, float | None]] = [
     *((FIRST, torque) for torque in (None, 100.0, 10.0, 2.0)),
     *((SECOND, torque) for torque in (None, 100.0, 10.0, 2.0)),
     *((THIRD, torque) for torque in (None, 10.0)),
 ]
 if QUICK:
-    SCENES = [(FIRST, None), (SECOND, 10.0)]
+    CASES = [(FIRST, None), (SECOND, 10.0)]
 
 
-def make(machine: str, torque: float | None) -> vi.Scene:
-    """The scene with the ideal drive (no torque given) or the motor."""
-    values = MACHINES[machine]
+def make(which: str, torque: float | None) -> vi.Scene:
+    """One of `MACHINES` with the ideal drive (no torque given) or the motor."""
+    values = MACHINES[which]
     table = vi.Parameters(
         control=KAPPA, gap=0.08, torque=10.0 if torque is None else torque, **values
     )
     return table.scene(drive="ideal" if torque is None else "motor")
 
 
-def flow(scene: vi.Scene) -> vi.AbstractMethod:
-    """How the scene is carried, in searches and transients alike."""
+def flow(machine: vi.Scene) -> vi.AbstractMethod:
+    """How the machine is simulated, in searches and transients alike."""
     return (
         vi.ExactFlight()
-        if isinstance(scene.drive, vi.IdealDrive)
+        if isinstance(machine.drive, vi.IdealDrive)
         else vi.FixedStep(steps_per_cycle=16)
     )
 
 
-def search(scene: vi.Scene, guess: Any, method: vi.AbstractRootFinder, section=0.0) -> vi.Orbit:
+def search(machine: vi.Scene, guess: Any, method: vi.AbstractRootFinder, section=0.0) -> vi.Orbit:
     """A search for the 4π motion."""
     return vi.find_orbit(
-        scene, guess, cycles=2, root_finder=method, method=flow(scene), section=section
+        machine, guess, cycles=2, root_finder=method, method=flow(machine), section=section
     )
 
 
 def timed(work: Callable[[], Any], rounds: int = 5) -> tuple[Any, float]:
     """A result and the fewest seconds it takes once compiled."""
-    result, seconds = jax.block_until_ready(work()), []
-    for _ in range(rounds):
-        begin = time.perf_counter()
-        jax.block_until_ready(work())
-        seconds.append(time.perf_counter() - begin)
+    result, seconds = repeated(work, rounds)
     return result, min(seconds)
-
-
-def kind(orbit: vi.Orbit) -> str:
-    """What a search found, in a word."""
-    if bool(orbit.successful):
-        return f"{2 * int(orbit.cycles)}π"
-    return str(orbit.to_xarray()["result"].item())
 
 
 def found(orbit: vi.Orbit) -> str:
@@ -120,10 +107,12 @@ def found(orbit: vi.Orbit) -> str:
 
 
 # %%
-def transient(scene: vi.Scene) -> tuple[int, int, float, np.ndarray]:
+def transient(machine: vi.Scene) -> tuple[int, int, float, np.ndarray]:
     """Period it settles to (0: none), cycles until then, their seconds, and the last section."""
     run, seconds = timed(
-        lambda: vi.simulate(scene, scene.start(), TRANSIENT, method=flow(scene), record="sections")
+        lambda: vi.simulate(
+            machine, machine.start(), TRANSIENT, method=flow(machine), record="sections"
+        )
     )
     sections = np.stack(jax.tree.leaves(run.sections), axis=1)
     for period in range(1, 9):
@@ -135,14 +124,8 @@ def transient(scene: vi.Scene) -> tuple[int, int, float, np.ndarray]:
     return 0, TRANSIENT, seconds, sections[-1]
 
 
-def same(orbit: vi.Orbit, section: np.ndarray) -> bool:
-    """Whether a motion is the one that the transient settled to."""
-    states = np.stack(jax.tree.leaves(orbit.sections), axis=1)
-    return bool(orbit.successful) and bool(np.abs(states - section).max(axis=1).min() < 1e-4)
-
-
 # %% [markdown]
-# ## Searches of one scene
+# ## Searches of one machine
 #
 # The closed form is that of the ideal drive; a motor's guess begins at its no-load speed. At
 # k = 0.8 the body is so near the stop on the section that 5 % more is beyond it: so Y is taken 5 %
@@ -151,46 +134,38 @@ def same(orbit: vi.Orbit, section: np.ndarray) -> bool:
 
 
 # %%
-def searches(machine: str, torque: float | None) -> dict[str, Any]:
-    """Everything measured for one scene."""
-    scene = make(machine, torque)
+def searches(which: str, torque: float | None) -> dict[str, Any]:
+    """Everything measured for one machine."""
+    machine = make(which, torque)
     ideal = torque is None
-    form = vi.closed_form_orbits(make(machine, None), cycles=2)
+    form = vi.closed_form_orbits(make(which, None), cycles=2)
     guesses = {
-        "displaced": scene.start(Y=0.95 * form.Y[0], V=1.05 * form.V[0]),
-        "rest": scene.start(),
+        "displaced": machine.start(Y=0.95 * form.Y[0], V=1.05 * form.V[0]),
+        "rest": machine.start(),
     }
-    row: dict[str, Any] = {"machine": machine, "torque": torque, "transient": transient(scene)}
+    row: dict[str, Any] = {"machine": which, "torque": torque, "transient": transient(machine)}
     for name, method in (("newton", NEWTON), ("adam", ADAM)):
         for where, guess in guesses.items():
             rounds = 5 if name == "newton" else 1
-            result = timed(lambda m=method, g=guess: search(scene, g, m), rounds)
+            result = timed(lambda m=method, g=guess: search(machine, g, m), rounds)
             row[f"{name}, {where}"] = result
     random = np.random.default_rng(1)
     tally: dict[str, list[vi.Orbit]] = {"newton": [], "adam": []}
     for i in range(GUESSES):
         Y, V, W = random.uniform((-3.5, -3.0, 0.8), (2.0, 3.0, 0.95))
-        guess = scene.start(Y=Y, V=V) if ideal else scene.start(Y=Y, V=V, W=W)
-        tally["newton"].append(search(scene, guess, NEWTON, np.pi))
+        guess = machine.start(Y=Y, V=V) if ideal else machine.start(Y=Y, V=V, W=W)
+        tally["newton"].append(search(machine, guess, NEWTON, np.pi))
         if i < (ADAM_IDEAL if ideal else ADAM_MOTOR):
-            tally["adam"].append(search(scene, guess, ADAM, np.pi))
+            tally["adam"].append(search(machine, guess, ADAM, np.pi))
     row["tally"] = tally
     return row
 
 
-def title(row: dict[str, Any]) -> str:
-    torque = row["torque"]
-    return f"{row['machine']}, " + ("ideal" if torque is None else f"T0 = {torque:g}")
-
-
-begin, rows = time.perf_counter(), []
-for machine, torque in SCENES:
-    rows.append(searches(machine, torque))
-    print(
-        f"{title(rows[-1])}: Newton {found(rows[-1]['newton, displaced'][0])}; from rest "
-        f"{found(rows[-1]['newton, rest'][0])} ({time.perf_counter() - begin:.0f} s)",
-        flush=True,
-    )
+rows = []
+for case in CASES:
+    rows.append(searches(*case))
+    newton, from_rest = (found(rows[-1][f"newton, {where}"][0]) for where in ("displaced", "rest"))
+    say(f"{title(rows[-1])}: Newton {newton}; from rest {from_rest}")
 
 
 # %% [markdown]
@@ -198,9 +173,6 @@ for machine, torque in SCENES:
 
 
 # %%
-SEARCHES = [f"{name}, {where}" for name in ("newton", "adam") for where in ("displaced", "rest")]
-
-
 def share(orbits: list[vi.Orbit]) -> str:
     """How often a 4π motion, a 2π motion and none was found."""
     kinds = [kind(orbit) for orbit in orbits]
@@ -208,93 +180,44 @@ def share(orbits: list[vi.Orbit]) -> str:
     return " / ".join(map(str, [*counts, len(kinds) - sum(counts)])) + f" of {len(kinds)}"
 
 
-lines = [
-    "| scene | transient: cycles | transient, ms | Newton, displaced | ms (saved) | "
-    "Newton, from rest | ms (saved) | Adam, displaced | ms | Adam, from rest | ms |",
-    "|" + "---|" * 11,
-]
-for row in rows:
+def cells(row: dict[str, Any]) -> list[str]:
+    """One machine: its transient, and each search with the time that it saves."""
     period, cycles, seconds, section = row["transient"]
-    cells = [title(row), f"{cycles} to the {2 * period}π motion", f"{1e3 * seconds:.1f}"]
+    found_in = [title(row), f"{cycles} to the {2 * period}π motion", f"{1e3 * seconds:.1f}"]
     for name in SEARCHES:
         orbit, taken = row[name]
-        cells += [found(orbit), f"{1e3 * taken:.{1 if 'newton' in name else 0}f}"]
+        ms = f"{1e3 * taken:.{1 if 'newton' in name else 0}f}"
         if "newton" in name:
-            saved = 1e3 * (seconds - taken)
-            cells[-1] += f" ({saved:+.1f})" if same(orbit, section) else " (–)"
-    lines.append("| " + " | ".join(cells) + " |")
-lines += [
-    "",
-    "| scene | Newton: 4π / 2π / none | median steps | Adam: 4π / 2π / none | median steps |",
-    "|---|---|---|---|---|",
-]
-for row in rows:
-    cells = [title(row)]
+            ms += f" ({1e3 * (seconds - taken):+.1f})" if same(orbit, section) else " (–)"
+        found_in += [found(orbit), ms]
+    return found_in
+
+
+def tally(row: dict[str, Any]) -> list[str]:
+    """The same machine from random guesses."""
+    parts = [title(row)]
     for orbits in row["tally"].values():
-        cells += [share(orbits), f"{np.median([int(o.iterations) for o in orbits]):.0f}"]
-    lines.append("| " + " | ".join(cells) + " |")
-table = "\n".join(lines)
-print(table)
+        parts += [share(orbits), f"{np.median([int(o.iterations) for o in orbits]):.0f}"]
+    return parts
+
+
+heads = [
+    "machine", "transient: cycles", "transient, ms", "Newton, displaced", "ms (saved)",
+    "Newton, from rest", "ms (saved)", "Adam, displaced", "ms", "Adam, from rest", "ms",
+]  # fmt: skip
+searched = table(heads, map(cells, rows))
+steps = "median steps"
+guessed = table(
+    ["machine", "Newton: 4π / 2π / none", steps, "Adam: 4π / 2π / none", steps], map(tally, rows)
+)
+print(searched, guessed, sep="\n\n")
 
 # %% [markdown]
 # ## Figure
 
 # %%
-COLORS = {"newton": "0.2", "adam": "#cc79a7"}
-figure = Figure(figsize=(11, 8), layout="constrained")
-(first, second), (bars, times) = figure.subplots(2, 2)
 shown = [rows[0], next(r for r in rows if r["machine"] == SECOND and r["torque"] == 10.0)]
-for axes, row in zip((first, second), shown, strict=True):
-    for name in SEARCHES:
-        method, where = name.split(", ")
-        orbit = row[name][0]
-        history = np.asarray(orbit.history)
-        style = ("." if method == "newton" else "") + ("-" if where == "displaced" else ":")
-        label = f"{method.capitalize()}, {where}: {kind(orbit).replace('_', ' ')}"
-        steps = np.arange(1, history.size + 1)
-        axes.loglog(steps, history, style, color=COLORS[method], lw=1.3, label=label)
-    axes.set_title(title(row))
-    axes.set_xlabel("step of the search")
-    axes.set_ylabel("largest residual component (a, a ω, ω)")
-    axes.set_ylim(1e-16, 10)
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize=8.5, loc="lower right")
-
-place = np.arange(len(rows))[::-1]
-names = [title(row) for row in rows]
-for shift, method, alpha in ((0.2, "newton", 1.0), (-0.2, "adam", 0.5)):
-    start = np.zeros(len(rows))
-    for wanted, color in (("4π", color_of(2)), ("2π", color_of(1)), ("none", "0.7")):
-        part = np.zeros(len(rows))
-        for i, row in enumerate(rows):
-            orbits = row["tally"][method]
-            kinds = [kind(o) if kind(o) in ("4π", "2π") else "none" for o in orbits]
-            part[i] = 100 * kinds.count(wanted) / len(kinds)
-        label = wanted if method == "newton" else None
-        bars.barh(place + shift, part, 0.36, start, color=color, alpha=alpha, label=label)
-        start += part
-bars.set_yticks(place, names, fontsize=8)
-bars.set_xlabel("random guesses, % (upper bars Newton, pale ones Adam)")
-bars.set_title("what is found from random guesses")
-bars.legend(fontsize=8, loc="upper center", ncols=3, bbox_to_anchor=(0.5, -0.14))
-
-for name in ("transient", *SEARCHES):
-    method, _, where = name.partition(", ")
-    color = COLORS.get(method, "k")
-    marker = {"": "|", "displaced": "o", "rest": "s"}[where]
-    for i, row in enumerate(rows):
-        seconds = row[name][2 if method == "transient" else 1]
-        hit = method == "transient" or same(row[name][0], row["transient"][3])
-        dots = {"color": color, "mfc": color if hit else "none", "mew": 1.5}
-        times.plot(1e3 * seconds, place[i], marker, ms=14 if not where else 6, **dots)
-    times.plot([], [], marker, color=color, label=name.capitalize())
-times.set_xscale("log")
-times.set_yticks(place, [])
-times.set_ylim(bars.get_ylim())
-times.grid(alpha=0.3)
-times.set_xlabel("ms, once compiled (hollow: not the motion of the transient)")
-times.set_title("time to the motion")
-times.legend(fontsize=8, loc="upper center", ncols=3, bbox_to_anchor=(0.5, -0.14))
+figure = picture(rows, shown)
 text = f"""# Fitting the 4π motion: Newton and optax
 
 ζ or κ = {KAPPA}, gap 0.08 m. *Displaced*: the ideal, undamped or damped closed form with Y 5 %
@@ -303,10 +226,12 @@ why not, and the steps. Times are once compiled, the fastest of five (Adam: one)
 orders of magnitude; *saved* is the transient's time less the search's, where both are the same
 motion. A transient is over when the section repeats within 1e-6.
 
-{table}
+{searched}
 
-- A stable 4π motion exists in all these scenes, and every transient from rest ends on it. From the
-  displaced closed form Newton finds it in five or six steps with any drive (16 in the ideal scene
+{guessed}
+
+- A stable 4π motion exists in all these cases, and every transient from rest ends on it. From the
+  displaced closed form Newton finds it in five or six steps with any drive (16 in the ideal machine
   with k = 0.95), to rounding: the ideal drive's closed form is a good guess for a motor too.
 - From rest Newton mostly does not find what the transient does: it falls on the unstable 2π motion,
   which is a zero of the same residual (`smaller_period`), or stops between motions.
@@ -325,5 +250,4 @@ numbers = {
     for row in rows
     if row["torque"] is None
 }
-if not QUICK:
-    keep(HERE, "fit_4pi_orbit", text, numbers, figure)
+write("fit_4pi_orbit", text, numbers, figure)

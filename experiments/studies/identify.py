@@ -30,11 +30,10 @@ from vi_jax.plot.colors import BLUE, ORANGE, RED, STOP, paler
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
-sys.path.insert(0, str(HERE.parent))
-from headlines import keep
+sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
+from tools.study import QUICK, write
+from tools.tables import table
 
-QUICK = "--quick" in sys.argv
 RECORDS = 16 if QUICK else 256
 CYCLES, SAMPLES, DECIBELS = 10, 32, 30.0
 NAMES = ("k", "ξ", "d", "Y0", "V0")
@@ -122,20 +121,19 @@ found = scatter < 1.25 * noise
 units = ((estimates - truth) / errors)[found]
 covered = np.abs(units) < 1.96
 slack = 1.96 * np.sqrt(0.95 * 0.05 / found.sum())
-lines = [
-    "| | true | first guess | estimate, first record | its standard error | "
-    "mean of all estimates | their spread | mean standard error | within ±1.96 errors |",
-    "|---|---|---|---|---|---|---|---|---|",
-]
+heads = [
+    "", "true", "first guess", "estimate, first record", "its standard error",
+    "mean of all estimates", "their spread", "mean standard error", "within ±1.96 errors",
+]  # fmt: skip
+rows = []
 for i, name in enumerate(NAMES):
     one, all_ = estimates[0, i], estimates[found, i]
-    lines.append(
-        f"| {name} | {truth[i]:.5f} | {float(GUESS[i]):g} | {one:.5f} | {errors[0, i]:.5f} | "
-        f"{all_.mean():.5f} | {all_.std(ddof=1):.5f} | {errors[found, i].mean():.5f} | "
-        f"{covered[:, i].mean():.1%} |"
-    )
-table = "\n".join(lines)
-print(table)
+    mean, spread = all_.mean(), all_.std(ddof=1)
+    numbers = (one, errors[0, i], mean, spread, errors[found, i].mean())
+    cells = [f"{truth[i]:.5f}", f"{float(GUESS[i]):g}", *(f"{x:.5f}" for x in numbers)]
+    rows.append([name, *cells, f"{covered[:, i].mean():.1%}"])
+unknowns = table(heads, rows)
+print(unknowns)
 
 
 jacobian = np.asarray(jax.jit(jax.jacfwd(positions))(TRUTH))
@@ -166,7 +164,7 @@ left = float(np.min(np.asarray(again[2])[~near], initial=np.inf)) / noise
 worst = float(np.max(np.abs(covered.mean(axis=0) - 0.95)))
 report = f"""# Identifying a stop from a noisy record of the motion
 
-{table}
+{unknowns}
 
 Ideal drive, ζ = 0.9, {CYCLES} cycles with {impacts} impacts, {clean.size} positions with noise of \
 {noise:.4f} a ({DECIBELS:g} dB below the signal's standard deviation); lengths in units of a, \
@@ -201,7 +199,7 @@ for unknowns, name, style in (
     (jnp.asarray(estimates[0]), "fit", {"color": BLUE, "lw": 1.3}),
 ):
     vi.plot_history(
-        show(unknowns), scene=scene_of(unknowns), ax=history, label=name, stops=False, **style
+        show(unknowns), machine=scene_of(unknowns), ax=history, label=name, stops=False, **style
     )
 history.axhline(truth[2], color=STOP, lw=1.5, label="stop", zorder=0)
 history.set(xlim=(0, 2 * CYCLES), ylim=(-2.6, 2.1))
@@ -229,5 +227,4 @@ axes[NAMES[2]].set_title(
 numbers = {f"{name}, first record": float(estimates[0, i]) for i, name in enumerate(NAMES)}
 numbers["k and ξ: correlation"] = float(correlation[0, 1])
 numbers["noise"] = noise
-if not QUICK:
-    keep(HERE, "identify", report.replace("\\\n", ""), numbers, figure)
+write("identify", report, numbers, figure)

@@ -17,19 +17,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import vi_jax as vi
-from matplotlib.figure import Figure
+from vi_jax import machines
 from vi_jax.plot.colors import BLUE, GREEN, ORANGE, RED
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
-sys.path.insert(0, str(HERE.parent))
-from headlines import keep
+sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
+from tools.pictures import open_frames, panels
+from tools.study import QUICK, write
+from tools.tables import table
 
-QUICK = "--quick" in sys.argv
 RESTITUTIONS = (0.4, 0.6) if QUICK else (0.2, 0.8)
 PI = np.pi
-M = vi.machines
 
 
 def sigma(e: Any) -> Any:
@@ -54,8 +53,8 @@ def curve(point: vi.SpecialPoint, second: str, first_bounds: tuple, bounds: tupl
 # One bounce a cycle is born at Γ = πσ and doubles at Γ² = (πσ)² + (2(1 + e²)/(1 + e)²)².
 
 # %%
-table = M.BouncingBall(acceleration=1.2, restitution=0.5)  # pyright: ignore[reportCallIssue]
-bounce = vi.find_orbit(table, table.start(height=6.15831535, speed=-1.06063272), throw=True)
+shaken = machines.BouncingBall(acceleration=1.2, restitution=0.5)  # pyright: ignore[reportCallIssue]
+bounce = vi.find_orbit(shaken, shaken.start(height=6.15831535, speed=-1.06063272), throw=True)
 found = followed(bounce, "acceleration", (0.05, 3.0))
 wide = (0.01, 4.0)
 born = curve(found["fold"], "restitution", wide, RESTITUTIONS)
@@ -73,7 +72,7 @@ def doubling_of(e: Any) -> Any:
 # λ = (π/2 - 2/π)/√(4/π² + σ²).
 
 # %%
-pair = M.ImpactPair(half_gap=2.0, restitution=0.5)  # pyright: ignore[reportCallIssue]
+pair = machines.ImpactPair(half_gap=2.0, restitution=0.5)  # pyright: ignore[reportCallIssue]
 whole = vi.find_orbit(pair, pair.start(place=-1.137, speed=0.785), throw=True)
 special = followed(whole, "half_gap", (1.05, 6.0))
 folds = curve(special["fold"], "restitution", (1.0, 30.0), RESTITUTIONS)
@@ -95,7 +94,7 @@ def breaking_of(e: Any) -> Any:
 # 15.2 of COCO's tutorials).
 
 # %%
-classic = M.Duffing(amplitude=0.05, two_sided=False)  # pyright: ignore[reportCallIssue]
+classic = machines.Duffing(amplitude=0.05, two_sided=False)  # pyright: ignore[reportCallIssue]
 grazes = followed(vi.find_orbit(classic, classic.start(), throw=True), "amplitude", (0.02, 0.3))
 frequencies = (0.95, 1.05) if QUICK else (0.85, 1.15)
 touch = curve(grazes["grazing"], "frequency", (0.02, 0.6), frequencies)
@@ -113,14 +112,14 @@ AMPLITUDES = np.linspace(0.6, 3.0, 25 if QUICK else 241)
 
 
 def settled(amplitude):
-    capsule = M.Capsule(amplitude=amplitude)  # pyright: ignore[reportCallIssue]
+    capsule = machines.Capsule(amplitude=amplitude)  # pyright: ignore[reportCallIssue]
     run = vi.simulate(capsule, capsule.start(), 16, settle=400)
     return run.sections.progress[1:], run.successful
 
 
 progress, good = (np.asarray(x) for x in vi.jit(jax.vmap(settled))(jnp.asarray(AMPLITUDES)))
 assert good.all()
-capsule = M.Capsule()  # pyright: ignore[reportCallIssue]
+capsule = machines.Capsule()  # pyright: ignore[reportCallIssue]
 moving = vi.simulate(capsule, capsule.start(), 1, settle=400).last
 branch = vi.continue_orbit(
     vi.find_orbit(capsule, moving, throw=True), parameter="amplitude", bounds=(0.6, 3.0)
@@ -138,15 +137,11 @@ CURVES = [
     ("ball in a box", "loss of symmetry, λ(e)", breaks, breaking_of),
     ("impact oscillator", "grazing, A(ω)", touch, touch_of),
 ]
-rows = [
-    "| machine | curve | points | from | to | largest difference |",
-    "|---|---|---|---|---|---|",
-]
+rows = []
 for machine, name, (first, second), known in CURVES:
     apart = np.abs(first - known(second)).max()
-    rows.append(
-        f"| {machine} | {name} | {len(first)} | {second.min():g} | {second.max():g} | {apart:.0e} |"
-    )
+    ends = (f"{second.min():g}", f"{second.max():g}")
+    rows.append((machine, name, len(first), *ends, f"{apart:.0e}"))
 numbers = {
     "birth of one bounce, e = 0.5": found["fold"].parameter,
     "its period doubling, e = 0.5": found["period-doubling"].parameter,
@@ -154,11 +149,11 @@ numbers = {
     "its loss of symmetry, e = 0.5": special["symmetry-breaking"].parameter,
     "grazing of the oscillator, ω = 1": grazes["grazing"].parameter,
 }
-table_text = "\n".join(rows)
-print(table_text)
+heads = ["machine", "curve", "points", "from", "to", "largest difference"]
+followed_curves = table(heads, rows)
+print(followed_curves)
 
-figure = Figure(figsize=(10, 7.2), layout="constrained")
-panels = figure.subplots(2, 2)
+figure, grid = panels(10, 7.2, 2, 2)
 
 
 def drawn(ax: Any, points: np.ndarray, known: Any, color: str, name: str) -> None:
@@ -170,7 +165,7 @@ def drawn(ax: Any, points: np.ndarray, known: Any, color: str, name: str) -> Non
     ax.plot(at, known(at), "o", ms=5, mfc="none", color=color, label=f"{name}, closed form")
 
 
-ball, box, oscillator, capsules = panels.flat
+ball, box, oscillator, capsules = grid.flat
 drawn(ball, born, CURVES[0][3], BLUE, "birth")
 drawn(ball, doubles, CURVES[1][3], RED, "period doubling")
 ball.set(
@@ -194,9 +189,9 @@ for point in branch.special:
     capsules.plot(point.parameter, at, "ok", ms=5, label=None)
 capsules.plot([], [], "ok", ms=5, label="its ends: events fall together")
 capsules.set(title="capsule", xlabel="amplitude α (F)", ylabel="progress in a cycle (F/k)")
-for ax in panels.flat:
+for ax in grid.flat:
     ax.legend(frameon=False, fontsize=8)
-    ax.spines[["top", "right"]].set_visible(False)
+open_frames(grid.flat)
 
 # %%
 text = f"""# Ready machines beside what is known of them
@@ -209,12 +204,11 @@ events fall together.
 
 ![Four machines](../figures/known_machines.png)
 
-{table_text}
+{followed_curves}
 
 - The smallest amplitude at which the oscillator touches its wall is {touch[0].min():.6f}; the
   closed form says {touch_of(np.sqrt(1 - 0.1**2 / 2)):.6f}.
 - The capsule's branch of one impact a cycle runs from α = {branch.parameter.min():.6f} to
   {branch.parameter.max():.6f}, where it goes {along[np.argmax(branch.parameter)]:.4f} F/k a cycle.
 """
-if not QUICK:
-    keep(HERE, "known_machines", text, numbers, figure)
+write("known_machines", text, numbers, figure)

@@ -32,11 +32,10 @@ from vi_jax.plot.colors import BLUE, ORANGE, STOP, paler
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
-sys.path.insert(0, str(HERE.parent))
-from headlines import keep
+sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
+from tools.study import QUICK, write
+from tools.tables import table
 
-QUICK = "--quick" in sys.argv
 RECORDS, WARM_UP, DRAWS = (8, 100, 100) if QUICK else (200, 300, 800)
 CYCLES, SAMPLES, NOISE = 4, 16, 0.05
 NAMES = ("restitution", "gap", "damping_ratio")
@@ -139,7 +138,7 @@ prior = np.quantile(
     np.asarray(jax.vmap(numbers_of)(jax.random.normal(jax.random.key(3), (4096, 3)))),
     [0.05, 0.95], axis=0,
 )  # fmt: skip
-told = (high - low).mean(axis=0) / (prior[1] - prior[0])
+narrower = (high - low).mean(axis=0) / (prior[1] - prior[0])
 for i, name in enumerate(LABELS):
     print(f"{name}: {covered[:, i].mean():.1%} covered, ranks uniform with p = {p_values[i]:.2f}")
 print(f"{RECORDS} posteriors in {walked:.0f} s")
@@ -205,58 +204,54 @@ def draw() -> Figure:
 
 def page() -> str:
     """The tables."""
-    pooled = covered.mean()
     rows = [
-        f"| {name} | {covered[:, i].mean():.1%} | {p_values[i]:.2f} | {told[i]:.2f} |"
+        (name, f"{covered[:, i].mean():.1%}", f"{p_values[i]:.2f}", f"{narrower[i]:.2f}")
         for i, name in enumerate(LABELS)
     ]
+    heads = [
+        "number", "90 % intervals that hold the true one",
+        "uniform ranks, p (Kolmogorov–Smirnov)", "width of the interval beside the prior's",
+    ]  # fmt: skip
     of_one = [
-        f"| {label} | {known[FIRST, i]:.4f} | {summary.loc[name, 'mean']:.4f} | "
-        f"{summary.loc[name, 'hdi_5%']:.4f} … {summary.loc[name, 'hdi_95%']:.4f} | "
-        f"{summary.loc[name, 'ess_bulk']:.0f} | {summary.loc[name, 'r_hat']:.3f} |"
+        (
+            label, f"{known[FIRST, i]:.4f}", f"{summary.loc[name, 'mean']:.4f}",
+            f"{summary.loc[name, 'hdi_5%']:.4f} … {summary.loc[name, 'hdi_95%']:.4f}",
+            f"{summary.loc[name, 'ess_bulk']:.0f}", f"{summary.loc[name, 'r_hat']:.3f}",
+        )
         for i, (name, label) in enumerate(zip(NAMES, LABELS, strict=True))
-    ]
-    lines = [
-        "# Posteriors of a stop from a noisy record",
-        "",
-        f"{RECORDS} records of {CYCLES} drive cycles from rest, {SAMPLES} positions a cycle, noise "
-        f"{NOISE} a; ζ = 0.9. The numbers are drawn from the prior, so that over many records a "
-        "90 % interval must hold them 90 times of 100, and their rank among the draws must be "
-        "uniform.",
-        "",
-        "| number | 90 % intervals that hold the true one | uniform ranks, p (Kolmogorov–Smirnov) "
-        "| width of the interval beside the prior's |",
-        "|---|---|---|---|",
-        *rows,
-        "",
-        f"All three together: {pooled:.1%} of {3 * RECORDS}. Mean acceptance "
-        f"{float(np.mean(acceptance)):.2f}; {int(np.sum(np.asarray(divergent)))} of "
-        f"{RECORDS * DRAWS:,} steps diverged.",
-        "",
-        f"One record with {int(impacts[FIRST])} impacts, four walks, by ArviZ:",
-        "",
-        "| number | true | mean | 90 % interval | effective draws | R̂ |",
-        "|---|---|---|---|---|---|",
-        *of_one,
-        "",
-        "Where a number decides whether an impact happens at all, the positions change without a "
-        "jump, but their derivative by that number grows without bound as the impact becomes a "
-        "graze, and is another beyond it. The sampler meets a kink in the density there: its steps "
-        "diverge or are refused, and a walk may stay on one side. Records of velocities would be "
-        "worse: they jump at every impact, and the density jumps as an impact moves past a sample. "
-        f"With this prior and these records it does no harm that {RECORDS} records would show.",
-    ]
-    return "\n".join(lines)
+    ]  # fmt: skip
+    one = ["number", "true", "mean", "90 % interval", "effective draws", "R̂"]
+    return f"""# Posteriors of a stop from a noisy record
+
+{RECORDS} records of {CYCLES} drive cycles from rest, {SAMPLES} positions a cycle, noise \
+{NOISE} a; ζ = 0.9. The numbers are drawn from the prior, so that over many records a 90 % \
+interval must hold them 90 times of 100, and their rank among the draws must be uniform.
+
+{table(heads, rows)}
+
+All three together: {covered.mean():.1%} of {3 * RECORDS}. Mean acceptance \
+{float(np.mean(acceptance)):.2f}; {int(np.sum(np.asarray(divergent)))} of {RECORDS * DRAWS:,} \
+steps diverged.
+
+One record with {int(impacts[FIRST])} impacts, four walks, by ArviZ:
+
+{table(one, of_one)}
+
+Where a number decides whether an impact happens at all, the positions change without a jump, but \
+their derivative by that number grows without bound as the impact becomes a graze, and is another \
+beyond it. The sampler meets a kink in the density there: its steps diverge or are refused, and a \
+walk may stay on one side. Records of velocities would be worse: they jump at every impact, and \
+the density jumps as an impact moves past a sample. With this prior and these records it does no \
+harm that {RECORDS} records would show."""
 
 
 figure = draw()
 print(f"{time.perf_counter() - BEGUN:.0f} s")
-if not QUICK:
-    slope = np.asarray(jax.jacfwd(positions)(truth[FIRST]))
-    numbers = {
-        "record of the picture": FIRST,
-        "its impacts": int(impacts[FIRST]),
-        "its least position": float(clean[FIRST].min()),
-        "its information on z": float(np.linalg.slogdet(slope.T @ slope)[1]),
-    }
-    keep(HERE, "posterior", page(), numbers, figure)
+slope = np.asarray(jax.jacfwd(positions)(truth[FIRST]))
+numbers = {
+    "record of the picture": FIRST,
+    "its impacts": int(impacts[FIRST]),
+    "its least position": float(clean[FIRST].min()),
+    "its information on z": float(np.linalg.slogdet(slope.T @ slope)[1]),
+}
+write("posterior", page(), numbers, figure)

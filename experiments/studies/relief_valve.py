@@ -17,16 +17,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import vi_jax as vi
-from matplotlib.figure import Figure
 from scipy.optimize import brentq
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
-sys.path.insert(0, str(HERE.parent))
-from headlines import keep
+sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
+from tools.pictures import open_frames, panels
+from tools.study import QUICK, write
+from tools.tables import table
 
-QUICK = "--quick" in sys.argv
 RATES = np.linspace(0.3, 8.48, 60 if QUICK else 600)
 SETTLE, SEEN = (100, 16) if QUICK else (600, 64)
 BOUNDS = (0.3, 9.0)
@@ -81,18 +80,15 @@ rest_lost: Any = brentq(growth, 8.0, 9.0, xtol=1e-12)
 # ## Table and figure
 
 # %%
-rows = ["| q | what happens | period, in maxima of the lift | duration |", "|---|---|---|---|"]
+rows = []
 for branch in (free, hitting, *doubled):
     for point in branch.special:
-        rows.append(
-            f"| {point.parameter:.9f} | {point.kind}: {point.detail} | {int(point.orbit.cycles)} | "
-            f"{float(point.orbit.duration):.6f} |"
-        )
-table = "\n".join(rows)
-print(table)
+        what, duration = f"{point.kind}: {point.detail}", f"{float(point.orbit.duration):.6f}"
+        rows.append((f"{point.parameter:.9f}", what, int(point.orbit.cycles), duration))
+points = table(["q", "what happens", "period, in maxima of the lift", "duration"], rows)
+print(points)
 
-figure = Figure(figsize=(11, 5.4), layout="constrained")
-upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
+figure, (upper, lower) = panels(11, 5.4, 2, 1, sharex=True, height_ratios=(3, 1))
 upper.plot(np.repeat(RATES, SEEN), lifts.ravel(), ",", color="0.45", rasterized=True)
 upper.plot([], [], ".", color="0.45", ms=3, label="what valves settle on")
 colors = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
@@ -117,8 +113,7 @@ upper.set_ylabel("lift at its maxima")
 upper.legend(frameon=False, fontsize=9, ncols=2, loc="upper left")
 lower.plot(RATES, impacts.mean(axis=1), ".", color="0.3", ms=2.5)
 lower.set(xlabel="flow rate q", ylabel="impacts in a cycle", xlim=(0, 9))
-for ax in (upper, lower):
-    ax.spines[["top", "right"]].set_visible(False)
+open_frames((upper, lower))
 
 # %%
 text = f"""# A relief valve, from rest to chatter
@@ -138,7 +133,7 @@ broken where they are unstable.
 - **Below, one impact a cycle** is stable between the period doublings at
   q = {min(p.parameter for p in doublings):.9f} and {max(p.parameter for p in doublings):.9f}.
 
-{table}
+{points}
 """
 numbers = {
     "Hopf, q": hopf.parameter,
@@ -146,5 +141,4 @@ numbers = {
     "first doubling, q": min(p.parameter for p in doublings),
     "second doubling, q": max(p.parameter for p in doublings),
 }
-if not QUICK:
-    keep(HERE, "relief_valve", text, numbers, figure)
+write("relief_valve", text, numbers, figure)

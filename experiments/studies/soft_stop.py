@@ -19,18 +19,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import vi_jax as vi
-from matplotlib.figure import Figure
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 from vi_jax.plot.colors import BLUE, GREEN, RED
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
-sys.path.insert(0, str(HERE.parent))
-from headlines import keep
+sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
+from tools.pictures import panels
+from tools.study import QUICK, write
+from tools.tables import table
 
-QUICK = "--quick" in sys.argv
 STIFFNESS = np.logspace(1, 6, 11 if QUICK else 51)
 NEAR = np.logspace(1.8, 2.4, 6 if QUICK else 61)  # where the two motions part
 
@@ -79,7 +78,7 @@ rigid = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ra
 CLOSED = {cycles: vi.closed_form_orbits(rigid, cycles=cycles) for cycles in (1, 2)}
 
 
-def scene(law: str, stiffness: float) -> vi.Scene:
+def machine(law: str, stiffness: float) -> vi.Scene:
     """The machine with a compliant stop, its stiffness in units of the body's own spring."""
     stop = vi.SoftStop(2.0, stiffness, **LAWS[law])
     return vi.Scene(oscillator=vi.Oscillator(0.0), drive=vi.IdealDrive(0.9), soft_stops=(stop,))
@@ -108,7 +107,7 @@ def motions(law: str, cycles: int) -> list[Found]:
     for stiffness in STIFFNESS[::-1]:
         if cycles == 2 and stiffness < NEAR[-1]:
             break
-        orbit = vi.find_orbit(scene(law, stiffness), guess, cycles=cycles, throw=True)
+        orbit = vi.find_orbit(machine(law, stiffness), guess, cycles=cycles, throw=True)
         guess = orbit.state
         found.append(described(stiffness, orbit))
     return found[::-1]
@@ -125,7 +124,7 @@ def attracted(law: str) -> list[Found]:
     @jax.jit
     @jax.vmap
     def last(stiffness):
-        there = scene(law, stiffness)
+        there = machine(law, stiffness)
         run = vi.simulate(there, there.start(), 2, settle=1000, method="reference")
         # Of the two sections of the motion the one with the greater Y.
         place = jnp.argmax(run.sections.Y[:2])
@@ -134,7 +133,7 @@ def attracted(law: str) -> list[Found]:
     states, found = last(jnp.asarray(NEAR)), []
     for i, stiffness in enumerate(NEAR):
         guess = rigid.start(Y=float(states.Y[i]), V=float(states.V[i]))
-        orbit = vi.find_orbit(scene(law, stiffness), guess, cycles=2)
+        orbit = vi.find_orbit(machine(law, stiffness), guess, cycles=2)
         if bool(orbit.successful) and int(orbit.cycles) == 2:
             found.append(described(stiffness, orbit))
     return found
@@ -147,7 +146,7 @@ def doubling(law: str, found: list[Found]) -> float:
     guess = rigid.start(Y=found[place].state[0], V=found[place].state[1])
 
     def excess(exponent):
-        orbit = vi.find_orbit(scene(law, 10.0**exponent), guess, throw=True)
+        orbit = vi.find_orbit(machine(law, 10.0**exponent), guess, throw=True)
         return float(np.min(np.real(orbit.multipliers))) + 1
 
     low, high = (np.log10(found[i].stiffness) for i in (place, place + 1))
@@ -172,7 +171,7 @@ def from_rest(law: str, stiffness: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Whether a run from rest ends in a 2π motion, and whether it repeats after two cycles."""
 
     def one(stiffness):
-        there = scene(law, stiffness)
+        there = machine(law, stiffness)
         run = vi.simulate(there, there.start(), 4, settle=400, method="reference")
         far = [jnp.abs(run.sections.Y[n:] - run.sections.Y[:-n]).max() for n in (1, 2)]
         return run.successful & (far[0] < 1e-6), run.successful & (far[1] < 1e-6)
@@ -203,10 +202,7 @@ def critical(law: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 MULTIPLIER = float(np.min(np.real(CLOSED[1].multipliers[0])))
-rows = [
-    "| law | 2π loses its stability at K | its depth there | slope of the change in Y by K |",
-    "|---|---|---|---|",
-]
+rows = []
 slopes = {}
 for law in LAWS:
     K = critical(law)[0]
@@ -215,21 +211,20 @@ for law in LAWS:
     slopes[law] = float(np.polyfit(np.log(K[K >= 1e4]), away[K >= 1e4], 1)[0])
     depths = [x.depth for x in orbits[law, 1]]
     depth = float(np.interp(np.log(limit[law]), np.log(K), depths))
-    rows.append(f"| {law} | {limit[law]:.4f} | {depth:.3f} | {slopes[law]:.3f} |")
-table = "\n".join(rows)
-names = " | ".join(f"K = {K:g}" for K in CHECKED)
-runs = "\n".join(
-    [f"| from rest | {names} |", "|---" * (len(CHECKED) + 1) + "|"]
-    + [f"| {law} | {' | '.join(seen(law, i) for i in range(len(CHECKED)))} |" for law in LAWS]
+    rows.append((law, f"{limit[law]:.4f}", f"{depth:.3f}", f"{slopes[law]:.3f}"))
+heads = ["law", "2π loses its stability at K", "its depth there", "slope of the change in Y by K"]
+doublings = table(heads, rows)
+runs = table(
+    ["from rest", *(f"K = {K:g}" for K in CHECKED)],
+    [(law, *(seen(law, i) for i in range(len(CHECKED)))) for law in LAWS],
 )
-print(table, runs, sep="\n")
+print(doublings, runs, sep="\n")
 
 # %% [markdown]
 # ## Figure
 
 # %%
-figure = Figure(figsize=(10.5, 4.4), layout="constrained")
-left, right = figure.subplots(1, 2)
+figure, (left, right) = panels(10.5, 4.4, 1, 2)
 for law, colour in COLOURS.items():
     K, least = critical(law)
     left.semilogx(K, least, color=colour, label=law)
@@ -268,7 +263,7 @@ motion is unstable (least multiplier {MULTIPLIER:.6f}) and the 4π motion attrac
 
 ![multipliers and sections](../figures/soft_stop.png)
 
-{table}
+{doublings}
 
 - The rigid stop's result holds for stops stiffer than about {greatest:.0f} (in these units), by
   whichever law: the 2π motion is unstable there, the 4π motion exists and attracts. At the
@@ -290,5 +285,4 @@ numbers["multiplier of the 2π motion at K = 1000, spring and dashpot"] = float(
     np.interp(3.0, np.log10(critical("spring and dashpot")[0]), critical("spring and dashpot")[1])
 )
 print(f"all: {time.perf_counter() - begin:.0f} s")
-if not QUICK:
-    keep(HERE, "soft_stop", text, numbers, figure)
+write("soft_stop", text, numbers, figure)

@@ -18,16 +18,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import vi_jax as vi
-from matplotlib.figure import Figure
 from vi_jax.plot.colors import BLUE, GREEN, RED, once
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
-sys.path.insert(0, str(HERE.parent))
-from headlines import keep
+sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
+from tools.pictures import open_frames, panels
+from tools.study import QUICK, write
+from tools.tables import table
 
-QUICK = "--quick" in sys.argv
 STRENGTHS = (0.1, 0.2, 1.0)
 EPSILON, XI, GAP = 0.01, 0.05, 4.0
 VALUES, SETTLE = (31, 200) if QUICK else (161, 400)
@@ -98,34 +97,31 @@ for strength in STRENGTHS:
 # ## Table and figure
 
 # %%
-rows = [
-    "| τ0 | run-up jumps in κ | fold | averaged | close-down jumps in κ | fold | averaged | "
-    "run-up with a stop |",
-    "|" + "---|" * 8,
-]
+heads = ["τ0", "run-up jumps in κ", "fold", "averaged", "close-down jumps in κ", "fold", "averaged"]
+heads += ["run-up with a stop"]
+rows = []
 numbers, apart = {}, []
 for i, strength in enumerate(STRENGTHS):
-    told = averaged(strength)[2]
+    turns = averaged(strength)[2]
     cells = [f"{strength:g}"]
     for k, way in enumerate(("run-up", "close-down")):
-        if not told:
+        if not turns:
             cells += ["none", "none", "none"]
             continue
         low, high = jump(free, i + k * len(STRENGTHS))
-        cells += [f"{low:.4f} … {high:.4f}", f"{folds[strength][k]:.5f}", f"{told[k]:.5f}"]
+        cells += [f"{low:.4f} … {high:.4f}", f"{folds[strength][k]:.5f}", f"{turns[k]:.5f}"]
         numbers[f"τ0 = {strength:g}, {way}: fold, κ"] = folds[strength][k]
-        numbers[f"τ0 = {strength:g}, {way}: averaged fold, κ"] = told[k]
-        apart.append(abs(folds[strength][k] / told[k] - 1))
+        numbers[f"τ0 = {strength:g}, {way}: averaged fold, κ"] = turns[k]
+        apart.append(abs(folds[strength][k] / turns[k] - 1))
     assert held.frequency_ratio is not None
     low, high = jump(held, i)
     step = np.nanmax(np.abs(np.diff(np.asarray(held.frequency_ratio)[i])))
     cells.append(f"{low:.4f} … {high:.4f}" if step > 0.05 else "none")
-    rows.append("| " + " | ".join(cells) + " |")
-table = "\n".join(rows)
-print(table)
+    rows.append(cells)
+motors = table(heads, rows)
+print(motors)
 
-figure = Figure(figsize=(11, 4.4), layout="constrained")
-left, right = figure.subplots(1, 2, sharex=True, sharey=True)
+figure, (left, right) = panels(11, 4.4, 1, 2, sharex=True, sharey=True)
 colors = (RED, BLUE, GREEN)
 for i, strength in enumerate(STRENGTHS):
     speeds, kappa, _ = averaged(strength)
@@ -150,7 +146,7 @@ for ax, title in ((left, "no stop"), (right, f"a stop at {GAP:g} m r/M")):
     ax.plot([LOW, HIGH], [LOW, HIGH], color="0.6", lw=0.8, ls=":", zorder=0, label="ζ = κ")
     ax.set(xlabel="motor control κ", ylabel="mean speed ζ (ω)", xlim=(LOW, HIGH), ylim=(LOW, HIGH))
     ax.set_title(title, fontsize=10)
-    ax.spines[["top", "right"]].set_visible(False)
+open_frames((left, right))
 right.set_ylabel("")
 left.legend(frameon=False, fontsize=8, loc="upper left")
 
@@ -173,7 +169,6 @@ the continued motion the thin one (unstable: dashed).
   not know of it. So a stop can bring a jump where there was none (τ0 = {STRENGTHS[-1]:g}), and hold
   a weak motor down all the way (τ0 = {STRENGTHS[0]:g}: no jump up to κ = {HIGH:g}).
 
-{table}
+{motors}
 """
-if not QUICK:
-    keep(HERE, "sommerfeld", text, numbers, figure)
+write("sommerfeld", text, numbers, figure)

@@ -17,16 +17,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import vi_jax as vi
-from matplotlib.figure import Figure
 from vi_jax.plot.colors import BLUE, GREEN, RED
 
 jax.config.update("jax_enable_x64", True)
 
-HERE = Path(__file__).parent if "__file__" in globals() else Path("experiments/studies")
-sys.path.insert(0, str(HERE.parent))
-from headlines import keep
+sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
+from tools.pictures import open_frames, panels
+from tools.study import QUICK, write
+from tools.tables import table
 
-QUICK = "--quick" in sys.argv
 SETTLE, SEEN = (60, 8) if QUICK else (1500, 8)
 FRICTIONS = np.linspace(0.2, 1.1, 46 if QUICK else 361)
 # How runs end that do not go on: too many impacts in a cycle, an impact that would gain energy.
@@ -66,18 +65,18 @@ for kind, number, at, value in zip(
     *(np.asarray(x[0, -1]) for x in (log.kind, log.number, log.phase, log.value)), strict=True
 ):
     word = vi.EVENTS[int(kind)] if number >= 0 else "rest"
-    if word == "rest":  # told by the impact before it
+    if word == "rest":  # the impact before it says so
         continue
     slips = "sticks: the sleeve jams" if value == 0 else "slips"
     events.append((f"{NAMES[number]} {WORDS.get(word, slips)}", float(at)))
-rows = ["| event | ms | reference, ms |", "|---|---|---|"]
+rows = []
 for (what, at), known in zip(events, KNOWN, strict=True):
-    rows.append(f"| {what} | {1e3 * at:.4f} | {1e3 * known:.4f} |")
+    rows.append((what, f"{1e3 * at:.4f}", f"{1e3 * known:.4f}"))
 rows += [
-    f"| period | {time[0, -1]:.6f} | 145.976065 |",
-    f"| drop (mm) | {drop[0, -1]:.6f} | 19.445379 |",
+    ("period", f"{time[0, -1]:.6f}", "145.976065"),
+    ("drop (mm)", f"{drop[0, -1]:.6f}", "19.445379"),
 ]
-cycle_table = "\n".join(rows)
+cycle_table = table(["event", "ms", "reference, ms"], rows)
 print(cycle_table)
 
 # %% [markdown]
@@ -98,18 +97,16 @@ pecks = FRICTIONS[good[1:]]
 first, last = float(pecks.min()), float(pecks.max())
 share = np.where(good, lost.sum(1) / (WEIGHT * 1e-3 * drop.sum(1)), np.nan)
 speed = drop.sum(1) / duration.sum(1) / 10  # cm/s
-stands = ["| μ | period | time of a cycle, ms | drop, mm | way down, cm/s | lost in impacts |",
-          "|---|---|---|---|---|---|"]  # fmt: skip
+stands = []
 for value in (0.3, 0.35, 0.4, 0.45, 0.5, 0.6, 0.8, 1.0):
     i = 1 + int(np.argmin(np.abs(FRICTIONS - value)))
     k = max(1, int(periods[i - 1]))
-    told = (", ".join(f"{x:.3f}" for x in np.sort(row[i, -k:])) for row in (time, drop))
-    stands.append(
-        f"| {FRICTIONS[i - 1]:.4g} | {periods[i - 1]} | {' | '.join(told)} | {speed[i]:.3f} | "
-        f"{share[i]:.3f} |"
-    )
-table = "\n".join(stands)
-print(table)
+    last_ones = (", ".join(f"{x:.3f}" for x in np.sort(row[i, -k:])) for row in (time, drop))
+    rates = (f"{speed[i]:.3f}", f"{share[i]:.3f}")
+    stands.append([f"{FRICTIONS[i - 1]:.4g}", periods[i - 1], *last_ones, *rates])
+heads = ["μ", "period", "time of a cycle, ms", "drop, mm", "way down, cm/s", "lost in impacts"]
+toys = table(heads, stands)
+print(toys)
 
 # %% [markdown]
 # ## Where the period doubles
@@ -156,8 +153,7 @@ print(known, doubling)
 # ## Figure
 
 # %%
-figure = Figure(figsize=(11, 6.4), layout="constrained")
-axes = figure.subplots(3, 1, sharex=True, height_ratios=(2, 2, 1.3))
+figure, axes = panels(11, 6.4, 3, 1, sharex=True, height_ratios=(2, 2, 1.3))
 for ax, rows_of, name, reference, color in (
     (axes[0], time, "time of a cycle (ms)", 145.976, BLUE),
     (axes[1], drop, "drop in a cycle (mm)", 19.4454, RED),
@@ -173,7 +169,7 @@ axes[2].set_ylim(0, 40)
 for ax in axes:
     ax.axvspan(FRICTIONS[0], first, color="0.93", lw=0)
     ax.axvspan(last, FRICTIONS[-1], color="0.93", lw=0)
-    ax.spines[["top", "right"]].set_visible(False)
+open_frames(axes)
 for place, word in (((FRICTIONS[0] + first) / 2, "falls"), ((last + FRICTIONS[-1]) / 2, "no\nlaw")):
     axes[0].text(place, 0.5, word, ha="center", va="center", color="0.3",
                  transform=axes[0].get_xaxis_transform())  # fmt: skip
@@ -217,7 +213,7 @@ all from one start; {SEEN} cycles after {SETTLE}. A cycle ends where φS falls t
 Frictions are {FRICTIONS[1] - FRICTIONS[0]:.2g} apart; of the {between.sum()} toys between these two
 {others or "none"} ended for another reason.
 
-{table}
+{toys}
 
 Watch it with
 
@@ -236,5 +232,4 @@ for value in (0.6, 0.8, 1.0):
     numbers[f"period at μ = {value:g}, ms"] = time[i, -1]
     numbers[f"drop at μ = {value:g}, mm"] = drop[i, -1]
 numbers |= {"multiplier at μ = 0.3": known, "period doubles, μ": doubling}
-if not QUICK:
-    keep(HERE, "woodpecker", text, numbers, figure)
+write("woodpecker", text, numbers, figure)

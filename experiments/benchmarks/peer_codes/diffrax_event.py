@@ -27,7 +27,7 @@ def build(
     task: Task, kappas: np.ndarray, *, solver: str, tol: float, batch: int = 64
 ) -> tuple[Run, float]:
     """The restarts are a `while_loop` around `diffeqsolve`."""
-    # Numbers that differ between scenes are arguments: another restitution is not compiled again.
+    # Numbers that differ between machines are arguments: another restitution is not compiled again.
     key = (task.drive, task.cycles, kappas.size, solver, batch)
     numbers = jnp.array([task.k, task.Y0, tol])
     lanes = jnp.asarray(kappas)

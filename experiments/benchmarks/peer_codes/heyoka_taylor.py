@@ -8,6 +8,7 @@ callback reaches the state through a memoryview, a tenth faster than through Num
 
 import math
 import time
+from collections.abc import Callable
 from typing import Any
 
 import heyoka as hy  # pyright: ignore[reportMissingImports]
@@ -44,40 +45,19 @@ def build(
     `wrapped` restarts the clock in each cycle: slower, and more accurate over a long run.
     """
     variables, rhs, parameters = equations(task)
-    size, k = len(variables), task.k
+    size, scalar = len(variables), batch == 1
     system = list(zip(variables, rhs, strict=True))
     if jacobian:
         system += _tangent(variables, rhs, parameters)
-    views: dict[str, Any] = {}
-    jump = _saltation(task) if jacobian else None
-
-    def bounce(integrator, direction, lane=0):
-        if threads:
-            integrator.state[1, lane] *= -k
-        elif jump is not None:
-            jump(views["state"], views["pars"], lane, views["time"][lane])
-        elif batch == 1:
-            views["memory"][1] *= -k
-        else:
-            views["memory"][1, lane] *= -k
-        return True
-
-    scalar = batch == 1
-    event = (hy.t_event if scalar else hy.t_event_batch)(
-        variables[0] - task.gap, direction=hy.event_direction.positive, callback=bounce
-    )
     rows = len(system)
-    empty = np.zeros(rows) if scalar else np.zeros((rows, batch))
+    views: dict[str, Any] = {}
+    event = (hy.t_event if scalar else hy.t_event_batch)(
+        variables[0] - task.gap, direction=hy.event_direction.positive,
+        callback=_bounce(task, views, scalar=scalar, jacobian=jacobian, threads=threads),
+    )  # fmt: skip
     pars = np.array([1.0, task.xi, task.tau0, task.eps])[: len(parameters)]
     begin = time.perf_counter()
-    integrator = (hy.taylor_adaptive if scalar else hy.taylor_adaptive_batch)(
-        system,
-        empty,
-        tol=tol,
-        t_events=[event],
-        pars=pars if scalar else np.repeat(pars[:, None], batch, axis=1),
-        fast_math=True,
-    )
+    integrator = _integrator(system, event, pars, tol, batch)
     seconds = time.perf_counter() - begin
     views["state"], views["pars"] = integrator.state, integrator.pars
     views["memory"] = memoryview(integrator.state)
@@ -128,6 +108,40 @@ def build(
         return np.concatenate([entry[0].state[:2].T for entry in found])[: len(kappas)]
 
     return (ensemble if threads else run), seconds
+
+
+def _integrator(system: list, event: Any, pars: np.ndarray, tol: float, batch: int) -> Any:
+    """The compiled integrator of one lane or of a batch."""
+    rows, scalar = len(system), batch == 1
+    return (hy.taylor_adaptive if scalar else hy.taylor_adaptive_batch)(
+        system,
+        np.zeros(rows) if scalar else np.zeros((rows, batch)),
+        tol=tol,
+        t_events=[event],
+        pars=pars if scalar else np.repeat(pars[:, None], batch, axis=1),
+        fast_math=True,
+    )
+
+
+def _bounce(
+    task: Task, views: dict[str, Any], *, scalar: bool, jacobian: bool, threads: int
+) -> Callable[..., bool]:
+    """What is called at an impact; `views` are filled with the integrator's memory later."""
+    k = task.k
+    jump = _saltation(task) if jacobian else None
+
+    def bounce(integrator, direction, lane=0):
+        if threads:
+            integrator.state[1, lane] *= -k
+        elif jump is not None:
+            jump(views["state"], views["pars"], lane, views["time"][lane])
+        elif scalar:
+            views["memory"][1] *= -k
+        else:
+            views["memory"][1, lane] *= -k
+        return True
+
+    return bounce
 
 
 def _tangent(variables: list, rhs: list, parameters: tuple) -> list:

@@ -111,8 +111,49 @@ def dense_rate(th, r2, r3, r4, r5):
     return r2 + (u - th) * r3 + th * (2 * u - th) * r4 + 2 * th * u * (u - th) * r5
 
 
+@nb.njit(**INLINE)
+def hump(y, gap, r2, r3, r4, r5):
+    """The fraction of the step at which the body turns beyond the stop; 0 if it turns before it."""
+    low, high = 0.0, 1.0
+    for _ in range(30):
+        th = 0.5 * (low + high)
+        if dense_rate(th, r2, r3, r4, r5) > 0:
+            low = th
+        else:
+            high = th
+    if dense(low, y, r2, r3, r4, r5) <= gap:
+        return 0.0
+    return low
+
+
+@nb.njit(**INLINE)
+def crossing(top, y, rate, gap, r2, r3, r4, r5):
+    """The fraction of the step, below `top`, at which the body meets the stop.
+
+    Newton's method, kept within an interval that is halved; `rate` is that at the step's begin.
+    """
+    low, high = 0.0, top
+    th = 0.5 * top
+    if rate > 0:
+        th = min(0.999 * top, max(1e-3 * top, (gap - y) / rate))
+    for _ in range(40):
+        over = dense(th, y, r2, r3, r4, r5) - gap
+        slope = dense_rate(th, r2, r3, r4, r5)
+        if over < 0 or slope <= 0:
+            low = th
+        else:
+            high = th
+        new = th - over / slope
+        if not (new > low and new < high):
+            new = 0.5 * (low + high)
+        moved, th = abs(new - th), new
+        if moved < 1e-15:
+            break
+    return th
+
+
 def stepper(field: Any, add: Any, bounce: Any, norm: Any) -> Any:
-    """The compiled integrator of one lane for one kind of scene."""
+    """The compiled integrator of one lane with one kind of drive."""
 
     @nb.njit(**OPTIONS)
     def lane(y, p, k, gap, cycles, tol):
@@ -159,34 +200,9 @@ def stepper(field: Any, add: Any, bounce: Any, norm: Any) -> Any:
                 r5 = add(r5, h * (-1453857185 / 822651844), k6)
                 r5 = add(r5, h * (69997945 / 29380423), k7)
                 if top > 1:
-                    low, high = 0.0, 1.0
-                    for _ in range(30):
-                        th = 0.5 * (low + high)
-                        if dense_rate(th, r2[0], r3[0], r4[0], r5[0]) > 0:
-                            low = th
-                        else:
-                            high = th
-                    top = low
-                    if dense(top, y[0], r2[0], r3[0], r4[0], r5[0]) <= gap:
-                        top = 0.0
+                    top = hump(y[0], gap, r2[0], r3[0], r4[0], r5[0])
             if top > 0:
-                low, high = 0.0, top
-                th = 0.5 * top
-                if k1[0] > 0:
-                    th = min(0.999 * top, max(1e-3 * top, (gap - y[0]) / (h * k1[0])))
-                for _ in range(40):
-                    over = dense(th, y[0], r2[0], r3[0], r4[0], r5[0]) - gap
-                    rate = dense_rate(th, r2[0], r3[0], r4[0], r5[0])
-                    if over < 0 or rate <= 0:
-                        low = th
-                    else:
-                        high = th
-                    new = th - over / rate
-                    if not (new > low and new < high):
-                        new = 0.5 * (low + high)
-                    moved, th = abs(new - th), new
-                    if moved < 1e-15:
-                        break
+                th = crossing(top, y[0], h * k1[0], gap, r2[0], r3[0], r4[0], r5[0])
                 u = 1 - th
                 z = add(add(y, th, r2), th * u, r3)
                 y = bounce(add(add(z, th * th * u, r4), th * th * u * u, r5), gap, k)

@@ -1,4 +1,4 @@
-"""Workers: a process pinned to each core, and one that has all cores, told what to run by pipe.
+"""Workers: a process pinned to each core, and one that has all cores; pipes say what to run.
 
 `python -m peer_codes.pool CORES` is such a process. Pinning it before anything is imported makes
 every library count the cores that it is meant to use.

@@ -1,0 +1,214 @@
+"""The measurement of `peers.py`: codes set up on pinned workers, and their interleaved rounds."""
+
+import hashlib
+import json
+import statistics
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .entries import (
+    CYCLES,
+    KAPPA,
+    LANES,
+    QUICK,
+    ROUNDS,
+    Entry,
+    derivative_entries,
+    entries,
+)
+from .pool import Worker, cores, together
+from .task import PARAMETERS, Task
+
+RESTITUTIONS = (0.5, 0.8)
+KEPT = Path(tempfile.gettempdir()) / f"vi_jax-peers-{'quick' if QUICK else 'full'}.json"
+_BENCHMARKS = Path(__file__).parents[1]
+
+
+def note(text: str) -> None:
+    """A line on how far the work is."""
+    print(f"{time.strftime('%H:%M:%S')} {text}", file=sys.stderr, flush=True)
+
+
+@dataclass
+class Job:
+    """An entry, set up on the workers that it runs on."""
+
+    entry: Entry
+    workers: list[Worker]
+    shares: list[np.ndarray]
+    compiling: float = 0.0
+
+    @property
+    def lanes(self) -> np.ndarray:
+        """Indices of the lanes that it runs."""
+        return np.concatenate(self.shares)
+
+    def all(self, *message: Any) -> tuple[list, float]:
+        """The same message to all of its workers."""
+        return together(self.workers, [message] * len(self.workers))
+
+    def begin_build(self, task: Task) -> None:
+        """Send what is to be set up and compiled, without waiting for it."""
+        for worker, share in zip(self.workers, self.shares, strict=True):
+            name, code, options = self.entry.name, self.entry.code, self.entry.options
+            worker.ask("build", name, code, task, KAPPA[share], options)
+
+    def end_build(self) -> None:
+        """Wait for it; the largest of the workers' compile times is kept."""
+        self.compiling = max(worker.answer() for worker in self.workers)
+        note(f"  built {self.entry.name}")
+
+    def result(self) -> np.ndarray:
+        """What it gives for its lanes, in the order of `lanes`."""
+        return np.concatenate(self.all("result", self.entry.name)[0])
+
+    def timed(self) -> float:
+        """Seconds for all lanes."""
+        return self.all("run", self.entry.name)[1] * LANES / len(self.lanes)
+
+
+class Bench:
+    """The workers, started when they are first needed."""
+
+    def __init__(self):
+        self.cores = cores()
+        self._pinned: list[Worker] = []
+        self._whole: Worker | None = None
+
+    @property
+    def pinned(self) -> list[Worker]:
+        """A worker on each core."""
+        if not self._pinned:
+            self._pinned = [Worker([core]) for core in self.cores]
+        return self._pinned
+
+    @property
+    def whole(self) -> Worker:
+        """A worker on all cores."""
+        if self._whole is None:
+            self._whole = Worker(self.cores, devices=len(self.cores))
+        return self._whole
+
+    def jobs(self, listed: list[Entry], task: Task, *, all_cores: bool) -> list[Job]:
+        """Entries, compiled. For one core each sits on some core, so that they compile together."""
+        jobs = []
+        for i, entry in enumerate(listed):
+            shares = task.dealt(
+                LANES, entry.block, entry.every, len(self.cores) if all_cores else 1
+            )
+            workers = self.pinned if all_cores else [self.pinned[i % len(self.cores)]]
+            if entry.whole:
+                workers, shares = [self.whole], [np.concatenate(shares)]
+            jobs.append(Job(entry, workers, shares))
+            jobs[-1].begin_build(task)
+        for job in jobs:
+            job.end_build()
+        return jobs
+
+    def close(self) -> None:
+        """End all workers."""
+        for worker in [*self._pinned, *([self._whole] if self._whole else [])]:
+            worker.close()
+
+
+def reference(bench: Bench, task: Task, *, jacobian: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    """The full-precision results, and which lanes are regular."""
+    found = []
+    for name, shifted in (("reference", 0.0), ("shifted", 1e-10)):
+        start = Task(task.drive, task.k, task.cycles, Y0=shifted)
+        wanted = jacobian and not shifted
+        options = {"tol": 1e-16, "wrapped": not wanted, "jacobian": wanted}
+        entry = Entry(name, "heyoka_taylor", options)
+        (job,) = bench.jobs([entry], start, all_cores=True)
+        lanes = np.empty((LANES, 2, len(PARAMETERS)) if wanted else (LANES, 2))
+        lanes[job.lanes] = job.result()
+        found.append(lanes)
+    if jacobian:
+        return found[0], reference(bench, task)[1]
+    return found[0], np.abs(found[0] - found[1]).max(axis=1) < 1e-6
+
+
+def measure(bench: Bench, task: Task, listed: list[Entry], truth, *, all_cores: bool) -> list[dict]:
+    """A row for each entry, from interleaved rounds."""
+    exact, regular = truth
+    jobs = bench.jobs(listed, task, all_cores=all_cores)
+    rows: list[dict[str, Any]] = []
+    for job in jobs:
+        found, right = job.result(), exact[job.lanes]
+        if found.ndim < right.ndim:  # the primal among derivatives has no such error
+            error = np.full(len(found), np.nan)
+        elif found.ndim == 3:
+            error = np.abs(found - right).max(axis=(1, 2)) / np.abs(right).max(axis=(1, 2))
+        else:
+            error = np.abs(found - right).max(axis=1)
+        error = error[regular[job.lanes]]
+        rows.append(
+            {
+                "name": job.entry.name,
+                "compiling": job.compiling,
+                "error": float(np.median(error)),
+                "lost": float(np.mean(error > 1e-3)),
+                "lanes": len(job.lanes),
+                "rounds": job.entry.rounds,
+                "times": [],
+            }
+        )
+    for i in range(ROUNDS):
+        for job, row in zip(jobs, rows, strict=True):
+            if i < job.entry.rounds:
+                row["times"].append(job.timed())
+    for row in rows:
+        row["seconds"] = statistics.median(row["times"])
+        note(f"  {row['name']:48s} {row['seconds']:9.3f} s  error {row['error']:.1e}")
+    for worker in {id(worker): worker for job in jobs for worker in job.workers}.values():
+        together([worker], [("drop", "")])
+    return rows
+
+
+def sources() -> str:
+    """Fingerprint of all that decides the figures: what was measured with other code is stale."""
+    files = [*_BENCHMARKS.glob("peers.py"), *_BENCHMARKS.glob("peer_codes/*.py")]
+    files += [
+        file
+        for room in ("flow", "lanes", "machine")
+        for file in (_BENCHMARKS.parents[1] / "vi_jax" / room).iterdir()
+    ]
+    return hashlib.sha256(
+        b"".join(file.read_bytes() for file in sorted(files) if file.is_file())
+    ).hexdigest()
+
+
+def contest() -> dict[str, dict]:
+    """All sections, taken from where an earlier run left off."""
+    stamp = sources()
+    kept: dict[str, Any] = {}
+    if KEPT.exists() and "--fresh" not in sys.argv:
+        kept = json.loads(KEPT.read_text())
+        if kept.get("stamp") != stamp:
+            kept = {}
+    kept["stamp"] = stamp
+    bench = Bench()
+    try:
+        wanted = [(drive, k, False) for drive in ("motor", "ideal") for k in RESTITUTIONS]
+        for drive, k, jacobian in [*wanted, ("motor", 0.5, True)]:
+            task, truth = Task(drive, k, CYCLES), None
+            for all_cores in (False, True):
+                kind = "derivatives" if jacobian else "states"
+                key = f"{kind}, {drive}, {k}, {'all' if all_cores else 'one'}"
+                if key in kept:
+                    continue
+                note(key)
+                truth = truth or reference(bench, task, jacobian=jacobian)
+                listed = derivative_entries() if jacobian else entries(drive, all_cores)
+                rows = measure(bench, task, listed, truth, all_cores=all_cores)
+                kept[key] = {"rows": rows, "regular": int(truth[1].sum())}
+                KEPT.write_text(json.dumps(kept))
+    finally:
+        bench.close()
+    return {key: value for key, value in kept.items() if key != "stamp"}

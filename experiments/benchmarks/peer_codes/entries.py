@@ -1,0 +1,99 @@
+"""Which codes `peers.py` runs, with which options, and how their lanes are dealt."""
+
+import sys
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from .pool import cores
+
+QUICK = "--quick" in sys.argv
+LANES, CYCLES, ROUNDS, SLOW_ROUNDS = (256, 20, 3, 1) if QUICK else (1024, 200, 5, 3)
+KAPPA = np.linspace(0.5, 1.9, LANES)
+OURS = "vi_jax"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A code with its options, and how its lanes are dealt."""
+
+    name: str
+    code: str
+    options: dict[str, Any] = field(default_factory=dict)
+    block: int = 16
+    every: int = 1
+    whole: bool = False
+    """One process on all cores, with the code's own way of using them."""
+
+    @property
+    def rounds(self) -> int:
+        """Fewer for the slow ones."""
+        return ROUNDS if self.every == 1 else SLOW_ROUNDS
+
+
+def ours(name: str, number: float = 0.0, *, whole: bool = False, **options: Any) -> Entry:
+    """An entry of vi_jax."""
+    inside = "" if not number else f"{number:g}"
+    if name == "Taylor" and number > 1:
+        inside += ", 8 steps"
+    elif name == "FixedStep":
+        inside = f"Verner9, {inside}"
+    label = f"{OURS} {name}({inside})" + (", forced devices" if whole else "")
+    return Entry(label, "ours", {"name": name, "number": number, **options}, whole=whole)
+
+
+def heyoka(tol: float, **options: Any) -> Entry:
+    """An entry of heyoka in batch mode."""
+    return Entry(f"heyoka batch 8, {tol:.0e}", "heyoka_taylor", {"tol": tol, **options})
+
+
+def entries(drive: str, all_cores: bool) -> list[Entry]:
+    """All codes for one machine."""
+    sparse = LANES // 8 if not all_cores else LANES // (8 if len(cores()) > 8 else 16)
+    motor = [("FixedStep", n) for n in (5, 6, 8, 10, 12, 16, 20, 24)]
+    motor += [("Taylor", n) for n in (14, 16, 18)] + [("Taylor", 1e-12), ("Taylor", 1e-13)]
+    methods = motor if drive == "motor" else [("ExactFlight", 0), ("FixedStep", 10)]
+    listed = [ours(*method) for method in methods]
+    listed += [heyoka(tol) for tol in (1e-6, 1e-9, 1e-15)]
+    scalar = {"tol": 1e-9, "batch": 1}
+    listed += [Entry("heyoka scalar, 1e-09", "heyoka_taylor", scalar, every=4)]
+    listed += [
+        Entry(f"numba Dormand–Prince, {tol:.0e}", "numba_rk", {"tol": tol}, every=4)
+        for tol in (1e-6, 1e-9)
+    ]
+    listed += [
+        Entry(
+            f"diffrax Event {solver}, {tol:.0e}",
+            "diffrax_event",
+            {"solver": solver, "tol": tol},
+            block=64,
+            every=4,
+        )
+        for solver, tol in (("Tsit5", 1e-6), ("Dopri8", 1e-9))
+    ]
+    listed += [Entry("SciPy DOP853, 1e-09", "scipy_ivp", {"tol": 1e-9}, block=1, every=sparse)]
+    if all_cores:
+        best = ("FixedStep", 10) if drive == "motor" else methods[0]
+        threads = {"tol": 1e-9, "threads": len(cores())}
+        prange = {"tol": 1e-9, "parallel": True}
+        listed += [
+            ours(*best, whole=True),
+            Entry("heyoka ensemble, threads, 1e-09", "heyoka_taylor", threads, whole=True),
+            Entry("numba Dormand–Prince, prange, 1e-09", "numba_rk", prange, whole=True),
+        ]
+    return listed
+
+
+def derivative_entries() -> list[Entry]:
+    """The codes that give derivatives by six parameters, each primal beside its derivatives."""
+    listed = []
+    for method in (("FixedStep", 6), ("FixedStep", 10), ("FixedStep", 16), ("Taylor", 1e-12)):
+        primal = ours(*method)
+        with_six = Entry(primal.name + " six jvp", "ours", {**primal.options, "jacobian": True})
+        listed += [primal, with_six]
+    for tol in (1e-6, 1e-9, 1e-15):
+        options = {"tol": tol, "jacobian": True}
+        named = f"heyoka variational, saltation by hand, {tol:.0e}"
+        listed += [heyoka(tol), Entry(named, "heyoka_taylor", options)]
+    return listed

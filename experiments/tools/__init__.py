@@ -1,0 +1,1 @@
+"""What the studies and benchmarks share: how they are run, their tables, clocks and pictures."""

@@ -1,0 +1,35 @@
+"""What the pictures have in common."""
+
+from collections.abc import Iterable
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+
+def open_frames(panels: Iterable[Axes]) -> None:
+    """Panels without the upper and the right line of their frames."""
+    for ax in panels:
+        ax.spines[["top", "right"]].set_visible(False)
+
+
+def gridded(panels: Iterable[Axes], titles: Iterable[str | None] = ()) -> None:
+    """Panels with a pale grid, and their titles where there are some."""
+    listed = list(panels)
+    for ax in listed:
+        ax.grid(alpha=0.3)
+    for ax, title in zip(listed, titles, strict=False):
+        if title is not None:
+            ax.set_title(title)
+
+
+def legend_below(figure: Any, handles: Iterable[Any], columns: int, **look: Any) -> None:
+    """One legend for all panels, below them."""
+    look = {"frameon": False, "fontsize": 9, **look}
+    figure.legend(handles=list(handles), loc="outside lower center", ncols=columns, **look)
+
+
+def panels(width: float, height: float, *grid: int, **look: Any) -> tuple[Figure, Any]:
+    """A figure of a size in inches, and its panels as `Figure.subplots` gives them."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    return figure, figure.subplots(*grid, **look)

@@ -1,0 +1,42 @@
+"""What the studies share, and that none of their files outgrows its subject."""
+
+import time
+from pathlib import Path
+
+import pytest
+from tools.tables import or_dash, table
+from tools.timing import Clock, repeated, side_by_side
+
+FOLDER = Path(__file__).parents[2] / "experiments"
+
+
+def test_table():
+    text = table(["", "ζ"], [("2π", 0.9), ("", "–")])
+    assert text == "| | ζ |\n|---|---|\n| 2π | 0.9 |\n|  | – |"
+    with pytest.raises(ValueError, match="1 cells under 2 headings"):
+        table(["a", "b"], [("alone",)])
+    assert (or_dash(None, ".2f"), or_dash(0.125, ".2f")) == ("–", "0.12")
+
+
+def test_clocks():
+    calls = []
+
+    def slow():
+        calls.append("slow")
+        time.sleep(0.02)
+
+    def quick():
+        calls.append("quick")
+
+    longer, shorter = side_by_side([slow, quick], rounds=3)
+    assert longer >= 0.02 > shorter and calls == ["slow", "quick"] * 3
+    result, seconds = repeated(lambda: 7, rounds=4)
+    assert (result, len(seconds)) == (7, 4)
+    with Clock() as clock:
+        time.sleep(0.05)
+    assert clock.wall >= 0.04 > clock.cpu
+
+
+def test_no_file_has_more_than_350_lines():
+    lines = {path: path.read_text(encoding="utf-8").count("\n") for path in FOLDER.rglob("*.py")}
+    assert len(lines) > 50 and max(lines.values()) <= 350

@@ -1,0 +1,53 @@
+"""The studies' headline numbers, computed with the library as it is, by cheaper ways.
+
+Each function gives numbers by the names under which the study of that name keeps them, with the
+difference that is allowed.
+"""
+
+from .benchmarks import explorer, peers, scene_cost, speed_accuracy
+from .closed_forms import XI, Expected, closed
+from .machines import dc_motor, known_machines, relief_valve, sommerfeld, woodpecker
+from .orbits import (
+    all_orbits,
+    basins_map,
+    design_percussion,
+    escape_from_2pi,
+    fit_4pi_orbit,
+    soft_stop,
+)
+from .paper import (
+    bifurcation_diagram,
+    boundaries,
+    fig2_frequency_response,
+    motor_frequency_response,
+    regime_maps,
+)
+from .records import identify, posterior
+
+__all__ = [
+    "XI",
+    "Expected",
+    "all_orbits",
+    "basins_map",
+    "bifurcation_diagram",
+    "boundaries",
+    "closed",
+    "dc_motor",
+    "design_percussion",
+    "escape_from_2pi",
+    "explorer",
+    "fig2_frequency_response",
+    "fit_4pi_orbit",
+    "identify",
+    "known_machines",
+    "motor_frequency_response",
+    "peers",
+    "posterior",
+    "regime_maps",
+    "relief_valve",
+    "scene_cost",
+    "soft_stop",
+    "sommerfeld",
+    "speed_accuracy",
+    "woodpecker",
+]

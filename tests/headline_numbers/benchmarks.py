@@ -1,0 +1,69 @@
+"""Of the benchmarks: errors and sizes of programs, which no clock changes."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import vi_jax as vi
+from headlines.jaxprs import primitives
+
+from .closed_forms import XI, Expected
+
+
+def fixed_steps_error(cycles: int) -> float:
+    """Median error of 10 steps of Verner9, of 64 lanes of Table 1's machine, k = 0.8, d = 2."""
+
+    def lane(method, zeta):
+        scene = vi.Scene.ideal(frequency_ratio=zeta, restitution=0.8, gap=2.0, damping_ratio=XI)
+        run = vi.simulate(scene, scene.start(), cycles, method=method, record="sections")
+        return jnp.stack([run.last.Y, run.last.V])
+
+    exact, fixed = (
+        vi.jit(jax.vmap(partial(lane, method)))(jnp.linspace(0.5, 1.9, 64))
+        for method in (vi.ExactFlight(), vi.FixedStep())
+    )
+    return float(np.median(np.abs(exact - fixed).max(axis=1)))
+
+
+# The lanes of the test are fewer than a study's, so that the median is the same within a third.
+
+
+def speed_accuracy() -> Expected:
+    error = fixed_steps_error(20)
+    name = "FixedStep Verner9, 10 steps: median error of the state, 20 cycles, ideal drive"
+    return {name: (error, error / 3)}
+
+
+def peers() -> Expected:
+    error = fixed_steps_error(200)
+    name = "vi_jax FixedStep(Verner9, 10), ideal drive, k = 0.8: median error"
+    return {name: (error, error / 3)}
+
+
+def scene_cost() -> Expected:
+    """Operations in the program of a lane; other versions of JAX write some of it otherwise."""
+
+    def run(method, ratio):
+        scene = vi.Scene(
+            oscillator=vi.Oscillator(0.0448), drive=vi.IdealDrive(ratio),
+            stops=[vi.RigidStop(2.0, 0.8)],
+        )  # fmt: skip
+        found = vi.simulate(scene, scene.start(), 200, method=method, record="sections")
+        return jax.tree.leaves(found)
+
+    numbers = {}
+    for name, method in (("one stop", vi.FixedStep()), ("exact flight", vi.ExactFlight())):
+        size = primitives(jax.make_jaxpr(partial(run, method))(0.9).jaxpr).total()
+        numbers[f"operations: ideal, {name}"] = (float(size), 0.05 * size)
+    return numbers
+
+
+def explorer() -> Expected:
+    """The motion where the sliders begin: the 4π motion in closed form."""
+    scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.01)
+    found = vi.closed_form_orbits(scene, cycles=2)
+    return {
+        "lowest position where the sliders begin": (float(found.y_min[0]), 1e-9),
+        "highest": (2.0, 1e-9),
+    }

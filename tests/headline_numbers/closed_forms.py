@@ -1,0 +1,56 @@
+"""Closed forms of the ideal drive: where motions double, touch the stop, fold and are born."""
+
+from functools import partial
+from typing import Any
+
+import jax
+import numpy as np
+import vi_jax as vi
+from scipy.optimize import brentq
+
+Expected = dict[str, tuple[float, float]]
+"""Numbers by name, each with the difference that is allowed."""
+XI = float(vi.Parameters().scene(drive="ideal").damping_ratio)
+# Roots by brentq beside located special points, both to rounding of a multiplier or a clearance.
+ROOT = 1e-8
+
+
+@partial(jax.jit, static_argnames="cycles")
+def closed(zeta: Any, k: Any, xi: Any, gap: Any, *, cycles: int) -> vi.ClosedFormOrbits:
+    """Motions with one impact in so many cycles."""
+    scene = vi.Scene.ideal(frequency_ratio=zeta, restitution=k, gap=gap, damping_ratio=xi)
+    return vi.closed_form_orbits(scene, cycles=cycles)
+
+
+def doubling(k: float, xi: float, cycles: int, low: float, high: float) -> float:
+    """ζ at which a multiplier is -1."""
+
+    def test(zeta):
+        found = closed(zeta, k, xi, 2.0, cycles=cycles)
+        return float(np.real(np.prod(np.asarray(found.multipliers[0]) + 1)))
+
+    return float(brentq(test, low, high, xtol=1e-13))
+
+
+def touch(k: float, xi: float, low: float, high: float) -> float:
+    """ζ at which the 4π motion touches the stop between its impacts."""
+
+    def clearance(zeta):
+        return float(closed(zeta, k, xi, 2.0, cycles=2).clearance[0])
+
+    return float(brentq(clearance, low, high, xtol=1e-13))
+
+
+def fold(k: float, xi: float, low: float, high: float) -> float:
+    """ζ beyond which there is no 2π motion with an impact."""
+    while high - low > 1e-10:
+        middle = 0.5 * (low + high)
+        there = bool(closed(middle, k, xi, 2.0, cycles=1).exists.any())
+        low, high = (middle, high) if there else (low, middle)
+    return low
+
+
+def births(xi: float) -> tuple[float, float]:
+    """ζ at which the steady vibration without impacts reaches the stop at d = 2."""
+    half = np.sqrt((1 - 2 * xi**2) ** 2 - 0.75)
+    return float(np.sqrt(1 - 2 * xi**2 - half)), float(np.sqrt(1 - 2 * xi**2 + half))

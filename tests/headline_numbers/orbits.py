@@ -1,0 +1,112 @@
+"""Of the studies of single motions: orbits, basins, transients and designs."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import vi_jax as vi
+from scipy.optimize import brentq
+
+from .closed_forms import XI, Expected, closed
+
+
+def all_orbits() -> Expected:
+    zeta, k, gap, xi = 3.2, 0.9, 1.05, 0.002
+    numbers = {"largest multiplier of A": float(np.exp(-2 * np.pi * xi / zeta))}
+    for names, cycles in (("BC", 2), ("DE", 3)):
+        found = closed(zeta, k, xi, gap, cycles=cycles)
+        sizes = np.sort(np.abs(np.asarray(found.multipliers)).max(axis=1))
+        numbers |= {
+            f"largest multiplier of {name}": float(size)
+            for name, size in zip(names, sizes, strict=True)
+        }
+    return {name: (value, 1e-7) for name, value in numbers.items()}
+
+
+def basins_map() -> Expected:
+    first, second = "ζ = 3.2, k = 0.9, d = 1.05, ξ = 0.002", "ζ = 1.1, k = 0.85, d = 2, ξ = 0.005"
+    third = "ζ = 1.4, k = 0.8, d = 2, Table 1's ξ = 0.0448"
+
+    def stable(zeta, k, xi, gap, cycles):
+        return float(
+            np.nanmin(np.abs(closed(zeta, k, xi, gap, cycles=cycles).multipliers).max(axis=1))
+        )
+
+    numbers = {
+        f"{first}: multiplier of the 4π motion, 1 impacts": stable(3.2, 0.9, 0.002, 1.05, 2),
+        f"{first}: multiplier of the 2π motion, 0 impacts": np.exp(-2 * np.pi * 0.002 / 3.2),
+        f"{first}: multiplier of the 6π motion, 1 impacts": stable(3.2, 0.9, 0.002, 1.05, 3),
+        f"{second}: multiplier of the 2π motion, 1 impacts": stable(1.1, 0.85, 0.005, 2.0, 1),
+        f"{third}: multiplier of the 2π motion, 1 impacts": stable(1.4, 0.8, XI, 2.0, 1),
+        f"{third}: multiplier of the 2π motion, 0 impacts": np.exp(-2 * np.pi * XI / 1.4),
+    }
+    # From Lyapunov exponents over 600 cycles, which the first cycles' turning leaves inexact.
+    return {name: (float(value), 2e-3) for name, value in numbers.items()}
+
+
+def design_percussion(kept: dict[str, float]) -> Expected:
+    table = vi.Parameters(restitution=0.5)
+    numbers: Expected = {}
+    for name in ("start", "A", "B", "C"):
+        zeta, gap, c = (kept[f"{name}: {x}"] for x in ("ζ", "Δ, mm", "c, N·s/m"))
+        xi = c * XI / float(table.damping)
+        found = closed(zeta, 0.5, xi, gap / 40.0, cycles=1)
+        speed = float(table.metres_per_second(found.impact_speed[0]))
+        energy = 0.5 * float(table.body_mass) * 0.75 * speed**2
+        power = energy * zeta * float(table.natural_frequency) / (2 * np.pi)
+        modulus = float(np.abs(found.multipliers[0]).max())
+        numbers[f"{name}: power, W"] = (power, 1e-7)
+        numbers[f"{name}: largest modulus"] = (modulus, 1e-6)
+    return numbers
+
+
+def escape_from_2pi() -> Expected:
+    found = closed(0.9, 0.5, 0.0, 2.0, cycles=1)
+    scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0)
+    start = scene.start(Y=float(found.Y[0]) - 1e-7, V=float(found.V[0]))
+    run = vi.simulate(scene, start, 120, method=vi.ExactFlight(), record="sections")
+    apart = np.abs(np.stack([run.sections.Y - found.Y[0], run.sections.V - found.V[0]])).max(axis=0)
+    left = int(np.flatnonzero(apart > 0.05)[0])
+    return {
+        "multiplier of the 2π motion": (float(np.real(found.multipliers[0]).min()), 1e-9),
+        "cycles near the 2π motion, displaced by 1e-7": (left, 0),
+    }
+
+
+def fit_4pi_orbit() -> Expected:
+    numbers = {}
+    for k, xi, name in (
+        (0.5, 0.0, "k = 0.5, undamped"), (0.8, XI, "k = 0.8, Table 1"),
+        (0.95, 0.0, "k = 0.95, undamped"),
+    ):  # fmt: skip
+        scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=k, gap=2.0, damping_ratio=xi)
+        run = vi.simulate(scene, scene.start(), 1000, method=vi.ExactFlight(), record="sections")
+        sections = np.stack([run.sections.Y, run.sections.V], axis=1)
+        late = np.flatnonzero(~(np.abs(sections[2:] - sections[:-2]).max(axis=1) < 1e-6))
+        # A cycle more or less where rounding decides when 1e-6 is passed.
+        numbers[f"{name}, ideal: cycles of the transient"] = (float(late[-1]) + 1, 1)
+    return numbers
+
+
+def soft_stop() -> Expected:
+    """Where the 2π motion doubles its period before a linear stop, and a multiplier well above."""
+    closed_form = closed(0.9, 0.5, 0.0, 2.0, cycles=1)
+    stop = vi.SoftStop(2.0, 1.0, restitution=0.5)
+    doubles = "K at the doubling, spring and dashpot"
+
+    def least(stiffness):
+        scene = vi.Scene(
+            vi.Oscillator(0.0), vi.IdealDrive(0.9), soft_stops=(with_stiffness(stop, stiffness),)
+        )
+        orbit = vi.find_orbit(scene, guess[0], throw=True)
+        guess[0] = orbit.state
+        return float(np.min(np.real(np.asarray(orbit.multipliers))))
+
+    guess = [vi.OscillatorState(closed_form.Y[0], closed_form.V[0])]
+    found = {"multiplier of the 2π motion at K = 1000, spring and dashpot": (least(1000.0), 1e-6)}
+    least(200.0)
+    stiffness = float(brentq(lambda K: least(K) + 1, 60, 90, xtol=1e-9))
+    return {doubles: (stiffness, 1e-6), **found}
+
+
+def with_stiffness(stop: vi.SoftStop, stiffness: float) -> vi.SoftStop:
+    return eqx.tree_at(lambda x: x.stiffness, stop, jnp.asarray(stiffness))
