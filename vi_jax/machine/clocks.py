@@ -1,13 +1,14 @@
 """What counts the cycles of a machine, and what measures time."""
 
 import abc
-from typing import Any, Self
+from typing import Any, TypeVar
 
 from jaxtyping import Array, Float
 
 from .shown import Shown
 
 State = Any
+Machine = TypeVar("Machine", bound="Clocked")
 
 
 class Clocked(Shown):
@@ -40,14 +41,14 @@ class Clocked(Shown):
         """Mean drive speed over cycles of these durations, or `None` where nothing is driven."""
         return None
 
-    def in_clock(self, clock: str) -> Self:
+    def in_clock(self: Machine, clock: str) -> Machine:
         """The same machine with another independent variable, for one that has several."""
         raise ValueError(
             f"Argument `clock` must be left out for a {type(self).__name__}, which has its own "
             f"clock, but got {clock!r}."
         )
 
-    def in_cycle_clock(self) -> Self:
+    def in_cycle_clock(self: Machine) -> Machine:
         """The same machine with what counts its cycles as its independent variable."""
         return self
 

@@ -1,12 +1,13 @@
 """What is observed of a machine, cycle by cycle."""
 
-from typing import Any, Self
+from typing import Any, TypeVar
 
 from jaxtyping import Array, Float
 
 from .shown import Shown
 
 State = Any
+Machine = TypeVar("Machine", bound="Observed")
 
 
 class Observed(Shown):
@@ -17,14 +18,14 @@ class Observed(Shown):
         """What rises through zero where a cycle ends; `None` where `s` or `clock` counts them."""
         return None
 
-    def at_section(self, phase: Any) -> Self:
+    def at_section(self: Machine, phase: Any) -> Machine:
         """The same machine observed elsewhere in its cycle, for one that can be."""
         raise ValueError(
             f"Argument `section` must be left out for a {type(self).__name__}, which has its own "
             f"section, but got {phase!r}."
         )
 
-    def observed_later(self, since_section: Any) -> Self | None:
+    def observed_later(self: Machine, since_section: Any) -> Machine | None:
         """The same machine with its section moved by so much of its clock; `None` if it cannot."""
         return None
 
