@@ -171,11 +171,11 @@ def work(*arguments, **options):
 
 if __name__ == "__main__":
     for module, name in (
-        ("scan.scan", "run_here"),
-        ("scan.scan", "run_on_cluster"),
-        ("scan.sweep", "_sweep"),
+        ("scan._scan", "run_here"),
+        ("scan._scan", "run_on_cluster"),
+        ("scan._sweep", "_sweep"),
         ("orbit.find", "_find"),
-        ("flow.simulate", "_simulate"),
+        ("flow._simulate", "_simulate"),
     ):
         setattr(importlib.import_module(f"vi_jax.{module}"), name, work)
     wrong = {}

@@ -12,6 +12,7 @@ FILES = sorted(HOUSE.rglob("*.py"))
 
 # Each may import from those before it.
 ORDER = "lanes machine flow machines orbit scan plot paper explore cli".split()
+LATE = [["explore", "serve"], ["paper", "report"]]
 TOOLS = {
     "_checks",
     "_files",
@@ -56,8 +57,9 @@ def test_rooms_import_one_way_and_nothing_private():
                 continue
             seen += 1
             assert other in ORDER and ORDER.index(other) < ORDER.index(room), (path, other)
-            private = [word for word in (*words, name) if word.startswith("_")]
-            assert not private, (path, private)
+            # By the one way in, its `__init__`; what takes long to load is loaded where it is used.
+            assert len(words) <= 1 or words in LATE, (path, words)
+            assert not name.startswith("_"), (path, name)
     assert seen > 100
 
 

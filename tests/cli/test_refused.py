@@ -203,10 +203,10 @@ def test_what_cannot_be_done_is_said_before_any_work(here, capsys, monkeypatch, 
         raise AssertionError("work began")
 
     for module, name in (
-        ("scan.scan", "run_here"),
-        ("scan.sweep", "_sweep"),
+        ("scan._scan", "run_here"),
+        ("scan._sweep", "_sweep"),
         ("orbit.find", "_find"),
-        ("flow.simulate", "_simulate"),
+        ("flow._simulate", "_simulate"),
     ):
         if verb == "scan" and name == "_simulate":
             continue  # traced for the shapes of what will be stored

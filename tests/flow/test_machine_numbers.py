@@ -78,7 +78,7 @@ def traces(monkeypatch):
 
         monkeypatch.setattr(room, name, wrapper)
 
-    counted("simulate", "vi_jax.flow.simulate", "collect")
+    counted("simulate", "vi_jax.flow._simulate", "collect")
     counted("find_orbit", "vi_jax.orbit.find", "_judged")
     return counts
 

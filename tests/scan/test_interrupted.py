@@ -31,7 +31,7 @@ def test_verbs_end_soon(verb):
 
 
 def test_an_interrupted_sweep_gives_the_values_that_were_done(monkeypatch):
-    room = importlib.import_module("vi_jax.scan.sweep")
+    room = importlib.import_module("vi_jax.scan._sweep")
     whole = vi.sweep(MOTOR, "drive.control", VALUES, settle=4, cycles=4)
     assert whole.values.shape == (40,) and bool(whole.successful.all())
     calls, swept = [], room._sweep
@@ -78,7 +78,7 @@ def test_an_interrupted_branch_is_a_branch(monkeypatch):
 
 @pytest.mark.slow
 def test_interrupted_basins_keep_the_starts_that_were_followed(monkeypatch):
-    room = importlib.import_module("vi_jax.scan.basins")
+    room = importlib.import_module("vi_jax.scan._basins")
 
     def interrupted(*arguments):
         raise KeyboardInterrupt

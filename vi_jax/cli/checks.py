@@ -6,14 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from .._checks import unwritable
-from ..machine import AbstractMachine
-from ..machine.numbers import leaf, leaf_names
-from ..orbit.branch import column_names
-from ..orbit.curve import check_walk
-from ..plot.save import ENDINGS
-from ..scan.corners import check_corners
-from ..scan.grid import Blocks, axes_of
-from ..scan.program import make_program
+from ..machine import AbstractMachine, leaf, leaf_names
+from ..orbit import check_walk, column_names
+from ..plot import ENDINGS
+from ..scan import Blocks, axes_of, check_corners, make_program
 from .config import OrbitTable
 from .toml import ConfigError, given, in_terms_of, unknown
 

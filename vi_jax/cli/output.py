@@ -11,13 +11,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from .._files import write_whole
-from ..flow import RESULTS
-from ..flow.results import REASONS, number_of
-from ..machine.numbers import components
+from ..flow import REASONS, RESULTS, number_of
+from ..machine import components
 from ..plot import save_picture
-from ..scan import Sweep
-from ..scan.regime import REGIMES, periods_of
-from ..scan.store import NOT_COMPUTED
+from ..scan import NOT_COMPUTED, REGIMES, Sweep, periods_of
 
 
 def failures(codes: np.ndarray, *, what: str = "motions") -> tuple[list[str], bool]:

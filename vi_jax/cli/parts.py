@@ -15,13 +15,9 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
-from ..flow import RESULTS, Run, Samples
-from ..flow.arguments import planned
-from ..flow.options import RunOptions
-from ..flow.simulate import simulate
-from ..machine import AbstractMachine
-from ..machine.numbers import with_leaf
-from ..scan.sweep import Sweep, sweep, taken_along
+from ..flow import RESULTS, Run, RunOptions, Samples, planned, simulate
+from ..machine import AbstractMachine, with_leaf
+from ..scan import Sweep, sweep, taken_along
 
 # Intervals (samples, or cycles as so many) of one part: a fraction of a second. Each other length
 # is another program, so that it is chosen before the time is known.

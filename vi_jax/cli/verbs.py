@@ -15,12 +15,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from .._files import write_whole
-from ..flow import RESULTS, Run
-from ..flow.named import average_names
-from ..flow.results import number_of
+from ..flow import RESULTS, Run, average_names, number_of
 from ..machine import AbstractMachine
 from ..orbit import Orbit, continue_orbit, find_orbit
 from ..plot import (
+    BLUE,
+    RED,
     plot_basins,
     plot_branch,
     plot_history,
@@ -28,12 +28,9 @@ from ..plot import (
     plot_regimes,
     plot_sweep,
 )
-from ..plot.colors import BLUE, RED
-from ..scan import Sweep
+from ..scan import COLUMNS, LanesFailed, Sweep
 from ..scan import basins as find_basins
 from ..scan import scan as run_scan
-from ..scan.scan import LanesFailed
-from ..scan.sweep import COLUMNS
 from .checks import (
     check_continuation,
     check_map,

@@ -11,17 +11,11 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .._programs import compiled
-from ..flow import RESULTS, Run, simulate
-from ..flow.methods import chosen
+from ..flow import RESULTS, Run, chosen, simulate
 from ..machine import AbstractMachine
-from ..orbit import STABILITY
-from ..orbit.cycle_map import cycle_map
-from ..orbit.floquet import stability_of
-from ..orbit.results import complex_in_words, impacts_in_words
-from ..plot.path import MotionPath, motion_path
-from ..scan import REGIMES, lyapunov
-from ..scan.measures import Regime
-from ..scan.sweep import taken_along
+from ..orbit import STABILITY, complex_in_words, cycle_map, impacts_in_words, stability_of
+from ..plot import MotionPath, motion_path
+from ..scan import REGIMES, Regime, lyapunov, taken_along
 
 WINDOW = 8
 """Drive cycles drawn as a motion."""

@@ -13,9 +13,8 @@ from matplotlib.lines import Line2D
 from matplotlib.text import Text
 from PIL import Image
 
-from ..machine.states import UNITS
-from ..plot.branch import axis_name
-from ..plot.colors import BLUE, GREEN, RED
+from ..machine import UNITS
+from ..plot import BLUE, GREEN, RED, axis_name
 from .diagram import SHOWN, Diagram
 from .motion import WINDOW, Motion
 

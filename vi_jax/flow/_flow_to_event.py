@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from .._types import Scalar
-from ..machine.event import guard_of, section_number
+from ..machine import guard_of, section_number
 from ._lane import Plan
 from .beside import rate_beside
 from .events import rates

@@ -9,8 +9,8 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
 from .._types import Scalar
-from ..machine import AbstractMachine
-from ..machine.event import (
+from ..machine import (
+    AbstractMachine,
     begin_modes,
     events_of,
     is_autonomous,

@@ -15,8 +15,7 @@ from jax.core import Tracer
 
 from .._numbers import warn
 from .._types import Scalar
-from ..machine import AbstractMachine
-from ..machine.event import begin_modes, is_autonomous
+from ..machine import AbstractMachine, begin_modes, is_autonomous
 from ._by_numpy import by_numpy
 
 _NO_NUMBERS = (

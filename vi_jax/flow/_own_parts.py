@@ -11,8 +11,15 @@ import numpy as np
 
 from .._numbers import concrete
 from .._types import Scalar
-from ..machine import AbstractEvent, AbstractMachine, AbstractSwitch, Reset, RigidStop
-from ..machine.event import event_of, events_of
+from ..machine import (
+    AbstractEvent,
+    AbstractMachine,
+    AbstractSwitch,
+    Reset,
+    RigidStop,
+    event_of,
+    events_of,
+)
 from ._own import in_short, in_words_of
 
 _KINDS = {

@@ -12,8 +12,7 @@ from jaxtyping import Array, Int
 from .. import lanes
 from .._checks import count, fits_records, instance_of, require_real
 from .._numbers import concrete, narrow, require_session, strongly_typed, warn, warn_of_narrow
-from ..machine import AbstractMachine, Scene
-from ..machine.event import begin_modes, is_autonomous
+from ..machine import AbstractMachine, Scene, begin_modes, is_autonomous
 from ._lane import Plan
 from ._own import check_period as check_period
 from ._own_parts import check_parts

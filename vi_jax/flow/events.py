@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from .._types import Flag, Scalar
-from ..machine.trig import horner
+from ..machine import horner
 
 
 class Rates(NamedTuple):

@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from .._checks import one_of
-from ..machine.numbers import by_name
-from ..machine.units import with_units
+from ..machine import by_name, with_units
 
 EVENTS = ("impact", "rest", "release", "mode", "reset")
 """What may happen to a motion, as `EventLog` lists it: an impact on a stop; a body that comes to

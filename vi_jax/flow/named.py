@@ -9,9 +9,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array
 
-from ..machine import AbstractMachine
-from ..machine.event import begin_modes
-from ..machine.numbers import components, leaf_names
+from ..machine import AbstractMachine, begin_modes, components, leaf_names
 from ._own import in_words_of
 
 # What results have by these names already: columns of runs, orbits, branches and scans, and axes.

@@ -9,9 +9,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float, Int
 
-from ..machine.numbers import state_in_words
-from ..machine.shown import Shown, Summarized
-from ..machine.units import PLAIN, Stated, in_unit, name_in
+from ..machine import PLAIN, Shown, Stated, Summarized, in_unit, name_in, state_in_words
 from ._listed import listed
 from .enumeration import NamedEnumeration
 from .labelled import EVENTS as EVENTS

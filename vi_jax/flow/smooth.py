@@ -9,10 +9,7 @@ import jax.tree_util as jtu
 from jax.lax import stop_gradient
 
 from .._types import Scalar
-from ..machine import AbstractMachine, Coordinate
-from ..machine.contacts import held_flow
-from ..machine.event import rubs
-from ..machine.switch import field_in
+from ..machine import AbstractMachine, Coordinate, field_in, held_flow, rubs
 
 
 class SmoothMachine(eqx.Module):

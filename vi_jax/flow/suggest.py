@@ -15,10 +15,10 @@ from jax.core import Tracer
 from .._checks import count, one_of, require
 from .._renamed import renamed
 from ..machine import AbstractMachine
+from ._simulate import simulate
 from .arguments import check_start, machine_of
 from .fusion import jit
 from .methods import AbstractMethod, Adaptive, ExactFlight, FixedStep, Taylor, Verner9, preset
-from .simulate import simulate
 
 QUANTITIES = ("state", "extremes", "impacts", "derivative")
 

@@ -8,8 +8,7 @@ import jax.numpy as jnp
 from .._checks import NOT_NEGATIVE, SHARE
 from .._numbers import number
 from .._types import Scalar
-from ..machine import RigidStop
-from ..machine.shown import Shown
+from ..machine import RigidStop, Shown
 from ._base import PhaseMachine, number_field
 
 

@@ -10,8 +10,7 @@ import jax.numpy as jnp
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Range
 from .._numbers import number
 from .._types import Scalar
-from ..machine import Coordinate, DryFriction, RigidStop
-from ..machine.shown import Shown
+from ..machine import Coordinate, DryFriction, RigidStop, Shown
 from ._base import ForcedMachine, number_field
 
 

@@ -8,8 +8,7 @@ import jax.numpy as jnp
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE
 from .._numbers import number
 from .._types import Scalar
-from ..machine import Coordinate, RigidStop
-from ..machine.shown import Shown
+from ..machine import Coordinate, RigidStop, Shown
 from ._base import PhaseMachine, number_field, stops_at
 
 

@@ -10,8 +10,7 @@ from jaxtyping import Array, Bool
 from .._checks import NOT_NEGATIVE, POSITIVE, SHARE
 from .._numbers import concrete, number
 from .._types import Scalar
-from ..machine import RigidStop
-from ..machine.shown import Shown
+from ..machine import RigidStop, Shown
 from ._base import AutonomousMachine, number_field
 
 

@@ -13,8 +13,7 @@ from jaxtyping import Array, Float
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Range, require
 from .._numbers import number
 from .._types import Scalar
-from ..machine import RigidStop, ShaftMachine
-from ..machine.shown import Shown
+from ..machine import RigidStop, ShaftMachine, Shown
 from ._base import PhaseMachine, number_field, stops_at
 
 

@@ -11,8 +11,7 @@ from jaxtyping import Array, Bool
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE
 from .._numbers import concrete, number
 from .._types import Scalar
-from ..machine import ContactFriction, Coordinate, RigidStop
-from ..machine.shown import Shown
+from ..machine import ContactFriction, Coordinate, RigidStop, Shown
 from ._base import AutonomousMachine, number_field
 from ._levers import by_levers, dot, response
 from ._woodpecker_drawn import draw_woodpecker

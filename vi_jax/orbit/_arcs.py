@@ -16,12 +16,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._types import Flag, Scalar
 from ..flow import Run, simulate
-from ..machine import AbstractMachine
-from ..machine.event import is_autonomous
+from ..machine import AbstractMachine, is_autonomous
+from ._cycle_map import CycleMap
 from ._forward_jacobian import forward_jacobian
 from ._neutral import neutral
 from ._root import shooting_matrix
-from .cycle_map import CycleMap
 
 # Places in a cycle at which an orbit can be searched.
 _PLACES = 8

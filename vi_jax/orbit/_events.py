@@ -6,8 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._types import Scalar
-from ..machine import AbstractEvent, AbstractMachine
-from ..machine.event import events_of, guard_of, section_number
+from ..machine import AbstractEvent, AbstractMachine, events_of, guard_of, section_number
 
 
 class Event(NamedTuple):

@@ -12,8 +12,7 @@ import numpy as np
 
 from .._programs import compiled
 from .._types import Scalar
-from ..flow import AbstractMethod, FixedStep
-from ..flow.methods import MethodLike, chosen
+from ..flow import AbstractMethod, FixedStep, MethodLike, chosen
 from ..machine import AbstractMachine
 
 

@@ -11,9 +11,7 @@ from jaxtyping import Array, Float
 
 from .. import lanes
 from .._types import Scalar, Vector
-from ..flow import AbstractMethod
-from ..flow.beside import Beside, elapsed
-from ..flow.smooth import SmoothMachine, in_modes
+from ..flow import AbstractMethod, Beside, SmoothMachine, elapsed, in_modes
 from ..machine import AbstractMachine
 
 

@@ -16,8 +16,7 @@ from jaxtyping import Array
 
 from .._programs import compiled
 from .._types import Scalar, Vector
-from ..machine import AbstractMachine
-from ..machine.base import renews
+from ..machine import AbstractMachine, renews
 from ._events import section_of
 from ._shooting import Shooting
 from ._solve import observe

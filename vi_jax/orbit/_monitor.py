@@ -6,7 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ..machine.numbers import with_leaf
+from ..machine import with_leaf
 from ._events import Event
 from ._hopf import hopf_between, size_of
 from ._origin import halves, origin

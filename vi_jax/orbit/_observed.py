@@ -6,8 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
 from .._types import Scalar
-from ..machine import AbstractMachine
-from ..machine.event import events_of, guard_of, section_number
+from ..machine import AbstractMachine, events_of, guard_of, section_number
 from ._events import Event
 from ._turns import Nearest
 

@@ -18,8 +18,8 @@ from jaxtyping import Array, Float
 
 from .._types import Vector
 from ..flow import simulate
+from ._cycle_map import CycleMap
 from ._neutral import least
-from .cycle_map import CycleMap
 from .root_finders import AbstractRootFinder, Found, find_root
 
 

@@ -20,12 +20,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from .._types import Scalar, Vector
-from ..flow import AbstractMethod
-from ..flow.beside import means
-from ..flow.named import average_names
-from ..machine import AbstractMachine
-from ..machine.event import after_event, is_autonomous, jump_of, mode_number
-from ..machine.numbers import with_leaf
+from ..flow import AbstractMethod, average_names, means
+from ..machine import AbstractMachine, after_event, is_autonomous, jump_of, mode_number, with_leaf
 from ._events import Event, guard_at
 from ._flight import Flight
 from ._observed import Observed, apart

@@ -13,15 +13,18 @@ from jaxtyping import Array
 
 from .._programs import compiled
 from .._types import Vector
-from ..flow.arguments import planned
-from ..flow.loop import run_lane
-from ..flow.methods import MethodLike
-from ..flow.options import RunOptions
-from ..flow.simulate import collect
-from ..machine import AbstractMachine
-from ..machine.base import renews
-from ..machine.event import after_event, begin_modes, events_of, is_autonomous
-from ..machine.numbers import check_again, leaf, with_leaf
+from ..flow import MethodLike, RunOptions, collect, planned, run_lane
+from ..machine import (
+    AbstractMachine,
+    after_event,
+    begin_modes,
+    check_again,
+    events_of,
+    is_autonomous,
+    leaf,
+    renews,
+    with_leaf,
+)
 from ._events import Event, section_of
 from ._fixed_step_method import fixed_step_method, steps_of
 from ._flight import Flight

@@ -8,10 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._lazy import lazy
-from ..flow.named import average_names, quantities_on, quantity_names
-from ..machine import AbstractMachine
-from ..machine.numbers import components
-from ..machine.units import with_units
+from ..flow import average_names, quantities_on, quantity_names
+from ..machine import AbstractMachine, components, with_units
 from ._shooting import Shooting
 from ._solution import sections_of
 from .curve import Step

@@ -14,10 +14,8 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
 from .._types import Flag, Scalar, Vector
-from ..flow.beside import Beside
-from ..flow.events import Rates, guard_rates
-from ..flow.smooth import SmoothMachine
-from ..machine.event import events_of, guard_of, happens_at, section_number
+from ..flow import Beside, Rates, SmoothMachine, guard_rates
+from ..machine import events_of, guard_of, happens_at, section_number
 from ._flight import Flight
 
 # Newton's method has met a turn if it ends this close to it (as a share of the step).

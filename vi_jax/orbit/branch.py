@@ -11,10 +11,8 @@ import numpy as np
 from .._checks import interval, one_of
 from .._interrupted import Interrupted
 from .._lazy import lazy
-from ..flow.labelled import tidy
-from ..flow.methods import MethodLike
-from ..machine.numbers import check_leaf, leaf
-from ..machine.units import in_unit, with_units
+from ..flow import MethodLike, tidy
+from ..machine import check_leaf, in_unit, leaf, with_units
 from ._monitor import BranchMonitor
 from ._observed import Observed
 from ._rest import rests

@@ -26,9 +26,8 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from .._checks import count
 from .._programs import compiled
 from .._types import Scalar
-from ..flow.methods.exact import lack_of_closed_form
-from ..machine import IdealDrive, Scene
-from ..machine.shown import Shown
+from ..flow import lack_of_closed_form
+from ..machine import IdealDrive, Scene, Shown
 from .floquet import eigenvalues
 
 # Grid points per drive cycle on which turning points are bracketed.

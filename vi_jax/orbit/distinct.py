@@ -5,7 +5,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .._checks import given_number
-from ..machine.numbers import state_in_words
+from ..machine import state_in_words
 from .results import InWords, Orbit, impacts_in_words, span_in_words, trimmed
 
 

@@ -16,13 +16,11 @@ from .._checks import count, flag
 from .._numbers import concrete
 from .._programs import compiled
 from .._renamed import renamed
-from ..flow.arguments import check_leaves, refuse_arrays
-from ..flow.beside import means
-from ..flow.methods import MethodLike
+from ..flow import MethodLike, check_leaves, means, refuse_arrays
 from ..machine import AbstractMachine
 from ._arcs import by_the_first_state, error_of, in_order, moved_from_impacts, observe_arc
+from ._cycle_map import CycleMap, adopted, cycle_map
 from ._root import root_of
-from .cycle_map import CycleMap, adopted, cycle_map
 from .floquet import multipliers_of
 from .results import ORBIT_RESULTS, Orbit, trimmed
 from .root_finders import AbstractRootFinder, Newton

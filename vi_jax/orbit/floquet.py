@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
-from ..flow.enumeration import NamedEnumeration
+from ..flow import NamedEnumeration
 
 
 class STABILITY(NamedEnumeration):

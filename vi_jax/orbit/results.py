@@ -13,15 +13,29 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from .._renamed import refuse_attribute
-from ..flow import AbstractMethod, Run, simulate
-from ..flow.enumeration import NamedEnumeration
-from ..flow.labelled import batch_names, in_names, present, states, tidy
-from ..flow.named import quantities_on
-from ..machine import AbstractMachine
-from ..machine.event import is_autonomous
-from ..machine.numbers import plain, state_in_words
-from ..machine.shown import Summarized, summary_table
-from ..machine.units import in_unit, name_in, with_units
+from ..flow import (
+    AbstractMethod,
+    NamedEnumeration,
+    Run,
+    batch_names,
+    in_names,
+    present,
+    quantities_on,
+    simulate,
+    states,
+    tidy,
+)
+from ..machine import (
+    AbstractMachine,
+    Summarized,
+    in_unit,
+    is_autonomous,
+    name_in,
+    plain,
+    state_in_words,
+    summary_table,
+    with_units,
+)
 from .floquet import STABILITY, STABILITY_NAMES, stability_of
 
 

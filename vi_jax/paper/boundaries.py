@@ -13,7 +13,7 @@ from scipy.interpolate import CubicSpline
 
 from ..machine import Parameters, Scene
 from ..orbit import Boundary, Branch, SpecialPoint, boundary, continue_orbit, find_orbit
-from ..plot.colors import DASHES, color_of, paler
+from ..plot import DASHES, color_of, paler
 from .motions import FREQUENCY_RATIO, GAP, RESTITUTION, orbits, table_damping_ratio
 from .response import RANGE, RATIO
 

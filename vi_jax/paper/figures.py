@@ -8,10 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ..flow import Run
-from ..plot import motion_path, plot_history, save_picture
-from ..plot.colors import STOP, color_of
-from ..plot.motion import angle_axis
-from ..plot.stamp import stamp
+from ..plot import STOP, angle_axis, color_of, motion_path, plot_history, save_picture, stamp
 from .motions import Case
 
 _DPI = 110

@@ -12,10 +12,8 @@ from matplotlib.figure import Figure
 
 from ..flow import Run, simulate
 from ..machine import Parameters, Scene
-from ..orbit import Orbit, find_orbit
-from ..orbit.results import trimmed
-from ..plot.colors import STOP, color_of
-from ..plot.motion import angle_axis
+from ..orbit import Orbit, find_orbit, trimmed
+from ..plot import STOP, angle_axis, color_of
 from .figures import common_legend
 from .motions import CYCLES, FREQUENCY_RATIO, RESTITUTION, SAMPLES, figure_scene
 from .orbits import TableRow, orbits

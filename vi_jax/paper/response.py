@@ -10,8 +10,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from ..flow import jit
-from ..machine import RigidStop, Scene
-from ..machine.numbers import with_leaf
+from ..machine import RigidStop, Scene, with_leaf
 from ..orbit import Branch, ClosedFormOrbits, closed_form_orbits, continue_orbit, find_orbit
 from ..scan import REGIMES, Sweep, lyapunov, sweep
 from .motions import GAP, table_damping_ratio

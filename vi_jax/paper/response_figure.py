@@ -9,8 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from ..plot import plot_branch
-from ..plot.colors import MORE_IMPACTS, STOP, color_of, mark_of, paler
+from ..plot import MORE_IMPACTS, STOP, color_of, mark_of, paler, plot_branch
 from ..scan import REGIMES
 from .discrepancy import between, rows
 from .motions import GAP

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ..machine import Parameters
-from ..plot.pen import Pen
+from ..plot import Pen
 
 
 def draw_sketch() -> Figure:

@@ -1,17 +1,30 @@
 """Pictures of motions: every function takes an `ax`, or makes one, and returns it; animations."""
 
-from .animate import MotionAnimation as MotionAnimation
-from .animate import animate as animate
+from ._animate import MotionAnimation as MotionAnimation
+from ._animate import animate as animate
+from .branch import axis_name as axis_name
 from .branch import plot_boundary as plot_boundary
 from .branch import plot_branch as plot_branch
 from .branch import plot_sweep as plot_sweep
+from .colors import BLUE as BLUE
+from .colors import DASHES as DASHES
+from .colors import GREEN as GREEN
+from .colors import MORE_IMPACTS as MORE_IMPACTS
+from .colors import RED as RED
+from .colors import STOP as STOP
+from .colors import color_of as color_of
+from .colors import mark_of as mark_of
+from .colors import paler as paler
+from .motion import angle_axis as angle_axis
 from .motion import plot_history as plot_history
 from .motion import plot_phase_portrait as plot_phase_portrait
 from .orbit import plot_multipliers as plot_multipliers
 from .path import MotionPath as MotionPath
 from .path import motion_path as motion_path
 from .pen import Pen as Pen
+from .save import ENDINGS as ENDINGS
 from .save import save_picture as save_picture
 from .scan import plot_basins as plot_basins
 from .scan import plot_regimes as plot_regimes
 from .schematic import plot_sketch as plot_sketch
+from .stamp import stamp as stamp

@@ -8,9 +8,8 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from .._checks import instance_of, one_of
-from ..machine.units import in_brackets, name_in, quantity_of, unit_of
-from ..orbit import Boundary, Branch
-from ..orbit.results import impacts_in_words
+from ..machine import in_brackets, name_in, quantity_of, unit_of
+from ..orbit import Boundary, Branch, impacts_in_words
 from ..scan import Sweep
 from .colors import DASHES, MARKS, color_of, mark_style, once
 from .motion import new_axes

@@ -14,13 +14,9 @@ from matplotlib.patches import Patch
 
 from .._checks import flag
 from .._renamed import renamed
-from ..machine import AbstractMachine
-from ..machine.numbers import by_name
-from ..machine.units import in_brackets, unit_of
-from ..orbit.results import impacts_in_words
-from ..scan import REGIMES, Basins
-from ..scan.regime import periods_of
-from ..scan.store import NOT_COMPUTED
+from ..machine import AbstractMachine, by_name, in_brackets, unit_of
+from ..orbit import impacts_in_words
+from ..scan import NOT_COMPUTED, REGIMES, Basins, periods_of
 from . import colors as look
 from .branch import axis_name
 from .colors import IRREGULAR, PERIODS, color_of, shades

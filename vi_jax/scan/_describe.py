@@ -13,10 +13,8 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .._version import installed_version
-from ..flow.results import REASON_NAMES
-from ..machine import AbstractMachine
-from ..machine.numbers import leaf, leaf_names
-from ..machine.units import attributes, unit_of
+from ..flow import REASON_NAMES
+from ..machine import AbstractMachine, attributes, leaf, leaf_names, unit_of
 from ._identity import Unverifiable, identity
 from .grid import Blocks
 from .measures import Regime

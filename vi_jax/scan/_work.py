@@ -23,7 +23,7 @@ from jaxtyping import Array
 from .. import lanes
 from .._checks import count
 from .._programs import PLAIN, CompiledFunction
-from ..flow.fusion import compiling
+from ..flow import compiling
 from .grid import Blocks
 from .program import ScanProgram
 

@@ -6,8 +6,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ..flow.arguments import check_period, check_reals, refuse_arrays
-from ..machine.numbers import check_again, with_leaf
+from ..flow import check_period, check_reals, refuse_arrays
+from ..machine import check_again, with_leaf
 from .grid import Blocks
 from .program import START, ScanProgram, check_leaf_name
 

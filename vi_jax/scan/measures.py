@@ -12,9 +12,8 @@ from jaxtyping import Array, Bool
 
 from .._checks import count, require
 from ..flow import AbstractMethod, Run
-from ..machine import AbstractMachine
-from ..machine.numbers import by_name
-from .lyapunov import lyapunov
+from ..machine import AbstractMachine, by_name
+from ._lyapunov import lyapunov
 from .regime import CODES, REGIMES, flags, impacts_of, least_period
 
 Numbers = dict[str, Array]

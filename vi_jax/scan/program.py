@@ -15,15 +15,19 @@ from jaxtyping import Array, Float
 
 from .._checks import count, tuple_of
 from .._numbers import strongly_typed
-from ..flow import AbstractMethod
-from ..flow.arguments import machine_of, refuse_arrays
-from ..flow.methods import MethodLike, chosen
-from ..flow.named import average_names, has_averages
-from ..flow.options import RunOptions
-from ..flow.results import number_of
-from ..flow.simulate import simulate_pool
-from ..machine import AbstractMachine
-from ..machine.numbers import check_name, leaf, leaf_names, with_leaf
+from ..flow import (
+    AbstractMethod,
+    MethodLike,
+    RunOptions,
+    average_names,
+    chosen,
+    has_averages,
+    machine_of,
+    number_of,
+    refuse_arrays,
+    simulate_pool,
+)
+from ..machine import AbstractMachine, check_name, leaf, leaf_names, with_leaf
 from ._asked import measures_of
 from .grid import Blocks
 from .measures import AbstractMeasure, Numbers

@@ -5,8 +5,7 @@ from typing import Any
 import jax.numpy as jnp
 
 from ..._types import Flag
-from ...machine import AbstractMachine
-from ...machine.event import rubs
+from ...machine import AbstractMachine, rubs
 from .. import results
 from .._arrival import Arrival, ended
 from .._lane import Plan, select, to_event

@@ -15,9 +15,7 @@ import jax.tree_util as jtu
 from jax.lax import stop_gradient
 
 from ..._types import Flag, Scalar
-from ...machine import Coordinate
-from ...machine.contacts import forces, push_of, rubbed, shares
-from ...machine.event import rubbing_on, rubs
+from ...machine import Coordinate, forces, push_of, rubbed, rubbing_on, rubs, shares
 from .. import results
 from .._arrival import Arrival, ended
 from .._lane import Plan, select, to_event

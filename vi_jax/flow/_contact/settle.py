@@ -14,8 +14,7 @@ from jax.lax import stop_gradient
 
 from ..._types import Flag, Scalar
 from ...lanes import pin, pin_flag
-from ...machine.contacts import added, forces, held_by, push_of, shares
-from ...machine.event import rubs, struck_modes
+from ...machine import added, forces, held_by, push_of, rubs, shares, struck_modes
 from .._arrival import Arrival
 from .._flow_to_event import FlowToEvent
 from .._lane import RESTS, Lane, Plan, select

@@ -11,7 +11,7 @@ from jax.lax import stop_gradient
 
 from ..._types import Flag, Scalar
 from ...lanes import pin
-from ...machine.event import events_of, section_number
+from ...machine import events_of, section_number
 from .._lane import FREE, Lane, Plan, select, to_event, to_release, to_turn_of
 from ..events import quintic, to_turn
 from ..methods import Foreseen

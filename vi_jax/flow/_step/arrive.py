@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 
 from ..._types import Flag, Scalar
-from ...machine.event import section_number, struck_modes
+from ...machine import section_number, struck_modes
 from .._arrival import Arrival, Onward, Tally
 from .._contact.impact import is_compound, strike
 from .._contact.rest import Release

@@ -6,8 +6,7 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 
 from ..._types import Flag, Scalar
-from ...machine import AbstractMachine
-from ...machine.event import events_of, guard_of
+from ...machine import AbstractMachine, events_of, guard_of
 from .. import results
 from .._lane import FREE, Lane, Plan, Record, to_event, total
 from ..events import guard_rates

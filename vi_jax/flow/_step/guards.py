@@ -8,8 +8,7 @@ from jax.lax import stop_gradient
 
 from ..._types import Flag, Scalar
 from ...lanes import pin_flag
-from ...machine import AbstractEvent, AbstractMachine
-from ...machine.event import events_of, guard_of, section_number
+from ...machine import AbstractEvent, AbstractMachine, events_of, guard_of, section_number
 from .._lane import Lane, Plan, to_event
 from ..events import Rates, guard_rates, landing
 from ..smooth import exact

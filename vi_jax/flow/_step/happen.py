@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 
 from ..._types import Flag, Scalar
-from ...machine.event import after_event, happens_at, mode_number, value_of
+from ...machine import after_event, happens_at, mode_number, value_of
 from .. import results
 from .._arrival import Arrival, ended
 from .._lane import CHANGES, LEAVES, RESETS, Plan, select, to_event

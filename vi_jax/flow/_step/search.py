@@ -7,8 +7,7 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 
 from ..._types import Flag, Scalar
-from ...machine import RigidStop
-from ...machine.trig import horner
+from ...machine import RigidStop, horner
 from .._lane import Lane, Plan, select, to_event, to_turn_of
 from ..events import Rates, highest, rising_root, slope
 from .guards import Crossing

@@ -12,8 +12,15 @@ from numpy.polynomial.legendre import leggauss
 
 from ..._checks import count
 from ..._types import Scalar
-from ...machine import AbstractMachine, CosineCrank, IdealDrive, OscillatorState, Scene
-from ...machine.trig import horner, sincos
+from ...machine import (
+    AbstractMachine,
+    CosineCrank,
+    IdealDrive,
+    OscillatorState,
+    Scene,
+    horner,
+    sincos,
+)
 from ..beside import Beside, rate_beside
 from ..smooth import SmoothMachine
 from .base import AbstractMethod

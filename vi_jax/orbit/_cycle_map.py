@@ -13,9 +13,19 @@ from jaxtyping import Array, Float, Int
 
 from .._checks import count
 from .._renamed import renamed
-from ..flow import AbstractMethod, Adaptive, FixedStep, simulate
-from ..flow.arguments import as_floats, check_period, check_reals, machine_of
-from ..flow.methods import MethodLike, chosen, preset
+from ..flow import (
+    AbstractMethod,
+    Adaptive,
+    FixedStep,
+    MethodLike,
+    as_floats,
+    check_period,
+    check_reals,
+    chosen,
+    machine_of,
+    preset,
+    simulate,
+)
 from ..machine import AbstractMachine
 from ._forward_jacobian import forward_jacobian
 

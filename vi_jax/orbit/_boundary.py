@@ -12,9 +12,8 @@ from jaxtyping import Array, Float
 from .._checks import interval
 from .._interrupted import Interrupted
 from .._lazy import lazy
-from ..flow.labelled import tidy
-from ..machine.numbers import check_leaf, leaf
-from ..machine.units import with_units
+from ..flow import tidy
+from ..machine import check_leaf, leaf, with_units
 from ._fixed_step_method import steps_of
 from ._shooting import Shooting
 from ._solution import orbit_of

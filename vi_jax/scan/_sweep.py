@@ -15,16 +15,37 @@ from .._interrupted import Interrupted
 from .._numbers import concrete, number
 from .._programs import compiled, is_outermost
 from .._renamed import renamed
-from ..flow import RESULTS, simulate
-from ..flow.arguments import check_reals, check_start, machine_of, refuse_arrays
-from ..flow.labelled import batch_names, in_names, present, states, tidy
-from ..flow.methods import MethodLike, chosen
-from ..flow.results import REASON_NAMES
-from ..machine import AbstractMachine
-from ..machine.numbers import check_again, check_leaf, with_leaf
-from ..machine.shown import Summarized
-from ..machine.units import PLAIN, Stated, name_in, stated, unit_of, with_unit, with_units
-from ..orbit.results import impacts_in_words
+from ..flow import (
+    REASON_NAMES,
+    RESULTS,
+    MethodLike,
+    batch_names,
+    check_reals,
+    check_start,
+    chosen,
+    in_names,
+    machine_of,
+    present,
+    refuse_arrays,
+    simulate,
+    states,
+    tidy,
+)
+from ..machine import (
+    PLAIN,
+    AbstractMachine,
+    Stated,
+    Summarized,
+    check_again,
+    check_leaf,
+    name_in,
+    stated,
+    unit_of,
+    with_leaf,
+    with_unit,
+    with_units,
+)
+from ..orbit import impacts_in_words
 from .regime import CODES, REGIMES, flags, impacts_of, least_period
 
 # A jump is so many times the change at the values beside it, and this part of 1 + |number|.

@@ -13,18 +13,36 @@ from jaxtyping import Array, Bool, Float
 from .._checks import count, flag
 from .._programs import compiled
 from .._renamed import renamed
-from ..flow import RESULTS, has_fixed_cycle, simulate
-from ..flow.beside import means
-from ..flow.labelled import batch_names, in_names, present, states, tidy
-from ..flow.methods import MethodLike, chosen
-from ..flow.named import has_averages
-from ..flow.results import REASON_NAMES
-from ..machine import AbstractMachine
-from ..machine.base import renews
-from ..machine.event import is_autonomous
-from ..machine.shown import Summarized, number_in_words
-from ..machine.units import Stated, attributes, in_unit, stated, unit_of, with_unit, with_units
-from ..orbit.cycle_map import CycleMap, adopted, cycle_map
+from ..flow import (
+    REASON_NAMES,
+    RESULTS,
+    MethodLike,
+    batch_names,
+    chosen,
+    has_averages,
+    has_fixed_cycle,
+    in_names,
+    means,
+    present,
+    simulate,
+    states,
+    tidy,
+)
+from ..machine import (
+    AbstractMachine,
+    Stated,
+    Summarized,
+    attributes,
+    in_unit,
+    is_autonomous,
+    number_in_words,
+    renews,
+    stated,
+    unit_of,
+    with_unit,
+    with_units,
+)
+from ..orbit import CycleMap, adopted, cycle_map
 
 
 class Lyapunov(Summarized):

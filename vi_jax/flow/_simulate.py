@@ -14,8 +14,7 @@ from .. import lanes
 from .._checks import flag
 from .._programs import compiled
 from .._renamed import renamed
-from ..machine import AbstractMachine
-from ..machine.units import stated
+from ..machine import AbstractMachine, stated
 from ._failed_derivatives import failed_derivatives
 from ._lane import Plan, Record
 from .arguments import planned

@@ -17,12 +17,9 @@ from .._checks import count, fits_memory, fits_records, flag, instance_of
 from .._interrupted import Interrupted
 from .._lazy import lazy
 from .._renamed import renamed
-from ..flow import AbstractMethod
-from ..flow.methods import MethodLike, preset
-from ..flow.options import RunOptions
-from ..flow.results import REASON_NAMES
+from ..flow import REASON_NAMES, AbstractMethod, MethodLike, RunOptions, preset
 from ..machine import AbstractMachine
-from ..machine.units import attributes as units_of
+from ..machine import attributes as units_of
 from ._describe import attributes_of, description_of, unit_on_axis, variables_of
 from ._work import (
     ClusterLost,

@@ -13,20 +13,22 @@ import numpy as np
 from .._checks import count, fits_records, given_number
 from .._lazy import lazy
 from .._renamed import renamed
-from ..flow import simulate
-from ..flow.arguments import machine_of
-from ..flow.labelled import tidy
-from ..flow.methods import MethodLike, chosen
-from ..machine import AbstractMachine
-from ..machine.numbers import by_name, state_in_words, with_leaf
-from ..machine.shown import summary_table
-from ..machine.units import attributes, unit_of
-from ..orbit.results import impacts_in_words
+from ..flow import MethodLike, chosen, machine_of, simulate, tidy
+from ..machine import (
+    AbstractMachine,
+    attributes,
+    by_name,
+    state_in_words,
+    summary_table,
+    unit_of,
+    with_leaf,
+)
+from ..orbit import impacts_in_words
+from ._scan import LanesFailed, ScanInterrupted, scan
 from .grid import axes_of
 from .measures import AbstractMeasure, Regime
 from .program import START
 from .regime import CODES, REGIMES, flags
-from .scan import LanesFailed, ScanInterrupted, scan
 
 if TYPE_CHECKING:
     import xarray as xr
