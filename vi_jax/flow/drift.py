@@ -1,6 +1,6 @@
 """The way from a step's end to an event close by: too short to matter, but for its derivatives.
 
-A step ends within rounding of its event, so that in value little is left of the way. When the event
+A step ends within 1e-9 of its event, so that in value little is left of the way. When the event
 is met, and how far the state has come then, depend on everything that came before, though: the
 derivatives of both are those of the flow and of the event's equation, and are given as such, to any
 order.

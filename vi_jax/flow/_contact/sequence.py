@@ -22,9 +22,9 @@ from .._lane import Plan, select, to_event
 from ..smooth import rounding
 from .blow import Blow, gains_speed, listed
 
-# A speed of approach is none that has no more than this share of the first one; a sequence that has
-# come down to the second is taken to its limit; what is struck then has speeds within this factor
-# of each other.
+# Shares of the greatest speed of approach so far. Below the first a contact does not close: it is
+# rounding of the blows before. At the second the sequence is replaced by its limit, in which those
+# contacts come to rest that were struck and move no faster than `_ALIKE` times the fastest.
 _NONE, _WEAK, _ALIKE = 1e-12, 1e-7, 30.0
 
 # Speeds that differ by no more than this share are the same.

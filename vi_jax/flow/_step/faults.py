@@ -1,6 +1,6 @@
 """Why a lane ends before its time: by what its steps come to, or by an event that has no answer."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax.lax import stop_gradient
@@ -21,19 +21,32 @@ _LOST, _MANY = 64.0, 16.0
 _STUCK = 65536.0
 
 
+class Progress(NamedTuple):
+    """How far a lane has come, and how hard that was."""
+
+    length: Scalar
+    """Length proposed for its next ordinary step."""
+    record: Record
+    """Of the interval on its way."""
+    steps: Scalar
+    """Steps tried since the lane began."""
+    spent: Scalar
+    """Steps tried in this interval."""
+    aims: Scalar
+    """Times aimed since the last step taken."""
+
+
 def faults(
-    plan: Plan,
-    lane: Lane,
-    trial: Trial,
-    rejected: Flag,
-    length: Scalar,
-    record: Record,
-    steps: Scalar,
-    spent: Scalar,
-    aims: Scalar,
-    target: Scalar,
+    plan: Plan, lane: Lane, trial: Trial, rejected: Flag, progress: Progress, target: Scalar
 ) -> list[tuple[Flag, Any]]:
-    """What ends a lane, the first that holds being the reason."""
+    """What ends a lane, the first that holds being the reason.
+
+    **Arguments:** whether the trial was rejected; the lane's progress, and what it aims at, after
+    it.
+
+    **Returns:** pairs of a condition and a reason, a code of `RESULTS`.
+    """
+    length, record, steps, spent, aims = progress
     broken = results.NOT_FINITE
     if plan.machine.alive(trial.state) is not None:
         # A clock that breaks down makes the steps shrink to nothing.

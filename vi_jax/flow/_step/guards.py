@@ -168,11 +168,13 @@ def _seen(
 
 
 def leniency(lane: Lane) -> Scalar:
+    """By what factor a lane's landing tolerance is larger, after so many aims."""
     return jnp.where(lane.aims >= _PATIENCE, 1e3, jnp.ones_like(lane.aims))
 
 
 def _landing_tolerance(x: Scalar) -> float:
-    """Largest accepted |δ|: a derivative's error is of its order, the state's of its square."""
+    """Largest accepted |δ|, the distance in `s` from the step's end to the event. State and
+    derivatives are carried over it to first order (`drift.drifted`): errors are of order δ²."""
     return 1e-9 if x.dtype == jnp.float64 else 1e-4
 
 

@@ -5,7 +5,7 @@ Each iteration tries one step of one lane:
 - *advance*: the step holds no event and is taken;
 - *aim*: it crosses a stop (or a section of the time clock, or a turning point that matters); it is
   not taken, and the next one is shortened to end there;
-- *land*: the shortened step ends within rounding of the event; the second-order Taylor offset
+- *land*: the shortened step ends within 1e-9 of the event; the offset of a second-order expansion
   δ = t* - t puts the state on it, and the jump is applied. Otherwise it is aimed once more.
 
 The length of an aimed step is a constant for differentiation, while δ carries dt*/dp, so that
@@ -26,7 +26,7 @@ from .._lane import FREE, Lane, Plan, Record, select
 from ..smooth import holding
 from .aim import aim_ahead, aim_at
 from .arrive import arrive
-from .faults import faults
+from .faults import Progress, faults
 from .jump import after_jump
 from .trial import Trial, attempt, timing
 
@@ -65,9 +65,8 @@ def iterate(plan: Plan, lane: Lane) -> Step:
     spent = jnp.where(completed, 0.0, lane.spent + 1.0)
     fault = there.fault
     aims = jnp.where(aim, lane.aims + 1, 0.0)
-    for condition, code in faults(
-        plan, lane, trial, rejected, length, new.record, steps, spent, aims, target
-    ):
+    progress = Progress(length, new.record, steps, spent, aims)
+    for condition, code in faults(plan, lane, trial, rejected, progress, target):
         stops_here = active & (fault == 0) & condition & (done < plan.intervals)
         fault = jnp.where(stops_here, code, fault)
     new = dataclasses.replace(
