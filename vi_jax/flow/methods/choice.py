@@ -4,7 +4,7 @@ from typing import Any
 
 from ..._checks import one_of
 from ..._renamed import renamed
-from ...machine import AbstractMachine, Scene
+from ...machine import AbstractMachine
 from .base import AbstractMethod
 from .exact import ExactFlight
 from .runge_kutta import Adaptive, FixedStep
@@ -50,7 +50,7 @@ def _named(machine: AbstractMachine | None, name: str, argument: str) -> Abstrac
     steps, tolerance = _PRESETS[one_of(argument, name, tuple(_PRESETS))]
     if machine is not None and _flies(machine):
         return ExactFlight()
-    if machine is None or (isinstance(machine, Scene) and not machine.soft_stops):
+    if machine is None or machine.scales_known:
         return FixedStep(steps_per_cycle=steps)
     return Adaptive(rtol=tolerance)
 
