@@ -25,10 +25,10 @@ from ._vector import check
 # Kernels that are kept although no compiled program needs them any more.
 _MOST_KERNELS = 64
 
-# Most numbers in a lane's inputs and carry with which groups go in twice the width, by the bits of a
-# register. Measured, not a count of registers: with AVX-512 (256 lanes on one core of an AMD EPYC)
-# the motor with extremes, 36 numbers, takes 20 % less, by time, 33, 10 %, with its log, 49, 4 %, and
-# with its derivative by one number as long. With AVX2 only up to 32 were measured.
+# Most numbers in a lane's inputs and carry with which groups go in twice the width, by the bits of
+# a register. Measured, not a count of registers: with AVX-512 (256 lanes on one core of an AMD
+# EPYC) the motor with extremes, 36 numbers, takes 20 % less, by time, 33, 10 %, with its log, 49,
+# 4 %, and with its derivative by one number as long. With AVX2 only up to 32 were measured.
 _MOST_NUMBERS = {512: 64, 256: 32}
 
 # More than any machine has cores; a process may not be granted so many threads.

@@ -249,6 +249,8 @@ class Orbit(Summarized):
             f"  section: {state_in_words(self.state, 9, units)}",
             f"  {span_in_words(self, 9)}",
         ]
+        if is_autonomous(self.machine, self.state):
+            lines.append(f"  duration: {in_unit(f'{float(self.duration):.9g}', units, 'time')}")
         impacts = zip(self.impact_phase, self.impact_speed, self.impact_stop, strict=True)
         for phase, speed, stop in impacts:
             if stop >= 0:
@@ -266,7 +268,7 @@ class Orbit(Summarized):
         lines.append(f"  clearance: {room}")
         lines.append(
             f"  residual {float(self.residual):.2g} after {int(self.iterations)} steps, estimated "
-            f"error {float(self.error):.2g}"
+            f"error of the search {float(self.error):.2g}"
         )
         reason = ORBIT_RESULTS[self.result]
         return "\n".join([*lines, f"  note: {reason}"] if reason else lines)
