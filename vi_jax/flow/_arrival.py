@@ -26,6 +26,7 @@ class Onward(NamedTuple):
     direction: tuple[Scalar, ...]
     contact: tuple[Scalar, ...] | None
     modes: tuple[Scalar, ...]
+    below: tuple[Scalar, ...]
 
 
 class Arrival(NamedTuple):

@@ -21,7 +21,8 @@ from ..events import Rates, to_turn
 from ..smooth import exact, holding
 from .faults import may_end
 from .guards import Crossing, furthest_landing
-from .happen import happened
+from .happen import happened, let_go
+from .jump import disarmed, disarmed_itself
 from .trial import Trial
 
 
@@ -44,7 +45,7 @@ def arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Fla
     here = plan.machine.position(trial.state)
     arrival = Arrival(
         trial.s, trial.state, trial.end.time, here, here if plan.machine.events else None,
-        Onward(tuple(direction), lane.contact, lane.modes),
+        Onward(tuple(direction), lane.contact, lane.modes, trial.seen.below),
         Tally(old.impacts, old.speed, old.loss, old.rests, old.log, old.events),
         trial.ends_interval, lane.fault if may_end(plan.machine) else None,
     )  # fmt: skip
@@ -69,7 +70,7 @@ def arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Fla
         direction=select(taken, arrival.direction, lane.direction),
         contact=select(taken, arrival.contact, lane.contact),
         modes=select(taken, arrival.modes, lane.modes),
-        below=_below(plan, lane, trial, taken),
+        below=select(taken, arrival.onward.below, lane.below),
         fault=lane.fault if arrival.fault is None else jnp.where(taken, arrival.fault, lane.fault),
         record=Record(
             time=time, y_max=y_max, y_min=y_min, clearance=clearance, **arrival.tally._asdict()
@@ -97,13 +98,15 @@ def _met(
         if plan.machine.stops:
             arrival = _impact(plan, lane, trial, taken, arrival, landed, there)
         for c in trial.crossings:
+            happens = c.landed
             if c.number == section_number(plan.machine):
                 # What begins anew with a cycle does so at its end.
                 arrival = arrival._replace(state=select(c.landed, there, arrival.state))
+                arrival = disarmed_itself(plan, arrival, c)
             elif c.coordinate is None:
-                arrival = happened(plan, taken, arrival, c, there)
+                arrival, happens = happened(plan, taken, arrival, c, there)
             if c.event.ends_cycle:
-                arrival = arrival._replace(completed=arrival.completed | c.landed)
+                arrival = arrival._replace(completed=arrival.completed | happens)
     for k, path in enumerate(trial.paths):
         if path.leaves is not None:
             arrival = _released(plan, lane, taken, arrival, way, k, path.leaves)
@@ -156,19 +159,6 @@ def _released(
         direction=_put(arrival.direction, k, direction),
         contact=_put(contact, k, jnp.where(free, 0.0, contact[k])),
     )
-
-
-def _below(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Scalar, ...]:
-    """As in `Lane`: after a jump each guard is to come from below again."""
-    found = []
-    numbers = plan.from_below(lane.state)
-    for number, old, new in zip(numbers, lane.below, trial.seen.below, strict=True):
-        for c in trial.crossings:
-            jumps = plan.machine.events and not c.event.holds_mode
-            if c.number == number or jumps:
-                new = jnp.where(c.landed, 0.0, new)
-        found.append(jnp.where(taken, new, old))
-    return tuple(found)
 
 
 def _put(values: tuple, k: int, value: Any) -> tuple:
@@ -225,7 +215,12 @@ def _impact(
         for number, here in landed.items():
             given = machine, arrival.s, there, arrival.state, modes
             modes = select(here, machine.stops[number].modes_after(*given), modes)
-    return arrival.going(direction=tuple(direction), modes=modes)
+    before = there, arrival.modes
+    arrival = arrival.going(direction=tuple(direction), modes=modes)
+    arrival = disarmed(plan, arrival, met, before)
+    # What rests on other stops may be let go of by it.
+    several = arrival.contact is not None and len(blows) > 1
+    return let_go(plan, arrival, taken, met, before, lane.contact) if several else arrival
 
 
 def _reached(

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 
 from ..._types import Flag, Scalar
-from ...machine import after_event, happens_at, mode_number, value_of
+from ...machine import after_event, guard_of, happens_at, mode_number, value_of
 from .. import results
 from .._arrival import Arrival, ended
 from .._lane import CHANGES, LEAVES, RESETS, Plan, select, to_event
@@ -15,11 +15,18 @@ from ..events import rates
 from ..smooth import holding, rounding
 from .faults import comes_back
 from .guards import Crossing
-from .jump import after_jump
+from .jump import after_jump, disarmed, disarmed_itself
+
+# A guard has jumped above zero by more than this, which is more than rounding leaves of one that
+# was met.
+_JUMPED = 1e-9
 
 
-def happened(plan: Plan, taken: Flag, arrival: Arrival, c: Crossing, there: Any) -> Arrival:
-    """State and modes after an event in the state `there` that is no impact."""
+def happened(
+    plan: Plan, taken: Flag, arrival: Arrival, c: Crossing, there: Any
+) -> tuple[Arrival, Flag]:
+    """State and modes after an event in the state `there` that is no impact; and whether it
+    happens where its guard has risen."""
     machine, event = plan.machine, c.event
     met = machine, c.number, arrival.s, there, arrival.modes
     when = happens_at(*met)
@@ -45,18 +52,58 @@ def happened(plan: Plan, taken: Flag, arrival: Arrival, c: Crossing, there: Any)
         arrival = arrival.counting(log=log, impacts=before.impacts + count)
     if not event.holds_mode:
         arrival = _jumped(plan, arrival, c, happens, there, new)
-    modes_before = arrival.modes
-    arrival = arrival._replace(state=select(happens, new, arrival.state)).going(modes=modes)
-    return _let_go(plan, arrival, taken, happens, (there, modes_before))
+    before = there, arrival.modes
+    state = select(happens, new, select(c.landed, there, arrival.state))
+    arrival = arrival._replace(state=state).going(modes=modes)
+    arrival = _switched(plan, arrival, taken, happens, (c, *before))
+    arrival = let_go(plan, arrival, taken, happens, before)
+    if not event.holds_mode:
+        arrival = disarmed(plan, arrival, happens, before)
+    return disarmed_itself(plan, arrival, c), happens
 
 
-def _let_go(
-    plan: Plan, arrival: Arrival, taken: Flag, when: Flag, before: tuple[Any, tuple[Scalar, ...]]
-) -> Arrival:
-    """With those bodies free that were pressed on their stops `before` the modes changed, and are
-    pulled away behind it: a force that jumps has no place where it passes zero."""
+def _switched(
+    plan: Plan, arrival: Arrival, taken: Flag, when: Flag,
+    before: tuple[Crossing, Any, tuple[Scalar, ...]],
+) -> Arrival:  # fmt: skip
+    """With the modes of those switches changed whose guard has jumped above zero with an event, as
+    that of friction does that held a pull which is another one now: it has no place where it
+    passes zero.
+
+    **Arguments:** the event that happened, and state and modes before it.
+    """
+    machine, contact, (c, old, modes_before) = plan.machine, arrival.contact or (), before
+    first = len(machine.stops)
+    for number in range(first, first + len(machine.switches)):
+        if number == c.number:
+            continue
+        now = arrival.s, arrival.state, arrival.modes
+        was = guard_of(machine, number, arrival.s, old, modes_before, contact)
+        is_now = guard_of(machine, number, *now, contact)
+        was, is_now = stop_gradient((was, is_now))
+        slack = _JUMPED * (1 + jnp.abs(is_now))
+        turns = when & (was <= slack) & (is_now > slack)
+        new, modes = after_event(machine, number, *now, contact)
+        state, modes = select(turns, (new, modes), (arrival.state, arrival.modes))
+        value, clock = modes[mode_number(machine, number)], clock_at(plan, arrival.s, state)
+        here = arrival.tally.events, taken & turns, clock
+        events = noted(*here, CHANGES, number - first, value)
+        arrival = arrival._replace(state=state).going(modes=modes).counting(events=events)
+    return arrival
+
+
+def let_go(
+    plan: Plan, arrival: Arrival, taken: Flag, when: Flag,
+    before: tuple[Any, tuple[Scalar, ...]], resting: tuple[Scalar, ...] | None = None,
+) -> Arrival:  # fmt: skip
+    """With those bodies free that were pressed on their stops before an event, and are pulled away
+    behind it: a force that jumps has no place where it passes zero.
+
+    **Arguments:** whether the event happens; state and modes before it; what rested then, if that
+    may be another than now (as in `Lane.contact`).
+    """
     machine, contact, modes = plan.machine, arrival.contact, arrival.modes
-    if contact is None or not modes:
+    if contact is None:
         return arrival
     old, modes_before = before
     freed, direction, events = list(contact), list(arrival.direction), arrival.tally.events
@@ -69,6 +116,8 @@ def _let_go(
         sign, _ = plan.wall(k, contact[k])
         pressed, pulled = sign * pressing(modes_before, old), sign * pressing(modes, arrival.state)
         goes = when & (contact[k] > 0) & stop_gradient((pressed >= 0) & (pulled < 0))
+        if resting is not None:
+            goes = goes & (resting[k] == contact[k])
         clock = clock_at(plan, arrival.s, arrival.state)
         events = noted(events, taken & goes, clock, LEAVES, contact[k] - to_event(0), jnp.nan)
         freed[k] = jnp.where(goes, 0.0, contact[k])

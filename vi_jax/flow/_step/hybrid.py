@@ -97,7 +97,7 @@ def _onward(plan: Plan, there: Lane, completed: Flag, done: Scalar) -> Lane:
         state = select(turned, plan.machine.rewound(state), state)
     renewed = plan.machine.renewed(state)
     if renewed is not state:
-        onward = Onward(there.direction, there.contact, there.modes)
+        onward = Onward(there.direction, there.contact, there.modes, there.below)
         direction, contact = after_jump(plan, onward, turned, state, renewed, jnp.zeros_like(s))
         there = dataclasses.replace(there, direction=direction, contact=contact)
         state = select(turned, renewed, state)

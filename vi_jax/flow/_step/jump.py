@@ -6,10 +6,12 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 
 from ..._types import Flag, Scalar
-from .._arrival import Onward
+from ...machine import guard_of
+from .._arrival import Arrival, Onward
 from .._lane import Plan
 from ..events import rates
 from ..smooth import holding, rounding
+from .guards import Crossing
 
 
 def after_jump(
@@ -21,7 +23,7 @@ def after_jump(
     **Arguments:** how the motion went on (direction and contact are returned); where the state is
     another one; the states before and after, and s.
     """
-    direction, contact, modes = onward
+    direction, contact, modes, _ = onward
     directions: list[Any] = list(direction)
     contacts: list[Any] = list(contact or ())
     slack = rounding(plan.machine, new)
@@ -43,3 +45,35 @@ def after_jump(
             after = stop_gradient(jnp.where(after == 0, here.a, after))
             directions[k] = jnp.where(when & (after != 0), jnp.sign(after), directions[k])
     return tuple(directions), contact
+
+
+def disarmed(
+    plan: Plan, arrival: Arrival, when: Flag, before: tuple[Any, tuple[Scalar, ...]]
+) -> Arrival:
+    """With those guards to come from below anew (see `Lane.below`) that a jump of the state has put
+    on their surface or beyond. Those that it did not change stay as they are: what they belong to
+    may happen at the same instant.
+
+    **Arguments:** where the state jumped, and state and modes before.
+    """
+    if not plan.machine.events:
+        return arrival
+    (old, modes), contact, below = before, arrival.contact or (), []
+    for number, armed in zip(plan.from_below(arrival.state), arrival.onward.below, strict=True):
+        was = guard_of(plan.machine, number, arrival.s, old, modes, contact)
+        now = guard_of(plan.machine, number, arrival.s, arrival.state, arrival.modes, contact)
+        was, now = stop_gradient((jnp.asarray(was), jnp.asarray(now)))
+        slack = float(jnp.finfo(now.dtype).eps) ** 0.5 * (1 + jnp.abs(now))
+        put = when & (now >= -slack) & (jnp.abs(now - was) > slack)
+        below.append(jnp.where(put, 0.0, armed))
+    return arrival.going(below=tuple(below))
+
+
+def disarmed_itself(plan: Plan, arrival: Arrival, c: Crossing) -> Arrival:
+    """With the guard of an event that was met to come from below anew."""
+    numbers = plan.from_below(arrival.state)
+    if c.number not in numbers:
+        return arrival
+    below, i = arrival.onward.below, numbers.index(c.number)
+    used = jnp.where(c.landed, 0.0, below[i])
+    return arrival.going(below=(*below[:i], used, *below[i + 1 :]))

@@ -1,0 +1,133 @@
+"""Events that come together, that do not happen, and what rests or sticks as a force jumps."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import pytest
+import vi_jax as vi
+
+from rough_block import Plane
+
+State = vi.OscillatorState
+
+
+def begins(Y, V):
+    return State(jnp.asarray(float(Y)), jnp.asarray(float(V)))
+
+
+class Glider(vi.AbstractMachine):
+    """A body that nothing pulls."""
+
+    stops: tuple = ()
+    events: tuple = ()
+    cycle = 4.0
+
+    def field(self, s, state):
+        return State(state.V, 0 * state.V)
+
+
+def faster(machine, s, state):
+    return State(state.Y, state.V + 1)
+
+
+def same(machine, s, state):
+    return state
+
+
+def test_two_resets_at_one_instant_both_happen():
+    both = (vi.Reset(lambda m, s, x: x.Y - 1, faster), vi.Reset(lambda m, s, x: s - 1.0, faster))
+    run = vi.simulate(Glider(events=both), begins(0, 1), 1, event_log=4)
+    assert float(run.last.Y) == pytest.approx(1 + 3 * 3)
+    assert run.event_log.number[0, :3].tolist() == [0, 1, -1]
+
+
+def test_a_cycle_ends_at_the_instant_of_an_impact():
+    ends = (vi.Reset(lambda m, s, x: s - 1.0, same, ends_cycle=True),)
+    machine = Glider(stops=(vi.RigidStop(1.0, 0.5),), events=ends)
+    run = vi.simulate(machine, begins(0, 1), 1)
+    assert float(run.duration[0]) == pytest.approx(1.0, abs=1e-12)
+    assert float(run.last.V) == pytest.approx(-0.5)
+
+
+def test_an_event_that_does_not_happen_leaves_no_trace():
+    no = (vi.Reset(lambda m, s, x: x.Y - 1, faster, when=lambda m, s, x: x.Y > 9),)
+
+    def last(V):
+        return vi.simulate(Glider(events=no), State(jnp.asarray(0.0), V), 1).last.Y
+
+    value, slope = jax.value_and_grad(last)(jnp.asarray(1.0))
+    assert float(value) == pytest.approx(4.0, abs=1e-14)
+    assert float(slope) == pytest.approx(4.0, abs=1e-14)
+
+
+def test_nor_does_it_end_a_cycle():
+    third = vi.Reset(
+        lambda m, s, x: jnp.sin(x.Y), same, when=lambda m, s, x: x.Y > 7, ends_cycle=True
+    )
+    run = vi.simulate(Glider(events=(third,)), begins(1, 1), 1)
+    assert float(run.duration[0]) == pytest.approx(4 * jnp.pi - 1, abs=1e-9)
+
+
+class Held(State):
+    force: Any
+
+
+class Pressed(Glider):
+    """A body on the left stop, whose force is part of its state."""
+
+    stops: tuple = (vi.RigidStop(0.0, 0.0, "left"),)
+    events: tuple = (vi.Reset(lambda m, s, x: s - 2.0, lambda m, s, x: Held(x.Y, x.V, -x.force)),)
+
+    def placed(self, state, Y, V):
+        return Held(Y, V, state.force)
+
+    def field(self, s, state):
+        return Held(state.V, state.force, 0 * state.force)
+
+
+def test_a_body_is_let_go_of_as_its_force_jumps():
+    run = vi.simulate(Pressed(), Held(*(jnp.asarray(x) for x in (0.0, 0.0, -1.0))), 1, event_log=4)
+    assert float(run.last.Y) == pytest.approx(0.5 * 2**2, abs=1e-12)
+    assert [vi.EVENTS[int(k)] for k in run.event_log.kind[0, :2]] == ["reset", "release"]
+
+
+class Pulled(vi.AbstractMachine):
+    """A block on a floor that is pulled harder from s = 1 on."""
+
+    slope: jax.Array | float = 0.0
+    stops: tuple = (vi.RigidStop(0.0, 0.0, "left"),)
+    cycle = 3.0
+
+    @property
+    def coordinates(self):
+        return (
+            vi.Coordinate(lambda z: z.y, lambda z: z.v, lambda z, Y, V: Plane(z.x, Y, z.u, V)),
+            vi.Coordinate(lambda z: z.x, lambda z: z.u, lambda z, Y, V: Plane(Y, z.y, V, z.v)),
+        )
+
+    @property
+    def switches(self):
+        later = vi.Switch(lambda machine, s, state: s - 1.0)
+        return vi.ContactFriction(1.0, stop=0, along=1), later
+
+    def field(self, s, z, slips, on):
+        pull = jnp.where(on > 0, 2.0 + self.slope * (s - 1), 0.5)
+        return Plane(z.u, z.v, pull + 0 * z.u, -1 + 0 * z.v)
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.1, -0.1])
+def test_friction_lets_go_as_the_pull_jumps(slope):
+    """Whether the pull then grows or falls: u = ∫(pull - 1) ds over two."""
+    start = Plane(*(jnp.asarray(0.0) for _ in range(4)))
+    run = vi.simulate(Pulled(slope=slope), start, 1)
+    assert float(run.last.u) == pytest.approx(2.0 + 2 * slope, abs=1e-12)
+
+
+def test_a_reset_onto_the_surface_of_another_is_no_event_there():
+    """From Y = 1 back to -1, which is the surface of one that only happens from above."""
+    back = vi.Reset(lambda m, s, x: x.Y - 1, lambda m, s, x: State(x.Y - 2, x.V))
+    below = vi.Reset(lambda m, s, x: -1 - x.Y, faster)
+    run = vi.simulate(Glider(events=(back, below)), begins(0, 1), 1, event_log=4)
+    assert run.event_log.number[0].tolist() == [0, 0, -1, -1]
+    assert (float(run.last.Y), float(run.last.V)) == pytest.approx((0.0, 1.0), abs=1e-12)
