@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from . import _functions as functions
+from ._library import LIBRARY
 from ._text import KINDS, Text, Value, is_float
 
 Rule = Callable[..., Any]
@@ -256,12 +257,8 @@ def _(t, p, d, a):
     return functions.sincos(t, a)
 
 
-_LIBRARY = (
-    "tanh", "tan", "sinh", "cosh", "asin", "acos", "atan", "asinh", "acosh", "atanh", "atan2",
-    "exp2", "expm1", "log1p", "cbrt", "erf", "erfc",
-)  # fmt: skip
-for _name in _LIBRARY:
-    ELEMENTWISE[_name] = lambda t, p, d, *args, name=_name: t.each(name, *args)
+for _name, _function in LIBRARY.items():
+    ELEMENTWISE[_name] = lambda t, p, d, *args, function=_function: function(t, *args)
 ELEMENTWISE["rem"] = lambda t, p, d, a, b: (
     t.each("fmod", a, b) if is_float(a.kind) else _of_integers(t, "rem", a, b, _is_unsigned(d[0]))
 )
