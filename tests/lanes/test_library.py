@@ -116,6 +116,7 @@ def test_functions_of_the_library_have_the_same_bits_in_any_width(library):
             np.testing.assert_array_equal(value, found[name][few], err_msg=name)
 
 
+@pytest.mark.skipif(np.finfo(np.longdouble).nmant < 63, reason="no extended precision")
 @pytest.mark.parametrize("kind", [np.float64, np.float32])
 def test_angles_of_all_quadrants(kind):
     """`atan2` beside numpy's where numbers have signs and sizes of all kinds."""
@@ -129,3 +130,22 @@ def test_angles_of_all_quadrants(kind):
     with np.errstate(all="ignore"):
         units = _units(value, np.arctan2(y.astype(np.longdouble), x.astype(np.longdouble)))
     assert units.max() < 2
+
+
+@pytest.mark.skipif(np.finfo(np.longdouble).nmant < 63, reason="no extended precision")
+@pytest.mark.parametrize("kind", [np.float64, np.float32])
+def test_powers_are_right_to_two_units(kind):
+    rng = np.random.default_rng(8)
+    n, info = 20000, np.finfo(kind)
+    some = [*CORNERS, 2.0, 3.0, -1.5, 0.25, 2.0**53 - 1, 2.0**53, 1e16, 1e-5]
+    corners = np.meshgrid([*some, *np.negative(some)], [*some, *np.negative(some)])
+    bases = [np.exp(rng.normal(0, 4, n)), rng.uniform(0.5, 2, n), 1 + rng.normal(0, 1e-3, n)]
+    powers = [rng.normal(0, 20, n), rng.uniform(-1000, 1000, n), rng.normal(0, 3e5, n)]
+    with np.errstate(all="ignore"):
+        x = np.concatenate([*bases, corners[0].ravel()]).astype(kind)
+        y = np.concatenate([*powers, corners[1].ravel()]).astype(kind)
+        x, y = (np.where(np.abs(z) < info.tiny, np.copysign(0, z), z).astype(kind) for z in (x, y))
+        value = np.asarray(as_lanes(lambda xy: jax.lax.pow(*xy), (x, y)))
+        units = _units(value, np.power(x.astype(np.longdouble), y.astype(np.longdouble)))
+    worst = np.argmax(units)
+    assert units[worst] < (2 if kind == np.float64 else 0.51), (x[worst], y[worst])

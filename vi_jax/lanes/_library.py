@@ -9,8 +9,8 @@ from collections.abc import Callable
 from math import factorial, inf, log, nan, pi
 
 from ._fitted import ASIN, ATAN, CBRT, ERF, ERFC, SINH, TAN, TANH
-from ._functions import LN2, mantissa, parts_of
-from ._real import Real
+from ._functions import LN2, parts_of
+from ._real import Real, fast_sum, significand, two_sum
 from ._text import Text, Value
 
 # (e^r - 1 - r) / r², by Taylor's series: |r| <= ln(2) / 2, error below 1e-17.
@@ -21,22 +21,9 @@ _LOG = tuple(2 / (2 * n + 3) for n in range(10))
 _EXP2 = tuple(log(2) ** n / factorial(n) for n in range(1, 14))
 
 _HALF_PI = [part / 2 for part in parts_of(pi, 4)]
-# Up to here n times each of the first three is exact.
+# For |x| up to here n times each of the first three is exact.
 _TURNED = 2.0**20
 _PI, _PI_LOW = pi, 1.2246467991473532e-16
-
-
-def _two_sum(a: Real, b: Real) -> tuple[Real, Real]:
-    """a + b rounded, and what was rounded off."""
-    total = a.plus(b)
-    part = total.minus(a)
-    return total, a.minus(total.minus(part)).plus(b.minus(part))
-
-
-def _fast_sum(a: Real, b: Real) -> tuple[Real, Real]:
-    """The same where |a| >= |b| or a is zero."""
-    total = a.plus(b)
-    return total, b.minus(total.minus(a))
 
 
 def _odd(x: Real, value: Real) -> Real:
@@ -54,7 +41,7 @@ def _split_exponent(x: Real) -> tuple[Real, Real, Real]:
     return n, r, r * r * r.polynomial(_EXP) + (rest + rest * r)
 
 
-def _exp(x: Real) -> tuple[Real, Real]:
+def exp_parts(x: Real) -> tuple[Real, Real]:
     """n, and e^x 2^-n - 1, which is from √½ - 1 to √2 - 1."""
     n, r, rest = _split_exponent(x)
     return n, r + rest
@@ -64,14 +51,14 @@ def expm1(x: Real) -> Real:
     n, r, rest = _split_exponent(x.at_least(-60.0).at_most(709.9))
     # 2^n (r + rest) + (2^n - 1), halved so that it stays finite until the end.
     half = (n - 1).power_of_two()
-    high, low = _fast_sum(half.minus(0.5), half * r)
+    high, low = fast_sum(half.minus(0.5), half * r)
     value = 2.0 * (high + (low + half * rest))
     return x.choose(x.size() < 2.0**-54, value)
 
 
 def tanh(x: Real) -> Real:
     a = x.size()
-    n, e = _exp((2.0 * a).at_most(40.0))
+    n, e = exp_parts((2.0 * a).at_most(40.0))
     square = a * a
     near = a < 0.55
     rest = (a * square * square.polynomial(TANH)).choose(
@@ -82,7 +69,7 @@ def tanh(x: Real) -> Real:
 
 def _half_exp(a: Real) -> Real:
     """e^a / 2 for a >= 0; infinite only where that is."""
-    n, e = _exp(a.at_most(711.0))
+    n, e = exp_parts(a.at_most(711.0))
     return (2.0 * e + 2.0) * (n - 2.0).power_of_two()
 
 
@@ -101,21 +88,20 @@ def cosh(x: Real) -> Real:
 def _log_sum(u: Real, low: Real, doublings: Real | float = 0.0) -> Real:
     """ln(u + low) + doublings ln(2), for a normal u > 0 and a small `low`, to rounding also where
     that is near zero. Infinity stays so."""
-    t = u.t
-    m, power = mantissa(t, u.value)
-    n = Real(t, t.cast("sitofp", power, "double")) + doublings
-    f = Real(t, m).minus(1.0)
+    m, n = u.split()
+    n = n + doublings
+    f = m.minus(1.0)
     s = f / (f + 2.0)
     square = s * s
     # ln(1 + f) = 2 artanh(s), and 2s = f - s f.
     rest = low / u - s * (f - square * square.polynomial(_LOG))
-    high, off = _fast_sum(n * LN2[0], f)
+    high, off = fast_sum(n * LN2[0], f)
     value = high + (off + (n * LN2[1] + rest))
     return value.choose(u < inf, u)
 
 
 def log1p(x: Real) -> Real:
-    u, low = _two_sum(x.of(1.0), x)
+    u, low = two_sum(x.of(1.0), x)
     value = _log_sum(u, low)
     value = x.of(-inf).choose(u.equals(0.0), value)
     value = x.of(nan).choose(u < 0.0, value)
@@ -125,10 +111,10 @@ def log1p(x: Real) -> Real:
 def atanh(x: Real) -> Real:
     a = x.size()
     # (1 + a) / (1 - a) = 1 + v, with what the division and 1 - a rounded off.
-    below, off = _fast_sum(x.of(1.0), -a)
+    below, off = fast_sum(x.of(1.0), -a)
     v = 2.0 * a / below
     rest = (-v).call("fma", below, 2.0 * a) - v * off
-    u, low = _two_sum(x.of(1.0), v)
+    u, low = two_sum(x.of(1.0), v)
     value = 0.5 * _log_sum(u, low + rest / below)
     value = x.of(inf).choose(a.equals(1.0), value)
     value = x.of(nan).choose(a > 1.0, value)
@@ -141,8 +127,8 @@ def asinh(x: Real) -> Real:
     near = a.at_most(2.0**28)
     square = near * near
     root = (square + 1.0).call("sqrt")
-    v, off = _fast_sum(near, square / (root + 1.0))
-    u, low = _two_sum(x.of(1.0), v)
+    v, off = fast_sum(near, square / (root + 1.0))
+    u, low = two_sum(x.of(1.0), v)
     low = (low + off).choose(a < 2.0**28, 0.0)
     value = _log_sum(a.choose(far, u), low, x.of(1.0).choose(far, 0.0))
     return _odd(x, value)
@@ -153,8 +139,8 @@ def acosh(x: Real) -> Real:
     v = x.at_most(2.0**28).minus(1.0)
     square = v.call("fma", v, 2.0 * v)
     root = square.call("sqrt")
-    w, off = _two_sum(v, root)
-    u, low = _two_sum(x.of(1.0), w)
+    w, off = two_sum(v, root)
+    u, low = two_sum(x.of(1.0), w)
     low = (low + off).choose(x < 2.0**28, 0.0)
     value = _log_sum(x.choose(far, u), low, x.of(1.0).choose(far, 0.0))
     return x.of(nan).choose(x < 1.0, value)
@@ -198,7 +184,7 @@ def _arcsine(a: Real) -> tuple[Value, Real, Real]:
 
 def asin(x: Real) -> Real:
     far, z, rest = _arcsine(x.size())
-    high, off = _fast_sum(x.of(_PI / 2), -2.0 * z)
+    high, off = fast_sum(x.of(_PI / 2), -2.0 * z)
     steep = high + (off + (_PI_LOW / 2 - 2.0 * rest))
     return _odd(x, steep.choose(far, z + rest))
 
@@ -210,20 +196,20 @@ def acos(x: Real) -> Real:
     factor = x.of(2.0).choose(far, 1.0)
     factor = factor.choose(x.t.binary("xor", far, left, "i1"), -factor)
     base = x.of(2.0).choose(left, 0.0).choose(far, 1.0)
-    high, off = _fast_sum(base * (_PI / 2), factor * z)
+    high, off = fast_sum(base * (_PI / 2), factor * z)
     return high + (off + (base * (_PI_LOW / 2) + factor * rest))
 
 
 def tan(x: Real) -> Real:
     n = (x * (2 / pi)).call("roundeven")
     first = x - n * _HALF_PI[0]  # exact up to 2^20 quarter turns, as the next two products
-    second, off = _two_sum(first, -(n * _HALF_PI[1]))
-    third, more = _two_sum(second, -(n * _HALF_PI[2]))
-    r, low = _fast_sum(third, (off + more) - n * _HALF_PI[3])
+    second, off = two_sum(first, -(n * _HALF_PI[1]))
+    third, more = two_sum(second, -(n * _HALF_PI[2]))
+    r, low = fast_sum(third, (off + more) - n * _HALF_PI[3])
     square = r * r
     rest = r * square * square.polynomial(TAN)
     rest = rest + low * (1.0 + (r + rest) * (r + rest))
-    value, off = _fast_sum(r, rest)
+    value, off = fast_sum(r, rest)
     inverse = -1.0 / value
     inverse = inverse + inverse * (inverse.call("fma", value, 1.0) + inverse * off)
     even = (2.0 * (0.5 * n).call("roundeven")).equals(n)
@@ -257,14 +243,8 @@ def exp2(x: Real) -> Real:
 
 
 def cbrt(x: Real) -> Real:
-    t, a = x.t, x.size()
-    # The bits of a subnormal number are its multiple of 2^-1074.
-    small = a < 2.0**-1022
-    whole = Real(t, t.cast("uitofp", t.cast("bitcast", a.value, "i64"), "double"))
-    m, power = mantissa(t, whole.choose(small, a).value)
-    m = Real(t, m)
-    n = Real(t, t.cast("sitofp", power, "double"))
-    n = (n - 1074.0).choose(small, n)
+    a = x.size()
+    m, n = significand(a)
     k = (n * (1 / 3)).call("roundeven")
     m = m * (n - 3.0 * k).power_of_two()
     y = m.polynomial(CBRT)
@@ -278,8 +258,7 @@ def cbrt(x: Real) -> Real:
     miss = (-square).call("fma", root, m) - off * root
     root = root + miss * (y * y) * (1 / 3)
     value = (root * k.power_of_two()).with_sign_of(x)
-    zero = t.binary("icmp eq", t.cast("bitcast", a.value, "i64"), t.zero("i64"), "i1")
-    return x.choose(zero, value.choose(a < inf, x))
+    return x.choose(a.is_zero(), value.choose(a < inf, x))
 
 
 def _error_functions(a: Real) -> tuple[Value, Real, Real]:
@@ -289,10 +268,10 @@ def _error_functions(a: Real) -> tuple[Value, Real, Real]:
     b = a.at_least(0.5).at_most(27.5)
     square = b * b
     off = b.call("fma", b, -square)
-    n, s = _exp(-square)
-    high, more = _fast_sum(b.of(1.0), s)
+    n, s = exp_parts(-square)
+    high, more = fast_sum(b.of(1.0), s)
     shape = ((b - 3.5) / (b + 3.5)).polynomial(ERFC)
-    below, lost = _two_sum(2.0 * b, b.of(1.0))
+    below, lost = two_sum(2.0 * b, b.of(1.0))
     inverse = 1.0 / below
     # high shape / below, then what was rounded off on the way.
     product = high * shape
@@ -315,7 +294,7 @@ def erfc(x: Real) -> Real:
     return (1.0 - near.with_sign_of(x)).choose(below, (2.0 - far).choose(left, far))
 
 
-def _rule(function: Callable[..., Real]) -> Callable[..., Value]:
+def rule(function: Callable[..., Real]) -> Callable[..., Value]:
     """A function of `Real`s for values of either precision."""
 
     def written(t: Text, *args: Value) -> Value:
@@ -328,7 +307,7 @@ def _rule(function: Callable[..., Real]) -> Callable[..., Value]:
 
 
 LIBRARY = {
-    function.__name__: _rule(function)
+    function.__name__: rule(function)
     for function in (
         tanh, tan, sinh, cosh, asin, acos, atan, atan2, asinh, acosh, atanh,
         exp2, expm1, log1p, cbrt, erf, erfc,

@@ -8,6 +8,7 @@ import numpy as np
 
 from . import _functions as functions
 from ._library import LIBRARY
+from ._power import power
 from ._text import KINDS, Text, Value, is_float
 
 Rule = Callable[..., Any]
@@ -221,9 +222,9 @@ def _(t, p, d, a, b):
     if a.kind == "float" and b.number is not None and b.number != round(b.number):
         # No negative base has such a power, and double precision leaves single to rounding.
         wide = t.cast("fpext", a, "double")
-        power = mul(t, functions.log_(t, wide), t.constant(b.number, "double"))
-        return t.cast("fptrunc", functions.exp(t, power), "float")
-    return t.each("pow", a, b)
+        exponent = mul(t, functions.log_(t, wide), t.constant(b.number, "double"))
+        return t.cast("fptrunc", functions.exp(t, exponent), "float")
+    return power(t, a, b)
 
 
 @elementwise("exp")

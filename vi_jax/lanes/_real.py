@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from ._functions import horner
+from ._functions import horner, mantissa
 from ._text import Text, Value
 
 
@@ -92,6 +92,16 @@ class Real:
         bits = self.t.cast("bitcast", self.value, "i64")
         return self.t.binary("icmp slt", bits, self.t.zero("i64"), "i1")
 
+    def is_zero(self) -> Value:
+        """Whether this is zero without a sign; no subnormal number is, whatever the processor."""
+        bits = self.t.cast("bitcast", self.value, "i64")
+        return self.t.binary("icmp eq", bits, self.t.zero("i64"), "i1")
+
+    def split(self) -> "tuple[Real, Real]":
+        """For a normal positive number, m between √½ and √2 and a whole n: m 2^n."""
+        m, power = mantissa(self.t, self.value)
+        return Real(self.t, m), Real(self.t, self.t.cast("sitofp", power, "double"))
+
     def polynomial(self, coefficients: Sequence[float]) -> "Real":
         return Real(self.t, horner(self.t, coefficients, self.value))
 
@@ -102,3 +112,25 @@ class Real:
         biased = t.cast("bitcast", self.plus(1.5 * 2.0**52 + 1023).value, "i64")
         bits = t.binary("shl", biased, t.constant(52, "i64"))
         return Real(t, t.cast("bitcast", bits, "double"))
+
+
+def two_sum(a: Real, b: Real) -> tuple[Real, Real]:
+    """a + b rounded, and what was rounded off."""
+    total = a.plus(b)
+    part = total.minus(a)
+    return total, a.minus(total.minus(part)).plus(b.minus(part))
+
+
+def fast_sum(a: Real, b: Real) -> tuple[Real, Real]:
+    """The same where |a| >= |b| or a is zero."""
+    total = a.plus(b)
+    return total, b.minus(total.minus(a))
+
+
+def significand(a: Real) -> tuple[Real, Real]:
+    """`Real.split` for any finite a >= 0; anything at zero."""
+    small = a < 2.0**-1022
+    # The bits of a subnormal number are its multiple of 2^-1074.
+    whole = Real(a.t, a.t.cast("uitofp", a.t.cast("bitcast", a.value, "i64"), "double"))
+    m, n = whole.choose(small, a).split()
+    return m, (n - 1074.0).choose(small, n)
