@@ -12,7 +12,7 @@ _EXP = tuple(1 / factorial(n) for n in range(14))
 _ATANH = tuple(2 / (2 * n + 1) for n in range(12))
 
 
-def _parts(number: float, count: int) -> list[float]:
+def parts_of(number: float, count: int) -> list[float]:
     """`number` (to some hundred bits) as a sum of doubles whose products with small integers are
     exact."""
     exact = {
@@ -29,7 +29,7 @@ def _parts(number: float, count: int) -> list[float]:
     return [*parts, float(exact)]
 
 
-_PI, _LN2 = _parts(pi, 3), _parts(log(2), 2)
+_PI, LN2 = parts_of(pi, 3), parts_of(log(2), 2)
 
 
 def _add(t: Text, a: Value, b: Value) -> Value:
@@ -40,7 +40,8 @@ def _mul(t: Text, a: Value, b: Value) -> Value:
     return t.binary("fmul contract", a, b)
 
 
-def _horner(t: Text, coefficients: Sequence[float], x: Value) -> Value:
+def horner(t: Text, coefficients: Sequence[float], x: Value) -> Value:
+    """The polynomial with these coefficients, constant term first."""
     total = t.constant(coefficients[-1], x.kind)
     for c in coefficients[-2::-1]:
         total = _add(t, _mul(t, total, x), t.constant(c, x.kind))
@@ -70,8 +71,8 @@ def sincos(t: Text, x: Value) -> tuple[Value, Value]:
     wide = t.cast("fpext", x, "double") if x.kind == "float" else x
     rest, bit = _reduced(t, wide)
     square = _mul(t, rest, rest)
-    sine = _flipped(t, _mul(t, rest, _horner(t, _SIN, square)), bit)
-    cosine = _flipped(t, _horner(t, _COS, square), bit)
+    sine = _flipped(t, _mul(t, rest, horner(t, _SIN, square)), bit)
+    cosine = _flipped(t, horner(t, _COS, square), bit)
     if x.kind == "float":
         return t.cast("fptrunc", sine, "float"), t.cast("fptrunc", cosine, "float")
     return sine, cosine
@@ -86,7 +87,7 @@ def exp(t: Text, x: Value) -> Value:
     y = t.select(_compare(t, "olt", x, low), low, x)
     y = t.select(_compare(t, "ogt", y, high), high, y)
     n = t.intrinsic("roundeven", _mul(t, y, t.constant(1 / log(2), "double")))
-    value = _horner(t, _EXP, _less_multiples(t, y, n, _LN2))
+    value = horner(t, _EXP, _less_multiples(t, y, n, LN2))
     # 2^n in two factors, so that neither leaves the range of exponents.
     finite = t.select(_compare(t, "uno", x, x), t.zero("double"), n)
     whole = t.cast("fptosi", finite, "i64")
@@ -98,26 +99,29 @@ def exp(t: Text, x: Value) -> Value:
     return value
 
 
+def mantissa(t: Text, x: Value) -> tuple[Value, Value]:
+    """m between √½ and √2 and a whole number n, so that x = m 2^n, for a normal x > 0."""
+    bits = t.cast("bitcast", x, "i64")
+    shifted = t.binary("sub", bits, t.constant(0x3FE6A09E667F3BCD, "i64"))
+    power = t.binary("ashr", shifted, t.constant(52, "i64"))
+    shifted = t.binary("sub", bits, t.binary("shl", power, t.constant(52, "i64")))
+    return t.cast("bitcast", shifted, "double"), power
+
+
 def log_(t: Text, x: Value) -> Value:
     """Natural logarithm."""
     if x.kind == "float":
         return t.cast("fptrunc", log_(t, t.cast("fpext", x, "double")), "float")
     tiny = _compare(t, "olt", x, t.constant(2.0**-1000, "double"))
     scaled = t.select(tiny, _mul(t, x, t.constant(2.0**54, "double")), x)
-    bits = t.cast("bitcast", scaled, "i64")
-    # The mantissa between √½ and √2.
-    shifted = t.binary("sub", bits, t.constant(0x3FE6A09E667F3BCD, "i64"))
-    power = t.binary("ashr", shifted, t.constant(52, "i64"))
-    mantissa = t.cast(
-        "bitcast", t.binary("sub", bits, t.binary("shl", power, t.constant(52, "i64"))), "double"
-    )
+    significand, power = mantissa(t, scaled)
     n = t.cast("sitofp", power, "double")
     n = t.select(tiny, t.binary("fsub", n, t.constant(54.0, "double")), n)
     one = t.constant(1.0, "double")
-    ratio = t.binary("fdiv", t.binary("fsub", mantissa, one), t.binary("fadd", mantissa, one))
-    series = _mul(t, ratio, _horner(t, _ATANH, _mul(t, ratio, ratio)))
-    low = _add(t, series, _mul(t, n, t.constant(_LN2[1], "double")))
-    value = _add(t, _mul(t, n, t.constant(_LN2[0], "double")), low)
+    ratio = t.binary("fdiv", t.binary("fsub", significand, one), t.binary("fadd", significand, one))
+    series = _mul(t, ratio, horner(t, _ATANH, _mul(t, ratio, ratio)))
+    low = _add(t, series, _mul(t, n, t.constant(LN2[1], "double")))
+    value = _add(t, _mul(t, n, t.constant(LN2[0], "double")), low)
     infinity, nan = t.constant(float("inf"), "double"), t.constant(float("nan"), "double")
     value = t.select(_compare(t, "olt", x, infinity), value, x)
     value = t.select(

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 
 from . import _functions as functions
+from ._library import LIBRARY
+from ._power import power
 from ._text import KINDS, Text, Value, is_float
 
 Rule = Callable[..., Any]
@@ -220,9 +222,9 @@ def _(t, p, d, a, b):
     if a.kind == "float" and b.number is not None and b.number != round(b.number):
         # No negative base has such a power, and double precision leaves single to rounding.
         wide = t.cast("fpext", a, "double")
-        power = mul(t, functions.log_(t, wide), t.constant(b.number, "double"))
-        return t.cast("fptrunc", functions.exp(t, power), "float")
-    return t.each("pow", a, b)
+        exponent = mul(t, functions.log_(t, wide), t.constant(b.number, "double"))
+        return t.cast("fptrunc", functions.exp(t, exponent), "float")
+    return power(t, a, b)
 
 
 @elementwise("exp")
@@ -256,12 +258,8 @@ def _(t, p, d, a):
     return functions.sincos(t, a)
 
 
-_LIBRARY = (
-    "tanh", "tan", "sinh", "cosh", "asin", "acos", "atan", "asinh", "acosh", "atanh", "atan2",
-    "exp2", "expm1", "log1p", "cbrt", "erf", "erfc",
-)  # fmt: skip
-for _name in _LIBRARY:
-    ELEMENTWISE[_name] = lambda t, p, d, *args, name=_name: t.each(name, *args)
+for _name, _function in LIBRARY.items():
+    ELEMENTWISE[_name] = lambda t, p, d, *args, function=_function: function(t, *args)
 ELEMENTWISE["rem"] = lambda t, p, d, a, b: (
     t.each("fmod", a, b) if is_float(a.kind) else _of_integers(t, "rem", a, b, _is_unsigned(d[0]))
 )

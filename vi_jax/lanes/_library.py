@@ -1,0 +1,316 @@
+"""The elementary functions of the C library as code on whole vectors.
+
+Each is written for double precision, and single precision goes by way of it. Errors are at most 2
+units in the last place (`tests/lanes/test_library.py`). Subnormal results may be zero: the threads
+that run lanes take such numbers for zero.
+"""
+
+from collections.abc import Callable
+from math import factorial, inf, log, nan, pi
+
+from ._fitted import ASIN, ATAN, CBRT, ERF, ERFC, SINH, TAN, TANH
+from ._functions import LN2, parts_of
+from ._real import Real, fast_sum, significand, two_sum
+from ._text import Text, Value
+
+# (e^r - 1 - r) / r², by Taylor's series: |r| <= ln(2) / 2, error below 1e-17.
+_EXP = tuple(1 / factorial(n) for n in range(2, 14))
+# ln((1 + s) / (1 - s)) / s - 2 over s², the same; s² <= 0.0295.
+_LOG = tuple(2 / (2 * n + 3) for n in range(10))
+# 2^r / r - 1 / r, the same; |r| <= 1/2.
+_EXP2 = tuple(log(2) ** n / factorial(n) for n in range(1, 14))
+
+_HALF_PI = [part / 2 for part in parts_of(pi, 4)]
+# For |x| up to here n times each of the first three is exact.
+_TURNED = 2.0**20
+_PI, _PI_LOW = pi, 1.2246467991473532e-16
+
+
+def _odd(x: Real, value: Real) -> Real:
+    """An odd function near x at zero, from its value at |x|; small x also where the processor takes
+    subnormal numbers for zero, as on XLA's threads."""
+    return x.choose(x.size() < 2.0**-30, value.with_sign_of(x))
+
+
+def _split_exponent(x: Real) -> tuple[Real, Real, Real]:
+    """x as n ln(2) + r, |r| <= 0.35: n, r rounded, and e^r - 1 less that."""
+    n = (x * (1 / log(2))).call("roundeven")
+    head = x - n * LN2[0]  # exact
+    r = head.minus(n * LN2[1])
+    rest = head.minus(r) - n * LN2[1]
+    return n, r, r * r * r.polynomial(_EXP) + (rest + rest * r)
+
+
+def exp_parts(x: Real) -> tuple[Real, Real]:
+    """n, and e^x 2^-n - 1, which is from √½ - 1 to √2 - 1."""
+    n, r, rest = _split_exponent(x)
+    return n, r + rest
+
+
+def expm1(x: Real) -> Real:
+    n, r, rest = _split_exponent(x.at_least(-60.0).at_most(709.9))
+    # 2^n (r + rest) + (2^n - 1), halved so that it stays finite until the end.
+    half = (n - 1).power_of_two()
+    high, low = fast_sum(half.minus(0.5), half * r)
+    value = 2.0 * (high + (low + half * rest))
+    return x.choose(x.size() < 2.0**-54, value)
+
+
+def tanh(x: Real) -> Real:
+    a = x.size()
+    n, e = exp_parts((2.0 * a).at_most(40.0))
+    square = a * a
+    near = a < 0.55
+    rest = (a * square * square.polynomial(TANH)).choose(
+        near, -2.0 / ((e + 1.0) * n.power_of_two() + 1.0)
+    )
+    return _odd(x, a.choose(near, 1.0) + rest)
+
+
+def _half_exp(a: Real) -> Real:
+    """e^a / 2 for a >= 0; infinite only where that is."""
+    n, e = exp_parts(a.at_most(711.0))
+    return (2.0 * e + 2.0) * (n - 2.0).power_of_two()
+
+
+def sinh(x: Real) -> Real:
+    a = x.size()
+    square, half = a * a, _half_exp(a)
+    near = a + a * square * square.polynomial(SINH)
+    return _odd(x, near.choose(a < 1.0, half - 0.25 / half))
+
+
+def cosh(x: Real) -> Real:
+    half = _half_exp(x.size())
+    return half + 0.25 / half
+
+
+def _log_sum(u: Real, low: Real, doublings: Real | float = 0.0) -> Real:
+    """ln(u + low) + doublings ln(2), for a normal u > 0 and a small `low`, to rounding also where
+    that is near zero. Infinity stays so."""
+    m, n = u.split()
+    n = n + doublings
+    f = m.minus(1.0)
+    s = f / (f + 2.0)
+    square = s * s
+    # ln(1 + f) = 2 artanh(s), and 2s = f - s f.
+    rest = low / u - s * (f - square * square.polynomial(_LOG))
+    high, off = fast_sum(n * LN2[0], f)
+    value = high + (off + (n * LN2[1] + rest))
+    return value.choose(u < inf, u)
+
+
+def log1p(x: Real) -> Real:
+    u, low = two_sum(x.of(1.0), x)
+    value = _log_sum(u, low)
+    value = x.of(-inf).choose(u.equals(0.0), value)
+    value = x.of(nan).choose(u < 0.0, value)
+    return x.choose(x.size() < 2.0**-54, value)
+
+
+def atanh(x: Real) -> Real:
+    a = x.size()
+    # (1 + a) / (1 - a) = 1 + v, with what the division and 1 - a rounded off.
+    below, off = fast_sum(x.of(1.0), -a)
+    v = 2.0 * a / below
+    rest = (-v).call("fma", below, 2.0 * a) - v * off
+    u, low = two_sum(x.of(1.0), v)
+    value = 0.5 * _log_sum(u, low + rest / below)
+    value = x.of(inf).choose(a.equals(1.0), value)
+    value = x.of(nan).choose(a > 1.0, value)
+    return _odd(x, value)
+
+
+def asinh(x: Real) -> Real:
+    a = x.size()
+    far = a > 2.0**28
+    near = a.at_most(2.0**28)
+    square = near * near
+    root = (square + 1.0).call("sqrt")
+    v, off = fast_sum(near, square / (root + 1.0))
+    u, low = two_sum(x.of(1.0), v)
+    low = (low + off).choose(a < 2.0**28, 0.0)
+    value = _log_sum(a.choose(far, u), low, x.of(1.0).choose(far, 0.0))
+    return _odd(x, value)
+
+
+def acosh(x: Real) -> Real:
+    far = x > 2.0**28
+    v = x.at_most(2.0**28).minus(1.0)
+    square = v.call("fma", v, 2.0 * v)
+    root = square.call("sqrt")
+    w, off = two_sum(v, root)
+    u, low = two_sum(x.of(1.0), w)
+    low = (low + off).choose(x < 2.0**28, 0.0)
+    value = _log_sum(x.choose(far, u), low, x.of(1.0).choose(far, 0.0))
+    return x.of(nan).choose(x < 1.0, value)
+
+
+def _arctangent(z: Real) -> Real:
+    square = z * z
+    # Its terms alternate; with fewer in one chain their rounding adds up to 2.2 units near one.
+    return z + z * square * square.polynomial(ATAN, 8)
+
+
+def atan(x: Real) -> Real:
+    a = x.size()
+    far = a > 1.0
+    angle = _arctangent((-1.0 / a).choose(far, a))
+    high = x.of(_PI / 2).choose(far, 0.0)
+    return _odd(x, high + (angle + x.of(_PI_LOW / 2).choose(far, 0.0)))
+
+
+def atan2(y: Real, x: Real) -> Real:
+    a, b = x.size(), y.size()
+    steep = b > a
+    less, more = a.choose(steep, b), b.choose(steep, a)
+    ratio = less / more
+    same = a.of(0.0).choose(a.equals(0.0), 1.0)
+    angle = _arctangent(same.choose(a.equals(b), ratio))
+    # x < 0: π less the angle to the x axis; steep: π/2 less the angle to the y axis.
+    left = x.negative()
+    angle = (-angle).choose(x.t.binary("xor", steep, left, "i1"), angle)
+    quarters = x.of(1.0).choose(steep, x.of(2.0).choose(left, 0.0))
+    value = quarters * (_PI / 2) + (angle + quarters * (_PI_LOW / 2))
+    return value.with_sign_of(y)
+
+
+def _arcsine(a: Real) -> tuple[Value, Real, Real]:
+    """For a >= 0, whether a > 1/2; z = a, or then √((1 - a) / 2); asin(z) - z."""
+    far = a > 0.5
+    square = (0.5 - 0.5 * a).choose(far, a * a)
+    z = square.call("sqrt").choose(far, a)
+    return far, z, z * square * square.polynomial(ASIN)
+
+
+def asin(x: Real) -> Real:
+    far, z, rest = _arcsine(x.size())
+    high, off = fast_sum(x.of(_PI / 2), -2.0 * z)
+    steep = high + (off + (_PI_LOW / 2 - 2.0 * rest))
+    return _odd(x, steep.choose(far, z + rest))
+
+
+def acos(x: Real) -> Real:
+    far, z, rest = _arcsine(x.size())
+    left = x.negative()
+    # 2 asin(z) on the right, π less that on the left, π/2 less asin(x) between.
+    factor = x.of(2.0).choose(far, 1.0)
+    factor = factor.choose(x.t.binary("xor", far, left, "i1"), -factor)
+    base = x.of(2.0).choose(left, 0.0).choose(far, 1.0)
+    high, off = fast_sum(base * (_PI / 2), factor * z)
+    return high + (off + (base * (_PI_LOW / 2) + factor * rest))
+
+
+def tan(x: Real) -> Real:
+    n = (x * (2 / pi)).call("roundeven")
+    first = x - n * _HALF_PI[0]  # exact up to 2^20 quarter turns, as the next two products
+    second, off = two_sum(first, -(n * _HALF_PI[1]))
+    third, more = two_sum(second, -(n * _HALF_PI[2]))
+    r, low = fast_sum(third, (off + more) - n * _HALF_PI[3])
+    square = r * r
+    rest = r * square * square.polynomial(TAN)
+    rest = rest + low * (1.0 + (r + rest) * (r + rest))
+    value, off = fast_sum(r, rest)
+    inverse = -1.0 / value
+    inverse = inverse + inverse * (inverse.call("fma", value, 1.0) + inverse * off)
+    even = (2.0 * (0.5 * n).call("roundeven")).equals(n)
+    a = x.size()
+    value = _elsewhere("tan", x, a > _TURNED, value.choose(even, inverse))
+    return x.choose(a < 2.0**-30, value)
+
+
+def _elsewhere(name: str, x: Real, where: Value, value: Real) -> Real:
+    """`value`, but the C library's function where a flag holds; skipped if it does in no lane."""
+    t = x.t
+    inside, after = t.label(), t.label()
+    before = t.block
+    t.fork(t.any(where), inside, after, rare=True)
+    t.open(inside)
+    laid = t.select(where, t.each(name, x.value), value.value)
+    end = t.block
+    t.line(f"br label %{after}")
+    t.close()
+    t.follow(after)
+    return Real(t, t.phi("double", (laid.text, end), (value.value.text, before)))
+
+
+def exp2(x: Real) -> Real:
+    y = x.at_least(-1100.0).at_most(1030.0)
+    n = y.call("roundeven")
+    r = y - n
+    half = (0.5 * n).call("roundeven")
+    value = 1.0 + r * r.polynomial(_EXP2)
+    return value * half.power_of_two() * (n - half).power_of_two()
+
+
+def cbrt(x: Real) -> Real:
+    a = x.size()
+    m, n = significand(a)
+    k = (n * (1 / 3)).call("roundeven")
+    m = m * (n - 3.0 * k).power_of_two()
+    y = m.polynomial(CBRT)
+    miss = 1.0 - m * (y * y) * y
+    y = y + y * miss * (1 / 3 + miss * (2 / 9))
+    y = y + y * (1.0 - m * (y * y) * y) * (1 / 3)
+    # A step of Newton's for the root itself, its residual without rounding.
+    root = m * (y * y)
+    square = root * root
+    off = root.call("fma", root, -square)
+    miss = (-square).call("fma", root, m) - off * root
+    root = root + miss * (y * y) * (1 / 3)
+    value = (root * k.power_of_two()).with_sign_of(x)
+    return x.choose(a.is_zero(), value.choose(a < inf, x))
+
+
+def _error_functions(a: Real) -> tuple[Value, Real, Real]:
+    """For a >= 0, whether a < 1/2; then erf(a), else anything; else erfc(a)."""
+    square = a * a
+    near = a + a * square.polynomial(ERF)
+    b = a.at_least(0.5).at_most(27.5)
+    square = b * b
+    off = b.call("fma", b, -square)
+    n, s = exp_parts(-square)
+    high, more = fast_sum(b.of(1.0), s)
+    shape = ((b - 3.5) / (b + 3.5)).polynomial(ERFC)
+    below, lost = two_sum(2.0 * b, b.of(1.0))
+    inverse = 1.0 / below
+    # high shape / below, then what was rounded off on the way.
+    product = high * shape
+    far = product * inverse
+    left = high.call("fma", shape, -product) + (-far).call("fma", below, product)
+    far = far + (left + shape * (more - high * off) - far * lost) * inverse
+    half = (0.5 * n).call("roundeven")
+    far = far * half.power_of_two() * (n - half).power_of_two()
+    return a < 0.5, near, far
+
+
+def erf(x: Real) -> Real:
+    below, near, far = _error_functions(x.size())
+    return near.choose(below, 1.0 - far).with_sign_of(x)
+
+
+def erfc(x: Real) -> Real:
+    below, near, far = _error_functions(x.size())
+    left = x.negative()
+    return (1.0 - near.with_sign_of(x)).choose(below, (2.0 - far).choose(left, far))
+
+
+def rule(function: Callable[..., Real]) -> Callable[..., Value]:
+    """A function of `Real`s for values of either precision."""
+
+    def written(t: Text, *args: Value) -> Value:
+        single = args[0].kind == "float"
+        wide = [t.cast("fpext", a, "double") if single else a for a in args]
+        value = function(*(Real(t, a) for a in wide)).value
+        return t.cast("fptrunc", value, "float") if single else value
+
+    return written
+
+
+LIBRARY = {
+    function.__name__: rule(function)
+    for function in (
+        tanh, tan, sinh, cosh, asin, acos, atan, atan2, asinh, acosh, atanh,
+        exp2, expm1, log1p, cbrt, erf, erfc,
+    )
+}  # fmt: skip
