@@ -107,6 +107,11 @@ class MotionPicture:
         _fit(self._portrait, x=np.append(path.Y, gap), y=path.V)
 
     def _set_map(self, x: np.ndarray, y: np.ndarray, across: str, up: str, note: str = "") -> None:
+        """Draw the map of impacts or of sections.
+
+        **Arguments:** `x` and `y`, its points; `across` and `up`, the names of its axes; `note`, a
+        text in it.
+        """
         self._lines["map"].set_data(x, y)
         self._map.set(xlabel=across, ylabel=up)
         self._notes["map"].set_text(note)

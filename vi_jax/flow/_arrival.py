@@ -10,7 +10,8 @@ from .beside import Beside
 
 
 class Tally(NamedTuple):
-    """What is written down of the events of an interval; as in `Record`."""
+    """What has been recorded of the events of an interval: the fields of `Record` that an event
+    changes."""
 
     impacts: Scalar
     speed: Scalar | None
@@ -21,7 +22,7 @@ class Tally(NamedTuple):
 
 
 class Onward(NamedTuple):
-    """How a motion goes on; as in `Lane`."""
+    """How a motion goes on behind an event: the fields of `Lane` of the same names."""
 
     direction: tuple[Scalar, ...]
     contact: tuple[Scalar, ...] | None
@@ -29,7 +30,11 @@ class Onward(NamedTuple):
 
 
 class Arrival(NamedTuple):
-    """The lane where a step leads, and what is kept of its way there."""
+    """Where a step leads, while its events are applied.
+
+    `arrive` begins with the end of the step; each event makes another `Arrival` of it, and the lane
+    takes over what the last one says.
+    """
 
     s: Scalar
     state: Any
@@ -61,16 +66,20 @@ class Arrival(NamedTuple):
         return self.onward.modes
 
     def going(self, **onward: Any) -> "Arrival":
-        """With another direction, contact or modes."""
+        """A copy with another direction, contact or modes."""
         return self._replace(onward=self.onward._replace(**onward))
 
     def counting(self, **tally: Any) -> "Arrival":
-        """With something else written down."""
+        """A copy in which something else is recorded: fields of `Tally`."""
         return self._replace(tally=self.tally._replace(**tally))
 
 
 def ended(arrival: Arrival, where: Flag, when: Flag | None, reason: int) -> Arrival:
-    """With this reason to end, `where` it was met and `when` it holds; `None` where it cannot."""
+    """The arrival, with a reason for its lane to end there.
+
+    **Arguments:** `where`, whether the event was met; `when`, whether it ends the lane, `None` if
+    it never can; `reason`, a code of `results`.
+    """
     if when is None or arrival.fault is None:
         return arrival
     return arrival._replace(fault=jnp.where(where & when, float(reason), arrival.fault))

@@ -31,17 +31,18 @@ FREE = 0.0
 
 
 def to_event(number: int) -> float:
-    """Event of this number among the machine's (see `events_of`); all others are negative."""
+    """The target of a step that is aimed at the event of this number (see `events_of`), positive;
+    `Lane.contact` names stops by the same numbers. All other targets are negative."""
     return 1.0 + number
 
 
 def to_turn_of(k: int) -> float:
-    """A turning point of coordinate number k."""
+    """The target of a step that is aimed at a turning point of coordinate number k."""
     return -1.0 - 2 * k
 
 
 def to_release(k: int) -> float:
-    """The release of coordinate number k from the stop on which it rests."""
+    """The target of a step that is aimed at the release of coordinate number k from its stop."""
     return -2.0 - 2 * k
 
 
@@ -129,7 +130,8 @@ def has_fixed_cycle(machine: AbstractMachine, state: Any) -> bool:
 
 
 class Plan(eqx.Module):
-    """What is asked of the loop."""
+    """What the loop is to do, the same for all lanes of a batch. All that is static is a part of
+    the compiled program."""
 
     machine: AbstractMachine
     method: AbstractMethod
@@ -177,13 +179,14 @@ class Plan(eqx.Module):
         return list(range(len(self.machine.stops), last))
 
     def from_below(self, state: Any) -> list[int]:
-        """Of those the ones that happen from below."""
+        """Those of `others` that happen only once their guard has been below zero (see
+        `AbstractEvent.from_below`)."""
         events = events_of(self.machine)
         return [number for number in self.others(state) if events[number].from_below]
 
     @property
     def to_section(self) -> float:
-        """The end of a cycle, where an event is it."""
+        """The target of a step that is aimed at the end of a cycle, where an event is that."""
         return to_event(section_number(self.machine))
 
     def end(self, part: Scalar) -> Scalar:
@@ -192,8 +195,8 @@ class Plan(eqx.Module):
         return cycle * (part + 1) / self.parts if self.parts > 1 else cycle
 
     def first_part(self, done: Scalar) -> Scalar:
-        """The part with which a cycle begins after so many intervals: those that are not kept are
-        whole cycles, as if only their last part were left."""
+        """`Lane.part` at the begin of a cycle, when so many intervals are done: 0, unless the cycle
+        is not recorded. Such a cycle is one interval, as if only its last part were left."""
         return jnp.where(done < self.settle, self.parts - 1.0, jnp.zeros_like(done))
 
     def ticks(self, state: Any) -> bool:
@@ -205,8 +208,9 @@ class Plan(eqx.Module):
         return self.motion and not has_fixed_cycle(self.machine, state)
 
     def meets_turns(self, done: Scalar) -> Any:
-        """Whether every turning point is met after so many intervals, or only those that are close
-        to a stop: for extremes, and where something else may happen there."""
+        """Whether steps end on every turning point, for extremes, and since switches and events may
+        be there; or only on those close to a stop. A flag where that depends on how many intervals
+        are done, else known while the program is traced."""
         if self.machine.switches or self.machine.events:
             return True
         return (done >= self.settle) if self.motion else False
@@ -236,7 +240,8 @@ class Plan(eqx.Module):
         return Beside(zero if timed else None, {name: zero for name in self.averages})
 
     def launch(self, start: Any, wanted: Any = True) -> Lane:
-        """A lane on its first section; one that cannot be run, or is not wanted, has ended."""
+        """The lane as its loop begins, in the state `start`; one that cannot be run, or is not
+        `wanted`, has ended already."""
         machine = self.machine
         Y = machine.position(start)
         numbers = jtu.tree_leaves((start, eqx.filter(machine, eqx.is_inexact_array)))
@@ -295,7 +300,8 @@ class Plan(eqx.Module):
         )
 
     def place(self, k: int, contact: Scalar, otherwise: Scalar) -> Scalar:
-        """Where coordinate number k is that rests on the stop named by `contact`."""
+        """The position of coordinate number k while it rests on the stop named by `contact` (see
+        `Lane.contact`); `otherwise` while it rests on none."""
         place = otherwise
         for i, stop in enumerate(self.machine.stops):
             if stop.coordinate == k:
@@ -303,8 +309,8 @@ class Plan(eqx.Module):
         return place
 
     def wall(self, k: int, contact: Scalar) -> tuple[Any, Any]:
-        """Side and gap of the stop of coordinate number k that is named by `contact`; of its first
-        one if none is."""
+        """The sign (1 right, -1 left) and the gap of the stop of coordinate number k that is named
+        by `contact`; of its first stop if none is."""
         mine = [(i, stop) for i, stop in enumerate(self.machine.stops) if stop.coordinate == k]
         (_, first), others = mine[0], mine[1:]
         sign, gap = float(first.sign), first.gap

@@ -15,14 +15,23 @@ def clock_at(plan: Plan, s: Scalar, state: Any) -> Scalar:
 
 
 def logged(log: Any, hit: Flag, place: Scalar, clock: Scalar, approach: Scalar, stop: int) -> Any:
-    """The log with this impact, the `place`-th of its interval."""
+    """The log of impacts with this one in its place, if there is room.
+
+    **Arguments:** `log`, (3, size), `None` where none is kept; `hit`, whether there was an impact;
+    `place`, the number of those before it in this interval; `approach`, V⁻; `stop`, the stop's
+    number.
+    """
     if log is None:
         return None
     return _written(log, hit, place, clock, approach, stop)
 
 
 def noted(events: Any, when: Flag, clock: Scalar, kind: float, number: Any, value: Any) -> Any:
-    """The log of all events with this one behind those that it holds, if there is room."""
+    """The log of all events with this one behind those that it holds, if there is room.
+
+    **Arguments:** `events`, (4, size), `None` where none is kept; `when`, whether the event
+    happened; `kind`, its place in `results.EVENTS`; `number` and `value` as in `EventLog`.
+    """
     if events is None:
         return None
     place = jnp.sum(jnp.where(jnp.isnan(events[1]), 0.0, 1.0))

@@ -66,6 +66,10 @@ def in_short(tree: Any) -> str:
 def _check_arguments(
     machine: AbstractMachine, whose: str, s: Scalar, state: Any, modes: Any
 ) -> None:
+    """**Raises:** `TypeError` for a field that does not take s, a state and its modes.
+
+    **Arguments:** `whose`, the field in words; `s`, `state` and `modes`, as it will be called.
+    """
     try:
         inspect.signature(machine.field).bind(s, state, *modes)
     except TypeError as error:

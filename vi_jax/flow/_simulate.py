@@ -113,7 +113,7 @@ def _simulate(plan: Plan, start: Any, sampled: bool) -> Run:
 
 
 def _errors(run: Run, tighter: Run) -> Errors:
-    """What two runs differ by."""
+    """The differences between a run and one by a tighter method; NaN where either failed."""
 
     def apart(a: Any, b: Any) -> Any:
         both = run.successful & tighter.successful
@@ -151,7 +151,11 @@ def simulate_pool(
 
 
 def collect(plan: Plan, sampled: bool, lane: Ends, points: Any, records: Record) -> Run:
-    """The run from what the loop stored for each interval."""
+    """The run from what the loop stored for each interval.
+
+    **Arguments:** `sampled`, whether the states are given as samples; `lane`, how it ended;
+    `points` and `records`, the states and records of the intervals, as `run_lane` returns them.
+    """
     machine, parts = plan.machine, plan.parts
     records = jtu.tree_map(lambda x: x[1:], records)
 
@@ -236,8 +240,8 @@ def _events(plan: Plan, entries: Any) -> EventLog:
 
 
 def _by_cycle(plan: Plan, entries: Any, *, used: int) -> list[Any]:
-    """The rows of a log (intervals, rows, size), each as (cycles, size), its entries in their order
-    and those not used last: they have NaN in the row `used`."""
+    """The rows of a log (intervals, rows, size), each as (cycles, size): the entries of a cycle in
+    their order, unused places last, which have NaN in the row `used`."""
     rows, size = entries.shape[1:]
     entries = entries.reshape(plan.cycles, plan.parts, rows, size)
     entries = jnp.moveaxis(entries, 2, 0).reshape(rows, plan.cycles, plan.parts * size)

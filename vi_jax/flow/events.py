@@ -51,9 +51,13 @@ def guard_rates(
 
 
 def force_rate(machine: Any, position: Any, holding: Any, s: Scalar, state: Any) -> Scalar:
-    """d/ds of the acceleration that a free body would have, along the flow of `holding`.
+    """d/ds of the acceleration that a body would have if it were free, while it moves along with a
+    machine in which it may be held.
 
     A constant for differentiation: it tells where to look.
+
+    **Arguments:** `machine`, in which the body is free; `position`, its coordinate as a function of
+    the state; `holding`, the machine that moves.
     """
     s, state = jax.lax.stop_gradient((s, state))
 
@@ -141,7 +145,7 @@ def to_turn(end: Rates) -> Scalar:
 
 
 def turns_within(length: Scalar, end: Rates) -> Flag:
-    """Whether `to_turn` is no longer than this; without its division, in each step."""
+    """Whether `to_turn` is at most this length; without a division, since each step asks for it."""
     bend = jax.lax.stop_gradient(end.a)
     return jnp.abs(jax.lax.stop_gradient(end.v)) <= length * jnp.where(
         bend == 0, 1.0, jnp.abs(bend)

@@ -62,7 +62,8 @@ _LISTED = {"impact": "log_stop", "event": "event_number"}
 
 
 def _met(log: Any, number: str) -> Any:
-    """The entries of a log one after the other, without the places that are not used."""
+    """The entries of a log, one after the other, without unused places: those where the variable
+    `number` is negative."""
     rows = log.stack(row=log[number].dims).reset_index("row")
     return rows.isel(row=np.flatnonzero(np.asarray(rows[number]) >= 0))
 

@@ -81,6 +81,13 @@ def quantities_on(machine: AbstractMachine, sections: Any, lead: int = 0) -> dic
 def _names(
     machine: AbstractMachine, which: str, function: Any, start: Any, arguments: tuple
 ) -> tuple[str, ...]:
+    """The names of a machine's averages or quantities, sorted.
+
+    **Arguments:** `which`, the method's name; `function`, the method; `start`, a state, whose own
+    names are taken; `arguments`, those of the method.
+
+    **Raises:** as `average_names`.
+    """
     whose = f"`{which}` of a {type(machine).__name__}"
     with in_words_of(whose):
         found = jax.eval_shape(lambda *x: _as_arrays(whose, function(*x)), *arguments)

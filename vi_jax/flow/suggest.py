@@ -194,7 +194,11 @@ def _series(bench: "_Bench", error: float) -> list[Tried]:
 
 
 class _Bench:
-    """The run that methods are compared on: some lanes, their truth and their start."""
+    """The run that methods are compared on.
+
+    **Arguments:** `start`, a state; `quantity`, what is compared (see `suggest_method`); `cycles`
+    to simulate; `lanes`, how many, which differ in their first velocity.
+    """
 
     truth: np.ndarray
 
@@ -207,7 +211,8 @@ class _Bench:
         self.compiled: dict[Any, Callable] = {}
 
     def lane(self, method: AbstractMethod, nudge: Any) -> Any:
-        """What is looked at, of one lane."""
+        """What is compared, as one vector, of the lane whose first velocity differs by `nudge`; its
+        first number is infinite if the lane failed."""
         machine = self.machine
 
         def looked_at(nudge):

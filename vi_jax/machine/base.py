@@ -146,12 +146,15 @@ class AbstractMachine(Clocked, Observed, Worded):
 
     @property
     def coordinates(self) -> tuple[Coordinate, ...]:
-        """What stops limit; extremes are recorded of the first."""
+        """The coordinates that stops limit, by number as `RigidStop.coordinate` names them;
+        extremes are recorded of the first. By default one, the machine's `position`, `velocity` and
+        `placed`."""
         return (Coordinate(*(self._said(name) for name in ("position", "velocity", "placed"))),)
 
     def _said(self, name: str) -> Callable[..., Any]:
-        """A method of the machine's own; else the default for a state with `Y` and `V`, which does
-        not ask `coordinates` again where these ask their `super()`."""
+        """A method of the machine's own if it has one, else the default for a state with `Y` and
+        `V`. The default does not ask `coordinates`, which would ask it again where they call
+        `super()`."""
         default = getattr(AbstractMachine, name)
         if self._has_coordinates and getattr(type(self), name) is default:
             return partial(_DEFAULTS[name], self)
@@ -203,7 +206,8 @@ class AbstractMachine(Clocked, Observed, Worded):
         return bool(self.stops)
 
     def alive(self, state: State) -> Bool[Array, ""] | None:
-        """False where the clock of this machine breaks down; `None` where it cannot."""
+        """Whether the motion can go on: false where the clock of this machine breaks down, as where
+        a crank stops in the phase clock; `None` where it cannot."""
         return None
 
     def in_range(self, start: State) -> Bool[Array, ""]:

@@ -53,20 +53,23 @@ class Clocked(Shown):
         return self
 
     def in_cycle_state(self, name: str, state: Any) -> State:
-        """A state on the section, of any of its clocks, as the machine in that clock needs it."""
+        """A state on the section, made for any clock of this machine, as the machine of
+        `in_cycle_clock` needs it; `name` is the argument that messages blame."""
         return state
 
     def phase_at(self, since_section: Any) -> Any:
-        """What the clock reads, from what it counted since the section."""
+        """What the clock shows when it has counted so much since the section: a crank angle may
+        begin elsewhere than at 0."""
         return since_section
 
     @property
     def turn(self) -> Float[Array, ""] | float:
-        """What an impact log counts in one cycle."""
+        """The length of a cycle as an impact log counts it."""
         return self.cycle
 
     def as_logged(self, clock: Float[Array, "..."]) -> Float[Array, "..."]:
-        """A reading of what counts the cycles, as the impact log tells it; by default itself."""
+        """What an impact log says for a reading of what counts the cycles; by default the reading
+        itself."""
         return clock
 
     def step_limit(self, s: Float[Array, ""], state: State) -> Float[Array, ""] | float:

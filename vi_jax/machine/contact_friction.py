@@ -67,17 +67,24 @@ class ContactFriction(AbstractSwitch):
         return False
 
     def begin(self, machine, s, state):
-        """The way that the body slips."""
+        """The mode of a motion that begins: the sign of the velocity along the stop."""
         return self._slip(machine, state)
 
     def struck(self, machine, s, state, mode, *, around: Around | None = None):
-        """The way that the body slips, or would."""
+        """The mode after an impact or another jump: the way that the body slips, or would begin to.
+
+        **Arguments:** as every event's, and `around`, what else acts; `None` if that is not known
+        yet.
+        """
         slips = self._slip(machine, state)
         return jnp.where(slips == 0, self._from_rest(machine, s, state, around), slips)
 
     def guard(self, machine, s, state, mode, *, around: Around | None = None):
         """The velocity along the stop coming to zero; or the force coming to what friction can
-        hold. Nothing happens where the body does not rest on the stop."""
+        hold. Nothing happens where the body does not rest on the stop.
+
+        **Arguments:** as every event's, and `around`, the other modes and who rests where.
+        """
         if around is None or not around.contact:
             return jnp.full_like(s, -1.0)
         drag, pressing = self._forces(machine, s, state, around, mode)
@@ -86,7 +93,10 @@ class ContactFriction(AbstractSwitch):
         return jnp.where(self._rests(machine, around), own, -1.0)
 
     def after(self, machine, s, state, mode, *, around: Around | None = None):
-        """Sticking, or slipping the way the force pulls."""
+        """Sticking, or slipping the way the force pulls.
+
+        **Arguments:** as every event's, and `around`, the other modes and who rests where.
+        """
         # It vanishes to rounding; and with it what that would give to the velocity on the stop.
         stop, along = machine.stops[self.stop], machine.coordinates[self.along]
         both = (machine.coordinates[stop.coordinate], along)
@@ -112,7 +122,12 @@ class ContactFriction(AbstractSwitch):
     def _from_rest(
         self, machine: Any, s: Any, state: Any, around: Around | None, sticks: Any = True
     ) -> Any:
-        """Sticking, if it may, where the force is not too large; else the way that it pulls."""
+        """The mode of a body without velocity along the stop: sticking (0) where the force is not
+        too large, else the way that it pulls.
+
+        **Arguments:** `around`, the other modes and who rests where, `None` if that is not known;
+        `sticks`, whether the body may stick at all.
+        """
         if around is None or not around.contact:
             return jnp.zeros_like(s)
         drag, pressing = self._forces(machine, s, state, around, jnp.zeros_like(s))
@@ -121,7 +136,10 @@ class ContactFriction(AbstractSwitch):
         return jnp.where(holds | ~self._rests(machine, around), 0.0, away)
 
     def _forces(self, machine: Any, s: Any, state: Any, around: Around, mode: Any) -> Any:
-        """Those along and on the stop, in a mode of it."""
+        """The force along the stop and that which presses on it.
+
+        **Arguments:** `around`, the other modes and who rests where; `mode`, that of this friction.
+        """
         modes = around.instead(mode)
         flow = machine.field(s, state, *modes)
         return held_flow(machine, flow, state, modes, around.contact)[1][around.own]

@@ -21,19 +21,20 @@ _REDUNDANT = 1e-9
 
 
 def push_of(coordinate: Any, state: Any) -> Any:
-    """How a state changes by a contact's force, by so much as changes its velocity by one."""
+    """A contact's push: how the state changes by as much of its force as changes its velocity by
+    one."""
     place, velocity = coordinate.position(state), coordinate.velocity(state)
     one = jnp.ones_like(velocity)
     return jax.jvp(lambda V: coordinate.placed(state, place, V), (velocity,), (one,))[1]
 
 
 def gained(coordinate: Any, state: Any, change: Any) -> Scalar:
-    """What a coordinate's velocity gains as the state changes."""
+    """By how much a coordinate's velocity changes as the state does."""
     return jax.jvp(coordinate.velocity, (state,), (change,))[1]
 
 
 def shares(coordinates: Sequence[Any], state: Any, pushes: Sequence[Any]) -> list[list[Scalar]]:
-    """What each coordinate's velocity gains by each push."""
+    """By how much each coordinate's velocity changes with each push: a row for each coordinate."""
     return [[gained(coordinate, state, push) for push in pushes] for coordinate in coordinates]
 
 
@@ -72,7 +73,7 @@ def _solved(rows: list[list[Scalar]]) -> list[Scalar]:
 
 
 def added(state: Any, amounts: Sequence[Scalar], changes: Sequence[Any]) -> Any:
-    """A tree with so much of each change added."""
+    """A tree to which each change is added, multiplied by its amount."""
     for amount, change in zip(amounts, changes, strict=True):
         state = jtu.tree_map(lambda a, b, amount=amount: a + amount * b, state, change)
     return state
@@ -92,8 +93,8 @@ def rubbed(machine: Any, number: int, friction: Any, before: Any, after: Any) ->
     the stop reversed and scaled by the tangential restitution, if the impulse that this takes is at
     most `level` times that of the stop; else it slips against that much.
 
-    **Arguments:** the friction on the stop; the states before the impact, and after one that is as
-    smooth as it is hard: the velocity towards the stop is that one's.
+    **Arguments:** `friction`, the one on this stop; `before` and `after`, the states before the
+    impact and after one without friction, whose velocity towards the stop is kept.
     """
     stop = machine.stops[number]
     body, along = machine.coordinates[stop.coordinate], machine.coordinates[friction.along]
@@ -120,8 +121,8 @@ def rubbed(machine: Any, number: int, friction: Any, before: Any, after: Any) ->
 
 
 def _slipping(gains: list[list[Scalar]], wanted: Scalar, ratio: Any) -> tuple[Scalar, Scalar]:
-    """How much of both pushes there is, so that the velocity towards the stop changes as wanted,
-    with so much of that along the stop for one of the other."""
+    """How much there is of both pushes, the stop's and that along it, if the velocity towards the
+    stop changes as wanted and the push along it is `ratio` times the stop's."""
     pushed = wanted / (1 + ratio * gains[0][1])
     return pushed, ratio * pushed
 
@@ -144,7 +145,7 @@ class Held(NamedTuple):
 def held_by(machine: Any, state: Any, modes: Sequence[Any], contact: Sequence[Any]) -> Held:
     """What holds the bodies that rest on stops.
 
-    **Arguments:** the modes of the machine's switches, which come first; `contact` as in `Around`.
+    **Arguments:** `modes`, those of the machine's switches first; `contact` as in `Around`.
     """
     limited = sorted({stop.coordinate for stop in machine.stops})
     bodies = [machine.coordinates[k] for k in limited]
@@ -175,7 +176,7 @@ def held_flow(
     velocities, all at once: contacts that share a body are held by forces that depend on each
     other, and on the friction there.
 
-    **Arguments:** the modes of the machine's switches, which come first; `contact` as in `Around`.
+    **Arguments:** `modes`, those of the machine's switches first; `contact` as in `Around`.
 
     **Returns:** the rate, and of each friction on a stop, by its place among the switches, the
     force along the stop and that which presses on it.

@@ -69,8 +69,8 @@ class AbstractEvent(Shown):
 
     @property
     def from_below(self) -> bool:
-        """Whether it happens only once its guard has been below zero since the last jump. A guard
-        that is another one after the event need not ask for that."""
+        """Whether the event happens only once its guard has been below zero since the last jump. It
+        need not ask for that if its guard is another function after the event."""
         return True
 
     @abc.abstractmethod
@@ -83,8 +83,8 @@ class AbstractEvent(Shown):
 
     def jump(self, *args: Any, **kwargs: Any) -> Any:
         """`jump(machine, s, state, *modes)`: the state after the event as a smooth function of that
-        before it, also of one beside the event: what `after` only puts right to rounding is left as
-        it is."""
+        before it, for derivatives. It has to hold for states beside the event too, and leaves out
+        what `after` only corrects to rounding."""
         return self.after(*args, **kwargs)[0]
 
     def happens(self, machine: Any, s: Any, state: Any, *modes: Any) -> Any:
@@ -105,8 +105,8 @@ class AbstractEvent(Shown):
         return self.begin(machine, s, state)
 
     def speed(self, machine: Any, state: Any, rate: Any) -> Any:
-        """How fast it is met, in the machine's words: by default how fast the guard rises by s,
-        which is the `rate`."""
+        """How fast the event is met, in the machine's words: by default `rate`, how fast its guard
+        rises by s."""
         return rate
 
 
@@ -173,8 +173,8 @@ class AbstractSwitch(AbstractEvent):
         return False
 
     def contribution(self, machine: Any, s: Scalar, state: Any, mode: Scalar) -> Any:
-        """What it adds to the machine's field in this mode, where it knows: of a soft stop the
-        acceleration of its coordinate, of dry friction the force on the body that rubs."""
+        """What the switch adds to the machine's field in this mode, where it knows that: a soft
+        stop the acceleration of its coordinate, dry friction the force on the body that rubs."""
         raise NotImplementedError(f"A {type(self).__name__} has no `contribution`.")
 
 
@@ -194,52 +194,62 @@ class Section(AbstractEvent):
         return (s if clock is None else clock) - jnp.asarray(machine.cycle, jnp.result_type(s))
 
     def after(self, machine, s, state, *modes):
-        """As the next cycle begins."""
+        """The state as the next cycle begins."""
         return machine.renewed(state), modes
 
 
 def events_of(machine: Any) -> tuple[AbstractEvent, ...]:
-    """All events of a machine, by which number they go: its stops, its switches, those of other
-    kinds, its section."""
+    """All events of a machine, in the order in which they are numbered: its stops, its switches,
+    its other events, its section."""
     return (*machine.stops, *machine.switches, *machine.events, Section())
 
 
 def is_autonomous(machine: Any, state: Any) -> bool:
-    """Whether an event ends the cycles of a machine."""
+    """Whether an event ends the cycles of a machine, instead of its clock."""
     ends = any(event.ends_cycle for event in events_of(machine)[:-1])
     return ends or machine.section(state) is not None
 
 
 def section_number(machine: Any) -> int:
-    """The number of the section."""
+    """The section's number among the machine's events: the last."""
     return len(events_of(machine)) - 1
 
 
 def guard_of(
     machine: Any, number: int, s: Any, state: Any, modes: Modes, contact: tuple[Any, ...] = ()
 ) -> Scalar:
-    """What rises through zero at one of a machine's events, in these modes of it.
+    """The guard of one of a machine's events, which rises through zero where it happens.
 
-    **Arguments:** `contact` as in `Around`.
+    **Arguments:** `number`, the event's; `modes`, all of the machine; `contact` as in `Around`.
     """
     event, own, more = event_of(machine, number, modes, contact)
     return event.guard(machine, s, state, *modes[own], **more)
 
 
 def jump_of(machine: Any, number: int, s: Any, state: Any, modes: Modes) -> Any:
-    """The state after one of its events, also of one beside it."""
+    """The state after one of a machine's events as a smooth function of that before it (see
+    `AbstractEvent.jump`).
+
+    **Arguments:** `number`, the event's; `modes`, all of the machine.
+    """
     event, own, _ = event_of(machine, number, modes, ())
     return _rubbed(machine, number, state, event.jump(machine, s, state, *modes[own]))
 
 
 def happens_at(machine: Any, number: int, s: Any, state: Any, modes: Modes) -> Any:
-    """Whether one of its events happens where its guard has risen; `None` if always."""
+    """Whether one of a machine's events happens where its guard has risen; `None` if always.
+
+    **Arguments:** `number`, the event's; `modes`, all of the machine.
+    """
     event, own, _ = event_of(machine, number, modes, ())
     return event.happens(machine, s, state, *modes[own])
 
 
 def value_of(machine: Any, number: int, s: Any, state: Any, modes: Modes) -> Any:
-    """What the log of events keeps of one of its events."""
+    """What the log of events keeps of one of a machine's events.
+
+    **Arguments:** `number`, the event's; `modes`, all of the machine.
+    """
     event, own, _ = event_of(machine, number, modes, ())
     return event.value(machine, s, state, *modes[own])
 
@@ -247,9 +257,10 @@ def value_of(machine: Any, number: int, s: Any, state: Any, modes: Modes) -> Any
 def after_event(
     machine: Any, number: int, s: Any, state: Any, modes: Modes, contact: tuple[Any, ...] = ()
 ) -> tuple[Any, Modes]:
-    """State and modes after one of its events.
+    """State and modes after one of a machine's events.
 
-    **Arguments:** `contact` as in `Around`.
+    **Arguments:** `number`, the event's; `modes`, all of the machine before it; `contact` as in
+    `Around`.
     """
     event, own, more = event_of(machine, number, modes, contact)
     new, changed = event.after(machine, s, state, *modes[own], **more)
@@ -259,7 +270,7 @@ def after_event(
 
 
 def _rubbed(machine: Any, number: int, before: Any, after: Any) -> Any:
-    """The state after an impact on a stop with what friction makes of it."""
+    """The state after an impact, with what friction on the stop makes of it."""
     friction = rubbing_on(machine, number)
     return after if friction is None else rubbed(machine, number, friction, before, after).state
 
@@ -277,14 +288,15 @@ def rubs(machine: Any) -> bool:
 
 
 def mode_number(machine: Any, number: int) -> int:
-    """Which mode an event holds that holds one."""
+    """The place among the machine's modes of the one that an event holds."""
     return sum(event.holds_mode for event in events_of(machine)[:number])
 
 
 def event_of(
     machine: Any, number: int, modes: Modes, contact: tuple[Any, ...]
 ) -> tuple[AbstractEvent, slice, dict[str, Around]]:
-    """An event, which of the machine's modes it is given, its own or all, and what else."""
+    """An event, which of the machine's modes its methods get (its own or all), and what keyword
+    arguments besides."""
     event = events_of(machine)[number]
     if not event.holds_mode:
         return event, slice(None), {}
@@ -312,10 +324,10 @@ def struck_modes(
     own: Sequence[Any] | None = None,
     contact: tuple[Any, ...] = (),
 ) -> Modes:
-    """The modes after a jump, which left this state; the machine's own are those given, or stay as
-    they are.
+    """The modes after the state has jumped to this one.
 
-    **Arguments:** `contact` as in `Around`.
+    **Arguments:** `modes`, before the jump; `own`, the machine's own after it, which stay as they
+    are if left out; `contact` as in `Around`.
     """
     held = []
     for number, event in enumerate(events_of(machine)):

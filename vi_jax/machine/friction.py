@@ -55,15 +55,15 @@ class DryFriction(AbstractSwitch):
         return False
 
     def sliding(self, machine: Any, s: Any, state: Any, mode: Any) -> Any:
-        """The friction on a body that slides forward or backward; that on one at rest (mode 0)
-        which begins to."""
+        """The size of friction on a body that slides forward or backward; in mode 0 on one that
+        begins to."""
         level = self.level
         if callable(level):
             level = level(mode * self.velocity(machine, state))
         return level if self.load is None else level * self.load(machine, s, state)
 
     def sticking(self, machine: Any, s: Any, state: Any) -> Any:
-        """The most that friction holds."""
+        """The largest force that friction can balance on a body at rest."""
         return self.sliding(machine, s, state, jnp.zeros_like(s)) * self.static_ratio
 
     def contribution(self, machine, s, state, mode):

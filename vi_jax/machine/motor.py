@@ -46,7 +46,8 @@ class Motor(AbstractDrive):
         require_ranges(self)
 
     def field(self, scene, s, state, pushes):
-        """Of body and shaft: by crank angle (Eq. 8 to 9 of the paper) or by time (Eq. 5 to 7)."""
+        """d(state)/ds of body and shaft: by crank angle (Eq. 8 to 9 of the paper) or by time (Eq. 5
+        to 7)."""
         by_angle = scene.clock_name == "phase"
         slide = scene.crank.slide(scene.phase_at(s if by_angle else state.phase))
         # By angle all is divided by W. Products with 1/W are shared: a power series pays for each.
@@ -71,7 +72,7 @@ class Motor(AbstractDrive):
         return self.line(state.W, pace), ()
 
     def usual(self, name, known):
-        """The no-load speed κ w0."""
+        """A speed that a start leaves out is the no-load speed κ w0."""
         return self.control * self.no_load_speed
 
     def rate(self):

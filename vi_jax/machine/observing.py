@@ -26,7 +26,8 @@ class Observed(Shown):
         )
 
     def observed_later(self: Machine, since_section: Any) -> Machine | None:
-        """The same machine with its section moved by so much of its clock; `None` if it cannot."""
+        """The same machine with its section moved by so much of its clock; `None` for a machine
+        whose section cannot be moved."""
         return None
 
     def renewed(self, state: State) -> State:

@@ -29,7 +29,7 @@ Number = Float[Array, "..."] | float
 
 
 def _si(name: str, unit: str, default: float | None) -> Any:
-    """A number in this unit, or a quantity of `pint` that can be given in it."""
+    """A field for a number in this unit, or for a quantity of `pint` that can be given in it."""
     convert = real(name) if default is not None else optional_real(name)
     return eqx.field(
         default=default,

@@ -149,11 +149,13 @@ class Scene(ShaftMachine):
         return since_section if self.section_phase is None else since_section + self.section_phase
 
     def start(self, *, Y: Any = 0.0, V: Any = 0.0, W: Any = None, M: Any = None, **others) -> Any:
-        """A state on the section: position (unit: a), velocity (a ω), crank speed (ω) and the
-        torque of a `DCMotor` (J ω²); `others` are what a drive of one's own has besides.
+        """A state on the section.
 
         `W` belongs to motor scenes and defaults to the motor's no-load speed κ w0. `M` defaults to
         the steady torque at that speed; a motor that is being switched on has `W=0, M=0`.
+
+        **Arguments:** position `Y` (unit: a), velocity `V` (a ω), crank speed `W` (ω) and the
+        torque `M` of a `DCMotor` (J ω²); `others` are what a drive of one's own has besides.
 
         **Raises:** `ValueError` if a number is not finite, or is given to a drive that has none.
         """
@@ -165,12 +167,13 @@ class Scene(ShaftMachine):
 
     @property
     def state_type(self) -> Any:
-        """Of a state in the phase clock."""
+        """The class of a state in the phase clock."""
         return self.drive.state
 
     @property
     def timed_states(self) -> dict[type, type]:
-        """By the drive's state class, what its states are by time."""
+        """For the drive's class of states, that of its states by time; empty where both are the
+        same."""
         timed = self.drive.timed_state
         return {} if timed is None else {self.drive.state: timed}
 
@@ -184,7 +187,8 @@ class Scene(ShaftMachine):
         return self.drive.field(self, s, state, self._pushes(s, state, modes))
 
     def pull(self, stretch: Any, speed: Any, pushes: Iterable[Any]) -> Any:
-        """d²Y/dτ² from U - Y, V and what pushes; divided by W they give dV/dφ."""
+        """d²Y/dτ² from U - Y, V and what compliant stops add; from all three divided by W,
+        dV/dφ."""
         pull = stretch - 2 * self.damping_ratio * speed
         for push in pushes:
             pull = pull + push
@@ -248,12 +252,13 @@ class Scene(ShaftMachine):
         return any(gap is None or not (gap > 1).all() for gap in gaps)
 
     def in_range(self, start: Any) -> Bool[Array, ""]:
-        """As its parts say; with room between two stops, and not beyond the section."""
+        """Whether all parts are in range, there is room between two stops, and the start is not
+        beyond the section."""
         good = super().in_range(start)
         return good & (_room(self.stops) > 0) if len(self.stops) == 2 else good
 
     def alive(self, state: Any) -> jax.Array | None:
-        """In the phase clock of a motor the crank must turn forward."""
+        """Whether the crank turns forward, in the phase clock of a motor; `None` for others."""
         return state.W > 0 if self.is_paced(state) else None
 
 

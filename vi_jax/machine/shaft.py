@@ -33,13 +33,13 @@ class ShaftMachine(AbstractMachine):
 
     @property
     def state_type(self) -> Any:
-        """Of a state in the phase clock."""
+        """The class of a state in the phase clock."""
         raise NotImplementedError
 
     @property
     def timed_states(self) -> dict[type, type]:
-        """Of the states with a speed of the shaft: what they are by time, with `phase` at the
-        end."""
+        """For each class of states that has the speed of the shaft, that of the same states by
+        time, with `phase` as one more component at the end."""
         raise NotImplementedError
 
     def is_timed(self, state: Any) -> bool:
@@ -47,7 +47,8 @@ class ShaftMachine(AbstractMachine):
         return type(state) in self.timed_states.values()
 
     def is_paced(self, state: Any) -> bool:
-        """Whether time passes at the pace of the shaft, whose speed is part of the state."""
+        """Whether time is not the independent variable, but passes by the speed of the shaft in the
+        state."""
         return type(state) in self.timed_states
 
     def in_clock(self: Machine, clock: str) -> Machine:
@@ -104,7 +105,7 @@ class ShaftMachine(AbstractMachine):
         return 2 * pi / duration
 
     def in_range(self, start: Any) -> Bool[Array, ""]:
-        """As its parts say, and not beyond the section."""
+        """Whether all parts are in range, and the start is not beyond the section."""
         good = super().in_range(start)
         return good & (start.phase < 2 * pi) if self.is_timed(start) else good
 

@@ -105,7 +105,8 @@ class SoftStop(Wall, AbstractSwitch):
 
     @property
     def analytic(self) -> bool:
-        """Of a force that is straight in the depth; others have a kink or a root at first touch."""
+        """Whether the force has a power series at first touch: where it is straight in the depth.
+        Others have a kink or a root there."""
         return self.law.is_analytic
 
     @property
@@ -129,7 +130,8 @@ class SoftStop(Wall, AbstractSwitch):
         return jnp.where(mode > 0, -self.sign * self.force(*self.depth(machine, state)), 0.0)
 
     def begin(self, machine, s, state):
-        """Touching, unless apart or let go of."""
+        """The mode of a motion that begins: touching, unless the body is apart or has been let go
+        of."""
         depth, rate = self.depth(machine, state)
         inside = (depth > 0) | ((depth == 0) & (rate > 0))
         holds = TOUCHING

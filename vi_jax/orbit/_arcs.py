@@ -30,8 +30,8 @@ _DRIFTS = 0.5
 
 
 def _run(the_map: CycleMap, state: Any, impact_log: int) -> Run:
-    """The motion with its impacts: one program for the look at the guess and for that at the orbit,
-    where they are as long."""
+    """The motion with its impacts. The look at the guess and that at the orbit ask for the same
+    program, if they are as long."""
     places = _places(the_map, state)
     return simulate(
         the_map.machine, state, the_map.cycles, method=the_map.method,
@@ -40,7 +40,8 @@ def _run(the_map: CycleMap, state: Any, impact_log: int) -> Run:
 
 
 def _places(the_map: CycleMap, state: Any) -> int:
-    """Places of a cycle that are looked at: of an autonomous machine only its section."""
+    """At how many places of a cycle the state is looked at: for an autonomous machine only on its
+    section."""
     return 1 if is_autonomous(the_map.machine, state) else _PLACES
 
 
@@ -99,7 +100,8 @@ class ObservedArc(NamedTuple):
 
 
 def observe_arc(arc: CycleMap, state: Any, impact_log: int) -> ObservedArc:
-    """What an arc does from the `state` in which it begins; differentiated by columns."""
+    """What is observed of an arc that begins in `state`; its derivatives are taken by columns (see
+    `forward_jacobian`)."""
 
     @forward_jacobian
     def seen(arc, state):
@@ -131,8 +133,8 @@ def observe_arc(arc: CycleMap, state: Any, impact_log: int) -> ObservedArc:
 
 
 def by_the_first_state(jacobians: Float[Array, "arcs cycles n n"]) -> Float[Array, "all n n"]:
-    """Derivatives of the states after each cycle by the first state of the first arc, from those by
-    the first state of their own arc: each after those of the arcs before."""
+    """Derivatives of the states after each cycle of all arcs by the first state of the first arc,
+    from those by the first state of their own arc: a running product."""
     passed, all_of_them = jnp.eye(jacobians.shape[-1], dtype=jacobians.dtype), []
     for own in jacobians:
         all_of_them.append(own @ passed)

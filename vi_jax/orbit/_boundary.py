@@ -251,7 +251,8 @@ class SymmetryCondition(eqx.Module):
     """w."""
 
     def instead(self, problem: Shooting, missing: Array, x: Array) -> Array:
-        """The equations' residual F, `missing`, with that combination exchanged."""
+        """The equations' residual F, given as `missing`, with the combination l·F exchanged for
+        w·D."""
         departs = self.weight @ images(problem, x)
         return missing + self.left * (departs - self.left @ missing)
 
@@ -311,7 +312,11 @@ def _inside(step: Step, bounds: Intervals) -> bool:
 
 
 def _cut(advance: Any, here: Step, new: Step, bounds: Intervals, scale: np.ndarray) -> Step:
-    """The last point inside the bounds, by halving the step."""
+    """The last point inside the bounds between two, found by halving the step.
+
+    **Arguments:** `advance` as for `walk`; `here` and `new`, inside and outside; `scale`, the size
+    of each unknown.
+    """
     low, high = 0.0, float(np.dot(here.tangent, (new.x - here.x) / scale))
     last = here
     for _ in range(30):

@@ -31,10 +31,11 @@ from ._forward_jacobian import forward_jacobian
 
 
 class CycleMap(eqx.Module):
-    """The Poincaré map over `cycles` drive cycles; made by `cycle_map`.
+    """The Poincaré map of a machine over `cycles` drive cycles, from a state on the section to the
+    state there; made by `cycle_map`.
 
     Differentiable in forward and in reverse mode, to any order, by the state and by every leaf of
-    the machine; clean under `jit` and `vmap`. Where a run fails the values are NaN.
+    the machine; can be used under `jit` and `vmap`. Where a run fails the values are NaN.
     """
 
     machine: AbstractMachine
@@ -115,8 +116,8 @@ def _usual(machine: AbstractMachine) -> AbstractMethod:
 
 
 def adopted(machine: AbstractMachine, state: Any, name: str = "state") -> Any:
-    """The state in the argument of this name as a cycle map needs it, in floating-point arrays of
-    one type."""
+    """A state as a cycle map needs it, in floating-point arrays of one type; `name` is the argument
+    that messages blame."""
     state = machine.adopt(machine.in_cycle_state(name, state))
     check_reals(name, state)
     if machine.clock(state) is not None:

@@ -64,5 +64,5 @@ def steps_of(
 
 @compiled
 def _fewest(method: AbstractMethod, machine: AbstractMachine, like: Any) -> Scalar | float:
-    """Steps of a cycle where they are as long as they may be."""
+    """The number of steps in a cycle if each is as long as the method allows."""
     return machine.cycle / method.longest(machine, jnp.zeros(()), like)

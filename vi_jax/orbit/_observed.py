@@ -48,8 +48,8 @@ def apart(
     each other, or the least distance, where one is met, of those that are not met there. Negative
     where the motion is none of the machine's.
 
-    **Arguments:** the machine; its events in their order, the modes of the flight that each begins,
-    its clock, the time to the next one, and the state just before it.
+    **Arguments:** `events` in their order; of each, `modes` of the flight that it begins, its
+    `clock`, in `lengths` the time to the next one, in `states` the state just before it.
     """
     least = jnp.asarray(jnp.inf, clock.dtype)
     for i, event in enumerate(events):

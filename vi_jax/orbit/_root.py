@@ -35,8 +35,9 @@ def _missing(
 def root_of(arc: CycleMap, guess: Any, root_finder: AbstractRootFinder) -> Found:
     """Where a root finder comes to from a guess; differentiated by the numbers of `arc`.
 
-    **Arguments:** the map over one arc; a state on its section, in which the first arc begins, the
-    others where the motion from there is then; the root finder, which says how many arcs there are.
+    **Arguments:** `arc`, the map over one arc; `guess`, a state on its section, in which the first
+    arc begins, the others where the motion from there is then; `root_finder`, which says how many
+    arcs there are.
 
     **Returns:** `Found`, all its numbers floats; its `x` are the states in which the arcs begin, as
     rows.

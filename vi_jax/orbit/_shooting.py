@@ -137,7 +137,8 @@ class Shooting(eqx.Module):
         return tuple(modes[j] for j in range(len(self.modes[0])))
 
     def _each(self, leg: Leg, function: Callable[..., Any], *inputs: Any) -> Any:
-        """`function(event, *inputs)` of the event that begins a leg."""
+        """`function(event, *inputs)` for the event that begins a leg, whose number may be
+        traced."""
         kinds = sorted(set(self.events))
         which = jnp.asarray([kinds.index(event) for event in self.events])[leg]
         return jax.lax.switch(which, [partial(function, kind) for kind in kinds], *inputs)
@@ -274,7 +275,8 @@ class Shooting(eqx.Module):
         return jacobian + jnp.outer(after - jacobian @ before, slope) / rate, approach
 
     def _order(self, machine: AbstractMachine, leg: Leg, s: Scalar, u: Vector) -> Scalar:
-        """Whether a switch goes into the mode of the leg that begins with its event: 1 or -1."""
+        """1 if a switch goes, at the event that begins a leg, into the mode that the leg has; else
+        -1."""
 
         def order(event, s, u):
             if not event.of(machine).holds_mode:

@@ -52,8 +52,11 @@ def table_of(
     values: np.ndarray,
     units: Mapping[str, str],
 ) -> "xr.Dataset":
-    """What the function makes of each orbit, beside the values of the parameter (see
-    `Branch.table`)."""
+    """What a function makes of each orbit, as a data set over them (see `Branch.table`).
+
+    **Arguments:** `parameter` and `values`, the name of the branch's parameter and its value for
+    each orbit; `units`, the machine's.
+    """
     rows = [_numbers(function(orbit)) for orbit in orbits]
     shapes = {name: x.shape for name, x in rows[0].items()}
     for i, row in enumerate(rows):

@@ -60,7 +60,7 @@ class _Found(NamedTuple):
 
 
 class _Guard(NamedTuple):
-    """What turns: the guard of an event, by the event's number; of a machine on a flight."""
+    """Something that may turn along a flight: the guard of the machine's event of this number."""
 
     number: int
 
@@ -73,11 +73,11 @@ class _Guard(NamedTuple):
         return self.value(flight, s, flight.unravel(u))
 
     def rate(self, flight: Flight, s: Scalar, u: Vector) -> Scalar:
-        """d/ds of the guard along the flight, or a number of its sign."""
+        """d/ds of the guard along the flight, or another number of the same sign."""
         return self.rates(flight, flight.smooth, s, u).v
 
     def happens(self, flight: Flight, s: Scalar, u: Vector, length: Scalar) -> Flag:
-        """Whether the event would happen if its guard were zero a length from here."""
+        """Whether the event would happen if its guard were zero at a `length` from here."""
         if not events_of(flight.machine)[self.number].from_below:
             return jnp.ones((), bool)
         there = flight.unravel(_stepped(flight, (s, length, u)))
@@ -94,7 +94,7 @@ class _Guard(NamedTuple):
 
 
 class _Body(_Guard):
-    """What turns: a coordinate, by its number among the machine's."""
+    """Something that may turn along a flight: the machine's coordinate of this number."""
 
     def value(self, flight, s, state):
         return flight.machine.coordinates[self.number].position(state)
@@ -160,7 +160,8 @@ def turns_of(
 
 
 def _stepped(flight: Flight, inputs: tuple[Scalar, Scalar, Vector]) -> Vector:
-    """The state after a step from clock, by a length, from a state."""
+    """The state after one step; `inputs` are the clock, the length of the step, and the state
+    before it."""
     s, h, u = inputs
     return flight.step(s, s + h, u, Beside(jnp.zeros_like(s), {}))[0]
 

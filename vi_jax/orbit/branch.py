@@ -310,6 +310,11 @@ def _branch(
     problem: Shooting, name: str, steps: list[Step], special: list[SpecialPoint],
     ends: tuple[str, str], scale: np.ndarray,
 ) -> Branch:  # fmt: skip
+    """The branch as arrays, from its points.
+
+    **Arguments:** `name`, the parameter's; `steps`, the points in their order; `special` and `ends`
+    as in `Branch`; `scale`, the size of each unknown.
+    """
     xs = np.stack([step.x for step in steps])
     impacts = np.asarray(problem.impacts, int)
 

@@ -199,6 +199,11 @@ def _least_period(sections: Float[Array, "cycles states"], error: Array) -> Arra
 def _verdict(
     found: Array, smaller: Array, near_grazing: Array, drifts: Array, no_run: Array
 ) -> ORBIT_RESULTS:
+    """The result of a search, from flags.
+
+    **Arguments:** `found`, an orbit; `smaller`, its period; `near_grazing`, where the search ended;
+    `drifts`, the motion; `no_run`, the guess cannot be simulated.
+    """
     where, results = ORBIT_RESULTS.where, ORBIT_RESULTS
     missed = where(near_grazing, results.grazing, results.no_orbit)
     missed = where(drifts, results.drifts, missed)

@@ -33,7 +33,7 @@ class AbstractRootFinder(eqx.Module):
 
     @abc.abstractmethod
     def init(self, residual: Residual, x: Unknowns) -> Any:
-        """What it remembers between its steps: any pytree."""
+        """The memory that `step` begins with: any pytree."""
 
     @abc.abstractmethod
     def step(
@@ -88,7 +88,7 @@ class Newton(AbstractRootFinder):
         return optx.Dogleg(rtol=1e-15, atol=1e-15, linear_solver=least)
 
     def init(self, residual, x):
-        """The dogleg's state."""
+        """The memory at first: the dogleg's state."""
         fn = _with_aux(residual)
         shapes, aux = eqx.filter_eval_shape(fn, x, None)
         return self._solver(x.dtype).init(fn, x, None, {}, shapes, aux, frozenset())
@@ -140,7 +140,7 @@ class Gradient(AbstractRootFinder):
         return optax.adam(optax.cosine_decay_schedule(0.02, self.max_steps))
 
     def init(self, residual, x):
-        """The optimiser's state."""
+        """The memory at first: the optimiser's state."""
         return self._optimiser.init(x)
 
     def step(self, residual, x, memory):

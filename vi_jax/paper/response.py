@@ -152,7 +152,11 @@ def _branches(
 
 @partial(jit, static_argnames="settle")
 def _carried(scene: Scene, numbers, values, starts, settle: int) -> Sweep:
-    """One sweep for each row of values."""
+    """One sweep for each row of values, all in one program.
+
+    **Arguments:** `numbers`, k and ξ of each row, (rows, 2); `values` of ζ, (rows, values);
+    `starts`, a state with one leading axis; `settle` in cycles.
+    """
 
     def one(numbers, values, start):
         here = with_numbers(scene, numbers[0], numbers[1], values[0])
@@ -181,7 +185,12 @@ def _sweeps(
     closed: list[dict[int, ClosedFormOrbits]],
     part: np.ndarray | None = None,
 ) -> list[tuple[dict[str, Sweep], dict[str, np.ndarray]]]:
-    """Run-up and close-down of each system, all in one program."""
+    """Run-up and close-down of each system, all in one program.
+
+    **Arguments:** `numbers`, k and ξ of each system; `ratios`, the values of ζ, rising; `closed`,
+    of each system the closed forms by their period; `part`, flags of those ratios inside the range
+    of impacts, where close-downs are to begin in it.
+    """
     lanes = [(k, xi, up) for k, xi in numbers for up in (True, False)]
     pairs = np.array([lane[:2] for lane in lanes])
     values = np.stack([ratios if up else ratios[::-1] for *_, up in lanes])
@@ -222,7 +231,11 @@ def _sweeps(
 
 
 def _again(scene: Scene, flat: Sweep, pairs: np.ndarray, values: np.ndarray, which) -> None:
-    """Settle the values of these indices for another 1,000 cycles, and put the results in place."""
+    """Settle some values for another 1,000 cycles, and put the results in place.
+
+    **Arguments:** `flat`, the sweeps as one row, changed in place; `pairs` and `values`, k and ξ,
+    and ζ, of each; `which`, the indices to settle.
+    """
     for some in _chunks(which):
         ends = jtu.tree_map(lambda x, some=some: x[some, -1], flat.sections)
         later = _carried(scene, pairs[some], values[some][:, None], ends, 1000)

@@ -262,7 +262,11 @@ def _starts_in(
 def _attractor(
     number: int, motion: np.ndarray, names: list[str], label: np.ndarray, impacts: np.ndarray
 ) -> Attractor:
-    """A motion, from its section states, the label of each start and what impacts each had."""
+    """A motion that starts came to, with its share of them.
+
+    **Arguments:** `number`, its label; `motion`, its section states, (period, states); `names` of
+    their components; `label` and `impacts`, of each start the motion it came to and its impacts.
+    """
     here = label == number
     fraction = float(np.mean(here))
     return Attractor(

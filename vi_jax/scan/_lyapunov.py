@@ -178,6 +178,11 @@ def lyapunov(
 
 @compiled
 def _lyapunov(the_map: CycleMap, start, cycles: int, settle, number: int) -> Lyapunov:
+    """The exponents of one motion.
+
+    **Arguments:** `start`, a state on the section; `settle`, cycles before those observed; `number`
+    of exponents.
+    """
     machine, method, rests = the_map.machine, the_map.method, the_map.rests
     before = simulate(
         machine, start, 1, settle=settle, method=method, rests=rests, record="sections"

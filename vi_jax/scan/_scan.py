@@ -187,6 +187,9 @@ def _computed(
 ) -> "xr.Dataset":
     """What a program finds on a grid, checked before any work.
 
+    **Arguments:** `blocks`, the grid; `place`, where it is computed; `store`, a path to keep it at,
+    `None` for the memory; `progress`, whether a bar is shown.
+
     **Raises:** as `scan`.
     """
     program = check_corners(program, blocks)
@@ -243,6 +246,10 @@ def _blocks(
 ) -> Blocks:
     """The grid in blocks of `lanes`: as in the store if there is one, or as suits the workplace.
 
+    **Arguments:** `grid`, values by axis; `place`, where it is computed; `paired`, whether the axes
+    have one length and are gone along together; `store`, a path or `None`; `lanes`, `None` to
+    choose.
+
     **Raises:** `ValueError` if a block would not fit into the memory.
     """
     total = Blocks(grid, 1, paired=paired).total
@@ -280,7 +287,12 @@ def _better(program: ScanProgram) -> AbstractMethod:
 def _verified(
     data: "xr.Dataset", blocks: Blocks, lanes: int, program: ScanProgram, place: _Workplace
 ) -> dict[str, Any]:
-    """How so many of the lanes, or all, come out by a better program; attributes by their names."""
+    """How some of the lanes, drawn by chance, come out by a better program; attributes by their
+    names.
+
+    **Arguments:** `data`, what was found; `lanes`, how many (at most all); `program`, the better
+    one; `place`, where it is computed.
+    """
     total = data["result"].size
     lanes = min(lanes, total)
     drawn = np.sort(np.random.default_rng(0).choice(total, lanes, replace=False))

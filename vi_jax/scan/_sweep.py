@@ -263,7 +263,10 @@ def sweep(
 
 
 def _in_parts(machine, parameter, values, start, *options) -> Sweep:
-    """Some values at a time, all by one program, so that an interrupt loses few of them."""
+    """Some values at a time, all by one program, so that an interrupt loses few of them.
+
+    **Arguments:** as `_sweep`.
+    """
     if values.size <= _AT_ONCE:
         return _sweep(machine, parameter, values, start, *options)[1]
     missing = -values.size % _AT_ONCE  # filled up by what ends at once
@@ -304,7 +307,10 @@ def taken_along(machine: AbstractMachine, state: Any) -> Any:
 def _sweep(
     machine, parameter, values, start, settle, cycles, method, rests, tolerance, max_steps
 ) -> tuple[Any, Sweep]:
-    """The state after the last value, and what was found at each."""
+    """The state after the last value, and what was found at each.
+
+    **Arguments:** as `sweep`, all of them checked.
+    """
 
     def one(state, value):
         here = with_leaf(machine, parameter, value)

@@ -129,6 +129,9 @@ def run_here(
     """The blocks `todo` with their numbers, as they are done, each on one core, several at a time.
 
     On an accelerator, or over several devices, one at a time.
+
+    **Arguments:** `blocks`, the whole grid; `todo`, which of its blocks; `workers`, threads;
+    `devices`, on how many a block is spread.
     """
     if devices > 1 or jax.default_backend() != "cpu":
         workers = 1

@@ -71,8 +71,11 @@ class AbstractMeasure(eqx.Module):
         pass_number: Any = 0,
         rests: bool | None = None,
     ) -> Numbers:
-        """Costlier numbers, only for lanes that need them; they replace those found. `state` is
-        that after the cycles observed, at every pass; `rests` is as for `simulate`."""
+        """Costlier numbers, only for lanes that need them; they replace those found.
+
+        **Arguments:** `state`, that after the cycles observed, at every pass; `found`, the numbers
+        so far; `pass_number`, from 0; `rests` as for `simulate`.
+        """
         return {}
 
 
@@ -217,7 +220,10 @@ class Exponent(AbstractMeasure):
         return jnp.asarray(True)
 
     def refine(self, machine, state, method, found, pass_number=0, rests=None):
-        """Of one lane."""
+        """The exponent of one lane.
+
+        **Arguments:** as `AbstractMeasure.refine`.
+        """
         found_out = lyapunov(
             machine, state, self.observed, settle=0, number=1, method=method, rests=rests
         )
@@ -303,7 +309,10 @@ class Regime(AbstractMeasure):
         )
 
     def refine(self, machine, state, method, found, pass_number=0, rests=None):
-        """Chaotic or not; at the second pass, still or not."""
+        """Chaotic or not; at the second pass, still or not.
+
+        **Arguments:** as `AbstractMeasure.refine`.
+        """
         settle = pass_number * (self.observed + self.lasting)
         out = lyapunov(
             machine, state, self.observed, settle=settle, number=1, method=method, rests=rests

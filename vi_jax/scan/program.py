@@ -158,7 +158,12 @@ class ScanProgram(eqx.Module):
     def _again(
         self, measure: AbstractMeasure, values, wanted, state, out: Numbers, *pass_number: Array
     ) -> Numbers:
-        """`out` with what `measure` finds at another pass, at the lanes that need it only."""
+        """`out` with what a measure finds at another pass, at the lanes that need it only.
+
+        **Arguments:** each of all lanes: `values` of the axes; `wanted`, whether it is computed;
+        `state`, after the cycles observed; `out`, the numbers so far; `pass_number`, for a measure
+        that counts its passes.
+        """
         needs_refinement = jax.vmap(lambda found: measure.needs_refinement(found, *pass_number))(
             out
         )

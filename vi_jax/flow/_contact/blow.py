@@ -16,7 +16,7 @@ _FASTER = 16.0
 
 
 class Blow(NamedTuple):
-    """What the impacts of an instant were to a coordinate that stops limit."""
+    """What the impacts of one instant were to one coordinate."""
 
     struck: Scalar
     """1 + i if stop number i was struck last, 0 if none was."""
@@ -39,7 +39,11 @@ def gains_speed(stop: RigidStop, approach: Scalar, rebound: Scalar) -> Flag | No
 def listed(
     plan: Plan, arrival: Arrival, there: Any, hit: Flag, number: int, approach: Scalar
 ) -> Arrival:
-    """With an impact counted and logged."""
+    """The arrival with an impact counted and logged.
+
+    **Arguments:** `there`, the state in which the stop is met; `hit`, whether it is, by a step that
+    is taken; `number`, the stop's; `approach`, V⁻.
+    """
     clock, speed = clock_at(plan, arrival.s, there), arrival.tally.speed
     return arrival.counting(
         impacts=arrival.tally.impacts + jnp.where(hit, 1.0, 0.0),

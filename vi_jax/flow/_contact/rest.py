@@ -57,6 +57,9 @@ def release(
     """Where coordinate number k leaves the stop that it rests on, if it does.
 
     The force is the acceleration that a free body would have there.
+
+    **Arguments:** `stops`, the machine's; `begin` and `end`, the free coordinate's rates at the
+    ends of the step; `good`, whether the step was; `h`, its length.
     """
     assert lane.contact is not None
     known = allowed(h)

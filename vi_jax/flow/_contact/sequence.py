@@ -51,7 +51,7 @@ class _Round(NamedTuple):
 
 
 class _Instant(NamedTuple):
-    """What is known of an instant beforehand."""
+    """What is known of an instant before its impacts, and stays the same in all of them."""
 
     plan: Plan
     taken: Flag
@@ -81,7 +81,10 @@ def strike_in_turn(
     plan: Plan, taken: Flag, arrival: Arrival, landed: dict[int, Flag], there: Any,
     limited: list[int],
 ) -> tuple[Arrival, dict[int, Blow]]:  # fmt: skip
-    """Of machines with several coordinates that stops limit."""
+    """As `strike`, where stops limit several coordinates, or something rubs.
+
+    **Arguments:** as `strike`; `limited`, the numbers of those coordinates.
+    """
     instant = _instant(plan, taken, arrival, landed, there, limited)
     zero = jnp.zeros_like(arrival.s)
     nothing = tuple(zero for _ in limited)
@@ -114,6 +117,10 @@ def _instant(
     plan: Plan, taken: Flag, arrival: Arrival, landed: dict[int, Flag], there: Any,
     limited: list[int],
 ) -> _Instant:  # fmt: skip
+    """What is known of an instant before its impacts.
+
+    **Arguments:** as `strike_in_turn`.
+    """
     bodies = [plan.machine.coordinates[k] for k in limited]
     gains_ = shares(bodies, there, [push_of(body, there) for body in bodies])
     met = jnp.zeros_like(taken)
@@ -140,7 +147,12 @@ def _coupled(
     plan: Plan, limited: list[int], gains: list[list[Scalar]], touches: dict[int, Flag],
     coupled: list[Flag],
 ) -> list[Flag]:  # fmt: skip
-    """Of each coordinate, whether one of those marked in `coupled` acts on it."""
+    """Of each coordinate, whether a blow on one of those marked is felt by it through closed
+    contacts.
+
+    **Arguments:** `limited`, the numbers of the coordinates; `gains` as from `shares`; `touches`,
+    of each stop whether its contact is closed; `coupled`, the marks.
+    """
     closed = [jnp.zeros((), bool) for _ in limited]
     for number, stop in enumerate(plan.machine.stops):
         i = limited.index(stop.coordinate)
@@ -157,7 +169,7 @@ def _coupled(
 
 
 def _struck(instant: _Instant, x: _Round) -> _Round:
-    """A sequence with its next impacts."""
+    """The sequence after its next impacts: those of the contacts that close fastest."""
     plan, arrival = instant.plan, x.arrival
     stops, state = plan.machine.stops, arrival.state
     velocities = [body.velocity(state) for body in instant.bodies]
@@ -233,8 +245,11 @@ def _thrown(
     instant: _Instant, state: Any, velocities: list[Scalar], slow: list[Flag],
     hits: dict[int, Flag], rebounds: dict[int, Scalar],
 ) -> tuple[Any, list[tuple[Coordinate, Scalar]]]:  # fmt: skip
-    """The state after the rebounds of those stops that are hit, with those coordinates at rest that
-    are so slow; and by how much each coordinate was pushed."""
+    """The state after the next impacts, and by how much each coordinate's velocity was pushed.
+
+    **Arguments:** `state` and `velocities` before them; `slow`, which coordinates come to rest; of
+    each stop, by its number, in `hits` whether it is hit, in `rebounds` the velocity after that.
+    """
     machine = instant.plan.machine
     on, wanted, places = list(slow), [-V for V in velocities], []
     for i, body in enumerate(instant.bodies):
@@ -266,7 +281,7 @@ def _thrown(
 
 
 def _closing(instant: _Instant, x: _Round, velocities: list[Scalar]) -> dict[int, Scalar]:
-    """Of each stop the speed of approach, of those whose turn it may be: negative for others.
+    """Of each stop the speed of approach, if it may be hit next; else a negative number.
 
     Two bodies that meet their stops at one instant, of which neither feels the other, are two
     instants to derivatives: only what a blow brought together, or acts on what is landed upon,

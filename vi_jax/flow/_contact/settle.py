@@ -45,10 +45,11 @@ def settle(
     plan: Plan, lane: Lane, approaches: dict[int, Approach], taken: Flag, arrival: Arrival,
     there: Any, met: Flag, blows: dict[int, Blow],
 ) -> Arrival:  # fmt: skip
-    """The lane at rest on the stops whose impacts were the last before it.
+    """The arrival at rest on those stops whose impacts were the last ones.
 
-    **Arguments:** `approaches` of each coordinate; `there` is the state before the impacts, if any
-    are `met`, the arrival's that behind them.
+    **Arguments:** `approaches`, what the step knew of each coordinate; `taken`, whether the step is
+    taken; `arrival`, behind the impacts; `there`, the state before them; `met`, whether there were
+    any; `blows`, what they were to each coordinate.
     """
     contact = arrival.contact
     if contact is None:
@@ -71,7 +72,12 @@ def _held(
     plan: Plan, lane: Lane, taken: Flag, arrival: Arrival, rests: dict[int, Flag],
     blows: dict[int, Blow], waits: dict[int, Scalar],
 ) -> Arrival:  # fmt: skip
-    """The lane when the impacts are over, with those bodies held that come to rest."""
+    """The arrival when the impacts that never end are over, with those bodies held that come to
+    rest.
+
+    **Arguments:** `taken`, whether the step is taken; of each coordinate in `rests` whether it
+    comes to rest, in `blows` its impacts, in `waits` how long it takes (in s).
+    """
     s, state, time, contact = arrival.s, arrival.state, arrival.time, arrival.contact
     assert contact is not None
     wait = jnp.zeros_like(s)
@@ -127,7 +133,7 @@ def _without_rebounds(
     that went with them: the weight of the hops that are left out rubs instead, while the body is
     held. And the energy that goes with the rebounds.
 
-    **Arguments:** the modes behind the impacts; the others as in `stilled`.
+    **Arguments:** `modes`, behind the impacts; `rests` and `walls` as in `stilled`.
     """
     machine, zero = plan.machine, jnp.zeros_like(modes[0])
     contact = [zero for _ in machine.coordinates]
@@ -154,7 +160,8 @@ def stilled(
     """The state with those coordinates put on their stops that rest, without velocity, all at once;
     and the energy that goes with it.
 
-    **Arguments:** of each coordinate whether it rests, and the stop as in `Lane.contact`.
+    **Arguments:** of each coordinate in `rests` whether it does, in `walls` the stop as in
+    `Lane.contact`.
     """
     bodies = {k: plan.machine.coordinates[k] for k in rests}
     velocities = [body.velocity(state) for body in bodies.values()]
@@ -184,9 +191,9 @@ def _ends(
 ) -> tuple[Flag, Scalar]:  # fmt: skip
     """Whether an impact is one of the endless last ones before rest, and the time they take.
 
-    **Arguments:** the machine with this body free; the number of its coordinate; the speed by s of
-    its rebound; s and a state of the impact; how fast the force on the body grows, where that is
-    known.
+    **Arguments:** `free`, the machine with this body free; `k`, the number of its coordinate;
+    `speed`, by s, of its rebound; `at`, s and a state of the impact; `growth`, how fast the force
+    on the body grows, where that is known.
     """
     (s, state), body = at, plan.machine.coordinates[k]
     sign, gap = plan.wall(k, blow.struck)
@@ -231,7 +238,11 @@ def _before_it_presses(
 def _broken(
     plan: Plan, arrival: Arrival, there: Any, met: Flag, blows: dict[int, Blow]
 ) -> tuple[Scalar, ...]:
-    """As in `Lane`, without the contacts that were struck or pulled apart by the impacts `met`."""
+    """`Lane.contact` without those contacts that were struck or pulled apart by the impacts.
+
+    **Arguments:** `there`, the state before them; `met`, whether there were any; `blows`, what they
+    were to each coordinate.
+    """
     assert arrival.contact is not None
     contact, slack = list(arrival.contact), rounding(plan.machine, there)
     for k, blow in blows.items():
@@ -250,6 +261,9 @@ def _together(
 
     What presses on a body may be another one that comes to rest on it at the same instant: which of
     them do is found by trying, those that rest being held while the others are looked at.
+
+    **Arguments:** `arrival`, behind the impacts; `blows`, what they were to each coordinate;
+    `contact`, the contacts that they left closed.
     """
     s, state = arrival.s, arrival.state
     free = in_modes(plan.machine, arrival.modes)

@@ -41,8 +41,8 @@ def faults(
 ) -> list[tuple[Flag, Any]]:
     """What ends a lane, the first that holds being the reason.
 
-    **Arguments:** whether the trial was rejected; the lane's progress, and what it aims at, after
-    it.
+    **Arguments:** `rejected`, whether the trial was; `progress` and `target`, how far the lane has
+    come and what it aims at, after the trial.
 
     **Returns:** pairs of a condition and a reason, a code of `RESULTS`.
     """
@@ -99,7 +99,7 @@ def comes_back(
     """Whether the field behind a switch points back at its surface, as that before it did: the
     motion would slide along it. `None` for a kind of switch whose motion cannot.
 
-    **Arguments:** the number of the event; the modes, s and the state behind it.
+    **Arguments:** `i`, the number of the event; `modes`, `s` and `state` behind it.
     """
     if not events_of(machine)[i].may_slide:
         return None

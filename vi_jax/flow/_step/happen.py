@@ -19,7 +19,11 @@ from .jump import after_jump
 
 
 def happened(plan: Plan, taken: Flag, arrival: Arrival, c: Crossing, there: Any) -> Arrival:
-    """State and modes after an event in the state `there` that is no impact."""
+    """The arrival after an event that is no impact: a switch, a reset or another kind.
+
+    **Arguments:** `taken`, whether the step is taken; `c`, the event; `there`, the state in which
+    it is met.
+    """
     machine, event = plan.machine, c.event
     met = machine, c.number, arrival.s, there, arrival.modes
     when = happens_at(*met)
@@ -53,8 +57,12 @@ def happened(plan: Plan, taken: Flag, arrival: Arrival, c: Crossing, there: Any)
 def _let_go(
     plan: Plan, arrival: Arrival, taken: Flag, when: Flag, before: tuple[Any, tuple[Scalar, ...]]
 ) -> Arrival:
-    """With those bodies free that were pressed on their stops `before` the modes changed, and are
-    pulled away behind it: a force that jumps has no place where it passes zero."""
+    """The arrival without those bodies at rest that were pressed on their stops before an event and
+    are pulled away behind it: a force that jumps has no zero to be released at.
+
+    **Arguments:** `taken`, whether the step is taken; `when`, whether the event happened; `before`,
+    the state and the modes before it.
+    """
     machine, contact, modes = plan.machine, arrival.contact, arrival.modes
     if contact is None or not modes:
         return arrival
@@ -80,8 +88,12 @@ def _let_go(
 def _jumped(
     plan: Plan, arrival: Arrival, c: Crossing, happens: Flag, there: Any, new: Any
 ) -> Arrival:
-    """Which way the motion goes on after a jump of the state, and what of it rests still; a lane
-    that was put beyond a stop ends."""
+    """The arrival after a jump of the state: which way the motion goes on, and which bodies still
+    rest. A lane whose body was put beyond a stop ends.
+
+    **Arguments:** `c`, the event; `happens`, whether it did; `there` and `new`, the states before
+    and after it.
+    """
     beyond = jnp.zeros_like(happens)
     for stop in plan.machine.stops:
         place = plan.machine.coordinates[stop.coordinate].position(new)

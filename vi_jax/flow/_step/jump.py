@@ -15,11 +15,11 @@ from ..smooth import holding, rounding
 def after_jump(
     plan: Plan, onward: Onward, when: Flag, old: Any, new: Any, s: Scalar
 ) -> tuple[tuple[Scalar, ...], tuple[Scalar, ...] | None]:
-    """Which way the motion goes on, where a state was put in place of another, and what of it still
-    rests: only what was not moved.
+    """The directions of all coordinates, and the stops rested on, after the state was replaced by
+    another one. What was moved rests no longer.
 
-    **Arguments:** how the motion went on (direction and contact are returned); where the state is
-    another one; the states before and after, and s.
+    **Arguments:** `onward`, how the motion went on before; `when`, where the state is replaced;
+    `old` and `new`, the states before and after.
     """
     direction, contact, modes = onward
     directions: list[Any] = list(direction)

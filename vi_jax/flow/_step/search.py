@@ -52,9 +52,10 @@ def first_event(
 ) -> First:
     """The first event of a step.
 
-    **Arguments:** what is known of the events and of each coordinate, not none of either; whether
-    an event was met that the step was aimed at; how often a root is corrected, which a motion's own
-    polynomial is worth: one through a step's ends only says where to aim.
+    **Arguments:** `guards` and `courses`, what is known of the events and of each coordinate, not
+    both empty; `met`, whether the step landed on an event that it was aimed at; `corrections`, how
+    often a root is corrected: a motion's own polynomial is worth it, one through a step's ends only
+    says where to aim.
     """
     found, crossed, any_turn = [], jnp.zeros_like(met), jnp.zeros_like(met)
     for guard, over, curve in guards:
@@ -96,11 +97,11 @@ def first_event(
 
 
 def _earliest(lane: Lane, found: list[tuple]) -> tuple[Scalar, Curve, Flag | None]:
-    """Of the earliest of these its target, what rises through zero there, and whether that is where
-    the step begins.
+    """The earliest of what a step met: its target, the curve that rises through zero there, and
+    whether that is where the step begins (`None` if it cannot be).
 
-    **Arguments:** of each, before these three, its place: infinite if it was not met, below zero
-    for what comes before any event.
+    **Arguments:** `found`, of each of these before the three its place: infinite if it was not met,
+    below zero if it comes before any event.
     """
     (soonest, target, curve, at_once), *others = found
     target = jnp.full_like(lane.s, target)
@@ -141,8 +142,12 @@ def _root(curve: Curve, corrections: int) -> tuple[Scalar, Flag | None]:
 
 
 def may_matter(plan: Plan, lane: Lane, k: int, begin: Rates, end: Rates, h: Scalar) -> Flag:
-    """Whether a turn of coordinate number k within a step may have to be met: by a bound, before
-    its place is known."""
+    """Whether a step may have to end at a turning point of coordinate number k: by a bound, before
+    the place of the turn is known.
+
+    **Arguments:** `begin` and `end`, the coordinate's rates at the ends of the step, `h` its
+    length.
+    """
 
     def bound(stop: RigidStop) -> Scalar:
         gap = stop_gradient(stop.gap)
@@ -154,8 +159,12 @@ def may_matter(plan: Plan, lane: Lane, k: int, begin: Rates, end: Rates, h: Scal
 def _has_to_be_met(
     plan: Plan, lane: Lane, k: int, depth: Callable[[RigidStop], Scalar], margin: float
 ) -> Flag:
-    """Whether a turn of coordinate number k that comes so far beyond its stops has to be met: if
-    not every one has, then only one close to a stop."""
+    """Whether a step has to end at a turning point of coordinate number k: at each one (see
+    `Plan.meets_turns`), or if it is close to a stop.
+
+    **Arguments:** `depth`, how far the turn is beyond a stop; `margin`, how far short of a stop is
+    close.
+    """
     everything = plan.meets_turns(lane.done)
     if everything is True:
         return jnp.ones_like(lane.s, bool)

@@ -21,7 +21,7 @@ _SLIVER = 1e-3
 
 
 class Path(NamedTuple):
-    """What a step saw of a coordinate."""
+    """What a step shows of one coordinate."""
 
     begin: Rates
     end: Rates
@@ -44,7 +44,7 @@ class End(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """What a step came by."""
+    """What a step shows of events and coordinates."""
 
     crossings: tuple[Crossing, ...]
     """The machine's events."""
@@ -105,7 +105,11 @@ def timing(plan: Plan, lane: Lane) -> Beside | None:
 def attempt(
     plan: Plan, lane: Lane, active: Flag, smooth: SmoothMachine, motion: Foreseen | None
 ) -> Trial:
-    """Try the next step and see what it meets; of length zero for a lane that has ended."""
+    """Try the next step and see what it meets; of length zero for a lane that has ended.
+
+    **Arguments:** `active`, whether the lane goes on; `smooth`, the machine in its modes with those
+    bodies held that rest; `motion`, that ahead, of a method that knows it; else `None`.
+    """
     machine, method = plan.machine, plan.method
     free = lane.target == FREE
     bound = plan.end(lane.part)
@@ -159,7 +163,12 @@ def _path(
     there: tuple,
     good: Flag,
 ) -> Path:
-    """What a step that ends `there` saw of coordinate number k."""
+    """What a step shows of coordinate number k.
+
+    **Arguments:** `free`, the machine with this body free and the others held that rest; `smooth`,
+    the machine that the step was taken with; `there`, s and state at the step's end, its length and
+    the longest length; `good`, whether the step was.
+    """
     s1, new, h, limit = there
     position = plan.machine.coordinates[k].position
     begin = rates(free.field, position, lane.s, lane.state)

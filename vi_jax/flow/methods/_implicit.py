@@ -33,6 +33,9 @@ def implicit_stages(
     Numerical Mathematics 44, 2004). Each is solved to `tolerance` relative to 1 + |y|; where that
     fails what is left is infinite. Derivatives are those of the solution, by the implicit function
     theorem.
+
+    **Arguments:** `tableau`, diffrax's Butcher tableau; `field`, dy/ds; `s0`, `h` and `y0`, where
+    the step begins, its length and the state, flattened.
     """
     gamma = float(tableau.a_diagonal[-1])
     still = stop_gradient((s0, y0))
@@ -105,7 +108,8 @@ def inverse_of(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 
 def _tangent(linear: Callable[[Vector], Vector], right: Vector) -> Vector:
-    """What a linear function makes `right` of."""
+    """The solution of a linear equation, the function given and the right side: how `custom_root`
+    carries derivatives over."""
     unit = jnp.eye(right.size, dtype=right.dtype)
     columns = jnp.stack([linear(unit[i]) for i in range(right.size)], axis=1)
     return dot(inverse_of(columns), right)

@@ -47,7 +47,8 @@ def expand(
 
 
 def along(function: Callable[[Any], Any], treedef: Any, series: list[Series]) -> "Along":
-    """A scalar function of the state."""
+    """A scalar function of the state along a motion, as a power series; `treedef` and `series` as
+    from `expand`."""
 
     def flat(*leaves):
         return jtu.tree_leaves(function(jtu.tree_unflatten(treedef, leaves)))
@@ -72,7 +73,7 @@ def _slope(series: Series) -> Series:
 
 
 class Along(NamedTuple):
-    """A number along a motion, by its series; a constant for differentiation."""
+    """A number along a motion, as a power series in s; a constant for differentiation."""
 
     series: Series
 
@@ -98,7 +99,8 @@ class Along(NamedTuple):
 
 
 class _Flow:
-    """A jaxpr evaluated coefficient by coefficient."""
+    """A jaxpr evaluated coefficient by coefficient: each of its equations keeps the series of its
+    operands and results."""
 
     def __init__(self, closed: ClosedJaxpr, inputs: list[Series]):
         self.env: dict[Any, Series] = {}

@@ -46,8 +46,8 @@ class AbstractMethod(eqx.Module):
 
     @property
     def wander(self) -> Any:
-        """How far the states of a motion that repeats differ from one period to the next (relative
-        to 1 + |state|): by rounding, written 0, where the steps are the same each time."""
+        """How far the states of a periodic motion may differ from one period to the next, relative
+        to 1 + |state|; 0 where only by rounding, as the steps are the same in each period."""
         return 0.0
 
     @property
@@ -84,8 +84,10 @@ class AbstractMethod(eqx.Module):
         error.
 
         The error is relative to the tolerance (a step is accepted up to 1); it is 0 for methods
-        that are not adaptive. `beside` is `None` unless averages, or the elapsed time of a machine
-        with a `pace`, are asked for; its rate is `rate_beside`.
+        that are not adaptive.
+
+        **Arguments:** `smooth`, the machine in its modes; `beside`, `None` unless averages, or the
+        elapsed time of a machine with a `pace`, are asked for; its rate is `rate_beside`.
         """
 
     def foresee(

@@ -112,7 +112,7 @@ class Taylor(AbstractMethod):
     def foresee(
         self, smooth: SmoothMachine, s: Scalar, state: Any, beside: Beside | None
     ) -> Expansion:
-        """Its power series about (s, state), and what is integrated beside it."""
+        """The motion as a power series about (s, state), with what is integrated beside it."""
 
         def field(s, y):
             state, beside = y
@@ -128,6 +128,9 @@ class Taylor(AbstractMethod):
         return Expansion(treedef, series, self.rtol)
 
     def step(self, smooth, s0, s1, state, beside):
-        """The sum of the series at `s1`."""
+        """The sum of the series at `s1`.
+
+        **Arguments:** as `AbstractMethod.step`.
+        """
         new, beside = self.foresee(smooth, s0, state, beside).at(s1 - s0)
         return new, beside, jnp.zeros_like(s0)
