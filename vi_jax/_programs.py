@@ -113,10 +113,7 @@ class CompiledFunction:
     """
 
     def __init__(
-        self,
-        function: Callable[..., Any],
-        quick: Mapping[str, Any] = _QUICK,
-        **options: Any,
+        self, function: Callable[..., Any], quick: Mapping[str, Any] = _QUICK, **options: Any
     ):
         functools.update_wrapper(self, function)
         self._function, self._quick_options = _uncollected(function), quick

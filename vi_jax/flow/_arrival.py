@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._types import Flag, Scalar
+from .._types import Flag, Scalar, Scalars, State
 from .beside import Beside
 
 
@@ -24,9 +24,9 @@ class Tally(NamedTuple):
 class Onward(NamedTuple):
     """How a motion goes on behind an event: the fields of `Lane` of the same names."""
 
-    direction: tuple[Scalar, ...]
-    contact: tuple[Scalar, ...] | None
-    modes: tuple[Scalar, ...]
+    direction: Scalars
+    contact: Scalars | None
+    modes: Scalars
 
 
 class Arrival(NamedTuple):
@@ -37,7 +37,7 @@ class Arrival(NamedTuple):
     """
 
     s: Scalar
-    state: Any
+    state: State
     time: Beside | None
     place: Scalar
     """Y there: on the stop, with the stop's derivatives, where one is met."""
@@ -51,17 +51,17 @@ class Arrival(NamedTuple):
     """As in `Lane`; absent where no event can end it."""
 
     @property
-    def direction(self) -> tuple[Scalar, ...]:
+    def direction(self) -> Scalars:
         """Of each coordinate, the way that it goes on: the sign of its velocity."""
         return self.onward.direction
 
     @property
-    def contact(self) -> tuple[Scalar, ...] | None:
+    def contact(self) -> Scalars | None:
         """The stops rested on, as in `Lane`."""
         return self.onward.contact
 
     @property
-    def modes(self) -> tuple[Scalar, ...]:
+    def modes(self) -> Scalars:
         """The modes of the machine behind what was met, as in `Lane`."""
         return self.onward.modes
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
-from .._types import Scalar
+from .._types import Flag, Scalar, Scalars, State
 from ..machine import (
     AbstractMachine,
     begin_modes,
@@ -57,7 +57,7 @@ def total(tree: Any, start: Scalar) -> Scalar:
     return start
 
 
-def select(condition: Any, a: Any, b: Any) -> Any:
+def select(condition: Flag, a: Any, b: Any) -> Any:
     """`jnp.where` for pytrees; what is the same in both is left as it is."""
     return jtu.tree_map(lambda x, y: x if x is y else jnp.where(condition, x, y), a, b)
 
@@ -85,15 +85,15 @@ class Lane(eqx.Module):
     """One trajectory on its way. All floats: other types would keep the loop from fusing."""
 
     s: Scalar
-    state: Any
+    state: State
     record: Record
-    direction: tuple[Scalar, ...]
+    direction: Scalars
     """Of each coordinate, the sign of its velocity since the last turn or impact."""
-    contact: tuple[Scalar, ...] | None
+    contact: Scalars | None
     """Of each coordinate, 1 + i while it rests on stop number i, else 0; absent where none can."""
-    modes: tuple[Scalar, ...]
+    modes: Scalars
     """Of each switch, then the machine's own."""
-    below: tuple[Scalar, ...]
+    below: Scalars
     """Of each event that happens from below (see `AbstractEvent.from_below`), 1 once its guard has
     been below zero since the last jump, else 0."""
     length: Scalar
@@ -116,12 +116,12 @@ class Lane(eqx.Module):
     rejected: Scalar
 
 
-def ticks(machine: AbstractMachine, state: Any) -> bool:
+def ticks(machine: AbstractMachine, state: State) -> bool:
     """Whether the independent variable itself counts the cycles."""
     return machine.clock(state) is None and not is_autonomous(machine, state)
 
 
-def has_fixed_cycle(machine: AbstractMachine, state: Any) -> bool:
+def has_fixed_cycle(machine: AbstractMachine, state: State) -> bool:
     """Whether all cycles have the same duration, `machine.period`."""
     return (
         ticks(machine, state)
@@ -173,12 +173,12 @@ class Plan(eqx.Module):
         """Iterations in which a lane completes at most one interval, its steps being so short."""
         return max(1, self.method.steps_per_cycle // self.parts)
 
-    def others(self, state: Any) -> list[int]:
+    def others(self, state: State) -> list[int]:
         """The numbers of the events, besides stops, whose guards are looked at in each step."""
         last = section_number(self.machine) + (self.machine.section(state) is not None)
         return list(range(len(self.machine.stops), last))
 
-    def from_below(self, state: Any) -> list[int]:
+    def from_below(self, state: State) -> list[int]:
         """Those of `others` that happen only once their guard has been below zero (see
         `AbstractEvent.from_below`)."""
         events = events_of(self.machine)
@@ -199,15 +199,15 @@ class Plan(eqx.Module):
         is not recorded. Such a cycle is one interval, as if only its last part were left."""
         return jnp.where(done < self.settle, self.parts - 1.0, jnp.zeros_like(done))
 
-    def ticks(self, state: Any) -> bool:
+    def ticks(self, state: State) -> bool:
         """Whether `s` itself counts the cycles."""
         return ticks(self.machine, state)
 
-    def timed(self, state: Any) -> bool:
+    def timed(self, state: State) -> bool:
         """Whether the duration of a cycle is recorded, which only a fixed one need not be."""
         return self.motion and not has_fixed_cycle(self.machine, state)
 
-    def meets_turns(self, done: Scalar) -> Any:
+    def meets_turns(self, done: Scalar) -> Flag | bool:
         """Whether steps end on every turning point, for extremes, and since switches and events may
         be there; or only on those close to a stop. A flag where that depends on how many intervals
         are done, else known while the program is traced."""
@@ -215,7 +215,7 @@ class Plan(eqx.Module):
             return True
         return (done >= self.settle) if self.motion else False
 
-    def fresh(self, state: Any) -> Record:
+    def fresh(self, state: State) -> Record:
         """The record of an interval that begins in `state`."""
         Y = self.machine.position(state)
         zero = jnp.zeros_like(Y)
@@ -232,14 +232,14 @@ class Plan(eqx.Module):
             events=jnp.full((4, self.events), jnp.nan, Y.dtype) if self.events else None,
         )
 
-    def _beside(self, state: Any, zero: Scalar) -> Beside | None:
+    def _beside(self, state: State, zero: Scalar) -> Beside | None:
         """Time and integrals as an interval begins; `None` where neither is asked for."""
         timed = self.timed(state)
         if not timed and not self.averages:
             return None
         return Beside(zero if timed else None, {name: zero for name in self.averages})
 
-    def launch(self, start: Any, wanted: Any = True) -> Lane:
+    def launch(self, start: State, wanted: Flag | bool = True) -> Lane:
         """The lane as its loop begins, in the state `start`; one that cannot be run, or is not
         `wanted`, has ended already."""
         machine = self.machine
@@ -308,7 +308,7 @@ class Plan(eqx.Module):
                 place = jnp.where(contact == to_event(i), stop.place, place)
         return place
 
-    def wall(self, k: int, contact: Scalar) -> tuple[Any, Any]:
+    def wall(self, k: int, contact: Scalar) -> tuple[Scalar | float, Scalar]:
         """The sign (1 right, -1 left) and the gap of the stop of coordinate number k that is named
         by `contact`; of its first stop if none is."""
         mine = [(i, stop) for i, stop in enumerate(self.machine.stops) if stop.coordinate == k]
@@ -319,7 +319,7 @@ class Plan(eqx.Module):
             sign, gap = jnp.where(here, float(stop.sign), sign), jnp.where(here, stop.gap, gap)
         return sign, gap
 
-    def _rests_on(self, k: int, here: Rates, growth: Scalar, slack: Any) -> Scalar:
+    def _rests_on(self, k: int, here: Rates, growth: Scalar, slack: Scalar | float) -> Scalar:
         """The stop that coordinate number k rests on as the motion begins: pressed on, or about to
         be by a force that grows; place and velocity are known to within `slack`."""
         contact = jnp.zeros_like(here.x)

@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from .._types import Scalar
+from .._types import Scalar, State
+from .smooth import SmoothMachine
 
 
 class Beside(NamedTuple):
@@ -21,7 +22,9 @@ class Beside(NamedTuple):
     `pace`, over s."""
 
 
-def rate_beside(smooth: Any, s: Scalar, state: Any, beside: Beside | None) -> Beside | None:
+def rate_beside(
+    smooth: SmoothMachine, s: Scalar, state: State, beside: Beside | None
+) -> Beside | None:
     """d/ds of what is integrated beside the state, the elapsed time and the averages; `None` where
     neither is.
 

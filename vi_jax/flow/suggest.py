@@ -11,9 +11,11 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax.core import Tracer
+from jaxtyping import Array
 
 from .._checks import count, one_of, require
 from .._renamed import renamed
+from .._types import Scalar, State
 from ..machine import AbstractMachine
 from ._simulate import simulate
 from .arguments import check_start, machine_of
@@ -68,7 +70,7 @@ def suggest_method(
     *,
     error: float = 1e-6,
     quantity: str = "state",
-    start: Any = None,
+    start: State = None,
     cycles: int = 20,
     lanes: int = 256,
 ) -> Suggestion:
@@ -143,14 +145,14 @@ def suggest_method(
     return Suggestion(found.method, bool(timed), found.error, tuple(tried))
 
 
-def _is_stiff(machine: AbstractMachine, start: Any) -> bool:
+def _is_stiff(machine: AbstractMachine, start: State) -> bool:
     """Whether something fades much faster than the motion goes, at its start."""
     s = jnp.zeros(())
     fading = machine.relaxation(s, start)
     return fading is not None and bool(machine.step_limit(s, start) > _STIFF * fading)
 
 
-def _adaptive(bench: "_Bench", error: float, solver: Any) -> list[Tried]:
+def _adaptive(bench: "_Bench", error: float, solver: diffrax.AbstractSolver) -> list[Tried]:
     """The loosest tolerance that keeps to the error."""
     tried: list[Tried] = []
     for tolerance in _TOLERANCES[:-1]:
@@ -203,14 +205,14 @@ class _Bench:
     truth: np.ndarray
 
     def __init__(
-        self, machine: AbstractMachine, start: Any, quantity: str, cycles: int, lanes: int
+        self, machine: AbstractMachine, start: State, quantity: str, cycles: int, lanes: int
     ):
         self.machine, self.start, self.quantity, self.cycles = machine, start, quantity, cycles
         # Nothing but the velocity is free of stops.
         self.nudges = jnp.linspace(-0.1, 0.1, lanes) if lanes > 1 else jnp.zeros(1)
         self.compiled: dict[Any, Callable] = {}
 
-    def lane(self, method: AbstractMethod, nudge: Any) -> Any:
+    def lane(self, method: AbstractMethod, nudge: Scalar) -> Array:
         """What is compared, as one vector, of the lane whose first velocity differs by `nudge`; its
         first number is infinite if the lane failed."""
         machine = self.machine

@@ -1,6 +1,6 @@
 """Dry friction on a stop: in its impacts, and while a body rests on it."""
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from .._checks import NOT_NEGATIVE, SHARE, count, require_ranges
 from .._numbers import real
+from .._types import Flag, Machine, Scalar, State
 from .contacts import added, forces, held_flow, push_of, shares
 from .event import AbstractSwitch, Around
 
@@ -107,12 +108,12 @@ class ContactFriction(AbstractSwitch):
         state = added(state, amounts, pushes)
         return state, self._from_rest(machine, s, state, around, sticks=mode != 0)
 
-    def _rests(self, machine: Any, around: Around) -> Any:
+    def _rests(self, machine: Machine, around: Around) -> Flag:
         if not around.contact:
             return jnp.zeros((), bool)
         return around.contact[machine.stops[self.stop].coordinate] == 1.0 + self.stop
 
-    def _slip(self, machine: Any, state: Any) -> Any:
+    def _slip(self, machine: Machine, state: State) -> Scalar:
         """The sign of the velocity along the stop; zero where that is rounding."""
         velocity = machine.coordinates[self.along].velocity(state)
         size = sum((jnp.sum(jnp.abs(x)) for x in jtu.tree_leaves(state)), start=jnp.asarray(0.0))
@@ -120,8 +121,9 @@ class ContactFriction(AbstractSwitch):
         return jnp.where(jnp.abs(velocity) <= least, 0.0, jnp.sign(velocity))
 
     def _from_rest(
-        self, machine: Any, s: Any, state: Any, around: Around | None, sticks: Any = True
-    ) -> Any:
+        self, machine: Machine, s: Scalar, state: State, around: Around | None,
+        sticks: Flag | bool = True,
+    ) -> Scalar:  # fmt: skip
         """The mode of a body without velocity along the stop: sticking (0) where the force is not
         too large, else the way that it pulls.
 
@@ -135,7 +137,9 @@ class ContactFriction(AbstractSwitch):
         away = jnp.where(drag > 0, -1.0, 1.0)
         return jnp.where(holds | ~self._rests(machine, around), 0.0, away)
 
-    def _forces(self, machine: Any, s: Any, state: Any, around: Around, mode: Any) -> Any:
+    def _forces(
+        self, machine: Machine, s: Scalar, state: State, around: Around, mode: Scalar
+    ) -> tuple[Scalar, Scalar]:
         """The force along the stop and that which presses on it.
 
         **Arguments:** `around`, the other modes and who rests where; `mode`, that of this friction.

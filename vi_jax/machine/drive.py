@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from .._checks import POSITIVE, require, require_ranges
 from .._numbers import number, real
+from .._types import State
 from .shown import Shown
 from .states import OscillatorState
 
@@ -44,7 +45,7 @@ class AbstractDrive(Shown):
         return None
 
     @abc.abstractmethod
-    def field(self, scene: Any, s: Any, state: Any, pushes: Iterable[Any]) -> Any:
+    def field(self, scene: Any, s: Any, state: State, pushes: Iterable[Any]) -> State:
         """d(state)/ds, by crank angle or, if `scene.clock_name` is `"time"`, by time τ.
 
         **Arguments:** the scene, for its `crank`, `phase_at` and `pull`; s, the state, and what
@@ -97,7 +98,7 @@ class AbstractDrive(Shown):
             require(name, found[name])
         return found
 
-    def speed(self, state: Any) -> Float[Array, "..."]:
+    def speed(self, state: State) -> Float[Array, "..."]:
         """How fast the crank turns (unit: ω), without sign."""
         fixed = self.fixed_speed
         return jnp.abs(state.W) if fixed is None else fixed

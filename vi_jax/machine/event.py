@@ -8,11 +8,11 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax.lax import stop_gradient
 
-from .._types import Scalar
+from .._types import Machine, Scalar, Scalars, State
 from .contacts import rubbed
 from .shown import Shown
 
-Modes = tuple[Scalar, ...]
+Modes = Scalars
 
 
 class Around(NamedTuple):
@@ -22,7 +22,7 @@ class Around(NamedTuple):
     """All modes of the machine."""
     own: int
     """Which of them is the event's."""
-    contact: tuple[Scalar, ...]
+    contact: Scalars
     """Of each coordinate, 1 + i while it rests on stop number i, else 0; empty where none can."""
 
     def instead(self, mode: Any) -> Modes:
@@ -87,24 +87,24 @@ class AbstractEvent(Shown):
         what `after` only corrects to rounding."""
         return self.after(*args, **kwargs)[0]
 
-    def happens(self, machine: Any, s: Any, state: Any, *modes: Any) -> Any:
+    def happens(self, machine: Machine, s: Scalar, state: State, *modes: Any) -> Any:
         """Whether the event happens where its guard has risen through zero; `None` if always."""
         return None
 
-    def value(self, machine: Any, s: Any, state: Any, *modes: Any) -> Any:
+    def value(self, machine: Machine, s: Scalar, state: State, *modes: Any) -> Any:
         """A number that the log of events keeps of it, of the state in which it is met."""
         return jnp.nan
 
-    def begin(self, machine: Any, s: Scalar, state: Any) -> Scalar:
+    def begin(self, machine: Machine, s: Scalar, state: State) -> Scalar:
         """The mode of a motion that begins in `state`, of an event that holds one."""
         raise NotImplementedError(f"A {type(self).__name__} holds no mode.")
 
-    def struck(self, machine: Any, s: Scalar, state: Any, mode: Scalar) -> Scalar:
+    def struck(self, machine: Machine, s: Scalar, state: State, mode: Scalar) -> Scalar:
         """Its mode after an impact or another jump of the state; by default that of a new
         motion."""
         return self.begin(machine, s, state)
 
-    def speed(self, machine: Any, state: Any, rate: Any) -> Any:
+    def speed(self, machine: Machine, state: State, rate: Scalar) -> Scalar:
         """How fast the event is met, in the machine's words: by default `rate`, how fast its guard
         rises by s."""
         return rate
@@ -144,15 +144,17 @@ class AbstractSwitch(AbstractEvent):
         return True
 
     @abc.abstractmethod
-    def begin(self, machine: Any, s: Scalar, state: Any) -> Scalar:
+    def begin(self, machine: Machine, s: Scalar, state: State) -> Scalar:
         """The mode of a motion that begins in `state`."""
 
     @abc.abstractmethod
-    def guard(self, machine: Any, s: Scalar, state: Any, mode: Scalar) -> Scalar:
+    def guard(self, machine: Machine, s: Scalar, state: State, mode: Scalar) -> Scalar:
         """What rises through zero where this mode ends."""
 
     @abc.abstractmethod
-    def after(self, machine: Any, s: Scalar, state: Any, mode: Scalar) -> tuple[Any, Scalar]:
+    def after(
+        self, machine: Machine, s: Scalar, state: State, mode: Scalar
+    ) -> tuple[State, Scalar]:
         """State and mode after the event. The state may be corrected by what is below rounding
         (a velocity set to zero where it vanishes), and must not jump."""
 
@@ -172,7 +174,7 @@ class AbstractSwitch(AbstractEvent):
         surface where they meet (see `Switch`)."""
         return False
 
-    def contribution(self, machine: Any, s: Scalar, state: Any, mode: Scalar) -> Any:
+    def contribution(self, machine: Machine, s: Scalar, state: State, mode: Scalar) -> Any:
         """What the switch adds to the machine's field in this mode, where it knows that: a soft
         stop the acceleration of its coordinate, dry friction the force on the body that rubs."""
         raise NotImplementedError(f"A {type(self).__name__} has no `contribution`.")
@@ -198,25 +200,25 @@ class Section(AbstractEvent):
         return machine.renewed(state), modes
 
 
-def events_of(machine: Any) -> tuple[AbstractEvent, ...]:
+def events_of(machine: Machine) -> tuple[AbstractEvent, ...]:
     """All events of a machine, in the order in which they are numbered: its stops, its switches,
     its other events, its section."""
     return (*machine.stops, *machine.switches, *machine.events, Section())
 
 
-def is_autonomous(machine: Any, state: Any) -> bool:
+def is_autonomous(machine: Machine, state: State) -> bool:
     """Whether an event ends the cycles of a machine, instead of its clock."""
     ends = any(event.ends_cycle for event in events_of(machine)[:-1])
     return ends or machine.section(state) is not None
 
 
-def section_number(machine: Any) -> int:
+def section_number(machine: Machine) -> int:
     """The section's number among the machine's events: the last."""
     return len(events_of(machine)) - 1
 
 
 def guard_of(
-    machine: Any, number: int, s: Any, state: Any, modes: Modes, contact: tuple[Any, ...] = ()
+    machine: Machine, number: int, s: Scalar, state: State, modes: Modes, contact: Scalars = ()
 ) -> Scalar:
     """The guard of one of a machine's events, which rises through zero where it happens.
 
@@ -226,7 +228,7 @@ def guard_of(
     return event.guard(machine, s, state, *modes[own], **more)
 
 
-def jump_of(machine: Any, number: int, s: Any, state: Any, modes: Modes) -> Any:
+def jump_of(machine: Machine, number: int, s: Scalar, state: State, modes: Modes) -> State:
     """The state after one of a machine's events as a smooth function of that before it (see
     `AbstractEvent.jump`).
 
@@ -236,7 +238,7 @@ def jump_of(machine: Any, number: int, s: Any, state: Any, modes: Modes) -> Any:
     return _rubbed(machine, number, state, event.jump(machine, s, state, *modes[own]))
 
 
-def happens_at(machine: Any, number: int, s: Any, state: Any, modes: Modes) -> Any:
+def happens_at(machine: Machine, number: int, s: Scalar, state: State, modes: Modes) -> Any:
     """Whether one of a machine's events happens where its guard has risen; `None` if always.
 
     **Arguments:** `number`, the event's; `modes`, all of the machine.
@@ -245,7 +247,7 @@ def happens_at(machine: Any, number: int, s: Any, state: Any, modes: Modes) -> A
     return event.happens(machine, s, state, *modes[own])
 
 
-def value_of(machine: Any, number: int, s: Any, state: Any, modes: Modes) -> Any:
+def value_of(machine: Machine, number: int, s: Scalar, state: State, modes: Modes) -> Any:
     """What the log of events keeps of one of a machine's events.
 
     **Arguments:** `number`, the event's; `modes`, all of the machine.
@@ -255,8 +257,8 @@ def value_of(machine: Any, number: int, s: Any, state: Any, modes: Modes) -> Any
 
 
 def after_event(
-    machine: Any, number: int, s: Any, state: Any, modes: Modes, contact: tuple[Any, ...] = ()
-) -> tuple[Any, Modes]:
+    machine: Machine, number: int, s: Scalar, state: State, modes: Modes, contact: Scalars = ()
+) -> tuple[State, Modes]:
     """State and modes after one of a machine's events.
 
     **Arguments:** `number`, the event's; `modes`, all of the machine before it; `contact` as in
@@ -269,31 +271,31 @@ def after_event(
     return _rubbed(machine, number, state, new), settled_modes(changed, s)
 
 
-def _rubbed(machine: Any, number: int, before: Any, after: Any) -> Any:
+def _rubbed(machine: Machine, number: int, before: State, after: State) -> State:
     """The state after an impact, with what friction on the stop makes of it."""
     friction = rubbing_on(machine, number)
     return after if friction is None else rubbed(machine, number, friction, before, after).state
 
 
-def rubbing_on(machine: Any, number: int) -> Any:
+def rubbing_on(machine: Machine, number: int) -> Any:
     """The friction on stop number `number`, or `None`."""
     if number >= len(machine.stops):
         return None
     return next((x for x in machine.switches if x.rubs_on == number), None)
 
 
-def rubs(machine: Any) -> bool:
+def rubs(machine: Machine) -> bool:
     """Whether there is friction on one of its stops."""
     return any(x.rubs_on is not None for x in machine.switches)
 
 
-def mode_number(machine: Any, number: int) -> int:
+def mode_number(machine: Machine, number: int) -> int:
     """The place among the machine's modes of the one that an event holds."""
     return sum(event.holds_mode for event in events_of(machine)[:number])
 
 
 def event_of(
-    machine: Any, number: int, modes: Modes, contact: tuple[Any, ...]
+    machine: Machine, number: int, modes: Modes, contact: Scalars
 ) -> tuple[AbstractEvent, slice, dict[str, Around]]:
     """An event, which of the machine's modes its methods get (its own or all), and what keyword
     arguments besides."""
@@ -305,7 +307,7 @@ def event_of(
     return event, slice(own, own + 1), more
 
 
-def begin_modes(machine: Any, s: Scalar, state: Any) -> Modes:
+def begin_modes(machine: Machine, s: Scalar, state: State) -> Modes:
     """The modes of a motion that begins in `state`: those that events hold, in their order, then
     the machine's own."""
     held = [event for event in events_of(machine) if event.holds_mode]
@@ -317,12 +319,12 @@ def begin_modes(machine: Any, s: Scalar, state: Any) -> Modes:
 
 
 def struck_modes(
-    machine: Any,
+    machine: Machine,
     s: Scalar,
-    state: Any,
+    state: State,
     modes: Modes,
     own: Sequence[Any] | None = None,
-    contact: tuple[Any, ...] = (),
+    contact: Scalars = (),
 ) -> Modes:
     """The modes after the state has jumped to this one.
 
@@ -338,6 +340,6 @@ def struck_modes(
     return settled_modes([*held, *kept], s)
 
 
-def settled_modes(modes: Sequence[Any], s: Any) -> Modes:
+def settled_modes(modes: Sequence[Any], s: Scalar) -> Modes:
     """Modes as the loop carries them: floats, which nothing is differentiated by."""
     return tuple(stop_gradient(jnp.asarray(mode, jnp.result_type(s))) for mode in modes)

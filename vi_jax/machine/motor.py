@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, require_ranges
 from .._numbers import real
+from .._types import State
 from .crank import Slide
 from .drive import AbstractDrive
 from .states import MotorState, TimedMotorState
@@ -65,7 +66,7 @@ class Motor(AbstractDrive):
         return type(state)(speed, pull, shaft, *more, *clock)
 
     def torque(
-        self, state: Any, pace: Number | None, paced: Callable[[Any], Any]
+        self, state: State, pace: Number | None, paced: Callable[[Any], Any]
     ) -> tuple[Number, tuple[Number, ...]]:
         """The motor's torque (per J ω²), and how the components of its own change behind W; by
         crank angle divided by W, which `paced` does."""

@@ -7,16 +7,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import (
-    NOT_NEGATIVE,
-    POSITIVE,
-    REAL,
-    count,
-    instance_of,
-    one_of,
-    require_ranges,
-)
+from .._checks import NOT_NEGATIVE, POSITIVE, REAL, count, instance_of, one_of, require_ranges
 from .._numbers import number
+from .._types import Machine, State
 from .event import AbstractSwitch
 from .law import AbstractContactLaw, HuntCrossley, PowerLaw
 from .stop import Wall
@@ -115,7 +108,7 @@ class SoftStop(Wall, AbstractSwitch):
         body that goes in is that on one that comes out."""
         return self.prestress is not None
 
-    def depth(self, machine: Any, state: Any) -> tuple[Any, Any]:
+    def depth(self, machine: Machine, state: State) -> tuple[Any, Any]:
         """δ and δ' (by time); δ is negative apart from the stop."""
         body = machine.coordinates[self.coordinate]
         return self.beyond(body.position(state)), self.approach(body.velocity(state))
@@ -159,7 +152,7 @@ class SoftStop(Wall, AbstractSwitch):
         again = jnp.where(inside & (-pulls > -depth), TOUCHING, APART)
         return state, jnp.where(mode < 0, TOUCHING, jnp.where(mode > 0, released, again))
 
-    def longest_step(self, machine: Any, state: Any) -> Any:
+    def longest_step(self, machine: Machine, state: State) -> Any:
         """A fifth of the period in which a body oscillates on the stop; infinite apart from it."""
         depth, rate = self.depth(machine, state)
         frequency = self.law.frequency(self.stiffness, depth, rate)

@@ -12,7 +12,8 @@ from jaxtyping import Array, Float
 
 from .._checks import REAL, SHARE, count, one_of, require_ranges
 from .._numbers import concrete, real, real_or_law
-from .event import AbstractEvent, struck_modes
+from .._types import Machine, Scalar, State
+from .event import AbstractEvent, Modes, struck_modes
 from .shown import Shown
 
 
@@ -90,7 +91,9 @@ class RigidStop(Wall, AbstractEvent):
         new = body.placed(state, self.place, self.leaving(body.velocity(state)))
         return new, self.modes_after(machine, s, state, new, modes)
 
-    def modes_after(self, machine: Any, s: Any, before: Any, after: Any, modes: Any) -> Any:
+    def modes_after(
+        self, machine: Machine, s: Scalar, before: State, after: State, modes: Modes
+    ) -> Modes:
         """The machine's modes after an impact.
 
         **Arguments:** `before` and `after`, the states; `modes`, those before.

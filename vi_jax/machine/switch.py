@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.lax import stop_gradient
 
+from .._types import Machine, Scalar, Scalars, State
 from .event import AbstractSwitch, Around
 
 
@@ -92,13 +93,13 @@ class Switch(AbstractSwitch):
         leaves = jnp.where(up > -down, 1.0, -1.0)
         return state, jnp.where(slides, 0.0, jnp.where(mode == 0, leaves, -mode))
 
-    def _rates(self, machine: Any, s: Any, state: Any, around: Around) -> tuple[Any, Any]:
+    def _rates(self, machine: Machine, s: Scalar, state: State, around: Around) -> Scalars:
         """d/ds of the function in the modes +1 and -1."""
         up, down = (field_in(machine, s, state, around.instead(mode)) for mode in (1.0, -1.0))
         return _rate(self, machine, s, state, up), _rate(self, machine, s, state, down)
 
 
-def _rate(switch: Switch, machine: Any, s: Any, state: Any, flow: Any) -> Any:
+def _rate(switch: Switch, machine: Machine, s: Scalar, state: State, flow: State) -> Scalar:
     """d/ds of a switch's function along a flow.
 
     **Arguments:** `flow`, d(state)/ds.
@@ -107,7 +108,7 @@ def _rate(switch: Switch, machine: Any, s: Any, state: Any, flow: Any) -> Any:
     return jax.jvp(lambda s, state: switch.function(machine, s, state), *along)[1]
 
 
-def field_in(machine: Any, s: Any, state: Any, modes: tuple[Any, ...], first: int = 0) -> Any:
+def field_in(machine: Any, s: Scalar, state: State, modes: Scalars, first: int = 0) -> State:
     """The machine's field in these modes; on the surfaces along which it slides, the mean of those
     on both sides.
 

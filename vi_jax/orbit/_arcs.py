@@ -6,7 +6,7 @@ begins.
 """
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ import jax.tree_util as jtu
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
-from .._types import Flag, Scalar
+from .._types import Flag, Scalar, State
 from ..flow import Run, simulate
 from ..machine import AbstractMachine, is_autonomous
 from ._cycle_map import CycleMap
@@ -29,7 +29,7 @@ _PLACES = 8
 _DRIFTS = 0.5
 
 
-def _run(the_map: CycleMap, state: Any, impact_log: int) -> Run:
+def _run(the_map: CycleMap, state: State, impact_log: int) -> Run:
     """The motion with its impacts. The look at the guess and that at the orbit ask for the same
     program, if they are as long."""
     places = _places(the_map, state)
@@ -39,15 +39,15 @@ def _run(the_map: CycleMap, state: Any, impact_log: int) -> Run:
     )  # fmt: skip
 
 
-def _places(the_map: CycleMap, state: Any) -> int:
+def _places(the_map: CycleMap, state: State) -> int:
     """At how many places of a cycle the state is looked at: for an autonomous machine only on its
     section."""
     return 1 if is_autonomous(the_map.machine, state) else _PLACES
 
 
 def moved_from_impacts(
-    the_map: CycleMap, guess: Any, impact_log: int
-) -> tuple[CycleMap, Any, Int[Array, ""]]:
+    the_map: CycleMap, guess: State, impact_log: int
+) -> tuple[CycleMap, State, Int[Array, ""]]:
     """Map, guess and their place (in eighths of a cycle) on the section to search on.
 
     The map jumps where an impact falls on its section, and no search gets across; so it is done
@@ -99,7 +99,7 @@ class ObservedArc(NamedTuple):
     """Of the machine's averages, over the time of each cycle."""
 
 
-def observe_arc(arc: CycleMap, state: Any, impact_log: int) -> ObservedArc:
+def observe_arc(arc: CycleMap, state: State, impact_log: int) -> ObservedArc:
     """What is observed of an arc that begins in `state`; its derivatives are taken by columns (see
     `forward_jacobian`)."""
 

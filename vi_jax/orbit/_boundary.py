@@ -1,6 +1,7 @@
 """`boundary`: curves of folds, period doublings, lost symmetries and grazings."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -17,8 +18,8 @@ from ..machine import check_leaf, leaf, with_units
 from ._fixed_step_method import steps_of
 from ._shooting import Shooting
 from ._solution import orbit_of
+from ._solve import Unknowns, check_parameter, jacobian_at, tangent_at
 from ._solve import advance as solved
-from ._solve import check_parameter, jacobian_at, tangent_at
 from ._symmetry import images, may_be_symmetric
 from .curve import INTERRUPTED, Step, Walk, check_walk, walk
 from .results import InWords, Orbit
@@ -127,7 +128,7 @@ def boundary(
     scale = np.ones(x.size)
     scale[-2:] = [0.5 * (high - low) for low, high in bounds]
 
-    def advance(x: Any, tangent: Any, length: float) -> Step:
+    def advance(x: Unknowns, tangent: Unknowns, length: float) -> Step:
         return solved(condition, x, tangent, scale, length)
 
     start = advance(x, tangent_at(condition, x, scale), 0.0)
@@ -311,7 +312,9 @@ def _inside(step: Step, bounds: Intervals) -> bool:
     return all(low <= x <= high for x, (low, high) in zip(step.x[-2:], bounds, strict=True))
 
 
-def _cut(advance: Any, here: Step, new: Step, bounds: Intervals, scale: np.ndarray) -> Step:
+def _cut(
+    advance: Callable[..., Step], here: Step, new: Step, bounds: Intervals, scale: np.ndarray
+) -> Step:
     """The last point inside the bounds between two, found by halving the step.
 
     **Arguments:** `advance` as for `walk`; `here` and `new`, inside and outside; `scale`, the size

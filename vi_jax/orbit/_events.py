@@ -1,11 +1,11 @@
 """The events of a periodic motion, in their order: the unknowns of `Shooting` belong to them."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._types import Scalar
+from .._types import Scalar, State
 from ..machine import AbstractEvent, AbstractMachine, events_of, guard_of, section_number
 
 
@@ -39,7 +39,7 @@ def section_of(machine: AbstractMachine, cycle: int) -> Event:
 
 
 def guard_at(
-    machine: AbstractMachine, event: Event, s: Scalar, state: Any, modes: tuple[Array, ...]
+    machine: AbstractMachine, event: Event, s: Scalar, state: State, modes: tuple[Array, ...]
 ) -> Scalar:
     """The guard of an event in the course of a motion, zero there and rising.
 

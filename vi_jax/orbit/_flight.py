@@ -10,7 +10,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from .. import lanes
-from .._types import Scalar, Vector
+from .._types import Scalar, Scalars, State, Vector
 from ..flow import AbstractMethod, Beside, SmoothMachine, elapsed, in_modes
 from ..machine import AbstractMachine
 
@@ -20,9 +20,9 @@ class Flight(eqx.Module):
     as they are; solved with steps of one length by a method of fixed steps."""
 
     machine: AbstractMachine
-    modes: tuple[Scalar, ...]
+    modes: Scalars
     method: AbstractMethod
-    like: Any
+    like: State
     """A state, for its structure."""
 
     @property
@@ -30,7 +30,7 @@ class Flight(eqx.Module):
         """The machine in its modes."""
         return in_modes(self.machine, self.modes)
 
-    def unravel(self, u: Vector) -> Any:
+    def unravel(self, u: Vector) -> State:
         """A state from its vector."""
         return ravel_pytree(self.like)[1](u)
 

@@ -19,7 +19,7 @@ import jax.tree_util as jtu
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from .._types import Scalar, Vector
+from .._types import Scalar, State, Vector
 from ..flow import AbstractMethod, average_names, means
 from ..machine import AbstractMachine, after_event, is_autonomous, jump_of, mode_number, with_leaf
 from ._events import Event, guard_at
@@ -50,7 +50,7 @@ class Shooting(eqx.Module):
     machine: AbstractMachine
     method: AbstractMethod
     """Of fixed steps."""
-    like: Any
+    like: State
     """A state, for its structure."""
     cycles: int = eqx.field(static=True)
     """The period in cycles of the machine."""
@@ -125,7 +125,7 @@ class Shooting(eqx.Module):
             clock = clock.at[0].set(period)
         return jnp.concatenate([clock, jnp.ravel(states), jnp.ravel(jnp.asarray(parameters))])
 
-    def unravel(self, u: Vector) -> Any:
+    def unravel(self, u: Vector) -> State:
         """A state from its vector."""
         return ravel_pytree(self.like)[1](u)
 
@@ -288,7 +288,7 @@ class Shooting(eqx.Module):
 
         return self._each(leg, order, s, u)
 
-    def state_at(self, x: Vector, leg: Leg, s: Scalar) -> Any:
+    def state_at(self, x: Vector, leg: Leg, s: Scalar) -> State:
         """The state at clock `s`, which lies in leg number `leg`."""
         machine = self.at(x)
         clock, states = self.parts(x)

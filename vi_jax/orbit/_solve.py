@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from .._programs import compiled
-from .._types import Vector
+from .._types import State, Vector
 from ..flow import MethodLike, RunOptions, collect, planned, run_lane
 from ..machine import (
     AbstractMachine,
@@ -126,7 +126,9 @@ class _Way(NamedTuple):
     """The machine's modes in each flight."""
 
 
-def _followed(blank: Shooting, state: Any, found: list[tuple[float, Event]], period: float) -> _Way:
+def _followed(
+    blank: Shooting, state: State, found: list[tuple[float, Event]], period: float
+) -> _Way:
     """A motion of one period, followed from event to event.
 
     **Arguments:** `blank`, the problem without events; `state`, that on the section; `found`, clock
@@ -278,11 +280,7 @@ def images_at(problem: Shooting, x):
 
 
 def located(
-    problem: Shooting,
-    here: Step,
-    new: Step,
-    scale: np.ndarray,
-    test: Callable[[Step], float],
+    problem: Shooting, here: Step, new: Step, scale: np.ndarray, test: Callable[[Step], float]
 ) -> Step | None:
     """The point between two, along the first one's tangent, at which a test is zero; `None` if
     there is none.

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._lazy import lazy
+from .._types import State
 from ..flow import average_names, quantities_on, quantity_names
 from ..machine import AbstractMachine, components, with_units
 from ._shooting import Shooting
@@ -28,7 +29,7 @@ COLUMNS = (
 )  # fmt: skip
 
 
-def column_names(machine: AbstractMachine, like: Any) -> tuple[str, ...]:
+def column_names(machine: AbstractMachine, like: State) -> tuple[str, ...]:
     """What is a number at each point of a branch of this machine, whose states are like this."""
     inner = (*components(like), *quantity_names(machine, like))
     return (*COLUMNS, *average_names(machine, like), *(f"section_{name}" for name in inner))

@@ -5,7 +5,7 @@ such a turn grows until it touches: the motion ends there in a grazing.
 """
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
-from .._types import Flag, Scalar, Vector
+from .._types import Flag, Scalar, State, Vector
 from ..flow import Beside, Rates, SmoothMachine, guard_rates
 from ..machine import events_of, guard_of, happens_at, section_number
 from ._flight import Flight
@@ -64,7 +64,7 @@ class _Guard(NamedTuple):
 
     number: int
 
-    def value(self, flight: Flight, s: Scalar, state: Any) -> Scalar:
+    def value(self, flight: Flight, s: Scalar, state: State) -> Scalar:
         """The guard in a state."""
         return guard_of(flight.machine, self.number, s, state, flight.modes)
 
@@ -110,10 +110,7 @@ class _Body(_Guard):
 
 
 def turns_of(
-    flight: Flight,
-    places: Float[Array, " steps"],
-    states: Float[Array, "steps states"],
-    h: Scalar,
+    flight: Flight, places: Float[Array, " steps"], states: Float[Array, "steps states"], h: Scalar
 ) -> Turns:
     """The turning points of all coordinates and guards along a flight.
 

@@ -25,7 +25,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from .._checks import count
 from .._programs import compiled
-from .._types import Scalar
+from .._types import Flag, Scalar
 from ..flow import lack_of_closed_form
 from ..machine import IdealDrive, Scene, Shown
 from .floquet import eigenvalues
@@ -215,7 +215,7 @@ def _after_impact(k, d, v, phase) -> Float[Array, "... 4"]:
 
 def _impacts(
     flight: Float[Array, "4 4"], k: Scalar, d: Scalar, period: Scalar
-) -> tuple[Float[Array, "2"], Float[Array, "2"], Float[Array, "2"], Bool[Array, ""]]:
+) -> tuple[Float[Array, "2"], Float[Array, "2"], Float[Array, "2"], Flag]:
     """Impact speeds (unit: a ω), impact phases in [0, 2π) with what rounding leaves open of them,
     and whether they are real.
 

@@ -7,9 +7,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from .._checks import count, given_number
+from .._types import Flag, Scalar
 
 Vector = Float[Array, " n"]
 
@@ -21,11 +22,11 @@ class Step(NamedTuple):
     """The unknowns, the curve's parameter last."""
     tangent: Vector
     """Unit tangent in scaled unknowns, in the sense of the step."""
-    size: Float[Array, ""]
+    size: Scalar
     """Largest component of the last correction (scaled)."""
     iterations: Int[Array, ""]
     """Corrections that it took."""
-    good: Bool[Array, ""]
+    good: Flag
     """Whether the corrector converged."""
     seen: Any
     """What is observed there, an `Observed` of a branch."""
@@ -37,7 +38,7 @@ def corrected(
     x: Vector,
     tangent: Vector,
     scale: Vector,
-    length: Float[Array, ""],
+    length: Scalar,
     *,
     tolerance: float = 1e-11,
 ) -> Step:

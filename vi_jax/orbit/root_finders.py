@@ -18,10 +18,11 @@ from jaxtyping import Array, Float
 
 from .._checks import count, instance_of, require
 from .._numbers import number
+from .._types import Scalar
 from ._neutral import rounding
 
 Unknowns = Float[Array, "..."]
-Residual = Callable[[Any], Any]
+Residual = Callable[[Unknowns], Unknowns]
 
 
 class AbstractRootFinder(eqx.Module):
@@ -38,7 +39,7 @@ class AbstractRootFinder(eqx.Module):
     @abc.abstractmethod
     def step(
         self, residual: Residual, x: Unknowns, memory: Any
-    ) -> tuple[Unknowns, Any, Unknowns, Float[Array, ""]]:
+    ) -> tuple[Unknowns, Any, Unknowns, Scalar]:
         """One step from `x`.
 
         **Returns:** where to go on from; the memory; a place whose residual was computed, and the
@@ -105,7 +106,7 @@ class Newton(AbstractRootFinder):
         return 1e-10
 
 
-def _with_aux(residual: Residual) -> Callable[[Any, Any], tuple[Any, None]]:
+def _with_aux(residual: Residual) -> Callable[[Unknowns, Any], tuple[Unknowns, None]]:
     return lambda x, args: (residual(x), None)
 
 
@@ -170,7 +171,7 @@ class Found(NamedTuple):
 
     x: Unknowns
     """The place with the smallest residual that was met."""
-    residual: Float[Array, ""]
+    residual: Scalar
     """Its largest component there."""
     converged: Array
     """Whether that is within its tolerance."""

@@ -17,19 +17,12 @@ from .._checks import count, fits_memory, fits_records, flag, instance_of
 from .._interrupted import Interrupted
 from .._lazy import lazy
 from .._renamed import renamed
+from .._types import State
 from ..flow import REASON_NAMES, AbstractMethod, MethodLike, RunOptions, preset
 from ..machine import AbstractMachine
 from ..machine import attributes as units_of
 from ._describe import attributes_of, description_of, unit_on_axis, variables_of
-from ._work import (
-    ClusterLost,
-    block_size,
-    rounded,
-    run_here,
-    run_on_cluster,
-    size_of,
-    worker_count,
-)
+from ._work import ClusterLost, block_size, rounded, run_here, run_on_cluster, size_of, worker_count
 from .corners import check_corners
 from .grid import Blocks, axes_of
 from .program import ScanProgram, make_program
@@ -70,7 +63,7 @@ def scan(
     axes: Mapping[str, Any],
     *,
     measure: Any = ("extremes", "regime"),
-    start: Any = None,
+    start: State = None,
     settle: int = 200,
     cycles: int | None = None,
     method: MethodLike = None,

@@ -15,6 +15,7 @@ from .._interrupted import Interrupted
 from .._numbers import concrete, number
 from .._programs import compiled, is_outermost
 from .._renamed import renamed
+from .._types import State
 from ..flow import (
     REASON_NAMES,
     RESULTS,
@@ -78,7 +79,7 @@ class Sweep(Summarized):
     """ζ: mean speed of the drive; `None` for machines that are not driven."""
     impact_speed: Float[Array, "..."]
     """Greatest V⁻ over the cycles observed."""
-    sections: Any
+    sections: State
     """Section states of the cycles observed; leaves (values, cycles)."""
     result: RESULTS
     """Whether each value was simulated to its end."""
@@ -193,7 +194,7 @@ def sweep(
     parameter: str,
     values: Any,
     *,
-    start: Any = None,
+    start: State = None,
     settle: int = 200,
     cycles: int = 32,
     method: MethodLike = None,
@@ -292,7 +293,7 @@ def _finite(numbers: np.ndarray | None) -> bool:
     return numbers is None or bool(np.isfinite(numbers).all())
 
 
-def taken_along(machine: AbstractMachine, state: Any) -> Any:
+def taken_along(machine: AbstractMachine, state: State) -> State:
     """The state, the body taken along by a stop that has come nearer."""
     for stop in machine.stops:
         body = machine.coordinates[stop.coordinate]
@@ -306,7 +307,7 @@ def taken_along(machine: AbstractMachine, state: Any) -> Any:
 @compiled
 def _sweep(
     machine, parameter, values, start, settle, cycles, method, rests, tolerance, max_steps
-) -> tuple[Any, Sweep]:
+) -> tuple[State, Sweep]:
     """The state after the last value, and what was found at each.
 
     **Arguments:** as `sweep`, all of them checked.

@@ -1,11 +1,11 @@
 """What one blow on a stop is, and what is written down of it."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax.lax import stop_gradient
 
-from ..._types import Flag, Scalar
+from ..._types import Flag, Scalar, State
 from ...machine import RigidStop
 from .._arrival import Arrival
 from .._lane import HIT, Plan
@@ -37,7 +37,7 @@ def gains_speed(stop: RigidStop, approach: Scalar, rebound: Scalar) -> Flag | No
 
 
 def listed(
-    plan: Plan, arrival: Arrival, there: Any, hit: Flag, number: int, approach: Scalar
+    plan: Plan, arrival: Arrival, there: State, hit: Flag, number: int, approach: Scalar
 ) -> Arrival:
     """The arrival with an impact counted and logged.
 

@@ -4,7 +4,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from ..._types import Flag
+from ..._types import Flag, State
 from ...machine import AbstractMachine, rubs
 from .. import results
 from .._arrival import Arrival, ended
@@ -14,7 +14,7 @@ from .sequence import strike_in_turn
 
 
 def strike(
-    plan: Plan, taken: Flag, arrival: Arrival, landed: dict[int, Flag], there: Any
+    plan: Plan, taken: Flag, arrival: Arrival, landed: dict[int, Flag], there: State
 ) -> tuple[Arrival, dict[int, Blow]]:
     """The arrival after the impacts of one instant, and what they were to each coordinate, by its
     number.
@@ -34,7 +34,7 @@ def is_compound(machine: AbstractMachine) -> bool:
 
 
 def _one_blow(
-    plan: Plan, taken: Flag, arrival: Arrival, landed: dict[int, Flag], there: Any, k: int
+    plan: Plan, taken: Flag, arrival: Arrival, landed: dict[int, Flag], there: State, k: int
 ) -> tuple[Arrival, dict[int, Blow]]:
     """As `strike`, where stops limit one coordinate and nothing rubs.
 

@@ -7,14 +7,14 @@ symmetrical stays so; then the next, until none closes. A sequence that gets wea
 to rest against each other.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.lax import stop_gradient
 
-from ..._types import Flag, Scalar
+from ..._types import Flag, Scalar, Scalars, State
 from ...machine import Coordinate, forces, push_of, rubbed, rubbing_on, rubs, shares
 from .. import results
 from .._arrival import Arrival, ended
@@ -41,9 +41,9 @@ class _Round(NamedTuple):
     """A sequence of impacts between two of them."""
 
     arrival: Arrival
-    struck: tuple[Scalar, ...]
+    struck: Scalars
     """Of each coordinate, as in `Blow`."""
-    approach: tuple[Scalar, ...]
+    approach: Scalars
     most: Scalar
     """The greatest speed of approach that there was."""
     goes_on: Scalar
@@ -57,7 +57,7 @@ class _Instant(NamedTuple):
     taken: Flag
     met: Flag
     """Whether any stop is landed upon."""
-    there: Any
+    there: State
     """The state before."""
     limited: list[int]
     """The numbers of the coordinates that stops limit."""
@@ -73,12 +73,12 @@ class _Instant(NamedTuple):
     coupled: list[Flag]
     """Of each coordinate, whether one of those landed upon acts on it, through contacts that are
     closed."""
-    slack: Any
+    slack: Scalar | float
     """What of a velocity is rounding."""
 
 
 def strike_in_turn(
-    plan: Plan, taken: Flag, arrival: Arrival, landed: dict[int, Flag], there: Any,
+    plan: Plan, taken: Flag, arrival: Arrival, landed: dict[int, Flag], there: State,
     limited: list[int],
 ) -> tuple[Arrival, dict[int, Blow]]:  # fmt: skip
     """As `strike`, where stops limit several coordinates, or something rubs.
@@ -114,7 +114,7 @@ def strike_in_turn(
 
 
 def _instant(
-    plan: Plan, taken: Flag, arrival: Arrival, landed: dict[int, Flag], there: Any,
+    plan: Plan, taken: Flag, arrival: Arrival, landed: dict[int, Flag], there: State,
     limited: list[int],
 ) -> _Instant:  # fmt: skip
     """What is known of an instant before its impacts.
@@ -242,9 +242,9 @@ def _each_by_itself(
 
 
 def _thrown(
-    instant: _Instant, state: Any, velocities: list[Scalar], slow: list[Flag],
+    instant: _Instant, state: State, velocities: list[Scalar], slow: list[Flag],
     hits: dict[int, Flag], rebounds: dict[int, Scalar],
-) -> tuple[Any, list[tuple[Coordinate, Scalar]]]:  # fmt: skip
+) -> tuple[State, list[tuple[Coordinate, Scalar]]]:  # fmt: skip
     """The state after the next impacts, and by how much each coordinate's velocity was pushed.
 
     **Arguments:** `state` and `velocities` before them; `slow`, which coordinates come to rest; of
@@ -299,7 +299,7 @@ def _closing(instant: _Instant, x: _Round, velocities: list[Scalar]) -> dict[int
 
 
 def _accounted(
-    instant: _Instant, arrival: Arrival, before: Any, pushed: list[tuple[Coordinate, Scalar]]
+    instant: _Instant, arrival: Arrival, before: State, pushed: list[tuple[Coordinate, Scalar]]
 ) -> Arrival:
     """With the energy that the impacts have lost: the work of each force at the mean velocity of
     its contact. A law that gains some ends the lane."""

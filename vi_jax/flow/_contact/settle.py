@@ -6,13 +6,13 @@ faster, their speeds a geometric series in k, and end in rest after a finite tim
 brief.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
 
-from ..._types import Flag, Scalar
+from ..._types import Flag, Scalar, Scalars, State
 from ...lanes import pin, pin_flag
 from ...machine import added, forces, held_by, push_of, rubs, shares, struck_modes
 from .._arrival import Arrival
@@ -37,13 +37,13 @@ class Approach(NamedTuple):
     """Its rate by s."""
     growth: Scalar | None
     """That of the force on it; absent where nothing can rest."""
-    alone: Any
+    alone: SmoothMachine
     """The machine in its modes with the other bodies held that rest."""
 
 
 def settle(
     plan: Plan, lane: Lane, approaches: dict[int, Approach], taken: Flag, arrival: Arrival,
-    there: Any, met: Flag, blows: dict[int, Blow],
+    there: State, met: Flag, blows: dict[int, Blow],
 ) -> Arrival:  # fmt: skip
     """The arrival at rest on those stops whose impacts were the last ones.
 
@@ -116,7 +116,7 @@ def _held(
     return arrival.counting(events=events, rests=count, loss=loss)
 
 
-def _beyond_any(plan: Plan, state: Any) -> Flag:
+def _beyond_any(plan: Plan, state: State) -> Flag:
     """Whether a body is beyond a stop by more than rounding."""
     found, slack = jnp.zeros((), bool), rounding(plan.machine, state)
     for stop in plan.machine.stops:
@@ -126,9 +126,9 @@ def _beyond_any(plan: Plan, state: Any) -> Flag:
 
 
 def _without_rebounds(
-    plan: Plan, state: Any, modes: tuple[Scalar, ...], rests: dict[int, Flag],
+    plan: Plan, state: State, modes: Scalars, rests: dict[int, Flag],
     walls: dict[int, Scalar],
-) -> tuple[Any, Scalar]:  # fmt: skip
+) -> tuple[State, Scalar]:  # fmt: skip
     """The state without the rebounds of those bodies that come to rest, and without the friction
     that went with them: the weight of the hops that are left out rubs instead, while the body is
     held. And the energy that goes with the rebounds.
@@ -155,8 +155,8 @@ def _without_rebounds(
 
 
 def stilled(
-    plan: Plan, state: Any, rests: dict[int, Flag], walls: dict[int, Scalar]
-) -> tuple[Any, Scalar]:
+    plan: Plan, state: State, rests: dict[int, Flag], walls: dict[int, Scalar]
+) -> tuple[State, Scalar]:
     """The state with those coordinates put on their stops that rest, without velocity, all at once;
     and the energy that goes with it.
 
@@ -187,7 +187,7 @@ def stilled(
 
 def _ends(
     plan: Plan, lane: Lane, free: SmoothMachine, k: int, blow: Blow, speed: Scalar,
-    at: tuple[Scalar, Any], growth: Scalar | None = None,
+    at: tuple[Scalar, State], growth: Scalar | None = None,
 ) -> tuple[Flag, Scalar]:  # fmt: skip
     """Whether an impact is one of the endless last ones before rest, and the time they take.
 
@@ -236,8 +236,8 @@ def _before_it_presses(
 
 
 def _broken(
-    plan: Plan, arrival: Arrival, there: Any, met: Flag, blows: dict[int, Blow]
-) -> tuple[Scalar, ...]:
+    plan: Plan, arrival: Arrival, there: State, met: Flag, blows: dict[int, Blow]
+) -> Scalars:
     """`Lane.contact` without those contacts that were struck or pulled apart by the impacts.
 
     **Arguments:** `there`, the state before them; `met`, whether there were any; `blows`, what they
@@ -255,7 +255,7 @@ def _broken(
 
 def _together(
     plan: Plan, lane: Lane, arrival: Arrival, blows: dict[int, Blow],
-    contact: tuple[Scalar, ...],
+    contact: Scalars,
 ) -> tuple[dict[int, Flag], dict[int, Scalar]]:  # fmt: skip
     """Of each coordinate that was struck, whether it comes to rest, and the time that takes.
 

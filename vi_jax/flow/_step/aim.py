@@ -90,8 +90,7 @@ def aim_at(plan: Plan, lane: Lane, trial: Trial, foreseen: bool) -> tuple[Flag, 
     """
     # What is found out here is only where to look.
     trial = trial._replace(
-        h=stop_gradient(trial.h),
-        seen=trial.seen._replace(paths=stop_gradient(trial.paths)),
+        h=stop_gradient(trial.h), seen=trial.seen._replace(paths=stop_gradient(trial.paths))
     )
     nothing = jnp.zeros_like(trial.good), trial.h, jnp.full_like(trial.h, FREE)
     if not trial.paths and not trial.crossings:

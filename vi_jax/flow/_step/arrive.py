@@ -1,13 +1,12 @@
 """Where a step leads: rebounds, rest, changes of mode, and what is recorded of the way."""
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
 
-from ..._types import Flag, Scalar
+from ..._types import Flag, Scalar, Scalars, State
 from ...machine import section_number, struck_modes
 from .._arrival import Arrival, Onward, Tally
 from .._contact.impact import is_compound, strike
@@ -169,7 +168,7 @@ def _released(
     )
 
 
-def _below(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Scalar, ...]:
+def _below(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> Scalars:
     """`Lane.below` after the step: after a jump of the state each guard has to come from below
     again."""
     found = []
@@ -183,7 +182,7 @@ def _below(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Scalar, .
     return tuple(found)
 
 
-def _put(values: tuple, k: int, value: Any) -> tuple:
+def _put(values: tuple, k: int, value: Scalar) -> tuple:
     return (*values[:k], value, *values[k + 1 :])
 
 
@@ -206,7 +205,7 @@ def _offset(plan: Plan, lane: Lane, trial: Trial, way: FlowToEvent, c: Crossing)
 
 def _impact(
     plan: Plan, lane: Lane, trial: Trial, taken: Flag, arrival: Arrival,
-    landed: dict[int, Flag], there: Any,
+    landed: dict[int, Flag], there: State,
 ) -> Arrival:  # fmt: skip
     """The arrival after the rebound from a stop, or at rest on it.
 

@@ -1,11 +1,11 @@
 """Why a lane ends before its time: by what its steps come to, or by an event that has no answer."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax.lax import stop_gradient
 
-from ..._types import Flag, Scalar
+from ..._types import Flag, Scalar, State
 from ...machine import AbstractMachine, events_of, guard_of
 from .. import results
 from .._lane import FREE, Lane, Plan, Record, to_event, total
@@ -38,7 +38,7 @@ class Progress(NamedTuple):
 
 def faults(
     plan: Plan, lane: Lane, trial: Trial, rejected: Flag, progress: Progress, target: Scalar
-) -> list[tuple[Flag, Any]]:
+) -> list[tuple[Flag, Scalar | float]]:
     """What ends a lane, the first that holds being the reason.
 
     **Arguments:** `rejected`, whether the trial was; `progress` and `target`, how far the lane has
@@ -94,7 +94,7 @@ def may_end(machine: AbstractMachine) -> bool:
 
 
 def comes_back(
-    machine: AbstractMachine, i: int, modes: tuple, s: Scalar, state: Any
+    machine: AbstractMachine, i: int, modes: tuple, s: Scalar, state: State
 ) -> Flag | None:
     """Whether the field behind a switch points back at its surface, as that before it did: the
     motion would slide along it. `None` for a kind of switch whose motion cannot.
@@ -105,7 +105,7 @@ def comes_back(
         return None
     smooth = in_modes(machine, modes)
 
-    def guard(s: Scalar, state: Any) -> Scalar:
+    def guard(s: Scalar, state: State) -> Scalar:
         return guard_of(machine, i, s, state, modes)
 
     here = stop_gradient(guard_rates(smooth.field, guard, s, state))

@@ -6,12 +6,12 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax.lax import stop_gradient
 
-from ..._types import Flag, Scalar
+from ..._types import Flag, Scalar, Scalars, State
 from ...lanes import pin_flag
 from ...machine import AbstractEvent, AbstractMachine, events_of, guard_of, section_number
 from .._lane import Lane, Plan, to_event
 from ..events import Rates, guard_rates, landing
-from ..smooth import exact
+from ..smooth import SmoothMachine, exact
 
 # Newton's method on a smooth flow needs two or three aims. Where rounding keeps it from gaining
 # more, a lane that has aimed this often accepts a thousand times the tolerance.
@@ -26,7 +26,7 @@ class Crossing(NamedTuple):
     """Its place among the machine's events."""
     begin: Rates
     end: Rates
-    scale: Any
+    scale: Scalar
     """Of g, for its rounding."""
     coordinate: int | None = None
     """That it limits, as stops do."""
@@ -48,8 +48,9 @@ class Crossing(NamedTuple):
 
 
 def crossings(
-    plan: Plan, lane: Lane, holding: Any, paths: list[Any], there: tuple, ends: tuple[Flag, Flag]
-) -> tuple[tuple[Crossing, ...], tuple[Scalar, ...]]:
+    plan: Plan, lane: Lane, holding: SmoothMachine, paths: list[Any], there: tuple,
+    ends: tuple[Flag, Flag],
+) -> tuple[tuple[Crossing, ...], Scalars]:  # fmt: skip
     """The events that a step saw, and `Lane.below` at its end.
 
     **Arguments:** `holding`, the machine as the step saw it; `paths`, what the step saw of each
@@ -77,8 +78,8 @@ def at_stops(machine: AbstractMachine, ends: list[tuple[Rates, Rates]]) -> list[
 
 
 def _others(
-    plan: Plan, lane: Lane, moving: Any, s1: Scalar, new: Any
-) -> tuple[list[Crossing], tuple[Scalar, ...]]:
+    plan: Plan, lane: Lane, moving: SmoothMachine, s1: Scalar, new: State
+) -> tuple[list[Crossing], Scalars]:
     """The events besides stops as a step sees them, with that of a clock in the state, which counts
     the cycles; and `Lane.below` at the step's end.
 
@@ -87,7 +88,7 @@ def _others(
     """
     machine, found, below = plan.machine, [], []
 
-    def ends(guard: Callable[[Scalar, Any], Any]) -> tuple[Rates, Rates]:
+    def ends(guard: Callable[[Scalar, State], Scalar]) -> tuple[Rates, Rates]:
         begin = guard_rates(moving.field, guard, lane.s, lane.state)
         return begin, guard_rates(moving.field, guard, s1, new)
 

@@ -1,11 +1,9 @@
 """What an event that is no impact makes of a lane."""
 
-from typing import Any
-
 import jax.numpy as jnp
 from jax.lax import stop_gradient
 
-from ..._types import Flag, Scalar
+from ..._types import Flag, Scalar, Scalars, State
 from ...machine import after_event, happens_at, mode_number, value_of
 from .. import results
 from .._arrival import Arrival, ended
@@ -18,7 +16,7 @@ from .guards import Crossing
 from .jump import after_jump
 
 
-def happened(plan: Plan, taken: Flag, arrival: Arrival, c: Crossing, there: Any) -> Arrival:
+def happened(plan: Plan, taken: Flag, arrival: Arrival, c: Crossing, there: State) -> Arrival:
     """The arrival after an event that is no impact: a switch, a reset or another kind.
 
     **Arguments:** `taken`, whether the step is taken; `c`, the event; `there`, the state in which
@@ -55,7 +53,7 @@ def happened(plan: Plan, taken: Flag, arrival: Arrival, c: Crossing, there: Any)
 
 
 def _let_go(
-    plan: Plan, arrival: Arrival, taken: Flag, when: Flag, before: tuple[Any, tuple[Scalar, ...]]
+    plan: Plan, arrival: Arrival, taken: Flag, when: Flag, before: tuple[State, Scalars]
 ) -> Arrival:
     """The arrival without those bodies at rest that were pressed on their stops before an event and
     are pulled away behind it: a force that jumps has no zero to be released at.
@@ -70,7 +68,7 @@ def _let_go(
     freed, direction, events = list(contact), list(arrival.direction), arrival.tally.events
     for k in sorted({stop.coordinate for stop in machine.stops}):
 
-        def pressing(modes: tuple[Scalar, ...], state: Any, k: int = k) -> Scalar:
+        def pressing(modes: Scalars, state: State, k: int = k) -> Scalar:
             free = holding(machine, modes, contact, but=k)
             return rates(free.field, machine.coordinates[k].position, arrival.s, state).a
 
@@ -86,7 +84,7 @@ def _let_go(
 
 
 def _jumped(
-    plan: Plan, arrival: Arrival, c: Crossing, happens: Flag, there: Any, new: Any
+    plan: Plan, arrival: Arrival, c: Crossing, happens: Flag, there: State, new: State
 ) -> Arrival:
     """The arrival after a jump of the state: which way the motion goes on, and which bodies still
     rest. A lane whose body was put beyond a stop ends.

@@ -14,12 +14,12 @@ they are those at a fixed reading of the clock, so that the steps to come carry 
 """
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax.lax import stop_gradient
 
-from ..._types import Flag, Scalar
+from ..._types import Flag, Scalar, State
 from ...lanes import pin_flag
 from .._arrival import Onward
 from .._lane import FREE, Lane, Plan, Record, select
@@ -37,7 +37,7 @@ class Step(NamedTuple):
     lane: Lane
     completed: Flag
     """Whether an interval ended with it."""
-    state: Any
+    state: State
     record: Record
     """Of that interval."""
 

@@ -1,11 +1,9 @@
 """How a motion goes on behind a state that was put in place of another."""
 
-from typing import Any
-
 import jax.numpy as jnp
 from jax.lax import stop_gradient
 
-from ..._types import Flag, Scalar
+from ..._types import Flag, Scalar, Scalars, State
 from .._arrival import Onward
 from .._lane import Plan
 from ..events import rates
@@ -13,8 +11,8 @@ from ..smooth import holding, rounding
 
 
 def after_jump(
-    plan: Plan, onward: Onward, when: Flag, old: Any, new: Any, s: Scalar
-) -> tuple[tuple[Scalar, ...], tuple[Scalar, ...] | None]:
+    plan: Plan, onward: Onward, when: Flag, old: State, new: State, s: Scalar
+) -> tuple[Scalars, Scalars | None]:
     """The directions of all coordinates, and the stops rested on, after the state was replaced by
     another one. What was moved rests no longer.
 
@@ -22,8 +20,8 @@ def after_jump(
     `old` and `new`, the states before and after.
     """
     direction, contact, modes = onward
-    directions: list[Any] = list(direction)
-    contacts: list[Any] = list(contact or ())
+    directions: list[Scalar] = list(direction)
+    contacts: list[Scalar] = list(contact or ())
     slack = rounding(plan.machine, new)
     for k, coordinate in enumerate(plan.machine.coordinates):
         (place, before), (there, after) = (

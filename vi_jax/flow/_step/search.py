@@ -6,14 +6,14 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax.lax import stop_gradient
 
-from ..._types import Flag, Scalar
+from ..._types import Flag, Scalar, Scalars
 from ...machine import RigidStop, horner
 from .._lane import Lane, Plan, select, to_event, to_turn_of
 from ..events import Rates, highest, rising_root, slope
 from .guards import Crossing
 
 # Coefficients in θ, which goes from 0 to 1 along a step.
-Curve = tuple[Scalar, ...]
+Curve = Scalars
 
 # An event, whether a step ends beyond it, and its guard along the step; of a coordinate whether it
 # turned within the step, and itself along it. Curves are asked for only where something is met.
@@ -43,12 +43,7 @@ class First(NamedTuple):
 
 
 def first_event(
-    plan: Plan,
-    lane: Lane,
-    guards: list[Passed],
-    courses: list[Course],
-    met: Flag,
-    corrections: int,
+    plan: Plan, lane: Lane, guards: list[Passed], courses: list[Course], met: Flag, corrections: int
 ) -> First:
     """The first event of a step.
 

@@ -1,12 +1,12 @@
 """A step that is tried, and what it meets on its way."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.lax import stop_gradient
 
-from ..._types import Flag, Scalar
+from ..._types import Flag, Scalar, Scalars, State
 from ...lanes import pin, pin_flag
 from .._contact.rest import Release, release
 from .._lane import FREE, Lane, Plan, to_event, to_turn_of, total
@@ -38,7 +38,7 @@ class End(NamedTuple):
     """Independent variable, state and elapsed time where a step ends."""
 
     s: Scalar
-    state: Any
+    state: State
     time: Beside | None
     """Elapsed time and integrals, where they are recorded."""
 
@@ -50,7 +50,7 @@ class Seen(NamedTuple):
     """The machine's events."""
     paths: tuple[Path, ...]
     """Of each coordinate; none where nothing asks for it."""
-    below: tuple[Scalar, ...]
+    below: Scalars
     """As in `Lane`, at the step's end."""
 
 
@@ -78,7 +78,7 @@ class Trial(NamedTuple):
         return self.end.s
 
     @property
-    def state(self) -> Any:
+    def state(self) -> State:
         """The state where the step ends."""
         return self.end.state
 

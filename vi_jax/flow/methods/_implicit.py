@@ -21,12 +21,12 @@ _MOST = 12
 
 def implicit_stages(
     tableau: Any,
-    field: Callable[[Any, Vector], Vector],
-    s0: Any,
-    h: Any,
+    field: Callable[[Scalar, Vector], Vector],
+    s0: Scalar,
+    h: Scalar,
     y0: Vector,
-    tolerance: Any,
-) -> tuple[list[Vector], Any]:
+    tolerance: Scalar | float,
+) -> tuple[list[Vector], Scalar]:
     """The slopes of all stages, and what the last steps of Newton's method still changed.
 
     All stages share one matrix 1 - hγJ, with the Jacobian at the start of the step (Kværnø, BIT
@@ -46,10 +46,10 @@ def implicit_stages(
         base = y0 + h * weighted(row, stages)
         s = s0 + float(c) * h
 
-        def lacks(k: Vector, s: Any = s, base: Any = base) -> Vector:
+        def lacks(k: Vector, s: Scalar = s, base: Vector = base) -> Vector:
             return k - field(s, base + h * gamma * k)
 
-        def solve(lacks: Any, k: Vector) -> tuple[Vector, Scalar]:
+        def solve(lacks: Callable[[Vector], Vector], k: Vector) -> tuple[Vector, Scalar]:
             def goes_on(carry):
                 _, size, i = carry
                 return (size > tolerance) & (i < _MOST)

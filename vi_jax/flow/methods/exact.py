@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from math import factorial
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -11,7 +10,7 @@ import jax.tree_util as jtu
 from numpy.polynomial.legendre import leggauss
 
 from ..._checks import count
-from ..._types import Scalar
+from ..._types import Scalar, State
 from ...machine import (
     AbstractMachine,
     CosineCrank,
@@ -93,7 +92,7 @@ class ExactFlight(AbstractMethod):
 
 
 def _integrated(
-    smooth: SmoothMachine, s0: Scalar, s1: Scalar, state: Any, along: Callable, beside: Beside
+    smooth: SmoothMachine, s0: Scalar, s1: Scalar, state: State, along: Callable, beside: Beside
 ) -> Beside:
     """Integrals beside a flight from `s0` to `s1`, by quadrature.
 

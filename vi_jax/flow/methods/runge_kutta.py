@@ -10,8 +10,9 @@ import jax.tree_util as jtu
 import numpy as np
 
 from ..._checks import count, require
+from ..._types import Scalar, State
 from ...lanes import pin
-from ..beside import rate_beside
+from ..beside import Beside, rate_beside
 from ..smooth import SmoothMachine
 from .base import AbstractMethod
 from .unrolled import Unrolled
@@ -38,7 +39,7 @@ def _runge_kutta(solver: Unrolled, smooth: SmoothMachine, s0, s1, state, beside)
     return *y1, error
 
 
-def _sized_by(state: Any, beside: Any) -> tuple[Any, Any]:
+def _sized_by(state: State, beside: Beside | None) -> tuple[State, dict[str, Scalar] | None]:
     """What the size of a step is chosen by: the state and the integrals, but not the elapsed
     time."""
     return state, None if beside is None else beside.integrals
