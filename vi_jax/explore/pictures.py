@@ -21,6 +21,7 @@ from .motion import WINDOW, Motion
 MAPS = ("impact map", "section map")
 """What the third picture of an ideal motion shows."""
 
+# Dots per inch, and the look of lines behind: choices.
 _DPI, _FAINT = 90, {"color": "0.88", "lw": 0.8, "zorder": 0}
 
 # Limits are kept while what is drawn is within them and fills so much of them.

@@ -24,12 +24,14 @@ from .methods import AbstractMethod, Adaptive, ExactFlight, FixedStep, Taylor, V
 
 QUANTITIES = ("state", "extremes", "impacts", "derivative")
 
+# What is tried: steps in a cycle, each a tenth to a third more than the last; decades of
+# tolerances. Of so many rounds the median time counts. All are choices.
 _STEPS = (5, 6, 7, 8, 10, 12, 16, 20, 24, 32, 48, 64)
 _TOLERANCES = tuple(10.0**-n for n in range(3, 15))
 _ROUNDS = 5
 
 # Stiff is a machine in which what fades fastest asks for steps so many times shorter than its
-# motion.
+# motion; from where on implicit methods are tried. A choice.
 _STIFF = 20.0
 
 

@@ -16,7 +16,8 @@ from jax.lax import stop_gradient
 from .._types import Flag, Machine, Scalar, State
 
 # A pivot smaller than this (its row's begins as 1) is that of a contact whose velocity the others
-# have settled already, as that of the fourth leg of a table: it gets no force.
+# have settled already, as that of the fourth leg of a table: it gets no force. A choice, far above
+# rounding and far below the pivots of contacts that matter.
 _REDUNDANT = 1e-9
 
 

@@ -21,7 +21,8 @@ from .scene import Oscillator, Scene
 from .shown import Shown
 from .stop import RigidStop
 
-# Crank radii from which a length is taken to be in another unit than metres.
+# Crank radii from which a length is taken to be in another unit than metres: a choice. Table 1's
+# gap is 2 of them, and would be 2,000 if given in millimetres.
 _LONG = 1000.0
 
 # A plain number is taken as well as an array of them to `vmap` over.

@@ -15,7 +15,8 @@ from .base import AbstractMachine
 
 Machine = TypeVar("Machine", bound="ShaftMachine")
 
-# A state that was carried to the section lies on it to rounding, in single precision too.
+# A state that was carried to the section lies on it to rounding, in single precision too, where
+# that of a turn is 5e-7.
 _ON_SECTION = 1e-5
 
 

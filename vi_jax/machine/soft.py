@@ -20,7 +20,8 @@ TOUCHING, RELEASED, APART = 1.0, 0.0, -1.0
 # Laws that may be asked for by their names.
 _LAWS: dict[str, type[AbstractContactLaw]] = {"power": PowerLaw, "hunt-crossley": HuntCrossley}
 
-# A body is near enough for the contact's time scale to matter (unit: that of the coordinate).
+# A body is near enough for the contact's time scale to matter (unit: that of the coordinate): a
+# choice, since a step that ends on first touch may end a little short of it.
 _NEAR = 1e-6
 
 

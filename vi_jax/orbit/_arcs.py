@@ -22,10 +22,11 @@ from ._forward_jacobian import forward_jacobian
 from ._neutral import neutral
 from ._root import shooting_matrix
 
-# Places in a cycle at which an orbit can be searched.
+# Places in a cycle at which an orbit can be searched: a choice; each costs a sample of the guess.
 _PLACES = 8
 
-# A motion drifts if so much of what it lacks to be periodic is what no other start would change.
+# A motion drifts if so much of what it lacks to be periodic is what no other start would change: by
+# choice, most of it.
 _DRIFTS = 0.5
 
 

@@ -30,7 +30,8 @@ if TYPE_CHECKING:
 else:
     xr = lazy("xarray")
 
-# What lies below zero by no more than this is zero to rounding.
+# What lies below zero by no more than this is zero to rounding: a choice, a hundred times the
+# corrector's tolerance.
 _NOISE = 1e-9
 
 # Of the first and of the second parameter.

@@ -22,7 +22,8 @@ from ._shooting import Shooting
 from ._solve import observe
 from .curve import Step
 
-# The motion that stands for the branch there has so much of the size of the one before it.
+# The motion that stands for the branch there has so much of the size of the one before it. This and
+# the numbers below are choices.
 _SMALL = 1e-5
 
 # By how much an eigenvalue's period may differ from that of the last motion, as a share of it.

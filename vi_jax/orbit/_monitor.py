@@ -17,6 +17,7 @@ from ._symmetry import may_be_symmetric
 from .curve import Step
 from .special import CROSSING, DOUBLING, FOLD, GRAZING, HOPF, SYMMETRY, TORUS, SpecialPoint
 
+# The thresholds here are choices, but for those of which a measurement is given.
 # What lies before the place where a branch springs is looked for on so much of the way there.
 _SHORT = 0.999
 

@@ -34,14 +34,16 @@ from ._symmetry import images
 from .curve import Step, array_of, corrected, first_tangent
 from .results import Orbit
 
-# Events of a cycle that can be followed, of a machine with switches or a section of its own.
+# Events of a cycle that can be followed, of a machine with switches or a section of its own: a
+# choice.
 _LISTED = 32
 
 # Twice the steps of a flight change its end by less than this (relative to 1 + |state|); a motion
-# that asks for more of them than this is followed with so many.
+# that asks for more of them than this is followed with so many. The first is the corrector's
+# tolerance (`curve.corrected`), the second a choice.
 _SETTLED, _MOST = 1e-11, 4096
 
-# How far short of a place that has no solution (as a share of the step) one is looked for.
+# How far short of a place that has no solution (as a share of the step) one is looked for: choices.
 _SHORT_OF = (1e-6, 1e-5, 1e-4, 1e-3)
 
 

@@ -18,7 +18,8 @@ from ..flow import Beside, Rates, SmoothMachine, guard_rates
 from ..machine import events_of, guard_of, happens_at, section_number
 from ._flight import Flight
 
-# Newton's method has met a turn if it ends this close to it (as a share of the step).
+# Newton's method has met a turn if it ends this close to it (as a share of the step): a choice,
+# since what is left enters the height in second order and is taken off.
 _TURNED = 1e-3
 
 

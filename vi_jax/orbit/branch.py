@@ -32,7 +32,7 @@ else:
     xr = lazy("xarray")
 
 # An orbit found on the cycle map solves the equations from impact to impact closer than this; one
-# that rests on a stop does not.
+# that rests on a stop does not. A choice.
 _SAME = 1e-3
 
 # A point lies at a value of the parameter if it is no further from it (in the parameter's scale).

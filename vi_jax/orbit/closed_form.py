@@ -30,7 +30,8 @@ from ..flow import lack_of_closed_form
 from ..machine import IdealDrive, Scene, Shown
 from .floquet import eigenvalues
 
-# Grid points per drive cycle on which turning points are bracketed.
+# Grid points per drive cycle on which turning points are bracketed: a choice, for ζ well above
+# 1/256.
 _POINTS = 256
 
 

@@ -26,11 +26,11 @@ from .floquet import multipliers_of
 from .results import ORBIT_RESULTS, Orbit, trimmed
 from .root_finders import AbstractRootFinder, Newton
 
-# Lanes searched at once: a batch lasts as long as its slowest lane.
+# Lanes searched at once, a choice: a batch lasts as long as its slowest lane.
 _BATCH = 512
 
 # A search that fails with an impact slower than this (or a turn that would be one) failed at a
-# grazing: there the map's derivative is of the order of 1/V⁻ and jumps.
+# grazing: there the map's derivative is of the order of 1/V⁻, here 50, and jumps. A choice.
 _SLOW = 0.02
 
 

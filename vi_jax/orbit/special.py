@@ -19,7 +19,7 @@ FOLD, DOUBLING, TORUS = "fold", "period-doubling", "neimark-sacker"
 GRAZING, CROSSING, SYMMETRY = "grazing", "branch-point", "symmetry-breaking"
 HOPF = "hopf"
 
-# Where something grazes it is touched to rounding.
+# Where something grazes it is touched to rounding, by choice within this.
 _TOUCHES = 1e-6
 
 

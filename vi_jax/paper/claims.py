@@ -10,7 +10,7 @@ from .motions import Case, closed_form, half_turn_states, last_minima, run_of, s
 CONFIRMED, UNDAMPED_ONLY, CONTRADICTED = "confirmed", "confirmed undamped only", "contradicted"
 PARTLY = "confirmed in part"
 
-# A motion counts as settled once it stays this close to an orbit (unit: a, a ω).
+# A motion counts as settled once it stays this close to an orbit (unit: a, a ω): a choice.
 _SETTLED = 1e-3
 
 

@@ -11,6 +11,7 @@ from ..flow import Run
 from ..plot import STOP, angle_axis, color_of, motion_path, plot_history, save_picture, stamp
 from .motions import Case
 
+# Dots per inch: a choice.
 _DPI = 110
 # Colour of a simulated motion: neutral, as its regime is what the picture is to show.
 _INK = "0.2"

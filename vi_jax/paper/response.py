@@ -15,6 +15,7 @@ from ..orbit import Branch, ClosedFormOrbits, closed_form_orbits, continue_orbit
 from ..scan import REGIMES, Sweep, lyapunov, sweep
 from .motions import GAP, table_damping_ratio
 
+# The k that Figure 2 is computed for, and Table 1's range of ζ.
 RESTITUTIONS = (0.8, 0.5)
 RANGE = (0.5, 1.9)
 RATIO, DAMPING, BOUNCE = "drive.frequency_ratio", "oscillator.damping_ratio", "stops.0.restitution"
@@ -24,7 +25,7 @@ RATIO, DAMPING, BOUNCE = "drive.frequency_ratio", "oscillator.damping_ratio", "s
 WALL = -2.5
 # Between these the motions change much, and ζ is stepped through more finely.
 FINE = (0.695, 1.015)
-# Periods of more cycles than this are not looked for.
+# Periods of more cycles than this are not looked for: a choice.
 LONGEST = 12
 # Lanes of the programs that settle single values again; one number, so that there is one program.
 _LANES = 128

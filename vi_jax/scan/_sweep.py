@@ -49,7 +49,8 @@ from ..machine import (
 from ..orbit import impacts_in_words
 from .regime import CODES, REGIMES, flags, impacts_of, least_period
 
-# A jump is so many times the change at the values beside it, and this part of 1 + |number|.
+# A jump is so many times the change at the values beside it, and this part of 1 + |number|:
+# choices.
 _JUMP, _NOTED = 3.0, 0.01
 
 # What is a number at each value of every sweep.

@@ -21,10 +21,11 @@ from ..flow import compiling
 from .grid import Blocks
 from .program import ScanProgram
 
-# Lanes of a block on a CPU and on an accelerator.
+# Lanes of a block on a CPU and on an accelerator: choices. A block is what an interrupt loses.
 _MOST, _ON_ACCELERATOR = 4096, 65536
 
-# A block has a multiple of so many lanes on each device: few sizes, for few programs.
+# A block has so many lanes on each device, or so many doubled again and again: few sizes, for few
+# programs. A choice.
 _LEAST = 256
 
 

@@ -15,10 +15,11 @@ from .._types import Scalar, State
 Number = Scalar | float
 
 # How far sections a period apart may differ; so many times that, if a longer period fits within it;
-# and so many times what the longer one differs by.
+# and so many times what the longer one differs by. Choices.
 _TOLERANCE, _SLACK, _WORSE = 1e-6, 100.0, 1e4
 
 # The least that sections are held to: so many times what they wander by, and so many roundings.
+# Choices.
 _WANDERS, _ROUNDINGS = 10.0, 64.0
 
 

@@ -11,7 +11,8 @@ from .._arrival import Arrival
 from .._lane import HIT, Plan
 from .._log import clock_at, logged, noted
 
-# By so many roundings a rebound may be faster than the approach.
+# By so many roundings a rebound may be faster than the approach: a choice, a few more than the one
+# or two that a law's own arithmetic makes.
 _FASTER = 16.0
 
 

@@ -25,10 +25,11 @@ class _Precision(NamedTuple):
     straight: float
     close: float
     # How much of a chatter may be left when it is completed, as a share of the longest step: its
-    # error is of second order.
+    # error is of second order, 6e-11 of that step in double precision.
     brief: float
 
 
+# `close` is the tolerance of landings (`guards`). The others are choices.
 _DOUBLE = _Precision(short=1e-3, straight=1e-5, close=1e-9, brief=8e-6)
 _SINGLE = _Precision(short=1e-2, straight=1e-3, close=1e-4, brief=8e-3)
 

@@ -25,15 +25,17 @@ from .blow import Blow, gains_speed, listed
 # Shares of the greatest speed of approach so far. Below the first a contact does not close: it is
 # rounding of the blows before. At the second the sequence is replaced by its limit, in which those
 # contacts come to rest that were struck and move no faster than `_ALIKE` times the fastest.
+# All three are choices; how many blows they take in known cases is in docs/internals/step.md.
 _NONE, _WEAK, _ALIKE = 1e-12, 1e-7, 30.0
 
-# Speeds that differ by no more than this share are the same.
+# Speeds that differ by no more than this share are the same: a choice, far above rounding.
 _EQUAL = 1e-9
 
-# Contacts that share less than this of each other's velocity are struck each by itself.
+# Contacts that share less than this of each other's velocity are struck each by itself: a choice.
 _APART = 1e-6
 
-# A ball between a wall and a body 100 times heavier is struck 31 times, one of 10,000 times 314.
+# A ball between a wall and a body 100 times heavier is struck 31 times, one of 10,000 times 314
+# (π times the root of the ratio): this is enough for a body 1.7 million times heavier.
 _ROUNDS = 4096.0
 
 

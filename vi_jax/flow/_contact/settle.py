@@ -26,7 +26,7 @@ from .blow import Blow
 from .rest import allowed
 
 # A contact whose bodies leave each other with less than this share of the speed with which they
-# came stays closed while it is looked at what presses on it.
+# came stays closed while it is looked at what presses on it: a choice, far above rounding.
 _CLOSED = 1e-9
 
 

@@ -14,10 +14,10 @@ from ..smooth import in_modes
 from .trial import Trial
 
 # A lane that has aimed this often without landing is lost; after so many impacts in one interval
-# it was chattering.
+# it was chattering. Both are choices: a smooth flow needs two or three aims.
 _LOST, _MANY = 64.0, 16.0
 
-# Nothing that a lane could do in one interval takes so many steps.
+# Nothing that a lane could do in one interval takes so many steps; a power of two, by choice.
 _STUCK = 65536.0
 
 

@@ -14,7 +14,7 @@ from ..events import Rates, guard_rates, landing
 from ..smooth import SmoothMachine, exact
 
 # Newton's method on a smooth flow needs two or three aims. Where rounding keeps it from gaining
-# more, a lane that has aimed this often accepts a thousand times the tolerance.
+# more, a lane that has aimed this often (a choice) accepts a thousand times the tolerance.
 _PATIENCE = 12.0
 
 

@@ -8,7 +8,7 @@ from .._lane import Lane
 from .guards import Crossing
 from .trial import Path
 
-# A hump of a guard this close to an end of a step (as a share of it) is seen from there.
+# A hump of a guard this close to an end of a step (as a share of it) is seen from there: a choice.
 _BRIEF = 1e-3
 
 

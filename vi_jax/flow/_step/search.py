@@ -20,13 +20,14 @@ Curve = Scalars
 Passed = tuple[Crossing, Flag, Callable[[], Curve]]
 Course = tuple[Flag, Callable[[], Curve]]
 
-# Turning points this far inside the gap (unit: a) are passed by where only impacts matter.
+# Turning points this far inside the gap (unit: a) are passed by where only impacts matter. A
+# choice: the quintic through a step's ends has to be right to this.
 _MARGIN = 0.02
 
 # By so much a bound is wider, for what rounding makes of it.
 _WIDER = 1.001
 
-# A turn whose velocity is known no better than to this share of that at the step's ends.
+# A turn whose velocity is known no better than to this share of that at the step's ends: a choice.
 _UNCERTAIN = 1e-3
 
 

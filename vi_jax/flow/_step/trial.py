@@ -16,7 +16,8 @@ from ..methods import Foreseen
 from ..smooth import SmoothMachine, exact, holding
 from .guards import Crossing, crossings, leniency, turn_tolerance
 
-# A window of force shorter than this share of the longest step moves the body by its third power.
+# A window of force shorter than this share of the longest step moves the body by its third power,
+# 1e-9 of what a whole step does.
 _SLIVER = 1e-3
 
 

@@ -15,7 +15,7 @@ from ..._types import Scalar
 
 Vector = Float[Array, " n"]
 
-# Newton's steps after which a stage is given up, so that the step is tried again shorter.
+# Newton's steps after which a stage is given up, so that the step is tried again shorter: a choice.
 _MOST = 12
 
 
