@@ -1,4 +1,4 @@
-"""Types that every package in this one uses."""
+"""Types that signatures are written in, throughout the package."""
 
 from typing import TYPE_CHECKING, Any
 
