@@ -12,11 +12,11 @@ jax.config.update("jax_enable_x64", True)
 # The lanes' many small functions, which write a program's text, would take three times as long;
 # they are checked in a process of their own (`lanes/test_types.py`).
 _PACKAGE = Path(__file__).parents[1] / "vi_jax"
-_ROOMS = sorted(
+_MODULES = sorted(
     {path.name.removesuffix(".py") for path in _PACKAGE.iterdir() if path.name[0] != "."}
     - {"__pycache__", "__init__", "py", "lanes"}
 )
-_hook = jaxtyping.install_import_hook([f"vi_jax.{x}" for x in _ROOMS], "beartype.beartype")
+_hook = jaxtyping.install_import_hook([f"vi_jax.{x}" for x in _MODULES], "beartype.beartype")
 
 # What JAX traces lives long, and looking it through for rubbish takes a tenth of the time.
 gc.set_threshold(200_000, 20, 20)

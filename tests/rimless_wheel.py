@@ -1,4 +1,4 @@
-"""A rimless wheel that walks down a slope, for the tests of several rooms."""
+"""A rimless wheel that walks down a slope, for the tests of several packages."""
 
 import jax.numpy as jnp
 import numpy as np

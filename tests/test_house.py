@@ -1,4 +1,4 @@
-"""Rooms import one way, nothing private of each other, and no file outgrows its subject."""
+"""Packages import one way, nothing private of each other, and no file outgrows its subject."""
 
 import ast
 import importlib
@@ -43,20 +43,20 @@ def imports(path: Path) -> Iterator[tuple[list[str], str]]:
             yield words, name.name
 
 
-def test_rooms_import_one_way_and_nothing_private():
-    rooms = {path.name for path in HOUSE.iterdir() if (path / "__init__.py").exists()}
-    assert rooms == set(ORDER)
+def test_packages_import_one_way_and_nothing_private():
+    packages = {path.name for path in HOUSE.iterdir() if (path / "__init__.py").exists()}
+    assert packages == set(ORDER)
     seen = 0
     for path in FILES:
-        room = path.relative_to(HOUSE).parts[0]
-        if room not in ORDER:
+        package = path.relative_to(HOUSE).parts[0]
+        if package not in ORDER:
             continue
         for words, name in imports(path):
             other = words[0] if words else name
-            if other == room or other in TOOLS:
+            if other == package or other in TOOLS:
                 continue
             seen += 1
-            assert other in ORDER and ORDER.index(other) < ORDER.index(room), (path, other)
+            assert other in ORDER and ORDER.index(other) < ORDER.index(package), (path, other)
             # By the one way in, its `__init__`; what takes long to load is loaded where it is used.
             assert len(words) <= 1 or words in LATE, (path, words)
             assert not name.startswith("_"), (path, name)
@@ -72,7 +72,7 @@ def test_no_file_has_more_than_350_lines():
     assert not long
 
 
-def test_a_room_hidden_by_a_verb_can_be_imported_from():
+def test_a_package_hidden_by_a_verb_can_be_imported_from():
     import vi_jax.scan.store as store
     from vi_jax.scan import measures
 

@@ -1,4 +1,4 @@
-"""A machine of one's own with several impacting coordinates, for the tests of several rooms."""
+"""A machine of one's own with several impacting coordinates, for the tests of several packages."""
 
 from typing import Any
 

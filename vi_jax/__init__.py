@@ -118,7 +118,7 @@ def __getattr__(name: str):
 
 
 def __dir__() -> list[str]:
-    """What this package offers: its names, the plots and the rooms of ready parts."""
+    """What this package offers: its names, the plots and the packages of ready parts."""
     from . import plot
 
     pictures = [name for name in vars(plot) if name.startswith("plot_")]
@@ -132,13 +132,13 @@ def __dir__() -> list[str]:
     )
 
 
-def _room_of(verb: typing.Any) -> None:
-    """Give a verb the modules of the room that it hides by its name, so that `import` finds them:
-    `import vi_jax.scan.store`, while `vi_jax.scan(...)` scans."""
-    room = sys.modules[f"{__name__}.{verb.__name__}"]
-    for name, value in list(vars(room).items()):
-        if isinstance(value, types.ModuleType) and value.__name__ == f"{room.__name__}.{name}":
+def _show_modules_on(verb: typing.Any) -> None:
+    """Give a verb the modules of the package that it hides by its name, so that `import` finds
+    them: `import vi_jax.scan.store`, while `vi_jax.scan(...)` scans."""
+    package = sys.modules[f"{__name__}.{verb.__name__}"]
+    for name, value in list(vars(package).items()):
+        if isinstance(value, types.ModuleType) and value.__name__ == f"{package.__name__}.{name}":
             setattr(verb, name, value)
 
 
-_room_of(scan)
+_show_modules_on(scan)

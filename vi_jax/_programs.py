@@ -29,7 +29,8 @@ _QUICK = {**PLAIN, "xla_backend_optimization_level": 0}
 
 _MAPS, _MOST = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
 
-# Parts of the maps beyond which programs are dropped, and down to which.
+# Parts of the maps beyond which programs are dropped, and down to which. Both are choices: they
+# leave room for what else takes maps, and make dropping rare.
 _FULL, _ROOM = 0.6, 0.4
 
 # To count the maps takes up to a tenth of a second. So it is done at most once in `_SELDOM` times
@@ -113,10 +114,7 @@ class CompiledFunction:
     """
 
     def __init__(
-        self,
-        function: Callable[..., Any],
-        quick: Mapping[str, Any] = _QUICK,
-        **options: Any,
+        self, function: Callable[..., Any], quick: Mapping[str, Any] = _QUICK, **options: Any
     ):
         functools.update_wrapper(self, function)
         self._function, self._quick_options = _uncollected(function), quick

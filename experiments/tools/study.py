@@ -29,6 +29,6 @@ def write(study: str, page: str, numbers: dict[str, float], figure: Figure, **lo
     """
     if QUICK:
         return
-    rooms = (_EXPERIMENTS / room for room in ("studies", "benchmarks"))
-    folder = next(room for room in rooms if (room / f"{study}.py").exists())
+    folders = (_EXPERIMENTS / kind for kind in ("studies", "benchmarks"))
+    folder = next(x for x in folders if (x / f"{study}.py").exists())
     keep(folder, study, page, numbers, figure, **look)

@@ -17,7 +17,7 @@ import headline_numbers
 
 FOLDER = Path(__file__).parents[2] / "experiments"
 
-PATHS = {p.stem: p for room in ("studies", "benchmarks") for p in FOLDER.glob(f"{room}/*.py")}
+PATHS = {p.stem: p for kind in ("studies", "benchmarks") for p in FOLDER.glob(f"{kind}/*.py")}
 COMPUTED = {
     name: function
     for name, function in inspect.getmembers(headline_numbers, inspect.isfunction)

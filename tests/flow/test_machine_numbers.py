@@ -68,15 +68,15 @@ def traces(monkeypatch):
     """How often each of the verbs was traced."""
     counts = {"simulate": 0, "find_orbit": 0}
 
-    def counted(verb, module, name):
-        room = importlib.import_module(module)
-        function = getattr(room, name)
+    def counted(verb, path, name):
+        module = importlib.import_module(path)
+        function = getattr(module, name)
 
         def wrapper(*args, **options):
             counts[verb] += 1
             return function(*args, **options)
 
-        monkeypatch.setattr(room, name, wrapper)
+        monkeypatch.setattr(module, name, wrapper)
 
     counted("simulate", "vi_jax.flow._simulate", "collect")
     counted("find_orbit", "vi_jax.orbit.find", "_judged")

@@ -31,10 +31,10 @@ def test_verbs_end_soon(verb):
 
 
 def test_an_interrupted_sweep_gives_the_values_that_were_done(monkeypatch):
-    room = importlib.import_module("vi_jax.scan._sweep")
+    module = importlib.import_module("vi_jax.scan._sweep")
     whole = vi.sweep(MOTOR, "drive.control", VALUES, settle=4, cycles=4)
     assert whole.values.shape == (40,) and bool(whole.successful.all())
-    calls, swept = [], room._sweep
+    calls, swept = [], module._sweep
 
     def interrupted(*arguments):
         calls.append(1)
@@ -42,7 +42,7 @@ def test_an_interrupted_sweep_gives_the_values_that_were_done(monkeypatch):
             raise KeyboardInterrupt
         return swept(*arguments)
 
-    monkeypatch.setattr(room, "_sweep", interrupted)
+    monkeypatch.setattr(module, "_sweep", interrupted)
     with pytest.raises(vi.Interrupted, match="the sweep was interrupted") as caught:
         vi.sweep(MOTOR, "drive.control", VALUES, settle=4, cycles=4)
     part = caught.value.partial
@@ -78,12 +78,12 @@ def test_an_interrupted_branch_is_a_branch(monkeypatch):
 
 @pytest.mark.slow
 def test_interrupted_basins_keep_the_starts_that_were_followed(monkeypatch):
-    room = importlib.import_module("vi_jax.scan._basins")
+    module = importlib.import_module("vi_jax.scan._basins")
 
     def interrupted(*arguments):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(room, "_sorted_out", interrupted)
+    monkeypatch.setattr(module, "_sorted_out", interrupted)
     scene = vi.Scene.ideal(frequency_ratio=1.4, restitution=0.8, gap=2.0, damping_ratio=0.2)
     with pytest.raises(vi.ScanInterrupted) as caught:
         vi.basins(

@@ -60,6 +60,8 @@ def simulate_in_parts(
 ) -> Run:
     """As `simulate` of one lane, with `interrupted` asked between its parts, all of one program.
 
+    **Arguments:** `interrupted`, whether to end here; all else as for `simulate`.
+
     **Returns:** the run, shorter if it was interrupted.
 
     **Raises:** `KeyboardInterrupt` if it was before anything was to be kept; as `simulate`.
@@ -169,6 +171,8 @@ def sweep_in_parts(
     **options: Any,
 ) -> Sweep:
     """As `sweep`, value by value, all by one program, with `interrupted` asked between them.
+
+    **Arguments:** `interrupted`, whether to end here; all else as for `sweep`.
 
     **Returns:** the sweep, shorter if it was interrupted.
 

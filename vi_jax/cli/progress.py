@@ -5,6 +5,8 @@ import threading
 import time
 from types import TracebackType
 
+# Seconds from one countdown to the next, and below which what is left is not said in numbers:
+# choices.
 _PAUSE, _SOON = 0.5, 5.0
 
 

@@ -91,10 +91,7 @@ def given(table: Any, *but: str) -> dict[str, Any]:
 
 @contextmanager
 def in_terms_of(
-    table: str,
-    *,
-    keys: Iterable[str] | None = None,
-    named: Mapping[str, str] | None = None,
+    table: str, *, keys: Iterable[str] | None = None, named: Mapping[str, str] | None = None
 ) -> Iterator[None]:
     """Errors of the library about its arguments, in the words of the file.
 

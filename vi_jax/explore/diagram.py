@@ -60,6 +60,11 @@ def _diagram(
     Y: float,
     V: float,
 ) -> Diagram:
+    """The diagram, remembered.
+
+    **Arguments:** `fixed`, names and values of the numbers that stay as they are; all else as for
+    `diagram`.
+    """
     values = np.linspace(*bounds, VALUES)
     rows = {name: np.full(VALUES, value) for name, value in fixed} | {parameter: values}
     found = _settled(rows, np.asarray(float(Y)), np.asarray(float(V)))

@@ -23,6 +23,7 @@ WINDOW = 8
 OBSERVED = 256
 """Drive cycles observed for the maps, the regime and the multipliers."""
 
+# As for scans but shorter, for a slider: choices.
 _REGIME = Regime(longest=32, observed=128, lasting=0)
 
 # Samples of a cycle; impacts of one that are drawn, and that enter the impact map.

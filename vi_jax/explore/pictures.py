@@ -21,6 +21,7 @@ from .motion import WINDOW, Motion
 MAPS = ("impact map", "section map")
 """What the third picture of an ideal motion shows."""
 
+# Dots per inch, and the look of lines behind: choices.
 _DPI, _FAINT = 90, {"color": "0.88", "lw": 0.8, "zorder": 0}
 
 # Limits are kept while what is drawn is within them and fills so much of them.
@@ -107,6 +108,11 @@ class MotionPicture:
         _fit(self._portrait, x=np.append(path.Y, gap), y=path.V)
 
     def _set_map(self, x: np.ndarray, y: np.ndarray, across: str, up: str, note: str = "") -> None:
+        """Draw the map of impacts or of sections.
+
+        **Arguments:** `x` and `y`, its points; `across` and `up`, the names of its axes; `note`, a
+        text in it.
+        """
         self._lines["map"].set_data(x, y)
         self._map.set(xlabel=across, ylabel=up)
         self._notes["map"].set_text(note)

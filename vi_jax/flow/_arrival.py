@@ -5,12 +5,13 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._types import Flag, Scalar
+from .._types import Flag, Scalar, Scalars, State
 from .beside import Beside
 
 
 class Tally(NamedTuple):
-    """What is written down of the events of an interval; as in `Record`."""
+    """What has been recorded of the events of an interval: the fields of `Record` that an event
+    changes."""
 
     impacts: Scalar
     speed: Scalar | None
@@ -21,19 +22,23 @@ class Tally(NamedTuple):
 
 
 class Onward(NamedTuple):
-    """How a motion goes on; as in `Lane`."""
+    """How a motion goes on behind an event: the fields of `Lane` of the same names."""
 
-    direction: tuple[Scalar, ...]
-    contact: tuple[Scalar, ...] | None
-    modes: tuple[Scalar, ...]
-    below: tuple[Scalar, ...]
+    direction: Scalars
+    contact: Scalars | None
+    modes: Scalars
+    below: Scalars
 
 
 class Arrival(NamedTuple):
-    """The lane where a step leads, and what is kept of its way there."""
+    """Where a step leads, while its events are applied.
+
+    `arrive` begins with the end of the step; each event makes another `Arrival` of it, and the lane
+    takes over what the last one says.
+    """
 
     s: Scalar
-    state: Any
+    state: State
     time: Beside | None
     place: Scalar
     """Y there: on the stop, with the stop's derivatives, where one is met."""
@@ -47,31 +52,35 @@ class Arrival(NamedTuple):
     """As in `Lane`; absent where no event can end it."""
 
     @property
-    def direction(self) -> tuple[Scalar, ...]:
+    def direction(self) -> Scalars:
         """Of each coordinate, the way that it goes on: the sign of its velocity."""
         return self.onward.direction
 
     @property
-    def contact(self) -> tuple[Scalar, ...] | None:
+    def contact(self) -> Scalars | None:
         """The stops rested on, as in `Lane`."""
         return self.onward.contact
 
     @property
-    def modes(self) -> tuple[Scalar, ...]:
+    def modes(self) -> Scalars:
         """The modes of the machine behind what was met, as in `Lane`."""
         return self.onward.modes
 
     def going(self, **onward: Any) -> "Arrival":
-        """With another direction, contact or modes."""
+        """A copy with another direction, contact or modes."""
         return self._replace(onward=self.onward._replace(**onward))
 
     def counting(self, **tally: Any) -> "Arrival":
-        """With something else written down."""
+        """A copy in which something else is recorded: fields of `Tally`."""
         return self._replace(tally=self.tally._replace(**tally))
 
 
 def ended(arrival: Arrival, where: Flag, when: Flag | None, reason: int) -> Arrival:
-    """With this reason to end, `where` it was met and `when` it holds; `None` where it cannot."""
+    """The arrival, with a reason for its lane to end there.
+
+    **Arguments:** `where`, whether the event was met; `when`, whether it ends the lane, `None` if
+    it never can; `reason`, a code of `results`.
+    """
     if when is None or arrival.fault is None:
         return arrival
     return arrival._replace(fault=jnp.where(where & when, float(reason), arrival.fault))

@@ -46,6 +46,11 @@ def by_numpy(function: Callable[..., Any], *arguments: Any) -> Any:
 
 @partial(jax.jit, static_argnums=(0, 1, 2, 3))
 def _traced(function: Any, treedef: Any, others: Any, frame: Any, numbers: list[Any]) -> Any:
+    """The function's value, its arguments put together from their parts; traced, never run.
+
+    **Arguments:** `treedef` and `numbers`, the structure and the leaves of those parts that are
+    numbers; `frame` and `others`, those of the rest.
+    """
     parts = jtu.tree_unflatten(treedef, numbers), jtu.tree_unflatten(frame, others)
     return function(*eqx.combine(*parts))
 

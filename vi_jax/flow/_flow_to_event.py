@@ -16,11 +16,15 @@ from .smooth import SmoothMachine, holding
 
 
 class FlowToEvent:
-    """The way that a machine goes on from `moving`: s, its state, and the time and the integrals
-    where they are asked for.
+    """The motion close to an event, as the functions that `drift` asks for: its rate, and guards,
+    positions and forces along it.
 
-    Its functions close over no number: everything that may have a derivative is an argument, in
-    `fixed`.
+    Each is a function of `(moving, fixed, rest)`: `moving` is s, the state, and the time and
+    integrals beside it (or `None`), `fixed` what may have a derivative besides, `rest` the arrays
+    that have none. The functions close over no number, so that JAX can differentiate them again.
+
+    **Arguments:** `smooth`, the machine in its modes; `part`, the index of the interval within its
+    cycle; `moving`, where the motion begins.
     """
 
     def __init__(self, plan: Plan, smooth: SmoothMachine, part: Scalar, moving: tuple):
@@ -32,7 +36,8 @@ class FlowToEvent:
 
     @property
     def fixed(self) -> Any:
-        """The machine's numbers, and those around what it was written as."""
+        """The numbers that may have a derivative: the machine's own, and those that its functions
+        close over."""
         return self._fixed, tuple(self._around)
 
     def guard(self, number: int) -> Callable:
@@ -58,7 +63,8 @@ class FlowToEvent:
         return self._pure(coordinate)
 
     def force(self, k: int) -> Callable:
-        """What coordinate number k would be accelerated by if it were not held."""
+        """The acceleration that coordinate number k would have if it were not held; the body is
+        released where that turns away from the stop."""
 
         def acceleration(moving, fixed, rest):
             (smooth, _), (s, state, _) = self._whole(fixed, rest), moving

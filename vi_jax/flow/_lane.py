@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
-from .._types import Scalar
+from .._types import Flag, Scalar, Scalars, State
 from ..machine import (
     AbstractMachine,
     begin_modes,
@@ -31,17 +31,18 @@ FREE = 0.0
 
 
 def to_event(number: int) -> float:
-    """Event of this number among the machine's (see `events_of`); all others are negative."""
+    """The target of a step that is aimed at the event of this number (see `events_of`), positive;
+    `Lane.contact` names stops by the same numbers. All other targets are negative."""
     return 1.0 + number
 
 
 def to_turn_of(k: int) -> float:
-    """A turning point of coordinate number k."""
+    """The target of a step that is aimed at a turning point of coordinate number k."""
     return -1.0 - 2 * k
 
 
 def to_release(k: int) -> float:
-    """The release of coordinate number k from the stop on which it rests."""
+    """The target of a step that is aimed at the release of coordinate number k from its stop."""
     return -2.0 - 2 * k
 
 
@@ -56,7 +57,7 @@ def total(tree: Any, start: Scalar) -> Scalar:
     return start
 
 
-def select(condition: Any, a: Any, b: Any) -> Any:
+def select(condition: Flag, a: Any, b: Any) -> Any:
     """`jnp.where` for pytrees; what is the same in both is left as it is."""
     return jtu.tree_map(lambda x, y: x if x is y else jnp.where(condition, x, y), a, b)
 
@@ -84,15 +85,15 @@ class Lane(eqx.Module):
     """One trajectory on its way. All floats: other types would keep the loop from fusing."""
 
     s: Scalar
-    state: Any
+    state: State
     record: Record
-    direction: tuple[Scalar, ...]
+    direction: Scalars
     """Of each coordinate, the sign of its velocity since the last turn or impact."""
-    contact: tuple[Scalar, ...] | None
+    contact: Scalars | None
     """Of each coordinate, 1 + i while it rests on stop number i, else 0; absent where none can."""
-    modes: tuple[Scalar, ...]
+    modes: Scalars
     """Of each switch, then the machine's own."""
-    below: tuple[Scalar, ...]
+    below: Scalars
     """Of each event that happens from below (see `AbstractEvent.from_below`), 1 once its guard has
     been below zero since the last jump, else 0."""
     length: Scalar
@@ -115,12 +116,12 @@ class Lane(eqx.Module):
     rejected: Scalar
 
 
-def ticks(machine: AbstractMachine, state: Any) -> bool:
+def ticks(machine: AbstractMachine, state: State) -> bool:
     """Whether the independent variable itself counts the cycles."""
     return machine.clock(state) is None and not is_autonomous(machine, state)
 
 
-def has_fixed_cycle(machine: AbstractMachine, state: Any) -> bool:
+def has_fixed_cycle(machine: AbstractMachine, state: State) -> bool:
     """Whether all cycles have the same duration, `machine.period`."""
     return (
         ticks(machine, state)
@@ -129,7 +130,8 @@ def has_fixed_cycle(machine: AbstractMachine, state: Any) -> bool:
 
 
 class Plan(eqx.Module):
-    """What is asked of the loop."""
+    """What the loop is to do, the same for all lanes of a batch. All that is static is a part of
+    the compiled program."""
 
     machine: AbstractMachine
     method: AbstractMethod
@@ -171,19 +173,20 @@ class Plan(eqx.Module):
         """Iterations in which a lane completes at most one interval, its steps being so short."""
         return max(1, self.method.steps_per_cycle // self.parts)
 
-    def others(self, state: Any) -> list[int]:
+    def others(self, state: State) -> list[int]:
         """The numbers of the events, besides stops, whose guards are looked at in each step."""
         last = section_number(self.machine) + (self.machine.section(state) is not None)
         return list(range(len(self.machine.stops), last))
 
-    def from_below(self, state: Any) -> list[int]:
-        """Of those the ones that happen from below."""
+    def from_below(self, state: State) -> list[int]:
+        """Those of `others` that happen only once their guard has been below zero (see
+        `AbstractEvent.from_below`)."""
         events = events_of(self.machine)
         return [number for number in self.others(state) if events[number].from_below]
 
     @property
     def to_section(self) -> float:
-        """The end of a cycle, where an event is it."""
+        """The target of a step that is aimed at the end of a cycle, where an event is that."""
         return to_event(section_number(self.machine))
 
     def end(self, part: Scalar) -> Scalar:
@@ -192,26 +195,27 @@ class Plan(eqx.Module):
         return cycle * (part + 1) / self.parts if self.parts > 1 else cycle
 
     def first_part(self, done: Scalar) -> Scalar:
-        """The part with which a cycle begins after so many intervals: those that are not kept are
-        whole cycles, as if only their last part were left."""
+        """`Lane.part` at the begin of a cycle, when so many intervals are done: 0, unless the cycle
+        is not recorded. Such a cycle is one interval, as if only its last part were left."""
         return jnp.where(done < self.settle, self.parts - 1.0, jnp.zeros_like(done))
 
-    def ticks(self, state: Any) -> bool:
+    def ticks(self, state: State) -> bool:
         """Whether `s` itself counts the cycles."""
         return ticks(self.machine, state)
 
-    def timed(self, state: Any) -> bool:
+    def timed(self, state: State) -> bool:
         """Whether the duration of a cycle is recorded, which only a fixed one need not be."""
         return self.motion and not has_fixed_cycle(self.machine, state)
 
-    def meets_turns(self, done: Scalar) -> Any:
-        """Whether every turning point is met after so many intervals, or only those that are close
-        to a stop: for extremes, and where something else may happen there."""
+    def meets_turns(self, done: Scalar) -> Flag | bool:
+        """Whether steps end on every turning point, for extremes, and since switches and events may
+        be there; or only on those close to a stop. A flag where that depends on how many intervals
+        are done, else known while the program is traced."""
         if self.machine.switches or self.machine.events:
             return True
         return (done >= self.settle) if self.motion else False
 
-    def fresh(self, state: Any) -> Record:
+    def fresh(self, state: State) -> Record:
         """The record of an interval that begins in `state`."""
         Y = self.machine.position(state)
         zero = jnp.zeros_like(Y)
@@ -228,15 +232,16 @@ class Plan(eqx.Module):
             events=jnp.full((4, self.events), jnp.nan, Y.dtype) if self.events else None,
         )
 
-    def _beside(self, state: Any, zero: Scalar) -> Beside | None:
+    def _beside(self, state: State, zero: Scalar) -> Beside | None:
         """Time and integrals as an interval begins; `None` where neither is asked for."""
         timed = self.timed(state)
         if not timed and not self.averages:
             return None
         return Beside(zero if timed else None, {name: zero for name in self.averages})
 
-    def launch(self, start: Any, wanted: Any = True) -> Lane:
-        """A lane on its first section; one that cannot be run, or is not wanted, has ended."""
+    def launch(self, start: State, wanted: Flag | bool = True) -> Lane:
+        """The lane as its loop begins, in the state `start`; one that cannot be run, or is not
+        `wanted`, has ended already."""
         machine = self.machine
         Y = machine.position(start)
         numbers = jtu.tree_leaves((start, eqx.filter(machine, eqx.is_inexact_array)))
@@ -295,16 +300,17 @@ class Plan(eqx.Module):
         )
 
     def place(self, k: int, contact: Scalar, otherwise: Scalar) -> Scalar:
-        """Where coordinate number k is that rests on the stop named by `contact`."""
+        """The position of coordinate number k while it rests on the stop named by `contact` (see
+        `Lane.contact`); `otherwise` while it rests on none."""
         place = otherwise
         for i, stop in enumerate(self.machine.stops):
             if stop.coordinate == k:
                 place = jnp.where(contact == to_event(i), stop.place, place)
         return place
 
-    def wall(self, k: int, contact: Scalar) -> tuple[Any, Any]:
-        """Side and gap of the stop of coordinate number k that is named by `contact`; of its first
-        one if none is."""
+    def wall(self, k: int, contact: Scalar) -> tuple[Scalar | float, Scalar]:
+        """The sign (1 right, -1 left) and the gap of the stop of coordinate number k that is named
+        by `contact`; of its first stop if none is."""
         mine = [(i, stop) for i, stop in enumerate(self.machine.stops) if stop.coordinate == k]
         (_, first), others = mine[0], mine[1:]
         sign, gap = float(first.sign), first.gap
@@ -313,7 +319,7 @@ class Plan(eqx.Module):
             sign, gap = jnp.where(here, float(stop.sign), sign), jnp.where(here, stop.gap, gap)
         return sign, gap
 
-    def _rests_on(self, k: int, here: Rates, growth: Scalar, slack: Any) -> Scalar:
+    def _rests_on(self, k: int, here: Rates, growth: Scalar, slack: Scalar | float) -> Scalar:
         """The stop that coordinate number k rests on as the motion begins: pressed on, or about to
         be by a force that grows; place and velocity are known to within `slack`."""
         contact = jnp.zeros_like(here.x)

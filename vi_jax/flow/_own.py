@@ -14,7 +14,7 @@ import numpy as np
 from jax.core import Tracer
 
 from .._numbers import warn
-from .._types import Scalar
+from .._types import Scalar, Scalars, State
 from ..machine import AbstractMachine, begin_modes, is_autonomous
 from ._by_numpy import by_numpy
 
@@ -29,7 +29,7 @@ _NO_NUMBERS = (
 _APART = 1e-4
 
 
-def check_field(machine: AbstractMachine, s: Scalar, state: Any, modes: tuple[Scalar, ...]) -> None:
+def check_field(machine: AbstractMachine, s: Scalar, state: State, modes: Scalars) -> None:
     """**Raises:** `TypeError` for a field (or a section) that cannot be traced, takes other
     arguments or returns no state; while the loop is traced, and at no cost where it runs."""
     whose = f"`field` of a {type(machine).__name__}"
@@ -64,8 +64,12 @@ def in_short(tree: Any) -> str:
 
 
 def _check_arguments(
-    machine: AbstractMachine, whose: str, s: Scalar, state: Any, modes: Any
+    machine: AbstractMachine, whose: str, s: Scalar, state: State, modes: Scalars
 ) -> None:
+    """**Raises:** `TypeError` for a field that does not take s, a state and its modes.
+
+    **Arguments:** `whose`, the field in words; `s`, `state` and `modes`, as it will be called.
+    """
     try:
         inspect.signature(machine.field).bind(s, state, *modes)
     except TypeError as error:
@@ -120,7 +124,7 @@ def check_laws(machine: AbstractMachine, speed: Scalar) -> None:
             )
 
 
-def check_period(machine: AbstractMachine, start: Any) -> None:
+def check_period(machine: AbstractMachine, start: State) -> None:
     """Warn once of a field that is not the same at both ends of its cycle.
 
     Machines whose numbers are traced are not looked at, nor are ours, nor those whose cycles
@@ -145,7 +149,7 @@ def check_period(machine: AbstractMachine, start: Any) -> None:
             return
 
 
-def _ends(machine: AbstractMachine, start: Any) -> tuple[Any, list[Any], list[Any]]:
+def _ends(machine: AbstractMachine, start: State) -> tuple[Scalar, list[Any], list[Any]]:
     """The cycle, and the field where it begins and where it ends, in one state."""
     zero = jnp.zeros_like(machine.position(start))
     modes = begin_modes(machine, zero, start)

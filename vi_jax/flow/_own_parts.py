@@ -10,7 +10,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .._numbers import concrete
-from .._types import Scalar
+from .._types import Scalar, Scalars, State
 from ..machine import (
     AbstractEvent,
     AbstractMachine,
@@ -78,9 +78,7 @@ def _check_frictions(machine: AbstractMachine) -> None:
             )
 
 
-def check_events(
-    machine: AbstractMachine, s: Scalar, state: Any, modes: tuple[Scalar, ...]
-) -> None:
+def check_events(machine: AbstractMachine, s: Scalar, state: State, modes: Scalars) -> None:
     """**Raises:** `TypeError` for a coordinate or an event whose functions do not return what they
     must; while the loop is traced, and at no cost where it runs."""
     name = type(machine).__name__
@@ -95,7 +93,7 @@ def check_events(
 
 
 def _check_event(
-    machine: AbstractMachine, number: int, event: AbstractEvent, at: tuple[Scalar, Any, Any]
+    machine: AbstractMachine, number: int, event: AbstractEvent, at: tuple[Scalar, State, Scalars]
 ) -> None:
     s, state, modes = at
     switches, name = len(machine.switches), type(machine).__name__
@@ -139,7 +137,7 @@ def _length(modes: Any) -> int:
     return len(modes) if isinstance(modes, Sequence) else -1
 
 
-def _check_state(whose: str, state: Any, found: Any) -> None:
+def _check_state(whose: str, state: State, found: Any) -> None:
     """**Raises:** `TypeError` for what is no state like the one given."""
 
     def kind(x: Any) -> Any:

@@ -14,6 +14,7 @@ from .. import lanes
 from .._checks import flag
 from .._programs import compiled
 from .._renamed import renamed
+from .._types import State
 from ..machine import AbstractMachine, stated
 from ._failed_derivatives import failed_derivatives
 from ._lane import Plan, Record
@@ -29,7 +30,7 @@ from .results import Errors, EventLog, ImpactLog, Run, Samples, reason
 @renamed(scene="machine")
 def simulate(
     machine: AbstractMachine,
-    start: Any,
+    start: State,
     cycles: int | Int[Array, ""],
     *,
     settle: Any = 0,
@@ -108,12 +109,12 @@ def simulate(
 
 
 @compiled
-def _simulate(plan: Plan, start: Any, sampled: bool) -> Run:
+def _simulate(plan: Plan, start: State, sampled: bool) -> Run:
     return failed_derivatives(collect(plan, sampled, *run_lane(plan, start)))
 
 
 def _errors(run: Run, tighter: Run) -> Errors:
-    """What two runs differ by."""
+    """The differences between a run and one by a tighter method; NaN where either failed."""
 
     def apart(a: Any, b: Any) -> Any:
         both = run.successful & tighter.successful
@@ -150,8 +151,12 @@ def simulate_pool(
     return jax.vmap(one)(values, wanted)
 
 
-def collect(plan: Plan, sampled: bool, lane: Ends, points: Any, records: Record) -> Run:
-    """The run from what the loop stored for each interval."""
+def collect(plan: Plan, sampled: bool, lane: Ends, points: State, records: Record) -> Run:
+    """The run from what the loop stored for each interval.
+
+    **Arguments:** `sampled`, whether the states are given as samples; `lane`, how it ended;
+    `points` and `records`, the states and records of the intervals, as `run_lane` returns them.
+    """
     machine, parts = plan.machine, plan.parts
     records = jtu.tree_map(lambda x: x[1:], records)
 
@@ -209,7 +214,7 @@ def collect(plan: Plan, sampled: bool, lane: Ends, points: Any, records: Record)
     )
 
 
-def _quantities(plan: Plan, points: Any) -> dict[str, Any]:
+def _quantities(plan: Plan, points: State) -> dict[str, Array]:
     """The machine's functions of its state at the points recorded."""
     machine = plan.machine
     if not has_quantities(machine):
@@ -235,9 +240,9 @@ def _events(plan: Plan, entries: Any) -> EventLog:
     return EventLog(plan.machine.as_logged(phase), _numbers(code), _numbers(number), value)
 
 
-def _by_cycle(plan: Plan, entries: Any, *, used: int) -> list[Any]:
-    """The rows of a log (intervals, rows, size), each as (cycles, size), its entries in their order
-    and those not used last: they have NaN in the row `used`."""
+def _by_cycle(plan: Plan, entries: Array, *, used: int) -> list[Array]:
+    """The rows of a log (intervals, rows, size), each as (cycles, size): the entries of a cycle in
+    their order, unused places last, which have NaN in the row `used`."""
     rows, size = entries.shape[1:]
     entries = entries.reshape(plan.cycles, plan.parts, rows, size)
     entries = jnp.moveaxis(entries, 2, 0).reshape(rows, plan.cycles, plan.parts * size)
@@ -245,5 +250,5 @@ def _by_cycle(plan: Plan, entries: Any, *, used: int) -> list[Any]:
     return [jnp.take_along_axis(x, order, axis=1) for x in entries]
 
 
-def _numbers(x: Any) -> Any:
+def _numbers(x: Array) -> Array:
     return jnp.where(jnp.isnan(x), -1.0, x).astype(jnp.int32)

@@ -12,6 +12,7 @@ from jaxtyping import Array, Int
 from .. import lanes
 from .._checks import count, fits_records, instance_of, require_real
 from .._numbers import concrete, narrow, require_session, strongly_typed, warn, warn_of_narrow
+from .._types import State
 from ..machine import AbstractMachine, Scene, begin_modes, is_autonomous
 from ._lane import Plan
 from ._own import check_period as check_period
@@ -23,11 +24,8 @@ from .smooth import rounding
 
 
 def planned(
-    machine: AbstractMachine,
-    start: Any,
-    cycles: int | Int[Array, ""],
-    options: RunOptions,
-) -> tuple[Plan, Any]:
+    machine: AbstractMachine, start: State, cycles: int | Int[Array, ""], options: RunOptions
+) -> tuple[Plan, State]:
     """What `simulate` was asked, checked and put in the form in which the loop needs it.
 
     **Returns:** the plan, and the start as this machine has it.
@@ -123,13 +121,13 @@ def _countable(cycles: int, settle: Any, parts: int, dtype: Any) -> jax.Array:
     return jnp.where(counts, settle.astype(dtype), jnp.nan)
 
 
-def as_floats(machine: AbstractMachine, state: Any) -> Any:
+def as_floats(machine: AbstractMachine, state: State) -> State:
     """`state` in arrays of the one floating-point type that it and the machine ask for."""
     dtype = _type_of(machine, state)
     return jtu.tree_map(lambda x: jnp.asarray(x, dtype), state)
 
 
-def of_one_type(machine: AbstractMachine, start: Any) -> tuple[AbstractMachine, Any]:
+def of_one_type(machine: AbstractMachine, start: State) -> tuple[AbstractMachine, State]:
     """Scene and start with all their floating-point numbers of one type, the widest among them.
 
     Numbers of a machine made before double precision was switched on are promoted, with a warning.
@@ -144,7 +142,7 @@ def of_one_type(machine: AbstractMachine, start: Any) -> tuple[AbstractMachine, 
     return machine, as_floats(machine, start)
 
 
-def _type_of(machine: AbstractMachine, state: Any) -> Any:
+def _type_of(machine: AbstractMachine, state: State) -> Any:
     numbers = jtu.tree_leaves(eqx.filter((machine, state), eqx.is_array_like))
     return jnp.result_type(jnp.result_type(float), *numbers)
 
@@ -160,7 +158,7 @@ def _check_scalars(**arguments: Any) -> None:
                 )
 
 
-def _check_flow(machine: AbstractMachine, start: Any) -> None:
+def _check_flow(machine: AbstractMachine, start: State) -> None:
     """**Raises:** `TypeError` for what is no state, where only the field says what one is."""
     try:
         jax.eval_shape(
@@ -173,7 +171,7 @@ def _check_flow(machine: AbstractMachine, start: Any) -> None:
         ) from None
 
 
-def check_leaves(argument: str, state: Any) -> None:
+def check_leaves(argument: str, state: State) -> None:
     """**Raises:** `ValueError` if an array in a state holds no number."""
     for path, leaf in jtu.tree_leaves_with_path(state):
         if 0 in jnp.shape(leaf):
@@ -183,7 +181,7 @@ def check_leaves(argument: str, state: Any) -> None:
             )
 
 
-def refuse_arrays(argument: str, verb: str, state: Any) -> None:
+def refuse_arrays(argument: str, verb: str, state: State) -> None:
     """**Raises:** `ValueError` if a state holds an array, for a verb that needs numbers."""
     for path, leaf in jtu.tree_leaves_with_path(state):
         if jnp.ndim(leaf):
@@ -198,13 +196,13 @@ def _leaf_in_words(path: Any) -> str:
     return f"its {jtu.keystr(path).lstrip('.')}" if path else "it"
 
 
-def check_reals(name: str, state: Any) -> None:
+def check_reals(name: str, state: State) -> None:
     """**Raises:** `TypeError` that names what is no real number in a state of any form."""
     for path, leaf in jtu.tree_leaves_with_path(state):
         require_real(name, jtu.keystr(path).lstrip(".") or "value", leaf)
 
 
-def check_start(machine: AbstractMachine, start: Any) -> None:
+def check_start(machine: AbstractMachine, start: State) -> None:
     """Warns of a field of another period. **Raises:** `ValueError` or `TypeError` if a concrete
     start cannot be simulated."""
     try:

@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from .._types import Scalar
+from .._types import Scalar, State
+from .smooth import SmoothMachine
 
 
 class Beside(NamedTuple):
@@ -21,11 +22,14 @@ class Beside(NamedTuple):
     `pace`, over s."""
 
 
-def rate_beside(smooth: Any, s: Scalar, state: Any, beside: Beside | None) -> Beside | None:
-    """How fast by s that changes which is integrated beside the state; `None` for nothing.
+def rate_beside(
+    smooth: SmoothMachine, s: Scalar, state: State, beside: Beside | None
+) -> Beside | None:
+    """d/ds of what is integrated beside the state, the elapsed time and the averages; `None` where
+    neither is.
 
-    **Arguments:** the machine in its modes (so that its averages are asked with these); s and
-    state; what is integrated, for its structure.
+    **Arguments:** `smooth`, the machine in its modes (so that its averages are asked with these);
+    `beside`, what is integrated, for its structure.
     """
     if beside is None:
         return None
@@ -41,8 +45,11 @@ def rate_beside(smooth: Any, s: Scalar, state: Any, beside: Beside | None) -> Be
 
 
 def elapsed(old: Beside, carried: Beside | None, h: Scalar) -> Beside:
-    """What has passed after a step of length h: what the method `carried` along, and the time,
-    where that is s itself."""
+    """Time and integrals after a step.
+
+    **Arguments:** `old`, before it; `carried`, what the method integrated along with the state,
+    `None` if nothing; `h`, the step's length, which is the time where s measures that.
+    """
     time = None if carried is None else carried.time
     if time is None and old.time is not None:
         time = old.time + h

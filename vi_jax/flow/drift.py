@@ -53,14 +53,22 @@ def _written_out(tangents: Any) -> Any:
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def drifted(rate: Callable, offset: Scalar, moving: Any, fixed: Any, rest: Any) -> Any:
-    """Where the flow of `rate` carries `moving` within `offset`: to first order in value, with the
-    flow's derivatives."""
+    """`moving` after a further `offset` of s: in value only to first order, which is enough for an
+    offset of 1e-9, but with the exact derivatives of the flow.
+
+    **Arguments:** `rate`, `moving`, `fixed` and `rest`, as at the top of this file; `offset`, how
+    far in s.
+    """
     return jtu.tree_map(lambda x, dx: x + offset * dx, moving, rate(moving, fixed, rest))
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def unmoved(rate: Callable, offset: Scalar, moving: Any, fixed: Any, rest: Any) -> Any:
-    """`drifted` within an offset that is zero, but for its derivatives: `moving` itself."""
+    """`drifted` by an offset that is zero in value, but has derivatives: `moving` itself, with
+    those of the flow.
+
+    **Arguments:** as `drifted`.
+    """
     return moving
 
 
@@ -93,8 +101,13 @@ unmoved.defjvp(partial(_carried_jvp, unmoved), symbolic_zeros=True)
 def met_after(
     rate: Callable, guard: Callable, offset: Scalar, moving: Any, fixed: Any, rest: Any
 ) -> Scalar:
-    """The offset at which the flow of `rate` from `moving` meets the zero of `guard`: `offset`
-    itself, which must be that to rounding, with the derivatives of the implicit function."""
+    """When the motion comes to the zero of a guard: `offset` itself, which must be that to
+    rounding, with the derivatives of the implicit function.
+
+    **Arguments:** `rate`, `moving`, `fixed` and `rest`, as at the top of this file; `guard`, a
+    function like the rate that is zero at the event; `offset`, how far in s the event is from
+    `moving`.
+    """
     return offset
 
 
@@ -129,8 +142,13 @@ def height_of_turn(
     fixed: Any,
     rest: Any,
 ) -> Scalar:
-    """`height` itself, with the derivatives of `place` where the flow of `rate` turns, `offset`
-    from `moving`; or, where nothing `turns`, of `place` in `moving`."""
+    """The height of a turning point: `height` itself, with its derivatives.
+
+    **Arguments:** `rate`, `moving`, `fixed` and `rest`, as at the top of this file; `place`, the
+    position as a function like the rate; `height`, its value at the turn; `turns`, whether there is
+    one (if not, the derivatives are those of the position in `moving`); `offset`, how far in s the
+    turn is from `moving`.
+    """
     return height
 
 

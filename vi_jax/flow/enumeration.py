@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-# Of a batch no more than so many are listed one by one.
+# Of a batch no more than so many are listed one by one: a choice, what fits a line.
 _LISTED = 8
 
 

@@ -6,13 +6,17 @@ Taylor's series about its end removes what is left.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from .._types import Flag, Scalar
+from .._types import Flag, Scalar, Scalars, State
 from ..machine import horner
+from .smooth import SmoothMachine
+
+# d(state)/ds of s and the state.
+Field = Callable[[Scalar, State], State]
 
 
 class Rates(NamedTuple):
@@ -22,23 +26,18 @@ class Rates(NamedTuple):
     v: Scalar
     a: Scalar
 
-    def scaled(self, factor: Any, offset: Any) -> "Rates":
+    def scaled(self, factor: int, offset: Scalar) -> "Rates":
         """Rates of factor·x - offset."""
         return Rates(factor * self.x - offset, factor * self.v, factor * self.a)
 
 
-def rates(
-    field: Callable[[Scalar, Any], Any], coordinate: Callable[[Any], Scalar], s: Scalar, state: Any
-) -> Rates:
+def rates(field: Field, coordinate: Callable[[State], Scalar], s: Scalar, state: State) -> Rates:
     """Rates of `coordinate(state)` along the flow of `field`, by two forward derivatives."""
     return guard_rates(field, lambda _, state: coordinate(state), s, state)
 
 
 def guard_rates(
-    field: Callable[[Scalar, Any], Any],
-    guard: Callable[[Scalar, Any], Scalar],
-    s: Scalar,
-    state: Any,
+    field: Field, guard: Callable[[Scalar, State], Scalar], s: Scalar, state: State
 ) -> Rates:
     """Rates of `guard(s, state)` along the flow of `field`, by two forward derivatives."""
     one = jnp.ones_like(s)
@@ -50,10 +49,17 @@ def guard_rates(
     return Rates(x, v, a)
 
 
-def force_rate(machine: Any, position: Any, holding: Any, s: Scalar, state: Any) -> Scalar:
-    """d/ds of the acceleration that a free body would have, along the flow of `holding`.
+def force_rate(
+    machine: SmoothMachine, position: Callable[[State], Scalar], holding: SmoothMachine, s: Scalar,
+    state: State,
+) -> Scalar:  # fmt: skip
+    """d/ds of the acceleration that a body would have if it were free, while it moves along with a
+    machine in which it may be held.
 
     A constant for differentiation: it tells where to look.
+
+    **Arguments:** `machine`, in which the body is free; `position`, its coordinate as a function of
+    the state; `holding`, the machine that moves.
     """
     s, state = jax.lax.stop_gradient((s, state))
 
@@ -64,7 +70,7 @@ def force_rate(machine: Any, position: Any, holding: Any, s: Scalar, state: Any)
     return jax.lax.stop_gradient(jax.jvp(force, (s, state), (jnp.ones_like(s), flow))[1])
 
 
-def quintic(begin: Rates, end: Rates, h: Scalar) -> tuple[Scalar, ...]:
+def quintic(begin: Rates, end: Rates, h: Scalar) -> Scalars:
     """Coefficients in θ ∈ [0, 1] of the quintic Hermite interpolant of a step of length h."""
     v0, v1 = h * begin.v, h * end.v
     a0, a1 = 0.5 * h * h * begin.a, 0.5 * h * h * end.a
@@ -90,12 +96,12 @@ def highest(begin: Rates, end: Rates, h: Scalar) -> Scalar:
     return jnp.maximum(from_begin, from_end)
 
 
-def slope(c: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
+def slope(c: Scalars) -> Scalars:
     """Coefficients of the derivative, padded to the same length."""
     return (*(n * c[n] for n in range(1, len(c))), jnp.zeros_like(c[0]))
 
 
-def rising_root(c: tuple[Scalar, ...], *, iterations: int = 3) -> Scalar:
+def rising_root(c: Scalars, *, iterations: int = 3) -> Scalar:
     """The θ in [0, 1] at which a polynomial that ends positive first rises through zero.
 
     Newton's method kept inside a bracket. A polynomial that starts at zero and falls (the body
@@ -141,7 +147,7 @@ def to_turn(end: Rates) -> Scalar:
 
 
 def turns_within(length: Scalar, end: Rates) -> Flag:
-    """Whether `to_turn` is no longer than this; without its division, in each step."""
+    """Whether `to_turn` is at most this length; without a division, since each step asks for it."""
     bend = jax.lax.stop_gradient(end.a)
     return jnp.abs(jax.lax.stop_gradient(end.v)) <= length * jnp.where(
         bend == 0, 1.0, jnp.abs(bend)

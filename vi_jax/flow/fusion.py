@@ -8,6 +8,7 @@ import jax
 _CPU_OPTIONS = {
     # Small kernels lose more by being split over threads than they gain.
     "xla_disable_hlo_passes": "cpu-parallel-task-assigner",
+    # The widest there are; XLA itself prefers half of that.
     "xla_cpu_prefer_vector_width": 512,
 }
 

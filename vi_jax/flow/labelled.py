@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from .._checks import one_of
+from .._types import State
 from ..machine import by_name, with_units
 
 EVENTS = ("impact", "rest", "release", "mode", "reset")
@@ -29,7 +30,7 @@ def batch_names(dims: Sequence[str] | None, number: int) -> tuple[str, ...]:
     return tuple(dims)
 
 
-def states(prefix: str, state: Any, dims: tuple[str, ...]) -> Variables:
+def states(prefix: str, state: State, dims: tuple[str, ...]) -> Variables:
     """The components of a state, each a variable; an array among them has axes of its own."""
     found = {}
     for name, x in by_name(state).items():
@@ -62,7 +63,8 @@ _LISTED = {"impact": "log_stop", "event": "event_number"}
 
 
 def _met(log: Any, number: str) -> Any:
-    """The entries of a log one after the other, without the places that are not used."""
+    """The entries of a log, one after the other, without unused places: those where the variable
+    `number` is negative."""
     rows = log.stack(row=log[number].dims).reset_index("row")
     return rows.isel(row=np.flatnonzero(np.asarray(rows[number]) >= 0))
 

@@ -1,38 +1,43 @@
 """The loop around the hybrid step."""
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array
 
 from .. import lanes
+from .._types import Flag, Scalar, State
 from ._lane import Lane, Plan, Record
 from ._step.hybrid import iterate
 
 
-def _active(plan: Plan, lane: Lane) -> Bool[Array, ""]:
+def _active(plan: Plan, lane: Lane) -> Flag:
     return (jax.lax.stop_gradient(lane.done) < plan.intervals) & (
         jax.lax.stop_gradient(lane.fault) == 0
     )
 
 
+# The numbers of a plan, the start, and whether the lane is wanted.
+_Inputs = tuple[Plan, State, Array]
+
+
 class Ends(NamedTuple):
     """What is kept of a lane when it has ended."""
 
-    done: Any
-    fault: Any
-    steps: Any
-    rejected: Any
+    done: Scalar
+    fault: Scalar
+    steps: Scalar
+    rejected: Scalar
 
     @classmethod
     def of(cls, lane: Lane) -> "Ends":
         return cls(lane.done, lane.fault, lane.steps, lane.rejected)
 
 
-def run_lane(plan: Plan, start: Any, wanted: Any = True) -> tuple[Ends, Any, Record]:
+def run_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> tuple[Ends, State, Record]:
     """A lane to its end, in one flat loop: in a batch no lane waits for another at a section.
 
     **Returns:** how it ended, and the states and records of the intervals kept, with leading axis
@@ -46,7 +51,7 @@ def run_lane(plan: Plan, start: Any, wanted: Any = True) -> tuple[Ends, Any, Rec
     return ends, states, records
 
 
-def _begin(rest: Any, inputs: Any) -> tuple[Lane, lanes.Emitted]:
+def _begin(rest: Plan, inputs: _Inputs) -> tuple[Lane, lanes.Emitted]:
     numbers, start, wanted = inputs
     plan = eqx.combine(numbers, rest)
     lane = plan.launch(start, wanted)
@@ -54,12 +59,12 @@ def _begin(rest: Any, inputs: Any) -> tuple[Lane, lanes.Emitted]:
     return lane, lanes.Emitted(_active(plan, lane), first, (start, plan.fresh(start)))
 
 
-def _step(rest: Any, inputs: Any, lane: Lane) -> tuple[Lane, lanes.Emitted]:
+def _step(rest: Plan, inputs: _Inputs, lane: Lane) -> tuple[Lane, lanes.Emitted]:
     plan = eqx.combine(inputs[0], rest)
     new = iterate(plan, lane)
     complete = new.completed & (new.lane.done >= plan.settle)
     return new.lane, lanes.Emitted(_active(plan, new.lane), complete, (new.state, new.record))
 
 
-def _end(inputs: Any, lane: Lane) -> Ends:
+def _end(inputs: _Inputs, lane: Lane) -> Ends:
     return Ends.of(lane)

@@ -1,6 +1,6 @@
 """The quantities that a machine names itself: functions of its state, and averages over a cycle."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array
 
+from .._types import State
 from ..machine import AbstractMachine, begin_modes, components, leaf_names
 from ._own import in_words_of
 
@@ -32,7 +33,7 @@ def has_quantities(machine: AbstractMachine) -> bool:
     return type(machine).quantities is not AbstractMachine.quantities
 
 
-def average_names(machine: AbstractMachine, start: Any) -> tuple[str, ...]:
+def average_names(machine: AbstractMachine, start: State) -> tuple[str, ...]:
     """The names of a machine's averages in their order, by name.
 
     **Raises:** `TypeError` for averages that are no numbers by name; `ValueError` for a name that
@@ -52,7 +53,7 @@ def average_names(machine: AbstractMachine, start: Any) -> tuple[str, ...]:
     return names
 
 
-def quantity_names(machine: AbstractMachine, start: Any) -> tuple[str, ...]:
+def quantity_names(machine: AbstractMachine, start: State) -> tuple[str, ...]:
     """The names of the functions of a machine's state. **Raises:** as `average_names`."""
     if not has_quantities(machine):
         return ()
@@ -60,7 +61,7 @@ def quantity_names(machine: AbstractMachine, start: Any) -> tuple[str, ...]:
     return _names(machine, "quantities", machine.quantities, start, (zero, start))
 
 
-def quantities_on(machine: AbstractMachine, sections: Any, lead: int = 0) -> dict[str, Array]:
+def quantities_on(machine: AbstractMachine, sections: State, lead: int = 0) -> dict[str, Array]:
     """The machine's functions of its state on sections, which are in a row; by name. With `lead`
     axes in front of machine and sections, as `vmap` gives them."""
     if not has_quantities(machine):
@@ -68,7 +69,7 @@ def quantities_on(machine: AbstractMachine, sections: Any, lead: int = 0) -> dic
     dtype = jnp.result_type(*jtu.tree_leaves(sections))
     numbers, rest = eqx.partition(machine, eqx.is_array)
 
-    def one(numbers: Any, state: Any) -> dict[str, Array]:
+    def one(numbers: Any, state: State) -> dict[str, Array]:
         found = eqx.combine(numbers, rest).quantities(jnp.zeros((), dtype), state)
         return {name: jnp.asarray(x, dtype) for name, x in found.items()}
 
@@ -79,8 +80,15 @@ def quantities_on(machine: AbstractMachine, sections: Any, lead: int = 0) -> dic
 
 
 def _names(
-    machine: AbstractMachine, which: str, function: Any, start: Any, arguments: tuple
+    machine: AbstractMachine, which: str, function: Callable, start: State, arguments: tuple
 ) -> tuple[str, ...]:
+    """The names of a machine's averages or quantities, sorted.
+
+    **Arguments:** `which`, the method's name; `function`, the method; `start`, a state, whose own
+    names are taken; `arguments`, those of the method.
+
+    **Raises:** as `average_names`.
+    """
     whose = f"`{which}` of a {type(machine).__name__}"
     with in_words_of(whose):
         found = jax.eval_shape(lambda *x: _as_arrays(whose, function(*x)), *arguments)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float, Int
 
+from .._types import Scalar, State
 from ..machine import PLAIN, Shown, Stated, Summarized, in_unit, name_in, state_in_words
 from ._listed import listed
 from .enumeration import NamedEnumeration
@@ -102,7 +103,7 @@ REASONS = tuple(getattr(RESULTS, name) for name in REASON_NAMES)
 ) = range(len(REASONS))
 
 
-def reason(code: Float[Array, ""]) -> RESULTS:
+def reason(code: Scalar) -> RESULTS:
     """The enumeration item for a reason carried as a number."""
     result = REASONS[0]
     for number, item in enumerate(REASONS[1:], start=1):
@@ -122,7 +123,7 @@ class Samples(Shown):
     """Place of the sample on the drive's clock, in cycles since the start."""
     time: Float[Array, " points"]
     """Time τ since the start (in units of `s` for machines of your own)."""
-    state: Any
+    state: State
     """The states, a pytree like the start."""
     quantities: dict[str, Float[Array, " points"]] = eqx.field(default_factory=dict)
     """The machine's own quantities there, by name (see `AbstractMachine.quantities`)."""
@@ -188,7 +189,7 @@ class Errors(Shown):
     motion. Under `vmap` batch axes come first.
     """
 
-    sections: Any
+    sections: State
     """Of the section states, a pytree like them; leaves (cycles + 1,)."""
     y_max: Float[Array, " cycles"] | None
     """Of the greatest Y in each cycle."""
@@ -205,7 +206,7 @@ class Run(Summarized):
     `AbstractMachine.units`): those of a `Scene` in a, ω and m_C.
     """
 
-    sections: Any
+    sections: State
     """States at the start and after each cycle, a pytree like the start; leaves (cycles + 1,), of
     an array in the state with its own axes behind."""
     y_max: Float[Array, " cycles"] | None
@@ -261,14 +262,14 @@ class Run(Summarized):
         return self.result == RESULTS.successful
 
     @property
-    def last(self) -> Any:
+    def last(self) -> State:
         """The state on the last section: a start to go on from, or a guess for `find_orbit`."""
         # Batch axes are in front, those of an array in the state behind; how many there are in
         # front is shown by a number for each lane.
         place = (*[slice(None)] * self.steps.ndim, -1)
         return jtu.tree_map(lambda x: x[place], self.sections)
 
-    def mean_averages(self) -> dict[str, Float[Array, ""]]:
+    def mean_averages(self) -> dict[str, Scalar]:
         """The machine's own averages over the time of all cycles, of one lane."""
         if self.duration is None:
             return {}

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.lax import stop_gradient
 
-from .._types import Scalar
+from .._types import Scalar, Scalars, State
 from ..machine import AbstractMachine, Coordinate, field_in, held_flow, rubs
 
 
@@ -17,11 +17,11 @@ class SmoothMachine(eqx.Module):
     rest are held."""
 
     machine: AbstractMachine
-    modes: tuple[Scalar, ...]
-    contact: tuple[Scalar, ...]
+    modes: Scalars
+    contact: Scalars
     """Of each coordinate, 1 + i while it rests on stop number i, else 0; or none at all."""
 
-    def field(self, s: Scalar, state: Any) -> Any:
+    def field(self, s: Scalar, state: State) -> State:
         """d(state)/ds, without motion of a body that is held."""
         machine = self.machine
         flow = field_in(machine, s, state, self.modes)
@@ -35,16 +35,16 @@ class SmoothMachine(eqx.Module):
             flow = jtu.tree_map(lambda a, b, rests=rests: jnp.where(rests, a, b), still, flow)
         return flow
 
-    def pace(self, s: Scalar, state: Any) -> Scalar | None:
+    def pace(self, s: Scalar, state: State) -> Scalar | None:
         """d(time)/ds of the machine, `None` where `s` measures time."""
         return self.machine.pace(s, state)
 
-    def averages(self, s: Scalar, state: Any) -> dict[str, Any]:
+    def averages(self, s: Scalar, state: State) -> dict[str, Any]:
         """What is averaged over time, in these modes."""
         return self.machine.averages(s, state, *self.modes)
 
 
-def _held_still(coordinate: Coordinate, state: Any, flow: Any) -> Any:
+def _held_still(coordinate: Coordinate, state: State, flow: State) -> State:
     """The rate at which a state changes along `flow` while this coordinate keeps its place and
     velocity: the derivative of `placed`, which need not be linear (bodies with a radius, a contact
     that moves along with the state)."""
@@ -54,16 +54,13 @@ def _held_still(coordinate: Coordinate, state: Any, flow: Any) -> Any:
     return jax.jvp(coordinate.placed, *along)[1]
 
 
-def in_modes(machine: AbstractMachine, modes: tuple[Scalar, ...]) -> SmoothMachine:
+def in_modes(machine: AbstractMachine, modes: Scalars) -> SmoothMachine:
     """The machine with its modes as they are and nothing held."""
     return SmoothMachine(machine, modes, ())
 
 
 def holding(
-    machine: AbstractMachine,
-    modes: tuple[Scalar, ...],
-    contact: tuple[Scalar, ...] | None,
-    but: int | None = None,
+    machine: AbstractMachine, modes: Scalars, contact: Scalars | None, but: int | None = None
 ) -> SmoothMachine:
     """The machine in its modes, with those bodies held that rest on a stop (see `Lane.contact`);
     that of coordinate number `but` is free."""
@@ -73,7 +70,7 @@ def holding(
     return SmoothMachine(machine, modes, tuple(others))
 
 
-def exact(machine: AbstractMachine, state: Any) -> bool:
+def exact(machine: AbstractMachine, state: State) -> bool:
     """Whether one number of the state is all that stops limit, so that it can be put on a stop
     without rounding; known while a step is traced."""
     place = machine.coordinates[0].position(state)
@@ -81,7 +78,7 @@ def exact(machine: AbstractMachine, state: Any) -> bool:
     return own and len(machine.coordinates) == 1
 
 
-def rounding(machine: AbstractMachine, state: Any) -> Scalar | float:
+def rounding(machine: AbstractMachine, state: State) -> Scalar | float:
     """How far a coordinate may be beyond its stop, or its velocity from zero, by rounding alone:
     not at all where it is a number of the state itself."""
     if exact(machine, state):

@@ -11,9 +11,11 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax.core import Tracer
+from jaxtyping import Array
 
 from .._checks import count, one_of, require
 from .._renamed import renamed
+from .._types import Scalar, State
 from ..machine import AbstractMachine
 from ._simulate import simulate
 from .arguments import check_start, machine_of
@@ -22,12 +24,14 @@ from .methods import AbstractMethod, Adaptive, ExactFlight, FixedStep, Taylor, V
 
 QUANTITIES = ("state", "extremes", "impacts", "derivative")
 
+# What is tried: steps in a cycle, each a tenth to a third more than the last; decades of
+# tolerances. Of so many rounds the median time counts. All are choices.
 _STEPS = (5, 6, 7, 8, 10, 12, 16, 20, 24, 32, 48, 64)
 _TOLERANCES = tuple(10.0**-n for n in range(3, 15))
 _ROUNDS = 5
 
 # Stiff is a machine in which what fades fastest asks for steps so many times shorter than its
-# motion.
+# motion; from where on implicit methods are tried. A choice.
 _STIFF = 20.0
 
 
@@ -68,7 +72,7 @@ def suggest_method(
     *,
     error: float = 1e-6,
     quantity: str = "state",
-    start: Any = None,
+    start: State = None,
     cycles: int = 20,
     lanes: int = 256,
 ) -> Suggestion:
@@ -143,14 +147,14 @@ def suggest_method(
     return Suggestion(found.method, bool(timed), found.error, tuple(tried))
 
 
-def _is_stiff(machine: AbstractMachine, start: Any) -> bool:
+def _is_stiff(machine: AbstractMachine, start: State) -> bool:
     """Whether something fades much faster than the motion goes, at its start."""
     s = jnp.zeros(())
     fading = machine.relaxation(s, start)
     return fading is not None and bool(machine.step_limit(s, start) > _STIFF * fading)
 
 
-def _adaptive(bench: "_Bench", error: float, solver: Any) -> list[Tried]:
+def _adaptive(bench: "_Bench", error: float, solver: diffrax.AbstractSolver) -> list[Tried]:
     """The loosest tolerance that keeps to the error."""
     tried: list[Tried] = []
     for tolerance in _TOLERANCES[:-1]:
@@ -194,20 +198,25 @@ def _series(bench: "_Bench", error: float) -> list[Tried]:
 
 
 class _Bench:
-    """The run that methods are compared on: some lanes, their truth and their start."""
+    """The run that methods are compared on.
+
+    **Arguments:** `start`, a state; `quantity`, what is compared (see `suggest_method`); `cycles`
+    to simulate; `lanes`, how many, which differ in their first velocity.
+    """
 
     truth: np.ndarray
 
     def __init__(
-        self, machine: AbstractMachine, start: Any, quantity: str, cycles: int, lanes: int
+        self, machine: AbstractMachine, start: State, quantity: str, cycles: int, lanes: int
     ):
         self.machine, self.start, self.quantity, self.cycles = machine, start, quantity, cycles
         # Nothing but the velocity is free of stops.
         self.nudges = jnp.linspace(-0.1, 0.1, lanes) if lanes > 1 else jnp.zeros(1)
         self.compiled: dict[Any, Callable] = {}
 
-    def lane(self, method: AbstractMethod, nudge: Any) -> Any:
-        """What is looked at, of one lane."""
+    def lane(self, method: AbstractMethod, nudge: Scalar) -> Array:
+        """What is compared, as one vector, of the lane whose first velocity differs by `nudge`; its
+        first number is infinite if the lane failed."""
         machine = self.machine
 
         def looked_at(nudge):

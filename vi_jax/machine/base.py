@@ -7,25 +7,21 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.tree_util as jtu
-from jaxtyping import Array, Bool, Float
 
 from .._checks import in_range
+from .._types import Flag, Scalar, State
 from .clocks import Clocked
 from .event import AbstractEvent, AbstractSwitch
 from .observing import Observed
 from .stop import RigidStop
 from .words import Worded
 
-State = Any
-"""A pytree of numbers (or arrays, which not every verb takes); the defaults below expect the fields
-`Y` and `V`."""
-
 
 class Coordinate(NamedTuple):
     """A coordinate that stops limit."""
 
-    position: Callable[[State], Float[Array, ""]]
-    velocity: Callable[[State], Float[Array, ""]]
+    position: Callable[[State], Scalar]
+    velocity: Callable[[State], Scalar]
     """What an impact reverses; of the sign of d(position)/ds."""
     placed: Callable[[State, Any, Any], State]
     """A state with another position and velocity, and with all that an impact changes besides."""
@@ -33,15 +29,15 @@ class Coordinate(NamedTuple):
     """What an impact acts on, in the machine's unit of mass: of two bodies the reduced mass."""
 
 
-def _position(machine: Any, state: State) -> Float[Array, ""]:
+def _position(machine: "AbstractMachine", state: State) -> Scalar:
     return state.Y if machine.stops or hasattr(state, "Y") else jtu.tree_leaves(state)[0]
 
 
-def _velocity(machine: Any, state: State) -> Float[Array, ""]:
+def _velocity(machine: "AbstractMachine", state: State) -> Scalar:
     return state.V if machine.has_velocity(state) else jtu.tree_leaves(state)[:2][-1]
 
 
-def _placed(machine: Any, state: State, Y: Float[Array, ""], V: Float[Array, ""]) -> State:
+def _placed(machine: "AbstractMachine", state: State, Y: Scalar, V: Scalar) -> State:
     if machine.has_velocity(state):
         return eqx.tree_at(lambda x: (x.Y, x.V), state, (Y, V))
     leaves, structure = jtu.tree_flatten(state)
@@ -125,7 +121,7 @@ class AbstractMachine(Clocked, Observed, Worded):
         """Events of other kinds: resets (`Reset`), and kinds of one's own."""
         return ()
 
-    def begin(self, s: Float[Array, ""], state: State) -> tuple[Any, ...]:
+    def begin(self, s: Scalar, state: State) -> tuple[Any, ...]:
         """The machine's own modes in a motion that begins in `state`: numbers that its field gets
         behind the state and behind the modes of its switches, and that events change."""
         return ()
@@ -146,30 +142,33 @@ class AbstractMachine(Clocked, Observed, Worded):
 
     @property
     def coordinates(self) -> tuple[Coordinate, ...]:
-        """What stops limit; extremes are recorded of the first."""
+        """The coordinates that stops limit, by number as `RigidStop.coordinate` names them;
+        extremes are recorded of the first. By default one, the machine's `position`, `velocity` and
+        `placed`."""
         return (Coordinate(*(self._said(name) for name in ("position", "velocity", "placed"))),)
 
     def _said(self, name: str) -> Callable[..., Any]:
-        """A method of the machine's own; else the default for a state with `Y` and `V`, which does
-        not ask `coordinates` again where these ask their `super()`."""
+        """A method of the machine's own if it has one, else the default for a state with `Y` and
+        `V`. The default does not ask `coordinates`, which would ask it again where they call
+        `super()`."""
         default = getattr(AbstractMachine, name)
         if self._has_coordinates and getattr(type(self), name) is default:
             return partial(_DEFAULTS[name], self)
         return getattr(self, name)
 
-    def position(self, state: State) -> Float[Array, ""]:
+    def position(self, state: State) -> Scalar:
         """The coordinate that stops limit: by default the first of `coordinates`, or `state.Y`; of
         a machine without stops whose state has no `Y` what extremes are of, its first number."""
         first = self.coordinates[0].position if self._has_coordinates else partial(_position, self)
         return first(state)
 
-    def velocity(self, state: State) -> Float[Array, ""]:
+    def velocity(self, state: State) -> Scalar:
         """The velocity that an impact reverses; of the sign of d(position)/ds. Of a machine without
         stops whose state has no `V`, what pictures draw over the position: its second number."""
         first = self.coordinates[0].velocity if self._has_coordinates else partial(_velocity, self)
         return first(state)
 
-    def placed(self, state: State, Y: Float[Array, ""], V: Float[Array, ""]) -> State:
+    def placed(self, state: State, Y: Scalar, V: Scalar) -> State:
         """`state` with this position and velocity: how a landing and a rebound are applied."""
         first = self.coordinates[0].placed if self._has_coordinates else partial(_placed, self)
         return first(state, Y, V)
@@ -194,7 +193,7 @@ class AbstractMachine(Clocked, Observed, Worded):
             "its own."
         )
 
-    def adopt(self, start: Any) -> State:
+    def adopt(self, start: State) -> State:
         """A start as this machine needs it. **Raises:** `TypeError` if it is none."""
         return start
 
@@ -202,11 +201,12 @@ class AbstractMachine(Clocked, Observed, Worded):
         """Whether the body can come to rest on a stop, as far as is known; static."""
         return bool(self.stops)
 
-    def alive(self, state: State) -> Bool[Array, ""] | None:
-        """False where the clock of this machine breaks down; `None` where it cannot."""
+    def alive(self, state: State) -> Flag | None:
+        """Whether the motion can go on: false where the clock of this machine breaks down, as where
+        a crank stops in the phase clock; `None` where it cannot."""
         return None
 
-    def in_range(self, start: State) -> Bool[Array, ""]:
+    def in_range(self, start: State) -> Flag:
         """Whether the numbers of this machine, traced ones too, are such that it can be run from
         `start`; asked once, when a lane begins. By default what its parts say (`ranges`)."""
         return in_range((self, self.stops, self.switches))

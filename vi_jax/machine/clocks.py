@@ -5,9 +5,9 @@ from typing import Any, TypeVar
 
 from jaxtyping import Array, Float
 
+from .._types import Scalar, State
 from .shown import Shown
 
-State = Any
 Machine = TypeVar("Machine", bound="Clocked")
 
 
@@ -16,11 +16,11 @@ class Clocked(Shown):
 
     @property
     @abc.abstractmethod
-    def cycle(self) -> Float[Array, ""] | float:
+    def cycle(self) -> Scalar | float:
         """Length of one cycle in `s` (or in `clock(state)`, where that is not `None`); where
         `section` ends a cycle, its usual length, by which steps are sized."""
 
-    def clock(self, state: State) -> Float[Array, ""] | None:
+    def clock(self, state: State) -> Scalar | None:
         """The state component that counts cycles, or `None` where `s` itself does."""
         return None
 
@@ -28,12 +28,12 @@ class Clocked(Shown):
         """`state` with its clock set back by one cycle (only asked where there is a clock)."""
         return state
 
-    def pace(self, s: Float[Array, ""], state: State) -> Float[Array, ""] | None:
+    def pace(self, s: Scalar, state: State) -> Scalar | None:
         """d(time)/ds where it varies along the motion, or `None` where `s` measures time."""
         return None
 
     @property
-    def period(self) -> Float[Array, ""] | float:
+    def period(self) -> Scalar | float:
         """Duration of a cycle, where it is fixed."""
         return self.cycle
 
@@ -52,24 +52,27 @@ class Clocked(Shown):
         """The same machine with what counts its cycles as its independent variable."""
         return self
 
-    def in_cycle_state(self, name: str, state: Any) -> State:
-        """A state on the section, of any of its clocks, as the machine in that clock needs it."""
+    def in_cycle_state(self, name: str, state: State) -> State:
+        """A state on the section, made for any clock of this machine, as the machine of
+        `in_cycle_clock` needs it; `name` is the argument that messages blame."""
         return state
 
     def phase_at(self, since_section: Any) -> Any:
-        """What the clock reads, from what it counted since the section."""
+        """What the clock shows when it has counted so much since the section: a crank angle may
+        begin elsewhere than at 0."""
         return since_section
 
     @property
-    def turn(self) -> Float[Array, ""] | float:
-        """What an impact log counts in one cycle."""
+    def turn(self) -> Scalar | float:
+        """The length of a cycle as an impact log counts it."""
         return self.cycle
 
     def as_logged(self, clock: Float[Array, "..."]) -> Float[Array, "..."]:
-        """A reading of what counts the cycles, as the impact log tells it; by default itself."""
+        """What an impact log says for a reading of what counts the cycles; by default the reading
+        itself."""
         return clock
 
-    def step_limit(self, s: Float[Array, ""], state: State) -> Float[Array, ""] | float:
+    def step_limit(self, s: Scalar, state: State) -> Scalar | float:
         """The longest step that holds at most one extremum of the motion; at most `cycle`/5."""
         return self.cycle / 5
 
@@ -78,7 +81,7 @@ class Clocked(Shown):
         """Whether the usual number of fixed steps in a cycle is known to be enough; static."""
         return False
 
-    def relaxation(self, s: Float[Array, ""], state: State) -> Float[Array, ""] | None:
+    def relaxation(self, s: Scalar, state: State) -> Scalar | None:
         """The shortest time constant (in `s`) with which something fades, `None` if nothing does.
 
         Explicit Runge–Kutta methods are unstable with steps much longer than this.

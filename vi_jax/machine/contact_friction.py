@@ -1,6 +1,6 @@
 """Dry friction on a stop: in its impacts, and while a body rests on it."""
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from .._checks import NOT_NEGATIVE, SHARE, count, require_ranges
 from .._numbers import real
+from .._types import Flag, Machine, Scalar, State
 from .contacts import added, forces, held_flow, push_of, shares
 from .event import AbstractSwitch, Around
 
@@ -67,17 +68,24 @@ class ContactFriction(AbstractSwitch):
         return False
 
     def begin(self, machine, s, state):
-        """The way that the body slips."""
+        """The mode of a motion that begins: the sign of the velocity along the stop."""
         return self._slip(machine, state)
 
     def struck(self, machine, s, state, mode, *, around: Around | None = None):
-        """The way that the body slips, or would."""
+        """The mode after an impact or another jump: the way that the body slips, or would begin to.
+
+        **Arguments:** as every event's, and `around`, what else acts; `None` if that is not known
+        yet.
+        """
         slips = self._slip(machine, state)
         return jnp.where(slips == 0, self._from_rest(machine, s, state, around), slips)
 
     def guard(self, machine, s, state, mode, *, around: Around | None = None):
         """The velocity along the stop coming to zero; or the force coming to what friction can
-        hold. Nothing happens where the body does not rest on the stop."""
+        hold. Nothing happens where the body does not rest on the stop.
+
+        **Arguments:** as every event's, and `around`, the other modes and who rests where.
+        """
         if around is None or not around.contact:
             return jnp.full_like(s, -1.0)
         drag, pressing = self._forces(machine, s, state, around, mode)
@@ -86,7 +94,10 @@ class ContactFriction(AbstractSwitch):
         return jnp.where(self._rests(machine, around), own, -1.0)
 
     def after(self, machine, s, state, mode, *, around: Around | None = None):
-        """Sticking, or slipping the way the force pulls."""
+        """Sticking, or slipping the way the force pulls.
+
+        **Arguments:** as every event's, and `around`, the other modes and who rests where.
+        """
         # It vanishes to rounding; and with it what that would give to the velocity on the stop.
         stop, along = machine.stops[self.stop], machine.coordinates[self.along]
         both = (machine.coordinates[stop.coordinate], along)
@@ -97,12 +108,12 @@ class ContactFriction(AbstractSwitch):
         state = added(state, amounts, pushes)
         return state, self._from_rest(machine, s, state, around, sticks=mode != 0)
 
-    def _rests(self, machine: Any, around: Around) -> Any:
+    def _rests(self, machine: Machine, around: Around) -> Flag:
         if not around.contact:
             return jnp.zeros((), bool)
         return around.contact[machine.stops[self.stop].coordinate] == 1.0 + self.stop
 
-    def _slip(self, machine: Any, state: Any) -> Any:
+    def _slip(self, machine: Machine, state: State) -> Scalar:
         """The sign of the velocity along the stop; zero where that is rounding."""
         velocity = machine.coordinates[self.along].velocity(state)
         size = sum((jnp.sum(jnp.abs(x)) for x in jtu.tree_leaves(state)), start=jnp.asarray(0.0))
@@ -110,9 +121,15 @@ class ContactFriction(AbstractSwitch):
         return jnp.where(jnp.abs(velocity) <= least, 0.0, jnp.sign(velocity))
 
     def _from_rest(
-        self, machine: Any, s: Any, state: Any, around: Around | None, sticks: Any = True
-    ) -> Any:
-        """Sticking, if it may, where the force is not too large; else the way that it pulls."""
+        self, machine: Machine, s: Scalar, state: State, around: Around | None,
+        sticks: Flag | bool = True,
+    ) -> Scalar:  # fmt: skip
+        """The mode of a body without velocity along the stop: sticking (0) where the force is not
+        too large, else the way that it pulls.
+
+        **Arguments:** `around`, the other modes and who rests where, `None` if that is not known;
+        `sticks`, whether the body may stick at all.
+        """
         if around is None or not around.contact:
             return jnp.zeros_like(s)
         drag, pressing = self._forces(machine, s, state, around, jnp.zeros_like(s))
@@ -120,8 +137,13 @@ class ContactFriction(AbstractSwitch):
         away = jnp.where(drag > 0, -1.0, 1.0)
         return jnp.where(holds | ~self._rests(machine, around), 0.0, away)
 
-    def _forces(self, machine: Any, s: Any, state: Any, around: Around, mode: Any) -> Any:
-        """Those along and on the stop, in a mode of it."""
+    def _forces(
+        self, machine: Machine, s: Scalar, state: State, around: Around, mode: Scalar
+    ) -> tuple[Scalar, Scalar]:
+        """The force along the stop and that which presses on it.
+
+        **Arguments:** `around`, the other modes and who rests where; `mode`, that of this friction.
+        """
         modes = around.instead(mode)
         flow = machine.field(s, state, *modes)
         return held_flow(machine, flow, state, modes, around.contact)[1][around.own]

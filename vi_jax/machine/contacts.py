@@ -13,27 +13,29 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.lax import stop_gradient
 
-from .._types import Flag, Scalar
+from .._types import Flag, Machine, Scalar, State
 
 # A pivot smaller than this (its row's begins as 1) is that of a contact whose velocity the others
-# have settled already, as that of the fourth leg of a table: it gets no force.
+# have settled already, as that of the fourth leg of a table: it gets no force. A choice, far above
+# rounding and far below the pivots of contacts that matter.
 _REDUNDANT = 1e-9
 
 
-def push_of(coordinate: Any, state: Any) -> Any:
-    """How a state changes by a contact's force, by so much as changes its velocity by one."""
+def push_of(coordinate: Any, state: State) -> State:
+    """A contact's push: how the state changes by as much of its force as changes its velocity by
+    one."""
     place, velocity = coordinate.position(state), coordinate.velocity(state)
     one = jnp.ones_like(velocity)
     return jax.jvp(lambda V: coordinate.placed(state, place, V), (velocity,), (one,))[1]
 
 
-def gained(coordinate: Any, state: Any, change: Any) -> Scalar:
-    """What a coordinate's velocity gains as the state changes."""
+def gained(coordinate: Any, state: State, change: State) -> Scalar:
+    """By how much a coordinate's velocity changes as the state does."""
     return jax.jvp(coordinate.velocity, (state,), (change,))[1]
 
 
-def shares(coordinates: Sequence[Any], state: Any, pushes: Sequence[Any]) -> list[list[Scalar]]:
-    """What each coordinate's velocity gains by each push."""
+def shares(coordinates: Sequence[Any], state: State, pushes: Sequence[State]) -> list[list[Scalar]]:
+    """By how much each coordinate's velocity changes with each push: a row for each coordinate."""
     return [[gained(coordinate, state, push) for push in pushes] for coordinate in coordinates]
 
 
@@ -71,8 +73,8 @@ def _solved(rows: list[list[Scalar]]) -> list[Scalar]:
     return [row[-1] for row in rows]
 
 
-def added(state: Any, amounts: Sequence[Scalar], changes: Sequence[Any]) -> Any:
-    """A tree with so much of each change added."""
+def added(state: State, amounts: Sequence[Scalar], changes: Sequence[State]) -> State:
+    """A tree to which each change is added, multiplied by its amount."""
     for amount, change in zip(amounts, changes, strict=True):
         state = jtu.tree_map(lambda a, b, amount=amount: a + amount * b, state, change)
     return state
@@ -81,19 +83,19 @@ def added(state: Any, amounts: Sequence[Scalar], changes: Sequence[Any]) -> Any:
 class Rubbed(NamedTuple):
     """The state behind an impact with friction, and the impulses of it."""
 
-    state: Any
+    state: State
     pushed: Scalar
     """How much of the contact's push there is, and of the push along it."""
     dragged: Scalar
 
 
-def rubbed(machine: Any, number: int, friction: Any, before: Any, after: Any) -> Rubbed:
+def rubbed(machine: Machine, number: int, friction: Any, before: State, after: State) -> Rubbed:
     """An impact on stop `number` as Coulomb's friction has it: the body sticks, its velocity along
     the stop reversed and scaled by the tangential restitution, if the impulse that this takes is at
     most `level` times that of the stop; else it slips against that much.
 
-    **Arguments:** the friction on the stop; the states before the impact, and after one that is as
-    smooth as it is hard: the velocity towards the stop is that one's.
+    **Arguments:** `friction`, the one on this stop; `before` and `after`, the states before the
+    impact and after one without friction, whose velocity towards the stop is kept.
     """
     stop = machine.stops[number]
     body, along = machine.coordinates[stop.coordinate], machine.coordinates[friction.along]
@@ -119,9 +121,9 @@ def rubbed(machine: Any, number: int, friction: Any, before: Any, after: Any) ->
     return Rubbed(moved, pushed, dragged)
 
 
-def _slipping(gains: list[list[Scalar]], wanted: Scalar, ratio: Any) -> tuple[Scalar, Scalar]:
-    """How much of both pushes there is, so that the velocity towards the stop changes as wanted,
-    with so much of that along the stop for one of the other."""
+def _slipping(gains: list[list[Scalar]], wanted: Scalar, ratio: Scalar) -> tuple[Scalar, Scalar]:
+    """How much there is of both pushes, the stop's and that along it, if the velocity towards the
+    stop changes as wanted and the push along it is `ratio` times the stop's."""
     pushed = wanted / (1 + ratio * gains[0][1])
     return pushed, ratio * pushed
 
@@ -132,7 +134,7 @@ class Held(NamedTuple):
 
     coordinates: list[Any]
     """Whose velocity is held; of a friction that along the stop."""
-    pushes: list[Any]
+    pushes: list[State]
     """How the state changes by its force; of a stop with the drag of a body that slips on it."""
     acts: list[Flag]
     """Whether it holds; a friction holds while the body sticks."""
@@ -141,10 +143,10 @@ class Held(NamedTuple):
     its own push goes with one of the stop's."""
 
 
-def held_by(machine: Any, state: Any, modes: Sequence[Any], contact: Sequence[Any]) -> Held:
+def held_by(machine: Any, state: State, modes: Sequence[Scalar], contact: Sequence[Scalar]) -> Held:
     """What holds the bodies that rest on stops.
 
-    **Arguments:** the modes of the machine's switches, which come first; `contact` as in `Around`.
+    **Arguments:** `modes`, those of the machine's switches first; `contact` as in `Around`.
     """
     limited = sorted({stop.coordinate for stop in machine.stops})
     bodies = [machine.coordinates[k] for k in limited]
@@ -169,13 +171,13 @@ def held_by(machine: Any, state: Any, modes: Sequence[Any], contact: Sequence[An
 
 
 def held_flow(
-    machine: Any, flow: Any, state: Any, modes: Sequence[Any], contact: Sequence[Any]
-) -> tuple[Any, dict[int, tuple[Scalar, Scalar]]]:
+    machine: Machine, flow: State, state: State, modes: Sequence[Scalar], contact: Sequence[Scalar]
+) -> tuple[State, dict[int, tuple[Scalar, Scalar]]]:
     """The rate at which a state changes along `flow` while those coordinates that rest keep their
     velocities, all at once: contacts that share a body are held by forces that depend on each
     other, and on the friction there.
 
-    **Arguments:** the modes of the machine's switches, which come first; `contact` as in `Around`.
+    **Arguments:** `modes`, those of the machine's switches first; `contact` as in `Around`.
 
     **Returns:** the rate, and of each friction on a stop, by its place among the switches, the
     force along the stop and that which presses on it.

@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 
 from .._checks import Range, require_ranges
 from .._numbers import real
+from .._types import Scalar
 from .shown import Shown
 from .trig import sincos
 
@@ -29,7 +30,7 @@ class AbstractCrank(Shown):
         return False
 
     @property
-    def drawn_rod(self) -> Float[Array, ""] | float:
+    def drawn_rod(self) -> Scalar | float:
         """Length of the rod in pictures (unit: a)."""
         return 3.0
 

@@ -41,11 +41,11 @@ class DCMotor(Motor):
     timed_state: ClassVar = TimedDCMotorState
 
     def torque(self, state, pace, paced):
-        """M, and how it builds up."""
+        """The torque M of the state, and how fast it builds up."""
         return paced(state.M), (paced(self.build_up(state.W, state.M)),)
 
     def usual(self, name, known):
-        """Of the torque that which is steady at the speed."""
+        """A torque that a start leaves out is the steady one at its speed."""
         return self.line(known["W"]) if name == "M" else super().usual(name, known)
 
     def build_up(self, W: Float[Array, "..."], M: Float[Array, "..."]) -> Float[Array, "..."]:

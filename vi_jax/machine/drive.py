@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from .._checks import POSITIVE, require, require_ranges
 from .._numbers import number, real
+from .._types import State
 from .shown import Shown
 from .states import OscillatorState
 
@@ -44,7 +45,7 @@ class AbstractDrive(Shown):
         return None
 
     @abc.abstractmethod
-    def field(self, scene: Any, s: Any, state: Any, pushes: Iterable[Any]) -> Any:
+    def field(self, scene: Any, s: Any, state: State, pushes: Iterable[Any]) -> State:
         """d(state)/ds, by crank angle or, if `scene.clock_name` is `"time"`, by time τ.
 
         **Arguments:** the scene, for its `crank`, `phase_at` and `pull`; s, the state, and what
@@ -56,7 +57,8 @@ class AbstractDrive(Shown):
         return None
 
     def usual(self, name: str, known: dict[str, Any]) -> Any:
-        """A component of its own where a start does not give it; `known` are those before it."""
+        """A component of the drive's own where a start leaves it out; `known` are the components
+        before it."""
         raise ValueError(
             f"Argument `{name}` of `start` must be given for a `{type(self).__name__}`, which has "
             "no `usual` for it."
@@ -77,7 +79,8 @@ class AbstractDrive(Shown):
             )
 
     def begin(self, **given: Any) -> dict[str, Any]:
-        """Its own components of a start, by name; what is not given, or `None`, is the `usual`.
+        """The drive's own components of a start, by name; what is not given, or `None`, is the
+        `usual`.
 
         **Raises:** `ValueError` if a number is not finite, or no component of its state.
         """
@@ -95,13 +98,13 @@ class AbstractDrive(Shown):
             require(name, found[name])
         return found
 
-    def speed(self, state: Any) -> Float[Array, "..."]:
-        """Of the crank (unit: ω), without its sign."""
+    def speed(self, state: State) -> Float[Array, "..."]:
+        """How fast the crank turns (unit: ω), without sign."""
         fixed = self.fixed_speed
         return jnp.abs(state.W) if fixed is None else fixed
 
     def duration(self) -> Float[Array, "..."] | float | None:
-        """2π/ζ of time τ for a turn, where the speed is fixed."""
+        """How long a turn takes (time τ), 2π/ζ; `None` where the speed is not fixed."""
         fixed = self.fixed_speed
         return None if fixed is None else 2 * pi / fixed
 
@@ -124,7 +127,7 @@ class IdealDrive(AbstractDrive):
         return self.frequency_ratio
 
     def field(self, scene, s, state, pushes):
-        """Of the body alone, by crank angle (Eq. 8 of the paper) or by time (Eq. 5)."""
+        """d(state)/ds of the body alone, by crank angle (Eq. 8 of the paper) or by time (Eq. 5)."""
         zeta = self.frequency_ratio
         timed = scene.clock_name == "time"
         slide = scene.crank.slide(scene.phase_at(zeta * s if timed else s))

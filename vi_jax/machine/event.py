@@ -8,11 +8,11 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax.lax import stop_gradient
 
-from .._types import Scalar
+from .._types import Machine, Scalar, Scalars, State
 from .contacts import rubbed
 from .shown import Shown
 
-Modes = tuple[Scalar, ...]
+Modes = Scalars
 
 
 class Around(NamedTuple):
@@ -22,7 +22,7 @@ class Around(NamedTuple):
     """All modes of the machine."""
     own: int
     """Which of them is the event's."""
-    contact: tuple[Scalar, ...]
+    contact: Scalars
     """Of each coordinate, 1 + i while it rests on stop number i, else 0; empty where none can."""
 
     def instead(self, mode: Any) -> Modes:
@@ -69,8 +69,8 @@ class AbstractEvent(Shown):
 
     @property
     def from_below(self) -> bool:
-        """Whether it happens only once its guard has been below zero since the last jump. A guard
-        that is another one after the event need not ask for that."""
+        """Whether the event happens only once its guard has been below zero since the last jump. It
+        need not ask for that if its guard is another function after the event."""
         return True
 
     @abc.abstractmethod
@@ -83,30 +83,30 @@ class AbstractEvent(Shown):
 
     def jump(self, *args: Any, **kwargs: Any) -> Any:
         """`jump(machine, s, state, *modes)`: the state after the event as a smooth function of that
-        before it, also of one beside the event: what `after` only puts right to rounding is left as
-        it is."""
+        before it, for derivatives. It has to hold for states beside the event too, and leaves out
+        what `after` only corrects to rounding."""
         return self.after(*args, **kwargs)[0]
 
-    def happens(self, machine: Any, s: Any, state: Any, *modes: Any) -> Any:
+    def happens(self, machine: Machine, s: Scalar, state: State, *modes: Any) -> Any:
         """Whether the event happens where its guard has risen through zero; `None` if always."""
         return None
 
-    def value(self, machine: Any, s: Any, state: Any, *modes: Any) -> Any:
+    def value(self, machine: Machine, s: Scalar, state: State, *modes: Any) -> Any:
         """A number that the log of events keeps of it, of the state in which it is met."""
         return jnp.nan
 
-    def begin(self, machine: Any, s: Scalar, state: Any) -> Scalar:
+    def begin(self, machine: Machine, s: Scalar, state: State) -> Scalar:
         """The mode of a motion that begins in `state`, of an event that holds one."""
         raise NotImplementedError(f"A {type(self).__name__} holds no mode.")
 
-    def struck(self, machine: Any, s: Scalar, state: Any, mode: Scalar) -> Scalar:
+    def struck(self, machine: Machine, s: Scalar, state: State, mode: Scalar) -> Scalar:
         """Its mode after an impact or another jump of the state; by default that of a new
         motion."""
         return self.begin(machine, s, state)
 
-    def speed(self, machine: Any, state: Any, rate: Any) -> Any:
-        """How fast it is met, in the machine's words: by default how fast the guard rises by s,
-        which is the `rate`."""
+    def speed(self, machine: Machine, state: State, rate: Scalar) -> Scalar:
+        """How fast the event is met, in the machine's words: by default `rate`, how fast its guard
+        rises by s."""
         return rate
 
 
@@ -144,15 +144,17 @@ class AbstractSwitch(AbstractEvent):
         return True
 
     @abc.abstractmethod
-    def begin(self, machine: Any, s: Scalar, state: Any) -> Scalar:
+    def begin(self, machine: Machine, s: Scalar, state: State) -> Scalar:
         """The mode of a motion that begins in `state`."""
 
     @abc.abstractmethod
-    def guard(self, machine: Any, s: Scalar, state: Any, mode: Scalar) -> Scalar:
+    def guard(self, machine: Machine, s: Scalar, state: State, mode: Scalar) -> Scalar:
         """What rises through zero where this mode ends."""
 
     @abc.abstractmethod
-    def after(self, machine: Any, s: Scalar, state: Any, mode: Scalar) -> tuple[Any, Scalar]:
+    def after(
+        self, machine: Machine, s: Scalar, state: State, mode: Scalar
+    ) -> tuple[State, Scalar]:
         """State and mode after the event. The state may be corrected by what is below rounding
         (a velocity set to zero where it vanishes), and must not jump."""
 
@@ -172,9 +174,9 @@ class AbstractSwitch(AbstractEvent):
         surface where they meet (see `Switch`)."""
         return False
 
-    def contribution(self, machine: Any, s: Scalar, state: Any, mode: Scalar) -> Any:
-        """What it adds to the machine's field in this mode, where it knows: of a soft stop the
-        acceleration of its coordinate, of dry friction the force on the body that rubs."""
+    def contribution(self, machine: Machine, s: Scalar, state: State, mode: Scalar) -> Any:
+        """What the switch adds to the machine's field in this mode, where it knows that: a soft
+        stop the acceleration of its coordinate, dry friction the force on the body that rubs."""
         raise NotImplementedError(f"A {type(self).__name__} has no `contribution`.")
 
 
@@ -194,62 +196,73 @@ class Section(AbstractEvent):
         return (s if clock is None else clock) - jnp.asarray(machine.cycle, jnp.result_type(s))
 
     def after(self, machine, s, state, *modes):
-        """As the next cycle begins."""
+        """The state as the next cycle begins."""
         return machine.renewed(state), modes
 
 
-def events_of(machine: Any) -> tuple[AbstractEvent, ...]:
-    """All events of a machine, by which number they go: its stops, its switches, those of other
-    kinds, its section."""
+def events_of(machine: Machine) -> tuple[AbstractEvent, ...]:
+    """All events of a machine, in the order in which they are numbered: its stops, its switches,
+    its other events, its section."""
     return (*machine.stops, *machine.switches, *machine.events, Section())
 
 
-def is_autonomous(machine: Any, state: Any) -> bool:
-    """Whether an event ends the cycles of a machine."""
+def is_autonomous(machine: Machine, state: State) -> bool:
+    """Whether an event ends the cycles of a machine, instead of its clock."""
     ends = any(event.ends_cycle for event in events_of(machine)[:-1])
     return ends or machine.section(state) is not None
 
 
-def section_number(machine: Any) -> int:
-    """The number of the section."""
+def section_number(machine: Machine) -> int:
+    """The section's number among the machine's events: the last."""
     return len(events_of(machine)) - 1
 
 
 def guard_of(
-    machine: Any, number: int, s: Any, state: Any, modes: Modes, contact: tuple[Any, ...] = ()
+    machine: Machine, number: int, s: Scalar, state: State, modes: Modes, contact: Scalars = ()
 ) -> Scalar:
-    """What rises through zero at one of a machine's events, in these modes of it.
+    """The guard of one of a machine's events, which rises through zero where it happens.
 
-    **Arguments:** `contact` as in `Around`.
+    **Arguments:** `number`, the event's; `modes`, all of the machine; `contact` as in `Around`.
     """
     event, own, more = event_of(machine, number, modes, contact)
     return event.guard(machine, s, state, *modes[own], **more)
 
 
-def jump_of(machine: Any, number: int, s: Any, state: Any, modes: Modes) -> Any:
-    """The state after one of its events, also of one beside it."""
+def jump_of(machine: Machine, number: int, s: Scalar, state: State, modes: Modes) -> State:
+    """The state after one of a machine's events as a smooth function of that before it (see
+    `AbstractEvent.jump`).
+
+    **Arguments:** `number`, the event's; `modes`, all of the machine.
+    """
     event, own, _ = event_of(machine, number, modes, ())
     return _rubbed(machine, number, state, event.jump(machine, s, state, *modes[own]))
 
 
-def happens_at(machine: Any, number: int, s: Any, state: Any, modes: Modes) -> Any:
-    """Whether one of its events happens where its guard has risen; `None` if always."""
+def happens_at(machine: Machine, number: int, s: Scalar, state: State, modes: Modes) -> Any:
+    """Whether one of a machine's events happens where its guard has risen; `None` if always.
+
+    **Arguments:** `number`, the event's; `modes`, all of the machine.
+    """
     event, own, _ = event_of(machine, number, modes, ())
     return event.happens(machine, s, state, *modes[own])
 
 
-def value_of(machine: Any, number: int, s: Any, state: Any, modes: Modes) -> Any:
-    """What the log of events keeps of one of its events."""
+def value_of(machine: Machine, number: int, s: Scalar, state: State, modes: Modes) -> Any:
+    """What the log of events keeps of one of a machine's events.
+
+    **Arguments:** `number`, the event's; `modes`, all of the machine.
+    """
     event, own, _ = event_of(machine, number, modes, ())
     return event.value(machine, s, state, *modes[own])
 
 
 def after_event(
-    machine: Any, number: int, s: Any, state: Any, modes: Modes, contact: tuple[Any, ...] = ()
-) -> tuple[Any, Modes]:
-    """State and modes after one of its events.
+    machine: Machine, number: int, s: Scalar, state: State, modes: Modes, contact: Scalars = ()
+) -> tuple[State, Modes]:
+    """State and modes after one of a machine's events.
 
-    **Arguments:** `contact` as in `Around`.
+    **Arguments:** `number`, the event's; `modes`, all of the machine before it; `contact` as in
+    `Around`.
     """
     event, own, more = event_of(machine, number, modes, contact)
     new, changed = event.after(machine, s, state, *modes[own], **more)
@@ -258,33 +271,34 @@ def after_event(
     return _rubbed(machine, number, state, new), settled_modes(changed, s)
 
 
-def _rubbed(machine: Any, number: int, before: Any, after: Any) -> Any:
-    """The state after an impact on a stop with what friction makes of it."""
+def _rubbed(machine: Machine, number: int, before: State, after: State) -> State:
+    """The state after an impact, with what friction on the stop makes of it."""
     friction = rubbing_on(machine, number)
     return after if friction is None else rubbed(machine, number, friction, before, after).state
 
 
-def rubbing_on(machine: Any, number: int) -> Any:
+def rubbing_on(machine: Machine, number: int) -> Any:
     """The friction on stop number `number`, or `None`."""
     if number >= len(machine.stops):
         return None
     return next((x for x in machine.switches if x.rubs_on == number), None)
 
 
-def rubs(machine: Any) -> bool:
+def rubs(machine: Machine) -> bool:
     """Whether there is friction on one of its stops."""
     return any(x.rubs_on is not None for x in machine.switches)
 
 
-def mode_number(machine: Any, number: int) -> int:
-    """Which mode an event holds that holds one."""
+def mode_number(machine: Machine, number: int) -> int:
+    """The place among the machine's modes of the one that an event holds."""
     return sum(event.holds_mode for event in events_of(machine)[:number])
 
 
 def event_of(
-    machine: Any, number: int, modes: Modes, contact: tuple[Any, ...]
+    machine: Machine, number: int, modes: Modes, contact: Scalars
 ) -> tuple[AbstractEvent, slice, dict[str, Around]]:
-    """An event, which of the machine's modes it is given, its own or all, and what else."""
+    """An event, which of the machine's modes its methods get (its own or all), and what keyword
+    arguments besides."""
     event = events_of(machine)[number]
     if not event.holds_mode:
         return event, slice(None), {}
@@ -293,7 +307,7 @@ def event_of(
     return event, slice(own, own + 1), more
 
 
-def begin_modes(machine: Any, s: Scalar, state: Any) -> Modes:
+def begin_modes(machine: Machine, s: Scalar, state: State) -> Modes:
     """The modes of a motion that begins in `state`: those that events hold, in their order, then
     the machine's own."""
     held = [event for event in events_of(machine) if event.holds_mode]
@@ -305,17 +319,17 @@ def begin_modes(machine: Any, s: Scalar, state: Any) -> Modes:
 
 
 def struck_modes(
-    machine: Any,
+    machine: Machine,
     s: Scalar,
-    state: Any,
+    state: State,
     modes: Modes,
     own: Sequence[Any] | None = None,
-    contact: tuple[Any, ...] = (),
+    contact: Scalars = (),
 ) -> Modes:
-    """The modes after a jump, which left this state; the machine's own are those given, or stay as
-    they are.
+    """The modes after the state has jumped to this one.
 
-    **Arguments:** `contact` as in `Around`.
+    **Arguments:** `modes`, before the jump; `own`, the machine's own after it, which stay as they
+    are if left out; `contact` as in `Around`.
     """
     held = []
     for number, event in enumerate(events_of(machine)):
@@ -326,6 +340,6 @@ def struck_modes(
     return settled_modes([*held, *kept], s)
 
 
-def settled_modes(modes: Sequence[Any], s: Any) -> Modes:
+def settled_modes(modes: Sequence[Any], s: Scalar) -> Modes:
     """Modes as the loop carries them: floats, which nothing is differentiated by."""
     return tuple(stop_gradient(jnp.asarray(mode, jnp.result_type(s))) for mode in modes)

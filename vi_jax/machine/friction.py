@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from .._checks import NOT_NEGATIVE, Range, require_ranges
 from .._numbers import real, real_or_law
+from .._types import Flag, Machine, Scalar, State
 from .event import AbstractSwitch
 
 
@@ -54,16 +55,16 @@ class DryFriction(AbstractSwitch):
         """Never along its own surface: where both sides point at it, the body sticks."""
         return False
 
-    def sliding(self, machine: Any, s: Any, state: Any, mode: Any) -> Any:
-        """The friction on a body that slides forward or backward; that on one at rest (mode 0)
-        which begins to."""
+    def sliding(self, machine: Machine, s: Scalar, state: State, mode: Scalar) -> Any:
+        """The size of friction on a body that slides forward or backward; in mode 0 on one that
+        begins to."""
         level = self.level
         if callable(level):
             level = level(mode * self.velocity(machine, state))
         return level if self.load is None else level * self.load(machine, s, state)
 
-    def sticking(self, machine: Any, s: Any, state: Any) -> Any:
-        """The most that friction holds."""
+    def sticking(self, machine: Machine, s: Scalar, state: State) -> Any:
+        """The largest force that friction can balance on a body at rest."""
         return self.sliding(machine, s, state, jnp.zeros_like(s)) * self.static_ratio
 
     def contribution(self, machine, s, state, mode):
@@ -88,5 +89,5 @@ class DryFriction(AbstractSwitch):
         sticks = (jnp.abs(force) <= self.sticking(machine, s, state)) & (mode != 0)
         return state, self._from_rest(sticks, force)
 
-    def _from_rest(self, sticks: Any, force: Any) -> Any:
+    def _from_rest(self, sticks: Flag, force: Scalar) -> Scalar:
         return jnp.where(sticks, 0.0, jnp.where(force < 0, -1.0, 1.0))

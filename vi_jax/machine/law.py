@@ -31,12 +31,16 @@ class AbstractContactLaw(Shown):
 
     @abc.abstractmethod
     def force(self, stiffness: Any, damping: Any, depth: Any, rate: Any) -> Any:
-        """Of a body that touches, without prestress; it may pull."""
+        """The force away from the stop, per unit of mass, on a body that touches, without
+        prestress; it may pull (be negative)."""
 
     def pulls(self, stiffness: Any, damping: Any, prestress: Any, depth: Any, rate: Any) -> Any:
-        """Of the sign of the force, turned: positive where it would pull. It ends a contact that
-        may not pull, and should be smooth at first touch; `prestress` is `None` where there is
-        none."""
+        """A function with the sign of the pull: positive where the stop would pull the body. It
+        ends a contact that may not pull, and should be smooth at first touch.
+
+        **Arguments:** `stiffness` K and `damping` α; `prestress` F0, `None` where there is none;
+        `depth` δ and its `rate` δ' by time.
+        """
         force = self.force(stiffness, damping, depth, rate)
         return -force if prestress is None else -(prestress + force)
 
@@ -46,7 +50,8 @@ class AbstractContactLaw(Shown):
         return None
 
     def frequency(self, stiffness: Any, depth: Any, rate: Any) -> Any:
-        """With which a body oscillates on the stop, at the depth that it will reach."""
+        """The frequency with which a body oscillates on the stop, at the depth that it will
+        reach."""
         p, deepest = self.exponent, jnp.maximum(depth, 1e-12)
         if p > 1:
             reach = (0.5 * (p + 1) * rate**2 / stiffness + 1e-30) ** (1 / (p + 1))
@@ -68,7 +73,10 @@ class PowerLaw(AbstractContactLaw):
         return stiffness * power(depth, p) + resist
 
     def pulls(self, stiffness, damping, prestress, depth, rate):
-        """By the force over δ^((p-1)/2)."""
+        """The pull over δ^((p-1)/2), which is smooth at first touch.
+
+        **Arguments:** as `AbstractContactLaw.pulls`.
+        """
         root = power(depth, 0.5 * (self.exponent + 1))
         pull = -stiffness * root - damping * jnp.sqrt(stiffness) * rate
         flat = power(depth, 0.5 * (self.exponent - 1))
@@ -85,12 +93,15 @@ class HuntCrossley(AbstractContactLaw):
     """K δᵖ (1 + α δ'), whose restitution falls with the speed."""
 
     def force(self, stiffness, damping, depth, rate):
-        """Damped in proportion to the spring's force."""
+        """The spring's force with a damping in proportion to it."""
         spring = stiffness * power(depth, self.exponent)
         return spring + damping * spring * rate
 
     def pulls(self, stiffness, damping, prestress, depth, rate):
-        """By what the spring's force is multiplied with."""
+        """The pull over the spring's force, without prestress: that vanishes at first touch.
+
+        **Arguments:** as `AbstractContactLaw.pulls`.
+        """
         if prestress is None:
             return -(1 + damping * rate)
         return super().pulls(stiffness, damping, prestress, depth, rate)

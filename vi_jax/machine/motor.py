@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, require_ranges
 from .._numbers import real
+from .._types import State
 from .crank import Slide
 from .drive import AbstractDrive
 from .states import MotorState, TimedMotorState
@@ -46,7 +47,8 @@ class Motor(AbstractDrive):
         require_ranges(self)
 
     def field(self, scene, s, state, pushes):
-        """Of body and shaft: by crank angle (Eq. 8 to 9 of the paper) or by time (Eq. 5 to 7)."""
+        """d(state)/ds of body and shaft: by crank angle (Eq. 8 to 9 of the paper) or by time (Eq. 5
+        to 7)."""
         by_angle = scene.clock_name == "phase"
         slide = scene.crank.slide(scene.phase_at(s if by_angle else state.phase))
         # By angle all is divided by W. Products with 1/W are shared: a power series pays for each.
@@ -64,14 +66,14 @@ class Motor(AbstractDrive):
         return type(state)(speed, pull, shaft, *more, *clock)
 
     def torque(
-        self, state: Any, pace: Number | None, paced: Callable[[Any], Any]
+        self, state: State, pace: Number | None, paced: Callable[[Any], Any]
     ) -> tuple[Number, tuple[Number, ...]]:
         """The motor's torque (per J ω²), and how the components of its own change behind W; by
         crank angle divided by W, which `paced` does."""
         return self.line(state.W, pace), ()
 
     def usual(self, name, known):
-        """The no-load speed κ w0."""
+        """A speed that a start leaves out is the no-load speed κ w0."""
         return self.control * self.no_load_speed
 
     def rate(self):

@@ -10,6 +10,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._types import State
 from .units import in_unit
 
 
@@ -24,7 +25,7 @@ def by_name(tree: Any) -> dict[str, Any]:
     return dict(_named(tree))
 
 
-def components(state: Any, lead: int = 0) -> dict[str, Any]:
+def components(state: State, lead: int = 0) -> dict[str, Any]:
     """All numbers of a state by their names, those of an array `name[i]`; of several states beside
     each other, which have `lead` axes in front, rows of them."""
     found = {}
@@ -35,7 +36,7 @@ def components(state: Any, lead: int = 0) -> dict[str, Any]:
     return found
 
 
-def state_in_words(state: Any, digits: int, units: Mapping[str, str]) -> str:
+def state_in_words(state: State, digits: int, units: Mapping[str, str]) -> str:
     """The numbers of a state of any kind, in their units."""
     parts = components(state).items()
     return ", ".join(f"{name} = {in_unit(plain(x, digits), units, name)}" for name, x in parts)

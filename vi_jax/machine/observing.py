@@ -2,11 +2,9 @@
 
 from typing import Any, TypeVar
 
-from jaxtyping import Array, Float
-
+from .._types import Scalar, State
 from .shown import Shown
 
-State = Any
 Machine = TypeVar("Machine", bound="Observed")
 
 
@@ -14,7 +12,7 @@ class Observed(Shown):
     """What is observed of a motion: where a cycle ends, what begins anew with it, means and
     quantities."""
 
-    def section(self, state: State) -> Float[Array, ""] | None:
+    def section(self, state: State) -> Scalar | None:
         """What rises through zero where a cycle ends; `None` where `s` or `clock` counts them."""
         return None
 
@@ -26,7 +24,8 @@ class Observed(Shown):
         )
 
     def observed_later(self: Machine, since_section: Any) -> Machine | None:
-        """The same machine with its section moved by so much of its clock; `None` if it cannot."""
+        """The same machine with its section moved by so much of its clock; `None` for a machine
+        whose section cannot be moved."""
         return None
 
     def renewed(self, state: State) -> State:

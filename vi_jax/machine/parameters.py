@@ -21,7 +21,8 @@ from .scene import Oscillator, Scene
 from .shown import Shown
 from .stop import RigidStop
 
-# Crank radii from which a length is taken to be in another unit than metres.
+# Crank radii from which a length is taken to be in another unit than metres: a choice. Table 1's
+# gap is 2 of them, and would be 2,000 if given in millimetres.
 _LONG = 1000.0
 
 # A plain number is taken as well as an array of them to `vmap` over.
@@ -29,7 +30,7 @@ Number = Float[Array, "..."] | float
 
 
 def _si(name: str, unit: str, default: float | None) -> Any:
-    """A number in this unit, or a quantity of `pint` that can be given in it."""
+    """A field for a number in this unit, or for a quantity of `pint` that can be given in it."""
     convert = real(name) if default is not None else optional_real(name)
     return eqx.field(
         default=default,

@@ -8,10 +8,11 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from .._checks import NOT_NEGATIVE, Range, instance_of, require, require_ranges, tuple_of
 from .._numbers import concrete, number, optional_real, real
+from .._types import Flag, Scalar, State
 from .crank import AbstractCrank, CosineCrank
 from .drive import AbstractDrive, IdealDrive
 from .shaft import ShaftMachine
@@ -107,12 +108,12 @@ class Scene(ShaftMachine):
         return self.oscillator.damping_ratio
 
     @property
-    def cycle(self) -> Float[Array, ""] | float:
+    def cycle(self) -> Scalar | float:
         """2π of crank angle; in the time clock of an ideal drive 2π/ζ of time τ."""
         return self.period if self.clock_name == "time" else 2 * pi
 
     @property
-    def period(self) -> Float[Array, ""] | float:
+    def period(self) -> Scalar | float:
         """2π/ζ of time τ for an ideal drive; of another a turn of the crank."""
         duration = self.drive.duration()
         return 2 * pi if duration is None else duration
@@ -148,12 +149,14 @@ class Scene(ShaftMachine):
         """Crank angle from the one counted since the section."""
         return since_section if self.section_phase is None else since_section + self.section_phase
 
-    def start(self, *, Y: Any = 0.0, V: Any = 0.0, W: Any = None, M: Any = None, **others) -> Any:
-        """A state on the section: position (unit: a), velocity (a ω), crank speed (ω) and the
-        torque of a `DCMotor` (J ω²); `others` are what a drive of one's own has besides.
+    def start(self, *, Y: Any = 0.0, V: Any = 0.0, W: Any = None, M: Any = None, **others) -> State:
+        """A state on the section.
 
         `W` belongs to motor scenes and defaults to the motor's no-load speed κ w0. `M` defaults to
         the steady torque at that speed; a motor that is being switched on has `W=0, M=0`.
+
+        **Arguments:** position `Y` (unit: a), velocity `V` (a ω), crank speed `W` (ω) and the
+        torque `M` of a `DCMotor` (J ω²); `others` are what a drive of one's own has besides.
 
         **Raises:** `ValueError` if a number is not finite, or is given to a drive that has none.
         """
@@ -164,13 +167,14 @@ class Scene(ShaftMachine):
         return self.adopt(self.state_type(Y, V, *own.values()))
 
     @property
-    def state_type(self) -> Any:
-        """Of a state in the phase clock."""
+    def state_type(self) -> type:
+        """The class of a state in the phase clock."""
         return self.drive.state
 
     @property
     def timed_states(self) -> dict[type, type]:
-        """By the drive's state class, what its states are by time."""
+        """For the drive's class of states, that of its states by time; empty where both are the
+        same."""
         timed = self.drive.timed_state
         return {} if timed is None else {self.drive.state: timed}
 
@@ -179,12 +183,13 @@ class Scene(ShaftMachine):
         """The compliant stops, each with contact as its mode."""
         return self.soft_stops
 
-    def field(self, s: Float[Array, ""], state: Any, *modes: Float[Array, ""]) -> Any:
+    def field(self, s: Scalar, state: State, *modes: Scalar) -> State:
         """d(state)/ds: by crank angle (Eq. 8 to 9 of the paper) or by time τ (Eq. 5 to 7)."""
         return self.drive.field(self, s, state, self._pushes(s, state, modes))
 
     def pull(self, stretch: Any, speed: Any, pushes: Iterable[Any]) -> Any:
-        """d²Y/dτ² from U - Y, V and what pushes; divided by W they give dV/dφ."""
+        """d²Y/dτ² from U - Y, V and what compliant stops add; from all three divided by W,
+        dV/dφ."""
         pull = stretch - 2 * self.damping_ratio * speed
         for push in pushes:
             pull = pull + push
@@ -200,7 +205,7 @@ class Scene(ShaftMachine):
         speed = self.drive.fixed_speed
         return clock if speed is None or self.clock_name == "phase" else speed * clock
 
-    def pace(self, s: Float[Array, ""], state: Any) -> Float[Array, ""] | None:
+    def pace(self, s: Scalar, state: State) -> Scalar | None:
         """dτ/dφ = 1/W in the phase clock of a motor."""
         return 1 / state.W if self.is_paced(state) else None
 
@@ -211,7 +216,7 @@ class Scene(ShaftMachine):
             return super().frequency_ratio(duration)
         return jnp.broadcast_to(speed, duration.shape)
 
-    def step_limit(self, s: Float[Array, ""], state: Any) -> Float[Array, ""]:
+    def step_limit(self, s: Scalar, state: State) -> Scalar:
         """A fifth of the shorter of the drive's turn and the body's natural period."""
         speed = self.drive.speed(state)
         turn = 0.4 * pi / jnp.maximum(1.0, speed)
@@ -224,7 +229,7 @@ class Scene(ShaftMachine):
         """Not with soft stops, whose contacts may be much briefer than a cycle."""
         return not self.soft_stops
 
-    def relaxation(self, s: Float[Array, ""], state: Any) -> Float[Array, ""]:
+    def relaxation(self, s: Scalar, state: State) -> Scalar:
         """1/2ξ of a strongly damped body, or what the drive says: the time w0/τ0 in which a motor
         is back at speed, or in which the current of a `DCMotor` settles."""
         rate, of_drive = 2 * self.damping_ratio, self.drive.rate()
@@ -233,7 +238,7 @@ class Scene(ShaftMachine):
         pace = self.drive.speed(state) if self.clock_name == "phase" else 1.0
         return pace / jnp.maximum(rate, 1e-6)
 
-    def mirrored(self, state: Any) -> Any:
+    def mirrored(self, state: State) -> State | None:
         """Y → -Y half a turn later, if both sides have the same stops and the crank is odd."""
         for stops in (self.stops, self.soft_stops):
             if not all(any(stop.mirrors(other) for other in stops) for stop in stops):
@@ -247,13 +252,14 @@ class Scene(ShaftMachine):
         gaps = [concrete(stop.gap) for stop in self.stops]
         return any(gap is None or not (gap > 1).all() for gap in gaps)
 
-    def in_range(self, start: Any) -> Bool[Array, ""]:
-        """As its parts say; with room between two stops, and not beyond the section."""
+    def in_range(self, start: State) -> Flag:
+        """Whether all parts are in range, there is room between two stops, and the start is not
+        beyond the section."""
         good = super().in_range(start)
         return good & (_room(self.stops) > 0) if len(self.stops) == 2 else good
 
-    def alive(self, state: Any) -> jax.Array | None:
-        """In the phase clock of a motor the crank must turn forward."""
+    def alive(self, state: State) -> jax.Array | None:
+        """Whether the crank turns forward, in the phase clock of a motor; `None` for others."""
         return state.W > 0 if self.is_paced(state) else None
 
 

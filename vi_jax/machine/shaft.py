@@ -6,15 +6,17 @@ from typing import Any, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from .._checks import one_of, state_of_numbers
 from .._numbers import concrete
+from .._types import Flag, Scalar, State
 from .base import AbstractMachine
 
 Machine = TypeVar("Machine", bound="ShaftMachine")
 
-# A state that was carried to the section lies on it to rounding, in single precision too.
+# A state that was carried to the section lies on it to rounding, in single precision too, where
+# that of a turn is 5e-7.
 _ON_SECTION = 1e-5
 
 
@@ -32,22 +34,23 @@ class ShaftMachine(AbstractMachine):
         one_of("clock_name", self.clock_name, ("phase", "time"))
 
     @property
-    def state_type(self) -> Any:
-        """Of a state in the phase clock."""
+    def state_type(self) -> type:
+        """The class of a state in the phase clock."""
         raise NotImplementedError
 
     @property
     def timed_states(self) -> dict[type, type]:
-        """Of the states with a speed of the shaft: what they are by time, with `phase` at the
-        end."""
+        """For each class of states that has the speed of the shaft, that of the same states by
+        time, with `phase` as one more component at the end."""
         raise NotImplementedError
 
-    def is_timed(self, state: Any) -> bool:
+    def is_timed(self, state: State) -> bool:
         """Whether the angle of the shaft is part of the state."""
         return type(state) in self.timed_states.values()
 
-    def is_paced(self, state: Any) -> bool:
-        """Whether time passes at the pace of the shaft, whose speed is part of the state."""
+    def is_paced(self, state: State) -> bool:
+        """Whether time is not the independent variable, but passes by the speed of the shaft in the
+        state."""
         return type(state) in self.timed_states
 
     def in_clock(self: Machine, clock: str) -> Machine:
@@ -55,7 +58,7 @@ class ShaftMachine(AbstractMachine):
         one_of("clock", clock, ("phase", "time"))
         return dataclasses.replace(self, clock_name=clock)
 
-    def adopt(self, start: Any) -> Any:
+    def adopt(self, start: State) -> State:
         """A start made for either clock, as this machine's clock needs it."""
         wanted = self.state_type
         if self.clock_name == "time" and wanted in self.timed_states:
@@ -75,7 +78,7 @@ class ShaftMachine(AbstractMachine):
         the shaft one more state."""
         return self.in_clock("phase")
 
-    def in_cycle_state(self, name: str, state: Any) -> Any:
+    def in_cycle_state(self, name: str, state: State) -> State:
         """A state on the section that was made for the time clock, without the angle of the shaft;
         any other as it is.
 
@@ -91,11 +94,11 @@ class ShaftMachine(AbstractMachine):
             )
         return self.state_type(*list(vars(state).values())[:-1])
 
-    def clock(self, state: Any) -> Float[Array, ""] | None:
+    def clock(self, state: State) -> Scalar | None:
         """The angle of the shaft, where time is the independent variable."""
         return state.phase if self.is_timed(state) else None
 
-    def rewound(self, state: Any) -> Any:
+    def rewound(self, state: State) -> State:
         """The state with a full turn taken off the angle."""
         return eqx.tree_at(lambda x: x.phase, state, state.phase - 2 * pi)
 
@@ -103,12 +106,12 @@ class ShaftMachine(AbstractMachine):
         """ζ: mean speed of the shaft over cycles of these durations (unit: ω)."""
         return 2 * pi / duration
 
-    def in_range(self, start: Any) -> Bool[Array, ""]:
-        """As its parts say, and not beyond the section."""
+    def in_range(self, start: State) -> Flag:
+        """Whether all parts are in range, and the start is not beyond the section."""
         good = super().in_range(start)
         return good & (start.phase < 2 * pi) if self.is_timed(start) else good
 
-    def check_start(self, start: Any) -> None:
+    def check_start(self, start: State) -> None:
         """Raise a `ValueError` if the shaft does not turn forward in the phase clock, or is beyond
         its section."""
         if self.is_paced(start):
@@ -126,6 +129,6 @@ class ShaftMachine(AbstractMachine):
                     f"2π, but has {phase.max():g}."
                 )
 
-    def section_speed(self, state: Any) -> Any:
+    def section_speed(self, state: State) -> Any:
         """W of a state on the section."""
         return state.W

@@ -7,16 +7,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import (
-    NOT_NEGATIVE,
-    POSITIVE,
-    REAL,
-    count,
-    instance_of,
-    one_of,
-    require_ranges,
-)
+from .._checks import NOT_NEGATIVE, POSITIVE, REAL, count, instance_of, one_of, require_ranges
 from .._numbers import number
+from .._types import Machine, State
 from .event import AbstractSwitch
 from .law import AbstractContactLaw, HuntCrossley, PowerLaw
 from .stop import Wall
@@ -27,7 +20,8 @@ TOUCHING, RELEASED, APART = 1.0, 0.0, -1.0
 # Laws that may be asked for by their names.
 _LAWS: dict[str, type[AbstractContactLaw]] = {"power": PowerLaw, "hunt-crossley": HuntCrossley}
 
-# A body is near enough for the contact's time scale to matter (unit: that of the coordinate).
+# A body is near enough for the contact's time scale to matter (unit: that of the coordinate): a
+# choice, since a step that ends on first touch may end a little short of it.
 _NEAR = 1e-6
 
 
@@ -105,7 +99,8 @@ class SoftStop(Wall, AbstractSwitch):
 
     @property
     def analytic(self) -> bool:
-        """Of a force that is straight in the depth; others have a kink or a root at first touch."""
+        """Whether the force has a power series at first touch: where it is straight in the depth.
+        Others have a kink or a root there."""
         return self.law.is_analytic
 
     @property
@@ -114,7 +109,7 @@ class SoftStop(Wall, AbstractSwitch):
         body that goes in is that on one that comes out."""
         return self.prestress is not None
 
-    def depth(self, machine: Any, state: Any) -> tuple[Any, Any]:
+    def depth(self, machine: Machine, state: State) -> tuple[Any, Any]:
         """δ and δ' (by time); δ is negative apart from the stop."""
         body = machine.coordinates[self.coordinate]
         return self.beyond(body.position(state)), self.approach(body.velocity(state))
@@ -129,7 +124,8 @@ class SoftStop(Wall, AbstractSwitch):
         return jnp.where(mode > 0, -self.sign * self.force(*self.depth(machine, state)), 0.0)
 
     def begin(self, machine, s, state):
-        """Touching, unless apart or let go of."""
+        """The mode of a motion that begins: touching, unless the body is apart or has been let go
+        of."""
         depth, rate = self.depth(machine, state)
         inside = (depth > 0) | ((depth == 0) & (rate > 0))
         holds = TOUCHING
@@ -157,7 +153,7 @@ class SoftStop(Wall, AbstractSwitch):
         again = jnp.where(inside & (-pulls > -depth), TOUCHING, APART)
         return state, jnp.where(mode < 0, TOUCHING, jnp.where(mode > 0, released, again))
 
-    def longest_step(self, machine: Any, state: Any) -> Any:
+    def longest_step(self, machine: Machine, state: State) -> Any:
         """A fifth of the period in which a body oscillates on the stop; infinite apart from it."""
         depth, rate = self.depth(machine, state)
         frequency = self.law.frequency(self.stiffness, depth, rate)

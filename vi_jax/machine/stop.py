@@ -12,7 +12,8 @@ from jaxtyping import Array, Float
 
 from .._checks import REAL, SHARE, count, one_of, require_ranges
 from .._numbers import concrete, real, real_or_law
-from .event import AbstractEvent, struck_modes
+from .._types import Machine, Scalar, State
+from .event import AbstractEvent, Modes, struck_modes
 from .shown import Shown
 
 
@@ -90,8 +91,13 @@ class RigidStop(Wall, AbstractEvent):
         new = body.placed(state, self.place, self.leaving(body.velocity(state)))
         return new, self.modes_after(machine, s, state, new, modes)
 
-    def modes_after(self, machine: Any, s: Any, before: Any, after: Any, modes: Any) -> Any:
-        """Those of the machine, from the states before and after an impact."""
+    def modes_after(
+        self, machine: Machine, s: Scalar, before: State, after: State, modes: Modes
+    ) -> Modes:
+        """The machine's modes after an impact.
+
+        **Arguments:** `before` and `after`, the states; `modes`, those before.
+        """
         own = None if self.modes is None else self.modes(machine, s, before, *modes)
         return struck_modes(machine, s, after, modes, own)
 
@@ -123,14 +129,14 @@ class RigidStop(Wall, AbstractEvent):
         return -self.coefficient(self.approach(V)) * V
 
     def leaving(self, V: Any) -> Any:
-        """The velocity after an impact with this one: the rebound from what is more than nothing. A
-        speed whose square is no number ends here, as a body may die out on a stop."""
+        """The velocity after an impact with this one: the `rebound`, but nothing for a speed whose
+        square is below the smallest number, so that a body may come to rest on the stop."""
         least = 100 * float(jnp.finfo(jnp.result_type(V)).tiny) ** 0.5
         return self.rebound(jnp.where(jnp.abs(V) > least, V, 0.0))
 
     def share(self, approach: Any) -> Any:
-        """The share of a speed of approach that is left after the impact: k, or what a `rebound` of
-        one's own makes of it."""
+        """The share of a speed of approach that is left after the impact: k, or by a `rebound` of
+        one's own."""
         if type(self).rebound is RigidStop.rebound:
             return self.coefficient(approach)
         left = -self.approach(self.rebound(self.sign * approach))

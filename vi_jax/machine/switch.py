@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.lax import stop_gradient
 
+from .._types import Machine, Scalar, Scalars, State
 from .event import AbstractSwitch, Around
 
 
@@ -52,7 +53,12 @@ class Switch(AbstractSwitch):
         return jnp.where(positive, 1.0, -1.0).astype(value.dtype)
 
     def struck(self, machine, s, state, mode, *, around: Around | None = None):
-        """The sign of the function; 0 on a surface that both fields point at."""
+        """The mode after an impact or another jump: the sign of the function; 0 on a surface that
+        both fields point at.
+
+        **Arguments:** as every event's, and `around`, given to a switch that slides: the other
+        modes.
+        """
         side = self.begin(machine, s, state)
         if around is None:
             return side
@@ -63,7 +69,11 @@ class Switch(AbstractSwitch):
 
     def guard(self, machine, s, state, mode, *, around: Around | None = None):
         """The function, falling from above or rising from below; while the motion slides, that
-        field which is the first to point away."""
+        field which is the first to point away.
+
+        **Arguments:** as every event's, and `around`, given to a switch that slides: the other
+        modes.
+        """
         value = -mode * self.function(machine, s, state)
         if around is None:
             return value
@@ -71,7 +81,11 @@ class Switch(AbstractSwitch):
         return jnp.where(mode == 0, jnp.maximum(up, -down), value)
 
     def after(self, machine, s, state, mode, *, around: Around | None = None):
-        """On the other side, or along the surface."""
+        """On the other side, or along the surface.
+
+        **Arguments:** as every event's, and `around`, given to a switch that slides: the other
+        modes.
+        """
         if around is None:
             return state, -mode
         up, down = self._rates(machine, s, state, around)
@@ -79,20 +93,23 @@ class Switch(AbstractSwitch):
         leaves = jnp.where(up > -down, 1.0, -1.0)
         return state, jnp.where(slides, 0.0, jnp.where(mode == 0, leaves, -mode))
 
-    def _rates(self, machine: Any, s: Any, state: Any, around: Around) -> tuple[Any, Any]:
-        """How fast the function changes in modes +1 and -1."""
+    def _rates(self, machine: Machine, s: Scalar, state: State, around: Around) -> Scalars:
+        """d/ds of the function in the modes +1 and -1."""
         up, down = (field_in(machine, s, state, around.instead(mode)) for mode in (1.0, -1.0))
         return _rate(self, machine, s, state, up), _rate(self, machine, s, state, down)
 
 
-def _rate(switch: Switch, machine: Any, s: Any, state: Any, flow: Any) -> Any:
-    """How fast a switch's function changes along a flow."""
+def _rate(switch: Switch, machine: Machine, s: Scalar, state: State, flow: State) -> Scalar:
+    """d/ds of a switch's function along a flow.
+
+    **Arguments:** `flow`, d(state)/ds.
+    """
     along = (s, state), (jnp.ones_like(s), flow)
     return jax.jvp(lambda s, state: switch.function(machine, s, state), *along)[1]
 
 
-def field_in(machine: Any, s: Any, state: Any, modes: tuple[Any, ...], first: int = 0) -> Any:
-    """The machine's field in these modes; along the surfaces on which it slides the mean of those
+def field_in(machine: Any, s: Scalar, state: State, modes: Scalars, first: int = 0) -> State:
+    """The machine's field in these modes; on the surfaces along which it slides, the mean of those
     on both sides.
 
     **Arguments:** switches before number `first` are in mode +1 or -1.

@@ -4,6 +4,8 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
+from .._types import Machine
+
 NONE: Mapping[str, str] = MappingProxyType({})
 
 Stated = tuple[tuple[str, str], ...]
@@ -22,7 +24,7 @@ def unit_of(units: Mapping[str, str], name: str) -> str:
     return ""
 
 
-def stated(machine: Any) -> Stated:
+def stated(machine: Machine) -> Stated:
     """The units of a machine."""
     return tuple(machine.units.items())
 

@@ -31,6 +31,10 @@ def _turned(points: Any, angle: float) -> np.ndarray:
 
 
 def _filled(pen: Any, points: np.ndarray, color: str, alpha: float = 1.0, **look: Any) -> None:
+    """Fill a polygon.
+
+    **Arguments:** `points`, (corners, 2); `look`, further options of matplotlib's `fill`.
+    """
     look = {"lw": 1.2, "edgecolor": INK, "joinstyle": "round", **look}
     pen.ax.fill(*points.T, facecolor=color, alpha=alpha, **look)
 
@@ -53,7 +57,11 @@ def _pole(pen: Any, size: dict[str, float]) -> None:
 
 
 def _sleeve(pen: Any, size: dict[str, float], middle: Any, tilt: float, hang: Any) -> None:
-    """A tube cut open: its two walls about the pole, and the spring that starts at it."""
+    """A tube cut open: its two walls about the pole, and the spring that starts at it.
+
+    **Arguments:** `size`, lengths by name; `middle` and `hang`, (x, y) of its middle and of the
+    spring's other end; `tilt` in radians.
+    """
     inside, half = size["sleeve_radius"], size["sleeve_height"]
     wall = 0.28 * inside
     for side in (-1, 1):

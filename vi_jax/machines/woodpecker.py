@@ -223,8 +223,12 @@ class Woodpecker(AutonomousMachine):
         self, *, height: Any = 0.0, sleeve_angle: Any = None, bird_angle: Any = None,
         speed: Any = -0.34, sleeve_rate: Any = 0.0, bird_rate: Any = -7.5,
     ) -> WoodpeckerState:  # fmt: skip
-        """On the section by default, the sleeve on its lower edge and sliding down, the bird
-        swinging away: near to the cycle of the default numbers."""
+        """A state that is near to the cycle of the default numbers: on the section, the sleeve on
+        its lower edge and sliding down, the bird swinging away.
+
+        **Arguments:** a component each, in SI units; `None` is the sleeve on its lower edge, and
+        the bird at the section.
+        """
         jammed = -self.play / self.sleeve_height
         given = {
             "height": height, "sleeve_angle": jammed if sleeve_angle is None else sleeve_angle,

@@ -6,7 +6,7 @@ begins.
 """
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ import jax.tree_util as jtu
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
-from .._types import Flag, Scalar
+from .._types import Flag, Scalar, State
 from ..flow import Run, simulate
 from ..machine import AbstractMachine, is_autonomous
 from ._cycle_map import CycleMap
@@ -22,16 +22,17 @@ from ._forward_jacobian import forward_jacobian
 from ._neutral import neutral
 from ._root import shooting_matrix
 
-# Places in a cycle at which an orbit can be searched.
+# Places in a cycle at which an orbit can be searched: a choice; each costs a sample of the guess.
 _PLACES = 8
 
-# A motion drifts if so much of what it lacks to be periodic is what no other start would change.
+# A motion drifts if so much of what it lacks to be periodic is what no other start would change: by
+# choice, most of it.
 _DRIFTS = 0.5
 
 
-def _run(the_map: CycleMap, state: Any, impact_log: int) -> Run:
-    """The motion with its impacts: one program for the look at the guess and for that at the orbit,
-    where they are as long."""
+def _run(the_map: CycleMap, state: State, impact_log: int) -> Run:
+    """The motion with its impacts. The look at the guess and that at the orbit ask for the same
+    program, if they are as long."""
     places = _places(the_map, state)
     return simulate(
         the_map.machine, state, the_map.cycles, method=the_map.method,
@@ -39,14 +40,15 @@ def _run(the_map: CycleMap, state: Any, impact_log: int) -> Run:
     )  # fmt: skip
 
 
-def _places(the_map: CycleMap, state: Any) -> int:
-    """Places of a cycle that are looked at: of an autonomous machine only its section."""
+def _places(the_map: CycleMap, state: State) -> int:
+    """At how many places of a cycle the state is looked at: for an autonomous machine only on its
+    section."""
     return 1 if is_autonomous(the_map.machine, state) else _PLACES
 
 
 def moved_from_impacts(
-    the_map: CycleMap, guess: Any, impact_log: int
-) -> tuple[CycleMap, Any, Int[Array, ""]]:
+    the_map: CycleMap, guess: State, impact_log: int
+) -> tuple[CycleMap, State, Int[Array, ""]]:
     """Map, guess and their place (in eighths of a cycle) on the section to search on.
 
     The map jumps where an impact falls on its section, and no search gets across; so it is done
@@ -98,8 +100,9 @@ class ObservedArc(NamedTuple):
     """Of the machine's averages, over the time of each cycle."""
 
 
-def observe_arc(arc: CycleMap, state: Any, impact_log: int) -> ObservedArc:
-    """What an arc does from the `state` in which it begins; differentiated by columns."""
+def observe_arc(arc: CycleMap, state: State, impact_log: int) -> ObservedArc:
+    """What is observed of an arc that begins in `state`; its derivatives are taken by columns (see
+    `forward_jacobian`)."""
 
     @forward_jacobian
     def seen(arc, state):
@@ -131,8 +134,8 @@ def observe_arc(arc: CycleMap, state: Any, impact_log: int) -> ObservedArc:
 
 
 def by_the_first_state(jacobians: Float[Array, "arcs cycles n n"]) -> Float[Array, "all n n"]:
-    """Derivatives of the states after each cycle by the first state of the first arc, from those by
-    the first state of their own arc: each after those of the arcs before."""
+    """Derivatives of the states after each cycle of all arcs by the first state of the first arc,
+    from those by the first state of their own arc: a running product."""
     passed, all_of_them = jnp.eye(jacobians.shape[-1], dtype=jacobians.dtype), []
     for own in jacobians:
         all_of_them.append(own @ passed)

@@ -1,6 +1,7 @@
 """`boundary`: curves of folds, period doublings, lost symmetries and grazings."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -17,8 +18,8 @@ from ..machine import check_leaf, leaf, with_units
 from ._fixed_step_method import steps_of
 from ._shooting import Shooting
 from ._solution import orbit_of
+from ._solve import Unknowns, check_parameter, jacobian_at, tangent_at
 from ._solve import advance as solved
-from ._solve import check_parameter, jacobian_at, tangent_at
 from ._symmetry import images, may_be_symmetric
 from .curve import INTERRUPTED, Step, Walk, check_walk, walk
 from .results import InWords, Orbit
@@ -29,7 +30,8 @@ if TYPE_CHECKING:
 else:
     xr = lazy("xarray")
 
-# What lies below zero by no more than this is zero to rounding.
+# What lies below zero by no more than this is zero to rounding: a choice, a hundred times the
+# corrector's tolerance.
 _NOISE = 1e-9
 
 # Of the first and of the second parameter.
@@ -127,7 +129,7 @@ def boundary(
     scale = np.ones(x.size)
     scale[-2:] = [0.5 * (high - low) for low, high in bounds]
 
-    def advance(x: Any, tangent: Any, length: float) -> Step:
+    def advance(x: Unknowns, tangent: Unknowns, length: float) -> Step:
         return solved(condition, x, tangent, scale, length)
 
     start = advance(x, tangent_at(condition, x, scale), 0.0)
@@ -251,7 +253,8 @@ class SymmetryCondition(eqx.Module):
     """w."""
 
     def instead(self, problem: Shooting, missing: Array, x: Array) -> Array:
-        """The equations' residual F, `missing`, with that combination exchanged."""
+        """The equations' residual F, given as `missing`, with the combination l·F exchanged for
+        w·D."""
         departs = self.weight @ images(problem, x)
         return missing + self.left * (departs - self.left @ missing)
 
@@ -310,8 +313,14 @@ def _inside(step: Step, bounds: Intervals) -> bool:
     return all(low <= x <= high for x, (low, high) in zip(step.x[-2:], bounds, strict=True))
 
 
-def _cut(advance: Any, here: Step, new: Step, bounds: Intervals, scale: np.ndarray) -> Step:
-    """The last point inside the bounds, by halving the step."""
+def _cut(
+    advance: Callable[..., Step], here: Step, new: Step, bounds: Intervals, scale: np.ndarray
+) -> Step:
+    """The last point inside the bounds between two, found by halving the step.
+
+    **Arguments:** `advance` as for `walk`; `here` and `new`, inside and outside; `scale`, the size
+    of each unknown.
+    """
     low, high = 0.0, float(np.dot(here.tangent, (new.x - here.x) / scale))
     last = here
     for _ in range(30):

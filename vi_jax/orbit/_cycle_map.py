@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, Int
 
 from .._checks import count
 from .._renamed import renamed
+from .._types import State
 from ..flow import (
     AbstractMethod,
     Adaptive,
@@ -31,10 +32,11 @@ from ._forward_jacobian import forward_jacobian
 
 
 class CycleMap(eqx.Module):
-    """The Poincaré map over `cycles` drive cycles; made by `cycle_map`.
+    """The Poincaré map of a machine over `cycles` drive cycles, from a state on the section to the
+    state there; made by `cycle_map`.
 
     Differentiable in forward and in reverse mode, to any order, by the state and by every leaf of
-    the machine; clean under `jit` and `vmap`. Where a run fails the values are NaN.
+    the machine; can be used under `jit` and `vmap`. Where a run fails the values are NaN.
     """
 
     machine: AbstractMachine
@@ -44,16 +46,16 @@ class CycleMap(eqx.Module):
     rests: bool = eqx.field(static=True)
     """Whether the body may come to rest on a stop."""
 
-    def __call__(self, state: Any) -> Any:
+    def __call__(self, state: State) -> State:
         """The state `cycles` drive cycles after `state`."""
         return _end(self, adopted(self.machine, state))
 
-    def residual(self, state: Any) -> Any:
+    def residual(self, state: State) -> State:
         """What the motion from `state` lacks to be periodic: the mapped state less `state`."""
         state = adopted(self.machine, state)
         return jtu.tree_map(lambda a, b: a - b, _end(self, state), state)
 
-    def jacobian(self, state: Any) -> Float[Array, "states states"]:
+    def jacobian(self, state: State) -> Float[Array, "states states"]:
         """Derivative of the map: the monodromy matrix if `state` lies on a periodic motion.
 
         Rows and columns are in the order of the state's leaves: Y, V, and W for a motor.
@@ -63,7 +65,7 @@ class CycleMap(eqx.Module):
 
 
 @forward_jacobian
-def _end(cycle_map: CycleMap, state: Any) -> Any:
+def _end(cycle_map: CycleMap, state: State) -> State:
     run = simulate(
         cycle_map.machine, state, cycle_map.cycles, method=cycle_map.method, record="sections",
         rests=cycle_map.rests,
@@ -114,9 +116,9 @@ def _usual(machine: AbstractMachine) -> AbstractMethod:
     return Adaptive(diffrax.Tsit5(), rtol=1e-11) if isinstance(usual, FixedStep) else usual
 
 
-def adopted(machine: AbstractMachine, state: Any, name: str = "state") -> Any:
-    """The state in the argument of this name as a cycle map needs it, in floating-point arrays of
-    one type."""
+def adopted(machine: AbstractMachine, state: State, name: str = "state") -> State:
+    """A state as a cycle map needs it, in floating-point arrays of one type; `name` is the argument
+    that messages blame."""
     state = machine.adopt(machine.in_cycle_state(name, state))
     check_reals(name, state)
     if machine.clock(state) is not None:

@@ -1,11 +1,11 @@
 """The events of a periodic motion, in their order: the unknowns of `Shooting` belong to them."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._types import Scalar
+from .._types import Scalar, State
 from ..machine import AbstractEvent, AbstractMachine, events_of, guard_of, section_number
 
 
@@ -25,7 +25,7 @@ class Event(NamedTuple):
         return event.name or f"{event.word} {place}"
 
     def later(self, cycles: int) -> "Event":
-        """The same event so many cycles later."""
+        """The same event so many cycles later in the motion."""
         return self if self.cycle is None else self._replace(cycle=self.cycle + cycles)
 
     def of(self, machine: AbstractMachine) -> AbstractEvent:
@@ -39,12 +39,12 @@ def section_of(machine: AbstractMachine, cycle: int) -> Event:
 
 
 def guard_at(
-    machine: AbstractMachine, event: Event, s: Scalar, state: Any, modes: tuple[Array, ...]
+    machine: AbstractMachine, event: Event, s: Scalar, state: State, modes: tuple[Array, ...]
 ) -> Scalar:
-    """What is zero at an event, and rises there.
+    """The guard of an event in the course of a motion, zero there and rising.
 
-    **Arguments:** the clock `s` counts from the beginning of the period; the state there and the
-    modes before the event.
+    **Arguments:** `s`, the clock since the beginning of the period; `state` and `modes`, those
+    before the event.
     """
     if event.cycle is not None:
         s = s - jnp.asarray(machine.cycle, s.dtype) * (event.cycle - 1)

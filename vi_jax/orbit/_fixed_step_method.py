@@ -5,13 +5,12 @@ Steps that are sized by a tolerance do not: their number jumps.
 """
 
 from math import ceil
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from .._programs import compiled
-from .._types import Scalar
+from .._types import Scalar, State
 from ..flow import AbstractMethod, FixedStep, MethodLike, chosen
 from ..machine import AbstractMachine
 
@@ -50,7 +49,7 @@ def fixed_step_method(
 
 
 def steps_of(
-    method: AbstractMethod, machines: list[AbstractMachine], like: Any, cycles: int
+    method: AbstractMethod, machines: list[AbstractMachine], like: State, cycles: int
 ) -> int:
     """Steps that a flight over the whole period needs, in the most demanding of the machines.
 
@@ -63,6 +62,6 @@ def steps_of(
 
 
 @compiled
-def _fewest(method: AbstractMethod, machine: AbstractMachine, like: Any) -> Scalar | float:
-    """Steps of a cycle where they are as long as they may be."""
+def _fewest(method: AbstractMethod, machine: AbstractMachine, like: State) -> Scalar | float:
+    """The number of steps in a cycle if each is as long as the method allows."""
     return machine.cycle / method.longest(machine, jnp.zeros(()), like)

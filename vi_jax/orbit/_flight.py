@@ -10,7 +10,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from .. import lanes
-from .._types import Scalar, Vector
+from .._types import Scalar, Scalars, State, Vector
 from ..flow import AbstractMethod, Beside, SmoothMachine, elapsed, in_modes
 from ..machine import AbstractMachine
 
@@ -20,9 +20,9 @@ class Flight(eqx.Module):
     as they are; solved with steps of one length by a method of fixed steps."""
 
     machine: AbstractMachine
-    modes: tuple[Scalar, ...]
+    modes: Scalars
     method: AbstractMethod
-    like: Any
+    like: State
     """A state, for its structure."""
 
     @property
@@ -30,12 +30,13 @@ class Flight(eqx.Module):
         """The machine in its modes."""
         return in_modes(self.machine, self.modes)
 
-    def unravel(self, u: Vector) -> Any:
+    def unravel(self, u: Vector) -> State:
         """A state from its vector."""
         return ravel_pytree(self.like)[1](u)
 
     def step(self, s0: Scalar, s1: Scalar, u: Vector, passed: Beside) -> tuple[Vector, Beside]:
-        """State, and time and integrals beside it, after a step of the method."""
+        """The state, and the time and integrals beside it, after one step of the method from `s0`
+        to `s1`."""
         smooth, state = self.smooth, self.unravel(u)
         paced, beside = smooth.pace(s0, state) is not None, None
         if paced or passed.integrals:
@@ -44,17 +45,20 @@ class Flight(eqx.Module):
         return ravel_pytree(new)[0], elapsed(passed, after, s1 - s0)
 
     def once(self, function: Callable[["Flight", Any], Any], inputs: Any) -> Any:
-        """A function of the flight and of one lane's numbers as vector code."""
+        """A function of the flight and of one lane's numbers, evaluated as vector code (see
+        `lanes.once`)."""
         numbers, rest = eqx.partition(self, eqx.is_array)
         return lanes.once(partial(_of_flight, rest, function), (numbers, inputs))
 
     def fly(
         self, s0: Scalar, s1: Scalar, u: Vector, steps: int, averages: tuple[str, ...] = ()
     ) -> tuple[Vector, Beside, tuple[Float[Array, " steps"], Float[Array, "steps states"]]]:
-        """The flight from u at clock s0 to s1.
+        """The flight from the state `u` at clock `s0` to clock `s1`, in equal steps.
 
-        **Returns:** the state at s1; the time that passed and the integrals of the averages named;
-        clock and state before each of the steps.
+        **Arguments:** `averages`, the names of the machine's averages to integrate.
+
+        **Returns:** the state at s1; the time that passed and the integrals; clock and state before
+        each of the steps.
         """
         numbers, rest = eqx.partition(self, eqx.is_array)
         (u, passed), path = lanes.run(

@@ -22,7 +22,8 @@ from ._shooting import Shooting
 from ._solve import observe
 from .curve import Step
 
-# The motion that stands for the branch there has so much of the size of the one before it.
+# The motion that stands for the branch there has so much of the size of the one before it. This and
+# the numbers below are choices.
 _SMALL = 1e-5
 
 # By how much an eigenvalue's period may differ from that of the last motion, as a share of it.
@@ -124,7 +125,8 @@ def _imaginary(problem: Shooting, guess: np.ndarray) -> _Equilibrium | None:
 
 
 def _equilibrium(problem: Shooting, x: np.ndarray, turn: float) -> _Equilibrium | None:
-    """By Newton's method from the state in `x`, at its parameter."""
+    """The equilibrium near the state in `x`, at its parameter, by Newton's method, and its
+    eigenvalue nearest to i `turn`; `None` if there is none, or only real ones."""
     u = _state(problem, x)
     for _ in range(20):
         rate, jacobian, *_ = _flow_at(problem, x, u)
@@ -146,7 +148,8 @@ def _equilibrium(problem: Shooting, x: np.ndarray, turn: float) -> _Equilibrium 
 
 
 def _about(problem: Shooting, here: Step, there: _Equilibrium) -> Step | None:
-    """A motion of hardly any size about an equilibrium, as it leaves the section."""
+    """A motion of hardly any size about an equilibrium, at the moment at which it passes the
+    section."""
     seen, steep = there.slope @ there.vector, np.linalg.norm(there.slope)
     apart = np.linalg.norm(_state(problem, here.x) - _state(problem, there.x))
     if abs(seen) <= _ZERO * steep or abs(there.section) > _ZERO * steep * apart:

@@ -17,6 +17,7 @@ from ._symmetry import may_be_symmetric
 from .curve import Step
 from .special import CROSSING, DOUBLING, FOLD, GRAZING, HOPF, SYMMETRY, TORUS, SpecialPoint
 
+# The thresholds here are choices, but for those of which a measurement is given.
 # What lies before the place where a branch springs is looked for on so much of the way there.
 _SHORT = 0.999
 
@@ -133,7 +134,8 @@ class BranchMonitor:
         )  # fmt: skip
 
     def _sprung(self, at: Step) -> tuple[Step, SpecialPoint]:
-        """Where the branch springs from a motion of half its period, on both."""
+        """Where the branch springs from a motion of half its period: as a step of the branch, and
+        as a special point of that motion."""
         at, half, step = origin(self.problem, at, self.scale)
         detail = "the branch springs from a motion of half the period"
         scale = np.append(np.ones(step.x.size - 1), self.scale[-1])
@@ -264,7 +266,7 @@ class BranchMonitor:
         return size < _SHRINKS * max(beside)
 
     def _springs(self, here: Step, at: Step) -> bool:
-        """Whether the branch springs there, as is seen by halves of a period becoming alike."""
+        """Whether the branch springs there: halves of a period are alike, or images."""
         apart, images = self._halves(at), self._images(at)
         if apart.size and np.linalg.norm(apart) < _ALIKE:
             return True

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 Matrix = Float[Array, "n n"]
 
 # Where the greatest singular value is larger than this, a motion is so unstable that its rounding
-# hides what is neutral.
+# hides what is neutral: a choice.
 _STEEP = 1e3
 
 

@@ -1,11 +1,11 @@
 """What is observed of a periodic motion beside its unknowns, at each point of a branch."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
-from .._types import Scalar
+from .._types import Scalar, State
 from ..machine import AbstractMachine, events_of, guard_of, section_number
 from ._events import Event
 from ._turns import Nearest
@@ -42,14 +42,14 @@ def apart(
     modes: tuple[tuple[float, ...], ...],
     clock: Float[Array, " legs"],
     lengths: Float[Array, " legs"],
-    states: list[Any],
+    states: list[State],
 ) -> Scalar:
     """How far the events are from coming in another order: the least time between two that follow
     each other, or the least distance, where one is met, of those that are not met there. Negative
     where the motion is none of the machine's.
 
-    **Arguments:** the machine; its events in their order, the modes of the flight that each begins,
-    its clock, the time to the next one, and the state just before it.
+    **Arguments:** `events` in their order; of each, `modes` of the flight that it begins, its
+    `clock`, in `lengths` the time to the next one, in `states` the state just before it.
     """
     least = jnp.asarray(jnp.inf, clock.dtype)
     for i, event in enumerate(events):

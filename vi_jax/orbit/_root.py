@@ -6,7 +6,6 @@ differentiated. How a root is searched for is in `root_finders.py`.
 """
 
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -16,7 +15,7 @@ from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Float
 
-from .._types import Vector
+from .._types import State, Vector
 from ..flow import simulate
 from ._cycle_map import CycleMap
 from ._neutral import least
@@ -24,7 +23,7 @@ from .root_finders import AbstractRootFinder, Found, find_root
 
 
 def _missing(
-    arc: CycleMap, arcs: Float[Array, "arcs states"], unravel: Callable[[Vector], Any]
+    arc: CycleMap, arcs: Float[Array, "arcs states"], unravel: Callable[[Vector], State]
 ) -> Float[Array, "arcs states"]:
     """F: what each arc lacks to end where the next one begins; after the last comes the first."""
     ends = jax.vmap(lambda x: ravel_pytree(arc(unravel(x)))[0])(arcs)
@@ -32,11 +31,12 @@ def _missing(
 
 
 @eqx.filter_custom_jvp
-def root_of(arc: CycleMap, guess: Any, root_finder: AbstractRootFinder) -> Found:
+def root_of(arc: CycleMap, guess: State, root_finder: AbstractRootFinder) -> Found:
     """Where a root finder comes to from a guess; differentiated by the numbers of `arc`.
 
-    **Arguments:** the map over one arc; a state on its section, in which the first arc begins, the
-    others where the motion from there is then; the root finder, which says how many arcs there are.
+    **Arguments:** `arc`, the map over one arc; `guess`, a state on its section, in which the first
+    arc begins, the others where the motion from there is then; `root_finder`, which says how many
+    arcs there are.
 
     **Returns:** `Found`, all its numbers floats; its `x` are the states in which the arcs begin, as
     rows.

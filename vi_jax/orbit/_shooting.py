@@ -19,7 +19,7 @@ import jax.tree_util as jtu
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from .._types import Scalar, Vector
+from .._types import Scalar, State, Vector
 from ..flow import AbstractMethod, average_names, means
 from ..machine import AbstractMachine, after_event, is_autonomous, jump_of, mode_number, with_leaf
 from ._events import Event, guard_at
@@ -50,7 +50,7 @@ class Shooting(eqx.Module):
     machine: AbstractMachine
     method: AbstractMethod
     """Of fixed steps."""
-    like: Any
+    like: State
     """A state, for its structure."""
     cycles: int = eqx.field(static=True)
     """The period in cycles of the machine."""
@@ -125,7 +125,7 @@ class Shooting(eqx.Module):
             clock = clock.at[0].set(period)
         return jnp.concatenate([clock, jnp.ravel(states), jnp.ravel(jnp.asarray(parameters))])
 
-    def unravel(self, u: Vector) -> Any:
+    def unravel(self, u: Vector) -> State:
         """A state from its vector."""
         return ravel_pytree(self.like)[1](u)
 
@@ -137,7 +137,8 @@ class Shooting(eqx.Module):
         return tuple(modes[j] for j in range(len(self.modes[0])))
 
     def _each(self, leg: Leg, function: Callable[..., Any], *inputs: Any) -> Any:
-        """`function(event, *inputs)` of the event that begins a leg."""
+        """`function(event, *inputs)` for the event that begins a leg, whose number may be
+        traced."""
         kinds = sorted(set(self.events))
         which = jnp.asarray([kinds.index(event) for event in self.events])[leg]
         return jax.lax.switch(which, [partial(function, kind) for kind in kinds], *inputs)
@@ -274,7 +275,8 @@ class Shooting(eqx.Module):
         return jacobian + jnp.outer(after - jacobian @ before, slope) / rate, approach
 
     def _order(self, machine: AbstractMachine, leg: Leg, s: Scalar, u: Vector) -> Scalar:
-        """Whether a switch goes into the mode of the leg that begins with its event: 1 or -1."""
+        """1 if a switch goes, at the event that begins a leg, into the mode that the leg has; else
+        -1."""
 
         def order(event, s, u):
             if not event.of(machine).holds_mode:
@@ -286,7 +288,7 @@ class Shooting(eqx.Module):
 
         return self._each(leg, order, s, u)
 
-    def state_at(self, x: Vector, leg: Leg, s: Scalar) -> Any:
+    def state_at(self, x: Vector, leg: Leg, s: Scalar) -> State:
         """The state at clock `s`, which lies in leg number `leg`."""
         machine = self.at(x)
         clock, states = self.parts(x)

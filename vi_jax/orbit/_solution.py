@@ -1,14 +1,12 @@
 """A solution of an orbit's equations as data."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from .._programs import compiled
-from .._types import Scalar
+from .._types import Scalar, State
 from ._shooting import Shooting
 from .curve import Step
 from .results import ORBIT_RESULTS, Orbit
@@ -25,7 +23,7 @@ def _clock_of(problem: Shooting, x: Array) -> tuple[np.ndarray, float]:
     return np.asarray(problem.parts(x)[0])[: len(problem.events)], float(problem.period(x))
 
 
-def sections_of(problem: Shooting, x: np.ndarray | Array) -> tuple[Any, Scalar]:
+def sections_of(problem: Shooting, x: np.ndarray | Array) -> tuple[State, Scalar]:
     """The states on the sections of a solution, leaves (cycles,), and the largest component of its
     residual."""
     x = jnp.asarray(x)

@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from .._programs import compiled
-from .._types import Vector
+from .._types import State, Vector
 from ..flow import MethodLike, RunOptions, collect, planned, run_lane
 from ..machine import (
     AbstractMachine,
@@ -34,14 +34,16 @@ from ._symmetry import images
 from .curve import Step, array_of, corrected, first_tangent
 from .results import Orbit
 
-# Events of a cycle that can be followed, of a machine with switches or a section of its own.
+# Events of a cycle that can be followed, of a machine with switches or a section of its own: a
+# choice.
 _LISTED = 32
 
 # Twice the steps of a flight change its end by less than this (relative to 1 + |state|); a motion
-# that asks for more of them than this is followed with so many.
+# that asks for more of them than this is followed with so many. The first is the corrector's
+# tolerance (`curve.corrected`), the second a choice.
 _SETTLED, _MOST = 1e-11, 4096
 
-# How far short of a place that has no solution (as a share of the step) one is looked for.
+# How far short of a place that has no solution (as a share of the step) one is looked for: choices.
 _SHORT_OF = (1e-6, 1e-5, 1e-4, 1e-3)
 
 
@@ -69,8 +71,11 @@ class Equations(Protocol):
 def check_parameter(
     machine: AbstractMachine, name: str, value: float, interval: tuple[float, float], whose: str
 ) -> None:
-    """**Raises:** `ValueError` unless the interval of a machine's number holds its value, `whose`
-    in words, and the machine can be one with either end of it."""
+    """**Raises:** `ValueError` unless the interval of a machine's number holds its value, and the
+    machine is valid with either end of it.
+
+    **Arguments:** `name` and `value`, the number's; `whose`, whose value that is, in words.
+    """
     low, high = interval
     if not low <= value <= high:
         raise ValueError(
@@ -123,9 +128,14 @@ class _Way(NamedTuple):
     """The machine's modes in each flight."""
 
 
-def _followed(blank: Shooting, state: Any, found: list[tuple[float, Event]], period: float) -> _Way:
-    """**Arguments:** the problem without events; the state on the section; clock and event of all
-    that is met within the period, in their order; the period by the clock."""
+def _followed(
+    blank: Shooting, state: State, found: list[tuple[float, Event]], period: float
+) -> _Way:
+    """A motion of one period, followed from event to event.
+
+    **Arguments:** `blank`, the problem without events; `state`, that on the section; `found`, clock
+    and event of all that is met within the period, in their order; `period`, by the clock.
+    """
     machine = blank.machine
     modes = begin_modes(machine, jnp.zeros(()), state)
     u, s = ravel_pytree(state)[0], 0.0
@@ -200,12 +210,21 @@ def _listed(plan, start):
 
 @compiled
 def _carry(blank: Shooting, modes, s0, s1, u):
+    """The state at clock `s1`, from the state `u` at `s0`, without an event in between.
+
+    **Arguments:** `blank`, the problem without events; `modes`, the machine's.
+    """
     flight = Flight(blank.machine, modes, blank.method, blank.like)
     return flight.fly(jnp.asarray(s0), jnp.asarray(s1), u, blank.steps)[0]
 
 
 @compiled
 def _compiled_advance(equations, x, tangent, scale, length) -> Step:
+    """As `advance`, of arrays.
+
+    **Arguments:** as `advance`.
+    """
+
     def observe(x, tangent):
         return equations.observe(x)
 
@@ -215,8 +234,11 @@ def _compiled_advance(equations, x, tangent, scale, length) -> Step:
 def advance(
     equations: Equations, x: Unknowns, tangent: Unknowns, scale: Unknowns, length: float | Array
 ) -> Step:
-    """The solution at this length along a unit tangent from `x`, both measured in unknowns divided
-    by `scale` (see `curve.corrected`)."""
+    """The solution on the plane across a tangent (see `curve.corrected`).
+
+    **Arguments:** `x`, the unknowns from where; `tangent`, a unit vector, and `length`, how far
+    along it, both in unknowns divided by `scale`.
+    """
     arguments = (jnp.asarray(a) for a in (x, tangent, scale, length))
     return array_of(_compiled_advance(equations, *arguments))
 
@@ -243,7 +265,7 @@ def tangent_at(equations: Equations, x: np.ndarray, scale: np.ndarray) -> np.nda
 
 @compiled
 def state_at(problem: Shooting, x, leg, s):
-    """The state at a clock reading within the flight after an impact."""
+    """The state at clock `s` within the leg of this number."""
     return problem.state_at(x, leg, s)
 
 
@@ -260,13 +282,14 @@ def images_at(problem: Shooting, x):
 
 
 def located(
-    problem: Shooting,
-    here: Step,
-    new: Step,
-    scale: np.ndarray,
-    test: Callable[[Step], float],
+    problem: Shooting, here: Step, new: Step, scale: np.ndarray, test: Callable[[Step], float]
 ) -> Step | None:
-    """The point between two, along the first one's tangent, at which a test is zero."""
+    """The point between two, along the first one's tangent, at which a test is zero; `None` if
+    there is none.
+
+    **Arguments:** `here` and `new`, the points; `scale`, the size of each unknown; `test`, a
+    function of a point that changes its sign between them.
+    """
     length = float(np.dot(here.tangent, (new.x - here.x) / scale))
     at: dict[float, Step] = {0.0: here, length: new}
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._lazy import lazy
+from .._types import State
 from ..flow import average_names, quantities_on, quantity_names
 from ..machine import AbstractMachine, components, with_units
 from ._shooting import Shooting
@@ -28,7 +29,7 @@ COLUMNS = (
 )  # fmt: skip
 
 
-def column_names(machine: AbstractMachine, like: Any) -> tuple[str, ...]:
+def column_names(machine: AbstractMachine, like: State) -> tuple[str, ...]:
     """What is a number at each point of a branch of this machine, whose states are like this."""
     inner = (*components(like), *quantity_names(machine, like))
     return (*COLUMNS, *average_names(machine, like), *(f"section_{name}" for name in inner))
@@ -52,8 +53,11 @@ def table_of(
     values: np.ndarray,
     units: Mapping[str, str],
 ) -> "xr.Dataset":
-    """What the function makes of each orbit, beside the values of the parameter (see
-    `Branch.table`)."""
+    """What a function makes of each orbit, as a data set over them (see `Branch.table`).
+
+    **Arguments:** `parameter` and `values`, the name of the branch's parameter and its value for
+    each orbit; `units`, the machine's.
+    """
     rows = [_numbers(function(orbit)) for orbit in orbits]
     shapes = {name: x.shape for name, x in rows[0].items()}
     for i, row in enumerate(rows):

@@ -5,7 +5,7 @@ such a turn grows until it touches: the motion ends there in a grazing.
 """
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,12 +13,13 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
-from .._types import Flag, Scalar, Vector
+from .._types import Flag, Scalar, State, Vector
 from ..flow import Beside, Rates, SmoothMachine, guard_rates
 from ..machine import events_of, guard_of, happens_at, section_number
 from ._flight import Flight
 
-# Newton's method has met a turn if it ends this close to it (as a share of the step).
+# Newton's method has met a turn if it ends this close to it (as a share of the step): a choice,
+# since what is left enters the height in second order and is taken off.
 _TURNED = 1e-3
 
 
@@ -60,11 +61,11 @@ class _Found(NamedTuple):
 
 
 class _Guard(NamedTuple):
-    """What turns: the guard of an event, by the event's number; of a machine on a flight."""
+    """Something that may turn along a flight: the guard of the machine's event of this number."""
 
     number: int
 
-    def value(self, flight: Flight, s: Scalar, state: Any) -> Scalar:
+    def value(self, flight: Flight, s: Scalar, state: State) -> Scalar:
         """The guard in a state."""
         return guard_of(flight.machine, self.number, s, state, flight.modes)
 
@@ -73,11 +74,11 @@ class _Guard(NamedTuple):
         return self.value(flight, s, flight.unravel(u))
 
     def rate(self, flight: Flight, s: Scalar, u: Vector) -> Scalar:
-        """d/ds of the guard along the flight, or a number of its sign."""
+        """d/ds of the guard along the flight, or another number of the same sign."""
         return self.rates(flight, flight.smooth, s, u).v
 
     def happens(self, flight: Flight, s: Scalar, u: Vector, length: Scalar) -> Flag:
-        """Whether the event would happen if its guard were zero a length from here."""
+        """Whether the event would happen if its guard were zero at a `length` from here."""
         if not events_of(flight.machine)[self.number].from_below:
             return jnp.ones((), bool)
         there = flight.unravel(_stepped(flight, (s, length, u)))
@@ -94,7 +95,7 @@ class _Guard(NamedTuple):
 
 
 class _Body(_Guard):
-    """What turns: a coordinate, by its number among the machine's."""
+    """Something that may turn along a flight: the machine's coordinate of this number."""
 
     def value(self, flight, s, state):
         return flight.machine.coordinates[self.number].position(state)
@@ -110,10 +111,7 @@ class _Body(_Guard):
 
 
 def turns_of(
-    flight: Flight,
-    places: Float[Array, " steps"],
-    states: Float[Array, "steps states"],
-    h: Scalar,
+    flight: Flight, places: Float[Array, " steps"], states: Float[Array, "steps states"], h: Scalar
 ) -> Turns:
     """The turning points of all coordinates and guards along a flight.
 
@@ -160,7 +158,8 @@ def turns_of(
 
 
 def _stepped(flight: Flight, inputs: tuple[Scalar, Scalar, Vector]) -> Vector:
-    """The state after a step from clock, by a length, from a state."""
+    """The state after one step; `inputs` are the clock, the length of the step, and the state
+    before it."""
     s, h, u = inputs
     return flight.step(s, s + h, u, Beside(jnp.zeros_like(s), {}))[0]
 

@@ -32,7 +32,7 @@ else:
     xr = lazy("xarray")
 
 # An orbit found on the cycle map solves the equations from impact to impact closer than this; one
-# that rests on a stop does not.
+# that rests on a stop does not. A choice.
 _SAME = 1e-3
 
 # A point lies at a value of the parameter if it is no further from it (in the parameter's scale).
@@ -310,6 +310,11 @@ def _branch(
     problem: Shooting, name: str, steps: list[Step], special: list[SpecialPoint],
     ends: tuple[str, str], scale: np.ndarray,
 ) -> Branch:  # fmt: skip
+    """The branch as arrays, from its points.
+
+    **Arguments:** `name`, the parameter's; `steps`, the points in their order; `special` and `ends`
+    as in `Branch`; `scale`, the size of each unknown.
+    """
     xs = np.stack([step.x for step in steps])
     impacts = np.asarray(problem.impacts, int)
 

@@ -25,12 +25,13 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from .._checks import count
 from .._programs import compiled
-from .._types import Scalar
+from .._types import Flag, Scalar
 from ..flow import lack_of_closed_form
 from ..machine import IdealDrive, Scene, Shown
 from .floquet import eigenvalues
 
-# Grid points per drive cycle on which turning points are bracketed.
+# Grid points per drive cycle on which turning points are bracketed: a choice, for ζ well above
+# 1/256.
 _POINTS = 256
 
 
@@ -113,13 +114,21 @@ def closed_form_orbits(scene: Scene, *, cycles: int | Int[Array, ""] = 1) -> Clo
 
 @compiled
 def _compiled_orbits(zeta, xi, k, d, section, *, n: int) -> ClosedFormOrbits:
+    """As `one_impact_orbits`, compiled.
+
+    **Arguments:** as `one_impact_orbits`.
+    """
     return one_impact_orbits(zeta, xi, k, d, n, section)
 
 
 def one_impact_orbits(
     zeta: Any, xi: Any, k: Any, d: Any, n: int, section: Any = 0.0
 ) -> ClosedFormOrbits:
-    """`closed_form_orbits` on bare dimensionless scalars: ζ > 0, ξ ≥ 0, k in [0, 1], d, n ≥ 1."""
+    """`closed_form_orbits` on bare dimensionless scalars.
+
+    **Arguments:** `zeta` > 0, `xi` ≥ 0, the restitution `k` in [0, 1], the gap `d`, the period `n`
+    ≥ 1 in drive cycles, and the crank angle of the section (radians).
+    """
     dtype = jnp.result_type(float, zeta, xi, k, d)
     zeta, xi, k, d, section = (jnp.asarray(x, dtype) for x in (zeta, xi, k, d, section))
     period = 2 * pi * n / zeta
@@ -207,7 +216,7 @@ def _after_impact(k, d, v, phase) -> Float[Array, "... 4"]:
 
 def _impacts(
     flight: Float[Array, "4 4"], k: Scalar, d: Scalar, period: Scalar
-) -> tuple[Float[Array, "2"], Float[Array, "2"], Float[Array, "2"], Bool[Array, ""]]:
+) -> tuple[Float[Array, "2"], Float[Array, "2"], Float[Array, "2"], Flag]:
     """Impact speeds (unit: a ω), impact phases in [0, 2π) with what rounding leaves open of them,
     and whether they are real.
 
@@ -246,7 +255,11 @@ def _impacts(
 
 def _early(flight, k, d, v, period) -> Float[Array, "2"]:
     """A change of V just after the impact, in its last digits, by which the next one comes before
-    the section on which both fall, rather than where rounding puts it."""
+    the section on which both fall, rather than where rounding puts it.
+
+    **Arguments:** `flight`, the matrix over a period; `k`, `d` and `v`, the restitution, the gap
+    and the speed of approach; `period`, the time between impacts.
+    """
     rounding = 64 * jnp.finfo(v.dtype).eps * (1 + period) * (1 + jnp.abs(d) + v)
     rise = flight[0, 1]
     change = rounding * rise / (rise * rise + 0.01)
@@ -254,7 +267,12 @@ def _early(flight, k, d, v, period) -> Float[Array, "2"]:
 
 
 def _follow(rates, flights, period, k, d, v, phase) -> tuple[Scalar, Scalar, Scalar]:
-    """Smallest and largest Y over the flight after the impact, and d - Y at its highest peak."""
+    """Smallest and largest Y over the flight after the impact, and d - Y at its highest peak.
+
+    **Arguments:** `rates`, the matrix of the motion; `flights`, those over 1, 2, 4, … grid steps;
+    `k`, `d` and `v`, the restitution, the gap and the speed of approach; `phase` and `period`, the
+    impact's crank angle and the time between impacts.
+    """
     states = _after_impact(k, d, v, phase)[None]
     for flight in flights:  # over 1, 2, 4, … grid steps
         states = jnp.concatenate([states, _dot(states, flight.T)])
@@ -305,6 +323,10 @@ def _multipliers(flight, xi, k, d, v, phase, period) -> Complex[Array, "2 2"]:
 
     The saltation (δ before to δ after, at fixed time) is [[-k, 0], [(k a⁻ + a⁺)/V⁻, -k]], where
     damping drops out of k a⁻ + a⁺ = (1 + k)(cos φ0 - d).
+
+    **Arguments:** `flight`, the matrix over a period; `xi`, ξ; `k`, `d` and `v`, the restitution,
+    the gap and the speed of approach; `phase` and `period`, the impact's crank angle and the time
+    between impacts.
     """
     kick = (1 + k) * (jnp.cos(phase) - d) / v
     half = 0.5 * (kick * flight[0, 1] - k * (flight[0, 0] + flight[1, 1]))

@@ -7,9 +7,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from .._checks import count, given_number
+from .._types import Flag, Scalar
 
 Vector = Float[Array, " n"]
 
@@ -21,11 +22,11 @@ class Step(NamedTuple):
     """The unknowns, the curve's parameter last."""
     tangent: Vector
     """Unit tangent in scaled unknowns, in the sense of the step."""
-    size: Float[Array, ""]
+    size: Scalar
     """Largest component of the last correction (scaled)."""
     iterations: Int[Array, ""]
     """Corrections that it took."""
-    good: Bool[Array, ""]
+    good: Flag
     """Whether the corrector converged."""
     seen: Any
     """What is observed there, an `Observed` of a branch."""
@@ -37,7 +38,7 @@ def corrected(
     x: Vector,
     tangent: Vector,
     scale: Vector,
-    length: Float[Array, ""],
+    length: Scalar,
     *,
     tolerance: float = 1e-11,
 ) -> Step:
@@ -46,8 +47,9 @@ def corrected(
     Newton's method on the equations and the plane. Nothing is close to singular at a fold, since
     the parameter is one of the unknowns.
 
-    **Arguments:** the equations; what to observe, of a point and its tangent; the last point and
-    its unit tangent in unknowns divided by `scale`; the length of the step.
+    **Arguments:** `residual`, the equations; `observe`, what to observe of a point and its tangent;
+    `x` and `tangent`, the last point and its unit tangent in unknowns divided by `scale`; `length`,
+    that of the step; `tolerance`, for the largest component of a correction (scaled).
     """
 
     def plane(y):
@@ -78,8 +80,8 @@ def corrected(
 
 
 def _jacobian(function: Callable[..., Any], x: Array) -> tuple[Array, Array]:
-    """Derivative and value. Loops within a function may leave nothing of it the same for all
-    directions, of which `jax.jacfwd` would not hear."""
+    """Derivative and value. Unlike `jax.jacfwd` it does not ask for a value that is the same for
+    all directions: loops within a function may not give one."""
 
     def along(direction):
         return jax.jvp(function, (x,), (direction,))
@@ -127,8 +129,10 @@ def walk(
 ) -> Walk:
     """Follow the curve from `start` in the sense of its tangent. Host-side.
 
-    **Arguments:** `advance`, the compiled corrector; `stop`, asked after each step, which may name
-    a reason to end and the last point; the first and the longest step length.
+    **Arguments:** `advance`, the compiled corrector, of unknowns, tangent and length; `stop`, asked
+    after each step with the points before and after it: the last point and a reason to end, or
+    `None`; `step` and `max_step`, the first and the longest step length; `max_points`, the most
+    points.
     """
     steps = [start]
     try:
@@ -139,7 +143,10 @@ def walk(
 
 
 def _walked(advance, steps: list[Step], stop, length: float, max_step: float, most: int) -> str:
-    """Adds the points to the first one, and says why there are no more."""
+    """Adds the points to `steps`, which holds the first one, and says why there are no more.
+
+    **Arguments:** as `walk`; `length`, of the first step; `most`, points.
+    """
     while len(steps) < most:
         here = steps[-1]
         new = advance(here.x, here.tangent, length)

@@ -16,6 +16,7 @@ from .._checks import count, flag
 from .._numbers import concrete
 from .._programs import compiled
 from .._renamed import renamed
+from .._types import State
 from ..flow import MethodLike, check_leaves, means, refuse_arrays
 from ..machine import AbstractMachine
 from ._arcs import by_the_first_state, error_of, in_order, moved_from_impacts, observe_arc
@@ -25,18 +26,18 @@ from .floquet import multipliers_of
 from .results import ORBIT_RESULTS, Orbit, trimmed
 from .root_finders import AbstractRootFinder, Newton
 
-# Lanes searched at once: a batch lasts as long as its slowest lane.
+# Lanes searched at once, a choice: a batch lasts as long as its slowest lane.
 _BATCH = 512
 
 # A search that fails with an impact slower than this (or a turn that would be one) failed at a
-# grazing: there the map's derivative is of the order of 1/V⁻ and jumps.
+# grazing: there the map's derivative is of the order of 1/V⁻, here 50, and jumps. A choice.
 _SLOW = 0.02
 
 
 @renamed(scene="machine")
 def find_orbit(
     machine: AbstractMachine,
-    guess: Any,
+    guess: State,
     cycles: int | Int[Array, ""] = 1,
     *,
     root_finder: AbstractRootFinder | None = None,
@@ -99,7 +100,7 @@ def find_orbit(
     return trimmed(orbit)
 
 
-def _check_guess(machine: AbstractMachine, state: Any) -> None:
+def _check_guess(machine: AbstractMachine, state: State) -> None:
     """**Raises:** `ValueError` unless these are numbers, or rows of them for as many guesses."""
     check_leaves("guess", state)
     with contextlib.suppress(AttributeError, TypeError, LookupError):  # which `simulate` explains
@@ -119,7 +120,9 @@ def _check_guess(machine: AbstractMachine, state: Any) -> None:
 
 
 @compiled
-def _find(the_map: CycleMap, guess: Any, root_finder: AbstractRootFinder, impact_log: int) -> Orbit:
+def _find(
+    the_map: CycleMap, guess: State, root_finder: AbstractRootFinder, impact_log: int
+) -> Orbit:
     def one(guess):
         return _judged(the_map, guess, root_finder, impact_log)
 
@@ -130,7 +133,7 @@ def _find(the_map: CycleMap, guess: Any, root_finder: AbstractRootFinder, impact
 
 
 def _judged(
-    the_map: CycleMap, guess: Any, root_finder: AbstractRootFinder, impact_log: int
+    the_map: CycleMap, guess: State, root_finder: AbstractRootFinder, impact_log: int
 ) -> Orbit:
     """The orbit found from one guess, with all that is said about it."""
     machine, cycles = the_map.machine, the_map.cycles
@@ -199,6 +202,11 @@ def _least_period(sections: Float[Array, "cycles states"], error: Array) -> Arra
 def _verdict(
     found: Array, smaller: Array, near_grazing: Array, drifts: Array, no_run: Array
 ) -> ORBIT_RESULTS:
+    """The result of a search, from flags.
+
+    **Arguments:** `found`, an orbit; `smaller`, its period; `near_grazing`, where the search ended;
+    `drifts`, the motion; `no_run`, the guess cannot be simulated.
+    """
     where, results = ORBIT_RESULTS.where, ORBIT_RESULTS
     missed = where(near_grazing, results.grazing, results.no_orbit)
     missed = where(drifts, results.drifts, missed)

@@ -13,6 +13,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from .._renamed import refuse_attribute
+from .._types import State
 from ..flow import (
     AbstractMethod,
     NamedEnumeration,
@@ -79,9 +80,9 @@ class Orbit(Summarized):
     machine: AbstractMachine
     """What moves; in the phase clock."""
     method: AbstractMethod
-    state: Any
+    state: State
     """State on the section, a pytree like a start."""
-    sections: Any
+    sections: State
     """States on the sections of the cycles that were asked for; leaves (cycles,)."""
     cycles: Int[Array, "..."]
     """Least period in drive cycles."""

@@ -18,10 +18,11 @@ from jaxtyping import Array, Float
 
 from .._checks import count, instance_of, require
 from .._numbers import number
+from .._types import Scalar
 from ._neutral import rounding
 
 Unknowns = Float[Array, "..."]
-Residual = Callable[[Any], Any]
+Residual = Callable[[Unknowns], Unknowns]
 
 
 class AbstractRootFinder(eqx.Module):
@@ -33,12 +34,12 @@ class AbstractRootFinder(eqx.Module):
 
     @abc.abstractmethod
     def init(self, residual: Residual, x: Unknowns) -> Any:
-        """What it remembers between its steps: any pytree."""
+        """The memory that `step` begins with: any pytree."""
 
     @abc.abstractmethod
     def step(
         self, residual: Residual, x: Unknowns, memory: Any
-    ) -> tuple[Unknowns, Any, Unknowns, Float[Array, ""]]:
+    ) -> tuple[Unknowns, Any, Unknowns, Scalar]:
         """One step from `x`.
 
         **Returns:** where to go on from; the memory; a place whose residual was computed, and the
@@ -88,7 +89,7 @@ class Newton(AbstractRootFinder):
         return optx.Dogleg(rtol=1e-15, atol=1e-15, linear_solver=least)
 
     def init(self, residual, x):
-        """The dogleg's state."""
+        """The memory at first: the dogleg's state."""
         fn = _with_aux(residual)
         shapes, aux = eqx.filter_eval_shape(fn, x, None)
         return self._solver(x.dtype).init(fn, x, None, {}, shapes, aux, frozenset())
@@ -105,7 +106,7 @@ class Newton(AbstractRootFinder):
         return 1e-10
 
 
-def _with_aux(residual: Residual) -> Callable[[Any, Any], tuple[Any, None]]:
+def _with_aux(residual: Residual) -> Callable[[Unknowns, Any], tuple[Unknowns, None]]:
     return lambda x, args: (residual(x), None)
 
 
@@ -140,7 +141,7 @@ class Gradient(AbstractRootFinder):
         return optax.adam(optax.cosine_decay_schedule(0.02, self.max_steps))
 
     def init(self, residual, x):
-        """The optimiser's state."""
+        """The memory at first: the optimiser's state."""
         return self._optimiser.init(x)
 
     def step(self, residual, x, memory):
@@ -170,7 +171,7 @@ class Found(NamedTuple):
 
     x: Unknowns
     """The place with the smallest residual that was met."""
-    residual: Float[Array, ""]
+    residual: Scalar
     """Its largest component there."""
     converged: Array
     """Whether that is within its tolerance."""

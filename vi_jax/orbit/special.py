@@ -19,7 +19,7 @@ FOLD, DOUBLING, TORUS = "fold", "period-doubling", "neimark-sacker"
 GRAZING, CROSSING, SYMMETRY = "grazing", "branch-point", "symmetry-breaking"
 HOPF = "hopf"
 
-# Where something grazes it is touched to rounding.
+# Where something grazes it is touched to rounding, by choice within this.
 _TOUCHES = 1e-6
 
 
@@ -76,7 +76,8 @@ class SpecialPoint(InWords):
 
 
 def _along(point: SpecialPoint, distance: float) -> Orbit:
-    """A motion further on the branch that the point's own problem is of."""
+    """A motion at this distance from a special point, on the branch that its own equations are
+    of."""
     x = np.asarray(point.step.x)
     tangent = tangent_at(point.problem, x, point.scale)
     step = advance(point.problem, x, tangent, point.scale, distance)

@@ -13,7 +13,7 @@ from .orbits import mean_ratio
 
 # Crank angles at the start: eighths of a turn.
 _PHASES = 8
-# A start counts as near the 2π motion within this distance (unit: a).
+# A start counts as near the 2π motion within this distance (unit: a): a choice.
 _NEAR = 0.3
 
 

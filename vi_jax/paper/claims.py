@@ -10,7 +10,7 @@ from .motions import Case, closed_form, half_turn_states, last_minima, run_of, s
 CONFIRMED, UNDAMPED_ONLY, CONTRADICTED = "confirmed", "confirmed undamped only", "contradicted"
 PARTLY = "confirmed in part"
 
-# A motion counts as settled once it stays this close to an orbit (unit: a, a ω).
+# A motion counts as settled once it stays this close to an orbit (unit: a, a ω): a choice.
 _SETTLED = 1e-3
 
 
@@ -54,7 +54,11 @@ def _verdict(undamped: bool, damped: bool | None = None) -> str:
 
 
 def _gap(case: Case, run: Run, first: int, last: int, period: int) -> float:
-    """Greatest |Y - closed form| over cycles `first` to `last` of the run from rest."""
+    """Greatest |Y - closed form| over some cycles of the run from rest.
+
+    **Arguments:** cycles `first` to `last`, without the last; `period` of the closed form in
+    cycles.
+    """
     cycles = run.impacts.shape[0]
     difference = sampled(run)[0] - closed_form(case, cycles, period)
     return float(np.abs(difference[first:last]).max())

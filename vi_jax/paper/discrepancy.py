@@ -9,7 +9,7 @@ from ..scan import Sweep
 from .motions import GAP
 from .response import LONGEST, Response, System
 
-# A motion without a period counts as chaotic beyond this exponent (per drive cycle).
+# A motion without a period counts as chaotic beyond this exponent (per drive cycle): a choice.
 _CHAOS = 0.01
 # From where on the minimum counts as apart from the 2π analysis (unit: a).
 _APART = 1e-3

@@ -11,6 +11,7 @@ from ..flow import Run
 from ..plot import STOP, angle_axis, color_of, motion_path, plot_history, save_picture, stamp
 from .motions import Case
 
+# Dots per inch: a choice.
 _DPI = 110
 # Colour of a simulated motion: neutral, as its regime is what the picture is to show.
 _INK = "0.2"
@@ -85,7 +86,10 @@ def _draw_row(number: int, case: Case, axes: list[Axes]) -> None:
 
 
 def _panel(ax: Axes, number: int, case: Case, run: Run, window: tuple[int, int]) -> None:
-    """A few cycles of the run with the closed forms on top."""
+    """A few cycles of the run with the closed forms on top.
+
+    **Arguments:** `number`, the figure's; `window`, the first and the last cycle.
+    """
     plot_history(
         run, machine=case.scene, ax=ax, window=window, stops=False, lw=3.2,
         color=_INK, alpha=0.55, label="simulation",

@@ -13,6 +13,7 @@ from .orbits import orbits as orbits
 
 # ζ, k and d of both figures.
 FREQUENCY_RATIO, RESTITUTION, GAP = 0.9, 0.5, 2.0
+# Cycles of the runs and samples of each, and those of a quick reproduction: choices.
 CYCLES, QUICK_CYCLES = 200, 60
 SAMPLES, QUICK_SAMPLES = 96, 64
 

@@ -18,13 +18,14 @@ from .figures import common_legend
 from .motions import CYCLES, FREQUENCY_RATIO, RESTITUTION, SAMPLES, figure_scene
 from .orbits import TableRow, orbits
 
+# T0 in N·m: a choice about Table 1's 10.
 TORQUES = (2.0, 10.0, 100.0)
 # (k, c in N·s/m, words): the figures, and the case in which Table 1's machine has a 4π motion.
 _MACHINES = (
     (RESTITUTION, 0.0, "k = 0.5, undamped"),
     (0.8, float(Parameters().damping), "k = 0.8, Table 1's damping"),
 )
-# ζ is tuned to this.
+# ζ is tuned to this: a choice.
 _TUNED = 1e-9
 
 

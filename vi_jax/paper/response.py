@@ -15,6 +15,7 @@ from ..orbit import Branch, ClosedFormOrbits, closed_form_orbits, continue_orbit
 from ..scan import REGIMES, Sweep, lyapunov, sweep
 from .motions import GAP, table_damping_ratio
 
+# The k that Figure 2 is computed for, and Table 1's range of ζ.
 RESTITUTIONS = (0.8, 0.5)
 RANGE = (0.5, 1.9)
 RATIO, DAMPING, BOUNCE = "drive.frequency_ratio", "oscillator.damping_ratio", "stops.0.restitution"
@@ -24,7 +25,7 @@ RATIO, DAMPING, BOUNCE = "drive.frequency_ratio", "oscillator.damping_ratio", "s
 WALL = -2.5
 # Between these the motions change much, and ζ is stepped through more finely.
 FINE = (0.695, 1.015)
-# Periods of more cycles than this are not looked for.
+# Periods of more cycles than this are not looked for: a choice.
 LONGEST = 12
 # Lanes of the programs that settle single values again; one number, so that there is one program.
 _LANES = 128
@@ -152,7 +153,11 @@ def _branches(
 
 @partial(jit, static_argnames="settle")
 def _carried(scene: Scene, numbers, values, starts, settle: int) -> Sweep:
-    """One sweep for each row of values."""
+    """One sweep for each row of values, all in one program.
+
+    **Arguments:** `numbers`, k and ξ of each row, (rows, 2); `values` of ζ, (rows, values);
+    `starts`, a state with one leading axis; `settle` in cycles.
+    """
 
     def one(numbers, values, start):
         here = with_numbers(scene, numbers[0], numbers[1], values[0])
@@ -181,7 +186,12 @@ def _sweeps(
     closed: list[dict[int, ClosedFormOrbits]],
     part: np.ndarray | None = None,
 ) -> list[tuple[dict[str, Sweep], dict[str, np.ndarray]]]:
-    """Run-up and close-down of each system, all in one program."""
+    """Run-up and close-down of each system, all in one program.
+
+    **Arguments:** `numbers`, k and ξ of each system; `ratios`, the values of ζ, rising; `closed`,
+    of each system the closed forms by their period; `part`, flags of those ratios inside the range
+    of impacts, where close-downs are to begin in it.
+    """
     lanes = [(k, xi, up) for k, xi in numbers for up in (True, False)]
     pairs = np.array([lane[:2] for lane in lanes])
     values = np.stack([ratios if up else ratios[::-1] for *_, up in lanes])
@@ -222,7 +232,11 @@ def _sweeps(
 
 
 def _again(scene: Scene, flat: Sweep, pairs: np.ndarray, values: np.ndarray, which) -> None:
-    """Settle the values of these indices for another 1,000 cycles, and put the results in place."""
+    """Settle some values for another 1,000 cycles, and put the results in place.
+
+    **Arguments:** `flat`, the sweeps as one row, changed in place; `pairs` and `values`, k and ξ,
+    and ζ, of each; `which`, the indices to settle.
+    """
     for some in _chunks(which):
         ends = jtu.tree_map(lambda x, some=some: x[some, -1], flat.sections)
         later = _carried(scene, pairs[some], values[some][:, None], ends, 1000)

@@ -162,7 +162,11 @@ def _zoom(
     wall: float,
     solid: bool = False,
 ) -> None:
-    """From BB' to CC', with a strip for each sweep that names its motions by colour."""
+    """From BB' to CC', with a strip for each sweep that names its motions by colour.
+
+    **Arguments:** `ratios`, the values of ζ; `colors` of the motions by name; `wall`, the place of
+    the second stop; `solid`, whether the stop is there.
+    """
     _closed_curves(ax, ratios, system)
     _free(ax, system)
     for branch in system.branches:
@@ -184,7 +188,10 @@ def _zoom(
 
 
 def _name(ax: Axes, x: float, y: float, motion: str, width: float, color: str) -> None:
-    """A strip's motion, or where it is too narrow only its period."""
+    """A strip's motion, or where it is too narrow only its period.
+
+    **Arguments:** `x` and `y`, the strip's middle; `width` of it; `color` behind the text.
+    """
     dark = np.dot(to_rgb(color), (0.3, 0.59, 0.11)) < 0.55
     for name in (motion, motion.partition(",")[0]):
         if width > 0.0026 * len(name):

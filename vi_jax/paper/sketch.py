@@ -54,7 +54,11 @@ def draw_sketch() -> Figure:
 
 
 def _drive(pen: Pen, a: float, pin: tuple[float, float], slider: float, phi: float) -> None:
-    """The motor's disc, the lever and their names."""
+    """The motor's disc, the lever and their names.
+
+    **Arguments:** `a`, the crank radius; `pin`, (x, y) of its end; `slider`, the place of the
+    slider; `phi`, the crank angle (radians).
+    """
     pen.disc(0.0, 0.0, a)
     pen.line((0.0, 0.0), pin)
     pen.line(pin, (slider, 0.0), lw=3)

@@ -45,7 +45,10 @@ class Pen:
 
     def body(self, x: float, y: float = 0.0, *, width: float | None = None,
              height: float | None = None, color: str = BLUE) -> None:  # fmt: skip
-        """A body with its middle at (x, y)."""
+        """A body with its middle at (x, y).
+
+        **Arguments:** `width`, the pen's size by default; `height`, as the width by default.
+        """
         width = self.size if width is None else width
         height = width if height is None else height
         place = x - width / 2, y - height / 2
@@ -76,9 +79,11 @@ class Pen:
         self, x: float, side: int = 1, *, low: float, high: float, slot: float = 0.0,
         color: str = GREEN,
     ) -> None:  # fmt: skip
-        """A wall whose face is at `x`, hatched behind it: on the right (+1) or the left (-1).
+        """A wall, hatched behind its face.
 
-        `slot` leaves half a height free about y = 0, through which a spring can pass.
+        **Arguments:** `x`, the place of the face; `side`, on which the hatching is: right (1) or
+        left (-1); `low` and `high`, its ends; `slot`, half a height that is left free about y = 0,
+        through which a spring can pass.
         """
         depth = 0.22 * self.size
         for bottom, top in ((low, -slot), (slot, high)) if slot else ((low, high),):
@@ -104,7 +109,11 @@ class Pen:
         self._along(start, end, [piston, length], [0, 0], lw=1.3)
 
     def _along(self, start: Point, end: Point, along: Any, across: Any, **look: Any) -> None:
-        """A line in coordinates along and across the way from one point to another."""
+        """A line in coordinates along and across the way from one point to another.
+
+        **Arguments:** `along` and `across`, coordinates of its points; `look`, options of
+        matplotlib's `plot`.
+        """
         way = np.subtract(end, start)
         length = np.hypot(*way)
         unit = way / length if length else np.array([1.0, 0.0])
@@ -122,7 +131,11 @@ class Pen:
         )  # fmt: skip
 
     def length(self, left: float, right: float, y: float, text: str, *, down: float) -> None:
-        """A length between two places, named below (`down` < 0) or above; only with labels."""
+        """A length between two places, with its name; only with labels.
+
+        **Arguments:** `left` and `right`, the places; `y`, the height; `down`, how far above that
+        the name is (below, if negative).
+        """
         if not self.labels:
             return
         look = {"arrowstyle": "<->", "color": "0.3", "lw": 1.0, "shrinkA": 0, "shrinkB": 0}
@@ -138,6 +151,11 @@ class Pen:
 def _zigzag(
     coils: int, half: float, start: Point, end: Point, size: float
 ) -> tuple[np.ndarray, np.ndarray]:
+    """A spring as a line, along and across the way between its ends.
+
+    **Arguments:** `half`, half its width; `size`, the pen's, by which its straight ends are
+    measured.
+    """
     length = float(np.hypot(end[0] - start[0], end[1] - start[1]))
     lead = min(0.2 * size, 0.2 * length)
     turns = np.tile([half, -half], coils)

@@ -173,7 +173,11 @@ def _crank(machine: Scene, pen: Pen, pin: tuple[float, float], slider: float) ->
 
 
 def _stop(pen: Pen, stop: Any, rest: float, size: float, *, rigid: bool) -> None:
-    """A wall that the body's face meets at the gap; a compliant one stands on a spring."""
+    """A wall that the body's face meets at the gap; a compliant one stands on a spring.
+
+    **Arguments:** `rest`, the place of the body's middle where its position is 0; `size`, its
+    width; `rigid`, whether the stop is.
+    """
     sign = 1 if stop.side == "right" else -1
     face = rest + sign * (float(stop.gap) + size / 2)
     slot = 0.0 if sign > 0 else 0.34 * size  # the spring passes through a stop on the left

@@ -13,6 +13,7 @@ import numpy as np
 from .._checks import count, fits_records, given_number
 from .._lazy import lazy
 from .._renamed import renamed
+from .._types import State
 from ..flow import MethodLike, chosen, machine_of, simulate, tidy
 from ..machine import (
     AbstractMachine,
@@ -152,7 +153,7 @@ def basins(
     tolerance: float | None = None,
     apart: float = 1e-3,
     method: MethodLike = None,
-    start: Any = None,
+    start: State = None,
     **options: Any,
 ) -> Basins:
     """Find the motions that starts in a region settle on, and which start goes to which.
@@ -262,7 +263,11 @@ def _starts_in(
 def _attractor(
     number: int, motion: np.ndarray, names: list[str], label: np.ndarray, impacts: np.ndarray
 ) -> Attractor:
-    """A motion, from its section states, the label of each start and what impacts each had."""
+    """A motion that starts came to, with its share of them.
+
+    **Arguments:** `number`, its label; `motion`, its section states, (period, states); `names` of
+    their components; `label` and `impacts`, of each start the motion it came to and its impacts.
+    """
     here = label == number
     fraction = float(np.mean(here))
     return Attractor(

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float
 from .._checks import count, flag
 from .._programs import compiled
 from .._renamed import renamed
+from .._types import Scalar, State
 from ..flow import (
     REASON_NAMES,
     RESULTS,
@@ -56,7 +57,7 @@ class Lyapunov(Summarized):
     autonomous machine per usual `cycle`, at which it is observed."""
     spread: Float[Array, "..."]
     """Difference of the greatest exponent between the two halves of the run."""
-    state: Any
+    state: State
     """Section state at the end."""
     result: RESULTS
     """Whether the run was simulated to its end; if not, the numbers are NaN."""
@@ -118,7 +119,7 @@ class Lyapunov(Summarized):
 @renamed(scene="machine")
 def lyapunov(
     machine: AbstractMachine,
-    start: Any,
+    start: State,
     cycles: int = 400,
     *,
     settle: Any = 200,
@@ -178,6 +179,11 @@ def lyapunov(
 
 @compiled
 def _lyapunov(the_map: CycleMap, start, cycles: int, settle, number: int) -> Lyapunov:
+    """The exponents of one motion.
+
+    **Arguments:** `start`, a state on the section; `settle`, cycles before those observed; `number`
+    of exponents.
+    """
     machine, method, rests = the_map.machine, the_map.method, the_map.rests
     before = simulate(
         machine, start, 1, settle=settle, method=method, rests=rests, record="sections"
@@ -243,7 +249,7 @@ def _window(cycles: int) -> int:
     return 2 if cycles % 2 == 0 else 1
 
 
-def _length(vector: Float[Array, " states"]) -> Float[Array, ""]:
+def _length(vector: Float[Array, " states"]) -> Scalar:
     """Its norm, of numbers whose squares are too small or too large for one too."""
     largest = jnp.max(jnp.abs(vector))
     unit = jnp.where((largest > 0) & (largest < jnp.inf), largest, 1.0)

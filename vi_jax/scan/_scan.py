@@ -17,19 +17,12 @@ from .._checks import count, fits_memory, fits_records, flag, instance_of
 from .._interrupted import Interrupted
 from .._lazy import lazy
 from .._renamed import renamed
+from .._types import State
 from ..flow import REASON_NAMES, AbstractMethod, MethodLike, RunOptions, preset
 from ..machine import AbstractMachine
 from ..machine import attributes as units_of
 from ._describe import attributes_of, description_of, unit_on_axis, variables_of
-from ._work import (
-    ClusterLost,
-    block_size,
-    rounded,
-    run_here,
-    run_on_cluster,
-    size_of,
-    worker_count,
-)
+from ._work import ClusterLost, block_size, rounded, run_here, run_on_cluster, size_of, worker_count
 from .corners import check_corners
 from .grid import Blocks, axes_of
 from .program import ScanProgram, make_program
@@ -70,7 +63,7 @@ def scan(
     axes: Mapping[str, Any],
     *,
     measure: Any = ("extremes", "regime"),
-    start: Any = None,
+    start: State = None,
     settle: int = 200,
     cycles: int | None = None,
     method: MethodLike = None,
@@ -187,6 +180,9 @@ def _computed(
 ) -> "xr.Dataset":
     """What a program finds on a grid, checked before any work.
 
+    **Arguments:** `blocks`, the grid; `place`, where it is computed; `store`, a path to keep it at,
+    `None` for the memory; `progress`, whether a bar is shown.
+
     **Raises:** as `scan`.
     """
     program = check_corners(program, blocks)
@@ -243,6 +239,10 @@ def _blocks(
 ) -> Blocks:
     """The grid in blocks of `lanes`: as in the store if there is one, or as suits the workplace.
 
+    **Arguments:** `grid`, values by axis; `place`, where it is computed; `paired`, whether the axes
+    have one length and are gone along together; `store`, a path or `None`; `lanes`, `None` to
+    choose.
+
     **Raises:** `ValueError` if a block would not fit into the memory.
     """
     total = Blocks(grid, 1, paired=paired).total
@@ -280,7 +280,12 @@ def _better(program: ScanProgram) -> AbstractMethod:
 def _verified(
     data: "xr.Dataset", blocks: Blocks, lanes: int, program: ScanProgram, place: _Workplace
 ) -> dict[str, Any]:
-    """How so many of the lanes, or all, come out by a better program; attributes by their names."""
+    """How some of the lanes, drawn by chance, come out by a better program; attributes by their
+    names.
+
+    **Arguments:** `data`, what was found; `lanes`, how many (at most all); `program`, the better
+    one; `place`, where it is computed.
+    """
     total = data["result"].size
     lanes = min(lanes, total)
     drawn = np.sort(np.random.default_rng(0).choice(total, lanes, replace=False))

@@ -15,6 +15,7 @@ from .._interrupted import Interrupted
 from .._numbers import concrete, number
 from .._programs import compiled, is_outermost
 from .._renamed import renamed
+from .._types import State
 from ..flow import (
     REASON_NAMES,
     RESULTS,
@@ -48,7 +49,8 @@ from ..machine import (
 from ..orbit import impacts_in_words
 from .regime import CODES, REGIMES, flags, impacts_of, least_period
 
-# A jump is so many times the change at the values beside it, and this part of 1 + |number|.
+# A jump is so many times the change at the values beside it, and this part of 1 + |number|:
+# choices.
 _JUMP, _NOTED = 3.0, 0.01
 
 # What is a number at each value of every sweep.
@@ -78,7 +80,7 @@ class Sweep(Summarized):
     """ζ: mean speed of the drive; `None` for machines that are not driven."""
     impact_speed: Float[Array, "..."]
     """Greatest V⁻ over the cycles observed."""
-    sections: Any
+    sections: State
     """Section states of the cycles observed; leaves (values, cycles)."""
     result: RESULTS
     """Whether each value was simulated to its end."""
@@ -193,7 +195,7 @@ def sweep(
     parameter: str,
     values: Any,
     *,
-    start: Any = None,
+    start: State = None,
     settle: int = 200,
     cycles: int = 32,
     method: MethodLike = None,
@@ -263,7 +265,10 @@ def sweep(
 
 
 def _in_parts(machine, parameter, values, start, *options) -> Sweep:
-    """Some values at a time, all by one program, so that an interrupt loses few of them."""
+    """Some values at a time, all by one program, so that an interrupt loses few of them.
+
+    **Arguments:** as `_sweep`.
+    """
     if values.size <= _AT_ONCE:
         return _sweep(machine, parameter, values, start, *options)[1]
     missing = -values.size % _AT_ONCE  # filled up by what ends at once
@@ -289,7 +294,7 @@ def _finite(numbers: np.ndarray | None) -> bool:
     return numbers is None or bool(np.isfinite(numbers).all())
 
 
-def taken_along(machine: AbstractMachine, state: Any) -> Any:
+def taken_along(machine: AbstractMachine, state: State) -> State:
     """The state, the body taken along by a stop that has come nearer."""
     for stop in machine.stops:
         body = machine.coordinates[stop.coordinate]
@@ -303,8 +308,11 @@ def taken_along(machine: AbstractMachine, state: Any) -> Any:
 @compiled
 def _sweep(
     machine, parameter, values, start, settle, cycles, method, rests, tolerance, max_steps
-) -> tuple[Any, Sweep]:
-    """The state after the last value, and what was found at each."""
+) -> tuple[State, Sweep]:
+    """The state after the last value, and what was found at each.
+
+    **Arguments:** as `sweep`, all of them checked.
+    """
 
     def one(state, value):
         here = with_leaf(machine, parameter, value)

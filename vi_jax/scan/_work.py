@@ -3,13 +3,7 @@
 import functools
 import math
 from collections.abc import Callable, Iterator
-from concurrent.futures import (
-    FIRST_COMPLETED,
-    CancelledError,
-    Future,
-    ThreadPoolExecutor,
-    wait,
-)
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ThreadPoolExecutor, wait
 from typing import Any
 
 import equinox as eqx
@@ -27,10 +21,11 @@ from ..flow import compiling
 from .grid import Blocks
 from .program import ScanProgram
 
-# Lanes of a block on a CPU and on an accelerator.
+# Lanes of a block on a CPU and on an accelerator: choices. A block is what an interrupt loses.
 _MOST, _ON_ACCELERATOR = 4096, 65536
 
-# A block has a multiple of so many lanes on each device: few sizes, for few programs.
+# A block has so many lanes on each device, or so many doubled again and again: few sizes, for few
+# programs. A choice.
 _LEAST = 256
 
 
@@ -129,6 +124,9 @@ def run_here(
     """The blocks `todo` with their numbers, as they are done, each on one core, several at a time.
 
     On an accelerator, or over several devices, one at a time.
+
+    **Arguments:** `blocks`, the whole grid; `todo`, which of its blocks; `workers`, threads;
+    `devices`, on how many a block is spread.
     """
     if devices > 1 or jax.default_backend() != "cpu":
         workers = 1

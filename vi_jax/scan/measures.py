@@ -8,9 +8,10 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Bool
+from jaxtyping import Array
 
 from .._checks import count, require
+from .._types import Flag, State
 from ..flow import AbstractMethod, Run
 from ..machine import AbstractMachine, by_name
 from ._lyapunov import lyapunov
@@ -36,7 +37,7 @@ class AbstractMeasure(eqx.Module):
     """What it must see of them, as in `simulate`: `"motion"`, or only `"sections"` and the numbers
     of impacts and steps."""
 
-    def described(self, start: Any) -> About:
+    def described(self, start: State) -> About:
         """The same for states like `start`."""
         return self.attributes
 
@@ -58,21 +59,24 @@ class AbstractMeasure(eqx.Module):
         """How often `later` may be needed for a lane."""
         return 1
 
-    def needs_refinement(self, found: Numbers, pass_number: Any = 0) -> Bool[Array, ""] | None:
+    def needs_refinement(self, found: Numbers, pass_number: Any = 0) -> Flag | None:
         """Whether a lane needs `refine`, at pass number `pass_number`; `None` if none ever does."""
         return None
 
     def refine(
         self,
         machine: AbstractMachine,
-        state: Any,
+        state: State,
         method: AbstractMethod,
         found: Numbers,
         pass_number: Any = 0,
         rests: bool | None = None,
     ) -> Numbers:
-        """Costlier numbers, only for lanes that need them; they replace those found. `state` is
-        that after the cycles observed, at every pass; `rests` is as for `simulate`."""
+        """Costlier numbers, only for lanes that need them; they replace those found.
+
+        **Arguments:** `state`, that after the cycles observed, at every pass; `found`, the numbers
+        so far; `pass_number`, from 0; `rests` as for `simulate`.
+        """
         return {}
 
 
@@ -217,7 +221,10 @@ class Exponent(AbstractMeasure):
         return jnp.asarray(True)
 
     def refine(self, machine, state, method, found, pass_number=0, rests=None):
-        """Of one lane."""
+        """The exponent of one lane.
+
+        **Arguments:** as `AbstractMeasure.refine`.
+        """
         found_out = lyapunov(
             machine, state, self.observed, settle=0, number=1, method=method, rests=rests
         )
@@ -251,11 +258,7 @@ class Regime(AbstractMeasure):
     """What sections wander by under the method; a scan puts its own method's here."""
     record = "sections"
     attributes: ClassVar[About] = {
-        "period": {
-            "units": "cycles",
-            "long_name": "least period",
-            **flags(CODES),
-        },
+        "period": {"units": "cycles", "long_name": "least period", **flags(CODES)},
         "impacts": {
             "units": "1",
             "long_name": "impacts in a period (per cycle, on average, where there is none)",
@@ -303,7 +306,10 @@ class Regime(AbstractMeasure):
         )
 
     def refine(self, machine, state, method, found, pass_number=0, rests=None):
-        """Chaotic or not; at the second pass, still or not."""
+        """Chaotic or not; at the second pass, still or not.
+
+        **Arguments:** as `AbstractMeasure.refine`.
+        """
         settle = pass_number * (self.observed + self.lasting)
         out = lyapunov(
             machine, state, self.observed, settle=settle, number=1, method=method, rests=rests

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from .._checks import count, tuple_of
 from .._numbers import strongly_typed
+from .._types import State
 from ..flow import (
     AbstractMethod,
     MethodLike,
@@ -43,7 +44,7 @@ class ScanProgram(eqx.Module):
     machine: AbstractMachine | None
     build: Callable[..., Any] | None = eqx.field(static=True)
     """Makes the machine of the axes' values, in place of `machine`."""
-    start: Any
+    start: State
     """The first state, or `None` for the machine's own."""
     derivatives: tuple[str, ...] = eqx.field(static=True)
     """Names of the numbers by which the variables are differentiated."""
@@ -61,7 +62,7 @@ class ScanProgram(eqx.Module):
 
     def lane(
         self, values: Mapping[str, Any], nudge: Array | None = None
-    ) -> tuple[AbstractMachine, Any]:
+    ) -> tuple[AbstractMachine, State]:
         """Machine and start of the lane with these values on the axes, in the scan's clock.
 
         **Arguments:** the values by the names of the axes; what is added to each of the numbers
@@ -93,7 +94,7 @@ class ScanProgram(eqx.Module):
                 start = with_leaf(start, name.removeprefix(START), value)
         return machine, self._nudged(start, START, nudge)
 
-    def first(self, blocks: Blocks) -> tuple[AbstractMachine, Any]:
+    def first(self, blocks: Blocks) -> tuple[AbstractMachine, State]:
         """Machine and start of the first lane."""
         return self.lane({name: jnp.asarray(x[0]) for name, x in blocks.axes.items()})
 
@@ -133,7 +134,7 @@ class ScanProgram(eqx.Module):
             out |= {f"d_{n}": jnp.moveaxis(x, 0, 1) for n, x in slopes.items()}
         return out
 
-    def _first(self, values, wanted, nudge) -> tuple[Numbers, Any]:
+    def _first(self, values, wanted, nudge) -> tuple[Numbers, State]:
         def lane_of(values):
             return self.lane(values, nudge)
 
@@ -158,7 +159,12 @@ class ScanProgram(eqx.Module):
     def _again(
         self, measure: AbstractMeasure, values, wanted, state, out: Numbers, *pass_number: Array
     ) -> Numbers:
-        """`out` with what `measure` finds at another pass, at the lanes that need it only."""
+        """`out` with what a measure finds at another pass, at the lanes that need it only.
+
+        **Arguments:** each of all lanes: `values` of the axes; `wanted`, whether it is computed;
+        `state`, after the cycles observed; `out`, the numbers so far; `pass_number`, for a measure
+        that counts its passes.
+        """
         needs_refinement = jax.vmap(lambda found: measure.needs_refinement(found, *pass_number))(
             out
         )
@@ -184,7 +190,7 @@ def make_program(
     options: RunOptions = _USUAL,
     *,
     measure: Any,
-    start: Any = None,
+    start: State = None,
     cycles: int | None = None,
     derivatives: Iterable[str] = (),
 ) -> ScanProgram:
@@ -251,7 +257,7 @@ def _cycles_for(measures: Iterable[AbstractMeasure], cycles: int | None) -> int:
     return cycles
 
 
-def _averages_of(machine: Any, axes: Iterable[str], start: Any) -> tuple[str, ...]:
+def _averages_of(machine: Any, axes: Iterable[str], start: State) -> tuple[str, ...]:
     """The names of the averages of a machine, or of those that a function makes."""
     if isinstance(machine, AbstractMachine):
         return _names_of(machine, start)
@@ -266,7 +272,7 @@ def _averages_of(machine: Any, axes: Iterable[str], start: Any) -> tuple[str, ..
     return found[0] if found else ()
 
 
-def _names_of(machine: Any, start: Any) -> tuple[str, ...]:
+def _names_of(machine: AbstractMachine, start: State) -> tuple[str, ...]:
     if not isinstance(machine, AbstractMachine) or not has_averages(machine):
         return ()
     return average_names(machine, machine.start() if start is None else machine.adopt(start))
@@ -321,7 +327,7 @@ def _as_arrays(tree: Any) -> Any:
     )
 
 
-def check_leaf_name(machine: AbstractMachine, start: Any, name: str, argument: str) -> None:
+def check_leaf_name(machine: AbstractMachine, start: State, name: str, argument: str) -> None:
     """**Raises:** `ValueError` for a name that no number of the machine or of its start has."""
     names = leaf_names(machine) + [START + n for n in leaf_names(start)]
     check_name(names, name, argument)

@@ -10,13 +10,16 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-Number = Float[Array, ""] | float
+from .._types import Scalar, State
+
+Number = Scalar | float
 
 # How far sections a period apart may differ; so many times that, if a longer period fits within it;
-# and so many times what the longer one differs by.
+# and so many times what the longer one differs by. Choices.
 _TOLERANCE, _SLACK, _WORSE = 1e-6, 100.0, 1e4
 
 # The least that sections are held to: so many times what they wander by, and so many roundings.
+# Choices.
 _WANDERS, _ROUNDINGS = 10.0, 64.0
 
 
@@ -61,7 +64,7 @@ def periods_of(period: Any) -> np.ndarray:
 
 
 def least_period(
-    sections: Any,
+    sections: State,
     impacts: Int[Array, " cycles"],
     *,
     longest: int,
@@ -105,7 +108,7 @@ def least_period(
     return jnp.where(least <= tolerance, period, REGIMES.unsettled)
 
 
-def impacts_of(impacts: Float[Array, " cycles"], period: Int[Array, ""]) -> Float[Array, ""]:
+def impacts_of(impacts: Float[Array, " cycles"], period: Int[Array, ""]) -> Scalar:
     """Impacts in a period of a motion; in a cycle, on average, where it has none."""
     last = jnp.arange(impacts.size) >= impacts.size - period
     total = jnp.sum(jnp.where(last, impacts, 0.0))

@@ -176,8 +176,8 @@ def sources() -> str:
     files = [*_BENCHMARKS.glob("peers.py"), *_BENCHMARKS.glob("peer_codes/*.py")]
     files += [
         file
-        for room in ("flow", "lanes", "machine")
-        for file in (_BENCHMARKS.parents[1] / "vi_jax" / room).iterdir()
+        for package in ("flow", "lanes", "machine")
+        for file in (_BENCHMARKS.parents[1] / "vi_jax" / package).iterdir()
     ]
     return hashlib.sha256(
         b"".join(file.read_bytes() for file in sorted(files) if file.is_file())

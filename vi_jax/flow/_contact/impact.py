@@ -4,7 +4,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from ..._types import Flag
+from ..._types import Flag, State
 from ...machine import AbstractMachine, rubs
 from .. import results
 from .._arrival import Arrival, ended
@@ -14,10 +14,14 @@ from .sequence import strike_in_turn
 
 
 def strike(
-    plan: Plan, taken: Flag, arrival: Arrival, landed: dict[int, Flag], there: Any
+    plan: Plan, taken: Flag, arrival: Arrival, landed: dict[int, Flag], there: State
 ) -> tuple[Arrival, dict[int, Blow]]:
-    """The impacts in the state `there` of those stops that a step has `landed` upon; and what they
-    were to each coordinate."""
+    """The arrival after the impacts of one instant, and what they were to each coordinate, by its
+    number.
+
+    **Arguments:** `taken`, whether the step is taken; `landed`, of each stop, by its number,
+    whether the step landed on it; `there`, the state in which it did.
+    """
     limited = sorted({stop.coordinate for stop in plan.machine.stops})
     if not is_compound(plan.machine):
         return _one_blow(plan, taken, arrival, landed, there, limited[0])
@@ -30,9 +34,12 @@ def is_compound(machine: AbstractMachine) -> bool:
 
 
 def _one_blow(
-    plan: Plan, taken: Flag, arrival: Arrival, landed: dict[int, Flag], there: Any, k: int
+    plan: Plan, taken: Flag, arrival: Arrival, landed: dict[int, Flag], there: State, k: int
 ) -> tuple[Arrival, dict[int, Blow]]:
-    """Of the only coordinate that stops limit."""
+    """As `strike`, where stops limit one coordinate and nothing rubs.
+
+    **Arguments:** as `strike`; `k`, the number of that coordinate.
+    """
     machine, body = plan.machine, plan.machine.coordinates[k]
     blow = Blow(*(jnp.zeros_like(arrival.s) for _ in range(3)))
     velocity = body.velocity(there)

@@ -25,10 +25,11 @@ class _Precision(NamedTuple):
     straight: float
     close: float
     # How much of a chatter may be left when it is completed, as a share of the longest step: its
-    # error is of second order.
+    # error is of second order, 6e-11 of that step in double precision.
     brief: float
 
 
+# `close` is the tolerance of landings (`guards`). The others are choices.
 _DOUBLE = _Precision(short=1e-3, straight=1e-5, close=1e-9, brief=8e-6)
 _SINGLE = _Precision(short=1e-2, straight=1e-3, close=1e-4, brief=8e-3)
 
@@ -57,6 +58,9 @@ def release(
     """Where coordinate number k leaves the stop that it rests on, if it does.
 
     The force is the acceleration that a free body would have there.
+
+    **Arguments:** `stops`, the machine's; `begin` and `end`, the free coordinate's rates at the
+    ends of the step; `good`, whether the step was; `h`, its length.
     """
     assert lane.contact is not None
     known = allowed(h)

@@ -7,14 +7,14 @@ symmetrical stays so; then the next, until none closes. A sequence that gets wea
 to rest against each other.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.lax import stop_gradient
 
-from ..._types import Flag, Scalar
+from ..._types import Flag, Scalar, Scalars, State
 from ...machine import Coordinate, forces, push_of, rubbed, rubbing_on, rubs, shares
 from .. import results
 from .._arrival import Arrival, ended
@@ -25,15 +25,17 @@ from .blow import Blow, gains_speed, listed
 # Shares of the greatest speed of approach so far. Below the first a contact does not close: it is
 # rounding of the blows before. At the second the sequence is replaced by its limit, in which those
 # contacts come to rest that were struck and move no faster than `_ALIKE` times the fastest.
+# All three are choices; how many blows they take in known cases is in docs/internals/step.md.
 _NONE, _WEAK, _ALIKE = 1e-12, 1e-7, 30.0
 
-# Speeds that differ by no more than this share are the same.
+# Speeds that differ by no more than this share are the same: a choice, far above rounding.
 _EQUAL = 1e-9
 
-# Contacts that share less than this of each other's velocity are struck each by itself.
+# Contacts that share less than this of each other's velocity are struck each by itself: a choice.
 _APART = 1e-6
 
-# A ball between a wall and a body 100 times heavier is struck 31 times, one of 10,000 times 314.
+# A ball between a wall and a body 100 times heavier is struck 31 times, one of 10,000 times 314
+# (π times the root of the ratio): this is enough for a body 1.7 million times heavier.
 _ROUNDS = 4096.0
 
 
@@ -41,9 +43,9 @@ class _Round(NamedTuple):
     """A sequence of impacts between two of them."""
 
     arrival: Arrival
-    struck: tuple[Scalar, ...]
+    struck: Scalars
     """Of each coordinate, as in `Blow`."""
-    approach: tuple[Scalar, ...]
+    approach: Scalars
     most: Scalar
     """The greatest speed of approach that there was."""
     goes_on: Scalar
@@ -51,13 +53,13 @@ class _Round(NamedTuple):
 
 
 class _Instant(NamedTuple):
-    """What is known of an instant beforehand."""
+    """What is known of an instant before its impacts, and stays the same in all of them."""
 
     plan: Plan
     taken: Flag
     met: Flag
     """Whether any stop is landed upon."""
-    there: Any
+    there: State
     """The state before."""
     limited: list[int]
     """The numbers of the coordinates that stops limit."""
@@ -73,15 +75,18 @@ class _Instant(NamedTuple):
     coupled: list[Flag]
     """Of each coordinate, whether one of those landed upon acts on it, through contacts that are
     closed."""
-    slack: Any
+    slack: Scalar | float
     """What of a velocity is rounding."""
 
 
 def strike_in_turn(
-    plan: Plan, taken: Flag, arrival: Arrival, landed: dict[int, Flag], there: Any,
+    plan: Plan, taken: Flag, arrival: Arrival, landed: dict[int, Flag], there: State,
     limited: list[int],
 ) -> tuple[Arrival, dict[int, Blow]]:  # fmt: skip
-    """Of machines with several coordinates that stops limit."""
+    """As `strike`, where stops limit several coordinates, or something rubs.
+
+    **Arguments:** as `strike`; `limited`, the numbers of those coordinates.
+    """
     instant = _instant(plan, taken, arrival, landed, there, limited)
     zero = jnp.zeros_like(arrival.s)
     nothing = tuple(zero for _ in limited)
@@ -111,9 +116,13 @@ def strike_in_turn(
 
 
 def _instant(
-    plan: Plan, taken: Flag, arrival: Arrival, landed: dict[int, Flag], there: Any,
+    plan: Plan, taken: Flag, arrival: Arrival, landed: dict[int, Flag], there: State,
     limited: list[int],
 ) -> _Instant:  # fmt: skip
+    """What is known of an instant before its impacts.
+
+    **Arguments:** as `strike_in_turn`.
+    """
     bodies = [plan.machine.coordinates[k] for k in limited]
     gains_ = shares(bodies, there, [push_of(body, there) for body in bodies])
     met = jnp.zeros_like(taken)
@@ -140,7 +149,12 @@ def _coupled(
     plan: Plan, limited: list[int], gains: list[list[Scalar]], touches: dict[int, Flag],
     coupled: list[Flag],
 ) -> list[Flag]:  # fmt: skip
-    """Of each coordinate, whether one of those marked in `coupled` acts on it."""
+    """Of each coordinate, whether a blow on one of those marked is felt by it through closed
+    contacts.
+
+    **Arguments:** `limited`, the numbers of the coordinates; `gains` as from `shares`; `touches`,
+    of each stop whether its contact is closed; `coupled`, the marks.
+    """
     closed = [jnp.zeros((), bool) for _ in limited]
     for number, stop in enumerate(plan.machine.stops):
         i = limited.index(stop.coordinate)
@@ -157,7 +171,7 @@ def _coupled(
 
 
 def _struck(instant: _Instant, x: _Round) -> _Round:
-    """A sequence with its next impacts."""
+    """The sequence after its next impacts: those of the contacts that close fastest."""
     plan, arrival = instant.plan, x.arrival
     stops, state = plan.machine.stops, arrival.state
     velocities = [body.velocity(state) for body in instant.bodies]
@@ -230,11 +244,14 @@ def _each_by_itself(
 
 
 def _thrown(
-    instant: _Instant, state: Any, velocities: list[Scalar], slow: list[Flag],
+    instant: _Instant, state: State, velocities: list[Scalar], slow: list[Flag],
     hits: dict[int, Flag], rebounds: dict[int, Scalar],
-) -> tuple[Any, list[tuple[Coordinate, Scalar]]]:  # fmt: skip
-    """The state after the rebounds of those stops that are hit, with those coordinates at rest that
-    are so slow; and by how much each coordinate was pushed."""
+) -> tuple[State, list[tuple[Coordinate, Scalar]]]:  # fmt: skip
+    """The state after the next impacts, and by how much each coordinate's velocity was pushed.
+
+    **Arguments:** `state` and `velocities` before them; `slow`, which coordinates come to rest; of
+    each stop, by its number, in `hits` whether it is hit, in `rebounds` the velocity after that.
+    """
     machine = instant.plan.machine
     on, wanted, places = list(slow), [-V for V in velocities], []
     for i, body in enumerate(instant.bodies):
@@ -266,7 +283,7 @@ def _thrown(
 
 
 def _closing(instant: _Instant, x: _Round, velocities: list[Scalar]) -> dict[int, Scalar]:
-    """Of each stop the speed of approach, of those whose turn it may be: negative for others.
+    """Of each stop the speed of approach, if it may be hit next; else a negative number.
 
     Two bodies that meet their stops at one instant, of which neither feels the other, are two
     instants to derivatives: only what a blow brought together, or acts on what is landed upon,
@@ -284,7 +301,7 @@ def _closing(instant: _Instant, x: _Round, velocities: list[Scalar]) -> dict[int
 
 
 def _accounted(
-    instant: _Instant, arrival: Arrival, before: Any, pushed: list[tuple[Coordinate, Scalar]]
+    instant: _Instant, arrival: Arrival, before: State, pushed: list[tuple[Coordinate, Scalar]]
 ) -> Arrival:
     """With the energy that the impacts have lost: the work of each force at the mean velocity of
     its contact. A law that gains some ends the lane."""

@@ -6,13 +6,13 @@ faster, their speeds a geometric series in k, and end in rest after a finite tim
 brief.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
 
-from ..._types import Flag, Scalar
+from ..._types import Flag, Scalar, Scalars, State
 from ...lanes import pin, pin_flag
 from ...machine import added, forces, held_by, push_of, rubs, shares, struck_modes
 from .._arrival import Arrival
@@ -26,7 +26,7 @@ from .blow import Blow
 from .rest import allowed
 
 # A contact whose bodies leave each other with less than this share of the speed with which they
-# came stays closed while it is looked at what presses on it.
+# came stays closed while it is looked at what presses on it: a choice, far above rounding.
 _CLOSED = 1e-9
 
 
@@ -37,18 +37,19 @@ class Approach(NamedTuple):
     """Its rate by s."""
     growth: Scalar | None
     """That of the force on it; absent where nothing can rest."""
-    alone: Any
+    alone: SmoothMachine
     """The machine in its modes with the other bodies held that rest."""
 
 
 def settle(
     plan: Plan, lane: Lane, approaches: dict[int, Approach], taken: Flag, arrival: Arrival,
-    there: Any, met: Flag, blows: dict[int, Blow],
+    there: State, met: Flag, blows: dict[int, Blow],
 ) -> Arrival:  # fmt: skip
-    """The lane at rest on the stops whose impacts were the last before it.
+    """The arrival at rest on those stops whose impacts were the last ones.
 
-    **Arguments:** `approaches` of each coordinate; `there` is the state before the impacts, if any
-    are `met`, the arrival's that behind them.
+    **Arguments:** `approaches`, what the step knew of each coordinate; `taken`, whether the step is
+    taken; `arrival`, behind the impacts; `there`, the state before them; `met`, whether there were
+    any; `blows`, what they were to each coordinate.
     """
     contact = arrival.contact
     if contact is None:
@@ -71,7 +72,12 @@ def _held(
     plan: Plan, lane: Lane, taken: Flag, arrival: Arrival, rests: dict[int, Flag],
     blows: dict[int, Blow], waits: dict[int, Scalar],
 ) -> Arrival:  # fmt: skip
-    """The lane when the impacts are over, with those bodies held that come to rest."""
+    """The arrival when the impacts that never end are over, with those bodies held that come to
+    rest.
+
+    **Arguments:** `taken`, whether the step is taken; of each coordinate in `rests` whether it
+    comes to rest, in `blows` its impacts, in `waits` how long it takes (in s).
+    """
     s, state, time, contact = arrival.s, arrival.state, arrival.time, arrival.contact
     assert contact is not None
     wait = jnp.zeros_like(s)
@@ -110,7 +116,7 @@ def _held(
     return arrival.counting(events=events, rests=count, loss=loss)
 
 
-def _beyond_any(plan: Plan, state: Any) -> Flag:
+def _beyond_any(plan: Plan, state: State) -> Flag:
     """Whether a body is beyond a stop by more than rounding."""
     found, slack = jnp.zeros((), bool), rounding(plan.machine, state)
     for stop in plan.machine.stops:
@@ -120,14 +126,14 @@ def _beyond_any(plan: Plan, state: Any) -> Flag:
 
 
 def _without_rebounds(
-    plan: Plan, state: Any, modes: tuple[Scalar, ...], rests: dict[int, Flag],
+    plan: Plan, state: State, modes: Scalars, rests: dict[int, Flag],
     walls: dict[int, Scalar],
-) -> tuple[Any, Scalar]:  # fmt: skip
+) -> tuple[State, Scalar]:  # fmt: skip
     """The state without the rebounds of those bodies that come to rest, and without the friction
     that went with them: the weight of the hops that are left out rubs instead, while the body is
     held. And the energy that goes with the rebounds.
 
-    **Arguments:** the modes behind the impacts; the others as in `stilled`.
+    **Arguments:** `modes`, behind the impacts; `rests` and `walls` as in `stilled`.
     """
     machine, zero = plan.machine, jnp.zeros_like(modes[0])
     contact = [zero for _ in machine.coordinates]
@@ -149,12 +155,13 @@ def _without_rebounds(
 
 
 def stilled(
-    plan: Plan, state: Any, rests: dict[int, Flag], walls: dict[int, Scalar]
-) -> tuple[Any, Scalar]:
+    plan: Plan, state: State, rests: dict[int, Flag], walls: dict[int, Scalar]
+) -> tuple[State, Scalar]:
     """The state with those coordinates put on their stops that rest, without velocity, all at once;
     and the energy that goes with it.
 
-    **Arguments:** of each coordinate whether it rests, and the stop as in `Lane.contact`.
+    **Arguments:** of each coordinate in `rests` whether it does, in `walls` the stop as in
+    `Lane.contact`.
     """
     bodies = {k: plan.machine.coordinates[k] for k in rests}
     velocities = [body.velocity(state) for body in bodies.values()]
@@ -180,13 +187,13 @@ def stilled(
 
 def _ends(
     plan: Plan, lane: Lane, free: SmoothMachine, k: int, blow: Blow, speed: Scalar,
-    at: tuple[Scalar, Any], growth: Scalar | None = None,
+    at: tuple[Scalar, State], growth: Scalar | None = None,
 ) -> tuple[Flag, Scalar]:  # fmt: skip
     """Whether an impact is one of the endless last ones before rest, and the time they take.
 
-    **Arguments:** the machine with this body free; the number of its coordinate; the speed by s of
-    its rebound; s and a state of the impact; how fast the force on the body grows, where that is
-    known.
+    **Arguments:** `free`, the machine with this body free; `k`, the number of its coordinate;
+    `speed`, by s, of its rebound; `at`, s and a state of the impact; `growth`, how fast the force
+    on the body grows, where that is known.
     """
     (s, state), body = at, plan.machine.coordinates[k]
     sign, gap = plan.wall(k, blow.struck)
@@ -229,9 +236,13 @@ def _before_it_presses(
 
 
 def _broken(
-    plan: Plan, arrival: Arrival, there: Any, met: Flag, blows: dict[int, Blow]
-) -> tuple[Scalar, ...]:
-    """As in `Lane`, without the contacts that were struck or pulled apart by the impacts `met`."""
+    plan: Plan, arrival: Arrival, there: State, met: Flag, blows: dict[int, Blow]
+) -> Scalars:
+    """`Lane.contact` without those contacts that were struck or pulled apart by the impacts.
+
+    **Arguments:** `there`, the state before them; `met`, whether there were any; `blows`, what they
+    were to each coordinate.
+    """
     assert arrival.contact is not None
     contact, slack = list(arrival.contact), rounding(plan.machine, there)
     for k, blow in blows.items():
@@ -244,12 +255,15 @@ def _broken(
 
 def _together(
     plan: Plan, lane: Lane, arrival: Arrival, blows: dict[int, Blow],
-    contact: tuple[Scalar, ...],
+    contact: Scalars,
 ) -> tuple[dict[int, Flag], dict[int, Scalar]]:  # fmt: skip
     """Of each coordinate that was struck, whether it comes to rest, and the time that takes.
 
     What presses on a body may be another one that comes to rest on it at the same instant: which of
     them do is found by trying, those that rest being held while the others are looked at.
+
+    **Arguments:** `arrival`, behind the impacts; `blows`, what they were to each coordinate;
+    `contact`, the contacts that they left closed.
     """
     s, state = arrival.s, arrival.state
     free = in_modes(plan.machine, arrival.modes)

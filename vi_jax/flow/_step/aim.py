@@ -23,10 +23,11 @@ from .trial import Trial
 
 
 def aim_ahead(plan: Plan, lane: Lane, motion: Foreseen) -> Lane:
-    """The lane with its next step, where that is a free one, cut at the first event of `motion`.
+    """The lane with its next step cut at the first event of `motion`, of a method that knows the
+    motion before it takes a step (`Taylor`).
 
-    Of the events that `aim_at` looks for in the step then tried: stops and a clock in the state. It
-    lands on what it aims at.
+    Only steps that are not aimed already are cut, at stops and at a clock in the state; other
+    events are found by `aim_at`, once the step was tried.
     """
     limit = stop_gradient(jnp.asarray(plan.method.longest(plan.machine, lane.s, lane.state)))
     h = jnp.minimum(lane.attempt, motion.reach(limit))
@@ -81,14 +82,15 @@ def _foreseen(
 
 
 def aim_at(plan: Plan, lane: Lane, trial: Trial, foreseen: bool) -> tuple[Flag, Scalar, Scalar]:
-    """Whether to shorten the step, to what length, and at what it then aims.
+    """Whether a tried step has to be shortened to end at an event, to what length, and its target
+    (see `Lane.target`).
 
-    **Arguments:** whether the motion was known before the step (see `aim_ahead`); static.
+    **Arguments:** `foreseen`, whether the motion was known before the step (see `aim_ahead`);
+    static.
     """
     # What is found out here is only where to look.
     trial = trial._replace(
-        h=stop_gradient(trial.h),
-        seen=trial.seen._replace(paths=stop_gradient(trial.paths)),
+        h=stop_gradient(trial.h), seen=trial.seen._replace(paths=stop_gradient(trial.paths))
     )
     nothing = jnp.zeros_like(trial.good), trial.h, jnp.full_like(trial.h, FREE)
     if not trial.paths and not trial.crossings:
@@ -112,7 +114,7 @@ def at_a_turn(trial: Trial) -> Flag:
 
 
 class _Seen(NamedTuple):
-    """What a tried step says of what lies on its way."""
+    """What both ends of a tried step say of the events between them."""
 
     guards: list[Passed]
     courses: list[Course]
@@ -124,7 +126,10 @@ class _Seen(NamedTuple):
 
 
 def _met_something(plan: Plan, lane: Lane, trial: Trial, seen: _Seen, foreseen: bool) -> Flag:
-    """Whether `_aimed` has anything to say, or may have."""
+    """Whether a step may have met anything; if not, `_aimed` need not be evaluated.
+
+    **Arguments:** `seen`, what the step's ends say; `foreseen` as for `aim_at`.
+    """
     if any(path.leaves is not None for path in trial.paths):
         return jnp.ones_like(trial.good)
     met = trial.good & ((lane.target != FREE) & ~at_a_turn(trial) | seen.twice)
@@ -159,7 +164,7 @@ class _Goal(NamedTuple):
 
 
 def _aimed(plan: Plan, lane: Lane, trial: Trial, seen: _Seen) -> tuple[Flag, Scalar, Scalar]:
-    """As `aim_at`, of a step that met something."""
+    """What `aim_at` returns for a step that may have met something."""
     h, landed = trial.h, jnp.zeros_like(trial.good)
     for c in trial.crossings:
         landed = landed | c.landed
@@ -188,7 +193,7 @@ def _aimed(plan: Plan, lane: Lane, trial: Trial, seen: _Seen) -> tuple[Flag, Sca
 
 
 def _seen(plan: Plan, lane: Lane, trial: Trial) -> _Seen:
-    """What a tried step says, by its ends."""
+    """What both ends of a tried step say of the events between them."""
     h, good, guards, courses, humps = trial.h, trial.good, [], [], []
     for c in trial.crossings:
         guards.append((c, good & beyond(c), partial(quintic, c.begin, c.end, h)))

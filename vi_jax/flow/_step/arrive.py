@@ -1,13 +1,12 @@
 """Where a step leads: rebounds, rest, changes of mode, and what is recorded of the way."""
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
 
-from ..._types import Flag, Scalar
+from ..._types import Flag, Scalar, State
 from ...machine import section_number, struck_modes
 from .._arrival import Arrival, Onward, Tally
 from .._contact.impact import is_compound, strike
@@ -27,7 +26,8 @@ from .trial import Trial
 
 
 def arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Flag]:
-    """The lane where the step leads, its record kept, and whether the interval is complete."""
+    """The lane after a step, with its event applied and recorded, and whether the interval is
+    complete. If the step is not `taken`, the lane stays what it was."""
     old = lane.record
     direction = []
     for k, along in enumerate(lane.direction):
@@ -82,8 +82,13 @@ def arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Fla
 def _met(
     plan: Plan, lane: Lane, trial: Trial, taken: Flag, way: FlowToEvent, arrival: Arrival
 ) -> Arrival:
-    """What the event makes of a step that met one: the last part of its way, and the jump. A step
-    lands on one event; what is met with it is met by the next."""
+    """The arrival after the event that the step landed on: first the last part of the way, then the
+    jump. A step lands on one event; another one at the same instant is landed upon by the next
+    step, which has no length.
+
+    **Arguments:** `taken`, whether the step is taken; `way`, the motion from the step's end on;
+    `arrival`, the step's end.
+    """
     landed = {c.number: c.landed for c in trial.crossings}
     if landed:
         offset = jnp.zeros_like(arrival.s)
@@ -118,8 +123,9 @@ def _met(
 
 
 def _at_fixed_clock(plan: Plan, lane: Lane, trial: Trial, arrival: Arrival) -> Arrival:
-    """The same place, its derivatives those at this reading of the clock rather than at an event
-    that comes sooner or later: so that the steps to come need none of `s`."""
+    """The same arrival with the derivatives that it has at a fixed reading of the clock. Behind an
+    event that a parameter makes come sooner or later, s has a derivative; it is carried over to the
+    state, so that the steps to come need none by `s`."""
     smooth = holding(plan.machine, arrival.modes, arrival.contact)
     bound = plan.end(lane.part)
     # The end of the interval may depend on what is differentiated by.
@@ -133,7 +139,11 @@ def _at_fixed_clock(plan: Plan, lane: Lane, trial: Trial, arrival: Arrival) -> A
 def _released(
     plan: Plan, lane: Lane, taken: Flag, arrival: Arrival, way: FlowToEvent, k: int, leaves: Release
 ) -> Arrival:
-    """Coordinate number k free again."""
+    """The arrival with coordinate number k free, where the step ended at its release.
+
+    **Arguments:** `taken`, whether the step is taken; `way`, the motion from the step's end on;
+    `leaves`, where the body leaves its stop.
+    """
     contact = arrival.contact
     assert contact is not None
     free, offset = leaves.landed, stop_gradient(leaves.offset)
@@ -161,12 +171,16 @@ def _released(
     )
 
 
-def _put(values: tuple, k: int, value: Any) -> tuple:
+def _put(values: tuple, k: int, value: Scalar) -> tuple:
     return (*values[:k], value, *values[k + 1 :])
 
 
 def _offset(plan: Plan, lane: Lane, trial: Trial, way: FlowToEvent, c: Crossing) -> Scalar:
-    """To the event from the step's end."""
+    """How far in s the event is from the step's end, with the derivatives of the time at which it
+    is met; 0 in value where the step landed on another.
+
+    **Arguments:** `way`, the motion from the step's end on; `c`, the event.
+    """
     # Of a motion so flat that the event's place is known worse than its surface, it is here.
     near = c.landed & (jnp.abs(c.offset) <= furthest_landing(trial.h))
     offset = stop_gradient(jnp.where(near, c.offset, 0.0))
@@ -180,9 +194,13 @@ def _offset(plan: Plan, lane: Lane, trial: Trial, way: FlowToEvent, c: Crossing)
 
 def _impact(
     plan: Plan, lane: Lane, trial: Trial, taken: Flag, arrival: Arrival,
-    landed: dict[int, Flag], there: Any,
+    landed: dict[int, Flag], there: State,
 ) -> Arrival:  # fmt: skip
-    """The rebound from a stop in `there`, the state of the impact; or coming to rest on it."""
+    """The arrival after the rebound from a stop, or at rest on it.
+
+    **Arguments:** `taken`, whether the step is taken; `landed`, whether the step landed on the
+    event of each number; `there`, the state in which the stop is met.
+    """
     machine, stops = plan.machine, range(len(plan.machine.stops))
     landed = {number: landed[number] for number in stops}
     arrival, blows = strike(plan, taken, arrival, landed, there)
@@ -226,7 +244,12 @@ def _impact(
 def _reached(
     plan: Plan, lane: Lane, trial: Trial, taken: Flag, way: FlowToEvent, arrival: Arrival
 ) -> tuple[Scalar | None, Scalar | None, Scalar | None]:
-    """Greatest and smallest Y so far, and the smallest distance at a turn that met no stop."""
+    """Greatest and smallest Y so far in this interval, and the smallest distance to a stop at a
+    turning point; each `None` if it is not recorded.
+
+    **Arguments:** `taken`, whether the step is taken; `way`, the motion from the step's end on;
+    `arrival`, where the step leads.
+    """
     record = lane.record
     y_max, y_min, clearance = record.y_max, record.y_min, record.clearance
     if y_max is None or y_min is None or not trial.paths:
@@ -247,7 +270,8 @@ def _reached(
 
 
 def _top(trial: Trial, k: int, way: FlowToEvent) -> Scalar:
-    """Coordinate number k at the turning point that a step was aimed at, or else at its end."""
+    """The position of coordinate number k at the turning point that the step was aimed at; else
+    where the step ends."""
     path = trial.paths[k]
     end: Rates = stop_gradient(path.end)
     bend = jnp.where(end.a == 0, 1.0, end.a)

@@ -1,11 +1,11 @@
 """Why a lane ends before its time: by what its steps come to, or by an event that has no answer."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax.lax import stop_gradient
 
-from ..._types import Flag, Scalar
+from ..._types import Flag, Scalar, State
 from ...machine import AbstractMachine, events_of, guard_of
 from .. import results
 from .._lane import FREE, Lane, Plan, Record, to_event, total
@@ -14,10 +14,10 @@ from ..smooth import in_modes
 from .trial import Trial
 
 # A lane that has aimed this often without landing is lost; after so many impacts in one interval
-# it was chattering.
+# it was chattering. Both are choices: a smooth flow needs two or three aims.
 _LOST, _MANY = 64.0, 16.0
 
-# Nothing that a lane could do in one interval takes so many steps.
+# Nothing that a lane could do in one interval takes so many steps; a power of two, by choice.
 _STUCK = 65536.0
 
 
@@ -38,11 +38,11 @@ class Progress(NamedTuple):
 
 def faults(
     plan: Plan, lane: Lane, trial: Trial, rejected: Flag, progress: Progress, target: Scalar
-) -> list[tuple[Flag, Any]]:
+) -> list[tuple[Flag, Scalar | float]]:
     """What ends a lane, the first that holds being the reason.
 
-    **Arguments:** whether the trial was rejected; the lane's progress, and what it aims at, after
-    it.
+    **Arguments:** `rejected`, whether the trial was; `progress` and `target`, how far the lane has
+    come and what it aims at, after the trial.
 
     **Returns:** pairs of a condition and a reason, a code of `RESULTS`.
     """
@@ -94,18 +94,18 @@ def may_end(machine: AbstractMachine) -> bool:
 
 
 def comes_back(
-    machine: AbstractMachine, i: int, modes: tuple, s: Scalar, state: Any
+    machine: AbstractMachine, i: int, modes: tuple, s: Scalar, state: State
 ) -> Flag | None:
     """Whether the field behind a switch points back at its surface, as that before it did: the
     motion would slide along it. `None` for a kind of switch whose motion cannot.
 
-    **Arguments:** the number of the event; the modes, s and the state behind it.
+    **Arguments:** `i`, the number of the event; `modes`, `s` and `state` behind it.
     """
     if not events_of(machine)[i].may_slide:
         return None
     smooth = in_modes(machine, modes)
 
-    def guard(s: Scalar, state: Any) -> Scalar:
+    def guard(s: Scalar, state: State) -> Scalar:
         return guard_of(machine, i, s, state, modes)
 
     here = stop_gradient(guard_rates(smooth.field, guard, s, state))

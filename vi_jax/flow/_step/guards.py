@@ -6,15 +6,15 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax.lax import stop_gradient
 
-from ..._types import Flag, Scalar
+from ..._types import Flag, Scalar, Scalars, State
 from ...lanes import pin_flag
 from ...machine import AbstractEvent, AbstractMachine, events_of, guard_of, section_number
 from .._lane import Lane, Plan, to_event
 from ..events import Rates, guard_rates, landing
-from ..smooth import exact
+from ..smooth import SmoothMachine, exact
 
 # Newton's method on a smooth flow needs two or three aims. Where rounding keeps it from gaining
-# more, a lane that has aimed this often accepts a thousand times the tolerance.
+# more, a lane that has aimed this often (a choice) accepts a thousand times the tolerance.
 _PATIENCE = 12.0
 
 
@@ -26,7 +26,7 @@ class Crossing(NamedTuple):
     """Its place among the machine's events."""
     begin: Rates
     end: Rates
-    scale: Any
+    scale: Scalar
     """Of g, for its rounding."""
     coordinate: int | None = None
     """That it limits, as stops do."""
@@ -48,12 +48,14 @@ class Crossing(NamedTuple):
 
 
 def crossings(
-    plan: Plan, lane: Lane, holding: Any, paths: list[Any], there: tuple, ends: tuple[Flag, Flag]
-) -> tuple[tuple[Crossing, ...], tuple[Scalar, ...]]:
+    plan: Plan, lane: Lane, holding: SmoothMachine, paths: list[Any], there: tuple,
+    ends: tuple[Flag, Flag],
+) -> tuple[tuple[Crossing, ...], Scalars]:  # fmt: skip
     """The events that a step saw, and `Lane.below` at its end.
 
-    **Arguments:** the machine as the step saw it; what it saw of each coordinate; s, its length and
-    the state at its end; whether it was good, and whether it ends an interval.
+    **Arguments:** `holding`, the machine as the step saw it; `paths`, what the step saw of each
+    coordinate; `there`, s at its end, its length and the state at its end; `ends`, whether it was
+    good, and whether it ends an interval.
     """
     machine, (s1, h, new), (good, last) = plan.machine, there, ends
     others, below = _others(plan, lane, holding, s1, new)
@@ -67,7 +69,7 @@ def crossings(
 
 
 def at_stops(machine: AbstractMachine, ends: list[tuple[Rates, Rates]]) -> list[Crossing]:
-    """Of the stops, from the rates of each coordinate at both ends of a step."""
+    """The stops as a step sees them, from the rates of each coordinate where it begins and ends."""
     found = []
     for i, stop in enumerate(machine.stops):
         begin, end = (x.scaled(stop.sign, stop.gap) for x in ends[stop.coordinate])
@@ -76,13 +78,17 @@ def at_stops(machine: AbstractMachine, ends: list[tuple[Rates, Rates]]) -> list[
 
 
 def _others(
-    plan: Plan, lane: Lane, moving: Any, s1: Scalar, new: Any
-) -> tuple[list[Crossing], tuple[Scalar, ...]]:
-    """Of the events besides stops, and of a clock in the state, which counts the cycles; and
-    `Lane.below` at the step's end."""
+    plan: Plan, lane: Lane, moving: SmoothMachine, s1: Scalar, new: State
+) -> tuple[list[Crossing], Scalars]:
+    """The events besides stops as a step sees them, with that of a clock in the state, which counts
+    the cycles; and `Lane.below` at the step's end.
+
+    **Arguments:** `moving`, the machine as the step saw it; `s1` and `new`, s and the state at its
+    end.
+    """
     machine, found, below = plan.machine, [], []
 
-    def ends(guard: Callable[[Scalar, Any], Any]) -> tuple[Rates, Rates]:
+    def ends(guard: Callable[[Scalar, State], Scalar]) -> tuple[Rates, Rates]:
         begin = guard_rates(moving.field, guard, lane.s, lane.state)
         return begin, guard_rates(moving.field, guard, s1, new)
 
@@ -105,8 +111,13 @@ def _others(
 def _from_below(
     below: Scalar, begin: Rates, end: Rates, scale: Scalar
 ) -> tuple[Rates, Rates, Scalar]:
-    """The rates of a guard that counts only once it has been below zero, where one that begins on
-    its surface and falls already is; and whether it has been at the step's end."""
+    """A guard that counts only once it has been below zero: its rates where the step begins and
+    ends, those of a constant -1 as long as it does not count; and `Lane.below` at the step's end.
+    One that begins at zero and falls counts.
+
+    **Arguments:** `below`, as in `Lane`; the guard's rates; `scale`, its size, by which rounding is
+    judged.
+    """
     # On it is also what a search's step left so close to it: a cycle is no shorter.
     rounding = float(jnp.finfo(end.x.dtype).eps) ** 0.5 * scale
     here = stop_gradient(begin)
@@ -133,10 +144,13 @@ def beyond(event: Crossing) -> Flag:
 def _seen(
     lane: Lane, ends: Flag, good: Flag, h: Scalar, guard: Crossing, all_of_them: list[Crossing]
 ) -> Crossing:
-    """Whether a step that was aimed at this event met it.
+    """The event, with whether a step that was aimed at it landed on it, or has to be aimed again.
 
     A step that ends an interval as it meets a stop, to rounding, is aimed at it: an impact on the
     section belongs to the cycle that ends there, so that it is not now in one, now in the next.
+
+    **Arguments:** `ends`, whether the step was good and ends an interval; `good`, whether it was
+    good; `h`, its length; `guard`, the event; `all_of_them`, all events that the step saw.
     """
     end = guard.end
     aimed = good & (lane.target == to_event(guard.number))

@@ -1,11 +1,9 @@
 """What an event that is no impact makes of a lane."""
 
-from typing import Any
-
 import jax.numpy as jnp
 from jax.lax import stop_gradient
 
-from ..._types import Flag, Scalar
+from ..._types import Flag, Scalar, Scalars, State
 from ...machine import after_event, guard_of, happens_at, mode_number, value_of
 from .. import results
 from .._arrival import Arrival, ended
@@ -23,10 +21,14 @@ _JUMPED = 1e-9
 
 
 def happened(
-    plan: Plan, taken: Flag, arrival: Arrival, c: Crossing, there: Any
+    plan: Plan, taken: Flag, arrival: Arrival, c: Crossing, there: State
 ) -> tuple[Arrival, Flag]:
-    """State and modes after an event in the state `there` that is no impact; and whether it
-    happens where its guard has risen."""
+    """The arrival after an event that is no impact: a switch, a reset or another kind; and whether
+    the event happens where its guard has risen.
+
+    **Arguments:** `taken`, whether the step is taken; `c`, the event; `there`, the state in which
+    it is met.
+    """
     machine, event = plan.machine, c.event
     met = machine, c.number, arrival.s, there, arrival.modes
     when = happens_at(*met)
@@ -64,7 +66,7 @@ def happened(
 
 def _switched(
     plan: Plan, arrival: Arrival, taken: Flag, when: Flag,
-    before: tuple[Crossing, Any, tuple[Scalar, ...]],
+    before: tuple[Crossing, State, Scalars],
 ) -> Arrival:  # fmt: skip
     """With the modes of those switches changed whose guard has jumped above zero with an event, as
     that of friction does that held a pull which is another one now: it has no place where it
@@ -94,7 +96,7 @@ def _switched(
 
 def let_go(
     plan: Plan, arrival: Arrival, taken: Flag, when: Flag,
-    before: tuple[Any, tuple[Scalar, ...]], resting: tuple[Scalar, ...] | None = None,
+    before: tuple[State, Scalars], resting: Scalars | None = None,
 ) -> Arrival:  # fmt: skip
     """With those bodies free that were pressed on their stops before an event, and are pulled away
     behind it: a force that jumps has no place where it passes zero.
@@ -109,7 +111,7 @@ def let_go(
     freed, direction, events = list(contact), list(arrival.direction), arrival.tally.events
     for k in sorted({stop.coordinate for stop in machine.stops}):
 
-        def pressing(modes: tuple[Scalar, ...], state: Any, k: int = k) -> Scalar:
+        def pressing(modes: Scalars, state: State, k: int = k) -> Scalar:
             free = holding(machine, modes, contact, but=k)
             return rates(free.field, machine.coordinates[k].position, arrival.s, state).a
 
@@ -127,10 +129,14 @@ def let_go(
 
 
 def _jumped(
-    plan: Plan, arrival: Arrival, c: Crossing, happens: Flag, there: Any, new: Any
+    plan: Plan, arrival: Arrival, c: Crossing, happens: Flag, there: State, new: State
 ) -> Arrival:
-    """Which way the motion goes on after a jump of the state, and what of it rests still; a lane
-    that was put beyond a stop ends."""
+    """The arrival after a jump of the state: which way the motion goes on, and which bodies still
+    rest. A lane whose body was put beyond a stop ends.
+
+    **Arguments:** `c`, the event; `happens`, whether it did; `there` and `new`, the states before
+    and after it.
+    """
     beyond = jnp.zeros_like(happens)
     for stop in plan.machine.stops:
         place = plan.machine.coordinates[stop.coordinate].position(new)

@@ -8,17 +8,18 @@ from .._lane import Lane
 from .guards import Crossing
 from .trial import Path
 
-# A hump of a guard this close to an end of a step (as a share of it) is seen from there.
+# A hump of a guard this close to an end of a step (as a share of it) is seen from there: a choice.
 _BRIEF = 1e-3
 
 
 def _corner(
     begin: tuple[Scalar, Scalar], end: tuple[Scalar, Scalar], h: Scalar, bent: Flag
 ) -> tuple[Scalar, Scalar, Scalar]:
-    """How far from its begin the tangents at both ends of a step meet, and how high: no curve that
-    is bent one way goes beyond. And where it is greatest, if its slope changes evenly.
+    """Where the tangents at both ends of a step meet, from its begin on, and how high: no curve
+    that is bent one way goes beyond. And where the curve is greatest, if its slope changes evenly.
 
-    **Arguments:** value and slope at either end; the step's length; where it is bent.
+    **Arguments:** `begin` and `end`, value and slope there; `h`, the step's length; `bent`, where
+    the curve is bent.
     """
     (x0, v0), (x1, v1) = begin, end
     fall = jnp.where(bent, v0 - v1, 1.0)

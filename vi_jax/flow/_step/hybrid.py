@@ -14,12 +14,12 @@ they are those at a fixed reading of the clock, so that the steps to come carry 
 """
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax.lax import stop_gradient
 
-from ..._types import Flag, Scalar
+from ..._types import Flag, Scalar, State
 from ...lanes import pin_flag
 from .._arrival import Onward
 from .._lane import FREE, Lane, Plan, Record, select
@@ -37,7 +37,7 @@ class Step(NamedTuple):
     lane: Lane
     completed: Flag
     """Whether an interval ended with it."""
-    state: Any
+    state: State
     record: Record
     """Of that interval."""
 
@@ -85,8 +85,12 @@ def iterate(plan: Plan, lane: Lane) -> Step:
 
 
 def _onward(plan: Plan, there: Lane, completed: Flag, done: Scalar) -> Lane:
-    """The lane as its next interval begins, where one was completed, and its next cycle, where the
-    last of one was; so many are done."""
+    """The lane as its next interval begins, where one was completed; and as its next cycle begins,
+    where that was the cycle's last.
+
+    **Arguments:** `there`, the lane after the step; `completed`, whether it completed an interval;
+    `done`, how many are complete.
+    """
     turned, part, state = completed, there.part, there.state
     if plan.parts > 1:
         part = part + jnp.where(completed, 1.0, 0.0)
@@ -106,7 +110,11 @@ def _onward(plan: Plan, there: Lane, completed: Flag, done: Scalar) -> Lane:
 
 
 def _resized(plan: Plan, lane: Lane, trial: Trial, taken: Flag, rejected: Flag) -> Scalar:
-    """The length proposed for the next ordinary step."""
+    """The length proposed for the next ordinary step.
+
+    **Arguments:** `taken` and `rejected`, whether the step was; one that is to be shortened to an
+    event was neither.
+    """
     if not plan.method.adaptive:
         return lane.length
     h = stop_gradient(trial.h)

@@ -1,11 +1,9 @@
 """How a motion goes on behind a state that was put in place of another."""
 
-from typing import Any
-
 import jax.numpy as jnp
 from jax.lax import stop_gradient
 
-from ..._types import Flag, Scalar
+from ..._types import Flag, Scalar, Scalars, State
 from ...machine import guard_of
 from .._arrival import Arrival, Onward
 from .._lane import Plan
@@ -15,17 +13,17 @@ from .guards import Crossing
 
 
 def after_jump(
-    plan: Plan, onward: Onward, when: Flag, old: Any, new: Any, s: Scalar
-) -> tuple[tuple[Scalar, ...], tuple[Scalar, ...] | None]:
-    """Which way the motion goes on, where a state was put in place of another, and what of it still
-    rests: only what was not moved.
+    plan: Plan, onward: Onward, when: Flag, old: State, new: State, s: Scalar
+) -> tuple[Scalars, Scalars | None]:
+    """The directions of all coordinates, and the stops rested on, after the state was replaced by
+    another one. What was moved rests no longer.
 
-    **Arguments:** how the motion went on (direction and contact are returned); where the state is
-    another one; the states before and after, and s.
+    **Arguments:** `onward`, how the motion went on before; `when`, where the state is replaced;
+    `old` and `new`, the states before and after.
     """
     direction, contact, modes, _ = onward
-    directions: list[Any] = list(direction)
-    contacts: list[Any] = list(contact or ())
+    directions: list[Scalar] = list(direction)
+    contacts: list[Scalar] = list(contact or ())
     slack = rounding(plan.machine, new)
     for k, coordinate in enumerate(plan.machine.coordinates):
         (place, before), (there, after) = (
@@ -47,9 +45,7 @@ def after_jump(
     return tuple(directions), contact
 
 
-def disarmed(
-    plan: Plan, arrival: Arrival, when: Flag, before: tuple[Any, tuple[Scalar, ...]]
-) -> Arrival:
+def disarmed(plan: Plan, arrival: Arrival, when: Flag, before: tuple[State, Scalars]) -> Arrival:
     """With those guards to come from below anew (see `Lane.below`) that a jump of the state has put
     on their surface or beyond. Those that it did not change stay as they are: what they belong to
     may happen at the same instant.

@@ -6,27 +6,28 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax.lax import stop_gradient
 
-from ..._types import Flag, Scalar
+from ..._types import Flag, Scalar, Scalars
 from ...machine import RigidStop, horner
 from .._lane import Lane, Plan, select, to_event, to_turn_of
 from ..events import Rates, highest, rising_root, slope
 from .guards import Crossing
 
 # Coefficients in θ, which goes from 0 to 1 along a step.
-Curve = tuple[Scalar, ...]
+Curve = Scalars
 
 # An event, whether a step ends beyond it, and its guard along the step; of a coordinate whether it
 # turned within the step, and itself along it. Curves are asked for only where something is met.
 Passed = tuple[Crossing, Flag, Callable[[], Curve]]
 Course = tuple[Flag, Callable[[], Curve]]
 
-# Turning points this far inside the gap (unit: a) are passed by where only impacts matter.
+# Turning points this far inside the gap (unit: a) are passed by where only impacts matter. A
+# choice: the quintic through a step's ends has to be right to this.
 _MARGIN = 0.02
 
 # By so much a bound is wider, for what rounding makes of it.
 _WIDER = 1.001
 
-# A turn whose velocity is known no better than to this share of that at the step's ends.
+# A turn whose velocity is known no better than to this share of that at the step's ends: a choice.
 _UNCERTAIN = 1e-3
 
 
@@ -43,18 +44,14 @@ class First(NamedTuple):
 
 
 def first_event(
-    plan: Plan,
-    lane: Lane,
-    guards: list[Passed],
-    courses: list[Course],
-    met: Flag,
-    corrections: int,
+    plan: Plan, lane: Lane, guards: list[Passed], courses: list[Course], met: Flag, corrections: int
 ) -> First:
     """The first event of a step.
 
-    **Arguments:** what is known of the events and of each coordinate, not none of either; whether
-    an event was met that the step was aimed at; how often a root is corrected, which a motion's own
-    polynomial is worth: one through a step's ends only says where to aim.
+    **Arguments:** `guards` and `courses`, what is known of the events and of each coordinate, not
+    both empty; `met`, whether the step landed on an event that it was aimed at; `corrections`, how
+    often a root is corrected: a motion's own polynomial is worth it, one through a step's ends only
+    says where to aim.
     """
     found, crossed, any_turn = [], jnp.zeros_like(met), jnp.zeros_like(met)
     for guard, over, curve in guards:
@@ -96,11 +93,11 @@ def first_event(
 
 
 def _earliest(lane: Lane, found: list[tuple]) -> tuple[Scalar, Curve, Flag | None]:
-    """Of the earliest of these its target, what rises through zero there, and whether that is where
-    the step begins.
+    """The earliest of what a step met: its target, the curve that rises through zero there, and
+    whether that is where the step begins (`None` if it cannot be).
 
-    **Arguments:** of each, before these three, its place: infinite if it was not met, below zero
-    for what comes before any event.
+    **Arguments:** `found`, of each of these before the three its place: infinite if it was not met,
+    below zero if it comes before any event.
     """
     (soonest, target, curve, at_once), *others = found
     target = jnp.full_like(lane.s, target)
@@ -141,8 +138,12 @@ def _root(curve: Curve, corrections: int) -> tuple[Scalar, Flag | None]:
 
 
 def may_matter(plan: Plan, lane: Lane, k: int, begin: Rates, end: Rates, h: Scalar) -> Flag:
-    """Whether a turn of coordinate number k within a step may have to be met: by a bound, before
-    its place is known."""
+    """Whether a step may have to end at a turning point of coordinate number k: by a bound, before
+    the place of the turn is known.
+
+    **Arguments:** `begin` and `end`, the coordinate's rates at the ends of the step, `h` its
+    length.
+    """
 
     def bound(stop: RigidStop) -> Scalar:
         gap = stop_gradient(stop.gap)
@@ -154,8 +155,12 @@ def may_matter(plan: Plan, lane: Lane, k: int, begin: Rates, end: Rates, h: Scal
 def _has_to_be_met(
     plan: Plan, lane: Lane, k: int, depth: Callable[[RigidStop], Scalar], margin: float
 ) -> Flag:
-    """Whether a turn of coordinate number k that comes so far beyond its stops has to be met: if
-    not every one has, then only one close to a stop."""
+    """Whether a step has to end at a turning point of coordinate number k: at each one (see
+    `Plan.meets_turns`), or if it is close to a stop.
+
+    **Arguments:** `depth`, how far the turn is beyond a stop; `margin`, how far short of a stop is
+    close.
+    """
     everything = plan.meets_turns(lane.done)
     if everything is True:
         return jnp.ones_like(lane.s, bool)

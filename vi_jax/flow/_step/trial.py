@@ -1,12 +1,12 @@
 """A step that is tried, and what it meets on its way."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.lax import stop_gradient
 
-from ..._types import Flag, Scalar
+from ..._types import Flag, Scalar, Scalars, State
 from ...lanes import pin, pin_flag
 from .._contact.rest import Release, release
 from .._lane import FREE, Lane, Plan, to_event, to_turn_of, total
@@ -16,12 +16,13 @@ from ..methods import Foreseen
 from ..smooth import SmoothMachine, exact, holding
 from .guards import Crossing, crossings, leniency, turn_tolerance
 
-# A window of force shorter than this share of the longest step moves the body by its third power.
+# A window of force shorter than this share of the longest step moves the body by its third power,
+# 1e-9 of what a whole step does.
 _SLIVER = 1e-3
 
 
 class Path(NamedTuple):
-    """What a step saw of a coordinate."""
+    """What a step shows of one coordinate."""
 
     begin: Rates
     end: Rates
@@ -38,19 +39,19 @@ class End(NamedTuple):
     """Independent variable, state and elapsed time where a step ends."""
 
     s: Scalar
-    state: Any
+    state: State
     time: Beside | None
     """Elapsed time and integrals, where they are recorded."""
 
 
 class Seen(NamedTuple):
-    """What a step came by."""
+    """What a step shows of events and coordinates."""
 
     crossings: tuple[Crossing, ...]
     """The machine's events."""
     paths: tuple[Path, ...]
     """Of each coordinate; none where nothing asks for it."""
-    below: tuple[Scalar, ...]
+    below: Scalars
     """As in `Lane`, at the step's end."""
 
 
@@ -78,7 +79,7 @@ class Trial(NamedTuple):
         return self.end.s
 
     @property
-    def state(self) -> Any:
+    def state(self) -> State:
         """The state where the step ends."""
         return self.end.state
 
@@ -105,7 +106,11 @@ def timing(plan: Plan, lane: Lane) -> Beside | None:
 def attempt(
     plan: Plan, lane: Lane, active: Flag, smooth: SmoothMachine, motion: Foreseen | None
 ) -> Trial:
-    """Try the next step and see what it meets; of length zero for a lane that has ended."""
+    """Try the next step and see what it meets; of length zero for a lane that has ended.
+
+    **Arguments:** `active`, whether the lane goes on; `smooth`, the machine in its modes with those
+    bodies held that rest; `motion`, that ahead, of a method that knows it; else `None`.
+    """
     machine, method = plan.machine, plan.method
     free = lane.target == FREE
     bound = plan.end(lane.part)
@@ -159,7 +164,12 @@ def _path(
     there: tuple,
     good: Flag,
 ) -> Path:
-    """What a step that ends `there` saw of coordinate number k."""
+    """What a step shows of coordinate number k.
+
+    **Arguments:** `free`, the machine with this body free and the others held that rest; `smooth`,
+    the machine that the step was taken with; `there`, s and state at the step's end, its length and
+    the longest length; `good`, whether the step was.
+    """
     s1, new, h, limit = there
     position = plan.machine.coordinates[k].position
     begin = rates(free.field, position, lane.s, lane.state)

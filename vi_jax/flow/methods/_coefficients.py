@@ -44,7 +44,11 @@ def scaled(c: float, a: Coefficient) -> Coefficient:
 def convolution(
     a: Series, b: Series, n: int, begin: int = 0, weight: Callable[[int], float] | None = None
 ) -> Coefficient:
-    """Σ weight(j) a_j b_{n-j} over j from `begin` to n."""
+    """The n-th coefficient of a product of two series, or a part of that sum: Σ weight(j) a_j
+    b_{n-j} over j from `begin` to n.
+
+    **Arguments:** `weight`, 1 if left out.
+    """
     terms = []
     # What is known longest comes first: only the last products wait for the newest coefficients.
     for j in sorted(range(begin, n + 1), key=lambda j: max(j, n - j)):

@@ -15,24 +15,27 @@ from ..._types import Scalar
 
 Vector = Float[Array, " n"]
 
-# Newton's steps after which a stage is given up, so that the step is tried again shorter.
+# Newton's steps after which a stage is given up, so that the step is tried again shorter: a choice.
 _MOST = 12
 
 
 def implicit_stages(
     tableau: Any,
-    field: Callable[[Any, Vector], Vector],
-    s0: Any,
-    h: Any,
+    field: Callable[[Scalar, Vector], Vector],
+    s0: Scalar,
+    h: Scalar,
     y0: Vector,
-    tolerance: Any,
-) -> tuple[list[Vector], Any]:
+    tolerance: Scalar | float,
+) -> tuple[list[Vector], Scalar]:
     """The slopes of all stages, and what the last steps of Newton's method still changed.
 
     All stages share one matrix 1 - hγJ, with the Jacobian at the start of the step (Kværnø, BIT
     Numerical Mathematics 44, 2004). Each is solved to `tolerance` relative to 1 + |y|; where that
     fails what is left is infinite. Derivatives are those of the solution, by the implicit function
     theorem.
+
+    **Arguments:** `tableau`, diffrax's Butcher tableau; `field`, dy/ds; `s0`, `h` and `y0`, where
+    the step begins, its length and the state, flattened.
     """
     gamma = float(tableau.a_diagonal[-1])
     still = stop_gradient((s0, y0))
@@ -43,10 +46,10 @@ def implicit_stages(
         base = y0 + h * weighted(row, stages)
         s = s0 + float(c) * h
 
-        def lacks(k: Vector, s: Any = s, base: Any = base) -> Vector:
+        def lacks(k: Vector, s: Scalar = s, base: Vector = base) -> Vector:
             return k - field(s, base + h * gamma * k)
 
-        def solve(lacks: Any, k: Vector) -> tuple[Vector, Scalar]:
+        def solve(lacks: Callable[[Vector], Vector], k: Vector) -> tuple[Vector, Scalar]:
             def goes_on(carry):
                 _, size, i = carry
                 return (size > tolerance) & (i < _MOST)
@@ -105,7 +108,8 @@ def inverse_of(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 
 def _tangent(linear: Callable[[Vector], Vector], right: Vector) -> Vector:
-    """What a linear function makes `right` of."""
+    """The solution of a linear equation, the function given and the right side: how `custom_root`
+    carries derivatives over."""
     unit = jnp.eye(right.size, dtype=right.dtype)
     columns = jnp.stack([linear(unit[i]) for i in range(right.size)], axis=1)
     return dot(inverse_of(columns), right)

@@ -1,5 +1,12 @@
 """The next coefficient of each primitive's result, from those known: a sum, a convolution, or a
 recurrence of the kind e' = a' e.
+
+Each rule returns the n-th coefficient of an equation's result, or a list of them where
+it has several results.
+
+**Arguments** of every rule: `eqn`, the equation of a jaxpr; `n`; `operands`, the series of what it
+takes, known up to n; `results`, those of its results, known before n; `extra`, a dictionary of its
+own that it keeps from one n to the next.
 """
 
 from collections.abc import Callable
@@ -102,7 +109,11 @@ def _quotient(eqn, n, operands, results, extra):
 
 
 def _power(series: Series, own: Series, p: float, n: int, first: Any, extra: dict) -> Coefficient:
-    """Of a^p: n a0 c_n = Σ (p j - (n - j)) a_j c_{n-j}."""
+    """The n-th coefficient c_n of a^p: n a0 c_n = Σ (p j - (n - j)) a_j c_{n-j}.
+
+    **Arguments:** `series`, a; `own`, the coefficients c before it; `first`, a^p of a number;
+    `extra`, what is kept from one n to the next.
+    """
     if n == 0:
         return first(series[0])
     total = convolution(series, own, n, 1, lambda j: (p * j - (n - j)) / n)
@@ -224,7 +235,7 @@ def _saturating(slope: Callable[[Any], Any], next_slope: Callable[[Series, int],
 
 
 def _chosen(eqn, n, operands, results, extra):
-    """max and min: one operand or the other, by their values where the step begins."""
+    """Of max and min: that of one operand, chosen by their values where the step begins."""
     a, b = operands
     if n == 0:
         extra["first"] = a[0] >= b[0] if eqn.primitive.name == "max" else a[0] <= b[0]

@@ -13,6 +13,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
+from ..._types import Scalar, Scalars, State
 from ...lanes import CALLS
 from ..events import Rates
 from ._coefficients import Coefficient, NoSeries, Series, nth, plus
@@ -20,8 +21,8 @@ from ._recurrences import RULES
 
 
 def expand(
-    field: Callable[[Any, Any], Any], s: Any, state: Any, order: int
-) -> tuple[Any, list[Any]]:
+    field: Callable[[Scalar, State], State], s: Scalar, state: State, order: int
+) -> tuple[Any, list[Series]]:
     """Coefficients of the solution of d(state)/ds = field(s, state) in powers of s - s0.
 
     **Arguments:** `order`, the last power.
@@ -46,8 +47,9 @@ def expand(
     return treedef, series
 
 
-def along(function: Callable[[Any], Any], treedef: Any, series: list[Series]) -> "Along":
-    """A scalar function of the state."""
+def along(function: Callable[[State], Scalar], treedef: Any, series: list[Series]) -> "Along":
+    """A scalar function of the state along a motion, as a power series; `treedef` and `series` as
+    from `expand`."""
 
     def flat(*leaves):
         return jtu.tree_leaves(function(jtu.tree_unflatten(treedef, leaves)))
@@ -57,7 +59,7 @@ def along(function: Callable[[Any], Any], treedef: Any, series: list[Series]) ->
     return Along([flow.next(n)[0] for n in range(len(series[0]))])
 
 
-def at(series: Series, h: Any) -> Any:
+def at(series: Series, h: Scalar) -> Coefficient:
     """The sum of a series, by Horner's rule."""
     total = None
     for c in reversed(series):
@@ -72,21 +74,21 @@ def _slope(series: Series) -> Series:
 
 
 class Along(NamedTuple):
-    """A number along a motion, by its series; a constant for differentiation."""
+    """A number along a motion, as a power series in s; a constant for differentiation."""
 
     series: Series
 
-    def ends(self, h: Any) -> tuple[Rates, Rates]:
+    def ends(self, h: Scalar) -> tuple[Rates, Rates]:
         """Its rates at both ends of a step of this length."""
         slope, zero = _slope(self.series), jnp.zeros_like(h)
         each = self.series, slope, _slope(slope)
 
-        def rates(place: Callable[[Series], Any]) -> Rates:
+        def rates(place: Callable[[Series], Coefficient]) -> Rates:
             return Rates(*(zero if (x := place(c)) is None else x for c in each))
 
         return rates(lambda c: c[0]), rates(lambda c: at(c, h))
 
-    def over(self, h: Any, factor: int = 1, offset: Any = None) -> tuple[Any, ...]:
+    def over(self, h: Scalar, factor: int = 1, offset: Scalar | None = None) -> Scalars:
         """Coefficients of factor·x - offset in θ, which goes from 0 to 1 along such a step."""
         found, power = [], None
         for c in self.series:
@@ -98,7 +100,8 @@ class Along(NamedTuple):
 
 
 class _Flow:
-    """A jaxpr evaluated coefficient by coefficient."""
+    """A jaxpr evaluated coefficient by coefficient: each of its equations keeps the series of its
+    operands and results."""
 
     def __init__(self, closed: ClosedJaxpr, inputs: list[Series]):
         self.env: dict[Any, Series] = {}

@@ -1,13 +1,14 @@
 """What the hybrid step asks of a method, which is an argument of every verb."""
 
 import abc
+from collections.abc import Callable
 from math import pi
 from typing import Any, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
 
-from ..._types import Scalar
+from ..._types import Scalar, State
 from ...machine import AbstractMachine
 from ..beside import Beside
 from ..smooth import SmoothMachine
@@ -18,11 +19,11 @@ from ._series import Along
 class Foreseen(Protocol):
     """A motion that is known before a step is taken."""
 
-    def at(self, h: Scalar) -> tuple[Any, Beside | None]:
+    def at(self, h: Scalar) -> tuple[State, Beside | None]:
         """State, and what is integrated beside it, a length h away."""
         ...
 
-    def of(self, function: Any) -> Along:
+    def of(self, function: Callable[[State], Any]) -> Along:
         """A scalar function of the state along it, as a power series."""
         ...
 
@@ -46,8 +47,8 @@ class AbstractMethod(eqx.Module):
 
     @property
     def wander(self) -> Any:
-        """How far the states of a motion that repeats differ from one period to the next (relative
-        to 1 + |state|): by rounding, written 0, where the steps are the same each time."""
+        """How far the states of a periodic motion may differ from one period to the next, relative
+        to 1 + |state|; 0 where only by rounding, as the steps are the same in each period."""
         return 0.0
 
     @property
@@ -59,7 +60,7 @@ class AbstractMethod(eqx.Module):
         """Raise a `ValueError` if this method cannot move `machine`."""
         return None
 
-    def longest(self, machine: AbstractMachine, s: Any, state: Any) -> Any:
+    def longest(self, machine: AbstractMachine, s: Scalar, state: State) -> Scalar | float:
         """The longest step from here.
 
         A method of so many steps in a drive cycle takes as many in a natural period, where that is
@@ -73,23 +74,20 @@ class AbstractMethod(eqx.Module):
 
     @abc.abstractmethod
     def step(
-        self,
-        smooth: SmoothMachine,
-        s0: Scalar,
-        s1: Scalar,
-        state: Any,
-        beside: Beside | None,
-    ) -> tuple[Any, Beside | None, Scalar]:
+        self, smooth: SmoothMachine, s0: Scalar, s1: Scalar, state: State, beside: Beside | None
+    ) -> tuple[State, Beside | None, Scalar]:
         """State, and what is integrated `beside` it, at `s1` from those at `s0`, and the step's
         error.
 
         The error is relative to the tolerance (a step is accepted up to 1); it is 0 for methods
-        that are not adaptive. `beside` is `None` unless averages, or the elapsed time of a machine
-        with a `pace`, are asked for; its rate is `rate_beside`.
+        that are not adaptive.
+
+        **Arguments:** `smooth`, the machine in its modes; `beside`, `None` unless averages, or the
+        elapsed time of a machine with a `pace`, are asked for; its rate is `rate_beside`.
         """
 
     def foresee(
-        self, smooth: SmoothMachine, s: Scalar, state: Any, beside: Beside | None
+        self, smooth: SmoothMachine, s: Scalar, state: State, beside: Beside | None
     ) -> Foreseen | None:
         """The motion from here, of a method that knows it before a step is taken (see `Taylor`): a
         step then ends at the first event on it, and is `Foreseen.at` instead of `step`."""

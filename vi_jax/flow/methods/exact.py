@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from math import factorial
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -11,7 +10,7 @@ import jax.tree_util as jtu
 from numpy.polynomial.legendre import leggauss
 
 from ..._checks import count
-from ..._types import Scalar
+from ..._types import Scalar, State
 from ...machine import (
     AbstractMachine,
     CosineCrank,
@@ -25,6 +24,8 @@ from ..beside import Beside, rate_beside
 from ..smooth import SmoothMachine
 from .base import AbstractMethod
 
+# Series of the cosine and of sin(x)/x in x²: on an arc, of up to 2π/5, the next term is below
+# 1e-16.
 _COS = tuple((-1) ** n / factorial(2 * n) for n in range(10))
 _SINC = tuple((-1) ** n / factorial(2 * n + 1) for n in range(10))
 # (e^x - 1)/x
@@ -74,7 +75,10 @@ class ExactFlight(AbstractMethod):
             raise ValueError(f"Method `ExactFlight` needs a {lack}. Use `Adaptive` or `FixedStep`.")
 
     def step(self, smooth, s0, s1, state, beside):
-        """The flight from `s0` to `s1`, exact to rounding; averages by quadrature along it."""
+        """The flight from `s0` to `s1`, exact to rounding; averages by quadrature along it.
+
+        **Arguments:** as `AbstractMethod.step`.
+        """
         machine = smooth.machine
         zeta, xi, in_phase = _numbers(machine)
         tau = (s1 - s0) / zeta if in_phase else s1 - s0
@@ -90,10 +94,14 @@ class ExactFlight(AbstractMethod):
 
 
 def _integrated(
-    smooth: SmoothMachine, s0: Scalar, s1: Scalar, state: Any, along: Callable, beside: Beside
+    smooth: SmoothMachine, s0: Scalar, s1: Scalar, state: State, along: Callable, beside: Beside
 ) -> Beside:
-    """Integrals beside a flight, which is known `along` the shares of its length; where a body is
-    held it stays in `state`."""
+    """Integrals beside a flight from `s0` to `s1`, by quadrature.
+
+    **Arguments:** `smooth`, the machine in its modes; `state`, where the flight begins, and where a
+    body that is held stays; `along`, the state of the flight at a share of its length; `beside`,
+    the integrals before.
+    """
     total = beside
     for node, weight in zip(_NODES, _WEIGHTS, strict=True):
         there = along(float(node))
@@ -133,11 +141,13 @@ def flight(
 ) -> tuple[Scalar, Scalar]:
     """Y and V after a time τ of free flight from (Y, V) at crank angle `phase`.
 
-    Dimensionless scalars; |τ| up to a fifth of the shorter of the periods 2π and 2π/ζ, less
-    under strong damping (|ξτ| ≤ 0.4π). Paper, Eq. 14, here with damping.
+    Dimensionless scalars; |τ| up to a fifth of the shorter of the periods 2π and 2π/ζ, less under
+    strong damping (|ξτ| ≤ 0.4π). Paper, Eq. 14, here with damping.
 
     What is summed are changes, each of the order of τ: the rounding of a short flight is that of
     its own length, as it has to be where a body leaves the stop by less than its position rounds.
+
+    **Arguments:** `zeta` and `xi`, ζ and ξ; `phase` in radians.
     """
     # C = cos(ω_d τ) and S = sin(ω_d τ)/ω_d are entire in ω_d² = 1 - ξ², whatever its sign.
     square = (1 - xi * xi) * tau * tau
@@ -190,12 +200,13 @@ def _minus(a, b):
 
 
 def _from_rest(zeta, xi, begin, turn, tau):
-    """Response from rest at a phase whose (cos, sin) is `begin` and changes by `turn`, near
-    resonance only.
+    """Y and V at a time `tau` after a start from rest, near resonance only.
 
-    With p = -ξ + iω_d it is Re{[τ e^{pτ} E(w) e^{iφ0} - (e^{iφ1} - e^{p̄τ} e^{iφ0})/(iζ - p̄)]
-    / (2iω_d)}, w = (iζ - p)τ, where E(w) = (e^w - 1)/w stays smooth through resonance. Complex
+    With p = -ξ + iω_d it is Re{[τ e^{pτ} E(w) e^{iφ0} - (e^{iφ1} - e^{p̄τ} e^{iφ0})/(iζ - p̄)] /
+    (2iω_d)}, w = (iζ - p)τ, where E(w) = (e^w - 1)/w stays smooth through resonance. Complex
     numbers are pairs, because pairs of floats fuse.
+
+    **Arguments:** `begin`, cosine and sine of the phase at the start; `turn`, their changes since.
     """
     omega = (1 - xi * xi) ** 0.5
     loss = _less_one(-xi * tau)

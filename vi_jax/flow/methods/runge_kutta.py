@@ -10,8 +10,9 @@ import jax.tree_util as jtu
 import numpy as np
 
 from ..._checks import count, require
+from ..._types import Scalar, State
 from ...lanes import pin
-from ..beside import rate_beside
+from ..beside import Beside, rate_beside
 from ..smooth import SmoothMachine
 from .base import AbstractMethod
 from .unrolled import Unrolled
@@ -23,6 +24,11 @@ def _unrolled(solver: Any) -> Unrolled:
 
 
 def _runge_kutta(solver: Unrolled, smooth: SmoothMachine, s0, s1, state, beside):
+    """A step of the solver: state, what is integrated `beside` it, and the errors of both.
+
+    **Arguments:** as `AbstractMethod.step`.
+    """
+
     def field(s, y, args):
         state, beside = y
         return pin((smooth.field(s, state), rate_beside(smooth, s, state, beside)))
@@ -33,8 +39,9 @@ def _runge_kutta(solver: Unrolled, smooth: SmoothMachine, s0, s1, state, beside)
     return *y1, error
 
 
-def _told(state: Any, beside: Any) -> tuple[Any, Any]:
-    """What sizes a step: the state and the integrals, but not the elapsed time."""
+def _sized_by(state: State, beside: Beside | None) -> tuple[State, dict[str, Scalar] | None]:
+    """What the size of a step is chosen by: the state and the integrals, but not the elapsed
+    time."""
     return state, None if beside is None else beside.integrals
 
 
@@ -87,7 +94,10 @@ class Adaptive(AbstractMethod):
 
     def step(self, smooth, s0, s1, state, beside):
         """One Runge–Kutta step and its error norm (root mean square over the components of the
-        state and the integrals of averages)."""
+        state and the integrals of averages).
+
+        **Arguments:** as `AbstractMethod.step`.
+        """
         # Below the precision's own rounding a tolerance would only be rejected for ever.
         floor = 8 * jnp.finfo(s0.dtype).eps
         rtol = jnp.maximum(jnp.asarray(self.rtol, s0.dtype), floor)
@@ -95,7 +105,7 @@ class Adaptive(AbstractMethod):
         if solver.implicit:
             solver = Unrolled(solver.solver, tolerance=jnp.maximum(0.01 * rtol, floor))
         new, after, errors = _runge_kutta(solver, smooth, s0, s1, state, beside)
-        old, there, error = (_told(*x) for x in ((state, beside), (new, after), errors))
+        old, there, error = (_sized_by(*x) for x in ((state, beside), (new, after), errors))
         atol = rtol if self.atol is None else jnp.maximum(jnp.asarray(self.atol, s0.dtype), floor)
         scaled = jtu.tree_map(
             lambda e, a, b: (e / (atol + rtol * jnp.maximum(jnp.abs(a), jnp.abs(b)))) ** 2,
@@ -152,7 +162,10 @@ class FixedStep(AbstractMethod):
             )
 
     def step(self, smooth, s0, s1, state, beside):
-        """One Runge–Kutta step; its error is not asked for."""
+        """One Runge–Kutta step; its error is not asked for.
+
+        **Arguments:** as `AbstractMethod.step`.
+        """
         new, beside, _ = _runge_kutta(self.solver, smooth, s0, s1, state, beside)
         return new, beside, jnp.zeros_like(s0)
 

@@ -1,5 +1,6 @@
 """A Taylor method: each step is a power series, which also says where in it an event lies."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -9,7 +10,7 @@ import numpy as np
 from jax.lax import stop_gradient
 
 from ..._checks import count, require
-from ..._types import Scalar
+from ..._types import Scalar, State
 from ..beside import Beside, rate_beside
 from ..smooth import SmoothMachine
 from . import _series as power_series
@@ -23,14 +24,14 @@ class Expansion(NamedTuple):
     treedef: Any
     """Of the state and what is integrated beside it."""
     series: list[Series]
-    tolerance: Any
+    tolerance: np.ndarray | float | None
     """By which its reach is measured; `None` where it reaches as far as is asked."""
 
-    def at(self, h: Scalar) -> tuple[Any, Beside | None]:
+    def at(self, h: Scalar) -> tuple[State, Beside | None]:
         """State, and what is integrated beside it, a length h away."""
         return jtu.tree_unflatten(self.treedef, [power_series.at(x, h) for x in self.series])
 
-    def of(self, function: Any) -> Along:
+    def of(self, function: Callable[[State], Any]) -> Along:
         """A scalar function of the state along it, a constant for differentiation."""
         still = [[None if c is None else stop_gradient(c) for c in x] for x in self.series]
         return power_series.along(lambda y: function(y[0]), self.treedef, still)
@@ -110,9 +111,9 @@ class Taylor(AbstractMethod):
         return machine.step_limit(s, state) * (5 / self.steps_per_cycle)
 
     def foresee(
-        self, smooth: SmoothMachine, s: Scalar, state: Any, beside: Beside | None
+        self, smooth: SmoothMachine, s: Scalar, state: State, beside: Beside | None
     ) -> Expansion:
-        """Its power series about (s, state), and what is integrated beside it."""
+        """The motion as a power series about (s, state), with what is integrated beside it."""
 
         def field(s, y):
             state, beside = y
@@ -128,6 +129,9 @@ class Taylor(AbstractMethod):
         return Expansion(treedef, series, self.rtol)
 
     def step(self, smooth, s0, s1, state, beside):
-        """The sum of the series at `s1`."""
+        """The sum of the series at `s1`.
+
+        **Arguments:** as `AbstractMethod.step`.
+        """
         new, beside = self.foresee(smooth, s0, state, beside).at(s1 - s0)
         return new, beside, jnp.zeros_like(s0)

@@ -52,7 +52,10 @@ class Unrolled(diffrax.AbstractSolver):
         return self.solver.order(terms)
 
     def init(self, terms, t0, t1, y0, args):
-        """No hidden state: the first stage is evaluated anew in each step."""
+        """No hidden state: the first stage is evaluated anew in each step.
+
+        **Arguments:** those of `diffrax`'s `init`, not used.
+        """
         return None
 
     def func(self, terms, t0, y0, args):
@@ -60,7 +63,12 @@ class Unrolled(diffrax.AbstractSolver):
         return terms.vf(t0, y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        """One step over [t0, t1], with the arguments and results of `diffrax`'s `step`."""
+        """One step over [t0, t1].
+
+        **Arguments:** those of `diffrax`'s `step`; `solver_state` and `made_jump` are not used.
+
+        **Returns:** as `diffrax`'s `step`.
+        """
         tableau = _tableau(self.solver)
         control = terms.contr(t0, t1)
         if self.implicit:
@@ -83,7 +91,10 @@ class Unrolled(diffrax.AbstractSolver):
         return y1, error, {"y0": y0, "y1": y1, "k": k}, None, diffrax.RESULTS.successful
 
     def _implicit(self, terms, t0, t1, y0, args, control):
-        """The step of an implicit solver; its error is infinite where a stage was not solved."""
+        """The step of an implicit solver; its error is infinite where a stage was not solved.
+
+        **Arguments:** as `step`; `control`, the length of the step.
+        """
         tableau = _tableau(self.solver)
         flat, unravel = ravel_pytree(y0)
         tolerance = 1e-12 if self.tolerance is None else self.tolerance
