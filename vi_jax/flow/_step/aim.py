@@ -72,7 +72,10 @@ def _foreseen(
     for guard in at_stops(machine, ends):
         stop = machine.stops[guard.number]
         curve = partial(paths[stop.coordinate].over, h, stop.sign, stop_gradient(stop.gap))
-        guards.append((guard, guard.end.x > 0, curve))
+        over = guard.end.x > 0
+        if lane.contact is not None:  # a body at rest is beyond its stop by rounding only
+            over = over & (lane.contact[stop.coordinate] == 0)
+        guards.append((guard, over, curve))
     if machine.clock(lane.state) is not None:
         clock, bound = motion.of(machine.clock), stop_gradient(plan.end(lane.part))
         begin, end = (x.scaled(1, bound) for x in clock.ends(h))
