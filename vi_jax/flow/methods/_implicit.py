@@ -22,8 +22,8 @@ _MOST = 12
 def implicit_stages(
     tableau: Any,
     field: Callable[[Scalar, Vector], Vector],
-    s0: Scalar,
-    h: Scalar,
+    s0: Any,
+    h: Any,
     y0: Vector,
     tolerance: Scalar | float,
 ) -> tuple[list[Vector], Scalar]:
