@@ -92,6 +92,38 @@ def test_a_body_is_let_go_of_as_its_force_jumps():
     assert [vi.EVENTS[int(k)] for k in run.event_log.kind[0, :2]] == ["reset", "release"]
 
 
+class Lever(vi.AbstractMachine):
+    """A body on the left stop, pulled away from it once another one has hit its own stop."""
+
+    cycle = 4.0
+
+    @property
+    def stops(self):
+        hit = vi.RigidStop(1.0, 0.5, coordinate=1, modes=lambda m, s, z, way: (1.0,))
+        return vi.RigidStop(0.0, 0.0, "left"), hit
+
+    @property
+    def coordinates(self):
+        return (
+            vi.Coordinate(lambda z: z.y, lambda z: z.v, lambda z, Y, V: Plane(z.x, Y, z.u, V)),
+            vi.Coordinate(lambda z: z.x, lambda z: z.u, lambda z, Y, V: Plane(Y, z.y, V, z.v)),
+        )
+
+    def begin(self, s, state):
+        return (-1.0,)
+
+    def field(self, s, z, way):
+        return Plane(z.u, z.v, 0 * z.u, way + 0 * z.v)
+
+
+def test_a_body_is_let_go_of_by_the_impact_of_another():
+    start = Plane(*(jnp.asarray(x) for x in (0.0, 0.0, 0.5, 0.0)))
+    run = vi.simulate(Lever(), start, 1, event_log=4)
+    assert [vi.EVENTS[int(k)] for k in run.event_log.kind[0, :2]] == ["impact", "release"]
+    assert float(run.last.y) == pytest.approx(0.5 * 2**2, abs=1e-12)
+    assert float(run.last.x) == pytest.approx(1 - 2 * 0.25, abs=1e-12)
+
+
 class Pulled(vi.AbstractMachine):
     """A block on a floor that is pulled harder from s = 1 on."""
 
