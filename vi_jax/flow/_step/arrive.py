@@ -233,7 +233,7 @@ def _impact(
         for number, here in landed.items():
             given = machine, arrival.s, there, arrival.state, modes
             modes = select(here, machine.stops[number].modes_after(*given), modes)
-    before = there, arrival.modes
+    before = there, lane.modes  # a stop may have changed them already
     arrival = arrival.going(direction=tuple(direction), modes=modes)
     arrival = disarmed(plan, arrival, met, before)
     # What rests on other stops may be let go of by it.
