@@ -19,6 +19,12 @@ def on_plane(*numbers):
     return Plane(*(jnp.asarray(float(x)) for x in numbers))
 
 
+ABOVE_AND_ALONG = (
+    vi.Coordinate(lambda z: z.y, lambda z: z.v, lambda z, Y, V: Plane(z.x, Y, z.u, V)),
+    vi.Coordinate(lambda z: z.x, lambda z: z.u, lambda z, Y, V: Plane(Y, z.y, V, z.v)),
+)
+
+
 class Block(vi.AbstractMachine):
     """A particle above a floor at y = 0, pulled along it."""
 
@@ -33,10 +39,7 @@ class Block(vi.AbstractMachine):
 
     @property
     def coordinates(self):
-        return (
-            vi.Coordinate(lambda z: z.y, lambda z: z.v, lambda z, Y, V: Plane(z.x, Y, z.u, V)),
-            vi.Coordinate(lambda z: z.x, lambda z: z.u, lambda z, Y, V: Plane(Y, z.y, V, z.v)),
-        )
+        return ABOVE_AND_ALONG
 
     @property
     def stops(self):

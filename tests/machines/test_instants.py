@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import pytest
 import vi_jax as vi
 
-from rough_block import Plane
+from rough_block import ABOVE_AND_ALONG, Plane
 
 State = vi.OscillatorState
 
@@ -104,10 +104,7 @@ class Lever(vi.AbstractMachine):
 
     @property
     def coordinates(self):
-        return (
-            vi.Coordinate(lambda z: z.y, lambda z: z.v, lambda z, Y, V: Plane(z.x, Y, z.u, V)),
-            vi.Coordinate(lambda z: z.x, lambda z: z.u, lambda z, Y, V: Plane(Y, z.y, V, z.v)),
-        )
+        return ABOVE_AND_ALONG
 
     def begin(self, s, state):
         return (-1.0,)
@@ -133,10 +130,7 @@ class Pulled(vi.AbstractMachine):
 
     @property
     def coordinates(self):
-        return (
-            vi.Coordinate(lambda z: z.y, lambda z: z.v, lambda z, Y, V: Plane(z.x, Y, z.u, V)),
-            vi.Coordinate(lambda z: z.x, lambda z: z.u, lambda z, Y, V: Plane(Y, z.y, V, z.v)),
-        )
+        return ABOVE_AND_ALONG
 
     @property
     def switches(self):

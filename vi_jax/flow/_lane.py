@@ -62,6 +62,11 @@ def select(condition: Flag, a: Any, b: Any) -> Any:
     return jtu.tree_map(lambda x, y: x if x is y else jnp.where(condition, x, y), a, b)
 
 
+def in_place(values: tuple, k: int, value: Any) -> tuple:
+    """The values with another one in place number k."""
+    return (*values[:k], value, *values[k + 1 :])
+
+
 class Record(eqx.Module):
     """What is kept of an interval between two record points; `None` where it was not asked for."""
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.lax import stop_gradient
 
-from .._types import Scalar, Scalars, State
+from .._types import Flag, Scalar, Scalars, State
 from ..machine import AbstractMachine, Coordinate, field_in, held_flow, rubs
 
 
@@ -85,3 +85,12 @@ def rounding(machine: AbstractMachine, state: State) -> Scalar | float:
         return 0.0
     size = sum((jnp.sum(jnp.abs(x)) for x in jtu.tree_leaves(state)), start=jnp.asarray(1.0))
     return stop_gradient(16 * jnp.finfo(size.dtype).eps * size)
+
+
+def beyond_a_stop(machine: AbstractMachine, state: State) -> Flag:
+    """Whether a coordinate is beyond one of its stops by more than rounding."""
+    found, slack = jnp.zeros((), bool), rounding(machine, state)
+    for stop in machine.stops:
+        place = machine.coordinates[stop.coordinate].position(state)
+        found = found | (stop_gradient(stop.beyond(place)) > slack)
+    return found

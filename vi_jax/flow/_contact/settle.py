@@ -17,11 +17,11 @@ from ...lanes import pin, pin_flag
 from ...machine import added, forces, held_by, push_of, rubs, shares, struck_modes
 from .._arrival import Arrival
 from .._flow_to_event import FlowToEvent
-from .._lane import RESTS, Lane, Plan, select
+from .._lane import RESTS, Lane, Plan, in_place, select
 from .._log import clock_at, noted
 from ..drift import drifted
 from ..events import force_rate, rates
-from ..smooth import SmoothMachine, holding, in_modes, rounding
+from ..smooth import SmoothMachine, beyond_a_stop, holding, in_modes, rounding
 from .blow import Blow
 from .rest import allowed
 
@@ -84,7 +84,7 @@ def _held(
     for k, ends in rests.items():
         left = jnp.where(ends, waits[k], 0.0)
         wait = left if len(rests) == 1 else jnp.maximum(wait, left)
-        contact = (*contact[:k], jnp.where(ends, blows[k].struck, contact[k]), *contact[k + 1 :])
+        contact = in_place(contact, k, jnp.where(ends, blows[k].struck, contact[k]))
     walls, modes = {k: blow.struck for k, blow in blows.items()}, arrival.modes
     if rubs(plan.machine):
         # Which way a body slips is known behind its impact.
@@ -98,7 +98,7 @@ def _held(
     way = FlowToEvent(plan, resting, lane.part, (s, still, time))
     later, still, passed = drifted(way.rate, pin(wait), way.moving, way.fixed, way.rest)
     if len(rests) > 1:  # another body may come upon this one before its impacts are over
-        clear = ~_beyond_any(plan, still)
+        clear = ~beyond_a_stop(plan.machine, still)
         rests = {k: ends & clear for k, ends in rests.items()}
         contact = select(clear, contact, arrival.contact)
     any_rests = jnp.zeros_like(taken)
@@ -114,15 +114,6 @@ def _held(
         loss = loss + jnp.where(taken & any_rests, lost, 0.0)
     arrival = arrival._replace(s=s, state=state, time=time).going(contact=contact)
     return arrival.counting(events=events, rests=count, loss=loss)
-
-
-def _beyond_any(plan: Plan, state: State) -> Flag:
-    """Whether a body is beyond a stop by more than rounding."""
-    found, slack = jnp.zeros((), bool), rounding(plan.machine, state)
-    for stop in plan.machine.stops:
-        place = plan.machine.coordinates[stop.coordinate].position(state)
-        found = found | (stop_gradient(stop.beyond(place)) > slack)
-    return found
 
 
 def _without_rebounds(

@@ -13,7 +13,7 @@ from .._contact.impact import is_compound, strike
 from .._contact.rest import Release
 from .._contact.settle import Approach, settle, stilled
 from .._flow_to_event import FlowToEvent
-from .._lane import LEAVES, Lane, Plan, Record, select, to_event, to_turn_of
+from .._lane import LEAVES, Lane, Plan, Record, in_place, select, to_event, to_turn_of
 from .._log import clock_at, noted
 from ..drift import drifted, height_of_turn, met_after, unmoved
 from ..events import Rates, to_turn
@@ -166,13 +166,9 @@ def _released(
         time=select(free, time, arrival.time),
     )
     return arrival.counting(events=events).going(
-        direction=_put(arrival.direction, k, direction),
-        contact=_put(contact, k, jnp.where(free, 0.0, contact[k])),
+        direction=in_place(arrival.direction, k, direction),
+        contact=in_place(contact, k, jnp.where(free, 0.0, contact[k])),
     )
-
-
-def _put(values: tuple, k: int, value: Scalar) -> tuple:
-    return (*values[:k], value, *values[k + 1 :])
 
 
 def _offset(plan: Plan, lane: Lane, trial: Trial, way: FlowToEvent, c: Crossing) -> Scalar:

@@ -10,7 +10,7 @@ from .._arrival import Arrival, ended
 from .._lane import CHANGES, LEAVES, RESETS, Plan, select, to_event
 from .._log import clock_at, logged, noted
 from ..events import rates
-from ..smooth import holding, rounding
+from ..smooth import beyond_a_stop, holding
 from .faults import comes_back
 from .guards import Crossing
 from .jump import after_jump, disarmed, disarmed_itself
@@ -137,11 +137,8 @@ def _jumped(
     **Arguments:** `c`, the event; `happens`, whether it did; `there` and `new`, the states before
     and after it.
     """
-    beyond = jnp.zeros_like(happens)
-    for stop in plan.machine.stops:
-        place = plan.machine.coordinates[stop.coordinate].position(new)
-        beyond = beyond | (stop.beyond(place) > rounding(plan.machine, new))
     if plan.machine.stops:
+        beyond = beyond_a_stop(plan.machine, new)
         arrival = ended(arrival, c.landed, happens & beyond, results.BAD_RESET)
     direction, contact = after_jump(plan, arrival.onward, happens, there, new, arrival.s)
     assert arrival.before is not None  # as the machine has such events

@@ -6,7 +6,7 @@ from jax.lax import stop_gradient
 from ..._types import Flag, Scalar, Scalars, State
 from ...machine import guard_of
 from .._arrival import Arrival, Onward
-from .._lane import Plan
+from .._lane import Plan, in_place
 from ..events import rates
 from ..smooth import holding, rounding
 from .guards import Crossing
@@ -71,5 +71,4 @@ def disarmed_itself(plan: Plan, arrival: Arrival, c: Crossing) -> Arrival:
     if c.number not in numbers:
         return arrival
     below, i = arrival.onward.below, numbers.index(c.number)
-    used = jnp.where(c.landed, 0.0, below[i])
-    return arrival.going(below=(*below[:i], used, *below[i + 1 :]))
+    return arrival.going(below=in_place(below, i, jnp.where(c.landed, 0.0, below[i])))
