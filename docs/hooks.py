@@ -1,17 +1,28 @@
 """Takes into the site what lies beside `docs/`, so that the same links hold there and here.
 
 A page links to `../experiments/...` as it lies in the repository; the site holds a copy of what is
-linked, and `../` is taken off.
+linked, and `../` is taken off. Formulas become MathML, which browsers draw without a script, a font
+or a server.
 """
 
+import html
+import logging
 import re
 from pathlib import Path
 from typing import Any
 
 from mkdocs.structure.files import File
 
+try:
+    from latex2mathml.converter import convert  # pyright: ignore[reportMissingImports]
+except ImportError:  # pages show the source of their formulas then
+    convert = None
+
 ROOT = Path(__file__).resolve().parents[1]
-KINDS = {".md", ".png", ".py", ".ipynb", ".toml"}
+KINDS = {".md", ".png", ".gif", ".py", ".ipynb", ".toml"}
+FORMULA = re.compile(
+    r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</(?:span|div)>', re.DOTALL
+)
 BESIDE = re.compile(r"\]\(((?:\.\./)+)(experiments/|CHANGELOG\.md)")
 
 
@@ -29,3 +40,23 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
     if page.file.src_uri.startswith("experiments/"):
         return markdown
     return BESIDE.sub(lambda m: f"]({m[1].removeprefix('../')}{m[2]}", markdown)
+
+
+def on_page_content(content: str, page: Any, config: Any, files: Any) -> str:
+    """Formulas, as `pymdownx.arithmatex` marks them, are set."""
+    if convert is None:
+        if FORMULA.search(content):
+            logging.getLogger("mkdocs").info(
+                "%s: formulas are shown as their source; `pip install '.[docs]'` for latex2mathml",
+                page.file.src_uri,
+            )
+        return content
+    return FORMULA.sub(_set, content)
+
+
+def _set(formula: re.Match[str]) -> str:
+    """The MathML of a formula; one on a line of its own may be scrolled on a narrow screen."""
+    assert convert is not None
+    block = formula[1] == "div"
+    drawn = convert(html.unescape(formula[2]).strip(), display="block" if block else "inline")
+    return f'<div style="overflow-x: auto">{drawn}</div>' if block else drawn

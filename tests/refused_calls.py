@@ -68,6 +68,7 @@ CALLS = {
     "settle=[1]": (simulate(settle=[1]), f"`settle` {COUNT}"),
     "settle=10**20": (simulate(settle=10**20), "`settle` must be at most"),
     "settle of lyapunov": (lambda: vi.lyapunov(SCENE, START, 10, settle="3"), f"`settle` {COUNT}"),
+    "machine and start swapped": (lambda: vi.simulate(START, SCENE, 2), "`machine` must be a"),
     "a list as start": (simulate([0.0, 0.0]), "`start` must be a `OscillatorState`"),
     "a text as start": (simulate("ab"), "`start` must be a `OscillatorState`"),
     "lists in a start": (simulate(vi.OscillatorState([0.0], [0.0])), "its Y is [0.0]"),
@@ -137,6 +138,9 @@ CALLS = {
     "root_finder=Newton": (orbit(root_finder=vi.Newton), "`root_finder` must be `Newton(...)`"),
     "boundary('x')": (lambda: vi.boundary("x", parameter="stops.0.gap", bounds=((0, 1), (0, 1))),
                       "`point` must be a `SpecialPoint`"),
+    "grazing('x')": (lambda: vi.grazing("x"), "`point` must be a `SpecialPoint`"),
+    "resonant_grazings('x')": (lambda: vi.resonant_grazings("x"), "`curve` must be a `Boundary`"),
+    "plot_grazing('x')": (lambda: vi.plot_grazing("x"), "`found` must be a `Grazing`"),
     "continue_orbit('x')": (lambda: vi.continue_orbit("x", parameter=ZETA, bounds=(0, 1)),
                             "`orbit` must be one `Orbit`"),
     "step='a'": (lambda: vi.continue_orbit("x", parameter=ZETA, bounds=(0, 1), step="a"),
@@ -171,8 +175,8 @@ def work(*arguments, **options):
 
 if __name__ == "__main__":
     for module, name in (
-        ("scan._scan", "run_here"),
-        ("scan._scan", "run_on_cluster"),
+        ("scan._computed", "run_here"),
+        ("scan._computed", "run_on_cluster"),
         ("scan._sweep", "_sweep"),
         ("orbit.find", "_find"),
         ("flow._simulate", "_simulate"),

@@ -11,11 +11,13 @@ HOUSE = Path(__file__).parents[1] / "vi_jax"
 FILES = sorted(HOUSE.rglob("*.py"))
 
 # Each may import from those before it.
-ORDER = "lanes machine flow machines orbit scan plot paper explore cli".split()
+ORDER = "lanes machine flow machines orbit scan robust plot paper explore cli".split()
 LATE = [["explore", "serve"], ["paper", "report"]]
 TOOLS = {
+    "_calls",
     "_checks",
     "_files",
+    "_at_work",
     "_interrupted",
     "_lazy",
     "_numbers",

@@ -24,6 +24,7 @@ from .flow import Suggestion as Suggestion
 from .flow import Taylor as Taylor
 from .flow import Unrolled as Unrolled
 from .flow import Verner9 as Verner9
+from .flow import WhiteNoise as WhiteNoise
 from .flow import jit as jit
 from .flow import preset as preset
 from .flow import simulate as simulate
@@ -59,6 +60,7 @@ from .machine import Switch as Switch
 from .machine import TimedDCMotorState as TimedDCMotorState
 from .machine import TimedMotorState as TimedMotorState
 from .orbit import ORBIT_RESULTS as ORBIT_RESULTS
+from .orbit import SCENARIOS as SCENARIOS
 from .orbit import STABILITY as STABILITY
 from .orbit import AbstractRootFinder as AbstractRootFinder
 from .orbit import Boundary as Boundary
@@ -66,8 +68,10 @@ from .orbit import Branch as Branch
 from .orbit import ClosedFormOrbits as ClosedFormOrbits
 from .orbit import CycleMap as CycleMap
 from .orbit import Gradient as Gradient
+from .orbit import Grazing as Grazing
 from .orbit import Newton as Newton
 from .orbit import Orbit as Orbit
+from .orbit import ResonantGrazing as ResonantGrazing
 from .orbit import SpecialPoint as SpecialPoint
 from .orbit import boundary as boundary
 from .orbit import closed_form_orbits as closed_form_orbits
@@ -75,19 +79,39 @@ from .orbit import continue_orbit as continue_orbit
 from .orbit import cycle_map as cycle_map
 from .orbit import distinct_orbits as distinct_orbits
 from .orbit import find_orbit as find_orbit
+from .orbit import grazing as grazing
+from .orbit import resonant_grazings as resonant_grazings
+from .robust import EdgeState as EdgeState
+from .robust import Manifold as Manifold
+from .robust import MinimalKick as MinimalKick
+from .robust import edge_state as edge_state
+from .robust import manifold as manifold
+from .robust import minimal_kick as minimal_kick
 from .scan import REGIMES as REGIMES
 from .scan import AbstractMeasure as AbstractMeasure
+from .scan import AllOrbits as AllOrbits
 from .scan import Attractor as Attractor
+from .scan import BasinEntropy as BasinEntropy
 from .scan import Basins as Basins
+from .scan import Density as Density
+from .scan import Escape as Escape
 from .scan import Exponent as Exponent
+from .scan import Integrity as Integrity
+from .scan import IntegrityProfile as IntegrityProfile
 from .scan import Lyapunov as Lyapunov
 from .scan import Regime as Regime
 from .scan import ScanInterrupted as ScanInterrupted
 from .scan import Sections as Sections
+from .scan import Statistics as Statistics
 from .scan import Sweep as Sweep
+from .scan import Uncertainty as Uncertainty
+from .scan import all_orbits as all_orbits
 from .scan import basins as basins
+from .scan import escape_rate as escape_rate
+from .scan import integrity_profile as integrity_profile
 from .scan import lyapunov as lyapunov
 from .scan import scan as scan
+from .scan import spectrum as spectrum
 from .scan import sweep as sweep
 
 if typing.TYPE_CHECKING:
@@ -96,11 +120,15 @@ if typing.TYPE_CHECKING:
     from .plot import plot_basins as plot_basins
     from .plot import plot_boundary as plot_boundary
     from .plot import plot_branch as plot_branch
+    from .plot import plot_grazing as plot_grazing
     from .plot import plot_history as plot_history
+    from .plot import plot_integrity as plot_integrity
+    from .plot import plot_manifold as plot_manifold
     from .plot import plot_multipliers as plot_multipliers
     from .plot import plot_phase_portrait as plot_phase_portrait
     from .plot import plot_regimes as plot_regimes
     from .plot import plot_sketch as plot_sketch
+    from .plot import plot_style as plot_style
     from .plot import plot_sweep as plot_sweep
     from .plot import save_picture as save_picture
 

@@ -176,7 +176,7 @@ def row_of_numbers(values: Any) -> np.ndarray | None:
 
 
 def flag(name: str, value: Any) -> bool:
-    """`True` or `False`."""
+    """A flag as Python's own. **Raises:** `TypeError` unless it is `True` or `False`."""
     if not isinstance(value, bool | np.bool_):
         raise TypeError(f"Argument `{name}` must be True or False, but got {value!r}.")
     return bool(value)
@@ -199,6 +199,11 @@ def tuple_of(name: str, value: Any, kind: type) -> tuple[Any, ...]:
         raise TypeError(
             f"Argument `{name}` must be a tuple of `{kind.__name__}`s, but got {value!r}."
         ) from None
+
+
+def tuple_of_names(name: str, value: Any) -> tuple[str, ...]:
+    """A tuple of names, of which there may be one alone, as a string."""
+    return (value,) if isinstance(value, str) else tuple_of(name, value, str)
 
 
 def instance_of(name: str, value: Any, kind: type | tuple[type, ...], described: str) -> None:

@@ -10,9 +10,12 @@ class Interrupted(KeyboardInterrupt):
     """
 
     partial: Any
-    """What was computed: of `sweep` a `Sweep` of the values that were done, of `continue_orbit` a
-    `Branch` and of `boundary` a `Boundary` that end where they were interrupted, of `scan` and
-    `basins` the data set."""
+    """What was computed, of the kind that the verb returns: a `Sweep` of the values that were done,
+    a `Branch`, a `Boundary` or a `Manifold` that ends where it was interrupted, the `Lyapunov`
+    exponents of the cycles that were observed, an `EdgeState` without its orbit, the `MinimalKick`
+    found so far, an `AllOrbits` of the periods that were
+    searched, a `Grazing` that the machine was not asked about; of `scan`, `basins` and
+    `integrity_profile` the data set."""
 
     def __init__(self, what: str, partial: Any, where: str = "what was computed is in `.partial`"):
         super().__init__(f"the {what} was interrupted; {where}")

@@ -3,9 +3,10 @@
 import importlib.util
 import sys
 from types import ModuleType
+from typing import TYPE_CHECKING
 
 
-def lazy(name: str) -> ModuleType:
+def _lazy(name: str) -> ModuleType:
     """The module of this name; its code runs when something of it is first asked for."""
     if name in sys.modules:
         return sys.modules[name]
@@ -17,3 +18,12 @@ def lazy(name: str) -> ModuleType:
     sys.modules[name] = module
     spec.loader.exec_module(module)
     return module
+
+
+if TYPE_CHECKING:
+    import xarray as xr
+    import zarr
+else:
+    xr, zarr = _lazy("xarray"), _lazy("zarr")
+
+__all__ = ["xr", "zarr"]

@@ -136,7 +136,7 @@ class CompiledFunction:
                 getattr(cached, "clear_cache", jax.clear_caches)()
 
     def __call__(self, *arguments: Any, **keywords: Any) -> Any:
-        """As the function."""
+        """What the function returns, by its compiled program."""
         _watch.called(self)
         if self._may_be_quick and current_backend() != "xla" and is_outermost(arguments, keywords):
             try:

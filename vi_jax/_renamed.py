@@ -1,8 +1,10 @@
-"""Names that this package once had: refused, with the one that took its place."""
+"""Names that this package once had, or never: refused, with the one to take."""
 
 import functools
 from collections.abc import Callable
 from typing import ParamSpec, TypeVar
+
+from ._calls import check_call
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -18,7 +20,8 @@ NAMES = {
 def renamed(**new_by_old: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Decorator: a function whose arguments once had other names.
 
-    **Raises:** in a call, `TypeError` for an old name, with the new one.
+    **Raises:** in a call, `TypeError` for an old name, with the new one, and for one that it never
+    had.
     """
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
@@ -29,6 +32,7 @@ def renamed(**new_by_old: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
                     raise TypeError(
                         f"Argument `{old}` of `{function.__name__}` is called `{new}` now."
                     )
+            check_call(function, function.__name__, args, kwargs)
             return function(*args, **kwargs)
 
         return called

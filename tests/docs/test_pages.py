@@ -6,6 +6,7 @@ import subprocess
 import sys
 from inspect import ismodule
 from pathlib import Path
+from typing import Any
 
 import pytest
 import vi_jax as vi
@@ -38,13 +39,22 @@ def cases(language: str):
     ]
 
 
-def run(folder: Path, *command: str) -> None:
+def run(folder: Path, *command: str) -> str:
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "agg"}
     done = subprocess.run(
         [sys.executable, *command],
         cwd=folder, env=environment, capture_output=True, text=True, timeout=600,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-2000:]
+    return done.stdout
+
+
+def words(printed: str) -> list[Any]:
+    """The words of an output, and its numbers to what other processors give as well; a residual is
+    left out, which is rounding."""
+    kept = [line for line in printed.splitlines() if "residual" not in line]
+    parts = re.split(r"(-?\d+\.\d+)", " ".join(kept))
+    return [pytest.approx(float(x), abs=2e-6) if i % 2 else x.strip() for i, x in enumerate(parts)]
 
 
 @pytest.mark.parametrize("page", cases("python"))
@@ -52,7 +62,9 @@ def test_code_runs(page, tmp_path):
     """The blocks of a page one after the other, in one process."""
     code = "\n".join(blocks(page, "python"))
     (tmp_path / "page.py").write_text(code, encoding="utf-8")
-    run(tmp_path, "page.py")
+    said = run(tmp_path, "page.py")
+    for shown in blocks(page, "text") if page.name == "README.md" else []:
+        assert words(shown) == words(said)
     for picture in re.findall(r'save_picture\(.*"(.*)"\)', code):
         assert (tmp_path / picture).exists()
 

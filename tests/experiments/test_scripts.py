@@ -12,8 +12,8 @@ FOLDER = Path(__file__).parents[2] / "experiments"
 STUDIES = sorted([*FOLDER.glob("studies/*.py"), *FOLDER.glob("benchmarks/*.py")])
 # A table is all there is to see.
 WITHOUT_FIGURE = {"extremes"}
-# `peers` needs the extra `bench`; the rows of `extremes` are tests of their own.
-RUN_ELSEWHERE = {"peers", "extremes"}
+# `peers` and `chains` need the extra `bench`; the rows of `extremes` are tests of their own.
+RUN_ELSEWHERE = {"peers", "chains", "extremes"}
 
 
 @pytest.mark.parametrize("study", STUDIES, ids=lambda path: path.stem)

@@ -34,7 +34,7 @@ def test_clocks():
     assert (result, len(seconds)) == (7, 4)
     with Clock() as clock:
         time.sleep(0.05)
-    assert clock.wall >= 0.04 > clock.cpu
+    assert clock.wall >= 0.039 > clock.cpu  # a clock may go in steps of 10 ms
 
 
 def test_no_file_has_more_than_350_lines():

@@ -142,19 +142,57 @@ def test_the_cycle_map_and_its_exponents(plain):
 MACHINE = Chain(rows)
 
 
+def test_a_branch_is_that_of_numbers():
+    found = []
+    for made in (rows, Numbers):
+        machine = Chain(made)
+        end = vi.simulate(machine, machine.start(), 1, settle=200).last
+        orbit = vi.find_orbit(machine, end)
+        assert bool(orbit.successful)
+        branch = vi.continue_orbit(orbit, parameter="gap", bounds=(0.55, 0.65), step=0.05)
+        found.append((orbit, branch))
+    (one, line), (other, wanted) = found
+    np.testing.assert_allclose(one.state.q, [other.state.x, other.state.y], rtol=0, atol=1e-11)
+    for name in ("multipliers", "impact_phase", "y_min"):
+        np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=0, atol=1e-8)
+    np.testing.assert_allclose(line.y_min, wanted.y_min, rtol=0, atol=1e-8)
+    many = vi.find_orbit(MACHINE, Rows(*(jnp.stack([x, x]) for x in (one.state.q, one.state.v))))
+    np.testing.assert_allclose(many.state.q, [one.state.q, one.state.q], rtol=0, atol=1e-10)
+
+
+@pytest.mark.slow
+def test_sweeps_scans_and_basins_are_those_of_numbers():
+    names = {"q[0]": "x", "q[1]": "y", "v[0]": "u", "v[1]": "w"}
+    swept, scanned, basins = [], [], []
+    for made, start in ((rows, "start.q[1]"), (Numbers, "start.y")):
+        machine = Chain(made)
+        swept.append(vi.sweep(machine, "gap", [0.5, 0.6], settle=20, cycles=4))
+        axes = {"gap": [0.5, 0.6], start: [0.0, 0.1]}
+        measure = ("extremes", vi.Sections(2))
+        scanned.append(vi.scan(machine, axes, measure=measure, cycles=4, settle=20, progress=False))
+        basins.append(
+            vi.basins(machine, {start: (-0.5, 0.5)}, resolution=4, longest=8, progress=False)
+        )
+    np.testing.assert_allclose(swept[0].y_min, swept[1].y_min, rtol=0, atol=1e-11)
+    for ours, theirs in (*names.items(), ("y_min", "y_min")):
+        np.testing.assert_allclose(scanned[0][ours], scanned[1][theirs], rtol=0, atol=1e-11)
+    ours, theirs = (found.attractors[0] for found in basins)
+    assert (ours.starts, ours.period) == (theirs.starts, theirs.period) == (4, theirs.period)
+    for name, other in names.items():
+        apart = ours.sections[name] - theirs.sections[other]
+        np.testing.assert_allclose(apart, 0, rtol=0, atol=1e-7)
+
+
 @pytest.mark.parametrize(
-    ("argument", "call"),
+    "call",
     [
-        ("guess", lambda: vi.find_orbit(MACHINE, MACHINE.start())),
-        ("start", lambda: vi.sweep(MACHINE, "gap", [0.5, 0.6])),
-        ("start", lambda: vi.scan(MACHINE, {"gap": [0.5, 0.6]}, progress=False)),
-        ("start", lambda: vi.scan(lambda gap: Chain(rows, gap), {"gap": [0.5, 0.6]})),
-        ("start", lambda: vi.basins(MACHINE, {"start.q": (0.0, 0.1)}, progress=False)),
+        lambda: vi.sweep(MACHINE, "q", [0.5, 0.6]),
+        lambda: vi.scan(MACHINE, {"start.q": [0.5, 0.6]}, progress=False),
+        lambda: vi.scan(MACHINE, {"start.q[2]": [0.5, 0.6]}, progress=False),
     ],
-    ids=["find_orbit", "sweep", "scan", "scan of a function", "basins"],
 )
-def test_verbs_that_take_none_say_so(argument, call):
-    with pytest.raises(ValueError, match=rf"`{argument}` must hold scalars.*its q has shape \(2,"):
+def test_names_of_numbers_in_arrays(call):
+    with pytest.raises(ValueError, match=r"must be a number of the machine.*q"):
         call()
 
 

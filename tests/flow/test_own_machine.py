@@ -311,7 +311,7 @@ class Odd(vi.AbstractMachine):
         (0.0, lambda x: x, "`cycle` of a Odd must be positive, but is 0.0"),
         (-1.0, lambda x: x, "must be positive"),
         (np.nan, lambda x: x, "must be positive"),
-        (1.0, lambda x: None, "but returned None"),
+        (1.0, lambda x: None, "its `return` is missing"),
         (1.0, lambda x: x.V, r"OscillatorState\(Y=f64\[\], V=f64\[\]\), but returned f64"),
         (1.0, lambda x: (x.V, x.Y), r"but returned \(f64\[\], f64\[\]\)"),
     ],

@@ -4,7 +4,7 @@ Each function gives numbers by the names under which the study of that name keep
 difference that is allowed.
 """
 
-from .benchmarks import explorer, peers, scene_cost, speed_accuracy
+from .benchmarks import chains, explorer, peers, scene_cost, speed_accuracy
 from .closed_forms import XI, Expected, closed
 from .machines import dc_motor, known_machines, relief_valve, sommerfeld, woodpecker
 from .orbits import (
@@ -21,8 +21,9 @@ from .paper import (
     fig2_frequency_response,
     motor_frequency_response,
     regime_maps,
+    why_four_pi,
 )
-from .records import identify, posterior
+from .records import identify, learned_laws, posterior
 
 __all__ = [
     "XI",
@@ -31,6 +32,7 @@ __all__ = [
     "basins_map",
     "bifurcation_diagram",
     "boundaries",
+    "chains",
     "closed",
     "dc_motor",
     "design_percussion",
@@ -40,6 +42,7 @@ __all__ = [
     "fit_4pi_orbit",
     "identify",
     "known_machines",
+    "learned_laws",
     "motor_frequency_response",
     "peers",
     "posterior",
@@ -49,5 +52,6 @@ __all__ = [
     "soft_stop",
     "sommerfeld",
     "speed_accuracy",
+    "why_four_pi",
     "woodpecker",
 ]

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import vi_jax as vi
 from headlines.jaxprs import primitives
+from tools.chains import linear_chain
 
 from .closed_forms import XI, Expected
 
@@ -67,3 +68,15 @@ def explorer() -> Expected:
         "lowest position where the sliders begin": (float(found.y_min[0]), 1e-9),
         "highest": (2.0, 1e-9),
     }
+
+
+def chains() -> Expected:
+    """Where the last of ten masses is; lanes that impact often differ by what rounding became."""
+
+    def lane(frequency):
+        machine = linear_chain(frequency, 10)
+        return vi.simulate(machine, machine.start(), 20, record="sections").last.displacement[-1]
+
+    places = vi.jit(jax.vmap(lane))(jnp.linspace(0.2, 0.9, 256))
+    middle = float(np.median(np.abs(places)))
+    return {"linear, N = 10: median |x| of the last mass at the end": (middle, 0.01 * middle)}

@@ -122,3 +122,20 @@ def regime_maps() -> Expected:
     # Borders cross the coarse grid elsewhere, by about half its step: 1 % of a side.
     name = "(ζ, k), c = 0.5 N·s/m (Table 1)"
     return {f"{name}: {kind}": (100 * float(np.mean(x)), 1.0) for kind, x in parts.items()}
+
+
+def why_four_pi() -> Expected:
+    numbers = {}
+    places = {  # near the doubling, near the touches that end the 4π motion with one impact
+        (0.5, 0.0): (0.93990, 0.85029, 0.94124), (0.8, 0.0): (0.99377, 0.83434, None),
+        (0.5, XI): (0.82456, None, None), (0.8, XI): (0.96554, 0.83340, 0.96912),
+    }  # fmt: skip
+    for (k, xi), (near, low, high) in places.items():
+        name = f"k = {k}, ξ = {xi:.4f}"
+        numbers[f"{name}: BB'"] = births(xi)[0]
+        numbers[f"{name}: CC'"] = doubling(k, xi, 1, near - 2e-3, near + 2e-3)
+        if low:
+            numbers[f"{name}: least ζ of 4π"] = touch(k, xi, low - 2e-3, low + 2e-3)
+        if high:
+            numbers[f"{name}: greatest ζ of 4π"] = touch(k, xi, high - 1e-3, high + 1e-3)
+    return {name: (value, ROOT) for name, value in numbers.items()}

@@ -1,5 +1,7 @@
 """Of the studies that fit machines to records."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,6 +28,43 @@ def identify() -> Expected:
     return {
         "noise": (float(jnp.std(clean)) * 10**-1.5, 1e-9),
         "k and ξ: correlation": (float(covariance[0, 1] / size[0] / size[1]), 1e-6),
+    }
+
+
+def learned_laws() -> Expected:
+    """The records' impacts, and how far noise puts them from the true motions."""
+
+    class Oscillator(vi.AbstractMachine):
+        amplitude: Any
+
+        @property
+        def stops(self):
+            return (vi.RigidStop(0.6, lambda v: 0.4 + 0.5 * jnp.exp(-v / 0.8)),)
+
+        @property
+        def cycle(self):
+            return 2 * jnp.pi / 0.9
+
+        def field(self, s, state):
+            force = 0.7 * state.Y + 0.15 * state.Y**3
+            shaking = self.amplitude * jnp.cos(0.9 * s)
+            return vi.OscillatorState(state.V, shaking - 0.04 * state.V - force)
+
+    first = jax.random.split(jax.random.key(2), 13)[0]
+    a, b, c, d = jax.random.split(first, 4)
+    amplitude = jax.random.uniform(a, (32,), minval=0.2, maxval=1.2)
+    pulled = jax.random.uniform(b, (32,), minval=0.3, maxval=2.5)
+    places, speeds = 0.05 * jax.random.normal(c, (32, 2)).T
+    state = vi.OscillatorState(places - pulled, speeds)
+    runs = vi.jit(jax.vmap(lambda x, y: vi.simulate(Oscillator(x), y, 3, samples=16)))(
+        amplitude, state
+    )
+    noise = jax.random.normal(d, (32, 48))
+    assert runs.samples is not None
+    return {
+        "impacts": (int(runs.impacts.sum()), 0),
+        "misfit at the truth": (float(jnp.mean(noise**2)), 1e-9),
+        "greatest depth": (float(jnp.min(runs.samples.state.Y)), 1e-8),
     }
 
 

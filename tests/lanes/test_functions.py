@@ -68,6 +68,12 @@ FUNCTIONS = {
         lambda x, y: (x.astype(jnp.int32), (x.astype(jnp.int32) % 7) // 3,
                       x.astype(jnp.int32) + 3, (x > 0).astype(jnp.int32)), 0,
     ),
+    "shifts": (
+        lambda x, y: tuple(
+            move(x.astype(jnp.int32).astype(jnp.uint32) * jnp.uint32(2654435761), jnp.uint32(by))
+            for move in (jax.lax.shift_left, jax.lax.shift_right_logical) for by in (0, 13, 31, 32)
+        ), 0,
+    ),
     "choice": (
         lambda x, y: (jax.lax.select_n(jnp.clip(x, 0, 2).astype(jnp.int32), x, y, x + y),), 1,
     ),

@@ -107,7 +107,7 @@ def test_a_drive_of_ones_own(clock):
 def test_what_such_a_drive_has_is_told():
     with pytest.raises(ValueError, match=r"`M` must be left out: only a `DCMotor`"):
         clockwork().start(M=1.0)
-    with pytest.raises(ValueError, match=r"`torque` must be left out: the state of this drive has"):
+    with pytest.raises(ValueError, match=r"`torque` must be left out: a state has Y, V, W, wound"):
         clockwork().start(torque=1.0)
     with pytest.raises(TypeError, match="drive"):
         vi.Scene(vi.Oscillator(0.1), "motor")

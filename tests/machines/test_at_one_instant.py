@@ -249,6 +249,7 @@ def test_without_an_end_a_sequence_goes_to_its_limit():
     assert float(run.impact_energy[0]) == pytest.approx(0.4, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_a_stack_that_falls_on_a_wall_stays_there():
     """Whatever height it came from, which derivatives say as well."""
     stack = Chain(0.2, (1.0,) * 3, 0.0, force=1.0, length=3.0)

@@ -97,7 +97,8 @@ def test_derivatives_of_a_crowd(name):
         run = vi.simulate(scene, start, 2, method="reference", record="sections")
         return jnp.stack(jax.tree.leaves(run.last)), (run.impacts, run.successful)
 
-    forward, (impacts, good) = vi.jit(jax.vmap(jax.jacfwd(last, has_aux=True)))(at)
+    jacobian = vi.jit(jax.vmap(jax.jacfwd(last, has_aux=True)))
+    forward, (impacts, good) = jacobian(at)
     moves = jnp.eye(at.shape[1])
     places = jnp.array([step, -step, step / 2, -step / 2])[:, None, None, None]
     moved, (counts, _) = vi.jit(jax.vmap(jax.vmap(jax.vmap(last))))(
@@ -113,7 +114,19 @@ def test_derivatives_of_a_crowd(name):
     wrong = np.abs(np.asarray(forward) - slope).max(axis=(1, 2)) / size
     assert (wrong[sure] < 1e-6).all()
 
+    # The two sum in different orders, so a lane near a graze, whose derivative changes by 1e-7 as
+    # the input does by its last bit, agrees no better. Each lane is held to what such bits do to
+    # its own derivatives (worst of 700 lanes: 3.1 times that of six moves).
     weights = jnp.arange(1.0, forward.shape[1] + 1)
-    backward = vi.jit(jax.vmap(jax.grad(lambda x: weights @ last(x)[0])))(at)
-    wanted = jnp.einsum("s,lsn->ln", weights, forward)
-    np.testing.assert_allclose(backward[good], wanted[good], rtol=1e-12, atol=1e-12)
+    backward = np.asarray(vi.jit(jax.vmap(jax.grad(lambda x: weights @ last(x)[0])))(at))
+    wanted = np.asarray(jnp.einsum("s,lsn->ln", weights, forward))
+    scale = 1 + np.abs(wanted).max(axis=1)
+    rng = np.random.default_rng(0)
+    bits = [1 + np.finfo(float).eps * rng.choice([-1, 1], at.shape) for _ in range(6)]
+    near = [np.einsum("s,lsn->ln", weights, jacobian(at * move)[0]) for move in bits]
+    doubt = np.max([np.abs(other - wanted).max(axis=1) for other in near], axis=0) / scale
+    apart = np.abs(backward - wanted).max(axis=1) / scale
+    good = np.asarray(good)
+    assert (doubt[good] < 1e-12).mean() > 0.8
+    shares = (apart / (1e-12 + 10 * doubt))[good]
+    assert (shares <= 1).all(), shares.max()

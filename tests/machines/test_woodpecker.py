@@ -72,6 +72,7 @@ def events(run, i):
     return [(vi.EVENTS[int(k)], int(n), float(t)) for k, n, t in rows if n >= 0]
 
 
+@pytest.mark.slow
 def test_the_known_cycle(run):
     last = lane(run.last, 0)
     assert float(run.duration[0, 0]) == pytest.approx(PERIOD, rel=1e-9)
@@ -85,6 +86,7 @@ def test_the_known_cycle(run):
     np.testing.assert_allclose([x[2] for x in found], [x[2] for x in EVENTS], atol=1e-7)
 
 
+@pytest.mark.slow
 def test_its_multipliers(run):
     """By differences of the map of the two numbers that a start on the lower edge has."""
     ends = np.stack([run.last.speed, run.last.bird_rate], -1)
@@ -93,6 +95,7 @@ def test_its_multipliers(run):
     np.testing.assert_allclose(found, [MULTIPLIER, 0], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_beside_scipy(run, truth):
     for i, wanted in enumerate(truth):
         last = lane(run.last, i)
@@ -107,6 +110,7 @@ def test_beside_scipy(run, truth):
     assert len({len(x.events) for x in truth}) > 1
 
 
+@pytest.mark.slow
 def test_energy(run, truth):
     """What is lost in impacts, as recorded, and by friction between them is what the motion lost;
     in the cycle that is weight times drop."""

@@ -7,9 +7,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 import pytest
 import vi_jax as vi
-from scipy.integrate import solve_ivp
+import xarray as xr
 from scipy.optimize import brentq
 
 ZETA = "drive.frequency_ratio"
@@ -157,88 +158,6 @@ def test_a_motor_branch_agrees_with_found_orbits():
 
 
 @pytest.mark.slow
-def test_grazing_of_the_classic_impact_oscillator():
-    """The motion that stays off the stop has the amplitude 1/√((1 - ζ²)² + (2ξζ)²); it grazes
-    where that is the gap (Shaw and Holmes 1983; Nordmark 1991)."""
-    xi, gap = 0.05, 1.5
-    scene = vi.Scene.ideal(frequency_ratio=0.3, restitution=0.8, gap=gap, damping_ratio=xi)
-    rest = vi.find_orbit(scene, scene.start(), throw=True)
-    assert int(rest.impacts) == 0
-    branch = vi.continue_orbit(rest, parameter=ZETA, bounds=(0.2, 0.9))
-    wanted = brentq(lambda z: (1 - z * z) ** 2 + (2 * xi * z) ** 2 - gap**-2, 0.3, 0.9)
-    assert branch.ends == ("bounds", "grazing") and branch.stable.all()
-    grazing = branch.special[-1]
-    assert grazing.kind == "grazing" and grazing.parameter == pytest.approx(wanted, abs=1e-9)
-    amplitude = 1 / np.hypot(1 - branch.parameter**2, 2 * xi * branch.parameter)
-    np.testing.assert_allclose(branch.y_max, amplitude, rtol=1e-10)
-    # Beyond it an impact is gained: the closed form knows that motion.
-    gained = grazing.switch()
-    assert int(gained.impacts) == 1 and float(gained.impact_speed[0]) > 0
-    there = vi.Scene.ideal(
-        frequency_ratio=gained.machine.drive.frequency_ratio, restitution=0.8, gap=gap,
-        damping_ratio=xi,
-    )  # fmt: skip
-    closed = vi.closed_form_orbits(there)
-    assert np.nanmin(np.abs(closed.impact_speed - gained.impact_speed[0])) < 1e-9
-    # In ζ and d the grazing is the resonance curve itself.
-    curve = vi.boundary(grazing, parameter="stops.0.gap", bounds=((0.3, 0.95), (1.1, 3.0)))
-    zeta, d = curve.parameters.T
-    np.testing.assert_allclose(1 / np.hypot(1 - zeta**2, 2 * xi * zeta), d, rtol=1e-9)
-    assert np.ptp(d) > 1
-
-
-class Duffing(vi.AbstractMachine):
-    """Y'' + 2ξY' + Y + γY³ = F cos(Ωt), over the cycles of its force."""
-
-    stops: tuple[vi.RigidStop, ...]
-    frequency: jax.Array
-    cubic: jax.Array
-    force: jax.Array
-    damping: jax.Array
-
-    @property
-    def cycle(self):
-        return 2 * np.pi
-
-    def field(self, s, state):
-        pull = self.force * jnp.cos(s) - 2 * self.damping * state.V - state.Y
-        pull = pull - self.cubic * state.Y**3
-        return vi.OscillatorState(state.V / self.frequency, pull / self.frequency)
-
-
-@pytest.mark.slow
-def test_folds_of_a_duffing_oscillator():
-    """Jump frequencies of a hardening oscillator: up at 1 + ½ (3/2)^(4/3) γ^(1/3) F^(2/3) to first
-    order in γ (Kovacic and Brennan, The Duffing Equation, 2011, section 5.3); and SciPy's word that
-    at the folds a multiplier is 1."""
-    gamma, force, xi = 1e-3, 0.2, 0.005
-    scene = Duffing((), *(jnp.asarray(x) for x in (0.8, gamma, force, xi)))
-    guess = vi.OscillatorState(jnp.asarray(force / (1 - 0.64)), jnp.asarray(0.0))
-    orbit = vi.find_orbit(scene, guess, throw=True)
-    branch = vi.continue_orbit(
-        orbit, parameter="frequency", bounds=(0.7, 1.6), max_step=0.5, max_points=2000
-    )
-    folds = [p for p in branch.special if p.kind == "fold"]
-    assert branch.ends == ("bounds", "bounds") and len(folds) == 2
-    lower = min(p.parameter for p in folds)
-    first_order = 1 + 0.5 * 1.5 ** (4 / 3) * gamma ** (1 / 3) * force ** (2 / 3)
-    assert lower == pytest.approx(first_order, abs=0.01)
-    for point in folds:
-        state = np.array([float(point.orbit.state.Y), float(point.orbit.state.V)])
-        omega = point.parameter
-
-        def field(t, x, omega=omega):
-            A = np.array([[0, 1], [-1 - 3 * gamma * x[0] ** 2, -2 * xi]])
-            pull = force * np.cos(omega * t) - x[0] - gamma * x[0] ** 3 - 2 * xi * x[1]
-            return np.concatenate([[x[1], pull], (A @ x[2:].reshape(2, 2)).ravel()])
-
-        start = np.concatenate([state, np.eye(2).ravel()])
-        end = solve_ivp(field, (0, 2 * np.pi / omega), start, rtol=1e-12, atol=1e-12).y[:, -1]
-        np.testing.assert_allclose(end[:2], state, atol=1e-7)
-        assert np.abs(np.linalg.eigvals(end[2:].reshape(2, 2)) - 1).min() < 1e-4
-
-
-@pytest.mark.slow
 def test_boundaries_in_a_second_parameter():
     branch = branch_of(0.5)
     doubling = next(p for p in branch.special if p.kind == "period-doubling")
@@ -289,11 +208,39 @@ def test_the_motions_at_its_bounds_and_ends(short, restitution):
 
 def test_a_branch_as_data(short):
     data = short.to_xarray()
-    assert data.sizes == {"point": len(short.parameter), "impact": 1, "state": 2}
+    assert data.sizes == {
+        "point": len(short.parameter), "impact": 1, "state": 2, "special": len(short.special),
+    }  # fmt: skip
     assert data.y_min.attrs["units"] == "a" and data.attrs["parameter"] == ZETA
+    assert data.attrs["ends"] == list(short.ends)
     assert "period-doubling at" in str(short)
     table = short.to_xarray(along="point").to_dataframe()
     assert table.y_min.tolist() == short.y_min.tolist()
+    # Where stability changes, at points of the branch, it is neither.
+    sure = table[table.stability != "neutral"]
+    assert len(sure) >= len(table) - len(short.special)
+    np.testing.assert_array_equal(sure.stability == "stable", sure.stable)
+    kinds = short.to_xarray(along="special").to_dataframe()
+    assert kinds.special_kind.tolist() == [point.kind for point in short.special]
+    # Each special point is one of the branch's.
+    np.testing.assert_array_equal(
+        short.parameter[kinds.special_point], kinds.special_parameter.to_numpy()
+    )
+    np.testing.assert_array_equal(short.y_min[kinds.special_point], kinds.special_y_min.to_numpy())
+
+
+def test_a_branch_in_files(short, tmp_path):
+    """NetCDF keeps all of it; a table all digits of the numbers at its points."""
+    few = dataclasses.replace(short, special=[])
+    for branch in (short, few):
+        data, path = branch.to_xarray(), tmp_path / f"{len(branch.special)}.nc"
+        data.to_netcdf(path, engine="h5netcdf")
+        with xr.open_dataset(path, engine="h5netcdf") as file:
+            assert file.load().identical(data)
+    table = short.to_xarray(along="point").to_dataframe()
+    table.to_csv(tmp_path / "branch.csv")
+    again = pd.read_csv(tmp_path / "branch.csv", index_col="point")
+    pd.testing.assert_frame_equal(table, again, check_dtype=False, check_exact=True)
 
 
 @pytest.mark.parametrize(
@@ -316,7 +263,7 @@ def listing(orbit, count):
     return dataclasses.replace(orbit, **{f"impact_{name}": x for name, x in listed.items()})
 
 
-def test_a_motion_that_rests_is_refused_for_that(short):
+def test_a_motion_at_rest_on_its_section_is_refused_for_that(short):
     """However many of its impacts are listed: chatter, one that sticks, and rest all the time."""
     for gap, restitution in ((0.3, 0.3), (0.3, 0.0), (-3.0, 0.3)):
         scene = vi.Scene.ideal(
@@ -325,7 +272,7 @@ def test_a_motion_that_rests_is_refused_for_that(short):
         orbit = vi.find_orbit(scene, scene.start(Y=gap), impact_log=32, throw=True)
         assert (int(orbit.impacts) > 1) == (gap > 0)
         for listed in (orbit, listing(orbit, 1)):
-            with pytest.raises(ValueError, match="`orbit` must not rest on a stop, but does"):
+            with pytest.raises(ValueError, match="`orbit` must not rest on a stop on its section"):
                 vi.continue_orbit(listed, parameter=ZETA, bounds=(0.4, 0.6))
     with pytest.raises(ValueError, match=r"list all its 1 impacts, .* larger `impact_log`"):
         vi.continue_orbit(listing(short.orbit(0), 0), parameter=ZETA, bounds=(0.5, 1.9))
@@ -396,7 +343,7 @@ def test_a_doubled_branch_springs_where_the_other_doubles(short, long):
 
 
 @pytest.mark.slow
-def test_a_boundary_ends_on_its_bounds(short):
+def test_a_boundary_ends_on_its_bounds(short, tmp_path):
     # Its second parameter has a scale far below 1.
     doubling = next(p for p in short.special if p.kind == "period-doubling")
     xi = "oscillator.damping_ratio"
@@ -404,25 +351,10 @@ def test_a_boundary_ends_on_its_bounds(short):
     data = curve.to_xarray()
     np.testing.assert_array_equal(data[xi], curve.parameters[:, 1])
     assert data[ZETA].attrs["units"] == "ω" and data.attrs["kind"] == curve.kind
+    data.to_netcdf(tmp_path / "curve.nc", engine="h5netcdf")
+    with xr.open_dataset(tmp_path / "curve.nc", engine="h5netcdf") as file:
+        assert file.load().identical(data)
     assert len(curve.to_xarray(along="point").to_dataframe()) == len(curve.parameters)
     assert "bounds" in curve.ends
     ends = curve.parameters[[0, -1], 1]
     assert min(abs(ends)) < 1e-9 and max(ends) == pytest.approx(0.004, abs=1e-9)
-
-
-@pytest.mark.slow
-def test_a_motor_hangs_at_resonance_below_a_certain_torque():
-    """Without a stop the response folds where the motor's line, κ - ζ/w0 times τ0, is less steep
-    than the averaged load's steepest fall: Table 1's to first order in the coupling is 0.75461, a
-    torque of 11.49 N·m. There the two folds meet, at the top of their curve."""
-    table = vi.Parameters(torque=8.0, control=0.8)
-    scene = dataclasses.replace(table.scene(), stops=())
-    branch = vi.continue_orbit(
-        vi.find_orbit(scene, scene.start()), parameter="drive.control", bounds=(0.6, 1.6)
-    )
-    first, second = (point for point in branch.special if point.kind == "fold")
-    assert first.parameter > second.parameter
-    curve = vi.boundary(first, parameter="drive.strength", bounds=((0.6, 2.5), (0.3, 2.0)))
-    top = curve.parameters[:, 1].max()
-    assert top == pytest.approx(0.75461, rel=3e-3)
-    assert 8.0 * top / float(scene.drive.strength) == pytest.approx(11.49, rel=3e-3)

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import minimize_scalar
 from vi_jax.orbit.closed_form import closed_form_orbits, one_impact_orbits
 
-FIELDS = ("Y", "V", "impact_phase", "impact_speed", "y_min", "y_max", "clearance")
+from closed_forms import FIELDS, ideal, solve
 
 
 def flight(zeta, xi, phase, Y, V, tau):
@@ -40,7 +40,6 @@ def samples(seed, count=400):
     return zeta[apart], xi[apart], k[apart], d[apart]
 
 
-solve = jax.jit(one_impact_orbits, static_argnums=4)
 solve_many = jax.jit(
     lambda zeta, xi, k, d, n: jax.vmap(partial(one_impact_orbits, n=n))(zeta, xi, k, d),
     static_argnums=4,
@@ -306,56 +305,6 @@ def test_vmap_equals_a_loop():
     jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-10, atol=1e-11), together, stacked)
 
 
-@partial(jax.jit, static_argnums=1)
-def answer(at, n):
-    """All numbers of the first motion, derivatives of which the absent second must not spoil."""
-    orbits = one_impact_orbits(*at, n)
-    values = jnp.stack([getattr(orbits, name)[0] for name in FIELDS])
-    values = jnp.where(jnp.isinf(values), 0.0, values)
-    return jnp.append(values, orbits.multipliers[0, 0].real)
-
-
-@partial(jax.jit, static_argnums=1)
-def slopes(at, n):
-    return jax.jacfwd(answer)(at, n), jax.jacrev(answer)(at, n)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "at, n",
-    [
-        ((0.9, 0.0, 0.5, 2.0), 1),
-        ((0.9, 0.0, 0.5, 2.0), 2),
-        ((0.9, 0.03, 0.5, 1.5), 1),
-        ((1.0, 0.0, 0.4, 1.5), 1),
-        ((0.8, 1.0, 0.5, 0.1), 1),
-    ],
-)
-def test_gradients_agree_with_central_differences(at, n):
-    at = jnp.array(at)
-    forward, reverse = slopes(at, n)
-    np.testing.assert_allclose(forward, reverse, rtol=1e-9, atol=1e-10)
-    # At resonance the section is at the impact itself, where its state jumps, and the multiplier
-    # is double, so that it has no derivative.
-    kept = slice(3, 5) if at[0] == 1 else slice(None)
-    h = 1e-5  # ξ may step below zero: the formulas continue there
-    differences = [(answer(at + e, n) - answer(at - e, n)) / (2 * h) for e in h * jnp.eye(4)]
-    np.testing.assert_allclose(forward[kept], jnp.stack(differences, 1)[kept], rtol=2e-6, atol=2e-7)
-
-
-@pytest.mark.slow
-def test_absent_motions_have_finite_derivatives_behind_a_where():
-    @partial(jax.jit, static_argnums=1)
-    @jax.grad
-    def slope(at, n):
-        orbits = solve(*at, n)
-        fields = jnp.stack([getattr(orbits, name) for name in FIELDS[:6]])
-        return jnp.where(orbits.exists, fields, 0.0).sum()
-
-    for at, n in (((0.5, 0.0, 0.5, 2.0), 1), ((0.9, 0.0, 0.5, 9.0), 1), ((0.9, 0.1, 0.0, 2.0), 1)):
-        assert jnp.isfinite(slope(jnp.array(at), n)).all()
-
-
 @pytest.mark.slow
 def test_single_precision():
     at = [jnp.float32(x) for x in (0.9, 0.0, 0.5, 2.0)]
@@ -363,104 +312,3 @@ def test_single_precision():
     assert orbits.Y.dtype == jnp.float32
     np.testing.assert_allclose(orbits.Y[0], 1.609674, atol=5e-5)
     np.testing.assert_allclose(orbits.y_min[0], -3.254293, atol=1e-4)
-
-
-def ideal(**changes):
-    numbers = {"frequency_ratio": 0.9, "restitution": 0.5, "gap": 2.0, "damping_ratio": 0.0}
-    return vi.Scene.ideal(**(numbers | changes))
-
-
-@pytest.mark.slow
-def test_reads_the_scene_and_its_tracers():
-    scene = ideal(damping_ratio=0.01)
-    orbits = jax.jit(partial(closed_form_orbits, cycles=2))(scene)
-    direct = solve(0.9, 0.01, 0.5, 2.0, 2)
-    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-12), orbits, direct)
-
-    def speed(zeta):
-        return closed_form_orbits(ideal(frequency_ratio=zeta)).impact_speed[0]
-
-    speeds, zetas = jax.jit(jax.vmap(speed)), jnp.array([0.85, 0.9, 0.95])
-    found = jax.jit(jax.vmap(jax.grad(speed)))(zetas)
-    wanted = (speeds(zetas + 1e-5) - speeds(zetas - 1e-5)) / 2e-5
-    np.testing.assert_allclose(found, wanted, rtol=1e-6)
-
-
-def driven_by_a_motor():
-    motor = vi.Motor(strength=1.0, control=1.0, coupling=0.01, slider_inertia=0.01)
-    return vi.Scene(vi.Oscillator(0.0), motor, (vi.RigidStop(2.0, 0.5),))
-
-
-def stopped_on_the_left():
-    stop = vi.RigidStop(2.0, 0.5, side="left")
-    return vi.Scene(vi.Oscillator(0.0), vi.IdealDrive(0.9), (stop,))
-
-
-class Doubled(vi.CosineCrank):
-    """Of twice the throw."""
-
-    def slide(self, phase):
-        return vi.CosineCrank().slide(phase)._replace(U=2 * jnp.cos(phase))
-
-
-class Hardening(vi.Scene):
-    """With a spring of its own."""
-
-    def field(self, s, state, *modes):
-        flow = super().field(s, state, *modes)
-        return vi.OscillatorState(flow.Y, flow.V - 0.3 * state.Y**3)
-
-
-class Softening(vi.RigidStop):
-    """Another law, of the speed of approach."""
-
-    def rebound(self, V):
-        return -self.restitution * V / (1 + 0.3 * jnp.abs(V))
-
-
-def of(kind=vi.Scene, crank=None, stop=None):
-    crank, stop = crank or vi.CosineCrank(), stop or vi.RigidStop(1.5, 0.9)
-    return kind(vi.Oscillator(0.05), vi.IdealDrive(0.9), (stop,), crank)
-
-
-def falling(approach):
-    return 0.9 / (1 + 0.3 * approach)
-
-
-def test_flight_in_closed_form_is_asked_for_only_where_it_is_that():
-    """Parts with a law of their own are refused, or carried as by steps."""
-    for other in (of(crank=Doubled()), of(Hardening)):
-        with pytest.raises(ValueError, match=r"`ExactFlight` needs a .*(Doubled|Hardening)"):
-            vi.simulate(other, other.start(), 8, method=vi.ExactFlight())
-        assert isinstance(vi.preset(other), vi.FixedStep)
-    for law in (of(stop=Softening(1.5, 0.9)), of(stop=vi.RigidStop(1.5, falling))):
-        exact, stepped = (
-            vi.simulate(law, law.start(), 8, method=method, record="sections")
-            for method in (vi.ExactFlight(), vi.Adaptive(rtol=1e-11))
-        )
-        assert int(exact.impacts.sum()) > 5
-        np.testing.assert_allclose(exact.sections.Y, stepped.sections.Y, atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    "scene, message",
-    [
-        (lambda: of(crank=Doubled()), "`scene`.*`CosineCrank`.*Doubled"),
-        (lambda: of(Hardening), "`scene`.*Hardening` has another `field`"),
-        (lambda: of(stop=Softening(1.5, 0.9)), "`scene`.*a law of its own: Softening"),
-        (lambda: of(stop=vi.RigidStop(1.5, falling)), "`scene`.*a law of its own"),
-        (driven_by_a_motor, "`scene`.*IdealDrive.*Motor"),
-        (lambda: ideal(crank=vi.SliderCrank(1 / 3)), "`scene`.*CosineCrank.*SliderCrank"),
-        (stopped_on_the_left, r"`scene`.*on the right.*\['left'\]"),
-        (lambda: ideal(gap=None), r"`scene`.*exactly one stop.*\[\]"),
-        (lambda: ideal(frequency_ratio=jnp.array([0.8, 0.9])), r"`scene`.*vmap.*\(2,\)"),
-    ],
-)
-def test_says_what_is_wrong_with_the_scene(scene, message):
-    with pytest.raises(ValueError, match=message):
-        closed_form_orbits(scene())
-
-
-def test_says_what_is_wrong_with_the_cycles():
-    with pytest.raises(ValueError, match="`cycles` must be at least 1, but got 0"):
-        closed_form_orbits(ideal(), cycles=0)

@@ -71,8 +71,11 @@ def test_every_special_point_has_a_mark_of_its_own():
     assert len({mark for mark, _ in MARKS.values()}) == len(MARKS)
     assert set(MARKS) == {
         getattr(special, name)
-        for name in ("FOLD", "DOUBLING", "TORUS", "GRAZING", "CROSSING", "SYMMETRY", "HOPF")
-    }
+        for name in (
+            "FOLD", "DOUBLING", "TORUS", "GRAZING", "CROSSING", "SYMMETRY", "HOPF", "REST",
+            "EXTREMUM", "TURN",
+        )
+    }  # fmt: skip
 
 
 def test_sweep_of_a_machine_speaks_its_words():

@@ -132,7 +132,7 @@ def test_failed_lanes_are_no_damage(tmp_path):
 
 def test_functions_that_differ_between_the_probed_lanes_are_refused(tmp_path, monkeypatch):
     """First and last lane are alike: only their code tells them apart."""
-    module = importlib.import_module("vi_jax.scan._scan")
+    module = importlib.import_module("vi_jax.scan._computed")
     monkeypatch.setattr(module, "run_here", lambda *arguments: iter(()))
 
     def run(name, change=0.0, hidden=None):

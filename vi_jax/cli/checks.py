@@ -10,7 +10,7 @@ from ..machine import AbstractMachine, leaf, leaf_names
 from ..orbit import check_walk, column_names
 from ..plot import ENDINGS
 from ..scan import Blocks, axes_of, check_corners, make_program
-from .config import OrbitTable
+from .config import ContinueTable
 from .toml import ConfigError, given, in_terms_of, unknown
 
 
@@ -70,10 +70,8 @@ def check_map(axes: Mapping[str, Any], measure: Iterable[str] | None, *, paired:
         )
 
 
-def check_continuation(machine: AbstractMachine, start: Any, table: OrbitTable) -> None:
+def check_continuation(machine: AbstractMachine, start: Any, asked: ContinueTable) -> None:
     """**Raises:** `ConfigError` if the branch cannot begin, or its files not be written."""
-    asked = table.continue_
-    assert asked is not None
     check_names(machine, [asked.parameter], "[orbit.continue]")
     low, high = asked.bounds
     value = float(leaf(machine, asked.parameter))

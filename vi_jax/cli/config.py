@@ -190,7 +190,7 @@ class SimulateTable:
 
 @frozen(kw_only=True)
 class Config:
-    """A whole file."""
+    """A whole file: a machine, how it moves, and a table for each verb."""
 
     scene: SceneTable | None = None
     parameters: ParametersTable | None = None

@@ -10,7 +10,7 @@ import jax
 
 from .._checks import unwritable
 from .._version import installed_version
-from ..explore.serve import missing, serve
+from ..explore.serve import Subject, missing, serve
 from ..paper.report import reproduce, summary
 from .config import (
     BasinsTable,
@@ -21,6 +21,7 @@ from .config import (
     SweepTable,
     read,
 )
+from .machine import machine_named
 from .progress import Countdown
 from .toml import ConfigError, keys_of
 from .verbs import VERBS
@@ -83,12 +84,39 @@ def _explore(options: argparse.Namespace) -> int:
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_platforms", "cpu")  # the fastest for one motion
     try:
-        serve(options.host, options.port, browser=options.browser, tell=_say)
+        shown = _shown(options)
+    except (ConfigError, ValueError) as error:
+        return _error(error, 2)
+    try:
+        serve(
+            options.host, options.port, browser=options.browser, tell=_say, machine=shown,
+            paper=not options.ready,
+        )  # fmt: skip
     except KeyboardInterrupt:
         pass
     except OSError as error:
         return _error(f"cannot serve {options.host} port {options.port}: {error.strerror}", 1)
     return 0
+
+
+def _shown(options: argparse.Namespace) -> tuple[str, Subject] | None:
+    """The machine to explore, with its name; `None` where none is named.
+
+    **Raises:** `ConfigError` or `ValueError` for what is none, or for ranges that are not.
+    """
+    ranges = {}
+    for text in options.range:
+        name, _, ends = text.partition("=")
+        low, _, high = ends.partition(":")
+        try:
+            ranges[name] = (float(low), float(high))
+        except ValueError:
+            raise ConfigError(f"--range must be NAME=LOW:HIGH, but is {text!r}") from None
+    if options.machine is None:
+        if ranges:
+            raise ConfigError("--range needs --machine, whose numbers it is of")
+        return None
+    return options.machine, Subject(machine_named(options.machine), ranges)
 
 
 def _run_file(options: argparse.Namespace) -> int:
@@ -101,7 +129,7 @@ def _run_file(options: argparse.Namespace) -> int:
         if table is None:
             raise ConfigError(f"missing table [{verb}], which says what to do")
         store = getattr(table, "store", None)
-        found = VERBS[verb](config, _say)
+        found = VERBS[verb](config, table, _say)
     except ConfigError as error:
         for problem in error.problems:
             _error(f"{options.file}: {problem}", 2)
@@ -157,6 +185,22 @@ def _parser() -> argparse.ArgumentParser:
     verb.add_argument("--host", default="127.0.0.1", help="address to listen at (%(default)s)")
     verb.add_argument(
         "--port", type=int, default=8417, help="port to listen at; 0 is any free one (%(default)s)"
+    )
+    verb.add_argument(
+        "--machine",
+        metavar="MODULE:FUNCTION",
+        help="show the machine that a function without arguments returns, of a module or of a file "
+        "(path/to/file.py:function)",
+    )
+    verb.add_argument(
+        "--range",
+        action="append",
+        default=[],
+        metavar="NAME=LOW:HIGH",
+        help="the range of a slider of that machine; may be given several times",
+    )
+    verb.add_argument(
+        "--ready", action="store_true", help="show the ready machines, instead of the paper's scene"
     )
     verb.add_argument(
         "--no-browser", dest="browser", action="store_false", help="do not open a browser"

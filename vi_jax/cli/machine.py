@@ -1,11 +1,13 @@
 """The tables of a file that describe a machine, and a machine named on the command line."""
 
 import importlib
+import importlib.util
 import inspect
 import sys
 import traceback
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, Literal
 
 from attrs import field, frozen
@@ -48,7 +50,7 @@ class ParametersTable:
     electrical_time: float | None = None
 
     def build(self) -> Scene:
-        """The dimensionless scene."""
+        """The scene, made dimensionless. **Raises:** `ConfigError`."""
         with in_terms_of("[parameters]"):
             table = Parameters(**given(self, "drive", "crank", "clock"))
             return table.scene(drive=self.drive, crank=self.crank).in_clock(self.clock)
@@ -56,7 +58,7 @@ class ParametersTable:
 
 @frozen(kw_only=True)
 class StopTable:
-    """One `[[scene.stops]]`."""
+    """One `[[scene.stops]]`: the arguments of `RigidStop`."""
 
     gap: float
     restitution: float | None = None
@@ -86,7 +88,7 @@ class MachineTable:
     numbers: dict[str, float] = field(factory=dict)
 
     def build(self) -> AbstractMachine:
-        """The machine."""
+        """The machine. **Raises:** `ConfigError` for a name or a number that is none."""
         kinds = {name: x for name, x in vars(machines).items() if _is_machine(x)}
         if self.name not in kinds:
             raise ConfigError(unknown("machine", self.name, "[machine]", sorted(kinds)))
@@ -114,13 +116,13 @@ class MotorTable:
     electrical_time: float | None = None
 
     def build(self) -> Motor:
-        """The drive."""
+        """The drive that these numbers are of."""
         return (Motor if self.electrical_time is None else DCMotor)(**given(self))
 
 
 @frozen(kw_only=True)
 class SceneTable:
-    """`[scene]`: dimensionless numbers."""
+    """`[scene]`: the paper's machine in numbers without dimensions."""
 
     drive: Literal["ideal", "motor"] = "ideal"
     frequency_ratio: float | None = None
@@ -194,13 +196,16 @@ def start_of(machine: AbstractMachine, numbers: Mapping[str, float], place: str)
 
 def machine_named(name: str) -> AbstractMachine:
     """The machine that a function of this name returns."""
-    module, _, function = name.partition(":")
+    module, _, function = name.rpartition(":")
     if not module or not function:
-        raise ConfigError(f"--machine must be package.module:function, but is {name!r}")
+        raise ConfigError(
+            "--machine must be package.module:function or path/to/file.py:function, but is "
+            f"{name!r}"
+        )
     with _beside():
         try:
-            make = getattr(importlib.import_module(module), function)
-        except (ImportError, AttributeError) as error:
+            make = getattr(_imported(module), function)
+        except (ImportError, AttributeError, FileNotFoundError) as error:
             raise ConfigError(f"--machine {name} cannot be found: {error}") from None
         except Exception as error:
             raise _raised(name, error) from error
@@ -215,6 +220,27 @@ def machine_named(name: str) -> AbstractMachine:
     return found
 
 
+def _imported(module: str) -> Any:
+    """A module by its name, or a file by its path; what lies beside the file can be imported."""
+    if not module.endswith(".py"):
+        return importlib.import_module(module)
+    path = Path(module).resolve()
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    if not path.is_file() or spec is None or spec.loader is None:
+        raise FileNotFoundError(f"there is no file {module}")
+    made = importlib.util.module_from_spec(spec)
+    sys.modules[path.stem] = made  # where dataclasses look for what they are of
+    sys.path.insert(0, str(path.parent))
+    try:
+        spec.loader.exec_module(made)
+    except BaseException:
+        del sys.modules[path.stem]
+        raise
+    finally:
+        sys.path.remove(str(path.parent))
+    return made
+
+
 def _is_called_with_nothing(make: Any) -> bool:
     try:
         inspect.signature(make).bind()
@@ -225,10 +251,15 @@ def _is_called_with_nothing(make: Any) -> bool:
 
 def _raised(name: str, error: BaseException) -> ConfigError:
     """What went wrong in a user's module, and on which of its lines."""
-    own = getattr(sys.modules.get(name.partition(":")[0]), "__file__", None)
+    module = name.rpartition(":")[0]
+    own = getattr(sys.modules.get(module), "__file__", None)
+    if module.endswith(".py"):
+        own = str(Path(module).resolve())
     lines = traceback.extract_tb(error.__traceback__)
     last = ([line for line in lines if line.filename == own] or lines)[-1]
     where = f" ({last.filename}, line {last.lineno})"
+    if isinstance(error, SyntaxError):  # which says itself where it is
+        where = ""
     return ConfigError(f"--machine {name} raised {type(error).__name__}: {error}{where}")
 
 

@@ -39,7 +39,16 @@ from .checks import (
     check_quantity,
     check_range,
 )
-from .config import Config, OrbitTable, SimulateTable, SweepTable, start_of
+from .config import (
+    BasinsTable,
+    Config,
+    ContinueTable,
+    OrbitTable,
+    ScanTable,
+    SimulateTable,
+    SweepTable,
+    start_of,
+)
 from .output import (
     axes_in_words,
     cycle_columns,
@@ -59,7 +68,7 @@ Tell = Callable[[str], None]
 
 
 class Outcome(NamedTuple):
-    """How a verb ended."""
+    """How a verb ended, and what is printed of it."""
 
     text: str
     """What to print."""
@@ -69,11 +78,10 @@ class Outcome(NamedTuple):
     """Where Ctrl-C ended it, if it did; what was computed before is kept."""
 
 
-def scan(config: Config, tell: Tell) -> Outcome:
-    """`vi-jax scan`."""
+def scan(config: Config, table: ScanTable, tell: Tell) -> Outcome:
+    """`vi-jax scan`: a grid of motions, its regimes and its numbers."""
     machine, start, method = config.build()
-    table, axes = config.scan, config.axes
-    assert table is not None
+    axes = config.axes
     if not axes:
         raise ConfigError("missing table [axes]: a scan needs at least one")
     check_names(machine, axes, "[axes]", start=True)
@@ -107,11 +115,9 @@ def scan(config: Config, tell: Tell) -> Outcome:
     return Outcome("\n".join([*lines, *failed]), good)
 
 
-def sweep(config: Config, tell: Tell) -> Outcome:
-    """`vi-jax sweep`."""
+def sweep(config: Config, table: SweepTable, tell: Tell) -> Outcome:
+    """`vi-jax sweep`: one way through the values, or there and back."""
     machine, start, method = config.build()
-    table = config.sweep
-    assert table is not None
     check_names(machine, [table.parameter], "[sweep]")
     check_range(machine, table.parameter, table.values, "`values` in [sweep]")
     own = average_names(machine, machine.start() if start is None else start)
@@ -157,11 +163,9 @@ def _describe_sweeps(found: Mapping[str, Sweep], table: SweepTable) -> Outcome:
     return Outcome("\n".join([*lines, *failed]), good)
 
 
-def basins(config: Config, tell: Tell) -> Outcome:
-    """`vi-jax basins`."""
+def basins(config: Config, table: BasinsTable, tell: Tell) -> Outcome:
+    """`vi-jax basins`: what each start of a region settles on."""
     machine, start, method = config.build()
-    table = config.basins
-    assert table is not None
     check_names(machine, table.region, "[basins.region]", start=True)
     if table.picture is not None and len(table.region) != 2:
         raise ConfigError(
@@ -189,14 +193,12 @@ def basins(config: Config, tell: Tell) -> Outcome:
     return Outcome("\n".join([*lines, *failed]), good)
 
 
-def orbit(config: Config, tell: Tell) -> Outcome:
-    """`vi-jax orbit`."""
+def orbit(config: Config, table: OrbitTable, tell: Tell) -> Outcome:
+    """`vi-jax orbit`: a periodic motion, and the branch that it lies on."""
     machine, start, method = config.build()
-    table = config.orbit
-    assert table is not None
     check_paths("[orbit]", picture=table.picture)
     if table.continue_ is not None:
-        check_continuation(machine, machine.start() if start is None else start, table)
+        check_continuation(machine, machine.start() if start is None else start, table.continue_)
     guess = start
     if table.guess is not None:
         guess = start_of(machine, table.guess, "`guess` in [orbit]")
@@ -218,13 +220,12 @@ def orbit(config: Config, tell: Tell) -> Outcome:
     if table.picture is not None:
         lines.append(saved(_portrait(found), table.picture))
     if table.continue_ is not None:
-        lines += _continued(found, table, tell)
+        lines += _continued(found, table.continue_, tell)
     return Outcome("\n".join(lines), True)
 
 
-def _continued(found: Orbit, table: OrbitTable, tell: Tell) -> list[str]:
-    asked = table.continue_
-    assert asked is not None
+def _continued(found: Orbit, asked: ContinueTable, tell: Tell) -> list[str]:
+    """A branch followed from an orbit, as lines to print; it is written and drawn as asked for."""
     tell(f"following it in {asked.parameter}")
     with in_terms_of("[orbit.continue]"):
         branch = continue_orbit(found, **given(asked, "y", "picture", "output"))
@@ -248,11 +249,9 @@ def _portrait(found: Orbit) -> Axes:
     return ax
 
 
-def simulate(config: Config, tell: Tell) -> Outcome:
-    """`vi-jax simulate`."""
+def simulate(config: Config, table: SimulateTable, tell: Tell) -> Outcome:
+    """`vi-jax simulate`: one motion, cycle by cycle."""
     machine, start, method = config.build()
-    table = config.simulate
-    assert table is not None
     check_paths("[simulate]", picture=table.picture, output=table.output)
     options = given(table, "picture", "output")
     if table.picture is not None:
@@ -288,7 +287,7 @@ def _describe_run(machine: AbstractMachine, run: Run, table: SimulateTable) -> O
     return Outcome("\n".join(lines), bool(run.successful))
 
 
-VERBS: Mapping[str, Callable[[Config, Tell], Outcome]] = {
+VERBS: Mapping[str, Callable[[Config, Any, Tell], Outcome]] = {
     "scan": scan,
     "sweep": sweep,
     "basins": basins,

@@ -9,10 +9,11 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 from .._programs import compiled
 from ..flow import RESULTS, Run, chosen, simulate
-from ..machine import AbstractMachine
+from ..machine import AbstractMachine, is_autonomous, unit_of, with_unit
 from ..orbit import STABILITY, complex_in_words, cycle_map, impacts_in_words, stability_of
 from ..plot import MotionPath, motion_path
 from ..scan import REGIMES, Regime, lyapunov, taken_along
@@ -61,26 +62,38 @@ class Motion(NamedTuple):
     """Greatest Lyapunov exponent where there is no period, else NaN."""
     fault: str
     """Why it could not be simulated; empty if it could."""
+    places: tuple[np.ndarray, np.ndarray]
+    """Position and velocity on the sections."""
+    quantities: dict[str, float]
+    """The machine's own quantities on the last section, and its averages over the cycles."""
+    lasting: str
+    """The period in the machine's words; where there is none, the longest that was looked for."""
+    rate: str
+    """The unit of exponents."""
+    window: Run
+    """What is drawn."""
 
     @property
     def regime(self) -> str:
         """The regime in words: its period and impacts, or what has no period."""
         if self.period > 0:
             impacts = impacts_in_words(round(self.impacts))
-            return f"period {2 * self.period}π with {impacts}"
+            return f"period {self.lasting} with {impacts}"
         kinds: dict[int, str] = {regime: regime.meaning for regime in REGIMES}
         if self.period == REGIMES.failed:
             return kinds[self.period]
         kind = kinds[self.period]
         if self.period == REGIMES.unsettled:
-            kind = f"no period up to {2 * _REGIME.longest}π: still settling, or quasi-periodic"
+            kind = f"no period up to {self.lasting}: still settling, or quasi-periodic"
         return f"{kind}, {self.impacts:.2f} impacts in a cycle"
 
     @property
     def stability(self) -> str:
         """The multipliers in words, or the exponent."""
         if self.period <= 0:
-            return f"greatest Lyapunov exponent {self.exponent:.4f} ω" if not self.fault else ""
+            if self.fault or not np.isfinite(self.exponent):
+                return ""
+            return with_unit(f"greatest Lyapunov exponent {self.exponent:.4f}", self.rate)
         if not np.isfinite(self.multipliers).all():
             return "no multipliers: an impact falls on the section"
         verdict = STABILITY[stability_of(jnp.asarray(self.multipliers))]
@@ -95,11 +108,11 @@ def look(scene: AbstractMachine, start: Any, settle: int = 1000) -> Motion:
 
     A start beyond a stop is moved onto it.
     """
-    run, window, found, monodromy = _seen(scene, start, jnp.asarray(float(settle)))
+    run, window, found, monodromy, places = _seen(scene, start, jnp.asarray(float(settle)))
     period = int(found["period"])
     exponent = np.nan
     if period == REGIMES.unsettled:
-        exponent = float(_exponent(scene, run.last))
+        exponent = _exponent_of(scene, run.last)
         if exponent > _REGIME.threshold:
             period = int(REGIMES.chaotic)
     multipliers = np.empty(0, complex)
@@ -109,44 +122,61 @@ def look(scene: AbstractMachine, start: Any, settle: int = 1000) -> Motion:
         if np.isfinite(matrix).all():
             multipliers = np.linalg.eigvals(matrix).astype(complex)
             multipliers = multipliers[np.argsort(-abs(multipliers), kind="stable")]
-    log = run.impact_log
+    log, ratio = run.impact_log, run.frequency_ratio
     assert log is not None and run.y_min is not None and run.y_max is not None
-    assert run.frequency_ratio is not None
+    averages = {name: x.mean() for name, x in run.averages.items()}
+    numbers = {name: x[-1] for name, x in run.quantities.items()} | averages
     met = np.asarray(log.stop) >= 0
     good = bool(run.successful)
     return Motion(
-        path=motion_path(window, machine=scene),
+        path=motion_path(window, machine=seen_evenly(scene, run.last)),
         sections=jtu.tree_map(np.asarray, run.sections),
         impact_phase=np.asarray(log.phase)[met],
         impact_speed=np.asarray(log.speed)[met],
-        frequency_ratio=np.asarray(run.frequency_ratio),
+        frequency_ratio=np.full(OBSERVED, np.nan) if ratio is None else np.asarray(ratio),
         extremes=(float(np.min(run.y_min)), float(np.max(run.y_max))),
         period=period,
         impacts=float(found["impacts"]),
         multipliers=multipliers,
         exponent=exponent,
         fault="" if good else str(RESULTS[run.result]),
+        places=(np.asarray(places[0]), np.asarray(places[1])),
+        quantities={name: float(x) for name, x in numbers.items() if not np.ndim(x)},
+        lasting=scene.period_of(period if period > 0 else _REGIME.longest),
+        rate=unit_of(scene.units, "rate"),
+        window=window,
     )
 
 
 def prepare(scene: AbstractMachine, start: Any) -> Motion:
     """Compile what `look` needs for scenes of this structure, and return the motion."""
     found = look(scene, start, 0)
-    _exponent(scene, jtu.tree_map(lambda x: jnp.asarray(x[-1]), found.sections))
+    _exponent_of(scene, jtu.tree_map(lambda x: jnp.asarray(x[-1]), found.sections))
     return found
 
 
 @compiled
-def _seen(scene: AbstractMachine, start: Any, settle: Any) -> tuple[Run, Run, Any, Any]:
-    """The run observed, its first cycles sampled, its regime, and the derivative of its map."""
+def _seen(scene: AbstractMachine, start: Any, settle: Any) -> tuple[Run, Run, Any, Any, Any]:
+    """The run observed, its first cycles sampled, its regime, the derivative of its map, and
+    position and velocity on its sections."""
     method = chosen(scene, None)
     options = {"method": method, "max_steps": _MOST_STEPS}
     start = taken_along(scene, scene.adopt(start))
     run = simulate(scene, start, OBSERVED, settle=settle, impact_log=_MAPPED, **options)
     first = jtu.tree_map(lambda x: x[0], run.sections)
-    window = simulate(scene, first, WINDOW, samples=_SAMPLES, impact_log=_DRAWN, **options)
+    window = simulate(
+        seen_evenly(scene, first), first, WINDOW, samples=_SAMPLES, impact_log=_DRAWN, **options
+    )
     found = _REGIME(scene, run)
-    return run, window, found, _monodromy(scene, run, found["period"], method)
+    places = tuple(jax.vmap(f)(run.sections) for f in (scene.position, scene.velocity))
+    return run, window, found, _monodromy(scene, run, found["period"], method), places
+
+
+def seen_evenly(machine: AbstractMachine, state: Any) -> AbstractMachine:
+    """The machine; one without a drive observed at equal intervals, where samples can be taken."""
+    if not is_autonomous(machine, state):
+        return machine
+    return machine.observed_every(jnp.asarray(machine.cycle))
 
 
 def _monodromy(scene: AbstractMachine, run: Run, period: Any, method: Any) -> jax.Array:
@@ -158,8 +188,16 @@ def _monodromy(scene: AbstractMachine, run: Run, period: Any, method: Any) -> ja
         place = OBSERVED - cycles + i
         return the_map.jacobian(jtu.tree_map(lambda x: x[place], run.sections)) @ product
 
-    leaves = jtu.tree_leaves(run.sections)
-    return jax.lax.fori_loop(0, cycles, one, jnp.eye(len(leaves), dtype=leaves[0].dtype))
+    row = ravel_pytree(run.last)[0]
+    return jax.lax.fori_loop(0, cycles, one, jnp.eye(row.size, dtype=row.dtype))
+
+
+def _exponent_of(scene: AbstractMachine, state: Any) -> float:
+    """The greatest exponent; NaN for a machine that has none (a drift renewed on its section)."""
+    try:
+        return float(_exponent(scene, state))
+    except ValueError:
+        return float("nan")
 
 
 @compiled

@@ -3,7 +3,10 @@
 Frames and labels take most of the time of drawing one; they are kept until the limits change.
 """
 
+import tempfile
 from io import BytesIO
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,16 +16,23 @@ from matplotlib.lines import Line2D
 from matplotlib.text import Text
 from PIL import Image
 
-from ..machine import UNITS
-from ..plot import BLUE, GREEN, RED, axis_name
+from ..machine import UNITS, AbstractMachine, name_in
+from ..plot import BLUE, GREEN, RED, animate, axis_name
 from .diagram import SHOWN, Diagram
-from .motion import WINDOW, Motion
+from .motion import WINDOW, Motion, seen_evenly
 
 MAPS = ("impact map", "section map")
 """What the third picture of an ideal motion shows."""
 
 # Dots per inch, and the look of lines behind: choices.
 _DPI, _FAINT = 90, {"color": "0.88", "lw": 0.8, "zorder": 0}
+
+# Of the motion's extent, the least that a map of its sections shows, so that sections that move a
+# little need no new frame: a choice.
+_WIDE = 0.3
+
+# Of an animation: a choice, which takes some seconds to draw.
+_SECONDS, _FPS = 4, 15
 
 # Limits are kept while what is drawn is within them and fills so much of them.
 _FILLED = 0.5
@@ -32,8 +42,13 @@ class MotionPicture:
     """Four pictures of a motion in one: its time history, phase portrait, map, and multipliers;
     with a motor the crank's speed takes the place of the map."""
 
-    def __init__(self, *, motor: bool = False):
+    def __init__(self, *, motor: bool = False, labels: tuple[str, str] | None = None):
+        """**Arguments:** `motor`, whether the crank's speed is shown; `labels`, what a machine of
+        another kind than the paper's calls its position and its velocity."""
         self._motor = motor
+        self._labels = labels or ("Y = y/a", "V = dY/dτ")
+        self._names = tuple(map(name_in, self._labels))
+        self._across = "cycles" if labels else "drive cycles φ/(2π)"
         self.figure = Figure(figsize=(11.2, 6.6), dpi=_DPI)
         self._canvas = FigureCanvasAgg(self.figure)
         grid = self.figure.add_gridspec(
@@ -48,8 +63,8 @@ class MotionPicture:
 
     def _made_lines(self) -> dict[str, Line2D]:
         lines = {}
-        self._course.set(xlabel="drive cycles φ/(2π)", ylabel="Y = y/a", xlim=(0, WINDOW))
-        self._portrait.set(xlabel="Y = y/a", ylabel="V = dY/dτ")
+        self._course.set(xlabel=self._across, ylabel=self._labels[0], xlim=(0, WINDOW))
+        self._portrait.set(xlabel=self._labels[0], ylabel=self._labels[1])
         for name, ax in (("course", self._course), ("portrait", self._portrait)):
             line = ax.axhline if name == "course" else ax.axvline
             lines[f"{name} stop"] = line(0, color=GREEN, lw=1.8)
@@ -74,8 +89,11 @@ class MotionPicture:
             for name, ax in (("map", self._map), ("multipliers", self._circle))
         }
 
-    def draw(self, motion: Motion, gap: float, *, which: str = MAPS[0]) -> bytes:
-        """The picture of a motion, as PNG."""
+    def draw(self, motion: Motion, gap: Any, *, which: str = MAPS[0]) -> bytes:
+        """The picture of a motion, as PNG.
+
+        **Arguments:** `gap`, the place of the stop, or of several; `which`, out of `MAPS`.
+        """
         self._set_motion(motion, gap)
         if self._motor:
             self._set_speed(motion)
@@ -97,13 +115,15 @@ class MotionPicture:
             self.figure.draw_artist(artist)
         return _packed(self._canvas)
 
-    def _set_motion(self, motion: Motion, gap: float) -> None:
+    def _set_motion(self, motion: Motion, gap: Any) -> None:
         lines, path = self._lines, motion.path
         lines["course"].set_data(path.cycles, path.Y)
         lines["portrait"].set_data(path.Y, path.V)
-        lines["course stop"].set_ydata([gap, gap])
-        lines["portrait stop"].set_xdata([gap, gap])
-        lines["sections"].set_data(motion.sections.Y, motion.sections.V)
+        at = np.repeat(np.atleast_1d(gap), 3)
+        across = np.tile([0.0, 1.0, np.nan], at.size // 3)  # a line for each stop
+        lines["course stop"].set_data(across, at)
+        lines["portrait stop"].set_data(at, across)
+        lines["sections"].set_data(*motion.places)
         _fit(self._course, y=np.append(path.Y, gap))
         _fit(self._portrait, x=np.append(path.Y, gap), y=path.V)
 
@@ -125,9 +145,11 @@ class MotionPicture:
         _fit(self._map, y=np.append(speed, 0.0))
 
     def _set_sections(self, motion: Motion) -> None:
-        Y, V = motion.sections.Y, motion.sections.V
-        self._set_map(Y, V, "Y on the section", "V on the section")
-        _fit(self._map, x=Y, y=V)
+        Y, V = motion.places
+        self._set_map(Y, V, *(f"{name} on the section" for name in self._names))
+        for values, drawn, way in ((Y, motion.path.Y, "x"), (V, motion.path.V, "y")):
+            span = np.ptp(drawn[np.isfinite(drawn)]) if np.isfinite(drawn).any() else 0.0
+            _fit(self._map, **{way: values}, least=max(_WIDE * float(span), 1e-12))
 
     def _set_speed(self, motion: Motion) -> None:
         ratio = motion.frequency_ratio
@@ -146,13 +168,13 @@ class DiagramPicture:
         (self._dots,) = self.ax.plot([], [], "o", color="0.15", ms=1.3, mew=0)
         self._mark = self.ax.axvline(0, color=RED, lw=1)
 
-    def set(self, found: Diagram, chosen: float, *, shown: str) -> Axes:
-        """The axes, with the diagram in them."""
+    def set(self, found: Diagram, chosen: float, *, shown: str, label: str | None = None) -> Axes:
+        """The axes, with the diagram in them; `label`, what is written across."""
         rows = getattr(found, SHOWN[shown])
         across = np.broadcast_to(found.values[:, None], rows.shape)
         self._dots.set_data(across.ravel(), rows.ravel())
         self._mark.set_xdata([chosen, chosen])
-        self.ax.set(xlabel=axis_name(found.parameter, UNITS), ylabel=shown)
+        self.ax.set(xlabel=label or axis_name(found.parameter, UNITS), ylabel=shown)
         self.ax.set_xlim(found.values[0], found.values[-1])
         _fit(self.ax, y=rows)
         return self.ax
@@ -173,6 +195,15 @@ def _fit(
         if left <= low and high <= right and width >= _FILLED * (right - left):
             continue
         setter(low - 0.1 * width, high + 0.1 * width)
+
+
+def gif_of(motion: Motion, machine: AbstractMachine) -> bytes:
+    """The machine moving through the cycles that are drawn of its motion, as a GIF."""
+    evenly = seen_evenly(machine, motion.window.last)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "motion.gif"
+        animate(motion.window, evenly, seconds=_SECONDS, fps=_FPS).save(path)
+        return path.read_bytes()
 
 
 def _packed(canvas: FigureCanvasAgg) -> bytes:

@@ -16,6 +16,7 @@ from . import controls
 from .diagram import diagram
 from .guard import Guard
 from .motion import prepare
+from .subject import Subject as Subject
 
 NEEDED = "marimo>=0.25"
 """What the page needs beside the library."""
@@ -41,13 +42,33 @@ def compile_all(tell: Callable[[str], None]) -> None:
     prepare(*controls.motor(controls.beginning(controls.MOTOR)))
 
 
-def serve(host: str, port: int, *, browser: bool, tell: Callable[[str], None]) -> None:
+# What the page of a machine shows: its name and the machine. The page runs on threads of this
+# process, and is told nothing but its address.
+_SERVED: list[tuple[str, Subject]] = []
+
+
+def served() -> tuple[str, Subject] | None:
+    """The machine that is served beside the ready ones, and its name; `None` if there is none."""
+    return _SERVED[-1] if _SERVED else None
+
+
+def serve(
+    host: str,
+    port: int,
+    *,
+    browser: bool,
+    tell: Callable[[str], None],
+    machine: tuple[str, Subject] | None = None,
+    paper: bool = True,
+) -> None:
     """Serve the page until Ctrl-C, which ends the process.
 
     Its address, which is reported, holds a token without which nothing is answered.
 
     **Arguments:** address and port to listen at (port 0: any that is free); whether to open a
-    browser; `tell`, called with lines about the progress.
+    browser; `tell`, called with lines about the progress; `machine`, the name and the sliders of
+    one to show instead of the paper's scene; `paper`, whether that is shown where no machine is
+    given, else the ready ones.
 
     **Raises:** `OSError` if it cannot listen there.
     """
@@ -56,11 +77,15 @@ def serve(host: str, port: int, *, browser: bool, tell: Callable[[str], None]) -
 
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.create_server((host, port), family=family) as listening:
-        compile_all(tell)
+        if machine is not None:
+            machine[1].compile(tell)
+            _SERVED.append(machine)
+        elif paper:
+            compile_all(tell)
         name = f"[{host}]" if ":" in host else host
         port, token = listening.getsockname()[1], secrets.token_urlsafe(16)
         address = f"http://{name}:{port}?access_token={token}"
-        app: Any = Guard(_page(marimo, port, token), host)
+        app: Any = Guard(_page(marimo, port, token, machine is None and paper), host)
         options = {"log_level": "warning", "timeout_graceful_shutdown": 1}
         server = uvicorn.Server(uvicorn.Config(app, **options))
         tell(f"serving {address} until Ctrl-C")
@@ -74,9 +99,9 @@ def serve(host: str, port: int, *, browser: bool, tell: Callable[[str], None]) -
     os._exit(0)
 
 
-def _page(marimo: Any, port: int, token: str) -> Any:
+def _page(marimo: Any, port: int, token: str, paper: bool) -> Any:
     """The page as an ASGI app that answers only requests with the token."""
-    page = str(Path(__file__).with_name("page.py"))
+    page = str(Path(__file__).with_name("page.py" if paper else "machine_page.py"))
     made = marimo.create_asgi_app(quiet=True, token=token, skew_protection=True)
     app = made.with_app(path="", root=page).build()
     # The cookie with the token is named by the port: a browser keeps one cookie of each name for

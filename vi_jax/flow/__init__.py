@@ -11,7 +11,6 @@ from .arguments import check_reals as check_reals
 from .arguments import check_start as check_start
 from .arguments import machine_of as machine_of
 from .arguments import planned as planned
-from .arguments import refuse_arrays as refuse_arrays
 from .beside import Beside as Beside
 from .beside import elapsed as elapsed
 from .beside import means as means
@@ -41,6 +40,10 @@ from .named import average_names as average_names
 from .named import has_averages as has_averages
 from .named import quantities_on as quantities_on
 from .named import quantity_names as quantity_names
+from .noise import WhiteNoise as WhiteNoise
+from .noise import check_noise as check_noise
+from .noise import lane_key as lane_key
+from .noise import words_of as words_of
 from .options import RunOptions as RunOptions
 from .results import EVENTS as EVENTS
 from .results import REASON_NAMES as REASON_NAMES

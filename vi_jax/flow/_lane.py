@@ -1,30 +1,22 @@
 """What the flat loop carries: one trajectory on its way, and what is asked of it."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, UInt32
 
 from .._types import Flag, Scalar, Scalars, State
 from ..machine import (
     AbstractMachine,
-    begin_modes,
     events_of,
     is_autonomous,
-    rubs,
     section_number,
-    struck_modes,
 )
-from . import results
-from ._own import check_field, check_laws
-from ._own_parts import check_events
 from .beside import Beside
-from .events import Rates, force_rate, rates
 from .methods import AbstractMethod
-from .smooth import in_modes, rounding
 
 # What the next step aims at: nothing, or one of those below. Numbers, which the loop carries.
 FREE = 0.0
@@ -134,6 +126,18 @@ def has_fixed_cycle(machine: AbstractMachine, state: State) -> bool:
     )
 
 
+class Impulses(eqx.Module):
+    """White noise as the loop needs it: impulses on velocities, at instants of each cycle."""
+
+    key: UInt32[Array, "2"]
+    scales: tuple[Array | None, ...]
+    """Of each array of the state, the standard deviation of one impulse on it; `None`: none."""
+    count: int = eqx.field(static=True)
+    """Impulses in a cycle; a multiple of the record points."""
+    functions: tuple[Callable | None, ...] = eqx.field(static=True)
+    """Of each array of the state, a factor of its own as a function of the state; `None`: none."""
+
+
 class Plan(eqx.Module):
     """What the loop is to do, the same for all lanes of a batch. All that is static is a part of
     the compiled program."""
@@ -162,6 +166,8 @@ class Plan(eqx.Module):
     """Cycles before the first one recorded."""
     max_steps: Scalar
     max_impacts: Scalar
+    noise: Impulses | None = None
+    """Impulses of white noise; without it the program has nothing of it."""
 
     @property
     def kept(self) -> int:
@@ -176,7 +182,24 @@ class Plan(eqx.Module):
     @property
     def block(self) -> int:
         """Iterations in which a lane completes at most one interval, its steps being so short."""
+        if self.noise is not None:
+            return max(1, self.noise.count // self.parts)  # steps end on each impulse
         return max(1, self.method.steps_per_cycle // self.parts)
+
+    @property
+    def instants(self) -> int:
+        """Instants of a cycle that steps end on: record points and impulses of noise."""
+        return self.parts if self.noise is None else self.noise.count
+
+    def cycle_of(self, done: Scalar) -> Scalar:
+        """The cycle on its way when so many intervals are done, counted from the start."""
+        recorded = jnp.floor((done - self.settle) / self.parts)
+        return jnp.where(done < self.settle, done, self.settle + recorded)
+
+    def is_record_point(self, part: Scalar, done: Scalar) -> Flag:
+        """Whether the end of the `part`-th piece between two impulses completes an interval."""
+        each = (part + 1) * (self.parts / self.instants)
+        return (part + 1 >= self.instants) | (done >= self.settle) & (each == jnp.floor(each))
 
     def others(self, state: State) -> list[int]:
         """The numbers of the events, besides stops, whose guards are looked at in each step."""
@@ -195,13 +218,17 @@ class Plan(eqx.Module):
         return to_event(section_number(self.machine))
 
     def end(self, part: Scalar) -> Scalar:
-        """Clock reading at the end of the `part`-th interval of a cycle."""
+        """Clock reading at the end of the `part`-th piece of a cycle: an interval, or the way from
+        one impulse of noise to the next."""
         cycle = jnp.asarray(self.machine.cycle, part.dtype)
-        return cycle * (part + 1) / self.parts if self.parts > 1 else cycle
+        return cycle * (part + 1) / self.instants if self.instants > 1 else cycle
 
     def first_part(self, done: Scalar) -> Scalar:
         """`Lane.part` at the begin of a cycle, when so many intervals are done: 0, unless the cycle
-        is not recorded. Such a cycle is one interval, as if only its last part were left."""
+        is not recorded. Such a cycle is one interval, as if only its last part were left. With
+        noise it has all of its impulses."""
+        if self.noise is not None:
+            return jnp.zeros_like(done)
         return jnp.where(done < self.settle, self.parts - 1.0, jnp.zeros_like(done))
 
     def ticks(self, state: State) -> bool:
@@ -244,66 +271,6 @@ class Plan(eqx.Module):
             return None
         return Beside(zero if timed else None, {name: zero for name in self.averages})
 
-    def launch(self, start: State, wanted: Flag | bool = True) -> Lane:
-        """The lane as its loop begins, in the state `start`; one that cannot be run, or is not
-        `wanted`, has ended already."""
-        machine = self.machine
-        Y = machine.position(start)
-        numbers = jtu.tree_leaves((start, eqx.filter(machine, eqx.is_inexact_array)))
-        bad = ~jnp.isfinite(total(numbers, self.settle)) | ~jnp.asarray(wanted)
-        bad = bad | ~machine.in_range(start)
-        slack = rounding(machine, start)
-        for stop in machine.stops:
-            bad = bad | (stop.beyond(machine.coordinates[stop.coordinate].position(start)) > slack)
-        bad = jax.lax.stop_gradient(bad)
-        zero = jnp.zeros_like(Y)
-        modes = begin_modes(machine, zero, start)
-        check_field(machine, zero, start, modes)
-        check_laws(machine, zero)
-        check_events(machine, zero, start, modes)
-        free = in_modes(machine, modes)
-        here = [rates(free.field, x.position, zero, start) for x in machine.coordinates]
-        # At rest the acceleration says which way the motion goes.
-        direction = tuple(jnp.where(x.v == 0, jnp.sign(x.a), jnp.sign(x.v)) for x in here)
-        contact = None
-        if self.rests:
-            growth = [force_rate(free, x.position, free, zero, start) for x in machine.coordinates]
-            both = enumerate(zip(here, growth, strict=True))
-            contact = tuple(self._rests_on(k, *x, slack) for k, x in both)
-            direction = tuple(
-                jnp.where((x.v == 0) & (x.a == 0), jnp.sign(j), along)
-                for x, j, along in zip(here, growth, direction, strict=True)
-            )
-            for i, stop in enumerate(machine.stops):
-                # A little off the stop it would come to rest there: no derivative by the start.
-                at = machine.coordinates[stop.coordinate].placed(start, stop.place, zero)
-                rests = contact[stop.coordinate] == to_event(i)
-                start = jtu.tree_map(lambda a, b, rests=rests: jnp.where(rests, a, b), at, start)
-            if rubs(machine):
-                modes = struck_modes(machine, zero, start, modes, contact=contact)
-        length = zero + jax.lax.stop_gradient(machine.cycle) / self.method.steps_per_cycle
-        if self.method.adaptive:
-            length = length / 8
-        return Lane(
-            s=zero,
-            state=start,
-            record=self.fresh(start),
-            direction=jax.lax.stop_gradient(direction),
-            contact=contact,
-            modes=modes,
-            below=tuple(zero for _ in self.from_below(start)),
-            length=length,
-            attempt=length,
-            target=zero,
-            aims=zero,
-            part=self.first_part(zero) if self.parts > 1 else zero,
-            done=zero,
-            fault=jnp.where(bad, float(results.BAD_START), zero),
-            steps=zero,
-            spent=zero,
-            rejected=zero,
-        )
-
     def place(self, k: int, contact: Scalar, otherwise: Scalar) -> Scalar:
         """The position of coordinate number k while it rests on the stop named by `contact` (see
         `Lane.contact`); `otherwise` while it rests on none."""
@@ -323,14 +290,3 @@ class Plan(eqx.Module):
             here = contact == to_event(i)
             sign, gap = jnp.where(here, float(stop.sign), sign), jnp.where(here, stop.gap, gap)
         return sign, gap
-
-    def _rests_on(self, k: int, here: Rates, growth: Scalar, slack: Scalar | float) -> Scalar:
-        """The stop that coordinate number k rests on as the motion begins: pressed on, or about to
-        be by a force that grows; place and velocity are known to within `slack`."""
-        contact = jnp.zeros_like(here.x)
-        for i, stop in enumerate(self.machine.stops):
-            if stop.coordinate == k:
-                pressed = (stop.sign * here.a > 0) | (here.a == 0) & (stop.sign * growth > 0)
-                rests = (stop.beyond(here.x) >= -slack) & (jnp.abs(here.v) <= slack) & pressed
-                contact = jnp.where(rests, to_event(i), contact)
-        return contact

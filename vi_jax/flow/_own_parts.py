@@ -15,6 +15,7 @@ from ..machine import (
     AbstractEvent,
     AbstractMachine,
     AbstractSwitch,
+    LinearMachine,
     Reset,
     RigidStop,
     event_of,
@@ -48,6 +49,12 @@ def check_parts(machine: AbstractMachine) -> None:
             raise ValueError(
                 f"Stop {i} of a {name} limits coordinate {stop.coordinate}, but there are {many}: "
                 "name each in `coordinates`."
+            )
+        if stop.at is not None and not isinstance(machine, LinearMachine):
+            raise ValueError(
+                f"Stop {i} of a {name} has an `at`, which only a linear machine "
+                "(`vi.machines.Structure`) takes; other machines name what stops limit in "
+                "`coordinates`, and stops its number in `coordinate`."
             )
     _check_frictions(machine)
 

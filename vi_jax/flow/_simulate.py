@@ -23,8 +23,11 @@ from .beside import means
 from .loop import Ends, run_lane
 from .methods import MethodLike
 from .named import has_quantities
+from .noise import with_noise
 from .options import RunOptions
 from .results import Errors, EventLog, ImpactLog, Run, Samples, reason
+
+_FAILED = "A lane of the simulation failed; see `RESULTS` and `Run.result`."
 
 
 @renamed(scene="machine")
@@ -45,14 +48,17 @@ def simulate(
     max_impacts: int = 1000,
     max_steps: int | None = None,
     throw: bool = False,
+    noise: Any = None,
+    key: Any = None,
 ) -> Run:
     """Simulate `machine` from `start` for a number of drive cycles.
 
     Works under `jit`, under `vmap` over any leaf of machine and start, and is differentiable
-    through impacts to any order: forward, and in reverse, which runs forward along each number that
-    is differentiated (a reverse pass would take the steps again, and might decide otherwise about
-    an event) and so costs the more, the more of them there are. Outside of a transformation it
-    compiles itself, once for each structure.
+    through impacts to any order, forward and in reverse. A gradient by more than four numbers keeps
+    the motion and goes back along it, for about five simulations however many numbers it is by; by
+    fewer, on XLA's backend, or where a step has no transpose (a loop of varying length within it)
+    it runs forward along each number. Outside of a transformation it compiles itself, once for each
+    structure.
 
     **Arguments:**
 
@@ -82,6 +88,7 @@ def simulate(
     - `max_steps`: steps beyond which a lane ends, apart from 65,536 in any one cycle (or sampling
       interval).
     - `throw`: raise an error if a lane fails, instead of only reporting it in `result`.
+    - `noise`, `key`: a `WhiteNoise`, by default none, and with it one key of JAX's for each lane.
 
     **Returns:** a `Run`.
 
@@ -96,16 +103,14 @@ def simulate(
         max_steps=max_steps,
     )  # fmt: skip
     plan, start = planned(machine, start, cycles, options)
+    plan = plan if noise is None else with_noise(plan, start, noise, key, samples)
     with lanes.interruptible():
         run = _simulate(plan, start, samples > 0)
     if estimate:
         tighter = dataclasses.replace(plan, method=plan.method.tighter())
         errors = _errors(run, _simulate(tighter, start, False))
         run = dataclasses.replace(run, errors=errors)
-    if throw:
-        failed = "A lane of the simulation failed; see `RESULTS` and `Run.result`."
-        run = eqx.error_if(run, ~run.successful, failed)
-    return run
+    return eqx.error_if(run, ~run.successful, _FAILED) if throw else run
 
 
 @compiled
@@ -134,17 +139,22 @@ def simulate_pool(
     cycles: int,
     options: RunOptions,
     wanted: Array | None = None,
+    noise_of: Callable[[Any], tuple[Any, Any]] | None = None,
 ) -> Run:
     """As `simulate` under `vmap`, for lanes some of which are not wanted; forward mode only.
 
     **Arguments:** machine and start of one lane from its values; the values of all lanes, a pytree
     with one leading axis; the cycles to record; the options of each run; flags of the lanes that
-    are wanted, all by default (the others are not run and come back as failed).
+    are wanted, all by default (the others are not run and come back as failed); noise and key of
+    one lane from its values, where there is noise.
     """
 
     def one(value, wanted):
         plan, start = planned(*lane_of(value), cycles, options)
-        return failed_derivatives(collect(plan, False, *run_lane(plan, start, wanted)))
+        if noise_of is not None:
+            plan = with_noise(plan, start, *noise_of(value), options.samples)
+        run = collect(plan, options.samples > 0, *run_lane(plan, start, wanted))
+        return failed_derivatives(run)
 
     if wanted is None:
         wanted = jnp.ones(jtu.tree_leaves(values)[0].shape[0], bool)

@@ -181,17 +181,6 @@ def check_leaves(argument: str, state: State) -> None:
             )
 
 
-def refuse_arrays(argument: str, verb: str, state: State) -> None:
-    """**Raises:** `ValueError` if a state holds an array, for a verb that needs numbers."""
-    for path, leaf in jtu.tree_leaves_with_path(state):
-        if jnp.ndim(leaf):
-            raise ValueError(
-                f"Argument `{argument}` must hold scalars, each component a number of its own, "
-                f"but {_leaf_in_words(path)} has shape {jnp.shape(leaf)}: `{verb}` takes no arrays "
-                "in a state (`simulate`, `cycle_map` and `lyapunov` do)."
-            )
-
-
 def _leaf_in_words(path: Any) -> str:
     return f"its {jtu.keystr(path).lstrip('.')}" if path else "it"
 
@@ -209,9 +198,10 @@ def check_start(machine: AbstractMachine, start: State) -> None:
         shape = jnp.shape(machine.position(start)) or jnp.shape(machine.velocity(start))
     except (AttributeError, TypeError, LookupError):
         raise TypeError(
-            f"Argument `start` must be a state of this machine, but got {start!r}. Of a state "
-            "without `Y` and `V` a machine of your own with stops says by `position`, `velocity` "
-            "and `placed`, or by `coordinates`, what they limit."
+            f"Argument `start` must be a state of this machine, but got {start!r}; one with `Y` "
+            "and `V` is `vi_jax.OscillatorState(Y, V)`. Of a state without them a machine of your "
+            "own with stops says by `position`, `velocity` and `placed`, or by `coordinates`, what "
+            "they limit."
         ) from None
     check_reals("start", start)
     if shape:

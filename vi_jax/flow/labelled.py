@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from .._checks import one_of
+from .._lazy import xr
 from .._types import State
 from ..machine import by_name, with_units
 
@@ -45,7 +46,7 @@ def present(values: Mapping[str, Any], dims: tuple[str, ...]) -> Variables:
     return {name: (dims, np.asarray(x)) for name, x in values.items() if x is not None}
 
 
-def tidy(data: Any, along: str | None) -> Any:
+def tidy(data: "xr.Dataset", along: str | None) -> "xr.Dataset":
     """Of a data set what lies along one of its dimensions, so that it makes a table with one
     row for each of its places; all of it by default.
 
@@ -80,10 +81,10 @@ def in_names(item: Any, kind: Any, names: Sequence[str]) -> np.ndarray:
     return np.asarray(np.asarray(names)[np.asarray(place)])
 
 
-def run_dataset(run: Any, dims: Sequence[str] | None, result: np.ndarray, along: str | None) -> Any:
+def run_dataset(
+    run: Any, dims: Sequence[str] | None, result: np.ndarray, along: str | None
+) -> "xr.Dataset":
     """A run as a data set (see `Run.to_xarray`)."""
-    import xarray as xr  # slow to load
-
     batch = batch_names(dims, run.steps.ndim)
     cycle, section = (*batch, "cycle"), (*batch, "section")
     names = ("y_max", "y_min", "impacts", "impact_speed", "rests", "impact_energy", "clearance",

@@ -1,5 +1,6 @@
 """The loop around the hybrid step."""
 
+import dataclasses
 from functools import partial
 from typing import NamedTuple
 
@@ -11,6 +12,7 @@ from jaxtyping import Array
 from .. import lanes
 from .._types import Flag, Scalar, State
 from ._lane import Lane, Plan, Record
+from ._launch import launched
 from ._step.hybrid import iterate
 
 
@@ -43,18 +45,24 @@ def run_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> tuple[Ends
     **Returns:** how it ended, and the states and records of the intervals kept, with leading axis
     `plan.kept + 1`: the first holds the state in which recording begins, and no record.
     """
+    way = plan.machine.prepared()
+    own = way.machine is plan.machine
+    if not own:
+        plan, start = dataclasses.replace(plan, machine=way.machine), way.inward(start)
     numbers, rest = eqx.partition(plan, eqx.is_array)
     ends, (states, records) = lanes.run(
         partial(_begin, rest), partial(_step, rest), _end, (numbers, start, jnp.asarray(wanted)),
         rows=plan.kept + 1, block=plan.block, backend=plan.backend,
     )  # fmt: skip
+    if not own:
+        states = jax.vmap(way.outward)(states)
     return ends, states, records
 
 
 def _begin(rest: Plan, inputs: _Inputs) -> tuple[Lane, lanes.Emitted]:
     numbers, start, wanted = inputs
     plan = eqx.combine(numbers, rest)
-    lane = plan.launch(start, wanted)
+    lane = launched(plan, start, wanted)
     first = plan.settle <= 0
     return lane, lanes.Emitted(_active(plan, lane), first, (start, plan.fresh(start)))
 

@@ -10,7 +10,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array
 
 from .._types import State
-from ..machine import AbstractMachine, begin_modes, components, leaf_names
+from ..machine import AbstractMachine, begin_modes, components, is_own, leaf_names
 from ._own import in_words_of
 
 # What results have by these names already: columns of runs, orbits, branches and scans, and axes.
@@ -25,12 +25,12 @@ _TAKEN = frozenset(
 
 def has_averages(machine: AbstractMachine) -> bool:
     """Whether a machine names averages at all."""
-    return type(machine).averages is not AbstractMachine.averages
+    return is_own(type(machine).averages)
 
 
 def has_quantities(machine: AbstractMachine) -> bool:
     """Whether a machine names functions of its state."""
-    return type(machine).quantities is not AbstractMachine.quantities
+    return is_own(type(machine).quantities)
 
 
 def average_names(machine: AbstractMachine, start: State) -> tuple[str, ...]:

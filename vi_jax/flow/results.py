@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float, Int
 
+from .._lazy import xr
 from .._types import Scalar, State
 from ..machine import PLAIN, Shown, Stated, Summarized, in_unit, name_in, state_in_words
 from ._listed import listed
@@ -276,7 +277,9 @@ class Run(Summarized):
         whole = jnp.sum(self.duration)
         return {name: jnp.sum(x * self.duration) / whole for name, x in self.averages.items()}
 
-    def to_xarray(self, dims: Sequence[str] | None = None, *, along: str | None = None) -> Any:
+    def to_xarray(
+        self, dims: Sequence[str] | None = None, *, along: str | None = None
+    ) -> "xr.Dataset":
         """This run as an `xarray.Dataset`, labelled by cycle, section and sample.
 
         States become a variable for each component: `section_Y` (cycles + 1), `sample_Y`; an array

@@ -7,13 +7,13 @@ transposes, concatenations) is done while the code is written and costs nothing.
 from collections.abc import Callable
 from functools import partial
 
+import jax
 import numpy as np
 
-from ._operations import Rule, add, compare, extreme, kind_of, mul, register
+from ._large import LARGE, Held, Large, Values, at, held
+from ._operations import Rule, add, kind_of, register
+from ._reductions import register_products, register_reductions
 from ._text import Text, Value
-
-Values = np.ndarray
-"""An object array of `Value`s, of the shape of the JAX array."""
 
 # Rules with the arguments `t`, the `Text`; `p`, the parameters of the equation; `avals`, the shapes
 # and types of its results; and `Values` for each argument. They return `Values`, or a tuple.
@@ -67,9 +67,20 @@ def _(t, p, avals, *xs):
     return np.stack(xs, axis=p["axis"])
 
 
+@structural("unstack")
+def _(t, p, avals, x):
+    return tuple(np.asarray(part, object) for part in np.moveaxis(x, p["axis"], 0))
+
+
 @structural("split")
 def _(t, p, avals, x):
     return tuple(np.split(x, np.cumsum(p["sizes"])[:-1], axis=p["axis"]))
+
+
+@structural("empty2")
+def _(t, p, avals):
+    """What JAX leaves where a branch has nothing that its derivative needs: any number."""
+    return each(lambda _: t.zero(kind_of(avals[0].dtype)), np.zeros(avals[0].shape))
 
 
 @structural("iota")
@@ -83,16 +94,15 @@ def _(t, p, avals, *sizes):
 def _(t, p, avals, x, fill):
     out = x
     for axis, (low, high, inside) in enumerate(p["padding_config"]):
-        if min(low, high) < 0:
-            raise KeyError("pad")
         shape = list(out.shape)
-        shape[axis] = low + high + shape[axis] + inside * max(shape[axis] - 1, 0)
+        shape[axis] = max(0, low) + max(0, high) + shape[axis] + inside * max(shape[axis] - 1, 0)
         padded = np.empty(shape, object)
         padded.fill(fill[()])
         where = [slice(None)] * out.ndim
-        where[axis] = slice(low, shape[axis] - high, inside + 1)
+        where[axis] = slice(max(0, low), shape[axis] - max(0, high), inside + 1)
         padded[tuple(where)] = out
-        out = padded
+        where[axis] = slice(max(0, -low), shape[axis] - max(0, -high))
+        out = padded[tuple(where)]
     return out
 
 
@@ -108,31 +118,22 @@ def _reduce(function: Callable, x: Values, axes: tuple[int, ...], empty: Value) 
     return out
 
 
-for _name, _with in {
-    "reduce_sum": add,
-    "reduce_prod": mul,
-    "reduce_max": lambda t, a, b: extreme(t, "gt", a, b, False),
-    "reduce_min": lambda t, a, b: extreme(t, "lt", a, b, False),
-    "reduce_and": lambda t, a, b: t.binary("and", a, b),
-    "reduce_or": lambda t, a, b: t.binary("or", a, b),
-}.items():
-    STRUCTURAL[_name] = lambda t, p, avals, x, how=_with, name=_name: _reduce(
-        lambda a, b: how(t, a, b), x, tuple(p["axes"]),
-        t.constant(int(name in ("reduce_prod", "reduce_and")), kind_of(avals[0].dtype)),
-    )  # fmt: skip
-
-
-@structural("cumsum")
-def _(t, p, avals, x):
+def _cumulated(t, p, avals, x, how):
     out = np.moveaxis(x, p["axis"], 0).copy()
     out = out[::-1] if p["reverse"] else out
     for i in range(1, len(out)):
-        out[i : i + 1] = each(lambda a, b: add(t, a, b), out[i - 1 : i], out[i : i + 1])
+        out[i : i + 1] = each(how, out[i - 1 : i], out[i : i + 1])
     return np.moveaxis(out[::-1] if p["reverse"] else out, 0, p["axis"])
 
 
-@structural("dot_general")
-def _(t, p, avals, a, b):
+register_reductions(
+    STRUCTURAL,
+    lambda t, p, avals, x, how, empty: _reduce(how, x, tuple(p["axes"]), empty),
+    _cumulated,
+)
+
+
+def _dot(t, p, avals, a, b, product: Callable):
     (over_a, over_b), (batch_a, batch_b) = p["dimension_numbers"]
     free_a = [i for i in range(a.ndim) if i not in (*over_a, *batch_a)]
     free_b = [i for i in range(b.ndim) if i not in (*over_b, *batch_b)]
@@ -146,43 +147,22 @@ def _(t, p, avals, a, b):
     n, m = len(batch_a), len(free_a)
     zero = t.zero(kind_of(avals[0].dtype))
     for i in np.ndindex(*shape):
-        x, y = left[i[: n + m]].ravel(), right[i[:n] + i[n + m :]].ravel()
+        # Without a sum an element is a `Value` itself.
+        x, y = np.ravel(left[i[: n + m]]), np.ravel(right[i[:n] + i[n + m :]])
         total = zero
         for u, v in zip(x, y, strict=True):
-            total = add(t, total, mul(t, u, v))
+            total = add(t, total, product(t, u, v))
         out[i] = total
     return out
 
 
-def _starts(t: Text, starts: list[Value], sizes: list[int], shape: tuple[int, ...]):
-    """Every place at which a block of `sizes` may begin, and whether it does (clamped)."""
-    for corner in np.ndindex(*(n - m + 1 for n, m in zip(shape, sizes, strict=True))):
-        flag = t.constant(True, "i1")
-        for i, start, n, m in zip(corner, starts, shape, sizes, strict=True):
-            if n == m:
-                continue
-            at = t.constant(i, start.kind)
-            how = "le" if i == 0 else "ge" if i == n - m else "eq"
-            flag = t.both(flag, compare(t, how, start, at, False))
-        yield corner, flag
+register_products(STRUCTURAL, _dot)
 
 
-@structural("dynamic_slice")
-def _(t, p, avals, x, *starts):
-    sizes = list(p["slice_sizes"])
-    out = None
-    for corner, flag in _starts(t, [s[()] for s in starts], sizes, x.shape):
-        block = x[tuple(slice(i, i + m) for i, m in zip(corner, sizes, strict=True))]
-        out = block if out is None else each(lambda a, b, f=flag: t.select(f, a, b), block, out)
-    return out
-
-
-@structural("dynamic_update_slice")
-def _(t, p, avals, x, update, *starts):
-    out = x
-    for corner, flag in _starts(t, [s[()] for s in starts], list(update.shape), x.shape):
-        moved = x.copy()
-        where = tuple(slice(i, i + m) for i, m in zip(corner, update.shape, strict=True))
-        moved[where] = update
-        out = each(lambda a, b, f=flag: a if a == b else t.select(f, a, b), moved, out)
-    return out
+def any_in(t: Text, x: Held) -> Value:
+    """Whether any flag of an array holds."""
+    if not x.ndim:
+        return at(t, x, ())
+    rules = LARGE if isinstance(x, Large) else STRUCTURAL
+    axes, flag = {"axes": tuple(range(x.ndim))}, jax.ShapeDtypeStruct((), bool)
+    return at(t, held(t, rules["reduce_or"](t, axes, [flag], x)), ())

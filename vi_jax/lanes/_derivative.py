@@ -35,6 +35,7 @@ def forward(program: LaneProgram, varied: tuple[bool, ...]) -> tuple[LaneProgram
         rows=program.rows,
         block=program.block,
         tangents=(*before, *(True for m in varied if m)),
+        varied=varied,
         base=program,
     )
     return derived, (*depend.outs, *rows)

@@ -17,12 +17,25 @@ from typing import Any, NamedTuple
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
-from ._arrays import Values, each
-from ._memory import gather, load_pointer, load_stride, scatter, splat
+from ._arrays import each
+from ._large import MOST_IN_REGISTERS, Formula, Held, Large, Strided, replace, room, splat
+from ._memory import (
+    claim,
+    gather,
+    gather_over,
+    load_pointer,
+    load_stride,
+    over_rows,
+    scatter,
+    shared,
+)
 from ._operations import kind_of
 from ._program import LaneProgram
 from ._text import RARE, Text, Value, is_float
-from ._vector import write
+from ._vector import Unsupported, write
+
+# The most memory of a thread for arrays: a choice. What asks for more runs on XLA, with a warning.
+_MOST_BYTES = 4 << 30
 
 _PREAMBLE = """\
 define void @kernel(ptr noalias readonly %inputs, ptr noalias readonly %strides,
@@ -30,16 +43,22 @@ define void @kernel(ptr noalias readonly %inputs, ptr noalias readonly %strides,
 entry:"""
 
 
-def kernel_text(program: LaneProgram, width: int, bits: int) -> str:
-    """LLVM's text of a program, for groups of `width` lanes in registers of `bits` bits."""
-    return _Writer(program, width).text(bits)
+def kernel_text(
+    program: LaneProgram, width: int, bits: int, one_for_all: tuple[bool, ...] = ()
+) -> str:
+    """LLVM's text of a program, for groups of `width` lanes in registers of `bits` bits.
+
+    **Arguments:** further, which inputs all lanes share; asked of large ones only, which are then
+    read where they are.
+    """
+    return _Writer(program, width, one_for_all).text(bits)
 
 
 class _Group(NamedTuple):
     """What the slots of a group hold at one place of the kernel."""
 
-    arrays: list[Values]
-    """The lanes' inputs, then their carry."""
+    arrays: list[Any]
+    """The lanes' inputs, then their carry. Large ones are in memory, at one place throughout."""
     lane: Value
     """The number of each slot's lane; -1 where there are no more."""
     rows: Value
@@ -49,15 +68,17 @@ class _Group(NamedTuple):
 
     def values(self) -> list[Value]:
         """All numbers in one order."""
-        return [*(v for x in self.arrays for v in x.ravel()), self.lane, self.rows, self.active]
+        numbers = (v for x in self.arrays if not isinstance(x, Large) for v in x.ravel())
+        return [*numbers, self.lane, self.rows, self.active]
 
 
 class _Writer:
     """A kernel while it is written. The methods append blocks to `t` in the order of `text`."""
 
-    def __init__(self, program: LaneProgram, width: int):
+    def __init__(self, program: LaneProgram, width: int, one_for_all: tuple[bool, ...]):
         self.program = program
         self.t = Text(width)
+        self.one_for_all = one_for_all or (False,) * len(program.in_avals)
 
     def text(self, bits: int) -> str:
         """The whole module. `bits` is the width of the registers that LLVM may use."""
@@ -73,12 +94,16 @@ class _Writer:
         ready = self._ready(old, begun, begin_end)
         # The head was written before the two ways that lead to it.
         t.join(head.values(), (ready.values(), "ready"), (stepped.values(), step_end), at=place)
-        t.lines += ["exit:", "  ret void", "}"]
+        if t.arena.size * t.width * 8 > _MOST_BYTES:
+            raise Unsupported(f"{t.arena.size * t.width * 8 >> 30} GB for its arrays")
+        claimed, released = claim(t)
+        t.lines += ["exit:", *released, "  ret void", "}"]
         attributes = (
             f'attributes #0 = {{ nounwind "min-legal-vector-width"="{bits}" '
             f'"prefer-vector-width"="{bits}" }}'
         )
-        return "\n".join([*t.declared.values(), _PREAMBLE, *t.lines, attributes, RARE, ""])
+        declared = t.declared.values()
+        return "\n".join([*declared, _PREAMBLE, *claimed, *t.lines, attributes, RARE, ""])
 
     def _entry(self) -> None:
         """Once per thread: the addresses of all arrays, and the strides."""
@@ -88,12 +113,25 @@ class _Writer:
         self.strides = [load_stride(t, i) for i in range(len(program.in_avals))]
         outs = [load_pointer(t, "outputs", i) for i in range(results + len(program.row_avals))]
         self.results, self.rows = outs[:results], outs[results:]
+        self.large: list[Strided | None] = []
+        for i, aval in enumerate((*program.in_avals, *program.carry_avals)):
+            kind, found = kind_of(aval.dtype), None
+            if aval.size > MOST_IN_REGISTERS:
+                if i < len(self.inputs) and self.one_for_all[i]:
+                    found = shared(self.inputs[i], aval.shape, kind)
+                else:
+                    found = room(t, aval.shape, kind)
+            self.large.append(found)
         t.line("br label %refill")
 
     def _names(self) -> _Group:
         """New names for all that a group holds, to be defined by phi instructions."""
         t, arrays = self.t, []
-        for aval in (*self.program.in_avals, *self.program.carry_avals):
+        avals = (*self.program.in_avals, *self.program.carry_avals)
+        for aval, in_memory in zip(avals, self.large, strict=True):
+            if in_memory is not None:
+                arrays.append(in_memory)
+                continue
             x = np.empty(aval.shape, object)
             for i in np.ndindex(aval.shape):
                 x[i] = Value(t.fresh(), kind_of(aval.dtype))
@@ -134,6 +172,7 @@ class _Writer:
         complete = t.both(active, complete)
         self._store_row(group.lane, complete, group.rows, row)
         rows = t.binary("add", group.rows, t.cast("zext", complete, "i64"))
+        replace(t, group.arrays[n:], carry)
         end = t.block
         t.line("br label %head")
         t.close()
@@ -200,16 +239,17 @@ class _Writer:
         block."""
         t = self.t
         t.open("begin")
-        read = [
-            gather(t, pointer, stride, old.lane, x, new)
-            for pointer, stride, x in zip(self.inputs, self.strides, old.arrays, strict=False)
-        ]
+        n, read = (
+            len(self.inputs),
+            [self._read(i, x, old.lane, new) for i, x in enumerate(old.arrays[: len(self.inputs)])],
+        )
         carry, going, complete, row = self._run(self.program.begin, read, new)
         complete = t.both(new, complete)
         self._store_row(old.lane, complete, t.zero("i64"), row)
         rows = t.select(new, t.cast("zext", complete, "i64"), old.rows)
+        replace(t, old.arrays[n:], carry, new)
         arrays = [
-            each(lambda a, b: t.select(new, a, b), x, y)
+            y if isinstance(y, Large) else each(lambda a, b: t.select(new, a, b), x, y)
             for x, y in zip([*read, *carry], old.arrays, strict=True)
         ]
         active = t.select(new, going, old.active)
@@ -217,6 +257,16 @@ class _Writer:
         t.line("br label %ready")
         t.close()
         return _Group(arrays, old.lane, rows, active), end
+
+    def _read(self, i: int, old: Held, lane: Value, new: Value) -> Held:
+        """Input number i of the lanes in the slots `new`."""
+        t, pointer, stride = self.t, self.inputs[i], self.strides[i]
+        if not isinstance(old, Large):
+            return gather(t, pointer, stride, lane, old, new)
+        if not self.one_for_all[i]:
+            assert isinstance(old, Strided)
+            gather_over(t, pointer, stride, lane, old, new)
+        return old
 
     def _ready(self, old: _Group, begun: _Group, begin_end: str) -> _Group:
         """The group with and without new lanes; to the head if any slot has a lane, else out."""
@@ -226,15 +276,18 @@ class _Writer:
         def either(a: Value, b: Value) -> Value:
             return t.phi(a.kind, (a.text, begin_end), (b.text, "refill"))
 
-        arrays = [each(either, a, b) for a, b in zip(begun.arrays, old.arrays, strict=True)]
+        arrays = [
+            b if isinstance(b, Large) else each(either, a, b)
+            for a, b in zip(begun.arrays, old.arrays, strict=True)
+        ]
         rows, active = either(begun.rows, old.rows), either(begun.active, old.active)
         left = t.any(t.binary("icmp sge", old.lane, t.zero("i64"), "i1"))
         t.fork(left, "head", "exit")
         return _Group(arrays, old.lane, rows, active)
 
     def _run(
-        self, jaxpr: ClosedJaxpr, args: list[Values], mask: Value
-    ) -> tuple[list[Values], Value, Value, list[Values]]:
+        self, jaxpr: ClosedJaxpr, args: list[Any], mask: Value
+    ) -> tuple[list[Any], Value, Value, list[Any]]:
         """What `begin` or `step` gives: carry, whether the lane goes on, has a row, the row."""
         out: list[Any] = write(self.t, jaxpr, args, mask)
         n = len(self.program.carry_avals)
@@ -242,7 +295,7 @@ class _Writer:
 
     # Rows
 
-    def _store_row(self, lane: Value, mask: Value, place: Value, row: list[Values]) -> None:
+    def _store_row(self, lane: Value, mask: Value, place: Value, row: list[Any]) -> None:
         """Store a row where `mask` holds and there is room for it; skipped if no lane has one.
 
         **Arguments:** each slot's lane; which have completed a row; its number in the lane; it.
@@ -259,7 +312,7 @@ class _Writer:
         t.close()
         t.follow(after)
 
-    def _put_row(self, lane: Value, mask: Value, place: Value, row: list[Values]) -> None:
+    def _put_row(self, lane: Value, mask: Value, place: Value, row: list[Any]) -> None:
         t = self.t
         line = t.binary("add", t.binary("mul", lane, t.constant(self.program.rows, "i64")), place)
         for pointer, x in zip(self.rows, row, strict=True):
@@ -273,23 +326,13 @@ class _Writer:
         empty = []
         for aval in program.row_avals:
             kind = kind_of(aval.dtype)
+            nothing = t.constant(float("nan") if is_float(kind) else 0, kind)
+            if aval.size > MOST_IN_REGISTERS:
+                empty.append(Formula(aval.shape, kind, lambda index, x=nothing: x))
+                continue
             x = np.empty(aval.shape, object)
-            x.fill(t.constant(float("nan") if is_float(kind) else 0, kind))
+            x.fill(nothing)
             empty.append(x)
-        head, inside, after = t.label(), t.label(), t.label()
-        before = t.block
-        t.line(f"br label %{head}")
-        t.open(head)
-        place, following = Value(t.fresh(), "i64"), Value(t.fresh(), "i64")
-        t.join([place], ([filled], before), ([following], inside))
-        room = t.binary("icmp slt", place, t.constant(program.rows, "i64"), "i1")
-        room = t.both(ended, room)
-        t.fork(t.any(room), inside, after)
-        t.open(inside)
-        self._put_row(lane, room, place, empty)
-        one = t.constant(1, "i64").text
-        t.line(f"{following.text} = add {t.vector('i64')} {place.text}, {one}")
-        t.line(f"br label %{head}")
-        t.close()
-        t.close()
-        t.follow(after)
+        over_rows(
+            t, filled, program.rows, ended, lambda n, mask: self._put_row(lane, mask, n, empty)
+        )

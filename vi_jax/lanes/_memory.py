@@ -1,11 +1,32 @@
 """Loads and stores of a kernel: where the numbers of a group's lanes lie in XLA's arrays."""
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 
-from ._arrays import Values
+from ._large import (
+    Formula,
+    Held,
+    Large,
+    Strided,
+    Table,
+    Values,
+    contiguous,
+    fill,
+    gathered,
+    in_lanes,
+    over,
+    place_of,
+    scattered,
+    selected,
+    splat,
+)
+from ._operations import kind_of
 from ._text import Text, Value
 
-_BYTES = {"double": 8, "float": 4, "i1": 1, "i8": 1, "i16": 2, "i32": 4, "i64": 8}
+# Bytes of a cache line, and of the widest register.
+_LINE = 64
 
 
 def load_pointer(t: Text, table: str, i: int) -> str:
@@ -18,14 +39,6 @@ def load_stride(t: Text, i: int) -> Value:
     """How many numbers input `i` has per lane (0 for one that all lanes share), for every lane."""
     place = t.raw(f"getelementptr i64, ptr %strides, i64 {i}")
     return splat(t, t.raw(f"load i64, ptr {place}"), "i64")
-
-
-def splat(t: Text, scalar: str, kind: str) -> Value:
-    """A scalar of the kernel in every lane of the group."""
-    v = t.vector(kind)
-    one = t.raw(f"insertelement {v} poison, {kind} {scalar}, i32 0")
-    mask = f"<{t.width} x i32> zeroinitializer"
-    return Value(t.raw(f"shufflevector {v} {one}, {v} poison, {mask}"), kind)
 
 
 def _addresses(t: Text, pointer: str, offset: Value, kind: str) -> str:
@@ -42,32 +55,103 @@ def gather(t: Text, pointer: str, stride: Value, lane: Value, old: Values, mask:
     out = np.empty(old.shape, object)
     for n, i in enumerate(np.ndindex(old.shape)):
         kind: str = old[i].kind  # pyright: ignore[reportAttributeAccessIssue]
-        stored = "i8" if kind == "i1" else kind  # XLA keeps truth values in bytes
-        where = _addresses(t, pointer, t.binary("add", base, t.constant(n, "i64")), stored)
-        v, p, flags = t.vector(stored), f"<{t.width} x ptr>", t.vector("i1")
-        name = f"@llvm.masked.gather.{t.suffix(stored)}.v{t.width}p0"
-        t.declared[name] = f"declare {v} {name}({p}, i32, {flags}, {v})"
-        call = f"{p} {where}, i32 {_BYTES[stored]}, {flags} {mask.text}, {v} zeroinitializer"
-        value = Value(t.raw(f"call {v} {name}({call})"), stored)
-        if kind == "i1":
-            value = t.binary("icmp ne", value, t.zero("i8"), "i1")
-        out[i] = value
+        out[i] = _number(t, pointer, t.binary("add", base, t.constant(n, "i64")), kind, mask)
     return out
 
 
-def scatter(t: Text, pointer: str, base: Value, x: Values, mask: Value) -> None:
+def gather_over(
+    t: Text, pointer: str, stride: Value, lane: Value, old: Strided, mask: Value
+) -> None:
+    """The same for an array in memory, where it replaces the numbers of the slots that read."""
+    new = gathering(t, pointer, t.binary("mul", lane, stride), old, mask)
+    fill(t, old, selected(t, mask, new, old))
+
+
+def gathering(t: Text, pointer: str, base: Value, like: Any, mask: Value) -> Formula:
+    """A large array of each slot, read where it is asked for and `mask` holds, else zeros.
+
+    **Arguments:** where the arrays of all lanes begin; the number of its first number in them; a
+    large array, or an aval, of its shape and type; which slots read.
+    """
+    steps = contiguous(like.shape)
+    kind = like.kind if isinstance(like, Large) else kind_of(like.dtype)
+
+    def number(index) -> Value:
+        place = t.binary("add", base, in_lanes(t, place_of(t, index, steps)))
+        return _number(t, pointer, place, kind, mask)
+
+    return Formula(tuple(like.shape), kind, number)
+
+
+def shared(pointer: str, shape: tuple[int, ...], kind: str) -> Strided:
+    """An input that all lanes share, where XLA keeps it."""
+    return Strided(shape, kind, Table(pointer), contiguous(shape))
+
+
+def _number(t: Text, pointer: str, place: Value, kind: str, mask: Value) -> Value:
+    """Each slot's number at a place of XLA's array, where `mask` holds."""
+    stored = "i8" if kind == "i1" else kind  # XLA keeps truth values in bytes
+    value = gathered(t, _addresses(t, pointer, place, stored), stored, mask)
+    return t.binary("icmp ne", value, t.zero("i8"), "i1") if kind == "i1" else value
+
+
+def scatter(t: Text, pointer: str, base: Value, x: Held, mask: Value) -> None:
     """Write `x` of the lanes in `mask`, the numbers of each from `base` on.
 
     **Arguments:** where the output's array begins; of each lane, the number of its first number in
     the array; the values; which slots write.
     """
-    for n, value in enumerate(x.ravel()):
+
+    def put(place, value: Value) -> None:
         if value.kind == "i1":
             value = t.cast("zext", value, "i8")
-        kind = value.kind
-        where = _addresses(t, pointer, t.binary("add", base, t.constant(n, "i64")), kind)
-        v, p, flags = t.vector(kind), f"<{t.width} x ptr>", t.vector("i1")
-        name = f"@llvm.masked.scatter.{t.suffix(kind)}.v{t.width}p0"
-        t.declared[name] = f"declare void {name}({v}, {p}, i32, {flags})"
-        call = f"{v} {value.text}, {p} {where}, i32 {_BYTES[kind]}, {flags} {mask.text}"
-        t.line(f"call void {name}({call})")
+        number = t.binary("add", base, in_lanes(t, place))
+        scattered(t, _addresses(t, pointer, number, value.kind), value, mask)
+
+    if isinstance(x, Large):
+        steps = contiguous(x.shape)
+        over(t, x.shape, lambda i: put(place_of(t, i, steps), x.at(t, i)), x.cuts)
+        return
+    for n, value in enumerate(x.ravel()):
+        put(n, value)
+
+
+def over_rows(
+    t: Text, first: Value, number: int, mask: Value, body: Callable[[Value, Value], None]
+) -> None:
+    """The rows of each lane from one of its own on.
+
+    **Arguments:** each slot's first row; how many a lane has room for; which slots take part; what
+    is done with the row of each slot, and which slots have it.
+    """
+    head, inside, after, before = t.label(), t.label(), t.label(), t.block
+    t.line(f"br label %{head}")
+    t.open(head)
+    at, place, following = len(t.lines), Value(t.fresh(), "i64"), Value(t.fresh(), "i64")
+    room = t.both(mask, t.binary("icmp slt", place, t.constant(number, "i64"), "i1"))
+    t.fork(t.any(room), inside, after)
+    t.open(inside)
+    body(place, room)
+    one = t.constant(1, "i64").text
+    t.line(f"{following.text} = add {t.vector('i64')} {place.text}, {one}")
+    t.join([place], ([first], before), ([following], t.block), at=at)
+    t.line(f"br label %{head}")
+    t.close()
+    t.close()
+    t.follow(after)
+
+
+def claim(t: Text) -> tuple[list[str], list[str]]:
+    """What a kernel does to have memory for large arrays, aligned to a cache line, and to let go of
+    it."""
+    if not t.arena.size:
+        return [], []
+    t.declared["@malloc"] = "declare noalias ptr @malloc(i64)"
+    t.declared["@free"] = "declare void @free(ptr)"
+    claimed = [
+        f"  %heap = call ptr @malloc(i64 {t.arena.size * t.width * 8 + _LINE})",
+        f"  %ahead = getelementptr i8, ptr %heap, i64 {_LINE - 1}",
+        f"  %arena = call ptr @llvm.ptrmask.p0.i64(ptr %ahead, i64 {-_LINE})",
+    ]
+    t.declared["@llvm.ptrmask"] = "declare ptr @llvm.ptrmask.p0.i64(ptr, i64)"
+    return claimed, ["  call void @free(ptr %heap)"]

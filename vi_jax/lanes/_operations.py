@@ -10,6 +10,7 @@ from . import _functions as functions
 from ._library import LIBRARY
 from ._power import power
 from ._text import KINDS, Text, Value, is_float
+from ._whole import compare, in_total_order, known, of_integers
 
 Rule = Callable[..., Any]
 ELEMENTWISE: dict[str, Rule] = {}
@@ -20,7 +21,7 @@ def kind_of(dtype: Any) -> str:
     return KINDS[np.dtype(dtype).name]
 
 
-def _is_unsigned(dtype: Any) -> bool:
+def is_unsigned(dtype: Any) -> bool:
     return np.dtype(dtype).kind in "ub"
 
 
@@ -58,48 +59,22 @@ def _commuting(t: Text, a: Value, b: Value, neutral: int, real: str, whole: str)
     """A sum or product: by `real` for floating-point numbers, none if one is `neutral`; by `whole`
     for integers."""
     if not is_float(a.kind):
-        return t.binary(whole, a, b)
+        return known(t, a, b, whole) or t.binary(whole, a, b)
     if a.number == neutral:
         return b
-    return a if b.number == neutral else t.binary(real, *_ordered(a, b))
-
-
-def _ordered(a: Value, b: Value) -> tuple[Value, Value]:
-    """In one order, so that a·b and b·a are merged; a constant last."""
-    first = a.number is not None, a.text
-    return (a, b) if first <= (b.number is not None, b.text) else (b, a)
+    return a if b.number == neutral else t.binary(real, *t.ordered(a, b))
 
 
 def sub(t: Text, a: Value, b: Value) -> Value:
     if not is_float(a.kind):
-        return t.binary("sub", a, b)
+        return known(t, a, b, "sub") or t.binary("sub", a, b)
     return a if b.number == 0 else t.binary("fsub contract", a, b)
 
 
 def div(t: Text, a: Value, b: Value, *, unsigned: bool = False) -> Value:
     if not is_float(a.kind):
-        return _of_integers(t, "div", a, b, unsigned)
+        return of_integers(t, "div", a, b, unsigned)
     return a if b.number == 1 else t.binary("fdiv contract", a, b)
-
-
-def _of_integers(t: Text, what: str, a: Value, b: Value, unsigned: bool) -> Value:
-    """Quotient (`"div"`) or remainder (`"rem"`) of integers as XLA has them where a processor would
-    trap: by zero -1 and the dividend; by -1, which may overflow, -a and 0. A slot of a group in
-    which there is no lane holds zeros."""
-    operation = ("u" if unsigned else "s") + what
-    if b.number is not None and b.number not in (0, -1):
-        return t.binary(operation, a, b)
-    zero, one = t.zero(a.kind), t.constant(1, a.kind)
-    minus = t.binary("sub", zero, one)
-    by_zero = compare(t, "eq", b, zero, True)
-    divisor = t.select(by_zero, one, b)
-    if unsigned:
-        found = t.binary(operation, a, divisor)
-    else:
-        by_minus = compare(t, "eq", b, minus, True)
-        found = t.binary(operation, a, t.select(by_minus, one, divisor))
-        found = t.select(by_minus, neg(t, a) if what == "div" else zero, found)
-    return t.select(by_zero, minus if what == "div" else a, found)
 
 
 def neg(t: Text, a: Value) -> Value:
@@ -110,26 +85,25 @@ def neg(t: Text, a: Value) -> Value:
     return t.value(f"fneg {t.vector(a.kind)} {a.text}", a.kind)
 
 
-def compare(t: Text, how: str, a: Value, b: Value, unsigned: bool) -> Value:
-    """Whether a is `"lt"`, `"le"`, `"eq"`, … b; false where either is NaN, but for `"ne"`."""
-    if is_float(a.kind):
-        order = {"eq": "oeq", "ne": "une"}.get(how, "o" + how)
-        return t.binary(f"fcmp {order}", a, b, "i1")
-    order = how if how in ("eq", "ne") else ("u" if unsigned else "s") + how
-    return t.binary(f"icmp {order}", a, b, "i1")
+def weighted(t: Text, weight: Value, product: Value) -> Value:
+    """A product or quotient with a cotangent: zero where that is, whatever the other number is."""
+    return t.select(compare(t, "eq", weight, t.zero(weight.kind), False), weight, product)
 
 
 for _name in ("add", "add_any"):
     ELEMENTWISE[_name] = lambda t, p, d, a, b: add(t, a, b)
 ELEMENTWISE["sub"] = lambda t, p, d, a, b: sub(t, a, b)
 ELEMENTWISE["mul"] = lambda t, p, d, a, b: mul(t, a, b)
-ELEMENTWISE["div"] = lambda t, p, d, a, b: div(t, a, b, unsigned=_is_unsigned(d[0]))
+ELEMENTWISE["div"] = lambda t, p, d, a, b: div(t, a, b, unsigned=is_unsigned(d[0]))
 ELEMENTWISE["quotient"] = lambda t, p, d, a, b: div(t, a, b)
+ELEMENTWISE["weighted"] = lambda t, p, d, a, b: weighted(t, a, mul(t, a, b))
+ELEMENTWISE["weighted_quotient"] = lambda t, p, d, a, b: weighted(t, a, div(t, a, b))
 ELEMENTWISE["neg"] = lambda t, p, d, a: neg(t, a)
 for _name in ("eq", "ne", "lt", "le", "gt", "ge"):
-    ELEMENTWISE[_name] = lambda t, p, d, a, b, how=_name: compare(t, how, a, b, _is_unsigned(d[0]))
-_SAME = "stop_gradient copy copy_p name pvary reshard reduce_precision pin"
-for _name in _SAME.split():
+    ELEMENTWISE[_name] = lambda t, p, d, a, b, how=_name: compare(t, how, a, b, is_unsigned(d[0]))
+SAME = "stop_gradient copy copy_p name pvary reshard reduce_precision pin".split()
+"""What leaves its argument as it is."""
+for _name in SAME:
     ELEMENTWISE[_name] = lambda t, p, d, a: a
 ELEMENTWISE["square"] = lambda t, p, d, a: mul(t, a, a)
 ELEMENTWISE["sqrt"] = lambda t, p, d, a: t.intrinsic("sqrt", a)
@@ -145,6 +119,12 @@ def _(t, p, d, a):
     return t.select(t.binary("icmp slt", a, t.zero(a.kind), "i1"), neg(t, a), a)
 
 
+for _name, _how in {"lt_to": "slt", "le_to": "sle"}.items():
+    ELEMENTWISE[_name] = lambda t, p, d, a, b, how=_how: t.binary(
+        f"icmp {how}", in_total_order(t, a), in_total_order(t, b), "i1"
+    )
+
+
 @elementwise("sign")
 def _(t, p, d, a):
     zero = t.zero(a.kind)
@@ -154,12 +134,12 @@ def _(t, p, d, a):
 
 @elementwise("max")
 def _(t, p, d, a, b):
-    return extreme(t, "gt", a, b, _is_unsigned(d[0]))
+    return extreme(t, "gt", a, b, is_unsigned(d[0]))
 
 
 @elementwise("min")
 def _(t, p, d, a, b):
-    return extreme(t, "lt", a, b, _is_unsigned(d[0]))
+    return extreme(t, "lt", a, b, is_unsigned(d[0]))
 
 
 def extreme(t: Text, how: str, a: Value, b: Value, unsigned: bool) -> Value:
@@ -177,8 +157,8 @@ def extreme(t: Text, how: str, a: Value, b: Value, unsigned: bool) -> Value:
 
 @elementwise("clamp")
 def _(t, p, d, low, a, high):
-    above = extreme(t, "gt", a, low, _is_unsigned(d[1]))
-    return extreme(t, "lt", above, high, _is_unsigned(d[1]))
+    above = extreme(t, "gt", a, low, is_unsigned(d[1]))
+    return extreme(t, "lt", above, high, is_unsigned(d[1]))
 
 
 @elementwise("is_finite")
@@ -261,7 +241,7 @@ def _(t, p, d, a):
 for _name, _function in LIBRARY.items():
     ELEMENTWISE[_name] = lambda t, p, d, *args, function=_function: function(t, *args)
 ELEMENTWISE["rem"] = lambda t, p, d, a, b: (
-    t.each("fmod", a, b) if is_float(a.kind) else _of_integers(t, "rem", a, b, _is_unsigned(d[0]))
+    t.each("fmod", a, b) if is_float(a.kind) else of_integers(t, "rem", a, b, is_unsigned(d[0]))
 )
 
 
@@ -287,6 +267,18 @@ def _(t, p, d, a, b):
     return t.binary("xor", a, b)
 
 
+# Beyond the last bit LLVM leaves a shift undefined.
+for _name, _how in {"shift_left": "shl", "shift_right_logical": "lshr"}.items():
+    ELEMENTWISE[_name] = lambda t, p, d, a, b, how=_how: _shifted(t, how, a, b)
+
+
+def _shifted(t: Text, how: str, a: Value, by: Value) -> Value:
+    bits = int(a.kind[1:])
+    within = compare(t, "lt", by, t.constant(bits, a.kind), True)
+    safe = t.binary("and", by, t.constant(bits - 1, a.kind))
+    return t.select(within, t.binary(how, a, safe), t.zero(a.kind))
+
+
 @elementwise("not")
 def _(t, p, d, a):
     if a.kind == "i1" and a.number is not None:
@@ -296,11 +288,13 @@ def _(t, p, d, a):
 
 @elementwise("convert_element_type")
 def _(t, p, d, a):
-    return convert(t, a, kind_of(p["new_dtype"]), _is_unsigned(d[0]))
+    new = p["new_dtype"]
+    return convert(t, a, kind_of(new), is_unsigned(d[0]), to_unsigned=is_unsigned(new))
 
 
-def convert(t: Text, a: Value, kind: str, unsigned: bool) -> Value:
-    """A value in another type, as JAX converts it; `unsigned` says how its own is meant."""
+def convert(t: Text, a: Value, kind: str, unsigned: bool, *, to_unsigned: bool = False) -> Value:
+    """A value in another type, as JAX converts it; `unsigned` says how its own is meant,
+    `to_unsigned` how the new one is."""
     if a.kind == kind:
         return a
     if a.number is not None:
@@ -313,7 +307,7 @@ def convert(t: Text, a: Value, kind: str, unsigned: bool) -> Value:
         return t.cast("uitofp" if unsigned else "sitofp", a, kind)
     if is_float(a.kind):
         v, w = t.suffix(kind), t.suffix(a.kind)
-        name = f"@llvm.fptosi.sat.{v}.{w}"
+        name = f"@llvm.fpto{'u' if to_unsigned else 's'}i.sat.{v}.{w}"
         t.declared[name] = f"declare {t.vector(kind)} {name}({t.vector(a.kind)})"
         return t.value(f"call {t.vector(kind)} {name}({t.vector(a.kind)} {a.text})", kind)
     if int(a.kind[1:]) > int(kind[1:]):

@@ -1,8 +1,12 @@
-"""The JAX primitive behind `run`: batched, differentiated forward, lowered for either backend."""
+"""The JAX primitive behind `run`: batched, differentiated forward, lowered for either backend.
+
+Its transpose, by which it is differentiated backward, is in `_backward.py`.
+"""
 
 import functools
 import math
 import warnings
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from contextvars import ContextVar
 from typing import Any
@@ -16,10 +20,11 @@ from jax.interpreters import ad, batching, mlir, partial_eval
 from . import _xla as xla
 from ._context import within
 from ._derivative import forward, widened
+from ._large import MOST_IN_REGISTERS
 from ._program import LaneProgram, dependent_parts
 from ._vector import Unsupported
 from .call import header, registered
-from .runtime import kernel_of
+from .runtime import AnyProgram, kernel_of
 
 _vector_only: ContextVar[bool] = ContextVar("strict", default=False)
 
@@ -50,11 +55,11 @@ def _(*args, program: LaneProgram, backend: str):
 
 # The most directions of a derivative that one lane carries along. Six of them took 2.6 times as
 # long as lanes of their own (`docs/internals/lanes.md`).
-_DIRECTIONS = 8
+DIRECTIONS = 8
 
 
 def _batched(args, dims, *, program: LaneProgram, backend: str):
-    """An axis of `jax.vmap`, which becomes one of lanes; up to `_DIRECTIONS` tangents of one lane
+    """An axis of `jax.vmap`, which becomes one of lanes; up to `DIRECTIONS` tangents of one lane
     become directions instead."""
     args = [jnp.asarray(x) for x in args]
     size = next(x.shape[d] for x, d in zip(args, dims, strict=True) if d is not None)
@@ -65,17 +70,9 @@ def _batched(args, dims, *, program: LaneProgram, backend: str):
     ]
     inner = program.batch(shapes)
     tangents = program.tangents or (False,) * len(many)
-    if all(t or not m for t, m in zip(tangents, many, strict=True)) and 1 < size <= _DIRECTIONS:
+    if all(t or not m for t, m in zip(tangents, many, strict=True)) and 1 < size <= DIRECTIONS:
         return _batched_directions(args, dims, inner, many, size, program, backend)
-    moved = []
-    for x, d, shape, aval in zip(args, dims, shapes, program.in_avals, strict=True):
-        if d is None and len(shape) == aval.ndim:
-            moved.append(x)  # one for all lanes
-            continue
-        x = x[None] if d is None else jnp.moveaxis(x, d, 0)
-        if len(shape) == aval.ndim:
-            x = x.reshape(x.shape[0], *(1 for _ in inner), *aval.shape)
-        moved.append(jnp.broadcast_to(x, (size, *inner, *aval.shape)))
+    moved = with_lane_axis(args, dims, program.in_avals, inner, size)
     out = lanes_p.bind(*moved, program=program, backend=backend)
     depend = dependent_parts(program, many, smooth=False)
     wide = [depend.control or w for w in (*depend.outs, *depend.rows)]
@@ -83,6 +80,25 @@ def _batched(args, dims, *, program: LaneProgram, backend: str):
     return [x if w else x[0] for x, w in zip(out, wide, strict=True)], [
         0 if w else None for w in wide
     ]
+
+
+def with_lane_axis(args, dims, avals, inner: tuple, size: int) -> list[Any]:
+    """Arguments of a batch of lanes with an axis of `jax.vmap` before those that the lanes have.
+
+    **Arguments:** the arrays; of each the place of the new axis, or `None`; the shapes of one lane;
+    the axes that the lanes have; the length of the new one.
+    """
+    moved = []
+    for x, d, aval in zip(args, dims, avals, strict=True):
+        own = x.ndim - (d is not None) == aval.ndim
+        if d is None and own:
+            moved.append(x)  # one for all lanes
+            continue
+        x = x[None] if d is None else jnp.moveaxis(x, d, 0)
+        if own:
+            x = x.reshape(x.shape[0], *(1 for _ in inner), *aval.shape)
+        moved.append(jnp.broadcast_to(x, (size, *inner, *aval.shape)))
+    return moved
 
 
 def _batched_directions(
@@ -178,56 +194,6 @@ def _saved(policy: Any) -> bool:
     return policy is True or type(policy).__name__.startswith("Saveable")
 
 
-def _transposed(cotangents, *args, program: LaneProgram, backend: str):
-    """Reverse mode by columns: the program is run forward along every number that is
-    differentiated, `_DIRECTIONS` of them with one motion, and each derivative is weighted with the
-    cotangents.
-
-    A reverse pass would have to take the steps again, and rounding may then let them decide
-    otherwise about an event than the first time.
-    """
-    places: dict[int, slice] = {}  # of each tangent asked for, among all their numbers
-    number = 0
-    for i, (x, aval) in enumerate(zip(args, program.in_avals, strict=True)):
-        if ad.is_undefined_primal(x):
-            places[i] = slice(number, number + aval.size)
-            number += aval.size
-    args = [x if i in places else jnp.asarray(x) for i, x in enumerate(args)]
-    batch = program.batch([x.aval.shape if i in places else x.shape for i, x in enumerate(args)])
-    weights = [(k, ct) for k, ct in enumerate(cotangents) if type(ct) is not ad.Zero]
-    size = min(number, _DIRECTIONS)
-    units = jnp.eye(-(-number // size) * size, number)  # filled up: one program for all
-    along = jax.vmap(
-        functools.partial(lanes_p.bind, program=program, backend=backend),
-        [0 if i in places else None for i in range(len(args))],
-        axis_size=size,
-    )
-    found = []
-    for first in range(0, number, size):
-        given = list(args)
-        for i, place in places.items():
-            aval = program.in_avals[i]
-            some = units[first : first + size, place].astype(aval.dtype)
-            given[i] = some.reshape(size, *aval.shape)
-        columns = along(*given)
-        found.append(sum(_weighted(columns[k], ct, 1 + len(batch)) for k, ct in weights))
-    each = jnp.concatenate(found)  # (numbers, *batch)
-    out: list[Any] = [None] * len(args)
-    for i, place in places.items():
-        aval, x = args[i].aval, each[place]
-        if aval.ndim == program.in_avals[i].ndim:  # one for all lanes
-            x = jnp.sum(x, axis=tuple(range(1, x.ndim)))
-        out[i] = jnp.moveaxis(x, 0, -1).reshape(aval.shape).astype(aval.dtype)
-    return out
-
-
-def _weighted(column, weight, kept: int):
-    """The weighted sum over all but the first `kept` axes. A value of weight 0 may be NaN, as
-    after a failure."""
-    product = jnp.where(weight == 0, 0.0, column * weight)
-    return jnp.sum(product, axis=tuple(range(kept, product.ndim)))
-
-
 def _result_count(program: LaneProgram) -> int:
     return len(program.out_avals)
 
@@ -235,7 +201,6 @@ def _result_count(program: LaneProgram) -> int:
 ad.primitive_jvps[lanes_p] = _jvp
 partial_eval.custom_partial_eval_rules[lanes_p] = _partially_known
 partial_eval.partial_eval_jaxpr_custom_rules[lanes_p] = _partially_known_equation
-ad.primitive_transposes[lanes_p] = _transposed
 
 
 _on_xla = mlir.lower_fun(
@@ -246,24 +211,36 @@ _on_xla = mlir.lower_fun(
 def _lowered(ctx, *args, program: LaneProgram, backend: str):
     """On a CPU: a call of the program's kernel; XLA's loop where that was asked for or there can be
     no kernel."""
+    otherwise = functools.partial(_on_xla, ctx, *args, program=program, backend=backend)
     if backend == "xla":
         if _vector_only.get():
             raise Unsupported("the other backend")
-        return _on_xla(ctx, *args, program=program, backend=backend)
+        return otherwise()
+    return lower_to_kernel(ctx, args, program, otherwise)
+
+
+def lower_to_kernel(ctx, args, program: AnyProgram, otherwise: Callable[[], Any]):
+    """The call of a program's kernel; what `otherwise` gives, after a warning, where there can be
+    none.
+
+    **Raises:** `Unsupported` instead within `vector_only`.
+    """
     try:
-        kernel = kernel_of(program, _lane_count(program, ctx.avals_in))
+        avals = list(zip(ctx.avals_in, program.in_avals, strict=True))
+        one_for_all = tuple(a.size > MOST_IN_REGISTERS and x.ndim == a.ndim for x, a in avals)
+        kernel = kernel_of(program, _lane_count(program, ctx.avals_in), one_for_all)
         target = registered()
     except Unsupported as reason:
         if _vector_only.get():
             raise
         _warn(str(reason))
-        return _on_xla(ctx, *args, program=program, backend=backend)
+        return otherwise()
     ctx.module_context.add_keepalive(kernel)  # as long as the compiled program lives
-    call = functools.partial(_kernel_call, target, kernel, program, ctx.avals_out)
+    call = functools.partial(kernel_call, target, kernel, program, ctx.avals_out)
     return mlir.lower_fun(call, multiple_results=True)(ctx, *args)
 
 
-def _kernel_call(target: str, kernel, program: LaneProgram, avals, *args):
+def kernel_call(target: str, kernel, program: AnyProgram, avals, *args):
     """The kernel as a foreign function of XLA's: results of the shapes `avals`."""
     strides = [
         aval.size if x.ndim > aval.ndim else 0
@@ -274,7 +251,7 @@ def _kernel_call(target: str, kernel, program: LaneProgram, avals, *args):
     return jax.ffi.ffi_call(target, results)(head, *args)
 
 
-def _lane_count(program: LaneProgram, args) -> int:
+def _lane_count(program: AnyProgram, args) -> int:
     return math.prod(program.batch([x.shape for x in args]))
 
 

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+from jax.core import eval_jaxpr
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 
@@ -26,6 +27,10 @@ class LaneProgram(eqx.Module):
 
     tangents: tuple[bool, ...] = eqx.field(static=True, default=())
     """Which inputs are tangents. How long a lane goes on must not depend on them."""
+
+    varied: tuple[bool, ...] = eqx.field(static=True, default=())
+    """Of a program of values and derivatives, which inputs of `base` its last tangents are of; none
+    if they are in several directions."""
 
     base: "LaneProgram | None" = eqx.field(static=True, default=None)
     """Of a program of values and derivatives, that of the values alone. Its inputs come first."""
@@ -83,10 +88,15 @@ class LaneProgram(eqx.Module):
 
     def batch(self, shapes: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
         """The axes that inputs of these shapes have beyond those of one lane."""
-        for aval, shape in zip(self.in_avals, shapes, strict=True):
-            if len(shape) > aval.ndim:
-                return shape[: len(shape) - aval.ndim]
-        return ()
+        return batch_of(self.in_avals, shapes)
+
+
+def batch_of(avals: Sequence[Any], shapes: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
+    """The axes of a batch: those that arrays have beyond the ones of a lane's own shapes."""
+    for aval, shape in zip(avals, shapes, strict=True):
+        if len(shape) > aval.ndim:
+            return shape[: len(shape) - aval.ndim]
+    return ()
 
 
 class DependentParts(NamedTuple):
@@ -108,7 +118,7 @@ def dependent_parts(
     depends = functools.partial(dependent_results, smooth=smooth)
     begun = depends(program.begin.jaxpr, sources)
     step = program.step.jaxpr
-    stepped = _fixed_point(lambda carry: depends(step, [*sources, *carry]), begun[:n])
+    stepped = fixed_point(lambda carry: depends(step, [*sources, *carry]), begun[:n])
     carry = stepped[:n]
     rest = [a or b for a, b in zip(begun[n:], stepped[n:], strict=True)]
     outs = depends(program.end.jaxpr, (*sources, *carry))
@@ -134,6 +144,71 @@ def inner(jaxpr: ClosedJaxpr | Jaxpr) -> Jaxpr:
     return jaxpr.jaxpr if isinstance(jaxpr, ClosedJaxpr) else jaxpr
 
 
+# Calls without a derivative of their own, and without a say about what is kept for it.
+_INLINED = ("jit", "pjit", "closed_call", "core_call")
+
+
+def evaluated(closed: ClosedJaxpr | Jaxpr, *args: Any) -> list[Any]:
+    """The results of a jaxpr, its calls of other jaxprs taken into it: JAX would differentiate and
+    transpose each of them by itself, which takes several times as long."""
+    jaxpr, known = inner(closed), {}
+
+    def read(atom: Any) -> Any:
+        return atom.val if isinstance(atom, Literal) else known[atom]
+
+    known.update(zip(jaxpr.constvars, getattr(closed, "consts", ()), strict=True))
+    known.update(zip(jaxpr.invars, args, strict=True))
+    for eqn in jaxpr.eqns:
+        given, name = [read(a) for a in eqn.invars], eqn.primitive.name
+        if name in _INLINED:
+            out = evaluated(eqn.params[CALLS[name]], *given)
+        elif name in OWN_DERIVATIVE:
+            names = list(dict.fromkeys(a for a in eqn.invars if not isinstance(a, Literal)))
+            alone = jaxpr.replace(constvars=[], invars=names, outvars=eqn.outvars, eqns=[eqn])
+            out = eval_jaxpr(alone, (), *map(read, names))
+        else:
+            out = eqn.primitive.bind(*given, **eqn.params)
+            out = out if eqn.primitive.multiple_results else [out]
+        known.update(zip(eqn.outvars, out, strict=True))
+    return [read(a) for a in jaxpr.outvars]
+
+
+def rewritten(closed: ClosedJaxpr, one: Callable[[Any], Any]) -> ClosedJaxpr:
+    """A jaxpr with `one` of each of its equations in that one's place, in inner jaxprs too; but
+    what has a derivative of its own stays as it is."""
+    return closed.replace(jaxpr=_rewritten(closed.jaxpr, one))
+
+
+def _rewritten(jaxpr: Jaxpr, one: Callable[[Any], Any]) -> Jaxpr:
+    eqns = []
+    for eqn in map(one, jaxpr.eqns):
+        if eqn.primitive.name not in OWN_DERIVATIVE:
+            eqn = eqn.replace(params={k: _parameter(x, one) for k, x in eqn.params.items()})
+        eqns.append(eqn)
+    return jaxpr.replace(eqns=eqns)
+
+
+def _parameter(value: Any, one: Callable[[Any], Any]) -> Any:
+    if isinstance(value, ClosedJaxpr):
+        return rewritten(value, one)
+    if isinstance(value, Jaxpr):
+        return _rewritten(value, one)
+    if isinstance(value, tuple) and any(isinstance(x, ClosedJaxpr) for x in value):
+        found = [_parameter(x, one) for x in value]
+        return type(value)(*found) if hasattr(value, "_fields") else tuple(found)
+    return value
+
+
+def size_of(jaxpr: Jaxpr) -> int:
+    """The number of operations, those of inner jaxprs once."""
+    total = 0
+    for eqn in jaxpr.eqns:
+        held = [x for v in eqn.params.values() for x in (v if isinstance(v, tuple) else (v,))]
+        held = [x for x in held if isinstance(x, Jaxpr | ClosedJaxpr)]
+        total += 1 + sum(size_of(inner(x)) for x in held)
+    return total
+
+
 # Primitives with floating-point results whose derivative is zero, or is treated as zero.
 _ZERO_DERIVATIVE = ("stop_gradient", "sign", "round", "floor", "ceil")
 
@@ -150,14 +225,16 @@ def dependent_results(jaxpr: Jaxpr, sources: Sequence[bool], *, smooth: bool) ->
         args = [depends(a) for a in eqn.invars]
         if not any(args) or (smooth and eqn.primitive.name in _ZERO_DERIVATIVE):
             continue
-        for var, here in zip(eqn.outvars, _of_equation(eqn, args, smooth=smooth), strict=True):
+        for var, here in zip(
+            eqn.outvars, dependent_of_equation(eqn, args, smooth=smooth), strict=True
+        ):
             aval: Any = var.aval
             if here and not (smooth and not jnp.issubdtype(aval.dtype, jnp.inexact)):
                 found.add(var)
     return [depends(a) for a in jaxpr.outvars]
 
 
-def _of_equation(eqn: Any, args: list[bool], *, smooth: bool) -> list[bool]:
+def dependent_of_equation(eqn: Any, args: list[bool], *, smooth: bool) -> list[bool]:
     """Which results of an equation depend on the arguments `args`."""
     name, params = eqn.primitive.name, eqn.params
     depends = functools.partial(dependent_results, smooth=smooth)
@@ -170,18 +247,29 @@ def _of_equation(eqn: Any, args: list[bool], *, smooth: bool) -> list[bool]:
         n, m = params["num_consts"], params["num_carry"]
         fixed, carry, rows = args[:n], args[n : n + m], args[n + m :]
         body = inner(params["jaxpr"])
-        return _fixed_point(lambda c: depends(body, [*fixed, *c, *rows]), carry)
+        return fixed_point(lambda c: depends(body, [*fixed, *c, *rows]), carry)
     if name == "while":
         n, m = params["cond_nconsts"], params["body_nconsts"]
         asked, fixed, carry = args[:n], args[n : n + m], args[n + m :]
         body = inner(params["body_jaxpr"])
-        outs = _fixed_point(lambda c: depends(body, [*fixed, *c]), carry)
+        outs = fixed_point(lambda c: depends(body, [*fixed, *c]), carry)
         ends = depends(inner(params["cond_jaxpr"]), [*asked, *outs])
         return [True] * len(outs) if any(ends) else outs
     return [True] * len(eqn.outvars)
 
 
-def _fixed_point(turn: Callable[[list[bool]], list[bool]], carry: list[bool]) -> list[bool]:
+def dependent_in_loop(eqn: Any, args: list[bool]) -> list[bool]:
+    """Which arguments of the body of a `scan` or a `while` depend in any turn on the loop's own
+    `args`."""
+    outs = dependent_of_equation(eqn, args, smooth=False)
+    if eqn.primitive.name == "while":
+        first = eqn.params["cond_nconsts"]
+        return [*args[first : first + eqn.params["body_nconsts"]], *outs]
+    n, m = eqn.params["num_consts"], eqn.params["num_carry"]
+    return [*args[:n], *outs[:m], *args[n + m :]]
+
+
+def fixed_point(turn: Callable[[list[bool]], list[bool]], carry: list[bool]) -> list[bool]:
     """What one turn of a loop gives, carry first, once no more of the carry depends.
 
     **Arguments:** which results of a turn depend where these parts of the carry do; those that do

@@ -10,43 +10,26 @@ from typing import Any
 
 import jax.numpy as jnp
 from jax.core import ShapedArray
-from jax.extend.core import ClosedJaxpr, Jaxpr, Primitive
+from jax.extend.core import ClosedJaxpr, Primitive
 from jax.interpreters import ad, batching
 
-from ._program import OWN_DERIVATIVE
+from ._program import rewritten
 from .elementary import jitted
 
 quotient_p = Primitive("quotient")
 
 
+def _divided(eqn: Any) -> Any:
+    """An equation, with this derivative if it divides floating-point numbers."""
+    if eqn.primitive.name == "div" and jnp.issubdtype(eqn.outvars[0].aval.dtype, jnp.floating):
+        return eqn.replace(primitive=quotient_p, params={})
+    return eqn
+
+
 @functools.lru_cache(maxsize=256)
 def with_quotients(closed: ClosedJaxpr) -> ClosedJaxpr:
     """The same jaxpr, its divisions of floating-point numbers with this derivative."""
-    return closed.replace(jaxpr=_rewritten(closed.jaxpr))
-
-
-def _rewritten(jaxpr: Jaxpr) -> Jaxpr:
-    return jaxpr.replace(eqns=[_equation(eqn) for eqn in jaxpr.eqns])
-
-
-def _equation(eqn: Any) -> Any:
-    """An equation with divisions replaced, in inner jaxprs too."""
-    name = eqn.primitive.name
-    if name == "div" and jnp.issubdtype(eqn.outvars[0].aval.dtype, jnp.floating):
-        return eqn.replace(primitive=quotient_p, params={})
-    if name in OWN_DERIVATIVE:
-        return eqn
-    return eqn.replace(params={key: _parameter(x) for key, x in eqn.params.items()})
-
-
-def _parameter(value: Any) -> Any:
-    if isinstance(value, ClosedJaxpr):
-        return with_quotients(value)
-    if isinstance(value, Jaxpr):
-        return _rewritten(value)
-    if isinstance(value, tuple) and any(isinstance(x, ClosedJaxpr) for x in value):
-        return tuple(map(_parameter, value))
-    return value
+    return rewritten(closed, _divided)
 
 
 @quotient_p.def_abstract_eval

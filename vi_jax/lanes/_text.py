@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from ._arena import Arena
+
 
 @dataclass(frozen=True, slots=True)
 class Value:
@@ -47,6 +49,10 @@ class Text:
         self.lines: list[str] = []
         self.declared: dict[str, str] = {}
         self.block = "entry"
+        self.arena = Arena()
+        # Of a loop's counter, and of places counted from it, the least and the greatest number.
+        self.ranges: dict[str, tuple[int, int]] = {}
+        self._stores = 0
         self._names = 0
         # Operations written in blocks that dominate the current one, a table for each open scope.
         self._seen: list[dict[tuple, Value]] = [{}]
@@ -86,6 +92,26 @@ class Text:
         self.line(f"{name} = {operation}")
         return name
 
+    def once(self, operation: str) -> str:
+        """The name of a scalar's operation, merged as `value` is."""
+        return self.value(operation, "scalar").text
+
+    def load(self, operation: str, kind: str) -> Value:
+        """Append a load from memory, merged with an equal one in this block since the last store.
+
+        **Arguments:** as for `value`.
+        """
+        key = (f"{operation}, {self._stores}", kind)
+        found = self._seen[-1].get(key)
+        if found is None:
+            found = self._seen[-1][key] = Value(self.raw(operation), kind)
+        return found
+
+    def store(self, operation: str) -> None:
+        """Append a store to memory."""
+        self._stores += 1
+        self.line(operation)
+
     def value(self, operation: str, kind: str, *, merge: bool = True) -> Value:
         """Append an operation on vectors, unless an equal one was written in a block that dominates
         this one.
@@ -101,6 +127,15 @@ class Text:
         if merge:
             self._seen[-1][key] = result
         return result
+
+    def ordered(self, a: Value, b: Value) -> tuple[Value, Value]:
+        """In one order, so that a·b and b·a are merged; a constant last."""
+        first = a.number is not None, a.text
+        return (a, b) if first <= (b.number is not None, b.text) else (b, a)
+
+    def opaque(self, a: Value) -> Value:
+        """A value that comes out of a condition or a turn of a loop (see `FixedText`)."""
+        return a
 
     def binary(self, operation: str, a: Value, b: Value, kind: str | None = None) -> Value:
         """An operation on two values of one type; `kind` is its result's type if another."""
@@ -175,9 +210,13 @@ class Text:
 
     def open(self, label: str) -> None:
         """Begin a block that the current one dominates, in a scope that lasts until `close`."""
+        self._begin(label)
+        self._seen.append({})
+
+    def _begin(self, label: str) -> None:
         self.lines.append(f"{label}:")
         self.block = label
-        self._seen.append({})
+        self._stores += 1  # what is in memory may have changed on the way to this block
 
     def close(self) -> None:
         """End the last scope: the blocks that follow do not see what was computed in it."""
@@ -189,8 +228,7 @@ class Text:
 
     def follow(self, label: str) -> None:
         """Begin a block that the blocks of all open scopes dominate, without a scope of its own."""
-        self.lines.append(f"{label}:")
-        self.block = label
+        self._begin(label)
 
     def label(self) -> str:
         """A new name of a block."""

@@ -5,17 +5,31 @@ from typing import Any
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
-from ._arrays import STRUCTURAL, Values, each
-from ._operations import ELEMENTWISE, kind_of
+from ._arrays import STRUCTURAL
+from ._control import CONTROL
+from ._derived import DERIVED, derived
+from ._large import (
+    LARGE,
+    MOST_IN_REGISTERS,
+    PLACED,
+    Formula,
+    Held,
+    Large,
+    Values,
+    at,
+    chosen,
+    held,
+    joined,
+    over,
+    room,
+    settled,
+    store_at,
+    table,
+    uniform,
+)
+from ._operations import ELEMENTWISE, SAME, kind_of
 from ._program import CALLS, inner
 from ._text import Text, Value
-
-# The most operations of a loop of known length, all turns together, that are written one after the
-# other because it has rows; a sixteenth of that if it has none. A bound on the time of compilation.
-_MOST_UNROLLED = 4096
-
-# A branch of no more operations than this is computed whether any lane needs it or not.
-_CHEAP = 4
 
 
 class Unsupported(Exception):
@@ -32,68 +46,86 @@ def check(jaxpr: Jaxpr) -> None:
         except (KeyError, TypeError):
             raise Unsupported(f"a value of type {dtype}") from None
     for eqn in needed:
-        name = eqn.primitive.name
-        if name in CALLS:
-            check(inner(eqn.params[CALLS[name]]))
-        elif name == "cond":
-            for branch in eqn.params["branches"]:
-                check(inner(branch))
-        elif name == "while":
-            check(inner(eqn.params["cond_jaxpr"]))
-            check(inner(eqn.params["body_jaxpr"]))
-        elif name == "scan":
-            body = inner(eqn.params["jaxpr"])
+        for body in _bodies(eqn):
             check(body)
-            plain = _has_no_rows(eqn.params, len(eqn.invars), len(eqn.outvars))
-            if not plain and _size(body) * eqn.params["length"] > _MOST_UNROLLED:
-                raise Unsupported(f"the primitive `scan` of length {eqn.params['length']}")
-        elif name not in ELEMENTWISE and name not in STRUCTURAL:
-            raise Unsupported(f"the primitive `{name}`")
+        if not (_bodies(eqn) or _has_rule(eqn.primitive.name)):
+            raise Unsupported(f"the primitive `{eqn.primitive.name}`")
 
 
-def _size(jaxpr: Jaxpr) -> int:
-    """The number of operations, those of inner jaxprs once."""
-    total = 0
-    for eqn in jaxpr.eqns:
-        held = [x for v in eqn.params.values() for x in (v if isinstance(v, tuple) else (v,))]
-        held = [x for x in held if isinstance(x, Jaxpr | ClosedJaxpr)]
-        total += 1 + sum(_size(inner(x)) for x in held)
-    return total
+def _has_rule(name: str) -> bool:
+    return any(name in rules for rules in (ELEMENTWISE, STRUCTURAL, LARGE, PLACED, DERIVED))
 
 
-def constants(t: Text, array: Any) -> Values:
-    """A known array, the same in every lane, as `Value`s."""
+def _bodies(eqn: Any) -> list[Jaxpr]:
+    """The jaxprs that are written where an equation calls, chooses or repeats them."""
+    name, params = eqn.primitive.name, eqn.params
+    if name in CALLS:
+        return [inner(params[CALLS[name]])]
+    if name == "cond":
+        return [inner(branch) for branch in params["branches"]]
+    if name == "while":
+        return [inner(params["cond_jaxpr"]), inner(params["body_jaxpr"])]
+    if name == "scan":
+        return [inner(params["jaxpr"])]
+    return [inner(params["jaxprs"].solve)] if name == "custom_linear_solve" else []
+
+
+def constants(t: Text, array: Any) -> Held:
+    """A known array, the same in every lane."""
     array = np.asarray(array)
     kind = kind_of(array.dtype)
+    if array.size > MOST_IN_REGISTERS:
+        return table(t, array, kind)
     out = np.empty(array.shape, object)
     for i in np.ndindex(array.shape):
         out[i] = t.constant(array[i], kind)
     return out
 
 
-def write(t: Text, closed: ClosedJaxpr | Jaxpr, args: list[Values], mask: Value) -> list[Values]:
+def write(t: Text, closed: ClosedJaxpr | Jaxpr, args: list[Any], mask: Value) -> list[Any]:
     """Append the operations of a jaxpr to a text.
 
-    **Arguments:** the text; the jaxpr; the values of its arguments, of their shapes; which lanes
+    **Arguments:** the text; the jaxpr; its arguments, as `Held` arrays of their shapes; which lanes
     need the results: what none of them needs may be skipped, and the others get any numbers.
 
-    **Returns:** the values of its results.
+    **Returns:** its results, likewise.
     """
     jaxpr, env = inner(closed), {}
+    needed = _needed(jaxpr)
+    uses, last = _uses(jaxpr, needed)
 
-    def read(atom: Any) -> Values:
+    def read(atom: Any) -> Held:
         if isinstance(atom, Literal):
             aval: Any = atom.aval
             return constants(t, np.asarray(atom.val, aval.dtype))
         return env[atom]
 
-    for var, const in zip(jaxpr.constvars, getattr(closed, "consts", ()), strict=True):
-        env[var] = constants(t, const)
-    env.update(zip(jaxpr.invars, args, strict=True))
-    for eqn in _needed(jaxpr):
-        outs = _equation(t, eqn, [read(a) for a in eqn.invars], mask)
-        env.update(zip(eqn.outvars, outs, strict=True))
+    def put(variables: list[Any], values: list[Any]) -> None:
+        for var, value in zip(variables, values, strict=True):
+            # What is asked for more than once is computed once.
+            env[var] = settled(t, value) if uses.get(var, 0) > 1 else value
+
+    put(jaxpr.constvars, [constants(t, x) for x in getattr(closed, "consts", ())])
+    put(jaxpr.invars, args)
+    for number, eqn in enumerate(needed):
+        put(eqn.outvars, _equation(t, eqn, [read(a) for a in eqn.invars], mask))
+        for var in last.get(number, ()):  # so that its memory serves again
+            env.pop(var, None)
     return [read(a) for a in jaxpr.outvars]
+
+
+def _uses(jaxpr: Jaxpr, needed: list[Any]) -> tuple[dict[Any, int], dict[int, list[Any]]]:
+    """How often each variable is asked for; which ones are not asked for after an equation."""
+    uses, at_last = {}, {}
+    for number, atoms in enumerate([*(eqn.invars for eqn in needed), jaxpr.outvars]):
+        for atom in atoms:
+            if not isinstance(atom, Literal):
+                uses[atom] = uses.get(atom, 0) + 1
+                at_last[atom] = number
+    last: dict[int, list[Any]] = {}
+    for var, number in at_last.items():
+        last.setdefault(number, []).append(var)
+    return uses, last
 
 
 def _needed(jaxpr: Jaxpr) -> list[Any]:
@@ -107,172 +139,92 @@ def _needed(jaxpr: Jaxpr) -> list[Any]:
     return kept[::-1]
 
 
-def _equation(t: Text, eqn: Any, args: list[Values], mask: Value) -> list[Values]:
+def _equation(t: Text, eqn: Any, args: list[Any], mask: Value) -> list[Any]:
     """The values of an equation's results, by the rule of its primitive."""
     name, params = eqn.primitive.name, eqn.params
-    if name in ELEMENTWISE:
-        dtypes = [a.aval.dtype for a in eqn.invars]
-        return _elementwise(t, name, params, dtypes, args, len(eqn.outvars))
-    if name in STRUCTURAL:
-        out = STRUCTURAL[name](t, params, [v.aval for v in eqn.outvars], *args)
-        return list(out) if eqn.primitive.multiple_results else [out]
     if name in CALLS:
         return write(t, params[CALLS[name]], args, mask)
-    if name == "cond":
-        return _cond(t, params["branches"], args[0].item(), args[1:], mask)
-    if name == "while":
-        return _while(t, params, args, mask)
-    if name == "scan":
-        return _scan(t, params, args, mask)
-    raise Unsupported(f"the primitive `{name}`")
+    if name in CONTROL:
+        return CONTROL[name](write, t, params, [settled(t, x) for x in args], mask)
+    if name == "custom_linear_solve":
+        before, _, solve, _ = np.cumsum([0, *params["const_lengths"]])[1:]
+        given = int(before + params["const_lengths"].vecmat), int(solve)
+        consts, right = args[slice(*given)], args[sum(params["const_lengths"]) :]
+        return write(t, params["jaxprs"].solve, [*consts, *right], mask)
+    avals = [v.aval for v in eqn.outvars]
+    if name in DERIVED:
+        return write(t, derived(name, [a.aval for a in eqn.invars], params), args, mask)
+    large = any(isinstance(x, Large) for x in args) or any(
+        a.size > MOST_IN_REGISTERS for a in avals
+    )
+    if name in ELEMENTWISE:
+        dtypes = [a.aval.dtype for a in eqn.invars]
+        how = _formulas if large else _elementwise
+        return how(t, name, params, dtypes, args, avals)
+    if name in PLACED:
+        dtypes = [a.aval.dtype for a in eqn.invars[_PLACES.get(name, 1) :]]
+        out = PLACED[name](t, params, avals, dtypes, *args)
+    else:
+        out = (LARGE if large else STRUCTURAL)[name](t, params, avals, *args)
+    return [held(t, x) for x in (out if eqn.primitive.multiple_results else [out])]
 
 
-def _elementwise(t: Text, name, params, dtypes, args, results: int) -> list[Values]:
+_PLACES = {"dynamic_update_slice": 2}
+"""Where the places begin among the arguments of a primitive of `PLACED`."""
+
+
+def _elementwise(t: Text, name, params, dtypes, args, avals) -> list[Values]:
     """A rule of `ELEMENTWISE`, number by number."""
     args = np.broadcast_arrays(*args, subok=False)
-    outs = [np.empty(args[0].shape, object) for _ in range(results)]
+    outs = [np.empty(args[0].shape, object) for _ in avals]
     for i in np.ndindex(args[0].shape):
         out = ELEMENTWISE[name](t, params, dtypes, *(a[i] for a in args))
-        for array, value in zip(outs, out if results > 1 else (out,), strict=True):
+        for array, value in zip(outs, out if len(avals) > 1 else (out,), strict=True):
             array[i] = value
     return outs
 
 
-def _cond(t: Text, branches: tuple, which: Value, args: list[Values], mask: Value) -> list[Values]:
-    """Each branch is skipped where no lane of the group takes it, but for a cheap one.
+def _formulas(t: Text, name, params, dtypes, args, avals) -> list[Held]:
+    """The same for arrays too large for registers, as formulas; those of several results, which
+    are computed together, are stored."""
+    if name in SAME:
+        return args[:1]
+    shape, kinds = avals[0].shape, [kind_of(a.dtype) for a in avals]
 
-    **Arguments:** the text; the branches' jaxprs; which of them each lane takes; their arguments;
-    which lanes need the results.
-    """
-    last = len(branches) - 1
-    taken = []
-    for i in range(len(branches)):
-        how = "sle" if i == 0 else "sge" if i == last else "eq"
-        if which.kind == "i1":
-            flag = which if i else t.inverse(which)
-        else:
-            flag = t.binary(f"icmp {how}", which, t.constant(i, which.kind), "i1")
-        taken.append(flag)
-    # The cheapest comes first: the results of the others replace its own in their lanes.
-    order = sorted(range(len(branches)), key=lambda i: _size(inner(branches[i])))
-    result: list[Values] | None = None
-    for i in order:
-        if result is None and _size(inner(branches[i])) <= _CHEAP:
-            result = write(t, branches[i], args, mask)
-            continue
-        result = _branch_if_any(t, branches[i], args, t.both(mask, taken[i]), result)
-    assert result is not None
-    return result
+    def numbers(index: tuple) -> Any:
+        # JAX lets numbers, and axes of one number, stand for arrays.
+        given = (
+            at(t, x, [i if n != 1 else 0 for i, n in zip(index, x.shape, strict=False)])
+            for x in args
+        )
+        found = ELEMENTWISE[name](t, params, dtypes, *given)
+        # Whether it is stored before it is used must not decide how it is rounded.
+        return t.opaque(found) if len(avals) == 1 else found
 
+    values = [_one_number(x) for x in args]
+    if all(v is not None for v in values):
+        found = ELEMENTWISE[name](t, params, dtypes, *values)
+        return [uniform(shape, v) for v in (found if len(avals) > 1 else (found,))]
+    if name == "select_n" and len(args) == 3 and values[0] is not None:
+        if values[0].kind == "i1" and args[1].shape == args[2].shape:
+            found = chosen(t, values[0], args[2], args[1])
+            if found is not None:
+                return [found]
+    if len(avals) == 1:
+        cuts = joined(*(x.cuts for x in args if isinstance(x, Large) and x.ndim))
+        return [Formula(shape, kinds[0], numbers, cuts=cuts)]
+    outs = [room(t, shape, kind) for kind in kinds]
 
-def _branch_if_any(t: Text, jaxpr, args, mask: Value, otherwise) -> list[Values]:
-    """The results of a jaxpr in the lanes of `mask`, and `otherwise` (or anything, if that is
-    `None`) in the others; skipped if `mask` has no lane."""
-    inside, after = t.label(), t.label()
-    before = t.block
-    t.fork(t.any(mask), inside, after, rare=True)
-    t.open(inside)
-    found = write(t, jaxpr, args, mask)
-    if otherwise is None:
-        otherwise = [each(lambda a: t.zero(a.kind), x) for x in found]
-        laid = found
-    else:
-        laid = [
-            each(lambda a, b: t.select(mask, a, b), x, y)
-            for x, y in zip(found, otherwise, strict=True)
-        ]
-    end = t.block
-    t.line(f"br label %{after}")
-    t.close()
-    t.follow(after)
-    return [
-        each(lambda a, b: a if a == b else t.phi(a.kind, (a.text, end), (b.text, before)), x, y)
-        for x, y in zip(laid, otherwise, strict=True)
-    ]
+    def put(index: tuple) -> None:
+        for out, value in zip(outs, numbers(index), strict=True):
+            store_at(t, out, index, value)
+
+    over(t, shape, put, joined(*(x.cuts for x in args if isinstance(x, Large))))
+    return list(outs)
 
 
-def _while(t: Text, params: dict, args: list[Values], mask: Value) -> list[Values]:
-    """Until no lane of `mask` goes on; a lane that has ended keeps its carry."""
-    n, m = params["cond_nconsts"], params["body_nconsts"]
-    cond_args, body_args, first = args[:n], args[n : n + m], args[n + m :]
-    head, inside, after = t.label(), t.label(), t.label()
-    before = t.block
-    t.line(f"br label %{head}")
-    t.open(head)
-    place = len(t.lines)
-    carry = [each(lambda a: Value(t.fresh(), a.kind), x) for x in first]
-    live = Value(t.fresh(), "i1")
-    asked = write(t, params["cond_jaxpr"], [*cond_args, *carry], live)[0].item()
-    going = t.both(live, asked)
-    t.fork(t.any(going), inside, after)
-    t.open(inside)
-    new = write(t, params["body_jaxpr"], [*body_args, *carry], going)
-    new = [each(lambda a, b: t.select(going, a, b), x, y) for x, y in zip(new, carry, strict=True)]
-    end = t.block
-    t.line(f"br label %{head}")
-    t.close()
-    t.close()
-    begun, back = ([*_flat(first), mask], before), ([*_flat(new), going], end)
-    t.join([*_flat(carry), live], begun, back, at=place)
-    t.follow(after)
-    return carry
-
-
-def _flat(arrays: list[Values]) -> list[Value]:
-    return [value for x in arrays for value in x.ravel()]
-
-
-def _has_no_rows(params: dict, inputs: int, outputs: int) -> bool:
-    """Whether a loop of known length has a carry only: no rows, neither given nor made.
-
-    **Arguments:** the parameters of `scan`; the numbers of its arguments and results.
-    """
-    carried = params["num_carry"]
-    return params["length"] > 0 and inputs == params["num_consts"] + carried == outputs + (
-        inputs - carried
-    )
-
-
-def _counted_loop(t: Text, params: dict, args: list[Values], mask: Value) -> list[Values]:
-    """A loop of known length without rows, as a loop with a scalar counter."""
-    n = params["num_consts"]
-    fixed, first = args[:n], args[n:]
-    inside, after = t.label(), t.label()
-    before = t.block
-    t.line(f"br label %{inside}")
-    t.open(inside)
-    place = len(t.lines)
-    carry = [each(lambda a: Value(t.fresh(), a.kind), x) for x in first]
-    count, following = t.fresh(), t.fresh()
-    new = write(t, params["jaxpr"], [*fixed, *carry], mask)
-    end = t.block
-    t.line(f"{following} = add i64 {count}, 1")
-    more = t.raw(f"icmp slt i64 {following}, {params['length']}")
-    t.join(_flat(carry), (_flat(first), before), (_flat(new), end), at=place)
-    t.lines.insert(place, f"  {count} = phi i64 [ 0, %{before} ], [ {following}, %{end} ]")
-    t.fork(more, inside, after)
-    t.close()
-    t.follow(after)
-    return new
-
-
-def _scan(t: Text, params: dict, args: list[Values], mask: Value) -> list[Values]:
-    """A loop of known length: its turns one after the other, unless it is long and has no rows."""
-    body = inner(params["jaxpr"])
-    big = _size(body) * params["length"] > _MOST_UNROLLED // 16
-    if big and _has_no_rows(params, len(args), len(body.outvars)):
-        return _counted_loop(t, params, args, mask)
-    n, m, length = params["num_consts"], params["num_carry"], params["length"]
-    fixed, carry, rows = args[:n], args[n : n + m], args[n + m :]
-    order = range(length)[::-1] if params["reverse"] else range(length)
-    kept: dict[int, list[Values]] = {}
-    for i in order:
-        row = [x[i] for x in map(_rowwise, rows)]
-        out = write(t, params["jaxpr"], [*fixed, *carry, *row], mask)
-        carry, kept[i] = out[:m], out[m:]
-    columns = [np.stack([kept[i][j] for i in range(length)]) for j in range(len(body.outvars) - m)]
-    return [*carry, *columns]
-
-
-def _rowwise(x: Values) -> list[Values]:
-    return [np.asarray(x[i], object).reshape(x.shape[1:]) for i in range(x.shape[0])]
+def _one_number(x: Held) -> Value | None:
+    """The number of an array that has only one."""
+    if isinstance(x, Large):
+        return x.value if isinstance(x, Formula) else None
+    return x.item() if x.size == 1 else None

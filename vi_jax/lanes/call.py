@@ -17,6 +17,7 @@ from ctypes import POINTER, Structure, c_char_p, c_int, c_int32, c_int64, c_size
 import jax
 import numpy as np
 
+from ._driver import OUT_OF_MEMORY
 from ._interrupts import SUCCESS, HandlerResult, guard, interrupt_raises, watch
 from ._recent import made_once
 from ._vector import Unsupported
@@ -29,8 +30,8 @@ INTERRUPTED = "Lanes were interrupted before all of them had ended."
 # The version of the interface whose structures follow.
 _MAJOR, _MINOR = 0, 3
 
-# `XLA_FFI_Extension_Metadata`, `XLA_FFI_ExecutionStage_EXECUTE`, two of `XLA_FFI_Error_Code`.
-_METADATA, _EXECUTE, _CANCELLED, _INTERNAL = 1, 3, 1, 13
+# `XLA_FFI_Extension_Metadata`, `XLA_FFI_ExecutionStage_EXECUTE`, three of `XLA_FFI_Error_Code`.
+_METADATA, _EXECUTE, _CANCELLED, _EXHAUSTED, _INTERNAL = 1, 3, 1, 8, 13
 
 
 @contextmanager
@@ -205,6 +206,8 @@ def _run_kernel(frame: _Frame) -> int | None:
     del _running[ctypes.addressof(frame)]
     if succeeded:
         return SUCCESS
+    if work.stop.value == OUT_OF_MEMORY:
+        return _error(frame, "There is no memory for the tape of a derivative.", _EXHAUSTED)
     if work.stop.value:
         return _error(frame, INTERRUPTED, _CANCELLED)
     return _error(frame, "Not all lanes were run.", _INTERNAL)

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
+from . import _backward as _backward  # how `lanes_p` is differentiated in reverse mode
 from ._context import within
 from ._primitive import lanes_p
 from ._trace import Functions, traced
@@ -58,9 +59,10 @@ def run(
 
     Batched by `vmap`, all lanes run together: on a CPU as vector code for groups of them, on all
     cores that the process may use, each place of a group taking up the next lane when its own has
-    ended. Differentiable in forward mode. The functions see scalars (and small arrays) of one lane;
-    what they close over is shared. Functions that close over nothing, but may have constants bound
-    by `functools.partial`, are traced once for inputs that are alike.
+    ended. Differentiable forward and in reverse, to any order (in reverse by a tape of the steps
+    taken, or by running forward along each number). The functions see scalars (and small arrays) of
+    one lane; what they close over is shared. Functions that close over nothing, but may have
+    constants bound by `functools.partial`, are traced once for inputs that are alike.
 
     **Arguments:**
 

@@ -20,6 +20,8 @@ from ._context import within
 from ._kernel import kernel_text
 from ._program import LaneProgram
 from ._recent import Recent
+from ._reverse import ReverseProgram
+from ._tape import reverse_text
 from ._vector import check
 
 # Kernels that are kept although no compiled program needs them any more.
@@ -36,6 +38,9 @@ _MOST_THREADS = 1024
 
 # Seconds between two looks at threads that are to stop.
 _POLL = 1e-3
+
+# What a kernel runs.
+AnyProgram = LaneProgram | ReverseProgram
 
 _threads: ContextVar[int | None] = ContextVar("threads", default=None)
 _entered: list[int] = []
@@ -209,12 +214,14 @@ _recent: "Recent[int, Kernel]" = Recent(_MOST_KERNELS)
 _lock = threading.Lock()
 
 # The keys of a program's texts by processor and width, so that no text is written twice.
-_keys: "weakref.WeakKeyDictionary[LaneProgram, dict[tuple, int]]" = weakref.WeakKeyDictionary()
+_keys: "weakref.WeakKeyDictionary[AnyProgram, dict[tuple, int]]" = weakref.WeakKeyDictionary()
 
 
-def kernel_of(program: LaneProgram, lanes: int) -> Kernel:
+def kernel_of(program: AnyProgram, lanes: int, one_for_all: tuple[bool, ...] = ()) -> Kernel:
     """The kernel of a program for a number of lanes: one for the same text, compiled once while it
     is in use.
+
+    **Arguments:** further, which inputs all lanes share.
 
     **Raises:** `Unsupported` if the program has no vector form, or LLVM cannot be had.
     """
@@ -223,15 +230,15 @@ def kernel_of(program: LaneProgram, lanes: int) -> Kernel:
     width = _width(program, lanes, bits)
     with _lock:
         keys = _keys.setdefault(program, {})
-        kernel = _in_use.get(keys.get((cpu, width), -1))
+        kernel = _in_use.get(keys.get((cpu, width, one_for_all), -1))
     if kernel is None:
-        kernel = _new_kernel(program, cpu, width, bits)
-        keys[cpu, width] = kernel.key
+        kernel = _new_kernel(program, cpu, (width, bits, one_for_all))
+        keys[cpu, width, one_for_all] = kernel.key
     _recent.put(kernel.key, kernel)
     return kernel
 
 
-def _width(program: LaneProgram, lanes: int, bits: int) -> int:
+def _width(program: AnyProgram, lanes: int, bits: int) -> int:
     """Lanes of a group: a power of two of at least 4. It changes no result.
 
     **Arguments:** the program; the lanes of the batch; the bits of a vector register.
@@ -249,16 +256,22 @@ def _width(program: LaneProgram, lanes: int, bits: int) -> int:
     return 2 * full if many and few_numbers else full
 
 
-def _new_kernel(program: LaneProgram, cpu: str | None, width: int, bits: int) -> Kernel:
-    """The kernel of a program whose text was not written yet; compiled unless its text is known."""
+def _new_kernel(
+    program: AnyProgram, cpu: str | None, form: tuple[int, int, tuple[bool, ...]]
+) -> Kernel:
+    """The kernel of a program whose text was not written yet, in the form that the arguments of
+    `kernel_text` say; compiled unless its text is known."""
     for jaxpr in program.jaxprs:
         check(jaxpr.jaxpr)
-    text = kernel_text(program, width, bits)
+    if isinstance(program, ReverseProgram):
+        text = reverse_text(program, *form)
+    else:
+        text = kernel_text(program, *form)
     key = key_of(text, cpu)
     with _lock:
         kernel = _in_use.get(key)
         if kernel is None:
-            kernel = _in_use[key] = Kernel(text, cpu, width)
+            kernel = _in_use[key] = Kernel(text, cpu, form[0])
     return kernel
 
 

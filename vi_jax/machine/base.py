@@ -13,6 +13,7 @@ from .._types import Flag, Scalar, State
 from .clocks import Clocked
 from .event import AbstractEvent, AbstractSwitch
 from .observing import Observed
+from .own import by_default, is_own
 from .stop import RigidStop
 from .words import Worded
 
@@ -27,6 +28,18 @@ class Coordinate(NamedTuple):
     """A state with another position and velocity, and with all that an impact changes besides."""
     mass: Any = 1.0
     """What an impact acts on, in the machine's unit of mass: of two bodies the reduced mass."""
+
+
+class Prepared(NamedTuple):
+    """A machine as a run follows it, and states on the way in and out."""
+
+    machine: Any
+    inward: Callable[[State], State]
+    outward: Callable[[State], State]
+
+
+def _as_it_is(state: State) -> State:
+    return state
 
 
 def _position(machine: "AbstractMachine", state: State) -> Scalar:
@@ -44,10 +57,9 @@ def _placed(machine: "AbstractMachine", state: State, Y: Scalar, V: Scalar) -> S
     return jtu.tree_unflatten(structure, [Y, V, *leaves[2:]][-len(leaves) :])
 
 
-# Of a state with the fields `Y` and `V`, or of a machine without stops.
-_DEFAULTS: dict[str, Callable[..., Any]] = {
-    "position": _position, "velocity": _velocity, "placed": _placed,
-}  # fmt: skip
+def _plain(machine: "AbstractMachine") -> Coordinate:
+    """That of a state with the fields `Y` and `V`, or of a machine without stops."""
+    return Coordinate(*(partial(function, machine) for function in (_position, _velocity, _placed)))
 
 
 class AbstractMachine(Clocked, Observed, Worded):
@@ -98,6 +110,7 @@ class AbstractMachine(Clocked, Observed, Worded):
     | `labels`, `units`, `period_of`, `place_of` | pictures and messages in its own words |
     | `in_range`, `check_start`, `alive` | its own limits, checked before and while it runs |
     | `may_rest` | programs without rest on a stop |
+    | `prepared` | what is worked out once for each run |
 
     Ready machines, each written in this way, are in `vi_jax.machines`.
     """
@@ -130,7 +143,7 @@ class AbstractMachine(Clocked, Observed, Worded):
         """An autonomous machine observed at equal intervals of `s` instead of on its section."""
         name = type(self).__name__
         what = "a `section`"
-        if type(self).section is AbstractMachine.section:
+        if not is_own(type(self).section):
             if not any(x.ends_cycle for x in (*self.stops, *self.switches, *self.events)):
                 raise ValueError(f"A {name} is driven: its cycle is its drive's.")
             what = "an event that ends its cycles"
@@ -141,47 +154,42 @@ class AbstractMachine(Clocked, Observed, Worded):
         )
 
     @property
+    @by_default
     def coordinates(self) -> tuple[Coordinate, ...]:
         """The coordinates that stops limit, by number as `RigidStop.coordinate` names them;
         extremes are recorded of the first. By default one, the machine's `position`, `velocity` and
         `placed`."""
-        return (Coordinate(*(self._said(name) for name in ("position", "velocity", "placed"))),)
+        methods = ("position", "velocity", "placed")
+        own = {name: getattr(self, name) for name in methods if is_own(getattr(type(self), name))}
+        return (_plain(self)._replace(**own),)
 
-    def _said(self, name: str) -> Callable[..., Any]:
-        """A method of the machine's own if it has one, else the default for a state with `Y` and
-        `V`. The default does not ask `coordinates`, which would ask it again where they call
-        `super()`."""
-        default = getattr(AbstractMachine, name)
-        if self._has_coordinates and getattr(type(self), name) is default:
-            return partial(_DEFAULTS[name], self)
-        return getattr(self, name)
+    @property
+    def _first(self) -> Coordinate:
+        """What `position`, `velocity` and `placed` are where the machine does not say it by them:
+        the first of its own `coordinates`, if it has some."""
+        return self.coordinates[0] if is_own(type(self).coordinates) else _plain(self)
 
+    @by_default
     def position(self, state: State) -> Scalar:
         """The coordinate that stops limit: by default the first of `coordinates`, or `state.Y`; of
         a machine without stops whose state has no `Y` what extremes are of, its first number."""
-        first = self.coordinates[0].position if self._has_coordinates else partial(_position, self)
-        return first(state)
+        return self._first.position(state)
 
+    @by_default
     def velocity(self, state: State) -> Scalar:
         """The velocity that an impact reverses; of the sign of d(position)/ds. Of a machine without
         stops whose state has no `V`, what pictures draw over the position: its second number."""
-        first = self.coordinates[0].velocity if self._has_coordinates else partial(_velocity, self)
-        return first(state)
+        return self._first.velocity(state)
 
+    @by_default
     def placed(self, state: State, Y: Scalar, V: Scalar) -> State:
         """`state` with this position and velocity: how a landing and a rebound are applied."""
-        first = self.coordinates[0].placed if self._has_coordinates else partial(_placed, self)
-        return first(state, Y, V)
+        return self._first.placed(state, Y, V)
 
     def has_velocity(self, state: State) -> bool:
         """Whether `velocity` is one; it need not be where there is nothing to meet."""
-        own = type(self).velocity is not AbstractMachine.velocity or self._has_coordinates
+        own = is_own(type(self).velocity) or is_own(type(self).coordinates)
         return own or bool(self.stops) or hasattr(state, "V")
-
-    @property
-    def _has_coordinates(self) -> bool:
-        """Whether a machine names its coordinates itself."""
-        return type(self).coordinates is not AbstractMachine.coordinates
 
     def start(self) -> State:
         """The state to begin from where none is given.
@@ -192,6 +200,12 @@ class AbstractMachine(Clocked, Observed, Worded):
             f"Argument `start` must be given for a {type(self).__name__}, which has no `start` of "
             "its own."
         )
+
+    def prepared(self) -> Prepared:
+        """The machine in the form in which a run follows it: what its numbers alone determine is
+        worked out here, once, and its state may be another one (natural modes); with the ways from
+        its own states to those, and back. By default it is the machine itself."""
+        return Prepared(self, _as_it_is, _as_it_is)
 
     def adopt(self, start: State) -> State:
         """A start as this machine needs it. **Raises:** `TypeError` if it is none."""
@@ -218,4 +232,4 @@ class AbstractMachine(Clocked, Observed, Worded):
 
 def renews(machine: AbstractMachine) -> bool:
     """Whether a machine begins each cycle with something set back."""
-    return type(machine).renewed is not AbstractMachine.renewed
+    return is_own(type(machine).renewed)

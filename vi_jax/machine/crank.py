@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 from .._checks import Range, require_ranges
 from .._numbers import real
 from .._types import Scalar
+from .own import by_default, is_own
 from .shown import Shown
 from .trig import sincos
 
@@ -45,8 +46,9 @@ class CosineCrank(AbstractCrank):
     @property
     def is_odd(self):
         """True, unless a subclass has another `slide`."""
-        return type(self).slide is CosineCrank.slide
+        return not is_own(type(self).slide)
 
+    @by_default
     def slide(self, phase: Float[Array, "..."]) -> Slide:
         """U = cos φ and its derivatives (dimensionless)."""
         sine, cosine = sincos(phase)

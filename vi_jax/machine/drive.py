@@ -87,7 +87,10 @@ class AbstractDrive(Shown):
         names = [part.name for part in dataclasses.fields(self.state)][2:]
         for name, value in given.items():
             if value is not None and name not in names:
-                why = _WITHOUT.get(name, f"the state of this drive has {names or 'none'}")
+                there = ["Y", "V", *names]
+                near = [x for x in there if x.lower() == name.lower()]
+                has = f"it is called `{near[0]}`" if near else f"a state has {', '.join(there)}"
+                why = _WITHOUT.get(name, has)
                 raise ValueError(
                     f"Argument `{name}` must be left out: {why}, but got {name}={value!r}."
                 )

@@ -1,15 +1,12 @@
 """Events: a guard, and what happens where it rises through zero."""
 
 import abc
-from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jax.lax import stop_gradient
 
 from .._types import Machine, Scalar, Scalars, State
-from .contacts import rubbed
 from .shown import Shown
 
 Modes = Scalars
@@ -198,148 +195,3 @@ class Section(AbstractEvent):
     def after(self, machine, s, state, *modes):
         """The state as the next cycle begins."""
         return machine.renewed(state), modes
-
-
-def events_of(machine: Machine) -> tuple[AbstractEvent, ...]:
-    """All events of a machine, in the order in which they are numbered: its stops, its switches,
-    its other events, its section."""
-    return (*machine.stops, *machine.switches, *machine.events, Section())
-
-
-def is_autonomous(machine: Machine, state: State) -> bool:
-    """Whether an event ends the cycles of a machine, instead of its clock."""
-    ends = any(event.ends_cycle for event in events_of(machine)[:-1])
-    return ends or machine.section(state) is not None
-
-
-def section_number(machine: Machine) -> int:
-    """The section's number among the machine's events: the last."""
-    return len(events_of(machine)) - 1
-
-
-def guard_of(
-    machine: Machine, number: int, s: Scalar, state: State, modes: Modes, contact: Scalars = ()
-) -> Scalar:
-    """The guard of one of a machine's events, which rises through zero where it happens.
-
-    **Arguments:** `number`, the event's; `modes`, all of the machine; `contact` as in `Around`.
-    """
-    event, own, more = event_of(machine, number, modes, contact)
-    return event.guard(machine, s, state, *modes[own], **more)
-
-
-def jump_of(machine: Machine, number: int, s: Scalar, state: State, modes: Modes) -> State:
-    """The state after one of a machine's events as a smooth function of that before it (see
-    `AbstractEvent.jump`).
-
-    **Arguments:** `number`, the event's; `modes`, all of the machine.
-    """
-    event, own, _ = event_of(machine, number, modes, ())
-    return _rubbed(machine, number, state, event.jump(machine, s, state, *modes[own]))
-
-
-def happens_at(machine: Machine, number: int, s: Scalar, state: State, modes: Modes) -> Any:
-    """Whether one of a machine's events happens where its guard has risen; `None` if always.
-
-    **Arguments:** `number`, the event's; `modes`, all of the machine.
-    """
-    event, own, _ = event_of(machine, number, modes, ())
-    return event.happens(machine, s, state, *modes[own])
-
-
-def value_of(machine: Machine, number: int, s: Scalar, state: State, modes: Modes) -> Any:
-    """What the log of events keeps of one of a machine's events.
-
-    **Arguments:** `number`, the event's; `modes`, all of the machine.
-    """
-    event, own, _ = event_of(machine, number, modes, ())
-    return event.value(machine, s, state, *modes[own])
-
-
-def after_event(
-    machine: Machine, number: int, s: Scalar, state: State, modes: Modes, contact: Scalars = ()
-) -> tuple[State, Modes]:
-    """State and modes after one of a machine's events.
-
-    **Arguments:** `number`, the event's; `modes`, all of the machine before it; `contact` as in
-    `Around`.
-    """
-    event, own, more = event_of(machine, number, modes, contact)
-    new, changed = event.after(machine, s, state, *modes[own], **more)
-    if event.holds_mode:
-        changed = (*modes[: own.start], changed, *modes[own.stop :])
-    return _rubbed(machine, number, state, new), settled_modes(changed, s)
-
-
-def _rubbed(machine: Machine, number: int, before: State, after: State) -> State:
-    """The state after an impact, with what friction on the stop makes of it."""
-    friction = rubbing_on(machine, number)
-    return after if friction is None else rubbed(machine, number, friction, before, after).state
-
-
-def rubbing_on(machine: Machine, number: int) -> Any:
-    """The friction on stop number `number`, or `None`."""
-    if number >= len(machine.stops):
-        return None
-    return next((x for x in machine.switches if x.rubs_on == number), None)
-
-
-def rubs(machine: Machine) -> bool:
-    """Whether there is friction on one of its stops."""
-    return any(x.rubs_on is not None for x in machine.switches)
-
-
-def mode_number(machine: Machine, number: int) -> int:
-    """The place among the machine's modes of the one that an event holds."""
-    return sum(event.holds_mode for event in events_of(machine)[:number])
-
-
-def event_of(
-    machine: Machine, number: int, modes: Modes, contact: Scalars
-) -> tuple[AbstractEvent, slice, dict[str, Around]]:
-    """An event, which of the machine's modes its methods get (its own or all), and what keyword
-    arguments besides."""
-    event = events_of(machine)[number]
-    if not event.holds_mode:
-        return event, slice(None), {}
-    own = mode_number(machine, number)
-    more = {"around": Around(modes, own, contact)} if event.sees_around else {}
-    return event, slice(own, own + 1), more
-
-
-def begin_modes(machine: Machine, s: Scalar, state: State) -> Modes:
-    """The modes of a motion that begins in `state`: those that events hold, in their order, then
-    the machine's own."""
-    held = [event for event in events_of(machine) if event.holds_mode]
-    modes = [*(event.begin(machine, s, state) for event in held), *machine.begin(s, state)]
-    modes = settled_modes(modes, s)
-    if any(event.sees_around for event in held):  # which looks at the other modes
-        modes = struck_modes(machine, s, state, modes)
-    return modes
-
-
-def struck_modes(
-    machine: Machine,
-    s: Scalar,
-    state: State,
-    modes: Modes,
-    own: Sequence[Any] | None = None,
-    contact: Scalars = (),
-) -> Modes:
-    """The modes after the state has jumped to this one.
-
-    **Arguments:** `modes`, before the jump; `own`, the machine's own after it, which stay as they
-    are if left out; `contact` as in `Around`.
-    """
-    held = []
-    for number, event in enumerate(events_of(machine)):
-        if event.holds_mode:
-            _, place, more = event_of(machine, number, modes, contact)
-            held.append(event.struck(machine, s, state, *modes[place], **more))
-    kept = modes[len(held) :] if own is None else own
-    return settled_modes([*held, *kept], s)
-
-
-def settled_modes(modes: Sequence[Any], s: Scalar) -> Modes:
-    """Modes as the loop carries them: floats, which nothing is differentiated by."""
-    return tuple(stop_gradient(jnp.asarray(mode, jnp.result_type(s))) for mode in modes)

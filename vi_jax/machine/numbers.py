@@ -36,10 +36,27 @@ def components(state: State, lead: int = 0) -> dict[str, Any]:
     return found
 
 
+def in_rows(states: State, lead: int = 1) -> Array:
+    """Several states beside each other, which have `lead` axes in front, as rows of all their
+    numbers, in the order of `ravel_pytree`."""
+    leaves = [jnp.asarray(x) for x in jtu.tree_leaves(states)]
+    return jnp.concatenate([x.reshape(*x.shape[:lead], -1) for x in leaves], axis=-1)
+
+
 def state_in_words(state: State, digits: int, units: Mapping[str, str]) -> str:
-    """The numbers of a state of any kind, in their units."""
-    parts = components(state).items()
-    return ", ".join(f"{name} = {in_unit(plain(x, digits), units, name)}" for name, x in parts)
+    """The numbers of a state of any kind, in their units; of one with many the first few."""
+    parts = list(components(state).items())
+    words = [f"{name} = {in_unit(plain(x, digits), units, name)}" for name, x in parts]
+    return ", ".join(first_few(words))
+
+
+def first_few(words: list[str]) -> list[str]:
+    """A list's words, of a long one the first few and how many more there are."""
+    return words if len(words) <= _MANY else [*words[:_FEW], f"and {len(words) - _FEW} more"]
+
+
+# What is printed of long lists: choices.
+_MANY, _FEW = 16, 8
 
 
 def plain(x: Any, digits: int) -> str:
@@ -49,25 +66,47 @@ def plain(x: Any, digits: int) -> str:
 
 def leaf(tree: Any, name: str) -> Float[Array, "..."]:
     """The number of that name. **Raises:** `ValueError` that lists the near names."""
-    return jnp.asarray(by_name(tree)[check_leaf(tree, name)])
+    base, place = _place_in(tree, check_leaf(tree, name))
+    return jnp.asarray(by_name(tree)[base])[place]
 
 
 def with_leaf(tree: Any, name: str, value: Any) -> Any:
     """The same machine with another number in place of that name; traced values pass."""
-    index = leaf_names(tree).index(check_leaf(tree, name))
+    base, place = _place_in(tree, check_leaf(tree, name))
+    index = leaf_names(tree).index(base)
     leaves, treedef = jtu.tree_flatten(tree)
     arrays = [i for i, x in enumerate(leaves) if eqx.is_array_like(x)]
     old = leaves[arrays[index]]
     kind = jnp.result_type(old)
     if jnp.issubdtype(kind, jnp.integer) and jnp.issubdtype(jnp.result_type(value), jnp.floating):
         kind = jnp.result_type(float)  # or else it would be cut off
-    leaves[arrays[index]] = jnp.asarray(value, kind)
+    if place:
+        leaves[arrays[index]] = jnp.asarray(old, kind).at[place].set(value)
+    elif jnp.ndim(old) and not jnp.ndim(value):
+        raise ValueError(
+            f"Argument `parameter` must be a number of the machine, but {name!r} is an array of "
+            f"shape {jnp.shape(old)}; name one of its numbers, as "
+            f"{name + str([0] * jnp.ndim(old))!r}."
+        )
+    else:
+        leaves[arrays[index]] = jnp.asarray(value, kind)
     return jtu.tree_unflatten(treedef, leaves)
 
 
+def _place_in(tree: Any, name: str) -> tuple[str, tuple[int, ...]]:
+    """The array that a number's name begins with, and its place in it: none of the number itself or
+    of a whole array."""
+    if name in by_name(tree):
+        return name, ()
+    base, _, inner = name.removesuffix("]").rpartition("[")
+    return base, tuple(int(i) for i in inner.split(","))
+
+
 def check_leaf(tree: Any, name: str, *, argument: str = "parameter") -> str:
-    """`name`, if the machine has such a number."""
-    return check_name(leaf_names(tree), name, argument)
+    """`name`, if the machine has such a number, or such an array, whose numbers are called
+    `name[i]`."""
+    names = leaf_names(tree)
+    return name if name in names else check_name(list(components(tree)), name, argument)
 
 
 def check_name(names: list[str], name: str, argument: str) -> str:

@@ -3,6 +3,7 @@
 from typing import Any, TypeVar
 
 from .._types import Scalar, State
+from .own import by_default
 from .shown import Shown
 
 Machine = TypeVar("Machine", bound="Observed")
@@ -12,6 +13,7 @@ class Observed(Shown):
     """What is observed of a motion: where a cycle ends, what begins anew with it, means and
     quantities."""
 
+    @by_default
     def section(self, state: State) -> Scalar | None:
         """What rises through zero where a cycle ends; `None` where `s` or `clock` counts them."""
         return None
@@ -28,11 +30,13 @@ class Observed(Shown):
         whose section cannot be moved."""
         return None
 
+    @by_default
     def renewed(self, state: State) -> State:
         """`state` as the next cycle begins, where something is counted by the cycle: a drift, say,
         is given as the progress in the last cycle and begins again from zero."""
         return state
 
+    @by_default
     def averages(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
         """`averages(s, state)`: what is averaged over time between events, by name.
 
@@ -43,6 +47,7 @@ class Observed(Shown):
         some; nothing is integrated where no motion is recorded (`record="sections"`)."""
         return {}
 
+    @by_default
     def quantities(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
         """`quantities(s, state)`: functions of the state, by name, which results tell beside it: on
         sections, in samples, along branches. `s` counts from the section; it is 0 where the state

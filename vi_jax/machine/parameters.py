@@ -134,7 +134,7 @@ class Parameters(Shown):
 
     @property
     def natural_frequency(self) -> Number:
-        """ω = √(k0/m_C), rad/s."""
+        """Natural frequency of the body on its spring, ω = √(k0/m_C), in rad/s."""
         return (self.stiffness / self.body_mass) ** 0.5
 
     def scene(self, *, drive: str = "motor", crank: str = "cosine") -> Scene:

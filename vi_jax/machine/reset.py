@@ -5,7 +5,8 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 
-from .event import AbstractEvent, struck_modes
+from .event import AbstractEvent
+from .events import struck_modes
 
 
 class Reset(AbstractEvent):

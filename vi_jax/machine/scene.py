@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._calls import named
 from .._checks import NOT_NEGATIVE, Range, instance_of, require, require_ranges, tuple_of
 from .._numbers import concrete, number, optional_real, real
 from .._types import Flag, Scalar, State
@@ -78,6 +79,7 @@ class Scene(ShaftMachine):
         require_ranges(self)
 
     @classmethod
+    @named
     def ideal(
         cls,
         *,

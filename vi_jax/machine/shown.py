@@ -11,6 +11,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jax.core import Tracer
 
+from .._calls import check_call
 from .numbers import by_name
 from .units import NONE, unit_of, with_unit
 
@@ -19,7 +20,12 @@ _WIDTH, _LISTED = 88, 6
 
 
 class Shown(eqx.Module):
-    """A module that shows its numbers, in the units that its `units` state, if it has any."""
+    """A module that shows its numbers, in the units that its `units` state, if it has any, and
+    refuses arguments that it does not have by their names."""
+
+    def __new__(cls, *args: Any, **kwargs: Any):
+        check_call(cls.__init__, cls.__name__, (None, *args), kwargs, bound=1)
+        return super().__new__(cls)
 
     def __repr__(self) -> str:
         return in_words(self, getattr(self, "units", NONE)) if known(self) else super().__repr__()

@@ -11,9 +11,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._checks import REAL, SHARE, count, one_of, require_ranges
-from .._numbers import concrete, real, real_or_law
+from .._numbers import concrete, optional_real, real, real_or_law
 from .._types import Machine, Scalar, State
-from .event import AbstractEvent, Modes, struck_modes
+from .event import AbstractEvent, Modes
+from .events import struck_modes
+from .own import by_default, is_own
 from .shown import Shown
 
 
@@ -59,7 +61,8 @@ class RigidStop(Wall, AbstractEvent):
     negative (a body pressed on); the restitution is in [0, 1], both ends included, or a function of
     the speed of approach with values there (a pytree, if it has numbers of its own).
 
-    What is hit is the machine's first coordinate unless another is named by its index.
+    What is hit is the machine's first coordinate unless another is named by its index; of a linear
+    machine (`vi.machines.Structure`) it is the sum `at`·x of its displacements.
     """
 
     gap: Float[Array, "..."] = eqx.field(converter=real("gap"))
@@ -73,7 +76,11 @@ class RigidStop(Wall, AbstractEvent):
     modes: Callable[..., Any] | None = eqx.field(static=True, default=None, kw_only=True)
     """`modes(machine, s, state, *modes)`: the machine's own modes after an impact in this state, a
     tuple like that of its `begin`; they stay as they are if left out."""
-    ranges: ClassVar = {"gap": REAL, "restitution": SHARE}
+    at: Float[Array, "..."] | None = eqx.field(
+        default=None, kw_only=True, converter=optional_real("at")
+    )
+    """c, by how much each displacement of a linear machine enters; `None` for other machines."""
+    ranges: ClassVar = {"gap": REAL, "restitution": SHARE, "at": REAL}
     word: ClassVar = "impact"
 
     def __check_init__(self):
@@ -124,6 +131,7 @@ class RigidStop(Wall, AbstractEvent):
         """k at this speed of approach."""
         return self.restitution(approach) if callable(self.restitution) else self.restitution
 
+    @by_default
     def rebound(self, V: Any) -> Any:
         """The velocity after an impact with this one (Eq. 17 of the paper)."""
         return -self.coefficient(self.approach(V)) * V
@@ -137,7 +145,7 @@ class RigidStop(Wall, AbstractEvent):
     def share(self, approach: Any) -> Any:
         """The share of a speed of approach that is left after the impact: k, or by a `rebound` of
         one's own."""
-        if type(self).rebound is RigidStop.rebound:
+        if not is_own(type(self).rebound):
             return self.coefficient(approach)
         left = -self.approach(self.rebound(self.sign * approach))
         return left / jnp.where(approach > 0, approach, 1.0)

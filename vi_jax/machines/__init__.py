@@ -1,5 +1,7 @@
 """Ready machines of other kinds than the paper's, each in a file that shows how to write one."""
 
+from ..machine import StructureState as StructureState
+from .beam import Beam as Beam
 from .bouncing_ball import BallState as BallState
 from .bouncing_ball import BouncingBall as BouncingBall
 from .capsule import Capsule as Capsule
@@ -10,6 +12,7 @@ from .impact_pair import ImpactPair as ImpactPair
 from .impact_pair import PairState as PairState
 from .relief_valve import ReliefValve as ReliefValve
 from .relief_valve import ValveState as ValveState
+from .structure import Structure as Structure
 from .unbalanced_rotor import RotorState as RotorState
 from .unbalanced_rotor import TimedRotorState as TimedRotorState
 from .unbalanced_rotor import UnbalancedRotor as UnbalancedRotor

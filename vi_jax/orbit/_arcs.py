@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._types import Flag, Scalar, State
 from ..flow import Run, simulate
-from ..machine import AbstractMachine, is_autonomous
+from ..machine import AbstractMachine, in_rows, is_autonomous
 from ._cycle_map import CycleMap
 from ._forward_jacobian import forward_jacobian
 from ._neutral import neutral
@@ -64,7 +64,7 @@ def moved_from_impacts(
     apart = jnp.abs(jnp.mod(phase + half, machine.cycle) - half)
     place = jnp.argmax(jnp.min(jnp.where(jnp.isnan(apart), half, apart), axis=1))
     there = jtu.tree_map(lambda x: x[place], run.samples.state)
-    lost = ~jnp.isfinite(sum(jtu.tree_leaves(there)))
+    lost = ~jnp.all(jnp.isfinite(in_rows(there, 0)))
     place = jnp.where(lost, 0, place)
     there = jtu.tree_map(lambda a, b: jnp.where(lost, a, b), guess, there)
     moved = machine.observed_later(jnp.asarray(step, phase.dtype) * place)
@@ -113,7 +113,7 @@ def observe_arc(arc: CycleMap, state: State, impact_log: int) -> ObservedArc:
                 arc.machine, unravel(x), arc.cycles, method=arc.method, record="sections",
                 rests=arc.rests,
             )  # fmt: skip
-            return jnp.stack(jtu.tree_leaves(run.sections), axis=-1)[1:]
+            return in_rows(run.sections)[1:]
 
         # Apart from the motion: a program with second derivatives should hold no more than it must.
         jacobians = jax.jacfwd(states)(x)
@@ -121,7 +121,7 @@ def observe_arc(arc: CycleMap, state: State, impact_log: int) -> ObservedArc:
         log = run.impact_log
         assert log is not None and run.y_min is not None and run.y_max is not None
         met = run.sections if run.samples is None else run.samples.state
-        places = jnp.stack(jtu.tree_leaves(met), axis=-1)[1:]
+        places = in_rows(met)[1:]
         places = places.reshape(arc.cycles, _places(arc, state), -1)
         assert run.clearance is not None and run.duration is not None
         return ObservedArc(

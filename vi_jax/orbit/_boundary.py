@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -10,25 +10,24 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._checks import interval
+from .._at_work import at_work
+from .._checks import flag, interval
 from .._interrupted import Interrupted
-from .._lazy import lazy
+from .._lazy import xr
 from ..flow import tidy
 from ..machine import check_leaf, leaf, with_units
+from ._conditions import AbstractCondition
 from ._fixed_step_method import steps_of
+from ._problem import check_parameter
 from ._shooting import Shooting
 from ._solution import orbit_of
-from ._solve import Unknowns, check_parameter, jacobian_at, tangent_at
+from ._solve import Unknowns, jacobian_at, tangent_at
 from ._solve import advance as solved
 from ._symmetry import images, may_be_symmetric
-from .curve import INTERRUPTED, Step, Walk, check_walk, walk
+from ._tables import stability_in_words
+from .curve import INTERRUPTED, Step, check_walk, walk
 from .results import InWords, Orbit
 from .special import DOUBLING, FOLD, GRAZING, SYMMETRY, SpecialPoint
-
-if TYPE_CHECKING:
-    import xarray as xr
-else:
-    xr = lazy("xarray")
 
 # What lies below zero by no more than this is zero to rounding: a choice, a hundred times the
 # corrector's tolerance.
@@ -62,6 +61,8 @@ class Boundary(InWords):
     "max_points", "interrupted"."""
     problem: Shooting = dataclasses.field(repr=False)
     steps: list[Step] = dataclasses.field(repr=False)
+    condition: "Special" = dataclasses.field(repr=False)
+    scale: np.ndarray = dataclasses.field(repr=False)
 
     def orbit(self, index: int) -> Orbit:
         """The motion at one point."""
@@ -81,6 +82,7 @@ class Boundary(InWords):
         data |= {name: ("point", getattr(self, name)) for name in ("y_min", "clearance")}
         data["impact_speed"] = ("point", "impact"), self.impact_speed
         data["multipliers"] = ("point", "state"), self.multipliers
+        data["stability"] = "point", stability_in_words(self.multipliers)
         about = {"kind": self.kind, "ends": list(self.ends)}
         found = xr.Dataset(data, attrs={**about, "period_in_cycles": self.problem.cycles})
         found = with_units(found, self.problem.machine.units, {name: name for name in self.names})
@@ -103,6 +105,7 @@ def boundary(
     step: float = 0.01,
     max_step: float = 0.05,
     max_points: int = 1000,
+    progress: bool = True,
 ) -> Boundary:
     """Follow a bifurcation of a branch in a second parameter, both ways.
 
@@ -115,7 +118,8 @@ def boundary(
     - `point`: from `Branch.special`; its parameter is the first of the two.
     - `parameter`: name of the second.
     - `bounds`: intervals of the first and of the second parameter.
-    - `step`, `max_step`, `max_points`: as for `continue_orbit`, parameters in half their intervals.
+    - `step`, `max_step`, `max_points`, `progress`: as for `continue_orbit`, parameters in half
+      their intervals.
 
     **Returns:** a `Boundary`. It ends where the motion ceases to be one (another impact grazes).
 
@@ -123,16 +127,17 @@ def boundary(
     unknown or the same; on Ctrl-C `Interrupted`, whose `partial` is the curve so far.
     """
     settings = check_walk(step=step, max_step=max_step, max_points=max_points)
+    progress = flag("progress", progress)
     _check_point(point)
     bounds = _checked_bounds(point, parameter, bounds)
-    condition, x = _special_motion(point, parameter, bounds)
+    problem, condition, x = _special_motion(point, parameter, bounds)
     scale = np.ones(x.size)
     scale[-2:] = [0.5 * (high - low) for low, high in bounds]
 
     def advance(x: Unknowns, tangent: Unknowns, length: float) -> Step:
-        return solved(condition, x, tangent, scale, length)
+        return solved(problem, x, tangent, scale, length)
 
-    start = advance(x, tangent_at(condition, x, scale), 0.0)
+    start = advance(x, tangent_at(problem, x, scale), 0.0)
     if not bool(start.good):
         raise ValueError(
             "Argument `point` could not be refined in two parameters (last correction "
@@ -144,15 +149,20 @@ def boundary(
             return _cut(advance, here, new, bounds, scale), "bounds"
         return (here, "grazing") if condition.another_grazes(new) else None
 
-    forward = walk(advance, start, stop=stop, **settings)
-    backward = Walk([start], INTERRUPTED)
-    if forward.end != INTERRUPTED:
-        backward = walk(advance, start._replace(tangent=-start.tangent), stop=stop, **settings)
-    path = [*reversed(backward.steps[1:]), *forward.steps]
-    curve = _curve(condition, path, (backward.end, forward.end))
-    if INTERRUPTED in curve.ends:
-        raise Interrupted("walk along the boundary", curve)
-    return curve
+    forward, backward = [start], [start._replace(tangent=-start.tangent)]
+    ends = [INTERRUPTED, INTERRUPTED]
+
+    def curve() -> Boundary:
+        path = [*reversed(backward[1:]), *forward]
+        return _curve(problem, condition, path, (ends[0], ends[1]), scale)
+
+    def kept() -> Interrupted:
+        return Interrupted("walk along the boundary", curve())
+
+    with at_work("boundary", kept, progress=progress, unit="point") as tell:
+        ends[1] = walk(advance, forward, stop=stop, tell=tell, **settings)
+        ends[0] = walk(advance, backward, stop=stop, tell=tell, **settings)
+    return curve()
 
 
 def _check_point(point: SpecialPoint) -> None:
@@ -165,6 +175,11 @@ def _check_point(point: SpecialPoint) -> None:
         raise ValueError(
             "Argument `point` must be a fold, a period doubling, a symmetry breaking or a grazing, "
             f"but is a {point.kind}."
+        )
+    if not point.problem.follows_events:
+        raise ValueError(
+            "Argument `point` must belong to motions without rest on a stop, but these rest, and "
+            "are followed in one parameter only."
         )
     if point.kind == GRAZING and not point.touches:
         raise ValueError(
@@ -195,8 +210,9 @@ def _checked_bounds(point: SpecialPoint, parameter: str, bounds: Any) -> Interva
 
 def _special_motion(
     point: SpecialPoint, parameter: str, bounds: Intervals
-) -> tuple["SpecialMotion", np.ndarray]:
-    """The equations of the curve, and their unknowns at the point where it begins."""
+) -> tuple[Shooting, "Special", np.ndarray]:
+    """The equations of the curve, the condition among them that makes its motions special, and
+    their unknowns at the point where it begins."""
     old = point.problem
     two = dataclasses.replace(old, parameters=(*old.parameters, parameter))
     corners = [two.at(jnp.asarray([a, b])) for a in bounds[0] for b in bounds[1]]
@@ -212,11 +228,15 @@ def _special_motion(
                 f"{parameter} a motion is not its own image."
             )
         symmetry = _symmetry_condition(problem, x)
-    return SpecialMotion(problem, point.kind, point.impact, symmetry), x
+    condition = Special(point.kind, point.impact, symmetry)
+    return dataclasses.replace(problem, conditions=(condition,)), condition, x
 
 
-def _curve(condition: "SpecialMotion", path: list[Step], ends: tuple[str, str]) -> Boundary:
-    problem, seen = condition.problem, [step.seen for step in path]
+def _curve(
+    problem: Shooting, condition: "Special", path: list[Step], ends: tuple[str, str],
+    scale: np.ndarray,
+) -> Boundary:  # fmt: skip
+    seen = [step.seen for step in path]
     return Boundary(
         kind=condition.kind,
         names=(problem.parameters[0], problem.parameters[1]),
@@ -228,6 +248,8 @@ def _curve(condition: "SpecialMotion", path: list[Step], ends: tuple[str, str]) 
         ends=ends,
         problem=problem,
         steps=path,
+        condition=condition,
+        scale=scale,
     )
 
 
@@ -248,9 +270,9 @@ class SymmetryCondition(eqx.Module):
     """
 
     left: Float[Array, " equations"]
-    """l."""
+    """l, the left null vector of J where the symmetry is lost."""
     weight: Float[Array, " differences"]
-    """w."""
+    """w, which picks out of D how far the motion has gone along r."""
 
     def instead(self, problem: Shooting, missing: Array, x: Array) -> Array:
         """The equations' residual F, given as `missing`, with the combination l·F exchanged for
@@ -269,35 +291,30 @@ def _symmetry_condition(problem: Shooting, x: np.ndarray) -> SymmetryCondition:
     return SymmetryCondition(jnp.asarray(left[:, -1]), change / (change @ change))
 
 
-class SpecialMotion(eqx.Module):
-    """The equations of a motion that is special, in two parameters: the orbit's own, and one more.
+class Special(AbstractCondition):
+    """The condition that a motion is special.
 
     With the monodromy matrix M that is det(M - I) = 0 at a fold or where a symmetry is lost,
     det(M + I) = 0 at a period doubling; at a grazing V⁻ = 0 of the impact that is lost, or a
     clearance of zero.
     """
 
-    problem: Shooting
     kind: str = eqx.field(static=True)
     impact: int | None = eqx.field(static=True)
     """The event that grazes; `None` at a touch, and where nothing grazes."""
     symmetry: SymmetryCondition | None = None
 
-    def residual(self, x):
-        missing, seen = self.problem.residual(x), self.problem.observe(x)
-        if self.symmetry is not None:
-            missing = self.symmetry.instead(self.problem, missing, x)
+    def exchanged(self, problem, x, missing):
+        """Where a symmetry is lost, one of the equations is exchanged (see `SymmetryCondition`)."""
+        return missing if self.symmetry is None else self.symmetry.instead(problem, missing, x)
+
+    def missing(self, problem, x, seen):
+        """The determinant, V⁻ or the clearance."""
         identity = jnp.eye(seen.monodromy.shape[0], dtype=x.dtype)
         if self.kind == GRAZING:
-            extra = seen.nearest.room if self.impact is None else seen.approach[self.impact]
-        elif self.kind == DOUBLING:
-            extra = jnp.linalg.det(seen.monodromy + identity)
-        else:
-            extra = jnp.linalg.det(seen.monodromy - identity)
-        return jnp.append(missing, extra)
-
-    def observe(self, x):
-        return self.problem.observe(x)
+            return seen.nearest.room if self.impact is None else seen.approach[self.impact]
+        sign = 1 if self.kind == DOUBLING else -1
+        return jnp.linalg.det(seen.monodromy + sign * identity)
 
     def another_grazes(self, step: Step) -> bool:
         """Whether an impact beside the one that grazes here is lost, or a stop is touched."""

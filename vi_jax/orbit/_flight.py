@@ -5,6 +5,7 @@ from functools import partial
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
@@ -60,6 +61,16 @@ class Flight(eqx.Module):
         **Returns:** the state at s1; the time that passed and the integrals; clock and state before
         each of the steps.
         """
+        way = self.machine.prepared()
+        if way.machine is not self.machine:
+            inner = Flight(way.machine, self.modes, self.method, way.inward(self.like))
+
+            def outward(u: Vector) -> Vector:
+                return ravel_pytree(way.outward(inner.unravel(u)))[0]
+
+            start = ravel_pytree(way.inward(self.unravel(u)))[0]
+            u, passed, (clock, states) = inner.fly(s0, s1, start, steps, averages)
+            return outward(u), passed, (clock, jax.vmap(outward)(states))
         numbers, rest = eqx.partition(self, eqx.is_array)
         (u, passed), path = lanes.run(
             partial(_begin, averages), partial(_step, rest, steps), _end,

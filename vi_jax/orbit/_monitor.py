@@ -1,28 +1,41 @@
 """Following a branch: what happens between two of its points, and when it ends."""
 
+import dataclasses
+import itertools
 from collections.abc import Callable
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
-from ..machine import with_leaf
+from ._conditions import alone
+from ._crossing import BESIDE, changed_between, crossing, tests_of
 from ._events import Event
+from ._extrema import Extrema
 from ._hopf import hopf_between, size_of
 from ._origin import halves, origin
+from ._sequence import changed_sequence
 from ._shooting import Shooting
 from ._solution import orbit_of
 from ._solve import advance, images_at, located, observe
 from ._symmetry import may_be_symmetric
+from ._words import ANEW, DETAILS, HELD_FOLD, REORDERED, RESTS
 from .curve import Step
-from .special import CROSSING, DOUBLING, FOLD, GRAZING, HOPF, SYMMETRY, TORUS, SpecialPoint
+from .special import (
+    CROSSING,
+    DOUBLING,
+    EXTREMUM,
+    FOLD,
+    GRAZING,
+    HOPF,
+    SYMMETRY,
+    TORUS,
+    TURN,
+    SpecialPoint,
+)
 
 # The thresholds here are choices, but for those of which a measurement is given.
 # What lies before the place where a branch springs is looked for on so much of the way there.
 _SHORT = 0.999
-
-# How far beside a point where branches cross (in the norm of the scaled unknowns) it is looked at.
-_BESIDE = 1e-3
 
 # An autonomous motion of so much of the size of another is rest: what solves its equations there is
 # an equilibrium.
@@ -35,22 +48,11 @@ _SHRINKS = 1e-2
 # rimless wheel towards its homoclinic motion the multiplier is right to 2e-12 then.
 _LONG = 4.0
 
+# A place where the sequence of a motion's events changes is refined within so long a step.
+_BEYOND = 1e-4
+
 # Events that are to come together do so within this.
 _TOGETHER = 1e-9
-
-# Stand in the place of the number of an impact, for what grazes without being one.
-_REORDERED, _RESTS, _ANEW = -1, -2, -3
-
-# What is said of a special point, by its kind or by what stands for the impact.
-_DETAILS = {
-    FOLD: "a multiplier passes 1 and the branch turns back",
-    DOUBLING: "a multiplier passes -1",
-    CROSSING: "a multiplier passes 1 and another branch crosses",
-    SYMMETRY: "a multiplier passes 1 and the motion loses its symmetry",
-    TORUS: "a complex pair of multipliers leaves the unit circle",
-    _REORDERED: "two of its events fall together, and come in another order beyond",
-    _ANEW: "a switch goes into another mode: the motion sticks or slips anew",
-}
 
 # Halves of a period that differ by less than this are those of a motion of half the period.
 _ALIKE = 1e-3
@@ -63,17 +65,22 @@ class BranchMonitor:
     """Looks at each step of a walk along a branch: locates what happens in it and says when to end.
 
     **Arguments:** the equations of the motions, with the parameter as their last unknown; the size
-    of each unknown; the interval of the parameter.
+    of each unknown; the intervals of its parameters, in their order; names of the numbers whose
+    extremes are sought.
     """
 
-    def __init__(self, problem: Shooting, scale: np.ndarray, bounds: tuple[float, float]):
+    def __init__(
+        self, problem: Shooting, scale: np.ndarray, bounds: list[tuple[float, float]],
+        extrema: tuple[str, ...] = (),
+    ):  # fmt: skip
         self.problem, self.scale, self.bounds = problem, scale, bounds
-        machine, (name,) = problem.machine, problem.parameters
-        self.symmetric = may_be_symmetric(
-            problem, [machine, *(with_leaf(machine, name, bound) for bound in bounds)]
-        )
+        self.extrema = Extrema(problem, extrema, scale)
+        corners = itertools.product(*bounds)
+        machines = [problem.machine, *(problem.at(jnp.asarray(corner)) for corner in corners)]
+        self.symmetric = may_be_symmetric(problem, machines)
         self.special: list[SpecialPoint] = []
         self.between: dict[int, list[Step]] = {}
+        self.whole: dict[int, Step] = {}  # steps of special points, by what is observed there
         self.start: Step | None = None
         self.away, self.size, self.duration = False, None, None
 
@@ -89,17 +96,17 @@ class BranchMonitor:
     def stop(self, here: Step, new: Step) -> tuple[Step, str] | None:
         """The last point of the branch, and why it ends between these two; `None` if it goes on."""
         reason, last = None, new
-        low, high = self.bounds
-        if not low <= new.x[-1] <= high:
-            bound = low if new.x[-1] < low else high
-            last = self._where(here, new, lambda step: float(step.x[-1]) - bound) or here
-            reason = "bounds"
-        elif self._lengthened(here, new) > 0:
+        for i, (low, high) in enumerate(self.bounds, -len(self.bounds)):
+            if not low <= last.x[i] <= high:
+                bound = low if last.x[i] < low else high
+                last = self._where(here, last, lambda s, i=i, at=bound: float(s.x[i]) - at) or here
+                reason = "bounds"
+        if reason is None and self._lengthened(here, new) > 0:
             last = self._where(here, new, lambda step: self._lengthened(here, step)) or here
             reason = "long"
-        grazing = self._grazing(here, last)
+        grazing = self._grazing(here, last) or self._sequence(here, last)
         if grazing is not None:
-            last, reason = grazing.step, grazing.kind
+            last, reason = self.whole[id(grazing.step.seen)], grazing.kind
         spring = self._bifurcations(here, last)
         if spring is not None:
             return spring, self.special[-1].kind
@@ -128,15 +135,18 @@ class BranchMonitor:
         return located(self.problem, here, new, self.scale, test)
 
     def _point(self, kind: str, step: Step, detail: str, impact: int | None = None) -> SpecialPoint:
+        self.whole[id(step.seen)] = step
+        problem, step, scale = alone(self.problem, step, self.scale)
+        orbit = orbit_of(problem, step)
         return SpecialPoint(
-            kind, float(step.x[-1]), orbit_of(self.problem, step), detail, self.problem, step,
-            self.scale, impact,
+            kind, float(step.x[-1]), orbit, detail, problem, step, scale, impact
         )  # fmt: skip
 
     def _sprung(self, at: Step) -> tuple[Step, SpecialPoint]:
         """Where the branch springs from a motion of half its period: as a step of the branch, and
         as a special point of that motion."""
-        at, half, step = origin(self.problem, at, self.scale)
+        begins, half, step = origin(*alone(self.problem, at, self.scale))
+        at = at if self.problem.conditions else begins
         detail = "the branch springs from a motion of half the period"
         scale = np.append(np.ones(step.x.size - 1), self.scale[-1])
         return at, SpecialPoint(
@@ -153,17 +163,18 @@ class BranchMonitor:
 
         for i, event in enumerate(self.problem.events):
             if new.seen.approach[i] <= 0 < here.seen.approach[i]:
-                hopf = None if event.cycle is None else hopf_between(self.problem, here, new)
+                alone_there = event.cycle is not None and not self.problem.conditions
+                hopf = hopf_between(self.problem, here, new) if alone_there else None
                 if hopf is not None:
-                    found.append((hopf, _RESTS))
+                    found.append((hopf, RESTS))
                 else:
                     tests.append((lambda step, i=i: float(step.seen.approach[i]), i))
         if room(new) < 0 < room(here):
             tests.append((room, None))
         if new.seen.order < 0 < here.seen.order:
-            tests.append((lambda step: float(step.seen.order), _ANEW))
+            tests.append((lambda step: float(step.seen.order), ANEW))
         if new.seen.apart < -_TOGETHER < here.seen.apart:
-            tests.append((lambda step: float(step.seen.apart) + _TOGETHER, _REORDERED))
+            tests.append((lambda step: float(step.seen.apart) + _TOGETHER, REORDERED))
         for test, impact in tests:
             at = self._where(here, new, test)
             if at is not None:
@@ -171,9 +182,9 @@ class BranchMonitor:
         if not found:
             return None
         at, impact = min(found, key=lambda f: float(np.dot(here.tangent, f[0].x - here.x)))
-        if impact in _DETAILS:
-            return self._point(GRAZING, at, _DETAILS[impact])
-        if impact == _RESTS:
+        if impact in DETAILS:
+            return self._point(GRAZING, at, DETAILS[impact])
+        if impact == RESTS:
             return self._point(HOPF, at, "the motion shrinks to rest", 0)
         if impact is None:
             machine, touched = self.problem.machine, int(at.seen.nearest.event)
@@ -185,6 +196,23 @@ class BranchMonitor:
             lost = self.problem.events[impact].of(self.problem.machine)
             detail = f"the {lost.name or lost.word} at {self._place(at, clock)} is lost"
         return self._point(GRAZING, at, detail, impact)
+
+    def _sequence(self, here: Step, last: Step) -> SpecialPoint | None:
+        """Where a motion that rests gains or loses one of its rests or impacts."""
+
+        def where(
+            start: Step, end: Step, test: Callable[[Step], float]
+        ) -> tuple[Step, Step] | None:
+            # A test that jumps is met short of its place by a share of the step: the second step
+            # is a short one.
+            at = self._where(start, end, test)
+            if at is None:
+                return None
+            beyond = self.advance(at.x, at.tangent, _BEYOND)
+            return self._where(at, beyond, test) or at, beyond
+
+        found = changed_sequence(here, last, where)
+        return None if found is None else self._point(*found)
 
     def _place(self, at: Step, clock: float) -> str:
         """A reading of the clock of impacts, in words, within one period from the section on."""
@@ -227,14 +255,15 @@ class BranchMonitor:
 
         **Returns:** where they are, in their order.
         """
-        before, after = _tests(here), _tests(last)
-        changed = [kind for kind in before if before[kind] * after[kind] < 0]
-        both = FOLD in changed and CROSSING in changed
+        before, after = tests_of(here), tests_of(last)
+        changed = changed_between(before, after)
+        held = bool(self.problem.conditions)
+        both = FOLD in changed and CROSSING in changed and not held
         if both:
             changed.remove(CROSSING)
         found = []
         for kind in changed:
-            at = self._where(here, last, lambda step, kind=kind: _tests(step)[kind])
+            at = self._where(here, last, lambda step, kind=kind: tests_of(step)[kind])
             if at is None:
                 continue
             if kind == FOLD and not both and not self._turns_back(here, at, last):
@@ -243,20 +272,27 @@ class BranchMonitor:
                 continue  # it has a multiplier 1 to rounding
             if kind in (FOLD, CROSSING) and self._springs(here, at):
                 continue  # both are zero there
-            if kind == CROSSING:
+            if held and kind == FOLD:
+                found.append((self._point(TURN, at, DETAILS[TURN]), at))
+                continue
+            if kind == CROSSING and (self.symmetric or not held):
                 at = self._crossing(here, at, CROSSING)
             values = at.seen.multipliers
             complex_ones = np.abs(values[np.abs(values.imag) > 1e-9])
             off = {DOUBLING: values + 1, TORUS: complex_ones - 1}.get(kind, values - 1)
             # Else it is a pole of the determinant, or a real pair μ, 1/μ.
             if np.abs(off).min(initial=np.inf) < 1e-5:
-                found.append((float(np.dot(here.tangent, at.x - here.x)), kind, at))
-        found.sort(key=lambda f: f[0])
-        for _, kind, at in found:
-            if kind == CROSSING and self.symmetric and self._apart(at) < _ALIKE:
-                kind = SYMMETRY
-            self.special.append(self._point(kind, at, _DETAILS[kind]))
-        return [at for _, _, at in found]
+                if kind == CROSSING and self.symmetric and self._apart(at) < _ALIKE:
+                    kind = SYMMETRY
+                kind = FOLD if held and kind == CROSSING else kind
+                detail = HELD_FOLD if held and kind == FOLD else DETAILS[kind]
+                found.append((self._point(kind, at, detail), at))
+        for at, name, detail in self.extrema.between(here, last, self._where):
+            point = self._point(EXTREMUM, at, detail)
+            found.append((dataclasses.replace(point, quantity=name), at))
+        found.sort(key=lambda f: float(np.dot(here.tangent, f[1].x - here.x)))
+        self.special += [point for point, _ in found]
+        return [at for _, at in found]
 
     def _shrinks(self, here: Step, at: Step, last: Step) -> bool:
         """Whether an autonomous motion is about to shrink to rest."""
@@ -275,41 +311,20 @@ class BranchMonitor:
         return bool(images.size and close and before > _NOISE)
 
     def _crossing(self, here: Step, at: Step, kind: str) -> Step:
-        """The point where branches cross, from points on both sides, by a test that is zero there.
+        """The point where branches cross (see `crossing`)."""
 
-        Close to it the equations cannot be solved, but the branch passes through it smoothly, so
-        that a polynomial through its neighbours tells where it is, and what the motion is there.
-        """
+        def along(length: float) -> Step | None:
+            step = self.advance(here.x, here.tangent, length)
+            # So close to where they cross the corrector may find the other branch.
+            other = self.symmetric and (kind == FOLD) == (self._apart(step) < _ALIKE * BESIDE)
+            return step if bool(step.good) and not other else None
+
         root = float(np.dot(here.tangent, (at.x - here.x) / self.scale))
-        found: dict[float, Step] = {}
-        for side, wanted in ((-_BESIDE, 3), (_BESIDE, 6)):
-            for n in range(1, 9):
-                if len(found) == wanted:
-                    break
-                step = self.advance(here.x, here.tangent, root + n * side)
-                # So close to where they cross the corrector may find the other branch.
-                other = self.symmetric and (kind == FOLD) == (self._apart(step) < _ALIKE * _BESIDE)
-                if bool(step.good) and not other:
-                    found[n * side] = step
-            if len(found) < wanted:
-                return at
-        places, beside = np.array(list(found)), list(found.values())
-
-        def through(values: Any) -> np.polynomial.Polynomial:
-            return np.polynomial.Polynomial.fit(places, values, len(places) - 1)
-
-        zeros = through([np.asarray(_tests(step)[kind]) for step in beside]).roots()
-        zeros = zeros[np.abs(zeros.imag) < 1e-12].real
-        if not zeros.size or np.abs(zeros).min() > _BESIDE:
+        found = crossing(along, root, kind)
+        if found is None:
             return at
-        place = zeros[np.argmin(np.abs(zeros))]
-
-        def there(get: Callable[[Step], Any]) -> np.ndarray:
-            return np.stack([through(x)(place) for x in zip(*map(get, beside), strict=True)])
-
-        x, tangent = there(lambda step: step.x), there(lambda step: step.tangent)
-        unit = tangent / np.linalg.norm(tangent)
-        return at._replace(x=x, tangent=unit, seen=observe(self.problem, x))
+        x, tangent = found
+        return at._replace(x=x, tangent=tangent, seen=observe(self.problem, x))
 
     def _images(self, step: Step) -> np.ndarray:
         """How far the motion is from being its own image; empty if it cannot be."""
@@ -331,20 +346,3 @@ class BranchMonitor:
     def path(self, steps: list[Step]) -> list[Step]:
         """The steps of a walk with the bifurcations located between them."""
         return [step for new in steps for step in [*self.between.get(id(new), ()), new]]
-
-
-def _tests(step: Step) -> dict[str, float]:
-    """Functions that change sign at the bifurcations."""
-    M, identity = step.seen.monodromy, np.eye(step.seen.monodromy.shape[0])
-    values = step.seen.multipliers
-    with np.errstate(invalid="ignore"):  # a step without an answer has none here either
-        doubling, crossing = np.linalg.det(M + identity), np.linalg.det(M - identity)
-    pairs = [
-        1 - values[i] * values[j] for i in range(len(values)) for j in range(i + 1, len(values))
-    ]
-    return {
-        FOLD: float(step.tangent[-1]),
-        DOUBLING: float(doubling),
-        CROSSING: float(crossing),
-        TORUS: float(np.real(np.prod(pairs))),
-    }

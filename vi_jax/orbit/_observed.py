@@ -3,12 +3,27 @@
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Complex, Float, Int
 
 from .._types import Scalar, State
 from ..machine import AbstractMachine, events_of, guard_of, section_number
 from ._events import Event
 from ._turns import Nearest
+
+
+class Counted(NamedTuple):
+    """The impacts and rests of a motion whose events are found by the simulator."""
+
+    impacts: Int[Array, ""]
+    """Their number in the period, hops of a chatter included."""
+    rests: Int[Array, ""]
+    """Times that a body came to rest on a stop."""
+    clock: Float[Array, " log"]
+    """Clock of each impact since the section; NaN where there is none."""
+    speed: Float[Array, " log"]
+    """V⁻ of each."""
+    stop: Int[Array, " log"]
+    """Index into `machine.stops` of each, -1 where there is none."""
 
 
 class Observed(NamedTuple):
@@ -34,6 +49,8 @@ class Observed(NamedTuple):
     """The period in time."""
     averages: dict[str, Scalar]
     """The machine's own, over the period."""
+    counted: Counted | None = None
+    """Of a motion that is a fixed point of the section map: its impacts and rests."""
 
 
 def apart(

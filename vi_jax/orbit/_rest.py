@@ -8,7 +8,7 @@ from .results import Orbit
 
 def rests(orbit: Orbit) -> bool:
     """Whether a body rests on a stop in the course of a motion, or all the time."""
-    return orbit.machine.may_rest() and _forgets(orbit) and (_rests_now(orbit) or _comes_to(orbit))
+    return orbit.machine.may_rest() and _forgets(orbit) and (rests_now(orbit) or _comes_to(orbit))
 
 
 def _forgets(orbit: Orbit) -> bool:
@@ -17,7 +17,7 @@ def _forgets(orbit: Orbit) -> bool:
     return bool(multipliers.min() < np.sqrt(np.finfo(multipliers.dtype).eps))
 
 
-def _rests_now(orbit: Orbit) -> bool:
+def rests_now(orbit: Orbit) -> bool:
     """Whether a body lies still on a stop on the section."""
     bodies = ((stop, orbit.machine.coordinates[stop.coordinate]) for stop in orbit.machine.stops)
     x = orbit.state

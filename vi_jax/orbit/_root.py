@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 
 from .._types import State, Vector
 from ..flow import simulate
+from ..machine import in_rows
 from ._cycle_map import CycleMap
 from ._neutral import least
 from .root_finders import AbstractRootFinder, Found, find_root
@@ -47,7 +48,7 @@ def root_of(arc: CycleMap, guess: State, root_finder: AbstractRootFinder) -> Fou
         run = simulate(
             arc.machine, guess, arc.cycles * root_finder.arcs, method=arc.method, rests=arc.rests
         )
-        sections = jnp.stack(jtu.tree_leaves(run.sections), axis=-1)[: -1 : arc.cycles]
+        sections = in_rows(run.sections)[: -1 : arc.cycles]
         arcs = jnp.where(jnp.isfinite(sections), sections, x)
     found = find_root(root_finder, lambda arcs: _missing(arc, arcs, unravel), arcs)
     return jtu.tree_map(lambda a: a.astype(x.dtype), found)  # numbers all, for `jvp`

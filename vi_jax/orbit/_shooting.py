@@ -49,7 +49,7 @@ class Shooting(eqx.Module):
 
     machine: AbstractMachine
     method: AbstractMethod
-    """Of fixed steps."""
+    """The integrator, one of fixed steps so that what it returns is smooth in its arguments."""
     like: State
     """A state, for its structure."""
     cycles: int = eqx.field(static=True)
@@ -62,10 +62,12 @@ class Shooting(eqx.Module):
     """Steps of the flight of a leg."""
     parameters: tuple[str, ...] = eqx.field(static=True)
     """Names of the machine's numbers that are unknowns."""
+    conditions: tuple[Any, ...] = ()
+    """Equations more (`AbstractCondition`), as many as there are parameters less one on a curve."""
 
     @property
     def legs(self) -> int:
-        """Number of legs."""
+        """Number of legs, from event to event: at least one."""
         return max(1, len(self.events))
 
     @property
@@ -75,13 +77,18 @@ class Shooting(eqx.Module):
 
     @property
     def states(self) -> int:
-        """Number of state components."""
-        return len(jtu.tree_leaves(self.like))
+        """Number of components of the state, as unknowns."""
+        return sum(jnp.size(x) for x in jtu.tree_leaves(self.like))
 
     @property
     def autonomous(self) -> bool:
         """Whether the period is an unknown."""
         return is_autonomous(self.machine, self.like)
+
+    @property
+    def follows_events(self) -> bool:
+        """Whether the events are given, and in that order."""
+        return True
 
     @property
     def impacts(self) -> tuple[int, ...]:
@@ -129,7 +136,7 @@ class Shooting(eqx.Module):
         """A state from its vector."""
         return ravel_pytree(self.like)[1](u)
 
-    def _modes_in(self, leg: Leg) -> tuple[Array, ...]:
+    def modes_in(self, leg: Leg) -> tuple[Array, ...]:
         """The machine's modes in a leg."""
         if not self.modes[0]:
             return ()
@@ -147,7 +154,7 @@ class Shooting(eqx.Module):
         """R(u), the state after the event that begins a leg."""
 
         def new(event, s, u):
-            state, modes = self.unravel(u), self._modes_in(leg - 1)
+            state, modes = self.unravel(u), self.modes_in(leg - 1)
             return ravel_pytree(after_event(machine, event.number, s, state, modes)[0])[0]
 
         return self._each(leg, new, s, u) if self.events else u
@@ -156,7 +163,7 @@ class Shooting(eqx.Module):
         """g(s, u), which is zero at the event that begins a leg, and rises there."""
 
         def value(event, s, u):
-            return guard_at(machine, event, s, self.unravel(u), self._modes_in(leg - 1))
+            return guard_at(machine, event, s, self.unravel(u), self.modes_in(leg - 1))
 
         return self._each(leg, value, s, u)
 
@@ -166,12 +173,24 @@ class Shooting(eqx.Module):
 
     def flight(self, machine: AbstractMachine, leg: Leg) -> Flight:
         """The flight of a leg."""
-        return Flight(machine, self._modes_in(leg), self.method, self.like)
+        return Flight(machine, self.modes_in(leg), self.method, self.like)
 
     def residual(self, x: Vector) -> Vector:
-        """The left sides of the equations: what each leg lacks to end where the next one begins,
-        then the guards; zero for a periodic motion. Its Jacobian is taken forward (`jacobian_at`,
-        `curve.corrected`), so that each leg is carried along with its derivatives."""
+        """The left sides of the motion's equations, then those of the conditions."""
+        missing = self.lacks(x)
+        if not self.conditions:
+            return missing
+        seen = self.observe(x)
+        for condition in self.conditions:
+            missing = condition.exchanged(self, x, missing)
+        more = [condition.missing(self, x, seen) for condition in self.conditions]
+        return jnp.concatenate([missing, jnp.stack(more)])
+
+    def lacks(self, x: Vector) -> Vector:
+        """The left sides of the motion's own equations: what each leg lacks to end where the next
+        one begins, then the guards; zero for a periodic motion. Its Jacobian is taken forward
+        (`jacobian_at`, `curve.corrected`), so that each leg is carried along with its
+        derivatives."""
         machine = self.at(x)
         clock, states = self.parts(x)
 
@@ -207,11 +226,14 @@ class Shooting(eqx.Module):
             carried, (passed, path) = jax.jacfwd(end, has_aux=True)(after)
             approach, order = jnp.zeros((0,), x.dtype), jnp.ones((), x.dtype)
             if self.events:
-                saltation, rises = self._saltation(machine, leg, s0, u)
+                saltation, rises = self.saltation(machine, leg, s0, u)
                 carried, approach = carried @ saltation, rises[None]
                 order = self._order(machine, leg, s0, u)
             places = [machine.position(self.unravel(x)) for x in (u, after)]
-            turns = turns_of(self.flight(machine, leg), path[0], path[1], (s1 - s0) / self.steps)
+            turns = turns_of(
+                self.flight(machine, leg), path[0], path[1], (s1 - s0) / self.steps,
+                closed=not self.events,
+            )  # fmt: skip
             return carried, passed, approach, order, turns, places
 
         legs = jnp.arange(len(states))
@@ -238,7 +260,7 @@ class Shooting(eqx.Module):
             averages=means(integrals, time),
         )
 
-    def _saltation(
+    def saltation(
         self, machine: AbstractMachine, leg: Leg, s: Scalar, u: Vector
     ) -> tuple[Float[Array, "states states"], Scalar]:
         """How a perturbation passes the event that begins a leg: the saltation matrix
@@ -253,7 +275,7 @@ class Shooting(eqx.Module):
             return ravel_pytree(machine.field(s, self.unravel(u)))[0]
 
         def jumped(event, u):
-            state, modes = self.unravel(u), self._modes_in(leg - 1)
+            state, modes = self.unravel(u), self.modes_in(leg - 1)
             return ravel_pytree(jump_of(machine, event.number, s, state, modes))[0]
 
         def reset(u):
@@ -281,9 +303,9 @@ class Shooting(eqx.Module):
         def order(event, s, u):
             if not event.of(machine).holds_mode:
                 return jnp.ones_like(s)
-            j, before = mode_number(machine, event.number), self._modes_in(leg - 1)
+            j, before = mode_number(machine, event.number), self.modes_in(leg - 1)
             mode = after_event(machine, event.number, s, self.unravel(u), before)[1][j]
-            wanted = self._modes_in(leg)[j]
+            wanted = self.modes_in(leg)[j]
             return jnp.where(mode == wanted, 1.0, -1.0).astype(s.dtype)
 
         return self._each(leg, order, s, u)

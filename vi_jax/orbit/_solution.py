@@ -7,6 +7,7 @@ from jaxtyping import Array
 
 from .._programs import compiled
 from .._types import Scalar, State
+from ._observed import Observed
 from ._shooting import Shooting
 from .curve import Step
 from .results import ORBIT_RESULTS, Orbit
@@ -15,7 +16,7 @@ from .results import ORBIT_RESULTS, Orbit
 @compiled
 def _compiled_sections(problem, x, legs, places):
     states = jax.vmap(lambda leg, s: problem.state_at(x, leg, s))(legs, places)
-    return states, jnp.max(jnp.abs(problem.residual(x)))
+    return states, jnp.max(jnp.abs(problem.lacks(x)))
 
 
 def _clock_of(problem: Shooting, x: Array) -> tuple[np.ndarray, float]:
@@ -40,6 +41,22 @@ def sections_of(problem: Shooting, x: np.ndarray | Array) -> tuple[State, Scalar
     return _compiled_sections(problem, x, jnp.asarray(legs), jnp.asarray(places))
 
 
+def _impacts_of(
+    problem: Shooting, seen: Observed, clock: np.ndarray, period: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+    """Clock within the period, V⁻ and stop of each impact that is listed, and their number."""
+    if seen.counted is not None:
+        listed, count = np.asarray(seen.counted.stop) >= 0, int(seen.counted.impacts)
+        clock, speed, stop = (
+            np.asarray(a)[listed]
+            for a in (seen.counted.clock, seen.counted.speed, seen.counted.stop)
+        )
+        return clock, speed, stop.astype(np.int32), count
+    impacts = np.asarray(problem.impacts, int)
+    stops = np.asarray([problem.events[i].number for i in impacts], np.int32)
+    return np.mod(clock[impacts], period), np.asarray(seen.approach)[impacts], stops, len(impacts)
+
+
 def orbit_of(problem: Shooting, step: Step) -> Orbit:
     """The solution at a step as an `Orbit`."""
     x, seen = jnp.asarray(step.x), step.seen
@@ -48,10 +65,8 @@ def orbit_of(problem: Shooting, step: Step) -> Orbit:
     sections, residual = sections_of(problem, x)
     admissible = seen.nearest.room >= -1e-9 and min(seen.approach, default=1.0) > -1e-9
     # Along a branch an impact may move past the section: an orbit's clocks lie within its period.
-    impacts = np.asarray(problem.impacts, int)
-    within = np.mod(clock[impacts], period)
+    within, speeds, stops, count = _impacts_of(problem, seen, clock, period)
     order = np.argsort(within)
-    stops = np.asarray([problem.events[i].number for i in impacts], np.int32)
     since = machine.phase_at(within[order])
     duration = jnp.asarray(seen.duration)
     return Orbit(
@@ -63,9 +78,9 @@ def orbit_of(problem: Shooting, step: Step) -> Orbit:
         duration=duration,
         frequency_ratio=machine.frequency_ratio(duration / problem.cycles),
         impact_phase=jnp.asarray(since),
-        impact_speed=jnp.asarray(np.asarray(seen.approach)[impacts][order]),
+        impact_speed=jnp.asarray(speeds[order]),
         impact_stop=jnp.asarray(stops[order]),
-        impacts=jnp.asarray(len(impacts), jnp.int32),
+        impacts=jnp.asarray(count, jnp.int32),
         y_min=jnp.asarray(seen.y_min),
         y_max=jnp.asarray(seen.y_max),
         clearance=jnp.asarray(seen.nearest.room),

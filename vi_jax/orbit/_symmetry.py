@@ -19,6 +19,8 @@ def may_be_symmetric(problem: Shooting, machines: Iterable[AbstractMachine]) -> 
     odd number of cycles can be.
     """
     events, half = problem.events, len(problem.events) // 2
+    if not problem.follows_events:
+        return False
     if problem.cycles % 2 == 0 or problem.autonomous or len(events) % 2:
         return False
     if any(machine.mirrored(problem.like) is None for machine in machines):

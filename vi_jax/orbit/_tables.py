@@ -7,25 +7,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._lazy import lazy
+from .._lazy import xr
 from .._types import State
-from ..flow import average_names, quantities_on, quantity_names
+from ..flow import average_names, in_names, quantities_on, quantity_names
 from ..machine import AbstractMachine, components, with_units
 from ._shooting import Shooting
 from ._solution import sections_of
 from .curve import Step
+from .floquet import STABILITY, STABILITY_NAMES, stability_of
 from .results import Orbit
 
 if TYPE_CHECKING:
-    import xarray as xr
-else:
-    xr = lazy("xarray")
-
+    from .special import SpecialPoint
 
 # What is a number at each point of every branch.
 COLUMNS = (
     "parameter", "y_min", "y_max", "clearance", "frequency_ratio", "duration", "impacts",
-    "stable",
+    "fastest_impact", "slowest_impact", "multiplier", "stable",
 )  # fmt: skip
 
 
@@ -44,6 +42,38 @@ def on_sections(problem: Shooting, steps: list[Step]) -> dict[str, np.ndarray]:
         own = quantities_on(problem.at(jnp.asarray(step.x)), first)
         rows.append(components(first, 1) | own)
     return {name: np.concatenate([np.asarray(row[name]) for row in rows]) for name in rows[0]}
+
+
+def stability_in_words(multipliers: np.ndarray) -> np.ndarray:
+    """Of each point's multipliers, (points, states), the name of the verdict in `STABILITY`."""
+    verdicts = jax.vmap(stability_of)(jnp.asarray(multipliers))
+    return in_names(verdicts, STABILITY, STABILITY_NAMES)
+
+
+def point_of(special: "SpecialPoint", steps: list[Step]) -> int:
+    """Which of a branch's points a special point is; -1 if it is none of them."""
+    for i, step in enumerate(steps):
+        if step.seen is special.step.seen:  # what is observed stays where conditions are left out
+            return i
+    if special.springs:  # its motion has half the period, but it is the branch's end
+        return min((0, len(steps) - 1), key=lambda i: abs(steps[i].x[-1] - special.parameter))
+    return -1
+
+
+def special_table(special: list["SpecialPoint"], steps: list[Step]) -> dict[str, Any]:
+    """Kind, place and extremes of each special point, as variables along `special`."""
+    orbits = [point.orbit for point in special]
+    # Without any the words are empty ones, whose type files can hold.
+    found = {
+        "kind": np.array([point.kind for point in special], str),
+        "detail": np.array([point.detail for point in special], str),
+        "parameter": np.array([point.parameter for point in special], float),
+        "point": np.array([point_of(point, steps) for point in special], int),
+        "cycles": np.array([int(orbit.cycles) for orbit in orbits], int),
+        "y_min": np.array([float(orbit.y_min) for orbit in orbits], float),
+        "y_max": np.array([float(orbit.y_max) for orbit in orbits], float),
+    }
+    return {f"special_{name}": ("special", x) for name, x in found.items()}
 
 
 def table_of(

@@ -51,9 +51,9 @@ class _Found(NamedTuple):
     turns: Bool[Array, " steps"]
     """Whether there is one within the step."""
     height: Float[Array, " steps"]
-    """The function there."""
+    """Value of the function at the turn."""
     place: Float[Array, " steps"]
-    """Clock there."""
+    """Clock (phase or time) of the turn."""
     before: Float[Array, " steps"]
     """The function's rate, or one of its sign, at the start of the step."""
     happens: Bool[Array, " steps"]
@@ -110,41 +110,25 @@ class _Body(_Guard):
         return jnp.ones((), bool)
 
 
+class _Room(NamedTuple):
+    """How near a flight comes to one of the machine's events at its turns, one for each step."""
+
+    room: Float[Array, " steps"]
+    """Distance to the event at the turn, as `Nearest.room`; infinite where the step has no turn."""
+    clock: Float[Array, " steps"]
+    """Clock of the turn."""
+
+
 def turns_of(
-    flight: Flight, places: Float[Array, " steps"], states: Float[Array, "steps states"], h: Scalar
-) -> Turns:
+    flight: Flight, places: Float[Array, " steps"], states: Float[Array, "steps states"],
+    h: Scalar, *, closed: bool,
+) -> Turns:  # fmt: skip
     """The turning points of all coordinates and guards along a flight.
 
-    **Arguments:** the flight; clock and state at the start of each step, and its length.
+    **Arguments:** the flight; clock and state at the start of each step, and its length; `closed`,
+    whether it ends in the state in which it begins (static).
     """
-    machine, begin = flight.machine, places[0]
-    # The end of the last step is the next event: its velocity is that of a further step.
-    last = flight.once(_stepped, (places[-1], h, states[-1]))
-
-    def found(watched: _Guard) -> _Found:
-        v = jax.vmap(partial(watched.rate, flight))(places, states)
-        v1 = jnp.concatenate([v[1:], watched.rate(flight, places[-1] + h, last)[None]])
-        return jax.vmap(lambda *x: flight.once(partial(_turn, watched), (h, *x)))(
-            places, states, v, v1
-        )
-
-    bodies = [found(_Body(k)) for k in range(len(machine.coordinates))]
-    rooms = []
-    for stop in machine.stops:
-        at = bodies[stop.coordinate]
-        facing = at.turns & (stop.sign * at.before > 0)
-        rooms.append((jnp.where(facing, -stop.beyond(at.height), jnp.inf), at.place))
-    for number, event in enumerate(events_of(machine)):
-        if number < len(machine.stops) or number == section_number(machine):
-            continue
-        at = found(_Guard(number))
-        # A body that friction lets go begins to slide with velocity and acceleration zero.
-        away = at.place > begin + _TURNED * h
-        facing = at.turns & (at.before > 0) & away
-        if event.from_below:  # it touches nothing where it has not been below zero
-            value = jax.vmap(partial(_Guard(number).at, flight))(places, states)
-            facing = facing & at.happens & (jax.lax.cummin(value) < 0)
-        rooms.append((jnp.where(facing, -at.height, jnp.inf), at.place))
+    bodies, rooms = _turning(flight, places, states, h, closed)
     room, touch = jnp.full((), jnp.inf, h.dtype), jnp.zeros((), h.dtype)
     touched = touch
     for i, (values, place) in enumerate(rooms):
@@ -155,6 +139,59 @@ def turns_of(
     low = jnp.min(jnp.where(bodies[0].turns, bodies[0].height, jnp.inf))
     high = jnp.max(jnp.where(bodies[0].turns, bodies[0].height, -jnp.inf))
     return Turns(low, high, Nearest(room, touch, touched))
+
+
+def rooms_of(
+    flight: Flight, places: Float[Array, " steps"], states: Float[Array, "steps states"],
+    h: Scalar, *, closed: bool,
+) -> list[_Room]:  # fmt: skip
+    """How near a flight comes to each of the machine's events but its section, in their order.
+
+    **Arguments:** as `turns_of`.
+    """
+    return _turning(flight, places, states, h, closed)[1]
+
+
+def _turning(
+    flight: Flight, places: Float[Array, " steps"], states: Float[Array, "steps states"],
+    h: Scalar, closed: bool,
+) -> tuple[list[_Found], list[_Room]]:  # fmt: skip
+    """The turning points of each coordinate, and how near the flight comes to each event.
+
+    **Arguments:** as `turns_of`.
+    """
+    machine, begin = flight.machine, places[0]
+    # The end of the last step is the next event: its velocity is that of a further step.
+    last = flight.once(_stepped, (places[-1], h, states[-1]))
+
+    def found(watched: _Guard) -> _Found:
+        v = jax.vmap(partial(watched.rate, flight))(places, states)
+        # What turns on the section itself does so at the begin or at the end, whatever the sign of
+        # the rounding that its rate consists of there: so that sign has to be one.
+        end = v[0] if closed else watched.rate(flight, places[-1] + h, last)
+        v1 = jnp.concatenate([v[1:], end[None]])
+        return jax.vmap(lambda *x: flight.once(partial(_turn, watched), (h, *x)))(
+            places, states, v, v1
+        )
+
+    bodies = [found(_Body(k)) for k in range(len(machine.coordinates))]
+    rooms = []
+    for stop in machine.stops:
+        at = bodies[stop.coordinate]
+        facing = at.turns & (stop.sign * at.before > 0)
+        rooms.append(_Room(jnp.where(facing, -stop.beyond(at.height), jnp.inf), at.place))
+    for number, event in enumerate(events_of(machine)):
+        if number < len(machine.stops) or number == section_number(machine):
+            continue
+        at = found(_Guard(number))
+        # A body that friction lets go begins to slide with velocity and acceleration zero.
+        away = at.place > begin + _TURNED * h
+        facing = at.turns & (at.before > 0) & away
+        if event.from_below:  # it touches nothing where it has not been below zero
+            value = jax.vmap(partial(_Guard(number).at, flight))(places, states)
+            facing = facing & at.happens & (jax.lax.cummin(value) < 0)
+        rooms.append(_Room(jnp.where(facing, -at.height, jnp.inf), at.place))
+    return bodies, rooms
 
 
 def _stepped(flight: Flight, inputs: tuple[Scalar, Scalar, Vector]) -> Vector:

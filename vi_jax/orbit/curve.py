@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from .._at_work import Tell
 from .._checks import count, given_number
 from .._types import Flag, Scalar
 
@@ -106,48 +107,31 @@ def check_walk(*, step: Any, max_step: Any, max_points: Any) -> dict[str, Any]:
     }
 
 
-# Why a walk ended on which Ctrl-C was pressed.
+# The end of a walk that has not come to one: Ctrl-C was pressed.
 INTERRUPTED = "interrupted"
-
-
-class Walk(NamedTuple):
-    """The points of a curve in one direction from the first, which is included."""
-
-    steps: list[Step]
-    end: str
-    """Why it ended."""
 
 
 def walk(
     advance: Callable[[Vector, Vector, float], Step],
-    start: Step,
+    steps: list[Step],
     *,
     stop: Callable[[Step, Step], tuple[Step, str] | None],
+    tell: Tell,
     step: float,
     max_step: float,
     max_points: int,
-) -> Walk:
-    """Follow the curve from `start` in the sense of its tangent. Host-side.
+) -> str:
+    """Follow the curve from its first point in the sense of its tangent. Host-side.
 
-    **Arguments:** `advance`, the compiled corrector, of unknowns, tangent and length; `stop`, asked
-    after each step with the points before and after it: the last point and a reason to end, or
-    `None`; `step` and `max_step`, the first and the longest step length; `max_points`, the most
-    points.
+    **Arguments:** `advance`, the compiled corrector, of unknowns, tangent and length; `steps`, the
+    first point, to which the others are added; `stop`, asked after each step with the points before
+    and after it: the last point and a reason to end, or `None`; `tell`, told of each point; `step`
+    and `max_step`, the first and the longest step length; `max_points`, the most points.
+
+    **Returns:** why it ended.
     """
-    steps = [start]
-    try:
-        end = _walked(advance, steps, stop, step, max_step, max_points)
-    except KeyboardInterrupt:
-        end = INTERRUPTED
-    return Walk(steps, end)
-
-
-def _walked(advance, steps: list[Step], stop, length: float, max_step: float, most: int) -> str:
-    """Adds the points to `steps`, which holds the first one, and says why there are no more.
-
-    **Arguments:** as `walk`; `length`, of the first step; `most`, points.
-    """
-    while len(steps) < most:
+    length = step
+    while len(steps) < max_points:
         here = steps[-1]
         new = advance(here.x, here.tangent, length)
         turn = float(np.dot(np.asarray(new.tangent), np.asarray(here.tangent)))
@@ -163,6 +147,7 @@ def _walked(advance, steps: list[Step], stop, length: float, max_step: float, mo
                 steps.append(last)
             return reason
         steps.append(new)
+        tell(1)
         if turn > 0.99 and int(new.iterations) <= 6:
             length = min(1.4 * length, max_step)
         elif turn < 0.97:

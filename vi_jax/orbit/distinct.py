@@ -1,11 +1,14 @@
 """Which of many found orbits are different motions."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
 from .._checks import given_number
-from ..machine import state_in_words
+from ..machine import in_rows, state_in_words
 from .results import InWords, Orbit, impacts_in_words, span_in_words, trimmed
 
 
@@ -14,11 +17,11 @@ class Orbits(InWords, list[Orbit]):
 
     def __str__(self) -> str:
         return "\n".join(
-            [f"{len(self)} orbit{'' if len(self) == 1 else 's'}", *map(_in_words, self)]
+            [f"{len(self)} orbit{'' if len(self) == 1 else 's'}", *map(in_one_line, self)]
         )
 
 
-def _in_words(orbit: Orbit) -> str:
+def in_one_line(orbit: Orbit) -> str:
     """A motion in one line."""
     cycles = int(orbit.cycles)
     period = orbit.machine.period_of(cycles)
@@ -45,25 +48,45 @@ def distinct_orbits(orbits: Orbit, *, tolerance: float = 1e-6) -> tuple[Orbits, 
     if not isinstance(orbits, Orbit):
         raise TypeError(f"Argument `orbits` must be from `find_orbit`, but got {orbits!r}.")
     given_number("tolerance", tolerance, low=0.0)
-    shape = orbits.residual.shape
-    flat = jtu.tree_map(lambda x: jnp.reshape(x, (-1, *x.shape[len(shape) :])), orbits)
-    sections = np.stack([np.asarray(x) for x in jtu.tree_leaves(flat.sections)], axis=-1)
-    cycles, found = np.asarray(flat.cycles), np.asarray(flat.successful)
-    kinds: list[tuple[int, np.ndarray]] = []
-    first: list[int] = []
-    counts: list[int] = []
-    for i in np.flatnonzero(found):
-        path = sections[i, : cycles[i]]
-        for j, (period, other) in enumerate(kinds):
-            if period == cycles[i]:
-                apart = np.abs(other - path[0]) / (1 + np.abs(other))
-                if (apart.max(axis=1) <= tolerance).any():
-                    counts[j] += 1
-                    break
-        else:
-            kinds.append((int(cycles[i]), path))
-            first.append(int(i))
-            counts.append(1)
-    chosen = [trimmed(jtu.tree_map(lambda x, i=i: x[i], flat)) for i in first]
-    order = sorted(range(len(chosen)), key=lambda j: (kinds[j][0], float(chosen[j].y_min)))
-    return Orbits(chosen[j] for j in order), np.array([counts[j] for j in order], int)
+    found, counts = distinct_among([orbits], tolerance)
+    return found, counts[:, 0]
+
+
+def distinct_among(batches: Sequence[Orbit], tolerance: float) -> tuple[Orbits, np.ndarray]:
+    """The different motions in several batches of searches, whose periods asked for may differ; and
+    how many searches of each batch found each, (motions, batches). See `distinct_orbits`."""
+    chosen: list[Orbit] = []
+    paths: list[np.ndarray] = []
+    counts: list[np.ndarray] = []
+    for which, orbits in enumerate(batches):
+        shape = orbits.residual.shape
+
+        def in_one_row(x: Any, shape: tuple[int, ...] = shape) -> np.ndarray:
+            x = np.asarray(x)
+            return x.reshape(-1, *x.shape[len(shape) :])
+
+        found = in_one_row(orbits.successful)
+        flat = jtu.tree_map(in_one_row, orbits)
+        sections, cycles = np.asarray(in_rows(flat.sections, 2)), flat.cycles
+        for i in np.flatnonzero(found):
+            path = sections[i, : cycles[i]]
+            j = _known(paths, path, tolerance)
+            if j == len(paths):
+                paths.append(path)
+                chosen.append(trimmed(jtu.tree_map(lambda x, i=i: jnp.asarray(x[i]), flat)))
+                counts.append(np.zeros(len(batches), int))
+            counts[j][which] += 1
+    order = sorted(range(len(chosen)), key=lambda j: (len(paths[j]), float(chosen[j].y_min)))
+    table = np.array([counts[j] for j in order], int).reshape(len(order), len(batches))
+    return Orbits(chosen[j] for j in order), table
+
+
+def _known(paths: list[np.ndarray], path: np.ndarray, tolerance: float) -> int:
+    """Which of the known motions one is, by its sections from whichever of them on; else how many
+    there are."""
+    for j, other in enumerate(paths):
+        if len(other) == len(path):
+            apart = np.abs(other - path[0]) / (1 + np.abs(other))
+            if (apart.max(axis=1) <= tolerance).any():
+                return j
+    return len(paths)

@@ -17,7 +17,7 @@ from .._numbers import concrete
 from .._programs import compiled
 from .._renamed import renamed
 from .._types import State
-from ..flow import MethodLike, check_leaves, means, refuse_arrays
+from ..flow import MethodLike, check_leaves, means
 from ..machine import AbstractMachine
 from ._arcs import by_the_first_state, error_of, in_order, moved_from_impacts, observe_arc
 from ._cycle_map import CycleMap, adopted, cycle_map
@@ -101,22 +101,28 @@ def find_orbit(
 
 
 def _check_guess(machine: AbstractMachine, state: State) -> None:
-    """**Raises:** `ValueError` unless these are numbers, or rows of them for as many guesses."""
+    """**Raises:** `ValueError` unless this is a state, or as many of them in rows."""
     check_leaves("guess", state)
-    with contextlib.suppress(AttributeError, TypeError, LookupError):  # which `simulate` explains
-        if not jnp.ndim(machine.position(state)):
-            refuse_arrays("guess", "find_orbit", state)
-    shapes = {jnp.shape(leaf) for leaf in jtu.tree_leaves(state)}
-    if len(shapes) > 1 or len(next(iter(shapes))) > 1:
+    many = _are_many(machine, state)
+    shapes = {jnp.shape(leaf)[:1] for leaf in jtu.tree_leaves(state)} if many else {()}
+    if len(shapes) > 1:
+        whole = sorted(jnp.shape(leaf) for leaf in jtu.tree_leaves(state))
         raise ValueError(
-            "Argument `guess` must hold scalars, or arrays of one length for as many guesses, but "
-            f"holds shapes {sorted(shapes)}."
+            "Argument `guess` must hold the numbers of a state, or rows of one length for as many "
+            f"guesses, but holds shapes {whole}."
         )
     for path, leaf in jtu.tree_leaves_with_path(state):
         numbers = concrete(leaf)
-        if numbers is not None and numbers.ndim == 0 and not np.isfinite(numbers):
+        if numbers is not None and not many and not np.isfinite(numbers).all():
             name = jtu.keystr(path).lstrip(".")
             raise ValueError(f"Argument `guess` must be finite, but its {name} is {numbers}.")
+
+
+def _are_many(machine: AbstractMachine, state: State) -> bool:
+    """Whether a guess is several: whether it has several positions."""
+    with contextlib.suppress(AttributeError, TypeError, LookupError):  # which `simulate` explains
+        return jnp.ndim(machine.position(state)) > 0
+    return any(jnp.ndim(leaf) for leaf in jtu.tree_leaves(state))
 
 
 @compiled
@@ -127,7 +133,7 @@ def _find(
         return _judged(the_map, guess, root_finder, impact_log)
 
     first = jtu.tree_leaves(guess)[0]
-    if not first.ndim:
+    if not _are_many(the_map.machine, guess):
         return one(guess)
     return jax.lax.map(one, guess, batch_size=min(_BATCH, first.shape[0]))
 

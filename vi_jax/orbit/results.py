@@ -12,6 +12,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Complex, Float, Int
 
+from .._lazy import xr
 from .._renamed import refuse_attribute
 from .._types import State
 from ..flow import (
@@ -29,6 +30,7 @@ from ..flow import (
 from ..machine import (
     AbstractMachine,
     Summarized,
+    first_few,
     in_unit,
     is_autonomous,
     name_in,
@@ -51,7 +53,10 @@ class ORBIT_RESULTS(NamedEnumeration):
     successful = ""
     smaller_period = "The motion found has a smaller period than was asked for; see `Orbit.cycles`."
     inadmissible = "The motion found would pass through a stop."
-    no_orbit = "The residual did not fall below the tolerance: no orbit was found from this guess."
+    no_orbit = (
+        "The residual did not fall below the tolerance: no orbit was found from this guess; begin "
+        "nearer to one."
+    )
     grazing = (
         "No orbit was found: the search ended beside a grazing, where the cycle map has no "
         "derivative."
@@ -60,7 +65,7 @@ class ORBIT_RESULTS(NamedEnumeration):
         "No orbit was found: something in the state is neutral (a multiplier is 1) and drifts from "
         "cycle to cycle. What is counted by the cycle is set back by the machine's `renewed`."
     )
-    not_simulated = "The guess cannot be simulated: see `simulate(...).result` for the reason."
+    not_simulated = "The guess cannot be simulated, as one beyond a stop: `simulate` says why."
 
 
 _RESULT_NAMES = (
@@ -199,7 +204,9 @@ class Orbit(Summarized):
             impact_log=impact_log,
         )  # fmt: skip
 
-    def to_xarray(self, dims: Sequence[str] | None = None, *, along: str | None = None) -> Any:
+    def to_xarray(
+        self, dims: Sequence[str] | None = None, *, along: str | None = None
+    ) -> "xr.Dataset":
         """This orbit, or a batch of them, as an `xarray.Dataset`.
 
         Section states become a variable for each component (`section_Y`), multipliers complex
@@ -212,8 +219,6 @@ class Orbit(Summarized):
         **Raises:** `ValueError` if these are not as many as there are batch axes, or there is no
         such dimension.
         """
-        import xarray as xr  # slow to load
-
         batch = batch_names(dims, self.residual.ndim)
         alone = ("cycles", "duration", "frequency_ratio", "impacts", "y_min", "y_max", "clearance",
                  "residual", "error", "iterations")  # fmt: skip
@@ -263,8 +268,8 @@ class Orbit(Summarized):
         listed = int(jnp.sum(self.impact_stop >= 0))
         if listed < count:
             lines.append(f"  only {listed} of {count} impacts are listed: see `impact_log`")
-        values = ", ".join(complex_in_words(m, 7, 1e-12) for m in np.asarray(self.multipliers))
-        lines.append(f"  multipliers: {values}")
+        values = [complex_in_words(m, 7, 1e-12) for m in np.asarray(self.multipliers)]
+        lines.append(f"  multipliers: {', '.join(first_few(values))}")
         room = in_unit(f"{float(self.clearance):.4g}", units, "position")
         lines.append(f"  clearance: {room}")
         lines.append(

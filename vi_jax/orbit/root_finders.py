@@ -102,7 +102,7 @@ class Newton(AbstractRootFinder):
 
     @property
     def usual_tolerance(self) -> float:
-        """1e-10."""
+        """1e-10, taken for a `tolerance` that is not given."""
         return 1e-10
 
 
@@ -157,7 +157,7 @@ class Gradient(AbstractRootFinder):
 
     @property
     def usual_tolerance(self) -> float:
-        """1e-7."""
+        """1e-7, taken for a `tolerance` that is not given."""
         return 1e-7
 
 
@@ -172,11 +172,11 @@ class Found(NamedTuple):
     x: Unknowns
     """The place with the smallest residual that was met."""
     residual: Scalar
-    """Its largest component there."""
+    """Largest component of the residual at `x`."""
     converged: Array
     """Whether that is within its tolerance."""
     steps: Array
-    """Their number."""
+    """Steps that the search took."""
     history: Float[Array, " max_steps"]
     """Largest residual component after each step, NaN beyond the last."""
 

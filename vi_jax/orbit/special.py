@@ -8,6 +8,7 @@ from jax.flatten_util import ravel_pytree
 
 from .._checks import given_number
 from ._events import Event
+from ._fewer_events import without_events
 from ._origin import repeated
 from ._shooting import Shooting
 from ._solution import orbit_of
@@ -17,7 +18,7 @@ from .results import InWords, Orbit
 
 FOLD, DOUBLING, TORUS = "fold", "period-doubling", "neimark-sacker"
 GRAZING, CROSSING, SYMMETRY = "grazing", "branch-point", "symmetry-breaking"
-HOPF = "hopf"
+HOPF, REST, EXTREMUM, TURN = "hopf", "rest", "extremum", "turn"
 
 # Where something grazes it is touched to rounding, by choice within this.
 _TOUCHES = 1e-6
@@ -30,7 +31,9 @@ class SpecialPoint(InWords):
     kind: str
     """"fold", "period-doubling", "neimark-sacker", "branch-point", "symmetry-breaking" (where
     motions that are their own image under the symmetry of their machine meet some that are not),
-    "grazing", or "hopf" (an autonomous machine's motion shrinks to rest)."""
+    "grazing", "hopf" (an autonomous machine's motion shrinks to rest), "rest" (a rest on a stop
+    is gained or lost), "extremum" (of a `quantity` that was asked for), or "turn" (the parameter
+    turns back where others are free; no multiplier need be 1)."""
     parameter: float
     orbit: Orbit
     detail: str
@@ -42,6 +45,8 @@ class SpecialPoint(InWords):
     """The impact that grazes; `None` where the body touches a stop that it did not hit before."""
     springs: bool = False
     """Whether the branch springs here from a motion of half its period, which `orbit` is then."""
+    quantity: str | None = None
+    """Of an extremum, the name of what is largest or least here."""
 
     @property
     def touches(self) -> bool:
@@ -129,6 +134,11 @@ def _crossed(point: SpecialPoint, distance: float) -> Orbit:
 def _beyond_grazing(point: SpecialPoint, distance: float) -> Orbit:
     """The motion with the grazing impact less, or with the touch as an impact more."""
     old, step = point.problem, point.step
+    if not old.follows_events:
+        raise ValueError(
+            "`switch` at a grazing needs a motion without rest on a stop, but this one rests: find "
+            "the motion beyond it with `find_orbit`."
+        )
     if old.modes[0] or old.machine.events:
         raise ValueError(
             "`switch` at a grazing needs a machine without soft stops, friction or other switches, "
@@ -144,31 +154,10 @@ def _beyond_grazing(point: SpecialPoint, distance: float) -> Orbit:
             "`switch` needs an impact that grazes, but here the section of the machine is touched: "
             "beyond it the motion has another number of cycles. Find it with `find_orbit`."
         )
-    x = jnp.asarray(step.x)
-    clock, states = (np.asarray(a) for a in old.parts(x))
-    events, value = list(old.events), np.asarray(step.x)[-1:]
-    period = float(old.period(x))
     if point.impact is not None:
-        del events[point.impact]
-        if events:
-            clock, states = (np.delete(a, point.impact, axis=0) for a in (clock, states))
-        else:
-            section = state_at(old, x, jnp.asarray(0), jnp.asarray(period))
-            clock, states = np.zeros(0), np.asarray(ravel_pytree(section)[0])[None]
+        new, start = without_events(old, np.asarray(step.x), [point.impact])
     else:
-        touch = float(step.seen.nearest.clock)
-        leg = max(0, int(np.searchsorted(clock, touch, side="right")) - 1) if events else 0
-        there = state_at(old, x, jnp.asarray(leg), jnp.asarray(touch))
-        u, hit = np.asarray(ravel_pytree(there)[0])[None], Event(int(step.seen.nearest.event))
-        if not events:
-            clock, states, events = np.array([touch]), u, [hit]
-        else:
-            clock, states = np.append(clock, touch), np.append(states, u, axis=0)
-            order = np.argsort(np.mod(clock, period))
-            clock, states = np.mod(clock, period)[order], states[order]
-            events = [[*events, hit][i] for i in order]
-    new = dataclasses.replace(old, events=tuple(events), modes=((),) * max(1, len(events)))
-    start = np.asarray(new.pack(clock, states, value, period))
+        new, start = _with_touch(old, step)
     scale = np.concatenate([np.ones(len(start) - 1), point.scale[-1:]])
     tangent = tangent_at(new, start, scale)
     for sense in (1.0, -1.0):
@@ -180,3 +169,27 @@ def _beyond_grazing(point: SpecialPoint, distance: float) -> Orbit:
         "Beyond this grazing there is no admissible motion with "
         f"{len(new.impacts)} impacts at distance {distance:g}."
     )
+
+
+def _with_touch(old: Shooting, step: Step) -> tuple[Shooting, np.ndarray]:
+    """The equations of a motion at a touch, which is an event there, and their unknowns.
+
+    **Arguments:** the equations of the motion, without modes, and their solution.
+    """
+    x = jnp.asarray(step.x)
+    clock, states = (np.asarray(a) for a in old.parts(x))
+    events, value = list(old.events), np.asarray(step.x)[-1:]
+    period = float(old.period(x))
+    touch = float(step.seen.nearest.clock)
+    leg = max(0, int(np.searchsorted(clock, touch, side="right")) - 1) if events else 0
+    there = state_at(old, x, jnp.asarray(leg), jnp.asarray(touch))
+    u, hit = np.asarray(ravel_pytree(there)[0])[None], Event(int(step.seen.nearest.event))
+    if not events:
+        clock, states, events = np.array([touch]), u, [hit]
+    else:
+        clock, states = np.append(clock, touch), np.append(states, u, axis=0)
+        order = np.argsort(np.mod(clock, period))
+        clock, states = np.mod(clock, period)[order], states[order]
+        events = [[*events, hit][i] for i in order]
+    new = dataclasses.replace(old, events=tuple(events), modes=((),) * len(events))
+    return new, np.asarray(new.pack(clock, states, value, period))

@@ -15,6 +15,9 @@ from .colors import STOP as STOP
 from .colors import color_of as color_of
 from .colors import mark_of as mark_of
 from .colors import paler as paler
+from .grazing import plot_grazing as plot_grazing
+from .integrity import plot_integrity as plot_integrity
+from .manifold import plot_manifold as plot_manifold
 from .motion import angle_axis as angle_axis
 from .motion import plot_history as plot_history
 from .motion import plot_phase_portrait as plot_phase_portrait
@@ -28,3 +31,4 @@ from .scan import plot_basins as plot_basins
 from .scan import plot_regimes as plot_regimes
 from .schematic import plot_sketch as plot_sketch
 from .stamp import stamp as stamp
+from .style import plot_style as plot_style

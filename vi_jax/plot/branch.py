@@ -9,10 +9,11 @@ from matplotlib.axes import Axes
 
 from .._checks import instance_of, one_of
 from ..machine import in_brackets, name_in, quantity_of, unit_of
-from ..orbit import Boundary, Branch, impacts_in_words
+from ..orbit import Boundary, Branch, impacts_in_words, point_of
 from ..scan import Sweep
 from .colors import DASHES, MARKS, color_of, mark_style, once
 from .motion import new_axes
+from .style import thick
 
 # Names of lines in a legend, and where dots lie: above lines and below the marks.
 _STABLE, _UNSTABLE = "stable", "unstable"
@@ -37,10 +38,9 @@ def plot_branch(
     **Arguments:** the branch; `ax`, a new figure if left out; `y` and `x`, names of what is a
     number at each point, `Branch.column_names`: `"duration"`, `"section_Y"`, or an average of the
     machine's such as `"power"` (`y` is by default the first of `"y_min"`, `"y_max"` that is
-    not fixed by a stop); `special`, whether to mark the special points (where `y` is a number
-    of an orbit); `legend`, whether to draw one: the period and the impacts that the colour
-    stands for (or the branch's `label`), what solid and dashed lines are, and the marks;
-    options of `Axes.plot`.
+    not fixed by a stop); `special`, whether to mark the special points; `legend`, whether to
+    draw one: the period and the impacts that the colour stands for (or the branch's `label`), what
+    solid and dashed lines are, and the marks; options of `Axes.plot`.
 
     **Returns:** the axes.
 
@@ -55,7 +55,7 @@ def plot_branch(
     stable = inside[1:] & inside[:-1]
     label = style.pop("label", None)
     impacts = branch.impact_speed.shape[1]
-    look = {"color": color_of(branch.cycles, impacts), "lw": 1.6, **style}
+    look = {"color": color_of(branch.cycles, impacts), "lw": thick(1.6), **style}
     if label is not None:
         ax.plot([], [], label=label, **{"ls": "-", **look})
     for start, end, solid in _stretches(stable):
@@ -67,16 +67,16 @@ def plot_branch(
     for word, line, drawn in ((_STABLE, "-", stable.any()), (_UNSTABLE, "--", not stable.all())):
         if drawn:
             ax.plot([], [], line, color="0.3", lw=look["lw"], label=once(ax, word))
-    if special and x == "parameter":
-        for point in branch.special:
-            value = point.orbit.averages.get(y, getattr(point.orbit, y, None))
-            if value is not None and np.ndim(value) == 0:
-                mark = {**mark_style(point.kind), "zorder": 4, "label": once(ax, point.kind)}
-                ax.plot(point.parameter, float(value), **mark)
+    for point in branch.special if special else ():
+        i = point_of(point, branch.steps)
+        mark = {**mark_style(point.kind), "zorder": 4, "label": once(ax, point.kind)}
+        if i >= 0:
+            ax.plot(across[i], up[i], **mark)
     if legend:
         _legend(ax)
     machine = branch.problem.machine
-    ax.set_xlabel("ζ" if x == "frequency_ratio" else axis_name(branch.name, machine.units))
+    along = x if x in branch.free else branch.name
+    ax.set_xlabel("ζ" if x == "frequency_ratio" else axis_name(along, machine.units))
     ax.set_ylabel(extreme_name(y, machine.labels, machine.units, branch.averages))
     return ax
 
@@ -150,7 +150,7 @@ def plot_boundary(curve: Boundary, *, ax: Axes | None = None, **style: Any) -> A
     **Returns:** the axes.
     """
     ax = new_axes(ax)
-    look = {"ls": DASHES[curve.kind], "lw": 1.6, "label": curve.kind}
+    look = {"ls": DASHES[curve.kind], "lw": thick(1.6), "label": curve.kind}
     if "linestyle" in style:
         look.pop("ls")
     color = color_of(curve.problem.cycles, curve.impact_speed.shape[1])

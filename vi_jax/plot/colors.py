@@ -45,6 +45,9 @@ MARKS = {
     "branch-point": ("X", "k"),
     "symmetry-breaking": ("P", "w"),
     "hopf": ("*", "0.7"),
+    "rest": ("h", "0.7"),
+    "extremum": ("d", "w"),
+    "turn": ("<", "w"),
 }
 DASHES = {
     "grazing": "-",

@@ -10,15 +10,17 @@ from ..flow import Run, Samples
 from ..machine import AbstractMachine
 from .colors import BLUE, STOP, once
 from .path import motion_path
+from .style import is_set, thick
 
 
 def new_axes(ax: Axes | None) -> Axes:
-    """`ax`, or the axes of a new figure."""
+    """`ax`, or the axes of a new figure, of the size that was set for figures if one was."""
     if ax is not None:
         return ax
     import matplotlib.pyplot as plt  # only here, so that drawing into given axes has no state
 
-    return plt.subplots(figsize=(7, 3.5), layout="constrained")[1]
+    size = None if is_set("figure.figsize") else (7, 3.5)
+    return plt.subplots(figsize=size, layout="constrained")[1]
 
 
 def counts_by_angle(machine: AbstractMachine | None) -> bool:
@@ -62,10 +64,10 @@ def plot_history(
     ax = new_axes(ax)
     path = motion_path(motion, machine=machine, window=window)
     factor = 2.0 if unit == "angle" else 1.0
-    ax.plot(factor * (path.cycles + shift), path.Y, **{"color": BLUE, "lw": 1.3, **style})
+    ax.plot(factor * (path.cycles + shift), path.Y, **{"color": BLUE, "lw": thick(1.3), **style})
     if stops and machine is not None:
         for stop in machine.stops:
-            ax.axhline(float(stop.place), color=STOP, lw=1.8, label=once(ax, "stop"))
+            ax.axhline(float(stop.place), color=STOP, lw=thick(1.8), label=once(ax, "stop"))
     ax.set_ylabel(_labels(motion, machine)[0])
     if unit == "cycles":
         ax.set_xlabel("drive cycles φ/(2π)" if turning else "cycles since the start")
@@ -112,7 +114,7 @@ def plot_phase_portrait(
     """
     ax = new_axes(ax)
     path = motion_path(motion, machine=machine, window=window)
-    (line,) = ax.plot(path.Y, path.V, **{"color": BLUE, "lw": 1.0, **style})
+    (line,) = ax.plot(path.Y, path.V, **{"color": BLUE, "lw": thick(1.0), **style})
     if sections:
         only = motion.samples if isinstance(motion, Run) else motion  # without the impacts
         assert only is not None
@@ -122,7 +124,7 @@ def plot_phase_portrait(
         ax.plot(samples.Y[whole], samples.V[whole], "o", **dots)
     if machine is not None:
         for stop in machine.stops:
-            ax.axvline(float(stop.place), color=STOP, lw=1.8, label=once(ax, "stop"))
+            ax.axvline(float(stop.place), color=STOP, lw=thick(1.8), label=once(ax, "stop"))
     position, velocity = _labels(motion, machine)
     ax.set_xlabel(position)
     ax.set_ylabel(velocity)

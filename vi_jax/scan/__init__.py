@@ -1,17 +1,27 @@
 """Many motions at once: grids, sweeps, basins, Lyapunov exponents, regimes."""
 
-from ._basins import Attractor as Attractor
-from ._basins import Basins as Basins
+from ._all_orbits import AllOrbits as AllOrbits
+from ._all_orbits import Searched as Searched
+from ._all_orbits import all_orbits as all_orbits
 from ._basins import basins as basins
+from ._computed import ScanInterrupted as ScanInterrupted
+from ._escape_rate import escape_rate as escape_rate
+from ._found import Attractor as Attractor
+from ._found import Basins as Basins
+from ._found import Integrity as Integrity
+from ._geometry import BasinEntropy as BasinEntropy
+from ._geometry import Uncertainty as Uncertainty
+from ._integrity import IntegrityProfile as IntegrityProfile
+from ._integrity import integrity_profile as integrity_profile
 from ._lyapunov import Lyapunov as Lyapunov
 from ._lyapunov import lyapunov as lyapunov
 from ._scan import LanesFailed as LanesFailed
-from ._scan import ScanInterrupted as ScanInterrupted
 from ._scan import scan as scan
-from ._sweep import COLUMNS as COLUMNS
-from ._sweep import Sweep as Sweep
+from ._spectrum import spectrum as spectrum
 from ._sweep import sweep as sweep
 from ._sweep import taken_along as taken_along
+from ._swept import COLUMNS as COLUMNS
+from ._swept import Sweep as Sweep
 from .corners import check_corners as check_corners
 from .grid import Blocks as Blocks
 from .grid import axes_of as axes_of
@@ -22,4 +32,7 @@ from .measures import Sections as Sections
 from .program import make_program as make_program
 from .regime import REGIMES as REGIMES
 from .regime import periods_of as periods_of
+from .statistics import Density as Density
+from .statistics import Escape as Escape
+from .statistics import Statistics as Statistics
 from .store import NOT_COMPUTED as NOT_COMPUTED

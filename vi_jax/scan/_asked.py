@@ -7,6 +7,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 
+from .._checks import count
 from .measures import (
     AbstractMeasure,
     Average,
@@ -91,3 +92,28 @@ def _measure(one: Any, averages: Sequence[str]) -> AbstractMeasure:
     if callable(one):
         return Custom(one)
     raise TypeError(f"Argument `measure` must be a name or a function, but got {one!r}.")
+
+
+def cycles_for(measures: Iterable[AbstractMeasure], cycles: int | None) -> int:
+    """The cycles to observe: those asked for, or as many as these measures need.
+
+    **Raises:** `ValueError` if they are too few for one of them.
+    """
+    needed = max(m.cycles for m in measures)
+    cycles = max(32, needed) if cycles is None else count("cycles", cycles, least=1)
+    if cycles < needed:
+        who = next(type(m).__name__ for m in measures if m.cycles > cycles)
+        raise ValueError(
+            f"Argument `cycles` must be at least {needed} for the measure {who}, but got {cycles}."
+        )
+    return cycles
+
+
+def samples_for(measures: Iterable[AbstractMeasure]) -> int:
+    """Samples in a cycle. **Raises:** `ValueError` for measures that ask for different ones."""
+    asked = {m.instants for m in measures if m.instants}
+    if len(asked) > 1:
+        raise ValueError(
+            f"Argument `measure` must ask for one number of samples, but asks for {sorted(asked)}."
+        )
+    return max(asked, default=0)

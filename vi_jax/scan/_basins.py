@@ -1,122 +1,30 @@
 """`basins`: which start goes to which motion, the motions found on the way."""
 
+import functools
 import math
 import warnings
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._at_work import at_work
 from .._checks import count, fits_records, given_number
-from .._lazy import lazy
+from .._lazy import xr
 from .._renamed import renamed
 from .._types import State
-from ..flow import MethodLike, chosen, machine_of, simulate, tidy
-from ..machine import (
-    AbstractMachine,
-    attributes,
-    by_name,
-    state_in_words,
-    summary_table,
-    unit_of,
-    with_leaf,
-)
-from ..orbit import impacts_in_words
-from ._scan import LanesFailed, ScanInterrupted, scan
+from ..flow import AbstractMethod, MethodLike, check_start, chosen, machine_of, simulate
+from ..machine import AbstractMachine, components, with_leaf
+from ._computed import ScanInterrupted
+from ._found import Attractor, Basins
+from ._scan import LanesFailed, scan
+from ._shaken import START
 from .grid import axes_of
 from .measures import AbstractMeasure, Regime
-from .program import START
 from .regime import CODES, REGIMES, flags
-
-if TYPE_CHECKING:
-    import xarray as xr
-else:
-    xr = lazy("xarray")
-
-
-class Attractor(NamedTuple):
-    """A motion on which starts have ended."""
-
-    label: int
-    period: int
-    """Period in drive cycles."""
-    impacts: float
-    """Impacts in a period."""
-    sections: dict[str, np.ndarray]
-    """Its section states, arrays of shape (period,)."""
-    starts: int
-    """Number of starts that ended on it."""
-    fraction: float
-    """Part of all starts."""
-    error: float
-    """Standard error of `fraction` for random starts, √(p(1 - p)/N); on a grid it is an upper
-    estimate."""
-
-
-class Basins(NamedTuple):
-    """Basins of attraction."""
-
-    data: "xr.Dataset"
-    """`label` over the region (or over `sample`): a number in `attractors`, or below 0 for
-    what is on none (`label.attrs` says which); `period`, `impacts`, `result`, and a section state
-    on which the lane ended."""
-    attractors: list[Attractor]
-    """The periodic motions, the largest basin first: label i is `attractors[i]`."""
-    irregular: dict[str, float]
-    """Fractions of the starts that ended on no periodic motion: chaotic, unsettled, failed,
-    transient (transiently chaotic, see `Regime`)."""
-    machine: AbstractMachine | None = None
-    """What moves; its words name the periods."""
-
-    def period_of(self, cycles: int) -> str:
-        """A duration of so many cycles, in the words of the machine."""
-        return f"{2 * cycles}π" if self.machine is None else self.machine.period_of(cycles)
-
-    def to_xarray(self, *, along: str | None = None) -> "xr.Dataset":
-        """These basins as an `xarray.Dataset`: `data`, and of each motion `motion_period`,
-        `motion_impacts`, `motion_starts`, `motion_fraction`, `motion_error` and its section states
-        (`motion_Y`, NaN beyond its period). A `label` from 0 on is a place along `motion`.
-
-        **Arguments:** `along`, to keep only what lies along one dimension: `"motion"`, `"cycle"`
-        (their section states), or the last axis of the starts for `data`.
-
-        **Raises:** `ValueError` if there is no such dimension.
-        """
-        variables = {}
-        for name in ("period", "impacts", "starts", "fraction", "error"):
-            values = [getattr(a, name) for a in self.attractors]
-            variables[f"motion_{name}"] = "motion", np.asarray(values)
-        longest = max((a.period for a in self.attractors), default=0)
-        units = {} if self.machine is None else self.machine.units
-        for name in self.attractors[0].sections if self.attractors else ():
-            rows = np.full((len(self.attractors), longest), np.nan)
-            for row, a in zip(rows, self.attractors, strict=True):
-                row[: a.period] = a.sections[name]
-            about = attributes(unit_of(units, name))
-            variables[f"motion_{name}"] = ("motion", "cycle"), rows, about
-        return tidy(self.data.assign(variables), along)
-
-    def __str__(self) -> str:
-        many = "" if len(self.attractors) == 1 else "s"
-        units = {} if self.machine is None else self.machine.units
-        lines = [f"Basins of {len(self.attractors)} periodic motion{many}"]
-        for a in self.attractors:
-            where = state_in_words({name: x[0] for name, x in a.sections.items()}, 6, units)
-            lines.append(
-                f"  {a.label}: period {self.period_of(a.period)}, "
-                f"{impacts_in_words(round(a.impacts))}, {where}: "
-                f"{100 * a.fraction:.2f} ± {100 * a.error:.2f} %"
-            )
-        lines += [f"  {name}: {100 * x:.2f} %" for name, x in self.irregular.items() if x]
-        return "\n".join(lines)
-
-    __repr__ = __str__
-
-    def _repr_html_(self) -> str:
-        return summary_table(str(self))
 
 
 class _Mark(AbstractMeasure):
@@ -126,7 +34,7 @@ class _Mark(AbstractMeasure):
 
     def described(self, start):
         """Each component of the state."""
-        return {name: {"unit_of": name} for name in by_name(start)}
+        return {name: {"unit_of": name} for name in components(start)}
 
     @property
     def cycles(self):
@@ -134,8 +42,8 @@ class _Mark(AbstractMeasure):
         return self.longest
 
     def __call__(self, machine, run):
-        """Of one lane."""
-        states = {name: x[-self.longest :] for name, x in by_name(run.sections).items()}
+        """The section with the highest position among the last of one lane."""
+        states = {name: x[-self.longest :] for name, x in components(run.sections, 1).items()}
         highest = jnp.argmax(jax.vmap(machine.position)(run.sections)[-self.longest :])
         return {name: x[highest] for name, x in states.items()}
 
@@ -154,6 +62,7 @@ def basins(
     apart: float = 1e-3,
     method: MethodLike = None,
     start: State = None,
+    progress: bool = True,
     **options: Any,
 ) -> Basins:
     """Find the motions that starts in a region settle on, and which start goes to which.
@@ -173,7 +82,8 @@ def basins(
     - `longest`, `tolerance`: as in `Regime`.
     - `apart`: section states farther apart than this (relative to 1 + |state|) belong to different
       motions.
-    - `method`, `start`, and further options: as for `scan` (`store` to interrupt and resume).
+    - `method`, `start`, `progress`, and further options: as for `scan` (`store` to interrupt and
+      resume).
 
     **Returns:** `Basins`.
 
@@ -185,17 +95,36 @@ def basins(
         if name in options:
             raise TypeError(f"Argument `{name}` is `scan`'s, and not to be given to `basins`.")
     given_number("apart", apart, low=0.0, open_low=True)
-    axes = _starts_in(region, resolution, samples, count("seed", seed))
+    axes = starts_in(region, resolution, samples, count("seed", seed))
     method = chosen(machine, method)
-    measure = (Regime(longest=longest, tolerance=tolerance), _Mark(longest))
+    measure = measures(longest, tolerance)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", LanesFailed)
         data = scan(
             machine, axes, measure=measure, start=start, settle=settle, method=method,
-            paired=samples is not None, **options,
+            paired=samples is not None, progress=progress, **options,
         )  # fmt: skip
     begin = machine.start() if start is None else start
-    names = list(by_name(begin))
+    kept = functools.partial(ScanInterrupted, data, options.get("store"))
+    with at_work("sorting", kept, progress=False):
+        return sorted_out(data, machine, begin, apart=apart, longest=longest, method=method)
+
+
+def sorted_out(
+    data: "xr.Dataset",
+    machine: AbstractMachine,
+    begin: Any,
+    *,
+    apart: float,
+    longest: int,
+    method: AbstractMethod,
+) -> Basins:
+    """The basins in what a scan of starts found.
+
+    **Arguments:** the scan's data, with `measures`; the machine; a start, of which the region's
+    parts are replaced; `apart`, `longest` and `method` as for `basins`.
+    """
+    names = list(components(begin))
 
     def followed(state: np.ndarray, cycles: int) -> np.ndarray:
         here = begin
@@ -204,28 +133,61 @@ def basins(
         # Always as many cycles, so that another period is not another program.
         run = simulate(machine, here, longest, method=method)
         return np.stack(
-            [np.asarray(x)[1 : cycles + 1] for x in by_name(run.sections).values()], axis=1
+            [np.asarray(x)[1 : cycles + 1] for x in components(run.sections, 1).values()], axis=1
         )
 
-    try:
-        label, motions = _sorted_out(data, names, apart, followed)
-    except KeyboardInterrupt:
-        raise ScanInterrupted(data, options.get("store")) from None
+    label, motions = _labelled(data, names, apart, followed)
     impacts = np.asarray(data["impacts"]).ravel()
     attractors = [_attractor(i, m, names, label, impacts) for i, m in enumerate(motions)]
     parts = {name: float(np.mean(label == number)) for name, number in CODES.items()}
     about = {"long_name": "motion that the start settles on", **flags(CODES)}
+    about["at_stop"] = _at_stop(data, machine, begin)
     period = data["period"]
     kind = np.min_scalar_type(-max(4, len(motions)))
     data = data.assign(label=(period.dims, label.astype(kind).reshape(period.shape), about))
     return Basins(data, attractors, parts, machine)
 
 
-def _starts_in(
+def _at_stop(data: "xr.Dataset", machine: AbstractMachine, begin: Any) -> list[str]:
+    """Edges of the region beyond which no start can be, such as `"start.Y high"`, for a stop is
+    there: in the middle of each edge a start inside of it is looked at, and one beyond."""
+    rows = {str(name): np.asarray(data[name]) for name in data["period"].dims}
+    found = []
+    for name, row in rows.items():
+        if not name.startswith(START) or row.size < 2:
+            continue
+        half = 0.5 * (row[1] - row[0])
+        for side, edge, out in (("low", row[0] - half, -half), ("high", row[-1] + half, half)):
+            middle = {other: 0.5 * (x[0] + x[-1]) for other, x in rows.items()}
+            inside, beyond = ({**middle, name: edge + x * out} for x in (-1e-3, 1e-3))
+            if _can_be(machine, begin, inside) and not _can_be(machine, begin, beyond):
+                found.append(f"{name} {side}")
+    return found
+
+
+def _can_be(machine: AbstractMachine, begin: Any, values: Mapping[str, float]) -> bool:
+    """Whether a start with these parts can be simulated."""
+    for name, value in values.items():
+        begin = with_leaf(begin, name.removeprefix(START), value)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            check_start(machine, begin)
+        except ValueError:
+            return False
+    return True
+
+
+def measures(longest: int, tolerance: float | None) -> tuple[AbstractMeasure, ...]:
+    """What a scan of starts has to measure for `sorted_out`."""
+    return Regime(longest=longest, tolerance=tolerance), _Mark(longest)
+
+
+def starts_in(
     region: Mapping[str, tuple[float, float]],
     resolution: int | tuple[int, ...],
     samples: int | None,
-    seed: int,
+    seed: int | tuple[int, ...],
 ) -> dict[str, np.ndarray]:
     """The starts in a region, as axes of a scan: those of a grid, or random ones in pairs.
 
@@ -281,7 +243,7 @@ def _attractor(
     )
 
 
-def _sorted_out(
+def _labelled(
     data: "xr.Dataset",
     names: list[str],
     apart: float,

@@ -16,9 +16,10 @@ from .._version import installed_version
 from ..flow import REASON_NAMES
 from ..machine import AbstractMachine, attributes, leaf, leaf_names, unit_of
 from ._identity import Unverifiable, identity
-from .grid import Blocks
+from ._shaken import NOISE, START, part_of
+from .grid import LANE, Blocks
 from .measures import Regime
-from .program import START, ScanProgram
+from .program import ScanProgram
 from .regime import CODES, flags
 from .store import NOT_COMPUTED, UNVERIFIABLE, Variable
 
@@ -71,6 +72,8 @@ def description_of(program: ScanProgram, blocks: Blocks) -> dict[str, Any]:
         "precision": str(jnp.result_type(float)),
         "code of": _codes(program),
     }
+    if program.shaken is not None:
+        about["noise"] = program.shaken.described()
     if any(isinstance(measure, Regime) for measure in program.measures):
         # A store of an earlier release has other numbers for them, not to be mixed with these.
         about["regimes"] = dict(CODES)
@@ -90,6 +93,8 @@ def _codes(program: ScanProgram) -> dict[str, str]:
     """What tells the user's own functions and classes from others of the same name."""
     parts: dict[str, Any] = {"machine": program.machine if program.build is None else program.build}
     parts |= {"start": program.start, "method": program.method}
+    if program.shaken is not None and program.shaken.noise.functions:
+        parts["noise"] = program.shaken.noise.functions
     for i, measure in enumerate(program.measures):
         parts[f"measure {i + 1}"] = measure
     found = {}
@@ -116,12 +121,14 @@ def attributes_of(about: dict[str, Any], machine: AbstractMachine) -> dict[str, 
         "machine": json.dumps(about["machine"]),
         "start": json.dumps(about["start"]),
         "precision": about["precision"],
-    }
+    } | ({"noise": json.dumps(about["noise"])} if "noise" in about else {})
 
 
 def variables_of(program: ScanProgram, blocks: Blocks) -> dict[str, Variable]:
     """The variables that a program computes, by name, found without computing them."""
     values = {name: jnp.zeros(4) + x[0] for name, x in blocks.axes.items()}
+    if blocks.numbers is not None:
+        values[LANE] = jnp.zeros(4, jnp.uint32)
     shapes = eqx.filter_eval_shape(program, values, jnp.ones(4, bool))
     known: dict[str, Mapping[str, Any]] = {
         "result": {
@@ -158,7 +165,10 @@ def variables_of(program: ScanProgram, blocks: Blocks) -> dict[str, Variable]:
 
 
 def unit_on_axis(program: ScanProgram, blocks: Blocks, name: str) -> str:
-    """The unit of an axis' values; "" where a function makes the machine, which has its own."""
+    """The unit of an axis' values; "" where a function makes the machine, which has its own, and of
+    an amplitude of noise."""
+    if part_of(name) == NOISE:
+        return ""
     if program.build is not None and not name.startswith(START):
         return ""
     return unit_of(program.first(blocks)[0].units, name)

@@ -1,119 +1,42 @@
 """Lyapunov exponents, through the impacts."""
 
 import dataclasses
-from collections.abc import Sequence
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
+from .._at_work import at_work
 from .._checks import count, flag
-from .._programs import compiled
+from .._interrupted import Interrupted
+from .._programs import compiled, is_outermost
 from .._renamed import renamed
 from .._types import Scalar, State
 from ..flow import (
-    REASON_NAMES,
     RESULTS,
     MethodLike,
-    batch_names,
     chosen,
     has_averages,
     has_fixed_cycle,
-    in_names,
     means,
-    present,
     simulate,
-    states,
-    tidy,
 )
 from ..machine import (
     AbstractMachine,
-    Stated,
-    Summarized,
-    attributes,
-    in_unit,
     is_autonomous,
-    number_in_words,
     renews,
     stated,
     unit_of,
-    with_unit,
-    with_units,
 )
 from ..orbit import CycleMap, adopted, cycle_map
+from ._exponents import Lyapunov
 
-
-class Lyapunov(Summarized):
-    """Lyapunov exponents of a motion. Under `vmap` batch axes come first."""
-
-    exponents: Float[Array, "... states"]
-    """The spectrum, greatest first: mean growth rates in time, as the machine counts it (`unit`;
-    for a `Scene` ω)."""
-    per_cycle: Float[Array, "... states"]
-    """The same per drive cycle (dimensionless): ln|multipliers|/n on an orbit of n cycles. Of an
-    autonomous machine per usual `cycle`, at which it is observed."""
-    spread: Float[Array, "..."]
-    """Difference of the greatest exponent between the two halves of the run."""
-    state: State
-    """Section state at the end."""
-    result: RESULTS
-    """Whether the run was simulated to its end; if not, the numbers are NaN."""
-    averages: dict[str, Float[Array, "..."]] = eqx.field(default_factory=dict)
-    """The machine's own averages over the time of the cycles observed, by name."""
-    units: Stated = eqx.field(static=True, default=())
-    """In which units they are, as the machine states it."""
-    unit: str = eqx.field(static=True, default="")
-    """Of the exponents, as the machine states it; "" if it does not."""
-
-    @property
-    def successful(self) -> Bool[Array, "..."]:
-        """Whether the run was simulated to its end."""
-        return self.result == RESULTS.successful
-
-    def to_xarray(self, dims: Sequence[str] | None = None, *, along: str | None = None) -> Any:
-        """These exponents, or a batch of them, as an `xarray.Dataset`.
-
-        The state at the end becomes a variable for each component (`state_Y`), and `result` is the
-        reason's name. Host-side: not to be traced.
-
-        **Arguments:** names of the batch axes, by default `lane`; `along`, to keep only what is
-        given along one dimension: `"exponent"`, or a batch axis.
-
-        **Raises:** `ValueError` if these are not as many as there are batch axes, or there is no
-        such dimension.
-        """
-        import xarray as xr  # slow to load
-
-        batch = batch_names(dims, self.exponents.ndim - 1)
-        each = *batch, "exponent"
-        variables = present({"exponents": self.exponents, "per_cycle": self.per_cycle}, each)
-        variables |= states("state", self.state, batch)
-        variables |= present(self.averages, batch)
-        alone = {"spread": self.spread, "result": in_names(self.result, RESULTS, REASON_NAMES)}
-        data = xr.Dataset(variables | present(alone, batch))
-        for name in ("exponents", "spread"):
-            data[name].attrs |= attributes(self.unit)
-        own = {name: name for name in self.averages}
-        return tidy(with_units(data, dict(self.units), own) if own else data, along)
-
-    def summary(self) -> str:
-        """The exponents; of a batch the range of the greatest."""
-        if self.exponents.ndim > 1:
-            lanes, good = self.spread.shape, int(jnp.sum(self.successful))
-            greatest = number_in_words(self.exponents[..., 0].ravel(), self.unit)
-            return f"Lyapunov exponents of lanes {lanes}, {good} successful; greatest: {greatest}"
-        numbers = ", ".join(f"{x:.9g}" for x in self.exponents)
-        ended = "" if bool(self.successful) else f"; ended: {RESULTS[self.result]}"
-        numbers = with_unit(numbers, self.unit)
-        first = f"Lyapunov exponents {numbers} (halves differ by {self.spread:.1g}){ended}"
-        lines = (
-            f"  mean {name}: {in_unit(f'{float(x):.6g}', dict(self.units), name)}"
-            for name, x in self.averages.items()
-        )
-        return "\n".join([first, *lines])
+# Cycles of one call where more than twice as many are asked for: some tenths of a second. A choice,
+# even, as the windows of `_window` are.
+_AT_ONCE = 512
 
 
 @renamed(scene="machine")
@@ -126,6 +49,7 @@ def lyapunov(
     number: int | None = None,
     method: MethodLike = None,
     rests: bool | None = None,
+    progress: bool = True,
 ) -> Lyapunov:
     """The Lyapunov spectrum of the motion that `start` settles on.
 
@@ -147,12 +71,16 @@ def lyapunov(
       as the simulation itself.
     - `method`: by default the `"standard"` preset.
     - `rests`: as for `simulate`.
+    - `progress`: show a bar where more than 1024 cycles are observed, in a terminal or a notebook;
+      not within `jit` or `vmap`.
 
     **Returns:** a `Lyapunov`.
 
-    **Raises:** as `simulate`; `ValueError` for a machine with both a `section` and a `renewed`.
+    **Raises:** as `simulate`; `ValueError` for a machine with both a `section` and a `renewed`; on
+    Ctrl-C, where more than 1024 cycles are observed, `Interrupted`, whose `partial` are the
+    exponents by the cycles so far.
     """
-    cycles = count("cycles", cycles, least=8)
+    cycles, progress = count("cycles", cycles, least=8), flag("progress", progress)
     if is_autonomous(machine, start):
         if renews(machine):
             raise ValueError(
@@ -174,6 +102,8 @@ def lyapunov(
             f"Argument `number` must be at most {states}, the states of this machine, but got "
             f"{number}."
         )
+    if cycles > 2 * _AT_ONCE and is_outermost(carried, start, settle):
+        return _in_parts(carried, start, cycles, settle, number, progress)
     return _lyapunov(carried, start, cycles, settle, number)
 
 
@@ -184,18 +114,76 @@ def _lyapunov(the_map: CycleMap, start, cycles: int, settle, number: int) -> Lya
     **Arguments:** `start`, a state on the section; `settle`, cycles before those observed; `number`
     of exponents.
     """
+    carry = _begun(the_map, start, settle, number)
+    window = _window(cycles) if number == 1 else 1
+    carry, seen = jax.lax.scan(_observer(the_map, start, window), carry, length=cycles // window)
+    return _summed(the_map, start, carry, seen)
+
+
+@compiled
+def _begun(the_map: CycleMap, start, settle, number: int) -> Any:
+    """The numbers of the state where observing begins, the first tangent vectors, and whether the
+    motion came there."""
     machine, method, rests = the_map.machine, the_map.method, the_map.rests
     before = simulate(
         machine, start, 1, settle=settle, method=method, rests=rests, record="sections"
     )
-    x, unravel = ravel_pytree(before.last)
+    x = ravel_pytree(before.last)[0]
+    return x, jnp.eye(x.size, number, dtype=x.dtype), before.result
+
+
+def _in_parts(
+    the_map: CycleMap, start, cycles: int, settle, number: int, progress: bool
+) -> Lyapunov:
+    """The exponents by some cycles at a time, all by one program, so that an interrupt loses few of
+    them.
+
+    **Arguments:** as `_lyapunov`; `progress`, whether a bar is shown.
+    """
+    carry = _begun(the_map, start, settle, number)
+    window = _window(cycles) if number == 1 else 1
+    parts: list[Any] = []
+
+    def summed() -> Lyapunov:
+        seen = jtu.tree_map(lambda *x: jnp.concatenate(x), *parts)
+        return _ended(the_map, start, carry, seen)
+
+    def kept() -> Interrupted | None:
+        return Interrupted("observation of exponents", summed()) if parts else None
+
+    with at_work("lyapunov", kept, progress=progress, unit="cycle", total=cycles) as tell:
+        for done in range(0, cycles, _AT_ONCE):
+            here = min(_AT_ONCE, cycles - done)
+            new = _part(the_map, start, carry, jnp.asarray(here // window), window)
+            carry, seen = jax.block_until_ready(new)
+            parts.append(jtu.tree_map(lambda x, n=here // window: x[:n], seen))
+            tell(here)
+    return summed()
+
+
+@compiled
+def _part(the_map: CycleMap, start, carry, windows, window: int) -> Any:
+    """What is observed in `_AT_ONCE` cycles, of which all but the first `windows` are left out."""
+    observe = _observer(the_map, start, window)
+    absent = jtu.tree_map(jnp.zeros_like, jax.eval_shape(observe, carry, None)[1])
+
+    def one(carry, i):
+        return jax.lax.cond(
+            i < windows, lambda carry: observe(carry, None), lambda carry: (carry, absent), carry
+        )
+
+    return jax.lax.scan(one, carry, jnp.arange(_AT_ONCE // window))
+
+
+def _observer(the_map: CycleMap, start, window: int) -> Any:
+    """A function that observes so many cycles: what `_begun` gives carried on, and rates of growth,
+    durations and integrals."""
+    machine, method, rests = the_map.machine, the_map.method, the_map.rests
+    unravel = ravel_pytree(start)[1]
 
     # Where all cycles last alike, turning points need not be met for the sake of durations.
-    plain = has_fixed_cycle(machine, before.last) and not has_averages(machine)
+    plain = has_fixed_cycle(machine, start) and not has_averages(machine)
     record = "sections" if plain else "motion"
-
-    # One direction alone need not be kept apart from others after every cycle.
-    window = _window(cycles) if number == 1 else 1
 
     def image(x):
         run = simulate(machine, unravel(x), window, method=method, rests=rests, record=record)
@@ -216,14 +204,21 @@ def _lyapunov(the_map: CycleMap, start, cycles: int, settle, number: int) -> Lya
             along, in_axes=1, out_axes=(None, 2, None)
         )(frame)
         frame, sizes = _orthogonal(grown[-1])
-        rates = _growth(grown[..., 0])[:, None] if number == 1 else jnp.log(sizes)[None]
+        alone = frame.shape[1] == 1
+        rates = _growth(grown[..., 0])[:, None] if alone else jnp.log(sizes)[None]
         result = RESULTS.where(result == RESULTS.successful, ended, result)
         return (new[-1], frame, result), (rates, duration, integrals)
 
-    frame = jnp.eye(x.size, number, dtype=x.dtype)
-    carry = (x, frame, before.result)
-    carry, (rates, duration, integrals) = jax.lax.scan(observe, carry, length=cycles // window)
-    (x, _, result), rates, duration = carry, rates.reshape(cycles, number), duration.ravel()
+    return observe
+
+
+def _summed(the_map: CycleMap, start, carry, seen) -> Lyapunov:
+    """The exponents by what was observed.
+
+    **Arguments:** `carry` and `seen`, as `_observer`'s function gives them, the latter in a row.
+    """
+    (x, _, result), (rates, duration, integrals) = carry, seen
+    rates, duration, machine = rates.reshape(-1, rates.shape[-1]), duration.ravel(), the_map.machine
     mean, halves = _weighted(rates, duration)
 
     def good_sum(x):
@@ -235,12 +230,15 @@ def _lyapunov(the_map: CycleMap, start, cycles: int, settle, number: int) -> Lya
         exponents=exponents,
         per_cycle=exponents * jnp.mean(duration),
         spread=jnp.where(halves[0] == halves[1], 0.0, jnp.abs(halves[0] - halves[1])),
-        state=unravel(x),
+        state=ravel_pytree(start)[1](x),
         result=result,
         averages=means(jax.tree.map(good_sum, integrals), jnp.sum(duration)),
         unit=unit_of(machine.units, "rate"),
         units=stated(machine),
     )
+
+
+_ended = compiled(_summed)
 
 
 def _window(cycles: int) -> int:

@@ -2,59 +2,28 @@
 
 import dataclasses
 import functools
-import json
-import math
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
-import jax
 import numpy as np
-from tqdm import tqdm
 
-from .._checks import count, fits_memory, fits_records, flag, instance_of
-from .._interrupted import Interrupted
-from .._lazy import lazy
+from .._at_work import at_work
+from .._checks import count, flag, instance_of
+from .._lazy import xr
 from .._renamed import renamed
 from .._types import State
 from ..flow import REASON_NAMES, AbstractMethod, MethodLike, RunOptions, preset
 from ..machine import AbstractMachine
-from ..machine import attributes as units_of
-from ._describe import attributes_of, description_of, unit_on_axis, variables_of
-from ._work import ClusterLost, block_size, rounded, run_here, run_on_cluster, size_of, worker_count
-from .corners import check_corners
+from ._computed import ScanInterrupted, Workplace, computed, in_blocks, workplace
+from ._shaken import lane_numbers
 from .grid import Blocks, axes_of
 from .program import ScanProgram, make_program
-from .store import MemoryStore, ZarrStore, check_writable
-
-if TYPE_CHECKING:
-    import xarray as xr
-else:
-    xr = lazy("xarray")
-
-
-class ScanInterrupted(Interrupted):
-    """Raised when a scan is interrupted: what was computed is not lost, but in `data`."""
-
-    def __init__(self, data: "xr.Dataset", store: str | Path | None):
-        kept = "what was computed is in `.data`"
-        if store is not None:
-            kept = f"what was computed is in {store}, and the same call goes on from there"
-        super().__init__("scan", data, kept)
-        self.data = data
 
 
 class LanesFailed(UserWarning):
     """Said of a scan of which some lanes failed."""
-
-
-class _Workplace(NamedTuple):
-    """Where blocks are computed: by threads on local devices, or by a Dask cluster."""
-
-    workers: int
-    devices: int
-    cluster: Any
 
 
 @renamed(scene="machine")
@@ -68,7 +37,9 @@ def scan(
     cycles: int | None = None,
     method: MethodLike = None,
     clock: str | None = None,
-    derivatives: Iterable[str] = (),
+    derivatives: str | Iterable[str] = (),
+    noise: Any = None,
+    key: Any = None,
     paired: bool = False,
     verify: int = 0,
     max_impacts: int = 1000,
@@ -82,8 +53,7 @@ def scan(
 ) -> "xr.Dataset":
     """Simulate every combination of the axes' values and keep what is measured.
 
-    The grid is computed in blocks of lanes, several at a time, all by one compiled program. Other
-    numbers on the axes, in the machine or in `settle` compile nothing again.
+    Other numbers on the axes, in the machine or in `settle` compile nothing again.
 
     **Arguments:**
 
@@ -92,36 +62,39 @@ def scan(
     - `axes`: names of numbers of the machine (`"drive.frequency_ratio"`, `"stops.0.restitution"`)
       or of the start (`"start.Y"`), each with a row of values.
     - `measure`: what is kept: names out of `"extremes"`, `"regime"`, `"frequency_ratio"`,
-      `"power"`, `"impact_rate"`, `"sections"`, `"exponent"`, `"steps"`; `AbstractMeasure`s;
-      functions of a lane's machine and `Run` that return named numbers; or the name of one of the
-      machine's own `averages` (one called `"power"` takes the place of ours).
+      `"power"`, `"impact_rate"`, `"sections"`, `"exponent"`, `"steps"`, or of the machine's own
+      `averages` (its `"power"` takes the place of ours); `AbstractMeasure`s; functions of a lane's
+      machine and `Run` that return named numbers.
     - `start`: the first state; by default the machine's own start at rest.
     - `settle`, `cycles`: drive cycles before observing (any number), and observed (static; by
       default as many as the measures need, at least 32).
     - `method`, `clock`, `max_impacts`, `max_steps`: as for `simulate`; by default `"standard"`.
-    - `derivatives`: names, as on the axes, by which all floating-point variables are
-      differentiated, in forward mode: `d_y_min` and so on, with an axis `by`.
-    - `paired`: take the axes' values together, one lane for each place in the rows (of one
-      length), along the dimension `sample`, instead of every combination.
-    - `verify`: so many lanes, drawn at random, are run again by the `"reference"` preset (a still
-      tighter method if that is the method). `data.attrs` then says of each variable how many of
-      them came out otherwise (`verified_changed_period`, for whole numbers) or what 95 of 100 are
-      off by at most (`verified_error_y_min`; infinite where one of both failed).
-    - `store`: folder of a Zarr store, written block by block. The same call resumes it after an
-      interruption; a changed one is refused with the difference named, the code of your own
-      functions included. Chunks that were lost or damaged are named and computed again.
+    - `derivatives`: names (or one), as on the axes, by which all floating-point variables are
+      differentiated: `d_y_min` and so on, with an axis `by`.
+    - `noise`, `key`: a `WhiteNoise`, by default none, and with it one key of JAX's. Lane number n
+      of the grid (the last axis is filled first) has the key `jax.random.fold_in(key, n)`, wherever
+      and beside what it is computed. An axis `"noise.V"` has values of the amplitude of that name;
+      `"noise.path"` changes nothing but that each of its numbers has paths of its own. Measures
+      that look for a period, or go on beyond the cycles observed, are refused.
+    - `paired`: a lane for each place in the rows (of one length), along `sample`, and no grid.
+    - `verify`: so many lanes, drawn at random, are run again by a tighter method. `data.attrs`
+      then says how many came out otherwise (`verified_changed_period`, of whole numbers) or what
+      95 of 100 are off by at most (`verified_error_y_min`; infinite where one of both failed).
+    - `store`: folder of a Zarr store, written block by block. The same call resumes it, and names
+      and computes again what was lost or damaged; a changed one, your own functions' code
+      included, is refused with the difference named.
     - `lanes`: lanes in a block (a multiple of 256); memory grows with it and with `cycles`.
-    - `workers`: blocks at work at the same time on a CPU, by default as many as it has cores.
-    - `devices`: local devices over which a block is spread; all by default.
-    - `cluster`: a `dask.distributed.Client`, to compute the blocks there. If its scheduler is
-      lost, a `ConnectionError` says what is kept and how to go on.
-    - `progress`: show a bar with rate and time left (in a terminal or notebook).
+    - `workers`, `devices`: blocks at work at the same time on a CPU (by default one for each core),
+      and local devices over which a block is spread (all by default).
+    - `cluster`: a `dask.distributed.Client`, to compute the blocks there.
+    - `progress`: show a bar, in a terminal or a notebook.
 
     **Returns:** an `xarray.Dataset` over the axes, with units; `result` says of each lane how it
     ended (0: well; -1: not computed). With a `store` it is read lazily from there.
 
     **Raises:** `ValueError` or `TypeError` before any work for what cannot be run;
-    `ScanInterrupted`, a `KeyboardInterrupt`, on Ctrl-C.
+    `ScanInterrupted`, a `KeyboardInterrupt`, on Ctrl-C; `ConnectionError`, which says what is kept
+    and how to go on, if the cluster's scheduler is lost.
     """
     grid, verify = axes_of(axes), count("verify", verify)
     paired, progress = flag("paired", paired), flag("progress", progress)
@@ -129,19 +102,17 @@ def scan(
     options = RunOptions(
         settle=settle, method=method, clock=clock, max_impacts=max_impacts, max_steps=max_steps
     )
-    make = functools.partial(
-        make_program, machine, tuple(grid), measure=measure, start=start, cycles=cycles
-    )
+    what = {"measure": measure, "start": start, "cycles": cycles, "noise": noise, "key": key}
+    make = functools.partial(make_program, machine, tuple(grid), **what)
     program = make(options, derivatives=derivatives)
-    place = _workplace(workers, devices, cluster)
-    blocks = _blocks(program, grid, place, paired, store, lanes)
-    data = _computed(program, blocks, place, store, progress)
+    place = workplace(workers, devices, cluster)
+    blocks = in_blocks(program, grid, place, paired, store, lanes)
+    data = computed(program, blocks, place, store, progress)
     if verify:
         better = make(dataclasses.replace(options, method=_better(program)))
-        try:
+        kept = functools.partial(ScanInterrupted, data, store)
+        with at_work("verification", kept, progress=False):
             data.attrs |= _verified(data, blocks, verify, better, place)
-        except KeyboardInterrupt:
-            raise ScanInterrupted(data, store) from None
     _warn_of_failures(data)
     return data
 
@@ -161,115 +132,6 @@ def _check_call(grid: Mapping[str, np.ndarray], paired: bool, store: Any, cluste
         )
 
 
-def _workplace(workers: int | None, devices: int | None, cluster: Any) -> _Workplace:
-    """As many threads and devices as are asked for, or as there are.
-
-    **Raises:** `ValueError` for more devices than there are.
-    """
-    workers, there = worker_count(workers), len(jax.local_devices())
-    devices = there if devices is None else count("devices", devices, least=1)
-    if devices > there:
-        raise ValueError(
-            f"Argument `devices` must be at most {there}, the local devices, but got {devices}."
-        )
-    return _Workplace(workers, devices, cluster)
-
-
-def _computed(
-    program: ScanProgram, blocks: Blocks, place: _Workplace, store: Any = None, progress=False
-) -> "xr.Dataset":
-    """What a program finds on a grid, checked before any work.
-
-    **Arguments:** `blocks`, the grid; `place`, where it is computed; `store`, a path to keep it at,
-    `None` for the memory; `progress`, whether a bar is shown.
-
-    **Raises:** as `scan`.
-    """
-    program = check_corners(program, blocks)
-    variables = variables_of(program, blocks)
-    per_lane = sum(math.prod(v.sizes) * v.dtype.itemsize for v in variables.values())
-    total = blocks.total
-    fits_memory("axes", total * per_lane if store is None else total + 500 * len(blocks))
-    description = description_of(program, blocks)
-    if store is not None:
-        check_writable(store)
-        kept: MemoryStore | ZarrStore = ZarrStore(store, description, blocks, variables)
-    else:
-        kept = MemoryStore(blocks, variables)
-
-    def collected() -> "xr.Dataset":
-        data = kept.data()
-        for name in blocks.axes:
-            data[name].attrs |= units_of(unit_on_axis(program, blocks, name))
-        data.attrs = attributes_of(description, program.first(blocks)[0])
-        return data
-
-    open_blocks = kept.open_blocks()
-    _ = xr.Dataset  # loaded now: after an interrupt nobody waits for that
-    try:
-        with tqdm(
-            total=total,
-            initial=total - sum(size_of(where) for where in open_blocks),
-            unit="lane",
-            unit_scale=True,
-            disable=None if progress else True,
-        ) as bar:
-            done = (
-                run_on_cluster(program, blocks, open_blocks, place.cluster)
-                if place.cluster is not None
-                else run_here(program, blocks, open_blocks, place.workers, place.devices)
-            )
-            for where, numbers in done:
-                kept.write(where, numbers)
-                bar.update(size_of(where))
-    except KeyboardInterrupt:
-        raise ScanInterrupted(collected(), store) from None
-    except ClusterLost as lost:
-        raise ConnectionError(_how_to_go_on(kept)) from lost
-    return collected()
-
-
-def _blocks(
-    program: ScanProgram,
-    grid: Mapping[str, np.ndarray],
-    place: _Workplace,
-    paired: bool,
-    store: str | Path | None = None,
-    lanes: int | None = None,
-) -> Blocks:
-    """The grid in blocks of `lanes`: as in the store if there is one, or as suits the workplace.
-
-    **Arguments:** `grid`, values by axis; `place`, where it is computed; `paired`, whether the axes
-    have one length and are gone along together; `store`, a path or `None`; `lanes`, `None` to
-    choose.
-
-    **Raises:** `ValueError` if a block would not fit into the memory.
-    """
-    total = Blocks(grid, 1, paired=paired).total
-    if store is not None and lanes is None:
-        lanes = _lanes_in(Path(store))
-    at_fault = "cycles" if lanes is None else "lanes"
-    if lanes is None:
-        lanes = block_size(total, place.workers, place.devices)
-    else:
-        lanes = rounded(lanes, total, place.devices)
-    fits_records(at_fault, lanes * (program.cycles + 1), 12)
-    return Blocks(grid, lanes, paired=paired)
-
-
-def _how_to_go_on(kept: MemoryStore | ZarrStore) -> str:
-    """What is left of a scan whose cluster is lost."""
-    how = "Nothing is kept: give the scan a `store`, from which the same call goes on."
-    if isinstance(kept, ZarrStore):
-        number = len(kept.blocks)
-        done = number - len(kept.open_blocks())
-        how = (
-            f"{done:,} of {number:,} blocks are computed and kept in {kept.path}: the same call "
-            "goes on from there, with a new client or without `cluster`."
-        )
-    return f"The scheduler of the Dask cluster was lost. {how}"
-
-
 def _better(program: ScanProgram) -> AbstractMethod:
     """A method to verify the program's by."""
     best, mine = preset(program.machine, "reference"), program.method
@@ -278,7 +140,7 @@ def _better(program: ScanProgram) -> AbstractMethod:
 
 
 def _verified(
-    data: "xr.Dataset", blocks: Blocks, lanes: int, program: ScanProgram, place: _Workplace
+    data: "xr.Dataset", blocks: Blocks, lanes: int, program: ScanProgram, place: Workplace
 ) -> dict[str, Any]:
     """How some of the lanes, drawn by chance, come out by a better program; attributes by their
     names.
@@ -293,7 +155,10 @@ def _verified(
     if blocks.paired:
         places = (drawn,) * len(blocks.axes)
     axes = {name: x[i] for (name, x), i in zip(blocks.axes.items(), places, strict=True)}
-    better = _computed(program, _blocks(program, axes, place, paired=True), place)
+    numbers = lane_numbers(total)[drawn]  # each has its own path
+    numbers = None if program.shaken is None else numbers
+    again = in_blocks(program, axes, place, paired=True, numbers=numbers)
+    better = computed(program, again, place)
     found: dict[str, Any] = {"verified_lanes": lanes}
     for name in better:
         mine = np.asarray(data[name]).reshape(total, -1)[drawn]
@@ -321,12 +186,3 @@ def _warn_of_failures(data: "xr.Dataset") -> None:
         LanesFailed,
         stacklevel=4,
     )
-
-
-def _lanes_in(path: Path) -> int | None:
-    """The block size of a store that is there already."""
-    try:
-        attributes = json.loads((path / "zarr.json").read_text(encoding="utf-8"))["attributes"]
-        return int(attributes["scan"]["lanes"])
-    except (OSError, KeyError, ValueError, TypeError):
-        return None

@@ -6,10 +6,11 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ..flow import check_period, check_reals, refuse_arrays
+from ..flow import check_noise, check_period, check_reals
 from ..machine import check_again, with_leaf
+from ._shaken import MACHINE, part_of
 from .grid import Blocks
-from .program import START, ScanProgram, check_leaf_name
+from .program import ScanProgram, check_leaf_name
 
 
 def _corners(blocks: Blocks) -> np.ndarray:
@@ -33,7 +34,9 @@ def check_corners(program: ScanProgram, blocks: Blocks) -> ScanProgram:
     """
     rests = False
     if blocks.paired and program.machine is not None:
-        lanes = {name: jnp.asarray(x) for name, x in blocks.axes.items() if name[:6] != START}
+        lanes = {
+            name: jnp.asarray(x) for name, x in blocks.axes.items() if part_of(name) == MACHINE
+        }
         machine = program.machine
         for name, x in lanes.items():
             machine = with_leaf(machine, name, x)
@@ -44,12 +47,13 @@ def check_corners(program: ScanProgram, blocks: Blocks) -> ScanProgram:
         check_again(machine)
         rests = rests or machine.may_rest()
         for name in program.derivatives:
-            check_leaf_name(machine, start, name, "derivatives")
+            check_leaf_name(machine, start, name, "derivatives", program.shaken)
         program.method.check(machine)
         start = machine.adopt(start)
         check_reals("start", start)
         check_period(machine, start)
-        refuse_arrays("start", "scan", start)
+        if program.shaken is not None:
+            check_noise(machine, start, program.shaken.noise_of(lane))
     if program.build is not None:
         return program
     return dataclasses.replace(program, options=dataclasses.replace(program.options, rests=rests))

@@ -9,6 +9,9 @@ import numpy as np
 
 from .._checks import row_of_numbers
 
+# The number of a lane among its values, where it has one: no name of an axis.
+LANE = "lane number"
+
 
 def axes_of(axes: Mapping[str, Any], argument: str = "axes") -> dict[str, np.ndarray]:
     """The axes as rows of numbers.
@@ -36,9 +39,17 @@ class Blocks:
     """A grid cut into rectangles of at most so many lanes, contiguous in the grid's order.
 
     If its axes are `paired`, their values are taken together, one lane for each place in the rows.
+    With `numbers`, one for each lane in the grid's order, they are among the lanes' values.
     """
 
-    def __init__(self, axes: Mapping[str, np.ndarray], lanes: int, *, paired: bool = False):
+    def __init__(
+        self,
+        axes: Mapping[str, np.ndarray],
+        lanes: int,
+        *,
+        paired: bool = False,
+        numbers: np.ndarray | None = None,
+    ):
         self.axes, self.paired, self.lanes = dict(axes), paired, lanes
         self.dims = ("sample",) if paired else tuple(axes)
         self.shape = tuple(x.size for x in axes.values())[: 1 if paired else None]
@@ -51,10 +62,11 @@ class Blocks:
         self.counts = tuple(
             math.ceil(size / part) for size, part in zip(self.shape, self.block, strict=True)
         )
+        self.numbers = None if numbers is None else numbers.reshape(self.shape)
 
     @property
     def total(self) -> int:
-        """Number of lanes."""
+        """Number of lanes in the whole grid."""
         return math.prod(self.shape)
 
     def dims_of(self, name: str) -> tuple[str]:
@@ -78,14 +90,15 @@ class Blocks:
         )
 
     def index(self, where: tuple[slice, ...]) -> int:
-        """Which block lies there."""
+        """The number of the block that lies there."""
         corner = [part.start // size for part, size in zip(where, self.block, strict=True)]
         return int(np.ravel_multi_index(corner, self.counts))
 
     def values(self, where: tuple[slice, ...]) -> dict[str, np.ndarray]:
-        """The axes' values of the block's lanes."""
+        """The axes' values of the block's lanes, and their numbers as `LANE`."""
+        beside = {} if self.numbers is None else {LANE: self.numbers[where].ravel()}
         if self.paired:
-            return {name: x[where] for name, x in self.axes.items()}
+            return {name: x[where] for name, x in self.axes.items()} | beside
         rows = [x[part] for x, part in zip(self.axes.values(), where, strict=True)]
         grid = np.meshgrid(*rows, indexing="ij")
-        return {name: x.ravel() for name, x in zip(self.axes, grid, strict=True)}
+        return {name: x.ravel() for name, x in zip(self.axes, grid, strict=True)} | beside

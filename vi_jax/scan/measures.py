@@ -13,7 +13,7 @@ from jaxtyping import Array
 from .._checks import count, require
 from .._types import Flag, State
 from ..flow import AbstractMethod, Run
-from ..machine import AbstractMachine, by_name
+from ..machine import AbstractMachine, by_name, components
 from ._lyapunov import lyapunov
 from .regime import CODES, REGIMES, flags, impacts_of, least_period
 
@@ -45,6 +45,11 @@ class AbstractMeasure(eqx.Module):
     def cycles(self) -> int:
         """The fewest cycles that it must see."""
         return 1
+
+    @property
+    def instants(self) -> int:
+        """Samples in a cycle that it must see (`Run.samples`); 0 for none."""
+        return 0
 
     def under(self, method: AbstractMethod) -> "AbstractMeasure":
         """This measure for motions that are carried by a method; itself, if it is no matter how."""
@@ -90,7 +95,7 @@ class Extremes(AbstractMeasure):
     }
 
     def __call__(self, machine, run):
-        """Of one lane."""
+        """Extremes and the greatest speed of approach of one lane."""
         assert run.y_min is not None and run.y_max is not None and run.impact_speed is not None
         return {
             "y_min": jnp.min(run.y_min),
@@ -107,7 +112,7 @@ class FrequencyRatio(AbstractMeasure):
     }
 
     def __call__(self, machine, run):
-        """Of one lane."""
+        """The mean of one lane. **Raises:** `ValueError` for a machine without a drive."""
         assert run.duration is not None
         ratio = machine.frequency_ratio(jnp.mean(run.duration))
         if ratio is None:
@@ -121,7 +126,7 @@ class Power(AbstractMeasure):
     attributes: ClassVar[About] = {"power": {"unit_of": "power", "long_name": "mean impact power"}}
 
     def __call__(self, machine, run):
-        """Of one lane."""
+        """Energy lost in impacts over the time that one lane took."""
         assert run.duration is not None and run.impact_energy is not None
         return {"power": jnp.sum(run.impact_energy) / jnp.sum(run.duration)}
 
@@ -137,7 +142,7 @@ class Average(AbstractMeasure):
         return {self.name: {"unit_of": self.name, "long_name": f"mean {self.name}"}}
 
     def __call__(self, machine, run):
-        """Of one lane."""
+        """The machine's own average over all cycles of one lane."""
         found = run.mean_averages()
         if self.name not in found:
             raise ValueError(
@@ -160,7 +165,7 @@ class Sections(AbstractMeasure):
         """Each component of the state."""
         return {
             name: {"unit_of": name, "long_name": f"{name} on the section", "dims": ("cycle",)}
-            for name in by_name(start)
+            for name in components(start)
         }
 
     @property
@@ -170,7 +175,7 @@ class Sections(AbstractMeasure):
 
     def __call__(self, machine, run):
         """Of one lane, arrays of shape (number,)."""
-        return {name: x[-self.number :] for name, x in by_name(run.sections).items()}
+        return {name: x[-self.number :] for name, x in components(run.sections, 1).items()}
 
 
 class ImpactRate(AbstractMeasure):
@@ -182,7 +187,7 @@ class ImpactRate(AbstractMeasure):
     }
 
     def __call__(self, machine, run):
-        """Of one lane."""
+        """Impacts a cycle of one lane."""
         return {"impact_rate": jnp.mean(run.impacts.astype(_dtype(run)))}
 
 
@@ -196,7 +201,7 @@ class Steps(AbstractMeasure):
     }
 
     def __call__(self, machine, run):
-        """Of one lane."""
+        """Steps tried and rejected in the cycles of one lane."""
         return {"steps": run.steps, "rejected": run.rejected}
 
 
@@ -213,11 +218,11 @@ class Exponent(AbstractMeasure):
         count("observed", self.observed, least=8)
 
     def __call__(self, machine, run):
-        """Not yet known."""
+        """NaN: the exponent is found by `refine`."""
         return {"exponent": jnp.full((), jnp.nan, _dtype(run))}
 
     def needs_refinement(self, found, pass_number=0):
-        """Always."""
+        """True: every lane has an exponent to be found."""
         return jnp.asarray(True)
 
     def refine(self, machine, state, method, found, pass_number=0, rests=None):
@@ -279,7 +284,7 @@ class Regime(AbstractMeasure):
 
     @property
     def cycles(self):
-        """Twice the longest period."""
+        """Twice the longest period, so that each is seen to repeat."""
         return 2 * self.longest
 
     @property

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import inspect
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
@@ -11,9 +12,9 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Shaped
 
-from .._checks import count, tuple_of
+from .._checks import count, tuple_of_names
 from .._numbers import strongly_typed
 from .._types import State
 from ..flow import (
@@ -25,15 +26,13 @@ from ..flow import (
     has_averages,
     machine_of,
     number_of,
-    refuse_arrays,
     simulate_pool,
 )
-from ..machine import AbstractMachine, check_name, leaf, leaf_names, with_leaf
-from ._asked import measures_of
+from ..machine import AbstractMachine, check_name, components, leaf, leaf_names, with_leaf
+from ._asked import cycles_for, measures_of, samples_for
+from ._shaken import MACHINE, NOISE, START, Shaken, part_of, shaken_by
 from .grid import Blocks
 from .measures import AbstractMeasure, Numbers
-
-START = "start."
 
 _USUAL = RunOptions()
 
@@ -53,10 +52,12 @@ class ScanProgram(eqx.Module):
     """Cycles observed."""
     options: RunOptions
     """How each lane is run, checked; its method is one, no name."""
+    shaken: Shaken | None = None
+    """Noise, where there is some."""
 
     @property
     def method(self) -> AbstractMethod:
-        """What moves the machines."""
+        """The method that moves the machines."""
         assert isinstance(self.options.method, AbstractMethod)
         return self.options.method
 
@@ -70,7 +71,7 @@ class ScanProgram(eqx.Module):
 
         **Raises:** `TypeError` if the function that makes the machine makes something else.
         """
-        of_machine = {name: x for name, x in values.items() if not name.startswith(START)}
+        of_machine = {name: x for name, x in values.items() if part_of(name) == MACHINE}
         if self.build is not None:
             machine = self.build(**of_machine)
             if not isinstance(machine, AbstractMachine):
@@ -83,14 +84,14 @@ class ScanProgram(eqx.Module):
             for name, value in of_machine.items():
                 machine = with_leaf(machine, name, value)
         assert machine is not None
-        machine = self._nudged(machine, "", nudge)
+        machine = self._nudged(machine, MACHINE, nudge)
         if self.options.clock is not None:
             machine = machine.in_clock(self.options.clock)
         start = self.start
         if start is None:
             start = machine.start()
         for name, value in values.items():
-            if name.startswith(START):
+            if part_of(name) == START:
                 start = with_leaf(start, name.removeprefix(START), value)
         return machine, self._nudged(start, START, nudge)
 
@@ -103,13 +104,13 @@ class ScanProgram(eqx.Module):
         if nudge is None:
             return tree
         for name, change in zip(self.derivatives, nudge, strict=True):
-            if name.startswith(START) == bool(prefix):
+            if part_of(name) == prefix:
                 own = name.removeprefix(prefix)
                 tree = with_leaf(tree, own, leaf(tree, own) + change)
         return tree
 
     def __call__(
-        self, values: dict[str, Float[Array, " lanes"]], wanted: Array
+        self, values: dict[str, Shaped[Array, " lanes"]], wanted: Array
     ) -> dict[str, Array]:
         """The numbers of all lanes, by name; `result` among them."""
         found, state = self._first(values, wanted, None)
@@ -124,7 +125,7 @@ class ScanProgram(eqx.Module):
 
             out = jax.lax.fori_loop(0, measure.passes, again, out)
         if self.derivatives:
-            basis = jnp.eye(len(self.derivatives), dtype=jtu.tree_leaves(values)[0].dtype)
+            basis = jnp.eye(len(self.derivatives), dtype=jnp.result_type(float))
 
             def floats(nudge):
                 found, _ = self._first(values, wanted, nudge)
@@ -139,7 +140,10 @@ class ScanProgram(eqx.Module):
             return self.lane(values, nudge)
 
         options = dataclasses.replace(self.options, clock=None)  # `lane` has seen to it
-        run = simulate_pool(lane_of, values, self.cycles, options, wanted)
+        noise_of = None
+        if self.shaken is not None:
+            noise_of = functools.partial(self.shaken.lane, names=self.derivatives, nudge=nudge)
+        run = simulate_pool(lane_of, values, self.cycles, options, wanted, noise_of)
 
         def measured(values, run):
             machine, _ = lane_of(values)
@@ -192,7 +196,9 @@ def make_program(
     measure: Any,
     start: State = None,
     cycles: int | None = None,
-    derivatives: Iterable[str] = (),
+    derivatives: str | Iterable[str] = (),
+    noise: Any = None,
+    key: Any = None,
 ) -> ScanProgram:
     """The program of a scan, its arguments checked as far as they can be without the axes' values.
 
@@ -201,15 +207,16 @@ def make_program(
     **Raises:** `TypeError` or `ValueError`, as `scan`.
     """
     measures = measures_of(measure, _averages_of(machine, names, start))
-    cycles = _cycles_for(measures, cycles)
+    derivatives = tuple_of_names("derivatives", derivatives)
+    shaken = shaken_by(noise, key, names, derivatives, measures)
+    cycles = cycles_for(measures, cycles)
     settle = count("settle", options.settle)
-    derivatives = (derivatives,) if isinstance(derivatives, str) else derivatives
     template, build, rests = None, None, True
     if isinstance(machine, AbstractMachine):
         template = machine_of(machine)
         method = chosen(template, options.method)
     elif callable(machine):
-        build, own = machine, [name for name in names if not name.startswith(START)]
+        build, own = machine, [name for name in names if part_of(name) == MACHINE]
         _check_names_of(build, own)
         method, rests = _suited(build, own, options.method)
     else:
@@ -220,41 +227,25 @@ def make_program(
     first = start
     if template is not None and start is None:
         first = template.start()
-    if first is not None:
-        refuse_arrays("start", "scan", first)
     if template is not None:
         for name in names:
-            check_leaf_name(template, first, name, "axes")
+            check_leaf_name(template, first, name, "axes", shaken)
     measures = tuple(measure.under(method) for measure in measures)
     motion = any(measure.record == "motion" for measure in measures)
     options = dataclasses.replace(
         options, settle=settle, method=method, rests=rests,
-        record="motion" if motion else "sections",
+        record="motion" if motion else "sections", samples=samples_for(measures),
     ).checked(template)  # fmt: skip
     return ScanProgram(
         machine=_as_arrays(template),
         build=build,
         start=_as_arrays(start),
-        derivatives=tuple_of("derivatives", derivatives, str),
+        derivatives=derivatives,
         measures=_as_arrays(measures),
         cycles=cycles,
         options=dataclasses.replace(_as_arrays(options), settle=jnp.asarray(settle)),
+        shaken=shaken,
     )
-
-
-def _cycles_for(measures: Iterable[AbstractMeasure], cycles: int | None) -> int:
-    """The cycles to observe: those asked for, or as many as these measures need.
-
-    **Raises:** `ValueError` if they are too few for one of them.
-    """
-    needed = max(m.cycles for m in measures)
-    cycles = max(32, needed) if cycles is None else count("cycles", cycles, least=1)
-    if cycles < needed:
-        who = next(type(m).__name__ for m in measures if m.cycles > cycles)
-        raise ValueError(
-            f"Argument `cycles` must be at least {needed} for the measure {who}, but got {cycles}."
-        )
-    return cycles
 
 
 def _averages_of(machine: Any, axes: Iterable[str], start: State) -> tuple[str, ...]:
@@ -268,7 +259,7 @@ def _averages_of(machine: Any, axes: Iterable[str], start: State) -> tuple[str, 
 
     # What cannot be made is reported where the method is looked for.
     with contextlib.suppress(Exception):
-        jax.eval_shape(made, {x: jnp.zeros(()) for x in axes if not x.startswith(START)})
+        jax.eval_shape(made, {x: jnp.zeros(()) for x in axes if part_of(x) == MACHINE})
     return found[0] if found else ()
 
 
@@ -327,7 +318,14 @@ def _as_arrays(tree: Any) -> Any:
     )
 
 
-def check_leaf_name(machine: AbstractMachine, start: State, name: str, argument: str) -> None:
-    """**Raises:** `ValueError` for a name that no number of the machine or of its start has."""
-    names = leaf_names(machine) + [START + n for n in leaf_names(start)]
-    check_name(names, name, argument)
+def check_leaf_name(
+    machine: AbstractMachine, start: State, name: str, argument: str, shaken: Shaken | None
+) -> None:
+    """**Raises:** `ValueError` for a name that no number of the machine, of its start or of the
+    noise has."""
+    if part_of(name) == NOISE and shaken is not None:
+        return  # checked with the noise
+    tree, own = (start, name.removeprefix(START)) if part_of(name) == START else (machine, name)
+    if own in leaf_names(tree):
+        return
+    check_name([*components(machine), *(START + n for n in components(start))], name, argument)

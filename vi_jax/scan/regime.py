@@ -6,11 +6,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._types import Scalar, State
+from ..machine import in_rows
 
 Number = Scalar | float
 
@@ -86,7 +86,7 @@ def least_period(
     that is more, ten times what they wander by; what the sections of a motion that repeats wander
     by under its method (`AbstractMethod.wander`).
     """
-    states = jnp.stack(jtu.tree_leaves(sections))
+    states = in_rows(sections).T
     if tolerance is None:
         tolerance = jnp.maximum(_TOLERANCE, _WANDERS * jnp.asarray(wander, states.dtype))
     rows = jnp.concatenate([states, impacts[None].astype(states.dtype)])

@@ -6,21 +6,14 @@ import warnings
 import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from .._checks import unwritable
-from .._lazy import lazy
+from .._lazy import xr, zarr
 from .._numbers import warn
 from .grid import Blocks
-
-if TYPE_CHECKING:
-    import xarray as xr
-    import zarr
-else:
-    xr = lazy("xarray")
-    zarr = lazy("zarr")
 
 # What stands in whole numbers of lanes that were not computed, `result` among them.
 NOT_COMPUTED = -1
@@ -51,7 +44,7 @@ class Variable(NamedTuple):
 
 
 class MemoryStore:
-    """Arrays in memory."""
+    """Arrays in memory, for a scan that nothing is to be kept of."""
 
     def __init__(self, blocks: Blocks, variables: Mapping[str, Variable]):
         self.arrays = {
@@ -64,7 +57,7 @@ class MemoryStore:
         return list(self.blocks)
 
     def write(self, where: tuple[slice, ...], numbers: Mapping[str, np.ndarray]) -> None:
-        """Keep a block's numbers."""
+        """Put a block's numbers in their place in the arrays."""
         for name, x in numbers.items():
             array = self.arrays[name]
             array[where] = x.reshape(array[where].shape)
@@ -168,7 +161,7 @@ class ZarrStore:
         return not lost
 
     def write(self, where: tuple[slice, ...], numbers: Mapping[str, np.ndarray]) -> None:
-        """Keep a block's numbers."""
+        """Write a block's numbers to its chunks, and then their check sums."""
         sums = []
         for name in self.names:
             array = self._array(name)

@@ -1,6 +1,5 @@
 """The picture of `all_orbits.py`, and the motions that it shows."""
 
-from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -13,18 +12,11 @@ from vi_jax.plot.colors import STOP, color_of, paler
 
 
 class Kind:
-    """A motion of the merged list, with the number of guesses that led to it for each n."""
+    """A motion, with the number of searches that led to it for each period asked for."""
 
-    def __init__(self, orbit: vi.Orbit):
-        self.orbit = orbit
+    def __init__(self, orbit: vi.Orbit, counts: np.ndarray):
+        self.orbit, self.counts = orbit, counts
         self.path = np.stack([np.asarray(orbit.sections.Y), np.asarray(orbit.sections.V)], axis=-1)
-        self.counts: Counter[int] = Counter()
-
-    def same(self, other: vi.Orbit) -> bool:
-        """Whether `other` runs through the same sections, from whichever of them it starts."""
-        start = np.array([float(other.state.Y), float(other.state.V)])
-        alike = int(other.cycles) == len(self.path)
-        return alike and bool(np.abs(self.path - start).max(axis=1).min() < 1e-6)
 
     @property
     def stable(self) -> bool:

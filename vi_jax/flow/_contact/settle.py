@@ -34,7 +34,7 @@ class Approach(NamedTuple):
     """What a step knew of a coordinate when it met a stop."""
 
     speed: Scalar
-    """Its rate by s."""
+    """Rate of the coordinate by the clock."""
     growth: Scalar | None
     """That of the force on it; absent where nothing can rest."""
     alone: SmoothMachine

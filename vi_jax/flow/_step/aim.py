@@ -17,7 +17,7 @@ from ..events import quintic, to_turn
 from ..methods import Foreseen
 from ..smooth import exact
 from .guards import Crossing, at_stops, beyond
-from .hidden import force_may_turn, hump, may_turn_twice
+from .hidden import force_may_turn, hump, may_turn_twice, rise
 from .search import Course, Passed, first_event, may_matter
 from .trial import Trial
 
@@ -124,6 +124,8 @@ class _Seen(NamedTuple):
     """Both as `first_event` asks for them: quintics through the step's ends."""
     humps: list[tuple[Flag, Scalar]]
     """Of the guards that hold a mode, where they may have been positive in between."""
+    rises: list[tuple[Flag, Scalar]]
+    """Of those that happen from below, likewise, also before what was landed upon."""
     twice: Flag
     """A motion may have turned twice."""
 
@@ -134,16 +136,17 @@ def _met_something(plan: Plan, lane: Lane, trial: Trial, seen: _Seen, foreseen: 
     **Arguments:** `seen`, what the step's ends say; `foreseen` as for `aim_at`.
     """
     if any(path.leaves is not None for path in trial.paths):
-        return jnp.ones_like(trial.good)
+        anything = jnp.ones_like(trial.good)
+        return anything if trial.clear is None else ~trial.clear
     met = trial.good & ((lane.target != FREE) & ~at_a_turn(trial) | seen.twice)
     for c, over, _ in seen.guards:
         met = met | over & ~c.landed | c.again
-    for above, _ in seen.humps:
+    for above, _ in (*seen.humps, *seen.rises):
         met = met | above
     for k, ((turned, _), path) in enumerate(zip(seen.courses, trial.paths, strict=True)):
         if not foreseen:
             met = met | turned & may_matter(plan, lane, k, path.begin, path.end, trial.h)
-    return met
+    return met if trial.clear is None else met & ~trial.clear
 
 
 class _Goal(NamedTuple):
@@ -177,6 +180,8 @@ def _aimed(plan: Plan, lane: Lane, trial: Trial, seen: _Seen) -> tuple[Flag, Sca
     goal = _by_newton(lane, trial, goal)
     for above, place in reversed(seen.humps):  # of several the first listed
         goal = goal.cut(above & ~(goal.event | landed), place)
+    for above, place in reversed(seen.rises):
+        goal = goal.cut(above & ~goal.event, place)
     nothing_else = trial.good & ~(first.crossed | first.turned | met)
     goal = goal.cut(seen.twice & nothing_else, 0.5 * h)
     for k, path in enumerate(trial.paths):
@@ -198,11 +203,15 @@ def _aimed(plan: Plan, lane: Lane, trial: Trial, seen: _Seen) -> tuple[Flag, Sca
 def _seen(plan: Plan, lane: Lane, trial: Trial) -> _Seen:
     """What both ends of a tried step say of the events between them."""
     h, good, guards, courses, humps = trial.h, trial.good, [], [], []
+    rises = []
     for c in trial.crossings:
         guards.append((c, good & beyond(c), partial(quintic, c.begin, c.end, h)))
         if c.event.holds_mode:
             above, place = hump(c, h)
             humps.append((good & above, place))
+        elif c.within:
+            above, place = rise(c, h)
+            rises.append((good & above, place))
     exactly, twice = exact(plan.machine, lane.state), jnp.zeros_like(good)
     eps = float(jnp.finfo(h.dtype).eps)
     for k, path in enumerate(trial.paths):
@@ -216,7 +225,7 @@ def _seen(plan: Plan, lane: Lane, trial: Trial) -> _Seen:
             moves = jnp.abs(end.v) * h > eps * (1 + jnp.abs(end.x))
             turned = turned & (jnp.abs(to_turn(end)) > now) & moves
         courses.append((turned, partial(quintic, path.begin, end, h)))
-    return _Seen(guards, courses, humps, twice)
+    return _Seen(guards, courses, humps, rises, twice)
 
 
 def _by_newton(lane: Lane, trial: Trial, goal: _Goal) -> _Goal:

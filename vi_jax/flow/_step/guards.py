@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import jax.tree_util as jtu
 from jax.lax import stop_gradient
 
 from ..._types import Flag, Scalar, Scalars, State
@@ -16,6 +17,9 @@ from ..smooth import SmoothMachine, exact
 # Newton's method on a smooth flow needs two or three aims. Where rounding keeps it from gaining
 # more, a lane that has aimed this often (a choice) accepts a thousand times the tolerance.
 _PATIENCE = 12.0
+
+# Where within a step a guard is looked at, of an event that happens from below.
+WITHIN = (0.25, 0.5, 0.75)
 
 
 class Crossing(NamedTuple):
@@ -38,6 +42,8 @@ class Crossing(NamedTuple):
     landed: Any = None
     again: Any = None
     """The step was aimed at it and has to be corrected by δ."""
+    within: Scalars = ()
+    """Of an event that happens from below, about what g is at `WITHIN`, shares of the step."""
 
     @property
     def at_once(self) -> Flag | None:
@@ -93,14 +99,20 @@ def _others(
         return begin, guard_rates(moving.field, guard, s1, new)
 
     around = lane.modes, lane.contact or ()
+    places = ()
+    if plan.from_below(lane.state):
+        places = _within(moving, (lane.s, lane.state), (s1, new))
     for number in plan.others(lane.state):
         event = events_of(machine)[number]
         begin, end = ends(lambda s, x, i=number: jnp.asarray(guard_of(machine, i, s, x, *around)))
-        scale = 1 + stop_gradient(jnp.abs(end.v))
+        scale, within = 1 + stop_gradient(jnp.abs(end.v)), ()
         if event.from_below:
-            begin, end, risen = _from_below(lane.below[len(below)], begin, end, scale)
+            within = [guard_of(machine, number, *place, *around) for place in places]
+            armed, risen = _from_below(lane.below[len(below)], begin, end, scale)
+            begin, end = _if_armed(armed, begin), _if_armed(armed, end)
+            within = tuple(jnp.where(armed, x, -1.0) for x in within)
             below.append(risen)
-        found.append(Crossing(event, number, begin, end, scale))
+        found.append(Crossing(event, number, begin, end, scale, within=within))
     if machine.clock(lane.state) is not None:
         number, bound = section_number(machine), plan.end(lane.part)
         begin, end = ends(lambda _, x: jnp.asarray(machine.clock(x)) - bound)
@@ -108,27 +120,43 @@ def _others(
     return found, tuple(below)
 
 
-def _from_below(
-    below: Scalar, begin: Rates, end: Rates, scale: Scalar
-) -> tuple[Rates, Rates, Scalar]:
-    """A guard that counts only once it has been below zero: its rates where the step begins and
-    ends, those of a constant -1 as long as it does not count; and `Lane.below` at the step's end.
-    One that begins at zero and falls counts.
+def _within(
+    moving: SmoothMachine, begin: tuple[Scalar, State], end: tuple[Scalar, State]
+) -> list[tuple[Scalar, State]]:
+    """About s and the state at each of `WITHIN` in a step: the cubic through both ends."""
+    (s0, x0), (s1, x1) = begin, end
+    h, rates0, rates1 = s1 - s0, moving.field(s0, x0), moving.field(s1, x1)
 
-    **Arguments:** `below`, as in `Lane`; the guard's rates; `scale`, its size, by which rounding is
-    judged.
+    def at(share: float) -> tuple[Scalar, State]:
+        left = 1 - share
+        late, early = share * share * (1 + 2 * left), share * left * left
+        state = jtu.tree_map(
+            lambda a, b, va, vb: a + late * (b - a) + h * (early * va - share * share * left * vb),
+            x0, x1, rates0, rates1,
+        )  # fmt: skip
+        return stop_gradient((s0 + share * h, state))
+
+    return [at(share) for share in WITHIN]
+
+
+def _from_below(below: Scalar, begin: Rates, end: Rates, scale: Scalar) -> tuple[Flag, Scalar]:
+    """Whether a guard counts that does so only once it has been below zero, and `Lane.below` at the
+    step's end. One that begins at zero and falls counts.
+
+    **Arguments:** `below`, as in `Lane`; the guard's rates where the step begins and ends; `scale`,
+    its size, by which rounding is judged.
     """
     # On it is also what a search's step left so close to it: a cycle is no shorter.
     rounding = float(jnp.finfo(end.x.dtype).eps) ** 0.5 * scale
     here = stop_gradient(begin)
     falls = (here.x <= rounding) & (here.v < 0)
     armed = (below > 0) | (here.x < -rounding) | falls
-    risen = jnp.where(armed | (stop_gradient(end.x) < -rounding), 1.0, below)
-    begin, end = (
-        Rates(jnp.where(armed, r.x, -1.0), *(jnp.where(armed, x, 0.0) for x in (r.v, r.a)))
-        for r in (begin, end)
-    )
-    return begin, end, risen
+    return armed, jnp.where(armed | (stop_gradient(end.x) < -rounding), 1.0, below)
+
+
+def _if_armed(armed: Flag, r: Rates) -> Rates:
+    """The rates of a guard that counts; of one that does not, those of a constant -1."""
+    return Rates(jnp.where(armed, r.x, -1.0), *(jnp.where(armed, x, 0.0) for x in (r.v, r.a)))
 
 
 def beyond(event: Crossing) -> Flag:

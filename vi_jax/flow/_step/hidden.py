@@ -4,12 +4,23 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 
 from ..._types import Flag, Scalar
+from ...machine import horner
 from .._lane import Lane
-from .guards import Crossing
+from ..events import quintic
+from .guards import WITHIN, Crossing
 from .trial import Path
 
 # A hump of a guard this close to an end of a step (as a share of it) is seen from there: a choice.
 _BRIEF = 1e-3
+
+# A guard's quintic is looked at where it has gone through so many parts of the step, and doubted by
+# so many times what it is off in between. Choices, measured on balls that fly over ramps with up to
+# five waves in a step (`tests/flow/test_hidden_resets.py`).
+_PARTS = 8
+_DOUBT = 4.0
+
+# Steps shorter than this (in s) are not shortened any more.
+_SHORTEST = 1e-6
 
 
 def _corner(
@@ -35,6 +46,32 @@ def hump(c: Crossing, h: Scalar) -> tuple[Flag, Scalar]:
     _, bound, place = _corner((begin.x, begin.v), (end.x, end.v), h, rises)
     brief = _BRIEF * h
     return rises & (bound > 0) & (place > brief) & (h - place > brief), place
+
+
+def rise(c: Crossing, h: Scalar) -> tuple[Flag, Scalar]:
+    """Whether a guard of any shape may have been positive before the end of a step that it does not
+    end beyond, or that landed on it, and where first: by the quintic through the step's ends, and
+    by how far the guard is off it at `WITHIN`, which says how little the quintic knows.
+
+    Looked at where the guard falls from its surface as well, as behind a reset.
+    """
+    begin, end, within = stop_gradient((c.begin, c.end, c.within))
+    curve = quintic(begin, end, h)
+    unknown = jnp.zeros_like(end.x)
+    for share, value in zip(WITHIN, within, strict=True):
+        off = jnp.abs(value - horner(curve, jnp.asarray(share)))
+        unknown = jnp.maximum(unknown, _DOUBT / _bump(share) * off)
+    above, place = jnp.zeros_like(end.x, bool), h
+    for n in range(_PARTS - 1, 0, -1):
+        share = n / _PARTS
+        over = horner(curve, jnp.asarray(share)) + _bump(share) * unknown > 0
+        above, place = above | over, jnp.where(over, share * h, place)
+    return above & ((end.x < 0) | c.landed) & (h > _SHORTEST), place
+
+
+def _bump(share: float) -> float:
+    """The shape of a Hermite interpolant's error, of third order at both ends; 1 in the middle."""
+    return (4 * share * (1 - share)) ** 3
 
 
 def may_turn_twice(direction: Scalar, path: Path, h: Scalar) -> Flag:

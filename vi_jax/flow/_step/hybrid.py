@@ -23,6 +23,7 @@ from ..._types import Flag, Scalar, State
 from ...lanes import pin_flag
 from .._arrival import Onward
 from .._lane import FREE, Lane, Plan, Record, select
+from ..noise import kicked
 from ..smooth import holding
 from .aim import aim_ahead, aim_at
 from .arrive import arrive
@@ -39,7 +40,7 @@ class Step(NamedTuple):
     """Whether an interval ended with it."""
     state: State
     record: Record
-    """Of that interval."""
+    """What is recorded of the interval that ended."""
 
 
 def iterate(plan: Plan, lane: Lane) -> Step:
@@ -56,13 +57,15 @@ def iterate(plan: Plan, lane: Lane) -> Step:
     rejected = active & ~trial.good
     length = _resized(plan, lane, trial, taken, rejected)
     there, completed = arrive(plan, lane, trial, taken)
-    completed = pin_flag(completed, lane.s)
+    reached = completed = pin_flag(completed, lane.s)
+    if plan.noise is not None:
+        completed = completed & plan.is_record_point(lane.part, lane.done)
     done = lane.done + jnp.where(completed, 1.0, 0.0)
-    new = _onward(plan, there, completed, done)
+    new = _onward(plan, there, reached, completed, done)
 
     steps = lane.steps + jnp.where(active, 1.0, 0.0)
     # Counted anew in each interval: in single precision the sum of all stands still at 2²⁴.
-    spent = jnp.where(completed, 0.0, lane.spent + 1.0)
+    spent = jnp.where(reached, 0.0, lane.spent + 1.0)
     fault = there.fault
     aims = jnp.where(aim, lane.aims + 1, 0.0)
     progress = Progress(length, new.record, steps, spent, aims)
@@ -84,17 +87,17 @@ def iterate(plan: Plan, lane: Lane) -> Step:
     return Step(new, completed, new.state, there.record)
 
 
-def _onward(plan: Plan, there: Lane, completed: Flag, done: Scalar) -> Lane:
+def _onward(plan: Plan, there: Lane, reached: Flag, completed: Flag, done: Scalar) -> Lane:
     """The lane as its next interval begins, where one was completed; and as its next cycle begins,
     where that was the cycle's last.
 
-    **Arguments:** `there`, the lane after the step; `completed`, whether it completed an interval;
-    `done`, how many are complete.
+    **Arguments:** `there`, the lane after the step; whether it `reached` the end of a piece of its
+    cycle, and `completed` an interval with it; `done`, how many are complete.
     """
-    turned, part, state = completed, there.part, there.state
-    if plan.parts > 1:
-        part = part + jnp.where(completed, 1.0, 0.0)
-        turned = completed & (part >= plan.parts)
+    turned, part, state = reached, there.part, there.state
+    if plan.instants > 1:
+        part = part + jnp.where(reached, 1.0, 0.0)
+        turned = reached & (part >= plan.instants)
         part = jnp.where(turned, plan.first_part(done), part)
     s = jnp.where(turned, 0.0, there.s)
     if not plan.ticks(state):
@@ -105,6 +108,14 @@ def _onward(plan: Plan, there: Lane, completed: Flag, done: Scalar) -> Lane:
         direction, contact = after_jump(plan, onward, turned, state, renewed, jnp.zeros_like(s))
         there = dataclasses.replace(there, direction=direction, contact=contact)
         state = select(turned, renewed, state)
+    if plan.noise is not None:
+        before = done - jnp.where(completed, 1.0, 0.0)
+        at = stop_gradient((plan.cycle_of(before), there.part))
+        behind = kicked(plan.noise, reached, *at, state)
+        onward = Onward(there.direction, there.contact, there.modes, there.below)
+        direction, contact = after_jump(plan, onward, reached, state, behind, s)
+        there = dataclasses.replace(there, direction=direction, contact=contact)
+        state = behind
     record = select(completed, plan.fresh(state), there.record)
     return dataclasses.replace(there, s=s, state=state, part=part, record=record)
 

@@ -72,6 +72,8 @@ class Trial(NamedTuple):
     """The machine as the step saw it: its bodies held where they rest."""
     alone: tuple[SmoothMachine, ...]
     """Of each coordinate, the machine in its modes with the other bodies held that rest."""
+    clear: Flag | None
+    """Nothing can have been met within it; absent where that is never known before."""
 
     @property
     def s(self) -> Scalar:
@@ -115,7 +117,9 @@ def attempt(
     free = lane.target == FREE
     bound = plan.end(lane.part)
     limit = method.longest(machine, lane.s, lane.state)
-    h = stop_gradient(jnp.where(free, jnp.minimum(lane.attempt, limit), lane.attempt))
+    h, clear = jnp.minimum(lane.attempt, limit), _clear(plan, lane)
+    h = stop_gradient(jnp.where(free, h if clear is None else jnp.maximum(h, clear), lane.attempt))
+    nothing = None if clear is None else free & (h <= clear)
     s1, last = lane.s + h, jnp.zeros_like(free)
     if plan.ticks(lane.state):
         # The margin spares a step for the last sliver that rounding leaves.
@@ -131,7 +135,7 @@ def attempt(
     else:
         new, beside, error = method.step(smooth, lane.s, s1, lane.state, beside)
     time = None if lane.record.time is None else elapsed(lane.record.time, beside, h)
-    if lane.contact is not None and not method.uses_field:
+    if lane.contact is not None and not method.holds(machine):
         rests = lane.contact[0] > 0
         new = jtu.tree_map(lambda a, b: jnp.where(rests, a, b), lane.state, new)
     new = pin(new)
@@ -152,7 +156,20 @@ def attempt(
             paths.append(_path(plan, lane, k, one, smooth, (s1, new, h, limit), good))
     seen, below = crossings(plan, lane, smooth, paths, (s1, h, new), (good, last))
     end, found = End(s1, new, time), Seen(seen, tuple(paths), below)
-    return Trial(h, end, error, good, last, found, smooth, alone)
+    return Trial(h, end, error, good, last, found, smooth, alone, nothing)
+
+
+def _clear(plan: Plan, lane: Lane) -> Scalar | None:
+    """How long nothing can be met from here, in which only the end of a step counts; 0 where it is
+    not so, `None` where that is never known."""
+    if plan.averages or plan.meets_turns(lane.done) is True:
+        return None
+    clear = plan.method.clear(plan.machine, lane.s, lane.state)
+    if clear is None:
+        return None
+    for contact in lane.contact or ():
+        clear = jnp.where(contact > 0, 0.0, clear)
+    return stop_gradient(jnp.where(plan.meets_turns(lane.done), 0.0, clear))
 
 
 def _path(

@@ -33,11 +33,15 @@ from ._coefficients import (
 _LINEAR = (
     "neg", "convert_element_type", "stop_gradient", "copy", "copy_p", "pin", "reshape",
     "broadcast_in_dim", "squeeze", "expand_dims", "transpose", "slice", "rev", "reduce_sum",
-    "cumsum", "split",
+    "cumsum", "split", "tile",
 )  # fmt: skip
 
-# What moves arrays about: of all operands at once.
-_JOINED = ("concatenate", "stack", "dynamic_slice")
+# What is linear in several operands at once: those in these places, or all; the others are places
+# in arrays, known where the step begins.
+_JOINED = {
+    "concatenate": None, "stack": None, "pad": None, "dynamic_slice": (0,), "gather": (0,),
+    "dynamic_update_slice": (0, 1), "scatter": (0, 2), "scatter-add": (0, 2),
+}  # fmt: skip
 
 # What is decided by the value where the step begins.
 _DECIDED = ("eq", "ne", "lt", "le", "gt", "ge", "and", "or", "not", "xor", "is_finite", "iota")
@@ -59,10 +63,10 @@ def _linear(eqn, n, operands, results, extra):
 
 
 def _joined(eqn, n, operands, results, extra):
-    parts = [nth(x, n) for x in operands]
-    if eqn.primitive.name == "dynamic_slice":
-        return None if parts[0] is None else _bound(eqn, parts[0], *(x[0] for x in operands[1:]))
-    if all(p is None for p in parts):
+    places = _JOINED[eqn.primitive.name]
+    parts = [nth(x, n) if places is None or i in places else x[0] for i, x in enumerate(operands)]
+    moving = parts if places is None else [parts[i] for i in places]
+    if all(p is None for p in moving):
         return None
     full = [jnp.zeros_like(x[0]) if p is None else p for p, x in zip(parts, operands, strict=True)]
     return _bound(eqn, *full)

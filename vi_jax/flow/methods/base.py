@@ -51,9 +51,9 @@ class AbstractMethod(eqx.Module):
         to 1 + |state|; 0 where only by rounding, as the steps are the same in each period."""
         return 0.0
 
-    @property
-    def uses_field(self) -> bool:
-        """Whether a step evaluates the machine's field, and so holds what the field holds."""
+    def holds(self, machine: AbstractMachine) -> bool:
+        """Whether a step holds the bodies that rest, as one does that evaluates the field; else the
+        whole state stays as it is while a body rests."""
         return True
 
     def check(self, machine: AbstractMachine) -> None:
@@ -71,6 +71,11 @@ class AbstractMethod(eqx.Module):
         if fading is not None:
             limit = jnp.minimum(limit, 0.8 * pi * fading)
         return limit * (5 / self.steps_per_cycle)
+
+    def clear(self, machine: AbstractMachine, s: Scalar, state: State) -> Scalar | None:
+        """A length of motion from here in which no stop can be met, whatever the motion does
+        within; a step may be so long, and is not searched. `None` of a method that knows none."""
+        return None
 
     @abc.abstractmethod
     def step(

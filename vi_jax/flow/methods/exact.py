@@ -1,4 +1,4 @@
-"""Flight in closed form: the ideally driven oscillator between impacts."""
+"""Flight in closed form: the ideally driven oscillator, and linear machines, between impacts."""
 
 from collections.abc import Callable
 from math import factorial
@@ -15,13 +15,17 @@ from ...machine import (
     AbstractMachine,
     CosineCrank,
     IdealDrive,
+    LinearMachine,
+    ModalMachine,
     OscillatorState,
+    Prepared,
     Scene,
     horner,
     sincos,
 )
 from ..beside import Beside, rate_beside
 from ..smooth import SmoothMachine
+from ._linear import clear, flown, longest
 from .base import AbstractMethod
 
 # Series of the cosine and of sin(x)/x in x²: on an arc, of up to 2π/5, the next term is below
@@ -41,12 +45,16 @@ _NODES, _WEIGHTS = (0.5 * (x + shift) for x, shift in zip(leggauss(10), (1.0, 0.
 
 
 class ExactFlight(AbstractMethod):
-    """The closed form of Y'' + 2ξY' + Y = cos φ between impacts; only impact times need a root.
+    """The closed form of Y'' + 2ξY' + Y = cos φ between impacts, and of M x'' + C x' + K x = f of a
+    linear machine (`vi.machines.Structure`); only impact times need a root.
 
     Holds for every ξ ≥ 0 (under-, critically and over-damped) and every ζ > 0, ζ = 1 with ξ = 0
     (the secular case) included. For ideal drives with a `CosineCrank`. The motion is followed in
     arcs of at most a fifth of the shorter period, each ended at the next turning point, so that
-    an impact is missed only if it is shallower than rounding.
+    an impact is missed only if it is shallower than rounding. Of a linear machine of several modes
+    arcs are a tenth of the period of the fastest one that moves a contact by more than rounding;
+    what modes coupled by damping do, or resonance, or a body at rest, is a matrix exponential by
+    its series.
 
     **Arguments:** `steps_per_cycle`, arcs in a turn (default 5, the fewest). More of them change
     nothing but the rounding.
@@ -63,10 +71,9 @@ class ExactFlight(AbstractMethod):
         """Three more arcs: the difference is what rounding has grown to."""
         return ExactFlight(self.steps_per_cycle + 3)
 
-    @property
-    def uses_field(self) -> bool:
-        """False: the flight is written out."""
-        return False
+    def holds(self, machine):
+        """Of a linear machine what rests is held; another one does not move as it rests."""
+        return isinstance(machine, LinearMachine | ModalMachine)
 
     def check(self, machine):
         """Refuse machines whose flight has no closed form."""
@@ -74,12 +81,27 @@ class ExactFlight(AbstractMethod):
         if lack is not None:
             raise ValueError(f"Method `ExactFlight` needs a {lack}. Use `Adaptive` or `FixedStep`.")
 
+    def longest(self, machine, s, state):
+        """The longest step from here; of a linear machine by the modes that matter there."""
+        if not isinstance(machine, ModalMachine):
+            return super().longest(machine, s, state)
+        return longest(machine, s, state) * (5 / self.steps_per_cycle)
+
+    def clear(self, machine, s, state):
+        """By a bound of what all modes can do; a share of a cycle at most, as a step of one mode
+        is."""
+        if not isinstance(machine, ModalMachine):
+            return None
+        return jnp.minimum(clear(machine, s, state), machine.cycle / self.steps_per_cycle)
+
     def step(self, smooth, s0, s1, state, beside):
         """The flight from `s0` to `s1`, exact to rounding; averages by quadrature along it.
 
         **Arguments:** as `AbstractMethod.step`.
         """
         machine = smooth.machine
+        if isinstance(machine, LinearMachine | ModalMachine):
+            return _linear(smooth, s0, s1, state, beside)
         zeta, xi, in_phase = _numbers(machine)
         tau = (s1 - s0) / zeta if in_phase else s1 - s0
         phase = machine.phase_at(s0 if in_phase else zeta * s0)
@@ -91,6 +113,26 @@ class ExactFlight(AbstractMethod):
         if beside is not None:
             beside = _integrated(smooth, s0, s1, state, along, beside)
         return along(None), beside, jnp.zeros_like(s0)
+
+
+def _linear(
+    smooth: SmoothMachine, s0: Scalar, s1: Scalar, state: State, beside: Beside | None
+) -> tuple[State, Beside | None, Scalar]:
+    """The flight of a linear machine, in its modes or to be taken there; as `ExactFlight.step`."""
+    machine, h = smooth.machine, s1 - s0
+    if isinstance(machine, LinearMachine):
+        way = machine.prepared_modes()
+    else:
+        way = Prepared(machine, lambda x: x, lambda x: x)
+    begin = way.inward(state)
+
+    def along(share: float) -> State:
+        return way.outward(flown(way.machine, smooth.contact, s0, share * h, begin))
+
+    if beside is not None:
+        beside = _integrated(smooth, s0, s1, state, along, beside)
+    new = way.outward(flown(way.machine, smooth.contact, s0, h, begin))
+    return new, beside, jnp.zeros_like(s0)
 
 
 def _integrated(
@@ -105,7 +147,7 @@ def _integrated(
     total = beside
     for node, weight in zip(_NODES, _WEIGHTS, strict=True):
         there = along(float(node))
-        if smooth.contact:
+        if smooth.contact and not isinstance(smooth.machine, LinearMachine):
             rests = smooth.contact[0] > 0
             there = jtu.tree_map(lambda a, b, rests=rests: jnp.where(rests, a, b), state, there)
         rate = rate_beside(smooth, s0 + float(node) * (s1 - s0), there, beside)
@@ -117,6 +159,8 @@ def _integrated(
 def lack_of_closed_form(machine: AbstractMachine) -> str | None:
     """What a machine should be for its flight to be the closed form, and what it is instead, in
     words; `None` if it is that."""
+    if isinstance(machine, LinearMachine | ModalMachine):
+        return _lack_of_linear(machine)
     if not isinstance(machine, Scene) or not isinstance(machine.drive, IdealDrive):
         drive = type(machine.drive if isinstance(machine, Scene) else machine).__name__
         return f"`Scene` with an `IdealDrive`, but got a `{drive}`"
@@ -127,6 +171,16 @@ def lack_of_closed_form(machine: AbstractMachine) -> str | None:
         return f"`Scene` with its own field, but a `{type(machine).__name__}` has another `field`"
     if machine.switches:
         return f"machine without soft stops, but it has {len(machine.switches)}"
+    return None
+
+
+def _lack_of_linear(machine: AbstractMachine) -> str | None:
+    """As `lack_of_closed_form`, of a machine that is linear but for what a subclass changes."""
+    name = type(machine).__name__
+    if isinstance(machine, LinearMachine) and type(machine).field is not LinearMachine.field:
+        return f"linear machine with the field of its matrices, but a `{name}` has another `field`"
+    if machine.switches:
+        return f"machine without switches, but it has {len(machine.switches)}"
     return None
 
 

@@ -1,0 +1,79 @@
+"""Runs the scripts and writes `docs/validated.md`: `python experiments/validated [name ...]`.
+
+With names only these are run, and nothing is written.
+"""
+
+import contextlib
+import io
+import re
+import runpy
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).resolve().parent
+PAGE = HERE.parents[1] / "docs" / "validated.md"
+SCRIPTS = sorted(path for path in HERE.glob("*.py") if not path.name.startswith("_"))
+# In the order of the page: what most people know first.
+ORDER = (
+    "siconos_balls", "matlab_balls", "contact_gradients", "heyoka_ramp", "heyoka_sensitivity",
+    "coco_grazing", "coco_stick_slip", "pwsdde_pair", "mpgos_valve", "siconos_woodpecker",
+    "siconos_friction", "bstab_belt", "duffing_basins", "walker", "siconos_chain", "siconos_bar",
+)  # fmt: skip
+
+BEGIN = """# Validated against other codes
+
+What vi_jax gives for published examples of other codes and authors. Each section is a script of at
+most sixty lines in [`experiments/validated`](../experiments/validated). The tests run all of them
+and compare every number below with what comes out.
+
+*Theirs* is written with the digits that were published. *How* says where these come from: printed
+in a documentation, a program or the reference file of a test, known in closed form, or computed
+from their equations by an independent integrator. Where they are not right to their last digit, it
+says how far off they are. The time is that of a processor (an Intel Xeon's core) for the script,
+compilation included.
+"""
+
+
+def comparison_of(path: Path) -> Any:
+    """What a script compares; it prints nothing."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        return runpy.run_path(str(path))["comparison"]
+
+
+def told(path: Path) -> tuple[str, str]:
+    """The title and the text that a script begins with."""
+    text = path.read_text(encoding="utf-8").split('"""')[1]
+    title, _, body = text.partition("\n")
+    return title.lstrip("# "), body.strip()
+
+
+def section(path: Path, comparison: Any, seconds: float) -> str:
+    """A section of the page."""
+    title, text = told(path)
+    source = re.sub(r"https://[^\s,;]+", r"<\g<0>>", comparison.source)
+    return (
+        f"## {comparison.code}: {title[0].lower()}{title[1:]}\n\n{text}\n\n{comparison}\n\n"
+        f"*How:* {comparison.how}. *Source:* {source}.\n\n"
+        f"[Script](../experiments/validated/{path.name}), {seconds:.0f} s.\n"
+    )
+
+
+def main() -> None:
+    """Run all scripts and write the page, or run those that are named."""
+    names = sys.argv[1:]
+    assert sorted(ORDER) == [path.stem for path in SCRIPTS]
+    sections = []
+    for name in names or ORDER:
+        begin = time.process_time()
+        comparison = comparison_of(HERE / f"{name}.py")
+        seconds = time.process_time() - begin
+        sections.append(section(HERE / f"{name}.py", comparison, seconds))
+        print(f"{name}, {seconds:.1f} s\n{comparison}\n", flush=True)
+    if not names:
+        PAGE.write_text("\n".join([BEGIN, *sections]), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,60 @@
+# %% [markdown]
+"""# The derivative of a bounce
+
+A ball flies at a floor without gravity and bounces without loss: raised by 1 cm at the start, it
+ends 1 cm lower, since it arrives later. Simulators that step over the contact give +1, or a jump.
+With gravity and e = 0.8 the derivatives of the height at T = 1 s are known in closed form as well.
+"""
+
+# %%
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import vi_jax as vi
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from tools.validated import Comparison
+
+jax.config.update("jax_enable_x64", True)
+
+
+# %% Height Y (m) over a second
+class Ball(vi.AbstractMachine):
+    gravity: jax.Array | float
+    stops: tuple[vi.RigidStop, ...]
+    cycle: float = 1.0
+
+    def field(self, s, state):
+        return vi.OscillatorState(state.V, -self.gravity + 0 * state.V)
+
+
+def ends(height, restitution, gravity, speed):
+    ball = Ball(gravity, (vi.RigidStop(0.0, restitution, "left"),))
+    start = vi.OscillatorState(jnp.asarray(height), jnp.asarray(speed))
+    return vi.simulate(ball, start, 1, method=vi.Adaptive(rtol=1e-12)).last.Y
+
+
+flies, drops = (2.95, 1.0, 0.0, -5.0), (1.0, 0.8, 9.81, 0.0)
+apart = (ends(1.0 + 1e-5, *drops[1:]) - ends(1.0 - 1e-5, *drops[1:])) / 2e-5
+
+# %% v is the speed of the first impact, e v that behind it
+g, e, v = 9.81, 0.8, np.sqrt(2 * 9.81)
+by_height, again = g * (1 + e) / v - 1 - 2 * e, -(g**2) * (1 + e) / v**3
+comparison = Comparison(
+    "Brax, MuJoCo MJX, DiffTaichi",
+    "https://github.com/google/brax/issues/317, https://github.com/google-deepmind/mujoco/issues/"
+    "2841; Y. Hu and others, DiffTaichi, ICLR 2020 (time of impact)",
+    "in closed form, which is what the reports ask for",
+    [
+        ("no gravity, by the height: forward", "-1", jax.jacfwd(ends)(*flies)),
+        ("backward", "-1", jax.grad(ends)(*flies)),
+        ("with gravity, by the height", f"{by_height:.12f}", jax.grad(ends)(*drops)),
+        ("the same by differences of runs", f"{by_height:.12f}", apart, 1e-8),  # h² and 1e-14/h
+        ("second derivative", f"{again:.12f}", jax.jacfwd(jax.jacfwd(ends))(*drops)),
+        ("by the restitution", f"{v - v**2 / g:.12f}", jax.grad(ends, 1)(*drops)),
+    ],
+)
+print(comparison)

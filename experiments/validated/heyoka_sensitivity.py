@@ -1,0 +1,60 @@
+# %% [markdown]
+"""# How the time of an event changes
+
+A mass on a spring of stiffness k is pushed off with speed 1. How does the time at which it first
+turns change with k, and how a misfit (x - 10.123)² of the place where it turns?
+"""
+
+# %%
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import vi_jax as vi
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from tools.validated import Comparison
+
+jax.config.update("jax_enable_x64", True)
+
+
+# %% A cycle ends where the velocity falls through zero
+class Spring(vi.AbstractMachine):
+    stiffness: jax.Array | float
+    stops: tuple = ()
+    cycle: float = 2.0
+
+    def section(self, state):
+        return -state.V
+
+    def field(self, s, state):
+        return vi.OscillatorState(state.V, -self.stiffness * state.Y)
+
+
+def turn(stiffness):
+    """Its time, and the misfit of its place."""
+    start = vi.OscillatorState(jnp.array(0.0), jnp.array(1.0))
+    run = vi.simulate(Spring(stiffness), start, 1, method=vi.Adaptive(rtol=1e-13))
+    return run.duration[0], (run.last.Y - 10.123) ** 2
+
+
+# %%
+comparison = Comparison(
+    "heyoka.py",
+    "https://bluescarni.github.io/heyoka.py, Computing event sensitivity",
+    "printed in its documentation, where variational equations are written by hand",
+    [
+        (
+            "derivative of the time by k, k = 0.456",
+            "-2.5506015388296643",
+            jax.grad(lambda k: turn(k)[0])(0.456),
+        ),
+        (
+            "derivative of the misfit by k, k = 7.23",
+            "0.5015866697490922",
+            jax.grad(lambda k: turn(k)[1])(7.23),
+        ),
+    ],
+)
+print(comparison)

@@ -1,0 +1,46 @@
+"""A body on a belt whose friction falls with the speed of sliding, for several packages' tests."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import vi_jax as vi
+
+
+def level(speed):
+    return 0.5 + 0.5 * jnp.exp(-2 * speed)
+
+
+class Belt(vi.AbstractMachine):
+    """x'' = -x - 0.1 x' + friction of a belt that runs at `speed`; a cycle ends where the body is
+    furthest back."""
+
+    speed: jax.Array | float = 1.5
+    stops: tuple = ()
+
+    @property
+    def switches(self):
+        return (
+            vi.DryFriction(
+                level,
+                velocity=lambda machine, x: x.V - machine.speed,
+                force=pull,
+                stopped=lambda machine, x: eqx.tree_at(lambda x: x.V, x, machine.speed),
+            ),
+        )
+
+    @property
+    def cycle(self):
+        return 2 * np.pi
+
+    def section(self, state):
+        return state.V
+
+    def field(self, s, x, mode):
+        return vi.OscillatorState(
+            x.V, pull(self, s, x) + self.switches[0].contribution(self, s, x, mode)
+        )
+
+
+def pull(machine, s, x):
+    return -x.Y - 0.1 * x.V

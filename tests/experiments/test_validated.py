@@ -1,0 +1,68 @@
+"""The examples of other codes: each script gives what the page prints, beside their numbers."""
+
+import re
+from math import floor, log10
+
+import pytest
+from tools.validated import Comparison, last_digit
+from validated.__main__ import ORDER, SCRIPTS, comparison_of, section, told
+
+from gallery_page import rows, sections
+
+# The quickest of them; the others run with the slow tests.
+QUICK = {
+    "siconos_balls", "matlab_balls", "heyoka_ramp", "heyoka_sensitivity", "coco_stick_slip",
+    "siconos_friction", "siconos_chain", "siconos_woodpecker",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
+def test_is_a_short_script_on_the_page(script):
+    text = script.read_text(encoding="utf-8")
+    assert text.startswith('# %% [markdown]\n"""# ') and len(text.splitlines()) <= 60
+    part = sections()[script.stem]
+    assert told(script)[1] in part
+
+
+def test_the_page_has_every_script_once():
+    assert list(sections()) == list(ORDER)
+    assert sorted(ORDER) == [path.stem for path in SCRIPTS]
+
+
+@pytest.mark.parametrize(
+    "script",
+    [
+        pytest.param(path, id=path.stem, marks=[] if path.stem in QUICK else pytest.mark.slow)
+        for path in SCRIPTS
+    ],
+)
+def test_gives_what_the_page_prints(script):
+    comparison = comparison_of(script)
+    part = sections()[script.stem]
+    now = section(script, comparison, 0.0)
+    # All but the table and the time, word for word.
+    prose = [re.sub(r"\), \d+ s\.", "", re.sub(r"^\|.*\n", "", x, flags=re.M)) for x in (part, now)]
+    assert prose[1].strip() == f"## {prose[0].strip()}"
+    printed = rows(part)
+    assert len(printed) == len(comparison.numbers) > 0
+    for cells, number in zip(printed, comparison.numbers, strict=True):
+        quantity, theirs, ours, difference = cells
+        assert (quantity, theirs) == (number.quantity, number.theirs)
+        # Two units of the last digit: machines round differently. Of a zero, its bound.
+        zero = float(theirs) == 0
+        slack = number.allowed if zero else 2 * last_digit(ours)
+        assert abs(float(ours) - float(number.ours)) <= slack, quantity
+        assert float(difference) <= number.allowed * 1.1, quantity  # of one digit
+        size = 10.0 ** floor(log10(float(difference) or 1e-300))
+        assert abs(float(difference) - number.difference) <= 0.51 * size + slack, quantity
+
+
+def test_a_number_that_is_off_is_refused():
+    good = Comparison("a code", "a page", "printed", [("x", "0.488", 0.4884), ("n", "0", 0.0)])
+    assert str(good).splitlines()[2:] == ["| x | 0.488 | 0.4884 | 4e-04 |", "| n | 0 | 0e+00 | 0 |"]
+    assert (last_digit("0.488"), last_digit("12"), last_digit("1.25e-3")) == (1e-3, 1.0, 1e-5)
+    for wrong in (0.4886, float("nan")):
+        with pytest.raises(ValueError, match=r"x: theirs 0\.488, ours .* 5e-04 apart"):
+            Comparison("a code", "a page", "printed", [("x", "0.488", wrong)])
+    with pytest.raises(ValueError, match="1e-02 apart"):
+        Comparison("a code", "a page", "printed", [("x", "0.488", 0.5, 0.01)])

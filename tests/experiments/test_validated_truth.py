@@ -1,0 +1,121 @@
+"""What the page of others' examples says to be by SciPy, computed by SciPy from event to event."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq, fsolve
+from tools.validated import last_digit
+
+from gallery_page import rows, sections
+
+pytestmark = pytest.mark.slow
+CLOSE = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-14}
+
+
+def theirs(script):
+    """What the page prints as theirs, by quantity; of equal names the first."""
+    return {row[0]: row[1] for row in reversed(rows(sections()[script]))}
+
+
+def agree(printed, computed):
+    assert abs(float(printed) - computed) <= 1.5 * last_digit(printed)
+
+
+def crossing(function, direction):
+    function.terminal, function.direction = True, direction
+    return function
+
+
+def test_balls_in_a_row():
+    def rate(t, z):
+        x, v = z[:10], z[10:]
+        push = np.maximum(x[:-1] - x[1:], 0) ** 1.5
+        return np.concatenate([v, -np.diff(push, prepend=0, append=0)])
+
+    v = solve_ivp(rate, (0, 60), np.eye(20)[10], **CLOSE).y[10:, -1]
+    known = theirs("siconos_chain")
+    for name, i in (("the first", 0), ("the ninth", 8), ("the last", 9)):
+        agree(known[f"by SciPy: {name}"], v[i])
+
+
+def lifted(flow_rate, y):
+    """The valve from a maximum of its lift to the next: state, time, impacts."""
+
+    def rate(t, y):
+        falls = y[0] * np.sqrt(y[2])
+        return [y[1], y[2] - 1.25 * y[1] - y[0] - 10, 20 * (flow_rate - falls)]
+
+    greatest = crossing(lambda t, y: y[1], -1)
+    seat = crossing(lambda t, y: y[0], -1)
+    out = solve_ivp(rate, (0, 1e-3), y, **CLOSE)
+    hits = 0
+    while True:
+        out = solve_ivp(rate, (out.t[-1], 50), out.y[:, -1], events=(greatest, seat), **CLOSE)
+        if len(out.t_events[0]):
+            return out.y[:, -1], out.t[-1], hits
+        out.y[:2, -1] = 0.0, -0.8 * out.y[1, -1]
+        hits += 1
+
+
+@pytest.mark.parametrize(
+    ("flow_rate", "guess", "hits", "lift"),
+    [
+        (3.0, (2.5, 1.53), 1, "greatest lift, q = 3, one impact a cycle"),
+        (7.8, (7.39, 1.12), 0, "greatest lift, q = 7.8, no impact"),
+    ],
+)
+def test_a_relief_valve(flow_rate, guess, hits, lift):
+    def left(x):
+        return lifted(flow_rate, (x[0], 0, x[1]))[0][[0, 2]] - x
+
+    x = fsolve(left, guess, xtol=1e-10)
+    _, time, struck = lifted(flow_rate, (x[0], 0, x[1]))
+    assert struck == hits
+    printed = rows(sections()["mpgos_valve"])
+    known = {row[0]: row[1] for row in (printed[:3] if hits else printed[3:])}
+    agree(known[lift], x[0])
+    agree(known["time of a cycle"], time)
+    if hits:
+        agree(known["pressure there"], x[1])
+
+
+def half(omega, z):
+    """Half a period of the two masses, mirrored."""
+
+    def rate(t, z):
+        x, y, u, v = z
+        pull = 0.952**2 * (x - y) + 2 * 0.127 * (u - v) + 0.1 * (x - y) ** 3
+        return [u, v, np.cos(omega * t) - x - 2 * 0.02 * u - 0.1 * x**3 - 0.05 * pull, pull]
+
+    ends = [crossing(lambda t, z, s=s: s * (z[1] - z[0]) - 1, 1) for s in (1, -1)]
+    t, z = 0.0, np.array(z)
+    while t < np.pi / omega:
+        out = solve_ivp(rate, (t, np.pi / omega), z, events=ends, **CLOSE)
+        t, z = out.t[-1], out.y[:, -1]
+        if t < np.pi / omega:
+            mean = 1.9 * (z[2] + 0.05 * z[3]) / 1.05
+            z[2:] = mean - 0.9 * z[2:]
+    return -z
+
+
+def test_two_masses():
+    known, guess = theirs("pwsdde_pair"), np.array([-0.686, -1.514, 0.1256, -1.2246])
+
+    def orbit(omega, guess):
+        return fsolve(lambda z: half(omega, z) - z, guess, xtol=1e-12)
+
+    z = orbit(1.5, guess)
+    agree(known["x1 at phase 0, ω = 1.5"], z[0])
+    agree(known["x2"], z[1])
+    for omega in (1.47, 1.45):
+        z = orbit(omega, z)
+
+    def above(omega):
+        """Symmetry is lost where a multiplier of half a period is -1."""
+        at, h = orbit(omega, z), 1e-5
+        steps = h * np.eye(4)
+        slopes = [(half(omega, at + e) - half(omega, at - e)) / (2 * h) for e in steps]
+        return np.linalg.eigvals(np.transpose(slopes)).real.min() + 1
+
+    # The differences are right to 1e-9.
+    agree(known["ω at which the symmetry is lost"], brentq(above, 1.438, 1.441, xtol=1e-11))

@@ -1,0 +1,316 @@
+"""White noise as impulses: the path, its random numbers, and stationary means in closed form.
+
+The oscillator is x'' + 0.2 x' + x = 0.5 dW, of temperature σ²/(4ζ) = 0.625.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+from jax.extend.random import threefry_2x32
+from scipy.linalg import expm
+from vi_jax.flow._random import normal_pair, threefry
+
+from differences import quick
+from free_oscillator import Free
+
+SIGMA, CYCLE = 0.5, 2 * np.pi
+START = vi.OscillatorState(jnp.array(1.0), jnp.array(0.0))
+
+
+class Walled(Free):
+    """With a rigid stop to its left."""
+
+    restitution: jax.Array
+    place: jax.Array
+
+    @property
+    def stops(self):
+        return (vi.RigidStop(-self.place, self.restitution, "left"),)
+
+    def averages(self, s, x):
+        return {"square": x.V**2}
+
+
+class Cushioned(Free):
+    """With a spring stop of stiffness 10 beyond 1."""
+
+    @property
+    def switches(self):
+        return (vi.SoftStop(1.0, 10.0, damping=0.0),)
+
+    def push(self, x, mode):
+        return jnp.where(mode > 0, 10.0 * (x.Y - 1.0), 0.0)
+
+    def field(self, s, x, mode):
+        return vi.OscillatorState(x.V, -x.Y - 0.2 * x.V - self.push(x, mode))
+
+    def averages(self, s, x, mode):
+        return {"contact": 0.5 * (mode + 1.0), "force": self.push(x, mode)}
+
+
+def walled(restitution=0.7, place=0.0):
+    return Walled(jnp.array(restitution), jnp.array(place))
+
+
+def shaken(impulses=16, amplitude=SIGMA):
+    return vi.WhiteNoise({"V": amplitude}, impulses=impulses)
+
+
+KEYS = jax.random.split(jax.random.key(5), 21)
+
+
+def paths(keys=KEYS, machine=None, cycles=8, **options):
+    machine = walled() if machine is None else machine
+
+    def one(key):
+        return vi.simulate(machine, START, cycles, noise=shaken(), key=key, **options)
+
+    return jax.vmap(one)(keys)
+
+
+@pytest.fixture(scope="module")
+def many():
+    return paths()
+
+
+def means(values):
+    """The mean over lanes, and its standard error from the means of each."""
+    each = np.asarray(values).reshape(len(values), -1).mean(axis=1)
+    return np.array([each.mean(), each.std(ddof=1) / len(each) ** 0.5])
+
+
+def test_the_generator_is_threefry():
+    key = jax.random.key_data(jax.random.key(7))
+    counts = jnp.array([5, 2**31 + 9], jnp.uint32)
+    assert np.array_equal(jnp.stack(threefry(key, *counts)), threefry_2x32(key, counts))
+
+
+def test_numbers_are_normal_and_independent():
+    key, count = jax.random.key_data(jax.random.key(1)), jnp.arange(200_000, dtype=jnp.uint32)
+    x, y = (np.asarray(a) for a in normal_pair(key, count // 64, count % 64, jnp.float64))
+    n = len(x)
+    for z in (x, y):
+        for power, moment, variance in ((1, 0, 1), (2, 1, 2), (3, 0, 15), (4, 3, 96)):
+            assert abs(np.mean(z**power) - moment) < 4 * (variance / n) ** 0.5
+        assert abs(np.mean(z[1:] * z[:-1])) < 4 / n**0.5
+    assert abs(np.mean(x * y)) < 4 / n**0.5
+    assert abs(np.mean(x**2 * y**2) - 1) < 4 * (8 / n) ** 0.5
+
+
+def test_the_path_is_the_linear_flow_with_jumps_between():
+    key, n, cycles = KEYS[3], 16, 5
+    run = vi.simulate(Free(), START, cycles, noise=shaken(n), key=key)
+    words, x, found = jax.random.key_data(key), np.array([1.0, 0.0]), [[1.0, 0.0]]
+    flow = expm(np.array([[0.0, 1.0], [-1.0, -0.2]]) * CYCLE / n)
+    for cycle in range(cycles):
+        for instant in range(n):
+            bits = np.asarray(threefry_2x32(words, jnp.array([cycle, instant], jnp.uint32)))
+            u, turn = (bits[0] + 0.5) / 2**32, bits[1] / 2**32
+            normal = np.sqrt(-2 * np.log(u)) * np.cos(2 * np.pi * turn)
+            x = flow @ x + [0.0, SIGMA * np.sqrt(CYCLE / n) * normal]
+        found.append(x)
+    here = np.stack([run.sections.Y, run.sections.V], axis=1)
+    np.testing.assert_allclose(here, found, atol=1e-9)
+
+
+def test_impulses_on_a_machine_that_counts_in_phase_are_those_of_its_time():
+    """A cycle of which takes π, by a phase of 2π."""
+
+    class Sooner(Free):
+        cycle = np.pi
+
+    forced = vi.machines.Duffing(amplitude=0.0, frequency=2.0, damping=0.2, gap=50.0)
+    here, there = (
+        vi.simulate(machine, START, 4, noise=shaken(), key=KEYS[3], record="sections").sections
+        for machine in (forced, Sooner())
+    )
+    np.testing.assert_allclose(here.V, there.V, atol=1e-9)
+    np.testing.assert_allclose(here.Y, there.Y, atol=1e-9)
+
+
+def test_a_path_depends_on_its_key_alone(many):
+    V = np.asarray(many.sections.V)
+    assert np.array_equal(paths(KEYS[5:6]).sections.V[0], V[5])
+    assert np.array_equal(paths(KEYS[::-1]).sections.V[::-1], V)
+    with vi.threads(1):
+        assert np.array_equal(paths().sections.V, V)
+    assert len(np.unique(V[:, 1])) == len(V)
+
+
+def test_samples_leave_the_path(many):
+    V = np.asarray(many.sections.V)
+    np.testing.assert_allclose(paths(samples=4).sections.V, V, atol=1e-11)
+
+
+@pytest.mark.slow
+def test_methods_and_backends_leave_the_path(many):
+    V = np.asarray(many.sections.V)
+    np.testing.assert_allclose(paths(method=vi.FixedStep()).sections.V, V, atol=1e-10)
+    with vi.backend("xla"):
+        np.testing.assert_allclose(paths().sections.V, V, atol=1e-11)
+
+
+def test_cycles_that_settle_are_counted():
+    whole = paths(record="sections").sections.V
+    late = paths(cycles=5, settle=3, record="sections").sections.V
+    assert np.array_equal(late, whole[:, 3:])
+
+
+@pytest.mark.parametrize("mode", quick([jax.jacfwd, jax.grad], jax.jacfwd))
+def test_derivatives_follow_the_path(mode):
+    def last(x):
+        noise = shaken(16, x[0])
+        return vi.simulate(walled(x[1]), START, 3, noise=noise, key=KEYS[0]).last.V
+
+    at, step = jnp.array([0.5, 0.7]), 1e-6
+    differences = [(last(at + e) - last(at - e)) / (2 * step) for e in step * jnp.eye(2)]
+    np.testing.assert_allclose(mode(last)(at), differences, rtol=1e-6)
+
+
+@pytest.mark.parametrize("wall", quick(["elastic", "rebounds", "pressed"], "pressed"))
+def test_energy_is_balanced_for_any_number_of_impulses(wall):
+    """At 0.3 the spring presses the body on its stop, where it comes to rest between impulses."""
+    walls = {"elastic": (1.0, 0.0), "rebounds": (0.7, 0.0), "pressed": (0.5, 0.3)}
+    restitution, place = walls[wall]
+    machine = walled(restitution, place)
+
+    def one(key):
+        noise, log = shaken(), 96
+        options = {"settle": 20, "noise": noise, "key": key, "impact_log": log}
+        run = vi.simulate(machine, START, 100, **options)
+        speeds = jnp.nansum(run.impact_log.speed**2, axis=-1)
+        lost = 0.2 * run.averages["square"] + 0.5 * (1 - restitution**2) * speeds / CYCLE
+        return lost, run.impacts, run.y_min
+
+    lost, impacts, lowest = jax.jit(jax.vmap(one))(jax.random.split(jax.random.key(2), 256))
+    assert np.max(impacts) <= 96
+    assert np.min(lowest) >= place - 1e-12
+    mean, error = means(lost)
+    assert error < 2e-3
+    assert abs(mean - SIGMA**2 / 2) < 3 * error
+
+
+def extrapolated(found, few, many):
+    """Means at no time between impulses, from those for two numbers of impulses, with errors."""
+    a, b = many / (many - few), few / (many - few)
+    return {
+        k: (a * found[many][k][0] - b * found[few][k][0],
+            np.hypot(a * found[many][k][1], b * found[few][k][1]))
+        for k in found[few]
+    }  # fmt: skip
+
+
+def stationary(observed, few=32, many=64):
+    found = {}
+    for impulses in (few, many):
+        keys = jax.random.split(jax.random.key(impulses), 1024)
+        values = jax.jit(jax.vmap(lambda key, n=impulses: observed(shaken(n), key)))(keys)
+        found[impulses] = {name: means(x) for name, x in values.items()}
+    return extrapolated(found, few, many)
+
+
+def check(found, truth, largest):
+    for name, value in truth.items():
+        mean, error = found[name]
+        assert error < largest * value
+        assert abs(mean - value) < 3 * error, (name, mean, error)
+
+
+@pytest.mark.slow
+def test_an_elastic_wall_leaves_the_temperature():
+    def observed(noise, key):
+        run = vi.simulate(walled(1.0), START, 400, settle=40, noise=noise, key=key)
+        return {"square": run.averages["square"], "impacts": run.impacts / CYCLE}
+
+    check(stationary(observed), {"square": 0.625, "impacts": 1 / np.pi}, 0.01)
+
+
+@pytest.mark.slow
+def test_a_spring_stop_is_touched_as_boltzmann_says():
+    def observed(noise, key):
+        start = vi.OscillatorState(jnp.array(0.5), jnp.array(0.0))
+        options = {"settle": 40, "noise": noise, "key": key, "event_log": 16}
+        run = vi.simulate(Cushioned(), start, 400, **options)
+        log = run.event_log
+        touched = jnp.sum((log.kind == 3) & (log.value > 0), axis=-1)
+        return {**run.averages, "touched": touched / CYCLE}
+
+    truth = {"contact": 0.0540010619, "force": 0.0867696801, "touched": 0.0754152755}
+    check(stationary(observed), truth, 0.02)
+
+
+class Growing(vi.AbstractMachine):
+    """x' = 0.3 x, a cycle of 1."""
+
+    stops = ()
+    cycle = 1.0
+
+    def field(self, s, x):
+        return {"x": 0.3 * x["x"]}
+
+
+def in_proportion(state):
+    return 0.5 * state["x"]
+
+
+def test_an_amplitude_that_depends_on_the_state_is_itos():
+    """Of geometric Brownian motion dx = 0.3 x dt + 0.5 x dW both moments are known, with any number
+    of impulses; in Stratonovich's sense the mean would be larger by exp(0.25), 28 %."""
+    noise, start = vi.WhiteNoise({"x": in_proportion}, impulses=8), {"x": jnp.array(1.0)}
+
+    def last(key):
+        return vi.simulate(Growing(), start, 2, noise=noise, key=key).last["x"]
+
+    found = np.asarray(jax.jit(jax.vmap(last))(jax.random.split(jax.random.key(8), 20_000)))
+    truth = (np.exp(0.6), np.exp(1.2) * (1 + 0.25 / 8) ** 16)
+    for power, moment in enumerate(truth, 1):
+        mean, error = means(found**power)
+        assert error < 0.02 * moment
+        assert abs(mean - moment) < 3 * error
+
+
+def test_a_constant_function_is_its_number():
+    noise = vi.WhiteNoise({"V": lambda state: SIGMA}, impulses=16)
+    run = vi.simulate(walled(), START, 8, noise=noise, key=KEYS[5])
+    assert np.array_equal(run.sections.V, paths(KEYS[5:6]).sections.V[0])
+
+
+class Released(Cushioned):
+    """Its stop lets go where the force falls to zero, which a jump of the velocity may pass."""
+
+    @property
+    def switches(self):
+        return (vi.SoftStop(1.0, 10.0, damping=0.5, adhesive=False),)
+
+
+MOTOR = vi.Parameters(torque=10.0, restitution=0.5, gap=0.05).scene()
+
+
+@pytest.mark.parametrize(
+    "machine, options, message",
+    [
+        (walled(), {"noise": 0.5}, "must be a `WhiteNoise`"),
+        (walled(), {"key": None}, "Argument `key` must be one key"),
+        (walled(), {"key": KEYS}, "use `jax.vmap`"),
+        (walled(), {"samples": 5}, "must divide the number of impulses"),
+        (walled(), {"noise": vi.WhiteNoise({"W": 0.5})}, r"parts of the state \(Y, V\)"),
+        (walled(), {"noise": vi.WhiteNoise({"Y": 0.5})}, "must change velocities only"),
+        (walled(), {"noise": vi.WhiteNoise({"V": jnp.array([0.5, 1.0])})}, "one amplitude"),
+        (walled(), {"noise": vi.WhiteNoise({"V": lambda x: jnp.ones(2)})}, "one returns shape"),
+        (MOTOR, {}, "whose cycles all have the same known duration"),
+        (Released(), {}, "without friction"),
+    ],
+)
+def test_what_does_not_fit_is_refused(machine, options, message):
+    given = {"noise": shaken(), "key": KEYS[0], **options}
+    start = START if isinstance(machine, Free) else machine.start()
+    with pytest.raises((TypeError, ValueError), match=message):
+        vi.simulate(machine, start, 2, **given)
+
+
+@pytest.mark.parametrize("amplitudes", [{}, 0.5, {"V": -1.0}, {"V": np.nan}, {"V": 1j}])
+def test_amplitudes_are_checked(amplitudes):
+    with pytest.raises((TypeError, ValueError), match="Argument `amplitudes`"):
+        vi.WhiteNoise(amplitudes)

@@ -1,0 +1,17 @@
+"""A damped oscillator without stops or a drive: under noise everything is known of it."""
+
+import jax.numpy as jnp
+import vi_jax as vi
+
+
+class Free(vi.AbstractMachine):
+    """x'' + 0.2 x' + x = σ dW, of temperature σ²/0.4."""
+
+    stops = ()
+
+    @property
+    def cycle(self):
+        return 2 * jnp.pi
+
+    def field(self, s, x):
+        return vi.OscillatorState(x.V, -x.Y - 0.2 * x.V)

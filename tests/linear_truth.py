@@ -1,0 +1,140 @@
+"""Linear machines with rigid stops by SciPy's matrix exponential, apart from the package."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import expm
+
+
+class Chatters(Exception):
+    """More impacts in a cycle than can be followed one by one."""
+
+
+class Contact(NamedTuple):
+    """A stop: sign·c·x ≤ gap."""
+
+    row: np.ndarray
+    gap: float
+    restitution: float
+    sign: int = 1
+
+
+class LinearTruth:
+    """M x'' + C x' + K x = f₀ + f₁ cos ωs + f₂ sin ωs between stops.
+
+    The state is (x, v, 1, cos ωs, sin ωs), which a matrix carries. Steps of a fortieth of the
+    fastest period are looked at, at both ends and at the turn between them, and events found by
+    halving. A contact without restitution rests on its stop until its force turns."""
+
+    def __init__(self, matrices, loads, frequency, contacts):
+        mass, damping, stiffness = (np.asarray(x, float) for x in matrices)
+        n, self.contacts, self.frequency = len(mass), contacts, frequency
+        self.n, self.inverse = n, np.linalg.inv(mass)
+        self.free = np.zeros((2 * n + 3, 2 * n + 3))
+        self.free[:n, n : 2 * n] = np.eye(n)
+        self.free[n : 2 * n, :n] = -self.inverse @ stiffness
+        self.free[n : 2 * n, n : 2 * n] = -self.inverse @ damping
+        self.free[n : 2 * n, 2 * n :] = self.inverse @ np.stack(loads, axis=1)
+        self.free[2 * n + 1, 2 * n + 2], self.free[2 * n + 2, 2 * n + 1] = -frequency, frequency
+        fastest = np.sqrt(np.abs(np.linalg.eigvals(self.inverse @ stiffness)).max())
+        self.steps = int(np.ceil(40 * max(fastest / frequency, 1.0)))
+        self.known = {}
+
+    def held(self, resting):
+        """The matrix while these contacts rest."""
+        if not resting:
+            return self.free
+        c = np.stack([self.contacts[i].row for i in resting])
+        push = self.inverse @ c.T
+        project = np.eye(len(self.free))
+        rows = slice(self.n, 2 * self.n)
+        project[rows, rows] -= push @ np.linalg.solve(c @ push, c)
+        return project @ self.free
+
+    def moved(self, resting, length, z):
+        key = resting, length
+        if key not in self.known:
+            self.known[key] = expm(self.held(resting) * length)
+        return self.known[key] @ z
+
+    def depth(self, i, z):
+        c = self.contacts[i]
+        return c.sign * (c.row @ z[: self.n]) - c.gap
+
+    def speed(self, i, z):
+        c = self.contacts[i]
+        return c.sign * (c.row @ z[self.n : 2 * self.n])
+
+    def pressed(self, i, resting, z):
+        others = tuple(j for j in resting if j != i)
+        rate = self.held(others) @ z
+        return self.contacts[i].sign * (self.contacts[i].row @ rate[self.n : 2 * self.n])
+
+    def first_zero(self, resting, z, length, function):
+        """Where a function of the state, negative here, is positive first, as far as it is seen."""
+        low, high = 0.0, length
+        for _ in range(52):
+            middle = 0.5 * (low + high)
+            if function(expm(self.held(resting) * middle) @ z) > 0:
+                high = middle
+            else:
+                low = middle
+        return high
+
+    def event(self, resting, z, length):
+        """Time and contact of the first event within a step, or `None`."""
+        end, found = self.moved(resting, length, z), []
+        for i in range(len(self.contacts)):
+            if i in resting:
+                if self.pressed(i, resting, end) < 0:
+                    found.append(
+                        (
+                            self.first_zero(
+                                resting, z, length, lambda y, i=i: -self.pressed(i, resting, y)
+                            ),
+                            i,
+                        )
+                    )
+                continue
+            reach = length
+            if self.speed(i, z) > 0 > self.speed(i, end):  # it turns in between
+                reach = self.first_zero(resting, z, length, lambda y, i=i: -self.speed(i, y))
+            top = expm(self.held(resting) * reach) @ z
+            if self.depth(i, top) > 1e-13 and self.speed(i, top) > -1e-9:
+                found.append(
+                    (
+                        self.first_zero(resting, z, reach, lambda y, i=i: self.depth(i, y)),
+                        i,
+                    )
+                )
+        return min(found) if found else None
+
+    def cycle(self, x, v, resting=()):
+        """State and impacts after a cycle from s = 0, and what rests then."""
+        z, clock, impacts = np.concatenate([x, v, [1.0, 1.0, 0.0]]), 0.0, 0
+        period = 2 * np.pi / self.frequency
+        step, behind = period / self.steps, 0
+        while clock < period * (1 - 1e-14):
+            # Behind an impact a hop may begin and end within a step.
+            length = min(step / 16 if behind < 32 else step, period - clock)
+            behind += 1
+            event = self.event(resting, z, length)
+            if event is None:
+                z, clock = self.moved(resting, length, z), clock + length
+                continue
+            length, i = event
+            z, clock = expm(self.held(resting) * length) @ z, clock + length
+            if i in resting:
+                resting = tuple(j for j in resting if j != i)
+                continue
+            impacts, behind = impacts + 1, 0
+            if impacts > 60:
+                raise Chatters
+            c = self.contacts[i]
+            push = self.inverse @ c.row
+            speed = c.row @ z[self.n : 2 * self.n]
+            z[self.n : 2 * self.n] -= (1 + c.restitution) * speed * push / (c.row @ push)
+            z[: self.n] -= c.sign * self.depth(i, z) * push / (c.row @ push)
+            if c.restitution == 0 and self.pressed(i, resting, z) > 0:
+                resting = (*resting, i)
+        return z[: self.n], z[self.n : 2 * self.n], impacts, resting

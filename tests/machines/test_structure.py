@@ -1,0 +1,270 @@
+"""Structures of many degrees of freedom beside matrix exponentials, and what they refuse."""
+
+import contextlib
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+
+from linear_truth import Chatters
+from structures import KINDS, machine_and_truth
+
+
+def check_cycle_by_cycle(machine, truth, start, cycles, tolerance=1e-11, **options):
+    """Each cycle from the reference's state: equal states and impacts. Returns all impacts, and how
+    often a contact rested as a cycle ended."""
+    (x, v), resting, impacts, rests = start, (), 0, 0
+    for _ in range(cycles):
+        state = machine.start(displacement=x, velocity=v)
+        x, v, count, resting = truth.cycle(x, v, resting)
+        run = vi.simulate(machine, state, 1, **options)
+        assert bool(run.successful)
+        impacts, rests = impacts + count, rests + len(resting)
+        assert int(run.impacts[0]) == count
+        np.testing.assert_allclose(run.last.displacement, x, rtol=0, atol=tolerance)
+        np.testing.assert_allclose(run.last.velocity, v, rtol=0, atol=tolerance)
+    return impacts, rests
+
+
+def test_beside_matrix_exponentials():
+    """Damped in any way, and with a motion as a rigid body."""
+    total, options = 0, {"record": "sections", "rests": False}
+    for seed, kind in enumerate(KINDS):
+        total += check_cycle_by_cycle(*machine_and_truth(seed, 3, kind), 1, **options)[0]
+    assert total >= 10
+
+
+def test_rest_beside_matrix_exponentials():
+    """What comes to rest on a stop is held, the others moving on, until its force turns."""
+    rested = 0
+    for kind, seed in (("proportional", 5), ("general", 1), ("rigid", 1), ("undamped", 5)):
+        machine, truth, start = machine_and_truth(seed, 2, kind, (0.0, 0.0, 0.0), 0.5)
+        machine = dataclasses.replace(machine, contacts=machine.contacts[:1])
+        truth.contacts = truth.contacts[:1]
+        rested += check_cycle_by_cycle(machine, truth, start, 3, record="sections")[1]
+    assert rested >= 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("n", [1, 2, 4, 8, 40])
+def test_machines_of_all_kinds(n):
+    """Large ones by XLA; a seed that chatters is left out."""
+    compared = impacts = 0
+    with vi.backend("xla") if n > 8 else contextlib.nullcontext():
+        for kind in KINDS:
+            for seed in range(3 if n <= 8 else 1):
+                with contextlib.suppress(Chatters):
+                    case = machine_and_truth(100 * n + seed, n, kind)
+                    options = {"record": "sections", "rests": False}
+                    impacts += check_cycle_by_cycle(*case, 3, **options)[0]
+                    compared += 1
+    assert compared >= (9 if n <= 8 else 3) and impacts > 5
+
+
+@pytest.mark.slow
+def test_rest_on_several_stops_beside_adaptive_steps():
+    compared = 0
+    for n in (1, 3, 5):
+        for kind in KINDS:
+            machine, _, start = machine_and_truth(2, n, kind, (0.0, 0.0, 0.0), 0.3)
+            start = machine.start(displacement=start[0], velocity=start[1])
+            runs = [vi.simulate(machine, start, 3, method=m) for m in (None, tight())]
+            assert bool(runs[0].successful) and bool(runs[1].successful)
+            np.testing.assert_array_equal(runs[0].impacts, runs[1].impacts)
+            np.testing.assert_array_equal(runs[0].rests, runs[1].rests)
+            for a, b in zip(*(jax.tree.leaves(run.sections) for run in runs), strict=True):
+                np.testing.assert_allclose(a, b, rtol=0, atol=1e-11)
+            compared += int(runs[0].rests.sum())
+    assert compared > 10
+
+
+def tight():
+    return vi.Adaptive(rtol=1e-13)
+
+
+def oscillator(**changes):
+    given = {
+        "mass": [2.0], "damping": [0.2], "stiffness": [2.0], "force": [2.0], "frequency": 0.9,
+        "contacts": (vi.RigidStop(0.7, 0.6, at=[1.0]),), **changes,
+    }  # fmt: skip
+    return vi.machines.Structure(**given)
+
+
+def test_of_one_degree_it_is_the_oscillator():
+    scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.6, gap=0.7, damping_ratio=0.05)
+    wanted = vi.simulate(scene, scene.start(Y=0.1), 20)
+    run = vi.simulate(machine := oscillator(), machine.start(displacement=0.1), 20)
+    np.testing.assert_allclose(run.last.displacement, wanted.last.Y, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(run.last.velocity, wanted.last.V, rtol=0, atol=1e-11)
+    np.testing.assert_array_equal(run.impacts, wanted.impacts)
+    np.testing.assert_allclose(run.y_min, wanted.y_min, rtol=0, atol=1e-11)
+    # ½ M (1 - k²) V², in units of the stiffness: the mass that is hit is 2.
+    np.testing.assert_allclose(run.impact_energy, 2 * wanted.impact_energy, rtol=1e-9)
+
+
+def test_undamped_in_resonance_and_with_a_constant_force():
+    """x = sin(s)·s/2 + 3(1 - cos s), and a rigid body under a constant force: s²/2."""
+    machine = vi.machines.Structure(
+        mass=[1.0, 1.0], stiffness=[1.0, 0.0], force=[1.0, 0.0], static_force=[3.0, 1.0]
+    )
+    last = vi.simulate(machine, machine.start(), 1, record="sections").last
+    T = 2 * np.pi
+    np.testing.assert_allclose(last.displacement, [0.0, T * T / 2], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(last.velocity, [T / 2, T], rtol=0, atol=1e-12)
+
+
+def test_energy_and_momentum_of_an_impact():
+    """A blow takes ½ (1 - k²) m (c·v)², with m = 1/(cᵀM⁻¹c), and acts along c alone."""
+    machine, _, _ = machine_and_truth(4, 4, "general")
+    stop, body = machine.stops[2], machine.coordinates[1]
+    v = jnp.asarray([0.3, -0.2, 0.5, 0.1])
+    state = machine.start(velocity=v)
+    new = body.placed(state, body.position(state), stop.rebound(body.velocity(state)))
+    mass, row = np.asarray(machine.mass), np.asarray(stop.at)
+    gained = mass @ np.asarray(new.velocity - v)
+    np.testing.assert_allclose(gained / row, gained[0] / row[0], rtol=1e-10)
+    lost = 0.5 * (v @ mass @ v - new.velocity @ mass @ new.velocity)
+    np.testing.assert_allclose(lost, body.mass * stop.loss(row @ v), rtol=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("alike", [False, True], ids=["apart", "coincident"])
+def test_derivatives_by_matrices(alike):
+    """By mass, damping, stiffness, gap, frequency, force and start, where frequencies coincide
+    too: beside adaptive steps and differences."""
+    n = 3
+    base = 1.5 * np.eye(n) if alike else 2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
+    change = np.array([[0.3, 0.2, 0.1], [0.2, -0.1, 0.4], [0.1, 0.4, 0.2]])
+
+    def last(p, method=None):
+        machine = vi.machines.Structure(
+            mass=jnp.eye(n) + p[1] * change @ change, damping=0.05 * np.eye(n) + p[2] * change,
+            stiffness=base + p[0] * change, force=p[5] * jnp.asarray([1.0, 0.3, -0.2]),
+            frequency=p[4], contacts=(vi.RigidStop(p[3], 0.7, at=jnp.array([0.3, 0, 1]) + p[7]),),
+        )  # fmt: skip
+        start = machine.start(displacement=p[6] * jnp.array([0.1, 0.2, -0.3]))
+        run = vi.simulate(machine, start, 3, method=method, record="sections", rests=False)
+        return jnp.concatenate([run.last.displacement, run.last.velocity])
+
+    p = jnp.asarray([0.0, 0.0, 0.0, 0.25, 0.9, 1.0, 1.0, 0.0])
+    found = jax.jacfwd(last)(p)
+    wanted = jax.jacfwd(lambda p: last(p, tight()))(p)
+    size = np.abs(wanted).max(axis=0)
+    np.testing.assert_allclose(found / size, wanted / size, rtol=0, atol=1e-9)
+    h = 1e-6 * jnp.eye(8)
+    slopes = np.stack([(last(p + e) - last(p - e)) / 2e-6 for e in h], axis=-1)
+    np.testing.assert_allclose(found / size, slopes / size, rtol=0, atol=1e-6)
+
+    def energy(stiff):
+        return jax.grad(lambda x: jnp.sum(last(p.at[jnp.array([0, 4])].set(x)) ** 2))(stiff)
+
+    # Of second order, by stiffness and frequency.
+    at = p[jnp.array([0, 4])]
+    second = jax.jacfwd(energy)(at)
+    differences = [(energy(at + e) - energy(at - e)) / 2e-5 for e in 1e-5 * jnp.eye(2)]
+    np.testing.assert_allclose(second, np.stack(differences, -1), rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_steps_of_one_length():
+    method = vi.FixedStep(steps_per_cycle=40)
+    machine, _, start = machine_and_truth(0, 3, "general")
+    start = machine.start(displacement=start[0], velocity=start[1])
+    wanted, run = (vi.simulate(machine, start, 2, method=m) for m in (None, method))
+    np.testing.assert_array_equal(run.impacts, wanted.impacts)
+    np.testing.assert_allclose(run.last.displacement, wanted.last.displacement, atol=1e-9)
+
+
+def test_both_sides_of_a_gap_are_one_coordinate():
+    c = [1.0, -1.0]
+    stops = (
+        vi.RigidStop(0.5, 0.8, at=c),
+        vi.RigidStop(0.5, 0.8, "left", at=c),
+        vi.RigidStop(1.0, at=[0.0, 1.0], restitution=0.5),
+    )
+    machine = vi.machines.Structure(mass=np.eye(2), stiffness=np.eye(2), contacts=stops[:2])
+    assert len(machine.coordinates) == 1
+    state = machine.start(displacement=[0.1, 0.2])
+    np.testing.assert_array_equal(machine.mirrored(state).displacement, [-0.1, -0.2])
+    machine = vi.machines.Structure(mass=np.eye(2), stiffness=np.eye(2), contacts=stops)
+    assert [stop.coordinate for stop in machine.stops] == [0, 0, 1]
+    assert machine.mirrored(state) is None
+    np.testing.assert_allclose(machine.coordinates[0].mass, 0.5)
+
+
+def test_modes_at_points():
+    """Two equal masses between three equal springs: modes (1, 1) and (1, -1) over √2."""
+    K = np.array([[2.0, -1.0], [-1.0, 2.0]])
+    shapes = np.array([[1.0, 1.0], [1.0, -1.0]]) / np.sqrt(2)
+    contact = (vi.RigidStop(0.6, 0.7, at=[0.0, 1.0]),)
+    given = {"contacts": contact, "force": [1.0, 0.0], "frequency": 0.8}
+    by_modes = vi.machines.Structure.from_modes([1.0, np.sqrt(3.0)], 0.02, shapes, **given)
+    np.testing.assert_allclose(by_modes.contacts[0].at, shapes[1])
+    C = shapes @ np.diag([0.04, 0.04 * np.sqrt(3)]) @ shapes.T
+    plain = vi.machines.Structure(mass=np.eye(2), damping=C, stiffness=K, **given)
+    runs = [vi.simulate(m, m.start(), 6, record="sections") for m in (by_modes, plain)]
+    assert int(runs[0].impacts.sum()) > 3
+    np.testing.assert_array_equal(runs[0].impacts, runs[1].impacts)
+    there = shapes @ np.asarray(runs[0].last.displacement)
+    np.testing.assert_allclose(there, runs[1].last.displacement, rtol=0, atol=1e-12)
+
+
+EYE = np.eye(2)
+WRONG = {
+    "mass that is not square": ({"mass": np.ones((2, 3))}, r"`mass`.*\(2, 3\)"),
+    "no degree of freedom": ({"mass": np.ones((0, 0))}, r"`mass`.*\(0, 0\)"),
+    "mass that is not definite": ({"mass": np.diag([1.0, 0.0])}, "positive definite.* 0,"),
+    "mass that is not symmetric": (
+        {"mass": [[2.0, 1.0], [0.0, 2.0]]},
+        r"`mass`.*symmetric.*\[0, 1",
+    ),
+    "stiffness of another size": ({"stiffness": np.eye(3)}, r"`stiffness`.*\(3, 3\)"),
+    "stiffness not symmetric": ({"stiffness": [[1.0, 0.0], [1.0, 1.0]]}, "`stiffness`.*symmetric"),
+    "damping not symmetric": ({"damping": [[1.0, 0.0], [1.0, 1.0]]}, "`damping`.*symmetric"),
+    "NaN": ({"damping": np.nan * EYE}, "`damping` must be finite.*nan"),
+    "force of another length": ({"force": [1.0]}, r"`force`.*\(2,\).*\(1,\)"),
+    "row of another length": ({"contacts": (vi.RigidStop(1, 1, at=[1.0]),)}, r"contacts\[0\].at"),
+    "row of zeros": ({"contacts": (vi.RigidStop(1, 1, at=[0.0, 0.0]),)}, "zero throughout"),
+    "no row": ({"contacts": (vi.RigidStop(1, 1),)}, r"stop 0 .*at=c"),
+    "frequency": ({"frequency": 0.0}, "`frequency`"),
+}
+
+
+@pytest.mark.parametrize(("changes", "words"), WRONG.values(), ids=WRONG)
+def test_what_is_no_structure(changes, words):
+    with pytest.raises(ValueError, match=words):
+        vi.machines.Structure(**{"mass": EYE, "stiffness": EYE, **changes})
+
+
+def test_what_else_is_refused():
+    machine = oscillator()
+    with pytest.raises(TypeError, match="`contacts` must hold `RigidStop`s"):
+        oscillator(contacts=(1.0,))
+    with pytest.raises(ValueError, match=r"`displacement` must have the shape \(1,\)"):
+        machine.start(displacement=[1.0, 2.0])
+    with pytest.raises(TypeError, match="state of a Structure"):
+        vi.simulate(machine, vi.OscillatorState(jnp.array(0.0), jnp.array(0.0)), 1)
+    with pytest.raises(ValueError, match=r"`start` must have n = 1 numbers"):
+        vi.simulate(machine, vi.machines.StructureState(jnp.zeros(2), jnp.zeros(2)), 1)
+    with pytest.raises(ValueError, match="`damping_ratios`"):
+        vi.machines.Structure.from_modes([1.0, 2.0], [0.1, 0.1, 0.1])
+    with pytest.raises(ValueError, match="`shapes`"):
+        vi.machines.Structure.from_modes([1.0, 2.0], 0.1, np.eye(3))
+    scene = vi.Scene(
+        oscillator=vi.Oscillator(0.1), drive=vi.IdealDrive(0.9),
+        stops=(vi.RigidStop(1.5, 0.5, at=[1.0]),),
+    )  # fmt: skip
+    with pytest.raises(ValueError, match=r"Stop 0 of a Scene .* `at`"):
+        vi.simulate(scene, scene.start(), 1)
+
+
+def test_a_traced_mass_that_is_not_definite_ends_its_lane():
+    def last(mass):
+        machine = oscillator(mass=mass[None, None] * jnp.ones((1, 1)))
+        return vi.simulate(machine, machine.start(), 1, record="sections", rests=False)
+
+    run = vi.jit(jax.vmap(last))(jnp.asarray([2.0, -1.0]))
+    assert run.successful.tolist() == [True, False]

@@ -1,0 +1,142 @@
+"""Branches of motions that rest on a stop for a part of their period."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+import vi_jax as vi
+from jax.flatten_util import ravel_pytree
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
+
+ZETA, GAP = "drive.frequency_ratio", 0.3
+
+
+def scene_at(zeta):
+    """Its body chatters to rest once a cycle; on the section it flies."""
+    scene = vi.Scene.ideal(frequency_ratio=zeta, restitution=0.3, gap=GAP, damping_ratio=0.05)
+    return scene.at_section(np.pi)
+
+
+def settled(scene, cycles=40):
+    return vi.simulate(scene, scene.start(Y=0.0), cycles).last
+
+
+@pytest.fixture(scope="module")
+def branch():
+    scene = scene_at(0.7)
+    orbit = vi.find_orbit(scene, settled(scene), impact_log=32, throw=True)
+    return vi.continue_orbit(orbit, parameter=ZETA, bounds=(0.6, 0.8))
+
+
+def rate(zeta, clock, y, v):
+    """d(y, v)/ds of the body in flight, from the section on."""
+    scene = scene_at(zeta)
+    x = scene.start(Y=y, V=v)
+    return np.asarray(ravel_pytree(RATE(scene, clock, x))[0])
+
+
+RATE = jax.jit(lambda scene, clock, x: scene.field(clock, x))
+
+
+def test_motions_of_the_branch_are_flights_from_release(branch):
+    """A rest ends where the force on the body in it turns away from the stop, by a root; from there
+    to the section the body flies, by scipy."""
+    assert set(branch.rests) == {1}
+    for i in (0, len(branch.parameter) // 2):
+        zeta = float(branch.parameter[i])
+
+        def pressed(clock, zeta=zeta):
+            return rate(zeta, clock, GAP, 0.0)[1]
+
+        clocks = np.linspace(0.0, 2 * np.pi, 60)
+        pressing = np.array([pressed(s) for s in clocks])
+        (k,) = np.flatnonzero((pressing[:-1] > 0) & (pressing[1:] <= 0))
+        release = brentq(pressed, clocks[k], clocks[k + 1], xtol=1e-14)
+        flight = solve_ivp(
+            lambda s, x, zeta=zeta: rate(zeta, s, *x), (release, 2 * np.pi), [GAP, 0.0],
+            method="DOP853", rtol=1e-11, atol=1e-13,
+        )  # fmt: skip
+        assert flight.y[0, 1:].max() < GAP
+        x = [branch.column("section_Y")[i], branch.column("section_V")[i]]
+        np.testing.assert_allclose(np.ravel(x), flight.y[:, -1], atol=1e-9)
+        np.testing.assert_allclose(branch.multipliers[i], 0, atol=1e-12)
+
+
+def test_the_rest_is_lost_where_simulations_lose_it(branch):
+    """Beside a bisection by simulation, without derivative or corrector."""
+    assert branch.ends == ("bounds", "rest")
+    (point,) = branch.special
+    assert point.kind == "rest"
+    assert "lost" in point.detail
+    start = point.orbit.state
+
+    def rests(zeta):
+        return int(vi.simulate(scene_at(zeta), start, 6).rests[-1])
+
+    low, high = point.parameter - 1e-4, point.parameter + 1e-4
+    assert (rests(low), rests(high)) == (1, 0)
+    while high - low > 1e-10:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if rests(middle) else (low, middle)
+    assert point.parameter == pytest.approx(low, abs=1e-8)
+    with pytest.raises(ValueError, match="this special point is a rest"):
+        point.switch()
+    with pytest.raises(ValueError, match="but is a rest"):
+        vi.boundary(point, parameter="stops.0.gap", bounds=((0.6, 0.8), (0.2, 0.4)))
+
+
+def test_its_orbits_list_their_impacts(branch):
+    orbit = branch.orbit(0)
+    assert int(orbit.impacts) == branch.impacts[0] == len(orbit.impact_speed)
+    again = vi.find_orbit(orbit.machine, orbit, impact_log=32, throw=True)
+    np.testing.assert_allclose(orbit.impact_phase, again.impact_phase, atol=1e-8)
+    np.testing.assert_allclose(orbit.impact_speed, again.impact_speed, atol=1e-8)
+    assert "rest on a stop" in str(branch)
+
+
+@pytest.mark.slow
+def test_a_stop_on_the_other_side_is_grazed_where_the_body_turns():
+    """Until then the motion does not know of that stop, so that its least position is the place."""
+    scene = scene_at(0.7)
+    other = vi.RigidStop(gap=2.5, restitution=0.3, side="left")
+    scene = dataclasses.replace(scene, stops=(*scene.stops, other))
+    orbit = vi.find_orbit(scene, settled(scene), impact_log=32, throw=True)
+    branch = vi.continue_orbit(orbit, parameter="stops.1.gap", bounds=(1.5, 2.6), max_step=0.3)
+    assert branch.ends == ("grazing", "bounds")
+    point = branch.special[0]
+    assert point.parameter == pytest.approx(-float(orbit.y_min), abs=1e-10)
+    with pytest.raises(ValueError, match="this one rests"):
+        point.switch()
+    with pytest.raises(ValueError, match="these rest"):
+        vi.boundary(point, parameter=ZETA, bounds=((1.5, 2.6), (0.5, 0.8)))
+    with pytest.raises(ValueError, match="without rest on a stop"):
+        vi.grazing(point)
+
+
+@pytest.mark.slow
+def test_a_motor_remembers_its_speed_through_a_rest():
+    """Rest forgets two of three numbers; the third's multiplier beside differences of the map."""
+    scene = vi.Parameters(torque=10.0, control=0.55, restitution=0.3, gap=0.006).scene(
+        drive="motor"
+    )
+    scene = scene.at_section(np.pi)
+    orbit = vi.find_orbit(scene, settled(scene, 100), impact_log=32, throw=True)
+    gap = float(scene.stops[0].gap)
+    branch = vi.continue_orbit(
+        orbit, parameter="stops.0.gap", bounds=(0.95 * gap, gap), max_step=0.3
+    )
+    there = branch.orbit(0)
+    x, unravel = ravel_pytree(there.state)
+
+    def mapped(x):
+        run = vi.simulate(there.machine, unravel(x), 1, method=there.method)
+        return np.asarray(ravel_pytree(run.last)[0])
+
+    h = 1e-4
+    differences = [(mapped(x + h * e) - mapped(x - h * e)) / (2 * h) for e in np.eye(3)]
+    expected = np.linalg.eigvals(np.stack(differences, axis=-1))
+    expected = expected[np.argsort(-np.abs(expected))]
+    assert abs(expected[0]) > 1e-5
+    np.testing.assert_allclose(branch.multipliers[0], expected, atol=1e-7)

@@ -1,0 +1,108 @@
+"""Which scenes have their motions in closed form, and what is said of others."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+from vi_jax.orbit.closed_form import closed_form_orbits
+
+from closed_forms import ideal, solve
+
+
+@pytest.mark.slow
+def test_reads_the_scene_and_its_tracers():
+    scene = ideal(damping_ratio=0.01)
+    orbits = jax.jit(partial(closed_form_orbits, cycles=2))(scene)
+    direct = solve(0.9, 0.01, 0.5, 2.0, 2)
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-12), orbits, direct)
+
+    def speed(zeta):
+        return closed_form_orbits(ideal(frequency_ratio=zeta)).impact_speed[0]
+
+    speeds, zetas = jax.jit(jax.vmap(speed)), jnp.array([0.85, 0.9, 0.95])
+    found = jax.jit(jax.vmap(jax.grad(speed)))(zetas)
+    wanted = (speeds(zetas + 1e-5) - speeds(zetas - 1e-5)) / 2e-5
+    np.testing.assert_allclose(found, wanted, rtol=1e-6)
+
+
+def driven_by_a_motor():
+    motor = vi.Motor(strength=1.0, control=1.0, coupling=0.01, slider_inertia=0.01)
+    return vi.Scene(vi.Oscillator(0.0), motor, (vi.RigidStop(2.0, 0.5),))
+
+
+def stopped_on_the_left():
+    stop = vi.RigidStop(2.0, 0.5, side="left")
+    return vi.Scene(vi.Oscillator(0.0), vi.IdealDrive(0.9), (stop,))
+
+
+class Doubled(vi.CosineCrank):
+    """Of twice the throw."""
+
+    def slide(self, phase):
+        return vi.CosineCrank().slide(phase)._replace(U=2 * jnp.cos(phase))
+
+
+class Hardening(vi.Scene):
+    """With a spring of its own."""
+
+    def field(self, s, state, *modes):
+        flow = super().field(s, state, *modes)
+        return vi.OscillatorState(flow.Y, flow.V - 0.3 * state.Y**3)
+
+
+class Softening(vi.RigidStop):
+    """Another law, of the speed of approach."""
+
+    def rebound(self, V):
+        return -self.restitution * V / (1 + 0.3 * jnp.abs(V))
+
+
+def of(kind=vi.Scene, crank=None, stop=None):
+    crank, stop = crank or vi.CosineCrank(), stop or vi.RigidStop(1.5, 0.9)
+    return kind(vi.Oscillator(0.05), vi.IdealDrive(0.9), (stop,), crank)
+
+
+def falling(approach):
+    return 0.9 / (1 + 0.3 * approach)
+
+
+def test_flight_in_closed_form_is_asked_for_only_where_it_is_that():
+    """Parts with a law of their own are refused, or carried as by steps."""
+    for other in (of(crank=Doubled()), of(Hardening)):
+        with pytest.raises(ValueError, match=r"`ExactFlight` needs a .*(Doubled|Hardening)"):
+            vi.simulate(other, other.start(), 8, method=vi.ExactFlight())
+        assert isinstance(vi.preset(other), vi.FixedStep)
+    for law in (of(stop=Softening(1.5, 0.9)), of(stop=vi.RigidStop(1.5, falling))):
+        exact, stepped = (
+            vi.simulate(law, law.start(), 8, method=method, record="sections")
+            for method in (vi.ExactFlight(), vi.Adaptive(rtol=1e-11))
+        )
+        assert int(exact.impacts.sum()) > 5
+        np.testing.assert_allclose(exact.sections.Y, stepped.sections.Y, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "scene, message",
+    [
+        (lambda: of(crank=Doubled()), "`scene`.*`CosineCrank`.*Doubled"),
+        (lambda: of(Hardening), "`scene`.*Hardening` has another `field`"),
+        (lambda: of(stop=Softening(1.5, 0.9)), "`scene`.*a law of its own: Softening"),
+        (lambda: of(stop=vi.RigidStop(1.5, falling)), "`scene`.*a law of its own"),
+        (driven_by_a_motor, "`scene`.*IdealDrive.*Motor"),
+        (lambda: ideal(crank=vi.SliderCrank(1 / 3)), "`scene`.*CosineCrank.*SliderCrank"),
+        (stopped_on_the_left, r"`scene`.*on the right.*\['left'\]"),
+        (lambda: ideal(gap=None), r"`scene`.*exactly one stop.*\[\]"),
+        (lambda: ideal(frequency_ratio=jnp.array([0.8, 0.9])), r"`scene`.*vmap.*\(2,\)"),
+    ],
+)
+def test_says_what_is_wrong_with_the_scene(scene, message):
+    with pytest.raises(ValueError, match=message):
+        closed_form_orbits(scene())
+
+
+def test_says_what_is_wrong_with_the_cycles():
+    with pytest.raises(ValueError, match="`cycles` must be at least 1, but got 0"):
+        closed_form_orbits(ideal(), cycles=0)

@@ -1,0 +1,113 @@
+"""Periodic motions of machines other than the ideally driven scene: families and motors."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+
+
+class Sledges(eqx.Module):
+    """Places and speeds of two bodies."""
+
+    x: jax.Array
+    v: jax.Array
+    y: jax.Array
+    w: jax.Array
+
+
+class Coupled(vi.AbstractMachine):
+    """Two bodies on a spring that nothing else holds: x'' = y - x - c x' + cos s, y'' = x - y -
+    c y' + push; where they are as a pair is free."""
+
+    damping: jax.Array = eqx.field(default=0.3, converter=jnp.asarray)
+    push: jax.Array = eqx.field(default=0.0, converter=jnp.asarray)
+    stops: tuple = ()
+
+    @property
+    def cycle(self):
+        return 2 * np.pi
+
+    def field(self, s, z):
+        pull = z.y - z.x
+        force = pull - self.damping * z.v + jnp.cos(s)
+        return Sledges(z.v, force, z.w, self.push - pull - self.damping * z.w)
+
+    def position(self, z):
+        return z.x
+
+    def velocity(self, z):
+        return z.v
+
+
+def sledge_speeds(damping):
+    """Of both bodies at s = 0: of their sum, which is free, and of their distance."""
+    both, apart = 1 / (1j + damping), 1j / (1 + 1j * damping)
+    return (both + apart).real / 2, (both - apart).real / 2
+
+
+def test_a_motion_that_may_be_anywhere_is_found_beside_the_guess():
+    """A multiplier is 1 to rounding: the equations of the orbit are singular."""
+    guess = Sledges(*map(jnp.asarray, (0.4, 0.1, 0.3, -0.2)))
+    orbit = vi.find_orbit(Coupled(), guess)
+    assert bool(orbit.successful) and orbit.stability == vi.STABILITY.neutral
+    assert not bool(orbit.stable)
+    speeds = [float(orbit.state.v), float(orbit.state.w)]
+    assert speeds == pytest.approx(sledge_speeds(0.3), abs=1e-10)
+    assert float(orbit.state.x + orbit.state.y) == pytest.approx(0.7, abs=1e-10)
+    with pytest.raises(ValueError, match="one of its multipliers is 1"):
+        vi.continue_orbit(orbit, parameter="damping", bounds=(0.2, 0.5))
+    drifting = vi.find_orbit(Coupled(push=0.01), guess)
+    assert drifting.result == vi.ORBIT_RESULTS.drifts and "drifts" in str(drifting)
+
+
+@pytest.mark.slow
+def test_the_derivative_of_a_motion_that_may_be_anywhere():
+    guess = Sledges(*map(jnp.asarray, (0.4, 0.1, 0.3, -0.2)))
+    found = jax.jacrev(lambda c: vi.find_orbit(Coupled(c), guess).state)(jnp.asarray(0.3))
+    h = 1e-6
+    wanted = np.subtract(sledge_speeds(0.3 + h), sledge_speeds(0.3 - h)) / (2 * h)
+    assert [float(found.v), float(found.w)] == pytest.approx(wanted, abs=1e-8)
+    assert float(found.x + found.y) == pytest.approx(0, abs=1e-10)
+
+
+def motor(torque, restitution, damping=0.5):
+    return vi.Parameters(
+        torque=torque, control=0.9, restitution=restitution, gap=0.08, damping=damping
+    ).scene(drive="motor")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("restitution", [0.5, 0.8])
+def test_motor_orbits_are_where_long_simulation_settles(restitution):
+    for torque in (2.0, 10.0, 100.0):
+        scene = motor(torque, restitution)
+        run = vi.simulate(scene, scene.start(), 400, method=vi.Adaptive(rtol=1e-10))
+        last = jax.tree.map(lambda x: x[-1], run.sections)
+        orbit = vi.find_orbit(scene, last, cycles=2)
+        assert bool(orbit.stable) and bool(orbit.admissible)
+        # k = 0.5 settles on a 2π motion, k = 0.8 on the 4π motion.
+        assert int(orbit.cycles) == (1 if restitution == 0.5 else 2)
+        assert float(orbit.y_min) == pytest.approx(float(run.y_min[-2:].min()), abs=1e-8)
+        for a, b in zip(jax.tree.leaves(orbit.state), jax.tree.leaves(last), strict=True):
+            assert float(a) == pytest.approx(float(b), abs=1e-7)
+        assert float(orbit.frequency_ratio) == pytest.approx(
+            float(2 / (1 / run.frequency_ratio[-1] + 1 / run.frequency_ratio[-2])), abs=1e-9
+        )
+
+
+@pytest.mark.slow
+def test_a_strong_motor_approaches_the_ideal_drive_at_first_order():
+    ideal = vi.Parameters(restitution=0.8, gap=0.08).scene(drive="ideal")
+    ideal = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.8, damping_ratio=ideal.damping_ratio)
+    closed = vi.closed_form_orbits(ideal, cycles=2)
+    apart, torques = [], np.array([50.0, 100.0, 200.0, 400.0])
+    for torque in torques:
+        scene = motor(torque, 0.8)
+        guess = scene.start(Y=closed.Y[0], V=closed.V[0])
+        orbit = vi.find_orbit(scene, guess, cycles=2)
+        assert bool(orbit.successful) and int(orbit.cycles) == 2
+        apart.append(abs(float(orbit.y_min - closed.y_min[0])))
+    slope = np.polyfit(np.log(torques), np.log(apart), 1)[0]
+    assert slope == pytest.approx(-1, abs=0.05)

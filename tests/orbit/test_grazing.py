@@ -1,0 +1,303 @@
+"""What a grazing leads to, beside closed forms, the root map and flights of SciPy's."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm
+from scipy.optimize import brentq
+from vi_jax.orbit._forecast import settled
+from vi_jax.orbit._local_map import graze_at
+
+from grazings import grazing_of
+
+K = 0.8
+
+
+def overdamped(share):
+    """x'' + 10.1 x' + x = cos ωt, whose slower multiplier over a cycle is this share, and the
+    amplitude of its motion without impact, in closed form."""
+    frequency = 0.2 * np.pi / np.log(1 / share)
+    amplitude = 1 / np.hypot(1 - frequency**2, 10.1 * frequency)
+    machine = vi.machines.Duffing(
+        amplitude=1.0, frequency=frequency, damping=10.1, gap=1.1 * amplitude, restitution=K,
+        two_sided=False,
+    )  # fmt: skip
+    return machine, frequency, amplitude
+
+
+@pytest.fixture(scope="module")
+def half():
+    machine, frequency, amplitude = overdamped(0.5)
+    point = grazing_of(machine, "gap", (0.9 * amplitude, 1.2 * amplitude))
+    return point, vi.grazing(point), frequency, amplitude
+
+
+@pytest.mark.slow
+def test_local_map_is_that_of_the_closed_form(half):
+    _, found, frequency, amplitude = half
+    assert found.value == pytest.approx(amplitude, rel=1e-12)
+    field = np.array([[0.0, 1.0], [-1.0, -10.1]])
+    np.testing.assert_allclose(found.matrix, expm(field * 2 * np.pi / frequency), atol=1e-12)
+    np.testing.assert_allclose(np.sort(np.abs(found.multipliers)), [0, 0.5], atol=1e-12)
+    # By the phase: h = gap - amplitude·cos, and dh/ds = -V/ω.
+    assert found.rate[0] == pytest.approx(amplitude, rel=1e-11)
+    np.testing.assert_allclose(found.gradient, [[-1, 0]], atol=1e-15)
+    jump = -np.sqrt(2 * amplitude) * (1 + K) * frequency
+    np.testing.assert_allclose(found.kick, [[0, jump]], rtol=1e-10, atol=1e-15)
+    assert found.slope[0] == pytest.approx(1, abs=1e-10) and found.side == -1
+    e = [-(expm(field * 2 * np.pi * n / frequency) @ [0, jump])[0] for n in range(1, 13)]
+    np.testing.assert_allclose(found.entries, e, atol=1e-13)
+
+
+def true_sections(frequency, gap, cycles):
+    """x and x' a cycle apart, and the impacts, of the overdamped oscillator: flights in closed
+    form, roots by Brent's method."""
+    swing = 1 / (1 - frequency**2 + 10.1j * frequency)
+    slow, fast = -0.1, -10.0
+    period = 2 * np.pi / frequency
+
+    def flight(t0, x0, v0):
+        x0, v0 = (
+            x0 - (swing * np.exp(1j * frequency * t0)).real,
+            v0 - (1j * frequency * swing * np.exp(1j * frequency * t0)).real,
+        )
+        a = (v0 - fast * x0) / (slow - fast)
+        b = x0 - a
+
+        def at(t):
+            turned = swing * np.exp(1j * frequency * np.asarray(t))
+            p, q = a * np.exp(slow * (t - t0)), b * np.exp(fast * (t - t0))
+            return p + q + turned.real, slow * p + fast * q + (1j * frequency * turned).real
+
+        return at
+
+    t, x, v = 0.0, swing.real, (1j * frequency * swing).real
+    sections, hits = [], []
+    for n in range(cycles):
+        end, count = (n + 1) * period, 0
+        while True:
+            at = flight(t, x, v)
+            # An impact falls where the motion without it comes nearest; its neighbourhood is fine.
+            grid = np.union1d(np.linspace(t, end, 400), _near_top(swing, frequency, n, t, end))
+            beyond = at(grid)[0] - gap
+            first = np.flatnonzero((beyond[1:] > 0) & (beyond[:-1] <= 0))
+            if count == 0 and beyond[0] > 0:
+                raise AssertionError("begins beyond the stop")
+            if not first.size:
+                break
+            i = first[0]
+            t = brentq(lambda s, at=at: at(s)[0] - gap, grid[i], grid[i + 1], xtol=1e-15)
+            x, v, count = gap, -K * at(t)[1], count + 1
+            t, x = t + 1e-13, gap - 1e-16
+        x, v = (float(z) for z in flight(t, x, v)(end))
+        t = end
+        sections.append((x, v))
+        hits.append(count)
+    return np.array(sections), np.array(hits)
+
+
+def _near_top(swing, frequency, n, t, end):
+    top = (2 * np.pi * np.arange(n, n + 2) - np.angle(swing)) / frequency
+    near = (top[:, None] + np.linspace(-0.05, 0.05, 401) / frequency).ravel()
+    return near[(near > t) & (near < end)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("beyond", "period"), [(8.4e-5, 5), (1.5e-5, 6), (4.0e-6, 7), (3.5e-5, 0)])
+def test_periods_after_a_grazing(half, beyond, period):
+    """Windows of motions with one impact, chaos between: by the forecast and by the oscillator."""
+    point, found, frequency, amplitude = half
+    gap = amplitude / (1 + beyond)
+    local = graze_at(point).map
+    forecast = settled(local, np.array([gap - amplitude]))
+    assert forecast.period[0] == period
+    sections, hits = true_sections(frequency, gap, 240)
+    last, struck = sections[120:], hits[120:]
+    apart = [np.abs(last[p:] - last[:-p]).max() for p in range(1, 41)]
+    size = np.ptp(last[:, 1])
+    if period:
+        assert forecast.impacts[0] == 1
+        # The roots of the flights here are good to 1e-13, after a drop of some 1e-9.
+        assert apart[period - 1] < 5e-3 * size < 0.1 * min(apart[: period - 1])
+        assert struck[-period:].sum() == 1
+        near, far = found.windows.stable[period - 1]
+        assert far < gap - amplitude < near
+    else:
+        assert min(apart) > 0.01 * size
+        assert found.outcome == vi.SCENARIOS.period_adding_with_chaos
+
+
+@pytest.mark.slow
+def test_the_machine_agrees_over_decades(half):
+    _, found, _, _ = half
+    low, high = found.checked
+    assert high / low > 1e3 and found.agreement > 0.9
+    assert set(found.machine.offset) <= set(found.forecast.offset)
+
+
+def flown(field, hit, s0, s1, x):
+    """A flight of SciPy's with the stop's jump where it is met, or without a stop."""
+    options = {"rtol": 1e-12, "atol": 1e-14, "max_step": 0.02}
+    while True:
+        events = None if hit is None else hit[0]
+        run = solve_ivp(field, (s0, s1), x, events=events, **options)
+        if hit is None or run.status == 0:
+            return run.y[:, -1]
+        s0, x = run.t[-1], hit[1](run.y[:, -1])
+
+
+@pytest.mark.slow
+def test_discontinuity_mapping_beside_flights():
+    """A nonlinear oscillator: what an impact changes is of the order of y, to an error of y²."""
+    machine = vi.machines.Duffing(
+        amplitude=0.5, frequency=0.9, damping=0.6, cubic=0.4, gap=1.5, restitution=K,
+        two_sided=False,
+    )  # fmt: skip
+    graze = graze_at(grazing_of(machine, "gap", (0.1, 2.0)))
+    (touch,) = graze.touches
+    gap = graze.x[-1]
+
+    def field(s, x):
+        push = 0.5 * np.cos(s) - 0.6 * x[1] - x[0] - 0.4 * x[0] ** 3
+        return np.array([x[1], push]) / 0.9
+
+    def beyond(s, x):
+        return x[0] - gap
+
+    beyond.terminal, beyond.direction = True, 1
+    hit = beyond, lambda x: np.array([x[0] - 1e-15, -K * x[1]])
+    depths, errors = 0.02 / 2.0 ** np.arange(4), []
+    for y in depths:
+        deep = touch.state - y**2 * touch.gradient / (touch.gradient @ touch.gradient)
+        before = flown(field, None, touch.clock, touch.clock - 0.5, deep)
+        free = flown(field, None, touch.clock, touch.clock + 0.5, deep)
+        struck = flown(field, hit, touch.clock - 0.5, touch.clock + 0.5, before)
+        kicked = flown(field, None, touch.clock, touch.clock + 0.5, deep + y * touch.kick.vector)
+        errors.append(np.abs(struck - kicked).max())
+        assert np.abs(struck - free).max() > 10 * errors[-1]
+    slopes = np.diff(np.log(errors)) / np.diff(np.log(depths))
+    np.testing.assert_allclose(slopes, 2, atol=0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("restitution", [0.5, 0.8])
+@pytest.mark.parametrize(("damping", "zeta"), [(0.0, 0.70711), (0.04483682577, 0.70998)])
+def test_grazing_of_the_paper(restitution, damping, zeta):
+    """Where the 2π motion of the paper is lost (its BB'): e₁ > 0 > e₂, so that an impact brings
+    the next but one nearer to the stop, and nothing near attracts."""
+    scene = vi.Scene.ideal(frequency_ratio=0.8, restitution=restitution, damping_ratio=damping)
+    closed = vi.closed_form_orbits(scene)
+    point = grazing_of(
+        scene, "drive.frequency_ratio", (0.5, 1.9), scene.start(Y=closed.Y[0], V=closed.V[0])
+    )
+    found = vi.grazing(point)
+    assert found.value == pytest.approx(zeta, abs=1e-5) and found.side == 1
+    rate, turn = np.sqrt(1 - damping**2), 2 * np.pi / found.value
+    n = np.arange(1, 13)
+    e = np.exp(-damping * turn * n) * np.sin(rate * turn * n) / rate
+    e = e * np.sqrt(2 * 2.0) * (1 + restitution) * found.value
+    np.testing.assert_allclose(found.entries, e, rtol=1e-8, atol=1e-8)
+    assert found.entries[0] > 0 > found.entries[1]
+    assert found.outcome == vi.SCENARIOS.jump
+    assert found.checked[1] > 1e3 * found.checked[0] and found.agreement == 1
+
+
+@pytest.mark.slow
+def test_two_stops_are_touched_at_once():
+    """A symmetric motion grazes on both sides; half a period leads from one to the other."""
+    machine = vi.machines.Duffing(amplitude=0.3, frequency=0.7, damping=0.4, gap=1.0)
+    found = vi.grazing(grazing_of(machine, "gap", (0.3, 1.2)))
+    assert found.kick.shape == (2, 2) and found.touched == "left stop and the right stop"
+    field = np.array([[0.0, 1.0], [-1.0, -0.4]])
+    np.testing.assert_allclose(found.matrix, expm(field * 2 * np.pi / 0.7), atol=1e-10)
+    assert found.checked is not None and found.windows is None
+
+
+class Limit(vi.AbstractMachine):
+    """A van der Pol oscillator against a stop, observed as it rises."""
+
+    gap: jax.Array | float = 2.2
+
+    @property
+    def stops(self):
+        return (vi.RigidStop(self.gap, K),)
+
+    @property
+    def cycle(self):
+        return 2 * jnp.pi
+
+    def section(self, x):
+        return x.Y
+
+    def field(self, s, x):
+        return vi.OscillatorState(x.V, 0.1 * (1 - x.Y**2) * x.V - x.Y)
+
+
+@pytest.mark.slow
+def test_what_cannot_be_said_is_refused(half):
+    machine = Limit()
+    start = vi.simulate(machine, vi.OscillatorState(jnp.asarray(0.0), jnp.asarray(2.0)), 100).last
+    point = grazing_of(machine, "gap", (1.8, 2.3), start)
+    with pytest.raises(ValueError, match="forgotten within a period"):
+        vi.grazing(point)
+    scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5)
+    closed = vi.closed_form_orbits(scene)
+    orbit = vi.find_orbit(scene, scene.start(Y=closed.Y[0], V=closed.V[0]))
+    branch = vi.continue_orbit(orbit, parameter="drive.frequency_ratio", bounds=(0.85, 1.0))
+    with pytest.raises(ValueError, match=r"must be a grazing .* but is a period-doubling"):
+        vi.grazing(branch.special[0])
+
+
+@pytest.mark.slow
+def test_it_says_what_follows(half):
+    _, found, _, _ = half
+    text = str(found)
+    assert text.startswith("Grazing at gap = 0.1092048354: touches the right stop\n")
+    assert "what follows: period adding with chaos between" in text
+    assert "one impact in 5 periods: stable at -4.29e-06 … -1.23e-05 from there" in text
+    assert "checked by the machine: from " in text
+    assert "<table>" in found._repr_html_()
+    assert repr(found.outcome) == "SCENARIOS.period_adding_with_chaos"
+
+
+@pytest.mark.slow
+def test_picture(half):
+    _, found, _, _ = half
+    ax = vi.plot_grazing(found)
+    named = [text.get_text() for text in ax.get_legend().get_texts()]
+    assert named[0] == "the machine" and named[-1] == "grazing"
+    assert {"forecast: 5 periods", "forecast: no period"} <= set(named)
+    assert ax.get_xlabel() == "gap d, from 0.109205" and ax.get_xscale() == "function"
+    drawn = np.concatenate([line.get_xdata() for line in ax.lines if len(line.get_xdata())])
+    assert drawn.min() == found.forecast.offset.min() and drawn.max() == 0
+
+
+@pytest.mark.slow
+def test_resonant_grazings_of_a_linear_oscillator():
+    """eₙ ∝ sin(2πn ω_d/ω) vanishes at ω = 2n ω_d/m, ω_d the damped frequency; it begins a motion of
+    n cycles where the entries before it are positive."""
+    damped = np.sqrt(1 - 0.05**2)
+    machine = vi.machines.Duffing(
+        amplitude=0.01, frequency=1.9, damping=0.1, gap=1.0, restitution=K, two_sided=False
+    )
+    point = grazing_of(machine, "amplitude", (0.005, 5.0))
+    curve = vi.boundary(point, parameter="frequency", bounds=((0.001, 5.0), (0.6, 2.2)))
+    found = vi.resonant_grazings(curve, periods=3)
+    wanted = []
+    for n in (1, 2, 3):
+        for m in range(1, 12):
+            frequency = 2 * n * damped / m
+            before = np.sin(2 * np.pi * np.arange(1, n) * damped / frequency)
+            if 0.6 < frequency < 2.2 and (before > 1e-6).all():
+                wanted.append((n, frequency))
+    assert len(wanted) == 5
+    assert sorted(point.period for point in found) == sorted(n for n, _ in wanted)
+    for point in found:
+        amplitude, frequency = point.parameters
+        assert min(abs(frequency - w) for n, w in wanted if n == point.period) < 1e-12
+        # By the swing of the motion without impact at the stop, one away.
+        swing = np.hypot(1 - frequency**2, 0.1 * frequency)
+        assert amplitude == pytest.approx(swing, rel=1e-10)

@@ -1,0 +1,54 @@
+"""The local map of a grazing: root map, and signs of its entries."""
+
+import numpy as np
+import pytest
+from vi_jax.orbit._forecast import is_local, scenario_of, settled, windows
+from vi_jax.orbit._local_map import LocalMap
+
+
+def root_map(share):
+    """One multiplier and a kick that comes back: eₙ = λⁿ."""
+    ones = np.ones((1, 1))
+    return LocalMap(np.array([[[share]]]), ones, ones, np.array([0.5]), np.array([1.0]))
+
+
+@pytest.mark.parametrize(
+    ("share", "outcome", "least", "most"),
+    [
+        (0.15, "period_adding", 0.0, 0.017), (0.24, "period_adding", 0.0, 0.017),
+        (0.26, "period_adding_with_chaos", 0.02, 0.04),
+        (0.3, "period_adding_with_chaos", 0.04, 0.07),
+        (0.5, "period_adding_with_chaos", 0.3, 0.4),
+        (0.65, "period_adding_with_chaos", 0.8, 0.96), (0.68, "chaos", 0.96, 1.0),
+        (0.8, "chaos", 0.99, 1.0),
+    ],
+)  # fmt: skip
+def test_thresholds_of_the_root_map(share, outcome, least, most):
+    """1/4 and 2/3 (Nusse, Ott and Yorke 1994), and the shares of aperiodic motion."""
+    local = root_map(share)
+    offsets = -np.geomspace(1e-7, 1e-3, 1000) * share**2
+    name, aperiodic = scenario_of(local, offsets, settled(local, offsets))
+    assert name == outcome and least <= aperiodic <= most
+
+
+def test_windows_of_the_root_map_shrink_by_the_square_of_the_multiplier():
+    found = windows(root_map(0.2), 4e-4, 6)
+    edges = found.stable[2:, 0]
+    np.testing.assert_allclose(edges[1:] / edges[:-1], 0.04, rtol=0.05)
+    assert np.isnan(found.stable[0]).all()
+
+
+def test_signs_of_the_entries_decide():
+    """One multiplier, by hand: a kick towards the stop leaves nothing near, and with a sum of
+    entries below zero the motion with an impact in each period is on the other side."""
+    offsets = -np.geomspace(1e-7, 1e-3, 60) * 0.25
+    ones, half = np.ones((1, 1)), np.array([0.5])
+    away = LocalMap(np.array([[[0.5]]]), ones, -ones, half, np.ones(1))
+    assert scenario_of(away, offsets, settled(away, offsets))[0] == "nonsmooth_fold"
+    back = windows(away, 1e-2, 1)
+    assert back.exists[0].max() > 0
+    turned = LocalMap(np.array([[[-0.5]]]), ones, -ones, half, np.ones(1))  # e₁ > 0 > e₂
+    found = settled(turned, offsets)
+    assert not is_local(turned, offsets, found).all()
+    smooth = LocalMap(np.array([[[-0.5]]]), ones, ones, np.array([1.5]), np.ones(1))
+    assert scenario_of(smooth, offsets, settled(smooth, offsets))[0] == "persistence"

@@ -1,0 +1,126 @@
+"""Branches on which numbers of the motion are held and others of the machine are free."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+from scipy.optimize import brentq
+
+ZETA, XI, GAP = "drive.frequency_ratio", "oscillator.damping_ratio", "stops.0.gap"
+
+
+@pytest.fixture(scope="module")
+def linear():
+    """An orbit of the linear oscillator, out of reach of its stop."""
+    scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=20.0, damping_ratio=0.1)
+    return vi.find_orbit(scene, scene.start(), throw=True)
+
+
+def held(orbit, size):
+    return vi.continue_orbit(
+        orbit, parameter=ZETA, bounds=(0.5, 1.5), free={XI: (0.001, 0.5)}, fixed={"y_max": size}
+    )
+
+
+@pytest.mark.slow
+def test_an_amplitude_is_held_by_the_damping(linear):
+    """1/√((1 - ζ²)² + (2ξζ)²) = A; the branch ends where no damping would be needed."""
+    branch = held(linear, 3.0)
+    np.testing.assert_allclose(branch.y_max, 3.0, atol=1e-12)
+    zeta, xi = branch.parameter, branch.free[XI]
+    np.testing.assert_allclose(np.hypot(1 - zeta**2, 2 * xi * zeta), 1 / 3, atol=1e-12)
+    assert branch.ends == ("bounds", "bounds")
+    np.testing.assert_allclose(xi[[0, -1]], 0.001, atol=1e-12)
+    data = branch.to_xarray()
+    np.testing.assert_array_equal(data[XI], xi)
+    assert vi.plot_branch(branch, x=XI, y="multiplier").get_xlabel() == "damping ratio ξ"
+
+
+def test_another_value_is_not_another_program(linear, monkeypatch):
+    from vi_jax.orbit import _conditions
+
+    traced, plain = [], _conditions.quantity_of
+    monkeypatch.setattr(_conditions, "quantity_of", lambda *a: (traced.append(a[-1]), plain(*a))[1])
+    held(linear, 3.0)
+    traced.clear()
+    branch = held(linear, 2.9)
+    assert not traced and branch.y_max == pytest.approx(2.9, abs=1e-12)
+
+
+@pytest.fixture(scope="module")
+def struck():
+    """Motions with one impact whose least position is held by moving the stop."""
+    scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5)
+    near = vi.closed_form_orbits(scene)
+    orbit = vi.find_orbit(scene, scene.start(Y=near.Y[0] - 1e-3, V=near.V[0]), throw=True)
+    return vi.continue_orbit(
+        orbit, parameter=ZETA, bounds=(0.6, 1.8), free={GAP: (1.1, 4.0)}, fixed={"y_min": -3.0}
+    )
+
+
+@jax.jit
+@jax.vmap
+def closed(zeta, gap):
+    return vi.closed_form_orbits(vi.Scene.ideal(frequency_ratio=zeta, restitution=0.5, gap=gap))
+
+
+@pytest.mark.slow
+def test_a_motion_with_one_impact_beside_its_closed_form(struck):
+    inside = slice(1, None)  # at the first point its impact is lost
+    found = closed(jnp.asarray(struck.parameter), jnp.asarray(struck.free[GAP]))
+    apart = np.abs(np.asarray(found.impact_speed) - struck.impact_speed)
+    which = np.argmin(np.where(np.isnan(apart), np.inf, apart), axis=1)[inside]
+    rows = np.arange(len(struck.parameter))[inside]
+    np.testing.assert_allclose(np.asarray(found.y_min)[rows, which], -3.0, atol=1e-9)
+    speeds = np.asarray(found.impact_speed)[rows, which]
+    np.testing.assert_allclose(speeds, struck.impact_speed[inside, 0], atol=1e-9)
+    traces = np.asarray(found.multipliers)[rows, which].sum(axis=-1)
+    np.testing.assert_allclose(traces, struck.multipliers[inside].sum(axis=1), rtol=1e-7)
+
+
+@pytest.mark.slow
+def test_special_points_where_numbers_are_held(struck):
+    """The impact is lost where the free oscillator itself has the amplitude, 1/(1 - ζ²) = 3."""
+    lost, doubling = struck.special
+    assert (lost.kind, doubling.kind) == ("grazing", "period-doubling")
+    assert lost.parameter == pytest.approx(np.sqrt(2 / 3), abs=1e-9)
+    assert np.abs(doubling.orbit.multipliers + 1).min() < 1e-8
+    gap = float(doubling.orbit.machine.stops[0].gap)
+
+    def beyond(zeta):
+        (values, _) = closed(jnp.array([zeta]), jnp.array([gap])).multipliers[0]
+        return float(values.real.min()) + 1
+
+    at = brentq(beyond, doubling.parameter - 1e-3, doubling.parameter + 1e-3, xtol=1e-13)
+    assert doubling.parameter == pytest.approx(at, abs=1e-8)
+    # From there on the gap is a number like any other.
+    doubled = doubling.switch()
+    assert int(doubled.cycles) == 2 and float(doubled.machine.stops[0].gap) == gap
+    curve = vi.boundary(
+        doubling, parameter="stops.0.restitution", bounds=((0.9, 1.05), (0.45, 0.55))
+    )
+    assert np.abs(curve.multipliers + 1).min(axis=1).max() < 1e-8
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"free": {XI: (0.0, 0.5)}}, "`fixed` must hold as many numbers as `free` frees, 1"),
+        ({"fixed": {"y_max": 3.0}}, "as many numbers as `free` frees, 0, but holds 1"),
+        ({"free": {"xi": (0.0, 0.5)}, "fixed": {"y_max": 3.0}}, "`free` must be a number"),
+        ({"free": {XI: (0.2, 0.5)}, "fixed": {"y_max": 3.0}}, "must hold the orbit's"),
+        ({"free": {ZETA: (0.2, 1.5)}, "fixed": {"y_max": 3.0}}, "others than the parameter"),
+        ({"free": {XI: (0.0, 0.5)}, "fixed": {"height": 3.0}}, "`fixed` must be one of .*'y_max'"),
+        ({"free": {XI: (0.0, 0.5)}, "fixed": {"y_max": np.nan}}, "`fixed` must be"),
+    ],
+)
+def test_says_what_is_wrong(linear, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        vi.continue_orbit(linear, parameter=ZETA, bounds=(0.5, 1.5), **arguments)
+
+
+def test_what_cannot_be_held_is_said(linear):
+    given = {"parameter": ZETA, "bounds": (0.5, 1.5)}
+    with pytest.raises(ValueError, match="`free` must hold the orbit's"):
+        vi.continue_orbit(linear, **given, free={XI: (0.2, 0.5)}, fixed={"y_max": None})

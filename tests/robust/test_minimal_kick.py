@@ -1,0 +1,215 @@
+"""How hard a motion may be kicked: beside brute force, bisection, SciPy and a closed form."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq, minimize_scalar
+
+from belts import Belt
+
+# Between two motions of period 4π, with one impact and with two.
+SCENE = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.02)
+
+
+@pytest.fixture(scope="module")
+def motions():
+    found = [
+        vi.find_orbit(SCENE, SCENE.start(Y=Y, V=V), 2) for Y, V in ((1.283, 1.007), (1.528, 1.314))
+    ]
+    assert [int(orbit.impacts) for orbit in found] == [1, 2]
+    return found
+
+
+@pytest.fixture(scope="module")
+def result(motions):
+    return vi.minimal_kick(SCENE, motions[0])
+
+
+@pytest.fixture(scope="module")
+def two_impacts():
+    """Of many kicks of the first motion, whether two impacts a period come of it."""
+
+    def one(row):
+        run = vi.simulate(SCENE, SCENE.start(Y=row[0], V=row[1]), 2, settle=200)
+        return jnp.sum(run.impacts) == 2
+
+    return vi.jit(jax.vmap(one))
+
+
+def row_of(state):
+    return np.array([float(state.Y), float(state.V)])
+
+
+def test_the_kick_of_the_scene_beside_a_bisection_along_it(motions, result, two_impacts):
+    begin, there = row_of(motions[0].state), row_of(result.start)
+    size = np.linalg.norm(there - begin)
+    assert float(result.norm) == pytest.approx(size, rel=1e-12)
+    np.testing.assert_allclose([result.kick["Y"], result.kick["V"]], there - begin, atol=1e-14)
+    low, high = 0.0, 2.0
+    for _ in range(5):
+        parts = np.linspace(low, high, 256)
+        first = int(np.argmax(np.asarray(two_impacts(begin + parts[:, None] * (there - begin)))))
+        low, high = parts[first - 1], parts[first]
+    assert high == pytest.approx(1, abs=1e-9)
+    assert result.exact and result.confirmed and float(result.residual) < 1e-9
+    assert int(result.settles.impacts) == 2 and bool(result.settles.stable)
+
+
+@pytest.mark.slow
+def test_no_kick_as_small_leads_elsewhere(motions, result, two_impacts):
+    """All around, and close beside the kick; a little harder it does."""
+    begin, angle = row_of(motions[0].state), np.arctan2(result.kick["V"], result.kick["Y"])
+    angles = np.concatenate(
+        [np.linspace(0, 2 * np.pi, 8192), angle + np.linspace(-0.01, 0.01, 512)]
+    )
+    around = np.stack([np.cos(angles), np.sin(angles)], axis=1) * float(result.norm)
+    for size in (1 - 1e-7, 0.7, 0.3, 0.1):
+        assert not np.asarray(two_impacts(begin + size * around)).any()
+    assert np.asarray(two_impacts(begin + (1 + 1e-7) * around)).any()
+
+
+def test_the_edge_is_the_saddle(motions, result):
+    saddle = vi.find_orbit(SCENE, SCENE.start(Y=1.26, V=1.086), 2)
+    assert saddle.successful and not saddle.stable
+    tracked = vi.edge_state(SCENE, motions[1], motions[0])
+    sections = np.array([saddle.sections.Y, saddle.sections.V]).T
+    for edge in (result.edge, tracked):
+        assert edge.kind == "saddle"
+        assert np.abs(sections - row_of(edge.orbit.state)).max(axis=1).min() < 1e-8
+
+
+@pytest.mark.slow
+def test_the_kick_of_the_scene_beside_its_basin(motions, result, two_impacts):
+    """Pixels of a picture of 2,048² starts on the square of ±0.4: those within ±0.05."""
+    pixel, half = 0.8 / 2048, 128
+    Y, V = row_of(motions[0].state)
+    places = pixel * (np.arange(2 * half) - half + 0.5)
+    rows = np.stack(np.meshgrid(places, places), axis=-1).reshape(-1, 2)
+    elsewhere = np.asarray(two_impacts(np.array([Y, V]) + rows))
+    nearest = np.linalg.norm(rows[elsewhere], axis=1)
+    assert 0 < nearest.min() - float(result.norm) < pixel
+    # Of as many lanes as the whole picture, a hundredth at most.
+    assert result.lanes < 2048**2 / 100
+
+
+@pytest.mark.slow
+def test_one_component_and_weights(motions, two_impacts):
+    """A kick of the speed alone is the first change along a line; a weight scales the norm."""
+    begin = row_of(motions[0].state)
+    kicks = np.linspace(-1, 1, 2**15)
+    rows = begin + np.stack([0 * kicks, kicks], axis=1)
+    elsewhere = kicks[np.asarray(two_impacts(rows))]
+    nearest = elsewhere[np.argmin(np.abs(elsewhere))]
+    result = vi.minimal_kick(SCENE, motions[0], components=["V"], weights={"V": 3.0})
+    assert list(result.kick) == ["V"] and result.confirmed
+    assert float(result.kick["V"]) == pytest.approx(nearest, abs=2 / 2**15)
+    assert float(result.norm) == pytest.approx(3.0 * abs(float(result.kick["V"])))
+
+
+def test_what_cannot_be_asked(motions, result):
+    ask = vi.minimal_kick
+    with pytest.raises(ValueError, match="`orbit` must be a stable orbit"):
+        ask(SCENE, result.edge.orbit)
+    with pytest.raises(ValueError, match=r"`components` must name .* but names 'W'"):
+        ask(SCENE, motions[0], components=["W"])
+    with pytest.raises(TypeError, match="`components` must be a list"):
+        ask(SCENE, motions[0], components="V")
+    with pytest.raises(ValueError, match=r"weights\['V'\]` must be"):
+        ask(SCENE, motions[0], weights={"V": 0.0})
+    with pytest.raises(ValueError, match="`bounds` must hold the state"):
+        ask(SCENE, motions[0], bounds={"Y": (-1.0, 1.0)})
+    with pytest.raises(ValueError, match="No kick leads elsewhere"):
+        ask(SCENE, motions[0], largest=0.5 * float(result.norm))
+    with pytest.raises(ValueError, match="must settle on different motions"):
+        vi.edge_state(SCENE, motions[0], motions[0])
+
+
+def least_distance(rest, speed=1.5):
+    """From steady sliding to the unstable cycle of sliding, by SciPy: backward in time motions go
+    to it."""
+
+    def backward(t, x):
+        return [-x[1], x[0] + 0.1 * x[1] - 0.5 - 0.5 * np.exp(-2 * (speed - x[1]))]
+
+    options = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-13}
+
+    def stands(t, x):
+        return x[1]
+
+    def away(t):
+        return np.hypot(cycle(t)[0] - rest, cycle(t)[1])
+
+    def turned(Y):
+        """Where a motion from (Y, 0) is farthest back the time before."""
+        found = solve_ivp(backward, (0, 9), [Y, 0.0], events=stands, **options)
+        times, states = found.t_events[0], found.y_events[0]
+        return states[times > 4][0, 0]
+
+    Y = brentq(lambda Y: turned(Y) - Y, -0.8, -0.5, xtol=1e-13)
+    cycle = solve_ivp(backward, (0, 6.4), [Y, 0.0], dense_output=True, **options).sol
+    times = np.linspace(0, 6.29, 2000)
+    t = times[np.argmin([away(t) for t in times])]
+    near = minimize_scalar(away, bounds=(t - 0.01, t + 0.01), method="bounded",
+                           options={"xatol": 1e-10})  # fmt: skip
+    return near.fun, cycle(near.x)
+
+
+@pytest.mark.slow
+def test_how_hard_steady_sliding_may_be_kicked():
+    """To sticking and slipping; over the unstable cycle of sliding between them."""
+    rest = 0.5 + 0.5 * np.exp(-3.0)
+    result = vi.minimal_kick(
+        Belt(), vi.OscillatorState(jnp.asarray(rest), jnp.asarray(0.0)), directions=64
+    )
+    distance, place = least_distance(rest)
+    assert float(result.norm) == pytest.approx(distance, abs=1e-9)
+    assert float(result.norm) == pytest.approx(1.17393040, abs=1e-8)
+    np.testing.assert_allclose(row_of(result.start), place, atol=1e-6)
+    np.testing.assert_allclose(row_of(result.start), [-0.464548, 0.631758], atol=1e-6)
+    assert result.exact and result.confirmed
+    assert result.edge.kind == "saddle" and bool(result.settles.stable)
+
+
+class Third(eqx.Module):
+    Y: jax.Array
+    V: jax.Array
+    x: jax.Array
+
+
+class Between(vi.AbstractMachine):
+    """x goes to 1 or -1, where an oscillator dies out; on the boundary x = 0 it is Ueda's, which is
+    pushed."""
+
+    push: jax.Array | float = 1.0
+    stops: tuple = ()
+
+    @property
+    def cycle(self):
+        return 2 * np.pi
+
+    def field(self, s, z):
+        calm = z.x**2
+        pushed = self.push * jnp.cos(s) * (1 - calm) - z.Y**3 - calm * z.Y
+        return Third(z.V, pushed - (0.05 + 0.5 * calm) * z.V, 0.1 * (z.x - z.x**3))
+
+
+def third(Y, V, x):
+    return Third(jnp.asarray(Y), jnp.asarray(V), jnp.asarray(x))
+
+
+@pytest.mark.slow
+def test_a_kick_in_three_components_and_a_chaotic_edge():
+    """The boundary is the plane x = 0, at the distance 1 from the motion at rest."""
+    home, away = third(0.0, 0.0, 1.0), third(1.0, 0.5, -0.5)
+    result = vi.minimal_kick(Between(), home, candidates=1, directions=64)
+    kick = [float(result.kick[name]) for name in ("Y", "V", "x")]
+    np.testing.assert_allclose(kick, [0.0, 0.0, -1.0], atol=1e-9)
+    assert result.exact and result.confirmed and result.edge.kind == "saddle"
+    # With a push of 7.5 Ueda's oscillator is chaotic.
+    edge = vi.edge_state(Between(push=7.5), home, away, rounds=24)
+    assert edge.orbit is None and edge.kind == "chaotic"
+    assert np.abs(np.asarray(edge.sections.x)).max() < 2e-5

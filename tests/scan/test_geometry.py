@@ -1,0 +1,222 @@
+"""The geometry of basins, from labels of which it is known."""
+
+import itertools
+
+import numpy as np
+import pytest
+import vi_jax as vi
+import xarray as xr
+from vi_jax.scan._geometry import Cells, ball_around, entropy_of, largest_ball, uncertainty_of
+
+ONES, CLOSED = np.ones(2), np.ones((2, 2), bool)
+
+
+def square(size, low=-1.0, high=1.0):
+    """Centres of cells along an axis, and the plane of them."""
+    x = low + (high - low) * (np.arange(size) + 0.5) / size
+    return x, *np.meshgrid(x, x, indexing="ij")
+
+
+def test_balls_in_a_half_plane_are_exact():
+    """x < 0.1 on the square ±1: distances to the line, or to the edges."""
+    x, across, _ = square(200)
+    own = across < 0.1
+    cells = Cells([x, x], ONES, CLOSED)
+    found = ball_around(np.array([-0.4, 0.0]), ~own, cells)
+    assert found.radius == pytest.approx(0.5, abs=1e-12) and not found.at_edge
+    found = ball_around(np.array([-0.8, 0.3]), ~own, cells)
+    assert found.radius == pytest.approx(0.2, abs=1e-12) and found.at_edge
+    largest = largest_ball(own, ~own, cells)
+    assert largest.radius == pytest.approx(0.55, abs=1e-12) and largest.at_edge
+    assert largest.centre[0] == pytest.approx(-0.45, abs=1e-12)
+    # With twice the scale along y, the edges above and below end nothing any more at (-0.45, ...).
+    wide = cells._replace(scales=np.array([1.0, 0.5]))
+    assert largest_ball(own, ~own, wide).radius == pytest.approx(0.55, abs=1e-12)
+    narrow = cells._replace(scales=np.array([1.0, 4.0]))
+    assert largest_ball(own, ~own, narrow).radius == pytest.approx(0.25, abs=1e-12)
+    # Of a half plane whose left edge is a stop only the line counts, and edges up and down.
+    stop = cells._replace(ends=np.array([[False, True], [True, True]]))
+    assert largest_ball(own, ~own, stop).radius == pytest.approx(1.0, abs=1e-12)
+    assert ball_around(np.array([-0.8, 0.3]), ~own, stop).radius == pytest.approx(0.7, abs=1e-12)
+    assert np.isnan(ball_around(np.array([-1.2, 0.3]), ~own, stop).radius)
+
+
+def test_balls_in_a_disc_and_a_sphere_within_a_cell():
+    for size in (50, 100, 200):
+        x, *places = square(size)
+        own = places[0] ** 2 + places[1] ** 2 < 0.6**2
+        cells = Cells([x, x], ONES, CLOSED)
+        half = np.sqrt(2) / size  # half a diagonal of a cell
+        assert abs(largest_ball(own, ~own, cells).radius - 0.6) < half
+        near = ball_around(np.array([0.1, 0.05]), ~own, cells).radius
+        assert abs(near - (0.6 - np.hypot(0.1, 0.05))) < half
+    x, *places = *square(40)[:1], *np.meshgrid(*(square(40)[0],) * 3, indexing="ij")
+    own = sum(y**2 for y in places) < 0.6**2
+    cells = Cells([x, x, x], np.ones(3), np.ones((3, 2), bool))
+    assert abs(largest_ball(own, ~own, cells).radius - 0.6) < np.sqrt(3) / 40
+
+
+def test_the_largest_ball_is_that_of_brute_force():
+    """On random labels, over all centres that are looked at, some cells without a start."""
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        label = (rng.random((9, 12)) < 0.1).astype(int)
+        there = rng.random(label.shape) < 0.9
+        rows = [np.linspace(0.1, 1.7, 9), np.linspace(-2.0, 0.2, 12)]
+        cells = Cells(rows, np.array([0.7, 1.3]), rng.random((2, 2)) < 0.7)
+        own, foreign = there & (label == 0), there & (label == 1)
+        best = 0.0
+        for i, j in np.argwhere(own):
+            for step in itertools.product((-0.5, 0.0, 0.5), repeat=2):
+                point = np.array([rows[0][i], rows[1][j]]) + cells.widths * step
+                point = np.clip(point, *cells.edges.T)
+                best = max(best, ball_around(point, foreign, cells).radius)
+        assert largest_ball(own, foreign, cells).radius == pytest.approx(best, rel=1e-9)
+
+
+def test_entropy_of_half_planes_and_stripes():
+    _, across, _ = square(100)
+    aligned = entropy_of((across > 0.0).astype(int), box=5)
+    assert aligned.total == 0.0 and np.isnan(aligned.boundary) and aligned.boundary_boxes == 0
+    # A line through the boxes of one column, two of their five cells on one side.
+    cut = entropy_of((across > 0.04).astype(int), box=5)
+    one = -(0.4 * np.log(0.4) + 0.6 * np.log(0.6))
+    assert cut.boundary == pytest.approx(one) and cut.total == pytest.approx(one / 20)
+    assert (cut.boxes, cut.boundary_boxes) == (400, 20)
+    # Three outcomes in turn, box by box all alike; a box of six holds each of them twice.
+    turns = np.broadcast_to(np.arange(60) % 3, (60, 60))
+    found = entropy_of(turns, box=6)
+    assert found.total == pytest.approx(np.log(3)) and found.boundary == pytest.approx(np.log(3))
+    # Cells without a start are no outcome.
+    there = turns != 2
+    assert entropy_of(turns, box=6, there=there).total == pytest.approx(np.log(2))
+
+
+def test_a_smooth_boundary_has_the_exponent_one():
+    _, across, up = square(256)
+    for label in (across > 0.1, across**2 + up**2 < 0.6**2, across > 0.3 * up + 0.1):
+        found = uncertainty_of(label.astype(int))
+        assert found.exponent == pytest.approx(1.0, abs=0.01)
+        low, high = found.interval
+        assert low < 1.0 < high and high - low < 0.2
+    assert np.isnan(uncertainty_of((across > 0.1).astype(int)).exponents[1])
+    nothing = uncertainty_of(np.zeros((64, 64), int))
+    assert np.isnan(nothing.exponent) and np.isnan(nothing.interval).all()
+
+
+@pytest.mark.parametrize(("grows", "falls"), [(3, 1.5), (2, 1.5), (3, 2.0)])
+def test_the_exponent_of_a_boundary_whose_dimension_is_known(grows, falls):
+    """x -> grows·x mod 1, y -> falls·y + cos 2πx (McDonald, Grebogi, Ott and Yorke, Physica D 17,
+    125 (1985)): y goes to ±∞, and the boundary is a curve of Weierstrass, whose dimension is
+    2 - ln(falls) / ln(grows). It is the graph of a function, so that errors in y have the exponent
+    1."""
+    size = 1024
+    x = (np.arange(size) + 0.5) / size
+    powers = np.arange(25)
+    waves = np.cos(2 * np.pi * grows**powers * x[:, None]) * falls ** -(powers + 1.0)
+    label = (4 * x - 2 > -waves.sum(axis=1)[:, None]).astype(int)
+    found = uncertainty_of(label)
+    exact = np.log(falls) / np.log(grows)
+    low, high = found.interval
+    assert low < exact < high and high - low < 0.15
+    assert abs(found.exponent - exact) < 0.03
+    assert found.exponents[1] == pytest.approx(1.0, abs=0.01)
+
+
+def kicked_disc(size, cycles=100):
+    """Grebogi, McDonald, Ott and Yorke's map (1983) on (0, 2π) × ±0.5: which of θ = 0, π it comes
+    to."""
+    angle = 2 * np.pi * (np.arange(size) + 0.5) / size
+    place = -0.5 + (np.arange(size) + 0.5) / size
+    angle, place = np.meshgrid(angle, place, indexing="ij")
+    for _ in range(cycles):
+        turned = angle + 1.32 * np.sin(2 * angle) - 0.9 * np.sin(4 * angle)
+        angle, place = turned - place * np.sin(angle), -0.3 * np.cos(angle)
+    assert np.abs(np.sin(angle)).max() < 0.1
+    return (np.cos(angle) < 0).astype(int)
+
+
+def test_published_numbers_of_the_map_of_1983():
+    """Its exponent for errors in x, some 0.2; entropies as the tests of Attractors.jl have them, of
+    boxes of 6 × 6 in 300 × 300 starts: 0.40 to 0.42 and, of the boundary, 0.60 to 0.61 there."""
+    label = kicked_disc(300)
+    assert label.mean() == pytest.approx(0.5, abs=0.01)  # x and θ + π are as x and θ
+    found = uncertainty_of(label)
+    low, high = found.intervals[1]
+    assert low < 0.2 < high and abs(found.exponents[1] - 0.2) < 0.02
+    entropy = entropy_of(label, box=6)
+    assert 0.395 < entropy.total < 0.42 and 0.59 < entropy.boundary < 0.61
+
+
+def test_newtons_cubic():
+    """z³ = 1 by Newton's method: its boundary has the dimension 1.42, as the tests of Attractors.jl
+    quote, and S_bb is above ln 2, since everywhere on it all three basins meet."""
+    x = square(600)[0]
+    z = x[:, None] + 1j * x
+    for _ in range(40):
+        z = z - (z**3 - 1) / (3 * z**2)
+    label = np.argmin(np.abs(z[..., None] - np.exp(2j * np.pi * np.arange(3) / 3)), axis=-1)
+    found = uncertainty_of(label)
+    for exponent, (low, high) in zip(found.exponents, found.intervals, strict=True):
+        assert abs(exponent - 0.58) < 0.03 and low < 0.58 < high
+    assert entropy_of(label, box=5).boundary > np.log(2)
+
+
+def disc_and_rest(size=40, *, beyond=0.8):
+    """Starts in ±1 of which those in a disc of 0.6 around 0 settle on a motion of two cycles; those
+    with V > `beyond` cannot be, as beyond a stop."""
+    x, Y, V = square(size)
+    label = np.where(Y**2 + V**2 < 0.6**2, 0, 1)
+    result = np.where(V > beyond, 1, 0)
+    coords = {"start.Y": x, "start.V": x}
+    data = xr.Dataset(
+        {"label": (tuple(coords), label), "result": (tuple(coords), result)}, coords=coords
+    )
+    sections = {"Y": np.array([0.1, 0.0]), "V": np.array([0.0, -0.3])}
+    inside = vi.Attractor(0, 2, 1.0, sections, 1, 0.3, 0.01)
+    outside = vi.Attractor(1, 1, 1.0, {"Y": np.array([5.0]), "V": np.array([0.0])}, 1, 0.7, 0.01)
+    return vi.Basins(data, [inside, outside], {})
+
+
+def test_integrity_of_motions():
+    found = disc_and_rest(200)
+    inside, outside = found.integrity()
+    assert inside.resolution == pytest.approx(np.sqrt(2) / 200)
+    np.testing.assert_allclose(inside.sections, [0.5, 0.3], atol=inside.resolution)
+    assert inside.local == inside.sections.min() and not inside.local_at_edge
+    assert inside.factor == pytest.approx(0.6, abs=inside.resolution)
+    assert np.isnan(outside.local) and outside.factor_at_edge
+    # With twice the distance along V, from (0, -0.3) to the circle: least of Y² + 4 (V + 0.3)².
+    halved = found.integrity(scales={"start.V": 0.5})[0]
+    np.testing.assert_allclose(halved.sections[1], np.sqrt(0.24), atol=halved.resolution)
+
+
+def test_a_stop_ends_no_ball():
+    """With no start beyond V = 0.3, what would settle elsewhere there ends nothing."""
+    found = disc_and_rest(200, beyond=0.3)
+    inside, _ = found.integrity()
+    cells = np.asarray(found.data["start.Y"])
+    _, Y, V = square(200)
+    foreign = (Y**2 + V**2 >= 0.36) & (V <= 0.3)
+    best = ball_around(np.array([0.0, 0.3]), foreign, Cells([cells, cells], ONES, CLOSED)).radius
+    assert best == pytest.approx(np.sqrt(0.36 - 0.09), abs=0.01)
+    assert inside.factor >= best and found.entropy().boxes < 1600
+
+
+def test_what_has_no_geometry_says_so():
+    """Random starts, too few of them, boxes and scales that are none."""
+    found = disc_and_rest(8)
+    few = found._replace(data=found.data.stack(sample=("start.Y", "start.V")))
+    for ask in (few.integrity, few.entropy, few.uncertainty):
+        with pytest.raises(ValueError, match="starts on a grid"):
+            ask()
+    with pytest.raises(ValueError, match="16 starts at least"):
+        found.uncertainty()
+    with pytest.raises(ValueError, match="`confidence` must be finite and in"):
+        found.uncertainty(confidence=1.0)
+    with pytest.raises(ValueError, match="`box` must be at most 8"):
+        found.entropy(box=9)
+    with pytest.raises(ValueError, match="`scales` must name"):
+        found.integrity(scales={"start.W": 1.0})
+    with pytest.raises(ValueError, match="`scales` must be finite and in"):
+        found.integrity(scales={"start.V": 0.0})

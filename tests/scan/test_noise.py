@@ -1,0 +1,180 @@
+"""Noise in scans and sweeps: the paths of lanes, stores, and what is left without noise."""
+
+import importlib
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+import xarray as xr
+from vi_jax.flow import RunOptions
+from vi_jax.scan import make_program
+from vi_jax.scan.grid import LANE
+
+from differences import quick
+
+SCENE = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.7, gap=1.5, damping_ratio=0.1)
+NOISE, KEY = vi.WhiteNoise({"V": 0.1}, impulses=16), jax.random.key(3)
+AXES = {"noise.V": [0.05, 0.1], "noise.path": np.arange(300)}
+
+
+def scanned(**options):
+    given = {
+        "measure": ("sections", "extremes"), "settle": 3, "cycles": 16, "noise": NOISE,
+        "key": KEY, "progress": False, "lanes": 256, "workers": 1,
+    }  # fmt: skip
+    return vi.scan(SCENE, AXES, **(given | options))
+
+
+@pytest.fixture(scope="module")
+def whole():
+    return scanned().load()
+
+
+def test_a_lane_is_the_run_with_the_key_of_its_number(whole):
+    for row, path in ((0, 7), (1, 211)):
+        noise = vi.WhiteNoise({"V": AXES["noise.V"][row]}, impulses=16)
+        key = jax.random.fold_in(KEY, 300 * row + path)
+        run = vi.simulate(SCENE, SCENE.start(), 16, settle=3, noise=noise, key=key)
+        assert np.array_equal(run.sections.V[1:], whole.V[row, path])
+        assert run.y_min is not None
+        assert np.array_equal(jnp.min(run.y_min), whole.y_min[row, path])
+    assert len(np.unique(whole.V[..., -1])) == 600
+
+
+def test_paths_depend_on_no_block_worker_or_thread(whole):
+    with vi.threads(1):
+        other = scanned(lanes=512, workers=2)
+    xr.testing.assert_identical(other, whole)
+    assert np.any(scanned(key=jax.random.key(4)).V != whole.V)
+
+
+def test_a_store_goes_on_to_the_same_numbers(whole, tmp_path, monkeypatch):
+    work = importlib.import_module("vi_jax.scan._work")
+    compute, left = work.compute, [2]
+
+    def stopped(*arguments, **options):
+        left[0] -= 1
+        if left[0] < 0:
+            raise KeyboardInterrupt
+        return compute(*arguments, **options)
+
+    monkeypatch.setattr(work, "compute", stopped)
+    with pytest.raises(vi.ScanInterrupted):
+        scanned(store=tmp_path / "s")
+    left[0] = 9
+    data = scanned(store=tmp_path / "s")
+    assert left[0] == 7  # of four blocks two were there
+    for name in whole:
+        assert np.array_equal(data[name], whole[name])
+    assert '"impulses": 16' in data.noise
+    for other, word in (
+        ({"key": jax.random.key(4)}, "noise key"),
+        ({"noise": vi.WhiteNoise({"V": 0.1}, impulses=32)}, "noise impulses"),
+        ({"noise": None, "key": None}, "noise"),
+    ):
+        with pytest.raises(ValueError, match=f"in .* the {word} is|`axes`, which names"):
+            scanned(store=tmp_path / "s", **other)
+
+
+def test_a_store_knows_the_function_of_an_amplitude(tmp_path):
+    def scan(factor):
+        noise = vi.WhiteNoise({"V": lambda state: factor * state.Y}, impulses=16)
+        given = {"settle": 1, "cycles": 4, "noise": noise, "key": KEY, "progress": False}
+        return vi.scan(
+            SCENE, {"noise.path": [0, 1]}, measure="extremes", store=tmp_path / "s", **given
+        )
+
+    first = scan(0.1).load()
+    assert np.array_equal(scan(0.1).y_min, first.y_min)
+    with pytest.raises(ValueError, match="the code of noise is"):
+        scan(0.2)
+
+
+@pytest.mark.slow
+def test_lanes_are_verified_on_their_own_paths():
+    data = scanned(verify=40, method=vi.FixedStep())
+    assert data.verified_error_V < 1e-5
+    assert np.std(data.V) > 1e-2
+
+
+@pytest.mark.slow
+def test_derivatives_by_an_amplitude(whole):
+    axes = {"noise.V": [0.05], "noise.path": [0]}
+    found, step = {}, 1e-6
+    given = {"measure": "sections", "settle": 3, "cycles": 16, "noise": NOISE, "key": KEY}
+    for change in (-step, 0.0, step):
+        axes["noise.V"] = [0.05 + change]
+        found[change] = vi.scan(SCENE, axes, **given, derivatives="noise.V", progress=False)
+    differences = (found[step].V.values - found[-step].V.values) / (2 * step)
+    np.testing.assert_allclose(found[0.0].d_V.squeeze(), differences.squeeze(), rtol=1e-5)
+
+
+def test_without_noise_the_program_has_nothing_of_it():
+    """Neither whole numbers of 32 bits without sign, of which its numbers are made, nor a key."""
+
+    def program(**noise):
+        made = make_program(SCENE, ("start.Y",), RunOptions(), measure="extremes", **noise)
+        numbers, rest = eqx.partition(made, eqx.is_array)
+        values = {"start.Y": jnp.zeros(4)}
+        if noise:
+            values[LANE] = jnp.arange(4, dtype=jnp.uint32)
+        return str(
+            jax.make_jaxpr(lambda n: eqx.combine(n, rest)(values, jnp.ones(4, bool)))(numbers)
+        )
+
+    assert "u32[" not in program()
+    assert "u32[" in program(noise=NOISE, key=KEY)
+
+
+@pytest.mark.parametrize("size", quick([5, 20], 5))
+def test_a_sweep_is_shaken_by_the_number_of_each_value(size):
+    values = np.linspace(0.8, 1.0, 20)[:size]
+    options = {"cycles": 4, "settle": 4, "noise": NOISE, "key": KEY}
+    sweep = vi.sweep(SCENE, "drive.frequency_ratio", values, **options)
+    state = SCENE.start()
+    for n in range(size):
+        here = vi.Scene.ideal(
+            frequency_ratio=values[n], restitution=0.7, gap=1.5, damping_ratio=0.1
+        )
+        options["key"] = jax.random.fold_in(KEY, n)
+        run = vi.simulate(here, state, **options)
+        np.testing.assert_allclose(sweep.sections.V[n], run.sections.V[1:], atol=1e-12)
+        state = run.last
+    assert np.all(sweep.period == vi.REGIMES.unsettled)
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"measure": "regime"}, "must be without Regime where there is noise"),
+        ({"measure": "exponent"}, "must be without Exponent"),
+        ({"noise": 0.5}, "must be a `WhiteNoise`"),
+        ({"key": None}, "Argument `key` must be one key"),
+        ({"noise": None}, "Argument `key` needs noise"),
+        ({"noise": None, "key": None}, "names 'noise.V', needs noise"),
+        ({"noise": vi.WhiteNoise({"W": 0.5})}, r"has \(noise.W, noise.path\), but got 'noise.V'"),
+        ({"derivatives": "noise.path"}, r"has \(noise.V\), but got 'noise.path'"),
+    ],
+)
+def test_what_does_not_fit_is_refused(options, message):
+    with pytest.raises((TypeError, ValueError), match=message):
+        scanned(**options)
+
+
+@pytest.mark.parametrize(
+    "machine, noise, message",
+    [
+        (vi.Parameters(torque=10.0, restitution=0.5, gap=0.05).scene(), NOISE, "same known dur"),
+        (SCENE, vi.WhiteNoise({"Y": 0.1}), "must change velocities only"),
+    ],
+)
+def test_what_does_not_fit_the_machine_is_refused(machine, noise, message):
+    given = {"noise": noise, "key": KEY, "settle": 1, "cycles": 4}
+    with pytest.raises(ValueError, match=message):
+        vi.scan(machine, {"noise.path": [0, 1]}, measure="extremes", progress=False, **given)
+    with pytest.raises(ValueError, match=message):
+        name = "stops.0.restitution"
+        vi.sweep(machine, name, [0.5], **given)

@@ -1,0 +1,247 @@
+"""Means with errors, densities, escapes and spectra under noise, against what is known of them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+import xarray as xr
+from scipy.linalg import eigvals, expm, solve_discrete_lyapunov
+from scipy.stats import norm
+
+from differences import quick
+from free_oscillator import Free
+
+CYCLE, SIGMA, IMPULSES = 2 * np.pi, 0.5, 16
+STEP = CYCLE / IMPULSES
+START = vi.OscillatorState(jnp.array(0.0), jnp.array(0.0))
+NOISE = vi.WhiteNoise({"V": SIGMA}, impulses=IMPULSES)
+
+
+# Of it everything is known, the impulses included: from one to the next it is a linear map.
+FLOW = expm(np.array([[0.0, 1.0], [-1.0, -0.2]]) * STEP)
+JUMP = np.diag([0.0, SIGMA**2 * STEP])
+COVARIANCE = solve_discrete_lyapunov(FLOW, JUMP)
+
+EDGES = np.linspace(-2.5, 2.5, 11)
+LANES = 256
+
+
+@pytest.fixture(scope="module")
+def shaken():
+    measure = (
+        vi.Statistics("Y", samples=4), vi.Statistics("V", samples=4),
+        vi.Density({"Y": EDGES}, samples=4),
+    )  # fmt: skip
+    return vi.scan(
+        Free(), {"noise.path": np.arange(LANES)}, measure=measure, start=START, settle=20,
+        cycles=320, noise=NOISE, key=jax.random.key(1), progress=False,
+    )  # fmt: skip
+
+
+def test_the_variances_of_a_linear_oscillator(shaken):
+    assert abs(COVARIANCE[0, 0] - 0.625) < 2e-5  # that of the state between impulses has no error
+    for i, name in enumerate("YV"):
+        square = shaken[f"{name}_spread"] ** 2 + shaken[f"{name}_mean"] ** 2
+        error = float(square.std(ddof=1)) / LANES**0.5
+        assert error < 0.01
+        assert abs(float(square.mean()) - COVARIANCE[i, i]) < 3 * error
+
+
+def test_batch_means_give_the_scatter_of_lanes(shaken):
+    """Of 255 lanes a variance is known within 9 %, their scatter therefore within 4.4 %; errors
+    from 16 parts are means of squares that scatter by 37 %, over as many lanes 2.3 %. Three times
+    both, and what correlation across the ends of parts of 20 cycles leaves, is 0.2."""
+    for name in ("Y", "V"):
+        for what, error in (("mean", "error"), ("spread", "spread_error")):
+            found = float((shaken[f"{name}_{error}"] ** 2).mean() ** 0.5)
+            assert abs(found / float(shaken[f"{name}_{what}"].std(ddof=1)) - 1) < 0.2
+
+
+def test_the_density_is_gauss(shaken):
+    shares = np.diff(norm.cdf(EDGES / COVARIANCE[0, 0] ** 0.5))
+    density = shaken.density.mean("noise.path").values
+    error = shaken.density.std("noise.path", ddof=1).values / LANES**0.5
+    assert np.all(np.abs(density - shares / 0.5) < 4 * error)
+    assert np.max(error) < 0.01
+    whole = (shaken.density.sum("Y_bin") * 0.5 + shaken.outside).values
+    np.testing.assert_allclose(whole, 1.0, rtol=1e-12)
+    assert shaken.density.attrs["Y_edges"] == EDGES.tolist()
+
+
+@pytest.mark.parametrize("names", quick(["VY", "YV"], "YV"))
+def test_a_density_of_two_is_numpys(names):
+    edges = {"V": np.linspace(-1.0, 1.5, 6), "Y": np.linspace(-1.0, 1.0, 4)}
+    edges = {name: edges[name] for name in names}
+    given = {"settle": 3, "cycles": 64, "noise": NOISE, "key": jax.random.key(2)}
+    data = vi.scan(
+        Free(), {"noise.path": [0, 1]}, measure=(vi.Density(edges), vi.Sections(64)),
+        start=START, progress=False, **given,
+    )  # fmt: skip
+    for lane in (0, 1):
+        here = data.sel({"noise.path": lane})
+        first, second = names
+        counts, *_ = np.histogram2d(here[first], here[second], list(edges.values()))
+        np.testing.assert_allclose(here.density, counts / 64 / (0.5 * 2 / 3), atol=1e-12)
+        assert abs(float(here.outside) - (1 - counts.sum() / 64)) < 1e-12
+    assert data.density.dims == ("noise.path", *(f"{name}_bin" for name in names))
+
+
+class Reflected(Free):
+    """The same with an elastic stop at 0."""
+
+    @property
+    def stops(self):
+        return (vi.RigidStop(0.0, 1.0, "left"),)
+
+
+def test_impacts_on_an_elastic_stop_are_crossings_of_zero():
+    """By Rice's formula with the covariance at each time between two impulses, so that of the
+    number of impulses, 4 in a cycle, nothing is left to be extrapolated."""
+    step = CYCLE / 4
+    turn = expm(np.array([[0.0, 1.0], [-1.0, -0.2]]) * step)
+    begin = solve_discrete_lyapunov(turn, np.diag([0.0, SIGMA**2 * step]))
+    places, weights = np.polynomial.legendre.leggauss(20)
+    rate = 0.0
+    for place, weight in zip(places, weights, strict=True):
+        flow = expm(np.array([[0.0, 1.0], [-1.0, -0.2]]) * step * 0.5 * (place + 1))
+        here = flow @ begin @ flow.T
+        rate += 0.5 * weight * np.linalg.det(here) ** 0.5 / here[0, 0] / np.pi
+    data = vi.scan(
+        Reflected(), {"noise.path": np.arange(512)}, measure=vi.Statistics("impacts"), start=START,
+        settle=20, cycles=400, noise=vi.WhiteNoise({"V": SIGMA}, impulses=4), progress=False,
+        key=jax.random.key(9),
+    )  # fmt: skip
+    mean = float(data.impacts_mean.mean()) / CYCLE
+    error = float(data.impacts_mean.std(ddof=1)) / 512**0.5 / CYCLE
+    assert error < 1e-3 * rate
+    assert abs(mean - rate) < 3 * error
+    assert abs(rate - 1 / np.pi) > 3 * error  # what is left to impulses so far apart
+
+
+class Relaxing(vi.AbstractMachine):
+    """x' = -x + σ dW, with one impulse in a cycle of 0.5."""
+
+    stops = ()
+    cycle = 0.5
+
+    def field(self, s, x):
+        return {"x": -x["x"]}
+
+
+def test_the_rate_of_escape_is_that_of_the_map():
+    """The share left behind each impulse is the greatest eigenvalue of the map of densities below
+    the threshold (by Gauss and Legendre's rule)."""
+    sigma, high = 1.0, 1.5
+    nodes, weights = np.polynomial.legendre.leggauss(80)
+    x, w = high + 4 * (nodes - 1), 4 * weights
+    jump = sigma * 0.5**0.5
+    left = np.max(np.abs(eigvals(norm.pdf((x[:, None] - np.exp(-0.5) * x) / jump) / jump * w)))
+    data = vi.scan(
+        Relaxing(), {"noise.path": np.arange(2048)}, measure=vi.Escape("x", high=high, samples=1),
+        start={"x": jnp.array(0.0)}, settle=0, cycles=60, key=jax.random.key(5), progress=False,
+        noise=vi.WhiteNoise({"x": sigma}, impulses=1),
+    )  # fmt: skip
+    found = vi.escape_rate(data, after=8, confidence=0.99)
+    assert found.rate_low < -np.log(left) < found.rate_high
+    assert found.rate_high / found.rate_low < 1.2
+    assert int(found.escapes) + int(found.censored) < 2048 == data.escaped.size
+    assert int(found.censored) == int((data.escaped == 0).sum()) > 20
+    # A mean of the times of escape leaves the censored ones out.
+    assert 1 / float(data.escape_cycle.mean()) > float(found.rate_high)
+
+
+def test_escapes_are_counted_with_those_that_are_watched():
+    data = xr.Dataset(
+        {
+            "escape_cycle": (("a", "path"), [[2.0, 10.0, 10.0, 0.0], [10.0, 10.0, np.nan, 10.0]]),
+            "escaped": (("a", "path"), [[1, 0, 0, 1], [0, 0, 0, 0]]),
+        }
+    )
+    data.escape_cycle.attrs["step"] = 1.0
+    found = vi.escape_rate(data, "path")
+    assert found.escapes.values.tolist() == [1, 0]
+    assert found.censored.values.tolist() == [2, 3]
+    assert found.cycles.values.tolist() == [22.0, 30.0]
+    np.testing.assert_allclose(found.rate, [-np.log(1 - 1 / 22), 0.0])
+    # Garwood's interval of 1 and of 0 events: 0.0253 to 5.572, and 0 to 3.689.
+    np.testing.assert_allclose(found.rate_low, [-np.log(1 - 0.025318 / 22), 0.0], rtol=1e-4)
+    high = -np.log(1 - np.array([5.571643 / 22, 3.688879 / 30]))
+    np.testing.assert_allclose(found.rate_high, high, rtol=1e-6)
+    late = vi.escape_rate(data, after=2.0)
+    assert (int(late.escapes), int(late.censored), float(late.cycles)) == (0, 5, 40.0)
+
+
+@pytest.mark.slow
+def test_extremes_tell_of_passages_between_sections():
+    given = {"settle": 3, "cycles": 32, "noise": NOISE, "key": jax.random.key(2), "start": START}
+    late, soon = (
+        vi.scan(Free(), {"noise.path": np.arange(64)}, measure=m, progress=False, **given)
+        for m in (vi.Escape("Y", high=0.8, samples=1), vi.Escape("y_max", high=0.8))
+    )
+    both = (late.escaped & soon.escaped) == 1
+    assert both.sum() > 30
+    # A cycle's greatest position counts from the first cycle's end.
+    assert np.all(soon.escape_cycle <= np.maximum(late.escape_cycle, 1.0))
+    assert np.mean(soon.escape_cycle < late.escape_cycle) > 0.5
+
+
+def test_the_spectrum_of_a_linear_oscillator():
+    """That of the map from impulse to impulse, in closed form."""
+
+    def one(key):
+        options = {"settle": 20, "samples": IMPULSES, "record": "sections"}
+        return vi.simulate(Free(), START, 256, noise=NOISE, key=key, **options)
+
+    runs = jax.vmap(one)(jax.random.split(jax.random.key(1), 32))
+    found = vi.spectrum(runs, "Y", segment=512)
+    assert found.segments == 256
+
+    def exact(frequency):
+        turn = np.exp(-2j * np.pi * frequency * STEP)
+        inverse = np.linalg.inv(np.eye(2) - FLOW * turn)
+        return 2 * STEP * (inverse @ JUMP @ inverse.conj().T)[0, 0].real
+
+    # Without the ends, where the mean is taken off, and half of the last is meant.
+    inner = found.isel(frequency=slice(3, -2))
+    truth = np.array([exact(x) for x in inner.frequency.values])
+    # 256 numbers of exponential distribution have a mean within 1/16, and so its error.
+    score = (inner.density.values - truth) / (truth / 16)
+    assert np.max(np.abs(score)) < 5
+    assert abs(np.mean(score**2) - 1) < 0.4
+    assert abs(np.mean(inner.error.values / truth) * 16 - 1) < 0.1
+    whole = float(found.density.sum() * found.frequency[1])
+    assert runs.samples is not None
+    variance = np.var(np.asarray(runs.samples.state.Y)[:, 1:])
+    assert abs(whole / variance - 1) < 0.05
+
+
+@pytest.mark.parametrize(
+    "make, message",
+    [
+        (lambda: vi.Statistics("V", batches=1), "Argument `batches`"),
+        (lambda: vi.Density({"Y": [0.0, 0.0]}), "edges that rise"),
+        (lambda: vi.Density({"Y": [0, 1], "V": [0, 1], "W": [0, 1]}), "one name or two"),
+        (lambda: vi.Escape("Y"), "one of them finite"),
+        (lambda: vi.Escape("Y", low=1.0, high=0.0), "ends of an interval"),
+        (lambda: vi.escape_rate(xr.Dataset()), "measure `Escape`"),
+        (lambda: scanned(vi.Statistics("W")), "must be one of Y, V, impacts"),
+        (lambda: scanned(vi.Statistics("impacts", samples=4)), "must be one of Y, V, but"),
+        (lambda: scanned(vi.Statistics("V", 4), cycles=3), "at least 4 for the measure Statistics"),
+        (
+            lambda: scanned((vi.Statistics("V", samples=4), vi.Escape("Y", high=1.0, samples=2))),
+            r"one number of samples, but asks for \[2, 4\]",
+        ),
+        (lambda: vi.spectrum(vi.simulate(Free(), START, 2), "Y"), "must have samples"),
+        (lambda: vi.spectrum(vi.simulate(Free(), START, 2, samples=4), "W"), "one of Y, V"),
+    ],
+)
+def test_what_does_not_fit_is_refused(make, message):
+    with pytest.raises((TypeError, ValueError), match=message):
+        make()
+
+
+def scanned(measure, cycles=32):
+    return vi.scan(
+        Free(), {"start.Y": [0.0]}, measure=measure, start=START, cycles=cycles, progress=False
+    )

@@ -1,0 +1,165 @@
+"""Ten mistakes that everybody makes once: each is answered by a sentence that says what to do.
+
+The page `docs/faq.md` lists them in this order."""
+
+import math
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+
+SCENE = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.05)
+
+
+class Machine(vi.AbstractMachine):
+    """A driven oscillator with a stop, whose field is spoilt below."""
+
+    omega: jax.Array | float = 0.9
+    stops: tuple = (vi.RigidStop(2.0, 0.5),)
+
+    @property
+    def cycle(self):
+        return 2 * jnp.pi / self.omega
+
+    def start(self):
+        return vi.OscillatorState(jnp.array(0.0), jnp.array(0.0))
+
+    def force(self, s, x):
+        return jnp.cos(self.omega * s)
+
+    def field(self, s, x):
+        return vi.OscillatorState(x.V, self.force(s, x) - x.Y)
+
+
+class OtherPeriod(Machine):
+    def force(self, s, x):
+        return jnp.cos(s)
+
+
+class ByNumpy(Machine):
+    def force(self, s, x):
+        return np.cos(self.omega * s)
+
+
+class ByMath(Machine):
+    def force(self, s, x):
+        return math.cos(self.omega * s)
+
+
+class WithIf(Machine):
+    def force(self, s, x):
+        return 1.0 if x.Y > 0 else 0.0
+
+
+class NoReturn(Machine):
+    def field(self, s, x):
+        vi.OscillatorState(x.V, -x.Y)
+
+
+class Tuple(Machine):
+    def field(self, s, x):
+        return x.V, -x.Y
+
+
+def simulate(machine):
+    return vi.simulate(machine, machine.start(), 1)
+
+
+def refused(call):
+    """What is said of a call that raises."""
+    with pytest.raises((TypeError, ValueError)) as caught:
+        call()
+    return str(caught.value)
+
+
+def warned(call):
+    """What a call warns of."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        call()
+    return " ".join(str(x.message) for x in caught)
+
+
+@pytest.mark.parametrize(
+    ("call", "says"),
+    [
+        (lambda: vi.Scene.ideal(frequency_ration=0.9), "near names: frequency_ratio"),
+        (lambda: Machine(omgea=1.0), "`Machine` has no argument `omgea`; near names: omega"),
+        (lambda: vi.RigidStop(gap=1.0, restitutoin=0.5), "near names: restitution"),
+        (lambda: vi.simulate(SCENE, SCENE.start(), 2, sample=8), "near names: samples"),
+        (lambda: vi.scan(SCENE, {"frequency_ratio": [0.9]}), "near names: drive.frequency_ratio"),
+        (lambda: SCENE.start(y=0.5), "it is called `Y`"),
+    ],
+)
+def test_1_a_name_that_is_not_there(call, says):
+    assert says in refused(call)
+
+
+def test_2_other_units():
+    assert "lengths are in metres" in warned(lambda: vi.Parameters(gap=80.0))
+    assert "in [0, 1], but got 50" in refused(lambda: vi.RigidStop(1.0, 50.0))
+
+
+def test_3_single_precision():
+    with jax.enable_x64(False):
+        scene = vi.Scene.ideal(frequency_ratio=0.9)
+        said = warned(lambda: vi.simulate(scene, scene.start(), 1))
+    assert 'call `jax.config.update("jax_enable_x64", True)` first' in said
+
+
+@pytest.mark.parametrize(
+    ("call", "says"),
+    [
+        (lambda: vi.Scene.ideal(0.9, 0.5), "takes its arguments by name, as frequency_ratio=…"),
+        (lambda: vi.RigidStop(0.5, 2.0), "`restitution` must be finite and in [0, 1]"),
+    ],
+)
+def test_4_arguments_in_another_order(call, says):
+    """That of machine and start is among the calls of `refused_calls.py`."""
+    assert says in refused(call)
+
+
+def test_5_a_field_of_another_period():
+    said = warned(lambda: simulate(OtherPeriod()))
+    assert "`cycle` must be a period of the field" in said
+    assert not warned(lambda: simulate(Machine()))
+
+
+def test_6_a_start_beyond_the_stop():
+    said = refused(lambda: vi.simulate(SCENE, SCENE.start(Y=3.0), 2))
+    assert "must not lie beyond a stop, but lies 1 beyond stop 0 (right, gap 2.0)" in said
+    orbit = vi.find_orbit(SCENE, SCENE.start(Y=3.0))
+    assert "as one beyond a stop: `simulate` says why" in str(orbit)
+
+
+@pytest.mark.parametrize("kind", [ByNumpy, ByMath])
+def test_7_numpy_in_a_field(kind):
+    assert "with the functions of `jax.numpy`" in refused(lambda: simulate(kind()))
+
+
+def test_8_an_if_on_a_traced_number():
+    assert "`jnp.where`, not `if`" in refused(lambda: simulate(WithIf()))
+
+
+@pytest.mark.parametrize(
+    ("kind", "says"),
+    [(NoReturn, "its `return` is missing"), (Tuple, "but returned (f64[], f64[])")],
+)
+def test_9_a_field_that_returns_no_state(kind, says):
+    said = refused(lambda: simulate(kind()))
+    assert "must return what is like its state" in said
+    assert says in said
+
+
+def test_10_a_guess_of_no_stable_motion():
+    orbit = vi.find_orbit(
+        SCENE, SCENE.start(Y=1.0, V=50.0), cycles=1, root_finder=vi.Newton(max_steps=2)
+    )
+    assert "begin nearer to one" in str(orbit)
+    undamped = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0)
+    orbit = vi.find_orbit(undamped, undamped.start(Y=1.92303, V=-0.876442))
+    assert "unstable" in str(orbit)
+    assert "`orbit` must be a stable orbit" in refused(lambda: vi.minimal_kick(undamped, orbit))

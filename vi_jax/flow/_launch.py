@@ -1,0 +1,88 @@
+"""A lane as its loop begins: what it begins with, and whether it can be run at all."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+
+from .._types import Flag, Scalar, State
+from ..machine import begin_modes, rubs, struck_modes
+from . import results
+from ._lane import Lane, Plan, to_event, total
+from ._own import check_field, check_laws
+from ._own_parts import check_events
+from .events import Rates, force_rate, rates
+from .smooth import in_modes, rounding
+
+
+def launched(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
+    """The lane as its loop begins, in the state `start`; one that cannot be run, or is not
+    `wanted`, has ended already."""
+    machine = plan.machine
+    Y = machine.position(start)
+    numbers = jtu.tree_leaves((start, eqx.filter(machine, eqx.is_inexact_array)))
+    bad = ~jnp.isfinite(total(numbers, plan.settle)) | ~jnp.asarray(wanted)
+    bad = bad | ~machine.in_range(start)
+    slack = rounding(machine, start)
+    for stop in machine.stops:
+        bad = bad | (stop.beyond(machine.coordinates[stop.coordinate].position(start)) > slack)
+    bad = jax.lax.stop_gradient(bad)
+    zero = jnp.zeros_like(Y)
+    modes = begin_modes(machine, zero, start)
+    check_field(machine, zero, start, modes)
+    check_laws(machine, zero)
+    check_events(machine, zero, start, modes)
+    free = in_modes(machine, modes)
+    here = [rates(free.field, x.position, zero, start) for x in machine.coordinates]
+    # At rest the acceleration says which way the motion goes.
+    direction = tuple(jnp.where(x.v == 0, jnp.sign(x.a), jnp.sign(x.v)) for x in here)
+    contact = None
+    if plan.rests:
+        growth = [force_rate(free, x.position, free, zero, start) for x in machine.coordinates]
+        both = enumerate(zip(here, growth, strict=True))
+        contact = tuple(_rests_on(plan, k, *x, slack) for k, x in both)
+        direction = tuple(
+            jnp.where((x.v == 0) & (x.a == 0), jnp.sign(j), along)
+            for x, j, along in zip(here, growth, direction, strict=True)
+        )
+        for i, stop in enumerate(machine.stops):
+            # A little off the stop it would come to rest there: no derivative by the start.
+            at = machine.coordinates[stop.coordinate].placed(start, stop.place, zero)
+            rests = contact[stop.coordinate] == to_event(i)
+            start = jtu.tree_map(lambda a, b, rests=rests: jnp.where(rests, a, b), at, start)
+        if rubs(machine):
+            modes = struck_modes(machine, zero, start, modes, contact=contact)
+    length = zero + jax.lax.stop_gradient(machine.cycle) / plan.method.steps_per_cycle
+    if plan.method.adaptive:
+        length = length / 8
+    return Lane(
+        s=zero,
+        state=start,
+        record=plan.fresh(start),
+        direction=jax.lax.stop_gradient(direction),
+        contact=contact,
+        modes=modes,
+        below=tuple(zero for _ in plan.from_below(start)),
+        length=length,
+        attempt=length,
+        target=zero,
+        aims=zero,
+        part=plan.first_part(zero) if plan.instants > 1 else zero,
+        done=zero,
+        fault=jnp.where(bad, float(results.BAD_START), zero),
+        steps=zero,
+        spent=zero,
+        rejected=zero,
+    )
+
+
+def _rests_on(plan: Plan, k: int, here: Rates, growth: Scalar, slack: Scalar | float) -> Scalar:
+    """The stop that coordinate number k rests on as the motion begins: pressed on, or about to
+    be by a force that grows; place and velocity are known to within `slack`."""
+    contact = jnp.zeros_like(here.x)
+    for i, stop in enumerate(plan.machine.stops):
+        if stop.coordinate == k:
+            pressed = (stop.sign * here.a > 0) | (here.a == 0) & (stop.sign * growth > 0)
+            rests = (stop.beyond(here.x) >= -slack) & (jnp.abs(here.v) <= slack) & pressed
+            contact = jnp.where(rests, to_event(i), contact)
+    return contact

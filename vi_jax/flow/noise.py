@@ -1,0 +1,249 @@
+"""White noise on accelerations, as impulses at equal instants of a cycle."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, UInt32
+
+from .._checks import count, require_real
+from .._numbers import concrete
+from .._types import Flag, Scalar, State
+from ..machine import AbstractMachine, SoftStop, leaf_names
+from ._lane import Impulses, Plan, has_fixed_cycle, ticks
+from ._random import normal_pair, threefry
+
+
+class WhiteNoise(eqx.Module):
+    """White noise on accelerations: dV = … dt + σ dW for the velocities that are named.
+
+    It acts as impulses. At `impulses` instants of each cycle, evenly spaced, the last at its end,
+    a velocity jumps by σ √h N(0, 1), with h the time between two instants and a number of its own
+    for each instant and component. Between them the motion is free of noise, so that impacts,
+    extremes and derivatives along the path hold as without it. The mean gain of energy by the noise
+    is exact; what is left of the finite number of impulses falls with h, so that results from two
+    numbers of impulses can be extrapolated.
+
+    For machines whose cycles all have the same known duration, without friction and resets. States
+    on record points are those behind their impulses; `samples` of a run must divide `impulses`.
+    Each lane of a batch has a key of its own (`jax.random.split`). A lane's numbers depend on its
+    key and the cycle and instant alone, not on the batch, the method or `samples`; cycles are
+    counted from the start, those of `settle` too. A run that goes on from another's end takes
+    another key (`jax.random.fold_in`).
+
+    **Arguments:**
+
+    - `amplitudes`: σ of each velocity by its name in the state, as `{"V": 0.5}`, in the units of
+      velocity over √time. An array that is part of a state gets numbers of its own for each entry.
+      In place of a number a function of the state gives σ where an impulse finds it: dV = … dt +
+      σ(state) dW in Itô's sense. It is a part of the program: define it once.
+    - `impulses`: impulses in a cycle, at least 1; static.
+
+    **Raises:** `TypeError` or `ValueError` for amplitudes that are not real, not finite or
+    negative, and for other numbers of impulses.
+    """
+
+    amplitudes: dict[str, Any]
+    """Those that are numbers."""
+    impulses: int = eqx.field(static=True)
+    functions: tuple[tuple[str, Callable], ...] = eqx.field(static=True, init=False)
+    """Those that are functions of the state, by name."""
+
+    def __init__(self, amplitudes: Any, *, impulses: Any = 64):
+        if not isinstance(amplitudes, dict) or not amplitudes:
+            raise TypeError(
+                "Argument `amplitudes` must be a dictionary of at least one velocity's name and "
+                f"amplitude, but got {amplitudes!r}."
+            )
+        self.functions = tuple((name, x) for name, x in amplitudes.items() if callable(x))
+        amplitudes = {name: x for name, x in amplitudes.items() if not callable(x)}
+        for name, value in amplitudes.items():
+            require_real("amplitudes", repr(name), value)
+            numbers = concrete(value)
+            if numbers is not None and not np.all(
+                np.isfinite(numbers) & (np.asarray(numbers) >= 0)
+            ):
+                raise ValueError(
+                    "Argument `amplitudes` must hold finite numbers of at least 0, but that of "
+                    f"{name!r} is {value}."
+                )
+        self.amplitudes = {name: jnp.asarray(x, float) for name, x in amplitudes.items()}
+        self.impulses = count("impulses", impulses, least=1, most=2**16)
+
+
+def with_noise(plan: Plan, start: State, noise: Any, key: Any, samples: int) -> Plan:
+    """The plan of a run with its noise, as the loop needs it.
+
+    **Raises:** `TypeError` or `ValueError` as `simulate` for noise, key or samples that do not fit
+    together or do not fit the machine.
+    """
+    machine = plan.machine
+    check_noise(machine, start, noise)
+    if samples and noise.impulses % samples:
+        raise ValueError(
+            "Argument `samples` must divide the number of impulses in a cycle, "
+            f"{noise.impulses}, but got {samples}."
+        )
+    amplitudes, functions = _by_leaf(start, noise)
+    dtype = machine.position(start).dtype
+    duration = _duration(machine, start)
+    root = jnp.sqrt(jnp.asarray(duration, dtype) / noise.impulses)
+    scales = tuple(None if x is None else jnp.asarray(x, dtype) * root for x in amplitudes)
+    impulses = Impulses(words_of(key), scales, noise.impulses, functions)
+    return dataclasses.replace(plan, noise=impulses)
+
+
+def check_noise(machine: AbstractMachine, start: State, noise: Any) -> None:
+    """**Raises:** `TypeError` or `ValueError` as `simulate` for noise that does not fit the machine
+    in the state `start`."""
+    if not isinstance(noise, WhiteNoise):
+        raise TypeError(f"Argument `noise` must be a `WhiteNoise`, but got {noise!r}.")
+    _check_machine(machine, start)
+    amplitudes, functions = _by_leaf(start, noise)
+    _check_velocities(machine, start, amplitudes)
+    for leaf, function in zip(jtu.tree_leaves(start), functions, strict=True):
+        if function is not None:
+            shape = jax.eval_shape(lambda x, f=function: jnp.asarray(f(x)), start).shape
+            if shape not in ((), jnp.shape(leaf)):
+                raise ValueError(
+                    "Argument `noise` must have functions that return one amplitude, or an array "
+                    f"of shape {jnp.shape(leaf)}, but one returns shape {shape}."
+                )
+
+
+def _duration(machine: AbstractMachine, start: State) -> Scalar | float | None:
+    """The time that every cycle takes; `None` if it is not known beforehand."""
+    if has_fixed_cycle(machine, start):
+        return machine.period
+    if not ticks(machine, start):
+        return None
+    # The independent variable is in proportion to time if its pace needs neither it nor the state.
+    zero = jnp.zeros_like(machine.position(start))
+    traced = jax.make_jaxpr(machine.pace)(zero, start).jaxpr
+    read = {id(x) for equation in traced.eqns for x in equation.invars}
+    read |= {id(x) for x in traced.outvars}
+    if any(id(x) in read for x in traced.invars):
+        return None
+    pace = machine.pace(zero, start)
+    assert pace is not None
+    return pace * machine.cycle
+
+
+def _check_machine(machine: AbstractMachine, start: State) -> None:
+    what = None
+    if _duration(machine, start) is None:
+        what = "whose cycles all have the same known duration"
+    elif (
+        not all(isinstance(x, SoftStop) and x.adhesive for x in machine.switches) or machine.events
+    ):
+        what = "without friction, resets and switches other than adhesive soft stops"
+    elif machine.prepared().machine is not machine:
+        what = "that is not followed in its natural modes"
+    if what is not None:
+        raise ValueError(
+            f"Argument `noise` must be left out but for a machine {what}, but got a "
+            f"{type(machine).__name__}."
+        )
+
+
+def _by_leaf(start: State, noise: WhiteNoise) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+    """The amplitude of each array of the state, `None` where it has none and 1 where a function
+    gives it; and these functions, `None` where there is none."""
+    functions = dict(noise.functions)
+    amplitudes = {**noise.amplitudes, **dict.fromkeys(functions, 1.0)}
+    names = leaf_names(start)
+    for name in amplitudes:
+        if name not in names:
+            raise ValueError(
+                f"Argument `noise` must name parts of the state ({', '.join(names)}), but got "
+                f"{name!r}."
+            )
+    leaves = jtu.tree_leaves(start)
+    for name, leaf in zip(names, leaves, strict=True):
+        shape = jnp.shape(amplitudes.get(name, 0.0))
+        if shape not in ((), jnp.shape(leaf)):
+            raise ValueError(
+                f"Argument `noise` must have for {name!r} one amplitude, or an array of shape "
+                f"{jnp.shape(leaf)}, but got shape {shape}."
+            )
+    given = tuple(amplitudes.get(name) for name in names)
+    return given, tuple(functions.get(name) for name in names)
+
+
+def _check_velocities(machine: AbstractMachine, start: State, amplitudes: tuple) -> None:
+    """**Raises:** `ValueError` where noise moves what a stop limits, and not only its velocity."""
+    leaves, tree = jtu.tree_flatten(start)
+    along = [
+        jnp.zeros_like(x) if a is None else jnp.ones_like(x)
+        for x, a in zip(leaves, amplitudes, strict=True)
+    ]
+    for k in sorted({stop.coordinate for stop in machine.stops}):
+        place = machine.coordinates[k].position
+        moved = concrete(jax.jvp(place, (start,), (tree.unflatten(along),))[1])
+        if moved is not None and np.any(moved):
+            raise ValueError(
+                "Argument `noise` must change velocities only, but it moves coordinate number "
+                f"{k}, which a stop limits."
+            )
+
+
+def lane_key(key: UInt32[Array, "2"], number: UInt32[Array, ""]) -> UInt32[Array, "2"]:
+    """The words of the key of lane `number`, of the words of a key: `jax.random.fold_in`."""
+    return jnp.stack(threefry(key, jnp.uint32(0), number))
+
+
+def words_of(key: Any) -> UInt32[Array, "2"]:
+    """The two words of a key of JAX's.
+
+    **Raises:** `TypeError` or `ValueError` for what is none.
+    """
+    what = "one key of JAX's Threefry generator, as `jax.random.key(0)` makes it"
+    if key is None:
+        raise TypeError(f"Argument `key` must be {what}, where there is noise.")
+    data = key
+    if isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
+        data = jax.random.key_data(key)
+    if not isinstance(data, jax.Array | np.ndarray) or data.dtype != jnp.uint32:
+        raise TypeError(f"Argument `key` must be {what}, but got {key!r}.")
+    if data.shape != (2,):
+        raise ValueError(f"Argument `key` must be {what}, but got {key!r}; use `jax.vmap`.")
+    return jnp.asarray(data)
+
+
+def kicked(noise: Impulses, when: Flag, cycle: Scalar, instant: Scalar, state: State) -> State:
+    """The state behind the impulse of an instant, where there is one.
+
+    **Arguments:** whether there is one; the cycle, counted from the start of the run with those
+    that settle, and the number of the instant in it.
+    """
+    leaves, tree = jtu.tree_flatten(state)
+    sizes = [0 if x is None else leaf.size for x, leaf in zip(noise.scales, leaves, strict=True)]
+    words = cycle.astype(jnp.uint32), instant.astype(jnp.uint32)
+    dtype = next(leaf.dtype for leaf, n in zip(leaves, sizes, strict=True) if n)
+
+    def drawn(words: tuple[Array, Array]) -> tuple[Array, ...]:
+        numbers: list[Array] = []
+        for pair in range((sum(sizes) + 1) // 2):
+            # The instant takes 16 bits of the second word, the pair those above.
+            second = words[1] + jnp.uint32(pair << 16)
+            numbers += normal_pair(noise.key, words[0], second, dtype)
+        return tuple(numbers[: sum(sizes)])
+
+    def none(words: tuple[Array, Array]) -> tuple[Array, ...]:
+        return tuple(jnp.zeros((), dtype) for _ in range(sum(sizes)))
+
+    numbers = list(jax.lax.cond(when, drawn, none, words))
+    new = []
+    for leaf, scale, n, f in zip(leaves, noise.scales, sizes, noise.functions, strict=True):
+        if scale is not None and n:
+            mine, numbers = numbers[:n], numbers[n:]
+            here = mine[0] if leaf.ndim == 0 else jnp.stack(mine).reshape(leaf.shape)
+            size = scale if f is None else scale * f(state)
+            leaf = jnp.where(when, leaf + size * here, leaf)
+        new.append(leaf)
+    return tree.unflatten(new)

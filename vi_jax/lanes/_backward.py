@@ -1,0 +1,287 @@
+"""Reverse mode: the transpose of `lanes`, and the primitive `lanes_backward` for that by a tape.
+
+`lanes_backward` gives Jᵀc: J is the Jacobian of a program's results and rows by some of its inputs,
+c their cotangents. On a CPU it is a kernel that goes forward and then backward (`_tape.py`), else
+columns. Its own derivatives need no other code: with D, the program of values y and derivatives Jv,
+
+    d(Jᵀc) = Jᵀ dc + ∂(cᵀJv)/∂x,
+
+which are the cotangents of x by D backward, dc being that of y, and c that of Jv.
+"""
+
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.core import ShapedArray
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+
+from ._columns import by_columns
+from ._derivative import forward
+from ._primitive import lanes_p, lower_to_kernel, with_lane_axis
+from ._program import LaneProgram, size_of
+from ._reverse import ReverseProgram, reverse
+
+# Up to so many numbers go by columns. Simulations of the motor that a gradient takes (64 lanes, 50
+# cycles, one thread), by 1, 2, 4, 8, 11 numbers: columns 2.1, 2.5, 3.3, 6.7, 9.7; a tape 3.2, 3.3,
+# 3.5, 4.5, 4.5. They are compiled in about the same time.
+_BY_COLUMNS = 4
+
+# Where a step is longer than so many equations, more numbers go by columns, by the square of how
+# much longer it is: a tape takes some 1.5 ms an equation to trace, columns a third. A motor's step
+# has 3,600; that of a structure with three stops, whose blows of one instant are a loop, 15,000. By
+# 16 numbers its first gradient took 43 s by a tape and 5 by columns, to gain 4 simulations.
+_SHORT = 4_000
+
+# One cotangent by a tape takes as long as so many columns (the same measurement as `_BY_COLUMNS`).
+_COLUMNS_EACH = 4
+
+lanes_backward_p = Primitive("lanes_backward")
+lanes_backward_p.multiple_results = True
+
+
+@lanes_backward_p.def_abstract_eval
+def _(*args, program: ReverseProgram):
+    batch = program.batch([a.shape for a in args])
+    return [ShapedArray((*batch, *a.shape), a.dtype) for a in program.out_avals]
+
+
+@lanes_backward_p.def_impl
+def _(*args, program: ReverseProgram):
+    return jax.jit(functools.partial(lanes_backward_p.bind, program=program))(*args)
+
+
+# --- the transpose of `lanes`
+
+
+def _transposed(cotangents, *args, program: LaneProgram, backend: str):
+    """Reverse mode: by a tape for many numbers, where that can be; else by columns."""
+    linear = [ad.is_undefined_primal(x) for x in args]
+    shapes = [x.aval.shape if u else jnp.shape(x) for x, u in zip(args, linear, strict=True)]
+    batch = program.batch(shapes)
+    weights = {k: ct for k, ct in enumerate(cotangents) if type(ct) is not ad.Zero}
+    number = sum(a.size for a, u in zip(program.in_avals, linear, strict=True) if u)
+    found = None
+    if backend != "xla" and number > _BY_COLUMNS * max(1.0, _length(program) / _SHORT) ** 2:
+        found = _by_tape(program, args, linear, weights)
+    if found is None:
+        given = [None if u else jnp.asarray(x) for x, u in zip(args, linear, strict=True)]
+        found = by_columns(program, backend, given, weights, batch)
+    out: list[Any] = [None] * len(args)
+    for i, x in found.items():
+        out[i] = _for_argument(x, program.in_avals[i], args[i].aval)
+    return out
+
+
+@functools.lru_cache(maxsize=64)
+def _length(program: LaneProgram) -> int:
+    """The equations of a step of its values."""
+    return size_of((program.base or program).step.jaxpr)
+
+
+def _for_argument(x, own, aval):
+    """The cotangent of an argument from those of all lanes: the sum, if it is one for all.
+
+    **Arguments:** the cotangents with the axes of a batch; the shapes of one lane's and of the
+    argument.
+    """
+    if aval.ndim == own.ndim:
+        x = jnp.sum(x, axis=tuple(range(x.ndim - own.ndim)))
+    return x.reshape(aval.shape).astype(aval.dtype)
+
+
+def _by_tape(program: LaneProgram, args, linear: list[bool], weights) -> dict[int, Any] | None:
+    """The cotangents of the tangents `linear` of a program of values and derivatives, by their
+    places; `None` if it is no such program, or if something in it has no transpose."""
+    base = program.base
+    if base is None or not program.varied or any(linear[: len(base.in_avals)]):
+        return None
+    places = _tangent_places(program)
+    wanted = tuple(i in places and linear[places[i]] for i in range(len(base.in_avals)))
+    own = _derivative_places(base, program.varied)
+    if set(weights) - set(own.values()):
+        return None
+    given = tuple(own.get(k, -1) in weights for k in range(_result_count(base)))
+    back = reverse(base, wanted, given)
+    if back is None:
+        return None
+    inputs = [jnp.asarray(x) for x in args[: len(base.in_avals)]]
+    some = [weights[own[k]] for k, here in enumerate(given) if here]
+    found = lanes_backward_p.bind(*inputs, *some, program=back)
+    asked = [places[i] for i, here in enumerate(wanted) if here]
+    return dict(zip(asked, found, strict=True))
+
+
+def _tangent_places(program: LaneProgram) -> dict[int, int]:
+    """Of the inputs of a program's base, where the program has their tangents."""
+    assert program.base is not None
+    moved = [i for i, here in enumerate(program.varied) if here]
+    return {i: len(program.base.in_avals) + n for n, i in enumerate(moved)}
+
+
+def _derivative_places(base: LaneProgram, varied: tuple[bool, ...]) -> dict[int, int]:
+    """Of the results and parts of a row of a program, where `forward(base, varied)` has their
+    derivatives."""
+    _, has = forward(base, varied)
+    outs, rows = len(base.out_avals), len(base.row_avals)
+    places, at = {}, outs
+    for k, here in enumerate(has):
+        if k == outs:
+            at += rows
+        if here:
+            places[k] = at
+            at += 1
+    return places
+
+
+def _result_count(program: LaneProgram) -> int:
+    return len(program.out_avals) + len(program.row_avals)
+
+
+ad.primitive_transposes[lanes_p] = _transposed
+
+
+# --- `lanes_backward`
+
+
+def _columns(*args, program: ReverseProgram) -> list[Any]:
+    """What `lanes_backward` gives, by columns."""
+    base, varied = program.program, program.varied
+    n, batch = len(base.in_avals), program.batch([x.shape for x in args])
+    inputs, given = list(args[:n]), args[n:]
+    inputs[0] = jnp.broadcast_to(inputs[0], (*batch, *base.in_avals[0].shape))
+    derived, _ = forward(base, varied)
+    own = _derivative_places(base, varied)
+    some = iter(given)
+    weights = {own[k]: next(some) for k, here in enumerate(program.given) if here}
+    tangents = [None for here in varied if here]
+    found = by_columns(derived, "auto", [*inputs, *tangents], weights, batch)
+    return [found[n + k] for k in range(len(tangents))]
+
+
+def _batched(args, dims, *, program: ReverseProgram):
+    """An axis of `jax.vmap` becomes one of lanes; but many cotangents of the same motions, as
+    `jax.jacrev` has them, share columns."""
+    args = [jnp.asarray(x) for x in args]
+    n = len(program.program.in_avals)
+    size = next(x.shape[d] for x, d in zip(args, dims, strict=True) if d is not None)
+    number = sum(a.size for a in program.out_avals)
+    alike = all(d is None for d in dims[:n])
+    if alike and size * _COLUMNS_EACH > number:
+        over = jax.vmap(functools.partial(_columns, program=program), dims)
+        return over(*args), [0] * len(program.out_avals)
+    shapes = [
+        x.shape if d is None else x.shape[:d] + x.shape[d + 1 :]
+        for x, d in zip(args, dims, strict=True)
+    ]
+    moved = with_lane_axis(args, dims, program.in_avals, program.batch(shapes), size)
+    out = lanes_backward_p.bind(*moved, program=program)
+    return out, [0] * len(out)
+
+
+def _jvp(primals, tangents, *, program: ReverseProgram):
+    """Jᵀc and its derivative (see above)."""
+    values = lanes_backward_p.bind(*primals, program=program)
+    base, n = program.program, len(program.program.in_avals)
+    moved = tuple(type(x) is not ad.Zero for x in tangents[:n])
+    changed = [None if type(x) is ad.Zero else x for x in tangents[n:]]
+    inputs, cotangents = primals[:n], primals[n:]
+    dc = _by_result(program, changed)
+    if any(moved):
+        derived, _ = forward(base, moved)
+        own = _derivative_places(base, moved)
+        c = _by_result(program, cotangents)
+        weights = {own[k]: x for k, x in c.items() if k in own}
+        weights |= {_value_place(base, moved, k): x for k, x in dc.items()}
+        inputs = [*inputs, *(x for x, here in zip(tangents[:n], moved, strict=True) if here)]
+    else:
+        derived, weights = base, dc
+    wanted = (*program.varied, *(False for _ in inputs[n:]))
+    given = tuple(k in weights for k in range(_result_count(derived)))
+    if not weights:
+        return values, [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in values]
+    back = reverse(derived, wanted, given)
+    if back is None:
+        along = functools.partial(_columns, program=program)
+        return values, jax.jvp(along, primals, [*map(ad.instantiate_zeros, tangents)])[1]
+    some = [weights[k] for k in sorted(weights)]
+    return values, lanes_backward_p.bind(*inputs, *some, program=back)
+
+
+def _by_result(program: ReverseProgram, cotangents: Sequence[Any]) -> dict[int, Any]:
+    """The cotangents that there are, by the places of their results and parts of a row."""
+    places = [k for k, here in enumerate(program.given) if here]
+    return {k: x for k, x in zip(places, cotangents, strict=True) if x is not None}
+
+
+def _value_place(base: LaneProgram, varied: tuple[bool, ...], k: int) -> int:
+    """Where `forward(base, varied)` has result, or part of a row, number k of `base`."""
+    _, has = forward(base, varied)
+    outs = len(base.out_avals)
+    return k if k < outs else k + sum(has[:outs])
+
+
+def _transposed_back(cotangents, *args, program: ReverseProgram):
+    """Reverse over reverse. Jᵀc is linear in c, and its transpose is J. What `_jvp` gives is linear
+    in dc and v, and by the symmetry of second derivatives its transpose in v is of its own kind:
+
+        along w:   J w for dc,   ∂(cᵀJw)/∂x for v.
+    """
+    derived, n = program.program, len(program.program.in_avals)
+    linear = [ad.is_undefined_primal(x) for x in args]
+    base, second = derived, any(linear[:n])
+    if second:
+        if derived.base is None or not derived.varied:
+            raise NotImplementedError("A gradient by the numbers of a lane that is no tangent's.")
+        base = derived.base
+    varied = program.varied[: len(base.in_avals)]
+    along, _ = forward(base, varied)
+    own = _derivative_places(base, varied)
+    w = [ad.instantiate_zeros(x) for x in cotangents]
+    inputs = [*args[: len(base.in_avals)], *w]
+    weights = [k for k, here in enumerate(program.given) if here]
+    found: dict[int, Any] = {}
+    if any(linear[n:]):
+        values = lanes_p.bind(*inputs, program=along, backend="auto")
+        of_value = {_value_place(base, derived.varied, k) if second else k: k for k in own}
+        for i, k in enumerate(weights, n):
+            if linear[i] and k in of_value:
+                found[i] = values[own[of_value[k]]]
+    if second:
+        before = {place: k for k, place in _derivative_places(base, derived.varied).items()}
+        pairs = [(before.get(k), args[i]) for i, k in enumerate(weights, n) if not linear[i]]
+        given = {own[k]: x for k, x in pairs if k in own}
+        places = {i: k for i, k in _tangent_places(derived).items() if linear[k]}
+        flags = tuple(k in given for k in range(_result_count(along)))
+        back = reverse(along, tuple(i in places for i in range(len(along.in_avals))), flags)
+        if back is None:
+            raise NotImplementedError("A loop that is taken back by a tape once, but not twice.")
+        some = lanes_backward_p.bind(*inputs, *(given[k] for k in sorted(given)), program=back)
+        found |= dict(zip(places.values(), some, strict=True))
+    out: list[Any] = [None] * len(args)
+    for i, x in enumerate(args):
+        if linear[i]:
+            own_aval, zero = program.in_avals[i], jnp.zeros(x.aval.shape, x.aval.dtype)
+            out[i] = _for_argument(found[i], own_aval, x.aval) if i in found else zero
+    return out
+
+
+batching.primitive_batchers[lanes_backward_p] = _batched
+ad.primitive_transposes[lanes_backward_p] = _transposed_back
+ad.primitive_jvps[lanes_backward_p] = _jvp
+
+
+_columns_lowered = mlir.lower_fun(_columns, multiple_results=True)
+
+
+def _lowered(ctx, *args, program: ReverseProgram):
+    """On a CPU: a call of the reverse kernel; else columns, as on all other devices."""
+    otherwise = functools.partial(_columns_lowered, ctx, *args, program=program)
+    return lower_to_kernel(ctx, args, program, otherwise)
+
+
+mlir.register_lowering(lanes_backward_p, _lowered, platform="cpu")
+mlir.register_lowering(lanes_backward_p, _columns_lowered)

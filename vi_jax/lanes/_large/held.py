@@ -1,0 +1,157 @@
+"""Large arrays computed, stored, chosen, replaced."""
+
+import hashlib
+import struct
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from .._text import Text, Value, is_float
+from .index import Index, contiguous, over, place_of
+from .kinds import (
+    MOST_IN_REGISTERS,
+    Formula,
+    Held,
+    Large,
+    Memory,
+    Pieces,
+    Strided,
+    Table,
+    at,
+    joined,
+    kind_in,
+    stored_kind,
+    uniform,
+)
+
+
+def as_large(t: Text, x: Held) -> Large:
+    """An array as one that can be asked for numbers at places known only at run time."""
+    if isinstance(x, Large):
+        return x
+    if x.size == 1:
+        value = x.reshape(-1)[0]
+        return uniform(x.shape, value)
+    return stored(t, x)
+
+
+def held(t: Text, x: Held) -> Held:
+    """An array as a kernel holds one of its size."""
+    if not isinstance(x, Large) or x.size > MOST_IN_REGISTERS:
+        return x
+    out = np.empty(x.shape, object)
+    for i in np.ndindex(x.shape):
+        out[i] = x.at(t, i)
+    return out
+
+
+def room(t: Text, shape: Sequence[int], kind: str) -> Strided:
+    """An array in memory whose numbers are still to be stored."""
+    numbers = int(np.prod(shape, dtype=int))
+    source = Memory(t.arena.take(max(1, numbers)))
+    return Strided(tuple(shape), kind, source, contiguous(shape))
+
+
+def fill(
+    t: Text, out: Strided, x: Held, *, offset: Index = 0, strides: Sequence[int] | None = None
+) -> None:
+    """Store the numbers of an array in room for them, by default in order.
+
+    **Arguments:** the text; the room; the array; the place of its first number, and the places from
+    one number to the next along each axis.
+    """
+    steps = contiguous(x.shape) if strides is None else strides
+    memory = out.source
+    assert isinstance(memory, Memory)
+    if not isinstance(x, Large):
+        for i in np.ndindex(x.shape):
+            memory.store(t, place_of(t, i, steps, offset), x[i])
+        return
+    over(t, x.shape, lambda i: memory.store(t, place_of(t, i, steps, offset), x.at(t, i)), x.cuts)
+
+
+def stored(t: Text, x: Held) -> Strided:
+    """A copy of an array in memory."""
+    out = room(t, x.shape, kind_in(x))
+    fill(t, out, x)
+    return out
+
+
+def settled(t: Text, x: Held) -> Held:
+    """An array whose numbers are computed: what is a formula is stored."""
+    return x if is_cheap(x) else stored(t, x)
+
+
+def is_cheap(x: Held) -> bool:
+    """Whether the numbers of an array need not be stored to be asked for again."""
+    if isinstance(x, Pieces):
+        return all(map(is_cheap, x.parts))
+    return not isinstance(x, Formula) or x.cheap
+
+
+def store_at(t: Text, x: Strided, index: Sequence[Index], value: Value) -> None:
+    """Store one number of an array in memory."""
+    memory = x.source
+    assert isinstance(memory, Memory)
+    memory.store(t, place_of(t, index, x.strides, x.offset), value)
+
+
+def selected(t: Text, mask: Value, a: Held, b: Held) -> Formula:
+    """The first array where `mask` holds, else the second."""
+    cuts = joined(*(x.cuts for x in (a, b) if isinstance(x, Large)))
+    return Formula(
+        a.shape, kind_in(a), lambda i: t.select(mask, at(t, a, i), at(t, b, i)), cuts=cuts
+    )
+
+
+def replace(t: Text, old: Sequence[Held], new: Sequence[Held], mask: Value | None = None) -> None:
+    """Store large arrays over those that they replace, where `mask` holds. The new ones may depend
+    on any of the old ones; arrays in registers are left out."""
+    pairs = [
+        (a, b)
+        for a, b in zip(old, new, strict=True)
+        if isinstance(a, Strided) and isinstance(b, Large) and not same(a, b)
+    ]
+    blocks = [a.source.block for a, _ in pairs if isinstance(a.source, Memory)]
+
+    def apart(x: Large) -> Large:
+        free = isinstance(x, Strided) and not (
+            isinstance(x.source, Memory) and any(x.source.block is b for b in blocks)
+        )
+        return x if free else stored(t, x)
+
+    for a, b in [(a, apart(b)) for a, b in pairs]:
+        fill(t, a, b if mask is None else selected(t, mask, b, a))
+
+
+def same(a: Held, b: Held) -> bool:
+    """Whether two large arrays are the same numbers of the same memory."""
+    if a is b:
+        return True
+    if not (isinstance(a, Strided) and isinstance(b, Strided)):
+        return False
+    mine = isinstance(a.source, Memory) and isinstance(b.source, Memory)
+    alike = a.source.block is b.source.block if mine else a.source == b.source  # pyright: ignore[reportAttributeAccessIssue]
+    return alike and (a.shape, a.strides, a.offset) == (b.shape, b.strides, b.offset)
+
+
+def table(t: Text, array: Any, kind: str) -> Large:
+    """A large array known while the code is written, as constants in the module's text."""
+    array = np.asarray(array)
+    numbers = array.reshape(-1)
+    word = stored_kind(kind)
+    if all(x.tobytes() == numbers[0].tobytes() for x in numbers):
+        return uniform(array.shape, t.constant(numbers[0], kind))
+    body = ", ".join(f"{word} {_word(x, kind)}" for x in numbers)
+    content = f"private unnamed_addr constant [{numbers.size} x {word}] [{body}], align 64"
+    name = f"@table{hashlib.blake2b(content.encode(), digest_size=8).hexdigest()}"
+    t.declared[name] = f"{name} = {content}"
+    return Strided(array.shape, kind, Table(name), contiguous(array.shape))
+
+
+def _word(number: Any, kind: str) -> str:
+    """A number in LLVM's words."""
+    if is_float(kind):
+        return "0x" + struct.pack(">d", float(number)).hex().upper()
+    return str(int(number))

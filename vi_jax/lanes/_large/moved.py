@@ -1,0 +1,278 @@
+"""What moves the numbers of large arrays about: other places of the same numbers, arrays joined."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from itertools import pairwise
+
+import numpy as np
+
+from .._operations import Rule, convert, kind_of, register
+from .._text import Text, Value
+from .held import as_large, fill, held, is_cheap, same, selected, settled, stored
+from .index import Index, contiguous, in_lanes, plus, times
+from .kinds import Formula, Held, Large, Pieces, Strided, at, joined, kind_in, uniform
+
+LARGE: dict[str, Rule] = {}
+large = partial(register, LARGE)
+"""As `register`, of rules with the arguments of those in `_arrays.py`, for arrays of which some are
+too large for registers."""
+
+
+# --- the same numbers at other places
+
+
+def _moved(
+    t: Text,
+    x: Large,
+    shape: Sequence[int],
+    places: Callable,
+    strides: Callable,
+    cut: Callable = lambda axis, place: None,
+) -> Large:
+    """An array that shows the numbers of another one.
+
+    **Arguments:** the text; the array; the new shape; from an index of it to that of the other;
+    from the other's strides to its own, and the place of its first number; from a cut of the other
+    to its own axis and place, `None` if it has no such place.
+    """
+    cuts: dict[int, set[int]] = {}
+    for axis, old in x.cuts.items():
+        for place in old:
+            found = cut(axis, place)
+            if found is None:
+                x, cuts = stored(t, x), {}
+                break
+            cuts.setdefault(found[0], set()).add(found[1])
+        if not x.cuts:
+            break
+    if isinstance(x, Formula) and x.value is not None:
+        return uniform(shape, x.value)
+    if isinstance(x, Strided):
+        steps, offset = strides(x.strides)
+        return x.viewed(shape, steps, offset)
+    known = {a: frozenset(n for n in ns if 0 < n < shape[a]) for a, ns in cuts.items()}
+    cheap = is_cheap(x)
+    return Formula(tuple(shape), x.kind, lambda i: x.at(t, tuple(places(i))), cheap, cuts=known)
+
+
+@large("reshape")
+def _(t, p, avals, x):
+    return reshaped(t, x, tuple(p["new_sizes"]))
+
+
+def reshaped(t: Text, x: Held, shape: tuple[int, ...]) -> Large:
+    """The numbers of an array in another shape, in the same order."""
+    x = as_large(t, x)
+    mine, other = ([i for i, n in enumerate(s) if n != 1] for s in (x.shape, shape))
+    if [x.shape[i] for i in mine] == [shape[i] for i in other]:
+        there = dict(zip(other, mine, strict=True))
+        back = dict(zip(mine, other, strict=True))
+        return _moved(
+            t, x, shape,
+            lambda i: [i[back[a]] if a in back else 0 for a in range(x.ndim)],
+            lambda s: ([s[there[a]] if a in there else 0 for a in range(len(shape))], 0),
+            lambda a, n: (back[a], n) if a in back else (0, 0),
+        )  # fmt: skip
+    if not isinstance(x, Strided) or [x.strides[i] for i in mine] != [
+        contiguous(x.shape)[i] for i in mine
+    ]:
+        x = stored(t, x)
+    return x.viewed(shape, contiguous(shape))
+
+
+@large("squeeze", "expand_dims")
+def _(t, p, avals, x):
+    return reshaped(t, x, avals[0].shape)
+
+
+@large("transpose")
+def _(t, p, avals, x):
+    order = p["permutation"]
+    return transposed(t, as_large(t, x), order)
+
+
+def transposed(t: Text, x: Large, order: Sequence[int]) -> Large:
+    """An array with its axes in another order."""
+    order = list(order)
+    return _moved(
+        t, x, [x.shape[a] for a in order],
+        lambda i: [i[order.index(a)] for a in range(len(order))],
+        lambda s: ([s[a] for a in order], 0),
+        lambda a, n: (order.index(a), n),
+    )  # fmt: skip
+
+
+@large("rev")
+def _(t, p, avals, x):
+    shape, turned = avals[0].shape, p["dimensions"]
+
+    def places(index):
+        return [
+            plus(t, n - 1, times(t, i, -1)) if a in turned else i
+            for a, (i, n) in enumerate(zip(index, shape, strict=True))
+        ]
+
+    def strides(steps):
+        back = [-s if a in turned else s for a, s in enumerate(steps)]
+        return back, sum(steps[a] * (shape[a] - 1) for a in turned)
+
+    return _moved(t, as_large(t, x), shape, places, strides)
+
+
+@large("slice")
+def _(t, p, avals, x):
+    begin = p["start_indices"]
+    return sliced(t, as_large(t, x), begin, avals[0].shape, p["strides"] or [1] * len(begin))
+
+
+def sliced(t: Text, x: Large, begin: Sequence[int], shape: Sequence[int], by=()) -> Large:
+    """A part of an array: from a place on, of a shape, every so many numbers along each axis."""
+    # JAX's transposes have NumPy's integers.
+    begin, by = [int(n) for n in begin], [int(n) for n in by] or [1] * len(begin)
+
+    def places(index: tuple[Index, ...]) -> list[Index]:
+        return [plus(t, times(t, i, n), b) for i, n, b in zip(index, by, begin, strict=True)]
+
+    def strides(steps: tuple[int, ...]) -> tuple[list[int], int]:
+        offset = sum(a * b for a, b in zip(steps, begin, strict=True))
+        return [a * n for a, n in zip(steps, by, strict=True)], offset
+
+    def cut(axis: int, place: int) -> tuple[int, int] | None:
+        return (axis, place - begin[axis]) if by[axis] == 1 else None
+
+    return _moved(t, x, shape, places, strides, cut)
+
+
+@large("split")
+def _(t, p, avals, x):
+    x, axis, parts, first = as_large(t, settled(t, x)), p["axis"], [], 0
+    for aval in avals:
+        begin = [first if a == axis else 0 for a in range(x.ndim)]
+        parts.append(sliced(t, x, begin, aval.shape))
+        first += aval.shape[axis]
+    return tuple(parts)
+
+
+@large("unstack")
+def _(t, p, avals, x):
+    x, axis = as_large(t, settled(t, x)), p["axis"]
+    shape = [1 if a == axis else n for a, n in enumerate(x.shape)]
+    corners = ([i if a == axis else 0 for a in range(x.ndim)] for i in range(x.shape[axis]))
+    return tuple(reshaped(t, sliced(t, x, c, shape), avals[0].shape) for c in corners)
+
+
+@large("empty2")
+def _(t, p, avals):
+    return uniform(avals[0].shape, t.zero(kind_of(avals[0].dtype)))
+
+
+@large("broadcast_in_dim")
+def _(t, p, avals, x, *sizes):
+    shape, where = tuple(p["shape"]), p["broadcast_dimensions"]
+    x = as_large(t, x)
+    if x.size < int(np.prod(shape)):  # else nothing would be computed twice
+        x = as_large(t, settled(t, x))
+    return _moved(
+        t, x, shape,
+        lambda index: [index[a] if n != 1 else 0 for a, n in zip(where, x.shape, strict=True)],
+        lambda s: (_broadcast_strides(s, x.shape, where, len(shape)), 0),
+        lambda a, n: (where[a], n),
+    )  # fmt: skip
+
+
+def _broadcast_strides(strides, sizes, where, axes: int) -> list[int]:
+    out = [0] * axes
+    for a, stride, size in zip(where, strides, sizes, strict=True):
+        out[a] = stride if size != 1 else 0
+    return out
+
+
+def chosen(t: Text, flag: Value, a: Held, b: Held) -> Large | None:
+    """The first array where a flag holds, else the second, where they differ in a few places only,
+    as in a state of which one number was changed; else `None`."""
+    cuts = joined(*(x.cuts for x in (a, b) if isinstance(x, Large)))
+    if len(cuts) != 1:
+        return None
+    ((axis, places),) = cuts.items()
+    parts = []
+    for begin, end in pairwise(sorted({0, a.shape[axis], *places})):
+        x, y = (_piece(t, z, axis, begin, end) for z in (a, b))
+        part = x if same(x, y) else held(t, selected(t, flag, x, y))
+        parts.append(part)
+    return Pieces(a.shape, kind_in(a), axis, tuple(parts))
+
+
+def _piece(t: Text, x: Held, axis: int, begin: int, end: int) -> Large:
+    """What lies between two places of an axis; the numbers that it was put together from, if it
+    was."""
+    first = 0
+    for part in x.parts if isinstance(x, Pieces) and x.axis == axis else ():
+        size = part.shape[axis]
+        if first <= begin and end <= first + size:
+            return _piece(t, part, axis, begin - first, end - first)
+        first += size
+    x = as_large(t, x)
+    corner = [begin if a == axis else 0 for a in range(x.ndim)]
+    return sliced(t, x, corner, [end - begin if a == axis else n for a, n in enumerate(x.shape)])
+
+
+# --- arrays put together
+
+
+@large("concatenate")
+def _(t, p, avals, *xs):
+    return Pieces(avals[0].shape, kind_of(avals[0].dtype), p["dimension"], _filled(xs))
+
+
+@large("stack")
+def _(t, p, avals, *xs):
+    axis, aval = p["axis"], avals[0]
+    shape = (*aval.shape[:axis], 1, *aval.shape[axis + 1 :])
+    parts = [reshaped(t, x, shape) if isinstance(x, Large) else x.reshape(shape) for x in xs]
+    return Pieces(aval.shape, kind_of(aval.dtype), axis, tuple(parts))
+
+
+def _filled(xs: Sequence[Held]) -> tuple[Held, ...]:
+    return tuple(x for x in xs if x.size)
+
+
+@large("pad")
+def _(t, p, avals, x, value):
+    number = at(t, value, ())
+    if any(inside for _, _, inside in p["padding_config"]):
+        x = _spread(t, p["padding_config"], as_large(t, x), number)
+    for axis, (low, high, _) in enumerate(p["padding_config"]):
+        low, high = int(low), int(high)
+        before, after = (
+            uniform([max(0, n) if a == axis else m for a, m in enumerate(x.shape)], number)
+            for n in (low, high)
+        )
+        size = max(0, low) + x.shape[axis] + max(0, high)
+        shape = tuple(size if a == axis else m for a, m in enumerate(x.shape))
+        x = Pieces(shape, kind_in(value), axis, _filled([before, x, after]))
+        if min(low, high) < 0:  # that much is cut off
+            begin = [max(0, -low) if a == axis else 0 for a in range(x.ndim)]
+            size += min(0, low) + min(0, high)
+            x = sliced(t, x, begin, [size if a == axis else m for a, m in enumerate(x.shape)])
+    return x
+
+
+def _spread(t: Text, config: Sequence[tuple[int, int, int]], x: Large, number: Value) -> Strided:
+    """An array with so many other numbers between its own along each axis."""
+    between = [int(inside) for _, _, inside in config]
+    shape = [max(0, (n - 1) * (i + 1) + 1) for n, i in zip(x.shape, between, strict=True)]
+    out = stored(t, uniform(shape, number))
+    steps = [(i + 1) * s for i, s in zip(between, out.strides, strict=True)]
+    fill(t, out, x, strides=steps)
+    return out
+
+
+@large("iota")
+def _(t, p, avals, *sizes):
+    kind, axis = kind_of(p["dtype"]), p["dimension"]
+    return Formula(
+        tuple(p["shape"]),
+        kind,
+        lambda index: convert(t, in_lanes(t, index[axis]), kind, False),
+        cheap=True,
+    )

@@ -1,0 +1,192 @@
+"""A program's parts forward and backward: what the cotangents of its results make of its inputs'.
+
+Each of the three functions of a `LaneProgram` is traced once together with its transposed
+derivative (`jax.vjp`), and that jaxpr is taken apart into the way there and the way back. So both
+hold the same equations for the values, in the same order, and where these are computed again for
+the way back they are the same bits (`_fixed.py`).
+"""
+
+import functools
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+from jax.extend.core import ClosedJaxpr
+from jax.interpreters import partial_eval
+
+from ._program import LaneProgram, batch_of, dependent_parts, dependent_results, evaluated
+from ._quotient import with_quotients
+from ._trace import shape_of
+from ._undone import with_loops, without_loops
+from ._vector import Unsupported, check
+from ._weighted import with_weights
+
+
+class BothWays(NamedTuple):
+    """One of a lane's functions. The arguments of either jaxpr are its own, then the cotangents of
+    what has one, of the carry before rows or results."""
+
+    forward: ClosedJaxpr
+    """Of `begin` and `step`: the carry, whether the lane goes on, whether a row is complete."""
+    backward: ClosedJaxpr
+    """The cotangents of the inputs that are asked for; of `step` and `end`, then of the carry."""
+
+
+class ReverseProgram(eqx.Module):
+    """What a reverse kernel runs; hashable, as a primitive's parameter must be. Its inputs are
+    those of the program, then the cotangents that are given; its results the cotangents of the
+    inputs that are asked for."""
+
+    program: LaneProgram = eqx.field(static=True)
+    varied: tuple[bool, ...] = eqx.field(static=True)
+    """Which inputs' cotangents are asked for."""
+    given: tuple[bool, ...] = eqx.field(static=True)
+    """Which results, and then which parts of a row, have a cotangent."""
+    carried: tuple[bool, ...] = eqx.field(static=True)
+    """Which parts of the carry have one: those that depend on such inputs, and that something
+    given depends on."""
+    begin: BothWays = eqx.field(static=True)
+    step: BothWays = eqx.field(static=True)
+    end: BothWays = eqx.field(static=True)
+
+    __hash__ = object.__hash__
+    __eq__ = object.__eq__
+
+    @property
+    def jaxprs(self) -> tuple[ClosedJaxpr, ...]:
+        """All jaxprs of a kernel."""
+        begin, step, end = self.begin, self.step, self.end
+        return begin.forward, step.forward, end.backward, step.backward, begin.backward
+
+    @property
+    def carry_avals(self) -> list[Any]:
+        """Shapes and types of one lane's carry."""
+        return self.program.carry_avals
+
+    @property
+    def weight_avals(self) -> list[Any]:
+        """Shapes and types of the cotangents of one lane's results and of a row."""
+        avals = (*self.program.out_avals, *self.program.row_avals)
+        return [a for a, here in zip(avals, self.given, strict=True) if here]
+
+    @property
+    def in_avals(self) -> list[Any]:
+        """Shapes and types of one lane's inputs, the cotangents of all of its rows included."""
+        outs = sum(self.given[: len(self.program.out_avals)])
+        weights = [
+            shape_of(a)
+            if i < outs
+            else jax.ShapeDtypeStruct((self.program.rows, *a.shape), a.dtype)
+            for i, a in enumerate(self.weight_avals)
+        ]
+        return [*self.program.in_avals, *weights]
+
+    def batch(self, shapes: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
+        """The axes that inputs of these shapes have beyond those of one lane."""
+        return batch_of(self.in_avals, shapes)
+
+    @property
+    def out_avals(self) -> list[Any]:
+        """Shapes and types of the cotangents asked for, of one lane."""
+        return [a for a, v in zip(self.program.in_avals, self.varied, strict=True) if v]
+
+
+@functools.lru_cache(maxsize=64)
+def reverse(
+    program: LaneProgram, varied: tuple[bool, ...], given: tuple[bool, ...]
+) -> ReverseProgram | None:
+    """The program backward; `None` if something in it has no transpose, or no vector form.
+
+    **Arguments:** the program; which inputs' cotangents are asked for; which results, and then
+    which parts of a row, have a cotangent (all of them must depend on such inputs).
+    """
+    carried = _carried(program, varied, given)
+    outs, flags = given[: len(program.out_avals)], (False, False)
+    emitted = (*carried, *flags, *given[len(program.out_avals) :])
+    try:
+        found = ReverseProgram(
+            program, varied, given, carried,
+            begin=_both_ways(program.begin, varied, emitted, len(carried) + 2),
+            step=_both_ways(program.step, (*varied, *carried), emitted, len(carried) + 2),
+            end=_both_ways(program.end, (*varied, *carried), outs, 0),
+        )  # fmt: skip
+        for jaxpr in found.jaxprs:
+            check(jaxpr.jaxpr)
+    except (NotImplementedError, ValueError, Unsupported):  # as JAX says that there is no transpose
+        return None
+    return found
+
+
+def _carried(program: LaneProgram, varied, given) -> tuple[bool, ...]:
+    """The parts of the carry that have a cotangent (see `ReverseProgram.carried`)."""
+    n, inputs = len(program.carry_avals), [False] * len(program.in_avals)
+    depend = dependent_parts(program, varied, smooth=True)
+    outs = given[: len(program.out_avals)]
+    rows = given[len(program.out_avals) :]
+    needed, leads = set(), {}
+    for i in (i for i in range(n) if depend.carry[i]):
+        one = [*inputs, *(j == i for j in range(n))]
+        stepped = dependent_results(program.step.jaxpr, one, smooth=True)
+        ended = dependent_results(program.end.jaxpr, one, smooth=True)
+        leads[i] = {j for j in range(n) if stepped[j]}
+        if any(g and r for g, r in zip((*outs, *rows), (*ended, *stepped[n + 2 :]), strict=True)):
+            needed.add(i)
+    grown = True
+    while grown:
+        more = {i for i, to in leads.items() if to & needed} - needed
+        needed, grown = needed | more, bool(more)
+    return tuple(i in needed for i in range(n))
+
+
+def _both_ways(
+    closed: ClosedJaxpr, varied: Sequence[bool], weighted: Sequence[bool], kept: int
+) -> BothWays:
+    """A jaxpr and its transposed derivative.
+
+    **Arguments:** the jaxpr; which arguments are differentiated; which results have a cotangent;
+    how many results are needed on the way there.
+
+    **Raises:** `NotImplementedError` or `ValueError` if something has no transpose.
+    """
+    function = functools.partial(evaluated, with_loops(with_quotients(closed)))
+    number = len(varied)
+
+    def both(*args):
+        primals, weights = args[:number], args[number:]
+
+        def of_varied(*changing):
+            some = iter(changing)
+            out = function(*_merged(varied, some, primals))
+            return [x for x, w in zip(out, weighted, strict=True) if w], out
+
+        changing = [x for x, v in zip(primals, varied, strict=True) if v]
+        values: list[Any] = []
+
+        def along(*tangents):
+            # Not by `jax.vjp`, whose rule for each primitive takes three times as long to trace.
+            _, slopes, out = jax.jvp(of_varied, changing, [*tangents], has_aux=True)
+            values[:] = out
+            return slopes
+
+        pullback = jax.linear_transpose(along, *changing)
+        return [*values[:kept], *pullback(list(weights))]
+
+    shapes = [shape_of(a) for a in closed.in_avals]
+    shapes += [shape_of(a) for a, w in zip(closed.out_avals, weighted, strict=True) if w]
+    whole = without_loops(jax.make_jaxpr(both)(*shapes))
+    cotangents = len(whole.out_avals) - kept
+    there = _pruned(whole, [True] * kept + [False] * cotangents)
+    back = _pruned(whole, [False] * kept + [True] * cotangents)
+    return BothWays(there, with_weights(back, [i >= number for i in range(len(shapes))]))
+
+
+def _merged(which: Sequence[bool], some: Iterator, others: Sequence) -> list[Any]:
+    """The next of `some` where the flag holds, else what stands there in `others`."""
+    return [next(some) if here else x for here, x in zip(which, others, strict=True)]
+
+
+def _pruned(closed: ClosedJaxpr, wanted: list[bool]) -> ClosedJaxpr:
+    """A jaxpr with some of its results, without what only the others need; of equal arguments."""
+    jaxpr, _ = partial_eval.dce_jaxpr(closed.jaxpr, wanted, instantiate=True)
+    return closed.replace(jaxpr=jaxpr)

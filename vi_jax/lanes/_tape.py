@@ -1,0 +1,348 @@
+"""A program forward and then backward, as one machine function with the arguments of `_kernel.py`.
+
+A thread takes a group of lanes at a time. All of them go forward until the last has ended, and the
+group's carry is kept of every iteration, on the *tape*. Then it goes back: through `end`, through
+the iterations from the last to the first, through `begin`. A lane takes part in the iterations that
+it had. The driver is scalar code (`_driver.py`); it calls these functions, each of which reads and
+writes the group's *frame*, and is written by the method of its name:
+
+    begin       takes up new lanes: their inputs, their first carry
+    step        one iteration of the lanes that have not ended
+    end_back    from the cotangents of the results to those of the carry and the inputs
+    step_back   the same through one iteration, and through the rows that were completed in it
+    begin_back  the same through `begin`; stores the cotangents of the inputs
+
+Memory is bounded. A tape that is full is thinned: every other entry is dropped, and from then on
+only every second (fourth, …) iteration is kept. On the way back the iterations in between are
+taken again from the entry before them, by the same function, into a second tape, the *window*.
+"""
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+from jax.extend.core import ClosedJaxpr
+
+from ._arrays import any_in
+from ._driver import DRIVER
+from ._fixed import FixedText
+from ._group import (
+    Frame,
+    add_all,
+    each_of,
+    select_all,
+    tape_add,
+    tape_load,
+    tape_size,
+    tape_store,
+    zeros,
+)
+from ._large import MOST_IN_REGISTERS, Held, Large, splat
+from ._memory import gather, gathering, load_pointer, load_stride, over_rows, scatter, shared
+from ._operations import compare, kind_of
+from ._reverse import ReverseProgram
+from ._text import RARE, Text, Value
+from ._vector import write
+
+# Bytes of a thread's tape. The paper's motor takes 1.1 kB an iteration in groups of eight, so that
+# 4,000 cycles of 15 steps are kept whole; what is longer takes its steps once more. (10,000 cycles:
+# 5.7 simulations instead of 4.8, and 116 MB more of the process's memory on two threads.)
+_TAPE_BYTES = 64 << 20
+
+# Entries of a tape at least, however large they are.
+_FEWEST_ENTRIES = 16
+
+# How many iterations a lane has that has not ended yet.
+_NO_END = (1 << 63) - 1
+
+
+def reverse_text(
+    program: ReverseProgram,
+    width: int,
+    bits: int,
+    one_for_all: tuple[bool, ...] = (),
+    *,
+    entries: int | None = None,
+) -> str:
+    """LLVM's text of a program forward and backward.
+
+    **Arguments:** the program; the lanes of a group; the width of the registers that LLVM may use;
+    as for `_kernel.kernel_text`; the entries of a tape, an even number from 4 on (by default as
+    many as `_TAPE_BYTES` hold).
+    """
+    return _Writer(program, width, one_for_all).text(bits, entries)
+
+
+def _is_no_number(t: Text, x: Value) -> Value:
+    """Whether a number is NaN or infinite: 0 times it is NaN then."""
+    return compare(t, "ne", t.binary("fsub", x, x), t.zero(x.kind), False)
+
+
+def _read(t: Text, pointer: str, stride: Value, lane: Value, aval: Any, mask: Value) -> Held:
+    """An array of each lane, zeros where `mask` does not hold (see `_memory.gather`)."""
+    if aval.size > MOST_IN_REGISTERS:
+        return gathering(t, pointer, t.binary("mul", lane, stride), aval, mask)
+    return gather(t, pointer, stride, lane, zeros(t, [aval])[0], mask)
+
+
+# The types of a lane's number, and of what is counted for a lane; of a truth value.
+_LANE, _FLAG = np.zeros((), np.int64), np.zeros((), bool)
+
+_ARGUMENTS = "ptr %inputs, ptr %strides, ptr %outputs, ptr %frame"
+
+
+class _Writer:
+    """A reverse kernel while it is written."""
+
+    def __init__(self, program: ReverseProgram, width: int, one_for_all: tuple[bool, ...]):
+        self.program, self.base, self.width = program, program.program, width
+        self.declared: dict[str, str] = {}
+        self.arena = 0
+        n = len(self.base.in_avals)
+        self.inputs, self.weights = program.in_avals[:n], program.in_avals[n:]
+        self.shared = [
+            here and a.size > MOST_IN_REGISTERS
+            for here, a in zip(one_for_all or (False,) * n, self.inputs, strict=False)
+        ]
+        self.results = sum(program.given[: len(self.base.out_avals)])
+        self.varied = program.out_avals
+        self.carried = [
+            a for a, here in zip(program.carry_avals, program.carried, strict=True) if here
+        ]
+        # An entry of the tape: the carry, and how many rows were complete before the iteration.
+        self.entry = [*program.carry_avals, _LANE]
+        parts = {
+            "now": self.entry,  # as an entry of the tape
+            "lane": [_LANE],  # its number; -1 for a slot without one
+            "count": [_LANE],  # its iterations
+            "inputs": self._own(self.inputs),
+            "spoilt": [_FLAG],  # whether a cotangent that was given makes all others NaN
+            "to_inputs": self.varied,  # cotangents so far
+            "to_carry": self.carried,
+        }
+        self.frame = Frame(parts, width)
+        # Where it has the numbers of rows, the last part of an entry.
+        self.rows_place = self.frame.places["now"] + tape_size(self.entry[:-1], width)
+
+    def text(self, bits: int, entries: int | None) -> str:
+        """LLVM's text of the module: forward sweep, backward sweep, and the driver of both."""
+        entry = tape_size(self.entry, self.width)
+        if entries is None:
+            entries = max(_FEWEST_ENTRIES, _TAPE_BYTES // entry // 2 * 2)
+        functions = [
+            self._begin(), self._step(), self._end_back(), self._step_back(), self._begin_back(),
+        ]  # fmt: skip
+        frame = self.frame.size + self.arena
+        driver = DRIVER.format(
+            width=self.width, frame=frame, entry=entry, entries=entries, half=entries // 2,
+            whole=64 + frame + entries * entry, call=_ARGUMENTS, rows=self.rows_place,
+        )  # fmt: skip
+        attributes = (
+            f'attributes #0 = {{ nounwind "min-legal-vector-width"="{bits}" '
+            f'"prefer-vector-width"="{bits}" }}'
+        )
+        return "\n".join([*self.declared.values(), *functions, driver, attributes, RARE, ""])
+
+    def _function(self, kind: str, name: str, more: str, t: Text, result: str) -> str:
+        """A function around what was written; `more` are arguments of its own."""
+        self.declared.update(t.declared)
+        self.arena = max(self.arena, t.arena.size * self.width * 8)
+        head = f"define internal {kind} @{name}({_ARGUMENTS}{more}) noinline #0 {{\nentry:"
+        arena = f"  %arena = getelementptr i8, ptr %frame, i64 {self.frame.size}"
+        return "\n".join([head, arena, *t.lines, f"  ret {result}", "}"])
+
+    # What the functions share
+
+    def _own(self, inputs: list[Any]) -> list[Any]:
+        """Those inputs of which each lane has its own, or that are small."""
+        return [x for x, shared in zip(inputs, self.shared, strict=True) if not shared]
+
+    def _load_inputs(self, t: Text) -> list[Held]:
+        """The inputs: large ones that all lanes share where XLA keeps them."""
+        own = iter(self.frame.load(t, "inputs"))
+        return [
+            shared(load_pointer(t, "inputs", i), aval.shape, kind_of(aval.dtype))
+            if here
+            else next(own)
+            for i, (aval, here) in enumerate(zip(self.inputs, self.shared, strict=True))
+        ]
+
+    def _present(self, t: Text, lane: Value) -> Value:
+        return t.binary("icmp sge", lane, t.zero("i64"), "i1")
+
+    def _weights(
+        self, t: Text, first: int, avals: list[Any], lane: Value, place: Value | None, mask: Value
+    ) -> list[Held]:
+        """Cotangents that were given, zero where `mask` does not hold.
+
+        **Arguments:** the number of the first of them; shapes and types of them; each slot's lane;
+        the number of the row, if they are a row's; which lanes have any.
+        """
+        arrays = []
+        for i, aval in enumerate(avals, len(self.inputs) + first):
+            start = t.binary("mul", lane, load_stride(t, i))
+            if place is not None:
+                row = t.binary("mul", place, t.constant(aval.size, "i64"))
+                start = t.binary("add", start, row)
+            pointer = load_pointer(t, "inputs", i)
+            arrays.append(_read(t, pointer, t.constant(1, "i64"), start, aval, mask))
+        return arrays
+
+    def _row_weights(self, t: Text, lane: Value, place: Value, complete: Value) -> list[Held]:
+        """The cotangents of the rows number `place`, of the lanes that have `complete`d one; not
+        read if there are none."""
+        avals = self.program.weight_avals[self.results :]
+        none = zeros(t, avals)
+        if not avals:
+            return none
+        room = t.binary("icmp slt", place, t.constant(self.base.rows, "i64"), "i1")
+        mask = t.both(complete, room)
+        if any(isinstance(x, Large) for x in none):
+            read = self._weights(t, self.results, avals, lane, place, mask)
+            self._spoil(t, [each_of(t, partial(_is_no_number, t), "i1", x) for x in read])
+            return read
+        inside, after, before = t.label(), t.label(), t.block
+        t.fork(t.any(mask), inside, after)
+        t.open(inside)
+        read = self._weights(t, self.results, avals, lane, place, mask)
+        self._spoil(t, [each_of(t, partial(_is_no_number, t), "i1", x) for x in read])
+        end = t.block
+        t.line(f"br label %{after}")
+        t.close()
+        t.follow(after)
+        either = lambda a, b: t.phi(a.kind, (a.text, end), (b.text, before))
+        return [each_of(t, either, None, a, b) for a, b in zip(read, none, strict=True)]
+
+    def _spoil(self, t: Text, flags: list[Held]) -> None:
+        """The lanes in which one of these flags holds have no derivative."""
+        spoilt = self.frame.number(t, "spoilt")
+        for x in flags:
+            spoilt = t.binary("or", spoilt, any_in(t, x))
+        self.frame.store_number(t, "spoilt", spoilt)
+
+    def _spoil_by_missing_rows(self, t: Text, lane: Value, rows: Value, present: Value) -> None:
+        """Rows that a lane did not come to are NaN, so that none of them may have a weight."""
+        avals = self.program.weight_avals[self.results :]
+        if not avals:
+            return
+
+        def weighs(place: Value, mask: Value) -> None:
+            read = self._weights(t, self.results, avals, lane, place, mask)
+            weighs = lambda x: compare(t, "ne", x, t.zero(x.kind), False)
+            self._spoil(t, [each_of(t, weighs, "i1", x) for x in read])
+
+        over_rows(t, rows, self.base.rows, present, weighs)
+
+    def _back(
+        self, t: Text, jaxpr: ClosedJaxpr, args: list[Held], mask: Value
+    ) -> tuple[list[Held], list[Held]]:
+        """The cotangents of inputs and carry that the way back gives, zero where `mask` does not
+        hold."""
+        out = write(t, jaxpr, args, mask)
+        out = select_all(t, mask, out, zeros(t, jaxpr.out_avals))
+        return out[: len(self.varied)], out[len(self.varied) :]
+
+    # The functions
+
+    def _begin(self) -> str:
+        t = FixedText(self.width)
+        places = ", ".join(f"i64 {i}" for i in range(self.width))
+        lane = t.binary("add", splat(t, "%first", "i64"), Value(f"<{places}>", "i64"))
+        present = t.binary("icmp slt", lane, splat(t, "%lanes", "i64"), "i1")
+        lane = t.select(present, lane, t.constant(-1, "i64"))
+        inputs = [
+            _read(t, load_pointer(t, "inputs", i), load_stride(t, i), lane, aval, present)
+            for i, aval in enumerate(self.inputs)
+            if not self.shared[i]
+        ]
+        self.frame.store_number(t, "lane", lane)
+        self.frame.store(t, "inputs", inputs)
+        inputs = self._load_inputs(t)
+        given = zeros(t, [*self.carried, *self.program.weight_avals[self.results :]])
+        out: list[Any] = write(t, self.program.begin.forward, [*inputs, *given], present)
+        *carry, active, complete = out
+        going = t.both(present, active.item())
+        rows = t.cast("zext", t.both(present, complete.item()), "i64")
+        count = t.select(going, t.constant(_NO_END, "i64"), t.zero("i64"))
+        self.frame.store_number(t, "count", count)
+        self.frame.store(t, "now", [*carry, np.array(rows, object)])
+        return self._function("i1", "begin", ", i64 %first, i64 %lanes", t, f"i1 {t.any(going)}")
+
+    def _step(self) -> str:
+        """The lanes that take part are those with more iterations than this one's number; the
+        function gives whether any has still more."""
+        t = FixedText(self.width)
+        number, count = splat(t, "%number", "i64"), self.frame.number(t, "count")
+        mask = t.binary("icmp slt", number, count, "i1")
+        inputs = self._load_inputs(t)
+        *carry, rows = self.frame.load(t, "now")
+        given = zeros(t, [*self.carried, *self.program.weight_avals[self.results :]])
+        out: list[Any] = write(t, self.program.step.forward, [*inputs, *carry, *given], mask)
+        *new, active, complete = out
+        more = t.binary("add", rows.item(), t.cast("zext", complete.item(), "i64"))
+        new = [*new, np.array(more, object)]
+        self.frame.store(t, "now", select_all(t, mask, new, [*carry, rows]))
+        over = t.both(mask, t.inverse(active.item()))
+        following = t.binary("add", number, t.constant(1, "i64"))
+        count = t.select(over, following, count)
+        self.frame.store_number(t, "count", count)
+        left = t.any(t.binary("icmp slt", following, count, "i1"))
+        return self._function("i1", "step", ", i64 %number", t, f"i1 {left}")
+
+    def _end_back(self) -> str:
+        t = FixedText(self.width)
+        lane = self.frame.number(t, "lane")
+        present = self._present(t, lane)
+        inputs = self._load_inputs(t)
+        *carry, rows = self.frame.load(t, "now")
+        avals = self.program.weight_avals[: self.results]
+        weights = self._weights(t, 0, avals, lane, None, present)
+        self.frame.store_number(t, "spoilt", t.constant(False, "i1"))
+        self._spoil(t, [each_of(t, partial(_is_no_number, t), "i1", x) for x in weights])
+        self._spoil_by_missing_rows(t, lane, rows.item(), present)
+        args = [*inputs, *carry, *weights]
+        to_inputs, to_carry = self._back(t, self.program.end.backward, args, present)
+        self.frame.store(t, "to_inputs", to_inputs)
+        self.frame.store(t, "to_carry", to_carry)
+        return self._function("void", "end_back", "", t, "void")
+
+    def _step_back(self) -> str:
+        """Through iteration `number`, before which the carry was that of an `entry` of the tape.
+        The rows of the frame are those complete after it, and then those complete before it."""
+        t = FixedText(self.width)
+        lane, count = self.frame.number(t, "lane"), self.frame.number(t, "count")
+        mask = t.binary("icmp slt", splat(t, "%number", "i64"), count, "i1")
+        inputs = self._load_inputs(t)
+        *carry, rows = tape_load(t, "%before", 0, self.entry)
+        *_, after = self.frame.load(t, "now")
+        complete = t.both(mask, t.binary("icmp slt", rows.item(), after.item(), "i1"))
+        weights = self._row_weights(t, lane, rows.item(), complete)
+        to_carry = self.frame.load(t, "to_carry")
+        args = [*inputs, *carry, *to_carry, *weights]
+        more, new = self._back(t, self.program.step.backward, args, mask)
+        tape_add(t, "%frame", self.frame.places["to_inputs"], self.varied, more)
+        self.frame.store(t, "to_carry", select_all(t, mask, new, to_carry))
+        left = np.array(t.select(mask, rows.item(), after.item()), object)
+        tape_store(t, "%frame", self.rows_place, [left])
+        return self._function("void", "step_back", ", ptr %before, i64 %number", t, "void")
+
+    def _begin_back(self) -> str:
+        t = FixedText(self.width)
+        lane = self.frame.number(t, "lane")
+        present = self._present(t, lane)
+        inputs = self._load_inputs(t)
+        *_, rows = self.frame.load(t, "now")
+        zero = t.zero("i64")
+        complete = t.both(present, t.binary("icmp sgt", rows.item(), zero, "i1"))
+        weights = self._row_weights(t, lane, zero, complete)
+        args = [*inputs, *self.frame.load(t, "to_carry"), *weights]
+        more, _ = self._back(t, self.program.begin.backward, args, present)
+        total = add_all(t, self.frame.load(t, "to_inputs"), more)
+        spoilt = self.frame.number(t, "spoilt")
+        nan = lambda v: t.constant(float("nan"), v.kind)
+        nothing = [each_of(t, nan, None, x) for x in total]
+        total = select_all(t, spoilt, nothing, total)
+        for i, x in enumerate(total):
+            start = t.binary("mul", lane, t.constant(x.size, "i64"))
+            scatter(t, load_pointer(t, "outputs", i), start, x, present)
+        return self._function("void", "begin_back", "", t, "void")

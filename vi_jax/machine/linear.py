@@ -1,0 +1,177 @@
+"""Machines that are linear between impacts: M x'' + C x' + K x = f₀ + f₁ cos ωs + f₂ sin ωs."""
+
+import abc
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._numbers import concrete, number
+from .._types import Scalar
+from .base import AbstractMachine, Coordinate, Prepared
+from .modal import Modes, along, harmonic, modal, solved, times, without_row
+from .shown import Shown
+from .stop import RigidStop
+
+
+class StructureState(Shown):
+    """Displacements and velocities of a machine of n degrees of freedom."""
+
+    displacement: Float[Array, "..."]
+    """x, one number for each degree of freedom."""
+    velocity: Float[Array, "..."]
+    """dx/ds, one number for each degree of freedom."""
+
+
+class LinearMachine(AbstractMachine):
+    """A machine of n degrees of freedom that is linear between impacts:
+
+        M x'' + C x' + K x = f₀ + f₁ cos ωs + f₂ sin ωs
+
+    with M symmetric and positive definite, C and K symmetric. Time is the independent variable s, a
+    cycle 2π/ω. Stops limit sums c·x of the displacements. A restitution k takes v to
+    v - (1 + k) (c·v) M⁻¹c/(cᵀM⁻¹c), so that an impact acts on the mass 1/(cᵀM⁻¹c).
+
+    It is followed in its natural modes, which are worked out once for each run (`prepared`).
+    `ExactFlight` has no step error; every other method takes the field (`Taylor` only where the
+    matrices are diagonal).
+
+    Subclasses give `mass`, `damping` and `stiffness`, each (n, n), or (n,) for a diagonal one (no
+    damping may be `None`); `forces`; `frequency`; and `contacts`, stops of which each has its c in
+    `RigidStop.at`, or, where that is `None`, the number of an earlier one's in
+    `RigidStop.coordinate`.
+    """
+
+    mass: eqx.AbstractVar[Float[Array, "..."]]
+    damping: eqx.AbstractVar[Float[Array, "..."] | None]
+    stiffness: eqx.AbstractVar[Float[Array, "..."]]
+    frequency: eqx.AbstractVar[Scalar]
+    contacts: eqx.AbstractVar[tuple[RigidStop, ...]]
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """None: its numbers are the equation's."""
+        return {"": "1"}
+
+    @property
+    @abc.abstractmethod
+    def forces(self) -> tuple[Any, Any, Any]:
+        """f₀, f₁ and f₂, each (n,), or `None` for none."""
+
+    @property
+    def size(self) -> int:
+        """n, the number of degrees of freedom."""
+        return jnp.shape(self.mass)[-1]
+
+    @property
+    def stops(self) -> tuple[RigidStop, ...]:  # pyright: ignore
+        """The contacts, under the name by which every machine is asked for them."""
+        return self.contacts
+
+    @property
+    def rows(self) -> list[Float[Array, " n"]]:
+        """c of each coordinate; without contacts the first displacement is what extremes are of."""
+        rows = [stop.at for stop in self.contacts if stop.at is not None]
+        return rows or [jnp.eye(1, self.size)[0]]
+
+    @property
+    def coordinates(self) -> tuple[Coordinate, ...]:
+        """c·x of each contact."""
+        mobile = [solved(self.mass, c) for c in self.rows]
+        masses = [1 / jnp.dot(c, m) for c, m in zip(self.rows, mobile, strict=True)]
+        pushes = [m * one for m, one in zip(mobile, masses, strict=True)]
+        return tuple(along(*x) for x in zip(self.rows, pushes, masses, strict=True))
+
+    @property
+    def cycle(self) -> Scalar:
+        """2π/ω."""
+        return 2 * jnp.pi / self.frequency
+
+    @property
+    def labels(self) -> tuple[str, str]:
+        """Axis labels of position and velocity."""
+        return ("x of contact 0", "dx/ds") if self.contacts else ("x[0]", "dx[0]/ds")
+
+    def field(self, s: Scalar, state: StructureState) -> StructureState:
+        """d(state)/ds between impacts."""
+        x, v = state.displacement, state.velocity
+        pull = harmonic(self.forces, self.frequency * s, x) - times(self.stiffness, x)
+        if self.damping is not None:
+            pull = pull - times(self.damping, v)
+        return StructureState(v, solved(self.mass, pull))
+
+    def start(self, *, displacement: Any = 0.0, velocity: Any = 0.0) -> StructureState:
+        """A state; at rest in x = 0 by default.
+
+        **Arguments:** (n,) each, or one number for all.
+
+        **Raises:** `ValueError` for arrays of another shape.
+        """
+        given = {"displacement": displacement, "velocity": velocity}
+        found = []
+        for name, value in given.items():
+            value = number(name, value)
+            if value.shape not in ((), (self.size,)):
+                raise ValueError(
+                    f"Argument `{name}` must have the shape ({self.size},), one number for each "
+                    f"degree of freedom, but has {value.shape}."
+                )
+            found.append(jnp.broadcast_to(value, (self.size,)))
+        return StructureState(*found)
+
+    def adopt(self, start: Any) -> StructureState:
+        """**Raises:** `TypeError` for a state of another kind, `ValueError` for one of other n."""
+        if not isinstance(start, StructureState):
+            raise TypeError(
+                f"Argument `start` must be a state of a {type(self).__name__}, from its "
+                f"`start(displacement=..., velocity=...)`, but got {start!r}."
+            )
+        for name, value in vars(start).items():
+            if jnp.shape(value) != (self.size,):
+                raise ValueError(
+                    f"Argument `start` must have n = {self.size} numbers in its {name}, but that "
+                    f"has the shape {jnp.shape(value)}."
+                )
+        return start
+
+    def step_limit(self, s: Scalar, state: StructureState) -> Scalar:
+        """A fifth of the shortest period, of the modes or the force."""
+        return self.natural_modes().machine.step_limit(s, state)
+
+    def mirrored(self, state: StructureState) -> StructureState | None:
+        """x → -x half a cycle later, where no constant force acts and each stop has its image."""
+        steady, alike = self.forces[0], [without_row(stop) for stop in self.contacts]
+        pressed = None if steady is None else concrete(steady)
+        if steady is not None and (pressed is None or pressed.any()):
+            return None
+        for stop in alike:
+            others = (x for x in alike if x.coordinate == stop.coordinate)
+            if not any(stop.mirrors(x) for x in others):
+                return None
+        return StructureState(-state.displacement, -state.velocity)
+
+    def natural_modes(self) -> Modes:
+        """The natural modes, and the machine in them."""
+        return modal(self)
+
+    def prepared(self) -> Prepared:
+        """The machine in its natural modes, unless a subclass moves, or meets events, by rules of
+        its own."""
+        own = ("field", "switches", "events", "begin", "averages", "section", "clock", "renewed")
+        if any(getattr(type(self), name) is not getattr(LinearMachine, name) for name in own):
+            return super().prepared()
+        return self.prepared_modes()
+
+    def prepared_modes(self) -> Prepared:
+        """The machine in its natural modes, and the ways there and back."""
+        found = self.natural_modes()
+
+        def inward(state: StructureState) -> StructureState:
+            return StructureState(found.into(state.displacement), found.into(state.velocity))
+
+        def outward(state: StructureState) -> StructureState:
+            return StructureState(found.out_of(state.displacement), found.out_of(state.velocity))
+
+        return Prepared(found.machine, inward, outward)

@@ -1,0 +1,17 @@
+"""What a machine or one of its parts says itself, and what is said in its place."""
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+Method = TypeVar("Method", bound=Callable[..., Any])
+
+
+def by_default(method: Method) -> Method:
+    """Mark a method as what is said in the place of those who do not say it themselves."""
+    method.by_default = True  # pyright: ignore[reportFunctionMemberAccess]
+    return method
+
+
+def is_own(method: Any) -> bool:
+    """Whether a method or a property, as a class has it, is not marked by `by_default`."""
+    return not hasattr(getattr(method, "fget", method), "by_default")

@@ -1,0 +1,160 @@
+"""A cantilever beam with a stop, by its exact modes."""
+
+from functools import cache
+from math import pi
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._checks import (
+    NOT_NEGATIVE,
+    POSITIVE,
+    REAL,
+    SHARE,
+    Range,
+    count,
+    flag,
+    one_of,
+    require_ranges,
+)
+from .._numbers import optional_real
+from .._types import Scalar
+from ..machine import LinearMachine, RigidStop, StructureState
+from ._base import number_field, stops_at
+
+
+@cache
+def _roots(modes: int) -> np.ndarray:
+    """The first roots β of cos β cosh β = -1, by Newton's method on cos β + 1/cosh β."""
+    x = (np.arange(modes) + 0.5) * pi
+    with np.errstate(over="ignore"):
+        for _ in range(8):
+            x = x + (np.cos(x) + 1 / np.cosh(x)) / (np.sin(x) + np.tanh(x) / np.cosh(x))
+    return x
+
+
+@cache
+def _tilt(modes: int) -> tuple[np.ndarray, np.ndarray]:
+    """σ = (cosh β + cos β)/(sinh β + sin β) of each mode, and (1 - σ)e^β, without cancellation."""
+    x = _roots(modes)
+    small = np.exp(-x)
+    below = 0.5 * (1 - small * small) + small * np.sin(x)
+    return (
+        (0.5 * (1 + small * small) + small * np.cos(x)) / below,
+        (np.sin(x) - np.cos(x) - small) / below,
+    )
+
+
+class Beam(LinearMachine):
+    """A slender beam, clamped at one end and free at the other, that hits a stop, by its modes:
+
+        EI ∂⁴w/∂x⁴ + ρA ∂²w/∂s² = load,   w = Σ φᵢ(x/L) qᵢ(s),   ωᵢ = βᵢ² √(EI/(ρA L⁴))
+
+    with cos β cosh β = -1 and φ = cosh βξ - cos βξ - σ (sinh βξ - sin βξ), of which the square has
+    the mean 1 (R. D. Blevins, Formulas for Natural Frequency and Mode Shape, 1979). Its state is a
+    `StructureState` of the modes' coordinates q; `deflection` gives w.
+
+    The clamp moves as a cos ωs, w being seen from it, or a force F cos ωs acts on the tip. An
+    impact acts on all modes at once (F. C. Moon and S. W. Shaw, International Journal of Non-Linear
+    Mechanics 18, 1983, had one): the more of them, the smaller the mass that is hit, and the
+    shorter the steps while they ring. A cycle is 2π/ω.
+
+    **Arguments:**
+
+    - `modes`, how many, at least 1; static.
+    - `gap` of the stop, any number, or `None` for none; `restitution` in [0, 1]; `place` of the
+      stop along the beam, in (0, 1] of its length; `two_sided` for one on each side, static.
+    - `damping_ratio`, not negative, one for all modes or (modes,).
+    - `amplitude` of the shaking, a or F, any number; `shaken`: `"base"` or `"tip"`, static;
+      `frequency` ω, positive.
+    - `length` L, `bending_stiffness` EI and `mass_per_length` ρA, positive, by default 1.
+    """
+
+    modes: int = eqx.field(kw_only=True, static=True, default=3)
+    gap: Scalar | None = eqx.field(kw_only=True, default=0.1, converter=optional_real("gap"))
+    restitution: Scalar = number_field("restitution", 0.8)
+    place: Scalar = number_field("place", 1.0)
+    damping_ratio: Float[Array, "..."] = number_field("damping_ratio", 0.01)
+    amplitude: Scalar = number_field("amplitude", 0.1)
+    frequency: Scalar = number_field("frequency", 3.0)
+    length: Scalar = number_field("length", 1.0)
+    bending_stiffness: Scalar = number_field("bending_stiffness", 1.0)
+    mass_per_length: Scalar = number_field("mass_per_length", 1.0)
+    shaken: str = eqx.field(kw_only=True, static=True, default="base")
+    two_sided: bool = eqx.field(kw_only=True, static=True, default=False)
+    ranges: ClassVar[dict[str, Any]] = {
+        "gap": REAL, "restitution": SHARE, "place": Range(0.0, 1.0, open_low=True),
+        "damping_ratio": NOT_NEGATIVE, "amplitude": REAL,
+        **dict.fromkeys(("frequency", "length", "bending_stiffness", "mass_per_length"), POSITIVE),
+    }  # fmt: skip
+
+    def __check_init__(self):
+        count("modes", self.modes, least=1)
+        one_of("shaken", self.shaken, ("base", "tip"))
+        flag("two_sided", self.two_sided)
+        if self.damping_ratio.shape not in ((), (self.modes,)):
+            raise ValueError(
+                f"Argument `damping_ratio` must be one number, or one for each of {self.modes} "
+                f"modes, but has the shape {self.damping_ratio.shape}."
+            )
+        require_ranges(self)
+
+    @property
+    def natural_frequencies(self) -> Float[Array, " modes"]:
+        """ωᵢ."""
+        stiff = self.bending_stiffness / (self.mass_per_length * self.length**4)
+        return jnp.asarray(_roots(self.modes) ** 2) * jnp.sqrt(stiff)
+
+    @property
+    def mass(self) -> Float[Array, " modes"]:  # pyright: ignore
+        """ρA L, of each mode."""
+        return jnp.full((self.modes,), self.mass_per_length * self.length)
+
+    @property
+    def stiffness(self) -> Float[Array, " modes"]:  # pyright: ignore
+        """ρA L ω²."""
+        return self.mass * self.natural_frequencies**2
+
+    @property
+    def damping(self) -> Float[Array, " modes"]:  # pyright: ignore
+        """2ξω ρA L."""
+        return 2 * self.damping_ratio * self.natural_frequencies * self.mass
+
+    @property
+    def contacts(self) -> tuple[RigidStop, ...]:  # pyright: ignore
+        """The stop at `place`, or one on each side of it; none without a gap."""
+        if self.gap is None:
+            return ()
+        first, *other = stops_at(self.gap, self.restitution, two_sided=self.two_sided)
+        return (eqx.tree_at(lambda x: x.at, first, self.shape(self.place), is_leaf=_absent), *other)
+
+    @property
+    def forces(self) -> tuple[None, Float[Array, " modes"], None]:
+        """What shakes each mode: the beam's inertia as its clamp moves, or the force on its tip."""
+        if self.shaken == "tip":
+            return None, self.amplitude * self.shape(1.0), None
+        mean = jnp.asarray(2 * _tilt(self.modes)[0] / _roots(self.modes))
+        return None, self.mass * mean * self.amplitude * self.frequency**2, None
+
+    @property
+    def labels(self) -> tuple[str, str]:
+        """Axis labels of position and velocity."""
+        return "w at the stop" if self.contacts else "q of mode 1", "its rate"
+
+    def shape(self, place: Any) -> Float[Array, "*places modes"]:
+        """φ of each mode at places along the beam, in [0, 1] of its length."""
+        x = jnp.asarray(place)[..., None]
+        beta, (sigma, lean) = _roots(self.modes), _tilt(self.modes)
+        away = jnp.exp(beta * (x - 1)) * lean + (1 + sigma) * jnp.exp(-beta * x)
+        return 0.5 * away - jnp.cos(beta * x) + sigma * jnp.sin(beta * x)
+
+    def deflection(self, state: StructureState, place: Any = 1.0) -> Float[Array, "..."]:
+        """w at places along the beam, in [0, 1] of its length: by default of its tip."""
+        return self.shape(place) @ state.displacement
+
+
+def _absent(x: Any) -> bool:
+    return x is None

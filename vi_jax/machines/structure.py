@@ -1,0 +1,148 @@
+"""A structure of many degrees of freedom with rigid stops, given by its matrices or its modes."""
+
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._checks import NOT_NEGATIVE, POSITIVE, REAL, require, require_ranges
+from .._numbers import number
+from .._types import Scalar
+from ..machine import LinearMachine, RigidStop
+from ._base import number_field
+from ._matrices import check_contacts, check_matrices, check_vector, matrix, numbered, vector
+
+
+class Structure(LinearMachine):
+    """A structure of n degrees of freedom that is linear between its impacts on rigid stops:
+
+        M x'' + C x' + K x = f₀ + A (f₁ cos ωs + f₂ sin ωs)
+
+    Its state is a `StructureState` of displacements x and velocities x', n numbers each. Each stop
+    limits a sum c·x, which is its `at`: `vi.RigidStop(0.5, 0.8, at=[0, 0, 1])` is met by the third
+    mass at 0.5, `at=[1, -1, 0]` where the first two approach each other. An impact with the
+    restitution k takes x' to x' - (1 + k) (c·x') M⁻¹c/(cᵀM⁻¹c), by an impulse along c
+    (B. Brogliato, Nonsmooth Mechanics, 2016). What comes to rest on a stop stays there, the rest of
+    the structure moving on, until the stop would have to pull.
+
+    Time is the independent variable, and a cycle is 2π/ω, also where nothing is shaken.
+
+    It is followed in its natural modes, by `ExactFlight` unless another method is asked for:
+    without any error of steps, however it is damped, as a rigid body and in resonance too.
+    Derivatives by each of its numbers exist where frequencies coincide.
+
+    **Arguments:**
+
+    - `mass` M, symmetric and positive definite; `damping` C and `stiffness` K, symmetric: (n, n),
+      or (n,) for a diagonal matrix. Without `damping` there is none.
+    - `contacts`, `vi.RigidStop`s with `at`; those with the same `at` are the two sides of a gap.
+    - `force` f₁, `sine_force` f₂ and `static_force` f₀: (n,), or `None` for none.
+    - `amplitude` A, any number; `frequency` ω, positive.
+
+    **Raises:** `ValueError` for numbers and shapes that are none of these.
+    """
+
+    mass: jax.Array = eqx.field(kw_only=True, converter=matrix("mass"))
+    stiffness: jax.Array = eqx.field(kw_only=True, converter=matrix("stiffness"))
+    damping: jax.Array = eqx.field(kw_only=True, default=None, converter=vector("damping"))  # pyright: ignore
+    contacts: tuple[RigidStop, ...] = eqx.field(kw_only=True, default=(), converter=numbered)
+    force: jax.Array | None = eqx.field(kw_only=True, default=None, converter=vector("force"))
+    sine_force: jax.Array | None = eqx.field(
+        kw_only=True, default=None, converter=vector("sine_force")
+    )
+    static_force: jax.Array | None = eqx.field(
+        kw_only=True, default=None, converter=vector("static_force")
+    )
+    amplitude: Scalar = number_field("amplitude", 1.0)
+    frequency: Scalar = number_field("frequency", 1.0)
+    ranges: ClassVar[dict[str, Any]] = {
+        "amplitude": REAL, "frequency": POSITIVE,
+    }  # fmt: skip
+
+    def __check_init__(self):
+        loss = jnp.zeros(self.mass.shape[-1:]) if self.damping is None else self.damping
+        n = check_matrices(self.mass, loss, self.stiffness)
+        for name in ("force", "sine_force", "static_force"):
+            check_vector(name, getattr(self, name), n)
+        check_contacts(self.contacts, n)
+        require_ranges(self)
+
+    @classmethod
+    def from_modes(
+        cls,
+        frequencies: Any,
+        damping_ratios: Any = 0.0,
+        shapes: Any = None,
+        *,
+        contacts: Any = (),
+        force: Any = None,
+        sine_force: Any = None,
+        static_force: Any = None,
+        **others: Any,
+    ) -> "Structure":
+        """A structure given by n modes: measured ones, or some of a larger model's.
+
+        Its state holds the modes' own coordinates q: the points of `shapes` are displaced by
+        `shapes @ q`.
+
+        **Arguments:**
+
+        - `frequencies`, angular ones (n,), not negative; `damping_ratios` (n,), or one for all.
+        - `shapes` (points, n), of modes of mass 1: by how much each mode displaces each point.
+          Rows `at` of `contacts` and the forces then have a number for each point; without shapes
+          one for each mode.
+        - The others are those of a `Structure`.
+
+        **Raises:** `ValueError` for numbers and shapes that are none of these.
+        """
+        omega, xi = number("frequencies", frequencies), number("damping_ratios", damping_ratios)
+        require("frequencies", omega, **NOT_NEGATIVE._asdict())
+        require("damping_ratios", xi)
+        if omega.ndim != 1 or not omega.size or xi.shape not in ((), omega.shape):
+            raise ValueError(
+                "Arguments `frequencies` and `damping_ratios` must have the shapes (n,) and (n,) "
+                f"or (), but have {omega.shape} and {xi.shape}."
+            )
+        forces = {"force": force, "sine_force": sine_force, "static_force": static_force}
+        if shapes is not None:
+            shapes = number("shapes", shapes)
+            if shapes.ndim != 2 or shapes.shape[1] != omega.size or not shapes.size:
+                raise ValueError(
+                    f"Argument `shapes` must have the shape (points, {omega.size}), a column for "
+                    f"each mode, but has {shapes.shape}."
+                )
+            require("shapes", shapes)
+            forces = {name: _onto(name, f, shapes) for name, f in forces.items()}
+            contacts = tuple(
+                stop
+                if getattr(stop, "at", None) is None
+                else eqx.tree_at(lambda x: x.at, stop, _onto("at", stop.at, shapes))
+                for stop in numbered(contacts)
+            )
+        return cls(
+            mass=jnp.ones_like(omega), damping=2 * xi * omega, stiffness=omega**2,
+            contacts=contacts, **forces, **others,
+        )  # fmt: skip
+
+    @property
+    def forces(self) -> tuple[Any, Any, Any]:
+        """f₀, A f₁ and A f₂."""
+        cosine, sine = (
+            None if f is None else self.amplitude * f for f in (self.force, self.sine_force)
+        )
+        return self.static_force, cosine, sine
+
+
+def _onto(name: str, f: Any, shapes: Float[Array, "points n"]) -> Any:
+    """What acts at points, as it acts on modes."""
+    if f is None:
+        return None
+    f = number(name, f)
+    if f.shape != shapes.shape[:1]:
+        raise ValueError(
+            f"Argument `{name}` must have the shape ({shapes.shape[0]},), one number for each "
+            f"point of `shapes`, but has {f.shape}."
+        )
+    return f @ shapes

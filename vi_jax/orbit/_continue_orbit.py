@@ -1,0 +1,284 @@
+"""`continue_orbit`: a periodic motion followed in one parameter, and why it changes."""
+
+import dataclasses
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from .._at_work import at_work
+from .._checks import flag, given_number, interval, one_of, tuple_of_names
+from .._interrupted import Interrupted
+from ..flow import MethodLike
+from ..machine import check_leaf, leaf
+from ._conditions import as_held
+from ._fixed_step_method import steps_of
+from ._monitor import BranchMonitor
+from ._observed import Observed
+from ._problem import check_parameter, problem_of
+from ._quantities import names_of, rates_at
+from ._rest import rests
+from ._section_map import section_map_of
+from ._shooting import Shooting
+from ._solve import advance, tangent_at
+from .branch import Branch
+from .curve import INTERRUPTED, Step, check_walk, walk
+from .floquet import NEUTRAL
+from .results import ORBIT_RESULTS, Orbit
+from .special import SpecialPoint
+
+_NONE: Mapping[str, Any] = MappingProxyType({})
+
+# An orbit found on the cycle map solves the equations of its branch closer than this: a choice.
+_SAME = 1e-3
+
+
+def continue_orbit(
+    orbit: Orbit,
+    *,
+    parameter: str,
+    bounds: tuple[float, float],
+    step: float = 0.01,
+    max_step: float = 0.1,
+    max_points: int = 1000,
+    extrema: str | Sequence[str] = (),
+    free: Mapping[str, tuple[float, float]] = _NONE,
+    fixed: Mapping[str, float | None] = _NONE,
+    method: MethodLike = None,
+    progress: bool = True,
+) -> Branch:
+    """Follow a periodic motion in one number of its machine, both ways, through folds.
+
+    Pseudo-arclength on the equations from impact to impact, which stay smooth at a grazing. Folds,
+    period doublings, Neimark–Sacker bifurcations, crossings of branches and grazings are located
+    to rounding. A motion that rests on a stop for a part of its period is followed as a fixed point
+    of the section map, whose chatter the simulator completes, and ends where a rest is gained or
+    lost. Where an impact is lost or a stop is touched, the motion ceases to be one: there
+    the branch ends (`special[i].switch()` goes on with the other impacts). Host-side: not to be
+    traced; one compiled program for each number of cycles and impacts.
+
+    **Arguments:**
+
+    - `orbit`: from `find_orbit`, or from another branch.
+    - `parameter`: name of a number of the machine: `"drive.frequency_ratio"`, `"stops.0.gap"`,
+      `"oscillator.damping_ratio"`, …
+    - `bounds`: the interval of the parameter.
+    - `step`, `max_step`: first and longest step along the branch, in the norm of the unknowns: the
+      state and the clock of each impact in the machine's own units (of a `Scene`: positions in a,
+      velocities in a ω, crank angles in radians), the parameter in half its interval.
+    - `max_points`: points in each direction at most.
+    - `extrema`: names of numbers whose largest and least values along the branch are located, as
+      special points: `"y_min"`, `"y_max"`, `"clearance"`, `"duration"`, `"frequency_ratio"`,
+      `"fastest_impact"`, `"slowest_impact"`, `"multiplier"` (the greatest modulus), an average of
+      the machine's own, and of the section `"section_Y"` and the like. They cost a program more.
+    - `free`: further numbers of the machine that are to vary, with the interval of each:
+      `{"stops.0.gap": (1.0, 3.0)}`.
+    - `fixed`: for each of them a number of the motion, of the names above, that is held instead:
+      `{"y_min": -3.0}`; `None` holds it where the orbit has it. The orbit must have about the
+      value, and what the free numbers do not change cannot be held (`"y_max"` of a motion that
+      hits its right stop). The special point `turn` is one where the parameter turns back; a
+      `fold` is then where a multiplier passes 1. Hopf points are not sought.
+    - `method`: how the machine is carried, of fixed steps: by default that of the orbit if its
+      steps are, else `ExactFlight()` where it applies, else 20 steps of `Verner9` a cycle.
+    - `progress`: count the points found, in a terminal or a notebook.
+
+    **Returns:** a `Branch`.
+
+    **Raises:** `ValueError` if the orbit is none, rests on a stop on its section, does not list all
+    its impacts, or lies outside the bounds, or if the name is unknown; on Ctrl-C `Interrupted`,
+    whose `partial` is the branch so far.
+    """
+    settings = check_walk(step=step, max_step=max_step, max_points=max_points)
+    progress = flag("progress", progress)
+    _check_orbit(orbit)
+    check_leaf(orbit.machine, parameter)
+    bounds = interval("bounds", bounds)
+    value = float(leaf(orbit.machine, parameter))
+    check_parameter(orbit.machine, parameter, value, bounds, "orbit")
+    if rests(orbit):
+        problem, x = section_map_of(orbit, parameter, method)
+    else:
+        problem, x = problem_of(orbit, parameter, bounds, method)
+    sought = _names("extrema", extrema, problem)
+    problem, x, ranges = _freed(problem, x, free, fixed, bounds)
+    scale = np.ones(problem.size)
+    scale[-len(ranges) :] = [0.5 * (high - low) for low, high in ranges]
+    start = _first_point(problem, x, scale, orbit)
+    ahead = BranchMonitor(problem, scale, ranges, sought)
+    back = BranchMonitor(problem, scale, ranges, sought)
+    forward, backward = [start], [start._replace(tangent=-start.tangent)]
+    ends = [INTERRUPTED, INTERRUPTED]
+
+    def branch() -> Branch:
+        special = [*reversed(back.special), *ahead.special]
+        steps = [*reversed(back.path(backward[1:])), *ahead.path(forward)]
+        return _branch(problem, parameter, steps, special, (ends[0], ends[1]), scale)
+
+    def kept() -> Interrupted:
+        return Interrupted("walk along the branch", branch())
+
+    with at_work("branch", kept, progress=progress, unit="point") as tell:
+        ends[1] = walk(ahead.advance, forward, stop=ahead.stop, tell=tell, **settings)
+        if ends[1] == "closed":
+            ends[0] = ends[1]
+        else:
+            ends[0] = walk(back.advance, backward, stop=back.stop, tell=tell, **settings)
+    return branch()
+
+
+def _check_orbit(orbit: Orbit) -> None:
+    """**Raises:** `ValueError` unless this is one orbit."""
+    if not isinstance(orbit, Orbit) or orbit.residual.ndim:
+        raise ValueError("Argument `orbit` must be one `Orbit`, not a batch or a state.")
+    if not bool(orbit.successful):
+        reason = ORBIT_RESULTS[orbit.result]
+        raise ValueError(f"Argument `orbit` must be an orbit, but is: {reason}")
+
+
+def _freed(
+    problem: Shooting, x: np.ndarray, free: Mapping[str, tuple[float, float]],
+    fixed: Mapping[str, float | None], bounds: tuple[float, float],
+) -> tuple[Shooting, np.ndarray, list[tuple[float, float]]]:  # fmt: skip
+    """The equations with further parameters and as many conditions, their unknowns, and the
+    intervals of all parameters.
+
+    **Raises:** `ValueError` or `TypeError` for what cannot be freed or held.
+    """
+    for argument, given in (("free", free), ("fixed", fixed)):
+        if not isinstance(given, Mapping):
+            example = '{"stops.0.gap": (1.0, 3.0)}' if argument == "free" else '{"y_min": None}'
+            raise TypeError(
+                f"Argument `{argument}` must map names, as {example}, but got {given!r}."
+            )
+    if len(free) != len(fixed):
+        raise ValueError(
+            f"Argument `fixed` must hold as many numbers as `free` frees, {len(free)}, but holds "
+            f"{len(fixed)}."
+        )
+    if not free:
+        return problem, x, [bounds]
+    machine, values, ranges = problem.machine, [], []
+    for name, given in free.items():
+        check_leaf(machine, name, argument="free")
+        if name == problem.parameters[0]:
+            raise ValueError(f"Argument `free` must name others than the parameter, {name}.")
+        ranges.append(interval("free", given))
+        values.append(float(leaf(machine, name)))
+        check_parameter(machine, name, values[-1], ranges[-1], "orbit", "free")
+    names = _names("fixed", tuple(fixed), problem)
+    here, _ = rates_at(problem, names, jnp.asarray(x), jnp.zeros(x.size))
+    targets = {
+        name: float(here[name]) if at is None else given_number("fixed", at)
+        for name, at in fixed.items()
+    }
+    for name, target in targets.items():
+        if not np.isfinite(target):
+            raise ValueError(
+                f"Argument `fixed` must name what the orbit has, but its {name} is {target:g}."
+            )
+    ranges.append(bounds)
+    wide = dataclasses.replace(
+        problem, parameters=(*free, *problem.parameters), conditions=as_held(targets)
+    )
+    corners = [wide.at(jnp.asarray(corner)) for corner in itertools.product(*ranges)]
+    if problem.follows_events:
+        steps = max(problem.steps, steps_of(problem.method, corners, problem.like, problem.cycles))
+        wide = dataclasses.replace(wide, steps=steps)
+    return wide, np.concatenate([x[:-1], values, x[-1:]]), ranges
+
+
+def _names(argument: str, names: str | Sequence[str], problem: Shooting) -> tuple[str, ...]:
+    """Names of numbers of a motion. **Raises:** `ValueError` that lists those there are."""
+    known = names_of(problem)
+    return tuple(one_of(argument, name, known) for name in tuple_of_names(argument, names))
+
+
+def _first_point(problem: Shooting, x: np.ndarray, scale: np.ndarray, orbit: Orbit) -> Step:
+    """The orbit as a solution of its equations from event to event.
+
+    It is refined at its parameter, unless it lies at a fold: then across the branch, which takes a
+    program of its own.
+
+    **Raises:** `ValueError` where there is no solution close to it, or many.
+    """
+    start, moved = _refined(problem, x, np.eye(problem.size)[-1], scale)
+    if problem.conditions:
+        if bool(start.good):
+            return start
+        raise ValueError(
+            "Argument `fixed` must hold numbers near those of the orbit, that the free ones can "
+            "bring about at its parameter, but no such motion was found (last correction "
+            f"{float(start.size):.2g}). What the free ones do not change cannot be held, as an "
+            "extreme that lies on a stop."
+        )
+    if moved > _SAME:
+        start, moved = _refined(problem, x, tangent_at(problem, x, scale), scale)
+    if moved > _SAME and float(np.abs(np.asarray(orbit.multipliers) - 1).min()) < NEUTRAL:
+        raise ValueError(
+            "Argument `orbit` must be alone at its parameter, but one of its multipliers is 1: "
+            "branches cross there, or something in its state is neutral, as a place that is free "
+            "or a number carried along. Leave that out of the state to follow it."
+        )
+    if moved > _SAME:
+        raise ValueError(
+            "Argument `orbit` could not be refined from impact to impact (last correction "
+            f"{max(moved, float(start.size)):.2g}): branches cross there, or it is no orbit of "
+            "this machine."
+        )
+    return start
+
+
+def _refined(
+    problem: Shooting, x: np.ndarray, tangent: np.ndarray, scale: np.ndarray
+) -> tuple[Step, float]:
+    """The solution in the plane across a tangent at `x`, and how far (scaled) it is from there."""
+    start = advance(problem, x, tangent, scale, 0.0)
+    return start, float(np.max(np.abs(start.x - x) / scale)) if bool(start.good) else np.inf
+
+
+def _branch(
+    problem: Shooting, name: str, steps: list[Step], special: list[SpecialPoint],
+    ends: tuple[str, str], scale: np.ndarray,
+) -> Branch:  # fmt: skip
+    """The branch as arrays, from its points.
+
+    **Arguments:** `name`, the parameter's; `steps`, the points in their order; `special` and `ends`
+    as in `Branch`; `scale`, the size of each unknown.
+    """
+    xs = np.stack([step.x for step in steps])
+    impacts = np.asarray(problem.impacts, int)
+
+    def column(get: Callable[[Observed], Any]) -> np.ndarray:
+        return np.stack([np.asarray(get(step.seen)) for step in steps])
+
+    duration = column(lambda seen: seen.duration)
+    ratio = problem.machine.frequency_ratio(jnp.asarray(duration / problem.cycles))
+    numbers = dict(zip(problem.parameters, xs[:, -len(problem.parameters) :].T, strict=True))
+    if ratio is not None:
+        ratio = numbers.get("drive.frequency_ratio", ratio)
+    return Branch(
+        name=name,
+        parameter=xs[:, -1],
+        y_min=column(lambda seen: seen.y_min),
+        y_max=column(lambda seen: seen.y_max),
+        multipliers=column(lambda seen: seen.multipliers),
+        impact_phase=xs[:, impacts],
+        impact_speed=column(lambda seen: np.asarray(seen.approach)[impacts]),
+        clearance=column(lambda seen: seen.nearest.room),
+        frequency_ratio=np.full(len(xs), np.nan) if ratio is None else np.asarray(ratio),
+        duration=duration,
+        averages={
+            name: column(lambda seen, name=name: seen.averages[name])
+            for name in steps[0].seen.averages
+        },
+        cycles=problem.cycles,
+        special=special,
+        ends=ends,
+        problem=problem,
+        steps=steps,
+        scale=scale,
+        free={each: values for each, values in numbers.items() if each != name},
+    )

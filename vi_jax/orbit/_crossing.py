@@ -1,0 +1,81 @@
+"""Tests for bifurcations along a branch, and the place where branches cross."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from .curve import Step
+from .floquet import NEUTRAL
+from .special import CROSSING, DOUBLING, FOLD, TORUS
+
+# How far beside a point where branches cross (in the norm of the scaled unknowns) it is looked at:
+# a choice.
+BESIDE = 1e-3
+
+
+def tests_of(step: Step) -> dict[str, float]:
+    """Functions that change sign at the bifurcations."""
+    M, identity = step.seen.monodromy, np.eye(step.seen.monodromy.shape[0])
+    values = step.seen.multipliers
+    with np.errstate(invalid="ignore"):  # a step without an answer has none here either
+        doubling, crosses = np.linalg.det(M + identity), np.linalg.det(M - identity)
+    pairs = [
+        1 - values[i] * values[j] for i in range(len(values)) for j in range(i + 1, len(values))
+    ]
+    return {
+        FOLD: float(step.tangent[-1]),
+        DOUBLING: float(doubling),
+        CROSSING: float(crosses),
+        TORUS: float(np.real(np.prod(pairs))),
+    }
+
+
+def changed_between(before: dict[str, float], after: dict[str, float]) -> list[str]:
+    """Which tests change their sign from one step to another."""
+    changed = [kind for kind in before if before[kind] * after[kind] < 0]
+    # Without damping a pair stays on the unit circle, to rounding of either sign.
+    if TORUS in changed and max(abs(before[TORUS]), abs(after[TORUS])) < NEUTRAL:
+        changed.remove(TORUS)
+    return changed
+
+
+def crossing(
+    along: Callable[[float], Step | None], root: float, kind: str
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """The point where branches cross, from points on both sides, by a test that is zero there.
+
+    Close to it the equations cannot be solved, but the branch passes through it smoothly, so that a
+    polynomial through its neighbours tells where it is, and what the motion is there.
+
+    **Arguments:** `along`, the branch's point at a length along a tangent, `None` where there is
+    none; `root`, about where they cross; `kind`, whose test it is.
+
+    **Returns:** its unknowns and its tangent; `None` if too few points were found, or no zero.
+    """
+    found: dict[float, Step] = {}
+    for side, wanted in ((-BESIDE, 3), (BESIDE, 6)):
+        for n in range(1, 9):
+            if len(found) == wanted:
+                break
+            step = along(root + n * side)
+            if step is not None:
+                found[n * side] = step
+        if len(found) < wanted:
+            return None
+    places, beside = np.array(list(found)), list(found.values())
+
+    def through(values: Any) -> np.polynomial.Polynomial:
+        return np.polynomial.Polynomial.fit(places, values, len(places) - 1)
+
+    zeros = through([np.asarray(tests_of(step)[kind]) for step in beside]).roots()
+    zeros = zeros[np.abs(zeros.imag) < 1e-12].real
+    if not zeros.size or np.abs(zeros).min() > BESIDE:
+        return None
+    place = zeros[np.argmin(np.abs(zeros))]
+
+    def there(get: Callable[[Step], Any]) -> np.ndarray:
+        return np.stack([through(x)(place) for x in zip(*map(get, beside), strict=True)])
+
+    tangent = there(lambda step: step.tangent)
+    return there(lambda step: step.x), tangent / np.linalg.norm(tangent)

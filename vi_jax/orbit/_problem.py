@@ -1,0 +1,189 @@
+"""The equations of an orbit from impact to impact, made from one that was found."""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from .._programs import compiled
+from .._types import State
+from ..flow import MethodLike, RunOptions, collect, planned, run_lane
+from ..machine import (
+    AbstractMachine,
+    after_event,
+    begin_modes,
+    check_again,
+    events_of,
+    is_autonomous,
+    leaf,
+    renews,
+    with_leaf,
+)
+from ._events import Event, section_of
+from ._fixed_step_method import fixed_step_method, steps_of
+from ._flight import Flight
+from ._shooting import Shooting
+from .results import Orbit
+
+# Events of a cycle that can be followed, of a machine with switches or a section of its own: a
+# choice.
+_LISTED = 32
+
+# Twice the steps of a flight change its end by less than this (relative to 1 + |state|); a motion
+# that asks for more of them than this is followed with so many. The first is the corrector's
+# tolerance (`curve.corrected`), the second a choice.
+_SETTLED, _MOST = 1e-11, 4096
+
+
+def check_parameter(
+    machine: AbstractMachine, name: str, value: float, interval: tuple[float, float], whose: str,
+    argument: str = "bounds",
+) -> None:  # fmt: skip
+    """**Raises:** `ValueError` unless the interval of a machine's number holds its value, and the
+    machine is valid with either end of it.
+
+    **Arguments:** `name` and `value`, the number's; `whose`, whose value that is, in words; the
+    argument that gives the interval.
+    """
+    low, high = interval
+    if not low <= value <= high:
+        raise ValueError(
+            f"Argument `{argument}` must hold the {whose}'s {name} = {value:g}, but is "
+            f"({low:g}, {high:g})."
+        )
+    for end in interval:
+        check_again(with_leaf(machine, name, end))
+
+
+def problem_of(
+    orbit: Orbit, parameter: str, bounds: tuple[float, float], method: MethodLike
+) -> tuple[Shooting, np.ndarray]:
+    """The equations of an orbit from impact to impact, and the unknowns it gives."""
+    machine = orbit.machine
+    carried = fixed_step_method(method, orbit.method, machine)
+    corners = [with_leaf(machine, parameter, end) for end in bounds]
+    cycles = int(orbit.cycles)
+    if int(np.sum(np.asarray(orbit.impact_stop) >= 0)) != int(orbit.impacts):
+        raise ValueError(
+            f"Argument `orbit` must list all its {int(orbit.impacts)} impacts, but lists "
+            f"{len(orbit.impact_stop)}: find it with a larger `impact_log`."
+        )
+    steps = steps_of(carried, corners, orbit.state, cycles)
+    found = events_in(orbit)
+    blank = Shooting(machine, carried, orbit.state, cycles, (), (), steps, (parameter,))
+    period = float(orbit.duration) if blank.autonomous else float(machine.cycle) * cycles
+    way = _followed(blank, orbit.state, found, period)
+    while not machine.scales_known:
+        finer = dataclasses.replace(blank, steps=2 * blank.steps)
+        again = _followed(finer, orbit.state, found, period)
+        apart = np.max(np.abs(again.states - way.states) / (1 + np.abs(again.states)))
+        if finer.steps > _MOST:
+            break
+        blank, way = finer, again  # the finer one: along the branch flights may ask for more
+        if apart < _SETTLED:
+            break
+    problem = dataclasses.replace(blank, events=tuple(event for _, event in found), modes=way.modes)
+    states = way.states[:-1] if found else way.states
+    x = problem.pack([place for place, _ in found], states, [leaf(machine, parameter)], period)
+    return problem, np.asarray(x)
+
+
+class _Way(NamedTuple):
+    """A motion over one period, followed from event to event."""
+
+    states: np.ndarray
+    """Just before each event, and at the end of the period; (events + 1, states)."""
+    modes: tuple[tuple[float, ...], ...]
+    """The machine's modes in each flight."""
+
+
+def _followed(
+    blank: Shooting, state: State, found: list[tuple[float, Event]], period: float
+) -> _Way:
+    """A motion of one period, followed from event to event.
+
+    **Arguments:** `blank`, the problem without events; `state`, that on the section; `found`, clock
+    and event of all that is met within the period, in their order; `period`, by the clock.
+    """
+    machine = blank.machine
+    modes = begin_modes(machine, jnp.zeros(()), state)
+    u, s = ravel_pytree(state)[0], 0.0
+    states, in_flight = [], []
+    for place, event in found:
+        if place > s:
+            u = _carry(blank, modes, s, place, u)
+        states.append(np.asarray(u))
+        here = blank.unravel(u)
+        if (place, event.cycle) != (0.0, 0):  # after which an orbit's state is
+            here, modes = after_event(machine, event.number, jnp.asarray(place), here, modes)
+        in_flight.append(tuple(float(m) for m in modes))
+        u, s = ravel_pytree(here)[0], place
+    states.append(np.asarray(_carry(blank, modes, s, period, u)))
+    first = found[0][1] if found and found[0][1].cycle == 0 else None
+    if first is not None and (renews(machine) or first != section_of(machine, 0)):
+        states[0] = states[-1]
+    return _Way(np.stack(states), tuple(in_flight) or (tuple(float(m) for m in modes),))
+
+
+def events_in(orbit: Orbit) -> list[tuple[float, Event]]:
+    """The events of a motion, with the clock of each since the section, in their order."""
+    machine, cycles = orbit.machine, int(orbit.cycles)
+    autonomous = is_autonomous(machine, orbit.state)
+    clock = np.asarray(orbit.impact_phase) - float(machine.phase_at(0.0))
+    stops = np.asarray(orbit.impact_stop)
+    found = [(float(s), Event(int(i))) for s, i in zip(clock, stops, strict=True) if i >= 0]
+    begins = float(machine.cycle) * np.arange(cycles)
+    others = bool(machine.switches or machine.events or any(e.ends_cycle for e in machine.stops))
+    if others or (autonomous and cycles > 1):
+        begins, listed = _listed_events(orbit)
+        found = listed if others else found
+    if machine.section(orbit.state) is not None or renews(machine):
+        found += [(float(begins[n]), section_of(machine, n)) for n in range(cycles)]
+    # What is met with a section belongs to the cycle that ends there.
+    return sorted(found, key=lambda f: (f[0], f[1].cycle is not None))
+
+
+def _listed_events(orbit: Orbit) -> tuple[np.ndarray, list[tuple[float, Event]]]:
+    """When each cycle of a motion begins, and its impacts and switches, by a simulation."""
+    options = RunOptions(method=orbit.method, impact_log=_LISTED, log_switches=True)
+    plan, start = planned(orbit.machine, orbit.state, int(orbit.cycles), options)
+    log, begins, counts = (np.asarray(a) for a in _listed(plan, start))
+    if counts.max() > _LISTED:
+        raise ValueError(
+            f"Argument `orbit` must have at most {_LISTED} events in a cycle, but has "
+            f"{int(counts.max())}."
+        )
+    found, events = [], events_of(orbit.machine)
+    for n, (clock, number) in enumerate(zip(log[0], log[1], strict=True)):
+        for s, i in zip(clock[number >= 0], number[number >= 0].astype(int), strict=True):
+            if events[i].ends_cycle:
+                later = (n + 1) % len(log[0])
+                found.append((float(begins[later]), Event(int(i), later)))
+            else:
+                found.append((float(begins[n] + s), Event(int(i))))
+    return begins, found
+
+
+@compiled
+def _listed(plan, start):
+    """Clock and number of the events of each cycle, when each cycle begins, and their counts."""
+    run = collect(plan, False, *run_lane(plan, start))
+    assert run.impact_log is not None and run.duration is not None
+    begins = jnp.concatenate([jnp.zeros((1,)), jnp.cumsum(run.duration)])
+    if plan.ticks(start):
+        begins = jnp.asarray(plan.machine.cycle) * jnp.arange(plan.cycles + 1)
+    events = run.impact_log
+    log = jnp.stack([events.phase, events.stop.astype(events.phase.dtype)])
+    return log, begins, run.impacts
+
+
+@compiled
+def _carry(blank: Shooting, modes, s0, s1, u):
+    """The state at clock `s1`, from the state `u` at `s0`, without an event in between.
+
+    **Arguments:** `blank`, the problem without events; `modes`, the machine's.
+    """
+    flight = Flight(blank.machine, modes, blank.method, blank.like)
+    return flight.fly(jnp.asarray(s0), jnp.asarray(s1), u, blank.steps)[0]

@@ -1,0 +1,254 @@
+"""`grazing`: what a grazing leads to, by its local map and beside the machine itself."""
+
+import dataclasses
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Complex, Float
+
+from .._at_work import at_work
+from .._checks import count, flag, instance_of
+from .._interrupted import Interrupted
+from ..machine import Stated, Summarized, in_unit, stated
+from ._beside_grazing import ASKED, DECADES, Motions, beside_grazing, positions, stretch
+from ._events import Event
+from ._forecast import (
+    SCENARIOS,
+    Settled,
+    Windows,
+    is_local,
+    natural_depth,
+    scenario_of,
+    settled,
+    windows,
+)
+from ._local_map import Graze, graze_at
+from .results import complex_in_words, impacts_in_words
+from .special import SpecialPoint
+
+# Of the depth at which windows end, or of that which a touch of so much of a cycle has, the
+# greatest that is looked at; and values in each decade below it. Choices.
+_DEEPEST, _BRIEF, _EACH = 0.1, 0.05, 144
+
+# What an impact does is forgotten if what it adds to the distance later is this small a share: a
+# choice, far above rounding (1e-28 for a van der Pol oscillator) and below all that was tried.
+_VANISHES = 1e-14
+
+
+class Grazing(Summarized):
+    """What a grazing leads to, from `grazing`. Arrays of the host, in the machine's units; of m
+    touches in a period, usually one, and n states."""
+
+    parameter: str = eqx.field(static=True)
+    """Name of the branch's parameter."""
+    value: float
+    """The parameter at the grazing."""
+    touched: str = eqx.field(static=True)
+    """What is touched, in words."""
+    cycles: int = eqx.field(static=True)
+    """Period of the motion that grazes, in cycles: the unit of all periods here."""
+    matrix: Float[np.ndarray, "n n"]
+    """N, the derivative of the motion's section map without the impact, from touch to touch at a
+    fixed reading of the clock."""
+    multipliers: Complex[np.ndarray, " n"]
+    """Of N, the largest modulus first."""
+    rate: Float[np.ndarray, " m"]
+    """a, the second derivative of the distance to the stop by the clock, at each touch."""
+    gradient: Float[np.ndarray, "m n"]
+    """∂h, of that distance by the state."""
+    kick: Float[np.ndarray, "m n"]
+    """Change of the state by an impact, over the depth to the power of `order`; -√(2a) W for a
+    rigid stop, whose impact adds W·dh/ds."""
+    order: Float[np.ndarray, " m"]
+    """1/2 for rigid and prestressed stops, 3/2 for a spring that is relaxed when touched."""
+    slope: Float[np.ndarray, " m"]
+    """Derivative of the least distance by the parameter, along the motion without impact."""
+    entries: Float[np.ndarray, " 12"]
+    """eₙ = ∂h Nⁿ kick, n = 1, 2, …: what an impact of depth one adds to the distance n periods
+    later. A motion with one impact in n periods needs eⱼ > 0 for 0 < j < n."""
+    side: int
+    """1 if impacts appear as the parameter rises, -1 if as it falls."""
+    outcome: SCENARIOS
+    """What follows on that side."""
+    aperiodic: float
+    """Share of the values looked at, evenly spaced by their logarithm, without a period."""
+    windows: Windows | None
+    """Motions with one impact in n periods; `None` where there are several touches or no root."""
+    forecast: Motions
+    """What the local map settles on."""
+    machine: Motions | None
+    """What the machine settles on at some of these values; `None` if it was not asked."""
+    checked: tuple[float, float] | None
+    """Distances from the grazing, in the parameter, between which the machine agrees with the
+    forecast on both sides, but for edges of windows; `None` if nowhere or not asked."""
+    agreement: float
+    """Share of the values there at which period and impacts are the same; NaN if none."""
+    far: tuple[int, int] | None
+    """Period in cycles, 0 for none up to 64 of those of the motion that grazes, and rigid impacts
+    in it (0 where it has none) of what the machine settles on where nothing near attracts, at most
+    of the values; `None` where it stays near or was not asked."""
+    labels: tuple[str, str] = eqx.field(static=True)
+    """What pictures write beside position and velocity, in the machine's words."""
+    units: Stated = eqx.field(static=True)
+    """In which units its quantities are, as the machine states it."""
+
+    def summary(self) -> str:
+        """What is touched, the local map, what follows, and how far the machine agrees."""
+        at = in_unit(f"{self.value:.10g}", dict(self.units), self.parameter)
+        values = ", ".join(complex_in_words(z, 6, 1e-9) for z in self.multipliers)
+        entries = ", ".join(f"{e:.4g}" for e in self.entries[:6])
+        orders = ", ".join(f"{x:g}" for x in self.order)
+        lines = [
+            f"Grazing at {self.parameter} = {at}: touches the {self.touched}",
+            f"  what follows: {SCENARIOS[self.outcome]}",
+            *self._far_in_words(),
+            f"  impacts appear: as {self.parameter} {'rises' if self.side > 0 else 'falls'}",
+            f"  multipliers without impact: {values}",
+            f"  second derivative of the distance: {', '.join(f'{a:.6g}' for a in self.rate)}",
+            f"  power of the depth: {orders}",
+            f"  entries: {entries}, …",
+            f"  values without a period: {100 * self.aperiodic:.3g} %",
+            *self._windows_in_words(),
+        ]
+        if self.checked is not None:
+            low, high = (f"{x:.3g}" for x in self.checked)
+            lines.append(
+                f"  checked by the machine: from {low} to {high} on both sides, "
+                f"{100 * self.agreement:.3g} % of the values alike"
+            )
+        elif self.machine is not None:
+            lines.append("  checked by the machine: it does not agree at the values looked at")
+        return "\n".join(lines)
+
+    def _far_in_words(self) -> list[str]:
+        if self.far is None:
+            return []
+        period, impacts = self.far
+        cycles = f"{period} cycle{'' if period == 1 else 's'}"
+        motion = f"a motion of {cycles} with {impacts_in_words(impacts)}"
+        return [f"  far away: the machine settles on {motion if period else 'no short period'}"]
+
+    def _windows_in_words(self) -> list[str]:
+        if self.windows is None:
+            return []
+        lines, least = [], np.abs(self.forecast.offset).min()
+        for n, (near, far) in zip(self.windows.period, self.windows.stable, strict=True):
+            if np.isfinite(near) and abs(far) > least:  # further ones are too close to tell apart
+                place = in_unit(f"{near:+.3g} … {far:+.3g}", dict(self.units), self.parameter)
+                each = f"{n} periods" if n > 1 else "each period"
+                lines.append(f"  one impact in {each}: stable at {place} from there")
+        return lines
+
+    def drawn(self):
+        """The period at each value, as the local map has it."""
+        return self.forecast.period
+
+
+def grazing(
+    point: SpecialPoint, *, check: bool = True, periods: int = 12, progress: bool = True
+) -> Grazing:
+    """What a grazing of a branch leads to: its local map, and what that settles on.
+
+    The motion that grazes has a smooth section map without the impact. A neighbour that would pass
+    beyond the stop is corrected by the discontinuity mapping (Nordmark 1991; di Bernardo, Budd,
+    Champneys and Kowalczyk 2008): by the root of the depth at a rigid stop. Both are derivatives of
+    what the machine says, whatever it is: rigid, soft and prestressed stops, bodies that meet, an
+    autonomous machine on its section. The map is iterated over decades of the parameter on the side
+    of the impacts, what it settles on is named, and the machine itself is simulated at the same
+    values, from the motion that grazes on, and on the other side. Host-side: not to be traced.
+
+    **Arguments:**
+
+    - `point`: a special point of a branch of the kind "grazing" (`Branch.special`).
+    - `check`: whether to simulate the machine beside it, which takes most of the time.
+    - `periods`: motions with one impact in up to so many periods are listed.
+    - `progress`: show a bar while the machine is simulated, in a terminal or a notebook.
+
+    **Returns:** a `Grazing`.
+
+    **Raises:** `TypeError` if this is no special point; `ValueError` if it is of another kind, if
+    nothing is touched there, if what is touched is an event whose jump does not fade with the
+    speed, or if the motion without the impact turns back there; on Ctrl-C while the machine is
+    simulated `Interrupted`, whose `partial` is what `check=False` gives.
+    """
+    instance_of("point", point, SpecialPoint, "a `SpecialPoint`, from `Branch.special`")
+    check, periods = flag("check", check), count("periods", periods, least=1)
+    progress = flag("progress", progress)
+    graze = graze_at(point)
+    local, machine = graze.map, graze.problem.machine
+    first = graze.touches[0]
+    natural, brief = natural_depth(local), _brief_depth(graze)
+    if natural < _VANISHES * brief:
+        raise ValueError(
+            "Argument `point` must be a grazing whose impacts come back to the stop, but here what "
+            "they do is forgotten within a period to first order, as of an autonomous machine with "
+            "one degree of freedom, where they only shift the time."
+        )
+    deepest = _DEEPEST * min(natural, brief)
+    side = -1 if first.slope > 0 else 1
+    size = deepest / abs(first.slope) * np.logspace(-DECADES, 0, DECADES * _EACH + 1)
+    found = settled(local, side * size)
+    outcome, aperiodic = scenario_of(local, side * size, found)
+    near = is_local(local, side * size, found)
+    single = len(graze.touches) == 1 and first.kick.order == 0.5
+    values = np.linalg.eigvals(local.matrix)
+    names = sorted({_called(graze, t.number) for t in graze.touches})
+    unchecked = Grazing(
+        parameter=graze.problem.parameters[0],
+        value=float(graze.x[-1]),
+        touched=" and the ".join(names),
+        cycles=graze.problem.cycles,
+        matrix=local.matrix,
+        multipliers=values[np.argsort(-np.abs(values))].astype(complex),
+        rate=np.array([t.rate for t in graze.touches]),
+        gradient=local.gradients,
+        kick=local.kicks,
+        order=local.orders,
+        slope=local.slopes,
+        entries=local.entries(12),
+        side=side,
+        outcome=getattr(SCENARIOS, outcome),
+        aperiodic=aperiodic,
+        windows=windows(local, deepest, periods) if single else None,
+        forecast=Motions(
+            side * size, np.where(near, found.period, -1), found.impacts,
+            positions(graze, side * size, found.places @ graze.section.matrix.T),
+        ),
+        machine=None,
+        checked=None,
+        agreement=np.nan,
+        far=None,
+        labels=machine.labels,
+        units=stated(machine),
+    )  # fmt: skip
+    if not check:
+        return unchecked
+    with at_work(
+        "grazing", lambda: Interrupted("check of the grazing", unchecked),
+        progress=progress, unit="value", total=len(size[::ASKED]),
+    ) as tell:  # fmt: skip
+        asked = slice(None, None, ASKED)
+        some = Settled(*(part[asked] for part in found))
+        beside, same, far = beside_grazing(graze, side * size[asked], some, near[asked])
+        checked, agreement = stretch(size[asked], *same)
+        tell(len(size[asked]))
+    return dataclasses.replace(
+        unchecked, machine=beside, checked=checked, agreement=agreement, far=far
+    )
+
+
+def _called(graze: Graze, number: int) -> str:
+    """What is touched, in words."""
+    machine = graze.problem.machine
+    if number >= len(machine.stops):
+        return Event(number).called(machine)
+    stop = machine.stops[number]
+    return stop.name or f"{stop.side} stop"
+
+
+def _brief_depth(graze: Graze) -> float:
+    """The depth of a passage beyond the stop that lasts a small share of a cycle."""
+    problem = graze.problem
+    half = 0.5 * _BRIEF * float(problem.period(jnp.asarray(graze.x))) / problem.cycles
+    return 0.5 * graze.touches[0].rate * half**2

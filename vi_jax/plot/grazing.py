@@ -1,0 +1,92 @@
+"""Pictures of what a grazing leads to: the forecast's attractor over the machine's own."""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from .._checks import flag, instance_of
+from ..machine import in_brackets, name_in, unit_of
+from ..orbit import Grazing
+from ..scan import REGIMES
+from .branch import axis_name
+from .colors import IRREGULAR, color_of, mark_style
+from .motion import new_axes
+
+# Sections drawn at each value of the parameter, the last ones: more would only lie on each other.
+_DRAWN = 64
+
+# Marks on the axis, which its scale would let run into each other.
+_TICKS = 5
+
+# At most so many motions are named in the legend.
+_NAMED = 8
+
+
+def plot_grazing(
+    found: Grazing, *, ax: Axes | None = None, legend: bool = True, **style: Any
+) -> Axes:
+    """What the local map of a grazing settles on, over what the machine does.
+
+    Along the axis is the parameter, less its value at the grazing, scaled by the square root, so
+    that what grows as the root lies between straight lines; upwards the first coordinate on the
+    section, less that of the motion without impact. The machine's attractor is in pale rings (where
+    it was simulated), the forecast's in dots of the colour of its period, chaos dark.
+
+    **Arguments:** the `Grazing`; `ax`, axes to draw into, a new figure if left out; `legend`,
+    whether to draw one; options of `Axes.plot` for the forecast's dots.
+
+    **Returns:** the axes.
+
+    **Raises:** `TypeError` if this is no `Grazing`.
+    """
+    instance_of("found", found, Grazing, "a `Grazing`, from `grazing`")
+    legend, ax = flag("legend", legend), new_axes(ax)
+    if found.machine is not None:
+        near = found.machine.period >= 0
+        across, up = _dots(found.machine.offset[near], found.machine.position[near])
+        rings = {"marker": "o", "ms": 4.5, "mfc": "none", "mec": "0.72", "mew": 0.6, "ls": "none"}
+        ax.plot(across, up, label="the machine", **rings)
+    period = found.forecast.period
+    for n in sorted(set(period[period >= 0]), key=lambda n: (n == 0, n)):
+        lanes = period == n
+        across, up = _dots(found.forecast.offset[lanes], found.forecast.position[lanes])
+        color = color_of(int(n) * found.cycles) if n else IRREGULAR[REGIMES.chaotic]
+        look = {"marker": ".", "ms": 2, "ls": "none", "color": color, **style}
+        ax.plot(across, up, **look)
+    for n in sorted(set(period[period > 0]))[:_NAMED]:
+        named = f"forecast: {n} periods" if n > 1 else "forecast: one period"
+        ax.plot([], [], ".", color=color_of(int(n) * found.cycles), label=named)
+    if (period == 0).any():
+        chaos = IRREGULAR[REGIMES.chaotic]
+        ax.plot([], [], ".", color=chaos, label="forecast: no period")
+    ax.plot(0.0, 0.0, **{**mark_style("grazing"), "label": "grazing", "zorder": 4})
+    ax.set_xscale("function", functions=(_root, _square))
+    farthest = found.forecast.offset[np.argmax(np.abs(found.forecast.offset))]
+    ticks = farthest * (np.arange(_TICKS) / (_TICKS - 1)) ** 2
+    ax.set_xticks(ticks, ["0", *(f"{x:.2g}" for x in ticks[1:])])
+    units = dict(found.units)
+    ax.set_xlabel(f"{axis_name(found.parameter, units)}, from {found.value:.6g}")
+    ax.set_ylabel(
+        in_brackets(f"{name_in(found.labels[0])} on the section", unit_of(units, "position"))
+    )
+    if legend:
+        ax.legend(fontsize="small", frameon=False)
+    return ax
+
+
+def _dots(offset: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The last sections of each lane as points."""
+    up = position[:, -_DRAWN:]
+    return np.repeat(offset, up.shape[1]), up.ravel()
+
+
+def _root(x: Any) -> np.ndarray:
+    """The square root, continued as an odd function."""
+    x = np.asarray(x, float)
+    return np.sign(x) * np.sqrt(np.abs(x))
+
+
+def _square(x: Any) -> np.ndarray:
+    x = np.asarray(x, float)
+    return np.sign(x) * x * x

@@ -1,0 +1,9 @@
+"""How hard a motion may be kicked: the least kick out of its basin, the motion on the edge,
+the manifolds of saddles."""
+
+from ._edge_state import EdgeState as EdgeState
+from ._edge_state import edge_state as edge_state
+from ._manifold import Manifold as Manifold
+from ._manifold import manifold as manifold
+from ._minimal_kick import MinimalKick as MinimalKick
+from ._minimal_kick import minimal_kick as minimal_kick

@@ -1,0 +1,208 @@
+"""`edge_state`: the motion on the boundary between two basins, by edge tracking."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._at_work import Tell, at_work, silent
+from .._checks import count, flag
+from .._interrupted import Interrupted
+from .._types import State
+from ..flow import MethodLike
+from ..machine import AbstractMachine, Summarized, in_rows
+from ..orbit import Orbit, adopted
+from ._motion import distance_to, in_row, orbit_near, settling_on
+from ._settling import ELSEWHERE, INADMISSIBLE, RETURNS, TRAIL, Row, Rows, Settling
+
+# Two starts on both sides of the boundary are brought as close as this and followed until they are
+# as far apart as that, relative to 1 + |state|: choices. What lies between them is the edge's
+# motion to within the latter.
+_CLOSE, _APART = 1e-10, 1e-5
+
+# Pieces of `TRAIL` cycles after which two neighbours are bisected again, apart or not: a choice.
+_PIECES = 16
+
+# Of the 0-1 test: the fewest section states, and the correlation of time with the square of how far
+# a walk has strayed, 1 for chaos and 0 for anything regular. Choices.
+_LEAST, _GROWS = 200, 0.7
+
+# How near the edge's motion must come back to itself for a search, and how far from it an orbit may
+# be that counts as what it settles on. Choices; a search that leads elsewhere asks for a tenth.
+_RECURS, _NEAR = 1e-3, 10.0
+
+
+class EdgeState(Summarized):
+    """What a motion on the boundary between two basins settles on."""
+
+    orbit: Orbit | None
+    """The periodic motion, unstable, by `find_orbit`; `None` where none was found."""
+    kind: str = eqx.field(static=True)
+    """`"saddle"`, a periodic motion with one multiplier outside the unit circle; `"unstable"`, one
+    with more of them; `"chaotic"`, by the 0-1 test of the motion along the edge; `"irregular"`,
+    none of these: a quasi-periodic edge, one of a longer period than `longest`, or one that settles
+    more slowly than it was followed."""
+    sections: State
+    """Section states along the edge, arrays of shape (cycles,), each within 1e-5 (relative to
+    1 + |state|) of the boundary."""
+    machine: AbstractMachine
+    """What moves."""
+
+    def summary(self) -> str:
+        """The edge state in words."""
+        cycles = len(in_rows(self.sections))
+        if self.orbit is not None:
+            return f"Edge state ({self.kind}), after {cycles} cycles along it\n{self.orbit}"
+        return (
+            f"Edge state ({self.kind}): no motion that repeats was met in {cycles} cycles along it"
+        )
+
+
+def edge_state(
+    machine: AbstractMachine,
+    inside: Orbit | State,
+    outside: Orbit | State,
+    *,
+    settle: int = 1000,
+    tolerance: float = 1e-4,
+    longest: int = 8,
+    rounds: int = 60,
+    method: MethodLike = None,
+    progress: bool = True,
+) -> EdgeState:
+    """The edge state between two starts that settle on different motions.
+
+    The line between the starts is bisected until two on both sides of the boundary are 1e-10 apart;
+    these are followed until they are 1e-5 apart, and the line between them is bisected again. What
+    lies between them stays on the boundary, and so goes to what attracts within it (edge tracking:
+    Skufca, Yorke and Eckhardt 2006). As soon as that comes near to where it was,
+    `find_orbit` makes it exact. Host-side: not to be traced.
+
+    **Arguments:**
+
+    - `machine`: the machine.
+    - `inside`: a stable `Orbit`, or a state from which the machine settles on a motion that repeats
+      within `longest` cycles. Of a machine without a drive it may be an equilibrium.
+    - `outside`: an `Orbit` or a state from which it settles on any other motion.
+    - `settle`: cycles after which a start that has not come back to the motion of `inside` counts
+      as being elsewhere.
+    - `tolerance`: a start has come back once a section state lies so near to one of the motion's,
+      relative to 1 + |state|. Less than the size of its basin.
+    - `longest`: longest period of the edge state that is looked for, in cycles.
+    - `rounds`: bisections after which the edge is called irregular.
+    - `method`: as for `cycle_map`.
+    - `progress`: count the bisections, in a terminal or a notebook.
+
+    **Returns:** an `EdgeState`.
+
+    **Raises:** `ValueError` or `TypeError` for arguments that cannot be used, and `ValueError`
+    where both starts settle on the same motion; on Ctrl-C `Interrupted`, whose `partial` is an
+    irregular `EdgeState` as far as the edge was followed.
+    """
+    progress = flag("progress", progress)
+    longest, rounds = count("longest", longest, least=1), count("rounds", rounds, least=1)
+    settling, start = settling_on(machine, inside, settle, tolerance, longest, method, "inside")
+    beyond = outside.state if isinstance(outside, Orbit) else outside
+    beyond = in_row(adopted(settling.the_map.machine, beyond, "outside"))
+    first, second = settling.judge(np.stack([start, beyond]))
+    for name, verdict, wanted in (("inside", first, RETURNS), ("outside", second, ELSEWHERE)):
+        if verdict == INADMISSIBLE:
+            raise ValueError(f"Argument `{name}` must be a start that can be simulated.")
+        if verdict != wanted:
+            raise ValueError(
+                "Arguments `inside` and `outside` must settle on different motions, but "
+                f"`{name}` {'does not come' if wanted else 'comes'} back to that of `inside`. See "
+                "`settle` and `tolerance`."
+            )
+    trail: list[Rows] = []
+
+    def kept() -> Interrupted | None:
+        return Interrupted("edge", _described(settling, trail, None)) if trail else None
+
+    with at_work("edge", kept, progress=progress, unit="round", total=rounds) as tell:
+        return tracked(settling, start, beyond, longest, rounds, trail, tell)
+
+
+def tracked(
+    settling: Settling,
+    inside: Row,
+    outside: Row,
+    longest: int,
+    rounds: int,
+    trail: list[Rows] | None = None,
+    tell: Tell = silent,
+) -> EdgeState:
+    """The edge state between a start that comes back and one that does not.
+
+    **Arguments:** `trail`, to which the sections along the edge are added; `tell`, told of rounds.
+    """
+    recurs, trail = _RECURS, [] if trail is None else trail
+    for _ in range(rounds):
+        inside, outside = settling.bisected(inside, outside, _CLOSE)
+        pair, sections = _followed(settling, np.stack([inside, outside]))
+        if not len(sections):
+            break
+        trail.append(sections)
+        tell(1)
+        inside, outside = pair
+        met = _met_again(np.concatenate(trail)[-4 * longest - 1 :], longest, recurs)
+        if met is not None:
+            orbit = orbit_near(settling, *met)
+            if orbit is not None and distance_to(orbit, met[0]) <= _NEAR * recurs:
+                if not bool(orbit.stable):
+                    return _described(settling, trail, orbit)
+            recurs *= 0.1
+    return _described(settling, trail, None)
+
+
+def _followed(settling: Settling, pair: Rows) -> tuple[Rows, Rows]:
+    """Two neighbours once they are apart, and the section states half way between them until
+    then."""
+    parts = []
+    for _ in range(_PIECES):
+        both = settling.trail(pair, TRAIL)
+        apart = np.max(np.abs(both[1] - both[0]) / (1 + np.abs(both[0])), axis=1)
+        far = np.flatnonzero(~(apart <= _APART))  # what is no number is far as well
+        end = far[0] if far.size else TRAIL
+        end = end if np.isfinite(both[:, end]).all() else end - 1
+        parts.append(both[:, 1 : end + 1].mean(axis=0))
+        pair = both[:, max(end, 0)]
+        if far.size:
+            break
+    return pair, np.concatenate(parts)
+
+
+def _met_again(trail: Rows, longest: int, recurs: float) -> tuple[Row, int] | None:
+    """A state near to which the motion comes back, the latest, and after how many cycles."""
+    last = trail[-1]
+    apart = np.max(np.abs(trail[:-1] - last) / (1 + np.abs(last)), axis=1)[::-1][:longest]
+    back = np.flatnonzero(apart <= recurs)
+    return (last, int(back[0]) + 1) if back.size else None
+
+
+def _described(settling: Settling, trail: list[Rows], orbit: Orbit | None) -> EdgeState:
+    rows = np.concatenate(trail) if trail else np.zeros((0, settling.motion.shape[1]))
+    if orbit is not None:
+        outside = int(np.sum(np.abs(np.asarray(orbit.multipliers)) > 1))
+        kind = "saddle" if outside == 1 else "unstable"
+    else:
+        kind = "chaotic" if _chaotic(rows[len(rows) // 4 :]) else "irregular"
+    sections = jax.vmap(settling.state)(jnp.asarray(rows))
+    return EdgeState(orbit, kind, sections, settling.the_map.machine)
+
+
+def _chaotic(rows: Rows) -> bool:
+    """The 0-1 test for chaos (Gottwald and Melbourne 2009) of section states, at least 200 of them:
+    a walk that is driven by a chaotic signal strays as a random one, any other stays bounded."""
+    count = len(rows)
+    if count < _LEAST:
+        return False
+    signal = rows[:, np.argmax(np.std(rows, axis=0))]
+    signal = signal - signal.mean()
+    lags, near = np.arange(1, count // 10 + 1), count - count // 10
+    growths = []
+    for rate in np.random.default_rng(0).uniform(np.pi / 5, 4 * np.pi / 5, 64):
+        walk = np.cumsum(signal * np.exp(1j * rate * np.arange(1, count + 1)))
+        strays = np.array([np.mean(np.abs(walk[n : n + near] - walk[:near]) ** 2) for n in lags])
+        growths.append(np.corrcoef(lags, strays)[0, 1])
+    return bool(np.median(growths) > _GROWS)

@@ -1,0 +1,275 @@
+"""`manifold`: the stable and the unstable manifold of a saddle of a planar section, as curves."""
+
+from collections.abc import Iterator
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool
+
+from .._at_work import at_work
+from .._checks import flag, given_number, one_of
+from .._interrupted import Interrupted
+from .._types import State
+from ..machine import AbstractMachine, Summarized, in_rows, is_autonomous
+from ..orbit import Orbit, cycle_map
+from ._motion import in_row
+from ._settling import Row, Rows, Settling
+
+# How far from the saddle, relative to 1 + |state|, its manifolds are taken to be straight: they
+# part from their tangents by the square of it. A choice.
+_BEGIN = 1e-5
+
+# The angle, in radians, by which a curve may turn from one point to the next, and the part of
+# `spacing` down to which points are set closer for its sake: choices.
+_TURN, _CLOSEST = 0.15, 1 / 64
+
+# Points of an arc that are looked at once, its half angle, and the rounds that narrow it: 64 points
+# in 6 rounds are an angle of 1e-10. Choices.
+_ARC, _HALF, _ROUNDS = 64, 2.4, 6
+
+# On an arc, what is left of the change of w·(Pⁿ(x) - xₛ) at a zero of a continuous function; at a
+# jump it is all. A choice.
+_CONTINUOUS = 1e-3
+
+# How near to the saddle the image of a point on its stable manifold is taken, where that can be;
+# how near it must be; and how much a difference may grow on the way. Choices.
+_NEAR, _FAR, _GROWTH = 1e-5, 0.2, 1e9
+
+# Of `spacing`, what a period adds to an unstable manifold that has come to an attractor: a choice.
+_ENDED = 1e-3
+
+# Parts of a period's stretch of an unstable manifold below which two neighbours are on both sides
+# of a jump, and the most points of one. Choices.
+_JUMP, _MOST = 1e-9, 4096
+
+
+class Manifold(Summarized):
+    """A stable or unstable manifold of a saddle on a planar section, both its branches."""
+
+    orbit: Orbit
+    """The saddle."""
+    which: str = eqx.field(static=True)
+    """`"stable"` or `"unstable"`."""
+    branches: tuple[State, State]
+    """Section states along each branch from the saddle on, arrays of shape (points,); NaN where a
+    curve is cut at a jump of the section map."""
+    lengths: tuple[float, float] = eqx.field(static=True)
+    """Of each branch, in the units of the state; less than was asked for where it ends."""
+    machine: AbstractMachine
+    """What moves."""
+
+    def summary(self) -> str:
+        """The branches in words."""
+        parts = [
+            f"length {length:.4g} ({len(in_rows(branch))} points)"
+            for length, branch in zip(self.lengths, self.branches, strict=True)
+        ]
+        return f"{self.which.capitalize()} manifold of a saddle: {', '.join(parts)}"
+
+
+def manifold(
+    orbit: Orbit,
+    *,
+    which: str = "stable",
+    length: float = 2.0,
+    spacing: float = 0.05,
+    progress: bool = True,
+) -> Manifold:
+    """The stable or unstable manifold of a saddle of a driven machine with two states.
+
+    The stable manifold, the states from which the machine goes to the saddle, is the boundary of
+    basins near it. It is grown from the saddle point by point: on an arc ahead of the last one the
+    zero of w·(Pⁿ(x) - xₛ) is taken, w the saddle's left unstable eigenvector (no inverse of the
+    section map is needed, and no derivative, so that it passes kinks at grazings). The unstable
+    manifold, the states that come from the saddle, is the image of a short stretch along its
+    eigenvector, with points set closer where the images part or turn. Host-side: not to be traced.
+
+    **Arguments:**
+
+    - `orbit`: an orbit from `find_orbit`, with one multiplier outside the unit circle and one
+      inside.
+    - `which`: `"stable"` or `"unstable"`.
+    - `length`: of each branch, in the units of the state.
+    - `spacing`: the greatest distance of neighbouring points. Where the curve turns by more than
+      0.15 from one to the next they are closer, to a 64th of that.
+
+    **Returns:** a `Manifold`. A branch of a stable manifold ends early at a stop, at a jump of
+    the section map, or where its points take too long to come near the saddle; an unstable one goes
+    on behind a jump.
+
+    **Raises:** `ValueError` or `TypeError` for arguments that cannot be used.
+    """
+    progress = flag("progress", progress)
+    which = one_of("which", which, ("stable", "unstable"))
+    length = given_number("length", length, low=0.0, open_low=True)
+    spacing = given_number("spacing", spacing, low=0.0, open_low=True)
+    if not isinstance(orbit, Orbit) or orbit.residual.ndim or not bool(orbit.successful):
+        raise ValueError("Argument `orbit` must be one orbit that was found, but is no such.")
+    sizes = np.abs(np.asarray(orbit.multipliers))
+    if sizes.size != 2 or is_autonomous(orbit.machine, orbit.state):
+        raise ValueError(
+            "Argument `orbit` must be of a driven machine with two states, so that its section is "
+            "a plane."
+        )
+    if not sizes[0] > 1 > sizes[1]:
+        raise ValueError(
+            "Argument `orbit` must be a saddle, one multiplier outside the unit circle and one "
+            f"inside, but their sizes are {sizes[0]:.6g} and {sizes[1]:.6g}."
+        )
+    saddle = _Saddle(orbit)
+    grow = _stable if which == "stable" else _unstable
+    parts, lengths = ([saddle.place[None]], [saddle.place[None]]), [0.0, 0.0]
+
+    def grown() -> Manifold:
+        first, second = (jax.vmap(saddle.map.state)(jnp.concatenate(part)) for part in parts)
+        return Manifold(orbit, which, (first, second), (lengths[0], lengths[1]), orbit.machine)
+
+    def kept() -> Interrupted | None:
+        return Interrupted("manifold", grown()) if any(lengths) else None
+
+    with at_work("manifold", kept, progress=progress, unit="point") as tell:
+        for i, side in enumerate((1.0, -1.0)):
+            for rows, lengths[i] in grow(saddle, side, length, spacing):
+                parts[i].append(rows)
+                tell(len(rows))
+    return grown()
+
+
+Pieces = Iterator[tuple[Rows, float]]
+"""Of a curve from the saddle on: further points, and how long it is with them."""
+
+
+class _Saddle:
+    """A saddle on its section, with its directions."""
+
+    def __init__(self, orbit: Orbit):
+        the_map = cycle_map(orbit.machine, method=orbit.method)
+        self.place = in_row(orbit.state)
+        self.map = Settling(the_map, orbit.state, self.place[None], 1, 1.0)
+        period = int(orbit.cycles)
+        whole = cycle_map(orbit.machine, period, method=orbit.method)
+        jacobian = np.asarray(whole.jacobian(orbit.state))
+        values, right = np.linalg.eig(jacobian)
+        order = np.argsort(-np.abs(values))
+        growth = np.real(values[order])
+        self.along = {
+            "unstable": np.real(right[:, order[0]]),
+            "stable": np.real(right[:, order[1]]),
+        }
+        self.across = np.real(np.linalg.inv(right)[order[0]])
+        # A multiplier below zero changes sides: two periods do not.
+        turns = 2 if growth[0] < 0 else 1
+        self.period, self.growth = turns * period, float(np.abs(growth[0]) ** turns)
+
+    def side_of(self, rows: Rows, periods: int) -> tuple[Row, Rows]:
+        """w·(Pⁿ(x) - xₛ), and Pⁿ(x) - xₛ."""
+        away = self.map.carried(rows, periods * self.period) - self.place
+        return away @ self.across, away
+
+
+def _stable(saddle: _Saddle, side: float, length: float, spacing: float) -> Pieces:
+    """One branch of a stable manifold."""
+    ahead = side * saddle.along["stable"] / np.linalg.norm(saddle.along["stable"])
+    here, grown = saddle.place, 0.0
+    step, periods = spacing * _CLOSEST * 4, 1
+    most = max(1, int(np.log(_GROWTH) / np.log(saddle.growth)))
+    while grown < length:
+        size = min(step, length - grown + 1e-12)
+        found = _ahead(saddle, here, ahead, size, periods)
+        if found is None:
+            if step <= spacing * _CLOSEST:
+                break
+            step = max(step / 2, spacing * _CLOSEST)
+            continue
+        new, away = found
+        if away > _NEAR and periods < most:
+            periods += 1
+            continue
+        if away > _FAR:
+            break
+        direction = (new - here) / size
+        turn = np.arccos(np.clip(direction @ ahead, -1, 1))
+        if turn > _TURN and step > spacing * _CLOSEST:
+            step = max(step / 2, spacing * _CLOSEST)
+            continue
+        here, grown, ahead = new, grown + size, direction
+        yield new[None], grown
+        step = min(spacing, step * (1.5 if turn < _TURN / 3 else 1.0))
+
+
+def _ahead(
+    saddle: _Saddle, here: Row, ahead: Row, size: float, periods: int
+) -> tuple[Row, float] | None:
+    """The point of the stable manifold at a distance from another one, ahead of it, and how far
+    from the saddle its image is; `None` where there is none."""
+    middle, low, high = np.arctan2(ahead[1], ahead[0]), -_HALF, _HALF
+    scale, at, rows, away = 0.0, 0, np.zeros((0, 2)), np.zeros((0, 2))
+    for round_ in range(_ROUNDS):
+        turns = np.linspace(low, high, _ARC)
+        angles = middle + turns
+        rows = here + size * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        value, away = saddle.side_of(rows, periods)
+        change = np.flatnonzero(value[:-1] * value[1:] <= 0)  # never beside what is no number
+        if not change.size:
+            return None
+        at = int(change[np.argmin(np.abs(turns[change]))])
+        low, high = turns[at], turns[at + 1]
+        jump = abs(value[at + 1] - value[at])
+        if not round_:
+            scale = max(jump, np.finfo(float).tiny)
+        elif round_ == _ROUNDS - 1 and jump > _CONTINUOUS * scale:
+            return None
+    distance = np.max(np.abs(away[at]) / (1 + np.abs(saddle.place)))
+    return rows[at], float(distance)
+
+
+def _unstable(saddle: _Saddle, side: float, length: float, spacing: float) -> Pieces:
+    """One branch of an unstable manifold, with rows of NaN at jumps."""
+    unit = saddle.along["unstable"] / np.linalg.norm(saddle.along["unstable"])
+    begin = side * _BEGIN * unit
+    grown, periods = 0.0, 0
+    while grown < length and periods < 400:
+        periods += 1
+        rows, kept = _stretch(saddle, begin, periods, spacing)
+        steps = np.linalg.norm(np.diff(rows, axis=0), axis=1)
+        steps[~kept] = 0.0
+        run = grown + np.concatenate([[0.0], np.cumsum(steps)])
+        use = int(np.searchsorted(run, length)) + 1
+        cut = np.flatnonzero(~kept[: use - 1])
+        if run[-1] - grown < _ENDED * spacing and grown > spacing:
+            break  # it has come to an attractor
+        grown = float(min(run[-1], length))
+        yield np.insert(rows[:use], cut + 1, np.nan, axis=0), grown
+
+
+def _stretch(
+    saddle: _Saddle, begin: Row, periods: int, spacing: float
+) -> tuple[Rows, Bool[np.ndarray, " _"]]:
+    """What becomes of a period's stretch along the eigenvector after some periods, and which
+    neighbours belong together."""
+
+    def images(parts):
+        rows = saddle.place + begin * (saddle.growth**parts)[:, None]
+        return saddle.map.carried(rows, periods * saddle.period)
+
+    parts = np.linspace(0, 1, 9)
+    rows = images(parts)
+    while True:
+        steps = np.diff(rows, axis=0)
+        sizes = np.linalg.norm(steps, axis=1)
+        wide = ~(sizes <= spacing)
+        inner = np.sum(steps[1:] * steps[:-1], axis=1)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            turned = np.arccos(np.clip(inner / (sizes[1:] * sizes[:-1]), -1, 1)) > _TURN
+        large = sizes > spacing * _CLOSEST
+        wide[1:] |= turned & large[1:]
+        wide[:-1] |= turned & large[:-1]
+        jumps = np.diff(parts) < _JUMP
+        split = np.flatnonzero(wide & ~jumps)
+        if not split.size or len(parts) > _MOST:
+            return rows, ~(jumps & ~(sizes <= spacing))
+        new = 0.5 * (parts[split] + parts[split + 1])
+        parts = np.insert(parts, split + 1, new)
+        rows = np.insert(rows, split + 1, images(new), axis=0)

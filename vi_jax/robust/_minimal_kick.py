@@ -1,0 +1,318 @@
+"""`minimal_kick`: the smallest change of the state after which a machine settles elsewhere."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+
+from .._at_work import at_work
+from .._checks import count, flag, given_number, interval
+from .._interrupted import Interrupted
+from .._types import State
+from ..flow import MethodLike
+from ..machine import AbstractMachine, Summarized, components, state_in_words
+from ..orbit import Orbit
+from ._edge_state import EdgeState, tracked
+from ._motion import settled_orbit, settling_on
+from ._rays import NARROWER, Exits, Kick, first_exits, narrowed, nearer, nearest_first
+from ._settling import ELSEWHERE, RETURNS, Row, Settling
+from ._shortest import shortest
+
+# Of the kick, relative to it: by how much more and less simulation confirms it.
+_ASIDE = 1e-6
+
+# Rounds of looking more closely around the best rays: before Newton's method, and instead of it.
+# Choices: the latter narrow a turn of 1/128 to 1e-8.
+_LOOKS, _MORE_LOOKS = 2, 14
+
+# Rounds of bisection by eight that leave nothing between two numbers of double precision.
+_ROUNDING = 18
+
+# How much longer than what rays found Newton's may be, and how much shorter: else it is another
+# kick. A choice, for rays as dense as the default.
+_LONGER, _SHORTER = 1e-4, 0.05
+
+# Two kicks are the same within this, relative to their norm; edges are tracked for so many rounds.
+_SAME, _ROUNDS = 1e-4, 40
+
+
+class MinimalKick(Summarized):
+    """The smallest change of a state after which a machine settles elsewhere."""
+
+    kick: dict[str, Any]
+    """What is added to each component of the state that is kicked."""
+    norm: Any
+    """√(Σ (weight·kick)²)."""
+    start: State
+    """The state just after the kick, on the boundary of the basin."""
+    settles: Orbit | None
+    """The motion that the machine settles on after a slightly harder kick; `None` where it is none
+    that repeats within `longest` cycles and that `find_orbit` finds, as an equilibrium of a machine
+    without a drive."""
+    edge: EdgeState
+    """What a motion on the boundary, where the kick leads to, settles on."""
+    residual: Any
+    """Relative to the norm: how far the kick is from the saddle's stable manifold, or from standing
+    at a right angle on it, whichever is more. Where no saddle gives a gradient (`exact` is false)
+    how far the last kick that comes back and the first one that does not are apart."""
+    exact: bool = eqx.field(static=True)
+    """Whether the kick is exact, by the saddle and Newton's method; else only by simulations in
+    ever more directions: its norm is good to `residual` and a little more, its direction to about
+    1e-4."""
+    confirmed: bool = eqx.field(static=True)
+    """Whether by simulation the machine comes back after a kick smaller by 1e-6 of it, and settles
+    elsewhere after one larger by 1e-6 of it."""
+    others: tuple["MinimalKick", ...]
+    """Kicks in other directions that none near them undercuts, the smallest first."""
+    lanes: int = eqx.field(static=True)
+    """Simulations by which starts were judged."""
+    machine: AbstractMachine
+    """What moves."""
+
+    def summary(self) -> str:
+        """The kick and where it leads, in words."""
+        units = self.machine.units
+        parts = state_in_words({name: np.asarray(x) for name, x in self.kick.items()}, 9, units)
+        how = "exact" if self.exact else "by simulations only"
+        sure = "confirmed" if self.confirmed else "NOT confirmed"
+        leads = "no motion that repeats was found"
+        if self.settles is not None:
+            leads = str(self.settles).splitlines()[0]
+        edge = self.edge.summary().splitlines()
+        lines = [
+            f"Minimal kick of norm {float(self.norm):.9g}: {parts}",
+            f"  to: {state_in_words(self.start, 9, units)}",
+            f"  settles on: {leads}",
+            f"  edge: {edge[0] if len(edge) == 1 else f'{self.edge.kind}, {edge[1]}'}",
+            f"  residual {float(self.residual):.1g} ({how}), {sure} by simulation at 1 ± 1e-6",
+        ]
+        lines += [f"  another: norm {float(other.norm):.9g}" for other in self.others]
+        return "\n".join(lines)
+
+
+def minimal_kick(
+    machine: AbstractMachine,
+    orbit: Orbit | State,
+    *,
+    components: Sequence[str] | None = None,
+    weights: Mapping[str, float] | None = None,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    cycle: int = 0,
+    largest: float | None = None,
+    directions: int = 128,
+    points: int = 32,
+    candidates: int = 3,
+    settle: int = 1000,
+    tolerance: float = 1e-4,
+    longest: int = 8,
+    seed: int = 0,
+    method: MethodLike = None,
+    progress: bool = True,
+) -> MinimalKick:
+    """The smallest kick, a sudden change of the state, after which a stable motion does not come
+    back: how robust it is, in the units of its state.
+
+    The least kick leads onto the boundary of the basin, which is the stable manifold of an unstable
+    motion, the edge state. It is found in three steps. Rays of kicks in all directions are
+    simulated beside each other, and where each first leaves the basin is bisected. From the rays
+    that leave sooner than their neighbours, `edge_state` follows the boundary to a saddle. With the
+    saddle's left eigenvector the boundary has an equation with a derivative, and Newton's method
+    makes the kick exact, through the impacts. Simulation from 1 ± 1e-6 of the kick confirms it.
+    Where the boundary has no saddle (a chaotic edge, or a grazing beside it) directions are
+    narrowed by simulations alone. Host-side: not to be traced.
+
+    A basin that is entered and left again between two points of a ray, or between two rays, may be
+    missed: `directions` and `points` say how fine the search is.
+
+    **Arguments:**
+
+    - `machine`: the machine.
+    - `orbit`: the motion that is kicked, on the section: a stable `Orbit`, or a state on a motion
+      that repeats. Of a machine without a drive it may be an equilibrium. Kicks at another phase
+      are those of the orbit on another section (`Scene.at_section`).
+    - `components`: names of the numbers of the state that are kicked, such as `["V"]`; all of them
+      by default.
+    - `weights`: of some of them, by which they count in the norm, above 0; 1 by default. With
+      velocities weighed by √(m/2) and no places the norm squared is an energy.
+    - `bounds`: the range of the kicked state in some of them, such as `{"Y": (-3.0, 2.0)}`. What
+      lies beyond a stop is out of bounds by itself.
+    - `cycle`: in which cycle of its period an orbit of several is kicked, from 0 on. Coming back in
+      another cycle than the kicked one counts as coming back.
+    - `largest`: norm up to which kicks are looked for; by default they grow until one leads
+      elsewhere.
+    - `directions`, `points`: rays, and points on each that are simulated in a round.
+    - `candidates`: rays that leave sooner than their neighbours, from which kicks are made exact.
+    - `settle`, `tolerance`, `longest`, `method`: as for `edge_state`. The kick found should be
+      many times `tolerance`.
+    - `seed`: of the directions, where more than two components are kicked.
+    - `progress`: count the starts simulated, in a terminal or a notebook.
+
+    **Returns:** a `MinimalKick`.
+
+    **Raises:** `ValueError` or `TypeError` for arguments that cannot be used; `ValueError` where no
+    kick leads elsewhere; on Ctrl-C `Interrupted`, whose `partial` is the smallest kick found so
+    far, as soon as there is one.
+    """
+    cycle, candidates = count("cycle", cycle), count("candidates", candidates, least=1)
+    directions, points = count("directions", directions, least=4), count("points", points, least=2)
+    longest, seed = count("longest", longest, least=1), count("seed", seed)
+    progress = flag("progress", progress)
+    if largest is not None:
+        largest = given_number("largest", largest, low=0.0, open_low=True)
+    settling, start = settling_on(
+        machine, orbit, settle, tolerance, longest, method, "orbit", cycle
+    )
+    kick = _kicks(settling, start, components, weights or {}, bounds or {})
+    angle = 2 * np.pi / directions ** (1 / max(1, kick.size - 1))
+    kicks: list[MinimalKick] = []
+
+    def smallest() -> MinimalKick:
+        first, *others = sorted(kicks, key=lambda one: float(one.norm))
+        return dataclasses.replace(first, others=tuple(others), lanes=settling.lanes)
+
+    def kept() -> Interrupted | None:
+        return Interrupted("search for kicks", smallest()) if kicks else None
+
+    with at_work("minimal kick", kept, progress=progress, unit="start") as settling.tell:
+        found, best = _ways_out(settling, kick, directions, points, largest, candidates, seed)
+        for ray in best:
+            radius = float(found.outside[ray])
+            new = _exact(settling, kick, found.directions[ray], radius, angle, longest, seed)
+            if all(_apart(new, old) > _SAME for old in kicks):
+                kicks.append(new)
+    return smallest()
+
+
+def _ways_out(
+    settling: Settling,
+    kick: Kick,
+    directions: int,
+    points: int,
+    largest: float | None,
+    candidates: int,
+    seed: int,
+) -> tuple[Exits, list[int]]:
+    """Where rays leave the basin, and which of them leave sooner than their neighbours.
+
+    **Raises:** `ValueError` if none leaves it.
+    """
+    found = first_exits(settling, kick, directions, points, largest, seed)
+    best = nearest_first(found, candidates)
+    if not best or not np.isfinite(found.outside[best[0]]):
+        raise ValueError(
+            "No kick leads elsewhere, of those that `components`, `bounds` and `largest` allow: "
+            "the motion came back from all of them."
+        )
+    return found, best
+
+
+def _kicks(
+    settling: Settling,
+    start: Row,
+    names: Sequence[str] | None,
+    weights: Mapping[str, float],
+    bounds: Mapping[str, tuple[float, float]],
+) -> Kick:
+    """The kicks that are asked for.
+
+    **Raises:** `ValueError` or `TypeError` that names the argument.
+    """
+    numbered = components(settling.state(np.arange(start.size, dtype=start.dtype)))
+    places = {name: int(place) for name, place in numbered.items()}
+    if isinstance(names, str):
+        raise TypeError(f"Argument `components` must be a list of names, but got {names!r}.")
+    names = list(places) if names is None else list(names)
+    if not names or len({*names}) < len(names):
+        raise ValueError(f"Argument `components` must be different names, but got {names!r}.")
+    for argument, given in (("components", names), ("weights", weights), ("bounds", bounds)):
+        among = list(places) if argument == "components" else names
+        for name in given:
+            if name not in among:
+                raise ValueError(
+                    f"Argument `{argument}` must name numbers of the state that are kicked, of "
+                    f"{', '.join(among)}, but names {name!r}."
+                )
+    weigh = [
+        given_number(f"weights[{name!r}]", weights.get(name, 1.0), low=0.0, open_low=True)
+        for name in names
+    ]
+    free = (-np.inf, np.inf)
+    ranges = [interval("bounds", bounds[name]) if name in bounds else free for name in names]
+    low, high = np.array(ranges).T
+    kick = Kick(start, tuple(places[name] for name in names), np.array(weigh), low, high)
+    if not kick.allowed(np.zeros(kick.size)):
+        raise ValueError("Argument `bounds` must hold the state that is kicked, but does not.")
+    return kick
+
+
+def _exact(
+    settling: Settling,
+    kick: Kick,
+    unit: Row,
+    radius: float,
+    angle: float,
+    longest: int,
+    seed: int,
+) -> MinimalKick:
+    """The shortest kick near a ray that leaves the basin at a radius.
+
+    **Arguments:** `angle`, how far the rays around are from it.
+    """
+    unit, inside, outside = nearer(settling, kick, unit, radius, angle, _LOOKS, seed)
+    line = narrowed(
+        settling, kick, Exits(unit[None], np.array([inside]), np.array([outside])), _ROUNDING
+    )
+    ends = kick.rows(np.array([line.inside[0], line.outside[0] * (1 + _ASIDE)])[:, None] * unit)
+    edge = tracked(settling, ends[0], ends[1], longest, _ROUNDS)
+    z, residual, exact = unit * line.outside[0], np.inf, False
+    if edge.kind == "saddle" and edge.orbit is not None:
+        better = shortest(settling, kick, edge.orbit, z)
+        if better is not None:
+            change = np.linalg.norm(better.z) / line.outside[0] - 1
+            exact = bool(-_SHORTER <= change <= _LONGER)
+            if exact:
+                z, residual = better.z, better.residual
+    if not exact:
+        narrow = angle / NARROWER**_LOOKS
+        unit, inside, outside = nearer(settling, kick, unit, outside, narrow, _MORE_LOOKS, seed)
+        z, residual = unit * outside, (outside - inside) / outside
+    return _described(settling, kick, z, residual, exact, edge, longest)
+
+
+def _described(
+    settling: Settling,
+    kick: Kick,
+    z: Row,
+    residual: float,
+    exact: bool,
+    edge: EdgeState,
+    longest: int,
+) -> MinimalKick:
+    """A kick, with what simulation says of it."""
+    aside = kick.rows(np.array([1 - _ASIDE, 1 + _ASIDE])[:, None] * z)
+    verdicts = settling.judge(aside)
+    row = kick.rows(z)
+    changed = components(settling.state(row - kick.start))
+    kicked = components(settling.state(np.isin(np.arange(row.size), kick.places).astype(float)))
+    return MinimalKick(
+        kick={name: x for name, x in changed.items() if kicked[name] > 0},
+        norm=float(np.linalg.norm(z)),
+        start=settling.state(row),
+        settles=settled_orbit(settling, aside[1], longest),
+        edge=edge,
+        residual=float(residual),
+        exact=exact,
+        confirmed=bool(verdicts[0] == RETURNS and verdicts[1] == ELSEWHERE),
+        others=(),
+        lanes=settling.lanes,
+        machine=settling.the_map.machine,
+    )
+
+
+def _apart(a: MinimalKick, b: MinimalKick) -> float:
+    """How different two kicks are, relative to the norm of one."""
+    change = np.array([float(a.kick[name]) - float(b.kick[name]) for name in a.kick])
+    size = np.array([float(x) for x in a.kick.values()])
+    return float(np.linalg.norm(change) / np.linalg.norm(size))

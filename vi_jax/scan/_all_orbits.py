@@ -1,0 +1,246 @@
+"""`all_orbits`: the periodic motions that searches from a region of starts find."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._checks import count, given_number
+from .._interrupted import Interrupted
+from .._lazy import xr
+from .._renamed import renamed
+from .._types import State
+from ..flow import MethodLike, in_names, machine_of, tidy
+from ..machine import AbstractMachine, components, with_leaf, with_units
+from ..orbit import (
+    STABILITY,
+    STABILITY_NAMES,
+    AbstractRootFinder,
+    InWords,
+    Orbit,
+    Orbits,
+    distinct_among,
+    find_orbit,
+    in_one_line,
+)
+from ._basins import starts_in
+from .program import START, check_leaf_name
+
+
+@dataclasses.dataclass(frozen=True)
+class Searched:
+    """What was searched for motions of one period, and what this says of motions not found."""
+
+    cycles: int
+    """The period asked for, in drive cycles; motions of its divisors solve its equations too."""
+    starts: int
+    """Random starts from which a search began."""
+    simulated: int
+    """Those that could be simulated: not beyond a stop, for one."""
+    converged: int
+    """Searches that found a motion."""
+    motions: int
+    """Different motions among them."""
+    once: int
+    """Motions that one search alone found."""
+
+    @property
+    def unseen(self) -> float:
+        """Good and Turing's estimate of the probability that the next search which converges finds
+        a motion that none of these has: `once / converged`, NaN if none converged. It counts
+        searches, not motions: many motions with small sets of starts may hide in it."""
+        return self.once / self.converged if self.converged else np.nan
+
+    @property
+    def detectable(self) -> float:
+        """The share of the searches that converge which a motion must have to be found by one of so
+        many in 95 of 100 cases; NaN if none converged."""
+        return 1 - 0.05 ** (1 / self.converged) if self.converged else np.nan
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class AllOrbits(InWords):
+    """The periodic motions that were found from a region of starts, stable and unstable, and what
+    was searched for them."""
+
+    orbits: Orbits
+    """The motions, by period and then by least position; each with its multipliers."""
+    found: np.ndarray
+    """Searches that found each; (motions, periods), in the order of `searched`."""
+    searched: tuple[Searched, ...]
+    """One for each period asked for."""
+    region: dict[str, tuple[float, float]]
+    """Ranges of the parts of the start."""
+    machine: AbstractMachine
+
+    @property
+    def stable(self) -> np.ndarray:
+        """Whether each motion is stable."""
+        return np.array([bool(orbit.stable) for orbit in self.orbits], bool)
+
+    @property
+    def periods(self) -> np.ndarray:
+        """The least period of each motion, in drive cycles."""
+        return np.array([int(orbit.cycles) for orbit in self.orbits], int)
+
+    def to_xarray(self, *, along: str | None = None) -> "xr.Dataset":
+        """The motions as an `xarray.Dataset`: of each its period, extremes, impacts, stability,
+        multipliers and section states (NaN beyond its period), and how many searches `found` it;
+        of each period what was searched.
+
+        **Arguments:** `along`, to keep only what has one dimension: `"motion"`, `"search"` (the
+        periods asked for), `"cycle"` or `"multiplier"`, which then makes a table without
+        repetitions.
+
+        **Raises:** `ValueError` if there is no such dimension.
+        """
+        data: dict[str, Any] = {"period": ("motion", self.periods)}
+        for name in ("impacts", "duration", "y_min", "y_max", "clearance", "slowest_impact"):
+            values = [np.asarray(getattr(orbit, name)) for orbit in self.orbits]
+            data[name] = "motion", np.array(values, int if name == "impacts" else float)
+        words = [str(in_names(o.stability, STABILITY, STABILITY_NAMES)) for o in self.orbits]
+        data["stability"] = "motion", np.array(words, str)
+        states = [components(orbit.sections, 1) for orbit in self.orbits]
+        longest = max(self.periods, default=0)
+        for name in states[0] if states else ():
+            rows = np.full((len(states), longest), np.nan)
+            for row, state, period in zip(rows, states, self.periods, strict=True):
+                row[:period] = np.asarray(state[name])[:period]
+            data[f"section_{name}"] = ("motion", "cycle"), rows
+        if states:
+            multipliers = np.stack([np.asarray(orbit.multipliers) for orbit in self.orbits])
+            data["multipliers"] = ("motion", "multiplier"), multipliers
+            data["total_found"] = "motion", self.found.sum(axis=1)
+            data["found"] = ("motion", "search"), self.found
+        for name in ("cycles", "starts", "simulated", "converged", "motions", "once", "unseen",
+                     "detectable"):  # fmt: skip
+            values = [getattr(searched, name) for searched in self.searched]
+            data[f"search_{name}"] = "search", np.array(values)
+        return tidy(with_units(xr.Dataset(data), self.machine.units, {}), along)
+
+    def __str__(self) -> str:
+        count, stable = len(self.orbits), int(self.stable.sum())
+        longest = max(searched.cycles for searched in self.searched)
+        lines = [
+            f"{count} periodic motion{'' if count == 1 else 's'} of at most "
+            f"{self.machine.period_of(longest)}, {stable} of them stable"
+        ]
+        for orbit, found in zip(self.orbits, self.found, strict=True):
+            lines.append(f"{in_one_line(orbit)}; found {found.sum():,} times")
+        where = ", ".join(f"{name} in [{a:g}, {b:g}]" for name, (a, b) in self.region.items())
+        lines.append(f"searched from random starts, {where}:")
+        for s in self.searched:
+            lost = s.starts - s.simulated
+            beyond = f" ({lost:,} could not be simulated)" if lost else ""
+            line = (
+                f"  {self.machine.period_of(s.cycles)}: {s.converged:,} of {s.starts:,} searches "
+                f"converged{beyond}, on {s.motions}"
+            )
+            if s.converged:
+                line += (
+                    f"; of further such searches about {100 * s.unseen:.2g} % find others (none "
+                    f"likely gets more than {100 * s.detectable:.2g} %)"
+                )
+            lines.append(line)
+        return "\n".join(lines)
+
+
+@renamed(scene="machine")
+def all_orbits(
+    machine: AbstractMachine,
+    cycles: int = 6,
+    *,
+    region: Mapping[str, tuple[float, float]],
+    starts: int = 1024,
+    seed: int = 0,
+    tolerance: float = 1e-6,
+    start: State = None,
+    root_finder: AbstractRootFinder | None = None,
+    method: MethodLike = None,
+) -> AllOrbits:
+    """Find the periodic motions of up to so many cycles, stable and unstable.
+
+    For each period of 1 to `cycles` drive cycles `find_orbit` searches from random starts, all in
+    one compiled call. What is found is sorted into different motions, whatever the cycle on which
+    they are observed and by their least period. A random search proves nothing complete: the
+    result says what was searched, how many searches converged, and by Good and Turing's estimate
+    how much of what searches find has not been found. Host-side: not to be traced; one compiled
+    program for each period.
+
+    **Arguments:**
+
+    - `machine`: the machine.
+    - `cycles`: the longest period.
+    - `region`: ranges of parts of the start, such as `{"start.Y": (-4, 2), "start.V": (-4, 4)}`,
+      on the machine's section.
+    - `starts`: random starts for each period, uniform in the region (with `seed`).
+    - `tolerance`: as for `distinct_orbits`.
+    - `start`: a state on the section with the parts that are not in the region; by default
+      `machine.start()`.
+    - `root_finder`, `method`: as for `find_orbit`.
+
+    **Returns:** `AllOrbits`.
+
+    **Raises:** `ValueError` or `TypeError` for arguments that cannot be used; on Ctrl-C
+    `Interrupted`, whose `partial` holds the periods that were searched, if there are any.
+    """
+    machine, cycles = machine_of(machine), count("cycles", cycles, least=1)
+    starts, seed = count("starts", starts, least=1), count("seed", seed)
+    tolerance = given_number("tolerance", tolerance, low=0.0)
+    begin = machine.start() if start is None else start
+    batches: list[Orbit] = []
+    # A draw for each period: longer ones do not change what shorter ones are searched from.
+    rows = [starts_in(region, 1, starts, (seed, n)) for n in range(1, cycles + 1)]
+    for name in rows[0]:
+        check_leaf_name(machine, begin, name, "region", None)
+    ranges = {name: (float(low), float(high)) for name, (low, high) in region.items()}
+
+    def so_far() -> AllOrbits:
+        return _sorted_out(machine, batches, tolerance, ranges)
+
+    try:
+        for n, row in enumerate(rows, 1):
+            options = {"root_finder": root_finder, "method": method}
+            found = find_orbit(machine, _guesses(begin, row), n, **options)
+            batches.append(jax.block_until_ready(found))
+        return so_far()
+    except KeyboardInterrupt:
+        if not batches:
+            raise
+        raise Interrupted("search for periodic motions", so_far()) from None
+
+
+def _guesses(begin: State, row: Mapping[str, np.ndarray]) -> State:
+    """A start for each place in the rows of its parts."""
+
+    def one(values: Mapping[str, Any]) -> State:
+        here = begin
+        for name, value in values.items():
+            here = with_leaf(here, name.removeprefix(START), value)
+        return here
+
+    return jax.vmap(one)({name: jnp.asarray(x) for name, x in row.items()})
+
+
+def _sorted_out(
+    machine: AbstractMachine, batches: list[Orbit], tolerance: float,
+    region: dict[str, tuple[float, float]],
+) -> AllOrbits:  # fmt: skip
+    """The different motions in what searches for 1, 2, … cycles found."""
+    orbits, found = distinct_among(batches, tolerance)
+    searched = []
+    for n, (batch, column) in enumerate(zip(batches, found.T, strict=True), 1):
+        searched.append(
+            Searched(
+                cycles=n,
+                starts=int(batch.residual.size),
+                simulated=int(np.isfinite(np.asarray(batch.residual)).sum()),
+                converged=int(column.sum()),
+                motions=int((column > 0).sum()),
+                once=int((column == 1).sum()),
+            )
+        )
+    return AllOrbits(orbits, found, tuple(searched), region, machine)

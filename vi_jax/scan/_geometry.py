@@ -1,0 +1,291 @@
+"""The geometry of basins, from labels on a grid: entropies, uncertainty exponent, largest balls."""
+
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+
+# Tiles along each axis, of which one after the other is left out for the confidence interval, in
+# one dimension and in more; and the distances looked at if none are given, at most this part of
+# the grid. Choices.
+_TILES, _TILES_OF_A_ROW = 8, 64
+_DISTANCES, _FARTHEST = 8, 1 / 16
+
+
+class BasinEntropy(NamedTuple):
+    """Basin entropy, after Daza, Wagemakers, Georgeot, Guéry-Odelin and Sanjuán, Scientific
+    Reports 6, 31416 (2016)."""
+
+    total: float
+    """S_b: mean over all boxes of -Σ p ln p, with p the shares of the outcomes in a box."""
+    boundary: float
+    """S_bb: the same mean over the boxes with two outcomes at least; NaN if there is none. Above
+    ln 2 the boundary is fractal; below, it may be either."""
+    boxes: int
+    """Boxes in which there are starts."""
+    boundary_boxes: int
+    """Those among them with two outcomes at least."""
+    box: int
+    """Starts along each side of a box."""
+
+
+class Uncertainty(NamedTuple):
+    """Final-state sensitivity, after Grebogi, McDonald, Ott and Yorke, Physics Letters A 99, 415
+    (1983): the part of the starts that an error ε may send elsewhere grows as a power of ε.
+
+    The error is one of a single part of the start at a time. Across a smooth boundary the exponent
+    is 1; across a fractal one it is the dimension of the starts less that of the boundary. A
+    boundary may be smooth in one direction and fractal in another: the smallest exponent is what
+    counts as ε → 0.
+    """
+
+    exponents: np.ndarray
+    """Exponent for errors along each axis of the grid, shape (axes,); NaN where fewer than three
+    distances meet a boundary."""
+    intervals: np.ndarray
+    """Confidence interval of each; shape (axes, 2)."""
+    distances: np.ndarray
+    """The errors ε, in cells of the grid; shape (distances,)."""
+    fractions: np.ndarray
+    """Part of the starts for which the one at this distance, up or down the axis, has another
+    outcome; shape (axes, distances)."""
+
+    @property
+    def exponent(self) -> float:
+        """The smallest of `exponents`."""
+        return float(self.exponents[self._least])
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Its confidence interval."""
+        low, high = self.intervals[self._least]
+        return float(low), float(high)
+
+    @property
+    def _least(self) -> int:
+        known = np.where(np.isnan(self.exponents), np.inf, self.exponents)
+        return int(np.argmin(known))
+
+
+class Ball(NamedTuple):
+    """A ball of starts that all have one outcome."""
+
+    radius: float
+    centre: np.ndarray
+    at_edge: bool
+    """Whether the edge of the region is what it meets first, so that it might be larger."""
+
+
+def entropy_of(label: np.ndarray, *, box: int, there: np.ndarray | None = None) -> BasinEntropy:
+    """Basin entropy of labels on a grid of any dimension.
+
+    **Arguments:** `label`, an integer for each outcome; `box`, cells along each side of a box:
+    boxes do not overlap, and cells left over at the ends of the axes are left out; `there`, which
+    cells hold a start at all (all by default).
+    """
+    there = np.ones(label.shape, bool) if there is None else there
+    cells, held = _boxes(label, box), _boxes(there, box)
+    many = held.sum(axis=1)
+    cells, held, many = cells[many > 0], held[many > 0], many[many > 0]
+    entropy, outcomes = np.zeros(len(many)), np.zeros(len(many), int)
+    for number in np.unique(cells[held]):
+        share = np.sum((cells == number) & held, axis=1) / many
+        entropy -= share * np.log(np.where(share > 0, share, 1.0))
+        outcomes += share > 0
+    mixed = outcomes > 1
+    return BasinEntropy(
+        total=float(entropy.mean()) if len(many) else np.nan,
+        boundary=float(entropy[mixed].mean()) if mixed.any() else np.nan,
+        boxes=len(many),
+        boundary_boxes=int(mixed.sum()),
+        box=box,
+    )
+
+
+def _boxes(cells: np.ndarray, box: int) -> np.ndarray:
+    """The cells box by box, (boxes, cells of a box)."""
+    counts = [size // box for size in cells.shape]
+    whole = cells[tuple(slice(n * box) for n in counts)]
+    split = whole.reshape([part for n in counts for part in (n, box)])
+    first = range(0, 2 * cells.ndim, 2)
+    return split.transpose([*first, *(i + 1 for i in first)]).reshape(-1, box**cells.ndim)
+
+
+def uncertainty_of(
+    label: np.ndarray,
+    *,
+    distances: np.ndarray | None = None,
+    confidence: float = 0.95,
+    there: np.ndarray | None = None,
+) -> Uncertainty:
+    """Uncertainty exponents of the boundaries between labels on a grid of any dimension.
+
+    The same starts are looked at for all distances: those that have neighbours at the largest one.
+    An exponent is the slope of ln(fraction) over ln(distance) by least squares. Its interval has
+    two parts, added in quadrature: what the slope varies by as one tile of the grid after the
+    other is left out (jackknife), which is the chance of where the region lies, and the scatter
+    about the straight line.
+
+    **Arguments:** `label`, an integer for each outcome; `distances`, in cells (left out: eight
+    from 1 on to a sixteenth of the shortest axis, three at least); `confidence` of the intervals;
+    `there`, which cells hold a start at all (all by default): one without is no other outcome.
+    """
+    there = np.ones(label.shape, bool) if there is None else there
+    if distances is None:
+        farthest = max(int(min(label.shape) * _FARTHEST), 3)
+        distances = np.unique(np.geomspace(1, farthest, _DISTANCES).round().astype(int))
+    margin = int(distances.max())
+    exponents, intervals, fractions = [], [], []
+    for axis in range(label.ndim):
+        apart = (_apart(label, there, axis, d) for d in distances.tolist())
+        sums = [_by_tile(found, there, margin) for found in apart]
+        uncertain, starts = np.stack([x for x, _ in sums]), sums[0][1]
+        exponent, half = _power(distances, uncertain, starts, confidence)
+        exponents.append(exponent)
+        intervals.append((exponent - half, exponent + half))
+        fractions.append(uncertain.sum(axis=1) / max(starts.sum(), 1))
+    return Uncertainty(np.array(exponents), np.array(intervals), distances, np.array(fractions))
+
+
+def _power(
+    distances: np.ndarray, uncertain: np.ndarray, starts: np.ndarray, confidence: float
+) -> tuple[float, float]:
+    """The exponent by which uncertain starts grow with the distance, and half of its interval.
+
+    **Arguments:** distances; uncertain starts, (distances, tiles); starts, (tiles,); confidence.
+    """
+    from scipy.special import stdtrit  # slow to load
+
+    total = uncertain.sum(axis=1)
+    used = total > 0
+    if used.sum() < 3:
+        return np.nan, np.nan
+    across, uncertain = np.log(distances[used]), uncertain[used]
+    exponent, scatter = _slope(across, np.log(total[used] / starts.sum()))
+    spread = _jackknife(across, uncertain, starts)
+    tiles = int(np.count_nonzero(starts))
+    quantile = float(stdtrit(max(tiles - 1, 1), 0.5 + 0.5 * confidence))
+    return exponent, quantile * float(np.hypot(spread, scatter))
+
+
+def _apart(label: np.ndarray, there: np.ndarray, axis: int, distance: int) -> np.ndarray:
+    """Which cells have another outcome so many cells away along an axis, up or down."""
+    found = np.zeros(label.shape, bool)
+    low = (slice(None),) * axis + (slice(None, -distance),)
+    high = (slice(None),) * axis + (slice(distance, None),)
+    differ = (label[low] != label[high]) & there[low] & there[high]
+    found[low] |= differ
+    found[high] |= differ
+    return found
+
+
+def _by_tile(found: np.ndarray, there: np.ndarray, margin: int) -> tuple[np.ndarray, np.ndarray]:
+    """How many starts away from the margin are found, and are there, in each tile of the grid."""
+    inner = tuple(slice(margin, size - margin) for size in found.shape)
+    found, there = found[inner] & there[inner], there[inner]
+    tiles = _TILES_OF_A_ROW if found.ndim == 1 else _TILES
+    place = np.zeros(found.shape, int)
+    for axis, size in enumerate(found.shape):
+        row = np.arange(size) * tiles // max(size, 1)
+        place = place * tiles + row.reshape([-1 if i == axis else 1 for i in range(found.ndim)])
+    many = tiles**found.ndim
+    return np.bincount(place[found], minlength=many), np.bincount(place[there], minlength=many)
+
+
+def _slope(across: np.ndarray, up: np.ndarray) -> tuple[float, float]:
+    """Slope of a straight line by least squares, and its standard error from the scatter."""
+    x, y = across - across.mean(), up - up.mean()
+    slope = float(x @ y / (x @ x))
+    rest = y - slope * x
+    return slope, float(np.sqrt(rest @ rest / max(len(x) - 2, 1) / (x @ x)))
+
+
+def _jackknife(across: np.ndarray, uncertain: np.ndarray, starts: np.ndarray) -> float:
+    """Standard error of the slope, from its values with each tile left out.
+
+    **Arguments:** logarithms of the distances; uncertain starts (distances, tiles); starts.
+    """
+    slopes = []
+    for tile in np.flatnonzero(starts):
+        rest = uncertain.sum(axis=1) - uncertain[:, tile]
+        if not (rest > 0).all():
+            return np.inf  # one tile holds all that is uncertain: nothing is known of the spread
+        slopes.append(_slope(across, np.log(rest / (starts.sum() - starts[tile])))[0])
+    several = len(slopes)
+    return float(np.sqrt((several - 1) * np.var(slopes))) if several > 1 else np.inf
+
+
+class Cells(NamedTuple):
+    """The cells of a grid, in which distances are measured."""
+
+    centres: list[np.ndarray]
+    """Their centres along each axis, equally spaced."""
+    scales: np.ndarray
+    """What counts as distance 1 along each axis."""
+    ends: np.ndarray
+    """Whether the low and the high edge of each axis end a ball; shape (axes, 2)."""
+
+    @property
+    def widths(self) -> np.ndarray:
+        """Width of the cells along each axis."""
+        return np.array([(x[-1] - x[0]) / (x.size - 1) for x in self.centres])
+
+    @property
+    def edges(self) -> np.ndarray:
+        """Low and high edge of each axis; shape (axes, 2)."""
+        half = 0.5 * self.widths
+        return np.array([(x[0] - h, x[-1] + h) for x, h in zip(self.centres, half, strict=True)])
+
+    def to_edge(self, point: np.ndarray) -> float:
+        """How far a point is from the edges that end a ball."""
+        distance = np.abs(self.edges - point[:, None]) / self.scales[:, None]
+        return float(np.min(distance[self.ends], initial=np.inf))
+
+
+def ball_around(point: np.ndarray, foreign: np.ndarray, cells: Cells) -> Ball:
+    """The largest ball around a point that meets neither foreign cells nor an edge.
+
+    Cells are boxes around their starts, of which the whole counts as foreign. The radius is NaN
+    for a point outside of the region.
+
+    **Arguments:** `point`, (axes,); `foreign`, which cells have another outcome; the grid.
+    """
+    low, high = cells.edges.T
+    if not ((point >= low) & (point <= high)).all():
+        return Ball(np.nan, point, False)
+    square = np.zeros(foreign.shape)
+    parts = zip(cells.centres, point, cells.widths, cells.scales, strict=True)
+    for axis, (row, x, width, scale) in enumerate(parts):
+        gap = np.maximum(np.abs(row - x) - width / 2, 0.0) / scale
+        square += (gap**2).reshape([-1 if i == axis else 1 for i in range(foreign.ndim)])
+    nearest = float(np.sqrt(np.min(square[foreign], initial=np.inf)))
+    edge = cells.to_edge(point)
+    return Ball(min(edge, nearest), point, edge < nearest)
+
+
+def largest_ball(own: np.ndarray, foreign: np.ndarray, cells: Cells) -> Ball:
+    """The largest ball around a start (or a corner or face of its cell) of one outcome that meets
+    neither foreign cells nor an edge, by an exact Euclidean distance transform.
+
+    **Arguments:** `own`, which cells have the outcome, one at least; the others as for
+    `ball_around`. Cells that are neither hold no start, and do not end a ball.
+    """
+    from scipy.ndimage import distance_transform_edt  # slow to load
+
+    # On a lattice of half the spacing the point of a box nearest to any node is itself a node.
+    shape = tuple(2 * size + 1 for size in own.shape)
+    free, near = np.ones(shape, bool), np.zeros(shape, bool)
+    for offset in itertools.product((0, 1, 2), repeat=own.ndim):
+        nodes = tuple(slice(o, o + 2 * n - 1, 2) for o, n in zip(offset, own.shape, strict=True))
+        free[nodes] &= ~foreign
+        near[nodes] |= own
+    for axis, side in np.argwhere(cells.ends):
+        free[(slice(None),) * int(axis) + (-int(side),)] = False
+    low, half = cells.edges[:, 0], cells.widths / 2
+    if free.all():
+        return Ball(np.inf, cells.edges.mean(axis=1), False)
+    distance = distance_transform_edt(free, sampling=list(half / cells.scales))
+    radius = np.where(near, np.asarray(distance, float), -1.0)
+    place = np.array(np.unravel_index(int(np.argmax(radius)), shape))
+    largest, centre = float(radius.max()), low + place * half
+    return Ball(largest, centre, cells.to_edge(centre) <= largest * (1 + 1e-9))

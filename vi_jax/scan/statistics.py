@@ -1,0 +1,285 @@
+"""Measures of motions that do not repeat: means with errors, densities, times of escape."""
+
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._checks import count, given_number, instance_of
+from ..flow import Run
+from ..machine import components
+from .grid import axes_of
+from .measures import About, AbstractMeasure
+
+# What a run tells of each cycle, and not at an instant.
+_COLUMNS = (
+    "impacts", "y_min", "y_max", "impact_speed", "impact_energy", "rests", "duration",
+    "frequency_ratio",
+)  # fmt: skip
+
+Of = str | Callable[..., Any]
+
+
+def instants_of(run: Run, name: str, samples: int) -> Array | None:
+    """A part of the state, or a quantity of the machine, at all sections or samples of one lane
+    with the first; `None` for what is neither.
+
+    **Arguments:** the run; the name; samples in a cycle, 0 for sections.
+    """
+    states, quantities = run.sections, run.quantities
+    if samples:
+        assert run.samples is not None
+        states, quantities = run.samples.state, run.samples.quantities
+    return {**components(states, 1), **quantities}.get(name)
+
+
+class _Observed(AbstractMeasure):
+    """A measure of one quantity on sections, at sampled instants or cycle by cycle."""
+
+    of: eqx.AbstractVar[Any]
+    samples: eqx.AbstractVar[int]
+
+    @property
+    def record(self):  # pyright: ignore
+        """Only what is not known on sections, or of each cycle, needs the motion between them."""
+        of_states = self.samples or isinstance(self.of, tuple)
+        return "sections" if of_states or self.of == "impacts" else "motion"
+
+    @property
+    def instants(self):
+        """As many as are asked for."""
+        return self.samples
+
+    def row(self, machine: Any, run: Run, name: Of) -> tuple[Array, Array]:
+        """The quantity at all instants, and at those behind the first, or in all cycles.
+
+        **Raises:** `ValueError` for a name that has none.
+        """
+        if not isinstance(name, str):
+            found = jnp.asarray(name(machine, run))
+            if found.ndim != 1:
+                raise ValueError(
+                    f"Argument `of` must be a function of machine and run that returns one row, "
+                    f"but returned shape {found.shape}."
+                )
+            return found, found
+        found = instants_of(run, name, self.samples)
+        if found is not None:
+            return found, found[1:]
+        columns = {} if self.samples else {n: getattr(run, n) for n in _COLUMNS} | run.averages
+        found = columns.get(name)
+        if found is None:
+            there = [*components(run.sections, 1), *run.quantities]
+            there += [n for n, x in columns.items() if x is not None]
+            raise ValueError(f"Argument `of` must be one of {', '.join(there)}, but got {name!r}.")
+        found = found.astype(jnp.result_type(float))
+        return found, found
+
+
+def _checked_of(name: Any) -> None:
+    if not callable(name):
+        instance_of("of", name, str, "the name of a quantity, or a function of machine and run")
+
+
+def _called(of: Of) -> str:
+    return of if isinstance(of, str) else of.__name__
+
+
+class Statistics(_Observed):
+    """Mean and spread of a quantity over the cycles observed, each with its standard error.
+
+    Of `"V"` they are `V_mean`, `V_error`, `V_spread` (the standard deviation) and `V_spread_error`.
+    Cycles beside each other are not independent, so that the errors are those of means over
+    `batches` parts of the row (batch means): right if a part is long beside the time in which the
+    motion forgets its past, too small if not. Lanes of their own paths give an error without this
+    condition, the scatter of their means.
+
+    **Arguments:**
+
+    - `of`: a part of the state (`"V"`) or a quantity of the machine, on sections; of each cycle
+      `"impacts"`, `"y_min"`, `"y_max"`, `"impact_speed"`, `"impact_energy"`, `"rests"`,
+      `"duration"`, or one of the machine's averages; or a function of a lane's machine and `Run`
+      that returns one row, whose name it takes.
+    - `batches`: parts of the row, at least 2; static.
+    - `samples`: instants in a cycle at which the state is looked at instead of sections; static.
+
+    **Raises:** `TypeError` or `ValueError` for arguments of other kinds.
+    """
+
+    of: Of = eqx.field(static=True)
+    batches: int = eqx.field(static=True, default=16)
+    samples: int = eqx.field(static=True, default=0, kw_only=True)
+
+    def __check_init__(self):
+        _checked_of(self.of)
+        count("batches", self.batches, least=2)
+        count("samples", self.samples)
+
+    @property
+    def cycles(self):
+        """One in each part."""
+        return self.batches
+
+    def described(self, start):
+        """In the unit of the quantity."""
+        name = _called(self.of)
+        words = {
+            "mean": f"mean of {name}", "error": f"standard error of the mean of {name}",
+            "spread": f"standard deviation of {name}",
+            "spread_error": f"standard error of the standard deviation of {name}",
+        }  # fmt: skip
+        return {f"{name}_{k}": {"unit_of": name, "long_name": x} for k, x in words.items()}
+
+    def __call__(self, machine, run):
+        """Of one lane."""
+        _, row = self.row(machine, run, self.of)
+        if row.size < self.batches:
+            raise ValueError(
+                f"Argument `batches` must be at most the {row.size} values of `of`, but is "
+                f"{self.batches}."
+            )
+        mean = jnp.mean(row)
+        square = (row - mean) ** 2
+        spread = jnp.sqrt(jnp.mean(square))
+        # That of the variance, and from it that of its root, in proportion.
+        halved = 2 * jnp.where(spread > 0, spread, 1.0)
+        numbers = {
+            "mean": mean,
+            "error": self._error(row),
+            "spread": spread,
+            "spread_error": self._error(square) / halved,
+        }
+        return {f"{_called(self.of)}_{k}": x for k, x in numbers.items()}
+
+    def _error(self, row: Float[Array, " instants"]) -> Float[Array, ""]:
+        """The standard error of the mean of a row, by the last of it that makes equal parts."""
+        long = row.size // self.batches
+        parts = row[row.size - long * self.batches :].reshape(self.batches, long)
+        return jnp.std(jnp.mean(parts, axis=1), ddof=1) / self.batches**0.5
+
+
+class Density(_Observed):
+    """Probability density of one or two parts of the state: `density`, by bins, and `outside`, the
+    share of the instants that lie in none of them.
+
+    The density times the size of a bin is the share of the instants in it, of all instants, those
+    outside included. The bins' edges are in the attributes of `density`, by the name of the part.
+    Lanes of their own paths give its error, the scatter of theirs.
+
+    **Arguments:**
+
+    - `of`: the edges of the bins, rising, by the name of what they are of, as in
+      `{"Y": jnp.linspace(-2, 2, 41)}`; with two names the density is that of both together.
+    - `samples`: instants in a cycle, evenly spaced; 0 for the sections alone; static.
+
+    **Raises:** `TypeError` or `ValueError` for edges that do not rise, and for more than two names.
+    """
+
+    of: tuple[str, ...] = eqx.field(static=True)
+    edges: tuple[Array, ...]
+    samples: int = eqx.field(static=True, default=0, kw_only=True)
+
+    def __init__(self, of: Mapping[str, Any], *, samples: int = 0):
+        edges = axes_of(of, "of")
+        if len(edges) > 2:
+            raise ValueError(f"Argument `of` must have one name or two, but has {len(edges)}.")
+        for name, row in edges.items():
+            if row.size < 2 or not np.all(np.diff(row) > 0):
+                raise ValueError(
+                    f"Argument `of` must have for {name!r} edges that rise, two at least, but got "
+                    f"{row}."
+                )
+        self.of = tuple(edges)
+        self.edges = tuple(jnp.asarray(x, jnp.result_type(float)) for x in edges.values())
+        self.samples = count("samples", samples)
+
+    def described(self, start):
+        """Over bins of each name."""
+        rows = zip(self.of, self.edges, strict=True)
+        edges = {f"{name}_edges": np.asarray(x).tolist() for name, x in rows}
+        words = " and ".join(self.of)
+        return {
+            "density": {
+                "long_name": f"probability density of {words}",
+                "dims": tuple(f"{name}_bin" for name in self.of),
+                **edges,
+            },
+            "outside": {"long_name": "share of the instants outside of all bins", "units": "1"},
+        }
+
+    def __call__(self, machine, run):
+        """Of one lane."""
+        rows = [self.row(machine, run, name)[1] for name in self.of]
+        sizes = [edges.size - 1 for edges in self.edges]
+        place, inside, area = jnp.zeros_like(rows[0], dtype=int), True, jnp.ones(())
+        for row, edges, size in zip(rows, self.edges, sizes, strict=True):
+            mine = jnp.searchsorted(edges, row, side="right") - 1
+            inside = inside & (mine >= 0) & (mine < size)
+            place = place * size + jnp.clip(mine, 0, size - 1)
+            area = area[..., None] * jnp.diff(edges)
+        shares = jnp.where(inside, 1.0, 0.0) / rows[0].size
+        flat = jnp.zeros(int(np.prod(sizes))).at[place].add(shares)
+        return {"density": flat.reshape(sizes) / area, "outside": 1.0 - jnp.sum(shares)}
+
+
+class Escape(_Observed):
+    """When a quantity leaves an interval for the first time: `escape_cycle`, counted in cycles from
+    where observation begins, and `escaped`, whether it does (1) or not (0).
+
+    Of a lane that does not, `escape_cycle` is how long it was watched: its time of escape is
+    censored, known to be longer. Means of `escape_cycle` alone are too small; see `escape_rate`. A
+    lane that lies outside where observation begins has 0. A passage is seen at the instants looked
+    at only. Where the motion may return between them, the extremes `"y_min"` and `"y_max"` of each
+    cycle, which are exact, tell in which cycle it was.
+
+    **Arguments:**
+
+    - `of`: as for `Statistics`; what is known cycle by cycle counts as at the cycle's end.
+    - `low`, `high`: ends of the interval; by default infinite.
+    - `samples`: instants in a cycle at which the state is looked at instead of sections; static.
+
+    **Raises:** `TypeError` or `ValueError` for arguments of other kinds, or an interval that is
+    empty or without ends.
+    """
+
+    attributes: ClassVar[About] = {
+        "escape_cycle": {"units": "cycle", "long_name": "cycles until it escapes, or was watched"},
+        "escaped": {"units": "1", "long_name": "whether it escapes"},
+    }
+
+    of: Of = eqx.field(static=True)
+    low: Any = -jnp.inf
+    high: Any = jnp.inf
+    samples: int = eqx.field(static=True, default=0, kw_only=True)
+
+    def __check_init__(self):
+        _checked_of(self.of)
+        for name in ("low", "high"):
+            if not np.isinf(getattr(self, name)):
+                given_number(name, getattr(self, name))
+        if not self.low < self.high or (np.isinf(self.low) and np.isinf(self.high)):
+            raise ValueError(
+                "Arguments `low` and `high` must be the ends of an interval, one of them finite, "
+                f"but got {self.low} and {self.high}."
+            )
+        count("samples", self.samples)
+
+    def described(self, start):
+        """With the time between two looks."""
+        step = 1.0 / max(1, self.samples)
+        first = {**self.attributes["escape_cycle"], "step": step}
+        return {**self.attributes, "escape_cycle": first}
+
+    def __call__(self, machine, run):
+        """Of one lane."""
+        row, behind = self.row(machine, run, self.of)
+        # What is known of cycles begins with the first cycle's end.
+        row = row if row.size > behind.size else jnp.concatenate([jnp.zeros(1) + jnp.nan, row])
+        outside = (row < self.low) | (row > self.high)
+        escaped = jnp.any(outside)
+        first = jnp.where(escaped, jnp.argmax(outside), row.size - 1)
+        step = jnp.asarray(1.0 / max(1, self.samples), jnp.result_type(float))
+        return {"escape_cycle": first * step, "escaped": escaped.astype(jnp.int8)}
