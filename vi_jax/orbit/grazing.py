@@ -176,6 +176,29 @@ def grazing(
     check, periods = flag("check", check), count("periods", periods, least=1)
     progress = flag("progress", progress)
     graze = graze_at(point)
+    unchecked, size, found, near = _unchecked(graze, periods)
+    if not check:
+        return unchecked
+    with at_work(
+        "grazing", lambda: Interrupted("check of the grazing", unchecked),
+        progress=progress, unit="value", total=len(size[::ASKED]),
+    ) as tell:  # fmt: skip
+        asked = slice(None, None, ASKED)
+        some = Settled(*(part[asked] for part in found))
+        beside, same, far = beside_grazing(graze, unchecked.side * size[asked], some, near[asked])
+        checked, agreement = stretch(size[asked], *same)
+        tell(len(size[asked]))
+    return dataclasses.replace(
+        unchecked, machine=beside, checked=checked, agreement=agreement, far=far
+    )
+
+
+def _unchecked(graze: Graze, periods: int) -> tuple[Grazing, np.ndarray, Settled, np.ndarray]:
+    """What the local map says of a grazing.
+
+    **Returns:** that; distances from it in the parameter, and at each of them what the map settles
+    on and whether that is near enough for the map to hold.
+    """
     local, machine = graze.map, graze.problem.machine
     first = graze.touches[0]
     natural, brief = natural_depth(local), _brief_depth(graze)
@@ -222,20 +245,7 @@ def grazing(
         labels=machine.labels,
         units=stated(machine),
     )  # fmt: skip
-    if not check:
-        return unchecked
-    with at_work(
-        "grazing", lambda: Interrupted("check of the grazing", unchecked),
-        progress=progress, unit="value", total=len(size[::ASKED]),
-    ) as tell:  # fmt: skip
-        asked = slice(None, None, ASKED)
-        some = Settled(*(part[asked] for part in found))
-        beside, same, far = beside_grazing(graze, side * size[asked], some, near[asked])
-        checked, agreement = stretch(size[asked], *same)
-        tell(len(size[asked]))
-    return dataclasses.replace(
-        unchecked, machine=beside, checked=checked, agreement=agreement, far=far
-    )
+    return unchecked, size, found, near
 
 
 def _called(graze: Graze, number: int) -> str:

@@ -51,53 +51,47 @@ def scan(
     cluster: Any = None,
     progress: bool = True,
 ) -> "xr.Dataset":
-    """Simulate every combination of the axes' values and keep what is measured.
-
-    Other numbers on the axes, in the machine or in `settle` compile nothing again.
+    """Simulate every combination of the axes' values and keep what is measured. Other numbers on
+    the axes, in the machine or in `settle` compile nothing again.
 
     **Arguments:**
 
-    - `machine`: the machine, or a function of the axes' values by name that makes it (define the
-      function once: another one is another program).
+    - `machine`: the machine, or a function of the axes' values by name that makes it (define it
+      once: another function is another program).
     - `axes`: names of numbers of the machine (`"drive.frequency_ratio"`, `"stops.0.restitution"`)
       or of the start (`"start.Y"`), each with a row of values.
     - `measure`: what is kept: names out of `"extremes"`, `"regime"`, `"frequency_ratio"`,
       `"power"`, `"impact_rate"`, `"sections"`, `"exponent"`, `"steps"`, or of the machine's own
-      `averages` (its `"power"` takes the place of ours); `AbstractMeasure`s; functions of a lane's
+      `averages`, which replace ours of the same name; `AbstractMeasure`s; functions of a lane's
       machine and `Run` that return named numbers.
     - `start`: the first state; by default the machine's own start at rest.
-    - `settle`, `cycles`: drive cycles before observing (any number), and observed (static; by
-      default as many as the measures need, at least 32).
-    - `method`, `clock`, `max_impacts`, `max_steps`: as for `simulate`; by default `"standard"`.
-    - `derivatives`: names (or one), as on the axes, by which all floating-point variables are
-      differentiated: `d_y_min` and so on, with an axis `by`.
-    - `noise`, `key`: a `WhiteNoise`, by default none, and with it one key of JAX's. Lane number n
-      of the grid (the last axis is filled first) has the key `jax.random.fold_in(key, n)`, wherever
-      and beside what it is computed. An axis `"noise.V"` has values of the amplitude of that name;
-      `"noise.path"` changes nothing but that each of its numbers has paths of its own. Measures
-      that look for a period, or go on beyond the cycles observed, are refused.
+    - `settle`, `cycles`: drive cycles before observing, and observed (static; by default 32 or
+      what the measures need); `method`, `clock`, `max_impacts`, `max_steps`: as for `simulate`.
+    - `derivatives`: names, as on the axes, by which every real variable is differentiated:
+      `d_y_min` and so on, with an axis `by`.
+    - `noise`, `key`: a `WhiteNoise`, by default none, and with it one key of JAX's. Lane n of the
+      grid (the last axis is filled first) has the key `jax.random.fold_in(key, n)`. `"noise.V"` is
+      an axis of amplitudes, `"noise.path"` of paths. Measures that look for a period are refused.
     - `paired`: a lane for each place in the rows (of one length), along `sample`, and no grid.
-    - `verify`: so many lanes, drawn at random, are run again by a tighter method. `data.attrs`
-      then says how many came out otherwise (`verified_changed_period`, of whole numbers) or what
-      95 of 100 are off by at most (`verified_error_y_min`; infinite where one of both failed).
-    - `store`: folder of a Zarr store, written block by block. The same call resumes it, and names
-      and computes again what was lost or damaged; a changed one, your own functions' code
-      included, is refused with the difference named.
+    - `verify`: so many lanes, drawn at random, are run again by a tighter method. `data.attrs` then
+      says how many came out otherwise (`verified_changed_period`, of whole numbers) or what 95 of
+      100 are off by at most (`verified_error_y_min`; infinite where one failed).
+    - `store`: folder of a Zarr store, written block by block. The same call resumes it and computes
+      again what was lost; a changed one (or your functions' code) is refused with the difference.
     - `lanes`: lanes in a block (a multiple of 256); memory grows with it and with `cycles`.
-    - `workers`, `devices`: blocks at work at the same time on a CPU (by default one for each core),
-      and local devices over which a block is spread (all by default).
+    - `workers`, `devices`: blocks at work at once on a CPU (by default one a core), and local
+      devices over which a block is spread (all by default).
     - `cluster`: a `dask.distributed.Client`, to compute the blocks there.
     - `progress`: show a bar, in a terminal or a notebook.
 
     **Returns:** an `xarray.Dataset` over the axes, with units; `result` says of each lane how it
     ended (0: well; -1: not computed). With a `store` it is read lazily from there.
 
-    **Raises:** `ValueError` or `TypeError` before any work for what cannot be run;
-    `ScanInterrupted`, a `KeyboardInterrupt`, on Ctrl-C; `ConnectionError`, which says what is kept
-    and how to go on, if the cluster's scheduler is lost.
+    **Raises:** `ValueError` or `TypeError` before any work for what cannot be run; on Ctrl-C
+    `ScanInterrupted`; `ConnectionError`, which says what is kept, if the cluster is lost.
     """
     grid, verify = axes_of(axes), count("verify", verify)
-    paired, progress = flag("paired", paired), flag("progress", progress)
+    progress, paired = flag("progress", progress), flag("paired", paired)
     _check_call(grid, paired, store, cluster)
     options = RunOptions(
         settle=settle, method=method, clock=clock, max_impacts=max_impacts, max_steps=max_steps
@@ -110,9 +104,7 @@ def scan(
     data = computed(program, blocks, place, store, progress)
     if verify:
         better = make(dataclasses.replace(options, method=_better(program)))
-        kept = functools.partial(ScanInterrupted, data, store)
-        with at_work("verification", kept, progress=False):
-            data.attrs |= _verified(data, blocks, verify, better, place)
+        data.attrs |= _verified(data, blocks, verify, better, place, store)
     _warn_of_failures(data)
     return data
 
@@ -140,13 +132,14 @@ def _better(program: ScanProgram) -> AbstractMethod:
 
 
 def _verified(
-    data: "xr.Dataset", blocks: Blocks, lanes: int, program: ScanProgram, place: Workplace
-) -> dict[str, Any]:
+    data: "xr.Dataset", blocks: Blocks, lanes: int, program: ScanProgram, place: Workplace,
+    store: str | Path | None,
+) -> dict[str, Any]:  # fmt: skip
     """How some of the lanes, drawn by chance, come out by a better program; attributes by their
     names.
 
-    **Arguments:** `data`, what was found; `lanes`, how many (at most all); `program`, the better
-    one; `place`, where it is computed.
+    **Arguments:** `data`, what was found, and the `store` that keeps it, if any; `lanes`, how many
+    (at most all); `program`, the better one; `place`, where it is computed.
     """
     total = data["result"].size
     lanes = min(lanes, total)
@@ -158,7 +151,9 @@ def _verified(
     numbers = lane_numbers(total)[drawn]  # each has its own path
     numbers = None if program.shaken is None else numbers
     again = in_blocks(program, axes, place, paired=True, numbers=numbers)
-    better = computed(program, again, place)
+    kept = functools.partial(ScanInterrupted, data, store)
+    with at_work("verification", kept, progress=False):
+        better = computed(program, again, place)
     found: dict[str, Any] = {"verified_lanes": lanes}
     for name in better:
         mine = np.asarray(data[name]).reshape(total, -1)[drawn]

@@ -86,19 +86,12 @@ def sweep(
     check_leaf(machine, parameter)
     settle, cycles = count("settle", settle), count("cycles", cycles, least=2)
     progress = flag("progress", progress)
-    values = number("values", values).astype(jnp.result_type(float))
-    numbers = concrete(values)
+    values, numbers = _values(values)
     if max_steps is not None:
         max_steps = count("max_steps", max_steps, least=1)
     fits_records("cycles", values.size * cycles, 4)
     if tolerance is not None:
         require("tolerance", tolerance, low=0.0, open_low=True)
-    if values.ndim != 1 or not values.size or not _finite(numbers):
-        infinite = values.ndim == 1 and values.size
-        raise ValueError(
-            "Argument `values` must be finite numbers in one row, but has shape "
-            f"{values.shape}{' and numbers that are not finite' if infinite else ''}."
-        )
     rests = True
     if numbers is not None:
         ends = [with_leaf(machine, parameter, value) for value in {numbers.min(), numbers.max()}]
@@ -156,8 +149,21 @@ def _row(parts: list[Sweep], size: int) -> Sweep:
     return jtu.tree_map(lambda *x: jnp.asarray(np.concatenate(x)[:size]), *parts)
 
 
-def _finite(numbers: np.ndarray | None) -> bool:
-    return numbers is None or bool(np.isfinite(numbers).all())
+def _values(values: Any) -> tuple[jax.Array, np.ndarray | None]:
+    """The values of a sweep, and the same on the host where they are known.
+
+    **Raises:** `ValueError` unless they are finite and in one row.
+    """
+    values = number("values", values).astype(jnp.result_type(float))
+    numbers = concrete(values)
+    finite = numbers is None or bool(np.isfinite(numbers).all())
+    if values.ndim != 1 or not values.size or not finite:
+        infinite = values.ndim == 1 and values.size
+        raise ValueError(
+            "Argument `values` must be finite numbers in one row, but has shape "
+            f"{values.shape}{' and numbers that are not finite' if infinite else ''}."
+        )
+    return values, numbers
 
 
 def taken_along(machine: AbstractMachine, state: State) -> State:
