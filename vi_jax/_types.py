@@ -17,6 +17,10 @@ State = Any
 structure the machine chooses. What changes it, as its rate, has the same structure."""
 
 if TYPE_CHECKING:
+    from jax.typing import ArrayLike as Number
+
     from .machine import AbstractMachine as Machine
 else:
     Machine = Any  # for what the module of `AbstractMachine` itself imports
+    Number = Any  # what is none is refused in words of ours, not by a check of types
+    """One number as a user gives it: Python's, NumPy's or JAX's, which may be traced."""

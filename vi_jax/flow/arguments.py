@@ -12,7 +12,7 @@ from jaxtyping import Array, Int
 from .. import lanes
 from .._checks import count, fits_records, instance_of, require_real
 from .._numbers import concrete, narrow, require_session, strongly_typed, warn, warn_of_narrow
-from .._types import State
+from .._types import Machine, State
 from ..machine import AbstractMachine, Scene, begin_modes, is_autonomous
 from ._lane import Plan
 from ._own import check_period as check_period
@@ -90,7 +90,7 @@ def _warn_of_single_precision() -> None:
         )
 
 
-def machine_of(machine: Any) -> AbstractMachine:
+def machine_of(machine: Machine) -> AbstractMachine:
     """The machine as every verb takes it, so that other numbers are not another program: each
     number that is a `float` is an array. Whole numbers, truth values and words stay what they are,
     and a part of the program.

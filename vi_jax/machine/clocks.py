@@ -5,7 +5,7 @@ from typing import Any, TypeVar
 
 from jaxtyping import Array, Float
 
-from .._types import Scalar, State
+from .._types import Number, Scalar, State
 from .shown import Shown
 
 Machine = TypeVar("Machine", bound="Clocked")
@@ -57,7 +57,7 @@ class Clocked(Shown):
         `in_cycle_clock` needs it; `name` is the argument that messages blame."""
         return state
 
-    def phase_at(self, since_section: Any) -> Any:
+    def phase_at(self, since_section: Number) -> Any:
         """What the clock shows when it has counted so much since the section: a crank angle may
         begin elsewhere than at 0."""
         return since_section

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._numbers import concrete, number
-from .._types import Scalar
+from .._types import Scalar, State
 from .base import AbstractMachine, Coordinate, Prepared
 from .modal import Modes, along, harmonic, modal, solved, times, without_row
 from .shown import Shown
@@ -121,7 +121,7 @@ class LinearMachine(AbstractMachine):
             found.append(jnp.broadcast_to(value, (self.size,)))
         return StructureState(*found)
 
-    def adopt(self, start: Any) -> StructureState:
+    def adopt(self, start: State) -> StructureState:
         """**Raises:** `TypeError` for a state of another kind, `ValueError` for one of other n."""
         if not isinstance(start, StructureState):
             raise TypeError(

@@ -18,7 +18,7 @@ from jax.lax import stop_gradient
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
-from .._types import Flag, Scalar, Scalars
+from .._types import Flag, Scalar, Scalars, State
 from .base import AbstractMachine, Coordinate
 from .stop import RigidStop
 
@@ -111,17 +111,17 @@ class ModalMachine(AbstractMachine):
             q, p,
         )  # fmt: skip
 
-    def field(self, s: Scalar, state: Any) -> Any:
+    def field(self, s: Scalar, state: State) -> Any:
         """d(state)/ds between impacts."""
         q, p = state.displacement, state.velocity
         pull = self.force(s) - self.stiffness * q - self.damping * p - self.coupled(q, p)
         return type(state)(p, pull)
 
-    def step_limit(self, s: Scalar, state: Any) -> Scalar:
+    def step_limit(self, s: Scalar, state: State) -> Scalar:
         """A fifth of the shortest period, of the modes or the force."""
         return 0.4 * jnp.pi / jnp.maximum(jnp.max(self.pace_of), self.frequency)
 
-    def relaxation(self, s: Scalar, state: Any) -> Scalar:
+    def relaxation(self, s: Scalar, state: State) -> Scalar:
         """The shortest time constant with which a mode fades."""
         tiny = 1e-6 / self.cycle
         return 1 / jnp.maximum(jnp.max(jnp.abs(self.damping)), tiny)
@@ -133,7 +133,7 @@ def along(row: Numbers, push: Numbers, mass: Scalar) -> Coordinate:
     **Arguments:** `row`, c; `push`, M⁻¹c/(cᵀM⁻¹c); `mass`, 1/(cᵀM⁻¹c).
     """
 
-    def placed(state: Any, Y: Scalar, V: Scalar) -> Any:
+    def placed(state: State, Y: Scalar, V: Scalar) -> Any:
         x, v = state.displacement, state.velocity
         return type(state)(x + push * (Y - jnp.dot(row, x)), v + push * (V - jnp.dot(row, v)))
 

@@ -10,7 +10,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._types import State
+from .._types import Machine, State
 from .units import in_unit
 
 
@@ -122,7 +122,7 @@ def check_name(names: list[str], name: str, argument: str) -> str:
     )
 
 
-def check_again(machine: Any) -> None:
+def check_again(machine: Machine) -> None:
     """Run the machine's own checks: a number put in place of another has passed none."""
     parts = jtu.tree_leaves(
         machine, is_leaf=lambda x: isinstance(x, eqx.Module) and x is not machine

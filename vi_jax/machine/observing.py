@@ -2,7 +2,7 @@
 
 from typing import Any, TypeVar
 
-from .._types import Scalar, State
+from .._types import Number, Scalar, State
 from .own import by_default
 from .shown import Shown
 
@@ -18,14 +18,14 @@ class Observed(Shown):
         """What rises through zero where a cycle ends; `None` where `s` or `clock` counts them."""
         return None
 
-    def at_section(self: Machine, phase: Any) -> Machine:
+    def at_section(self: Machine, phase: Number) -> Machine:
         """The same machine observed elsewhere in its cycle, for one that can be."""
         raise ValueError(
             f"Argument `section` must be left out for a {type(self).__name__}, which has its own "
             f"section, but got {phase!r}."
         )
 
-    def observed_later(self: Machine, since_section: Any) -> Machine | None:
+    def observed_later(self: Machine, since_section: Number) -> Machine | None:
         """The same machine with its section moved by so much of its clock; `None` for a machine
         whose section cannot be moved."""
         return None

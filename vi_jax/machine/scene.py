@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from .._calls import named
 from .._checks import NOT_NEGATIVE, Range, instance_of, require, require_ranges, tuple_of
 from .._numbers import concrete, number, optional_real, real
-from .._types import Flag, Scalar, State
+from .._types import Flag, Number, Scalar, State
 from .crank import AbstractCrank, CosineCrank
 from .drive import AbstractDrive, IdealDrive
 from .shaft import ShaftMachine
@@ -83,10 +83,10 @@ class Scene(ShaftMachine):
     def ideal(
         cls,
         *,
-        frequency_ratio: Any,
-        restitution: Any = 0.5,
-        gap: Any = 2.0,
-        damping_ratio: Any = 0.0,
+        frequency_ratio: Number,
+        restitution: Number = 0.5,
+        gap: Number = 2.0,
+        damping_ratio: Number = 0.0,
         crank: AbstractCrank | None = None,
     ) -> "Scene":
         """An ideally driven scene with one stop on the right.
@@ -138,20 +138,28 @@ class Scene(ShaftMachine):
         """2π: impacts are logged by crank angle."""
         return 2 * pi
 
-    def at_section(self, phase: Any) -> "Scene":
+    def at_section(self, phase: Number) -> "Scene":
         """The same scene, observed where the crank angle is `phase` (radians) instead of 0."""
         return dataclasses.replace(self, section_phase=phase)
 
-    def observed_later(self, since_section: Any) -> "Scene":
+    def observed_later(self, since_section: Number) -> "Scene":
         """Observed so much crank angle (radians) after its own section."""
         angle = self.phase_at(since_section)
         return self.at_section(jnp.where(angle > 2 * pi, angle - 2 * pi, angle))
 
-    def phase_at(self, since_section: Any) -> Any:
+    def phase_at(self, since_section: Number) -> Any:
         """Crank angle from the one counted since the section."""
         return since_section if self.section_phase is None else since_section + self.section_phase
 
-    def start(self, *, Y: Any = 0.0, V: Any = 0.0, W: Any = None, M: Any = None, **others) -> State:
+    def start(
+        self,
+        *,
+        Y: Number = 0.0,
+        V: Number = 0.0,
+        W: Number | None = None,
+        M: Number | None = None,
+        **others,
+    ) -> State:
         """A state on the section.
 
         `W` belongs to motor scenes and defaults to the motor's no-load speed κ w0. `M` defaults to
@@ -189,7 +197,7 @@ class Scene(ShaftMachine):
         """d(state)/ds: by crank angle (Eq. 8 to 9 of the paper) or by time τ (Eq. 5 to 7)."""
         return self.drive.field(self, s, state, self._pushes(s, state, modes))
 
-    def pull(self, stretch: Any, speed: Any, pushes: Iterable[Any]) -> Any:
+    def pull(self, stretch: Any, speed: Number, pushes: Iterable[Any]) -> Any:
         """d²Y/dτ² from U - Y, V and what compliant stops add; from all three divided by W,
         dV/dφ."""
         pull = stretch - 2 * self.damping_ratio * speed

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, count, instance_of, one_of, require_ranges
 from .._numbers import number
-from .._types import Machine, State
+from .._types import Machine, Number, State
 from .event import AbstractSwitch
 from .law import AbstractContactLaw, HuntCrossley, PowerLaw
 from .stop import Wall
@@ -69,14 +69,14 @@ class SoftStop(Wall, AbstractSwitch):
 
     def __init__(
         self,
-        gap: Any,
-        stiffness: Any,
+        gap: Number,
+        stiffness: Number,
         *,
-        restitution: Any = None,
-        damping: Any = None,
+        restitution: Number | None = None,
+        damping: Number | None = None,
         exponent: float | None = None,
         law: str | AbstractContactLaw = "power",
-        prestress: Any = None,
+        prestress: Number | None = None,
         adhesive: bool = True,
         side: str = "right",
         coordinate: int = 0,
@@ -114,7 +114,7 @@ class SoftStop(Wall, AbstractSwitch):
         body = machine.coordinates[self.coordinate]
         return self.beyond(body.position(state)), self.approach(body.velocity(state))
 
-    def force(self, depth: Any, rate: Any) -> Any:
+    def force(self, depth: Number, rate: Number) -> Any:
         """Force away from the stop, per unit of mass, of a body that touches."""
         force = self.law.force(self.stiffness, self.damping, depth, rate)
         return force if self.prestress is None else self.prestress + force
@@ -177,7 +177,9 @@ def _law(law: str | AbstractContactLaw, exponent: float | None) -> AbstractConta
     return law
 
 
-def _damping_of(law: AbstractContactLaw, restitution: Any, damping: Any, given: str) -> Any:
+def _damping_of(
+    law: AbstractContactLaw, restitution: Number, damping: Number | None, given: str
+) -> Any:
     """α from a restitution that was `given` in its place."""
     found = law.damping_of(restitution) if damping is None else None
     if found is None:

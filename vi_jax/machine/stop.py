@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from .._checks import REAL, SHARE, count, one_of, require_ranges
 from .._numbers import concrete, optional_real, real, real_or_law
-from .._types import Machine, Scalar, State
+from .._types import Machine, Number, Scalar, State
 from .event import AbstractEvent, Modes
 from .events import struck_modes
 from .own import by_default, is_own
@@ -34,11 +34,11 @@ class Wall(Shown):
         """Position of the stop, sign·gap (unit: that of the gap)."""
         return self.sign * self.gap
 
-    def beyond(self, Y: Any) -> Any:
+    def beyond(self, Y: Number) -> Any:
         """How far a position lies beyond the stop; negative inside."""
         return self.sign * Y - self.gap
 
-    def approach(self, V: Any) -> Any:
+    def approach(self, V: Number) -> Any:
         """Speed towards the stop, sign·V; negative for a body that moves away."""
         return self.sign * V
 
@@ -132,11 +132,11 @@ class RigidStop(Wall, AbstractEvent):
         return self.restitution(approach) if callable(self.restitution) else self.restitution
 
     @by_default
-    def rebound(self, V: Any) -> Any:
+    def rebound(self, V: Number) -> Any:
         """The velocity after an impact with this one (Eq. 17 of the paper)."""
         return -self.coefficient(self.approach(V)) * V
 
-    def leaving(self, V: Any) -> Any:
+    def leaving(self, V: Number) -> Any:
         """The velocity after an impact with this one: the `rebound`, but nothing for a speed whose
         square is below the smallest number, so that a body may come to rest on the stop."""
         least = 100 * float(jnp.finfo(jnp.result_type(V)).tiny) ** 0.5

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from .._checks import require, require_ranges
 from .._numbers import number, optional_real, real
-from .._types import Scalar
+from .._types import Scalar, State
 from ..machine import AbstractMachine, RigidStop
 
 
@@ -52,7 +52,7 @@ class ForcedMachine(PhaseMachine):
         """2π/ω, the time that a cycle takes."""
         return 2 * pi / self.frequency
 
-    def pace(self, s: Scalar, state: Any) -> Scalar:
+    def pace(self, s: Scalar, state: State) -> Scalar:
         """dt/ds = 1/ω, the time that a unit of phase takes."""
         return 1 / self.frequency
 
@@ -68,7 +68,7 @@ class AutonomousMachine(AbstractMachine):
     def __check_init__(self):
         require_ranges(self)
 
-    def event(self, state: Any) -> Scalar:
+    def event(self, state: State) -> Scalar:
         """A function of the state that rises through zero once in a cycle."""
         raise NotImplementedError
 
@@ -82,11 +82,11 @@ class AutonomousMachine(AbstractMachine):
         """The interval between observations, or the usual time from event to event."""
         return self.usual if self.interval is None else self.interval
 
-    def section(self, state: Any) -> Scalar | None:
+    def section(self, state: State) -> Scalar | None:
         """The event, unless time ends the cycles."""
         return self.event(state) if self.interval is None else None
 
-    def step_limit(self, s: Scalar, state: Any) -> Scalar | float:
+    def step_limit(self, s: Scalar, state: State) -> Scalar | float:
         """A fifth of the usual cycle, however rarely it is observed."""
         if self.interval is None:
             return self.usual / 5

@@ -4,11 +4,13 @@ from typing import Any
 
 import numpy as np
 
+from .._types import Machine, State
+
 WOOD, SLEEVE, BIRD, CREST = "#c9a36b", "#6f6f6f", "#4c5b66", "#d55e00"
 INK = "0.15"
 
 
-def draw_woodpecker(machine: Any, pen: Any, state: Any) -> None:
+def draw_woodpecker(machine: Machine, pen: Any, state: State) -> None:
     """The pole, upright at x = 0, with the toy at its height; by a `vi_jax.plot.Pen`."""
     size = {
         name: float(getattr(machine, name))

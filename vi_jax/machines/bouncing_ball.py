@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from .._checks import NOT_NEGATIVE, SHARE
 from .._numbers import number
-from .._types import Scalar
+from .._types import Number, Scalar
 from ..machine import RigidStop, Shown
 from ._base import PhaseMachine, number_field
 
@@ -60,7 +60,7 @@ class BouncingBall(PhaseMachine):
         """d(state)/d(ωt): free fall less the table's acceleration."""
         return BallState(state.speed, -1 - self.acceleration * jnp.cos(s))
 
-    def start(self, *, height: Any = 1.0, speed: Any = 0.0) -> BallState:
+    def start(self, *, height: Number = 1.0, speed: Number = 0.0) -> BallState:
         """A ball above the table at ωt = 0, where the table is lowest."""
         return BallState(number("height", height), number("speed", speed))
 

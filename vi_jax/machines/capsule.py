@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Range
 from .._numbers import number
-from .._types import Scalar
+from .._types import Number, Scalar, State
 from ..machine import Coordinate, DryFriction, RigidStop, Shown
 from ._base import ForcedMachine, number_field
 
@@ -105,7 +105,7 @@ class Capsule(ForcedMachine):
         rates = {"rate": "√(k/m)", "time": "√(m/k)", "energy": "F²/k", "power": "F²/√(k m)"}
         return {**super().units, **own, **rates, "": "1"}
 
-    def step_limit(self, s: Scalar, state: Any) -> Scalar:
+    def step_limit(self, s: Scalar, state: State) -> Scalar:
         """A fifth of the shorter of the drive's cycle and the period of the mass on its spring."""
         stiffness = jnp.sqrt(1 + 1 / self.mass_ratio)
         return 0.4 * pi * jnp.minimum(1.0, self.frequency / stiffness)
@@ -135,7 +135,7 @@ class Capsule(ForcedMachine):
         x = state
         return CapsuleState(x.place, x.speed, x.capsule_speed, jnp.zeros_like(x.travel), x.travel)
 
-    def start(self, *, place: Any = 0.0, speed: Any = 0.0, capsule_speed: Any = 0.0) -> Any:
+    def start(self, *, place: Any = 0.0, speed: Number = 0.0, capsule_speed: Any = 0.0) -> Any:
         """At rest, with the spring relaxed, by default."""
         given = number("place", place), number("speed", speed)
         capsule = number("capsule_speed", capsule_speed)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE
 from .._numbers import number
-from .._types import Scalar
+from .._types import Number, Scalar
 from ..machine import OscillatorState, RigidStop
 from ._base import ForcedMachine, number_field, stops_at
 
@@ -59,7 +59,7 @@ class Duffing(ForcedMachine):
         force = force - x * (self.stiffness + self.cubic * x * x)
         return OscillatorState(v / self.frequency, force / self.frequency)
 
-    def start(self, *, Y: Any = 0.0, V: Any = 0.0) -> OscillatorState:
+    def start(self, *, Y: Number = 0.0, V: Number = 0.0) -> OscillatorState:
         """At rest in the middle by default."""
         return OscillatorState(number("Y", Y), number("V", V))
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE
 from .._numbers import number
-from .._types import Scalar
+from .._types import Number, Scalar, State
 from ..machine import Coordinate, RigidStop, Shown
 from ._base import PhaseMachine, number_field, stops_at
 
@@ -100,7 +100,7 @@ class ImpactPair(PhaseMachine):
         rates = {"rate": "ω", "time": "1/ω", "energy": f"{mass} a² ω²", "power": f"{mass} a² ω³"}
         return {**super().units, **own, **rates, "": "1"}
 
-    def field(self, s: Scalar, state: Any) -> Any:
+    def field(self, s: Scalar, state: State) -> Any:
         """d(state)/ds between impacts: a ball on which nothing acts, seen from the box."""
         if self.mass_ratio is None:
             return PairState(state.speed, jnp.sin(s))
@@ -110,7 +110,7 @@ class ImpactPair(PhaseMachine):
         return FreePairState(state.speed, -box, state.box_speed, box)
 
     def start(
-        self, *, place: Any = 0.0, speed: Any = 0.5, box: Any = 0.0, box_speed: Any = 0.0
+        self, *, place: Any = 0.0, speed: Number = 0.5, box: Any = 0.0, box_speed: Any = 0.0
     ) -> Any:
         """The ball in the middle of the box by default; a box that is free at rest."""
         ball = number("place", place), number("speed", speed)
@@ -118,15 +118,15 @@ class ImpactPair(PhaseMachine):
             return PairState(*ball)
         return FreePairState(*ball, number("box", box), number("box_speed", box_speed))
 
-    def position(self, state: Any) -> Scalar:
+    def position(self, state: State) -> Scalar:
         """The place of the ball in the box."""
         return state.place
 
-    def velocity(self, state: Any) -> Scalar:
+    def velocity(self, state: State) -> Scalar:
         """Speed of the ball relative to the box."""
         return state.speed
 
-    def placed(self, state: Any, Y: Scalar, V: Scalar) -> Any:
+    def placed(self, state: State, Y: Scalar, V: Scalar) -> Any:
         """The ball at this place with this relative speed; what the box gains or loses by it keeps
         the momentum of both."""
         if self.mass_ratio is None:
@@ -134,6 +134,6 @@ class ImpactPair(PhaseMachine):
         share = self.mass_ratio / (1 + self.mass_ratio)
         return FreePairState(Y, V, state.box, state.box_speed - share * (V - state.speed))
 
-    def mirrored(self, state: Any) -> Any:
+    def mirrored(self, state: State) -> Any:
         """Left and right exchanged, half a cycle later."""
         return type(state)(*(-x for x in vars(state).values()))

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool
 
 from .._checks import NOT_NEGATIVE, POSITIVE, SHARE
 from .._numbers import concrete, number
-from .._types import Scalar
+from .._types import Number, Scalar
 from ..machine import RigidStop, Shown
 from ._base import AutonomousMachine, number_field
 
@@ -87,7 +87,7 @@ class ReliefValve(AutonomousMachine):
         drains = self.compressibility * jnp.abs(state.lift) / (2 * jnp.sqrt(state.pressure))
         return 1 / jnp.maximum(jnp.maximum(self.damping, drains), 1e-6)
 
-    def start(self, *, lift: Any = 1.0, speed: Any = 0.0, pressure: Any = 12.0) -> ValveState:
+    def start(self, *, lift: Any = 1.0, speed: Number = 0.0, pressure: Any = 12.0) -> ValveState:
         """An open valve by default, its lift about to fall."""
         return ValveState(
             number("lift", lift), number("speed", speed), number("pressure", pressure)

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Range, require
 from .._numbers import number
-from .._types import Scalar
+from .._types import Number, Scalar, State
 from ..machine import RigidStop, ShaftMachine, Shown
 from ._base import PhaseMachine, number_field, stops_at
 
@@ -112,21 +112,21 @@ class UnbalancedRotor(ShaftMachine, PhaseMachine):
         rates = {"rate": "ω", "time": "1/ω", "energy": "m² r² ω²/M", "power": "m² r² ω³/M"}
         return {**super().units, **own, **rates, "": "1"}
 
-    def speed(self, phase: Any, state: Any) -> Scalar:
+    def speed(self, phase: Number, state: State) -> Scalar:
         """W = dφ/dτ of the rotor (unit: ω) at this angle."""
         return state.P + self.coupling * state.V * jnp.sin(phase)
 
-    def load(self, speed: Any) -> Float[Array, "..."]:
+    def load(self, speed: Number) -> Float[Array, "..."]:
         """ε ξ ζ⁵/D, the averaged load of the vibration on a rotor of this speed (unit: J ω²)."""
         z = jnp.asarray(speed)
         detuned = (1 - z * z) ** 2 + (2 * self.damping_ratio * z) ** 2
         return self.coupling * self.damping_ratio * z**5 / detuned
 
-    def averaged_control(self, speed: Any) -> Float[Array, "..."]:
+    def averaged_control(self, speed: Number) -> Float[Array, "..."]:
         """κ at which a motor runs at this mean speed, to first order in ε and without stops."""
         return jnp.asarray(speed) / self.no_load_speed + self.load(speed) / self.strength
 
-    def field(self, s: Scalar, state: Any) -> Any:
+    def field(self, s: Scalar, state: State) -> Any:
         """d(state)/dφ, or d(state)/dτ of a state for the time clock, between impacts."""
         timed = self.is_timed(state)
         phase = state.phase if timed else s
@@ -142,7 +142,7 @@ class UnbalancedRotor(ShaftMachine, PhaseMachine):
         pace = _pace(W)
         return RotorState(pace * state.V, pace * push, pace * twist)
 
-    def start(self, *, Y: Any = 0.0, V: Any = 0.0, W: Any = None) -> Any:
+    def start(self, *, Y: Number = 0.0, V: Number = 0.0, W: Number | None = None) -> Any:
         """A state on the section φ = 0; `W` (unit: ω) defaults to the no-load speed κ w0, and
         `W=0` is a start from rest, for the time clock."""
         speed = self.control * self.no_load_speed if W is None else W
@@ -151,7 +151,7 @@ class UnbalancedRotor(ShaftMachine, PhaseMachine):
             require(name, value)
         return self.adopt(RotorState(Y, V, P))
 
-    def mirrored(self, state: Any) -> Any:
+    def mirrored(self, state: State) -> Any:
         """Y → -Y half a turn later, unless there is a stop on one side only."""
         if self.gap is not None and not self.two_sided:
             return None
@@ -167,31 +167,31 @@ class UnbalancedRotor(ShaftMachine, PhaseMachine):
         """Class of a state in the time clock, by that in the phase clock."""
         return {RotorState: TimedRotorState}
 
-    def section_speed(self, state: Any) -> Any:
+    def section_speed(self, state: State) -> Any:
         """The momentum of the shaft is its speed where φ = 0."""
         return state.P
 
-    def pace(self, s: Scalar, state: Any) -> Scalar | None:
+    def pace(self, s: Scalar, state: State) -> Scalar | None:
         """dτ/dφ = 1/W where the angle is the independent variable."""
         return _pace(self.speed(s, state)) if self.is_paced(state) else None
 
-    def step_limit(self, s: Scalar, state: Any) -> Scalar:
+    def step_limit(self, s: Scalar, state: State) -> Scalar:
         """A fifth of the shorter of the rotor's turn and the body's natural period."""
         speed = self._speed(s, state)
         turn = 0.4 * pi / jnp.maximum(1.0, speed)
         return turn * speed if self.clock_name == "phase" else turn
 
-    def relaxation(self, s: Scalar, state: Any) -> Scalar:
+    def relaxation(self, s: Scalar, state: State) -> Scalar:
         """The shortest time constant: of a strongly damped body, or of a strong motor."""
         rate = jnp.maximum(2 * self.damping_ratio, self.strength / self.no_load_speed)
         pace = self._speed(s, state) if self.clock_name == "phase" else 1.0
         return pace * (1 - self.coupling) / jnp.maximum(rate, 1e-6)
 
-    def _speed(self, s: Scalar, state: Any) -> Scalar:
+    def _speed(self, s: Scalar, state: State) -> Scalar:
         """Speed of the rotor without its sign (unit: ω)."""
         return jnp.abs(self.speed(state.phase if self.is_timed(state) else s, state))
 
-    def alive(self, state: Any) -> jax.Array | None:
+    def alive(self, state: State) -> jax.Array | None:
         """In the phase clock a rotor that does not turn forward has a state that is no number."""
         return jnp.isfinite(state.P) if self.is_paced(state) else None
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool
 
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE
 from .._numbers import concrete, number
-from .._types import Scalar
+from .._types import Number, Scalar, State
 from ..machine import ContactFriction, Coordinate, RigidStop, Shown
 from ._base import AutonomousMachine, number_field
 from ._levers import by_levers, dot, response
@@ -201,7 +201,7 @@ class Woodpecker(AutonomousMachine):
         inertia = self.bird_inertia + self.bird_mass * self.bird_arm**2
         return 2 * pi * jnp.sqrt(inertia / self.stiffness)
 
-    def step_limit(self, s: Scalar, state: Any) -> Scalar:
+    def step_limit(self, s: Scalar, state: State) -> Scalar:
         """A fifth of the period of the sleeve and the bird in free fall, which swing against each
         other."""
         _, sleeve, bird = response((None, -1, 1), self._inertia())
@@ -220,8 +220,8 @@ class Woodpecker(AutonomousMachine):
         return eqx.tree_at(lambda x: (x.height, x.drop), state, (at, -state.height))
 
     def start(
-        self, *, height: Any = 0.0, sleeve_angle: Any = None, bird_angle: Any = None,
-        speed: Any = -0.34, sleeve_rate: Any = 0.0, bird_rate: Any = -7.5,
+        self, *, height: Number = 0.0, sleeve_angle: Any = None, bird_angle: Any = None,
+        speed: Number = -0.34, sleeve_rate: Any = 0.0, bird_rate: Any = -7.5,
     ) -> WoodpeckerState:  # fmt: skip
         """A state that is near to the cycle of the default numbers: on the section, the sleeve on
         its lower edge and sliding down, the bird swinging away.

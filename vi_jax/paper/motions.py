@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from .._types import State
 from ..flow import ExactFlight, Run, simulate
 from ..machine import Parameters, Scene
 from ..orbit import ClosedFormOrbits
@@ -88,7 +89,7 @@ def simulate_cases(*, quick: bool = False) -> tuple[Case, Case]:
     return cases[0], cases[1]
 
 
-def run_of(scene: Scene, start: Any, cycles: int, samples: int) -> Run:
+def run_of(scene: Scene, start: State, cycles: int, samples: int) -> Run:
     """A run with the options of all runs here, so that they share one compiled program."""
     return simulate(
         scene, start, cycles, method=ExactFlight(), samples=samples, impact_log=2, throw=True

@@ -1,12 +1,12 @@
 """The paper's equations as they are printed, to measure what is wrong with them."""
 
 from math import pi
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._types import State
 from ..flow import Adaptive, simulate
 from ..machine import AbstractMachine, RigidStop, TimedMotorState
 
@@ -41,7 +41,7 @@ class CoastingMachine(AbstractMachine):
         return TimedMotorState(state.V, cosine - state.Y, torque / inertia, state.W)
 
 
-def energy(state: Any, *, coupling: float, slider_inertia: float) -> np.ndarray:
+def energy(state: State, *, coupling: float, slider_inertia: float) -> np.ndarray:
     """E = ½V² + ½(Y - U)² + ½(1 + μU_φ²)W²/ε, in units of k0 a², at each state."""
     Y, V, W, phase = (np.asarray(x) for x in (state.Y, state.V, state.W, state.phase))
     shaft = (1 + slider_inertia * np.sin(phase) ** 2) * W**2 / coupling

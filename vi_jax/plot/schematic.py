@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 
 from .._checks import instance_of
 from .._renamed import renamed
+from .._types import State
 from ..machine import AbstractMachine, Scene, ShaftMachine, SoftStop
 from ..machines import BouncingBall, Duffing, ImpactPair, UnbalancedRotor
 from .colors import GREEN, RED
@@ -17,7 +18,7 @@ from .motion import new_axes
 from .pen import Pen
 
 
-def sketch(machine: AbstractMachine, pen: Pen, state: Any, phase: float) -> None:
+def sketch(machine: AbstractMachine, pen: Pen, state: State, phase: float) -> None:
     """Draw a machine in a state: by its own `sketch(pen, state, phase)`, if it has one."""
     own = getattr(machine, "sketch", None)
     if own is not None:
@@ -28,7 +29,7 @@ def sketch(machine: AbstractMachine, pen: Pen, state: Any, phase: float) -> None
 
 @renamed(scene="machine")
 def plot_sketch(
-    machine: AbstractMachine, state: Any = None, *, phase: Any = None, ax: Axes | None = None
+    machine: AbstractMachine, state: State = None, *, phase: Any = None, ax: Axes | None = None
 ) -> Axes:
     """A schematic of a machine with the names of its parts.
 
@@ -64,7 +65,7 @@ def frame_axes(ax: Axes) -> None:
     ax.margins(0.06)
 
 
-def _positions(machine: AbstractMachine, state: Any) -> np.ndarray:
+def _positions(machine: AbstractMachine, state: State) -> np.ndarray:
     return np.array([float(c.position(state)) for c in machine.coordinates])
 
 
@@ -98,7 +99,7 @@ def _(machine: ShaftMachine) -> float:
 
 
 @singledispatch
-def _drawn(machine: AbstractMachine, pen: Pen, state: Any, phase: float) -> None:
+def _drawn(machine: AbstractMachine, pen: Pen, state: State, phase: float) -> None:
     """Every coordinate as a body between its stops, one below the other."""
     size = pen.size
     for i, place in enumerate(_positions(machine, state)):
@@ -116,7 +117,7 @@ def _drawn(machine: AbstractMachine, pen: Pen, state: Any, phase: float) -> None
 
 
 @_drawn.register
-def _(machine: Scene, pen: Pen, state: Any, phase: float) -> None:
+def _(machine: Scene, pen: Pen, state: State, phase: float) -> None:
     crank, size = machine.crank, pen.size
     rod = float(crank.drawn_rod)
     pin = cos(phase), sin(phase)
@@ -195,7 +196,7 @@ def _stop(pen: Pen, stop: Any, rest: float, size: float, *, rigid: bool) -> None
 
 
 @_drawn.register
-def _(machine: BouncingBall, pen: Pen, state: Any, phase: float) -> None:
+def _(machine: BouncingBall, pen: Pen, state: State, phase: float) -> None:
     radius, table = 0.3 * pen.size, -float(machine.acceleration) * cos(phase)
     wide = 2.4 * pen.size
     pen.body(0.0, table - 0.15 * pen.size, width=wide, height=0.3 * pen.size, color=GREEN)
@@ -206,7 +207,7 @@ def _(machine: BouncingBall, pen: Pen, state: Any, phase: float) -> None:
 
 
 @_drawn.register
-def _(machine: ImpactPair, pen: Pen, state: Any, phase: float) -> None:
+def _(machine: ImpactPair, pen: Pen, state: State, phase: float) -> None:
     free = machine.mass_ratio is not None
     box = float(state.box) if free else sin(phase)
     radius, half = 0.4 * pen.size, float(machine.half_gap)
@@ -251,7 +252,7 @@ def _supported(machine: AbstractMachine, pen: Pen, place: float) -> float:
 
 
 @_drawn.register
-def _(machine: Duffing, pen: Pen, state: Any, phase: float) -> None:
+def _(machine: Duffing, pen: Pen, state: State, phase: float) -> None:
     place, size = float(state.Y), pen.size
     post = _supported(machine, pen, place)
     pull = 0.9 * size * cos(phase)
@@ -262,7 +263,7 @@ def _(machine: Duffing, pen: Pen, state: Any, phase: float) -> None:
 
 
 @_drawn.register
-def _(machine: UnbalancedRotor, pen: Pen, state: Any, phase: float) -> None:
+def _(machine: UnbalancedRotor, pen: Pen, state: State, phase: float) -> None:
     place, size = float(state.Y), pen.size
     radius = 0.34 * size
     post = _supported(machine, pen, place)

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._checks import count, given_number, instance_of
+from .._types import Machine
 from ..flow import Run
 from ..machine import components
 from .grid import axes_of
@@ -53,7 +54,7 @@ class _Observed(AbstractMeasure):
         """As many as are asked for."""
         return self.samples
 
-    def row(self, machine: Any, run: Run, name: Of) -> tuple[Array, Array]:
+    def row(self, machine: Machine, run: Run, name: Of) -> tuple[Array, Array]:
         """The quantity at all instants, and at those behind the first, or in all cycles.
 
         **Raises:** `ValueError` for a name that has none.

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 from jax.lax import stop_gradient
 
-from ..._types import Flag, Scalar, Scalars
+from ..._types import Flag, Scalar, Scalars, State
 from ...machine import ModalMachine, forces, horner
 
 # The series of a matrix exponential is summed over lengths in which things change by twice
@@ -32,7 +32,7 @@ _ALONE, _SEVERAL = 5, 10
 _BEND = tuple((-1) ** n * n / factorial(2 * n + 1) for n in range(1, 10))
 
 
-def flown(machine: ModalMachine, contact: Scalars, s: Scalar, h: Scalar, state: Any) -> Any:
+def flown(machine: ModalMachine, contact: Scalars, s: Scalar, h: Scalar, state: State) -> Any:
     """The state a time h after that at s, exact to rounding for any h.
 
     Free flight of uncoupled modes is the closed form of each. All else is a matrix exponential:
@@ -49,7 +49,7 @@ def flown(machine: ModalMachine, contact: Scalars, s: Scalar, h: Scalar, state: 
     return type(state)(*(jnp.where(free, a, b) for a, b in zip(closed, series, strict=True)))
 
 
-def longest(machine: ModalMachine, s: Scalar, state: Any) -> Scalar:
+def longest(machine: ModalMachine, s: Scalar, state: State) -> Scalar:
     """A tenth of the period of the fastest mode that matters, or of the force; a fifth where there
     is but one mode.
 
@@ -69,7 +69,7 @@ def longest(machine: ModalMachine, s: Scalar, state: Any) -> Scalar:
     return stop_gradient(2 * jnp.pi / (count * fastest))
 
 
-def clear(machine: ModalMachine, s: Scalar, state: Any) -> Scalar:
+def clear(machine: ModalMachine, s: Scalar, state: State) -> Scalar:
     """How long no stop can be met in free flight from here; 0 where that is not known.
 
     A mode that swings and fades stays within its amplitude a, and is accelerated by κa at most; so
@@ -183,7 +183,7 @@ _pair.defjvp(_pair_jvp, symbolic_zeros=True)
 
 
 def _by_series(
-    machine: ModalMachine, contact: Scalars, s: Scalar, h: Scalar, state: Any, wanted: Flag
+    machine: ModalMachine, contact: Scalars, s: Scalar, h: Scalar, state: State, wanted: Flag
 ) -> tuple[Any, Any]:
     """The matrix exponential by its series, in parts so short that it converges at once; of none
     where it is not wanted.
