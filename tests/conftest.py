@@ -18,7 +18,7 @@ _MODULES = sorted(
 )
 _hook = jaxtyping.install_import_hook([f"vi_jax.{x}" for x in _MODULES], "beartype.beartype")
 
-# What JAX traces lives long, and looking it through for rubbish takes a tenth of the time.
+# What JAX traces lives long, and collecting garbage among it takes a tenth of the time.
 gc.set_threshold(200_000, 20, 20)
 
 _MAPS = Path("/proc/self/maps")

@@ -26,7 +26,7 @@ def at_work(
     total: int | None = None,
     done: int = 0,
 ) -> Iterator[Tell]:
-    """A part of a verb that may take long: gives what is told how much more is done.
+    """A part of a verb that may take long: gives a function that is called with what is done.
 
     **Arguments:** `what`, the word before the bar; `kept`, asked on Ctrl-C, what to raise: an
     `Interrupted` with what was computed, or `None` where there is nothing to keep yet; `progress`,

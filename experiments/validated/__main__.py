@@ -42,7 +42,7 @@ def comparison_of(path: Path) -> Any:
         return runpy.run_path(str(path))["comparison"]
 
 
-def told(path: Path) -> tuple[str, str]:
+def described(path: Path) -> tuple[str, str]:
     """The title and the text that a script begins with."""
     text = path.read_text(encoding="utf-8").split('"""')[1]
     title, _, body = text.partition("\n")
@@ -51,7 +51,7 @@ def told(path: Path) -> tuple[str, str]:
 
 def section(path: Path, comparison: Any, seconds: float) -> str:
     """A section of the page."""
-    title, text = told(path)
+    title, text = described(path)
     source = re.sub(r"https://[^\s,;]+", r"<\g<0>>", comparison.source)
     return (
         f"## {comparison.code}: {title[0].lower()}{title[1:]}\n\n{text}\n\n{comparison}\n\n"

@@ -162,6 +162,18 @@ def test_functions_that_differ_between_the_probed_lanes_are_refused(tmp_path, mo
         run("measure", hidden=opaque)
 
 
+def test_another_release_that_finishes_a_store_warns(whole, tmp_path):
+    path = tmp_path / "store"
+    shutil.copytree(whole[0], path)
+    head = json.loads((path / "zarr.json").read_text())
+    assert head["attributes"]["vi_jax"] == vi.__version__
+    head["attributes"]["vi_jax"] = "0.0.1"
+    (path / "zarr.json").write_text(json.dumps(head))
+    with pytest.warns(UserWarning, match=rf"begun by vi_jax 0\.0\.1, and this is {vi.__version__}"):
+        found = scanned(path)
+    np.testing.assert_array_equal(found.y_min, whole[1]["y_min"])
+
+
 def test_a_store_in_which_machines_are_called_scenes_is_resumed(whole, tmp_path):
     """As earlier releases wrote them."""
     path = tmp_path / "store"

@@ -43,7 +43,7 @@ def compile_all(tell: Callable[[str], None]) -> None:
 
 
 # What the page of a machine shows: its name and the machine. The page runs on threads of this
-# process, and is told nothing but its address.
+# process, and gets nothing but its address.
 _SERVED: list[tuple[str, Subject]] = []
 
 

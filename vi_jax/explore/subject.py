@@ -118,7 +118,7 @@ class Subject:
             self.before = _fitting(timed)
 
     def beginning(self) -> dict[str, float]:
-        """Where the sliders begin."""
+        """The first value of each slider, by name."""
         return {name: control.value for name, control in self.controls.items()}
 
     def diagram(self, values: Mapping[str, Any], parameter: str) -> Diagram:
@@ -134,7 +134,7 @@ class Subject:
         return Diagram(parameter, across, *map(np.asarray, found))
 
     def words(self, motion: Motion) -> dict[str, str]:
-        """What is told of a motion beside its picture, by name."""
+        """What stands beside the picture of a motion, by name."""
         units, (low, high) = self.machine.units, motion.extremes
         found = {"position": f"{low:.5g} … {high:.5g}"}
         found = {name: with_unit(x, unit_of(units, name)) for name, x in found.items()}

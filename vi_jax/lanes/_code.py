@@ -142,6 +142,7 @@ def _write(place: Path, code: bytes) -> None:
         pass
 
 
+# Bytes of a check sum: as many as of a commit of Git, by choice.
 _DIGEST = 20
 
 

@@ -40,7 +40,7 @@ class LaneProgram(eqx.Module):
 
     @property
     def jaxprs(self) -> tuple[ClosedJaxpr, ...]:
-        """The three jaxprs."""
+        """`begin`, `step` and `end`, in this order."""
         return self.begin, self.step, self.end
 
     @property

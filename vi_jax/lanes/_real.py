@@ -74,14 +74,14 @@ class Real:
         return Real(self.t, self.t.select(flag, self.value, self.of(other).value))
 
     def at_most(self, most: float) -> "Real":
-        """NaN stays NaN."""
+        """The smaller of this and `most`; NaN stays NaN."""
         return self.of(most).choose(self > most, self)
 
     def at_least(self, least: float) -> "Real":
         return self.of(least).choose(self < least, self)
 
     def call(self, name: str, *others) -> "Real":
-        """An intrinsic of LLVM."""
+        """The intrinsic of LLVM of this name, of this and the others."""
         return Real(self.t, self.t.intrinsic(name, self.value, *(self.of(o).value for o in others)))
 
     def size(self) -> "Real":

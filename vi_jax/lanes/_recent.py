@@ -22,7 +22,7 @@ class Recent(Generic[K, V]):
         return len(self._values)
 
     def clear(self) -> None:
-        """Drop all."""
+        """Forget all values that are kept."""
         with self._lock:
             self._values.clear()
 

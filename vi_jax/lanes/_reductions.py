@@ -42,7 +42,7 @@ def register_reductions(table: dict[str, Rule], reduce: Rule, cumulate: Rule) ->
 def register_products(table: dict[str, Rule], dot: Rule) -> None:
     """Put the rules for products of arrays into a table.
 
-    **Arguments:** the table; a rule for `dot_general` that is told, last, what the product of two
+    **Arguments:** the table; a rule for `dot_general` that takes, last, what the product of two
     numbers is.
     """
     table["dot_general"] = lambda t, p, avals, a, b: dot(t, p, avals, a, b, mul)

@@ -15,10 +15,10 @@ import jax
 from jax.extend.core import ClosedJaxpr
 from jax.interpreters import partial_eval
 
+from ._loop_transpose import with_loops, without_loops
 from ._program import LaneProgram, batch_of, dependent_parts, dependent_results, evaluated
 from ._quotient import with_quotients
 from ._trace import shape_of
-from ._undone import with_loops, without_loops
 from ._vector import Unsupported, check
 from ._weighted import with_weights
 

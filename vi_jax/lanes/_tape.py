@@ -49,7 +49,8 @@ from ._vector import write
 # 5.7 simulations instead of 4.8, and 116 MB more of the process's memory on two threads.)
 _TAPE_BYTES = 64 << 20
 
-# Entries of a tape at least, however large they are.
+# Entries of a tape at least, however large they are: a choice; of fewer than a few nearly every
+# iteration would be taken again.
 _FEWEST_ENTRIES = 16
 
 # How many iterations a lane has that has not ended yet.

@@ -190,7 +190,7 @@ class Text:
     # Flags
 
     def both(self, a: Value, b: Value) -> Value:
-        """a and b."""
+        """Whether both flags hold, lane by lane."""
         if a.number is not None:
             return b if a.number else a
         if b.number is not None:
@@ -198,7 +198,7 @@ class Text:
         return self.binary("and", a, b)
 
     def inverse(self, a: Value) -> Value:
-        """Not a."""
+        """Whether a flag does not hold, lane by lane."""
         return self.binary("xor", a, self.constant(True, "i1"))
 
     def any(self, a: Value) -> str:

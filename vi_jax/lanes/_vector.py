@@ -83,7 +83,7 @@ def constants(t: Text, array: Any) -> Held:
 
 
 def write(t: Text, closed: ClosedJaxpr | Jaxpr, args: list[Any], mask: Value) -> list[Any]:
-    """Append the operations of a jaxpr to a text.
+    """Append the operations of a jaxpr to a text, as LLVM code for one group of lanes.
 
     **Arguments:** the text; the jaxpr; its arguments, as `Held` arrays of their shapes; which lanes
     need the results: what none of them needs may be skipped, and the others get any numbers.

@@ -24,7 +24,8 @@ from ._reverse import ReverseProgram
 from ._tape import reverse_text
 from ._vector import check
 
-# Kernels that are kept although no compiled program needs them any more.
+# Kernels that are kept although no compiled program needs them any more: a choice, for notebooks
+# in which a cell is run again.
 _MOST_KERNELS = 64
 
 # Most numbers in a lane's inputs and carry with which groups go in twice the width, by the bits of

@@ -78,7 +78,7 @@ class LinearMachine(AbstractMachine):
 
     @property
     def coordinates(self) -> tuple[Coordinate, ...]:
-        """c·x of each contact."""
+        """One for each contact: the sum c·x of displacements that it limits."""
         mobile = [solved(self.mass, c) for c in self.rows]
         masses = [1 / jnp.dot(c, m) for c, m in zip(self.rows, mobile, strict=True)]
         pushes = [m * one for m, one in zip(mobile, masses, strict=True)]
@@ -86,7 +86,7 @@ class LinearMachine(AbstractMachine):
 
     @property
     def cycle(self) -> Scalar:
-        """2π/ω."""
+        """The period 2π/ω of the force."""
         return 2 * jnp.pi / self.frequency
 
     @property

@@ -87,7 +87,7 @@ class ModalMachine(AbstractMachine):
 
     @property
     def cycle(self) -> Scalar:
-        """2π/ω."""
+        """The period 2π/ω of the force."""
         return 2 * jnp.pi / self.frequency
 
     @property
@@ -119,6 +119,7 @@ class ModalMachine(AbstractMachine):
 
     def step_limit(self, s: Scalar, state: State) -> Scalar:
         """A fifth of the shortest period, of the modes or the force."""
+        # A fifth is a choice, as for soft stops (`SoftStop.longest_step`).
         return 0.4 * jnp.pi / jnp.maximum(jnp.max(self.pace_of), self.frequency)
 
     def relaxation(self, s: Scalar, state: State) -> Scalar:

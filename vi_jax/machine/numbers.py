@@ -143,7 +143,7 @@ def _named(tree: Any) -> list[tuple[str, Any]]:
 
 
 def _word(key: Any) -> Any:
-    """Of an attribute, an index or a key."""
+    """One step of a path through a machine, as text: an attribute, an index or a key."""
     for kind in ("name", "idx", "key"):
         if hasattr(key, kind):
             return getattr(key, kind)

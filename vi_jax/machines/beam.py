@@ -104,7 +104,7 @@ class Beam(LinearMachine):
 
     @property
     def natural_frequencies(self) -> Float[Array, " modes"]:
-        """ωᵢ."""
+        """ωᵢ, the angular frequencies of the modes, lowest first."""
         stiff = self.bending_stiffness / (self.mass_per_length * self.length**4)
         return jnp.asarray(_roots(self.modes) ** 2) * jnp.sqrt(stiff)
 
@@ -115,12 +115,12 @@ class Beam(LinearMachine):
 
     @property
     def stiffness(self) -> Float[Array, " modes"]:  # pyright: ignore
-        """ρA L ω²."""
+        """Of each mode, ρA L ω²."""
         return self.mass * self.natural_frequencies**2
 
     @property
     def damping(self) -> Float[Array, " modes"]:  # pyright: ignore
-        """2ξω ρA L."""
+        """Of each mode, 2ξω ρA L."""
         return 2 * self.damping_ratio * self.natural_frequencies * self.mass
 
     @property

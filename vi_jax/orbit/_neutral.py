@@ -25,7 +25,7 @@ def rounding(dtype: Any) -> float:
 
 
 class Neutral(NamedTuple):
-    """What a matrix does not see."""
+    """Projections on the null space of a matrix and on what it does not reach."""
 
     filled: Matrix
     """To be added to it: an image for each direction that has none, so that it can be inverted.

@@ -194,7 +194,7 @@ def grazing(
 
 
 def _unchecked(graze: Graze, periods: int) -> tuple[Grazing, np.ndarray, Settled, np.ndarray]:
-    """What the local map says of a grazing.
+    """What the local map forecasts of a grazing, not yet compared with the machine.
 
     **Returns:** that; distances from it in the parameter, and at each of them what the map settles
     on and whether that is near enough for the map to hold.

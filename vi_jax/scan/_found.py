@@ -62,7 +62,7 @@ class Integrity(NamedTuple):
     """Whether the edge of the region is what ends the ball of `local`: a larger region might give a
     larger one."""
     factor_at_edge: bool
-    """The same of `factor`."""
+    """Whether the edge of the region ends the ball of `factor`."""
     resolution: float
     """What the radii may be off by: half a diagonal of the grid's cells."""
 

@@ -57,7 +57,7 @@ class Uncertainty(NamedTuple):
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Its confidence interval."""
+        """The confidence interval of `exponent`."""
         low, high = self.intervals[self._least]
         return float(low), float(high)
 

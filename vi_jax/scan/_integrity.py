@@ -65,7 +65,7 @@ class IntegrityProfile(NamedTuple):
     """Whether the edge of the region is what ends the ball, so that a larger region might give a
     larger one."""
     factor_at_edge: np.ndarray
-    """The same of `factor`."""
+    """Whether the edge of the region ends the ball of `factor`."""
     resolution: float
     """What the radii may be off by; NaN if there is no motion."""
     basins: list[Basins]

@@ -38,7 +38,7 @@ class AbstractMeasure(eqx.Module):
     of impacts and steps."""
 
     def described(self, start: State) -> About:
-        """The same for states like `start`."""
+        """Attributes of the variables, for states like `start`."""
         return self.attributes
 
     @property
@@ -61,7 +61,7 @@ class AbstractMeasure(eqx.Module):
 
     @property
     def passes(self) -> int:
-        """How often `later` may be needed for a lane."""
+        """How often a lane may need `refine` at most."""
         return 1
 
     def needs_refinement(self, found: Numbers, pass_number: Any = 0) -> Flag | None:
@@ -279,7 +279,8 @@ class Regime(AbstractMeasure):
         count("lasting", self.lasting)
 
     def under(self, method):
-        """With what sections wander by under it."""
+        """The measure, knowing by how much sections of a motion that repeats differ under this
+        method."""
         return dataclasses.replace(self, wander=method.wander)
 
     @property
@@ -293,7 +294,7 @@ class Regime(AbstractMeasure):
         return 2 if self.lasting else 1
 
     def __call__(self, machine, run):
-        """Of one lane; chaos is not yet looked for."""
+        """Period and impacts of one lane; whether it is chaotic is left to `refine`."""
         sections = {name: x[1:] for name, x in by_name(run.sections).items()}
         period = least_period(
             sections, run.impacts, longest=self.longest, tolerance=self.tolerance,

@@ -121,7 +121,7 @@ class Statistics(_Observed):
 
     @property
     def cycles(self):
-        """One in each part."""
+        """At least one cycle in each batch."""
         return self.batches
 
     def described(self, start):
@@ -135,7 +135,7 @@ class Statistics(_Observed):
         return {f"{name}_{k}": {"unit_of": name, "long_name": x} for k, x in words.items()}
 
     def __call__(self, machine, run):
-        """Of one lane."""
+        """Means, spreads and their errors over one lane's cycles."""
         _, row = self.row(machine, run, self.of)
         if row.size < self.batches:
             raise ValueError(
@@ -212,7 +212,7 @@ class Density(_Observed):
         }
 
     def __call__(self, machine, run):
-        """Of one lane."""
+        """Histogram of one lane's record, as a density."""
         rows = [self.row(machine, run, name)[1] for name in self.of]
         sizes = [edges.size - 1 for edges in self.edges]
         place, inside, area = jnp.zeros_like(rows[0], dtype=int), True, jnp.ones(())
@@ -269,13 +269,13 @@ class Escape(_Observed):
         count("samples", self.samples)
 
     def described(self, start):
-        """With the time between two looks."""
+        """The attributes, with the time between two samples, in cycles."""
         step = 1.0 / max(1, self.samples)
         first = {**self.attributes["escape_cycle"], "step": step}
         return {**self.attributes, "escape_cycle": first}
 
     def __call__(self, machine, run):
-        """Of one lane."""
+        """When one lane first leaves, in cycles."""
         row, behind = self.row(machine, run, self.of)
         # What is known of cycles begins with the first cycle's end.
         row = row if row.size > behind.size else jnp.concatenate([jnp.zeros(1) + jnp.nan, row])

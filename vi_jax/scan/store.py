@@ -13,6 +13,7 @@ import numpy as np
 from .._checks import unwritable
 from .._lazy import xr, zarr
 from .._numbers import warn
+from .._version import installed_version
 from .grid import Blocks
 
 # What stands in whole numbers of lanes that were not computed, `result` among them.
@@ -22,6 +23,9 @@ UNVERIFIABLE = "it cannot be looked at: "
 
 # What lies in the store, not what it was made with: a file may have been lost since.
 _AS_IT_IS: dict[str, Any] = {"use_consolidated": False}
+
+# The attribute that says which release began a store.
+_RELEASE = "vi_jax"
 
 # Where the check sums lie: a row for each block, a column for each variable. They are written last,
 # and are in a group of their own, so that they are no variable of the data set.
@@ -107,7 +111,16 @@ class ZarrStore:
                 f"cannot be read: {error}."
             ) from None
         _compare(self.path, dict(self.group.attrs), description, new=new)
+        self._warn_of_release()
         self._complete()
+
+    def _warn_of_release(self) -> None:
+        begun, now = self.group.attrs.get(_RELEASE), installed_version()
+        if begun is not None and begun != now:
+            warn(
+                f"{self.path} was begun by vi_jax {begun}, and this is {now}: the blocks that are "
+                "still missing come from another release than those that are there."
+            )
 
     def _complete(self) -> None:
         """Make again what arrays are missing, or are not those of this scan."""
@@ -201,7 +214,8 @@ def _make(
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as beside:
         made = Path(beside) / "store"
-        group = zarr.create_group(str(made), zarr_format=3, attributes={"scan": description})
+        about = {"scan": description, _RELEASE: installed_version()}
+        group = zarr.create_group(str(made), zarr_format=3, attributes=about)
         for name, x in blocks.axes.items():
             _add_axis(group, name, x, blocks)
         for name, v in variables.items():

@@ -35,7 +35,7 @@ _SINGLE = _Precision(short=1e-2, straight=1e-3, close=1e-4, brief=8e-3)
 
 
 def allowed(s: Scalar) -> _Precision:
-    """What the precision of `s` allows."""
+    """The thresholds of rest and release for the precision of `s`."""
     return _DOUBLE if s.dtype == jnp.float64 else _SINGLE
 
 

@@ -33,7 +33,7 @@ from .trial import Trial, attempt, timing
 
 
 class Step(NamedTuple):
-    """What a step made of a lane."""
+    """A lane after one step, and the row that it completed."""
 
     lane: Lane
     completed: Flag
@@ -130,7 +130,9 @@ def _resized(plan: Plan, lane: Lane, trial: Trial, taken: Flag, rejected: Flag) 
         return lane.length
     h = stop_gradient(trial.h)
     factor = plan.method.resize(trial.error)
-    # A step cut short by an event says little about how long the next may be.
+    # Choices: 0.7 is what a step shrinks to at most where its error is too large, 0.2 where it was
+    # rejected for another reason (NaN, say). A step cut short by an event says little about how
+    # long the next may be.
     grown = jnp.where(h < lane.length, jnp.maximum(lane.length, h * factor), h * factor)
     shrunk = h * jnp.where(trial.error > 1, jnp.minimum(factor, 0.7), 0.2)
     return jnp.where(taken, grown, jnp.where(rejected, shrunk, lane.length))

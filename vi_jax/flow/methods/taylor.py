@@ -85,7 +85,7 @@ class Taylor(AbstractMethod):
 
     @property
     def wander(self):
-        """Within the tolerance, if there is one."""
+        """By how much a motion that repeats may differ: the tolerance; 0 of fixed steps."""
         return 0.0 if self.rtol is None else self.rtol
 
     def tighter(self):

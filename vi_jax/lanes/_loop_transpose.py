@@ -80,7 +80,7 @@ def _transposed(cotangents, *args, varied, cond_nconsts, cond_jaxpr, body_nconst
     def before(x: tuple) -> tuple:
         turn, shares, weights = x
         _, carry = jax.lax.while_loop(lambda y: y[0] < turn - 1, taken, begin)
-        new = _undone(body_jaxpr, (*fixed, *carry), varied, moved, weights)
+        new = _one_back(body_jaxpr, (*fixed, *carry), varied, moved, weights)
         count = len(shares)
         return turn - 1, tuple(map(jnp.add, shares, new[:count])), tuple(new[count:])
 
@@ -92,7 +92,7 @@ def _transposed(cotangents, *args, varied, cond_nconsts, cond_jaxpr, body_nconst
     return [None] * number + [x if ad.is_undefined_primal(a) else None for x, a in found]
 
 
-def _undone(
+def _one_back(
     body: ClosedJaxpr, at: Sequence[Any], varied: Sequence[bool], moved: Sequence[bool],
     weights: Sequence[Any],
 ) -> list[Any]:  # fmt: skip
