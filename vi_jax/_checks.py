@@ -40,7 +40,7 @@ class Range(NamedTuple):
 REAL, POSITIVE, NOT_NEGATIVE, SHARE = Range(), Range(0.0, open_low=True), Range(0.0), Range(0, 1)
 
 
-def require(name: str, value: Any, **bounds: Any) -> None:
+def require(name: str, value: object, **bounds: Any) -> None:
     """Raise a `ValueError` unless every concrete number in `value` is finite and in range, the
     `Range` of these bounds.
 
@@ -63,7 +63,7 @@ def require_ranges(part: Any) -> None:
             require(name, value, **range_._asdict())
 
 
-def in_range(tree: Any) -> Bool[Array, ""]:
+def in_range(tree: object) -> Bool[Array, ""]:
     """Whether all numbers of all modules in a tree are in their `ranges`, traced ones too.
 
     What is put into a module by `eqx.tree_at`, or is being traced, has passed no other check.
@@ -77,7 +77,7 @@ def in_range(tree: Any) -> Bool[Array, ""]:
     return good
 
 
-def _modules(node: Any) -> Iterator[eqx.Module]:
+def _modules(node: object) -> Iterator[eqx.Module]:
     if isinstance(node, eqx.Module):
         yield node
         inner = list(vars(node).values())
@@ -87,7 +87,7 @@ def _modules(node: Any) -> Iterator[eqx.Module]:
         yield from _modules(part)
 
 
-def count(name: str, value: Any, *, least: int = 0, most: int = 2**31 - 1) -> int:
+def count(name: str, value: object, *, least: int = 0, most: int = 2**31 - 1) -> int:
     """A Python integer from `least` to `most`, or an error that says what came. A known integer of
     JAX's or NumPy's, such as an orbit's `cycles`, is one."""
     if isinstance(value, Tracer):
@@ -115,7 +115,7 @@ def unwritable(folder: str | Path) -> str | None:
         return str(getattr(error, "strerror", None) or error)
 
 
-def one_of(name: str, value: Any, allowed: tuple[str, ...]) -> str:
+def one_of(name: str, value: object, allowed: tuple[str, ...]) -> str:
     """One of a few words, or an error that lists them."""
     if not isinstance(value, str) or value not in allowed:
         words = ", ".join(repr(word) for word in allowed)
@@ -123,7 +123,7 @@ def one_of(name: str, value: Any, allowed: tuple[str, ...]) -> str:
     return value
 
 
-def _real(name: str, value: Any) -> np.ndarray | None:
+def _real(name: str, value: object) -> np.ndarray | None:
     """The numbers behind `value`, or `None` for tracers and placeholders."""
     numbers = concrete(value)
     kind = None if numbers is None else numbers.dtype
@@ -135,7 +135,7 @@ def _real(name: str, value: Any) -> np.ndarray | None:
     return numbers
 
 
-def given_number(name: str, value: Any, **limits: Any) -> float:
+def given_number(name: str, value: object, **limits: Any) -> float:
     """One finite real number that is known, in the limits of `require`."""
     numbers = _real(name, value)
     if numbers is None or numbers.ndim:
@@ -157,7 +157,7 @@ def interval(name: str, value: Any) -> tuple[float, float]:
     )
 
 
-def row_of_numbers(values: Any) -> np.ndarray | None:
+def row_of_numbers(values: object) -> np.ndarray | None:
     """Finite real numbers in one row, one at least, or `None` if `values` is none such.
 
     Texts, truth values, dates and complex numbers are no real numbers, even where NumPy takes them.
@@ -175,14 +175,14 @@ def row_of_numbers(values: Any) -> np.ndarray | None:
     return row if np.isfinite(row).all() else None
 
 
-def flag(name: str, value: Any) -> bool:
+def flag(name: str, value: object) -> bool:
     """A flag as Python's own. **Raises:** `TypeError` unless it is `True` or `False`."""
     if not isinstance(value, bool | np.bool_):
         raise TypeError(f"Argument `{name}` must be True or False, but got {value!r}.")
     return bool(value)
 
 
-def count_or_traced(name: str, value: Any) -> Any:
+def count_or_traced(name: str, value: object) -> Any:
     """As `count`, where the number may be traced, or a JAX array."""
     if isinstance(value, Tracer):
         return value
@@ -201,18 +201,18 @@ def tuple_of(name: str, value: Any, kind: type) -> tuple[Any, ...]:
         ) from None
 
 
-def tuple_of_names(name: str, value: Any) -> tuple[str, ...]:
+def tuple_of_names(name: str, value: object) -> tuple[str, ...]:
     """A tuple of names, of which there may be one alone, as a string."""
     return (value,) if isinstance(value, str) else tuple_of(name, value, str)
 
 
-def instance_of(name: str, value: Any, kind: type | tuple[type, ...], described: str) -> None:
+def instance_of(name: str, value: object, kind: type | tuple[type, ...], described: str) -> None:
     """**Raises:** `TypeError` if `value` is none of this kind, which is `described`."""
     if not isinstance(value, kind):
         raise TypeError(f"Argument `{name}` must be {described}, but got {value!r}.")
 
 
-def state_of_numbers(name: str, state: Any) -> Any:
+def state_of_numbers(name: str, state: object) -> Any:
     """`state`, each part of which is a real number or an array of them.
 
     **Raises:** `TypeError` that names the part which is none.
@@ -222,7 +222,7 @@ def state_of_numbers(name: str, state: Any) -> Any:
     return state
 
 
-def require_real(name: str, part: str, value: Any) -> None:
+def require_real(name: str, part: str, value: object) -> None:
     """**Raises:** `TypeError` if this part of an argument is neither a real number nor an array of
     them, traced or not."""
     real = isinstance(value, int | float) and not isinstance(value, bool)

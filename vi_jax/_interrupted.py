@@ -17,6 +17,8 @@ class Interrupted(KeyboardInterrupt):
     searched, a `Grazing` that the machine was not asked about; of `scan`, `basins` and
     `integrity_profile` the data set."""
 
-    def __init__(self, what: str, partial: Any, where: str = "what was computed is in `.partial`"):
+    def __init__(
+        self, what: str, partial: object, where: str = "what was computed is in `.partial`"
+    ):
         super().__init__(f"the {what} was interrupted; {where}")
         self.partial = partial

@@ -14,7 +14,7 @@ import numpy as np
 from jax.core import Tracer
 
 
-def number(name: str, value: Any) -> jax.Array:
+def number(name: str, value: object) -> jax.Array:
     """A real number or array of numbers as a floating-point JAX array.
 
     What is no tracer stays a known number inside of `jit` too, so that it can be checked there.
@@ -35,14 +35,14 @@ def number(name: str, value: Any) -> jax.Array:
     return _floating(name, array)
 
 
-def _type_of(value: Any) -> tuple[Any, ...]:
+def _type_of(value: object) -> tuple[Any, ...]:
     """The type of the array that holds it, where it is not its own: a `float` of Python's would
     make an array of no certain type, for which a program is compiled apart from that for others."""
     own = isinstance(value, np.generic) or not isinstance(value, float)
     return () if own else (jnp.result_type(float),)
 
 
-def strongly_typed(value: Any) -> Any:
+def strongly_typed(value: object) -> Any:
     """A number as an array of a certain type; all else, whole numbers and rows among it, as it is.
 
     What is no tracer stays a known number inside of `jit` too.
@@ -84,7 +84,7 @@ def _floating(name: str, array: jax.Array) -> jax.Array:
     return array.astype(jnp.result_type(float))
 
 
-def narrow(value: Any) -> bool:
+def narrow(value: object) -> bool:
     """Whether these are floating-point numbers of less than the session's precision."""
     return _bits(value) < 0
 
@@ -96,7 +96,7 @@ def _bits(value: Any) -> int:
     return jnp.finfo(value.dtype).bits - jnp.finfo(jnp.result_type(float)).bits
 
 
-def require_session(name: str, tree: Any) -> None:
+def require_session(name: str, tree: object) -> None:
     """**Raises:** `TypeError` for JAX arrays of double precision in a session of single precision,
     in which operations on them are not defined."""
     wide = [path for path, x in jtu.tree_leaves_with_path(tree) if _bits(x) > 0]
@@ -130,7 +130,7 @@ def warn(words: str) -> None:
     warnings.warn(words, stacklevel=level)
 
 
-def concrete(value: Any) -> np.ndarray | None:
+def concrete(value: object) -> np.ndarray | None:
     """The numbers behind `value`, or `None` while they are being traced."""
     if not isinstance(value, jax.Array | np.ndarray | np.generic | float | int):
         return None  # a placeholder (a spec, a tangent's None), which holds no number to check

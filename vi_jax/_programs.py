@@ -185,7 +185,7 @@ def _known(options: Mapping[str, Any]) -> dict[str, Any]:
 
 
 @functools.cache
-def _is_known(name: str, value: Any) -> bool:
+def _is_known(name: str, value: object) -> bool:
     with contextlib.suppress(jax.errors.JaxRuntimeError):
         jax.jit(lambda: 0, compiler_options={name: value}).lower().compile()
         return True

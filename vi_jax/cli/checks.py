@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from .._checks import unwritable
+from .._types import State
 from ..machine import AbstractMachine, leaf, leaf_names
 from ..orbit import check_walk, column_names
 from ..plot import ENDINGS
@@ -70,7 +71,7 @@ def check_map(axes: Mapping[str, Any], measure: Iterable[str] | None, *, paired:
         )
 
 
-def check_continuation(machine: AbstractMachine, start: Any, asked: ContinueTable) -> None:
+def check_continuation(machine: AbstractMachine, start: State, asked: ContinueTable) -> None:
     """**Raises:** `ConfigError` if the branch cannot begin, or its files not be written."""
     check_names(machine, [asked.parameter], "[orbit.continue]")
     low, high = asked.bounds

@@ -100,7 +100,7 @@ class MachineTable:
             return kinds[self.name](**self.numbers)
 
 
-def _is_machine(kind: Any) -> bool:
+def _is_machine(kind: object) -> bool:
     return isinstance(kind, type) and issubclass(kind, AbstractMachine)
 
 

@@ -73,7 +73,7 @@ def sweep_columns(way: str, run: Sweep) -> dict[str, np.ndarray]:
     return {"direction": np.full(results.size, way), **columns, "result": results}
 
 
-def _there(run: Any, names: Iterable[str]) -> dict[str, np.ndarray]:
+def _there(run: object, names: Iterable[str]) -> dict[str, np.ndarray]:
     """Those of its arrays that it has: nothing says how fast the drive is where there is none."""
     values = {name: getattr(run, name) for name in names}
     return {name: np.asarray(x) for name, x in values.items() if x is not None}

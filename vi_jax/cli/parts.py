@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
+from .._types import State
 from ..flow import RESULTS, Run, RunOptions, Samples, planned, simulate
 from ..machine import AbstractMachine, with_leaf
 from ..scan import Sweep, sweep, taken_along
@@ -35,7 +36,7 @@ def noted_interrupts() -> Iterator[Callable[[], bool]]:
         yield lambda: False
         return
 
-    def note(number: int, _: Any) -> None:
+    def note(number: int, _: object) -> None:
         if not pressed:
             print("interrupted: keeping what was computed …", file=sys.stderr, flush=True)
         pressed.append(number)
@@ -49,7 +50,7 @@ def noted_interrupts() -> Iterator[Callable[[], bool]]:
 
 def simulate_in_parts(
     machine: AbstractMachine,
-    start: Any,
+    start: State,
     cycles: int,
     *,
     interrupted: Callable[[], bool],
@@ -72,7 +73,7 @@ def simulate_in_parts(
     length = math.ceil(cycles / number)
     spent, runs = 0, []
 
-    def part(start: Any, settle: int) -> Run:
+    def part(start: State, settle: int) -> Run:
         nonlocal spent
         left = None if max_steps is None else max(1, max_steps - spent)
         run = simulate(

@@ -83,7 +83,7 @@ def unknown(what: str, name: str, place: str, known: Iterable[str]) -> str:
     return f"unknown {what} `{name}` in {place}; {hint}"
 
 
-def given(table: Any, *but: str) -> dict[str, Any]:
+def given(table: object, *but: str) -> dict[str, Any]:
     """What the keys of a table were set to, without those keys."""
     pairs = ((name, getattr(table, name)) for name in keys_of(type(table)) if name not in but)
     return {name: value for name, value in pairs if value is not None}
@@ -157,7 +157,7 @@ def _in_words(place: Place) -> str:
     return f"`{last}` in {_table(place[:-1])}"
 
 
-def _number(value: Any, _: Any = None) -> float:
+def _number(value: object, _: object = None) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise TypeError(f"must be a number, but is {_shown(value)}")
     try:
@@ -166,14 +166,14 @@ def _number(value: Any, _: Any = None) -> float:
         raise ValueError("must be a number below 1.8e308, but is a longer one") from None
 
 
-def _finite(value: Any, _: Any = None) -> float:
+def _finite(value: object, _: object = None) -> float:
     number = _number(value)
     if not math.isfinite(number):
         raise ValueError(f"must be a finite number, but is {number}")
     return number
 
 
-def _integer(value: Any, _: Any = None) -> int:
+def _integer(value: object, _: object = None) -> int:
     if isinstance(value, bool) or not isinstance(value, int):
         raise TypeError(f"must be a whole number, but is {_shown(value)}")
     if abs(value) > _MOST:
@@ -181,13 +181,13 @@ def _integer(value: Any, _: Any = None) -> int:
     return value
 
 
-def _flag(value: Any, _: Any = None) -> bool:
+def _flag(value: object, _: object = None) -> bool:
     if not isinstance(value, bool):
         raise TypeError(f"must be true or false, but is {_shown(value)}")
     return value
 
 
-def _text(value: Any, _: Any = None) -> str:
+def _text(value: object, _: object = None) -> str:
     if not isinstance(value, str) or not value:
         raise TypeError(f"must be a text in quotes, but is {_shown(value)}")
     if "\0" in value:
@@ -195,7 +195,7 @@ def _text(value: Any, _: Any = None) -> str:
     return value
 
 
-def _row(value: Any, _: Any = None) -> Row:
+def _row(value: object, _: object = None) -> Row:
     if isinstance(value, list) and value:
         return Row(_CONVERTER.structure(value, list[Finite]))
     if not isinstance(value, dict):
@@ -213,7 +213,7 @@ def _row(value: Any, _: Any = None) -> Row:
     return Row(np.linspace(_finite(value["from"]), _finite(value["to"]), count).tolist())
 
 
-def _shown(value: Any) -> str:
+def _shown(value: object) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, dict):
@@ -238,11 +238,11 @@ def _word(kind: Any) -> Callable[[Any, Any], str]:
     return hook
 
 
-def _list(kind: Any) -> Callable[[Any, Any], tuple[Any, ...]]:
+def _list(kind: object) -> Callable[[Any, Any], tuple[Any, ...]]:
     item, *rest = get_args(kind)
     size = None if rest == [...] else 1 + len(rest)
 
-    def hook(value: Any, _: Any) -> tuple[Any, ...]:
+    def hook(value: object, _: object) -> tuple[Any, ...]:
         if not isinstance(value, list) and size is None:
             value = [value]  # one of several, without brackets
         if not isinstance(value, list) or len(value) != (size or len(value)):
@@ -252,10 +252,10 @@ def _list(kind: Any) -> Callable[[Any, Any], tuple[Any, ...]]:
     return hook
 
 
-def _mapping(kind: Any) -> Callable[[Any, Any], dict[str, Any]]:
+def _mapping(kind: object) -> Callable[[Any, Any], dict[str, Any]]:
     item = get_args(kind)[1]
 
-    def hook(value: Any, _: Any) -> dict[str, Any]:
+    def hook(value: object, _: object) -> dict[str, Any]:
         if not isinstance(value, dict):
             raise TypeError(f"must be a table, but is {_shown(value)}")
         return dict(_CONVERTER.structure(dict(_flat(value)), Mapping[str, item]))
@@ -279,7 +279,7 @@ def _class(kind: Any) -> Callable[[Any, Any], Any]:
     settings: dict[str, Any] = {"_cattrs_forbid_extra_keys": True, **names}
     structured = make_dict_structure_fn(kind, _CONVERTER, **settings)
 
-    def hook(value: Any, _: Any) -> Any:
+    def hook(value: object, _: object) -> Any:
         if not isinstance(value, dict):
             raise TypeError(f"must be a table, but is {_shown(value)}")
         return structured(value, kind)

@@ -296,7 +296,7 @@ VERBS: Mapping[str, Callable[[Config, Any, Tell], Outcome]] = {
 }
 
 
-def _last_state(run: Sweep, otherwise: Any) -> Any:
+def _last_state(run: Sweep, otherwise: object) -> Any:
     """The section state on which a sweep ended."""
     good = np.flatnonzero(np.asarray(run.result == RESULTS.successful))
     if not good.size:

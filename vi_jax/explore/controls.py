@@ -24,7 +24,7 @@ class Control(NamedTuple):
         steps = round((min(max(value, self.low), self.high) - self.low) / self.step)
         return round(self.low + steps * self.step, 6)
 
-    def holds(self, value: Any) -> bool:
+    def holds(self, value: object) -> bool:
         """Whether this is a number that the slider can be at."""
         if not isinstance(value, int | float):
             return False

@@ -12,6 +12,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from .._programs import compiled
+from .._types import State
 from ..flow import RESULTS, Run, chosen, simulate
 from ..machine import AbstractMachine, is_autonomous, unit_of, with_unit
 from ..orbit import STABILITY, complex_in_words, cycle_map, impacts_in_words, stability_of
@@ -103,7 +104,7 @@ class Motion(NamedTuple):
         return f"multipliers {values}: {verdict}"
 
 
-def look(scene: AbstractMachine, start: Any, settle: int = 1000) -> Motion:
+def look(scene: AbstractMachine, start: State, settle: int = 1000) -> Motion:
     """The motion of a scene after `settle` cycles, by its standard method.
 
     A start beyond a stop is moved onto it.
@@ -148,7 +149,7 @@ def look(scene: AbstractMachine, start: Any, settle: int = 1000) -> Motion:
     )
 
 
-def prepare(scene: AbstractMachine, start: Any) -> Motion:
+def prepare(scene: AbstractMachine, start: State) -> Motion:
     """Compile what `look` needs for scenes of this structure, and return the motion."""
     found = look(scene, start, 0)
     _exponent_of(scene, jtu.tree_map(lambda x: jnp.asarray(x[-1]), found.sections))
@@ -156,7 +157,7 @@ def prepare(scene: AbstractMachine, start: Any) -> Motion:
 
 
 @compiled
-def _seen(scene: AbstractMachine, start: Any, settle: Any) -> tuple[Run, Run, Any, Any, Any]:
+def _seen(scene: AbstractMachine, start: State, settle: Any) -> tuple[Run, Run, Any, Any, Any]:
     """The run observed, its first cycles sampled, its regime, the derivative of its map, and
     position and velocity on its sections."""
     method = chosen(scene, None)
@@ -172,7 +173,7 @@ def _seen(scene: AbstractMachine, start: Any, settle: Any) -> tuple[Run, Run, An
     return run, window, found, _monodromy(scene, run, found["period"], method), places
 
 
-def seen_evenly(machine: AbstractMachine, state: Any) -> AbstractMachine:
+def seen_evenly(machine: AbstractMachine, state: State) -> AbstractMachine:
     """The machine; one without a drive observed at equal intervals, where samples can be taken."""
     if not is_autonomous(machine, state):
         return machine
@@ -192,7 +193,7 @@ def _monodromy(scene: AbstractMachine, run: Run, period: Any, method: Any) -> ja
     return jax.lax.fori_loop(0, cycles, one, jnp.eye(row.size, dtype=row.dtype))
 
 
-def _exponent_of(scene: AbstractMachine, state: Any) -> float:
+def _exponent_of(scene: AbstractMachine, state: State) -> float:
     """The greatest exponent; NaN for a machine that has none (a drift renewed on its section)."""
     try:
         return float(_exponent(scene, state))
@@ -201,6 +202,6 @@ def _exponent_of(scene: AbstractMachine, state: Any) -> float:
 
 
 @compiled
-def _exponent(scene: AbstractMachine, state: Any) -> jax.Array:
+def _exponent(scene: AbstractMachine, state: State) -> jax.Array:
     out = lyapunov(scene, state, _REGIME.observed, settle=0, number=1)
     return out.exponents[0]

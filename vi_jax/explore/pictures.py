@@ -89,7 +89,7 @@ class MotionPicture:
             for name, ax in (("map", self._map), ("multipliers", self._circle))
         }
 
-    def draw(self, motion: Motion, gap: Any, *, which: str = MAPS[0]) -> bytes:
+    def draw(self, motion: Motion, gap: object, *, which: str = MAPS[0]) -> bytes:
         """The picture of a motion, as PNG.
 
         **Arguments:** `gap`, the place of the stop, or of several; `which`, out of `MAPS`.

@@ -160,11 +160,11 @@ def ready() -> dict[str, type[AbstractMachine]]:
     }
 
 
-def _is_real(x: Any) -> bool:
+def _is_real(x: object) -> bool:
     return jnp.issubdtype(jnp.result_type(x), jnp.floating)
 
 
-def _range_of(machine: Any, name: str, value: float) -> tuple[float, float]:
+def _range_of(machine: object, name: str, value: float) -> tuple[float, float]:
     """From zero to twice the value (-1 to 1 of zero), within what the machine allows."""
     low, high = sorted((0.0, 2 * value)) if value else (-1.0, 1.0)
     if name.startswith(START):

@@ -77,7 +77,7 @@ class FlowToEvent:
         (smooth, _), (s, state, time) = self._whole(fixed, rest), moving
         return jnp.ones_like(s), smooth.field(s, state), rate_beside(smooth, s, state, time)
 
-    def _whole(self, fixed: Any, rest: Any) -> Any:
+    def _whole(self, fixed: object, rest: object) -> Any:
         return eqx.combine(fixed, rest, self._static)
 
     def _pure(self, function: Callable) -> Callable:

@@ -42,19 +42,19 @@ def to_release(k: int) -> float:
 HIT, RESTS, LEAVES, CHANGES, RESETS = 0.0, 1.0, 2.0, 3.0, 4.0
 
 
-def total(tree: Any, start: Scalar) -> Scalar:
+def total(tree: object, start: Scalar) -> Scalar:
     """Sum of all numbers in a tree and of `start`: finite if all of them are."""
     for leaf in jtu.tree_leaves(tree):
         start = start + jnp.sum(leaf)
     return start
 
 
-def select(condition: Flag, a: Any, b: Any) -> Any:
+def select(condition: Flag, a: object, b: object) -> Any:
     """`jnp.where` for pytrees; what is the same in both is left as it is."""
     return jtu.tree_map(lambda x, y: x if x is y else jnp.where(condition, x, y), a, b)
 
 
-def in_place(values: tuple, k: int, value: Any) -> tuple:
+def in_place(values: tuple, k: int, value: object) -> tuple:
     """The values with another one in place number k."""
     return (*values[:k], value, *values[k + 1 :])
 

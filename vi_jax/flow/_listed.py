@@ -1,7 +1,6 @@
 """The logs of a run in words: what happened in each cycle."""
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
@@ -9,7 +8,7 @@ import numpy as np
 _CYCLES, _EVENTS = 8, 6
 
 
-def listed(what: str, used: Any, word: Callable[[int, int], str]) -> str:
+def listed(what: str, used: object, word: Callable[[int, int], str]) -> str:
     """How many there are, and those of the first cycles one by one.
 
     **Arguments:** what is listed; which places of the log, (cycles, size) and batch axes before

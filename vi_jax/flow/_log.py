@@ -30,7 +30,7 @@ def logged(log: Log, hit: Flag, place: Scalar, clock: Scalar, approach: Scalar, 
 
 
 def noted(
-    events: Log, when: Flag, clock: Scalar, kind: float, number: Scalar | int, value: Any
+    events: Log, when: Flag, clock: Scalar, kind: float, number: Scalar | int, value: object
 ) -> Log:
     """The log of all events with this one behind those that it holds, if there is room.
 

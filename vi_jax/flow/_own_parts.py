@@ -140,7 +140,7 @@ def _is_number(x: Any) -> bool:
     return getattr(x, "shape", None) == () and jnp.issubdtype(x.dtype, jnp.floating)
 
 
-def _length(modes: Any) -> int:
+def _length(modes: object) -> int:
     return len(modes) if isinstance(modes, Sequence) else -1
 
 

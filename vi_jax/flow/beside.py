@@ -56,6 +56,6 @@ def elapsed(old: Beside, carried: Beside | None, h: Scalar) -> Beside:
     return Beside(time, {} if carried is None else carried.integrals)
 
 
-def means(integrals: dict[str, Any], duration: Any) -> dict[str, Any]:
+def means(integrals: dict[str, Any], duration: object) -> dict[str, Any]:
     """The averages of the integrals over this duration."""
     return {name: x / duration for name, x in integrals.items()}

@@ -70,12 +70,12 @@ def _met(log: Any, number: str) -> Any:
     return rows.isel(row=np.flatnonzero(np.asarray(rows[number]) >= 0))
 
 
-def place_of(item: Any, items: Sequence[Any]) -> Int[Array, "..."]:
+def place_of(item: object, items: Sequence[Any]) -> Int[Array, "..."]:
     """Which of these items of an enumeration it is; a number for each lane."""
     return jnp.asarray(sum(jnp.where(item == other, i, 0) for i, other in enumerate(items)))
 
 
-def in_names(item: Any, kind: Any, names: Sequence[str]) -> np.ndarray:
+def in_names(item: object, kind: object, names: Sequence[str]) -> np.ndarray:
     """Of items of an enumeration their names, one for each lane."""
     place = place_of(item, [getattr(kind, name) for name in names])
     return np.asarray(np.asarray(names)[np.asarray(place)])

@@ -103,7 +103,7 @@ def _names(
     return tuple(sorted(found))  # as pytrees have them
 
 
-def _as_arrays(whose: str, found: Any) -> dict[str, Array]:
+def _as_arrays(whose: str, found: object) -> dict[str, Array]:
     if not isinstance(found, Mapping):
         raise TypeError(
             f"{whose} must be a mapping of names to numbers, but returned {type(found).__name__}."

@@ -58,7 +58,7 @@ class RunOptions:
             record=one_of("record", self.record, ("motion", "sections")),
         )
 
-    def check_limits(self, dtype: Any) -> None:
+    def check_limits(self, dtype: object) -> None:
         """**Raises:** `ValueError` for a limit beyond which numbers of this type do not count."""
         for name in ("max_impacts", "max_steps"):
             value = getattr(self, name)
@@ -69,6 +69,6 @@ class RunOptions:
                 )
 
 
-def largest_count(dtype: Any) -> int:
+def largest_count(dtype: object) -> int:
     """The number up to which floating-point numbers of this type, in which the loop counts, do."""
     return round(2 / float(jnp.finfo(dtype).eps))

@@ -2,11 +2,10 @@
 
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import Any
 
 
 @contextmanager
-def within(setting: ContextVar, value: Any):
+def within(setting: ContextVar, value: object):
     """`setting` has this value within this context."""
     token = setting.set(value)
     try:

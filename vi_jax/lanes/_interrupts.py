@@ -113,7 +113,7 @@ def _native() -> _Native:
     )
 
 
-def guard(handler: Any) -> int:
+def guard(handler: object) -> int:
     """The address of a handler for XLA that calls this function until it has an answer.
 
     **Arguments:** `handler(frame, out)`, made by `ctypes`, which stores into `out`, a

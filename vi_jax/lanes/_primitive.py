@@ -188,7 +188,7 @@ def _partially_known_equation(saveable, unknown, instantiated, equation):
     return now, equation, [not known for known in found], [True] * outs, kept
 
 
-def _saved(policy: Any) -> bool:
+def _saved(policy: object) -> bool:
     """Whether a policy of `jax.checkpoint` says to save a value: by `True`, or by an instance of
     JAX's `SaveableType` (0.10.2), which no public module has."""
     return policy is True or type(policy).__name__.startswith("Saveable")

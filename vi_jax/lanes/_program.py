@@ -153,7 +153,7 @@ def evaluated(closed: ClosedJaxpr | Jaxpr, *args: Any) -> list[Any]:
     transpose each of them by itself, which takes several times as long."""
     jaxpr, known = inner(closed), {}
 
-    def read(atom: Any) -> Any:
+    def read(atom: object) -> Any:
         return atom.val if isinstance(atom, Literal) else known[atom]
 
     known.update(zip(jaxpr.constvars, getattr(closed, "consts", ()), strict=True))
@@ -188,7 +188,7 @@ def _rewritten(jaxpr: Jaxpr, one: Callable[[Any], Any]) -> Jaxpr:
     return jaxpr.replace(eqns=eqns)
 
 
-def _parameter(value: Any, one: Callable[[Any], Any]) -> Any:
+def _parameter(value: object, one: Callable[[Any], Any]) -> Any:
     if isinstance(value, ClosedJaxpr):
         return rewritten(value, one)
     if isinstance(value, Jaxpr):
@@ -218,7 +218,7 @@ def dependent_results(jaxpr: Jaxpr, sources: Sequence[bool], *, smooth: bool) ->
     that can have a derivative counts."""
     found = {v for v, s in zip(jaxpr.invars, sources, strict=True) if s}
 
-    def depends(atom: Any) -> bool:
+    def depends(atom: object) -> bool:
         return not isinstance(atom, Literal) and atom in found
 
     for eqn in jaxpr.eqns:

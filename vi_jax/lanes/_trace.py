@@ -40,7 +40,7 @@ class Traced(NamedTuple):
 _recent: "Recent[Any, Traced]" = Recent(64)
 
 
-def traced(functions: Functions, treedef: Any, leaves: Sequence[Any], **options: int) -> Traced:
+def traced(functions: Functions, treedef: object, leaves: Sequence[Any], **options: int) -> Traced:
     """The program for inputs of one structure, and of their leaves' shapes and types.
 
     **Arguments:** the functions; the structure and the leaves of the inputs of one lane; `rows` and
@@ -67,7 +67,7 @@ def traced(functions: Functions, treedef: Any, leaves: Sequence[Any], **options:
 
 
 @jax.jit
-def _clear_with_jax(x: Any) -> Any:
+def _clear_with_jax(x: object) -> Any:
     # Traced again only after `jax.clear_caches()`, which has no public hook (JAX 0.10.2).
     _recent.clear()
     return x
@@ -93,7 +93,7 @@ def _function_key(function: Callable[..., Any]) -> tuple:
     return (function,)
 
 
-def _argument_key(x: Any) -> tuple:
+def _argument_key(x: object) -> tuple:
     """The same for an argument that is bound by `functools.partial`: a function or a pytree."""
     if isinstance(x, FunctionType | functools.partial):
         return _function_key(x)
@@ -101,7 +101,7 @@ def _argument_key(x: Any) -> tuple:
     return (treedef, *map(_constant_key, leaves))
 
 
-def _constant_key(x: Any) -> Any:
+def _constant_key(x: object) -> Any:
     """A key that is equal only for equal constants: 1, 1.0 and True differ, and 0.0 and -0.0.
 
     **Raises:** `TypeError` for what may vary.
@@ -158,11 +158,11 @@ def shape_of(x: Any) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct(x.shape, x.dtype)
 
 
-def _flag(x: Any) -> Any:
+def _flag(x: object) -> Any:
     return jnp.asarray(x, bool)
 
 
-def _checked(what: str, treedef: Any, tree: Any, avals: list) -> list:
+def _checked(what: str, treedef: object, tree: object, avals: list) -> list:
     """The leaves of what `step` gave, in the types that `begin` gave.
 
     **Raises:** `TypeError` where structure or shapes differ.

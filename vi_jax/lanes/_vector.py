@@ -70,7 +70,7 @@ def _bodies(eqn: Any) -> list[Jaxpr]:
     return [inner(params["jaxprs"].solve)] if name == "custom_linear_solve" else []
 
 
-def constants(t: Text, array: Any) -> Held:
+def constants(t: Text, array: object) -> Held:
     """A known array, the same in every lane."""
     array = np.asarray(array)
     kind = kind_of(array.dtype)
@@ -94,7 +94,7 @@ def write(t: Text, closed: ClosedJaxpr | Jaxpr, args: list[Any], mask: Value) ->
     needed = _needed(jaxpr)
     uses, last = _uses(jaxpr, needed)
 
-    def read(atom: Any) -> Held:
+    def read(atom: object) -> Held:
         if isinstance(atom, Literal):
             aval: Any = atom.aval
             return constants(t, np.asarray(atom.val, aval.dtype))

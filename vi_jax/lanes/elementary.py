@@ -72,7 +72,7 @@ def _sincos_batched(args, dims):
 pin_p = Primitive("pin")
 
 
-def pin(tree: Any) -> Any:
+def pin(tree: object) -> Any:
     """The same values, which XLA's CPU backend computes once.
 
     When it fuses it copies cheap producers into each of their consumers, which multiplies the work

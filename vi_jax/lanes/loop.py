@@ -49,7 +49,7 @@ def run(
     begin: Callable[[Any], tuple[Any, Emitted]],
     step: Callable[[Any, Any], tuple[Any, Emitted]],
     end: Callable[[Any, Any], Any],
-    inputs: Any,
+    inputs: object,
     *,
     rows: int,
     block: int = 1,
@@ -88,7 +88,7 @@ def run(
     return results, row
 
 
-def once(function: Callable[[Any], Any], inputs: Any) -> Any:
+def once(function: Callable[[Any], Any], inputs: object) -> Any:
     """`function(inputs)` as vector code, without a loop; batched by `vmap` as `run` is.
 
     **Arguments:** a function of a pytree of scalars and small arrays; the pytree.
@@ -96,13 +96,13 @@ def once(function: Callable[[Any], Any], inputs: Any) -> Any:
     return run(_begin_ended, _no_step, functools.partial(_end_with, function), inputs, rows=0)[0]
 
 
-def _begin_ended(inputs: Any) -> tuple[Any, Emitted]:
+def _begin_ended(inputs: object) -> tuple[Any, Emitted]:
     return (), Emitted(False, False, ())
 
 
-def _no_step(inputs: Any, carry: Any) -> tuple[Any, Emitted]:
+def _no_step(inputs: object, carry: object) -> tuple[Any, Emitted]:
     return carry, Emitted(False, False, ())
 
 
-def _end_with(function: Callable[[Any], Any], inputs: Any, carry: Any) -> Any:
+def _end_with(function: Callable[[Any], Any], inputs: object, carry: object) -> Any:
     return function(inputs)

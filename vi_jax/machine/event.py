@@ -22,7 +22,7 @@ class Around(NamedTuple):
     contact: Scalars
     """Of each coordinate, 1 + i while it rests on stop number i, else 0; empty where none can."""
 
-    def instead(self, mode: Any) -> Modes:
+    def instead(self, mode: object) -> Modes:
         """All modes, with another one in the place of the event's."""
         mode = jnp.asarray(mode, jnp.result_type(self.modes[self.own]))
         return (*self.modes[: self.own], mode, *self.modes[self.own + 1 :])

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._numbers import concrete, number
-from .._types import Scalar, State
+from .._types import Number, Scalar, State
 from .base import AbstractMachine, Coordinate, Prepared
 from .modal import Modes, along, harmonic, modal, solved, times, without_row
 from .shown import Shown
@@ -102,7 +102,7 @@ class LinearMachine(AbstractMachine):
             pull = pull - times(self.damping, v)
         return StructureState(v, solved(self.mass, pull))
 
-    def start(self, *, displacement: Any = 0.0, velocity: Any = 0.0) -> StructureState:
+    def start(self, *, displacement: Number = 0.0, velocity: Number = 0.0) -> StructureState:
         """A state; at rest in x = 0 by default.
 
         **Arguments:** (n,) each, or one number for all.

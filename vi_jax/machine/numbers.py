@@ -14,12 +14,12 @@ from .._types import Machine, State
 from .units import in_unit
 
 
-def leaf_names(tree: Any) -> list[str]:
+def leaf_names(tree: object) -> list[str]:
     """Names of all numbers in a machine (or another pytree), in the order of its leaves."""
     return list(by_name(tree))
 
 
-def by_name(tree: Any) -> dict[str, Any]:
+def by_name(tree: object) -> dict[str, Any]:
     """All numbers of a machine, a state or another pytree by their names, in the order of its
     leaves."""
     return dict(_named(tree))
@@ -64,7 +64,7 @@ def plain(x: Any, digits: int) -> str:
     return f"{float(x) + 0.0:.{digits}g}"
 
 
-def leaf(tree: Any, name: str) -> Float[Array, "..."]:
+def leaf(tree: object, name: str) -> Float[Array, "..."]:
     """The number of that name. **Raises:** `ValueError` that lists the near names."""
     base, place = _place_in(tree, check_leaf(tree, name))
     return jnp.asarray(by_name(tree)[base])[place]
@@ -93,7 +93,7 @@ def with_leaf(tree: Any, name: str, value: Any) -> Any:
     return jtu.tree_unflatten(treedef, leaves)
 
 
-def _place_in(tree: Any, name: str) -> tuple[str, tuple[int, ...]]:
+def _place_in(tree: object, name: str) -> tuple[str, tuple[int, ...]]:
     """The array that a number's name begins with, and its place in it: none of the number itself or
     of a whole array."""
     if name in by_name(tree):
@@ -102,7 +102,7 @@ def _place_in(tree: Any, name: str) -> tuple[str, tuple[int, ...]]:
     return base, tuple(int(i) for i in inner.split(","))
 
 
-def check_leaf(tree: Any, name: str, *, argument: str = "parameter") -> str:
+def check_leaf(tree: object, name: str, *, argument: str = "parameter") -> str:
     """`name`, if the machine has such a number, or such an array, whose numbers are called
     `name[i]`."""
     names = leaf_names(tree)
@@ -133,7 +133,7 @@ def check_again(machine: Machine) -> None:
             check()
 
 
-def _named(tree: Any) -> list[tuple[str, Any]]:
+def _named(tree: object) -> list[tuple[str, Any]]:
     named = []
     for path, value in jtu.tree_leaves_with_path(tree):
         if eqx.is_array_like(value):
@@ -142,7 +142,7 @@ def _named(tree: Any) -> list[tuple[str, Any]]:
     return named
 
 
-def _word(key: Any) -> Any:
+def _word(key: object) -> Any:
     """One step of a path through a machine, as text: an attribute, an index or a key."""
     for kind in ("name", "idx", "key"):
         if hasattr(key, kind):

@@ -12,6 +12,6 @@ def by_default(method: Method) -> Method:
     return method
 
 
-def is_own(method: Any) -> bool:
+def is_own(method: object) -> bool:
     """Whether a method or a property, as a class has it, is not marked by `by_default`."""
     return not hasattr(getattr(method, "fget", method), "by_default")

@@ -58,18 +58,18 @@ class Summarized(eqx.Module):
         return summary_table(repr(self), self.drawn() if known(self) else None)
 
 
-def known(tree: Any) -> bool:
+def known(tree: object) -> bool:
     """Whether all numbers in a tree are there: none is traced, a placeholder, or given away."""
     return all(_there(x) for x in jtu.tree_leaves(tree))
 
 
-def _there(x: Any) -> bool:
+def _there(x: object) -> bool:
     if isinstance(x, Tracer) or not eqx.is_array_like(x):
         return False
     return not (isinstance(x, jax.Array) and x.is_deleted())
 
 
-def in_words(x: Any, units: Mapping[str, str] = NONE, name: str = "", indent: int = 0) -> str:
+def in_words(x: object, units: Mapping[str, str] = NONE, name: str = "", indent: int = 0) -> str:
     """A module, a state or a number, as it would be written, each number with its unit."""
     if eqx.is_array_like(x) and not isinstance(x, bool):
         return number_in_words(x, unit_of(units, name) if name else "")
@@ -85,7 +85,7 @@ def in_words(x: Any, units: Mapping[str, str] = NONE, name: str = "", indent: in
     return opened + "".join(f"{margin}{part}," for part in parts) + end + closed.lstrip(",")
 
 
-def _parts(x: Any) -> tuple[str, list[tuple[str, Any]], str]:
+def _parts(x: object) -> tuple[str, list[tuple[str, Any]], str]:
     """How the text of something begins, what is in it, by name, and how the text ends."""
     name = f"{type(x).__name__}("
     if dataclasses.is_dataclass(x) and not isinstance(x, type):
@@ -104,7 +104,7 @@ def _parts(x: Any) -> tuple[str, list[tuple[str, Any]], str]:
     return getattr(x, "__qualname__", None) or repr(x), [], ""
 
 
-def number_in_words(x: Any, unit: str = "") -> str:
+def number_in_words(x: object, unit: str = "") -> str:
     """A number with its unit; of several, if they are many, their range and their shape."""
     x = np.asarray(x)
     if not x.ndim:
@@ -128,7 +128,7 @@ def table(title: str, rows: Iterable[tuple[str, ...]], after: str = "") -> str:
     return f"<table>{caption}{cells}</table>{after}"
 
 
-def summary_table(text: str, row: Any = None) -> str:
+def summary_table(text: str, row: object = None) -> str:
     """A result in words as a table: its lines "name: value", the first one above."""
     first, *lines = text.splitlines()
     after = "" if row is None else sparkline(row)
@@ -137,7 +137,7 @@ def summary_table(text: str, row: Any = None) -> str:
     return table(first, (row[::2] for row in rows), after)
 
 
-def sparkline(row: Any, width: int = 240, height: int = 40) -> str:
+def sparkline(row: object, width: int = 240, height: int = 40) -> str:
     """A row of numbers as a small curve; nothing where fewer than two of them are finite."""
     y = np.asarray(row, float).ravel()
     good = np.isfinite(y)

@@ -159,7 +159,7 @@ class SoftStop(Wall, AbstractSwitch):
         frequency = self.law.frequency(self.stiffness, depth, rate)
         return jnp.where(depth > -_NEAR, 0.4 * pi / frequency, jnp.inf)
 
-    def _pulls(self, depth: Any, rate: Any) -> Any:
+    def _pulls(self, depth: object, rate: object) -> Any:
         return self.law.pulls(self.stiffness, self.damping, self.prestress, depth, rate)
 
 

@@ -127,7 +127,7 @@ class RigidStop(Wall, AbstractEvent):
         """Whether the law is Newton's with one number, so that its range is known beforehand."""
         return type(self) is RigidStop and not callable(self.restitution)
 
-    def coefficient(self, approach: Any) -> Any:
+    def coefficient(self, approach: object) -> Any:
         """k at this speed of approach."""
         return self.restitution(approach) if callable(self.restitution) else self.restitution
 

@@ -47,7 +47,7 @@ def check_matrices(mass: Any, damping: Any, stiffness: Any) -> int:
     return n
 
 
-def _check_numbers(name: str, value: Any) -> None:
+def _check_numbers(name: str, value: object) -> None:
     """**Raises:** `ValueError` for a matrix that is known and not finite, or not symmetric."""
     known = concrete(value)
     if known is None:
@@ -67,7 +67,7 @@ def _check_numbers(name: str, value: Any) -> None:
         )
 
 
-def _check_positive(mass: Any) -> None:
+def _check_positive(mass: object) -> None:
     """**Raises:** `ValueError` for masses that are known and not positive definite."""
     known = concrete(mass)
     if known is None:
@@ -92,7 +92,7 @@ def check_vector(name: str, value: Any, n: int) -> None:
     _check_numbers(name, value)
 
 
-def numbered(contacts: Any) -> tuple[RigidStop, ...]:
+def numbered(contacts: object) -> tuple[RigidStop, ...]:
     """Contacts with the numbers of their coordinates; those of one `at` share the first one's."""
     rows, found = [], []
     for stop in tuple_of("contacts", contacts, RigidStop):
@@ -109,7 +109,7 @@ def numbered(contacts: Any) -> tuple[RigidStop, ...]:
     return tuple(found)
 
 
-def _same(a: Any, b: Any) -> bool:
+def _same(a: object, b: object) -> bool:
     one, other = concrete(a), concrete(b)
     return a is b or (one is not None and other is not None and np.array_equal(one, other))
 

@@ -10,7 +10,7 @@ WOOD, SLEEVE, BIRD, CREST = "#c9a36b", "#6f6f6f", "#4c5b66", "#d55e00"
 INK = "0.15"
 
 
-def draw_woodpecker(machine: Machine, pen: Any, state: State) -> None:
+def draw_woodpecker(machine: Machine, pen: object, state: State) -> None:
     """The pole, upright at x = 0, with the toy at its height; by a `vi_jax.plot.Pen`."""
     size = {
         name: float(getattr(machine, name))
@@ -26,7 +26,7 @@ def draw_woodpecker(machine: Machine, pen: Any, state: State) -> None:
     _names(pen, size, middle, hang)
 
 
-def _turned(points: Any, angle: float) -> np.ndarray:
+def _turned(points: object, angle: float) -> np.ndarray:
     """Points turned counterclockwise about the origin."""
     cosine, sine = np.cos(angle), np.sin(angle)
     return np.asarray(points, float) @ np.array([[cosine, sine], [-sine, cosine]])
@@ -41,7 +41,7 @@ def _filled(pen: Any, points: np.ndarray, color: str, alpha: float = 1.0, **look
     pen.ax.fill(*points.T, facecolor=color, alpha=alpha, **look)
 
 
-def _oval(middle: Any, long: float, wide: float, angle: float) -> np.ndarray:
+def _oval(middle: object, long: float, wide: float, angle: float) -> np.ndarray:
     turn = np.linspace(0, 2 * np.pi, 60)
     return middle + _turned(np.stack([long * np.cos(turn), wide * np.sin(turn)], -1), angle)
 
@@ -88,7 +88,7 @@ def _bird(pen: Any, size: dict[str, float], hang: Any, lean: float) -> None:
     angle = float(np.arctan2(*(head - centre)[::-1]))
     round_ = 0.23 * long
 
-    def put(points: Any, color: str, alpha: float = 1.0, **look: Any) -> None:
+    def put(points: object, color: str, alpha: float = 1.0, **look: Any) -> None:
         _filled(pen, hang + _turned(points, lean), color, alpha, **look)
 
     axis, aside = (head - centre) / long, _turned([(head - centre) / long], np.pi / 2)[0]

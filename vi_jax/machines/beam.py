@@ -21,7 +21,7 @@ from .._checks import (
     require_ranges,
 )
 from .._numbers import optional_real
-from .._types import Scalar
+from .._types import Number, Scalar
 from ..machine import LinearMachine, RigidStop, StructureState
 from ._base import number_field, stops_at
 
@@ -151,10 +151,10 @@ class Beam(LinearMachine):
         away = jnp.exp(beta * (x - 1)) * lean + (1 + sigma) * jnp.exp(-beta * x)
         return 0.5 * away - jnp.cos(beta * x) + sigma * jnp.sin(beta * x)
 
-    def deflection(self, state: StructureState, place: Any = 1.0) -> Float[Array, "..."]:
+    def deflection(self, state: StructureState, place: Number = 1.0) -> Float[Array, "..."]:
         """w at places along the beam, in [0, 1] of its length: by default of its tip."""
         return self.shape(place) @ state.displacement
 
 
-def _absent(x: Any) -> bool:
+def _absent(x: object) -> bool:
     return x is None

@@ -135,7 +135,9 @@ class Capsule(ForcedMachine):
         x = state
         return CapsuleState(x.place, x.speed, x.capsule_speed, jnp.zeros_like(x.travel), x.travel)
 
-    def start(self, *, place: Any = 0.0, speed: Number = 0.0, capsule_speed: Any = 0.0) -> Any:
+    def start(
+        self, *, place: Number = 0.0, speed: Number = 0.0, capsule_speed: Number = 0.0
+    ) -> Any:
         """At rest, with the spring relaxed, by default."""
         given = number("place", place), number("speed", speed)
         capsule = number("capsule_speed", capsule_speed)

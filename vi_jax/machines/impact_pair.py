@@ -110,7 +110,12 @@ class ImpactPair(PhaseMachine):
         return FreePairState(state.speed, -box, state.box_speed, box)
 
     def start(
-        self, *, place: Any = 0.0, speed: Number = 0.5, box: Any = 0.0, box_speed: Any = 0.0
+        self,
+        *,
+        place: Number = 0.0,
+        speed: Number = 0.5,
+        box: Number = 0.0,
+        box_speed: Number = 0.0,
     ) -> Any:
         """The ball in the middle of the box by default; a box that is free at rest."""
         ball = number("place", place), number("speed", speed)

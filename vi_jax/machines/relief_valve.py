@@ -87,7 +87,9 @@ class ReliefValve(AutonomousMachine):
         drains = self.compressibility * jnp.abs(state.lift) / (2 * jnp.sqrt(state.pressure))
         return 1 / jnp.maximum(jnp.maximum(self.damping, drains), 1e-6)
 
-    def start(self, *, lift: Any = 1.0, speed: Number = 0.0, pressure: Any = 12.0) -> ValveState:
+    def start(
+        self, *, lift: Number = 1.0, speed: Number = 0.0, pressure: Number = 12.0
+    ) -> ValveState:
         """An open valve by default, its lift about to fall."""
         return ValveState(
             number("lift", lift), number("speed", speed), number("pressure", pressure)

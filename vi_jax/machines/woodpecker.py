@@ -220,8 +220,9 @@ class Woodpecker(AutonomousMachine):
         return eqx.tree_at(lambda x: (x.height, x.drop), state, (at, -state.height))
 
     def start(
-        self, *, height: Number = 0.0, sleeve_angle: Any = None, bird_angle: Any = None,
-        speed: Number = -0.34, sleeve_rate: Any = 0.0, bird_rate: Any = -7.5,
+        self, *, height: Number = 0.0, sleeve_angle: Number | None = None,
+        bird_angle: Number | None = None, speed: Number = -0.34, sleeve_rate: Number = 0.0,
+        bird_rate: Number = -7.5,
     ) -> WoodpeckerState:  # fmt: skip
         """A state that is near to the cycle of the default numbers: on the section, the sleeve on
         its lower edge and sliding down, the bird swinging away.
@@ -242,6 +243,6 @@ class Woodpecker(AutonomousMachine):
         """As its numbers say, and with play."""
         return super().in_range(start) & (self.play > 0)
 
-    def sketch(self, pen: Any, state: WoodpeckerState, phase: float) -> None:
+    def sketch(self, pen: object, state: WoodpeckerState, phase: float) -> None:
         """Pole, sleeve, spring and bird, as large as they are."""
         draw_woodpecker(self, pen, state)

@@ -45,7 +45,7 @@ class Flight(eqx.Module):
         new, after, _ = self.method.step(smooth, s0, s1, state, beside)
         return ravel_pytree(new)[0], elapsed(passed, after, s1 - s0)
 
-    def once(self, function: Callable[["Flight", Any], Any], inputs: Any) -> Any:
+    def once(self, function: Callable[["Flight", Any], Any], inputs: object) -> Any:
         """A function of the flight and of one lane's numbers, evaluated as vector code (see
         `lanes.once`)."""
         numbers, rest = eqx.partition(self, eqx.is_array)

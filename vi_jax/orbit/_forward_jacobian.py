@@ -49,7 +49,7 @@ def forward_jacobian(f: Callable[..., Any]) -> Callable[..., Any]:
     return wrapped
 
 
-def _tied(out: Any, args: Any) -> Any:
+def _tied(out: object, args: object) -> Any:
     """`out`, batched by `vmap` in every leaf as soon as one of `args` is.
 
     JAX mixes up the axes of a staged custom derivative whose values are batched in other leaves

@@ -5,7 +5,7 @@ well as at any other: a number carried along in the state, a body that slides fr
 a family, of which the one nearest to the guess is looked for; or there is none, where it drifts.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax.lax import stop_gradient
@@ -18,7 +18,7 @@ Matrix = Float[Array, "n n"]
 _STEEP = 1e3
 
 
-def rounding(dtype: Any) -> float:
+def rounding(dtype: object) -> float:
     """The share of the greatest singular value below which one is zero to rounding: 2e-12 in double
     and 6e-6 in single precision."""
     return float(jnp.finfo(dtype).eps) ** 0.75

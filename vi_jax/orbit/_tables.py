@@ -109,7 +109,7 @@ def table_of(
     return with_units(xr.Dataset(data, attrs={"parameter": parameter}), units, named)
 
 
-def _numbers(found: Any) -> dict[str, np.ndarray]:
+def _numbers(found: object) -> dict[str, np.ndarray]:
     """Numbers by name, of what a function of an orbit returned."""
     named = found if isinstance(found, Mapping) else {"value": found}
     numbers = {str(name): np.asarray(x) for name, x in named.items()}

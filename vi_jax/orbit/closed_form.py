@@ -17,7 +17,6 @@ the printed Eq. 21 lacks the factor ζ of the cosine and so misses the boundary 
 """
 
 from math import pi
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +24,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from .._checks import count
 from .._programs import compiled
-from .._types import Flag, Scalar
+from .._types import Flag, Number, Scalar
 from ..flow import lack_of_closed_form
 from ..machine import IdealDrive, Scene, Shown
 from .floquet import eigenvalues
@@ -122,7 +121,7 @@ def _compiled_orbits(zeta, xi, k, d, section, *, n: int) -> ClosedFormOrbits:
 
 
 def one_impact_orbits(
-    zeta: Any, xi: Any, k: Any, d: Any, n: int, section: Any = 0.0
+    zeta: Number, xi: Number, k: Number, d: Number, n: int, section: Number = 0.0
 ) -> ClosedFormOrbits:
     """`closed_form_orbits` on bare dimensionless scalars.
 

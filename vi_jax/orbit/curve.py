@@ -98,7 +98,7 @@ def first_tangent(residual: Callable[[Vector], Vector], x: Vector, scale: Vector
     return tangent * jnp.where(tangent[-1] < 0, -1.0, 1.0)
 
 
-def check_walk(*, step: Any, max_step: Any, max_points: Any) -> dict[str, Any]:
+def check_walk(*, step: object, max_step: object, max_points: object) -> dict[str, Any]:
     """The settings of `walk`. **Raises:** `ValueError` or `TypeError` that names the wrong one."""
     return {
         "step": given_number("step", step, low=0.0, open_low=True),
@@ -155,6 +155,6 @@ def walk(
     return "max_points"
 
 
-def array_of(tree: Any) -> Any:
+def array_of(tree: object) -> Any:
     """Host copies of a compiled call's results, so that what follows costs no dispatch."""
     return jax.tree.map(lambda x: np.asarray(x) if eqx.is_array(x) else x, tree)

@@ -1,7 +1,6 @@
 """Which of many found orbits are different motions."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -61,7 +60,7 @@ def distinct_among(batches: Sequence[Orbit], tolerance: float) -> tuple[Orbits, 
     for which, orbits in enumerate(batches):
         shape = orbits.residual.shape
 
-        def in_one_row(x: Any, shape: tuple[int, ...] = shape) -> np.ndarray:
+        def in_one_row(x: object, shape: tuple[int, ...] = shape) -> np.ndarray:
             x = np.asarray(x)
             return x.reshape(-1, *x.shape[len(shape) :])
 

@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -16,7 +15,7 @@ from .._checks import count, flag
 from .._numbers import concrete
 from .._programs import compiled
 from .._renamed import renamed
-from .._types import State
+from .._types import Number, State
 from ..flow import MethodLike, check_leaves, means
 from ..machine import AbstractMachine
 from ._arcs import by_the_first_state, error_of, in_order, moved_from_impacts, observe_arc
@@ -42,7 +41,7 @@ def find_orbit(
     *,
     root_finder: AbstractRootFinder | None = None,
     method: MethodLike = None,
-    section: Any = None,
+    section: Number | None = None,
     impact_log: int = 8,
     throw: bool = False,
 ) -> Orbit:

@@ -65,7 +65,7 @@ def _machine(torque: Any, kappa: Any, k: Any, c: Any) -> Scene:
 
 
 @eqx.filter_jit
-def _searched(cycles: int, lanes: Any, kappa: Any, guess: Any) -> Orbit:
+def _searched(cycles: int, lanes: object, kappa: object, guess: object) -> Orbit:
     """One orbit for each row of `lanes`, which holds (T0, k, c)."""
 
     def one(lane, kappa, guess):
@@ -107,7 +107,7 @@ def _tuned(cycles: int) -> list[TableRow]:
 
 
 @eqx.filter_jit
-def _simulated(kappa: Any, starts: Any) -> Run:
+def _simulated(kappa: object, starts: object) -> Run:
     def one(torque, kappa, start):
         scene = _machine(torque, kappa, RESTITUTION, 0.0)
         begin = scene.start(Y=start[0], V=start[1], W=start[2])

@@ -107,7 +107,7 @@ def stepped_finely(ratios: np.ndarray) -> np.ndarray:
     return (ratios >= FINE[0]) & (ratios <= FINE[1])
 
 
-def with_numbers(scene: Scene, k: Any, xi: Any, ratio: Any) -> Any:
+def with_numbers(scene: Scene, k: object, xi: object, ratio: object) -> Any:
     """The scene with this k at every stop, this ξ and this ζ."""
     for name, value in ((BOUNCE, k), (DAMPING, xi), (RATIO, ratio)):
         scene = with_leaf(scene, name, value)

@@ -121,7 +121,7 @@ def _frames(
     ends = np.interp([low, high], cycles[inside], time[inside])
     at = np.interp(np.linspace(ends[0], ends[1], number), time[inside], cycles[inside])
 
-    def between(x: Any) -> np.ndarray:
+    def between(x: object) -> np.ndarray:
         x = np.asarray(x, float)[inside]
         rows = [np.interp(at, cycles[inside], row) for row in x.reshape(len(x), -1).T]
         return np.stack(rows, axis=-1).reshape(-1, *x.shape[1:])

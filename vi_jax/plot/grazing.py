@@ -81,12 +81,12 @@ def _dots(offset: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, np.ndar
     return np.repeat(offset, up.shape[1]), up.ravel()
 
 
-def _root(x: Any) -> np.ndarray:
+def _root(x: object) -> np.ndarray:
     """The square root, continued as an odd function."""
     x = np.asarray(x, float)
     return np.sign(x) * np.sqrt(np.abs(x))
 
 
-def _square(x: Any) -> np.ndarray:
+def _square(x: object) -> np.ndarray:
     x = np.asarray(x, float)
     return np.sign(x) * x * x

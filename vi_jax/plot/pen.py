@@ -108,7 +108,7 @@ class Pen:
         self._along(start, end, [piston, piston], [-0.7 * half, 0.7 * half], lw=2.0)
         self._along(start, end, [piston, length], [0, 0], lw=1.3)
 
-    def _along(self, start: Point, end: Point, along: Any, across: Any, **look: Any) -> None:
+    def _along(self, start: Point, end: Point, along: object, across: object, **look: Any) -> None:
         """A line in coordinates along and across the way from one point to another.
 
         **Arguments:** `along` and `across`, coordinates of its points; `look`, options of

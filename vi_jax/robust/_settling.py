@@ -57,7 +57,7 @@ class Settling:
         self.tell: Tell = silent
         """Told of each start that is judged."""
 
-    def state(self, row: Any) -> State:
+    def state(self, row: object) -> State:
         """A state from its numbers."""
         return ravel_pytree(self.like)[1](jnp.asarray(row))
 
@@ -146,7 +146,7 @@ class Settling:
 
 
 def advanced(
-    the_map: CycleMap, like: State, rows: Any, cycles: int, wanted: Any
+    the_map: CycleMap, like: State, rows: object, cycles: int, wanted: object
 ) -> tuple[Rows, Bool[np.ndarray, " lanes"], Bool[np.ndarray, " lanes"]]:
     """States so many cycles later, whether they got there, and whether they were no starts."""
     found = _advanced(the_map, like, jnp.asarray(rows), jnp.asarray(cycles), jnp.asarray(wanted))

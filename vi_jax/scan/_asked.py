@@ -59,7 +59,7 @@ MEASURES: Mapping[str, Callable[[], AbstractMeasure]] = {
 }
 
 
-def measures_of(measure: Any, averages: Sequence[str] = ()) -> tuple[AbstractMeasure, ...]:
+def measures_of(measure: object, averages: Sequence[str] = ()) -> tuple[AbstractMeasure, ...]:
     """Measures by name, as objects, or functions of a machine and a run; one or several. A name may
     be that of one of the machine's own `averages`, which comes first.
 
@@ -75,7 +75,7 @@ def measures_of(measure: Any, averages: Sequence[str] = ()) -> tuple[AbstractMea
     return found
 
 
-def _measure(one: Any, averages: Sequence[str]) -> AbstractMeasure:
+def _measure(one: object, averages: Sequence[str]) -> AbstractMeasure:
     if isinstance(one, AbstractMeasure):
         return one
     if isinstance(one, str):

@@ -113,7 +113,7 @@ def basins(
 def sorted_out(
     data: "xr.Dataset",
     machine: AbstractMachine,
-    begin: Any,
+    begin: object,
     *,
     apart: float,
     longest: int,
@@ -148,7 +148,7 @@ def sorted_out(
     return Basins(data, attractors, parts, machine)
 
 
-def _at_stop(data: "xr.Dataset", machine: AbstractMachine, begin: Any) -> list[str]:
+def _at_stop(data: "xr.Dataset", machine: AbstractMachine, begin: object) -> list[str]:
     """Edges of the region beyond which no start can be, such as `"start.Y high"`, for a stop is
     there: in the middle of each edge a start inside of it is looked at, and one beyond."""
     rows = {str(name): np.asarray(data[name]) for name in data["period"].dims}
@@ -165,7 +165,7 @@ def _at_stop(data: "xr.Dataset", machine: AbstractMachine, begin: Any) -> list[s
     return found
 
 
-def _can_be(machine: AbstractMachine, begin: Any, values: Mapping[str, float]) -> bool:
+def _can_be(machine: AbstractMachine, begin: object, values: Mapping[str, float]) -> bool:
     """Whether a start with these parts can be simulated."""
     for name, value in values.items():
         begin = with_leaf(begin, name.removeprefix(START), value)

@@ -42,7 +42,7 @@ class Workplace(NamedTuple):
     cluster: Any
 
 
-def workplace(workers: int | None, devices: int | None, cluster: Any) -> Workplace:
+def workplace(workers: int | None, devices: int | None, cluster: object) -> Workplace:
     """As many threads and devices as are asked for, or as there are.
 
     **Raises:** `ValueError` for more devices than there are.

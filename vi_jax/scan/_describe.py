@@ -27,7 +27,7 @@ from .store import NOT_COMPUTED, UNVERIFIABLE, Variable
 def description_of(program: ScanProgram, blocks: Blocks) -> dict[str, Any]:
     """What makes two scans the same, in words and numbers that JSON can hold."""
 
-    def described(tree: Any) -> str:
+    def described(tree: object) -> str:
         return _lasting(eqx.tree_pformat(tree, short_arrays=False, width=10**6))
 
     machine: dict[str, Any]
@@ -106,7 +106,7 @@ def _codes(program: ScanProgram) -> dict[str, str]:
     return found
 
 
-def _described(x: Any) -> Any:
+def _described(x: object) -> Any:
     return np.asarray(x, float).tolist()
 
 

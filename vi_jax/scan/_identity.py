@@ -26,7 +26,7 @@ class Unverifiable(Exception):
     """Something whose code or content cannot be looked at."""
 
 
-def identity(thing: Any) -> str:
+def identity(thing: object) -> str:
     """A digest of a function, or of an object: its code, and all that it refers to.
 
     Code is what Python runs, so that comments and line breaks may change. A function refers to its
@@ -44,7 +44,7 @@ def identity(thing: Any) -> str:
     return digest.hexdigest()[:16]
 
 
-def _words(thing: Any, seen: dict[int, Any]) -> Iterator[str]:
+def _words(thing: object, seen: dict[int, Any]) -> Iterator[str]:
     """The words that `thing` is made of. `seen` holds what was begun: things refer in rings."""
     yield type(thing).__qualname__
     if isinstance(thing, _PLAIN):
@@ -131,7 +131,7 @@ def _full(cell: types.CellType) -> bool:
         return False
 
 
-def _global(thing: Any, names: set[str], seen: dict[int, Any]) -> Iterator[str]:
+def _global(thing: object, names: set[str], seen: dict[int, Any]) -> Iterator[str]:
     """What a function may use of a global: of a user's module, what it may name there."""
     yield from _words(thing, seen)
     if isinstance(thing, types.ModuleType) and not _library(thing.__name__):
@@ -167,7 +167,7 @@ def _class(kind: type, seen: dict[int, Any]) -> Iterator[str]:
             yield from _words(value, seen)
 
 
-def _object(thing: Any, seen: dict[int, Any]) -> Iterator[str]:
+def _object(thing: object, seen: dict[int, Any]) -> Iterator[str]:
     """An object by its class and its content."""
     fields = dict(getattr(thing, "__dict__", {}))
     for kind in type(thing).__mro__:

@@ -132,7 +132,7 @@ class IntegrityProfile(NamedTuple):
 def integrity_profile(
     machine: AbstractMachine,
     parameter: str,
-    values: Any,
+    values: object,
     region: Mapping[str, tuple[float, float]],
     *,
     resolution: int | tuple[int, ...] = 64,

@@ -45,7 +45,7 @@ def lyapunov(
     start: State,
     cycles: int = 400,
     *,
-    settle: Any = 200,
+    settle: object = 200,
     number: int | None = None,
     method: MethodLike = None,
     rests: bool | None = None,

@@ -81,8 +81,8 @@ class Shaken(eqx.Module):
 
 
 def shaken_by(
-    noise: Any,
-    key: Any,
+    noise: object,
+    key: object,
     axes: Iterable[str],
     derivatives: Iterable[str],
     measures: Iterable[AbstractMeasure],

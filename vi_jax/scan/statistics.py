@@ -80,7 +80,7 @@ class _Observed(AbstractMeasure):
         return found, found
 
 
-def _checked_of(name: Any) -> None:
+def _checked_of(name: object) -> None:
     if not callable(name):
         instance_of("of", name, str, "the name of a quantity, or a function of machine and run")
 

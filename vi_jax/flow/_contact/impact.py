@@ -1,7 +1,5 @@
 """The impacts of one instant: one blow on a stop, or a sequence between bodies that touch."""
 
-from typing import Any
-
 import jax.numpy as jnp
 
 from ..._types import Flag, State
@@ -59,5 +57,5 @@ def _one_blow(
     return arrival, {k: blow}
 
 
-def _is_one(mass: Any) -> bool:
+def _is_one(mass: object) -> bool:
     return isinstance(mass, float) and mass == 1.0

@@ -76,7 +76,7 @@ def change_of(change: Vector, y: Vector) -> Scalar:
     return jnp.where(jnp.isfinite(size), size, jnp.inf)
 
 
-def weighted(weights: np.ndarray, stages: list, base: Any = None) -> Any:
+def weighted(weights: np.ndarray, stages: list, base: object = None) -> Any:
     """base + Σ weight·stage, leaf by leaf, without the zero weights."""
     used = [(float(w), stage) for w, stage in zip(weights, stages, strict=False) if w != 0]
 

@@ -113,7 +113,7 @@ def _steady(machine: ModalMachine, s: Scalar) -> tuple[Any, Any]:
     return constant + cosine * c + sine * d, omega * (sine * c - cosine * d)
 
 
-def _closed(machine: ModalMachine, s: Scalar, h: Scalar, q: Any, p: Any) -> tuple[Any, Any]:
+def _closed(machine: ModalMachine, s: Scalar, h: Scalar, q: object, p: object) -> tuple[Any, Any]:
     """Each mode by itself: q'' + c q' + κ q = f."""
     half = 0.5 * machine.damping
     square = machine.stiffness - half * half

@@ -47,7 +47,7 @@ def expand(
     return treedef, series
 
 
-def along(function: Callable[[State], Scalar], treedef: Any, series: list[Series]) -> "Along":
+def along(function: Callable[[State], Scalar], treedef: object, series: list[Series]) -> "Along":
     """A scalar function of the state along a motion, as a power series; `treedef` and `series` as
     from `expand`."""
 
@@ -116,7 +116,7 @@ class _Flow:
             names[var] = [const]
         names.update(zip(jaxpr.invars, args, strict=True))
 
-        def read(atom: Any) -> Series:
+        def read(atom: object) -> Series:
             if isinstance(atom, Literal):
                 return [np.asarray(atom.val, getattr(atom.aval, "dtype", None))]
             return names[atom]

@@ -1,7 +1,5 @@
 """Which method moves a machine: one that is given, a preset by its name, or the default."""
 
-from typing import Any
-
 from ..._checks import one_of
 from ..._renamed import renamed
 from ...machine import AbstractMachine
@@ -57,7 +55,7 @@ def _named(machine: AbstractMachine | None, name: str, argument: str) -> Abstrac
 
 def chosen(
     machine: AbstractMachine | None,
-    method: Any,
+    method: object,
     otherwise: AbstractMethod | None = None,
     *,
     argument: str = "method",

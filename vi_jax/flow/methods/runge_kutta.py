@@ -1,7 +1,5 @@
 """Steps by a diffrax Runge–Kutta solver, sized by its error or of fixed number."""
 
-from typing import Any
-
 import diffrax
 import equinox as eqx
 import jax
@@ -19,7 +17,7 @@ from .unrolled import Unrolled
 from .verner import Verner9
 
 
-def _unrolled(solver: Any) -> Unrolled:
+def _unrolled(solver: object) -> Unrolled:
     return solver if isinstance(solver, Unrolled) else Unrolled(solver)
 
 

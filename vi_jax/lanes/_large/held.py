@@ -136,7 +136,7 @@ def same(a: Held, b: Held) -> bool:
     return alike and (a.shape, a.strides, a.offset) == (b.shape, b.strides, b.offset)
 
 
-def table(t: Text, array: Any, kind: str) -> Large:
+def table(t: Text, array: object, kind: str) -> Large:
     """A large array known while the code is written, as constants in the module's text."""
     array = np.asarray(array)
     numbers = array.reshape(-1)
