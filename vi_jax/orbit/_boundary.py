@@ -1,14 +1,10 @@
 """`boundary`: curves of folds, period doublings, lost symmetries and grazings."""
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from .._at_work import at_work
 from .._checks import flag, interval
@@ -16,25 +12,18 @@ from .._interrupted import Interrupted
 from .._lazy import xr
 from ..flow import tidy
 from ..machine import check_leaf, leaf, with_units
-from ._conditions import AbstractCondition
+from ._curve_monitor import CurveMonitor, Intervals
 from ._fixed_step_method import steps_of
 from ._problem import check_parameter
 from ._shooting import Shooting
 from ._solution import orbit_of
-from ._solve import Unknowns, jacobian_at, tangent_at
-from ._solve import advance as solved
-from ._symmetry import images, may_be_symmetric
+from ._solve import tangent_at
+from ._special_condition import Special, symmetry_condition
+from ._symmetry import may_be_symmetric
 from ._tables import stability_in_words
 from .curve import INTERRUPTED, Step, check_walk, walk
 from .results import InWords, Orbit
 from .special import DOUBLING, FOLD, GRAZING, SYMMETRY, SpecialPoint
-
-# What lies below zero by no more than this is zero to rounding: a choice, a hundred times the
-# corrector's tolerance.
-_NOISE = 1e-9
-
-# Of the first and of the second parameter.
-Intervals = tuple[tuple[float, float], tuple[float, float]]
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -57,11 +46,12 @@ class Boundary(InWords):
     clearance: np.ndarray
     """Smallest distance to a stop at a turn that does not touch it."""
     ends: tuple[str, str]
-    """Why the curve ends on each side: "bounds", "grazing" (an impact more or less), "stalled",
-    "max_points", "interrupted"."""
+    """Why the curve ends on each side: "bounds", "grazing" (an impact more or less), "closed" (it
+    has come back to its first point, which is its last one as well), "stalled", "max_points",
+    "interrupted"."""
     problem: Shooting = dataclasses.field(repr=False)
     steps: list[Step] = dataclasses.field(repr=False)
-    condition: "Special" = dataclasses.field(repr=False)
+    condition: Special = dataclasses.field(repr=False)
     scale: np.ndarray = dataclasses.field(repr=False)
 
     def orbit(self, index: int) -> Orbit:
@@ -134,20 +124,13 @@ def boundary(
     scale = np.ones(x.size)
     scale[-2:] = [0.5 * (high - low) for low, high in bounds]
 
-    def advance(x: Unknowns, tangent: Unknowns, length: float) -> Step:
-        return solved(problem, x, tangent, scale, length)
-
-    start = advance(x, tangent_at(problem, x, scale), 0.0)
+    ahead, back = (CurveMonitor(problem, condition, scale, bounds) for _ in range(2))
+    start = ahead.advance(x, tangent_at(problem, x, scale), 0.0)
     if not bool(start.good):
         raise ValueError(
             "Argument `point` could not be refined in two parameters (last correction "
             f"{float(start.size):.2g})."
         )
-
-    def stop(here: Step, new: Step) -> tuple[Step, str] | None:
-        if not _inside(new, bounds):
-            return _cut(advance, here, new, bounds, scale), "bounds"
-        return (here, "grazing") if condition.another_grazes(new) else None
 
     forward, backward = [start], [start._replace(tangent=-start.tangent)]
     ends = [INTERRUPTED, INTERRUPTED]
@@ -160,8 +143,11 @@ def boundary(
         return Interrupted("walk along the boundary", curve())
 
     with at_work("boundary", kept, progress=progress, unit="point") as tell:
-        ends[1] = walk(advance, forward, stop=stop, tell=tell, **settings)
-        ends[0] = walk(advance, backward, stop=stop, tell=tell, **settings)
+        ends[1] = walk(ahead.advance, forward, stop=ahead.stop, tell=tell, **settings)
+        if ends[1] == "closed":
+            ends[0] = ends[1]
+        else:
+            ends[0] = walk(back.advance, backward, stop=back.stop, tell=tell, **settings)
     return curve()
 
 
@@ -210,7 +196,7 @@ def _checked_bounds(point: SpecialPoint, parameter: str, bounds: Any) -> Interva
 
 def _special_motion(
     point: SpecialPoint, parameter: str, bounds: Intervals
-) -> tuple[Shooting, "Special", np.ndarray]:
+) -> tuple[Shooting, Special, np.ndarray]:
     """The equations of the curve, the condition among them that makes its motions special, and
     their unknowns at the point where it begins."""
     old = point.problem
@@ -227,13 +213,13 @@ def _special_motion(
                 "Argument `parameter` must leave the machine its symmetry, but with another "
                 f"{parameter} a motion is not its own image."
             )
-        symmetry = _symmetry_condition(problem, x)
+        symmetry = symmetry_condition(problem, x)
     condition = Special(point.kind, point.impact, symmetry)
     return dataclasses.replace(problem, conditions=(condition,)), condition, x
 
 
 def _curve(
-    problem: Shooting, condition: "Special", path: list[Step], ends: tuple[str, str],
+    problem: Shooting, condition: Special, path: list[Step], ends: tuple[str, str],
     scale: np.ndarray,
 ) -> Boundary:  # fmt: skip
     seen = [step.seen for step in path]
@@ -251,99 +237,3 @@ def _curve(
         condition=condition,
         scale=scale,
     )
-
-
-class SymmetryCondition(eqx.Module):
-    """The condition that a motion is its own image under the symmetry of its machine, in the place
-    of one of its equations.
-
-    The motions x of the equations F(x, p) = 0 from event to event are symmetric where D(x), their
-    difference from their own image (`images`), vanishes. Where they lose their symmetry F cannot be
-    solved for x: its Jacobian J = ∂F/∂x has a null vector r, along which the motion departs from
-    its image, and a left null vector l, so that l·F = 0 is met by every symmetric motion close by
-    to first order. That combination of the equations gives way to w·D = 0, where w picks out of D
-    how far the motion has gone along r:
-
-        F + l (w·D - l·F) = 0,   w = DD r/|DD r|²,   DD the derivative of D by x.
-
-    These equations are regular, and the curve's own condition det(M - I) = 0 is added to them.
-    """
-
-    left: Float[Array, " equations"]
-    """l, the left null vector of J where the symmetry is lost."""
-    weight: Float[Array, " differences"]
-    """w, which picks out of D how far the motion has gone along r."""
-
-    def instead(self, problem: Shooting, missing: Array, x: Array) -> Array:
-        """The equations' residual F, given as `missing`, with the combination l·F exchanged for
-        w·D."""
-        departs = self.weight @ images(problem, x)
-        return missing + self.left * (departs - self.left @ missing)
-
-
-def _symmetry_condition(problem: Shooting, x: np.ndarray) -> SymmetryCondition:
-    """The condition at a motion that loses its symmetry, by the singular vectors of its Jacobian
-    without the columns of the parameters."""
-    count = len(problem.parameters)
-    left, _, right = np.linalg.svd(np.asarray(jacobian_at(problem, jnp.asarray(x)))[:, :-count])
-    direction = jnp.append(jnp.asarray(right[-1]), jnp.zeros(count))
-    change = jax.jvp(lambda x: images(problem, x), (jnp.asarray(x),), (direction,))[1]
-    return SymmetryCondition(jnp.asarray(left[:, -1]), change / (change @ change))
-
-
-class Special(AbstractCondition):
-    """The condition that a motion is special.
-
-    With the monodromy matrix M that is det(M - I) = 0 at a fold or where a symmetry is lost,
-    det(M + I) = 0 at a period doubling; at a grazing V⁻ = 0 of the impact that is lost, or a
-    clearance of zero.
-    """
-
-    kind: str = eqx.field(static=True)
-    impact: int | None = eqx.field(static=True)
-    """The event that grazes; `None` at a touch, and where nothing grazes."""
-    symmetry: SymmetryCondition | None = None
-
-    def exchanged(self, problem, x, missing):
-        """Where a symmetry is lost, one of the equations is exchanged (see `SymmetryCondition`)."""
-        return missing if self.symmetry is None else self.symmetry.instead(problem, missing, x)
-
-    def missing(self, problem, x, seen):
-        """The determinant, V⁻ or the clearance."""
-        identity = jnp.eye(seen.monodromy.shape[0], dtype=x.dtype)
-        if self.kind == GRAZING:
-            return seen.nearest.room if self.impact is None else seen.approach[self.impact]
-        sign = 1 if self.kind == DOUBLING else -1
-        return jnp.linalg.det(seen.monodromy + sign * identity)
-
-    def another_grazes(self, step: Step) -> bool:
-        """Whether an impact beside the one that grazes here is lost, or a stop is touched."""
-        # In a symmetric motion another impact grazes as well, to rounding.
-        others = [v + _NOISE for i, v in enumerate(step.seen.approach) if i != self.impact]
-        # At a grazing the body turns on the stop, to rounding.
-        touching = self.kind == GRAZING and self.impact is None
-        passed = not touching and step.seen.nearest.room < -_NOISE
-        return bool(min(others, default=1.0) <= 0 or passed)
-
-
-def _inside(step: Step, bounds: Intervals) -> bool:
-    return all(low <= x <= high for x, (low, high) in zip(step.x[-2:], bounds, strict=True))
-
-
-def _cut(
-    advance: Callable[..., Step], here: Step, new: Step, bounds: Intervals, scale: np.ndarray
-) -> Step:
-    """The last point inside the bounds between two, found by halving the step.
-
-    **Arguments:** `advance` as for `walk`; `here` and `new`, inside and outside; `scale`, the size
-    of each unknown.
-    """
-    low, high = 0.0, float(np.dot(here.tangent, (new.x - here.x) / scale))
-    last = here
-    for _ in range(30):
-        middle = 0.5 * (low + high)
-        step = advance(here.x, here.tangent, middle)
-        inside = bool(step.good) and _inside(step, bounds)
-        low, high = (middle, high) if inside else (low, middle)
-        last = step if inside else last
-    return last

@@ -1,7 +1,7 @@
 """Tests for bifurcations along a branch, and the place where branches cross."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -40,18 +40,27 @@ def changed_between(before: dict[str, float], after: dict[str, float]) -> list[s
     return changed
 
 
-def crossing(
-    along: Callable[[float], Step | None], root: float, kind: str
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """The point where branches cross, from points on both sides, by a test that is zero there.
+class Crossing(NamedTuple):
+    """A point at which the equations of a curve cannot be solved, but which it passes smoothly."""
 
-    Close to it the equations cannot be solved, but the branch passes through it smoothly, so that a
+    x: np.ndarray
+    tangent: np.ndarray
+    monodromy: np.ndarray
+
+
+def crossing(
+    along: Callable[[float], Step | None], root: float, test: Callable[[Step], float]
+) -> Crossing | None:
+    """The point of a curve at which a test is zero, where its equations are singular: where
+    branches cross, or where an impact grazes.
+
+    Close to it the equations cannot be solved, but the curve passes through it smoothly, so that a
     polynomial through its neighbours tells where it is, and what the motion is there.
 
-    **Arguments:** `along`, the branch's point at a length along a tangent, `None` where there is
-    none; `root`, about where they cross; `kind`, whose test it is.
+    **Arguments:** `along`, the curve's point at a length along a tangent, `None` where there is
+    none; `root`, about where it is; the test.
 
-    **Returns:** its unknowns and its tangent; `None` if too few points were found, or no zero.
+    **Returns:** it; `None` if too few points were found, or no zero.
     """
     found: dict[float, Step] = {}
     for side, wanted in ((-BESIDE, 3), (BESIDE, 6)):
@@ -68,14 +77,19 @@ def crossing(
     def through(values: Any) -> np.polynomial.Polynomial:
         return np.polynomial.Polynomial.fit(places, values, len(places) - 1)
 
-    zeros = through([np.asarray(tests_of(step)[kind]) for step in beside]).roots()
+    zeros = through([np.asarray(test(step)) for step in beside]).roots()
     zeros = zeros[np.abs(zeros.imag) < 1e-12].real
     if not zeros.size or np.abs(zeros).min() > BESIDE:
         return None
     place = zeros[np.argmin(np.abs(zeros))]
 
     def there(get: Callable[[Step], Any]) -> np.ndarray:
-        return np.stack([through(x)(place) for x in zip(*map(get, beside), strict=True)])
+        values = np.stack([np.asarray(get(step)) for step in beside])
+        flat = [through(x)(place) for x in values.reshape(len(values), -1).T]
+        return np.asarray(flat).reshape(values.shape[1:])
 
     tangent = there(lambda step: step.tangent)
-    return there(lambda step: step.x), tangent / np.linalg.norm(tangent)
+    return Crossing(
+        there(lambda step: step.x), tangent / np.linalg.norm(tangent),
+        there(lambda step: step.seen.monodromy),
+    )  # fmt: skip

@@ -1,5 +1,11 @@
 """What is said of the special points of a branch, by their kinds."""
 
+import jax.numpy as jnp
+import numpy as np
+
+from ._events import Event
+from ._shooting import Shooting
+from .curve import Step
 from .special import CROSSING, DOUBLING, FOLD, SYMMETRY, TORUS, TURN
 
 # Stand in the place of the number of an impact, for what grazes without being one.
@@ -19,3 +25,19 @@ DETAILS = {
 
 # The same of a fold where numbers are held: the parameter alone would turn back.
 HELD_FOLD = "a multiplier passes 1"
+
+
+def grazing_in_words(problem: Shooting, at: Step, impact: int | None) -> str:
+    """What a motion loses, if that is an impact, or touches, and where within its period."""
+    machine, x = problem.machine, jnp.asarray(at.x)
+    if impact is None:
+        touched, clock = int(at.seen.nearest.event), float(at.seen.nearest.clock)
+        guard = f"the guard of {Event(touched).called(machine)}"
+        what = "touches a stop" if touched < len(machine.stops) else f"touches {guard}"
+    else:
+        clock = float(np.asarray(problem.parts(x)[0])[impact])
+        lost = problem.events[impact].of(machine)
+        what = f"the {lost.name or lost.word}"
+    # Clocks are counted within one period from the section on.
+    place = machine.place_of(clock % float(problem.period(x)), problem.cycles)
+    return f"{what} at {place}" + ("" if impact is None else " is lost")
