@@ -11,7 +11,7 @@ class Kicked(vi.AbstractMachine):
 
     a: jax.Array = eqx.field(converter=jnp.asarray)
     b: jax.Array = eqx.field(converter=jnp.asarray)
-    stops: tuple = ()
+    stops: tuple = eqx.field(default=(), kw_only=True)
 
     @property
     def cycle(self):
@@ -43,3 +43,28 @@ class Kicked(vi.AbstractMachine):
 
 def at(*x):
     return tuple(jnp.asarray(y, float) for y in x)
+
+
+# Powers of x, y, a and b.
+POWERS = (
+    (0, 0, 0, 0), (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (2, 0, 0, 0), (1, 1, 0, 0),
+    (0, 2, 0, 0), (3, 0, 0, 0), (1, 0, 1, 0), (1, 0, 0, 1), (0, 1, 0, 1), (1, 0, 0, 2),
+    (3, 0, 0, 1),
+)  # fmt: skip
+
+
+class Polynomial(Kicked):
+    """Both numbers become polynomials of themselves and of a and b, all by the same programs."""
+
+    shares: jax.Array = eqx.field(kw_only=True)
+
+    def kick(self, x, y):
+        powers = [x**i * y**j * self.a**k * self.b**n for i, j, k, n in POWERS]
+        return tuple(self.shares @ jnp.stack(powers))
+
+
+def polynomial(a, b, *rows):
+    """The machine whose rows say by which factor each term enters."""
+    shares = [[row.get(power, 0.0) for power in POWERS] for row in rows]
+    assert all(power in POWERS for row in rows for power in row)
+    return Polynomial(a, b, shares=jnp.asarray(shares))

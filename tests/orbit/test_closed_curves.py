@@ -8,7 +8,6 @@ from scipy.optimize import brentq
 from kicked import Kicked, at
 from one_impact import one_impact
 
-
 pytestmark = pytest.mark.slow
 
 

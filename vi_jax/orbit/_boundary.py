@@ -1,6 +1,7 @@
 """`boundary`: curves of folds, period doublings, lost symmetries and grazings."""
 
 import dataclasses
+from functools import cached_property
 from typing import Any
 
 import jax.numpy as jnp
@@ -12,7 +13,8 @@ from .._interrupted import Interrupted
 from .._lazy import xr
 from ..flow import tidy
 from ..machine import check_leaf, leaf, with_units
-from ._curve_monitor import CurveMonitor, Intervals
+from ._codimension import points_of
+from ._curve_monitor import CurveMonitor, Intervals, cosine_of
 from ._fixed_step_method import steps_of
 from ._problem import check_parameter
 from ._shooting import Shooting
@@ -21,9 +23,10 @@ from ._solve import tangent_at
 from ._special_condition import Special, symmetry_condition
 from ._symmetry import may_be_symmetric
 from ._tables import stability_in_words
+from .codimension_two import CodimensionTwo
 from .curve import INTERRUPTED, Step, check_walk, walk
 from .results import InWords, Orbit
-from .special import DOUBLING, FOLD, GRAZING, SYMMETRY, SpecialPoint
+from .special import DOUBLING, FOLD, GRAZING, SYMMETRY, TORUS, SpecialPoint
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -32,7 +35,7 @@ class Boundary(InWords):
     machine's units (see `AbstractMachine.units`)."""
 
     kind: str
-    """"fold", "period-doubling", "symmetry-breaking" or "grazing"."""
+    """"fold", "period-doubling", "neimark-sacker", "symmetry-breaking" or "grazing"."""
     names: tuple[str, str]
     """Names of the two parameters."""
     parameters: np.ndarray
@@ -47,12 +50,27 @@ class Boundary(InWords):
     """Smallest distance to a stop at a turn that does not touch it."""
     ends: tuple[str, str]
     """Why the curve ends on each side: "bounds", "grazing" (an impact more or less), "closed" (it
-    has come back to its first point, which is its last one as well), "stalled", "max_points",
-    "interrupted"."""
+    has come back to its first point, which is its last one as well), of a curve of Neimark–Sacker
+    points "resonance-1:1" and "resonance-1:2" (the two multipliers become real), "stalled",
+    "max_points", "interrupted"."""
     problem: Shooting = dataclasses.field(repr=False)
     steps: list[Step] = dataclasses.field(repr=False)
     condition: Special = dataclasses.field(repr=False)
     scale: np.ndarray = dataclasses.field(repr=False)
+
+    @cached_property
+    def special(self) -> tuple[CodimensionTwo, ...]:
+        """The points of codimension two on the curve, in its order, each located to rounding; they
+        are looked for when they are first asked for."""
+        return points_of(self.problem, self.condition, self.steps, self.ends, self.scale)
+
+    @property
+    def angle(self) -> np.ndarray:
+        """The angle of the pair of multipliers that leaves the unit circle, in radians, at each
+        point; NaN on curves of other kinds."""
+        if self.kind != TORUS:
+            return np.full(len(self.steps), np.nan)
+        return np.arccos(np.clip([cosine_of(step) for step in self.steps], -1, 1))
 
     def orbit(self, index: int) -> Orbit:
         """The motion at one point."""
@@ -73,6 +91,8 @@ class Boundary(InWords):
         data["impact_speed"] = ("point", "impact"), self.impact_speed
         data["multipliers"] = ("point", "state"), self.multipliers
         data["stability"] = "point", stability_in_words(self.multipliers)
+        if self.kind == TORUS:
+            data["angle"] = "point", self.angle
         about = {"kind": self.kind, "ends": list(self.ends)}
         found = xr.Dataset(data, attrs={**about, "period_in_cycles": self.problem.cycles})
         found = with_units(found, self.problem.machine.units, {name: name for name in self.names})
@@ -80,11 +100,13 @@ class Boundary(InWords):
 
     def __str__(self) -> str:
         low, high = self.parameters.min(axis=0), self.parameters.max(axis=0)
-        return (
+        lines = [
             f"Curve of {len(self.parameters)} points of {self.kind}: {self.names[0]} in "
             f"[{low[0]:.6g}, {high[0]:.6g}], {self.names[1]} in [{low[1]:.6g}, {high[1]:.6g}]; "
-            f"ends: {self.ends[0]}, {self.ends[1]}"
-        )
+            f"ends: {self.ends[0]}, {self.ends[1]}",
+            *(f"  {point}" for point in self.special),
+        ]
+        return "\n".join(lines)
 
 
 def boundary(
@@ -101,17 +123,20 @@ def boundary(
 
     Pseudo-arclength on the orbit's equations together with the condition that makes the point
     special: det(M - I) = 0 for a fold or a symmetry breaking, det(M + I) = 0 for a period doubling,
-    V⁻ = 0 or a clearance of zero for a grazing. Host-side: not to be traced.
+    two multipliers whose product is 1 for a Neimark–Sacker bifurcation, V⁻ = 0 or a clearance of
+    zero for a grazing. Host-side: not to be traced.
 
     **Arguments:**
 
-    - `point`: from `Branch.special`; its parameter is the first of the two.
+    - `point`: from `Branch.special`, or by `switch` from a point of codimension two; its parameter
+      is the first of the two.
     - `parameter`: name of the second.
     - `bounds`: intervals of the first and of the second parameter.
     - `step`, `max_step`, `max_points`, `progress`: as for `continue_orbit`, parameters in half
       their intervals.
 
-    **Returns:** a `Boundary`. It ends where the motion ceases to be one (another impact grazes).
+    **Returns:** a `Boundary`, whose `special` are its points of codimension two. It ends where the
+    motion ceases to be one (another impact grazes).
 
     **Raises:** `ValueError` if the point is of another kind, outside the bounds, or the name
     unknown or the same; on Ctrl-C `Interrupted`, whose `partial` is the curve so far.
@@ -157,10 +182,10 @@ def _check_point(point: SpecialPoint) -> None:
         raise TypeError(
             f"Argument `point` must be a `SpecialPoint`, from `Branch.special`, but got {point!r}."
         )
-    if point.kind not in (FOLD, DOUBLING, SYMMETRY, GRAZING):
+    if point.kind not in (FOLD, DOUBLING, TORUS, SYMMETRY, GRAZING):
         raise ValueError(
-            "Argument `point` must be a fold, a period doubling, a symmetry breaking or a grazing, "
-            f"but is a {point.kind}."
+            "Argument `point` must be a fold, a period doubling, a Neimark–Sacker bifurcation, a "
+            f"symmetry breaking or a grazing, but is a {point.kind}."
         )
     if not point.problem.follows_events:
         raise ValueError(

@@ -12,14 +12,11 @@ from ._solve import advance, located, observe
 from ._special_condition import Special
 from .curve import Step
 from .floquet import multipliers_of
-from .special import GRAZING, TORUS
+from .special import GRAZING, RESONANCE_1, RESONANCE_2, TORUS
 
 # What lies below zero by no more than this is zero to rounding: a choice, a hundred times the
 # corrector's tolerance.
 _NOISE = 1e-9
-
-# Where a pair of multipliers that leaves the unit circle becomes real: the strong resonances.
-RESONANCE_1, RESONANCE_2 = "resonance-1:1", "resonance-1:2"
 
 # Of the first and of the second parameter.
 Intervals = tuple[tuple[float, float], tuple[float, float]]

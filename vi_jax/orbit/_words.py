@@ -6,7 +6,23 @@ import numpy as np
 from ._events import Event
 from ._shooting import Shooting
 from .curve import Step
-from .special import CROSSING, DOUBLING, FOLD, SYMMETRY, TORUS, TURN
+from .special import (
+    CROSSING,
+    CUSP,
+    DEGENERATE,
+    DEGENERATE_SYMMETRY,
+    DOUBLING,
+    FLIP,
+    FOLD,
+    RESONANCE_1,
+    RESONANCE_2,
+    RESONANCE_3,
+    RESONANCE_4,
+    RESONANT,
+    SYMMETRY,
+    TORUS,
+    TURN,
+)
 
 # Stand in the place of the number of an impact, for what grazes without being one.
 REORDERED, RESTS, ANEW = -1, -2, -3
@@ -21,6 +37,21 @@ DETAILS = {
     TURN: "the parameter turns back where it is followed under conditions",
     REORDERED: "two of its events fall together, and come in another order beyond",
     ANEW: "a switch goes into another mode: the motion sticks or slips anew",
+}
+
+# What is said of a point of codimension two.
+AT_CODIMENSION_TWO = {
+    CUSP: "two curves of folds meet and end",
+    DEGENERATE: "beyond, the motions of twice the period begin on the other side",
+    DEGENERATE_SYMMETRY: "beyond, the motions without symmetry begin on the other side",
+    FLIP: "multipliers 1 and -1: a curve of folds meets one of period doublings",
+    RESONANCE_1: "a double multiplier 1: a curve of Neimark–Sacker points begins",
+    RESONANCE_2: "a double multiplier -1: a curve of Neimark–Sacker points begins",
+    RESONANCE_3: "the angle of the multipliers is 2π/3",
+    RESONANCE_4: "the angle of the multipliers is π/2",
+    RESONANT: "a curve of folds and one of period doublings begin",
+    FOLD: "the motion that grazes has a multiplier 1",
+    DOUBLING: "the motion that grazes has a multiplier -1",
 }
 
 # The same of a fold where numbers are held: the parameter alone would turn back.
