@@ -36,7 +36,7 @@ def test_folds_meet_in_a_cusp():
         (0, 0, 0, 0): -0.02, (0, 0, 1, 0): 0.1, (1, 0, 0, 0): 0.99, (1, 0, 0, 1): 0.1,
         (3, 0, 0, 0): -0.1,
     }  # fmt: skip
-    first, second = special_of(polynomial(0.2, 0.4, terms, FADES), (0.0, 0.0), "fold")
+    first, _ = special_of(polynomial(0.2, 0.4, terms, FADES), (0.0, 0.0), "fold")
     curve = vi.boundary(first, parameter="b", bounds=FREE)
     a, b = curve.parameters.T
     np.testing.assert_allclose((a - 0.2) ** 2 / 4, ((b - 0.1) / 3) ** 3, atol=1e-10)

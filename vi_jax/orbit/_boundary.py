@@ -43,7 +43,8 @@ class Boundary(InWords):
     y_min: np.ndarray
     """Smallest position (of the first coordinate)."""
     multipliers: np.ndarray
-    """Floquet multipliers over the period; (points, states)."""
+    """Floquet multipliers over the period; (points, states). NaN at an end where an impact is lost,
+    where some of them have no limit."""
     impact_speed: np.ndarray
     """V⁻ of each impact; (points, impacts)."""
     clearance: np.ndarray

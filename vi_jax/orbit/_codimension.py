@@ -130,7 +130,7 @@ def _tests_of(problem: Shooting, condition: Special, scale: np.ndarray) -> dict[
 def _product(step: Step, sign: int) -> float:
     """det(M ± I)."""
     M = step.seen.monodromy
-    return float(np.linalg.det(M + sign * np.eye(len(M))))
+    return _determinant(M + sign * np.eye(len(M)))
 
 
 def _others(step: Step, sign: int) -> float:
@@ -138,7 +138,12 @@ def _others(step: Step, sign: int) -> float:
     principal minors of one row less, which unlike the eigenvalues is smooth."""
     M = step.seen.monodromy + sign * np.eye(len(step.seen.monodromy))
     minors = (np.delete(np.delete(M, i, 0), i, 1) for i in range(len(M)))
-    return float(sum(np.linalg.det(minor) for minor in minors))
+    return sum(map(_determinant, minors))
+
+
+def _determinant(matrix: np.ndarray) -> float:
+    """NaN of what is not finite, as where an impact is lost."""
+    return float(np.linalg.det(matrix)) if np.isfinite(matrix).all() else np.nan
 
 
 def _nulls(matrix: np.ndarray, like: Vectors | None) -> Vectors:

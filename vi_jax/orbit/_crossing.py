@@ -1,7 +1,7 @@
 """Tests for bifurcations along a branch, and the place where branches cross."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -40,17 +40,9 @@ def changed_between(before: dict[str, float], after: dict[str, float]) -> list[s
     return changed
 
 
-class Crossing(NamedTuple):
-    """A point at which the equations of a curve cannot be solved, but which it passes smoothly."""
-
-    x: np.ndarray
-    tangent: np.ndarray
-    monodromy: np.ndarray
-
-
 def crossing(
     along: Callable[[float], Step | None], root: float, test: Callable[[Step], float]
-) -> Crossing | None:
+) -> tuple[np.ndarray, np.ndarray] | None:
     """The point of a curve at which a test is zero, where its equations are singular: where
     branches cross, or where an impact grazes.
 
@@ -60,7 +52,7 @@ def crossing(
     **Arguments:** `along`, the curve's point at a length along a tangent, `None` where there is
     none; `root`, about where it is; the test.
 
-    **Returns:** it; `None` if too few points were found, or no zero.
+    **Returns:** its unknowns and its tangent; `None` if too few points were found, or no zero.
     """
     found: dict[float, Step] = {}
     for side, wanted in ((-BESIDE, 3), (BESIDE, 6)):
@@ -84,12 +76,7 @@ def crossing(
     place = zeros[np.argmin(np.abs(zeros))]
 
     def there(get: Callable[[Step], Any]) -> np.ndarray:
-        values = np.stack([np.asarray(get(step)) for step in beside])
-        flat = [through(x)(place) for x in values.reshape(len(values), -1).T]
-        return np.asarray(flat).reshape(values.shape[1:])
+        return np.stack([through(x)(place) for x in zip(*map(get, beside), strict=True)])
 
     tangent = there(lambda step: step.tangent)
-    return Crossing(
-        there(lambda step: step.x), tangent / np.linalg.norm(tangent),
-        there(lambda step: step.seen.monodromy),
-    )  # fmt: skip
+    return there(lambda step: step.x), tangent / np.linalg.norm(tangent)

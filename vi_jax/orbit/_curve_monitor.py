@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator
 
-import jax.numpy as jnp
 import numpy as np
 
 from ._closing import Closing
@@ -11,7 +10,6 @@ from ._shooting import Shooting
 from ._solve import advance, located, observe
 from ._special_condition import Special
 from .curve import Step
-from .floquet import multipliers_of
 from .special import GRAZING, RESONANCE_1, RESONANCE_2, TORUS
 
 # What lies below zero by no more than this is zero to rounding: a choice, a hundred times the
@@ -76,7 +74,7 @@ class CurveMonitor:
         yield at or here, GRAZING
 
     def _singular(self, here: Step, at: Step, test: Callable[[Step], float]) -> Step:
-        """The point at which an impact grazes, where the determinants have poles."""
+        """The point at which an impact grazes, where the monodromy matrix has a pole."""
 
         def along(length: float) -> Step | None:
             step = self.advance(here.x, here.tangent, length)
@@ -86,11 +84,12 @@ class CurveMonitor:
         found = crossing(along, root, test)
         if found is None:
             return at
-        # There M is what its entries tend to along the curve.
-        multipliers = np.asarray(multipliers_of(jnp.asarray(found.monodromy)))
-        seen = observe(self.problem, found.x)
-        seen = seen._replace(monodromy=found.monodromy, multipliers=multipliers)
-        return at._replace(x=found.x, tangent=found.tangent, seen=seen)
+        x, tangent = found
+        seen = observe(self.problem, x)
+        seen = seen._replace(
+            monodromy=np.nan * seen.monodromy, multipliers=np.nan * seen.multipliers
+        )
+        return at._replace(x=x, tangent=tangent, seen=seen)
 
     def _resonances(self, here: Step, last: Step) -> Iterator[tuple[Step, str]]:
         """Where a pair of multipliers on the unit circle becomes real: beyond, the product of two

@@ -303,7 +303,8 @@ class BranchMonitor:
         found = crossing(along, root, lambda step: tests_of(step)[kind])
         if found is None:
             return at
-        return at._replace(x=found.x, tangent=found.tangent, seen=observe(self.problem, found.x))
+        x, tangent = found
+        return at._replace(x=x, tangent=tangent, seen=observe(self.problem, x))
 
     def _images(self, step: Step) -> np.ndarray:
         """How far the motion is from being its own image; empty if it cannot be."""
