@@ -70,6 +70,28 @@ def test_a_branch_that_comes_near_itself_is_not_closed():
     assert beside > 30 * np.sqrt(0.5) / 500
 
 
+class Twisted(Kicked):
+    """z ← -z - G/5 in the plane, where G = 0 if x² - y² = a and x² + y² = 1: motions of two cycles
+    ±z, that are one another after a round of their isola."""
+
+    def kick(self, x, y):
+        first, second = x**2 - y**2 - self.a, x**2 + y**2 - 1
+        return -x - 0.2 * (x * first + y * second), -y - 0.2 * (y * first - x * second)
+
+
+def test_a_motion_that_comes_again_a_cycle_later_is_the_same():
+    x, y = np.sqrt([0.65, 0.35])
+    orbit = vi.find_orbit(Twisted(0.3, 0.0), at(x, y), cycles=2, throw=True)
+    branch = vi.continue_orbit(orbit, parameter="a", bounds=(-3.0, 3.0))
+    assert branch.ends == ("closed", "closed")
+    x, y = branch.column("section_0"), branch.column("section_1")
+    np.testing.assert_allclose(x**2 - y**2, branch.parameter, atol=1e-10)
+    turned = np.unwrap(np.arctan2(y, x))
+    assert abs(turned[-1] - turned[0]) == pytest.approx(np.pi, abs=1e-6)
+    folds = [point.parameter for point in branch.special if point.kind == "fold"]
+    np.testing.assert_allclose(np.sort(folds), [-1, 1], atol=1e-9)
+
+
 def test_an_isola_of_an_impact_oscillator():
     """The motions with one impact in three cycles of a damped oscillator: apart from all other
     branches, between two folds, where the closed form's two speeds are one."""

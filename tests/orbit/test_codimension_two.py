@@ -128,6 +128,24 @@ def test_neimark_sacker_points_and_their_resonances(torus):
     table = torus.to_xarray(along="point").to_dataframe()
     np.testing.assert_array_equal(table.angle, torus.angle)
     assert "resonance-1:3 at (" in str(torus)
+    listed = torus.to_xarray(along="special").to_dataframe()
+    assert listed.special_kind.tolist() == kinds_of(torus)
+    np.testing.assert_array_equal(
+        listed[["special_a", "special_b"]], [point.parameters for point in torus.special]
+    )
+
+
+def test_a_picture_marks_them(torus):
+    ax = vi.plot_boundary(torus)
+    np.testing.assert_array_equal(ax.lines[0].get_xydata(), torus.parameters)
+    marked = {line.get_label(): line.get_xydata()[0] for line in ax.lines[1:]}
+    assert sorted(marked) == sorted(kinds_of(torus))
+    for point in torus.special:
+        np.testing.assert_array_equal(marked[point.kind], point.parameters)
+    named = [text.get_text() for text in ax.get_legend().get_texts()]
+    assert named == ["neimark-sacker", *kinds_of(torus)]
+    plain = vi.plot_boundary(torus, special=False, legend=False)
+    assert len(plain.lines) == 1 and plain.get_legend() is None
 
 
 @pytest.mark.parametrize(

@@ -78,10 +78,12 @@ class Boundary(InWords):
         return orbit_of(self.problem, self.steps[index])
 
     def to_xarray(self, *, along: str | None = None) -> "xr.Dataset":
-        """The curve as an `xarray.Dataset` over its points, the two parameters by their names.
+        """The curve as an `xarray.Dataset` over its points, the two parameters by their names, and
+        its points of codimension two: `special_kind`, `special_detail` and, by `special_` and
+        their names, the parameters.
 
-        **Arguments:** `along`, to keep only what has one dimension: `"point"`, `"impact"` or
-        `"state"` (the multipliers), which then makes a table without repetitions.
+        **Arguments:** `along`, to keep only what has one dimension: `"point"`, `"special"`,
+        `"impact"` or `"state"` (the multipliers), which then makes a table without repetitions.
 
         **Raises:** `ValueError` if there is no such dimension.
         """
@@ -94,9 +96,16 @@ class Boundary(InWords):
         data["stability"] = "point", stability_in_words(self.multipliers)
         if self.kind == TORUS:
             data["angle"] = "point", self.angle
+        places = np.array([point.parameters for point in self.special], float).reshape(-1, 2)
+        named = {f"special_{name}": name for name in self.names}
+        data |= {name: ("special", x) for name, x in zip(named, places.T, strict=True)}
+        for word in ("kind", "detail"):
+            words = [getattr(point, word) for point in self.special]
+            data[f"special_{word}"] = "special", np.array(words, str)
         about = {"kind": self.kind, "ends": list(self.ends)}
         found = xr.Dataset(data, attrs={**about, "period_in_cycles": self.problem.cycles})
-        found = with_units(found, self.problem.machine.units, {name: name for name in self.names})
+        named |= {name: name for name in self.names}
+        found = with_units(found, self.problem.machine.units, named)
         return tidy(found, along)
 
     def __str__(self) -> str:

@@ -77,14 +77,15 @@ class Closing:
 
     def _beginnings(self, first: Step) -> list[tuple[np.ndarray, np.ndarray]]:
         """Unknowns and tangent of the first motion, and of the same one observed otherwise."""
+        x = np.asarray(first.x)
         ahead, behind = (
-            observed_otherwise(self.problem, first.x + sign * _SHORT * first.tangent * self.scale)
+            observed_otherwise(self.problem, x + sign * _SHORT * first.tangent * self.scale)
             for sign in (1, -1)
         )
         tangents = [(a - b) / (2 * _SHORT * self.scale) for a, b in zip(ahead, behind, strict=True)]
-        others = zip(observed_otherwise(self.problem, first.x), tangents, strict=True)
+        others = zip(observed_otherwise(self.problem, x), tangents, strict=True)
         return [
-            (np.asarray(first.x), np.asarray(first.tangent)),
+            (x, np.asarray(first.tangent)),
             *(found for found in others if self._apart(first, found[0]) > _AGAIN),
         ]
 
@@ -108,6 +109,8 @@ def observed_otherwise(problem: Shooting, x: np.ndarray) -> list[np.ndarray]:
     at, found = jnp.asarray(x), []
     parameters, period = x[-len(problem.parameters) :], float(problem.period(at))
     if not problem.events:
+        if problem.cycles == 1:
+            return []
         sections, _ = sections_of(problem, at)
         for n in range(1, problem.cycles):
             state = ravel_pytree(jax.tree.map(lambda leaf, n=n: leaf[n], sections))[0]
