@@ -66,6 +66,7 @@ from .orbit import AbstractRootFinder as AbstractRootFinder
 from .orbit import Boundary as Boundary
 from .orbit import Branch as Branch
 from .orbit import ClosedFormOrbits as ClosedFormOrbits
+from .orbit import CodimensionTwo as CodimensionTwo
 from .orbit import CycleMap as CycleMap
 from .orbit import Gradient as Gradient
 from .orbit import Grazing as Grazing

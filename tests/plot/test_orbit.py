@@ -73,7 +73,8 @@ def test_every_special_point_has_a_mark_of_its_own():
         getattr(special, name)
         for name in (
             "FOLD", "DOUBLING", "TORUS", "GRAZING", "CROSSING", "SYMMETRY", "HOPF", "REST",
-            "EXTREMUM", "TURN",
+            "EXTREMUM", "TURN", "CUSP", "DEGENERATE", "DEGENERATE_SYMMETRY", "FLIP", "RESONANCE_1",
+            "RESONANCE_2", "RESONANCE_3", "RESONANCE_4", "RESONANT",
         )
     }  # fmt: skip
 

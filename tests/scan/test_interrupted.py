@@ -194,7 +194,7 @@ def test_interrupted_boundaries_grazings_and_profiles(monkeypatch):
     with pytest.raises(vi.Interrupted) as caught:
         vi.grazing(point)
     assert caught.value.partial.machine is None and caught.value.partial.windows is not None
-    struck(monkeypatch, "orbit._boundary.solved", after=4)
+    struck(monkeypatch, "orbit._curve_monitor.advance", after=4)
     with pytest.raises(vi.Interrupted) as caught:
         vi.boundary(point, parameter="amplitude", bounds=((0.05, 0.5), (0.5, 2.0)))
     curve = caught.value.partial

@@ -12,6 +12,7 @@ from .branch import Branch as Branch
 from .branch import column_names as column_names
 from .closed_form import ClosedFormOrbits as ClosedFormOrbits
 from .closed_form import closed_form_orbits as closed_form_orbits
+from .codimension_two import CodimensionTwo as CodimensionTwo
 from .curve import check_walk as check_walk
 from .distinct import Orbits as Orbits
 from .distinct import distinct_among as distinct_among

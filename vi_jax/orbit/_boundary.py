@@ -1,14 +1,11 @@
 """`boundary`: curves of folds, period doublings, lost symmetries and grazings."""
 
 import dataclasses
-from collections.abc import Callable
+from functools import cached_property
 from typing import Any
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from .._at_work import at_work
 from .._checks import flag, interval
@@ -16,25 +13,20 @@ from .._interrupted import Interrupted
 from .._lazy import xr
 from ..flow import tidy
 from ..machine import check_leaf, leaf, with_units
-from ._conditions import AbstractCondition
+from ._codimension import points_of
+from ._curve_monitor import CurveMonitor, Intervals, cosine_of
 from ._fixed_step_method import steps_of
 from ._problem import check_parameter
 from ._shooting import Shooting
 from ._solution import orbit_of
-from ._solve import Unknowns, jacobian_at, tangent_at
-from ._solve import advance as solved
-from ._symmetry import images, may_be_symmetric
+from ._solve import tangent_at
+from ._special_condition import Special, symmetry_condition
+from ._symmetry import may_be_symmetric
 from ._tables import stability_in_words
+from .codimension_two import CodimensionTwo
 from .curve import INTERRUPTED, Step, check_walk, walk
 from .results import InWords, Orbit
-from .special import DOUBLING, FOLD, GRAZING, SYMMETRY, SpecialPoint
-
-# What lies below zero by no more than this is zero to rounding: a choice, a hundred times the
-# corrector's tolerance.
-_NOISE = 1e-9
-
-# Of the first and of the second parameter.
-Intervals = tuple[tuple[float, float], tuple[float, float]]
+from .special import DOUBLING, FOLD, GRAZING, SYMMETRY, TORUS, SpecialPoint
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -43,7 +35,7 @@ class Boundary(InWords):
     machine's units (see `AbstractMachine.units`)."""
 
     kind: str
-    """"fold", "period-doubling", "symmetry-breaking" or "grazing"."""
+    """"fold", "period-doubling", "neimark-sacker", "symmetry-breaking" or "grazing"."""
     names: tuple[str, str]
     """Names of the two parameters."""
     parameters: np.ndarray
@@ -51,28 +43,47 @@ class Boundary(InWords):
     y_min: np.ndarray
     """Smallest position (of the first coordinate)."""
     multipliers: np.ndarray
-    """Floquet multipliers over the period; (points, states)."""
+    """Floquet multipliers over the period; (points, states). NaN at an end where an impact is lost,
+    where some of them have no limit."""
     impact_speed: np.ndarray
     """V⁻ of each impact; (points, impacts)."""
     clearance: np.ndarray
     """Smallest distance to a stop at a turn that does not touch it."""
     ends: tuple[str, str]
-    """Why the curve ends on each side: "bounds", "grazing" (an impact more or less), "stalled",
+    """Why the curve ends on each side: "bounds", "grazing" (an impact more or less), "closed" (it
+    has come back to its first point, which is its last one as well), of a curve of Neimark–Sacker
+    points "resonance-1:1" and "resonance-1:2" (the two multipliers become real), "stalled",
     "max_points", "interrupted"."""
     problem: Shooting = dataclasses.field(repr=False)
     steps: list[Step] = dataclasses.field(repr=False)
-    condition: "Special" = dataclasses.field(repr=False)
+    condition: Special = dataclasses.field(repr=False)
     scale: np.ndarray = dataclasses.field(repr=False)
+
+    @cached_property
+    def special(self) -> tuple[CodimensionTwo, ...]:
+        """The points of codimension two on the curve, in its order, each located to rounding; they
+        are looked for when they are first asked for."""
+        return points_of(self.problem, self.condition, self.steps, self.ends, self.scale)
+
+    @property
+    def angle(self) -> np.ndarray:
+        """The angle of the pair of multipliers that leaves the unit circle, in radians, at each
+        point; NaN on curves of other kinds."""
+        if self.kind != TORUS:
+            return np.full(len(self.steps), np.nan)
+        return np.arccos(np.clip([cosine_of(step) for step in self.steps], -1, 1))
 
     def orbit(self, index: int) -> Orbit:
         """The motion at one point."""
         return orbit_of(self.problem, self.steps[index])
 
     def to_xarray(self, *, along: str | None = None) -> "xr.Dataset":
-        """The curve as an `xarray.Dataset` over its points, the two parameters by their names.
+        """The curve as an `xarray.Dataset` over its points, the two parameters by their names, and
+        its points of codimension two: `special_kind`, `special_detail` and, by `special_` and
+        their names, the parameters.
 
-        **Arguments:** `along`, to keep only what has one dimension: `"point"`, `"impact"` or
-        `"state"` (the multipliers), which then makes a table without repetitions.
+        **Arguments:** `along`, to keep only what has one dimension: `"point"`, `"special"`,
+        `"impact"` or `"state"` (the multipliers), which then makes a table without repetitions.
 
         **Raises:** `ValueError` if there is no such dimension.
         """
@@ -83,18 +94,29 @@ class Boundary(InWords):
         data["impact_speed"] = ("point", "impact"), self.impact_speed
         data["multipliers"] = ("point", "state"), self.multipliers
         data["stability"] = "point", stability_in_words(self.multipliers)
+        if self.kind == TORUS:
+            data["angle"] = "point", self.angle
+        places = np.array([point.parameters for point in self.special], float).reshape(-1, 2)
+        named = {f"special_{name}": name for name in self.names}
+        data |= {name: ("special", x) for name, x in zip(named, places.T, strict=True)}
+        for word in ("kind", "detail"):
+            words = [getattr(point, word) for point in self.special]
+            data[f"special_{word}"] = "special", np.array(words, str)
         about = {"kind": self.kind, "ends": list(self.ends)}
         found = xr.Dataset(data, attrs={**about, "period_in_cycles": self.problem.cycles})
-        found = with_units(found, self.problem.machine.units, {name: name for name in self.names})
+        named |= {name: name for name in self.names}
+        found = with_units(found, self.problem.machine.units, named)
         return tidy(found, along)
 
     def __str__(self) -> str:
         low, high = self.parameters.min(axis=0), self.parameters.max(axis=0)
-        return (
+        lines = [
             f"Curve of {len(self.parameters)} points of {self.kind}: {self.names[0]} in "
             f"[{low[0]:.6g}, {high[0]:.6g}], {self.names[1]} in [{low[1]:.6g}, {high[1]:.6g}]; "
-            f"ends: {self.ends[0]}, {self.ends[1]}"
-        )
+            f"ends: {self.ends[0]}, {self.ends[1]}",
+            *(f"  {point}" for point in self.special),
+        ]
+        return "\n".join(lines)
 
 
 def boundary(
@@ -111,17 +133,20 @@ def boundary(
 
     Pseudo-arclength on the orbit's equations together with the condition that makes the point
     special: det(M - I) = 0 for a fold or a symmetry breaking, det(M + I) = 0 for a period doubling,
-    V⁻ = 0 or a clearance of zero for a grazing. Host-side: not to be traced.
+    two multipliers whose product is 1 for a Neimark–Sacker bifurcation, V⁻ = 0 or a clearance of
+    zero for a grazing. Host-side: not to be traced.
 
     **Arguments:**
 
-    - `point`: from `Branch.special`; its parameter is the first of the two.
+    - `point`: from `Branch.special`, or by `switch` from a point of codimension two; its parameter
+      is the first of the two.
     - `parameter`: name of the second.
     - `bounds`: intervals of the first and of the second parameter.
     - `step`, `max_step`, `max_points`, `progress`: as for `continue_orbit`, parameters in half
       their intervals.
 
-    **Returns:** a `Boundary`. It ends where the motion ceases to be one (another impact grazes).
+    **Returns:** a `Boundary`, whose `special` are its points of codimension two. It ends where the
+    motion ceases to be one (another impact grazes).
 
     **Raises:** `ValueError` if the point is of another kind, outside the bounds, or the name
     unknown or the same; on Ctrl-C `Interrupted`, whose `partial` is the curve so far.
@@ -134,20 +159,13 @@ def boundary(
     scale = np.ones(x.size)
     scale[-2:] = [0.5 * (high - low) for low, high in bounds]
 
-    def advance(x: Unknowns, tangent: Unknowns, length: float) -> Step:
-        return solved(problem, x, tangent, scale, length)
-
-    start = advance(x, tangent_at(problem, x, scale), 0.0)
+    ahead, back = (CurveMonitor(problem, condition, scale, bounds) for _ in range(2))
+    start = ahead.advance(x, tangent_at(problem, x, scale), 0.0)
     if not bool(start.good):
         raise ValueError(
             "Argument `point` could not be refined in two parameters (last correction "
             f"{float(start.size):.2g})."
         )
-
-    def stop(here: Step, new: Step) -> tuple[Step, str] | None:
-        if not _inside(new, bounds):
-            return _cut(advance, here, new, bounds, scale), "bounds"
-        return (here, "grazing") if condition.another_grazes(new) else None
 
     forward, backward = [start], [start._replace(tangent=-start.tangent)]
     ends = [INTERRUPTED, INTERRUPTED]
@@ -160,8 +178,11 @@ def boundary(
         return Interrupted("walk along the boundary", curve())
 
     with at_work("boundary", kept, progress=progress, unit="point") as tell:
-        ends[1] = walk(advance, forward, stop=stop, tell=tell, **settings)
-        ends[0] = walk(advance, backward, stop=stop, tell=tell, **settings)
+        ends[1] = walk(ahead.advance, forward, stop=ahead.stop, tell=tell, **settings)
+        if ends[1] == "closed":
+            ends[0] = ends[1]
+        else:
+            ends[0] = walk(back.advance, backward, stop=back.stop, tell=tell, **settings)
     return curve()
 
 
@@ -171,10 +192,10 @@ def _check_point(point: SpecialPoint) -> None:
         raise TypeError(
             f"Argument `point` must be a `SpecialPoint`, from `Branch.special`, but got {point!r}."
         )
-    if point.kind not in (FOLD, DOUBLING, SYMMETRY, GRAZING):
+    if point.kind not in (FOLD, DOUBLING, TORUS, SYMMETRY, GRAZING):
         raise ValueError(
-            "Argument `point` must be a fold, a period doubling, a symmetry breaking or a grazing, "
-            f"but is a {point.kind}."
+            "Argument `point` must be a fold, a period doubling, a Neimark–Sacker bifurcation, a "
+            f"symmetry breaking or a grazing, but is a {point.kind}."
         )
     if not point.problem.follows_events:
         raise ValueError(
@@ -210,7 +231,7 @@ def _checked_bounds(point: SpecialPoint, parameter: str, bounds: Any) -> Interva
 
 def _special_motion(
     point: SpecialPoint, parameter: str, bounds: Intervals
-) -> tuple[Shooting, "Special", np.ndarray]:
+) -> tuple[Shooting, Special, np.ndarray]:
     """The equations of the curve, the condition among them that makes its motions special, and
     their unknowns at the point where it begins."""
     old = point.problem
@@ -227,13 +248,13 @@ def _special_motion(
                 "Argument `parameter` must leave the machine its symmetry, but with another "
                 f"{parameter} a motion is not its own image."
             )
-        symmetry = _symmetry_condition(problem, x)
+        symmetry = symmetry_condition(problem, x)
     condition = Special(point.kind, point.impact, symmetry)
     return dataclasses.replace(problem, conditions=(condition,)), condition, x
 
 
 def _curve(
-    problem: Shooting, condition: "Special", path: list[Step], ends: tuple[str, str],
+    problem: Shooting, condition: Special, path: list[Step], ends: tuple[str, str],
     scale: np.ndarray,
 ) -> Boundary:  # fmt: skip
     seen = [step.seen for step in path]
@@ -251,99 +272,3 @@ def _curve(
         condition=condition,
         scale=scale,
     )
-
-
-class SymmetryCondition(eqx.Module):
-    """The condition that a motion is its own image under the symmetry of its machine, in the place
-    of one of its equations.
-
-    The motions x of the equations F(x, p) = 0 from event to event are symmetric where D(x), their
-    difference from their own image (`images`), vanishes. Where they lose their symmetry F cannot be
-    solved for x: its Jacobian J = ∂F/∂x has a null vector r, along which the motion departs from
-    its image, and a left null vector l, so that l·F = 0 is met by every symmetric motion close by
-    to first order. That combination of the equations gives way to w·D = 0, where w picks out of D
-    how far the motion has gone along r:
-
-        F + l (w·D - l·F) = 0,   w = DD r/|DD r|²,   DD the derivative of D by x.
-
-    These equations are regular, and the curve's own condition det(M - I) = 0 is added to them.
-    """
-
-    left: Float[Array, " equations"]
-    """l, the left null vector of J where the symmetry is lost."""
-    weight: Float[Array, " differences"]
-    """w, which picks out of D how far the motion has gone along r."""
-
-    def instead(self, problem: Shooting, missing: Array, x: Array) -> Array:
-        """The equations' residual F, given as `missing`, with the combination l·F exchanged for
-        w·D."""
-        departs = self.weight @ images(problem, x)
-        return missing + self.left * (departs - self.left @ missing)
-
-
-def _symmetry_condition(problem: Shooting, x: np.ndarray) -> SymmetryCondition:
-    """The condition at a motion that loses its symmetry, by the singular vectors of its Jacobian
-    without the columns of the parameters."""
-    count = len(problem.parameters)
-    left, _, right = np.linalg.svd(np.asarray(jacobian_at(problem, jnp.asarray(x)))[:, :-count])
-    direction = jnp.append(jnp.asarray(right[-1]), jnp.zeros(count))
-    change = jax.jvp(lambda x: images(problem, x), (jnp.asarray(x),), (direction,))[1]
-    return SymmetryCondition(jnp.asarray(left[:, -1]), change / (change @ change))
-
-
-class Special(AbstractCondition):
-    """The condition that a motion is special.
-
-    With the monodromy matrix M that is det(M - I) = 0 at a fold or where a symmetry is lost,
-    det(M + I) = 0 at a period doubling; at a grazing V⁻ = 0 of the impact that is lost, or a
-    clearance of zero.
-    """
-
-    kind: str = eqx.field(static=True)
-    impact: int | None = eqx.field(static=True)
-    """The event that grazes; `None` at a touch, and where nothing grazes."""
-    symmetry: SymmetryCondition | None = None
-
-    def exchanged(self, problem, x, missing):
-        """Where a symmetry is lost, one of the equations is exchanged (see `SymmetryCondition`)."""
-        return missing if self.symmetry is None else self.symmetry.instead(problem, missing, x)
-
-    def missing(self, problem, x, seen):
-        """The determinant, V⁻ or the clearance."""
-        identity = jnp.eye(seen.monodromy.shape[0], dtype=x.dtype)
-        if self.kind == GRAZING:
-            return seen.nearest.room if self.impact is None else seen.approach[self.impact]
-        sign = 1 if self.kind == DOUBLING else -1
-        return jnp.linalg.det(seen.monodromy + sign * identity)
-
-    def another_grazes(self, step: Step) -> bool:
-        """Whether an impact beside the one that grazes here is lost, or a stop is touched."""
-        # In a symmetric motion another impact grazes as well, to rounding.
-        others = [v + _NOISE for i, v in enumerate(step.seen.approach) if i != self.impact]
-        # At a grazing the body turns on the stop, to rounding.
-        touching = self.kind == GRAZING and self.impact is None
-        passed = not touching and step.seen.nearest.room < -_NOISE
-        return bool(min(others, default=1.0) <= 0 or passed)
-
-
-def _inside(step: Step, bounds: Intervals) -> bool:
-    return all(low <= x <= high for x, (low, high) in zip(step.x[-2:], bounds, strict=True))
-
-
-def _cut(
-    advance: Callable[..., Step], here: Step, new: Step, bounds: Intervals, scale: np.ndarray
-) -> Step:
-    """The last point inside the bounds between two, found by halving the step.
-
-    **Arguments:** `advance` as for `walk`; `here` and `new`, inside and outside; `scale`, the size
-    of each unknown.
-    """
-    low, high = 0.0, float(np.dot(here.tangent, (new.x - here.x) / scale))
-    last = here
-    for _ in range(30):
-        middle = 0.5 * (low + high)
-        step = advance(here.x, here.tangent, middle)
-        inside = bool(step.good) and _inside(step, bounds)
-        low, high = (middle, high) if inside else (low, middle)
-        last = step if inside else last
-    return last

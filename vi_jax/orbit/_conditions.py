@@ -43,21 +43,24 @@ class Held(AbstractCondition):
         return quantity_of(problem, x, seen, self.name) - self.value
 
 
-def alone(problem: Shooting, step: Step, scale: np.ndarray) -> tuple[Shooting, Step, np.ndarray]:
-    """The equations of a motion in their last parameter only, without conditions, the others as
-    they are at a step; and the step and the sizes of the unknowns as theirs."""
+def alone(
+    problem: Shooting, step: Step, scale: np.ndarray, kept: int = -1
+) -> tuple[Shooting, Step, np.ndarray]:
+    """The equations of a motion in one of their parameters only, without conditions, the others as
+    they are at a step; and the step and the sizes of the unknowns as theirs.
+
+    **Arguments:** `kept`, which parameter, from the last one back: -1 is that one.
+    """
     count = len(problem.parameters)
     if not problem.conditions:
         return problem, step, scale
-    machine = problem.machine
-    for name, value in zip(problem.parameters[:-1], step.x[-count:-1], strict=True):
-        machine = with_leaf(machine, name, value)
+    gone, machine = [i for i in range(-count, 0) if i != kept], problem.machine
+    for i in gone:
+        machine = with_leaf(machine, problem.parameters[i], step.x[i])
     one = dataclasses.replace(
-        problem, machine=machine, parameters=problem.parameters[-1:], conditions=()
+        problem, machine=machine, parameters=(problem.parameters[kept],), conditions=()
     )
-    x, tangent, sizes = (
-        np.delete(np.asarray(a), np.arange(-count, -1)) for a in (step.x, step.tangent, scale)
-    )
+    x, tangent, sizes = (np.delete(np.asarray(a), gone) for a in (step.x, step.tangent, scale))
     size = float(np.linalg.norm(tangent)) or 1.0
     return one, step._replace(x=x, tangent=tangent / size), sizes
 

@@ -41,15 +41,16 @@ def changed_between(before: dict[str, float], after: dict[str, float]) -> list[s
 
 
 def crossing(
-    along: Callable[[float], Step | None], root: float, kind: str
+    along: Callable[[float], Step | None], root: float, test: Callable[[Step], float]
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """The point where branches cross, from points on both sides, by a test that is zero there.
+    """The point of a curve at which a test is zero, where its equations are singular: where
+    branches cross, or where an impact grazes.
 
-    Close to it the equations cannot be solved, but the branch passes through it smoothly, so that a
+    Close to it the equations cannot be solved, but the curve passes through it smoothly, so that a
     polynomial through its neighbours tells where it is, and what the motion is there.
 
-    **Arguments:** `along`, the branch's point at a length along a tangent, `None` where there is
-    none; `root`, about where they cross; `kind`, whose test it is.
+    **Arguments:** `along`, the curve's point at a length along a tangent, `None` where there is
+    none; `root`, about where it is; the test.
 
     **Returns:** its unknowns and its tangent; `None` if too few points were found, or no zero.
     """
@@ -68,7 +69,7 @@ def crossing(
     def through(values: Any) -> np.polynomial.Polynomial:
         return np.polynomial.Polynomial.fit(places, values, len(places) - 1)
 
-    zeros = through([np.asarray(tests_of(step)[kind]) for step in beside]).roots()
+    zeros = through([np.asarray(test(step)) for step in beside]).roots()
     zeros = zeros[np.abs(zeros.imag) < 1e-12].real
     if not zeros.size or np.abs(zeros).min() > BESIDE:
         return None

@@ -7,9 +7,9 @@ from collections.abc import Callable
 import jax.numpy as jnp
 import numpy as np
 
+from ._closing import Closing
 from ._conditions import alone
 from ._crossing import BESIDE, changed_between, crossing, tests_of
-from ._events import Event
 from ._extrema import Extrema
 from ._hopf import hopf_between, size_of
 from ._origin import halves, origin
@@ -18,7 +18,7 @@ from ._shooting import Shooting
 from ._solution import orbit_of
 from ._solve import advance, images_at, located, observe
 from ._symmetry import may_be_symmetric
-from ._words import ANEW, DETAILS, HELD_FOLD, REORDERED, RESTS
+from ._words import ANEW, DETAILS, HELD_FOLD, REORDERED, RESTS, grazing_in_words
 from .curve import Step
 from .special import (
     CROSSING,
@@ -81,8 +81,8 @@ class BranchMonitor:
         self.special: list[SpecialPoint] = []
         self.between: dict[int, list[Step]] = {}
         self.whole: dict[int, Step] = {}  # steps of special points, by what is observed there
-        self.start: Step | None = None
-        self.away, self.size, self.duration = False, None, None
+        self.closing = Closing(problem, scale)
+        self.size, self.duration = None, None
 
     def advance(self, x, tangent, length) -> Step:
         """The point at this length along the tangent."""
@@ -107,13 +107,14 @@ class BranchMonitor:
         grazing = self._grazing(here, last) or self._sequence(here, last)
         if grazing is not None:
             last, reason = self.whole[id(grazing.step.seen)], grazing.kind
+        if reason is None:
+            again = self.closing.between(here, new, lambda test: self._where(here, new, test))
+            last, reason = (new, None) if again is None else (again, "closed")
         spring = self._bifurcations(here, last)
         if spring is not None:
             return spring, self.special[-1].kind
         if grazing is not None:
             self.special.append(grazing)
-        elif reason is None and self._closed(here, new):
-            return here, "closed"
         return None if reason is None else (last, reason)
 
     def _lengthened(self, here: Step, new: Step) -> float:
@@ -122,13 +123,6 @@ class BranchMonitor:
             return -1.0
         self.duration = float(here.seen.duration) if self.duration is None else self.duration
         return float(new.seen.duration) / self.duration - _LONG
-
-    def _closed(self, here: Step, new: Step) -> bool:
-        self.start = here if self.start is None else self.start
-        apart = float(np.linalg.norm((new.x - self.start.x) / self.scale))
-        length = float(np.linalg.norm((new.x - here.x) / self.scale))
-        self.away = self.away or apart > 3 * length
-        return self.away and apart < 0.5 * length
 
     def _where(self, here: Step, new: Step, test: Callable[[Step], float]) -> Step | None:
         """The point between two at which a test is zero."""
@@ -186,16 +180,7 @@ class BranchMonitor:
             return self._point(GRAZING, at, DETAILS[impact])
         if impact == RESTS:
             return self._point(HOPF, at, "the motion shrinks to rest", 0)
-        if impact is None:
-            machine, touched = self.problem.machine, int(at.seen.nearest.event)
-            guard = f"the guard of {Event(touched).called(machine)}"
-            what = "a stop" if touched < len(machine.stops) else guard
-            detail = f"touches {what} at {self._place(at, float(at.seen.nearest.clock))}"
-        else:
-            clock = float(np.asarray(self.problem.parts(jnp.asarray(at.x))[0])[impact])
-            lost = self.problem.events[impact].of(self.problem.machine)
-            detail = f"the {lost.name or lost.word} at {self._place(at, clock)} is lost"
-        return self._point(GRAZING, at, detail, impact)
+        return self._point(GRAZING, at, grazing_in_words(self.problem, at, impact), impact)
 
     def _sequence(self, here: Step, last: Step) -> SpecialPoint | None:
         """Where a motion that rests gains or loses one of its rests or impacts."""
@@ -213,11 +198,6 @@ class BranchMonitor:
 
         found = changed_sequence(here, last, where)
         return None if found is None else self._point(*found)
-
-    def _place(self, at: Step, clock: float) -> str:
-        """A reading of the clock of impacts, in words, within one period from the section on."""
-        period = float(self.problem.period(jnp.asarray(at.x)))
-        return self.problem.machine.place_of(clock % period, self.problem.cycles)
 
     def _bifurcations(self, here: Step, last: Step) -> Step | None:
         """Record what happens between two points; the point where the branch springs, if met.
@@ -320,7 +300,7 @@ class BranchMonitor:
             return step if bool(step.good) and not other else None
 
         root = float(np.dot(here.tangent, (at.x - here.x) / self.scale))
-        found = crossing(along, root, kind)
+        found = crossing(along, root, lambda step: tests_of(step)[kind])
         if found is None:
             return at
         x, tangent = found

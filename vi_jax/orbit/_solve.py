@@ -160,3 +160,13 @@ def located(
         return abs(left), bool(left * begin < 0), abs(place[0] - root)
 
     return min(good, key=off)[1] if good else None
+
+
+def between(
+    problem: Shooting, here: Step, new: Step, scale: np.ndarray, test: Callable[[Step], float]
+) -> Step | None:
+    """As `located`, between two points that follow each other in a finished curve: its steps
+    follow its sense, except in its backward half, which is turned."""
+    if float(np.dot(here.tangent, (new.x - here.x) / scale)) < 0:
+        here, new = new, here
+    return located(problem, here, new, scale, test)

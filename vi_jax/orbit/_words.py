@@ -1,6 +1,28 @@
 """What is said of the special points of a branch, by their kinds."""
 
-from .special import CROSSING, DOUBLING, FOLD, SYMMETRY, TORUS, TURN
+import jax.numpy as jnp
+import numpy as np
+
+from ._events import Event
+from ._shooting import Shooting
+from .curve import Step
+from .special import (
+    CROSSING,
+    CUSP,
+    DEGENERATE,
+    DEGENERATE_SYMMETRY,
+    DOUBLING,
+    FLIP,
+    FOLD,
+    RESONANCE_1,
+    RESONANCE_2,
+    RESONANCE_3,
+    RESONANCE_4,
+    RESONANT,
+    SYMMETRY,
+    TORUS,
+    TURN,
+)
 
 # Stand in the place of the number of an impact, for what grazes without being one.
 REORDERED, RESTS, ANEW = -1, -2, -3
@@ -17,5 +39,36 @@ DETAILS = {
     ANEW: "a switch goes into another mode: the motion sticks or slips anew",
 }
 
+# What is said of a point of codimension two.
+AT_CODIMENSION_TWO = {
+    CUSP: "two curves of folds meet and end",
+    DEGENERATE: "beyond, the motions of twice the period begin on the other side",
+    DEGENERATE_SYMMETRY: "beyond, the motions without symmetry begin on the other side",
+    FLIP: "multipliers 1 and -1: a curve of folds meets one of period doublings",
+    RESONANCE_1: "a double multiplier 1: a curve of Neimark–Sacker points begins",
+    RESONANCE_2: "a double multiplier -1: a curve of Neimark–Sacker points begins",
+    RESONANCE_3: "the angle of the multipliers is 2π/3",
+    RESONANCE_4: "the angle of the multipliers is π/2",
+    RESONANT: "a curve of folds and one of period doublings begin",
+    FOLD: "the motion that grazes has a multiplier 1",
+    DOUBLING: "the motion that grazes has a multiplier -1",
+}
+
 # The same of a fold where numbers are held: the parameter alone would turn back.
 HELD_FOLD = "a multiplier passes 1"
+
+
+def grazing_in_words(problem: Shooting, at: Step, impact: int | None) -> str:
+    """What a motion loses, if that is an impact, or touches, and where within its period."""
+    machine, x = problem.machine, jnp.asarray(at.x)
+    if impact is None:
+        touched, clock = int(at.seen.nearest.event), float(at.seen.nearest.clock)
+        guard = f"the guard of {Event(touched).called(machine)}"
+        what = "touches a stop" if touched < len(machine.stops) else f"touches {guard}"
+    else:
+        clock = float(np.asarray(problem.parts(x)[0])[impact])
+        lost = problem.events[impact].of(machine)
+        what = f"the {lost.name or lost.word}"
+    # Clocks are counted within one period from the section on.
+    place = machine.place_of(clock % float(problem.period(x)), problem.cycles)
+    return f"{what} at {place}" + ("" if impact is None else " is lost")

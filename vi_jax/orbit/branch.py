@@ -13,7 +13,7 @@ from ..flow import tidy
 from ..machine import in_unit, with_units
 from ._shooting import Shooting
 from ._solution import orbit_of
-from ._solve import located
+from ._solve import between
 from ._tables import COLUMNS, on_sections, special_table, stability_in_words, table_of
 from ._tables import column_names as column_names
 from .curve import Step
@@ -60,7 +60,8 @@ class Branch(InWords):
     """Why the branch ends on each side: "bounds", "grazing" (an impact is lost or a stop touched),
     "period-doubling" (it springs there from a motion of half its period), "symmetry-breaking" (from
     a symmetric one), "hopf" (it shrinks to rest), "rest" (a rest on a stop is gained
-    or lost), "closed", "stalled", "max_points", "interrupted", "long" (an autonomous motion takes
+    or lost), "closed" (it has come back to its first point, which is its last one as well: an
+    isola), "stalled", "max_points", "interrupted", "long" (an autonomous motion takes
     four times as long as that from which the branch began, for which its steps are: begin another
     one there)."""
     problem: Shooting = dataclasses.field(repr=False)
@@ -167,21 +168,14 @@ class Branch(InWords):
 
         found = []
         following: list[Step | None] = [*self.steps[1:], None]
-        if "closed" in self.ends:
-            following[-1] = self.steps[0]
-        for here, new in zip(self.steps, following, strict=True):
+        for i, (here, new) in enumerate(zip(self.steps, following, strict=True)):
             if not apart(here):
-                found.append(here)
+                # The last point of a closed branch is its first one.
+                if i == 0 or new is not None or "closed" not in self.ends:
+                    found.append(here)
             elif new is not None and apart(here) * apart(new) < 0:
-                found.append(self._between(here, new, apart))
+                found.append(between(self.problem, here, new, self.scale, apart))
         return [orbit_of(self.problem, step) for step in found if step is not None]
-
-    def _between(self, here: Step, new: Step, test: Callable[[Step], float]) -> Step | None:
-        """The point at which a test is zero, between two that follow each other."""
-        # Steps follow the branch's sense, except in its backward half, which is turned.
-        if float(np.dot(here.tangent, (new.x - here.x) / self.scale)) < 0:
-            here, new = new, here
-        return located(self.problem, here, new, self.scale, test)
 
     def to_xarray(self, *, along: str | None = None) -> "xr.Dataset":
         """The branch as an `xarray.Dataset` over its points, with a word for the `stability` at

@@ -20,6 +20,12 @@ FOLD, DOUBLING, TORUS = "fold", "period-doubling", "neimark-sacker"
 GRAZING, CROSSING, SYMMETRY = "grazing", "branch-point", "symmetry-breaking"
 HOPF, REST, EXTREMUM, TURN = "hopf", "rest", "extremum", "turn"
 
+# Kinds of points of codimension two.
+CUSP, FLIP, RESONANT = "cusp", "fold-flip", "resonant-grazing"
+DEGENERATE, DEGENERATE_SYMMETRY = "degenerate-doubling", "degenerate-symmetry-breaking"
+RESONANCE_1, RESONANCE_2 = "resonance-1:1", "resonance-1:2"
+RESONANCE_3, RESONANCE_4 = "resonance-1:3", "resonance-1:4"
+
 # Where something grazes it is touched to rounding, by choice within this.
 _TOUCHES = 1e-6
 
@@ -96,16 +102,20 @@ def _found(problem: Shooting, step: Step, what: str, distance: float) -> Orbit:
     return orbit_of(problem, step)
 
 
-def _doubled(point: SpecialPoint, distance: float) -> Orbit:
-    """A motion of twice the period, along what the multiplier -1 makes possible."""
-    old = point.problem
-    x = np.asarray(point.step.x)
+def doubled(old: Shooting) -> Shooting:
+    """The equations of a motion that is gone through twice."""
     events, modes = old.events, old.modes
     if events:
         events, modes = (*events, *(event.later(old.cycles) for event in events)), modes * 2
-    new = dataclasses.replace(
+    return dataclasses.replace(
         old, cycles=2 * old.cycles, events=events, modes=modes, steps=2 * old.steps
     )
+
+
+def _doubled(point: SpecialPoint, distance: float) -> Orbit:
+    """A motion of twice the period, along what the multiplier -1 makes possible."""
+    old, new = point.problem, doubled(point.problem)
+    x = np.asarray(point.step.x)
     count = len(old.parameters)
     twice = repeated(old, x, new)
     scale = np.concatenate([np.ones(len(twice) - count), point.scale[-count:]])

@@ -139,22 +139,36 @@ def plot_sweep(
     return ax
 
 
-def plot_boundary(curve: Boundary, *, ax: Axes | None = None, **style: Any) -> Axes:
-    """A boundary curve in the plane of its two parameters.
+def plot_boundary(
+    curve: Boundary, *, ax: Axes | None = None, special: bool = True, legend: bool = True,
+    **style: Any,
+) -> Axes:  # fmt: skip
+    """A boundary curve in the plane of its two parameters, points of codimension two marked.
 
     Its colour is that of the motion's period, its dash shows what happens there: solid a grazing,
-    dashed a period doubling, dash-dotted a fold, dotted a loss of symmetry.
+    dashed a period doubling, dash-dotted a fold, with two dots a Neimark–Sacker bifurcation, dotted
+    a loss of symmetry.
 
-    **Arguments:** the curve; `ax`; options of `Axes.plot`.
+    **Arguments:** the curve; `ax`; `special`, whether to mark the points of codimension two;
+    `legend`, whether to draw one: what the dash means (or the curve's `label`), and the marks;
+    options of `Axes.plot`.
 
     **Returns:** the axes.
+
+    **Raises:** `TypeError` if it is no boundary.
     """
+    instance_of("curve", curve, Boundary, "a `Boundary`, from `boundary`")
     ax = new_axes(ax)
     look = {"ls": DASHES[curve.kind], "lw": thick(1.6), "label": curve.kind}
     if "linestyle" in style:
         look.pop("ls")
     color = color_of(curve.problem.cycles, curve.impact_speed.shape[1])
     ax.plot(*curve.parameters.T, **{"color": color, **look, **style})
+    for point in curve.special if special else ():
+        mark = {**mark_style(point.kind), "zorder": 4, "label": once(ax, point.kind)}
+        ax.plot(*point.parameters, **mark)
+    if legend:
+        _legend(ax)
     units = curve.problem.machine.units
     ax.set_xlabel(axis_name(curve.names[0], units))
     ax.set_ylabel(axis_name(curve.names[1], units))

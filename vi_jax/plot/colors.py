@@ -48,12 +48,22 @@ MARKS = {
     "rest": ("h", "0.7"),
     "extremum": ("d", "w"),
     "turn": ("<", "w"),
+    "cusp": ("v", "k"),
+    "degenerate-doubling": ("p", "w"),
+    "degenerate-symmetry-breaking": ("H", "w"),
+    "fold-flip": (">", "w"),
+    "resonance-1:1": ("$1$", "k"),
+    "resonance-1:2": ("$2$", "k"),
+    "resonance-1:3": ("$3$", "k"),
+    "resonance-1:4": ("$4$", "k"),
+    "resonant-grazing": ("8", "w"),
 }
 DASHES = {
     "grazing": "-",
     "period-doubling": (0, (5, 2)),
     "fold": (0, (6, 1.5, 1.2, 1.5)),
     "symmetry-breaking": (0, (1.2, 1.2)),
+    "neimark-sacker": (0, (5, 1.5, 1.2, 1.5, 1.2, 1.5)),
 }
 
 
@@ -101,7 +111,7 @@ def mark_of(kind: str, **style: Any) -> Line2D:
 def mark_style(kind: str) -> dict[str, Any]:
     """Options of `Axes.plot` for a special point."""
     marker, fill = MARKS[kind]
-    size = {"*": 9.0, "X": 7.0, "P": 7.0}.get(marker, 5.0)
+    size = {"*": 9.0, "X": 7.0, "P": 7.0}.get(marker, 7.0 if "$" in marker else 5.0)
     return {"marker": marker, "mfc": fill, "mec": "k", "mew": 0.8, "ms": size, "ls": "none"}
 
 

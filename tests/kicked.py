@@ -1,0 +1,70 @@
+"""Machines that stand still but for a kick in each cycle: their section map is any map."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import vi_jax as vi
+
+
+class Kicked(vi.AbstractMachine):
+    """The map is `kick`, of a state that nothing else moves."""
+
+    a: jax.Array = eqx.field(converter=jnp.asarray)
+    b: jax.Array = eqx.field(converter=jnp.asarray)
+    stops: tuple = eqx.field(default=(), kw_only=True)
+
+    @property
+    def cycle(self):
+        return 1.0
+
+    @property
+    def events(self):
+        half = 2 * jnp.pi * 0.5
+        return (
+            vi.Reset(
+                lambda machine, s, x: jnp.sin(2 * jnp.pi * s - half),
+                lambda machine, s, x: machine.kick(*x),
+            ),
+        )
+
+    def kick(self, *x):
+        """The state after a cycle."""
+        raise NotImplementedError
+
+    def field(self, s, x):
+        return tuple(0 * y for y in x)
+
+    def position(self, x):
+        return x[0]
+
+    def velocity(self, x):
+        return x[1]
+
+
+def at(*x):
+    return tuple(jnp.asarray(y, float) for y in x)
+
+
+# Powers of x, y, a and b.
+POWERS = (
+    (0, 0, 0, 0), (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (2, 0, 0, 0), (1, 1, 0, 0),
+    (0, 2, 0, 0), (3, 0, 0, 0), (1, 0, 1, 0), (1, 0, 0, 1), (0, 1, 0, 1), (1, 0, 0, 2),
+    (3, 0, 0, 1),
+)  # fmt: skip
+
+
+class Polynomial(Kicked):
+    """Both numbers become polynomials of themselves and of a and b, all by the same programs."""
+
+    shares: jax.Array = eqx.field(kw_only=True)
+
+    def kick(self, x, y):
+        powers = [x**i * y**j * self.a**k * self.b**n for i, j, k, n in POWERS]
+        return tuple(self.shares @ jnp.stack(powers))
+
+
+def polynomial(a, b, *rows):
+    """The machine whose rows say by which factor each term enters."""
+    shares = [[row.get(power, 0.0) for power in POWERS] for row in rows]
+    assert all(power in POWERS for row in rows for power in row)
+    return Polynomial(a, b, shares=jnp.asarray(shares))

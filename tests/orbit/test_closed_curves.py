@@ -1,0 +1,121 @@
+"""Curves that come back to where they began: isolas and closed boundaries, beside closed forms."""
+
+import numpy as np
+import pytest
+import vi_jax as vi
+from scipy.optimize import brentq
+
+from kicked import Kicked, at
+from one_impact import one_impact
+
+pytestmark = pytest.mark.slow
+
+
+class Ring(Kicked):
+    """x ← x + (x² + a² + 4b² - 1)/2: fixed points on an ellipsoid, that meet at its equator."""
+
+    def kick(self, x, y):
+        return x + 0.5 * (x**2 + self.a**2 + 4 * self.b**2 - 1), 0.3 * y
+
+
+@pytest.fixture(scope="module")
+def ring():
+    machine = Ring(0.3, 0.1)
+    orbit = vi.find_orbit(machine, at(-np.sqrt(0.87), 0.0), throw=True)
+    return vi.continue_orbit(orbit, parameter="a", bounds=(-3.0, 3.0))
+
+
+def test_a_closed_branch_is_gone_round_once(ring):
+    assert ring.ends == ("closed", "closed")
+    x, a = ring.column("section_0"), ring.parameter
+    np.testing.assert_allclose(x**2 + a**2, 0.96, rtol=1e-11)
+    angle = np.unwrap(np.arctan2(x, a))
+    assert abs(angle[-1] - angle[0]) == pytest.approx(2 * np.pi, abs=1e-9)
+    assert (np.diff(angle) * np.sign(angle[-1] - angle[0]) > 0).all()
+    assert a[0] == a[-1] == 0.3
+    folds = [point.parameter for point in ring.special if point.kind == "fold"]
+    assert len(folds) == len(ring.special) == 2
+    np.testing.assert_allclose(np.sort(folds), [-np.sqrt(0.96), np.sqrt(0.96)], atol=1e-10)
+    for value in (0.3, 0.0, -0.5):
+        found = [float(orbit.state[0]) for orbit in ring.at(value)]
+        root = np.sqrt(0.96 - value**2)
+        np.testing.assert_allclose(np.sort(found), [-root, root], atol=1e-11)
+
+
+def test_a_closed_boundary_is_gone_round_once(ring):
+    curve = vi.boundary(ring.special[0], parameter="b", bounds=((-3.0, 3.0), (-3.0, 3.0)))
+    assert curve.ends == ("closed", "closed")
+    a, b = curve.parameters.T
+    np.testing.assert_allclose(a**2 + 4 * b**2, 1, rtol=1e-10)
+    angle = np.unwrap(np.arctan2(2 * b, a))
+    assert abs(angle[-1] - angle[0]) == pytest.approx(2 * np.pi, abs=1e-9)
+
+
+class Hairpin(Kicked):
+    """x ← x + 100 x² + a/10⁴: two sheets that a fold joins at a = 0."""
+
+    def kick(self, x, y):
+        return x + 100 * x**2 + 1e-4 * self.a, 0.3 * y
+
+
+def test_a_branch_that_comes_near_itself_is_not_closed():
+    """Where it begins its other sheet is a thirtieth of a step away."""
+    orbit = vi.find_orbit(Hairpin(-0.5, 0.0), at(-np.sqrt(0.5) / 1000, 0.0), throw=True)
+    branch = vi.continue_orbit(orbit, parameter="a", bounds=(-3.0, 3.0))
+    assert branch.ends == ("bounds", "bounds") and len(branch.special) == 1
+    assert branch.special[0].parameter == pytest.approx(0, abs=1e-10)
+    np.testing.assert_allclose(branch.parameter[[0, -1]], -3, atol=1e-12)
+    other = branch.parameter[branch.column("section_0") > 0]
+    beside = np.sort(np.abs(other + 0.5))[:2].sum() / 3
+    assert beside > 30 * np.sqrt(0.5) / 500
+
+
+class Twisted(Kicked):
+    """z ← -z - G/5 in the plane, where G = 0 if x² - y² = a and x² + y² = 1: motions of two cycles
+    ±z, that are one another after a round of their isola."""
+
+    def kick(self, x, y):
+        first, second = x**2 - y**2 - self.a, x**2 + y**2 - 1
+        return -x - 0.2 * (x * first + y * second), -y - 0.2 * (y * first - x * second)
+
+
+def test_a_motion_that_comes_again_a_cycle_later_is_the_same():
+    x, y = np.sqrt([0.65, 0.35])
+    orbit = vi.find_orbit(Twisted(0.3, 0.0), at(x, y), cycles=2, throw=True)
+    branch = vi.continue_orbit(orbit, parameter="a", bounds=(-3.0, 3.0))
+    assert branch.ends == ("closed", "closed")
+    x, y = branch.column("section_0"), branch.column("section_1")
+    np.testing.assert_allclose(x**2 - y**2, branch.parameter, atol=1e-10)
+    turned = np.unwrap(np.arctan2(y, x))
+    assert abs(turned[-1] - turned[0]) == pytest.approx(np.pi, abs=1e-6)
+    folds = [point.parameter for point in branch.special if point.kind == "fold"]
+    np.testing.assert_allclose(np.sort(folds), [-1, 1], atol=1e-9)
+
+
+def test_an_isola_of_an_impact_oscillator():
+    """The motions with one impact in three cycles of a damped oscillator: apart from all other
+    branches, between two folds, where the closed form's two speeds are one."""
+    given = {"damping": 0.02, "restitution": 0.85, "gap": 1.2, "cycles": 3}
+    scene = vi.Scene.ideal(frequency_ratio=3.6, restitution=0.85, gap=1.2, damping_ratio=0.02)
+    closed = vi.closed_form_orbits(scene, cycles=3)
+    start = scene.start(Y=closed.Y[0], V=closed.V[0])
+    orbit = vi.find_orbit(scene, start, cycles=3, throw=True)
+    branch = vi.continue_orbit(orbit, parameter="drive.frequency_ratio", bounds=(2.5, 5.0))
+    assert branch.ends == ("closed", "closed") and branch.admissible.all()
+
+    def apart(zeta):
+        slow, fast = one_impact(zeta, 1.0, **given).speed
+        return ((fast - slow) ** 2).real
+
+    folds = [brentq(apart, *ends, xtol=1e-14) for ends in ((3.1, 3.5), (3.7, 4.3))]
+    found = [point.parameter for point in branch.special if point.kind == "fold"]
+    np.testing.assert_allclose(np.sort(found), folds, atol=1e-9)
+    for zeta, speed, values in zip(
+        branch.parameter, branch.impact_speed[:, 0], branch.multipliers, strict=True
+    ):
+        both = one_impact(zeta, 1.0, **given)
+        which = int(np.argmin(np.abs(both.speed - speed)))
+        # At a fold the closed form has the root of its rounding.
+        if np.abs(values - 1).min() > 1e-2:
+            assert both.speed[which].real == pytest.approx(speed, abs=1e-9)
+            assert both.trace[which].real == pytest.approx(values.sum().real, rel=1e-7)

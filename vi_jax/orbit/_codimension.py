@@ -1,0 +1,229 @@
+"""Where the points of codimension two of a curve of special motions are."""
+
+import dataclasses
+import itertools
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._programs import compiled
+from ._curve_monitor import cosine_of
+from ._origin import repeated
+from ._resonances import resonances
+from ._shooting import Shooting
+from ._solution import orbit_of
+from ._solve import between, jacobian_at
+from ._special_condition import Special
+from ._words import AT_CODIMENSION_TWO, grazing_in_words
+from .codimension_two import CodimensionTwo
+from .curve import Step
+from .special import (
+    CUSP,
+    DEGENERATE,
+    DEGENERATE_SYMMETRY,
+    DOUBLING,
+    FLIP,
+    FOLD,
+    GRAZING,
+    RESONANCE_1,
+    RESONANCE_2,
+    RESONANCE_3,
+    RESONANCE_4,
+    RESONANT,
+    SYMMETRY,
+    TORUS,
+    doubled,
+)
+
+# A test that changes its sign without coming this near to zero (as a share of its neighbours) has a
+# pole: a choice.
+_ZERO = 1e-6
+
+# Motions that graze are looked at over so many periods: a choice, as in `resonant_grazings`.
+_PERIODS = 3
+
+
+class Vectors(NamedTuple):
+    """Left and right null vector of the Jacobian by all unknowns but the parameters."""
+
+    left: np.ndarray
+    right: np.ndarray
+
+
+# The value of a test at a step and the vectors that it used, given those of a point close by, whose
+# senses they keep.
+Test = Callable[[Step, Vectors | None], tuple[float, Vectors | None]]
+
+
+def points_of(
+    problem: Shooting, condition: Special, steps: list[Step], ends: tuple[str, str],
+    scale: np.ndarray,
+) -> tuple[CodimensionTwo, ...]:  # fmt: skip
+    """The points of codimension two on a curve, in its order."""
+
+    def point(kind: str, step: Step, impact: int | None = None, more: str = "") -> CodimensionTwo:
+        grazes = kind == GRAZING
+        detail = grazing_in_words(problem, step, impact) if grazes else AT_CODIMENSION_TWO[kind]
+        return CodimensionTwo(
+            kind, np.asarray(step.x)[-2:], orbit_of(problem, step), detail + more, condition.kind,
+            problem, step, scale, impact,
+        )  # fmt: skip
+
+    found: list[tuple[float, CodimensionTwo]] = []
+    for place, end in ((0, ends[0]), (len(steps) - 1, ends[1])):
+        if end == GRAZING and condition.kind != GRAZING:
+            found.append((place, point(GRAZING, steps[place], _grazes(steps[place]))))
+        if end in (RESONANCE_1, RESONANCE_2):
+            found.append((place, point(end, steps[place])))
+    for kind, test in _tests_of(problem, condition, scale).items():
+        for place, step in _zeros(problem, steps, scale, test):
+            found.append((place, point(kind, step)))
+    if condition.kind == GRAZING:
+        for place, step, entries in _resonances_of(problem, condition, steps, scale):
+            more = f" of the motion with one impact in {len(entries)} periods"
+            found.append((place, point(RESONANT, step, condition.impact, more)))
+    return tuple(point for _, point in sorted(found, key=lambda f: f[0]))
+
+
+def _grazes(step: Step) -> int | None:
+    """The impact that grazes at the end of a curve; `None` at a touch."""
+    approach = np.asarray(step.seen.approach)
+    if approach.size and approach.min() < abs(float(step.seen.nearest.room)):
+        return int(np.argmin(approach))
+    return None
+
+
+def _resonances_of(
+    problem: Shooting, condition: Special, steps: list[Step], scale: np.ndarray
+) -> list[tuple[float, Step, np.ndarray]]:
+    """The resonant grazings; none where the local map is not known (see `grazing`)."""
+    try:
+        return resonances(problem, condition.impact, steps, scale, _PERIODS)
+    except ValueError:
+        return []
+
+
+def _tests_of(problem: Shooting, condition: Special, scale: np.ndarray) -> dict[str, Test]:
+    """Functions that change their sign at the points of each kind, by the curve's kind."""
+
+    def plain(function: Callable[[Step], float]) -> Test:
+        return lambda step, like: (function(step), None)
+
+    fold, doubling = plain(lambda s: _product(s, -1)), plain(lambda s: _product(s, 1))
+    bare = dataclasses.replace(problem, conditions=())
+    if condition.kind == TORUS:
+        return {RESONANCE_3: plain(lambda s: cosine_of(s) + 0.5), RESONANCE_4: plain(cosine_of)}
+    double = plain(lambda s: _others(s, 1 if condition.kind == DOUBLING else -1))
+    if condition.kind == FOLD:
+        return {CUSP: _cusp(bare, scale), FLIP: doubling, RESONANCE_1: double}
+    if condition.kind == DOUBLING:
+        return {DEGENERATE: _cubic(bare, twice=True), FLIP: fold, RESONANCE_2: double}
+    if condition.kind == SYMMETRY:
+        return {DEGENERATE_SYMMETRY: _cubic(bare, twice=False), RESONANCE_1: double}
+    # Where an impact grazes M has a pole, but not where a stop is touched.
+    return {} if condition.impact is not None else {FOLD: fold, DOUBLING: doubling}
+
+
+def _product(step: Step, sign: int) -> float:
+    """det(M ± I)."""
+    M = step.seen.monodromy
+    return _determinant(M + sign * np.eye(len(M)))
+
+
+def _others(step: Step, sign: int) -> float:
+    """The product of all eigenvalues of M ± I but one, where that one is zero: the sum of the
+    principal minors of one row less, which unlike the eigenvalues is smooth."""
+    M = step.seen.monodromy + sign * np.eye(len(step.seen.monodromy))
+    minors = (np.delete(np.delete(M, i, 0), i, 1) for i in range(len(M)))
+    return sum(map(_determinant, minors))
+
+
+def _determinant(matrix: np.ndarray) -> float:
+    """NaN of what is not finite, as where an impact is lost."""
+    return float(np.linalg.det(matrix)) if np.isfinite(matrix).all() else np.nan
+
+
+def _nulls(matrix: np.ndarray, like: Vectors | None) -> Vectors:
+    """The null vectors of a square matrix, in the senses of those of another one."""
+    left, _, right = np.linalg.svd(matrix)
+    found = Vectors(left[:, -1], right[-1])
+    if like is None:
+        return found
+    return Vectors(*(a * (np.sign(a @ b) or 1.0) for a, b in zip(found, like, strict=True)))
+
+
+def _cusp(bare: Shooting, scale: np.ndarray) -> Test:
+    """How fast the parameters move along a curve of folds, with a sign.
+
+    With the left null vector l of F_x both change so that l·F_p dp = 0: along the line across the
+    vector l·F_p, which turns slowly, while the sense in which they go is turned round at a cusp.
+    """
+
+    def test(step: Step, like: Vectors | None) -> tuple[float, Vectors]:
+        jacobian = np.asarray(jacobian_at(bare, jnp.asarray(step.x)))
+        nulls = _nulls(jacobian[:, :-2], like)
+        first, second = nulls.left @ jacobian[:, -2:] * scale[-2:]
+        moves = np.asarray(step.tangent)[-2:]
+        return float(moves @ [-second, first] / np.hypot(first, second)), nulls
+
+    return test
+
+
+@compiled
+def _bent(problem: Shooting, x, right, bend):
+    """Second and third derivative of the equations along x + t right + t² bend/2, at t = 0."""
+
+    def along(t):
+        return problem.lacks(x + t * right + 0.5 * t * t * bend)
+
+    def derivative(function):
+        return lambda t: jax.jvp(function, (t,), (jnp.ones_like(t),))[1]
+
+    second = derivative(derivative(along))
+    zero = jnp.zeros((), x.dtype)
+    return jax.jvp(second, (zero,), (jnp.ones_like(zero),))
+
+
+def _cubic(bare: Shooting, *, twice: bool) -> Test:
+    """The cubic coefficient of the motions that begin at a doubling, or where a symmetry is lost.
+
+    Of the equations F of the motion that is gone through twice, or those of the symmetric motion,
+    with null vectors l and r: l·(C(r, r, r) + 3 B(r, w))/6, F_x w = -B(r, r), where B and C are
+    their second and third derivatives (Kuznetsov, Elements of Applied Bifurcation Theory, 2004,
+    section 5.4). The quadratic coefficient l·B(r, r)/2 is zero by the symmetry of both halves.
+    """
+    whole = doubled(bare) if twice else bare
+
+    def test(step: Step, like: Vectors | None) -> tuple[float, Vectors]:
+        x = repeated(bare, step.x, whole) if twice else np.asarray(step.x)
+        at = jnp.asarray(x)
+        matrix = np.asarray(jacobian_at(whole, at))[:, :-2]
+        nulls = _nulls(matrix, like)
+        right = jnp.asarray(np.append(nulls.right, [0.0, 0.0]))
+        second, _ = _bent(whole, at, right, jnp.zeros_like(at))
+        bend = np.linalg.lstsq(matrix, -np.asarray(second))[0]
+        _, third = _bent(whole, at, right, jnp.asarray(np.append(bend, [0.0, 0.0])))
+        return float(nulls.left @ np.asarray(third)) / 6, nulls
+
+    return test
+
+
+def _zeros(
+    problem: Shooting, steps: list[Step], scale: np.ndarray, test: Test
+) -> Iterator[tuple[float, Step]]:
+    """Where a test changes its sign along a curve: which step, with a fraction, and the point."""
+    seen: list[tuple[float, Vectors | None]] = []
+    for step in steps:
+        seen.append(test(step, seen[-1][1] if seen else None))
+    for i, (here, new) in enumerate(itertools.pairwise(steps)):
+        (before, like), (after, _) = seen[i], seen[i + 1]
+        if not (before * after < 0 or (after == 0 and before != 0)):
+            continue
+        at = between(problem, here, new, scale, lambda s, like=like: test(s, like)[0])
+        if at is None or abs(test(at, like)[0]) > _ZERO * max(abs(before), abs(after)):
+            continue
+        way = (new.x - here.x) / scale
+        yield i + float(way @ ((at.x - here.x) / scale) / (way @ way)), at

@@ -1,0 +1,136 @@
+"""Following a curve in two parameters: where it ends."""
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from ._closing import Closing
+from ._crossing import crossing
+from ._shooting import Shooting
+from ._solve import advance, located, observe
+from ._special_condition import Special
+from .curve import Step
+from .special import GRAZING, RESONANCE_1, RESONANCE_2, TORUS
+
+# What lies below zero by no more than this is zero to rounding: a choice, a hundred times the
+# corrector's tolerance.
+_NOISE = 1e-9
+
+# Of the first and of the second parameter.
+Intervals = tuple[tuple[float, float], tuple[float, float]]
+
+
+class CurveMonitor:
+    """Looks at each step of a walk along a curve of special motions and says when to end.
+
+    **Arguments:** the equations of the motions, with two parameters as their last unknowns; the
+    condition that makes them special; the size of each unknown; the parameters' intervals.
+    """
+
+    def __init__(self, problem: Shooting, condition: Special, scale: np.ndarray, bounds: Intervals):
+        self.problem, self.condition, self.scale = problem, condition, scale
+        self.bounds = bounds
+        self.closing = Closing(problem, scale)
+
+    def advance(self, x, tangent, length) -> Step:
+        """The point at this length along the tangent."""
+        return advance(self.problem, x, tangent, self.scale, length)
+
+    def stop(self, here: Step, new: Step) -> tuple[Step, str] | None:
+        """The last point of the curve, and why it ends between these two; `None` if it goes on."""
+        last, reason = new, None
+        if not self._inside(new):
+            last, reason = self._cut(here, new), "bounds"
+        found = [*self._grazings(here, last), *self._resonances(here, last)]
+        if found:
+            return min(found, key=lambda f: float(np.dot(here.tangent, (f[0].x - here.x))))
+        if reason is None:
+            last = self.closing.between(here, new, lambda test: self._where(here, new, test))
+            reason = None if last is None else "closed"
+        return None if reason is None or last is None else (last, reason)
+
+    def _where(self, here: Step, new: Step, test: Callable[[Step], float]) -> Step | None:
+        return located(self.problem, here, new, self.scale, test)
+
+    def _grazings(self, here: Step, last: Step) -> Iterator[tuple[Step, str]]:
+        """Where an impact beside the one that grazes is lost, or a stop is touched."""
+        # At a grazing the body turns on the stop, to rounding.
+        if self.condition.kind != GRAZING or self.condition.impact is not None:
+            yield from self._passed(here, last, room, None)
+        for i in range(len(last.seen.approach)):
+            # In a symmetric motion another impact grazes as well, to rounding.
+            if i != self.condition.impact:
+                yield from self._passed(here, last, lambda s, i=i: float(s.seen.approach[i]), i)
+
+    def _passed(
+        self, here: Step, last: Step, test: Callable[[Step], float], impact: int | None
+    ) -> Iterator[tuple[Step, str]]:
+        """Where a test falls through zero."""
+        if not test(last) <= -_NOISE:
+            return
+        at = self._where(here, last, test) if test(here) > _NOISE else here
+        if impact is not None and self.condition.kind != GRAZING and at is not here:
+            at = self._singular(here, at or here, test)
+        yield at or here, GRAZING
+
+    def _singular(self, here: Step, at: Step, test: Callable[[Step], float]) -> Step:
+        """The point at which an impact grazes, where the monodromy matrix has a pole."""
+
+        def along(length: float) -> Step | None:
+            step = self.advance(here.x, here.tangent, length)
+            return step if bool(step.good) else None
+
+        root = float(np.dot(here.tangent, (at.x - here.x) / self.scale))
+        found = crossing(along, root, test)
+        if found is None:
+            return at
+        x, tangent = found
+        seen = observe(self.problem, x)
+        seen = seen._replace(
+            monodromy=np.nan * seen.monodromy, multipliers=np.nan * seen.multipliers
+        )
+        return at._replace(x=x, tangent=tangent, seen=seen)
+
+    def _resonances(self, here: Step, last: Step) -> Iterator[tuple[Step, str]]:
+        """Where a pair of multipliers on the unit circle becomes real: beyond, the product of two
+        is still 1, but none has the modulus 1."""
+        if self.condition.kind != TORUS:
+            return
+        for kind, sign in ((RESONANCE_1, 1), (RESONANCE_2, -1)):
+
+            def left(step: Step, sign=sign) -> float:
+                return 1 - sign * cosine_of(step)
+
+            if left(last) <= -_NOISE:
+                at = self._where(here, last, left) if left(here) > _NOISE else here
+                yield at or here, kind
+
+    def _inside(self, step: Step) -> bool:
+        pairs = zip(step.x[-2:], self.bounds, strict=True)
+        return all(low <= x <= high for x, (low, high) in pairs)
+
+    def _cut(self, here: Step, new: Step) -> Step:
+        """The last point inside the bounds between two, found by halving the step."""
+        low, high = 0.0, float(np.dot(here.tangent, (new.x - here.x) / self.scale))
+        last = here
+        for _ in range(30):
+            middle = 0.5 * (low + high)
+            step = self.advance(here.x, here.tangent, middle)
+            inside = bool(step.good) and self._inside(step)
+            low, high = (middle, high) if inside else (low, middle)
+            last = step if inside else last
+        return last
+
+
+def room(step: Step) -> float:
+    """The clearance, of those without a turn 1."""
+    return float(np.clip(step.seen.nearest.room, -1.0, 1.0))
+
+
+def cosine_of(step: Step) -> float:
+    """The cosine of the angle of the two multipliers whose product is nearest to 1: half their sum,
+    beyond ±1 if they are real."""
+    values = step.seen.multipliers
+    first, second = np.triu_indices(len(values), 1)
+    pair = int(np.argmin(np.abs(values[first] * values[second] - 1)))
+    return float(0.5 * (values[first[pair]] + values[second[pair]]).real)
