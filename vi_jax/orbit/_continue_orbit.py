@@ -103,7 +103,7 @@ def continue_orbit(
     else:
         problem, x = problem_of(orbit, parameter, bounds, method)
     sought = _names("extrema", extrema, problem)
-    problem, x, ranges = _freed(problem, x, free, fixed, bounds)
+    problem, x, ranges = _freed(problem, x, free, fixed, bounds, np.asarray(orbit.multipliers))
     scale = np.ones(problem.size)
     scale[-len(ranges) :] = [0.5 * (high - low) for low, high in ranges]
     start = _first_point(problem, x, scale, orbit)
@@ -140,10 +140,13 @@ def _check_orbit(orbit: Orbit) -> None:
 
 def _freed(
     problem: Shooting, x: np.ndarray, free: Mapping[str, tuple[float, float]],
-    fixed: Mapping[str, float | None], bounds: tuple[float, float],
+    fixed: Mapping[str, float | None], bounds: tuple[float, float], multipliers: np.ndarray,
 ) -> tuple[Shooting, np.ndarray, list[tuple[float, float]]]:  # fmt: skip
     """The equations with further parameters and as many conditions, their unknowns, and the
     intervals of all parameters.
+
+    **Arguments:** the equations and the unknowns that the orbit gives; `free`, `fixed` and `bounds`
+    as in `continue_orbit`; the orbit's `multipliers`.
 
     **Raises:** `ValueError` or `TypeError` for what cannot be freed or held.
     """
@@ -181,7 +184,7 @@ def _freed(
             )
     ranges.append(bounds)
     wide = dataclasses.replace(
-        problem, parameters=(*free, *problem.parameters), conditions=as_held(targets)
+        problem, parameters=(*free, *problem.parameters), conditions=as_held(targets, multipliers)
     )
     corners = [wide.at(jnp.asarray(corner)) for corner in itertools.product(*ranges)]
     if problem.follows_events:

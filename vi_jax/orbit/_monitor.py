@@ -7,7 +7,7 @@ from collections.abc import Callable
 import jax.numpy as jnp
 import numpy as np
 
-from ._conditions import alone
+from ._conditions import alone, overtaken
 from ._crossing import BESIDE, changed_between, crossing, tests_of
 from ._events import Event
 from ._extrema import Extrema
@@ -104,6 +104,9 @@ class BranchMonitor:
         if reason is None and self._lengthened(here, new) > 0:
             last = self._where(here, new, lambda step: self._lengthened(here, step)) or here
             reason = "long"
+        if reason is None and overtaken(self.problem, new) > 0:
+            last = self._where(here, new, lambda step: overtaken(self.problem, step)) or here
+            reason = "multiplier"
         grazing = self._grazing(here, last) or self._sequence(here, last)
         if grazing is not None:
             last, reason = self.whole[id(grazing.step.seen)], grazing.kind
