@@ -9,7 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from .._at_work import at_work
+from .._at_work import Tell, at_work
 from .._checks import flag, given_number, interval, one_of, tuple_of_names
 from .._interrupted import Interrupted
 from ..flow import MethodLike
@@ -18,6 +18,7 @@ from ._conditions import as_held
 from ._fixed_step_method import steps_of
 from ._monitor import BranchMonitor
 from ._observed import Observed
+from ._past_section import past_section
 from ._problem import check_parameter, problem_of
 from ._quantities import names_of, rates_at
 from ._rest import rests
@@ -121,12 +122,27 @@ def continue_orbit(
         return Interrupted("walk along the branch", branch())
 
     with at_work("branch", kept, progress=progress, unit="point") as tell:
-        ends[1] = walk(ahead.advance, forward, stop=ahead.stop, tell=tell, **settings)
+        ends[1] = _walked(ahead, forward, tell, settings)
         if ends[1] == "closed":
             ends[0] = ends[1]
         else:
-            ends[0] = walk(back.advance, backward, stop=back.stop, tell=tell, **settings)
+            ends[0] = _walked(back, backward, tell, settings)
     return branch()
+
+
+def _walked(monitor: BranchMonitor, steps: list[Step], tell: Tell, settings: dict[str, Any]) -> str:
+    """Walk from the last of these steps on, to which others are added; why it ended.
+
+    Where a motion that rests meets a stop on its section the walk is taken up beyond.
+    """
+    while True:
+        end = walk(monitor.advance, steps, stop=monitor.stop, tell=tell, **settings)
+        beyond = (
+            past_section(monitor.problem, steps[-1], monitor.scale) if end == "stalled" else None
+        )
+        if beyond is None or len(steps) >= settings["max_points"]:
+            return end
+        steps.append(beyond)
 
 
 def _check_orbit(orbit: Orbit) -> None:

@@ -211,7 +211,8 @@ class BranchMonitor:
             at = self._where(start, end, test)
             if at is None:
                 return None
-            beyond = self.advance(at.x, at.tangent, _BEYOND)
+            left = float(np.dot(at.tangent, (end.x - at.x) / self.scale))
+            beyond = end if left < _BEYOND else self.advance(at.x, at.tangent, _BEYOND)
             return self._where(at, beyond, test) or at, beyond
 
         found = changed_sequence(here, last, where)
