@@ -165,7 +165,7 @@ def carried(half_gap, restitution=0.5):
         return np.cos(s) * short + 2 * np.sin(s) * np.sin(d / 2) ** 2 / d
 
     while v > 1e-14 and np.pi - s > 1e-13 and pressed(np.pi - s) > v:
-        d = brentq(lambda d: pressed(d) - v, 1e-30, np.pi - s, xtol=1e-18, rtol=1e-14)
+        d = brentq(lambda d, v=v: pressed(d) - v, 1e-30, np.pi - s, xtol=1e-18, rtol=1e-14)
         v = restitution * (2 * np.sin(s + d / 2) * np.sin(d / 2) - v)
         s += d
         found.append((s, v))
@@ -198,5 +198,5 @@ def test_chatter_and_rest_pass_over_the_section():
     while high - low > 1e-10:
         middle = 0.5 * (low + high)
         low, high = (middle, high) if carried(middle)[-1][1] < 1e-14 else (low, middle)
-    # So close to it hops are lost in the rounding of the place, which rests of 3e-4 are briefer than.
+    # So close to it hops are lost in the rounding of the place: rests of 3e-4 are not seen.
     assert point.parameter == pytest.approx(low, abs=1e-7)
