@@ -73,9 +73,10 @@ def find_orbit(
 
     **Returns:** an `Orbit`. Its `result` tells an orbit of a smaller period, a search that found
     none, one that ended at a grazing or at an equilibrium, a motion that drifts and a guess that
-    cannot be simulated from each other. Where something in the state is neutral (a multiplier is exactly 1), as the
-    place of a body that slides freely or a number that is carried along, the orbits are a family:
-    the one nearest to the guess is found, and derivatives are those across the family.
+    cannot be simulated from each other. Where something in the state is neutral (a multiplier is
+    exactly 1), as the place of a body that slides freely or a number that is carried along, the
+    orbits are a family: the one nearest to the guess is found, and derivatives are those across
+    the family.
 
     **Raises:** `ValueError` or `TypeError` for arguments that cannot be used, before any work.
     """
