@@ -9,9 +9,9 @@ import numpy as np
 
 from ._conditions import alone, overtaken
 from ._crossing import BESIDE, changed_between, crossing, tests_of
-from ._events import Event
 from ._extrema import Extrema
 from ._hopf import hopf_between, size_of
+from ._named import named
 from ._origin import halves, origin
 from ._sequence import changed_sequence
 from ._shooting import Shooting
@@ -25,8 +25,6 @@ from .special import (
     DOUBLING,
     EXTREMUM,
     FOLD,
-    GRAZING,
-    HOPF,
     SYMMETRY,
     TORUS,
     TURN,
@@ -185,20 +183,9 @@ class BranchMonitor:
         if not found:
             return None
         at, impact = min(found, key=lambda f: float(np.dot(here.tangent, f[0].x - here.x)))
-        if impact in DETAILS:
-            return self._point(GRAZING, at, DETAILS[impact])
-        if impact == RESTS:
-            return self._point(HOPF, at, "the motion shrinks to rest", 0)
-        if impact is None:
-            machine, touched = self.problem.machine, int(at.seen.nearest.event)
-            guard = f"the guard of {Event(touched).called(machine)}"
-            what = "a stop" if touched < len(machine.stops) else guard
-            detail = f"touches {what} at {self._place(at, float(at.seen.nearest.clock))}"
-        else:
-            clock = float(np.asarray(self.problem.parts(jnp.asarray(at.x))[0])[impact])
-            lost = self.problem.events[impact].of(self.problem.machine)
-            detail = f"the {lost.name or lost.word} at {self._place(at, clock)} is lost"
-        return self._point(GRAZING, at, detail, impact)
+        kind, detail = named(self.problem, at, impact)
+        impact = 0 if impact == RESTS else None if impact in DETAILS else impact
+        return self._point(kind, at, detail, impact)
 
     def _sequence(self, here: Step, last: Step) -> SpecialPoint | None:
         """Where a motion that rests gains or loses one of its rests or impacts."""
@@ -217,11 +204,6 @@ class BranchMonitor:
 
         found = changed_sequence(here, last, where)
         return None if found is None else self._point(*found)
-
-    def _place(self, at: Step, clock: float) -> str:
-        """A reading of the clock of impacts, in words, within one period from the section on."""
-        period = float(self.problem.period(jnp.asarray(at.x)))
-        return self.problem.machine.place_of(clock % period, self.problem.cycles)
 
     def _bifurcations(self, here: Step, last: Step) -> Step | None:
         """Record what happens between two points; the point where the branch springs, if met.

@@ -48,6 +48,10 @@ MARKS = {
     "rest": ("h", "0.7"),
     "extremum": ("d", "w"),
     "turn": ("<", "w"),
+    "crossing-sliding": (">", "k"),
+    "grazing-sliding": ("o", "w"),
+    "switching-sliding": ("v", "w"),
+    "adding-sliding": ("p", "w"),
 }
 DASHES = {
     "grazing": "-",
