@@ -1,5 +1,5 @@
-"""Sliding bifurcations: where a motion gains or loses a part in which a body sticks, or slides along
-the surface of a switch.
+"""Sliding bifurcations: where a motion gains or loses a part in which a body sticks, or slides
+along the surface of a switch.
 
 Such a part begins where the motion comes upon the surface with the fields of both sides pointing at
 it, and ends where one of them turns away. There are four ways in which the sequence changes (di

@@ -58,6 +58,7 @@ class Branch(InWords):
     special: list[SpecialPoint]
     ends: tuple[str, str]
     """Why the branch ends on each side: "bounds", "grazing" (an impact is lost or a stop touched),
+    one of the four sliding bifurcations ("crossing-sliding", …; see `SpecialPoint.kind`),
     "period-doubling" (it springs there from a motion of half its period), "symmetry-breaking" (from
     a symmetric one), "hopf" (it shrinks to rest), "rest" (a rest on a stop is gained or lost),
     "closed", "multiplier" (another becomes as large as the one that is held, or those of a held
