@@ -1,10 +1,12 @@
 """All periodic motions in a region of starts, beside closed forms and a search by brute force."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
 import xarray as xr
 
+from belts import Belt, level
 from truth import flown
 
 ZETA, K, GAP, XI = 1.6, 0.8, 1.5, 0.02
@@ -62,6 +64,21 @@ def test_says_what_was_searched(found, tmp_path):
     table = found.to_xarray(along="motion").to_dataframe()
     assert table.total_found.sum() == searched.converged and set(table.period) == {1}
     assert data.y_min.attrs["units"] == "a" and len(found.to_xarray(along="search").search) == 1
+
+
+def test_an_equilibrium_of_an_autonomous_machine_is_no_motion():
+    """A body on a belt slides steadily where its spring holds friction, and there every period
+    would do; about it there is the cycle that sticks and slips, and one that only slips."""
+    belt, speed = Belt(), 1.5
+    standing = vi.OscillatorState(level(jnp.asarray(speed)) + 1e-2, jnp.asarray(0.0))
+    orbit = vi.find_orbit(belt, standing)
+    assert orbit.result == vi.ORBIT_RESULTS.equilibrium and not bool(orbit.successful)
+    near = vi.all_orbits(belt, 1, region={"start.Y": (-1.0, 3.0)}, starts=64, start=standing)
+    (searched,) = near.searched
+    assert len(near.orbits) == 2 and (near.found.sum() == searched.converged)
+    assert searched.still > 32 and searched.still + searched.converged <= 64
+    assert all(float(o.y_max) - float(o.y_min) > 2 for o in near.orbits)
+    assert f"{searched.still} ended at an equilibrium" in str(near)
 
 
 def test_interrupted_after_a_period(found, scene, monkeypatch):

@@ -7,10 +7,12 @@ be held.
 
 import abc
 import dataclasses
+import itertools
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from .._types import Scalar, Vector
 from ..machine import with_leaf
@@ -43,6 +45,44 @@ class Held(AbstractCondition):
         return quantity_of(problem, x, seen, self.name) - self.value
 
 
+class HeldMultiplier(AbstractCondition):
+    """The greatest multiplier has a given modulus, as an equation that is smooth where two of them
+    meet on the real axis, as their moduli are not there: a root of the characteristic polynomial of
+    the monodromy matrix, or of that of its second compound, whose eigenvalues are the products of
+    two multipliers."""
+
+    value: Scalar
+    """The multiplier, with its sign; of a complex pair its modulus."""
+    pair: bool = eqx.field(static=True)
+
+    def missing(self, problem, x, seen):
+        """The characteristic polynomial at the value held."""
+        matrix, root = seen.monodromy, self.value
+        if self.pair:
+            matrix, root = _second_compound(matrix), self.value**2
+        return jnp.linalg.det(matrix - root * jnp.eye(len(matrix), dtype=matrix.dtype))
+
+    def overtaken(self, seen: Observed) -> float:
+        """Negative while the multiplier held is the greatest, or the pair complex; host-side."""
+        values, value = np.asarray(seen.multipliers), float(self.value)
+        if not self.pair:
+            others = np.delete(values, np.argmin(np.abs(values - value)))
+            return float(np.abs(others).max(initial=0.0) - abs(value))
+        i, j = min(
+            itertools.combinations(range(len(values)), 2),
+            key=lambda pair: abs(np.prod(values[list(pair)]) - value**2),
+        )
+        others = np.abs(np.delete(values, [i, j])).max(initial=0.0) - value
+        return float(max(others, np.real((values[i] - values[j]) ** 2)))
+
+
+def _second_compound(matrix: Array) -> Array:
+    """The minors of two rows and two columns each."""
+    pairs = np.array(list(itertools.combinations(range(len(matrix)), 2)))
+    (i, j), (k, l) = pairs.T[:, :, None], pairs.T[:, None, :]
+    return matrix[i, k] * matrix[j, l] - matrix[i, l] * matrix[j, k]
+
+
 def alone(
     problem: Shooting, step: Step, scale: np.ndarray, kept: int = -1
 ) -> tuple[Shooting, Step, np.ndarray]:
@@ -65,6 +105,26 @@ def alone(
     return one, step._replace(x=x, tangent=tangent / size), sizes
 
 
-def as_held(values: dict[str, float]) -> tuple[Held, ...]:
-    """The conditions that numbers of these names have these values."""
-    return tuple(Held(name, jnp.asarray(value, float)) for name, value in values.items())
+def as_held(values: dict[str, float], multipliers: np.ndarray) -> tuple[AbstractCondition, ...]:
+    """The conditions that numbers of these names have these values.
+
+    **Arguments:** `multipliers`, those of the motion that is begun with.
+    """
+    return tuple(
+        _multiplier(value, complex(multipliers[0]))
+        if name == "multiplier"
+        else Held(name, jnp.asarray(value, float))
+        for name, value in values.items()
+    )
+
+
+def _multiplier(size: float, greatest: complex) -> HeldMultiplier:
+    pair = abs(greatest.imag) > 1e-9
+    value = size if pair or greatest.real > 0 else -size
+    return HeldMultiplier(jnp.asarray(value, float), pair)
+
+
+def overtaken(problem: Shooting, step: Step) -> float:
+    """Positive where another multiplier is greater than the one that is held."""
+    held = (c for c in problem.conditions if isinstance(c, HeldMultiplier))
+    return max((c.overtaken(step.seen) for c in held), default=-1.0)

@@ -9,7 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from .._at_work import at_work
+from .._at_work import Tell, at_work
 from .._checks import flag, given_number, interval, one_of, tuple_of_names
 from .._interrupted import Interrupted
 from ..flow import MethodLike
@@ -18,6 +18,7 @@ from ._conditions import as_held
 from ._fixed_step_method import steps_of
 from ._monitor import BranchMonitor
 from ._observed import Observed
+from ._past_section import past_section
 from ._problem import check_parameter, problem_of
 from ._quantities import names_of, rates_at
 from ._rest import rests
@@ -103,7 +104,7 @@ def continue_orbit(
     else:
         problem, x = problem_of(orbit, parameter, bounds, method)
     sought = _names("extrema", extrema, problem)
-    problem, x, ranges = _freed(problem, x, free, fixed, bounds)
+    problem, x, ranges = _freed(problem, x, free, fixed, bounds, np.asarray(orbit.multipliers))
     scale = np.ones(problem.size)
     scale[-len(ranges) :] = [0.5 * (high - low) for low, high in ranges]
     start = _first_point(problem, x, scale, orbit)
@@ -121,12 +122,27 @@ def continue_orbit(
         return Interrupted("walk along the branch", branch())
 
     with at_work("branch", kept, progress=progress, unit="point") as tell:
-        ends[1] = walk(ahead.advance, forward, stop=ahead.stop, tell=tell, **settings)
+        ends[1] = _walked(ahead, forward, tell, settings)
         if ends[1] == "closed":
             ends[0] = ends[1]
         else:
-            ends[0] = walk(back.advance, backward, stop=back.stop, tell=tell, **settings)
+            ends[0] = _walked(back, backward, tell, settings)
     return branch()
+
+
+def _walked(monitor: BranchMonitor, steps: list[Step], tell: Tell, settings: dict[str, Any]) -> str:
+    """Walk from the last of these steps on, to which others are added; why it ended.
+
+    Where a motion that rests meets a stop on its section the walk is taken up beyond.
+    """
+    while True:
+        end = walk(monitor.advance, steps, stop=monitor.stop, tell=tell, **settings)
+        beyond = (
+            past_section(monitor.problem, steps[-1], monitor.scale) if end == "stalled" else None
+        )
+        if beyond is None or len(steps) >= settings["max_points"]:
+            return end
+        steps.append(beyond)
 
 
 def _check_orbit(orbit: Orbit) -> None:
@@ -140,10 +156,13 @@ def _check_orbit(orbit: Orbit) -> None:
 
 def _freed(
     problem: Shooting, x: np.ndarray, free: Mapping[str, tuple[float, float]],
-    fixed: Mapping[str, float | None], bounds: tuple[float, float],
+    fixed: Mapping[str, float | None], bounds: tuple[float, float], multipliers: np.ndarray,
 ) -> tuple[Shooting, np.ndarray, list[tuple[float, float]]]:  # fmt: skip
     """The equations with further parameters and as many conditions, their unknowns, and the
     intervals of all parameters.
+
+    **Arguments:** the equations and the unknowns that the orbit gives; `free`, `fixed` and `bounds`
+    as in `continue_orbit`; the orbit's `multipliers`.
 
     **Raises:** `ValueError` or `TypeError` for what cannot be freed or held.
     """
@@ -181,7 +200,7 @@ def _freed(
             )
     ranges.append(bounds)
     wide = dataclasses.replace(
-        problem, parameters=(*free, *problem.parameters), conditions=as_held(targets)
+        problem, parameters=(*free, *problem.parameters), conditions=as_held(targets, multipliers)
     )
     corners = [wide.at(jnp.asarray(corner)) for corner in itertools.product(*ranges)]
     if problem.follows_events:

@@ -8,25 +8,24 @@ import jax.numpy as jnp
 import numpy as np
 
 from ._closing import Closing
-from ._conditions import alone
+from ._conditions import alone, overtaken
 from ._crossing import BESIDE, changed_between, crossing, tests_of
 from ._extrema import Extrema
 from ._hopf import hopf_between, size_of
+from ._named import named
 from ._origin import halves, origin
 from ._sequence import changed_sequence
 from ._shooting import Shooting
 from ._solution import orbit_of
 from ._solve import advance, images_at, located, observe
 from ._symmetry import may_be_symmetric
-from ._words import ANEW, DETAILS, HELD_FOLD, REORDERED, RESTS, grazing_in_words
+from ._words import ANEW, DETAILS, HELD_FOLD, REORDERED, RESTS
 from .curve import Step
 from .special import (
     CROSSING,
     DOUBLING,
     EXTREMUM,
     FOLD,
-    GRAZING,
-    HOPF,
     SYMMETRY,
     TORUS,
     TURN,
@@ -104,6 +103,9 @@ class BranchMonitor:
         if reason is None and self._lengthened(here, new) > 0:
             last = self._where(here, new, lambda step: self._lengthened(here, step)) or here
             reason = "long"
+        if reason is None and overtaken(self.problem, new) > 0:
+            last = self._where(here, new, lambda step: overtaken(self.problem, step)) or here
+            reason = "multiplier"
         grazing = self._grazing(here, last) or self._sequence(here, last)
         if grazing is not None:
             last, reason = self.whole[id(grazing.step.seen)], grazing.kind
@@ -176,11 +178,9 @@ class BranchMonitor:
         if not found:
             return None
         at, impact = min(found, key=lambda f: float(np.dot(here.tangent, f[0].x - here.x)))
-        if impact in DETAILS:
-            return self._point(GRAZING, at, DETAILS[impact])
-        if impact == RESTS:
-            return self._point(HOPF, at, "the motion shrinks to rest", 0)
-        return self._point(GRAZING, at, grazing_in_words(self.problem, at, impact), impact)
+        kind, detail = named(self.problem, at, impact)
+        impact = 0 if impact == RESTS else None if impact in DETAILS else impact
+        return self._point(kind, at, detail, impact)
 
     def _sequence(self, here: Step, last: Step) -> SpecialPoint | None:
         """Where a motion that rests gains or loses one of its rests or impacts."""
@@ -193,7 +193,8 @@ class BranchMonitor:
             at = self._where(start, end, test)
             if at is None:
                 return None
-            beyond = self.advance(at.x, at.tangent, _BEYOND)
+            left = float(np.dot(at.tangent, (end.x - at.x) / self.scale))
+            beyond = end if left < _BEYOND else self.advance(at.x, at.tangent, _BEYOND)
             return self._where(at, beyond, test) or at, beyond
 
         found = changed_sequence(here, last, where)

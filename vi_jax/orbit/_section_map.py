@@ -6,8 +6,11 @@ forgets how it began, so that the map is smooth, though of lower rank, as long a
 impact outside of a chatter is gained or lost.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
@@ -17,7 +20,6 @@ from ..machine import AbstractMachine, in_rows, is_autonomous, leaf
 from ._cycle_map import CycleMap
 from ._fixed_step_method import fixed_step_method
 from ._observed import Counted, Observed
-from ._rest import rests_now
 from ._shooting import Leg, Shooting
 from ._turns import Nearest
 from .floquet import multipliers_of
@@ -47,7 +49,18 @@ class SectionMap(Shooting):
     def _map(self, machine: AbstractMachine, u: Vector) -> Vector:
         """The state a period after `u`."""
         carried = CycleMap(machine, self.method, self.cycles, True)
-        return ravel_pytree(carried(self.unravel(u)))[0]
+        return ravel_pytree(carried(self._begun(machine, u)))[0]
+
+    def _begun(self, machine: AbstractMachine, u: Vector) -> State:
+        """The state `u`, put on those stops that it is beyond: where the motion rests on its
+        section a guess of the state there may be."""
+        state = self.unravel(u)
+        for stop in machine.stops:
+            body = machine.coordinates[stop.coordinate]
+            beyond = stop.beyond(body.position(state)) > 0
+            there = body.placed(state, stop.place, body.velocity(state))
+            state = jtu.tree_map(partial(jnp.where, beyond), there, state)
+        return state
 
     def lacks(self, x: Vector) -> Vector:
         """What the motion lacks to be periodic."""
@@ -58,7 +71,7 @@ class SectionMap(Shooting):
         """Multipliers, extremes, impacts and rests of a solution `x`."""
         machine, u = self.at(x), x[: self.states]
         run = simulate(
-            machine, self.unravel(u), self.cycles, method=self.method, impact_log=_LISTED,
+            machine, self._begun(machine, u), self.cycles, method=self.method, impact_log=_LISTED,
             rests=True,
         )  # fmt: skip
         log, duration = run.impact_log, run.duration
@@ -93,7 +106,7 @@ class SectionMap(Shooting):
         """The state on the section that is met at clock `s`, counted in whole cycles."""
         machine = self.at(x)
         run = simulate(
-            machine, self.unravel(x[: self.states]), self.cycles, method=self.method,
+            machine, self._begun(machine, x[: self.states]), self.cycles, method=self.method,
             record="sections", rests=True,
         )  # fmt: skip
         rows = in_rows(run.sections)
@@ -103,17 +116,8 @@ class SectionMap(Shooting):
 def section_map_of(
     orbit: Orbit, parameter: str, method: MethodLike
 ) -> tuple[SectionMap, np.ndarray]:
-    """The equations of a motion that rests, and the unknowns it gives.
-
-    **Raises:** `ValueError` if it is at rest on the section.
-    """
+    """The equations of a motion that rests, and the unknowns it gives."""
     machine = orbit.machine
-    if rests_now(orbit):
-        raise ValueError(
-            "Argument `orbit` must not rest on a stop on its section to be followed as a branch, "
-            "but does: find it on a section that it passes in flight (`find_orbit(..., "
-            "section=...)`)."
-        )
     carried = fixed_step_method(method, orbit.method, machine)
     problem = SectionMap(
         machine, carried, orbit.state, int(orbit.cycles), (), ((),), 1, (parameter,)

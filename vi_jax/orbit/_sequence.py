@@ -2,8 +2,6 @@
 
 from collections.abc import Callable
 
-import numpy as np
-
 from .curve import Step
 from .special import GRAZING, REST
 
@@ -62,7 +60,6 @@ def _number(step: Step, name: str) -> int:
 
 
 def _same(step: Step, name: str, count: int) -> float:
-    """1 where a motion has so many rests or impacts, else -1; NaN where it is none."""
-    if not bool(step.good) and not np.all(np.isfinite(step.x)):
-        return np.nan
-    return 1.0 if _number(step, name) == count else -1.0
+    """1 where a motion has so many rests or impacts, else -1; where there is none at all too, as
+    beyond a rest that is lost, where the hops of a chatter end one by one in grazings."""
+    return 1.0 if bool(step.good) and _number(step, name) == count else -1.0

@@ -58,12 +58,14 @@ class Branch(InWords):
     special: list[SpecialPoint]
     ends: tuple[str, str]
     """Why the branch ends on each side: "bounds", "grazing" (an impact is lost or a stop touched),
+    one of the four sliding bifurcations ("crossing-sliding", …; see `SpecialPoint.kind`),
     "period-doubling" (it springs there from a motion of half its period), "symmetry-breaking" (from
-    a symmetric one), "hopf" (it shrinks to rest), "rest" (a rest on a stop is gained
-    or lost), "closed" (it has come back to its first point, which is its last one as well: an
-    isola), "stalled", "max_points", "interrupted", "long" (an autonomous motion takes
-    four times as long as that from which the branch began, for which its steps are: begin another
-    one there)."""
+    a symmetric one), "hopf" (it shrinks to rest), "rest" (a rest on a stop is gained or lost),
+    "closed" (it has come back to its first point, which is its last one as well: an isola),
+    "multiplier" (another becomes as large as the one that is held, or those of a held complex pair
+    turn real), "stalled" (the corrector finds no motion further on, however close), "max_points",
+    "interrupted", "long" (an autonomous motion takes four times as long as that from which the
+    branch began, for which its steps are: begin another one there)."""
     problem: Shooting = dataclasses.field(repr=False)
     steps: list[Step] = dataclasses.field(repr=False)
     scale: np.ndarray = dataclasses.field(repr=False)

@@ -16,6 +16,14 @@ from .._types import Flag, Scalar
 Vector = Float[Array, " n"]
 
 
+# A walk whose steps have to be shorter than this share of the longest stalls: a choice. The
+# shortest that the branches of the tests need is 2e-3 of it.
+_SHORTEST = 1e-6
+
+# After a step that had to be cut so many have its length, before they grow again: a choice.
+_STEADY = 3
+
+
 class Step(NamedTuple):
     """A point of the curve, as one corrector finds it."""
 
@@ -130,16 +138,18 @@ def walk(
 
     **Returns:** why it ended.
     """
-    length = step
+    length, failed, steady = step, 0, 0
     while len(steps) < max_points:
         here = steps[-1]
         new = advance(here.x, here.tangent, length)
         turn = float(np.dot(np.asarray(new.tangent), np.asarray(here.tangent)))
         if not bool(new.good) or turn < 0.9:
-            length *= 0.4
-            if length < 1e-9:
+            # The further off a solution is, the longer each trial takes.
+            length, failed, steady = length * (0.4 if failed < 2 else 0.1), failed + 1, _STEADY
+            if length < _SHORTEST * max_step:
                 return "stalled"
             continue
+        failed, steady = 0, max(0, steady - 1)
         ending = stop(here, new)
         if ending is not None:
             last, reason = ending
@@ -148,7 +158,7 @@ def walk(
             return reason
         steps.append(new)
         tell(1)
-        if turn > 0.99 and int(new.iterations) <= 6:
+        if turn > 0.99 and int(new.iterations) <= 6 and not steady:
             length = min(1.4 * length, max_step)
         elif turn < 0.97:
             length *= 0.7

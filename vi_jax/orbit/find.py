@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -15,9 +16,9 @@ from .._checks import count, flag
 from .._numbers import concrete
 from .._programs import compiled
 from .._renamed import renamed
-from .._types import Number, State
-from ..flow import MethodLike, check_leaves, means
-from ..machine import AbstractMachine
+from .._types import Flag, Number, State
+from ..flow import MethodLike, check_leaves, in_modes, means
+from ..machine import AbstractMachine, begin_modes, is_autonomous
 from ._arcs import by_the_first_state, error_of, in_order, moved_from_impacts, observe_arc
 from ._cycle_map import CycleMap, adopted, cycle_map
 from ._root import root_of
@@ -70,10 +71,11 @@ def find_orbit(
     - `throw`: raise an error if no orbit is found, instead of only saying so in `result`.
 
     **Returns:** an `Orbit`. Its `result` tells an orbit of a smaller period, a search that found
-    none, one that ended at a grazing, a motion that drifts and a guess that cannot be simulated
-    from each other. Where something in the state is neutral (a multiplier is exactly 1), as the
-    place of a body that slides freely or a number that is carried along, the orbits are a family:
-    the one nearest to the guess is found, and derivatives are those across the family.
+    none, one that ended at a grazing or at an equilibrium, a motion that drifts and a guess that
+    cannot be simulated from each other. Where something in the state is neutral (a multiplier is
+    exactly 1), as the place of a body that slides freely or a number that is carried along, the
+    orbits are a family: the one nearest to the guess is found, and derivatives are those across
+    the family.
 
     **Raises:** `ValueError` or `TypeError` for arguments that cannot be used, before any work.
     """
@@ -162,7 +164,8 @@ def _judged(
     duration = jnp.sum(jnp.where(within, seen.duration, 0.0))
     sums = {name: jnp.sum(jnp.where(within, a, 0.0)) for name, a in seen.integrals.items()}
     clearance = jnp.min(jnp.where(within, seen.clearance, jnp.inf))
-    found = (root.converged > 0) & (error < jnp.sqrt(jnp.finfo(x.dtype).eps) * 100)
+    still = _stands_still(machine, sections[0], unravel, duration)
+    found = (root.converged > 0) & ~still & (error < jnp.sqrt(jnp.finfo(x.dtype).eps) * 100)
     slowest = jnp.min(jnp.where(hit, seen.listed.speed, jnp.inf))
     near = jnp.minimum(slowest, jnp.sqrt(2 * jnp.maximum(clearance, 0))) < _SLOW
     return Orbit(
@@ -187,7 +190,7 @@ def _judged(
         iterations=root.steps.astype(jnp.int32),
         history=root.history,
         averages=means(sums, duration),
-        result=_verdict(found, least < cycles, near, drifts, jnp.isnan(root.residual)),
+        result=_verdict(found, least < cycles, near, drifts, still, jnp.isnan(root.residual)),
     )
 
 
@@ -195,7 +198,7 @@ def _least_period(sections: Float[Array, "cycles states"], error: Array) -> Arra
     """The fewest cycles after which the sections repeat."""
     cycles = sections.shape[0]
     least = jnp.asarray(cycles, jnp.int32)
-    slack = jnp.maximum(1e-6 if sections.dtype == jnp.float64 else 1e-3, 100 * error)
+    slack = jnp.maximum(_slack(sections.dtype), 100 * error)
     for m in range(cycles - 1, 0, -1):
         if cycles % m == 0:
             apart = jnp.abs(sections - jnp.roll(sections, -m, axis=0))
@@ -204,16 +207,35 @@ def _least_period(sections: Float[Array, "cycles states"], error: Array) -> Arra
     return least
 
 
+def _stands_still(
+    machine: AbstractMachine, x: Array, unravel: Callable[[Array], State], duration: Array
+) -> Flag:
+    """Whether an autonomous machine stands still in the state `x`, at an equilibrium: as fast as
+    it leaves the section it would get nowhere in its period."""
+    if not is_autonomous(machine, unravel(x)):
+        return jnp.zeros((), bool)
+    s, state = jnp.zeros((), x.dtype), unravel(x)
+    field = in_modes(machine, begin_modes(machine, s, state)).field
+    passed = jnp.abs(ravel_pytree(field(s, state))[0]) * duration
+    return jnp.all(passed <= _slack(x.dtype) * (1 + jnp.abs(x)))
+
+
+def _slack(dtype: object) -> float:
+    """What tells states from each other, relative to 1 + their size."""
+    return 1e-6 if dtype == jnp.float64 else 1e-3
+
+
 def _verdict(
-    found: Array, smaller: Array, near_grazing: Array, drifts: Array, no_run: Array
+    found: Array, smaller: Array, near_grazing: Array, drifts: Array, still: Array, no_run: Array
 ) -> ORBIT_RESULTS:
     """The result of a search, from flags.
 
     **Arguments:** `found`, an orbit; `smaller`, its period; `near_grazing`, where the search ended;
-    `drifts`, the motion; `no_run`, the guess cannot be simulated.
+    `drifts`, the motion; `still`, an equilibrium; `no_run`, the guess cannot be simulated.
     """
     where, results = ORBIT_RESULTS.where, ORBIT_RESULTS
     missed = where(near_grazing, results.grazing, results.no_orbit)
     missed = where(drifts, results.drifts, missed)
+    missed = where(still, results.equilibrium, missed)
     missed = where(no_run, results.not_simulated, missed)
     return where(found, where(smaller, results.smaller_period, results.successful), missed)

@@ -65,12 +65,16 @@ class ORBIT_RESULTS(NamedEnumeration):
         "No orbit was found: something in the state is neutral (a multiplier is 1) and drifts from "
         "cycle to cycle. What is counted by the cycle is set back by the machine's `renewed`."
     )
+    equilibrium = (
+        "No orbit was found: the search ended at an equilibrium, where nothing moves; it meets the "
+        "equations of a motion with any period."
+    )
     not_simulated = "The guess cannot be simulated, as one beyond a stop: `simulate` says why."
 
 
 _RESULT_NAMES = (
     "successful", "smaller_period", "inadmissible", "no_orbit", "grazing", "drifts",
-    "not_simulated",
+    "equilibrium", "not_simulated",
 )  # fmt: skip
 
 

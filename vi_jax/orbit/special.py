@@ -7,10 +7,12 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from .._checks import given_number
+from ._across_sliding import across_sliding, without_part
 from ._events import Event
 from ._fewer_events import without_events
 from ._origin import repeated
 from ._shooting import Shooting
+from ._sliding import SLIDING
 from ._solution import orbit_of
 from ._solve import advance, jacobian_at, state_at, tangent_at
 from .curve import Step
@@ -38,8 +40,10 @@ class SpecialPoint(InWords):
     """"fold", "period-doubling", "neimark-sacker", "branch-point", "symmetry-breaking" (where
     motions that are their own image under the symmetry of their machine meet some that are not),
     "grazing", "hopf" (an autonomous machine's motion shrinks to rest), "rest" (a rest on a stop
-    is gained or lost), "extremum" (of a `quantity` that was asked for), or "turn" (the parameter
-    turns back where others are free; no multiplier need be 1)."""
+    is gained or lost), "crossing-sliding", "grazing-sliding", "switching-sliding" or
+    "adding-sliding" (a part in which a switch is held on its surface, as by dry friction, vanishes
+    or appears; see the `detail`), "extremum" (of a `quantity` that was asked for), or "turn" (the
+    parameter turns back where others are free; no multiplier need be 1)."""
     parameter: float
     orbit: Orbit
     detail: str
@@ -64,7 +68,8 @@ class SpecialPoint(InWords):
 
         At a period doubling, the motion of twice the period, or of half of it where the branch
         springs from one; at a grazing, the motion with that impact less or one more, on the side on
-        which it is admissible; where branches cross, a motion of the other one.
+        which it is admissible; where branches cross, a motion of the other one; at a sliding
+        bifurcation the motion that sticks once more or less.
 
         **Arguments:** how far from the point (in the norm of the scaled unknowns).
 
@@ -77,9 +82,11 @@ class SpecialPoint(InWords):
             return _beyond_grazing(self, distance)
         if self.kind in (CROSSING, SYMMETRY):
             return _crossed(self, distance)
+        if self.kind in SLIDING:
+            return _held_otherwise(self, distance)
         raise ValueError(
-            "`switch` needs a period doubling, a grazing or a point where branches cross, but this "
-            f"special point is a {self.kind}."
+            "`switch` needs a period doubling, a grazing, a sliding bifurcation or a point where "
+            f"branches cross, but this special point is a {self.kind}."
         )
 
     def __str__(self) -> str:
@@ -139,6 +146,22 @@ def _crossed(point: SpecialPoint, distance: float) -> Orbit:
     off = off / np.linalg.norm(off)
     step = advance(problem, x, off, point.scale, distance)
     return _found(problem, step, "the other branch", distance)
+
+
+def _held_otherwise(point: SpecialPoint, distance: float) -> Orbit:
+    """The motion on the other side of a sliding bifurcation."""
+    found = without_part(point.problem, point.step, point.scale, distance)
+    found = (
+        orbit_of(*found)
+        if found is not None
+        else across_sliding(point.problem, point.step, point.scale, distance)
+    )
+    if found is None:
+        raise ValueError(
+            f"Beside this {point.kind} no motion that sticks or slides another number of times was "
+            f"found at distance {distance:g}; try another."
+        )
+    return found
 
 
 def _beyond_grazing(point: SpecialPoint, distance: float) -> Orbit:

@@ -57,6 +57,10 @@ MARKS = {
     "resonance-1:3": ("$3$", "k"),
     "resonance-1:4": ("$4$", "k"),
     "resonant-grazing": ("8", "w"),
+    "crossing-sliding": (">", "k"),
+    "grazing-sliding": ("o", "w"),
+    "switching-sliding": ("v", "w"),
+    "adding-sliding": ("p", "k"),
 }
 DASHES = {
     "grazing": "-",

@@ -16,6 +16,7 @@ from .._types import State
 from ..flow import MethodLike, in_names, machine_of, tidy
 from ..machine import AbstractMachine, components, with_leaf, with_units
 from ..orbit import (
+    ORBIT_RESULTS,
     STABILITY,
     STABILITY_NAMES,
     AbstractRootFinder,
@@ -46,6 +47,8 @@ class Searched:
     """Different motions among them."""
     once: int
     """Motions that one search alone found."""
+    still: int = 0
+    """Searches that ended at an equilibrium, which is no motion."""
 
     @property
     def unseen(self) -> float:
@@ -116,7 +119,7 @@ class AllOrbits(InWords):
             data["total_found"] = "motion", self.found.sum(axis=1)
             data["found"] = ("motion", "search"), self.found
         for name in ("cycles", "starts", "simulated", "converged", "motions", "once", "unseen",
-                     "detectable"):  # fmt: skip
+                     "detectable", "still"):  # fmt: skip
             values = [getattr(searched, name) for searched in self.searched]
             data[f"search_{name}"] = "search", np.array(values)
         return tidy(with_units(xr.Dataset(data), self.machine.units, {}), along)
@@ -139,6 +142,8 @@ class AllOrbits(InWords):
                 f"  {self.machine.period_of(s.cycles)}: {s.converged:,} of {s.starts:,} searches "
                 f"converged{beyond}, on {s.motions}"
             )
+            if s.still:
+                line += f", {s.still:,} ended at an equilibrium"
             if s.converged:
                 line += (
                     f"; of further such searches about {100 * s.unseen:.2g} % find others (none "
@@ -241,6 +246,7 @@ def _sorted_out(
                 converged=int(column.sum()),
                 motions=int((column > 0).sum()),
                 once=int((column == 1).sum()),
+                still=int((np.asarray(batch.result == ORBIT_RESULTS.equilibrium)).sum()),
             )
         )
     return AllOrbits(orbits, found, tuple(searched), region, machine)

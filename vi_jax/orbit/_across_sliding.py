@@ -1,0 +1,89 @@
+"""The motion on the other side of a sliding bifurcation, with a part more or less in which a switch
+is held."""
+
+from collections.abc import Iterator
+
+import jax
+import numpy as np
+
+from .._types import State
+from ..flow import simulate
+from ..machine import with_leaf
+from ._fewer_events import without_events
+from ._problem import events_in
+from ._shooting import Shooting
+from ._sliding import change_at
+from ._solution import sections_of
+from ._solve import advance, tangent_at
+from .curve import Step
+from .find import find_orbit
+from .results import Orbit
+
+# Periods after which a stable motion near the point has settled: a choice.
+_SETTLES = 100
+
+
+def without_part(
+    problem: Shooting, step: Step, scale: np.ndarray, distance: float
+) -> tuple[Shooting, Step] | None:
+    """A motion without the part that vanishes at a sliding bifurcation, before and after which its
+    switch has one mode: the equations without both events, and their solution; `None` if there is
+    no such part, or no admissible motion.
+
+    **Arguments:** as `across_sliding`.
+    """
+    change = change_at(problem, step)
+    if change is None or not change.there or change.modes[0] != change.modes[2]:
+        return None
+    first = int(np.argmin(np.abs(np.asarray(problem.parts(step.x)[0]) - change.clock)))
+    both = [first, (first + 1) % problem.legs]
+    new, start = without_events(problem, np.asarray(step.x), both)
+    scale = np.concatenate([np.ones(len(start) - 1), scale[-1:]])
+    tangent = tangent_at(new, start, scale)
+    for sense in (1.0, -1.0):
+        found = advance(new, start, sense * tangent, scale, distance)
+        seen = found.seen
+        inside = seen.nearest.room > 0 and min(seen.approach, default=1.0) > 0
+        if bool(found.good) and inside and min(seen.order, seen.apart) > 0:
+            return new, found
+    return None
+
+
+def across_sliding(
+    problem: Shooting, step: Step, scale: np.ndarray, distance: float
+) -> Orbit | None:
+    """A motion beside a sliding bifurcation with another number of events than the branch has;
+    `None` if none is found.
+
+    The map of the section has no jump there, so that the motion is looked for by its fixed points:
+    from the state on the section there, from that to which the branch would go on, and from where
+    a simulation settles. Beyond the point is looked at first.
+
+    **Arguments:** the equations of the branch and their solution at the point, with the tangent in
+    the sense in which it ends; the size of each unknown; how far away, in the parameter's.
+    """
+    sense = np.copysign(1.0, float(step.tangent[-1]))
+    name, guesses = problem.parameters[-1], list(_guesses(problem, step, scale, distance))
+    for side in (sense, -sense):
+        value = float(step.x[-1]) + side * distance * float(scale[-1])
+        machine = with_leaf(problem.machine, name, value)
+        for guess in (*guesses, None):
+            if guess is None:
+                run = simulate(
+                    machine, guesses[-1], problem.cycles, settle=_SETTLES * problem.cycles,
+                    method=problem.method, record="sections",
+                )  # fmt: skip
+                guess = run.last
+            found = find_orbit(machine, guess, problem.cycles, method=problem.method)
+            if bool(found.successful) and len(events_in(found)) != len(problem.events):
+                return found
+    return None
+
+
+def _guesses(problem: Shooting, step: Step, scale: np.ndarray, distance: float) -> Iterator[State]:
+    """States on the section of motions close by."""
+    beyond = advance(problem, step.x, step.tangent, scale, distance)
+    for place in (beyond, step):
+        if np.all(np.isfinite(place.x)):
+            states, _ = sections_of(problem, place.x)
+            yield jax.tree.map(lambda x: x[0], states)

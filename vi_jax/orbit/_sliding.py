@@ -1,0 +1,184 @@
+"""Sliding bifurcations: where a motion gains or loses a part in which a body sticks, or slides
+along the surface of a switch.
+
+Such a part begins where the motion comes upon the surface with the fields of both sides pointing at
+it, and ends where one of them turns away. There are four ways in which the sequence changes (di
+Bernardo, Budd, Champneys and Kowalczyk, Piecewise-smooth Dynamical Systems, 2008, chapter 8), told
+apart by the modes before, in and after the part that is brief.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._programs import compiled
+from ..flow import guard_rates
+from ..machine import AbstractEvent, DryFriction, after_event, guard_of, mode_number
+from ._events import Event
+from ._flight import Flight
+from ._shooting import Shooting
+from .curve import Step
+
+CROSSING_SLIDING, GRAZING_SLIDING = "crossing-sliding", "grazing-sliding"
+SWITCHING_SLIDING, ADDING_SLIDING = "switching-sliding", "adding-sliding"
+
+# What is said of each: of a motion without the part that is brief, and of one with it.
+SLIDING = {
+    CROSSING_SLIDING: (
+        "{name} passes its surface {place} where beyond it is held there for a while",
+        "{name} is held {place} no longer, and beyond passes its surface there at once",
+    ),
+    GRAZING_SLIDING: (
+        "{name} just touches its surface {place}, and beyond is held there for a while",
+        "{name} is held {place} no longer, and beyond does not come to its surface there",
+    ),
+    SWITCHING_SLIDING: (
+        "{name} is held from {place} on, where beyond it first passes and comes back",
+        "{name} passes and comes back {place} no longer, and beyond is held there at once",
+    ),
+    ADDING_SLIDING: (
+        "{name} is just held {place}, where beyond it leaves its surface and comes back",
+        "{name} leaves its surface {place} no longer, and beyond is held there throughout",
+    ),
+}
+
+# A part of a motion this brief, as a share of its period, vanishes; and a guard this small is zero
+# where it stands for that. Choices: special points are located far closer.
+_BRIEF, _ZERO = 1e-4, 1e-6
+
+
+class Change(NamedTuple):
+    """A part of a motion that vanishes at a special point, or appears there."""
+
+    number: int
+    """The number of the switch."""
+    clock: float
+    modes: tuple[float, float, float]
+    """Of the switch, before that part, in it and after it."""
+    there: bool
+    """Whether the motion has that part, on this side."""
+
+    @property
+    def kind(self) -> str | None:
+        """Which of the four it is, if any."""
+        before, brief, after = self.modes
+        if brief == 0 and before and after:
+            return GRAZING_SLIDING if before == after else CROSSING_SLIDING
+        if brief and before == after == 0:
+            return ADDING_SLIDING
+        return SWITCHING_SLIDING if before and brief == -before and after == 0 else None
+
+
+def holds(event: AbstractEvent) -> bool:
+    """Whether a switch has a mode (0) in which the motion stays on its surface."""
+    return event.holds_mode and (isinstance(event, DryFriction) or getattr(event, "blends", False))
+
+
+def change_at(problem: Shooting, at: Step) -> Change | None:
+    """What changes at a special point in the sequence of sticking and sliding; `None` if that is
+    none of the four."""
+    if not problem.modes[0]:
+        return None
+    found = _vanishing(problem, at) or _touching(problem, at) or _beginning(problem, at)
+    return found if found is not None and found.kind is not None else None
+
+
+def _mode(problem: Shooting, leg: int, number: int) -> float:
+    return float(problem.modes[leg % problem.legs][mode_number(problem.machine, number)])
+
+
+def _clocks(problem: Shooting, at: Step) -> tuple[np.ndarray, np.ndarray, float]:
+    """Clock of each event, time to the next one, and the period."""
+    x = jnp.asarray(at.x)
+    clock, period = np.asarray(problem.parts(x)[0]), float(problem.period(x))
+    return clock, np.append(clock[1:], clock[0] + period) - clock, period
+
+
+def _vanishing(problem: Shooting, at: Step) -> Change | None:
+    """The briefest part of the motion between two events of one switch, if it is about to
+    vanish."""
+    clock, lengths, period = _clocks(problem, at)
+    events, found = problem.events, []
+    for i, event in enumerate(events):
+        if event != events[(i + 1) % len(events)] or not holds(event.of(problem.machine)):
+            continue
+        modes = tuple(_mode(problem, leg, event.number) for leg in (i - 1, i, i + 1))
+        found.append((lengths[i], Change(event.number, float(clock[i]), modes, True)))
+    length, change = min(found, key=lambda f: f[0], default=(np.inf, None))
+    return change if length < _BRIEF * period else None
+
+
+def _touching(problem: Shooting, at: Step) -> Change | None:
+    """A flight that just touches a switch's surface, or a body that is only just held."""
+    nearest, machine = at.seen.nearest, problem.machine
+    number = int(nearest.event)
+    if abs(float(nearest.room)) > _ZERO or not holds(Event(number).of(machine)):
+        return None
+    clock, _, period = _clocks(problem, at)
+    place = float(clock[0] + np.mod(float(nearest.clock) - clock[0], period))
+    leg = max(0, int(np.searchsorted(clock, place, side="right")) - 1)
+    mode = _mode(problem, leg, number)
+    if mode:
+        force, _ = _held(problem, at, leg, number, place)
+        # A surface that is touched from one side holds only what the other side's field drives on.
+        return Change(number, place, (mode, 0.0, mode), False) if force < _ZERO else None
+    return Change(number, place, (0.0, _away(problem, at, leg, number, place), 0.0), False)
+
+
+def _beginning(problem: Shooting, at: Step) -> Change | None:
+    """An event of a switch at which it is only just held, or only just not."""
+    clock, _, _ = _clocks(problem, at)
+    found = []
+    for i, event in enumerate(problem.events):
+        if not holds(event.of(problem.machine)):
+            continue
+        before, after = (_mode(problem, leg, event.number) for leg in (i - 1, i))
+        if before:
+            force, rate = _held(problem, at, i, event.number, float(clock[i]))
+            found.append((abs(force), rate, event.number, float(clock[i]), before, after))
+    if not found:
+        return None
+    force, rate, number, place, before, after = min(found)
+    if force > _ZERO:
+        return None
+    if rate > 0:  # what holds it is about to let go of it
+        return Change(number, place, (before, 0.0, after or -before), False)
+    return Change(number, place, (before, -before, 0.0), after != 0)
+
+
+@compiled
+def _rates(problem: Shooting, x, leg, number: int, s):
+    """The guard of a switch that holds, and its rate in that mode, where a flight is at clock
+    `s`."""
+    machine, j = problem.at(x), mode_number(problem.machine, number)
+    clock, states = problem.parts(x)
+    # An event's state is that before it; in a leg it is flown to.
+    begins = jnp.abs(s - clock[leg]) < 1e-12
+    flown = problem.state_at(x, leg, jnp.where(begins, clock[leg], s))
+    u = jax.tree.map(lambda a, b: jnp.where(begins, a, b), problem.unravel(states[leg]), flown)
+    modes = problem.modes_in(leg)
+    modes = (*modes[:j], jnp.zeros_like(modes[j]), *modes[j + 1 :])
+    field = Flight(machine, modes, problem.method, problem.like).smooth.field
+
+    def guard(s, state):
+        return guard_of(machine, number, s, state, modes)
+
+    found = guard_rates(field, guard, s, u)
+    return found.x, found.v
+
+
+def _held(problem: Shooting, at: Step, leg: int, number: int, s: float) -> tuple[float, float]:
+    """How far what drives a switch off its surface exceeds what holds it there, and how fast that
+    grows while it is held."""
+    found = _rates(problem, jnp.asarray(at.x), jnp.asarray(leg), number, jnp.asarray(s))
+    return float(found[0]), float(found[1])
+
+
+def _away(problem: Shooting, at: Step, leg: int, number: int, s: float) -> float:
+    """The mode in which a switch that is just held would leave its surface."""
+    x = jnp.asarray(at.x)
+    state, modes = problem.state_at(x, leg, jnp.asarray(s)), problem.modes_in(leg)
+    new = after_event(problem.at(x), number, jnp.asarray(s), state, modes)[1]
+    return float(new[mode_number(problem.machine, number)])
