@@ -277,15 +277,15 @@ def test_a_constant_function_is_its_number():
     assert np.array_equal(run.sections.V, paths(KEYS[5:6]).sections.V[0])
 
 
-class Released(Cushioned):
-    """Its stop lets go where the force falls to zero, which a jump of the velocity may pass."""
+class Reset(Free):
+    """With an event that a jump of the velocity may pass."""
 
     @property
-    def switches(self):
-        return (vi.SoftStop(1.0, 10.0, damping=0.5, adhesive=False),)
+    def events(self):
+        return (vi.Reset(lambda machine, s, x: x.V - 9.0, lambda machine, s, x: x),)
 
 
-MOTOR = vi.Parameters(torque=10.0, restitution=0.5, gap=0.05).scene()
+VALVE = vi.machines.ReliefValve(flow_rate=5.0)
 
 
 @pytest.mark.parametrize(
@@ -299,8 +299,8 @@ MOTOR = vi.Parameters(torque=10.0, restitution=0.5, gap=0.05).scene()
         (walled(), {"noise": vi.WhiteNoise({"Y": 0.5})}, "must change velocities only"),
         (walled(), {"noise": vi.WhiteNoise({"V": jnp.array([0.5, 1.0])})}, "one amplitude"),
         (walled(), {"noise": vi.WhiteNoise({"V": lambda x: jnp.ones(2)})}, "one returns shape"),
-        (MOTOR, {}, "whose cycles all have the same known duration"),
-        (Released(), {}, "without friction"),
+        (VALVE, {}, r"as `machine.observed_every\(interval\)`"),
+        (Reset(), {}, "without resets"),
     ],
 )
 def test_what_does_not_fit_is_refused(machine, options, message):

@@ -6,13 +6,14 @@ difference that is allowed.
 
 from .benchmarks import chains, explorer, peers, scene_cost, speed_accuracy
 from .closed_forms import XI, Expected, closed
-from .machines import dc_motor, known_machines, relief_valve, sommerfeld, woodpecker
+from .machines import dc_motor, known_machines, noise, relief_valve, sommerfeld, woodpecker
 from .orbits import (
     all_orbits,
     basins_map,
     design_percussion,
     escape_from_2pi,
     fit_4pi_orbit,
+    robustness,
     soft_stop,
 )
 from .paper import (
@@ -44,10 +45,12 @@ __all__ = [
     "known_machines",
     "learned_laws",
     "motor_frequency_response",
+    "noise",
     "peers",
     "posterior",
     "regime_maps",
     "relief_valve",
+    "robustness",
     "scene_cost",
     "soft_stop",
     "sommerfeld",

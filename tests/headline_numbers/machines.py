@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import vi_jax as vi
+from scipy.linalg import solve_continuous_lyapunov
 from scipy.optimize import brentq
 
 from .closed_forms import XI, Expected, closed
@@ -69,6 +70,19 @@ def relief_valve() -> Expected:
         "grazing, q": (special(7.8, (7.4, 7.9)).parameter, 1e-8),
         "first doubling, q": (special(1.6, (1.2, 1.7)).parameter, 1e-8),
         "second doubling, q": (special(5.8, (5.7, 6.2)).parameter, 1e-8),
+    }
+
+
+def noise() -> Expected:
+    """By Lyapunov's equation and the barometric law, within four standard errors of the study."""
+    flow = np.array([[0, 1, 0, 0], [-1, -0.08, 0, -1], [0, 0, 0, 1], [0, 0, -1, -0.2]])
+    covariance = solve_continuous_lyapunov(flow, -np.diag([0, 0, 0, 0.4]))
+    power, D = 0.06 * float(covariance[1, 1]), 0.6**2 / 0.4
+    flux = np.sqrt(D / (2 * np.pi)) / D * (1 + np.exp(-1 / D)) / (1 - np.exp(-1 / D))
+    return {
+        "harvester, no stops, Ω = 1, power": (power, 4 * 0.034),
+        "the same by Lyapunov's equation": (power, 1e-9),
+        "gears, e = 1, σ = 0.6, impacts per unit time": (float(flux), 4 * 0.0021),
     }
 
 

@@ -1,6 +1,7 @@
 """Of the studies of single motions: orbits, basins, transients and designs."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import vi_jax as vi
@@ -110,3 +111,31 @@ def soft_stop() -> Expected:
 
 def with_stiffness(stop: vi.SoftStop, stiffness: float) -> vi.SoftStop:
     return eqx.tree_at(lambda x: x.stiffness, stop, jnp.asarray(stiffness))
+
+
+def robustness() -> Expected:
+    """The kick again; the blow by simulations of ever closer ones, of either sign."""
+    scene = vi.Scene.ideal(frequency_ratio=0.968, restitution=0.8, gap=2.0, damping_ratio=XI)
+    form = closed(0.968, 0.8, XI, 2.0, cycles=2)
+    best = int(np.argmin(np.where(form.admissible, np.abs(form.multipliers).max(axis=1), np.inf)))
+    orbit = vi.find_orbit(scene, scene.start(Y=form.Y[best], V=form.V[best]), 2, throw=True)
+    options = {"settle": 1500, "candidates": 1, "directions": 32, "progress": False}
+    kick = vi.minimal_kick(scene, orbit, **options)
+
+    def impacts(blow):
+        start = scene.start(Y=orbit.state.Y, V=orbit.state.V + blow)
+        return jnp.sum(vi.simulate(scene, start, 2, settle=600).impacts)
+
+    lanes, ends = vi.jit(jax.vmap(impacts)), []
+    for side in (1, -1):
+        low, high = 0.0, 0.2
+        for _ in range(4):
+            parts = np.linspace(low, high, 100)
+            lost = np.asarray(lanes(side * parts)) != 1
+            first = int(np.argmax(lost)) if lost.any() else len(lost) - 1
+            low, high = parts[first - 1], parts[first]
+        ends.append(high)
+    return {
+        "ζ = 0.968, 4π to 2π": (float(kick.norm), 1e-8),
+        "ζ = 0.968, blow on the section": (min(ends), 1e-8),
+    }

@@ -111,6 +111,9 @@ class Lane(eqx.Module):
     spent: Scalar
     """Steps tried in the interval on its way."""
     rejected: Scalar
+    shaken: Scalar | None = None
+    """The time of the interval at the last impulse of noise; absent where impulses come at times
+    that are known beforehand."""
 
 
 def ticks(machine: AbstractMachine, state: State) -> bool:
@@ -136,6 +139,12 @@ class Impulses(eqx.Module):
     """Impulses in a cycle; a multiple of the record points."""
     functions: tuple[Callable | None, ...] = eqx.field(static=True)
     """Of each array of the state, a factor of its own as a function of the state; `None`: none."""
+    timed: bool = eqx.field(static=True)
+    """Whether the time between two impulses is measured on the way; then the scales are those of a
+    unit of time."""
+    modes: tuple[Array | None, ...] = ()
+    """Of each array of the state, the matrix that makes of an impulse on it one on what the loop
+    carries in its place, where that are natural modes."""
 
 
 class Plan(eqx.Module):
@@ -236,7 +245,10 @@ class Plan(eqx.Module):
         return ticks(self.machine, state)
 
     def timed(self, state: State) -> bool:
-        """Whether the duration of a cycle is recorded, which only a fixed one need not be."""
+        """Whether the duration of a cycle is recorded, which only a fixed one need not be; or the
+        time between impulses is measured."""
+        if self.noise is not None and self.noise.timed:
+            return True
         return self.motion and not has_fixed_cycle(self.machine, state)
 
     def meets_turns(self, done: Scalar) -> Flag | bool:

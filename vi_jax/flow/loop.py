@@ -14,6 +14,7 @@ from .._types import Flag, Scalar, State
 from ._lane import Lane, Plan, Record
 from ._launch import launched
 from ._step.hybrid import iterate
+from .noise import in_modes_of
 
 
 def _active(plan: Plan, lane: Lane) -> Flag:
@@ -48,6 +49,8 @@ def run_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> tuple[Ends
     way = plan.machine.prepared()
     own = way.machine is plan.machine
     if not own:
+        if plan.noise is not None:
+            plan = dataclasses.replace(plan, noise=in_modes_of(way, plan.noise, start))
         plan, start = dataclasses.replace(plan, machine=way.machine), way.inward(start)
     numbers, rest = eqx.partition(plan, eqx.is_array)
     ends, (states, records) = lanes.run(

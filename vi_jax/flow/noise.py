@@ -14,7 +14,7 @@ from jaxtyping import Array, UInt32
 from .._checks import count, require_real
 from .._numbers import concrete
 from .._types import Flag, Scalar, State
-from ..machine import AbstractMachine, SoftStop, leaf_names
+from ..machine import AbstractMachine, Prepared, is_autonomous, leaf_names
 from ._lane import Impulses, Plan, has_fixed_cycle, ticks
 from ._random import normal_pair, threefry
 
@@ -29,12 +29,17 @@ class WhiteNoise(eqx.Module):
     is exact; what is left of the finite number of impulses falls with h, so that results from two
     numbers of impulses can be extrapolated.
 
-    For machines whose cycles all have the same known duration, without friction and resets. States
-    on record points are those behind their impulses; `samples` of a run must divide `impulses`.
-    Each lane of a batch has a key of its own (`jax.random.split`). A lane's numbers depend on its
-    key and the cycle and instant alone, not on the batch, the method or `samples`; cycles are
-    counted from the start, those of `settle` too. A run that goes on from another's end takes
-    another key (`jax.random.fold_in`).
+    For machines whose cycles end with their drive's: at equal readings of the clock that counts
+    them. Where these are not at equal times (a motor) h is the time that has passed since the last
+    impulse. A machine without a drive is shaken as `machine.observed_every(interval)`. Machines
+    with resets, and events of their own, are refused. An impulse may set a body free that rests or
+    sticks; the logs of events list no impulses.
+
+    States on record points are those behind their impulses; `samples` of a run must divide
+    `impulses`. Each lane of a batch has a key of its own (`jax.random.split`). A lane's numbers
+    depend on its key and the cycle and instant alone, not on the batch, the method or `samples`;
+    cycles are counted from the start, those of `settle` too. A run that goes on from another's end
+    takes another key (`jax.random.fold_in`).
 
     **Arguments:**
 
@@ -92,10 +97,28 @@ def with_noise(plan: Plan, start: State, noise: Any, key: Any, samples: int) -> 
     amplitudes, functions = _by_leaf(start, noise)
     dtype = machine.position(start).dtype
     duration = _duration(machine, start)
-    root = jnp.sqrt(jnp.asarray(duration, dtype) / noise.impulses)
+    step = 1.0 if duration is None else jnp.asarray(duration, dtype) / noise.impulses
+    root = jnp.sqrt(jnp.asarray(step, dtype))
     scales = tuple(None if x is None else jnp.asarray(x, dtype) * root for x in amplitudes)
-    impulses = Impulses(words_of(key), scales, noise.impulses, functions)
+    impulses = Impulses(words_of(key), scales, noise.impulses, functions, duration is None)
     return dataclasses.replace(plan, noise=impulses)
+
+
+def in_modes_of(way: Prepared, noise: Impulses, start: State) -> Impulses:
+    """The noise of a machine that is followed in its natural modes: its impulses act on the
+    machine's own velocities.
+
+    **Arguments:** `start`, a state of the machine itself.
+    """
+    leaves, tree = jtu.tree_flatten(start)
+
+    def matrix(i: int) -> Array:
+        """Of what the modes take over from array number i, which they are linear in."""
+        put = lambda x: tree.unflatten([*leaves[:i], x, *leaves[i + 1 :]])
+        return jax.jacfwd(lambda x: jtu.tree_leaves(way.inward(put(x)))[i])(leaves[i])
+
+    modes = [None if x is None else matrix(i) for i, x in enumerate(noise.scales)]
+    return dataclasses.replace(noise, modes=tuple(modes))
 
 
 def check_noise(machine: AbstractMachine, start: State, noise: Any) -> None:
@@ -106,6 +129,11 @@ def check_noise(machine: AbstractMachine, start: State, noise: Any) -> None:
     _check_machine(machine, start)
     amplitudes, functions = _by_leaf(start, noise)
     _check_velocities(machine, start, amplitudes)
+    if noise.functions and machine.prepared().machine is not machine:
+        raise ValueError(
+            "Argument `noise` must have numbers as amplitudes for a machine that is followed in "
+            f"its natural modes, but has functions for a {type(machine).__name__}."
+        )
     for leaf, function in zip(jtu.tree_leaves(start), functions, strict=True):
         if function is not None:
             shape = jax.eval_shape(lambda x, f=function: jnp.asarray(f(x)), start).shape
@@ -136,14 +164,13 @@ def _duration(machine: AbstractMachine, start: State) -> Scalar | float | None:
 
 def _check_machine(machine: AbstractMachine, start: State) -> None:
     what = None
-    if _duration(machine, start) is None:
-        what = "whose cycles all have the same known duration"
-    elif (
-        not all(isinstance(x, SoftStop) and x.adhesive for x in machine.switches) or machine.events
-    ):
-        what = "without friction, resets and switches other than adhesive soft stops"
-    elif machine.prepared().machine is not machine:
-        what = "that is not followed in its natural modes"
+    if is_autonomous(machine, start):
+        what = (
+            "whose cycles end with its drive's; shake one that an event ends at equal intervals, "
+            "as `machine.observed_every(interval)`"
+        )
+    elif machine.events:
+        what = "without resets and other events that its velocities may pass in a jump"
     if what is not None:
         raise ValueError(
             f"Argument `noise` must be left out but for a machine {what}, but got a "
@@ -215,11 +242,15 @@ def words_of(key: Any) -> UInt32[Array, "2"]:
     return jnp.asarray(data)
 
 
-def kicked(noise: Impulses, when: Flag, cycle: Scalar, instant: Scalar, state: State) -> State:
+def kicked(
+    noise: Impulses, when: Flag, cycle: Scalar, instant: Scalar, state: State,
+    elapsed: Scalar | None,
+) -> State:  # fmt: skip
     """The state behind the impulse of an instant, where there is one.
 
     **Arguments:** whether there is one; the cycle, counted from the start of the run with those
-    that settle, and the number of the instant in it.
+    that settle, and the number of the instant in it; the time since the last impulse, `None` where
+    it is known beforehand.
     """
     leaves, tree = jtu.tree_flatten(state)
     sizes = [0 if x is None else leaf.size for x, leaf in zip(noise.scales, leaves, strict=True)]
@@ -238,12 +269,19 @@ def kicked(noise: Impulses, when: Flag, cycle: Scalar, instant: Scalar, state: S
         return tuple(jnp.zeros((), dtype) for _ in range(sum(sizes)))
 
     numbers = list(jax.lax.cond(when, drawn, none, words))
+    root = None
+    if elapsed is not None:
+        root = jnp.sqrt(jnp.where(when & (elapsed > 0), elapsed, 1.0))
     new = []
-    for leaf, scale, n, f in zip(leaves, noise.scales, sizes, noise.functions, strict=True):
+    for i, (leaf, scale, n) in enumerate(zip(leaves, noise.scales, sizes, strict=True)):
         if scale is not None and n:
             mine, numbers = numbers[:n], numbers[n:]
             here = mine[0] if leaf.ndim == 0 else jnp.stack(mine).reshape(leaf.shape)
+            f = noise.functions[i]
             size = scale if f is None else scale * f(state)
-            leaf = jnp.where(when, leaf + size * here, leaf)
+            jump = here * (size if root is None else size * root)
+            matrix = noise.modes[i] if noise.modes else None
+            jump = jump if matrix is None else matrix @ jump
+            leaf = jnp.where(when, leaf + jump, leaf)
         new.append(leaf)
     return tree.unflatten(new)

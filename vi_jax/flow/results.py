@@ -47,7 +47,7 @@ class RESULTS(NamedEnumeration):
     )
     max_steps = (
         "The number of steps exceeded `max_steps` before the last cycle was complete, or 65,536 "
-        "within one, as where an autonomous machine is at rest and meets its section no more."
+        "within one, as where an autonomous machine comes to rest off its section."
     )
     bad_impact = (
         "An impact left faster than it came, or further into its stop: a restitution law must have "

@@ -17,19 +17,23 @@ import dataclasses
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import jax.tree_util as jtu
 from jax.lax import stop_gradient
 
 from ..._types import Flag, Scalar, State
 from ...lanes import pin_flag
 from .._arrival import Onward
 from .._lane import FREE, Lane, Plan, Record, select
-from ..noise import kicked
 from ..smooth import holding
 from .aim import aim_ahead, aim_at
 from .arrive import arrive
 from .faults import Progress, faults
+from .impulse import Instant, shaken
 from .jump import after_jump
 from .trial import Trial, attempt, timing
+
+# Of a cycle, a step that is long enough to tell by it whether anything moves. A choice.
+_LONG = 1e-3
 
 
 class Step(NamedTuple):
@@ -57,6 +61,8 @@ def iterate(plan: Plan, lane: Lane) -> Step:
     rejected = active & ~trial.good
     length = _resized(plan, lane, trial, taken, rejected)
     there, completed = arrive(plan, lane, trial, taken)
+    if plan.machine.section(lane.state) is not None:
+        completed = completed | taken & _stands_on_section(plan, lane, there)
     reached = completed = pin_flag(completed, lane.s)
     if plan.noise is not None:
         completed = completed & plan.is_record_point(lane.part, lane.done)
@@ -87,6 +93,25 @@ def iterate(plan: Plan, lane: Lane) -> Step:
     return Step(new, completed, new.state, there.record)
 
 
+def _stands_on_section(plan: Plan, lane: Lane, there: Lane) -> Flag:
+    """Whether a motion has died out, to rounding, in an equilibrium that lies on the machine's
+    section: a step changes nothing, and it is twice as long on its way as a cycle is expected to
+    take. It would meet the section by accident of rounding only, or never.
+
+    **Arguments:** the lane before the step and after it.
+    """
+    old, new = (jtu.tree_leaves(stop_gradient(x)) for x in (lane.state, there.state))
+    slack = 8 * float(jnp.finfo(there.s.dtype).eps)
+    cycle, size = plan.machine.cycle, jnp.ones_like(there.s)
+    # One that is aimed at something may be so short that nothing has time to change.
+    still = (there.s >= 2 * cycle) & (there.s - lane.s >= _LONG * cycle)
+    for before, after in zip(old, new, strict=True):
+        still = still & jnp.all(jnp.abs(after - before) <= slack * (1 + jnp.abs(before)))
+        size = size + jnp.max(jnp.abs(after))
+    guard = jnp.asarray(plan.machine.section(stop_gradient(there.state)))
+    return still & (jnp.abs(guard) <= slack * size)
+
+
 def _onward(plan: Plan, there: Lane, reached: Flag, completed: Flag, done: Scalar) -> Lane:
     """The lane as its next interval begins, where one was completed; and as its next cycle begins,
     where that was the cycle's last.
@@ -110,12 +135,8 @@ def _onward(plan: Plan, there: Lane, reached: Flag, completed: Flag, done: Scala
         state = select(turned, renewed, state)
     if plan.noise is not None:
         before = done - jnp.where(completed, 1.0, 0.0)
-        at = stop_gradient((plan.cycle_of(before), there.part))
-        behind = kicked(plan.noise, reached, *at, state)
-        onward = Onward(there.direction, there.contact, there.modes, there.below)
-        direction, contact = after_jump(plan, onward, reached, state, behind, s)
-        there = dataclasses.replace(there, direction=direction, contact=contact)
-        state = behind
+        here = Instant(reached, completed, before, there.part, s)
+        there, state = shaken(plan, there, state, here)
     record = select(completed, plan.fresh(state), there.record)
     return dataclasses.replace(there, s=s, state=state, part=part, record=record)
 

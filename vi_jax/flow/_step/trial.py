@@ -99,8 +99,10 @@ class Trial(NamedTuple):
 def timing(plan: Plan, lane: Lane) -> Beside | None:
     """Elapsed time and integrals, where the method has to carry them along."""
     passed = lane.record.time
-    paced = plan.motion and plan.machine.pace(lane.s, lane.state) is not None
-    if passed is None or not (paced or passed.integrals):
+    if passed is None:
+        return None
+    paced = passed.time is not None and plan.machine.pace(lane.s, lane.state) is not None
+    if not (paced or passed.integrals):
         return None
     return Beside(passed.time if paced else None, passed.integrals)
 
