@@ -12,10 +12,18 @@ from matplotlib.patches import Patch
 from scipy.interpolate import CubicSpline
 
 from ..machine import Parameters, Scene
-from ..orbit import Boundary, Branch, SpecialPoint, boundary, continue_orbit, find_orbit
+from ..orbit import (
+    Boundary,
+    Branch,
+    SpecialPoint,
+    boundary,
+    closed_form_orbits,
+    continue_orbit,
+    find_orbit,
+)
 from ..plot import DASHES, color_of, paler
-from .motions import FREQUENCY_RATIO, GAP, RESTITUTION, orbits, table_damping_ratio
-from .response import RANGE, RATIO
+from .motions import FREQUENCY_RATIO, GAP, RESTITUTION, table_damping_ratio
+from .response import MAX_STEP, RANGE, RATIO
 
 K, XI = "stops.0.restitution", "oscillator.damping_ratio"
 # At k = 1 without damping the motions are no longer isolated, and the curves end there.
@@ -62,6 +70,25 @@ class BoundaryCurves(NamedTuple):
     """Period doubling of the 4π motion, which is unstable between the curve's two arms."""
 
 
+# Where each curve begins: the period in cycles and the k of a branch, the kind of its point, and
+# the number that is changed with ζ. At k = 0.5 the 4π motion is stable wherever it exists; at
+# k = 0.8 it is not.
+_BEGINNINGS: dict[str, tuple[int, float, str, str]] = {
+    "doubling_k": (1, RESTITUTION, "period-doubling", K),
+    "touch_k": (2, RESTITUTION, "grazing", K),
+    "doubling_c": (1, RESTITUTION, "period-doubling", XI),
+    "touch_c": (2, RESTITUTION, "grazing", XI),
+    "birth_c": (1, RESTITUTION, "grazing", XI),
+    "fold_k": (1, RESTITUTION, "fold", K),
+    "fold_c": (1, RESTITUTION, "fold", XI),
+    "long_doubling_k": (2, 0.8, "period-doubling", K),
+}
+CURVES = tuple(_BEGINNINGS)
+# The curves around the region between BB' and CC', and those of the 2π motion.
+_AROUND = CURVES[:5]
+SHORT_CURVES = tuple(name for name, at in _BEGINNINGS.items() if at[0] == 1)
+
+
 def boundary_curves(branches: Sequence[Branch] = (), *, quick: bool = False) -> BoundaryCurves:
     """Follow the borders of the 2π and of the 4π motion through both planes.
 
@@ -69,27 +96,23 @@ def boundary_curves(branches: Sequence[Branch] = (), *, quick: bool = False) -> 
     response with k = 0.5 (what is missing is followed first); `quick` for the curves around the
     region between BB' and CC' only. Double precision is needed.
     """
-    short = _branch(1, RESTITUTION, branches)
-    long = _branch(2, RESTITUTION, branches)
-    starts = {
-        "doubling_k": (_special(short, "period-doubling"), K),
-        "touch_k": (_special(long, "grazing"), K),
-        "doubling_c": (_special(short, "period-doubling"), XI),
-        "touch_c": (_special(long, "grazing"), XI),
-        "birth_c": (_special(short, "grazing"), XI),
-    }
-    if not quick:
-        # At k = 0.5 the 4π motion is stable wherever it exists; at k = 0.8 it is not.
-        doubling = _special(_branch(2, 0.8, branches), "period-doubling")
-        starts |= {
-            "fold_k": (_special(short, "fold"), K),
-            "fold_c": (_special(short, "fold"), XI),
-            "long_doubling_k": (doubling, K),
-        }
+    return BoundaryCurves(**follow_curves(_AROUND if quick else CURVES, branches))
+
+
+def follow_curves(names: Sequence[str], branches: Sequence[Branch] = ()) -> dict[str, Boundary]:
+    """Those of the curves that are named, out of `CURVES`. **Arguments:** as `boundary_curves`."""
+    known: dict[tuple[int, float], Branch] = {}
+    for cycles, k, *_ in map(_BEGINNINGS.__getitem__, names):
+        if (cycles, k) not in known:
+            known[cycles, k] = _branch(cycles, k, branches)
+
+    def follow(name: str) -> Boundary:
+        cycles, k, kind, parameter = _BEGINNINGS[name]
+        return _follow(_special(known[cycles, k], kind), parameter)
+
     # What takes the time is compiling, of which two threads do more than one.
     with ThreadPoolExecutor(2) as threads:
-        found = dict(zip(starts, threads.map(lambda x: _follow(*x), starts.values()), strict=True))
-    return BoundaryCurves(**found)
+        return dict(zip(names, threads.map(follow, names), strict=True))
 
 
 def _branch(cycles: int, k: float, known: Sequence[Branch]) -> Branch:
@@ -104,10 +127,10 @@ def _branch(cycles: int, k: float, known: Sequence[Branch]) -> Branch:
         ):
             return branch
     scene = Scene.ideal(frequency_ratio=FREQUENCY_RATIO, restitution=k)
-    closed = orbits(scene, cycles=cycles)
+    closed = closed_form_orbits(scene, cycles=cycles)
     start = scene.start(Y=closed.Y[0], V=closed.V[0])
     orbit = find_orbit(scene, start, cycles=cycles, throw=True)
-    return continue_orbit(orbit, parameter=RATIO, bounds=RANGE)
+    return continue_orbit(orbit, parameter=RATIO, bounds=RANGE, max_step=MAX_STEP)
 
 
 def _special(branch: Branch, kind: str) -> SpecialPoint:

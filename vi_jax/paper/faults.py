@@ -2,13 +2,12 @@
 
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from ..flow import simulate
 from ..machine import Parameters
-from .motions import FREQUENCY_RATIO, GAP, RESTITUTION, figure_scene, orbits
+from ..orbit import closed_form_orbits
+from .motions import FREQUENCY_RATIO, GAP, RESTITUTION, figure_scene
 from .printed import energy_drift, eq21_misses
 
 
@@ -141,7 +140,7 @@ def _captions() -> Fault:
     scene = figure_scene(0.0)
     wide = figure_scene(0.0, gap=2 * amplitude)
     counts = {
-        name: int(sum(int(np.sum(orbits(s, cycles=n).admissible)) for n in (1, 2)))
+        name: int(sum(int(np.sum(closed_form_orbits(s, cycles=n).admissible)) for n in (1, 2)))
         for name, s in (("2a", scene), ("2A", wide))
     }
     return Fault(
@@ -160,26 +159,18 @@ def _captions() -> Fault:
 def period_doubling_damping() -> float:
     """The damping c (N·s/m) at which a multiplier of the 2π motion of Figure 3 crosses -1."""
 
-    def excess(c):
-        return jnp.min(_multipliers(c).real) + 1  # negative while it is below -1
-
-    @jax.jit
-    def bisect():
-        def halve(_, ends):
-            low, high = ends
-            middle = 0.5 * (low + high)
-            unstable = excess(middle) < 0
-            return jnp.where(unstable, middle, low), jnp.where(unstable, high, middle)
-
-        return jax.lax.fori_loop(0, 50, halve, (jnp.asarray(0.0), jnp.asarray(0.5)))[0]
-
-    return float(bisect())
+    low, high = 0.0, 0.5
+    for _ in range(50):
+        middle = 0.5 * (low + high)
+        unstable = np.min(np.real(np.asarray(_multipliers(middle)))) < -1
+        low, high = (middle, high) if unstable else (low, middle)
+    return low
 
 
 def _multipliers(c: Any) -> Any:
     """Those of the 2π motion of Figure 3 with the damping c (N·s/m)."""
     ratio = Parameters(damping=c).scene(drive="ideal").damping_ratio
-    return orbits(figure_scene(ratio), cycles=1).multipliers[0]
+    return closed_form_orbits(figure_scene(ratio), cycles=1).multipliers[0]
 
 
 def _damping() -> Fault:

@@ -8,9 +8,8 @@ import numpy as np
 from .._types import State
 from ..flow import ExactFlight, Run, simulate
 from ..machine import Parameters, Scene
-from ..orbit import ClosedFormOrbits
+from ..orbit import ClosedFormOrbits, closed_form_orbits
 from .orbits import fit_long
-from .orbits import orbits as orbits
 
 # ζ, k and d of both figures.
 FREQUENCY_RATIO, RESTITUTION, GAP = 0.9, 0.5, 2.0
@@ -67,12 +66,12 @@ def simulate_cases(*, quick: bool = False) -> tuple[Case, Case]:
     """The undamped and the damped case; `quick` takes fewer cycles and samples."""
     cycles, samples = (QUICK_CYCLES, QUICK_SAMPLES) if quick else (CYCLES, SAMPLES)
     undamped = figure_scene(0.0)
-    long_state = orbits(undamped, cycles=2)
+    long_state = closed_form_orbits(undamped, cycles=2)
     fitted = fit_long(undamped)
     cases = []
     for name, ratio in (("undamped", 0.0), ("damped", table_damping_ratio())):
         scene = figure_scene(ratio)
-        short, long = orbits(scene, cycles=1), orbits(scene, cycles=2)
+        short, long = (closed_form_orbits(scene, cycles=n) for n in (1, 2))
         origin = long if bool(long.admissible[0]) else long_state
         runs = [
             run_of(scene, start, cycles, samples)

@@ -3,20 +3,20 @@
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from matplotlib.figure import Figure
 
+from .._programs import compiled
 from ..flow import Run, simulate
 from ..machine import Parameters, Scene
-from ..orbit import Orbit, find_orbit, trimmed
+from ..orbit import Orbit, closed_form_orbits, find_orbit, trimmed
 from ..plot import STOP, angle_axis, color_of
 from .figures import common_legend
 from .motions import CYCLES, FREQUENCY_RATIO, RESTITUTION, SAMPLES, figure_scene
-from .orbits import TableRow, orbits
+from .orbits import TableRow
 
 # T0 in N·m: a choice about Table 1's 10.
 TORQUES = (2.0, 10.0, 100.0)
@@ -64,7 +64,7 @@ def _machine(torque: Any, kappa: Any, k: Any, c: Any) -> Scene:
     return Parameters(torque=torque, control=kappa, restitution=k, damping=c).scene()
 
 
-@eqx.filter_jit
+@compiled
 def _searched(cycles: int, lanes: object, kappa: object, guess: object) -> Orbit:
     """One orbit for each row of `lanes`, which holds (T0, k, c)."""
 
@@ -82,7 +82,7 @@ def _tuned(cycles: int) -> list[TableRow]:
     starts = []
     for _, k, c in lanes:
         ratio = Parameters(damping=c).scene(drive="ideal").damping_ratio
-        closed = orbits(figure_scene(ratio, restitution=k), cycles=cycles)
+        closed = closed_form_orbits(figure_scene(ratio, restitution=k), cycles=cycles)
         starts.append([float(closed.Y[0]), float(closed.V[0]), FREQUENCY_RATIO])
     kappa, guess = np.full(len(lanes), FREQUENCY_RATIO), jnp.asarray(starts)
     slope = np.ones(len(lanes))
@@ -98,7 +98,7 @@ def _tuned(cycles: int) -> list[TableRow]:
         kappa = kappa - off / slope
         state = found.state
         guess = jnp.stack([state.Y, state.V, state.W], axis=1)
-    rows = []
+    rows, found = [], jtu.tree_map(np.asarray, found)  # or each index were a program
     for i, (torque, k, c) in enumerate(lanes):
         words = next(words for *key, words in _MACHINES if key == [k, c])
         orbit = trimmed(jtu.tree_map(lambda x, i=i: x[i], found))
@@ -106,7 +106,7 @@ def _tuned(cycles: int) -> list[TableRow]:
     return rows
 
 
-@eqx.filter_jit
+@compiled
 def _simulated(kappa: object, starts: object) -> Run:
     def one(torque, kappa, start):
         scene = _machine(torque, kappa, RESTITUTION, 0.0)
@@ -123,14 +123,15 @@ def simulate_motors() -> Motors:
     kappa = [row.kappa for row in tuned]
     rest = [[0.0, 0.0, x] for x in kappa]
     there = [[float(getattr(row.orbit.state, name)) for name in "YVW"] for row in tuned]
-    runs = jax.block_until_ready(_simulated(jnp.asarray(2 * kappa), jnp.asarray(rest + there)))
+    runs = _simulated(jnp.asarray(2 * kappa), jnp.asarray(rest + there))
+    runs = jtu.tree_map(np.asarray, runs)
     each = [jtu.tree_map(lambda x, i=i: x[i], runs) for i in range(2 * len(TORQUES))]
     made = [
         MotorRun(torque, row.kappa or 0.0, row.orbit, each[i], each[i + len(TORQUES)])
         for i, (torque, row) in enumerate(zip(TORQUES, tuned, strict=True))
     ]
     pairs = [row for pair in zip(short, long, strict=True) for row in pair]
-    ideal = orbits(figure_scene(0.0), cycles=2)
+    ideal = closed_form_orbits(figure_scene(0.0), cycles=2)
     return Motors(pairs, made, float(ideal.y_min[0]))
 
 

@@ -2,7 +2,6 @@
 
 from typing import NamedTuple
 
-import equinox as eqx
 import optax
 
 from ..machine import Scene
@@ -10,9 +9,6 @@ from ..orbit import Gradient, Orbit, closed_form_orbits, find_orbit
 
 # How wrong the fit's guess is, and how well it must do: no transient is to be seen afterwards.
 _WRONG, _FITTED = 0.05, 1e-10
-
-# Compiled once for each period, as every number is one of the scene's.
-orbits = eqx.filter_jit(closed_form_orbits)
 
 
 class TableRow(NamedTuple):
@@ -36,7 +32,7 @@ def fit_long(scene: Scene) -> Orbit:
     This is what the paper asks for with Figure 4: initial conditions accurate enough to skip the
     transient.
     """
-    closed = orbits(scene, cycles=2)
+    closed = closed_form_orbits(scene, cycles=2)
     guess = scene.start(Y=(1 + _WRONG) * closed.Y[0], V=(1 - _WRONG) * closed.V[0])
     steps = 2000
     descent = Gradient(
@@ -53,7 +49,7 @@ def orbit_table(scenes: dict[str, Scene]) -> list[TableRow]:
     rows = []
     for name, scene in scenes.items():
         for cycles in (1, 2):
-            closed = orbits(scene, cycles=cycles)
+            closed = closed_form_orbits(scene, cycles=cycles)
             if bool(closed.admissible[0]):
                 guess = scene.start(Y=closed.Y[0], V=closed.V[0])
                 rows.append(TableRow(f"ideal, {name}", find_orbit(scene, guess, cycles=cycles)))

@@ -1,49 +1,62 @@
 """The reproduction in one go: figures, measured claims and faults, and a report of them."""
 
 import time
-from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from matplotlib.figure import Figure
-
 from .._files import write_whole
 from ..machine import Scene
+from ..orbit import Boundary
 from ..plot import save_picture
 from .assumptions import check_assumptions
-from .boundaries import boundary_curves, describe_boundaries, draw_boundaries
+from .beside import beside, second_core
+from .boundaries import (
+    CURVES,
+    SHORT_CURVES,
+    BoundaryCurves,
+    describe_boundaries,
+    draw_boundaries,
+    follow_curves,
+)
 from .claims import Claim, check_claims
 from .discrepancy import describe
 from .faults import Fault, check_faults
 from .figure2_claims import check_figure_2
 from .figures import draw_figure
-from .motions import figure_scene, simulate_cases, table_damping_ratio
-from .motors import Motors, draw_motors, simulate_motors
-from .orbits import orbit_table
+from .motions import Case, figure_scene, simulate_cases, table_damping_ratio
+from .motors import draw_motors, simulate_motors
+from .orbits import TableRow, orbit_table
 from .pages import Findings, as_json, as_markdown
 from .response import response
 from .response_figure import LOOK, draw_response
 from .sketch import draw_sketch
 
 REPORT, NUMBERS = "report.md", "report.json"
+# The paper's figures in their order, then what it does not show; and those of a quick one.
+_PICTURES = ("fig1.png", "fig2.png", "fig3.png", "fig4.png", "boundaries.png", "motor.png")
+_QUICK_PICTURES = ("fig1.png", "fig3.png", "fig4.png")
 
-# The steps in their order, and the seconds that each took where it was measured (two cores).
-_CASES, _FIGURE_3, _FIGURE_4, _FAULTS, _ORBITS, _RESPONSE, _CURVES, _MOTORS, _CLAIMS = _STEPS = (
+_CASES, _FIGURE_3, _FIGURE_4, _FIGURE_2, _FAULTS, _ORBITS, _MOTORS, _CURVES, _WAITING, _CLAIMS = (
     "simulating: from rest, from the 4π and from the 2π state, undamped and damped",
     "drawing Figure 3",
     "drawing Figure 4",
+    "Figure 2 and the boundaries: closed forms, branches, sweeps up and down",
     "measuring the faults of the printed text",
     "finding the periodic motions",
-    "Figure 2: closed forms, branches, sweeps up and down",
-    "following the boundaries of the discrepancy in (ζ, k) and (ζ, c)",
     "Figures 3 and 4 with the motor",
+    "following the boundaries of the discrepancy in (ζ, k) and (ζ, c)",
+    "Figure 2, which was computed beside all this",
     "measuring what the paper claims and assumes",
 )
-_SECONDS: dict[str, float] = dict(
-    zip(_STEPS, (8.0, 4.0, 1.0, 2.0, 2.0, 18.0, 11.0, 2.0, 5.0), strict=True)
-)
-_NOT_QUICK = (_RESPONSE, _CURVES, _MOTORS)
+# The steps in their order, and the seconds that each took where it was measured: of a quick
+# reproduction, in one process, and in two.
+_FIRST = {_CASES: 4.0, _FIGURE_3: 1.5, _FIGURE_4: 1.5}
+_SECOND = {_FAULTS: 3.0, _ORBITS: 3.0}
+_QUICK = {**_FIRST, **_SECOND, _CLAIMS: 2.0}
+_ALONE = {**_FIRST, _FIGURE_2: 40.0, **_SECOND, _MOTORS: 10.0, _CLAIMS: 2.0}
+_TOGETHER = {**_FIRST, **_SECOND, _MOTORS: 10.0, _CURVES: 14.0, _WAITING: 2.0, _CLAIMS: 2.0}
 
 Progress = Callable[[str, float], None]
 """Called as a step begins with its name and about how many seconds there are left."""
@@ -57,10 +70,22 @@ class Reproduction(NamedTuple):
     files: list[Path]
 
 
+class Figure2(NamedTuple):
+    """What is found with Figure 2."""
+
+    panels: dict[str, Any]
+    """As `describe` gives them."""
+    claims: list[Claim]
+    curves: dict[str, Boundary]
+    """Those of `follow_curves` that were wanted."""
+
+
 def reproduce(
     out: str | Path, *, quick: bool = False, progress: Progress | None = None
 ) -> Reproduction:
     """Draw Figures 1 to 4 and the boundaries of the discrepancy, and write the report.
+
+    On a CPU of more than one core Figure 2 is computed in a second process.
 
     **Arguments:** the folder to write into, made if it is missing; `quick` for fewer cycles and
     samples, without Figure 2, the boundaries and the motors; `progress`, called as each step
@@ -68,31 +93,34 @@ def reproduce(
     it. The numbers need double precision (`jax.config.update("jax_enable_x64", True)`), which the
     command line turns on.
 
-    **Returns:** the claims, the faults, and the files in the order in which they were written:
-    `fig1.png`, `fig3.png`, `fig4.png`, `motor.png`, `fig2.png`, `boundaries.png`, `report.json`,
-    `report.md`.
+    **Returns:** the claims, the faults, and the files: `fig1.png`, `fig2.png`, `fig3.png`,
+    `fig4.png`, `boundaries.png`, `motor.png`, `report.json`, `report.md`.
     """
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
-    files: list[Path] = []
-    # What takes the time is compiling, of which two threads do more than one.
-    with ThreadPoolExecutor(1) as aside:
-        motors = None if quick else aside.submit(simulate_motors)
-        findings = _measured(out, files, motors, _countdown(quick, progress))
-    for name, text in ((NUMBERS, as_json(findings)), (REPORT, as_markdown(findings))):
-        files.append(out / name)
-        write_whole(files[-1], text)
-    return Reproduction(findings.claims, findings.faults, files)
+    if quick:
+        findings = _quick(out, _countdown(_QUICK, progress))
+    elif second_core():
+        theirs = [name for name in CURVES if name not in SHORT_CURVES]
+        with beside(figure_2, out, theirs) as other:
+            findings = _whole(out, _countdown(_TOGETHER, progress), other, SHORT_CURVES)
+    else:
+        alone = partial(figure_2, out, CURVES)
+        findings = _whole(out, _countdown(_ALONE, progress), alone, ())
+    texts = {NUMBERS: as_json(findings), REPORT: as_markdown(findings)}
+    for name, text in texts.items():
+        write_whole(out / name, text)
+    pictures = _QUICK_PICTURES if quick else _PICTURES
+    return Reproduction(findings.claims, findings.faults, [out / x for x in (*pictures, *texts)])
 
 
-def _countdown(quick: bool, progress: Progress | None) -> Callable[[str], None]:
+def _countdown(steps: dict[str, float], progress: Progress | None) -> Callable[[str], None]:
     """A function that reports the step that begins, and how long this computer takes from there."""
-    steps = [step for step in _STEPS if not (quick and step in _NOT_QUICK)]
     begin = time.perf_counter()
 
     def tell(step: str) -> None:
-        place = steps.index(step)
-        past, ahead = (sum(_SECONDS[x] for x in part) for part in (steps[:place], steps[place:]))
+        place, seconds = list(steps).index(step), list(steps.values())
+        past, ahead = sum(seconds[:place]), sum(seconds[place:])
         pace = (time.perf_counter() - begin) / past if past else 1.0
         if progress is not None:
             progress(step, pace * ahead)
@@ -100,44 +128,74 @@ def _countdown(quick: bool, progress: Progress | None) -> Callable[[str], None]:
     return tell
 
 
-def _measured(
-    out: Path, files: list[Path], motors: Future[Motors] | None, tell: Callable[[str], None]
-) -> Findings:
-    """All work but the report's; quick if `motors` is `None`. Pictures are added to `files`."""
-
-    def keep(name: str, figure: Figure, **look: Any) -> None:
-        files.append(save_picture(figure, out / name, **look))
-
+def _first(out: Path, tell: Callable[[str], None], *, quick: bool) -> tuple[Case, Case]:
+    """The motions of Figures 3 and 4, with both drawn, and the sketch."""
     tell(_CASES)
-    keep("fig1.png", draw_sketch())
-    cases = simulate_cases(quick=motors is None)
+    save_picture(draw_sketch(), out / "fig1.png")
+    cases = simulate_cases(quick=quick)
     for number, step in ((3, _FIGURE_3), (4, _FIGURE_4)):
         tell(step)
-        files.append(out / f"fig{number}.png")
-        draw_figure(number, cases, files[-1])
+        draw_figure(number, cases, out / f"fig{number}.png")
+    return cases
+
+
+def _second(tell: Callable[[str], None]) -> tuple[list[Fault], list[TableRow]]:
+    """The faults of the text, and the table of the periodic motions."""
     tell(_FAULTS)
     faults = check_faults()
     tell(_ORBITS)
-    orbits = orbit_table(_table_scenes())
-    if motors is None:
-        tell(_CLAIMS)
-        claims = [*check_claims(cases), *check_assumptions(cases[0])]
-        return Findings(cases, claims, faults, orbits, None, None, None)
-    tell(_RESPONSE)
-    found = response()
-    panels = describe(found)
-    tell(_CURVES)
-    curves = boundary_curves([b for system in found.systems for b in system.branches])
-    tell(_MOTORS)
-    driven = motors.result()
-    keep("motor.png", draw_motors(driven.runs, cases[0].from_rest))
-    keep("fig2.png", draw_response(found), **LOOK)
-    keep("boundaries.png", draw_boundaries(curves))
+    return faults, orbit_table(_table_scenes())
+
+
+def _quick(out: Path, tell: Callable[[str], None]) -> Findings:
+    """All work of a quick reproduction but the report's."""
+    cases = _first(out, tell, quick=True)
+    faults, orbits = _second(tell)
     tell(_CLAIMS)
-    claims = check_claims(cases, panels["panels"]) + check_figure_2(found, panels["panels"])
+    claims = [*check_claims(cases), *check_assumptions(cases[0])]
+    return Findings(cases, claims, faults, orbits, None, None, None)
+
+
+def _whole(
+    out: Path, tell: Callable[[str], None], other: Callable[[], Figure2], own: Sequence[str]
+) -> Findings:
+    """All work but the report's.
+
+    **Arguments:** `other`, which computes or waits for what is found with Figure 2; `own`, the
+    curves that are not among that, none if there is no other process.
+    """
+    cases = _first(out, tell, quick=False)
+    found: Figure2 | None = None
+    if not own:
+        tell(_FIGURE_2)
+        found = other()
+    faults, orbits = _second(tell)
+    tell(_MOTORS)
+    driven = simulate_motors()
+    save_picture(draw_motors(driven.runs, cases[0].from_rest), out / "motor.png")
+    curves: dict[str, Boundary] = {}
+    if found is None:
+        tell(_CURVES)
+        curves = follow_curves(own)
+        tell(_WAITING)
+        found = other()
+    bounds = BoundaryCurves(**curves, **found.curves)
+    save_picture(draw_boundaries(bounds), out / "boundaries.png")
+    tell(_CLAIMS)
+    claims = check_claims(cases, found.panels["panels"]) + found.claims
     claims += check_assumptions(cases[0], driven)
-    borders = describe_boundaries(curves)
-    return Findings(cases, claims, faults, orbits + driven.rows, driven, panels, borders)
+    borders = describe_boundaries(bounds)
+    return Findings(cases, claims, faults, orbits + driven.rows, driven, found.panels, borders)
+
+
+def figure_2(out: Path, names: Sequence[str]) -> Figure2:
+    """Draw Figure 2 into a folder, measure it, and follow the curves of these names from it."""
+    found = response()
+    save_picture(draw_response(found), out / "fig2.png", **LOOK)
+    panels = describe(found)
+    branches = [branch for system in found.systems for branch in system.branches]
+    curves = follow_curves(names, branches)
+    return Figure2(panels, check_figure_2(found, panels["panels"]), curves)
 
 
 def _table_scenes() -> dict[str, Scene]:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
+from .._programs import compiled
 from ..flow import jit
 from ..machine import RigidStop, Scene, with_leaf
 from ..orbit import Branch, ClosedFormOrbits, closed_form_orbits, continue_orbit, find_orbit
@@ -18,6 +19,8 @@ from .motions import GAP, table_damping_ratio
 # The k that Figure 2 is computed for, and Table 1's range of ζ.
 RESTITUTIONS = (0.8, 0.5)
 RANGE = (0.5, 1.9)
+# The longest step along its branches, in the units of `continue_orbit`: a choice.
+MAX_STEP = 0.2
 RATIO, DAMPING, BOUNCE = "drive.frequency_ratio", "oscillator.damping_ratio", "stops.0.restitution"
 
 # The paper draws a second stop below without a number. Here the 2π motion is clear of it, and most
@@ -114,7 +117,7 @@ def with_numbers(scene: Scene, k: object, xi: object, ratio: object) -> Any:
     return with_leaf(scene, "stops.1.restitution", k) if len(scene.stops) > 1 else scene
 
 
-@partial(jit, static_argnames="cycles")
+@compiled
 def _closed_forms(scene: Scene, grid, ratios, cycles: int) -> ClosedFormOrbits:
     def one(numbers, ratio):
         return closed_form_orbits(with_numbers(scene, numbers[0], numbers[1], ratio), cycles=cycles)
@@ -128,7 +131,7 @@ def _branches(
     """The 2π branch and what springs from it; ζ of BB' and CC'."""
     near = int(np.argmin(abs(ratios - 0.9)))
     orbit = find_orbit(scene, scene.start(Y=closed.Y[near, 0], V=closed.V[near, 0]), throw=True)
-    follow = partial(continue_orbit, parameter=RATIO, bounds=RANGE, max_step=0.2)
+    follow = partial(continue_orbit, parameter=RATIO, bounds=RANGE, max_step=MAX_STEP)
     branches = [follow(orbit)]
     born = min(p.parameter for p in branches[0].special if p.kind == "grazing")
     waiting = [p for p in branches[0].special if p.kind == "period-doubling"]
