@@ -1,4 +1,4 @@
-"""All tests run in double precision, and with the package's annotations checked at run time."""
+"""All tests run in double precision, the default ones with annotations checked at run time."""
 
 import gc
 from pathlib import Path
@@ -16,7 +16,16 @@ _MODULES = sorted(
     {path.name.removesuffix(".py") for path in _PACKAGE.iterdir() if path.name[0] != "."}
     - {"__pycache__", "__init__", "py", "lanes"}
 )
-_hook = jaxtyping.install_import_hook([f"vi_jax.{x}" for x in _MODULES], "beartype.beartype")
+
+
+def pytest_configure(config):
+    """Check annotations, but not where only slow tests are run: these go through the same code with
+    more numbers, and checks take two fifths of their time (40 for 29 s of a processor, for the
+    friction and the quantities of orbits)."""
+    if config.option.markexpr != "slow":
+        modules = [f"vi_jax.{name}" for name in _MODULES]
+        config.checked = jaxtyping.install_import_hook(modules, "beartype.beartype")
+
 
 # What JAX traces lives long, and collecting garbage among it takes a tenth of the time.
 gc.set_threshold(200_000, 20, 20)
