@@ -12,7 +12,6 @@ import itertools
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from .._types import Scalar, Vector
 from ..machine import with_leaf
@@ -20,6 +19,7 @@ from ._observed import Observed
 from ._quantities import quantity_of
 from ._shooting import Shooting
 from .curve import Step
+from .floquet import compound
 
 
 class AbstractCondition(eqx.Module):
@@ -48,8 +48,7 @@ class Held(AbstractCondition):
 class HeldMultiplier(AbstractCondition):
     """The greatest multiplier has a given modulus, as an equation that is smooth where two of them
     meet on the real axis, as their moduli are not there: a root of the characteristic polynomial of
-    the monodromy matrix, or of that of its second compound, whose eigenvalues are the products of
-    two multipliers."""
+    the monodromy matrix, or of that of its second compound (`compound`)."""
 
     value: Scalar
     """The multiplier, with its sign; of a complex pair its modulus."""
@@ -59,7 +58,7 @@ class HeldMultiplier(AbstractCondition):
         """The characteristic polynomial at the value held."""
         matrix, root = seen.monodromy, self.value
         if self.pair:
-            matrix, root = _second_compound(matrix), self.value**2
+            matrix, root = compound(matrix), self.value**2
         return jnp.linalg.det(matrix - root * jnp.eye(len(matrix), dtype=matrix.dtype))
 
     def overtaken(self, seen: Observed) -> float:
@@ -74,13 +73,6 @@ class HeldMultiplier(AbstractCondition):
         )
         others = np.abs(np.delete(values, [i, j])).max(initial=0.0) - value
         return float(max(others, np.real((values[i] - values[j]) ** 2)))
-
-
-def _second_compound(matrix: Array) -> Array:
-    """The minors of two rows and two columns each."""
-    pairs = np.array(list(itertools.combinations(range(len(matrix)), 2)))
-    (i, j), (k, l) = pairs.T[:, :, None], pairs.T[:, None, :]
-    return matrix[i, k] * matrix[j, l] - matrix[i, l] * matrix[j, k]
 
 
 def alone(

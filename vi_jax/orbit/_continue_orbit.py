@@ -53,20 +53,17 @@ def continue_orbit(
 ) -> Branch:
     """Follow a periodic motion in one number of its machine, both ways, through folds.
 
-    Pseudo-arclength on the equations from impact to impact, which stay smooth at a grazing. Folds,
-    period doublings, Neimark–Sacker bifurcations, crossings of branches and grazings are located
-    to rounding. A motion that rests on a stop for a part of its period is followed as a fixed point
-    of the section map, whose chatter the simulator completes, and ends where a rest is gained or
-    lost. Where an impact is lost or a stop is touched, the motion ceases to be one: there
-    the branch ends (`special[i].switch()` goes on with the other impacts). Host-side: not to be
-    traced; one compiled program for each number of cycles and impacts.
+    Pseudo-arclength on the equations from impact to impact, which stay smooth at a grazing. Special
+    points are located to rounding. A motion that rests on a stop for a part of its period is
+    followed as a fixed point of the section map, and ends where a rest is gained or lost. Where an
+    impact is lost or a stop is touched the branch ends too (`special[i].switch()` goes on with the
+    other impacts). Host-side: not to be traced; one compiled program for each number of impacts.
 
     **Arguments:**
 
     - `orbit`: from `find_orbit`, or from another branch.
-    - `parameter`: name of a number of the machine: `"drive.frequency_ratio"`, `"stops.0.gap"`,
-      `"oscillator.damping_ratio"`, …
-    - `bounds`: the interval of the parameter.
+    - `parameter`, `bounds`: a number of the machine, such as `"drive.frequency_ratio"` or
+      `"stops.0.gap"`, and its interval.
     - `step`, `max_step`: first and longest step along the branch, in the norm of the unknowns: the
       state and the clock of each impact in the machine's own units (of a `Scene`: positions in a,
       velocities in a ω, crank angles in radians), the parameter in half its interval.
@@ -108,25 +105,32 @@ def continue_orbit(
     scale = np.ones(problem.size)
     scale[-len(ranges) :] = [0.5 * (high - low) for low, high in ranges]
     start = _first_point(problem, x, scale, orbit)
-    ahead = BranchMonitor(problem, scale, ranges, sought)
-    back = BranchMonitor(problem, scale, ranges, sought)
+    both = (BranchMonitor(problem, scale, ranges, sought) for _ in range(2))
+    return _both_ways(parameter, start, *both, progress, settings)
+
+
+def _both_ways(
+    parameter: str, start: Step, back: BranchMonitor, ahead: BranchMonitor, progress: bool,
+    settings: dict[str, Any],
+) -> Branch:  # fmt: skip
+    """The branch through a point, with a monitor for each of the two walks.
+
+    **Arguments:** whether a bar is shown, and the settings of `walk`.
+    """
     forward, backward = [start], [start._replace(tangent=-start.tangent)]
     ends = [INTERRUPTED, INTERRUPTED]
 
     def branch() -> Branch:
         special = [*reversed(back.special), *ahead.special]
         steps = [*reversed(back.path(backward[1:])), *ahead.path(forward)]
-        return _branch(problem, parameter, steps, special, (ends[0], ends[1]), scale)
+        return _branch(ahead.problem, parameter, steps, special, (ends[0], ends[1]), ahead.scale)
 
     def kept() -> Interrupted:
         return Interrupted("walk along the branch", branch())
 
     with at_work("branch", kept, progress=progress, unit="point") as tell:
         ends[1] = _walked(ahead, forward, tell, settings)
-        if ends[1] == "closed":
-            ends[0] = ends[1]
-        else:
-            ends[0] = _walked(back, backward, tell, settings)
+        ends[0] = ends[1] if ends[1] == "closed" else _walked(back, backward, tell, settings)
     return branch()
 
 

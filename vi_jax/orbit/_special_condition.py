@@ -10,6 +10,7 @@ from ._conditions import AbstractCondition
 from ._shooting import Shooting
 from ._solve import jacobian_at
 from ._symmetry import images
+from .floquet import compound
 from .special import DOUBLING, GRAZING, TORUS
 
 
@@ -78,11 +79,3 @@ class Special(AbstractCondition):
         sign = 1 if self.kind == DOUBLING else -1
         identity = jnp.eye(matrix.shape[0], dtype=x.dtype)
         return jnp.linalg.det(matrix + sign * identity) * jnp.prod(seen.approach)
-
-
-def compound(matrix: Float[Array, "n n"]) -> Float[Array, "pairs pairs"]:
-    """The second compound matrix, of all determinants of two rows and two columns: its eigenvalues
-    are the products of two of the eigenvalues."""
-    first, second = np.triu_indices(len(matrix), 1)
-    rows, others = matrix[first], matrix[second]
-    return rows[:, first] * others[:, second] - rows[:, second] * others[:, first]

@@ -1,6 +1,7 @@
 """Floquet multipliers and what they say about a periodic motion."""
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from ..flow import NamedEnumeration
@@ -60,3 +61,11 @@ def stability_of(multipliers: Complex[Array, " n"]) -> STABILITY:
     rounding = max(NEUTRAL, 100 * float(jnp.finfo(size.dtype).eps))
     verdict = STABILITY.where(jnp.abs(size - 1) <= rounding, STABILITY.neutral, verdict)
     return STABILITY.where(jnp.isnan(size), STABILITY.unknown, verdict)
+
+
+def compound(matrix: Float[Array, "n n"]) -> Float[Array, "pairs pairs"]:
+    """The second compound matrix, of all determinants of two rows and two columns: its eigenvalues
+    are the products of two of the eigenvalues."""
+    first, second = np.triu_indices(len(matrix), 1)
+    rows, others = matrix[first], matrix[second]
+    return rows[:, first] * others[:, second] - rows[:, second] * others[:, first]

@@ -114,17 +114,13 @@ def minimal_kick(
     """The smallest kick, a sudden change of the state, after which a stable motion does not come
     back: how robust it is, in the units of its state.
 
-    The least kick leads onto the boundary of the basin, which is the stable manifold of an unstable
-    motion, the edge state. It is found in three steps. Rays of kicks in all directions are
-    simulated beside each other, and where each first leaves the basin is bisected. From the rays
-    that leave sooner than their neighbours, `edge_state` follows the boundary to a saddle. With the
-    saddle's left eigenvector the boundary has an equation with a derivative, and Newton's method
-    makes the kick exact, through the impacts. Simulation from 1 ± 1e-6 of the kick confirms it.
-    Where the boundary has no saddle (a chaotic edge, or a grazing beside it) directions are
-    narrowed by simulations alone. Host-side: not to be traced.
-
-    A basin that is entered and left again between two points of a ray, or between two rays, may be
-    missed: `directions` and `points` say how fine the search is.
+    The least kick leads onto the boundary of the basin, the stable manifold of an unstable motion.
+    Rays of kicks in all directions are simulated, and where each first leaves the basin is
+    bisected; from the best, `edge_state` follows the boundary to a saddle, and Newton's method makes
+    the kick exact, through the impacts. Simulation from 1 ± 1e-6 of the kick confirms it. Where the
+    boundary has no saddle (a chaotic edge, or a grazing beside it) directions are narrowed by
+    simulations alone. What leaves the basin and comes back between two points of a ray, or between
+    two rays, may be missed. Host-side: not to be traced.
 
     **Arguments:**
 
@@ -136,10 +132,8 @@ def minimal_kick(
       by default.
     - `weights`: of some of them, by which they count in the norm, above 0; 1 by default. With
       velocities weighed by √(m/2) and no places the norm squared is an energy.
-    - `bounds`: the range of the kicked state in some of them, such as `{"Y": (-3.0, 2.0)}`. What
-      lies beyond a stop is out of bounds by itself.
-    - `cycle`: in which cycle of its period an orbit of several is kicked, from 0 on. Coming back in
-      another cycle than the kicked one counts as coming back.
+    - `bounds`: the range of the kicked state in some of them, such as `{"Y": (-3.0, 2.0)}`.
+    - `cycle`: in which cycle of its period an orbit of several is kicked, from 0 on.
     - `largest`: norm up to which kicks are looked for; by default they grow until one leads
       elsewhere.
     - `directions`, `points`: rays, and points on each that are simulated in a round.
@@ -151,9 +145,8 @@ def minimal_kick(
 
     **Returns:** a `MinimalKick`.
 
-    **Raises:** `ValueError` or `TypeError` for arguments that cannot be used; `ValueError` where no
-    kick leads elsewhere; on Ctrl-C `Interrupted`, whose `partial` is the smallest kick found so
-    far, as soon as there is one.
+    **Raises:** `ValueError` or `TypeError` for arguments that cannot be used, or where no kick leads
+    elsewhere; on Ctrl-C `Interrupted`, whose `partial` is the smallest kick found so far.
     """
     cycle, candidates = count("cycle", cycle), count("candidates", candidates, least=1)
     directions, points = count("directions", directions, least=4), count("points", points, least=2)
