@@ -111,16 +111,13 @@ def minimal_kick(
     method: MethodLike = None,
     progress: bool = True,
 ) -> MinimalKick:
-    """The smallest kick, a sudden change of the state, after which a stable motion does not come
-    back: how robust it is, in the units of its state.
+    """The smallest kick, a sudden change of the state, after which a stable motion does not return.
 
-    The least kick leads onto the boundary of the basin, the stable manifold of an unstable motion.
-    Rays of kicks in all directions are simulated, and where each first leaves the basin is
-    bisected; from the best, `edge_state` follows the boundary to a saddle, and Newton's method makes
-    the kick exact, through the impacts. Simulation from 1 ± 1e-6 of the kick confirms it. Where the
-    boundary has no saddle (a chaotic edge, or a grazing beside it) directions are narrowed by
-    simulations alone. What leaves the basin and comes back between two points of a ray, or between
-    two rays, may be missed. Host-side: not to be traced.
+    It leads onto the boundary of the basin, the stable manifold of an unstable motion. Rays of kicks in all directions are simulated, and where each first leaves the basin is
+    bisected; from the best, `edge_state` follows the boundary to a saddle, and Newton's method
+    makes the kick exact, through the impacts. Simulation from 1 ± 1e-6 of it confirms it. Where
+    the boundary has no saddle (a chaotic edge, a grazing) directions are narrowed by simulations.
+    What leaves the basin and comes back between two points or two rays may be missed. Host-side.
 
     **Arguments:**
 
@@ -134,10 +131,9 @@ def minimal_kick(
       velocities weighed by √(m/2) and no places the norm squared is an energy.
     - `bounds`: the range of the kicked state in some of them, such as `{"Y": (-3.0, 2.0)}`.
     - `cycle`: in which cycle of its period an orbit of several is kicked, from 0 on.
-    - `largest`: norm up to which kicks are looked for; by default they grow until one leads
-      elsewhere.
-    - `directions`, `points`: rays, and points on each that are simulated in a round.
-    - `candidates`: rays that leave sooner than their neighbours, from which kicks are made exact.
+    - `largest`: norm up to which kicks are looked for; by default until one leads elsewhere.
+    - `directions`, `points`: rays, and points on each that are simulated in a round; `candidates`:
+      rays that leave sooner than their neighbours, from which kicks are made exact.
     - `settle`, `tolerance`, `longest`, `method`: as for `edge_state`. The kick found should be
       many times `tolerance`.
     - `seed`: of the directions, where more than two components are kicked.
@@ -145,7 +141,7 @@ def minimal_kick(
 
     **Returns:** a `MinimalKick`.
 
-    **Raises:** `ValueError` or `TypeError` for arguments that cannot be used, or where no kick leads
+    **Raises:** `ValueError` or `TypeError` for arguments that cannot be used, or if no kick leads
     elsewhere; on Ctrl-C `Interrupted`, whose `partial` is the smallest kick found so far.
     """
     cycle, candidates = count("cycle", cycle), count("candidates", candidates, least=1)
