@@ -113,11 +113,12 @@ def minimal_kick(
 ) -> MinimalKick:
     """The smallest kick, a sudden change of the state, after which a stable motion does not return.
 
-    It leads onto the boundary of the basin, the stable manifold of an unstable motion. Rays of kicks in all directions are simulated, and where each first leaves the basin is
-    bisected; from the best, `edge_state` follows the boundary to a saddle, and Newton's method
-    makes the kick exact, through the impacts. Simulation from 1 ± 1e-6 of it confirms it. Where
-    the boundary has no saddle (a chaotic edge, a grazing) directions are narrowed by simulations.
-    What leaves the basin and comes back between two points or two rays may be missed. Host-side.
+    It leads onto the boundary of the basin, the stable manifold of an unstable motion. Rays of
+    kicks in all directions are simulated, and where each first leaves the basin is bisected; from
+    the best, `edge_state` follows the boundary to a saddle, and Newton's method makes the kick
+    exact, through the impacts. Simulation from 1 ± 1e-6 of it confirms it. Where the boundary has
+    no saddle (a chaotic edge, a grazing) directions are narrowed by simulations. What leaves the
+    basin and comes back between two points or two rays may be missed. Host-side.
 
     **Arguments:**
 
@@ -134,8 +135,7 @@ def minimal_kick(
     - `largest`: norm up to which kicks are looked for; by default until one leads elsewhere.
     - `directions`, `points`: rays, and points on each that are simulated in a round; `candidates`:
       rays that leave sooner than their neighbours, from which kicks are made exact.
-    - `settle`, `tolerance`, `longest`, `method`: as for `edge_state`. The kick found should be
-      many times `tolerance`.
+    - `settle`, `tolerance` (far smaller than the kick), `longest`, `method`: as for `edge_state`.
     - `seed`: of the directions, where more than two components are kicked.
     - `progress`: count the starts simulated, in a terminal or a notebook.
 

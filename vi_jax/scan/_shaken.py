@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, UInt32
 
 from ..flow import WhiteNoise, lane_key, words_of
+from ..machine import is_own
 from .grid import LANE
 from .measures import AbstractMeasure
 
@@ -113,7 +114,7 @@ def shaken_by(
                 f"but got {name!r}."
             )
     for measure in measures:
-        if type(measure).refine is not AbstractMeasure.refine:
+        if is_own(type(measure).refine):
             raise ValueError(
                 f"Argument `measure` must be without {type(measure).__name__} where there is "
                 "noise: a motion that is shaken has no period, and what it looks at beyond the "

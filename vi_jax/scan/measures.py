@@ -13,7 +13,7 @@ from jaxtyping import Array
 from .._checks import count, require
 from .._types import Flag, State
 from ..flow import AbstractMethod, Run
-from ..machine import AbstractMachine, by_name, components
+from ..machine import AbstractMachine, by_default, by_name, components
 from ._lyapunov import lyapunov
 from .regime import CODES, REGIMES, flags, impacts_of, least_period
 
@@ -68,6 +68,7 @@ class AbstractMeasure(eqx.Module):
         """Whether a lane needs `refine`, at pass number `pass_number`; `None` if none ever does."""
         return None
 
+    @by_default
     def refine(
         self,
         machine: AbstractMachine,
