@@ -14,8 +14,10 @@ from ._extrema import Extrema
 from ._hopf import hopf_between, size_of
 from ._named import named
 from ._origin import halves, origin
+from ._refined_sliding import refined
 from ._sequence import changed_sequence
 from ._shooting import Shooting
+from ._sliding import change_at
 from ._solution import orbit_of
 from ._solve import advance, images_at, located, observe
 from ._symmetry import may_be_symmetric
@@ -178,7 +180,9 @@ class BranchMonitor:
         if not found:
             return None
         at, impact = min(found, key=lambda f: float(np.dot(here.tangent, f[0].x - here.x)))
-        kind, detail = named(self.problem, at, impact)
+        change = None if impact == RESTS else change_at(self.problem, at)
+        at = at if change is None else refined(self.problem, at, change)
+        kind, detail = named(self.problem, at, impact, change)
         impact = 0 if impact == RESTS else None if impact in DETAILS else impact
         return self._point(kind, at, detail, impact)
 

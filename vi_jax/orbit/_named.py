@@ -6,21 +6,23 @@ import numpy as np
 
 from ._events import Event
 from ._shooting import Shooting
-from ._sliding import SLIDING, change_at
+from ._sliding import SLIDING, Change
 from ._words import DETAILS, RESTS
 from .curve import Step
 from .special import GRAZING, HOPF
 
 
-def named(problem: Shooting, at: Step, impact: int | None) -> tuple[str, str]:
+def named(
+    problem: Shooting, at: Step, impact: int | None, change: Change | None
+) -> tuple[str, str]:
     """Kind and description.
 
     **Arguments:** the equations and their solution there; the number of the event that is lost,
-    `None` where something is touched, or what stands for it in `DETAILS`.
+    `None` where something is touched, or what stands for it in `DETAILS`; what changes there in
+    the sequence of sticking and sliding.
     """
     if impact == RESTS:
         return HOPF, "the motion shrinks to rest"
-    change = change_at(problem, at)
     if change is not None and change.kind is not None:
         words = SLIDING[change.kind][change.there]
         name = Event(change.number).called(problem.machine)

@@ -35,7 +35,7 @@ SLIDING = {
         "{name} is held {place} no longer, and beyond does not come to its surface there",
     ),
     SWITCHING_SLIDING: (
-        "{name} is held from {place} on, where beyond it first passes and comes back",
+        "{name} is held {place} at once, where beyond it first passes and comes back",
         "{name} passes and comes back {place} no longer, and beyond is held there at once",
     ),
     ADDING_SLIDING: (
@@ -44,9 +44,10 @@ SLIDING = {
     ),
 }
 
-# A part of a motion this brief, as a share of its period, vanishes; and a guard this small is zero
-# where it stands for that. Choices: special points are located far closer.
-_BRIEF, _ZERO = 1e-4, 1e-6
+# A part of a motion this brief, as a share of its period, vanishes; where nothing else happens one
+# that is nearly so, as a corrector may not get closer. A guard this small is zero. Choices: special
+# points are located far closer (see `refined`).
+_BRIEF, _NEARLY, _ZERO = 1e-4, 1e-2, 1e-6
 
 
 class Change(NamedTuple):
@@ -81,7 +82,12 @@ def change_at(problem: Shooting, at: Step) -> Change | None:
     none of the four."""
     if not problem.modes[0]:
         return None
-    found = _vanishing(problem, at) or _touching(problem, at) or _beginning(problem, at)
+    found = (
+        _vanishing(problem, at, _BRIEF)
+        or _touching(problem, at)
+        or _beginning(problem, at)
+        or _vanishing(problem, at, _NEARLY)
+    )
     return found if found is not None and found.kind is not None else None
 
 
@@ -96,9 +102,9 @@ def _clocks(problem: Shooting, at: Step) -> tuple[np.ndarray, np.ndarray, float]
     return clock, np.append(clock[1:], clock[0] + period) - clock, period
 
 
-def _vanishing(problem: Shooting, at: Step) -> Change | None:
-    """The briefest part of the motion between two events of one switch, if it is about to
-    vanish."""
+def _vanishing(problem: Shooting, at: Step, brief: float) -> Change | None:
+    """The briefest part of the motion between two events of one switch, if it is as brief (as a
+    share of the period)."""
     clock, lengths, period = _clocks(problem, at)
     events, found = problem.events, []
     for i, event in enumerate(events):
@@ -107,7 +113,7 @@ def _vanishing(problem: Shooting, at: Step) -> Change | None:
         modes = tuple(_mode(problem, leg, event.number) for leg in (i - 1, i, i + 1))
         found.append((lengths[i], Change(event.number, float(clock[i]), modes, True)))
     length, change = min(found, key=lambda f: f[0], default=(np.inf, None))
-    return change if length < _BRIEF * period else None
+    return change if length < brief * period else None
 
 
 def _touching(problem: Shooting, at: Step) -> Change | None:
@@ -121,7 +127,7 @@ def _touching(problem: Shooting, at: Step) -> Change | None:
     leg = max(0, int(np.searchsorted(clock, place, side="right")) - 1)
     mode = _mode(problem, leg, number)
     if mode:
-        force, _ = _held(problem, at, leg, number, place)
+        force, _ = holding_force(problem, at, leg, number, place)
         # A surface that is touched from one side holds only what the other side's field drives on.
         return Change(number, place, (mode, 0.0, mode), False) if force < _ZERO else None
     return Change(number, place, (0.0, _away(problem, at, leg, number, place), 0.0), False)
@@ -136,7 +142,7 @@ def _beginning(problem: Shooting, at: Step) -> Change | None:
             continue
         before, after = (_mode(problem, leg, event.number) for leg in (i - 1, i))
         if before:
-            force, rate = _held(problem, at, i, event.number, float(clock[i]))
+            force, rate = holding_force(problem, at, i, event.number, float(clock[i]))
             found.append((abs(force), rate, event.number, float(clock[i]), before, after))
     if not found:
         return None
@@ -169,7 +175,9 @@ def _rates(problem: Shooting, x, leg, number: int, s):
     return found.x, found.v
 
 
-def _held(problem: Shooting, at: Step, leg: int, number: int, s: float) -> tuple[float, float]:
+def holding_force(
+    problem: Shooting, at: Step, leg: int, number: int, s: float
+) -> tuple[float, float]:
     """How far what drives a switch off its surface exceeds what holds it there, and how fast that
     grows while it is held."""
     found = _rates(problem, jnp.asarray(at.x), jnp.asarray(leg), number, jnp.asarray(s))

@@ -40,12 +40,17 @@ def _corner(
 
 def hump(c: Crossing, h: Scalar) -> tuple[Flag, Scalar]:
     """Whether a guard that is negative at both ends may have been positive in between, and where
-    it was greatest."""
+    it was greatest; or where one that falls at both, as of a body that has just passed through its
+    standstill, has begun to rise, from where its greatest value shows."""
     begin, end = stop_gradient((c.begin, c.end))
     rises = (begin.x < 0) & (end.x < 0) & (begin.v > 0) & (end.v < 0)
     _, bound, place = _corner((begin.x, begin.v), (end.x, end.v), h, rises)
     brief = _BRIEF * h
-    return rises & (bound > 0) & (place > brief) & (h - place > brief), place
+    seen = rises & (bound > 0) & (place > brief) & (h - place > brief)
+    dips = (begin.x <= 0) & (end.x < 0) & (begin.v < 0) & (end.v < 0) & (begin.a > 0)
+    least = -begin.v / jnp.where(dips, begin.a, 1.0)
+    dips = dips & (least < 0.5 * h) & (h > _SHORTEST)
+    return seen | dips, jnp.where(dips, jnp.maximum(1.5 * least, brief), place)
 
 
 def rise(c: Crossing, h: Scalar) -> tuple[Flag, Scalar]:
