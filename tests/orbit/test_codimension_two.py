@@ -48,19 +48,23 @@ def test_folds_meet_in_a_cusp():
         cusp.switch()
 
 
-def test_a_doubling_becomes_degenerate():
-    """x ← -(1 + a - 0.1b²) x + x² + b x³ doubles at a = 0.1b², to stable motions where
-    (f''/2)² + f'''/6 = 1 + b is positive."""
+@pytest.mark.parametrize("decay", [0.0, 1.0])
+def test_a_doubling_becomes_degenerate(decay):
+    """x ← -(1 + a - 0.1b²) x + x² + b x³, with x' = -decay x³ before and after for half a cycle:
+    x - decay x³/2 + … It doubles at a = 0.1b², to stable motions where (f''/2)² + f'''/6 =
+    1 + b + decay is positive."""
     terms = {
         (1, 0, 0, 0): -1.0, (1, 0, 1, 0): -1.0, (1, 0, 0, 2): 0.1, (2, 0, 0, 0): 1.0,
         (3, 0, 0, 1): 1.0,
     }  # fmt: skip
-    (doubling,) = special_of(polynomial(0.2, 0.5, terms, FADES), (0.0, 0.0), "period-doubling")
+    machine = polynomial(0.2, 0.5, terms, FADES, decay=decay)
+    (doubling,) = special_of(machine, (0.0, 0.0), "period-doubling")
     assert doubling.parameter == pytest.approx(0.025, abs=1e-10)
-    curve = vi.boundary(doubling, parameter="b", bounds=((-1.0, 1.0), (-2.0, 2.0)))
+    curve = vi.boundary(doubling, parameter="b", bounds=((-1.0, 1.0), (-3.0, 3.0)))
     np.testing.assert_allclose(curve.parameters[:, 0], 0.1 * curve.parameters[:, 1] ** 2, atol=1e-9)
     assert kinds_of(curve) == ["degenerate-doubling"]
-    np.testing.assert_allclose(curve.special[0].parameters, [0.1, -1.0], atol=1e-9)
+    wanted = np.array([0.1 * (1 + decay) ** 2, -1 - decay])
+    np.testing.assert_allclose(curve.special[0].parameters, wanted, atol=1e-9)
 
 
 def test_folds_meet_doublings():
