@@ -1,5 +1,8 @@
 """Points of codimension two on boundaries of maps, where all of them are known in closed form."""
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
@@ -169,3 +172,36 @@ def test_curves_on_which_neimark_sacker_points_begin(torus, kind, resonant, cosi
     np.testing.assert_allclose(point.parameters, resonance(cosine), atol=1e-8)
     again = vi.boundary(point.switch(), parameter="b", bounds=FREE)
     assert again.kind == "neimark-sacker" and sorted(again.ends) == sorted(torus.ends)
+
+
+class Pitchfork(vi.AbstractMachine):
+    """x' = (a - 0.1b²) x + (b - 0.5) x³ - x⁵, y' = -y: the rest x = 0 loses its symmetry at
+    a = 0.1b², to motions on the other side where b > 0.5."""
+
+    a: jax.Array = eqx.field(converter=jnp.asarray)
+    b: jax.Array = eqx.field(converter=jnp.asarray)
+    stops: tuple = ()
+
+    @property
+    def cycle(self):
+        return 1.0
+
+    def field(self, s, x):
+        grows = self.a - 0.1 * self.b**2 + (self.b - 0.5) * x[0] ** 2 - x[0] ** 4
+        return grows * x[0], -x[1]
+
+    def position(self, x):
+        return x[0]
+
+    def velocity(self, x):
+        return x[1]
+
+    def mirrored(self, x):
+        return tuple(-y for y in x)
+
+
+def test_a_loss_of_symmetry_becomes_degenerate():
+    (point,) = special_of(Pitchfork(-0.5, 0.2), (0.0, 0.0), "symmetry-breaking")
+    curve = vi.boundary(point, parameter="b", bounds=((-1.0, 1.0), (-1.0, 1.0)))
+    assert kinds_of(curve) == ["degenerate-symmetry-breaking"]
+    np.testing.assert_allclose(curve.special[0].parameters, [0.025, 0.5], atol=1e-9)
