@@ -54,17 +54,22 @@ POWERS = (
 
 
 class Polynomial(Kicked):
-    """Both numbers become polynomials of themselves and of a and b, all by the same programs."""
+    """Both numbers become polynomials of themselves and of a and b, all by the same programs.
+    Between kicks x' = -decay x³."""
 
     shares: jax.Array = eqx.field(kw_only=True)
+    decay: jax.Array = eqx.field(kw_only=True, converter=jnp.asarray)
+
+    def field(self, s, x):
+        return -self.decay * x[0] ** 3, 0 * x[1]
 
     def kick(self, x, y):
         powers = [x**i * y**j * self.a**k * self.b**n for i, j, k, n in POWERS]
         return tuple(self.shares @ jnp.stack(powers))
 
 
-def polynomial(a, b, *rows):
+def polynomial(a, b, *rows, decay=0.0):
     """The machine whose rows say by which factor each term enters."""
     shares = [[row.get(power, 0.0) for power in POWERS] for row in rows]
     assert all(power in POWERS for row in rows for power in row)
-    return Polynomial(a, b, shares=jnp.asarray(shares))
+    return Polynomial(a, b, shares=jnp.asarray(shares), decay=decay)

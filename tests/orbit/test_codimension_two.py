@@ -1,5 +1,8 @@
 """Points of codimension two on boundaries of maps, where all of them are known in closed form."""
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
@@ -48,19 +51,23 @@ def test_folds_meet_in_a_cusp():
         cusp.switch()
 
 
-def test_a_doubling_becomes_degenerate():
-    """x ← -(1 + a - 0.1b²) x + x² + b x³ doubles at a = 0.1b², to stable motions where
-    (f''/2)² + f'''/6 = 1 + b is positive."""
+@pytest.mark.parametrize("decay", [0.0, 1.0])
+def test_a_doubling_becomes_degenerate(decay):
+    """x ← -(1 + a - 0.1b²) x + x² + b x³, with x' = -decay x³ before and after for half a cycle:
+    x - decay x³/2 + … It doubles at a = 0.1b², to stable motions where (f''/2)² + f'''/6 =
+    1 + b + decay is positive."""
     terms = {
         (1, 0, 0, 0): -1.0, (1, 0, 1, 0): -1.0, (1, 0, 0, 2): 0.1, (2, 0, 0, 0): 1.0,
         (3, 0, 0, 1): 1.0,
     }  # fmt: skip
-    (doubling,) = special_of(polynomial(0.2, 0.5, terms, FADES), (0.0, 0.0), "period-doubling")
+    machine = polynomial(0.2, 0.5, terms, FADES, decay=decay)
+    (doubling,) = special_of(machine, (0.0, 0.0), "period-doubling")
     assert doubling.parameter == pytest.approx(0.025, abs=1e-10)
-    curve = vi.boundary(doubling, parameter="b", bounds=((-1.0, 1.0), (-2.0, 2.0)))
+    curve = vi.boundary(doubling, parameter="b", bounds=((-1.0, 1.0), (-3.0, 3.0)))
     np.testing.assert_allclose(curve.parameters[:, 0], 0.1 * curve.parameters[:, 1] ** 2, atol=1e-9)
     assert kinds_of(curve) == ["degenerate-doubling"]
-    np.testing.assert_allclose(curve.special[0].parameters, [0.1, -1.0], atol=1e-9)
+    wanted = np.array([0.1 * (1 + decay) ** 2, -1 - decay])
+    np.testing.assert_allclose(curve.special[0].parameters, wanted, atol=1e-9)
 
 
 def test_folds_meet_doublings():
@@ -165,3 +172,36 @@ def test_curves_on_which_neimark_sacker_points_begin(torus, kind, resonant, cosi
     np.testing.assert_allclose(point.parameters, resonance(cosine), atol=1e-8)
     again = vi.boundary(point.switch(), parameter="b", bounds=FREE)
     assert again.kind == "neimark-sacker" and sorted(again.ends) == sorted(torus.ends)
+
+
+class Pitchfork(vi.AbstractMachine):
+    """x' = (a - 0.1b²) x + (b - 0.5) x³ - x⁵, y' = -y: the rest x = 0 loses its symmetry at
+    a = 0.1b², to motions on the other side where b > 0.5."""
+
+    a: jax.Array = eqx.field(converter=jnp.asarray)
+    b: jax.Array = eqx.field(converter=jnp.asarray)
+    stops: tuple = ()
+
+    @property
+    def cycle(self):
+        return 1.0
+
+    def field(self, s, x):
+        grows = self.a - 0.1 * self.b**2 + (self.b - 0.5) * x[0] ** 2 - x[0] ** 4
+        return grows * x[0], -x[1]
+
+    def position(self, x):
+        return x[0]
+
+    def velocity(self, x):
+        return x[1]
+
+    def mirrored(self, x):
+        return tuple(-y for y in x)
+
+
+def test_a_loss_of_symmetry_becomes_degenerate():
+    (point,) = special_of(Pitchfork(-0.5, 0.2), (0.0, 0.0), "symmetry-breaking")
+    curve = vi.boundary(point, parameter="b", bounds=((-1.0, 1.0), (-1.0, 1.0)))
+    assert kinds_of(curve) == ["degenerate-symmetry-breaking"]
+    np.testing.assert_allclose(curve.special[0].parameters, [0.025, 0.5], atol=1e-9)
