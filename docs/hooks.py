@@ -59,4 +59,4 @@ def _set(formula: re.Match[str]) -> str:
     assert convert is not None
     block = formula[1] == "div"
     drawn = convert(html.unescape(formula[2]).strip(), display="block" if block else "inline")
-    return f'<div style="overflow-x: auto">{drawn}</div>' if block else drawn
+    return f'<div class="formula">{drawn}</div>' if block else drawn

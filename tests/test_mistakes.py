@@ -1,6 +1,7 @@
-"""Ten mistakes that everybody makes once: each is answered by a sentence that says what to do.
+"""Ten mistakes that everybody makes once, and others: each is answered by a sentence that says what
+to do.
 
-The page `docs/faq.md` lists them in this order."""
+The page `docs/faq.md` lists the ten in this order."""
 
 import math
 import warnings
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
+from vi_jax._checks import instance_of
 
 SCENE = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.05)
 
@@ -163,3 +165,34 @@ def test_10_a_guess_of_no_stable_motion():
     orbit = vi.find_orbit(undamped, undamped.start(Y=1.92303, V=-0.876442))
     assert "unstable" in str(orbit)
     assert "`orbit` must be a stable orbit" in refused(lambda: vi.minimal_kick(undamped, orbit))
+
+
+class NoType(Machine):
+    stiffness = 2.0
+
+
+class Assigns(Machine):
+    def field(self, s, x):
+        x.V = -x.Y
+        return x
+
+
+@pytest.mark.parametrize(
+    ("call", "says"),
+    [
+        (lambda: NoType(stiffness=3.0), "in the class, `stiffness: float = 2.0`"),
+        (lambda: simulate(Assigns()), "must return new numbers"),
+        (
+            lambda: instance_of("machine", Machine, vi.AbstractMachine, "one"),
+            "`Machine(…)`, for one",
+        ),
+        (lambda: vi.find_orbit(SCENE, vi.simulate(SCENE, SCENE.start(), 1)), "take its `last`"),
+        (lambda: vi.simulate(SCENE, vi.find_orbit(SCENE, SCENE.start()), 1), "take its `state`"),
+        (
+            lambda: vi.scan(SCENE, {"drive.frequency_ratio": [0.9]}, measure="period"),
+            "there are: extremes, regime",
+        ),
+    ],
+)
+def test_others(call, says):
+    assert says in refused(call)

@@ -208,8 +208,12 @@ def tuple_of_names(name: str, value: object) -> tuple[str, ...]:
 
 def instance_of(name: str, value: object, kind: type | tuple[type, ...], described: str) -> None:
     """**Raises:** `TypeError` if `value` is none of this kind, which is `described`."""
-    if not isinstance(value, kind):
-        raise TypeError(f"Argument `{name}` must be {described}, but got {value!r}.")
+    if isinstance(value, kind):
+        return
+    got = repr(value)
+    if isinstance(value, type) and issubclass(value, kind):
+        got = f"the class `{value.__name__}`: call it, `{value.__name__}(…)`, for one"
+    raise TypeError(f"Argument `{name}` must be {described}, but got {got}.")
 
 
 def state_of_numbers(name: str, state: object) -> Any:

@@ -1,6 +1,7 @@
 """What is checked of a machine that a user wrote, in words that name it."""
 
 import contextlib
+import dataclasses
 import functools
 import inspect
 from collections.abc import Callable, Iterator
@@ -89,7 +90,8 @@ def _runs(function: Callable[..., Any], *arguments: Any) -> bool:
 
 @contextlib.contextmanager
 def in_words_of(whose: str) -> Iterator[None]:
-    """JAX's errors about traced numbers as one sentence that says what to write instead."""
+    """Errors about traced numbers and about assignments as one sentence that says what to write
+    instead."""
     try:
         yield
     except jax.errors.TracerBoolConversionError as error:
@@ -100,6 +102,10 @@ def in_words_of(whose: str) -> Iterator[None]:
         raise TypeError(
             f"{whose} must be written for numbers that are traced: with the functions of "
             "`jax.numpy`, not with those of `numpy` or `math`, `float` or `int`."
+        ) from error
+    except dataclasses.FrozenInstanceError as error:
+        raise TypeError(
+            f"{whose} must return new numbers, and change neither machine nor state: {error}."
         ) from error
 
 

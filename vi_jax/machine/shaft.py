@@ -67,9 +67,11 @@ class ShaftMachine(AbstractMachine):
                 return self.timed_states[wanted](*components, jnp.zeros_like(start.Y))
             wanted = self.timed_states[wanted]
         if type(start) is not wanted:
+            parts = [x for x in ("last", "state") if type(getattr(start, x, None)) is wanted]
+            hint = f"; take its `{parts[0]}`" if parts else ""
             raise TypeError(
                 f"Argument `start` must be a `{wanted.__name__}` for this machine (use its "
-                f"`start(...)`), but got a `{type(start).__name__}`."
+                f"`start(...)`), but got a `{type(start).__name__}`{hint}."
             )
         return state_of_numbers("start", start)
 

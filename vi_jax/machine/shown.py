@@ -24,6 +24,13 @@ class Shown(eqx.Module):
     refuses arguments that it does not have by their names."""
 
     def __new__(cls, *args: Any, **kwargs: Any):
+        fields = {field.name for field in dataclasses.fields(cls)}
+        for name in kwargs:
+            if name not in fields and isinstance(getattr(cls, name, None), int | float):
+                raise TypeError(
+                    f"`{cls.__name__}` has no argument `{name}`: a number is declared with its "
+                    f"type in the class, `{name}: float = {getattr(cls, name)!r}`."
+                )
         check_call(cls.__init__, cls.__name__, (None, *args), kwargs, bound=1)
         return super().__new__(cls)
 

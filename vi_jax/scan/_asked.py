@@ -84,11 +84,9 @@ def _measure(one: object, averages: Sequence[str]) -> AbstractMeasure:
         if one in MEASURES:
             return MEASURES[one]()
         names = [*averages, *MEASURES]
-        near = difflib.get_close_matches(one, names, n=2, cutoff=0.4) or names
-        raise ValueError(
-            f"Argument `measure` must name a measure, but got {one!r}; near names: "
-            f"{', '.join(near)}."
-        )
+        near = difflib.get_close_matches(one, names, n=2, cutoff=0.6)
+        hint = f"near names: {', '.join(near)}" if near else f"there are: {', '.join(names)}"
+        raise ValueError(f"Argument `measure` must name a measure, but got {one!r}; {hint}.")
     if callable(one):
         return Custom(one)
     raise TypeError(f"Argument `measure` must be a name or a function, but got {one!r}.")
