@@ -18,6 +18,7 @@ from .orbits import (
 from .paper import (
     bifurcation_diagram,
     boundaries,
+    codimension_two,
     fig2_frequency_response,
     motor_frequency_response,
     regime_maps,
@@ -34,6 +35,7 @@ __all__ = [
     "boundaries",
     "chains",
     "closed",
+    "codimension_two",
     "dc_motor",
     "design_percussion",
     "escape_from_2pi",
