@@ -173,8 +173,8 @@ page = f"""# Points of codimension two of the paper's machine
 
 Ideal drive, d = {GAP:g}. The 2π motion with one impact is followed in ζ at k = 0.5 and Table 1's
 damping, ξ = {TABLE:.6f} (c = {table_damping():g} N·s/m, ξ = {xi_per_c():.6f} for each N·s/m). From
-there `vi.boundary` follows its grazing, period doubling and fold in (ζ, ξ) and in (ζ, k). Each curve
-lists its points of codimension two:
+there `vi.boundary` follows its grazing, period doubling and fold in (ζ, ξ) and in (ζ, k). Each
+curve lists its points of codimension two:
 
 {table(["plane", "curve", "point", "ζ", "ξ or k"], listed)}
 
@@ -190,9 +190,9 @@ Beside the degenerate doublings, the motion of twice the period where it begins:
 {table(["number", "its value", "doubling at ζ", "4π motion begins", "and is"], rows)}
 
 - The period doubling and the fold of the 2π motion end on its grazing in one point, the resonant
-  grazing at ζ = √(1 - ξ²), ξ = {closed[1, 2][1]:.4f}: what is between the birth of the 2π motion and its
-  period doubling, where it is unstable, ends there. Above ξ = {top:.4f} the vibration without
-  impacts does not reach the stop.
+  grazing at ζ = √(1 - ξ²), ξ = {closed[1, 2][1]:.4f}: what is between the birth of the 2π motion
+  and its period doubling, where it is unstable, ends there. Above ξ = {top:.4f} the vibration
+  without impacts does not reach the stop.
 - Along the period doubling the motion of twice the period changes the side on which it begins: up
   to such a point the 2π motion gives way to a stable one beside it, beyond it to one far away. With
   Table 1's damping and k = 0.8 it is the latter.
