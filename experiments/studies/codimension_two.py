@@ -63,8 +63,9 @@ for curve in curves.values():
 # %% [markdown]
 # ## Beside closed forms
 #
-# The motion without impacts grazes where 1/|1 - ζ² + 2iξζ| = d. An impact there adds to the distance
-# n periods later what is proportional to sin(2πn √(1 - ξ²)/ζ): a resonance at ζ = 2n √(1 - ξ²)/m.
+# The motion without impacts grazes where 1/|1 - ζ² + 2iξζ| = d. An impact there adds to the
+# distance n periods later what is proportional to sin(2πn √(1 - ξ²)/ζ): there is a resonance at
+# ζ = 2n √(1 - ξ²)/m.
 
 
 # %%
@@ -93,7 +94,7 @@ meets = {kind: np.abs(p.parameters - closed[1, 2]).max() for kind, p in ends.ite
 say(f"resonances miss by {max(misses.values()):.1e}, the ends by {max(meets.values()):.1e}")
 
 # %% [markdown]
-# ## Beside a degenerate doubling: where the motion of twice the period begins, and whether it is stable
+# ## Beside a degenerate doubling: where the motion of twice the period begins, and how
 
 
 # %%
@@ -112,14 +113,16 @@ def beside(other: str, value: float) -> tuple[float, str, str]:
     (doubling,) = (p for p in branch_at(0.9, xi, k).special if p.kind == "period-doubling")
     orbit = doubling.switch(distance=1e-3)
     side = float(orbit.machine.drive.frequency_ratio) - doubling.parameter
-    return doubling.parameter, "above" if side > 0 else "below", orbit.stability.name
+    return (
+        doubling.parameter,
+        "above" if side > 0 else "below",
+        "stable" if orbit.stable else "unstable",
+    )
 
 
 rows = []
 for other, point in degenerate:
-    zeta, value = point.parameters
-    if other == XI and value > 0.2:
-        continue  # it is too near to the grazing for motions beside it
+    value = point.parameters[1]
     for shift in (-0.02, 0.02):
         found = beside(other, value + shift)
         rows.append([("ξ" if other == XI else "k"), f"{value + shift:.4f}", f"{found[0]:.5f}",
@@ -165,19 +168,20 @@ checks = [
         for kind, miss in meets.items()
     ),
 ]  # fmt: skip
+top = np.sqrt((1 - np.sqrt(1 - GAP**-2)) / 2)
 page = f"""# Points of codimension two of the paper's machine
 
 Ideal drive, d = {GAP:g}. The 2π motion with one impact is followed in ζ at k = 0.5 and Table 1's
-damping, ξ = {TABLE:.6f}; its grazing, period doubling and fold from there by `vi.boundary` in
-(ζ, ξ) and in (ζ, k). Each curve lists its points of codimension two:
+damping, ξ = {TABLE:.6f} (c = {table_damping():g} N·s/m, ξ = {xi_per_c():.6f} for each N·s/m). From
+there `vi.boundary` follows its grazing, period doubling and fold in (ζ, ξ) and in (ζ, k). Each
+curve lists its points of codimension two:
 
 {table(["plane", "curve", "point", "ζ", "ξ or k"], listed)}
 
 ![Curves and points of codimension two](../figures/codimension_two.png)
 
-Beside closed forms: the motion without impacts touches the stop where 1/|1 - ζ² + 2iξζ| = d, and there
-an impact changes nothing n periods later where ζ = 2n√(1 - ξ²)/m. From the first of these points the
-fold and the period doubling of the 2π motion leave the curve of grazings.
+Beside closed forms: the motion without impacts touches the stop where 1/|1 - ζ² + 2iξζ| = d, and
+there an impact changes nothing n periods later where ζ = 2n√(1 - ξ²)/m.
 
 {table(["point", "ζ", "ξ", "largest difference"], checks)}
 
@@ -185,11 +189,13 @@ Beside the degenerate doublings, the motion of twice the period where it begins:
 
 {table(["number", "its value", "doubling at ζ", "4π motion begins", "and is"], rows)}
 
-- The strip of ζ in which the 2π motion is unstable ends at ξ = {closed[1, 2][1]:.4f}: there its birth, its period
-  doubling and its fold meet in one point, the resonant grazing at ζ = √(1 - ξ²). With more damping the
-  vibration without impacts does not reach the stop.
-- Along the period doubling the motion of twice the period changes the side on which it begins, so that the
-  loss of stability is a gradual one on one side of such a point and a jump on the other.
+- The period doubling and the fold of the 2π motion end on its grazing in one point, the resonant
+  grazing at ζ = √(1 - ξ²), ξ = {closed[1, 2][1]:.4f}: what is between the birth of the 2π motion
+  and its period doubling, where it is unstable, ends there. Above ξ = {top:.4f} the vibration
+  without impacts does not reach the stop.
+- Along the period doubling the motion of twice the period changes the side on which it begins: up
+  to such a point the 2π motion gives way to a stable one beside it, beyond it to one far away. With
+  Table 1's damping and k = 0.8 it is the latter.
 """
 print(page)
 kept = {}
@@ -197,10 +203,9 @@ for (n, m), place in closed.items():
     kept[f"resonant grazing n = {n}, m = {m}, ζ"] = float(place[0])
     kept[f"resonant grazing n = {n}, m = {m}, ξ"] = float(place[1])
 for other, point in degenerate:
-    if other == K or point.parameters[1] < 0.2:
-        name = "ξ" if other == XI else "k"
-        kept[f"degenerate doubling in (ζ, {name}), ζ"] = float(point.parameters[0])
-        kept[f"degenerate doubling in (ζ, {name}), {name}"] = float(point.parameters[1])
+    name = "ξ" if other == XI else "k"
+    kept[f"degenerate doubling in (ζ, {name}), ζ"] = float(point.parameters[0])
+    kept[f"degenerate doubling in (ζ, {name}), {name}"] = float(point.parameters[1])
 for kind, point in ends.items():
     kept[f"{kind} that grazes, ζ"], kept[f"{kind} that grazes, ξ"] = map(float, point.parameters)
 write("codimension_two", page, kept, figure, dpi=100)

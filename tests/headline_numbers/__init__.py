@@ -19,6 +19,7 @@ from .orbits import (
 from .paper import (
     bifurcation_diagram,
     boundaries,
+    codimension_two,
     fig2_frequency_response,
     motor_frequency_response,
     regime_maps,
@@ -35,6 +36,7 @@ __all__ = [
     "boundaries",
     "chains",
     "closed",
+    "codimension_two",
     "dc_motor",
     "design_percussion",
     "escape_from_2pi",

@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, fsolve
 
 from grazings import grazing_of
-from one_impact import one_impact
+from one_impact import degenerate, one_impact
 
 pytestmark = pytest.mark.slow
 
@@ -209,3 +209,20 @@ def test_a_fold_that_touches_the_stop(bent):
     assert min(np.abs(point.parameters - end.parameters).max() for point in folds) < 1e-8
     back = vi.boundary(folds[0].switch(), parameter="gap", bounds=((0.05, 2.0), (0.5, 10.0)))
     assert back.kind == "fold"
+
+
+def test_a_doubling_of_the_paper_becomes_degenerate():
+    """Beside the normal form of a map of closed forms, by differences, which are right to 1e-7."""
+    scene = vi.Scene.ideal(frequency_ratio=0.78, restitution=0.5, gap=2.0, damping_ratio=0.12)
+    closed = vi.closed_form_orbits(scene)
+    start = scene.start(Y=closed.Y[0], V=closed.V[0])
+    branch = vi.continue_orbit(
+        vi.find_orbit(scene, start, throw=True), parameter="drive.frequency_ratio",
+        bounds=(0.7, 0.9),
+    )  # fmt: skip
+    (point,) = (point for point in branch.special if point.kind == "period-doubling")
+    curve = vi.boundary(
+        point, parameter="oscillator.damping_ratio", bounds=((0.7, 0.9), (0.1, 0.2))
+    )
+    wanted = degenerate(lambda xi: (0.5, xi), 0.13, 0.145, (0.775, 0.795))
+    np.testing.assert_allclose(the(curve, "degenerate-doubling").parameters, wanted, atol=5e-7)

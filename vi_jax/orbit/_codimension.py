@@ -146,13 +146,18 @@ def _determinant(matrix: np.ndarray) -> float:
     return float(np.linalg.det(matrix)) if np.isfinite(matrix).all() else np.nan
 
 
-def _nulls(matrix: np.ndarray, like: Vectors | None) -> Vectors:
-    """The null vectors of a square matrix, in the senses of those of another one."""
+def _nulls(matrix: np.ndarray, like: Vectors | None = None) -> Vectors:
+    """The null vectors l and r of a square matrix.
+
+    Their senses go together: the adjugate is r lᵀ times det U · det V and a positive number, and it
+    is continuous. Which of the two pairs it is the vectors of a point close by say.
+    """
     left, _, right = np.linalg.svd(matrix)
-    found = Vectors(left[:, -1], right[-1])
+    found = Vectors(left[:, -1] * np.linalg.det(left) * np.linalg.det(right), right[-1])
     if like is None:
         return found
-    return Vectors(*(a * (np.sign(a @ b) or 1.0) for a, b in zip(found, like, strict=True)))
+    overlap = max((float(a @ b) for a, b in zip(found, like, strict=True)), key=abs)
+    return Vectors(*(np.sign(overlap) * a for a in found))
 
 
 def _cusp(bare: Shooting, scale: np.ndarray) -> Test:
@@ -197,16 +202,16 @@ def _cubic(bare: Shooting, *, twice: bool) -> Test:
     """
     whole = doubled(bare) if twice else bare
 
-    def test(step: Step, like: Vectors | None) -> tuple[float, Vectors]:
+    def test(step: Step, like: Vectors | None) -> tuple[float, None]:
         x = repeated(bare, step.x, whole) if twice else np.asarray(step.x)
         at = jnp.asarray(x)
         matrix = np.asarray(jacobian_at(whole, at))[:, :-2]
-        nulls = _nulls(matrix, like)
+        nulls = _nulls(matrix)
         right = jnp.asarray(np.append(nulls.right, [0.0, 0.0]))
         second, _ = _bent(whole, at, right, jnp.zeros_like(at))
         bend = np.linalg.lstsq(matrix, -np.asarray(second))[0]
         _, third = _bent(whole, at, right, jnp.asarray(np.append(bend, [0.0, 0.0])))
-        return float(nulls.left @ np.asarray(third)) / 6, nulls
+        return float(nulls.left @ np.asarray(third)) / 6, None
 
     return test
 
@@ -217,7 +222,10 @@ def _zeros(
     """Where a test changes its sign along a curve: which step, with a fraction, and the point."""
     seen: list[tuple[float, Vectors | None]] = []
     for step in steps:
-        seen.append(test(step, seen[-1][1] if seen else None))
+        like = seen[-1][1] if seen else None
+        # At an end where an impact is lost the tests have poles.
+        regular = np.isfinite(step.seen.monodromy).all()
+        seen.append(test(step, like) if regular else (np.nan, like))
     for i, (here, new) in enumerate(itertools.pairwise(steps)):
         (before, like), (after, _) = seen[i], seen[i + 1]
         if not (before * after < 0 or (after == 0 and before != 0)):
