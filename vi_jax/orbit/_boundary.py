@@ -20,6 +20,7 @@ from ._conditions import AbstractCondition
 from ._fixed_step_method import steps_of
 from ._problem import check_parameter
 from ._shooting import Shooting
+from ._sliding import SLIDING
 from ._solution import orbit_of
 from ._solve import Unknowns, jacobian_at, tangent_at
 from ._solve import advance as solved
@@ -171,7 +172,7 @@ def _check_point(point: SpecialPoint) -> None:
         raise TypeError(
             f"Argument `point` must be a `SpecialPoint`, from `Branch.special`, but got {point!r}."
         )
-    if point.kind not in (FOLD, DOUBLING, SYMMETRY, GRAZING):
+    if point.kind not in (FOLD, DOUBLING, SYMMETRY, GRAZING, *SLIDING):
         raise ValueError(
             "Argument `point` must be a fold, a period doubling, a symmetry breaking or a grazing, "
             f"but is a {point.kind}."
@@ -181,7 +182,7 @@ def _check_point(point: SpecialPoint) -> None:
             "Argument `point` must belong to motions without rest on a stop, but these rest, and "
             "are followed in one parameter only."
         )
-    if point.kind == GRAZING and not point.touches:
+    if point.kind in (GRAZING, *SLIDING) and not point.touches:
         raise ValueError(
             "Argument `point` must be a grazing at which something is touched, but there "
             f"{point.detail}."
@@ -311,7 +312,7 @@ class Special(AbstractCondition):
     def missing(self, problem, x, seen):
         """The determinant, V⁻ or the clearance."""
         identity = jnp.eye(seen.monodromy.shape[0], dtype=x.dtype)
-        if self.kind == GRAZING:
+        if self.kind in (GRAZING, *SLIDING):
             return seen.nearest.room if self.impact is None else seen.approach[self.impact]
         sign = 1 if self.kind == DOUBLING else -1
         return jnp.linalg.det(seen.monodromy + sign * identity)
@@ -321,7 +322,7 @@ class Special(AbstractCondition):
         # In a symmetric motion another impact grazes as well, to rounding.
         others = [v + _NOISE for i, v in enumerate(step.seen.approach) if i != self.impact]
         # At a grazing the body turns on the stop, to rounding.
-        touching = self.kind == GRAZING and self.impact is None
+        touching = self.kind in (GRAZING, *SLIDING) and self.impact is None
         passed = not touching and step.seen.nearest.room < -_NOISE
         return bool(min(others, default=1.0) <= 0 or passed)
 

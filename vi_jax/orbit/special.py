@@ -54,8 +54,10 @@ class SpecialPoint(InWords):
 
     @property
     def touches(self) -> bool:
-        """Whether at a grazing an impact is lost or a stop is touched, to rounding."""
-        return self.impact is not None or abs(float(self.step.seen.nearest.room)) <= _TOUCHES
+        """Whether at a grazing an impact is lost or a stop is touched, to rounding; at a sliding
+        bifurcation a surface, by a motion without the part that vanishes there."""
+        lost = self.impact is not None and self.kind not in SLIDING
+        return lost or abs(float(self.step.seen.nearest.room)) <= _TOUCHES
 
     def switch(self, *, distance: float = 0.01) -> Orbit:
         """An orbit of the other branch that begins here, to be continued.
