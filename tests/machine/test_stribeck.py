@@ -64,8 +64,15 @@ def test_it_ends_as_a_branch_where_a_slip_only_touches_the_belt(orbit):
     coarse = vi.find_orbit(Belt(), orbit.state)
     branch = vi.continue_orbit(coarse, parameter="speed", bounds=(1.4, 1.9))
     assert float(branch.parameter.min()) == pytest.approx(1.4)
-    assert [point.kind for point in branch.special] == ["grazing"]
-    assert branch.special[0].parameter == pytest.approx(1.83660097, abs=2e-8)
+    (end,) = branch.special
+    assert end.kind == branch.ends[1] == "grazing-sliding"
+    assert end.parameter == pytest.approx(1.83660097, abs=1e-8)
+    # There it meets the motion that only slides, which is unstable and ends there as well.
+    slides = vi.continue_orbit(end.switch(), parameter="speed", bounds=(1.75, 1.9))
+    assert not slides.stable.any() and slides.ends == ("bounds", "grazing-sliding")
+    assert slides.special[-1].parameter == pytest.approx(end.parameter, abs=1e-10)
+    again = slides.special[-1].switch()
+    np.testing.assert_allclose(np.abs(again.multipliers), 0.0, atol=1e-9)
 
 
 def test_sliding_is_steady_above_the_hopf_bifurcation():

@@ -272,7 +272,7 @@ def test_a_block_is_followed_while_it_sticks():
     assert branch.ends[0] == "bounds"
     assert branch.parameter.min() == pytest.approx(0.2)
     (change,) = branch.special
-    assert change.kind == "grazing" and "another mode" in change.detail
+    assert change.kind == "crossing-sliding" and "passes its surface there at once" in change.detail
     # Where it comes to a stop the force is what friction just holds.
     where = change.orbit
     run = vi.simulate(where.machine, where.state, 1, method=vi.Adaptive(rtol=1e-11), samples=2048)

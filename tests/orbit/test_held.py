@@ -124,3 +124,42 @@ def test_what_cannot_be_held_is_said(linear):
     given = {"parameter": ZETA, "bounds": (0.5, 1.5)}
     with pytest.raises(ValueError, match="`free` must hold the orbit's"):
         vi.continue_orbit(linear, **given, free={XI: (0.2, 0.5)}, fixed={"y_max": None})
+
+
+def test_a_multiplier_is_held_until_another_is_as_large():
+    """Two multipliers μ, ν of a motion with one impact have the product (k exp(-2π ξ/ζ))², so that
+    they meet where k exp(-2π ξ/ζ) = |μ|."""
+    zeta, xi = 0.9, 0.05
+    scene = vi.Scene.ideal(frequency_ratio=zeta, restitution=0.5, gap=1.6, damping_ratio=xi)
+    near = vi.closed_form_orbits(scene)
+    orbit = vi.find_orbit(scene, scene.start(Y=near.Y[0] - 1e-3, V=near.V[0]), throw=True)
+    size = float(np.abs(orbit.multipliers).max())
+    assert float(np.abs(orbit.multipliers).min()) < 0.9 * size < 0.9
+    branch = vi.continue_orbit(
+        orbit, parameter="stops.0.restitution", bounds=(0.3, 0.99), free={GAP: (0.5, 4.0)},
+        fixed={"multiplier": None},
+    )  # fmt: skip
+    assert branch.ends[1] == "multiplier"
+    np.testing.assert_allclose(branch.multiplier, size, rtol=1e-6)
+    assert branch.parameter[-1] == pytest.approx(size * np.exp(2 * np.pi * xi / zeta), abs=1e-8)
+
+
+def test_a_pair_of_multipliers_is_held_until_it_turns_real():
+    """On matrices of known eigenvalues."""
+    from vi_jax.orbit._conditions import as_held
+
+    rng = np.random.default_rng(0)
+    turn = np.array([[np.cos(1.0), -np.sin(1.0)], [np.sin(1.0), np.cos(1.0)]])
+    matrix = np.zeros((3, 3))
+    matrix[:2, :2], matrix[2, 2] = 0.7 * turn, 0.3
+    base = rng.normal(size=(3, 3))
+    seen = type("Seen", (), {})()
+    seen.monodromy = jnp.asarray(base @ matrix @ np.linalg.inv(base))
+    seen.multipliers = np.array([0.7 * np.exp(1j), 0.7 * np.exp(-1j), 0.3])
+    (held,) = as_held({"multiplier": 0.7}, seen.multipliers)
+    assert held.pair and float(held.missing(None, None, seen)) == pytest.approx(0, abs=1e-12)
+    assert held.overtaken(seen) < 0
+    seen.multipliers = np.array([0.75, 0.49 / 0.75, 0.3])
+    assert held.overtaken(seen) > 0
+    seen.multipliers = np.array([0.8, 0.7 * np.exp(1j), 0.7 * np.exp(-1j)])
+    assert held.overtaken(seen) > 0

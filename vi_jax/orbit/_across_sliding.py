@@ -4,6 +4,7 @@ is held."""
 from collections.abc import Iterator
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from .._types import State
@@ -35,7 +36,7 @@ def without_part(
     change = change_at(problem, step)
     if change is None or not change.there or change.modes[0] != change.modes[2]:
         return None
-    first = int(np.argmin(np.abs(np.asarray(problem.parts(step.x)[0]) - change.clock)))
+    first = int(np.argmin(np.abs(np.asarray(problem.parts(jnp.asarray(step.x))[0]) - change.clock)))
     both = [first, (first + 1) % problem.legs]
     new, start = without_events(problem, np.asarray(step.x), both)
     scale = np.concatenate([np.ones(len(start) - 1), scale[-1:]])

@@ -26,7 +26,7 @@ from ._tables import stability_in_words
 from .codimension_two import CodimensionTwo
 from .curve import INTERRUPTED, Step, check_walk, walk
 from .results import InWords, Orbit
-from .special import DOUBLING, FOLD, GRAZING, SYMMETRY, TORUS, SpecialPoint
+from .special import DOUBLING, FOLD, SYMMETRY, TORUS, TOUCHING, SpecialPoint
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -192,7 +192,7 @@ def _check_point(point: SpecialPoint) -> None:
         raise TypeError(
             f"Argument `point` must be a `SpecialPoint`, from `Branch.special`, but got {point!r}."
         )
-    if point.kind not in (FOLD, DOUBLING, TORUS, SYMMETRY, GRAZING):
+    if point.kind not in (FOLD, DOUBLING, TORUS, SYMMETRY, *TOUCHING):
         raise ValueError(
             "Argument `point` must be a fold, a period doubling, a Neimark–Sacker bifurcation, a "
             f"symmetry breaking or a grazing, but is a {point.kind}."
@@ -202,7 +202,7 @@ def _check_point(point: SpecialPoint) -> None:
             "Argument `point` must belong to motions without rest on a stop, but these rest, and "
             "are followed in one parameter only."
         )
-    if point.kind == GRAZING and not point.touches:
+    if point.kind in TOUCHING and not point.touches:
         raise ValueError(
             "Argument `point` must be a grazing at which something is touched, but there "
             f"{point.detail}."

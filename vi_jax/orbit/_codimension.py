@@ -35,6 +35,7 @@ from .special import (
     RESONANT,
     SYMMETRY,
     TORUS,
+    TOUCHING,
     doubled,
 )
 
@@ -74,7 +75,7 @@ def points_of(
 
     found: list[tuple[float, CodimensionTwo]] = []
     for place, end in ((0, ends[0]), (len(steps) - 1, ends[1])):
-        if end == GRAZING and condition.kind != GRAZING:
+        if end == GRAZING and condition.kind not in TOUCHING:
             found.append((place, point(GRAZING, steps[place], _grazes(steps[place]))))
         if end in (RESONANCE_1, RESONANCE_2):
             found.append((place, point(end, steps[place])))

@@ -10,7 +10,7 @@ from ._shooting import Shooting
 from ._solve import advance, located, observe
 from ._special_condition import Special
 from .curve import Step
-from .special import GRAZING, RESONANCE_1, RESONANCE_2, TORUS
+from .special import GRAZING, RESONANCE_1, RESONANCE_2, TORUS, TOUCHING
 
 # What lies below zero by no more than this is zero to rounding: a choice, a hundred times the
 # corrector's tolerance.
@@ -55,7 +55,7 @@ class CurveMonitor:
     def _grazings(self, here: Step, last: Step) -> Iterator[tuple[Step, str]]:
         """Where an impact beside the one that grazes is lost, or a stop is touched."""
         # At a grazing the body turns on the stop, to rounding.
-        if self.condition.kind != GRAZING or self.condition.impact is not None:
+        if self.condition.kind not in TOUCHING or self.condition.impact is not None:
             yield from self._passed(here, last, room, None)
         for i in range(len(last.seen.approach)):
             # In a symmetric motion another impact grazes as well, to rounding.
@@ -69,7 +69,7 @@ class CurveMonitor:
         if not test(last) <= -_NOISE:
             return
         at = self._where(here, last, test) if test(here) > _NOISE else here
-        if impact is not None and self.condition.kind != GRAZING and at is not here:
+        if impact is not None and self.condition.kind not in TOUCHING and at is not here:
             at = self._singular(here, at or here, test)
         yield at or here, GRAZING
 

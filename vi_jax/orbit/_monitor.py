@@ -11,7 +11,8 @@ from ._closing import Closing
 from ._conditions import alone, overtaken
 from ._crossing import BESIDE, changed_between, crossing, tests_of
 from ._extrema import Extrema
-from ._hopf import hopf_between, size_of
+from ._hopf import size_of
+from ._lost import first_lost
 from ._named import named
 from ._origin import halves, origin
 from ._refined_sliding import refined
@@ -21,7 +22,7 @@ from ._sliding import change_at
 from ._solution import orbit_of
 from ._solve import advance, images_at, located, observe
 from ._symmetry import may_be_symmetric
-from ._words import ANEW, DETAILS, HELD_FOLD, REORDERED, RESTS
+from ._words import DETAILS, HELD_FOLD, RESTS
 from .curve import Step
 from .special import (
     CROSSING,
@@ -51,9 +52,6 @@ _LONG = 4.0
 
 # A place where the sequence of a motion's events changes is refined within so long a step.
 _BEYOND = 1e-4
-
-# Events that are to come together do so within this.
-_TOGETHER = 1e-9
 
 # Halves of a period that differ by less than this are those of a motion of half the period.
 _ALIKE = 1e-3
@@ -154,32 +152,10 @@ class BranchMonitor:
 
     def _grazing(self, here: Step, new: Step) -> SpecialPoint | None:
         """The first of the impacts lost and the stops touched between two points."""
-        found, tests = [], []
-
-        def room(step: Step) -> float:
-            return float(np.clip(step.seen.nearest.room, -1.0, 1.0))
-
-        for i, event in enumerate(self.problem.events):
-            if new.seen.approach[i] <= 0 < here.seen.approach[i]:
-                alone_there = event.cycle is not None and not self.problem.conditions
-                hopf = hopf_between(self.problem, here, new) if alone_there else None
-                if hopf is not None:
-                    found.append((hopf, RESTS))
-                else:
-                    tests.append((lambda step, i=i: float(step.seen.approach[i]), i))
-        if room(new) < 0 < room(here):
-            tests.append((room, None))
-        if new.seen.order < 0 < here.seen.order:
-            tests.append((lambda step: float(step.seen.order), ANEW))
-        if new.seen.apart < -_TOGETHER < here.seen.apart:
-            tests.append((lambda step: float(step.seen.apart) + _TOGETHER, REORDERED))
-        for test, impact in tests:
-            at = self._where(here, new, test)
-            if at is not None:
-                found.append((at, impact))
-        if not found:
+        first = first_lost(self.problem, here, new, self._where)
+        if first is None:
             return None
-        at, impact = min(found, key=lambda f: float(np.dot(here.tangent, f[0].x - here.x)))
+        at, impact = first
         change = None if impact == RESTS else change_at(self.problem, at)
         at = at if change is None else refined(self.problem, at, change)
         kind, detail = named(self.problem, at, impact, change)

@@ -110,7 +110,8 @@ def _vanishing(problem: Shooting, at: Step, brief: float) -> Change | None:
     for i, event in enumerate(events):
         if event != events[(i + 1) % len(events)] or not holds(event.of(problem.machine)):
             continue
-        modes = tuple(_mode(problem, leg, event.number) for leg in (i - 1, i, i + 1))
+        before, within, after = (_mode(problem, leg, event.number) for leg in (i - 1, i, i + 1))
+        modes = before, within, after
         found.append((lengths[i], Change(event.number, float(clock[i]), modes, True)))
     length, change = min(found, key=lambda f: f[0], default=(np.inf, None))
     return change if length < brief * period else None

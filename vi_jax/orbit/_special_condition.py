@@ -11,7 +11,7 @@ from ._shooting import Shooting
 from ._solve import jacobian_at
 from ._symmetry import images
 from .floquet import compound
-from .special import DOUBLING, GRAZING, TORUS
+from .special import DOUBLING, TORUS, TOUCHING
 
 
 class SymmetryCondition(eqx.Module):
@@ -73,7 +73,7 @@ class Special(AbstractCondition):
 
     def missing(self, problem, x, seen):
         """The determinant, V⁻ or the clearance."""
-        if self.kind == GRAZING:
+        if self.kind in TOUCHING:
             return seen.nearest.room if self.impact is None else seen.approach[self.impact]
         matrix = compound(seen.monodromy) if self.kind == TORUS else seen.monodromy
         sign = 1 if self.kind == DOUBLING else -1

@@ -28,6 +28,9 @@ DEGENERATE, DEGENERATE_SYMMETRY = "degenerate-doubling", "degenerate-symmetry-br
 RESONANCE_1, RESONANCE_2 = "resonance-1:1", "resonance-1:2"
 RESONANCE_3, RESONANCE_4 = "resonance-1:3", "resonance-1:4"
 
+# Kinds at which something is touched: by a flight, or by a body that is only just held.
+TOUCHING = (GRAZING, *SLIDING)
+
 # Where something grazes it is touched to rounding, by choice within this.
 _TOUCHES = 1e-6
 
@@ -60,8 +63,10 @@ class SpecialPoint(InWords):
 
     @property
     def touches(self) -> bool:
-        """Whether at a grazing an impact is lost or a stop is touched, to rounding."""
-        return self.impact is not None or abs(float(self.step.seen.nearest.room)) <= _TOUCHES
+        """Whether at a grazing an impact is lost or a stop is touched, to rounding; at a sliding
+        bifurcation a surface, by a motion without the part that vanishes there."""
+        lost = self.impact is not None and self.kind not in SLIDING
+        return lost or abs(float(self.step.seen.nearest.room)) <= _TOUCHES
 
     def switch(self, *, distance: float = 0.01) -> Orbit:
         """An orbit of the other branch that begins here, to be continued.

@@ -64,6 +64,8 @@ MARKS = {
 }
 DASHES = {
     "grazing": "-",
+    "grazing-sliding": (0, (3, 1)),
+    "adding-sliding": (0, (8, 1.5)),
     "period-doubling": (0, (5, 2)),
     "fold": (0, (6, 1.5, 1.2, 1.5)),
     "symmetry-breaking": (0, (1.2, 1.2)),
