@@ -65,7 +65,11 @@ class Harvester(vi.AbstractMachine):
     restitution: float = 0.6
     mechanical: float = 0.01
     electrical: float = 0.03
-    cycle: float = CYCLE
+
+    @property
+    def cycle(self) -> float:
+        """That of the mass on its spring."""
+        return CYCLE
 
     @property
     def stops(self) -> tuple[vi.RigidStop, ...]:  # pyright: ignore
@@ -102,7 +106,9 @@ def linear_power(machine: Harvester, centre: float) -> float:
     return 2 * machine.electrical * solve_continuous_lyapunov(flow, -brought)[1, 1]
 
 
-harvester = Harvester(jnp.array(1.0), jnp.array(2.0))
+harvester = Harvester(  # pyright: ignore[reportCallIssue]
+    centre=jnp.array(1.0), gap=jnp.array(2.0)
+)
 centres = np.linspace(0.6, 1.8, 3 if QUICK else 13)
 gaps = np.array([2.0, 4.0, 1000.0])
 zero = jnp.array(0.0)
@@ -133,7 +139,11 @@ class Gears(vi.AbstractMachine):
 
     restitution: jax.Array
     load: float = 1.0
-    cycle: float = CYCLE
+
+    @property
+    def cycle(self) -> float:
+        """A unit to count by."""
+        return CYCLE
 
     @property
     def stops(self) -> tuple[vi.RigidStop, ...]:  # pyright: ignore
@@ -159,7 +169,8 @@ def barometric(temperature: Any) -> tuple[Any, Any]:
 trembles = np.geomspace(0.2, 0.6, 3 if QUICK else 7)
 losses = np.array([0.7, 0.9, 1.0])
 gears = scanned(
-    Gears(jnp.array(0.7)), {"restitution": losses, "noise.V": trembles},
+    Gears(restitution=jnp.array(0.7)),  # pyright: ignore[reportCallIssue]
+    {"restitution": losses, "noise.V": trembles},
     (vi.Statistics("impacts"), vi.Statistics(crosses)), {"V": 1.0},
     vi.OscillatorState(jnp.array(0.01), zero),
 )  # fmt: skip
@@ -256,28 +267,36 @@ for pane in (left_pane, middle, right):
 
 # %%
 peak, gain = int(np.argmax(power[-1])), int(np.argmax(power[0] / power[-1]))
+mechanical, electrical, width = (
+    f"{x:g}" for x in (harvester.mechanical, harvester.electrical, 2 * harvester.width)
+)
+some = len(trembles) // 2
+range_of = [x.max() / x.min() for x in power]
 text = f"""# Three machines that are shaken at random
 
-White noise as 16 impulses in each cycle, {PATHS} paths of {CYCLES} cycles at each point; ± are standard
-errors from the scatter of paths.
+White noise as 16 impulses in each cycle, {PATHS} paths of {CYCLES} cycles at each point; ± are
+standard errors from the scatter of paths.
 
 ![Harvested power, rattling gears, a valve that touches its seat](../figures/noise.png)
 
 ## A harvester under band-limited vibration
 
-A mass on a spring between stops at ±gap (restitution {harvester.restitution:g}), ζ = {harvester.mechanical:g} and, of the
-generator, {harvester.electrical:g}; its base has the acceleration w of variance 1, in a band of the centre Ω and the width
-{2 * harvester.width:g}: white noise through a filter, z' = w, w' = -Ω² z - {2 * harvester.width:g} w + noise. Units are those of the mass
-on its spring.
+A mass on a spring between stops at ±gap (restitution {harvester.restitution:g}), ζ = {mechanical}
+and, of the generator, {electrical}; its base has the acceleration w of variance 1, in a band of the
+centre Ω and the width {width}: white noise through a filter, z' = w,
+w' = -Ω² z - {width} w + noise. Units are those of the mass on its spring.
 
-- Without stops the power agrees with Lyapunov's equation: the largest of {len(centres)} differences is
-  {off_theory.max():.1f} standard errors. With them, what the base gives is what dampers and impacts take, at all
-  {balance.size} points: the largest difference is {off_balance.max():.1f} standard errors.
-- Stops cost power where the band holds the resonance: at Ω = {centres[peak]:g} those at ±{gaps[0]:g} leave {power[0][peak] / power[-1][peak]:.0%} of
-  it. But they make the machine care less where the band lies: over all centres its power varies by
-  a factor of {power[0].max() / power[0].min():.1f}, without stops of {power[-1].max() / power[-1].min():.0f}.
-- Above the resonance stops bring power, as motions with impacts are faster: at Ω = {centres[gain]:g} those at
-  ±{gaps[0]:g} give {power[0][gain] / power[-1][gain]:.2f} times what is had without.
+- Without stops the power agrees with Lyapunov's equation: the largest of {len(centres)} differences
+  is {off_theory.max():.1f} standard errors. With them, what the base gives is what dampers and
+  impacts take, at all {balance.size} points: the largest difference is {off_balance.max():.1f}
+  standard errors.
+- Stops cost power where the band holds the resonance: at Ω = {centres[peak]:g} those at
+  ±{gaps[0]:g} leave {power[0][peak] / power[-1][peak]:.0%} of it. But they make the machine care
+  less where the band lies: over all centres its power varies by a factor of {range_of[0]:.1f},
+  without stops of {range_of[-1]:.0f}.
+- Above the resonance stops bring power, as motions with impacts are faster: at
+  Ω = {centres[gain]:g} those at ±{gaps[0]:g} give {power[0][gain] / power[-1][gain]:.2f} times what
+  is had without.
 
 Harvested power:
 
@@ -290,8 +309,8 @@ x'' = -1 - 0.2 x' + σ dW between two flanks, 1 apart, of which the one at 0 car
 - Elastic flanks obey the barometric law, exp(-x/D) with D = σ²/0.4: impacts per unit time within
   {off_law.max():.1f} standard errors at {len(trembles)} intensities.
 - The far flank is hit at a rate that falls like exp(-load × play / D) without loss. With it the
-  body is cooler, and the teeth cross far more rarely: at σ = {trembles[len(trembles) // 2]:.3f} in {rattle[-1][len(trembles) // 2]:.1%} of the cycles with
-  e = 1, in {rattle[0][len(trembles) // 2]:.2%} with e = {losses[0]:g}.
+  body is cooler, and the teeth cross far more rarely: at σ = {trembles[some]:.3f} in
+  {rattle[-1][some]:.1%} of the cycles with e = 1, in {rattle[0][some]:.2%} with e = {losses[0]:g}.
 
 Impacts per unit time (with loss they still grow with the number of impulses, see
 [the limits](../../docs/limits.md)):
@@ -300,12 +319,12 @@ Impacts per unit time (with loss they still grow with the number of impulses, se
 
 ## A relief valve whose flow trembles
 
-κ = 1.25, δ = 10, β = 20, r = 0.8; its lift oscillates above the seat, which it touches without noise below
-q = 7.557 only ([relief_valve](relief_valve.md)). White noise acts on the speed of the lift, 16 impulses in each
-{INTERVAL:g} units of time.
+κ = 1.25, δ = 10, β = 20, r = 0.8; its lift oscillates above the seat, which it touches without
+noise below q = 7.557 only ([relief_valve](relief_valve.md)). White noise acts on the speed of the
+lift, 16 impulses in each {INTERVAL:g} units of time.
 
-- At q = 7.9 and 8.1 the first touch comes at a rate that falls nearly like exp(-c/σ²). At q = 7.7, so
-  near to the grazing, all of these intensities are large ones.
+- At q = 7.9 and 8.1 the first touch comes at a rate that falls nearly like exp(-c/σ²). At q = 7.7,
+  so near to the grazing, all of these intensities are large ones.
 - The valve does not stay at its seat: it goes back to its oscillation, and comes again. There are
   hardly more touches in all than first ones per unit time.
 
