@@ -105,8 +105,8 @@ def continue_orbit(
     scale = np.ones(problem.size)
     scale[-len(ranges) :] = [0.5 * (high - low) for low, high in ranges]
     start = _first_point(problem, x, scale, orbit)
-    both = (BranchMonitor(problem, scale, ranges, sought) for _ in range(2))
-    return _both_ways(parameter, start, *both, progress, settings)
+    back, ahead = (BranchMonitor(problem, scale, ranges, sought) for _ in range(2))
+    return _both_ways(parameter, start, back, ahead, progress, settings)
 
 
 def _both_ways(
