@@ -112,7 +112,7 @@ def beside(other: str, value: float) -> tuple[float, str, str]:
     xi, k = (value, 0.5) if other == XI else (TABLE, value)
     (doubling,) = (p for p in branch_at(0.9, xi, k).special if p.kind == "period-doubling")
     orbit = doubling.switch(distance=1e-3)
-    side = float(orbit.machine.drive.frequency_ratio) - doubling.parameter
+    side = float(np.asarray(orbit.frequency_ratio)) - doubling.parameter
     return (
         doubling.parameter,
         "above" if side > 0 else "below",
