@@ -126,6 +126,7 @@ def test_what_cannot_be_held_is_said(linear):
         vi.continue_orbit(linear, **given, free={XI: (0.2, 0.5)}, fixed={"y_max": None})
 
 
+@pytest.mark.slow
 def test_a_multiplier_is_held_until_another_is_as_large():
     """Two multipliers μ, ν of a motion with one impact have the product (k exp(-2π ξ/ζ))², so that
     they meet where k exp(-2π ξ/ζ) = |μ|."""
@@ -145,21 +146,24 @@ def test_a_multiplier_is_held_until_another_is_as_large():
 
 
 def test_a_pair_of_multipliers_is_held_until_it_turns_real():
-    """On matrices of known eigenvalues."""
-    from vi_jax.orbit._conditions import as_held
+    """On a matrix of known eigenvalues: those of its second compound are their products."""
+    from vi_jax.orbit._conditions import _second_compound, as_held
+    from vi_jax.orbit._observed import Observed
 
-    rng = np.random.default_rng(0)
-    turn = np.array([[np.cos(1.0), -np.sin(1.0)], [np.sin(1.0), np.cos(1.0)]])
+    turn = 0.7 * np.array([[np.cos(1.0), -np.sin(1.0)], [np.sin(1.0), np.cos(1.0)]])
     matrix = np.zeros((3, 3))
-    matrix[:2, :2], matrix[2, 2] = 0.7 * turn, 0.3
-    base = rng.normal(size=(3, 3))
-    seen = type("Seen", (), {})()
-    seen.monodromy = jnp.asarray(base @ matrix @ np.linalg.inv(base))
-    seen.multipliers = np.array([0.7 * np.exp(1j), 0.7 * np.exp(-1j), 0.3])
-    (held,) = as_held({"multiplier": 0.7}, seen.multipliers)
-    assert held.pair and float(held.missing(None, None, seen)) == pytest.approx(0, abs=1e-12)
-    assert held.overtaken(seen) < 0
-    seen.multipliers = np.array([0.75, 0.49 / 0.75, 0.3])
-    assert held.overtaken(seen) > 0
-    seen.multipliers = np.array([0.8, 0.7 * np.exp(1j), 0.7 * np.exp(-1j)])
-    assert held.overtaken(seen) > 0
+    matrix[:2, :2], matrix[2, 2] = turn, 0.3
+    base = np.random.default_rng(0).normal(size=(3, 3))
+    products = np.linalg.eigvals(_second_compound(jnp.asarray(base @ matrix @ np.linalg.inv(base))))
+    expected = [0.49, 0.21 * np.exp(1j), 0.21 * np.exp(-1j)]
+    np.testing.assert_allclose(np.sort_complex(products), np.sort_complex(expected), atol=1e-12)
+    pair = [0.7 * np.exp(1j), 0.7 * np.exp(-1j)]
+    (held,) = as_held({"multiplier": 0.7}, np.array([*pair, 0.3]))
+    assert held.pair
+
+    def overtaken(*values):
+        rest = {name: None for name in Observed._fields[1:10]}
+        return held.overtaken(Observed(multipliers=np.array(values), **rest))
+
+    assert overtaken(*pair, 0.3) < 0
+    assert overtaken(0.75, 0.49 / 0.75, 0.3) > 0 and overtaken(0.8, *pair) > 0

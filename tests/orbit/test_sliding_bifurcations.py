@@ -81,7 +81,7 @@ def test_sticking_begins_where_den_hartog_says(omega):
     assert back.parameter == pytest.approx(limit, abs=1e-10)
 
 
-def settled(omega, level, second, damping, cycles=16):
+def settled(omega, level, second, damping, cycles=10):
     """Phase, place, mode before and after each event of the last cycle, by SciPy."""
 
     def drive(phase):
@@ -103,7 +103,7 @@ def settled(omega, level, second, damping, cycles=16):
         first = min(phase + (1e-6 if mode else 0.0), end)
         options = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-13}
         x = solve_ivp(field, (phase, first), x, **options).y[:, -1] if first > phase else x
-        found = solve_ivp(field, (first, end), x, events=changes, max_step=0.1, **options)
+        found = solve_ivp(field, (first, end), x, events=changes, max_step=0.3, **options)
         phase, x = found.t[-1], found.y[:, -1]
         if not found.t_events[0].size:
             return [e for e in events if e[0] > end - 2 * np.pi]
@@ -132,7 +132,7 @@ def test_a_body_that_passes_and_comes_back():
     assert branch.ends[1] == point.kind == "switching-sliding"
     near = float(point.detail.split("clock ")[1].split()[0])
     args = (numbers, near)
-    truth = brentq(held_by, point.parameter - 1e-5, point.parameter + 2e-7, args=args, xtol=1e-12)
+    truth = brentq(held_by, point.parameter - 1e-5, point.parameter + 2e-7, args=args, xtol=1e-10)
     assert point.parameter == pytest.approx(truth, abs=1e-8)
     back = on_both_sides(point, "omega", (0.19, 0.21), 1e-3)
     assert back.kind == "switching-sliding" and "comes back" in back.detail
@@ -152,9 +152,7 @@ def test_a_slip_between_two_times_of_sticking():
     branch = branch_of("omega", (0.15, 0.7), omega=0.25, **numbers)
     point, last = branch.special
     assert branch.ends == ("adding-sliding", "crossing-sliding")
-    assert last.kind == "crossing-sliding" and "floor at" in point.detail.replace(
-        "is just held ", ""
-    )
+    assert last.kind == "crossing-sliding" and "floor is just held" in point.detail
 
     def excess(omega):
         """At phase 2π of the body that came to stand before."""
@@ -162,9 +160,7 @@ def test_a_slip_between_two_times_of_sticking():
         Y = [e[1] for e in events if e[3] == 0 and e[1] > 0]
         return 1.0 - Y[0] - 0.5 if Y[0] < 1 else Y[0] - 1.5
 
-    sign = [excess(point.parameter + d) for d in (-1e-4, 1e-4)]
-    assert sign[0] * sign[1] < 0
-    truth = brentq(excess, point.parameter - 1e-4, point.parameter + 1e-4, xtol=1e-12)
+    truth = brentq(excess, point.parameter - 1e-5, point.parameter + 1e-5, xtol=1e-10)
     assert point.parameter == pytest.approx(truth, abs=1e-8)
     back = on_both_sides(point, "omega", (0.15, 0.2))
     assert back.kind == "adding-sliding" and "no longer" in back.detail

@@ -27,7 +27,7 @@ SWITCHING_SLIDING, ADDING_SLIDING = "switching-sliding", "adding-sliding"
 # What is said of each: of a motion without the part that is brief, and of one with it.
 SLIDING = {
     CROSSING_SLIDING: (
-        "{name} passes its surface {place} where beyond it is held there for a while",
+        "{name} passes its surface {place}, and beyond is held there for a while",
         "{name} is held {place} no longer, and beyond passes its surface there at once",
     ),
     GRAZING_SLIDING: (
@@ -35,11 +35,11 @@ SLIDING = {
         "{name} is held {place} no longer, and beyond does not come to its surface there",
     ),
     SWITCHING_SLIDING: (
-        "{name} is held {place} at once, where beyond it first passes and comes back",
+        "{name} is held {place} at once, and beyond first passes and comes back",
         "{name} passes and comes back {place} no longer, and beyond is held there at once",
     ),
     ADDING_SLIDING: (
-        "{name} is just held {place}, where beyond it leaves its surface and comes back",
+        "{name} is just held {place}, and beyond leaves its surface and comes back",
         "{name} leaves its surface {place} no longer, and beyond is held there throughout",
     ),
 }
