@@ -60,5 +60,5 @@ def test_the_share_of_steady_sliding_is_the_area_of_its_basin():
     (share,) = (x.fraction for x in found.attractors if abs(x.sections["Y"][0] - 0.5249) < 1e-3)
     truth = area_of_sliding(1.5) / 8
     assert truth == pytest.approx(0.30712, abs=1e-5)
-    # The boundary cuts some 110 of 48² cells, each of which errs by 0.3 of itself; three times that.
+    # The boundary cuts some 110 of 48² cells, each off by 0.3 of itself: three such errors.
     assert share == pytest.approx(truth, abs=3 * 0.3 * 110**0.5 / 48**2)
