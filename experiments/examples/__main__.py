@@ -1,18 +1,49 @@
 """Runs the examples and writes their notebooks: `python experiments/examples [name ...]`.
 
-The pictures go to `experiments/figures/examples`; with `--notebooks` nothing is run.
+The pictures go to `experiments/figures/examples`; with `--notebooks` nothing is run, and what the
+notebooks have printed stays in them.
 """
 
 import argparse
+import base64
 import json
+import os
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 HERE = Path(__file__).resolve().parent
 FIGURES = HERE.parent / "figures" / "examples"
 EXAMPLES = sorted(path for path in HERE.glob("*.py") if not path.name.startswith("_"))
+
+# The first cell of each notebook.
+INSTALL = """\
+# Where vi_jax is missing, as in a hosted notebook, it is installed: from a wheel that was put
+# beside this notebook, or else from the checkout that the notebook lies in.
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+
+if importlib.util.find_spec("vi_jax") is None:
+    source = next(Path.cwd().glob("vi_jax-*.whl"), Path.cwd().parents[1])
+    subprocess.run([sys.executable, "-m", "pip", "install", "--quiet", str(source)], check=True)\
+"""
+
+# Runs cells one after the other in one namespace.
+_RUN = """
+import contextlib, io, json, sys
+_asked, _told = sys.argv[1:]
+_texts = []
+for _source in json.load(open(_asked, encoding="utf-8")):
+    with contextlib.redirect_stdout(io.StringIO()) as _out:
+        exec(_source, globals())
+    _texts.append(_out.getvalue())
+json.dump(_texts, open(_told, "w", encoding="utf-8"))
+"""
 
 
 def cells(text: str) -> list[tuple[str, str]]:
@@ -33,15 +64,46 @@ def cells(text: str) -> list[tuple[str, str]]:
     return found
 
 
-def notebook(path: Path) -> str:
-    """The notebook of an example, which ends with the picture that the example makes."""
-    picture = f"![The picture of this example](../figures/examples/{path.stem}.png)"
-    made = [*cells(path.read_text(encoding="utf-8")), ("markdown", picture)]
+def printed(path: Path) -> list[str]:
+    """Run a script cell by cell, as a notebook does, and give what each code cell prints."""
+    with TemporaryDirectory() as folder:
+        asked, told = Path(folder) / "cells.json", Path(folder) / "printed.json"
+        sources = [source for kind, source in cells(path.read_text("utf-8")) if kind == "code"]
+        asked.write_text(json.dumps(sources), encoding="utf-8")
+        command = [sys.executable, "-c", _RUN, str(asked), str(told)]
+        subprocess.run(command, cwd=FIGURES, env={**os.environ, "MPLBACKEND": "Agg"}, check=True)
+        return json.loads(told.read_text(encoding="utf-8"))
+
+
+def printed_in(book: str) -> list[str]:
+    """What the code cells of a notebook have printed, the cell that installs left out."""
+    code = [cell for cell in json.loads(book)["cells"] if cell["cell_type"] == "code"]
+    texts = [[out["text"] for out in x["outputs"] if out.get("name") == "stdout"] for x in code]
+    return ["".join(lines for text in each for lines in text) for each in texts[1:]]
+
+
+def notebook(path: Path, texts: Sequence[str]) -> str:
+    """The notebook of an example, with what it prints and, below its last cell, its picture.
+
+    **Arguments:** the script; what each of its code cells prints.
+    """
+    parts = cells(path.read_text(encoding="utf-8"))
+    parts.insert(1, ("code", INSTALL))
+    places = [i for i, (kind, _) in enumerate(parts) if kind == "code"]
+    told = dict(zip(places, ["", *texts], strict=True))
+    picture = base64.b64encode((FIGURES / f"{path.stem}.png").read_bytes()).decode()
     listed: list[dict[str, Any]] = []
-    for i, (kind, source) in enumerate(made):
+    for i, (kind, source) in enumerate(parts):
         cell = {"cell_type": kind, "id": f"{path.stem}-{i}", "metadata": {}}
         if kind == "code":
-            cell |= {"execution_count": None, "outputs": []}
+            outputs: list[dict[str, Any]] = []
+            if told[i]:
+                lines = told[i].splitlines(keepends=True)
+                outputs.append({"output_type": "stream", "name": "stdout", "text": lines})
+            if i == places[-1]:
+                data = {"image/png": picture}
+                outputs.append({"output_type": "display_data", "metadata": {}, "data": data})
+            cell |= {"execution_count": places.index(i) + 1, "outputs": outputs}
         listed.append({**cell, "source": source.splitlines(keepends=True)})
     kernel = {"display_name": "Python 3", "language": "python", "name": "python3"}
     metadata = {"kernelspec": kernel, "language_info": {"name": "python"}}
@@ -59,10 +121,13 @@ def main() -> None:
     for path in EXAMPLES:
         if options.names and path.stem not in options.names:
             continue
-        path.with_suffix(".ipynb").write_text(notebook(path), encoding="utf-8")
-        if not options.notebooks:
+        book = path.with_suffix(".ipynb")
+        if options.notebooks:
+            texts = printed_in(book.read_text(encoding="utf-8"))
+        else:
             print(f"{path.stem} …", flush=True)
-            subprocess.run([sys.executable, str(path)], cwd=FIGURES, check=True)
+            texts = printed(path)
+        book.write_text(notebook(path, texts), encoding="utf-8")
 
 
 if __name__ == "__main__":

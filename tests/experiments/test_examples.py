@@ -1,11 +1,12 @@
 """The examples run, are short, and agree with their notebooks; their pictures are kept."""
 
 import os
+import re
 import subprocess
 import sys
 
 import pytest
-from examples.__main__ import EXAMPLES, FIGURES, HERE, cells, notebook
+from examples.__main__ import EXAMPLES, FIGURES, HERE, cells, notebook, printed_in
 from PIL import Image
 
 # The quickest of them; the others run with the slow tests.
@@ -19,7 +20,9 @@ def test_script_notebook_and_picture_are_kept(example):
     assert len(text.splitlines()) <= 40
     assert f'vi.save_picture(figure, "{example.stem}.png")' in text
     book = example.with_suffix(".ipynb").read_text(encoding="utf-8")
-    assert book == notebook(example), "run `python experiments/examples --notebooks`"
+    texts = printed_in(book)
+    assert book == notebook(example, texts), "run `python experiments/examples --notebooks`"
+    assert len(book) < 200_000
     picture = FIGURES / f"{example.stem}.png"
     assert picture.stat().st_size < 100_000
     assert Image.open(picture).size[0] >= 700
@@ -48,3 +51,10 @@ def test_runs(example, tmp_path):
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-2000:]
     assert (tmp_path / f"{example.stem}.png").exists()
+    kept = "".join(printed_in(example.with_suffix(".ipynb").read_text(encoding="utf-8")))
+    assert _words(kept) == _words(done.stdout), "run `python experiments/examples`"
+
+
+def _words(text):
+    """A text without its numbers, whose last digits another processor may round otherwise."""
+    return re.sub(r"[-+]?\d[\d.,]*(e[-+]?\d+)?", "#", text)

@@ -11,7 +11,7 @@ from vi_jax import _programs, lanes
 from vi_jax.lanes import _primitive
 from vi_jax.lanes._arrays import STRUCTURAL
 from vi_jax.lanes._operations import ELEMENTWISE
-from vi_jax.lanes._program import CALLS
+from vi_jax.lanes._program import CALLS, scan_counts
 
 # Primitives of this package, and some that JAX has in no public module or had in earlier versions.
 OWN = {"sincos", "pin", "quotient", "weighted", "weighted_quotient", "weighted_dot"}
@@ -54,7 +54,7 @@ LOOPS = {
     ),
     "scan": (
         lambda x: jax.lax.scan(lambda a, b: (a * b, a), x, jnp.arange(3.0))[0],
-        "jaxpr num_consts num_carry length reverse",
+        "jaxpr length reverse",
     ),
 }
 
@@ -66,6 +66,16 @@ def test_loops_and_branches_are_known_by_their_names(name):
     assert name in found, f"JAX makes {[*found]} of `{name}` (_vector.py, _program.py)"
     gone = {*parameters.split()} - {*found[name]}
     assert not gone, f"`{name}` has no parameters {gone}: see `_equation` (_vector.py)"
+
+
+def test_a_scan_says_what_it_carries():
+    def loop(x, carried):
+        turn = lambda a, row: ((a[0] * row + x[1], {"sum": a[1]["sum"] + row}), a[0])
+        return jax.lax.scan(turn, carried, jnp.arange(3.0))
+
+    numbers = (1.0, 2.0), (3.0, {"sum": 4.0})
+    (eqn,) = (e for e in jax.make_jaxpr(loop)(*numbers).eqns if e.primitive.name == "scan")
+    assert (*scan_counts(eqn.params), len(eqn.invars)) == (1, 2, 4)
 
 
 def test_what_a_policy_of_checkpoint_says():

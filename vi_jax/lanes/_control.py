@@ -34,7 +34,7 @@ from ._large import (
     times,
 )
 from ._operations import kind_of
-from ._program import inner, size_of
+from ._program import inner, scan_counts, size_of
 from ._text import Text, Value
 
 Write = Callable[..., list[Any]]
@@ -197,7 +197,7 @@ def _unflat(arrays: list[Any], values: list[Value]) -> list[Any]:
 def _scan(write: Write, t: Text, params: dict, args: list[Any], mask: Value) -> list[Any]:
     """A loop of known length: its turns one after the other, unless they are many."""
     body, length = inner(params["jaxpr"]), params["length"]
-    n, m = params["num_consts"], params["num_carry"]
+    n, m = scan_counts(params)
     if length and size_of(body) * length > _MOST_UNROLLED:
         return _counted_loop(write, t, params, args, mask)
     fixed, carry, rows = args[:n], args[n : n + m], args[n + m :]
@@ -231,7 +231,7 @@ def _row(t: Text, x: Held, i: Index) -> Held:
 
 def _counted_loop(write: Write, t: Text, params: dict, args: list[Any], mask: Value) -> list[Any]:
     """A loop of known length with a scalar counter; its rows lie in memory."""
-    n, m, length = params["num_consts"], params["num_carry"], params["length"]
+    (n, m), length = scan_counts(params), params["length"]
     fixed, rows = args[:n], [as_large(t, in_one(t, x)) for x in args[n + m :]]
     first = [stored(t, x) if isinstance(x, Large) else x for x in args[n : n + m]]
     made: list[Any] = [v.aval for v in inner(params["jaxpr"]).outvars[m:]]

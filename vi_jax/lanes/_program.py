@@ -1,7 +1,7 @@
 """What lanes run: a loop of one lane's numbers, traced once; which of its parts depend on which."""
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -244,7 +244,7 @@ def dependent_of_equation(eqn: Any, args: list[bool], *, smooth: bool) -> list[b
         ways = [depends(inner(b), args[1:]) for b in params["branches"]]
         return [any(way) for way in zip(*ways, strict=True)]
     if name == "scan":
-        n, m = params["num_consts"], params["num_carry"]
+        n, m = scan_counts(params)
         fixed, carry, rows = args[:n], args[n : n + m], args[n + m :]
         body = inner(params["jaxpr"])
         return fixed_point(lambda c: depends(body, [*fixed, *c, *rows]), carry)
@@ -265,8 +265,17 @@ def dependent_in_loop(eqn: Any, args: list[bool]) -> list[bool]:
     if eqn.primitive.name == "while":
         first = eqn.params["cond_nconsts"]
         return [*args[first : first + eqn.params["body_nconsts"]], *outs]
-    n, m = eqn.params["num_consts"], eqn.params["num_carry"]
+    n, m = scan_counts(eqn.params)
     return [*args[:n], *outs[:m], *args[n + m :]]
+
+
+def scan_counts(params: Mapping[str, Any]) -> tuple[int, int]:
+    """How many arguments of a `scan` with these parameters are the same in each turn, and how many
+    are carried from turn to turn."""
+    if "num_consts" in params:
+        return params["num_consts"], params["num_carry"]
+    fixed, carry, _ = params["ft_in"].unpack()  # since JAX 0.12: what it was given, as trees
+    return len(fixed), len(carry)
 
 
 def fixed_point(turn: Callable[[list[bool]], list[bool]], carry: list[bool]) -> list[bool]:

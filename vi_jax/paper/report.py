@@ -52,11 +52,11 @@ _CASES, _FIGURE_3, _FIGURE_4, _FIGURE_2, _FAULTS, _ORBITS, _MOTORS, _CURVES, _WA
 )
 # The steps in their order, and the seconds that each took where it was measured: of a quick
 # reproduction, in one process, and in two.
-_FIRST = {_CASES: 4.0, _FIGURE_3: 1.5, _FIGURE_4: 1.5}
-_SECOND = {_FAULTS: 3.0, _ORBITS: 3.0}
-_QUICK = {**_FIRST, **_SECOND, _CLAIMS: 2.0}
-_ALONE = {**_FIRST, _FIGURE_2: 40.0, **_SECOND, _MOTORS: 10.0, _CLAIMS: 2.0}
-_TOGETHER = {**_FIRST, **_SECOND, _MOTORS: 10.0, _CURVES: 14.0, _WAITING: 2.0, _CLAIMS: 2.0}
+_FIRST = {_CASES: 6.5, _FIGURE_3: 2.0, _FIGURE_4: 2.0}
+_SECOND = {_FAULTS: 3.0, _ORBITS: 3.5}
+_QUICK = {**_FIRST, **_SECOND, _CLAIMS: 3.5}
+_ALONE = {**_FIRST, _FIGURE_2: 40.0, **_SECOND, _MOTORS: 8.5, _CLAIMS: 3.5}
+_TOGETHER = {**_FIRST, **_SECOND, _MOTORS: 8.5, _CURVES: 13.0, _WAITING: 3.0, _CLAIMS: 3.5}
 
 Progress = Callable[[str, float], None]
 """Called as a step begins with its name and about how many seconds there are left."""
