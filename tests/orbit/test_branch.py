@@ -3,7 +3,6 @@
 import dataclasses
 import re
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +11,8 @@ import pytest
 import vi_jax as vi
 import xarray as xr
 from scipy.optimize import brentq
+
+from closed_forms import fold_by_eq_21
 
 ZETA = "drive.frequency_ratio"
 
@@ -43,16 +44,6 @@ def long(short):
     doubled = vi.continue_orbit(doubling.switch(), parameter=ZETA, bounds=(0.5, 1.9))
     grazing = next(p for p in doubled.special if p.kind == "grazing")
     return doubled, vi.continue_orbit(grazing.switch(), parameter=ZETA, bounds=(0.5, 1.9))
-
-
-def fold_by_eq_21(k, d, low, high):
-    """Where the quadratic of Eq. 21 (with its ζ) in the impact speed has a double root."""
-
-    def discriminant(zeta):
-        steep = zeta * (1 + k) / np.tan(np.pi / zeta)
-        return (1 - k) ** 2 * ((d * (1 - zeta**2)) ** 2 - 1) - steep**2
-
-    return brentq(discriminant, low, high, xtol=1e-14)
 
 
 @pytest.mark.slow
@@ -138,23 +129,6 @@ def test_sweeps_lie_on_stable_points(short, long, restitution):
         (orbit,) = (orbit for orbit in branch.at(zeta) if orbit.stable)
         assert float(orbit.machine.drive.frequency_ratio) == pytest.approx(zeta, abs=1e-12)
         assert float(orbit.y_min) == pytest.approx(float(y_min), abs=1e-6)
-
-
-@pytest.mark.slow
-def test_a_motor_branch_agrees_with_found_orbits():
-    scene = vi.Parameters(torque=10.0, control=0.9, restitution=0.8, gap=0.08).scene(drive="motor")
-    run = vi.simulate(scene, scene.start(), 200)
-    last = jax.tree.map(lambda x: x[-1], run.sections)
-    orbit = vi.find_orbit(scene, last, cycles=2)
-    branch = vi.continue_orbit(orbit, parameter="drive.control", bounds=(0.88, 0.95))
-    assert branch.ends == ("bounds", "bounds") and branch.stable.all()
-    np.testing.assert_allclose(branch.parameter[[0, -1]], [0.88, 0.95], atol=1e-10)
-    for end in (0, -1):
-        there = eqx.tree_at(lambda s: s.drive.control, scene, jnp.asarray(branch.parameter[end]))
-        found = vi.find_orbit(there, branch.orbit(end), cycles=2)
-        assert float(found.y_min) == pytest.approx(float(branch.y_min[end]), abs=1e-9)
-        np.testing.assert_allclose(found.multipliers, branch.multipliers[end], atol=1e-7)
-        assert float(found.frequency_ratio) == pytest.approx(branch.frequency_ratio[end], abs=1e-9)
 
 
 @pytest.mark.slow

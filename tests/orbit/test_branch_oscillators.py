@@ -1,7 +1,9 @@
-"""Branches of oscillators known from elsewhere: grazing and folds beside codes of their own."""
+"""Branches of oscillators known from elsewhere: grazing and folds beside codes of their own,
+and of a motor."""
 
 import dataclasses
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -123,3 +125,20 @@ def test_without_damping_the_touch_is_on_the_section_and_nothing_else_is_special
     (point,) = branch.special
     assert point.kind == "grazing" and branch.ends == ("bounds", "grazing")
     assert point.parameter == pytest.approx(np.sqrt(0.5), abs=1e-12)
+
+
+@pytest.mark.slow
+def test_a_motor_branch_agrees_with_found_orbits():
+    scene = vi.Parameters(torque=10.0, control=0.9, restitution=0.8, gap=0.08).scene(drive="motor")
+    run = vi.simulate(scene, scene.start(), 200)
+    last = jax.tree.map(lambda x: x[-1], run.sections)
+    orbit = vi.find_orbit(scene, last, cycles=2)
+    branch = vi.continue_orbit(orbit, parameter="drive.control", bounds=(0.88, 0.95))
+    assert branch.ends == ("bounds", "bounds") and branch.stable.all()
+    np.testing.assert_allclose(branch.parameter[[0, -1]], [0.88, 0.95], atol=1e-10)
+    for end in (0, -1):
+        there = eqx.tree_at(lambda s: s.drive.control, scene, jnp.asarray(branch.parameter[end]))
+        found = vi.find_orbit(there, branch.orbit(end), cycles=2)
+        assert float(found.y_min) == pytest.approx(float(branch.y_min[end]), abs=1e-9)
+        np.testing.assert_allclose(found.multipliers, branch.multipliers[end], atol=1e-7)
+        assert float(found.frequency_ratio) == pytest.approx(branch.frequency_ratio[end], abs=1e-9)
