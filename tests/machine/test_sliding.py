@@ -168,7 +168,7 @@ def test_sticking_is_sliding_along_the_surface_of_no_speed():
         orbit = vi.find_orbit(machine, vi.simulate(machine, start, 1, settle=20).last)
         branch = vi.continue_orbit(orbit, parameter="level", bounds=(0.1, 0.6))
         (graze,) = branch.special
-        assert graze.kind == "crossing-sliding"
+        assert graze.kind == "adding-sliding"
         multiplier = float(jnp.abs(orbit.multipliers).max())
         found.append((float(orbit.state.Y), multiplier, graze.parameter))
     np.testing.assert_allclose(*found, atol=1e-8)

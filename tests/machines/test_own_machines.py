@@ -279,7 +279,7 @@ def test_a_block_is_followed_while_it_sticks():
     s, Y, V = 2 * PI * run.samples.cycles, run.samples.state.Y, run.samples.state.V
     still = np.argmin(np.abs(np.asarray(V)))
     assert abs(float(np.cos(s[still]) - Y[still])) == pytest.approx(0.5, abs=0.02)
-    with pytest.raises(ValueError, match="goes into another mode"):
+    with pytest.raises(ValueError, match="beyond passes its surface there"):
         vi.boundary(change, parameter="level", bounds=((0.2, 2.0), (0.1, 0.9)))
 
 
