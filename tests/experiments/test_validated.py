@@ -5,7 +5,7 @@ from math import floor, log10
 
 import pytest
 from tools.validated import Comparison, last_digit
-from validated.__main__ import ORDER, SCRIPTS, comparison_of, section, told
+from validated.__main__ import ORDER, SCRIPTS, comparison_of, described, section
 
 from gallery_page import rows, sections
 
@@ -21,7 +21,7 @@ def test_is_a_short_script_on_the_page(script):
     text = script.read_text(encoding="utf-8")
     assert text.startswith('# %% [markdown]\n"""# ') and len(text.splitlines()) <= 60
     part = sections()[script.stem]
-    assert told(script)[1] in part
+    assert described(script)[1] in part
 
 
 def test_the_page_has_every_script_once():

@@ -147,14 +147,15 @@ def test_a_multiplier_is_held_until_another_is_as_large():
 
 def test_a_pair_of_multipliers_is_held_until_it_turns_real():
     """On a matrix of known eigenvalues: those of its second compound are their products."""
-    from vi_jax.orbit._conditions import _second_compound, as_held
+    from vi_jax.orbit._conditions import as_held
     from vi_jax.orbit._observed import Observed
+    from vi_jax.orbit.floquet import compound
 
     turn = 0.7 * np.array([[np.cos(1.0), -np.sin(1.0)], [np.sin(1.0), np.cos(1.0)]])
     matrix = np.zeros((3, 3))
     matrix[:2, :2], matrix[2, 2] = turn, 0.3
     base = np.random.default_rng(0).normal(size=(3, 3))
-    products = np.linalg.eigvals(_second_compound(jnp.asarray(base @ matrix @ np.linalg.inv(base))))
+    products = np.linalg.eigvals(compound(jnp.asarray(base @ matrix @ np.linalg.inv(base))))
     expected = [0.49, 0.21 * np.exp(1j), 0.21 * np.exp(-1j)]
     np.testing.assert_allclose(np.sort_complex(products), np.sort_complex(expected), atol=1e-12)
     pair = [0.7 * np.exp(1j), 0.7 * np.exp(-1j)]

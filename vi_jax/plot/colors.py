@@ -57,10 +57,10 @@ MARKS = {
     "resonance-1:3": ("$3$", "k"),
     "resonance-1:4": ("$4$", "k"),
     "resonant-grazing": ("8", "w"),
-    "crossing-sliding": (">", "k"),
-    "grazing-sliding": ("o", "w"),
-    "switching-sliding": ("v", "w"),
-    "adding-sliding": ("p", "k"),
+    "crossing-sliding": ("$c$", "k"),
+    "grazing-sliding": ("$g$", "k"),
+    "switching-sliding": ("$s$", "k"),
+    "adding-sliding": ("$a$", "k"),
 }
 DASHES = {
     "grazing": "-",
