@@ -30,10 +30,7 @@ class Ground(vi.AbstractMachine):
 
     gravity: jax.Array
     stops: tuple[vi.RigidStop, ...]
-
-    @property
-    def cycle(self):
-        return 10.0
+    cycle: float = 10.0
 
     def field(self, s, state):
         return Ball(state.V, -self.gravity, jnp.where(state.Y > 0, 1.0, 0.0))
