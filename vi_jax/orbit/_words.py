@@ -58,17 +58,21 @@ AT_CODIMENSION_TWO = {
 HELD_FOLD = "a multiplier passes 1"
 
 
+def place_in_words(problem: Shooting, at: Step, clock: float) -> str:
+    """Where within its period a motion is at this reading of its clock, which is counted from the
+    section on."""
+    period = float(problem.period(jnp.asarray(at.x)))
+    return f"at {problem.machine.place_of(clock % period, problem.cycles)}"
+
+
 def grazing_in_words(problem: Shooting, at: Step, impact: int | None) -> str:
     """What a motion loses, if that is an impact, or touches, and where within its period."""
-    machine, x = problem.machine, jnp.asarray(at.x)
+    machine = problem.machine
     if impact is None:
         touched, clock = int(at.seen.nearest.event), float(at.seen.nearest.clock)
         guard = f"the guard of {Event(touched).called(machine)}"
         what = "touches a stop" if touched < len(machine.stops) else f"touches {guard}"
-    else:
-        clock = float(np.asarray(problem.parts(x)[0])[impact])
-        lost = problem.events[impact].of(machine)
-        what = f"the {lost.name or lost.word}"
-    # Clocks are counted within one period from the section on.
-    place = machine.place_of(clock % float(problem.period(x)), problem.cycles)
-    return f"{what} at {place}" + ("" if impact is None else " is lost")
+        return f"{what} {place_in_words(problem, at, clock)}"
+    clock = float(np.asarray(problem.parts(jnp.asarray(at.x))[0])[impact])
+    lost = problem.events[impact].of(machine)
+    return f"the {lost.name or lost.word} {place_in_words(problem, at, clock)} is lost"
