@@ -175,9 +175,9 @@ def work(*arguments, **options):
 
 if __name__ == "__main__":
     for module, name in (
-        ("scan._computed", "run_here"),
-        ("scan._computed", "run_on_cluster"),
-        ("scan._sweep", "_sweep"),
+        ("scans._computed", "run_here"),
+        ("scans._computed", "run_on_cluster"),
+        ("scans._sweep", "_sweep"),
         ("orbit.find", "_find"),
         ("flow._simulate", "_simulate"),
     ):

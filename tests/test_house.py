@@ -2,6 +2,8 @@
 
 import ast
 import importlib
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,7 +13,7 @@ HOUSE = Path(__file__).parents[1] / "vi_jax"
 FILES = sorted(HOUSE.rglob("*.py"))
 
 # Each may import from those before it.
-ORDER = "lanes machine flow machines orbit scan robust plot paper explore cli".split()
+ORDER = "lanes machine flow machines orbit scans robust plot paper explore cli".split()
 LATE = [["explore", "serve"], ["paper", "report"]]
 TOOLS = {
     "_calls",
@@ -74,13 +76,30 @@ def test_no_file_has_more_than_350_lines():
     assert not long
 
 
-def test_a_package_hidden_by_a_verb_can_be_imported_from():
-    import vi_jax.scan.store as store
-    from vi_jax.scan import measures
+def test_names_that_load_later_are_those_that_type_checkers_see():
+    (block,) = (
+        node
+        for node in ast.parse((HOUSE / "__init__.py").read_text(encoding="utf-8")).body
+        if isinstance(node, ast.If)
+    )
+    seen = {
+        name.name: node.module
+        for node in block.body
+        if isinstance(node, ast.ImportFrom) and node.module
+        for name in node.names
+    }
+    assert seen == vi_jax._HOME  # pyright: ignore[reportAttributeAccessIssue]
+    for name, package in seen.items():
+        assert getattr(vi_jax, name) is getattr(importlib.import_module(f"vi_jax.{package}"), name)
 
-    assert store is importlib.import_module("vi_jax.scan.store")
-    assert vi_jax.scan.measures is measures  # pyright: ignore
-    assert vi_jax.scan is importlib.import_module("vi_jax.scan").scan
+
+def test_what_simulates_loads_nothing_else():
+    run = "import sys, vi_jax; print([name for name in sys.modules if name in {!r}])"
+    others = {f"vi_jax.{name}" for name in ("machines", "orbit", "scans", "robust", "plot")}
+    out = subprocess.run(
+        [sys.executable, "-c", run.format(others)], capture_output=True, text=True, check=True
+    )
+    assert out.stdout.strip() == "[]"
 
 
 def test_what_is_listed_is_what_is_offered():

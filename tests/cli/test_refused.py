@@ -203,8 +203,8 @@ def test_what_cannot_be_done_is_said_before_any_work(here, capsys, monkeypatch, 
         raise AssertionError("work began")
 
     for module, name in (
-        ("scan._computed", "run_here"),
-        ("scan._sweep", "_sweep"),
+        ("scans._computed", "run_here"),
+        ("scans._sweep", "_sweep"),
         ("orbit.find", "_find"),
         ("flow._simulate", "_simulate"),
     ):

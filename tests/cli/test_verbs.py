@@ -76,7 +76,7 @@ def test_interrupted_scans_tell_how_to_go_on(here, capsys, monkeypatch):
         raise KeyboardInterrupt
         yield
 
-    monkeypatch.setattr(importlib.import_module("vi_jax.scan._computed"), "run_here", interrupt)
+    monkeypatch.setattr(importlib.import_module("vi_jax.scans._computed"), "run_here", interrupt)
     assert cli.main(["scan", written(IDEAL + SCAN)]) == 130
     assert "nothing was kept" in capsys.readouterr().err.splitlines()[-1]
     assert cli.main(["scan", written(IDEAL + SCAN + "store = 's.zarr'")]) == 130

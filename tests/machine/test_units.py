@@ -9,9 +9,9 @@ import pytest
 import vi_jax as vi
 from vi_jax.machine.numbers import leaf_names
 from vi_jax.machine.units import unit_of
-from vi_jax.scan._describe import variables_of
-from vi_jax.scan.grid import Blocks
-from vi_jax.scan.program import make_program
+from vi_jax.scans._describe import variables_of
+from vi_jax.scans.grid import Blocks
+from vi_jax.scans.program import make_program
 
 from differences import quick
 

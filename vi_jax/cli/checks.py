@@ -10,7 +10,7 @@ from .._types import State
 from ..machine import AbstractMachine, leaf, leaf_names
 from ..orbit import check_walk, column_names
 from ..plot import ENDINGS
-from ..scan import Blocks, axes_of, check_corners, make_program
+from ..scans import Blocks, axes_of, check_corners, make_program
 from .config import ContinueTable
 from .toml import ConfigError, given, in_terms_of, unknown
 

@@ -14,7 +14,7 @@ from .._files import write_whole
 from ..flow import REASONS, RESULTS, number_of
 from ..machine import components
 from ..plot import save_picture
-from ..scan import NOT_COMPUTED, REGIMES, Sweep, periods_of
+from ..scans import NOT_COMPUTED, REGIMES, Sweep, periods_of
 
 
 def failures(codes: np.ndarray, *, what: str = "motions") -> tuple[list[str], bool]:

@@ -18,7 +18,7 @@ import numpy as np
 from .._types import State
 from ..flow import RESULTS, Run, RunOptions, Samples, planned, simulate
 from ..machine import AbstractMachine, with_leaf
-from ..scan import Sweep, sweep, taken_along
+from ..scans import Sweep, sweep, taken_along
 
 # Intervals (samples, or cycles as so many) of one part: a fraction of a second. Each other length
 # is another program, so that it is chosen before the time is known.

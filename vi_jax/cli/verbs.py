@@ -28,9 +28,9 @@ from ..plot import (
     plot_regimes,
     plot_sweep,
 )
-from ..scan import COLUMNS, LanesFailed, Sweep
-from ..scan import basins as find_basins
-from ..scan import scan as run_scan
+from ..scans import COLUMNS, LanesFailed, Sweep
+from ..scans import basins as find_basins
+from ..scans import scan as run_scan
 from .checks import (
     check_continuation,
     check_map,

@@ -11,7 +11,7 @@ import numpy as np
 from .._programs import compiled
 from ..flow import simulate
 from ..machine import OscillatorState, Scene
-from ..scan import taken_along
+from ..scans import taken_along
 
 VALUES, SETTLE, CYCLES = 281, 250, 16
 """Values across a diagram, drive cycles before what is drawn, and drive cycles drawn."""

@@ -17,7 +17,7 @@ from ..flow import RESULTS, Run, chosen, simulate
 from ..machine import AbstractMachine, is_autonomous, unit_of, with_unit
 from ..orbit import STABILITY, complex_in_words, cycle_map, impacts_in_words, stability_of
 from ..plot import MotionPath, motion_path
-from ..scan import REGIMES, Regime, lyapunov, taken_along
+from ..scans import REGIMES, Regime, lyapunov, taken_along
 
 WINDOW = 8
 """Drive cycles drawn as a motion."""

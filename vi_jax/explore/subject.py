@@ -21,7 +21,7 @@ from ..machine import (
     with_leaf,
     with_unit,
 )
-from ..scan import taken_along
+from ..scans import taken_along
 from .controls import Control
 from .diagram import CYCLES, Diagram
 from .motion import Motion, look, prepare

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..orbit import ClosedFormOrbits
-from ..scan import Sweep
+from ..scans import Sweep
 from .motions import GAP
 from .response import LONGEST, Response, System
 

@@ -13,7 +13,7 @@ from .._programs import compiled
 from ..flow import jit
 from ..machine import RigidStop, Scene, with_leaf
 from ..orbit import Branch, ClosedFormOrbits, closed_form_orbits, continue_orbit, find_orbit
-from ..scan import REGIMES, Sweep, lyapunov, sweep
+from ..scans import REGIMES, Sweep, lyapunov, sweep
 from .motions import GAP, table_damping_ratio
 
 # The k that Figure 2 is computed for, and Table 1's range of ζ.

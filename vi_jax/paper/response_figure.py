@@ -10,7 +10,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from ..plot import MORE_IMPACTS, STOP, color_of, mark_of, paler, plot_branch
-from ..scan import REGIMES
+from ..scans import REGIMES
 from .discrepancy import between, rows
 from .motions import GAP
 from .response import RANGE, RESTITUTIONS, Response, System, stepped_finely

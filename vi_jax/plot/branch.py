@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from .._checks import instance_of, one_of
 from ..machine import in_brackets, name_in, quantity_of, unit_of
 from ..orbit import Boundary, Branch, impacts_in_words, point_of
-from ..scan import Sweep
+from ..scans import Sweep
 from .colors import DASHES, MARKS, color_of, mark_style, once
 from .motion import new_axes
 from .style import thick

@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.lines import Line2D
 
-from ..scan import REGIMES
+from ..scans import REGIMES
 
 # By period in drive cycles: 2π, 4π, ...; a period beyond the list has the last one.
 PERIODS = (

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from .._checks import flag, instance_of
 from ..machine import in_brackets, name_in, unit_of
 from ..orbit import Grazing
-from ..scan import REGIMES
+from ..scans import REGIMES
 from .branch import axis_name
 from .colors import IRREGULAR, color_of, mark_style
 from .motion import new_axes

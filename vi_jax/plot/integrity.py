@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from .._checks import flag, instance_of, one_of
-from ..scan import IntegrityProfile
+from ..scans import IntegrityProfile
 from .branch import axis_name
 from .colors import color_of, shades
 from .motion import new_axes

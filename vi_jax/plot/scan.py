@@ -16,7 +16,7 @@ from .._checks import flag
 from .._renamed import renamed
 from ..machine import AbstractMachine, by_name, in_brackets, unit_of
 from ..orbit import impacts_in_words
-from ..scan import NOT_COMPUTED, REGIMES, Basins, periods_of
+from ..scans import NOT_COMPUTED, REGIMES, Basins, periods_of
 from . import colors as look
 from .branch import axis_name
 from .colors import IRREGULAR, PERIODS, color_of, shades

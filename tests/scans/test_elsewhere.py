@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import vi_jax as vi
 import xarray as xr
-from vi_jax.scan.store import ZarrStore
+from vi_jax.scans.store import ZarrStore
 
 SCRIPT = Path(__file__).with_name("long_scan.py")
 

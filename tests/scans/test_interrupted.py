@@ -35,7 +35,7 @@ def test_verbs_end_soon(verb):
 
 
 def test_an_interrupted_sweep_gives_the_values_that_were_done(monkeypatch):
-    module = importlib.import_module("vi_jax.scan._sweep")
+    module = importlib.import_module("vi_jax.scans._sweep")
     whole = vi.sweep(MOTOR, "drive.control", VALUES, settle=4, cycles=4)
     assert whole.values.shape == (40,) and bool(whole.successful.all())
     calls, swept = [], module._sweep
@@ -82,7 +82,7 @@ def test_an_interrupted_branch_is_a_branch(monkeypatch):
 
 @pytest.mark.slow
 def test_interrupted_basins_keep_the_starts_that_were_followed(monkeypatch):
-    module = importlib.import_module("vi_jax.scan._basins")
+    module = importlib.import_module("vi_jax.scans._basins")
 
     def interrupted(*arguments, **options):
         raise KeyboardInterrupt
@@ -134,12 +134,12 @@ def test_interrupted_exponents_are_those_of_fewer_cycles(monkeypatch):
     plain = jax.vmap(lambda y: vi.lyapunov(scene, scene.start(Y=y), 1100))(jnp.zeros(1))
     np.testing.assert_allclose(whole.exponents, plain.exponents[0], rtol=1e-11)
     np.testing.assert_allclose(float(whole.state.Y), float(plain.state.Y[0]), rtol=1e-11)
-    struck(monkeypatch, "scan._lyapunov._part", after=0)
+    struck(monkeypatch, "scans._lyapunov._part", after=0)
     with pytest.raises(KeyboardInterrupt) as nothing:
         vi.lyapunov(scene, scene.start(), 1100)
     assert not isinstance(nothing.value, vi.Interrupted)
     monkeypatch.undo()
-    struck(monkeypatch, "scan._lyapunov._part", after=1)
+    struck(monkeypatch, "scans._lyapunov._part", after=1)
     with pytest.raises(vi.Interrupted) as caught:
         vi.lyapunov(scene, scene.start(), 1100)
     assert float(caught.value.partial.exponents[0]) == pytest.approx(-0.2, rel=1e-6)
@@ -199,7 +199,7 @@ def test_interrupted_boundaries_grazings_and_profiles(monkeypatch):
         vi.boundary(point, parameter="amplitude", bounds=((0.05, 0.5), (0.5, 2.0)))
     curve = caught.value.partial
     assert curve.ends == ("interrupted", "interrupted") and len(curve.parameters) > 1
-    struck(monkeypatch, "scan._integrity.sorted_out", after=1)
+    struck(monkeypatch, "scans._integrity.sorted_out", after=1)
     region = {"start.Y": (-1.0, 1.0), "start.V": (-1.0, 1.0)}
     with pytest.raises(vi.ScanInterrupted) as caught:
         vi.integrity_profile(

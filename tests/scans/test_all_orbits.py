@@ -83,7 +83,7 @@ def test_an_equilibrium_of_an_autonomous_machine_is_no_motion():
 
 def test_interrupted_after_a_period(found, scene, monkeypatch):
     """What was searched before Ctrl-C is kept; before that there is nothing to keep."""
-    from vi_jax.scan import _all_orbits
+    from vi_jax.scans import _all_orbits
 
     plain = _all_orbits.find_orbit
 

@@ -11,7 +11,7 @@ SCENE = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ra
 
 
 def test_a_store_is_resumed_and_guards_itself(tmp_path, monkeypatch):
-    work = importlib.import_module("vi_jax.scan._work")
+    work = importlib.import_module("vi_jax.scans._work")
     axes = {"drive.frequency_ratio": np.linspace(0.6, 1.4, 40), "start.Y": np.linspace(-1, 1, 30)}
     options = {"settle": 20, "cycles": 128, "lanes": 256, "workers": 1}
     whole = vi.scan(SCENE, axes, **options)
@@ -76,7 +76,7 @@ def test_a_store_knows_functions_by_what_they_make(tmp_path):
 
 
 def test_a_store_is_made_whole_or_not_at_all(tmp_path, monkeypatch):
-    store = importlib.import_module("vi_jax.scan.store")
+    store = importlib.import_module("vi_jax.scans.store")
     create = store.zarr.Group.create_array
 
     def interrupted(group, name, **options):
@@ -97,7 +97,7 @@ def test_a_store_is_made_whole_or_not_at_all(tmp_path, monkeypatch):
 
 
 def test_an_interrupted_scan_in_memory_gives_what_it_has(monkeypatch):
-    work = importlib.import_module("vi_jax.scan._work")
+    work = importlib.import_module("vi_jax.scans._work")
     done = []
     compute = work.compute
 

@@ -10,8 +10,8 @@ import pytest
 import vi_jax as vi
 import xarray as xr
 from vi_jax.flow import RunOptions
-from vi_jax.scan import make_program
-from vi_jax.scan.grid import LANE
+from vi_jax.scans import make_program
+from vi_jax.scans.grid import LANE
 
 from differences import quick
 
@@ -52,7 +52,7 @@ def test_paths_depend_on_no_block_worker_or_thread(whole):
 
 
 def test_a_store_goes_on_to_the_same_numbers(whole, tmp_path, monkeypatch):
-    work = importlib.import_module("vi_jax.scan._work")
+    work = importlib.import_module("vi_jax.scans._work")
     compute, left = work.compute, [2]
 
     def stopped(*arguments, **options):

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import vi_jax as vi
-from vi_jax.scan._describe import description_of
-from vi_jax.scan.grid import Blocks
-from vi_jax.scan.program import make_program
+from vi_jax.scans._describe import description_of
+from vi_jax.scans.grid import Blocks
+from vi_jax.scans.program import make_program
 
 # Several motions live side by side here; see `experiments/studies/all_orbits.py`.
 SCENE = vi.Scene.ideal(frequency_ratio=3.2, restitution=0.9, gap=1.05, damping_ratio=0.01)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import vi_jax as vi
 import xarray as xr
-from vi_jax.scan._geometry import Cells, ball_around, entropy_of, largest_ball, uncertainty_of
+from vi_jax.scans._geometry import Cells, ball_around, entropy_of, largest_ball, uncertainty_of
 
 ONES, CLOSED = np.ones(2), np.ones((2, 2), bool)
 

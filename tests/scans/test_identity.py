@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import pytest
 import vi_jax as vi
-from vi_jax.scan._identity import Unverifiable, identity
+from vi_jax.scans._identity import Unverifiable, identity
 
 # What a user may have written: a global number, a helper, a closure, a default, a class.
 SOURCE = """
@@ -104,7 +104,7 @@ def test_another_process_gives_the_same(tmp_path):
     (tmp_path / "study.py").write_text(SOURCE)
     script = tmp_path / "tell.py"
     script.write_text(
-        "from study import *\nimport study\nfrom vi_jax.scan._identity import identity\n"
+        "from study import *\nimport study\nfrom vi_jax.scans._identity import identity\n"
         f"print([identity(eval(t, vars(study))) for t in {list(THINGS.values())!r}])\n"
     )
     described = [

@@ -69,7 +69,7 @@ def test_what_is_damaged_is_told_and_computed_again(
         shutil.rmtree(broken) if broken.is_dir() else broken.unlink()
     else:
         damage(broken)
-    work = importlib.import_module("vi_jax.scan._work")
+    work = importlib.import_module("vi_jax.scans._work")
     compute, computed = work.compute, []
     monkeypatch.setattr(work, "compute", lambda *a: computed.append(1) or compute(*a))
     with pytest.warns(UserWarning, match=f"lost or damaged, and is computed again: {words}[.]"):
@@ -132,7 +132,7 @@ def test_failed_lanes_are_no_damage(tmp_path):
 
 def test_functions_that_differ_between_the_probed_lanes_are_refused(tmp_path, monkeypatch):
     """First and last lane are alike: only their code tells them apart."""
-    module = importlib.import_module("vi_jax.scan._computed")
+    module = importlib.import_module("vi_jax.scans._computed")
     monkeypatch.setattr(module, "run_here", lambda *arguments: iter(()))
 
     def run(name, change=0.0, hidden=None):

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-from vi_jax.scan._lyapunov import _weighted
+from vi_jax.scans._lyapunov import _weighted
 
 from rimless_wheel import Wheel
 
