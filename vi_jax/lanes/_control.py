@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.extend.core import Jaxpr, Literal
 
 from ._arrays import any_in, each
 from ._large import (
@@ -15,6 +16,7 @@ from ._large import (
     Held,
     Index,
     Large,
+    Masked,
     Strided,
     as_large,
     at,
@@ -66,12 +68,22 @@ def _cond(write: Write, t: Text, params: dict, args: list[Any], mask: Value) -> 
     order = sorted(range(len(branches)), key=lambda i: size_of(inner(branches[i])))
     result: list[Any] | None = None
     for i in order:
-        if result is None and size_of(inner(branches[i])) <= _CHEAP:
+        if result is None and _is_cheap(inner(branches[i])):
             result = [settled(t, x) for x in write(t, branches[i], args, mask)]
             continue
         result = _branch_if_any(write, t, branches[i], args, t.both(mask, taken[i]), result)
     assert result is not None
     return [_opaque(t, x) for x in result]
+
+
+def _is_cheap(jaxpr: Jaxpr) -> bool:
+    """Whether a branch is not worth skipping: few operations, or constants however many, such as
+    the zeros that are the cotangents of what a branch does not need."""
+    constant = (
+        eqn.primitive.name == "broadcast_in_dim" and isinstance(eqn.invars[0], Literal)
+        for eqn in jaxpr.eqns
+    )
+    return size_of(jaxpr) <= _CHEAP or all(constant)
 
 
 def _branch_if_any(write: Write, t: Text, jaxpr, args, mask: Value, otherwise) -> list[Any]:
@@ -88,14 +100,11 @@ def _branch_if_any(write: Write, t: Text, jaxpr, args, mask: Value, otherwise) -
     laid: list[Any] = []
     others = [None] * len(found) if otherwise is None else otherwise
     for x, y, r in zip(found, others, rooms, strict=True):
-        if r is None:
+        if r is not None:
+            laid.append(_laid(t, x, y, r, args, mask))
+        else:
             y = each(lambda a: t.zero(a.kind), x) if y is None else y
             laid.append(x if otherwise is None else each(partial(t.select, mask), x, y))
-        elif y is None or not same(x, y):
-            fill(t, r, x if y is None else selected(t, mask, x, y))
-            laid.append(r)
-        else:
-            laid.append(y)
     end = t.block
     t.line(f"br label %{after}")
     t.close()
@@ -109,10 +118,7 @@ def _branch_if_any(write: Write, t: Text, jaxpr, args, mask: Value, otherwise) -
         t.close()
     t.follow(after)
     if otherwise is None:
-        others = [
-            each(lambda a: t.zero(a.kind), x) if r is None else r
-            for x, r in zip(found, rooms, strict=True)
-        ]
+        others = [x if isinstance(x, Large) else each(lambda a: t.zero(a.kind), x) for x in found]
 
     def either(a: Value, b: Value) -> Value:
         return a if a == b else t.phi(a.kind, (a.text, end), (b.text, before))
@@ -120,6 +126,28 @@ def _branch_if_any(write: Write, t: Text, jaxpr, args, mask: Value, otherwise) -
     return [
         each(either, x, y) if r is None else x for x, y, r in zip(laid, others, rooms, strict=True)
     ]
+
+
+def _laid(t: Text, x: Large, y: Large | None, r: Strided, args: list[Any], mask: Value) -> Large:
+    """A branch's large result in the lanes of `mask`, and that of the others in theirs. Nothing is
+    copied that need not be: a derivative's branches hand on whole matrices, or zeros in their
+    place.
+
+    **Arguments:** the text; the result `x`; the others', or `None` if it may be anything; memory
+    for what has to be stored; the branch's arguments; its lanes.
+    """
+    mine, other = (a.value if isinstance(a, Formula) else None for a in (x, y))
+    if mine is not None and mine.number is not None and (y is None or mine == other):
+        return x
+    if y is not None and same(x, y):
+        return y
+    if other == t.zero(r.kind):
+        if not (isinstance(x, Strided) and any(same(x, a) for a in args)):
+            fill(t, r, x)
+            x = r
+        return Masked(r.shape, r.kind, x, mask)
+    fill(t, r, x if y is None else selected(t, mask, x, y))
+    return r
 
 
 def _opaque(t: Text, x: Held) -> Held:

@@ -11,6 +11,7 @@ from ._large import (
     Formula,
     Held,
     Large,
+    Masked,
     Memory,
     Strided,
     Values,
@@ -48,12 +49,24 @@ def tape_store(t: Text, pointer: str, offset: int, arrays: list[Held]) -> None:
 def tape_add(t: Text, pointer: str, offset: int, avals: list[Any], arrays: list[Held]) -> None:
     """Add arrays to those that `tape_store` has written, of which they are no functions."""
     old, n = tape_load(t, pointer, offset, avals), 0
-    for x, new in zip(old, add_all(t, old, arrays), strict=True):
-        if isinstance(x, Strided):
-            fill(t, x, new)
-        else:
+    rare: dict[Value, list[tuple[Strided, Held]]] = {}
+    for x, more, new in zip(old, arrays, add_all(t, old, arrays), strict=True):
+        if not isinstance(x, Strided):
             _store_numbers(t, pointer, offset + 8 * t.width * n, new)
+        elif isinstance(more, Masked):
+            rare.setdefault(more.mask, []).append((x, new))
+        else:
+            fill(t, x, new)
         n += x.size
+    for mask, pairs in rare.items():  # the weights of a law matter in the iterations with an impact
+        inside, after = t.label(), t.label()
+        t.fork(t.any(mask), inside, after, rare=True)
+        t.open(inside)
+        for x, new in pairs:
+            fill(t, x, new)
+        t.line(f"br label %{after}")
+        t.close()
+        t.follow(after)
 
 
 def _at(pointer: str, begin: int, shape: tuple[int, ...], kind: str) -> Strided:
@@ -97,6 +110,13 @@ def each_of(t: Text, function: Callable[..., Value], kind: str | None, *arrays: 
     return Formula(
         arrays[0].shape, own, lambda i: function(*(at(t, x, i) for x in arrays)), cuts=cuts
     )
+
+
+def only_in(t: Text, flag: Value, arrays: list[Held], avals: list[Any]) -> list[Held]:
+    """The arrays in the lanes where the flag holds, else zeros; what is zero outside of some lanes
+    must be so outside of these."""
+    chosen = select_all(t, flag, arrays, zeros(t, avals))
+    return [x if isinstance(x, Masked) else y for x, y in zip(arrays, chosen, strict=True)]
 
 
 def select_all(t: Text, flag: Value, a: list[Held], b: list[Held]) -> list[Held]:

@@ -30,6 +30,7 @@ from ._group import (
     Frame,
     add_all,
     each_of,
+    only_in,
     select_all,
     tape_add,
     tape_load,
@@ -239,8 +240,7 @@ class _Writer:
     ) -> tuple[list[Held], list[Held]]:
         """The cotangents of inputs and carry that the way back gives, zero where `mask` does not
         hold."""
-        out = write(t, jaxpr, args, mask)
-        out = select_all(t, mask, out, zeros(t, jaxpr.out_avals))
+        out = only_in(t, mask, write(t, jaxpr, args, mask), jaxpr.out_avals)
         return out[: len(self.varied)], out[len(self.varied) :]
 
     # The functions

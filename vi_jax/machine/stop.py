@@ -19,6 +19,12 @@ from .own import by_default, is_own
 from .shown import Shown
 
 
+def _unless_tiny(V: Number) -> Any:
+    """A velocity, but 0 where its square is below the smallest number."""
+    least = 100 * float(jnp.finfo(jnp.result_type(V)).tiny) ** 0.5
+    return jnp.where(jnp.abs(V) > least, V, 0.0)
+
+
 class Wall(Shown):
     """Where a stop stands, rigid or compliant: at `gap` on its `side`."""
 
@@ -139,8 +145,16 @@ class RigidStop(Wall, AbstractEvent):
     def leaving(self, V: Number) -> Any:
         """The velocity after an impact with this one: the `rebound`, but nothing for a speed whose
         square is below the smallest number, so that a body may come to rest on the stop."""
-        least = 100 * float(jnp.finfo(jnp.result_type(V)).tiny) ** 0.5
-        return self.rebound(jnp.where(jnp.abs(V) > least, V, 0.0))
+        return self.rebound(_unless_tiny(V))
+
+    def rebound_and_share(self, approach: Any) -> tuple[Any, Any]:
+        """What an impact at this speed of approach leaves: the velocity (`leaving`) and the `share`
+        of the speed. The law is asked once for both, since it may be long (a network)."""
+        V = self.sign * approach
+        if not is_own(type(self).rebound):
+            k = self.coefficient(approach)
+            return -k * _unless_tiny(V), k
+        return self.leaving(V), self.share(approach)
 
     def share(self, approach: Any) -> Any:
         """The share of a speed of approach that is left after the impact: k, or by a `rebound` of
@@ -150,6 +164,7 @@ class RigidStop(Wall, AbstractEvent):
         left = -self.approach(self.rebound(self.sign * approach))
         return left / jnp.where(approach > 0, approach, 1.0)
 
-    def loss(self, approach: Any) -> Any:
-        """Energy lost in an impact, per unit of mass: ½(1 - k²) V⁻²."""
-        return 0.5 * (1 - self.share(approach) ** 2) * approach**2
+    def loss(self, approach: Any, share: Any = None) -> Any:
+        """Energy lost in an impact, per unit of mass: ½(1 - k²) V⁻²; `share` is k where known."""
+        share = self.share(approach) if share is None else share
+        return 0.5 * (1 - share**2) * approach**2

@@ -44,15 +44,15 @@ def _one_blow(
     for number, met in landed.items():
         stop = machine.stops[number]
         approach = jnp.maximum(stop.approach(velocity), 0.0)
-        rebound = stop.leaving(stop.sign * approach)
+        rebound, share = stop.rebound_and_share(approach)
         arrival = ended(arrival, met, gains_speed(stop, approach, rebound), results.BAD_IMPACT)
         state = select(met, body.placed(there, stop.place, rebound), arrival.state)
         arrival = listed(plan, arrival._replace(state=state), there, taken & met, number, approach)
         if arrival.tally.loss is not None:
-            lost = stop.loss(approach)
+            lost = stop.loss(approach, share)
             lost = lost if _is_one(body.mass) else body.mass * lost
             arrival = arrival.counting(loss=arrival.tally.loss + jnp.where(taken & met, lost, 0.0))
-        new = Blow(jnp.where(met, to_event(number), 0.0), approach, stop.share(approach))
+        new = Blow(jnp.where(met, to_event(number), 0.0), approach, share)
         blow = new if len(landed) == 1 else select(met, new, blow)
     return arrival, {k: blow}
 

@@ -29,6 +29,7 @@ from .kinds import MOST_IN_REGISTERS as MOST_IN_REGISTERS
 from .kinds import Formula as Formula
 from .kinds import Held as Held
 from .kinds import Large as Large
+from .kinds import Masked as Masked
 from .kinds import Memory as Memory
 from .kinds import Strided as Strided
 from .kinds import Table as Table

@@ -220,6 +220,20 @@ class Strided(Large):
         return Strided(tuple(shape), self.kind, self.source, tuple(strides), self.offset + more)
 
 
+@dataclass(eq=False)
+class Masked(Large):
+    """An array that is zero but in the lanes of a mask: numbers in memory to which nothing is
+    written where the mask has no lane."""
+
+    shape: tuple[int, ...]
+    kind: str
+    numbers: Strided
+    mask: Value
+
+    def at(self, t: Text, index: Sequence[Index]) -> Value:
+        return t.select(self.mask, self.numbers.at(t, index), t.zero(self.kind))
+
+
 def stored_kind(kind: str) -> str:
     return "i8" if kind == "i1" else kind  # XLA keeps truth values in bytes
 
