@@ -268,3 +268,36 @@ def test_a_traced_mass_that_is_not_definite_ends_its_lane():
 
     run = vi.jit(jax.vmap(last))(jnp.asarray([2.0, -1.0]))
     assert run.successful.tolist() == [True, False]
+
+
+class Hardening(vi.machines.Structure):
+    """With a force that is not linear, so that it does not move in modes."""
+
+    cubic: jax.Array = dataclasses.field(kw_only=True, default_factory=lambda: jnp.zeros(()))
+
+    def field(self, s, state):
+        rate = super().field(s, state)
+        more = jnp.linalg.solve(self.mass, self.cubic * state.displacement**3)
+        return vi.machines.StructureState(rate.displacement, rate.velocity - more)
+
+
+@pytest.mark.filterwarnings("error")
+def test_rules_of_its_own_are_vector_code():
+    """A mass matrix and the shortest period are worked out once, not in each step."""
+    M = jnp.asarray([[1.0, 0.2], [0.2, 2.0]])
+    K = jnp.asarray([[2.0, -1.0], [-1.0, 1.5]])
+    numbers = {"mass": M, "damping": 0.1 * K, "stiffness": K, "force": jnp.asarray([1.0, 0.0]),
+               "frequency": 0.7, "contacts": (vi.RigidStop(0.6, 0.5, at=[0.0, 1.0]),)}  # fmt: skip
+    plain, own = vi.machines.Structure(**numbers), Hardening(**numbers)
+
+    def end(machine):
+        run = vi.simulate(machine, machine.start(), 8, method=vi.Adaptive(rtol=1e-11))
+        return run.last.displacement, run.impacts
+
+    (x, impacts), (y, others) = jax.jit(end)(plain), jax.jit(end)(own)
+    np.testing.assert_allclose(x, y, rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(impacts, others)
+    assert int(impacts.sum()) > 3
+    heavier = lambda kind: lambda m: end(kind(**{**numbers, "mass": M * m}))[0]
+    by_steps, by_modes = (jax.jacfwd(heavier(k))(1.0) for k in (Hardening, vi.machines.Structure))
+    np.testing.assert_allclose(by_steps, by_modes, rtol=1e-6)

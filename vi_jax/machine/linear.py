@@ -2,10 +2,11 @@
 
 import abc
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
 from .._numbers import concrete, number
@@ -23,6 +24,15 @@ class StructureState(Shown):
     """x, one number for each degree of freedom."""
     velocity: Float[Array, "..."]
     """dx/ds, one number for each degree of freedom."""
+
+
+class _Known(NamedTuple):
+    """What a machine with rules of its own is asked for in each step, worked out beforehand."""
+
+    inverse: Float[Array, "n n"] | None
+    """M⁻¹; `None` for a diagonal M."""
+    longest: Scalar
+    """The longest step."""
 
 
 class LinearMachine(AbstractMachine):
@@ -49,6 +59,7 @@ class LinearMachine(AbstractMachine):
     stiffness: eqx.AbstractVar[Float[Array, "..."]]
     frequency: eqx.AbstractVar[Scalar]
     contacts: eqx.AbstractVar[tuple[RigidStop, ...]]
+    _known: _Known | None = eqx.field(default_factory=lambda: None, init=False, repr=False)
 
     @property
     def units(self) -> Mapping[str, str]:
@@ -79,7 +90,7 @@ class LinearMachine(AbstractMachine):
     @property
     def coordinates(self) -> tuple[Coordinate, ...]:
         """One for each contact: the sum c·x of displacements that it limits."""
-        mobile = [solved(self.mass, c) for c in self.rows]
+        mobile = [self._accelerated(c) for c in self.rows]
         masses = [1 / jnp.dot(c, m) for c, m in zip(self.rows, mobile, strict=True)]
         pushes = [m * one for m, one in zip(mobile, masses, strict=True)]
         return tuple(along(*x) for x in zip(self.rows, pushes, masses, strict=True))
@@ -100,7 +111,12 @@ class LinearMachine(AbstractMachine):
         pull = harmonic(self.forces, self.frequency * s, x) - times(self.stiffness, x)
         if self.damping is not None:
             pull = pull - times(self.damping, v)
-        return StructureState(v, solved(self.mass, pull))
+        return StructureState(v, self._accelerated(pull))
+
+    def _accelerated(self, force: Float[Array, " n"]) -> Float[Array, " n"]:
+        """M⁻¹ times a force."""
+        known = None if self._known is None else self._known.inverse
+        return solved(self.mass, force) if known is None else known @ force
 
     def start(self, *, displacement: Number = 0.0, velocity: Number = 0.0) -> StructureState:
         """A state; at rest in x = 0 by default.
@@ -138,6 +154,8 @@ class LinearMachine(AbstractMachine):
 
     def step_limit(self, s: Scalar, state: StructureState) -> Scalar:
         """A fifth of the shortest period, of the modes or the force."""
+        if self._known is not None:
+            return self._known.longest
         return self.natural_modes().machine.step_limit(s, state)
 
     def mirrored(self, state: StructureState) -> StructureState | None:
@@ -161,8 +179,16 @@ class LinearMachine(AbstractMachine):
         its own."""
         own = ("field", "switches", "events", "begin", "averages", "section", "clock", "renewed")
         if any(getattr(type(self), name) is not getattr(LinearMachine, name) for name in own):
-            return super().prepared()
+            return super().prepared()._replace(machine=self._with_known())
         return self.prepared_modes()
+
+    def _with_known(self) -> "LinearMachine":
+        """The machine with what none of its steps has to work out: in a lane's steps there is no
+        vector code for eigenvalues, and to solve by M takes its cube each time."""
+        longest = stop_gradient(self.step_limit(jnp.zeros(()), self.start()))
+        inverse = None if self.mass.ndim == 1 else jnp.linalg.inv(self.mass)
+        known = _Known(inverse, longest)
+        return eqx.tree_at(lambda m: m._known, self, known, is_leaf=lambda x: x is None)
 
     def prepared_modes(self) -> Prepared:
         """The machine in its natural modes, and the ways there and back."""
