@@ -4,7 +4,7 @@ Each function gives numbers by the names under which the study of that name keep
 difference that is allowed.
 """
 
-from .benchmarks import chains, explorer, peers, scene_cost, speed_accuracy
+from .benchmarks import chains, explorer, gradients, peers, scene_cost, speed_accuracy
 from .closed_forms import XI, Expected, closed
 from .machines import dc_motor, known_machines, noise, relief_valve, sommerfeld, woodpecker
 from .orbits import (
@@ -43,6 +43,7 @@ __all__ = [
     "explorer",
     "fig2_frequency_response",
     "fit_4pi_orbit",
+    "gradients",
     "identify",
     "known_machines",
     "learned_laws",

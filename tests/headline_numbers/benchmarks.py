@@ -2,12 +2,14 @@
 
 from functools import partial
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
 import vi_jax as vi
 from headlines.jaxprs import primitives
 from tools.chains import linear_chain
+from tools.networks import last_places, oscillator
 
 from .closed_forms import XI, Expected
 
@@ -80,3 +82,14 @@ def chains() -> Expected:
     places = vi.jit(jax.vmap(lane))(jnp.linspace(0.2, 0.9, 256))
     middle = float(np.median(np.abs(places)))
     return {"linear, N = 10: median |x| of the last mass at the end": (middle, 0.01 * middle)}
+
+
+def gradients() -> Expected:
+    """By columns: the derivative along the gradient's own direction is its length."""
+    method = vi.FixedStep(diffrax.Dopri8(), 24)
+    starts = jnp.linspace(-0.3, 0.3, 32)
+    value, numbers = last_places(oscillator(43, "law"), starts, 50, method)
+    slope = jax.grad(value)(numbers)
+    along = slope / jnp.linalg.norm(slope)
+    length = float(jax.jvp(value, [numbers], [along])[1])
+    return {"law of 2,022 weights: length of the gradient": (length, 1e-6 * length)}

@@ -1,0 +1,174 @@
+# %% [markdown]
+# # Gradients by many numbers
+#
+# What a gradient costs, in simulations of the same lanes: of a motor's lanes by its own numbers, of
+# an oscillator with a stop by the weights of a network that is its spring's force, or its law of
+# restitution. `jax.grad` by more than four numbers goes back along a tape of the steps that were
+# taken. For comparison diffrax differentiates the oscillator without a stop (a loop that ends at
+# events has no reverse mode there): the same network, method and steps, backward by its default,
+# recursive checkpoints. One core, to which all is pinned; rounds are interleaved, compile time is
+# apart.
+#
+# Run with `python experiments/benchmarks/gradients.py` (`--quick` for few lanes, writes nothing).
+
+# %%
+import os
+import sys
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+# One core for all, chosen before any library counts them.
+if hasattr(os, "sched_setaffinity"):
+    os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import vi_jax as vi
+from vi_jax.plot.colors import BLUE, GREEN
+
+jax.config.update("jax_enable_x64", True)
+
+sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
+from tools.networks import flat, last_places, oscillator
+from tools.pictures import open_frames, panels
+from tools.study import QUICK, say, write
+from tools.tables import table
+from tools.timing import side_by_side
+
+LANES, CYCLES, STEPS, ROUNDS = (4, 3, 24, 1) if QUICK else (32, 50, 24, 7)
+METHOD = vi.FixedStep(diffrax.Dopri8(), STEPS)
+STARTS = jnp.linspace(-0.3, 0.3, LANES)
+
+
+# %%
+class Task(NamedTuple):
+    """A sum over lanes, and the numbers that it is differentiated by."""
+
+    name: str
+    code: str
+    value: Callable[[jax.Array], jax.Array]
+    numbers: jax.Array
+
+
+def ours(name: str, machine: Any) -> Task:
+    """By all numbers of a machine."""
+    return Task(name, "vi_jax", *last_places(machine, STARTS, CYCLES, METHOD))
+
+
+def by_diffrax(name: str, width: int) -> Task:
+    """The same without a stop, by diffrax."""
+    machine = oscillator(width, "without")
+    numbers, whole = flat(machine)
+
+    def rate(s, state, own):
+        return state[1], own.rate(s, *state)
+
+    def lane(numbers, Y):
+        end = diffrax.diffeqsolve(
+            diffrax.ODETerm(rate), diffrax.Dopri8(), 0.0, CYCLES * machine.cycle,
+            machine.cycle / STEPS, (Y, 0 * Y), whole(numbers),
+            saveat=diffrax.SaveAt(t1=True), max_steps=CYCLES * STEPS + 2,
+        )  # fmt: skip
+        return end.ys[0][-1]  # pyright: ignore
+
+    value = lambda numbers: jnp.sum(jax.vmap(lane, (None, 0))(numbers, STARTS) ** 2)
+    return Task(name, "diffrax", value, numbers)
+
+
+def tasks() -> list[Task]:
+    """What is measured, by rising number of parameters; without a stop last."""
+    small, middle, large = (4, 5, 6) if QUICK else (8, 32, 43)
+    return [
+        ours("motor", vi.Parameters(torque=10.0, restitution=0.5, gap=0.05).scene()),
+        ours("network as spring", oscillator(small, "spring")),
+        ours("network as law", oscillator(small, "law")),
+        ours("network as spring", oscillator(middle, "spring")),
+        ours("network as law", oscillator(large, "law")),
+        ours("network as spring, no stop", oscillator(middle, "without")),
+        by_diffrax("network as spring, no stop", middle),
+    ]
+
+
+# %% [markdown]
+# ## Measured
+#
+# With the gradient's difference from central differences along a random direction, as a share of
+# its length. It is as large as the steps' own error where a step ends at an event (without a stop,
+# at a turning point): the derivative through it is the motion's, that of a difference the steps'.
+
+
+# %%
+def compiled(function: Callable, *args: Any) -> tuple[Callable, float]:
+    """A program, and the seconds that it took to trace and compile."""
+    begin = time.perf_counter()
+    program = vi.jit(function).lower(*args).compile()
+    return program, time.perf_counter() - begin
+
+
+def off(task: Task, value: Callable, slope: jax.Array) -> float:
+    """The gradient's error along one direction, beside differences of eight orders less."""
+    along = jax.random.normal(jax.random.key(1), slope.shape)
+    along = along / jnp.linalg.norm(along) * jnp.linalg.norm(slope)
+    step = 1e-6 / float(jnp.linalg.norm(along))
+    ahead, behind = (value(task.numbers + h * along) for h in (step, -step))
+    difference = float(ahead - behind) / (2 * step)
+    return abs(difference - float(slope @ along)) / float(jnp.linalg.norm(slope) ** 2)
+
+
+rows, bars, numbers = [], [], {}
+for task in tasks():
+    value, _ = compiled(task.value, task.numbers)
+    gradient, seconds = compiled(jax.grad(task.value), task.numbers)
+    runs = [partial(f, task.numbers) for f in (value, gradient)]
+    with vi.threads(1):
+        error = off(task, value, gradient(task.numbers))
+        plain, back = side_by_side(runs, ROUNDS)
+    times = f"{1e3 * plain:.2f}", f"{1e3 * back:.1f}", f"{back / plain:.1f}", f"{seconds:.1f}"
+    rows.append((task.name, task.code, f"{task.numbers.size:,}", *times, f"{error:.0e}"))
+    bars.append((f"{task.name}\n{task.numbers.size:,} numbers", task.code, back / plain))
+    say(rows[-1])
+    if task.code == "vi_jax" and "law" in task.name:
+        name = f"law of {task.numbers.size:,} weights: length of the gradient"
+        numbers[name] = float(np.linalg.norm(runs[1]()))
+
+# %% [markdown]
+# ## Table
+
+# %%
+heads = [
+    "machine", "code", "numbers", "value, ms", "gradient, ms", "gradient / value",
+    "compile, s", "off differences",
+]  # fmt: skip
+page = f"""# Gradients by many numbers
+
+{LANES} lanes of {CYCLES} cycles, {STEPS} steps of Dopri8 each, from different starts; the sum of \
+the squares of their last places and its gradient. JAX {jax.__version__}, diffrax \
+{diffrax.__version__}, one core, medians of {ROUNDS} interleaved rounds; times are for all lanes.
+
+![Gradients](../figures/gradients.png)
+
+{table(heads, rows)}
+"""
+print(page)
+
+# %% [markdown]
+# ## Figure
+
+# %%
+figure, ax = panels(8.5, 4)
+colors = {"vi_jax": BLUE, "diffrax": GREEN}
+for code, color in colors.items():
+    places = [i for i, bar in enumerate(bars) if bar[1] == code]
+    drawn = ax.barh(places, [bars[i][2] for i in places], 0.6, color=color, label=code)
+    ax.bar_label(drawn, fmt="%.1f", padding=2)
+ax.set_yticks(range(len(bars)), [bar[0] for bar in bars], fontsize=8)
+ax.invert_yaxis()
+ax.set(xlabel="time of the gradient over that of the value")
+ax.legend(frameon=False)
+open_frames([ax])
+write("gradients", page, numbers, figure)
