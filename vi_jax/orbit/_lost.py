@@ -1,30 +1,31 @@
 """Where an impact is lost, a stop touched, or the sequence of events changes between two points of
 a branch."""
 
-from collections.abc import Callable
-
 import numpy as np
 
 from ._hopf import hopf_between
 from ._shooting import Shooting
+from ._solve import advance, located
 from ._words import ANEW, REORDERED, RESTS
 from .curve import Step
 
 # Events that are to come together do so within this: a choice.
 _TOGETHER = 1e-9
 
-# The place between two points at which a test is zero.
-Where = Callable[[Step, Step, Callable[[Step], float]], Step | None]
+# What changes within so much of the way to a place changes there, and so does a test that has become
+# so small a share of what it was: choices, above what the tests are off by where the equations are
+# singular.
+_SHORT, _NOISE = 1e-4, 1e-3
 
 
 def first_lost(
-    problem: Shooting, here: Step, new: Step, where: Where
+    problem: Shooting, here: Step, new: Step, scale: np.ndarray
 ) -> tuple[Step, int | None] | None:
     """The first of these places between two points, one being looked for where a test changes its
     sign, and the number of the event that is lost, or what stands for it (see `named`); `None` if
     there is none.
 
-    **Arguments:** the equations; the points; `where`, that looks for a place.
+    **Arguments:** the equations; the points; the size of each unknown.
     """
     found, tests = [], []
 
@@ -45,8 +46,23 @@ def first_lost(
         tests.append((lambda step: float(step.seen.order), ANEW))
     if new.seen.apart < -_TOGETHER < here.seen.apart:
         tests.append((lambda step: float(step.seen.apart) + _TOGETHER, REORDERED))
+    first = min(found, key=lambda f: _way(here, f[0]), default=None)
     for test, impact in tests:
-        at = where(here, new, test)
+        end = new if first is None else _short_of(problem, here, first[0], scale)
+        # What falls together with the first one, or comes later, is not located.
+        if first is not None and (not bool(end.good) or test(end) > -_NOISE * test(here)):
+            continue
+        at = located(problem, here, end, scale, test)
         if at is not None:
-            found.append((at, impact))
-    return min(found, key=lambda f: float(np.dot(here.tangent, f[0].x - here.x)), default=None)
+            first = at, impact
+    return first
+
+
+def _way(here: Step, at: Step) -> float:
+    return float(np.dot(here.tangent, at.x - here.x))
+
+
+def _short_of(problem: Shooting, here: Step, at: Step, scale: np.ndarray) -> Step:
+    """A point between two, right before the second."""
+    length = float(np.dot(here.tangent, (at.x - here.x) / scale))
+    return advance(problem, here.x, here.tangent, scale, (1 - _SHORT) * length)
