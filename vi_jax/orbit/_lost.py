@@ -12,9 +12,9 @@ from .curve import Step
 # Events that are to come together do so within this: a choice.
 _TOGETHER = 1e-9
 
-# What changes within so much of the way to a place changes there, and so does a test that has become
-# so small a share of what it was: choices, above what the tests are off by where the equations are
-# singular.
+# What changes within so much of the way to a place changes there, and so does a test that has
+# become so small a share of what it was: choices, above what the tests are off by where the
+# equations are singular.
 _SHORT, _NOISE = 1e-4, 1e-3
 
 
@@ -45,7 +45,9 @@ def first_lost(
     if new.seen.order < 0 < here.seen.order:
         tests.append((lambda step: float(step.seen.order), ANEW))
     if new.seen.apart < -_TOGETHER < here.seen.apart:
-        tests.append((lambda step: float(step.seen.apart) + _TOGETHER, REORDERED))
+        # Of events that are together all along the rounding is left out.
+        off = 0.0 if here.seen.apart > _TOGETHER else _TOGETHER
+        tests.append((lambda step: float(step.seen.apart) + off, REORDERED))
     first = min(found, key=lambda f: _way(here, f[0]), default=None)
     for test, impact in tests:
         end = new if first is None else _short_of(problem, here, first[0], scale)
