@@ -5,27 +5,24 @@ import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.optimize import newton
 
-CLOSE = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-14}
 
+def flown(field, s, x, end, guards, noted=None):
+    """From the state `x` at `s` on until the first guard rises above zero: which one (`None` if
+    `end` comes first), when, the state there; and those on the way at which `noted` rises."""
 
-def flown(field, s, x, end, guards, **options):
-    """From the state `x` at `s` on until the first guard gets above zero: which one (`None` if
-    `end` comes first), when, and the state there.
-
-    A guard that is zero where the flight begins counts once it has been below.
-    """
-
-    def watched(guard):
+    def watched(guard, terminal):
         def value(s, x):
             return guard(s, x)
 
-        value.terminal, value.direction = True, 1
+        value.terminal, value.direction = terminal, 1
         return value
 
-    options = {**CLOSE, **options}
-    found = solve_ivp(field, (s, end), x, events=[watched(g) for g in guards], **options)
-    which = [i for i, times in enumerate(found.t_events) if times.size]
-    return (which[0] if which else None), found.t[-1], found.y[:, -1]
+    events = [watched(guard, True) for guard in guards]
+    events += [watched(noted, False)] if noted is not None else []
+    found = solve_ivp(field, (s, end), x, events=events, method="DOP853", rtol=1e-13, atol=1e-14)
+    which = [i for i, times in enumerate(found.t_events[: len(guards)]) if times.size]
+    way = found.y_events[-1] if noted is not None else []
+    return (which[0] if which else None), found.t[-1], found.y[:, -1], way
 
 
 def derivative(function, x, h):

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
+from scipy.optimize import newton
 
 from shooting import doubling, fixed_point, flown, zero_along
 
@@ -45,14 +46,14 @@ def after_a_cycle(voltage, x, turns=None):
         force = (voltage * np.sin(0.92 * s) / (1 - x[0])) ** 2 - 0.04 * x[1] - x[0]
         return [x[1], force + slides * (3.17 + 0.2 * force), slides * (-3.17 - 0.2 * force)]
 
-    _, s, x = flown(field, s, x, end, [lambda s, x: x[0] - 0.5])
+    _, s, x, _ = flown(field, s, x, end, [lambda s, x: x[0] - 0.5])
     x, slides = np.array([0.5, -0.8 * x[1], 0.3 * x[1]]), 1.0
-    _, s, x = flown(field, s, x, end, [lambda s, x: -x[2]])
+    _, s, x, _ = flown(field, s, x, end, [lambda s, x: -x[2]])
     x[2], slides = 0.0, 0.0
-    while turns is not None and s < end:
-        _, s, x = flown(field, s, x, end, [lambda s, x: -x[1]])
-        turns.append(x[0])
-    return flown(field, s, x, end, [])[2][:2]
+    _, _, x, turned = flown(field, s, x, end, [], lambda s, x: -x[1])
+    if turns is not None:
+        turns += [there[0] for there in turned]
+    return x[:2]
 
 
 @pytest.mark.slow
@@ -106,23 +107,72 @@ class Inside:
         return field
 
     def cycle(self, x):
-        """The state a cycle later; phase of the impact and the speeds before it, and how far from
-        the stop the mass turns next."""
-        guards = [lambda s, x: x[0] - self.gap]
-        _, s, x = flown(self.field(-1.0), -1.0, x, 3.0, guards)
-        self.impact, self.speed, self.capsule = s, x[1], x[2]
+        """The state a cycle later; the `impact`'s phase, the `capsule`'s speed before it, and how
+        far from the stop the mass turns after it (`room`)."""
+        _, s, x, _ = flown(self.field(-1.0), -1.0, x, 3.0, [lambda s, x: x[0] - self.gap])
+        self.impact, self.capsule, self.room, mode = s, x[2], np.inf, 1.0
         gained = (1 + self.restitution) * x[1]
         x = x + np.array([0.0, -gained, gained / (1 + self.ratio)])
-        self.room, mode = None, 1.0
         while s < 2 * np.pi - 1.0:
-            if mode == 1.0 and self.room is None:  # it turns first to the left, then to the right
-                for sign in (1.0, -1.0):
-                    _, s, x = flown(self.field(mode), s, x, 5.0, [lambda s, x: sign * x[1]])
-                self.room = self.gap - x[0]
-            ends = [lambda s, x: -x[2] if mode else abs(self.pull(x)) - 1.0]
-            ended, s, x = flown(self.field(mode), s, x, 2 * np.pi - 1.0, ends[: mode != -1.0])
-            mode = 0.0 if mode else np.sign(self.pull(x))
+
+            def ends(s, x, mode=mode):
+                return -mode * x[2] if mode else abs(self.pull(x)) - 1.0
+
+            ended, s, x, turned = flown(
+                self.field(mode), s, x, 2 * np.pi - 1.0, [ends], lambda s, x: -x[1]
+            )
+            self.room = min([self.room, *(self.gap - there[0] for there in turned)])
+            if ended is not None:
+                mode, x[2] = 0.0 if mode else np.sign(self.pull(x)), 0.0
         return x
+
+
+def settled(amplitude, x):
+    """The motion after cycles as many as it takes to repeat."""
+    motion = Inside(amplitude)
+    for _ in range(60):
+        before, x = x, motion.cycle(x)
+        if np.abs(x - before).max() < 1e-13:
+            break
+    motion.x = x
+    return motion
+
+
+def capsule_from(amplitude):
+    machine = vi.machines.Capsule(amplitude=amplitude)  # pyright: ignore[reportCallIssue]
+    orbit = vi.find_orbit(machine, vi.simulate(machine, machine.start(), 1, settle=300).last)
+    return vi.continue_orbit(orbit, parameter="amplitude", bounds=(1.2, 4.0))
+
+
+@pytest.mark.slow
+def test_a_capsule_that_sticks_once_a_cycle():
+    """What ends its branches: that it stands still as the mass hits it; that the mass hits it as a
+    cycle begins, where the other branch goes on; that the mass comes to the stop a second time."""
+    branches = capsule_from(1.6), capsule_from(2.2)
+    (stands, begins), (goes_on, touches) = (branch.special for branch in branches)
+    assert begins.parameter == pytest.approx(goes_on.parameter, abs=1e-10)
+    assert touches.detail.startswith("touches a stop")
+    x, motions = np.array([0.0, 1.0, -0.1]), {}
+    for amplitude in np.arange(1.6, 2.81, 0.1):
+        motions[round(amplitude, 1)] = motion = settled(amplitude, x)
+        x = motion.x
+    for point, begin, number in (
+        (stands, 1.6, "capsule"), (begins, 2.1, "impact"), (touches, 2.8, "room"),
+    ):  # fmt: skip
+        near = point.parameter + np.array([-1e-6, 1e-6])
+        truth = newton(
+            lambda a, x=motions[begin].x, number=number: getattr(settled(a, x), number),
+            near[0], x1=near[1], tol=1e-13,
+        )  # fmt: skip
+        assert point.parameter == pytest.approx(truth, abs=1e-8)
+    for branch in branches:
+        i = len(branch.parameter) // 2
+        amplitude = branch.parameter[i]
+        x = motions[round(amplitude, 1)].x
+        _, matrix = fixed_point(lambda x, a=amplitude: Inside(a).cycle(x), settled(amplitude, x).x)
+        expected = [*np.linalg.eigvals(matrix), 0.0, 0.0]
+        mine = np.sort_complex(branch.multipliers[i])
+        np.testing.assert_allclose(mine, np.sort_complex(expected), atol=1e-8)
 
 
 def least_force(restitution=0.8, damping=0.1):
