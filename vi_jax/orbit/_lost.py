@@ -1,6 +1,8 @@
 """Where an impact is lost, a stop touched, or the sequence of events changes between two points of
 a branch."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from ._hopf import hopf_between
@@ -21,47 +23,52 @@ _SHORT, _NOISE = 1e-4, 1e-3
 def first_lost(
     problem: Shooting, here: Step, new: Step, scale: np.ndarray
 ) -> tuple[Step, int | None] | None:
-    """The first of these places between two points, one being looked for where a test changes its
-    sign, and the number of the event that is lost, or what stands for it (see `named`); `None` if
-    there is none.
+    """The first of these places between two points, and the number of the event that is lost, or
+    what stands for it (see `named`); `None` if there is none.
+
+    One is looked for where a test has changed its sign, and then again on the way there: a test may
+    have changed it back, since beyond the first place the motion is none of the machine's.
 
     **Arguments:** the equations; the points; the size of each unknown.
     """
-    found, tests = [], []
-
-    def room(step: Step) -> float:
-        return float(np.clip(step.seen.nearest.room, -1.0, 1.0))
-
-    for i, event in enumerate(problem.events):
-        if new.seen.approach[i] <= 0 < here.seen.approach[i]:
-            alone_there = event.cycle is not None and not problem.conditions
-            hopf = hopf_between(problem, here, new) if alone_there else None
-            if hopf is not None:
-                found.append((hopf, RESTS))
-            else:
-                tests.append((lambda step, i=i: float(step.seen.approach[i]), i))
-    if room(new) < 0 < room(here):
-        tests.append((room, None))
-    if new.seen.order < 0 < here.seen.order:
-        tests.append((lambda step: float(step.seen.order), ANEW))
-    if new.seen.apart < -_TOGETHER < here.seen.apart:
-        # Of events that are together all along the rounding is left out.
-        off = 0.0 if here.seen.apart > _TOGETHER else _TOGETHER
-        tests.append((lambda step: float(step.seen.apart) + off, REORDERED))
-    first = min(found, key=lambda f: _way(here, f[0]), default=None)
-    for test, impact in tests:
-        end = new if first is None else _short_of(problem, here, first[0], scale)
-        # What falls together with the first one, or comes later, is not located.
-        if first is not None and (not bool(end.good) or test(end) > -_NOISE * test(here)):
+    first, end = None, new
+    tests = [(test, impact) for test, impact in _tests(problem, here) if test(here) > 0]
+    while True:
+        least = 0.0 if first is None else -_NOISE
+        changed = [i for i, (test, _) in enumerate(tests) if test(end) <= least * test(here)]
+        if not changed:
+            return first
+        test, impact = tests.pop(changed[0])
+        at = None
+        if impact is not None and impact >= 0 and problem.events[impact].cycle is not None:
+            at = None if problem.conditions else hopf_between(problem, here, end)
+            impact = impact if at is None else RESTS
+        at = located(problem, here, end, scale, test) if at is None else at
+        if at is None:
             continue
-        at = located(problem, here, end, scale, test)
-        if at is not None:
-            first = at, impact
-    return first
+        # What falls together with the first one is not looked for, nor what comes later.
+        first, end = (at, impact), _short_of(problem, here, at, scale)
+        if not bool(end.good):
+            return first
 
 
-def _way(here: Step, at: Step) -> float:
-    return float(np.dot(here.tangent, at.x - here.x))
+def _tests(problem: Shooting, here: Step) -> list[tuple[Callable[[Step], float], int | None]]:
+    """What is positive of a motion of the machine, and the number of the event that is lost where
+    it is not, or what stands for it.
+
+    **Arguments:** the equations; the point from which the walk comes.
+    """
+    # Of events that are together all along the rounding is left out.
+    off = 0.0 if here.seen.apart > _TOGETHER else _TOGETHER
+    approaches = [
+        (lambda step, i=i: float(step.seen.approach[i]), i) for i in range(len(problem.events))
+    ]
+    return [
+        *approaches,
+        (lambda step: float(np.clip(step.seen.nearest.room, -1.0, 1.0)), None),
+        (lambda step: float(step.seen.order), ANEW),
+        (lambda step: float(step.seen.apart) + off, REORDERED),
+    ]
 
 
 def _short_of(problem: Shooting, here: Step, at: Step, scale: np.ndarray) -> Step:
