@@ -53,11 +53,13 @@ class Rough(vi.AbstractMachine):
         return 0.4 * np.pi * jnp.minimum(1.0, self.omega)
 
 
-def branch_of(parameter, bounds, **numbers):
+def branch_of(parameter, bounds, *, max_step=0.1, **numbers):
     machine = Rough(**numbers)
     start = vi.OscillatorState(jnp.asarray(0.1), jnp.asarray(0.0))
     orbit = vi.find_orbit(machine, vi.simulate(machine, start, 1, settle=200).last)
-    return vi.continue_orbit(orbit, parameter=parameter, bounds=bounds, progress=False)
+    return vi.continue_orbit(
+        orbit, parameter=parameter, bounds=bounds, max_step=max_step, progress=False
+    )
 
 
 def on_both_sides(point, parameter, bounds, distance=0.01):
@@ -214,3 +216,20 @@ def test_a_walk_up_to_singular_equations_ends_there(monkeypatch):
 
     truth = brentq(touches, 0.096, 0.1, xtol=1e-14)
     assert first.parameter == pytest.approx(truth, abs=1e-10)
+
+
+@pytest.mark.slow
+def test_the_first_of_several_changes_within_a_step():
+    """A long step leads past the place where the body that is held at once first passes, around a
+    fold of what is no motion any more, and past one where a part of that vanishes."""
+    omega, numbers = 0.2, {"level": 0.11102, "second": 0.9535, "damping": 0.1122}
+    branch = branch_of("level", (0.01, 1.5), omega=omega, max_step=0.4, **numbers)
+    point = branch.special[0]
+    assert branch.ends[0] == point.kind == "switching-sliding"
+    near = float(point.detail.split("clock ")[1].split()[0])
+    # On this side the body is held by what is left, which falls to zero in a straight line.
+    levels = point.parameter + np.array([1e-6, 2e-6])
+    left = [held_by(omega, {**numbers, "level": level}, near) for level in levels]
+    assert max(left) < 0
+    truth = levels[0] - left[0] * (levels[1] - levels[0]) / (left[1] - left[0])
+    assert point.parameter == pytest.approx(truth, abs=1e-8)
