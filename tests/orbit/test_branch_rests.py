@@ -1,8 +1,10 @@
 """Branches of motions that rest on a stop for a part of their period."""
 
 import dataclasses
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
@@ -200,3 +202,77 @@ def test_chatter_and_rest_pass_over_the_section():
         low, high = (middle, high) if carried(middle)[-1][1] < 1e-14 else (low, middle)
     # So close to it hops are lost in the rounding of the place: rests of 3e-4 are not seen.
     assert point.parameter == pytest.approx(low, abs=1e-7)
+
+
+class Gears(vi.AbstractMachine):
+    """Play between two teeth: y'' = cos s - load between two flanks that are `backlash` apart. The
+    load presses on the left flank, from which the teeth part where cos s = load."""
+
+    load: Any = 0.3
+    backlash: Any = 1.0
+
+    @property
+    def stops(self):
+        return tuple(vi.RigidStop(0.5 * self.backlash, 0.5, side) for side in ("right", "left"))
+
+    @property
+    def cycle(self):
+        return 2 * np.pi
+
+    def field(self, s, x):
+        return vi.OscillatorState(x.V, jnp.cos(s) - self.load)
+
+
+def gone(load, s, v, d):
+    """How far the teeth have moved a time `d` after they had the velocity `v` at `s`, over `d`."""
+    lag = d * d / 6 if d < 1e-3 else 1 - np.sin(d) / d
+    pushed = 2 * np.cos(s) * np.sin(d / 2) ** 2 / d - np.sin(s) * lag
+    return v + pushed - load * d / 2
+
+
+def highest(load):
+    """How far the teeth part that rest on the left flank, without another."""
+    s = -np.arccos(load)
+    d = brentq(lambda d: np.sin(s + d) - np.sin(s) - load * d, 1.0 - s, 2 * np.pi, xtol=1e-15)
+    return gone(load, s, 0.0, d) * d
+
+
+def comes_to_rest(load, backlash):
+    """Whether the teeth, having parted and struck the right flank, rest on the left one before the
+    drive parts them again: by flights in closed form until hops are no longer than rounding."""
+    s, parts = -np.arccos(load), 2 * np.pi - np.arccos(load)
+    d = brentq(lambda d: gone(load, s, 0.0, d) * d - backlash, 0.5, -2 * s, xtol=1e-15)
+    v = -0.5 * (np.sin(s + d) - np.sin(s) - load * d)
+    s += d
+    d = brentq(lambda d: gone(load, s, v, d) * d + backlash, 0.5, parts - s, xtol=1e-15)
+    v = -0.5 * (v + np.sin(s + d) - np.sin(s) - load * d)
+    s += d
+    while v > 1e-14 and parts - s > 1e-13 and gone(load, s, v, parts - s) < 0:
+        args, close = (s, v), {"xtol": 1e-18, "rtol": 1e-14}
+        d = brentq(lambda d, s, v: gone(load, s, v, d), 1e-30, parts - s, args=args, **close)
+        v = -0.5 * (v + 2 * np.cos(s + d / 2) * np.sin(d / 2) - load * d)
+        s += d
+    return v <= 1e-14
+
+
+@pytest.mark.slow
+def test_gears_that_rattle_and_rest():
+    """Under a strong load they part and come back; the right flank is touched where it is as far as
+    they part, while their chatter on the left one has another number of hops a step further. Under
+    a weak one they strike it and come to rest, until the way back takes too long."""
+
+    def branch(load):
+        gears, flying = Gears(load=load), vi.OscillatorState(jnp.zeros(()), jnp.zeros(()))
+        start = vi.simulate(gears, flying, 1, settle=60).last
+        orbit = vi.find_orbit(gears, start, impact_log=64, throw=True)
+        return vi.continue_orbit(orbit, parameter="backlash", bounds=(0.4, 2.0))
+
+    parted, struck = branch(0.7), branch(0.3)
+    assert parted.ends == ("grazing", "bounds") and struck.ends == ("bounds", "rest")
+    assert parted.special[0].parameter == pytest.approx(highest(0.7), abs=1e-10)
+    low, high = 1.0, 1.2
+    while high - low > 1e-11:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if comes_to_rest(0.3, middle) else (low, middle)
+    # So close to it hops are lost in the rounding of the place, as above.
+    assert struck.special[0].parameter == pytest.approx(low, abs=3e-7)

@@ -9,6 +9,7 @@ import pytest
 import vi_jax as vi
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
+from vi_jax.orbit import _solve
 
 from den_hartog import den_hartog
 
@@ -52,11 +53,13 @@ class Rough(vi.AbstractMachine):
         return 0.4 * np.pi * jnp.minimum(1.0, self.omega)
 
 
-def branch_of(parameter, bounds, **numbers):
+def branch_of(parameter, bounds, *, max_step=0.1, **numbers):
     machine = Rough(**numbers)
     start = vi.OscillatorState(jnp.asarray(0.1), jnp.asarray(0.0))
     orbit = vi.find_orbit(machine, vi.simulate(machine, start, 1, settle=200).last)
-    return vi.continue_orbit(orbit, parameter=parameter, bounds=bounds, progress=False)
+    return vi.continue_orbit(
+        orbit, parameter=parameter, bounds=bounds, max_step=max_step, progress=False
+    )
 
 
 def on_both_sides(point, parameter, bounds, distance=0.01):
@@ -165,3 +168,68 @@ def test_a_slip_between_two_times_of_sticking():
     back = on_both_sides(point, "omega", (0.15, 0.2))
     assert back.kind == "adding-sliding" and "no longer" in back.detail
     assert back.parameter == pytest.approx(point.parameter, abs=1e-8)
+
+
+def slid(omega, Y, level=0.3, damping=0.04):
+    """By SciPy, where friction lets go of a body at `Y` at its first slip, and its slip back from
+    there as a function of the phase, which friction does not end."""
+
+    def field(phase, x):
+        return [x[1] / omega, (np.cos(phase) - x[0] - damping * x[1] + level) / omega]
+
+    begin = np.arccos(Y - level)
+    options = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-14, "dense_output": True}
+    path = solve_ivp(field, (begin, begin + np.pi), [Y, 0.0], **options).sol
+    return path, lambda phase: field(phase, path(phase))[1]
+
+
+@pytest.mark.slow
+def test_a_walk_up_to_singular_equations_ends_there(monkeypatch):
+    """Both its ends are places at which the equations of the motion are singular, since a part of
+    it has no length there: they are located all the same, without hundreds of trials."""
+    trials = []
+    advance = _solve._compiled_advance
+    monkeypatch.setattr(_solve, "_compiled_advance", lambda *x: trials.append(1) or advance(*x))
+    branch = branch_of("omega", (0.05, 2.0), omega=0.12, level=0.3, damping=0.04)
+    assert branch.ends == ("grazing-sliding", "adding-sliding")
+    assert len(trials) < len(branch.parameter) + 120
+    first, last = branch.special
+
+    def stops_short(omega):
+        """The body that stands at 1 - level is just held where the drive is strongest. It is one of
+        this motion if it comes to stand just there on the other side."""
+        path, _ = slid(omega, 0.7)
+        return path(brentq(lambda phase: path(phase)[1], 2.5, 2.8))[0] + 0.7
+
+    truth = brentq(stops_short, 0.128, 0.136, xtol=1e-14)
+    assert last.parameter == pytest.approx(truth, abs=1e-10)
+
+    def touches(omega):
+        """Velocity where the slip of a symmetric motion is slowest: it slips on to its end."""
+
+        def lacks(Y):
+            path, _ = slid(omega, Y)
+            return path(brentq(lambda phase: path(phase)[1], 2.6, 3.0))[0] + Y
+
+        path, rate = slid(omega, brentq(lacks, 0.70, 0.75, xtol=1e-15))
+        return path(brentq(rate, 2.25, 2.5))[1]
+
+    truth = brentq(touches, 0.096, 0.1, xtol=1e-14)
+    assert first.parameter == pytest.approx(truth, abs=1e-10)
+
+
+@pytest.mark.slow
+def test_the_first_of_several_changes_within_a_step():
+    """A long step leads past the place where the body that is held at once first passes, around a
+    fold of what is no motion any more, and past one where a part of that vanishes."""
+    omega, numbers = 0.2, {"level": 0.11102, "second": 0.9535, "damping": 0.1122}
+    branch = branch_of("level", (0.01, 1.5), omega=omega, max_step=0.4, **numbers)
+    point = branch.special[0]
+    assert branch.ends[0] == point.kind == "switching-sliding"
+    near = float(point.detail.split("clock ")[1].split()[0])
+    # On this side the body is held by what is left, which falls to zero in a straight line.
+    levels = point.parameter + np.array([1e-6, 2e-6])
+    left = [held_by(omega, {**numbers, "level": level}, near) for level in levels]
+    assert max(left) < 0
+    truth = levels[0] - left[0] * (levels[1] - levels[0]) / (left[1] - left[0])
+    assert point.parameter == pytest.approx(truth, abs=1e-8)

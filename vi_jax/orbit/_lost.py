@@ -7,46 +7,71 @@ import numpy as np
 
 from ._hopf import hopf_between
 from ._shooting import Shooting
+from ._solve import advance, located
 from ._words import ANEW, REORDERED, RESTS
 from .curve import Step
 
 # Events that are to come together do so within this: a choice.
 _TOGETHER = 1e-9
 
-# The place between two points at which a test is zero.
-Where = Callable[[Step, Step, Callable[[Step], float]], Step | None]
+# What changes within so much of the way to a place changes there, and so does a test that has
+# become so small a share of what it was: choices, above what the tests are off by where the
+# equations are singular.
+_SHORT, _NOISE = 1e-4, 1e-3
 
 
 def first_lost(
-    problem: Shooting, here: Step, new: Step, where: Where
+    problem: Shooting, here: Step, new: Step, scale: np.ndarray
 ) -> tuple[Step, int | None] | None:
-    """The first of these places between two points, one being looked for where a test changes its
-    sign, and the number of the event that is lost, or what stands for it (see `named`); `None` if
-    there is none.
+    """The first of these places between two points, and the number of the event that is lost, or
+    what stands for it (see `named`); `None` if there is none.
 
-    **Arguments:** the equations; the points; `where`, that looks for a place.
+    One is looked for where a test has changed its sign, and then again on the way there: a test may
+    have changed it back, since beyond the first place the motion is none of the machine's.
+
+    **Arguments:** the equations; the points; the size of each unknown.
     """
-    found, tests = [], []
+    first, end = None, new
+    tests = [(test, impact) for test, impact in _tests(problem, here) if test(here) > 0]
+    while True:
+        least = 0.0 if first is None else -_NOISE
+        changed = [i for i, (test, _) in enumerate(tests) if test(end) <= least * test(here)]
+        if not changed:
+            return first
+        test, impact = tests.pop(changed[0])
+        at = None
+        if impact is not None and impact >= 0 and problem.events[impact].cycle is not None:
+            at = None if problem.conditions else hopf_between(problem, here, end)
+            impact = impact if at is None else RESTS
+        at = located(problem, here, end, scale, test) if at is None else at
+        if at is None:
+            continue
+        # What falls together with the first one is not looked for, nor what comes later.
+        first, end = (at, impact), _short_of(problem, here, at, scale)
+        if not bool(end.good):
+            return first
 
-    def room(step: Step) -> float:
-        return float(np.clip(step.seen.nearest.room, -1.0, 1.0))
 
-    for i, event in enumerate(problem.events):
-        if new.seen.approach[i] <= 0 < here.seen.approach[i]:
-            alone_there = event.cycle is not None and not problem.conditions
-            hopf = hopf_between(problem, here, new) if alone_there else None
-            if hopf is not None:
-                found.append((hopf, RESTS))
-            else:
-                tests.append((lambda step, i=i: float(step.seen.approach[i]), i))
-    if room(new) < 0 < room(here):
-        tests.append((room, None))
-    if new.seen.order < 0 < here.seen.order:
-        tests.append((lambda step: float(step.seen.order), ANEW))
-    if new.seen.apart < -_TOGETHER < here.seen.apart:
-        tests.append((lambda step: float(step.seen.apart) + _TOGETHER, REORDERED))
-    for test, impact in tests:
-        at = where(here, new, test)
-        if at is not None:
-            found.append((at, impact))
-    return min(found, key=lambda f: float(np.dot(here.tangent, f[0].x - here.x)), default=None)
+def _tests(problem: Shooting, here: Step) -> list[tuple[Callable[[Step], float], int | None]]:
+    """What is positive of a motion of the machine, and the number of the event that is lost where
+    it is not, or what stands for it.
+
+    **Arguments:** the equations; the point from which the walk comes.
+    """
+    # Of events that are together all along the rounding is left out.
+    off = 0.0 if here.seen.apart > _TOGETHER else _TOGETHER
+    approaches = [
+        (lambda step, i=i: float(step.seen.approach[i]), i) for i in range(len(problem.events))
+    ]
+    return [
+        *approaches,
+        (lambda step: float(np.clip(step.seen.nearest.room, -1.0, 1.0)), None),
+        (lambda step: float(step.seen.order), ANEW),
+        (lambda step: float(step.seen.apart) + off, REORDERED),
+    ]
+
+
+def _short_of(problem: Shooting, here: Step, at: Step, scale: np.ndarray) -> Step:
+    """A point between two, right before the second."""
+    length = float(np.dot(here.tangent, (at.x - here.x) / scale))
+    return advance(problem, here.x, here.tangent, scale, (1 - _SHORT) * length)

@@ -152,7 +152,7 @@ class BranchMonitor:
 
     def _grazing(self, here: Step, new: Step) -> SpecialPoint | None:
         """The first of the impacts lost and the stops touched between two points."""
-        first = first_lost(self.problem, here, new, self._where)
+        first = first_lost(self.problem, here, new, self.scale)
         if first is None:
             return None
         at, impact = first

@@ -26,7 +26,7 @@ def refined(problem: Shooting, at: Step, change: Change) -> Step:
     **Arguments:** the equations of the motion with that part; what vanishes.
     """
     clock = np.asarray(problem.parts(jnp.asarray(at.x))[0])
-    if not change.there or problem.conditions or float(at.seen.apart) < _CLOSE:
+    if not change.there or problem.conditions or abs(float(at.seen.apart)) < _CLOSE:
         return at
     first = int(np.argmin(np.abs(clock - change.clock)))
     second, alike = (first + 1) % problem.legs, change.modes[0] == change.modes[2]

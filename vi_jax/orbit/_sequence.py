@@ -1,6 +1,9 @@
 """Where a motion whose events are found by the simulator gains or loses one of them."""
 
 from collections.abc import Callable
+from typing import Any
+
+import numpy as np
 
 from .curve import Step
 from .special import GRAZING, REST
@@ -30,22 +33,23 @@ def changed_sequence(here: Step, last: Step, where: Where) -> tuple[str, Step, s
 
 def _lost_or_gained(here: Step, last: Step, where: Where) -> tuple[str, Step, str] | None:
     """Where the number of rests changes."""
-    before, after = _number(here, "rests"), _number(last, "rests")
+    before, after = _rests(here), _rests(last)
     found = None
     if before != after:
-        found = where(here, last, lambda step: _same(step, "rests", before))
+        found = where(here, last, lambda step: _same(step, _rests, before))
     if found is None:
         return None
     return REST, found[0], f"a rest on a stop is {'gained' if after > before else 'lost'}"
 
 
 def _grazed(here: Step, last: Step, where: Where) -> tuple[str, Step, str] | None:
-    """The first of the places where the number of impacts changes by a graze."""
+    """The first of the places where the number of impacts on one of the stops changes by a
+    graze."""
     for _ in range(_PLACES):
-        count = _number(here, "impacts")
-        if count == _number(last, "impacts"):
+        counts = _impacts(here)
+        if counts == _impacts(last):
             return None
-        found = where(here, last, lambda step, count=count: _same(step, "impacts", count))
+        found = where(here, last, lambda step, counts=counts: _same(step, _impacts, counts))
         if found is None:
             return None
         at, here = found
@@ -54,12 +58,19 @@ def _grazed(here: Step, last: Step, where: Where) -> tuple[str, Step, str] | Non
     return None
 
 
-def _number(step: Step, name: str) -> int:
-    """The number of rests or impacts of a motion."""
-    return int(getattr(step.seen.counted, name))
+def _rests(step: Step) -> int:
+    """The number of rests of a motion."""
+    return int(step.seen.counted.rests)
 
 
-def _same(step: Step, name: str, count: int) -> float:
+def _impacts(step: Step) -> tuple[int, ...]:
+    """The number of impacts of a motion on each stop, of those that are listed, and of all. A stop
+    is grazed in the same step in which a chatter on another one loses a hop."""
+    listed = step.seen.counted.stop.astype(int)
+    return (int(step.seen.counted.impacts), *np.bincount(listed[listed >= 0]).tolist())
+
+
+def _same(step: Step, number: Callable[[Step], Any], wanted: Any) -> float:
     """1 where a motion has so many rests or impacts, else -1; where there is none at all too, as
     beyond a rest that is lost, where the hops of a chatter end one by one in grazings."""
-    return 1.0 if bool(step.good) and _number(step, name) == count else -1.0
+    return 1.0 if bool(step.good) and number(step) == wanted else -1.0

@@ -19,6 +19,10 @@ from .curve import Step, array_of, corrected, first_tangent
 # How far short of a place that has no solution (as a share of the step) one is looked for: choices.
 _SHORT_OF = (1e-6, 1e-5, 1e-4, 1e-3)
 
+# Places without a solution after which none closer is looked for: around a place at which the
+# equations are singular, what is left to be told is the rounding of the corrector. A choice.
+_TRIALS = 5
+
 
 # Of an orbit, as numbers of the host or of a compiled call.
 Unknowns = np.ndarray | Array
@@ -26,6 +30,10 @@ Unknowns = np.ndarray | Array
 
 class _NoValueError(ArithmeticError):
     """A test has no value, because the corrector has no answer there."""
+
+
+class _CloseError(ArithmeticError):
+    """The corrector has had no answer so often that no closer place is to be had."""
 
 
 @runtime_checkable
@@ -115,6 +123,7 @@ def located(
     """
     length = float(np.dot(here.tangent, (new.x - here.x) / scale))
     at: dict[float, Step] = {0.0: here, length: new}
+    silent: list[float] = []
 
     def reached(s: float) -> Step:
         """There, or where there is no answer, as close to where branches cross, right beside."""
@@ -122,11 +131,15 @@ def located(
         for short in _SHORT_OF:
             if bool(step.good):
                 break
+            if short == _SHORT_OF[0]:
+                silent.append(s)
             step = advance(problem, here.x, here.tangent, scale, s - short * length)
         return step
 
     def value(s: float) -> float:
         if s not in at:
+            if len(silent) >= _TRIALS:
+                raise _CloseError
             at[s] = reached(s)
         found = test(at[s])
         if np.isnan(found):
@@ -144,12 +157,14 @@ def located(
         value(root)
     except _NoValueError:
         return None
+    except _CloseError:
+        root = silent[-1]
     # Where branches cross, or a motion shrinks to rest, the corrector has no answer; a point short
     # of it will do.
     for short in _SHORT_OF:
         if any(bool(at[s].good) for s in at if abs(s - root) <= short * abs(length)):
             break
-        with contextlib.suppress(_NoValueError):
+        with contextlib.suppress(_NoValueError, _CloseError):
             value(root - short * length)
     begin, good = test(here), [(s, step) for s, step in at.items() if bool(step.good)]
 

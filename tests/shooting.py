@@ -1,0 +1,62 @@
+"""A shooting code without this package: fixed points of a map, their multipliers, and where
+something becomes zero along them."""
+
+import numpy as np
+from scipy.integrate import solve_ivp
+from scipy.optimize import newton
+
+
+def flown(field, s, x, end, guards, noted=None):
+    """From the state `x` at `s` on until the first guard rises above zero: which one (`None` if
+    `end` comes first), when, the state there; and those on the way at which `noted` rises."""
+
+    def watched(guard, terminal):
+        def value(s, x):
+            return guard(s, x)
+
+        value.terminal, value.direction = terminal, 1
+        return value
+
+    events = [watched(guard, True) for guard in guards]
+    events += [watched(noted, False)] if noted is not None else []
+    found = solve_ivp(field, (s, end), x, events=events, method="DOP853", rtol=1e-13, atol=1e-14)
+    which = [i for i, times in enumerate(found.t_events[: len(guards)]) if times.size]
+    way = found.y_events[-1] if noted is not None else []
+    return (which[0] if which else None), found.t[-1], found.y[:, -1], way
+
+
+def derivative(function, x, h):
+    """By differences of fourth order."""
+    columns = []
+    for step in h * np.eye(len(x)):
+        near = function(x + step) - function(x - step)
+        far = function(x + 2 * step) - function(x - 2 * step)
+        columns.append((8 * near - far) / (12 * h))
+    return np.stack(columns, axis=-1)
+
+
+def fixed_point(function, x, h=1e-4):
+    """The fixed point near `x`, and the derivative of the map there."""
+    x = np.array(x, float)
+    matrix = derivative(function, x, h)
+    for _ in range(20):
+        lacks = function(x) - x
+        x = x - np.linalg.solve(matrix - np.eye(len(x)), lacks)
+        if np.abs(lacks).max() < 3e-12:
+            return x, derivative(function, x, h)
+    raise ArithmeticError("no fixed point")
+
+
+def zero_along(mapped, condition, x, near, width=1e-6):
+    """The parameter near `near` at which `condition(parameter, x, matrix)` of the fixed point of
+    `mapped(parameter, x)` is zero, by the secant method."""
+
+    def value(parameter):
+        return condition(parameter, *fixed_point(lambda x: mapped(parameter, x), x))
+
+    return newton(value, near - width, x1=near + width, tol=1e-12)
+
+
+def doubling(parameter, x, matrix):
+    """Zero where a multiplier is -1."""
+    return np.linalg.det(matrix + np.eye(len(matrix)))
