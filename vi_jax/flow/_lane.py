@@ -181,6 +181,8 @@ class Plan(eqx.Module):
     """Clock of the start, where that is not on the section."""
     until: Scalar | None = None
     """Clock at which the one cycle ends, where that is not the machine's own."""
+    stop: Any = None
+    """What ends a lane early (see `RunOptions`); what it would have recorded then is no number."""
 
     @property
     def kept(self) -> int:

@@ -80,6 +80,7 @@ def planned(
         max_impacts=jnp.asarray(options.max_impacts, dtype),
         begin=_clock_reading(options.begin, dtype),
         until=_clock_reading(options.until, dtype),
+        stop=options.stop,
     )
     return plan, start
 
