@@ -167,6 +167,24 @@ def test_10_a_guess_of_no_stable_motion():
     assert "`orbit` must be a stable orbit" in refused(lambda: vi.minimal_kick(undamped, orbit))
 
 
+class NoStops(vi.AbstractMachine):
+    cycle: float = 1.0
+
+    def field(self, s, x):
+        return vi.OscillatorState(x.V, -x.Y)
+
+
+class NoCycle(vi.AbstractMachine):
+    stops: tuple = ()
+
+    def field(self, s, x):
+        return vi.OscillatorState(x.V, -x.Y)
+
+
+def basins_of(**options):
+    return vi.basins(Machine(), {"start.Y": (0.0, 1.0)}, **options)
+
+
 class NoType(Machine):
     stiffness = 2.0
 
@@ -182,6 +200,12 @@ class Assigns(Machine):
     [
         (lambda: NoType(stiffness=3.0), "in the class, `stiffness: float = 2.0`"),
         (lambda: simulate(Assigns()), "must return new numbers"),
+        (lambda: NoStops(), "`NoStops` has none: write `stops: tuple = ()` in the class"),
+        (lambda: NoCycle(), "must have `cycle`, but `NoCycle` has none: write `cycle: float"),
+        (lambda: simulate(Machine(omega=jnp.ones(3))), "with a row as omega, take `jax.vmap`"),
+        (lambda: basins_of(resolutions=9), "`basins` has no argument `resolutions`; near names: r"),
+        (lambda: basins_of(cycles=9), "`cycles` is not to be given to `basins`"),
+        (lambda: vi.SoftStop(1.0, 50.0, 0.1), "by name, as restitution=…"),
         (
             lambda: instance_of("machine", Machine, vi.AbstractMachine, "one"),
             "`Machine(…)`, for one",

@@ -49,7 +49,7 @@ def check_call(
         first = ", ".join(names[bound:places])
         beyond = f" after {first}" if first else ""
         ask = f"takes its arguments{beyond} by name, as {rest}" if rest else f"takes only {first}"
-        raise TypeError(f"`{who}` {ask}, but got {len(args) - places} without.")
+        raise TypeError(f"`{who}` {ask}, but got {len(args) - places} without a name.")
 
 
 @functools.lru_cache(maxsize=512)

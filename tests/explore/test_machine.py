@@ -68,6 +68,9 @@ def test_ranges_are_within_what_the_machine_allows():
     for subject in made.values():
         for name, control in subject.controls.items():
             assert control.low <= control.value <= control.high
+            # The page opens with the machine's own numbers, not with places next to them.
+            steps = (control.value - control.low) / control.step
+            assert abs(steps - round(steps)) < 1e-9
             for end in (control.low, control.high):
                 if not isinstance(subject.machine, vi.machines.Woodpecker):  # its sleeve and pole
                     subject.at({**subject.beginning(), name: end})  # no machine refuses it

@@ -151,6 +151,48 @@ def test_the_rate_of_escape_is_that_of_the_map():
     assert 1 / float(data.escape_cycle.mean()) > float(found.rate_high)
 
 
+@pytest.mark.parametrize(
+    "of, samples, settle",
+    [
+        ("Y", 4, 2),
+        *(pytest.param(*x, marks=pytest.mark.slow) for x in (("y_max", 0, 2), ("Y", 0, 0))),
+    ],
+)
+def test_a_lane_ends_once_it_has_escaped(of, samples, settle):
+    """To the same numbers as beside another measure, for which all lanes go on."""
+    given = {"settle": settle, "cycles": 32, "noise": NOISE, "key": jax.random.key(2)}
+    alone = vi.Escape(of, high=2.0, samples=samples)
+    other = vi.Density({"V": EDGES}, samples=samples)
+    short, long = (
+        vi.scan(
+            Free(), {"noise.path": np.arange(64)}, start=START, measure=m, progress=False, **given
+        )
+        for m in (alone, (alone, other))
+    )
+    assert 5 < int(short.escaped.sum()) < 64
+    for name in short.data_vars:
+        np.testing.assert_array_equal(short[name], long[name])
+
+
+class Bursting(vi.AbstractMachine):
+    """x' = x², which has no x after 1/x(0)."""
+
+    stops: tuple = ()
+    cycle: float = 0.25
+
+    def field(self, s, x):
+        return {"x": x["x"] ** 2}
+
+
+def test_what_comes_after_an_escape_does_not_count():
+    found = vi.scan(
+        Bursting(), {"start.x": [0.5, 0.05]}, measure=vi.Escape("x", high=1.0 + 1e-6),
+        start={"x": jnp.array(0.5)}, settle=0, cycles=12, progress=False,
+    )  # fmt: skip
+    assert found.escape_cycle.values.tolist() == [5.0, 12.0]
+    assert found.escaped.values.tolist() == [1, 0] and not found.result.values.any()
+
+
 def test_escapes_are_counted_with_those_that_are_watched():
     data = xr.Dataset(
         {

@@ -75,7 +75,7 @@ class Subject:
             low, high = min(low, value), max(high, value)
             unit = unit_of(machine.units, name.removeprefix(START))
             label = f"{name} ({unit})" if unit not in ("", "1") else name
-            self.controls[name] = Control(label, low, high, (high - low) / _STEPS, value)
+            self.controls[name] = Control(label, low, high, _step_of(low, high, value), value)
         self.controls[SETTLE] = Control(SETTLE, 0.0, _LONGEST, 1.0, 0.0)
         self.before = _FEWEST
         """Cycles before what a diagram shows."""
@@ -184,6 +184,13 @@ def _range_of(machine: object, name: str, value: float) -> tuple[float, float]:
     return low + margin * (low == legal.low and legal.open_low), high - margin * (
         high == legal.high and legal.open_high
     )
+
+
+def _step_of(low: float, high: float, value: float) -> float:
+    """The step of a slider: one of its places is the value, to which the page would move it."""
+    if not low < value < high:
+        return (high - low) / _STEPS
+    return (value - low) / max(1, round(_STEPS * (value - low) / (high - low)))
 
 
 def _fitting(do: Callable[[int], Any]) -> int:

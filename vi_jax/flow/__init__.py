@@ -38,6 +38,7 @@ from .methods import preset as preset
 from .methods.exact import lack_of_closed_form as lack_of_closed_form
 from .named import average_names as average_names
 from .named import has_averages as has_averages
+from .named import has_quantities as has_quantities
 from .named import quantities_on as quantities_on
 from .named import quantity_names as quantity_names
 from .noise import WhiteNoise as WhiteNoise

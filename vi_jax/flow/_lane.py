@@ -177,6 +177,12 @@ class Plan(eqx.Module):
     max_impacts: Scalar
     noise: Impulses | None = None
     """Impulses of white noise; without it the program has nothing of it."""
+    begin: Scalar | None = None
+    """Clock of the start, where that is not on the section."""
+    until: Scalar | None = None
+    """Clock at which the one cycle ends, where that is not the machine's own."""
+    stop: Any = None
+    """What ends a lane early (see `RunOptions`); what it would have recorded then is no number."""
 
     @property
     def kept(self) -> int:
@@ -229,7 +235,7 @@ class Plan(eqx.Module):
     def end(self, part: Scalar) -> Scalar:
         """Clock reading at the end of the `part`-th piece of a cycle: an interval, or the way from
         one impulse of noise to the next."""
-        cycle = jnp.asarray(self.machine.cycle, part.dtype)
+        cycle = jnp.asarray(self.machine.cycle if self.until is None else self.until, part.dtype)
         return cycle * (part + 1) / self.instants if self.instants > 1 else cycle
 
     def first_part(self, done: Scalar) -> Scalar:

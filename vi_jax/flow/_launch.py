@@ -28,17 +28,18 @@ def launched(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
         bad = bad | (stop.beyond(machine.coordinates[stop.coordinate].position(start)) > slack)
     bad = jax.lax.stop_gradient(bad)
     zero = jnp.zeros_like(Y)
-    modes = begin_modes(machine, zero, start)
-    check_field(machine, zero, start, modes)
+    s = zero if plan.begin is None else zero + plan.begin
+    modes = begin_modes(machine, s, start)
+    check_field(machine, s, start, modes)
     check_laws(machine, zero)
-    check_events(machine, zero, start, modes)
+    check_events(machine, s, start, modes)
     free = in_modes(machine, modes)
-    here = [rates(free.field, x.position, zero, start) for x in machine.coordinates]
+    here = [rates(free.field, x.position, s, start) for x in machine.coordinates]
     # At rest the acceleration says which way the motion goes.
     direction = tuple(jnp.where(x.v == 0, jnp.sign(x.a), jnp.sign(x.v)) for x in here)
     contact = None
     if plan.rests:
-        growth = [force_rate(free, x.position, free, zero, start) for x in machine.coordinates]
+        growth = [force_rate(free, x.position, free, s, start) for x in machine.coordinates]
         both = enumerate(zip(here, growth, strict=True))
         contact = tuple(_rests_on(plan, k, *x, slack) for k, x in both)
         direction = tuple(
@@ -51,12 +52,12 @@ def launched(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
             rests = contact[stop.coordinate] == to_event(i)
             start = jtu.tree_map(lambda a, b, rests=rests: jnp.where(rests, a, b), at, start)
         if rubs(machine):
-            modes = struck_modes(machine, zero, start, modes, contact=contact)
+            modes = struck_modes(machine, s, start, modes, contact=contact)
     length = zero + jax.lax.stop_gradient(machine.cycle) / plan.method.steps_per_cycle
     if plan.method.adaptive:
         length = length / 8
     return Lane(
-        s=zero,
+        s=s,
         state=start,
         record=plan.fresh(start),
         direction=jax.lax.stop_gradient(direction),

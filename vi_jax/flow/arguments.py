@@ -78,8 +78,15 @@ def planned(
         settle=_countable(cycles, options.settle, parts, dtype),
         max_steps=jnp.asarray(jnp.inf if most is None else most, dtype),
         max_impacts=jnp.asarray(options.max_impacts, dtype),
+        begin=_clock_reading(options.begin, dtype),
+        until=_clock_reading(options.until, dtype),
+        stop=options.stop,
     )
     return plan, start
+
+
+def _clock_reading(given: Any, dtype: Any) -> jax.Array | None:
+    return None if given is None else jnp.asarray(given, dtype)
 
 
 def _warn_of_single_precision() -> None:

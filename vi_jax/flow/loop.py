@@ -51,7 +51,9 @@ def run_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> tuple[Ends
     if not own:
         if plan.noise is not None:
             plan = dataclasses.replace(plan, noise=in_modes_of(way, plan.noise, start))
-        plan, start = dataclasses.replace(plan, machine=way.machine), way.inward(start)
+        # What ends a lane early knows the machine's own state only.
+        plan = dataclasses.replace(plan, machine=way.machine, stop=None)
+        start = way.inward(start)
     numbers, rest = eqx.partition(plan, eqx.is_array)
     ends, (states, records) = lanes.run(
         partial(_begin, rest), partial(_step, rest), _end, (numbers, start, jnp.asarray(wanted)),
@@ -74,7 +76,12 @@ def _step(rest: Plan, inputs: _Inputs, lane: Lane) -> tuple[Lane, lanes.Emitted]
     plan = eqx.combine(inputs[0], rest)
     new = iterate(plan, lane)
     complete = new.completed & (new.lane.done >= plan.settle)
-    return new.lane, lanes.Emitted(_active(plan, new.lane), complete, (new.state, new.record))
+    active = _active(plan, new.lane)
+    if plan.stop is not None:
+        first = new.lane.done <= plan.settle
+        left = plan.stop(plan.machine, new.state, new.record, first)
+        active = active if left is None else active & ~(complete & left)
+    return new.lane, lanes.Emitted(active, complete, (new.state, new.record))
 
 
 def _end(inputs: _Inputs, lane: Lane) -> Ends:

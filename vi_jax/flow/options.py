@@ -11,7 +11,7 @@ from .._checks import count, count_or_traced, flag, one_of
 from ..machine import AbstractMachine
 from .methods import MethodLike, chosen
 
-_NUMBERS = ["settle", "method"]
+_NUMBERS = ["settle", "method", "begin", "until", "stop"]
 _FIXED = [
     "clock", "samples", "impact_log", "event_log", "record", "rests", "max_impacts", "max_steps",
     "log_switches",
@@ -37,6 +37,14 @@ class RunOptions:
     rests: bool | None = None
     max_impacts: int = 1000
     max_steps: int | None = None
+    begin: Any = None
+    """Clock of the start, where that is not on the section."""
+    until: Any = None
+    """The clock at which the one cycle of the run ends; the machine's own by default. Neither is
+    for a machine whose cycles an event ends."""
+    stop: Any = None
+    """Ends a lane early, at a record point: `stop(machine, state, record, first)`, a flag, or
+    `None` where it cannot tell; `first`, whether recording begins there. A pytree."""
     log_switches: bool = False
     """Whether the log of impacts lists switches too, as stops beyond the last."""
 

@@ -38,6 +38,14 @@ class Prepared(NamedTuple):
     outward: Callable[[State], State]
 
 
+# What a machine must say, and how.
+_MUST_SAY = {
+    "stops": "write `stops: tuple = ()` in the class, if there are none",
+    "cycle": "write `cycle: float = …` in the class, its length in `s`, or a property",
+    "field": "write `def field(self, s, state)`, which returns the rate of each part of the state",
+}
+
+
 def _as_it_is(state: State) -> State:
     return state
 
@@ -116,6 +124,14 @@ class AbstractMachine(Clocked, Observed, Worded):
     """
 
     stops: eqx.AbstractVar[tuple[RigidStop, ...]]
+
+    def __new__(cls, *args: Any, **kwargs: Any):
+        missing = {*cls.__abstractmethods__, *getattr(cls, "__abstractvars__", ())}
+        if missing:
+            name = next((x for x in _MUST_SAY if x in missing), min(missing))
+            how = f": {_MUST_SAY[name]}" if name in _MUST_SAY else ""
+            raise TypeError(f"A machine must have `{name}`, but `{cls.__name__}` has none{how}.")
+        return super().__new__(cls, *args, **kwargs)
 
     @abc.abstractmethod
     def field(self, *args: Any, **kwargs: Any) -> State:

@@ -29,4 +29,4 @@ class Worded(Shown):
 
     def place_of(self, since_section: float, cycles: int) -> str:
         """A reading of the clock within a motion of so many cycles, in words."""
-        return f"clock {since_section:.6g} of its {self.period_of(cycles)}"
+        return f"clock {since_section:.6g} after its section (motion of {self.period_of(cycles)})"

@@ -274,8 +274,9 @@ class Orbit(Summarized):
             lines.append(f"  only {listed} of {count} impacts are listed: see `impact_log`")
         values = [complex_in_words(m, 7, 1e-12) for m in np.asarray(self.multipliers)]
         lines.append(f"  multipliers: {', '.join(first_few(values))}")
-        room = in_unit(f"{float(self.clearance):.4g}", units, "position")
-        lines.append(f"  clearance: {room}")
+        if np.isfinite(float(self.clearance)):
+            room = in_unit(f"{float(self.clearance):.4g}", units, "position")
+            lines.append(f"  clearance: {room}")
         lines.append(
             f"  residual {float(self.residual):.2g} after {int(self.iterations)} steps, estimated "
             f"error of the search {float(self.error):.2g}"

@@ -14,28 +14,15 @@ from .._types import State
 from ..flow import MethodLike
 from ..machine import AbstractMachine, Summarized, components, state_in_words
 from ..orbit import Orbit
-from ._edge_state import EdgeState, tracked
-from ._motion import settled_orbit, settling_on
-from ._rays import NARROWER, Exits, Kick, first_exits, narrowed, nearer, nearest_first
+from ._edge_state import EdgeState
+from ._exact import ASIDE, Found, Here, Look, exact, worst
+from ._moments import Moments
+from ._motion import settled_orbit, settling_on, stands_still
+from ._rays import Kick
 from ._settling import ELSEWHERE, RETURNS, Row, Settling
-from ._shortest import shortest
 
-# Of the kick, relative to it: by how much more and less simulation confirms it.
-_ASIDE = 1e-6
-
-# Rounds of looking more closely around the best rays: before Newton's method, and instead of it.
-# Choices: the latter narrow a turn of 1/128 to 1e-8.
-_LOOKS, _MORE_LOOKS = 2, 14
-
-# Rounds of bisection by eight that leave nothing between two numbers of double precision.
-_ROUNDING = 18
-
-# How much longer than what rays found Newton's may be, and how much shorter: else it is another
-# kick. A choice, for rays as dense as the default.
-_LONGER, _SHORTER = 1e-4, 0.05
-
-# Two kicks are the same within this, relative to their norm; edges are tracked for so many rounds.
-_SAME, _ROUNDS = 1e-4, 40
+# Two kicks are the same within this, relative to their norm. A choice.
+_SAME = 1e-4
 
 
 class MinimalKick(Summarized):
@@ -47,6 +34,10 @@ class MinimalKick(Summarized):
     """√(Σ (weight·kick)²)."""
     start: State
     """The state just after the kick, on the boundary of the basin."""
+    cycle: int = eqx.field(static=True)
+    """In which cycle of its period the motion is kicked."""
+    phase: Any
+    """How long after the section of that cycle, in the machine's clock."""
     settles: Orbit | None
     """The motion that the machine settles on after a slightly harder kick; `None` where it is none
     that repeats within `longest` cycles and that `find_orbit` finds, as an equilibrium of a machine
@@ -83,13 +74,18 @@ class MinimalKick(Summarized):
         edge = self.edge.summary().splitlines()
         lines = [
             f"Minimal kick of norm {float(self.norm):.9g}: {parts}",
-            f"  to: {state_in_words(self.start, 9, units)}",
+            f"  to: {state_in_words(self.start, 9, units)}{self._when()}",
             f"  settles on: {leads}",
             f"  edge: {edge[0] if len(edge) == 1 else f'{self.edge.kind}, {edge[1]}'}",
             f"  residual {float(self.residual):.1g} ({how}), {sure} by simulation at 1 ± 1e-6",
         ]
         lines += [f"  another: norm {float(other.norm):.9g}" for other in self.others]
         return "\n".join(lines)
+
+    def _when(self) -> str:
+        if not self.cycle and not float(self.phase):
+            return ""
+        return f", {float(self.phase):.9g} after the section of cycle {self.cycle}"
 
 
 def minimal_kick(
@@ -100,6 +96,8 @@ def minimal_kick(
     weights: Mapping[str, float] | None = None,
     bounds: Mapping[str, tuple[float, float]] | None = None,
     cycle: int = 0,
+    phase: float | str = 0.0,
+    phases: int = 16,
     largest: float | None = None,
     directions: int = 128,
     points: int = 32,
@@ -124,14 +122,16 @@ def minimal_kick(
 
     - `machine`: the machine.
     - `orbit`: the motion that is kicked, on the section: a stable `Orbit`, or a state on a motion
-      that repeats. Of a machine without a drive it may be an equilibrium. Kicks at another phase
-      are those of the orbit on another section (`Scene.at_section`).
+      that repeats. Of a machine without a drive it may be an equilibrium.
     - `components`: names of the numbers of the state that are kicked, such as `["V"]`; all of them
       by default.
     - `weights`: of some of them, by which they count in the norm, above 0; 1 by default. With
       velocities weighed by √(m/2) and no places the norm squared is an energy.
     - `bounds`: the range of the kicked state in some of them, such as `{"Y": (-3.0, 2.0)}`.
     - `cycle`: in which cycle of its period an orbit of several is kicked, from 0 on.
+    - `phase`: how long after the section of that cycle, in the machine's clock (a crank angle, or a
+      time); or `"worst"` for the moment of the whole period at which the least kick is smallest:
+      `phases` of each cycle are looked at, and the moment is refined beside the best of them.
     - `largest`: norm up to which kicks are looked for; by default until one leads elsewhere.
     - `directions`, `points`: rays, and points on each that are simulated in a round; `candidates`:
       rays that leave sooner than their neighbours, from which kicks are made exact.
@@ -150,11 +150,13 @@ def minimal_kick(
     progress = flag("progress", progress)
     if largest is not None:
         largest = given_number("largest", largest, low=0.0, open_low=True)
+    phases = count("phases", phases, least=2)
     settling, start = settling_on(
         machine, orbit, settle, tolerance, longest, method, "orbit", cycle
     )
     kick = _kicks(settling, start, components, weights or {}, bounds or {})
-    angle = 2 * np.pi / directions ** (1 / max(1, kick.size - 1))
+    when, since = _moments(settling, start, cycle, phase)
+    look = Look(directions, points, largest, candidates, longest, seed)
     kicks: list[MinimalKick] = []
 
     def smallest() -> MinimalKick:
@@ -165,36 +167,49 @@ def minimal_kick(
         return Interrupted("search for kicks", smallest()) if kicks else None
 
     with at_work("minimal kick", kept, progress=progress, unit="start") as settling.tell:
-        found, best = _ways_out(settling, kick, directions, points, largest, candidates, seed)
-        for ray in best:
-            radius = float(found.outside[ray])
-            new = _exact(settling, kick, found.directions[ray], radius, angle, longest, seed)
+        here = Here(settling, kick, cycle, 0.0)
+        if when is not None:
+            here = here.at(when, cycle, since or 0.0)
+        if when is not None and since is None:
+            here, look = worst(when, here, look, phases)
+        found = look.exits(here)
+        for ray in look.best(found):
+            new = exact(here, found.directions[ray], float(found.outside[ray]), look)
+            new = _described(here, new, longest)
             if all(_apart(new, old) > _SAME for old in kicks):
                 kicks.append(new)
     return smallest()
 
 
-def _ways_out(
-    settling: Settling,
-    kick: Kick,
-    directions: int,
-    points: int,
-    largest: float | None,
-    candidates: int,
-    seed: int,
-) -> tuple[Exits, list[int]]:
-    """Where rays leave the basin, and which of them leave sooner than their neighbours.
+def _moments(
+    settling: Settling, start: Row, cycle: int, phase: float | str
+) -> tuple[Moments | None, float | None]:
+    """The moments of the motion, `None` where it is kicked on its section; and the phase, `None`
+    for the worst.
 
-    **Raises:** `ValueError` if none leaves it.
+    **Raises:** `ValueError` or `TypeError` that names the argument.
     """
-    found = first_exits(settling, kick, directions, points, largest, seed)
-    best = nearest_first(found, candidates)
-    if not best or not np.isfinite(found.outside[best[0]]):
+    worst = isinstance(phase, str)
+    if worst and phase != "worst":
+        raise ValueError(f'Argument `phase` must be a number or "worst", but got {phase!r}.')
+    if worst and cycle:
         raise ValueError(
-            "No kick leads elsewhere, of those that `components`, `bounds` and `largest` allow: "
-            "the motion came back from all of them."
+            'Argument `cycle` must be left out with `phase="worst"`, which looks at every cycle of '
+            f"the period, but got {cycle}."
         )
-    return found, best
+    since = None if worst else given_number("phase", phase, low=0.0)
+    if since == 0:
+        return None, since
+    if stands_still(settling.the_map.machine, settling.state(start)):
+        raise ValueError("Argument `phase` must be 0 for an equilibrium, which is always the same.")
+    when = Moments(settling, start, cycle)
+    length = when.lengths[when.cycle(cycle)]
+    if since is not None and not since < length:
+        raise ValueError(
+            f"Argument `phase` must be less than the {length:.9g} that its cycle takes, but got "
+            f"{since:.9g}. See `cycle`."
+        )
+    return when, since
 
 
 def _kicks(
@@ -236,51 +251,10 @@ def _kicks(
     return kick
 
 
-def _exact(
-    settling: Settling,
-    kick: Kick,
-    unit: Row,
-    radius: float,
-    angle: float,
-    longest: int,
-    seed: int,
-) -> MinimalKick:
-    """The shortest kick near a ray that leaves the basin at a radius.
-
-    **Arguments:** `angle`, how far the rays around are from it.
-    """
-    unit, inside, outside = nearer(settling, kick, unit, radius, angle, _LOOKS, seed)
-    line = narrowed(
-        settling, kick, Exits(unit[None], np.array([inside]), np.array([outside])), _ROUNDING
-    )
-    ends = kick.rows(np.array([line.inside[0], line.outside[0] * (1 + _ASIDE)])[:, None] * unit)
-    edge = tracked(settling, ends[0], ends[1], longest, _ROUNDS)
-    z, residual, exact = unit * line.outside[0], np.inf, False
-    if edge.kind == "saddle" and edge.orbit is not None:
-        better = shortest(settling, kick, edge.orbit, z)
-        if better is not None:
-            change = np.linalg.norm(better.z) / line.outside[0] - 1
-            exact = bool(-_SHORTER <= change <= _LONGER)
-            if exact:
-                z, residual = better.z, better.residual
-    if not exact:
-        narrow = angle / NARROWER**_LOOKS
-        unit, inside, outside = nearer(settling, kick, unit, outside, narrow, _MORE_LOOKS, seed)
-        z, residual = unit * outside, (outside - inside) / outside
-    return _described(settling, kick, z, residual, exact, edge, longest)
-
-
-def _described(
-    settling: Settling,
-    kick: Kick,
-    z: Row,
-    residual: float,
-    exact: bool,
-    edge: EdgeState,
-    longest: int,
-) -> MinimalKick:
+def _described(here: Here, found: Found, longest: int) -> MinimalKick:
     """A kick, with what simulation says of it."""
-    aside = kick.rows(np.array([1 - _ASIDE, 1 + _ASIDE])[:, None] * z)
+    settling, kick, z = here.settling, here.kick, found.z
+    aside = kick.rows(np.array([1 - ASIDE, 1 + ASIDE])[:, None] * z)
     verdicts = settling.judge(aside)
     row = kick.rows(z)
     changed = components(settling.state(row - kick.start))
@@ -290,9 +264,11 @@ def _described(
         norm=float(np.linalg.norm(z)),
         start=settling.state(row),
         settles=settled_orbit(settling, aside[1], longest),
-        edge=edge,
-        residual=float(residual),
-        exact=exact,
+        cycle=here.cycle,
+        phase=here.phase,
+        edge=found.edge,
+        residual=float(found.residual),
+        exact=found.exact,
         confirmed=bool(verdicts[0] == RETURNS and verdicts[1] == ELSEWHERE),
         others=(),
         lanes=settling.lanes,

@@ -78,10 +78,11 @@ def settled_rows(settling: Settling, start: Row, longest: int) -> Rows | None:
     """The section states of one period of the motion that a start settles on; `None` if it has none
     of at most `longest` cycles, or comes to no end."""
     every = np.ones(1, bool)
-    last, good, _ = advanced(settling.the_map, settling.like, start[None], settling.settle, every)
+    the_map, like, begin = settling.the_map, settling.like, settling.begin
+    last, good, _ = advanced(the_map, like, start[None], settling.settle, every, begin)
     if not good[0]:
         return None
-    rows = settling.trail(last, 2 * longest)[0]
+    rows = settling.starting(0.0).trail(last, 2 * longest)[0]
     for period in range(1, longest + 1):
         apart = np.abs(rows[period:] - rows[:-period]) / (1 + np.abs(rows[period:]))
         if apart.max() <= _SAME:

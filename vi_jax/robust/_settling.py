@@ -1,5 +1,6 @@
 """Which starts come back to a motion, and where states go: many lanes of one compiled program."""
 
+import copy
 import math
 from typing import Any
 
@@ -12,8 +13,8 @@ from jaxtyping import Array, Bool, Float, Int
 from .._at_work import Tell, silent
 from .._programs import compiled
 from .._types import State
-from ..flow import RESULTS, RunOptions, simulate, simulate_pool
-from ..machine import in_rows
+from ..flow import RESULTS, Run, RunOptions, simulate_pool
+from ..machine import in_rows, is_autonomous
 from ..orbit import CycleMap
 
 Row = Float[np.ndarray, " _"]
@@ -46,25 +47,44 @@ class Settling:
     has shrunk to rounding, where its sections would be noise.
 
     **Arguments:** the map of one cycle; a state, for its structure; the motion's section states;
-    cycles after which a start that has not come back is elsewhere; the tolerance.
+    cycles after which a start that has not come back is elsewhere; the tolerance; how long after
+    the section starts are, by the clock of a machine with a drive (a cycle ends on its section).
     """
 
-    def __init__(self, the_map: CycleMap, like: State, motion: Rows, settle: int, tolerance: float):
+    def __init__(
+        self, the_map: CycleMap, like: State, motion: Rows, settle: int, tolerance: float,
+        begin: float = 0.0,
+    ):  # fmt: skip
         self.the_map, self.like, self.motion = the_map, like, motion
+        self.begin = begin
         self.settle, self.tolerance = settle, tolerance
-        self.lanes = 0
-        """Starts judged so far."""
+        self._judged_so_far: list[int] = []
         self.tell: Tell = silent
         """Told of each start that is judged."""
+
+    def starting(self, begin: float) -> "Settling":
+        """The same for starts at another clock."""
+        new = copy.copy(self)
+        new.begin = begin
+        return new
+
+    @property
+    def lanes(self) -> int:
+        """Starts judged so far, those at other clocks included."""
+        return sum(self._judged_so_far)
 
     def state(self, row: object) -> State:
         """A state from its numbers."""
         return ravel_pytree(self.like)[1](jnp.asarray(row))
 
-    def distance(self, rows: Rows) -> Float[np.ndarray, " lanes"]:
-        """How far section states lie from the motion's nearest one, relative to 1 + |state|."""
+    def distances(self, rows: Rows) -> Float[np.ndarray, "lanes sections"]:
+        """How far section states lie from each of the motion's, relative to 1 + |state|."""
         apart = np.abs(rows[:, None] - self.motion) / (1 + np.abs(self.motion))
-        return apart.max(axis=2).min(axis=1)
+        return apart.max(axis=2)
+
+    def distance(self, rows: Rows) -> Float[np.ndarray, " lanes"]:
+        """How far section states lie from the motion's nearest one."""
+        return self.distances(rows).min(axis=1)
 
     def judge(self, rows: Rows) -> Int[np.ndarray, " lanes"]:
         """`RETURNS`, `ELSEWHERE` or `INADMISSIBLE` for each start."""
@@ -74,21 +94,24 @@ class Settling:
     def _judged(self, rows: Rows) -> Int[np.ndarray, " lanes"]:
         """The same for at most as many as the program has lanes."""
         count = len(rows)
-        self.lanes += count
+        self._judged_so_far.append(count)
         self.tell(count)
         here = np.concatenate([rows, np.broadcast_to(rows[:1], (_LANES - count, rows.shape[1]))])
         goes_on = np.arange(_LANES) < count
         # What is on the motion need not come back to it; an equilibrium meets no section at all.
-        verdict = np.where(self.distance(here) > 0, ELSEWHERE, RETURNS)
+        off = self.distance(here) > 0
+        verdict = np.where(off | (self.begin > 0), ELSEWHERE, RETURNS)
         goes_on &= verdict == ELSEWHERE
         done, step = 0, 1
         while done < self.settle and goes_on.any():
             step = min(max(1, done // 4), self.settle - done)
-            there, good, bad_start = advanced(self.the_map, self.like, here, step, goes_on)
+            begin = 0.0 if done else self.begin
+            there, good, bad_start = advanced(self.the_map, self.like, here, step, goes_on, begin)
             if not done:
                 verdict[goes_on & bad_start] = INADMISSIBLE
             # What repeats has settled: to go on would cost, and end an equilibrium in noise.
             moves = np.max(np.abs(there - here) / (1 + np.abs(here)), axis=1) > _STILL
+            moves |= begin > 0
             here = np.where((goes_on & good)[:, None], there, here)
             goes_on &= good
             returned = goes_on.copy()
@@ -105,7 +128,7 @@ class Settling:
             part, wanted = rows[i : i + _LANES], np.arange(_LANES) < len(rows) - i
             filled = np.broadcast_to(part[:1], (_LANES - len(part), rows.shape[1]))
             there, good, _ = advanced(
-                self.the_map, self.like, np.concatenate([part, filled]), cycles, wanted
+                self.the_map, self.like, np.concatenate([part, filled]), cycles, wanted, self.begin
             )
             found.append(np.where(good[:, None], there, np.nan)[: len(part)])
         return np.concatenate(found)
@@ -125,10 +148,11 @@ class Settling:
 
     def trail(self, rows: Rows, cycles: int) -> Float[np.ndarray, "lanes sections states"]:
         """The section states of some motions, from their starts on."""
-        parts, here = [rows[:, None]], rows
+        parts, here, begin = [rows[:, None]], rows, self.begin
         for _ in range(math.ceil(cycles / TRAIL)):
-            parts.append(np.asarray(_trail(self.the_map, self.like, here))[:, 1:])
-            here = parts[-1][:, -1]
+            later = _trail(self.the_map, self.like, jnp.asarray(here), jnp.asarray(begin))
+            parts.append(np.asarray(later)[:, 1:])
+            here, begin = parts[-1][:, -1], 0.0
         return np.concatenate(parts, axis=1)[:, : cycles + 1]
 
     def bisected(self, inside: Row, outside: Row, width: float) -> tuple[Row, Row]:
@@ -146,58 +170,71 @@ class Settling:
 
 
 def advanced(
-    the_map: CycleMap, like: State, rows: object, cycles: int, wanted: object
+    the_map: CycleMap, like: State, rows: object, cycles: int, wanted: object, begin: float = 0.0
 ) -> tuple[Rows, Bool[np.ndarray, " lanes"], Bool[np.ndarray, " lanes"]]:
-    """States so many cycles later, whether they got there, and whether they were no starts."""
-    found = _advanced(the_map, like, jnp.asarray(rows), jnp.asarray(cycles), jnp.asarray(wanted))
+    """States so many cycles later, whether they got there, and whether they were no starts.
+
+    **Arguments:** `begin`, the clock of the starts since the section.
+    """
+    numbers = (jnp.asarray(x) for x in (rows, cycles, wanted, begin))
+    found = _advanced(the_map, like, *numbers)
     rows, good, bad = (np.asarray(x) for x in found)
     return rows, good, bad
 
 
 @compiled
-def _advanced(the_map: CycleMap, like: State, rows: Array, cycles: Array, wanted: Array):
-    unravel = ravel_pytree(like)[1]
-    options = RunOptions(
-        settle=cycles - 1, method=the_map.method, record="sections", rests=the_map.rests
-    )
-    run = simulate_pool(lambda x: (the_map.machine, unravel(x)), rows, 1, options, wanted)
+def _advanced(
+    the_map: CycleMap, like: State, rows: Array, cycles: Array, wanted: Array, begin: Array
+):
+    run = _runs(the_map, like, rows, 1, cycles - 1, begin, wanted)
     last = in_rows(run.sections, 2)[:, -1]
     good = run.successful & jnp.isfinite(last).all(axis=1)
     return last, good, run.result == RESULTS.bad_start
 
 
+def _runs(
+    the_map: CycleMap, like: State, rows: Array, cycles: int, settle: Any, begin: Any,
+    wanted: Array | None = None, until: Any = None,
+) -> Run:  # fmt: skip
+    """Runs from some states, their sections recorded; with clocks for a machine with a drive."""
+    unravel = ravel_pytree(like)[1]
+    driven = not is_autonomous(the_map.machine, like)
+    options = RunOptions(
+        settle=settle, method=the_map.method, record="sections", rests=the_map.rests,
+        begin=begin if driven else None, until=until,
+    )  # fmt: skip
+    return simulate_pool(lambda x: (the_map.machine, unravel(x)), rows, cycles, options, wanted)
+
+
 @compiled
-def _trail(the_map: CycleMap, like: State, rows: Array) -> Array:
-    def one(x):
-        run = simulate(
-            the_map.machine, ravel_pytree(like)[1](x), TRAIL, method=the_map.method,
-            record="sections", rests=the_map.rests,
-        )  # fmt: skip
-        return in_rows(run.sections)
-
-    return jax.vmap(one)(jnp.asarray(rows))
+def _trail(the_map: CycleMap, like: State, rows: Array, begin: Array) -> Array:
+    return in_rows(_runs(the_map, like, rows, TRAIL, 0, begin).sections, 2)
 
 
 @compiled
-def images(the_map: CycleMap, like: State, rows: Array, cycles: Array) -> tuple[Array, Array]:
+def until(the_map: CycleMap, like: State, row: Array, clock: Array) -> Array:
+    """The state of a machine with a drive at a clock within the cycle that begins in a state."""
+    return in_rows(_runs(the_map, like, row[None], 1, 0, None, until=clock).sections, 2)[0, -1]
+
+
+@compiled
+def images(
+    the_map: CycleMap, like: State, rows: Array, cycles: Array, begin: Array
+) -> tuple[Array, Array]:
     """States so many cycles later (at least one), and their derivatives by the states.
 
     **Arguments:** `rows`, (lanes, states); `cycles`, another number of which is not another
-    program.
+    program; `begin`, the clock of the states since the section.
 
     **Returns:** (lanes, states) and (lanes, states, states).
     """
 
-    def end(x):
-        run = simulate(
-            the_map.machine, ravel_pytree(like)[1](x), 1, settle=cycles - 1,
-            method=the_map.method, record="sections", rests=the_map.rests,
-        )  # fmt: skip
-        last = in_rows(run.sections)[-1]
-        return last, last
+    def ends(rows):
+        return in_rows(_runs(the_map, like, rows, 1, cycles - 1, begin).sections, 2)[:, -1]
 
-    def both(x):
-        jacobian, last = jax.jacfwd(end, has_aux=True)(x)
-        return last, jacobian
+    def along(direction):
+        return jax.jvp(ends, (rows,), (jnp.broadcast_to(direction, rows.shape),))
 
-    return jax.vmap(both)(rows)
+    basis = jnp.eye(rows.shape[1], dtype=rows.dtype)
+    last, slopes = jax.vmap(along, out_axes=(None, 2))(basis)
+    return last, slopes

@@ -55,6 +55,7 @@ class _Manifold(NamedTuple):
     the_map: CycleMap
     like: State
     kick: Kick
+    begin: float
     cycles: int
     saddle: Row
     across: Row
@@ -62,9 +63,8 @@ class _Manifold(NamedTuple):
 
     def at(self, z: Kicks) -> tuple[Row, Kicks]:
         """g and ∇g of some kicks."""
-        there, jacobian = images(
-            self.the_map, self.like, jnp.asarray(self.kick.rows(z)), jnp.asarray(self.cycles)
-        )
+        numbers = (jnp.asarray(x) for x in (self.kick.rows(z), self.cycles, self.begin))
+        there, jacobian = images(self.the_map, self.like, *numbers)
         slope = self.across @ np.asarray(jacobian)[:, :, list(self.kick.places)]
         return (np.asarray(there) - self.saddle) @ self.across, slope / self.kick.weights
 
@@ -86,7 +86,10 @@ def shortest(settling: Settling, kick: Kick, saddle: Orbit, z: Row) -> Shortest 
     last = np.inf
     for more in range(_PERIODS):
         cycles = begin + more * period
-        edge = _Manifold(settling.the_map, settling.like, kick, cycles, rows[place], normals[place])
+        edge = _Manifold(
+            settling.the_map, settling.like, kick, settling.begin, cycles, rows[place],
+            normals[place],
+        )  # fmt: skip
         found = _newton(edge, z)
         if found is None or np.linalg.norm(found.z - first) > _STRAYS * np.linalg.norm(first):
             return before

@@ -1,9 +1,11 @@
 """`basins`: which start goes to which motion, the motions found on the way."""
 
+import difflib
 import functools
+import inspect
 import math
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -25,6 +27,9 @@ from ._shaken import START
 from .grid import axes_of
 from .measures import AbstractMeasure, Regime
 from .regime import CODES, REGIMES, flags
+
+# Options of `scan` that verbs which scan starts set themselves.
+_SET = {"measure", "paired", "cycles", "derivatives", "axes"}
 
 
 class _Mark(AbstractMeasure):
@@ -91,19 +96,14 @@ def basins(
     followed where it ended (`period`, and a section state).
     """
     machine = machine_of(machine)
-    for name in ("measure", "paired", "cycles", "derivatives"):
-        if name in options:
-            raise TypeError(f"Argument `{name}` is `scan`'s, and not to be given to `basins`.")
+    check_options(basins, options, ())
     given_number("apart", apart, low=0.0, open_low=True)
     axes = starts_in(region, resolution, samples, count("seed", seed))
     method = chosen(machine, method)
-    measure = measures(longest, tolerance)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", LanesFailed)
-        data = scan(
-            machine, axes, measure=measure, start=start, settle=settle, method=method,
-            paired=samples is not None, progress=progress, **options,
-        )  # fmt: skip
+    data = followed(
+        machine, axes, longest, tolerance, start=start, settle=settle, method=method,
+        paired=samples is not None, progress=progress, **options,
+    )  # fmt: skip
     begin = machine.start() if start is None else start
     kept = functools.partial(ScanInterrupted, data, options.get("store"))
     with at_work("sorting", kept, progress=False):
@@ -121,12 +121,12 @@ def sorted_out(
 ) -> Basins:
     """The basins in what a scan of starts found.
 
-    **Arguments:** the scan's data, with `measures`; the machine; a start, of which the region's
+    **Arguments:** what `followed` found; the machine; a start, of which the region's
     parts are replaced; `apart`, `longest` and `method` as for `basins`.
     """
     names = list(components(begin))
 
-    def followed(state: np.ndarray, cycles: int) -> np.ndarray:
+    def sections(state: np.ndarray, cycles: int) -> np.ndarray:
         here = begin
         for name, value in zip(names, state, strict=True):
             here = with_leaf(here, name, value)
@@ -136,7 +136,7 @@ def sorted_out(
             [np.asarray(x)[1 : cycles + 1] for x in components(run.sections, 1).values()], axis=1
         )
 
-    label, motions = _labelled(data, names, apart, followed)
+    label, motions = _labelled(data, names, apart, sections)
     impacts = np.asarray(data["impacts"]).ravel()
     attractors = [_attractor(i, m, names, label, impacts) for i, m in enumerate(motions)]
     parts = {name: float(np.mean(label == number)) for name, number in CODES.items()}
@@ -178,9 +178,38 @@ def _can_be(machine: AbstractMachine, begin: object, values: Mapping[str, float]
     return True
 
 
-def measures(longest: int, tolerance: float | None) -> tuple[AbstractMeasure, ...]:
-    """What a scan of starts has to measure for `sorted_out`."""
-    return Regime(longest=longest, tolerance=tolerance), _Mark(longest)
+def check_options(
+    verb: Callable[..., Any], options: Mapping[str, Any], refused: Iterable[str]
+) -> None:
+    """**Raises:** `TypeError` for an option that is none of `scan`'s, or one that a verb which
+    scans starts does not take.
+
+    **Arguments:** `refused`, those that this verb alone does not take.
+    """
+    who = verb.__name__
+    own, of_scan = ({*inspect.signature(x).parameters} - {"options"} for x in (verb, scan))
+    for name in options:
+        if name in {*_SET, *refused}:
+            raise TypeError(f"Argument `{name}` is not to be given to `{who}`.")
+        if name not in of_scan:
+            near = difflib.get_close_matches(name, sorted(own | of_scan - _SET))
+            hint = f"near names: {', '.join(near)}" if near else f"see `help(vi_jax.{who})`"
+            raise TypeError(f"`{who}` has no argument `{name}`; {hint}.")
+
+
+def followed(
+    machine: AbstractMachine,
+    axes: Mapping[str, Any],
+    longest: int,
+    tolerance: float | None,
+    **options: Any,
+) -> "xr.Dataset":
+    """What a scan finds of starts, for `sorted_out`; those that fail are no news."""
+    measure: tuple[AbstractMeasure, ...]
+    measure = Regime(longest=longest, tolerance=tolerance), _Mark(longest)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", LanesFailed)
+        return scan(machine, axes, measure=measure, **options)
 
 
 def starts_in(

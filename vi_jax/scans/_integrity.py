@@ -2,7 +2,6 @@
 
 import functools
 import math
-import warnings
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -16,10 +15,9 @@ from .._types import State
 from ..flow import MethodLike, chosen, machine_of, tidy
 from ..machine import AbstractMachine, attributes, check_leaf, summary_table, unit_of, with_leaf
 from ..orbit import impacts_in_words
-from ._basins import measures, sorted_out, starts_in
+from ._basins import check_options, followed, sorted_out, starts_in
 from ._computed import ScanInterrupted
 from ._found import Attractor, Basins, Integrity
-from ._scan import LanesFailed, scan
 from ._shaken import START
 from .grid import axes_of
 
@@ -168,20 +166,16 @@ def integrity_profile(
     """
     machine = machine_of(machine)
     check_leaf(machine, parameter)
-    for name in ("measure", "paired", "cycles", "derivatives", "samples", "seed"):
-        if name in options:
-            raise TypeError(f"Argument `{name}` is not to be given to `integrity_profile`.")
+    check_options(integrity_profile, options, ("samples", "seed"))
     given_number("apart", apart, low=0.0, open_low=True)
     row = np.unique(axes_of({parameter: values}, "values")[parameter])
     axes = starts_in(region, resolution, None, 0)
     _check_scales(axes, scales)
     method = chosen(machine, method)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", LanesFailed)
-        data = scan(
-            machine, {parameter: row, **axes}, measure=measures(longest, tolerance), start=start,
-            settle=settle, method=method, progress=progress, **options,
-        )  # fmt: skip
+    data = followed(
+        machine, {parameter: row, **axes}, longest, tolerance, start=start, settle=settle,
+        method=method, progress=progress, **options,
+    )  # fmt: skip
     found, integrity = [], []
     kept = functools.partial(ScanInterrupted, data, options.get("store"))
     with at_work("basins", kept, progress=progress, unit="value", total=row.size) as tell:

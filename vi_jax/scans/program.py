@@ -33,6 +33,7 @@ from ._asked import cycles_for, measures_of, samples_for
 from ._shaken import MACHINE, NOISE, START, Shaken, part_of, shaken_by
 from .grid import Blocks
 from .measures import AbstractMeasure, Numbers
+from .statistics import Escape
 
 _USUAL = RunOptions()
 
@@ -235,6 +236,7 @@ def make_program(
     options = dataclasses.replace(
         options, settle=settle, method=method, rests=rests,
         record="motion" if motion else "sections", samples=samples_for(measures),
+        stop=_stop_of(measures, derivatives),
     ).checked(template)  # fmt: skip
     return ScanProgram(
         machine=_as_arrays(template),
@@ -246,6 +248,14 @@ def make_program(
         options=dataclasses.replace(_as_arrays(options), settle=jnp.asarray(settle)),
         shaken=shaken,
     )
+
+
+def _stop_of(measures: tuple[AbstractMeasure, ...], derivatives: tuple[str, ...]) -> Any:
+    """What ends a lane before its time: that it has escaped, where nothing else is asked."""
+    if len(measures) != 1 or not isinstance(measures[0], Escape) or derivatives:
+        return None
+    escape = measures[0]
+    return jtu.Partial(Escape.leaves, escape)
 
 
 def _averages_of(machine: Any, axes: Iterable[str], start: State) -> tuple[str, ...]:

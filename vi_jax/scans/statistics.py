@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._checks import count, given_number, instance_of
-from .._types import Machine
-from ..flow import Run
+from .._types import Machine, State
+from ..flow import Run, has_quantities
 from ..machine import components
 from .grid import axes_of
 from .measures import About, AbstractMeasure
@@ -20,6 +20,12 @@ _COLUMNS = (
     "impacts", "y_min", "y_max", "impact_speed", "impact_energy", "rests", "duration",
     "frequency_ratio",
 )  # fmt: skip
+
+# Of those, what the loop has at hand as a cycle ends: the names in its record.
+_OF_CYCLE = {
+    "impacts": "impacts", "y_min": "y_min", "y_max": "y_max", "impact_speed": "speed",
+    "impact_energy": "loss",
+}  # fmt: skip
 
 Of = str | Callable[..., Any]
 
@@ -274,12 +280,32 @@ class Escape(_Observed):
         first = {**self.attributes["escape_cycle"], "step": step}
         return {**self.attributes, "escape_cycle": first}
 
+    def leaves(self, machine: Machine, state: State, record: Any, first: Any) -> Any:
+        """Whether a lane has left, seen from the loop at a record point, so that it need not go on;
+        `None` where only the whole record tells.
+
+        **Arguments:** the state there; the record of the interval that ends there; `first`, whether
+        recording begins there.
+        """
+        parts, name = components(state), self.of
+        if not isinstance(name, str) or has_quantities(machine):
+            return None
+        if name in parts:
+            return self._outside(parts[name])
+        if self.samples or name not in _OF_CYCLE:
+            return None
+        value = getattr(record, _OF_CYCLE[name])
+        return None if value is None else self._outside(value) & ~first
+
+    def _outside(self, value: Any) -> Any:
+        return (value < self.low) | (value > self.high)
+
     def __call__(self, machine, run):
         """When one lane first leaves, in cycles."""
         row, behind = self.row(machine, run, self.of)
         # What is known of cycles begins with the first cycle's end.
         row = row if row.size > behind.size else jnp.concatenate([jnp.zeros(1) + jnp.nan, row])
-        outside = (row < self.low) | (row > self.high)
+        outside = self._outside(row)
         escaped = jnp.any(outside)
         first = jnp.where(escaped, jnp.argmax(outside), row.size - 1)
         step = jnp.asarray(1.0 / max(1, self.samples), jnp.result_type(float))
