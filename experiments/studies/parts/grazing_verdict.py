@@ -1,0 +1,178 @@
+"""What follows a grazing, by simulation alone: the judge of `grazing_forecast.py`.
+
+It knows nothing of local maps. Many lanes, on both sides of the grazing and each with a value of
+the parameter of its own, begin at the state of the motion that grazes, and are followed through
+`SETTLE` cycles and `WATCHED` more. What a lane does is read from its sections there:
+
+- its distance from the motion that grazes;
+- its period, the least number of cycles after which sections and touches repeat, up to `LONGEST`;
+- its touches in a period beyond those of the motion that grazes.
+
+The name for all lanes together is given by `verdict`.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import vi_jax as vi
+
+from .grazing_machines import changed
+
+LANES, SETTLE, WATCHED, LONGEST = 256, 1500, 128, 40
+METHOD = vi.FixedStep(vi.Verner9(), steps_per_cycle=48)
+
+# Sections that differ by less than this share of what they span repeat; and by less than this
+# altogether, where rounding decides.
+_REPEATS, _ROUNDING = 1e-3, 1e-11
+
+# What grows from the grazing on has a size that rises with some power of the distance from it in
+# the parameter (1/2 where the stop is rigid), and what is far away does not: the limit between.
+_GROWS = 0.15
+
+# A lane so many times farther away than others, over the root of its offset, has left.
+_LEFT = 10.0
+
+# Shares of lanes without a period below which windows lie next to each other, and above which there
+# is chaos alone; and of lanes with period 1 above which the motion persists.
+_FEW, _ALL = 0.02, 0.96
+
+# Starts of the search for a motion with one touch more on the calm side, at each of three values.
+_STARTS = 64
+
+
+class Lanes(NamedTuple):
+    """What lanes do, each at its offset of the parameter; positive offsets on the impacts' side."""
+
+    offset: np.ndarray
+    distance: np.ndarray
+    """From the motion that grazes, the largest on a section."""
+    period: np.ndarray
+    """0 without one."""
+    touches: np.ndarray
+    """In a period, beyond those of the motion that grazes; NaN without a period."""
+    side: int
+    """In which sense of the parameter there are more touches."""
+
+
+@jax.jit(static_argnames="name")
+def _swept(machine: Any, name: str, values: Any, state: Any) -> tuple[Any, Any, Any]:
+    """Sections, touches and whether it was followed, of each value."""
+
+    def one(value):
+        there = changed(machine, name, value)
+        run = vi.simulate(
+            there, state, WATCHED, settle=SETTLE, method=METHOD,
+            record="motion" if there.switches else "sections",
+        )  # fmt: skip
+        hits = run.y_max > there.stop.gap if there.switches else run.impacts
+        return jnp.stack(jax.tree.leaves(run.sections), axis=-1)[1:], hits, run.successful
+
+    return jax.vmap(one)(values)
+
+
+def swept(point: vi.SpecialPoint, name: str, low: float, high: float, seed: int) -> Lanes:
+    """Lanes on both sides of a grazing, their offsets at random between two sizes of it (evenly
+    spread by their logarithm), told apart by where there are more touches."""
+    rng = np.random.default_rng(seed)
+    size = np.sort(np.exp(rng.uniform(np.log(low), np.log(high), LANES)))
+    machine = point.orbit.machine
+    start = jax.tree.map(jnp.asarray, point.orbit.state)
+    at = np.concatenate([point.parameter + size, point.parameter - size])
+    rows, hits, good = map(np.asarray, _swept(machine, name, jnp.asarray(at), start))
+    origin = np.array([float(x) for x in jax.tree.leaves(start)])
+    more = hits - (0 if machine.switches else int(np.asarray(point.orbit.impacts)))
+    above, below = (np.abs(more[part]).any(axis=1).mean() for part in (slice(LANES), slice(LANES, None)))
+    side = 1 if above >= below else -1
+    part = slice(LANES) if side > 0 else slice(LANES, None)
+    rows, more, good = rows[part], more[part], good[part]
+    distance = np.where(good, np.abs(rows - origin).max(axis=(1, 2)), np.inf)
+    period = np.where(good, [_period(r, m, d) for r, m, d in zip(rows, more, distance, strict=True)], 0)
+    touches = [m[-p:].sum() if p else np.nan for p, m in zip(period, more, strict=True)]
+    return Lanes(size, distance, period, np.array(touches, float), side)
+
+
+def _period(rows: np.ndarray, more: np.ndarray, distance: float) -> int:
+    """The least period of a lane, or 0."""
+    span = np.ptp(rows, axis=0).max()
+    for p in range(1, LONGEST + 1):
+        apart = np.abs(rows[p:] - rows[:-p]).max()
+        whole = distance if p == 1 else span
+        if (more[p:] == more[:-p]).all() and apart <= max(_REPEATS * whole, _ROUNDING):
+            return p
+    return 0
+
+
+@jax.jit
+def _searched(machine: Any, starts: Any) -> tuple[Any, Any, Any]:
+    """State, touches and whether it was found, of the motion of one cycle near each start."""
+
+    def one(start):
+        orbit = vi.find_orbit(machine, start, cycles=1, method=METHOD)
+        good = (orbit.result == vi.ORBIT_RESULTS.successful) & orbit.admissible
+        hits = (orbit.y_max > machine.stop.gap).astype(int) if machine.switches else orbit.impacts
+        return jnp.stack(jax.tree.leaves(orbit.state)), hits, good
+
+    return jax.vmap(one)(starts)
+
+
+def folds(point: vi.SpecialPoint, name: str, lanes: Lanes, seed: int) -> bool:
+    """Whether on the calm side there is a motion of one cycle with a touch more that comes nearer
+    to the one that grazes as the parameter does, by Newton's method from random starts."""
+    rng, machine = np.random.default_rng(seed), point.orbit.machine
+    leaves, tree = jax.tree.flatten(jax.tree.map(jnp.asarray, point.orbit.state))
+    origin = np.array([float(x) for x in leaves])
+    base = 0 if machine.switches else int(np.asarray(point.orbit.impacts))
+    nearest = []
+    for offset in np.geomspace(lanes.offset[0], lanes.offset[-1], 3):
+        way = rng.normal(size=(_STARTS, len(origin)))
+        reach = np.exp(rng.uniform(np.log(0.01 * offset), 0.5 * np.log(offset), (_STARTS, 1)))
+        starts = origin + reach * way / np.linalg.norm(way, axis=1, keepdims=True)
+        there = changed(machine, name, jnp.asarray(point.parameter - lanes.side * offset))
+        found = _searched(there, jax.tree.unflatten(tree, list(jnp.asarray(starts.T))))
+        state, hits, good = map(np.asarray, found)
+        apart = np.abs(state - origin).max(axis=1)
+        nearest.append(np.min(apart, initial=np.inf, where=good & (hits == base + 1)))
+    return bool(np.isfinite(nearest).all() and nearest[0] < nearest[1] < nearest[2])
+
+
+def verdict(point: vi.SpecialPoint, name: str, lanes: Lanes, seed: int) -> str:
+    """The name in `vi.SCENARIOS` of what the lanes do.
+
+    Distances are compared between the third of the lanes nearest to the grazing and the farthest
+    third: if they do not grow, nothing near attracts, and it is a fold if on the calm side a motion
+    with a touch more comes to the grazing, else a jump. Else the lanes that are near count. If
+    (nearly) all have period 1, the motion persists; if (nearly) none has a period, it is chaos.
+    Period adding is what most periodic lanes do if they have one touch in n > 1 cycles, of at least
+    two numbers n which rise towards the grazing; else there are other periodic motions. Both with
+    or without lanes that have no period.
+    """
+    third = LANES // 3
+    near, far = (np.median(lanes.distance[part]) for part in (slice(third), slice(-third, None)))
+    ratio = np.median(lanes.offset[-third:]) / np.median(lanes.offset[:third])
+    with np.errstate(invalid="ignore"):
+        power = np.log(far / near) / np.log(ratio)
+    if not np.isfinite([near, far]).all() or power < _GROWS:
+        return "nonsmooth_fold" if folds(point, name, lanes, seed) else "jump"
+    scaled = lanes.distance / np.sqrt(lanes.offset)
+    stays = scaled <= _LEFT * np.median(scaled)
+    period, touches = lanes.period[stays], lanes.touches[stays]
+    aperiodic = (period == 0).mean()
+    if (period == 1).mean() > _ALL:
+        return "persistence"
+    if aperiodic > _ALL:
+        return "chaos"
+    single = (period > 1) & (touches == 1)
+    adding = single.sum() > 0.5 * (period > 0).sum() and _rises(lanes.offset[stays], period, single)
+    if aperiodic < _FEW:
+        return "period_adding" if adding else "periodic"
+    return "period_adding_with_chaos" if adding else "windows_and_chaos"
+
+
+def _rises(offset: np.ndarray, period: np.ndarray, single: np.ndarray) -> bool:
+    """Whether the periods of motions with one touch rise towards the grazing, one of them next to
+    another."""
+    kinds = np.unique(period[single])
+    places = [np.median(np.log(offset[single & (period == n)])) for n in kinds]
+    return len(kinds) > 1 and bool((np.diff(places) < 0).all() and (np.diff(kinds) == 1).any())
