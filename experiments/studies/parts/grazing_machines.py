@@ -201,8 +201,8 @@ def grazing_of(drawn: Drawn) -> vi.SpecialPoint | None:
     run = vi.simulate(machine, machine.start(), 1, settle=SETTLE)
     if not bool(run.successful):
         return None
-    orbit = vi.find_orbit(machine, run.last, cycles=1)
-    if orbit.result != vi.ORBIT_RESULTS.successful or not bool(orbit.stable):
+    orbit = vi.find_orbit(machine, run.last, cycles=1, impact_log=16)
+    if orbit.result != vi.ORBIT_RESULTS.successful or not bool(orbit.stable) or int(orbit.impacts) > 16:
         return None
     branch = vi.continue_orbit(
         orbit, parameter=drawn.parameter, bounds=drawn.bounds, progress=False
