@@ -38,8 +38,9 @@ _LEFT = 10.0
 # is chaos alone; and of lanes with period 1 above which the motion persists.
 _FEW, _ALL = 0.02, 0.96
 
-# Starts of the search for a motion with one touch more on the calm side, at each of three values.
-_STARTS = 64
+# Starts of the search for a motion with one touch more on the calm side, at each of three values;
+# how far they are, over the offset in the parameter; how many are gone on from, and how often.
+_STARTS, _REACH, _BEST, _ROUNDS = 8192, (0.1, 300.0), 256, 14
 
 
 class Lanes(NamedTuple):
@@ -105,36 +106,61 @@ def _period(rows: np.ndarray, more: np.ndarray, distance: float) -> int:
 
 
 @jax.jit
-def _searched(machine: Any, starts: Any) -> tuple[Any, Any, Any]:
-    """State, touches and whether it was found, of the motion of one cycle near each start."""
+@jax.vmap
+def _cycled(machine: Any, start: Any) -> tuple[Any, Any]:
+    """By how much a motion misses its start after a cycle, and its touches."""
+    run = vi.simulate(
+        machine, start, 1, method=METHOD, record="motion" if machine.switches else "sections"
+    )
+    ends = jnp.stack(jax.tree.leaves(run.sections))
+    hits = (run.y_max > machine.stop.gap) if machine.switches else run.impacts
+    miss = jnp.abs(ends[:, 1] - ends[:, 0]).max()
+    return jnp.where(run.successful, miss, jnp.inf), hits[0]
 
-    def one(start):
-        orbit = vi.find_orbit(machine, start, cycles=1, method=METHOD)
-        good = (orbit.result == vi.ORBIT_RESULTS.successful) & orbit.admissible
-        hits = (orbit.y_max > machine.stop.gap).astype(int) if machine.switches else orbit.impacts
-        return jnp.stack(jax.tree.leaves(orbit.state)), hits, good
 
-    return jax.vmap(one)(starts)
+@jax.jit
+@jax.vmap
+def _searched(machine: Any, start: Any) -> tuple[Any, Any, Any]:
+    """State, touches and whether it was found, of the motion of one cycle near a start."""
+    orbit = vi.find_orbit(machine, start, cycles=1, method=METHOD)
+    good = (orbit.result == vi.ORBIT_RESULTS.successful) & orbit.admissible
+    hits = (orbit.y_max > machine.stop.gap).astype(int) if machine.switches else orbit.impacts
+    return jnp.stack(jax.tree.leaves(orbit.state)), hits, good
 
 
 def folds(point: vi.SpecialPoint, name: str, lanes: Lanes, seed: int) -> bool:
     """Whether on the calm side there is a motion of one cycle with a touch more that comes nearer
-    to the one that grazes as the parameter does, by Newton's method from random starts."""
+    to the one that grazes as the parameter does. Of many random starts about that one those are
+    taken that touch once more and miss themselves least after a cycle, and Newton's method goes
+    on from them."""
     rng, machine = np.random.default_rng(seed), point.orbit.machine
     leaves, tree = jax.tree.flatten(jax.tree.map(jnp.asarray, point.orbit.state))
     origin = np.array([float(x) for x in leaves])
     base = 0 if machine.switches else int(np.asarray(point.orbit.impacts))
-    nearest = []
-    for offset in np.geomspace(lanes.offset[0], lanes.offset[-1], 3):
-        way = rng.normal(size=(_STARTS, len(origin)))
-        reach = np.exp(rng.uniform(np.log(0.01 * offset), 0.5 * np.log(offset), (_STARTS, 1)))
-        starts = origin + reach * way / np.linalg.norm(way, axis=1, keepdims=True)
-        there = changed(machine, name, jnp.asarray(point.parameter - lanes.side * offset))
-        found = _searched(there, jax.tree.unflatten(tree, list(jnp.asarray(starts.T))))
-        state, hits, good = map(np.asarray, found)
-        apart = np.abs(state - origin).max(axis=1)
-        nearest.append(np.min(apart, initial=np.inf, where=good & (hits == base + 1)))
-    return bool(np.isfinite(nearest).all() and nearest[0] < nearest[1] < nearest[2])
+    offsets = lanes.offset[-1] * np.array([[0.5], [0.7], [1.0]])
+    way = rng.normal(size=(3, _STARTS, len(origin)))
+    reach = np.exp(rng.uniform(*np.log(_REACH), (3, _STARTS, 1))) * offsets[..., None]
+    starts = origin + reach * way / np.linalg.norm(way, axis=2, keepdims=True)
+    values = point.parameter - lanes.side * offsets
+
+    def lanes_of(function: Any, chosen: np.ndarray, values: np.ndarray) -> list[np.ndarray]:
+        flat = chosen.reshape(-1, len(origin))
+        many = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(flat), *jnp.shape(x))), machine)
+        many = changed(many, name, jnp.asarray(np.broadcast_to(values, chosen.shape[:2]).ravel()))
+        found = function(many, jax.tree.unflatten(tree, list(jnp.asarray(flat.T))))
+        return [np.asarray(x).reshape(*chosen.shape[:2], *x.shape[1:]) for x in found]
+
+    for _ in range(_ROUNDS):
+        miss, hits = lanes_of(_cycled, starts, values)
+        order = np.argsort(np.where(hits == base + 1, miss, np.inf), axis=1)[:, :_BEST]
+        best, reach = (np.take_along_axis(x, order[..., None], 1) for x in (starts, 0.5 * reach))
+        reach = np.repeat(reach, _STARTS // _BEST, axis=1)
+        starts = np.repeat(best, _STARTS // _BEST, axis=1)
+        starts = starts + reach * rng.normal(size=starts.shape) * (np.arange(_STARTS)[:, None] % 8 > 0)
+    state, hits, good = lanes_of(_searched, best, values)
+    apart = np.abs(state - origin).max(axis=2)
+    near = np.min(apart, axis=1, initial=np.inf, where=good & (hits == base + 1))
+    return bool(np.isfinite(near).all() and near[0] < near[1] < near[2])
 
 
 def verdict(point: vi.SpecialPoint, name: str, lanes: Lanes, seed: int) -> str:
