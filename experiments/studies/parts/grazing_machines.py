@@ -16,12 +16,14 @@ SETTLE = 400
 def changed(machine: Any, name: str, value: Any) -> Any:
     """The same machine with another number in place of that name."""
 
-    def where(tree: Any) -> Any:
-        for part in name.split("."):
-            tree = tree[int(part)] if part.isdigit() else getattr(tree, part)
-        return tree
+    return eqx.tree_at(lambda machine: number(machine, name), machine, value)
 
-    return eqx.tree_at(where, machine, value)
+
+def number(machine: Any, name: str) -> Any:
+    """A number of a machine by its name, as "stops.0.gap"."""
+    for part in name.split("."):
+        machine = machine[int(part)] if part.isdigit() else getattr(machine, part)
+    return machine
 
 
 class TwoBodies(vi.AbstractMachine):

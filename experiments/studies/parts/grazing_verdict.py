@@ -11,6 +11,7 @@ the parameter of its own, begin at the state of the motion that grazes, and are 
 The name for all lanes together is given by `verdict`.
 """
 
+import contextlib
 from typing import Any, NamedTuple
 
 import jax
@@ -18,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 import vi_jax as vi
 
-from .grazing_machines import changed
+from .grazing_machines import changed, number
 
 LANES, SETTLE, WATCHED, LONGEST = 256, 1500, 128, 40
 METHOD = vi.FixedStep(vi.Verner9(), steps_per_cycle=48)
@@ -38,8 +39,8 @@ _LEFT = 10.0
 # is chaos alone; and of lanes with period 1 above which the motion persists.
 _FEW, _ALL = 0.02, 0.96
 
-# Starts of the search for a motion with one touch more on the calm side, at each of three values;
-# how far they are, over the offset in the parameter; how many are gone on from, and how often.
+# Starts of the search for a motion with one touch more; how far they are, over the offset in the
+# parameter; how many are gone on from, and how often.
 _STARTS, _REACH, _BEST, _ROUNDS = 8192, (0.1, 300.0), 256, 14
 
 
@@ -82,16 +83,22 @@ def swept(point: vi.SpecialPoint, name: str, low: float, high: float, seed: int)
     start = jax.tree.map(jnp.asarray, point.orbit.state)
     at = np.concatenate([point.parameter + size, point.parameter - size])
     rows, hits, good = map(np.asarray, _swept(machine, name, jnp.asarray(at), start))
-    origin = np.array([float(x) for x in jax.tree.leaves(start)])
-    more = hits - (0 if machine.switches else int(np.asarray(point.orbit.impacts)))
-    above, below = (np.abs(more[part]).any(axis=1).mean() for part in (slice(LANES), slice(LANES, None)))
-    side = 1 if above >= below else -1
+    more = hits - _base(point)
+    side = 1 if _goes_on(point, name, -size) >= _goes_on(point, name, size) else -1
     part = slice(LANES) if side > 0 else slice(LANES, None)
     rows, more, good = rows[part], more[part], good[part]
-    distance = np.where(good, np.abs(rows - origin).max(axis=(1, 2)), np.inf)
+    distance = np.where(good, np.abs(rows - _origin(point)).max(axis=(1, 2)), np.inf)
     period = np.where(good, [_period(r, m, d) for r, m, d in zip(rows, more, distance, strict=True)], 0)
     touches = [m[-p:].sum() if p else np.nan for p, m in zip(period, more, strict=True)]
     return Lanes(size, distance, period, np.array(touches, float), side)
+
+
+def _goes_on(point: vi.SpecialPoint, name: str, offsets: np.ndarray) -> int:
+    """At how many of some values there is, near the motion that grazes, one with its touches."""
+    some = offsets[:: LANES // 8]
+    many, starts = _beside(point, name, some, np.tile(_origin(point), (len(some), 1)))
+    _, hits, good = map(np.asarray, _searched(many, starts))
+    return int((good & (hits == _base(point))).sum())
 
 
 def _period(rows: np.ndarray, more: np.ndarray, distance: float) -> int:
@@ -128,39 +135,62 @@ def _searched(machine: Any, start: Any) -> tuple[Any, Any, Any]:
     return jnp.stack(jax.tree.leaves(orbit.state)), hits, good
 
 
+def _origin(point: vi.SpecialPoint) -> np.ndarray:
+    return np.array([float(x) for x in jax.tree.leaves(point.orbit.state)])
+
+
+def _base(point: vi.SpecialPoint) -> int:
+    """Touches in a cycle of the motion that grazes."""
+    return 0 if point.orbit.machine.switches else int(np.asarray(point.orbit.impacts))
+
+
+def _beside(point: vi.SpecialPoint, name: str, offsets: Any, rows: np.ndarray) -> tuple[Any, Any]:
+    """Machines at these offsets of the parameter and states from rows, one for each lane."""
+    machine, tree = point.orbit.machine, jax.tree.structure(point.orbit.state)
+    many = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(rows), *jnp.shape(x))), machine)
+    many = changed(many, name, jnp.asarray(point.parameter + np.broadcast_to(offsets, len(rows))))
+    return many, jax.tree.unflatten(tree, list(jnp.asarray(rows.T)))
+
+
 def folds(point: vi.SpecialPoint, name: str, lanes: Lanes, seed: int) -> bool:
-    """Whether on the calm side there is a motion of one cycle with a touch more that comes nearer
-    to the one that grazes as the parameter does. Of many random starts about that one those are
-    taken that touch once more and miss themselves least after a cycle, and Newton's method goes
-    on from them."""
-    rng, machine = np.random.default_rng(seed), point.orbit.machine
-    leaves, tree = jax.tree.flatten(jax.tree.map(jnp.asarray, point.orbit.state))
-    origin = np.array([float(x) for x in leaves])
-    base = 0 if machine.switches else int(np.asarray(point.orbit.impacts))
-    offsets = lanes.offset[-1] * np.array([[0.5], [0.7], [1.0]])
-    way = rng.normal(size=(3, _STARTS, len(origin)))
-    reach = np.exp(rng.uniform(*np.log(_REACH), (3, _STARTS, 1))) * offsets[..., None]
-    starts = origin + reach * way / np.linalg.norm(way, axis=2, keepdims=True)
-    values = point.parameter - lanes.side * offsets
+    """Whether the motion of one cycle with a touch more that begins at the grazing is on the calm
+    side. Wherever a candidate comes from, it is one if it repeats when it is simulated, and touches
+    once more."""
+    offset, state = _impacting(point, name, lanes, seed)
+    many, starts = _beside(point, name, offset, state[None])
+    miss, hits = map(np.asarray, _cycled(many, starts))
+    distance = np.abs(state - _origin(point)).max()
+    found = miss[0] < 0.01 * distance and hits[0] == _base(point) + 1
+    return bool(found and np.sign(offset) == -lanes.side)
 
-    def lanes_of(function: Any, chosen: np.ndarray, values: np.ndarray) -> list[np.ndarray]:
-        flat = chosen.reshape(-1, len(origin))
-        many = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(flat), *jnp.shape(x))), machine)
-        many = changed(many, name, jnp.asarray(np.broadcast_to(values, chosen.shape[:2]).ravel()))
-        found = function(many, jax.tree.unflatten(tree, list(jnp.asarray(flat.T))))
-        return [np.asarray(x).reshape(*chosen.shape[:2], *x.shape[1:]) for x in found]
 
+def _impacting(
+    point: vi.SpecialPoint, name: str, lanes: Lanes, seed: int
+) -> tuple[float, np.ndarray]:
+    """A candidate for it, and where: by its own equations; or, of a soft stop, for which there are
+    none, by Newton's method on the calm side from those of many random starts that touch once more
+    and miss themselves least."""
+    if not point.orbit.machine.switches:
+        for distance in (1e-4, 1e-5, 1e-3):
+            with contextlib.suppress(ValueError):
+                orbit = point.switch(distance=distance)
+                offset = float(number(orbit.machine, name)) - point.parameter
+                return offset, np.array([float(x) for x in jax.tree.leaves(orbit.state)])
+    rng, base = np.random.default_rng(seed), _base(point)
+    offset = -lanes.side * lanes.offset[-1]
+    way = rng.normal(size=(_STARTS, len(_origin(point))))
+    reach = abs(offset) * np.exp(rng.uniform(*np.log(_REACH), (_STARTS, 1)))
+    rows = _origin(point) + reach * way / np.linalg.norm(way, axis=1, keepdims=True)
     for _ in range(_ROUNDS):
-        miss, hits = lanes_of(_cycled, starts, values)
-        order = np.argsort(np.where(hits == base + 1, miss, np.inf), axis=1)[:, :_BEST]
-        best, reach = (np.take_along_axis(x, order[..., None], 1) for x in (starts, 0.5 * reach))
-        reach = np.repeat(reach, _STARTS // _BEST, axis=1)
-        starts = np.repeat(best, _STARTS // _BEST, axis=1)
-        starts = starts + reach * rng.normal(size=starts.shape) * (np.arange(_STARTS)[:, None] % 8 > 0)
-    state, hits, good = lanes_of(_searched, best, values)
-    apart = np.abs(state - origin).max(axis=2)
-    near = np.min(apart, axis=1, initial=np.inf, where=good & (hits == base + 1))
-    return bool(np.isfinite(near).all() and near[0] < near[1] < near[2])
+        miss, hits = map(np.asarray, _cycled(*_beside(point, name, offset, rows)))
+        order = np.argsort(np.where(hits == base + 1, miss, np.inf))[:_BEST]
+        best, reach = rows[order], np.repeat(0.5 * reach[order], _STARTS // _BEST, axis=0)
+        rows = np.repeat(best, _STARTS // _BEST, axis=0)
+        rows = rows + reach * rng.normal(size=rows.shape)
+        rows[:: _STARTS // _BEST] = best
+    state, hits, good = map(np.asarray, _searched(*_beside(point, name, offset, best)))
+    good &= hits == base + 1
+    return offset, state[np.argmax(good)]
 
 
 def verdict(point: vi.SpecialPoint, name: str, lanes: Lanes, seed: int) -> str:
