@@ -204,7 +204,11 @@ def grazing_of(drawn: Drawn) -> vi.SpecialPoint | None:
     if not bool(run.successful):
         return None
     orbit = vi.find_orbit(machine, run.last, cycles=1, impact_log=16)
-    if orbit.result != vi.ORBIT_RESULTS.successful or not bool(orbit.stable) or int(orbit.impacts) > 16:
+    if (
+        orbit.result != vi.ORBIT_RESULTS.successful
+        or not bool(orbit.stable)
+        or int(orbit.impacts) > 16
+    ):
         return None
     branch = vi.continue_orbit(
         orbit, parameter=drawn.parameter, bounds=drawn.bounds, progress=False
@@ -215,6 +219,13 @@ def grazing_of(drawn: Drawn) -> vi.SpecialPoint | None:
         if np.abs(np.asarray(point.orbit.multipliers)).max() < REMEMBERS:
             return point
     return None
+
+
+KINDS = {
+    "scene": (scene, 13), "pair": (pairs, 12), "two bodies": (two_bodies, 13), "soft": (relaxed, 6),
+    "prestressed": (prestressed, 6),
+}  # fmt: skip
+"""How machines of each kind are drawn, and how many of them."""
 
 
 def machines(draw: Any, count: int, seed: int) -> list[tuple[Drawn, vi.SpecialPoint]]:

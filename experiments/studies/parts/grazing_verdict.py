@@ -21,7 +21,7 @@ import vi_jax as vi
 
 from .grazing_machines import changed, number
 
-LANES, SETTLE, WATCHED, LONGEST = 256, 1500, 128, 40
+LANES, SETTLE, WATCHED, LONGEST = 192, 1000, 128, 40
 METHOD = vi.FixedStep(vi.Verner9(), steps_per_cycle=48)
 
 # Sections that differ by less than this share of what they span repeat; and by less than this
@@ -88,7 +88,9 @@ def swept(point: vi.SpecialPoint, name: str, low: float, high: float, seed: int)
     part = slice(LANES) if side > 0 else slice(LANES, None)
     rows, more, good = rows[part], more[part], good[part]
     distance = np.where(good, np.abs(rows - _origin(point)).max(axis=(1, 2)), np.inf)
-    period = np.where(good, [_period(r, m, d) for r, m, d in zip(rows, more, distance, strict=True)], 0)
+    period = np.where(
+        good, [_period(r, m, d) for r, m, d in zip(rows, more, distance, strict=True)], 0
+    )
     touches = [m[-p:].sum() if p else np.nan for p, m in zip(period, more, strict=True)]
     return Lanes(size, distance, period, np.array(touches, float), side)
 
@@ -189,8 +191,24 @@ def _impacting(
         rows = rows + reach * rng.normal(size=rows.shape)
         rows[:: _STARTS // _BEST] = best
     state, hits, good = map(np.asarray, _searched(*_beside(point, name, offset, best)))
-    good &= hits == base + 1
-    return offset, state[np.argmax(good)]
+    return offset, state[np.argmax(good & (hits == base + 1))]
+
+
+def name_of(found: vi.Grazing) -> str:
+    """The forecast's name in `vi.SCENARIOS`."""
+    return repr(found.outcome).split(".")[-1]
+
+
+def judged(
+    point: vi.SpecialPoint, name: str, found: vi.Grazing, seed: int
+) -> tuple[float, float, Lanes, str]:
+    """Lanes in the range over which a forecast was checked, or in all that it looked at, less what
+    rounding makes doubtful; that range, and the verdict."""
+    looked = np.abs(found.forecast.offset)
+    low, high = (looked.min(), looked.max()) if found.checked is None else found.checked
+    low = min(max(low, 1e-9 * abs(point.parameter)), 0.03 * high)
+    lanes = swept(point, name, low, high, seed)
+    return low, high, lanes, verdict(point, name, lanes, seed)
 
 
 def verdict(point: vi.SpecialPoint, name: str, lanes: Lanes, seed: int) -> str:
