@@ -7,9 +7,11 @@
 # each a stable motion of one cycle is followed to where it touches a stop once more. The forecast
 # is taken, and then the machine is simulated on lanes at 192 random values of the parameter in the
 # range over which the forecast says that it was checked. What the lanes do is named by rules that
-# know nothing of local maps and were written before any forecast was seen (`parts/grazing_verdict`).
+# know nothing of local maps and were written before any forecast was seen
+# (`parts/grazing_verdict.py`); only the search for the unstable motion beside a fold, and for the
+# side without impacts, was mended after it had missed some on a first draw of other machines.
 #
-# Run with `python experiments/studies/grazing_forecast.py` (`--quick` for one machine of each kind).
+# Run with `python experiments/studies/grazing_forecast.py` (`--quick`: one machine of each kind).
 
 # %%
 import sys
