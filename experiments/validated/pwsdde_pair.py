@@ -2,7 +2,7 @@
 """# Two masses, cubic springs and two stops
 
 A mass on a cubic spring is shaken; a smaller one hangs on it by another and hits both ends of its
-play. At ω = 1.5 its motion is symmetric, with one impact on each side, which it loses below 1.44.
+play. At ω = 1.5 its motion is symmetric, with one impact on each side; it ends in other ways too.
 """
 
 # %%
@@ -44,8 +44,8 @@ class Pair(vi.AbstractMachine):
 
 
 orbit = vi.find_orbit(Pair(), tuple(map(jnp.array, (-0.69, -1.5, 0.13, -1.2))))
-branch = vi.continue_orbit(orbit, parameter="omega", bounds=(1.42, 1.5))
-(breaks,) = (p.parameter for p in branch.special if p.kind == "symmetry-breaking")
+lost = vi.continue_orbit(orbit, parameter="omega", bounds=(1.25, 2.12)).special
+WHERE = "1.298963194", "1.439080000", "1.976551861", "2.094953736"
 comparison = Comparison(
     "PWSDDE-cont",
     "https://github.com/Tudesz/PWSDDE-cont, `impd_osc_demo.m`",
@@ -54,7 +54,7 @@ comparison = Comparison(
         ("x1 at phase 0, ω = 1.5", "-0.6861717357", orbit.state[0], 5e-10),
         ("x2", "-1.5139878705", orbit.state[1], 5e-10),
         ("relative speed of impacts", "1.3967862502", orbit.impact_speed[0], 5e-10),
-        ("ω at which the symmetry is lost", "1.439080000", breaks, 1e-9),
+        *((f"ω of the {p.kind}", w, p.parameter, 1e-9) for p, w in zip(lost, WHERE, strict=True)),
     ],
 )
 print(comparison)

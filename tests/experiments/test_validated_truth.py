@@ -98,6 +98,38 @@ def half(omega, z):
     return -z
 
 
+def multipliers_of_half(omega, z):
+    """By central differences."""
+    steps = 1e-5 * np.eye(4)
+    slopes = [(half(omega, z + e) - half(omega, z - e)) / 2e-5 for e in steps]
+    return np.linalg.eigvals(np.transpose(slopes))
+
+
+def test_where_the_two_masses_lose_their_stability():
+    """A multiplier of half a period is 1 at a fold; at a Neimark–Sacker point a pair crosses."""
+    *_, fold, _, first, second = [row[1] for row in rows(sections()["pwsdde_pair"])]
+
+    def lacks(x):
+        det = np.prod(multipliers_of_half(x[4], x[:4]) - 1).real
+        return [*(half(x[4], x[:4]) - x[:4]), det]
+
+    near = [-1.80955, -2.78315, 0.18278, 2.18286, 1.29897]
+    agree(fold, fsolve(lacks, near, xtol=1e-11)[4])
+    for printed, low, high, near in (
+        (first, 1.9764, 1.9767, (-0.2794, -0.9533, 0.0951, -1.3286)),
+        (second, 2.0948, 2.0951, (-0.2376, -0.8723, 0.0954, -1.3877)),
+    ):
+
+        def beyond(omega, near=near):
+            z = fsolve(lambda z: half(omega, z) - z, near, xtol=1e-12)
+            largest = multipliers_of_half(omega, z)
+            assert abs(largest[np.argmax(np.abs(largest))].imag) > 0.01
+            return np.abs(largest).max() - 1
+
+        assert beyond(low) * beyond(high) < 0
+        agree(printed, brentq(beyond, low, high, xtol=1e-11))
+
+
 def test_two_masses():
     known, guess = theirs("pwsdde_pair"), np.array([-0.686, -1.514, 0.1256, -1.2246])
 
@@ -112,10 +144,7 @@ def test_two_masses():
 
     def above(omega):
         """Symmetry is lost where a multiplier of half a period is -1."""
-        at, h = orbit(omega, z), 1e-5
-        steps = h * np.eye(4)
-        slopes = [(half(omega, at + e) - half(omega, at - e)) / (2 * h) for e in steps]
-        return np.linalg.eigvals(np.transpose(slopes)).real.min() + 1
+        return multipliers_of_half(omega, orbit(omega, z)).real.min() + 1
 
     # The differences are right to 1e-9.
-    agree(known["ω at which the symmetry is lost"], brentq(above, 1.438, 1.441, xtol=1e-11))
+    agree(known["ω of the symmetry-breaking"], brentq(above, 1.438, 1.441, xtol=1e-11))

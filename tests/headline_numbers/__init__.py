@@ -13,6 +13,7 @@ from .orbits import (
     design_percussion,
     escape_from_2pi,
     fit_4pi_orbit,
+    grazing_forecast,
     robustness,
     soft_stop,
 )
@@ -44,6 +45,7 @@ __all__ = [
     "fig2_frequency_response",
     "fit_4pi_orbit",
     "gradients",
+    "grazing_forecast",
     "identify",
     "known_machines",
     "learned_laws",

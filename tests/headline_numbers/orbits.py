@@ -88,6 +88,16 @@ def fit_4pi_orbit() -> Expected:
     return numbers
 
 
+def grazing_forecast(kept: dict[str, float]) -> Expected:
+    """Where the vibration without impacts just reaches the stop of the paper's machine."""
+    names = [name.removesuffix(": d") for name in kept if name.endswith(": d")]
+    numbers: Expected = {}
+    for name in names:
+        zeta, xi = kept[f"{name}: ζ"], kept[f"{name}: ξ"]
+        numbers[f"{name}: d"] = (float(1 / abs(1 - zeta**2 + 2j * xi * zeta)), 1e-9)
+    return numbers
+
+
 def soft_stop() -> Expected:
     """Where the 2π motion doubles its period before a linear stop, and a multiplier well above."""
     closed_form = closed(0.9, 0.5, 0.0, 2.0, cycles=1)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import vi_jax as vi
 from scipy.integrate import solve_ivp
+from scipy.linalg import expm
 from scipy.optimize import brentq, fsolve
 
 from grazings import grazing_of
@@ -24,6 +25,21 @@ def the(curve, kind):
 MEETS, FOLD, DOUBLING = 1.99749843554, -33.9869, 2.443565
 
 
+def grazes(omega):
+    """F at which x'' + 0.1x' + x = F cos ωt just reaches x = 1."""
+    return np.hypot(1 - omega**2, 0.1 * omega)
+
+
+def coefficient_at(omega, curve, reach):
+    """c of F = F_graze (1 + c (ω - ω*)²) on a curve in (F, ω), from points near ω* to it."""
+    near = np.abs(curve.parameters[:, 1] - omega)
+    near = curve.parameters[(near > 1e-3) & (near < reach)]
+    away = near[:, 1] - omega
+    assert len(away) > 6
+    share = (near[:, 0] / grazes(near[:, 1]) - 1) / away**2
+    return np.polynomial.Polynomial.fit(away, share, 5)(0.0)
+
+
 @pytest.mark.parametrize(
     ("kind", "frequency", "coefficient"),
     [("fold", 1.95, FOLD), ("period-doubling", 2.04, DOUBLING)],
@@ -31,9 +47,6 @@ MEETS, FOLD, DOUBLING = 1.99749843554, -33.9869, 2.443565
 def test_a_fold_and_a_doubling_graze_where_a_grazing_is_resonant(kind, frequency, coefficient):
     """Of x'' + 0.1x' + x = F cos ωt with k = 0.8 the motion with one impact a cycle folds at one
     side of ω* and doubles at the other, at F = F_graze (1 + c (ω - ω*)²)."""
-
-    def grazes(omega):
-        return np.hypot(1 - omega**2, 0.1 * omega)
 
     machine = vi.machines.Duffing(
         amplitude=0.9 * grazes(frequency), frequency=frequency, damping=0.1, gap=1.0,
@@ -48,14 +61,7 @@ def test_a_fold_and_a_doubling_graze_where_a_grazing_is_resonant(kind, frequency
     end = the(curve, "grazing")
     np.testing.assert_allclose(end.parameters, [grazes(MEETS), MEETS], atol=1e-8)
     assert "is lost" in end.detail and end.impact == 0
-    # The coefficient, from points near it to the point itself.
-    near = np.abs(curve.parameters[:, 1] - MEETS)
-    near = curve.parameters[(near > 1e-3) & (near < 3e-2)]
-    away = near[:, 1] - MEETS
-    share = (near[:, 0] / grazes(near[:, 1]) - 1) / away**2
-    assert len(away) > 6
-    fitted = np.polynomial.Polynomial.fit(away, share, 5)(0.0)
-    assert fitted == pytest.approx(coefficient, rel=1e-4)
+    assert coefficient_at(MEETS, curve, 3e-2) == pytest.approx(coefficient, rel=1e-4)
     other = vi.boundary(end.switch(), parameter="frequency", bounds=bounds)
     assert other.kind == "grazing"
     force, omega = other.parameters.T
@@ -63,6 +69,52 @@ def test_a_fold_and_a_doubling_graze_where_a_grazing_is_resonant(kind, frequency
     meets = the(other, "resonant-grazing")
     np.testing.assert_allclose(meets.parameters, [grazes(MEETS), MEETS], atol=1e-10)
     assert meets.detail.endswith("with one impact in 1 periods")
+
+
+def section_of(found, force, omega, cycles):
+    """x and x' at ωt = 0 of the faster motion with one impact in so many periods."""
+    A = np.array([[0.0, 1.0], [-1.0, -0.1]])
+    swing = force / (1 - omega**2 + 0.1j * omega)
+    v = found.speed[1].real
+    g = np.linalg.solve(np.eye(2) - expm(A * 2 * np.pi * cycles / omega), [0.0, -1.8])
+    turned = (1.0 - v * g[0]) - 1j * v * (1 - g[1] - 1.8) / omega
+    phase = np.mod(np.angle(turned / swing), 2 * np.pi)
+    after = np.array([1.0 - turned.real, -0.8 * v - (1j * omega * turned).real])
+    ahead = expm(A * (2 * np.pi - phase) / omega) @ after
+    return ahead + np.array([swing.real, (1j * omega * swing).real])
+
+
+@pytest.mark.parametrize("cycles", [2, 3])
+@pytest.mark.parametrize(
+    ("kind", "side", "away"), [("fold", -0.05, 0.5), ("period-doubling", 0.04, 3)]
+)
+def test_motions_of_several_cycles_have_theirs_as_well(kind, side, away, cycles):
+    """With one impact in n cycles at 2n√(1 - ζ²), with the coefficients of one cycle: its curves
+    there, and all along them the closed form of the motion."""
+    meets, c = cycles * MEETS, {"fold": FOLD, "period-doubling": DOUBLING}[kind]
+    omega = meets + side
+    force = grazes(omega) * (1 + away * c * side**2)
+    given = {"damping": 0.05, "restitution": 0.8, "gap": 1.0, "cycles": cycles}
+    machine = vi.machines.Duffing(
+        amplitude=force, frequency=omega, damping=0.1, gap=1.0, restitution=0.8, two_sided=False
+    )
+    Y, V = section_of(one_impact(omega, force, **given), force, omega, cycles)
+    orbit = vi.find_orbit(machine, machine.start(Y=Y, V=V), cycles=cycles, throw=True)
+    assert int(orbit.impacts) == 1 and bool(orbit.stable)
+    bounds = (0.5 * force, 1.5 * force)
+    branch = vi.continue_orbit(orbit, parameter="amplitude", bounds=bounds)
+    (special,) = (point for point in branch.special if point.kind == kind)
+    frequencies = (meets - 0.2, meets + 0.2)
+    curve = vi.boundary(special, parameter="frequency", bounds=(bounds, frequencies), max_step=0.01)
+    end = the(curve, "grazing")
+    np.testing.assert_allclose(end.parameters, [grazes(meets), meets], rtol=1e-9)
+    assert coefficient_at(meets, curve, 5e-2) == pytest.approx(c, rel=1e-4)
+    for F, w in curve.parameters[np.abs(curve.parameters[:, 1] - meets) > 1e-2]:
+        found = one_impact(w, F, **given)
+        if kind == "fold":
+            assert abs(found.speed[1] - found.speed[0]) < 1e-4 * abs(found.speed[1])
+        else:
+            assert abs(found.trace[1] + 1 + found.determinant) < 1e-6
 
 
 class Fed(vi.AbstractMachine):

@@ -1,72 +1,14 @@
 """The four sliding bifurcations of a driven body on a rough floor, from both sides, beside Den
 Hartog's closed form and motions that SciPy follows from event to event."""
 
-from typing import Any
-
-import jax.numpy as jnp
 import numpy as np
 import pytest
-import vi_jax as vi
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 from vi_jax.orbit import _solve
 
 from den_hartog import den_hartog
-
-SINCE = 0.3  # of the drive's phase on the section
-
-
-class Rough(vi.AbstractMachine):
-    """x'' = cos φ + second cos(2φ + 1) - x - damping x' - friction, φ = s + 0.3, s = omega t."""
-
-    omega: Any = 0.75
-    level: Any = 0.3
-    second: Any = 0.0
-    damping: Any = 0.0
-    stops: tuple = ()
-
-    @property
-    def cycle(self):
-        return 2 * np.pi
-
-    def pull(self, s, x):
-        drive = jnp.cos(s + SINCE) + self.second * jnp.cos(2 * (s + SINCE) + 1)
-        return drive - x.Y - self.damping * x.V
-
-    @property
-    def switches(self):
-        return (
-            vi.DryFriction(
-                self.level,
-                velocity=lambda machine, x: x.V,
-                force=lambda machine, s, x: machine.pull(s, x),
-                stopped=lambda machine, x: vi.OscillatorState(x.Y, jnp.zeros_like(x.V)),
-                name="floor",
-            ),
-        )
-
-    def field(self, s, x, mode):
-        rate = self.pull(s, x) + self.switches[0].contribution(self, s, x, mode)
-        return vi.OscillatorState(x.V / self.omega, rate / self.omega)
-
-    def step_limit(self, s, x):
-        return 0.4 * np.pi * jnp.minimum(1.0, self.omega)
-
-
-def branch_of(parameter, bounds, *, max_step=0.1, **numbers):
-    machine = Rough(**numbers)
-    start = vi.OscillatorState(jnp.asarray(0.1), jnp.asarray(0.0))
-    orbit = vi.find_orbit(machine, vi.simulate(machine, start, 1, settle=200).last)
-    return vi.continue_orbit(
-        orbit, parameter=parameter, bounds=bounds, max_step=max_step, progress=False
-    )
-
-
-def on_both_sides(point, parameter, bounds, distance=0.01):
-    """The special point at which the motion on the other side ends, close to this one."""
-    other = point.switch(distance=distance)
-    branch = vi.continue_orbit(other, parameter=parameter, bounds=bounds, step=1e-3)
-    return min(branch.special, key=lambda x: abs(x.parameter - point.parameter))
+from rough_floor import SINCE, branch_of, on_both_sides, settled
 
 
 @pytest.mark.slow
@@ -82,38 +24,6 @@ def test_sticking_begins_where_den_hartog_says(omega):
     back = on_both_sides(point, "level", bounds)
     assert back.kind == "crossing-sliding" and "no longer" in back.detail
     assert back.parameter == pytest.approx(limit, abs=1e-10)
-
-
-def settled(omega, level, second, damping, cycles=10):
-    """Phase, place, mode before and after each event of the last cycle, by SciPy."""
-
-    def drive(phase):
-        return np.cos(phase) + second * np.cos(2 * phase + 1)
-
-    def field(phase, x):
-        force = drive(phase) - x[0] - damping * x[1]
-        held = 0.0 if mode == 0 else 1.0
-        return [x[1] / omega, held * (force - mode * level) / omega]
-
-    def changes(phase, x):
-        return abs(drive(phase) - x[0]) - level if mode == 0 else -mode * x[1]
-
-    changes.terminal, changes.direction = True, 1
-    phase, x, mode, events = SINCE, np.array([0.1, 0.0]), 0, []
-    end = SINCE + 2 * np.pi * cycles
-    while True:
-        # From zero velocity the guard of a slip has first to fall.
-        first = min(phase + (1e-6 if mode else 0.0), end)
-        options = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-13}
-        x = solve_ivp(field, (phase, first), x, **options).y[:, -1] if first > phase else x
-        found = solve_ivp(field, (first, end), x, events=changes, max_step=0.3, **options)
-        phase, x = found.t[-1], found.y[:, -1]
-        if not found.t_events[0].size:
-            return [e for e in events if e[0] > end - 2 * np.pi]
-        force, before = drive(phase) - x[0], mode
-        mode = 0 if before and abs(force) <= level else (1 if force > 0 else -1)
-        x = np.array([x[0], 0.0])
-        events.append((phase, x[0], before, mode))
 
 
 def held_by(omega, numbers, near):

@@ -184,10 +184,21 @@ def scenario_of(local: LocalMap, offsets: np.ndarray, found: Settled) -> tuple[s
         return "chaos", aperiodic
     # A motion with one impact in n periods, or what doubling makes of it.
     single = (period > 1) & (impacts > 0) & (period == impacts * (period // np.maximum(impacts, 1)))
-    adding = single.sum() > 0.5 * (period > 0).sum() and len(set(period[single])) > 1
+    adding = single.sum() > 0.5 * (period > 0).sum() and _next_to_each_other(
+        offsets[near], np.where(single & (impacts == 1), period, 0)
+    )
     if aperiodic < _FEW:
         return ("period_adding" if adding else "periodic"), aperiodic
     return ("period_adding_with_chaos" if adding else "windows_and_chaos"), aperiodic
+
+
+def _next_to_each_other(offsets: np.ndarray, period: np.ndarray) -> bool:
+    """Whether the periods of motions with one impact (0 elsewhere) grow towards the grazing, some n
+    next to n + 1. Between two stops, say, there may be 5 and 7 without 6 or anything beyond: no
+    period adding."""
+    kinds = np.unique(period[period > 0])
+    places = [np.median(np.log(np.abs(offsets[period == n]))) for n in kinds]
+    return bool((np.diff(places) < 0).all() and (np.diff(kinds) == 1).any())
 
 
 def _sum_of_entries(local: LocalMap) -> float:

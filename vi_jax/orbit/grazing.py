@@ -70,9 +70,9 @@ class Grazing(Summarized):
     side: int
     """1 if impacts appear as the parameter rises, -1 if as it falls."""
     outcome: SCENARIOS
-    """What follows on that side."""
+    """What follows on that side, at the values in `checked`, or at all looked at without it."""
     aperiodic: float
-    """Share of the values looked at, evenly spaced by their logarithm, without a period."""
+    """Share of these values, evenly spaced by their logarithm, without a period."""
     windows: Windows | None
     """Motions with one impact in n periods; `None` where there are several touches or no root."""
     forecast: Motions
@@ -176,7 +176,7 @@ def grazing(
     check, periods = flag("check", check), count("periods", periods, least=1)
     progress = flag("progress", progress)
     graze = graze_at(point)
-    unchecked, size, found, near = _unchecked(graze, periods)
+    unchecked, size, settles, near = _unchecked(graze, periods)
     if not check:
         return unchecked
     with at_work(
@@ -184,13 +184,24 @@ def grazing(
         progress=progress, unit="value", total=len(size[::ASKED]),
     ) as tell:  # fmt: skip
         asked = slice(None, None, ASKED)
-        some = Settled(*(part[asked] for part in found))
+        some = Settled(*(part[asked] for part in settles))
         beside, same, far = beside_grazing(graze, unchecked.side * size[asked], some, near[asked])
         checked, agreement = stretch(size[asked], *same)
         tell(len(size[asked]))
-    return dataclasses.replace(
+    found = dataclasses.replace(
         unchecked, machine=beside, checked=checked, agreement=agreement, far=far
     )
+    return found if checked is None else _within(found, graze, settles)
+
+
+def _within(found: Grazing, graze: Graze, settles: Settled) -> Grazing:
+    """The same, what follows named for the values at which the machine agrees alone: elsewhere the
+    local map may go through other things than the machine does."""
+    size = np.abs(found.forecast.offset)
+    inside = (size >= found.checked[0]) & (size <= found.checked[1])
+    some = Settled(*(part[inside] for part in settles))
+    outcome, aperiodic = scenario_of(graze.map, found.forecast.offset[inside], some)
+    return dataclasses.replace(found, outcome=getattr(SCENARIOS, outcome), aperiodic=aperiodic)
 
 
 def _unchecked(graze: Graze, periods: int) -> tuple[Grazing, np.ndarray, Settled, np.ndarray]:

@@ -1,0 +1,36 @@
+"""Forecasts of what follows a grazing, of a few of the machines of the study, beside its judge."""
+
+import numpy as np
+import pytest
+import vi_jax as vi
+from studies.parts.grazing_machines import KINDS, machines
+from studies.parts.grazing_verdict import LANES, Lanes, judged, name_of, verdict
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "count"), [("scene", 3), ("prestressed", 1)])
+def test_forecasts_beside_simulation(kind, count):
+    draw, _ = KINDS[kind]
+    for n, (drawn, point) in enumerate(machines(draw, count, 7)):
+        found = vi.grazing(point, progress=False)
+        *_, lanes, named = judged(point, drawn.parameter, found, n)
+        assert lanes.side == found.side
+        assert name_of(found) == named
+
+
+def lanes_of(power, period, touches):
+    offset = np.geomspace(1e-6, 1e-3, LANES)
+    return Lanes(offset, offset**power, np.asarray(period), np.asarray(touches, float), 1)
+
+
+def test_the_judge_tells_windows_from_each_other():
+    """By made-up lanes: each name, without a machine."""
+    n, none = np.arange(LANES), np.zeros(LANES, int)
+    falling = 8 - n // 32  # 8 … 3, longest nearest to the grazing
+    assert verdict(None, "", lanes_of(0.5, none + 1, none + 1), 0) == "persistence"
+    assert verdict(None, "", lanes_of(0.5, none, none), 0) == "chaos"
+    assert verdict(None, "", lanes_of(0.5, falling, none + 1), 0) == "period_adding"
+    assert verdict(None, "", lanes_of(0.5, falling[::-1], none + 1), 0) == "periodic"
+    between = np.where(n % 4 == 0, 0, falling)
+    assert verdict(None, "", lanes_of(0.5, between, none + 1), 0) == "period_adding_with_chaos"
+    assert verdict(None, "", lanes_of(0.5, between, none + 2), 0) == "windows_and_chaos"

@@ -1,0 +1,77 @@
+"""Curves in two parameters along which a surface that slides is touched, beside a closed form and
+motions that SciPy follows from event to event."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+from scipy.optimize import brentq
+
+from rough_floor import Rough, branch_of, on_both_sides, settled
+
+pytestmark = pytest.mark.slow
+
+
+class Belted(Rough):
+    """The same body on a belt, which runs faster than the body as long as it slips."""
+
+    belt: Any = 2.0
+
+    @property
+    def switches(self):
+        return (
+            vi.DryFriction(
+                self.level,
+                velocity=lambda machine, x: x.V - machine.belt,
+                force=lambda machine, s, x: machine.pull(s, x),
+                stopped=lambda machine, x: vi.OscillatorState(
+                    x.Y, machine.belt * jnp.ones_like(x.V)
+                ),
+            ),
+        )
+
+
+def test_grazing_sliding_of_a_linear_motion():
+    """As long as it slips, friction is constant and x' swings by ω/|1 - ω² + iδω|: the belt is just
+    reached where it runs as fast."""
+    damping = 0.3
+
+    def reached(omega):
+        return omega / np.hypot(1 - omega**2, damping * omega)
+
+    machine = Belted(omega=0.75, level=0.2, damping=damping, belt=1.1 * reached(0.75))
+    start = vi.OscillatorState(jnp.asarray(0.1), jnp.asarray(0.0))
+    orbit = vi.find_orbit(machine, vi.simulate(machine, start, 1, settle=200).last, throw=True)
+    bounds = (0.2, 5.0)
+    branch = vi.continue_orbit(orbit, parameter="belt", bounds=bounds, progress=False)
+    (point,) = branch.special
+    assert point.kind == "grazing-sliding" and point.touches
+    assert point.parameter == pytest.approx(reached(0.75), abs=1e-10)
+    curve = vi.boundary(point, parameter="omega", bounds=(bounds, (0.4, 1.6)))
+    assert curve.kind == "grazing-sliding" and len(curve.parameters) > 10
+    belt, omega = curve.parameters.T
+    assert np.ptp(omega) == pytest.approx(1.2)
+    np.testing.assert_allclose(belt, reached(omega), rtol=1e-9)
+
+
+def test_adding_sliding_beside_motions_followed_from_event_to_event():
+    """Where the drive is strongest it just comes to what friction holds."""
+    numbers = {"level": 0.5, "second": 0.0, "damping": 0.04}
+    point = branch_of("omega", (0.15, 0.7), omega=0.25, **numbers).special[0]
+    sides = [point, on_both_sides(point, "omega", (0.15, 0.2))]
+    assert [side.kind for side in sides] == ["adding-sliding"] * 2
+    (without,) = (side for side in sides if side.touches)
+    curve = vi.boundary(without, parameter="level", bounds=((0.1, 0.3), (0.45, 0.55)))
+    assert curve.kind == "adding-sliding" and np.ptp(curve.parameters[:, 1]) > 0.04
+
+    def excess(omega, level):
+        """At phase 2π of the body that came to stand before, once it has settled."""
+        events = settled(omega, level, 0.0, 0.04, cycles=25)
+        (Y,) = (e[1] for e in events if e[3] == 0 and e[1] > 0)
+        return 1.0 - Y - level if Y < 1 else Y - 1 - level
+
+    for omega, level in curve.parameters[[0, len(curve.parameters) // 2, -1]]:
+        truth = brentq(excess, omega - 1e-5, omega + 1e-5, args=(level,), xtol=1e-11)
+        assert omega == pytest.approx(truth, abs=1e-8)
