@@ -29,6 +29,7 @@ from .methods import AbstractMethod as AbstractMethod
 from .methods import Adaptive as Adaptive
 from .methods import ExactFlight as ExactFlight
 from .methods import FixedStep as FixedStep
+from .methods import ImplicitSteps as ImplicitSteps
 from .methods import MethodLike as MethodLike
 from .methods import Taylor as Taylor
 from .methods import Unrolled as Unrolled

@@ -80,7 +80,8 @@ def continue_orbit(
       hits its right stop). The special point `turn` is one where the parameter turns back; a
       `fold` is then where a multiplier passes 1. Hopf points are not sought.
     - `method`: how the machine is carried, of fixed steps: by default that of the orbit if its
-      steps are, else `ExactFlight()` where it applies, else 20 steps of `Verner9` a cycle.
+      steps are, else `ExactFlight()` where it applies, else 20 steps of `Verner9` a cycle. Of an
+      implicit solver, as `Adaptive(diffrax.Kvaerno5())`, equal steps are taken.
     - `progress`: count the points found, in a terminal or a notebook.
 
     **Returns:** a `Branch`.

@@ -11,7 +11,7 @@ import numpy as np
 
 from .._programs import compiled
 from .._types import Scalar, State
-from ..flow import AbstractMethod, FixedStep, MethodLike, chosen
+from ..flow import AbstractMethod, Adaptive, FixedStep, ImplicitSteps, MethodLike, chosen
 from ..machine import AbstractMachine
 
 
@@ -29,10 +29,14 @@ def fixed_step_method(
     was found; the orbit's machine.
 
     **Returns:** the one asked for; else that of the orbit, if its steps are fixed; else
-    `ExactFlight` where it applies; else 20 steps of `Verner9` a cycle, whose error is 1e-13.
+    `ExactFlight` where it applies; else 20 steps of `Verner9` a cycle, whose error is 1e-13. Of an
+    implicit solver equal steps, as many as it takes (see `problem_of`).
 
-    **Raises:** `ValueError` if the one asked for sizes its steps by a tolerance.
+    **Raises:** `ValueError` if the one asked for is explicit and sizes its steps by a tolerance.
     """
+    method = found_with if asked is None else asked
+    if isinstance(method, Adaptive) and method.solver.implicit:
+        return ImplicitSteps(method.solver, 20)
     if asked is not None:
         method = chosen(machine, asked)
         if not has_fixed_steps(method):

@@ -9,7 +9,7 @@ from jax.flatten_util import ravel_pytree
 
 from .._programs import compiled
 from .._types import State
-from ..flow import MethodLike, RunOptions, collect, planned, run_lane
+from ..flow import ImplicitSteps, MethodLike, RunOptions, collect, planned, run_lane
 from ..machine import (
     AbstractMachine,
     after_event,
@@ -75,7 +75,7 @@ def problem_of(
     blank = Shooting(machine, carried, orbit.state, cycles, (), (), steps, (parameter,))
     period = float(orbit.duration) if blank.autonomous else float(machine.cycle) * cycles
     way = _followed(blank, orbit.state, found, period)
-    while not machine.scales_known:
+    while not machine.scales_known or isinstance(carried, ImplicitSteps):
         finer = dataclasses.replace(blank, steps=2 * blank.steps)
         again = _followed(finer, orbit.state, found, period)
         apart = np.max(np.abs(again.states - way.states) / (1 + np.abs(again.states)))

@@ -8,6 +8,7 @@ from .choice import preset as preset
 from .exact import ExactFlight as ExactFlight
 from .runge_kutta import Adaptive as Adaptive
 from .runge_kutta import FixedStep as FixedStep
+from .runge_kutta import ImplicitSteps as ImplicitSteps
 from .taylor import Taylor as Taylor
 from .unrolled import Unrolled as Unrolled
 from .verner import Verner9 as Verner9

@@ -153,7 +153,7 @@ class FixedStep(AbstractMethod):
 
     def __check_init__(self):
         count("steps_per_cycle", self.steps_per_cycle, least=5)
-        if self.solver.implicit:
+        if self.solver.implicit and not isinstance(self, ImplicitSteps):
             raise TypeError(
                 "Argument `solver` of `FixedStep` must be an explicit diffrax Runge–Kutta solver, "
                 f"but got {self.solver.solver!r}. Use `Adaptive`."
@@ -170,3 +170,28 @@ class FixedStep(AbstractMethod):
     def tighter(self):
         """The same solver with twice as many steps a cycle."""
         return FixedStep(self.solver, 2 * self.steps_per_cycle)
+
+
+class ImplicitSteps(FixedStep):
+    """An implicit solver with a fixed number of steps in a cycle, however fast something fades: by
+    these the branch of a stiff machine is followed. Where the stages of a step have no solution its
+    end is not a number."""
+
+    def longest(self, machine, s, state):
+        """As `Adaptive` with such a solver."""
+        return machine.step_limit(s, state) * (5 / self.steps_per_cycle)
+
+    def step(self, smooth, s0, s1, state, beside):
+        """One Runge–Kutta step; its error is not asked for.
+
+        **Arguments:** as `AbstractMethod.step`.
+        """
+        solver = Unrolled(self.solver.solver, tolerance=8 * jnp.finfo(s0.dtype).eps)
+        new, beside, errors = _runge_kutta(solver, smooth, s0, s1, state, beside)
+        solved = jnp.isfinite(sum(map(jnp.sum, jtu.tree_leaves(errors))))
+        new = jtu.tree_map(lambda x: jnp.where(solved, x, jnp.nan), new)
+        return new, beside, jnp.zeros_like(s0)
+
+    def tighter(self):
+        """The same solver with twice as many steps a cycle."""
+        return ImplicitSteps(self.solver, 2 * self.steps_per_cycle)
