@@ -63,7 +63,7 @@ for seed, (kind, (draw, count)) in enumerate(KINDS.items(), SEED):
         if kind == "scene" and one.parameter == "stops.0.gap" and not int(point.orbit.impacts):
             machine = point.orbit.machine
             closed |= {
-                f"{label}: ζ": float(machine.drive.frequency_ratio),
+                f"{label}: ζ": float(number(machine, "drive.frequency_ratio")),
                 f"{label}: ξ": float(number(machine, "oscillator.damping_ratio")),
                 f"{label}: d": point.parameter,
             }

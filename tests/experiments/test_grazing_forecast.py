@@ -1,5 +1,7 @@
 """Forecasts of what follows a grazing, of a few of the machines of the study, beside its judge."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import vi_jax as vi
@@ -25,12 +27,13 @@ def lanes_of(power, period, touches):
 
 def test_the_judge_tells_windows_from_each_other():
     """By made-up lanes: each name, without a machine."""
+    nowhere: Any = None
     n, none = np.arange(LANES), np.zeros(LANES, int)
     falling = 8 - n // 32  # 8 … 3, longest nearest to the grazing
-    assert verdict(None, "", lanes_of(0.5, none + 1, none + 1), 0) == "persistence"
-    assert verdict(None, "", lanes_of(0.5, none, none), 0) == "chaos"
-    assert verdict(None, "", lanes_of(0.5, falling, none + 1), 0) == "period_adding"
-    assert verdict(None, "", lanes_of(0.5, falling[::-1], none + 1), 0) == "periodic"
+    assert verdict(nowhere, "", lanes_of(0.5, none + 1, none + 1), 0) == "persistence"
+    assert verdict(nowhere, "", lanes_of(0.5, none, none), 0) == "chaos"
+    assert verdict(nowhere, "", lanes_of(0.5, falling, none + 1), 0) == "period_adding"
+    assert verdict(nowhere, "", lanes_of(0.5, falling[::-1], none + 1), 0) == "periodic"
     between = np.where(n % 4 == 0, 0, falling)
-    assert verdict(None, "", lanes_of(0.5, between, none + 1), 0) == "period_adding_with_chaos"
-    assert verdict(None, "", lanes_of(0.5, between, none + 2), 0) == "windows_and_chaos"
+    assert verdict(nowhere, "", lanes_of(0.5, between, none + 1), 0) == "period_adding_with_chaos"
+    assert verdict(nowhere, "", lanes_of(0.5, between, none + 2), 0) == "windows_and_chaos"

@@ -191,14 +191,16 @@ def grazing(
     found = dataclasses.replace(
         unchecked, machine=beside, checked=checked, agreement=agreement, far=far
     )
-    return found if checked is None else _within(found, graze, settles)
+    return found if checked is None else _within(found, graze, settles, checked)
 
 
-def _within(found: Grazing, graze: Graze, settles: Settled) -> Grazing:
+def _within(
+    found: Grazing, graze: Graze, settles: Settled, checked: tuple[float, float]
+) -> Grazing:
     """The same, what follows named for the values at which the machine agrees alone: elsewhere the
     local map may go through other things than the machine does."""
     size = np.abs(found.forecast.offset)
-    inside = (size >= found.checked[0]) & (size <= found.checked[1])
+    inside = (size >= checked[0]) & (size <= checked[1])
     some = Settled(*(part[inside] for part in settles))
     outcome, aperiodic = scenario_of(graze.map, found.forecast.offset[inside], some)
     return dataclasses.replace(found, outcome=getattr(SCENARIOS, outcome), aperiodic=aperiodic)

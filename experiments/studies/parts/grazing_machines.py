@@ -41,20 +41,20 @@ class TwoBodies(vi.AbstractMachine):
     """Whether it is the second that meets the stop."""
 
     @property
-    def stops(self):
+    def stops(self):  # pyright: ignore
         return (vi.RigidStop(self.gap, self.restitution),)
 
     @property
     def cycle(self):
         return 2 * np.pi
 
-    def position(self, x):
+    def position(self, x):  # pyright: ignore
         return x[2 * self.second]
 
-    def velocity(self, x):
+    def velocity(self, x):  # pyright: ignore
         return x[2 * self.second + 1]
 
-    def placed(self, x, Y, V):
+    def placed(self, x, Y, V):  # pyright: ignore
         i = 2 * self.second
         return (*x[:i], Y, V, *x[i + 2 :])
 
@@ -78,7 +78,7 @@ class Compliant(vi.AbstractMachine):
     stop: vi.SoftStop
 
     @property
-    def stops(self):
+    def stops(self):  # pyright: ignore
         return ()
 
     @property
@@ -129,7 +129,7 @@ def scene(rng: np.random.Generator) -> Drawn:
 def _turns_back(machine: Any) -> tuple[Any, Any, Any]:
     """How nearly the motion repeats after a cycle, how near it comes to a wall that it does not
     hit, and whether it was followed."""
-    run = vi.simulate(machine, machine.start(), 1, settle=SETTLE, impact_log=8)
+    run: Any = vi.simulate(machine, machine.start(), 1, settle=SETTLE, impact_log=8)
     ends = jnp.stack(jax.tree.leaves(run.sections))
     return jnp.abs(ends[:, 1] - ends[:, 0]).max(), run.clearance[0], run.successful
 
@@ -138,7 +138,7 @@ def pairs(rng: np.random.Generator) -> list[Drawn]:
     """Balls in boxes that are bodies on springs themselves. In few of them the ball turns back just
     before a wall: of many these are taken."""
     many = 4096
-    numbers = {
+    numbers: dict[str, Any] = {
         "half_gap": rng.uniform(0.05, 3.0, many), "restitution": rng.uniform(0.2, 0.9, many),
         "mass_ratio": rng.uniform(0.05, 0.5, many), "damping_ratio": rng.uniform(0.05, 0.5, many),
         "frequency": rng.uniform(0.3, 2.0, many), "force": rng.uniform(0.5, 2.0, many),
@@ -147,7 +147,8 @@ def pairs(rng: np.random.Generator) -> list[Drawn]:
     taken = np.flatnonzero(good & (repeats < 1e-9) & (room < 0.05 * numbers["half_gap"]))
     found = []
     for i in taken:
-        machine = vi.machines.ImpactPair(**{name: float(x[i]) for name, x in numbers.items()})
+        own: dict[str, Any] = {name: float(x[i]) for name, x in numbers.items()}
+        machine = vi.machines.ImpactPair(**own)
         name = ("half_gap", "restitution", "force")[rng.integers(3)]
         value = numbers[name][i]
         found.append(Drawn("pair", machine, name, _around(name, value)))
@@ -160,7 +161,7 @@ def _around(name: str, value: float) -> tuple[float, float]:
 
 def two_bodies(rng: np.random.Generator) -> Drawn:
     """Two degrees of freedom with cubic springs and a stop."""
-    machine = TwoBodies(
+    machine = TwoBodies(  # pyright: ignore
         frequency=jnp.asarray(rng.uniform(0.3, 2.5)), damping=jnp.asarray(_log(rng, 0.1, 3.0)),
         cubic=jnp.asarray(rng.uniform(0.0, 0.5)), coupling=jnp.asarray(rng.uniform(0.2, 2.0)),
         mass=jnp.asarray(rng.uniform(0.3, 2.0)), gap=jnp.asarray(100.0),
@@ -180,7 +181,7 @@ def prestressed(rng: np.random.Generator) -> Drawn:
 
 
 def _compliant(rng: np.random.Generator, kind: str, options: dict) -> Drawn:
-    machine = Compliant(
+    machine = Compliant(  # pyright: ignore
         jnp.asarray(rng.uniform(0.3, 2.5)), jnp.asarray(_log(rng, 0.1, 4.0)),
         jnp.asarray(rng.uniform(0.0, 0.5)), vi.SoftStop(100.0, _log(rng, 5.0, 100.0), **options),
     )  # fmt: skip
@@ -189,7 +190,7 @@ def _compliant(rng: np.random.Generator, kind: str, options: dict) -> Drawn:
 
 def _within_reach(rng: np.random.Generator, kind: str, machine: Any, gap: str) -> Drawn:
     """Its stop just beyond what it reaches without one, or half of the time well within."""
-    run = vi.simulate(machine, machine.start(), 3, settle=SETTLE)
+    run: Any = vi.simulate(machine, machine.start(), 3, settle=SETTLE)
     reach = float(run.y_max[-1])
     share = 1.15 if kind != "two bodies" or rng.random() < 0.5 else rng.uniform(0.2, 0.9)
     machine = changed(machine, gap, jnp.asarray(share * reach))

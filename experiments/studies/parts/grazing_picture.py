@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 from tools.pictures import legend_below, open_frames
 from vi_jax.plot.colors import BLUE, GREEN, ORANGE, RED
 
@@ -23,6 +24,10 @@ def picture(shown: dict[str, Any]) -> Figure:
         ax.set_title(f"{verdict}\n({label})", fontsize=9)
         ax.set_xlabel(f"distance in {parameter}", fontsize=8)
         ax.tick_params(labelsize=8)
+        for axis, values in ((ax.xaxis, lanes.offset), (ax.yaxis, lanes.distance)):
+            axis.set_minor_formatter(NullFormatter())  # else labels overlap within a decade
+            low, high = values.min(), values.max()
+            axis.set_view_interval(min(low / 1.3, 0.2 * high), max(high * 1.3, 5 * low))
     axes[0].set_ylabel("distance of the motion", fontsize=8)
     open_frames(axes)
     handles = [

@@ -181,8 +181,9 @@ def _impacting(
     rng, base = np.random.default_rng(seed), _base(point)
     offset = -lanes.side * lanes.offset[-1]
     way = rng.normal(size=(_STARTS, len(_origin(point))))
-    reach = abs(offset) * np.exp(rng.uniform(*np.log(_REACH), (_STARTS, 1)))
+    reach = abs(offset) * np.exp(rng.uniform(np.log(_REACH[0]), np.log(_REACH[1]), (_STARTS, 1)))
     rows = _origin(point) + reach * way / np.linalg.norm(way, axis=1, keepdims=True)
+    best = rows
     for _ in range(_ROUNDS):
         miss, hits = map(np.asarray, _cycled(*_beside(point, name, offset, rows)))
         order = np.argsort(np.where(hits == base + 1, miss, np.inf))[:_BEST]
