@@ -88,6 +88,13 @@ page = f"""# Forecasts of what follows a grazing, beside simulation
 "Impacts" are those of the motion that grazes, in a cycle; "largest multiplier" is its modulus
 without the touch. Simulations say: {", ".join(f"{n} {name}" for name, n in kinds.most_common())}.
 
+These machines are a second draw. On a first one of 50 others 47 forecasts were right. Two of the
+misses were called period adding where simulation had windows of some n without n + 1; since then
+`vi.grazing` asks for both, for the values at which the machine itself agrees. The third, whose
+largest multiplier is next to 2/3, where windows begin to touch, has chaos at 91 % of the values by
+its local map and at 97 % by simulation. The search for the unstable motion beside a fold was mended
+on that draw too.
+
 ![Lanes of one machine for each verdict](../figures/grazing_forecast.png)
 
 Each machine is drawn at random, and taken if the motion on which it settles has one cycle, comes to
