@@ -173,9 +173,11 @@ def evaluated(closed: ClosedJaxpr | Jaxpr, *args: Any) -> list[Any]:
     return [read(a) for a in jaxpr.outvars]
 
 
+@functools.lru_cache(maxsize=256)
 def rewritten(closed: ClosedJaxpr, one: Callable[[Any], Any]) -> ClosedJaxpr:
     """A jaxpr with `one` of each of its equations in that one's place, in inner jaxprs too; but
     what has a derivative of its own stays as it is."""
+    # What is one jaxpr in several equations stays one, which JAX then differentiates once.
     return closed.replace(jaxpr=_rewritten(closed.jaxpr, one))
 
 

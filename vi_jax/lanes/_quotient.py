@@ -5,7 +5,6 @@ each is multiplied by one reciprocal: in the derivatives of a machine's motion t
 take most of the time.
 """
 
-import functools
 from typing import Any
 
 import jax.numpy as jnp
@@ -26,7 +25,6 @@ def _divided(eqn: Any) -> Any:
     return eqn
 
 
-@functools.lru_cache(maxsize=256)
 def with_quotients(closed: ClosedJaxpr) -> ClosedJaxpr:
     """The same jaxpr, its divisions of floating-point numbers with this derivative."""
     return rewritten(closed, _divided)
