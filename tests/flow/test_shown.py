@@ -2,12 +2,14 @@
 
 import pickle
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
 from vi_jax.machine.numbers import by_name
+from vi_jax.machine.shown import known
 from vi_jax.machine.units import unit_of
 
 M = vi.machines
@@ -96,3 +98,8 @@ def test_a_misspelt_reason_names_the_near_ones(kind):
     with pytest.raises(AttributeError, match="its members: successful, "):
         _ = kind.xyzzy
     assert not hasattr(kind, "__wrapped__")
+
+
+def test_a_solver_with_functions_for_leaves_hides_no_result():
+    assert known(vi.Adaptive(diffrax.Kvaerno5()))
+    assert not known(jax.eval_shape(lambda x: x, SCENE)) and not known([object()])

@@ -84,7 +84,7 @@ def section_of(found, force, omega, cycles):
     return ahead + np.array([swing.real, (1j * omega * swing).real])
 
 
-@pytest.mark.parametrize("cycles", [2])
+@pytest.mark.parametrize("cycles", [2, 3])
 @pytest.mark.parametrize(
     ("kind", "side", "away"), [("fold", -0.05, 0.5), ("period-doubling", 0.04, 2)]
 )
@@ -99,13 +99,16 @@ def test_motions_of_several_cycles_have_theirs_as_well(kind, side, away, cycles)
         amplitude=force, frequency=omega, damping=0.1, gap=1.0, restitution=0.8, two_sided=False
     )
     Y, V = section_of(one_impact(omega, force, **given), force, omega, cycles)
-    orbit = vi.find_orbit(machine, machine.start(Y=Y, V=V), cycles=cycles, throw=True)
+    # Of three long cycles the steps' own error is more than the usual tolerance.
+    newton = vi.Newton(tolerance=1e-8)
+    start = machine.start(Y=Y, V=V)
+    orbit = vi.find_orbit(machine, start, cycles=cycles, throw=True, root_finder=newton)
     assert int(orbit.impacts) == 1 and bool(orbit.stable)
     bounds = (0.5 * force, 1.5 * force)
     branch = vi.continue_orbit(orbit, parameter="amplitude", bounds=bounds)
     (special,) = (point for point in branch.special if point.kind == kind)
     frequencies = (meets - 0.2, meets + 0.2)
-    curve = vi.boundary(special, parameter="frequency", bounds=(bounds, frequencies), max_step=0.01)
+    curve = vi.boundary(special, parameter="frequency", bounds=(bounds, frequencies), max_step=0.04)
     end = the(curve, "grazing")
     np.testing.assert_allclose(end.parameters, [grazes(meets), meets], rtol=1e-9)
     assert coefficient_at(meets, curve, 5e-2) == pytest.approx(c, rel=1e-4)

@@ -71,7 +71,8 @@ def known(tree: object) -> bool:
 
 
 def _there(x: object) -> bool:
-    if isinstance(x, Tracer) or not eqx.is_array_like(x):
+    # JAX's own placeholder is a bare object; a solver's leaves may be functions and words.
+    if isinstance(x, Tracer | jax.ShapeDtypeStruct) or type(x) is object:
         return False
     return not (isinstance(x, jax.Array) and x.is_deleted())
 

@@ -251,7 +251,7 @@ class Orbit(Summarized):
             )
         if not bool(self.successful):
             reason = ORBIT_RESULTS[self.result]
-            return f"No orbit: {reason} Residual {float(self.residual):.3g}."
+            return f"No orbit: {reason} Residual {float(self.residual):.3g}.{_nearly(self)}"
         count, cycles, units = int(self.impacts), int(self.cycles), self.machine.units
         period = self.machine.period_of(cycles)
         lines = [
@@ -293,6 +293,17 @@ class InWords:
 
     def _repr_html_(self) -> str:
         return summary_table(str(self), getattr(self, "y_min", None))
+
+
+def _nearly(orbit: Orbit) -> str:
+    """What to do where a search ended close to an orbit, by the errors of the steps."""
+    # A choice: starts that are no good end with residuals of some 1e-3 and more.
+    if orbit.result != ORBIT_RESULTS.no_orbit or not float(orbit.residual) < 1e-7:
+        return ""
+    return (
+        " So small a residual is mostly the steps' own error: ask for a finer `method`, or for less"
+        " by `root_finder=vi.Newton(tolerance=1e-8)`."
+    )
 
 
 def span_in_words(orbit: Orbit, digits: int) -> str:
