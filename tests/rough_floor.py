@@ -48,11 +48,13 @@ class Rough(vi.AbstractMachine):
         return 0.4 * np.pi * jnp.minimum(1.0, self.omega)
 
 
-def branch_of(parameter, bounds, **numbers):
+def branch_of(parameter, bounds, *, max_step=0.1, **numbers):
     machine = Rough(**numbers)
     start = vi.OscillatorState(jnp.asarray(0.1), jnp.asarray(0.0))
     orbit = vi.find_orbit(machine, vi.simulate(machine, start, 1, settle=200).last)
-    return vi.continue_orbit(orbit, parameter=parameter, bounds=bounds, progress=False)
+    return vi.continue_orbit(
+        orbit, parameter=parameter, bounds=bounds, max_step=max_step, progress=False
+    )
 
 
 def on_both_sides(point, parameter, bounds, distance=0.01):

@@ -10,14 +10,28 @@ from studies.parts.grazing_verdict import LANES, Lanes, judged, name_of, verdict
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("kind", "count"), [("scene", 3), ("prestressed", 1)])
-def test_forecasts_beside_simulation(kind, count):
-    draw, _ = KINDS[kind]
-    for n, (drawn, point) in enumerate(machines(draw, count, 7)):
+def test_forecasts_beside_simulation():
+    for n, (drawn, point) in enumerate(machines(KINDS["scene"][0], 3, 7)):
         found = vi.grazing(point, progress=False)
         *_, lanes, named = judged(point, drawn.parameter, found, n)
         assert lanes.side == found.side
         assert name_of(found) == named
+
+
+@pytest.mark.slow
+def test_windows_beside_simulation():
+    """Of a prestressed stop. The motion of three cycles is there 8e-7 before the grazing already,
+    9e-4 away: a jump in the limit, which lanes farther off read as the first window of period
+    adding. So it is the windows that are compared, not the names."""
+    ((drawn, point),) = machines(KINDS["prestressed"][0], 1, 7)
+    found = vi.grazing(point, progress=False)
+    *_, lanes, _ = judged(point, drawn.parameter, found, 0)
+    assert found.windows is not None and lanes.side == found.side
+    ends = dict(zip(found.windows.period, np.sort(found.windows.stable, axis=1), strict=True))
+    assert set(lanes.period) == {2, 3}
+    for offset, period in zip(found.side * lanes.offset, lanes.period, strict=True):
+        low, high = ends[period]  # of the local map, whose ends are a few per cent off out there
+        assert 1.1 * low < offset < 0.9 * high
 
 
 def lanes_of(power, period, touches):
