@@ -93,9 +93,9 @@ misses were called period adding where simulation had windows of some n without 
 `vi.grazing` asks for both, for the values at which the machine itself agrees. The third, whose
 largest multiplier is next to 2/3, where windows begin to touch, has chaos at 91 % of the values by
 its local map and at 97 % by simulation. The search for the unstable motion beside a fold was mended
-on that draw too. One more machine is in the tests: a motion of three cycles is there 8e-7 before the
-grazing already, 9e-4 away. That is a jump in the limit, and so it is called; simulation farther off
-reads it as the first window of period adding.
+on that draw too. One more machine is in the tests: a motion of three cycles is there 8e-7 before
+the grazing already, 9e-4 away. That is a jump in the limit, and so it is called; simulation farther
+off reads it as the first window of period adding.
 
 ![Lanes of one machine for each verdict](../figures/grazing_forecast.png)
 
