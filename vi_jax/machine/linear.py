@@ -32,7 +32,7 @@ class _Known(NamedTuple):
     inverse: Float[Array, "n n"] | None
     """M⁻¹; `None` for a diagonal M."""
     longest: Scalar
-    """The longest step."""
+    """The longest step, a fifth of the shortest period of the modes or the force."""
 
 
 class LinearMachine(AbstractMachine):
@@ -114,7 +114,7 @@ class LinearMachine(AbstractMachine):
         return StructureState(v, self._accelerated(pull))
 
     def _accelerated(self, force: Float[Array, " n"]) -> Float[Array, " n"]:
-        """M⁻¹ times a force."""
+        """The accelerations M⁻¹ f that a force on the displacements causes."""
         known = None if self._known is None else self._known.inverse
         return solved(self.mass, force) if known is None else known @ force
 

@@ -1,7 +1,7 @@
 """`minimal_kick`: the smallest change of the state after which a machine settles elsewhere."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -147,10 +147,9 @@ def minimal_kick(
     cycle, candidates = count("cycle", cycle), count("candidates", candidates, least=1)
     directions, points = count("directions", directions, least=4), count("points", points, least=2)
     longest, seed = count("longest", longest, least=1), count("seed", seed)
-    progress = flag("progress", progress)
+    phases, progress = count("phases", phases, least=2), flag("progress", progress)
     if largest is not None:
         largest = given_number("largest", largest, low=0.0, open_low=True)
-    phases = count("phases", phases, least=2)
     settling, start = settling_on(
         machine, orbit, settle, tolerance, longest, method, "orbit", cycle
     )
@@ -159,26 +158,42 @@ def minimal_kick(
     look = Look(directions, points, largest, candidates, longest, seed)
     kicks: list[MinimalKick] = []
 
-    def smallest() -> MinimalKick:
-        first, *others = sorted(kicks, key=lambda one: float(one.norm))
-        return dataclasses.replace(first, others=tuple(others), lanes=settling.lanes)
-
     def kept() -> Interrupted | None:
-        return Interrupted("search for kicks", smallest()) if kicks else None
+        return Interrupted("search for kicks", _smallest(kicks, settling)) if kicks else None
 
     with at_work("minimal kick", kept, progress=progress, unit="start") as settling.tell:
         here = Here(settling, kick, cycle, 0.0)
-        if when is not None:
-            here = here.at(when, cycle, since or 0.0)
-        if when is not None and since is None:
-            here, look = worst(when, here, look, phases)
-        found = look.exits(here)
-        for ray in look.best(found):
-            new = exact(here, found.directions[ray], float(found.outside[ray]), look)
-            new = _described(here, new, longest)
+        for new in _each(*_at(when, since, here, look, phases)):
             if all(_apart(new, old) > _SAME for old in kicks):
                 kicks.append(new)
-    return smallest()
+    return _smallest(kicks, settling)
+
+
+def _smallest(kicks: list[MinimalKick], settling: Settling) -> MinimalKick:
+    """The kick of the least norm, with the others."""
+    first, *others = sorted(kicks, key=lambda one: float(one.norm))
+    return dataclasses.replace(first, others=tuple(others), lanes=settling.lanes)
+
+
+def _at(
+    when: Moments | None, since: float | None, here: Here, look: Look, phases: int
+) -> tuple[Here, Look]:
+    """The moment at which the motion is kicked, and how kicks are looked for there.
+
+    **Arguments:** moments and phase as from `_moments`; the kicks on the section.
+    """
+    if when is None:
+        return here, look
+    there = here.at(when, here.cycle, since or 0.0)
+    return worst(when, there, look, phases) if since is None else (there, look)
+
+
+def _each(here: Here, look: Look) -> Iterator[MinimalKick]:
+    """The kicks from the best rays at a moment, made exact one after the other."""
+    found = look.exits(here)
+    for ray in look.best(found):
+        new = exact(here, found.directions[ray], float(found.outside[ray]), look)
+        yield _described(here, new, look.longest)
 
 
 def _moments(

@@ -60,6 +60,11 @@ class AbstractMethod(eqx.Module):
         """Raise a `ValueError` if this method cannot move `machine`."""
         return None
 
+    @property
+    def follows_fading(self) -> bool:
+        """Whether a step must be short beside what fades, or it grows instead; static."""
+        return True
+
     def longest(self, machine: AbstractMachine, s: Scalar, state: State) -> Scalar | float:
         """The longest step from here.
 
@@ -67,7 +72,8 @@ class AbstractMethod(eqx.Module):
         shorter. With the fewest, five, a step may be as long as 0.8π relaxation times: up to there
         explicit Runge–Kutta methods are stable, and the series of `ExactFlight` exact.
         """
-        limit, fading = machine.step_limit(s, state), machine.relaxation(s, state)
+        limit = machine.step_limit(s, state)
+        fading = machine.relaxation(s, state) if self.follows_fading else None
         if fading is not None:
             limit = jnp.minimum(limit, 0.8 * pi * fading)
         return limit * (5 / self.steps_per_cycle)

@@ -1,5 +1,7 @@
 """Steps by a diffrax Runge–Kutta solver, sized by its error or of fixed number."""
 
+from typing import ClassVar
+
 import diffrax
 import equinox as eqx
 import jax
@@ -84,11 +86,10 @@ class Adaptive(AbstractMethod):
         """Within the tolerances, by which each step is sized anew."""
         return self.rtol if self.atol is None else jnp.maximum(self.rtol, self.atol)
 
-    def longest(self, machine, s, state):
-        """As for all methods; of an implicit solver nothing that fades limits it."""
-        if self.solver.implicit:
-            return machine.step_limit(s, state)
-        return super().longest(machine, s, state)
+    @property
+    def follows_fading(self):
+        """Not with an implicit solver."""
+        return not self.solver.implicit
 
     def step(self, smooth, s0, s1, state, beside):
         """One Runge–Kutta step and its error norm (root mean square over the components of the
@@ -151,9 +152,12 @@ class FixedStep(AbstractMethod):
     solver: Unrolled = eqx.field(default_factory=Verner9, converter=_unrolled)
     steps_per_cycle: int = eqx.field(static=True, default=10)  # pyright: ignore
 
+    takes_implicit: ClassVar[bool] = False
+    """Whether the solver may be implicit."""
+
     def __check_init__(self):
         count("steps_per_cycle", self.steps_per_cycle, least=5)
-        if self.solver.implicit and not isinstance(self, ImplicitSteps):
+        if self.solver.implicit and not self.takes_implicit:
             raise TypeError(
                 "Argument `solver` of `FixedStep` must be an explicit diffrax Runge–Kutta solver, "
                 f"but got {self.solver.solver!r}. Use `Adaptive`."
@@ -177,9 +181,12 @@ class ImplicitSteps(FixedStep):
     these the branch of a stiff machine is followed. Where the stages of a step have no solution its
     end is not a number."""
 
-    def longest(self, machine, s, state):
-        """As `Adaptive` with such a solver."""
-        return machine.step_limit(s, state) * (5 / self.steps_per_cycle)
+    takes_implicit = True
+
+    @property
+    def follows_fading(self):
+        """Never, as with `Adaptive` and such a solver."""
+        return False
 
     def step(self, smooth, s0, s1, state, beside):
         """One Runge–Kutta step; its error is not asked for.

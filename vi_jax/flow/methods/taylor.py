@@ -104,11 +104,10 @@ class Taylor(AbstractMethod):
                     "Use `Adaptive`."
                 )
 
-    def longest(self, machine, s, state):
-        """As for every method of fixed steps; as long as it allows where they are sized."""
-        if self.rtol is None:
-            return super().longest(machine, s, state)
-        return machine.step_limit(s, state) * (5 / self.steps_per_cycle)
+    @property
+    def follows_fading(self):
+        """Where steps are fixed; else they are sized by their errors."""
+        return self.rtol is None
 
     def foresee(
         self, smooth: SmoothMachine, s: Scalar, state: State, beside: Beside | None
