@@ -158,15 +158,11 @@ def motions():
 @pytest.mark.slow
 def test_interrupted_searches_for_kicks_and_edges(monkeypatch, motions):
     one, two, saddle = motions
-    module = importlib.import_module("vi_jax.robust._minimal_kick")
-    ways_out = module._ways_out
-
-    def twice(*arguments):
-        found, best = ways_out(*arguments)
-        return found, best[:1] * 2  # a second ray to be interrupted at, whichever there are
-
-    monkeypatch.setattr(module, "_ways_out", twice)
-    struck(monkeypatch, "robust._minimal_kick._exact", after=1)
+    look = importlib.import_module("vi_jax.robust._minimal_kick").Look
+    best = look.best
+    # A second ray to be interrupted at, whichever there are.
+    monkeypatch.setattr(look, "best", lambda *arguments: best(*arguments)[:1] * 2)
+    struck(monkeypatch, "robust._minimal_kick.exact", after=1)
     with pytest.raises(vi.Interrupted) as caught:
         vi.minimal_kick(SCENE, one)
     assert caught.value.partial.confirmed and caught.value.partial.exact
