@@ -15,6 +15,7 @@ from ._hopf import size_of
 from ._lost import first_lost
 from ._named import named
 from ._origin import halves, origin
+from ._refined_rest import refined_rest
 from ._refined_sliding import refined
 from ._sequence import changed_sequence
 from ._shooting import Shooting
@@ -29,6 +30,7 @@ from .special import (
     DOUBLING,
     EXTREMUM,
     FOLD,
+    REST,
     SYMMETRY,
     TORUS,
     TURN,
@@ -178,7 +180,11 @@ class BranchMonitor:
             return self._where(at, beyond, test) or at, beyond
 
         found = changed_sequence(here, last, where)
-        return None if found is None else self._point(*found)
+        if found is None:
+            return None
+        kind, at, detail = found
+        at = refined_rest(self.problem, at, self.scale) if kind == REST else at
+        return self._point(kind, at, detail)
 
     def _bifurcations(self, here: Step, last: Step) -> Step | None:
         """Record what happens between two points; the point where the branch springs, if met.
