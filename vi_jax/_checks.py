@@ -210,7 +210,8 @@ def instance_of(name: str, value: object, kind: type | tuple[type, ...], describ
     """**Raises:** `TypeError` if `value` is none of this kind, which is `described`."""
     if isinstance(value, kind):
         return
-    got = repr(value)
+    got, *more = repr(value).splitlines() or [""]
+    got += " …" if more else ""
     if isinstance(value, type) and issubclass(value, kind):
         got = f"the class `{value.__name__}`: call it, `{value.__name__}(…)`, for one"
     raise TypeError(f"Argument `{name}` must be {described}, but got {got}.")

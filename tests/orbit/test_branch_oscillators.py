@@ -142,3 +142,29 @@ def test_a_motor_branch_agrees_with_found_orbits():
         assert float(found.y_min) == pytest.approx(float(branch.y_min[end]), abs=1e-9)
         np.testing.assert_allclose(found.multipliers, branch.multipliers[end], atol=1e-7)
         assert float(found.frequency_ratio) == pytest.approx(branch.frequency_ratio[end], abs=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("step", [0.01, 0.02, 0.5])
+def test_a_period_doubling_right_before_an_impact_is_lost(step):
+    """Of the closed form's multipliers one passes -1 beside the grazing, and goes to -∞ there; a
+    step that spans both tells it from none only by the side from which the grazing is reached."""
+
+    def scene_at(zeta):
+        return vi.Scene.ideal(frequency_ratio=zeta, restitution=0.8, gap=1.2, damping_ratio=0.2)
+
+    def beyond(zeta):
+        return float(vi.closed_form_orbits(scene_at(zeta)).multipliers[0].real.min()) + 1
+
+    wanted = brentq(beyond, 0.4315, 0.44, xtol=1e-13)
+    exact = vi.closed_form_orbits(scene_at(0.5))
+    orbit = vi.find_orbit(scene_at(0.5), scene_at(0.5).start(Y=exact.Y[0], V=exact.V[0]))
+    branch = vi.continue_orbit(
+        orbit, parameter=ZETA, bounds=(0.3, 0.6), step=step, max_step=max(step, 0.05)
+    )
+    grazing, doubling = branch.special
+    assert (grazing.kind, doubling.kind) == ("grazing", "period-doubling")
+    assert doubling.parameter == pytest.approx(wanted, abs=1e-10)
+    assert branch.multipliers[0, 0].real < -1e4 and not branch.stable[0]
+    assert branch.to_xarray().stability[0] == "period_doubling"
+    assert int(grazing.orbit.impacts) == 1 and grazing.orbit.multipliers[0].real < -1e4

@@ -68,7 +68,7 @@ def test_a_fold_and_a_doubling_graze_where_a_grazing_is_resonant(kind, frequency
     np.testing.assert_allclose(force, grazes(omega), rtol=1e-11)
     meets = the(other, "resonant-grazing")
     np.testing.assert_allclose(meets.parameters, [grazes(MEETS), MEETS], atol=1e-10)
-    assert meets.detail.endswith("with one impact in 1 periods")
+    assert meets.detail.endswith("with one impact in 1 period")
 
 
 def section_of(found, force, omega, cycles):

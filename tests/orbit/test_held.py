@@ -46,6 +46,7 @@ def test_another_value_is_not_another_program(linear, monkeypatch):
     traced.clear()
     branch = held(linear, 2.9)
     assert not traced and branch.y_max == pytest.approx(2.9, abs=1e-12)
+    assert f"held: y_max = 2.9 a; by {XI} in [0.001, " in str(branch)
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._at_work import at_work
-from .._checks import flag, interval
+from .._checks import flag, instance_of, interval
 from .._interrupted import Interrupted
 from .._lazy import xr
 from ..flow import tidy
@@ -26,7 +26,7 @@ from ._tables import stability_in_words
 from .codimension_two import CodimensionTwo
 from .curve import INTERRUPTED, Step, check_walk, walk
 from .results import InWords, Orbit
-from .special import DOUBLING, FOLD, SYMMETRY, TORUS, TOUCHING, SpecialPoint
+from .special import DOUBLING, FOLD, SYMMETRY, TORUS, TOUCHING, SpecialPoint, one
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -188,14 +188,11 @@ def boundary(
 
 def _check_point(point: SpecialPoint) -> None:
     """**Raises:** `TypeError` or `ValueError` unless this is a bifurcation that can be followed."""
-    if not isinstance(point, SpecialPoint):
-        raise TypeError(
-            f"Argument `point` must be a `SpecialPoint`, from `Branch.special`, but got {point!r}."
-        )
+    instance_of("point", point, SpecialPoint, "a `SpecialPoint`, from `Branch.special`")
     if point.kind not in (FOLD, DOUBLING, TORUS, SYMMETRY, *TOUCHING):
         raise ValueError(
             "Argument `point` must be a fold, a period doubling, a Neimark–Sacker bifurcation, a "
-            f"symmetry breaking or a grazing, but is a {point.kind}."
+            f"symmetry breaking or a grazing, but is {one(point.kind)}."
         )
     if not point.problem.follows_events:
         raise ValueError(
@@ -217,11 +214,11 @@ def _checked_bounds(point: SpecialPoint, parameter: str, bounds: Any) -> Interva
     if name == parameter:
         raise ValueError(f"Argument `parameter` must be another one than {name}.")
     try:
-        first, second = bounds
+        (_, _), (_, _) = first, second = bounds
     except (TypeError, ValueError):
         raise ValueError(
-            "Argument `bounds` must be an interval for each of the two parameters, but got "
-            f"{bounds!r}."
+            "Argument `bounds` must be two intervals, ((low, high), (low, high)), that of "
+            f"{name} and that of {parameter}, but got {bounds!r}."
         ) from None
     first, second = interval("bounds", first), interval("bounds", second)
     check_parameter(machine, name, point.parameter, first, "point")

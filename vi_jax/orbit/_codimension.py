@@ -84,7 +84,8 @@ def points_of(
             found.append((place, point(kind, step)))
     if condition.kind == GRAZING:
         for place, step, entries in _resonances_of(problem, condition, steps, scale):
-            more = f" of the motion with one impact in {len(entries)} periods"
+            n = len(entries)
+            more = f" of the motion with one impact in {n} period{'' if n == 1 else 's'}"
             found.append((place, point(RESONANT, step, condition.impact, more)))
     return tuple(point for _, point in sorted(found, key=lambda f: f[0]))
 

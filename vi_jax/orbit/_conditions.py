@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._types import Scalar, Vector
-from ..machine import with_leaf
+from ..machine import in_unit, with_leaf
+from ..machine import quantity_of as measured
 from ._observed import Observed
 from ._quantities import quantity_of
 from ._shooting import Shooting
@@ -114,6 +115,17 @@ def _multiplier(size: float, greatest: complex) -> HeldMultiplier:
     pair = abs(greatest.imag) > 1e-9
     value = size if pair or greatest.real > 0 else -size
     return HeldMultiplier(jnp.asarray(value, float), pair)
+
+
+def held_in_words(problem: Shooting) -> str:
+    """What is held, and where; host-side."""
+    held = (c for c in problem.conditions if isinstance(c, Held | HeldMultiplier))
+    named = ((c.name if isinstance(c, Held) else "multiplier", float(c.value)) for c in held)
+    units = problem.machine.units
+    return ", ".join(
+        f"{name} = {in_unit(f'{value:.9g}', units, measured(name) or name)}"
+        for name, value in named
+    )
 
 
 def overtaken(problem: Shooting, step: Step) -> float:

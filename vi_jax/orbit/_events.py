@@ -6,7 +6,14 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._types import Scalar, State
-from ..machine import AbstractEvent, AbstractMachine, events_of, guard_of, section_number
+from ..machine import (
+    AbstractEvent,
+    AbstractMachine,
+    SoftStop,
+    events_of,
+    guard_of,
+    section_number,
+)
 
 
 class Event(NamedTuple):
@@ -21,6 +28,8 @@ class Event(NamedTuple):
         """What messages call it: its name, or its kind and place among the machine's events of
         that kind."""
         event, events = self.of(machine), events_of(machine)
+        if isinstance(event, SoftStop):
+            return event.name or f"{event.side} soft stop"
         place = sum(other.word == event.word for other in events[: self.number])
         return event.name or f"{event.word} {place}"
 

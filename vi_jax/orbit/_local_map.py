@@ -21,7 +21,7 @@ from ._fewer_events import of_least_period, without_events
 from ._shooting import Shooting
 from ._solve import tangent_at
 from ._touch import Touch, touch_at, touched
-from .special import SpecialPoint
+from .special import SpecialPoint, one
 
 # A branch that is this steep in its parameter (share of a unit step in scaled unknowns) turns back.
 _STEEP = 1e-6
@@ -129,8 +129,8 @@ def _without_touch(point: SpecialPoint) -> tuple[Shooting, np.ndarray, int, floa
     number and the clock of the touch."""
     if point.kind != "grazing" or not point.touches:
         raise ValueError(
-            "Argument `point` must be a grazing at which something is touched, but is a "
-            f"{point.kind}: {point.detail}."
+            "Argument `point` must be a grazing at which something is touched, but is "
+            f"{one(point.kind)}: {point.detail}."
         )
     if not point.problem.follows_events:
         raise ValueError(

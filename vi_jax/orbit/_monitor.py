@@ -30,6 +30,7 @@ from .special import (
     DOUBLING,
     EXTREMUM,
     FOLD,
+    GRAZING,
     REST,
     SYMMETRY,
     TORUS,
@@ -40,6 +41,9 @@ from .special import (
 # The thresholds here are choices, but for those of which a measurement is given.
 # What lies before the place where a branch springs is looked for on so much of the way there.
 _SHORT = 0.999
+
+# And what lies before an impact that is lost, where the monodromy matrix has a pole: on so much.
+_BEFORE_POLE = 1 - 1e-6
 
 # An autonomous motion of so much of the size of another is rest: what solves its equations there is
 # an equilibrium.
@@ -114,7 +118,9 @@ class BranchMonitor:
         if reason is None:
             again = self.closing.between(here, new, lambda test: self._where(here, new, test))
             last, reason = (new, None) if again is None else (again, "closed")
-        spring = self._bifurcations(here, last)
+        pole = grazing is not None and grazing.kind == GRAZING and grazing.impact is not None
+        end = self._before_pole(here, last) if pole else last
+        spring = self._bifurcations(here, last, end)
         if spring is not None:
             return spring, self.special[-1].kind
         if grazing is not None:
@@ -162,6 +168,11 @@ class BranchMonitor:
         at = at if change is None else refined(self.problem, at, change)
         kind, detail = named(self.problem, at, impact, change)
         impact = 0 if impact == RESTS else None if impact in DETAILS else impact
+        if kind == GRAZING and impact is not None:
+            end = self._before_pole(here, at).seen
+            at = at._replace(
+                seen=at.seen._replace(monodromy=end.monodromy, multipliers=end.multipliers)
+            )
         return self._point(kind, at, detail, impact)
 
     def _sequence(self, here: Step, last: Step) -> SpecialPoint | None:
@@ -186,8 +197,18 @@ class BranchMonitor:
         at = refined_rest(self.problem, at, self.scale) if kind == REST else at
         return self._point(kind, at, detail)
 
-    def _bifurcations(self, here: Step, last: Step) -> Step | None:
-        """Record what happens between two points; the point where the branch springs, if met.
+    def _before_pole(self, here: Step, last: Step) -> Step:
+        """Right before a place where an impact is lost.
+
+        There a multiplier goes to infinity, and comes back from the other side: its sign is that of
+        rounding, and the tests for bifurcations may have changed twice.
+        """
+        end = self._on_the_way(here, last, _BEFORE_POLE)
+        return end if bool(end.good) else last
+
+    def _bifurcations(self, here: Step, last: Step, end: Step) -> Step | None:
+        """Record what happens between two points, as far as `end`; the point where the branch
+        springs, if met.
 
         There the two halves of the period become alike, or images of each other, and beyond it the
         same motions come again, observed half a period later or in the mirror.
@@ -209,13 +230,17 @@ class BranchMonitor:
                 at = self._crossing(here, at, FOLD)
                 point = self._point(kind, at, "the branch springs from a symmetric motion")
             # Beyond it the tests have changed twice: what lies before it shows short of it.
-            length = float(np.dot(here.tangent, (at.x - here.x) / self.scale))
-            found = self._changes(here, self.advance(here.x, here.tangent, _SHORT * length))
+            found = self._changes(here, self._on_the_way(here, at, _SHORT))
             self.between[id(at)] = found
             self.special.append(point)
             return at
-        self.between[id(last)] = self._changes(here, last)
+        self.between[id(last)] = self._changes(here, end)
         return None
+
+    def _on_the_way(self, here: Step, last: Step, share: float) -> Step:
+        """The point at this share of the way between two."""
+        length = float(np.dot(here.tangent, (last.x - here.x) / self.scale))
+        return self.advance(here.x, here.tangent, share * length)
 
     def _changes(self, here: Step, last: Step) -> list[Step]:
         """Record the bifurcations between two points, by the tests that change their signs.

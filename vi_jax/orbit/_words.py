@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
+from ..machine import RigidStop, SoftStop
 from ._events import Event
 from ._shooting import Shooting
 from .curve import Step
@@ -70,8 +71,10 @@ def grazing_in_words(problem: Shooting, at: Step, impact: int | None) -> str:
     machine = problem.machine
     if impact is None:
         touched, clock = int(at.seen.nearest.event), float(at.seen.nearest.clock)
-        guard = f"the guard of {Event(touched).called(machine)}"
-        what = "touches a stop" if touched < len(machine.stops) else f"touches {guard}"
+        event, called = Event(touched).of(machine), Event(touched).called(machine)
+        what = f"touches the guard of {called}"
+        if isinstance(event, RigidStop | SoftStop):
+            what = "touches a stop" if isinstance(event, RigidStop) else f"grazes the {called}"
         return f"{what} {place_in_words(problem, at, clock)}"
     clock = float(np.asarray(problem.parts(jnp.asarray(at.x))[0])[impact])
     lost = problem.events[impact].of(machine)

@@ -11,6 +11,7 @@ from .._checks import one_of
 from .._lazy import xr
 from ..flow import tidy
 from ..machine import in_unit, with_units
+from ._conditions import held_in_words
 from ._shooting import Shooting
 from ._solution import orbit_of
 from ._solve import between
@@ -213,6 +214,17 @@ class Branch(InWords):
             return "rest on a stop"
         return impacts_in_words(self.impact_speed.shape[1])
 
+    def _freed_in_words(self) -> list[str]:
+        """What was freed and what is held instead, if anything is."""
+        if not self.free:
+            return []
+        units = self.problem.machine.units
+        ranges = (
+            f"{name} in {in_unit(f'[{values.min():.6g}, {values.max():.6g}]', units, name)}"
+            for name, values in self.free.items()
+        )
+        return [f"  held: {held_in_words(self.problem)}; by {', '.join(ranges)}"]
+
     def __str__(self) -> str:
         low, high = self.parameter.min(), self.parameter.max()
         machine = self.problem.machine
@@ -222,6 +234,7 @@ class Branch(InWords):
             f"Branch of {len(self.parameter)} motions of period {period} with "
             f"{self._impacts_in_words()}, {self.name} in {span}, "
             f"{int(self.stable.sum())} of them stable; ends: {self.ends[0]}, {self.ends[1]}",
+            *self._freed_in_words(),
             *(f"  {point}" for point in self.special),
         ]
         return "\n".join(lines)

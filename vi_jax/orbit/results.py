@@ -69,7 +69,10 @@ class ORBIT_RESULTS(NamedEnumeration):
         "No orbit was found: the search ended at an equilibrium, where nothing moves; it meets the "
         "equations of a motion with any period."
     )
-    not_simulated = "The guess cannot be simulated, as one beyond a stop: `simulate` says why."
+    not_simulated = (
+        "The guess cannot be simulated, as one beyond a stop or a number of the machine that is "
+        "not finite: `simulate` says why."
+    )
 
 
 _RESULT_NAMES = (

@@ -35,6 +35,11 @@ TOUCHING = (GRAZING, *SLIDING)
 _TOUCHES = 1e-6
 
 
+def one(kind: str) -> str:
+    """A kind with its article, for messages."""
+    return f"{'an' if kind[0] in 'aeiou' else 'a'} {kind}"
+
+
 @dataclasses.dataclass(frozen=True, repr=False)
 class SpecialPoint(InWords):
     """A point of a branch at which something happens."""
@@ -74,7 +79,9 @@ class SpecialPoint(InWords):
         At a period doubling, the motion of twice the period, or of half of it where the branch
         springs from one; at a grazing, the motion with that impact less or one more, on the side on
         which it is admissible; where branches cross, a motion of the other one; at a sliding
-        bifurcation the motion that sticks once more or less.
+        bifurcation the motion that sticks once more or less. A grazing of a machine with soft
+        stops, friction, modes of its own or `events` is not switched at: take `find_orbit` beyond
+        it, from a simulated motion.
 
         **Arguments:** how far from the point (in the norm of the scaled unknowns).
 
@@ -91,7 +98,8 @@ class SpecialPoint(InWords):
             return _held_otherwise(self, distance)
         raise ValueError(
             "`switch` needs a period doubling, a grazing, a sliding bifurcation or a point where "
-            f"branches cross, but this special point is a {self.kind}."
+            f"branches cross, but this special point is {one(self.kind)}."
+            " What comes beyond another one `find_orbit` finds, from a simulated motion."
         )
 
     def __str__(self) -> str:

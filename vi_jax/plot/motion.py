@@ -1,5 +1,6 @@
 """Time histories and phase portraits of single motions."""
 
+from collections.abc import Callable
 from typing import Any
 
 from matplotlib.axes import Axes
@@ -7,7 +8,7 @@ from matplotlib.ticker import FuncFormatter, MultipleLocator
 
 from .._renamed import renamed
 from ..flow import Run, Samples
-from ..machine import AbstractMachine
+from ..machine import AbstractMachine, SoftStop
 from .colors import BLUE, STOP, once
 from .path import motion_path
 from .style import is_set, thick
@@ -40,7 +41,7 @@ def plot_history(
     stops: bool = True,
     **style: Any,
 ) -> Axes:
-    """Position over the drive's clock, with the stops of `machine` as green lines.
+    """Position over the drive's clock, with the stops of `machine` as green lines (dashed if soft).
 
     **Arguments:**
 
@@ -66,14 +67,25 @@ def plot_history(
     factor = 2.0 if unit == "angle" else 1.0
     ax.plot(factor * (path.cycles + shift), path.Y, **{"color": BLUE, "lw": thick(1.3), **style})
     if stops and machine is not None:
-        for stop in machine.stops:
-            ax.axhline(float(stop.place), color=STOP, lw=thick(1.8), label=once(ax, "stop"))
+        _draw_stops(machine, ax, ax.axhline)
     ax.set_ylabel(_labels(motion, machine)[0])
     if unit == "cycles":
         ax.set_xlabel("drive cycles φ/(2π)" if turning else "cycles since the start")
     else:
         angle_axis(ax)
     return ax
+
+
+def _draw_stops(machine: AbstractMachine, ax: Axes, line: Callable[..., Any]) -> None:
+    """Rigid stops as thick lines, soft ones, which a body goes into, as thin dashed ones; those of
+    the coordinate that is drawn."""
+    look = {"color": STOP, "lw": thick(1.8)}
+    for stop in machine.stops:
+        line(float(stop.place), **look, label=once(ax, "stop"))
+    for stop in machine.switches:
+        if isinstance(stop, SoftStop) and stop.coordinate == 0:
+            soft = {"lw": thick(1.2), "ls": "--", "label": once(ax, "soft stop")}
+            line(float(stop.place), **look | soft)
 
 
 def _labels(motion: Run | Samples, machine: AbstractMachine | None) -> tuple[str, str]:
@@ -105,7 +117,7 @@ def plot_phase_portrait(
     sections: bool = True,
     **style: Any,
 ) -> Axes:
-    """Velocity over position, with the stops as green lines and the sections as dots.
+    """Velocity over position, with the stops as green lines (dashed if soft), sections as dots.
 
     **Arguments:** as for `plot_history`; `sections` marks the state after each whole cycle. An
     impact is the vertical line along the stop from V to -k V (if the run has an impact log).
@@ -123,8 +135,7 @@ def plot_phase_portrait(
         dots = {"ms": 4, "color": line.get_color(), "zorder": 3, "label": once(ax, "section")}
         ax.plot(samples.Y[whole], samples.V[whole], "o", **dots)
     if machine is not None:
-        for stop in machine.stops:
-            ax.axvline(float(stop.place), color=STOP, lw=thick(1.8), label=once(ax, "stop"))
+        _draw_stops(machine, ax, ax.axvline)
     position, velocity = _labels(motion, machine)
     ax.set_xlabel(position)
     ax.set_ylabel(velocity)
