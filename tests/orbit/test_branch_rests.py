@@ -285,3 +285,58 @@ def test_gears_that_rattle_and_rest():
         low, high = (middle, high) if comes_to_rest(0.3, middle) else (low, middle)
     # So close to it hops are lost in the rounding of the place, as above.
     assert struck.special[0].parameter == pytest.approx(low, abs=3e-7)
+
+
+class Uneven(vi.AbstractMachine):
+    """A body on a spring, between a stop on which it rests and one that it strikes once."""
+
+    frequency: Any = 0.55
+    restitution: Any = 0.4
+
+    @property
+    def stops(self):
+        return vi.RigidStop(0.1, self.restitution), vi.RigidStop(1.9, 0.6, "left")
+
+    @property
+    def cycle(self):
+        return 2 * np.pi
+
+    def field(self, s, x):
+        pull = 0.35 * jnp.sin(2 * s) - jnp.cos(s) - 0.16 * x.V - x.Y
+        return vi.OscillatorState(x.V / self.frequency, pull / self.frequency)
+
+
+def released(frequency):
+    """How far from the other stop the body of `Uneven` turns after its rest, without that stop."""
+
+    def pull(s, y, v):
+        return 0.35 * np.sin(2 * s) - np.cos(s) - 0.16 * v - y
+
+    let_go = brentq(lambda s: pull(s, 0.1, 0.0), 3.5, 5.5, xtol=1e-14)
+
+    def turns(s, x):
+        return x[1]
+
+    turns.terminal, turns.direction = True, 1
+    flight = solve_ivp(
+        lambda s, x: [x[1] / frequency, pull(s, *x) / frequency], (let_go, let_go + 6), [0.1, 0.0],
+        method="DOP853", events=turns, rtol=1e-12, atol=1e-13,
+    )  # fmt: skip
+    return flight.y[0, -1] + 1.9
+
+
+@pytest.mark.slow
+def test_a_branch_passes_its_section_and_ends_at_a_graze_or_a_bound():
+    """An impact comes upon the section, where the corrector finds a solution far beyond the bounds;
+    then the body just reaches the other stop, where its release alone says. Restitution 0 is a
+    bound beyond which there is no machine."""
+    start = vi.OscillatorState(jnp.zeros(()), jnp.zeros(()))
+    settled = vi.simulate(Uneven(), start, 1, settle=40).last
+    orbit = vi.find_orbit(Uneven(), settled, impact_log=64, throw=True)
+    branch = vi.continue_orbit(orbit, parameter="frequency", bounds=(0.2, 0.6))
+    assert branch.ends == ("grazing", "bounds")
+    wanted = brentq(released, 0.37, 0.385, xtol=1e-13)
+    # So far off is where steps get too short to go on.
+    assert branch.special[0].parameter == pytest.approx(wanted, abs=3e-8)
+    soft = vi.continue_orbit(orbit, parameter="restitution", bounds=(0.0, 0.45))
+    assert soft.ends == ("bounds", "bounds") and soft.parameter[0] == 0.0

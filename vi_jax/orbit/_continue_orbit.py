@@ -145,6 +145,10 @@ def _walked(monitor: BranchMonitor, steps: list[Step], tell: Tell, settings: dic
         beyond = (
             past_section(monitor.problem, steps[-1], monitor.scale) if end == "stalled" else None
         )
+        if end == "stalled" and beyond is None:
+            last, end = monitor.stalled(steps[-1])
+            if last is not steps[-1]:
+                steps.append(last)
         if beyond is None or len(steps) >= settings["max_points"]:
             return end
         steps.append(beyond)

@@ -11,7 +11,9 @@ from .special import GRAZING, REST
 # A body that turns closer to a stop than this beside the place where the number of impacts changes
 # grazes it there; else a chatter has one hop more before it is completed, and the motion goes on.
 # A choice: a step of the parameter of 1e-12 beyond a graze leaves about its square root.
-_GRAZES = 1e-5
+GRAZES = 1e-5
+
+BETWEEN_RESTS = "touches a stop between its rests"
 
 # Places at which the number of impacts changes within one step are looked at, so many: a choice.
 _PLACES = 16
@@ -53,8 +55,8 @@ def _grazed(here: Step, last: Step, where: Where) -> tuple[str, Step, str] | Non
         if found is None:
             return None
         at, here = found
-        if float(at.seen.nearest.room) < _GRAZES:
-            return GRAZING, at, "touches a stop between its rests"
+        if float(at.seen.nearest.room) < GRAZES:
+            return GRAZING, at, BETWEEN_RESTS
     return None
 
 
