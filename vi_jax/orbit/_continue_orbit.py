@@ -26,7 +26,7 @@ from ._section_map import section_map_of
 from ._shooting import Shooting
 from ._solve import advance, tangent_at
 from .branch import Branch
-from .curve import INTERRUPTED, Step, check_walk, walk
+from .curve import INTERRUPTED, STALLED, Step, check_walk, walk
 from .floquet import NEUTRAL
 from .results import ORBIT_RESULTS, Orbit
 from .special import SpecialPoint
@@ -142,13 +142,12 @@ def _walked(monitor: BranchMonitor, steps: list[Step], tell: Tell, settings: dic
     """
     while True:
         end = walk(monitor.advance, steps, stop=monitor.stop, tell=tell, **settings)
-        beyond = (
-            past_section(monitor.problem, steps[-1], monitor.scale) if end == "stalled" else None
-        )
-        if end == "stalled" and beyond is None:
+        if end != STALLED:
+            return end
+        beyond = past_section(monitor.problem, steps[-1], monitor.scale)
+        if beyond is None:
             last, end = monitor.stalled(steps[-1])
-            if last is not steps[-1]:
-                steps.append(last)
+            steps += [] if last is steps[-1] else [last]
         if beyond is None or len(steps) >= settings["max_points"]:
             return end
         steps.append(beyond)

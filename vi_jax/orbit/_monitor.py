@@ -15,9 +15,10 @@ from ._hopf import size_of
 from ._lost import first_lost
 from ._named import named
 from ._origin import halves, origin
+from ._past_section import why_stalled
 from ._refined_rest import refined_rest
 from ._refined_sliding import refined
-from ._sequence import BETWEEN_RESTS, GRAZES, changed_sequence
+from ._sequence import BETWEEN_RESTS, changed_sequence
 from ._shooting import Shooting
 from ._sliding import change_at
 from ._solution import orbit_of
@@ -63,10 +64,6 @@ _BEYOND = 1e-4
 # its first tangent: so far off, as the cosine, it is another curve, beyond a jump of the equations.
 # Steps no longer than the second are rounding.
 _ASIDE, _TINY = 0.9, 1e-6
-
-# A walk that stalls this close to a bound or a grazing (in the parameter's scale) is taken to it: a
-# choice, a few times what the shortest of its steps leave.
-_STALLED_AT = 1e-6
 
 # Halves of a period that differ by less than this are those of a motion of half the period.
 _ALIKE = 1e-3
@@ -140,23 +137,11 @@ class BranchMonitor:
         return None if reason is None else (last, reason)
 
     def stalled(self, last: Step) -> tuple[Step, str]:
-        """The last point of a branch that the corrector follows no further, and why it ends: a
-        motion that rests has none beyond a bound at which its machine ends, as a restitution 0, and
-        beyond a grazing from which both of its branches lead back."""
-        if self.problem.follows_events:
-            return last, "stalled"
-        for bound in self.bounds[-1]:
-            way = (bound - float(last.x[-1])) / self.scale[-1]
-            if len(self.bounds) == 1 and abs(way) < _STALLED_AT:
-                at = advance(self.problem, last.x, np.eye(len(last.x))[-1], self.scale, way)
-                return (at, "bounds") if bool(at.good) else (last, "stalled")
-        # Short of an impact that is lost the body turns far from the stops, beyond it close by.
-        sides = np.outer((_STALLED_AT, -_STALLED_AT), np.eye(len(last.x))[-1])
-        beside = [advance(self.problem, last.x, way, self.scale, 1.0) for way in sides]
-        if any(bool(at.good) and at.seen.nearest.room < GRAZES for at in (last, *beside)):
+        """The last point of a branch that the corrector follows no further, and why it ends."""
+        last, reason = why_stalled(self.problem, last, self.scale, self.bounds)
+        if reason == GRAZING:
             self.special.append(self._point(GRAZING, last, BETWEEN_RESTS))
-            return last, GRAZING
-        return last, "stalled"
+        return last, reason
 
     def _lengthened(self, here: Step, new: Step) -> float:
         """By how much an autonomous motion is longer than its steps, as many as ever, allow."""

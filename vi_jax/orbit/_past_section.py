@@ -1,7 +1,9 @@
-"""Where an impact or a chatter of a motion that rests comes upon its section, and beyond.
+"""Where a walk along motions that rest stalls: an impact or a chatter comes upon their section, or
+there is nothing beyond.
 
-The motion goes on there, but its state on the section jumps: it is that behind the impact instead
-of that before it. So a branch of fixed points of the section map stalls, and is taken up beyond.
+In the first case the motion goes on, but its state on the section jumps: it is that behind the
+impact instead of that before it. So a branch of fixed points of the section map stalls, and is
+taken up beyond.
 """
 
 import jax.numpy as jnp
@@ -9,9 +11,11 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from ..machine import RigidStop
+from ._sequence import GRAZES
 from ._shooting import Shooting
 from ._solve import advance
-from .curve import Step
+from .curve import STALLED, Step
+from .special import GRAZING
 
 # A body this close to a stop on the section meets it there: a choice, far above how close to the
 # place a walk comes before it stalls.
@@ -19,6 +23,10 @@ _MEETS = 1e-5
 
 # How far beyond that place the motion is looked for (in the parameter's scale): choices.
 _BEYOND = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3)
+
+# A walk that stalls this close to a bound or a grazing (in the parameter's scale) is taken to it: a
+# choice, a few times what the shortest of its steps leave.
+_STALLED_AT = 1e-6
 
 
 def past_section(problem: Shooting, last: Step, scale: np.ndarray) -> Step | None:
@@ -42,6 +50,29 @@ def past_section(problem: Shooting, last: Step, scale: np.ndarray) -> Step | Non
                 if bool(found.good) and int(found.seen.counted.rests) == rests:
                     return found
     return None
+
+
+def why_stalled(
+    problem: Shooting, last: Step, scale: np.ndarray, bounds: list[tuple[float, float]]
+) -> tuple[Step, str]:
+    """The last point of a branch that the corrector follows no further, and why it ends.
+
+    A motion that rests has none beyond a bound at which its machine ends, as a restitution 0, and
+    beyond a grazing from which both of its branches lead back.
+    """
+    if problem.follows_events:
+        return last, STALLED
+    along = np.eye(len(last.x))[-1]
+    for bound in bounds[-1]:
+        way = (bound - float(last.x[-1])) / scale[-1]
+        if len(bounds) == 1 and abs(way) < _STALLED_AT:
+            at = advance(problem, last.x, along, scale, way)
+            return (at, "bounds") if bool(at.good) else (last, STALLED)
+    # Short of an impact that is lost the body turns far from the stops, beyond it close by.
+    beside = [advance(problem, last.x, along, scale, way) for way in (_STALLED_AT, -_STALLED_AT)]
+    if any(bool(at.good) and at.seen.nearest.room < GRAZES for at in (last, *beside)):
+        return last, GRAZING
+    return last, STALLED
 
 
 def _speeds(stop: RigidStop, V: float) -> list[float]:

@@ -16,6 +16,7 @@ for hops later and later that place converges, by a factor known from σ, and is
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -111,7 +112,7 @@ def _critical(speeds: Callable[[float], np.ndarray], k: float) -> float | None:
             V = speeds(place)
             return float(np.log(V[hop + 1] / V[hop] / r**2)) if hop + 1 < V.size else np.nan
 
-        place = newton(off, begin, x1=begin + _BESIDE, tol=_TOLERANCE, maxiter=20, disp=False)
+        place: Any = newton(off, begin, x1=begin + _BESIDE, tol=_TOLERANCE, maxiter=20, disp=False)
         return float(place) if abs(place) < _FAR else np.nan
 
     V = speeds(0.0)

@@ -115,8 +115,8 @@ def check_walk(*, step: object, max_step: object, max_points: object) -> dict[st
     }
 
 
-# The end of a walk that has not come to one: Ctrl-C was pressed.
-INTERRUPTED = "interrupted"
+# Ends of a walk that has not come to one: Ctrl-C was pressed, or the corrector has no answer.
+INTERRUPTED, STALLED = "interrupted", "stalled"
 
 
 def walk(
@@ -147,7 +147,7 @@ def walk(
             # The further off a solution is, the longer each trial takes.
             length, failed, steady = length * (0.4 if failed < 2 else 0.1), failed + 1, _STEADY
             if length < _SHORTEST * max_step:
-                return "stalled"
+                return STALLED
             continue
         failed, steady = 0, max(0, steady - 1)
         ending = stop(here, new)
