@@ -87,7 +87,8 @@ def _similar(k: float) -> tuple[float, float]:
     hop."""
     from scipy.optimize import brentq  # slow to load
 
-    a = float(brentq(lambda a: (3 - a) * (1 - a) ** 2 - k * (3 - 2 * a), 0.0, 1.0, xtol=1e-15))
+    root: Any = brentq(lambda a: (3 - a) * (1 - a) ** 2 - k * (3 - 2 * a), 0.0, 1.0, xtol=1e-15)
+    a = float(root)
     r = 1 - a
     # Derivatives by σ of u/(b τ²), of a hop and of the next one.
     this, after = (3 - 2 * a) / 6, k * ((3 - 4 * a) / r**2 + 2 * a * (3 - 2 * a) / r**3) / 6
