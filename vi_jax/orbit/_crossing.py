@@ -80,3 +80,10 @@ def crossing(
 
     tangent = there(lambda step: step.tangent)
     return there(lambda step: step.x), tangent / np.linalg.norm(tangent)
+
+
+def turns_back(here: Step, at: Step, last: Step, scale: np.ndarray) -> bool:
+    """Whether the parameter at a point between two lies beyond that at both, by more than
+    rounding."""
+    sides = [(float(at.x[-1]) - float(step.x[-1])) / scale[-1] for step in (here, last)]
+    return bool(sides[0] * sides[1] > 0 and min(map(abs, sides)) > 1e-12)

@@ -3,13 +3,14 @@
 import dataclasses
 import itertools
 from collections.abc import Callable
+from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
 
 from ._closing import Closing
 from ._conditions import alone, overtaken
-from ._crossing import BESIDE, changed_between, crossing, tests_of
+from ._crossing import BESIDE, changed_between, crossing, tests_of, turns_back
 from ._extrema import Extrema
 from ._hopf import size_of
 from ._lost import first_lost
@@ -229,7 +230,8 @@ class BranchMonitor:
         There the two halves of the period become alike, or images of each other, and beyond it the
         same motions come again, observed half a period later or in the mirror.
         """
-        for kind, difference in ((DOUBLING, self._halves), (SYMMETRY, self._images)):
+        alike = partial(halves, self.problem)
+        for kind, difference in ((DOUBLING, alike), (SYMMETRY, self._images)):
             begin = difference(here)
 
             def along(step: Step, begin=begin, difference=difference) -> float:
@@ -274,7 +276,7 @@ class BranchMonitor:
             at = self._where(here, last, lambda step, kind=kind: tests_of(step)[kind])
             if at is None:
                 continue
-            if kind == FOLD and not both and not self._turns_back(here, at, last):
+            if kind == FOLD and not both and not turns_back(here, at, last, self.scale):
                 continue  # rounding: the tangent is ill-defined close to where branches cross
             if kind in (FOLD, CROSSING) and self._shrinks(here, at, last):
                 continue  # it has a multiplier 1 to rounding
@@ -311,7 +313,7 @@ class BranchMonitor:
 
     def _springs(self, here: Step, at: Step) -> bool:
         """Whether the branch springs there: halves of a period are alike, or images."""
-        apart, images = self._halves(at), self._images(at)
+        apart, images = halves(self.problem, at), self._images(at)
         if apart.size and np.linalg.norm(apart) < _ALIKE:
             return True
         before = np.linalg.norm(self._images(here))
@@ -340,16 +342,8 @@ class BranchMonitor:
             return np.zeros(0)
         return np.asarray(images_at(self.problem, jnp.asarray(step.x)))
 
-    def _halves(self, step: Step) -> np.ndarray:
-        return halves(self.problem, step.x)
-
     def _apart(self, step: Step) -> float:
         return float(np.linalg.norm(self._images(step)))
-
-    def _turns_back(self, here: Step, at: Step, last: Step) -> bool:
-        """Whether the parameter there lies beyond that at both others, by more than rounding."""
-        sides = [(float(at.x[-1]) - float(step.x[-1])) / self.scale[-1] for step in (here, last)]
-        return bool(sides[0] * sides[1] > 0 and min(map(abs, sides)) > 1e-12)
 
     def path(self, steps: list[Step]) -> list[Step]:
         """The steps of a walk with the bifurcations located between them."""

@@ -13,13 +13,13 @@ from ._solve import advance, observe, state_at
 from .curve import Step
 
 
-def halves(problem: Shooting, x: np.ndarray | Array) -> np.ndarray:
+def halves(problem: Shooting, step: Step) -> np.ndarray:
     """How the second half of the period differs from the first; empty if it cannot be alike."""
     events, cycles = problem.events, problem.cycles
     legs = len(events)
     if cycles % 2 or legs % 2 or not _alike(events, cycles):
         return np.zeros(0)
-    x = jnp.asarray(x)
+    x = jnp.asarray(step.x)
     turn = float(problem.period(x)) / 2
     if not legs:
         middle = state_at(problem, x, jnp.asarray(0), jnp.asarray(turn))
@@ -64,7 +64,7 @@ def origin(problem: Shooting, at: Step, scale: np.ndarray) -> tuple[Step, Shooti
         clock = 0.5 * (clock[:legs] + clock[legs:] - turn)
         states = 0.5 * (states[:legs] + states[legs:])
     else:
-        states = states + 0.5 * halves(problem, at.x)
+        states = states + 0.5 * halves(problem, at)
     mean = np.asarray(half.pack(clock, states, at.x[-count:], turn))
     scale = np.append(np.ones(mean.size - count), scale[-count:])
     along = np.append(np.zeros(mean.size - 1), 1.0)
