@@ -17,9 +17,11 @@ from in_decimals import rests_again
 ZETA, GAP = "drive.frequency_ratio", 0.3
 
 
-def scene_at(zeta):
+def scene_at(zeta, restitution=0.3, gap=GAP, damping=0.05):
     """Its body chatters to rest once a cycle; on the section it flies."""
-    scene = vi.Scene.ideal(frequency_ratio=zeta, restitution=0.3, gap=GAP, damping_ratio=0.05)
+    scene = vi.Scene.ideal(
+        frequency_ratio=zeta, restitution=restitution, gap=gap, damping_ratio=damping
+    )
     return scene.at_section(np.pi)
 
 
@@ -77,9 +79,7 @@ LOST = [
 @pytest.mark.parametrize(("k", "gap", "damping", "bounds"), LOST)
 def test_the_rest_is_lost_where_its_chatter_takes_until_release(k, gap, damping, bounds):
     """Beside flights in 40 digits; those of double precision lose it 3e-7 elsewhere."""
-    zeta = bounds[0] + 0.01
-    scene = vi.Scene.ideal(frequency_ratio=zeta, restitution=k, gap=gap, damping_ratio=damping)
-    scene = scene.at_section(np.pi)
+    scene = scene_at(bounds[0] + 0.01, k, gap, damping)
     orbit = vi.find_orbit(scene, settled(scene), impact_log=32, throw=True)
     branch = vi.continue_orbit(orbit, parameter=ZETA, bounds=bounds)
     assert branch.ends == ("bounds", "rest")
@@ -283,7 +283,7 @@ def test_gears_that_rattle_and_rest():
     while high - low > 1e-11:
         middle = 0.5 * (low + high)
         low, high = (middle, high) if comes_to_rest(0.3, middle) else (low, middle)
-    # So close to it hops are lost in the rounding of the place, as above.
+    # Simulation loses the last hops so close to it in the rounding of the place.
     assert struck.special[0].parameter == pytest.approx(low, abs=3e-7)
 
 

@@ -93,6 +93,7 @@ class BranchMonitor:
         self.special: list[SpecialPoint] = []
         self.between: dict[int, list[Step]] = {}
         self.whole: dict[int, Step] = {}  # steps of special points, by what is observed there
+        self.short: dict[int, Step] = {}  # and those right before them, where an impact is lost
         self.closing = Closing(problem, scale)
         self.size, self.duration = None, None
 
@@ -128,9 +129,7 @@ class BranchMonitor:
         if reason is None:
             again = self.closing.between(here, new, lambda test: self._where(here, new, test))
             last, reason = (new, None) if again is None else (again, "closed")
-        pole = grazing is not None and grazing.kind == GRAZING and grazing.impact is not None
-        end = self._before_pole(here, last) if pole else last
-        spring = self._bifurcations(here, last, end)
+        spring = self._bifurcations(here, last, self.short.get(id(last.seen), last))
         if spring is not None:
             return spring, self.special[-1].kind
         if grazing is not None:
@@ -186,10 +185,10 @@ class BranchMonitor:
         kind, detail = named(self.problem, at, impact, change)
         impact = 0 if impact == RESTS else None if impact in DETAILS else impact
         if kind == GRAZING and impact is not None:
-            end = self._before_pole(here, at).seen
-            at = at._replace(
-                seen=at.seen._replace(monodromy=end.monodromy, multipliers=end.multipliers)
-            )
+            short = self._before_pole(here, at)
+            M, values = short.seen.monodromy, short.seen.multipliers
+            at = at._replace(seen=at.seen._replace(monodromy=M, multipliers=values))
+            self.short[id(at.seen)] = short
         return self._point(kind, at, detail, impact)
 
     def _sequence(self, here: Step, last: Step) -> SpecialPoint | None:

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._programs import compiled
-from ..flow import simulate
+from ._section_map import SectionMap
 from ._shooting import Shooting
 from .curve import Step
 
@@ -48,13 +48,9 @@ _TERMS = 2
 
 
 @compiled
-def _impacts(problem: Shooting, x):
+def _impacts(problem: SectionMap, x):
     """Speed and stop of all impacts of a period, in their order."""
-    run = simulate(
-        problem.at(x), problem.unravel(x[: problem.states]), problem.cycles, method=problem.method,
-        impact_log=_LISTED,
-    )  # fmt: skip
-    log = run.impact_log
+    log = problem.flown(x, impact_log=_LISTED).impact_log
     assert log is not None
     return log.speed.ravel(), log.stop.ravel()
 
@@ -71,12 +67,12 @@ def refined_rest(problem: Shooting, at: Step, scale: np.ndarray) -> Step:
         speed, where = (np.asarray(a) for a in _impacts(problem, x))
         return speed[where == stop]
 
-    machine = problem.at(jnp.asarray(at.x))
-    for i, stop in enumerate(machine.stops):
-        found = speeds(0.0, i)
-        k = float(stop.share(jnp.asarray(found[-1]))) if found.size else 0.0
+    assert isinstance(problem, SectionMap)
+    for i, stop in enumerate(problem.at(jnp.asarray(at.x)).stops):
+        V = speeds(0.0, i)
+        k = float(stop.share(jnp.asarray(V[-1]))) if V.size > 1 else 0.0
         if 0 < k < 1:
-            place = _critical(lambda place, i=i: speeds(place, i), k)
+            place = _critical(lambda place, i=i: speeds(place, i), V, k)
             if place is not None and abs(place) < _FAR:
                 return at._replace(x=at.x + place * at.tangent * scale)
     return at
@@ -95,12 +91,12 @@ def _similar(k: float) -> tuple[float, float]:
     return r, float(-np.log(after / this) / np.log(r))
 
 
-def _critical(speeds: Callable[[float], np.ndarray], k: float) -> float | None:
+def _critical(speeds: Callable[[float], np.ndarray], V: np.ndarray, k: float) -> float | None:
     """The place at which the hops of a chatter get smaller by the same factor all along; `None` if
     none do.
 
-    **Arguments:** `speeds`, those of the impacts on a stop by the place; its coefficient of
-    restitution at low speeds.
+    **Arguments:** `speeds`, those of the impacts on a stop by the place; what they are where the
+    search begins, two at least; the stop's coefficient of restitution at low speeds.
     """
     from scipy.optimize import newton  # slow to load
 
@@ -116,9 +112,6 @@ def _critical(speeds: Callable[[float], np.ndarray], k: float) -> float | None:
         place: Any = newton(off, begin, x1=begin + _BESIDE, tol=_TOLERANCE, maxiter=20, disp=False)
         return float(place) if abs(place) < _FAR else np.nan
 
-    V = speeds(0.0)
-    if V.size < 2:
-        return None
     # The hops that fall so already tell the place best; what those before and after them tell
     # leads there.
     best = int(np.argmin(np.abs(V[1:] / V[:-1] / r**2 - 1)))

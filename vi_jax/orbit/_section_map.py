@@ -7,6 +7,7 @@ impact outside of a chatter is gained or lost.
 """
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from .._types import Scalar, State, Vector
-from ..flow import MethodLike, means, simulate
+from ..flow import MethodLike, Run, means, simulate
 from ..machine import AbstractMachine, in_rows, is_autonomous, leaf
 from ._cycle_map import CycleMap
 from ._fixed_step_method import fixed_step_method
@@ -62,6 +63,12 @@ class SectionMap(Shooting):
             state = jtu.tree_map(partial(jnp.where, beyond), there, state)
         return state
 
+    def flown(self, x: Vector, **options: Any) -> Run:
+        """The motion of a period, simulated with these options."""
+        machine = self.at(x)
+        begin = self._begun(machine, x[: self.states])
+        return simulate(machine, begin, self.cycles, method=self.method, **options)
+
     def lacks(self, x: Vector) -> Vector:
         """What the motion lacks to be periodic."""
         u = x[: self.states]
@@ -70,10 +77,7 @@ class SectionMap(Shooting):
     def observe(self, x: Vector) -> Observed:
         """Multipliers, extremes, impacts and rests of a solution `x`."""
         machine, u = self.at(x), x[: self.states]
-        run = simulate(
-            machine, self._begun(machine, u), self.cycles, method=self.method, impact_log=_LISTED,
-            rests=True,
-        )  # fmt: skip
+        run = self.flown(x, impact_log=_LISTED, rests=True)
         log, duration = run.impact_log, run.duration
         assert log is not None and duration is not None and run.rests is not None
         assert run.y_min is not None and run.y_max is not None and run.clearance is not None
@@ -104,13 +108,8 @@ class SectionMap(Shooting):
 
     def state_at(self, x: Vector, leg: Leg, s: Scalar) -> State:
         """The state on the section that is met at clock `s`, counted in whole cycles."""
-        machine = self.at(x)
-        run = simulate(
-            machine, self._begun(machine, x[: self.states]), self.cycles, method=self.method,
-            record="sections", rests=True,
-        )  # fmt: skip
-        rows = in_rows(run.sections)
-        return self.unravel(rows[jnp.round(s / machine.cycle).astype(int)])
+        rows = in_rows(self.flown(x, record="sections", rests=True).sections)
+        return self.unravel(rows[jnp.round(s / self.at(x).cycle).astype(int)])
 
 
 def section_map_of(

@@ -77,8 +77,8 @@ def plot_history(
 
 
 def _draw_stops(machine: AbstractMachine, ax: Axes, line: Callable[..., Any]) -> None:
-    """Rigid stops as thick lines, soft ones, which a body goes into, as thin dashed ones; those of
-    the coordinate that is drawn."""
+    """Rigid stops as thick lines; soft ones of the coordinate that is drawn, which the body goes
+    into, as thin dashed ones."""
     look = {"color": STOP, "lw": thick(1.8)}
     for stop in machine.stops:
         line(float(stop.place), **look, label=once(ax, "stop"))
