@@ -17,7 +17,6 @@ from ._lost import first_lost
 from ._named import named
 from ._origin import halves, origin
 from ._past_section import why_stalled
-from ._refined_rest import refined_rest
 from ._refined_sliding import refined
 from ._sequence import BETWEEN_RESTS, changed_sequence
 from ._shooting import Shooting
@@ -26,14 +25,13 @@ from ._solution import orbit_of
 from ._solve import advance, images_at, located, observe
 from ._symmetry import may_be_symmetric
 from ._words import DETAILS, HELD_FOLD, RESTS
-from .curve import Step
+from .curve import SHORTER, Step
 from .special import (
     CROSSING,
     DOUBLING,
     EXTREMUM,
     FOLD,
     GRAZING,
-    REST,
     SYMMETRY,
     TORUS,
     TURN,
@@ -57,9 +55,6 @@ _SHRINKS = 1e-2
 # A motion so many times as long as that from which a branch begins has steps as much longer. Of a
 # rimless wheel towards its homoclinic motion the multiplier is right to 2e-12 then.
 _LONG = 4.0
-
-# A place where the sequence of a motion's events changes is refined within so long a step.
-_BEYOND = 1e-4
 
 # A step of a curve whose tangent turns by less than 26° (as `walk` asks) lies within half that of
 # its first tangent: so far off, as the cosine, it is another curve, beyond a jump of the equations.
@@ -124,6 +119,8 @@ class BranchMonitor:
             last = self._where(here, new, lambda step: overtaken(self.problem, step)) or here
             reason = "multiplier"
         grazing = self._grazing(here, last) or self._sequence(here, last)
+        if isinstance(grazing, str):
+            return here, grazing
         if grazing is not None:
             last, reason = self.whole[id(grazing.step.seen)], grazing.kind
         if reason is None:
@@ -191,27 +188,14 @@ class BranchMonitor:
             self.short[id(at.seen)] = short
         return self._point(kind, at, detail, impact)
 
-    def _sequence(self, here: Step, last: Step) -> SpecialPoint | None:
-        """Where a motion that rests gains or loses one of its rests or impacts."""
-
-        def where(
-            start: Step, end: Step, test: Callable[[Step], float]
-        ) -> tuple[Step, Step] | None:
-            # A test that jumps is met short of its place by a share of the step: the second step
-            # is a short one.
-            at = self._where(start, end, test)
-            if at is None:
-                return None
-            left = float(np.dot(at.tangent, (end.x - at.x) / self.scale))
-            beyond = end if left < _BEYOND else self.advance(at.x, at.tangent, _BEYOND)
-            return self._where(at, beyond, test) or at, beyond
-
-        found = changed_sequence(here, last, where)
+    def _sequence(self, here: Step, last: Step) -> SpecialPoint | str | None:
+        """Where a motion that rests gains or loses one of its rests or impacts; `SHORTER` if the
+        step has to be shorter to tell."""
+        found = changed_sequence(self.problem, here, last, self.scale)
         if found is None:
             return None
         kind, at, detail = found
-        at = refined_rest(self.problem, at, self.scale) if kind == REST else at
-        return self._point(kind, at, detail)
+        return SHORTER if kind == SHORTER else self._point(kind, at, detail)
 
     def _before_pole(self, here: Step, last: Step) -> Step:
         """Right before a place where an impact is lost.

@@ -11,9 +11,9 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from ..machine import RigidStop
-from ._sequence import GRAZES
 from ._shooting import Shooting
 from ._solve import advance
+from ._touched import touched_beside
 from .curve import STALLED, Step
 from .special import GRAZING
 
@@ -24,8 +24,8 @@ _MEETS = 1e-5
 # How far beyond that place the motion is looked for (in the parameter's scale): choices.
 _BEYOND = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3)
 
-# A walk that stalls this close to a bound or a grazing (in the parameter's scale) is taken to it: a
-# choice, a few times what the shortest of its steps leave.
+# A walk that stalls this close to a bound (in the parameter's scale) is taken to it: a choice, a
+# few times what the shortest of its steps leave.
 _STALLED_AT = 1e-6
 
 
@@ -68,11 +68,8 @@ def why_stalled(
         if len(bounds) == 1 and abs(way) < _STALLED_AT:
             at = advance(problem, last.x, along, scale, way)
             return (at, "bounds") if bool(at.good) else (last, STALLED)
-    # Short of an impact that is lost the body turns far from the stops, beyond it close by.
-    beside = [advance(problem, last.x, along, scale, way) for way in (_STALLED_AT, -_STALLED_AT)]
-    if any(bool(at.good) and at.seen.nearest.room < GRAZES for at in (last, *beside)):
-        return last, GRAZING
-    return last, STALLED
+    touch = touched_beside(problem, last, scale)
+    return (last, STALLED) if touch is None else (touch, GRAZING)
 
 
 def _speeds(stop: RigidStop, V: float) -> list[float]:

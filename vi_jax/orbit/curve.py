@@ -118,6 +118,9 @@ def check_walk(*, step: object, max_step: object, max_points: object) -> dict[st
 # Ends of a walk that has not come to one: Ctrl-C was pressed, or the corrector has no answer.
 INTERRUPTED, STALLED = "interrupted", "stalled"
 
+# Stands for the reason to end where a step has led to another curve: it is to be shorter.
+SHORTER = "shorter"
+
 
 def walk(
     advance: Callable[[Vector, Vector, float], Step],
@@ -133,8 +136,9 @@ def walk(
 
     **Arguments:** `advance`, the compiled corrector, of unknowns, tangent and length; `steps`, the
     first point, to which the others are added; `stop`, asked after each step with the points before
-    and after it: the last point and a reason to end, or `None`; `tell`, told of each point; `step`
-    and `max_step`, the first and the longest step length; `max_points`, the most points.
+    and after it: the last point and a reason to end, or `SHORTER` for one, or `None`; `tell`, told
+    of each point; `step` and `max_step`, the first and the longest step length; `max_points`, the
+    most points.
 
     **Returns:** why it ended.
     """
@@ -143,14 +147,14 @@ def walk(
         here = steps[-1]
         new = advance(here.x, here.tangent, length)
         turn = float(np.dot(np.asarray(new.tangent), np.asarray(here.tangent)))
-        if not bool(new.good) or turn < 0.9:
+        ending = stop(here, new) if bool(new.good) and turn >= 0.9 else (here, SHORTER)
+        if ending is not None and ending[1] == SHORTER:
             # The further off a solution is, the longer each trial takes.
             length, failed, steady = length * (0.4 if failed < 2 else 0.1), failed + 1, _STEADY
             if length < _SHORTEST * max_step:
                 return STALLED
             continue
         failed, steady = 0, max(0, steady - 1)
-        ending = stop(here, new)
         if ending is not None:
             last, reason = ending
             if last is not here:
