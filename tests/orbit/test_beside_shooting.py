@@ -139,9 +139,7 @@ def settled(amplitude, x):
     return motion
 
 
-def capsule_from(amplitude):
-    machine = vi.machines.Capsule(amplitude=amplitude)  # pyright: ignore[reportCallIssue]
-    orbit = vi.find_orbit(machine, vi.simulate(machine, machine.start(), 1, settle=300).last)
+def capsule_from(orbit):
     return vi.continue_orbit(orbit, parameter="amplitude", bounds=(1.2, 4.0))
 
 
@@ -149,8 +147,15 @@ def capsule_from(amplitude):
 def test_a_capsule_that_sticks_once_a_cycle():
     """What ends its branches: that it stands still as the mass hits it; that the mass hits it as a
     cycle begins, where the other branch goes on; that the mass comes to the stop a second time."""
-    branches = capsule_from(1.6), capsule_from(2.2)
+    machine = vi.machines.Capsule(amplitude=1.6)  # pyright: ignore[reportCallIssue]
+    orbit = vi.find_orbit(machine, vi.simulate(machine, machine.start(), 1, settle=300).last)
+    first = capsule_from(orbit)
+    branches = first, capsule_from(first.special[-1].switch())
     (stands, begins), (goes_on, touches) = (branch.special for branch in branches)
+    back = goes_on.switch()
+    np.testing.assert_array_less(back.machine.amplitude, goes_on.parameter)
+    # It sticks where it stood still: an event less, that it comes to stand.
+    assert float(stands.switch().machine.amplitude) < stands.parameter
     assert begins.parameter == pytest.approx(goes_on.parameter, abs=1e-10)
     assert touches.detail.startswith("touches a stop")
     x, motions = np.array([0.0, 1.0, -0.1]), {}

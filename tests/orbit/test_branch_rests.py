@@ -206,11 +206,10 @@ def test_chatter_and_rest_pass_over_the_section():
     # It is carried as long as its hops are over before the wall would let go of it.
     (point,) = branch.special
     low, high = 0.15, 0.165
-    while high - low > 1e-10:
+    while high - low > 1e-12:
         middle = 0.5 * (low + high)
         low, high = (middle, high) if carried(middle)[-1][1] < 1e-14 else (low, middle)
-    # So close to it hops are lost in the rounding of the place: rests of 3e-4 are not seen.
-    assert point.parameter == pytest.approx(low, abs=1e-7)
+    assert point.parameter == pytest.approx(low, abs=1e-9)
 
 
 class Gears(vi.AbstractMachine):
@@ -283,8 +282,7 @@ def test_gears_that_rattle_and_rest():
     while high - low > 1e-11:
         middle = 0.5 * (low + high)
         low, high = (middle, high) if comes_to_rest(0.3, middle) else (low, middle)
-    # Simulation loses the last hops so close to it in the rounding of the place.
-    assert struck.special[0].parameter == pytest.approx(low, abs=3e-7)
+    assert struck.special[0].parameter == pytest.approx(low, abs=1e-9)
 
 
 class Uneven(vi.AbstractMachine):

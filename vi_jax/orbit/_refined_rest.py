@@ -43,8 +43,9 @@ _LEAST, _ALIKE = 2, 0.2
 # what is left of the rounding in the places.
 _BESIDE, _TOLERANCE = 1e-8, 1e-13
 
-# Terms of the departure from the limit that are taken away: the first is a share τ of it.
-_TERMS = 2
+# Terms of the departure from the limit that are taken away: the first is a share τ of it, or τ²
+# where the acceleration has no term in τ², as that of a wall that is shaken by a sine alone.
+_TERMS, _FIRST = 2, (1, 2)
 
 
 @compiled
@@ -132,13 +133,21 @@ def _limit(places: np.ndarray, r: float, q: float) -> float | None:
     term; `None` if it does not. Its begin and its end, where rounding is all that is left, are not
     counted."""
     steps = np.diff(places)
-    falls = np.abs(steps[1:] / (r ** (1 + q) * steps[:-1]) - 1) < _ALIKE
-    ends = np.flatnonzero(np.diff(np.concatenate([[False], falls, [False]])))
-    first, end = max(ends.reshape(-1, 2), key=np.ptp, default=(0, 0))
-    if end - first < _LEAST:
+
+    def run(first: int) -> tuple[int, int]:
+        """The longest part that falls by the factor of this term."""
+        falls = np.abs(steps[1:] / (r ** (first + q) * steps[:-1]) - 1) < _ALIKE
+        ends = np.flatnonzero(np.diff(np.concatenate([[False], falls, [False]])))
+        begin, end = max(ends.reshape(-1, 2), key=np.ptp, default=(0, 0))
+        return int(begin), int(end)
+
+    runs = {first: run(first) for first in _FIRST}
+    first = max(runs, key=lambda first: runs[first][1] - runs[first][0])
+    begin, end = runs[first]
+    if end - begin < _LEAST:
         return None
-    places = places[first : end + 2]
-    for term in range(1, _TERMS + 1):
+    places = places[begin : end + 2]
+    for term in range(first, first + _TERMS):
         factor = r ** (term + q)
         places = places[1:] + np.diff(places) * factor / (1 - factor)
     return float(places[-1])

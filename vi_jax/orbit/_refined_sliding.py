@@ -41,7 +41,7 @@ def refined(problem: Shooting, at: Step, change: Change) -> Step:
         start = np.append((found[-1].x if found else x)[:-1], parameter)
         step = advance(new, start, fixed, sizes, 0.0)
         if not bool(step.good):
-            return np.nan
+            raise FloatingPointError  # else the secant goes on with NaN, fifty times
         found.append(step)
         if alike:
             return float(step.seen.nearest.room)
@@ -51,10 +51,13 @@ def refined(problem: Shooting, at: Step, change: Change) -> Step:
     from scipy.optimize import newton  # slow to load
 
     near, size = float(at.x[-1]), float(abs(at.x[-1])) or 1.0
-    root, info = newton(
-        test, near, x1=near + 1e-6 * size, tol=1e-14 * size, full_output=True, disp=False
-    )
-    if not info.converged or np.isnan(test(float(root))):
+    try:
+        root, info = newton(
+            test, near, x1=near + 1e-6 * size, tol=1e-14 * size, full_output=True, disp=False
+        )
+        if not info.converged or np.isnan(test(float(root))):
+            return at
+    except FloatingPointError:
         return at
     return _with_part(problem, at, new, found[-1], first, alike)
 

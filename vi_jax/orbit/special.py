@@ -1,13 +1,14 @@
 """Special points of a branch, and the branches that begin there."""
 
 import dataclasses
+from collections.abc import Callable
 
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from .._checks import given_number
-from ._across_sliding import across_sliding, without_part
+from ._across import across_order, across_sliding, without_part
 from ._events import Event
 from ._fewer_events import without_events
 from ._origin import repeated
@@ -79,9 +80,10 @@ class SpecialPoint(InWords):
         At a period doubling, the motion of twice the period, or of half of it where the branch
         springs from one; at a grazing, the motion with that impact less or one more, on the side on
         which it is admissible; where branches cross, a motion of the other one; at a sliding
-        bifurcation the motion that sticks once more or less. A grazing of a machine with soft
-        stops, friction, modes of its own or `events` is not switched at: take `find_orbit` beyond
-        it, from a simulated motion.
+        bifurcation the motion that sticks once more or less; where two events fall together, as an
+        impact and the section of a machine with `renewed`, the motion with them in another order.
+        Another grazing of a machine with soft stops, friction, modes of its own or `events` is not
+        switched at: take `find_orbit` beyond it, from a simulated motion.
 
         **Arguments:** how far from the point (in the norm of the scaled unknowns).
 
@@ -164,15 +166,24 @@ def _crossed(point: SpecialPoint, distance: float) -> Orbit:
 def _held_otherwise(point: SpecialPoint, distance: float) -> Orbit:
     """The motion on the other side of a sliding bifurcation."""
     found = without_part(point.problem, point.step, point.scale, distance)
-    found = (
-        orbit_of(*found)
-        if found is not None
-        else across_sliding(point.problem, point.step, point.scale, distance)
-    )
+    if found is not None:
+        return orbit_of(*found)
+    what = "another number of times of sticking or sliding"
+    return _otherwise(point, across_sliding, what, distance)
+
+
+def _otherwise(
+    point: SpecialPoint, across: Callable[..., Orbit | None], what: str, distance: float
+) -> Orbit:
+    """The motion that `across` finds. **Raises:** `ValueError` if it finds none.
+
+    **Arguments:** what the motion has that the branch has not, in words.
+    """
+    found = across(point.problem, point.step, point.scale, distance)
     if found is None:
         raise ValueError(
-            f"Beside this {point.kind} no motion that sticks or slides another number of times was "
-            f"found at distance {distance:g}; try another."
+            f"Beside this {point.kind} no motion with {what} was found at distance {distance:g}; "
+            "try another."
         )
     return found
 
@@ -185,15 +196,12 @@ def _beyond_grazing(point: SpecialPoint, distance: float) -> Orbit:
             "`switch` at a grazing needs a motion without rest on a stop, but this one rests: find "
             "the motion beyond it with `find_orbit`."
         )
+    if point.impact is None and not point.touches:
+        return _otherwise(point, across_order, "its events in another order", distance)
     if old.modes[0] or old.machine.events:
         raise ValueError(
             "`switch` at a grazing needs a machine without soft stops, friction or other switches, "
             "modes of its own and `events`: find the motion beyond it with `find_orbit`."
-        )
-    if not point.touches:
-        raise ValueError(
-            f"`switch` at a grazing needs something that is touched, but there {point.detail}: "
-            "find the motion beyond it with `find_orbit`."
         )
     if point.impact is not None and old.events[point.impact].cycle is not None:
         raise ValueError(

@@ -1,7 +1,8 @@
-"""The motion on the other side of a sliding bifurcation, with a part more or less in which a switch
-is held."""
+"""The motion on the other side of a place where the sequence of events changes: of a sliding
+bifurcation, with a part more or less in which a switch is held, or of two events that fall
+together."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +10,8 @@ import numpy as np
 
 from .._types import State
 from ..flow import simulate
-from ..machine import with_leaf
+from ..machine import after_event, with_leaf
+from ._events import Event
 from ._fewer_events import without_events
 from ._problem import events_in
 from ._shooting import Shooting
@@ -22,6 +24,9 @@ from .results import Orbit
 
 # Periods after which a stable motion near the point has settled: a choice.
 _SETTLES = 100
+
+# Events that are closer than this fall together: a choice, above how close a place is located.
+_TOGETHER = 1e-6
 
 
 def without_part(
@@ -56,15 +61,42 @@ def across_sliding(
     """A motion beside a sliding bifurcation with another number of events than the branch has;
     `None` if none is found.
 
-    The map of the section has no jump there, so that the motion is looked for by its fixed points:
-    from the state on the section there, from that to which the branch would go on, and from where
-    a simulation settles. Beyond the point is looked at first.
-
     **Arguments:** the equations of the branch and their solution at the point, with the tangent in
     the sense in which it ends; the size of each unknown; how far away, in the parameter's.
     """
+    guesses = list(_guesses(problem, step, scale, distance))
+    return _beside(
+        problem, step, scale, distance, guesses, lambda events: len(events) != len(problem.events)
+    )
+
+
+def across_order(problem: Shooting, step: Step, scale: np.ndarray, distance: float) -> Orbit | None:
+    """A motion beside a place where two events fall together, with others or in another order;
+    `None` if none is found.
+
+    **Arguments:** as `across_sliding`.
+    """
+    both = [*_swapped(problem, step), *_guesses(problem, step, scale, distance)]
+    here = list(problem.events)
+    turned = [here[i:] + here[:i] for i in range(len(here))]
+    return _beside(problem, step, scale, distance, both, lambda events: events not in turned)
+
+
+def _beside(
+    problem: Shooting, step: Step, scale: np.ndarray, distance: float, guesses: list[State],
+    other: Callable[[list[Event]], bool],
+) -> Orbit | None:  # fmt: skip
+    """A motion beside a place, with other events than the branch has.
+
+    The map of the section has no jump there but where an impact falls on the section, so that the
+    motion is looked for by its fixed points: from the guesses, and from where a simulation settles.
+    Beyond the point is looked at first.
+
+    **Arguments:** as `across_sliding`; states on the section; whether events, in their order, are
+    others.
+    """
     sense = np.copysign(1.0, float(step.tangent[-1]))
-    name, guesses = problem.parameters[-1], list(_guesses(problem, step, scale, distance))
+    name = problem.parameters[-1]
     for side in (sense, -sense):
         value = float(step.x[-1]) + side * distance * float(scale[-1])
         machine = with_leaf(problem.machine, name, value)
@@ -76,7 +108,7 @@ def across_sliding(
                 )  # fmt: skip
                 guess = run.last
             found = find_orbit(machine, guess, problem.cycles, method=problem.method)
-            if bool(found.successful) and len(events_in(found)) != len(problem.events):
+            if bool(found.successful) and other([event for _, event in events_in(found)]):
                 return found
     return None
 
@@ -88,3 +120,20 @@ def _guesses(problem: Shooting, step: Step, scale: np.ndarray, distance: float) 
         if np.all(np.isfinite(place.x)):
             states, _ = sections_of(problem, place.x)
             yield jax.tree.map(lambda x: x[0], states)
+
+
+def _swapped(problem: Shooting, step: Step) -> Iterator[State]:
+    """The state on the section where an event that falls on it comes on the other side of it."""
+    x = jnp.asarray(step.x)
+    machine, clock, states = problem.at(x), *problem.parts(x)
+    ends = problem.ends(clock, problem.period(x))
+    for i, event in enumerate(problem.events):
+        j = (i + 1) % problem.legs
+        after = problem.events[j]
+        if 0 not in (event.cycle, after.cycle) or abs(float(ends[i] - clock[i])) > _TOGETHER:
+            continue
+        state, modes = problem.unravel(states[i]), problem.modes_in(i - 1)
+        # The section's state is that behind it.
+        for each in (after, event) if event.cycle == 0 else (after,):
+            state, modes = after_event(machine, each.number, clock[i], state, modes)
+        yield state
