@@ -11,6 +11,7 @@ from .._at_work import at_work
 from .._checks import flag, instance_of, interval
 from .._interrupted import Interrupted
 from .._lazy import xr
+from .._words import so_many
 from ..flow import tidy
 from ..machine import check_leaf, leaf, with_units
 from ._codimension import points_of
@@ -111,7 +112,7 @@ class Boundary(InWords):
     def __str__(self) -> str:
         low, high = self.parameters.min(axis=0), self.parameters.max(axis=0)
         lines = [
-            f"Curve of {len(self.parameters)} points of {self.kind}: {self.names[0]} in "
+            f"Curve of {so_many(len(self.parameters), 'point')} of {self.kind}: {self.names[0]} in "
             f"[{low[0]:.6g}, {high[0]:.6g}], {self.names[1]} in [{low[1]:.6g}, {high[1]:.6g}]; "
             f"ends: {self.ends[0]}, {self.ends[1]}",
             *(f"  {point}" for point in self.special),

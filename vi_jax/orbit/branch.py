@@ -9,6 +9,7 @@ import numpy as np
 
 from .._checks import one_of
 from .._lazy import xr
+from .._words import so_many
 from ..flow import tidy
 from ..machine import in_unit, with_units
 from ._conditions import held_in_words
@@ -18,7 +19,7 @@ from ._solve import between
 from ._tables import COLUMNS, on_sections, special_table, stability_in_words, table_of
 from ._tables import column_names as column_names
 from .curve import Step
-from .results import InWords, Orbit, impacts_in_words
+from .results import InWords, Orbit
 from .special import SpecialPoint
 
 # A point lies at a value of the parameter if it is no further from it (in the parameter's scale).
@@ -209,11 +210,6 @@ class Branch(InWords):
         found = with_units(found, self.problem.machine.units, own)
         return tidy(found, along)
 
-    def _impacts_in_words(self) -> str:
-        if self.rests.any():
-            return "rest on a stop"
-        return impacts_in_words(self.impact_speed.shape[1])
-
     def _freed_in_words(self) -> list[str]:
         """What was freed and what is held instead, if anything is."""
         if not self.free:
@@ -231,10 +227,17 @@ class Branch(InWords):
         period = machine.period_of(self.cycles)
         span = in_unit(f"[{low:.6g}, {high:.6g}]", machine.units, self.name)
         lines = [
-            f"Branch of {len(self.parameter)} motions of period {period} with "
-            f"{self._impacts_in_words()}, {self.name} in {span}, "
+            f"Branch of {so_many(len(self.parameter), 'motion')} of period {period} with "
+            f"{branch_hits_in_words(self)}, {self.name} in {span}, "
             f"{int(self.stable.sum())} of them stable; ends: {self.ends[0]}, {self.ends[1]}",
             *self._freed_in_words(),
             *(f"  {point}" for point in self.special),
         ]
         return "\n".join(lines)
+
+
+def branch_hits_in_words(branch: Branch) -> str:
+    """The impacts of a branch's motions, or that they rest, as their impacts differ in number."""
+    if branch.rests.any():
+        return "rest on a stop"
+    return so_many(branch.impact_speed.shape[1], "impact")

@@ -180,6 +180,7 @@ def _judged(
         impact_speed=listed.speed,
         impact_stop=listed.stop.astype(jnp.int32),
         impacts=jnp.sum(jnp.where(within, seen.impacts, 0.0)).astype(jnp.int32),
+        rests=jnp.sum(jnp.where(within, seen.rests, 0.0)).astype(jnp.int32),
         y_min=jnp.min(jnp.where(within, seen.y_min, jnp.inf)),
         y_max=jnp.max(jnp.where(within, seen.y_max, -jnp.inf)),
         clearance=clearance,

@@ -10,6 +10,7 @@ from jaxtyping import Complex, Float
 from .._at_work import at_work
 from .._checks import count, flag, instance_of
 from .._interrupted import Interrupted
+from .._words import so_many
 from ..machine import Stated, Summarized, in_unit, stated
 from ._beside_grazing import ASKED, DECADES, Motions, beside_grazing, positions, stretch
 from ._events import Event
@@ -24,7 +25,7 @@ from ._forecast import (
     windows,
 )
 from ._local_map import Graze, graze_at
-from .results import complex_in_words, impacts_in_words
+from .results import complex_in_words
 from .special import SpecialPoint
 
 # Of the depth at which windows end, or of that which a touch of so much of a cycle has, the
@@ -125,8 +126,7 @@ class Grazing(Summarized):
         if self.far is None:
             return []
         period, impacts = self.far
-        cycles = f"{period} cycle{'' if period == 1 else 's'}"
-        motion = f"a motion of {cycles} with {impacts_in_words(impacts)}"
+        motion = f"a motion of {so_many(period, 'cycle')} with {so_many(impacts, 'impact')}"
         return [f"  far away: the machine settles on {motion if period else 'no short period'}"]
 
     def _windows_in_words(self) -> list[str]:

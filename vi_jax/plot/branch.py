@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 
 from .._checks import instance_of, one_of
 from ..machine import in_brackets, name_in, quantity_of, unit_of
-from ..orbit import Boundary, Branch, impacts_in_words, point_of
+from ..orbit import Boundary, Branch, branch_hits_in_words, point_of
 from ..scans import Sweep
 from .colors import DASHES, MARKS, color_of, mark_style, once
 from .motion import new_axes
@@ -54,15 +54,15 @@ def plot_branch(
     inside = np.abs(branch.multipliers).max(axis=1) < 1 + 1e-6
     stable = inside[1:] & inside[:-1]
     label = style.pop("label", None)
-    impacts = branch.impact_speed.shape[1]
-    look = {"color": color_of(branch.cycles, impacts), "lw": thick(1.6), **style}
+    look = {"color": color_of(branch.cycles, int(branch.impacts.max())), "lw": thick(1.6), **style}
     if label is not None:
         ax.plot([], [], label=label, **{"ls": "-", **look})
     for start, end, solid in _stretches(stable):
         part = slice(start, end)
         ax.plot(across[part], up[part], **{"ls": "-" if solid else "--", **look})
     if label is None and legend:
-        motion = f"{branch.problem.machine.period_of(branch.cycles)}, {impacts_in_words(impacts)}"
+        period = branch.problem.machine.period_of(branch.cycles)
+        motion = f"{period}, {branch_hits_in_words(branch)}"
         ax.plot([], [], label=once(ax, motion), **{"ls": "-", **look})
     for word, line, drawn in ((_STABLE, "-", stable.any()), (_UNSTABLE, "--", not stable.all())):
         if drawn:
