@@ -198,19 +198,26 @@ def check_reals(name: str, state: State) -> None:
         require_real(name, jtu.keystr(path).lstrip(".") or "value", leaf)
 
 
+def shape_of(argument: str, machine: AbstractMachine, state: State) -> tuple[int, ...]:
+    """The shape of position and velocity in a state, `()` in one. **Raises:** `TypeError` for what
+    is no state of this machine."""
+    try:
+        shape = jnp.shape(machine.position(state)) or jnp.shape(machine.velocity(state))
+    except (AttributeError, TypeError, LookupError):
+        raise TypeError(
+            f"Argument `{argument}` must be a state of this machine, but got {state!r}; one with "
+            "`Y` and `V` is `vi_jax.OscillatorState(Y, V)`. Of a state without them a machine of "
+            "your own with stops says by `position`, `velocity` and `placed`, or by `coordinates`, "
+            "what they limit."
+        ) from None
+    check_reals(argument, state)
+    return shape
+
+
 def check_start(machine: AbstractMachine, start: State) -> None:
     """Warns of a field of another period. **Raises:** `ValueError` or `TypeError` if a concrete
     start cannot be simulated."""
-    try:
-        shape = jnp.shape(machine.position(start)) or jnp.shape(machine.velocity(start))
-    except (AttributeError, TypeError, LookupError):
-        raise TypeError(
-            f"Argument `start` must be a state of this machine, but got {start!r}; one with `Y` "
-            "and `V` is `vi_jax.OscillatorState(Y, V)`. Of a state without them a machine of your "
-            "own with stops says by `position`, `velocity` and `placed`, or by `coordinates`, what "
-            "they limit."
-        ) from None
-    check_reals("start", start)
+    shape = shape_of("start", machine, start)
     if shape:
         raise ValueError(
             "Argument `start` must be one state (use `jax.vmap` for a batch), in which position "

@@ -88,6 +88,10 @@ def table_of(
     **Arguments:** `parameter` and `values`, the name of the branch's parameter and its value for
     each orbit; `units`, the machine's.
     """
+    if not callable(function):
+        raise TypeError(
+            f"Argument `function` must be a function of an `Orbit`, but got {function!r}."
+        )
     rows = [_numbers(function(orbit)) for orbit in orbits]
     shapes = {name: x.shape for name, x in rows[0].items()}
     for i, row in enumerate(rows):

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .._checks import one_of
+from .._checks import count, given_number, one_of
 from .._lazy import xr
 from .._words import so_many
 from ..flow import tidy
@@ -159,11 +159,13 @@ class Branch(InWords):
         return table_of(function, orbits, self.name, self.parameter, self.problem.machine.units)
 
     def orbit(self, index: int) -> Orbit:
-        """The motion at one point."""
-        return orbit_of(self.problem, self.steps[index])
+        """The motion at one point; a negative `index` counts from the end."""
+        many = len(self.steps)
+        return orbit_of(self.problem, self.steps[count("index", index, least=-many, most=many - 1)])
 
     def at(self, value: float) -> list[Orbit]:
         """The branch's motions at a value of the parameter, solved for; in the branch's order."""
+        value = given_number("value", value)
 
         def apart(step: Step) -> float:
             # Points are put on a value, such as a bound, to rounding.

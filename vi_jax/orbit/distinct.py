@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
-from .._checks import given_number
+from .._checks import given_number, short
 from .._words import so_many
 from ..machine import in_rows, state_in_words
 from .results import InWords, Orbit, hits_in_words, span_in_words, trimmed
@@ -44,7 +44,7 @@ def distinct_orbits(orbits: Orbit, *, tolerance: float = 1e-6) -> tuple[Orbits, 
     it.
     """
     if not isinstance(orbits, Orbit):
-        raise TypeError(f"Argument `orbits` must be from `find_orbit`, but got {orbits!r}.")
+        raise TypeError(f"Argument `orbits` must be from `find_orbit`, but got {short(orbits)}.")
     given_number("tolerance", tolerance, low=0.0)
     found, counts = distinct_among([orbits], tolerance)
     return found, counts[:, 0]
