@@ -165,16 +165,16 @@ def _check_scalars(**arguments: Any) -> None:
                 )
 
 
-def _check_flow(machine: AbstractMachine, start: State) -> None:
+def _check_flow(argument: str, machine: AbstractMachine, state: State) -> None:
     """**Raises:** `TypeError` for what is no state, where only the field says what one is."""
     try:
         jax.eval_shape(
-            lambda s, x: machine.field(s, x, *begin_modes(machine, s, x)), jnp.zeros(()), start
+            lambda s, x: machine.field(s, x, *begin_modes(machine, s, x)), jnp.zeros(()), state
         )
     except (AttributeError, TypeError, ValueError, LookupError) as error:
         raise TypeError(
-            f"Argument `start` must be a state of this machine, but got {start!r}, of which its "
-            f"`field` says: {error}"
+            f"Argument `{argument}` must be a state of this machine, but got {state!r}, of which "
+            f"its `field` says: {error}"
         ) from None
 
 
@@ -211,6 +211,8 @@ def shape_of(argument: str, machine: AbstractMachine, state: State) -> tuple[int
             "what they limit."
         ) from None
     check_reals(argument, state)
+    if not shape and not machine.has_velocity(state):
+        _check_flow(argument, machine, state)
     return shape
 
 
@@ -223,8 +225,6 @@ def check_start(machine: AbstractMachine, start: State) -> None:
             "Argument `start` must be one state (use `jax.vmap` for a batch), in which position "
             f"and velocity are numbers, but there they have shape {shape}."
         )
-    if not machine.has_velocity(start):
-        _check_flow(machine, start)
     for path, leaf in jtu.tree_leaves_with_path(start):
         numbers = concrete(leaf)
         if numbers is not None and not np.isfinite(numbers).all():

@@ -1,5 +1,6 @@
 """Periodic motion: the cycle map, closed-form solutions, finding orbits and judging them."""
 
+from ._beside_grazing import Motions as Motions
 from ._boundary import Boundary as Boundary
 from ._boundary import boundary as boundary
 from ._continue_orbit import continue_orbit as continue_orbit

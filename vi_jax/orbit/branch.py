@@ -186,7 +186,8 @@ class Branch(InWords):
     def to_xarray(self, *, along: str | None = None) -> "xr.Dataset":
         """The branch as an `xarray.Dataset` over its points, with a word for the `stability` at
         each, and its special points: `special_kind`, `special_detail`, `special_parameter`, which
-        `special_point` of the branch it is (-1 if none), and more. Its ends are in `attrs`.
+        `special_point` of the branch it is (-1 if none), and more. The parameter is there by its
+        own name too, where that is not the name of another column. The ends are in `attrs`.
 
         `.to_netcdf(path, engine="h5netcdf")` writes all of it, complex multipliers too.
 
@@ -196,7 +197,8 @@ class Branch(InWords):
 
         **Raises:** `ValueError` if there is no such dimension.
         """
-        data = {name: ("point", self.column(name)) for name in self.column_names}
+        data: dict[str, Any] = {self.name: ("point", self.parameter)}
+        data |= {name: ("point", self.column(name)) for name in self.column_names}
         data |= {
             "impact_phase": (("point", "impact"), self.impact_phase),
             "impact_speed": (("point", "impact"), self.impact_speed),
@@ -204,10 +206,12 @@ class Branch(InWords):
             "stability": ("point", stability_in_words(self.multipliers)),
         }
         data |= special_table(self.special, self.steps)
+        data.setdefault(f"special_{self.name}", data["special_parameter"])
         about = {"parameter": self.name, "period_in_cycles": self.cycles, "ends": list(self.ends)}
         found = xr.Dataset(data, attrs=about)
         own = {name: name for name in (*self.averages, *self.free)}
-        own |= dict.fromkeys(("parameter", "special_parameter"), self.name)
+        named = ("parameter", "special_parameter", self.name, f"special_{self.name}")
+        own |= dict.fromkeys(named, self.name)
         own |= dict.fromkeys(("special_y_min", "special_y_max"), "position")
         found = with_units(found, self.problem.machine.units, own)
         return tidy(found, along)

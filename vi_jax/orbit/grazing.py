@@ -103,7 +103,7 @@ class Grazing(Summarized):
         lines = [
             f"Grazing at {self.parameter} = {at}: touches the {self.touched}",
             f"  what follows: {SCENARIOS[self.outcome]}",
-            *self._far_in_words(),
+            *([] if self.far is None else [f"  far away: the machine settles on {self.afar}"]),
             f"  impacts appear: as {self.parameter} {'rises' if self.side > 0 else 'falls'}",
             f"  multipliers without impact: {values}",
             f"  second derivative of the distance: {', '.join(f'{a:.6g}' for a in self.rate)}",
@@ -122,12 +122,12 @@ class Grazing(Summarized):
             lines.append("  checked by the machine: it does not agree at the values looked at")
         return "\n".join(lines)
 
-    def _far_in_words(self) -> list[str]:
-        if self.far is None:
-            return []
-        period, impacts = self.far
+    @property
+    def afar(self) -> str:
+        """What the machine settles on where nothing near attracts, `far` in words; "" if `None`."""
+        period, impacts = self.far or (0, 0)
         motion = f"a motion of {so_many(period, 'cycle')} with {so_many(impacts, 'impact')}"
-        return [f"  far away: the machine settles on {motion if period else 'no short period'}"]
+        return motion if period else "no short period" * (self.far is not None)
 
     def _windows_in_words(self) -> list[str]:
         if self.windows is None:
