@@ -224,6 +224,10 @@ def test_a_branch_in_files(short, tmp_path):
     [
         ({"parameter": "drive.frequency"}, "near names: drive.frequency_ratio"),
         ({"bounds": (1.0, 1.2)}, "`bounds` must hold the orbit's drive.frequency_ratio = 0.9"),
+        (
+            {"bounds": (-1.0, 1.2)},
+            "`bounds` must leave the machine valid, but at .* = -1: Argument",
+        ),
         ({"step": 0.0}, "`step` must be finite and in"),
     ],
 )
