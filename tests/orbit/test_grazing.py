@@ -209,7 +209,7 @@ def test_grazing_of_the_paper(restitution, damping, zeta):
     labels = [text.get_text() for text in vi.plot_grazing(found).get_legend().get_texts()]
     assert labels == [f"the machine, far away: {found.afar}", "grazing"]
     ax = vi.plot_grazing(dataclasses.replace(found, machine=None, far=None))
-    assert [text.get_text() for text in ax.texts] == ["nothing near attracts"]
+    assert [text.get_text() for text in ax.texts] == ["forecast: nothing near attracts"]
 
 
 @pytest.mark.slow

@@ -82,10 +82,12 @@ def plot_branch(
 
 
 def _moving(found: Branch | Sweep) -> str:
-    """The extreme that varies: the other one may be a stop's place."""
-    low, high = np.asarray(found.y_min), np.asarray(found.y_max)
-    held = np.ptp(low) <= 1e-9 * (1 + np.abs(low).max())
-    return "y_max" if held and np.ptp(high) > np.ptp(low) else "y_min"
+    """The extreme that varies: the other one may be a stop's place. The least if neither does."""
+    low, high = (
+        np.ptp(x) > 1e-9 * (1 + np.abs(x).max())
+        for x in (np.asarray(found.y_min), np.asarray(found.y_max))
+    )
+    return "y_max" if high and not low else "y_min"
 
 
 def _array(found: Branch | Sweep, argument: str, name: str) -> np.ndarray:
