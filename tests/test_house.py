@@ -27,6 +27,7 @@ TOOLS = {
     "_renamed",
     "_types",
     "_version",
+    "_words",
 }
 
 

@@ -210,11 +210,16 @@ def instance_of(name: str, value: object, kind: type | tuple[type, ...], describ
     """**Raises:** `TypeError` if `value` is none of this kind, which is `described`."""
     if isinstance(value, kind):
         return
-    got, *more = repr(value).splitlines() or [""]
-    got += " …" if more else ""
+    got = short(value)
     if isinstance(value, type) and issubclass(value, kind):
         got = f"the class `{value.__name__}`: call it, `{value.__name__}(…)`, for one"
     raise TypeError(f"Argument `{name}` must be {described}, but got {got}.")
+
+
+def short(value: object) -> str:
+    """What came, in one line."""
+    first, *more = repr(value).splitlines() or [""]
+    return first + " …" * bool(more)
 
 
 def state_of_numbers(name: str, state: object) -> Any:

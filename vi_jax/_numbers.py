@@ -1,8 +1,10 @@
 """Numbers as arrays of one floating-point type, and what is said of their precision."""
 
+import contextlib
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextvars import ContextVar
 from functools import partial
 from typing import Any
 
@@ -118,12 +120,34 @@ def warn_of_narrow(what: str) -> None:
     )
 
 
+# What has been warned of in the call of a user's that is at work.
+_SAID: ContextVar[set[str] | None] = ContextVar("said", default=None)
+
 # Whose frames lie between a user's line and what is said about it.
-_BETWEEN = {__name__.partition(".")[0], "equinox", "jaxtyping", "beartype", "functools"}
+_BETWEEN = {
+    __name__.partition(".")[0], "beartype", "contextlib", "diffrax", "equinox", "functools", "jax",
+    "jaxtyping", "lineax", "optimistix",
+}  # fmt: skip
+
+
+@contextlib.contextmanager
+def saying_once() -> Iterator[None]:
+    """Within it each warning is given once, however often a call simulates and JAX traces it."""
+    token = _SAID.set(set()) if _SAID.get() is None else None
+    try:
+        yield
+    finally:
+        if token is not None:
+            _SAID.reset(token)
 
 
 def warn(words: str) -> None:
     """Warn at the line of the user's that called this package, however deep within it this is."""
+    said = _SAID.get()
+    if said is not None:
+        if words in said:
+            return
+        said.add(words)
     frame, level = sys._getframe(), 1
     while frame.f_back and frame.f_globals.get("__name__", "").partition(".")[0] in _BETWEEN:
         frame, level = frame.f_back, level + 1

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import ParamSpec, TypeVar
 
 from ._calls import check_call
+from ._numbers import saying_once
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -18,7 +19,7 @@ NAMES = {
 
 
 def renamed(**new_by_old: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorator: a function whose arguments once had other names.
+    """Decorator: a function whose arguments once had other names. What it warns of it says once.
 
     **Raises:** in a call, `TypeError` for an old name, with the new one, and for one that it never
     had.
@@ -33,7 +34,8 @@ def renamed(**new_by_old: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
                         f"Argument `{old}` of `{function.__name__}` is called `{new}` now."
                     )
             check_call(function, function.__name__, args, kwargs)
-            return function(*args, **kwargs)
+            with saying_once():
+                return function(*args, **kwargs)
 
         return called
 

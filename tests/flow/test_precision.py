@@ -1,5 +1,7 @@
 """Numbers of single precision in a session of double precision."""
 
+import warnings
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -58,3 +60,14 @@ def test_a_scene_that_outlived_double_precision_is_refused_by_that_name():
         early = vi.Scene.ideal(**NUMBERS)
         with pytest.raises(TypeError, match=r"`start` .* double precision \(Y, V\)"):
             vi.simulate(early, start, 2)
+
+
+def test_single_precision_is_told_once_and_no_branch_is_begun_in_it():
+    """A search simulates within several programs; the corrector of a branch asks for 1e-11."""
+    with jax.enable_x64(False), warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        scene = vi.Scene.ideal(frequency_ratio=0.9)
+        orbit = vi.find_orbit(scene, scene.start(Y=1.6, V=-1.9), cycles=2)
+        assert [str(x.message)[:37] for x in told] == ["vi_jax is running in single precision"]
+        with pytest.raises(ValueError, match="`orbit` must be of double precision"):
+            vi.continue_orbit(orbit, parameter="stops.0.gap", bounds=(1.9, 2.1))

@@ -194,7 +194,9 @@ def test_a_branch_as_data(short):
     sure = table[table.stability != "neutral"]
     assert len(sure) >= len(table) - len(short.special)
     np.testing.assert_array_equal(sure.stability == "stable", sure.stable)
+    np.testing.assert_array_equal(table[ZETA], table.parameter)  # a file tells what it is
     kinds = short.to_xarray(along="special").to_dataframe()
+    np.testing.assert_array_equal(kinds[f"special_{ZETA}"], kinds.special_parameter)
     assert kinds.special_kind.tolist() == [point.kind for point in short.special]
     # Each special point is one of the branch's.
     np.testing.assert_array_equal(
@@ -222,6 +224,10 @@ def test_a_branch_in_files(short, tmp_path):
     [
         ({"parameter": "drive.frequency"}, "near names: drive.frequency_ratio"),
         ({"bounds": (1.0, 1.2)}, "`bounds` must hold the orbit's drive.frequency_ratio = 0.9"),
+        (
+            {"bounds": (-1.0, 1.2)},
+            "`bounds` must leave the machine valid, but at .* = -1: Argument",
+        ),
         ({"step": 0.0}, "`step` must be finite and in"),
     ],
 )

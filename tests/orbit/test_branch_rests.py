@@ -70,6 +70,19 @@ def test_motions_of_the_branch_are_flights_from_release(branch):
         np.testing.assert_allclose(branch.multipliers[i], 0, atol=1e-12)
 
 
+def test_a_motion_says_that_it_rests(branch):
+    """As found and as a point of a branch; and one that never leaves its stop."""
+    point = branch.orbit(0)
+    found = vi.find_orbit(point.machine, point.state, impact_log=32)
+    for orbit in (point, found):
+        assert int(orbit.rests) == 1 and "impacts and 1 rest on a stop, stable" in str(orbit)
+    pressed = scene_at(0.7, gap=-3.0)
+    orbit = vi.find_orbit(pressed, pressed.start(Y=-3.0), impact_log=32)
+    assert int(orbit.rests) == 0 and "0 impacts and rest on a stop, stable" in str(orbit)
+    drawn, *_ = vi.plot_branch(branch).get_legend().get_texts()
+    assert drawn.get_text() == "2π, rest on a stop"
+
+
 LOST = [
     (0.1, 0.6, 0.2, (0.89, 0.92)), (0.3, GAP, 0.05, (0.7, 0.8)), (0.5, 0.0, 0.2, (0.76, 0.8)),
     (0.7, 0.3, 0.2, (0.46, 0.5)), (0.7, 0.6, 0.2, (0.34, 0.37)),
@@ -94,7 +107,7 @@ def test_nothing_goes_on_from_a_rest_that_is_lost(branch):
     (point,) = branch.special
     with pytest.raises(ValueError, match="this special point is a rest"):
         point.switch()
-    with pytest.raises(ValueError, match="but is a rest"):
+    with pytest.raises(ValueError, match=r"but is a rest\. Such a point is found value by value"):
         vi.boundary(point, parameter="stops.0.gap", bounds=((0.6, 0.8), (0.2, 0.4)))
 
 

@@ -1,5 +1,7 @@
 """What a grazing leads to, beside closed forms, the root map and flights of SciPy's."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -203,6 +205,11 @@ def test_grazing_of_the_paper(restitution, damping, zeta):
     assert found.entries[0] > 0 > found.entries[1]
     assert found.outcome == vi.SCENARIOS.jump
     assert found.checked[1] > 1e3 * found.checked[0] and found.agreement == 1
+    # What the machine does instead is in the picture; unasked, that nothing near attracts.
+    labels = [text.get_text() for text in vi.plot_grazing(found).get_legend().get_texts()]
+    assert labels == [f"the machine, far away: {found.afar}", "grazing"]
+    ax = vi.plot_grazing(dataclasses.replace(found, machine=None, far=None))
+    assert [text.get_text() for text in ax.texts] == ["forecast: nothing near attracts"]
 
 
 @pytest.mark.slow

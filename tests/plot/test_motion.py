@@ -86,6 +86,32 @@ def test_history_of_a_machine_counts_its_own_cycles():
     assert ax.lines[0].get_xdata().max() == pytest.approx(3.0)
 
 
+class Stated(vi.AbstractMachine):
+    """A body on a spring between a stop and a soft one, in millimetres."""
+
+    stops: tuple = (vi.RigidStop(1.5, 0.5),)
+    switches: tuple = (vi.SoftStop(1.2, 50.0, side="left"),)
+    cycle: float = 6.0
+
+    @property
+    def units(self):
+        return {"position": "mm", "velocity": "mm/s"}
+
+    def field(self, s, x, mode):
+        return vi.OscillatorState(x.V, -x.Y)
+
+
+def test_pictures_say_the_units_that_a_machine_states_and_show_its_soft_stop():
+    machine, start = Stated(), vi.OscillatorState(jnp.array(1.0), jnp.array(0.0))
+    run = vi.simulate(machine, start, 1, samples=16)
+    assert plot_history(run, machine=machine, ax=_axes()).get_ylabel() == "position (mm)"
+    portrait = plot_phase_portrait(run, machine, ax=_axes())
+    assert portrait.get_xlabel() == "position (mm)" and portrait.get_ylabel() == "velocity (mm/s)"
+    drawn = [line.get_xdata() for line in vi.plot_sketch(machine, start, ax=_axes()).lines]
+    face = -1.2 - 0.35 * 1.5 / 2  # half a body beyond the stop
+    assert any(np.allclose(x, [face, face]) for x in drawn)
+
+
 def test_pictures_are_listed():
     assert {"save_picture", "animate", "plot_history"} <= set(dir(vi))
 

@@ -57,6 +57,14 @@ def test_branch_names_its_marks_and_begins_its_legend_solid(branch):
             assert again == ["2π", "2π, 1 impact", *named[1:]]
 
 
+def test_a_branch_along_which_nothing_moves_is_drawn_by_its_least_position(branch):
+    """By rounding alone the other extreme varies, and a sweep would be drawn by another one."""
+    still = np.full_like(branch.y_min, -1.3)
+    noisy = np.where(np.arange(len(still)) % 2, 1.3, 1.3 + 1e-15)
+    drawn = vi.plot_branch(dataclasses.replace(branch, y_min=still, y_max=noisy), ax=_axes())
+    assert drawn.get_ylabel() == "min Y (a)"
+
+
 def test_a_sweep_lies_above_branches_and_below_marks(branch):
     sweep = vi.sweep(branch.orbit(0).machine, NAME, np.linspace(0.95, 1.0, 4), settle=10, cycles=8)
     ax = vi.plot_sweep(sweep, ax=_axes())

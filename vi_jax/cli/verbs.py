@@ -15,6 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from .._files import write_whole
+from .._words import so_many
 from ..flow import RESULTS, Run, average_names, number_of
 from ..machine import AbstractMachine
 from ..orbit import Orbit, continue_orbit, find_orbit
@@ -202,7 +203,7 @@ def orbit(config: Config, table: OrbitTable, tell: Tell) -> Outcome:
     guess = start
     if table.guess is not None:
         guess = start_of(machine, table.guess, "`guess` in [orbit]")
-    tell(f"searching a motion of {table.cycles} cycle{'' if table.cycles == 1 else 's'}")
+    tell(f"searching a motion of {so_many(table.cycles, 'cycle')}")
     named = {"root_finder": "[orbit]", "method": "[method]", "guess": "[start]"}
     if table.guess is not None:
         named["guess"] = "`guess` in [orbit]"

@@ -13,9 +13,10 @@ from jax.flatten_util import ravel_pytree
 
 from .._programs import compiled
 from .._types import State
+from .._words import so_many
 from ..flow import RESULTS, Run, chosen, simulate
 from ..machine import AbstractMachine, is_autonomous, unit_of, with_unit
-from ..orbit import STABILITY, complex_in_words, cycle_map, impacts_in_words, stability_of
+from ..orbit import STABILITY, complex_in_words, cycle_map, stability_of
 from ..plot import MotionPath, motion_path
 from ..scans import REGIMES, Regime, lyapunov, taken_along
 
@@ -78,7 +79,7 @@ class Motion(NamedTuple):
     def regime(self) -> str:
         """The regime in words: its period and impacts, or what has no period."""
         if self.period > 0:
-            impacts = impacts_in_words(round(self.impacts))
+            impacts = so_many(round(self.impacts), "impact")
             return f"period {self.lasting} with {impacts}"
         kinds: dict[int, str] = {regime: regime.meaning for regime in REGIMES}
         if self.period == REGIMES.failed:

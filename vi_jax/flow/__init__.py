@@ -11,6 +11,7 @@ from .arguments import check_reals as check_reals
 from .arguments import check_start as check_start
 from .arguments import machine_of as machine_of
 from .arguments import planned as planned
+from .arguments import shape_of as shape_of
 from .beside import Beside as Beside
 from .beside import elapsed as elapsed
 from .beside import means as means

@@ -4,6 +4,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from .._words import so_many
+
 # Cycles of which a text tells, and events of each.
 _CYCLES, _EVENTS = 8, 6
 
@@ -17,8 +19,8 @@ def listed(what: str, used: object, word: Callable[[int, int], str]) -> str:
     used = np.asarray(used)
     if used.ndim > 2:
         return f"{int(used.sum())} {what}s in lanes of shape {used.shape[:-2]}"
-    many = int(used.sum())
-    lines = [f"{many} {what}{'' if many == 1 else 's'} listed in {len(used)} cycles"]
+    many = so_many(int(used.sum()), what)
+    lines = [f"{many} listed in {so_many(len(used), 'cycle')}"]
     some = np.flatnonzero(used.any(axis=1))
     for i in some[:_CYCLES]:
         places = np.flatnonzero(used[i])

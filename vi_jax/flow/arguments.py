@@ -165,16 +165,16 @@ def _check_scalars(**arguments: Any) -> None:
                 )
 
 
-def _check_flow(machine: AbstractMachine, start: State) -> None:
+def _check_flow(argument: str, machine: AbstractMachine, state: State) -> None:
     """**Raises:** `TypeError` for what is no state, where only the field says what one is."""
     try:
         jax.eval_shape(
-            lambda s, x: machine.field(s, x, *begin_modes(machine, s, x)), jnp.zeros(()), start
+            lambda s, x: machine.field(s, x, *begin_modes(machine, s, x)), jnp.zeros(()), state
         )
     except (AttributeError, TypeError, ValueError, LookupError) as error:
         raise TypeError(
-            f"Argument `start` must be a state of this machine, but got {start!r}, of which its "
-            f"`field` says: {error}"
+            f"Argument `{argument}` must be a state of this machine, but got {state!r}, of which "
+            f"its `field` says: {error}"
         ) from None
 
 
@@ -198,26 +198,33 @@ def check_reals(name: str, state: State) -> None:
         require_real(name, jtu.keystr(path).lstrip(".") or "value", leaf)
 
 
+def shape_of(argument: str, machine: AbstractMachine, state: State) -> tuple[int, ...]:
+    """The shape of position and velocity in a state, `()` in one. **Raises:** `TypeError` for what
+    is no state of this machine."""
+    try:
+        shape = jnp.shape(machine.position(state)) or jnp.shape(machine.velocity(state))
+    except (AttributeError, TypeError, LookupError):
+        raise TypeError(
+            f"Argument `{argument}` must be a state of this machine, but got {state!r}; one with "
+            "`Y` and `V` is `vi_jax.OscillatorState(Y, V)`. Of a state without them a machine of "
+            "your own with stops says by `position`, `velocity` and `placed`, or by `coordinates`, "
+            "what they limit."
+        ) from None
+    check_reals(argument, state)
+    if not shape and not machine.has_velocity(state):
+        _check_flow(argument, machine, state)
+    return shape
+
+
 def check_start(machine: AbstractMachine, start: State) -> None:
     """Warns of a field of another period. **Raises:** `ValueError` or `TypeError` if a concrete
     start cannot be simulated."""
-    try:
-        shape = jnp.shape(machine.position(start)) or jnp.shape(machine.velocity(start))
-    except (AttributeError, TypeError, LookupError):
-        raise TypeError(
-            f"Argument `start` must be a state of this machine, but got {start!r}; one with `Y` "
-            "and `V` is `vi_jax.OscillatorState(Y, V)`. Of a state without them a machine of your "
-            "own with stops says by `position`, `velocity` and `placed`, or by `coordinates`, what "
-            "they limit."
-        ) from None
-    check_reals("start", start)
+    shape = shape_of("start", machine, start)
     if shape:
         raise ValueError(
             "Argument `start` must be one state (use `jax.vmap` for a batch), in which position "
             f"and velocity are numbers, but there they have shape {shape}."
         )
-    if not machine.has_velocity(start):
-        _check_flow(machine, start)
     for path, leaf in jtu.tree_leaves_with_path(start):
         numbers = concrete(leaf)
         if numbers is not None and not np.isfinite(numbers).all():

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from .._lazy import xr
 from .._types import Scalar, State
+from .._words import so_many
 from ..machine import PLAIN, Shown, Stated, Summarized, in_unit, name_in, state_in_words
 from ._listed import listed
 from .enumeration import NamedEnumeration
@@ -311,7 +312,9 @@ class Run(Summarized):
             good = int(jnp.sum(self.successful))
             return f"Run of {self.steps.size} lanes {self.steps.shape}, {good} successful"
         cycles = self.impacts.shape[-1]
-        lines = [f"Run of {cycles} cycles, {int(jnp.sum(self.impacts))} impacts"]
+        lines = [
+            f"Run of {so_many(cycles, 'cycle')}, {so_many(int(jnp.sum(self.impacts)), 'impact')}"
+        ]
         units = dict(self.units)
         lines.append(f"  last section: {state_in_words(self.last, 9, units)}")
         if self.y_min is not None and self.y_max is not None:

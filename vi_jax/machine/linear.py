@@ -139,18 +139,22 @@ class LinearMachine(AbstractMachine):
 
     def adopt(self, start: State) -> StructureState:
         """**Raises:** `TypeError` for a state of another kind, `ValueError` for one of other n."""
-        if not isinstance(start, StructureState):
+        return self.in_cycle_state("start", start)
+
+    def in_cycle_state(self, name: str, state: State) -> StructureState:
+        """A state of this machine; `name` is the argument that messages blame."""
+        if not isinstance(state, StructureState):
             raise TypeError(
-                f"Argument `start` must be a state of a {type(self).__name__}, from its "
-                f"`start(displacement=..., velocity=...)`, but got {start!r}."
+                f"Argument `{name}` must be a state of a {type(self).__name__}, from its "
+                f"`start(displacement=..., velocity=...)`, but got {state!r}."
             )
-        for name, value in vars(start).items():
+        for part, value in vars(state).items():
             if jnp.shape(value) != (self.size,):
                 raise ValueError(
-                    f"Argument `start` must have n = {self.size} numbers in its {name}, but that "
+                    f"Argument `{name}` must have n = {self.size} numbers in its {part}, but that "
                     f"has the shape {jnp.shape(value)}."
                 )
-        return start
+        return state
 
     def step_limit(self, s: Scalar, state: StructureState) -> Scalar:
         """A fifth of the shortest period, of the modes or the force."""

@@ -66,13 +66,7 @@ class ShaftMachine(AbstractMachine):
                 components = vars(start).values()
                 return self.timed_states[wanted](*components, jnp.zeros_like(start.Y))
             wanted = self.timed_states[wanted]
-        if type(start) is not wanted:
-            parts = [x for x in ("last", "state") if type(getattr(start, x, None)) is wanted]
-            hint = f"; take its `{parts[0]}`" if parts else ""
-            raise TypeError(
-                f"Argument `start` must be a `{wanted.__name__}` for this machine (use its "
-                f"`start(...)`), but got a `{type(start).__name__}`{hint}."
-            )
+        _require_state("start", start, wanted)
         return state_of_numbers("start", start)
 
     def in_cycle_clock(self: Machine) -> Machine:
@@ -84,9 +78,11 @@ class ShaftMachine(AbstractMachine):
         """A state on the section that was made for the time clock, without the angle of the shaft;
         any other as it is.
 
-        **Raises:** `ValueError` that names the argument if the angle is known and not 0.
+        **Raises:** `ValueError` that names the argument if the angle is known and not 0,
+        `TypeError` for what is no state of this machine.
         """
         if not self.is_timed(state):
+            _require_state(name, state, self.state_type)
             return state
         phase = concrete(state.phase)
         if phase is not None and not (abs(phase) <= _ON_SECTION).all():
@@ -134,3 +130,15 @@ class ShaftMachine(AbstractMachine):
     def section_speed(self, state: State) -> Any:
         """W of a state on the section."""
         return state.W
+
+
+def _require_state(name: str, state: object, wanted: type) -> None:
+    """**Raises:** `TypeError` if this argument is no state of the wanted class."""
+    if type(state) is wanted:
+        return
+    parts = [x for x in ("last", "state") if type(getattr(state, x, None)) is wanted]
+    hint = f"; take its `{parts[0]}`" if parts else ""
+    raise TypeError(
+        f"Argument `{name}` must be a `{wanted.__name__}` for this machine (use its "
+        f"`start(...)`), but got a `{type(state).__name__}`{hint}."
+    )

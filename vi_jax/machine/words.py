@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 
+from .._words import so_many
 from .shown import Shown
 from .units import PLAIN, unit_in
 
@@ -25,7 +26,7 @@ class Worded(Shown):
 
     def period_of(self, cycles: int) -> str:
         """A duration of so many cycles, in words."""
-        return f"{cycles} cycle{'' if cycles == 1 else 's'}"
+        return so_many(cycles, "cycle")
 
     def place_of(self, since_section: float, cycles: int) -> str:
         """A reading of the clock within a motion of so many cycles, in words."""

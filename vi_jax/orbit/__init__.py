@@ -1,5 +1,6 @@
 """Periodic motion: the cycle map, closed-form solutions, finding orbits and judging them."""
 
+from ._beside_grazing import Motions as Motions
 from ._boundary import Boundary as Boundary
 from ._boundary import boundary as boundary
 from ._continue_orbit import continue_orbit as continue_orbit
@@ -9,6 +10,7 @@ from ._cycle_map import cycle_map as cycle_map
 from ._forecast import SCENARIOS as SCENARIOS
 from ._tables import point_of as point_of
 from .branch import Branch as Branch
+from .branch import branch_hits_in_words as branch_hits_in_words
 from .branch import column_names as column_names
 from .closed_form import ClosedFormOrbits as ClosedFormOrbits
 from .closed_form import closed_form_orbits as closed_form_orbits
@@ -30,7 +32,6 @@ from .results import ORBIT_RESULTS as ORBIT_RESULTS
 from .results import InWords as InWords
 from .results import Orbit as Orbit
 from .results import complex_in_words as complex_in_words
-from .results import impacts_in_words as impacts_in_words
 from .results import trimmed as trimmed
 from .root_finders import AbstractRootFinder as AbstractRootFinder
 from .root_finders import Gradient as Gradient

@@ -92,6 +92,8 @@ class ObservedArc(NamedTuple):
     listed: Impacts
     impacts: Float[Array, " cycles"]
     """Their number, those beyond the list included."""
+    rests: Float[Array, " cycles"]
+    """Times that a body comes to rest on a stop."""
     y_min: Float[Array, " cycles"]
     y_max: Float[Array, " cycles"]
     clearance: Float[Array, " cycles"]
@@ -124,9 +126,10 @@ def observe_arc(arc: CycleMap, state: State, impact_log: int) -> ObservedArc:
         places = in_rows(met)[1:]
         places = places.reshape(arc.cycles, _places(arc, state), -1)
         assert run.clearance is not None and run.duration is not None
+        rests = jnp.zeros_like(run.y_min) if run.rests is None else run.rests.astype(x.dtype)
         return ObservedArc(
             places, jacobians, Impacts(log.phase, log.speed, log.stop.astype(x.dtype)),
-            run.impacts.astype(x.dtype), run.y_min, run.y_max, run.clearance, run.duration,
+            run.impacts.astype(x.dtype), rests, run.y_min, run.y_max, run.clearance, run.duration,
             {name: mean * run.duration for name, mean in run.averages.items()},
         )  # fmt: skip
 

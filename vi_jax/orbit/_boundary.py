@@ -8,9 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._at_work import at_work
-from .._checks import flag, instance_of, interval
+from .._checks import count, flag, instance_of, interval
 from .._interrupted import Interrupted
 from .._lazy import xr
+from .._words import so_many
 from ..flow import tidy
 from ..machine import check_leaf, leaf, with_units
 from ._codimension import points_of
@@ -18,6 +19,7 @@ from ._curve_monitor import CurveMonitor, Intervals, cosine_of
 from ._fixed_step_method import steps_of
 from ._problem import check_parameter
 from ._shooting import Shooting
+from ._sliding import ADDING_SLIDING, GRAZING_SLIDING
 from ._solution import orbit_of
 from ._solve import tangent_at
 from ._special_condition import Special, symmetry_condition
@@ -27,6 +29,17 @@ from .codimension_two import CodimensionTwo
 from .curve import INTERRUPTED, Step, check_walk, walk
 from .results import InWords, Orbit
 from .special import DOUBLING, FOLD, SYMMETRY, TORUS, TOUCHING, SpecialPoint, one
+
+# What to do instead at a point that is not followed: at others, and at one that is seen from the
+# side on which its motion has the part that vanishes.
+_INSTEAD = (
+    "Such a point is found value by value of the second parameter: `find_orbit` with another one, "
+    "from this motion, and `continue_orbit` from there locates it again."
+)
+_OTHER_SIDE = (
+    "It is followed from the side without that part: `continue_orbit(point.switch(), ...)` ends at "
+    "it too, and its special point there can be given."
+)
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -74,8 +87,9 @@ class Boundary(InWords):
         return np.arccos(np.clip([cosine_of(step) for step in self.steps], -1, 1))
 
     def orbit(self, index: int) -> Orbit:
-        """The motion at one point."""
-        return orbit_of(self.problem, self.steps[index])
+        """The motion at one point; a negative `index` counts from the end."""
+        many = len(self.steps)
+        return orbit_of(self.problem, self.steps[count("index", index, least=-many, most=many - 1)])
 
     def to_xarray(self, *, along: str | None = None) -> "xr.Dataset":
         """The curve as an `xarray.Dataset` over its points, the two parameters by their names, and
@@ -111,7 +125,7 @@ class Boundary(InWords):
     def __str__(self) -> str:
         low, high = self.parameters.min(axis=0), self.parameters.max(axis=0)
         lines = [
-            f"Curve of {len(self.parameters)} points of {self.kind}: {self.names[0]} in "
+            f"Curve of {so_many(len(self.parameters), 'point')} of {self.kind}: {self.names[0]} in "
             f"[{low[0]:.6g}, {high[0]:.6g}], {self.names[1]} in [{low[1]:.6g}, {high[1]:.6g}]; "
             f"ends: {self.ends[0]}, {self.ends[1]}",
             *(f"  {point}" for point in self.special),
@@ -192,7 +206,8 @@ def _check_point(point: SpecialPoint) -> None:
     if point.kind not in (FOLD, DOUBLING, TORUS, SYMMETRY, *TOUCHING):
         raise ValueError(
             "Argument `point` must be a fold, a period doubling, a Neimark–Sacker bifurcation, a "
-            f"symmetry breaking or a grazing, but is {one(point.kind)}."
+            "symmetry breaking, or a grazing or sliding bifurcation at which something is touched, "
+            f"but is {one(point.kind)}. {_INSTEAD}"
         )
     if not point.problem.follows_events:
         raise ValueError(
@@ -200,9 +215,11 @@ def _check_point(point: SpecialPoint) -> None:
             "are followed in one parameter only."
         )
     if point.kind in TOUCHING and not point.touches:
+        touched = point.kind in (ADDING_SLIDING, GRAZING_SLIDING)
         raise ValueError(
-            "Argument `point` must be a grazing at which something is touched, but there "
-            f"{point.detail}."
+            "Argument `point` must be a grazing or a sliding bifurcation at which something is "
+            f"touched, but is {one(point.kind)}: {point.detail}. "
+            f"{_OTHER_SIDE if touched else _INSTEAD}"
         )
 
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._programs import compiled
+from .._words import so_many
 from ._curve_monitor import cosine_of
 from ._origin import repeated
 from ._resonances import resonances
@@ -85,7 +86,7 @@ def points_of(
     if condition.kind == GRAZING:
         for place, step, entries in _resonances_of(problem, condition, steps, scale):
             n = len(entries)
-            more = f" of the motion with one impact in {n} period{'' if n == 1 else 's'}"
+            more = f" of the motion with one impact in {so_many(n, 'period')}"
             found.append((place, point(RESONANT, step, condition.impact, more)))
     return tuple(point for _, point in sorted(found, key=lambda f: f[0]))
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._at_work import Tell, at_work
-from .._checks import flag, given_number, interval, one_of, tuple_of_names
+from .._checks import flag, given_number, interval, one_of, short, tuple_of_names
 from .._interrupted import Interrupted
 from ..flow import MethodLike
 from ..machine import check_leaf, leaf
@@ -156,7 +156,14 @@ def _walked(monitor: BranchMonitor, steps: list[Step], tell: Tell, settings: dic
 def _check_orbit(orbit: Orbit) -> None:
     """**Raises:** `ValueError` unless this is one orbit."""
     if not isinstance(orbit, Orbit) or orbit.residual.ndim:
-        raise ValueError("Argument `orbit` must be one `Orbit`, not a batch or a state.")
+        raise ValueError(
+            f"Argument `orbit` must be one `Orbit`, not a batch or a state, but got {short(orbit)}."
+        )
+    if orbit.residual.dtype != jnp.float64:
+        raise ValueError(
+            "Argument `orbit` must be of double precision to be followed: call "
+            '`jax.config.update("jax_enable_x64", True)` first and find it again.'
+        )
     if not bool(orbit.successful):
         reason = ORBIT_RESULTS[orbit.result]
         raise ValueError(f"Argument `orbit` must be an orbit, but is: {reason}")

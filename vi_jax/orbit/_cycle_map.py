@@ -11,7 +11,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
-from .._checks import count
+from .._checks import count, require
 from .._renamed import renamed
 from .._types import State
 from ..flow import (
@@ -21,10 +21,10 @@ from ..flow import (
     MethodLike,
     as_floats,
     check_period,
-    check_reals,
     chosen,
     machine_of,
     preset,
+    shape_of,
     simulate,
 )
 from ..machine import AbstractMachine
@@ -100,6 +100,7 @@ def cycle_map(
     """
     machine = machine_of(machine).in_cycle_clock()
     if section is not None:
+        require("section", section)
         machine = machine.at_section(section)
     method = chosen(machine, method, _usual(machine))
     method.check(machine)
@@ -120,7 +121,7 @@ def adopted(machine: AbstractMachine, state: State, name: str = "state") -> Stat
     """A state as a cycle map needs it, in floating-point arrays of one type; `name` is the argument
     that messages blame."""
     state = machine.adopt(machine.in_cycle_state(name, state))
-    check_reals(name, state)
+    shape_of(name, machine, state)
     if machine.clock(state) is not None:
         raise ValueError(
             "Argument `machine` must count its cycles by its independent variable, but its state "

@@ -54,7 +54,13 @@ def check_parameter(
             f"({low:g}, {high:g})."
         )
     for end in interval:
-        check_again(with_leaf(machine, name, end))
+        try:
+            check_again(with_leaf(machine, name, end))
+        except ValueError as error:
+            raise ValueError(
+                f"Argument `{argument}` must leave the machine valid, but at {name} = {end:g}: "
+                f"{error}"
+            ) from None
 
 
 def problem_of(

@@ -81,6 +81,7 @@ def orbit_of(problem: Shooting, step: Step) -> Orbit:
         impact_speed=jnp.asarray(speeds[order]),
         impact_stop=jnp.asarray(stops[order]),
         impacts=jnp.asarray(count, jnp.int32),
+        rests=jnp.asarray(0 if seen.counted is None else seen.counted.rests, jnp.int32),
         y_min=jnp.asarray(seen.y_min),
         y_max=jnp.asarray(seen.y_max),
         clearance=jnp.asarray(seen.nearest.room),

@@ -88,6 +88,10 @@ def table_of(
     **Arguments:** `parameter` and `values`, the name of the branch's parameter and its value for
     each orbit; `units`, the machine's.
     """
+    if not callable(function):
+        raise TypeError(
+            f"Argument `function` must be a function of an `Orbit`, but got {function!r}."
+        )
     rows = [_numbers(function(orbit)) for orbit in orbits]
     shapes = {name: x.shape for name, x in rows[0].items()}
     for i, row in enumerate(rows):
@@ -101,11 +105,11 @@ def table_of(
         raise TypeError(
             "Argument `function` must call no number `parameter`, which is the branch's own."
         )
-    data: dict[str, Any] = {"parameter": ("point", values)}
+    data: dict[str, Any] = {name: ("point", values) for name in (parameter, "parameter")}
     for name, shape in shapes.items():
         axes = (f"{name}_{k}" for k in range(len(shape)))
         data[name] = ("point", *axes), np.stack([row[name] for row in rows])
-    named = {name: name for name in shapes} | {"parameter": parameter}
+    named = {name: name for name in (*shapes, parameter)} | {"parameter": parameter}
     return with_units(xr.Dataset(data, attrs={"parameter": parameter}), units, named)
 
 

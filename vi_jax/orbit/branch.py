@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from .._checks import one_of
+from .._checks import count, given_number, one_of
 from .._lazy import xr
+from .._words import so_many
 from ..flow import tidy
 from ..machine import in_unit, with_units
 from ._conditions import held_in_words
@@ -18,7 +19,7 @@ from ._solve import between
 from ._tables import COLUMNS, on_sections, special_table, stability_in_words, table_of
 from ._tables import column_names as column_names
 from .curve import Step
-from .results import InWords, Orbit, impacts_in_words
+from .results import InWords, Orbit
 from .special import SpecialPoint
 
 # A point lies at a value of the parameter if it is no further from it (in the parameter's scale).
@@ -158,11 +159,13 @@ class Branch(InWords):
         return table_of(function, orbits, self.name, self.parameter, self.problem.machine.units)
 
     def orbit(self, index: int) -> Orbit:
-        """The motion at one point."""
-        return orbit_of(self.problem, self.steps[index])
+        """The motion at one point; a negative `index` counts from the end."""
+        many = len(self.steps)
+        return orbit_of(self.problem, self.steps[count("index", index, least=-many, most=many - 1)])
 
     def at(self, value: float) -> list[Orbit]:
         """The branch's motions at a value of the parameter, solved for; in the branch's order."""
+        value = given_number("value", value)
 
         def apart(step: Step) -> float:
             # Points are put on a value, such as a bound, to rounding.
@@ -183,7 +186,8 @@ class Branch(InWords):
     def to_xarray(self, *, along: str | None = None) -> "xr.Dataset":
         """The branch as an `xarray.Dataset` over its points, with a word for the `stability` at
         each, and its special points: `special_kind`, `special_detail`, `special_parameter`, which
-        `special_point` of the branch it is (-1 if none), and more. Its ends are in `attrs`.
+        `special_point` of the branch it is (-1 if none), and more. The parameter is there by its
+        own name too, where that is not the name of another column. The ends are in `attrs`.
 
         `.to_netcdf(path, engine="h5netcdf")` writes all of it, complex multipliers too.
 
@@ -193,7 +197,8 @@ class Branch(InWords):
 
         **Raises:** `ValueError` if there is no such dimension.
         """
-        data = {name: ("point", self.column(name)) for name in self.column_names}
+        data: dict[str, Any] = {self.name: ("point", self.parameter)}
+        data |= {name: ("point", self.column(name)) for name in self.column_names}
         data |= {
             "impact_phase": (("point", "impact"), self.impact_phase),
             "impact_speed": (("point", "impact"), self.impact_speed),
@@ -201,18 +206,15 @@ class Branch(InWords):
             "stability": ("point", stability_in_words(self.multipliers)),
         }
         data |= special_table(self.special, self.steps)
+        data.setdefault(f"special_{self.name}", data["special_parameter"])
         about = {"parameter": self.name, "period_in_cycles": self.cycles, "ends": list(self.ends)}
         found = xr.Dataset(data, attrs=about)
         own = {name: name for name in (*self.averages, *self.free)}
-        own |= dict.fromkeys(("parameter", "special_parameter"), self.name)
+        named = ("parameter", "special_parameter", self.name, f"special_{self.name}")
+        own |= dict.fromkeys(named, self.name)
         own |= dict.fromkeys(("special_y_min", "special_y_max"), "position")
         found = with_units(found, self.problem.machine.units, own)
         return tidy(found, along)
-
-    def _impacts_in_words(self) -> str:
-        if self.rests.any():
-            return "rest on a stop"
-        return impacts_in_words(self.impact_speed.shape[1])
 
     def _freed_in_words(self) -> list[str]:
         """What was freed and what is held instead, if anything is."""
@@ -231,10 +233,17 @@ class Branch(InWords):
         period = machine.period_of(self.cycles)
         span = in_unit(f"[{low:.6g}, {high:.6g}]", machine.units, self.name)
         lines = [
-            f"Branch of {len(self.parameter)} motions of period {period} with "
-            f"{self._impacts_in_words()}, {self.name} in {span}, "
+            f"Branch of {so_many(len(self.parameter), 'motion')} of period {period} with "
+            f"{branch_hits_in_words(self)}, {self.name} in {span}, "
             f"{int(self.stable.sum())} of them stable; ends: {self.ends[0]}, {self.ends[1]}",
             *self._freed_in_words(),
             *(f"  {point}" for point in self.special),
         ]
         return "\n".join(lines)
+
+
+def branch_hits_in_words(branch: Branch) -> str:
+    """The impacts of a branch's motions, or that they rest, as their impacts differ in number."""
+    if branch.rests.any():
+        return "rest on a stop"
+    return so_many(branch.impact_speed.shape[1], "impact")

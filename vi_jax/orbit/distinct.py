@@ -6,18 +6,17 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
-from .._checks import given_number
+from .._checks import given_number, short
+from .._words import so_many
 from ..machine import in_rows, state_in_words
-from .results import InWords, Orbit, impacts_in_words, span_in_words, trimmed
+from .results import InWords, Orbit, hits_in_words, span_in_words, trimmed
 
 
 class Orbits(InWords, list[Orbit]):
     """Several periodic motions: a list that prints as a table, one motion a line."""
 
     def __str__(self) -> str:
-        return "\n".join(
-            [f"{len(self)} orbit{'' if len(self) == 1 else 's'}", *map(in_one_line, self)]
-        )
+        return "\n".join([so_many(len(self), "orbit"), *map(in_one_line, self)])
 
 
 def in_one_line(orbit: Orbit) -> str:
@@ -27,7 +26,7 @@ def in_one_line(orbit: Orbit) -> str:
     stable = "stable" if bool(orbit.stable) else "unstable"
     where, span = state_in_words(orbit.state, 6, orbit.machine.units), span_in_words(orbit, 6)
     size = f"greatest multiplier {np.abs(orbit.multipliers).max():.6g}"
-    return f"  {period}, {impacts_in_words(int(orbit.impacts))}, {stable}: {where}; {span}; {size}"
+    return f"  {period}, {hits_in_words(orbit)}, {stable}: {where}; {span}; {size}"
 
 
 def distinct_orbits(orbits: Orbit, *, tolerance: float = 1e-6) -> tuple[Orbits, np.ndarray]:
@@ -45,7 +44,7 @@ def distinct_orbits(orbits: Orbit, *, tolerance: float = 1e-6) -> tuple[Orbits, 
     it.
     """
     if not isinstance(orbits, Orbit):
-        raise TypeError(f"Argument `orbits` must be from `find_orbit`, but got {orbits!r}.")
+        raise TypeError(f"Argument `orbits` must be from `find_orbit`, but got {short(orbits)}.")
     given_number("tolerance", tolerance, low=0.0)
     found, counts = distinct_among([orbits], tolerance)
     return found, counts[:, 0]

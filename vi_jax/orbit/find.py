@@ -1,6 +1,5 @@
 """`find_orbit`: from a guess to a periodic motion that is judged and differentiable."""
 
-import contextlib
 import dataclasses
 from collections.abc import Callable
 
@@ -105,6 +104,12 @@ def _check_guess(machine: AbstractMachine, state: State) -> None:
     """**Raises:** `ValueError` unless this is a state, or as many of them in rows."""
     check_leaves("guess", state)
     many = _are_many(machine, state)
+    shape = jnp.shape(machine.position(state))
+    if len(shape) > 1:
+        raise ValueError(
+            "Argument `guess` must be one state, or several along one axis, but its position has "
+            f"the shape {shape}."
+        )
     shapes = {jnp.shape(leaf)[:1] for leaf in jtu.tree_leaves(state)} if many else {()}
     if len(shapes) > 1:
         whole = sorted(jnp.shape(leaf) for leaf in jtu.tree_leaves(state))
@@ -121,9 +126,7 @@ def _check_guess(machine: AbstractMachine, state: State) -> None:
 
 def _are_many(machine: AbstractMachine, state: State) -> bool:
     """Whether a guess is several: whether it has several positions."""
-    with contextlib.suppress(AttributeError, TypeError, LookupError):  # which `simulate` explains
-        return jnp.ndim(machine.position(state)) > 0
-    return any(jnp.ndim(leaf) for leaf in jtu.tree_leaves(state))
+    return jnp.ndim(machine.position(state)) > 0
 
 
 @compiled
@@ -180,6 +183,7 @@ def _judged(
         impact_speed=listed.speed,
         impact_stop=listed.stop.astype(jnp.int32),
         impacts=jnp.sum(jnp.where(within, seen.impacts, 0.0)).astype(jnp.int32),
+        rests=jnp.sum(jnp.where(within, seen.rests, 0.0)).astype(jnp.int32),
         y_min=jnp.min(jnp.where(within, seen.y_min, jnp.inf)),
         y_max=jnp.max(jnp.where(within, seen.y_max, -jnp.inf)),
         clearance=clearance,

@@ -10,6 +10,7 @@ from jaxtyping import Complex, Float
 from .._at_work import at_work
 from .._checks import count, flag, instance_of
 from .._interrupted import Interrupted
+from .._words import so_many
 from ..machine import Stated, Summarized, in_unit, stated
 from ._beside_grazing import ASKED, DECADES, Motions, beside_grazing, positions, stretch
 from ._events import Event
@@ -24,7 +25,7 @@ from ._forecast import (
     windows,
 )
 from ._local_map import Graze, graze_at
-from .results import complex_in_words, impacts_in_words
+from .results import complex_in_words
 from .special import SpecialPoint
 
 # Of the depth at which windows end, or of that which a touch of so much of a cycle has, the
@@ -102,7 +103,7 @@ class Grazing(Summarized):
         lines = [
             f"Grazing at {self.parameter} = {at}: touches the {self.touched}",
             f"  what follows: {SCENARIOS[self.outcome]}",
-            *self._far_in_words(),
+            *([] if self.far is None else [f"  far away: the machine settles on {self.afar}"]),
             f"  impacts appear: as {self.parameter} {'rises' if self.side > 0 else 'falls'}",
             f"  multipliers without impact: {values}",
             f"  second derivative of the distance: {', '.join(f'{a:.6g}' for a in self.rate)}",
@@ -121,13 +122,12 @@ class Grazing(Summarized):
             lines.append("  checked by the machine: it does not agree at the values looked at")
         return "\n".join(lines)
 
-    def _far_in_words(self) -> list[str]:
-        if self.far is None:
-            return []
-        period, impacts = self.far
-        cycles = f"{period} cycle{'' if period == 1 else 's'}"
-        motion = f"a motion of {cycles} with {impacts_in_words(impacts)}"
-        return [f"  far away: the machine settles on {motion if period else 'no short period'}"]
+    @property
+    def afar(self) -> str:
+        """What the machine settles on where nothing near attracts, `far` in words; "" if `None`."""
+        period, impacts = self.far or (0, 0)
+        motion = f"a motion of {so_many(period, 'cycle')} with {so_many(impacts, 'impact')}"
+        return motion if period else "no short period" * (self.far is not None)
 
     def _windows_in_words(self) -> list[str]:
         if self.windows is None:

@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from .._lazy import xr
 from .._renamed import refuse_attribute
 from .._types import State
+from .._words import so_many
 from ..flow import (
     AbstractMethod,
     NamedEnumeration,
@@ -40,11 +41,6 @@ from ..machine import (
     with_units,
 )
 from .floquet import STABILITY, STABILITY_NAMES, stability_of
-
-
-def impacts_in_words(count: int) -> str:
-    """So many impacts, in words."""
-    return f"{count} impact{'' if count == 1 else 's'}"
 
 
 class ORBIT_RESULTS(NamedEnumeration):
@@ -111,6 +107,9 @@ class Orbit(Summarized):
     """Index into `machine.stops` of each impact."""
     impacts: Int[Array, "..."]
     """Number of impacts in the period."""
+    rests: Int[Array, "..."]
+    """Times that a body comes to rest on a stop in the period; 0 too of one that lies there all the
+    time."""
     y_min: Float[Array, "..."]
     """Smallest position of the period (of the first coordinate)."""
     y_max: Float[Array, "..."]
@@ -227,8 +226,8 @@ class Orbit(Summarized):
         such dimension.
         """
         batch = batch_names(dims, self.residual.ndim)
-        alone = ("cycles", "duration", "frequency_ratio", "impacts", "y_min", "y_max", "clearance",
-                 "residual", "error", "iterations")  # fmt: skip
+        alone = ("cycles", "duration", "frequency_ratio", "impacts", "rests", "y_min", "y_max",
+                 "clearance", "residual", "error", "iterations")  # fmt: skip
         each = ("impact_phase", "impact_speed", "impact_stop")
         variables = states("section", self.sections, (*batch, "section"))
         variables |= states("section", self.quantities, (*batch, "section"))
@@ -258,7 +257,7 @@ class Orbit(Summarized):
         count, cycles, units = int(self.impacts), int(self.cycles), self.machine.units
         period = self.machine.period_of(cycles)
         lines = [
-            f"Orbit of period {period} with {impacts_in_words(count)}, {STABILITY[self.stability]}",
+            f"Orbit of period {period} with {hits_in_words(self)}, {STABILITY[self.stability]}",
             f"  section: {state_in_words(self.state, 9, units)}",
             f"  {span_in_words(self, 9)}",
         ]
@@ -307,6 +306,21 @@ def _nearly(orbit: Orbit) -> str:
         " So small a residual is mostly the steps' own error: ask for a finer `method`, or for less"
         " by `root_finder=vi.Newton(tolerance=1e-8)`."
     )
+
+
+def lies_on_a_stop(orbit: Orbit) -> bool:
+    """Whether a body lies still on a stop on the section."""
+    bodies = ((stop, orbit.machine.coordinates[stop.coordinate]) for stop in orbit.machine.stops)
+    x = orbit.state
+    return any(stop.beyond(y.position(x)) >= 0 and y.velocity(x) == 0 for stop, y in bodies)
+
+
+def hits_in_words(orbit: Orbit) -> str:
+    """The impacts of a motion, and how often it rests."""
+    words, rests = so_many(int(orbit.impacts), "impact"), int(orbit.rests)
+    if rests:
+        return f"{words} and {so_many(rests, 'rest')} on a stop"
+    return f"{words} and rest on a stop" if lies_on_a_stop(orbit) else words
 
 
 def span_in_words(orbit: Orbit, digits: int) -> str:

@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from .._words import so_many
 from ..orbit import ClosedFormOrbits
 from ..scans import Sweep
 from .motions import GAP
@@ -39,8 +40,7 @@ class Row(NamedTuple):
             if self.exponent > _CHAOS:
                 return "chaotic"
             return f"period over {2 * LONGEST}π" if self.exponent < -_CHAOS else "no period found"
-        count = round(self.impacts)
-        return f"{2 * self.cycles}π, {count} impact{'' if count == 1 else 's'}"
+        return f"{2 * self.cycles}π, {so_many(round(self.impacts), 'impact')}"
 
 
 def rows(system: System, direction: str, inside: np.ndarray) -> list[Row]:

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 
 from .._checks import instance_of, one_of
 from ..machine import in_brackets, name_in, quantity_of, unit_of
-from ..orbit import Boundary, Branch, impacts_in_words, point_of
+from ..orbit import Boundary, Branch, branch_hits_in_words, point_of
 from ..scans import Sweep
 from .colors import DASHES, MARKS, color_of, mark_style, once
 from .motion import new_axes
@@ -54,15 +54,15 @@ def plot_branch(
     inside = np.abs(branch.multipliers).max(axis=1) < 1 + 1e-6
     stable = inside[1:] & inside[:-1]
     label = style.pop("label", None)
-    impacts = branch.impact_speed.shape[1]
-    look = {"color": color_of(branch.cycles, impacts), "lw": thick(1.6), **style}
+    look = {"color": color_of(branch.cycles, int(branch.impacts.max())), "lw": thick(1.6), **style}
     if label is not None:
         ax.plot([], [], label=label, **{"ls": "-", **look})
     for start, end, solid in _stretches(stable):
         part = slice(start, end)
         ax.plot(across[part], up[part], **{"ls": "-" if solid else "--", **look})
     if label is None and legend:
-        motion = f"{branch.problem.machine.period_of(branch.cycles)}, {impacts_in_words(impacts)}"
+        period = branch.problem.machine.period_of(branch.cycles)
+        motion = f"{period}, {branch_hits_in_words(branch)}"
         ax.plot([], [], label=once(ax, motion), **{"ls": "-", **look})
     for word, line, drawn in ((_STABLE, "-", stable.any()), (_UNSTABLE, "--", not stable.all())):
         if drawn:
@@ -82,10 +82,12 @@ def plot_branch(
 
 
 def _moving(found: Branch | Sweep) -> str:
-    """The extreme that varies: the other one may be a stop's place."""
-    low, high = np.asarray(found.y_min), np.asarray(found.y_max)
-    held = np.ptp(low) <= 1e-9 * (1 + np.abs(low).max())
-    return "y_max" if held and np.ptp(high) > np.ptp(low) else "y_min"
+    """The extreme that varies: the other one may be a stop's place. The least if neither does."""
+    low, high = (
+        np.ptp(x) > 1e-9 * (1 + np.abs(x).max())
+        for x in (np.asarray(found.y_min), np.asarray(found.y_max))
+    )
+    return "y_max" if high and not low else "y_min"
 
 
 def _array(found: Branch | Sweep, argument: str, name: str) -> np.ndarray:

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 
 from .._checks import flag, instance_of
 from ..machine import in_brackets, name_in, unit_of
-from ..orbit import Grazing
+from ..orbit import Grazing, Motions
 from ..scans import REGIMES
 from .branch import axis_name
 from .colors import IRREGULAR, color_of, mark_style
@@ -31,7 +31,8 @@ def plot_grazing(
     Along the axis is the parameter, less its value at the grazing, scaled by the square root, so
     that what grows as the root lies between straight lines; upwards the first coordinate on the
     section, less that of the motion without impact. The machine's attractor is in pale rings (where
-    it was simulated), the forecast's in dots of the colour of its period, chaos dark.
+    it was simulated), the forecast's in dots of the colour of its period, chaos dark. Where nothing
+    near attracts, grey dots are what the machine settles on far away, `found.far`.
 
     **Arguments:** the `Grazing`; `ax`, axes to draw into, a new figure if left out; `legend`,
     whether to draw one; options of `Axes.plot` for the forecast's dots.
@@ -43,11 +44,10 @@ def plot_grazing(
     instance_of("found", found, Grazing, "a `Grazing`, from `grazing`")
     legend, ax = flag("legend", legend), new_axes(ax)
     if found.machine is not None:
-        near = found.machine.period >= 0
-        across, up = _dots(found.machine.offset[near], found.machine.position[near])
-        rings = {"marker": "o", "ms": 4.5, "mfc": "none", "mec": "0.72", "mew": 0.6, "ls": "none"}
-        ax.plot(across, up, label="the machine", **rings)
+        _draw_machine(ax, found, found.machine)
     period = found.forecast.period
+    if found.far is None and not (period >= 0).any():
+        ax.text(0.5, 0.6, "forecast: nothing near attracts", transform=ax.transAxes, ha="center")
     for n in sorted(set(period[period >= 0]), key=lambda n: (n == 0, n)):
         lanes = period == n
         across, up = _dots(found.forecast.offset[lanes], found.forecast.position[lanes])
@@ -63,6 +63,7 @@ def plot_grazing(
     ax.plot(0.0, 0.0, **{**mark_style("grazing"), "label": "grazing", "zorder": 4})
     ax.set_xscale("function", functions=(_root, _square))
     farthest = found.forecast.offset[np.argmax(np.abs(found.forecast.offset))]
+    ax.plot([farthest, 0.0], [0.0, 0.0], ls="none")  # where nothing is drawn, the axis as it is
     ticks = farthest * (np.arange(_TICKS) / (_TICKS - 1)) ** 2
     ax.set_xticks(ticks, ["0", *(f"{x:.2g}" for x in ticks[1:])])
     units = dict(found.units)
@@ -73,6 +74,20 @@ def plot_grazing(
     if legend:
         ax.legend(fontsize="small", frameon=False)
     return ax
+
+
+def _draw_machine(ax: Axes, found: Grazing, machine: Motions) -> None:
+    """What the machine settles on, near the grazing and, if most of it is there, far away."""
+    near = machine.period >= 0
+    if near.any() or found.far is None:
+        across, up = _dots(machine.offset[near], machine.position[near])
+        rings = {"marker": "o", "ms": 4.5, "mfc": "none", "mec": "0.72", "mew": 0.6, "ls": "none"}
+        ax.plot(across, up, label="the machine", **rings)
+    if found.far is not None:
+        across, up = _dots(machine.offset[~near], machine.position[~near])
+        dots = {"marker": ".", "ms": 2, "color": "0.6", "ls": "none"}
+        ax.plot(across, up, **dots)
+        ax.plot([], [], ".", color="0.6", label=f"the machine, far away: {found.afar}")
 
 
 def _dots(offset: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

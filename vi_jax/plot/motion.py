@@ -8,7 +8,7 @@ from matplotlib.ticker import FuncFormatter, MultipleLocator
 
 from .._renamed import renamed
 from ..flow import Run, Samples
-from ..machine import AbstractMachine, SoftStop
+from ..machine import PLAIN, AbstractMachine, SoftStop, in_brackets, name_in, unit_of
 from .colors import BLUE, STOP, once
 from .path import motion_path
 from .style import is_set, thick
@@ -57,13 +57,13 @@ def plot_history(
 
     **Returns:** the axes.
     """
+    path = motion_path(motion, machine=machine, window=window)
     turning = counts_by_angle(machine)
     if unit is None:
         unit = "angle" if turning else "cycles"
     if unit not in ("angle", "cycles"):
         raise ValueError(f"Argument `unit` must be 'angle' or 'cycles', but got {unit!r}.")
     ax = new_axes(ax)
-    path = motion_path(motion, machine=machine, window=window)
     factor = 2.0 if unit == "angle" else 1.0
     ax.plot(factor * (path.cycles + shift), path.Y, **{"color": BLUE, "lw": thick(1.3), **style})
     if stops and machine is not None:
@@ -89,10 +89,16 @@ def _draw_stops(machine: AbstractMachine, ax: Axes, line: Callable[..., Any]) ->
 
 
 def _labels(motion: Run | Samples, machine: AbstractMachine | None) -> tuple[str, str]:
-    """What position and velocity are called; samples alone do not know their machine."""
-    if machine is not None:
-        return machine.labels
-    return motion.labels if isinstance(motion, Run) else ("Y", "V")
+    """What position and velocity are called, with their units; samples alone do not know their
+    machine."""
+    if machine is None:
+        return motion.labels if isinstance(motion, Run) else ("Y", "V")
+    named = zip(PLAIN, machine.labels, strict=True)
+    position, velocity = (
+        in_brackets(label, unit_of(machine.units, name)) if name_in(label) == label else label
+        for name, label in named
+    )
+    return position, velocity
 
 
 def angle_axis(ax: Axes, *, every: int = 1) -> None:
@@ -124,8 +130,8 @@ def plot_phase_portrait(
 
     **Returns:** the axes.
     """
-    ax = new_axes(ax)
     path = motion_path(motion, machine=machine, window=window)
+    ax = new_axes(ax)
     (line,) = ax.plot(path.Y, path.V, **{"color": BLUE, "lw": thick(1.0), **style})
     if sections:
         only = motion.samples if isinstance(motion, Run) else motion  # without the impacts

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
+from .._checks import instance_of, tuple_of
 from ..orbit import Orbit
 from .colors import BLUE
 from .motion import new_axes
@@ -20,13 +21,18 @@ def plot_multipliers(
     figure if left out; options of `Axes.plot`.
 
     **Returns:** the axes.
+
+    **Raises:** `TypeError` for what is none.
     """
+    listed = [orbits] if isinstance(orbits, Orbit) else tuple_of("orbits", orbits, Orbit)
+    for orbit in listed:
+        instance_of("orbits", orbit, Orbit, "an `Orbit`, from `find_orbit`, or a list of them")
     ax = new_axes(ax)
     angle = np.linspace(0, 2 * np.pi, 256)
     ax.plot(np.cos(angle), np.sin(angle), color="0.5", lw=1)
     ax.axhline(0, color="0.85", lw=0.8, zorder=0)
     ax.axvline(0, color="0.85", lw=0.8, zorder=0)
-    for orbit in [orbits] if isinstance(orbits, Orbit) else orbits:
+    for orbit in listed:
         values = np.asarray(orbit.multipliers).ravel()
         ax.plot(np.real(values), np.imag(values), "o", **{"color": BLUE, "ms": 5, **style})
     ax.set_aspect("equal", adjustable="datalim")

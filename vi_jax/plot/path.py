@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from .._checks import instance_of
 from .._renamed import renamed
 from ..flow import Run, Samples
 from ..machine import AbstractMachine
@@ -48,6 +49,9 @@ def motion_path(
     """
     if isinstance(motion, Orbit):
         raise TypeError("Argument `motion` must be a `Run`: give `orbit.trajectory()` of an orbit.")
+    instance_of("motion", motion, (Run, Samples), "a `Run`, from `simulate`, or its `samples`")
+    if machine is not None:
+        instance_of("machine", machine, AbstractMachine, "a `Scene` or an `AbstractMachine`")
     samples = motion.samples if isinstance(motion, Run) else motion
     if samples is None:
         raise ValueError("Argument `motion` must have samples: simulate with `samples=64`, say.")

@@ -14,8 +14,8 @@ from matplotlib.patches import Patch
 
 from .._checks import flag
 from .._renamed import renamed
+from .._words import so_many
 from ..machine import AbstractMachine, by_name, in_brackets, unit_of
-from ..orbit import impacts_in_words
 from ..scans import NOT_COMPUTED, REGIMES, Basins, periods_of
 from . import colors as look
 from .branch import axis_name
@@ -115,7 +115,7 @@ def _named(code: int, word: Callable[[int], str]) -> tuple[str, str]:
 def _word_of(data: xr.Dataset) -> Callable[[int], str]:
     """What to call periods in these data, whose attributes hold the class of the machine."""
     if data.attrs.get("machine_class", "Scene") != "Scene":
-        return lambda cycles: f"{cycles} cycle{'' if cycles == 1 else 's'}"
+        return lambda cycles: so_many(cycles, "cycle")
     return lambda cycles: f"{2 * cycles}π"
 
 
@@ -148,7 +148,7 @@ def plot_basins(found: Basins, *, ax: Axes | None = None) -> Axes:
         color = colors[a.label + irregular]
         parts = [a.sections[name.removeprefix("start.")] for name in (x, y)]
         ax.plot(*parts, "o", color=color, mec="k", mew=1.0, ms=6, zorder=3)
-        motion = f"{found.period_of(a.period)}, {impacts_in_words(round(a.impacts))}"
+        motion = f"{found.period_of(a.period)}, {so_many(round(a.impacts), 'impact')}"
         entries.append((f"{motion}: {100 * a.fraction:.1f} %", color))
     if len(entries) > _NAMED:
         rest = sum(a.fraction for a in found.attractors[_NAMED:])

@@ -110,6 +110,9 @@ def _drawn(machine: AbstractMachine, pen: Pen, state: State, phase: float) -> No
         for stop in (stop for stop in machine.stops if stop.coordinate == i):
             face = float(stop.place) + stop.sign * size / 2
             pen.wall(face, stop.sign, low=row - 0.5 * size, high=row + 0.8 * size)
+        for stop in (stop for stop in machine.switches if isinstance(stop, SoftStop)):
+            if stop.coordinate == i:
+                _soft_stop(pen, float(stop.place) + stop.sign * size / 2, stop.sign, size, row)
         pen.mark(0.0, row - 0.5 * size, row + 1.1 * size)
         pen.mark(place, row, row + 1.1 * size)
         if place:
@@ -188,11 +191,19 @@ def _stop(pen: Pen, stop: Any, rest: float, size: float, *, rigid: bool) -> None
         if sign > 0:
             pen.label(face + 0.3 * size, high + 0.25, "stop, $k$", color=GREEN)
         return
-    back = face + sign * 0.8 * size
-    pen.line((face, 0.3 * size), (face, 0.7 * size), color=GREEN, lw=2.6)
-    pen.spring((face, 0.5 * size), (back, 0.5 * size), coils=3)
-    pen.wall(back, sign, low=low, high=high, slot=slot)
+    back = _soft_stop(pen, face, sign, size, slot=slot)
     pen.label(back + sign * 0.3 * size, high + 0.25, "soft stop", color=GREEN)
+
+
+def _soft_stop(
+    pen: Pen, face: float, sign: int, size: float, row: float = 0.0, slot: float = 0.0
+) -> float:
+    """A plate at `face` on a spring before a wall, whose place is returned."""
+    back = face + sign * 0.8 * size
+    pen.line((face, row + 0.3 * size), (face, row + 0.7 * size), color=GREEN, lw=2.6)
+    pen.spring((face, row + 0.5 * size), (back, row + 0.5 * size), coils=3)
+    pen.wall(back, sign, low=row - 0.5 * size, high=row + 0.8 * size, slot=slot)
+    return back
 
 
 @_drawn.register

@@ -13,6 +13,7 @@ from .._interrupted import Interrupted
 from .._lazy import xr
 from .._renamed import renamed
 from .._types import State
+from .._words import so_many
 from ..flow import MethodLike, in_names, machine_of, tidy
 from ..machine import AbstractMachine, components, with_leaf, with_units
 from ..orbit import (
@@ -128,11 +129,11 @@ class AllOrbits(InWords):
         count, stable = len(self.orbits), int(self.stable.sum())
         longest = max(searched.cycles for searched in self.searched)
         lines = [
-            f"{count} periodic motion{'' if count == 1 else 's'} of at most "
+            f"{so_many(count, 'periodic motion')} of at most "
             f"{self.machine.period_of(longest)}, {stable} of them stable"
         ]
         for orbit, found in zip(self.orbits, self.found, strict=True):
-            lines.append(f"{in_one_line(orbit)}; found {found.sum():,} times")
+            lines.append(f"{in_one_line(orbit)}; found {so_many(found.sum(), 'time')}")
         where = ", ".join(f"{name} in [{a:g}, {b:g}]" for name, (a, b) in self.region.items())
         lines.append(f"searched from random starts, {where}:")
         for s in self.searched:

@@ -7,9 +7,9 @@ import numpy as np
 
 from .._checks import count, given_number, require
 from .._lazy import xr
+from .._words import so_many
 from ..flow import REASON_NAMES, tidy
 from ..machine import AbstractMachine, attributes, state_in_words, summary_table, unit_of
-from ..orbit import impacts_in_words
 from ._geometry import (
     BasinEntropy,
     Cells,
@@ -198,14 +198,13 @@ class Basins(NamedTuple):
         return tidy(self.data.assign(variables), along)
 
     def __str__(self) -> str:
-        many = "" if len(self.attractors) == 1 else "s"
         units = {} if self.machine is None else self.machine.units
-        lines = [f"Basins of {len(self.attractors)} periodic motion{many}"]
+        lines = [f"Basins of {so_many(len(self.attractors), 'periodic motion')}"]
         for a in self.attractors:
             where = state_in_words({name: x[0] for name, x in a.sections.items()}, 6, units)
             lines.append(
                 f"  {a.label}: period {self.period_of(a.period)}, "
-                f"{impacts_in_words(round(a.impacts))}, {where}: "
+                f"{so_many(round(a.impacts), 'impact')}, {where}: "
                 f"{100 * a.fraction:.2f} ± {100 * a.error:.2f} %"
             )
         lines += [f"  {name}: {100 * x:.2f} %" for name, x in self.irregular.items() if x]

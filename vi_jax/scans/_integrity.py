@@ -12,9 +12,9 @@ from .._checks import count, given_number
 from .._lazy import xr
 from .._renamed import renamed
 from .._types import State
+from .._words import so_many
 from ..flow import MethodLike, chosen, machine_of, tidy
 from ..machine import AbstractMachine, attributes, check_leaf, summary_table, unit_of, with_leaf
-from ..orbit import impacts_in_words
 from ._basins import check_options, followed, sorted_out, starts_in
 from ._computed import ScanInterrupted
 from ._found import Attractor, Basins, Integrity
@@ -79,7 +79,7 @@ class IntegrityProfile(NamedTuple):
     def name_of(self, motion: int) -> str:
         """A motion in words: its period and its impacts."""
         period = self.basins[0].period_of(int(self.period[motion]))
-        return f"{period}, {impacts_in_words(round(float(self.impacts[motion])))}"
+        return f"{period}, {so_many(round(float(self.impacts[motion])), 'impact')}"
 
     def to_xarray(self, *, along: str | None = None) -> "xr.Dataset":
         """This profile as an `xarray.Dataset` over `motion` and the parameter.
@@ -103,7 +103,7 @@ class IntegrityProfile(NamedTuple):
         low, high = self.values[[0, -1]]
         lines = [
             f"Integrity over {self.parameter}, {self.values.size} values from {low:.6g} to "
-            f"{high:.6g}: {len(self.period)} motion{'' if len(self.period) == 1 else 's'}"
+            f"{high:.6g}: {so_many(len(self.period), 'motion')}"
         ]
         for i in range(min(len(self.period), 8)):
             here = self.values[self.share[i] > 0]

@@ -10,9 +10,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._lazy import xr
 from .._types import State
+from .._words import so_many
 from ..flow import REASON_NAMES, RESULTS, batch_names, in_names, present, states, tidy
 from ..machine import PLAIN, Stated, Summarized, name_in, unit_of, with_unit, with_units
-from ..orbit import impacts_in_words
 from .regime import CODES, REGIMES, flags
 
 # A jump is so many times the change at the values beside it, and this part of 1 + |number|:
@@ -120,7 +120,7 @@ class Sweep(Summarized):
         periods = dict(enumerate(self.periods, 1))
         return [
             names.get(int(p))
-            or f"{periods.get(int(p), f'{2 * int(p)}π')} with {impacts_in_words(round(float(n)))}"
+            or f"{periods.get(int(p), f'{2 * int(p)}π')} with {so_many(round(float(n)), 'impact')}"
             for p, n in zip(np.asarray(self.period), np.asarray(self.impacts), strict=True)
         ]
 

@@ -1,0 +1,6 @@
+"""Words that several modules need for what they print."""
+
+
+def so_many(number: int, noun: str) -> str:
+    """So many of something, in words; the noun takes an s."""
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
