@@ -30,7 +30,8 @@ def fixed_step_method(
 
     **Returns:** the one asked for; else that of the orbit, if its steps are fixed; else
     `ExactFlight` where it applies; else 20 steps of `Verner9` a cycle, whose error is 1e-13. Of an
-    implicit solver equal steps, as many as it takes (see `problem_of`).
+    implicit solver equal steps. Where the motion paces its own clock, and of such a solver, there
+    are as many steps as it takes (see `problem_of`).
 
     **Raises:** `ValueError` if the one asked for is explicit and sizes its steps by a tolerance.
     """

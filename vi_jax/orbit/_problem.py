@@ -81,7 +81,9 @@ def problem_of(
     blank = Shooting(machine, carried, orbit.state, cycles, (), (), steps, (parameter,))
     period = float(orbit.duration) if blank.autonomous else float(machine.cycle) * cycles
     way = _followed(blank, orbit.state, found, period)
-    while not machine.scales_known or isinstance(carried, ImplicitSteps):
+    # By a clock that the motion itself paces, as a motor's crank, it may be slow anywhere.
+    paced = machine.pace(jnp.zeros(()), orbit.state) is not None
+    while paced or not machine.scales_known or isinstance(carried, ImplicitSteps):
         finer = dataclasses.replace(blank, steps=2 * blank.steps)
         again = _followed(finer, orbit.state, found, period)
         apart = np.max(np.abs(again.states - way.states) / (1 + np.abs(again.states)))
