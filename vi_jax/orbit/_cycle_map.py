@@ -21,10 +21,10 @@ from ..flow import (
     MethodLike,
     as_floats,
     check_period,
+    check_reals,
     chosen,
     machine_of,
     preset,
-    shape_of,
     simulate,
 )
 from ..machine import AbstractMachine
@@ -121,7 +121,7 @@ def adopted(machine: AbstractMachine, state: State, name: str = "state") -> Stat
     """A state as a cycle map needs it, in floating-point arrays of one type; `name` is the argument
     that messages blame."""
     state = machine.adopt(machine.in_cycle_state(name, state))
-    shape_of(name, machine, state)
+    check_reals(name, state)
     if machine.clock(state) is not None:
         raise ValueError(
             "Argument `machine` must count its cycles by its independent variable, but its state "

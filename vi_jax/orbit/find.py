@@ -1,5 +1,6 @@
 """`find_orbit`: from a guess to a periodic motion that is judged and differentiable."""
 
+import contextlib
 import dataclasses
 from collections.abc import Callable
 
@@ -16,7 +17,7 @@ from .._numbers import concrete
 from .._programs import compiled
 from .._renamed import renamed
 from .._types import Flag, Number, State
-from ..flow import MethodLike, check_leaves, in_modes, means
+from ..flow import MethodLike, check_leaves, in_modes, means, shape_of
 from ..machine import AbstractMachine, begin_modes, is_autonomous
 from ._arcs import by_the_first_state, error_of, in_order, moved_from_impacts, observe_arc
 from ._cycle_map import CycleMap, adopted, cycle_map
@@ -103,13 +104,15 @@ def find_orbit(
 def _check_guess(machine: AbstractMachine, state: State) -> None:
     """**Raises:** `ValueError` unless this is a state, or as many of them in rows."""
     check_leaves("guess", state)
-    many = _are_many(machine, state)
-    shape = jnp.shape(machine.position(state))
-    if len(shape) > 1:
+    axes = _axes_of(machine, state)
+    if axes > 1:
         raise ValueError(
             "Argument `guess` must be one state, or several along one axis, but its position has "
-            f"the shape {shape}."
+            f"{axes} axes."
         )
+    many = axes > 0
+    if not many:
+        shape_of("guess", machine, state)
     shapes = {jnp.shape(leaf)[:1] for leaf in jtu.tree_leaves(state)} if many else {()}
     if len(shapes) > 1:
         whole = sorted(jnp.shape(leaf) for leaf in jtu.tree_leaves(state))
@@ -124,9 +127,11 @@ def _check_guess(machine: AbstractMachine, state: State) -> None:
             raise ValueError(f"Argument `guess` must be finite, but its {name} is {numbers}.")
 
 
-def _are_many(machine: AbstractMachine, state: State) -> bool:
-    """Whether a guess is several: whether it has several positions."""
-    return jnp.ndim(machine.position(state)) > 0
+def _axes_of(machine: AbstractMachine, state: State) -> int:
+    """Along how many axes a guess is several: how many its position has."""
+    with contextlib.suppress(AttributeError, TypeError, LookupError):  # looked at where it is one
+        return jnp.ndim(machine.position(state))
+    return int(any(jnp.ndim(leaf) for leaf in jtu.tree_leaves(state)))
 
 
 @compiled
@@ -137,7 +142,7 @@ def _find(
         return _judged(the_map, guess, root_finder, impact_log)
 
     first = jtu.tree_leaves(guess)[0]
-    if not _are_many(the_map.machine, guess):
+    if not _axes_of(the_map.machine, guess):
         return one(guess)
     return jax.lax.map(one, guess, batch_size=min(_BATCH, first.shape[0]))
 
