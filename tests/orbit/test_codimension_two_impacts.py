@@ -281,3 +281,19 @@ def test_a_doubling_of_the_paper_becomes_degenerate():
     )
     wanted = degenerate(lambda xi: (0.5, xi), 0.13, 0.145, (0.775, 0.795))
     np.testing.assert_allclose(the(curve, "degenerate-doubling").parameters, wanted, atol=5e-7)
+
+
+@pytest.mark.slow
+def test_both_walls_of_a_box_grazed_at_once_are_two_touches():
+    """Where half the gap is the box's amplitude the ball stands between both walls; an impact
+    of depth one moves it by 2π(1 + e)√2 in each period after it, which vanishes nowhere."""
+    pair = vi.machines.ImpactPair(half_gap=1.6, restitution=0.5)
+    orbit = vi.find_orbit(pair, pair.start(place=-0.855516, speed=0.562099), throw=True)
+    branch = vi.continue_orbit(orbit, parameter="half_gap", bounds=(0.9, 6.0))
+    point = branch.special[-1]
+    assert point.kind == "grazing" and point.parameter == pytest.approx(1.0, abs=1e-12)
+    curve = vi.boundary(point, parameter="restitution", bounds=((0.5, 2.0), (0.4, 0.6)))
+    np.testing.assert_allclose(curve.parameters[:, 0], 1.0, atol=1e-12)
+    assert curve.special == ()
+    found = vi.grazing(point, check=False)
+    np.testing.assert_allclose(found.entries, 3 * np.pi * np.sqrt(2) * np.arange(1, 13), rtol=1e-9)

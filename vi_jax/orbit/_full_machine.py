@@ -6,6 +6,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 from .._programs import compiled
 from ..flow import AbstractMethod, FixedStep, simulate
@@ -49,7 +50,7 @@ def _lanes(problem, method, name: str, values, states, cycles: int, settle):
         run = simulate(
             machine, problem.unravel(u), cycles, settle=settle, method=method, record="sections"
         )
-        rows = jnp.stack(jax.tree.leaves(run.sections), axis=-1)
+        rows = jax.vmap(lambda state: ravel_pytree(state)[0])(run.sections)
         return rows[1:], run.impacts, run.successful
 
     return jax.vmap(one)(values, states)
