@@ -11,6 +11,7 @@ import pytest
 import vi_jax as vi
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
+from vi_jax.orbit import _problem
 
 ZETA = "drive.frequency_ratio"
 
@@ -145,10 +146,10 @@ def test_a_motor_branch_agrees_with_found_orbits():
 
 
 @pytest.mark.slow
-def test_a_weak_motor_whose_crank_slows_down_within_a_turn():
+def test_a_weak_motor_whose_crank_slows_down_within_a_turn(monkeypatch):
     """Equal steps of crank angle, enough for the crank's speed on the section, are too few then:
     with them the branch had points where branches cross and a torus. At the fold and the grazing
-    SciPy's own flights come back to the state, by time, to 1e-8."""
+    SciPy's own flights come back to the state, by time, to 1e-8. A branch with too few says so."""
     scene = vi.Scene(
         oscillator=vi.Oscillator(0.02),
         drive=vi.Motor(strength=0.08, control=0.9, coupling=0.35, slider_inertia=0.02),
@@ -185,6 +186,9 @@ def test_a_weak_motor_whose_crank_slows_down_within_a_turn():
                 y[1] *= -0.8
         np.testing.assert_allclose(y[:3], [state.Y, state.V, state.W], atol=1e-8)
     assert slowest < 0.2
+    monkeypatch.setattr(_problem, "_MOST", 0)
+    with pytest.warns(UserWarning, match="twice as many change its states by"):
+        vi.continue_orbit(orbit, parameter="drive.control", bounds=(0.5, 1.2), max_points=3)
 
 
 @pytest.mark.slow

@@ -292,6 +292,8 @@ def test_both_walls_of_a_box_grazed_at_once_are_two_touches():
     branch = vi.continue_orbit(orbit, parameter="half_gap", bounds=(0.9, 6.0))
     point = branch.special[-1]
     assert point.kind == "grazing" and point.parameter == pytest.approx(1.0, abs=1e-12)
+    with pytest.raises(ValueError, match="no admissible motion with 0 impacts"):
+        point.switch()  # beyond it the ball floats anywhere
     curve = vi.boundary(point, parameter="restitution", bounds=((0.5, 2.0), (0.4, 0.6)))
     np.testing.assert_allclose(curve.parameters[:, 0], 1.0, atol=1e-12)
     assert curve.special == ()

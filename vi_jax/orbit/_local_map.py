@@ -26,9 +26,6 @@ from .special import SpecialPoint, one
 # A branch that is this steep in its parameter (share of a unit step in scaled unknowns) turns back.
 _STEEP = 1e-6
 
-# Another impact as slow as this, where one is lost, is lost too: a choice, far above rounding.
-_TOGETHER = 1e-9
-
 
 class LocalMap(eqx.Module):
     """z ↦ N (z + kick·(-h)₊^order), h = slope·(p - p*) + ∂h·z: neighbours of a grazing motion, by
@@ -153,9 +150,7 @@ def _without_touch(point: SpecialPoint) -> tuple[Shooting, np.ndarray, int, floa
     if old.events[i].of(old.machine).holds_mode:
         beside = [j % old.legs for j in (i - 1, i + 1)]
         which += [j for j in beside if old.events[j].number == old.events[i].number][:1]
-    # What grazes there too, as the image of a symmetric motion does, is a touch as well.
-    speed = np.abs(np.asarray(point.step.seen.approach))
-    which += [j for j in old.impacts if j not in which and speed[j] < _TOGETHER]
+    which += [j for j in point.lost if j not in which]
     clock = float(np.asarray(old.parts(jnp.asarray(x))[0])[i])
     return *without_events(old, x, sorted(which)), old.events[i].number, clock
 

@@ -81,9 +81,7 @@ def problem_of(
     blank = Shooting(machine, carried, orbit.state, cycles, (), (), steps, (parameter,))
     period = float(orbit.duration) if blank.autonomous else float(machine.cycle) * cycles
     way = _followed(blank, orbit.state, found, period)
-    # By a clock that the motion itself paces, as a motor's crank, it may be slow anywhere.
-    paced = machine.pace(jnp.zeros(()), orbit.state) is not None
-    while paced or not machine.scales_known or isinstance(carried, ImplicitSteps):
+    while sized_by_motion(blank):
         finer = dataclasses.replace(blank, steps=2 * blank.steps)
         again = _followed(finer, orbit.state, found, period)
         apart = np.max(np.abs(again.states - way.states) / (1 + np.abs(again.states)))
@@ -96,6 +94,14 @@ def problem_of(
     states = way.states[:-1] if found else way.states
     x = problem.pack([place for place, _ in found], states, [leaf(machine, parameter)], period)
     return problem, np.asarray(x)
+
+
+def sized_by_motion(problem: Shooting) -> bool:
+    """Whether only the motion itself tells how many steps its flights need: one that paces its own
+    clock, as a motor's crank, may be slow anywhere."""
+    machine = problem.machine
+    paced = machine.pace(jnp.zeros(()), problem.like) is not None
+    return paced or not machine.scales_known or isinstance(problem.method, ImplicitSteps)
 
 
 class _Way(NamedTuple):

@@ -1,6 +1,7 @@
 """The equations of an orbit solved: their programs, and what they say."""
 
 import contextlib
+import dataclasses
 from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
@@ -82,6 +83,17 @@ def _compiled_observe(problem, x):
 def observe(problem: Shooting, x: np.ndarray) -> Observed:
     """What is observed of a solution: multipliers, extremes, clearance, speeds of approach."""
     return array_of(_compiled_observe(problem, jnp.asarray(x)))
+
+
+@compiled
+def _compiled_lacks(problem, x):
+    return jnp.max(jnp.abs(problem.lacks(x)))
+
+
+def off_by(problem: Shooting, x: Unknowns) -> float:
+    """How much twice the steps change the states of a solution, where each flight ends."""
+    finer = dataclasses.replace(problem, steps=2 * problem.steps)
+    return float(_compiled_lacks(finer, jnp.asarray(x)))
 
 
 @compiled

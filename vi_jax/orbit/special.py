@@ -35,6 +35,9 @@ TOUCHING = (GRAZING, *SLIDING)
 # Where something grazes it is touched to rounding, by choice within this.
 _TOUCHES = 1e-6
 
+# Another impact as slow as this, where one is lost, is lost too: a choice, far above rounding.
+_TOGETHER = 1e-9
+
 
 def one(kind: str) -> str:
     """A kind with its article, for messages."""
@@ -73,6 +76,16 @@ class SpecialPoint(InWords):
         bifurcation a surface, by a motion without the part that vanishes there."""
         lost = self.impact is not None and self.kind not in SLIDING
         return lost or abs(float(self.step.seen.nearest.room)) <= _TOUCHES
+
+    @property
+    def lost(self) -> list[int]:
+        """Which of the events graze here, of a symmetric motion two at once; none where a stop is
+        touched that it did not hit before."""
+        if self.impact is None:
+            return []
+        speed = np.abs(np.asarray(self.step.seen.approach))
+        others = (i for i in self.problem.impacts if speed[i] < _TOGETHER)
+        return sorted({self.impact, *others})
 
     def switch(self, *, distance: float = 0.01) -> Orbit:
         """An orbit of the other branch that begins here, to be continued.
@@ -209,7 +222,7 @@ def _beyond_grazing(point: SpecialPoint, distance: float) -> Orbit:
             "beyond it the motion has another number of cycles. Find it with `find_orbit`."
         )
     if point.impact is not None:
-        new, start = without_events(old, np.asarray(step.x), [point.impact])
+        new, start = without_events(old, np.asarray(step.x), point.lost)
     else:
         new, start = _with_touch(old, step)
     scale = np.concatenate([np.ones(len(start) - 1), point.scale[-1:]])
