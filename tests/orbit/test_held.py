@@ -113,7 +113,8 @@ def test_special_points_where_numbers_are_held(struck):
         ({"free": {XI: (0.2, 0.5)}, "fixed": {"y_max": 3.0}}, "must hold the orbit's"),
         ({"free": {ZETA: (0.2, 1.5)}, "fixed": {"y_max": 3.0}}, "others than the parameter"),
         ({"free": {XI: (0.0, 0.5)}, "fixed": {"height": 3.0}}, "`fixed` must be one of .*'y_max'"),
-        ({"free": {XI: (0.0, 0.5)}, "fixed": {"y_max": np.nan}}, "`fixed` must be"),
+        ({"free": {XI: (0.0, 0.5)}, "fixed": {"y_max": np.nan}}, r"`fixed\['y_max'\]` must be"),
+        ({"free": {XI: (0.5, 0.0)}, "fixed": {"y_max": 3.0}}, r"`free\['.*'\]` must be two finite"),
     ],
 )
 def test_says_what_is_wrong(linear, arguments, message):

@@ -220,15 +220,13 @@ def _freed(
         check_leaf(machine, name, argument="free")
         if name == problem.parameters[0]:
             raise ValueError(f"Argument `free` must name others than the parameter, {name}.")
-        ranges.append(interval("free", given))
+        ranges.append(interval(f"free[{name!r}]", given))
         values.append(float(leaf(machine, name)))
         check_parameter(machine, name, values[-1], ranges[-1], "orbit", "free")
     names = _names("fixed", tuple(fixed), problem)
+    given = {k: at if at is None else given_number(f"fixed[{k!r}]", at) for k, at in fixed.items()}
     here, _ = rates_at(problem, names, jnp.asarray(x), jnp.zeros(x.size))
-    targets = {
-        name: float(here[name]) if at is None else given_number("fixed", at)
-        for name, at in fixed.items()
-    }
+    targets = {name: float(here[name]) if at is None else at for name, at in given.items()}
     for name, target in targets.items():
         if not np.isfinite(target):
             raise ValueError(
