@@ -31,8 +31,9 @@ bar = vi.machines.Structure(  # pyright: ignore[reportCallIssue]
     contacts=(vi.RigidStop(0.0, 0.0, "left", at=np.eye(n)[0]),), frequency=2 * np.pi / 1.5e-3,
 )  # fmt: skip
 start = vi.machines.StructureState(jnp.full(n, 5e-5), jnp.full(n, -0.1))
-run = vi.simulate(bar, start, 1, event_log=4)
-strikes, _, leaves, _ = run.event_log.phase[0]
+run = vi.simulate(bar, start, 1, event_log=8)
+# Nothing presses the end on its stop until it is deformed: by rounding it may hop once, for 1e-9 s.
+strikes, leaves = jnp.nanmin(run.event_log.phase), jnp.nanmax(run.event_log.phase)
 impulse = np.ones(n) @ mass @ (np.asarray(run.last.velocity) + 0.1)
 
 # %% Theirs are seen within some steps of 2e-6 s
