@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._at_work import at_work
-from .._checks import count, flag, instance_of, interval
+from .._checks import flag, instance_of, interval
 from .._interrupted import Interrupted
 from .._lazy import xr
 from .._words import so_many
@@ -20,7 +20,7 @@ from ._fixed_step_method import steps_of
 from ._problem import check_parameter
 from ._shooting import Shooting
 from ._sliding import ADDING_SLIDING, GRAZING_SLIDING
-from ._solution import orbit_of
+from ._solution import orbit_at
 from ._solve import tangent_at
 from ._special_condition import Special, symmetry_condition
 from ._symmetry import may_be_symmetric
@@ -88,8 +88,7 @@ class Boundary(InWords):
 
     def orbit(self, index: int) -> Orbit:
         """The motion at one point; a negative `index` counts from the end."""
-        many = len(self.steps)
-        return orbit_of(self.problem, self.steps[count("index", index, least=-many, most=many - 1)])
+        return orbit_at(self.problem, self.steps, index)
 
     def to_xarray(self, *, along: str | None = None) -> "xr.Dataset":
         """The curve as an `xarray.Dataset` over its points, the two parameters by their names, and

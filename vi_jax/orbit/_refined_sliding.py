@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from ._fewer_events import without_events
 from ._shooting import Shooting
 from ._sliding import Change, holding_force
-from ._solve import advance, observe, state_at
+from ._solve import NoValueError, advance, observe, state_at
 from .curve import Step
 
 # Events that are closer than this where they vanish are located well enough: a choice.
@@ -41,7 +41,7 @@ def refined(problem: Shooting, at: Step, change: Change) -> Step:
         start = np.append((found[-1].x if found else x)[:-1], parameter)
         step = advance(new, start, fixed, sizes, 0.0)
         if not bool(step.good):
-            raise FloatingPointError  # else the secant goes on with NaN, fifty times
+            raise NoValueError  # else the secant goes on with NaN, fifty times
         found.append(step)
         if alike:
             return float(step.seen.nearest.room)
@@ -57,7 +57,7 @@ def refined(problem: Shooting, at: Step, change: Change) -> Step:
         )
         if not info.converged or np.isnan(test(float(root))):
             return at
-    except FloatingPointError:
+    except NoValueError:
         return at
     return _with_part(problem, at, new, found[-1], first, alike)
 

@@ -1,10 +1,13 @@
 """A solution of an orbit's equations as data."""
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .._checks import count
 from .._programs import compiled
 from .._types import Scalar, State
 from ._observed import Observed
@@ -55,6 +58,12 @@ def _impacts_of(
     impacts = np.asarray(problem.impacts, int)
     stops = np.asarray([problem.events[i].number for i in impacts], np.int32)
     return np.mod(clock[impacts], period), np.asarray(seen.approach)[impacts], stops, len(impacts)
+
+
+def orbit_at(problem: Shooting, steps: Sequence[Step], index: int) -> Orbit:
+    """The solution at one of the steps; a negative `index` counts from the end."""
+    many = len(steps)
+    return orbit_of(problem, steps[count("index", index, least=-many, most=many - 1)])
 
 
 def orbit_of(problem: Shooting, step: Step) -> Orbit:

@@ -29,7 +29,7 @@ _TRIALS = 5
 Unknowns = np.ndarray | Array
 
 
-class _NoValueError(ArithmeticError):
+class NoValueError(ArithmeticError):
     """A test has no value, because the corrector has no answer there."""
 
 
@@ -155,7 +155,7 @@ def located(
             at[s] = reached(s)
         found = test(at[s])
         if np.isnan(found):
-            raise _NoValueError
+            raise NoValueError
         return found
 
     from scipy.optimize import brentq  # slow to load
@@ -167,7 +167,7 @@ def located(
             return None
         root = float(brentq(value, 0.0, length, full_output=True, disp=False, **options)[0])
         value(root)
-    except _NoValueError:
+    except NoValueError:
         return None
     except _CloseError:
         root = silent[-1]
@@ -176,7 +176,7 @@ def located(
     for short in _SHORT_OF:
         if any(bool(at[s].good) for s in at if abs(s - root) <= short * abs(length)):
             break
-        with contextlib.suppress(_NoValueError, _CloseError):
+        with contextlib.suppress(NoValueError, _CloseError):
             value(root - short * length)
     begin, good = test(here), [(s, step) for s, step in at.items() if bool(step.good)]
 

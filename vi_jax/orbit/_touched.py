@@ -29,8 +29,8 @@ def touched_beside(problem: Shooting, at: Step, scale: np.ndarray) -> Step | Non
     for far in _BESIDE:
         for sense in (far, -far):
             near = advance(problem, at.x, along, scale, sense)
-            beyond = advance(problem, near.x, along, scale, sense)
-            if not (bool(near.good) and bool(beyond.good)):
+            beyond = advance(problem, near.x, along, scale, sense) if bool(near.good) else near
+            if not bool(beyond.good):
                 continue
             room, rise = _room(near), (_room(beyond) - _room(near)) / sense
             # They touch the stop where their room ends: beside the place, no further off.

@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from .._checks import count, given_number, one_of
+from .._checks import given_number, one_of
 from .._lazy import xr
 from .._words import so_many
 from ..flow import tidy
 from ..machine import in_unit, with_units
 from ._conditions import held_in_words
 from ._shooting import Shooting
-from ._solution import orbit_of
+from ._solution import orbit_at, orbit_of
 from ._solve import between
 from ._tables import COLUMNS, on_sections, special_table, stability_in_words, table_of
 from ._tables import column_names as column_names
@@ -160,8 +160,7 @@ class Branch(InWords):
 
     def orbit(self, index: int) -> Orbit:
         """The motion at one point; a negative `index` counts from the end."""
-        many = len(self.steps)
-        return orbit_of(self.problem, self.steps[count("index", index, least=-many, most=many - 1)])
+        return orbit_at(self.problem, self.steps, index)
 
     def at(self, value: float) -> list[Orbit]:
         """The branch's motions at a value of the parameter, solved for; in the branch's order."""

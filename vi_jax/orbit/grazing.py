@@ -125,9 +125,12 @@ class Grazing(Summarized):
     @property
     def afar(self) -> str:
         """What the machine settles on where nothing near attracts, `far` in words; "" if `None`."""
-        period, impacts = self.far or (0, 0)
-        motion = f"a motion of {so_many(period, 'cycle')} with {so_many(impacts, 'impact')}"
-        return motion if period else "no short period" * (self.far is not None)
+        if self.far is None:
+            return ""
+        period, impacts = self.far
+        if not period:
+            return "no short period"
+        return f"a motion of {so_many(period, 'cycle')} with {so_many(impacts, 'impact')}"
 
     def _windows_in_words(self) -> list[str]:
         if self.windows is None:
