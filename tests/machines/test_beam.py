@@ -110,7 +110,8 @@ def test_a_bar_against_a_wall_approaches_wave_theory():
         assert bool(run.successful)
         log = run.event_log
         kinds = [vi.EVENTS[int(kind)] for kind in log.kind[0] if kind >= 0]
-        touch, leave = (float(log.phase[0, kinds.index(kind)]) for kind in ("rest", "release"))
+        # It may hop once, for 1e-7, by the rounding of its speed after the impact.
+        touch, leave = (float(log.phase[0, i]) for i in (0, kinds.index("release")))
         v, x = np.asarray(run.last.velocity), np.asarray(run.last.displacement)
         np.testing.assert_allclose(touch, 0.1, rtol=0, atol=1e-12)
         # The element at the wall loses its motion, and nothing else is lost.
