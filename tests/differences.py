@@ -15,11 +15,7 @@ def quick(cases, *names):
     return [x if x in names else pytest.param(x, marks=pytest.mark.slow) for x in cases]
 
 
-each_mode = pytest.mark.parametrize("mode", ["forward", "reverse"])
-
-
 def check_derivatives(
-    mode: str,
     last: Callable[..., Any],
     at: Any,
     *,
@@ -27,7 +23,7 @@ def check_derivatives(
     tolerance: float = 1e-6,
     impacts: int,
 ) -> None:
-    """Forward derivatives beside central differences, or reverse ones beside forward ones.
+    """Forward derivatives beside central differences, and reverse ones beside forward ones.
 
     `last(x)` simulates by a vector of numbers, and gives the state at the end and the
     impacts, which no step may change, and of which there are to be at least so many.
@@ -37,21 +33,17 @@ def check_derivatives(
 
     def numbers(x: Any) -> tuple[Any, Any]:
         state, counts = last(x)
-        return jnp.stack(jax.tree.leaves(state)), counts
+        found = jnp.stack(jax.tree.leaves(state))
+        return found, (found, counts)
 
-    forward = np.asarray(vi.jit(jax.jacfwd(lambda x: numbers(x)[0]))(at))
-    if mode == "forward":
-        moved, counts = vi.jit(jax.vmap(numbers))(jnp.concatenate([at + steps, at - steps]))
-        assert (counts == counts[0]).all() and int(counts[0].sum()) >= impacts
-        ahead, behind = np.split(np.asarray(moved), 2)
-        slope = (ahead - behind).T / (2 * np.diag(steps))
-        np.testing.assert_allclose(forward, slope, rtol=tolerance, atol=tolerance)
-        return
+    # One program gives the derivatives here and the motions on both sides.
+    places = jnp.concatenate([at[None], at + steps, at - steps])
+    slopes, (moved, counts) = vi.jit(jax.vmap(jax.jacfwd(numbers, has_aux=True)))(places)
+    assert (counts == counts[0]).all() and int(counts[0].sum()) >= impacts
+    forward, (ahead, behind) = np.asarray(slopes[0]), np.split(np.asarray(moved[1:]), 2)
+    slope = (ahead - behind).T / (2 * np.diag(steps))
+    np.testing.assert_allclose(forward, slope, rtol=tolerance, atol=tolerance)
     # Another weight for each component, so that none can be left out.
     weights = jnp.arange(1.0, forward.shape[0] + 1)
-
-    def weighted(x: Any) -> Any:
-        return weights @ numbers(x)[0]
-
-    backward = vi.jit(jax.grad(weighted))(at)
+    backward = vi.jit(jax.grad(lambda x: weights @ numbers(x)[0]))(at)
     np.testing.assert_allclose(backward, weights @ forward, rtol=1e-12, atol=1e-12)

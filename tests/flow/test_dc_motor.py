@@ -11,7 +11,7 @@ import vi_jax as vi
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from differences import check_derivatives, each_mode
+from differences import check_derivatives
 
 NUMBERS = {
     "strength": 0.65, "control": 0.9, "coupling": 0.0093, "slider_inertia": 0.0053,
@@ -229,8 +229,7 @@ def test_energy_is_accounted_for(clock):
 
 
 @pytest.mark.slow
-@each_mode
-def test_derivatives_beside_differences(mode):
+def test_derivatives_beside_differences():
     """By an electrical, a mechanical and a starting number at once."""
 
     def last(values):
@@ -241,7 +240,7 @@ def test_derivatives_beside_differences(mode):
         )  # fmt: skip
         return run.last, run.impacts
 
-    check_derivatives(mode, last, [0.4, 0.9, 0.1], tolerance=1e-7, impacts=2)
+    check_derivatives(last, [0.4, 0.9, 0.1], tolerance=1e-7, impacts=2)
 
 
 def test_a_stall_points_to_the_time_clock():

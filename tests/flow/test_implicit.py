@@ -10,7 +10,7 @@ import pytest
 import vi_jax as vi
 from vi_jax.flow.methods._implicit import inverse_of
 
-from differences import check_derivatives, each_mode
+from differences import check_derivatives
 from truth import integrated
 
 IMPLICIT = vi.Adaptive(diffrax.Kvaerno5(), rtol=1e-9)
@@ -71,8 +71,7 @@ def test_both_clocks_agree():
 
 
 @pytest.mark.slow
-@each_mode
-def test_derivatives(mode):
+def test_derivatives():
     method = vi.Adaptive(diffrax.Kvaerno5(), rtol=1e-11)
 
     def last(x):
@@ -81,7 +80,7 @@ def test_derivatives(mode):
         return run.last, run.impacts
 
     check_derivatives(
-        mode, last, [0.9, 1.25, 0.3], tolerance=2e-6, impacts=3,
+        last, [0.9, 1.25, 0.3], tolerance=2e-6, impacts=3,
     )  # fmt: skip
 
 

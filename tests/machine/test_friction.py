@@ -9,7 +9,7 @@ import vi_jax as vi
 from scipy.integrate import solve_ivp
 
 from den_hartog import den_hartog
-from differences import check_derivatives, each_mode
+from differences import check_derivatives
 
 CLOSE = vi.Adaptive(rtol=1e-12)
 
@@ -220,8 +220,7 @@ def test_a_body_on_a_belt(method):
 
 
 @pytest.mark.slow
-@each_mode
-def test_derivatives_through_sticking(mode):
+def test_derivatives_through_sticking():
     numbers, starts = drawn(40)
 
     def last(x):
@@ -229,7 +228,7 @@ def test_derivatives_through_sticking(mode):
         return run.last, run.impacts
 
     at = [*numbers[:, 0], starts[0]]
-    check_derivatives(mode, last, at, step=1e-6, impacts=0)
+    check_derivatives(last, at, step=1e-6, impacts=0)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import pytest
 import vi_jax as vi
 from scipy.integrate import solve_ivp
 
-from differences import check_derivatives, each_mode
+from differences import check_derivatives
 from thrown import thrown
 
 
@@ -240,14 +240,13 @@ def test_a_stiff_stop_is_a_rigid_one():
         np.testing.assert_allclose([alone.Y, alone.V], [found.Y[i], found.V[i]], atol=1e-9)
 
 
-@each_mode
 @pytest.mark.parametrize(
     ("options", "method"),
     [({}, vi.FixedStep(steps_per_cycle=48)),
      ({"exponent": 1.5, "adhesive": False}, vi.Adaptive(rtol=1e-12))],
     ids=["spring", "Hertz"],
 )  # fmt: skip
-def test_derivatives_through_a_contact(options, method, mode):
+def test_derivatives_through_a_contact(options, method):
     def last(x, **more):
         gap, stiffness, restitution, speed = x
         options_ = {**options, "restitution": restitution}
@@ -256,7 +255,7 @@ def test_derivatives_through_a_contact(options, method, mode):
         return run.last, run.impacts
 
     step = [1e-6, 6e-5, 1e-6, 1e-6]
-    check_derivatives(mode, last, [0.7, 60.0, 0.5, 0.3], step=step, impacts=0)
+    check_derivatives(last, [0.7, 60.0, 0.5, 0.3], step=step, impacts=0)
 
 
 @pytest.mark.parametrize(

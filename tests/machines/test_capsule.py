@@ -9,7 +9,7 @@ import pytest
 import vi_jax as vi
 from scipy.integrate import solve_ivp
 
-from differences import check_derivatives, each_mode
+from differences import check_derivatives
 
 CAPSULE = vi.machines.Capsule
 CLOSE = vi.Adaptive(rtol=1e-12)
@@ -194,8 +194,7 @@ def test_how_far_it_goes():
 
 
 @pytest.mark.slow
-@each_mode
-def test_derivatives_of_a_capsule(mode):
+def test_derivatives_of_a_capsule():
     """Through impacts, sticking, and the section at which `progress` is counted anew."""
     numbers, starts = drawn(100)
     numbers, start = jnp.asarray(numbers[:, 3]), jnp.asarray(starts[:, 3])
@@ -206,7 +205,7 @@ def test_derivatives_of_a_capsule(mode):
         run = lane(numbers + h[0] * along, start, 1, method=method)
         return run.last, run.impacts
 
-    check_derivatives(mode, last, [0.0], step=1e-6, tolerance=2e-6, impacts=0)
+    check_derivatives(last, [0.0], step=1e-6, tolerance=2e-6, impacts=0)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ import pytest
 import vi_jax as vi
 from scipy.integrate import solve_ivp
 
-from differences import check_derivatives, each_mode, quick
+from differences import check_derivatives, quick
 from two_bodies import Pair, TwoBodies
 
 matplotlib.use("Agg")
@@ -113,8 +113,7 @@ def test_two_bodies_with_three_contacts():
 
 
 @pytest.mark.slow
-@each_mode
-def test_derivatives_of_two_bodies(mode):
+def test_derivatives_of_two_bodies():
     """By all their numbers and their start, through impacts of all three kinds."""
     numbers, starts = drawn(100)
     log = vi.jit(jax.vmap(lambda p, x: lane(p, x, 2, impact_log=16).impact_log.stop, in_axes=1))(
@@ -128,7 +127,7 @@ def test_derivatives_of_two_bodies(mode):
         return run.last, run.impacts
 
     at = [*numbers[:, i], *starts[:, i]]
-    check_derivatives(mode, last, at, step=1e-6, tolerance=2e-6, impacts=3)
+    check_derivatives(last, at, step=1e-6, tolerance=2e-6, impacts=3)
 
 
 @pytest.mark.slow

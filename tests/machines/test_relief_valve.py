@@ -9,7 +9,7 @@ import vi_jax as vi
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from differences import check_derivatives, each_mode
+from differences import check_derivatives
 
 VALVE = vi.machines.ReliefValve
 CLOSE = vi.Adaptive(rtol=1e-12)
@@ -143,8 +143,7 @@ def test_a_valve_observed_at_equal_times():
         vi.machines.Duffing().observed_every(1.0)
 
 
-@each_mode
-def test_derivatives_of_returns(mode):
+def test_derivatives_of_returns():
     """Of state, count of returns being fixed: dt*/dq is in them."""
 
     def last(q):
@@ -152,7 +151,7 @@ def test_derivatives_of_returns(mode):
         run = vi.simulate(valve, valve.start(), 2, method=vi.FixedStep())
         return (run.last.lift, run.last.pressure, run.duration.sum()), run.impacts
 
-    check_derivatives(mode, last, [4.0], step=1e-6, impacts=0)
+    check_derivatives(last, [4.0], step=1e-6, impacts=0)
 
 
 def test_wrong_numbers_are_named():

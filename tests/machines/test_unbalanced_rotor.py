@@ -8,7 +8,7 @@ import pytest
 import vi_jax as vi
 from scipy.integrate import solve_ivp
 
-from differences import check_derivatives, each_mode
+from differences import check_derivatives
 
 ROTOR = vi.machines.UnbalancedRotor
 METHOD = vi.Adaptive(rtol=1e-12)
@@ -176,8 +176,7 @@ def test_an_elastic_impact_keeps_all():
 
 
 @pytest.mark.slow
-@each_mode
-def test_derivatives_beside_differences(mode):
+def test_derivatives_beside_differences():
     def last(values):
         rotor = ROTOR(coupling=values[0], control=values[1], gap=1.4, damping_ratio=values[2])
         run = vi.simulate(
@@ -186,7 +185,7 @@ def test_derivatives_beside_differences(mode):
         )  # fmt: skip
         return run.last, run.impacts
 
-    check_derivatives(mode, last, [0.1, 1.1, 0.05], tolerance=1e-7, impacts=1)
+    check_derivatives(last, [0.1, 1.1, 0.05], tolerance=1e-7, impacts=1)
 
 
 def test_a_start_from_rest_and_a_stall():
