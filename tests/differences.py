@@ -10,9 +10,19 @@ import pytest
 import vi_jax as vi
 
 
-def quick(cases, *names):
-    """Of these cases only the named ones run by default; the rest with the longer studies."""
-    return [x if x in names else pytest.param(x, marks=pytest.mark.slow) for x in cases]
+def quick(cases, *names, slow=None):
+    """Of these cases only the named ones run by default; the rest with the longer studies, or only
+    those of `slow` with these and all others before a release."""
+
+    def marks(x):
+        return pytest.mark.slow if slow is None or x in slow else pytest.mark.exhaustive
+
+    return [x if x in names else pytest.param(x, marks=marks(x)) for x in cases]
+
+
+def some(cases, *names):
+    """Of these cases the named ones run with the longer studies; the rest before a release."""
+    return quick(cases, slow=names)
 
 
 def check_derivatives(

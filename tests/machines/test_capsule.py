@@ -9,8 +9,6 @@ import pytest
 import vi_jax as vi
 from scipy.integrate import solve_ivp
 
-from differences import check_derivatives
-
 CAPSULE = vi.machines.Capsule
 CLOSE = vi.Adaptive(rtol=1e-12)
 NAMES = ("amplitude", "frequency", "damping_ratio", "mass_ratio", "gap", "restitution", "friction",
@@ -191,21 +189,6 @@ def test_how_far_it_goes():
     np.testing.assert_array_equal(run.sections.travel, 0.0)
     assert float(run.sections.progress[-1]) == pytest.approx(0.58211294, abs=1e-7)
     np.testing.assert_allclose(np.diff(run.sections.progress[-10:]), 0, atol=1e-9)
-
-
-@pytest.mark.slow
-def test_derivatives_of_a_capsule():
-    """Through impacts, sticking, and the section at which `progress` is counted anew."""
-    numbers, starts = drawn(100)
-    numbers, start = jnp.asarray(numbers[:, 3]), jnp.asarray(starts[:, 3])
-    along = jnp.asarray(np.random.default_rng(4).normal(size=8))
-
-    def last(h):
-        method = vi.FixedStep(steps_per_cycle=32)
-        run = lane(numbers + h[0] * along, start, 1, method=method)
-        return run.last, run.impacts
-
-    check_derivatives(last, [0.0], step=1e-6, tolerance=2e-6, impacts=0)
 
 
 @pytest.mark.parametrize(

@@ -1,14 +1,11 @@
 """Ready machines: closed forms of their motions, and an independent integration."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
 from scipy.integrate import solve_ivp
-
-from differences import check_derivatives
 
 PI = np.pi
 BALL, PAIR, DUFFING = vi.machines.BouncingBall, vi.machines.ImpactPair, vi.machines.Duffing
@@ -267,22 +264,6 @@ def test_energy_books_of_a_driven_box():
     kept = energy(run.last) - energy(start)
     assert work - kept == pytest.approx(float(run.impact_energy.sum()), abs=1e-3)
     assert float(run.impact_energy.sum()) > 0.1
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", MACHINES)
-def test_derivatives_of_a_machine(name):
-    machine = MACHINES[name]
-    parameter = {"ball": "acceleration", "pair": "half_gap", "free pair": "mass_ratio"}.get(
-        name, "cubic"
-    )
-
-    def last(value):
-        changed = eqx.tree_at(lambda m: getattr(m, parameter), machine, value[0])
-        run = vi.simulate(changed, starts_of(machine)[0], 1, method="reference")
-        return run.last, run.impacts
-
-    check_derivatives(last, [float(getattr(machine, parameter))], impacts=0)
 
 
 @pytest.mark.parametrize(

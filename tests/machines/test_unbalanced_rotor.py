@@ -8,8 +8,6 @@ import pytest
 import vi_jax as vi
 from scipy.integrate import solve_ivp
 
-from differences import check_derivatives
-
 ROTOR = vi.machines.UnbalancedRotor
 METHOD = vi.Adaptive(rtol=1e-12)
 
@@ -173,19 +171,6 @@ def test_an_elastic_impact_keeps_all():
     energy = state.V**2 / 2 + state.Y**2 / 2 + state.P**2 / 0.4
     assert int(run.impacts.sum()) > 10
     np.testing.assert_allclose(energy, energy[0], rtol=1e-10)
-
-
-@pytest.mark.slow
-def test_derivatives_beside_differences():
-    def last(values):
-        rotor = ROTOR(coupling=values[0], control=values[1], gap=1.4, damping_ratio=values[2])
-        run = vi.simulate(
-            rotor, rotor.start(Y=0.5, V=1.0), 2, method=vi.FixedStep(steps_per_cycle=24),
-            record="sections", rests=False,
-        )  # fmt: skip
-        return run.last, run.impacts
-
-    check_derivatives(last, [0.1, 1.1, 0.05], tolerance=1e-7, impacts=1)
 
 
 def test_a_start_from_rest_and_a_stall():
