@@ -73,7 +73,7 @@ def test_what_is_no_beam(argument, value, error):
 def test_a_periodic_motion_of_many_modes():
     """Newton's method on the cycle map, whose Jacobian is that of differences."""
     beam = vi.machines.Beam(
-        modes=20, gap=0.3, restitution=0.6, damping_ratio=0.03, frequency=3.4, amplitude=0.02
+        modes=8, gap=0.3, restitution=0.6, damping_ratio=0.03, frequency=3.4, amplitude=0.02
     )
     with vi.backend("xla"):
         run = vi.simulate(beam, beam.start(), 1, settle=100, max_impacts=10_000)
@@ -84,9 +84,9 @@ def test_a_periodic_motion_of_many_modes():
                 ravel_pytree(the_map.residual(unravel(x)))[0],
                 the_map.jacobian(unravel(x)),
             )
-            x = x - jnp.linalg.solve(slope - jnp.eye(40), missing)
+            x = x - jnp.linalg.solve(slope - jnp.eye(16), missing)
         assert int(run.impacts[0]) > 0 and np.abs(missing).max() < 1e-10
-        for i in (0, 1, 20, 25):
+        for i in (0, 1, 8, 13):
             ends = [ravel_pytree(the_map(unravel(x.at[i].add(h))))[0] for h in (1e-7, -1e-7)]
             np.testing.assert_allclose((ends[0] - ends[1]) / 2e-7, slope[:, i], atol=1e-5)
 

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 import vi_jax as vi
 
+from differences import some
+
 LANES, CYCLES = 10_000, 12
 M = vi.machines
 
@@ -81,8 +83,7 @@ def test_a_crowd(name):
     assert (np.asarray(run.result._value)[~good] > 0).all()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", some(KINDS, "free pair", "capsule"))
 def test_derivatives_of_a_crowd(name):
     """By every number and every part of the start: forward beside central differences where two
     steps of these agree with each other, and reverse beside forward."""
