@@ -9,8 +9,16 @@ import pytest
 from examples.__main__ import EXAMPLES, FIGURES, HERE, cells, notebook, printed_in
 from PIL import Image
 
-# The quickest of them; the others run with the slow tests.
-QUICK = {"paper_discrepancy", "own_machine"}
+# The quickest of them run by default, and these with the slow tests; the others, whose calls are
+# checked with all code, before a release.
+QUICK, SLOW = (
+    {"paper_discrepancy", "own_machine"},
+    {"find_orbit", "grazing", "simulate", "regime_map"},
+)
+
+
+def marks(name):
+    return () if name in QUICK else pytest.mark.slow if name in SLOW else pytest.mark.exhaustive
 
 
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
@@ -38,10 +46,7 @@ def test_the_gallery_shows_it(example):
 
 @pytest.mark.parametrize(
     "example",
-    [
-        pytest.param(path, id=path.stem, marks=[] if path.stem in QUICK else pytest.mark.slow)
-        for path in EXAMPLES
-    ],
+    [pytest.param(path, id=path.stem, marks=marks(path.stem)) for path in EXAMPLES],
 )
 def test_runs(example, tmp_path):
     environment = {**os.environ, "PYTHONPATH": str(HERE.parents[1])}

@@ -14,6 +14,9 @@ STUDIES = sorted([*FOLDER.glob("studies/*.py"), *FOLDER.glob("benchmarks/*.py")]
 WITHOUT_FIGURE = {"extremes"}
 # `peers` and `chains` need the extra `bench`; the rows of `extremes` are tests of their own.
 RUN_ELSEWHERE = {"peers", "chains", "extremes"}
+# These run with the slow tests; the others before a release. Calls are checked with all code, and
+# headline numbers are tests of their own (`test_headlines.py`).
+SLOW = {"fig2_frequency_response", "boundaries", "regime_maps", "soft_stop", "speed_accuracy"}
 
 
 @pytest.mark.parametrize("study", STUDIES, ids=lambda path: path.stem)
@@ -27,10 +30,17 @@ def test_table_and_figure_are_kept(study):
     assert Image.open(path).size[0] >= 800
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    "study", [p for p in STUDIES if p.stem not in RUN_ELSEWHERE], ids=lambda path: path.stem
-)
+    "study",
+    [
+        pytest.param(
+            path, id=path.stem,
+            marks=pytest.mark.slow if path.stem in SLOW else pytest.mark.exhaustive,
+        )
+        for path in STUDIES
+        if path.stem not in RUN_ELSEWHERE
+    ],
+)  # fmt: skip
 def test_runs(study, tmp_path):
     environment = {**os.environ, "PYTHONPATH": str(FOLDER.parent)}
     done = subprocess.run(
