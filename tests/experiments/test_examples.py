@@ -9,12 +9,10 @@ import pytest
 from examples.__main__ import EXAMPLES, FIGURES, HERE, cells, notebook, printed_in
 from PIL import Image
 
-# The quickest of them run by default, and these with the slow tests; the others, whose calls are
-# checked with all code, before a release.
-QUICK, SLOW = (
-    {"paper_discrepancy", "own_machine"},
-    {"find_orbit", "grazing", "simulate", "regime_map"},
-)
+# The quickest of them run by default, and some with the slow tests; the others, whose calls pyright
+# has checked, before a release.
+QUICK = {"paper_discrepancy", "own_machine"}
+SLOW = {"find_orbit", "grazing", "simulate", "regime_map"}
 
 
 def marks(name):

@@ -11,14 +11,14 @@ from studies.parts.grazing_verdict import LANES, Lanes, judged, name_of, verdict
 
 @pytest.mark.slow
 def test_forecasts_beside_simulation():
-    for n, (drawn, point) in enumerate(machines(KINDS["scene"][0], 3, 7)):
+    for n, (drawn, point) in enumerate(machines(KINDS["scene"][0], 2, 7)):
         found = vi.grazing(point, progress=False)
         *_, lanes, named = judged(point, drawn.parameter, found, n)
         assert lanes.side == found.side
         assert name_of(found) == named
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_windows_beside_simulation():
     """Of a prestressed stop. The motion of three cycles is there 8e-7 before the grazing already,
     9e-4 away: a jump in the limit, which lanes farther off read as the first window of period

@@ -14,8 +14,8 @@ STUDIES = sorted([*FOLDER.glob("studies/*.py"), *FOLDER.glob("benchmarks/*.py")]
 WITHOUT_FIGURE = {"extremes"}
 # `peers` and `chains` need the extra `bench`; the rows of `extremes` are tests of their own.
 RUN_ELSEWHERE = {"peers", "chains", "extremes"}
-# These run with the slow tests; the others before a release. Calls are checked with all code, and
-# headline numbers are tests of their own (`test_headlines.py`).
+# These run with the slow tests; the others, whose calls pyright has checked, before
+# a release. Headline numbers are tests of their own (`test_headlines.py`).
 SLOW = {"fig2_frequency_response", "boundaries", "regime_maps", "soft_stop", "speed_accuracy"}
 
 
