@@ -17,7 +17,10 @@ def quick(cases, *names, slow=None):
     def marks(x):
         return pytest.mark.slow if slow is None or x in slow else pytest.mark.exhaustive
 
-    return [x if x in names else pytest.param(x, marks=marks(x)) for x in cases]
+    def case(x):
+        return pytest.param(*(x if isinstance(x, tuple) else (x,)), marks=marks(x))
+
+    return [x if x in names else case(x) for x in cases]
 
 
 def some(cases, *names):

@@ -13,6 +13,7 @@ from scipy.optimize import brentq
 from vi_jax.orbit._forecast import settled
 from vi_jax.orbit._local_map import graze_at
 
+from differences import some
 from grazings import grazing_of
 
 K = 0.8
@@ -108,7 +109,7 @@ def _near_top(swing, frequency, n, t, end):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("beyond", "period"), [(8.4e-5, 5), (1.5e-5, 6), (4.0e-6, 7), (3.5e-5, 0)])
+@pytest.mark.parametrize(("beyond", "period"), [(8.4e-5, 5), (1.5e-5, 6), (3.5e-5, 0)])
 def test_periods_after_a_grazing(half, beyond, period):
     """Windows of motions with one impact, chaos between: by the forecast and by the oscillator."""
     point, found, frequency, amplitude = half
@@ -185,7 +186,7 @@ def test_discontinuity_mapping_beside_flights():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("restitution", [0.5, 0.8])
+@pytest.mark.parametrize("restitution", some([0.5, 0.8], 0.5))
 @pytest.mark.parametrize(("damping", "zeta"), [(0.0, 0.70711), (0.04483682577, 0.70998)])
 def test_grazing_of_the_paper(restitution, damping, zeta):
     """Where the 2π motion of the paper is lost (its BB'): e₁ > 0 > e₂, so that an impact brings

@@ -8,6 +8,8 @@ import pytest
 import vi_jax as vi
 from scipy.integrate import solve_ivp
 
+from differences import some
+
 M = vi.machines
 
 
@@ -87,12 +89,12 @@ def test_a_curve_of_lost_symmetry_of_a_scene(whole):
 
 
 # Steps at which branches were cut, or special points missed or told twice.
-STEPS = [0.02, 0.05, 0.1, 0.2, 0.4]
+STEPS = [(0.02, 0.01), (0.1, 0.005), (0.4, 0.03)]
+OTHERS = [(0.02, 0.005), (0.02, 0.03), (0.1, 0.01), (0.1, 0.03), (0.4, 0.005), (0.4, 0.01),
+          *((step, away) for step in (0.05, 0.2) for away in (0.005, 0.01, 0.03))]  # fmt: skip
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("distance", [0.005, 0.01, 0.03])
-@pytest.mark.parametrize("max_step", STEPS)
+@pytest.mark.parametrize(("max_step", "distance"), some(STEPS + OTHERS, *STEPS))
 def test_a_broken_branch_ends_nowhere_else(max_step, distance):
     pair = M.ImpactPair(half_gap=1.35, restitution=0.5)
     branch = vi.continue_orbit(settled(pair), parameter="half_gap", bounds=(1.25, 1.5))
@@ -120,8 +122,7 @@ def snapped():
     return vi.find_orbit(SNAP, SNAP.start(Y=-0.305011053, V=0.0199429225), throw=True)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("max_step", [0.02, 0.05, 0.08, 0.1, 0.15])
+@pytest.mark.parametrize("max_step", some([0.02, 0.05, 0.08, 0.1, 0.15], 0.05, 0.15))
 def test_a_motion_without_impacts_loses_its_symmetry(max_step):
     """Near where branches cross the equations may have no answer, or that of the other branch."""
     branch = vi.continue_orbit(
