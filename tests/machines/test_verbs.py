@@ -72,7 +72,7 @@ CASES = {
 }  # fmt: skip
 
 
-@pytest.fixture(scope="module", params=quick(CASES, "pair", slow=("capsule", "two bodies")))
+@pytest.fixture(scope="module", params=quick(CASES, "pair", slow=("capsule",)))
 def case(request):
     return CASES[request.param]
 

@@ -11,6 +11,7 @@ import pytest
 import vi_jax as vi
 
 import pecking
+from differences import some
 
 matplotlib.use("Agg")
 WOODPECKER = vi.machines.Woodpecker
@@ -175,7 +176,7 @@ def test_its_words():
     assert by_time.section(state) is None and by_time.renewed(state) is state
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_its_orbit_by_newton():
     """With the multipliers of all seven numbers."""
     toy = WOODPECKER(friction=0.3)
@@ -187,7 +188,7 @@ def test_its_orbit_by_newton():
     np.testing.assert_allclose(np.sort(np.real(orbit.multipliers)), np.sort(wanted), atol=1e-7)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_derivative_of_a_cycle():
     def duration(mu):
         found = one(mu, SPEED, BIRD_RATE, event_log=0)
@@ -199,7 +200,7 @@ def test_derivative_of_a_cycle():
         assert float(slope) == pytest.approx(float(ends[0] - ends[1]) / 2e-5, rel=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_lanes_are_what_each_is_by_itself():
     frictions = jnp.linspace(0.29, 0.33, 5)
     together = vi.jit(jax.vmap(lambda mu: one(mu, SPEED, BIRD_RATE, 3)))(frictions)
@@ -217,8 +218,7 @@ METHODS = {
 }  # fmt: skip
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", some(METHODS, "standard"))
 def test_methods_agree(name):
     method, tolerance = METHODS[name]
     found = one(0.3, SPEED, BIRD_RATE, 3, method=method, event_log=64)
@@ -228,7 +228,7 @@ def test_methods_agree(name):
     np.testing.assert_array_equal(found.impacts, 5)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_observed_at_equal_times():
     """It comes down as far, and its samples can be drawn."""
     toy = WOODPECKER()
