@@ -151,6 +151,7 @@ CALLS = {
     "a table of guesses": (orbit(vi.OscillatorState(np.zeros((2, 3)), np.zeros((2, 3)))),
                            "`guess` must be one state, or several along one axis"),
     "section='pi'": (orbit(section="pi"), f"`section` {REAL}"),
+    "plot_sketch(ax)": (lambda: vi.plot_sketch(SCENE, ax=np.empty(2)), "`ax` must be one `Axes`"),
     "plot_history('x')": (lambda: vi.plot_history("x"), "`motion` must be a `Run`"),
     "plot_multipliers(5)": (lambda: vi.plot_multipliers(5), "`orbits` must be a tuple of `Orbit`"),
     "step='a'": (lambda: vi.continue_orbit("x", parameter=ZETA, bounds=(0, 1), step="a"),

@@ -6,6 +6,7 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, MultipleLocator
 
+from .._checks import instance_of
 from .._renamed import renamed
 from ..flow import Run, Samples
 from ..machine import PLAIN, AbstractMachine, SoftStop, in_brackets, name_in, unit_of
@@ -17,6 +18,7 @@ from .style import is_set, thick
 def new_axes(ax: Axes | None) -> Axes:
     """`ax`, or the axes of a new figure, of the size that was set for figures if one was."""
     if ax is not None:
+        instance_of("ax", ax, Axes, "one `Axes` of matplotlib")
         return ax
     import matplotlib.pyplot as plt  # only here, so that drawing into given axes has no state
 
