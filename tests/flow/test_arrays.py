@@ -122,6 +122,7 @@ def test_lanes_beside_each_other(plain):
     }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_the_cycle_map_and_its_exponents(plain):
     machine = Chain(rows)
     the_map = vi.cycle_map(machine)
@@ -142,6 +143,7 @@ def test_the_cycle_map_and_its_exponents(plain):
 MACHINE = Chain(rows)
 
 
+@pytest.mark.slow
 def test_a_branch_is_that_of_numbers():
     found = []
     for made in (rows, Numbers):

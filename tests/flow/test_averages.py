@@ -131,6 +131,7 @@ def test_derivatives_through_impacts():
     np.testing.assert_allclose(back, slopes[-1], rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_lanes_are_alike_on_both_roads_and_alone():
     def lane(ratio):
         scene = flown(ratio)
