@@ -162,7 +162,7 @@ def test_a_branch_is_that_of_numbers():
     np.testing.assert_allclose(many.state.q, [one.state.q, one.state.q], rtol=0, atol=1e-10)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_sweeps_scans_and_basins_are_those_of_numbers():
     names = {"q[0]": "x", "q[1]": "y", "v[0]": "u", "v[1]": "w"}
     swept, scanned, basins = [], [], []

@@ -60,7 +60,7 @@ def test_policies_and_second_derivatives(policy):
     np.testing.assert_allclose(jax.grad(jax.checkpoint(jax.grad(last)))(0.1), second, rtol=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_checkpoint_around_an_orbit():
     scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.0)
     guess = scene.start(Y=1.6, V=-1.9)

@@ -173,7 +173,7 @@ def test_a_stack_is_let_go_of_as_one():
             assert float(x[i]) == pytest.approx(there, abs=1e-8)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_blows_that_feel_each_other_through_others_come_together():
     """Two balls upon a pair that touches, from both sides at once: symmetric before and after."""
     machine = Chain(0.6, (1.0, 2.0, 2.0, 1.0), length=2.0)
@@ -257,7 +257,7 @@ def test_without_an_end_a_sequence_goes_to_its_limit():
     assert float(run.impact_energy[0]) == pytest.approx(0.4, abs=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_stack_that_falls_on_a_wall_stays_there():
     """Whatever height it came from, which derivatives say as well."""
     stack = Chain(0.2, (1.0,) * 3, 0.0, force=1.0, length=3.0)

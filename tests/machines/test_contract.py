@@ -112,7 +112,7 @@ def test_two_bodies_with_three_contacts():
     assert compared > 32 and (several > 40).all()
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_derivatives_of_two_bodies():
     """By all their numbers and their start, through impacts of all three kinds."""
     numbers, starts = drawn(100)
@@ -180,7 +180,7 @@ class Slowed(eqx.Module):
         return 1 / (1 + self.rate * approach)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_restitution_that_depends_on_the_speed():
     machine = dataclasses.replace(TwoBodies(), restitution=Slowed(0.4))
     run = vi.simulate(machine, machine.start(), 6, impact_log=8, method=CLOSE)

@@ -124,7 +124,7 @@ def test_a_curve_of_lost_symmetry_is_its_closed_form(symmetric, whole, restituti
     assert np.ptp(e) > 0.4 and curve.kind == "symmetry-breaking"
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_duffing_oscillator_grazes_where_the_linear_one_reaches_its_stop():
     classic = DUFFING(amplitude=0.05, two_sided=False)
     rest = vi.find_orbit(classic, classic.start(), throw=True)

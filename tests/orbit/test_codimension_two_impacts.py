@@ -284,7 +284,7 @@ def test_a_doubling_of_the_paper_becomes_degenerate():
     np.testing.assert_allclose(the(curve, "degenerate-doubling").parameters, wanted, atol=5e-7)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_both_walls_of_a_box_grazed_at_once_are_two_touches():
     """Where half the gap is the box's amplitude the ball stands between both walls; an impact
     of depth one moves it by 2π(1 + e)√2 in each period after it, which vanishes nowhere."""

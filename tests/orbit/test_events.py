@@ -152,7 +152,7 @@ def valve_return(state: np.ndarray, flow_rate: float) -> tuple[np.ndarray, float
         y[0], y[1] = 0.0, -0.8 * y[1]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_valve_from_rest_to_chatter():
     """A Hopf bifurcation, a grazing and a period doubling in a row."""
     machine = vi.machines.ReliefValve(flow_rate=8.3)

@@ -52,7 +52,7 @@ def test_a_relaxed_soft_stop_is_smooth():
     assert found.outcome == vi.SCENARIOS.persistence
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_other_soft_stops():
     """The field jumps at a prestressed one, whose force F0 turns the body back
     with a + F0; a dashpot that may not pull has an impulse of y²."""

@@ -30,7 +30,7 @@ class Law(eqx.Module):
         return jax.nn.sigmoid(self.network(v))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_gradient_by_the_weights_of_a_restitution_law():
     """State, impact speed, extreme, average and multiplier at once, beside differences."""
     network = eqx.nn.MLP("scalar", "scalar", 8, 2, jnp.tanh, key=jax.random.key(0))

@@ -77,7 +77,7 @@ def test_tables_are_checked(branch):
         branch.table(lambda at: {"parameter": 0.0})
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_derivatives_of_an_orbit(branch):
     """By the implicit function theorem; beside the branch's own slope, and for several guesses."""
 

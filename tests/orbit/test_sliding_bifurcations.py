@@ -35,7 +35,7 @@ def held_by(omega, numbers, near):
     return abs(force) - numbers["level"]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_body_that_passes_and_comes_back():
     """Where it comes to stand the force is just what friction holds, and falls: it sticks at once,
     or passes a little way first."""
@@ -58,7 +58,7 @@ def test_a_body_that_passes_and_comes_back():
     assert with_it.parameter == pytest.approx(first.parameter, abs=1e-10)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_slip_between_two_times_of_sticking():
     """The drive is strongest at phase 2π, where it just comes to what friction holds."""
     numbers = {"level": 0.5, "second": 0.0, "damping": 0.04}
@@ -93,7 +93,7 @@ def slid(omega, Y, level=0.3, damping=0.04):
     return path, lambda phase: field(phase, path(phase))[1]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_walk_up_to_singular_equations_ends_there(monkeypatch):
     """Both its ends are places at which the equations of the motion are singular, since a part of
     it has no length there: they are located all the same, without hundreds of trials."""

@@ -56,6 +56,7 @@ def test_grazing_sliding_of_a_linear_motion():
     np.testing.assert_allclose(belt, reached(omega), rtol=1e-9)
 
 
+@pytest.mark.exhaustive
 def test_adding_sliding_beside_motions_followed_from_event_to_event():
     """Where the drive is strongest it just comes to what friction holds."""
     numbers = {"level": 0.5, "second": 0.0, "damping": 0.04}

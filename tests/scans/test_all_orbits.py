@@ -141,7 +141,7 @@ def by_brute_force(cycles, grid=100):
     return np.unique(x.round(5), axis=0)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_nothing_else_is_found_by_brute_force(scene):
     found = vi.all_orbits(scene, 3, region=REGION, starts=256)
     assert sorted(found.periods) == [1, 1, 1, 3, 3]

@@ -51,7 +51,7 @@ def area_of_sliding(speed):
     return turn(low)[2]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_share_of_steady_sliding_is_the_area_of_its_basin():
     """Of starts in [-2, 2] × [0, 2]; none fails, though all that slide come to rest."""
     region = {"start.Y": (-2.0, 2.0), "start.V": (0.0, 2.0)}
