@@ -69,7 +69,7 @@ METHODS = {
 
 
 @pytest.mark.parametrize("gap", [0.5, -0.3], ids=["impacts", "chatter and rest"])
-@pytest.mark.parametrize("name", quick(METHODS, "adaptive", "series"))
+@pytest.mark.parametrize("name", quick(METHODS, "adaptive", slow=("series",)))
 def test_energy_is_balanced_by_every_method(name, gap):
     method, close = METHODS[name]
     run = vi.simulate(Shaken(gap=gap), begin(gap), 12, method=method)

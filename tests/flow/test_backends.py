@@ -41,7 +41,7 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("name", quick(CASES, "exact flight"))
+@pytest.mark.parametrize("name", quick(CASES, "exact flight", slow=("motor", "exact flight, rest")))
 def test_roads_agree(name):
     make, method, options = CASES[name]
 
@@ -98,7 +98,7 @@ def test_roads_agree_where_contacts_act_together(make):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", quick(CASES, "exact flight", "motor"))
+@pytest.mark.parametrize("name", quick(CASES, "exact flight", slow=("motor",)))
 def test_groups_of_any_width_give_the_same(name):
     """Few lanes go in narrow groups and many in wide ones: the same to the last bit."""
     make, method, options = CASES[name]

@@ -8,6 +8,8 @@ import pytest
 import vi_jax as vi
 from vi_jax.lanes import _backward
 
+from differences import quick
+
 IDEAL = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.05)
 RESTING = vi.Scene.ideal(frequency_ratio=0.3, restitution=0.3, gap=-0.5, damping_ratio=0.05)
 MOTOR = vi.Parameters(torque=10.0, control=0.9, restitution=0.5).scene()
@@ -48,8 +50,7 @@ def lost(case):
 
 
 @pytest.mark.parametrize(
-    "case",
-    [x if x == "a section of its own" else pytest.param(x, marks=pytest.mark.slow) for x in CASES],
+    "case", quick(CASES, "a section of its own", slow=("chatter and rest", "friction"))
 )
 def test_the_tape_gives_what_columns_give(case, monkeypatch):
     """Forward derivatives are the columns. The two round differently, which grows along a motion:

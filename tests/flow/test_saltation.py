@@ -170,7 +170,7 @@ RECORDED = {
 }
 
 
-@pytest.mark.parametrize("name", quick(RECORDED, "motor"))
+@pytest.mark.parametrize("name", quick(RECORDED, slow=("motor",)))
 def test_derivatives_of_all_that_is_recorded(name):
     """States on sections and between them, extremes, times, and the impacts' phases and speeds."""
     kind, clock, method = RECORDED[name]

@@ -56,7 +56,7 @@ def test_every_number_has_a_unit(case):
     assert unit_of(units, names[int(machine.velocity(probe))]) == velocity
 
 
-@pytest.mark.parametrize("name", quick(MACHINES, "capsule"))
+@pytest.mark.parametrize("name", quick(MACHINES, "capsule", slow=("rotor",)))
 def test_runs_and_rates_say_their_units(name):
     machine, _, position, _, rate = MACHINES[name]
     run = jax.eval_shape(lambda: vi.simulate(machine, machine.start(), 2, impact_log=2))

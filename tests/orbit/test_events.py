@@ -8,6 +8,8 @@ import vi_jax as vi
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
+from differences import some
+
 
 class Slider(eqx.Module):
     """A body on a rough plane."""
@@ -80,7 +82,7 @@ CASES = {
 }
 
 
-@pytest.fixture(scope="module", params=CASES)
+@pytest.fixture(scope="module", params=some(CASES, "stick-slip", "soft stop"))
 def followed(request):
     """The case and its branch."""
     machine, settle, cycles, name, bounds, value = CASES[request.param]
