@@ -20,8 +20,8 @@ MOTOR = vi.Parameters().scene(drive="motor")
 IDEAL = vi.Scene.ideal(frequency_ratio=1.4, restitution=0.8, gap=2.0, damping_ratio=0.05)
 
 
-def sweep():
-    return vi.sweep(MOTOR, "drive.control", jnp.linspace(0.5, 1.9, 20_000), settle=200)
+def sweep(values=20_000):
+    return vi.sweep(MOTOR, "drive.control", jnp.linspace(0.5, 1.9, values), settle=20)
 
 
 def basins(settle):
@@ -29,12 +29,12 @@ def basins(settle):
     return vi.basins(IDEAL, region, resolution=(128, 64), settle=settle, lanes=256, progress=False)
 
 
-def branch():
+def branch(max_points=10**6):
     scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.0)
     orbit = vi.find_orbit(scene, scene.start(Y=1.6, V=-1.9), cycles=2)
     return vi.continue_orbit(
         orbit, parameter="drive.frequency_ratio", bounds=(0.5, 1.9), max_step=1e-4,
-        max_points=10**6,
+        max_points=max_points,
     )  # fmt: skip
 
 
@@ -51,16 +51,18 @@ def share(error):
     return int(done.sum()) if done.sum() < done.size else -1
 
 
+# What is interrupted, after how long, and the same programs with less to do, which compiles them.
 VERBS = {
-    "sweep": (sweep, 4.0),
+    "sweep": (sweep, 8.0, lambda: sweep(400)),
     # Many short blocks, and then one long one.
-    "basins": (lambda: basins(20_000), 14.0),
-    "long basins": (lambda: basins(10**8), 4.0),
-    "branch": (branch, 9.0),
+    "basins": (lambda: basins(4_000), 8.0, lambda: basins(1)),
+    "long basins": (lambda: basins(10**8), 1.0, lambda: basins(1)),
+    "branch": (branch, 3.0, lambda: branch(20)),
 }
 
 for name in sys.argv[1:] or VERBS:
-    verb, delay = VERBS[name]
+    verb, delay, less = VERBS[name]
+    less()
     at = []
 
     def strike(delay=delay, at=at):
