@@ -86,6 +86,7 @@ def pair():
     return subject
 
 
+@pytest.mark.slow
 def test_what_is_shown_is_what_is_simulated(pair):
     values = {**pair.beginning(), "restitution": 0.6, SETTLE: 100.0}
     seen, (machine, start) = pair.seen(values), pair.at(values)

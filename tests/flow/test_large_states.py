@@ -97,6 +97,7 @@ def test_arrays_are_numbers(method):
         np.testing.assert_array_equal(found.impacts, wanted.impacts)
 
 
+@pytest.mark.slow
 def test_both_backends_and_every_lane_alone():
     method = vi.FixedStep(steps_per_cycle=40)
     forces = jnp.linspace(0.9, 1.1, 5)
@@ -113,6 +114,7 @@ def test_both_backends_and_every_lane_alone():
     np.testing.assert_array_equal(flat(ours)[:2], alone)
 
 
+@pytest.mark.slow
 def test_derivatives_by_arrays_beside_differences():
     method = vi.FixedStep(steps_per_cycle=40)
 

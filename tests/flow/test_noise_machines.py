@@ -86,6 +86,7 @@ def test_noise_by_the_time_between_impulses_keeps_the_temperature():
     assert error < 0.02 * 0.625 and abs(mean - 0.625) < 3 * error
 
 
+@pytest.mark.slow
 def test_measured_time_leaves_the_path_and_its_derivatives():
     def sections(sigma=SIGMA, **options):
         given = {"noise": shaken(16, sigma), "key": jax.random.key(5), "settle": 2, **options}

@@ -202,6 +202,7 @@ def test_a_function_of_jax_computed_by_numpy():
         assert all(type(leaf) is np.ndarray for leaf in jax.tree.leaves(found))
 
 
+@pytest.mark.slow
 def test_a_field_of_another_period_than_its_cycle_is_warned_of_once():
     start, floor = Ball(*map(jnp.asarray, (1.0, 0.3))), ()
     with warnings.catch_warnings():

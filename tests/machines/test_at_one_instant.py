@@ -336,6 +336,7 @@ def test_two_balls_are_let_go_of_together():
     np.testing.assert_allclose(run.sections.x[0], run.sections.x[1], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_energy_never_grows():
     """On springs of their own, from starts some of which touch."""
     springs = jnp.array([1.0, 1.7, 0.6])

@@ -10,6 +10,7 @@ from vi_jax.flow.methods._linear import clear, flown
 from structures import machine_and_truth
 
 
+@pytest.mark.slow
 def test_where_no_stop_can_be_met_steps_are_longer():
     """A run of sections alone takes them, one with extremes does not; they meet the same stops."""
     fewer = impacts = 0

@@ -176,6 +176,7 @@ class Dome(vi.AbstractMachine):
         return Point(z.u, 0 * z.x, z.v, -1 + 0 * z.x)
 
 
+@pytest.mark.slow
 def test_a_particle_slides_off_a_dome():
     """It leaves where cos θ = (2 + v²)/3, from an angle where it had v²/2 + cos θ of energy."""
     angles, speed = jnp.linspace(0.05, 0.5, 16), 0.1

@@ -198,6 +198,7 @@ class Filter(vi.AbstractMachine):
         return Tanks(jnp.asarray(0.3), jnp.asarray(0.1))
 
 
+@pytest.mark.slow
 def test_a_machine_without_stops_needs_no_position():
     """It runs with every verb, and its extremes are those of the first number of its state."""
     machine = Filter(jnp.asarray(1.0))
