@@ -49,7 +49,7 @@ def product(Y: float, V: float, cycles: int) -> tuple[np.ndarray, int]:
 
 
 @pytest.mark.parametrize("impacts", CASES)
-@pytest.mark.parametrize("jacobian", [jax.jacfwd, jax.jacrev])
+@pytest.mark.parametrize("jacobian", quick([jax.jacfwd, jax.jacrev], jax.jacrev))
 @pytest.mark.parametrize(
     ("method", "tolerance"),
     [(vi.ExactFlight(), 1e-9), (vi.Adaptive(diffrax.Tsit5(), rtol=1e-11), 1e-7)],

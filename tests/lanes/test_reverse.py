@@ -9,6 +9,7 @@ import pytest
 from vi_jax import lanes
 from vi_jax.lanes import _backward, _code, _driver, runtime
 
+from differences import quick
 from lanes.toys import batch, fall, logistic
 
 P, V, W = (jnp.asarray(x) for x in ([0.2, 0.33, 0.71, 3.7], [0.3, -0.2, 0.5, 0.1],
@@ -161,7 +162,7 @@ def test_arrays_in_memory_go_back_too(by_tape, monkeypatch):
         np.testing.assert_array_equal(a, b)
 
 
-@pytest.mark.parametrize("size", [5, 23])
+@pytest.mark.parametrize("size", quick([5, 23], 5))
 def test_through_what_is_written_in_jax(by_tape, size):
     """Beside JAX's derivatives of the same steps without a loop."""
     functions = (

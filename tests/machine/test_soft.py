@@ -8,7 +8,7 @@ import pytest
 import vi_jax as vi
 from scipy.integrate import solve_ivp
 
-from differences import check_derivatives
+from differences import check_derivatives, quick
 from thrown import thrown
 
 
@@ -113,7 +113,7 @@ def integrated(rate, x, contacts, duration, *, ends=None, max_step=0.05):
 
 
 @pytest.mark.parametrize("law", LAWS, ids=str)
-@pytest.mark.parametrize("adhesive", [True, False])
+@pytest.mark.parametrize("adhesive", quick([True, False], False))
 @pytest.mark.parametrize("side", ["right", pytest.param("left", marks=pytest.mark.exhaustive)])
 def test_a_law_beside_scipy(law, adhesive, side):
     sign = 1 if side == "right" else -1

@@ -66,8 +66,9 @@ def test_runs_and_rates_say_their_units(name):
     assert f"0{'' if rate == '1' else ' ' + rate} (halves" in str(found)
 
 
-def test_scans_and_sweeps_say_their_units(case):
-    machine, called, position, velocity, rate = case
+@pytest.mark.parametrize("kind", quick(MACHINES, "valve", slow=("rotor",)))
+def test_scans_and_sweeps_say_their_units(kind):
+    machine, called, position, velocity, rate = MACHINES[kind]
     name, start = leaf_names(machine)[0], leaf_names(machine.start())[0]
     axes = {name: np.linspace(0.5, 0.6, 2), f"start.{start}": np.linspace(0.1, 0.2, 2)}
     job = make_program(machine, tuple(axes), measure=("extremes", "power", "sections", "exponent"))

@@ -210,6 +210,7 @@ def test_such_a_cycle_is_born_at_a_fold(cycle):
     assert float(fold.orbit.duration) == pytest.approx(5.846868672, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_a_cycle_that_an_impact_ends():
     """x = e^(0.1 t)(cos w t + B sin w t) from the stop to the stop."""
     k, a = 0.6, 0.1
