@@ -243,6 +243,7 @@ def listing(orbit, count):
     return dataclasses.replace(orbit, **{f"impact_{name}": x for name, x in listed.items()})
 
 
+@pytest.mark.slow
 def test_a_motion_at_rest_on_its_section(short):
     """Is followed, however many of its impacts are listed: chatter, one that sticks, and rest all
     the time."""

@@ -249,7 +249,9 @@ def followed_by(wanted, orbit, asked=None):
     np.testing.assert_allclose(same.multipliers, orbit.multipliers, rtol=1e-9)
 
 
-@pytest.mark.parametrize("method", [Counted(60), vi.Taylor(20, 40)])
+@pytest.mark.parametrize(
+    "method", [pytest.param(Counted(60), marks=pytest.mark.slow), vi.Taylor(20, 40)]
+)
 def test_a_branch_takes_any_method_of_fixed_steps(method):
     """One of one's own, and `Taylor` without a tolerance."""
     known = duffing_orbit(vi.FixedStep(steps_per_cycle=60))

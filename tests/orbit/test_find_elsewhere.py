@@ -47,6 +47,7 @@ def sledge_speeds(damping):
     return (both + apart).real / 2, (both - apart).real / 2
 
 
+@pytest.mark.slow
 def test_a_motion_that_may_be_anywhere_is_found_beside_the_guess():
     """A multiplier is 1 to rounding: the equations of the orbit are singular."""
     guess = Sledges(*map(jnp.asarray, (0.4, 0.1, 0.3, -0.2)))

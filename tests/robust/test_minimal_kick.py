@@ -44,6 +44,7 @@ def row_of(state):
     return np.array([float(state.Y), float(state.V)])
 
 
+@pytest.mark.slow
 def test_the_kick_of_the_scene_beside_a_bisection_along_it(motions, result, two_impacts):
     begin, there = row_of(motions[0].state), row_of(result.start)
     size = np.linalg.norm(there - begin)
