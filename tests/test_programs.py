@@ -136,7 +136,7 @@ def test_compiler_options_that_xla_does_not_know_are_left_out():
     assert float(_programs.CompiledFunction(lambda x: x + 1, options)(jnp.asarray(1.0))) == 2.0
 
 
-@pytest.mark.parametrize("backend", ["auto", pytest.param("xla", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("backend", ["auto", pytest.param("xla", marks=pytest.mark.exhaustive)])
 @pytest.mark.parametrize("derivative", [jax.jacfwd, pytest.param(jax.grad, marks=pytest.mark.slow)])
 def test_a_field_may_close_over_what_is_differentiated(derivative, backend):
     """A machine written within a function of its numbers, through impacts and turns."""

@@ -143,7 +143,7 @@ def test_the_cycle_map_and_its_exponents(plain):
 MACHINE = Chain(rows)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_branch_is_that_of_numbers():
     found = []
     for made in (rows, Numbers):

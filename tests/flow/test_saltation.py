@@ -96,7 +96,9 @@ def test_motor_control_by_central_differences(clock):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "method", [vi.ExactFlight(), vi.Adaptive(rtol=1e-12)], ids=["ExactFlight", "Adaptive"]
+    "method",
+    [vi.ExactFlight(), pytest.param(vi.Adaptive(rtol=1e-12), marks=pytest.mark.exhaustive)],
+    ids=["ExactFlight", "Adaptive"],
 )
 @pytest.mark.parametrize("cycles", some([1, 3], 3))  # without an impact, and with three
 def test_second_derivatives_pass_through_impacts(method, cycles):
@@ -116,7 +118,7 @@ def test_second_derivatives_pass_through_impacts(method, cycles):
     [
         (vi.ExactFlight(), 3),
         pytest.param(vi.ExactFlight(), 4, marks=pytest.mark.exhaustive),
-        (vi.FixedStep(steps_per_cycle=24), 3),
+        pytest.param(vi.FixedStep(steps_per_cycle=24), 3, marks=pytest.mark.exhaustive),
         (vi.Taylor(16, 8), 3),
     ],
     ids=["ExactFlight, third", "ExactFlight, fourth", "FixedStep", "Taylor"],

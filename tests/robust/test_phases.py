@@ -73,7 +73,7 @@ class Later(vi.machines.Duffing):
         return super().field(s + self.later, state)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_machine_of_ones_own_is_kicked_at_a_phase():
     """One that is driven, whose section cannot be moved: beside the same with another origin."""
     numbers = {"amplitude": 0.2, "damping": 0.15, "stiffness": -1.0, "cubic": 1.0, "gap": 100.0}

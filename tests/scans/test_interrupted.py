@@ -179,7 +179,7 @@ def test_interrupted_searches_for_kicks_and_edges(monkeypatch, motions):
     assert caught.value.partial.lengths[0] > 0 == caught.value.partial.lengths[1]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_interrupted_boundaries_grazings_and_profiles(monkeypatch):
     amplitude = 1 / np.hypot(1 - 0.9**2, 10.1 * 0.9)  # of x'' + 10.1 x' + x = cos 0.9 t
     machine = vi.machines.Duffing(

@@ -63,7 +63,7 @@ def test_a_chaotic_transient_is_not_called_chaos():
         assert float(Y) == pytest.approx(steady, abs=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_few_of_the_chaotic_lanes_are_transients():
     """Of 48 × 48 lanes from rest without damping, those called chaotic, much later."""
 
