@@ -119,7 +119,7 @@ def test_second_derivatives_pass_through_impacts(method, cycles):
         (vi.ExactFlight(), 3),
         pytest.param(vi.ExactFlight(), 4, marks=pytest.mark.exhaustive),
         pytest.param(vi.FixedStep(steps_per_cycle=24), 3, marks=pytest.mark.exhaustive),
-        (vi.Taylor(16, 8), 3),
+        pytest.param(vi.Taylor(16, 8), 3, marks=pytest.mark.exhaustive),
     ],
     ids=["ExactFlight, third", "ExactFlight, fourth", "FixedStep", "Taylor"],
 )

@@ -159,7 +159,7 @@ class Driven(vi.AbstractMachine):
         return vi.OscillatorState(z.V / self.omega, (drive(self, s, z) + rub) / self.omega)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_sticking_is_sliding_along_the_surface_of_no_speed():
     """Orbit, multipliers and branch beside those of `DryFriction`, whose mode says the same."""
     found = []

@@ -81,7 +81,7 @@ def test_a_kind_of_event_of_ones_own(walk):
     assert float(run.event_log.value[0, 0]) == pytest.approx(turning, abs=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_walker_doubles_its_step(walk):
     """As where a section and what begins anew with it say the same."""
     branch = vi.continue_orbit(walk, parameter="slope", bounds=(0.008, 0.017))

@@ -218,7 +218,7 @@ METHODS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", some(METHODS, "standard"))
+@pytest.mark.parametrize("name", some(METHODS))
 def test_methods_agree(name):
     method, tolerance = METHODS[name]
     found = one(0.3, SPEED, BIRD_RATE, 3, method=method, event_log=64)

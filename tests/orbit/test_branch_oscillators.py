@@ -98,7 +98,7 @@ def test_folds_of_a_duffing_oscillator():
         assert np.abs(np.linalg.eigvals(end[2:].reshape(2, 2)) - 1).min() < 1e-4
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_motor_hangs_at_resonance_below_a_certain_torque():
     """Without a stop the response folds where the motor's line, κ - ζ/w0 times τ0, is less steep
     than the averaged load's steepest fall: Table 1's to first order in the coupling is 0.75461, a

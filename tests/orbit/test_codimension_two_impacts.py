@@ -87,7 +87,8 @@ def section_of(found, force, omega, cycles):
 
 @pytest.mark.parametrize("cycles", some([2, 3], 2))
 @pytest.mark.parametrize(
-    ("kind", "side", "away"), [("fold", -0.05, 0.5), ("period-doubling", 0.04, 2)]
+    ("kind", "side", "away"),
+    some([("fold", -0.05, 0.5), ("period-doubling", 0.04, 2)], ("fold", -0.05, 0.5)),
 )
 def test_motions_of_several_cycles_have_theirs_as_well(kind, side, away, cycles):
     """With one impact in n cycles at 2n√(1 - ζ²), with the coefficients of one cycle: its curves

@@ -82,7 +82,7 @@ CASES = {
 }
 
 
-@pytest.fixture(scope="module", params=some(CASES, "stick-slip", "soft stop"))
+@pytest.fixture(scope="module", params=some(CASES, "stick-slip"))
 def followed(request):
     """The case and its branch."""
     machine, settle, cycles, name, bounds, value = CASES[request.param]

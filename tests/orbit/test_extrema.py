@@ -40,7 +40,7 @@ def closed(zeta):
     return vi.closed_form_orbits(vi.Scene.ideal(frequency_ratio=zeta, restitution=0.5))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_of_a_motion_with_one_impact():
     """Where the derivative of the closed form of Eq. 14 to 21 vanishes."""
     scene, near = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5), closed(0.9)

@@ -164,7 +164,7 @@ def test_a_curve_of_lost_symmetry_without_impacts_is_that_of_the_half_map():
     assert np.ptp(curve.parameters[:, 1]) == pytest.approx(0.28)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_doubled_branch_springs_from_the_motion_of_half_the_period():
     ball = M.BouncingBall(acceleration=1.2, restitution=0.5)
     orbit = vi.find_orbit(ball, ball.start(height=6.15831535, speed=-1.06063272), throw=True)

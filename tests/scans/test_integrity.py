@@ -131,7 +131,7 @@ def duffing(starts, cycles=120, steps=48):
     return starts
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_shares_of_a_bistable_oscillator_without_stops():
     """Attractors.jl has 0.489 and 0.511 of 1,000 random starts (left and right well)."""
     machine = vi.machines.Duffing(amplitude=0.2, damping=0.15, stiffness=-1.0, cubic=1.0, gap=100.0)
@@ -190,7 +190,7 @@ def turned(Y, V, force, cycles=160, steps=48):
     return V
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_exponent_of_a_pendulum_goes_on_below_the_grid():
     """Two motions that turn, f = 2: what the grid says over a decade of distances, pairs of random
     starts from 1e-2 to 1e-7 apart say too (the method of the paper of 1983), by the classical

@@ -155,7 +155,7 @@ def motions():
     return [vi.find_orbit(SCENE, SCENE.start(Y=Y, V=V), 2) for Y, V in places]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_interrupted_searches_for_kicks_and_edges(monkeypatch, motions):
     one, two, saddle = motions
     look = importlib.import_module("vi_jax.robust._minimal_kick").Look
