@@ -12,7 +12,7 @@ from PIL import Image
 # The quickest of them run by default, and some with the slow tests; the others, whose calls pyright
 # has checked, before a release.
 QUICK = {"paper_discrepancy", "own_machine"}
-SLOW = {"find_orbit", "grazing", "simulate", "regime_map"}
+SLOW = {"find_orbit", "simulate", "regime_map"}
 
 
 def marks(name):

@@ -69,7 +69,7 @@ def test_what_is_no_beam(argument, value, error):
         vi.machines.Beam(**{argument: value})
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_periodic_motion_of_many_modes():
     """Newton's method on the cycle map, whose Jacobian is that of differences."""
     beam = vi.machines.Beam(
