@@ -28,7 +28,7 @@ def watch(monkeypatch):
     return watch
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_oldest_programs_are_dropped_in_time(watch, monkeypatch):
     jax.clear_caches()
     first, used = section(1), _programs.maps_used()

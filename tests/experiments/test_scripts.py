@@ -16,7 +16,7 @@ WITHOUT_FIGURE = {"extremes"}
 RUN_ELSEWHERE = {"peers", "chains", "extremes"}
 # These run with the slow tests; the others, whose calls pyright has checked, before
 # a release. Headline numbers are tests of their own (`test_headlines.py`).
-SLOW = {"boundaries", "soft_stop"}
+SLOW = {"soft_stop"}
 
 
 @pytest.mark.parametrize("study", STUDIES, ids=lambda path: path.stem)

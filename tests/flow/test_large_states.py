@@ -131,7 +131,7 @@ def test_derivatives_by_arrays_beside_differences():
     np.testing.assert_allclose(along, slope, rtol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_network_as_a_force():
     """As a law of the springs: the same as XLA's."""
     network = eqx.nn.MLP("scalar", "scalar", 32, 2, jnp.tanh, key=jax.random.key(0))

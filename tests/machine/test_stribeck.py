@@ -59,7 +59,7 @@ def test_it_sticks_and_slips(orbit):
     assert orbit.stable
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_it_ends_as_a_branch_where_a_slip_only_touches_the_belt(orbit):
     """Independently of this package the cycle ends at 1.83660097."""
     coarse = vi.find_orbit(Belt(), orbit.state)

@@ -31,7 +31,7 @@ def orbit(machine):
     return vi.find_orbit(one, settled.last, throw=True)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_power_is_a_column_of_a_branch_and_an_axis_of_a_sweep(machine, orbit):
     branch = vi.continue_orbit(orbit, parameter="resistance", bounds=(0.8, 1.25))
     ax = vi.plot_branch(branch, y="power")

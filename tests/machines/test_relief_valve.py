@@ -165,7 +165,7 @@ def test_wrong_numbers_are_named():
     assert bool(run.result == vi.RESULTS.bad_start)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_open_valve_comes_to_rest_where_its_equilibrium_turns_stable():
     """The Hopf bifurcation, beside the eigenvalues of the linearised valve."""
     valve = VALVE(flow_rate=8.0)

@@ -57,7 +57,7 @@ def after_a_cycle(voltage, x, turns=None):
     return x[:2]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_an_impactor_that_makes_its_base_slide():
     start = tuple(map(jnp.array, (0.1166, 0.189, 0.0)))
     orbit = vi.find_orbit(Impactor(), start, throw=True)

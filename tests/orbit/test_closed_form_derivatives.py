@@ -35,7 +35,7 @@ AT = [
 ]
 
 
-@pytest.mark.parametrize(("at", "n"), some(AT, *AT[:2]))
+@pytest.mark.parametrize(("at", "n"), some(AT, AT[0]))
 def test_gradients_agree_with_central_differences(at, n):
     at = jnp.array(at)
     forward, reverse = slopes(at, n)

@@ -85,7 +85,7 @@ def section_of(found, force, omega, cycles):
     return ahead + np.array([swing.real, (1j * omega * swing).real])
 
 
-@pytest.mark.parametrize("cycles", some([2, 3], 2))
+@pytest.mark.parametrize("cycles", some([2, 3]))
 @pytest.mark.parametrize(
     ("kind", "side", "away"),
     some([("fold", -0.05, 0.5), ("period-doubling", 0.04, 2)], ("fold", -0.05, 0.5)),

@@ -259,6 +259,8 @@ def test_a_branch_takes_any_method_of_fixed_steps(method):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", [Counted(60), vi.Taylor(20, 40)])
+@pytest.mark.parametrize(
+    "method", [pytest.param(Counted(60), marks=pytest.mark.exhaustive), vi.Taylor(20, 40)]
+)
 def test_a_branch_is_followed_by_the_method_of_its_orbit_if_its_steps_are_fixed(method):
     followed_by(method, duffing_orbit(method))

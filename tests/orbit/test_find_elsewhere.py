@@ -63,7 +63,7 @@ def test_a_motion_that_may_be_anywhere_is_found_beside_the_guess():
     assert drifting.result == vi.ORBIT_RESULTS.drifts and "drifts" in str(drifting)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_derivative_of_a_motion_that_may_be_anywhere():
     guess = Sledges(*map(jnp.asarray, (0.4, 0.1, 0.3, -0.2)))
     found = jax.jacrev(lambda c: vi.find_orbit(Coupled(c), guess).state)(jnp.asarray(0.3))

@@ -213,7 +213,7 @@ def test_grazing_of_the_paper(restitution, damping, zeta):
     assert [text.get_text() for text in ax.texts] == ["forecast: nothing near attracts"]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_two_stops_are_touched_at_once():
     """A symmetric motion grazes on both sides; half a period leads from one to the other."""
     machine = vi.machines.Duffing(amplitude=0.3, frequency=0.7, damping=0.4, gap=1.0)

@@ -202,7 +202,7 @@ def third(Y, V, x):
     return Third(jnp.asarray(Y), jnp.asarray(V), jnp.asarray(x))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_kick_in_three_components_and_a_chaotic_edge():
     """The boundary is the plane x = 0, at the distance 1 from the motion at rest."""
     home, away = third(0.0, 0.0, 1.0), third(1.0, 0.5, -0.5)

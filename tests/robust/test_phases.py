@@ -126,7 +126,7 @@ def curves(speed):
     return cycle.T, np.concatenate([way.T, np.stack([stuck, speed + 0 * stuck], axis=1)])
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_worst_moment_of_a_machine_without_a_drive():
     """Kicks that stop sticking and slipping: the least is how far two cycles are apart."""
     belt = Observed(jnp.asarray(1.5))

@@ -87,7 +87,7 @@ def test_killed_again_and_again_the_store_ends_the_same(tmp_path, undisturbed):
     assert killed >= 3 and len(parts) >= 2, (killed, parts)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_any_number_of_devices_gives_the_same_numbers(tmp_path, whole):
     _same(_finished(tmp_path / "store", "--devices", "3"), whole)
 
