@@ -19,10 +19,10 @@ _MODULES = sorted(
 
 
 def pytest_configure(config):
-    """Check annotations in the default tests; slow ones go through the same code with more numbers,
-    and checks take two fifths of their time (40 for 29 s of a processor, for the friction and the
-    quantities of orbits)."""
-    if "not slow" in config.option.markexpr:
+    """Check annotations, but not where only longer tests are run: these go through the same code
+    with more numbers, and checks take two fifths of their time (40 for 29 s of a processor, for the
+    friction and the quantities of orbits)."""
+    if config.option.markexpr not in ("slow", "exhaustive", "slow and not exhaustive"):
         modules = [f"vi_jax.{name}" for name in _MODULES]
         config.checked = jaxtyping.install_import_hook(modules, "beartype.beartype")
 

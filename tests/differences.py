@@ -12,7 +12,8 @@ import vi_jax as vi
 
 def quick(cases, *names, slow=None):
     """Of these cases only the named ones run by default; the rest with the longer studies, or only
-    those of `slow` with these and all others before a release."""
+    those of `slow` with these and all others before a release. A case of several arguments is a
+    tuple."""
 
     def marks(x):
         return pytest.mark.slow if slow is None or x in slow else pytest.mark.exhaustive

@@ -9,14 +9,12 @@ import pytest
 from examples.__main__ import EXAMPLES, FIGURES, HERE, cells, notebook, printed_in
 from PIL import Image
 
+from differences import quick
+
 # The quickest of them run by default, and some with the slow tests; the others, whose calls pyright
 # has checked, before a release.
 QUICK = {"paper_discrepancy", "own_machine"}
 SLOW = {"find_orbit", "simulate", "regime_map"}
-
-
-def marks(name):
-    return () if name in QUICK else pytest.mark.slow if name in SLOW else pytest.mark.exhaustive
 
 
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
@@ -42,11 +40,9 @@ def test_the_gallery_shows_it(example):
     assert f"(../experiments/figures/examples/{example.stem}.png)" in gallery
 
 
-@pytest.mark.parametrize(
-    "example",
-    [pytest.param(path, id=path.stem, marks=marks(path.stem)) for path in EXAMPLES],
-)
-def test_runs(example, tmp_path):
+@pytest.mark.parametrize("name", quick([path.stem for path in EXAMPLES], *QUICK, slow=SLOW))
+def test_runs(name, tmp_path):
+    (example,) = (path for path in EXAMPLES if path.stem == name)
     environment = {**os.environ, "PYTHONPATH": str(HERE.parents[1])}
     done = subprocess.run(
         [sys.executable, str(example)],

@@ -11,7 +11,7 @@ from studies.parts.grazing_verdict import LANES, Lanes, judged, name_of, verdict
 
 @pytest.mark.slow
 def test_forecasts_beside_simulation():
-    for n, (drawn, point) in enumerate(machines(KINDS["scene"][0], 2, 7)):
+    for n, (drawn, point) in enumerate(machines(KINDS["scene"][0], 3, 7)):
         found = vi.grazing(point, progress=False)
         *_, lanes, named = judged(point, drawn.parameter, found, n)
         assert lanes.side == found.side

@@ -14,6 +14,7 @@ from vi_jax.paper.response import RATIO, _branches, _closed_forms, with_numbers
 from vi_jax.plot.stamp import stamped
 
 import headline_numbers
+from differences import quick
 
 FOLDER = Path(__file__).parents[2] / "experiments"
 
@@ -52,9 +53,7 @@ LONGER = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    "study", [pytest.param(x, marks=[pytest.mark.slow] * (x in LONGER)) for x in STUDIES]
-)
+@pytest.mark.parametrize("study", quick(STUDIES, *set(STUDIES) - LONGER))
 def test_headline_numbers(study):
     kept, function = headlines(page_of(study)), COMPUTED[study]
     computed = function(kept) if inspect.signature(function).parameters else function()

@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
+from differences import some
+
 FOLDER = Path(__file__).parents[2] / "experiments"
 STUDIES = sorted([*FOLDER.glob("studies/*.py"), *FOLDER.glob("benchmarks/*.py")])
 # A table is all there is to see.
@@ -31,17 +33,10 @@ def test_table_and_figure_are_kept(study):
 
 
 @pytest.mark.parametrize(
-    "study",
-    [
-        pytest.param(
-            path, id=path.stem,
-            marks=pytest.mark.slow if path.stem in SLOW else pytest.mark.exhaustive,
-        )
-        for path in STUDIES
-        if path.stem not in RUN_ELSEWHERE
-    ],
-)  # fmt: skip
-def test_runs(study, tmp_path):
+    "name", some([p.stem for p in STUDIES if p.stem not in RUN_ELSEWHERE], *SLOW)
+)
+def test_runs(name, tmp_path):
+    (study,) = (path for path in STUDIES if path.stem == name)
     environment = {**os.environ, "PYTHONPATH": str(FOLDER.parent)}
     done = subprocess.run(
         [sys.executable, str(study), "--quick"],

@@ -7,6 +7,7 @@ import pytest
 from tools.validated import Comparison, last_digit
 from validated.__main__ import ORDER, SCRIPTS, comparison_of, described, section
 
+from differences import quick
 from gallery_page import rows, sections
 
 # The quickest of them; the others run with the slow tests.
@@ -29,14 +30,9 @@ def test_the_page_has_every_script_once():
     assert sorted(ORDER) == [path.stem for path in SCRIPTS]
 
 
-@pytest.mark.parametrize(
-    "script",
-    [
-        pytest.param(path, id=path.stem, marks=[] if path.stem in QUICK else pytest.mark.slow)
-        for path in SCRIPTS
-    ],
-)
-def test_gives_what_the_page_prints(script):
+@pytest.mark.parametrize("name", quick([path.stem for path in SCRIPTS], *QUICK))
+def test_gives_what_the_page_prints(name):
+    (script,) = (path for path in SCRIPTS if path.stem == name)
     comparison = comparison_of(script)
     part = sections()[script.stem]
     now = section(script, comparison, 0.0)

@@ -12,7 +12,7 @@ import vi_jax as vi
 from vi_jax.machine.base import AbstractMachine
 
 from chain import Chain, balls
-from differences import quick, some
+from differences import quick
 from rough_block import Block, on_plane
 
 IDEAL = vi.Oscillator(0.05)
@@ -81,7 +81,8 @@ def sliding(pull):
     return Block(0.3, 0.5, pull=pull), on_plane(0, 0.02, 1, 0)
 
 
-@pytest.mark.parametrize("make", some([falling, sliding]))
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("make", [falling, sliding])
 def test_roads_agree_where_contacts_act_together(make):
     method = vi.FixedStep(steps_per_cycle=24)
     numbers = jnp.linspace(0.1, 0.7, 5)

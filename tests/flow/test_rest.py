@@ -8,8 +8,6 @@ import pytest
 import vi_jax as vi
 from scipy.optimize import brentq
 
-from differences import some
-
 METHODS = [vi.ExactFlight(), vi.Adaptive(rtol=1e-11), vi.FixedStep(steps_per_cycle=64)]
 IDS = ["exact", "adaptive", "fixed"]
 GAP, K, ZETA, XI = 0.3, 0.4, 0.3, 0.05
@@ -294,7 +292,8 @@ NUMBERS = {  # restitution, gap, control, coupling, damping ratio, Y and V of th
 }
 
 
-@pytest.mark.parametrize("name", some(NUMBERS))
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("name", NUMBERS)
 def test_higher_derivatives_pass_through_rest_and_release(name):
     """While a shaft moves on that feels the body: by all numbers of the machine at once."""
     numbers, expected = NUMBERS[name]

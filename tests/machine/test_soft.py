@@ -8,7 +8,7 @@ import pytest
 import vi_jax as vi
 from scipy.integrate import solve_ivp
 
-from differences import check_derivatives, quick
+from differences import check_derivatives, quick, some
 from thrown import thrown
 
 
@@ -114,7 +114,7 @@ def integrated(rate, x, contacts, duration, *, ends=None, max_step=0.05):
 
 @pytest.mark.parametrize("law", LAWS, ids=str)
 @pytest.mark.parametrize("adhesive", quick([True, False], False))
-@pytest.mark.parametrize("side", ["right", pytest.param("left", marks=pytest.mark.exhaustive)])
+@pytest.mark.parametrize("side", quick(["right", "left"], "right", slow=()))
 def test_a_law_beside_scipy(law, adhesive, side):
     sign = 1 if side == "right" else -1
     stop = vi.SoftStop(0.5, 100.0, adhesive=adhesive, side=side, **law)
@@ -161,7 +161,7 @@ def motor_driven(t, x, contacts):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("drive", ["ideal", pytest.param("motor", marks=pytest.mark.exhaustive)])
+@pytest.mark.parametrize("drive", some(["ideal", "motor"], "ideal"))
 @pytest.mark.parametrize(
     ("adhesive", "law"),
     [(True, {"damping": 0.4}), (False, {"damping": 0.5, "exponent": 1.5}),

@@ -108,15 +108,10 @@ def flown(machine, x, v, cycles=1, **options):
     return run, stops[stops >= 0]
 
 
-@pytest.mark.parametrize(
-    ("count", "k"),
-    [
-        (3, 1.0),
-        (3, 0.9),
-        pytest.param(5, 0.9, marks=pytest.mark.slow),
-        *(pytest.param(5, k, marks=pytest.mark.exhaustive) for k in (1.0, 0.5)),
-    ],
-)
+CRADLES = [(3, 1.0), (3, 0.9), (5, 0.9), (5, 1.0), (5, 0.5)]
+
+
+@pytest.mark.parametrize(("count", "k"), quick(CRADLES, *CRADLES[:2], slow=CRADLES[2:3]))
 def test_newtons_cradle(count, k):
     """One ball upon others that touch. Five with k = .9: the first keeps .0435250820."""
     speeds = np.eye(count)[0]
@@ -182,72 +177,6 @@ def test_blows_that_feel_each_other_through_others_come_together():
     wanted, struck = passed((1, 0, 0, -1), 0.6, (1, 2, 2, 1))
     assert stops.tolist() == struck == [0, 2, 1, 0, 2]
     np.testing.assert_allclose(run.last.v, wanted, atol=1e-12)
-
-
-class Feet(eqx.Module):
-    y: Any
-    tilt: Any
-    v: Any
-    turn: Any
-
-
-class Rod(vi.AbstractMachine):
-    """A rod of unit mass that falls flat on feet at `places` along it (inertia .3)."""
-
-    restitution: tuple[float, ...]
-    places: tuple[float, ...] = eqx.field(static=True)
-
-    @property
-    def stops(self):
-        return tuple(vi.RigidStop(0.0, k, coordinate=i) for i, k in enumerate(self.restitution))
-
-    @property
-    def coordinates(self):
-        def foot(at):
-            share = 1 / (1 + at * at / 0.3)
-
-            def placed(z, Y, V):
-                far, fast = share * (Y - z.y - at * z.tilt), share * (V - z.v - at * z.turn)
-                turns = at / 0.3
-                return Feet(z.y + far, z.tilt + turns * far, z.v + fast, z.turn + turns * fast)
-
-            return vi.Coordinate(
-                lambda z: z.y + at * z.tilt, lambda z: z.v + at * z.turn, placed, share
-            )
-
-        return tuple(foot(at) for at in self.places)
-
-    @property
-    def cycle(self):
-        return 1.0
-
-    def field(self, s, z):
-        return Feet(z.v, z.turn, 0 * z.v, 0 * z.turn)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("places", "restitution", "wanted"),
-    [
-        pytest.param((-0.5, 1.0), (0.5, 0.5), (-0.5, 0.0), marks=pytest.mark.exhaustive),
-        ((-1.0, 0.0, 1.0), (0.5,) * 3, (-0.5, 0.0)),  # one of them is redundant
-        pytest.param(
-            (0.5, 1.0), (0.5, 0.5), (1 - 1.5 / (1 + 1 / 1.2), -1.5 * 0.5 / 0.3 / (1 + 1 / 1.2)),
-            marks=pytest.mark.exhaustive,
-        ),
-        ((-0.5, 1.0), (0.0, 1.0), None),  # laws that would gain energy together
-    ],
-)  # fmt: skip
-def test_a_rod_lands_flat_on_its_feet(places, restitution, wanted):
-    """Where the far foot would have to pull, only the near one strikes."""
-    start = Feet(*(jnp.array(x) for x in (-0.3, 0.0, 1.0, 0.0)))
-    run = vi.simulate(Rod(restitution, places), start, 1)
-    assert bool(run.successful)
-    v, turn = float(run.last.v), float(run.last.turn)
-    assert v * v + 0.3 * turn * turn <= 1 + 1e-12
-    assert all(v + at * turn <= 1e-12 for at in places)
-    if wanted is not None:
-        np.testing.assert_allclose((v, turn), wanted, atol=1e-12)
 
 
 @pytest.mark.slow

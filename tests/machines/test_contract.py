@@ -86,7 +86,7 @@ METHODS = {
 
 @pytest.mark.slow
 def test_two_bodies_with_three_contacts():
-    numbers, starts = drawn(40)
+    numbers, starts = drawn(100)
     runs = [
         vi.jit(jax.vmap(lambda p, x, m=m: lane(p, x, method=m, impact_log=40), in_axes=1))(
             jnp.asarray(numbers), jnp.asarray(starts)
@@ -94,7 +94,7 @@ def test_two_bodies_with_three_contacts():
         for m in METHODS.values()
     ]
     compared, several = 0, np.zeros(3, int)
-    for i in range(40):
+    for i in range(100):
         wanted = flown(*numbers[:, i], starts[:, i], 8 * PI)
         if wanted is None:
             continue
@@ -109,7 +109,7 @@ def test_two_bodies_with_three_contacts():
         found = [leaf[i, -1] for leaf in jax.tree.leaves(runs[0].sections)]
         np.testing.assert_allclose(found, x, atol=1e-8)
         compared, several = compared + 1, several + impacts
-    assert compared > 32 and (several > 40).all()
+    assert compared > 80 and (several > 100).all()
 
 
 @pytest.mark.exhaustive

@@ -11,7 +11,6 @@ import pytest
 import vi_jax as vi
 
 import pecking
-from differences import some
 
 matplotlib.use("Agg")
 WOODPECKER = vi.machines.Woodpecker
@@ -218,7 +217,8 @@ METHODS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", some(METHODS))
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("name", METHODS)
 def test_methods_agree(name):
     method, tolerance = METHODS[name]
     found = one(0.3, SPEED, BIRD_RATE, 3, method=method, event_log=64)

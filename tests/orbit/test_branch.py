@@ -237,38 +237,6 @@ def test_says_what_is_wrong(arguments, message):
         vi.continue_orbit(orbit, **{"parameter": ZETA, "bounds": (0.5, 1.9), **arguments})
 
 
-def listing(orbit, count):
-    """An orbit with so many of its impacts listed, as by a shorter `impact_log`."""
-    listed = {name: getattr(orbit, f"impact_{name}")[:count] for name in ("phase", "speed", "stop")}
-    return dataclasses.replace(orbit, **{f"impact_{name}": x for name, x in listed.items()})
-
-
-@pytest.mark.slow
-def test_a_motion_at_rest_on_its_section(short):
-    """Is followed, however many of its impacts are listed: chatter, one that sticks, and rest all
-    the time."""
-    for gap, restitution in ((0.3, 0.3), (0.3, 0.0), (-3.0, 0.3)):
-        scene = vi.Scene.ideal(
-            frequency_ratio=0.5, restitution=restitution, gap=gap, damping_ratio=0.05
-        )
-        orbit = vi.find_orbit(scene, scene.start(Y=gap), impact_log=32, throw=True)
-        assert (int(orbit.impacts) > 1) == (gap > 0)
-        branch = vi.continue_orbit(
-            listing(orbit, 1), parameter=ZETA, bounds=(0.4, 0.6), max_step=0.3
-        )
-        assert branch.ends == ("bounds", "bounds") and not branch.special
-        np.testing.assert_allclose(branch.multipliers, 0.0, atol=1e-12)
-        for i in (0, -1):  # at the last one it has been let go of again
-            there = branch.orbit(i)
-            run = vi.simulate(there.machine, there.machine.start(Y=gap), 3)
-            last = [float(run.last.Y), float(run.last.V)]
-            section = [branch.column("section_Y")[i], branch.column("section_V")[i]]
-            np.testing.assert_allclose(section, last, atol=1e-9)
-            assert branch.impacts[i] == run.impacts[-1] and branch.rests[i] == run.rests[-1]
-    with pytest.raises(ValueError, match=r"list all its 1 impacts, .* larger `impact_log`"):
-        vi.continue_orbit(listing(short.orbit(0), 0), parameter=ZETA, bounds=(0.5, 1.9))
-
-
 @pytest.mark.parametrize("name", ["step", "max_step"])
 @pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf])
 def test_steps_that_would_never_end_are_refused(short, name, value):

@@ -296,3 +296,37 @@ def test_gears_that_rattle_and_rest():
         middle = 0.5 * (low + high)
         low, high = (middle, high) if comes_to_rest(0.3, middle) else (low, middle)
     assert struck.special[0].parameter == pytest.approx(low, abs=1e-9)
+
+
+def listing(orbit, count):
+    """An orbit with so many of its impacts listed, as by a shorter `impact_log`."""
+    listed = {name: getattr(orbit, f"impact_{name}")[:count] for name in ("phase", "speed", "stop")}
+    return dataclasses.replace(orbit, **{f"impact_{name}": x for name, x in listed.items()})
+
+
+@pytest.mark.slow
+def test_a_motion_at_rest_on_its_section():
+    """Is followed, however many of its impacts are listed: chatter, one that sticks, and rest all
+    the time."""
+    for gap, restitution in ((0.3, 0.3), (0.3, 0.0), (-3.0, 0.3)):
+        scene = vi.Scene.ideal(
+            frequency_ratio=0.5, restitution=restitution, gap=gap, damping_ratio=0.05
+        )
+        orbit = vi.find_orbit(scene, scene.start(Y=gap), impact_log=32, throw=True)
+        assert (int(orbit.impacts) > 1) == (gap > 0)
+        branch = vi.continue_orbit(
+            listing(orbit, 1), parameter=ZETA, bounds=(0.4, 0.6), max_step=0.3
+        )
+        assert branch.ends == ("bounds", "bounds") and not branch.special
+        np.testing.assert_allclose(branch.multipliers, 0.0, atol=1e-12)
+        for i in (0, -1):  # at the last one it has been let go of again
+            there = branch.orbit(i)
+            run = vi.simulate(there.machine, there.machine.start(Y=gap), 3)
+            last = [float(run.last.Y), float(run.last.V)]
+            section = [branch.column("section_Y")[i], branch.column("section_V")[i]]
+            np.testing.assert_allclose(section, last, atol=1e-9)
+            assert branch.impacts[i] == run.impacts[-1] and branch.rests[i] == run.rests[-1]
+    scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.0)
+    moving = vi.find_orbit(scene, scene.start(Y=1.6, V=-1.9), cycles=2, throw=True)
+    with pytest.raises(ValueError, match=r"list all its 1 impacts, .* larger `impact_log`"):
+        vi.continue_orbit(listing(moving, 0), parameter=ZETA, bounds=(0.5, 1.9))

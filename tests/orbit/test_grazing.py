@@ -108,8 +108,10 @@ def _near_top(swing, frequency, n, t, end):
     return near[(near > t) & (near < end)]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("beyond", "period"), [(8.4e-5, 5), (1.5e-5, 6), (3.5e-5, 0)])
+BEYOND = [(8.4e-5, 5), (1.5e-5, 6), (3.5e-5, 0), (4.0e-6, 7)]
+
+
+@pytest.mark.parametrize(("beyond", "period"), some(BEYOND, *BEYOND[:3]))
 def test_periods_after_a_grazing(half, beyond, period):
     """Windows of motions with one impact, chaos between: by the forecast and by the oscillator."""
     point, found, frequency, amplitude = half
