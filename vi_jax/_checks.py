@@ -233,13 +233,14 @@ def state_of_numbers(name: str, state: object) -> Any:
 
 
 def require_real(name: str, part: str, value: object) -> None:
-    """**Raises:** `TypeError` if this part of an argument is neither a real number nor an array of
-    them, traced or not."""
+    """**Raises:** `TypeError` if this part of an argument, or with `""` the whole of it, is neither
+    a real number nor an array of them, traced or not."""
     real = isinstance(value, int | float) and not isinstance(value, bool)
     if isinstance(value, jax.Array | np.ndarray | np.generic):  # tracers are among the first
         real = any(jnp.issubdtype(value.dtype, kind) for kind in (jnp.floating, jnp.integer))
     if not real:
-        raise TypeError(f"Argument `{name}` must hold real numbers, but its {part} is {value!r}.")
+        got = f"its {part} is {value!r}" if part else f"got {value!r}"
+        raise TypeError(f"Argument `{name}` must hold real numbers, but {got}.")
 
 
 def fits_records(name: str, records: int, numbers: int) -> None:

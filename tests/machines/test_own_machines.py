@@ -212,7 +212,7 @@ def test_a_machine_without_stops_needs_no_position():
     np.testing.assert_allclose(orbit.multipliers, np.exp([-2 * np.pi, -4 * np.pi]), atol=1e-9)
     branch = vi.continue_orbit(orbit, parameter="rate", bounds=(0.5, 2.0))
     np.testing.assert_allclose(branch.y_max, 1 / np.abs(1j + branch.parameter), atol=1e-9)
-    with pytest.raises(TypeError, match="`start` must be a state of this machine, but got 'none'"):
+    with pytest.raises(TypeError, match="`start` must hold real numbers, but got 'none'"):
         vi.simulate(machine, "none", 1)
 
 

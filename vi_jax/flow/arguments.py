@@ -195,12 +195,13 @@ def _leaf_in_words(path: Any) -> str:
 def check_reals(name: str, state: State) -> None:
     """**Raises:** `TypeError` that names what is no real number in a state of any form."""
     for path, leaf in jtu.tree_leaves_with_path(state):
-        require_real(name, jtu.keystr(path).lstrip(".") or "value", leaf)
+        require_real(name, jtu.keystr(path).lstrip("."), leaf)
 
 
 def shape_of(argument: str, machine: AbstractMachine, state: State) -> tuple[int, ...]:
     """The shape of position and velocity in a state, `()` in one. **Raises:** `TypeError` for what
     is no state of this machine."""
+    check_reals(argument, state)
     try:
         shape = jnp.shape(machine.position(state)) or jnp.shape(machine.velocity(state))
     except (AttributeError, TypeError, LookupError):
@@ -210,7 +211,6 @@ def shape_of(argument: str, machine: AbstractMachine, state: State) -> tuple[int
             "your own with stops says by `position`, `velocity` and `placed`, or by `coordinates`, "
             "what they limit."
         ) from None
-    check_reals(argument, state)
     if not shape and not machine.has_velocity(state):
         _check_flow(argument, machine, state)
     return shape
