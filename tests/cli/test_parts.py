@@ -59,6 +59,7 @@ def test_a_run_that_fails_is_nan_from_there_on(short):
     np.testing.assert_allclose(parts.y_min, whole.y_min, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_sweep_in_parts_is_the_same_sweep():
     gaps = [2.0, 1.2, 0.5, -0.5, 0.5, 2.0]
     options = {"settle": 50, "cycles": 8, "start": START}

@@ -22,6 +22,7 @@ numbers = st.floats(0.01, 0.99).map(lambda x: round(x, 6))
 SI = sorted(field.name for field in dataclasses.fields(vi.Parameters))
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=30)
 @given(machine=st.dictionaries(st.sampled_from(SI), numbers, max_size=6))
 def test_any_machine_is_read_as_it_is_written(tmp_path_factory, machine):

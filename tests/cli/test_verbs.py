@@ -84,6 +84,7 @@ def test_interrupted_scans_tell_how_to_go_on(here, capsys, monkeypatch):
     assert last == "vi-jax: interrupted; the same command goes on from what is in s.zarr"
 
 
+@pytest.mark.slow
 def test_sweep(here, capsys):
     text = """[sweep]
     parameter = "drive.frequency_ratio"
@@ -110,6 +111,7 @@ def test_sweep(here, capsys):
     assert down[table[10]["values"]] == pytest.approx(up[table[10]["values"]], abs=1e-4)
 
 
+@pytest.mark.slow
 def test_basins(here, capsys):
     text = """[basins]
     region = { start.Y = [0.05, 4.05], start.V = [-1, 1] }
@@ -145,6 +147,7 @@ def test_orbit_and_its_branch(here, capsys):
     assert {"y_min", "y_max", "clearance", "stable"} <= set(table[0])
 
 
+@pytest.mark.slow
 def test_an_orbit_that_is_not_found(here, capsys):
     text = "[orbit]\nguess = { Y = 1.9, V = 1.54 }\nroot_finder = 'gradient'\nmax_steps = 3"
     assert "No orbit" in ran(capsys, "orbit", text, code=1)

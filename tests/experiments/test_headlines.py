@@ -48,8 +48,9 @@ def test_every_study_has_headline_numbers():
 
 # Their programs take longer to compile than the rest of this file.
 LONGER = {
-    "all_orbits", "chains", "dc_motor", "gradients", "identify", "known_machines", "learned_laws",
-    "peers", "posterior", "regime_maps", "relief_valve", "robustness", "soft_stop", "woodpecker",
+    "all_orbits", "basins_map", "chains", "dc_motor", "gradients", "identify", "known_machines",
+    "learned_laws", "peers", "posterior", "regime_maps", "relief_valve", "robustness", "soft_stop",
+    "woodpecker",
 }  # fmt: skip
 
 

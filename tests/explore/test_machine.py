@@ -102,6 +102,7 @@ def test_what_is_shown_is_what_is_simulated(pair):
     np.testing.assert_allclose(found.y_min[60], run.y_min, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_no_slider_of_a_machine_compiles_and_redraws_are_quick(pair):
     picture, begin, took, compiled = MotionPicture(labels=pair.machine.labels), [], [], []
     begin = pair.beginning()

@@ -125,6 +125,7 @@ def test_redraws_are_quick():
     assert np.median(took) < 0.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", ["ideal", "motor"])
 def test_the_ends_of_all_sliders_can_be_shown(make):
     kinds = {"ideal": controls.IDEAL, "motor": controls.MOTOR}[make]

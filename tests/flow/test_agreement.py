@@ -92,6 +92,7 @@ def check(scenes) -> np.ndarray:
     return kept
 
 
+@pytest.mark.slow
 def test_extremes_are_those_of_fine_sampling():
     scenes = random_scenes(2, 60)
 

@@ -80,6 +80,7 @@ def plain():
     return machine, vi.simulate(machine, machine.start(), 3, samples=4, estimate=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("made", [rows, one_array])
 def test_a_run_is_that_of_numbers(made, plain):
     machine, wanted = Chain(made), plain[1]

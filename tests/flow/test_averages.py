@@ -113,6 +113,7 @@ def test_beside_scipy_with_samples_between():
     )
 
 
+@pytest.mark.slow
 def test_derivatives_through_impacts():
     """Beside finite differences; and with them energy stays balanced, to the last bit or so."""
 
@@ -193,6 +194,7 @@ def test_modes_and_resets():
     np.testing.assert_allclose(run.averages["height"], [height, height], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_what_a_run_tells_of_them():
     run = vi.simulate(Shaken(), begin(), 2, samples=2)
     assert "mean taken: " in repr(run) and f"{run.averages['taken'][-1]:.6g} W" in repr(run)

@@ -12,7 +12,7 @@ import vi_jax as vi
 from vi_jax.machine.base import AbstractMachine
 
 from chain import Chain, balls
-from differences import quick
+from differences import quick, some
 from rough_block import Block, on_plane
 
 IDEAL = vi.Oscillator(0.05)
@@ -99,7 +99,8 @@ def test_roads_agree_where_contacts_act_together(make):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", quick(CASES, "exact flight", slow=("motor",)))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", some(CASES, "exact flight", "motor"))
 def test_groups_of_any_width_give_the_same(name):
     """Few lanes go in narrow groups and many in wide ones: the same to the last bit."""
     make, method, options = CASES[name]
@@ -121,6 +122,7 @@ def test_groups_of_any_width_give_the_same(name):
             np.testing.assert_array_equal(np.asarray(a)[chosen], b)
 
 
+@pytest.mark.slow
 def test_single_precision():
     """In its own measure."""
 

@@ -31,6 +31,7 @@ def slope_of(f, V, h=1e-6):
     return (f(V + h) - f(V - h)) / (2 * h)
 
 
+@pytest.mark.slow
 def test_reverse_mode_through_a_checkpoint():
     truth = slope_of(last, 0.1)
     checked = jax.checkpoint(last)

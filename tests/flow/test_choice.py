@@ -60,6 +60,7 @@ def test_estimated_errors_are_those_made(scene, method):
     assert vi.simulate(scene, scene.start(), 2).errors is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("xi", [3.0, 10.0])
 def test_errors_are_estimated_under_strong_damping(xi):
     scene = vi.Scene.ideal(frequency_ratio=1.0, gap=None, damping_ratio=xi)

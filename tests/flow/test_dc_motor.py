@@ -121,6 +121,7 @@ def test_a_run_up_from_rest_as_in_closed_form(te):
     assert (float(run.samples.state.W.max()) > 1.1 * kappa * free) == (te > 1)
 
 
+@pytest.mark.slow
 def test_with_less_and_less_inductance_it_is_the_straight_line():
     times, cycles = jnp.geomspace(0.01, 0.001, 5), 6
     plain = {name: x for name, x in NUMBERS.items() if name != "electrical_time"}
@@ -142,6 +143,7 @@ def test_with_less_and_less_inductance_it_is_the_straight_line():
         assert order == pytest.approx(1.0, abs=0.05), name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("crank", [vi.CosineCrank(), vi.SliderCrank(1 / 3)], ids=["cos", "slider"])
 def test_clocks_agree(crank):
     scene = machine(crank=crank)
@@ -251,6 +253,7 @@ def test_a_stall_points_to_the_time_clock():
         vi.simulate(scene, scene.start(W=0.0, M=0.0), 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("te", [0.004, 0.3, 30.0])
 def test_fixed_steps_stay_stable(te):
     """However fast the current settles, or however slowly it swings with the shaft."""

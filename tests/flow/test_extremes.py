@@ -5,7 +5,7 @@ import pytest
 from envelope import CASES
 
 # The others take longer than a minute together.
-BRIEF = ("ζ = 1, ξ = 0", "d within", "denormal", "rtol")
+BRIEF = ("d within", "rtol")
 
 
 def rows():

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 import vi_jax as vi
 
 BOUNCES = 6
@@ -104,6 +105,7 @@ def compared(count, seed=7):
     return fair, wrong
 
 
+@pytest.mark.slow
 def test_bounces_on_a_ramp_whose_waves_are_shorter_than_steps():
     """Of 130 motions none goes through a crest, where a tenth of a second is a step."""
     fair, wrong = compared(140)

@@ -29,6 +29,7 @@ def test_inverse_of_small_matrices():
         np.testing.assert_allclose(inverse_of(jnp.asarray(matrix)) @ matrix, np.eye(n), atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("torque", [1e2, 1e4, 1e6])
 def test_strong_motors_beside_scipy(torque):
     scene = strong(torque)
@@ -61,6 +62,7 @@ def test_steps_do_not_grow_with_the_motor():
     assert int(counts.max()) < 1.2 * int(counts.min())
 
 
+@pytest.mark.slow
 def test_both_clocks_agree():
     scene = strong(1e3)
     phase, time = (vi.simulate(scene, scene.start(), 8, method=IMPLICIT, clock=c)

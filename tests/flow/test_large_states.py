@@ -79,6 +79,7 @@ def flat(state):
     return np.concatenate([np.atleast_1d(x) for x in jax.tree.leaves(state)], axis=-1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [vi.FixedStep(steps_per_cycle=40), vi.Adaptive(rtol=1e-9)])
 def test_arrays_are_numbers(method):
     def run(machine):

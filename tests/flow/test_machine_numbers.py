@@ -110,6 +110,7 @@ def test_ten_numbers_are_one_program_to_find_orbits(traces, name):
     assert traces["find_orbit"] == 1
 
 
+@pytest.mark.slow
 def test_what_is_whole_is_a_part_of_the_program(traces):
     two, three = Shaken(), Shaken(harmonics=3)
     last = {float(vi.simulate(m, m.start(), 11).last.Y) for m in (two, three)}

@@ -8,6 +8,7 @@ import vi_jax as vi
 from vi_jax.machine.trig import sincos
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("crank", ["cosine", "slider"])
 def test_clocks_agree(crank):
     scene = vi.Parameters(torque=10.0, control=0.9, restitution=0.5).scene(crank=crank)
@@ -24,6 +25,7 @@ def test_clocks_agree(crank):
     np.testing.assert_allclose(phase.frequency_ratio, 2 * np.pi / phase.duration, rtol=1e-14)
 
 
+@pytest.mark.slow
 def test_ideal_clocks_agree():
     scene = vi.Scene.ideal(frequency_ratio=0.7, restitution=0.6, gap=1.2, damping_ratio=0.02)
     start = scene.start(Y=0.3, V=0.1)

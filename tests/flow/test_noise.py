@@ -152,13 +152,15 @@ def test_methods_and_backends_leave_the_path(many):
         np.testing.assert_allclose(paths().sections.V, V, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_cycles_that_settle_are_counted():
     whole = paths(record="sections").sections.V
     late = paths(cycles=5, settle=3, record="sections").sections.V
     assert np.array_equal(late, whole[:, 3:])
 
 
-@pytest.mark.parametrize("mode", quick([jax.jacfwd, jax.grad], jax.jacfwd))
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.grad])
 def test_derivatives_follow_the_path(mode):
     def last(x):
         noise = shaken(16, x[0])

@@ -62,6 +62,7 @@ def test_a_scene_that_outlived_double_precision_is_refused_by_that_name():
             vi.simulate(early, start, 2)
 
 
+@pytest.mark.slow
 def test_single_precision_is_told_once_and_no_branch_is_begun_in_it():
     """A search simulates within several programs; the corrector of a branch asks for 1e-11."""
     with jax.enable_x64(False), warnings.catch_warnings(record=True) as told:

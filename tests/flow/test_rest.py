@@ -117,6 +117,7 @@ def test_a_motion_through_rest_forgets_its_start():
     assert float(orbit.state.Y) == GAP and float(orbit.state.V) == 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.grad])
 def test_derivatives_pass_through_rest(derivative):
     def lowest(zeta):
@@ -222,15 +223,15 @@ def test_nothing_is_lost_over_many_machines(k):
     assert float(beyond.max()) < 1e-12
 
 
-@pytest.mark.parametrize(
-    "method", [METHODS[0], pytest.param(METHODS[1], marks=pytest.mark.slow)], ids=IDS[:2]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("method", METHODS[:2], ids=IDS[:2])
 def test_one_impact_and_rest_without_restitution(method):
     body = scene(zeta=0.9, k=0.0, gap=0.8)
     orbit = vi.find_orbit(body, body.start(Y=0.2), method=method)
     assert bool(orbit.successful) and int(orbit.impacts) == 1
 
 
+@pytest.mark.slow
 def test_single_precision_rests_as_double_does():
     """Random machines that chatter, rest and leave; the flattest hops are below rounding."""
     rng = np.random.default_rng(0)

@@ -31,6 +31,7 @@ def test_samples_refine_the_sections(method):
     )
 
 
+@pytest.mark.slow
 def test_samples_of_a_motor_in_both_clocks():
     scene = vi.Parameters().scene()
     runs = [
@@ -104,6 +105,7 @@ def test_the_impact_log_tells_crank_angles_in_both_clocks():
     assert np.nanmax(logs[1].phase) <= 2 * np.pi
 
 
+@pytest.mark.slow
 def test_a_run_as_a_labelled_data_set():
     scene = vi.Scene.ideal(frequency_ratio=0.9)
 

@@ -52,8 +52,12 @@ def product(Y: float, V: float, cycles: int) -> tuple[np.ndarray, int]:
 @pytest.mark.parametrize("jacobian", quick([jax.jacfwd, jax.jacrev], jax.jacrev))
 @pytest.mark.parametrize(
     ("method", "tolerance"),
-    [(vi.ExactFlight(), 1e-9), (vi.Adaptive(diffrax.Tsit5(), rtol=1e-11), 1e-7)],
-    ids=["ExactFlight", "Adaptive"],
+    [
+        pytest.param(vi.ExactFlight(), 1e-9, id="ExactFlight"),
+        pytest.param(
+            vi.Adaptive(diffrax.Tsit5(), rtol=1e-11), 1e-7, marks=pytest.mark.slow, id="Adaptive"
+        ),
+    ],
 )
 def test_jacobian_is_the_product(method, tolerance, jacobian, impacts):
     Y, V, cycles = CASES[impacts]
@@ -78,6 +82,7 @@ def test_parameters_by_central_differences(impacts):
         np.testing.assert_allclose(found[:, i], difference, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("clock", ["phase", "time"])
 def test_motor_control_by_central_differences(clock):
     def f(kappa):

@@ -73,6 +73,7 @@ def test_an_ideal_drive_as_the_exact_flight(name, clock):
 MOTOR = vi.Parameters(torque=10.0, restitution=0.5, gap=0.08, control=0.9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("clock", ["phase", "time"])
 @pytest.mark.parametrize("method", [vi.Taylor(16, 8), vi.Taylor(16, rtol=1e-12)])
 def test_a_motor_as_the_reference(clock, method):
@@ -87,6 +88,7 @@ def test_a_motor_as_the_reference(clock, method):
     np.testing.assert_allclose(mine.duration, truth.duration, atol=2e-9)
 
 
+@pytest.mark.slow
 def test_two_stops_and_the_exact_crank():
     oscillator = vi.Oscillator(0.02)
     stops = (vi.RigidStop(0.9, 0.6), vi.RigidStop(1.1, 0.7, "left"))
@@ -126,6 +128,7 @@ def test_a_method_of_ones_own_foresees():
     np.testing.assert_array_equal(mine.steps, other.steps)
 
 
+@pytest.mark.slow
 def test_more_orders_and_shorter_steps_are_better():
     scene = MOTOR.scene()
     start = scene.start(W=0.9)
@@ -138,6 +141,7 @@ def test_more_orders_and_shorter_steps_are_better():
     assert error(vi.Taylor(8, 8)) > 10 * error(vi.Taylor(8, 16))
 
 
+@pytest.mark.slow
 def test_derivatives_pass_through_impacts():
     def final(kappa):
         motor = vi.Parameters(torque=10.0, restitution=0.5, gap=0.08, control=kappa).scene()

@@ -113,6 +113,7 @@ def _scaled(x):
     return FACTOR * x
 
 
+@pytest.mark.slow
 def test_clearing_the_caches_of_jax_clears_ours(monkeypatch):
     x = jnp.asarray(3.0)
     assert lanes.once(_scaled, x) == 6.0

@@ -206,6 +206,7 @@ def quotients(x, y):
     return x / y + 1 / y - x / 2 + inner(y) + branch + loop + rows.sum()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["auto", "xla"])
 def test_derivatives_of_quotients(backend):
     rng = np.random.default_rng(4)

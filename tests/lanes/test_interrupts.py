@@ -26,6 +26,7 @@ def test_threads_are_a_number(number):
         vi.threads(number)
 
 
+@pytest.mark.slow
 def test_two_threads_may_come_to_lanes_first():
     """The handler that XLA has must stay, whichever thread made it."""
     script = Path(__file__).with_name("first_use.py")
@@ -62,10 +63,8 @@ def _printed(script, *arguments):
     return done
 
 
-@pytest.mark.parametrize(
-    "ways", [("jit",), pytest.param(("simulate", "vi.jit", "vmap", "grad", "sweep"),
-                                    marks=pytest.mark.slow)],
-)  # fmt: skip
+@pytest.mark.slow
+@pytest.mark.parametrize("ways", [("jit",), ("simulate", "vi.jit", "vmap", "grad", "sweep")])
 def test_each_way_into_a_kernel_hears_an_interrupt(ways):
     done = _printed("interrupted_ways.py", *ways)
     assert "swallowed" not in done.stderr
@@ -74,6 +73,7 @@ def test_each_way_into_a_kernel_hears_an_interrupt(ways):
         assert name == way and all(float(s) < 2 for s in seconds), line
 
 
+@pytest.mark.slow
 def test_a_loop_hears_every_interrupt_and_keeps_its_numbers():
     """Wherever between two instructions it comes, also as XLA calls into Python."""
     done = _printed("interrupted_loop.py")

@@ -58,6 +58,7 @@ def test_the_backend_of_the_context():
         pass
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None, derandomize=True)
 @given(st.data())
 def test_lanes_do_not_depend_on_each_other(data):

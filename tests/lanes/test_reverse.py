@@ -59,12 +59,9 @@ ORDERS = {
     "reverse over reverse": lambda f: jax.jacrev(jax.jacrev(f)),
     "third": lambda f: jax.grad(lambda p: jax.jvp(jax.grad(f), (p,), (V,))[1] @ W),
 }
-SOON = ("gradient", "hessian", "reverse over reverse")
 
 
-@pytest.mark.parametrize(
-    "order", [x if x in SOON else pytest.param(x, marks=pytest.mark.slow) for x in ORDERS]
-)
+@pytest.mark.parametrize("order", quick(ORDERS, "gradient"))
 def test_derivatives_of_any_order_are_those_by_columns(by_tape, order):
     program = jax.make_jaxpr(ORDERS[order](lost))(P)
     # Else a JAX has other names for what it leaves in a transposed derivative (see `reverse`).
@@ -91,6 +88,7 @@ def gradients(x, r, n):
     return jax.jit(jax.vmap(jax.grad(one, (0, 1))))(x, r, n)
 
 
+@pytest.mark.slow
 def test_the_same_bits_by_any_tape_on_any_threads_in_any_batch(by_tape, monkeypatch):
     """Steps taken again from an entry of a thinned tape lead to the same states. (These maps are
     chaotic: over 100 steps one rounding would grow to everything.)"""
@@ -133,6 +131,7 @@ def ring(x, mix, weights):
     return lanes.run(begin, step, end, (x, mix, weights), rows=9)
 
 
+@pytest.mark.slow
 def test_arrays_in_memory_go_back_too(by_tape, monkeypatch):
     rng = np.random.default_rng(3)
     x, mix = rng.uniform(0.1, 0.9, (11, 20)), rng.uniform(0.1, 0.3, 11)
@@ -162,7 +161,8 @@ def test_arrays_in_memory_go_back_too(by_tape, monkeypatch):
         np.testing.assert_array_equal(a, b)
 
 
-@pytest.mark.parametrize("size", quick([5, 23], 5))
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [5, 23])
 def test_through_what_is_written_in_jax(by_tape, size):
     """Beside JAX's derivatives of the same steps without a loop."""
     functions = (

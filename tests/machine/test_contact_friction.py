@@ -12,6 +12,7 @@ from rough_block import Block, Plane
 from rough_block import on_plane as at
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("along", [0.0, 0.5])
 def test_an_oblique_impact_slips_or_sticks(along):
     """Closed form: the impulse along the floor is μ (1 + k) v of the speed v, or what sticking
@@ -56,6 +57,7 @@ def test_a_block_slides_to_rest():
     assert float(run.last.u) == 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", [1.0, -1.0])
 def test_a_block_bounces_to_rest_while_it_slides(way):
     """By its momentum: the floor's impulses, those of endless last bounces included, add up to its
@@ -124,6 +126,7 @@ def ends(pull, lift, one):
 PULLS = jnp.array([0.2, 0.5, 1.1])
 
 
+@pytest.mark.slow
 def test_under_the_force_of_the_floor_friction_is_dry_friction():
     """Stick and slip of a block under a force that varies: beside friction under a given load."""
     for lift in (0.0, 0.6):
@@ -177,6 +180,7 @@ class Coupled(vi.AbstractMachine):
         return Plane(z.u, z.v, 0 * z.u, 0 * z.v)
 
 
+@pytest.mark.slow
 def test_a_law_that_would_gain_energy_is_refused():
     """Newton's law across a stop and Coulomb's along it may add energy where both velocities are
     coupled (Kane's paradox); the impulses beside the linear complementarity problem, solved by

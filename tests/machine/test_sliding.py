@@ -108,6 +108,7 @@ def test_it_leaves_where_one_side_points_away(way):
     np.testing.assert_allclose(leaves, [np.pi + np.arcsin(1 / a)], atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_cycle_that_slides_forgets():
     """It forgets where it began."""
     machine = Relay(1.5)

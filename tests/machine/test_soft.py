@@ -240,6 +240,7 @@ def test_a_stiff_stop_is_a_rigid_one():
         np.testing.assert_allclose([alone.Y, alone.V], [found.Y[i], found.V[i]], atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "method"),
     [({}, vi.FixedStep(steps_per_cycle=48)),

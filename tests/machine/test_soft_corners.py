@@ -15,6 +15,7 @@ def scene(**law):
     )
 
 
+@pytest.mark.slow
 def test_without_damping_nothing_is_to_be_let_go_of():
     """The force falls to zero just where the body comes out."""
     places = jnp.linspace(-1.0, 0.3, 200)

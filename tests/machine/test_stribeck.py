@@ -46,6 +46,7 @@ def orbit():
     return vi.find_orbit(Belt(), guess, method=CLOSE)
 
 
+@pytest.mark.slow
 def test_it_sticks_and_slips(orbit):
     """One slip from the force that friction holds to the belt's speed, then sticking at it."""
     speed = 1.5

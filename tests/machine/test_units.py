@@ -13,7 +13,7 @@ from vi_jax.scans._describe import variables_of
 from vi_jax.scans.grid import Blocks
 from vi_jax.scans.program import make_program
 
-from differences import quick
+from differences import some
 
 matplotlib.use("Agg")
 M = vi.machines
@@ -56,7 +56,8 @@ def test_every_number_has_a_unit(case):
     assert unit_of(units, names[int(machine.velocity(probe))]) == velocity
 
 
-@pytest.mark.parametrize("name", quick(MACHINES, "capsule", slow=("rotor",)))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", some(MACHINES, "capsule", "rotor"))
 def test_runs_and_rates_say_their_units(name):
     machine, _, position, _, rate = MACHINES[name]
     run = jax.eval_shape(lambda: vi.simulate(machine, machine.start(), 2, impact_log=2))
@@ -66,7 +67,8 @@ def test_runs_and_rates_say_their_units(name):
     assert f"0{'' if rate == '1' else ' ' + rate} (halves" in str(found)
 
 
-@pytest.mark.parametrize("kind", quick(MACHINES, "valve", slow=("rotor",)))
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", some(MACHINES, "valve", "rotor"))
 def test_scans_and_sweeps_say_their_units(kind):
     machine, called, position, velocity, rate = MACHINES[kind]
     name, start = leaf_names(machine)[0], leaf_names(machine.start())[0]
@@ -85,6 +87,7 @@ def test_scans_and_sweeps_say_their_units(kind):
     plt.close("all")
 
 
+@pytest.mark.slow
 def test_a_machine_that_states_nothing_is_told_without_units():
     class Own(vi.AbstractMachine):
         gap: float = 0.5

@@ -45,6 +45,7 @@ def test_a_beam_without_a_stop():
     assert vi.machines.Beam(modes=2, gap=None).stops == ()
 
 
+@pytest.mark.slow
 def test_beside_adaptive_steps():
     """With a stop along it, and turning points and impacts recorded."""
     beam = vi.machines.Beam(modes=3, gap=0.06, place=0.8, restitution=0.6)

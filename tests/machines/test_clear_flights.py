@@ -29,6 +29,7 @@ def test_where_no_stop_can_be_met_steps_are_longer():
     assert impacts >= 4 and fewer > 20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_what_is_said_to_be_clear_is(seed):
     """No stop is met within the length given, from any state, by a fine sampling of the flight."""

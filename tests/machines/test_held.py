@@ -101,6 +101,7 @@ class Table(vi.AbstractMachine):
         return Ball(jnp.array(0.3), jnp.array(0.0), jnp.array(0.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("radius", [0.0, 0.25])
 def test_balls_with_a_radius_rest_on_one_another(radius):
     balls = Pressed(radius)
@@ -120,6 +121,7 @@ def test_balls_with_a_radius_rest_on_one_another(radius):
                                    rtol=1e-7)  # fmt: skip
 
 
+@pytest.mark.slow
 def test_derivatives_of_balls_that_rest_on_one_another():
     def places(radius):
         balls = Pressed(radius)

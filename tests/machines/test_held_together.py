@@ -10,8 +10,6 @@ import pytest
 import vi_jax as vi
 from scipy.integrate import solve_ivp
 
-from differences import quick
-
 
 class Pair(eqx.Module):
     x: Any
@@ -55,7 +53,8 @@ class Stack(vi.AbstractMachine):
 AT_REST = Pair(*(jnp.array(0.0) for _ in range(4)))
 
 
-@pytest.mark.parametrize("wall_first", quick([False, True], False))
+@pytest.mark.slow
+@pytest.mark.parametrize("wall_first", [False, True])
 def test_a_stack_pressed_on_a_wall_stays_there(wall_first):
     """Whichever of them is pressed; and the outer body leaves where its own force turns."""
 
@@ -94,6 +93,7 @@ class Thrown(Stack):
         return Pair(z.u, force, z.v, force)
 
 
+@pytest.mark.slow
 def test_a_stack_is_thrown_off_as_one_and_comes_back():
     """As one body, which leaves where 1 + 2 cos s = 0, flies, and bounces to rest or goes on."""
     run = vi.simulate(Thrown((1.0, 1.0, 2.0)), AT_REST, 3, event_log=12, max_impacts=2000)

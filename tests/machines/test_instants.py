@@ -113,6 +113,7 @@ class Lever(vi.AbstractMachine):
         return Plane(z.u, z.v, 0 * z.u, way + 0 * z.v)
 
 
+@pytest.mark.slow
 def test_a_body_is_let_go_of_by_the_impact_of_another():
     start = Plane(*(jnp.asarray(x) for x in (0.0, 0.0, 0.5, 0.0)))
     run = vi.simulate(Lever(), start, 1, event_log=4)
@@ -142,6 +143,7 @@ class Pulled(vi.AbstractMachine):
         return Plane(z.u, z.v, pull + 0 * z.u, -1 + 0 * z.v)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("slope", [0.0, 0.1, -0.1])
 def test_friction_lets_go_as_the_pull_jumps(slope):
     """Whether the pull then grows or falls: u = ∫(pull - 1) ds over two."""

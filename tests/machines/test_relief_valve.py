@@ -127,6 +127,7 @@ def test_a_closed_valve_rests_on_its_seat():
     np.testing.assert_allclose(run.sections.pressure[:13], 4 + 0.5 * np.arange(13), atol=1e-10)
 
 
+@pytest.mark.slow
 def test_a_valve_observed_at_equal_times():
     valve = VALVE(flow_rate=5.0)
     by_event = vi.simulate(valve, valve.start(), 4, method=CLOSE)
@@ -143,6 +144,7 @@ def test_a_valve_observed_at_equal_times():
         vi.machines.Duffing().observed_every(1.0)
 
 
+@pytest.mark.slow
 def test_derivatives_of_returns():
     """Of state, count of returns being fixed: dt*/dq is in them."""
 

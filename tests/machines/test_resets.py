@@ -34,6 +34,7 @@ def walk():
     return vi.find_orbit(Walker(0.009), legs(0.2003, -0.1998))
 
 
+@pytest.mark.slow
 def test_a_walker_walks(walk):
     assert bool(walk.successful)
     np.testing.assert_allclose(
@@ -95,6 +96,7 @@ def test_a_walker_doubles_its_step(walk):
     np.testing.assert_allclose(again.state.stance, twice.state.stance, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_exponents_of_a_walk_are_its_multipliers(walk):
     found = vi.lyapunov(Walker(0.009).observed_every(2.0), walk.state, 300, settle=20, number=3)
     per_time = np.log(abs(PAIR)) / STEP
@@ -107,6 +109,7 @@ def test_equal_times_are_asked_of_the_machine():
         vi.lyapunov(ThreeStates(1.8).observed_every(1.0), start, 4)
 
 
+@pytest.mark.slow
 def test_derivatives_pass_through_a_reset():
     """Of the state after three steps by the slope: forward, backward and by differences."""
 
@@ -196,6 +199,7 @@ def cycle():
     return vi.find_orbit(ThreeStates(1.8), tuple(map(jnp.asarray, (1.0, 0.7955, 0.2343))))
 
 
+@pytest.mark.slow
 def test_a_cycle_of_three_states_is_that_of_matrix_exponentials(cycle):
     found = [cycle.state[1], cycle.state[2], cycle.duration]
     np.testing.assert_allclose(found, three(1.8), atol=1e-10)

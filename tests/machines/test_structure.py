@@ -30,6 +30,7 @@ def check_cycle_by_cycle(machine, truth, start, cycles, tolerance=1e-11, **optio
     return impacts, rests
 
 
+@pytest.mark.slow
 def test_beside_matrix_exponentials():
     """Damped in any way, and with a motion as a rigid body."""
     total, options = 0, {"record": "sections", "rests": False}
@@ -38,6 +39,7 @@ def test_beside_matrix_exponentials():
     assert total >= 10
 
 
+@pytest.mark.slow
 def test_rest_beside_matrix_exponentials():
     """What comes to rest on a stop is held, the others moving on, until its force turns."""
     rested = 0
@@ -194,6 +196,7 @@ def test_both_sides_of_a_gap_are_one_coordinate():
     np.testing.assert_allclose(machine.coordinates[0].mass, 0.5)
 
 
+@pytest.mark.slow
 def test_modes_at_points():
     """Two equal masses between three equal springs: modes (1, 1) and (1, -1) over √2."""
     K = np.array([[2.0, -1.0], [-1.0, 2.0]])
@@ -280,6 +283,7 @@ class Hardening(vi.machines.Structure):
         return vi.machines.StructureState(rate.displacement, rate.velocity - more)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error")
 def test_rules_of_its_own_are_vector_code():
     """A mass matrix and the shortest period are worked out once, not in each step."""

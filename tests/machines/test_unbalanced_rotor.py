@@ -173,6 +173,7 @@ def test_an_elastic_impact_keeps_all():
     np.testing.assert_allclose(energy, energy[0], rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_a_start_from_rest_and_a_stall():
     rotor = ROTOR(control=1.2, strength=0.3)
     with pytest.raises(ValueError, match=r"W > 0 in the phase clock.*W = 0"):
@@ -186,6 +187,7 @@ def test_a_start_from_rest_and_a_stall():
         assert bool(stalled.result == vi.RESULTS.stalled)
 
 
+@pytest.mark.slow
 def test_a_body_pressed_on_comes_to_rest_and_leaves():
     """The unbalance presses the body on while W² cos φ exceeds the gap; in both clocks."""
     rotor = ROTOR(
@@ -221,6 +223,7 @@ def test_wrong_numbers_are_named(make, message):
         make()
 
 
+@pytest.mark.slow
 def test_an_orbit_of_the_time_clock_is_that_of_the_angle():
     """A search takes the machine by its angle, and states that were made for either clock."""
     timed = ROTOR(clock_name="time")

@@ -144,6 +144,7 @@ def test_lyapunov(case, orbit):
     assert (rates[~alive] < -10).all()
 
 
+@pytest.mark.slow
 def test_continue_orbit(case, orbit, branch):
     assert tuple(point.kind for point in branch.special) == case.special
     (again,) = (o for o in branch.at(value_of(case)) if bool(o.stable))
@@ -206,6 +207,7 @@ def test_scan(case, orbit):
     vi.plot_regimes(data, machine=case.machine)
 
 
+@pytest.mark.slow
 def test_basins(case, orbit):
     ends = {
         f"start.{name}": tuple(float(getattr(orbit.state, name)) + np.array([-0.02, 0.01]))
@@ -222,6 +224,7 @@ def test_basins(case, orbit):
     vi.plot_basins(found)
 
 
+@pytest.mark.slow
 def test_suggest_method(case):
     found = vi.suggest_method(case.machine, error=1e-4, cycles=3, lanes=8)
     assert found.reached and found.error <= 1e-4

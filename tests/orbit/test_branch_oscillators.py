@@ -116,6 +116,7 @@ def test_a_motor_hangs_at_resonance_below_a_certain_torque():
     assert 8.0 * top / float(scene.drive.strength) == pytest.approx(11.49, rel=3e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", [0.6, 0.65, 0.68])
 def test_without_damping_the_touch_is_on_the_section_and_nothing_else_is_special(start):
     """The body turns where φ = 0, with a rate that is rounding, and its multipliers have modulus 1,

@@ -46,6 +46,7 @@ def rate(zeta, clock, y, v):
 RATE = jax.jit(lambda scene, clock, x: scene.field(clock, x))
 
 
+@pytest.mark.slow
 def test_motions_of_the_branch_are_flights_from_release(branch):
     """A rest ends where the force on the body in it turns away from the stop, by a root; from there
     to the section the body flies, by scipy."""
@@ -89,6 +90,7 @@ LOST = [
 ]  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("k", "gap", "damping", "bounds"), LOST)
 def test_the_rest_is_lost_where_its_chatter_takes_until_release(k, gap, damping, bounds):
     """Beside flights in 40 digits; those of double precision lose it 3e-7 elsewhere."""
@@ -196,6 +198,7 @@ def carried(half_gap, restitution=0.5):
     return found
 
 
+@pytest.mark.slow
 def test_chatter_and_rest_pass_over_the_section():
     """Both walls of a shaken box carry its ball for a while. On the section the ball flies at
     first; as the gap gets smaller its first impact comes upon the section, where the state jumps

@@ -69,6 +69,7 @@ def falling(approach):
     return 0.9 / (1 + 0.3 * approach)
 
 
+@pytest.mark.slow
 def test_flight_in_closed_form_is_asked_for_only_where_it_is_that():
     """Parts with a law of their own are refused, or carried as by steps."""
     for other in (of(crank=Doubled()), of(Hardening)):

@@ -203,6 +203,7 @@ def test_a_flow_has_a_zero_exponent():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [vi.Adaptive(), vi.Taylor(rtol=1e-12)])
 def test_a_branch_refuses_steps_of_no_fixed_length(method):
     """Rather than replacing them."""
@@ -249,9 +250,8 @@ def followed_by(wanted, orbit, asked=None):
     np.testing.assert_allclose(same.multipliers, orbit.multipliers, rtol=1e-9)
 
 
-@pytest.mark.parametrize(
-    "method", [pytest.param(Counted(60), marks=pytest.mark.slow), vi.Taylor(20, 40)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("method", [Counted(60), vi.Taylor(20, 40)])
 def test_a_branch_takes_any_method_of_fixed_steps(method):
     """One of one's own, and `Taylor` without a tolerance."""
     known = duffing_orbit(vi.FixedStep(steps_per_cycle=60))

@@ -18,6 +18,7 @@ def free():
     return vi.continue_orbit(orbit, parameter=ZETA, bounds=(0.5, 1.5), extrema=sought)
 
 
+@pytest.mark.slow
 def test_of_the_linear_oscillator(free):
     """Resonance of the amplitude 1/√((1 - ζ²)² + (2ξζ)²), and of what is seen on the section, its
     real part and that of its velocity."""

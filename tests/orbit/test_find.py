@@ -25,7 +25,8 @@ def near(scene, cycles, by=0.01):
     return scene.start(Y=closed.Y[0] - by, V=closed.V[0] - by)
 
 
-@pytest.mark.parametrize("cycles", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("cycles", [1, 2])
 def test_the_table_of_values(cycles):
     Y, V, y_min, phase, speed, multipliers = TABLE[cycles]
     orbit = vi.find_orbit(UNDAMPED, near(UNDAMPED, cycles), cycles=cycles, throw=True)

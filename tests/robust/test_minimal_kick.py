@@ -73,6 +73,7 @@ def test_no_kick_as_small_leads_elsewhere(motions, result, two_impacts):
     assert np.asarray(two_impacts(begin + (1 + 1e-7) * around)).any()
 
 
+@pytest.mark.slow
 def test_the_edge_is_the_saddle(motions, result):
     saddle = vi.find_orbit(SCENE, SCENE.start(Y=1.26, V=1.086), 2)
     assert saddle.successful and not saddle.stable

@@ -141,6 +141,7 @@ def test_the_worst_moment_of_a_machine_without_a_drive():
     assert float(found.norm) == pytest.approx(apart.min(), abs=1e-5)
 
 
+@pytest.mark.slow
 def test_phases_that_cannot_be_asked(motion):
     ask = vi.minimal_kick
     with pytest.raises(ValueError, match="`phase` must be a number or \"worst\", but got 'best'"):

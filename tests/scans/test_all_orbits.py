@@ -66,6 +66,7 @@ def test_says_what_was_searched(found, tmp_path):
     assert data.y_min.attrs["units"] == "a" and len(found.to_xarray(along="search").search) == 1
 
 
+@pytest.mark.slow
 def test_an_equilibrium_of_an_autonomous_machine_is_no_motion():
     """A body on a belt slides steadily where its spring holds friction, and there every period
     would do; about it there is the cycle that sticks and slips, and one that only slips."""

@@ -20,6 +20,7 @@ def profile():
     return vi.integrity_profile(SCENE, ZETA, [1.5, 1.3, 1.4, 0.9], REGION, **QUICK)
 
 
+@pytest.mark.slow
 def test_motions_are_followed_along_the_values(profile):
     assert profile.values.tolist() == [0.9, 1.3, 1.4, 1.5]
     names = [profile.name_of(i) for i in range(3)]

@@ -56,6 +56,7 @@ def test_an_interrupted_sweep_gives_the_values_that_were_done(monkeypatch):
     np.testing.assert_array_equal(part.sections.W, whole.sections.W[:32])
 
 
+@pytest.mark.slow
 def test_an_interrupted_branch_is_a_branch(monkeypatch):
     scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.0)
     orbit = vi.find_orbit(scene, scene.start(Y=1.6, V=-1.9), cycles=2)
@@ -126,6 +127,7 @@ def struck(monkeypatch, place, after):
     monkeypatch.setattr(module, name, until)
 
 
+@pytest.mark.slow
 def test_interrupted_exponents_are_those_of_fewer_cycles(monkeypatch):
     """On a periodic motion, whose exponents are ln|multiplier|/duration."""
     scene = vi.Scene.ideal(frequency_ratio=1.4, restitution=0.8, gap=2.0, damping_ratio=0.2)

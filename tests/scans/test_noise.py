@@ -33,6 +33,7 @@ def whole():
     return scanned().load()
 
 
+@pytest.mark.slow
 def test_a_lane_is_the_run_with_the_key_of_its_number(whole):
     for row, path in ((0, 7), (1, 211)):
         noise = vi.WhiteNoise({"V": AXES["noise.V"][row]}, impulses=16)

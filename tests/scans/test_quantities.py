@@ -44,6 +44,7 @@ def test_a_sweep_shows_it(runs):
         vi.plot_sweep(swept, y="given")
 
 
+@pytest.mark.slow
 def test_exponents_tell_it(runs):
     machine = Shaken(frequency=FREQUENCIES[0])
     found = vi.lyapunov(machine, runs[0].last, 8, settle=0, number=1)
@@ -51,6 +52,7 @@ def test_exponents_tell_it(runs):
     assert "mean taken: " in repr(found) and found.to_xarray().taken.attrs["units"] == "W"
 
 
+@pytest.mark.slow
 def test_on_the_command_line(tmp_path, monkeypatch, capsys):
     """By name in files, and a wrong name is told with those there are, before any work."""
     monkeypatch.chdir(tmp_path)

@@ -22,6 +22,7 @@ def _regimes_of(lanes, settle):
     return vi.scan(SCENE, axes, measure="regime", settle=settle, paired=True)
 
 
+@pytest.mark.slow
 def test_regime_tells_periods_chaos_and_what_does_not_settle():
     zetas = [0.65, 0.7, 0.9, 0.97, 1.1, 1.4]
     data = _regimes_of([(zeta, 0.8, 0.0) for zeta in zetas], settle=3000)
@@ -101,6 +102,7 @@ def test_windows_of_periods_beside_a_grazing():
     assert vi.sweep(scene, "stops.0.gap", values, settle=400).period.tolist() == [5, 1]
 
 
+@pytest.mark.slow
 def test_what_repeats_and_what_spirals_in():
     """Sections made by hand: how closely periods must fit, by what fits best and by the method."""
     n, one = jnp.arange(256), jnp.ones(256, int)

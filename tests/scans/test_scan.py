@@ -121,6 +121,7 @@ def test_own_measures_scenes_and_starts():
     assert float(lane.frequency_ratio) == pytest.approx(speed, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_a_run():
     names = ("drive.frequency_ratio", "start.V", "stops.0.gap")
     data = vi.scan(

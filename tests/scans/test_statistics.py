@@ -95,6 +95,7 @@ class Reflected(Free):
         return (vi.RigidStop(0.0, 1.0, "left"),)
 
 
+@pytest.mark.slow
 def test_impacts_on_an_elastic_stop_are_crossings_of_zero():
     """By Rice's formula with the covariance at each time between two impulses, so that of the
     number of impulses, 4 in a cycle, nothing is left to be extrapolated."""
