@@ -82,8 +82,9 @@ def continue_orbit(
     - `fixed`: for each of them a number of the motion, of the names above, that is held instead:
       `{"y_min": -3.0}`; `None` holds it where the orbit has it. The orbit must have about the
       value, and what the free numbers do not change cannot be held (`"y_max"` of a motion that
-      hits its right stop). The special point `turn` is one where the parameter turns back; a
-      `fold` is then where a multiplier passes 1. Hopf points are not sought.
+      hits its right stop, unless the gap is free). The special point `turn` is one where the
+      parameter turns back; a `fold` is then where a multiplier passes 1. Hopf points are not
+      sought.
     - `method`: how the machine is carried, of fixed steps: by default that of the orbit if its
       steps are, else `ExactFlight()` where it applies, else 20 steps of `Verner9` a cycle. Of an
       implicit solver, as `Adaptive(diffrax.Kvaerno5())`, equal steps are taken.

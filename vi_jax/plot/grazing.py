@@ -68,9 +68,8 @@ def plot_grazing(
     ax.set_xticks(ticks, ["0", *(f"{x:.2g}" for x in ticks[1:])])
     units = dict(found.units)
     ax.set_xlabel(f"{axis_name(found.parameter, units)}, from {found.value:.6g}")
-    ax.set_ylabel(
-        in_brackets(f"{name_in(found.labels[0])} on the section", unit_of(units, "position"))
-    )
+    upwards = f"{name_in(found.labels[0])} on the section, from that without impact"
+    ax.set_ylabel(in_brackets(upwards, unit_of(units, "position")))
     if legend:
         ax.legend(fontsize="small", frameon=False)
     return ax
