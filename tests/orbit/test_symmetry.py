@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import vi_jax as vi
 from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
 
 from differences import some
 
@@ -112,6 +113,42 @@ def test_a_broken_branch_ends_nowhere_else(max_step, distance):
     phases = np.sort(np.asarray(low.impact_phase))
     apart = min(np.abs(phases - np.sort(x)).max() for x in ([5.7715, 1.5624], [2.6299, 4.7040]))
     assert apart < 2e-4
+
+
+def gap_of(e):
+    """Half the box in which a ball of restitution e loses its symmetry."""
+    return (np.pi / 2 - 2 / np.pi) / np.hypot(2 / np.pi, (1 - e) / (1 + e))
+
+
+def touched_again(e):
+    """How far beyond the wall that it has left the ball would come there once more. Between walls
+    it flies with the speed w, sin s₀ = π w/2 - λ and cos s₀ = -σ w at the wall."""
+    share, gap = (1 - e) / (1 + e), gap_of(e)
+    w = np.roots([np.pi**2 / 4 + share**2, -np.pi * gap, gap**2 - 1]).max()
+    begin = np.arctan2(np.pi * w / 2 - gap, -share * w)
+    turn = (-np.arccos(-w) - begin) % (2 * np.pi)
+    return np.sin(begin) - w * turn - np.sin(begin + turn)
+
+
+@pytest.mark.slow
+def test_grazings_end_where_the_motion_becomes_symmetric():
+    pair = M.ImpactPair(half_gap=1.35, restitution=0.5)
+    branch = vi.continue_orbit(settled(pair), parameter="half_gap", bounds=(1.25, 1.5))
+    broken = vi.continue_orbit(
+        branch.special[0].switch(distance=0.03), parameter="half_gap", bounds=(0.8, 6.0)
+    )
+    bounds = ((0.5, 2.0), (0.0, 1.0))
+    curve = vi.boundary(broken.special[0], parameter="restitution", bounds=bounds)
+    assert curve.ends == ("symmetry-breaking", "bounds")
+    assert curve.parameters[-1, 1] == 1.0  # a restitution of more has no machine
+    end = curve.special[0]
+    assert end.kind == "symmetry-breaking"
+    e = brentq(touched_again, 0.05, 0.1, xtol=1e-14)
+    np.testing.assert_allclose(end.parameters, [gap_of(e), e], atol=1e-9)
+    lost = vi.boundary(end.switch(), parameter="restitution", bounds=bounds)
+    gaps, shares = lost.parameters.T
+    np.testing.assert_allclose(gaps, gap_of(shares), atol=1e-12)
+    assert lost.ends == ("grazing", "bounds")
 
 
 SNAP = M.Duffing(

@@ -4,10 +4,9 @@ import dataclasses
 from functools import cached_property
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
-from .._at_work import at_work
+from .._at_work import Tell, at_work
 from .._checks import flag, instance_of, interval
 from .._interrupted import Interrupted
 from .._lazy import xr
@@ -26,7 +25,7 @@ from ._special_condition import Special, symmetry_condition
 from ._symmetry import may_be_symmetric
 from ._tables import stability_in_words
 from .codimension_two import CodimensionTwo
-from .curve import INTERRUPTED, Step, check_walk, walk
+from .curve import INTERRUPTED, STALLED, Step, check_walk, walk
 from .results import InWords, Orbit
 from .special import DOUBLING, FOLD, SYMMETRY, TORUS, TOUCHING, SpecialPoint, one
 
@@ -65,8 +64,9 @@ class Boundary(InWords):
     ends: tuple[str, str]
     """Why the curve ends on each side: "bounds", "grazing" (an impact more or less), "closed" (it
     has come back to its first point, which is its last one as well), of a curve of Neimark–Sacker
-    points "resonance-1:1" and "resonance-1:2" (the two multipliers become real), "stalled",
-    "max_points", "interrupted"."""
+    points "resonance-1:1" and "resonance-1:2" (the two multipliers become real), of a curve of
+    motions without symmetry "symmetry-breaking" (they become symmetric), "stalled", "max_points",
+    "interrupted"."""
     problem: Shooting = dataclasses.field(repr=False)
     steps: list[Step] = dataclasses.field(repr=False)
     condition: Special = dataclasses.field(repr=False)
@@ -191,12 +191,18 @@ def boundary(
         return Interrupted("walk along the boundary", curve())
 
     with at_work("boundary", kept, progress=progress, unit="point") as tell:
-        ends[1] = walk(ahead.advance, forward, stop=ahead.stop, tell=tell, **settings)
-        if ends[1] == "closed":
-            ends[0] = ends[1]
-        else:
-            ends[0] = walk(back.advance, backward, stop=back.stop, tell=tell, **settings)
+        ends[1] = _walked(ahead, forward, tell, settings)
+        ends[0] = ends[1] if ends[1] == "closed" else _walked(back, backward, tell, settings)
     return curve()
+
+
+def _walked(monitor: CurveMonitor, steps: list[Step], tell: Tell, settings: dict[str, Any]) -> str:
+    """Walk from the last of these steps on, to which others are added; why it ended."""
+    end = walk(monitor.advance, steps, stop=monitor.stop, tell=tell, **settings)
+    if end == STALLED:
+        last, end = monitor.stalled(steps)
+        steps += [] if last is steps[-1] else [last]
+    return end
 
 
 def _check_point(point: SpecialPoint) -> None:
@@ -249,7 +255,7 @@ def _special_motion(
     their unknowns at the point where it begins."""
     old = point.problem
     two = dataclasses.replace(old, parameters=(*old.parameters, parameter))
-    corners = [two.at(jnp.asarray([a, b])) for a in bounds[0] for b in bounds[1]]
+    corners = two.corners(bounds)
     steps = max(old.steps, steps_of(old.method, corners, old.like, old.cycles))
     problem = dataclasses.replace(two, steps=steps)
     values = point.parameter, float(leaf(old.machine, parameter))

@@ -78,7 +78,7 @@ def points_of(
     for place, end in ((0, ends[0]), (len(steps) - 1, ends[1])):
         if end == GRAZING and condition.kind not in TOUCHING:
             found.append((place, point(GRAZING, steps[place], _grazes(steps[place]))))
-        if end in (RESONANCE_1, RESONANCE_2):
+        if end in (RESONANCE_1, RESONANCE_2, SYMMETRY):
             found.append((place, point(end, steps[place])))
     for kind, test in _tests_of(problem, condition, scale).items():
         for place, step in _zeros(problem, steps, scale, test):

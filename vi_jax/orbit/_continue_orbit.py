@@ -1,7 +1,6 @@
 """`continue_orbit`: a periodic motion followed in one parameter, and why it changes."""
 
 import dataclasses
-import itertools
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
@@ -237,8 +236,8 @@ def _freed(
     wide = dataclasses.replace(
         problem, parameters=(*free, *problem.parameters), conditions=as_held(targets, multipliers)
     )
-    corners = [wide.at(jnp.asarray(corner)) for corner in itertools.product(*ranges)]
     if problem.follows_events:
+        corners = wide.corners(ranges)
         steps = max(problem.steps, steps_of(problem.method, corners, problem.like, problem.cycles))
         wide = dataclasses.replace(wide, steps=steps)
     return wide, np.concatenate([x[:-1], values, x[-1:]]), ranges

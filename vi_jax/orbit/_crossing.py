@@ -13,6 +13,9 @@ from .special import CROSSING, DOUBLING, FOLD, TORUS
 # a choice.
 BESIDE = 1e-3
 
+# At most so many times as far on each side.
+MOST = 8
+
 
 def tests_of(step: Step) -> dict[str, float]:
     """Functions that change sign at the bifurcations."""
@@ -52,18 +55,20 @@ def crossing(
     **Arguments:** `along`, the curve's point at a length along a tangent, `None` where there is
     none; `root`, about where it is; the test.
 
+    Where the curve is found on the near side only, there are more neighbours of that one.
+
     **Returns:** its unknowns and its tangent; `None` if too few points were found, or no zero.
     """
     found: dict[float, Step] = {}
-    for side, wanted in ((-BESIDE, 3), (BESIDE, 6)):
-        for n in range(1, 9):
+    for side, wanted in ((-BESIDE, 3), (BESIDE, 6), (-BESIDE, 6)):
+        for n in range(1, MOST + 1):
             if len(found) == wanted:
                 break
-            step = along(root + n * side)
+            step = None if n * side in found else along(root + n * side)
             if step is not None:
                 found[n * side] = step
-        if len(found) < wanted:
-            return None
+    if len(found) < 6:
+        return None
     places, beside = np.array(list(found)), list(found.values())
 
     def through(values: Any) -> np.polynomial.Polynomial:

@@ -2,15 +2,18 @@
 
 from collections.abc import Callable, Iterator
 
+import jax.numpy as jnp
 import numpy as np
 
 from ._closing import Closing
-from ._crossing import crossing
+from ._crossing import BESIDE, MOST, crossing
+from ._past_section import at_bound
 from ._shooting import Shooting
-from ._solve import advance, located, observe
+from ._solve import advance, images_at, located, observe
 from ._special_condition import Special
-from .curve import Step
-from .special import GRAZING, RESONANCE_1, RESONANCE_2, TORUS, TOUCHING
+from ._symmetry import ALIKE, ROUNDED, may_be_symmetric
+from .curve import STALLED, Step
+from .special import GRAZING, RESONANCE_1, RESONANCE_2, SYMMETRY, TORUS, TOUCHING
 
 # What lies below zero by no more than this is zero to rounding: a choice, a hundred times the
 # corrector's tolerance.
@@ -30,6 +33,10 @@ class CurveMonitor:
     def __init__(self, problem: Shooting, condition: Special, scale: np.ndarray, bounds: Intervals):
         self.problem, self.condition, self.scale = problem, condition, scale
         self.bounds = bounds
+        # Along a curve of symmetric motions the images are alike everywhere.
+        self.symmetric = condition.kind != SYMMETRY and may_be_symmetric(
+            problem, [problem.machine, *problem.corners(bounds)]
+        )
         self.closing = Closing(problem, scale)
 
     def advance(self, x, tangent, length) -> Step:
@@ -41,13 +48,29 @@ class CurveMonitor:
         last, reason = new, None
         if not self._inside(new):
             last, reason = self._cut(here, new), "bounds"
-        found = [*self._grazings(here, last), *self._resonances(here, last)]
+        found = [
+            *self._grazings(here, last), *self._resonances(here, last), *self._mirror(here, last),
+        ]  # fmt: skip
         if found:
             return min(found, key=lambda f: float(np.dot(here.tangent, (f[0].x - here.x))))
         if reason is None:
             last = self.closing.between(here, new, lambda test: self._where(here, new, test))
             reason = None if last is None else "closed"
         return None if reason is None or last is None else (last, reason)
+
+    def stalled(self, steps: list[Step]) -> tuple[Step, str]:
+        """The last point of a curve that the corrector follows no further, and why it ends."""
+        last = steps[-1]
+        at = at_bound(self.problem, last, self.scale, self.bounds)
+        if at is not None:
+            return at, "bounds"
+        if self.symmetric and np.linalg.norm(self._images(last)) < ALIKE:
+            for here in reversed(steps):
+                root = float(np.dot(here.tangent, (last.x - here.x) / self.scale))
+                if root > MOST * BESIDE:
+                    at = self._symmetric(here, root, beyond=False)
+                    return (last, STALLED) if at is None else (at, SYMMETRY)
+        return last, STALLED
 
     def _where(self, here: Step, new: Step, test: Callable[[Step], float]) -> Step | None:
         return located(self.problem, here, new, self.scale, test)
@@ -104,6 +127,43 @@ class CurveMonitor:
             if left(last) <= -_NOISE:
                 at = self._where(here, last, left) if left(here) > _NOISE else here
                 yield at or here, kind
+
+    def _mirror(self, here: Step, last: Step) -> Iterator[tuple[Step, str]]:
+        """Where the motion becomes symmetric: beyond, the same ones come again in the mirror, and
+        what grazed on one side is passed through on the other."""
+        if not self.symmetric:
+            return
+        begin = self._images(here)
+
+        def along(step: Step) -> float:
+            return float(np.dot(begin, self._images(step)))
+
+        if np.linalg.norm(begin) < ROUNDED or along(last) >= 0:
+            return
+        at = self._where(here, last, along)
+        if at is not None and np.linalg.norm(self._images(at)) < ALIKE:
+            root = float(np.dot(here.tangent, (at.x - here.x) / self.scale))
+            yield self._symmetric(here, root) or at, SYMMETRY
+
+    def _images(self, step: Step) -> np.ndarray:
+        """How far the motion is from being its own image."""
+        return np.asarray(images_at(self.problem, jnp.asarray(step.x)))
+
+    def _symmetric(self, here: Step, root: float, *, beyond: bool = True) -> Step | None:
+        """The point about so far ahead at which the motion is symmetric and the curve is crossed by
+        that of the symmetric motions; `beyond`, whether this one can be followed further."""
+        begin = self._images(here)
+
+        def along(length: float) -> Step | None:
+            step = self.advance(here.x, here.tangent, length)
+            other = np.linalg.norm(self._images(step)) < ALIKE * BESIDE
+            return step if bool(step.good) and not other and (beyond or length < root) else None
+
+        found = crossing(along, root, lambda s: float(np.dot(begin, self._images(s))))
+        if found is None:
+            return None
+        x, tangent = found
+        return here._replace(x=x, tangent=tangent, seen=observe(self.problem, x))
 
     def _inside(self, step: Step) -> bool:
         pairs = zip(step.x[-2:], self.bounds, strict=True)

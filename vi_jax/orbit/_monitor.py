@@ -1,7 +1,6 @@
 """Following a branch: what happens between two of its points, and when it ends."""
 
 import dataclasses
-import itertools
 from collections.abc import Callable
 from functools import partial
 
@@ -23,7 +22,7 @@ from ._shooting import Shooting
 from ._sliding import change_at
 from ._solution import orbit_of
 from ._solve import advance, images_at, located, observe
-from ._symmetry import may_be_symmetric
+from ._symmetry import ALIKE, ROUNDED, may_be_symmetric
 from ._words import DETAILS, HELD_FOLD, RESTS
 from .curve import SHORTER, Step
 from .special import (
@@ -61,12 +60,6 @@ _LONG = 4.0
 # Steps no longer than the second are rounding.
 _ASIDE, _TINY = 0.9, 1e-6
 
-# Halves of a period that differ by less than this are those of a motion of half the period.
-_ALIKE = 1e-3
-
-# And by less than this but for rounding.
-_NOISE = 1e-7
-
 
 class BranchMonitor:
     """Looks at each step of a walk along a branch: locates what happens in it and says when to end.
@@ -82,9 +75,7 @@ class BranchMonitor:
     ):  # fmt: skip
         self.problem, self.scale, self.bounds = problem, scale, bounds
         self.extrema = Extrema(problem, extrema, scale)
-        corners = itertools.product(*bounds)
-        machines = [problem.machine, *(problem.at(jnp.asarray(corner)) for corner in corners)]
-        self.symmetric = may_be_symmetric(problem, machines)
+        self.symmetric = may_be_symmetric(problem, [problem.machine, *problem.corners(bounds)])
         self.special: list[SpecialPoint] = []
         self.between: dict[int, list[Step]] = {}
         self.whole: dict[int, Step] = {}  # steps of special points, by what is observed there
@@ -220,10 +211,10 @@ class BranchMonitor:
             def along(step: Step, begin=begin, difference=difference) -> float:
                 return float(np.dot(begin, difference(step)))
 
-            if np.linalg.norm(begin) < _NOISE or along(last) >= 0:
+            if np.linalg.norm(begin) < ROUNDED or along(last) >= 0:
                 continue
             at = self._where(here, last, along)
-            if at is None or np.linalg.norm(difference(at)) > _ALIKE:
+            if at is None or np.linalg.norm(difference(at)) > ALIKE:
                 continue
             if kind == DOUBLING:
                 at, point = self._sprung(at)
@@ -275,7 +266,7 @@ class BranchMonitor:
             off = {DOUBLING: values + 1, TORUS: complex_ones - 1}.get(kind, values - 1)
             # Else it is a pole of the determinant, or a real pair μ, 1/μ.
             if np.abs(off).min(initial=np.inf) < 1e-5:
-                if kind == CROSSING and self.symmetric and self._apart(at) < _ALIKE:
+                if kind == CROSSING and self.symmetric and self._apart(at) < ALIKE:
                     kind = SYMMETRY
                 kind = FOLD if held and kind == CROSSING else kind
                 detail = HELD_FOLD if held and kind == FOLD else DETAILS[kind]
@@ -297,11 +288,11 @@ class BranchMonitor:
     def _springs(self, here: Step, at: Step) -> bool:
         """Whether the branch springs there: halves of a period are alike, or images."""
         apart, images = halves(self.problem, at), self._images(at)
-        if apart.size and np.linalg.norm(apart) < _ALIKE:
+        if apart.size and np.linalg.norm(apart) < ALIKE:
             return True
         before = np.linalg.norm(self._images(here))
-        close = np.linalg.norm(images) < min(_ALIKE, 0.5 * before)
-        return bool(images.size and close and before > _NOISE)
+        close = np.linalg.norm(images) < min(ALIKE, 0.5 * before)
+        return bool(images.size and close and before > ROUNDED)
 
     def _crossing(self, here: Step, at: Step, kind: str) -> Step:
         """The point where branches cross (see `crossing`)."""
@@ -309,7 +300,7 @@ class BranchMonitor:
         def along(length: float) -> Step | None:
             step = self.advance(here.x, here.tangent, length)
             # So close to where they cross the corrector may find the other branch.
-            other = self.symmetric and (kind == FOLD) == (self._apart(step) < _ALIKE * BESIDE)
+            other = self.symmetric and (kind == FOLD) == (self._apart(step) < ALIKE * BESIDE)
             return step if bool(step.good) and not other else None
 
         root = float(np.dot(here.tangent, (at.x - here.x) / self.scale))

@@ -6,6 +6,8 @@ impact instead of that before it. So a branch of fixed points of the section map
 taken up beyond.
 """
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
@@ -55,21 +57,27 @@ def past_section(problem: Shooting, last: Step, scale: np.ndarray) -> Step | Non
 def why_stalled(
     problem: Shooting, last: Step, scale: np.ndarray, bounds: list[tuple[float, float]]
 ) -> tuple[Step, str]:
-    """The last point of a branch that the corrector follows no further, and why it ends.
-
-    A motion that rests has none beyond a bound at which its machine ends, as a restitution 0, and
-    beyond a grazing from which both of its branches lead back.
-    """
-    if problem.follows_events:
-        return last, STALLED
-    along = np.eye(len(last.x))[-1]
-    for bound in bounds[-1]:
-        way = (bound - float(last.x[-1])) / scale[-1]
-        if len(bounds) == 1 and abs(way) < _STALLED_AT:
-            at = advance(problem, last.x, along, scale, way)
-            return (at, "bounds") if bool(at.good) else (last, STALLED)
-    touch = touched_beside(problem, last, scale)
+    """The last point of a branch that the corrector follows no further, and why it ends: a bound,
+    or of motions that rest a grazing from which both of its branches lead back."""
+    at = at_bound(problem, last, scale, bounds)
+    if at is not None:
+        return at, "bounds"
+    touch = None if problem.follows_events else touched_beside(problem, last, scale)
     return (last, STALLED) if touch is None else (touch, GRAZING)
+
+
+def at_bound(
+    problem: Shooting, last: Step, scale: np.ndarray, bounds: Sequence[tuple[float, float]]
+) -> Step | None:
+    """The point at the bound of a parameter before which a walk has stalled: its machine has
+    another form beyond, as with a restitution of 0 or 1. `None` if it has stalled elsewhere."""
+    for i, ends in enumerate(bounds, -len(bounds)):
+        for bound in ends:
+            way = (bound - float(last.x[i])) / scale[i]
+            if abs(way) < _STALLED_AT:
+                at = advance(problem, last.x, np.eye(len(last.x))[i], scale, way)
+                return at if bool(at.good) else None
+    return None
 
 
 def _speeds(stop: RigidStop, V: float) -> list[float]:

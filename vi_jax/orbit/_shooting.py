@@ -8,7 +8,8 @@ motion that the stop forbids, as the sign of V⁻ or of the clearance says. (The
 `hspo` of COCO.)
 """
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any
 
@@ -103,6 +104,10 @@ class Shooting(eqx.Module):
         for i, name in enumerate(self.parameters):
             machine = with_leaf(machine, name, x[x.shape[0] - count + i])
         return machine
+
+    def corners(self, intervals: Iterable[tuple[float, float]]) -> list[AbstractMachine]:
+        """The machines at the ends of these intervals of the parameters."""
+        return [self.at(jnp.asarray(ends)) for ends in itertools.product(*intervals)]
 
     def parts(self, x: Vector) -> tuple[Float[Array, " legs"], Float[Array, "legs states"]]:
         """Clock and state at the start of each leg (before its event)."""

@@ -11,6 +11,10 @@ from ..machine import AbstractMachine
 from ._events import Event
 from ._shooting import Shooting
 
+# Halves of a period that differ by less than this are alike, or images of each other; and by less
+# than this but for rounding: choices.
+ALIKE, ROUNDED = 1e-3, 1e-7
+
 
 def may_be_symmetric(problem: Shooting, machines: Iterable[AbstractMachine]) -> bool:
     """Whether a motion with these events can be its own image, on each of these machines.

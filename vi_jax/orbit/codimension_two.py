@@ -16,6 +16,7 @@ from .special import (
     GRAZING,
     RESONANCE_1,
     RESONANCE_2,
+    SYMMETRY,
     TORUS,
     SpecialPoint,
 )
@@ -33,6 +34,7 @@ _LEADS = {
     (TORUS, GRAZING): GRAZING,
     (GRAZING, FOLD): FOLD,
     (GRAZING, DOUBLING): DOUBLING,
+    (GRAZING, SYMMETRY): SYMMETRY,
 }
 
 
@@ -47,7 +49,8 @@ class CodimensionTwo(InWords):
     -1, where a curve of Neimark–Sacker points begins), "resonance-1:3", "resonance-1:4" (the
     angle of a complex pair is 2π/3 or π/2), "grazing" (of a motion that is special by its
     multipliers); on a curve of grazings "fold" or "period-doubling" (of the motion that grazes),
-    "resonant-grazing" (see `resonant_grazings`)."""
+    "resonant-grazing" (see `resonant_grazings`); "symmetry-breaking" (the motions of the curve
+    become symmetric, and it ends)."""
     parameters: np.ndarray
     """Both parameters of the curve."""
     orbit: Orbit
@@ -67,15 +70,17 @@ class CodimensionTwo(InWords):
 
         From a fold–flip that is the other curve; from a double multiplier 1 or -1 the curve of
         Neimark–Sacker points, or from that the curve of folds or doublings; from a fold or a
-        doubling that grazes the curve of grazings, and back.
+        doubling that grazes the curve of grazings, and back; where a motion that grazes becomes
+        symmetric, the curve of symmetry breakings.
 
         **Raises:** `ValueError` for other kinds, from which none leaves, or none of this motion.
         """
         kind = _LEADS.get((self.curve, self.kind))
         if kind is None:
             raise ValueError(
-                "`switch` needs a fold–flip, a resonance 1:1 or 1:2, or a fold or doubling that "
-                f"grazes, but this point on a curve of {self.curve} is a {self.kind}."
+                "`switch` needs a fold–flip, a resonance 1:1 or 1:2, or a fold, a doubling or a "
+                f"symmetry breaking that grazes, but this point on a curve of {self.curve} is a "
+                f"{self.kind}."
             )
         problem, step, scale = alone(self.problem, self.step, self.scale, kept=-2)
         grazes = kind == GRAZING
