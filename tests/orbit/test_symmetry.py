@@ -149,6 +149,15 @@ def test_grazings_end_where_the_motion_becomes_symmetric():
     gaps, shares = lost.parameters.T
     np.testing.assert_allclose(gaps, gap_of(shares), atol=1e-12)
     assert lost.ends == ("grazing", "bounds")
+    # Grazings of the symmetric motion pass through the same point.
+    pair = M.ImpactPair(half_gap=1.1, restitution=0.05)
+    branch = vi.continue_orbit(settled(pair), parameter="half_gap", bounds=(0.9, 1.2))
+    through = vi.boundary(
+        branch.special[0], parameter="restitution", bounds=((0.8, 1.1), (0.0, 0.15))
+    )
+    (point,) = through.special
+    assert point.kind == "symmetry-breaking"
+    np.testing.assert_allclose(point.parameters, end.parameters, atol=1e-9)
 
 
 SNAP = M.Duffing(

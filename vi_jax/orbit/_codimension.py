@@ -11,16 +11,18 @@ import numpy as np
 
 from .._programs import compiled
 from .._words import so_many
+from ._crossing import crossing
 from ._curve_monitor import cosine_of
 from ._origin import repeated
 from ._resonances import resonances
 from ._shooting import Shooting
 from ._solution import orbit_of
-from ._solve import between, jacobian_at
+from ._solve import advance, between, images_at, jacobian_at
 from ._special_condition import Special
+from ._symmetry import ALIKE, may_be_symmetric
 from ._words import AT_CODIMENSION_TWO, grazing_in_words
 from .codimension_two import CodimensionTwo
-from .curve import Step
+from .curve import SAME_CURVE, Step
 from .special import (
     CUSP,
     DEGENERATE,
@@ -82,13 +84,21 @@ def points_of(
             found.append((place, point(end, steps[place])))
     for kind, test in _tests_of(problem, condition, scale).items():
         for place, step in _zeros(problem, steps, scale, test):
-            found.append((place, point(kind, step)))
+            symmetric = kind == FOLD and condition.kind in TOUCHING and _symmetric(problem, step)
+            found.append((place, point(SYMMETRY if symmetric else kind, step)))
     if condition.kind == GRAZING:
         for place, step, entries in _resonances_of(problem, condition, steps, scale):
             n = len(entries)
             more = f" of the motion with one impact in {so_many(n, 'period')}"
             found.append((place, point(RESONANT, step, condition.impact, more)))
     return tuple(point for _, point in sorted(found, key=lambda f: f[0]))
+
+
+def _symmetric(problem: Shooting, step: Step) -> bool:
+    x = jnp.asarray(step.x)
+    if not may_be_symmetric(problem, [problem.machine, problem.at(x)]):
+        return False
+    return bool(np.linalg.norm(np.asarray(images_at(problem, x))) < ALIKE)
 
 
 def _grazes(step: Step) -> int | None:
@@ -233,8 +243,28 @@ def _zeros(
         (before, like), (after, _) = seen[i], seen[i + 1]
         if not (before * after < 0 or (after == 0 and before != 0)):
             continue
-        at = between(problem, here, new, scale, lambda s, like=like: test(s, like)[0])
-        if at is None or abs(test(at, like)[0]) > _ZERO * max(abs(before), abs(after)):
+        at = _zero(problem, here, new, scale, lambda s, like=like: test(s, like)[0])
+        if at is None:
             continue
         way = (new.x - here.x) / scale
         yield i + float(way @ ((at.x - here.x) / scale) / (way @ way)), at
+
+
+def _zero(
+    problem: Shooting, here: Step, new: Step, scale: np.ndarray, test: Callable[[Step], float]
+) -> Step | None:
+    """The point between two at which a test is zero; `None` where it has a pole."""
+    most = max(abs(test(here)), abs(test(new)))
+    at = between(problem, here, new, scale, test)
+    if at is None or abs(test(at)) <= _ZERO * most:
+        return at
+    # Where another curve crosses this one the corrector has no answer.
+    if float(here.tangent @ ((new.x - here.x) / scale)) < 0:
+        here = new
+    root = float(here.tangent @ ((at.x - here.x) / scale))
+
+    def admits(step: Step, length: float) -> bool:
+        return float(step.tangent @ here.tangent) >= SAME_CURVE and abs(test(step)) < most
+
+    ahead = lambda x, tangent, length: advance(problem, x, tangent, scale, length)
+    return crossing(problem, ahead, here, root, test, admits)

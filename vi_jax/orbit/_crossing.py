@@ -5,6 +5,8 @@ from typing import Any
 
 import numpy as np
 
+from ._shooting import Shooting
+from ._solve import observe
 from .curve import Step
 from .floquet import NEUTRAL
 from .special import CROSSING, DOUBLING, FOLD, TORUS
@@ -15,6 +17,8 @@ BESIDE = 1e-3
 
 # At most so many times as far on each side.
 MOST = 8
+
+Advance = Callable[[np.ndarray, np.ndarray, float], Step]
 
 
 def tests_of(step: Step) -> dict[str, float]:
@@ -44,22 +48,29 @@ def changed_between(before: dict[str, float], after: dict[str, float]) -> list[s
 
 
 def crossing(
-    along: Callable[[float], Step | None], root: float, test: Callable[[Step], float]
-) -> tuple[np.ndarray, np.ndarray] | None:
+    problem: Shooting, advance: Advance, here: Step, root: float, test: Callable[[Step], float],
+    admits: Callable[[Step, float], bool] = lambda step, length: True,
+) -> Step | None:  # fmt: skip
     """The point of a curve at which a test is zero, where its equations are singular: where
     branches cross, or where an impact grazes.
 
     Close to it the equations cannot be solved, but the curve passes through it smoothly, so that a
     polynomial through its neighbours tells where it is, and what the motion is there.
 
-    **Arguments:** `along`, the curve's point at a length along a tangent, `None` where there is
-    none; `root`, about where it is; the test.
+    **Arguments:** the equations; `advance`, of unknowns, tangent and length, the curve's point; a
+    point of it, and about how far along its tangent the place is; the test; `admits`, of a point
+    and its length, whether it belongs to this curve.
 
     Where the curve is found on the near side only, there are more neighbours of that one.
 
-    **Returns:** its unknowns and its tangent; `None` if too few points were found, or no zero.
+    **Returns:** `None` if too few points were found, or no zero.
     """
     found: dict[float, Step] = {}
+
+    def along(length: float) -> Step | None:
+        step = advance(here.x, here.tangent, length)
+        return step if bool(step.good) and admits(step, length) else None
+
     for side, wanted in ((-BESIDE, 3), (BESIDE, 6), (-BESIDE, 6)):
         for n in range(1, MOST + 1):
             if len(found) == wanted:
@@ -83,8 +94,8 @@ def crossing(
     def there(get: Callable[[Step], Any]) -> np.ndarray:
         return np.stack([through(x)(place) for x in zip(*map(get, beside), strict=True)])
 
-    tangent = there(lambda step: step.tangent)
-    return there(lambda step: step.x), tangent / np.linalg.norm(tangent)
+    x, tangent = there(lambda step: step.x), there(lambda step: step.tangent)
+    return here._replace(x=x, tangent=tangent / np.linalg.norm(tangent), seen=observe(problem, x))
 
 
 def turns_back(here: Step, at: Step, last: Step, scale: np.ndarray) -> bool:

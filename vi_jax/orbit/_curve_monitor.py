@@ -9,7 +9,7 @@ from ._closing import Closing
 from ._crossing import BESIDE, MOST, crossing
 from ._past_section import at_bound
 from ._shooting import Shooting
-from ._solve import advance, images_at, located, observe
+from ._solve import advance, images_at, located
 from ._special_condition import Special
 from ._symmetry import ALIKE, ROUNDED, may_be_symmetric
 from .curve import STALLED, Step
@@ -99,20 +99,13 @@ class CurveMonitor:
     def _singular(self, here: Step, at: Step, test: Callable[[Step], float]) -> Step:
         """The point at which an impact grazes, where the monodromy matrix has a pole."""
 
-        def along(length: float) -> Step | None:
-            step = self.advance(here.x, here.tangent, length)
-            return step if bool(step.good) else None
-
         root = float(np.dot(here.tangent, (at.x - here.x) / self.scale))
-        found = crossing(along, root, test)
+        found = crossing(self.problem, self.advance, here, root, test)
         if found is None:
             return at
-        x, tangent = found
-        seen = observe(self.problem, x)
-        seen = seen._replace(
-            monodromy=np.nan * seen.monodromy, multipliers=np.nan * seen.multipliers
-        )
-        return at._replace(x=x, tangent=tangent, seen=seen)
+        gone = {"monodromy": found.seen.monodromy, "multipliers": found.seen.multipliers}
+        gone = {name: np.nan * numbers for name, numbers in gone.items()}
+        return found._replace(seen=found.seen._replace(**gone))
 
     def _resonances(self, here: Step, last: Step) -> Iterator[tuple[Step, str]]:
         """Where a pair of multipliers on the unit circle becomes real: beyond, the product of two
@@ -154,16 +147,12 @@ class CurveMonitor:
         that of the symmetric motions; `beyond`, whether this one can be followed further."""
         begin = self._images(here)
 
-        def along(length: float) -> Step | None:
-            step = self.advance(here.x, here.tangent, length)
+        def admits(step: Step, length: float) -> bool:
             other = np.linalg.norm(self._images(step)) < ALIKE * BESIDE
-            return step if bool(step.good) and not other and (beyond or length < root) else None
+            return not other and (beyond or length < root)
 
-        found = crossing(along, root, lambda s: float(np.dot(begin, self._images(s))))
-        if found is None:
-            return None
-        x, tangent = found
-        return here._replace(x=x, tangent=tangent, seen=observe(self.problem, x))
+        alike = lambda step: float(np.dot(begin, self._images(step)))
+        return crossing(self.problem, self.advance, here, root, alike, admits)
 
     def _inside(self, step: Step) -> bool:
         pairs = zip(step.x[-2:], self.bounds, strict=True)

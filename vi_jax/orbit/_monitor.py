@@ -21,7 +21,7 @@ from ._sequence import BETWEEN_RESTS, changed_sequence
 from ._shooting import Shooting
 from ._sliding import change_at
 from ._solution import orbit_of
-from ._solve import advance, images_at, located, observe
+from ._solve import advance, images_at, located
 from ._symmetry import ALIKE, ROUNDED, may_be_symmetric
 from ._words import DETAILS, HELD_FOLD, RESTS
 from .curve import SHORTER, Step
@@ -297,18 +297,13 @@ class BranchMonitor:
     def _crossing(self, here: Step, at: Step, kind: str) -> Step:
         """The point where branches cross (see `crossing`)."""
 
-        def along(length: float) -> Step | None:
-            step = self.advance(here.x, here.tangent, length)
+        def admits(step: Step, length: float) -> bool:
             # So close to where they cross the corrector may find the other branch.
-            other = self.symmetric and (kind == FOLD) == (self._apart(step) < ALIKE * BESIDE)
-            return step if bool(step.good) and not other else None
+            return not self.symmetric or (kind == FOLD) != (self._apart(step) < ALIKE * BESIDE)
 
         root = float(np.dot(here.tangent, (at.x - here.x) / self.scale))
-        found = crossing(along, root, lambda step: tests_of(step)[kind])
-        if found is None:
-            return at
-        x, tangent = found
-        return at._replace(x=x, tangent=tangent, seen=observe(self.problem, x))
+        tested = lambda step: tests_of(step)[kind]
+        return crossing(self.problem, self.advance, here, root, tested, admits) or at
 
     def _images(self, step: Step) -> np.ndarray:
         """How far the motion is from being its own image; empty if it cannot be."""

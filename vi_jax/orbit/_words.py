@@ -53,7 +53,7 @@ AT_CODIMENSION_TWO = {
     RESONANT: "a curve of folds and one of period doublings begin",
     FOLD: "the motion that grazes has a multiplier 1",
     DOUBLING: "the motion that grazes has a multiplier -1",
-    SYMMETRY: "the motion becomes symmetric: a curve of symmetry breakings comes here",
+    SYMMETRY: "the motion loses or gains its symmetry: a curve of symmetry breakings comes here",
 }
 
 # The same of a fold where numbers are held: the parameter alone would turn back.

@@ -118,6 +118,9 @@ def check_walk(*, step: object, max_step: object, max_points: object) -> dict[st
 # Ends of a walk that has not come to one: Ctrl-C was pressed, or the corrector has no answer.
 INTERRUPTED, STALLED = "interrupted", "stalled"
 
+# The tangents of two points close to each other on one curve have at least this product: a choice.
+SAME_CURVE = 0.9
+
 # Stands for the reason to end where a step has led to another curve: it is to be shorter.
 SHORTER = "shorter"
 
@@ -147,7 +150,7 @@ def walk(
         here = steps[-1]
         new = advance(here.x, here.tangent, length)
         turn = float(np.dot(np.asarray(new.tangent), np.asarray(here.tangent)))
-        ending = stop(here, new) if bool(new.good) and turn >= 0.9 else (here, SHORTER)
+        ending = stop(here, new) if bool(new.good) and turn >= SAME_CURVE else (here, SHORTER)
         if ending is not None and ending[1] == SHORTER:
             # The further off a solution is, the longer each trial takes.
             length, failed, steady = length * (0.4 if failed < 2 else 0.1), failed + 1, _STEADY
