@@ -309,7 +309,7 @@ class Odd(vi.AbstractMachine):
 @pytest.mark.parametrize(
     ("cycle", "returns", "words"),
     [
-        (0.0, lambda x: x, "`cycle` of a Odd must be positive, but is 0.0"),
+        (0.0, lambda x: x, "`cycle` of a Odd must be positive and finite, but is 0.0"),
         (-1.0, lambda x: x, "must be positive"),
         (np.nan, lambda x: x, "must be positive"),
         (1.0, lambda x: None, "its `return` is missing"),

@@ -138,11 +138,13 @@ def test_a_multiplier_is_held_until_another_is_as_large():
     orbit = vi.find_orbit(scene, scene.start(Y=near.Y[0] - 1e-3, V=near.V[0]), throw=True)
     size = float(np.abs(orbit.multipliers).max())
     assert float(np.abs(orbit.multipliers).min()) < 0.9 * size < 0.9
-    branch = vi.continue_orbit(
-        orbit, parameter="stops.0.restitution", bounds=(0.3, 0.99), free={GAP: (0.5, 4.0)},
-        fixed={"multiplier": None},
-    )  # fmt: skip
-    assert branch.ends[1] == "multiplier"
+    given = {"free": {GAP: (0.5, 4.0)}, "fixed": {"multiplier": None}}
+    branch, cut = (
+        vi.continue_orbit(orbit, parameter="stops.0.restitution", bounds=(0.3, end), **given)
+        for end in (0.99, size * np.exp(2 * np.pi * xi / zeta) + 1e-4)
+    )
+    assert branch.ends[1] == cut.ends[1] == "multiplier"  # though a bound lies in the same step
+    assert cut.parameter[-1] == pytest.approx(branch.parameter[-1], abs=1e-8)
     np.testing.assert_allclose(branch.multiplier, size, rtol=1e-6)
     assert branch.parameter[-1] == pytest.approx(size * np.exp(2 * np.pi * xi / zeta), abs=1e-8)
 

@@ -72,7 +72,7 @@ def test_an_interrupted_branch_is_a_branch(monkeypatch):
 
         return curve.walk(until, *arguments, **options)
 
-    monkeypatch.setattr(importlib.import_module("vi_jax.orbit._continue_orbit"), "walk", walk)
+    monkeypatch.setattr(importlib.import_module("vi_jax.orbit._walked"), "walk", walk)
     with pytest.raises(vi.Interrupted) as caught:
         vi.continue_orbit(orbit, parameter="stops.0.gap", bounds=(1.5, 2.5))
     part = caught.value.partial

@@ -42,7 +42,7 @@ def check_parts(machine: AbstractMachine) -> None:
         raise TypeError(f"`cycle` of a {name} must be a number, or a property that gives one.")
     cycle = concrete(machine.cycle)
     if cycle is not None and not (np.isfinite(cycle) & (cycle > 0)).all():
-        raise ValueError(f"`cycle` of a {name} must be positive, but is {cycle}.")
+        raise ValueError(f"`cycle` of a {name} must be positive and finite, but is {cycle}.")
     many = len(machine.coordinates)
     for i, stop in enumerate(machine.stops):
         if stop.coordinate >= many:

@@ -77,8 +77,13 @@ def across_order(problem: Shooting, step: Step, scale: np.ndarray, distance: flo
     **Arguments:** as `across_sliding`.
     """
     both = [*_swapped(problem, step), *_guesses(problem, step, scale, distance)]
-    here = list(problem.events)
-    turned = [here[i:] + here[:i] for i in range(len(here))]
+    here, begins = list(problem.events), range(len(problem.events))
+    if all(event.cycle is None for event in here):
+        # The same motion may be observed whole cycles later, not from any other of its events.
+        cycle = float(problem.period(jnp.asarray(step.x))) / problem.cycles
+        clock = np.asarray(problem.parts(jnp.asarray(step.x))[0])
+        begins = [int(np.sum(clock < n * cycle)) for n in range(problem.cycles)]
+    turned = [here[i:] + here[:i] for i in begins]
     return _beside(problem, step, scale, distance, both, lambda events: events not in turned)
 
 

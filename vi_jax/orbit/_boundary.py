@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from .._at_work import Tell, at_work
+from .._at_work import at_work
 from .._checks import flag, instance_of, interval
 from .._interrupted import Interrupted
 from .._lazy import xr
@@ -24,8 +24,9 @@ from ._solve import tangent_at
 from ._special_condition import Special, symmetry_condition
 from ._symmetry import may_be_symmetric
 from ._tables import stability_in_words
+from ._walked import walked
 from .codimension_two import CodimensionTwo
-from .curve import INTERRUPTED, STALLED, Step, check_walk, walk
+from .curve import INTERRUPTED, Step, check_walk
 from .results import InWords, Orbit
 from .special import DOUBLING, FOLD, SYMMETRY, TORUS, TOUCHING, SpecialPoint, one
 
@@ -185,24 +186,16 @@ def boundary(
 
     def curve() -> Boundary:
         path = [*reversed(backward[1:]), *forward]
-        return _curve(problem, condition, path, (ends[0], ends[1]), scale)
+        finest = max(back.problem, ahead.problem, key=lambda p: p.steps)
+        return _curve(finest, condition, path, (ends[0], ends[1]), scale)
 
     def kept() -> Interrupted:
         return Interrupted("walk along the boundary", curve())
 
     with at_work("boundary", kept, progress=progress, unit="point") as tell:
-        ends[1] = _walked(ahead, forward, tell, settings)
-        ends[0] = ends[1] if ends[1] == "closed" else _walked(back, backward, tell, settings)
+        ends[1] = walked(ahead, forward, tell, settings)
+        ends[0] = ends[1] if ends[1] == "closed" else walked(back, backward, tell, settings)
     return curve()
-
-
-def _walked(monitor: CurveMonitor, steps: list[Step], tell: Tell, settings: dict[str, Any]) -> str:
-    """Walk from the last of these steps on, to which others are added; why it ended."""
-    end = walk(monitor.advance, steps, stop=monitor.stop, tell=tell, **settings)
-    if end == STALLED:
-        last, end = monitor.stalled(steps)
-        steps += [] if last is steps[-1] else [last]
-    return end
 
 
 def _check_point(point: SpecialPoint) -> None:

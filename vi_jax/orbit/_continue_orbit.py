@@ -8,25 +8,24 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from .._at_work import Tell, at_work
+from .._at_work import at_work
 from .._checks import flag, given_number, interval, one_of, short, tuple_of_names
 from .._interrupted import Interrupted
-from .._numbers import warn
 from ..flow import MethodLike
 from ..machine import check_leaf, leaf
 from ._conditions import as_held
 from ._fixed_step_method import steps_of
 from ._monitor import BranchMonitor
 from ._observed import Observed
-from ._past_section import past_section
-from ._problem import check_parameter, problem_of, sized_by_motion
+from ._problem import check_parameter, problem_of
 from ._quantities import names_of, rates_at
 from ._rest import rests
 from ._section_map import section_map_of
 from ._shooting import Shooting
-from ._solve import advance, off_by, tangent_at
+from ._solve import advance, tangent_at
+from ._walked import walked
 from .branch import Branch
-from .curve import INTERRUPTED, STALLED, Step, check_walk, walk
+from .curve import INTERRUPTED, Step, check_walk
 from .floquet import NEUTRAL
 from .results import ORBIT_RESULTS, Orbit
 from .special import SpecialPoint
@@ -35,10 +34,6 @@ _NONE: Mapping[str, Any] = MappingProxyType({})
 
 # An orbit found on the cycle map solves the equations of its branch closer than this: a choice.
 _SAME = 1e-3
-
-# Twice the steps change the states of a branch that is right by less than this: a choice, that to
-# which special points are promised. Of a motor whose crank slowed to a fifth it was 0.07.
-_TOO_LONG = 1e-8
 
 
 def continue_orbit(
@@ -128,50 +123,17 @@ def _both_ways(
 
     def branch() -> Branch:
         special = [*reversed(back.special), *ahead.special]
+        problem = max(back.problem, ahead.problem, key=lambda p: p.steps)
         steps = [*reversed(back.path(backward[1:])), *ahead.path(forward)]
-        return _branch(ahead.problem, parameter, steps, special, (ends[0], ends[1]), ahead.scale)
+        return _branch(problem, parameter, steps, special, (ends[0], ends[1]), ahead.scale)
 
     def kept() -> Interrupted:
         return Interrupted("walk along the branch", branch())
 
     with at_work("branch", kept, progress=progress, unit="point") as tell:
-        ends[1] = _walked(ahead, forward, tell, settings)
-        ends[0] = ends[1] if ends[1] == "closed" else _walked(back, backward, tell, settings)
-    found = branch()
-    _warn_of_long_steps(found)
-    return found
-
-
-def _walked(monitor: BranchMonitor, steps: list[Step], tell: Tell, settings: dict[str, Any]) -> str:
-    """Walk from the last of these steps on, to which others are added; why it ended.
-
-    Where a motion that rests meets a stop on its section the walk is taken up beyond.
-    """
-    while True:
-        end = walk(monitor.advance, steps, stop=monitor.stop, tell=tell, **settings)
-        if end != STALLED:
-            return end
-        beyond = past_section(monitor.problem, steps[-1], monitor.scale)
-        if beyond is None:
-            last, end = monitor.stalled(steps[-1])
-            steps += [] if last is steps[-1] else [last]
-        if beyond is None or len(steps) >= settings["max_points"]:
-            return end
-        steps.append(beyond)
-
-
-def _warn_of_long_steps(branch: Branch) -> None:
-    """Warn where flights of the branch would need more steps than those of its first motion."""
-    problem = branch.problem
-    if not (problem.follows_events and sized_by_motion(problem)):
-        return
-    off = np.array([off_by(problem, step.x) for step in branch.steps])
-    if off.max() > _TOO_LONG:
-        warn(
-            f"The flights of this branch have {problem.steps} steps each, as many as its first "
-            f"motion asks for, but at {branch.name} = {branch.parameter[off.argmax()]:.6g} twice "
-            f"as many change its states by {off.max():.1g}: follow it from a motion near there."
-        )
+        ends[1] = walked(ahead, forward, tell, settings)
+        ends[0] = ends[1] if ends[1] == "closed" else walked(back, backward, tell, settings)
+    return branch()
 
 
 def _check_orbit(orbit: Orbit) -> None:

@@ -58,6 +58,10 @@ class CurveMonitor:
             reason = None if last is None else "closed"
         return None if reason is None or last is None else (last, reason)
 
+    def refine(self, problem: Shooting) -> None:
+        """Go on with the same equations in more steps."""
+        self.problem = self.closing.problem = problem
+
     def stalled(self, steps: list[Step]) -> tuple[Step, str]:
         """The last point of a curve that the corrector follows no further, and why it ends."""
         last = steps[-1]

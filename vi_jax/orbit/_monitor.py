@@ -103,11 +103,11 @@ class BranchMonitor:
                 bound = low if last.x[i] < low else high
                 last = self._where(here, last, lambda s, i=i, at=bound: float(s.x[i]) - at) or here
                 reason = "bounds"
-        if reason is None and self._lengthened(here, new) > 0:
-            last = self._where(here, new, lambda step: self._lengthened(here, step)) or here
+        if self._lengthened(here, last) > 0:
+            last = self._where(here, last, lambda step: self._lengthened(here, step)) or here
             reason = "long"
-        if reason is None and overtaken(self.problem, new) > 0:
-            last = self._where(here, new, lambda step: overtaken(self.problem, step)) or here
+        if overtaken(self.problem, last) > 0:
+            last = self._where(here, last, lambda step: overtaken(self.problem, step)) or here
             reason = "multiplier"
         grazing = self._grazing(here, last) or self._sequence(here, last)
         if isinstance(grazing, str):
@@ -124,9 +124,13 @@ class BranchMonitor:
             self.special.append(grazing)
         return None if reason is None else (last, reason)
 
-    def stalled(self, last: Step) -> tuple[Step, str]:
+    def refine(self, problem: Shooting) -> None:
+        """Go on with the same equations in more steps."""
+        self.problem = self.extrema.problem = self.closing.problem = problem
+
+    def stalled(self, steps: list[Step]) -> tuple[Step, str]:
         """The last point of a branch that the corrector follows no further, and why it ends."""
-        last, reason = why_stalled(self.problem, last, self.scale, self.bounds)
+        last, reason = why_stalled(self.problem, steps[-1], self.scale, self.bounds)
         if reason == GRAZING:
             self.special.append(self._point(GRAZING, last, BETWEEN_RESTS))
         return last, reason

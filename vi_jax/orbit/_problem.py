@@ -9,7 +9,15 @@ from jax.flatten_util import ravel_pytree
 
 from .._programs import compiled
 from .._types import State
-from ..flow import ImplicitSteps, MethodLike, RunOptions, collect, planned, run_lane
+from ..flow import (
+    ImplicitSteps,
+    MethodLike,
+    RunOptions,
+    check_parts,
+    collect,
+    planned,
+    run_lane,
+)
 from ..machine import (
     AbstractMachine,
     after_event,
@@ -25,6 +33,7 @@ from ._events import Event, section_of
 from ._fixed_step_method import fixed_step_method, steps_of
 from ._flight import Flight
 from ._shooting import Shooting
+from ._solve import off_by
 from .results import Orbit
 
 # Events of a cycle that can be followed, of a machine with switches or a section of its own: a
@@ -54,8 +63,10 @@ def check_parameter(
             f"({low:g}, {high:g})."
         )
     for end in interval:
+        there = with_leaf(machine, name, end)
         try:
-            check_again(with_leaf(machine, name, end))
+            check_again(there)
+            check_parts(there)
         except ValueError as error:
             raise ValueError(
                 f"Argument `{argument}` must leave the machine valid, but at {name} = {end:g}: "
@@ -102,6 +113,21 @@ def sized_by_motion(problem: Shooting) -> bool:
     machine = problem.machine
     paced = machine.pace(jnp.zeros(()), problem.like) is not None
     return paced or not machine.scales_known or isinstance(problem.method, ImplicitSteps)
+
+
+def finer(problem: Shooting, x: np.ndarray) -> Shooting | None:
+    """The equations with as many steps as the flights of a solution ask for; `None` where more of
+    them change nothing, or more are not allowed."""
+    off, more = off_by(problem, x), None
+    while 2 * problem.steps <= _MOST:
+        problem = dataclasses.replace(problem, steps=2 * problem.steps)
+        before, off = off, off_by(problem, x)
+        if not off < 0.5 * before:  # rounding
+            break
+        more = problem
+        if off < _SETTLED:
+            break
+    return more
 
 
 class _Way(NamedTuple):

@@ -1,0 +1,87 @@
+"""Where two impacts of a motion fall together they come in the other order beyond."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+from scipy.integrate import solve_ivp
+
+
+class Both(eqx.Module):
+    a: jax.Array
+    va: jax.Array
+    b: jax.Array
+    vb: jax.Array
+
+
+class TwoBodies(vi.AbstractMachine):
+    """Two bodies joined by a spring, each with its own force and stop."""
+
+    shift: jax.Array | float = 0.3
+    stops = (vi.RigidStop(0.3, 0.6, name="first"), vi.RigidStop(0.3, 0.6, name="second",
+                                                               coordinate=1))  # fmt: skip
+    cycle = 2 * np.pi / 1.3
+
+    @property
+    def coordinates(self):
+        return (
+            vi.Coordinate(lambda x: x.a, lambda x: x.va, lambda x, Y, V: Both(Y, V, x.b, x.vb)),
+            vi.Coordinate(lambda x: x.b, lambda x: x.vb, lambda x, Y, V: Both(x.a, x.va, Y, V)),
+        )
+
+    def field(self, s, x):
+        return Both(*field(s, (x.a, x.va, x.b, x.vb), self.shift, jnp.cos))
+
+    def start(self):
+        return Both(*map(jnp.asarray, (0.0, 0.0, 0.1, 0.0)))
+
+
+def field(s, x, shift, cos):
+    a, va, b, vb = x
+    first = -a - 0.1 * va + 0.1 * (b - a) + cos(1.3 * s)
+    return va, first, vb, -1.2 * b - 0.1 * vb - 0.1 * (b - a) + cos(1.3 * s - shift)
+
+
+def flown(x, shift):
+    """The state a cycle later and which body strikes, by SciPy."""
+
+    def reaches(place):
+        def guard(s, y):
+            return y[place] - 0.3
+
+        guard.terminal, guard.direction = True, 1
+        return guard
+
+    s, struck = 0.0, []
+    while True:
+        run = solve_ivp(
+            lambda s, y: field(s, y, shift, np.cos), (s, TwoBodies.cycle), x, "DOP853",
+            events=[reaches(0), reaches(2)], rtol=1e-12, atol=1e-13,
+        )  # fmt: skip
+        s, x = run.t[-1], run.y[:, -1].copy()
+        if run.status == 0:
+            return x, struck
+        body = int(len(run.t_events[1]) > 0)
+        struck.append(body)
+        x[2 * body], x[2 * body + 1] = 0.3, -0.6 * x[2 * body + 1]
+
+
+@pytest.mark.slow
+def test_a_switch_leads_to_the_other_order():
+    machine = TwoBodies()
+    orbit = vi.find_orbit(machine, vi.simulate(machine, machine.start(), 6, settle=300).last)
+    options = {"parameter": "shift", "bounds": (-0.5, 0.5)}
+    branch = vi.continue_orbit(orbit, **options)
+    (point,) = branch.special
+    assert "fall together" in point.detail and branch.ends == ("grazing", "bounds")
+    other = point.switch()
+    for motion, order in ((orbit, [0, 1]), (other, [1, 0])):
+        x = np.asarray(jax.tree.leaves(motion.state))
+        later, struck = flown(x, float(motion.machine.shift))
+        assert struck == order
+        np.testing.assert_allclose(later, x, atol=1e-9)
+    back = vi.continue_orbit(other, **options)
+    assert back.ends == ("bounds", "grazing")
+    assert back.special[-1].parameter == pytest.approx(point.parameter, abs=1e-10)

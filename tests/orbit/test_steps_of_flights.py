@@ -1,0 +1,61 @@
+"""Along a curve flights may ask for more steps than those of the motion with which it begins."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+
+
+class Oscillator(vi.AbstractMachine):
+    """A linear oscillator in its own time, of which nothing says how fast it is."""
+
+    omega: jax.Array | float = 0.5
+    gap: jax.Array | float = 20.0
+    restitution: jax.Array | float = 0.7
+
+    @property
+    def stops(self):
+        return (vi.RigidStop(self.gap, self.restitution),)
+
+    @property
+    def cycle(self):
+        return 2 * jnp.pi / self.omega
+
+    def field(self, s, state):
+        Y, V = state.Y, state.V
+        return vi.OscillatorState(V, -Y - 0.1 * V + jnp.cos(self.omega * s))
+
+    def start(self):
+        return vi.OscillatorState(jnp.asarray(1.3), jnp.asarray(0.0))
+
+
+def amplitude(omega):
+    return 1 / np.hypot(1 - omega**2, 0.1 * omega)
+
+
+@pytest.mark.slow
+def test_a_branch_takes_more_where_the_drive_is_slow():
+    machine = Oscillator()
+    orbit = vi.find_orbit(machine, machine.start())
+    branch = vi.continue_orbit(orbit, parameter="omega", bounds=(0.03, 0.55))
+    assert branch.ends == ("bounds", "bounds") and not branch.special
+    for name, end in (("omega", 0.0), ("restitution", 1.3)):
+        words = f"`bounds` must leave the machine valid, but at {name} = {end:g}"
+        with pytest.raises(ValueError, match=words):
+            vi.continue_orbit(orbit, parameter=name, bounds=(end, 0.5) if end < 1 else (0.5, end))
+    np.testing.assert_allclose(branch.y_max, amplitude(branch.parameter), atol=1e-9)
+    periods = 2 * np.pi / branch.parameter
+    product = np.prod(branch.multipliers, axis=1)
+    np.testing.assert_allclose(product, np.exp(-0.1 * periods), atol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_curve_in_two_parameters_does_too():
+    machine = Oscillator(gap=1.5)
+    orbit = vi.find_orbit(machine, machine.start())
+    branch = vi.continue_orbit(orbit, parameter="gap", bounds=(0.9, 2.0))
+    curve = vi.boundary(branch.special[0], parameter="omega", bounds=((0.9, 2.0), (0.03, 0.6)))
+    assert curve.ends == ("bounds", "bounds")
+    gap, omega = curve.parameters.T
+    np.testing.assert_allclose(gap, amplitude(omega), atol=1e-9)
