@@ -40,11 +40,21 @@ def check_parts(machine: AbstractMachine) -> None:
             raise TypeError(f"`{what}` of a {name} must be a tuple of {words}, but is {parts!r}.")
     if callable(machine.cycle):
         raise TypeError(f"`cycle` of a {name} must be a number, or a property that gives one.")
+    if jnp.shape(machine.cycle):
+        raise ValueError(
+            f"`cycle` of a {name} must be one number, but has shape {jnp.shape(machine.cycle)}."
+        )
     cycle = concrete(machine.cycle)
     if cycle is not None and not (np.isfinite(cycle) & (cycle > 0)).all():
         raise ValueError(f"`cycle` of a {name} must be positive and finite, but is {cycle}.")
     many = len(machine.coordinates)
     for i, stop in enumerate(machine.stops):
+        for part in ("gap", "restitution"):
+            shape = () if callable(getattr(stop, part)) else jnp.shape(getattr(stop, part))
+            if shape:
+                raise ValueError(
+                    f"Stop {i} of a {name} must have one number as `{part}`, but has shape {shape}."
+                )
         if stop.coordinate >= many:
             raise ValueError(
                 f"Stop {i} of a {name} limits coordinate {stop.coordinate}, but there are {many}: "

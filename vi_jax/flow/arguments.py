@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from .. import lanes
-from .._checks import count, fits_records, instance_of, require_real
+from .._checks import count, fits_records, instance_of, require_real, short
 from .._numbers import concrete, narrow, require_session, strongly_typed, warn, warn_of_narrow
 from .._types import Machine, State
 from ..machine import AbstractMachine, Scene, begin_modes, is_autonomous
@@ -18,7 +18,7 @@ from ._lane import Plan
 from ._own import check_period as check_period
 from ._own_parts import check_parts
 from .methods import AbstractMethod
-from .named import average_names
+from .named import average_names, quantity_names
 from .options import RunOptions, largest_count
 from .smooth import rounding
 
@@ -53,10 +53,12 @@ def planned(
         )
     if isinstance(machine, Scene):
         _check_scalars(machine=machine, start=start)
+    _check_numbers(machine)
     check_start(machine, start)
     machine, start = of_one_type(machine, start)
     parts, motion = max(1, samples), options.record == "motion"
     averages = average_names(machine, start) if motion else ()
+    quantity_names(machine, start)  # what is none is refused
     columns = 12 + 3 * options.impact_log + 4 * options.event_log + len(averages)
     fits_records("cycles", cycles * parts, columns)
     _warn_of_single_precision()
@@ -165,6 +167,14 @@ def _check_scalars(**arguments: Any) -> None:
                 )
 
 
+def _check_numbers(machine: AbstractMachine) -> None:
+    for path, leaf in jtu.tree_leaves_with_path(machine):
+        numbers = concrete(leaf)
+        if numbers is not None and numbers.dtype.kind == "f" and np.isnan(numbers).any():
+            where = f"{jtu.keystr(path).lstrip('.')} is {short(numbers)}"
+            raise ValueError(f"Argument `machine` must hold numbers, but its {where}.")
+
+
 def _check_flow(argument: str, machine: AbstractMachine, state: State) -> None:
     """**Raises:** `TypeError` for what is no state, where only the field says what one is."""
     try:
@@ -223,7 +233,9 @@ def check_start(machine: AbstractMachine, start: State) -> None:
     if shape:
         raise ValueError(
             "Argument `start` must be one state (use `jax.vmap` for a batch), in which position "
-            f"and velocity are numbers, but there they have shape {shape}."
+            f"and velocity are numbers, but there they have shape {shape}. Of a state of arrays a "
+            "machine of your own says by `position` and `velocity`, or by `coordinates`, which "
+            "numbers these are."
         )
     for path, leaf in jtu.tree_leaves_with_path(start):
         numbers = concrete(leaf)

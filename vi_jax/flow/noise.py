@@ -16,6 +16,7 @@ from .._numbers import concrete
 from .._types import Flag, Scalar, State
 from ..machine import AbstractMachine, Prepared, is_autonomous, leaf_names
 from ._lane import Impulses, Plan, has_fixed_cycle, ticks
+from ._own import in_words_of
 from ._random import normal_pair, threefry
 
 
@@ -136,12 +137,19 @@ def check_noise(machine: AbstractMachine, start: State, noise: Any) -> None:
         )
     for leaf, function in zip(jtu.tree_leaves(start), functions, strict=True):
         if function is not None:
-            shape = jax.eval_shape(lambda x, f=function: jnp.asarray(f(x)), start).shape
-            if shape not in ((), jnp.shape(leaf)):
+            with in_words_of("A function in argument `noise`"):
+                found = jax.eval_shape(lambda x, f=function: _real(f(x)), start)
+            if found.shape not in ((), jnp.shape(leaf)):
                 raise ValueError(
                     "Argument `noise` must have functions that return one amplitude, or an array "
-                    f"of shape {jnp.shape(leaf)}, but one returns shape {shape}."
+                    f"of shape {jnp.shape(leaf)}, but one returns shape {found.shape}."
                 )
+
+
+def _real(amplitude: Any) -> Array:
+    """What a function gives as amplitude. **Raises:** `TypeError` for what is no real number."""
+    require_real("noise", "amplitude by a function", amplitude)
+    return jnp.asarray(amplitude)
 
 
 def _duration(machine: AbstractMachine, start: State) -> Scalar | float | None:

@@ -84,9 +84,8 @@ def with_leaf(tree: Any, name: str, value: Any) -> Any:
         leaves[arrays[index]] = jnp.asarray(old, kind).at[place].set(value)
     elif jnp.ndim(old) and not jnp.ndim(value):
         raise ValueError(
-            f"Argument `parameter` must be a number of the machine, but {name!r} is an array of "
-            f"shape {jnp.shape(old)}; name one of its numbers, as "
-            f"{name + str([0] * jnp.ndim(old))!r}."
+            f"A number of the machine must be named, but {name!r} is an array of shape "
+            f"{jnp.shape(old)}; name one of its numbers, as {name + str([0] * jnp.ndim(old))!r}."
         )
     else:
         leaves[arrays[index]] = jnp.asarray(value, kind)

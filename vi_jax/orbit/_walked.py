@@ -1,6 +1,6 @@
 """A walk along a curve, taken up again where its flights ask for more steps or it has stalled."""
 
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from .._at_work import Tell
 from .._numbers import warn
@@ -20,6 +20,7 @@ _COARSE, _WRONG = 1e-10, 1e-8
 _MORE_STEPS = "more steps"
 
 
+@runtime_checkable
 class Monitor(Protocol):
     """What looks at each step of a walk."""
 
