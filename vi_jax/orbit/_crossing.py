@@ -18,7 +18,7 @@ BESIDE = 1e-3
 # At most so many times as far on each side.
 MOST = 8
 
-Advance = Callable[[np.ndarray, np.ndarray, float], Step]
+Advance = Callable[[Any, Any, float], Step]
 
 
 def tests_of(step: Step) -> dict[str, float]:

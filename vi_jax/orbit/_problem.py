@@ -33,7 +33,7 @@ from ._events import Event, section_of
 from ._fixed_step_method import fixed_step_method, steps_of
 from ._flight import Flight
 from ._shooting import Shooting
-from ._solve import off_by
+from ._solve import Unknowns, off_by
 from .results import Orbit
 
 # Events of a cycle that can be followed, of a machine with switches or a section of its own: a
@@ -115,7 +115,7 @@ def sized_by_motion(problem: Shooting) -> bool:
     return paced or not machine.scales_known or isinstance(problem.method, ImplicitSteps)
 
 
-def finer(problem: Shooting, x: np.ndarray) -> Shooting | None:
+def finer(problem: Shooting, x: Unknowns) -> Shooting | None:
     """The equations with as many steps as the flights of a solution ask for; `None` where more of
     them change nothing, or more are not allowed."""
     off, more = off_by(problem, x), None
