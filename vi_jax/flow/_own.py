@@ -51,13 +51,13 @@ def check_field(machine: AbstractMachine, s: Scalar, state: State, modes: Scalar
     if jtu.tree_structure(state) != jtu.tree_structure(flow) or wanted != got:
         raise TypeError(
             f"{whose} must return what is like its state, {in_short(state)}, but returned "
-            f"{in_short(flow)}.{_rows_of(machine) if wanted != got else ''}"
+            f"{in_short(flow)}.{rows_of(machine) if wanted != got else ''}"
         )
     with in_words_of(f"`section` of a {type(machine).__name__}"):
         jax.eval_shape(machine.section, state)
 
 
-def _rows_of(machine: AbstractMachine) -> str:
+def rows_of(machine: AbstractMachine) -> str:
     """A hint at numbers of a machine that are rows, perhaps of many machines."""
     rows = [name for name, x in vars(machine).items() if eqx.is_array(x) and x.ndim]
     if not rows:

@@ -21,7 +21,7 @@ from ..machine import (
     event_of,
     events_of,
 )
-from ._own import in_short, in_words_of
+from ._own import in_short, in_words_of, rows_of
 
 _KINDS = {
     "stops": (RigidStop, "`RigidStop`s"),
@@ -43,6 +43,7 @@ def check_parts(machine: AbstractMachine) -> None:
     if jnp.shape(machine.cycle):
         raise ValueError(
             f"`cycle` of a {name} must be one number, but has shape {jnp.shape(machine.cycle)}."
+            f"{rows_of(machine)}"
         )
     cycle = concrete(machine.cycle)
     if cycle is not None and not (np.isfinite(cycle) & (cycle > 0)).all():
@@ -54,6 +55,7 @@ def check_parts(machine: AbstractMachine) -> None:
             if shape:
                 raise ValueError(
                     f"Stop {i} of a {name} must have one number as `{part}`, but has shape {shape}."
+                    f"{rows_of(machine)}"
                 )
         if stop.coordinate >= many:
             raise ValueError(
