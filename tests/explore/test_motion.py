@@ -15,6 +15,8 @@ from vi_jax.explore.motion import OBSERVED, WINDOW, look
 from vi_jax.explore.pictures import MAPS, DiagramPicture, MotionPicture
 from vi_jax.explore.serve import compile_all
 
+from differences import some
+
 
 @pytest.fixture(scope="module", autouse=True)
 def _compiled():
@@ -125,8 +127,7 @@ def test_redraws_are_quick():
     assert np.median(took) < 0.2
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("make", ["ideal", "motor"])
+@pytest.mark.parametrize("make", some(["ideal", "motor"], "motor"))
 def test_the_ends_of_all_sliders_can_be_shown(make):
     kinds = {"ideal": controls.IDEAL, "motor": controls.MOTOR}[make]
     see = {"ideal": ideal, "motor": motor}[make]

@@ -80,7 +80,13 @@ def flat(state):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", [vi.FixedStep(steps_per_cycle=40), vi.Adaptive(rtol=1e-9)])
+@pytest.mark.parametrize(
+    "method",
+    [
+        vi.FixedStep(steps_per_cycle=40),
+        pytest.param(vi.Adaptive(rtol=1e-9), marks=pytest.mark.exhaustive),
+    ],
+)
 def test_arrays_are_numbers(method):
     def run(machine):
         return vi.simulate(machine, machine.start(), 4, settle=2, method=method)

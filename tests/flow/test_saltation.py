@@ -55,7 +55,10 @@ def product(Y: float, V: float, cycles: int) -> tuple[np.ndarray, int]:
     [
         pytest.param(vi.ExactFlight(), 1e-9, id="ExactFlight"),
         pytest.param(
-            vi.Adaptive(diffrax.Tsit5(), rtol=1e-11), 1e-7, marks=pytest.mark.slow, id="Adaptive"
+            vi.Adaptive(diffrax.Tsit5(), rtol=1e-11),
+            1e-7,
+            marks=pytest.mark.exhaustive,
+            id="Adaptive",
         ),
     ],
 )

@@ -50,7 +50,7 @@ def test_power_is_a_column_of_a_branch_and_an_axis_of_a_sweep(machine, orbit):
     np.testing.assert_allclose(here.averages["power"], mean, rtol=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_its_derivative_by_the_load(machine, orbit):
     """Of a motion through impacts, beside finite differences. The current fades five times in a
     unit of time, which the machine does not say: so steps are sized."""

@@ -52,7 +52,7 @@ class CurveMonitor:
             *self._grazings(here, last), *self._resonances(here, last), *self._mirror(here, last),
         ]  # fmt: skip
         if found:
-            return min(found, key=lambda f: float(np.dot(here.tangent, (f[0].x - here.x))))
+            return min(found, key=lambda f: self._way(here, f[0]))
         if reason is None:
             last = self.closing.between(here, new, lambda test: self._where(here, new, test))
             reason = None if last is None else "closed"
@@ -70,11 +70,15 @@ class CurveMonitor:
             return at, "bounds"
         if self.symmetric and np.linalg.norm(self._images(last)) < ALIKE:
             for here in reversed(steps):
-                root = float(np.dot(here.tangent, (last.x - here.x) / self.scale))
+                root = self._way(here, last)
                 if root > MOST * BESIDE:
                     at = self._symmetric(here, root, beyond=False)
                     return (last, STALLED) if at is None else (at, SYMMETRY)
         return last, STALLED
+
+    def _way(self, here: Step, at: Step) -> float:
+        """How far along the first one's tangent the second lies."""
+        return float(np.dot(here.tangent, (at.x - here.x) / self.scale))
 
     def _where(self, here: Step, new: Step, test: Callable[[Step], float]) -> Step | None:
         return located(self.problem, here, new, self.scale, test)
@@ -102,8 +106,7 @@ class CurveMonitor:
 
     def _singular(self, here: Step, at: Step, test: Callable[[Step], float]) -> Step:
         """The point at which an impact grazes, where the monodromy matrix has a pole."""
-
-        root = float(np.dot(here.tangent, (at.x - here.x) / self.scale))
+        root = self._way(here, at)
         found = crossing(self.problem, self.advance, here, root, test)
         if found is None:
             return at
@@ -139,7 +142,7 @@ class CurveMonitor:
             return
         at = self._where(here, last, along)
         if at is not None and np.linalg.norm(self._images(at)) < ALIKE:
-            root = float(np.dot(here.tangent, (at.x - here.x) / self.scale))
+            root = self._way(here, at)
             yield self._symmetric(here, root) or at, SYMMETRY
 
     def _images(self, step: Step) -> np.ndarray:
@@ -164,7 +167,7 @@ class CurveMonitor:
 
     def _cut(self, here: Step, new: Step) -> Step:
         """The last point inside the bounds between two, found by halving the step."""
-        low, high = 0.0, float(np.dot(here.tangent, (new.x - here.x) / self.scale))
+        low, high = 0.0, self._way(here, new)
         last = here
         for _ in range(30):
             middle = 0.5 * (low + high)
