@@ -195,7 +195,7 @@ def test_sweeps_scans_and_basins_are_those_of_numbers():
     ],
 )
 def test_names_of_numbers_in_arrays(call):
-    with pytest.raises(ValueError, match=r"number of the machine.*q"):
+    with pytest.raises(ValueError, match=r"must be a number of the machine.*q"):
         call()
 
 

@@ -171,8 +171,8 @@ def _check_numbers(machine: AbstractMachine) -> None:
     for path, leaf in jtu.tree_leaves_with_path(machine):
         numbers = concrete(leaf)
         if numbers is not None and numbers.dtype.kind == "f" and np.isnan(numbers).any():
-            where = f"{jtu.keystr(path).lstrip('.')} is {short(numbers)}"
-            raise ValueError(f"Argument `machine` must hold numbers, but its {where}.")
+            where = f"{_leaf_in_words(path)} is {short(numbers)}"
+            raise ValueError(f"Argument `machine` must hold numbers, but {where}.")
 
 
 def _check_flow(argument: str, machine: AbstractMachine, state: State) -> None:

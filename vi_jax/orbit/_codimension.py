@@ -22,7 +22,7 @@ from ._special_condition import Special
 from ._symmetry import ALIKE, may_be_symmetric
 from ._words import AT_CODIMENSION_TWO, grazing_in_words
 from .codimension_two import CodimensionTwo
-from .curve import SAME_CURVE, Step
+from .curve import SAME_CURVE, Step, way
 from .special import (
     CUSP,
     DEGENERATE,
@@ -243,28 +243,29 @@ def _zeros(
         (before, like), (after, _) = seen[i], seen[i + 1]
         if not (before * after < 0 or (after == 0 and before != 0)):
             continue
-        at = _zero(problem, here, new, scale, lambda s, like=like: test(s, like)[0])
+        most = max(abs(before), abs(after))
+        at = _zero(problem, here, new, scale, lambda s, like=like: test(s, like)[0], most)
         if at is None:
             continue
-        way = (new.x - here.x) / scale
-        yield i + float(way @ ((at.x - here.x) / scale) / (way @ way)), at
+        whole = (new.x - here.x) / scale
+        yield i + float(whole @ ((at.x - here.x) / scale) / (whole @ whole)), at
 
 
 def _zero(
-    problem: Shooting, here: Step, new: Step, scale: np.ndarray, test: Callable[[Step], float]
-) -> Step | None:
-    """The point between two at which a test is zero; `None` where it has a pole."""
-    most = max(abs(test(here)), abs(test(new)))
+    problem: Shooting, here: Step, new: Step, scale: np.ndarray, test: Callable[[Step], float],
+    most: float,
+) -> Step | None:  # fmt: skip
+    """The point between two at which a test is zero; `None` where it has a pole. `most` is the
+    larger of its values at both."""
     at = between(problem, here, new, scale, test)
     if at is None or abs(test(at)) <= _ZERO * most:
         return at
     # Where another curve crosses this one the corrector has no answer.
-    if float(here.tangent @ ((new.x - here.x) / scale)) < 0:
+    if way(here, new, scale) < 0:
         here = new
-    root = float(here.tangent @ ((at.x - here.x) / scale))
 
     def admits(step: Step, length: float) -> bool:
         return float(step.tangent @ here.tangent) >= SAME_CURVE and abs(test(step)) < most
 
     ahead = lambda x, tangent, length: advance(problem, x, tangent, scale, length)
-    return crossing(problem, ahead, here, root, test, admits)
+    return crossing(problem, ahead, here, way(here, at, scale), test, admits)

@@ -7,12 +7,11 @@ import numpy as np
 
 from ._closing import Closing
 from ._crossing import BESIDE, MOST, crossing
-from ._past_section import at_bound
 from ._shooting import Shooting
 from ._solve import advance, images_at, located
 from ._special_condition import Special
 from ._symmetry import ALIKE, ROUNDED, may_be_symmetric
-from .curve import STALLED, Step
+from .curve import STALLED, Step, way
 from .special import GRAZING, RESONANCE_1, RESONANCE_2, SYMMETRY, TORUS, TOUCHING
 
 # What lies below zero by no more than this is zero to rounding: a choice, a hundred times the
@@ -52,7 +51,7 @@ class CurveMonitor:
             *self._grazings(here, last), *self._resonances(here, last), *self._mirror(here, last),
         ]  # fmt: skip
         if found:
-            return min(found, key=lambda f: self._way(here, f[0]))
+            return min(found, key=lambda f: way(here, f[0], self.scale))
         if reason is None:
             last = self.closing.between(here, new, lambda test: self._where(here, new, test))
             reason = None if last is None else "closed"
@@ -65,20 +64,13 @@ class CurveMonitor:
     def stalled(self, steps: list[Step]) -> tuple[Step, str]:
         """The last point of a curve that the corrector follows no further, and why it ends."""
         last = steps[-1]
-        at = at_bound(self.problem, last, self.scale, self.bounds)
-        if at is not None:
-            return at, "bounds"
         if self.symmetric and np.linalg.norm(self._images(last)) < ALIKE:
             for here in reversed(steps):
-                root = self._way(here, last)
+                root = way(here, last, self.scale)
                 if root > MOST * BESIDE:
                     at = self._symmetric(here, root, beyond=False)
                     return (last, STALLED) if at is None else (at, SYMMETRY)
         return last, STALLED
-
-    def _way(self, here: Step, at: Step) -> float:
-        """How far along the first one's tangent the second lies."""
-        return float(np.dot(here.tangent, (at.x - here.x) / self.scale))
 
     def _where(self, here: Step, new: Step, test: Callable[[Step], float]) -> Step | None:
         return located(self.problem, here, new, self.scale, test)
@@ -106,7 +98,7 @@ class CurveMonitor:
 
     def _singular(self, here: Step, at: Step, test: Callable[[Step], float]) -> Step:
         """The point at which an impact grazes, where the monodromy matrix has a pole."""
-        root = self._way(here, at)
+        root = way(here, at, self.scale)
         found = crossing(self.problem, self.advance, here, root, test)
         if found is None:
             return at
@@ -142,7 +134,7 @@ class CurveMonitor:
             return
         at = self._where(here, last, along)
         if at is not None and np.linalg.norm(self._images(at)) < ALIKE:
-            root = self._way(here, at)
+            root = way(here, at, self.scale)
             yield self._symmetric(here, root) or at, SYMMETRY
 
     def _images(self, step: Step) -> np.ndarray:
@@ -167,7 +159,7 @@ class CurveMonitor:
 
     def _cut(self, here: Step, new: Step) -> Step:
         """The last point inside the bounds between two, found by halving the step."""
-        low, high = 0.0, self._way(here, new)
+        low, high = 0.0, way(here, new, self.scale)
         last = here
         for _ in range(30):
             middle = 0.5 * (low + high)

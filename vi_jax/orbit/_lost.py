@@ -9,7 +9,7 @@ from ._hopf import hopf_between
 from ._shooting import Shooting
 from ._solve import advance, located
 from ._words import ANEW, REORDERED, RESTS
-from .curve import Step
+from .curve import Step, way
 
 # Events that are to come together do so within this: a choice.
 _TOGETHER = 1e-9
@@ -73,5 +73,5 @@ def _tests(problem: Shooting, here: Step) -> list[tuple[Callable[[Step], float],
 
 def _short_of(problem: Shooting, here: Step, at: Step, scale: np.ndarray) -> Step:
     """A point between two, right before the second."""
-    length = float(np.dot(here.tangent, (at.x - here.x) / scale))
+    length = way(here, at, scale)
     return advance(problem, here.x, here.tangent, scale, (1 - _SHORT) * length)

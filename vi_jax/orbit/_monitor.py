@@ -24,7 +24,7 @@ from ._solution import orbit_of
 from ._solve import advance, images_at, located
 from ._symmetry import ALIKE, ROUNDED, may_be_symmetric
 from ._words import DETAILS, HELD_FOLD, RESTS
-from .curve import SHORTER, Step
+from .curve import SHORTER, Step, way
 from .special import (
     CROSSING,
     DOUBLING,
@@ -130,7 +130,7 @@ class BranchMonitor:
 
     def stalled(self, steps: list[Step]) -> tuple[Step, str]:
         """The last point of a branch that the corrector follows no further, and why it ends."""
-        last, reason = why_stalled(self.problem, steps[-1], self.scale, self.bounds)
+        last, reason = why_stalled(self.problem, steps[-1], self.scale)
         if reason == GRAZING:
             self.special.append(self._point(GRAZING, last, BETWEEN_RESTS))
         return last, reason
@@ -235,7 +235,7 @@ class BranchMonitor:
 
     def _on_the_way(self, here: Step, last: Step, share: float) -> Step:
         """The point at this share of the way between two."""
-        length = float(np.dot(here.tangent, (last.x - here.x) / self.scale))
+        length = way(here, last, self.scale)
         return self.advance(here.x, here.tangent, share * length)
 
     def _changes(self, here: Step, last: Step) -> list[Step]:
@@ -305,7 +305,7 @@ class BranchMonitor:
             # So close to where they cross the corrector may find the other branch.
             return not self.symmetric or (kind == FOLD) != (self._apart(step) < ALIKE * BESIDE)
 
-        root = float(np.dot(here.tangent, (at.x - here.x) / self.scale))
+        root = way(here, at, self.scale)
         tested = lambda step: tests_of(step)[kind]
         return crossing(self.problem, self.advance, here, root, tested, admits) or at
 

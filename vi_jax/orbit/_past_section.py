@@ -6,8 +6,6 @@ impact instead of that before it. So a branch of fixed points of the section map
 taken up beyond.
 """
 
-from collections.abc import Sequence
-
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
@@ -25,10 +23,6 @@ _MEETS = 1e-5
 
 # How far beyond that place the motion is looked for (in the parameter's scale): choices.
 _BEYOND = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3)
-
-# A walk that stalls this close to a bound (in the parameter's scale) is taken to it: a choice, a
-# few times what the shortest of its steps leave.
-_STALLED_AT = 1e-6
 
 
 def past_section(problem: Shooting, last: Step, scale: np.ndarray) -> Step | None:
@@ -54,30 +48,11 @@ def past_section(problem: Shooting, last: Step, scale: np.ndarray) -> Step | Non
     return None
 
 
-def why_stalled(
-    problem: Shooting, last: Step, scale: np.ndarray, bounds: list[tuple[float, float]]
-) -> tuple[Step, str]:
-    """The last point of a branch that the corrector follows no further, and why it ends: a bound,
-    or of motions that rest a grazing from which both of its branches lead back."""
-    at = at_bound(problem, last, scale, bounds)
-    if at is not None:
-        return at, "bounds"
+def why_stalled(problem: Shooting, last: Step, scale: np.ndarray) -> tuple[Step, str]:
+    """The last point of a branch that the corrector follows no further, and why it ends: of motions
+    that rest a grazing, perhaps, from which both of its branches lead back."""
     touch = None if problem.follows_events else touched_beside(problem, last, scale)
     return (last, STALLED) if touch is None else (touch, GRAZING)
-
-
-def at_bound(
-    problem: Shooting, last: Step, scale: np.ndarray, bounds: Sequence[tuple[float, float]]
-) -> Step | None:
-    """The point at the bound of a parameter before which a walk has stalled: its machine has
-    another form beyond, as with a restitution of 0 or 1. `None` if it has stalled elsewhere."""
-    for i, ends in enumerate(bounds, -len(bounds)):
-        for bound in ends:
-            way = (bound - float(last.x[i])) / scale[i]
-            if abs(way) < _STALLED_AT:
-                at = advance(problem, last.x, np.eye(len(last.x))[i], scale, way)
-                return at if bool(at.good) else None
-    return None
 
 
 def _speeds(stop: RigidStop, V: float) -> list[float]:

@@ -93,12 +93,12 @@ def problem_of(
     period = float(orbit.duration) if blank.autonomous else float(machine.cycle) * cycles
     way = _followed(blank, orbit.state, found, period)
     while sized_by_motion(blank):
-        finer = dataclasses.replace(blank, steps=2 * blank.steps)
-        again = _followed(finer, orbit.state, found, period)
+        doubled = dataclasses.replace(blank, steps=2 * blank.steps)
+        again = _followed(doubled, orbit.state, found, period)
         apart = np.max(np.abs(again.states - way.states) / (1 + np.abs(again.states)))
-        if finer.steps > _MOST:
+        if doubled.steps > _MOST:
             break
-        blank, way = finer, again  # the finer one: along the branch flights may ask for more
+        blank, way = doubled, again  # the finer one: along the branch flights may ask for more
         if apart < _SETTLED:
             break
     problem = dataclasses.replace(blank, events=tuple(event for _, event in found), modes=way.modes)

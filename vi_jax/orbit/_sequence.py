@@ -8,7 +8,7 @@ from ._refined_rest import refined_rest
 from ._shooting import Shooting
 from ._solve import advance, located
 from ._touched import touched_beside
-from .curve import SHORTER, Step
+from .curve import SHORTER, Step, way
 from .special import GRAZING, REST
 
 BETWEEN_RESTS = "touches a stop between its rests"
@@ -85,7 +85,7 @@ def _changed(
     at = located(problem, here, last, scale, same)
     if at is None:
         return None
-    left = float(np.dot(at.tangent, (last.x - at.x) / scale))
+    left = way(at, last, scale)
     beyond = last if left < _BEYOND else advance(problem, at.x, at.tangent, scale, _BEYOND)
     return located(problem, at, beyond, scale, same) or at, beyond
 

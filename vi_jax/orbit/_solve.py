@@ -15,7 +15,7 @@ from .._types import Vector
 from ._observed import Observed
 from ._shooting import Shooting
 from ._symmetry import images
-from .curve import Step, array_of, corrected, first_tangent
+from .curve import Step, array_of, corrected, first_tangent, way
 
 # How far short of a place that has no solution (as a share of the step) one is looked for: choices.
 _SHORT_OF = (1e-6, 1e-5, 1e-4, 1e-3)
@@ -133,7 +133,7 @@ def located(
     **Arguments:** `here` and `new`, the points; `scale`, the size of each unknown; `test`, a
     function of a point that changes its sign between them.
     """
-    length = float(np.dot(here.tangent, (new.x - here.x) / scale))
+    length = way(here, new, scale)
     at: dict[float, Step] = {0.0: here, length: new}
     silent: list[float] = []
 
@@ -194,6 +194,6 @@ def between(
 ) -> Step | None:
     """As `located`, between two points that follow each other in a finished curve: its steps
     follow its sense, except in its backward half, which is turned."""
-    if float(np.dot(here.tangent, (new.x - here.x) / scale)) < 0:
+    if way(here, new, scale) < 0:
         here, new = new, here
     return located(problem, here, new, scale, test)

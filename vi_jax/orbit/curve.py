@@ -121,6 +121,12 @@ INTERRUPTED, STALLED = "interrupted", "stalled"
 # The tangents of two points close to each other on one curve have at least this product: a choice.
 SAME_CURVE = 0.9
 
+
+def way(here: Step, at: Step, scale: np.ndarray) -> float:
+    """How far along the first one's tangent the second lies, in unknowns divided by `scale`."""
+    return float(np.dot(here.tangent, (at.x - here.x) / scale))
+
+
 # Stands for the reason to end where a step has led to another curve: it is to be shorter.
 SHORTER = "shorter"
 
