@@ -1,5 +1,8 @@
-"""Types that signatures are written in, throughout the package."""
+"""Types of signatures, and libraries that are loaded at their first use."""
 
+import importlib.util
+import sys
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from jaxtyping import Array, Bool, Float
@@ -16,11 +19,29 @@ State = Any
 """The state of a machine: a pytree of numbers (or arrays, which not every verb takes) whose
 structure the machine chooses. What changes it, as its rate, has the same structure."""
 
+
+def _lazy(name: str) -> ModuleType:
+    """Return a module whose code runs at the first access to it."""
+    if name in sys.modules:
+        return sys.modules[name]
+    spec = importlib.util.find_spec(name)
+    if spec is None or spec.loader is None:
+        raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+    spec.loader = importlib.util.LazyLoader(spec.loader)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
 if TYPE_CHECKING:
+    import xarray as xr
+    import zarr
     from jax.typing import ArrayLike as Number
 
     from .machine import AbstractMachine as Machine
 else:
-    Machine = Any  # for what the module of `AbstractMachine` itself imports
-    Number = Any  # what is none is refused in words of ours, not by a check of types
-    """One number as a user gives it: Python's, NumPy's or JAX's, which may be traced."""
+    xr, zarr = _lazy("xarray"), _lazy("zarr")
+    Machine = Any  # `AbstractMachine`'s own module imports this one
+    Number = Any  # wrong values are refused with our own messages, not by a check of types
+    """One number as a user passes it: Python's, NumPy's or JAX's, which may be traced."""

@@ -9,7 +9,7 @@ from io import TextIOWrapper
 import jax
 
 from .._checks import unwritable
-from .._version import installed_version
+from .._messages import installed_version
 from ..explore.serve import Subject, missing, serve
 from ..paper.report import reproduce, summary
 from .config import (

@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from .._files import write_whole
-from .._words import so_many
+from .._messages import so_many
 from ..flow import RESULTS, Run, average_names, number_of
 from ..machine import AbstractMachine
 from ..orbit import Orbit, continue_orbit, find_orbit

@@ -11,9 +11,9 @@ import jax.tree_util as jtu
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from .._messages import so_many
 from .._programs import compiled
 from .._types import State
-from .._words import so_many
 from ..flow import RESULTS, Run, chosen, simulate
 from ..machine import AbstractMachine, is_autonomous, unit_of, with_unit
 from ..orbit import STABILITY, complex_in_words, cycle_map, stability_of

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from .._words import so_many
+from .._messages import so_many
 
 # Cycles of which a text tells, and events of each.
 _CYCLES, _EVENTS = 8, 6

@@ -14,7 +14,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jax.core import Tracer
 
-from .._numbers import warn
+from .._messages import warn
 from .._types import Scalar, Scalars, State
 from ..machine import AbstractMachine, begin_modes, is_autonomous
 from ._by_numpy import by_numpy

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
-from .._numbers import concrete
+from .._checks import concrete
 from .._types import Scalar, Scalars, State
 from ..machine import (
     AbstractEvent,

@@ -12,8 +12,8 @@ from jaxtyping import Array, Int
 
 from .. import lanes
 from .._checks import flag
+from .._messages import warning_once
 from .._programs import compiled
-from .._renamed import renamed
 from .._types import State
 from ..machine import AbstractMachine, stated
 from ._failed_derivatives import failed_derivatives
@@ -30,7 +30,7 @@ from .results import Errors, EventLog, ImpactLog, Run, Samples, reason
 _FAILED = "A lane of the simulation failed; see `RESULTS` and `Run.result`."
 
 
-@renamed(scene="machine")
+@warning_once
 def simulate(
     machine: AbstractMachine,
     start: State,

@@ -10,8 +10,19 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from .. import lanes
-from .._checks import count, fits_records, instance_of, require_real, short
-from .._numbers import concrete, narrow, require_session, strongly_typed, warn, warn_of_narrow
+from .._checks import (
+    concrete,
+    count,
+    fits_records,
+    instance_of,
+    narrow,
+    require_real,
+    require_session,
+    short,
+    strongly_typed,
+    warn_of_narrow,
+)
+from .._messages import warn
 from .._types import Machine, State
 from ..machine import AbstractMachine, Scene, begin_modes, is_autonomous
 from ._lane import Plan

@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from .._checks import one_of
-from .._lazy import xr
-from .._types import State
+from .._types import State, xr
 from ..machine import by_name, with_units
 
 EVENTS = ("impact", "rest", "release", "mode", "reset")

@@ -11,8 +11,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, UInt32
 
-from .._checks import count, require_real
-from .._numbers import concrete
+from .._checks import concrete, count, require_real
 from .._types import Flag, Scalar, State
 from ..machine import AbstractMachine, Prepared, is_autonomous, leaf_names
 from ._lane import Impulses, Plan, has_fixed_cycle, ticks

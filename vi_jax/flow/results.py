@@ -9,9 +9,8 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float, Int
 
-from .._lazy import xr
-from .._types import Scalar, State
-from .._words import so_many
+from .._messages import so_many
+from .._types import Scalar, State, xr
 from ..machine import PLAIN, Shown, Stated, Summarized, in_unit, name_in, state_in_words
 from ._listed import listed
 from .enumeration import NamedEnumeration

@@ -14,7 +14,7 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 from .._checks import count, one_of, require
-from .._renamed import renamed
+from .._messages import warning_once
 from .._types import Scalar, State
 from ..machine import AbstractMachine
 from ._simulate import simulate
@@ -66,7 +66,7 @@ class Suggestion(NamedTuple):
         return "\n".join(lines)
 
 
-@renamed(scene="machine")
+@warning_once
 def suggest_method(
     machine: AbstractMachine,
     *,

@@ -8,8 +8,7 @@ import jax.tree_util as jtu
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
-from .._checks import NOT_NEGATIVE, SHARE, count, require_ranges
-from .._numbers import real
+from .._checks import NOT_NEGATIVE, SHARE, count, real, require_ranges
 from .._types import Flag, Machine, Scalar, State
 from .contacts import added, forces, held_flow, push_of, shares
 from .event import AbstractSwitch, Around

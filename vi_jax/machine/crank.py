@@ -6,8 +6,7 @@ from typing import ClassVar, NamedTuple
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from .._checks import Range, require_ranges
-from .._numbers import real
+from .._checks import Range, real, require_ranges
 from .._types import Scalar
 from .own import by_default, is_own
 from .shown import Shown

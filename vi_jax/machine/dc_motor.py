@@ -6,8 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import POSITIVE
-from .._numbers import real
+from .._checks import POSITIVE, real
 from .motor import Motor
 from .states import DCMotorState, TimedDCMotorState
 

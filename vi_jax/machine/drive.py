@@ -10,8 +10,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import POSITIVE, require, require_ranges
-from .._numbers import number, real
+from .._checks import POSITIVE, number, real, require, require_ranges
 from .._types import State
 from .shown import Shown
 from .states import OscillatorState

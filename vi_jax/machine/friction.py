@@ -7,8 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import NOT_NEGATIVE, Range, require_ranges
-from .._numbers import real, real_or_law
+from .._checks import NOT_NEGATIVE, Range, real, real_or_law, require_ranges
 from .._types import Flag, Machine, Scalar, State
 from .event import AbstractSwitch
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
-from .._numbers import concrete, number
+from .._checks import concrete, number
 from .._types import Number, Scalar, State
 from .base import AbstractMachine, Coordinate, Prepared
 from .modal import Modes, along, harmonic, modal, solved, times, without_row

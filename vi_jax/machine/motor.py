@@ -6,8 +6,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from .._checks import NOT_NEGATIVE, POSITIVE, REAL, require_ranges
-from .._numbers import real
+from .._checks import NOT_NEGATIVE, POSITIVE, REAL, real, require_ranges
 from .._types import State
 from .crank import Slide
 from .drive import AbstractDrive

@@ -11,8 +11,19 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, in_range, one_of, require_ranges
-from .._numbers import concrete, optional_real, real, warn
+from .._checks import (
+    NOT_NEGATIVE,
+    POSITIVE,
+    REAL,
+    SHARE,
+    concrete,
+    in_range,
+    one_of,
+    optional_real,
+    real,
+    require_ranges,
+)
+from .._messages import warn
 from .crank import CosineCrank, SliderCrank
 from .dc_motor import DCMotor
 from .drive import IdealDrive

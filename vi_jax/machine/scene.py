@@ -10,9 +10,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._calls import named
-from .._checks import NOT_NEGATIVE, Range, instance_of, require, require_ranges, tuple_of
-from .._numbers import concrete, number, optional_real, real
+from .._checks import (
+    NOT_NEGATIVE,
+    Range,
+    concrete,
+    instance_of,
+    number,
+    optional_real,
+    real,
+    require,
+    require_ranges,
+    tuple_of,
+)
 from .._types import Flag, Number, Scalar, State
 from .crank import AbstractCrank, CosineCrank
 from .drive import AbstractDrive, IdealDrive
@@ -79,7 +88,6 @@ class Scene(ShaftMachine):
         require_ranges(self)
 
     @classmethod
-    @named
     def ideal(
         cls,
         *,

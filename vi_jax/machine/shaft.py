@@ -8,8 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import one_of, state_of_numbers
-from .._numbers import concrete
+from .._checks import concrete, one_of, state_of_numbers
 from .._types import Flag, Scalar, State
 from .base import AbstractMachine
 

@@ -11,7 +11,6 @@ import jax.tree_util as jtu
 import numpy as np
 from jax.core import Tracer
 
-from .._calls import check_call
 from .numbers import by_name
 from .units import NONE, unit_of, with_unit
 
@@ -20,8 +19,7 @@ _WIDTH, _LISTED = 88, 6
 
 
 class Shown(eqx.Module):
-    """A module that shows its numbers, in the units that its `units` state, if it has any, and
-    refuses arguments that it does not have by their names."""
+    """A module that shows its numbers, in the units that its `units` state, if it has any."""
 
     def __new__(cls, *args: Any, **kwargs: Any):
         fields = {field.name for field in dataclasses.fields(cls)}
@@ -31,7 +29,6 @@ class Shown(eqx.Module):
                     f"`{cls.__name__}` has no argument `{name}`: a number is declared with its "
                     f"type in the class, `{name}: float = {getattr(cls, name)!r}`."
                 )
-        check_call(cls.__init__, cls.__name__, (None, *args), kwargs, bound=1)
         return super().__new__(cls)
 
     def __repr__(self) -> str:

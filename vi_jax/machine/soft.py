@@ -7,8 +7,16 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import NOT_NEGATIVE, POSITIVE, REAL, count, instance_of, one_of, require_ranges
-from .._numbers import number
+from .._checks import (
+    NOT_NEGATIVE,
+    POSITIVE,
+    REAL,
+    count,
+    instance_of,
+    number,
+    one_of,
+    require_ranges,
+)
 from .._types import Machine, Number, State
 from .event import AbstractSwitch
 from .law import AbstractContactLaw, HuntCrossley, PowerLaw

@@ -10,8 +10,17 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._checks import REAL, SHARE, count, one_of, require_ranges
-from .._numbers import concrete, optional_real, real, real_or_law
+from .._checks import (
+    REAL,
+    SHARE,
+    concrete,
+    count,
+    one_of,
+    optional_real,
+    real,
+    real_or_law,
+    require_ranges,
+)
 from .._types import Machine, Number, Scalar, State
 from .event import AbstractEvent, Modes
 from .events import struck_modes

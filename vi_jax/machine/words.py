@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from .._words import so_many
+from .._messages import so_many
 from .shown import Shown
 from .units import PLAIN, unit_in
 

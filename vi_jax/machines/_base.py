@@ -7,8 +7,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 
-from .._checks import require, require_ranges
-from .._numbers import number, optional_real, real
+from .._checks import number, optional_real, real, require, require_ranges
 from .._types import Scalar, State
 from ..machine import AbstractMachine, RigidStop
 

@@ -7,8 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from .._checks import tuple_of
-from .._numbers import concrete, number
+from .._checks import concrete, number, tuple_of
 from ..machine import RigidStop
 
 # A matrix differs from its transpose by no more than this share of its largest number: rounding of

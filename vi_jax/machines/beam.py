@@ -18,9 +18,9 @@ from .._checks import (
     count,
     flag,
     one_of,
+    optional_real,
     require_ranges,
 )
-from .._numbers import optional_real
 from .._types import Number, Scalar
 from ..machine import LinearMachine, RigidStop, StructureState
 from ._base import number_field, stops_at

@@ -5,8 +5,7 @@ from typing import Any, ClassVar
 
 import jax.numpy as jnp
 
-from .._checks import NOT_NEGATIVE, SHARE
-from .._numbers import number
+from .._checks import NOT_NEGATIVE, SHARE, number
 from .._types import Number, Scalar
 from ..machine import RigidStop, Shown
 from ._base import PhaseMachine, number_field

@@ -7,8 +7,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 
-from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Range
-from .._numbers import number
+from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Range, number
 from .._types import Number, Scalar, State
 from ..machine import Coordinate, DryFriction, RigidStop, Shown
 from ._base import ForcedMachine, number_field

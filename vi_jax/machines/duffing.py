@@ -6,8 +6,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 
-from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE
-from .._numbers import number
+from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, number
 from .._types import Number, Scalar
 from ..machine import OscillatorState, RigidStop
 from ._base import ForcedMachine, number_field, stops_at

@@ -7,8 +7,7 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from .._checks import NOT_NEGATIVE, POSITIVE, SHARE
-from .._numbers import concrete, number
+from .._checks import NOT_NEGATIVE, POSITIVE, SHARE, concrete, number
 from .._types import Number, Scalar
 from ..machine import RigidStop, Shown
 from ._base import AutonomousMachine, number_field

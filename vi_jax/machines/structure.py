@@ -7,8 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import NOT_NEGATIVE, POSITIVE, REAL, require, require_ranges
-from .._numbers import number
+from .._checks import NOT_NEGATIVE, POSITIVE, REAL, number, require, require_ranges
 from .._types import Scalar
 from ..machine import LinearMachine, RigidStop
 from ._base import number_field

@@ -10,8 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Range, require
-from .._numbers import number
+from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Range, number, require
 from .._types import Number, Scalar, State
 from ..machine import RigidStop, ShaftMachine, Shown
 from ._base import PhaseMachine, number_field, stops_at

@@ -8,8 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE
-from .._numbers import concrete, number
+from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, concrete, number
 from .._types import Number, Scalar, State
 from ..machine import ContactFriction, Coordinate, RigidStop, Shown
 from ._base import AutonomousMachine, number_field

@@ -6,11 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from .._at_work import at_work
 from .._checks import flag, instance_of, interval
-from .._interrupted import Interrupted
-from .._lazy import xr
-from .._words import so_many
+from .._messages import Interrupted, at_work, so_many
+from .._types import xr
 from ..flow import tidy
 from ..machine import check_leaf, leaf, with_units
 from ._codimension import points_of

@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._messages import so_many
 from .._programs import compiled
-from .._words import so_many
 from ._crossing import crossing
 from ._curve_monitor import cosine_of
 from ._origin import repeated

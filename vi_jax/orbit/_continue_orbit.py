@@ -8,9 +8,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from .._at_work import at_work
 from .._checks import flag, given_number, interval, one_of, short, tuple_of_names
-from .._interrupted import Interrupted
+from .._messages import Interrupted, at_work
 from ..flow import MethodLike
 from ..machine import check_leaf, leaf
 from ._conditions import as_held

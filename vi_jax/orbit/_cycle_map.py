@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from .._checks import count, require
-from .._renamed import renamed
+from .._messages import warning_once
 from .._types import State
 from ..flow import (
     AbstractMethod,
@@ -73,7 +73,7 @@ def _end(cycle_map: CycleMap, state: State) -> State:
     return run.last
 
 
-@renamed(scene="machine")
+@warning_once
 def cycle_map(
     machine: AbstractMachine,
     cycles: int | Int[Array, ""] = 1,

@@ -7,8 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._lazy import xr
-from .._types import State
+from .._types import State, xr
 from ..flow import average_names, in_names, quantities_on, quantity_names
 from ..machine import AbstractMachine, components, with_units
 from ._shooting import Shooting

@@ -4,8 +4,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from .._at_work import Tell
-from .._numbers import warn
+from .._messages import Tell, warn
 from ._past_section import past_section
 from ._problem import finer, sized_by_motion
 from ._shooting import Shooting

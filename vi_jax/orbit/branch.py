@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from .._checks import given_number, one_of
-from .._lazy import xr
-from .._words import so_many
+from .._messages import so_many
+from .._types import xr
 from ..flow import tidy
 from ..machine import in_unit, with_units
 from ._conditions import held_in_words

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from .._at_work import Tell
 from .._checks import count, given_number
+from .._messages import Tell
 from .._types import Flag, Scalar
 
 Vector = Float[Array, " n"]

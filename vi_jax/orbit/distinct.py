@@ -7,7 +7,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .._checks import given_number, short
-from .._words import so_many
+from .._messages import so_many
 from ..machine import in_rows, state_in_words
 from .results import InWords, Orbit, hits_in_words, span_in_words, trimmed
 

@@ -12,10 +12,9 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
-from .._checks import count, flag
-from .._numbers import concrete
+from .._checks import concrete, count, flag
+from .._messages import warning_once
 from .._programs import compiled
-from .._renamed import renamed
 from .._types import Flag, Number, State
 from ..flow import MethodLike, check_leaves, in_modes, means, shape_of
 from ..machine import AbstractMachine, begin_modes, is_autonomous
@@ -34,7 +33,7 @@ _BATCH = 512
 _SLOW = 0.02
 
 
-@renamed(scene="machine")
+@warning_once
 def find_orbit(
     machine: AbstractMachine,
     guess: State,

@@ -7,10 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float
 
-from .._at_work import at_work
 from .._checks import count, flag, instance_of
-from .._interrupted import Interrupted
-from .._words import so_many
+from .._messages import Interrupted, at_work, so_many
 from ..machine import Stated, Summarized, in_unit, stated
 from ._beside_grazing import ASKED, DECADES, Motions, beside_grazing, positions, stretch
 from ._events import Event

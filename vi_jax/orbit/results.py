@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -12,10 +11,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from .._lazy import xr
-from .._renamed import refuse_attribute
-from .._types import State
-from .._words import so_many
+from .._messages import so_many
+from .._types import State, xr
 from ..flow import (
     AbstractMethod,
     NamedEnumeration,
@@ -135,9 +132,6 @@ class Orbit(Summarized):
     averages: dict[str, Float[Array, "..."]] = eqx.field(default_factory=dict)
     """The machine's own averages over the time of the period, by name (see
     `AbstractMachine.averages`)."""
-
-    def __getattr__(self, name: str) -> Any:
-        raise refuse_attribute(self, name, {"scene": "machine"})
 
     @property
     def successful(self) -> Bool[Array, "..."]:

@@ -16,8 +16,7 @@ import optax
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from .._checks import count, instance_of, require
-from .._numbers import number
+from .._checks import count, instance_of, number, require
 from .._types import Scalar
 from ._neutral import rounding
 

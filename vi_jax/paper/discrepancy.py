@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .._words import so_many
+from .._messages import so_many
 from ..orbit import ClosedFormOrbits
 from ..scans import Sweep
 from .motions import GAP

@@ -18,7 +18,6 @@ from PIL import Image
 
 from .._checks import count, flag, given_number, instance_of, unwritable
 from .._files import write_whole
-from .._renamed import renamed
 from ..flow import Run
 from ..machine import AbstractMachine
 from ..orbit import Orbit
@@ -45,7 +44,6 @@ class _Frames(NamedTuple):
     positions: np.ndarray
 
 
-@renamed(scene="machine")
 def animate(
     motion: Run | Orbit,
     machine: AbstractMachine | None = None,

@@ -7,7 +7,6 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, MultipleLocator
 
 from .._checks import instance_of
-from .._renamed import renamed
 from ..flow import Run, Samples
 from ..machine import PLAIN, AbstractMachine, SoftStop, in_brackets, name_in, unit_of
 from .colors import BLUE, STOP, once
@@ -31,7 +30,6 @@ def counts_by_angle(machine: AbstractMachine | None) -> bool:
     return machine is None or machine.period_of(1) == "2π"
 
 
-@renamed(scene="machine")
 def plot_history(
     motion: Run | Samples,
     *,
@@ -115,7 +113,6 @@ def _multiple_of_pi(value: float | int, _: int | None = None) -> str:
     return {0: "0", 1: "π", -1: "-π"}.get(whole, f"{whole}π")
 
 
-@renamed(scene="machine")
 def plot_phase_portrait(
     motion: Run | Samples,
     machine: AbstractMachine | None = None,

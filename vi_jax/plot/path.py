@@ -7,7 +7,6 @@ import jax
 import numpy as np
 
 from .._checks import instance_of
-from .._renamed import renamed
 from ..flow import Run, Samples
 from ..machine import AbstractMachine
 from ..orbit import Orbit
@@ -31,7 +30,6 @@ class MotionPath(NamedTuple):
     """Velocity: what an impact reverses (unit: the machine's; a ω for a `Scene`)."""
 
 
-@renamed(scene="machine")
 def motion_path(
     motion: Run | Samples,
     *,

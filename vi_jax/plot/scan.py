@@ -13,8 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from .._checks import flag
-from .._renamed import renamed
-from .._words import so_many
+from .._messages import so_many
 from ..machine import AbstractMachine, by_name, in_brackets, unit_of
 from ..scans import NOT_COMPUTED, REGIMES, Basins, periods_of
 from . import colors as look
@@ -36,7 +35,6 @@ _NONE, _ONE, _MORE = 100, 200, 300
 _NAMED = 12
 
 
-@renamed(scene="machine")
 def plot_regimes(
     data: xr.Dataset,
     *,

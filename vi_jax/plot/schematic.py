@@ -9,7 +9,6 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from .._checks import instance_of
-from .._renamed import renamed
 from .._types import State
 from ..machine import AbstractMachine, Scene, ShaftMachine, SoftStop
 from ..machines import BouncingBall, Duffing, ImpactPair, UnbalancedRotor
@@ -27,7 +26,6 @@ def sketch(machine: AbstractMachine, pen: Pen, state: State, phase: float) -> No
         _drawn(machine, pen, state, phase)
 
 
-@renamed(scene="machine")
 def plot_sketch(
     machine: AbstractMachine, state: State = None, *, phase: Any = None, ax: Axes | None = None
 ) -> Axes:

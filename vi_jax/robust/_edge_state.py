@@ -5,9 +5,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._at_work import Tell, at_work, silent
 from .._checks import count, flag
-from .._interrupted import Interrupted
+from .._messages import Interrupted, Tell, at_work, silent
 from .._types import State
 from ..flow import MethodLike
 from ..machine import AbstractMachine, Summarized, in_rows

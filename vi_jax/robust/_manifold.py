@@ -8,9 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool
 
-from .._at_work import at_work
 from .._checks import flag, given_number, one_of
-from .._interrupted import Interrupted
+from .._messages import Interrupted, at_work
 from .._types import State
 from ..machine import AbstractMachine, Summarized, in_rows, is_autonomous
 from ..orbit import Orbit, cycle_map

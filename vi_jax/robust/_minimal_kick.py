@@ -7,9 +7,8 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from .._at_work import at_work
 from .._checks import count, flag, given_number, interval
-from .._interrupted import Interrupted
+from .._messages import Interrupted, at_work
 from .._types import State
 from ..flow import MethodLike
 from ..machine import AbstractMachine, Summarized, components, state_in_words

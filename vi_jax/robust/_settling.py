@@ -10,7 +10,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
-from .._at_work import Tell, silent
+from .._messages import Tell, silent
 from .._programs import compiled
 from .._types import State
 from ..flow import RESULTS, Run, RunOptions, simulate_pool

@@ -9,11 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._checks import count, given_number
-from .._interrupted import Interrupted
-from .._lazy import xr
-from .._renamed import renamed
-from .._types import State
-from .._words import so_many
+from .._messages import Interrupted, so_many, warning_once
+from .._types import State, xr
 from ..flow import MethodLike, in_names, machine_of, tidy
 from ..machine import AbstractMachine, components, with_leaf, with_units
 from ..orbit import (
@@ -154,7 +151,7 @@ class AllOrbits(InWords):
         return "\n".join(lines)
 
 
-@renamed(scene="machine")
+@warning_once
 def all_orbits(
     machine: AbstractMachine,
     cycles: int = 6,

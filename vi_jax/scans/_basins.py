@@ -13,11 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._at_work import at_work
 from .._checks import count, fits_records, given_number
-from .._lazy import xr
-from .._renamed import renamed
-from .._types import State
+from .._messages import at_work, warning_once
+from .._types import State, xr
 from ..flow import AbstractMethod, MethodLike, check_start, chosen, machine_of, simulate
 from ..machine import AbstractMachine, components, with_leaf
 from ._computed import ScanInterrupted
@@ -53,7 +51,7 @@ class _Mark(AbstractMeasure):
         return {name: x[highest] for name, x in states.items()}
 
 
-@renamed(scene="machine")
+@warning_once
 def basins(
     machine: AbstractMachine,
     region: Mapping[str, tuple[float, float]],

@@ -9,10 +9,9 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from .._at_work import at_work
 from .._checks import count, fits_memory, fits_records
-from .._interrupted import Interrupted
-from .._lazy import xr
+from .._messages import Interrupted, at_work
+from .._types import xr
 from ..machine import attributes as units_of
 from ._describe import attributes_of, description_of, unit_on_axis, variables_of
 from ._shaken import lane_numbers

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
-from .._version import installed_version
+from .._messages import installed_version
 from ..flow import REASON_NAMES
 from ..machine import AbstractMachine, attributes, leaf, leaf_names, unit_of
 from ._identity import Unverifiable, identity

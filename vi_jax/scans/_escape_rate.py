@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from .._checks import given_number, require, tuple_of_names
-from .._lazy import xr
+from .._types import xr
 
 
 def escape_rate(

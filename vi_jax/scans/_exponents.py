@@ -6,8 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .._lazy import xr
-from .._types import State
+from .._types import State, xr
 from ..flow import (
     REASON_NAMES,
     RESULTS,

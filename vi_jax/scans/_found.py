@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from .._checks import count, given_number, require
-from .._lazy import xr
-from .._words import so_many
+from .._messages import so_many
+from .._types import xr
 from ..flow import REASON_NAMES, tidy
 from ..machine import AbstractMachine, attributes, state_in_words, summary_table, unit_of
 from ._geometry import (

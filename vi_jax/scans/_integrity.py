@@ -7,12 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .._at_work import at_work
 from .._checks import count, given_number
-from .._lazy import xr
-from .._renamed import renamed
-from .._types import State
-from .._words import so_many
+from .._messages import at_work, so_many, warning_once
+from .._types import State, xr
 from ..flow import MethodLike, chosen, machine_of, tidy
 from ..machine import AbstractMachine, attributes, check_leaf, summary_table, unit_of, with_leaf
 from ._basins import check_options, followed, sorted_out, starts_in
@@ -126,7 +123,7 @@ class IntegrityProfile(NamedTuple):
         return summary_table(str(self))
 
 
-@renamed(scene="machine")
+@warning_once
 def integrity_profile(
     machine: AbstractMachine,
     parameter: str,

@@ -9,11 +9,9 @@ import jax.tree_util as jtu
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from .._at_work import at_work
 from .._checks import count, flag
-from .._interrupted import Interrupted
+from .._messages import Interrupted, at_work, warning_once
 from .._programs import compiled, is_outermost
-from .._renamed import renamed
 from .._types import Scalar, State
 from ..flow import (
     RESULTS,
@@ -39,7 +37,7 @@ from ._exponents import Lyapunov
 _AT_ONCE = 512
 
 
-@renamed(scene="machine")
+@warning_once
 def lyapunov(
     machine: AbstractMachine,
     start: State,

@@ -9,11 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from .._at_work import at_work
 from .._checks import count, flag, instance_of
-from .._lazy import xr
-from .._renamed import renamed
-from .._types import State
+from .._messages import at_work, warning_once
+from .._types import State, xr
 from ..flow import REASON_NAMES, AbstractMethod, MethodLike, RunOptions, preset
 from ..machine import AbstractMachine
 from ._computed import ScanInterrupted, Workplace, computed, in_blocks, workplace
@@ -26,7 +24,7 @@ class LanesFailed(UserWarning):
     """Said of a scan of which some lanes failed."""
 
 
-@renamed(scene="machine")
+@warning_once
 def scan(
     machine: AbstractMachine | Callable[..., AbstractMachine],
     axes: Mapping[str, Any],

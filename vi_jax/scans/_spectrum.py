@@ -3,7 +3,7 @@
 import numpy as np
 
 from .._checks import count, instance_of
-from .._lazy import xr
+from .._types import xr
 from ..flow import Run
 from ..machine import components
 

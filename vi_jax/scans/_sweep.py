@@ -7,12 +7,9 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
-from .._at_work import at_work
-from .._checks import count, fits_records, flag, require
-from .._interrupted import Interrupted
-from .._numbers import concrete, number
+from .._checks import concrete, count, fits_records, flag, number, require
+from .._messages import Interrupted, at_work, warning_once
 from .._programs import compiled, is_outermost
-from .._renamed import renamed
 from .._types import State
 from ..flow import (
     MethodLike,
@@ -39,7 +36,7 @@ from .regime import REGIMES, impacts_of, least_period
 _AT_ONCE = 16
 
 
-@renamed(scene="machine")
+@warning_once
 def sweep(
     machine: AbstractMachine,
     parameter: str,

@@ -8,9 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._lazy import xr
-from .._types import State
-from .._words import so_many
+from .._messages import so_many
+from .._types import State, xr
 from ..flow import REASON_NAMES, RESULTS, batch_names, in_names, present, states, tidy
 from ..machine import PLAIN, Stated, Summarized, name_in, unit_of, with_unit, with_units
 from .regime import CODES, REGIMES, flags

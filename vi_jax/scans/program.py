@@ -14,8 +14,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Shaped
 
-from .._checks import count, tuple_of_names
-from .._numbers import strongly_typed
+from .._checks import count, strongly_typed, tuple_of_names
 from .._types import State
 from ..flow import (
     AbstractMethod,

@@ -11,9 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .._checks import unwritable
-from .._lazy import xr, zarr
-from .._numbers import warn
-from .._version import installed_version
+from .._messages import installed_version, warn
+from .._types import xr, zarr
 from .grid import Blocks
 
 # What stands in whole numbers of lanes that were not computed, `result` among them.

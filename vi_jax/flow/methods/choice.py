@@ -1,7 +1,6 @@
 """Which method moves a machine: one that is given, a preset by its name, or the default."""
 
 from ..._checks import one_of
-from ..._renamed import renamed
 from ...machine import AbstractMachine
 from .base import AbstractMethod
 from .exact import ExactFlight
@@ -15,7 +14,6 @@ MethodLike = AbstractMethod | str | None
 _PRESETS = {"draft": (6, 1e-6), "standard": (10, 1e-9), "reference": (30, 1e-13)}
 
 
-@renamed(scene="machine")
 def preset(machine: AbstractMachine | None, name: str = "standard") -> AbstractMethod:
     """The method of this name for a machine; every argument `method` takes the name itself.
 
