@@ -175,7 +175,6 @@ CALLS = {
     "store=5": (scan(store=5), "`store` must be a path"),
     "store=''": (scan(store=""), "`store` must be a path"),
     "store of a null": (scan(store="a\0b"), "`store` must be a path"),
-    "a picture of axes": (lambda: vi.save_picture("ax", "a.png"), "`figure` must be a figure, as"),
     "FixedStep": (lambda: vi.FixedStep(steps_per_cycle=10**12), "`steps_per_cycle` must be at"),
 }  # fmt: skip
 

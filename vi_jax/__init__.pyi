@@ -91,7 +91,6 @@ from .plot import plot_regimes as plot_regimes
 from .plot import plot_sketch as plot_sketch
 from .plot import plot_style as plot_style
 from .plot import plot_sweep as plot_sweep
-from .plot import save_picture as save_picture
 from .robust import EdgeState as EdgeState
 from .robust import Manifold as Manifold
 from .robust import MinimalKick as MinimalKick

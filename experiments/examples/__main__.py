@@ -16,6 +16,9 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 HERE = Path(__file__).resolve().parent
+sys.path.insert(0, str(HERE.parent))
+from tools.pictures import shrink
+
 FIGURES = HERE.parent / "figures" / "examples"
 EXAMPLES = sorted(path for path in HERE.glob("*.py") if not path.name.startswith("_"))
 
@@ -127,6 +130,7 @@ def main() -> None:
         else:
             print(f"{path.stem} …", flush=True)
             texts = printed(path)
+            shrink(FIGURES / f"{path.stem}.png")
         book.write_text(notebook(path, texts), encoding="utf-8")
 
 

@@ -32,4 +32,4 @@ figure, ax = plt.subplots(figsize=(8, 4), layout="constrained")
 for branch, name in (short, "2π"), (two, "4π, two impacts"), (one, "4π, one impact"):
     vi.plot_branch(branch, ax=ax, label=name)
 ax.set(xlim=(0.69, 1.1), ylim=(-4.2, -1.4), ylabel="lowest position, min Y (a)")
-vi.save_picture(figure, "branch.png")
+figure.savefig("branch.png")

@@ -30,4 +30,4 @@ left.set(xlabel="position Y (a)", ylabel="velocity V (a ω)", title="dots: after
 left.set_ylim(-2.8, 5.4)
 left.legend(loc="upper left", frameon=False, ncols=2)
 right.set_title("Floquet multipliers and the unit circle")
-vi.save_picture(figure, "find_orbit.png")
+figure.savefig("find_orbit.png")

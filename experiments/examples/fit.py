@@ -37,4 +37,4 @@ ax.plot(cycles, value(guess), "--", color="#d55e00", lw=1.4, label="first guess"
 ax.plot(cycles, value(x), color="#0072b2", lw=1.4, label="fit")
 ax.set(xlabel="drive cycles", ylabel="position Y (a)")
 ax.legend(frameon=False)
-vi.save_picture(figure, "fit.png")
+figure.savefig("fit.png")

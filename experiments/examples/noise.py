@@ -37,4 +37,4 @@ figure.colorbar(picture, ax=states, label="log$_{10}$ of the density in 1/(a²ω
 bars = abs(np.stack([found.rate_low, found.rate_high]) - found.rate.values)
 rates.errorbar(1e-4 * found["noise.V"] ** -2, found.rate, bars, fmt="o", capsize=3)
 rates.set(yscale="log", xlabel="10⁻⁴ a²ω³/σ²", ylabel="exits per cycle", title="How soon it goes")
-vi.save_picture(figure, "noise.png")
+figure.savefig("noise.png")

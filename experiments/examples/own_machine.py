@@ -37,4 +37,4 @@ data = vi.scan(Pendulum(), {"shaking": axis}, measure="sections", settle=400, pr
 figure, ax = plt.subplots(figsize=(8, 3.8), layout="constrained")
 ax.plot(axis, data["Y"], ".", color="#0072b2", ms=1.5)
 ax.set(xlabel="acceleration of the pivot (g)", ylabel="angle after each cycle (rad)")
-vi.save_picture(figure, "own_machine.png")
+figure.savefig("own_machine.png")

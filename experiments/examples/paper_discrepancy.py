@@ -29,4 +29,4 @@ for ax, (title, xi) in zip(axes, damping.items(), strict=True):
     print(f"{title}: last minima {run.y_min[-2]:.4f}, {run.y_min[-1]:.4f}")
 axes[0].set_xlabel("")
 figure.suptitle("From rest; triangles: the lowest point of each cycle, two levels mean 4π")
-vi.save_picture(figure, "paper_discrepancy.png")
+figure.savefig("paper_discrepancy.png")

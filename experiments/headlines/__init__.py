@@ -11,9 +11,8 @@ import re
 from pathlib import Path
 from typing import Any
 
-import vi_jax as vi
 from matplotlib.figure import Figure
-from vi_jax.plot.stamp import stamp
+from tools.pictures import save_picture, stamp
 
 FINGERPRINT = "vi_jax fingerprint of the table's numbers"
 _TITLE = "## Headline numbers"
@@ -27,7 +26,7 @@ def keep(
     """Write a study's page with its headline numbers, and its picture with their fingerprint.
 
     **Arguments:** the folder of the page, beside which is that of the pictures; the study's name;
-    its page; headline numbers by name; the picture, and how `save_picture` is to save it.
+    its page; headline numbers by name; the picture, and options of `save_picture`.
     """
     rounded = {name: float(f"{value:.12g}") for name, value in numbers.items()}
     listed = json.dumps(rounded, indent=2, ensure_ascii=False, allow_nan=False)
@@ -35,7 +34,7 @@ def keep(
     picture = folder.parent / "figures" / f"{study}.png"
     folder.mkdir(parents=True, exist_ok=True)
     picture.parent.mkdir(parents=True, exist_ok=True)
-    vi.save_picture(figure, picture, **look)
+    save_picture(figure, picture, **look)
     stamp(picture, FINGERPRINT, fingerprint(page))
     (folder / f"{study}.md").write_text(page, encoding="utf-8")
 

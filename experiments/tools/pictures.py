@@ -1,10 +1,16 @@
 """What the pictures have in common."""
 
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from PIL import Image
+from PIL.PngImagePlugin import PngInfo
+
+# Of a picture in the repository.
+_DPI = 110
 
 
 def open_frames(panels: Iterable[Axes]) -> None:
@@ -33,3 +39,35 @@ def panels(width: float, height: float, *grid: int, **look: Any) -> tuple[Figure
     """A figure of a size in inches, and its panels as `Figure.subplots` gives them."""
     figure = Figure(figsize=(width, height), layout="constrained")
     return figure, figure.subplots(*grid, **look)
+
+
+def save_picture(figure: Figure, path: str | Path, *, dpi: int = _DPI, colors: int = 200) -> None:
+    """Write a figure as a small PNG; the same figure gives the same file.
+
+    **Arguments:** the file; dots per inch; `colors`, how many colours are kept, 256 at most.
+    """
+    figure.savefig(path, dpi=dpi)
+    shrink(path, colors=colors)
+
+
+def shrink(path: str | Path, *, colors: int = 200) -> None:
+    """Write a PNG again with few colours, which loses nothing in line drawings."""
+    with Image.open(path) as image:
+        dpi = image.info.get("dpi")
+        picture = image.convert("RGB").quantize(colors, dither=Image.Dither.NONE)
+    picture.save(path, "png", optimize=True, dpi=dpi)
+
+
+def stamp(picture: str | Path, name: str, words: str) -> None:
+    """Put words into a PNG, whose pixels stay as they are; `stamped` reads them."""
+    with Image.open(picture) as image:
+        image.load()
+        info = PngInfo()
+        info.add_itxt(name, words)
+        image.save(picture, "png", optimize=True, pnginfo=info, dpi=image.info.get("dpi"))
+
+
+def stamped(picture: str | Path, name: str) -> str | None:
+    """Return the words of that name in a PNG, or `None`."""
+    with Image.open(picture) as image:
+        return image.info.get(name)

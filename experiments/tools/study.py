@@ -25,7 +25,7 @@ def write(study: str, page: str, numbers: dict[str, float], figure: Figure, **lo
     """Write a study's page and picture, beside each other's numbers; nothing with `--quick`.
 
     **Arguments:** the study's name, which is that of its file; its page in Markdown; its headline
-    numbers by name; its picture, and how `vi.save_picture` is to save it.
+    numbers by name; its picture, and options of `save_picture`.
     """
     if QUICK:
         return

@@ -65,7 +65,7 @@ def test_code_runs(page, tmp_path):
     said = run(tmp_path, "page.py")
     for shown in blocks(page, "text") if page.name == "README.md" else []:
         assert words(shown) == words(said)
-    for picture in re.findall(r'save_picture\(.*"(.*)"\)', code):
+    for picture in re.findall(r'savefig\("([^"]*)"', code):
         assert (tmp_path / picture).exists()
 
 

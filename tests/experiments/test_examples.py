@@ -22,7 +22,7 @@ def test_script_notebook_and_picture_are_kept(example):
     text = example.read_text(encoding="utf-8")
     assert text.startswith('# %% [markdown]\n"""# ')
     assert len(text.splitlines()) <= 40
-    assert f'vi.save_picture(figure, "{example.stem}.png")' in text
+    assert f'figure.savefig("{example.stem}.png")' in text
     book = example.with_suffix(".ipynb").read_text(encoding="utf-8")
     texts = printed_in(book)
     assert book == notebook(example, texts), "run `python experiments/examples --notebooks`"

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import vi_jax as vi
 from headlines import FINGERPRINT, fingerprint, headlines, keep
+from PIL import Image
+from tools.pictures import save_picture, stamped
 from vi_jax.paper.response import RATIO, _branches, _closed_forms, with_numbers
-from vi_jax.plot.stamp import stamped
 
 import headline_numbers
 from differences import quick
@@ -80,6 +81,18 @@ def _decimals(text: str, least: int) -> list[str]:
     words = text.replace("(", " ").replace(")", " ").replace(",", " ").replace(";", " ").split()
     words = [word.rstrip(".") for word in words]
     return [w for w in words if w.startswith("0.") and len(w) >= least + 2 and w[2:].isdigit()]
+
+
+def test_the_same_figure_gives_the_same_small_picture(tmp_path):
+    from matplotlib.figure import Figure
+
+    for name in ("a.png", "b.png"):
+        figure = Figure(figsize=(2, 2))
+        figure.subplots().plot([0, 1])
+        save_picture(figure, tmp_path / name)
+    with Image.open(tmp_path / "a.png") as image:
+        assert image.size == (220, 220) and image.mode == "P"
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 
 def test_what_is_stale_is_told(tmp_path):

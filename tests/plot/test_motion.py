@@ -113,7 +113,7 @@ def test_pictures_say_the_units_that_a_machine_states_and_show_its_soft_stop():
 
 
 def test_pictures_are_listed():
-    assert {"save_picture", "animate", "plot_history"} <= set(dir(vi))
+    assert {"animate", "plot_history"} <= set(dir(vi))
 
 
 def test_phase_portrait_marks_sections(scene, run):
