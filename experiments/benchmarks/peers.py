@@ -11,10 +11,9 @@
 #
 # Run with `python experiments/benchmarks/peers.py` (extra `bench`). What is measured is kept in the
 # folder for temporary files, and an interrupted run goes on from there; `--fresh` forgets it.
-# `--quick` takes few lanes and writes nothing. `--gpu` runs vi_jax on a GPU instead (no peers).
+# `--quick` takes few lanes and writes nothing.
 
 # %%
-import os
 import platform
 import sys
 from pathlib import Path
@@ -31,7 +30,7 @@ from peer_codes.entries import CYCLES, LANES, OURS, ROUNDS, SLOW_ROUNDS
 from peer_codes.pool import cores
 from peer_codes.task import PARAMETERS
 from tools.pictures import panels
-from tools.study import QUICK, write
+from tools.study import write
 from tools.tables import table
 
 # %% [markdown]
@@ -164,16 +163,7 @@ def headline(sections: dict[str, dict]) -> dict[str, float]:
 
 # %%
 if __name__ == "__main__":
-    if "--gpu" in sys.argv:
-        os.environ.setdefault("XLA_PYTHON_CLIENT_MEM_FRACTION", "0.9")
-        from peer_codes.gpu import on_gpu
-
-        page = f"# vi_jax on a GPU\n\n{on_gpu()}\n"
-        print(page)
-        if not QUICK:
-            (HERE / "peers_gpu.md").write_text(page)
-    else:
-        measured = contest()
-        page = f"# vi_jax beside its peers\n\n{report(measured)}"
-        print(page)
-        write("peers", page, headline(measured), picture(measured))
+    measured = contest()
+    page = f"# vi_jax beside its peers\n\n{report(measured)}"
+    print(page)
+    write("peers", page, headline(measured), picture(measured))

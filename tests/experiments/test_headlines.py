@@ -25,8 +25,8 @@ COMPUTED = {
     for name, function in inspect.getmembers(headline_numbers, inspect.isfunction)
     if name in PATHS
 }
-# The rows of `extremes` are tests of their own (`tests/flow/test_extremes.py`).
-STUDIES = sorted(set(PATHS) - {"extremes"})
+# The rows of `extremes` are tests of their own (`tests/flow/test_extremes.py`); `gpu` has only times.
+STUDIES = sorted(set(PATHS) - {"extremes", "gpu"})
 
 
 def page_of(study: str) -> str:

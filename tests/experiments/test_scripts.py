@@ -13,7 +13,7 @@ from differences import some
 FOLDER = Path(__file__).parents[2] / "experiments"
 STUDIES = sorted([*FOLDER.glob("studies/*.py"), *FOLDER.glob("benchmarks/*.py")])
 # A table is all there is to see.
-WITHOUT_FIGURE = {"extremes"}
+WITHOUT_FIGURE = {"extremes", "gpu"}
 # `peers` and `chains` need the extra `bench`; the rows of `extremes` are tests of their own.
 RUN_ELSEWHERE = {"peers", "chains", "extremes"}
 # These run with the slow tests; the others, whose calls pyright has checked, before

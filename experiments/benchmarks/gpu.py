@@ -1,22 +1,36 @@
-"""vi_jax on a GPU: lanes in batches that fit the memory, in double and in single precision."""
+# %% [markdown]
+# # vi_jax on a GPU
+#
+# Table 1's machine (T0 = 10 N·m, d = 2, k = 0.5) over κ or ζ from 0.5 to 1.9, 200 drive cycles, in
+# double and in single precision, in batches of 100,000 lanes. Arithmetic is counted by XLA for one
+# step of one lane; a sine, a root or a comparison counts as one operation.
+#
+# `python experiments/benchmarks/gpu.py` measures JAX's default device and prints a table, with
+# `--batch 500000` in larger batches. With `JAX_PLATFORMS=cpu` it measures the processor instead.
 
+# %%
+import os
+import sys
 import time
+from pathlib import Path
 from typing import Any
+
+os.environ.setdefault("XLA_PYTHON_CLIENT_MEM_FRACTION", "0.9")
+sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import vi_jax as vi
+from peer_codes.contest import note
+from peer_codes.entries import CYCLES, QUICK
+from peer_codes.task import Task
 from tools.tables import table
 from vi_jax.flow.smooth import in_modes
 
-from .contest import note
-from .entries import CYCLES, QUICK
-from .task import Task
-
 jax.config.update("jax_enable_x64", True)
-_SIZES = (1_000, 4_000) if QUICK else (100_000, 1_000_000, 10_000_000)
-_BATCH = 1_000 if QUICK else 500_000
+_SIZES = (1_000, 4_000) if QUICK else (10_000, 100_000, 1_000_000)
+_BATCH = int(sys.argv[sys.argv.index("--batch") + 1]) if "--batch" in sys.argv else 100_000
 _METHODS = [
     ("motor", "FixedStep(Verner9, 10)", vi.FixedStep()),
     ("motor", "Adaptive(Verner9, 1e-6)", vi.Adaptive(rtol=1e-6)),
@@ -24,15 +38,9 @@ _METHODS = [
 ]
 
 
-def on_gpu() -> str:
-    """A table of vi_jax on JAX's default device.
-
-    The arithmetic is counted by the compiler for one step of one lane; a sine, a root or a
-    comparison counts as one.
-    """
+def measured() -> str:
+    """Return a table of vi_jax's speed on JAX's default device."""
     device = jax.devices()[0]
-    if device.platform == "cpu" and not QUICK:
-        raise SystemExit("JAX's default device is no GPU; nothing was measured.")
     heads = [
         "drive", "method", "precision", "lanes", "compile, s", "run, s", "10⁶ lane-cycles/s",
         "steps a cycle", "10⁹ operations/s",
@@ -41,11 +49,11 @@ def on_gpu() -> str:
     for drive, name, method in _METHODS:
         for dtype in ("float64", "float32"):
             with jax.enable_x64(dtype == "float64"):
-                rows += [[drive, name, dtype, *cells] for cells in _measured(drive, method, dtype)]
+                rows += [[drive, name, dtype, *cells] for cells in _rows(drive, method, dtype)]
             eqx.clear_caches()
     return (
-        f"{device.device_kind}, {CYCLES} cycles, k = 0.5, batches of up to {_BATCH:,} lanes; the "
-        f"faster of two runs.\n\n{table(heads, rows)}"
+        f"JAX {jax.__version__}, {device.device_kind}, {CYCLES} cycles, k = 0.5, batches of up to "
+        f"{_BATCH:,} lanes; the faster of two runs.\n\n{table(heads, rows)}"
     )
 
 
@@ -61,7 +69,7 @@ def _machine(task: Task, kappa: jax.Array) -> tuple[vi.Scene, Any]:
     return machine, jax.tree.map(lambda x: jnp.asarray(x, kappa.dtype), start)
 
 
-def _measured(drive: str, method: Any, dtype: str) -> list[list[str]]:
+def _rows(drive: str, method: Any, dtype: str) -> list[list[str]]:
     """The numbers of one method in one precision, for each number of lanes."""
     task = Task(drive, 0.5, CYCLES)
 
@@ -99,3 +107,8 @@ def _measured(drive: str, method: Any, dtype: str) -> list[list[str]]:
         ])  # fmt: skip
         note(f"{drive} {method} {dtype} {rows[-1]}")
     return rows
+
+
+# %%
+if __name__ == "__main__":
+    print(measured())
