@@ -144,6 +144,17 @@ def test_samples_leave_the_path(many):
     np.testing.assert_allclose(paths(samples=4).sections.V, V, atol=1e-11)
 
 
+def test_samples_lie_where_they_are_asked_for():
+    """49 and 98 of 98 impulses: 49/49 is 1, though 49 times 1/49 is less."""
+    run = vi.simulate(Free(), START, 3, samples=2, noise=shaken(98, 0.0), key=KEYS[0])
+    flow = expm(np.array([[0.0, 1.0], [-1.0, -0.2]]) * CYCLE / 2)
+    path = [(1.0, 0.0)]
+    for _ in range(6):
+        path.append(flow @ path[-1])
+    np.testing.assert_allclose(run.sections.Y, np.array(path)[::2, 0], atol=1e-9)
+    np.testing.assert_allclose(run.samples.state.Y, np.array(path)[:, 0], atol=1e-9)
+
+
 @pytest.mark.slow
 def test_methods_and_backends_leave_the_path(many):
     V = np.asarray(many.sections.V)

@@ -195,13 +195,6 @@ class Plan(eqx.Module):
         return self.settle + self.kept
 
     @property
-    def block(self) -> int:
-        """Iterations in which a lane completes at most one interval, its steps being so short."""
-        if self.noise is not None:
-            return max(1, self.noise.count // self.parts)  # steps end on each impulse
-        return max(1, self.method.steps_per_cycle // self.parts)
-
-    @property
     def instants(self) -> int:
         """Instants of a cycle that steps end on: record points and impulses of noise."""
         return self.parts if self.noise is None else self.noise.count
@@ -213,8 +206,10 @@ class Plan(eqx.Module):
 
     def is_record_point(self, part: Scalar, done: Scalar) -> Flag:
         """Whether the end of the `part`-th piece between two impulses completes an interval."""
-        each = (part + 1) * (self.parts / self.instants)
-        return (part + 1 >= self.instants) | (done >= self.settle) & (each == jnp.floor(each))
+        behind, every = part + 1, self.instants // self.parts
+        # A product of whole numbers is exact, a quotient need not be.
+        whole = behind == every * jnp.round(behind / every)
+        return (behind >= self.instants) | (done >= self.settle) & whole
 
     def others(self, state: State) -> list[int]:
         """The numbers of the events, besides stops, whose guards are looked at in each step."""

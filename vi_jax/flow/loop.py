@@ -57,7 +57,7 @@ def run_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> tuple[Ends
     numbers, rest = eqx.partition(plan, eqx.is_array)
     ends, (states, records) = lanes.run(
         partial(_begin, rest), partial(_step, rest), _end, (numbers, start, jnp.asarray(wanted)),
-        rows=plan.kept + 1, block=plan.block, backend=plan.backend,
+        rows=plan.kept + 1, backend=plan.backend,
     )  # fmt: skip
     if not own:
         states = jax.vmap(way.outward)(states)

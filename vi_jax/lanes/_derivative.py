@@ -33,7 +33,6 @@ def forward(program: LaneProgram, varied: tuple[bool, ...]) -> tuple[LaneProgram
         step=_with_derivatives(program.step, both, wanted, groups, len(varied)),
         end=_with_derivatives(program.end, both, depend.outs, (len(depend.outs),), len(varied)),
         rows=program.rows,
-        block=program.block,
         tangents=(*before, *(True for m in varied if m)),
         varied=varied,
         base=program,
@@ -124,7 +123,6 @@ def widened(
         step=over(program.step, (*batched, *depend.carry), flags),
         end=over(program.end, (*batched, *depend.carry), depend.outs),
         rows=program.rows,
-        block=program.block,
         tangents=program.tangents,
         base=base,
     )

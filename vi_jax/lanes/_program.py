@@ -22,8 +22,6 @@ class LaneProgram(eqx.Module):
     step: ClosedJaxpr = eqx.field(static=True)
     end: ClosedJaxpr = eqx.field(static=True)
     rows: int = eqx.field(static=True)
-    block: int = eqx.field(static=True)
-    """Steps in which a lane completes at most one row."""
 
     tangents: tuple[bool, ...] = eqx.field(static=True, default=())
     """Which inputs are tangents. How long a lane goes on must not depend on them."""

@@ -40,11 +40,11 @@ class Traced(NamedTuple):
 _recent: "Recent[Any, Traced]" = Recent(64)
 
 
-def traced(functions: Functions, treedef: object, leaves: Sequence[Any], **options: int) -> Traced:
+def traced(functions: Functions, treedef: object, leaves: Sequence[Any], rows: int) -> Traced:
     """The program for inputs of one structure, and of their leaves' shapes and types.
 
-    **Arguments:** the functions; the structure and the leaves of the inputs of one lane; `rows` and
-    `block` of the `LaneProgram`.
+    **Arguments:** the functions; the structure and the leaves of the inputs of one lane; `rows` of
+    the `LaneProgram`.
     """
     shapes = [shape_of(x) for x in leaves]
     try:
@@ -53,14 +53,14 @@ def traced(functions: Functions, treedef: object, leaves: Sequence[Any], **optio
             *map(_function_key, functions),
             treedef,
             *((x.shape, x.dtype) for x in shapes),
-            *options.items(),
+            rows,
             bool(jax.config.jax_enable_x64),  # pyright: ignore
         )
         found = _recent.get(key)
     except (TypeError, ValueError):  # no hash, or whether two are equal is not known
-        return _traced(functions, treedef, shapes, options)
+        return _traced(functions, treedef, shapes, rows)
     if found is None:
-        found = _traced(functions, treedef, shapes, options)
+        found = _traced(functions, treedef, shapes, rows)
         if not any(isinstance(x, Tracer) for x in found.consts):
             _recent.put(key, found)
     return found
@@ -117,7 +117,7 @@ def _constant_key(x: object) -> Any:
     return type(x), x
 
 
-def _traced(functions: Functions, treedef: Any, leaves: list[Any], options: Any) -> Traced:
+def _traced(functions: Functions, treedef: Any, leaves: list[Any], rows: int) -> Traced:
     """As `traced`, without a look at what was traced before."""
     n = len(leaves)
     structures: dict[str, Any] = {}
@@ -125,8 +125,8 @@ def _traced(functions: Functions, treedef: Any, leaves: list[Any], options: Any)
     def begun(*args):
         carry, (active, complete, row) = functions.begin(jtu.tree_unflatten(treedef, args))
         found, structures["carry"] = jtu.tree_flatten(carry)
-        rows, structures["row"] = jtu.tree_flatten(row)
-        return [*found, _flag(active), _flag(complete), *rows]
+        first, structures["row"] = jtu.tree_flatten(row)
+        return [*found, _flag(active), _flag(complete), *first]
 
     begin = jax.make_jaxpr(begun)(*leaves)
     size = structures["carry"].num_leaves
@@ -137,8 +137,8 @@ def _traced(functions: Functions, treedef: Any, leaves: list[Any], options: Any)
         inputs = jtu.tree_unflatten(treedef, args[:n])
         carry, (active, complete, row) = functions.step(inputs, carry)
         found = _checked("carry", structures["carry"], carry, carried)
-        rows = _checked("row", structures["row"], row, begin.out_avals[size + 2 :])
-        return [*found, _flag(active), _flag(complete), *rows]
+        next_row = _checked("row", structures["row"], row, begin.out_avals[size + 2 :])
+        return [*found, _flag(active), _flag(complete), *next_row]
 
     def ended(*args):
         carry = jtu.tree_unflatten(structures["carry"], args[n:])
@@ -149,7 +149,7 @@ def _traced(functions: Functions, treedef: Any, leaves: list[Any], options: Any)
     both = [*leaves, *map(shape_of, carried)]
     jaxprs = [begin, jax.make_jaxpr(stepped)(*both), jax.make_jaxpr(ended)(*both)]
     (begin, step, end), consts = _consts_as_inputs(jaxprs, n)
-    program = LaneProgram(begin=begin, step=step, end=end, **options)
+    program = LaneProgram(begin=begin, step=step, end=end, rows=rows)
     return Traced(program, consts, structures["out"], structures["row"])
 
 

@@ -52,7 +52,6 @@ def run(
     inputs: object,
     *,
     rows: int,
-    block: int = 1,
     backend: str | None = None,
 ) -> tuple[Any, Any]:
     """One lane's loop to its end: begin, step while it is active, end.
@@ -71,7 +70,6 @@ def run(
     - `inputs`: a pytree of arrays;
     - `rows`: room for rows; they are stored in the order in which they are completed, and what a
       lane does not come to is not a number (0 for integers);
-    - `block`: steps in which a lane is sure to complete at most one row (for XLA);
     - `backend`: `"xla"` or `"auto"`; by default what the context says.
 
     **Returns:** the results, and the rows with a leading axis of length `rows`.
@@ -79,7 +77,7 @@ def run(
     leaves, treedef = jtu.tree_flatten(inputs)
     leaves = [jnp.asarray(x) for x in leaves]
     program, consts, *structures = traced(
-        Functions(begin, step, end), treedef, leaves, rows=rows, block=block
+        Functions(begin, step, end), treedef, leaves, rows=rows
     )
     backend = current_backend() if backend is None else backend
     found = lanes_p.bind(*leaves, *consts, program=program, backend=backend)

@@ -56,6 +56,7 @@ from .numbers import plain as plain
 from .numbers import state_in_words as state_in_words
 from .numbers import with_leaf as with_leaf
 from .own import by_default as by_default
+from .own import changed as changed
 from .own import is_own as is_own
 from .parameters import Parameters as Parameters
 from .reset import Reset as Reset

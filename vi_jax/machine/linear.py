@@ -13,6 +13,7 @@ from .._checks import concrete, number
 from .._types import Number, Scalar, State
 from .base import AbstractMachine, Coordinate, Prepared
 from .modal import Modes, along, harmonic, modal, solved, times, without_row
+from .own import changed
 from .shown import Shown
 from .stop import RigidStop
 
@@ -33,6 +34,14 @@ class _Known(NamedTuple):
     """M⁻¹; `None` for a diagonal M."""
     longest: Scalar
     """The longest step, a fifth of the shortest period of the modes or the force."""
+
+
+# What a run asks of a machine and the machine in its modes does not take over from a subclass.
+_IN_MODES = (
+    "field", "_accelerated", "switches", "events", "begin", "averages", "section", "renewed",
+    "coordinates", "position", "velocity", "placed", "has_velocity", "cycle", "period", "clock",
+    "rewound", "pace", "as_logged", "step_limit", "relaxation", "alive", "in_range",
+)  # fmt: skip
 
 
 class LinearMachine(AbstractMachine):
@@ -181,8 +190,7 @@ class LinearMachine(AbstractMachine):
     def prepared(self) -> Prepared:
         """The machine in its natural modes, unless a subclass moves, or meets events, by rules of
         its own."""
-        own = ("field", "switches", "events", "begin", "averages", "section", "clock", "renewed")
-        if any(getattr(type(self), name) is not getattr(LinearMachine, name) for name in own):
+        if changed(self, LinearMachine, _IN_MODES):
             return super().prepared()._replace(machine=self._with_known())
         return self.prepared_modes()
 

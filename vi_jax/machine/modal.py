@@ -211,7 +211,7 @@ def modal(machine: Any) -> Modes:
     pace, square = jnp.sqrt(jnp.abs(kappa)), kappa - 0.25 * c * c
     swing = jnp.sqrt(jnp.where(square > 0, square, 1.0))
     made = ModalMachine(
-        stops=tuple(without_row(stop) for stop in machine.contacts),
+        stops=tuple(without_row(stop) for stop in machine.stops),
         frequency=omega,
         stiffness=found.stiffness,
         damping=found.damping,

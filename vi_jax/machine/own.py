@@ -1,6 +1,6 @@
 """What a machine or one of its parts says itself, and what is said in its place."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
 
 Method = TypeVar("Method", bound=Callable[..., Any])
@@ -15,3 +15,10 @@ def by_default(method: Method) -> Method:
 def is_own(method: object) -> bool:
     """Whether a method or a property, as a class has it, is not marked by `by_default`."""
     return not hasattr(getattr(method, "fget", method), "by_default")
+
+
+def changed(part: object, base: type, names: Iterable[str]) -> str | None:
+    """The first of these methods and properties that the class of `part` does not share with
+    `base`; `None` if it shares all."""
+    kind = type(part)
+    return next((x for x in names if getattr(kind, x, None) is not getattr(base, x)), None)

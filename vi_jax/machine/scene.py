@@ -23,8 +23,10 @@ from .._checks import (
     tuple_of,
 )
 from .._types import Flag, Number, Scalar, State
-from .crank import AbstractCrank, CosineCrank
+from .crank import AbstractCrank, CosineCrank, SliderCrank
 from .drive import AbstractDrive, IdealDrive
+from .motor import Motor
+from .own import changed
 from .shaft import ShaftMachine
 from .shown import Shown
 from .soft import SoftStop
@@ -267,8 +269,30 @@ class Scene(ShaftMachine):
 
     def may_rest(self) -> bool:
         """Not if all gaps are known and beyond the crank's reach, so that nothing presses on."""
+        if not self._is_within_reach() or any(map(self._may_be_pressed, self.stops)):
+            return True
         gaps = [concrete(stop.gap) for stop in self.stops]
         return any(gap is None or not (gap > 1).all() for gap in gaps)
+
+    def _is_within_reach(self) -> bool:
+        """Whether the equations are the library's, whose slider stays within |U| ≤ 1 and alone
+        pulls at the body."""
+        return (
+            type(self.crank).slide in (CosineCrank.slide, SliderCrank.slide)
+            and type(self.drive).field in (IdealDrive.field, Motor.field)
+            and changed(self, Scene, ("field", "pull", "_pushes", "switches")) is None
+        )
+
+    def _may_be_pressed(self, stop: RigidStop) -> bool:
+        """Whether a compliant stop may press the body on a rigid one."""
+        for soft in self.soft_stops:
+            depth = concrete(soft.beyond(stop.place))
+            apart = depth is not None and bool((depth <= 0).all())
+            if changed(soft, SoftStop, ("force", "contribution")) or not (
+                apart or soft.side == stop.side
+            ):
+                return True
+        return False
 
     def in_range(self, start: State) -> Flag:
         """Whether all parts are in range, there is room between two stops, and the start is not

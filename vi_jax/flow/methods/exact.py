@@ -20,6 +20,7 @@ from ...machine import (
     OscillatorState,
     Prepared,
     Scene,
+    changed,
     horner,
     sincos,
 )
@@ -164,11 +165,20 @@ def lack_of_closed_form(machine: AbstractMachine) -> str | None:
     if not isinstance(machine, Scene) or not isinstance(machine.drive, IdealDrive):
         drive = type(machine.drive if isinstance(machine, Scene) else machine).__name__
         return f"`Scene` with an `IdealDrive`, but got a `{drive}`"
-    crank = type(machine.crank)
-    if not issubclass(crank, CosineCrank) or crank.slide is not CosineCrank.slide:
-        return f"`CosineCrank`, but the machine has a `{crank.__name__}`"
-    if type(machine).field is not Scene.field:
-        return f"`Scene` with its own field, but a `{type(machine).__name__}` has another `field`"
+    crank = machine.crank
+    if not isinstance(crank, CosineCrank) or changed(crank, CosineCrank, ("slide",)):
+        return f"`CosineCrank`, but the machine has a `{type(crank).__name__}`"
+    equations = (
+        (machine, Scene, ("field", "pull", "_pushes", "phase_at", "damping_ratio")),
+        (machine.drive, IdealDrive, ("field", "fixed_speed")),
+    )
+    for part, base, names in equations:
+        own = changed(part, base, names)
+        if own is not None:
+            return (
+                f"`{base.__name__}` with its own equations, but a `{type(part).__name__}` has "
+                f"another `{own}`"
+            )
     if machine.switches:
         return f"machine without soft stops, but it has {len(machine.switches)}"
     return None
@@ -177,8 +187,11 @@ def lack_of_closed_form(machine: AbstractMachine) -> str | None:
 def _lack_of_linear(machine: AbstractMachine) -> str | None:
     """As `lack_of_closed_form`, of a machine that is linear but for what a subclass changes."""
     name = type(machine).__name__
-    if isinstance(machine, LinearMachine) and type(machine).field is not LinearMachine.field:
-        return f"linear machine with the field of its matrices, but a `{name}` has another `field`"
+    if isinstance(machine, LinearMachine):
+        # What rests is held by the rows of the matrices' own coordinates.
+        own = changed(machine, LinearMachine, ("field", "_accelerated", "coordinates"))
+        if own is not None:
+            return f"linear machine as its matrices say, but a `{name}` has another `{own}`"
     if machine.switches:
         return f"machine without switches, but it has {len(machine.switches)}"
     return None

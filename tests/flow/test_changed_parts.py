@@ -1,0 +1,119 @@
+"""Subclasses of ready machines and parts: what they change is carried, or refused by name."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+
+
+class Weighted(vi.IdealDrive):
+    """Of a body that has a weight."""
+
+    def field(self, scene, s, state, pushes):
+        rate = super().field(scene, s, state, pushes)
+        return vi.OscillatorState(rate.Y, rate.V + 0.5 / self.frequency_ratio)
+
+
+class Faster(vi.IdealDrive):
+    @property
+    def fixed_speed(self):
+        return 2 * self.frequency_ratio
+
+
+class Pulled(vi.Scene):
+    def pull(self, stretch, speed, pushes):
+        return super().pull(stretch, speed, pushes) + 0.5
+
+
+class Named(vi.Scene):
+    """With other words only, and a mean."""
+
+    @property
+    def labels(self):
+        return "x", "v"
+
+    def averages(self, s, state):
+        return {"speed": state.V}
+
+
+class Wide(vi.CosineCrank):
+    def slide(self, phase):
+        return super().slide(phase)._replace(U=1.5 * jnp.cos(phase))
+
+
+class Hooked(vi.SoftStop):
+    """Pulls at the body from afar."""
+
+    def contribution(self, machine, s, state, mode):
+        return jnp.ones_like(state.Y)
+
+
+def scene(kind=vi.Scene, drive=vi.IdealDrive, crank=vi.CosineCrank, gap=1.2, soft=()):
+    stop = vi.RigidStop(gap, 0.5)
+    return kind(vi.Oscillator(0.1), drive(0.9), (stop,), crank(), soft_stops=soft)
+
+
+@pytest.mark.parametrize(
+    "machine, what",
+    [
+        (scene(drive=Weighted), "`Weighted` has another `field`"),
+        (scene(drive=Faster), "`Faster` has another `fixed_speed`"),
+        (scene(Pulled), "`Pulled` has another `pull`"),
+        (scene(crank=Wide), "`Wide`"),
+    ],
+)
+def test_a_closed_form_is_that_of_the_librarys_equations(machine, what):
+    with pytest.raises(ValueError, match=what):
+        vi.ExactFlight().check(machine)
+    assert isinstance(vi.preset(machine), vi.FixedStep)
+    assert isinstance(vi.preset(scene(Named)), vi.ExactFlight)
+
+
+@pytest.mark.parametrize(
+    "machine, may",
+    [
+        (scene(), False),
+        (scene(gap=0.9), True),
+        (scene(crank=Wide), True),
+        (scene(drive=Weighted), True),
+        (scene(Pulled), True),
+        (scene(soft=(vi.SoftStop(-1.5, 10.0, side="left"),)), True),  # overlaps the rigid stop
+        (scene(soft=(vi.SoftStop(0.8, 10.0, side="left"),)), False),
+        (scene(soft=(vi.SoftStop(1.0, 10.0),)), False),
+        (scene(soft=(Hooked(1.0, 10.0),)), True),
+    ],
+)
+def test_a_body_may_rest_where_anything_may_press_it_on(machine, may):
+    assert machine.may_rest() is may
+
+
+class Stopped(vi.machines.Structure):
+    """With a stop that is none of its contacts."""
+
+    @property
+    def stops(self):
+        return (*self.contacts, vi.RigidStop(0.5, 1.0))
+
+
+class Slanted(vi.machines.Structure):
+    """With a coordinate that is no sum of displacements."""
+
+    @property
+    def coordinates(self):
+        own = super().coordinates[0]
+        return (own._replace(position=lambda x: 2 * own.position(x)),)
+
+
+def test_a_structure_has_the_stops_and_coordinates_of_its_subclass():
+    """x'' + x = 0 from x = 0: the stop at 0.5 = sin(π/6) turns the phase to 5π/6."""
+    matrices = {"mass": jnp.ones(1), "stiffness": jnp.ones(1)}
+    machine = Stopped(**matrices, frequency=1.0)
+    run = vi.simulate(machine, machine.start(velocity=1.0), 3)
+    times = np.pi / 6 + 4 * np.pi / 3 * np.arange(6)
+    times = times[times < 6 * np.pi]
+    assert int(run.impacts.sum()) == len(times)
+    place = np.sin(6 * np.pi - times[-1] + 5 * np.pi / 6)
+    np.testing.assert_allclose(run.last.displacement, [place], atol=1e-9)
+    slanted = Slanted(**matrices, contacts=(vi.RigidStop(0.5, 1.0, at=[1.0]),))
+    assert isinstance(slanted.prepared().machine, Slanted)
+    assert not isinstance(vi.preset(slanted), vi.ExactFlight)
