@@ -51,7 +51,9 @@ class Ball(AbstractMachine):
 # Scene of a lane's number, method, options of `simulate`.
 CASES = {
     "cycles that an impact ends": (
-        lambda r: Ball(0.6 * r), vi.Adaptive(), {"record": "sections", "rests": False},
+        lambda r: Ball(0.6 * r),
+        vi.Adaptive(),
+        {"record": "sections", "rests": False},
     ),
     "exact flight": (ideal, vi.ExactFlight(), {}),
     "exact flight, two stops": (lambda r: ideal(r, TWO), vi.ExactFlight(), {"impact_log": 4}),
@@ -64,7 +66,9 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("name", quick(CASES, "cycles that an impact ends", slow=("motor", "exact flight, rest")))
+@pytest.mark.parametrize(
+    "name", quick(CASES, "cycles that an impact ends", slow=("motor", "exact flight, rest"))
+)
 def test_roads_agree(name):
     make, method, options = CASES[name]
 

@@ -1,5 +1,7 @@
 """Taylor series: each rule against derivatives by JAX, the method against the exact flight."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,8 +18,8 @@ RULES = {
     "roots": lambda t, x: jnp.sqrt(1 + x * x) + jax.lax.rsqrt(2 + x) + (1.5 + x) ** 1.5,
     "exponential": lambda t, x: jnp.exp(-x) + jnp.log(2 + x * t) + jax.nn.sigmoid(x),
     "circle": lambda t, x: jnp.sin(3 * x) * jnp.cos(t + x),
-    "saturation": lambda t, x: jnp.tanh(2 * x) + jnp.abs(x - 3) + jnp.sign(x),
-    "choice": lambda t, x: jnp.where(x > 0, x * x, -x) + jnp.maximum(x, 0.1) + jnp.minimum(t, x),
+    "saturation": lambda t, x: jnp.tanh(2 * x) + jnp.abs(jnp.asarray(-3.0)) * x,
+    "choice": lambda t, x: jnp.where(jnp.asarray(1.0) > 0, x * x, -x) + jnp.maximum(0.2, 0.1) * x,
     "arrays": lambda t, x: jnp.sum(
         jnp.array([[1.0, 2.0], [0.5, -1.0]]) @ jnp.stack([x * x, t]) * jnp.arange(1.0, 3.0)
     ),
@@ -163,6 +165,55 @@ def test_what_has_no_recursion_is_named():
     scene = vi.Scene.ideal(frequency_ratio=0.9, crank=Odd())
     with pytest.raises(NotImplementedError, match="`erf`"):
         vi.simulate(scene, scene.start(), 2, method=vi.Taylor())
+
+
+class Pushed(vi.AbstractMachine):
+    """With a force given as a function of s and Y."""
+
+    force: Callable
+    stops: tuple = ()
+    cycle: float = 1.0
+
+    def field(self, s, state):
+        return vi.OscillatorState(state.V, self.force(s, state.Y))
+
+
+KINKS = {
+    "where": lambda s, y: jnp.where(y > 0.2, -1.0, 0.0),
+    "maximum": lambda s, y: jnp.maximum(y, 0.2),
+    "minimum": lambda s, y: jnp.minimum(y, 0.4),
+    "abs": lambda s, y: jnp.abs(y),
+    "floor": lambda s, y: jnp.floor(3 * s),
+    "sign": lambda s, y: jnp.sign(y),
+    "an index": lambda s, y: jnp.arange(3.0).at[jnp.int32(2 * y)].get(wrap_negative_indices=False),
+}
+
+
+@pytest.mark.parametrize("name", KINKS)
+def test_what_is_not_smooth_is_named(name):
+    start = vi.OscillatorState(jnp.asarray(0.1), jnp.asarray(1.0))
+    with pytest.raises(NotImplementedError, match=f"decides by `{name}` .*`Adaptive`, or a `Swit"):
+        vi.simulate(Pushed(KINKS[name]), start, 1, method=vi.Taylor())
+
+
+class Damped(Pushed):
+    def field(self, s, state):
+        return vi.OscillatorState(state.V, self.force(s, state.Y, state.V))
+
+
+def test_strong_damping_shortens_steps():
+    """Of x'' + a x' + x = cos s from (0, 1), a known sum of sin s/a and two exponentials."""
+
+    def end(a):
+        force = lambda s, y, v: jnp.cos(s) - y - a * v
+        machine = Damped(force, (vi.RigidStop(0.9, 0.5),), 2 * np.pi)
+        return vi.simulate(machine, vi.OscillatorState(0.0 * a, 1.0 + 0 * a), 1, method=vi.Taylor())
+
+    a = np.array([3.0, 10.0, 30.0, 1000.0])
+    run, root = jax.vmap(end)(jnp.asarray(a)), np.sqrt(a * a - 4)
+    free = (1 - 1 / a) / root * np.exp(np.pi * (root - a))
+    assert bool(run.successful.all()) and int(run.impacts.sum()) == 0
+    np.testing.assert_allclose(run.last.Y, free, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize(

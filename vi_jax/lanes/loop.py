@@ -76,9 +76,7 @@ def run(
     """
     leaves, treedef = jtu.tree_flatten(inputs)
     leaves = [jnp.asarray(x) for x in leaves]
-    program, consts, *structures = traced(
-        Functions(begin, step, end), treedef, leaves, rows=rows
-    )
+    program, consts, *structures = traced(Functions(begin, step, end), treedef, leaves, rows=rows)
     backend = current_backend() if backend is None else backend
     found = lanes_p.bind(*leaves, *consts, program=program, backend=backend)
     n = len(program.out_avals)

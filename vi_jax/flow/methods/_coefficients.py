@@ -12,6 +12,10 @@ class NoSeries(Exception):
     """A field without a recursion; the argument is the primitive's name."""
 
 
+class NotSmooth(Exception):
+    """A field with a kink or a jump where the state says; the argument is what makes it."""
+
+
 def nth(series: Series, n: int) -> Coefficient:
     """The n-th coefficient, zero beyond those known."""
     return series[n] if n < len(series) else None

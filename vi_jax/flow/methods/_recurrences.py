@@ -10,7 +10,7 @@ own that it keeps from one n to the next.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -43,8 +43,38 @@ _JOINED = {
     "dynamic_update_slice": (0, 1), "scatter": (0, 2), "scatter-add": (0, 2),
 }  # fmt: skip
 
+
+class _Kink(NamedTuple):
+    """What is not smooth in some of its operands."""
+
+    word: str
+    """How a field writes it."""
+    places: tuple[int | None, int | None]
+    """The first of those operands, and the one behind the last; `None` for an end."""
+
+
+# A series goes on as the step begins. Comparisons count where something is chosen by them.
+KINKS = {
+    "abs": _Kink("abs", (0, None)),
+    "max": _Kink("maximum", (0, None)),
+    "min": _Kink("minimum", (0, None)),
+    "sign": _Kink("sign", (0, None)),
+    "round": _Kink("round", (0, None)),
+    "floor": _Kink("floor", (0, None)),
+    "ceil": _Kink("ceil", (0, None)),
+    "select_n": _Kink("where", (0, 1)),
+    "gather": _Kink("an index", (1, None)),
+    "dynamic_slice": _Kink("an index", (1, None)),
+    "dynamic_update_slice": _Kink("an index", (2, None)),
+    "scatter": _Kink("an index", (1, 2)),
+    "scatter-add": _Kink("an index", (1, 2)),
+}
+
 # What is decided by the value where the step begins.
-_DECIDED = ("eq", "ne", "lt", "le", "gt", "ge", "and", "or", "not", "xor", "is_finite", "iota")
+_DECIDED = (
+    "eq", "ne", "lt", "le", "gt", "ge", "and", "or", "not", "xor", "is_finite", "iota", "abs",
+    "max", "min", "sign", "round", "floor", "ceil",
+)  # fmt: skip
 
 
 def _bound(eqn: Any, *values: Any) -> Any:
@@ -238,34 +268,10 @@ def _saturating(slope: Callable[[Any], Any], next_slope: Callable[[Series, int],
     return rule
 
 
-def _chosen(eqn, n, operands, results, extra):
-    """Of max and min: that of one operand, chosen by their values where the step begins."""
-    a, b = operands
-    if n == 0:
-        extra["first"] = a[0] >= b[0] if eqn.primitive.name == "max" else a[0] <= b[0]
-        return _bound(eqn, a[0], b[0])
-    x, y = nth(a, n), nth(b, n)
-    if x is None and y is None:
-        return None
-    zero = jnp.zeros_like(a[0])
-    return jnp.where(extra["first"], zero if x is None else x, zero if y is None else y)
-
-
-def _absolute(eqn, n, operands, results, extra):
-    a = operands[0]
-    return jnp.abs(a[0]) if n == 0 else times(jnp.sign(a[0]), nth(a, n))
-
-
-def _flat(eqn, n, operands, results, extra):
-    return None if n else _bound(eqn, operands[0][0])
-
-
 RULES: dict[str, Callable] = {
     **dict.fromkeys(_LINEAR, _linear),
     **dict.fromkeys(_JOINED, _joined),
     **dict.fromkeys(_DECIDED, _decided),
-    **dict.fromkeys(("sign", "round", "floor", "ceil"), _flat),
-    **dict.fromkeys(("max", "min"), _chosen),
     "add": lambda e, n, o, r, x: plus(nth(o[0], n), nth(o[1], n)),
     "add_any": lambda e, n, o, r, x: plus(nth(o[0], n), nth(o[1], n)),
     "sub": lambda e, n, o, r, x: minus(nth(o[0], n), nth(o[1], n)),
@@ -283,7 +289,6 @@ RULES: dict[str, Callable] = {
     "cos": _one_of_pair(1),
     "tanh": _saturating(lambda y: 1 - y * y, lambda y, n: minus(None, square(y, n))),
     "logistic": _saturating(lambda y: y * (1 - y), lambda y, n: minus(nth(y, n), square(y, n))),
-    "abs": _absolute,
     "select_n": _selected,
     "dot_general": _dot,
 }

@@ -16,8 +16,8 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 from ..._types import Scalar, Scalars, State
 from ...lanes import CALLS
 from ..events import Rates
-from ._coefficients import Coefficient, NoSeries, Series, nth, plus
-from ._recurrences import RULES
+from ._coefficients import Coefficient, NoSeries, NotSmooth, Series, nth, plus
+from ._recurrences import KINKS, RULES
 
 
 def expand(
@@ -30,7 +30,8 @@ def expand(
     **Returns:** their tree, and the coefficients of each leaf, each a list of `order + 1` (`None`
     for zero).
 
-    **Raises:** `NoSeries` if the field has a primitive without a recursion.
+    **Raises:** `NoSeries` if the field has a primitive without a recursion, `NotSmooth` if one that
+    is not smooth acts on what moves.
     """
     leaves, treedef = jtu.tree_flatten(state)
 
@@ -107,6 +108,8 @@ class _Flow:
         self.env: dict[Any, Series] = {}
         self.equations: list[tuple[Any, list[Any], list[Any]]] = []
         self.extra: list[dict[str, Series]] = []
+        # By their identity the series that move; all others are numbers that stay what they are.
+        self.moving = {id(x) for x in inputs}
         self.outs = self._inline(closed.jaxpr, list(closed.consts), inputs)
 
     def _inline(self, jaxpr: Jaxpr, consts: list, args: list[Series]) -> list[Series]:
@@ -132,7 +135,12 @@ class _Flow:
                 continue
             if name not in RULES:
                 raise NoSeries(name)
+            moves = [id(x) in self.moving for x in operands]
+            if name in KINKS and any(moves[slice(*KINKS[name].places)]):
+                raise NotSmooth(KINKS[name].word)
             results: list[Series] = [[] for _ in eqn.outvars]
+            if any(moves):
+                self.moving.update(map(id, results))
             names.update(zip(eqn.outvars, results, strict=True))
             self.equations.append((eqn, operands, results))
             self.extra.append({})

@@ -1,6 +1,8 @@
 """A Taylor method: each step is a power series, which also says where in it an event lies."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from math import factorial, pi
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -14,8 +16,28 @@ from ..._types import Scalar, State
 from ..beside import Beside, rate_beside
 from ..smooth import SmoothMachine
 from . import _series as power_series
-from ._series import Along, NoSeries, Series
+from ._coefficients import NoSeries, NotSmooth, Series
+from ._series import Along
 from .base import AbstractMethod
+
+
+@contextmanager
+def _in_words() -> Iterator[None]:
+    """**Raises:** `NotImplementedError` for what has no series, by name and with a remedy."""
+    where = "in the machine's field, averages or coordinates"
+    try:
+        yield
+    except NoSeries as error:
+        raise NotImplementedError(
+            f"Method `Taylor` has no recursion for the primitive `{error}` {where}. Use `Adaptive` "
+            "or `FixedStep`."
+        ) from None
+    except NotSmooth as error:
+        raise NotImplementedError(
+            f"Method `Taylor` needs smooth functions, but the state decides by `{error}` {where}. "
+            "Use `Adaptive`, or a `Switch` whose guard is zero at the kink and whose mode chooses "
+            "in the field."
+        ) from None
 
 
 class Expansion(NamedTuple):
@@ -24,8 +46,8 @@ class Expansion(NamedTuple):
     treedef: Any
     """Of the state and what is integrated beside it."""
     series: list[Series]
-    tolerance: np.ndarray | float | None
-    """By which its reach is measured; `None` where it reaches as far as is asked."""
+    tolerance: np.ndarray | float
+    """By which its reach is measured."""
 
     def at(self, h: Scalar) -> tuple[State, Beside | None]:
         """State, and what is integrated beside it, a length h away."""
@@ -34,13 +56,12 @@ class Expansion(NamedTuple):
     def of(self, function: Callable[[State], Any]) -> Along:
         """A scalar function of the state along it, a constant for differentiation."""
         still = [[None if c is None else stop_gradient(c) for c in x] for x in self.series]
-        return power_series.along(lambda y: function(y[0]), self.treedef, still)
+        with _in_words():
+            return power_series.along(lambda y: function(y[0]), self.treedef, still)
 
     def reach(self, limit: Scalar) -> Scalar:
         """The length at which the last two terms are as small as the tolerance, relative to the
         state (Jorba and Zou, Experimental Mathematics 14, 2005), up to this limit."""
-        if self.tolerance is None:
-            return limit
         floor = 8 * jnp.finfo(limit.dtype).eps
         size = jnp.asarray(sum(jnp.sum(jnp.abs(stop_gradient(x[0]))) for x in self.series))
         allowed = jnp.maximum(jnp.asarray(self.tolerance, limit.dtype), floor) * (1 + size)
@@ -50,9 +71,7 @@ class Expansion(NamedTuple):
             if not terms:
                 continue
             term = jnp.maximum(sum(terms), jnp.finfo(size.dtype).tiny)
-            # A length needs no double precision, and single precision powers vectorise.
-            ratio = jnp.clip(allowed / term, 1e-30, 1e30).astype(jnp.float32)
-            limit = jnp.minimum(limit, (ratio ** (1.0 / n)).astype(size.dtype))
+            limit = jnp.minimum(limit, jnp.exp(jnp.log(allowed / term) * (1.0 / n)))
         return limit
 
 
@@ -61,11 +80,11 @@ class Taylor(AbstractMethod):
 
     A step knows the motion all along it, so that an event is found where it lies and met at once.
     The method of choice for smooth fields at small errors; `NotImplementedError` names what a field
-    uses that has no recursion.
+    uses that has no recursion, or that is not smooth where the state says (`jnp.where`, `jnp.abs`).
 
     **Arguments:** `order` of the series (at least 4, default 16); `steps_per_cycle` (at least 5,
-    default 8), as for `FixedStep`; `rtol`, if given, sizes each step by its last terms instead, and
-    `steps_per_cycle` is the fewest.
+    default 8), as for `FixedStep`, and the fewest: a step is shortened where its series would
+    diverge; `rtol`, if given, sizes each step by its last terms instead.
 
     **Raises:** `ValueError` for numbers out of range; when it is to carry a `SoftStop` of another
     exponent than 1, whose force has no series at first touch.
@@ -118,14 +137,17 @@ class Taylor(AbstractMethod):
             state, beside = y
             return smooth.field(s, state), rate_beside(smooth, s, state, beside)
 
-        try:
+        with _in_words():
             treedef, series = power_series.expand(field, s, (state, beside), self.order)
-        except NoSeries as error:
-            raise NotImplementedError(
-                f"Method `Taylor` has no recursion for the primitive `{error}` in the machine's "
-                "field or averages. Use `Adaptive` or `FixedStep`."
-            ) from None
-        return Expansion(treedef, series, self.rtol)
+        tolerance = self._coarsest if self.rtol is None else self.rtol
+        return Expansion(treedef, series, tolerance)
+
+    @property
+    def _coarsest(self) -> float:
+        """The last term, relative to the state, of a motion with four periods in a natural one or
+        a cycle: fixed steps are shortened where theirs is larger, as under strong damping, since
+        the series would diverge."""
+        return min((8 * pi / self.steps_per_cycle) ** self.order / factorial(self.order), 0.1)
 
     def step(self, smooth, s0, s1, state, beside):
         """The sum of the series at `s1`.
