@@ -57,4 +57,4 @@ def test_the_wheel_runs_away_from_the_checkout(built, tmp_path):
     ).stdout  # fmt: skip
     assert Path(run("-c", FIRST_STEPS).split()[0]).is_relative_to(tmp_path)
     command = "import sys; from vi_jax.cli import main; sys.argv[1:] = ['--help']; main()"
-    assert "reproduce" in run("-c", command)
+    assert "explore" in run("-c", command)

@@ -21,11 +21,11 @@ from matplotlib.lines import Line2D
 jax.config.update("jax_enable_x64", True)
 
 sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
+from reproduction.boundaries import table_damping, xi_per_c
 from tools.ideal import GAP
 from tools.pictures import gridded, legend_below, panels
 from tools.study import QUICK, say, write
 from tools.tables import table
-from vi_jax.paper.boundaries import table_damping, xi_per_c
 from vi_jax.plot import DASHES, mark_of
 
 ZETA, K, XI = "drive.frequency_ratio", "stops.0.restitution", "oscillator.damping_ratio"

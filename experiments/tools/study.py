@@ -1,18 +1,27 @@
-"""How a study is run: `--quick` or in full, what it reports on its way, and what it writes."""
+"""How a study is run: `--quick` or in full, what it reports on its way, and what it writes.
 
+A study's page ends with its headline numbers as JSON, which a test computes again with the library
+as it is.
+"""
+
+import json
+import re
 import sys
 import time
 from pathlib import Path
 from typing import Any
 
-from headlines import keep
 from matplotlib.figure import Figure
+
+from .pictures import save_picture
 
 QUICK = "--quick" in sys.argv
 """Whether to take few values, and to write nothing."""
 
 _EXPERIMENTS = Path(__file__).parents[1]
 _BEGIN = time.perf_counter()
+_TITLE = "## Headline numbers"
+_NOTE = "Computed again by the tests, which fail where the library gives others."
 
 
 def say(text: object) -> None:
@@ -21,8 +30,10 @@ def say(text: object) -> None:
     print(f"[{clock:5.1f} s, CPU {used:5.1f} s] {text}", flush=True)
 
 
-def write(study: str, page: str, numbers: dict[str, float], figure: Figure, **look: Any) -> None:
-    """Write a study's page and picture, beside each other's numbers; nothing with `--quick`.
+def write(
+    study: str, text: str, numbers: dict[str, float], figure: Figure | None = None, **look: Any
+) -> None:
+    """Write a study's page and picture; nothing with `--quick`.
 
     **Arguments:** the study's name, which is that of its file; its page in Markdown; its headline
     numbers by name; its picture, and options of `save_picture`.
@@ -31,4 +42,16 @@ def write(study: str, page: str, numbers: dict[str, float], figure: Figure, **lo
         return
     folders = (_EXPERIMENTS / kind for kind in ("studies", "benchmarks"))
     folder = next(x for x in folders if (x / f"{study}.py").exists())
-    keep(folder, study, page, numbers, figure, **look)
+    rounded = {name: float(f"{value:.12g}") for name, value in numbers.items()}
+    listed = json.dumps(rounded, indent=2, ensure_ascii=False, allow_nan=False)
+    page = f"{text.rstrip()}\n\n{_TITLE}\n\n{_NOTE}\n\n```json\n{listed}\n```\n"
+    if figure is not None:
+        save_picture(figure, _EXPERIMENTS / "figures" / f"{study}.png", **look)
+    (folder / f"{study}.md").write_text(page, encoding="utf-8")
+
+
+def headlines(page: str) -> dict[str, float]:
+    """Return the headline numbers of a page."""
+    _, _, rest = page.partition(_TITLE)
+    block = re.search(r"```json\n(.*?)```", rest, re.DOTALL)
+    return {} if block is None else json.loads(block[1])

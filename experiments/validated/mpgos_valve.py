@@ -14,7 +14,7 @@ import jax
 import vi_jax as vi
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from headlines import headlines
+from tools.study import headlines
 from tools.validated import Comparison
 
 jax.config.update("jax_enable_x64", True)

@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from headlines import headlines
+from tools.study import headlines
 from tools.validated import Comparison
 
 page = Path(__file__).parents[1] / "studies" / "woodpecker.md"

@@ -4,8 +4,9 @@ import jax
 import jax.numpy as jnp
 import pytest
 import vi_jax as vi
-from headlines.jaxprs import primitives
 from vi_jax.lanes._program import LaneProgram
+
+from traced_size import primitives
 
 
 def carried(jaxpr) -> int:

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import vi_jax as vi
-from headlines.jaxprs import primitives
 from tools.chains import linear_chain
 from tools.networks import last_places, oscillator
 
@@ -42,34 +41,6 @@ def peers() -> Expected:
     error = fixed_steps_error(200)
     name = "vi_jax FixedStep(Verner9, 10), ideal drive, k = 0.8: median error"
     return {name: (error, error / 3)}
-
-
-def scene_cost() -> Expected:
-    """Operations in the program of a lane; other versions of JAX write some of it otherwise."""
-
-    def run(method, ratio):
-        scene = vi.Scene(
-            oscillator=vi.Oscillator(0.0448), drive=vi.IdealDrive(ratio),
-            stops=[vi.RigidStop(2.0, 0.8)],
-        )  # fmt: skip
-        found = vi.simulate(scene, scene.start(), 200, method=method, record="sections")
-        return jax.tree.leaves(found)
-
-    numbers = {}
-    for name, method in (("one stop", vi.FixedStep()), ("exact flight", vi.ExactFlight())):
-        size = primitives(jax.make_jaxpr(partial(run, method))(0.9).jaxpr).total()
-        numbers[f"operations: ideal, {name}"] = (float(size), 0.05 * size)
-    return numbers
-
-
-def explorer() -> Expected:
-    """The motion where the sliders begin: the 4π motion in closed form."""
-    scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.01)
-    found = vi.closed_form_orbits(scene, cycles=2)
-    return {
-        "lowest position where the sliders begin": (float(found.y_min[0]), 1e-9),
-        "highest": (2.0, 1e-9),
-    }
 
 
 def chains() -> Expected:

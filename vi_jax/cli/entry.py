@@ -1,5 +1,4 @@
-"""The command line: `vi-jax reproduce`, `vi-jax explore`, and `vi-jax VERB FILE.toml` for what a
-file asks."""
+"""The command line: `vi-jax explore`, and `vi-jax VERB FILE.toml` for what a file asks."""
 
 import argparse
 import os
@@ -8,10 +7,8 @@ from io import TextIOWrapper
 
 import jax
 
-from .._checks import unwritable
 from .._messages import installed_version
 from ..explore.serve import Subject, missing, serve
-from ..paper.report import reproduce, summary
 from .config import (
     BasinsTable,
     ContinueTable,
@@ -22,7 +19,6 @@ from .config import (
     read,
 )
 from .machine import machine_named
-from .progress import Countdown
 from .toml import ConfigError, keys_of
 from .verbs import VERBS
 
@@ -51,28 +47,9 @@ def _run(argv: list[str] | None) -> int:
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal without Greek letters
     options = _parser().parse_args(argv)
-    if options.command == "reproduce":
-        return _reproduce(options)
     if options.command == "explore":
         return _explore(options)
     return _run_file(options)
-
-
-def _reproduce(options: argparse.Namespace) -> int:
-    problem = unwritable(options.out) if options.out else "it is empty"
-    if problem:
-        return _error(f"argument --out must be a folder to write into: {problem}", 2)
-    jax.config.update("jax_enable_x64", True)
-    try:
-        with Countdown() as countdown:
-            found = reproduce(options.out, quick=options.quick, progress=countdown)
-    except KeyboardInterrupt:
-        print(f"vi-jax: interrupted; what was written is in {options.out}", file=sys.stderr)
-        return 130
-    except OSError as error:
-        return _error(error, 1)
-    print(summary(found))
-    return 0
 
 
 def _explore(options: argparse.Namespace) -> int:
@@ -162,19 +139,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"vi-jax {installed_version()}")
     commands = parser.add_subparsers(dest="command", required=True)
-    verb = commands.add_parser(
-        "reproduce",
-        help="draw Figures 1 to 4 of the paper and write a report",
-        description="Draws Figures 1 to 4 of the paper and the boundaries of its discrepancy, "
-        "measures what it claims with them and the faults of its printed text (report.md, "
-        "report.json).",
-    )
-    verb.add_argument(
-        "--out", default="reproduction", metavar="DIR", help="folder to write into (%(default)s)"
-    )
-    verb.add_argument(
-        "--quick", action="store_true", help="60 cycles instead of 200, and fewer samples"
-    )
     verb = commands.add_parser(
         "explore",
         help="open a page with sliders, on which motions are seen at once",

@@ -6,10 +6,10 @@ from typing import NamedTuple
 import numpy as np
 import vi_jax as vi
 import xarray as xr
+from reproduction.boundaries import xi_per_c
 from tools.ideal import closed_forms
 from tools.study import QUICK, say
 from tools.timing import Clock
-from vi_jax.paper.boundaries import xi_per_c
 
 from .regime_planes import SIDE, ZETA, Plane, settled
 

@@ -8,8 +8,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from reproduction.boundaries import table_damping
 from tools.pictures import legend_below
-from vi_jax.paper.boundaries import table_damping
 from vi_jax.plot.colors import DASHES
 
 from .regime_checks import Seen

@@ -5,15 +5,16 @@ from typing import NamedTuple
 import numpy as np
 import vi_jax as vi
 import xarray as xr
-from tools.ideal import births, closed_forms, machine
-from tools.study import QUICK
-from vi_jax.paper.boundaries import (
+from reproduction.boundaries import (
+    CURVES,
     BoundaryCurves,
-    boundary_curves,
+    follow_curves,
     plane_points,
     table_damping,
     xi_per_c,
 )
+from tools.ideal import births, closed_forms, machine
+from tools.study import QUICK
 
 SIDE = 48 if QUICK else 256
 SETTLE = 400  # drive cycles
@@ -56,7 +57,11 @@ def settled(
 
 def planes() -> list[Plane]:
     """(ζ, k) without damping and with Table 1's, and (ζ, c) at k = 0.5."""
-    undamped, both, table = boundary_curves(quick=QUICK), np.array([0.0, 1.0]), table_damping()
+    undamped, both, table = (
+        BoundaryCurves(**follow_curves(CURVES)),
+        np.array([0.0, 1.0]),
+        table_damping(),
+    )
     grid = {"zeta": ZETA, "k": KS}
     found = []
     for c, title, curves in (
@@ -75,7 +80,7 @@ def planes() -> list[Plane]:
 def _undamped(curves: BoundaryCurves, other: str) -> dict[str, list[np.ndarray]]:
     """Those that begin without damping."""
     named = {name: getattr(curves, f"{name}_{other}") for name in ("doubling", "touch", "fold")}
-    return {name: [plane_points(x)] for name, x in named.items() if x is not None}
+    return {name: [plane_points(x)] for name, x in named.items()}
 
 
 def _with_damping(xi: float) -> dict[str, list[np.ndarray]]:

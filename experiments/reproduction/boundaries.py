@@ -1,0 +1,304 @@
+"""Where the paper's discrepancy lives: its borders in the planes (ζ, k) and (ζ, c)."""
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from scipy.interpolate import CubicSpline
+from vi_jax.machine import Parameters, Scene
+from vi_jax.orbit import (
+    Boundary,
+    Branch,
+    SpecialPoint,
+    boundary,
+    closed_form_orbits,
+    continue_orbit,
+    find_orbit,
+)
+from vi_jax.plot import DASHES, color_of, paler
+
+from .motions import FREQUENCY_RATIO, GAP, RESTITUTION, table_damping_ratio
+from .response import MAX_STEP, RANGE, RATIO
+
+K, XI = "stops.0.restitution", "oscillator.damping_ratio"
+# At k = 1 without damping the motions are no longer isolated, and the curves end there.
+K_RANGE, C_RANGE = (0.02, 0.999), (0.0, 1.2)
+
+SHORT, LONG = color_of(1, 1), color_of(2, 1)
+# Darker, to be seen on its filling.
+LONG_LINE = "#b87f00"
+SHORT_FILL, LONG_FILL = paler(SHORT, 0.2), paler(LONG, 0.4)
+
+
+def table_damping() -> float:
+    """c of Table 1 (N·s/m)."""
+    return float(Parameters().damping)
+
+
+def xi_per_c() -> float:
+    """ξ of c = 1 N·s/m in the machine of Table 1 (m·s/N)."""
+    return table_damping_ratio() / table_damping()
+
+
+class BoundaryCurves(NamedTuple):
+    """Curves in the planes (ζ, k), undamped, and (ζ, ξ), with k = 0.5; d = 2 in both.
+
+    The 2π motion has one impact per drive cycle, the 4π motion one in two.
+    """
+
+    doubling_k: Boundary
+    """Period doubling of the 2π motion, which is unstable on the side of smaller ζ."""
+    touch_k: Boundary
+    """The 4π motion touches the stop a second time: it exists between the curve's two arms.
+    That is the family of the figures' motion; with more damping than the curves begin with there
+    is another one beside the birth."""
+    doubling_c: Boundary
+    touch_c: Boundary
+    birth_c: Boundary
+    """Grazing in which the 2π motion is born. Without damping it lies at ζ = √(1 - 1/d) for
+    every k, since an impact that slow does nothing."""
+    fold_k: Boundary
+    """Fold in which the 2π motion ends towards large ζ."""
+    fold_c: Boundary
+    long_doubling_k: Boundary
+    """Period doubling of the 4π motion, which is unstable between the curve's two arms."""
+
+
+# Where each curve begins: the period in cycles and the k of a branch, the kind of its point, and
+# the number that is changed with ζ. At k = 0.5 the 4π motion is stable wherever it exists; at
+# k = 0.8 it is not.
+_BEGINNINGS: dict[str, tuple[int, float, str, str]] = {
+    "doubling_k": (1, RESTITUTION, "period-doubling", K),
+    "touch_k": (2, RESTITUTION, "grazing", K),
+    "doubling_c": (1, RESTITUTION, "period-doubling", XI),
+    "touch_c": (2, RESTITUTION, "grazing", XI),
+    "birth_c": (1, RESTITUTION, "grazing", XI),
+    "fold_k": (1, RESTITUTION, "fold", K),
+    "fold_c": (1, RESTITUTION, "fold", XI),
+    "long_doubling_k": (2, 0.8, "period-doubling", K),
+}
+CURVES = tuple(_BEGINNINGS)
+SHORT_CURVES = tuple(name for name, at in _BEGINNINGS.items() if at[0] == 1)
+
+
+def follow_curves(names: Sequence[str], branches: Sequence[Branch] = ()) -> dict[str, Boundary]:
+    """Follow those of `CURVES` that are named.
+
+    **Arguments:** the names; branches in ζ on which the curves may begin, such as those of the
+    undamped response with k = 0.5 (a branch that is missing is followed first).
+    """
+    known: dict[tuple[int, float], Branch] = {}
+    for cycles, k, *_ in map(_BEGINNINGS.__getitem__, names):
+        if (cycles, k) not in known:
+            known[cycles, k] = _branch(cycles, k, branches)
+
+    def follow(name: str) -> Boundary:
+        cycles, k, kind, parameter = _BEGINNINGS[name]
+        return _follow(_special(known[cycles, k], kind), parameter)
+
+    # What takes the time is compiling, of which two threads do more than one.
+    with ThreadPoolExecutor(2) as threads:
+        return dict(zip(names, threads.map(follow, names), strict=True))
+
+
+def _branch(cycles: int, k: float, known: Sequence[Branch]) -> Branch:
+    """The undamped branch in ζ with one impact in `cycles` cycles: a known one, or a new one."""
+    for branch in known:
+        scene = branch.problem.machine
+        if (
+            (branch.name, branch.cycles, branch.impact_speed.shape[1]) == (RATIO, cycles, 1)
+            and isinstance(scene, Scene)
+            and float(scene.stops[0].restitution) == k
+            and float(scene.damping_ratio) == 0.0
+        ):
+            return branch
+    scene = Scene.ideal(frequency_ratio=FREQUENCY_RATIO, restitution=k)
+    closed = closed_form_orbits(scene, cycles=cycles)
+    start = scene.start(Y=closed.Y[0], V=closed.V[0])
+    orbit = find_orbit(scene, start, cycles=cycles, throw=True)
+    return continue_orbit(orbit, parameter=RATIO, bounds=RANGE, max_step=MAX_STEP)
+
+
+def _special(branch: Branch, kind: str) -> SpecialPoint:
+    """The first special point of a kind, by ζ."""
+    return min((p for p in branch.special if p.kind == kind), key=lambda p: p.parameter)
+
+
+def _follow(point: SpecialPoint, parameter: str) -> Boundary:
+    other = K_RANGE if parameter == K else (0.0, C_RANGE[1] * xi_per_c())
+    return boundary(point, parameter=parameter, bounds=(RANGE, other), max_step=0.03)
+
+
+def plane_points(curve: Boundary) -> np.ndarray:
+    """Points (ζ, k) or (ζ, c) of a curve, with c in N·s/m."""
+    points = curve.parameters.copy()
+    if curve.names[1] == XI:
+        points[:, 1] = np.maximum(points[:, 1], 0.0) / xi_per_c()  # -1e-17 at its end
+    return points
+
+
+def crossings(curve: Boundary, column: int, value: float) -> list[float]:
+    """Where a curve has a value of ζ (column 0) or of k or c (1): the other number, rising.
+
+    Splines through the curve's points, whose error is below 1e-5 here.
+    """
+    points = plane_points(curve)
+    spline = _spline(points)
+    here = CubicSpline(spline.x, points[:, column])
+    places = here.solve(value, extrapolate=False)
+    return sorted(float(x) for x in spline(places)[:, 1 - column])
+
+
+def _spline(points: np.ndarray) -> CubicSpline:
+    scaled = points / np.ptp(points, axis=0).clip(1e-9)
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(scaled, axis=0), axis=1))])
+    keep = np.concatenate([[True], np.diff(length) > 1e-9])
+    return CubicSpline(length[keep], points[keep])
+
+
+def _turn(curve: Boundary, pick: Callable[[np.ndarray], np.intp]) -> tuple[float, float]:
+    """(ζ, other) at the least or the greatest k or c of a curve."""
+    points = plane_points(curve)
+    spline = _spline(points)
+    fine = spline(np.linspace(spline.x[0], spline.x[-1], 20_001))
+    zeta, other = fine[pick(fine[:, 1])]
+    return float(zeta), float(other)
+
+
+def birth_without_damping(curves: BoundaryCurves) -> float:
+    """ζ of the grazing in which the 2π motion is born, the same for every k."""
+    points = plane_points(curves.birth_c)
+    return float(points[np.argmin(points[:, 1]), 0])
+
+
+def free_motion_touches(c: np.ndarray) -> np.ndarray:
+    """The larger ζ at which the motion without impacts reaches the stop, for each c (N·s/m).
+
+    There, as at the smaller one, a motion with an impact is born; without damping at √(1 + 1/d).
+    """
+    q = 1 - 2 * (np.asarray(c) * xi_per_c()) ** 2
+    return np.sqrt(q + np.sqrt(q**2 - 1 + 1 / GAP**2))
+
+
+def describe_boundaries(curves: BoundaryCurves) -> dict[str, float | None]:
+    """What the curves say about the figures' ζ and k, and about Table 1's c, in numbers.
+
+    `None` where a curve does not get there, as that of the 4π motion to Table 1's c.
+    """
+
+    def at(curve: Boundary, column: int, value: float, place: int) -> float | None:
+        found = crossings(curve, column, value)
+        return found[place] if found else None
+
+    zeta, k = FREQUENCY_RATIO, RESTITUTION
+    top, bottom = _turn(curves.touch_c, np.argmax), _turn(curves.touch_k, np.argmin)
+    return {
+        "birth, undamped, ζ": birth_without_damping(curves),
+        "doubling at k = 0.5, undamped, ζ": at(curves.doubling_k, 1, k, 0),
+        "doubling at k = 0.8, undamped, ζ": at(curves.doubling_k, 1, 0.8, 0),
+        "4π motion at k = 0.5, undamped, from ζ": at(curves.touch_k, 1, k, 0),
+        "4π motion at k = 0.5, undamped, to ζ": at(curves.touch_k, 1, k, -1),
+        "4π motion, undamped, from k": bottom[1],
+        "4π motion, undamped, from k, at ζ": bottom[0],
+        "fold at k = 0.5, undamped, ζ": at(curves.fold_k, 1, k, 0),
+        "fold at k = 0.8, undamped, ζ": at(curves.fold_k, 1, 0.8, 0),
+        "doubling at ζ = 0.9, k = 0.5, c": at(curves.doubling_c, 0, zeta, 0),
+        "4π motion at ζ = 0.9, k = 0.5, up to c": at(curves.touch_c, 0, zeta, -1),
+        "4π motion at k = 0.5, up to c": top[1],
+        "4π motion at k = 0.5, up to c, at ζ": top[0],
+        "birth at Table 1's c, k = 0.5, ζ": at(curves.birth_c, 1, table_damping(), 0),
+        "doubling at Table 1's c, k = 0.5, ζ": at(curves.doubling_c, 1, table_damping(), 0),
+        "4π motion at Table 1's c, k = 0.5, from ζ": at(curves.touch_c, 1, table_damping(), 0),
+        "fold at Table 1's c, k = 0.5, ζ": at(curves.fold_c, 1, table_damping(), 0),
+    }
+
+
+def draw_boundaries(curves: BoundaryCurves) -> Figure:
+    """Both planes, the whole of them beside the region of the discrepancy.
+
+    Axes in the order (ζ, k), its region, (ζ, c), its region.
+    """
+    figure = Figure(figsize=(12.5, 9.6), dpi=110)
+    figure.set_layout_engine("constrained", w_pad=0.08)
+    grid = figure.subplots(2, 2, width_ratios=(1.0, 1.25))
+    for row, plane in zip(grid, ("k", "c"), strict=True):
+        for ax, zoom in zip(row, (False, True), strict=True):
+            _draw(ax, curves, plane, zoom)
+    handles = [
+        Patch(color=SHORT_FILL, label="2π motion unstable"),
+        Patch(color=LONG_FILL, label="4π with one impact, the paper's family"),
+        *(
+            Line2D([], [], color=color, lw=1.8, ls=DASHES[kind], label=label)
+            for color, kind, label in (
+                (SHORT, "grazing", "2π: born by grazing"),
+                (SHORT, "period-doubling", "2π: period doubling"),
+                (SHORT, "fold", "2π: fold"),
+                (LONG_LINE, "grazing", "4π: touches the stop again"),
+                (LONG_LINE, "period-doubling", "4π: period doubling"),
+            )
+        ),
+        Line2D(
+            [], [], color="k", marker="*", ls="none", ms=11, label="Figs. 3 and 4: k = 0.5, ζ = 0.9"
+        ),
+        Line2D([], [], color="k", marker="P", ls="none", ms=9, label="the same with Table 1's c"),
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False, fontsize=10)
+    figure.suptitle(
+        "Where the 2π motion is unstable and the paper's 4π motion exists (ideal, Δ = 2a)"
+    )
+    return figure
+
+
+def _draw(ax: Axes, curves: BoundaryCurves, plane: str, zoom: bool) -> None:
+    low, high = K_RANGE if plane == "k" else C_RANGE
+    levels = np.linspace(low, high, 400)
+    short, long, fold = (getattr(curves, f"{x}_{plane}") for x in ("doubling", "touch", "fold"))
+    birth = plane_points(curves.birth_c)
+    if plane == "k":
+        born = birth_without_damping(curves)
+        birth = np.array([[born, low], [born, high]])
+    doubling, touch = plane_points(short), plane_points(long)
+    # Birth and doubling have one ζ for each k and each c.
+    left, right = (_over(points, levels) for points in (birth, doubling))
+    ax.fill_betweenx(levels, left, right, color=SHORT_FILL, lw=0, zorder=0)
+    ax.fill(*touch.T, color=LONG_FILL, lw=0, zorder=1)
+    upper = np.column_stack([free_motion_touches(0.0 * levels if plane == "k" else levels), levels])
+    for points, color, kind in (
+        (birth, SHORT, "grazing"),
+        (upper, SHORT, "grazing"),
+        (doubling, SHORT, "period-doubling"),
+        (touch, LONG_LINE, "grazing"),
+        (curves.long_doubling_k if plane == "k" else None, LONG_LINE, "period-doubling"),
+        (fold, SHORT, "fold"),
+    ):
+        if points is not None:
+            points = plane_points(points) if isinstance(points, Boundary) else points
+            ax.plot(*points.T, color=color, lw=1.8, ls=DASHES[kind])
+    undamped = RESTITUTION if plane == "k" else 0.0
+    ax.plot(FREQUENCY_RATIO, undamped, "k*", ms=11, clip_on=False, zorder=6)
+    if plane == "c":
+        ax.axhline(table_damping(), color="k", lw=1.0, ls=":")
+        ax.plot(FREQUENCY_RATIO, table_damping(), "kP", ms=9, zorder=6)
+        if not zoom:
+            ax.text(
+                0.99, table_damping(), "c of Table 1", transform=ax.get_yaxis_transform(),
+                ha="right", va="bottom", fontsize=10,
+            )  # fmt: skip
+    ax.set_xlim(*((0.68, 1.02) if zoom else RANGE))
+    ax.set_ylim(low, 1.0 if plane == "k" else high)
+    ax.set_xlabel("frequency ratio ζ")
+    ax.set_ylabel("restitution k" if plane == "k" else "damping c (N·s/m)")
+    described = "without damping" if plane == "k" else f"k = {RESTITUTION:g}"
+    ax.set_title(f"{described}, enlarged" if zoom else described, fontsize=11)
+    ax.grid(alpha=0.25, lw=0.5)
+
+
+def _over(points: np.ndarray, levels: np.ndarray) -> np.ndarray:
+    """ζ of a curve over its other number."""
+    order = np.argsort(points[:, 1])
+    return np.interp(levels, points[order, 1], points[order, 0])

@@ -1,0 +1,135 @@
+"""The motions behind Figures 3 and 4: from rest and from the 4π state, undamped and damped."""
+
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from vi_jax.flow import ExactFlight, Run, simulate
+from vi_jax.machine import Parameters, Scene
+from vi_jax.orbit import ClosedFormOrbits, closed_form_orbits
+
+from .orbits import fit_long
+
+# ζ, k and d of both figures.
+FREQUENCY_RATIO, RESTITUTION, GAP = 0.9, 0.5, 2.0
+# Cycles of the runs and samples of each, and those of a quick reproduction: choices.
+CYCLES, QUICK_CYCLES = 200, 60
+SAMPLES, QUICK_SAMPLES = 96, 64
+
+
+class Case(NamedTuple):
+    """One damping: its scene, closed forms and simulations."""
+
+    name: str
+    """"undamped" (as in the paper's figures) or "damped" (Table 1)."""
+    scene: Scene
+    short: ClosedFormOrbits
+    """2π motions in closed form."""
+    long: ClosedFormOrbits
+    """4π motions in closed form."""
+    from_rest: Run
+    """Figure 3: from Y = V = 0."""
+    from_long: Run
+    """From the 4π closed-form state (of the undamped scene where there is none)."""
+    from_fit: Run
+    """Figure 4: from the 4π initial conditions that optax fits to the undamped scene."""
+    on_short: Run
+    """From the 2π closed-form state; its first cycle is the 2π closed form."""
+    long_shift: int
+    """Cycles by which the 4π closed form lies later in Figure 3 than the section it starts on."""
+
+    @property
+    def long_exists(self) -> bool:
+        """Whether the 4π closed form is a motion: inside the gap between impacts."""
+        return bool(self.long.admissible[0])
+
+
+def figure_scene(damping_ratio: Any, *, restitution: Any = RESTITUTION, gap: Any = GAP) -> Scene:
+    """The scene of Figures 3 and 4 with this ξ (dimensionless), at ζ = 0.90."""
+    scene = Scene.ideal(
+        frequency_ratio=FREQUENCY_RATIO,
+        restitution=restitution,
+        gap=gap,
+        damping_ratio=damping_ratio,
+    )
+    # A number, so that a run from another crank angle is the same program.
+    return scene.at_section(0.0)
+
+
+def table_damping_ratio() -> float:
+    """ξ from Table 1 (dimensionless)."""
+    return float(Parameters().scene(drive="ideal").damping_ratio)
+
+
+def simulate_cases(*, quick: bool = False) -> tuple[Case, Case]:
+    """The undamped and the damped case; `quick` takes fewer cycles and samples."""
+    cycles, samples = (QUICK_CYCLES, QUICK_SAMPLES) if quick else (CYCLES, SAMPLES)
+    undamped = figure_scene(0.0)
+    long_state = closed_form_orbits(undamped, cycles=2)
+    fitted = fit_long(undamped)
+    cases = []
+    for name, ratio in (("undamped", 0.0), ("damped", table_damping_ratio())):
+        scene = figure_scene(ratio)
+        short, long = (closed_form_orbits(scene, cycles=n) for n in (1, 2))
+        origin = long if bool(long.admissible[0]) else long_state
+        runs = [
+            run_of(scene, start, cycles, samples)
+            for start in (
+                scene.start(),
+                scene.start(Y=origin.Y[0], V=origin.V[0]),
+                fitted.state,
+                scene.start(Y=short.Y[0], V=short.V[0]),
+            )
+        ]
+        jax.block_until_ready(runs)
+        shift = _alignment(runs[0], runs[1]) if bool(long.admissible[0]) else 0
+        cases.append(Case(name, scene, short, long, *runs, long_shift=shift))
+    return cases[0], cases[1]
+
+
+def run_of(scene: Scene, start: Any, cycles: int, samples: int) -> Run:
+    """A run with the options of all runs here, so that they share one compiled program."""
+    return simulate(
+        scene, start, cycles, method=ExactFlight(), samples=samples, impact_log=2, throw=True
+    )
+
+
+def _alignment(from_rest: Run, orbit: Run) -> int:
+    """Which of the two sections of a 4π motion the run from rest is on after an even count."""
+    settled = np.asarray(from_rest.sections.Y)
+    even = (settled.size - 1) // 2 * 2
+    first, second = np.asarray(orbit.sections.Y)[:2]
+    return int(abs(settled[even] - second) < abs(settled[even] - first))
+
+
+def sampled(run: Run) -> tuple[np.ndarray, np.ndarray, int]:
+    """Sampled Y and V with shape (cycles, samples), and the number of samples in a cycle."""
+    assert run.samples is not None
+    cycles = run.impacts.shape[0]
+    Y, V = (
+        np.asarray(x, float)[:-1].reshape(cycles, -1)
+        for x in (run.samples.state.Y, run.samples.state.V)
+    )
+    return Y, V, Y.shape[1]
+
+
+def last_minima(run: Run) -> list[float]:
+    """The smallest Y of each of the last two cycles, the smaller one first."""
+    return sorted(np.asarray(run.y_min)[-2:].tolist())
+
+
+def closed_form(case: Case, cycles: int, period: int) -> np.ndarray:
+    """Y of the 2π (`period` 1) or 4π (2) closed form, sampled, tiled over cycles of Figure 3."""
+    run, shift = (case.on_short, 0) if period == 1 else (case.from_long, case.long_shift)
+    one = sampled(run)[0][:period]
+    return one[(np.arange(cycles) - shift) % period]
+
+
+def half_turn_states(run: Run) -> np.ndarray:
+    """(Y, V) at φ = π of each cycle, shape (cycles, 2).
+
+    The impacts of these motions lie near φ = 0, where a section would see them now before, now
+    after the jump.
+    """
+    Y, V, size = sampled(run)
+    return np.stack([Y[:, size // 2], V[:, size // 2]], axis=1)

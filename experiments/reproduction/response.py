@@ -1,0 +1,222 @@
+"""Figure 2: smallest and largest Y over ζ, by closed form, by continuation and by sweeps."""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from vi_jax.flow import jit
+from vi_jax.machine import Scene, with_leaf
+from vi_jax.orbit import Branch, ClosedFormOrbits, closed_form_orbits, continue_orbit, find_orbit
+from vi_jax.scans import REGIMES, Sweep, lyapunov, sweep
+
+from .motions import GAP, table_damping_ratio
+
+# The k that Figure 2 is computed for, and Table 1's range of ζ.
+RESTITUTIONS = (0.8, 0.5)
+RANGE = (0.5, 1.9)
+# The longest step along its branches, in the units of `continue_orbit`: a choice.
+MAX_STEP = 0.2
+RATIO, DAMPING, BOUNCE = "drive.frequency_ratio", "oscillator.damping_ratio", "stops.0.restitution"
+
+# The paper draws a second stop below without a number. Here the 2π motion is clear of it, and most
+# of the motions that the sweeps settle on are not.
+WALL = -2.5
+# Between these the motions change much, and ζ is stepped through more finely.
+FINE = (0.695, 1.015)
+# Periods of more cycles than this are not looked for: a choice.
+LONGEST = 12
+# Lanes of the programs that settle single values again; one number, so that there is one program.
+_LANES = 128
+
+
+class System(NamedTuple):
+    """One k and one ξ of Figure 2. Arrays of the sweeps are in the order of rising ζ."""
+
+    restitution: float
+    damping_ratio: float
+    closed: dict[int, ClosedFormOrbits]
+    """Motions with one impact per 1 and per 2 drive cycles at each ζ (2π and 4π)."""
+    branches: list[Branch]
+    """The 2π branch, what springs from its period doubling, and so on, grazing by grazing."""
+    stretch: tuple[float, float]
+    """ζ of BB' and CC': birth and period doubling of the 2π impact motion."""
+    sweeps: dict[str, Sweep]
+    """The sweeps of rising and of falling ζ, by the names "run-up" and "close-down"."""
+    exponents: dict[str, np.ndarray]
+    """Largest Lyapunov exponent per drive cycle where a sweep has no period, else NaN."""
+
+
+class Response(NamedTuple):
+    """All curves and marks of Figure 2."""
+
+    ratios: np.ndarray
+    """The values of ζ that were swept through, in rising order."""
+    systems: list[System]
+    """For each k of `RESTITUTIONS` the undamped one and the one with Table 1's damping."""
+
+
+def response() -> Response:
+    """Return closed forms, continued branches and both sweeps, for both k and both ξ."""
+    low, high = RANGE
+    ratios = np.concatenate(
+        [
+            np.arange(low, FINE[0], 0.01),
+            np.arange(FINE[0], FINE[1] - 0.001, 0.002),
+            np.arange(FINE[1], high + 0.005, 0.01),
+        ]
+    )
+    scene = Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=GAP, damping_ratio=0.0)
+    numbers = [(k, xi) for k in RESTITUTIONS for xi in (0.0, table_damping_ratio())]
+    grid = jnp.asarray(numbers)
+    closed = {
+        n: jtu.tree_map(np.asarray, _closed_forms(scene, grid, ratios, cycles=n)) for n in (1, 2)
+    }
+    each = [{n: jtu.tree_map(lambda x, i=i: x[i], closed[n]) for n in closed} for i in range(4)]
+    settled = _sweeps(scene, numbers, ratios)
+    systems = []
+    for (k, xi), forms, (sweeps, exponents) in zip(numbers, each, settled, strict=True):
+        branches, stretch = _branches(with_numbers(scene, k, xi, 0.9), ratios, forms[1])
+        systems.append(System(k, xi, forms, branches, stretch, sweeps, exponents))
+    return Response(ratios, systems)
+
+
+def with_numbers(scene: Scene, k: object, xi: object, ratio: object) -> Any:
+    """Return the scene with this k, this ξ and this ζ."""
+    for name, value in ((BOUNCE, k), (DAMPING, xi), (RATIO, ratio)):
+        scene = with_leaf(scene, name, value)
+    return scene
+
+
+# Unoptimised it compiles in half of the time, and it runs for milliseconds.
+@partial(jit, static_argnames="cycles", compiler_options={"xla_backend_optimization_level": 0})
+def _closed_forms(scene: Scene, grid, ratios, *, cycles: int) -> ClosedFormOrbits:
+    def one(numbers, ratio):
+        return closed_form_orbits(with_numbers(scene, numbers[0], numbers[1], ratio), cycles=cycles)
+
+    return jax.vmap(lambda numbers: jax.vmap(lambda z: one(numbers, z))(ratios))(grid)
+
+
+def _branches(
+    scene: Scene, ratios: np.ndarray, closed: ClosedFormOrbits
+) -> tuple[list[Branch], tuple[float, float]]:
+    """The 2π branch and what springs from it; ζ of BB' and CC'."""
+    near = int(np.argmin(abs(ratios - 0.9)))
+    orbit = find_orbit(scene, scene.start(Y=closed.Y[near, 0], V=closed.V[near, 0]), throw=True)
+    follow = partial(continue_orbit, parameter=RATIO, bounds=RANGE, max_step=MAX_STEP)
+    branches = [follow(orbit)]
+    born = min(p.parameter for p in branches[0].special if p.kind == "grazing")
+    waiting = [p for p in branches[0].special if p.kind == "period-doubling"]
+    doubling = max(p.parameter for p in waiting)
+    seen: set[float] = set()
+    # Each grazing of a doubled motion leads to the next motion; below 1/√2 nothing is of interest.
+    while waiting and len(branches) < 4:
+        at = waiting.pop()
+        try:
+            branch = follow(at.switch())
+        except ValueError:  # no admissible motion beyond
+            continue
+        branches.append(branch)
+        seen.add(round(at.parameter, 7))
+        waiting += [
+            p
+            for p in branch.special
+            if p.kind == "grazing" and p.parameter > born and round(p.parameter, 7) not in seen
+        ]
+    return branches, (born, doubling)
+
+
+@partial(jit, static_argnames="settle")
+def _carried(scene: Scene, numbers, values, starts, settle: int) -> Sweep:
+    """One sweep for each row of values, all in one program.
+
+    **Arguments:** `numbers`, k and ξ of each row, (rows, 2); `values` of ζ, (rows, values);
+    `starts`, a state with one leading axis; `settle` in cycles.
+    """
+
+    def one(numbers, values, start):
+        here = with_numbers(scene, numbers[0], numbers[1], values[0])
+        return sweep(
+            here, RATIO, values, start=start, settle=settle, cycles=2 * LONGEST, tolerance=1e-9
+        )
+
+    return jax.vmap(one)(numbers, values, starts)
+
+
+@jit
+def _exponents(scene: Scene, numbers, values, starts):
+    """Largest Lyapunov exponents per drive cycle."""
+
+    def one(numbers, value, start):
+        here = with_numbers(scene, numbers[0], numbers[1], value)
+        return lyapunov(here, start, 500, settle=0, number=1).per_cycle[0]
+
+    return jax.vmap(one)(numbers, values, starts)
+
+
+def _sweeps(
+    scene: Scene,
+    numbers: list[tuple[float, float]],
+    ratios: np.ndarray,
+) -> list[tuple[dict[str, Sweep], dict[str, np.ndarray]]]:
+    """Run-up and close-down of each system, all in one program.
+
+    **Arguments:** `numbers`, k and ξ of each system; `ratios`, the values of ζ, rising.
+    """
+    lanes = [(k, xi, up) for k, xi in numbers for up in (True, False)]
+    pairs = np.array([lane[:2] for lane in lanes])
+    values = np.stack([ratios if up else ratios[::-1] for *_, up in lanes])
+    # On the motion without impacts: undamped, a start at rest would never be forgotten.
+    gain = 1 / (1 - values[:, 0] ** 2 + 2j * pairs[:, 1] * values[:, 0])
+    begin_Y, begin_V = gain.real, (1j * values[:, 0] * gain).real
+    starts = jax.vmap(lambda Y, V: scene.start(Y=Y, V=V))(begin_Y, begin_V)
+    found = _carried(scene, pairs, values, starts, 120)
+    flat = jtu.tree_map(lambda x: np.array(x).reshape(-1, *x.shape[2:]), found)
+    pairs, values = np.repeat(pairs, len(ratios), axis=0), values.ravel()
+    for _ in range(2):
+        unsure = (flat.period == REGIMES.unsettled) | (flat.period > 2)
+        _again(scene, flat, pairs, values, np.flatnonzero(unsure))
+    exponents = np.full(len(values), np.nan)
+    for some in _chunks(np.flatnonzero(flat.period == REGIMES.unsettled)):
+        ends = jtu.tree_map(lambda x, some=some: x[some, -1], flat.sections)
+        exponents[some] = _exponents(scene, pairs[some], values[some], ends)
+    for _ in range(6):  # near a bifurcation motions come to rest slowly
+        quiet = (flat.period == REGIMES.unsettled) & (exponents < 0.002)
+        _again(scene, flat, pairs, values, np.flatnonzero(quiet))
+    exponents[flat.period > 0] = np.nan
+    results = []
+    for i in range(len(numbers)):
+        sweeps, grown = {}, {}
+        for j, name in enumerate(("run-up", "close-down")):
+            rows = slice((2 * i + j) * len(ratios), (2 * i + j + 1) * len(ratios))
+            turn = slice(None, None, -1 if j else 1)
+            sweeps[name] = jtu.tree_map(lambda x, r=rows, t=turn: x[r][t], flat)
+            grown[name] = exponents[rows][turn]
+        results.append((sweeps, grown))
+    return results
+
+
+def _again(scene: Scene, flat: Sweep, pairs: np.ndarray, values: np.ndarray, which) -> None:
+    """Settle some values for another 1,000 cycles, and put the results in place.
+
+    **Arguments:** `flat`, the sweeps as one row, changed in place; `pairs` and `values`, k and ξ,
+    and ζ, of each; `which`, the indices to settle.
+    """
+    for some in _chunks(which):
+        ends = jtu.tree_map(lambda x, some=some: x[some, -1], flat.sections)
+        later = _carried(scene, pairs[some], values[some][:, None], ends, 1000)
+
+        def put(old, new, some=some):
+            old[some] = np.asarray(new)[:, 0]
+
+        jtu.tree_map(put, flat, later)
+
+
+def _chunks(indices: np.ndarray) -> list[np.ndarray]:
+    """Indices in rows of equal length; the last row repeats its last one."""
+    if not indices.size:
+        return []
+    padded = np.append(indices, np.repeat(indices[-1:], -len(indices) % _LANES))
+    return list(padded.reshape(-1, _LANES))

@@ -1,0 +1,186 @@
+"""The reproduction: what it measures, beside the report that is kept.
+
+The README's first command runs it whole, and fails if a verdict or a special point is not as kept.
+"""
+
+import copy
+
+import numpy as np
+import pytest
+from PIL import Image
+from reproduction.assumptions import check_assumptions, check_motor
+from reproduction.claims import check_claims
+from reproduction.faults import check_faults, period_doubling_damping
+from reproduction.figures import draw_figure
+from reproduction.motions import closed_form, sampled, simulate_cases
+from reproduction.motors import TORQUES, draw_motors, simulate_motors
+from reproduction.printed import energy_drift, eq21_misses
+from reproduction.report import KEPT, differences, read
+
+
+@pytest.fixture(scope="module")
+def cases():
+    return simulate_cases(quick=True)
+
+
+@pytest.fixture(scope="module")
+def claims(cases):
+    return {claim.name: claim for claim in check_claims(cases)}
+
+
+@pytest.fixture(scope="module")
+def faults():
+    return {fault.number: fault for fault in check_faults()}
+
+
+def test_verdicts_are_those_kept(claims):
+    kept = {claim["name"]: claim["verdict"] for claim in read(KEPT)["claims"]}
+    assert len(kept) == 18 and len(claims) == 10
+    assert {name: claim.verdict for name, claim in claims.items()}.items() <= kept.items()
+    assert kept["rounding errors drive the transient"] == "contradicted"
+    assert kept["discrepancy of the minimum"] == "confirmed undamped only"
+
+
+def test_what_differs_is_told():
+    kept = read(KEPT)
+    other = copy.deepcopy(kept)
+    assert not differences(other, kept)
+    other["claims"][0]["verdict"] = "confirmed"
+    other["figure_2"]["panels"][0]["BB"] += 1e-4
+    del other["boundaries"]["birth, undamped, ζ"]
+    assert [line.partition(":")[0] for line in differences(other, kept)] == [
+        kept["claims"][0]["name"], "birth, undamped, ζ", "k = 0.8, undamped",
+    ]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def assumptions(cases):
+    return {claim.name: claim for claim in check_assumptions(cases[0])}
+
+
+def test_crank_phase_of_the_start(assumptions):
+    claim = assumptions["the start's crank phase"]
+    apart = claim.numbers["max_difference_cycles_3_4_by_phase_over_pi"]
+    assert claim.verdict == "confirmed in part"
+    assert apart["0"] == pytest.approx([0.197, 0.170], abs=2e-3)
+    assert apart["1"] == pytest.approx([1.708, 1.708], abs=2e-3)
+    # From every phase the same 4π motion in the end.
+    assert claim.numbers["last_minima"] == pytest.approx([-3.2543] * len(apart), abs=1e-2)
+
+
+def test_exact_crank(assumptions):
+    claim = assumptions["the cosine in the crank's place (Eq. 4)"]
+    assert claim.verdict == "confirmed"
+    assert claim.numbers["minima_exact"] == pytest.approx([-3.2985, -1.7043], abs=1e-4)
+    assert claim.numbers["minima_cosine"] == pytest.approx([-3.2543, -1.5442], abs=1e-4)
+
+
+def test_direct_short(claims):
+    numbers = claims["direct 2π solutions by initial conditions"].numbers
+    assert numbers["cycles_within_0.05"] == {"undamped": 60, "damped": 60}
+
+
+@pytest.mark.slow
+def test_motors_at_the_stated_speed(cases):
+    """κ and minima from an independent code (SciPy), at a mean ζ of 0.90."""
+    motors = simulate_motors()
+    for row in motors.rows:
+        assert row.kappa is not None and bool(row.orbit.successful)
+        assert float(row.orbit.frequency_ratio) == pytest.approx(0.9, abs=1e-9)
+    assert [run.torque for run in motors.runs] == list(TORQUES)
+    kappa = [run.kappa for run in motors.runs]
+    assert kappa == pytest.approx([0.9277, 0.9055, 0.9005], abs=1e-4)
+    minima = [float(run.orbit.y_min) for run in motors.runs]
+    assert minima == pytest.approx([-3.291, -3.282, -3.257], abs=1e-3)
+    found = {claim.name: claim for claim in check_motor(motors)}
+    assert found["Figures 3 and 4 with the motor"].verdict == "confirmed"
+    speed = found["the speed hardly varies within a cycle (Eq. 10)"].numbers
+    assert len(draw_motors(motors.runs, cases[0].from_rest).axes) == 6
+    assert 0 < speed["variation_by_torque"]["100"] < speed["variation_by_torque"]["2"] < 0.1
+
+
+def test_disc_and_lever(faults):
+    assert faults[8].numbers["mass_of_the_disc"] == pytest.approx(75.0)
+    assert faults[7].numbers["mass_of_such_a_lever"] == pytest.approx(12.5)
+
+
+def test_transient_from_rest(claims):
+    near = claims["begins near the 2π motion"].numbers
+    assert near["minima_cycles_3_4"]["undamped"] == pytest.approx([-2.004, -1.737], abs=1e-3)
+    assert near["closed_form_minimum_2pi"]["undamped"] == pytest.approx(-1.883583, abs=1e-6)
+    settled = claims["settles on the 4π motion"].numbers
+    assert 25 <= settled["cycle_settled_on_4pi_undamped"] <= 45
+    assert settled["last_minima"]["undamped"] == pytest.approx([-3.254, -1.544], abs=1e-3)
+
+
+def test_departure_has_the_rate_of_the_multiplier(claims):
+    numbers = claims["leaves the 2π motion"].numbers
+    assert numbers["rate_small_deviation"]["undamped"] == pytest.approx(1.166036, abs=1e-5)
+    assert numbers["rate_small_deviation"]["damped"] == pytest.approx(0.88598, abs=1e-4)
+
+
+def test_four_pi_motion_has_no_transient(claims):
+    # The state is the one optax fitted to a residual of 1e-10.
+    assert claims["no transient from the 4π state"].numbers["max_deviation_undamped"] < 1e-9
+
+
+def test_alignment_is_the_one_that_fits(cases):
+    case = cases[0]
+    Y = sampled(case.from_rest)[0]
+    right = np.abs(Y - closed_form(case, len(Y), 2))[-2:].max()
+    other = case._replace(long_shift=1 - case.long_shift)
+    wrong = np.abs(Y - closed_form(other, len(Y), 2))[-2:].max()
+    assert right < 1e-5 < 1 < wrong
+
+
+def test_right_equation_keeps_energy_and_printed_ones_do_not(faults):
+    first, second = faults[1].numbers, faults[2].numbers
+    assert first["energy_drift_right"] < 1e-10
+    assert first["energy_drift_printed_in_metres"] > 0.1
+    assert first["energy_drift_printed_in_crank_radii"] > 0.01
+    assert second["energy_drift_printed"] > 0.1
+
+
+def test_energy_drift_needs_both_faults_gone():
+    assert energy_drift(coupling=0.3, slider_inertia=0.4) < 1e-9
+    assert energy_drift(coupling=0.3, slider_inertia=0.4, printed_coupling=0.31) > 1e-4
+
+
+@pytest.mark.parametrize("zeta", [0.75, 0.9, 1.2])
+@pytest.mark.parametrize("n", [1, 2])
+def test_eq21_needs_its_zeta(zeta, n):
+    right = eq21_misses(zeta, 0.6, 2.0, n, printed=False)
+    printed = eq21_misses(zeta, 0.6, 2.0, n, printed=True)
+    assert max(right[name] for name in right if name.startswith("miss")) < 1e-11
+    assert printed["miss_17_before"] > 0.01
+
+
+def test_eq21_gives_the_checked_impacts():
+    for n, speed in ((1, 1.57475), (2, 3.54674)):
+        v0 = eq21_misses(0.9, 0.5, 2.0, n, printed=False)["v0"]
+        assert 0.9 * v0 == pytest.approx(speed, abs=1e-5)
+
+
+def test_no_load_speed_maps_kappa_to_zeta(faults):
+    by_kappa = faults[4].numbers["frequency_ratio_by_kappa"]["omega"]
+    for kappa, ratio in by_kappa.items():
+        assert ratio == pytest.approx(float(kappa), abs=1e-3)
+
+
+def test_damping_at_the_period_doubling(faults):
+    assert period_doubling_damping() == pytest.approx(0.27, abs=0.005)
+    assert faults[6].numbers["largest_multiplier_by_c"]["0.5"] < 1
+    assert faults[6].numbers["largest_multiplier_by_c"]["0"] > 1
+
+
+@pytest.mark.parametrize("number", [2, 3])
+def test_figures(number, cases, tmp_path):
+    path = tmp_path / "fig.png"
+    if number == 2:
+        with pytest.raises(ValueError, match="3 or 4"):
+            draw_figure(number, cases, path)
+        return
+    draw_figure(number, cases, path)
+    picture = Image.open(path)
+    assert picture.size == (1540, 924) and path.stat().st_size < 200_000
+    assert len(np.unique(np.asarray(picture))) > 16
