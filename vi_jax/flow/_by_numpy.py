@@ -10,7 +10,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jax.core import eval_jaxpr
 
-from ..lanes import CALLS
+from ..lanes import called
 
 _SAME = """add sub:subtract mul:multiply div:divide neg:negative sign abs floor ceil max:maximum
 min:minimum rem:fmod pow square sqrt cbrt exp exp2 log log1p expm1 sin cos tan asin acos atan atan2
@@ -84,8 +84,8 @@ def _by_xla(jaxpr: Any, equation: Any, values: list[Any]) -> list[Any]:
 def _results(equation: Any, values: list[Any]) -> list[Any] | None:
     """What an operation gives; `None` if it is none of those above."""
     name, params = equation.primitive.name, equation.params
-    if name in CALLS:
-        return _run(params[CALLS[name]], values)
+    if (body := called(equation)) is not None:
+        return _run(body, values)
     of_whole = name == "div" and np.issubdtype(values[0].dtype, np.integer)
     if name not in _RULES or of_whole:
         return None

@@ -1,7 +1,7 @@
 """One lane's loop, run for any number of lanes: vector code by LLVM on a CPU, else XLA."""
 
 from ._primitive import vector_only as vector_only
-from ._program import CALLS as CALLS
+from ._program import called as called
 from ._vector import Unsupported as Unsupported
 from .call import interruptible as interruptible
 from .elementary import horner as horner

@@ -1,10 +1,12 @@
 """What lanes run: a loop of one lane's numbers, traced once; which of its parts depend on which."""
 
 import functools
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax.core import eval_jaxpr
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
@@ -123,7 +125,7 @@ def dependent_parts(
     return DependentParts(tuple(carry), any(rest[:2]), tuple(rest[2:]), tuple(outs))
 
 
-# Primitives that call a jaxpr, and the parameter that holds it. JAX 0.8 to 0.10 gives them these
+# Primitives that call a jaxpr, and the parameter that holds it. JAX 0.9 to 0.12 gives them these
 # names (`tests/lanes/test_jax.py` fails where a later one gives others); "pjit", "remat",
 # "checkpoint" and "core_call" are older ones.
 CALLS = {
@@ -133,8 +135,49 @@ CALLS = {
 }  # fmt: skip
 
 
-# Of these, what has a derivative of its own, of which its body says nothing.
-OWN_DERIVATIVE = ("custom_jvp_call", "custom_vjp_call", "custom_lin")
+# JAX 0.12 has operations such as `searchsorted` as objects that expand themselves.
+_EXPANDED = "call_hi_primitive"
+
+
+def _polynomial(x: Any, *coefficients: Any, **unroll: Any) -> Any:
+    total = coefficients[-1]
+    for coefficient in coefficients[-2::-1]:
+        total = total * x + coefficient
+    return total
+
+
+# Primitives that JAX got with 0.12, by older ones.
+_BY_OLDER = {
+    "polynomial": _polynomial,
+    "one_minus_square": lambda x: (1 - x) * (1 + x),
+    "log2": lambda x, accuracy=None: jnp.log(x) / math.log(2),
+}
+
+# Calls with a derivative of their own, of which their bodies say nothing.
+OWN_DERIVATIVE = ("custom_jvp_call", "custom_vjp_call", "custom_lin", _EXPANDED)
+
+
+def called(eqn: Any) -> ClosedJaxpr | Jaxpr | None:
+    """Return the jaxpr that an equation calls or stands for, or `None` if there is none."""
+    name, params = eqn.primitive.name, eqn.params
+    if name in CALLS:
+        return params[CALLS[name]]
+    if name not in _BY_OLDER and name != _EXPANDED:
+        return None
+    shapes = tuple((x.aval.shape, x.aval.dtype) for x in eqn.invars)
+    return _body(name, tuple(params.items()), shapes)
+
+
+@functools.lru_cache(maxsize=256)
+def _body(name: str, params: tuple, shapes: tuple[tuple[tuple[int, ...], Any], ...]) -> ClosedJaxpr:
+    if name == _EXPANDED:
+        operation = dict(params)["_prim"]
+
+        def function(*args):
+            return jax.tree.leaves(operation.expand(*jax.tree.unflatten(operation.in_tree, args)))
+    else:
+        function = functools.partial(_BY_OLDER[name], **dict(params))
+    return jax.make_jaxpr(function)(*(jax.ShapeDtypeStruct(*x) for x in shapes))
 
 
 def inner(jaxpr: ClosedJaxpr | Jaxpr) -> Jaxpr:
@@ -238,8 +281,8 @@ def dependent_of_equation(eqn: Any, args: list[bool], *, smooth: bool) -> list[b
     """Which results of an equation depend on the arguments `args`."""
     name, params = eqn.primitive.name, eqn.params
     depends = functools.partial(dependent_results, smooth=smooth)
-    if name in CALLS and not (smooth and name in OWN_DERIVATIVE):
-        return depends(inner(params[CALLS[name]]), args)
+    if not (smooth and name in OWN_DERIVATIVE) and (body := called(eqn)) is not None:
+        return depends(inner(body), args)
     if name == "cond" and (smooth or not args[0]):
         ways = [depends(inner(b), args[1:]) for b in params["branches"]]
         return [any(way) for way in zip(*ways, strict=True)]

@@ -28,7 +28,7 @@ from ._large import (
     uniform,
 )
 from ._operations import ELEMENTWISE, SAME, kind_of
-from ._program import CALLS, inner
+from ._program import called, inner
 from ._text import Text, Value
 
 
@@ -59,8 +59,8 @@ def _has_rule(name: str) -> bool:
 def _bodies(eqn: Any) -> list[Jaxpr]:
     """The jaxprs that are written where an equation calls, chooses or repeats them."""
     name, params = eqn.primitive.name, eqn.params
-    if name in CALLS:
-        return [inner(params[CALLS[name]])]
+    if (body := called(eqn)) is not None:
+        return [inner(body)]
     if name == "cond":
         return [inner(branch) for branch in params["branches"]]
     if name == "while":
@@ -142,8 +142,8 @@ def _needed(jaxpr: Jaxpr) -> list[Any]:
 def _equation(t: Text, eqn: Any, args: list[Any], mask: Value) -> list[Any]:
     """The values of an equation's results, by the rule of its primitive."""
     name, params = eqn.primitive.name, eqn.params
-    if name in CALLS:
-        return write(t, params[CALLS[name]], args, mask)
+    if (body := called(eqn)) is not None:
+        return write(t, body, args, mask)
     if name in CONTROL:
         return CONTROL[name](write, t, params, [settled(t, x) for x in args], mask)
     if name == "custom_linear_solve":

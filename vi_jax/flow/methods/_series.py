@@ -14,7 +14,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from ..._types import Scalar, Scalars, State
-from ...lanes import CALLS
+from ...lanes import called
 from ..events import Rates
 from ._coefficients import Coefficient, NoSeries, NotSmooth, Series, nth, plus
 from ._recurrences import KINKS, RULES
@@ -127,8 +127,7 @@ class _Flow:
         for eqn in jaxpr.eqns:
             operands = [read(a) for a in eqn.invars]
             name = eqn.primitive.name
-            if name in CALLS:
-                inner = eqn.params[CALLS[name]]
+            if (inner := called(eqn)) is not None:
                 own = inner if isinstance(inner, Jaxpr) else inner.jaxpr
                 held = [] if isinstance(inner, Jaxpr) else list(inner.consts)
                 names.update(zip(eqn.outvars, self._inline(own, held, operands), strict=True))
