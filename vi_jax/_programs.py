@@ -119,7 +119,9 @@ class CompiledFunction:
         functools.update_wrapper(self, function)
         self._function, self._quick_options = _uncollected(function), quick
         self._compiled = eqx.filter_jit(self._function, **options)
-        self._may_be_quick = True
+        # The structures of arguments whose lanes are no vector code, so that XLA's loops would be
+        # slow by quick options.
+        self._never_quick: set[Any] = set()
 
     @functools.cached_property
     def _quick(self) -> Any:
@@ -138,12 +140,14 @@ class CompiledFunction:
     def __call__(self, *arguments: Any, **keywords: Any) -> Any:
         """What the function returns, by its compiled program."""
         _watch.called(self)
-        if self._may_be_quick and current_backend() != "xla" and is_outermost(arguments, keywords):
+        kind = _kind_of(arguments, keywords)
+        quick = kind not in self._never_quick and current_backend() != "xla"
+        if quick and is_outermost(arguments, keywords):
             try:
                 with vector_only():
                     return self._quick(*arguments, **keywords)
             except Unsupported:
-                self._may_be_quick = False  # its loops would be XLA's, and slow
+                self._never_quick.add(kind)
             except ValueError as error:
                 # Within another program, which `is_outermost` does not see where an argument's
                 # function closes over what is differentiated, JAX (0.10.2) refuses compiler options
@@ -151,6 +155,17 @@ class CompiledFunction:
                 if "compiler_options" not in str(error):
                     raise
         return self._compiled(*arguments, **keywords)
+
+
+def _kind_of(*arguments: Any) -> Any:
+    """What decides, besides shapes, which program a call gets; `None` if that has no hash."""
+    leaves, structure = jtu.tree_flatten(arguments)
+    kind = structure, tuple(x for x in leaves if not eqx.is_array(x))
+    try:
+        hash(kind)
+    except TypeError:
+        return None
+    return kind
 
 
 def _uncollected(function: Callable[..., Any]) -> Callable[..., Any]:

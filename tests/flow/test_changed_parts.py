@@ -114,6 +114,9 @@ def test_a_structure_has_the_stops_and_coordinates_of_its_subclass():
     assert int(run.impacts.sum()) == len(times)
     place = np.sin(6 * np.pi - times[-1] + 5 * np.pi / 6)
     np.testing.assert_allclose(run.last.displacement, [place], atol=1e-9)
+    table = run.to_xarray(along="section").to_dataframe()  # a column for each number of an array
+    assert len(table) == 4
+    assert set(table) == {"section_displacement[0]", "section_velocity[0]"}
     slanted = Slanted(**matrices, contacts=(vi.RigidStop(0.5, 1.0, at=[1.0]),))
     assert isinstance(slanted.prepared().machine, Slanted)
     assert not isinstance(vi.preset(slanted), vi.ExactFlight)

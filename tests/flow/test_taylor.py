@@ -183,7 +183,7 @@ KINKS = {
     "maximum": lambda s, y: jnp.maximum(y, 0.2),
     "minimum": lambda s, y: jnp.minimum(y, 0.4),
     "abs": lambda s, y: jnp.abs(y),
-    "floor": lambda s, y: jnp.floor(3 * s),
+    "floor": lambda s, y: jnp.floor(3 * y),
     "sign": lambda s, y: jnp.sign(y),
     "an index": lambda s, y: jnp.arange(3.0).at[jnp.int32(2 * y)].get(wrap_negative_indices=False),
 }

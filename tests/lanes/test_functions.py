@@ -52,6 +52,13 @@ FUNCTIONS = {
                       jnp.minimum(0.5, y), jnp.clip(x, -1.0, 1.0), jnp.abs(x)), 0,
     ),
     "signs": (lambda x, y: (jnp.sign(x), jnp.where(x < y, x, y)), 0),
+    "large unsigned": (
+        lambda x, y: (jnp.sign(jnp.where(x > 0, jnp.uint32(3_000_000_000), jnp.uint32(0))),), 0,
+    ),
+    "fewer bits": (
+        lambda x, y: tuple(jax.lax.reduce_precision(x, *bits) for bits in
+                           ((8, 7), (5, 10), (8, 23), (11, 20), (11, 52))), 0,
+    ),
     "comparisons": (
         lambda x, y: (x < y, x <= y, x > y, x >= y, x == y, x != y, jnp.isfinite(x)), 0,
     ),
@@ -134,6 +141,13 @@ def test_circle_is_right_to_rounding():
     np.testing.assert_allclose(cosine, np.cos(x), atol=3e-16, rtol=0)
 
 
+def test_a_phase_without_digits_is_no_number():
+    """Beyond 2^52 two neighbours are a radian apart, and a turn soon."""
+    x = np.array([1e15, -1e15, 1e18, -1e20, 1e300, np.inf, np.nan])
+    for value in once(lambda x: (jnp.sin(x), jnp.cos(x)), x, backend="auto"):
+        assert np.all(np.abs(value[:2]) <= 1) and np.all(np.isnan(value[2:]))
+
+
 ARRAYS = {
     "product": lambda x, y: jnp.stack([x, y, x * y]) @ jnp.stack([y, x, 1 + x]),
     "matrix": lambda x, y: jnp.array([[1.0, x], [y, 2.0]]) @ jnp.array([[x, 0.5], [1.0, y]]),
@@ -149,6 +163,15 @@ ARRAYS = {
         jnp.stack([x, y, x * y, x + y]), jnp.stack([y]), ((jnp.abs(x) % 5).astype(int),)
     ),
     "split": lambda x, y: jnp.split(jnp.stack([x, y, x, y]), 2)[1],
+    "singular": lambda x, y: jnp.concatenate(
+        jax.lax.linalg.lu(
+            jnp.stack(
+                [jnp.stack([0 * x, y, x]), jnp.stack([0 * x, 2 * y, x]), jnp.stack([x, y, y])]
+            )
+            * jnp.array([0.0, 1.0, 1.0])
+        )[0]
+    ),
+    "zeros in order": lambda x, y: 1 / jnp.sort(jnp.stack([-0.0 * jnp.abs(x), jnp.abs(y)])),
     "several at once": lambda x, y: jax.vmap(lambda t: t * x + y)(jnp.arange(3.0)),
 }
 

@@ -101,6 +101,24 @@ def test_nested_and_shared_axes():
         np.testing.assert_array_equal(b, np.swapaxes(c, 0, 1))
 
 
+def test_no_lanes_with_a_result_that_all_share():
+    alone = lambda x: lanes.once(lambda pair: (pair[0], pair[1] + 1.0), (jnp.asarray(2.0), x))
+    assert [x.shape for x in jax.vmap(alone)(jnp.zeros(0))] == [(0,), (0,)]
+
+
+def test_a_call_by_itself_is_compiled_once():
+    lanes.once(jnp.sin, jnp.asarray(0.5))
+    compiled = []
+    jax.monitoring.register_event_duration_secs_listener(
+        lambda name, *_, **__: compiled.append(name)
+    )
+    try:
+        np.testing.assert_allclose(lanes.once(jnp.sin, jnp.asarray(0.7)), np.sin(0.7))
+    finally:
+        jax.monitoring.clear_event_listeners()
+    assert not [name for name in compiled if "compile" in name or "trac" in name]
+
+
 def test_a_ball_falls():
     height = np.linspace(0.1, 5, 50)
     (time, speed), rows = jax.vmap(fall, (0, None))(height, 9.81)

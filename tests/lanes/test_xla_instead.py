@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from vi_jax import lanes
+from vi_jax._programs import compiled
 from vi_jax.lanes import _code, _primitive, call, runtime
 
 from lanes.toys import failing, fall
@@ -117,3 +118,21 @@ def test_another_version_of_the_calls_of_xla(difference, monkeypatch):
             found = jax.jit(jax.vmap(lambda x, g: fall(x, g)[0][0], (0, None)))(heights, gravity)
             np.testing.assert_allclose(found, np.sqrt(2 * heights / gravity), rtol=1e-6)
     assert len(seen) == 1
+
+
+def test_one_program_on_the_slower_backend_leaves_the_others_quick():
+    """A function with a word among its arguments, by which its lanes are vector code or not."""
+    functions = {"slow": jax.scipy.special.gammaln, "quick": jnp.sin}
+
+    @compiled
+    def chosen(word, x):
+        return jax.vmap(lambda x: lanes.once(functions[word], x))(x)
+
+    slowly, own = [], chosen._compiled
+    chosen._compiled = lambda *arguments: (slowly.append(arguments[0]), own(*arguments))[1]
+    x = jnp.linspace(1.0, 2.0, 3)
+    with pytest.warns(UserWarning, match="slower backend"):
+        chosen("slow", x)
+    np.testing.assert_allclose(chosen("quick", x), np.sin(x))
+    chosen("slow", 2 * x)
+    assert slowly == ["slow", "slow"]

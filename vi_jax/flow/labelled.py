@@ -53,9 +53,24 @@ def tidy(data: "xr.Dataset", along: str | None) -> "xr.Dataset":
     """
     if along is None:
         return data
-    last = {str(name): str(x.dims[-1]) for name, x in data.data_vars.items() if x.dims}
+    columns = {}
+    for name, x in data.data_vars.items():
+        columns |= _columns(str(name), x)
+    last = {name: str(x.dims[-1]) for name, x in columns.items() if x.dims}
     one_of("along", along, tuple(dict.fromkeys(last.values())))
-    return data[[name for name, dim in last.items() if dim == along]]
+    return data.assign(columns)[[name for name, dim in last.items() if dim == along]]
+
+
+def _columns(name: str, x: Any) -> dict[str, Any]:
+    """A variable, or those of the single numbers of an array of the state (see `states`)."""
+    inner = [dim for dim in map(str, x.dims) if name.endswith("_" + dim.rpartition("_")[0])]
+    if not inner:
+        return {name: x}
+    shape = [x.sizes[dim] for dim in inner]
+    return {
+        name + str(list(place)): x.isel(dict(zip(inner, place, strict=True)))
+        for place in np.ndindex(*shape)
+    }
 
 
 # What tells, along these dimensions, which places of a log are used.

@@ -51,7 +51,12 @@ def _(*args, program: ReverseProgram):
 
 @lanes_backward_p.def_impl
 def _(*args, program: ReverseProgram):
-    return jax.jit(functools.partial(lanes_backward_p.bind, program=program))(*args)
+    return _compiled(program)(*args)
+
+
+@functools.lru_cache(64)
+def _compiled(program: ReverseProgram) -> Any:
+    return jax.jit(functools.partial(lanes_backward_p.bind, program=program))
 
 
 # --- the transpose of `lanes`

@@ -34,7 +34,9 @@ def _lu(a):
             return jnp.where(at_k, other, moved)
 
         a, order = exchanged(a), exchanged(order)
-        factor = a[..., k : k + 1] / a[..., k : k + 1, k : k + 1]
+        largest = a[..., k : k + 1, k : k + 1]
+        # A column of zeros stays one: the matrix is singular.
+        factor = a[..., k : k + 1] / jnp.where(largest == 0, 1, largest)
         below, right = (rows > k)[:, None], jnp.arange(m) > k
         a = jnp.where(below & (jnp.arange(m) == k), factor, a)
         a = jnp.where(below & right, a - factor * a[..., k : k + 1, :], a)
@@ -91,7 +93,16 @@ def _sort(*xs, dimension, num_keys, **_):
         before = less | same & before
     rank = jnp.sum(before, axis=-1, dtype=places.dtype)
     there = rank[..., None, :] == places[:, None]
-    sorted_ = [jnp.sum(jnp.where(there, x[..., None, :], 0), axis=-1, dtype=x.dtype) for x in xs]
+
+    def placed(x):
+        found = jnp.sum(jnp.where(there, x[..., None, :], 0), axis=-1, dtype=x.dtype)
+        if not _is_float(x):
+            return found
+        # A sum has lost the sign of -0.
+        negative = jnp.any(there & (1 / x < 0)[..., None, :], axis=-1)
+        return jnp.where((found == 0) & negative, -0.0, found)
+
+    sorted_ = [placed(x) for x in xs]
     return [jnp.moveaxis(x, -1, dimension) for x in sorted_]
 
 

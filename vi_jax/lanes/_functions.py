@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from fractions import Fraction
-from math import factorial, frexp, log, pi
+from math import factorial, frexp, log, nan, pi
 
 from ._text import Text, Value
 
@@ -29,6 +29,8 @@ def parts_of(number: float, count: int) -> list[float]:
     return [*parts, float(exact)]
 
 
+# Beyond, a double does not tell where in a turn it is.
+_LARGEST_PHASE = 2.0**52
 _PI, LN2 = parts_of(pi, 3), parts_of(log(2), 2)
 
 
@@ -57,7 +59,8 @@ def _less_multiples(t: Text, x: Value, turns: Value, parts: Sequence[float]) -> 
 def _reduced(t: Text, x: Value) -> tuple[Value, Value]:
     """x less a multiple of π, within ±π/2, and the sign bit of (-1)^multiple."""
     turns = t.intrinsic("roundeven", _mul(t, x, t.constant(1 / pi, "double")))
-    whole = t.cast("fptosi", turns, "i64")
+    # What is too large, or no number, becomes any whole one.
+    whole = t.value(f"freeze {t.vector('i64')} {t.cast('fptosi', turns, 'i64').text}", "i64")
     odd = t.binary("shl", whole, t.constant(63, "i64"))
     return _less_multiples(t, x, turns, _PI), odd
 
@@ -67,7 +70,7 @@ def _flipped(t: Text, x: Value, bit: Value) -> Value:
 
 
 def sincos(t: Text, x: Value) -> tuple[Value, Value]:
-    """Sine and cosine of a phase, to rounding up to a million turns."""
+    """Sine and cosine of a phase, to rounding up to a million turns; any number beyond 2^52."""
     wide = t.cast("fpext", x, "double") if x.kind == "float" else x
     rest, bit = _reduced(t, wide)
     square = _mul(t, rest, rest)
@@ -76,6 +79,12 @@ def sincos(t: Text, x: Value) -> tuple[Value, Value]:
     if x.kind == "float":
         return t.cast("fptrunc", sine, "float"), t.cast("fptrunc", cosine, "float")
     return sine, cosine
+
+
+def of_any_phase(t: Text, x: Value, value: Value) -> Value:
+    """The sine or cosine of any x; not a number beyond 2^52, where x has no digits of a phase."""
+    known = _compare(t, "olt", t.intrinsic("fabs", x), t.constant(_LARGEST_PHASE, x.kind))
+    return t.select(known, value, t.constant(nan, x.kind))
 
 
 def exp(t: Text, x: Value) -> Value:
@@ -122,12 +131,12 @@ def log_(t: Text, x: Value) -> Value:
     series = _mul(t, ratio, horner(t, _ATANH, _mul(t, ratio, ratio)))
     low = _add(t, series, _mul(t, n, t.constant(LN2[1], "double")))
     value = _add(t, _mul(t, n, t.constant(LN2[0], "double")), low)
-    infinity, nan = t.constant(float("inf"), "double"), t.constant(float("nan"), "double")
+    infinity, none = t.constant(float("inf"), "double"), t.constant(nan, "double")
     value = t.select(_compare(t, "olt", x, infinity), value, x)
     value = t.select(
         _compare(t, "oeq", x, t.zero("double")), t.constant(-float("inf"), "double"), value
     )
-    return t.select(_compare(t, "olt", x, t.zero("double")), nan, value)
+    return t.select(_compare(t, "olt", x, t.zero("double")), none, value)
 
 
 def _compare(t: Text, how: str, a: Value, b: Value) -> Value:

@@ -101,7 +101,7 @@ ELEMENTWISE["weighted_quotient"] = lambda t, p, d, a, b: weighted(t, a, div(t, a
 ELEMENTWISE["neg"] = lambda t, p, d, a: neg(t, a)
 for _name in ("eq", "ne", "lt", "le", "gt", "ge"):
     ELEMENTWISE[_name] = lambda t, p, d, a, b, how=_name: compare(t, how, a, b, is_unsigned(d[0]))
-SAME = "stop_gradient copy copy_p name pvary reshard reduce_precision pin".split()
+SAME = "stop_gradient copy copy_p name pvary reshard pin".split()
 """What leaves its argument as it is."""
 for _name in SAME:
     ELEMENTWISE[_name] = lambda t, p, d, a: a
@@ -128,8 +128,40 @@ for _name, _how in {"lt_to": "slt", "le_to": "sle"}.items():
 @elementwise("sign")
 def _(t, p, d, a):
     zero = t.zero(a.kind)
-    up = t.select(compare(t, "gt", a, zero, False), t.constant(1, a.kind), a)
+    unsigned = is_unsigned(d[0])
+    up = t.select(compare(t, "gt", a, zero, unsigned), t.constant(1, a.kind), a)
+    if unsigned:
+        return up
     return t.select(compare(t, "lt", a, zero, False), t.constant(-1, a.kind), up)
+
+
+@elementwise("reduce_precision")
+def _(t, p, d, a):
+    """Rounded to fewer bits, ties to even; beyond the smaller range infinite, or zero."""
+    digits, most = p["mantissa_bits"], 2 ** (p["exponent_bits"] - 1) - 1
+    own = np.finfo(d[0])
+    if digits >= own.nmant and most >= own.maxexp - 1:
+        return a
+    if a.kind == "float":
+        wide = ELEMENTWISE["reduce_precision"](t, p, [np.float64], t.cast("fpext", a, "double"))
+        return t.cast("fptrunc", wide, "float")
+    shift, one = max(52 - digits, 0), t.constant(1, "i64")
+    bits = t.cast("bitcast", a, "i64")
+    if shift:
+        last = t.binary("and", t.binary("lshr", bits, t.constant(shift, "i64")), one)
+        up = t.binary("add", last, t.constant((1 << (shift - 1)) - 1, "i64"))
+        bits = t.binary("add", bits, up)
+        bits = t.binary("and", bits, t.constant(-(1 << shift), "i64"))
+    rounded = t.cast("bitcast", bits, "double")
+    size, sign = t.intrinsic("fabs", rounded), t.constant(1.0, "double")
+    sign = t.intrinsic("copysign", sign, a)
+    least = t.constant(2.0 ** (1 - most), "double")
+    largest = (2.0 - 2.0**-digits) * 2.0**most if most < 1023 else np.finfo(float).max
+    over = compare(t, "gt", size, t.constant(float(largest), "double"), False)
+    rounded = t.select(over, mul(t, sign, t.constant(float("inf"), "double")), rounded)
+    under = compare(t, "lt", size, least, False)
+    rounded = t.select(under, mul(t, sign, t.zero("double")), rounded)
+    return t.select(compare(t, "ne", a, a, False), a, rounded)
 
 
 @elementwise("max")
@@ -225,12 +257,12 @@ def _(t, p, d, a):
 
 @elementwise("sin")
 def _(t, p, d, a):
-    return functions.sincos(t, a)[0]
+    return functions.of_any_phase(t, a, functions.sincos(t, a)[0])
 
 
 @elementwise("cos")
 def _(t, p, d, a):
-    return functions.sincos(t, a)[1]
+    return functions.of_any_phase(t, a, functions.sincos(t, a)[1])
 
 
 @elementwise("sincos")

@@ -50,7 +50,12 @@ def _(*args, program: LaneProgram, backend: str):
 
 @lanes_p.def_impl
 def _(*args, program: LaneProgram, backend: str):
-    return jax.jit(functools.partial(lanes_p.bind, program=program, backend=backend))(*args)
+    return _compiled(program, backend)(*args)
+
+
+@functools.lru_cache(64)
+def _compiled(program: LaneProgram, backend: str) -> Any:
+    return jax.jit(functools.partial(lanes_p.bind, program=program, backend=backend))
 
 
 # The most directions of a derivative that one lane carries along. Six of them took 19 ms
@@ -77,8 +82,9 @@ def _batched(args, dims, *, program: LaneProgram, backend: str):
     depend = dependent_parts(program, many, smooth=False)
     wide = [depend.control or w for w in (*depend.outs, *depend.rows)]
     # What is the same in all lanes is one, as `vmap` has it for what does not depend on its axis.
-    return [x if w else x[0] for x, w in zip(out, wide, strict=True)], [
-        0 if w else None for w in wide
+    along = [w or size == 0 for w in wide]
+    return [x if w else x[0] for x, w in zip(out, along, strict=True)], [
+        0 if w else None for w in along
     ]
 
 

@@ -82,13 +82,11 @@ def _function_key(function: Callable[..., Any]) -> tuple:
         if function.keywords:
             raise TypeError("no place in an order")
         return (_function_key(function.func), *map(_argument_key, function.args))
-    if not isinstance(function, FunctionType):
-        raise TypeError("no function")
-    if function.__closure__ is not None:
-        # A decorated function closes over what it decorates. If it is that of its module, there is
-        # only one.
-        module = sys.modules.get(function.__module__)
-        if getattr(module, function.__qualname__, None) is not function:
+    if not isinstance(function, FunctionType) or function.__closure__ is not None:
+        # A decorated function closes over what it decorates, and a jitted one hides it. If it is
+        # that of its module, there is only one.
+        module = sys.modules.get(getattr(function, "__module__", ""))
+        if getattr(module, getattr(function, "__qualname__", ""), None) is not function:
             raise TypeError("perhaps made for this call")
     return (function,)
 
