@@ -92,7 +92,7 @@ class Lane(eqx.Module):
     """Of each switch, then the machine's own."""
     below: Scalars
     """Of each event that happens from below (see `AbstractEvent.from_below`), 1 once its guard has
-    been below zero since the last jump, else 0."""
+    been below zero since the last jump, else 0; and -1 till then from where the motion begins."""
     length: Scalar
     """Length proposed for an ordinary step."""
     attempt: Scalar

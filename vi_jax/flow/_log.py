@@ -17,7 +17,9 @@ def clock_at(plan: Plan, s: Scalar, state: State) -> Scalar:
     return s if clock is None else clock
 
 
-def logged(log: Log, hit: Flag, place: Scalar, clock: Scalar, approach: Scalar, stop: int) -> Log:
+def logged(
+    log: Log, hit: Flag, place: Scalar, clock: Scalar, approach: Scalar, stop: Scalar | int
+) -> Log:
     """The log of impacts with this one in its place, if there is room.
 
     **Arguments:** `log`, (3, size), `None` where none is kept; `hit`, whether there was an impact;
@@ -30,8 +32,9 @@ def logged(log: Log, hit: Flag, place: Scalar, clock: Scalar, approach: Scalar, 
 
 
 def noted(
-    events: Log, when: Flag, clock: Scalar, kind: float, number: Scalar | int, value: object
-) -> Log:
+    events: Log, when: Flag, clock: Scalar, kind: Scalar | float, number: Scalar | float | int,
+    value: object,
+) -> Log:  # fmt: skip
     """The log of all events with this one behind those that it holds, if there is room.
 
     **Arguments:** `events`, (4, size), `None` where none is kept; `when`, whether the event

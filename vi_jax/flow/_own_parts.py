@@ -128,6 +128,13 @@ def _check_event(
             f"`guard` of {whose} must return one floating-point number, but returned "
             f"{in_short(guard)}."
         )
+    with in_words_of(f"`when` of {whose}"):
+        when = jax.eval_shape(lambda: event.happens(machine, s, state, *modes[own]))
+    if when is not None and (jnp.shape(when) or not jnp.issubdtype(when.dtype, bool)):
+        raise TypeError(
+            f"`when` of {whose} must return a flag, but returned {in_short(when)}. Compare it with "
+            "a number: `state.V > 0`."
+        )
     if isinstance(event, Reset):  # its modes are asked for in the state after it
         with in_words_of(f"`reset` of {whose}"):
             new = eqx.filter_eval_shape(lambda: event.jump(machine, s, state, *modes))

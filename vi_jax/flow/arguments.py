@@ -27,6 +27,7 @@ from .._types import Machine, State
 from ..machine import AbstractMachine, Scene, begin_modes, is_autonomous
 from ._lane import Plan
 from ._own import check_period as check_period
+from ._own_guards import check_guards
 from ._own_parts import check_parts
 from .methods import AbstractMethod
 from .named import average_names, quantity_names
@@ -267,3 +268,4 @@ def check_start(machine: AbstractMachine, start: State) -> None:
                 f"({stop.side}, gap {gap})."
             )
     check_period(machine, start)
+    check_guards(machine, start)

@@ -54,7 +54,8 @@ class RESULTS(NamedEnumeration):
         "values in [0, 1]."
     )
     simultaneous = (
-        "The impacts of bodies that touch each other did not come to an end within one instant."
+        "The impacts of bodies that touch each other, or the events that set each other off, did "
+        "not come to an end within one instant."
     )
     sliding = (
         "The field on both sides of a switch points at its surface, so that the motion would have "

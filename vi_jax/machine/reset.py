@@ -14,12 +14,21 @@ class Reset(AbstractEvent):
     friction, a switch that is thrown.
 
     All functions get `(machine, s, state, *modes)`, with the modes as the machine's field gets
-    them. The reset happens once the guard has been below zero since the last time, and so does not
-    come again at once where it leaves the state on the guard's surface or beyond.
+    them. A reset happens where its guard rises through zero, once it has been negative since the
+    last time. A motion that begins on the guard's surface begins behind it.
+
+    Events of one instant happen in the order in which the machine lists them. One whose guard a
+    jump takes from below zero to above happens at that instant, too; but an event does not set off
+    itself, and a jump onto the surface sets off nothing. Two resets with the same guard both
+    happen, the second in the state that the first leaves. An event that is listed after one that
+    ends a cycle belongs to the next cycle.
+
+    A guard may jump, `where(x > 1, 1.0, -1.0)` say. The place is found by bisection, to 1e-12 in
+    `s`, in many steps; its time has no derivative.
 
     **Arguments:**
 
-    - `guard`: what rises through zero.
+    - `guard`: what rises through zero: negative before the event, positive after it.
     - `reset`: the state afterwards.
     - `when`: whether the reset happens where the guard has risen through zero, as a flag; where it
       does not hold the motion goes on. Always, if left out.

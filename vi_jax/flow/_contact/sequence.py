@@ -160,8 +160,8 @@ def _coupled(
         i = limited.index(stop.coordinate)
         closed[i] = closed[i] | touches[number]
     size, coupled = len(limited), list(coupled)
-    # There and back is enough for a row; so much more for any other arrangement of a few.
-    for _ in range(max(1, size.bit_length() - 1)):
+    # There and back takes each mark two contacts further, whatever their numbers.
+    for _ in range(max(1, size // 2)):
         for i in (*range(size), *reversed(range(size - 1))):
             for j in range(size):
                 if j != i:

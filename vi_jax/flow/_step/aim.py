@@ -236,7 +236,7 @@ def _by_newton(lane: Lane, trial: Trial, goal: _Goal) -> _Goal:
         shift, turn = to_turn(path.end), to_turn_of(k)
         again = turns & (goal.target == turn) & (lane.target == turn) & (jnp.abs(shift) < 0.25 * h)
         goal = goal._replace(length=jnp.where(again, h + shift, goal.length))
-    for c in trial.crossings:
+    for c in reversed(trial.crossings):  # of several the first listed
         again = c.again & ~turns
         goal = goal._replace(
             event=goal.event | again,

@@ -20,8 +20,8 @@ from ..events import Rates, to_turn
 from ..smooth import exact, holding
 from .faults import may_end
 from .guards import Crossing, furthest_landing
-from .happen import happened, let_go
-from .jump import disarmed, disarmed_itself
+from .happen import happened, let_go, set_off
+from .jump import disarmed_itself
 from .trial import Trial
 
 
@@ -100,18 +100,10 @@ def _met(
             met = met | here
         time = select(met, passed, arrival.time)
         arrival = arrival._replace(s=arrival.s + jnp.where(met, offset, 0.0), time=time)
-        if plan.machine.stops:
-            arrival = _impact(plan, lane, trial, taken, arrival, landed, there)
-        for c in trial.crossings:
-            happens = c.landed
-            if c.number == section_number(plan.machine):
-                # What begins anew with a cycle does so at its end.
-                arrival = arrival._replace(state=select(c.landed, there, arrival.state))
-                arrival = disarmed_itself(plan, arrival, c)
-            elif c.coordinate is None:
-                arrival, happens = happened(plan, taken, arrival, c, there)
-            if c.event.ends_cycle:
-                arrival = arrival._replace(completed=arrival.completed | happens)
+        if arrival.before is not None:
+            before = jnp.where(met, plan.machine.position(there), arrival.before)
+            arrival = arrival._replace(before=before)
+        arrival = _landed(plan, lane, trial, taken, arrival, there)
     for k, path in enumerate(trial.paths):
         if path.leaves is not None:
             arrival = _released(plan, lane, taken, arrival, way, k, path.leaves)
@@ -120,6 +112,61 @@ def _met(
     # which only derivatives along with the event do not see.
     fixed = plan.ticks(lane.state) and not plan.machine.switches
     return _at_fixed_clock(plan, lane, trial, arrival) if fixed else arrival
+
+
+def _landed(
+    plan: Plan, lane: Lane, trial: Trial, taken: Flag, arrival: Arrival, there: State
+) -> Arrival:
+    """The arrival after the event that the step landed on, and all that it sets off.
+
+    **Arguments:** `taken`, whether the step is taken; `arrival`, at the event; `there`, the state
+    in which it is met.
+    """
+    machine = plan.machine
+    landed = {c.number: c.landed for c in trial.crossings}
+    near = _near(plan, lane, trial)
+    off: dict[int, Flag] = {}
+    if machine.stops:
+        arrival = _impact(plan, lane, trial, taken, arrival, landed, there)
+        for number, stop in enumerate(machine.stops):
+            if stop.ends_cycle:
+                arrival = arrival._replace(completed=arrival.completed | landed[number])
+    if machine.stops and machine.events:
+        met = jnp.zeros_like(taken)
+        for number in range(len(machine.stops)):
+            met = met | landed[number]
+        close = tuple(jnp.where(near[n], 1.0, 0.0) for n in near)
+        # A stop may have changed the modes already.
+        arrival, off, _ = set_off(plan, arrival, met, (there, lane.modes), {}, close)
+    due = {}
+    for c in trial.crossings:
+        if c.coordinate is None:
+            arrival = arrival._replace(state=select(c.landed, there, arrival.state))
+            if c.number == section_number(machine):
+                # What begins anew with a cycle does so at its end.
+                ends = c.landed | off[c.number] if c.number in off else c.landed
+                arrival = arrival._replace(completed=arrival.completed | ends)
+                arrival = disarmed_itself(plan, arrival, c)
+            else:
+                due[c.number] = c.landed | off[c.number] if c.number in off else c.landed
+    return happened(plan, taken, arrival, due, near) if due else arrival
+
+
+def _near(plan: Plan, lane: Lane, trial: Trial) -> dict[int, Flag]:
+    """Of each event that happens from below, whether its guard is at zero to rounding where the
+    step landed on another event."""
+    numbers = plan.from_below(lane.state) if plan.machine.events else []
+    found = {}
+    eps = float(jnp.finfo(trial.h.dtype).eps)
+    for c in trial.crossings:
+        if c.number in numbers:
+            apart = jnp.full_like(trial.h, jnp.inf)
+            for other in trial.crossings:
+                if other.number != c.number:
+                    apart = jnp.where(other.landed, jnp.abs(c.offset - other.offset), apart)
+            slack = 64 * eps * (1 + jnp.abs(trial.s))
+            found[c.number] = c.near & (stop_gradient(apart) <= slack)
+    return found
 
 
 def _at_fixed_clock(plan: Plan, lane: Lane, trial: Trial, arrival: Arrival) -> Arrival:
@@ -185,7 +232,8 @@ def _offset(plan: Plan, lane: Lane, trial: Trial, way: FlowToEvent, c: Crossing)
         beyond = trial.s + offset - plan.end(lane.part)
         offset = offset - jnp.maximum(stop_gradient(beyond), 0.0)
     # With the derivatives of what is met, which mean nothing where nothing is.
-    return met_after(way.rate, way.guard(c.number), offset, way.moving, way.fixed, way.rest)
+    met = met_after(way.rate, way.guard(c.number), offset, way.moving, way.fixed, way.rest)
+    return met if c.sudden is None else jnp.where(c.sudden, 0.0, met)
 
 
 def _impact(
@@ -229,9 +277,8 @@ def _impact(
         for number, here in landed.items():
             given = machine, arrival.s, there, arrival.state, modes
             modes = select(here, machine.stops[number].modes_after(*given), modes)
-    before = there, lane.modes  # a stop may have changed them already
     arrival = arrival.going(direction=tuple(direction), modes=modes)
-    arrival = disarmed(plan, arrival, met, before)
+    before = there, lane.modes  # a stop may have changed them already
     # What rests on other stops may be let go of by it.
     several = arrival.contact is not None and len(blows) > 1
     return let_go(plan, arrival, taken, met, before, lane.contact) if several else arrival

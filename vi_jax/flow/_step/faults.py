@@ -90,7 +90,8 @@ def may_end(machine: AbstractMachine) -> bool:
     laws = any(not stop.is_one_number for stop in machine.stops)
     slides = any(event.may_slide for event in events_of(machine))
     several = bool(machine.stops) and (len(machine.coordinates) > 1 or bool(machine.events))
-    return laws or slides or several
+    chain = len(machine.switches) + len(machine.events) > 1
+    return laws or slides or several or chain
 
 
 def comes_back(

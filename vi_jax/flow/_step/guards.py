@@ -18,6 +18,13 @@ from ..smooth import SmoothMachine, exact
 # more, a lane that has aimed this often (a choice) accepts a thousand times the tolerance.
 _PATIENCE = 12.0
 
+# A guard has jumped above zero by more than this (a choice), which is more than rounding leaves of
+# one that was met.
+JUMPED = 1e-9
+
+# The place of a jump within a step is looked for down to this length (in s): a choice.
+_SUDDEN = 1e-12
+
 # Where within a step a guard is looked at, of an event that happens from below.
 WITHIN = (0.25, 0.5, 0.75)
 
@@ -37,20 +44,30 @@ class Crossing(NamedTuple):
     slack: Scalar | None = None
     """By so much, which is rounding's, a step may begin or end beyond it; `None` where places on it
     are exact."""
+    above: Flag | None = None
+    """The guard has jumped above zero as the step begins, with the clock as a cycle begins anew,
+    say; `None` for a stop."""
     offset: Any = None
     """δ to the event from the step's end, where it was tried."""
     landed: Any = None
+    near: Any = None
+    """The step ended there, whatever it was aimed at."""
     again: Any = None
     """The step was aimed at it and has to be corrected by δ."""
+    sudden: Any = None
+    """The guard jumped above zero there; its place says nothing of when; `None` where none can."""
     within: Scalars = ()
     """Of an event that happens from below, about what g is at `WITHIN`, shares of the step."""
 
     @property
     def at_once(self) -> Flag | None:
-        """Whether the step begins at rest on its surface, on its way through; `None` where nothing
-        is on it but exactly."""
+        """Whether the step begins at rest on its surface, on its way through, or above it; `None`
+        where nothing is on it but exactly."""
         x, v, a = stop_gradient(self.begin)
-        return None if self.slack is None else (jnp.abs(x) <= self.slack) & (v == 0) & (a > 0)
+        if self.slack is None:
+            return None
+        here = (jnp.abs(x) <= self.slack) & (v == 0) & (a > 0)
+        return here if self.above is None else here | self.above
 
 
 def crossings(
@@ -71,7 +88,14 @@ def crossings(
     if plan.others(lane.state) or not exact(machine, lane.state):
         eps = float(jnp.finfo(h.dtype).eps)
         guards = [guard._replace(slack=4 * eps * guard.scale) for guard in guards]
+        guards = [guard if guard.coordinate is not None else _jumped(guard) for guard in guards]
     return tuple(_seen(lane, good & last, good, h, each, guards) for each in guards), below
+
+
+def _jumped(guard: Crossing) -> Crossing:
+    """The event, with whether its guard has jumped above zero as the step begins."""
+    x = stop_gradient(guard.begin.x)
+    return guard._replace(above=x > JUMPED * (1 + jnp.abs(x)))
 
 
 def at_stops(machine: AbstractMachine, ends: list[tuple[Rates, Rates]]) -> list[Crossing]:
@@ -150,6 +174,9 @@ def _from_below(below: Scalar, begin: Rates, end: Rates, scale: Scalar) -> tuple
     rounding = float(jnp.finfo(end.x.dtype).eps) ** 0.5 * scale
     here = stop_gradient(begin)
     falls = (here.x <= rounding) & (here.v < 0)
+    # Where the motion has begun on it, which is behind it, rounding may be all that falls.
+    deep = here.v * here.v > 2 * rounding * jnp.maximum(here.a, 0.0)
+    falls = falls & ((below == 0) | deep)
     armed = (below > 0) | (here.x < -rounding) | falls
     return armed, jnp.where(armed | (stop_gradient(end.x) < -rounding), 1.0, below)
 
@@ -166,7 +193,8 @@ def beyond(event: Crossing) -> Flag:
     begin, end = event.begin, event.end
     if event.slack is None:
         return end.x > 0
-    return (end.x > event.slack) & ~((begin.v < 0) & (end.v < 0) & (begin.x >= end.x))
+    ends = (end.x > event.slack) & ~((begin.v < 0) & (end.v < 0) & (begin.x >= end.x))
+    return ends if event.above is None else ends | event.above
 
 
 def _seen(
@@ -193,6 +221,8 @@ def _seen(
             aimed = aimed & ~beyond(other)
         else:
             reached = (other.end.x <= 4 * other.slack) | ~beyond(other)
+            if guard.above is not None:  # then the first listed comes first
+                reached = reached | guard.above
             aimed, ends = aimed & reached, ends & reached
     offset, square = landing(end)
     size = stop_gradient(jnp.abs(offset))
@@ -201,12 +231,20 @@ def _seen(
     there = (jnp.abs(end.x) <= 4 * eps * guard.scale) & (end.v >= 0)
     real = stop_gradient(square) > 0
     # One that is there may have no way left along a parabola: a body that is at rest on a surface.
-    landed = pin_flag(aimed & (close & real | there), h)
+    near = close & real | there
+    landed = pin_flag(aimed & near, h)
     again = aimed & ~landed & real & (size < 0.25 * h)
     # Where bodies touch at rest, what is left of their speed is rounding.
-    rises = end.v > 0 if guard.slack is None else end.v * h > guard.slack
+    rises = end.v > 0 if guard.slack is None else end.v * lane.length > guard.slack
     again = again | ends & there & close & rises
-    return guard._replace(offset=offset, landed=landed, again=again)
+    sudden = None
+    if guard.above is not None:
+        shortest = jnp.maximum(_SUDDEN, 4 * eps * (1 + jnp.abs(stop_gradient(lane.s))))
+        sudden = pin_flag(aimed & ~near & (h <= shortest) & beyond(guard), h)
+        landed, offset = landed | sudden, jnp.where(sudden, 0.0, offset)
+        # What Newton's method does not come to is looked for by halves.
+        again = again & ~sudden & (lane.aims < _PATIENCE)
+    return guard._replace(offset=offset, landed=landed, again=again, near=near, sudden=sudden)
 
 
 def leniency(lane: Lane) -> Scalar:

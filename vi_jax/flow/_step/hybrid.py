@@ -23,7 +23,7 @@ from jax.lax import stop_gradient
 from ..._types import Flag, Scalar, State
 from ...lanes import pin_flag
 from .._arrival import Onward
-from .._lane import FREE, Lane, Plan, Record, select
+from .._lane import FREE, Lane, Plan, Record, select, to_event
 from ..smooth import holding
 from .aim import aim_ahead, aim_at
 from .arrive import arrive
@@ -81,7 +81,7 @@ def iterate(plan: Plan, lane: Lane) -> Step:
     new = dataclasses.replace(
         new,
         length=length,
-        attempt=jnp.where(aim, goal, length),
+        attempt=jnp.where(aim, goal, _next_attempt(plan, lane, trial, taken, length)),
         target=jnp.where(aim, target, FREE),
         aims=aims,
         done=done,
@@ -91,6 +91,21 @@ def iterate(plan: Plan, lane: Lane) -> Step:
         rejected=lane.rejected + jnp.where(rejected, 1.0, 0.0),
     )
     return Step(new, completed, new.state, there.record)
+
+
+def _next_attempt(plan: Plan, lane: Lane, trial: Trial, taken: Flag, length: Scalar) -> Scalar:
+    """The length of the next step that is aimed at nothing. One that was aimed at an event and fell
+    short of it is followed by one as long: so the place where a guard jumps is halved down to.
+
+    **Arguments:** `length`, that of an ordinary step.
+    """
+    if not plan.others(lane.state):
+        return length
+    short = taken & (lane.target >= to_event(len(plan.machine.stops)))
+    for c in trial.crossings:
+        if c.sudden is not None:
+            short = short & ~c.landed
+    return jnp.where(short, jnp.minimum(stop_gradient(trial.h), length), length)
 
 
 def _stands_on_section(plan: Plan, lane: Lane, there: Lane) -> Flag:

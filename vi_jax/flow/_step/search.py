@@ -61,6 +61,8 @@ def first_event(
         # One that a step without length is beyond is met where it begins.
         rise = jnp.where(end > begin, end - begin, 1.0)
         place = jnp.where(over, jnp.maximum(-begin, 0.0) / rise, jnp.inf)
+        if guard.above is not None:  # before any turn
+            place = jnp.where(guard.above, -3.0, place)
         found.append((place, to_event(guard.number), curve(), guard.at_once))
         crossed = crossed | over
     behind, everything = crossed | met, plan.meets_turns(lane.done)

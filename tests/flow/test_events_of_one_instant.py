@@ -1,0 +1,323 @@
+"""Events that come together, set each other off, jump, or change which way a motion goes."""
+
+import inspect
+import itertools
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+from vi_jax.flow._contact.sequence import _coupled
+
+CLOSE = vi.Adaptive(rtol=1e-11)
+
+
+class Two(eqx.Module):
+    x: Any
+    n: Any
+
+
+def two(x, n=0.0):
+    return Two(jnp.asarray(float(x)), jnp.asarray(float(n)))
+
+
+def by_case(machine, *cases):
+    """The number that the machine's `case` picks."""
+    return jnp.stack([jnp.asarray(x, float) for x in cases])[machine.case]
+
+
+P = 0.7
+CASES = ("end of the cycle", "set off", "set off back", "same guard", "jump", "clock", "for ever")
+
+
+class Cases(vi.AbstractMachine):
+    """x' = p or -x, n' = x or 0 or -n, and a pair of resets, by the number `case`."""
+
+    case: Any
+    p: Any = P
+    stops: tuple = ()
+    cycle: float = 5.0
+
+    @property
+    def events(self):
+        def first(m, s, z):
+            jumps = jnp.where(z.x > np.sqrt(2), 1.0, -1.0)
+            return by_case(m, s - 5, s - 0.5, z.x - 1, z.x - 1, jumps, 2 - s, z.x - 1)
+
+        def moved(m, s, z):
+            x = z.x
+            return Two(by_case(m, x + 1, x + 2, 2 * x, 0 * x, x - 1, x, -3 * x), z.n)
+
+        def second(m, s, z):
+            x = z.x
+            return by_case(m, s - 5, x - 1, x - 1.5, x - 1, -1 - x, -1 - x, -x)
+
+        def counted(m, s, z):
+            x, n = z.x, z.n
+            after = Two(by_case(m, x, x, -x, x, x, x, -x), n + by_case(m, 1, 1, x, 1, 1, 1, 1))
+            return after
+
+        return vi.Reset(first, moved), vi.Reset(second, counted)
+
+    def field(self, s, z):
+        still, p = 0 * z.x, self.p + 0 * z.x
+        return Two(
+            by_case(self, -z.x, still, p, p, p, p, p),
+            by_case(self, -z.n, still, z.x, still, still, z.x, still),
+        )
+
+
+@pytest.fixture(scope="module")
+def cases():
+    """Each case for three cycles, with derivatives by p."""
+
+    def run(p):
+        return jax.vmap(
+            lambda case: vi.simulate(Cases(case, p), two(0), 3, event_log=4, method=CLOSE)
+        )(jnp.arange(len(CASES)))
+
+    return jax.jvp(run, (jnp.asarray(P),), (jnp.asarray(1.0),))
+
+
+def named(cases, name):
+    """State on the sections behind the start, its derivative, and the run."""
+    run, slope = (jax.tree.map(lambda x: x[CASES.index(name)], y) for y in cases)
+    return *((y.sections.x[1:], y.sections.n[1:]) for y in (run, slope)), run
+
+
+def test_two_events_at_the_end_of_a_cycle(cases):
+    (x, n), _, run = named(cases, "end of the cycle")
+    shares = np.cumsum(np.exp(-5.0) ** np.arange(3))
+    np.testing.assert_allclose([x, n], [shares, shares], rtol=1e-10)
+    assert run.event_log.number[:, :3].tolist() == [[0, 1, -1]] * 3
+
+
+def test_an_event_sets_off_another(cases):
+    """And not itself; and none twice."""
+    (x, n), _, run = named(cases, "set off")
+    np.testing.assert_allclose([x, n], [[2, 4, 6], [1, 1, 1]], rtol=1e-14)
+    assert run.event_log.number[0, :3].tolist() == [0, 1, -1]
+
+
+def test_derivatives_pass_through_an_event_that_another_sets_off(cases):
+    """x = 1 at t = 1/p becomes 2, which n takes up, then -2: 1/2p + 2 + ∫(pt - 3)dt."""
+    (x, n), (dx, dn), _ = named(cases, "set off back")
+    np.testing.assert_allclose([x[0], n[0]], [5 * P - 3, 12.5 * P + 3 / P - 13], rtol=1e-10)
+    np.testing.assert_allclose([dx[0], dn[0]], [5.0, 12.5 - 3 / P**2], rtol=1e-9)
+
+
+def test_two_events_with_the_same_guard_both_happen(cases):
+    """The second too, although the first has taken its guard back."""
+    (x, n), _, _ = named(cases, "same guard")
+    way = 5 * P * np.arange(1, 4)
+    np.testing.assert_allclose([x, n], [way % 1, way // 1], atol=1e-9)
+
+
+def test_a_guard_that_jumps_is_located(cases):
+    (x, n), _, run = named(cases, "jump")
+    way = 5 * P * np.arange(1, 4)
+    times = np.ceil(way - np.sqrt(2))
+    np.testing.assert_allclose([x, n], [way - times, 0 * way], atol=1e-10)
+    clock = [(np.sqrt(2) + k) / P for k in range(3)]
+    np.testing.assert_allclose(run.event_log.phase[0, :3], clock, atol=1e-10)
+
+
+def test_a_clock_that_begins_anew_takes_a_guard_above_zero(cases):
+    """2 - s, from -3 to 2 with each cycle but the first; it is met before anything moves."""
+    _, _, run = named(cases, "clock")
+    assert run.event_log.number[:, 0].tolist() == [-1, 0, 0]
+    np.testing.assert_array_equal(run.event_log.phase[1:, 0], 0.0)
+
+
+def test_events_that_set_each_other_off_for_ever_end_the_lane(cases):
+    assert bool(named(cases, "for ever")[-1].result == vi.RESULTS.simultaneous)
+    assert int(cases[0].successful.sum()) == len(CASES) - 1
+
+
+class Furnace(vi.AbstractMachine):
+    """Off above 296, on below 294: T' = -2 (T - 285) + 25 if on."""
+
+    stops: tuple = ()
+    cycle: float = 1.0
+    events: tuple = (
+        vi.Reset(lambda m, s, T, on: 294 - T[0], lambda m, s, T, on: T, modes=lambda *_: (1.0,)),
+        vi.Reset(lambda m, s, T, on: T[0] - 296, lambda m, s, T, on: T, modes=lambda *_: (0.0,)),
+    )
+
+    def begin(self, s, T):
+        return (0.0,)
+
+    def field(self, s, T, on):
+        return (25 * on - 2 * (T[0] - 285),)
+
+
+def heated(T, time):
+    """From exponential to exponential."""
+    on = T < 294
+    while True:
+        limit, edge = (297.5, 296.0) if on else (285.0, 294.0)
+        away = (edge - limit) / (T - limit)
+        wait = -np.log(away) / 2 if 0 < away < 1 else np.inf
+        if wait >= time:
+            return limit + (T - limit) * np.exp(-2 * time)
+        T, time, on = edge, time - wait, not on
+
+
+def test_a_furnace_with_two_thresholds():
+    begins = np.array([300.0, 295.0, 296.5, 310.0])
+    runs = [
+        jax.vmap(lambda T, m=m: vi.simulate(Furnace(), (T,), 4, method=m))(jnp.asarray(begins))
+        for m in (CLOSE, vi.FixedStep(steps_per_cycle=40))
+    ]
+    for run in runs:
+        assert bool(run.successful.all())
+        np.testing.assert_allclose(run.last[0], [heated(T, 4) for T in begins], rtol=1e-11)
+    assert heated(300.0, 4) == pytest.approx(294.497730558, abs=1e-9)
+    np.testing.assert_allclose(runs[0].y_max[:, 2:], 296.0, rtol=1e-12)  # a turn where it switches
+
+
+class Wave(vi.AbstractMachine):
+    """x' = ±1 - κx by a switch of the clock, whose side at the end of a cycle is not that at its
+    begin."""
+
+    decay: Any = 0.0
+    stops: tuple = ()
+    cycle: float = 10.0
+    switches: tuple = (vi.Switch(lambda m, s, x: s - 5),)
+
+    def field(self, s, x, side):
+        return (jnp.where(side > 0, 1.0, -1.0) - self.decay * x[0],)
+
+
+def test_a_rate_that_changes_its_sign_with_a_mode():
+    run = jax.vmap(lambda k: vi.simulate(Wave(k), (0 * k,), 3, method=CLOSE))(jnp.array([0.0, 0.3]))
+    fades = np.exp(-0.3 * 5)
+    x, level = [0.0], 1 / 0.3
+    for _ in range(3):
+        half = -level + (x[-1] + level) * fades
+        x.append(level + (half - level) * fades)
+    np.testing.assert_allclose(run.sections[0], [np.zeros(4), x], atol=1e-9)
+    np.testing.assert_allclose(run.y_min[0], -5.0, rtol=1e-12)
+
+
+class Pair(eqx.Module):
+    x: Any
+    y: Any
+    u: Any
+    v: Any
+
+
+class Bodies(vi.AbstractMachine):
+    """Two bodies that nothing pulls, each before a stop."""
+
+    stops: tuple = (vi.RigidStop(1.0, 0.5), vi.RigidStop(1.0, 0.25, coordinate=1))
+    coordinates: tuple = (
+        vi.Coordinate(lambda z: z.x, lambda z: z.u, lambda z, Y, V: Pair(Y, z.y, V, z.v)),
+        vi.Coordinate(lambda z: z.y, lambda z: z.v, lambda z, Y, V: Pair(z.x, Y, z.u, V)),
+    )
+    cycle: float = 1.0
+
+    def field(self, s, z):
+        return Pair(z.u, z.v, 0 * z.u, 0 * z.v)
+
+
+def test_two_bodies_land_together_as_a_cycle_ends():
+    start = Pair(*(jnp.asarray(x) for x in (0.0, -1.0, 1.0, 2.0)))
+    run = vi.simulate(Bodies(), start, 1, rests=False)
+    np.testing.assert_allclose([run.last.u, run.last.v], [-0.5, -0.5], rtol=1e-12)
+    assert int(run.impacts[0]) == 2
+
+
+class Watched(vi.AbstractMachine):
+    """An oscillator with a stop, and a reset that never happens."""
+
+    gap: Any
+    cycle: float = 2 * np.pi / 0.9
+    events: tuple = (vi.Reset(lambda m, s, x: x.Y - 9, lambda m, s, x: x),)
+
+    @property
+    def stops(self):
+        return (vi.RigidStop(self.gap, 0.7),)
+
+    def field(self, s, x):
+        return vi.OscillatorState(x.V, jnp.cos(0.9 * s) - x.Y - 0.1 * x.V)
+
+
+def test_derivatives_of_extremes_beside_events():
+    def extremes(gap):
+        run = vi.simulate(Watched(gap), vi.OscillatorState(0 * gap, 0 * gap), 3, method=CLOSE)
+        return run.y_max[-1], run.y_min[-1]
+
+    h = 1e-5
+    gaps = 0.5 + h * jnp.array([-1.0, 0.0, 1.0])
+    (_, lowest), (top, low) = jax.jvp(jax.vmap(extremes), (gaps,), (jnp.ones(3),))
+    np.testing.assert_allclose(top, 1.0, atol=1e-12)
+    assert float(low[1]) == pytest.approx(float(lowest[2] - lowest[0]) / (2 * h), rel=1e-6)
+
+
+class Behind(vi.AbstractMachine):
+    """y'' = 2 - y, from where a reset has its surface."""
+
+    stops: tuple = ()
+    cycle: float = 9.0
+    events: tuple = (
+        vi.Reset(lambda m, s, x: x.Y - 1, lambda m, s, x: vi.OscillatorState(x.Y, x.V + 1)),
+    )
+
+    def field(self, s, x):
+        return vi.OscillatorState(x.V, 2 - x.Y)
+
+
+def test_a_start_on_a_surface_is_behind_it():
+    """To rounding, even if rounding makes it fall at first; what falls by more comes back."""
+    places = 1 + jnp.array([0.0, -1e-16, 0.0, -1e-12, 0.0])
+    speeds = jnp.array([-1e-17, -1e-17, -1e-9, 0.0, -0.1])
+    starts = vi.OscillatorState(places, speeds)
+    run = jax.vmap(lambda x: vi.simulate(Behind(), x, 1, event_log=2))(starts)
+    assert run.event_log.number[:, 0, 0].tolist() == [-1, -1, -1, -1, 0]
+    phase = 2 * np.arctan(0.1)  # y - 2 = -cos s - sin(s)/10
+    np.testing.assert_allclose(run.event_log.phase[-1, 0, 0], phase, rtol=1e-8)
+
+
+class NeverNegative(Behind):
+    events: tuple = (
+        vi.Reset(lambda m, s, x: x.Y - 1, lambda m, s, x: x),
+        vi.Reset(lambda m, s, x: jnp.maximum(x.Y - 1, 0), lambda m, s, x: x, name="push"),
+    )
+
+
+class ByNumber(Behind):
+    events: tuple = (
+        vi.Reset(lambda m, s, x: x.Y - 1, lambda m, s, x: x, when=lambda m, s, x: x.V),
+    )
+
+
+def test_guards_and_conditions_of_the_wrong_kind_are_named():
+    start = vi.OscillatorState(jnp.asarray(0.0), jnp.asarray(0.0))
+    with pytest.warns(UserWarning, match=r"event 1 \(push\) of a NeverNegative .* never happens"):
+        vi.simulate(NeverNegative(), start, 1, record="sections")
+    with pytest.raises(TypeError, match=r"`when` of event 0 .* must return a flag"):
+        vi.simulate(ByNumber(), start, 1)
+
+
+def test_a_blow_is_felt_along_any_path_of_contacts():
+    """Of six bodies in a row, in all the ways in which they can be numbered."""
+
+    def reached(order):
+        ones = jnp.zeros((6, 6)).at[order[:-1], order[1:]].set(1.0)
+        gains = [list(row) for row in ones + ones.T]
+        plan = type("Plan", (), {"machine": Row()})
+        struck = [jnp.equal(order[0], i) for i in range(6)]
+        closed = dict.fromkeys(range(6), jnp.ones((), bool))
+        return jnp.stack(
+            inspect.unwrap(_coupled)(plan, list(range(6)), gains, closed, struck)
+        ).all()
+
+    class Row:
+        stops = tuple(vi.RigidStop(0.0, 0.5, coordinate=i) for i in range(6))
+
+    orders = jnp.array(list(itertools.permutations(range(6))))
+    assert bool(jax.jit(jax.vmap(reached))(orders).all())
