@@ -1,1 +1,1 @@
-"""Ten short scripts that each end in a picture, and the notebooks made of them."""
+"""Short scripts that each end in a picture, and the notebooks made of them."""

@@ -3,8 +3,11 @@
 #
 # Where several motions are stable at one parameter point, the start decides. `vi.basins` simulates
 # a grid of starts, finds the motions on the way and labels each start. Three machines (ideal
-# drive): the lightly damped one of `all_orbits.py`, one in which motions of 2π and 6π share the
-# starts, and Table 1's above resonance, where the body may also swing free of the stop.
+# drive): a lightly damped one above its natural frequency, one in which motions of 2π and 6π share
+# the starts, and Table 1's above resonance, where the body may also swing free of the stop.
+#
+# For the first machine `vi.all_orbits` searches from random starts for motions of 1 to 6 cycles by
+# Newton's method, stable or not: neither function knows of the other.
 #
 # The fractions of the grid are held against those of random starts with their standard error, the
 # random starts' labels against `vi.FixedStep`, and the stability of each motion against its
@@ -33,8 +36,10 @@ from tools.timing import Clock
 # One size of block for all calls: one program. Impacts lie near φ = 0; look half a turn later.
 LANES, WORKERS, SECTION = (256, 2, np.pi) if QUICK else (4096, 2, np.pi)
 SAMPLES, AGAIN = (400, 100) if QUICK else (8192, 1000)
+GUESSES, PERIODS = (128, 2) if QUICK else (4096, 6)
 # A whole number of periods of every motion found here.
 WATCHED = 600
+LETTERS = "ABCDEFGHIJ"
 
 
 class Case(NamedTuple):
@@ -71,6 +76,17 @@ def machine_of(case: Case) -> vi.Scene:
     )
     return machine.at_section(SECTION)
 
+
+# %% [markdown]
+# ## All motions of the first machine, by Newton's method from random starts
+
+# %%
+searched = vi.all_orbits(machine_of(CASES[0]), PERIODS, region=CASES[0].region, starts=GUESSES)
+known = sorted(
+    zip(searched.orbits, searched.found, strict=True),
+    key=lambda x: (int(x[0].cycles), float(abs(x[0].multipliers[0]))),
+)
+say(searched)
 
 # %% [markdown]
 # ## Grid, random starts, another method
@@ -139,7 +155,17 @@ for ax, found in zip(figure.subplots(1, 3), everything, strict=True):
     )  # fmt: skip
     ax.set(title=found.case.title, xlabel="Y at the start (φ = π), a")
     ax.set_ylabel("V at the start, a ω")
-figure.suptitle("Which start settles on which motion; circles: the motions' section points")
+first = figure.axes[0]
+for i, (orbit, _) in enumerate(known):
+    Y, V = np.asarray(orbit.sections.Y), np.asarray(orbit.sections.V)
+    if not bool(orbit.stable):
+        first.plot(Y, V, "kX", ms=6, mec="w", mew=0.6, zorder=6)
+    look = {"xytext": (5, 4), "textcoords": "offset points", "fontsize": 9, "zorder": 7}
+    for place in zip(Y, V, strict=True):
+        first.annotate(LETTERS[i], place, **look)
+figure.suptitle(
+    "Which start settles on which motion; section points: circles, stable; crosses (left), unstable"
+)
 
 # %% [markdown]
 # ## The table
@@ -172,6 +198,17 @@ for found in everything:
     times.append((case.title, f"{case.side}² × {case.settle + 128:,}", *taken))
 heads = ["machine", "period", "impacts", "section (Y, V)", "grid, %", "random, %", "off"]
 motions = table([*heads, "multiplier"], motions)
+rows = []
+for i, (orbit, counts) in enumerate(known):
+    where = f"({float(orbit.state.Y):.6f}, {float(orbit.state.V):.6f})"
+    size, periods = float(abs(orbit.multipliers[0])), np.flatnonzero(counts) + 1
+    rows.append([
+        LETTERS[i], f"{2 * int(orbit.cycles)}π", int(orbit.impacts), where, f"{size:.6f}",
+        "yes" if bool(orbit.stable) else "no",
+        f"{int(np.sum(counts)):,} (n = {', '.join(map(str, periods))})",
+    ])  # fmt: skip
+heads = ["motion", "period", "impacts", "section (Y, V)", "largest multiplier", "stable"]
+orbits = table([*heads, "searches that found it"], rows)
 heads = ["machine", "starts × cycles", "wall, s", "CPU, s", "labels that `FixedStep` changes"]
 page = f"""# Basins of coexisting motions
 
@@ -184,10 +221,14 @@ from Lyapunov exponents over {WATCHED} cycles.
 
 {table(heads, times)}
 
+The periodic motions of 1 to {PERIODS} cycles of the first machine that `vi.all_orbits` finds from
+{GUESSES:,} random starts for each period:
+
+{orbits}
+
 - Nothing was listed beforehand. In the first machine `vi.basins` finds the four stable motions of
-  `all_orbits.md` with their multipliers (0.9961, 0.8930, 0.8895, 0.7943), and one more, of 15
-  cycles with 6 impacts, which that search for periods up to 6 could not find: it is what one in a
-  hundred starts was missing there.
+  that list with their multipliers, and one more, of 15 cycles with 6 impacts, which a search for
+  periods up to 6 cannot find. One in a hundred starts settles on it.
 - The basins of the 4π motion and of the free one have whole parts; elsewhere the basins are mixed
   down to single cells. There the label of a start depends on the last digits, and `FixedStep`
   changes some labels while the fractions stay. In the other two machines the borders are smooth and
@@ -205,5 +246,7 @@ numbers = {
     for found in everything
     for a, size in zip(found.grid.attractors, found.multipliers, strict=True)
 }
+for i, (orbit, _) in enumerate(known):
+    numbers[f"largest multiplier of {LETTERS[i]}"] = float(abs(orbit.multipliers[0]))
 write("basins_map", page, numbers, figure, dpi=85)
 say("done")

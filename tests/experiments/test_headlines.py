@@ -17,7 +17,7 @@ from headline_numbers.closed_forms import Expected
 FOLDER = Path(__file__).parents[2] / "experiments"
 
 PATHS = {p.stem: p for kind in ("studies", "benchmarks") for p in FOLDER.glob(f"{kind}/*.py")}
-# The rows of `extremes` are tests of their own (`tests/flow/test_extremes.py`); `gpu` has only times.
+# Of `extremes` the rows are tests of their own (`tests/flow/test_extremes.py`), `gpu` has times.
 NAMES = ["reproduction", *sorted(set(PATHS) - {"extremes", "gpu"})]
 COMPUTED = {
     name: function
@@ -44,9 +44,8 @@ def stale(kept: dict[str, float], computed: Expected) -> list[str]:
 
 # Their programs take longer to compile than the rest of this file.
 LONGER = {
-    "all_orbits", "basins_map", "chains", "dc_motor", "gradients", "identify", "known_machines",
-    "learned_laws", "peers", "posterior", "regime_maps", "relief_valve", "robustness", "soft_stop",
-    "woodpecker",
+    "basins_map", "chains", "gradients", "identify", "learned_laws", "motors", "peers", "posterior",
+    "regime_maps", "relief_valve", "robustness", "woodpecker",
 }  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Of the studies of other machines and motors."""
+"""Of the studies of motors and of other machines."""
 
 from typing import Any
 
@@ -9,10 +9,32 @@ import vi_jax as vi
 from scipy.linalg import solve_continuous_lyapunov
 from scipy.optimize import brentq
 
-from .closed_forms import XI, Expected, closed
+from .closed_forms import XI, Expected, closed, fold
 
 
-def dc_motor() -> Expected:
+def motors() -> Expected:
+    numbers: Expected = _armature() | _rotor()
+    # On the study's grid of ζ, 1e-4 apart at the fold.
+    numbers["ideal drive: 2π motion folds, ζ"] = (fold(0.5, XI, 1.44, 1.45), 1.1e-4)
+    table = vi.Parameters()
+    coupling = float(table.body_mass * table.crank_radius**2 / table.inertia)
+    per_nm = 1 / float(table.inertia * table.natural_frequency**2)
+    fine = np.linspace(0.9, 3.0, 210_001)
+    idle = -coupling * np.imag(0.5 / (1 - fine**2 + 2j * XI * fine))
+    clear = np.abs(1 - fine**2 + 2j * XI * fine) > 0.5
+    for torque, gap in (
+        (100, 2), (10, 2), (2, 2), (0.2, 2), (0.1, 2), (0.05, 2), (2, 20), (0.5, 20)
+    ):  # fmt: skip
+        kappa = fine + idle / (per_nm * torque)
+        name = f"T0 = {torque:g} N·m, gap {gap:g}a"
+        down = kappa[(fine > 1) & (clear | (gap == 20))].min()
+        numbers[f"{name}, close-down: forecast, κ"] = (float(down), 1.1e-3)  # its grid of ζ
+        if gap == 20:
+            numbers[f"{name}, run-up: forecast, κ"] = (float(kappa[fine < 1.05].max()), 1.1e-3)
+    return numbers
+
+
+def _armature() -> Expected:
     """From closed forms of the ideal drive on; the study comes from a long simulation."""
     guess = closed(0.896, 0.5, XI, 2.0, cycles=1)
     found = []
@@ -27,25 +49,6 @@ def dc_motor() -> Expected:
         "T0 = 10 N·m, κ = 0.9, τe = 0.1: min Y": (float(lagging.y_min), 1e-7),
         "T0 = 10 N·m, κ = 0.9, τe = 0.1: ζ": (float(lagging.frequency_ratio), 1e-7),
     }
-
-
-def known_machines() -> Expected:
-    """Closed forms, and multipliers and clearances of motions found at them."""
-    e, s = 0.5, 1 / 3
-    fold = (1 + (np.pi / (2 * s)) ** 2) ** 0.5
-    breaks = (np.pi / 2 - 2 / np.pi) / np.sqrt(4 / np.pi**2 + s * s)
-    pair = vi.machines.ImpactPair(half_gap=breaks + 1e-3, restitution=e)
-    orbit = vi.find_orbit(pair, vi.simulate(pair, pair.start(), 1, settle=2000).last, throw=True)
-    branch = vi.continue_orbit(orbit, parameter="half_gap", bounds=(1.28, 1.32))
-    return {
-        "birth of one bounce, e = 0.5": (np.pi * s, 1e-9),
-        "its period doubling, e = 0.5": (
-            float(np.hypot(np.pi * s, 2 * (1 + e * e) / (1 + e) ** 2)), 1e-9,
-        ),
-        "fold of the pair, e = 0.5": (float(fold), 1e-9),
-        "its loss of symmetry, e = 0.5": (branch.special[0].parameter, 1e-8),
-        "grazing of the oscillator, ω = 1": (0.1, 1e-9),
-    }  # fmt: skip
 
 
 def relief_valve() -> Expected:
@@ -121,7 +124,7 @@ def woodpecker(kept: dict[str, float]) -> Expected:
     return numbers
 
 
-def sommerfeld() -> Expected:
+def _rotor() -> Expected:
     """Where the averaged κ = ζ + ε ξ ζ⁵/(τ0 D) turns; the motion's own folds lie beside it."""
     numbers: Expected = {}
 

@@ -1,26 +1,11 @@
 """Of the studies of single motions: orbits, basins, transients and designs."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import vi_jax as vi
-from scipy.optimize import brentq
 
 from .closed_forms import XI, Expected, closed
-
-
-def all_orbits() -> Expected:
-    zeta, k, gap, xi = 3.2, 0.9, 1.05, 0.002
-    numbers = {"largest multiplier of A": float(np.exp(-2 * np.pi * xi / zeta))}
-    for names, cycles in (("BC", 2), ("DE", 3)):
-        found = closed(zeta, k, xi, gap, cycles=cycles)
-        sizes = np.sort(np.abs(np.asarray(found.multipliers)).max(axis=1))
-        numbers |= {
-            f"largest multiplier of {name}": float(size)
-            for name, size in zip(names, sizes, strict=True)
-        }
-    return {name: (value, 1e-7) for name, value in numbers.items()}
 
 
 def basins_map() -> Expected:
@@ -41,7 +26,20 @@ def basins_map() -> Expected:
         f"{third}: multiplier of the 2π motion, 0 impacts": np.exp(-2 * np.pi * XI / 1.4),
     }
     # From Lyapunov exponents over 600 cycles, which the first cycles' turning leaves inexact.
-    return {name: (float(value), 2e-3) for name, value in numbers.items()}
+    return _all_orbits() | {name: (float(value), 2e-3) for name, value in numbers.items()}
+
+
+def _all_orbits() -> Expected:
+    zeta, k, gap, xi = 3.2, 0.9, 1.05, 0.002
+    numbers = {"largest multiplier of A": float(np.exp(-2 * np.pi * xi / zeta))}
+    for names, cycles in (("BC", 2), ("DE", 3)):
+        found = closed(zeta, k, xi, gap, cycles=cycles)
+        sizes = np.sort(np.abs(np.asarray(found.multipliers)).max(axis=1))
+        numbers |= {
+            f"largest multiplier of {name}": float(size)
+            for name, size in zip(names, sizes, strict=True)
+        }
+    return {name: (value, 1e-7) for name, value in numbers.items()}
 
 
 def design_percussion(kept: dict[str, float]) -> Expected:
@@ -73,21 +71,6 @@ def escape_from_2pi() -> Expected:
     }
 
 
-def fit_4pi_orbit() -> Expected:
-    numbers = {}
-    for k, xi, name in (
-        (0.5, 0.0, "k = 0.5, undamped"), (0.8, XI, "k = 0.8, Table 1"),
-        (0.95, 0.0, "k = 0.95, undamped"),
-    ):  # fmt: skip
-        scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=k, gap=2.0, damping_ratio=xi)
-        run = vi.simulate(scene, scene.start(), 1000, method=vi.ExactFlight(), record="sections")
-        sections = np.stack([run.sections.Y, run.sections.V], axis=1)
-        late = np.flatnonzero(~(np.abs(sections[2:] - sections[:-2]).max(axis=1) < 1e-6))
-        # A cycle more or less where rounding decides when 1e-6 is passed.
-        numbers[f"{name}, ideal: cycles of the transient"] = (float(late[-1]) + 1, 1)
-    return numbers
-
-
 def grazing_forecast(kept: dict[str, float]) -> Expected:
     """Where the vibration without impacts just reaches the stop of the paper's machine."""
     names = [name.removesuffix(": d") for name in kept if name.endswith(": d")]
@@ -96,31 +79,6 @@ def grazing_forecast(kept: dict[str, float]) -> Expected:
         zeta, xi = kept[f"{name}: ζ"], kept[f"{name}: ξ"]
         numbers[f"{name}: d"] = (float(1 / abs(1 - zeta**2 + 2j * xi * zeta)), 1e-9)
     return numbers
-
-
-def soft_stop() -> Expected:
-    """Where the 2π motion doubles its period before a linear stop, and a multiplier well above."""
-    closed_form = closed(0.9, 0.5, 0.0, 2.0, cycles=1)
-    stop = vi.SoftStop(2.0, 1.0, restitution=0.5)
-    doubles = "K at the doubling, spring and dashpot"
-
-    def least(stiffness):
-        scene = vi.Scene(
-            vi.Oscillator(0.0), vi.IdealDrive(0.9), soft_stops=(with_stiffness(stop, stiffness),)
-        )
-        orbit = vi.find_orbit(scene, guess[0], throw=True)
-        guess[0] = orbit.state
-        return float(np.min(np.real(np.asarray(orbit.multipliers))))
-
-    guess = [vi.OscillatorState(closed_form.Y[0], closed_form.V[0])]
-    found = {"multiplier of the 2π motion at K = 1000, spring and dashpot": (least(1000.0), 1e-6)}
-    least(200.0)
-    stiffness = float(brentq(lambda K: least(K) + 1, 60, 90, xtol=1e-9))
-    return {doubles: (stiffness, 1e-6), **found}
-
-
-def with_stiffness(stop: vi.SoftStop, stiffness: float) -> vi.SoftStop:
-    return eqx.tree_at(lambda x: x.stiffness, stop, jnp.asarray(stiffness))
 
 
 def robustness() -> Expected:

@@ -116,28 +116,6 @@ def _resonance(share: float, xi: float) -> float:
     return float(abs(1 - zeta**2 + 2j * xi * zeta) - 0.5)
 
 
-def motor_frequency_response() -> Expected:
-    numbers: Expected = {}
-    # On the study's grid of ζ, 1e-4 apart at the fold.
-    numbers["ideal drive: 2π motion folds, ζ"] = (fold(0.5, XI, 1.44, 1.45), 1.1e-4)
-    table = vi.Parameters()
-    coupling = float(table.body_mass * table.crank_radius**2 / table.inertia)
-    per_nm = 1 / float(table.inertia * table.natural_frequency**2)
-    fine = np.linspace(0.9, 3.0, 210_001)
-    idle = -coupling * np.imag(0.5 / (1 - fine**2 + 2j * XI * fine))
-    clear = np.abs(1 - fine**2 + 2j * XI * fine) > 0.5
-    for torque, gap in (
-        (100, 2), (10, 2), (2, 2), (0.2, 2), (0.1, 2), (0.05, 2), (2, 20), (0.5, 20)
-    ):  # fmt: skip
-        kappa = fine + idle / (per_nm * torque)
-        name = f"T0 = {torque:g} N·m, gap {gap:g}a"
-        down = kappa[(fine > 1) & (clear | (gap == 20))].min()
-        numbers[f"{name}, close-down: forecast, κ"] = (float(down), 1.1e-3)  # its grid of ζ
-        if gap == 20:
-            numbers[f"{name}, run-up: forecast, κ"] = (float(kappa[fine < 1.05].max()), 1.1e-3)
-    return numbers
-
-
 def regime_maps() -> Expected:
     """Every fourth lane each way of the map with Table 1's damping."""
     data = vi.scan(
@@ -156,20 +134,3 @@ def regime_maps() -> Expected:
     # Borders cross the coarse grid elsewhere, by about half its step: 1 % of a side.
     name = "(ζ, k), c = 0.5 N·s/m (Table 1)"
     return {f"{name}: {kind}": (100 * float(np.mean(x)), 1.0) for kind, x in parts.items()}
-
-
-def why_four_pi() -> Expected:
-    numbers = {}
-    places = {  # near the doubling, near the touches that end the 4π motion with one impact
-        (0.5, 0.0): (0.93990, 0.85029, 0.94124), (0.8, 0.0): (0.99377, 0.83434, None),
-        (0.5, XI): (0.82456, None, None), (0.8, XI): (0.96554, 0.83340, 0.96912),
-    }  # fmt: skip
-    for (k, xi), (near, low, high) in places.items():
-        name = f"k = {k}, ξ = {xi:.4f}"
-        numbers[f"{name}: BB'"] = births(xi)[0]
-        numbers[f"{name}: CC'"] = doubling(k, xi, 1, near - 2e-3, near + 2e-3)
-        if low:
-            numbers[f"{name}: least ζ of 4π"] = touch(k, xi, low - 2e-3, low + 2e-3)
-        if high:
-            numbers[f"{name}: greatest ζ of 4π"] = touch(k, xi, high - 1e-3, high + 1e-3)
-    return {name: (value, ROOT) for name, value in numbers.items()}

@@ -1,0 +1,414 @@
+# %% [markdown]
+# # Motors of limited power
+#
+# The paper's Figure 2 belongs to an ideal drive, which turns at the frequency ratio ζ whatever the
+# machine does to it. A motor obeys its control κ only as far as its torque goes: ζ is an outcome.
+#
+# 1. Table 1's machine: κ is run up and closed down for strong and weak motors, with the stop at 2a
+#    and out of reach. The 2π motions are continued in κ through their folds. Both are compared with
+#    a forecast from the ideal machine's load in closed form (Kononenko's method).
+# 2. A motor with an armature, whose current lags: what does the straight line of the paper miss?
+# 3. An unbalanced rotor, beside its averaged response in closed form.
+#
+# Run with `python experiments/studies/motors.py` (`--quick` for coarser sweeps, and no files).
+
+# %%
+import sys
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import vi_jax as vi
+from vi_jax.plot.colors import BLUE, GREEN, ORANGE, RED
+
+jax.config.update("jax_enable_x64", True)
+
+sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
+from tools.ideal import vibration
+from tools.pictures import gridded, panels
+from tools.study import QUICK, say, write
+from tools.tables import table
+
+Key = tuple[float, float]
+"""A motor's stall torque T0 in N·m, and the gap in m."""
+
+# %% [markdown]
+# ## 1. Run-up and close-down, all motors in one compiled call
+
+# %%
+K, NEAR, FAR = 0.5, 0.08, 0.8  # restitution; gaps in metres, 2a and 20a: the free motion needs 11a
+# The largest κ of the sweeps, beyond each jump.
+HIGHEST: dict[Key, float] = {
+    (100.0, NEAR): 1.9, (10.0, NEAR): 1.9, (2.0, NEAR): 1.9,
+    (0.2, NEAR): 2.6, (0.1, NEAR): 3.6, (0.05, NEAR): 5.6,
+    (2.0, FAR): 1.9, (0.5, FAR): 3.0,
+}  # fmt: skip
+if QUICK:
+    HIGHEST = {key: HIGHEST[key] for key in ((10.0, NEAR), (0.2, NEAR), (2.0, FAR))}
+VALUES, SETTLE = (41, 300) if QUICK else (181, 400)
+WAYS = ("run-up", "close-down")
+
+
+def machine(torque: Any, kappa: Any, gap: float = NEAR, lag: Any = None) -> vi.Scene:
+    """Return Table 1's machine with k = 0.5; `lag` is the armature's time constant in s."""
+    table = vi.Parameters(torque=torque, control=kappa, restitution=K, gap=gap, electrical_time=lag)
+    return table.scene()
+
+
+BASE = machine(1.0, 1.0)
+assert isinstance(BASE.drive, vi.Motor)
+PER_NM, XI = float(BASE.drive.strength), float(BASE.damping_ratio)  # τ0 of 1 N·m; ξ
+
+
+def one_sweep(torque, gap, kappas):
+    """Sweep κ. The strongest motor pulls its shaft back at the rate τ0/κ per radian, 13 at T0 = 100
+    and κ = 0.5, and an explicit solver with 12 steps a cycle diverges there."""
+    swept = eqx.tree_at(
+        lambda s: (s.drive.strength, s.drive.control, s.stops[0].gap),
+        BASE,
+        (PER_NM * torque, kappas[0], gap / 0.04),
+    )
+    steps = vi.FixedStep(steps_per_cycle=24)
+    return vi.sweep(swept, "drive.control", kappas, settle=SETTLE, cycles=32, method=steps)
+
+
+grid = np.stack([np.linspace(0.5, high, VALUES) for high in HIGHEST.values()])
+torques, gaps = (np.tile(a, 2) for a in np.array(list(HIGHEST)).T)
+swept = vi.jit(jax.vmap(one_sweep))(torques, gaps, np.concatenate([grid, grid[:, ::-1]]))
+swept = jax.tree.map(np.asarray, swept)
+say(f"{grid.size * 2} values of κ swept")
+sweeps = {
+    (key, way): jax.tree.map(lambda x, i=i: x[i], swept)
+    for i, (way, key) in enumerate((way, key) for way in WAYS for key in HIGHEST)
+}
+
+
+def jump(sweep: vi.Sweep) -> tuple[float, float]:
+    """Return the smaller and the larger κ between which the motion changes most."""
+    i = int(np.nanargmax(np.abs(np.diff(np.asarray(sweep.y_min)))))
+    low, high = sorted(float(x) for x in sweep.values[i : i + 2])
+    return low, high
+
+
+# %% [markdown]
+# ## The 2π motions in κ, with one impact and with none
+#
+# They begin at motions that the sweeps met.
+
+# %%
+branches: dict[tuple[Key, int], vi.Branch] = {}
+for key, impacts in [(key, n) for n in (1, 0) for key in HIGHEST if n == 0 or key[1] == NEAR]:
+    sweep = sweeps[key, WAYS[0] if impacts else WAYS[1]]
+    fits = (np.asarray(sweep.period) == 1) & (np.asarray(sweep.impacts) == impacts)
+    i = int(np.flatnonzero(fits & (np.asarray(sweep.values) > 1))[-1 if impacts else 0])
+    guess = jax.tree.map(lambda x, i=i: x[i, -1], sweep.sections)
+    orbit = vi.find_orbit(machine(key[0], float(sweep.values[i]), key[1]), guess, throw=True)
+    branches[key, impacts] = vi.continue_orbit(
+        orbit, parameter="drive.control", bounds=(0.5, 6.0), max_step=0.2
+    )
+    say(f"T0 = {key[0]:g} N·m, gap {key[1]:g} m: {branches[key, impacts]}")
+
+
+def special(key: Key, way: str) -> vi.SpecialPoint:
+    """Return where the continued branches end or turn, so that a sweep must jump."""
+    up = way == WAYS[0]
+    points = branches[key, 1 if up and key[1] == NEAR else 0].special
+    folds = [p for p in points if p.kind == "fold"]
+    if up:
+        return max(folds, key=lambda p: p.parameter)
+    return min(folds or points, key=lambda p: p.parameter)
+
+
+# %% [markdown]
+# ## The forecast from the ideal machine
+#
+# The shaft's energy returns after a cycle, so that the motor's mean torque pays for the mean load
+# ε <Y sin φ>, a first Fourier coefficient of Y. With an ideal drive the projection of
+# ζ² Y'' + 2ξζ Y' + Y = cos φ - (1+k) V⁻ ζ δ(φ - φ0) on exp(-iφ) gives it in closed form. A motor
+# then runs at κ = ζ + L(ζ)/τ0 if its speed hardly varies within a cycle.
+
+
+# %%
+def load(zeta: np.ndarray, speed: Any = 0.0, phase: Any = 0.0) -> np.ndarray:
+    """Return the mean load torque in units of Jω²; without impacts if no speed is given."""
+    kick = (1 + K) * speed * zeta * np.exp(-1j * phase) / (2 * np.pi)
+    return -float(BASE.drive.coupling) * np.imag((0.5 - kick) * vibration(zeta, XI))
+
+
+def ideal(zeta: Any) -> vi.ClosedFormOrbits:
+    """Return the 2π motions with one impact, in closed form."""
+    return vi.closed_form_orbits(
+        vi.Scene.ideal(frequency_ratio=zeta, restitution=K, gap=NEAR / 0.04, damping_ratio=XI)
+    )
+
+
+ZETAS = np.sort(np.concatenate([np.linspace(0.4, 3.0, 2601), np.linspace(1.40, 1.45, 501)]))
+# In batches of 256: batched LAPACK calls of two thousand matrices may wait for each other forever
+# where XLA has only two threads.
+exact = jax.jit(lambda z: jax.lax.map(ideal, z, batch_size=256))(jnp.asarray(ZETAS))
+exact = jax.tree.map(np.asarray, exact)
+HARD = load(ZETAS, exact.impact_speed[:, 0], exact.impact_phase[:, 0])
+HARD = np.where(exact.admissible[:, 0], HARD, np.nan)  # the faster of two motions
+IDLE, REACH = load(ZETAS), np.abs(vibration(ZETAS, XI))
+
+
+def forecast(key: Key, way: str) -> float:
+    """Return the κ at which the motion ends."""
+    torque, gap = key
+    if way == WAYS[0]:
+        part = ZETAS < 1.05 if gap == FAR else np.isfinite(HARD)
+        return float(np.nanmax((ZETAS + (IDLE if gap == FAR else HARD) / (PER_NM * torque))[part]))
+    part = (ZETAS > 1.0) & ((gap == FAR) | (REACH < NEAR / 0.04))
+    return float(np.min((ZETAS + IDLE / (PER_NM * torque))[part]))
+
+
+numbers = {"ideal drive: 2π motion folds, ζ": float(ZETAS[np.isfinite(HARD)].max())}
+rows, missed, inside = [], [], 0
+for key in HIGHEST:
+    cells = [f"{key[0]:g}", f"{key[1] / 0.04:g}a"]
+    for way in WAYS:
+        point, (low, high), told = special(key, way), jump(sweeps[key, way]), forecast(key, way)
+        cells += [f"{low:.4f} … {high:.4f}", f"{point.kind} {point.parameter:.5f}", f"{told:.4f}"]
+        missed.append(abs(told / point.parameter - 1))
+        inside += low <= point.parameter <= high
+        name = f"T0 = {key[0]:g} N·m, gap {key[1] / 0.04:g}a, {way}"
+        numbers[f"{name}: {point.kind}, κ"] = point.parameter
+        numbers[f"{name}: forecast, κ"] = told
+    rows.append(cells)
+heads = ["T0, N·m", "gap"]
+heads += [f"{way}{x}" for way in WAYS for x in (" jumps in κ", ": special point", ": forecast")]
+motors = table(heads, rows)
+print(motors)
+
+# %% [markdown]
+# ## 2. An armature
+#
+# The stable 2π motions at many κ, with the straight line and with an armature of τe = ωL/R.
+
+# %%
+TORQUES = (10.0,) if QUICK else (0.2, 2.0, 10.0, 100.0)
+KAPPAS = np.linspace(0.5, 1.9, 5 if QUICK else 57)
+TIMES = (0.1, 1.0) if QUICK else (0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
+OMEGA = float(vi.Parameters().natural_frequency)
+
+
+def settled(torque, kappa):
+    """Return the state after 500 cycles with the straight line."""
+    scene = machine(torque, kappa)
+    steps = vi.FixedStep(steps_per_cycle=24)
+    return vi.simulate(scene, scene.start(), 1, settle=500, method=steps).last
+
+
+def found(torque, kappa, state, time=None):
+    """Return min Y, ζ, the largest multiplier's modulus, whether stable, and impacts."""
+    scene = machine(torque, kappa, lag=None if time is None else time / OMEGA)
+    orbit = vi.find_orbit(scene, scene.start(Y=state.Y, V=state.V, W=state.W))
+    slowest = jnp.max(jnp.abs(orbit.multipliers))
+    return orbit.y_min, orbit.frequency_ratio, slowest, orbit.stable, orbit.impacts
+
+
+lanes = [jnp.asarray(a.ravel()) for a in np.meshgrid(TORQUES, KAPPAS, indexing="ij")]
+states = vi.jit(jax.vmap(settled))(*lanes)
+shape = len(TORQUES), len(KAPPAS)
+line = [np.asarray(x).reshape(shape) for x in vi.jit(jax.vmap(found))(*lanes, states)]
+often, again = jax.tree.map(lambda x: jnp.tile(x, len(TIMES)), (lanes, states))
+lagging = vi.jit(jax.vmap(found))(*often, again, jnp.repeat(jnp.asarray(TIMES), lanes[0].size))
+lagging = [np.asarray(x).reshape(len(TIMES), *shape) for x in lagging]
+same = line[3] & lagging[3] & (line[4] == lagging[4])
+# The largest changes over κ, for each τe and torque.
+changes = [np.where(same, np.abs(lagging[i] - line[i]), 0.0).max(axis=2) for i in range(3)]
+heads = ["T0, N·m", "τe", "L/R, ms", "min Y", "ζ", "largest multiplier"]
+rows = [
+    [f"{torque:g}", f"{time:g}", f"{1e3 * time / OMEGA:.3g}", *(f"{x[i, j]:.1e}" for x in changes)]
+    for j, torque in enumerate(TORQUES)
+    for i, time in enumerate(TIMES)
+]
+armature = table(heads, rows)
+print(armature)
+for time in (None, 0.1):
+    scene = machine(10.0, 0.9, lag=None if time is None else time / OMEGA)
+    start = settled(10.0, 0.9)
+    orbit = vi.find_orbit(scene, scene.start(Y=start.Y, V=start.V, W=start.W), throw=True)
+    name = f"T0 = 10 N·m, κ = 0.9, {'straight line' if time is None else 'τe = 0.1'}"
+    numbers[f"{name}: min Y"] = float(orbit.y_min)
+    if time is not None:
+        numbers[f"{name}: ζ"] = float(np.asarray(orbit.frequency_ratio))
+
+# %% [markdown]
+# ## 3. An unbalanced rotor on an elastic support
+
+# %%
+STRENGTHS, LOW, HIGH, STOP = (0.1, 0.2, 1.0), 0.6, 1.8, 4.0
+
+
+def rotor(strength: float, gap: float | None = None) -> Any:
+    """Return a rotor with ε = 0.01 and ξ = 0.05, with a stop where a gap is given."""
+    return vi.machines.UnbalancedRotor(  # pyright: ignore[reportCallIssue]
+        strength=strength, control=0.8, coupling=0.01, damping_ratio=0.05, gap=gap
+    )
+
+
+def rotors(gap: float | None) -> vi.Sweep:
+    """Sweep every motor up, and then down."""
+
+    def one(strength, kappas):
+        base = rotor(0.1, gap)
+        there = eqx.tree_at(lambda r: (r.strength, r.control), base, (strength, kappas[0]))
+        steps = vi.FixedStep(steps_per_cycle=16)
+        return vi.sweep(there, "control", kappas, settle=SETTLE, cycles=16, method=steps)
+
+    up = np.linspace(LOW, HIGH, 31 if QUICK else 161)
+    values = np.stack([up] * len(STRENGTHS) + [up[::-1]] * len(STRENGTHS))
+    return jax.tree.map(np.asarray, vi.jit(jax.vmap(one))(jnp.asarray(STRENGTHS * 2), values))
+
+
+def leap(sweep: vi.Sweep, row: int) -> str:
+    """Return the two values of κ between which ζ jumps."""
+    ratio, values = np.asarray(sweep.frequency_ratio)[row], np.asarray(sweep.values)[row]
+    i = int(np.nanargmax(np.abs(np.diff(ratio))))
+    low, high = sorted(values[i : i + 2])
+    return f"{low:.4f} … {high:.4f}" if abs(ratio[i + 1] - ratio[i]) > 0.05 else "none"
+
+
+free, held = rotors(None), rotors(STOP)
+speeds, rows, turning = np.linspace(0.5, 2.2, 170_001), [], {}
+for i, strength in enumerate(STRENGTHS):
+    there = rotor(strength)
+    orbit = vi.find_orbit(there, vi.simulate(there, there.start(), 1, settle=300).last, throw=True)
+    turning[strength] = vi.continue_orbit(orbit, parameter="control", bounds=(LOW, HIGH))
+    points = [p.parameter for p in turning[strength].special if p.kind == "fold"]
+    kappa = np.asarray(there.averaged_control(speeds))
+    falls = np.flatnonzero(np.diff(kappa) < 0)
+    averaged = [float(kappa[falls[0]]), float(kappa[falls[-1] + 1])] if falls.size else []
+    cells = [f"{strength:g}"]
+    for k, way in enumerate(WAYS):
+        cells.append(leap(free, i + k * len(STRENGTHS)))
+        if not averaged:
+            cells += ["none", "none"]
+            continue
+        at = sorted(points, reverse=True)[k]
+        cells += [f"{at:.5f}", f"{averaged[k]:.5f}"]
+        numbers[f"τ0 = {strength:g}, {way}: fold, κ"] = at
+        numbers[f"τ0 = {strength:g}, {way}: averaged fold, κ"] = averaged[k]
+    rows.append([*cells, leap(held, i)])
+heads = ["τ0", *(f"{way}{x}" for way in WAYS for x in (" jumps in κ", ": fold", ": averaged"))]
+unbalanced = table([*heads, "run-up with a stop"], rows)
+print(unbalanced)
+
+# %% [markdown]
+# ## Picture
+
+# %%
+figure, axes = panels(14.0, 8.2, 2, 3)
+COLORS = dict(zip((100.0, 10.0, 2.0, 0.5, 0.2, 0.1, 0.05), "k #0072b2 #56b4e9 #882255 #e69f00 "
+                  "#d55e00 #332288".split(), strict=True))  # fmt: skip
+MARKS = {WAYS[0]: {"marker": "o", "mfc": "none", "ms": 4.5}, WAYS[1]: {"marker": "x", "ms": 3.6}}
+
+
+def draw(ax: Any, keys: list[Key], y: str, x: str) -> None:
+    """Draw the branches and sweeps of some motors."""
+    for key in keys:
+        for (name, _), branch in branches.items():
+            if name == key:
+                vi.plot_branch(branch, ax=ax, y=y, x=x, special=False, legend=False,
+                               color=COLORS[key[0]], lw=1.8)  # fmt: skip
+        for way in WAYS:
+            look = {"color": COLORS[key[0]], "mew": 0.7, "markevery": 6, "alpha": 0.8}
+            vi.plot_sweep(sweeps[key, way], ax=ax, y=y, x="values" if x == "parameter" else x,
+                          **look, **MARKS[way])  # fmt: skip
+        ax.plot([], [], color=COLORS[key[0]], lw=2.5, label=f"T0 = {key[0]:g} N·m")
+
+
+far, near = ([key for key in HIGHEST if key[1] == gap] for gap in (FAR, NEAR))
+for ax, keys in ((axes[0, 0], far), (axes[0, 1], [key for key in near if key[0] < 2])):
+    draw(ax, keys, "frequency_ratio", "parameter")
+    ax.axline((1, 1), slope=1, color="0.6", lw=0.9, ls=":")
+    ax.set(xlim=(0.5, max(HIGHEST[key] for key in keys)), ylim=(0.4, 3.2))
+    ax.set_ylabel("mean frequency ratio ζ")
+for key in near[:: 1 if QUICK else 3]:
+    for y in ("y_min", "y_max"):
+        draw(axes[0, 2], [key], y, "frequency_ratio")
+axes[0, 2].set(xlim=(0.5, 1.9), xlabel="mean frequency ratio ζ", ylabel="min Y, max Y (a)")
+for (key, way), sweep in sweeps.items():
+    slip = (np.asarray(sweep.values) - np.asarray(sweep.frequency_ratio)) * key[0]
+    look = {"color": COLORS[key[0]], "ls": "none", "markevery": 8, "mew": 0.6, **MARKS[way]}
+    axes[1, 0].plot(sweep.frequency_ratio, slip, **look)
+for needed, color, label in ((IDLE, "0.35", "no impacts"), (HARD, BLUE, "2π with impact")):
+    look = {"lw": 2.6, "alpha": 0.6, "zorder": 3, "label": f"ideal drive, {label}"}
+    axes[1, 0].plot(ZETAS, needed / PER_NM, color=color, **look)
+axes[1, 0].set(yscale="log", xlim=(0.5, 1.9), ylim=(1e-3, 2), xlabel="mean frequency ratio ζ",
+               ylabel="T0 (κ - ζ) (N·m)")  # fmt: skip
+for j, (torque, color) in enumerate(zip(TORQUES, (GREEN, ORANGE, BLUE, RED), strict=False)):
+    axes[1, 1].loglog(
+        TIMES, changes[0][:, j], "o-", color=color, ms=4, label=f"T0 = {torque:g} N·m"
+    )
+axes[1, 1].set(xlabel="electrical time τe = ωL/R (1/ω)", ylabel="largest change of min Y (a)")
+for i, (strength, color) in enumerate(zip(STRENGTHS, (RED, BLUE, GREEN), strict=True)):
+    kappa = np.asarray(rotor(strength).averaged_control(speeds))
+    axes[1, 2].plot(kappa, speeds, color=color, lw=5, alpha=0.25)
+    vi.plot_branch(turning[strength], ax=axes[1, 2], y="frequency_ratio", color=color, lw=1.2,
+                   legend=False, label=f"τ0 = {strength:g}")  # fmt: skip
+    for row, way in ((i, WAYS[0]), (i + len(STRENGTHS), WAYS[1])):
+        look = {"color": color, "ls": "none", "markevery": 3, "mew": 0.7, **MARKS[way]}
+        axes[1, 2].plot(free.values[row], np.asarray(free.frequency_ratio)[row], **look)
+axes[1, 2].set(xlim=(LOW, HIGH), ylim=(LOW, HIGH), xlabel="motor control κ", ylabel="mean speed ζ")
+gridded(axes.flat, (
+    "ζ against κ, stop out of reach", "ζ against κ, stop at 2a", "Extremes, stop at 2a",
+    "Load on the motor, all sweeps", "Armature beside straight line, κ = 0.5 … 1.9",
+    "Unbalanced rotor; broad: averaged",
+))  # fmt: skip
+for ax in axes.flat:
+    ax.legend(fontsize=8.5, framealpha=0.9)
+figure.suptitle("○ run-up, × close-down; lines: 2π motions continued in κ (dashed: unstable)")
+
+# %%
+text = f"""# Motors of limited power
+
+![Sweeps, branches, load, armature and rotor](../figures/motors.png)
+
+## Table 1's machine
+
+k = 0.5, Table 1's damping. Each sweep: {VALUES} values of κ from 0.5 up or down to it, at each
+{SETTLE} drive cycles to settle and 32 observed. *Special point*: where the continued 2π motion ends
+or turns. *Forecast* of that point: κ = ζ + L(ζ)/τ0 with the ideal machine's load L in closed form.
+
+{motors}
+
+- {inside} of {len(missed)} special points lie between the two values of κ where the sweep jumps.
+  Strong motors close down a little too early, because a coarse step of κ sets off a transient that
+  reaches the stop. The weakest motor needs the cycles of several values to leave its fold.
+- The forecast gives the κ of all special points to {100 * max(missed):.2f} %, from T0 = 0.05 to
+  100 N·m, although it leaves out that the shaft's speed varies within a cycle.
+- Sommerfeld effect: with the stop out of reach the run-up of a weak motor hangs at resonance, where
+  ζ hardly rises with κ, and then jumps.
+- With the stop at 2a the motor does not hang at ζ = 1. The impact motion carries on beyond it until
+  it folds, so that the effect needs a far weaker motor.
+
+## An armature
+
+Stable 2π motions at {len(KAPPAS)} values of κ from 0.5 to 1.9; largest changes over κ.
+
+{armature}
+
+- Over a period the armature keeps nothing, so that mean torque and mean speed lie on the straight
+  line whatever the inductance is. The extremes change by at most
+  {(changes[0] / np.asarray(TIMES)[:, None]).max():.1e} τe, the frequency ratio by
+  {changes[1].max():.0e}, and the largest multiplier by {changes[2].max():.1e}.
+- So the straight line does for frequency responses, extremes and impacts. Where the current itself
+  or a run-up from rest matters, take `DCMotor`.
+
+## An unbalanced rotor
+
+ε = 0.01, ξ = 0.05. *Averaged*: the fold of κ = ζ/w0 + ε ξ ζ⁵/(τ0 D), first order in ε.
+
+{unbalanced}
+
+- Averaging gives the κ of the folds to 0.1 %. A strong motor (τ0 = 1) has no jump.
+- A stop at {STOP:g} m r/M takes the peak away and bends the response to higher speeds, as a
+  hardening spring would. It can bring a jump where there was none, and hold a weak motor down.
+"""
+write("motors", text, numbers, figure)
+say("done")
