@@ -167,6 +167,34 @@ def _response(panels: dict[str, Any]) -> list[str]:
     ]
 
 
+def _branches(panels: dict[str, Any]) -> list[str]:
+    """Return the special points of the branches behind Figure 2, and how they hang together."""
+    rows = []
+    for panel in panels["panels"]:
+        motions: dict[str, list[str]] = {}
+        for x in panel["special_points"]:
+            name = f"{2 * x['cycles']}π, {x['impacts']} impact{'s' * (x['impacts'] > 1)}"
+            motions.setdefault(name, []).append(f"{x['kind']} {x['frequency_ratio']:.6f}")
+        for name, points in motions.items():
+            k, xi = panel["restitution"], panel["damping_ratio"]
+            rows.append(f"| {k:g} | {xi:.4f} | {name} | {'; '.join(points)} |")
+    return [
+        "## Why the motion takes 4π",
+        "",
+        "At BB' the vibration without impacts touches the stop. The 2π motion with one impact is "
+        "born there, and it is unstable: a grazing gives it a multiplier without bound. It becomes "
+        "stable at CC' only, in a period doubling. The doubled motion has two impacts in 4π, and "
+        "loses one of them in a grazing of its own. From there the 4π motion with one impact goes "
+        "on, to another grazing. So the 4π motion does not come from the grazing at BB': it hangs "
+        "together with CC'.",
+        "",
+        "| k | ξ | motion | special points of its branch, ζ |",
+        "|---|---|---|---|",
+        *rows,
+        "",
+    ]
+
+
 def _borders(borders: dict[str, float | None]) -> list[str]:
     """Where the discrepancy lives, in two planes."""
     return [
@@ -244,6 +272,7 @@ def as_markdown(found: Findings) -> str:
         "![With the motor](motor.png)",
         "",
         *_response(found.panels),
+        *_branches(found.panels),
         *_borders(found.borders),
         "## Faults of the printed text",
         "",

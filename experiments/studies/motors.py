@@ -361,7 +361,9 @@ gridded(axes.flat, (
     "Unbalanced rotor; broad: averaged",
 ))  # fmt: skip
 for ax in axes.flat:
-    ax.legend(fontsize=8.5, framealpha=0.9)
+    handles, labels = ax.get_legend_handles_labels()
+    named = dict(zip(labels, handles, strict=True))  # each once
+    ax.legend(named.values(), named, fontsize=8.5, framealpha=0.9)
 figure.suptitle("○ run-up, × close-down; lines: 2π motions continued in κ (dashed: unstable)")
 
 # %%
