@@ -61,6 +61,7 @@ def machine(torque: Any, kappa: Any, gap: float = NEAR, lag: Any = None) -> vi.S
 BASE = machine(1.0, 1.0)
 assert isinstance(BASE.drive, vi.Motor)
 PER_NM, XI = float(BASE.drive.strength), float(BASE.damping_ratio)  # τ0 of 1 N·m; ξ
+COUPLING = float(BASE.drive.coupling)
 
 
 def one_sweep(torque, gap, kappas):
@@ -135,7 +136,7 @@ def special(key: Key, way: str) -> vi.SpecialPoint:
 def load(zeta: np.ndarray, speed: Any = 0.0, phase: Any = 0.0) -> np.ndarray:
     """Return the mean load torque in units of Jω²; without impacts if no speed is given."""
     kick = (1 + K) * speed * zeta * np.exp(-1j * phase) / (2 * np.pi)
-    return -float(BASE.drive.coupling) * np.imag((0.5 - kick) * vibration(zeta, XI))
+    return -COUPLING * np.imag((0.5 - kick) * vibration(zeta, XI))
 
 
 def ideal(zeta: Any) -> vi.ClosedFormOrbits:
