@@ -1,13 +1,10 @@
-"""What the studies share, and that none of their files outgrows its subject."""
+"""What the studies share."""
 
 import time
-from pathlib import Path
 
 import pytest
 from tools.tables import or_dash, table
 from tools.timing import Clock, repeated, side_by_side
-
-FOLDER = Path(__file__).parents[2] / "experiments"
 
 
 def test_table():
@@ -35,8 +32,3 @@ def test_clocks():
     with Clock() as clock:
         time.sleep(0.05)
     assert clock.wall >= 0.039 > clock.cpu  # a clock may go in steps of 10 ms
-
-
-def test_no_file_has_more_than_350_lines():
-    lines = {path: path.read_text(encoding="utf-8").count("\n") for path in FOLDER.rglob("*.py")}
-    assert len(lines) > 50 and max(lines.values()) <= 350
