@@ -15,7 +15,7 @@ FILES = sorted(HOUSE.rglob("*.py"))
 
 # Each may import from those before it.
 ORDER = "lanes machine flow machines orbit scans robust plot explore cli".split()
-LATE = [["explore", "serve"]]
+LATE = [["explore", "named"], ["explore", "serve"]]
 TOOLS = {"_checks", "_files", "_messages", "_programs", "_types"}
 
 

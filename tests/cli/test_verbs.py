@@ -1,21 +1,55 @@
-"""Every verb of the command line once: what it prints, writes and draws."""
+"""Every verb of the command line: what it prints, writes and draws."""
 
 import csv
 import importlib
+import os
+import signal
+import sys
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 import vi_jax as vi
 import xarray as xr
 from vi_jax import cli
+from vi_jax.cli import verbs
 
-from toml_files import IDEAL, written
+READY = sorted((Path(__file__).parents[2] / "experiments").glob("*.toml"))
+
+OWN = """
+import jax.numpy as jnp
+import vi_jax as vi
 
 
-def ran(capsys, verb, text, code=0):
-    assert cli.main([verb, written(IDEAL + text)]) == code
-    return capsys.readouterr().out
+class Body(vi.AbstractMachine):
+    omega: float = 0.9
+    stops: tuple = (vi.RigidStop(1.0, 0.7),)
+
+    @property
+    def cycle(self):
+        return 2 * jnp.pi / self.omega
+
+    def field(self, s, x):
+        return vi.OscillatorState(x.V, jnp.cos(self.omega * s) - x.Y - 0.1 * x.V)
+
+
+class Started(Body):
+    def start(self):
+        return vi.OscillatorState(0.2, 0.1)
+"""
+
+BODY = """
+[simulate]
+cycles = 3
+settle = 20
+picture = "new/m.png"
+output = "new/m.csv"
+[scan]
+axes = { omega = [0.8, 1], stops.0.gap = [0.9, 1] }
+settle = 40
+picture = "s.png"
+"""
 
 
 def rows(path):
@@ -27,164 +61,242 @@ def is_png(path):
     return Path(path).read_bytes()[:4] == b"\x89PNG"
 
 
-def test_simulate(here, capsys):
-    text = (
-        "[simulate]\ncycles = 4\nsettle = 60\nsamples = 8\noutput = 'new/m.csv'\npicture = 'm.png'"
-    )
-    out = ran(capsys, "simulate", text)
+def test_simulate_samples_and_cycles(run):
+    text = "[simulate]\ncycles = 4\nsettle = 60\noutput = 'new/m.csv'\npicture = 'm.png'\n"
+    out = run("simulate", text + "samples = 8")
     assert "Run of 4 cycles" in out and "new/m.csv" in out and is_png("m.png")
     table = rows("new/m.csv")
-    assert list(table[0]) == ["cycles", "time", "Y", "V"] and len(table) == 33
+    assert list(table[0]) == ["sample", "sample_Y", "sample_V", "sample_time"] and len(table) == 33
     scene = vi.Scene.ideal(frequency_ratio=0.9, damping_ratio=0.05)
-    run = vi.simulate(scene, scene.start(), 4, settle=60, method=vi.ExactFlight())
-    np.testing.assert_allclose([float(r["Y"]) for r in table[::8]], run.sections.Y, atol=1e-12)
+    whole = vi.simulate(scene, scene.start(), 4, settle=60)
+    Y = [float(row["sample_Y"]) for row in table[::8]]
+    np.testing.assert_allclose(Y, whole.sections.Y, atol=1e-12)
+    run("simulate", text)
+    table = rows("new/m.csv")
+    assert [row["cycle"] for row in table] == ["1", "2", "3", "4"] and table[0]["impacts"] == "1"
+    assert float(table[3]["section_Y"]) == pytest.approx(float(whole.last.Y), abs=1e-12)
+    assert "`max_steps`" in run("simulate", text + "max_steps = 5", 1)
 
 
-def test_simulate_cycle_by_cycle_and_failing(here, capsys):
-    text = "[simulate]\ncycles = 3\nsettle = 60\noutput = 'm.csv'\n"
-    ran(capsys, "simulate", text)
-    table = rows("m.csv")
-    assert [row["cycle"] for row in table] == ["1", "2", "3"] and table[0]["impacts"] == "1"
-    assert "`max_steps`" in ran(capsys, "simulate", text + "max_steps = 5", code=1)
-
-
-SCAN = (
-    "[axes]\ndrive.frequency_ratio = [0.8, 0.9]\nstart.Y = [0.0, 1.0, 2.5]\n[scan]\nsettle = 60\n"
-)
-
-
-def test_scan(here, capsys):
-    out = ran(capsys, "scan", SCAN)
-    assert "Scan of 6 motions over drive.frequency_ratio (2: 0.8 … 0.9), start.Y" in out
-    assert "failed: 2 of 6 motions" in out and "2: The start or a number of the machine" in out
-    assert "<xarray.Dataset>" in out and "Nothing was written" in out
-    assert [path.name for path in here.iterdir()] == ["file.toml"]
-    out = ran(capsys, "scan", SCAN + "store = 'new/s.zarr'\npicture = 's.png'")
-    assert "new/s.zarr" in out and "<xarray.Dataset>" not in out and is_png("s.png")
+def test_scan(run):
+    text = "[scan]\nsettle = 60\n"
+    text += "axes = {drive.frequency_ratio = [0.8, 0.9], start.Y = [0, 1, 2.5]}\n"
+    out = run("scan", text)
+    assert "Scan of 6 motions over drive.frequency_ratio (2), start.Y (3)" in out
+    assert "  period 2π: " in out and "warning: 2 of 6 lanes failed (bad_start: 2)" in out
+    assert "<xarray.Dataset>" in out and os.listdir() == ["file.toml"]
+    asked = text + "store = 'new/s.zarr'\npicture = 's.png'\noutput = 's.nc'"
+    out = run("scan", asked)
+    assert "new/s.zarr" in out and is_png("s.png")
     data = xr.open_zarr("new/s.zarr")
     scene = vi.Scene.ideal(frequency_ratio=0.8, damping_ratio=0.05)
-    run = vi.simulate(scene, scene.start(), 128, settle=60, method=vi.ExactFlight())
-    assert float(data["y_min"][0, 0]) == pytest.approx(float(np.min(run.y_min)), abs=1e-12)
-    again = ran(capsys, "scan", SCAN + "store = 'new/s.zarr'\npicture = 's.png'")
-    assert again == out
-    assert cli.main(["scan", written(IDEAL + SCAN + "store = 'new/s.zarr'\ncycles = 200")]) == 2
-    assert "the cycles is 128, and now it is 200" in capsys.readouterr().err
+    whole = vi.simulate(scene, scene.start(), 128, settle=60)
+    assert float(data["y_min"][0, 0]) == pytest.approx(float(np.min(whole.y_min)), abs=1e-12)
+    with xr.open_dataset("s.nc") as kept:
+        np.testing.assert_array_equal(kept["y_min"], data["y_min"])
+    assert run("scan", asked) == out
+    said = run("scan", text + "store = 'new/s.zarr'\ncycles = 200", 2)
+    assert "the cycles is 128, and now it is 200" in said
 
 
-def test_interrupted_scans_tell_how_to_go_on(here, capsys, monkeypatch):
+def test_interrupted_scans_tell_how_to_go_on(run, capsys, monkeypatch):
     def interrupt(*args, **options):
         raise KeyboardInterrupt
         yield
 
     monkeypatch.setattr(importlib.import_module("vi_jax.scans._computed"), "run_here", interrupt)
-    assert cli.main(["scan", written(IDEAL + SCAN)]) == 130
-    assert "nothing was kept" in capsys.readouterr().err.splitlines()[-1]
-    assert cli.main(["scan", written(IDEAL + SCAN + "store = 's.zarr'")]) == 130
+    text = "[scan]\naxes.start.Y = [0.0, 1.0]\n"
+    Path("file.toml").write_text("machine = 'vi_jax.machines:Duffing'\n" + text)
+    assert cli.main(["scan", "file.toml"]) == 130
+    assert "nothing was written" in capsys.readouterr().err.splitlines()[-1]
+    Path("file.toml").write_text("machine = 'vi_jax.machines:Duffing'\n" + text + "store = 's'")
+    assert cli.main(["scan", "file.toml"]) == 130
     last = capsys.readouterr().err.splitlines()[-1]
-    assert last == "vi-jax: interrupted; the same command goes on from what is in s.zarr"
+    assert last == "vi-jax: interrupted; the same command goes on from what is in s"
 
 
 @pytest.mark.slow
-def test_sweep(here, capsys):
-    text = """[sweep]
-    parameter = "drive.frequency_ratio"
-    values = { from = 1.2, to = 1.7, count = 11 }
-    up_and_down = true
-    settle = 100
-    picture = "s.png"
-    output = "s.csv"
-    """
-    out = ran(capsys, "sweep", text)
+def test_sweep(run):
+    out = run("sweep", """[sweep]
+        parameter = "drive.frequency_ratio"
+        values = { from = 1.2, to = 1.7, count = 11 }
+        up_and_down = true
+        settle = 100
+        picture = "s.png"
+        output = "s.csv"
+        """)  # fmt: skip
     name = "Sweep of drive.frequency_ratio, 11 values"
     assert f"up: {name}:\n  2π with 1 impact from 1.2\n" in out
     assert f"down: {name}:\n  2π with 0 impacts from 1.7\n" in out
-    assert out.count(", jump since ") == 2
-    assert is_png("s.png")
+    assert out.count(", jump since ") == 2 and is_png("s.png")
     table = rows("s.csv")
     assert [row["direction"] for row in table] == ["up"] * 11 + ["down"] * 11
-    assert {row["result"] for row in table} == {"completed"}
-    up = {row["values"]: float(row["y_min"]) for row in table[:11]}
-    down = {row["values"]: float(row["y_min"]) for row in table[11:]}
+    assert {row["result"] for row in table} == {"successful"}
+    up, down = (
+        {row["drive.frequency_ratio"]: float(row["y_min"]) for row in half}
+        for half in (table[:11], table[11:])
+    )
     assert up.keys() == down.keys()
     # The resonance bends to the right: between the jumps the way back is another.
     assert max(abs(up[value] - down[value]) for value in up) > 0.5
-    assert down[table[10]["values"]] == pytest.approx(up[table[10]["values"]], abs=1e-4)
 
 
 @pytest.mark.slow
-def test_basins(here, capsys):
-    text = """[basins]
-    region = { start.Y = [0.05, 4.05], start.V = [-1, 1] }
-    resolution = [4, 3]
-    settle = 200
-    picture = "b.png"
-    output = "b.csv"
-    """
-    out = ran(capsys, "basins", text)
-    assert "failed: 6 of 12 starts" in out and "period 2π, 1 impact," in out and is_png("b.png")
+def test_basins(run):
+    out = run("basins", """[basins]
+        region = { start.Y = [0.05, 4.05], start.V = [-1, 1] }
+        resolution = [4, 3]
+        settle = 200
+        picture = "b.png"
+        output = "b.csv"
+        """)  # fmt: skip
+    assert "failed: 50.00 %" in out and "period 2π, 1 impact," in out and is_png("b.png")
     table = rows("b.csv")
     assert sorted(row["label"] for row in table) == ["-3"] * 6 + ["0"] * 6
     assert {row["start.Y"] for row in table} == {"0.55", "1.55", "2.55", "3.55"}
 
 
 @pytest.mark.slow
-def test_orbit_and_its_branch(here, capsys):
+def test_orbit_and_its_branch(run):
     text = """[orbit]
-    guess = { Y = 1.9, V = 1.54 }
-    picture = "o.png"
-    [orbit.continue]
-    parameter = "drive.frequency_ratio"
-    bounds = [0.88, 0.92]
-    picture = "c.png"
-    output = "c.csv"
-    """
-    out = ran(capsys, "orbit", text)
+        guess = { Y = 1.9, V = 1.54 }
+        picture = "o.png"
+        root_finder = { class = "vi_jax:Newton", tolerance = 1e-9 }
+        [continue]
+        parameter = "drive.frequency_ratio"
+        bounds = [0.88, 0.92]
+        picture = "c.png"
+        output = "c.csv"
+        """
+    out = run("continue", text)
     assert "Orbit of period 2π with 1 impact, stable" in out and "Branch of " in out
     assert is_png("o.png") and is_png("c.png")
     table = rows("c.csv")
-    ends = sorted((float(table[0]["parameter"]), float(table[-1]["parameter"])))
+    ends = sorted(float(row["drive.frequency_ratio"]) for row in (table[0], table[-1]))
     np.testing.assert_allclose(ends, [0.88, 0.92], atol=1e-12)
-    assert {"y_min", "y_max", "clearance", "stable"} <= set(table[0])
+    assert {"y_min", "y_max", "clearance", "stable", "section_Y"} <= set(table[0])
+    os.remove("o.png")
+    failing = text.replace("tolerance = 1e-9", "max_steps = 1")
+    assert "No orbit" in run("continue", failing, 1) and not os.path.exists("o.png")
 
 
-@pytest.mark.slow
-def test_an_orbit_that_is_not_found(here, capsys):
-    text = "[orbit]\nguess = { Y = 1.9, V = 1.54 }\nroot_finder = 'gradient'\nmax_steps = 3"
-    assert "No orbit" in ran(capsys, "orbit", text, code=1)
+@pytest.mark.parametrize(
+    "head, period",
+    [
+        ('machine = "mine.py:Started"\n[start]\nY = 0.3\n', "1 cycle"),
+        ('machine = "mine:Body"\n[start]\nclass = "vi_jax:OscillatorState"\nY = 0\nV = 0\n',
+         "1 cycle"),
+    ],
+)  # fmt: skip
+def test_machines_of_ones_own(run, here, monkeypatch, head, period):
+    """A start without arguments, and a machine without any; periods in the machine's words."""
+    (here / "mine.py").write_text(OWN)
+    monkeypatch.delitem(sys.modules, "mine", raising=False)
+    run("simulate", head + BODY)
+    assert is_png("new/m.png") and len(rows("new/m.csv")) == 3
+    out = run("scan", head + BODY)
+    assert f"period {period}: 4 (100.0 %)" in out and is_png("s.png")
+    said = run("simulate", 'machine = "mine.py:Body"\n' + BODY, 2)
+    assert said.count("\n") == 1 and "`start` must be given for a Body" in said
+    said = run("simulate", 'machine = "mine.py:Body"\n[start]\nY = 1\n' + BODY, 2)
+    assert said.count("\n") == 1 and "[start] needs the `class` of a state" in said
 
 
-def test_help_lists_the_keys(capsys):
-    with pytest.raises(SystemExit) as ended:
-        cli.main(["orbit", "--help"])
-    assert ended.value.code == 0
-    out = " ".join(capsys.readouterr().out.split())
-    assert (
-        "keys of [orbit]: cycles, guess, root_finder" in out and "keys of [orbit.continue]:" in out
-    )
+def test_machines_with_integers_flags_and_arrays_and_without_a_drive(run):
+    beam = """machine = "vi_jax.machines:Beam"
+        method = { class = "vi_jax:ExactFlight" }
+        arguments = { modes = 4, two_sided = true, shaken = "tip", gap = 1 }
+        start = { displacement = [0.1, 0, 0, 0] }
+        """
+    files = "[simulate]\ncycles = 2\nsettle = 2\npicture = 'b.png'\noutput = 'b.csv'\n"
+    assert "displacement[3] = " in run("simulate", beam + files)
+    assert "section_displacement[3]" in rows("b.csv")[0] and is_png("b.png")
+    run("simulate", 'machine = "vi_jax.machines:ReliefValve"\n' + files)
+    assert "section_pressure" in rows("b.csv")[0] and is_png("b.png")
+    si = """machine = "vi_jax:Parameters.scene"
+        arguments = { torque = 10, gap = 0.08, drive = "ideal" }
+        """
+    assert "a ω" in run("simulate", si + files)
+    assert "W = " in run("simulate", si.replace("ideal", "motor") + files)
 
 
-def test_a_ready_machine_and_one_of_ones_own(here, capsys):
-    own = "import vi_jax as vi\n\n\ndef ball():\n    return vi.machines.BouncingBall()\n"
-    own += "\n\ndef dead():\n    return vi.machines.BouncingBall(restitution=-1)\n"
-    (here / "shaken.py").write_text(own)
-    asked = written("[simulate]\ncycles = 3")
-    assert cli.main(["simulate", str(asked), "--machine", "shaken:ball"]) == 0
-    assert "Run of 3 cycles" in capsys.readouterr().out
-    ready = written(
-        "[machine]\nname = 'BouncingBall'\n[start]\nspeed = 1.5\n[simulate]\ncycles = 3"
-    )
-    assert cli.main(["simulate", str(ready)]) == 0
-    for name, sentence in (
-        ("shaken:bell", "cannot be found"),
-        ("nowhere:ball", "cannot be found"),
-        ("shaken", "must be package.module:function"),
-        ("os:system", "must be a function without arguments"),
-        ("math:pi", "must be a function without arguments"),
-        ("sys:exit", "raised SystemExit"),
-        ("os:getcwd", "must return a machine"),
-        ("shaken:dead", "shaken.py, line 9)"),
-    ):
-        assert cli.main(["simulate", str(asked), "--machine", name]) == 2
-        assert sentence in capsys.readouterr().err
-    assert cli.main(["simulate", str(ready), "--machine", "shaken:ball"]) == 2
-    assert "beside --machine" in capsys.readouterr().err
+PARTS = "[simulate]\ncycles = 40\nsettle = 30\nsamples = 4\noutput = 'o.csv'\n"
+
+
+def short(monkeypatch):
+    """Runs in parts of ten cycles."""
+    monkeypatch.setattr(verbs, "_CYCLES", 10)
+
+
+def test_a_run_in_parts_is_the_same_run(monkeypatch):
+    short(monkeypatch)
+    scene = vi.Scene.ideal(frequency_ratio=0.9, damping_ratio=0.02)
+    options = {"settle": 3, "samples": 4, "impact_log": 2}
+    whole = vi.simulate(scene, scene.start(Y=0.3), 23, **options)
+    parts = verbs.run_in_parts(scene, scene.start(Y=0.3), 23, **options)
+    for name in ("sections", "y_min", "impacts", "duration", "samples", "impact_log", "clearance"):
+        each = (jax.tree.leaves(getattr(run, name)) for run in (parts, whole))
+        for x, y in zip(*each, strict=True):
+            np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-9)
+    assert bool(parts.successful) and int(parts.steps) >= int(whole.steps)
+
+
+@pytest.mark.parametrize("pressed, kept", [(1, None), (3, 81)])
+def test_ctrl_c_keeps_the_recorded_cycles_of_a_run(run, monkeypatch, capsys, pressed, kept):
+    """Pressed while it settles and records its first part, or later; then again while it writes."""
+    short(monkeypatch)
+    compute, write, calls = verbs.simulate, verbs._write, []
+
+    def computed(*args, **options):
+        calls.append(1)
+        if len(calls) == pressed:
+            os.kill(os.getpid(), signal.SIGINT)
+        return compute(*args, **options)
+
+    def written(*args, **options):
+        os.kill(os.getpid(), signal.SIGINT)
+        return write(*args, **options)
+
+    monkeypatch.setattr(verbs, "simulate", computed)
+    monkeypatch.setattr(verbs, "_write", written)
+    before = signal.getsignal(signal.SIGINT)
+    run("simulate", PARTS, 130)
+    assert signal.getsignal(signal.SIGINT) is before and len(calls) == pressed
+    assert (len(rows("o.csv")) if kept else os.path.exists("o.csv")) == (kept or False)
+
+
+def test_ctrl_c_keeps_the_way_up_of_a_sweep(run, monkeypatch):
+    compute, calls = verbs.sweep, []
+
+    def computed(*args, **options):
+        calls.append(1)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return compute(*args, **options)
+
+    monkeypatch.setattr(verbs, "sweep", computed)
+    text = "[sweep]\nparameter = 'stops.0.gap'\nvalues = [2.0, 1.9]\nsettle = 9\ncycles = 8\n"
+    out = run("sweep", text + "up_and_down = true\noutput = 'o.csv'", 130)
+    assert "down: Sweep" in out and [row["direction"] for row in rows("o.csv")] == ["down"] * 2
+
+
+def test_a_picture_that_cannot_be_drawn_loses_nothing(run):
+    text = "[scan]\naxes.start.Y = [0.0, 1.0]\nsettle = 9\npicture = 'p.png'\noutput = 'o.csv'"
+    out = run("scan", text)
+    assert "picture: not drawn: " in out and len(rows("o.csv")) == 2
+
+
+@pytest.mark.parametrize("path", READY, ids=lambda path: path.stem)
+def test_ready_files(path, monkeypatch):
+    from vi_jax.cli.files import read
+    from vi_jax.explore.named import machine_of
+
+    tables = read(str(path))
+    machine = machine_of(tables["machine"], tables["arguments"])
+    (verb,) = verbs.VERBS.keys() & tables.keys()
+    assert f"vi-jax {verb} experiments/{path.name}" in path.read_text("utf-8")
+    assert tables[verb].keys() <= {*verbs.VERBS[verb].keys()} and machine.start() is not None
+
+
+def test_there_are_ready_files():
+    assert {"regimes", "basins", "frequency_response"} <= {path.stem for path in READY}

@@ -74,7 +74,7 @@ def test_files_run(page, tmp_path):
     """Each file by the verb that it has a table of."""
     for text in blocks(page, "toml"):
         (tmp_path / "page.toml").write_text(text, encoding="utf-8")
-        verb = next(x for x in ("scan", "sweep", "basins", "orbit", "simulate") if f"[{x}]" in text)
+        verb = next(x for x in ("scan", "sweep", "basins", "simulate") if f"[{x}]" in text)
         run(tmp_path, "-m", "vi_jax.cli", verb, "page.toml")
         for name in re.findall(r'^(?:picture|output|store) = "(.*)"', text, re.M):
             assert (tmp_path / name).exists()

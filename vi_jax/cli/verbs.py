@@ -1,305 +1,303 @@
-"""What the command line does with a file: one function for each verb.
+"""The verbs of the command line: each calls the function of its name, prints, writes and draws."""
 
-Each checks everything, the paths it will write to included, before it simulates, and returns the
-lines to print and whether anything succeeded.
-"""
-
-import math
+import dataclasses
+import inspect
+import signal
 import warnings
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from matplotlib.axes import Axes
+import xarray as xr
 from matplotlib.figure import Figure
 
-from .._files import write_whole
-from .._messages import so_many
-from ..flow import RESULTS, Run, average_names, number_of
-from ..machine import AbstractMachine
-from ..orbit import Orbit, continue_orbit, find_orbit
-from ..plot import (
-    BLUE,
-    RED,
-    plot_basins,
-    plot_branch,
-    plot_history,
-    plot_phase_portrait,
-    plot_regimes,
-    plot_sweep,
-)
-from ..scans import COLUMNS, LanesFailed, Sweep
-from ..scans import basins as find_basins
-from ..scans import scan as run_scan
-from .checks import (
-    check_continuation,
-    check_map,
-    check_names,
-    check_paths,
-    check_quantity,
-    check_range,
-)
-from .config import (
-    BasinsTable,
-    Config,
-    ContinueTable,
-    OrbitTable,
-    ScanTable,
-    SimulateTable,
-    SweepTable,
-    start_of,
-)
-from .output import (
-    axes_in_words,
-    cycle_columns,
-    failures,
-    new_axes,
-    ranges_in_words,
-    regimes_in_words,
-    sample_columns,
-    saved,
-    sweep_columns,
-    write_rows,
-)
-from .parts import noted_interrupts, simulate_in_parts, sweep_in_parts
-from .toml import ConfigError, given, in_terms_of, keys_of
+from .. import plot
+from .._checks import unwritable
+from .._messages import Interrupted
+from ..explore.named import InputError, check_keys, value_of
+from ..flow import RESULTS, Run, RunOptions, planned, simulate
+from ..machine import AbstractMachine, is_autonomous
+from ..orbit import continue_orbit, find_orbit
+from ..scans import REGIMES, Sweep, basins, periods_of, scan, sweep
+from .files import errors_in, start_of
 
-Tell = Callable[[str], None]
+_ENDINGS = {"output": (".csv", ".nc"), "picture": (".png", ".pdf", ".svg")}
+_LEFT_OUT = {"machine", "orbit", "options", "progress", "cluster", "throw", "key"}
+_NOT_NEEDED = {*_LEFT_OUT, "start", "guess"}
+
+# Cycles, or samples as so many, of one part of a run, which takes a fraction of a second.
+_CYCLES, _SAMPLES = 1024, 16384
 
 
-class Outcome(NamedTuple):
-    """How a verb ended, and what is printed of it."""
+class Found(NamedTuple):
+    """What a verb found, and how that is written as a table and drawn."""
 
-    text: str
-    """What to print."""
-    good: bool
+    lines: list[str]
+    table: Callable[[], Any] | None = None
+    draw: Callable[[Figure], object] | None = None
+    good: bool = True
     """Whether anything succeeded."""
-    interrupted: str | None = None
-    """Where Ctrl-C ended it, if it did; what was computed before is kept."""
+    interrupted: bool = False
+    """Whether Ctrl-C ended it early."""
+    result: Any = None
 
 
-def scan(config: Config, table: ScanTable, tell: Tell) -> Outcome:
-    """`vi-jax scan`: a grid of motions, its regimes and its numbers."""
-    machine, start, method = config.build()
-    axes = config.axes
-    if not axes:
-        raise ConfigError("missing table [axes]: a scan needs at least one")
-    check_names(machine, axes, "[axes]", start=True)
-    if table.picture is not None:
-        check_map(axes, table.measure, paired=table.paired)
-    check_paths("[scan]", picture=table.picture)
-    options = given(table, "picture")
-    total = len(next(iter(axes.values())))
-    if not table.paired:
-        total = math.prod(len(row) for row in axes.values())
-    tell(f"scanning {total:,} motions")
-    with in_terms_of("[scan]", keys=keys_of(type(table))), warnings.catch_warnings():
-        warnings.simplefilter("ignore", LanesFailed)
-        data = run_scan(machine, axes, start=start, method=method, **options)
-    lines = [f"Scan of {data['result'].size:,} motions over {axes_in_words(axes)}"]
-    if "period" in data:
-        lines += regimes_in_words(data)
-    lines += ranges_in_words(data)
-    if "verified_changed_period" in data.attrs:
-        changed, lanes = data.attrs["verified_changed_period"], data.attrs["verified_lanes"]
-        lines.append(f"  regime otherwise by a better method: {changed} of {lanes} lanes tried")
-    if table.store is None:
-        lines += ["", str(data), "", "Nothing was written: name a `store` in [scan] to keep it."]
-    else:
-        lines.append(f'  data: xarray.open_zarr("{table.store}")')
-    if table.picture is not None:
-        ax = new_axes()
-        plot_regimes(data, ax=ax)
-        lines.append(saved(ax, table.picture))
-    failed, good = failures(np.asarray(data["result"]))
-    return Outcome("\n".join([*lines, *failed]), good)
+class Verb(NamedTuple):
+    """A function of the library, and what is done with its arguments."""
+
+    about: str
+    function: Callable[..., Any]
+    work: Callable[..., Found]
+    own: tuple[str, ...] = ()
+    """Keys of its table that are no arguments of the function."""
+
+    def keys(self) -> list[str]:
+        """The keys of its table."""
+        names = [*inspect.signature(self.function).parameters]
+        names += [*inspect.signature(scan).parameters] if "options" in names else []
+        return [x for x in dict.fromkeys([*names, *self.own, *_ENDINGS]) if x not in _LEFT_OUT]
+
+    def check(self, table: Mapping[str, Any], place: str) -> None:
+        """**Raises:** `InputError` for a key that does not exist, or that is missing."""
+        check_keys(table, self.keys(), place)
+        for name, parameter in inspect.signature(self.function).parameters.items():
+            needed = parameter.default is parameter.empty and name not in _NOT_NEEDED
+            if needed and name not in table:
+                raise InputError(f"missing key `{name}` in {place}")
 
 
-def sweep(config: Config, table: SweepTable, tell: Tell) -> Outcome:
-    """`vi-jax sweep`: one way through the values, or there and back."""
-    machine, start, method = config.build()
-    check_names(machine, [table.parameter], "[sweep]")
-    check_range(machine, table.parameter, table.values, "`values` in [sweep]")
-    own = average_names(machine, machine.start() if start is None else start)
-    check_quantity(table.y, "`y` in [sweep]", (*COLUMNS, *own))
-    check_paths("[sweep]", picture=table.picture, output=table.output)
-    options = given(table, "values", "up_and_down", "y", "picture", "output")
-    there, back = ("up", "down") if table.values[0] <= table.values[-1] else ("down", "up")
-    found: dict[str, Sweep] = {}
-    with noted_interrupts() as interrupted:
-        with in_terms_of("[sweep]", keys=keys_of(type(table))):
-            options |= {"method": method, "interrupted": interrupted}
-            tell(f"sweeping {table.parameter} {there}, {len(table.values)} values")
-            found[there] = sweep_in_parts(machine, values=table.values, start=start, **options)
-            if table.up_and_down and not interrupted():
-                tell(f"sweeping {table.parameter} {back}")
-                last = _last_state(found[there], start)
-                back_again = table.values[::-1]
-                found[back] = sweep_in_parts(machine, values=back_again, start=last, **options)
-        outcome = _describe_sweeps(found, table)
-        done = sum(run.values.size for run in found.values())
-        wanted = len(table.values) * (2 if table.up_and_down else 1)
-        if interrupted() and done < wanted:
-            return outcome._replace(interrupted=f"after {done:,} of {wanted:,} values")
-        return outcome
+def do(verb: str, machine: AbstractMachine, tables: Mapping[str, Any]) -> Found:
+    """Do what a file asks of a verb. **Raises:** `InputError`."""
+    before, thing = [], machine
+    if verb == "continue":
+        found = do("orbit", machine, {"orbit": {}, **tables})
+        if not found.good:
+            return found
+        before, thing = found.lines, found.result
+    what, place, table = VERBS[verb], f"[{verb}]", tables.get(verb)
+    if not isinstance(table, dict):
+        raise InputError(f"missing table {place}, which says what to do")
+    what.check(table, place)
+    begin = "guess" if verb == "orbit" else "start"
+    shared = {begin: tables.get("start"), "method": tables.get("method")}
+    table = {key: x for key, x in shared.items() if x is not None and key in what.keys()} | table
+    values = {key: value_of(x, f"{place}: `{key}`") for key, x in table.items()}
+    if begin in values:
+        values[begin] = start_of(machine, values[begin])
+    files = {key: values.pop(key) for key in _ENDINGS if key in values}
+    for key, path in files.items():
+        _check_path(path, _ENDINGS[key], f"`{key}` in {place}")
+    own = {key: values.pop(key) for key in what.own if key in values}
+    with errors_in(place), warnings.catch_warnings(record=True) as caught:
+        found = what.work(thing, values, **own)
+        lines = [*before, *found.lines, *_write(found, **files)]
+    return found._replace(lines=lines + sorted({f"  warning: {x.message}" for x in caught}))
 
 
-def _describe_sweeps(found: Mapping[str, Sweep], table: SweepTable) -> Outcome:
-    lines, codes = [], []
-    for way, run in found.items():
-        lines.append(f"{way}: {run}")
-        codes.append(np.asarray(number_of(run.result)))
-    if table.output is not None:
-        write_rows(table.output, [sweep_columns(way, run) for way, run in found.items()])
-        lines.append(f"  data: {table.output}")
-    if table.picture is not None:
-        ax = new_axes()
-        for way, run in found.items():
-            look = {"color": BLUE, "ms": 6} if way == "up" else {"color": RED, "ms": 3}
-            plot_sweep(run, ax=ax, y=table.y, label=way, **look)
-        ax.legend(frameon=False)
-        lines.append(saved(ax, table.picture))
-    failed, good = failures(np.concatenate(codes), what="values")
-    return Outcome("\n".join([*lines, *failed]), good)
+def _check_path(path: Any, endings: tuple[str, ...], place: str) -> None:
+    """**Raises:** `InputError` if a file cannot be written; makes the folder above it."""
+    if not isinstance(path, str) or Path(path).suffix not in endings:
+        raise InputError(f"{place} must end in {', '.join(endings)}, but is {path!r}")
+    reason = unwritable(Path(path).parent) or ("it is a folder" if Path(path).is_dir() else None)
+    if reason:
+        raise InputError(f"{place} cannot be written: {path}: {reason}")
 
 
-def basins(config: Config, table: BasinsTable, tell: Tell) -> Outcome:
-    """`vi-jax basins`: what each start of a region settles on."""
-    machine, start, method = config.build()
-    check_names(machine, table.region, "[basins.region]", start=True)
-    if table.picture is not None and len(table.region) != 2:
-        raise ConfigError(
-            "`picture` in [basins] needs a region of two parts of the start, but it has "
-            f"{len(table.region)}"
-        )
-    check_paths("[basins]", picture=table.picture, output=table.output)
-    options = given(table, "resolution", "picture", "output")
-    if table.resolution is not None:
-        one = len(table.resolution) == 1
-        options["resolution"] = table.resolution[0] if one else table.resolution
-    tell("looking where the starts settle")
-    with in_terms_of("[basins]", keys=keys_of(type(table))):
-        found = find_basins(machine, start=start, method=method, **options)
-    lines = [str(found)]
-    if table.output is not None:
-        kept = found.data[["label", "period", "impacts"]]
-        write_whole(table.output, kept.to_dataframe().reset_index().to_csv(index=False))
-        lines.append(f"  data: {table.output}")
-    if table.picture is not None:
-        ax = new_axes()
-        plot_basins(found, ax=ax)
-        lines.append(saved(ax, table.picture))
-    failed, good = failures(np.asarray(found.data["result"]), what="starts")
-    return Outcome("\n".join([*lines, *failed]), good)
-
-
-def orbit(config: Config, table: OrbitTable, tell: Tell) -> Outcome:
-    """`vi-jax orbit`: a periodic motion, and the branch that it lies on."""
-    machine, start, method = config.build()
-    check_paths("[orbit]", picture=table.picture)
-    if table.continue_ is not None:
-        check_continuation(machine, machine.start() if start is None else start, table.continue_)
-    guess = start
-    if table.guess is not None:
-        guess = start_of(machine, table.guess, "`guess` in [orbit]")
-    tell(f"searching a motion of {so_many(table.cycles, 'cycle')}")
-    named = {"root_finder": "[orbit]", "method": "[method]", "guess": "[start]"}
-    if table.guess is not None:
-        named["guess"] = "`guess` in [orbit]"
-    with in_terms_of("[orbit]", keys=keys_of(type(table)), named=named):
-        found = find_orbit(
-            machine,
-            machine.start() if guess is None else guess,
-            table.cycles,
-            root_finder=table.search(),
-            method=method,
-        )
-    lines = [str(found)]
-    if not bool(found.successful):
-        return Outcome("\n".join(lines), False)
-    if table.picture is not None:
-        lines.append(saved(_portrait(found), table.picture))
-    if table.continue_ is not None:
-        lines += _continued(found, table.continue_, tell)
-    return Outcome("\n".join(lines), True)
-
-
-def _continued(found: Orbit, asked: ContinueTable, tell: Tell) -> list[str]:
-    """A branch followed from an orbit, as lines to print; it is written and drawn as asked for."""
-    tell(f"following it in {asked.parameter}")
-    with in_terms_of("[orbit.continue]"):
-        branch = continue_orbit(found, **given(asked, "y", "picture", "output"))
-    lines = [str(branch)]
-    if asked.output is not None:
-        data = branch.to_xarray()
-        columns = {name: np.asarray(x) for name, x in data.items() if x.dims == ("point",)}
-        write_rows(asked.output, [{str(name): x for name, x in columns.items()}])
-        lines.append(f"  data: {asked.output}")
-    if asked.picture is not None:
-        ax = new_axes()
-        plot_branch(branch, ax=ax, y=asked.y)
-        lines.append(saved(ax, asked.picture))
+def _write(found: Found, output: str | None = None, picture: str | None = None) -> list[str]:
+    """Write the files that are asked for; the lines that name them."""
+    lines = []
+    if output is not None and found.table is not None:
+        data = found.table()
+        if output.endswith(".csv"):
+            data.to_dataframe().reset_index().to_csv(output, index=False)
+        else:
+            data.to_netcdf(output)
+        lines.append(f"  output: {output}")
+    if picture is not None and found.draw is not None:
+        figure = Figure(figsize=(7.5, 4.2), layout="constrained")
+        try:
+            found.draw(figure)
+        except ValueError as error:  # what was computed is not lost by it
+            return [*lines, f"  picture: not drawn: {error}"]
+        figure.savefig(picture, dpi=110)
+        lines.append(f"  picture: {picture}")
     return lines
 
 
-def _portrait(found: Orbit) -> Axes:
-    """The phase portrait of a periodic motion."""
-    ax = new_axes()
-    plot_phase_portrait(found.trajectory(), found.machine, ax=ax)
-    return ax
+def _kept(function: Callable[..., Any], *args: Any, **options: Any) -> tuple[Any, bool]:
+    """What a function returns, or what it had computed on Ctrl-C, which is ignored from then on;
+    whether that ended it."""
+    try:
+        return function(*args, **options), False
+    except Interrupted as error:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        return error.partial, True
 
 
-def simulate(config: Config, table: SimulateTable, tell: Tell) -> Outcome:
-    """`vi-jax simulate`: one motion, cycle by cycle."""
-    machine, start, method = config.build()
-    check_paths("[simulate]", picture=table.picture, output=table.output)
-    options = given(table, "picture", "output")
-    if table.picture is not None:
-        options = {"samples": 64, "impact_log": 8, **options}
-        if options["samples"] < 1:
-            raise ConfigError("`samples` in [simulate] must be at least 1 for a picture")
-    tell(f"simulating {table.cycles:,} cycles")
-    with noted_interrupts() as interrupted:
-        with in_terms_of("[simulate]", keys=keys_of(type(table))):
-            start = machine.start() if start is None else start
-            run = simulate_in_parts(
-                machine, start, method=method, interrupted=interrupted, **options
-            )
-        outcome = _describe_run(machine, run, table)
-        done = run.impacts.size
-        if interrupted() and done < table.cycles:
-            return outcome._replace(interrupted=f"after {done:,} of {table.cycles:,} cycles")
-        return outcome
+def _simulate(machine: AbstractMachine, options: dict[str, Any]) -> Found:
+    along, start = "sample" if options.get("samples") else "cycle", options.pop("start", None)
+    start = machine.start() if start is None else start
+    drawn: dict[str, Any] = {"samples": 64, "impact_log": 8}
+    alone = is_autonomous(machine, start)  # which has no samples within its cycles
+    run, cut = _kept(run_in_parts, machine, start, **(options if alone else drawn | options))
 
+    def table() -> Any:
+        data = run.to_xarray(along=along)
+        if along == "cycle":  # with the state at its end
+            ends = run.to_xarray(along="section").isel(section=slice(1, None))
+            data = xr.merge([ends.rename(section="cycle"), data])
+        return data
 
-def _describe_run(machine: AbstractMachine, run: Run, table: SimulateTable) -> Outcome:
-    lines = [str(run)]
-    if table.output is not None:
-        columns = sample_columns(run.samples) if table.samples else cycle_columns(run)
-        write_rows(table.output, [columns])
-        lines.append(f"  data: {table.output}")
-    if table.picture is not None:
-        figure = Figure(figsize=(11, 3.6), layout="constrained")
+    def draw(figure: Figure) -> None:
+        figure.set_size_inches(11, 3.6)
         left, right = figure.subplots(1, 2, width_ratios=(2, 1))
-        plot_history(run, machine=machine, ax=left, unit="cycles")
-        plot_phase_portrait(run, machine, ax=right)
-        lines.append(saved(left, table.picture))
-    return Outcome("\n".join(lines), bool(run.successful))
+        seen, evenly = run, machine
+        if alone:  # as many intervals of its nominal cycle, from the first section
+            evenly, first = machine.observed_every(machine.cycle), run.sections
+            first = jtu.tree_map(lambda x: x[0], first)
+            seen = simulate(evenly, first, run.impacts.size, **drawn)
+        plot.plot_history(seen, machine=evenly, ax=left, unit="cycles")
+        plot.plot_phase_portrait(seen, evenly, ax=right)
+
+    return Found([str(run)], table, draw, bool(run.successful), cut)
 
 
-VERBS: Mapping[str, Callable[[Config, Any, Tell], Outcome]] = {
-    "scan": scan,
-    "sweep": sweep,
-    "basins": basins,
-    "orbit": orbit,
-    "simulate": simulate,
+def run_in_parts(
+    machine: AbstractMachine, start: Any, cycles: int, *, samples: int = 0, **options: Any
+) -> Run:
+    """As `simulate` of one motion, which Ctrl-C ends with the cycles that were recorded.
+
+    **Raises:** `Interrupted`, whose `partial` is the shorter run, if a part of it was recorded;
+    as `simulate`.
+    """
+    length, runs = max(1, min(_CYCLES, _SAMPLES // max(1, samples))), []
+    planned(machine, start, cycles, RunOptions(samples=samples, **options))  # checks them all
+    whole = not isinstance(cycles, int) or cycles <= length
+    if whole or options.keys() & {"estimate", "max_steps", "noise"}:
+        return simulate(machine, start, cycles, samples=samples, **options)
+    try:
+        for done in range(0, cycles, length):
+            now = min(length, cycles - done)
+            runs.append(simulate(machine, start, now, samples=samples, **options))
+            start, options["settle"] = runs[-1].last, 0
+            if not bool(runs[-1].successful):
+                break
+    except KeyboardInterrupt:
+        if runs:
+            raise Interrupted("run", _joined(runs)) from None
+        raise
+    return _joined(runs)
+
+
+def _joined(runs: list[Run]) -> Run:
+    """Parts of one run in a row; the first state of a part is the last of the part before it."""
+    cycles, time, length = 0, 0.0, runs[0].impacts.size
+    for i, run in enumerate(runs):
+        if run.samples is not None:
+            later = {"cycles": run.samples.cycles + cycles, "time": run.samples.time + time}
+            runs[i] = dataclasses.replace(run, samples=dataclasses.replace(run.samples, **later))
+            time = later["time"][-1]
+        cycles += run.impacts.size
+
+    def row(*parts: Any) -> Any:
+        if not jnp.ndim(parts[0]):
+            return parts[-1]
+        begin = int(len(parts[0]) != length)
+        return jnp.asarray(np.concatenate([parts[0], *(x[begin:] for x in parts[1:])]))
+
+    return dataclasses.replace(jtu.tree_map(row, *runs), steps=sum(run.steps for run in runs))
+
+
+def _sweep(
+    machine: AbstractMachine, options: dict[str, Any], *, up_and_down: bool = False,
+    y: str | None = None,
+) -> Found:  # fmt: skip
+    values = options.get("values", ())
+    ways = ("up", "down") if len(values) < 2 or values[0] <= values[-1] else ("down", "up")
+    there, cut = _kept(sweep, machine, **options)
+    found: dict[str, Sweep] = {ways[0]: there}
+    if up_and_down and not cut:
+        good = np.flatnonzero(np.asarray(there.result == RESULTS.successful))
+        if good.size:
+            last = int(good[-1])
+            options["start"] = jtu.tree_map(lambda x: x[last, -1], there.sections)
+        try:
+            found[ways[1]], cut = _kept(sweep, machine, **options | {"values": values[::-1]})
+        except KeyboardInterrupt:  # before there was anything to keep
+            cut = True
+
+    def table() -> Any:
+        each = [run.to_xarray(along="value").assign(direction=("value", [way] * run.values.size))
+                for way, run in found.items()]  # fmt: skip
+        return xr.concat(each, "value")
+
+    def draw(figure: Figure) -> None:
+        ax = figure.subplots()
+        for way, run in found.items():
+            look = {"color": plot.BLUE, "ms": 6} if way == "up" else {"color": plot.RED, "ms": 3}
+            plot.plot_sweep(run, ax=ax, y=y, label=way, **look)
+        ax.legend(frameon=False)
+
+    good = any(bool((run.result == RESULTS.successful).any()) for run in found.values())
+    return Found([f"{way}: {run}" for way, run in found.items()], table, draw, good, cut)
+
+
+def _scan(machine: AbstractMachine, options: dict[str, Any]) -> Found:
+    data = scan(machine, **options)
+    axes = ", ".join(f"{name} ({data[name].size})" for name in data.coords)
+    lines = [f"Scan of {data['result'].size:,} motions over {axes}"]
+    if "period" in data:
+        lines += _regimes(data, machine)
+    if options.get("store") is not None:
+        lines.append(f'  store: xarray.open_zarr("{options["store"]}")')
+    draw = lambda figure: plot.plot_regimes(data, ax=figure.subplots())
+    return Found([*lines, str(data)], lambda: data, draw, bool((data["result"] == 0).any()))
+
+
+def _regimes(data: xr.Dataset, machine: AbstractMachine) -> list[str]:
+    """How many motions there are of each period, in the machine's words."""
+    period = periods_of(data["period"])[np.asarray(data["result"]) == 0]
+    names: dict[int, str] = {regime: regime.meaning for regime in REGIMES}
+    kinds, counts = np.unique(period, return_counts=True)
+    lines = []
+    for i in np.argsort(-counts)[:12]:
+        name = names.get(int(kinds[i])) or f"period {machine.period_of(int(kinds[i]))}"
+        lines.append(f"  {name}: {counts[i]:,} ({100 * counts[i] / data['result'].size:.1f} %)")
+    return lines + [f"  {len(kinds) - 12} further periods"] * (len(kinds) > 12)
+
+
+def _basins(machine: AbstractMachine, options: dict[str, Any]) -> Found:
+    found = basins(machine, **options)
+    table = lambda: found.data[["label", "period", "impacts"]]
+    draw = lambda figure: plot.plot_basins(found, ax=figure.subplots())
+    return Found([str(found)], table, draw, bool((found.data["result"] == 0).any()))
+
+
+def _orbit(machine: AbstractMachine, options: dict[str, Any]) -> Found:
+    guess = options.pop("guess", None)
+    found = find_orbit(machine, machine.start() if guess is None else guess, **options)
+    if not bool(found.successful):
+        return Found([str(found)], good=False)
+    draw = lambda figure: plot.plot_phase_portrait(
+        found.trajectory(), machine, ax=figure.subplots()
+    )
+    return Found([str(found)], lambda: found.to_xarray(along="section"), draw, result=found)
+
+
+def _continue(orbit: Any, options: dict[str, Any], *, y: str | None = None) -> Found:
+    curve, cut = _kept(continue_orbit, orbit, **options)
+    draw = lambda figure: plot.plot_branch(curve, ax=figure.subplots(), y=y)
+    return Found([str(curve)], lambda: curve.to_xarray(along="point"), draw, True, cut)
+
+
+VERBS: Mapping[str, Verb] = {
+    "simulate": Verb("one motion, cycle by cycle", simulate, _simulate),
+    "sweep": Verb("one number changed step by step", sweep, _sweep, ("up_and_down", "y")),
+    "scan": Verb("every combination of the values on the axes", scan, _scan),
+    "basins": Verb("which start settles on which motion", basins, _basins),
+    "orbit": Verb("a periodic motion", find_orbit, _orbit),
+    "continue": Verb("the branch of the motion of [orbit]", continue_orbit, _continue, ("y",)),
 }
-
-
-def _last_state(run: Sweep, otherwise: object) -> Any:
-    """The section state on which a sweep ended."""
-    good = np.flatnonzero(np.asarray(run.result == RESULTS.successful))
-    if not good.size:
-        return otherwise
-    return jtu.tree_map(lambda x: x[good[-1], -1], run.sections)

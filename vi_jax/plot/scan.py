@@ -176,7 +176,7 @@ def _start_name(machine: AbstractMachine | None, name: str) -> str:
         start = machine.start()
     except ValueError:  # a machine that has no start of its own
         start = None
-    if start is not None:
+    if start is not None and name in by_name(start):  # not a number within an array
         values = {key: float(i) + 2.5 for i, key in enumerate(by_name(start))}
         leaves = [jnp.asarray(value) for value in values.values()]
         probe = jtu.tree_unflatten(jtu.tree_structure(start), leaves)

@@ -1,0 +1,54 @@
+"""TOML files for the command line."""
+
+import inspect
+import re
+import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from ..explore.named import InputError, check_keys
+from ..machine import AbstractMachine, check_name, leaf_names, with_leaf
+
+
+def read(path: str) -> dict[str, Any]:
+    """Return the tables of a file. **Raises:** `InputError`."""
+    try:
+        return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))  # some editors' mark
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
+
+
+@contextmanager
+def errors_in(place: str) -> Iterator[None]:
+    """Turn errors of the library about its arguments into a `InputError` that names the table."""
+    try:
+        yield
+    except (ValueError, TypeError) as error:
+        if isinstance(error, InputError) or not re.match(
+            "Argument|Axis|Method|Measure", str(error)
+        ):
+            raise
+        raise InputError(f"{place}: {error}") from None
+
+
+def start_of(machine: AbstractMachine, table: Any) -> Any:
+    """Return a state of the machine from `[start]`: by the arguments of its `start`, or from its
+    start with these numbers in place of its own. **Raises:** `InputError`."""
+    if not isinstance(table, dict):
+        return table
+    if type(machine).start is AbstractMachine.start:
+        raise InputError(
+            f"[start] needs the `class` of a state, because {type(machine).__name__} has no `start`"
+        )
+    parameters = inspect.signature(machine.start).parameters
+    with errors_in("[start]"):
+        if parameters:
+            if not any(x.kind is x.VAR_KEYWORD for x in parameters.values()):
+                check_keys(table, parameters, "[start]")
+            return machine.start(**table)
+        state = machine.start()
+        for name, number in table.items():
+            state = with_leaf(state, check_name(leaf_names(state), name, "start"), number)
+        return state
