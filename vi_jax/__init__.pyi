@@ -39,6 +39,7 @@ from .machine import DCMotor as DCMotor
 from .machine import DCMotorState as DCMotorState
 from .machine import DryFriction as DryFriction
 from .machine import HuntCrossley as HuntCrossley
+from .machine import HybridState as HybridState
 from .machine import IdealDrive as IdealDrive
 from .machine import Motor as Motor
 from .machine import MotorState as MotorState

@@ -179,6 +179,21 @@ def test_a_furnace_with_two_thresholds():
     np.testing.assert_allclose(runs[0].y_max[:, 2:], 296.0, rtol=1e-12)  # a turn where it switches
 
 
+def test_a_motion_goes_on_in_its_modes():
+    """Cycle by cycle as in one run; between the thresholds its state does not tell its mode."""
+    furnace = Furnace(cycle=0.37)
+    whole = vi.simulate(furnace, (jnp.asarray(300.0),), 12, method=CLOSE)
+    state, found = (jnp.asarray(300.0),), []
+    for _ in range(12):
+        state = vi.simulate(furnace, state, 1, method=CLOSE).last
+        found.append(float(state[0]))
+    np.testing.assert_allclose(found, whole.sections[0][1:], rtol=1e-13)
+    np.testing.assert_allclose(found[-1], heated(300.0, 12 * 0.37), rtol=1e-11)
+    assert state.modes == (whole.modes[0][-1],)
+    with pytest.raises(ValueError, match="1 modes, one number each"):
+        vi.simulate(furnace, vi.HybridState((jnp.asarray(300.0),), (0.0, 1.0)), 1)
+
+
 class Wave(vi.AbstractMachine):
     """x' = ±1 - κx by a switch of the clock, whose side at the end of a cycle is not that at its
     begin."""

@@ -15,7 +15,7 @@ from .._messages import so_many
 from .._programs import compiled
 from .._types import State
 from ..flow import RESULTS, Run, chosen, simulate
-from ..machine import AbstractMachine, is_autonomous, unit_of, with_unit
+from ..machine import AbstractMachine, bare, is_autonomous, unit_of, with_unit
 from ..orbit import STABILITY, complex_in_words, cycle_map, stability_of
 from ..plot import MotionPath, motion_path
 from ..scans import REGIMES, Regime, lyapunov, taken_along
@@ -190,7 +190,7 @@ def _monodromy(scene: AbstractMachine, run: Run, period: Any, method: Any) -> ja
         place = OBSERVED - cycles + i
         return the_map.jacobian(jtu.tree_map(lambda x: x[place], run.sections)) @ product
 
-    row = ravel_pytree(run.last)[0]
+    row = ravel_pytree(bare(run.last))[0]
     return jax.lax.fori_loop(0, cycles, one, jnp.eye(row.size, dtype=row.dtype))
 
 

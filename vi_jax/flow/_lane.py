@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, UInt32
 from .._types import Flag, Scalar, Scalars, State
 from ..machine import (
     AbstractMachine,
+    HybridState,
     events_of,
     is_autonomous,
     section_number,
@@ -181,6 +182,8 @@ class Plan(eqx.Module):
     """Clock of the start, where that is not on the section."""
     until: Scalar | None = None
     """Clock at which the one cycle ends, where that is not the machine's own."""
+    own: Scalars | None = None
+    """The machine's own modes in the start, where it says them."""
     stop: Any = None
     """What ends a lane early (see `RunOptions`); what it would have recorded then is no number."""
 
@@ -259,6 +262,12 @@ class Plan(eqx.Module):
         if self.machine.switches or self.machine.events:
             return True
         return (done >= self.settle) if self.motion else False
+
+    def point(self, state: State, modes: Scalars) -> State:
+        """What is kept of the end of an interval: the state, with the machine's own modes if it has
+        some."""
+        held = sum(event.holds_mode for event in events_of(self.machine))
+        return HybridState(state, modes[held:]) if modes[held:] else state
 
     def fresh(self, state: State) -> Record:
         """The record of an interval that begins in `state`."""

@@ -29,7 +29,7 @@ def launched(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
     bad = jax.lax.stop_gradient(bad)
     zero = jnp.zeros_like(Y)
     s = zero if plan.begin is None else zero + plan.begin
-    modes = begin_modes(machine, s, start)
+    modes = begin_modes(machine, s, start, plan.own)
     check_field(machine, s, start, modes)
     check_laws(machine, zero)
     check_events(machine, s, start, modes)

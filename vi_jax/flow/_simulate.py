@@ -15,7 +15,7 @@ from .._checks import flag
 from .._messages import warning_once
 from .._programs import compiled
 from .._types import State
-from ..machine import AbstractMachine, stated
+from ..machine import AbstractMachine, bare, modes_of, stated
 from ._failed_derivatives import failed_derivatives
 from ._lane import Plan, Record
 from .arguments import planned
@@ -63,7 +63,8 @@ def simulate(
     **Arguments:**
 
     - `machine`: a `Scene`, or an `AbstractMachine` of your own.
-    - `start`: the state on the first section, from `machine.start(...)`.
+    - `start`: the state on the first section, from `machine.start(...)`; or `last` of another run,
+      which goes on from there, in the machine's own modes too (see `HybridState`).
     - `cycles`: number of drive cycles to record, at least 1; static.
     - `settle`: drive cycles before them, of which nothing is kept; another number is not another
       program.
@@ -168,6 +169,7 @@ def collect(plan: Plan, sampled: bool, lane: Ends, points: State, records: Recor
     `points` and `records`, the states and records of the intervals, as `run_lane` returns them.
     """
     machine, parts = plan.machine, plan.parts
+    points, modes = bare(points), modes_of(points) or ()
     records = jtu.tree_map(lambda x: x[1:], records)
 
     def per_cycle(values, reduce):
@@ -195,7 +197,7 @@ def collect(plan: Plan, sampled: bool, lane: Ends, points: State, records: Recor
         interval = jnp.repeat(period / parts, parts) if times is None else times
         time = jnp.concatenate([jnp.zeros_like(interval[:1]), jnp.cumsum(interval)])
         place = jnp.arange(plan.kept + 1, dtype=time.dtype) / parts
-        dense = Samples(place, time, points, quantities)
+        dense = Samples(place, time, points, quantities, modes)
     log = None
     if plan.log:
         log = _log(plan, records.log)
@@ -221,6 +223,7 @@ def collect(plan: Plan, sampled: bool, lane: Ends, points: State, records: Recor
         quantities={name: x[::parts] for name, x in quantities.items()},
         labels=machine.labels,
         units=stated(machine),
+        modes=tuple(x[::parts] for x in modes),
     )
 
 

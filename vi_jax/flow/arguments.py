@@ -24,7 +24,7 @@ from .._checks import (
 )
 from .._messages import warn
 from .._types import Machine, State
-from ..machine import AbstractMachine, Scene, begin_modes, is_autonomous
+from ..machine import AbstractMachine, Scene, bare, begin_modes, is_autonomous, modes_of
 from ._lane import Plan
 from ._own import check_period as check_period
 from ._own_guards import check_guards
@@ -53,7 +53,7 @@ def planned(
     if options.clock is not None:
         machine = machine.in_clock(options.clock)
     require_session("machine", machine)
-    start = machine.adopt(start)
+    own, start = modes_of(start), machine.adopt(bare(start))
     check_leaves("start", start)
     require_session("start", start)
     method.check(machine)
@@ -95,8 +95,23 @@ def planned(
         begin=_clock_reading(options.begin, dtype),
         until=_clock_reading(options.until, dtype),
         stop=options.stop,
+        own=_own_modes(machine, start, own, dtype),
     )
     return plan, start
+
+
+def _own_modes(machine: AbstractMachine, start: State, own: Any, dtype: Any) -> Any:
+    """The machine's own modes of a start, as the loop needs them; `None` if it says nothing of
+    them. **Raises:** `ValueError` unless they are as many as the machine's."""
+    if own is None:
+        return None
+    wanted = jax.eval_shape(lambda x: machine.begin(jnp.zeros((), dtype), x), start)
+    if len(own) != len(wanted) or any(jnp.shape(mode) for mode in own):
+        raise ValueError(
+            f"Argument `start` must have {len(wanted)} modes, one number each, as many as `begin` "
+            f"of a {type(machine).__name__} returns, but has {tuple(own)}."
+        )
+    return tuple(jnp.asarray(mode, dtype) for mode in own)
 
 
 def _clock_reading(given: Any, dtype: Any) -> jax.Array | None:

@@ -106,6 +106,7 @@ def run_dataset(
     variables = states("section", run.sections, section)
     variables |= present({name: getattr(run, name) for name in names} | run.averages, cycle)
     variables |= states("section", run.quantities, section)
+    variables |= states("section", {f"mode_{i}": x for i, x in enumerate(run.modes)}, section)
     count = run.impacts.shape[-1]
     coordinates: dict[str, Any] = {
         "cycle": np.arange(1, count + 1), "section": np.arange(count + 1),

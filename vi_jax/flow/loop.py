@@ -11,6 +11,7 @@ from jaxtyping import Array
 
 from .. import lanes
 from .._types import Flag, Scalar, State
+from ..machine import bare, replaced
 from ._lane import Lane, Plan, Record
 from ._launch import launched
 from ._step.hybrid import iterate
@@ -44,7 +45,8 @@ def run_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> tuple[Ends
     """A lane to its end, in one flat loop: in a batch no lane waits for another at a section.
 
     **Returns:** how it ended, and the states and records of the intervals kept, with leading axis
-    `plan.kept + 1`: the first holds the state in which recording begins, and no record.
+    `plan.kept + 1`: the first holds the state in which recording begins, and no record. States of a
+    machine with modes of its own are `HybridState`s.
     """
     way = plan.machine.prepared()
     own = way.machine is plan.machine
@@ -60,7 +62,7 @@ def run_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> tuple[Ends
         rows=plan.kept + 1, backend=plan.backend,
     )  # fmt: skip
     if not own:
-        states = jax.vmap(way.outward)(states)
+        states = replaced(states, jax.vmap(way.outward)(bare(states)))
     return ends, states, records
 
 
@@ -68,8 +70,8 @@ def _begin(rest: Plan, inputs: _Inputs) -> tuple[Lane, lanes.Emitted]:
     numbers, start, wanted = inputs
     plan = eqx.combine(numbers, rest)
     lane = launched(plan, start, wanted)
-    first = plan.settle <= 0
-    return lane, lanes.Emitted(_active(plan, lane), first, (start, plan.fresh(start)))
+    first, here = plan.settle <= 0, plan.point(start, lane.modes)
+    return lane, lanes.Emitted(_active(plan, lane), first, (here, plan.fresh(start)))
 
 
 def _step(rest: Plan, inputs: _Inputs, lane: Lane) -> tuple[Lane, lanes.Emitted]:
@@ -81,7 +83,8 @@ def _step(rest: Plan, inputs: _Inputs, lane: Lane) -> tuple[Lane, lanes.Emitted]
         first = new.lane.done <= plan.settle
         left = plan.stop(plan.machine, new.state, new.record, first)
         active = active if left is None else active & ~(complete & left)
-    return new.lane, lanes.Emitted(active, complete, (new.state, new.record))
+    here = plan.point(new.state, new.lane.modes)
+    return new.lane, lanes.Emitted(active, complete, (here, new.record))
 
 
 def _end(inputs: _Inputs, lane: Lane) -> Ends:

@@ -11,7 +11,17 @@ from jaxtyping import Array, Float, Int
 
 from .._messages import so_many
 from .._types import Scalar, State, xr
-from ..machine import PLAIN, Shown, Stated, Summarized, in_unit, name_in, state_in_words
+from ..machine import (
+    PLAIN,
+    HybridState,
+    Shown,
+    Stated,
+    Summarized,
+    bare,
+    in_unit,
+    name_in,
+    state_in_words,
+)
 from ._listed import listed
 from .enumeration import NamedEnumeration
 from .labelled import EVENTS as EVENTS
@@ -129,6 +139,8 @@ class Samples(Shown):
     """The states, a pytree like the start."""
     quantities: dict[str, Float[Array, " points"]] = eqx.field(default_factory=dict)
     """The machine's own quantities there, by name (see `AbstractMachine.quantities`)."""
+    modes: tuple[Float[Array, " points"], ...] = ()
+    """The machine's own modes there (see `AbstractMachine.begin`)."""
 
 
 class ImpactLog(Summarized):
@@ -257,6 +269,8 @@ class Run(Summarized):
     """What position and velocity are called, in the machine's words."""
     units: Stated = eqx.field(static=True, default=())
     """In which units its quantities are, as the machine states it."""
+    modes: tuple[Float[Array, " sections"], ...] = ()
+    """The machine's own modes on the sections (see `AbstractMachine.begin`), each (cycles + 1,)."""
 
     @property
     def successful(self) -> jax.Array:
@@ -265,11 +279,13 @@ class Run(Summarized):
 
     @property
     def last(self) -> State:
-        """The state on the last section: a start to go on from, or a guess for `find_orbit`."""
+        """The state on the last section: a start to go on from, or a guess for `find_orbit`. Of a
+        machine with modes of its own it is a `HybridState`, which has them too."""
         # Batch axes are in front, those of an array in the state behind; how many there are in
         # front is shown by a number for each lane.
         place = (*[slice(None)] * self.steps.ndim, -1)
-        return jtu.tree_map(lambda x: x[place], self.sections)
+        kept = HybridState(self.sections, self.modes) if self.modes else self.sections
+        return jtu.tree_map(lambda x: x[place], kept)
 
     def mean_averages(self) -> dict[str, Scalar]:
         """The machine's own averages over the time of all cycles, of one lane."""
@@ -316,7 +332,7 @@ class Run(Summarized):
             f"Run of {so_many(cycles, 'cycle')}, {so_many(int(jnp.sum(self.impacts)), 'impact')}"
         ]
         units = dict(self.units)
-        lines.append(f"  last section: {state_in_words(self.last, 9, units)}")
+        lines.append(f"  last section: {state_in_words(bare(self.last), 9, units)}")
         if self.y_min is not None and self.y_max is not None:
             span = f"[{self.y_min[-1]:.6g}, {self.y_max[-1]:.6g}]"
             span = in_unit(span, units, "position")

@@ -35,6 +35,12 @@ from .events import section_number as section_number
 from .events import struck_modes as struck_modes
 from .events import value_of as value_of
 from .friction import DryFriction as DryFriction
+from .hybrid_state import HybridState as HybridState
+from .hybrid_state import bare as bare
+from .hybrid_state import begun as begun
+from .hybrid_state import modes_of as modes_of
+from .hybrid_state import raveled as raveled
+from .hybrid_state import replaced as replaced
 from .law import AbstractContactLaw as AbstractContactLaw
 from .law import HuntCrossley as HuntCrossley
 from .law import PowerLaw as PowerLaw

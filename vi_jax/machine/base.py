@@ -150,9 +150,11 @@ class AbstractMachine(Clocked, Observed, Worded):
         """Events of other kinds: resets (`Reset`), and kinds of one's own."""
         return ()
 
+    @by_default
     def begin(self, s: Scalar, state: State) -> tuple[Any, ...]:
         """The machine's own modes in a motion that begins in `state`: numbers that its field gets
-        behind the state and behind the modes of its switches, and that events change."""
+        behind the state and behind the modes of its switches, and that events change. A start that
+        is a `HybridState`, as `Run.last` is, has its own instead."""
         return ()
 
     def observed_every(self, interval: Any) -> "AbstractMachine":

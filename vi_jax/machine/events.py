@@ -118,11 +118,14 @@ def event_of(
     return event, slice(own, own + 1), more
 
 
-def begin_modes(machine: Machine, s: Scalar, state: State) -> Modes:
+def begin_modes(
+    machine: Machine, s: Scalar, state: State, own: Sequence[Any] | None = None
+) -> Modes:
     """The modes of a motion that begins in `state`: those that events hold, in their order, then
-    the machine's own."""
+    the machine's own, which are `own` where that is given."""
     held = [event for event in events_of(machine) if event.holds_mode]
-    modes = [*(event.begin(machine, s, state) for event in held), *machine.begin(s, state)]
+    own = machine.begin(s, state) if own is None else own
+    modes = [*(event.begin(machine, s, state) for event in held), *own]
     modes = settled_modes(modes, s)
     if any(event.sees_around for event in held):  # which looks at the other modes
         modes = struck_modes(machine, s, state, modes)

@@ -11,12 +11,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from .._types import Flag, Scalar, State
 from ..flow import Run, simulate
-from ..machine import AbstractMachine, in_rows, is_autonomous
+from ..machine import AbstractMachine, HybridState, bare, in_rows, is_autonomous, raveled
 from ._cycle_map import CycleMap
 from ._forward_jacobian import forward_jacobian
 from ._neutral import neutral
@@ -43,7 +42,7 @@ def _run(the_map: CycleMap, state: State, impact_log: int) -> Run:
 def _places(the_map: CycleMap, state: State) -> int:
     """At how many places of a cycle the state is looked at: for an autonomous machine only on its
     section."""
-    return 1 if is_autonomous(the_map.machine, state) else _PLACES
+    return 1 if is_autonomous(the_map.machine, bare(state)) else _PLACES
 
 
 def moved_from_impacts(
@@ -63,8 +62,10 @@ def moved_from_impacts(
     phase = run.impact_log.phase.ravel() - step * jnp.arange(_PLACES)[:, None]
     apart = jnp.abs(jnp.mod(phase + half, machine.cycle) - half)
     place = jnp.argmax(jnp.min(jnp.where(jnp.isnan(apart), half, apart), axis=1))
-    there = jtu.tree_map(lambda x: x[place], run.samples.state)
-    lost = ~jnp.all(jnp.isfinite(in_rows(there, 0)))
+    kept, modes = run.samples.state, run.samples.modes
+    kept = HybridState(kept, modes) if modes else kept
+    there = jtu.tree_map(lambda x: x[place], kept)
+    lost = ~jnp.all(jnp.isfinite(in_rows(bare(there), 0)))
     place = jnp.where(lost, 0, place)
     there = jtu.tree_map(lambda a, b: jnp.where(lost, a, b), guess, there)
     moved = machine.observed_later(jnp.asarray(step, phase.dtype) * place)
@@ -87,6 +88,8 @@ class ObservedArc(NamedTuple):
 
     states: Float[Array, "cycles places states"]
     """States at each place of each cycle, the start left out."""
+    modes: Float[Array, "cycles places modes"]
+    """The machine's own modes there."""
     jacobians: Float[Array, "cycles states states"]
     """Derivatives by the start of the states after each cycle."""
     listed: Impacts
@@ -108,7 +111,7 @@ def observe_arc(arc: CycleMap, state: State, impact_log: int) -> ObservedArc:
 
     @forward_jacobian
     def seen(arc, state):
-        x, unravel = ravel_pytree(state)
+        x, unravel = raveled(state)
 
         def states(x):
             run = simulate(
@@ -123,12 +126,16 @@ def observe_arc(arc: CycleMap, state: State, impact_log: int) -> ObservedArc:
         log = run.impact_log
         assert log is not None and run.y_min is not None and run.y_max is not None
         met = run.sections if run.samples is None else run.samples.state
-        places = in_rows(met)[1:]
-        places = places.reshape(arc.cycles, _places(arc, state), -1)
+        own = run.modes if run.samples is None else run.samples.modes
+        none = jnp.zeros((arc.cycles, _places(arc, state), 0), x.dtype)
+        places, modes = (
+            in_rows(rows)[1:].reshape(*none.shape[:2], -1) if rows is met or rows else none
+            for rows in (met, own)
+        )
         assert run.clearance is not None and run.duration is not None
         rests = jnp.zeros_like(run.y_min) if run.rests is None else run.rests.astype(x.dtype)
         return ObservedArc(
-            places, jacobians, Impacts(log.phase, log.speed, log.stop.astype(x.dtype)),
+            places, modes, jacobians, Impacts(log.phase, log.speed, log.stop.astype(x.dtype)),
             run.impacts.astype(x.dtype), rests, run.y_min, run.y_max, run.clearance, run.duration,
             {name: mean * run.duration for name, mean in run.averages.items()},
         )  # fmt: skip

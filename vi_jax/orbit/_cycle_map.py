@@ -1,5 +1,6 @@
 """The cycle map: a state on the section to the state n drive cycles later."""
 
+import contextlib
 from typing import Any
 
 import diffrax
@@ -8,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from .._checks import count, require
@@ -27,7 +27,7 @@ from ..flow import (
     preset,
     simulate,
 )
-from ..machine import AbstractMachine
+from ..machine import AbstractMachine, HybridState, bare, begun, modes_of, raveled
 from ._forward_jacobian import forward_jacobian
 
 
@@ -47,21 +47,22 @@ class CycleMap(eqx.Module):
     """Whether the body may come to rest on a stop."""
 
     def __call__(self, state: State) -> State:
-        """The state `cycles` drive cycles after `state`."""
+        """The state `cycles` drive cycles after `state`; a `HybridState` for a machine with modes
+        of its own."""
         return _end(self, adopted(self.machine, state))
 
     def residual(self, state: State) -> State:
         """What the motion from `state` lacks to be periodic: the mapped state less `state`."""
         state = adopted(self.machine, state)
-        return jtu.tree_map(lambda a, b: a - b, _end(self, state), state)
+        return jtu.tree_map(lambda a, b: a - b, bare(_end(self, state)), bare(state))
 
     def jacobian(self, state: State) -> Float[Array, "states states"]:
         """Derivative of the map: the monodromy matrix if `state` lies on a periodic motion.
 
         Rows and columns are in the order of the state's leaves: Y, V, and W for a motor.
         """
-        x, unravel = ravel_pytree(adopted(self.machine, state))
-        return jax.jacfwd(lambda x: ravel_pytree(_end(self, unravel(x)))[0])(x)
+        x, unravel = raveled(adopted(self.machine, state))
+        return jax.jacfwd(lambda x: raveled(_end(self, unravel(x)))[0])(x)
 
 
 @forward_jacobian
@@ -118,8 +119,9 @@ def _usual(machine: AbstractMachine) -> AbstractMethod:
 
 
 def adopted(machine: AbstractMachine, state: State, name: str = "state") -> State:
-    """A state as a cycle map needs it, in floating-point arrays of one type; `name` is the argument
-    that messages blame."""
+    """A state as a cycle map needs it, in floating-point arrays of one type, with the machine's own
+    modes if it has some; `name` is the argument that messages blame."""
+    modes, state = modes_of(state), bare(state)
     state = machine.adopt(machine.in_cycle_state(name, state))
     check_reals(name, state)
     if machine.clock(state) is not None:
@@ -128,4 +130,15 @@ def adopted(machine: AbstractMachine, state: State, name: str = "state") -> Stat
             "has a clock."
         )
     check_period(machine, state)
-    return as_floats(machine, state)
+    state = as_floats(machine, state)
+    if modes is None:
+        return begun(machine, state, axes_of(machine, state))
+    dtype = machine.position(state).dtype
+    return HybridState(state, tuple(jnp.asarray(mode, dtype) for mode in modes))
+
+
+def axes_of(machine: AbstractMachine, state: State) -> int:
+    """Along how many axes a guess is several: how many its position has."""
+    with contextlib.suppress(AttributeError, TypeError, LookupError):  # looked at where it is one
+        return jnp.ndim(machine.position(bare(state)))
+    return int(any(jnp.ndim(leaf) for leaf in jtu.tree_leaves(bare(state))))

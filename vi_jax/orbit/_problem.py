@@ -21,15 +21,17 @@ from ..flow import (
 from ..machine import (
     AbstractMachine,
     after_event,
+    bare,
     begin_modes,
     check_again,
     events_of,
     is_autonomous,
     leaf,
+    modes_of,
     renews,
     with_leaf,
 )
-from ._events import Event, section_of
+from ._events import Event, guard_at, section_of
 from ._fixed_step_method import fixed_step_method, steps_of
 from ._flight import Flight
 from ._shooting import Shooting
@@ -44,6 +46,20 @@ _LISTED = 32
 # that asks for more of them than this is followed with so many. The first is the corrector's
 # tolerance (`curve.corrected`), the second a choice.
 _SETTLED, _MOST = 1e-11, 4096
+
+
+# Events so close (by the clock) are met at one instant, and a guard so far from zero there is not
+# met by the motion: choices.
+_SAME_INSTANT, _OFF_ZERO = 1e-9, 1e-6
+
+
+class _Way(NamedTuple):
+    """A motion over one period, followed from event to event."""
+
+    states: np.ndarray
+    """Just before each event, and at the end of the period; (events + 1, states)."""
+    modes: tuple[tuple[float, ...], ...]
+    """The machine's modes in each flight."""
 
 
 def check_parameter(
@@ -87,11 +103,12 @@ def problem_of(
             f"Argument `orbit` must list all its {int(orbit.impacts)} impacts, but lists "
             f"{len(orbit.impact_stop)}: find it with a larger `impact_log`."
         )
-    steps = steps_of(carried, corners, orbit.state, cycles)
+    steps = steps_of(carried, corners, bare(orbit.state), cycles)
     found = events_in(orbit)
-    blank = Shooting(machine, carried, orbit.state, cycles, (), (), steps, (parameter,))
+    blank = Shooting(machine, carried, bare(orbit.state), cycles, (), (), steps, (parameter,))
     period = float(orbit.duration) if blank.autonomous else float(machine.cycle) * cycles
     way = _followed(blank, orbit.state, found, period)
+    _check_instants(blank, found, way)
     while sized_by_motion(blank):
         doubled = dataclasses.replace(blank, steps=2 * blank.steps)
         again = _followed(doubled, orbit.state, found, period)
@@ -105,6 +122,22 @@ def problem_of(
     states = way.states[:-1] if found else way.states
     x = problem.pack([place for place, _ in found], states, [leaf(machine, parameter)], period)
     return problem, np.asarray(x)
+
+
+def _check_instants(blank: Shooting, found: list[tuple[float, Event]], way: _Way) -> None:
+    """**Raises:** `ValueError` for an event that another one sets off: it has no guard of its own
+    to be zero, so that the equations have no place for it."""
+    machine = blank.machine
+    for i, (place, event) in enumerate(found):
+        if i and abs(place - found[i - 1][0]) <= _SAME_INSTANT and event.cycle is None:
+            state, modes = blank.unravel(jnp.asarray(way.states[i])), way.modes[i - 1]
+            before = tuple(jnp.asarray(mode) for mode in modes)
+            if abs(float(guard_at(machine, event, jnp.asarray(place), state, before))) > _OFF_ZERO:
+                raise ValueError(
+                    "Argument `orbit` must have no event that another one sets off, but "
+                    f"{event.called(machine)} is met with {found[i - 1][1].called(machine)}. "
+                    "Let one event do both."
+                )
 
 
 def sized_by_motion(problem: Shooting) -> bool:
@@ -130,15 +163,6 @@ def finer(problem: Shooting, x: Unknowns) -> Shooting | None:
     return more
 
 
-class _Way(NamedTuple):
-    """A motion over one period, followed from event to event."""
-
-    states: np.ndarray
-    """Just before each event, and at the end of the period; (events + 1, states)."""
-    modes: tuple[tuple[float, ...], ...]
-    """The machine's modes in each flight."""
-
-
 def _followed(
     blank: Shooting, state: State, found: list[tuple[float, Event]], period: float
 ) -> _Way:
@@ -148,7 +172,8 @@ def _followed(
     and event of all that is met within the period, in their order; `period`, by the clock.
     """
     machine = blank.machine
-    modes = begin_modes(machine, jnp.zeros(()), state)
+    own, state = modes_of(state), bare(state)
+    modes = begin_modes(machine, jnp.zeros(()), state, own)
     u, s = ravel_pytree(state)[0], 0.0
     states, in_flight = [], []
     for place, event in found:
@@ -170,7 +195,7 @@ def _followed(
 def events_in(orbit: Orbit) -> list[tuple[float, Event]]:
     """The events of a motion, with the clock of each since the section, in their order."""
     machine, cycles = orbit.machine, int(orbit.cycles)
-    autonomous = is_autonomous(machine, orbit.state)
+    autonomous = is_autonomous(machine, bare(orbit.state))
     clock = np.asarray(orbit.impact_phase) - float(machine.phase_at(0.0))
     stops = np.asarray(orbit.impact_stop)
     found = [(float(s), Event(int(i))) for s, i in zip(clock, stops, strict=True) if i >= 0]
@@ -179,7 +204,7 @@ def events_in(orbit: Orbit) -> list[tuple[float, Event]]:
     if others or (autonomous and cycles > 1):
         begins, listed = _listed_events(orbit)
         found = listed if others else found
-    if machine.section(orbit.state) is not None or renews(machine):
+    if machine.section(bare(orbit.state)) is not None or renews(machine):
         found += [(float(begins[n]), section_of(machine, n)) for n in range(cycles)]
     # What is met with a section belongs to the cycle that ends there.
     return sorted(found, key=lambda f: (f[0], f[1].cycle is not None))

@@ -11,13 +11,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Float
 
 from .._types import State, Vector
 from ..flow import simulate
-from ..machine import in_rows
+from ..machine import in_rows, raveled
 from ._cycle_map import CycleMap
 from ._neutral import least
 from .root_finders import AbstractRootFinder, Found, find_root
@@ -27,7 +26,7 @@ def _missing(
     arc: CycleMap, arcs: Float[Array, "arcs states"], unravel: Callable[[Vector], State]
 ) -> Float[Array, "arcs states"]:
     """F: what each arc lacks to end where the next one begins; after the last comes the first."""
-    ends = jax.vmap(lambda x: ravel_pytree(arc(unravel(x)))[0])(arcs)
+    ends = jax.vmap(lambda x: raveled(arc(unravel(x)))[0])(arcs)
     return ends - jnp.roll(arcs, -1, axis=0)
 
 
@@ -42,7 +41,7 @@ def root_of(arc: CycleMap, guess: State, root_finder: AbstractRootFinder) -> Fou
     **Returns:** `Found`, all its numbers floats; its `x` are the states in which the arcs begin, as
     rows.
     """
-    x, unravel = ravel_pytree(guess)
+    x, unravel = raveled(guess)
     arcs = x[None]
     if root_finder.arcs > 1:
         run = simulate(
@@ -58,7 +57,7 @@ def root_of(arc: CycleMap, guess: State, root_finder: AbstractRootFinder) -> Fou
 def _(primals, tangents):
     arc, guess, root_finder = primals
     root = root_of(arc, guess, root_finder)
-    _, unravel = ravel_pytree(guess)
+    _, unravel = raveled(guess)
     still = jtu.tree_map(jnp.zeros_like, root)
     if not jtu.tree_leaves(tangents[0]):
         return root, still

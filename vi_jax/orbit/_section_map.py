@@ -13,11 +13,20 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jax.flatten_util import ravel_pytree
+from jaxtyping import Array
 
 from .._types import Scalar, State, Vector
 from ..flow import MethodLike, Run, means, simulate
-from ..machine import AbstractMachine, in_rows, is_autonomous, leaf
+from ..machine import (
+    AbstractMachine,
+    HybridState,
+    bare,
+    in_rows,
+    is_autonomous,
+    leaf,
+    modes_of,
+    raveled,
+)
 from ._cycle_map import CycleMap
 from ._fixed_step_method import fixed_step_method
 from ._observed import Counted, Observed
@@ -50,7 +59,11 @@ class SectionMap(Shooting):
     def _map(self, machine: AbstractMachine, u: Vector) -> Vector:
         """The state a period after `u`."""
         carried = CycleMap(machine, self.method, self.cycles, True)
-        return ravel_pytree(carried(self._begun(machine, u)))[0]
+        return raveled(carried(self._begun(machine, u)))[0]
+
+    def own_modes(self, leg: Leg) -> tuple[Array, ...]:
+        """The machine's own modes on the section: all that `modes` has."""
+        return self.modes_in(leg)
 
     def _begun(self, machine: AbstractMachine, u: Vector) -> State:
         """The state `u`, put on those stops that it is beyond: where the motion rests on its
@@ -61,7 +74,8 @@ class SectionMap(Shooting):
             beyond = stop.beyond(body.position(state)) > 0
             there = body.placed(state, stop.place, body.velocity(state))
             state = jtu.tree_map(partial(jnp.where, beyond), there, state)
-        return state
+        own = self.own_modes(0)
+        return HybridState(state, own) if own else state
 
     def flown(self, x: Vector, **options: Any) -> Run:
         """The motion of a period, simulated with these options."""
@@ -119,6 +133,7 @@ def section_map_of(
     machine = orbit.machine
     carried = fixed_step_method(method, orbit.method, machine)
     problem = SectionMap(
-        machine, carried, orbit.state, int(orbit.cycles), (), ((),), 1, (parameter,)
-    )
-    return problem, np.append(ravel_pytree(orbit.state)[0], float(leaf(machine, parameter)))
+        machine, carried, bare(orbit.state), int(orbit.cycles), (),
+        (tuple(float(mode) for mode in modes_of(orbit.state) or ()),), 1, (parameter,),
+    )  # fmt: skip
+    return problem, np.append(raveled(orbit.state)[0], float(leaf(machine, parameter)))

@@ -22,7 +22,15 @@ from jaxtyping import Array, Float
 
 from .._types import Scalar, State, Vector
 from ..flow import AbstractMethod, average_names, means
-from ..machine import AbstractMachine, after_event, is_autonomous, jump_of, mode_number, with_leaf
+from ..machine import (
+    AbstractMachine,
+    after_event,
+    events_of,
+    is_autonomous,
+    jump_of,
+    mode_number,
+    with_leaf,
+)
 from ._events import Event, guard_at
 from ._flight import Flight
 from ._observed import Observed, apart
@@ -147,6 +155,11 @@ class Shooting(eqx.Module):
             return ()
         modes = jnp.asarray(self.modes, jnp.result_type(float))[leg]
         return tuple(modes[j] for j in range(len(self.modes[0])))
+
+    def own_modes(self, leg: Leg) -> tuple[Array, ...]:
+        """The machine's own modes in a leg: those that no event holds."""
+        held = sum(event.holds_mode for event in events_of(self.machine))
+        return self.modes_in(leg)[held:]
 
     def _each(self, leg: Leg, function: Callable[..., Any], *inputs: Any) -> Any:
         """`function(event, *inputs)` for the event that begins a leg, whose number may be

@@ -10,6 +10,7 @@ from jaxtyping import Array
 from .._checks import count
 from .._programs import compiled
 from .._types import Scalar, State
+from ..machine import HybridState
 from ._observed import Observed
 from ._shooting import Shooting
 from .curve import Step
@@ -31,6 +32,12 @@ def sections_of(problem: Shooting, x: np.ndarray | Array) -> tuple[State, Scalar
     """The states on the sections of a solution, leaves (cycles,), and the largest component of its
     residual."""
     x = jnp.asarray(x)
+    legs, places = _legs_of_sections(problem, x)
+    return _compiled_sections(problem, x, jnp.asarray(legs), jnp.asarray(places))
+
+
+def _legs_of_sections(problem: Shooting, x: Array) -> tuple[np.ndarray, np.ndarray]:
+    """Of each section of a solution, in which leg it lies, and its clock."""
     clock, period = _clock_of(problem, x)
     begins = [i for i, event in enumerate(problem.events) if event.cycle is not None]
     if begins:
@@ -41,7 +48,7 @@ def sections_of(problem: Shooting, x: np.ndarray | Array) -> tuple[State, Scalar
         if len(clock):
             places = clock[0] + np.mod(places - clock[0], period)
             legs = np.searchsorted(clock, places, side="right") - 1
-    return _compiled_sections(problem, x, jnp.asarray(legs), jnp.asarray(places))
+    return legs, places
 
 
 def _impacts_of(
@@ -78,10 +85,12 @@ def orbit_of(problem: Shooting, step: Step) -> Orbit:
     order = np.argsort(within)
     since = machine.phase_at(within[order])
     duration = jnp.asarray(seen.duration)
+    state = jax.tree.map(lambda x: x[0], sections)
+    own = problem.own_modes(int(_legs_of_sections(problem, x)[0][0]))
     return Orbit(
         machine=machine,
         method=problem.method,
-        state=jax.tree.map(lambda x: x[0], sections),
+        state=HybridState(state, own) if own else state,
         sections=sections,
         cycles=jnp.asarray(problem.cycles, jnp.int32),
         duration=duration,

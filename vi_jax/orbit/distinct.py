@@ -8,7 +8,7 @@ import numpy as np
 
 from .._checks import given_number, short
 from .._messages import so_many
-from ..machine import in_rows, state_in_words
+from ..machine import bare, in_rows, state_in_words
 from .results import InWords, Orbit, hits_in_words, span_in_words, trimmed
 
 
@@ -24,7 +24,7 @@ def in_one_line(orbit: Orbit) -> str:
     cycles = int(orbit.cycles)
     period = orbit.machine.period_of(cycles)
     stable = "stable" if bool(orbit.stable) else "unstable"
-    where, span = state_in_words(orbit.state, 6, orbit.machine.units), span_in_words(orbit, 6)
+    where, span = state_in_words(bare(orbit.state), 6, orbit.machine.units), span_in_words(orbit, 6)
     size = f"greatest multiplier {np.abs(orbit.multipliers).max():.6g}"
     return f"  {period}, {hits_in_words(orbit)}, {stable}: {where}; {span}; {size}"
 

@@ -1,8 +1,6 @@
 """`find_orbit`: from a guess to a periodic motion that is judged and differentiable."""
 
-import contextlib
 import dataclasses
-from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -17,9 +15,25 @@ from .._messages import warning_once
 from .._programs import compiled
 from .._types import Flag, Number, State
 from ..flow import MethodLike, check_leaves, in_modes, means, shape_of
-from ..machine import AbstractMachine, begin_modes, is_autonomous
-from ._arcs import by_the_first_state, error_of, in_order, moved_from_impacts, observe_arc
-from ._cycle_map import CycleMap, adopted, cycle_map
+from ..machine import (
+    AbstractMachine,
+    HybridState,
+    bare,
+    begin_modes,
+    is_autonomous,
+    modes_of,
+    raveled,
+    replaced,
+)
+from ._arcs import (
+    ObservedArc,
+    by_the_first_state,
+    error_of,
+    in_order,
+    moved_from_impacts,
+    observe_arc,
+)
+from ._cycle_map import CycleMap, adopted, axes_of, cycle_map
 from ._root import root_of
 from .floquet import multipliers_of
 from .results import ORBIT_RESULTS, Orbit, trimmed
@@ -94,6 +108,11 @@ def find_orbit(
     guess = guess.state if isinstance(guess, Orbit) else guess
     state = adopted(the_map.machine, guess, "guess")
     _check_guess(the_map.machine, state)
+    if modes_of(state) and root_finder.arcs > 1:
+        raise ValueError(
+            "Argument `root_finder` must have one arc for a machine with modes of its own, but has "
+            f"{root_finder.arcs}."
+        )
     orbit = _find(the_map, state, root_finder, impact_log)
     if throw:
         orbit = eqx.error_if(orbit, ~orbit.successful, "No orbit was found; see `Orbit.result`.")
@@ -103,7 +122,7 @@ def find_orbit(
 def _check_guess(machine: AbstractMachine, state: State) -> None:
     """**Raises:** `ValueError` unless this is a state, or as many of them in rows."""
     check_leaves("guess", state)
-    axes = _axes_of(machine, state)
+    axes = axes_of(machine, state)
     if axes > 1:
         raise ValueError(
             "Argument `guess` must be one state, or several along one axis, but its position has "
@@ -111,7 +130,7 @@ def _check_guess(machine: AbstractMachine, state: State) -> None:
         )
     many = axes > 0
     if not many:
-        shape_of("guess", machine, state)
+        shape_of("guess", machine, bare(state))
     shapes = {jnp.shape(leaf)[:1] for leaf in jtu.tree_leaves(state)} if many else {()}
     if len(shapes) > 1:
         whole = sorted(jnp.shape(leaf) for leaf in jtu.tree_leaves(state))
@@ -126,13 +145,6 @@ def _check_guess(machine: AbstractMachine, state: State) -> None:
             raise ValueError(f"Argument `guess` must be finite, but its {name} is {numbers}.")
 
 
-def _axes_of(machine: AbstractMachine, state: State) -> int:
-    """Along how many axes a guess is several: how many its position has."""
-    with contextlib.suppress(AttributeError, TypeError, LookupError):  # looked at where it is one
-        return jnp.ndim(machine.position(state))
-    return int(any(jnp.ndim(leaf) for leaf in jtu.tree_leaves(state)))
-
-
 @compiled
 def _find(
     the_map: CycleMap, guess: State, root_finder: AbstractRootFinder, impact_log: int
@@ -141,7 +153,7 @@ def _find(
         return _judged(the_map, guess, root_finder, impact_log)
 
     first = jtu.tree_leaves(guess)[0]
-    if not _axes_of(the_map.machine, guess):
+    if not axes_of(the_map.machine, guess):
         return one(guess)
     return jax.lax.map(one, guess, batch_size=min(_BATCH, first.shape[0]))
 
@@ -151,10 +163,11 @@ def _judged(
 ) -> Orbit:
     """The orbit found from one guess, with all that is said about it."""
     machine, cycles = the_map.machine, the_map.cycles
-    moved, start, place = moved_from_impacts(the_map, jax.lax.stop_gradient(guess), impact_log)
+    guess = _in_later_modes(the_map, jax.lax.stop_gradient(guess))
+    moved, start, place = moved_from_impacts(the_map, guess, impact_log)
     arc = dataclasses.replace(moved, cycles=cycles // root_finder.arcs)
     root = root_of(arc, start, root_finder)
-    x, unravel = root.x, ravel_pytree(guess)[1]
+    x, unravel = root.x, raveled(start)[1]
     seen = jax.vmap(lambda x: observe_arc(arc, unravel(x), impact_log))(x)
     jacobians = by_the_first_state(seen.jacobians)
     error, drifts = error_of(seen, x)
@@ -163,7 +176,9 @@ def _judged(
     # Back on the section asked for, of which the last one met is the guess's.
     last = seen.states.shape[1] - 1
     sections = jnp.roll(jnp.take(seen.states, last - place, axis=1), 1, axis=0)
-    least = _least_period(sections, error)
+    modes = jnp.roll(jnp.take(seen.modes, last - place, axis=1), 1, axis=0)
+    least = _least_period(jnp.concatenate([sections, modes], axis=1), error)
+    again = _comes_back(start, seen)
     monodromy = jacobians[least - 1]
     within = jnp.arange(cycles) < least
     hit = (seen.listed.stop >= 0) & within[:, None]
@@ -171,15 +186,16 @@ def _judged(
     duration = jnp.sum(jnp.where(within, seen.duration, 0.0))
     sums = {name: jnp.sum(jnp.where(within, a, 0.0)) for name, a in seen.integrals.items()}
     clearance = jnp.min(jnp.where(within, seen.clearance, jnp.inf))
-    still = _stands_still(machine, sections[0], unravel, duration)
-    found = (root.converged > 0) & ~still & (error < jnp.sqrt(jnp.finfo(x.dtype).eps) * 100)
+    state = _at_section(guess, sections[0], modes[0])
+    still = _stands_still(machine, state, duration)
+    found = (root.converged > 0) & again & ~still & (error < jnp.sqrt(jnp.finfo(x.dtype).eps) * 100)
     slowest = jnp.min(jnp.where(hit, seen.listed.speed, jnp.inf))
     near = jnp.minimum(slowest, jnp.sqrt(2 * jnp.maximum(clearance, 0))) < _SLOW
     return Orbit(
         machine=machine,
         method=the_map.method,
-        state=unravel(sections[0]),
-        sections=jax.vmap(unravel)(sections),
+        state=state,
+        sections=jax.vmap(ravel_pytree(bare(guess))[1])(sections),
         cycles=least,
         duration=duration,
         frequency_ratio=machine.frequency_ratio(duration / least),
@@ -198,8 +214,36 @@ def _judged(
         iterations=root.steps.astype(jnp.int32),
         history=root.history,
         averages=means(sums, duration),
-        result=_verdict(found, least < cycles, near, drifts, still, jnp.isnan(root.residual)),
-    )
+        result=_verdict(
+            found, least < cycles, near, drifts, still, jnp.isnan(root.residual),
+            (root.converged > 0) & ~again,
+        ),
+    )  # fmt: skip
+
+
+def _in_later_modes(the_map: CycleMap, guess: State) -> State:
+    """The guess in the modes in which the motion from it is a period later, which are more likely
+    those of an orbit near it than those that a motion begins with."""
+    if modes_of(guess) is None:
+        return guess
+    later = the_map(guess)
+    there = jnp.all(jnp.isfinite(raveled(later)[0]))
+    return jtu.tree_map(lambda a, b: jnp.where(there, a, b), replaced(later, bare(guess)), guess)
+
+
+def _comes_back(start: State, seen: ObservedArc) -> Flag:
+    """Whether a motion comes back to the modes in which it began: after as many cycles as were
+    asked for."""
+    modes = modes_of(start)
+    if modes is None:
+        return jnp.ones((), bool)
+    return jnp.all(seen.modes[-1, -1] == jnp.stack(modes))
+
+
+def _at_section(guess: State, section: Array, modes: Array) -> State:
+    """A state on the section from its numbers, and the machine's own modes there."""
+    state = ravel_pytree(bare(guess))[1](section)
+    return state if modes_of(guess) is None else HybridState(state, tuple(modes))
 
 
 def _least_period(sections: Float[Array, "cycles states"], error: Array) -> Array:
@@ -215,15 +259,15 @@ def _least_period(sections: Float[Array, "cycles states"], error: Array) -> Arra
     return least
 
 
-def _stands_still(
-    machine: AbstractMachine, x: Array, unravel: Callable[[Array], State], duration: Array
-) -> Flag:
-    """Whether an autonomous machine stands still in the state `x`, at an equilibrium: as fast as
-    it leaves the section it would get nowhere in its period."""
-    if not is_autonomous(machine, unravel(x)):
+def _stands_still(machine: AbstractMachine, state: State, duration: Array) -> Flag:
+    """Whether an autonomous machine stands still in a state, at an equilibrium: as fast as it
+    leaves the section it would get nowhere in its period."""
+    own, state = modes_of(state), bare(state)
+    if not is_autonomous(machine, state):
         return jnp.zeros((), bool)
-    s, state = jnp.zeros((), x.dtype), unravel(x)
-    field = in_modes(machine, begin_modes(machine, s, state)).field
+    x = ravel_pytree(state)[0]
+    s = jnp.zeros((), x.dtype)
+    field = in_modes(machine, begin_modes(machine, s, state, own)).field
     passed = jnp.abs(ravel_pytree(field(s, state))[0]) * duration
     return jnp.all(passed <= _slack(x.dtype) * (1 + jnp.abs(x)))
 
@@ -234,16 +278,19 @@ def _slack(dtype: object) -> float:
 
 
 def _verdict(
-    found: Array, smaller: Array, near_grazing: Array, drifts: Array, still: Array, no_run: Array
-) -> ORBIT_RESULTS:
+    found: Array, smaller: Array, near_grazing: Array, drifts: Array, still: Array, no_run: Array,
+    other_modes: Array,
+) -> ORBIT_RESULTS:  # fmt: skip
     """The result of a search, from flags.
 
     **Arguments:** `found`, an orbit; `smaller`, its period; `near_grazing`, where the search ended;
-    `drifts`, the motion; `still`, an equilibrium; `no_run`, the guess cannot be simulated.
+    `drifts`, the motion; `still`, an equilibrium; `no_run`, the guess cannot be simulated;
+    `other_modes`, the motion ends where it began, but in other modes.
     """
     where, results = ORBIT_RESULTS.where, ORBIT_RESULTS
     missed = where(near_grazing, results.grazing, results.no_orbit)
     missed = where(drifts, results.drifts, missed)
+    missed = where(other_modes, results.other_modes, missed)
     missed = where(still, results.equilibrium, missed)
     missed = where(no_run, results.not_simulated, missed)
     return where(found, where(smaller, results.smaller_period, results.successful), missed)

@@ -28,6 +28,7 @@ from ..flow import (
 from ..machine import (
     AbstractMachine,
     Summarized,
+    bare,
     first_few,
     in_unit,
     is_autonomous,
@@ -66,11 +67,15 @@ class ORBIT_RESULTS(NamedEnumeration):
         "The guess cannot be simulated, as one beyond a stop or a number of the machine that is "
         "not finite: `simulate` says why."
     )
+    other_modes = (
+        "No orbit was found: the motion comes back to its state in other modes of the machine. Its "
+        "period is longer: ask for more `cycles`."
+    )
 
 
 _RESULT_NAMES = (
     "successful", "smaller_period", "inadmissible", "no_orbit", "grazing", "drifts",
-    "equilibrium", "not_simulated",
+    "equilibrium", "not_simulated", "other_modes",
 )  # fmt: skip
 
 
@@ -86,7 +91,8 @@ class Orbit(Summarized):
     """What moves; in the phase clock."""
     method: AbstractMethod
     state: State
-    """State on the section, a pytree like a start."""
+    """State on the section, a pytree like a start; a `HybridState` for a machine with modes of its
+    own."""
     sections: State
     """States on the sections of the cycles that were asked for; leaves (cycles,)."""
     cycles: Int[Array, "..."]
@@ -252,7 +258,7 @@ class Orbit(Summarized):
         period = self.machine.period_of(cycles)
         lines = [
             f"Orbit of period {period} with {hits_in_words(self)}, {STABILITY[self.stability]}",
-            f"  section: {state_in_words(self.state, 9, units)}",
+            f"  section: {state_in_words(bare(self.state), 9, units)}",
             f"  {span_in_words(self, 9)}",
         ]
         if is_autonomous(self.machine, self.state):
@@ -305,7 +311,7 @@ def _nearly(orbit: Orbit) -> str:
 def lies_on_a_stop(orbit: Orbit) -> bool:
     """Whether a body lies still on a stop on the section."""
     bodies = ((stop, orbit.machine.coordinates[stop.coordinate]) for stop in orbit.machine.stops)
-    x = orbit.state
+    x = bare(orbit.state)
     return any(stop.beyond(y.position(x)) >= 0 and y.velocity(x) == 0 for stop, y in bodies)
 
 

@@ -9,7 +9,7 @@ from .._checks import count, flag
 from .._messages import Interrupted, Tell, at_work, silent
 from .._types import State
 from ..flow import MethodLike
-from ..machine import AbstractMachine, Summarized, in_rows
+from ..machine import AbstractMachine, Summarized, bare, in_rows
 from ..orbit import Orbit, adopted
 from ._motion import distance_to, in_row, orbit_near, settling_on
 from ._settling import ELSEWHERE, INADMISSIBLE, RETURNS, TRAIL, Row, Rows, Settling
@@ -102,7 +102,7 @@ def edge_state(
     longest, rounds = count("longest", longest, least=1), count("rounds", rounds, least=1)
     settling, start = settling_on(machine, inside, settle, tolerance, longest, method, "inside")
     beyond = outside.state if isinstance(outside, Orbit) else outside
-    beyond = in_row(adopted(settling.the_map.machine, beyond, "outside"))
+    beyond = in_row(bare(adopted(settling.the_map.machine, beyond, "outside")))
     first, second = settling.judge(np.stack([start, beyond]))
     for name, verdict, wanted in (("inside", first, RETURNS), ("outside", second, ELSEWHERE)):
         if verdict == INADMISSIBLE:

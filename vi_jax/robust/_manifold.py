@@ -11,7 +11,7 @@ from jaxtyping import Bool
 from .._checks import flag, given_number, one_of
 from .._messages import Interrupted, at_work
 from .._types import State
-from ..machine import AbstractMachine, Summarized, in_rows, is_autonomous
+from ..machine import AbstractMachine, Summarized, bare, in_rows, is_autonomous
 from ..orbit import Orbit, cycle_map
 from ._motion import in_row
 from ._settling import Row, Rows, Settling
@@ -145,8 +145,8 @@ class _Saddle:
 
     def __init__(self, orbit: Orbit):
         the_map = cycle_map(orbit.machine, method=orbit.method)
-        self.place = in_row(orbit.state)
-        self.map = Settling(the_map, orbit.state, self.place[None], 1, 1.0)
+        self.place = in_row(bare(orbit.state))
+        self.map = Settling(the_map, bare(orbit.state), self.place[None], 1, 1.0)
         period = int(orbit.cycles)
         whole = cycle_map(orbit.machine, period, method=orbit.method)
         jacobian = np.asarray(whole.jacobian(orbit.state))

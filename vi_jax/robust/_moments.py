@@ -8,7 +8,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from ..flow import simulate
-from ..machine import in_rows, is_autonomous
+from ..machine import bare, in_rows, is_autonomous
 from ._settling import Row, Settling, until
 
 # How exactly the worst moment is found, as a part of a cycle: the norm is flat there. A choice.
@@ -71,7 +71,7 @@ class Moments:
                 machine.observed_every(phase), self.settling.state(row), 1, method=method,
                 record="sections",
             )  # fmt: skip
-            return self.settling.starting(0.0), np.asarray(in_rows(there.last, 0))
+            return self.settling.starting(0.0), np.asarray(in_rows(bare(there.last), 0))
         numbers = (jnp.asarray(x) for x in (row, phase))
         later = until(self.settling.the_map, self.settling.like, *numbers)
         return self.settling.starting(phase), np.asarray(later)

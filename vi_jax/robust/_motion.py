@@ -6,7 +6,7 @@ import numpy as np
 from .._checks import count, given_number
 from .._types import State
 from ..flow import MethodLike
-from ..machine import AbstractMachine, begin_modes, field_in, in_rows, is_autonomous
+from ..machine import AbstractMachine, bare, begin_modes, field_in, in_rows, is_autonomous
 from ..orbit import Orbit, adopted, cycle_map, find_orbit
 from ._settling import Row, Rows, Settling, advanced
 
@@ -48,10 +48,10 @@ def settling_on(
             raise ValueError(f"Argument `{name}` must be one orbit that was found, but is no such.")
         if not bool(motion.stable):
             raise ValueError(f"Argument `{name}` must be a stable orbit, but this one is not.")
-        like = adopted(the_map.machine, motion.state, name)
+        like = bare(adopted(the_map.machine, motion.state, name))
         rows = np.asarray(in_rows(motion.sections))[: int(motion.cycles)]
         return Settling(the_map, like, rows, settle, tolerance), rows[cycle % len(rows)]
-    like = adopted(the_map.machine, motion, name)
+    like = bare(adopted(the_map.machine, motion, name))
     start = in_row(like)
     settling = Settling(the_map, like, start[None], settle, tolerance)
     if stands_still(the_map.machine, like):

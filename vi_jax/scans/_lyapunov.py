@@ -24,7 +24,11 @@ from ..flow import (
 )
 from ..machine import (
     AbstractMachine,
+    HybridState,
+    bare,
     is_autonomous,
+    modes_of,
+    raveled,
     renews,
     stated,
     unit_of,
@@ -79,7 +83,7 @@ def lyapunov(
     exponents by the cycles so far.
     """
     cycles, progress = count("cycles", cycles, least=8), flag("progress", progress)
-    if is_autonomous(machine, start):
+    if is_autonomous(machine, bare(start)):
         if renews(machine):
             raise ValueError(
                 "Argument `machine` must not have both a `section` and a `renewed`, as a "
@@ -93,7 +97,7 @@ def lyapunov(
     if rests is not None:
         carried = dataclasses.replace(carried, rests=flag("rests", rests))
     start = adopted(carried.machine, start, "start")
-    states = ravel_pytree(start)[0].size
+    states = raveled(start)[0].size
     number = states if number is None else count("number", number, least=1)
     if number > states:
         raise ValueError(
@@ -120,14 +124,15 @@ def _lyapunov(the_map: CycleMap, start, cycles: int, settle, number: int) -> Lya
 
 @compiled
 def _begun(the_map: CycleMap, start, settle, number: int) -> Any:
-    """The numbers of the state where observing begins, the first tangent vectors, and whether the
-    motion came there."""
+    """The numbers of the state where observing begins, with the machine's own modes (`None` if it
+    has none), the first tangent vectors, and whether the motion came there."""
     machine, method, rests = the_map.machine, the_map.method, the_map.rests
     before = simulate(
         machine, start, 1, settle=settle, method=method, rests=rests, record="sections"
     )
-    x = ravel_pytree(before.last)[0]
-    return x, jnp.eye(x.size, number, dtype=x.dtype), before.result
+    x = raveled(before.last)[0]
+    modes = modes_of(before.last)
+    return (x, modes), jnp.eye(x.size, number, dtype=x.dtype), before.result
 
 
 def _in_parts(
@@ -177,35 +182,36 @@ def _observer(the_map: CycleMap, start, window: int) -> Any:
     """A function that observes so many cycles: what `_begun` gives carried on, and rates of growth,
     durations and integrals."""
     machine, method, rests = the_map.machine, the_map.method, the_map.rests
-    unravel = ravel_pytree(start)[1]
+    unravel = ravel_pytree(bare(start))[1]
 
     # Where all cycles last alike, turning points need not be met for the sake of durations.
-    plain = has_fixed_cycle(machine, start) and not has_averages(machine)
+    plain = has_fixed_cycle(machine, bare(start)) and not has_averages(machine)
     record = "sections" if plain else "motion"
 
-    def image(x):
-        run = simulate(machine, unravel(x), window, method=method, rests=rests, record=record)
+    def image(x, modes):
+        state = unravel(x) if modes is None else HybridState(unravel(x), modes)
+        run = simulate(machine, state, window, method=method, rests=rests, record=record)
         duration = run.duration
         if duration is None:
             duration = jnp.full(window, machine.period, x.dtype)
         sections = jax.vmap(lambda state: ravel_pytree(state)[0])(run.sections)
         integrals = {name: x * duration for name, x in run.averages.items()}
-        return sections[1:], (duration, integrals, run.result)
+        return sections[1:], (duration, integrals, run.result, modes_of(run.last))
 
     def observe(carry, _):
-        x, frame, result = carry
+        (x, modes), frame, result = carry
 
         def along(direction):
-            return jax.jvp(image, (x,), (direction,), has_aux=True)
+            return jax.jvp(lambda x: image(x, modes), (x,), (direction,), has_aux=True)
 
-        new, grown, (duration, integrals, ended) = jax.vmap(
+        new, grown, (duration, integrals, ended, modes) = jax.vmap(
             along, in_axes=1, out_axes=(None, 2, None)
         )(frame)
         frame, sizes = _orthogonal(grown[-1])
         alone = frame.shape[1] == 1
         rates = _growth(grown[..., 0])[:, None] if alone else jnp.log(sizes)[None]
         result = RESULTS.where(result == RESULTS.successful, ended, result)
-        return (new[-1], frame, result), (rates, duration, integrals)
+        return ((new[-1], modes), frame, result), (rates, duration, integrals)
 
     return observe
 
@@ -215,7 +221,7 @@ def _summed(the_map: CycleMap, start, carry, seen) -> Lyapunov:
 
     **Arguments:** `carry` and `seen`, as `_observer`'s function gives them, the latter in a row.
     """
-    (x, _, result), (rates, duration, integrals) = carry, seen
+    ((x, modes), _, result), (rates, duration, integrals) = carry, seen
     rates, duration, machine = rates.reshape(-1, rates.shape[-1]), duration.ravel(), the_map.machine
     mean, halves = _weighted(rates, duration)
 
@@ -223,12 +229,12 @@ def _summed(the_map: CycleMap, start, carry, seen) -> Lyapunov:
         return jnp.where(result == RESULTS.successful, jnp.sum(x), jnp.nan)
 
     mean = jnp.where(result == RESULTS.successful, mean, jnp.nan)
-    exponents = jnp.sort(mean, descending=True)
+    exponents, state = jnp.sort(mean, descending=True), ravel_pytree(bare(start))[1](x)
     return Lyapunov(
         exponents=exponents,
         per_cycle=exponents * jnp.mean(duration),
         spread=jnp.where(halves[0] == halves[1], 0.0, jnp.abs(halves[0] - halves[1])),
-        state=ravel_pytree(start)[1](x),
+        state=state if modes is None else HybridState(state, modes),
         result=result,
         averages=means(jax.tree.map(good_sum, integrals), jnp.sum(duration)),
         unit=unit_of(machine.units, "rate"),

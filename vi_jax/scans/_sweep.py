@@ -22,8 +22,11 @@ from ..flow import (
 )
 from ..machine import (
     AbstractMachine,
+    bare,
+    begun,
     check_again,
     check_leaf,
+    replaced,
     stated,
     with_leaf,
 )
@@ -100,14 +103,14 @@ def sweep(
     method = chosen(machine, method)
     if clock is not None:
         machine = machine.in_clock(clock)
-    start = machine.adopt(start)
+    start = replaced(start, machine.adopt(bare(start)))
     check_reals("start", start)
-    start = jtu.tree_map(lambda x: jnp.asarray(x, values.dtype), start)
+    start = jtu.tree_map(lambda x: jnp.asarray(x, values.dtype), begun(machine, start))
     if numbers is not None:
-        check_start(with_leaf(machine, parameter, numbers[0]), start)
+        check_start(with_leaf(machine, parameter, numbers[0]), bare(start))
     shaken = shaken_by(noise, key, (), (), ())
     if shaken is not None:
-        check_noise(machine, start, noise)
+        check_noise(machine, bare(start), noise)
     options = (settle, cycles, method, rests, tolerance, max_steps, shaken)
     if not is_outermost(machine, values, start, tolerance, shaken):
         return _sweep(machine, parameter, values, _counted(start, shaken), *options)[1]
@@ -165,13 +168,14 @@ def _values(values: Any) -> tuple[jax.Array, np.ndarray | None]:
 
 def taken_along(machine: AbstractMachine, state: State) -> State:
     """The state, the body taken along by a stop that has come nearer."""
+    here = bare(state)
     for stop in machine.stops:
         body = machine.coordinates[stop.coordinate]
-        Y = body.position(state)
+        Y = body.position(here)
         beyond = stop.beyond(Y) > 0
-        moved = body.placed(state, stop.place, jnp.zeros_like(Y))
-        state = jtu.tree_map(lambda a, b, c=beyond: jnp.where(c, a, b), moved, state)
-    return state
+        moved = body.placed(here, stop.place, jnp.zeros_like(Y))
+        here = jtu.tree_map(lambda a, b, c=beyond: jnp.where(c, a, b), moved, here)
+    return replaced(state, here)
 
 
 @compiled

@@ -27,7 +27,16 @@ from ..flow import (
     number_of,
     simulate_pool,
 )
-from ..machine import AbstractMachine, check_name, components, leaf, leaf_names, with_leaf
+from ..machine import (
+    AbstractMachine,
+    bare,
+    check_name,
+    components,
+    leaf,
+    leaf_names,
+    replaced,
+    with_leaf,
+)
 from ._asked import cycles_for, measures_of, samples_for
 from ._shaken import MACHINE, NOISE, START, Shaken, part_of, shaken_by
 from .grid import Blocks
@@ -92,7 +101,7 @@ class ScanProgram(eqx.Module):
             start = machine.start()
         for name, value in values.items():
             if part_of(name) == START:
-                start = with_leaf(start, name.removeprefix(START), value)
+                start = replaced(start, with_leaf(bare(start), name.removeprefix(START), value))
         return machine, self._nudged(start, START, nudge)
 
     def first(self, blocks: Blocks) -> tuple[AbstractMachine, State]:
@@ -105,8 +114,8 @@ class ScanProgram(eqx.Module):
             return tree
         for name, change in zip(self.derivatives, nudge, strict=True):
             if part_of(name) == prefix:
-                own = name.removeprefix(prefix)
-                tree = with_leaf(tree, own, leaf(tree, own) + change)
+                own, here = name.removeprefix(prefix), bare(tree)
+                tree = replaced(tree, with_leaf(here, own, leaf(here, own) + change))
         return tree
 
     def __call__(
@@ -334,7 +343,11 @@ def check_leaf_name(
     noise has."""
     if part_of(name) == NOISE and shaken is not None:
         return  # checked with the noise
-    tree, own = (start, name.removeprefix(START)) if part_of(name) == START else (machine, name)
+    tree, own = (
+        (bare(start), name.removeprefix(START)) if part_of(name) == START else (machine, name)
+    )
     if own in leaf_names(tree):
         return
-    check_name([*components(machine), *(START + n for n in components(start))], name, argument)
+    check_name(
+        [*components(machine), *(START + n for n in components(bare(start)))], name, argument
+    )

@@ -1,0 +1,94 @@
+"""Orbits of machines with modes of their own, which a state alone does not tell."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+from scipy.integrate import solve_ivp
+
+
+class Flipped(vi.AbstractMachine):
+    """x'' = -(1 + 0.3 m) x - 0.04 x' + cos 2.2 s before a stop; each impact turns m over."""
+
+    depth: Any = 0.3
+    stops: tuple = (vi.RigidStop(0.1, 0.8, modes=lambda machine, s, x, m: (-m,)),)
+    cycle: float = 2 * np.pi / 2.2
+
+    def begin(self, s, x):
+        return (1.0,)
+
+    def field(self, s, x, m):
+        force = jnp.cos(2.2 * s) - 0.04 * x.V
+        return vi.OscillatorState(x.V, force - (1 + self.depth * m) * x.Y)
+
+
+def settled(cycles):
+    """Y, V and m after so many cycles, by SciPy from impact to impact."""
+    period, x, m = 2 * np.pi / 2.2, np.array([-1.4, 0.0]), 1.0
+
+    def field(t, x, m):
+        return [x[1], np.cos(2.2 * t) - 0.04 * x[1] - (1 + 0.3 * m) * x[0]]
+
+    def hit(t, x, m):
+        return x[0] - 0.1
+
+    hit.terminal, hit.direction = True, 1
+    for _ in range(cycles):
+        t = 0.0
+        while t < period:
+            out = solve_ivp(field, (t, period), x, args=(m,), events=hit, rtol=1e-9, atol=1e-11)
+            t, x = out.t[-1], out.y[:, -1]
+            if len(out.t_events[0]):
+                x, m = np.array([0.1, -0.8 * x[1]]), -m
+    return x, m
+
+
+@pytest.fixture(scope="module")
+def start():
+    return vi.OscillatorState(jnp.asarray(-1.4), jnp.asarray(0.0))
+
+
+@pytest.fixture(scope="module")
+def orbit(start):
+    return vi.find_orbit(Flipped(), start, 2)
+
+
+def test_a_motion_that_comes_back_in_other_modes_has_twice_the_period(start, orbit):
+    once = vi.find_orbit(Flipped(), start)
+    assert bool(once.result == vi.ORBIT_RESULTS.other_modes) and not bool(once.successful)
+    assert int(orbit.cycles) == 2 and bool(orbit.stable)
+    (Y, _), m = settled(240)
+    by_mode = orbit.sections.Y if m == orbit.state.modes[0] else jnp.roll(orbit.sections.Y, 1)
+    assert float(by_mode[0]) == pytest.approx(Y, abs=1e-7)
+    assert float(orbit.sections.Y.max()) == pytest.approx(-0.461410495, abs=1e-9)
+
+
+@pytest.mark.slow
+def test_all_orbits_finds_none_in_other_modes(start):
+    region = {"start.Y": (-2.0, 0.1), "start.V": (-2.0, 2.0)}
+    found = vi.all_orbits(Flipped(), 2, region=region, starts=8, start=start)
+    once, twice = found.searched
+    assert (once.converged, twice.motions) == (0, 1) and twice.converged > 2
+    np.testing.assert_allclose(found.orbits[0].sections.Y.max(), -0.461410495, atol=1e-9)
+
+
+def test_exponents_and_runs_go_on_in_an_orbits_modes(orbit):
+    run = vi.simulate(orbit.machine, orbit.state, 2)
+    np.testing.assert_allclose(run.sections.Y[:2], orbit.sections.Y, atol=1e-8)
+    np.testing.assert_allclose(run.last.Y, orbit.state.Y, atol=1e-8)
+    exponents = vi.lyapunov(Flipped(), orbit.state, 400).exponents
+    wanted = np.log(np.abs(orbit.multipliers)) / float(orbit.duration)
+    np.testing.assert_allclose(exponents, wanted, atol=2e-4)
+
+
+@pytest.mark.slow
+def test_a_branch_and_a_table_keep_the_modes(orbit):
+    branch = vi.continue_orbit(orbit, parameter="depth", bounds=(0.29, 0.31))
+    assert branch.ends == ("bounds", "bounds")
+    (there,) = branch.at(0.305)
+    run = vi.simulate(there.machine, there.state, 2)
+    np.testing.assert_allclose(run.last.Y, there.state.Y, atol=1e-8)
+    kept = run.to_xarray(along="section").section_mode_0
+    np.testing.assert_array_equal(kept, run.modes[0])
