@@ -16,8 +16,8 @@ import vi_jax as vi
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
-from vi_jax.plot import BLUE, RED, Pen
-from vi_jax.plot.schematic import reach_of, size_of, sketch
+from vi_jax.plot import BLUE, RED
+from vi_jax.plot.schematic import pen_for, sketch
 
 TARGET = Path(__file__).parent / "figures" / "moving_picture.gif"
 # Starts along each axis, cycles that are shown, frames in each of them.
@@ -54,8 +54,7 @@ def drawn(sections: np.ndarray, settled: np.ndarray, rest: vi.Run) -> Iterator[I
     above, right = figure.subplots(1, 2, width_ratios=(1.25, 1))
     assert rest.samples is not None
     states = jax.tree_util.tree_map(np.asarray, rest.samples.state)
-    reach = reach_of(SCENE, states.Y)
-    pen = Pen(above, reach=reach, size=size_of(SCENE, reach))
+    pen = pen_for(SCENE, above, states.Y)
     for i in range(2 * FRAMES):
         sketch(SCENE, pen, _at(states, i), 2 * np.pi * i / FRAMES)
     box = above.dataLim

@@ -16,7 +16,7 @@ FILES = sorted(HOUSE.rglob("*.py"))
 # Each may import from those before it.
 ORDER = "lanes machine flow machines orbit scans robust plot explore cli".split()
 LATE = [["explore", "named"], ["explore", "serve"]]
-TOOLS = {"_checks", "_files", "_messages", "_programs", "_types"}
+TOOLS = {"_checks", "_messages", "_programs", "_types"}
 
 
 def imports(path: Path) -> Iterator[tuple[list[str], str]]:

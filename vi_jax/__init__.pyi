@@ -90,7 +90,6 @@ from .plot import plot_multipliers as plot_multipliers
 from .plot import plot_phase_portrait as plot_phase_portrait
 from .plot import plot_regimes as plot_regimes
 from .plot import plot_sketch as plot_sketch
-from .plot import plot_style as plot_style
 from .plot import plot_sweep as plot_sweep
 from .robust import EdgeState as EdgeState
 from .robust import Manifold as Manifold

@@ -7,7 +7,6 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
-from PIL.PngImagePlugin import PngInfo
 
 # Of a picture in the repository.
 _DPI = 110
@@ -56,18 +55,3 @@ def shrink(path: str | Path, *, colors: int = 200) -> None:
         dpi = image.info.get("dpi")
         picture = image.convert("RGB").quantize(colors, dither=Image.Dither.NONE)
     picture.save(path, "png", optimize=True, dpi=dpi)
-
-
-def stamp(picture: str | Path, name: str, words: str) -> None:
-    """Put words into a PNG, whose pixels stay as they are; `stamped` reads them."""
-    with Image.open(picture) as image:
-        image.load()
-        info = PngInfo()
-        info.add_itxt(name, words)
-        image.save(picture, "png", optimize=True, pnginfo=info, dpi=image.info.get("dpi"))
-
-
-def stamped(picture: str | Path, name: str) -> str | None:
-    """Return the words of that name in a PNG, or `None`."""
-    with Image.open(picture) as image:
-        return image.info.get(name)

@@ -139,7 +139,7 @@ def test_a_machine_says_how_it_is_drawn():
     assert ax.patches[0].center == (0.5, 0.25)
 
 
-def test_files_are_written(run, tmp_path, monkeypatch):
+def test_files_are_written(run, tmp_path):
     shown = vi.animate(run, MACHINES["ideal"], seconds=0.4, fps=10)
     shown.save(tmp_path / "motion.gif")
     with Image.open(tmp_path / "motion.gif") as gif:
@@ -147,12 +147,9 @@ def test_files_are_written(run, tmp_path, monkeypatch):
     assert (tmp_path / "motion.gif").stat().st_size < 200_000
     shown.save(str(tmp_path / "motion.html"))
     text = (tmp_path / "motion.html").read_text()
-    assert ("<img" in text and text == shown._repr_html_()) or "data:image/png;base64" in text
     first = text.split("data:image/png;base64,")[1].split('"')[0].replace("\\\n", "")
     assert base64.b64decode(first)[:4] == b"\x89PNG"
-    monkeypatch.setattr(animation.FFMpegWriter, "isAvailable", classmethod(lambda cls: False))
-    with pytest.raises(ValueError, match=r"\.gif or \.html where ffmpeg is not installed"):
-        shown.save(tmp_path / "motion.mp4")
+    assert "data:image/png;base64," in shown._repr_html_()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["motion.gif", "motion.html"]
 
 
@@ -160,18 +157,6 @@ def test_files_are_written(run, tmp_path, monkeypatch):
 def test_a_movie_is_written(run, tmp_path):
     vi.animate(run, MACHINES["ideal"], seconds=0.4, fps=10).save(tmp_path / "motion.mp4")
     assert (tmp_path / "motion.mp4").stat().st_size > 1000
-
-
-def test_what_cannot_be_written_is_refused_before_any_drawing(run, tmp_path):
-    shown = vi.animate(run, MACHINES["ideal"], seconds=0.4, fps=10)
-    (tmp_path / "file").write_text("")
-    with pytest.raises(ValueError, match=r"`filename` must be a file.*lies below a file"):
-        shown.save(tmp_path / "file" / "motion.gif")
-    (tmp_path / "folder.gif").mkdir()
-    with pytest.raises(ValueError, match="it is a folder"):
-        shown.save(tmp_path / "folder.gif")
-    with pytest.raises(ValueError, match=r"must end in \.gif, \.mp4, \.html, but got .*\.avi"):
-        shown.save(tmp_path / "motion.avi")
 
 
 def test_wrong_arguments_are_named(run):
@@ -193,5 +178,5 @@ def test_wrong_arguments_are_named(run):
         vi.animate(batch, scene)
     lost = vi.find_orbit(scene, scene.start(Y=0.0), cycles=1, root_finder=vi.Newton(max_steps=1))
     if not bool(lost.successful):
-        with pytest.raises(ValueError, match="an orbit that was found"):
+        with pytest.raises(ValueError, match="an orbit whose search failed"):
             vi.animate(lost)

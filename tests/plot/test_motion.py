@@ -147,3 +147,13 @@ def test_errors_name_the_argument(scene, run):
     samples = vi.Samples(run.samples.cycles, run.samples.time, {"q": run.samples.state.Y})
     with pytest.raises(ValueError, match="`machine` must be given"):
         motion_path(samples)
+
+
+def test_impacts_of_a_machine_without_a_drive_lie_where_they_happen():
+    """Its nominal cycle is not as long as the motion's, so that a place is a part of its time."""
+    valve = vi.machines.ReliefValve()
+    start = valve.start(lift=2.4936, speed=0.0, pressure=1.5342)
+    run = vi.find_orbit(valve, start, throw=True).trajectory()
+    path = vi.plot.motion_path(run, machine=valve)
+    step = float(run.duration[0]) / 128
+    assert np.abs(np.diff(path.Y)).max() < 1.01 * step * np.abs(path.V).max()

@@ -23,6 +23,7 @@ from .._checks import (
     tuple_of,
 )
 from .._types import Flag, Number, Scalar, State
+from ._drawn import draw_scene
 from .crank import AbstractCrank, CosineCrank, SliderCrank
 from .drive import AbstractDrive, IdealDrive
 from .motor import Motor
@@ -303,6 +304,10 @@ class Scene(ShaftMachine):
     def alive(self, state: State) -> jax.Array | None:
         """Whether the crank turns forward, in the phase clock of a motor; `None` for others."""
         return state.W > 0 if self.is_paced(state) else None
+
+    def sketch(self, pen: Any, state: State, phase: float) -> None:
+        """See `plot_sketch`."""
+        draw_scene(self, pen, state, phase)
 
 
 def _check_room(stops: tuple[RigidStop, ...]) -> None:

@@ -6,9 +6,10 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 
 from .._checks import NOT_NEGATIVE, SHARE, number
-from .._types import Number, Scalar
+from .._types import Number, Scalar, State
 from ..machine import RigidStop, Shown
 from ._base import PhaseMachine, number_field
+from ._drawn import draw_ball
 
 
 class BallState(Shown):
@@ -74,3 +75,7 @@ class BouncingBall(PhaseMachine):
     def placed(self, state: BallState, Y: Scalar, V: Scalar) -> BallState:
         """A ball of this height and speed."""
         return BallState(Y, V)
+
+    def sketch(self, pen: Any, state: State, phase: float) -> None:
+        """See `plot_sketch`."""
+        draw_ball(self, pen, state, phase)

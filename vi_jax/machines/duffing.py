@@ -7,9 +7,10 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, number
-from .._types import Number, Scalar
+from .._types import Number, Scalar, State
 from ..machine import OscillatorState, RigidStop
 from ._base import ForcedMachine, number_field, stops_at
+from ._drawn import draw_duffing
 
 
 class Duffing(ForcedMachine):
@@ -65,3 +66,7 @@ class Duffing(ForcedMachine):
     def mirrored(self, state: OscillatorState) -> OscillatorState | None:
         """x → -x half a cycle later, if there are two stops."""
         return OscillatorState(-state.Y, -state.V) if self.two_sided else None
+
+    def sketch(self, pen: Any, state: State, phase: float) -> None:
+        """See `plot_sketch`."""
+        draw_duffing(self, pen, state, phase)

@@ -9,6 +9,7 @@ from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, number
 from .._types import Number, Scalar, State
 from ..machine import Coordinate, RigidStop, Shown
 from ._base import PhaseMachine, number_field, stops_at
+from ._drawn import draw_pair
 
 
 class PairState(Shown):
@@ -141,3 +142,7 @@ class ImpactPair(PhaseMachine):
     def mirrored(self, state: State) -> Any:
         """Left and right exchanged, half a cycle later."""
         return type(state)(*(-x for x in vars(state).values()))
+
+    def sketch(self, pen: Any, state: State, phase: float) -> None:
+        """See `plot_sketch`."""
+        draw_pair(self, pen, state, phase)

@@ -14,6 +14,7 @@ from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Range, number, requir
 from .._types import Number, Scalar, State
 from ..machine import RigidStop, ShaftMachine, Shown
 from ._base import PhaseMachine, number_field, stops_at
+from ._drawn import draw_rotor
 
 
 class RotorState(Shown):
@@ -193,6 +194,10 @@ class UnbalancedRotor(ShaftMachine, PhaseMachine):
     def alive(self, state: State) -> jax.Array | None:
         """In the phase clock a rotor that does not turn forward has a state that is no number."""
         return jnp.isfinite(state.P) if self.is_paced(state) else None
+
+    def sketch(self, pen: Any, state: State, phase: float) -> None:
+        """See `plot_sketch`."""
+        draw_rotor(self, pen, state, phase)
 
 
 def _pace(W: Scalar) -> Scalar:

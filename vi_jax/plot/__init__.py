@@ -25,10 +25,6 @@ from .orbit import plot_multipliers as plot_multipliers
 from .path import MotionPath as MotionPath
 from .path import motion_path as motion_path
 from .pen import Pen as Pen
-from .save import ENDINGS as ENDINGS
-from .save import save_picture as save_picture
 from .scan import plot_basins as plot_basins
 from .scan import plot_regimes as plot_regimes
 from .schematic import plot_sketch as plot_sketch
-from .stamp import stamp as stamp
-from .style import plot_style as plot_style

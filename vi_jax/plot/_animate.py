@@ -1,8 +1,5 @@
 """Animations: a machine that moves above its time history."""
 
-import os
-import tempfile
-from io import BytesIO
 from math import ceil
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,18 +11,15 @@ from matplotlib import animation
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from PIL import Image
 
-from .._checks import count, flag, given_number, instance_of, unwritable
-from .._files import write_whole
+from .._checks import count, flag, given_number, instance_of
 from ..flow import Run
 from ..machine import AbstractMachine
 from ..orbit import Orbit
 from .colors import BLUE, RED
 from .motion import counts_by_angle, plot_history
 from .path import motion_path
-from .pen import Pen
-from .schematic import reach_of, size_of, sketch
+from .schematic import pen_for, sketch
 
 # Samples of a cycle that an orbit is drawn with; seconds that a cycle takes, and most in all.
 _SAMPLES, _UNHURRIED, _LONGEST = 128, 2.5, 12.0
@@ -33,7 +27,8 @@ _SAMPLES, _UNHURRIED, _LONGEST = 128, 2.5, 12.0
 _MEASURED = 12
 # Inches: of a figure, and what the time history takes of its height.
 _WIDE, _BELOW = 7.2, 2.1
-_ENDINGS = (".gif", ".mp4", ".html")
+# Pictures within an HTML file may take so much: MB.
+_MOST = 50.0
 
 
 class _Frames(NamedTuple):
@@ -83,7 +78,9 @@ def animate(
         if machine is not None:
             raise ValueError("Argument `machine` must be left out: an orbit has its own.")
         if not motion.residual.ndim and not bool(motion.successful):
-            raise ValueError("Argument `motion` must be an orbit that was found, but is none.")
+            raise ValueError(
+                "Argument `motion` is an orbit whose search failed. Pass an orbit that was found."
+            )
         machine, motion = motion.machine, motion.trajectory(samples=_SAMPLES)
     if machine is None:
         raise ValueError("Argument `machine` must be given for a `Run`: it says what to draw.")
@@ -147,7 +144,6 @@ class MotionAnimation(animation.FuncAnimation):
         self.fps = fps
         """Frames per second."""
         self._machine, self._frames = machine, frames
-        self._reach = reach_of(machine, frames.positions)
         self._above = Figure().subplots()
         self._limits = self._measured()
         (left, right), (low, high) = self._limits
@@ -193,8 +189,7 @@ class MotionAnimation(animation.FuncAnimation):
         state = jax.tree_util.tree_map(lambda x: jnp.asarray(x[index]), frames.states)
         turn = float(machine.turn)
         phase = float(machine.phase_at((frames.cycles[index] % 1.0) * turn))
-        pen = Pen(self._above, reach=self._reach, size=size_of(machine, self._reach))
-        sketch(machine, pen, state, phase)
+        sketch(machine, pen_for(machine, self._above, frames.positions), state, phase)
 
     def _measured(self) -> tuple[tuple[float, float], tuple[float, float]]:
         """The room that all frames take, so that none of them moves the others."""
@@ -213,55 +208,19 @@ class MotionAnimation(animation.FuncAnimation):
         """The animation as HTML with controls, for notebooks."""
         return self.to_jshtml(fps=self.fps)
 
-    def save(self, filename: str | Path, *args: Any, **options: Any) -> None:  # pyright: ignore
-        """Write a `.gif`, an `.html` or, where ffmpeg is installed, an `.mp4`.
+    def save(self, filename: str | Path, writer: Any = None, **options: Any) -> None:  # pyright: ignore
+        """Write a file by one of matplotlib's writers.
 
-        The file appears whole or not at all. Further arguments, `writer` and so on, are those of
-        matplotlib's `Animation.save`; without any, a GIF is kept small by its few colours.
-
-        **Raises:** `ValueError` if the ending is another, the file cannot be written, or there is
-        no ffmpeg; before anything is drawn.
+        **Arguments:** the file; the `writer`, by default Pillow for a `.gif`, an HTML page for an
+        `.html`, and ffmpeg for anything else, where it is installed; options of matplotlib's
+        `Animation.save`.
         """
-        path = Path(filename)
-        _check_path(path)
-        if args or options:
-            super().save(filename, *args, **options)
-        elif path.suffix == ".html":
-            write_whole(path, self.to_jshtml(fps=self.fps))
-        elif path.suffix == ".gif":
-            write_whole(path, self._gif())
-        else:
-            self._movie(path)
-
-    def _movie(self, path: Path) -> None:
-        handle, beside = tempfile.mkstemp(suffix=path.suffix, dir=path.parent)
-        os.close(handle)
-        try:
-            super().save(beside, writer=animation.FFMpegWriter(fps=self.fps))
-            os.replace(beside, path)
-        except BaseException:
-            Path(beside).unlink(missing_ok=True)
-            raise
-
-    def _gif(self, colors: int = 48) -> bytes:
-        """All frames in one palette, which makes what does not move cost nothing."""
-        canvas = FigureCanvasAgg(self._figure)
-
-        def frame(index: int) -> Image.Image:
-            self.draw(index)
-            canvas.draw()
-            return Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
-
-        plain = Image.Dither.NONE
-        exact = Image.Quantize.MAXCOVERAGE  # keeps white white
-        palette = frame(len(self) // 2).quantize(colors, method=exact, dither=plain)
-        pictures = [frame(i).quantize(palette=palette, dither=plain) for i in range(len(self))]
-        file = BytesIO()
-        pictures[0].save(
-            file, "gif", save_all=True, append_images=pictures[1:], loop=0, optimize=True,
-            duration=round(1000 / self.fps),
-        )  # fmt: skip
-        return file.getvalue()
+        kinds = {".gif": animation.PillowWriter, ".html": animation.HTMLWriter}
+        kind = kinds.get(Path(filename).suffix)
+        if writer is None and kind is not None:
+            more = {"embed_frames": True, "embed_limit": _MOST} if kind is kinds[".html"] else {}
+            writer = kind(fps=self.fps, **more)
+        super().save(filename, "ffmpeg" if writer is None else writer, **options)
 
 
 class _History:
@@ -272,8 +231,6 @@ class _History:
         ends = float(frames.cycles[0]), float(frames.cycles[-1])
         window = ends[0] - 1e-9, ends[1] + 1e-9
         plot_history(run, machine=machine, ax=ax, window=window, unit=unit, color="0.75", lw=1.2)
-        if unit == "cycles":
-            ax.set_xlabel("drive cycles")
         self._factor = 2.0 if unit == "angle" else 1.0
         path = motion_path(run, machine=machine, window=window)
         self._place, self._Y = self._factor * path.cycles, path.Y
@@ -289,24 +246,3 @@ class _History:
         passed = self._place <= place
         self._line.set_data([*self._place[passed], place], [*self._Y[passed], Y])
         self._dot.set_data([place], [Y])
-
-
-def _check_path(path: Path) -> None:
-    reason = unwritable(path.parent)
-    if reason is None and path.is_dir():
-        reason = "it is a folder"
-    elif reason is None and path.exists() and not os.access(path, os.W_OK):
-        reason = "permission denied"
-    if reason is not None:
-        raise ValueError(
-            f"Argument `filename` must be a file that can be written, but {path} is none: {reason}."
-        )
-    if path.suffix not in _ENDINGS:
-        raise ValueError(
-            f"Argument `filename` must end in {', '.join(_ENDINGS)}, but got {str(path)!r}."
-        )
-    if path.suffix == ".mp4" and not animation.FFMpegWriter.isAvailable():
-        raise ValueError(
-            "Argument `filename` must end in .gif or .html where ffmpeg is not installed, but got "
-            f"{str(path)!r}."
-        )

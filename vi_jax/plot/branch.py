@@ -11,9 +11,8 @@ from .._checks import instance_of, one_of
 from ..machine import in_brackets, name_in, quantity_of, unit_of
 from ..orbit import Boundary, Branch, branch_hits_in_words, point_of
 from ..scans import Sweep
-from .colors import DASHES, MARKS, color_of, mark_style, once
+from .colors import DASHES, MARKS, color_of, mark_style, once, thick
 from .motion import new_axes
-from .style import thick
 
 # Names of lines in a legend, and where dots lie: above lines and below the marks.
 _STABLE, _UNSTABLE = "stable", "unstable"

@@ -1,4 +1,4 @@
-"""The colours of all pictures, distinct with any colour vision; the marks of special points.
+"""The looks of all pictures: colours that are distinct with any colour vision, marks, widths.
 
 A colour stands for a period, and for the same period everywhere; what has no period is grey. They
 are of the sets of Okabe and Ito and of Paul Tol, put in such an order that each differs from those
@@ -9,6 +9,7 @@ measures by how much). Bifurcations differ by mark and dash, so that they need n
 from collections.abc import Iterator
 from typing import Any
 
+import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex, to_rgb
@@ -124,3 +125,14 @@ def mark_style(kind: str) -> dict[str, Any]:
 def once(ax: Axes, label: str) -> str | None:
     """The label, unless something in the axes has it."""
     return None if label in ax.get_legend_handles_labels()[1] else label
+
+
+def is_set(name: Any) -> bool:
+    """Whether one of matplotlib's `rcParams` is another than it is by default."""
+    return matplotlib.rcParams[name] != matplotlib.rcParamsDefault[name]
+
+
+def thick(points: float) -> float:
+    """A line's width, thinner or thicker as lines are set to be."""
+    name: Any = "lines.linewidth"
+    return points * matplotlib.rcParams[name] / matplotlib.rcParamsDefault[name]

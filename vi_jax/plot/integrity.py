@@ -8,9 +8,8 @@ from matplotlib.axes import Axes
 from .._checks import flag, instance_of, one_of
 from ..scans import IntegrityProfile
 from .branch import axis_name
-from .colors import color_of, shades
+from .colors import color_of, shades, thick
 from .motion import new_axes
-from .style import thick
 
 _WORDS = {
     "share": "part of the starts, %",

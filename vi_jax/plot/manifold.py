@@ -7,9 +7,8 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from ..robust import Manifold
-from .colors import BLUE, RED
+from .colors import BLUE, RED, thick
 from .motion import new_axes
-from .style import thick
 
 
 def plot_manifold(found: Manifold, *, ax: Axes | None = None, **style: Any) -> Axes:

@@ -9,9 +9,8 @@ from matplotlib.ticker import FuncFormatter, MultipleLocator
 from .._checks import instance_of
 from ..flow import Run, Samples
 from ..machine import PLAIN, AbstractMachine, SoftStop, in_brackets, name_in, unit_of
-from .colors import BLUE, STOP, once
+from .colors import BLUE, STOP, is_set, once, thick
 from .path import motion_path
-from .style import is_set, thick
 
 
 def new_axes(ax: Axes | None) -> Axes:

@@ -8,7 +8,7 @@ import numpy as np
 
 from .._checks import instance_of
 from ..flow import Run, Samples
-from ..machine import AbstractMachine
+from ..machine import AbstractMachine, is_autonomous
 from ..orbit import Orbit
 
 
@@ -84,7 +84,10 @@ def _with_impacts(path: MotionPath, run: Run, machine: AbstractMachine) -> Motio
     if not stop.size:
         return path
     logged = np.asarray(log.stop) >= 0
-    at = cycle + np.asarray(log.phase)[logged] / float(machine.turn)
+    length = np.full(run.impacts.shape, float(machine.turn))
+    if is_autonomous(machine, run.last):  # whose cycles are of several lengths
+        length = np.asarray(run.duration)
+    at = cycle + np.asarray(log.phase)[logged] / length[cycle]
     speed = np.asarray(log.speed)[logged]
     hit = [machine.stops[i] for i in stop]
     before = np.array([s.sign for s in hit]) * speed

@@ -51,20 +51,16 @@ class Pen:
         """
         width = self.size if width is None else width
         height = width if height is None else height
-        place = x - width / 2, y - height / 2
-        for fill, alpha in ((color, 0.28), ("none", 1.0)):
-            self.ax.add_patch(
-                Rectangle(
-                    place, width, height, facecolor=fill, edgecolor=color, alpha=alpha, lw=1.6
-                )
-            )
+        self._fill(Rectangle, (x - width / 2, y - height / 2), width, height, color=color)
 
     def ball(self, x: float, y: float, radius: float, *, color: str = BLUE) -> None:
         """A ball with its middle at (x, y)."""
+        self._fill(Circle, (x, y), radius, color=color)
+
+    def _fill(self, shape: Any, *place: Any, color: str) -> None:
+        """A shape with a pale inside and an edge."""
         for fill, alpha in ((color, 0.28), ("none", 1.0)):
-            self.ax.add_patch(
-                Circle((x, y), radius, facecolor=fill, edgecolor=color, alpha=alpha, lw=1.6)
-            )
+            self.ax.add_patch(shape(*place, facecolor=fill, edgecolor=color, alpha=alpha, lw=1.6))
 
     def disc(self, x: float, y: float, radius: float) -> None:
         """A rotor or a crank's disc with its shaft."""
@@ -90,6 +86,15 @@ class Pen:
             self.ax.plot([x, x], [bottom, top], color=color, lw=2.6, solid_capstyle="butt")
             for y in np.arange(bottom, top - 0.6 * depth, 0.8 * depth):
                 self.ax.plot([x, x + side * depth], [y, y + 0.7 * depth], color=color, lw=0.9)
+
+    def soft_stop(self, face: float, side: int, row: float = 0.0, slot: float = 0.0) -> float:
+        """A plate at `face` on a spring before a wall, whose place is returned; see `wall`."""
+        size, back = self.size, face + side * 0.8 * self.size
+        plate = (face, row + 0.3 * size), (face, row + 0.7 * size)
+        self.line(*plate, color=GREEN, lw=2.6)
+        self.spring((face, row + 0.5 * size), (back, row + 0.5 * size), coils=3)
+        self.wall(back, side, low=row - 0.5 * size, high=row + 0.8 * size, slot=slot)
+        return back
 
     def floor(self, left: float, right: float, y: float) -> None:
         """The ground from left to right."""
