@@ -93,9 +93,15 @@ def crossings(
 
 
 def _jumped(guard: Crossing) -> Crossing:
-    """The event, with whether its guard has jumped above zero as the step begins."""
+    """The event, with whether its guard has jumped above zero as the step begins: by more than what
+    `_from_below` takes for zero in a guard that falls."""
     x = stop_gradient(guard.begin.x)
-    return guard._replace(above=x > JUMPED * (1 + jnp.abs(x)))
+    return guard._replace(above=x > JUMPED * (1 + jnp.abs(x)) + _rounding(guard.scale))
+
+
+def _rounding(scale: Scalar) -> Scalar:
+    """What a search's step leaves of a guard of this size that is zero."""
+    return float(jnp.finfo(scale.dtype).eps) ** 0.5 * scale
 
 
 def at_stops(machine: AbstractMachine, ends: list[tuple[Rates, Rates]]) -> list[Crossing]:
@@ -171,7 +177,7 @@ def _from_below(below: Scalar, begin: Rates, end: Rates, scale: Scalar) -> tuple
     its size, by which rounding is judged.
     """
     # On it is also what a search's step left so close to it: a cycle is no shorter.
-    rounding = float(jnp.finfo(end.x.dtype).eps) ** 0.5 * scale
+    rounding = _rounding(scale)
     here = stop_gradient(begin)
     falls = (here.x <= rounding) & (here.v < 0)
     # Where the motion has begun on it, which is behind it, rounding may be all that falls.
