@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from scipy.interpolate import CubicSpline
+from tools.ideal import births
 from vi_jax.machine import Parameters, Scene
 from vi_jax.orbit import (
     Boundary,
@@ -22,7 +23,7 @@ from vi_jax.orbit import (
 )
 from vi_jax.plot import DASHES, color_of, paler
 
-from .motions import FREQUENCY_RATIO, GAP, RESTITUTION, table_damping_ratio
+from .motions import FREQUENCY_RATIO, RESTITUTION, table_damping_ratio
 from .response import MAX_STEP, RANGE, RATIO
 
 K, XI = "stops.0.restitution", "oscillator.damping_ratio"
@@ -176,15 +177,6 @@ def birth_without_damping(curves: BoundaryCurves) -> float:
     return float(points[np.argmin(points[:, 1]), 0])
 
 
-def free_motion_touches(c: np.ndarray) -> np.ndarray:
-    """The larger ζ at which the motion without impacts reaches the stop, for each c (N·s/m).
-
-    There, as at the smaller one, a motion with an impact is born; without damping at √(1 + 1/d).
-    """
-    q = 1 - 2 * (np.asarray(c) * xi_per_c()) ** 2
-    return np.sqrt(q + np.sqrt(q**2 - 1 + 1 / GAP**2))
-
-
 def describe_boundaries(curves: BoundaryCurves) -> dict[str, float | None]:
     """What the curves say about the figures' ζ and k, and about Table 1's c, in numbers.
 
@@ -257,6 +249,7 @@ def draw_boundaries(curves: BoundaryCurves) -> Figure:
 def _draw(ax: Axes, curves: BoundaryCurves, plane: str, zoom: bool) -> None:
     low, high = K_RANGE if plane == "k" else C_RANGE
     levels = np.linspace(low, high, 400)
+    xi = xi_per_c() * levels * (plane == "c")
     short, long, fold = (getattr(curves, f"{x}_{plane}") for x in ("doubling", "touch", "fold"))
     birth = plane_points(curves.birth_c)
     if plane == "k":
@@ -267,7 +260,7 @@ def _draw(ax: Axes, curves: BoundaryCurves, plane: str, zoom: bool) -> None:
     left, right = (_over(points, levels) for points in (birth, doubling))
     ax.fill_betweenx(levels, left, right, color=SHORT_FILL, lw=0, zorder=0)
     ax.fill(*touch.T, color=LONG_FILL, lw=0, zorder=1)
-    upper = np.column_stack([free_motion_touches(0.0 * levels if plane == "k" else levels), levels])
+    upper = np.column_stack([births(xi)[1], levels])
     for points, color, kind in (
         (birth, SHORT, "grazing"),
         (upper, SHORT, "grazing"),

@@ -45,7 +45,7 @@ def stale(kept: dict[str, float], computed: Expected) -> list[str]:
 # Their programs take longer to compile than the rest of this file.
 LONGER = {
     "basins_map", "chains", "gradients", "identify", "learned_laws", "motors", "peers", "posterior",
-    "regime_maps", "relief_valve", "robustness", "woodpecker",
+    "regime_maps", "relief_valve", "reproduction", "robustness", "woodpecker",
 }  # fmt: skip
 
 

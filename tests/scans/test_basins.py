@@ -7,7 +7,7 @@ from vi_jax.scans._describe import description_of
 from vi_jax.scans.grid import Blocks
 from vi_jax.scans.program import make_program
 
-# Several motions live side by side here; see `experiments/studies/all_orbits.py`.
+# Several motions live side by side here; see `experiments/studies/basins_map.py`.
 SCENE = vi.Scene.ideal(frequency_ratio=3.2, restitution=0.9, gap=1.05, damping_ratio=0.01)
 REGION = {"start.Y": (-3.5, 1.05), "start.V": (-4.0, 4.0)}
 
