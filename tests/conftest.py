@@ -1,4 +1,4 @@
-"""All tests run in double precision, the default ones with annotations checked at run time."""
+"""All tests run in double precision; what takes most of their time, compiling, is kept short."""
 
 import gc
 from pathlib import Path
@@ -9,21 +9,26 @@ import pytest
 
 jax.config.update("jax_enable_x64", True)
 
-# The lanes' many small functions, which write a program's text, would take three times as long;
-# they are checked in a process of their own (`lanes/test_types.py`).
+# These rooms run the code that users run; in the others programs are compiled without optimisation,
+# which takes a third of the time off and changes rounding only.
+_AS_SHIPPED = {"lanes", "robust", "docs", "experiments"}
+
+# The lanes' many small functions, which write a program's text, would take three times as long with
+# checks of annotations; they have a test of their own (`lanes/test_types.py`).
 _PACKAGE = Path(__file__).parents[1] / "vi_jax"
-_MODULES = sorted(
-    {path.name.removesuffix(".py") for path in _PACKAGE.iterdir() if path.name[0] != "."}
-    - {"__pycache__", "__init__", "py", "lanes"}
-)
+_UNCHECKED = {"__init__", "lanes"}
+
+
+def pytest_addoption(parser):
+    parser.addoption(
+        "--annotations", action="store_true", help="check the package's annotations at run time"
+    )
 
 
 def pytest_configure(config):
-    """Check annotations, but not where only longer tests are run: these go through the same code
-    with more numbers, and checks take two fifths of their time (40 for 29 s of a processor, for the
-    friction and the quantities of orbits)."""
-    if config.option.markexpr not in ("slow", "exhaustive", "slow and not exhaustive"):
-        modules = [f"vi_jax.{name}" for name in _MODULES]
+    if config.option.annotations:
+        names = {path.stem for path in _PACKAGE.iterdir() if path.suffix == ".py" or path.is_dir()}
+        modules = [f"vi_jax.{name}" for name in sorted(names - _UNCHECKED) if name[:2] != "__"]
         config.checked = jaxtyping.install_import_hook(modules, "beartype.beartype")
 
 
@@ -31,6 +36,14 @@ def pytest_configure(config):
 gc.set_threshold(200_000, 20, 20)
 
 _MAPS = Path("/proc/self/maps")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _optimised_as_needed(request):
+    shipped = request.path.parent.name in _AS_SHIPPED
+    jax.config.update("jax_disable_most_optimizations", not shipped)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -1,6 +1,6 @@
 """Calls that cannot be run, each with what must be said. Prints what was said instead, if any.
 
-A script of its own, since the tests check the package's annotations, which would say it first."""
+A script of its own: its calls fill caches that other tests would share."""
 
 import datetime
 import importlib

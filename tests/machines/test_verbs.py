@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import vi_jax as vi
 
-from differences import quick
+from differences import some
 from two_bodies import TwoBodies
 
 matplotlib.use("Agg")
@@ -72,7 +72,8 @@ CASES = {
 }  # fmt: skip
 
 
-@pytest.fixture(scope="module", params=quick(CASES, "pair", slow=("capsule",)))
+# `tests/test_checks.py` runs the pair, with annotations checked.
+@pytest.fixture(scope="module", params=some(CASES, "capsule"))
 def case(request):
     return CASES[request.param]
 

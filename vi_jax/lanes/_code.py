@@ -61,7 +61,7 @@ def _load_or_compile(
 ) -> tuple[Any, int]:
     """The engine with a text's code, from a file in the folder `store` if it has one, and the
     address of `kernel`."""
-    words = (text, cpu, *_host(binding), binding.llvm_version_info)
+    words = (text, cpu, _level(), *_host(binding), binding.llvm_version_info)
     name = f"{hashlib.blake2b(repr(words).encode(), digest_size=20).hexdigest()}.o"
     code = store and _read(store / name)
     if code is None:
@@ -70,6 +70,11 @@ def _load_or_compile(
             _write(store / name, code)
     engine = _engine(binding, code)
     return engine, engine.get_function_address("kernel")
+
+
+def _level() -> int:
+    """LLVM's level of optimisation: less where JAX is told to take little time for it."""
+    return 0 if jax.config.read("jax_disable_most_optimizations") else 1
 
 
 def _host(binding: Any) -> tuple[str, str]:
@@ -85,7 +90,7 @@ def object_code(binding: Any, text: str, cpu: str | None) -> bytes:
     """
     name, features = _host(binding) if cpu is None else (cpu, "")
     target = binding.Target.from_default_triple()
-    machine = target.create_target_machine(cpu=name, features=features, opt=1)
+    machine = target.create_target_machine(cpu=name, features=features, opt=_level())
     try:
         module = binding.parse_assembly(text)
         module.verify()  # types, dominance: 0.1 to 1 ms, of the 100 to 600 ms that the rest takes
@@ -94,7 +99,7 @@ def object_code(binding: Any, text: str, cpu: str | None) -> bytes:
         raise RuntimeError(message) from None
     module.triple = binding.get_default_triple()
     module.data_layout = str(machine.target_data)
-    options = binding.create_pipeline_tuning_options(speed_level=1)
+    options = binding.create_pipeline_tuning_options(speed_level=_level())
     options.loop_vectorization = options.slp_vectorization = False
     options.loop_unrolling = False
     builder = binding.create_pass_builder(machine, options)
