@@ -13,13 +13,6 @@ from differences import quick
 IDEAL = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.05)
 RESTING = vi.Scene.ideal(frequency_ratio=0.3, restitution=0.3, gap=-0.5, damping_ratio=0.05)
 MOTOR = vi.Parameters(torque=10.0, control=0.9, restitution=0.5).scene()
-TWO = vi.machines.Structure(
-    mass=[[1.0, 0.0], [0.0, 1.0]], stiffness=[[2.0, -1.0], [-1.0, 2.0]], damping=[0.1, 0.1],
-    force=[1.0, 0.0], frequency=0.8, contacts=(
-        vi.RigidStop(gap=0.4, restitution=0.6, at=[1.0, 0.0]),
-        vi.RigidStop(gap=0.3, restitution=0.7, at=[0.0, 1.0]),
-    ),
-)  # fmt: skip
 CASES = {
     "every impact logged": (IDEAL, IDEAL.start(), 8, {"method": vi.ExactFlight(), "impact_log": 4}),
     "samples and events": (IDEAL, IDEAL.start(), 4, {"samples": 8, "event_log": 6}),
@@ -27,7 +20,6 @@ CASES = {
     "motor in time": (MOTOR, MOTOR.start(W=0.9), 8, {"clock": "time"}),
     "friction": (vi.machines.Capsule(), vi.machines.Capsule().start(), 4, {}),
     "chatter of a ball": (vi.machines.BouncingBall(), vi.machines.BouncingBall().start(), 4, {}),
-    "stops on several coordinates": (TWO, TWO.start(), 4, {}),
     "a section of its own": (vi.machines.ReliefValve(), vi.machines.ReliefValve().start(), 3, {}),
 }
 
@@ -81,7 +73,7 @@ def test_beside_differences():
 
 @pytest.mark.slow
 def test_many_cycles_keep_within_their_memory():
-    """10,000 cycles of a motor in a group of eight: 64 MB of tape, and steps taken once more."""
+    """10,000 cycles of a motor in a group of eight: a tape of 256 MB."""
     import resource
 
     def last(x):

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from vi_jax import lanes
-from vi_jax.lanes import _backward, _code, _driver, runtime
+from vi_jax.lanes import _backward, _code, runtime
 
 from differences import quick
 from lanes.toys import batch, fall, logistic
@@ -90,8 +90,8 @@ def gradients(x, r, n):
 
 @pytest.mark.slow
 def test_the_same_bits_by_any_tape_on_any_threads_in_any_batch(by_tape, monkeypatch):
-    """Steps taken again from an entry of a thinned tape lead to the same states. (These maps are
-    chaotic: over 100 steps one rounding would grow to everything.)"""
+    """A tape that grows holds the same states. (These maps are chaotic: over 100 steps one rounding
+    would grow to everything.)"""
     x, r, n = batch(37)
     n = 8 * n
     with lanes.threads(1):
@@ -103,7 +103,7 @@ def test_the_same_bits_by_any_tape_on_any_threads_in_any_batch(by_tape, monkeypa
         assert np.isfinite(a).all()
         np.testing.assert_array_equal(a[chosen], b)
     write = runtime.reverse_text
-    for entries in (4, 6):
+    for entries in (1, 6):
         monkeypatch.setattr(runtime, "reverse_text", functools.partial(write, entries=entries))
         monkeypatch.setattr(runtime, "_keys", type(runtime._keys)())
         jax.clear_caches()
@@ -220,8 +220,7 @@ def test_through_an_event(by_tape, size):
         np.testing.assert_allclose(a, b, rtol=1e-10)
 
 
-@pytest.mark.parametrize("order", ["gradient", "hessian"])
-def test_through_loops_of_any_number_of_turns(by_tape, order):
+def test_loops_of_any_number_of_turns_go_by_columns(by_tape):
     """Loops whose turns the numbers decide, one of them in a branch and with another in it."""
 
     def lane(x, y):
@@ -244,11 +243,9 @@ def test_through_loops_of_any_number_of_turns(by_tape, order):
 
     whole = lambda p: jnp.sum(jax.vmap(lane)(p[:3], p[3:]))
     p = jnp.asarray([1.5, 1.3, 2.2, 1.2, 1.4, 1.1])
-    backward, columns = ((jax.grad, jax.jacfwd) if order == "gradient"
-                         else (jax.hessian, lambda f: jax.jacfwd(jax.jacfwd(f))))  # fmt: skip
-    assert "lanes_backward" in str(jax.make_jaxpr(backward(whole))(p))
-    wanted = jax.jit(columns(whole))(p)
-    np.testing.assert_allclose(jax.jit(backward(whole))(p), wanted, rtol=1e-12)
+    assert "lanes_backward" not in str(jax.make_jaxpr(jax.grad(whole))(p))
+    wanted = jax.jit(jax.jacfwd(whole))(p)
+    np.testing.assert_allclose(jax.jit(jax.grad(whole))(p), wanted, rtol=1e-12)
 
 
 def test_without_a_transpose_by_columns(by_tape):
@@ -287,11 +284,12 @@ def test_without_a_kernel_by_columns(by_tape, monkeypatch):
     np.testing.assert_allclose(slope, jax.grad(lambda p: lost(p, "xla"))(P), rtol=1e-12)
 
 
-def test_no_memory_is_an_error(by_tape, monkeypatch):
-    """More than any machine has is asked for: no crash, no numbers."""
+@pytest.mark.parametrize("room", [{"entries": 1 << 44}, {"entries": 1, "most": 300}])
+def test_no_memory_is_an_error(by_tape, monkeypatch, room):
+    """More than any machine has, or than a tape may take: no crash, no numbers."""
     write = runtime.reverse_text
-    monkeypatch.setattr(runtime, "reverse_text", functools.partial(write, entries=1 << 44))
+    monkeypatch.setattr(runtime, "reverse_text", functools.partial(write, **room))
     monkeypatch.setattr(runtime, "_keys", type(runtime._keys)())
-    assert _driver.OUT_OF_MEMORY != 1
-    with pytest.raises(Exception, match="no memory for the tape"):
+    jax.clear_caches()
+    with pytest.raises(Exception, match=r"tape of this gradient needs more .* forward \(`jax.jacf"):
         jax.block_until_ready(jax.jit(lambda p: jax.grad(lost)(p * 1.0))(P))

@@ -32,8 +32,7 @@ _BY_COLUMNS = 4
 
 # Where a step is longer than so many equations, more numbers go by columns, by the square of how
 # much longer it is: a tape takes some 1.5 ms an equation to trace, columns a third. A motor's step
-# has 3,600; that of a structure with three stops, whose blows of one instant are a loop, 15,000. By
-# 16 numbers its first gradient took 43 s by a tape and 5 by columns, to gain 4 simulations.
+# has 3,600.
 _SHORT = 4_000
 
 # One cotangent by a tape takes as long as so many columns (the same measurement as `_BY_COLUMNS`).

@@ -3,36 +3,43 @@
 The blocks, of which `docs/internals/lanes.md` has the picture:
 
     take     a group's lanes, as long as there are any; begin
-    forward  as long as a lane goes on: keep the carry if its turn is `due` (thin a full tape), step
-    turn     all have ended: through `end`; a window, if not all iterations were kept
-    part     from the end, what lies between two entries (`again`, into the window), or all: back
+    forward  as long as a lane goes on: keep the carry (a full tape grows), step
+    turn     all have ended: through `end`, then back through the iterations
     finish   through `begin`
 """
 
-# What a kernel stores in `stop` where it gets no memory.
+# What a kernel stores in `stop` where it gets no memory, or where a tape would outgrow its limit.
 OUT_OF_MEMORY = 2
 
-# `shift`: of how many iterations one is kept, as a power of two. Memory lies on multiples of 64
-# bytes, so that no vector is part of two lines of the cache.
+# Memory lies on multiples of 64 bytes, so that no vector is part of two lines of the cache.
 DRIVER = """\
 declare ptr @malloc(i64)
 declare void @free(ptr)
 declare void @llvm.memcpy.p0.p0.i64(ptr, ptr, i64, i1)
 
-define void @kernel(ptr %inputs, ptr %strides, ptr %outputs, i64 %lanes, ptr %next, ptr %stop) #0 {{
-entry:
-  %memory = call ptr @malloc(i64 {whole})
-  %none = icmp eq ptr %memory, null
-  br i1 %none, label %lack, label %divide
-divide:
+define internal ptr @aligned(ptr %memory) {{
   %address = ptrtoint ptr %memory to i64
   %over = and i64 %address, 63
   %rest = sub i64 64, %over
-  %frame = getelementptr i8, ptr %memory, i64 %rest
-  %tape = getelementptr i8, ptr %frame, i64 {frame}
-  br label %take
+  %place = getelementptr i8, ptr %memory, i64 %rest
+  ret ptr %place
+}}
+
+define void @kernel(ptr %inputs, ptr %strides, ptr %outputs, i64 %lanes, ptr %next, ptr %stop) #0 {{
+entry:
+  %memory = call ptr @malloc(i64 {frame})
+  %first.size = mul i64 {entry}, {entries}
+  %first.whole = add i64 %first.size, 64
+  %first.tape = call ptr @malloc(i64 %first.whole)
+  %none = icmp eq ptr %memory, null
+  %none.tape = icmp eq ptr %first.tape, null
+  %lacks = or i1 %none, %none.tape
+  %frame = call ptr @aligned(ptr %memory)
+  br i1 %lacks, label %lack, label %take
 
 take:
+  %tape.t = phi ptr [ %first.tape, %entry ], [ %tape, %finish ]
+  %room.t = phi i64 [ {entries}, %entry ], [ %room, %finish ]
   %first = atomicrmw add ptr %next, i64 {width} monotonic
   %left = icmp slt i64 %first, %lanes
   br i1 %left, label %begin, label %leave
@@ -41,126 +48,76 @@ begin:
   br i1 %begun, label %forward, label %turn
 
 forward:
-  %n = phi i64 [ 0, %begin ], [ %n.next, %step ]
-  %shift = phi i64 [ 0, %begin ], [ %shift.now, %step ]
+  %n = phi i64 [ 0, %begin ], [ %n.next, %put ]
+  %tape.f = phi ptr [ %tape.t, %begin ], [ %tape.p, %put ]
+  %room.f = phi i64 [ %room.t, %begin ], [ %room.p, %put ]
   %halt.1 = load volatile i8, ptr %stop
   %halted.1 = icmp ne i8 %halt.1, 0
   br i1 %halted.1, label %leave, label %keep
 keep:
-  %spacing = shl i64 1, %shift
-  %between = sub i64 %spacing, 1
-  %off = and i64 %n, %between
-  %due = icmp eq i64 %off, 0
-  br i1 %due, label %room, label %step
-room:
-  %place = lshr i64 %n, %shift
-  %full = icmp eq i64 %place, {entries}
-  br i1 %full, label %thin, label %put
-thin:
-  %i = phi i64 [ 1, %room ], [ %i.next, %thin ]
-  %to = mul i64 %i, {entry}
-  %from = mul i64 %to, 2
-  %thin.to = getelementptr i8, ptr %tape, i64 %to
-  %thin.from = getelementptr i8, ptr %tape, i64 %from
-  call void @llvm.memcpy.p0.p0.i64(ptr %thin.to, ptr %thin.from, i64 {entry}, i1 false)
-  %i.next = add i64 %i, 1
-  %i.more = icmp slt i64 %i.next, {half}
-  br i1 %i.more, label %thin, label %thinned
-thinned:
-  %shift.more = add i64 %shift, 1
+  %full = icmp eq i64 %n, %room.f
+  br i1 %full, label %grow, label %put
+grow:
+  %old.size = mul i64 %room.f, {entry}
+  %room.more = mul i64 %room.f, 2
+  %new.size = mul i64 %old.size, 2
+  %new.whole = add i64 %new.size, 64
+  %beyond = icmp ugt i64 %new.size, {most}
+  br i1 %beyond, label %lack, label %ask
+ask:
+  %new = call ptr @malloc(i64 %new.whole)
+  %new.none = icmp eq ptr %new, null
+  br i1 %new.none, label %lack, label %move
+move:
+  %move.to = call ptr @aligned(ptr %new)
+  %move.from = call ptr @aligned(ptr %tape.f)
+  call void @llvm.memcpy.p0.p0.i64(ptr %move.to, ptr %move.from, i64 %old.size, i1 false)
+  call void @free(ptr %tape.f)
   br label %put
 put:
-  %at = phi i64 [ %place, %room ], [ {half}, %thinned ]
-  %shift.put = phi i64 [ %shift, %room ], [ %shift.more, %thinned ]
-  %at.byte = mul i64 %at, {entry}
-  %put.to = getelementptr i8, ptr %tape, i64 %at.byte
+  %tape.p = phi ptr [ %tape.f, %keep ], [ %new, %move ]
+  %room.p = phi i64 [ %room.f, %keep ], [ %room.more, %move ]
+  %entries.p = call ptr @aligned(ptr %tape.p)
+  %at.byte = mul i64 %n, {entry}
+  %put.to = getelementptr i8, ptr %entries.p, i64 %at.byte
   call void @llvm.memcpy.p0.p0.i64(ptr %put.to, ptr %frame, i64 {entry}, i1 false)
-  br label %step
-step:
-  %shift.now = phi i64 [ %shift, %keep ], [ %shift.put, %put ]
   %more = call i1 @step({call}, i64 %n)
   %n.next = add i64 %n, 1
   br i1 %more, label %forward, label %turn
 
 turn:
-  %total = phi i64 [ 0, %begin ], [ %n.next, %step ]
-  %log = phi i64 [ 0, %begin ], [ %shift.now, %step ]
+  %total = phi i64 [ 0, %begin ], [ %n.next, %put ]
+  %tape = phi ptr [ %tape.t, %begin ], [ %tape.p, %put ]
+  %room = phi i64 [ %room.t, %begin ], [ %room.p, %put ]
+  %entries = call ptr @aligned(ptr %tape)
   call void @end_back({call})
-  %every = shl i64 1, %log
-  %whole = icmp eq i64 %log, 0
-  br i1 %whole, label %part, label %window
-window:
-  %window.size = mul i64 %every, {entry}
-  %made = call ptr @malloc(i64 %window.size)
-  %window.none = icmp eq ptr %made, null
-  br i1 %window.none, label %lack, label %part
-
-part:
-  %entries = phi ptr [ %tape, %turn ], [ %made, %window ], [ %entries, %back ]
-  %until = phi i64 [ %total, %turn ], [ %total, %window ], [ %since, %back ]
-  %parts.left = icmp sgt i64 %until, 0
-  br i1 %parts.left, label %choose, label %finish
-choose:
-  %last = sub i64 %until, 1
-  %kept = lshr i64 %last, %log
-  %kept.first = shl i64 %kept, %log
-  %since = select i1 %whole, i64 0, i64 %kept.first
-  br i1 %whole, label %back.begin, label %again.begin
-again.begin:
-  ; The frame's own rows are those of the way back, and are put back afterwards.
-  %rows = getelementptr i8, ptr %frame, i64 {rows}
-  %rows.kept = load <{width} x i64>, ptr %rows, align 8
-  %kept.byte = mul i64 %kept, {entry}
-  %again.from = getelementptr i8, ptr %tape, i64 %kept.byte
-  call void @llvm.memcpy.p0.p0.i64(ptr %frame, ptr %again.from, i64 {entry}, i1 false)
-  br label %again
-again:
-  %a = phi i64 [ %since, %again.begin ], [ %a.next, %again.step ]
-  %a.place = sub i64 %a, %since
-  %a.byte = mul i64 %a.place, {entry}
-  %again.to = getelementptr i8, ptr %entries, i64 %a.byte
-  call void @llvm.memcpy.p0.p0.i64(ptr %again.to, ptr %frame, i64 {entry}, i1 false)
-  %a.next = add i64 %a, 1
-  %a.more = icmp slt i64 %a.next, %until
-  br i1 %a.more, label %again.step, label %again.end
-again.step:
-  %a.left = call i1 @step({call}, i64 %a)
-  br label %again
-again.end:
-  store <{width} x i64> %rows.kept, ptr %rows, align 8
-  br label %back.begin
-back.begin:
   br label %back
 back:
-  %b.next = phi i64 [ %until, %back.begin ], [ %b, %back.more ]
-  %b = sub i64 %b.next, 1
-  %b.place = sub i64 %b, %since
-  %b.byte = mul i64 %b.place, {entry}
-  %b.entry = getelementptr i8, ptr %entries, i64 %b.byte
-  call void @step_back({call}, ptr %b.entry, i64 %b)
-  %b.more = icmp sgt i64 %b, %since
-  br i1 %b.more, label %back.more, label %part
-back.more:
+  %b.next = phi i64 [ %total, %turn ], [ %b, %through ]
+  %some = icmp sgt i64 %b.next, 0
+  br i1 %some, label %look, label %finish
+look:
   %halt.2 = load volatile i8, ptr %stop
   %halted.2 = icmp ne i8 %halt.2, 0
-  br i1 %halted.2, label %stopped, label %back
+  br i1 %halted.2, label %leave, label %through
+through:
+  %b = sub i64 %b.next, 1
+  %b.byte = mul i64 %b, {entry}
+  %b.entry = getelementptr i8, ptr %entries, i64 %b.byte
+  call void @step_back({call}, ptr %b.entry, i64 %b)
+  br label %back
 
 finish:
   call void @begin_back({call})
-  br i1 %whole, label %take, label %finished
-finished:
-  call void @free(ptr %entries)
   br label %take
 
-stopped:
-  br i1 %whole, label %leave, label %stopped.window
-stopped.window:
-  call void @free(ptr %entries)
-  br label %leave
 lack:
-  store volatile i8 2, ptr %stop
+  %tape.l = phi ptr [ %first.tape, %entry ], [ %tape.f, %grow ], [ %tape.f, %ask ]
+  store volatile i8 {out_of_memory}, ptr %stop
   br label %leave
 leave:
+  %tape.e = phi ptr [ %tape.t, %take ], [ %tape.f, %forward ], [ %tape, %look ], [ %tape.l, %lack ]
+  call void @free(ptr %tape.e)
   call void @free(ptr %memory)
   ret void
 }}"""

@@ -301,15 +301,34 @@ def dependent_of_equation(eqn: Any, args: list[bool], *, smooth: bool) -> list[b
     return [True] * len(eqn.outvars)
 
 
-def dependent_in_loop(eqn: Any, args: list[bool]) -> list[bool]:
-    """Which arguments of the body of a `scan` or a `while` depend in any turn on the loop's own
-    `args`."""
+def dependent_in_scan(eqn: Any, args: list[bool]) -> list[bool]:
+    """Which arguments of the body of a `scan` depend in any turn on its own `args`."""
     outs = dependent_of_equation(eqn, args, smooth=False)
-    if eqn.primitive.name == "while":
-        first = eqn.params["cond_nconsts"]
-        return [*args[first : first + eqn.params["body_nconsts"]], *outs]
     n, m = scan_counts(eqn.params)
     return [*args[:n], *outs[:m], *args[n + m :]]
+
+
+def loop_depends(jaxpr: Jaxpr, sources: Sequence[bool]) -> bool:
+    """Whether a `while` of a jaxpr, or of one that it calls, has results with a derivative with
+    respect to the arguments `sources`."""
+    found = {v for v, s in zip(jaxpr.invars, sources, strict=True) if s}
+    for eqn in jaxpr.eqns:
+        args = [not isinstance(a, Literal) and a in found for a in eqn.invars]
+        if not any(args) or eqn.primitive.name in _ZERO_DERIVATIVE:
+            continue
+        outs = zip(eqn.outvars, dependent_of_equation(eqn, args, smooth=True), strict=True)
+        smooth: list[Any] = [v for v, here in outs if here]
+        smooth = [v for v in smooth if jnp.issubdtype(v.aval.dtype, jnp.inexact)]
+        found.update(smooth)
+        if eqn.primitive.name == "while" and smooth:
+            return True
+        body = called(eqn) if eqn.primitive.name not in OWN_DERIVATIVE else None
+        bodies = [(body, args)] if body is not None else []
+        if eqn.primitive.name == "cond":
+            bodies = [(branch, args[1:]) for branch in eqn.params["branches"]]
+        if any(loop_depends(inner(x), which) for x, which in bodies):
+            return True
+    return False
 
 
 def scan_counts(params: Mapping[str, Any]) -> tuple[int, int]:

@@ -15,8 +15,14 @@ import jax
 from jax.extend.core import ClosedJaxpr
 from jax.interpreters import partial_eval
 
-from ._loop_transpose import with_loops, without_loops
-from ._program import LaneProgram, batch_of, dependent_parts, dependent_results, evaluated
+from ._program import (
+    LaneProgram,
+    batch_of,
+    dependent_parts,
+    dependent_results,
+    evaluated,
+    loop_depends,
+)
 from ._quotient import with_quotients
 from ._trace import shape_of
 from ._vector import Unsupported, check
@@ -102,6 +108,9 @@ def reverse(
     which parts of a row, have a cotangent (all of them must depend on such inputs).
     """
     carried = _carried(program, varied, given)
+    parts = (program.begin, varied), (program.step, (*varied, *carried))
+    if any(loop_depends(jaxpr.jaxpr, which) for jaxpr, which in parts):
+        return None  # JAX has no transpose of a `while`; tracing would tell as much, later
     outs, flags = given[: len(program.out_avals)], (False, False)
     emitted = (*carried, *flags, *given[len(program.out_avals) :])
     try:
@@ -149,7 +158,7 @@ def _both_ways(
 
     **Raises:** `NotImplementedError` or `ValueError` if something has no transpose.
     """
-    function = functools.partial(evaluated, with_loops(with_quotients(closed)))
+    function = functools.partial(evaluated, with_quotients(closed))
     number = len(varied)
 
     def both(*args):
@@ -174,7 +183,7 @@ def _both_ways(
 
     shapes = [shape_of(a) for a in closed.in_avals]
     shapes += [shape_of(a) for a, w in zip(closed.out_avals, weighted, strict=True) if w]
-    whole = without_loops(jax.make_jaxpr(both)(*shapes))
+    whole = jax.make_jaxpr(both)(*shapes)
     cotangents = len(whole.out_avals) - kept
     there = _pruned(whole, [True] * kept + [False] * cotangents)
     back = _pruned(whole, [False] * kept + [True] * cotangents)

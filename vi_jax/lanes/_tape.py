@@ -24,7 +24,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr
 
 from ._arrays import any_in
-from ._driver import DRIVER
+from ._driver import DRIVER, OUT_OF_MEMORY
 from ._fixed import FixedText
 from ._group import (
     Frame,
@@ -45,14 +45,10 @@ from ._reverse import ReverseProgram
 from ._text import RARE, Text, Value
 from ._vector import write
 
-# Bytes of a thread's tape. The paper's motor takes 1.1 kB an iteration in groups of eight, so that
-# 4,000 cycles of 15 steps are kept whole; what is longer takes its steps once more. (10,000 cycles:
-# 5.7 simulations instead of 4.8, and 116 MB more of the process's memory on two threads.)
-_TAPE_BYTES = 64 << 20
-
-# Entries of a tape at least, however large they are: a choice; of fewer than a few nearly every
-# iteration would be taken again.
-_FEWEST_ENTRIES = 16
+# Bytes of a thread's tape at most, and its entries at first. The paper's motor takes 1.1 kB an
+# iteration in groups of eight, so that 250,000 cycles of 15 steps have room.
+MOST_BYTES = 4 << 30
+_FIRST_ENTRIES = 64
 
 # How many iterations a lane has that has not ended yet.
 _NO_END = (1 << 63) - 1
@@ -64,15 +60,15 @@ def reverse_text(
     bits: int,
     one_for_all: tuple[bool, ...] = (),
     *,
-    entries: int | None = None,
+    entries: int = _FIRST_ENTRIES,
+    most: int = MOST_BYTES,
 ) -> str:
     """LLVM's text of a program forward and backward.
 
     **Arguments:** the program; the lanes of a group; the width of the registers that LLVM may use;
-    as for `_kernel.kernel_text`; the entries of a tape, an even number from 4 on (by default as
-    many as `_TAPE_BYTES` hold).
+    as for `_kernel.kernel_text`; the entries of a tape at first; its bytes at most.
     """
-    return _Writer(program, width, one_for_all).text(bits, entries)
+    return _Writer(program, width, one_for_all).text(bits, entries, most)
 
 
 def _is_no_number(t: Text, x: Value) -> Value:
@@ -126,18 +122,14 @@ class _Writer:
         # Where it has the numbers of rows, the last part of an entry.
         self.rows_place = self.frame.places["now"] + tape_size(self.entry[:-1], width)
 
-    def text(self, bits: int, entries: int | None) -> str:
+    def text(self, bits: int, entries: int, most: int) -> str:
         """LLVM's text of the module: forward sweep, backward sweep, and the driver of both."""
-        entry = tape_size(self.entry, self.width)
-        if entries is None:
-            entries = max(_FEWEST_ENTRIES, _TAPE_BYTES // entry // 2 * 2)
         functions = [
             self._begin(), self._step(), self._end_back(), self._step_back(), self._begin_back(),
         ]  # fmt: skip
-        frame = self.frame.size + self.arena
         driver = DRIVER.format(
-            width=self.width, frame=frame, entry=entry, entries=entries, half=entries // 2,
-            whole=64 + frame + entries * entry, call=_ARGUMENTS, rows=self.rows_place,
+            width=self.width, frame=64 + self.frame.size + self.arena, entries=entries, most=most,
+            entry=tape_size(self.entry, self.width), call=_ARGUMENTS, out_of_memory=OUT_OF_MEMORY,
         )  # fmt: skip
         attributes = (
             f'attributes #0 = {{ nounwind "min-legal-vector-width"="{bits}" '

@@ -14,7 +14,7 @@ import numpy as np
 from jax.core import ShapedArray
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive
 
-from ._program import CALLS, dependent_in_loop, dependent_of_equation, inner
+from ._program import CALLS, dependent_in_scan, dependent_of_equation, inner
 from .elementary import jitted
 
 weighted_p = Primitive("weighted")
@@ -89,10 +89,7 @@ def _equation(eqn: Any, args: list[bool]) -> Any:
         branches = tuple(with_weights(b, args[1:]) for b in params["branches"])
         return eqn.replace(params={**params, "branches": branches})
     if name == "scan":
-        return eqn.replace(params=_with(params, "jaxpr", dependent_in_loop(eqn, args)))
-    if name == "while":
-        held = dependent_in_loop(eqn, args)
-        return eqn.replace(params=_with(params, "body_jaxpr", held))
+        return eqn.replace(params=_with(params, "jaxpr", dependent_in_scan(eqn, args)))
     return eqn
 
 

@@ -26,6 +26,10 @@ from .runtime import KernelCall, kernel_by_key
 TARGET = "vi_jax_lanes"
 
 INTERRUPTED = "Lanes were interrupted before all of them had ended."
+_NO_ROOM = (
+    "The tape of this gradient needs more than 4 GiB in a thread, or more memory than there is. "
+    "Simulate fewer cycles at once, or differentiate forward (`jax.jacfwd`)."
+)
 
 # The version of the interface whose structures follow.
 _MAJOR, _MINOR = 0, 3
@@ -207,7 +211,7 @@ def _run_kernel(frame: _Frame) -> int | None:
     if succeeded:
         return SUCCESS
     if work.stop.value == OUT_OF_MEMORY:
-        return _error(frame, "There is no memory for the tape of a derivative.", _EXHAUSTED)
+        return _error(frame, _NO_ROOM, _EXHAUSTED)
     if work.stop.value:
         return _error(frame, INTERRUPTED, _CANCELLED)
     return _error(frame, "Not all lanes were run.", _INTERNAL)
