@@ -15,6 +15,7 @@ from ..machine import (
     AbstractEvent,
     AbstractMachine,
     AbstractSwitch,
+    Coordinate,
     LinearMachine,
     Reset,
     RigidStop,
@@ -102,6 +103,7 @@ def check_events(machine: AbstractMachine, s: Scalar, state: State, modes: Scala
     must; while the loop is traced, and at no cost where it runs."""
     name = type(machine).__name__
     for k, coordinate in enumerate(machine.coordinates if machine.stops else ()):
+        _check_mass(f"`mass` of coordinate {k} of a {name}", coordinate, s, state)
         whose = f"`placed` of coordinate {k} of a {name}"
         place, velocity = coordinate.position(state), coordinate.velocity(state)
         with in_words_of(whose):
@@ -109,6 +111,20 @@ def check_events(machine: AbstractMachine, s: Scalar, state: State, modes: Scala
     first = len(machine.stops)
     for number, event in enumerate(events_of(machine)[first:-1], start=first):
         _check_event(machine, number, event, (s, state, modes))
+
+
+def _check_mass(whose: str, coordinate: Coordinate, s: Scalar, state: State) -> None:
+    """**Raises:** `TypeError` unless a mass is one number, or a function that returns one."""
+    mass = coordinate.mass
+    if callable(mass):
+        with in_words_of(whose):
+            mass = jax.eval_shape(lambda: jnp.asarray(coordinate.mass_at(s, state)))
+    kind = getattr(mass, "dtype", None) or jnp.result_type(type(mass))
+    if jnp.shape(mass) or not jnp.issubdtype(kind, jnp.number):
+        raise TypeError(
+            f"{whose} must be one number, or a function `mass(s, state)` that returns one, but "
+            f"is {in_short(mass)}."
+        )
 
 
 def _check_event(

@@ -29,7 +29,7 @@ class SmoothMachine(eqx.Module):
             return flow
         limited = sorted({stop.coordinate for stop in machine.stops})
         if len(limited) > 1 or rubs(machine):
-            return held_flow(machine, flow, state, self.modes, self.contact)[0]
+            return held_flow(machine, flow, s, state, self.modes, self.contact)[0]
         for k in limited:
             still, rests = _held_still(machine.coordinates[k], state, flow), self.contact[k] > 0
             flow = jtu.tree_map(lambda a, b, rests=rests: jnp.where(rests, a, b), still, flow)

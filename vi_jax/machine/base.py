@@ -27,7 +27,12 @@ class Coordinate(NamedTuple):
     placed: Callable[[State, Any, Any], State]
     """A state with another position and velocity, and with all that an impact changes besides."""
     mass: Any = 1.0
-    """What an impact acts on, in the machine's unit of mass: of two bodies the reduced mass."""
+    """What an impact acts on, in the machine's unit of mass: of two bodies the reduced mass. A
+    number, or a function `mass(s, state)`."""
+
+    def mass_at(self, s: Scalar, state: State) -> Any:
+        """The mass in a state."""
+        return self.mass(s, state) if callable(self.mass) else self.mass
 
 
 class Prepared(NamedTuple):

@@ -145,4 +145,4 @@ class ContactFriction(AbstractSwitch):
         """
         modes = around.instead(mode)
         flow = machine.field(s, state, *modes)
-        return held_flow(machine, flow, state, modes, around.contact)[1][around.own]
+        return held_flow(machine, flow, s, state, modes, around.contact)[1][around.own]

@@ -89,7 +89,9 @@ class Rubbed(NamedTuple):
     dragged: Scalar
 
 
-def rubbed(machine: Machine, number: int, friction: Any, before: State, after: State) -> Rubbed:
+def rubbed(
+    machine: Machine, number: int, friction: Any, s: Scalar, before: State, after: State
+) -> Rubbed:
     """An impact on stop `number` as Coulomb's friction has it: the body sticks, its velocity along
     the stop reversed and scaled by the tangential restitution, if the impulse that this takes is at
     most `level` times that of the stop; else it slips against that much.
@@ -105,7 +107,8 @@ def rubbed(machine: Machine, number: int, friction: Any, before: State, after: S
     wanted = body.velocity(after) - across
     both = jnp.ones((), bool)
     sticking = forces(gains, (both, both), (wanted, -(1 + friction.restitution) * slip))
-    level, away = friction.level * body.mass / along.mass, -float(stop.sign)
+    ratio = body.mass_at(s, before) / along.mass_at(s, before)
+    level, away = friction.level * ratio, -float(stop.sign)
     slips = jnp.abs(sticking[1]) > level * jnp.maximum(away * sticking[0], 0.0)
     # Forward or backward, as it slips then: the stop's push drags along, too.
     forward = _slipping(gains, wanted, -away * level)
@@ -143,7 +146,9 @@ class Held(NamedTuple):
     its own push goes with one of the stop's."""
 
 
-def held_by(machine: Any, state: State, modes: Sequence[Scalar], contact: Sequence[Scalar]) -> Held:
+def held_by(
+    machine: Any, s: Scalar, state: State, modes: Sequence[Scalar], contact: Sequence[Scalar]
+) -> Held:
     """What holds the bodies that rest on stops.
 
     **Arguments:** `modes`, those of the machine's switches first; `contact` as in `Around`.
@@ -161,7 +166,8 @@ def held_by(machine: Any, state: State, modes: Sequence[Scalar], contact: Sequen
         along, body = machine.coordinates[friction.along], bodies[at]
         drag = push_of(along, state)
         # The stop pushes a body away from it, and friction against the way it slips.
-        ratio = modes[i] * friction.level * stop.sign * body.mass / along.mass
+        ratio = body.mass_at(s, state) / along.mass_at(s, state)
+        ratio = modes[i] * friction.level * stop.sign * ratio
         slips = jnp.where(here, ratio, 0.0)
         pushes[at] = added(pushes[at], (slips,), (drag,))
         bodies, pushes = [*bodies, along], [*pushes, drag]
@@ -171,8 +177,9 @@ def held_by(machine: Any, state: State, modes: Sequence[Scalar], contact: Sequen
 
 
 def held_flow(
-    machine: Machine, flow: State, state: State, modes: Sequence[Scalar], contact: Sequence[Scalar]
-) -> tuple[State, dict[int, tuple[Scalar, Scalar]]]:
+    machine: Machine, flow: State, s: Scalar, state: State, modes: Sequence[Scalar],
+    contact: Sequence[Scalar],
+) -> tuple[State, dict[int, tuple[Scalar, Scalar]]]:  # fmt: skip
     """The rate at which a state changes along `flow` while those coordinates that rest keep their
     velocities, all at once: contacts that share a body are held by forces that depend on each
     other, and on the friction there.
@@ -182,12 +189,12 @@ def held_flow(
     **Returns:** the rate, and of each friction on a stop, by its place among the switches, the
     force along the stop and that which presses on it.
     """
-    held = held_by(machine, state, modes, contact)
+    held = held_by(machine, s, state, modes, contact)
     wanted = [-gained(body, state, flow) for body in held.coordinates]
     amounts = forces(shares(held.coordinates, state, held.pushes), held.acts, wanted)
     found, first = {}, len(held.coordinates) - len(held.rubbing)
     for row, (i, friction, at, _) in enumerate(held.rubbing, start=first):
         along, body = held.coordinates[row], held.coordinates[at]
-        pressing = -machine.stops[friction.rubs_on].sign * amounts[at] * body.mass
-        found[i] = amounts[row] * along.mass, pressing
+        pressing = -machine.stops[friction.rubs_on].sign * amounts[at] * body.mass_at(s, state)
+        found[i] = amounts[row] * along.mass_at(s, state), pressing
     return added(flow, amounts, held.pushes), found

@@ -46,7 +46,7 @@ def jump_of(machine: Machine, number: int, s: Scalar, state: State, modes: Modes
     **Arguments:** `number`, the event's; `modes`, all of the machine.
     """
     event, own, _ = event_of(machine, number, modes, ())
-    return _rubbed(machine, number, state, event.jump(machine, s, state, *modes[own]))
+    return _rubbed(machine, number, s, state, event.jump(machine, s, state, *modes[own]))
 
 
 def happens_at(machine: Machine, number: int, s: Scalar, state: State, modes: Modes) -> Any:
@@ -79,13 +79,15 @@ def after_event(
     new, changed = event.after(machine, s, state, *modes[own], **more)
     if event.holds_mode:
         changed = (*modes[: own.start], changed, *modes[own.stop :])
-    return _rubbed(machine, number, state, new), settled_modes(changed, s)
+    return _rubbed(machine, number, s, state, new), settled_modes(changed, s)
 
 
-def _rubbed(machine: Machine, number: int, before: State, after: State) -> State:
+def _rubbed(machine: Machine, number: int, s: Scalar, before: State, after: State) -> State:
     """The state after an impact, with what friction on the stop makes of it."""
     friction = rubbing_on(machine, number)
-    return after if friction is None else rubbed(machine, number, friction, before, after).state
+    if friction is None:
+        return after
+    return rubbed(machine, number, friction, s, before, after).state
 
 
 def rubbing_on(machine: Machine, number: int) -> Any:

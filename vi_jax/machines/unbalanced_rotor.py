@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Range, number, require
 from .._types import Number, Scalar, State
-from ..machine import RigidStop, ShaftMachine, Shown
+from ..machine import Coordinate, RigidStop, ShaftMachine, Shown
 from ._base import PhaseMachine, number_field, stops_at
 from ._drawn import draw_rotor
 
@@ -141,6 +141,16 @@ class UnbalancedRotor(ShaftMachine, PhaseMachine):
             return TimedRotorState(state.V, push, twist, W)
         pace = _pace(W)
         return RotorState(pace * state.V, pace * push, pace * twist)
+
+    def effective_mass(self, s: Scalar, state: State) -> Scalar:
+        """1 - ε sin²φ, what an impact acts on, since it jerks the shaft too (unit: M)."""
+        sine = jnp.sin(state.phase if self.is_timed(state) else s)
+        return 1 - self.coupling * sine * sine
+
+    @property
+    def coordinates(self) -> tuple[Coordinate, ...]:
+        """The body's, with its effective mass."""
+        return (super().coordinates[0]._replace(mass=self.effective_mass),)
 
     def start(self, *, Y: Number = 0.0, V: Number = 0.0, W: Number | None = None) -> Any:
         """A state on the section φ = 0; `W` (unit: ω) defaults to the no-load speed κ w0, and

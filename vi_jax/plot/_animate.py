@@ -122,9 +122,12 @@ def _frames(
         return np.stack(rows, axis=-1).reshape(-1, *x.shape[1:])
 
     states = jax.tree_util.tree_map(between, samples.state)
-    # The corners of the path at its impacts, which no samples have.
-    Y, V = (np.interp(at, path.cycles[good], x[good]) for x in (path.Y, path.V))
-    states = jax.vmap(machine.coordinates[0].placed)(states, Y, V)
+    # The corners of the paths at their impacts, which no samples have.
+    for k in sorted({0, *(stop.coordinate for stop in machine.stops)}):
+        one = motion_path(run, machine=machine, coordinate=k)
+        known = np.isfinite(one.Y)
+        Y, V = (np.interp(at, one.cycles[known], x[known]) for x in (one.Y, one.V))
+        states = jax.vmap(machine.coordinates[k].placed)(states, Y, V)
     places = [np.asarray(jax.vmap(c.position)(states), float) for c in machine.coordinates]
     return _Frames(at, states, np.stack(places))
 

@@ -38,6 +38,7 @@ def plot_history(
     shift: float | int = 0,
     unit: str | None = None,
     stops: bool = True,
+    coordinate: int = 0,
     **style: Any,
 ) -> Axes:
     """Position over the drive's clock, with the stops of `machine` as green lines (dashed if soft).
@@ -52,11 +53,12 @@ def plot_history(
     - `unit`: `"angle"` (crank angle φ in units of π) or `"cycles"`; by default the clock of the
       `machine`, which is the angle for the paper's machine and where no machine is given.
     - `stops`: whether to draw the stops.
+    - `coordinate`: the number of the machine's coordinate to draw, with its own stops and impacts.
     - `style`: options of `Axes.plot`.
 
     **Returns:** the axes.
     """
-    path = motion_path(motion, machine=machine, window=window)
+    path = motion_path(motion, machine=machine, window=window, coordinate=coordinate)
     turning = counts_by_angle(machine)
     if unit is None:
         unit = "angle" if turning else "cycles"
@@ -66,8 +68,8 @@ def plot_history(
     factor = 2.0 if unit == "angle" else 1.0
     ax.plot(factor * (path.cycles + shift), path.Y, **{"color": BLUE, "lw": thick(1.3), **style})
     if stops and machine is not None:
-        _draw_stops(machine, ax, ax.axhline)
-    ax.set_ylabel(_labels(motion, machine)[0])
+        _draw_stops(machine, coordinate, ax, ax.axhline)
+    ax.set_ylabel(_labels(motion, machine, coordinate)[0])
     if unit == "cycles":
         ax.set_xlabel("drive cycles φ/(2π)" if turning else "cycles since the start")
     else:
@@ -75,24 +77,32 @@ def plot_history(
     return ax
 
 
-def _draw_stops(machine: AbstractMachine, ax: Axes, line: Callable[..., Any]) -> None:
-    """Rigid stops as thick lines; soft ones of the coordinate that is drawn, which the body goes
-    into, as thin dashed ones."""
+def _draw_stops(
+    machine: AbstractMachine, coordinate: int, ax: Axes, line: Callable[..., Any]
+) -> None:
+    """Of a coordinate the rigid stops as thick lines, and the soft ones, which the body goes into,
+    as thin dashed ones."""
     look = {"color": STOP, "lw": thick(1.8)}
     for stop in machine.stops:
-        line(float(stop.place), **look, label=once(ax, "stop"))
+        if stop.coordinate == coordinate:
+            line(float(stop.place), **look, label=once(ax, "stop"))
     for stop in machine.switches:
-        if isinstance(stop, SoftStop) and stop.coordinate == 0:
+        if isinstance(stop, SoftStop) and stop.coordinate == coordinate:
             soft = {"lw": thick(1.2), "ls": "--", "label": once(ax, "soft stop")}
             line(float(stop.place), **look | soft)
 
 
-def _labels(motion: Run | Samples, machine: AbstractMachine | None) -> tuple[str, str]:
-    """What position and velocity are called, with their units; samples alone do not know their
-    machine."""
+def _labels(
+    motion: Run | Samples, machine: AbstractMachine | None, coordinate: int
+) -> tuple[str, str]:
+    """What position and velocity of a coordinate are called, with their units; samples alone do not
+    know their machine."""
     if machine is None:
         return motion.labels if isinstance(motion, Run) else ("Y", "V")
-    named = zip(PLAIN, machine.labels, strict=True)
+    labels = machine.labels
+    if coordinate:  # the machine's words are those of the first
+        labels = tuple(f"{name} of coordinate {coordinate}" for name in PLAIN)
+    named = zip(PLAIN, labels, strict=True)
     position, velocity = (
         in_brackets(label, unit_of(machine.units, name)) if name_in(label) == label else label
         for name, label in named
@@ -119,6 +129,7 @@ def plot_phase_portrait(
     ax: Axes | None = None,
     window: tuple[float | int, float | int] | None = None,
     sections: bool = True,
+    coordinate: int = 0,
     **style: Any,
 ) -> Axes:
     """Velocity over position, with the stops as green lines (dashed if soft), sections as dots.
@@ -128,19 +139,19 @@ def plot_phase_portrait(
 
     **Returns:** the axes.
     """
-    path = motion_path(motion, machine=machine, window=window)
+    path = motion_path(motion, machine=machine, window=window, coordinate=coordinate)
     ax = new_axes(ax)
     (line,) = ax.plot(path.Y, path.V, **{"color": BLUE, "lw": thick(1.0), **style})
     if sections:
         only = motion.samples if isinstance(motion, Run) else motion  # without the impacts
         assert only is not None
-        samples = motion_path(only, machine=machine, window=window)
+        samples = motion_path(only, machine=machine, window=window, coordinate=coordinate)
         whole = abs(samples.cycles - samples.cycles.round()) < 1e-9
         dots = {"ms": 4, "color": line.get_color(), "zorder": 3, "label": once(ax, "section")}
         ax.plot(samples.Y[whole], samples.V[whole], "o", **dots)
     if machine is not None:
-        _draw_stops(machine, ax, ax.axvline)
-    position, velocity = _labels(motion, machine)
+        _draw_stops(machine, coordinate, ax, ax.axvline)
+    position, velocity = _labels(motion, machine, coordinate)
     ax.set_xlabel(position)
     ax.set_ylabel(velocity)
     return ax

@@ -6,16 +6,20 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from .._checks import instance_of
+from .._checks import count, instance_of
 from ..flow import Run, Samples
 from ..machine import AbstractMachine, is_autonomous
 from ..orbit import Orbit
 
 
-def _coordinates(machine: AbstractMachine | None) -> tuple[Callable[[Any], Any], ...]:
-    """Position and velocity of states; without a machine their components `Y` and `V`."""
+def _coordinates(machine: AbstractMachine | None, k: int) -> tuple[Callable[[Any], Any], ...]:
+    """Position and velocity of states by coordinate number k; without a machine their components
+    `Y` and `V`."""
     if machine is not None:
-        return jax.vmap(machine.position), jax.vmap(machine.velocity)
+        body = machine.coordinates[k]
+        if k == 0:
+            return jax.vmap(machine.position), jax.vmap(machine.velocity)
+        return jax.vmap(body.position), jax.vmap(body.velocity)
     return (lambda state: state.Y), (lambda state: state.V)
 
 
@@ -35,21 +39,25 @@ def motion_path(
     *,
     machine: AbstractMachine | None = None,
     window: tuple[float | int, float | int] | None = None,
+    coordinate: int = 0,
 ) -> MotionPath:
     """The path of one sampled motion.
 
     **Arguments:** a `Run` simulated with `samples=...` (or its `Samples`); with the `machine`, the
     impacts logged (`impact_log=...`) enter as two points each, before and after the impact, so
-    that a corner at the stop is drawn where it is; `window`, the first and the last cycle to keep.
+    that a corner at the stop is drawn where it is; `window`, the first and the last cycle to keep;
+    `coordinate`, the number of the machine's coordinate whose path it is, with its own impacts.
 
-    **Raises:** `ValueError` if the run has no samples or is a batch, or its states lack `Y` and `V`
-    and no machine says what stands for them.
+    **Raises:** `ValueError` if the run has no samples or is a batch, if its states lack `Y` and `V`
+    and no machine says what stands for them, or for a coordinate that there is not.
     """
     if isinstance(motion, Orbit):
         raise TypeError("Argument `motion` must be a `Run`: give `orbit.trajectory()` of an orbit.")
     instance_of("motion", motion, (Run, Samples), "a `Run`, from `simulate`, or its `samples`")
     if machine is not None:
         instance_of("machine", machine, AbstractMachine, "a `Scene` or an `AbstractMachine`")
+    most = 0 if machine is None else len(machine.coordinates) - 1
+    coordinate = count("coordinate", coordinate, most=most)
     samples = motion.samples if isinstance(motion, Run) else motion
     if samples is None:
         raise ValueError("Argument `motion` must have samples: simulate with `samples=64`, say.")
@@ -60,7 +68,8 @@ def motion_path(
         )
     try:
         path = MotionPath(
-            cycles, *(np.asarray(read(samples.state), float) for read in _coordinates(machine))
+            cycles,
+            *(np.asarray(x(samples.state), float) for x in _coordinates(machine, coordinate)),
         )
     except AttributeError:
         raise ValueError(
@@ -68,22 +77,25 @@ def motion_path(
             "`Y` and `V`."
         ) from None
     if isinstance(motion, Run) and motion.impact_log is not None and machine is not None:
-        path = _with_impacts(path, motion, machine)
+        path = _with_impacts(path, motion, machine, coordinate)
     if window is not None:
         keep = (path.cycles >= window[0]) & (path.cycles <= window[1])
         path = MotionPath(*(x[keep] for x in path))
     return path
 
 
-def _with_impacts(path: MotionPath, run: Run, machine: AbstractMachine) -> MotionPath:
+def _with_impacts(
+    path: MotionPath, run: Run, machine: AbstractMachine, coordinate: int
+) -> MotionPath:
     log = run.impact_log
     assert log is not None
     stop = np.asarray(log.stop)
-    cycle, _ = np.nonzero(stop >= 0)
-    stop = stop[stop >= 0]
+    own = [i for i, x in enumerate(machine.stops) if x.coordinate == coordinate]
+    logged = np.isin(stop, own)
+    cycle, _ = np.nonzero(logged)
+    stop = stop[logged]
     if not stop.size:
         return path
-    logged = np.asarray(log.stop) >= 0
     length = np.full(run.impacts.shape, float(machine.turn))
     if is_autonomous(machine, run.last):  # whose cycles are of several lengths
         length = np.asarray(run.duration)

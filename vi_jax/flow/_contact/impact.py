@@ -50,7 +50,7 @@ def _one_blow(
         arrival = listed(plan, arrival._replace(state=state), there, taken & met, number, approach)
         if arrival.tally.loss is not None:
             lost = stop.loss(approach, share)
-            lost = lost if _is_one(body.mass) else body.mass * lost
+            lost = lost if _is_one(body.mass) else body.mass_at(arrival.s, there) * lost
             arrival = arrival.counting(loss=arrival.tally.loss + jnp.where(taken & met, lost, 0.0))
         new = Blow(jnp.where(met, to_event(number), 0.0), approach, share)
         blow = new if len(landed) == 1 else select(met, new, blow)

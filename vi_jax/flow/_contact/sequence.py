@@ -57,6 +57,7 @@ class _Instant(NamedTuple):
 
     plan: Plan
     taken: Flag
+    s: Scalar
     met: Flag
     """Whether any stop is landed upon."""
     there: State
@@ -140,8 +141,8 @@ def _instant(
     coupled = _coupled(plan, limited, gains_, touches, coupled)
     before = [body.velocity(there) for body in bodies]
     return _Instant(
-        plan, taken, met, there, limited, bodies, before, gains_, landed, touches, coupled,
-        rounding(plan.machine, there),
+        plan, taken, arrival.s, met, there, limited, bodies, before, gains_, landed, touches,
+        coupled, rounding(plan.machine, there),
     )  # fmt: skip
 
 
@@ -237,7 +238,9 @@ def _each_by_itself(
     amounts = stop_gradient(forces(instant.gains, on, wanted))
     gained, size_of, pulls = jnp.zeros(()), jnp.zeros(()), jnp.zeros((), bool)
     for i, body in enumerate(instant.bodies):
-        work = body.mass * amounts[i] * (velocities[i] + 0.5 * wanted[i])
+        work = (
+            body.mass_at(instant.s, instant.there) * amounts[i] * (velocities[i] + 0.5 * wanted[i])
+        )
         gained, size_of = gained + work, size_of + jnp.abs(work)
         pulls = pulls | (amounts[i] * signs[i] > _EQUAL * jnp.abs(wanted[i]))
     return stop_gradient(pulls | (gained > _EQUAL * size_of))
@@ -274,7 +277,7 @@ def _thrown(
         friction = rubbing_on(machine, number)
         if friction is not None:
             i = instant.limited.index(machine.stops[number].coordinate)
-            rough = rubbed(machine, number, friction, state, new)
+            rough = rubbed(machine, number, friction, instant.s, state, new)
             new = select(hit, rough.state, new)
             amounts[i] = jnp.where(hit, rough.pushed, amounts[i])
             along = machine.coordinates[friction.along]
@@ -308,8 +311,9 @@ def _accounted(
     lost, size = jnp.zeros_like(arrival.s), jnp.zeros_like(arrival.s)
     for body, amount in pushed:
         V, left = body.velocity(before), body.velocity(arrival.state)
-        lost = lost - body.mass * amount * 0.5 * (V + left)
-        size = size + body.mass * jnp.abs(amount) * (jnp.abs(V) + jnp.abs(left))
+        mass = body.mass_at(instant.s, before)
+        lost = lost - mass * amount * 0.5 * (V + left)
+        size = size + mass * jnp.abs(amount) * (jnp.abs(V) + jnp.abs(left))
     if arrival.tally.loss is not None:
         hit = instant.taken & instant.met
         arrival = arrival.counting(loss=arrival.tally.loss + jnp.where(hit, lost, 0.0))

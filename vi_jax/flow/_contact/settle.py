@@ -89,11 +89,11 @@ def _held(
     if rubs(plan.machine):
         # Which way a body slips is known behind its impact.
         modes = struck_modes(plan.machine, s, state, modes, contact=contact)
-        slowed, rubbed_away = _without_rebounds(plan, state, modes, rests, walls)
-        still, lost = stilled(plan, slowed, rests, walls)
+        slowed, rubbed_away = _without_rebounds(plan, s, state, modes, rests, walls)
+        still, lost = stilled(plan, s, slowed, rests, walls)
         lost = lost + rubbed_away
     else:
-        still, lost = stilled(plan, state, rests, walls)
+        still, lost = stilled(plan, s, state, rests, walls)
     resting = holding(plan.machine, modes, contact)
     way = FlowToEvent(plan, resting, lane.part, (s, still, time))
     later, still, passed = drifted(way.rate, pin(wait), way.moving, way.fixed, way.rest)
@@ -117,7 +117,7 @@ def _held(
 
 
 def _without_rebounds(
-    plan: Plan, state: State, modes: Scalars, rests: dict[int, Flag],
+    plan: Plan, s: Scalar, state: State, modes: Scalars, rests: dict[int, Flag],
     walls: dict[int, Scalar],
 ) -> tuple[State, Scalar]:  # fmt: skip
     """The state without the rebounds of those bodies that come to rest, and without the friction
@@ -130,7 +130,7 @@ def _without_rebounds(
     contact = [zero for _ in machine.coordinates]
     for k, ends in rests.items():
         contact[k] = jnp.where(ends, walls[k], zero)
-    held = held_by(machine, state, modes, contact)
+    held = held_by(machine, s, state, modes, contact)
     bodies = held.coordinates
     before = [body.velocity(state) for body in bodies]
     amounts = forces(
@@ -141,12 +141,12 @@ def _without_rebounds(
         pushed[row] = pushed[row] + drag * amounts[at]
     lost = zero
     for body, amount, V in zip(bodies, pushed, before, strict=True):
-        lost = lost - body.mass * amount * 0.5 * (V + body.velocity(new))
+        lost = lost - body.mass_at(s, state) * amount * 0.5 * (V + body.velocity(new))
     return new, lost
 
 
 def stilled(
-    plan: Plan, state: State, rests: dict[int, Flag], walls: dict[int, Scalar]
+    plan: Plan, s: Scalar, state: State, rests: dict[int, Flag], walls: dict[int, Scalar]
 ) -> tuple[State, Scalar]:
     """The state with those coordinates put on their stops that rest, without velocity, all at once;
     and the energy that goes with it.
@@ -172,7 +172,7 @@ def stilled(
             place, speed = sign * gap, jnp.zeros_like(V)
         moved = body.placed(new, place, speed)
         new = moved if len(rests) == 1 else select(rests[k], moved, new)
-        lost = lost - body.mass * change * 0.5 * V
+        lost = lost - body.mass_at(s, state) * change * 0.5 * V
     return new, lost
 
 

@@ -201,7 +201,7 @@ def _released(
         # While they were held their places were kept to the method's error.
         limited = sorted({stop.coordinate for stop in plan.machine.stops})
         walls = {i: contact[i] for i in limited}
-        put, _ = stilled(plan, state, {i: walls[i] > 0 for i in limited}, walls)
+        put, _ = stilled(plan, arrival.s, state, {i: walls[i] > 0 for i in limited}, walls)
         state = select(walls[k] > 0, put, state)
     direction = jnp.where(free, -lane.direction[k], arrival.direction[k])
     clock = clock_at(plan, arrival.s + jnp.where(free, offset, 0.0), state)

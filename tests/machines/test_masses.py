@@ -1,0 +1,112 @@
+"""What impacts act on, where that is no constant; and pictures of several coordinates."""
+
+from typing import Any
+
+import diffrax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+from matplotlib.figure import Figure
+from scipy.integrate import quad
+from scipy.optimize import brentq
+
+
+def test_impacts_of_an_unbalanced_rotor_lose_what_its_energy_does():
+    """Without damping and motor nothing else does."""
+    e = 0.2
+    rotor = vi.machines.UnbalancedRotor(
+        coupling=e, gap=0.5, restitution=0.6, strength=0.0, damping_ratio=0.0
+    )
+    steps = vi.FixedStep(diffrax.Tsit5(), 200)
+    run = vi.simulate(rotor, rotor.start(Y=0.1, V=0.3, W=3.0), 4, method=steps)
+    states = run.sections  # where φ = 0
+    energy = 0.5 * (states.V**2 + states.Y**2) + states.P**2 / (2 * e)
+    assert int(run.impacts.sum()) > 3
+    np.testing.assert_allclose(run.impact_energy, -np.diff(energy), atol=2e-9)
+
+
+class Growing(vi.AbstractMachine):
+    """A body that nothing pulls, whose mass changes: m(s) V is constant."""
+
+    stops: tuple = (vi.RigidStop(1.0, 0.5),)
+    cycle: float = 2 * np.pi
+
+    @property
+    def coordinates(self):
+        def place(z):
+            return z.Y
+
+        def speed(z):
+            return z.V
+
+        def put(z, Y, V):
+            return vi.OscillatorState(Y, V)
+
+        return (vi.Coordinate(place, speed, put, self.weight),)
+
+    def weight(self, s, z):
+        return 2 + jnp.sin(s)
+
+    def field(self, s, z):
+        return vi.OscillatorState(z.V, -z.V * jnp.cos(s) / self.weight(s, z))
+
+
+class Pairs(Growing):
+    @property
+    def coordinates(self):
+        return (super().coordinates[0]._replace(mass=lambda s, z: (s, z.V)),)
+
+
+def test_a_mass_may_be_a_function():
+    start = vi.OscillatorState(jnp.asarray(0.0), jnp.asarray(1.0))
+    run = vi.simulate(Growing(), start, 1, impact_log=2, method=vi.Adaptive(rtol=1e-11))
+    met = brentq(lambda s: quad(lambda s: 2 / (2 + np.sin(s)), 0, s)[0] - 1, 0.5, 3.0)
+    speed = 2 / (2 + np.sin(met))
+    np.testing.assert_allclose(run.impact_log.phase[0, 0], met, rtol=1e-9)
+    lost = 0.5 * (2 + np.sin(met)) * (1 - 0.5**2) * speed**2
+    np.testing.assert_allclose(run.impact_energy[0], lost, rtol=1e-9)
+    with pytest.raises(TypeError, match=r"`mass` of coordinate 0 of a Pairs must be one number"):
+        vi.simulate(Pairs(), start, 1)
+
+
+class Pair(vi.OscillatorState):
+    y: Any
+    v: Any
+
+
+class Bodies(vi.AbstractMachine):
+    """Two bodies that nothing pulls, between stops of their own."""
+
+    stops: tuple = (vi.RigidStop(1.0, 0.5), vi.RigidStop(2.0, 0.5, "left", coordinate=1))
+    coordinates: tuple = (
+        vi.Coordinate(lambda z: z.Y, lambda z: z.V, lambda z, Y, V: Pair(Y, V, z.y, z.v)),
+        vi.Coordinate(lambda z: z.y, lambda z: z.v, lambda z, Y, V: Pair(z.Y, z.V, Y, V)),
+    )
+    cycle: float = 3.0
+
+    def field(self, s, z):
+        return Pair(z.V, 0 * z.V, z.v, 0 * z.v)
+
+
+def test_pictures_show_a_coordinate_with_its_own_stops_and_impacts():
+    machine = Bodies()
+    start = Pair(*(jnp.asarray(x) for x in (0.0, 0.7, 0.0, -1.1)))
+    run = vi.simulate(machine, start, 1, samples=30, impact_log=4, rests=False)
+    assert run.impact_log.stop[0, :2].tolist() == [0, 1]
+    for k, (speed, place) in enumerate(((0.7, 1.0), (-1.1, -2.0))):
+        path = vi.plot.motion_path(run, machine=machine, coordinate=k)
+        s = 3 * path.cycles
+        wanted = np.where(s * abs(speed) <= abs(place), speed * s, 1.5 * place - 0.5 * speed * s)
+        np.testing.assert_allclose(path.Y, wanted, atol=1e-9)
+        ends = [np.sort(path.V)[[0, -1]].tolist()]
+        np.testing.assert_allclose(ends[0], sorted((speed, -0.5 * speed)), atol=1e-9)
+        for draw, along in ((vi.plot.plot_history, 1), (vi.plot.plot_phase_portrait, 0)):
+            ax = draw(run, machine=machine, ax=Figure().subplots(), coordinate=k)
+            stops = [x for x in ax.lines if x.get_label() == "stop"]
+            assert [float(x.get_data()[along][0]) for x in stops] == [place]
+    shown = vi.plot.animate(run, machine, seconds=2.0, fps=10)._frames.positions
+    np.testing.assert_allclose(shown[0].max(), 1.0, atol=0.1)
+    np.testing.assert_allclose(shown[1].min(), -2.0, atol=0.15)
+    with pytest.raises(ValueError, match="`coordinate` must be at most 1"):
+        vi.plot.motion_path(run, machine=machine, coordinate=2)
