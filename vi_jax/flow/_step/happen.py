@@ -26,8 +26,9 @@ from .faults import comes_back
 from .guards import JUMPED
 from .jump import directions, unheld
 
-# Events of one instant that set each other off so often do so for ever: a choice.
-_ROUNDS = 64.0
+# Events of one instant that set each other off for ever happen so often each, by choice, before the
+# lane ends.
+_ROUNDS = 4
 
 
 class _Instant(NamedTuple):
@@ -39,7 +40,6 @@ class _Instant(NamedTuple):
     near: Scalars
     """Of each of those that happen from below, 1 if its guard is at zero too, and it has not
     happened."""
-    rounds: Scalar
 
 
 def happened(
@@ -56,16 +56,20 @@ def happened(
     """
     zero = jnp.zeros_like(arrival.s)
     due_, near_ = (tuple(jnp.where(x, 1.0, zero) for x in y.values()) for y in (due, near))
-    begin = _Instant(arrival, due_, near_, zero)
+    begin = _Instant(arrival, due_, near_)
     if len(due) == 1:
         end = _next(plan, taken, tuple(due), begin)
     else:
-        end = jax.lax.while_loop(
-            lambda x: (sum(x.due, start=zero) > 0) & (x.rounds < _ROUNDS),
-            lambda x: _next(plan, taken, tuple(due), x),
-            begin,
-        )
-        endless = end.rounds >= _ROUNDS
+
+        def turn(x: _Instant, _: None) -> tuple[_Instant, None]:
+            left = sum(x.due, start=zero) > 0
+            return jax.lax.cond(
+                left, lambda x: _next(plan, taken, tuple(due), x), lambda x: x, x
+            ), None
+
+        # Not as many turns as there are to do: that has no transpose.
+        end, _ = jax.lax.scan(turn, begin, None, length=_ROUNDS * len(due))
+        endless = sum(end.due, start=zero) > 0
         end = end._replace(arrival=ended(end.arrival, endless, endless, results.SIMULTANEOUS))
     return end.arrival
 
@@ -154,7 +158,7 @@ def _next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _Instant) -> _In
     last = off.get(section_number(machine))
     if last is not None:
         arrival = arrival._replace(completed=arrival.completed | last)
-    return _Instant(arrival, tuple(due), near, x.rounds + 1)
+    return _Instant(arrival, tuple(due), near)
 
 
 def _listed(
