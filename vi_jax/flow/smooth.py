@@ -1,14 +1,17 @@
 """A machine as one step sees it: in its modes, with the bodies held that rest."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+from jax.extend.core import Jaxpr, Literal
 from jax.lax import stop_gradient
 
 from .._types import Flag, Scalar, Scalars, State
+from ..lanes import called
 from ..machine import AbstractMachine, Coordinate, field_in, held_flow, rubs
 
 
@@ -76,6 +79,40 @@ def exact(machine: AbstractMachine, state: State) -> bool:
     place = machine.coordinates[0].position(state)
     own = any(place is x for x in jtu.tree_leaves(state))
     return own and len(machine.coordinates) == 1
+
+
+# Primitives that are linear in all of their operands together, and in each of them.
+_LINEAR = {
+    "add", "add_any", "broadcast_in_dim", "concatenate", "convert_element_type", "copy", "neg",
+    "reduce_sum", "reshape", "slice", "squeeze", "sub", "transpose",
+}  # fmt: skip
+_BILINEAR = {"dot_general", "mul"}
+
+
+def is_affine(function: Callable[[State], Scalar], state: State) -> bool:
+    """Return whether a function of the state is a sum of its numbers with constant factors, so that
+    it is known as well as they are; found while a step is traced."""
+
+    def affine(jaxpr: Jaxpr, moving: list[bool]) -> list[bool] | None:
+        found = {v for v, moves in zip(jaxpr.invars, moving, strict=True) if moves}
+        for eqn in jaxpr.eqns:
+            moves = [not isinstance(x, Literal) and x in found for x in eqn.invars]
+            if not any(moves):
+                continue
+            name, outs = eqn.primitive.name, [True] * len(eqn.outvars)
+            inner = called(eqn)
+            if inner is not None:
+                outs = affine(inner if isinstance(inner, Jaxpr) else inner.jaxpr, moves)
+            elif name not in _LINEAR and not (name in _BILINEAR and sum(moves) == 1):
+                if name != "div" or moves[1]:
+                    return None
+            if outs is None:
+                return None
+            found |= {v for v, out in zip(eqn.outvars, outs, strict=True) if out}
+        return [not isinstance(x, Literal) and x in found for x in jaxpr.outvars]
+
+    jaxpr = jax.make_jaxpr(function)(state).jaxpr
+    return affine(jaxpr, [True] * len(jaxpr.invars)) is not None
 
 
 def rounding(machine: AbstractMachine, state: State) -> Scalar | float:

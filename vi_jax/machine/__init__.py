@@ -32,6 +32,7 @@ from .events import mode_number as mode_number
 from .events import rubbing_on as rubbing_on
 from .events import rubs as rubs
 from .events import section_number as section_number
+from .events import sides_of as sides_of
 from .events import struck_modes as struck_modes
 from .events import value_of as value_of
 from .friction import DryFriction as DryFriction

@@ -1,5 +1,6 @@
 """Dry friction on a stop: in its impacts, and while a body rests on it."""
 
+import functools
 from typing import ClassVar
 
 import equinox as eqx
@@ -85,12 +86,22 @@ class ContactFriction(AbstractSwitch):
 
         **Arguments:** as every event's, and `around`, the other modes and who rests where.
         """
+        return functools.reduce(jnp.maximum, self.sides(machine, s, state, mode, around=around))
+
+    def sides(self, machine, s, state, mode, *, around: Around | None = None):
+        """The guard for a force forward and for one backward.
+
+        **Arguments:** as `guard`.
+        """
         if around is None or not around.contact:
-            return jnp.full_like(s, -1.0)
+            return (jnp.full_like(s, -1.0),)
         drag, pressing = self._forces(machine, s, state, around, mode)
-        velocity = machine.coordinates[self.along].velocity(state)
-        own = jnp.where(mode == 0, jnp.abs(drag) - self.level * pressing, -mode * velocity)
-        return jnp.where(self._rests(machine, around), own, -1.0)
+        slows = -mode * machine.coordinates[self.along].velocity(state)
+        rests, holds = self._rests(machine, around), self.level * pressing
+        return tuple(
+            jnp.where(rests, jnp.where(mode == 0, way * drag - holds, slows), -1.0)
+            for way in (1.0, -1.0)
+        )
 
     def after(self, machine, s, state, mode, *, around: Around | None = None):
         """Sticking, or slipping the way the force pulls.

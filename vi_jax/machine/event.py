@@ -70,9 +70,20 @@ class AbstractEvent(Shown):
         need not ask for that if its guard is another function after the event."""
         return True
 
+    @property
+    def looked_at_within(self) -> bool:
+        """Whether the guard may be positive for a part of a step only, and has to be evaluated
+        within each one; static. Not where the length of a step is chosen by it already."""
+        return True
+
     @abc.abstractmethod
     def guard(self, *args: Any, **kwargs: Any) -> Scalar:
         """`guard(machine, s, state, *modes)`: what rises through zero at the event."""
+
+    def sides(self, *args: Any, **kwargs: Any) -> tuple[Scalar, ...]:
+        """`sides(machine, s, state, *modes)`: smooth functions of which the greatest is the guard,
+        for a guard with a kink; by default the guard alone."""
+        return (self.guard(*args, **kwargs),)
 
     @abc.abstractmethod
     def after(self, *args: Any, **kwargs: Any) -> tuple[Any, Any]:

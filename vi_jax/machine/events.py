@@ -39,6 +39,17 @@ def guard_of(
     return event.guard(machine, s, state, *modes[own], **more)
 
 
+def sides_of(
+    machine: Machine, number: int, s: Scalar, state: State, modes: Modes, contact: Scalars = ()
+) -> Scalars:
+    """Smooth functions of which the greatest is the guard of one of a machine's events.
+
+    **Arguments:** as `guard_of`.
+    """
+    event, own, more = event_of(machine, number, modes, contact)
+    return tuple(map(jnp.asarray, event.sides(machine, s, state, *modes[own], **more)))
+
+
 def jump_of(machine: Machine, number: int, s: Scalar, state: State, modes: Modes) -> State:
     """The state after one of a machine's events as a smooth function of that before it (see
     `AbstractEvent.jump`).

@@ -82,6 +82,12 @@ class DryFriction(AbstractSwitch):
         excess = jnp.abs(self.force(machine, s, state)) - self.sticking(machine, s, state)
         return jnp.where(mode == 0, excess, -mode * self.velocity(machine, state))
 
+    def sides(self, machine, s, state, mode):
+        """The guard for a force forward and for one backward."""
+        force, holds = self.force(machine, s, state), self.sticking(machine, s, state)
+        slows = -mode * self.velocity(machine, state)
+        return tuple(jnp.where(mode == 0, way * force - holds, slows) for way in (1.0, -1.0))
+
     def after(self, machine, s, state, mode):
         """Sticking, or sliding the way the force pulls."""
         state, force = self.stopped(machine, state), self.force(machine, s, state)

@@ -117,6 +117,11 @@ class SoftStop(Wall, AbstractSwitch):
         body that goes in is that on one that comes out."""
         return self.prestress is not None
 
+    @property
+    def looked_at_within(self) -> bool:
+        """False: steps are short beside a contact (`longest_step`)."""
+        return False
+
     def depth(self, machine: Machine, state: State) -> tuple[Any, Any]:
         """δ and δ' (by time); δ is negative apart from the stop."""
         body = machine.coordinates[self.coordinate]

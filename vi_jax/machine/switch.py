@@ -80,6 +80,17 @@ class Switch(AbstractSwitch):
         up, down = self._rates(machine, s, state, around)
         return jnp.where(mode == 0, jnp.maximum(up, -down), value)
 
+    def sides(self, machine, s, state, mode, *, around: Around | None = None):
+        """The guard; of a motion that slides the two of which it is the greater.
+
+        **Arguments:** as `guard`.
+        """
+        value = -mode * self.function(machine, s, state)
+        if around is None:
+            return (value,)
+        up, down = self._rates(machine, s, state, around)
+        return jnp.where(mode == 0, up, value), jnp.where(mode == 0, -down, value)
+
     def after(self, machine, s, state, mode, *, around: Around | None = None):
         """On the other side, or along the surface.
 

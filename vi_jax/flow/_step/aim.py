@@ -17,7 +17,7 @@ from ..events import quintic, to_turn
 from ..methods import Foreseen
 from ..smooth import exact
 from .guards import Crossing, at_stops, beyond
-from .hidden import force_may_turn, hump, may_turn_twice, rise
+from .hidden import crests, force_may_turn, hump, may_turn_twice
 from .search import Course, Passed, first_event, may_matter
 from .trial import Trial
 
@@ -125,7 +125,8 @@ class _Seen(NamedTuple):
     humps: list[tuple[Flag, Scalar]]
     """Of the guards that hold a mode, where they may have been positive in between."""
     rises: list[tuple[Flag, Scalar]]
-    """Of those that happen from below, likewise, also before what was landed upon."""
+    """Of those that were evaluated at stages, and of the forces on bodies that rest, likewise,
+    also before what was landed upon."""
     twice: Flag
     """A motion may have turned twice."""
 
@@ -180,8 +181,6 @@ def _aimed(plan: Plan, lane: Lane, trial: Trial, seen: _Seen) -> tuple[Flag, Sca
     goal = _by_newton(lane, trial, goal)
     for above, place in reversed(seen.humps):  # of several the first listed
         goal = goal.cut(above & ~(goal.event | landed), place)
-    for above, place in reversed(seen.rises):
-        goal = goal.cut(above & ~goal.event, place)
     nothing_else = trial.good & ~(first.crossed | first.turned | met)
     goal = goal.cut(seen.twice & nothing_else, 0.5 * h)
     for k, path in enumerate(trial.paths):
@@ -197,24 +196,30 @@ def _aimed(plan: Plan, lane: Lane, trial: Trial, seen: _Seen) -> tuple[Flag, Sca
                 length=jnp.where(left, place, goal.length),
                 target=jnp.where(left, to_release(k), goal.target),
             )
+    for above, place in reversed(seen.rises):
+        goal = goal.cut(above & ~goal.event, place)
     return goal.event | goal.before, stop_gradient(goal.length), goal.target
 
 
 def _seen(plan: Plan, lane: Lane, trial: Trial) -> _Seen:
     """What both ends of a tried step say of the events between them."""
     h, good, guards, courses, humps = trial.h, trial.good, [], [], []
-    rises = []
+    sides, below = [], []
     for c in trial.crossings:
         guards.append((c, good & beyond(c), partial(quintic, c.begin, c.end, h)))
         if c.event.holds_mode:
             above, place = hump(c, h)
             humps.append((good & above, place))
-        elif c.within:
-            above, place = rise(c, h)
-            rises.append((good & above, place))
+        for side in c.sides:
+            slack = 0.0 if c.slack is None else c.slack
+            sides.append(side._replace(slack=slack))
+            below.append((side.end.x <= slack) | c.landed)
     exactly, twice = exact(plan.machine, lane.state), jnp.zeros_like(good)
     eps = float(jnp.finfo(h.dtype).eps)
     for k, path in enumerate(trial.paths):
+        if path.pull is not None and path.leaves is not None:
+            sides.append(path.pull)
+            below.append(~path.leaves.left)
         end, twice = path.end, twice | may_turn_twice(lane.direction[k], path, h)
         turned = good & (lane.direction[k] * end.v < 0) & ~path.at_turn
         if not exactly:
@@ -225,6 +230,10 @@ def _seen(plan: Plan, lane: Lane, trial: Trial) -> _Seen:
             moves = jnp.abs(end.v) * h > eps * (1 + jnp.abs(end.x))
             turned = turned & (jnp.abs(to_turn(end)) > now) & moves
         courses.append((turned, partial(quintic, path.begin, end, h)))
+    rises = []
+    if sides:
+        found = crests(sides, trial.seen.shares, h)
+        rises = [(good & x & y, at) for (x, at), y in zip(found, below, strict=True)]
     return _Seen(guards, courses, humps, rises, twice)
 
 

@@ -1,18 +1,20 @@
 """The events of a machine as a step sees them."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-import jax.tree_util as jtu
 from jax.lax import stop_gradient
+from jaxtyping import Array
 
 from ..._types import Flag, Scalar, Scalars, State
 from ...lanes import pin_flag
-from ...machine import AbstractEvent, AbstractMachine, events_of, guard_of, section_number
-from .._lane import Lane, Plan, to_event
+from ...machine import AbstractEvent, AbstractMachine, events_of, guard_of, section_number, sides_of
+from .._lane import Lane, Plan, select, to_event
 from ..events import Rates, guard_rates, landing
 from ..smooth import SmoothMachine, exact
+from .within import Within
 
 # Newton's method on a smooth flow needs two or three aims. Where rounding keeps it from gaining
 # more, a lane that has aimed this often (a choice) accepts a thousand times the tolerance.
@@ -25,8 +27,16 @@ JUMPED = 1e-9
 # The place of a jump within a step is looked for down to this length (in s): a choice.
 _SUDDEN = 1e-12
 
-# Where within a step a guard is looked at, of an event that happens from below.
-WITHIN = (0.25, 0.5, 0.75)
+
+class Side(NamedTuple):
+    """A smooth function at the ends of a step and at its stages."""
+
+    begin: Rates
+    end: Rates
+    within: Array
+    """The value at each stage."""
+    slack: Scalar | float = 0.0
+    """What counts as zero."""
 
 
 class Crossing(NamedTuple):
@@ -56,8 +66,8 @@ class Crossing(NamedTuple):
     """The step was aimed at it and has to be corrected by δ."""
     sudden: Any = None
     """The guard jumped above zero there; its place says nothing of when; `None` where none can."""
-    within: Scalars = ()
-    """Of an event that happens from below, about what g is at `WITHIN`, shares of the step."""
+    sides: tuple[Side, ...] = ()
+    """The smooth functions of which the greatest is g, where they were evaluated at stages."""
 
     @property
     def at_once(self) -> Flag | None:
@@ -72,17 +82,18 @@ class Crossing(NamedTuple):
 
 def crossings(
     plan: Plan, lane: Lane, holding: SmoothMachine, paths: list[Any], there: tuple,
-    ends: tuple[Flag, Flag],
+    ends: tuple[Flag, Flag], seen: Within,
 ) -> tuple[tuple[Crossing, ...], Scalars]:  # fmt: skip
     """The events that a step saw, and `Lane.below` at its end.
 
     **Arguments:** `holding`, the machine as the step saw it; `paths`, what the step saw of each
     coordinate; `there`, s at its end, its length and the state at its end; `ends`, whether it was
-    good, and whether it ends an interval.
+    good, and whether it ends an interval; `seen`, guards at the stages.
     """
     machine, (s1, h, new), (good, last) = plan.machine, there, ends
-    others, below = _others(plan, lane, holding, s1, new)
-    guards = [*at_stops(machine, [(path.begin, path.end) for path in paths]), *others]
+    others, below = _others(plan, lane, holding, (s1, new), seen)
+    stops = at_stops(machine, [(path.begin, path.end) for path in paths])
+    guards = [*(_with_stages(lane, c, seen) for c in stops), *others]
     # The stops of one coordinate and a clock are never met together but on a section, where a step
     # ends; other events can be.
     if plan.others(lane.state) or not exact(machine, lane.state):
@@ -113,36 +124,59 @@ def at_stops(machine: AbstractMachine, ends: list[tuple[Rates, Rates]]) -> list[
     return found
 
 
+def _with_stages(lane: Lane, c: Crossing, seen: Within) -> Crossing:
+    """A stop with its distance at the stages, where that was evaluated; at -1 while its body
+    rests on it."""
+    if c.number not in seen.events:
+        return c
+    begin, end, (values,) = c.begin, c.end, seen.events[c.number]
+    if lane.contact is not None and c.coordinate is not None:
+        moves = lane.contact[c.coordinate] == 0
+        begin, end = _if_armed(moves, begin), _if_armed(moves, end)
+    return c._replace(sides=(Side(begin, end, values),))
+
+
 def _others(
-    plan: Plan, lane: Lane, moving: SmoothMachine, s1: Scalar, new: State
+    plan: Plan, lane: Lane, moving: SmoothMachine, there: tuple[Scalar, State], seen: Within
 ) -> tuple[list[Crossing], Scalars]:
     """The events besides stops as a step sees them, with that of a clock in the state, which counts
     the cycles; and `Lane.below` at the step's end.
 
-    **Arguments:** `moving`, the machine as the step saw it; `s1` and `new`, s and the state at its
-    end.
+    **Arguments:** `moving`, the machine as the step saw it; `there`, s and the state at its end;
+    `seen`, guards at the stages.
     """
     machine, found, below = plan.machine, [], []
 
     def ends(guard: Callable[[Scalar, State], Scalar]) -> tuple[Rates, Rates]:
         begin = guard_rates(moving.field, guard, lane.s, lane.state)
-        return begin, guard_rates(moving.field, guard, s1, new)
+        return begin, guard_rates(moving.field, guard, *there)
 
     around = lane.modes, lane.contact or ()
-    places = ()
-    if plan.from_below(lane.state):
-        places = _within(moving, (lane.s, lane.state), (s1, new))
     for number in plan.others(lane.state):
-        event = events_of(machine)[number]
-        begin, end = ends(lambda s, x, i=number: jnp.asarray(guard_of(machine, i, s, x, *around)))
-        scale, within = 1 + stop_gradient(jnp.abs(end.v)), ()
+        event, values = events_of(machine)[number], seen.events.get(number, (jnp.zeros(0),))
+        if len(values) == 1:
+            both = [ends(lambda s, x, i=number: jnp.asarray(guard_of(machine, i, s, x, *around)))]
+        else:
+            both = [
+                ends(lambda s, x, i=number, j=j: sides_of(machine, i, s, x, *around)[j])
+                for j in range(len(values))
+            ]
+        sides = [Side(*x, y) for x, y in zip(both, values, strict=True)]
+        scale = 1 + stop_gradient(functools.reduce(jnp.maximum, [abs(x.end.v) for x in sides]))
         if event.from_below:
-            within = [guard_of(machine, number, *place, *around) for place in places]
-            armed, risen = _from_below(lane.below[len(below)], begin, end, scale)
-            begin, end = _if_armed(armed, begin), _if_armed(armed, end)
-            within = tuple(jnp.where(armed, x, -1.0) for x in within)
+            (side,) = sides
+            armed, risen = _from_below(lane.below[len(below)], side.begin, side.end, scale)
+            begin, end = _if_armed(armed, side.begin), _if_armed(armed, side.end)
+            sides = [Side(begin, end, jnp.where(armed, side.within, -1.0))]
             below.append(risen)
-        found.append(Crossing(event, number, begin, end, scale, within=within))
+        if event.holds_mode:
+            sides = [side._replace(begin=_falling(side.begin, scale)) for side in sides]
+        begin, end = sides[0].begin, sides[0].end
+        for side in sides[1:]:  # that which is the guard where the step ends
+            greater = stop_gradient(side.end.x > end.x)
+            begin, end = select(greater, (side.begin, side.end), (begin, end))
+        crossing = Crossing(event, number, begin, end, scale)
+        found.append(crossing._replace(sides=tuple(sides)) if number in seen.events else crossing)
     if machine.clock(lane.state) is not None:
         number, bound = section_number(machine), plan.end(lane.part)
         begin, end = ends(lambda _, x: jnp.asarray(machine.clock(x)) - bound)
@@ -150,23 +184,17 @@ def _others(
     return found, tuple(below)
 
 
-def _within(
-    moving: SmoothMachine, begin: tuple[Scalar, State], end: tuple[Scalar, State]
-) -> list[tuple[Scalar, State]]:
-    """About s and the state at each of `WITHIN` in a step: the cubic through both ends."""
-    (s0, x0), (s1, x1) = begin, end
-    h, rates0, rates1 = s1 - s0, moving.field(s0, x0), moving.field(s1, x1)
+def _falling(begin: Rates, scale: Scalar) -> Rates:
+    """The rates of a guard where a step begins, without a rise that is rounding's: behind an event
+    that has just been landed upon the guard may be zero with its slope, as the velocity of a body
+    that begins to slip, and it is the second derivative by which it falls.
 
-    def at(share: float) -> tuple[Scalar, State]:
-        left = 1 - share
-        late, early = share * share * (1 + 2 * left), share * left * left
-        state = jtu.tree_map(
-            lambda a, b, va, vb: a + late * (b - a) + h * (early * va - share * share * left * vb),
-            x0, x1, rates0, rates1,
-        )  # fmt: skip
-        return stop_gradient((s0 + share * h, state))
-
-    return [at(share) for share in WITHIN]
+    **Arguments:** `scale`, of the guard.
+    """
+    x, v, a = stop_gradient(begin)
+    near = jnp.abs(x) <= 4 * float(jnp.finfo(x.dtype).eps) * scale
+    risen = near & (v > 0) & (2 * v <= -_landing_tolerance(x) * a)
+    return begin._replace(v=jnp.where(risen, 0.0, begin.v))
 
 
 def _from_below(below: Scalar, begin: Rates, end: Rates, scale: Scalar) -> tuple[Flag, Scalar]:

@@ -1,23 +1,26 @@
 """What a step may have met twice, so that its ends do not show it: bounds by their tangents."""
 
-import jax.numpy as jnp
-from jax.lax import stop_gradient
+from functools import partial
 
-from ..._types import Flag, Scalar
-from ...machine import horner
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jax.lax import stop_gradient
+from jaxtyping import Array
+
+from ..._types import Flag, Scalar, Scalars
 from .._lane import Lane
-from ..events import quintic
-from .guards import WITHIN, Crossing
+from .guards import Crossing, Side
 from .trial import Path
 
 # A hump of a guard this close to an end of a step (as a share of it) is seen from there: a choice.
 _BRIEF = 1e-3
 
-# A guard's quintic is looked at where it has gone through so many parts of the step, and doubted by
-# so many times what it is off in between. Choices, measured on balls that fly over ramps with up to
-# five waves in a step (`tests/flow/test_hidden_resets.py`).
-_PARTS = 8
-_DOUBT = 4.0
+# The polynomial of a guard is evaluated where so many parts of the step are over, and corrected by
+# stages that are no closer to its ends than this share. Choices.
+_PARTS = 16
+_EDGE = 0.1
 
 # Steps shorter than this (in s) are not shortened any more.
 _SHORTEST = 1e-6
@@ -53,30 +56,103 @@ def hump(c: Crossing, h: Scalar) -> tuple[Flag, Scalar]:
     return seen | dips, jnp.where(dips, jnp.maximum(1.5 * least, brief), place)
 
 
-def rise(c: Crossing, h: Scalar) -> tuple[Flag, Scalar]:
-    """Whether a guard of any shape may have been positive before the end of a step that it does not
-    end beyond, or that landed on it, and where first: by the quintic through the step's ends, and
-    by how far the guard is off it at `WITHIN`, which says how little the quintic knows.
+def crests(sides: list[Side], shares: tuple[float, ...], h: Scalar) -> list[tuple[Flag, Scalar]]:
+    """Return of functions that end a step below zero whether each may have been positive within
+    it, and the first place where.
 
-    Looked at where the guard falls from its surface as well, as behind a reset.
+    **Arguments:** `sides`, the functions; `shares`, the places of the stages; `h`, the length of
+    the step.
     """
-    begin, end, within = stop_gradient((c.begin, c.end, c.within))
-    curve = quintic(begin, end, h)
-    unknown = jnp.zeros_like(end.x)
-    for share, value in zip(WITHIN, within, strict=True):
-        off = jnp.abs(value - horner(curve, jnp.asarray(share)))
-        unknown = jnp.maximum(unknown, _DOUBT / _bump(share) * off)
-    above, place = jnp.zeros_like(end.x, bool), h
-    for n in range(_PARTS - 1, 0, -1):
-        share = n / _PARTS
-        over = horner(curve, jnp.asarray(share)) + _bump(share) * unknown > 0
-        above, place = above | over, jnp.where(over, share * h, place)
-    return above & ((end.x < 0) | c.landed) & (h > _SHORTEST), place
+    ends = [stop_gradient((x.begin.x, x.begin.v, x.end.x, x.end.v)) for x in sides]
+    values = [stop_gradient(x.within) for x in sides]
+    slack = [jnp.asarray(x.slack, h.dtype) for x in sides]
+    find = partial(_crest, shares, h)
+    stacked = jtu.tree_map(lambda *x: jnp.stack(x), *zip(ends, values, slack, strict=True))
+    doubtful = jnp.zeros_like(h, bool)
+    for (x0, _, x1, _), inner, zero in zip(ends, values, slack, strict=True):
+        greatest = jnp.maximum(jnp.maximum(x0, x1), jnp.max(inner))
+        least = jnp.minimum(jnp.minimum(x0, x1), jnp.min(inner))
+        doubtful = doubtful | (2 * greatest - least > zero)
+    none = jnp.zeros(len(sides), bool), jnp.zeros(len(sides), h.dtype)
+    above, place = jax.lax.cond(doubtful, lambda x: jax.vmap(find)(*x), lambda _: none, stacked)
+    return [(above[n], place[n]) for n in range(len(sides))]
 
 
-def _bump(share: float) -> float:
-    """The shape of a Hermite interpolant's error, of third order at both ends; 1 in the middle."""
-    return (4 * share * (1 - share)) ** 3
+def _crest(
+    shares: tuple[float, ...], h: Scalar, ends: Scalars, values: Array, slack: Scalar
+) -> tuple[Flag, Scalar]:
+    """As `crests` for one function.
+
+    The function is taken for the cubic through both ends of the step, plus what it is off at the
+    stages: that is divided by the shape of the cubic's error and interpolated linearly. By how much
+    it differs from stage to stage is the margin of doubt.
+
+    **Arguments:** `ends`, value and slope where the step begins and ends; `values`, at the stages;
+    `slack`, what counts as zero.
+    """
+    x0, v0, x1, v1 = ends
+    over, rises, over_end, falls = x0 - slack, h * v0, x1 - slack, h * v1
+    grid, inner = np.arange(_PARTS + 1) / _PARTS, _inner(shares)
+
+    def cubic(theta: np.ndarray) -> Array:
+        left = 1 - theta
+        late, early = theta * theta * (1 + 2 * left), left * left * (1 + 2 * theta)
+        slopes = rises * (theta * left * left) - falls * (theta * theta * left)
+        return over * early + over_end * late + slopes
+
+    heights = cubic(grid)
+    if inner:
+        places = np.asarray([shares[n] for n in inner])
+        off = (values[np.asarray(inner)] - slack - cubic(places)) / _bump(places)
+        left = np.clip(np.searchsorted(places, grid) - 1, 0, max(len(inner) - 2, 0))
+        right = np.minimum(left + 1, len(inner) - 1)
+        share = np.interp(grid, places, np.arange(len(inner))) - left
+        doubt = jnp.max(jnp.abs(off[1:] - off[:-1])) if len(inner) > 1 else jnp.abs(off[0])
+        heights = heights + _bump(grid) * (off[left] + share * (off[right] - off[left]) + doubt)
+    above, place = _first_top(heights, rises / _PARTS, falls / _PARTS)
+    first = jnp.min(jnp.where(values > slack, np.asarray(shares), 2.0))
+    place = jnp.maximum(jnp.minimum(place, first), _BRIEF)
+    return (above | (first < 1)) & (h > _SHORTEST), place * h
+
+
+def _inner(shares: tuple[float, ...]) -> list[int]:
+    """Which stages are apart from the ends of the step and from each other, in their order."""
+    found: dict[float, int] = {}
+    for n, share in enumerate(shares):
+        if _EDGE <= share <= 1 - _EDGE:
+            found.setdefault(round(share, 6), n)
+    return [found[share] for share in sorted(found)]
+
+
+def _first_top(heights: Array, rise: Scalar, fall: Scalar) -> tuple[Flag, Scalar]:
+    """Return whether a curve is positive between its ends, and where first, as a share of the way:
+    by parabolas through its heights at equal distances, and through its slopes at the ends.
+
+    **Arguments:** `heights`, ends included; `rise` and `fall`, the slopes at both ends, by that
+    distance.
+    """
+    parts = heights.size - 1
+    before, here, after = heights[:-2], heights[1:-1], heights[2:]
+    bend, tilt = 2 * here - before - after, after - before
+    top = (here >= before) & (here >= after) & (bend > 0)
+    found = (here > 0) | top & (tilt * tilt > -8 * bend * here)
+    at = np.arange(1, parts) + jnp.where(top, 0.5 * tilt / jnp.where(top, bend, 1.0), 0.0)
+    place = jnp.min(jnp.where(found, at, parts + 1.0))
+
+    def beside(height: Scalar, slope: Scalar, next_one: Scalar) -> Scalar:
+        bend = height + slope - next_one
+        found = (slope > 0) & (slope < 2 * bend) & (slope * slope > -4 * bend * height)
+        return jnp.where(found, slope / jnp.where(found, 2 * bend, 1.0), parts + 1.0)
+
+    place = jnp.minimum(place, beside(heights[0], rise, heights[1]))
+    back = beside(heights[-1], -fall, heights[-2])
+    place = jnp.minimum(place, jnp.where(back < parts, parts - back, parts + 1.0))
+    return place < parts, place / parts
+
+
+def _bump(share: np.ndarray) -> np.ndarray:
+    """The shape of a cubic Hermite interpolant's error; 1 in the middle."""
+    return (4 * share * (1 - share)) ** 2
 
 
 def may_turn_twice(direction: Scalar, path: Path, h: Scalar) -> Flag:

@@ -14,7 +14,8 @@ from ..beside import Beside, elapsed
 from ..events import Rates, force_rate, rates, turns_within
 from ..methods import Foreseen
 from ..smooth import SmoothMachine, exact, holding
-from .guards import Crossing, crossings, leniency, turn_tolerance
+from .guards import Crossing, Side, crossings, leniency, turn_tolerance
+from .within import Within, apart, at_rest, foreseen_stages, guards_error, looks_within, within
 
 # A window of force shorter than this share of the longest step moves the body by its third power,
 # 1e-9 of what a whole step does.
@@ -33,6 +34,8 @@ class Path(NamedTuple):
     surge: tuple[Scalar, Scalar, Scalar] | None
     """How fast the force changes at both ends, and the shortest step that is cut at a turn of the
     force; absent where the body cannot rest."""
+    pull: Side | None
+    """The force away from the stop that it rests on, if it can rest."""
 
 
 class End(NamedTuple):
@@ -53,6 +56,8 @@ class Seen(NamedTuple):
     """Of each coordinate; none where nothing asks for it."""
     below: Scalars
     """As in `Lane`, at the step's end."""
+    shares: tuple[float, ...]
+    """The places within the step at which guards were evaluated, as shares of it; static."""
 
 
 class Trial(NamedTuple):
@@ -132,8 +137,14 @@ def attempt(
     h = s1 - lane.s
 
     beside = timing(plan, lane)
+    stages, looks = [], looks_within(plan, lane.state)
     if motion is not None:
         (new, beside), error = motion.at(h), jnp.zeros_like(h)
+        stages = foreseen_stages(motion, lane.s, h) if looks else stages
+    elif looks:
+        there = lane.s, s1, lane.state
+        new, beside, error, stages = method.step_with_stages(smooth, *there, beside)
+        stages = stages if method.adaptive else apart(stages)
     else:
         new, beside, error = method.step(smooth, lane.s, s1, lane.state, beside)
     time = None if lane.record.time is None else elapsed(lane.record.time, beside, h)
@@ -141,6 +152,11 @@ def attempt(
         rests = lane.contact[0] > 0
         new = jtu.tree_map(lambda a, b: jnp.where(rests, a, b), lane.state, new)
     new = pin(new)
+    bodies = range(len(machine.coordinates))
+    alone = tuple(holding(machine, lane.modes, lane.contact, but=k) for k in bodies)
+    seen = within(plan, lane, alone, stages)
+    of_guards = guards_error(plan, seen, stages, h, jnp.asarray(limit))
+    error = error if of_guards is None else jnp.maximum(error, of_guards)
     good = jnp.isfinite(total(new, jnp.zeros_like(h)))
     alive = machine.alive(new)
     if alive is not None:
@@ -150,14 +166,14 @@ def attempt(
         good = good & (error <= 1)
     good = pin_flag(good, h)
 
-    bodies = range(len(machine.coordinates))
-    alone = tuple(holding(machine, lane.modes, lane.contact, but=k) for k in bodies)
+    inner = [n for n, stage in enumerate(stages) if 0 < stage.share < 1]
+    seen, shares = seen.only(inner), tuple(stages[n].share for n in inner)
     paths = []
     if plan.motion or machine.stops:
         for k, one in enumerate(alone):
-            paths.append(_path(plan, lane, k, one, smooth, (s1, new, h, limit), good))
-    seen, below = crossings(plan, lane, smooth, paths, (s1, h, new), (good, last))
-    end, found = End(s1, new, time), Seen(seen, tuple(paths), below)
+            paths.append(_path(plan, lane, k, one, smooth, (s1, new, h, limit), good, seen))
+    met, below = crossings(plan, lane, smooth, paths, (s1, h, new), (good, last), seen)
+    end, found = End(s1, new, time), Seen(met, tuple(paths), below, shares)
     return Trial(h, end, error, good, last, found, smooth, alone, nothing)
 
 
@@ -182,12 +198,13 @@ def _path(
     smooth: SmoothMachine,
     there: tuple,
     good: Flag,
+    seen: Within,
 ) -> Path:
     """What a step shows of coordinate number k.
 
     **Arguments:** `free`, the machine with this body free and the others held that rest; `smooth`,
     the machine that the step was taken with; `there`, s and state at the step's end, its length and
-    the longest length; `good`, whether the step was.
+    the longest length; `good`, whether the step was; `seen`, guards at the stages.
     """
     s1, new, h, limit = there
     position = plan.machine.coordinates[k].position
@@ -209,7 +226,7 @@ def _path(
         # Such an event may be a turning point as well.
         aimed = aimed | (lane.target >= to_event(len(plan.machine.stops)))
     at_turn = good & aimed & met
-    leaves, surge = None, None
+    leaves, surge, pull = None, None, None
     limited = any(stop.coordinate == k for stop in plan.machine.stops)
     if lane.contact is not None and limited:
         leaves = release(lane, k, plan.machine.stops, begin, end, good, h)
@@ -218,4 +235,12 @@ def _path(
             force_rate(free, position, smooth, s1, new),
             stop_gradient(_SLIVER * limit + jnp.zeros_like(h)),
         )
-    return Path(begin, end, at_turn, leaves, surge)
+        if k in seen.forces:
+            rests, away = at_rest(plan, lane, k)
+            first, last = (
+                Rates(jnp.where(rests, away * r.a, -1.0), jnp.where(rests, away * rate, 0.0), r.a)
+                for r, rate in ((begin, surge[0]), (end, surge[1]))
+            )
+            slack = 64 * float(jnp.finfo(h.dtype).eps) * jnp.max(jnp.abs(seen.forces[k]))
+            pull = Side(first, last, seen.forces[k], slack)
+    return Path(begin, end, at_turn, leaves, surge, pull)

@@ -2,6 +2,7 @@
 
 from .base import AbstractMethod as AbstractMethod
 from .base import Foreseen as Foreseen
+from .base import Stage as Stage
 from .choice import MethodLike as MethodLike
 from .choice import chosen as chosen
 from .choice import preset as preset

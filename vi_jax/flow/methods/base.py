@@ -3,16 +3,20 @@
 import abc
 from collections.abc import Callable
 from math import pi
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
+from jaxtyping import Array
 
 from ..._types import Scalar, State
 from ...machine import AbstractMachine
 from ..beside import Beside
 from ..smooth import SmoothMachine
 from ._series import Along
+
+# Where guards are evaluated within a step of a method without stages, as shares of it.
+QUARTERS = (0.25, 0.5, 0.75)
 
 
 @runtime_checkable
@@ -30,6 +34,17 @@ class Foreseen(Protocol):
     def reach(self, limit: Scalar) -> Scalar:
         """How far it is known well enough, up to this limit."""
         ...
+
+
+class Stage(NamedTuple):
+    """A place within a step at which its method knows the state, or nearly."""
+
+    share: float
+    """Of the step; static."""
+    s: Scalar
+    state: State
+    weight: float = 0.0
+    """Of the stage in the error estimate of the step; static, 0 of a method that has none."""
 
 
 class AbstractMethod(eqx.Module):
@@ -96,6 +111,35 @@ class AbstractMethod(eqx.Module):
         **Arguments:** `smooth`, the machine in its modes; `beside`, `None` unless averages, or the
         elapsed time of a machine with a `pace`, are asked for; its rate is `rate_beside`.
         """
+
+    def step_with_stages(
+        self, smooth: SmoothMachine, s0: Scalar, s1: Scalar, state: State, beside: Beside | None
+    ) -> tuple[State, Beside | None, Scalar, list[Stage]]:
+        """Return what `step` does, and the stages of the step: states within it, at which guards
+        are evaluated that its ends do not resolve. By default they are steps to three places.
+
+        **Arguments:** as `step`.
+        """
+        new, beside, error = self.step(smooth, s0, s1, state, beside)
+        if not self.holds(smooth.machine):
+            return new, beside, error, []
+        stages = []
+        for share in QUARTERS:
+            s = s0 + share * (s1 - s0)
+            stages.append(Stage(share, s, self.step(smooth, s0, s, state, None)[0]))
+        return new, beside, error, stages
+
+    def guard_error(
+        self, stages: list[Stage], values: Array, h: Scalar, longest: Scalar, *, acts: bool
+    ) -> Scalar | None:
+        """Return the error of the integral of a guard over a step, relative to the tolerance, or
+        `None` of a method that estimates none.
+
+        **Arguments:** `values`, the guard at each of the `stages`; `h`, the length of the step;
+        `longest`, that of the longest one; `acts`, whether the guard is a force on a body that is
+        held.
+        """
+        return None
 
     def foresee(
         self, smooth: SmoothMachine, s: Scalar, state: State, beside: Beside | None

@@ -6,6 +6,7 @@ import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from ._implicit import implicit_stages, weighted
@@ -69,12 +70,23 @@ class Unrolled(diffrax.AbstractSolver):
 
         **Returns:** as `diffrax`'s `step`.
         """
+        y1, error, stages, _ = self.step_with_stages(terms, t0, t1, y0, args)
+        k = jtu.tree_map(lambda *leaves: jnp.stack(leaves), *stages)
+        return y1, error, {"y0": y0, "y1": y1, "k": k}, None, diffrax.RESULTS.successful
+
+    def step_with_stages(self, terms, t0, t1, y0, args):
+        """Return the end of a step over [t0, t1], its error, the increment of each stage, and share
+        of the step, t, y and weight in the error of each.
+
+        **Arguments:** as `step`.
+        """
         tableau = _tableau(self.solver)
         control = terms.contr(t0, t1)
         if self.implicit:
             return self._implicit(terms, t0, t1, y0, args, control)
         # The length comes last: once for each sum of slopes, where it is part of the addition.
         slopes, y1 = [terms.vf(t0, y0, args)], None
+        places = [(0.0, t0, y0)]
 
         def reached(weights):
             return jtu.tree_map(jnp.add, y0, terms.prod(weighted(weights, slopes), control))
@@ -82,13 +94,13 @@ class Unrolled(diffrax.AbstractSolver):
         for a, c in zip(tableau.a_lower, tableau.c, strict=True):
             y1 = reached(a)
             t = t1 if c == 1 else t0 + float(c) * (t1 - t0)
+            places.append((float(c), t, y1))
             slopes.append(terms.vf(t, y1, args))
         if not tableau.ssal or y1 is None:
             y1 = reached(tableau.b_sol)
         error = terms.prod(weighted(tableau.b_error, slopes), control)
         stages = [terms.prod(slope, control) for slope in slopes]
-        k = jtu.tree_map(lambda *leaves: jnp.stack(leaves), *stages)
-        return y1, error, {"y0": y0, "y1": y1, "k": k}, None, diffrax.RESULTS.successful
+        return y1, error, stages, _with_weights(tableau, places)
 
     def _implicit(self, terms, t0, t1, y0, args, control):
         """The step of an implicit solver; its error is infinite where a stage was not solved.
@@ -106,8 +118,17 @@ class Unrolled(diffrax.AbstractSolver):
         stages = [unravel(control * k) for k in stages]
         error = jtu.tree_map(lambda e: jnp.abs(e) + left, weighted(tableau.b_error, stages))
         y1 = weighted(tableau.b_sol, stages, y0)
-        k = jtu.tree_map(lambda *leaves: jnp.stack(leaves), *stages)
-        return y1, error, {"y0": y0, "y1": y1, "k": k}, None, diffrax.RESULTS.successful
+        assert tableau.a_diagonal is not None
+        diagonal, places = tableau.a_diagonal[-1], [(0.0, t0, y0)]
+        for n, (a, c) in enumerate(zip(tableau.a_lower, tableau.c, strict=True), start=2):
+            there = weighted(np.append(a, diagonal), stages[:n], y0)
+            places.append((float(c), t0 + float(c) * (t1 - t0), there))
+        return y1, error, stages, _with_weights(tableau, places)
+
+
+def _with_weights(tableau: diffrax.ButcherTableau, places: list[tuple]) -> list[tuple]:
+    """The stages with their weights in the error."""
+    return [(*x, float(b)) for x, b in zip(places, tableau.b_error, strict=True)]
 
 
 def _tableau(solver: Any) -> diffrax.ButcherTableau:

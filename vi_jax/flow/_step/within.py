@@ -1,0 +1,147 @@
+"""What the stages of a step show of guards that its ends do not resolve.
+
+The error of a step is that of its state. A guard that is another function of the state and of `s`
+is no part of it: the force that holds a body at rest, the pull on a body that sticks, the distance
+from a curved stop, a threshold that moves. These guards are evaluated at the stages as well. Their
+integral over the step counts in its error, and `hidden.crest` tells where they may be positive.
+"""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jax.lax import stop_gradient
+from jaxtyping import Array
+
+from ..._types import Flag, Scalar, State
+from ...machine import AbstractMachine, events_of, sides_of
+from .._lane import Lane, Plan, to_event
+from ..events import rates
+from ..methods import Foreseen, Stage
+from ..smooth import SmoothMachine, exact, is_affine
+
+# Of a motion known beforehand, where guards are evaluated within a step, as shares of it.
+_SHARES = tuple(n / 8 for n in range(1, 8))
+
+# Stages that are closer to each other than this share of a step show the same. A choice.
+_APART = 0.08
+
+
+class Within(NamedTuple):
+    """Guards at the stages of a step: of each an array with a value for each stage."""
+
+    forces: dict[int, Array]
+    """By coordinate, the force that pulls a body at rest away from its stop; negative while it is
+    pressed on, -1 where it does not rest."""
+    events: dict[int, tuple[Array, ...]]
+    """By event, the values of each side of its guard (see `AbstractEvent.sides`)."""
+
+    def only(self, places: list[int]) -> "Within":
+        """The values at some of the stages."""
+        return jtu.tree_map(lambda values: values[np.asarray(places)], self)
+
+
+def looks_within(plan: Plan, state: State) -> bool:
+    """Whether there are guards to be evaluated at stages; static."""
+    return plan.rests or bool(events_looked_at(plan, state))
+
+
+def events_looked_at(plan: Plan, state: State) -> list[int]:
+    """The numbers of the events whose guards are evaluated at stages: not those of stops on
+    coordinates that are known as well as the state."""
+    machine, events, stops = plan.machine, events_of(plan.machine), []
+    if not exact(machine, state):
+        known = [is_affine(x.position, state) for x in machine.coordinates]
+        stops = [i for i, stop in enumerate(machine.stops) if not known[stop.coordinate]]
+    others = [number for number in plan.others(state) if events[number].looked_at_within]
+    return [*stops, *others]
+
+
+def foreseen_stages(motion: Foreseen, s: Scalar, h: Scalar) -> list[Stage]:
+    """Places within a step of a motion that is known beforehand."""
+    return [Stage(share, s + share * h, motion.at(share * h)[0]) for share in _SHARES]
+
+
+def guards_error(
+    plan: Plan, seen: Within, stages: list[Stage], h: Scalar, longest: Scalar
+) -> Scalar | None:
+    """Return the largest error of the guards at the stages of a step, relative to the tolerance;
+    `None` without guards, or of a method that estimates none."""
+    events = events_of(plan.machine)
+    guards = [(x, True) for x in seen.forces.values()]
+    for number, sides in seen.events.items():
+        guards += [(x, events[number].holds_mode) for x in sides]
+    errors = [plan.method.guard_error(stages, x, h, longest, acts=acts) for x, acts in guards]
+    known = [error for error in errors if error is not None]
+    return functools.reduce(jnp.maximum, known) if known else None
+
+
+def apart(stages: list[Stage]) -> list[Stage]:
+    """Return those stages within a step that are apart from each other."""
+    found: list[Stage] = []
+    for stage in sorted(stages, key=lambda x: x.share):
+        if 0 < stage.share < 1 and (not found or stage.share - found[-1].share >= _APART):
+            found.append(stage)
+    return found
+
+
+def within(plan: Plan, lane: Lane, alone: tuple[SmoothMachine, ...], stages: list[Stage]) -> Within:
+    """Return the guards at the stages of a step.
+
+    **Arguments:** `alone`, of each coordinate the machine with the other bodies held that rest.
+    """
+    if not stages:
+        return Within({}, {})
+    machine, around = plan.machine, (lane.modes, lane.contact or ())
+    limited = sorted({stop.coordinate for stop in machine.stops}) if plan.rests else []
+    looked_at = events_looked_at(plan, lane.state)
+
+    def guards(place):
+        s, state = place
+        forces, events = {}, {}
+        for k in limited:
+            rests, away = at_rest(plan, lane, k)
+            force = rates(alone[k].field, machine.coordinates[k].position, s, state).a
+            forces[k] = jnp.where(rests, away * force, -1.0)
+        for number in looked_at:
+            if number < len(machine.stops):
+                events[number] = (_distance(machine, lane, number, state),)
+            else:
+                events[number] = sides_of(machine, number, s, state, *around)
+        return forces, events
+
+    places = stop_gradient([(x.s, x.state) for x in stages])
+    places = jtu.tree_map(lambda *x: jnp.stack(x), *places)
+
+    # A loop, not written out: it is compiled once for all stages.
+    def at_each(places):
+        return jax.lax.scan(lambda c, x: (c, stop_gradient(guards(x))), None, places)[1]
+
+    if looked_at:
+        return Within(*at_each(places))
+    assert lane.contact is not None
+    none = {k: jnp.full(len(stages), -1.0, lane.s.dtype) for k in limited}
+    resting = functools.reduce(jnp.logical_or, [lane.contact[k] > 0 for k in limited])
+    return Within(*jax.lax.cond(resting, at_each, lambda _: (none, {}), places))
+
+
+def at_rest(plan: Plan, lane: Lane, k: int) -> tuple[Flag, Scalar]:
+    """Whether coordinate number k rests on a stop, and the sign of the direction away from it."""
+    assert lane.contact is not None
+    rests, away = lane.contact[k] > 0, jnp.zeros_like(lane.s)
+    for i, stop in enumerate(plan.machine.stops):
+        if stop.coordinate == k:
+            away = jnp.where(lane.contact[k] == to_event(i), -float(stop.sign), away)
+    return rests, away
+
+
+def _distance(machine: AbstractMachine, lane: Lane, number: int, state: State) -> Scalar:
+    """How far a coordinate is beyond one of its stops; -1 of one that rests."""
+    stop = machine.stops[number]
+    beyond = stop.beyond(machine.coordinates[stop.coordinate].position(state))
+    if lane.contact is None:
+        return beyond
+    return jnp.where(lane.contact[stop.coordinate] > 0, -1.0, beyond)
