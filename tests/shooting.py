@@ -1,9 +1,7 @@
-"""A shooting code without this package: fixed points of a map, their multipliers, and where
-something becomes zero along them."""
+"""Shooting without this package: flights to events, fixed points of a map and its derivative."""
 
 import numpy as np
 from scipy.integrate import solve_ivp
-from scipy.optimize import newton
 
 
 def flown(field, s, x, end, guards, noted=None):
@@ -45,18 +43,3 @@ def fixed_point(function, x, h=1e-4):
         if np.abs(lacks).max() < 3e-12:
             return x, derivative(function, x, h)
     raise ArithmeticError("no fixed point")
-
-
-def zero_along(mapped, condition, x, near, width=1e-6):
-    """The parameter near `near` at which `condition(parameter, x, matrix)` of the fixed point of
-    `mapped(parameter, x)` is zero, by the secant method."""
-
-    def value(parameter):
-        return condition(parameter, *fixed_point(lambda x: mapped(parameter, x), x))
-
-    return newton(value, near - width, x1=near + width, tol=1e-12)
-
-
-def doubling(parameter, x, matrix):
-    """Zero where a multiplier is -1."""
-    return np.linalg.det(matrix + np.eye(len(matrix)))
