@@ -30,10 +30,21 @@ def settled(scene, cycles=40):
 
 
 @pytest.fixture(scope="module")
-def branch():
-    scene = scene_at(0.7)
-    orbit = vi.find_orbit(scene, settled(scene), impact_log=32, throw=True)
+def orbit():
+    return vi.find_orbit(scene_at(0.7), settled(scene_at(0.7)), impact_log=32, throw=True)
+
+
+@pytest.fixture(scope="module")
+def branch(orbit):
     return vi.continue_orbit(orbit, parameter=ZETA, bounds=(0.6, 0.8))
+
+
+def test_a_motion_says_that_it_rests(orbit):
+    """And one that never leaves its stop."""
+    assert int(orbit.rests) == 1 and "impacts and 1 rest on a stop, stable" in str(orbit)
+    pressed = scene_at(0.7, gap=-3.0)
+    held = vi.find_orbit(pressed, pressed.start(Y=-3.0), impact_log=32)
+    assert int(held.rests) == 0 and "0 impacts and rest on a stop, stable" in str(held)
 
 
 def rate(zeta, clock, y, v):
@@ -71,27 +82,30 @@ def test_motions_of_the_branch_are_flights_from_release(branch):
         np.testing.assert_allclose(branch.multipliers[i], 0, atol=1e-12)
 
 
-def test_a_motion_says_that_it_rests(branch):
-    """As found and as a point of a branch; and one that never leaves its stop."""
+@pytest.mark.slow
+def test_a_branch_says_that_its_motions_rest(branch):
     point = branch.orbit(0)
-    found = vi.find_orbit(point.machine, point.state, impact_log=32)
-    for orbit in (point, found):
-        assert int(orbit.rests) == 1 and "impacts and 1 rest on a stop, stable" in str(orbit)
-    pressed = scene_at(0.7, gap=-3.0)
-    orbit = vi.find_orbit(pressed, pressed.start(Y=-3.0), impact_log=32)
-    assert int(orbit.rests) == 0 and "0 impacts and rest on a stop, stable" in str(orbit)
+    again = vi.find_orbit(point.machine, point, impact_log=32, throw=True)
+    for motion in (point, again):
+        assert int(motion.rests) == 1 and "impacts and 1 rest on a stop, stable" in str(motion)
+    assert int(point.impacts) == branch.impacts[0] == len(point.impact_speed)
+    np.testing.assert_allclose(point.impact_phase, again.impact_phase, atol=1e-8)
+    np.testing.assert_allclose(point.impact_speed, again.impact_speed, atol=1e-8)
+    assert "rest on a stop" in str(branch)
     drawn, *_ = vi.plot_branch(branch).get_legend().get_texts()
     assert drawn.get_text() == "2π, rest on a stop"
-
-
-LOST = [
-    (0.1, 0.6, 0.2, (0.89, 0.92)), (0.3, GAP, 0.05, (0.7, 0.8)), (0.5, 0.0, 0.2, (0.76, 0.8)),
-    (0.7, 0.3, 0.2, (0.46, 0.5)), (0.7, 0.6, 0.2, (0.34, 0.37)),
-]  # fmt: skip
+    (lost,) = branch.special  # from which nothing goes on
+    with pytest.raises(ValueError, match="this special point is a rest"):
+        lost.switch()
+    with pytest.raises(ValueError, match=r"but is a rest\. Such a point is found value by value"):
+        vi.boundary(lost, parameter="stops.0.gap", bounds=((0.6, 0.8), (0.2, 0.4)))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("k", "gap", "damping", "bounds"), LOST)
+@pytest.mark.parametrize(
+    ("k", "gap", "damping", "bounds"),
+    [(0.1, 0.6, 0.2, (0.89, 0.92)), (0.7, 0.3, 0.2, (0.46, 0.5))],
+)
 def test_the_rest_is_lost_where_its_chatter_takes_until_release(k, gap, damping, bounds):
     """Beside flights in 40 digits; those of double precision lose it 3e-7 elsewhere."""
     scene = scene_at(bounds[0] + 0.01, k, gap, damping)
@@ -103,23 +117,6 @@ def test_the_rest_is_lost_where_its_chatter_takes_until_release(k, gap, damping,
     assert "lost" in point.detail
     assert rests_again(point.parameter - 1e-9, k, gap, damping)
     assert not rests_again(point.parameter + 1e-9, k, gap, damping)
-
-
-def test_nothing_goes_on_from_a_rest_that_is_lost(branch):
-    (point,) = branch.special
-    with pytest.raises(ValueError, match="this special point is a rest"):
-        point.switch()
-    with pytest.raises(ValueError, match=r"but is a rest\. Such a point is found value by value"):
-        vi.boundary(point, parameter="stops.0.gap", bounds=((0.6, 0.8), (0.2, 0.4)))
-
-
-def test_its_orbits_list_their_impacts(branch):
-    orbit = branch.orbit(0)
-    assert int(orbit.impacts) == branch.impacts[0] == len(orbit.impact_speed)
-    again = vi.find_orbit(orbit.machine, orbit, impact_log=32, throw=True)
-    np.testing.assert_allclose(orbit.impact_phase, again.impact_phase, atol=1e-8)
-    np.testing.assert_allclose(orbit.impact_speed, again.impact_speed, atol=1e-8)
-    assert "rest on a stop" in str(branch)
 
 
 @pytest.mark.slow
@@ -228,77 +225,61 @@ def test_chatter_and_rest_pass_over_the_section():
     assert point.parameter == pytest.approx(low, abs=1e-9)
 
 
-class Gears(vi.AbstractMachine):
-    """Play between two teeth: y'' = cos s - load between two flanks that are `backlash` apart. The
-    load presses on the left flank, from which the teeth part where cos s = load."""
+class Uneven(vi.AbstractMachine):
+    """A body on a spring, between a stop on which it rests and one that it strikes once."""
 
-    load: Any = 0.3
-    backlash: Any = 1.0
+    frequency: Any = 0.55
+    restitution: Any = 0.4
 
     @property
     def stops(self):
-        return tuple(vi.RigidStop(0.5 * self.backlash, 0.5, side) for side in ("right", "left"))
+        return vi.RigidStop(0.1, self.restitution), vi.RigidStop(1.9, 0.6, "left")
 
     @property
     def cycle(self):
         return 2 * np.pi
 
     def field(self, s, x):
-        return vi.OscillatorState(x.V, jnp.cos(s) - self.load)
+        pull = 0.35 * jnp.sin(2 * s) - jnp.cos(s) - 0.16 * x.V - x.Y
+        return vi.OscillatorState(x.V / self.frequency, pull / self.frequency)
 
 
-def gone(load, s, v, d):
-    """How far the teeth have moved a time `d` after they had the velocity `v` at `s`, over `d`."""
-    lag = d * d / 6 if d < 1e-3 else 1 - np.sin(d) / d
-    pushed = 2 * np.cos(s) * np.sin(d / 2) ** 2 / d - np.sin(s) * lag
-    return v + pushed - load * d / 2
+def released(frequency):
+    """How far from the other stop the body of `Uneven` turns after its rest, without that stop."""
 
+    def pull(s, y, v):
+        return 0.35 * np.sin(2 * s) - np.cos(s) - 0.16 * v - y
 
-def highest(load):
-    """How far the teeth part that rest on the left flank, without another."""
-    s = -np.arccos(load)
-    d = brentq(lambda d: np.sin(s + d) - np.sin(s) - load * d, 1.0 - s, 2 * np.pi, xtol=1e-15)
-    return gone(load, s, 0.0, d) * d
+    let_go = brentq(lambda s: pull(s, 0.1, 0.0), 3.5, 5.5, xtol=1e-14)
 
+    def turns(s, x):
+        return x[1]
 
-def comes_to_rest(load, backlash):
-    """Whether the teeth, having parted and struck the right flank, rest on the left one before the
-    drive parts them again: by flights in closed form until hops are no longer than rounding."""
-    s, parts = -np.arccos(load), 2 * np.pi - np.arccos(load)
-    d = brentq(lambda d: gone(load, s, 0.0, d) * d - backlash, 0.5, -2 * s, xtol=1e-15)
-    v = -0.5 * (np.sin(s + d) - np.sin(s) - load * d)
-    s += d
-    d = brentq(lambda d: gone(load, s, v, d) * d + backlash, 0.5, parts - s, xtol=1e-15)
-    v = -0.5 * (v + np.sin(s + d) - np.sin(s) - load * d)
-    s += d
-    while v > 1e-14 and parts - s > 1e-13 and gone(load, s, v, parts - s) < 0:
-        args, close = (s, v), {"xtol": 1e-18, "rtol": 1e-14}
-        d = brentq(lambda d, s, v: gone(load, s, v, d), 1e-30, parts - s, args=args, **close)
-        v = -0.5 * (v + 2 * np.cos(s + d / 2) * np.sin(d / 2) - load * d)
-        s += d
-    return v <= 1e-14
+    turns.terminal, turns.direction = True, 1
+    flight = solve_ivp(
+        lambda s, x: [x[1] / frequency, pull(s, *x) / frequency], (let_go, let_go + 6), [0.1, 0.0],
+        method="DOP853", events=turns, rtol=1e-12, atol=1e-13, max_step=0.05,
+    )  # fmt: skip
+    return flight.y[0, -1] + 1.9
 
 
 @pytest.mark.slow
-def test_gears_that_rattle_and_rest():
-    """Under a strong load they part and come back; the right flank is touched where it is as far as
-    they part, while their chatter on the left one has another number of hops a step further. Under
-    a weak one they strike it and come to rest, until the way back takes too long."""
-
-    def branch(load):
-        gears, flying = Gears(load=load), vi.OscillatorState(jnp.zeros(()), jnp.zeros(()))
-        start = vi.simulate(gears, flying, 1, settle=60).last
-        orbit = vi.find_orbit(gears, start, impact_log=64, throw=True)
-        return vi.continue_orbit(orbit, parameter="backlash", bounds=(0.4, 2.0))
-
-    parted, struck = branch(0.7), branch(0.3)
-    assert parted.ends == ("grazing", "bounds") and struck.ends == ("bounds", "rest")
-    assert parted.special[0].parameter == pytest.approx(highest(0.7), abs=1e-10)
-    low, high = 1.0, 1.2
-    while high - low > 1e-11:
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if comes_to_rest(0.3, middle) else (low, middle)
-    assert struck.special[0].parameter == pytest.approx(low, abs=1e-9)
+def test_a_branch_passes_its_section_and_ends_at_a_graze_or_a_bound():
+    """An impact comes upon the section, where the corrector finds a solution far beyond the bounds;
+    then the body just reaches the other stop, where its release alone says: at one place both
+    motions lead back, at the other one the motion goes on. Restitution 0 is a bound beyond which
+    there is no machine."""
+    start = vi.OscillatorState(jnp.zeros(()), jnp.zeros(()))
+    settled = vi.simulate(Uneven(), start, 1, settle=40).last
+    orbit = vi.find_orbit(Uneven(), settled, impact_log=64, throw=True)
+    wanted = [brentq(released, *bracket, xtol=1e-13) for bracket in ((0.37, 0.385), (0.55, 0.6))]
+    branch = vi.continue_orbit(  # a step of 0.5 leads over both
+        orbit, parameter="frequency", bounds=(0.2, 0.6), step=0.5, max_step=0.5
+    )
+    assert branch.ends == ("grazing", "grazing")
+    np.testing.assert_allclose([p.parameter for p in branch.special], wanted, atol=1e-10)
+    soft = vi.continue_orbit(orbit, parameter="restitution", bounds=(0.0, 0.45))
+    assert soft.ends == ("bounds", "bounds") and soft.parameter[0] == 0.0
 
 
 def listing(orbit, count):

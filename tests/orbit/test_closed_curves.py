@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 import vi_jax as vi
-from scipy.optimize import brentq
 
 from kicked import Kicked, at
-from one_impact import one_impact
 
 pytestmark = pytest.mark.slow
 
@@ -90,32 +88,3 @@ def test_a_motion_that_comes_again_a_cycle_later_is_the_same():
     assert abs(turned[-1] - turned[0]) == pytest.approx(np.pi, abs=1e-6)
     folds = [point.parameter for point in branch.special if point.kind == "fold"]
     np.testing.assert_allclose(np.sort(folds), [-1, 1], atol=1e-9)
-
-
-def test_an_isola_of_an_impact_oscillator():
-    """The motions with one impact in three cycles of a damped oscillator: apart from all other
-    branches, between two folds, where the closed form's two speeds are one."""
-    given = {"damping": 0.02, "restitution": 0.85, "gap": 1.2, "cycles": 3}
-    scene = vi.Scene.ideal(frequency_ratio=3.6, restitution=0.85, gap=1.2, damping_ratio=0.02)
-    closed = vi.closed_form_orbits(scene, cycles=3)
-    start = scene.start(Y=closed.Y[0], V=closed.V[0])
-    orbit = vi.find_orbit(scene, start, cycles=3, throw=True)
-    branch = vi.continue_orbit(orbit, parameter="drive.frequency_ratio", bounds=(2.5, 5.0))
-    assert branch.ends == ("closed", "closed") and branch.admissible.all()
-
-    def apart(zeta):
-        slow, fast = one_impact(zeta, 1.0, **given).speed
-        return ((fast - slow) ** 2).real
-
-    folds = [brentq(apart, *ends, xtol=1e-14) for ends in ((3.1, 3.5), (3.7, 4.3))]
-    found = [point.parameter for point in branch.special if point.kind == "fold"]
-    np.testing.assert_allclose(np.sort(found), folds, atol=1e-9)
-    for zeta, speed, values in zip(
-        branch.parameter, branch.impact_speed[:, 0], branch.multipliers, strict=True
-    ):
-        both = one_impact(zeta, 1.0, **given)
-        which = int(np.argmin(np.abs(both.speed - speed)))
-        # At a fold the closed form has the root of its rounding.
-        if np.abs(values - 1).min() > 1e-2:
-            assert both.speed[which].real == pytest.approx(speed, abs=1e-9)
-            assert both.trace[which].real == pytest.approx(values.sum().real, rel=1e-7)
