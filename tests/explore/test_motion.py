@@ -9,18 +9,21 @@ import numpy as np
 import pytest
 import vi_jax as vi
 from PIL import Image
-from vi_jax.explore import controls
-from vi_jax.explore.diagram import CYCLES, SETTLE, SHOWN, diagram
-from vi_jax.explore.motion import OBSERVED, WINDOW, look
-from vi_jax.explore.pictures import MAPS, DiagramPicture, MotionPicture
-from vi_jax.explore.serve import compile_all
+from vi_jax.explore.motion import WINDOW, look
+from vi_jax.explore.pictures import MAPS, MotionPicture, draw_diagram, gif_of
+from vi_jax.explore.subject import CYCLES, SETTLE, SHOWN, Subject, ready
 
 from differences import some
 
+ZETA, GAP, K = "drive.frequency_ratio", "stops.0.gap", "stops.0.restitution"
 
-@pytest.fixture(scope="module", autouse=True)
-def _compiled():
-    compile_all(lambda step: None)
+
+@pytest.fixture(scope="module")
+def ideal():
+    """The page's first machine, compiled."""
+    subject = next(iter(ready().values()))()
+    subject.compile(lambda step: None)
+    return subject
 
 
 @contextmanager
@@ -39,131 +42,135 @@ def compilations():
         jax.monitoring.unregister_event_duration_listener(note)
 
 
-def ideal(settle=1000, **numbers):
-    return look(*controls.ideal({**controls.beginning(controls.IDEAL), **numbers}), settle)
+def seen(subject, settle=1000, **numbers):
+    names = {"zeta": ZETA, "gap": GAP, "xi": "oscillator.damping_ratio", "Y": "start.Y"}
+    values = subject.beginning() | {names.get(name, name): x for name, x in numbers.items()}
+    return look(*subject.at(values), settle)
 
 
-def motor(settle=300, **numbers):
-    return look(*controls.motor({**controls.beginning(controls.MOTOR), **numbers}), settle)
-
-
-@pytest.mark.parametrize("numbers", [{}, {"frequency_ratio": 1.1}, {"gap": 1.0, "Y": 3.0}])
-def test_a_motion_with_one_impact_is_as_in_closed_form(numbers):
-    seen = ideal(**numbers)
-    scene, _ = controls.ideal({**controls.beginning(controls.IDEAL), **numbers})
-    exact = vi.closed_form_orbits(scene, cycles=seen.period)
-    (place,) = np.flatnonzero(np.isclose(exact.y_min, seen.extremes[0], atol=1e-6))
-    assert exact.admissible[place] and seen.impacts == 1
+@pytest.mark.parametrize("numbers", [{}, {"zeta": 1.1}, {"gap": 1.0, "Y": 3.0}])
+def test_a_motion_with_one_impact_is_as_in_closed_form(ideal, numbers):
+    found = seen(ideal, **numbers)
+    zeta, gap = numbers.get("zeta", 0.9), numbers.get("gap", 2.0)
+    scene = vi.Scene.ideal(frequency_ratio=zeta, gap=gap, damping_ratio=0.01)
+    exact = vi.closed_form_orbits(scene, cycles=found.period)
+    (place,) = np.flatnonzero(np.isclose(exact.y_min, found.extremes[0], atol=1e-6))
+    assert exact.admissible[place] and found.impacts == 1
     expected = np.asarray(exact.multipliers[place])
     # In the order that the page has, conjugates apart.
-    assert np.sort_complex(seen.multipliers) == pytest.approx(np.sort_complex(expected), abs=1e-5)
-    assert "stable" in seen.stability and f"{2 * seen.period}π with 1 impact" in seen.regime
-    assert seen.impact_speed == pytest.approx(float(exact.impact_speed[place]), abs=1e-5)
+    assert np.sort_complex(found.multipliers) == pytest.approx(np.sort_complex(expected), abs=1e-5)
+    assert "stable" in found.stability and f"{2 * found.period}π with 1 impact" in found.regime
+    assert found.impact_speed == pytest.approx(float(exact.impact_speed[place]), abs=1e-5)
+    at_stop = np.isclose(found.path.Y, gap)
+    assert found.path.cycles[-1] == pytest.approx(WINDOW)
+    assert at_stop.sum() == 2 * WINDOW // found.period  # before and after each impact
 
 
-def test_the_path_touches_the_stop_where_the_impacts_are():
-    seen = ideal()
-    assert seen.path.cycles[0] == 0 and seen.path.cycles[-1] == pytest.approx(WINDOW)
-    at_stop = np.isclose(seen.path.Y, 2.0)
-    assert at_stop.sum() == 2 * WINDOW // seen.period  # before and after each impact
-    before, after = seen.path.V[at_stop][::2], seen.path.V[at_stop][1::2]
-    assert after == pytest.approx(-0.5 * before)
-    assert seen.sections.Y.shape == (OBSERVED + 1,)
-
-
-def test_without_settling_the_start_is_seen():
-    seen = ideal(settle=0, Y=-1.0, V=0.5)
-    assert (seen.path.Y[0], seen.path.V[0]) == (-1.0, 0.5)
-
-
-def test_a_motion_without_a_period_has_an_exponent():
-    seen = ideal(frequency_ratio=0.7, damping_ratio=0.0)
+def test_other_regimes(ideal):
+    start = seen(ideal, settle=0, Y=-1.0)
+    assert start.path.Y[0] == -1.0
+    chaos = seen(ideal, zeta=0.7, xi=0.0)
     scene = vi.Scene.ideal(frequency_ratio=0.7)
     exact = vi.lyapunov(scene, scene.start(), 2000, settle=500, number=1)
-    assert seen.regime.startswith("chaotic") and not seen.multipliers.size
-    assert seen.exponent == pytest.approx(float(exact.exponents[0]), abs=0.02)
+    assert chaos.regime.startswith("chaotic") and not chaos.multipliers.size
+    assert chaos.exponent == pytest.approx(float(exact.exponents[0]), abs=0.02)
+    free = seen(ideal, zeta=2.0, xi=0.0)
+    assert not free.impact_speed.size and "neither" in free.stability
 
 
-def test_free_motion_without_damping_is_neutral():
-    seen = ideal(frequency_ratio=2.0, damping_ratio=0.0)
-    assert not seen.impact_speed.size and "neither" in seen.stability
-
-
-def test_a_motor_lags_behind_by_what_it_must_deliver():
-    strong, weaker = motor(torque=15.0), motor(torque=7.5)
-    lag = [0.9 - seen.frequency_ratio.mean() for seen in (strong, weaker)]
+@pytest.mark.slow
+def test_a_motor_lags_behind_and_may_stop(ideal):
+    motors = [vi.Parameters(torque=T).scene() for T in (15.0, 7.5)]
+    strong, weaker = (look(motor, motor.start(W=0.9), 300) for motor in motors)
+    lag = [0.9 - found.frequency_ratio.mean() for found in (strong, weaker)]
     assert 0 < lag[0] < 5e-3 and lag[1] == pytest.approx(2 * lag[0], rel=0.02)
     assert strong.multipliers.size == 3 and "stable" in strong.stability
-
-
-def test_what_fails_says_why():
     scene = vi.Parameters(control=-1.0).scene()
-    seen = look(scene, scene.start(W=0.1), 300)
-    assert seen.regime == "failed" and "turning forward" in seen.fault and not seen.stability
-    assert MotionPicture(motor=True).draw(seen, 2.0)
+    found = look(scene, scene.start(W=0.1), 300)
+    assert found.regime == "failed" and "turning forward" in found.fault and not found.stability
+    for which in MAPS:
+        assert MotionPicture(scene.labels).draw(found, scene, which)
 
 
-def test_no_slider_compiles():
-    numbers = controls.beginning(controls.NUMBERS)
-    picture = MotionPicture()
-    picture.draw(ideal(), 2.0)
+def test_no_slider_compiles_and_redraws_are_quick(ideal):
+    begin, picture, took = ideal.beginning(), MotionPicture(ideal.machine.labels), []
+    picture.draw(ideal.seen(begin), ideal.machine)
     with compilations() as found:
-        for changed in ({"restitution": 0.8}, {"gap": 0.0}, {"Y": -3.0}, {"frequency_ratio": 0.7}):
-            seen = ideal(**changed)
-            picture.draw(seen, 2.0)
-            assert seen.stability
-        diagram({**numbers, "gap": 1.0}, "restitution", (0.1, 0.9), Y=0.3, V=0.1)
-        assert motor(control=1.3, torque=0.5, gap=0.2).stability
-    assert not found
+        for name, control in ideal.controls.items():
+            for part in (0.0, 0.4, 0.6, 1.0):
+                values = {**begin, name: control.low + part * (control.high - control.low)}
+                since = time.process_time()
+                machine, _ = ideal.at(values)
+                png = picture.draw(ideal.seen(values), machine)
+                took.append(time.process_time() - since)
+                assert Image.open(BytesIO(png)).size == (1008, 594)
+        ideal.diagram({**begin, GAP: 1.0}, K)
+    assert not found and np.median(took) < 0.2
 
 
-def test_redraws_are_quick():
-    picture, took = MotionPicture(), []
-    picture.draw(ideal(), 2.0)
-    for i in range(20):
-        begin = time.process_time()
-        picture.draw(ideal(frequency_ratio=0.9 + 0.004 * i), 2.0)
-        took.append(time.process_time() - begin)
-    assert np.median(took) < 0.2
-
-
-@pytest.mark.parametrize("make", some(["ideal", "motor"], "motor"))
-def test_the_ends_of_all_sliders_can_be_shown(make):
-    kinds = {"ideal": controls.IDEAL, "motor": controls.MOTOR}[make]
-    see = {"ideal": ideal, "motor": motor}[make]
-    picture = MotionPicture(motor=make == "motor")
-    for name, control in kinds.items():
-        for end in (control.low, control.high):
-            assert control.nearest(end) == end
-            if name != "settle":
-                seen = see(**{name: end}, settle=100)
-                assert seen.regime and not seen.fault, (name, end)
-                assert picture.draw(seen, 2.0)
-    assert control.nearest(-1e9) == control.low
-
-
-def test_a_diagram_is_made_of_runs():
-    numbers = controls.beginning(controls.NUMBERS)
-    found = diagram(numbers, "restitution", (0.0, 1.0), Y=0.5, V=0.0)
+def test_a_diagram_is_made_of_runs(ideal):
+    values = {**ideal.beginning(), "start.Y": 0.5}
+    found = ideal.diagram(values, K)
     assert found.values[0] == 0.0 and found.values[-1] == 1.0
-    value = found.nearest(0.4)
-    (row,) = np.flatnonzero(found.values == value)
-    scene = vi.Scene.ideal(**{**numbers, "restitution": value})
-    run = vi.simulate(scene, scene.start(Y=0.5), CYCLES, settle=SETTLE)
-    assert found.Y[row] == pytest.approx(np.asarray(run.sections.Y[1:]), abs=1e-9)
-    assert found.y_min[row] == pytest.approx(np.asarray(run.y_min), abs=1e-9)
-
-
-def test_pictures():
-    picture, seen = MotionPicture(), ideal()
-    first = picture.draw(seen, 2.0)
-    assert Image.open(BytesIO(first)).size == (1008, 594)
-    assert picture.draw(seen, 2.0) == first  # within kept frames
-    assert picture.draw(seen, 2.0, which=MAPS[1]) != first
-    moved = ideal(frequency_ratio=0.902)
-    assert picture.draw(moved, 2.0) != first
-    numbers = controls.beginning(controls.NUMBERS)
-    found = diagram(numbers, "gap", (0.0, 5.0), Y=0.0, V=0.0)
+    assert ideal.diagram({**values, K: 0.7, SETTLE: 3.0}, K) is found  # the slider moves along it
+    assert ideal.diagram({**values, GAP: 1.5}, K) is not found
+    here, start = ideal.at({**values, K: found.values[60]})
+    run = vi.simulate(here, start, CYCLES, settle=ideal.before)
+    assert found.low[60] == pytest.approx(np.asarray(run.y_min), abs=1e-9)
+    assert found.position[60] == pytest.approx(np.asarray(run.sections.Y[1:]), abs=1e-9)
     for name in SHOWN:
-        ax = DiagramPicture().set(found, 2.0, shown=name)
-        assert ax.get_ylabel() == name and ax.get_xlim() == (0.0, 5.0)
+        ax = draw_diagram(found, 0.5, name)
+        assert ax.get_ylabel() == name and ax.get_xlim() == (0.0, 1.0)
+        assert ax.get_xlabel() == "restitution k"
+
+
+def test_pictures(ideal):
+    picture, found = MotionPicture(ideal.machine.labels), ideal.seen(ideal.beginning())
+    first = picture.draw(found, ideal.machine)
+    assert picture.draw(found, ideal.machine) == first  # within kept frames
+    assert len({picture.draw(found, ideal.machine, which) for which in MAPS}) == len(MAPS)
+    assert picture.draw(seen(ideal, zeta=0.902), ideal.machine) != first
+
+
+def test_requests_that_no_slider_makes_are_refused_in_a_sentence(ideal):
+    values = ideal.beginning()
+    assert ideal.fault(values) is None
+    for wrong in (1e9, -5.0, float("nan"), None, "0.9"):
+        message = ideal.fault({**values, K: wrong})
+        assert message == f"The restitution k must be a number from 0 to 1, but is {wrong!r}."
+    with pytest.raises(ValueError, match="restitution"):
+        ideal.at({**values, K: 7.0})
+
+
+def test_ranges_are_within_what_the_machine_allows():
+    made = {name: make() for name, make in ready().items()}
+    assert {"Scene, motor", "BouncingBall", "Beam"} <= set(made) and "Structure" not in made
+    for subject in made.values():
+        assert len({c.label for c in subject.controls.values()}) == len(subject.controls)
+        for name, control in subject.controls.items():
+            assert control.low <= control.value <= control.high
+            # The page opens with the machine's own numbers, not with places next to them.
+            steps = (control.value - control.low) / control.step
+            assert abs(steps - round(steps)) < 1e-9
+            for end in (control.low, control.high):
+                if not isinstance(subject.machine, vi.machines.Woodpecker):  # its sleeve and pole
+                    subject.at({**subject.beginning(), name: end})  # no machine refuses it
+    duffing = made["Duffing"].controls
+    assert (duffing["restitution"].low, duffing["restitution"].high) == (0.0, 1.0)
+    assert (duffing["amplitude"].low, duffing["amplitude"].high) == pytest.approx((0.0, 0.6))
+
+
+@pytest.mark.parametrize("name", some(["Beam", "ReliefValve"], "ReliefValve"))
+def test_machines_of_other_kinds(name):
+    """Several coordinates to a state; no drive. Pictures of each, and it moves."""
+    subject: Subject = ready()[name]()
+    subject.compile(lambda step: None)
+    values = subject.beginning()
+    found = subject.seen(values)
+    assert not found.fault and found.regime and subject.words(found)["position"]
+    assert np.isfinite(found.path.Y).all()
+    assert gif_of(found, subject.machine).startswith(b"GIF")
+    diagram = subject.diagram(values, subject.names[0])
+    assert np.isfinite(diagram.position).any()
+    run = vi.simulate(*subject.at(values), 256, settle=int(values[SETTLE]))
+    np.testing.assert_allclose(found.extremes, (run.y_min.min(), run.y_max.max()), rtol=1e-7)

@@ -9,8 +9,9 @@ from io import TextIOWrapper
 import jax
 
 from .._messages import Interrupted, installed_version
-from ..explore.named import InputError, check_keys, machine_of
-from ..explore.serve import Subject, missing, serve
+from ..explore.serve import missing, serve
+from ..explore.subject import Subject, ready
+from ..machines.named import InputError, check_keys, machine_of
 from .files import read
 from .verbs import VERBS, do
 
@@ -72,42 +73,24 @@ def _run_file(options: argparse.Namespace) -> int:
 
 
 def _explore(options: argparse.Namespace) -> int:
-    if not 0 <= options.port <= 65535:
-        raise InputError(f"argument --port must be between 0 and 65535, but is {options.port}")
+    """Serve the page of a machine: that of the command, or the paper's scene."""
     problem = missing()
     if problem:
         return _error(problem, 1)
     jax.config.update("jax_platforms", "cpu")  # the fastest for one motion
+    name, make = next(iter(ready().items()))
     try:
-        shown = _shown(options)
-        serve(
-            options.host, options.port, browser=options.browser, tell=_say, machine=shown,
-            paper=not options.ready,
-        )  # fmt: skip
-    except ValueError as error:
+        ranges = {name: (float(low), float(high)) for name, low, high in options.range}
+        if options.machine is not None:
+            name, make = options.machine, lambda: Subject(machine_of(options.machine, {}), ranges)
+        serve(options.host, options.port, (name, make()), browser=options.browser, tell=_say)
+    except (ValueError, OverflowError) as error:  # the second of a port that is none
         return _error(error, 2)
-    except KeyboardInterrupt:
-        pass
     except OSError as error:
         return _error(f"cannot serve {options.host} port {options.port}: {error.strerror}", 1)
+    except KeyboardInterrupt:
+        pass
     return 0
-
-
-def _shown(options: argparse.Namespace) -> tuple[str, Subject] | None:
-    """The machine to explore, with its name; `None` where none is named."""
-    ranges = {}
-    for text in options.range:
-        name, _, ends = text.partition("=")
-        low, _, high = ends.partition(":")
-        try:
-            ranges[name] = (float(low), float(high))
-        except ValueError:
-            raise InputError(f"--range must be NAME=LOW:HIGH, but is {text!r}") from None
-    if options.machine is None:
-        if ranges:
-            raise InputError("--range needs --machine, whose numbers it is of")
-        return None
-    return options.machine, Subject(machine_of(options.machine, {}), ranges)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -124,12 +107,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     verb.add_argument("--machine", metavar="NAME", help=_MACHINE)
     verb.add_argument(
-        "--range", action="append", default=[], metavar="NAME=LOW:HIGH",
+        "--range", action="append", default=[], nargs=3, metavar=("NAME", "LOW", "HIGH"),
         help="the range of a slider of that machine; may be given several times",
     )  # fmt: skip
-    verb.add_argument(
-        "--ready", action="store_true", help="show the ready machines, instead of the paper's scene"
-    )
     verb.add_argument(
         "--no-browser", dest="browser", action="store_false", help="do not open a browser"
     )

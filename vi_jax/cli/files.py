@@ -8,8 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from ..explore.named import InputError, check_keys
 from ..machine import AbstractMachine, check_name, leaf_names, with_leaf
+from ..machines.named import InputError, check_keys
 
 
 def read(path: str) -> dict[str, Any]:

@@ -17,9 +17,9 @@ from matplotlib.figure import Figure
 from .. import plot
 from .._checks import unwritable
 from .._messages import Interrupted
-from ..explore.named import InputError, check_keys, value_of
 from ..flow import RESULTS, Run, RunOptions, planned, simulate
 from ..machine import AbstractMachine, is_autonomous
+from ..machines.named import InputError, check_keys, value_of
 from ..orbit import continue_orbit, find_orbit
 from ..scans import REGIMES, Sweep, basins, periods_of, scan, sweep
 from .files import errors_in, start_of

@@ -44,8 +44,6 @@ class Motion(NamedTuple):
 
     path: MotionPath
     """The motion over `WINDOW` cycles, with its impacts."""
-    sections: Any
-    """Section states of all cycles observed, a state of NumPy arrays."""
     impact_phase: np.ndarray
     """Crank angle of each impact observed (radians)."""
     impact_speed: np.ndarray
@@ -65,7 +63,7 @@ class Motion(NamedTuple):
     fault: str
     """Why it could not be simulated; empty if it could."""
     places: tuple[np.ndarray, np.ndarray]
-    """Position and velocity on the sections."""
+    """Position and velocity on the sections of the cycles observed."""
     quantities: dict[str, float]
     """The machine's own quantities on the last section, and its averages over the cycles."""
     lasting: str
@@ -82,9 +80,9 @@ class Motion(NamedTuple):
             impacts = so_many(round(self.impacts), "impact")
             return f"period {self.lasting} with {impacts}"
         kinds: dict[int, str] = {regime: regime.meaning for regime in REGIMES}
-        if self.period == REGIMES.failed:
-            return kinds[self.period]
         kind = kinds[self.period]
+        if self.period == REGIMES.failed:
+            return kind
         if self.period == REGIMES.unsettled:
             kind = f"no period up to {self.lasting}: still settling, or quasi-periodic"
         return f"{kind}, {self.impacts:.2f} impacts in a cycle"
@@ -129,10 +127,8 @@ def look(scene: AbstractMachine, start: State, settle: int = 1000) -> Motion:
     averages = {name: x.mean() for name, x in run.averages.items()}
     numbers = {name: x[-1] for name, x in run.quantities.items()} | averages
     met = np.asarray(log.stop) >= 0
-    good = bool(run.successful)
     return Motion(
         path=motion_path(window, machine=seen_evenly(scene, run.last)),
-        sections=jtu.tree_map(np.asarray, run.sections),
         impact_phase=np.asarray(log.phase)[met],
         impact_speed=np.asarray(log.speed)[met],
         frequency_ratio=np.full(OBSERVED, np.nan) if ratio is None else np.asarray(ratio),
@@ -141,7 +137,7 @@ def look(scene: AbstractMachine, start: State, settle: int = 1000) -> Motion:
         impacts=float(found["impacts"]),
         multipliers=multipliers,
         exponent=exponent,
-        fault="" if good else str(RESULTS[run.result]),
+        fault="" if bool(run.successful) else str(RESULTS[run.result]),
         places=(np.asarray(places[0]), np.asarray(places[1])),
         quantities={name: float(x) for name, x in numbers.items() if not np.ndim(x)},
         lasting=scene.period_of(period if period > 0 else _REGIME.longest),
@@ -150,11 +146,9 @@ def look(scene: AbstractMachine, start: State, settle: int = 1000) -> Motion:
     )
 
 
-def prepare(scene: AbstractMachine, start: State) -> Motion:
-    """Compile what `look` needs for scenes of this structure, and return the motion."""
-    found = look(scene, start, 0)
-    _exponent_of(scene, jtu.tree_map(lambda x: jnp.asarray(x[-1]), found.sections))
-    return found
+def prepare(scene: AbstractMachine, start: State) -> None:
+    """Compile what `look` needs for scenes of this structure."""
+    _exponent_of(scene, look(scene, start, 0).window.last)
 
 
 @compiled

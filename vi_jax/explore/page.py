@@ -1,4 +1,5 @@
-"""The page itself, a marimo app: what to show where. The other files compute and draw."""
+"""The page, a marimo app: sliders of a machine's numbers, its motion, a diagram, and the machine
+moving. The other files compute and draw."""
 
 import marimo  # pyright: ignore[reportMissingImports]
 
@@ -13,141 +14,134 @@ def _():
 
     import marimo as mo  # pyright: ignore[reportMissingImports]
 
-    from vi_jax.explore import controls
-    from vi_jax.explore.diagram import SHOWN, diagram
-    from vi_jax.explore.motion import look
-    from vi_jax.explore.pictures import MAPS, DiagramPicture, MotionPicture
+    from vi_jax.explore.pictures import MAPS, MotionPicture, draw_diagram, gif_of
+    from vi_jax.explore.serve import SERVED
+    from vi_jax.explore.subject import SHOWN, ready
 
     return (
-        MAPS, SHOWN, DiagramPicture, MotionPicture, b64encode, controls, diagram, html, look, mo,
-        time,
+        MAPS, SHOWN, MotionPicture, b64encode, draw_diagram, gif_of, html, mo, ready, SERVED, time,
     )  # fmt: skip
 
 
 @app.cell
-def _(DiagramPicture, MotionPicture, b64encode, html, mo, time):
-    pictures = {
-        "ideal": MotionPicture(), "motor": MotionPicture(motor=True), "diagram": DiagramPicture(),
-    }  # fmt: skip
-
-    def sliders(kinds, values):
-        return mo.ui.dictionary(
-            {
-                name: mo.ui.slider(
-                    c.low, c.high, c.step, value=values[name], label=c.label,
-                    include_input=True, full_width=True,
-                )
-                for name, c in kinds.items()
-            }
-        )  # fmt: skip
-
-    def shown(motion, picture, since):
-        """A motion in words and as a picture."""
-        low, high = motion.extremes
-        words = motion.fault or f"{motion.stability}; Y from {low:.4f} to {high:.4f}"
-        took = 1000 * (time.perf_counter() - since)
-        return mo.Html(
-            f'<p id="regime"><b>{html.escape(motion.regime)}</b><br>{html.escape(words)}</p>'
-            f'<img id="motion" style="max-width: 100%" alt="{html.escape(motion.regime)}" '
-            f'src="data:image/png;base64,{b64encode(picture).decode()}">'
-            f'<p style="opacity: 0.6"><small>redrawn in {took:.0f} ms</small></p>'
-        )
-
-    def stop_at(fault):
-        """Say what is wrong instead of showing anything."""
-        mo.stop(fault is not None, mo.Html(f'<p id="fault">{html.escape(str(fault))}</p>'))
-
-    return pictures, shown, sliders, stop_at
-
-
-@app.cell
-def _(mo):
-    tab = mo.ui.tabs({"Ideal drive": "", "Bifurcations": "", "Motor": ""})
-    mo.vstack([tab])
-    return (tab,)
-
-
-@app.cell
-def _(controls, mo):
-    # A click in the diagram moves the sliders.
-    picked, pick = mo.state(controls.beginning(controls.IDEAL))
-    return pick, picked
-
-
-@app.cell
-def _(controls, picked, sliders):
-    ideal = sliders(controls.IDEAL, picked())
-    return (ideal,)
-
-
-@app.cell
-def _(MAPS, SHOWN, controls, mo, sliders):
-    motor = sliders(controls.MOTOR, controls.beginning(controls.MOTOR))
+def _(MAPS, SERVED, SHOWN, mo, ready):
+    first, kinds, subjects = SERVED[-1], ready(), {}
+    menu = mo.ui.dropdown([*dict.fromkeys([first[0], *kinds])], value=first[0], label="machine")
+    tab = mo.ui.tabs({"Motion": "", "Diagram": "", "Animation": ""})
     which = mo.ui.radio(MAPS, value=MAPS[0])
-    names = {c.label: name for name, c in controls.NUMBERS.items()}
-    across = mo.ui.dropdown(names, value=next(iter(names)), label="across")
     upwards = mo.ui.dropdown(list(SHOWN), value=next(iter(SHOWN)), label="upwards")
-    return across, motor, upwards, which
+    moving = mo.ui.run_button(label="let it move")
+    picked, pick = mo.state(("", {}))  # of a machine, the values that a click has chosen
+    mo.hstack([menu, tab], justify="start", gap=2)
+    return first, kinds, menu, moving, pick, picked, subjects, tab, upwards, which
 
 
 @app.cell
-def _(across, ideal, mo, motor, tab, upwards, which):
-    _parts = {
-        "Ideal drive": [*ideal.elements.values(), which],
-        "Bifurcations": [across, upwards, *ideal.elements.values(), which],
-        "Motor": [*motor.elements.values()],
-    }
-    mo.sidebar([mo.md("### vi_jax"), *_parts[tab.value]], width="340px")
+def _(MotionPicture, first, kinds, menu, mo, subjects):
+    # Compiled when it is first chosen; the first one is already.
+    if menu.value not in subjects:
+        chosen = first[1]
+        if menu.value != first[0]:
+            chosen = kinds[menu.value]()
+            with mo.status.spinner(title=f"compiling {menu.value}"):
+                chosen.compile(lambda step: None)
+        subjects[menu.value] = chosen, MotionPicture(chosen.machine.labels)
+    shown, picture = subjects[menu.value]
+    names = {shown.controls[name].label: name for name in shown.names}
+    across = mo.ui.dropdown(names, value=next(iter(names), None), label="across")
+    return across, picture, shown
+
+
+@app.cell
+def _(menu, mo, picked, shown):
+    _own, _values = picked()
+    _values = shown.beginning() | (_values if _own == menu.value else {})
+    sliders = mo.ui.dictionary(
+        {
+            name: mo.ui.slider(
+                c.low, c.high, c.step, value=_values[name], label=c.label,
+                include_input=True, full_width=True,
+            )
+            for name, c in shown.controls.items()
+        }
+    )  # fmt: skip
+    return (sliders,)
+
+
+@app.cell
+def _(across, menu, mo, moving, sliders, tab, upwards, which):
+    _parts = {"Motion": [which], "Diagram": [across, upwards, which], "Animation": [moving]}
+    _all = [*_parts[tab.value], *sliders.elements.values()]
+    mo.sidebar([mo.md(f"### {menu.value}"), *_all], width="340px")
     return
 
 
 @app.cell
-def _(across, controls, diagram, ideal, mo, pictures, stop_at, tab, upwards):
-    mo.stop(tab.value != "Bifurcations")
-    stop_at(controls.fault(controls.IDEAL, ideal.value))
-    _control, _values = controls.NUMBERS[across.value], ideal.value
-    _found = diagram(
-        {name: _values[name] for name in controls.NUMBERS},
-        across.value,
-        (_control.low, _control.high),
-        Y=_values["Y"],
-        V=_values["V"],
-    )
-    _axes = pictures["diagram"].set(_found, _values[across.value], shown=upwards.value)
+def _(html, mo, shown, sliders, time):
+    since = time.perf_counter()
+    _fault, motion, machine = shown.fault(sliders.value), None, None
+    if _fault is None:
+        try:
+            machine, _ = shown.at(sliders.value)
+            motion = shown.seen(sliders.value)
+        except ValueError as error:
+            _fault = str(error)
+    mo.stop(_fault is not None, mo.Html(f'<p id="fault">{html.escape(str(_fault))}</p>'))
+    return machine, motion, since
+
+
+@app.cell
+def _(across, draw_diagram, html, mo, motion, shown, sliders, tab, upwards):
+    mo.stop(tab.value != "Diagram" or motion is None or across.value is None)
+    _found = shown.diagram(sliders.value, across.value)
+    _axes = draw_diagram(_found, sliders.value[across.value], upwards.value)
     place = mo.ui.matplotlib(_axes, debounce=True)
-    mo.vstack([place, mo.md("*Click on the diagram to see the motion there.*")])
+    mo.vstack([place, mo.Html(
+        f'<p id="diagram">{html.escape(across.value)}: each value from the same start, '
+        f'{shown.before} cycles before {_found.low.shape[1]} are drawn. A click moves the '
+        f'slider there.</p>'
+    )])  # fmt: skip
     return (place,)
 
 
 @app.cell
-def _(across, controls, ideal, pick, place):
+def _(across, menu, pick, place, shown, sliders):
     if place.value:
+        _control = shown.controls[across.value]
         _middle = (place.value.x_min + place.value.x_max) / 2
-        pick({**ideal.value, across.value: controls.NUMBERS[across.value].nearest(_middle)})
+        _steps = round((_middle - _control.low) / _control.step)
+        _there = min(max(_control.low + _steps * _control.step, _control.low), _control.high)
+        pick((menu.value, {**sliders.value, across.value: _there}))
     return
 
 
 @app.cell
-def _(controls, ideal, look, mo, pictures, shown, stop_at, tab, time, which):
-    mo.stop(tab.value == "Motor")
-    stop_at(controls.fault(controls.IDEAL, ideal.value))
-    _since = time.perf_counter()
-    _scene, _start = controls.ideal(ideal.value)
-    _motion = look(_scene, _start, ideal.value["settle"])
-    _picture = pictures["ideal"].draw(_motion, ideal.value["gap"], which=which.value)
-    shown(_motion, _picture, _since)
+def _(b64encode, html, machine, mo, motion, picture, shown, since, tab, time, which):
+    mo.stop(tab.value == "Animation" or motion is None)
+    assert motion is not None
+    _png = picture.draw(motion, machine, which.value)
+    _words = {"": motion.fault or motion.stability, **shown.words(motion)}
+    _told = "; ".join(html.escape(f"{name} {text}".strip()) for name, text in _words.items())
+    _took = 1000 * (time.perf_counter() - since)
+    mo.Html(
+        f'<p id="regime"><b>{html.escape(motion.regime)}</b><br>{_told}</p>'
+        f'<img id="motion" style="max-width: 100%" alt="{html.escape(motion.regime)}" '
+        f'src="data:image/png;base64,{b64encode(_png).decode()}">'
+        f'<p id="took" style="opacity: 0.6"><small>redrawn in {_took:.0f} ms</small></p>'
+    )
     return
 
 
 @app.cell
-def _(controls, look, mo, motor, pictures, shown, stop_at, tab, time):
-    mo.stop(tab.value != "Motor")
-    stop_at(controls.fault(controls.MOTOR, motor.value))
-    _since = time.perf_counter()
-    _scene, _start = controls.motor(motor.value)
-    _motion = look(_scene, _start, motor.value["settle"])
-    _picture = pictures["motor"].draw(_motion, float(_scene.stops[0].gap))
-    shown(_motion, _picture, _since)
+def _(b64encode, gif_of, machine, mo, motion, moving, tab):
+    mo.stop(tab.value != "Animation" or motion is None)
+    assert motion is not None
+    mo.stop(not moving.value, mo.md("*Set the sliders, then let it move: some seconds of work.*"))
+    _gif = b64encode(gif_of(motion, machine)).decode()
+    mo.Html(
+        f'<img id="moving" style="max-width: 100%" alt="{motion.regime}" '
+        f'src="data:image/gif;base64,{_gif}">'
+    )
     return
 
 

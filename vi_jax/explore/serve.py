@@ -1,7 +1,8 @@
-"""The page, served on this machine."""
+"""The page, served on this machine by marimo."""
 
 import contextlib
 import importlib.util
+import ipaddress
 import os
 import secrets
 import socket
@@ -11,15 +12,16 @@ import webbrowser
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
-from . import controls
-from .diagram import diagram
-from .guard import Guard
-from .motion import prepare
 from .subject import Subject as Subject
 
 NEEDED = "marimo>=0.25"
 """What the page needs beside the library."""
+
+SERVED: list[tuple[str, Subject]] = []
+"""Last the name and the sliders of the machine that the page shows first, which runs on threads of
+this process, and gets nothing but its address."""
 
 
 def missing() -> str | None:
@@ -29,65 +31,37 @@ def missing() -> str | None:
     return f"the page needs marimo, which is not installed: pip install '{NEEDED}'"
 
 
-def compile_all(tell: Callable[[str], None]) -> None:
-    """Compile every program that a slider can need."""
-    tell("compiling the ideal drive")
-    values = controls.beginning(controls.IDEAL)
-    _ = prepare(*controls.ideal(values)).stability
-    tell("compiling the diagram")
-    name, control = next(iter(controls.NUMBERS.items()))
-    numbers = {name: values[name] for name in controls.NUMBERS}
-    diagram(numbers, name, (control.low, control.high), Y=values["Y"], V=values["V"])
-    tell("compiling the motor")
-    prepare(*controls.motor(controls.beginning(controls.MOTOR)))
-
-
-# What the page of a machine shows: its name and the machine. The page runs on threads of this
-# process, and gets nothing but its address.
-_SERVED: list[tuple[str, Subject]] = []
-
-
-def served() -> tuple[str, Subject] | None:
-    """The machine that is served beside the ready ones, and its name; `None` if there is none."""
-    return _SERVED[-1] if _SERVED else None
-
-
 def serve(
-    host: str,
-    port: int,
-    *,
-    browser: bool,
+    host: str, port: int, machine: tuple[str, Subject], *, browser: bool,
     tell: Callable[[str], None],
-    machine: tuple[str, Subject] | None = None,
-    paper: bool = True,
-) -> None:
+) -> None:  # fmt: skip
     """Serve the page until Ctrl-C, which ends the process.
 
     Its address, which is reported, holds a token without which nothing is answered.
 
-    **Arguments:** address and port to listen at (port 0: any that is free); whether to open a
-    browser; `tell`, called with lines about the progress; `machine`, the name and the sliders of
-    one to show instead of the paper's scene; `paper`, whether that is shown where no machine is
-    given, else the ready ones.
+    **Arguments:** address and port to listen at (port 0: any that is free); the machine to show
+    first and its name; whether to open a browser; `tell`, called with lines about the progress.
 
     **Raises:** `OSError` if it cannot listen there.
     """
     import marimo  # pyright: ignore[reportMissingImports]
     import uvicorn  # pyright: ignore[reportMissingImports]
 
+    page = str(Path(__file__).with_name("page.py"))
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.create_server((host, port), family=family) as listening:
-        if machine is not None:
-            machine[1].compile(tell)
-            _SERVED.append(machine)
-        elif paper:
-            compile_all(tell)
-        name = f"[{host}]" if ":" in host else host
+        machine[1].compile(tell)
+        SERVED.append(machine)
         port, token = listening.getsockname()[1], secrets.token_urlsafe(16)
-        address = f"http://{name}:{port}?access_token={token}"
-        app: Any = Guard(_page(marimo, port, token, machine is None and paper), host)
-        options = {"log_level": "warning", "timeout_graceful_shutdown": 1}
-        server = uvicorn.Server(uvicorn.Config(app, **options))
+        address = f"http://{f'[{host}]' if ':' in host else host}:{port}?access_token={token}"
+        made = marimo.create_asgi_app(quiet=True, token=token, skew_protection=True)
+        app: Any = made.with_app(path="", root=page).build()
+        # The cookie with the token is named by the port: a browser keeps one cookie of each name
+        # for all ports of a host, so that two of these servers would overwrite each other's.
+        for mounted in app.routes:
+            mounted.app.state.port = port
+        options: Any = {"log_level": "warning", "timeout_graceful_shutdown": 1}
+        server = uvicorn.Server(uvicorn.Config(guarded(app, host), **options))
         tell(f"serving {address} until Ctrl-C")
         if browser:  # it waits until it is answered
             threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
@@ -99,13 +73,28 @@ def serve(
     os._exit(0)
 
 
-def _page(marimo: Any, port: int, token: str, paper: bool) -> Any:
-    """The page as an ASGI app that answers only requests with the token."""
-    page = str(Path(__file__).with_name("page.py" if paper else "machine_page.py"))
-    made = marimo.create_asgi_app(quiet=True, token=token, skew_protection=True)
-    app = made.with_app(path="", root=page).build()
-    # The cookie with the token is named by the port: a browser keeps one cookie of each name for
-    # all ports of a host, so that two of these servers would overwrite each other's.
-    for mounted in app.routes:
-        mounted.app.state.port = port
-    return app
+def guarded(app: Any, host: str) -> Any:
+    """An ASGI app that refuses requests from the pages of others, which a browser may send too: by
+    another name of this machine (DNS rebinding), or with another origin.
+
+    **Arguments:** the app; the address that it listens at.
+    """
+    from starlette import datastructures, responses, websockets  # pyright: ignore
+    from starlette.middleware import trustedhost  # pyright: ignore
+
+    async def own_origin(scope: Any, receive: Any, send: Any) -> None:
+        if scope["type"] in ("http", "websocket"):
+            headers = datastructures.Headers(scope=scope)
+            origin = headers.get("origin")
+            if origin is not None and urlsplit(origin).netloc != headers.get("host"):
+                refusal: Any = responses.PlainTextResponse("this page answers to itself only", 403)
+                if scope["type"] == "websocket":
+                    refusal = websockets.WebSocketClose(1008)
+                return await refusal(scope, receive, send)
+        return await app(scope, receive, send)
+
+    local = host == "localhost"
+    with contextlib.suppress(ValueError):
+        local = ipaddress.ip_address(host).is_loopback
+    names = [host, "localhost", "127.0.0.1", "::1", "[::1]"] if local else ["*"]
+    return trustedhost.TrustedHostMiddleware(own_origin, allowed_hosts=names, www_redirect=False)

@@ -1,9 +1,9 @@
-"""Any machine on the page: sliders made of its numbers, and the machine at other values of them."""
+"""A machine on the page: sliders made of its numbers, its motions and its diagrams."""
 
 import inspect
 import time
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,29 +15,58 @@ from .._programs import compiled
 from ..flow import simulate
 from ..machine import (
     AbstractMachine,
+    Parameters,
+    Scene,
     check_again,
     components,
+    in_brackets,
     unit_of,
     with_leaf,
     with_unit,
 )
+from ..plot import axis_name
 from ..scans import taken_along
-from .controls import Control
-from .diagram import CYCLES, Diagram
 from .motion import Motion, look, prepare
 
 START, SETTLE = "start.", "cycles before"
 """How the sliders of the start are named, and that of the cycles before what is drawn."""
 
-ACROSS = 121
-"""Values across a diagram."""
+ACROSS, CYCLES = 241, 16
+"""Values across a diagram, and cycles of each that are drawn."""
+
+SHOWN = {
+    "least position in a cycle": "low", "position on the section": "position",
+    "velocity on the section": "velocity", "fastest impact in a cycle": "speed",
+}  # fmt: skip
+"""What a diagram can show upwards, with the array of a `Diagram`."""
 
 # Steps of a slider; sliders at most that are made by themselves; seconds within which a redrawing
 # computes, which with drawing is below 0.2; cycles before what is drawn at most. Choices.
 _STEPS, _MOST, _PATIENCE, _LONGEST = 400, 40, 0.08, 1000
 
-# Numbers that cycles before are tried with, to learn what one takes; and the fewest. Choices.
-_TRIED, _FEWEST = 40, 20
+# Cycles before that are tried, to learn how long one takes; the fewest; and rounding of a slider.
+_TRIED, _FEWEST, _ROUNDING = 40, 20, 1e-9
+
+
+class Control(NamedTuple):
+    """One slider: its label, its range, its step and its value when the page opens."""
+
+    label: str
+    low: float
+    high: float
+    step: float
+    value: float
+
+
+class Diagram(NamedTuple):
+    """What motions from one start settle on, over one number; arrays of shape (values, cycles)."""
+
+    label: str
+    values: np.ndarray
+    position: np.ndarray
+    velocity: np.ndarray
+    low: np.ndarray
+    speed: np.ndarray
 
 
 class Subject:
@@ -55,33 +84,40 @@ class Subject:
     ):
         self.machine, self.start = machine, machine.adopt(machine.start())
         given = {**getattr(machine, "slider_ranges", {}), **(ranges or {})}
-        numbers = {name: x for name, x in components(machine).items() if _is_real(x)}
-        numbers = {name: float(x) for name, x in numbers.items()}
+        real = lambda x: jnp.issubdtype(jnp.result_type(x), jnp.floating)
+        numbers = {name: float(x) for name, x in components(machine).items() if real(x)}
         begin = {f"{START}{name}": float(x) for name, x in components(self.start).items()}
         for name in given:
             if name not in numbers and name not in begin:
                 known = ", ".join([*numbers, *begin])
                 raise ValueError(f"A range must be of a number of the machine ({known}), "
                                  f"but is of {name!r}.")  # fmt: skip
-        asked = [name for name in numbers if name in given]
-        shown = [*asked, *(name for name in numbers if name not in given)][:_MOST]
-        self.names = tuple(name for name in numbers if name in shown)
-        """Of the machine's numbers that have sliders."""
+        first = sorted(numbers, key=lambda name: name not in given)[:_MOST]
+        self.names = tuple(name for name in numbers if name in first)
+        """The machine's numbers that have sliders."""
         self.controls: dict[str, Control] = {}
         for name, value in {**{x: numbers[x] for x in self.names}, **begin}.items():
             low, high = _range_of(machine, name, value)
             if name in given:
                 low, high = interval(f"ranges[{name!r}]", given[name])
             low, high = min(low, value), max(high, value)
-            unit = unit_of(machine.units, name.removeprefix(START))
-            label = f"{name} ({unit})" if unit not in ("", "1") else name
-            self.controls[name] = Control(label, low, high, _step_of(low, high, value), value)
+            low, step = _grid(low, high, value)
+            self.controls[name] = Control(_label(machine, name, numbers), low, high, step, value)
         self.controls[SETTLE] = Control(SETTLE, 0.0, _LONGEST, 1.0, 0.0)
         self.before = _FEWEST
         """Cycles before what a diagram shows."""
+        self._kept: tuple[Any, Any] = None, None
+
+    def fault(self, values: Mapping[str, Any]) -> str | None:
+        """What is wrong with values that did not come from the sliders, or `None`."""
+        for name, (label, low, high, _, _) in self.controls.items():
+            x = values.get(name)
+            if not (isinstance(x, int | float) and low - _ROUNDING <= x <= high + _ROUNDING):
+                return f"The {label} must be a number from {low:g} to {high:g}, but is {x!r}."
+        return None
 
     def at(self, values: Mapping[str, Any]) -> tuple[AbstractMachine, Any]:
-        """Machine and start at these places of the sliders.
+        """Machine and start at these values of the sliders.
 
         **Raises:** `ValueError` for numbers that the machine refuses.
         """
@@ -95,7 +131,7 @@ class Subject:
         return machine, start
 
     def seen(self, values: Mapping[str, Any]) -> Motion:
-        """The motion at these places of the sliders."""
+        """The motion at these values of the sliders."""
         return look(*self.at(values), int(values[SETTLE]))
 
     def compile(self, tell: Callable[[str], None]) -> None:
@@ -108,12 +144,10 @@ class Subject:
         self.controls[SETTLE] = Control(SETTLE, 0.0, float(fits), 1.0, float(min(300, fits)))
         if self.names:
             tell(f"compiling the diagram of the {name}")
-            values, one = self.beginning(), self.names[0]
-            self.diagram(values, one)
 
             def timed(cycles: int) -> None:
-                self.before = cycles
-                self.diagram(values, one)
+                self.before, self._kept = cycles, (None, None)
+                self.diagram(self.beginning(), self.names[0])
 
             self.before = _fitting(timed)
 
@@ -122,46 +156,61 @@ class Subject:
         return {name: control.value for name, control in self.controls.items()}
 
     def diagram(self, values: Mapping[str, Any], parameter: str) -> Diagram:
-        """What motions from the start settle on over one of the machine's numbers."""
-        machine, start = self.at(values)
-        control = self.controls[parameter]
-        across = np.linspace(control.low, control.high, ACROSS)
-        rows = np.tile([float(values[name]) for name in self.names], (ACROSS, 1))
-        rows[:, self.names.index(parameter)] = across
-        found = _settled(
-            machine, self.names, jnp.asarray(rows), start, jnp.asarray(float(self.before))
-        )
-        return Diagram(parameter, across, *map(np.asarray, found))
+        """What motions from the start settle on over one of the machine's numbers; kept while the
+        others do not change."""
+        key = [(name, x) for name, x in values.items() if name not in (parameter, SETTLE)]
+        if self._kept[0] != (parameter, key):
+            machine, start = self.at(values)
+            control = self.controls[parameter]
+            across = np.linspace(control.low, control.high, ACROSS)
+            rows = np.tile([float(values[name]) for name in self.names], (ACROSS, 1))
+            rows[:, self.names.index(parameter)] = across
+            found = _settled(
+                machine, self.names, jnp.asarray(rows), start, jnp.asarray(float(self.before))
+            )
+            made = Diagram(control.label, across, *map(np.asarray, found))
+            self._kept = (parameter, key), made
+        return self._kept[1]
 
     def words(self, motion: Motion) -> dict[str, str]:
-        """What stands beside the picture of a motion, by name."""
+        """What stands above the picture of a motion, by name."""
         units, (low, high) = self.machine.units, motion.extremes
         found = {"position": f"{low:.5g} … {high:.5g}"}
-        found = {name: with_unit(x, unit_of(units, name)) for name, x in found.items()}
-        for name, x in motion.quantities.items():
-            found[name] = with_unit(f"{x:.5g}", unit_of(units, name))
-        return found
-
-    @staticmethod
-    def stops(machine: AbstractMachine) -> np.ndarray:
-        """The places of the stops that limit what pictures show; NaN where there are none."""
-        places = [float(stop.place) for stop in machine.stops if stop.coordinate == 0]
-        return np.array(places or [np.nan])
+        found |= {name: f"{x:.5g}" for name, x in motion.quantities.items()}
+        return {name: with_unit(x, unit_of(units, name)) for name, x in found.items()}
 
 
-def ready() -> dict[str, type[AbstractMachine]]:
-    """The ready machines that can be made without numbers, by their names."""
-    kinds = {name: x for name, x in vars(machines).items() if inspect.isclass(x)}
-    return {
-        name: kind
-        for name, kind in sorted(kinds.items())
-        if issubclass(kind, AbstractMachine)
-        and all(p.default is not p.empty for p in inspect.signature(kind).parameters.values())
+# Ranges of the sliders of the paper's scene with either drive, and with one of them.
+_SCENE = {"stops.0.gap": (0.0, 5.0), "oscillator.damping_ratio": (0.0, 0.2),
+          "start.Y": (-5.0, 5.0), "start.V": (-5.0, 5.0)}  # fmt: skip
+_IDEAL = {"drive.frequency_ratio": (0.3, 2.5), **_SCENE}
+_MOTOR = {"drive.control": (0.3, 2.5), "start.W": (0.1, 2.5), **_SCENE}
+
+
+def ready() -> dict[str, Callable[[], Subject]]:
+    """What the page's menu offers: the paper's scene, and the ready machines that can be made
+    without numbers."""
+    ideal, motor = Scene.ideal(frequency_ratio=0.9, damping_ratio=0.01), Parameters().scene()
+    found: dict[str, Callable[[], Subject]] = {
+        "Scene, ideal drive": lambda: Subject(ideal, _IDEAL),
+        "Scene, motor": lambda: Subject(motor, _MOTOR),
     }
+    for name, kind in sorted(vars(machines).items()):
+        if inspect.isclass(kind) and issubclass(kind, AbstractMachine):
+            parameters = inspect.signature(kind).parameters.values()
+            if all(part.default is not part.empty for part in parameters):
+                make: Any = kind
+                found[name] = lambda make=make: Subject(make())
+    return found
 
 
-def _is_real(x: object) -> bool:
-    return jnp.issubdtype(jnp.result_type(x), jnp.floating)
+def _label(machine: AbstractMachine, name: str, numbers: Mapping[str, Any]) -> str:
+    """The field's symbol for a number, or its name where another number has the same symbol."""
+    if name.startswith(START):
+        return f"start {axis_name(name.removeprefix(START), machine.units)}"
+    label = axis_name(name, machine.units)
+    alone = sum(axis_name(other, machine.units) == label for other in numbers) == 1
+    return label if alone else in_brackets(name, unit_of(machine.units, name))
 
 
 def _range_of(machine: object, name: str, value: float) -> tuple[float, float]:
@@ -186,11 +235,18 @@ def _range_of(machine: object, name: str, value: float) -> tuple[float, float]:
     )
 
 
-def _step_of(low: float, high: float, value: float) -> float:
-    """The step of a slider: one of its places is the value, to which the page would move it."""
+def _grid(low: float, high: float, value: float) -> tuple[float, float]:
+    """The first place of a slider and its step, which is 1, 2 or 5 times a power of ten if the
+    value is a multiple of that; the value is among its places, or the page would move it."""
+    rough = (high - low) / _STEPS
+    power = 10.0 ** np.floor(np.log10(rough))
+    step = float(power * max(digit for digit in (1, 2, 5) if digit * power <= 1.001 * rough))
+    if abs(value / step - round(value / step)) < 1e-9:
+        first = value - int((value - low) / step + 1e-9) * step
+        return (0.0 if abs(first) < 1e-9 * step else float(f"{first:.12g}")), step
     if not low < value < high:
-        return (high - low) / _STEPS
-    return (value - low) / max(1, round(_STEPS * (value - low) / (high - low)))
+        return low, rough
+    return low, (value - low) / max(1, round((value - low) / rough))
 
 
 def _fitting(do: Callable[[int], Any]) -> int:
