@@ -264,3 +264,28 @@ def test_a_reset_that_is_hardly_reached_happens_where_turns_are_not_recorded():
 
     expected = np.where(depths > 0, 125.0, 25.0) - depths
     assert np.abs(np.asarray(run(depths)) - expected).max() < 1e-9
+
+
+@pytest.mark.parametrize("name", ["Adaptive", "FixedStep", "Taylor", "ExactFlight"])
+def test_what_estimates_an_error_takes_steps_half_as_long(name):
+    method, scene = getattr(vi, name)(), vi.Scene.ideal(frequency_ratio=0.9)
+    place = scene, jnp.array(0.3), scene.start()
+    assert float(method.tighter().longest(*place)) <= 0.5 * float(method.longest(*place))
+
+
+def test_an_estimate_shows_pushes_that_fall_between_the_stages():
+    """Each push that the run itself has missed, with the same tolerance or a hundredth of it."""
+    places = jnp.linspace(3.0, 4.2, 25)
+
+    @jax.jit
+    @jax.vmap
+    def run(place):
+        force = {"steady": -1.0, "sizes": jnp.zeros(5), "phases": jnp.zeros(5), "cycle": 12.0}
+        machine = Floor(**force, height=2.0, place=place, width=0.06)
+        run = vi.simulate(machine, STILL, 1, estimate=True, method=vi.Taylor(rtol=1e-9))
+        return run.y_max[0], run.errors.y_max[0]
+
+    top, error = map(np.asarray, run(places))
+    missed = top == 0
+    assert missed.any()
+    assert np.all(error[missed] > 1e-3)

@@ -120,9 +120,9 @@ def suggest_method(
     if exact:
         truth = best.tighter()
     elif stiff:
-        truth = Adaptive(diffrax.Kvaerno5(), rtol=1e-12)
-    else:
-        truth = Adaptive(rtol=1e-14)
+        truth = Adaptive(diffrax.Kvaerno5(), rtol=1e-12, steps_per_cycle=10)
+    else:  # at most half as long as the shortest steps that are tried
+        truth = Adaptive(rtol=1e-14, steps_per_cycle=2 * max(_STEPS))
     bench.truth = bench.result(truth)
     failed = int(np.sum(~np.isfinite(bench.truth[:, 0])))
     if failed:

@@ -150,7 +150,8 @@ class AbstractMethod(eqx.Module):
 
     @abc.abstractmethod
     def tighter(self) -> "AbstractMethod":
-        """A method of the same kind and much smaller error, by which this one's is estimated."""
+        """A method of the same kind and much smaller error, by which this one's is estimated. Its
+        steps are at most half as long, so that it sees what is briefer than a step, too."""
 
     def resize(self, error: Scalar) -> Scalar:
         """Factor from one step's length to the next one's."""

@@ -69,8 +69,8 @@ class ExactFlight(AbstractMethod):
         count("steps_per_cycle", self.steps_per_cycle, least=5)
 
     def tighter(self):
-        """Three more arcs: the difference is what rounding has grown to."""
-        return ExactFlight(self.steps_per_cycle + 3)
+        """Twice as many arcs: the difference is what rounding has grown to."""
+        return ExactFlight(2 * self.steps_per_cycle)
 
     def holds(self, machine):
         """Of a linear machine what rests is held; another one does not move as it rests."""

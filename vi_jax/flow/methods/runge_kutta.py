@@ -1,6 +1,6 @@
 """Steps by a diffrax Runge–Kutta solver, sized by its error or of fixed number."""
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jax.core import Tracer
 
 from ..._checks import count, require
 from ..._types import Scalar, State
@@ -50,6 +51,10 @@ def _sized_by(state: State, beside: Beside | None) -> tuple[State, dict[str, Sca
     return state, None if beside is None else beside.integrals
 
 
+def _number(x: Any) -> Any:
+    return x if x is None or isinstance(x, Tracer) else np.asarray(x)
+
+
 class Adaptive(AbstractMethod):
     """A diffrax Runge–Kutta solver with steps sized by its error estimate.
 
@@ -58,28 +63,24 @@ class Adaptive(AbstractMethod):
 
     **Arguments:** `solver` (default `Verner9()`, the fastest measured from 1e-7 on); `rtol`
     and `atol`, tolerances relative to each state component and absolute (in the machine's
-    dimensionless units; `atol` defaults to `rtol`).
+    dimensionless units; `atol` defaults to `rtol`); `steps_per_cycle`, the fewest steps in a cycle
+    (at least 5, the default).
 
     **Raises:** `TypeError` if the solver is neither explicit nor diagonally implicit Runge–Kutta,
-    `ValueError` for tolerances out of (0, 1].
+    `ValueError` for tolerances out of (0, 1], or fewer than 5 steps.
     """
 
     solver: Unrolled = eqx.field(default_factory=Verner9, converter=_unrolled)
     # Arrays, so that another tolerance is not another program.
-    rtol: np.ndarray | float = eqx.field(kw_only=True, default=1e-9, converter=np.asarray)
-    atol: np.ndarray | float | None = eqx.field(
-        kw_only=True, default=None, converter=lambda x: x if x is None else np.asarray(x)
-    )
+    rtol: Any = eqx.field(kw_only=True, default=1e-9, converter=_number)
+    atol: Any = eqx.field(kw_only=True, default=None, converter=_number)
+    steps_per_cycle: int = eqx.field(static=True, kw_only=True, default=5)  # pyright: ignore
 
     def __check_init__(self):
+        count("steps_per_cycle", self.steps_per_cycle, least=5)
         require("rtol", self.rtol, low=0.0, high=1.0, open_low=True)
         if self.atol is not None:
             require("atol", self.atol, low=0.0, high=1.0, open_low=True)
-
-    @property
-    def steps_per_cycle(self) -> int:
-        """Five: no step is longer than a fifth of a cycle, so that it holds one hump."""
-        return 5
 
     @property
     def adaptive(self) -> bool:
@@ -146,14 +147,9 @@ class Adaptive(AbstractMethod):
         return jnp.abs(h * error) / (atol + rtol * longest * jnp.max(jnp.abs(values)))
 
     def tighter(self):
-        """A hundredth of the tolerances.
-
-        Where the longest step allowed is short enough for both, they are the same: the error is
-        below the tolerance then.
-        """
-        tolerances = [self.rtol] if self.atol is None else [self.rtol, self.atol]
-        smaller = [x / 100 for x in tolerances]
-        return eqx.tree_at(lambda m: [m.rtol, m.atol][: len(smaller)], self, smaller)
+        """A hundredth of the tolerances, and steps at most half as long."""
+        steps, atol = 2 * self.steps_per_cycle, None if self.atol is None else self.atol / 100
+        return Adaptive(self.solver, rtol=self.rtol / 100, atol=atol, steps_per_cycle=steps)
 
     def resize(self, error):
         """0.9 · error^(-1/order), between 0.2 and 5."""

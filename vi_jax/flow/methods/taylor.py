@@ -108,10 +108,11 @@ class Taylor(AbstractMethod):
         return 0.0 if self.rtol is None else self.rtol
 
     def tighter(self):
-        """Twice the steps, or a hundredth of the tolerance."""
+        """Twice the steps, and a hundredth of the tolerance if there is one."""
+        steps = 2 * self.steps_per_cycle
         if self.rtol is None:
-            return Taylor(self.order, 2 * self.steps_per_cycle)
-        return Taylor(self.order + 4, self.steps_per_cycle, rtol=self.rtol / 100)
+            return Taylor(self.order, steps)
+        return Taylor(self.order + 4, steps, rtol=self.rtol / 100)
 
     def check(self, machine):
         """**Raises:** `ValueError` for a soft stop whose force has no series at first touch."""
