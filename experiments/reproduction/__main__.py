@@ -30,13 +30,20 @@ def main() -> int:
     )
     parser.add_argument("--out", type=Path, default=Path("reproduction"), help="folder to write to")
     out = parser.parse_args().out
-    found = reproduce(out, tell)
+    try:
+        found = reproduce(out, tell)
+    except KeyboardInterrupt:
+        print(f"interrupted; what was written is in {out}", file=sys.stderr)
+        return 130
+    except OSError as error:  # the folder cannot be written to
+        parser.exit(1, f"{error}\n")
     print("Claims and assumptions of the paper (Figures 3 and 4: ζ = 0.90, k = 0.50, Δ = 2a):")
     print(summary(found.claims))
     print(f"{len(found.faults)} faults of the printed text, with their numbers: report.md")
     print(f"Written to {out}: {', '.join(sorted(path.name for path in out.iterdir()))}")
     differing = differences(read(out / "report.json"), read(KEPT)) if KEPT.exists() else []
-    print(*(f"not as kept: {line}" for line in differing), sep="\n", end="", file=sys.stderr)
+    for line in differing:
+        print(f"not as in the kept report: {line}", file=sys.stderr)
     return int(bool(differing))
 
 

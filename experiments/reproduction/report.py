@@ -1,6 +1,7 @@
 """The reproduction in one go: figures, measured claims and faults, and a report of them."""
 
 import json
+import signal
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
@@ -72,7 +73,9 @@ def reproduce(out: Path, tell: Callable[[str], None]) -> Findings:
     called with each of `STEPS` as it begins. Double precision is needed.
     """
     out.mkdir(parents=True, exist_ok=True)
-    with ProcessPoolExecutor(1, get_context("spawn")) as second:
+    # Ctrl-C ends the other process too, without a traceback.
+    end = {"initializer": signal.signal, "initargs": (signal.SIGINT, signal.SIG_DFL)}
+    with ProcessPoolExecutor(1, get_context("spawn"), **end) as second:
         later = second.submit(figure_2, out)
         findings = _findings(out, _each(tell), later.result)
     (out / "report.json").write_text(as_json(findings), encoding="utf-8")
