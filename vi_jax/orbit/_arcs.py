@@ -127,7 +127,8 @@ def observe_arc(arc: CycleMap, state: State, impact_log: int) -> ObservedArc:
         assert log is not None and run.y_min is not None and run.y_max is not None
         met = run.sections if run.samples is None else run.samples.state
         own = run.modes if run.samples is None else run.samples.modes
-        none = jnp.zeros((arc.cycles, _places(arc, state), 0), x.dtype)
+        # Taken from the states, so that it depends on what is differentiated as the rest does.
+        none = in_rows(met)[1:].reshape(arc.cycles, _places(arc, state), -1)[:, :, :0]
         places, modes = (
             in_rows(rows)[1:].reshape(*none.shape[:2], -1) if rows is met or rows else none
             for rows in (met, own)
