@@ -7,11 +7,13 @@
 #
 # `python experiments/benchmarks/gpu.py` measures JAX's default device and prints a table, with
 # `--batch 500000` in larger batches. With `JAX_PLATFORMS=cpu` it measures the processor instead.
+# `--check` compares the numbers of every verb on that device with those of the processor.
 
 # %%
 import os
 import sys
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +23,7 @@ sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import vi_jax as vi
 from peer_codes.contest import note
 from peer_codes.entries import CYCLES, QUICK
@@ -110,5 +113,57 @@ def _rows(drive: str, method: Any, dtype: str) -> list[list[str]]:
 
 
 # %%
+def _verbs() -> Iterator[tuple[str, Callable[[], Any]]]:
+    """Yield calls of verbs, each with what it is called."""
+    scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.05)
+    ready: dict[str, Any] = {"Scene": scene, "Scene with motor": vi.Parameters().scene()}
+    kinds = ("ImpactPair", "Capsule", "ReliefValve", "Duffing", "BouncingBall")
+    ready |= {kind: getattr(vi.machines, kind)() for kind in kinds}
+    for name, machine in ready.items():
+        many = jax.tree.map(lambda x: x + jnp.linspace(0, 0.01, 64), machine.start())
+        run = jax.vmap(lambda start, machine=machine: vi.simulate(machine, start, 5).last)
+        yield f"`simulate`, {name}", lambda run=run, many=many: run(many)
+
+    def last(k):
+        machine = vi.Scene.ideal(frequency_ratio=0.9, restitution=k, gap=2.0)
+        return vi.simulate(machine, machine.start(), 20).last.Y
+
+    def orbit():
+        settled = vi.simulate(scene, scene.start(), 1, settle=60).last
+        return vi.find_orbit(scene, settled, cycles=2)
+
+    def branch():
+        found = vi.continue_orbit(orbit(), parameter="drive.frequency_ratio", bounds=(0.85, 0.95))
+        return found.to_xarray().y_min.values
+
+    axis, square = "drive.frequency_ratio", {"start.Y": (-1.0, 1.0), "start.V": (-1.0, 1.0)}
+    yield "`jax.jvp`", lambda: jax.jvp(last, (0.5,), (1.0,))
+    yield "`jax.grad`", lambda: jax.grad(last)(0.5)
+    yield "`find_orbit`", lambda: (orbit().state, jnp.abs(orbit().multipliers))
+    yield "`continue_orbit`", branch
+    yield "`lyapunov`", lambda: vi.lyapunov(scene, scene.start(), cycles=200).exponents
+    yield "`sweep`", lambda: vi.sweep(scene, axis, np.linspace(0.8, 0.9, 6), cycles=8).y_min
+    scanned = {axis: np.linspace(0.7, 1.1, 32)}
+    yield "`scan`", lambda: [x.values for x in vi.scan(scene, scanned, cycles=128).values()]
+    basins = lambda: vi.basins(scene, square, resolution=8, settle=60).data
+    yield "`basins`", lambda: [x.values for x in basins().values()]
+
+
+def checked() -> str:
+    """Return a table of the differences between JAX's default device and the processor."""
+    rows = []
+    for name, call in _verbs():
+        ours = jax.tree.leaves(call())
+        with jax.default_device(jax.devices("cpu")[0]):
+            theirs = jax.tree.leaves(call())
+        pairs = zip(ours, theirs, strict=True)
+        apart = [np.abs(np.asarray(a, float) - b) / (1 + np.abs(b)) for a, b in pairs]
+        worst = max((float(np.nanmax(x)) for x in apart if np.size(x)), default=float("nan"))
+        rows.append([name, f"{worst:.0e}"])
+        note(f"{rows[-1]}")
+    return table(["", "largest difference, relative to 1 + size"], rows)
+
+
+# %%
 if __name__ == "__main__":
-    print(measured())
+    print(checked() if "--check" in sys.argv else measured())
