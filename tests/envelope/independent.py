@@ -5,9 +5,10 @@ from math import cos, pi, sin
 from typing import Any
 
 import numpy as np
-from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from scipy.optimize import brentq
+
+from event_by_event import followed
 
 
 def root(function: Callable[[float], float], low: float, high: float, xtol: float) -> float:
@@ -78,18 +79,6 @@ def flown(zeta: float, xi: float, stops: list, Y: float, V: float, cycles: int) 
     return np.array(states)
 
 
-class Event:
-    """Ends a SciPy run where a function of the state rises through zero."""
-
-    terminal, direction = True, 1
-
-    def __init__(self, function: Callable[[Any], float]):
-        self.function = function
-
-    def __call__(self, t, x):
-        return self.function(x)
-
-
 def turned(motor: dict, stops: list, start: list, cycles: int, ratio: float = 0.0) -> np.ndarray:
     """Section states (Y, V, W) of the motor by SciPy's DOP853 in time, impacts as its events."""
 
@@ -110,19 +99,15 @@ def turned(motor: dict, stops: list, start: list, cycles: int, ratio: float = 0.
         torque -= motor["mu"] * du * ddu * W * W
         return [V, u - Y - 2 * motor["xi"] * V, torque / (1 + motor["mu"] * du**2), W]
 
-    events = [Event(lambda x: x[3] - 2 * pi)]
-    events += [Event(lambda x, sign=sign, gap=gap: sign * x[0] - gap) for sign, gap, _ in stops]
-    x, states = np.array([*start, 0.0]), [start]
-    while len(states) <= cycles:
-        run = solve_ivp(
-            rates, (0, 1e4), x, method="DOP853", rtol=3e-14, atol=1e-14, events=events, max_step=0.2
-        )
-        x = run.y[:, -1]
-        which = next(i for i, times in enumerate(run.t_events) if len(times))
-        if which == 0:
-            states.append(list(x[:3]))
-            x = np.array([*x[:3], 0.0])
-        else:
-            sign, gap, k = stops[which - 1]
-            x = np.array([sign * gap, -k * x[1], x[2], x[3]])
+    def ends(t, x):
+        states.append([*x[:3]])
+        return None if len(states) > cycles else [*x[:3], 0.0]
+
+    def hit(sign, gap, k):
+        return lambda t, x: sign * x[0] - gap, lambda t, x: [sign * gap, -k * x[1], *x[2:]]
+
+    states = [start]
+    events = [(lambda t, x: x[3] - 2 * pi, ends), *(hit(*stop) for stop in stops)]
+    options = {"rtol": 3e-14, "atol": 1e-14, "max_step": 0.2}
+    followed(rates, [*start, 0.0], 1e5, events, **options)
     return np.array(states)

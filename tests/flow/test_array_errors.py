@@ -3,7 +3,6 @@
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import pytest
 import vi_jax as vi
@@ -67,15 +66,6 @@ START = Rows(jnp.zeros(2), jnp.ones(2))
 def test_of_a_machine(machine, words):
     with pytest.raises((TypeError, ValueError), match=words):
         vi.simulate(machine, START, 2)
-
-
-@pytest.mark.parametrize("amplitude", ["a", None, 1j])
-def test_of_an_amplitude_by_a_function(amplitude):
-    with pytest.raises(TypeError, match="`noise` must hold real numbers, but its amplitude by"):
-        vi.simulate(
-            Springs(), START, 2, noise=vi.WhiteNoise({"v": lambda x: amplitude}),
-            key=jax.random.key(0),
-        )  # fmt: skip
 
 
 def test_of_a_whole_array_as_an_axis():

@@ -20,8 +20,8 @@ def scene_with(*stops, zeta=0.8, xi=0.05):
 def test_the_earlier_of_two_stops_acts(method):
     """A body so fast that a free step would take it through one stop and far beyond the other."""
     left, right = vi.RigidStop(1.1, 0.5, "left"), vi.RigidStop(1.05, 0.5)
-    for V, first, gap in ((40.0, 0, 1.05), (-40.0, 1, 1.1)):
-        scene = scene_with(right, left)
+    for V, first, gap, stops in ((40.0, 1, 1.05, (left, right)), (-40.0, 1, 1.1, (right, left))):
+        scene = scene_with(*stops)
         run = vi.simulate(scene, scene.start(V=V), 1, method=method, impact_log=3)
         assert list(np.asarray(run.impact_log.stop[0])) == [first, 1 - first, first]
         # Over so short a way the speed is that of the start but for spring and damping.
@@ -29,50 +29,25 @@ def test_the_earlier_of_two_stops_acts(method):
         assert float(run.impact_log.speed[0, 0]) == pytest.approx(40.0, rel=1e-2)
 
 
-@pytest.mark.parametrize("method", METHODS, ids=NAMES)
-def test_order_of_stops_does_not_matter(method):
-    left, right = vi.RigidStop(1.1, 0.7, "left"), vi.RigidStop(1.3, 0.6)
-    runs = [
-        vi.simulate(scene, scene.start(V=2.0), 6, method=method)
-        for scene in (scene_with(left, right), scene_with(right, left))
-    ]
-    np.testing.assert_allclose(runs[0].sections.Y, runs[1].sections.Y, atol=1e-12)
-    assert int(runs[0].impacts.sum()) > 6
-    assert float(runs[0].y_max.max()) <= 1.3 + 1e-12 and float(runs[0].y_min.min()) >= -1.1 - 1e-12
-
-
-@pytest.mark.parametrize("method", METHODS, ids=NAMES)
-def test_a_start_on_the_stop(method):
-    scene = scene_with(vi.RigidStop(2.0, 0.5))
-    away = vi.simulate(scene, scene.start(Y=2.0, V=-0.5), 1, method=method, impact_log=2)
-    into = vi.simulate(scene, scene.start(Y=2.0, V=1.0), 1, method=method, impact_log=2)
-    still = vi.simulate(scene, scene.start(Y=2.0, V=0.0), 1, method=method, impact_log=2)
-    assert int(into.impacts[0]) == int(away.impacts[0]) + 1
-    assert float(into.impact_log.phase[0, 0]) == pytest.approx(0.0, abs=1e-12)
-    assert float(into.impact_log.speed[0, 0]) == pytest.approx(1.0, abs=1e-9)
-    # With k = 0.5 both go on from (2, -0.5).
-    assert float(into.sections.Y[-1]) == pytest.approx(float(away.sections.Y[-1]), abs=1e-9)
-    first = float(still.impact_log.phase[0, 0])
-    assert np.isnan(first) or first > 1.0
-
-
-@pytest.mark.parametrize("depth", [1e-3, 1e-6, 1e-9, 1e-11])
 # A method cannot see a graze shallower than its own error: eight steps a cycle are too few here.
 @pytest.mark.parametrize("method", [*METHODS[:2], vi.FixedStep(steps_per_cycle=64)], ids=NAMES)
-def test_entry_and_exit_within_a_step(method, depth):
+def test_entry_and_exit_within_a_step(method):
     """A graze enters and leaves inside one step; just below the peak it is an impact."""
     free = scene_with(zeta=0.5)
     start = free.start(Y=0.2, V=1.5)
     run = vi.simulate(free, start, 1, method=method)
-    peak = float(run.y_max[0])
+    peak, depth = float(run.y_max[0]), np.array([1e-3, 1e-6, 1e-9, 1e-11])
     assert float(run.sections.Y[-1]) < peak - 0.1  # a peak of the motion, not the interval's end
-    scene = scene_with(vi.RigidStop(peak + depth, 1.0), zeta=0.5)
-    assert int(vi.simulate(scene, start, 1, method=method).impacts[0]) == 0
-    scene = scene_with(vi.RigidStop(peak - depth, 1.0), zeta=0.5)
-    run = vi.simulate(scene, start, 1, method=method, impact_log=1)
+
+    def lane(gap):
+        scene = scene_with(vi.RigidStop(gap, 1.0), zeta=0.5)
+        return vi.simulate(scene, start, 1, method=method, impact_log=1)
+
+    run = jax.vmap(lane)(jnp.concatenate([peak + depth, peak - depth]))
+    assert (run.impacts[:4] == 0).all()
     # V⁻² = 2 |Y''| depth at the peak, with |Y''| of order one.
-    speed = float(run.impact_log.speed[0, 0])
-    assert 0.5 * np.sqrt(depth) < speed < 3 * np.sqrt(depth)
+    speed = run.impact_log.speed[4:, 0, 0] / np.sqrt(depth)
+    assert (speed > 0.5).all() and (speed < 3).all()
 
 
 def test_a_poisoned_lane_harms_no_other():
@@ -103,14 +78,6 @@ def test_ends_with_a_reason():
     assert bool(run.result == vi.RESULTS.chatter)
     with pytest.raises(eqx.EquinoxRuntimeError):
         vi.simulate(pressed, pressed.start(), 3, throw=True, **options)
-
-
-def test_limits_of_restitution():
-    for k in (0.0, 1.0):
-        scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=k, gap=1.5, damping_ratio=0.05)
-        runs = [vi.simulate(scene, scene.start(V=1.0), 12, method=m) for m in METHODS[:2]]
-        assert all(bool(run.successful) for run in runs) and int(runs[0].impacts.sum()) > 3
-        np.testing.assert_allclose(runs[0].sections.Y, runs[1].sections.Y, atol=1e-6)
 
 
 @pytest.mark.parametrize(

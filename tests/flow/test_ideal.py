@@ -45,12 +45,10 @@ def test_table_of_values(row):
     "method",
     [
         vi.ExactFlight(),
-        vi.Adaptive(rtol=1e-9),
         vi.Adaptive(diffrax.Tsit5(), rtol=1e-9),
         vi.FixedStep(),
-        vi.FixedStep(diffrax.Tsit5(), 32),
     ],
-    ids=["ExactFlight", "Dopri8", "Tsit5", "fixed Dopri8", "fixed Tsit5"],
+    ids=["ExactFlight", "Tsit5", "fixed Dopri8"],
 )
 def test_from_rest_settles_on_the_4pi_motion(method):
     run = vi.simulate(SCENE, SCENE.start(), 200, method=method)
@@ -61,24 +59,40 @@ def test_from_rest_settles_on_the_4pi_motion(method):
     assert (first > -2.4).all()
 
 
-@pytest.mark.parametrize("xi", [0.0, 1e-4, 0.3, 1.0, 1.5, 10.0])
-@pytest.mark.parametrize("zeta", [1e-3, 0.4, 1.0, 1 + 1e-9, 1 - 1e-6, 1.001, 0.991, 1.011, 30.0])
-def test_flight_is_the_matrix_exponential(zeta, xi):
+def generator(zeta, xi):
+    """d/dτ of (Y, V, cos φ, sin φ) is this matrix times it, between impacts."""
+    matrix = np.zeros((*np.shape(zeta), 4, 4))
+    matrix[..., 0, 1], matrix[..., 1, 0], matrix[..., 1, 1] = 1.0, -1.0, -2 * xi
+    matrix[..., 1, 2], matrix[..., 2, 3], matrix[..., 3, 2] = 1.0, -zeta, zeta
+    return matrix
+
+
+def test_flight_is_the_matrix_exponential():
     """Under-, critically and over-damped, the secular case, and both sides of the near switch."""
+    zetas = [1e-3, 0.4, 1.0, 1 + 1e-9, 1 - 1e-6, 1.001, 0.991, 1.011, 30.0]
+    zeta, xi = map(np.ravel, np.meshgrid(zetas, [0.0, 1e-4, 0.3, 1.0, 1.5, 10.0]))
     draw = np.random.default_rng(0)
-    phase, Y, V = draw.uniform(0, 6.28), *draw.normal(size=2)
-    tau = 0.4 * np.pi / max(1.0, zeta, xi)
-    matrix = np.array([[0, 1, 0, 0], [-1, -2 * xi, 1, 0], [0, 0, 0, -zeta], [0, 0, zeta, 0.0]])
-    truth = expm(matrix * tau) @ [Y, V, np.cos(phase), np.sin(phase)]
-    found = jax.jit(flight)(*map(jnp.asarray, (zeta, xi, phase, Y, V, tau)))
-    np.testing.assert_allclose(found, truth[:2], atol=2e-13)
+    phase, (Y, V) = draw.uniform(0, 6.28), draw.normal(size=2)
+    tau = 0.4 * np.pi / np.maximum(1.0, np.maximum(zeta, xi))
+    found = jax.jit(jax.vmap(lambda z, x, t: flight(z, x, phase, Y, V, t)))(
+        *map(jnp.asarray, (zeta, xi, tau))
+    )
+    truth = expm(generator(zeta, xi) * tau[:, None, None]) @ [Y, V, np.cos(phase), np.sin(phase)]
+    np.testing.assert_allclose(np.stack(found, -1), truth[:, :2], atol=2e-13)
 
 
-def test_resonance_grows_secularly():
-    scene = vi.Scene.ideal(frequency_ratio=1.0, gap=None, damping_ratio=0.0)
-    run = vi.simulate(scene, scene.start(), 50, method=vi.ExactFlight())
-    # Y = (τ/2) sin τ: at rest on the stop-free section the velocity is τ/2 cos τ.
-    time = 2 * np.pi * np.arange(51)
-    np.testing.assert_allclose(run.sections.Y, 0.0, atol=1e-10)
-    np.testing.assert_allclose(run.sections.V, time / 2, atol=1e-10)
-    assert int(run.impacts.sum()) == 0
+def test_free_flight_over_cycles():
+    """No stop: under-, critically and over-damped, and both sides of the switch at resonance."""
+    near = [0.0, 1e-6, -1e-6, 1e-3, -1e-3, 9e-3, -9e-3, 1.1e-2, -1.1e-2]
+    zeta, xi = map(np.ravel, np.meshgrid([0.3, 2.7, *(1 + np.array(near))], [0.0, 0.3, 1.0, 1.5]))
+
+    def lane(zeta, xi):
+        scene = vi.Scene.ideal(frequency_ratio=zeta, gap=None, damping_ratio=xi)
+        return vi.simulate(scene, scene.start(Y=0.7, V=-0.4), 10, method=vi.ExactFlight()).sections
+
+    found = jax.jit(jax.vmap(lane))(jnp.asarray(zeta), jnp.asarray(xi))
+    found = np.stack([found.Y, found.V], -1)
+    for n in range(11):
+        time = 2 * np.pi * n / zeta
+        whole = expm(generator(zeta, xi) * time[:, None, None]) @ [0.7, -0.4, 1.0, 0.0]
+        np.testing.assert_allclose(found[:, n], whole[:, :2], atol=1e-11)

@@ -30,10 +30,10 @@ def test_inverse_of_small_matrices():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("torque", [1e2, 1e4, 1e6])
-def test_strong_motors_beside_scipy(torque):
-    scene = strong(torque)
-    run = vi.simulate(scene, scene.start(), 4, method=IMPLICIT)
+@pytest.mark.parametrize("clock", ["phase", "time"])
+def test_a_strong_motor_beside_scipy(clock):
+    scene = strong(1e4)
+    run = vi.simulate(scene, scene.start(), 4, method=IMPLICIT, clock=clock)
     drive, (stop,), start = scene.drive, scene.stops, scene.start()
     truth = integrated(
         {
@@ -60,16 +60,6 @@ def test_steps_do_not_grow_with_the_motor():
 
     counts = steps(jnp.array([1e1, 1e2, 1e4, 1e6, 1e8]))
     assert int(counts.max()) < 1.2 * int(counts.min())
-
-
-@pytest.mark.slow
-def test_both_clocks_agree():
-    scene = strong(1e3)
-    phase, time = (vi.simulate(scene, scene.start(), 8, method=IMPLICIT, clock=c)
-                   for c in ("phase", "time"))  # fmt: skip
-    np.testing.assert_allclose(phase.sections.Y, time.sections.Y, atol=1e-6)
-    np.testing.assert_allclose(phase.duration, time.duration, atol=1e-6)
-    np.testing.assert_array_equal(phase.impacts, time.impacts)
 
 
 @pytest.mark.slow

@@ -102,10 +102,9 @@ def test_ten_numbers_are_one_program(traces, name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["own", "pair", "paper"])
-def test_ten_numbers_are_one_program_to_find_orbits(traces, name):
+def test_ten_numbers_are_one_program_to_find_orbits(traces):
     for x in NUMBERS:
-        machine = MACHINES[name](x)
+        machine = MACHINES["own"](x)
         vi.find_orbit(machine, machine.start(), impact_log=11)  # a program that no other test has
     assert traces["find_orbit"] == 1
 
@@ -122,14 +121,3 @@ def test_a_number_written_as_a_whole_one_is_not_cut_off():
     same = replace(machine, shaking=1.5)
     a, b = (vi.simulate(m, m.start(), 11).last.Y for m in (machine, same))
     assert float(machine.shaking) == 1.5 and float(a) == float(b)
-
-
-def test_derivatives_by_a_number_that_was_a_float():
-    def last(x):
-        machine = Shaken(shaking=x)
-        return vi.simulate(machine, machine.start(), 11).last.Y
-
-    slope = (last(1.05 + 1e-5) - last(1.05 - 1e-5)) / 2e-5
-    np.testing.assert_allclose(jax.grad(last)(1.05), slope, rtol=1e-6)
-    many = jax.vmap(last)(jnp.array([1.05, 1.06]))
-    np.testing.assert_allclose(many, [last(1.05), last(1.06)], rtol=1e-12)

@@ -74,11 +74,9 @@ def test_a_traced_settle_is_a_number_of_cycles_or_the_lane_is_refused():
     np.testing.assert_array_equal(again[-1], Y[-1])
 
 
-@pytest.mark.parametrize("place", ["restitution", "damping_ratio"])
-def test_a_known_number_put_in_ends_as_bad_start(place):
-    value = dict(zip(PLACES, OUTSIDE, strict=True))[place]
+def test_a_known_number_put_in_ends_as_bad_start():
     base = vi.Scene.ideal(frequency_ratio=0.9, damping_ratio=0.05)
-    scene = eqx.tree_at(PLACES[place], base, jnp.asarray(value))
+    scene = eqx.tree_at(PLACES["damping_ratio"], base, jnp.asarray(-0.9))
     run = vi.simulate(scene, scene.start(), 2)
     assert run.result == vi.RESULTS.bad_start
 

@@ -31,20 +31,6 @@ def test_samples_refine_the_sections(method):
     )
 
 
-@pytest.mark.slow
-def test_samples_of_a_motor_in_both_clocks():
-    scene = vi.Parameters().scene()
-    runs = [
-        vi.simulate(scene, scene.start(), 5, method=vi.Adaptive(rtol=1e-11), samples=16, clock=c)
-        for c in ("phase", "time")
-    ]
-    for name in ("Y", "V", "W"):
-        a, b = (getattr(run.samples.state, name) for run in runs)
-        np.testing.assert_allclose(a, b, atol=1e-7)
-    np.testing.assert_allclose(runs[0].samples.time, runs[1].samples.time, atol=1e-7)
-    np.testing.assert_allclose(runs[0].duration, runs[1].duration, atol=1e-7)
-
-
 def test_sections_only():
     full = vi.simulate(SCENE, SCENE.start(), 9)
     lean = vi.simulate(SCENE, SCENE.start(), 9, record="sections")

@@ -1,8 +1,6 @@
 """Impacts, chatter, rest and release beside an independent code (`tests/truth.py`)."""
 
-import importlib.util
 from functools import cache
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -10,17 +8,11 @@ import numpy as np
 import pytest
 import vi_jax as vi
 
-from differences import some
-
-PATH = Path(__file__).parents[1] / "truth.py"
-spec = importlib.util.spec_from_file_location("truth", PATH)
-assert spec is not None and spec.loader is not None
-truth = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(truth)
+import truth
 
 CYCLES = 4
 METHODS = {
-    "exact": (vi.ExactFlight(), 1_000, 1e-9),
+    "exact": (vi.ExactFlight(), 4_000, 1e-9),
     "fixed": (vi.FixedStep(), 256, 1e-6),
     "adaptive": (vi.Adaptive(rtol=1e-12), 256, 1e-8),
 }
@@ -118,11 +110,6 @@ def test_a_start_at_rest_just_short_of_the_stop():
     assert (rests == expected).all(axis=1)[clear].mean() > 0.999
 
 
-@pytest.mark.parametrize("seed", some(range(1, 11), 1))
-def test_a_hundred_thousand_random_lanes(seed):
-    check("exact", 10_000, seed)
-
-
 @pytest.mark.parametrize("method", [vi.ExactFlight(), vi.FixedStep(), vi.Adaptive(rtol=1e-13)])
 def test_a_deep_stop_lets_go_for_a_moment(method):
     """Between two steps' ends the force turns and turns back; ζ = 1, ξ = 0 for SciPy alone."""
@@ -167,8 +154,6 @@ def machine(drive, clock, stops):
     [
         ("ideal", "time", 2),
         ("motor", "phase", 1),
-        ("ideal", "phase", 2),
-        ("motor", "time", 1),
         ("motor", "time", 2),
     ],
 )

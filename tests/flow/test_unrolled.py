@@ -8,10 +8,7 @@ import optimistix as optx
 import pytest
 import vi_jax as vi
 
-SOLVERS = [
-    diffrax.Tsit5(), diffrax.Dopri5(), diffrax.Dopri8(), diffrax.Bosh3(),
-    diffrax.Heun(), diffrax.Euler(),
-]  # fmt: skip
+SOLVERS = [diffrax.Tsit5(), diffrax.Dopri5(), diffrax.Dopri8(), diffrax.Bosh3(), diffrax.Heun()]
 NAMES = [type(solver).__name__ for solver in SOLVERS]
 
 
@@ -23,7 +20,7 @@ TERM = diffrax.ODETerm(field)
 START = {"x": jnp.asarray(0.3), "v": jnp.asarray(-0.7)}
 
 
-@pytest.mark.parametrize("solver", SOLVERS[:5], ids=NAMES[:5])
+@pytest.mark.parametrize("solver", SOLVERS, ids=NAMES)
 def test_step_is_that_of_diffrax(solver):
     args = 0.1
     hidden = solver.init(TERM, 0.2, 0.5, START, args)
@@ -39,8 +36,9 @@ def test_step_is_that_of_diffrax(solver):
         np.testing.assert_allclose(a["x"], b["x"], rtol=1e-14)
 
 
-@pytest.mark.parametrize("solver", SOLVERS[:3], ids=NAMES[:3])
-def test_serves_diffeqsolve(solver):
+def test_serves_diffeqsolve():
+    solver = diffrax.Dopri8()
+
     def solve(solver):
         return diffrax.diffeqsolve(
             TERM, solver, 0.0, 20.0, 0.1, START, args=0.1,
@@ -53,9 +51,9 @@ def test_serves_diffeqsolve(solver):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", [diffrax.Kvaerno3, diffrax.Kvaerno4, diffrax.Kvaerno5])
-def test_an_implicit_step_is_that_of_diffrax(kind):
-    solver, args = kind(root_finder=optx.Newton(rtol=1e-13, atol=1e-13)), 0.1
+def test_an_implicit_step_is_that_of_diffrax():
+    kind, args = diffrax.Kvaerno5, 0.1
+    solver = kind(root_finder=optx.Newton(rtol=1e-13, atol=1e-13))
     times = jnp.asarray(0.2), jnp.asarray(0.5)
     hidden = solver.init(TERM, *times, START, args)
     original = solver.step(TERM, *times, START, args, hidden, jnp.asarray(True))

@@ -8,8 +8,10 @@ import pytest
 import vi_jax as vi
 from scipy.integrate import solve_ivp
 
+from belts import Belt
 from den_hartog import den_hartog
 from differences import check_derivatives
+from event_by_event import followed
 
 CLOSE = vi.Adaptive(rtol=1e-12)
 
@@ -77,22 +79,20 @@ def stops_in_a_cycle(V):
     return int((stands & ~np.roll(stands, 1)).sum())
 
 
-@pytest.mark.parametrize("r", [0.6, 0.75, 0.9, 1.2, 1.6, 2.5])
-def test_den_hartog(r):
-    limit = den_hartog(r, 0.0)[1]
-    shares = jnp.asarray([0.3, 0.7, 0.97, 1.05, 1.2])
+def test_den_hartog():
+    ratios, shares = (0.6, 0.75, 0.9, 1.2, 1.6, 2.5), (0.3, 0.7, 0.97, 1.05, 1.2)
+    cases = [(r, share, share * den_hartog(r, 0.0)[1]) for r in ratios for share in shares]
 
-    def settled(share):
-        numbers = 1.0, r, share * limit, 1.0
-        return rubbing(tuple(map(jnp.asarray, numbers)), jnp.asarray(0.1), 1, settle=400,
-                       samples=400, method=vi.Adaptive(rtol=1e-11))  # fmt: skip
+    def settled(r, _, level):
+        return rubbing((1.0, r, level, 1.0), jnp.asarray(0.1), 1, settle=400, samples=400,
+                       method=vi.Adaptive(rtol=1e-11))  # fmt: skip
 
-    run = vi.jit(jax.vmap(settled))(shares)
+    run = vi.jit(jax.vmap(settled))(*map(jnp.asarray, zip(*cases, strict=True)))
     assert bool(run.successful.all())
-    for i, share in enumerate(np.asarray(shares)):
+    for i, (r, share, level) in enumerate(cases):
         stops = stops_in_a_cycle(run.samples.state.V[i])
         if share < 1:
-            amplitude = den_hartog(r, share * limit)[0]
+            amplitude = den_hartog(r, level)[0]
             np.testing.assert_allclose(run.y_max[i, 0], amplitude, atol=1e-9)
             np.testing.assert_allclose(run.y_min[i, 0], -amplitude, atol=1e-9)
             assert stops == 0
@@ -102,15 +102,13 @@ def test_den_hartog(r):
             assert stops == 2
 
 
-@pytest.mark.slow
 def test_friction_that_holds_everything():
-    held = rubbing((0.5, 0.7, 0.6, 1.0), jnp.asarray(0.05), 3, samples=20)
-    np.testing.assert_array_equal(held.samples.state.Y, 0.05)
-    assert bool(held.successful)
-    # More of it while it sticks than while it slides: off it goes at another force.
-    moved = rubbing((0.5, 0.7, 0.3, 1.5), jnp.asarray(0.0), 1, samples=200)
-    still = rubbing((0.5, 0.7, 0.3, 1.7), jnp.asarray(0.0), 1, samples=200)
-    assert float(moved.y_max[0]) > 0.01 and float(still.y_max[0]) == 0
+    """More of it while it sticks than while it slides: off it goes at another force."""
+    cases = jnp.array([(0.6, 1.0, 0.05), (0.3, 1.5, 0.0), (0.3, 1.7, 0.0)])
+    run = jax.vmap(lambda x: rubbing((0.5, 0.7, x[0], x[1]), x[2], 1))(cases)
+    assert bool(run.successful.all())
+    assert float(run.y_min[0, 0]) == float(run.y_max[0, 0]) == 0.05
+    assert float(run.y_max[1, 0]) > 0.01 and float(run.y_max[2, 0]) == 0
 
 
 def integrated(A, w, f, ratio, Y0, duration):
@@ -125,26 +123,17 @@ def integrated(A, w, f, ratio, Y0, duration):
     def change(t, x):
         return abs(pull(t, x)) - f * ratio if mode == 0 else -mode * x[1]
 
-    change.terminal, change.direction = True, 1
-
     def set_off(t, x):
         return 0 if abs(pull(t, x)) <= f * ratio else np.sign(pull(t, x))
 
-    t, x, changes = 0.0, np.array([Y0, 0.0]), 0
-    mode = set_off(t, x)
-    while t < duration - 1e-14:
-        found = solve_ivp(
-            rate, (t, duration), x, method="DOP853", rtol=1e-13, atol=1e-14, events=change,
-            max_step=0.05,
-        )  # fmt: skip
-        t, x = found.t[-1], found.y[:, -1].copy()
-        if found.status == 1:
-            changes += 1
-            if mode == 0:
-                mode = np.sign(pull(t, x))
-            else:
-                x[1], mode = 0.0, set_off(t, x)
-    return x, changes
+    def changed(t, x):
+        nonlocal mode
+        mode = np.sign(pull(t, x)) if mode == 0 else set_off(t, x)
+        return x[0], 0.0
+
+    mode = set_off(0.0, [Y0])
+    _, x, met = followed(rate, (Y0, 0.0), duration, [(change, changed)], max_step=0.05)
+    return x, len(met)
 
 
 def drawn(number):
@@ -244,3 +233,39 @@ def test_wrong_numbers_are_named(arguments, told):
             force=lambda machine, s, x: -x.Y,
             stopped=lambda machine, x: x,
         )
+
+
+def falling(speed):
+    """Friction of the belt that `belts` has, for SciPy."""
+    return 0.5 + 0.5 * np.exp(-2 * speed)
+
+
+def slip(speed, until):
+    """A slip by SciPy, from where it begins."""
+
+    def field(t, x):
+        return [x[1], -x[0] - 0.1 * x[1] + falling(speed - x[1])]
+
+    until.terminal, until.direction = True, 1
+    start = [1.0 - 0.1 * speed, speed - 1e-13]
+    found = solve_ivp(field, (0, 20), start, "DOP853", events=until, rtol=1e-12, atol=1e-13)
+    return found.t_events[0][0], found.y_events[0][0]
+
+
+def furthest_back(t, x):
+    return x[1]
+
+
+def test_sticking_and_slipping_where_friction_falls_with_the_speed():
+    """One slip from the force that friction holds to the belt's speed, then sticking at it."""
+    speed = 1.5
+    start = vi.OscillatorState(jnp.asarray(0.5 - 0.1 * speed), jnp.asarray(speed))
+    run = vi.simulate(Belt(), start, 4, method=CLOSE)
+    slips, (Y, _) = slip(speed, lambda t, x: x[1] - speed + 1e-15 if t > 1 else -1.0)
+    _, (back, _) = slip(speed, furthest_back)
+    sticks = (1.0 - 0.1 * speed - Y) / speed
+    assert float(run.duration[-1]) == pytest.approx(slips + sticks, abs=1e-8)
+    assert float(run.y_min[-1]) == pytest.approx(back, abs=1e-8)
+    np.testing.assert_allclose(
+        run.duration[1:], run.duration[-1], atol=1e-9
+    )  # it forgets its start

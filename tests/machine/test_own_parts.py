@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-from scipy.integrate import solve_ivp
 
+from event_by_event import followed
+from rubbing import Rubbing
 from thrown import thrown
 
 CLOSE = vi.Adaptive(rtol=1e-12)
@@ -72,24 +73,10 @@ def wound_down(turns):
         shaft = 0.004 * T - 1.5 * W + 0.05 * np.sin(phase) * stretch
         return [V, stretch - 2 * XI * V, shaft, -W, W]
 
-    def meets(_, x):
-        return x[0] - REACH
-
-    def ends(_, x):
-        return x[4] - 2 * np.pi * turns
-
-    for event in (meets, ends):
-        event.terminal, event.direction = True, 1
-    t, x = 0.0, np.array([0.3, 0.0, 1.0, 380.0, 0.0])
-    for _ in range(1000):
-        found = solve_ivp(
-            field, (t, 1e4), x, method="DOP853", events=(meets, ends), rtol=1e-12, atol=1e-13
-        )
-        t, x = found.t[-1], found.y[:, -1]
-        if len(found.t_events[1]):
-            return x
-        x[0], x[1] = REACH, -0.6 * x[1]
-    raise AssertionError
+    meets = lambda t, x: x[0] - REACH, lambda t, x: [REACH, -0.6 * x[1], *x[2:]]
+    ends = lambda t, x: x[4] - 2 * np.pi * turns, lambda t, x: None
+    start = (0.3, 0.0, 1.0, 380.0, 0.0)
+    return followed(field, start, 1e4, [meets, ends], rtol=1e-12, atol=1e-13)[1]
 
 
 @pytest.mark.parametrize("clock", ["phase", "time"])
@@ -145,37 +132,20 @@ def test_laws_that_cannot_be_are_refused():
         vi.SoftStop(0.2, 100.0, law=lambda depth: depth)  # pyright: ignore
 
 
-class Pressed(vi.AbstractMachine):
+def pressed(varies):
     """x'' = -x - friction under a load that varies, μ (1 + c cos 2s); by time."""
 
-    varies: jax.Array = eqx.field(converter=jnp.asarray)
-    stops: tuple = ()
+    def load(machine, s, x):
+        return 1 + machine.numbers["varies"] * jnp.cos(2 * s)
 
-    @property
-    def switches(self):
-        return (
-            vi.DryFriction(
-                0.1,
-                load=lambda machine, s, x: 1 + machine.varies * jnp.cos(2 * s),
-                velocity=lambda machine, x: x.V,
-                force=lambda machine, s, x: -x.Y,
-                stopped=lambda machine, x: vi.OscillatorState(x.Y, 0 * x.V),
-            ),
-        )
-
-    @property
-    def cycle(self):
-        return 2 * jnp.pi
-
-    def field(self, s, x, mode):
-        return vi.OscillatorState(x.V, -x.Y + self.switches[0].contribution(self, s, x, mode))
+    return Rubbing(lambda machine, s, x: -x.Y, 0.1, {"varies": varies}, load)
 
 
 @pytest.mark.parametrize("varies", [-0.5, 0.8])
 def test_friction_follows_its_load(varies):
     """From 1 at rest x = μ (1 - (c/3) cos 2s) + A cos s until it stops, half a turn later."""
     start = vi.OscillatorState(jnp.asarray(1.0), jnp.asarray(0.0))
-    run = vi.simulate(Pressed(varies), start, 1, method=CLOSE, event_log=2)
+    run = vi.simulate(pressed(varies), start, 1, method=CLOSE, event_log=2)
     assert float(run.event_log.phase[0, 0]) == pytest.approx(np.pi, rel=1e-9)
     place = 0.2 - 1 - 0.2 * varies / 3
     assert float(run.y_min[0]) == pytest.approx(place, rel=1e-9)
@@ -185,6 +155,6 @@ def test_friction_follows_its_load(varies):
 def test_friction_that_holds_lets_go_as_its_load_falls():
     """Pulled with 0.12 where friction holds from 0.02 to 0.18."""
     start = vi.OscillatorState(jnp.asarray(-0.12), jnp.asarray(0.0))
-    run = vi.simulate(Pressed(0.8), start, 1, method=CLOSE, event_log=1)
+    run = vi.simulate(pressed(0.8), start, 1, method=CLOSE, event_log=1)
     # 0.1 (1 + 0.8 cos 2s) = 0.12
     assert float(run.event_log.phase[0, 0]) == pytest.approx(0.5 * np.arccos(0.25), rel=1e-9)

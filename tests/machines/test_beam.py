@@ -1,11 +1,9 @@
 """A cantilever by its modes: frequencies, shapes and responses in closed form; a stop; a bar."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-from jax.flatten_util import ravel_pytree
 
 BETA = (1.8751040687119611, 4.694091132974175, 7.854757438237613, 10.995540734875467)
 
@@ -39,57 +37,6 @@ def test_responses_of_the_whole_beam():
     pushed = vi.machines.Beam(shaken="tip", **many)
     bent = np.sum(tip * np.asarray(pushed.forces[1]) / np.asarray(pushed.stiffness))
     np.testing.assert_allclose(bent, 0.3 * 1.5**3 / (3 * 2.0), rtol=1e-6)
-
-
-def test_a_beam_without_a_stop():
-    assert vi.machines.Beam(modes=2, gap=None).stops == ()
-
-
-@pytest.mark.slow
-def test_beside_adaptive_steps():
-    """With a stop along it, and turning points and impacts recorded."""
-    beam = vi.machines.Beam(modes=3, gap=0.06, place=0.8, restitution=0.6)
-    runs = [vi.simulate(beam, beam.start(), 8, method=m) for m in (None, vi.Adaptive(rtol=1e-12))]
-    assert int(runs[0].impacts.sum()) > 5
-    np.testing.assert_array_equal(runs[0].impacts, runs[1].impacts)
-    np.testing.assert_allclose(runs[0].y_min, runs[1].y_min, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(runs[0].y_max, 0.06, rtol=0, atol=1e-12)
-    for a, b in zip(*(jax.tree.leaves(run.last) for run in runs), strict=True):
-        np.testing.assert_allclose(a, b, rtol=0, atol=1e-8)
-    assert int(runs[0].steps) < int(runs[1].steps)
-
-
-@pytest.mark.parametrize(
-    ("argument", "value", "error"),
-    [("modes", 0, ValueError), ("place", 0.0, ValueError),
-     ("place", 1.1, ValueError), ("damping_ratio", [0.1, 0.1], ValueError),
-     ("shaken", "middle", ValueError), ("length", 0.0, ValueError)],
-)  # fmt: skip
-def test_what_is_no_beam(argument, value, error):
-    with pytest.raises(error, match=f"`{argument}`"):
-        vi.machines.Beam(**{argument: value})
-
-
-@pytest.mark.exhaustive
-def test_a_periodic_motion_of_many_modes():
-    """Newton's method on the cycle map, whose Jacobian is that of differences."""
-    beam = vi.machines.Beam(
-        modes=20, gap=0.3, restitution=0.6, damping_ratio=0.03, frequency=3.4, amplitude=0.02
-    )
-    with vi.backend("xla"):
-        run = vi.simulate(beam, beam.start(), 1, settle=100, max_impacts=10_000)
-        x, unravel = ravel_pytree(run.last)
-        the_map = vi.cycle_map(beam)
-        for _ in range(3):
-            missing, slope = (
-                ravel_pytree(the_map.residual(unravel(x)))[0],
-                the_map.jacobian(unravel(x)),
-            )
-            x = x - jnp.linalg.solve(slope - jnp.eye(40), missing)
-        assert int(run.impacts[0]) > 0 and np.abs(missing).max() < 1e-10
-        for i in (0, 1, 20, 25):
-            ends = [ravel_pytree(the_map(unravel(x.at[i].add(h))))[0] for h in (1e-7, -1e-7)]
-            np.testing.assert_allclose((ends[0] - ends[1]) / 2e-7, slope[:, i], atol=1e-5)
 
 
 @pytest.mark.slow

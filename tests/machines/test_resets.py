@@ -8,10 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-from scipy.integrate import solve_ivp
-from scipy.optimize import brentq
+from scipy.linalg import expm
+from scipy.optimize import brentq, fsolve
 
+from event_by_event import followed
 from resets import (
+    A,
     Excited,
     Sliding,
     StickSlip,
@@ -80,46 +82,10 @@ def test_a_kind_of_event_of_ones_own(walk):
     assert float(run.event_log.value[0, 0]) == pytest.approx(turning, abs=1e-9)
 
 
-@pytest.mark.exhaustive
-def test_a_walker_doubles_its_step(walk):
-    """As where a section and what begins anew with it say the same."""
-    branch = vi.continue_orbit(walk, parameter="slope", bounds=(0.008, 0.017))
-    (doubling,) = branch.special
-    assert doubling.kind == "period-doubling"
-    assert doubling.parameter == pytest.approx(0.01508843794, abs=1e-10)
-    np.testing.assert_allclose(branch.y_min, -branch.y_max, atol=1e-12)
-    twice = doubling.switch(distance=0.002)
-    assert int(twice.cycles) == 2 and bool(twice.successful)
-    again = vi.find_orbit(twice.machine, twice.state, cycles=2, method=CLOSE)
-    np.testing.assert_allclose(again.state.stance, twice.state.stance, atol=1e-9)
-
-
-@pytest.mark.slow
-def test_exponents_of_a_walk_are_its_multipliers(walk):
-    found = vi.lyapunov(Walker(0.009).observed_every(2.0), walk.state, 300, settle=20, number=3)
-    per_time = np.log(abs(PAIR)) / STEP
-    np.testing.assert_allclose(found.exponents, [0.0, per_time, per_time], atol=2e-3)
-
-
 def test_equal_times_are_asked_of_the_machine():
     start = tuple(map(jnp.asarray, (1.0, 0.7955, 0.2343)))
     with pytest.raises(ValueError, match="an event that ends its cycles but no `observed_every`"):
         vi.lyapunov(ThreeStates(1.8).observed_every(1.0), start, 4)
-
-
-@pytest.mark.slow
-def test_derivatives_pass_through_a_reset():
-    """Of the state after three steps by the slope: forward, backward and by differences."""
-
-    def last(slope):
-        run = vi.simulate(Walker(slope), legs(0.2003, -0.1998), 3, method=CLOSE)
-        return run.last.turning
-
-    forward, backward = jax.jacfwd(last)(0.009), jax.grad(last)(0.009)
-    h = 1e-6
-    by_differences = (last(0.009 + h) - last(0.009 - h)) / (2 * h)
-    assert float(forward) == pytest.approx(float(by_differences), rel=1e-6)
-    assert float(backward) == pytest.approx(float(forward), rel=1e-12)
 
 
 def slid(voltage, x, cycles):
@@ -131,26 +97,27 @@ def slid(voltage, x, cycles):
             return [x[1], 3.17 + 1.2 * force, -3.17 - 0.2 * force]
         return [x[1], force, -x[2]]
 
-    def hits(t, x):
-        return x[0] - 0.5
+    def hit(t, x):
+        nonlocal slides
+        slides = True
+        return 0.5, -0.8 * x[1], 0.3 * x[1]
 
-    def holds(t, x):
-        return -x[2]
+    def held(t, x):
+        nonlocal slides
+        slides = False
+        return *x[:2], 0.0
 
-    hits.terminal = holds.terminal = True
-    hits.direction = holds.direction = 1
-    t, slides, found = 0.0, False, []
-    options = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-14}
-    for n in range(1, cycles + 1):
-        while t < n * np.pi / 0.92:
-            events = (hits, holds) if slides else (hits,)
-            out = solve_ivp(field, (t, n * np.pi / 0.92), x, events=events, **options)
-            t, x = out.t[-1], out.y[:, -1]
-            if len(out.t_events[0]):
-                x, slides = np.array([0.5, -0.8 * x[1], 0.3 * x[1]]), True
-            elif slides and len(out.t_events[1]):
-                x, slides = np.array([x[0], x[1], 0.0]), False
+    def ends(t, x):
         found.append(x)
+        return None if len(found) == cycles else x
+
+    slides, found = False, []
+    events = [
+        (lambda t, x: x[0] - 0.5, hit),
+        (lambda t, x: -x[2] if slides else -1.0, held),
+        (lambda t, x: t - (len(found) + 1) * np.pi / 0.92, ends),
+    ]
+    followed(field, x, 100.0, events, rtol=1e-12)
     return np.array(found)
 
 
@@ -230,23 +197,16 @@ def test_an_impact_changes_a_mode():
 
 
 CASES = {
-    "walker": (lambda x: (Walker(0.009 + 1e-4 * x), legs(0.2003, -0.1998)), 3),
-    "stick and slip": (lambda x: (StickSlip(0.57), sliding(0.1 + 0.01 * x, 0.0)), 3),
-    "three states": (
-        lambda x: (ThreeStates(1.8), (jnp.ones_like(x), 0.7955 + 1e-3 * x, 0.2343 + 0 * x)), 3,
-    ),
-    "impact": (lambda x: (Excited(0.6 + 0.01 * x), vi.OscillatorState(x, 0.5 + 0 * x)), 3),
-    "mode": (lambda x: (Toggled(0.8 + 0.01 * x), vi.OscillatorState(0 * x, x)), 1),
-}  # fmt: skip
+    "stick and slip": lambda x: (StickSlip(0.57), sliding(0.1 + 0.01 * x, 0.0)),
+    "impact": lambda x: (Excited(0.6 + 0.01 * x), vi.OscillatorState(x, 0.5 + 0 * x)),
+}
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_backends_agree(name):
-    make, cycles = CASES[name]
-
     @jax.vmap
     def lanes(x):
-        return vi.simulate(*make(x), cycles, method=vi.FixedStep(steps_per_cycle=20), event_log=4)
+        return vi.simulate(*CASES[name](x), 3, method=vi.FixedStep(steps_per_cycle=20), event_log=4)
 
     runs, at = [], jnp.linspace(-0.5, 0.5, 5)
     for backend in ("auto", "xla"):
@@ -319,3 +279,25 @@ def test_a_reset_of_a_state_without_names():
     assert bool(run.successful)
     np.testing.assert_allclose(run.y_max, 0.5, atol=1e-9)
     np.testing.assert_allclose(run.y_min, -np.hypot(1, 0.1), atol=1e-8)
+
+
+def three(b):
+    """A cycle of `ThreeStates` by the matrix exponential: after its reset, and its length."""
+
+    def left(u):
+        x = expm(A * u[2]) @ np.array([1.0, u[0], u[1]])
+        v = A[0] @ x
+        return [x[0] - 1, x[1] - b * v - u[0], x[2] - 1.6 * v - u[1]]
+
+    return fsolve(left, [0.7955, 0.23435, 6.69907], xtol=1e-14)
+
+
+@pytest.fixture(scope="module")
+def cycle():
+    return vi.find_orbit(ThreeStates(1.8), tuple(map(jnp.asarray, (1.0, 0.7955, 0.2343))))
+
+
+@pytest.mark.slow
+def test_a_cycle_of_three_states_is_that_of_matrix_exponentials(cycle):
+    found = [cycle.state[1], cycle.state[2], cycle.duration]
+    np.testing.assert_allclose(found, three(1.8), atol=1e-10)

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
+from vi_jax.flow.methods._linear import clear, flown
 
-from differences import some
 from linear_truth import Chatters
 from structures import KINDS, machine_and_truth
 
@@ -31,15 +31,6 @@ def check_cycle_by_cycle(machine, truth, start, cycles, tolerance=1e-11, **optio
 
 
 @pytest.mark.slow
-def test_beside_matrix_exponentials():
-    """Damped in any way, and with a motion as a rigid body."""
-    total, options = 0, {"record": "sections", "rests": False}
-    for seed, kind in enumerate(KINDS):
-        total += check_cycle_by_cycle(*machine_and_truth(seed, 3, kind), 1, **options)[0]
-    assert total >= 10
-
-
-@pytest.mark.slow
 def test_rest_beside_matrix_exponentials():
     """What comes to rest on a stop is held, the others moving on, until its force turns."""
     rested = 0
@@ -51,40 +42,17 @@ def test_rest_beside_matrix_exponentials():
     assert rested >= 2
 
 
-@pytest.mark.parametrize("n", some([1, 2, 4, 8, 40], 4))
-def test_machines_of_all_kinds(n):
-    """Large ones by XLA; a seed that chatters is left out."""
-    compared = impacts = 0
-    with vi.backend("xla") if n > 8 else contextlib.nullcontext():
-        for kind in KINDS:
-            for seed in range(3 if n <= 8 else 1):
-                with contextlib.suppress(Chatters):
-                    case = machine_and_truth(100 * n + seed, n, kind)
-                    options = {"record": "sections", "rests": False}
-                    impacts += check_cycle_by_cycle(*case, 3, **options)[0]
-                    compared += 1
-    assert compared >= (9 if n <= 8 else 3) and impacts > 5
-
-
 @pytest.mark.slow
-def test_rest_on_several_stops_beside_adaptive_steps():
-    compared = 0
-    for n in (1, 4):
-        for kind in KINDS:
-            machine, _, start = machine_and_truth(2, n, kind, (0.0, 0.0, 0.0), 0.3)
-            start = machine.start(displacement=start[0], velocity=start[1])
-            runs = [vi.simulate(machine, start, 3, method=m) for m in (None, tight())]
-            assert bool(runs[0].successful) and bool(runs[1].successful)
-            np.testing.assert_array_equal(runs[0].impacts, runs[1].impacts)
-            np.testing.assert_array_equal(runs[0].rests, runs[1].rests)
-            for a, b in zip(*(jax.tree.leaves(run.sections) for run in runs), strict=True):
-                np.testing.assert_allclose(a, b, rtol=0, atol=1e-11)
-            compared += int(runs[0].rests.sum())
-    assert compared > 10
-
-
-def tight():
-    return vi.Adaptive(rtol=1e-13)
+@pytest.mark.parametrize("kind", KINDS)
+def test_machines_of_all_kinds(kind):
+    """Damped in any way, and with a motion as a rigid body; a seed that chatters is left out."""
+    compared = impacts = 0
+    for seed in range(3):
+        with contextlib.suppress(Chatters):
+            case, options = machine_and_truth(400 + seed, 4, kind), {"rests": False}
+            impacts += check_cycle_by_cycle(*case, 3, record="sections", **options)[0]
+            compared += 1
+    assert compared >= 2 and impacts > 1
 
 
 def oscillator(**changes):
@@ -132,30 +100,28 @@ def test_energy_and_momentum_of_an_impact():
     np.testing.assert_allclose(lost, body.mass * stop.loss(row @ v), rtol=1e-12)
 
 
-@pytest.mark.parametrize("alike", [False, True], ids=["apart", "coincident"])
-@pytest.mark.exhaustive
-def test_derivatives_by_matrices(alike):
-    """By mass, damping, stiffness, gap, frequency, force and start, where frequencies coincide
-    too: beside adaptive steps and differences."""
+@pytest.mark.slow
+def test_derivatives_by_matrices():
+    """By mass, damping, stiffness, gap, frequency, force and start, where frequencies coincide:
+    beside differences."""
     n = 3
-    base = 1.5 * np.eye(n) if alike else 2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
+    base = 1.5 * np.eye(n)
     change = np.array([[0.3, 0.2, 0.1], [0.2, -0.1, 0.4], [0.1, 0.4, 0.2]])
 
-    def last(p, method=None):
+    @jax.jit
+    def last(p):
         machine = vi.machines.Structure(
             mass=jnp.eye(n) + p[1] * change @ change, damping=0.05 * np.eye(n) + p[2] * change,
             stiffness=base + p[0] * change, force=p[5] * jnp.asarray([1.0, 0.3, -0.2]),
             frequency=p[4], contacts=(vi.RigidStop(p[3], 0.7, at=jnp.array([0.3, 0, 1]) + p[7]),),
         )  # fmt: skip
         start = machine.start(displacement=p[6] * jnp.array([0.1, 0.2, -0.3]))
-        run = vi.simulate(machine, start, 3, method=method, record="sections", rests=False)
+        run = vi.simulate(machine, start, 3, record="sections", rests=False)
         return jnp.concatenate([run.last.displacement, run.last.velocity])
 
     p = jnp.asarray([0.0, 0.0, 0.0, 0.25, 0.9, 1.0, 1.0, 0.0])
     found = jax.jacfwd(last)(p)
-    wanted = jax.jacfwd(lambda p: last(p, tight()))(p)
-    size = np.abs(wanted).max(axis=0)
-    np.testing.assert_allclose(found / size, wanted / size, rtol=0, atol=1e-9)
+    size = np.abs(found).max(axis=0)
     h = 1e-6 * jnp.eye(8)
     slopes = np.stack([(last(p + e) - last(p - e)) / 2e-6 for e in h], axis=-1)
     np.testing.assert_allclose(found / size, slopes / size, rtol=0, atol=1e-6)
@@ -168,16 +134,6 @@ def test_derivatives_by_matrices(alike):
     second = jax.jacfwd(energy)(at)
     differences = [(energy(at + e) - energy(at - e)) / 2e-5 for e in 1e-5 * jnp.eye(2)]
     np.testing.assert_allclose(second, np.stack(differences, -1), rtol=1e-5)
-
-
-@pytest.mark.slow
-def test_steps_of_one_length():
-    method = vi.FixedStep(steps_per_cycle=40)
-    machine, _, start = machine_and_truth(0, 3, "general")
-    start = machine.start(displacement=start[0], velocity=start[1])
-    wanted, run = (vi.simulate(machine, start, 2, method=m) for m in (None, method))
-    np.testing.assert_array_equal(run.impacts, wanted.impacts)
-    np.testing.assert_allclose(run.last.displacement, wanted.last.displacement, atol=1e-9)
 
 
 def test_both_sides_of_a_gap_are_one_coordinate():
@@ -305,3 +261,33 @@ def test_rules_of_its_own_are_vector_code():
     heavier = lambda kind: lambda m: end(kind(**{**numbers, "mass": M * m}))[0]
     by_steps, by_modes = (jax.jacfwd(heavier(k))(1.0) for k in (Hardening, vi.machines.Structure))
     np.testing.assert_allclose(by_steps, by_modes, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_what_is_said_to_be_clear_is():
+    """No stop is met within the length given, from any state, by a fine sampling of the flight."""
+    random = np.random.default_rng(0)
+    machine, *_ = machine_and_truth(0, 4, "proportional")
+    way = machine.prepared_modes()
+    states = vi.machines.StructureState(
+        jnp.asarray(0.2 * random.normal(size=(200, 4))), jnp.asarray(random.normal(size=(200, 4)))
+    )
+    s = jnp.asarray(random.uniform(0, machine.cycle, 200))
+    free = tuple(jnp.zeros(()) for _ in way.machine.coordinates)
+
+    def nearest(s, state):
+        begin = way.inward(state)
+        length = jnp.minimum(clear(way.machine, s, begin), machine.cycle)
+
+        def beyond(share):
+            there = flown(way.machine, free, s, share * length, begin)
+            return jnp.stack([
+                stop.beyond(way.machine.coordinates[stop.coordinate].position(there))
+                for stop in way.machine.stops
+            ])  # fmt: skip
+
+        return length, jax.vmap(beyond)(jnp.linspace(0, 1, 65)).max()
+
+    length, furthest = jax.jit(jax.vmap(nearest))(s, states)
+    assert (length > 0).sum() > 60 and np.median(length[length > 0]) > 0.1
+    assert (furthest[length > 0] < 0).all()

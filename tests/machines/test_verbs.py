@@ -35,24 +35,6 @@ class Case(NamedTuple):
 
 
 CASES = {
-    "ball": Case(
-        M.BouncingBall(acceleration=1.2, restitution=0.6), {"height": 6.7877, "speed": -0.7136},
-        "height", "speed", "acceleration", (0.6, 1.6), ("fold", "period-doubling"),
-        "period-doubling", "restitution", (0.5, 0.7),
-    ),
-    "pair": Case(
-        M.ImpactPair(), {}, "place", "speed", "half_gap", (1.2, 3.0), ("symmetry-breaking",),
-        "symmetry-breaking", "restitution", (0.4, 0.6),
-    ),
-    "free pair": Case(
-        M.ImpactPair(half_gap=2.0, mass_ratio=0.2, damping_ratio=0.1, force=0.6), {}, "place",
-        "speed", "force", (0.4, 1.2), ("symmetry-breaking", "period-doubling", "grazing"),
-        "symmetry-breaking", "mass_ratio", (0.15, 0.25),
-    ),
-    "duffing": Case(
-        M.Duffing(amplitude=0.4, cubic=0.5, stiffness=0.5, frequency=0.9), {}, "Y", "V",
-        "amplitude", (0.1, 0.5), ("grazing", "symmetry-breaking"), "grazing", "cubic", (0.4, 0.6),
-    ),
     "valve": Case(
         M.ReliefValve(flow_rate=5.0), {}, "lift", "pressure", "flow_rate", (4.0, 8.0),
         ("period-doubling", "grazing"), "period-doubling", "restitution", (0.75, 0.85),

@@ -1,7 +1,5 @@
 """The woodpecker toy: its known cycle, beside SciPy, energy, derivatives, methods and backends."""
 
-import dataclasses
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -127,13 +125,7 @@ def test_energy(run, truth):
     assert float(run.impact_energy[0, 0]) > 0.1 * work
 
 
-def test_wrong_numbers_are_named():
-    with pytest.raises(ValueError, match="`friction`"):
-        WOODPECKER(friction=-0.1)
-    with pytest.raises(ValueError, match="`bird_mass`"):
-        WOODPECKER(bird_mass=0.0)
-    with pytest.raises(ValueError, match=r"`sleeve_radius` must be greater than `pole_radius`"):
-        WOODPECKER(sleeve_radius=0.0025)
+def test_its_range():
     toy = eqx.tree_at(lambda m: m.sleeve_radius, WOODPECKER(), jnp.asarray(0.002))
     assert not bool(toy.in_range(toy.start()))
     assert bool(WOODPECKER().in_range(WOODPECKER().start()))
@@ -173,71 +165,3 @@ def test_its_words():
     assert (float(toy.renewed(state).height), float(toy.renewed(state).drop)) == (0.0, 0.02)
     by_time = toy.observed_every(0.1)
     assert by_time.section(state) is None and by_time.renewed(state) is state
-
-
-@pytest.mark.exhaustive
-def test_its_orbit_by_newton():
-    """With the multipliers of all seven numbers."""
-    toy = WOODPECKER(friction=0.3)
-    orbit = vi.find_orbit(toy, toy.start(speed=SPEED, bird_rate=BIRD_RATE), method=CLOSE)
-    assert bool(orbit.successful) and int(orbit.cycles) == 1
-    assert float(orbit.duration) == pytest.approx(PERIOD, rel=1e-9)
-    assert float(orbit.state.drop) == pytest.approx(DROP, rel=1e-9)
-    wanted = [MULTIPLIER, *[0] * 6]
-    np.testing.assert_allclose(np.sort(np.real(orbit.multipliers)), np.sort(wanted), atol=1e-7)
-
-
-@pytest.mark.exhaustive
-def test_derivative_of_a_cycle():
-    def duration(mu):
-        found = one(mu, SPEED, BIRD_RATE, event_log=0)
-        return found.duration[0], found.last.drop
-
-    slopes = vi.jit(lambda mu: jax.jvp(duration, (mu,), (1.0,))[1])(0.3)
-    moved = vi.jit(jax.vmap(duration))(0.3 + jnp.asarray([1e-5, -1e-5]))
-    for slope, ends in zip(slopes, moved, strict=True):
-        assert float(slope) == pytest.approx(float(ends[0] - ends[1]) / 2e-5, rel=1e-6)
-
-
-@pytest.mark.exhaustive
-def test_lanes_are_what_each_is_by_itself():
-    frictions = jnp.linspace(0.29, 0.33, 5)
-    together = vi.jit(jax.vmap(lambda mu: one(mu, SPEED, BIRD_RATE, 3)))(frictions)
-    alone = vi.jit(lambda mu: one(mu, SPEED, BIRD_RATE, 3))
-    for i, mu in enumerate(frictions):
-        for a, b in zip(
-            jax.tree.leaves(lane(together, i)), jax.tree.leaves(alone(mu)), strict=True
-        ):
-            np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-11)
-
-
-METHODS = {
-    "standard": ("standard", 1e-6), "adaptive": (vi.Adaptive(), 1e-5),
-    "fixed": (vi.FixedStep(), 1e-6), "taylor": (vi.Taylor(rtol=1e-10), 1e-7),
-}  # fmt: skip
-
-
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("name", METHODS)
-def test_methods_agree(name):
-    method, tolerance = METHODS[name]
-    found = one(0.3, SPEED, BIRD_RATE, 3, method=method, event_log=64)
-    assert bool(found.successful)
-    np.testing.assert_allclose(found.duration, PERIOD, rtol=tolerance)
-    np.testing.assert_allclose(found.sections.drop[1:], DROP, rtol=tolerance)
-    np.testing.assert_array_equal(found.impacts, 5)
-
-
-@pytest.mark.exhaustive
-def test_observed_at_equal_times():
-    """It comes down as far, and its samples can be drawn."""
-    toy = WOODPECKER()
-    start = toy.start(speed=SPEED, bird_rate=BIRD_RATE)
-    seen = vi.simulate(toy.observed_every(3 * PERIOD), start, 1, samples=30, method=CLOSE)
-    assert float(seen.last.height) == pytest.approx(-3 * DROP, rel=1e-7)
-    assert seen.samples is not None
-    moving = vi.animate(seen, toy, seconds=0.4, fps=10)
-    assert len(moving) == 4
-    again = dataclasses.replace(start, height=start.height + 1.0)
-    higher = vi.simulate(toy.observed_every(3 * PERIOD), again, 1, samples=30, method=CLOSE)
-    assert float(higher.last.height - seen.last.height) == pytest.approx(1.0, abs=1e-9)
