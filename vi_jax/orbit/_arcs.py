@@ -88,8 +88,8 @@ class ObservedArc(NamedTuple):
 
     states: Float[Array, "cycles places states"]
     """States at each place of each cycle, the start left out."""
-    modes: Float[Array, "cycles places modes"]
-    """The machine's own modes there."""
+    modes: Float[Array, "cycles places modes"] | None
+    """The machine's own modes there; `None` if it has none."""
     jacobians: Float[Array, "cycles states states"]
     """Derivatives by the start of the states after each cycle."""
     listed: Impacts
@@ -127,12 +127,10 @@ def observe_arc(arc: CycleMap, state: State, impact_log: int) -> ObservedArc:
         assert log is not None and run.y_min is not None and run.y_max is not None
         met = run.sections if run.samples is None else run.samples.state
         own = run.modes if run.samples is None else run.samples.modes
-        # Taken from the states, so that it depends on what is differentiated as the rest does.
-        none = in_rows(met)[1:].reshape(arc.cycles, _places(arc, state), -1)[:, :, :0]
-        places, modes = (
-            in_rows(rows)[1:].reshape(*none.shape[:2], -1) if rows is met or rows else none
-            for rows in (met, own)
-        )
+        places, modes = in_rows(met)[1:], None
+        places = places.reshape(arc.cycles, _places(arc, state), -1)
+        if own:  # batched as all else is, see `forward_jacobian`
+            modes = in_rows(own)[1:].reshape(*places.shape[:2], -1) + 0 * places[..., :1]
         assert run.clearance is not None and run.duration is not None
         rests = jnp.zeros_like(run.y_min) if run.rests is None else run.rests.astype(x.dtype)
         return ObservedArc(

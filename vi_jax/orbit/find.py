@@ -176,8 +176,11 @@ def _judged(
     # Back on the section asked for, of which the last one met is the guess's.
     last = seen.states.shape[1] - 1
     sections = jnp.roll(jnp.take(seen.states, last - place, axis=1), 1, axis=0)
-    modes = jnp.roll(jnp.take(seen.modes, last - place, axis=1), 1, axis=0)
-    least = _least_period(jnp.concatenate([sections, modes], axis=1), error)
+    modes, told = None, sections
+    if seen.modes is not None:
+        modes = jnp.roll(jnp.take(seen.modes, last - place, axis=1), 1, axis=0)
+        told = jnp.concatenate([sections, modes], axis=1)
+    least = _least_period(told, error)
     again = _comes_back(start, seen)
     monodromy = jacobians[least - 1]
     within = jnp.arange(cycles) < least
@@ -186,7 +189,7 @@ def _judged(
     duration = jnp.sum(jnp.where(within, seen.duration, 0.0))
     sums = {name: jnp.sum(jnp.where(within, a, 0.0)) for name, a in seen.integrals.items()}
     clearance = jnp.min(jnp.where(within, seen.clearance, jnp.inf))
-    state = _at_section(guess, sections[0], modes[0])
+    state = _at_section(guess, sections[0], None if modes is None else modes[0])
     still = _stands_still(machine, state, duration)
     found = (root.converged > 0) & again & ~still & (error < jnp.sqrt(jnp.finfo(x.dtype).eps) * 100)
     slowest = jnp.min(jnp.where(hit, seen.listed.speed, jnp.inf))
@@ -235,15 +238,15 @@ def _comes_back(start: State, seen: ObservedArc) -> Flag:
     """Whether a motion comes back to the modes in which it began: after as many cycles as were
     asked for."""
     modes = modes_of(start)
-    if modes is None:
+    if modes is None or seen.modes is None:
         return jnp.ones((), bool)
     return jnp.all(seen.modes[-1, -1] == jnp.stack(modes))
 
 
-def _at_section(guess: State, section: Array, modes: Array) -> State:
+def _at_section(guess: State, section: Array, modes: Array | None) -> State:
     """A state on the section from its numbers, and the machine's own modes there."""
     state = ravel_pytree(bare(guess))[1](section)
-    return state if modes_of(guess) is None else HybridState(state, tuple(modes))
+    return state if modes is None else HybridState(state, tuple(modes))
 
 
 def _least_period(sections: Float[Array, "cycles states"], error: Array) -> Array:
