@@ -125,19 +125,20 @@ def problem_of(
 
 
 def _check_instants(blank: Shooting, found: list[tuple[float, Event]], way: _Way) -> None:
-    """**Raises:** `ValueError` for an event that another one sets off: it has no guard of its own
-    to be zero, so that the equations have no place for it."""
-    machine = blank.machine
+    """**Raises:** `ValueError` for an event that another one sets off, or the clock as it begins
+    anew: its guard is not zero there, so that the equations have no place for it."""
+    machine, before = blank.machine, 0.0
     for i, (place, event) in enumerate(found):
-        if i and abs(place - found[i - 1][0]) <= _SAME_INSTANT and event.cycle is None:
+        if abs(place - before) <= _SAME_INSTANT and event.cycle is None:
             state, modes = blank.unravel(jnp.asarray(way.states[i])), way.modes[i - 1]
-            before = tuple(jnp.asarray(mode) for mode in modes)
-            if abs(float(guard_at(machine, event, jnp.asarray(place), state, before))) > _OFF_ZERO:
+            modes = tuple(jnp.asarray(mode) for mode in modes)
+            if abs(float(guard_at(machine, event, jnp.asarray(place), state, modes))) > _OFF_ZERO:
                 raise ValueError(
-                    "Argument `orbit` must have no event that another one sets off, but "
-                    f"{event.called(machine)} is met with {found[i - 1][1].called(machine)}. "
-                    "Let one event do both."
+                    f"Argument `orbit` must have no event whose guard jumps, but that of "
+                    f"{event.called(machine)} does, with another event or as a cycle begins. Let "
+                    "one event do what two do at one instant; begin cycles where nothing jumps."
                 )
+        before = place
 
 
 def sized_by_motion(problem: Shooting) -> bool:
