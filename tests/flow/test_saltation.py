@@ -10,8 +10,7 @@ import vi_jax as vi
 from scipy.linalg import expm
 
 ZETA, XI, K, GAP = 0.9, 0.05, 0.5, 2.0
-# Starts and cycles with one and with three impacts.
-CASES = {1: (0.1, 0.2, 2), 3: (1.6, -1.9, 5)}
+START, CYCLES = (1.6, -1.9), 5  # with three impacts
 
 
 def final(method, cycles):
@@ -45,13 +44,11 @@ def product(Y: float, V: float, cycles: int) -> tuple[np.ndarray, int]:
     return flight(2 * np.pi * cycles / ZETA - time) @ matrix, impacts
 
 
-@pytest.mark.parametrize("impacts", CASES)
-def test_jacobian_is_the_product(impacts):
+def test_jacobian_is_the_product():
     """And derivatives by parameters are differences."""
-    Y, V, cycles = CASES[impacts]
-    truth, counted = product(Y, V, cycles)
-    assert counted == impacts
-    f, x = jax.jit(final(vi.ExactFlight(), cycles)), jnp.array([ZETA, XI, K, GAP, Y, V])
+    truth, impacts = product(*START, CYCLES)
+    assert impacts == 3
+    f, x = jax.jit(final(vi.ExactFlight(), CYCLES)), jnp.array([ZETA, XI, K, GAP, *START])
     found = jax.jit(jax.jacfwd(f))(x)
     np.testing.assert_allclose(found[:, 4:], truth, atol=1e-9)
     np.testing.assert_allclose(jax.jit(jax.jacrev(f))(x), found, rtol=1e-11, atol=1e-11)

@@ -1,5 +1,5 @@
 """Ten thousand random machines of each kind: all end, none passes its stop, gains at a contact or
-fails without a reason. Derivatives of a hundred of each by all their numbers."""
+fails without a reason."""
 
 import jax
 import jax.numpy as jnp
@@ -89,54 +89,3 @@ def test_a_crowd(name):
     assert int(np.asarray(run.impacts)[good].sum()) > LANES
     # Each that failed has its reason, and what came before it.
     assert (np.asarray(run.result._value)[~good] > 0).all()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["free pair", "capsule"])
-def test_derivatives_of_a_crowd(name):
-    """By every number and every part of the start: forward beside central differences where two
-    steps of these agree with each other, and reverse beside forward."""
-    lanes, step = 100, 1e-5
-    machine, drawn, starts = crowd(name, lanes)
-    at = jnp.stack([*drawn.values(), *starts.values()], axis=1)
-
-    def last(x):
-        values = dict(zip((*drawn, *starts), x, strict=True))
-        scene = changed(machine, {key: values[key] for key in drawn})
-        start = scene.start(**{key: values[key] for key in starts})
-        run = vi.simulate(scene, start, 2, method="reference", record="sections")
-        return jnp.stack(jax.tree.leaves(run.last)), (run.impacts, run.successful)
-
-    jacobian = vi.jit(jax.vmap(jax.jacfwd(last, has_aux=True)))
-    forward, (impacts, good) = jacobian(at)
-    moves = jnp.eye(at.shape[1])
-    places = jnp.array([step, -step, step / 2, -step / 2])[:, None, None, None]
-    moved, (counts, _) = vi.jit(jax.vmap(jax.vmap(jax.vmap(last))))(
-        at + places * moves[:, None]
-    )  # (4, numbers, lanes, states)
-    wide, close = (moved[0] - moved[1]) / (2 * step), (moved[2] - moved[3]) / step
-    slope = np.moveaxis(np.asarray(4 * close - wide) / 3, 0, -1)
-    size = 1 + np.abs(slope).max(axis=(1, 2))
-    doubt = np.abs(np.moveaxis(np.asarray(close - wide), 0, -1)).max(axis=(1, 2)) / size
-    same = np.asarray((counts == impacts).all(axis=(0, 1, 3)) & good)
-    sure = same & (doubt < 1e-6)
-    assert sure.sum() >= 60 and int(np.asarray(impacts)[sure].sum()) >= 30
-    wrong = np.abs(np.asarray(forward) - slope).max(axis=(1, 2)) / size
-    assert (wrong[sure] < 1e-6).all()
-
-    # The two sum in different orders, so a lane near a graze, whose derivative changes by 1e-7 as
-    # the input does by its last bit, agrees no better. Each lane is held to what such bits do to
-    # its own derivatives (worst of 700 lanes: 3.1 times that of six moves).
-    weights = jnp.arange(1.0, forward.shape[1] + 1)
-    backward = np.asarray(vi.jit(jax.vmap(jax.grad(lambda x: weights @ last(x)[0])))(at))
-    wanted = np.asarray(jnp.einsum("s,lsn->ln", weights, forward))
-    scale = 1 + np.abs(wanted).max(axis=1)
-    rng = np.random.default_rng(0)
-    bits = [1 + np.finfo(float).eps * rng.choice([-1, 1], at.shape) for _ in range(6)]
-    near = [np.einsum("s,lsn->ln", weights, jacobian(at * move)[0]) for move in bits]
-    doubt = np.max([np.abs(other - wanted).max(axis=1) for other in near], axis=0) / scale
-    apart = np.abs(backward - wanted).max(axis=1) / scale
-    good = np.asarray(good)
-    assert (doubt[good] < 1e-12).mean() > 0.8
-    shares = (apart / (1e-12 + 10 * doubt))[good]
-    assert (shares <= 1).all(), shares.max()

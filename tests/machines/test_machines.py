@@ -42,6 +42,7 @@ def bounces(restitution):
     return vi.continue_orbit(orbit, parameter="acceleration", bounds=(0.05, 2.0))
 
 
+@pytest.mark.slow
 def test_a_bounce_is_born_and_doubles_where_its_closed_form_does(bounces, restitution):
     e, born = restitution, PI * sigma(restitution)
     (fold,) = (p for p in bounces.special if p.kind == "fold")
