@@ -122,14 +122,6 @@ def test_derivatives_beside_differences():
     check_derivatives(last, [0.4, 0.9, 0.1], tolerance=1e-7, impacts=2)
 
 
-def test_a_stall_points_to_the_time_clock():
-    scene = machine(control=-0.5)
-    run = vi.simulate(scene, scene.start(V=0.5, W=0.5, M=0.0), 20)
-    assert bool(run.result == vi.RESULTS.stalled)
-    with pytest.raises(ValueError, match=r"W > 0 in the phase clock"):
-        vi.simulate(scene, scene.start(W=0.0, M=0.0), 2)
-
-
 @pytest.mark.slow
 def test_fixed_steps_stay_stable():
     """However fast the current settles, or however slowly it swings with the shaft."""

@@ -40,13 +40,6 @@ def test_sections_only():
     assert int(lean.steps) < int(full.steps)
 
 
-def test_words():
-    run = vi.simulate(SCENE, SCENE.start(), 9, method=vi.ExactFlight())
-    text = str(run)
-    assert "Run of 9 cycles" in text and "ended: completed" in text and "Y in [" in text
-    assert bool(run.successful) and bool(jnp.all(run.duration == run.duration[0]))
-
-
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [

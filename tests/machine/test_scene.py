@@ -95,19 +95,6 @@ def test_numbers_are_numbers(value):
         vi.IdealDrive(value)
 
 
-def test_unknown_parameters_are_refused():
-    with pytest.raises(TypeError, match="frequenzy_ratio"):
-        vi.Scene.ideal(frequency_ratio=0.9, frequenzy_ratio=0.9)
-    with pytest.raises(TypeError, match="masss"):
-        vi.Parameters(masss=1.0)
-
-
-def test_every_number_is_a_leaf():
-    assert len(jax.tree.leaves(vi.Scene.ideal(frequency_ratio=0.9))) == 4
-    assert len(jax.tree.leaves(vi.Parameters().scene(crank="slider"))) == 9
-    assert len(jax.tree.leaves(vi.Parameters())) == 11
-
-
 def test_parameters_take_quantities_with_units():
     unit = pint.UnitRegistry()
     given = vi.Parameters(
