@@ -219,7 +219,8 @@ def _seen(plan: Plan, lane: Lane, trial: Trial) -> _Seen:
     for k, path in enumerate(trial.paths):
         if path.pull is not None and path.leaves is not None:
             sides.append(path.pull)
-            below.append(~path.leaves.left)
+            same = (path.pull.end.x <= 0) | path.leaves.landed
+            below.append(~path.leaves.left & same)
         end, twice = path.end, twice | may_turn_twice(lane.direction[k], path, h)
         turned = good & (lane.direction[k] * end.v < 0) & ~path.at_turn
         if not exactly:

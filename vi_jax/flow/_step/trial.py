@@ -35,7 +35,8 @@ class Path(NamedTuple):
     """How fast the force changes at both ends, and the shortest step that is cut at a turn of the
     force; absent where the body cannot rest."""
     pull: Side | None
-    """The force away from the stop that it rests on, if it can rest."""
+    """The force away from the stop that it rests on, or its velocity against its direction while
+    it is slow; absent where it cannot rest."""
 
 
 class End(NamedTuple):
@@ -154,7 +155,7 @@ def attempt(
     new = pin(new)
     bodies = range(len(machine.coordinates))
     alone = tuple(holding(machine, lane.modes, lane.contact, but=k) for k in bodies)
-    seen = within(plan, lane, alone, stages)
+    seen = within(plan, lane, alone, stages, h)
     of_guards = guards_error(plan, seen, stages, h, jnp.asarray(limit))
     error = error if of_guards is None else jnp.maximum(error, of_guards)
     good = jnp.isfinite(total(new, jnp.zeros_like(h)))
@@ -237,8 +238,13 @@ def _path(
         )
         if k in seen.forces:
             rests, away = at_rest(plan, lane, k)
+            slow, along = seen.slow[k], -lane.direction[k]
             first, last = (
-                Rates(jnp.where(rests, away * r.a, -1.0), jnp.where(rests, away * rate, 0.0), r.a)
+                Rates(
+                    jnp.where(rests, away * r.a, jnp.where(slow, along * r.v, -1.0)),
+                    jnp.where(rests, away * rate, jnp.where(slow, along * r.a, 0.0)),
+                    r.a,
+                )
                 for r, rate in ((begin, surge[0]), (end, surge[1]))
             )
             slack = 64 * float(jnp.finfo(h.dtype).eps) * jnp.max(jnp.abs(seen.forces[k]))

@@ -19,7 +19,7 @@ from jaxtyping import Array
 from ..._types import Flag, Scalar, State
 from ...machine import AbstractMachine, events_of, sides_of
 from .._lane import Lane, Plan, to_event
-from ..events import rates
+from ..events import Rates, rates
 from ..methods import Foreseen, Stage
 from ..smooth import SmoothMachine, exact, is_affine
 
@@ -35,13 +35,17 @@ class Within(NamedTuple):
 
     forces: dict[int, Array]
     """By coordinate, the force that pulls a body at rest away from its stop; negative while it is
-    pressed on, -1 where it does not rest."""
+    pressed on. Of a body that is free and slow its velocity, positive once it has turned; -1 of a
+    faster one."""
     events: dict[int, tuple[Array, ...]]
     """By event, the values of each side of its guard (see `AbstractEvent.sides`)."""
+    slow: dict[int, Flag]
+    """By coordinate, whether it is so slow that it may turn twice within the step."""
 
     def only(self, places: list[int]) -> "Within":
         """The values at some of the stages."""
-        return jtu.tree_map(lambda values: values[np.asarray(places)], self)
+        kept = self.forces, self.events
+        return Within(*jtu.tree_map(lambda x: x[np.asarray(places)], kept), self.slow)
 
 
 def looks_within(plan: Plan, state: State) -> bool:
@@ -88,24 +92,32 @@ def apart(stages: list[Stage]) -> list[Stage]:
     return found
 
 
-def within(plan: Plan, lane: Lane, alone: tuple[SmoothMachine, ...], stages: list[Stage]) -> Within:
+def within(
+    plan: Plan, lane: Lane, alone: tuple[SmoothMachine, ...], stages: list[Stage], h: Scalar
+) -> Within:
     """Return the guards at the stages of a step.
 
-    **Arguments:** `alone`, of each coordinate the machine with the other bodies held that rest.
+    **Arguments:** `alone`, of each coordinate the machine with the other bodies held that rest;
+    `h`, the length of the step.
     """
     if not stages:
-        return Within({}, {})
+        return Within({}, {}, {})
     machine, around = plan.machine, (lane.modes, lane.contact or ())
     limited = sorted({stop.coordinate for stop in machine.stops}) if plan.rests else []
     looked_at = events_looked_at(plan, lane.state)
+
+    def moves(k: int, s: Scalar, state: State) -> Rates:
+        return rates(alone[k].field, machine.coordinates[k].position, s, state)
+
+    slow = {k: _is_slow(stop_gradient(moves(k, lane.s, lane.state)), h) for k in limited}
 
     def guards(place):
         s, state = place
         forces, events = {}, {}
         for k in limited:
-            rests, away = at_rest(plan, lane, k)
-            force = rates(alone[k].field, machine.coordinates[k].position, s, state).a
-            forces[k] = jnp.where(rests, away * force, -1.0)
+            (rests, away), here = at_rest(plan, lane, k), moves(k, s, state)
+            free = jnp.where(slow[k], -lane.direction[k] * here.v, -1.0)
+            forces[k] = jnp.where(rests, away * here.a, free)
         for number in looked_at:
             if number < len(machine.stops):
                 events[number] = (_distance(machine, lane, number, state),)
@@ -121,11 +133,18 @@ def within(plan: Plan, lane: Lane, alone: tuple[SmoothMachine, ...], stages: lis
         return jax.lax.scan(lambda c, x: (c, stop_gradient(guards(x))), None, places)[1]
 
     if looked_at:
-        return Within(*at_each(places))
+        return Within(*at_each(places), slow)
     assert lane.contact is not None
     none = {k: jnp.full(len(stages), -1.0, lane.s.dtype) for k in limited}
-    resting = functools.reduce(jnp.logical_or, [lane.contact[k] > 0 for k in limited])
-    return Within(*jax.lax.cond(resting, at_each, lambda _: (none, {}), places))
+    any_of_them = functools.reduce(
+        jnp.logical_or, [(lane.contact[k] > 0) | slow[k] for k in limited]
+    )
+    return Within(*jax.lax.cond(any_of_them, at_each, lambda _: (none, {}), places), slow)
+
+
+def _is_slow(begin: Rates, h: Scalar) -> Flag:
+    """Whether a body may turn twice within a step, as one that has just left its stop."""
+    return jnp.abs(begin.v) <= jnp.abs(begin.a) * h
 
 
 def at_rest(plan: Plan, lane: Lane, k: int) -> tuple[Flag, Scalar]:
