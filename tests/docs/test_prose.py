@@ -1,0 +1,59 @@
+"""Pages in plain English: sentences with a subject, the field's words, code that fits a column."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+DOCS = Path(__file__).parents[2] / "docs"
+NAMES = """theory faq concepts limits capabilities performance index
+howto/orbits howto/robustness howto/noise howto/scans howto/large howto/methods howto/hardware
+howto/export howto/fit howto/cluster"""
+PAGES = [DOCS / f"{name}.md" for name in NAMES.split()] + sorted(DOCS.glob("coming_from/*.md"))
+WIDTH = 76
+CODE = re.compile(r"^```\w*\n(.*?)^```$", re.M | re.S)
+FORMULA = re.compile(r"\$\$.*?\$\$|\$[^$]*\$|`[^`]*`", re.S)
+# A sentence that begins with a clause without a noun, as "What is there" or "Of these the first".
+HEADLESS = re.compile(
+    r"(?:^|(?<=[.!?] )|(?<=^- ))(?:What|Where|Of|That which|One that|Whoever)\b(?![^.]*\?)"
+)
+PHRASES = re.compile(
+    r"\b(?:(?:is|are) none|such as is|of its own|whatever|wherever|beside"
+    r"|(?:says?|tells?|knows?) (?:what|which|how|why|whether|where)"
+    r"|(?:gradients?|derivatives?|differentiated) by (?!columns|hand))\b",
+    re.I,
+)
+
+
+def paragraphs(text: str) -> list[str]:
+    """Each paragraph, item or row in one line; without code, formulas and headings."""
+    text = FORMULA.sub("x", CODE.sub("", text))
+    parts = re.split(r"\n\s*\n|\n(?=\s*[-|#]|\s*\d+\. )", text)
+    return [" ".join(part.split()) for part in parts if not part.lstrip().startswith("#")]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(DOCS).as_posix())
+def test_plain_english(page):
+    text = page.read_text("utf-8")
+    wide = [x for code in CODE.findall(text) for x in code.splitlines() if len(x) > WIDTH]
+    assert not wide
+    found = [x for x in paragraphs(text) if HEADLESS.search(x) or PHRASES.search(x)]
+    assert not found
+
+
+def test_the_patterns_find_what_they_are_for():
+    for bad in (
+        "- What is there costs.",
+        "It ends. Of these one stays.",
+        "Where it rests it stays.",
+    ):
+        assert HEADLESS.search(bad)
+    for bad in (
+        "there is none",
+        "a gradient by ten numbers",
+        "beside SciPy",
+        "the page says which",
+    ):
+        assert PHRASES.search(bad)
+    for good in ("Why? What does it do?", "It stays where it was.", "gradients by columns"):
+        assert not HEADLESS.search(good) and not PHRASES.search(good)
