@@ -37,12 +37,12 @@ SHORT_FILL, LONG_FILL = paler(SHORT, 0.2), paler(LONG, 0.4)
 
 
 def table_damping() -> float:
-    """c of Table 1 (N·s/m)."""
+    """Return c of Table 1 (N·s/m)."""
     return float(Parameters().damping)
 
 
 def xi_per_c() -> float:
-    """ξ of c = 1 N·s/m in the machine of Table 1 (m·s/N)."""
+    """Return ξ of c = 1 N·s/m in the machine of Table 1 (m·s/N)."""
     return table_damping_ratio() / table_damping()
 
 
@@ -136,7 +136,7 @@ def _follow(point: SpecialPoint, parameter: str) -> Boundary:
 
 
 def plane_points(curve: Boundary) -> np.ndarray:
-    """Points (ζ, k) or (ζ, c) of a curve, with c in N·s/m."""
+    """Return points (ζ, k) or (ζ, c) of a curve, with c in N·s/m."""
     points = curve.parameters.copy()
     if curve.names[1] == XI:
         points[:, 1] = np.maximum(points[:, 1], 0.0) / xi_per_c()  # -1e-17 at its end
@@ -144,7 +144,7 @@ def plane_points(curve: Boundary) -> np.ndarray:
 
 
 def crossings(curve: Boundary, column: int, value: float) -> list[float]:
-    """Where a curve has a value of ζ (column 0) or of k or c (1): the other number, rising.
+    """Return the other number, rising, where a curve has a value of ζ (column 0) or of k or c (1).
 
     Splines through the curve's points, whose error is below 1e-5 here.
     """
@@ -172,13 +172,13 @@ def _turn(curve: Boundary, pick: Callable[[np.ndarray], np.intp]) -> tuple[float
 
 
 def birth_without_damping(curves: BoundaryCurves) -> float:
-    """ζ of the grazing in which the 2π motion is born, the same for every k."""
+    """Return ζ of the grazing in which the 2π motion is born, the same for every k."""
     points = plane_points(curves.birth_c)
     return float(points[np.argmin(points[:, 1]), 0])
 
 
 def describe_boundaries(curves: BoundaryCurves) -> dict[str, float | None]:
-    """What the curves say about the figures' ζ and k, and about Table 1's c, in numbers.
+    """Return numbers of the curves at the figures' ζ and k, and at Table 1's c.
 
     `None` where a curve does not get there, as that of the 4π motion to Table 1's c.
     """
@@ -211,7 +211,7 @@ def describe_boundaries(curves: BoundaryCurves) -> dict[str, float | None]:
 
 
 def draw_boundaries(curves: BoundaryCurves) -> Figure:
-    """Both planes, the whole of them beside the region of the discrepancy.
+    """Draw both planes, the whole of them beside the region of the discrepancy.
 
     Axes in the order (ζ, k), its region, (ζ, c), its region.
     """

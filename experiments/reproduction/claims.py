@@ -28,7 +28,7 @@ class Claim(NamedTuple):
 
 
 def check_claims(cases: tuple[Case, Case], panels: list[dict] | None = None) -> list[Claim]:
-    """Each claim that Figures 3 and 4 carry, measured on the simulated cases.
+    """Measure each claim about Figures 3 and 4 on the simulated cases.
 
     **Arguments:** the cases; the panels of Figure 2 (`describe`), without which what is said of the
     whole figure rests on ζ = 0.90 alone.
@@ -119,7 +119,7 @@ def _rate(deviation: np.ndarray) -> float:
 
 
 def nudged_rate(case: Case, *, nudge: float = 1e-8) -> float:
-    """Growth per cycle of a deviation from the 2π motion that begins with `nudge` in Y."""
+    """Return the growth per cycle of a deviation of `nudge` in Y from the 2π motion."""
     start = case.scene.start(Y=case.short.Y[0] - nudge, V=case.short.V[0])
     cycles = case.from_rest.impacts.shape[0]
     samples = sampled(case.from_rest)[2]

@@ -44,7 +44,7 @@ class Row(NamedTuple):
 
 
 def rows(system: System, direction: str, inside: np.ndarray) -> list[Row]:
-    """What a sweep keeps to, over the indices `inside` of ζ."""
+    """Return the motions that a sweep keeps to, over the indices `inside` of ζ."""
     at, exponent = system.sweeps[direction], system.exponents[direction]
     period, impacts = np.asarray(at.period), np.asarray(at.impacts)
     kind = np.stack([period, np.where(period > 0, np.round(impacts), exponent > _CHAOS)])[:, inside]
@@ -57,12 +57,12 @@ def rows(system: System, direction: str, inside: np.ndarray) -> list[Row]:
 
 
 def between(system: System, ratios: np.ndarray) -> np.ndarray:
-    """Indices of the ζ between BB' and CC'."""
+    """Return the indices of the ζ between BB' and CC'."""
     return np.flatnonzero((ratios > system.stretch[0]) & (ratios < system.stretch[1]))
 
 
 def describe(found: Response) -> dict[str, Any]:
-    """Where the numerical minimum and the 2π analysis part in each panel, and what it is on.
+    """Describe where numerical minimum and 2π analysis differ in each panel, and the motions there.
 
     Floats, integers, strings, lists and `None` only. "apart" is where |min Y - min Y of the 2π
     closed form| > 1e-3; "on_the_4pi_curve" compares all values at which the one-impact 4π motion
@@ -125,8 +125,7 @@ def _panel(found: Response, system: System) -> dict[str, Any]:
 
 
 def shares(sweep: dict[str, Any]) -> tuple[float, float]:
-    """Which parts of a sweep of a panel are on the 4π motion with one impact, and on any of period
-    4π, each from 0 to 1."""
+    """Return the shares of a sweep on the 4π motion with one impact, and on any of period 4π."""
     one, four = (
         sum(m["values"] for m in sweep["motions"] if fits(m["motion"])) / sweep["values"]
         for fits in (lambda x: x == "4π, 1 impact", lambda x: x.startswith("4π"))

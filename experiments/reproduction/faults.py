@@ -24,7 +24,7 @@ class Fault(NamedTuple):
 
 
 def check_faults() -> list[Fault]:
-    """Each fault of the printed text, measured."""
+    """Measure each fault of the printed text."""
     return [
         _inertia_term(), _coupling(), _phase(), _no_load_speed(), _captions(), _damping(),
         _lever(), _disc(), _lines(),
@@ -157,7 +157,7 @@ def _captions() -> Fault:
 
 
 def period_doubling_damping() -> float:
-    """The damping c (N·s/m) at which a multiplier of the 2π motion of Figure 3 crosses -1."""
+    """Return the c (N·s/m) at which a multiplier of the 2π motion of Figure 3 crosses -1."""
 
     low, high = 0.0, 0.5
     for _ in range(50):

@@ -8,7 +8,7 @@ from .response import WALL, Response
 
 
 def check_figure_2(found: Response, panels: list[dict]) -> list[Claim]:
-    """Each claim about the whole of Figure 2.
+    """Measure each claim about the whole of Figure 2.
 
     **Arguments:** what was computed for the figure, and its panels as `describe` gives them.
     """

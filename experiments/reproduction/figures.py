@@ -35,7 +35,7 @@ def draw_figure(number: int, cases: tuple[Case, Case], path: Path) -> None:
 
 
 def common_legend(figure: Figure, axes: np.ndarray, *, ncols: int) -> None:
-    """One legend below the figure with the entries of all these axes."""
+    """Draw one legend below the figure with the entries of all these axes."""
     named = [pair for ax in axes for pair in zip(*ax.get_legend_handles_labels(), strict=True)]
     handles, labels = zip(*named, strict=True)
     look = {"loc": "outside lower center", "frameon": False, "fontsize": 11}

@@ -45,7 +45,7 @@ class Case(NamedTuple):
 
 
 def figure_scene(damping_ratio: Any, *, restitution: Any = RESTITUTION, gap: Any = GAP) -> Scene:
-    """The scene of Figures 3 and 4 with this ξ (dimensionless), at ζ = 0.90."""
+    """Return the scene of Figures 3 and 4 with this ξ (dimensionless), at ζ = 0.90."""
     scene = Scene.ideal(
         frequency_ratio=FREQUENCY_RATIO,
         restitution=restitution,
@@ -57,12 +57,12 @@ def figure_scene(damping_ratio: Any, *, restitution: Any = RESTITUTION, gap: Any
 
 
 def table_damping_ratio() -> float:
-    """ξ from Table 1 (dimensionless)."""
+    """Return ξ of Table 1 (dimensionless)."""
     return float(Parameters().scene(drive="ideal").damping_ratio)
 
 
 def simulate_cases(*, quick: bool = False) -> tuple[Case, Case]:
-    """The undamped and the damped case; `quick` takes fewer cycles and samples."""
+    """Simulate the undamped and the damped case; `quick` takes fewer cycles and samples."""
     cycles, samples = (QUICK_CYCLES, QUICK_SAMPLES) if quick else (CYCLES, SAMPLES)
     undamped = figure_scene(0.0)
     long_state = closed_form_orbits(undamped, cycles=2)
@@ -88,7 +88,7 @@ def simulate_cases(*, quick: bool = False) -> tuple[Case, Case]:
 
 
 def run_of(scene: Scene, start: Any, cycles: int, samples: int) -> Run:
-    """A run with the options of all runs here, so that they share one compiled program."""
+    """Simulate with the options of all runs here, so that they share one compiled program."""
     return simulate(
         scene, start, cycles, method=ExactFlight(), samples=samples, impact_log=2, throw=True
     )
@@ -103,7 +103,7 @@ def _alignment(from_rest: Run, orbit: Run) -> int:
 
 
 def sampled(run: Run) -> tuple[np.ndarray, np.ndarray, int]:
-    """Sampled Y and V with shape (cycles, samples), and the number of samples in a cycle."""
+    """Return sampled Y and V with shape (cycles, samples), and the number of samples in a cycle."""
     assert run.samples is not None
     cycles = run.impacts.shape[0]
     Y, V = (
@@ -114,19 +114,19 @@ def sampled(run: Run) -> tuple[np.ndarray, np.ndarray, int]:
 
 
 def last_minima(run: Run) -> list[float]:
-    """The smallest Y of each of the last two cycles, the smaller one first."""
+    """Return the smallest Y of each of the last two cycles, the smaller one first."""
     return sorted(np.asarray(run.y_min)[-2:].tolist())
 
 
 def closed_form(case: Case, cycles: int, period: int) -> np.ndarray:
-    """Y of the 2π (`period` 1) or 4π (2) closed form, sampled, tiled over cycles of Figure 3."""
+    """Return Y of the 2π (`period` 1) or 4π (2) closed form, over cycles of Figure 3."""
     run, shift = (case.on_short, 0) if period == 1 else (case.from_long, case.long_shift)
     one = sampled(run)[0][:period]
     return one[(np.arange(cycles) - shift) % period]
 
 
 def half_turn_states(run: Run) -> np.ndarray:
-    """(Y, V) at φ = π of each cycle, shape (cycles, 2).
+    """Return (Y, V) at φ = π of each cycle, shape (cycles, 2).
 
     The impacts of these motions lie near φ = 0, where a section would see them now before, now
     after the jump.

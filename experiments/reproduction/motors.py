@@ -102,7 +102,7 @@ def simulate_motors() -> Motors:
 
 
 def draw_motors(motors: Sequence[MotorRun], ideal: Run) -> Figure:
-    """The last 8π from rest with each motor above its crank speed.
+    """Draw the last 8π from rest with each motor above its crank speed.
 
     **Arguments:** the motors' runs; the ideal drive's run from rest, for comparison.
     """

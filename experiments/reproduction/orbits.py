@@ -20,13 +20,13 @@ class TableRow(NamedTuple):
 
 
 def mean_ratio(orbit: Orbit) -> float:
-    """ζ of a driven motion."""
+    """Return the mean ζ of a driven motion."""
     assert orbit.frequency_ratio is not None
     return float(orbit.frequency_ratio)
 
 
 def fit_long(scene: Scene) -> Orbit:
-    """The 4π motion, fitted by optax' Adam from a state 5 % off the closed form.
+    """Fit the 4π motion by optax' Adam from a state 5 % off the closed form.
 
     This is what the paper asks for with Figure 4: initial conditions accurate enough to skip the
     transient.
@@ -41,7 +41,7 @@ def fit_long(scene: Scene) -> Orbit:
 
 
 def orbit_table(scenes: dict[str, Scene]) -> list[TableRow]:
-    """The 2π and 4π motions of ideal scenes by name, stable and unstable ones alike.
+    """Find the 2π and 4π motions of ideal scenes by name, stable and unstable ones alike.
 
     Found by Newton's method from their closed forms.
     """

@@ -24,7 +24,7 @@ class Findings(NamedTuple):
 
 
 def as_json(found: Findings) -> str:
-    """The report as strict JSON: no NaN; what is absent is null."""
+    """Return the report as strict JSON, without NaN; an absent number is null."""
     cases = found.cases
     data = {
         "settings": {
@@ -215,7 +215,7 @@ def _borders(borders: dict[str, float | None]) -> list[str]:
 
 
 def as_markdown(found: Findings) -> str:
-    """The report as a page to read, with the figures in it."""
+    """Return the report as a page to read, with the figures in it."""
     undamped, damped = found.cases
     cycles = undamped.from_rest.impacts.shape[0]
     ratio = float(damped.scene.damping_ratio)

@@ -41,7 +41,7 @@ class CoastingMachine(AbstractMachine):
 
 
 def energy(state: Any, *, coupling: float, slider_inertia: float) -> np.ndarray:
-    """E = ½V² + ½(Y - U)² + ½(1 + μU_φ²)W²/ε, in units of k0 a², at each state."""
+    """Return E = ½V² + ½(Y - U)² + ½(1 + μU_φ²)W²/ε, in units of k0 a², at each state."""
     Y, V, W, phase = (np.asarray(x) for x in (state.Y, state.V, state.W, state.phase))
     shaft = (1 + slider_inertia * np.sin(phase) ** 2) * W**2 / coupling
     return 0.5 * (V**2 + (Y - np.cos(phase)) ** 2 + shaft)
@@ -51,7 +51,7 @@ def energy_drift(
     *, coupling: float, slider_inertia: float, printed_coupling: float | None = None,
     printed_inertia: float = 0.0,
 ) -> float:  # fmt: skip
-    """Greatest |E/E(0) - 1| of a coasting run over 20 natural periods (k = 1, d = 2).
+    """Return the greatest |E/E(0) - 1| of a coasting run over 20 natural periods (k = 1, d = 2).
 
     **Arguments:** ε and μ of the machine, which make the energy; the coefficients that the drive
     equation is integrated with, if they are others.
@@ -74,7 +74,7 @@ def energy_drift(
 
 
 def eq21_misses(zeta: float, k: float, d: float, n: int, *, printed: bool) -> dict[str, float]:
-    """By how much Eq. 14 with Eq. 20 and 21 misses the boundary conditions (16) to (18).
+    """Return by how much Eq. 14 with Eq. 20 and 21 misses the boundary conditions (16) to (18).
 
     **Arguments:** ζ ≠ 1, k, d = Δ/a, the period 2πn; Eq. 21 as `printed`, or with its factor ζ.
 

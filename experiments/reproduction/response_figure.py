@@ -30,7 +30,7 @@ _DOWN: dict[str, Any] = {
 
 
 def draw_response(found: Response) -> Figure:
-    """Figure 2: the range of ζ above, undamped and damped, from BB' to CC' below."""
+    """Draw Figure 2: the range of ζ above, undamped and damped; from BB' to CC' below."""
     titles = ["undamped, ξ = 0", f"Table 1, ξ = {found.systems[1].damping_ratio:.4f}"]
     figure = Figure(figsize=(15, 17.2))
     figure.set_layout_engine("constrained", w_pad=0.08)
