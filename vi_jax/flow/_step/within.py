@@ -45,7 +45,8 @@ class Within(NamedTuple):
     def only(self, places: list[int]) -> "Within":
         """The values at some of the stages."""
         kept = self.forces, self.events
-        return Within(*jtu.tree_map(lambda x: x[np.asarray(places)], kept), self.slow)
+        forces, events = jtu.tree_map(lambda x: x[np.asarray(places)], kept)
+        return Within(forces, events, self.slow)
 
 
 def looks_within(plan: Plan, state: State) -> bool:
@@ -139,7 +140,8 @@ def within(
     any_of_them = functools.reduce(
         jnp.logical_or, [(lane.contact[k] > 0) | slow[k] for k in limited]
     )
-    return Within(*jax.lax.cond(any_of_them, at_each, lambda _: (none, {}), places), slow)
+    forces, _ = jax.lax.cond(any_of_them, at_each, lambda _: (none, {}), places)
+    return Within(forces, {}, slow)
 
 
 def _is_slow(begin: Rates, h: Scalar) -> Flag:
