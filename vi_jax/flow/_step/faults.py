@@ -61,7 +61,9 @@ def faults(
     if not plan.method.adaptive:
         return [(rejected, float(broken)), *ends]
     eps = float(jnp.finfo(length.dtype).eps)
-    gone = rejected & (length < 4 * eps * jnp.maximum(1.0, plan.machine.cycle))
+    cycle = plan.machine.cycle
+    longest = jnp.maximum(1.0, cycle) if plan.machine.dimensionless else cycle
+    gone = rejected & (length < 4 * eps * longest)
     numeric = jnp.isfinite(total(trial.state, length))
     tiny = results.UNDERFLOW if broken == results.NOT_FINITE else broken
     return [(gone & ~numeric, float(broken)), (gone, float(tiny)), *ends]

@@ -35,13 +35,16 @@ def unheld(
     """
     if contact is None:
         return None
-    contacts, slack = list(contact), rounding(plan.machine, new)
+    contacts = list(contact)
     for k, coordinate in enumerate(plan.machine.coordinates):
         (place, before), (there, after) = (
             (coordinate.position(x), coordinate.velocity(x)) for x in (old, new)
         )
         if not (there is place and after is before):
-            moved = (jnp.abs(there - place) > slack) | (jnp.abs(after - before) > slack)
+            slack, late = (
+                rounding(plan.machine, new, x) for x in (coordinate.position, coordinate.velocity)
+            )
+            moved = (jnp.abs(there - place) > slack) | (jnp.abs(after - before) > late)
             contacts[k] = jnp.where(when & stop_gradient(moved), 0.0, contacts[k])
     return tuple(contacts)
 
