@@ -104,7 +104,7 @@ def test_what_is_wrong_with_a_machine_or_a_table(run, here, monkeypatch, text, w
         ("basins", "[basins]\nregion = {Y = [0, 1]}", "`region` must name parts"),
         ("basins", "[basins]\nregion = {start.Y = [0, 1]}\nsamples = 3\nseed = -1",
          "Argument `seed` must be at least 0"),
-        ("simulate", "[simulate]\ncycles = 2000000000", "Argument `cycles` must be at most"),
+        ("simulate", "[simulate]\ncycles = 2000000000", "Argument `cycles` must ask for"),
         ("orbit", "[orbit]\nroot_finder = 'newton'", "Argument `root_finder` must be"),
         ("orbit", "[orbit]\nguess = {W = 1}", "Argument `W` must be left out"),
     ],

@@ -243,9 +243,9 @@ def test_a_run_in_parts_is_the_same_run(monkeypatch):
 
 @pytest.mark.parametrize("pressed, kept", [(1, None), (3, 81)])
 def test_ctrl_c_keeps_the_recorded_cycles_of_a_run(run, monkeypatch, capsys, pressed, kept):
-    """Pressed while it settles and records its first part, or later; then again while it writes."""
+    """Pressed while it settles and records its first part, or later; then again and again."""
     short(monkeypatch)
-    compute, write, calls = verbs.simulate, verbs._write, []
+    compute, calls = verbs.simulate, []
 
     def computed(*args, **options):
         calls.append(1)
@@ -253,12 +253,13 @@ def test_ctrl_c_keeps_the_recorded_cycles_of_a_run(run, monkeypatch, capsys, pre
             os.kill(os.getpid(), signal.SIGINT)
         return compute(*args, **options)
 
-    def written(*args, **options):
-        os.kill(os.getpid(), signal.SIGINT)
-        return write(*args, **options)
-
+    for name in ("_joined", "_write"):
+        after = getattr(verbs, name)
+        press = lambda *args, after=after, **options: (
+            os.kill(os.getpid(), signal.SIGINT), after(*args, **options)
+        )[1]  # fmt: skip
+        monkeypatch.setattr(verbs, name, press)
     monkeypatch.setattr(verbs, "simulate", computed)
-    monkeypatch.setattr(verbs, "_write", written)
     before = signal.getsignal(signal.SIGINT)
     run("simulate", PARTS, 130)
     assert signal.getsignal(signal.SIGINT) is before and len(calls) == pressed

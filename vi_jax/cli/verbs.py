@@ -28,7 +28,7 @@ _ENDINGS = {"output": (".csv", ".nc"), "picture": (".png", ".pdf", ".svg")}
 _LEFT_OUT = {"machine", "orbit", "options", "progress", "cluster", "throw", "key"}
 _NOT_NEEDED = {*_LEFT_OUT, "start", "guess"}
 
-# Cycles, or samples as so many, of one part of a run, which takes a fraction of a second.
+# Cycles, or samples, of one part of a run: a fraction of a second, or seconds of a slow machine.
 _CYCLES, _SAMPLES = 1024, 16384
 
 
@@ -139,10 +139,7 @@ def _kept(function: Callable[..., Any], *args: Any, **options: Any) -> tuple[Any
 
 def _simulate(machine: AbstractMachine, options: dict[str, Any]) -> Found:
     along, start = "sample" if options.get("samples") else "cycle", options.pop("start", None)
-    start = machine.start() if start is None else start
-    drawn: dict[str, Any] = {"samples": 64, "impact_log": 8}
-    alone = is_autonomous(machine, start)  # which has no samples within its cycles
-    run, cut = _kept(run_in_parts, machine, start, **(options if alone else drawn | options))
+    run, cut = _kept(run_in_parts, machine, machine.start() if start is None else start, **options)
 
     def table() -> Any:
         data = run.to_xarray(along=along)
@@ -154,13 +151,14 @@ def _simulate(machine: AbstractMachine, options: dict[str, Any]) -> Found:
     def draw(figure: Figure) -> None:
         figure.set_size_inches(11, 3.6)
         left, right = figure.subplots(1, 2, width_ratios=(2, 1))
-        seen, evenly = run, machine
-        if alone:  # as many intervals of its nominal cycle, from the first section
-            evenly, first = machine.observed_every(machine.cycle), run.sections
-            first = jtu.tree_map(lambda x: x[0], first)
-            seen = simulate(evenly, first, run.impacts.size, **drawn)
-        plot.plot_history(seen, machine=evenly, ax=left, unit="cycles")
-        plot.plot_phase_portrait(seen, evenly, ax=right)
+        seen, shown = run, machine
+        if run.samples is None:  # the same cycles again; one without a drive at equal intervals
+            first = jtu.tree_map(lambda x: x[0], run.sections)
+            if is_autonomous(machine, first):
+                shown = machine.observed_every(machine.cycle)
+            seen = simulate(shown, first, run.impacts.size, samples=64, impact_log=8)
+        plot.plot_history(seen, machine=shown, ax=left, unit="cycles")
+        plot.plot_phase_portrait(seen, shown, ax=right)
 
     return Found([str(run)], table, draw, bool(run.successful), cut)
 
@@ -186,9 +184,10 @@ def run_in_parts(
             if not bool(runs[-1].successful):
                 break
     except KeyboardInterrupt:
-        if runs:
-            raise Interrupted("run", _joined(runs)) from None
-        raise
+        if not runs:
+            raise
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # nor while they are put together
+        raise Interrupted("run", _joined(runs)) from None
     return _joined(runs)
 
 
