@@ -207,3 +207,10 @@ def test_basins_of_random_starts():
 def test_basins_need_two_parts_of_the_start():
     with pytest.raises(ValueError, match="two axes"):
         vi.plot_basins(_basins([0, 1], ("start.Y",), **{"start.Y": [0.0, 1.0]}))
+
+
+def test_an_axis_of_a_number_within_an_array_has_its_name():
+    from vi_jax.plot.scan import _start_name
+
+    words = _start_name(vi.machines.Beam(), "start.displacement[0]")
+    assert words == "displacement[0] at the start"
