@@ -59,18 +59,13 @@ def test_a_motion_that_may_be_anywhere_is_found_beside_the_guess():
     assert float(orbit.state.x + orbit.state.y) == pytest.approx(0.7, abs=1e-10)
     with pytest.raises(ValueError, match="one of its multipliers is 1"):
         vi.continue_orbit(orbit, parameter="damping", bounds=(0.2, 0.5))
-    drifting = vi.find_orbit(Coupled(push=0.01), guess)
-    assert drifting.result == vi.ORBIT_RESULTS.drifts and "drifts" in str(drifting)
-
-
-@pytest.mark.exhaustive
-def test_the_derivative_of_a_motion_that_may_be_anywhere():
-    guess = Sledges(*map(jnp.asarray, (0.4, 0.1, 0.3, -0.2)))
     found = jax.jacrev(lambda c: vi.find_orbit(Coupled(c), guess).state)(jnp.asarray(0.3))
     h = 1e-6
     wanted = np.subtract(sledge_speeds(0.3 + h), sledge_speeds(0.3 - h)) / (2 * h)
     assert [float(found.v), float(found.w)] == pytest.approx(wanted, abs=1e-8)
     assert float(found.x + found.y) == pytest.approx(0, abs=1e-10)
+    drifting = vi.find_orbit(Coupled(push=0.01), guess)
+    assert drifting.result == vi.ORBIT_RESULTS.drifts and "drifts" in str(drifting)
 
 
 def motor(torque, restitution, damping=0.5):
@@ -80,9 +75,8 @@ def motor(torque, restitution, damping=0.5):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("restitution", [0.5, 0.8])
-def test_motor_orbits_are_where_long_simulation_settles(restitution):
-    for torque in (2.0, 10.0, 100.0):
+def test_motor_orbits_are_where_long_simulation_settles():
+    for torque, restitution in ((2.0, 0.5), (100.0, 0.8)):
         scene = motor(torque, restitution)
         run = vi.simulate(scene, scene.start(), 400, method=vi.Adaptive(rtol=1e-10))
         last = jax.tree.map(lambda x: x[-1], run.sections)

@@ -13,7 +13,6 @@ from scipy.optimize import brentq
 from vi_jax.orbit._forecast import settled
 from vi_jax.orbit._local_map import graze_at
 
-from differences import some
 from grazings import grazing_of
 
 K = 0.8
@@ -108,10 +107,8 @@ def _near_top(swing, frequency, n, t, end):
     return near[(near > t) & (near < end)]
 
 
-BEYOND = [(8.4e-5, 5), (1.5e-5, 6), (3.5e-5, 0), (4.0e-6, 7)]
-
-
-@pytest.mark.parametrize(("beyond", "period"), some(BEYOND, *BEYOND[:3]))
+@pytest.mark.slow
+@pytest.mark.parametrize(("beyond", "period"), [(8.4e-5, 5), (3.5e-5, 0)])
 def test_periods_after_a_grazing(half, beyond, period):
     """Windows of motions with one impact, chaos between: by the forecast and by the oscillator."""
     point, found, frequency, amplitude = half
@@ -133,14 +130,6 @@ def test_periods_after_a_grazing(half, beyond, period):
     else:
         assert min(apart) > 0.01 * size
         assert found.outcome == vi.SCENARIOS.period_adding_with_chaos
-
-
-@pytest.mark.slow
-def test_the_machine_agrees_over_decades(half):
-    _, found, _, _ = half
-    low, high = found.checked
-    assert high / low > 1e3 and found.agreement > 0.9
-    assert set(found.machine.offset) <= set(found.forecast.offset)
 
 
 def flown(field, hit, s0, s1, x):
@@ -188,11 +177,10 @@ def test_discontinuity_mapping_beside_flights():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("restitution", some([0.5, 0.8], 0.5))
-@pytest.mark.parametrize(("damping", "zeta"), [(0.0, 0.70711), (0.04483682577, 0.70998)])
-def test_grazing_of_the_paper(restitution, damping, zeta):
+def test_grazing_of_the_paper():
     """Where the 2π motion of the paper is lost (its BB'): e₁ > 0 > e₂, so that an impact brings
     the next but one nearer to the stop, and nothing near attracts."""
+    restitution, damping, zeta = 0.5, 0.04483682577, 0.70998
     scene = vi.Scene.ideal(frequency_ratio=0.8, restitution=restitution, damping_ratio=damping)
     closed = vi.closed_form_orbits(scene)
     point = grazing_of(
@@ -215,7 +203,7 @@ def test_grazing_of_the_paper(restitution, damping, zeta):
     assert [text.get_text() for text in ax.texts] == ["forecast: nothing near attracts"]
 
 
-@pytest.mark.exhaustive
+@pytest.mark.slow
 def test_two_stops_are_touched_at_once():
     """A symmetric motion grazes on both sides; half a period leads from one to the other."""
     machine = vi.machines.Duffing(amplitude=0.3, frequency=0.7, damping=0.4, gap=1.0)
@@ -264,6 +252,9 @@ def test_what_cannot_be_said_is_refused(half):
 @pytest.mark.slow
 def test_it_says_what_follows(half):
     _, found, _, _ = half
+    low, high = found.checked  # the machine agrees over decades
+    assert high / low > 1e3 and found.agreement > 0.9
+    assert set(found.machine.offset) <= set(found.forecast.offset)
     text = str(found)
     assert text.startswith("Grazing at gap = 0.1092048354: touches the right stop\n")
     assert "what follows: period adding with chaos between" in text
@@ -271,11 +262,6 @@ def test_it_says_what_follows(half):
     assert "checked by the machine: from " in text
     assert "<table>" in found._repr_html_()
     assert repr(found.outcome) == "SCENARIOS.period_adding_with_chaos"
-
-
-@pytest.mark.slow
-def test_picture(half):
-    _, found, _, _ = half
     ax = vi.plot_grazing(found)
     named = [text.get_text() for text in ax.get_legend().get_texts()]
     assert named[0] == "the machine" and named[-1] == "grazing"

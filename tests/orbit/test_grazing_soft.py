@@ -43,19 +43,15 @@ def soft_grazing(**options):
 
 
 @pytest.mark.slow
-def test_a_relaxed_soft_stop_is_smooth():
-    """The impulse of a spring K over the parabola of the depth is K (4/3) √(2/a) y³."""
+def test_soft_stops():
+    """The impulse of a spring K over the parabola of the depth is K (4/3) √(2/a) y³. A prestressed
+    one, at which the field jumps, turns the body back with a + F0 by its force F0. A dashpot that
+    may not pull has an impulse of y²."""
     found = vi.grazing(soft_grazing(), check=False)
     assert found.order[0] == 1.5 and found.rate[0] == pytest.approx(SWING, rel=1e-9)
     impulse = -30 * 4 / 3 * np.sqrt(2 / SWING)
     np.testing.assert_allclose(found.kick[0], [0, impulse], rtol=2e-3, atol=2e-3 * -impulse)
     assert found.outcome == vi.SCENARIOS.persistence
-
-
-@pytest.mark.exhaustive
-def test_other_soft_stops():
-    """The field jumps at a prestressed one, whose force F0 turns the body back
-    with a + F0; a dashpot that may not pull has an impulse of y²."""
     found = vi.grazing(soft_grazing(prestress=2.0))
     assert found.order[0] == 0.5
     kick = -2 * 2.0 * np.sqrt(2 * SWING) / (SWING + 2.0)

@@ -6,6 +6,9 @@ import numpy as np
 import pytest
 import vi_jax as vi
 from scipy.optimize import brentq
+from vi_jax.orbit import _conditions
+from vi_jax.orbit._observed import Observed
+from vi_jax.orbit.floquet import compound
 
 ZETA, XI, GAP = "drive.frequency_ratio", "oscillator.damping_ratio", "stops.0.gap"
 
@@ -24,7 +27,7 @@ def held(orbit, size):
 
 
 @pytest.mark.slow
-def test_an_amplitude_is_held_by_the_damping(linear):
+def test_an_amplitude_is_held_by_the_damping(linear, monkeypatch):
     """1/√((1 - ζ²)² + (2ξζ)²) = A; the branch ends where no damping would be needed."""
     branch = held(linear, 3.0)
     np.testing.assert_allclose(branch.y_max, 3.0, atol=1e-12)
@@ -35,15 +38,9 @@ def test_an_amplitude_is_held_by_the_damping(linear):
     data = branch.to_xarray()
     np.testing.assert_array_equal(data[XI], xi)
     assert vi.plot_branch(branch, x=XI, y="multiplier").get_xlabel() == "damping ratio ξ"
-
-
-def test_another_value_is_not_another_program(linear, monkeypatch):
-    from vi_jax.orbit import _conditions
-
+    # Another value is not another program.
     traced, plain = [], _conditions.quantity_of
     monkeypatch.setattr(_conditions, "quantity_of", lambda *a: (traced.append(a[-1]), plain(*a))[1])
-    held(linear, 3.0)
-    traced.clear()
     branch = held(linear, 2.9)
     assert not traced and branch.y_max == pytest.approx(2.9, abs=1e-12)
     assert f"held: y_max = 2.9 a; by {XI} in [0.001, " in str(branch)
@@ -114,18 +111,13 @@ def test_special_points_where_numbers_are_held(struck):
         ({"free": {ZETA: (0.2, 1.5)}, "fixed": {"y_max": 3.0}}, "others than the parameter"),
         ({"free": {XI: (0.0, 0.5)}, "fixed": {"height": 3.0}}, "`fixed` must be one of .*'y_max'"),
         ({"free": {XI: (0.0, 0.5)}, "fixed": {"y_max": np.nan}}, r"`fixed\['y_max'\]` must be"),
+        ({"free": {XI: (0.2, 0.5)}, "fixed": {"y_max": None}}, "`free` must hold the orbit's"),
         ({"free": {XI: (0.5, 0.0)}, "fixed": {"y_max": 3.0}}, r"`free\['.*'\]` must be two finite"),
     ],
 )
 def test_says_what_is_wrong(linear, arguments, message):
     with pytest.raises(ValueError, match=message):
         vi.continue_orbit(linear, parameter=ZETA, bounds=(0.5, 1.5), **arguments)
-
-
-def test_what_cannot_be_held_is_said(linear):
-    given = {"parameter": ZETA, "bounds": (0.5, 1.5)}
-    with pytest.raises(ValueError, match="`free` must hold the orbit's"):
-        vi.continue_orbit(linear, **given, free={XI: (0.2, 0.5)}, fixed={"y_max": None})
 
 
 @pytest.mark.slow
@@ -151,10 +143,6 @@ def test_a_multiplier_is_held_until_another_is_as_large():
 
 def test_a_pair_of_multipliers_is_held_until_it_turns_real():
     """On a matrix of known eigenvalues: those of its second compound are their products."""
-    from vi_jax.orbit._conditions import as_held
-    from vi_jax.orbit._observed import Observed
-    from vi_jax.orbit.floquet import compound
-
     turn = 0.7 * np.array([[np.cos(1.0), -np.sin(1.0)], [np.sin(1.0), np.cos(1.0)]])
     matrix = np.zeros((3, 3))
     matrix[:2, :2], matrix[2, 2] = turn, 0.3
@@ -163,12 +151,12 @@ def test_a_pair_of_multipliers_is_held_until_it_turns_real():
     expected = [0.49, 0.21 * np.exp(1j), 0.21 * np.exp(-1j)]
     np.testing.assert_allclose(np.sort_complex(products), np.sort_complex(expected), atol=1e-12)
     pair = [0.7 * np.exp(1j), 0.7 * np.exp(-1j)]
-    (held,) = as_held({"multiplier": 0.7}, np.array([*pair, 0.3]))
-    assert held.pair
+    (pair_held,) = _conditions.as_held({"multiplier": 0.7}, np.array([*pair, 0.3]))
+    assert pair_held.pair
 
     def overtaken(*values):
         rest = {name: None for name in Observed._fields[1:10]}
-        return held.overtaken(Observed(multipliers=np.array(values), **rest))
+        return pair_held.overtaken(Observed(multipliers=np.array(values), **rest))
 
     assert overtaken(*pair, 0.3) < 0
     assert overtaken(0.75, 0.49 / 0.75, 0.3) > 0 and overtaken(0.8, *pair) > 0

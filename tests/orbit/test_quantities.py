@@ -2,7 +2,6 @@
 
 import itertools
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -29,7 +28,6 @@ def branch(orbit):
     return vi.continue_orbit(orbit, parameter="frequency", bounds=(0.75, 0.85))
 
 
-@pytest.mark.slow
 def test_an_orbit_takes_the_power_that_it_loses(orbit):
     assert bool(orbit.successful)
     np.testing.assert_allclose(missing(orbit.averages, orbit), 0.0, atol=1e-8)
@@ -59,6 +57,7 @@ def test_along_a_branch(branch, orbit):
     assert frame.value.shape == branch.impact_speed.shape
 
 
+@pytest.mark.slow
 def test_pictures_by_name(branch):
     ax = vi.plot_branch(branch, y="taken")
     assert ax.get_ylabel() == "mean taken (W)"
@@ -69,6 +68,7 @@ def test_pictures_by_name(branch):
         vi.plot_branch(branch, y="power")
 
 
+@pytest.mark.slow
 def test_tables_are_checked(branch):
     with pytest.raises(TypeError, match="'word' is 'high'"):
         branch.table(lambda at: {"word": "high"})
@@ -77,21 +77,3 @@ def test_tables_are_checked(branch):
         branch.table(lambda at: np.zeros(next(counts)))
     with pytest.raises(TypeError, match="call no number `parameter`"):
         branch.table(lambda at: {"parameter": 0.0})
-
-
-@pytest.mark.exhaustive
-def test_derivatives_of_an_orbit(branch):
-    """By the implicit function theorem; beside the branch's own slope, and for several guesses."""
-
-    def power(frequency, guess):
-        found = vi.find_orbit(Shaken(frequency=frequency), guess, method=vi.Taylor())
-        return found.averages["taken"], found.quantities["energy"]
-
-    at = branch.at(0.8)[0]
-    (_, slope) = jax.jvp(lambda f: power(f, at.state)[0], (0.8,), (1.0,))
-    beside = [float(branch.at(0.8 + h)[0].averages["taken"]) for h in (2e-5, -2e-5)]
-    np.testing.assert_allclose(slope, (beside[0] - beside[1]) / 4e-5, rtol=1e-6)
-    guesses = jax.tree.map(lambda x: jnp.stack([x, x + 1e-3]), at.state)
-    taken, energy = power(0.8, guesses)
-    np.testing.assert_allclose(taken, at.averages["taken"], atol=1e-8)
-    assert energy.shape == (2, 1)

@@ -1,5 +1,4 @@
-"""Curves in two parameters along which a surface that slides is touched, beside a closed form and
-motions that SciPy follows from event to event."""
+"""A curve in two parameters along which a surface that slides is touched, beside a closed form."""
 
 from typing import Any
 
@@ -7,9 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-from scipy.optimize import brentq
 
-from rough_floor import Rough, branch_of, on_both_sides, settled
+from rough_floor import Rough
 
 pytestmark = pytest.mark.slow
 
@@ -54,25 +52,3 @@ def test_grazing_sliding_of_a_linear_motion():
     belt, omega = curve.parameters.T
     assert np.ptp(omega) == pytest.approx(1.2)
     np.testing.assert_allclose(belt, reached(omega), rtol=1e-9)
-
-
-@pytest.mark.exhaustive
-def test_adding_sliding_beside_motions_followed_from_event_to_event():
-    """Where the drive is strongest it just comes to what friction holds."""
-    numbers = {"level": 0.5, "second": 0.0, "damping": 0.04}
-    point = branch_of("omega", (0.15, 0.7), omega=0.25, **numbers).special[0]
-    sides = [point, on_both_sides(point, "omega", (0.15, 0.2))]
-    assert [side.kind for side in sides] == ["adding-sliding"] * 2
-    (without,) = (side for side in sides if side.touches)
-    curve = vi.boundary(without, parameter="level", bounds=((0.1, 0.3), (0.45, 0.55)))
-    assert curve.kind == "adding-sliding" and np.ptp(curve.parameters[:, 1]) > 0.04
-
-    def excess(omega, level):
-        """At phase 2π of the body that came to stand before, once it has settled."""
-        events = settled(omega, level, 0.0, 0.04, cycles=25)
-        (Y,) = (e[1] for e in events if e[3] == 0 and e[1] > 0)
-        return 1.0 - Y - level if Y < 1 else Y - 1 - level
-
-    for omega, level in curve.parameters[[0, len(curve.parameters) // 2, -1]]:
-        truth = brentq(excess, omega - 1e-5, omega + 1e-5, args=(level,), xtol=1e-11)
-        assert omega == pytest.approx(truth, abs=1e-8)
