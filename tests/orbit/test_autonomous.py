@@ -91,16 +91,24 @@ class Ahead(Belt):
 
 @pytest.mark.slow
 def test_cycles_with_sticking_end_where_the_belt_is_only_just_reached():
-    """Wherever the branch begins and whatever its steps; and so do those that only slide."""
+    """Wherever the branch begins. Those that only slide do so too, and shrink to rest on the other
+    side: the friction 0.5 + 0.5 exp(-2v) where the body stands has the slope exp(-2v), which is the
+    damping 0.1 at v = ½ ln 10."""
     ending = brentq(short_of_belt, 1.7, 1.9, xtol=1e-13)
     sliding = vi.OscillatorState(jnp.asarray(1.7), jnp.asarray(0.0))
     stuck = vi.OscillatorState(jnp.asarray(0.0), jnp.asarray(1.5))
     sticking = vi.simulate(Ahead(), stuck, 1, settle=40).last
-    for start, bounds in ((sliding, (1.3, 1.9)), (sticking, (1.3, 1.9)), (sticking, (0.05, 2.0))):
+    for start, bounds in ((sticking, (1.3, 1.9)), (sticking, (0.05, 2.0)), (sliding, (1.1, 1.9))):
         orbit = vi.find_orbit(Ahead(), start)
         branch = vi.continue_orbit(orbit, parameter="speed", bounds=bounds)
         assert branch.ends[1] == "grazing-sliding"
         assert branch.parameter[-1] == pytest.approx(ending, abs=1e-10)
+    hopf = branch.special[0]
+    assert branch.ends[0] == hopf.kind == "hopf"
+    assert hopf.parameter == pytest.approx(0.5 * np.log(10), abs=1e-13)
+    assert float(hopf.orbit.state.Y) == pytest.approx(0.55, abs=1e-5)
+    assert float(hopf.orbit.duration) == pytest.approx(2 * np.pi, abs=1e-12)
+    assert abs(hopf.orbit.multipliers[0]) == pytest.approx(1, abs=1e-6)
 
 
 @pytest.mark.slow

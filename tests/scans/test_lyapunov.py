@@ -14,25 +14,18 @@ def ideal(zeta=0.9, k=0.5, xi=0.0, gap=2.0):
     return vi.Scene.ideal(frequency_ratio=zeta, restitution=k, damping_ratio=xi, gap=gap)
 
 
-@pytest.mark.parametrize("xi", [0.02, 0.3, 0.9])
-def test_linear_oscillator(xi):
-    scene = ideal(xi=xi, gap=None)
-    found = vi.lyapunov(scene, scene.start(Y=1.0), 1000)
-    # Both turn around each other, slowly for ξ = 0.9; the weights average that out.
-    np.testing.assert_allclose(found.exponents, [-xi, -xi], atol=1e-9)
+def test_linear_oscillator():
+    """Both turn around each other, slowly for ξ = 0.9, which the weights average out; beyond ξ = 1
+    they part."""
+    for xi, cycles in ((0.02, 1000), (0.9, 1000), (1.5, 400)):
+        scene = ideal(xi=xi, gap=None)
+        found = vi.lyapunov(scene, scene.start(Y=1.0), cycles)
+        rates = -xi + np.array([1, -1]) * np.sqrt(max(xi**2 - 1, 0.0))
+        np.testing.assert_allclose(found.exponents, rates, atol=1e-9)
 
 
-def test_overdamped_oscillator():
-    xi = 1.5
-    rates = -xi + np.array([1, -1]) * np.sqrt(xi**2 - 1)
-    scene = ideal(xi=xi, gap=None)
-    found = vi.lyapunov(scene, scene.start(Y=1.0), 400)
-    np.testing.assert_allclose(found.exponents, rates, atol=1e-9)
-
-
-@pytest.mark.parametrize("k, xi", [(0.5, 0.0), (0.8, 0.01)])
-def test_stable_orbit_has_the_rates_of_its_multipliers(k, xi):
-    scene = ideal(k=k, xi=xi)
+def test_stable_orbit_has_the_rates_of_its_multipliers():
+    scene = ideal(k=0.8, xi=0.01)
     found = vi.lyapunov(scene, scene.start(), 400, settle=600)
     closed = vi.closed_form_orbits(scene, cycles=2)
     orbit = vi.find_orbit(scene, scene.start(Y=closed.Y[0], V=closed.V[0]), cycles=2)
@@ -51,9 +44,9 @@ def test_unstable_orbit_has_the_rates_of_its_multipliers():
     assert float(found.exponents[0]) > 0.01
 
 
-@pytest.mark.parametrize("cycles", [16, 23, 36])
-def test_the_greatest_alone_is_the_greatest_of_all(cycles):
+def test_the_greatest_alone_is_the_greatest_of_all():
     """One direction is made a unit only now and then, several are after every cycle."""
+    cycles = 23
     scene = ideal(zeta=0.7, k=0.8, xi=0.003)
     alone = vi.lyapunov(scene, scene.start(), cycles, number=1)
     whole = vi.lyapunov(scene, scene.start(), cycles)
@@ -64,12 +57,11 @@ def test_the_greatest_alone_is_the_greatest_of_all(cycles):
     np.testing.assert_allclose(alone.state.Y, whole.state.Y, rtol=1e-9)
 
 
-@pytest.mark.parametrize("zeta, xi", [(0.05, 0.9), (0.02, 0.9)])
-def test_a_long_cycle_leaves_next_to_nothing(zeta, xi):
-    """Of a direction after one cycle e^-113, and e^-283, whose square is no number."""
-    scene = ideal(zeta=zeta, xi=xi, gap=None)
+def test_a_long_cycle_leaves_next_to_nothing():
+    """Of a direction after one cycle e^-283, whose square is no number."""
+    scene = ideal(zeta=0.02, xi=0.9, gap=None)
     found = vi.lyapunov(scene, scene.start(Y=1.0), 16, settle=1, number=1)
-    np.testing.assert_allclose(found.exponents, -xi, atol=2e-3)
+    np.testing.assert_allclose(found.exponents, -0.9, atol=2e-3)
 
 
 def test_a_direction_in_single_precision():
@@ -82,14 +74,13 @@ def test_a_direction_in_single_precision():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("zeta", [0.6, 0.7, 0.97])
-def test_exponents_add_up_to_the_mean_contraction(zeta):
+def test_exponents_add_up_to_the_mean_contraction():
     """Volumes shrink by e^{-2ξ} in unit time and by k² in an impact, whatever the motion does.
 
     Over so few cycles that rounding does not part the motion from the one whose impacts are
     counted, and with the weights that vanish at both ends.
     """
-    k, xi, cycles = 0.8, 0.003, 16
+    zeta, k, xi, cycles = 0.7, 0.8, 0.003, 16
     scene = ideal(zeta=zeta, k=k, xi=xi)
     starts = vi.simulate(
         scene, scene.start(Y=0.3), 200, settle=500, method=vi.ExactFlight()
@@ -149,12 +140,9 @@ def test_failed_runs_and_bad_arguments():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "zeta, k, gap, xi", [(0.3, 0.4, 0.3, 0.05), (0.17, 0.6, 0.5, 0.02), (0.4, 0.6, 0.3, 0.05)]
-)
-def test_a_motion_that_rests_forgets_at_once(zeta, k, gap, xi):
+def test_a_motion_that_rests_forgets_at_once():
     # At the default 400 cycles, whose outermost weights are 0.
-    scene = ideal(zeta=zeta, k=k, xi=xi, gap=gap)
+    scene = ideal(zeta=0.17, k=0.6, xi=0.02, gap=0.5)
     start = scene.start(Y=-0.5, V=0.1)
     found = vi.lyapunov(scene, start)
     assert bool(found.successful) and (np.asarray(found.exponents) == -np.inf).all()

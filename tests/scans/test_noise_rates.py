@@ -1,12 +1,10 @@
 """Rates under noise: escapes over a barrier, and impacts as impulses come closer together."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.sparse as sp
 import vi_jax as vi
-from scipy.optimize import brentq
 from scipy.sparse.linalg import eigs
 
 
@@ -54,47 +52,3 @@ def test_escapes_over_a_barrier_come_as_kramers_says():
     assert abs(slope + 1) < 0.05
     exact = 2 * np.pi * np.array([fokker_planck(x, damping) for x in D])
     assert np.all(np.abs(rates / exact - 1) < 0.1 + 3 / weights**0.5)
-
-
-class Walled(vi.AbstractMachine):
-    """x'' + 0.2 x' + x = 0.5 dW with a stop at 0."""
-
-    restitution: jax.Array
-
-    @property
-    def cycle(self):
-        return 2 * jnp.pi
-
-    @property
-    def stops(self):
-        return (vi.RigidStop(0.0, self.restitution, "left"),)
-
-    def field(self, s, x):
-        return vi.OscillatorState(x.V, -x.Y - 0.2 * x.V)
-
-
-@pytest.mark.slow
-def test_the_rate_of_impacts_with_loss_is_off_by_a_root_of_the_step():
-    """Slow impacts have a flux like a power of their speed, a, of which 2 r^(1+a) cos(πa/3) = 1;
-    impulses miss those slower than the root of the step: its power (1 + a)/2, with r = 0.5 a half.
-    """
-    restitution, cycle = 0.5, 2 * np.pi
-    power = brentq(lambda a: 2 * restitution ** (1 + a) * np.cos(np.pi * a / 3) - 1, -0.5, 1.0)
-    start = vi.OscillatorState(jnp.array(1.0), jnp.array(0.0))
-    rates = []
-    for impulses in (8, 32, 128):
-        data = vi.scan(
-            Walled(jnp.array(restitution)), {"noise.path": np.arange(1024)}, start=start,
-            measure=vi.Statistics("impacts"), settle=20, cycles=400, progress=False,
-            noise=vi.WhiteNoise({"V": 0.5}, impulses=impulses), key=jax.random.key(impulses),
-        )  # fmt: skip
-        each = data.impacts_mean.values / cycle
-        rates.append((each.mean(), each.std(ddof=1) / 32))
-    (few, e0), (some, e1), (many, e2) = rates
-    first, second = some - few, many - some
-    order = np.log(first / second) / np.log(4)
-    # Errors of the two differences, that of the middle one being in both.
-    parts = [e0 / first, e1 * (1 / first + 1 / second), e2 / second]
-    error = np.linalg.norm(parts) / np.log(4)
-    assert error < 0.05
-    assert abs(order - 0.5 * (1 + power)) < 3 * error
