@@ -14,16 +14,13 @@ from vi_jax.lanes import runtime
 SCENE = vi.Scene.ideal(frequency_ratio=0.9)
 
 
-@pytest.mark.parametrize("number", [0, -1, 1025, 10**30])
-def test_threads_are_at_least_one(number):
-    with pytest.raises(ValueError, match="`number` must be from 1 to 1024, but got"):
-        vi.threads(number)
-
-
-@pytest.mark.parametrize("number", [False, True, "a", 1.5, None, jnp.asarray(2)])
-def test_threads_are_a_number(number):
-    with pytest.raises(TypeError, match="`number` must be an integer, but got"):
-        vi.threads(number)
+def test_threads_are_a_number_from_one_on():
+    for number in (0, -1, 1025, 10**30):
+        with pytest.raises(ValueError, match="`number` must be from 1 to 1024, but got"):
+            vi.threads(number)
+    for number in (False, True, "a", 1.5, None, jnp.asarray(2)):
+        with pytest.raises(TypeError, match="`number` must be an integer, but got"):
+            vi.threads(number)
 
 
 @pytest.mark.slow

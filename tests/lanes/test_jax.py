@@ -5,13 +5,12 @@ import jax
 import jax.numpy as jnp
 import pytest
 from jax.ad_checkpoint import checkpoint_name
-from jax.extend.core import ClosedJaxpr, Jaxpr, Primitive, primitives
+from jax.extend.core import Primitive, primitives
 from jax.interpreters import mlir, partial_eval
 from vi_jax import _programs, lanes
 from vi_jax.lanes import _primitive
 from vi_jax.lanes._arrays import STRUCTURAL
 from vi_jax.lanes._operations import ELEMENTWISE
-from vi_jax.lanes._program import called, scan_counts
 
 # Primitives of this package, and some that JAX has in no public module or had in earlier versions.
 OWN = {"sincos", "pin", "quotient", "weighted", "weighted_quotient", "weighted_dot"}
@@ -23,57 +22,6 @@ def test_rules_are_written_for_primitives_that_there_are():
              if isinstance(x, Primitive)}  # fmt: skip
     gone = {*ELEMENTWISE, *STRUCTURAL} - there - OWN - ELSEWHERE
     assert not gone, f"JAX has no primitives {gone}: rename their rules (_operations.py)"
-
-
-def by_vjp(x):
-    function = jax.custom_vjp(jnp.sin)
-    function.defvjp(lambda x: (jnp.sin(x), x), lambda x, g: (g * jnp.cos(x),))
-    return function(x)
-
-
-def by_jvp(x):
-    function = jax.custom_jvp(jnp.sin)
-    function.defjvps(lambda slope, out, x: slope * jnp.cos(x))
-    return function(x)
-
-
-@pytest.mark.parametrize("call", [jax.jit(jnp.sin), jax.checkpoint(jnp.sin), by_jvp, by_vjp])
-def test_calls_are_known_by_their_names(call):
-    (eqn,) = jax.make_jaxpr(call)(1.0).eqns
-    name = eqn.primitive.name
-    assert isinstance(called(eqn), Jaxpr | ClosedJaxpr), f"`called` (_program.py) lacks `{name}`"
-
-
-LOOPS = {
-    "cond": (lambda x: jax.lax.cond(x > 0, jnp.sin, jnp.cos, x), "branches"),
-    "while": (
-        lambda x: jax.lax.while_loop(lambda a: a < 5, lambda a: a * a, x),
-        "cond_jaxpr cond_nconsts body_jaxpr body_nconsts",
-    ),
-    "scan": (
-        lambda x: jax.lax.scan(lambda a, b: (a * b, a), x, jnp.arange(3.0))[0],
-        "jaxpr length reverse",
-    ),
-}
-
-
-@pytest.mark.parametrize("name", LOOPS)
-def test_loops_and_branches_are_known_by_their_names(name):
-    function, parameters = LOOPS[name]
-    found = {e.primitive.name: e.params for e in jax.make_jaxpr(function)(1.0).eqns}
-    assert name in found, f"JAX makes {[*found]} of `{name}` (_vector.py, _program.py)"
-    gone = {*parameters.split()} - {*found[name]}
-    assert not gone, f"`{name}` has no parameters {gone}: see `_equation` (_vector.py)"
-
-
-def test_a_scan_says_what_it_carries():
-    def loop(x, carried):
-        turn = lambda a, row: ((a[0] * row + x[1], {"sum": a[1]["sum"] + row}), a[0])
-        return jax.lax.scan(turn, carried, jnp.arange(3.0))
-
-    numbers = (1.0, 2.0), (3.0, {"sum": 4.0})
-    (eqn,) = (e for e in jax.make_jaxpr(loop)(*numbers).eqns if e.primitive.name == "scan")
-    assert (*scan_counts(eqn.params), len(eqn.invars)) == (1, 2, 4)
 
 
 def test_what_a_policy_of_checkpoint_says():

@@ -27,7 +27,7 @@ def plain(x, r, n):
     return out
 
 
-@pytest.mark.parametrize("size", [0, 1, 2, 7, 8, 9, 101, 1000])
+@pytest.mark.parametrize("size", [0, 1, 9, 101])
 def test_every_batch(size):
     x, r, n = batch(size)
     (last, steps), rows = MANY(x, r, n)
@@ -43,7 +43,7 @@ def test_every_batch(size):
 
 
 def test_backends_agree():
-    for size in (1, 7, 600):
+    for size in (1, 600):
         values = batch(size)
         other = jax.jit(jax.vmap(lambda *a: logistic(*a, backend="xla")))(*values)
         for a, b in zip(jax.tree.leaves(MANY(*values)), jax.tree.leaves(other), strict=True):
@@ -163,7 +163,7 @@ def test_single_precision():
     np.testing.assert_allclose(last, wide[0][0], rtol=2e-4)
 
 
-@pytest.mark.parametrize("cpu", ["x86-64-v3", "x86-64-v2", "x86-64"])
+@pytest.mark.parametrize("cpu", ["x86-64-v3", "x86-64"])
 def test_lesser_processors(cpu):
     import platform
 

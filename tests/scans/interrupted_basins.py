@@ -1,0 +1,47 @@
+"""Basins left at Ctrl-C: prints how long they took to end (seconds), and how many starts they had."""
+
+import os
+import signal
+import threading
+import time
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+import jax.numpy as jnp
+import numpy as np
+import vi_jax as vi
+
+# A shell starts what runs in the background without it.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
+SCENE = vi.Scene.ideal(frequency_ratio=1.4, restitution=0.8, gap=2.0, damping_ratio=0.05)
+
+
+def basins(settle):
+    region = {"start.Y": (-6.0, 2.0), "start.V": (-6.0, 6.0)}
+    return vi.basins(SCENE, region, resolution=(128, 64), settle=settle, lanes=256, progress=False)
+
+
+def strike(delay, at):
+    time.sleep(delay)
+    at.append(time.perf_counter())
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+basins(1)  # compiles
+for settle, delay in ((4_000, 8.0), (10**8, 1.0)):  # many short blocks, and then one long one
+    at = []
+    threading.Thread(target=strike, args=(delay, at), daemon=True).start()
+    try:
+        try:
+            basins(settle)
+            print("not interrupted")
+        except Exception as error:
+            print(repr(error))
+    except vi.Interrupted as error:
+        took = time.perf_counter() - at[0]
+        np.asarray(jnp.sin(jnp.arange(3.0)))  # waits for what runs still
+        done = np.asarray(error.data["result"]) >= 0
+        share = int(done.sum()) if done.sum() < done.size else -1
+        print(took, time.perf_counter() - at[0], share)
