@@ -98,23 +98,6 @@ def test_exponents_add_up_to_the_mean_contraction():
 
 
 @pytest.mark.slow
-def test_chaos_is_seen_by_a_disturbance_too():
-    scene = ideal(zeta=0.7, k=0.8)
-    found = vi.lyapunov(scene, scene.start(), 4000, settle=2000)
-    assert float(found.exponents[0]) > 10 * float(found.spread) > 0
-
-    def after(Y, cycles):
-        start = vi.OscillatorState(Y, found.state.V)
-        return vi.simulate(scene, start, cycles, method=vi.ExactFlight()).sections.Y
-
-    Y = found.state.Y
-    apart = jnp.abs(after(Y + 1e-12, 60) - after(Y, 60))
-    rate = np.polyfit(np.arange(61)[5:], np.log(np.asarray(apart) + 1e-300)[5:], 1)[0]
-    # One stretch of sixty cycles grows at its own rate, not at the mean one.
-    assert rate == pytest.approx(float(found.per_cycle[0]), rel=0.6)
-
-
-@pytest.mark.slow
 def test_motor_has_three_and_vmap_gives_the_same():
     scene = vi.Parameters(torque=10.0, control=0.9, restitution=0.8, gap=0.08).scene()
     start = scene.start(Y=0.5)

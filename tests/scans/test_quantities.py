@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import vi_jax as vi
-from vi_jax import cli
 
 from shaken_oscillator import Shaken
 
@@ -50,23 +49,3 @@ def test_exponents_tell_it(runs):
     found = vi.lyapunov(machine, runs[0].last, 8, settle=0, number=1)
     np.testing.assert_allclose(found.averages["taken"], runs[0].averages["taken"][-1], rtol=1e-6)
     assert "mean taken: " in repr(found) and found.to_xarray().taken.attrs["units"] == "W"
-
-
-@pytest.mark.slow
-def test_on_the_command_line(tmp_path, monkeypatch, capsys):
-    """By name in files, and a wrong name is told with those there are, before any work."""
-    monkeypatch.chdir(tmp_path)
-    asked = "[sweep]\nparameter = 'frequency'\nvalues = [0.76, 0.77]\nsettle = 5\ncycles = 4\n"
-    name = ["--machine", "shaken_oscillator:Shaken"]
-    (tmp_path / "good.toml").write_text(f"{asked}y = 'taken'\noutput = 'a.csv'\npicture = 'a.png'")
-    assert cli.main(["sweep", "good.toml", *name]) == 0
-    header = (tmp_path / "a.csv").read_text(encoding="utf-8").splitlines()[0]
-    assert {"lost", "taken"} <= set(header.split(",")) and (tmp_path / "a.png").exists()
-    (tmp_path / "run.toml").write_text("[simulate]\ncycles = 2\noutput = 'run.csv'")
-    assert cli.main(["simulate", "run.toml", *name]) == 0
-    header = (tmp_path / "run.csv").read_text(encoding="utf-8").splitlines()[0]
-    assert {"energy", "taken"} <= set(header.split(","))
-    capsys.readouterr()
-    (tmp_path / "bad.toml").write_text(f"{asked}y = 'power'")
-    assert cli.main(["sweep", "bad.toml", *name]) == 2
-    assert "impact_speed, lost, taken" in capsys.readouterr().err
