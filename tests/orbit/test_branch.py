@@ -179,6 +179,8 @@ def test_boundaries_in_a_second_parameter(short, tmp_path):
     folds = vi.boundary(the(short, "fold"), parameter="stops.0.restitution", bounds=bounds)
     for zeta, k in folds.parameters[::10]:
         assert zeta == pytest.approx(fold_by_eq_21(k, 2.0, zeta - 1e-3, zeta + 1e-3), abs=1e-8)
+    ax = vi.plot_boundary(folds)
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("frequency ratio ζ", "restitution k")
     # It ends on its bounds, also of a parameter whose scale is far below 1.
     curve = vi.boundary(doubling, parameter=xi, bounds=((0.5, 1.9), (0.0, 0.004)))
     ends = curve.parameters[[0, -1], 1]

@@ -1,6 +1,7 @@
 """Animations and schematics: what moves, what is written, what is refused."""
 
 import base64
+import dataclasses
 
 import jax
 import jax.numpy as jnp
@@ -124,6 +125,9 @@ def test_an_orbit_knows_its_machine():
     assert len(shown.draw(0).axes) == 1
     with pytest.raises(ValueError, match="`machine` must be left out"):
         vi.animate(orbit, scene)
+    lost = dataclasses.replace(orbit, result=vi.ORBIT_RESULTS.no_orbit)
+    with pytest.raises(ValueError, match="an orbit whose search failed"):
+        vi.animate(lost)
 
 
 def test_a_machine_says_how_it_is_drawn():
@@ -164,19 +168,13 @@ def test_wrong_arguments_are_named(run):
     with pytest.raises(ValueError, match="`machine` must be given"):
         vi.animate(run)
     with pytest.raises(ValueError, match="`motion` must have samples"):
-        vi.animate(vi.simulate(scene, scene.start(), 2), scene)
+        vi.animate(dataclasses.replace(run, samples=None), scene)
     with pytest.raises(ValueError, match=r"`fps` must be at least 1, but got 0"):
         vi.animate(run, scene, fps=0)
     with pytest.raises(ValueError, match=r"`seconds`"):
         vi.animate(run, scene, seconds=-1.0)
     with pytest.raises(ValueError, match="two samples at least within the window"):
         vi.animate(run, scene, window=(7, 8))
-    batch = jax.vmap(
-        lambda Y: vi.simulate(scene, scene.start(Y=Y), 2, samples=8)
-    )(jnp.array([0.0, 0.1]))  # fmt: skip
+    batch = jax.tree.map(lambda x: jnp.stack([x, x]), run)
     with pytest.raises(ValueError, match="one motion"):
         vi.animate(batch, scene)
-    lost = vi.find_orbit(scene, scene.start(Y=0.0), cycles=1, root_finder=vi.Newton(max_steps=1))
-    if not bool(lost.successful):
-        with pytest.raises(ValueError, match="an orbit whose search failed"):
-            vi.animate(lost)

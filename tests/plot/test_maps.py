@@ -74,10 +74,6 @@ def test_other_numbers_of_a_store_are_drawn_as_its_attributes_say():
     np.testing.assert_array_equal(cells, others)
 
 
-def test_a_map_without_its_legend():
-    assert vi.plot_regimes(_data(), ax=_axes(), legend=False).get_legend() is None
-
-
 def test_regimes_lie_around_their_values():
     shuffled = _data(PERIODS[[2, 0, 3, 1]], x=(0.9, 0.5, 1.1, 0.7))
     (cells, mesh), (others, _) = (
@@ -91,7 +87,8 @@ def test_regimes_lie_around_their_values():
 
 
 def test_axes_by_name_single_rows_and_what_was_not_computed():
-    turned = vi.plot_regimes(_data(), ax=_axes(), x="stops.0.restitution")
+    turned = vi.plot_regimes(_data(), ax=_axes(), x="stops.0.restitution", legend=False)
+    assert turned.get_legend() is None
     straight, _ = _cells(vi.plot_regimes(_data(), ax=_axes()))
     np.testing.assert_array_equal(_cells(turned)[0], straight.transpose(1, 0, 2))
     assert turned.get_xlabel() == "restitution k"
@@ -101,6 +98,8 @@ def test_axes_by_name_single_rows_and_what_was_not_computed():
 
 
 def test_maps_need_two_axes():
+    with pytest.raises(ValueError, match="two axes"):
+        vi.plot_basins(_basins([0, 1], ("start.Y",), **{"start.Y": [0.0, 1.0]}))
     with pytest.raises(ValueError, match="must hold `period`"):
         vi.plot_regimes(_data().drop_vars("period"))
     with pytest.raises(ValueError, match="two axes"):
@@ -202,11 +201,6 @@ def test_basins_of_random_starts():
     (dots,) = ax.collections
     assert dots.get_offsets().tolist() == [[0.0, 0.5], [1.0, 0.5], [2.0, 0.0]]
     assert len({tuple(color) for color in dots.get_facecolors()}) == 3
-
-
-def test_basins_need_two_parts_of_the_start():
-    with pytest.raises(ValueError, match="two axes"):
-        vi.plot_basins(_basins([0, 1], ("start.Y",), **{"start.Y": [0.0, 1.0]}))
 
 
 def test_an_axis_of_a_number_within_an_array_has_its_name():

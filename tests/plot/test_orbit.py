@@ -67,8 +67,12 @@ def test_a_branch_along_which_nothing_moves_is_drawn_by_its_least_position(branc
 
 def test_a_sweep_lies_above_branches_and_below_marks(branch):
     sweep = vi.sweep(branch.orbit(0).machine, NAME, np.linspace(0.95, 1.0, 4), settle=10, cycles=8)
-    ax = vi.plot_sweep(sweep, ax=_axes())
-    vi.plot_branch(branch, ax=ax)
+    ax = _axes()
+    assert vi.plot_sweep(sweep, ax=ax) is ax and vi.plot_branch(branch, ax=ax) is ax
+    assert len(ax.lines[0].get_xdata()) == 4
+    assert vi.plot_multipliers(branch.orbit(0), ax=(own := _axes())) is own
+    plain = vi.plot_branch(branch, ax=_axes(), y="y_max", special=False)
+    assert not [line for line in plain.lines if line.get_label() in MARKS]
     dots, *others = ax.lines
     marks = [line for line in others if line.get_label() in MARKS]
     lines = [line for line in others if line not in marks]
@@ -88,33 +92,6 @@ def test_every_special_point_has_a_mark_of_its_own():
     }  # fmt: skip
 
 
-def test_sweep_of_a_machine_speaks_its_words():
-    ball = vi.machines.BouncingBall(restitution=0.5, acceleration=1.2)
-    sweep = vi.sweep(ball, "acceleration", np.array([1.2, 1.25]), settle=200, cycles=8)
-    assert "cycle" in str(sweep) and "π" not in str(sweep)
-    assert vi.plot_sweep(sweep, ax=_axes()).get_ylabel() == "max height (g/ω²)"
-
-
-def test_given_axes_are_used(branch):
-    ax = Figure().subplots()
-    assert vi.plot_branch(branch, ax=ax, y="y_max", special=False) is ax
-    assert vi.plot_multipliers(branch.orbit(0), ax=ax) is ax
-    sweep = vi.sweep(branch.orbit(0).machine, NAME, np.linspace(0.95, 1.0, 4), settle=10, cycles=8)
-    assert vi.plot_sweep(sweep, ax=ax) is ax
-    assert len(ax.lines[-1].get_xdata()) == 4
-
-
-@pytest.mark.slow
-def test_boundary_is_drawn_in_its_plane(branch):
-    doubling = next(p for p in branch.special if p.kind == "period-doubling")
-    curve = vi.boundary(
-        doubling, parameter="stops.0.restitution", bounds=((0.9, 1.0), (0.45, 0.55))
-    )
-    ax = vi.plot_boundary(curve)
-    assert ax.get_xlabel() == "frequency ratio ζ" and ax.get_ylabel() == "restitution k"
-    np.testing.assert_allclose(np.asarray(ax.lines[0].get_xydata()), curve.parameters)
-
-
 def test_what_a_stop_holds_is_not_drawn(branch):
     """Of a ball on a table the least height is the table's; and names are checked."""
     ball = vi.machines.BouncingBall(acceleration=1.2, restitution=0.6)
@@ -122,7 +99,10 @@ def test_what_a_stop_holds_is_not_drawn(branch):
         ball, "acceleration", np.linspace(1.1, 1.2, 3), start=ball.start(height=6.8, speed=-0.7),
         settle=100, cycles=4,
     )  # fmt: skip
-    assert np.ptp(vi.plot_sweep(swept).lines[0].get_ydata()) > 0.01
+    drawn = vi.plot_sweep(swept)
+    assert np.ptp(drawn.lines[0].get_ydata()) > 0.01
+    assert drawn.get_ylabel() == "max height (g/ω²)"
+    assert "cycle" in str(swept) and "π" not in str(swept)
     assert vi.plot_branch(branch).lines[0].get_ydata()[0] in branch.y_min
     with pytest.raises(ValueError, match=r"`y` must be one of .*'y_min'"):
         vi.plot_sweep(swept, y="Ymin")

@@ -1,4 +1,4 @@
-"""Basins left at Ctrl-C: prints how long they took to end (seconds) and how many starts they had."""
+"""Basins left at Ctrl-C: prints how long they took to end (seconds), and the starts they had."""
 
 import os
 import signal
