@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 import vi_jax as vi
-from scipy.integrate import solve_ivp
-from scipy.optimize import fsolve
 
 from grazings import grazing_of
 
@@ -66,65 +64,16 @@ def test_a_fold_and_a_doubling_graze_where_a_grazing_is_resonant(kind, frequency
     assert meets.detail.endswith("with one impact in 1 period")
 
 
-# x'' + 0.1 x' + x + 0.1 x³ = F cos ωt, without impacts.
-DAMPING, CUBIC = 0.1, 0.1
-
-
-def flown(start, force, omega):
-    """SciPy's state after a period, and the derivative by the state."""
-
-    def field(t, x):
-        A = np.array([[0, 1], [-1 - 3 * CUBIC * x[0] ** 2, -DAMPING]])
-        push = force * np.cos(omega * t) - x[0] - CUBIC * x[0] ** 3 - DAMPING * x[1]
-        return np.concatenate([[x[1], push], (A @ x[2:].reshape(2, 2)).ravel()])
-
-    begin = np.concatenate([start, np.eye(2).ravel()])
-    options = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-13}
-    end = solve_ivp(field, (0, 2 * np.pi / omega), begin, **options).y[:, -1]
-    return end[:2], end[2:].reshape(2, 2)
-
-
-def lacks_of_a_cusp(unknowns):
-    """What state, F and ω lack to be those of a cusp: a periodic motion with a multiplier 1, and
-    beside it, along that one's vector, to second order as well."""
-    start, force, omega = unknowns[:2], *unknowns[2:]
-
-    def critical(x):
-        M = flown(x, force, omega)[1]
-        return np.linalg.det(M - np.eye(2))
-
-    end, M = flown(start, force, omega)
-    vector = np.linalg.svd(M - np.eye(2))[2][-1]
-    h = 4e-3
-    ahead = [critical(start + n * h * vector) for n in (-2, -1, 1, 2)]
-    slope = np.dot(ahead, [1, -8, 8, -1]) / (12 * h)
-    return [*(end - start), critical(start), slope]
-
-
-@pytest.fixture(scope="module")
-def bent():
-    """A fold of a Duffing oscillator in its force, far from its stop."""
+def test_a_fold_that_touches_the_stop():
+    """It does where the gap is what its motion reaches without a stop."""
     machine = vi.machines.Duffing(
-        amplitude=0.1, frequency=1.4, damping=DAMPING, cubic=CUBIC, gap=8.0, two_sided=False
+        amplitude=0.1, frequency=1.4, damping=0.1, cubic=0.1, gap=8.0, two_sided=False
     )
     orbit = vi.find_orbit(machine, machine.start(), throw=True)
     branch = vi.continue_orbit(orbit, parameter="amplitude", bounds=(0.05, 2.0))
     folds = [point for point in branch.special if point.kind == "fold"]
     assert len(folds) == 2
-    return max(folds, key=lambda point: float(point.orbit.y_max))
-
-
-def test_the_cusp_of_a_duffing_oscillator(bent):
-    curve = vi.boundary(bent, parameter="frequency", bounds=((0.02, 2.0), (1.0, 1.6)))
-    cusp = the(curve, "cusp")
-    state = [float(cusp.orbit.state.Y), float(cusp.orbit.state.V)]
-    root = fsolve(lacks_of_a_cusp, [*state, *cusp.parameters], xtol=1e-12)
-    np.testing.assert_allclose(cusp.parameters, root[2:], atol=1e-8)
-    np.testing.assert_allclose(state, root[:2], atol=1e-6)
-
-
-def test_a_fold_that_touches_the_stop(bent):
-    """It does where the gap is what its motion reaches without a stop."""
+    bent = max(folds, key=lambda point: float(point.orbit.y_max))
     high, force = float(bent.orbit.y_max), bent.parameter
     curve = vi.boundary(bent, parameter="gap", bounds=((0.05, 2.0), (1.0, 10.0)))
     end = the(curve, "grazing")
