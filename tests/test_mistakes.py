@@ -85,15 +85,10 @@ def warned(call):
     return " ".join(str(x.message) for x in caught)
 
 
-@pytest.mark.parametrize(
-    ("call", "says"),
-    [
-        (lambda: vi.scan(SCENE, {"frequency_ratio": [0.9]}), "near names: drive.frequency_ratio"),
-        (lambda: SCENE.start(y=0.5), "it is called `Y`"),
-    ],
-)
-def test_1_a_name_that_is_not_there(call, says):
-    assert says in refused(call)
+def test_1_a_name_that_is_not_there():
+    wrong = lambda: vi.scan(SCENE, {"frequency_ratio": [0.9]})
+    assert "near names: drive.frequency_ratio" in refused(wrong)
+    assert "it is called `Y`" in refused(lambda: SCENE.start(y=0.5))
 
 
 def test_2_other_units():
@@ -108,15 +103,10 @@ def test_3_single_precision():
     assert 'call `jax.config.update("jax_enable_x64", True)` first' in said
 
 
-@pytest.mark.parametrize(
-    ("call", "says"),
-    [
-        (lambda: vi.RigidStop(0.5, 2.0), "`restitution` must be finite and in [0, 1]"),
-    ],
-)
-def test_4_arguments_in_another_order(call, says):
+def test_4_arguments_in_another_order():
     """That of machine and start is among the calls of `refused_calls.py`."""
-    assert says in refused(call)
+    said = refused(lambda: vi.RigidStop(0.5, 2.0))
+    assert "`restitution` must be finite and in [0, 1]" in said
 
 
 def test_5_a_field_of_another_period():
@@ -132,23 +122,20 @@ def test_6_a_start_beyond_the_stop():
     assert "as one beyond a stop or a number of the machine that is not finite" in str(orbit)
 
 
-@pytest.mark.parametrize("kind", [ByNumpy, ByMath])
-def test_7_numpy_in_a_field(kind):
-    assert "with the functions of `jax.numpy`" in refused(lambda: simulate(kind()))
+def test_7_numpy_in_a_field():
+    for kind in (ByNumpy, ByMath):
+        said = refused(lambda kind=kind: simulate(kind()))
+        assert "with the functions of `jax.numpy`" in said
 
 
 def test_8_an_if_on_a_traced_number():
     assert "`jnp.where`, not `if`" in refused(lambda: simulate(WithIf()))
 
 
-@pytest.mark.parametrize(
-    ("kind", "says"),
-    [(NoReturn, "its `return` is missing"), (Tuple, "but returned (f64[], f64[])")],
-)
-def test_9_a_field_that_returns_no_state(kind, says):
-    said = refused(lambda: simulate(kind()))
-    assert "must return what is like its state" in said
-    assert says in said
+def test_9_a_field_that_returns_no_state():
+    nothing, row = (refused(lambda kind=kind: simulate(kind())) for kind in (NoReturn, Tuple))
+    assert "its `return` is missing" in nothing and "but returned (f64[], f64[])" in row
+    assert all("must return what is like its state" in said for said in (nothing, row))
 
 
 def test_10_a_guess_of_no_stable_motion():
