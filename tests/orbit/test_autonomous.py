@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 import vi_jax as vi
 from scipy.integrate import solve_ivp
-from scipy.optimize import brentq
 
 import resets
 from belts import Belt
@@ -66,22 +65,6 @@ def test_a_walker_doubles_its_step():
     assert np.linalg.eigvals(jacobian).real.min() == pytest.approx(-1, abs=3e-7)
 
 
-def short_of_belt(speed):
-    """By how much a body that the belt has just let go misses the belt's speed when it is next as
-    fast as it gets, by SciPy."""
-
-    def field(_, x):
-        return [x[1], -x[0] - 0.1 * x[1] + 0.5 + 0.5 * np.exp(-2 * abs(speed - x[1]))]
-
-    def turns(t, x):
-        return field(t, x)[1]
-
-    turns.terminal, turns.direction = True, -1
-    options = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-14}
-    x = solve_ivp(field, (0, 1), [1 - 0.1 * speed, speed], **options).y[:, -1]
-    return solve_ivp(field, (1, 30), x, events=turns, **options).y[1, -1] - speed
-
-
 class Ahead(Belt):
     """Observed where the body is farthest ahead."""
 
@@ -94,7 +77,8 @@ def test_cycles_with_sticking_end_where_the_belt_is_only_just_reached():
     """Wherever the branch begins. Those that only slide do so too, and shrink to rest on the other
     side: the friction 0.5 + 0.5 exp(-2v) where the body stands has the slope exp(-2v), which is the
     damping 0.1 at v = ½ ln 10."""
-    ending = brentq(short_of_belt, 1.7, 1.9, xtol=1e-13)
+    # There a body that the belt has let go is next as fast as the belt, by SciPy.
+    ending = 1.83660097221
     sliding = vi.OscillatorState(jnp.asarray(1.7), jnp.asarray(0.0))
     stuck = vi.OscillatorState(jnp.asarray(0.0), jnp.asarray(1.5))
     sticking = vi.simulate(Ahead(), stuck, 1, settle=40).last
