@@ -143,28 +143,26 @@ MACHINE = Chain(rows)
 
 @pytest.mark.slow
 def test_verbs_take_arrays_as_numbers():
-    """Orbits, branches, sweeps, scans and basins."""
+    """Orbits, sweeps, scans and basins."""
     found = []
     for made, start in ((rows, "start.q[1]"), (Numbers, "start.y")):
         machine = Chain(made)
         end = vi.simulate(machine, machine.start(), 1, settle=200).last
         orbit = vi.find_orbit(machine, end, throw=True)
-        branch = vi.continue_orbit(orbit, parameter="gap", bounds=(0.55, 0.65), step=0.05)
         sweep = vi.sweep(machine, "gap", [0.5, 0.6], settle=20, cycles=4)
         axes, quiet = {"gap": [0.5, 0.6], start: [0.0, 0.1]}, {"progress": False}
         measure = ("extremes", vi.Sections(2))
         scan = vi.scan(machine, axes, measure=measure, cycles=4, settle=20, **quiet)
         basins = vi.basins(machine, {start: (-0.5, 0.5)}, resolution=4, longest=8, **quiet)
-        found.append((orbit, branch, sweep, scan, basins.attractors[0]))
-    (orbit, branch, sweep, scan, basin), others = found
+        found.append((orbit, sweep, scan, basins.attractors[0]))
+    (orbit, sweep, scan, basin), others = found
     np.testing.assert_allclose(orbit.state.q, [others[0].state.x, others[0].state.y], atol=1e-11)
     np.testing.assert_allclose(orbit.multipliers, others[0].multipliers, rtol=0, atol=1e-8)
-    np.testing.assert_allclose(branch.y_min, others[1].y_min, rtol=0, atol=1e-8)
-    np.testing.assert_allclose(sweep.y_min, others[2].y_min, rtol=0, atol=1e-11)
-    assert (basin.starts, basin.period) == (4, others[4].period)
+    np.testing.assert_allclose(sweep.y_min, others[1].y_min, rtol=0, atol=1e-11)
+    assert (basin.starts, basin.period) == (4, others[3].period)
     for ours, theirs in {"q[0]": "x", "q[1]": "y", "v[0]": "u", "v[1]": "w"}.items():
-        np.testing.assert_allclose(scan[ours], others[3][theirs], rtol=0, atol=1e-11)
-        apart = basin.sections[ours] - others[4].sections[theirs]
+        np.testing.assert_allclose(scan[ours], others[2][theirs], rtol=0, atol=1e-11)
+        apart = basin.sections[ours] - others[3].sections[theirs]
         np.testing.assert_allclose(apart, 0, rtol=0, atol=1e-7)
     many = vi.find_orbit(MACHINE, jax.tree.map(lambda x: jnp.stack([x, x]), orbit.state))
     np.testing.assert_allclose(many.state.q, [orbit.state.q, orbit.state.q], rtol=0, atol=1e-10)

@@ -288,6 +288,7 @@ def test_an_impact_without_restitution_as_the_force_turns():
     assert float(run.last.Y) == 0.0 and float(run.last.V) == 0.0
 
 
+@pytest.mark.slow
 def test_every_event_is_logged_in_its_order():
     """A ball pressed for half of each cycle on a stop and let go of; without the log, the same."""
     body = Body(jnp.asarray((0.3, 0, 1.0)), (vi.RigidStop(0.0, 0.4),), drag=0.1)
