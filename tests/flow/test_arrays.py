@@ -143,7 +143,7 @@ MACHINE = Chain(rows)
 
 @pytest.mark.slow
 def test_verbs_take_arrays_as_numbers():
-    """Orbits, sweeps, scans and basins."""
+    """Orbits, branches, sweeps, scans and basins."""
     found = []
     for made, start in ((rows, "start.q[1]"), (Numbers, "start.y")):
         machine = Chain(made)
@@ -166,29 +166,8 @@ def test_verbs_take_arrays_as_numbers():
         np.testing.assert_allclose(apart, 0, rtol=0, atol=1e-7)
     many = vi.find_orbit(MACHINE, jax.tree.map(lambda x: jnp.stack([x, x]), orbit.state))
     np.testing.assert_allclose(many.state.q, [orbit.state.q, orbit.state.q], rtol=0, atol=1e-10)
-
-
-@pytest.mark.exhaustive
-def test_sweeps_scans_and_basins_are_those_of_numbers():
-    names = {"q[0]": "x", "q[1]": "y", "v[0]": "u", "v[1]": "w"}
-    swept, scanned, basins = [], [], []
-    for made, start in ((rows, "start.q[1]"), (Numbers, "start.y")):
-        machine = Chain(made)
-        swept.append(vi.sweep(machine, "gap", [0.5, 0.6], settle=20, cycles=4))
-        axes = {"gap": [0.5, 0.6], start: [0.0, 0.1]}
-        measure = ("extremes", vi.Sections(2))
-        scanned.append(vi.scan(machine, axes, measure=measure, cycles=4, settle=20, progress=False))
-        basins.append(
-            vi.basins(machine, {start: (-0.5, 0.5)}, resolution=4, longest=8, progress=False)
-        )
-    np.testing.assert_allclose(swept[0].y_min, swept[1].y_min, rtol=0, atol=1e-11)
-    for ours, theirs in (*names.items(), ("y_min", "y_min")):
-        np.testing.assert_allclose(scanned[0][ours], scanned[1][theirs], rtol=0, atol=1e-11)
-    ours, theirs = (found.attractors[0] for found in basins)
-    assert (ours.starts, ours.period) == (theirs.starts, theirs.period) == (4, theirs.period)
-    for name, other in names.items():
-        apart = ours.sections[name] - theirs.sections[other]
-        np.testing.assert_allclose(apart, 0, rtol=0, atol=1e-7)
+    branch = vi.continue_orbit(orbit, parameter="gap", bounds=(0.58, 0.62), step=0.02)
+    np.testing.assert_allclose(branch.y_max, branch.parameter, atol=1e-10)
 
 
 @pytest.mark.parametrize(
