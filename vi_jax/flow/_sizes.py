@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax.lax import stop_gradient
+from jaxtyping import Array
 
 from .._types import Scalar, Scalars, State
 from ..machine import guard_of
@@ -21,8 +22,8 @@ _AT_ONCE, _ROUNDINGS = 1e-3, 16.0
 
 def sizes_of(plan: Plan, smooth: SmoothMachine, s: Scalar, start: State) -> State:
     """About how large each number of the state may become: its value in the start, what its rate
-    there makes of it in a unit of time, and what the clock and the other numbers do to that. It is
-    zero for numbers that nothing moves.
+    there makes of it in a unit of time, and what the clock and the other numbers do to that. The
+    numbers of an array have one size. It is zero for numbers that nothing moves.
 
     **Arguments:** `smooth`, the machine in its modes with nothing held; `s` and `start`, where the
     motion begins.
@@ -31,18 +32,37 @@ def sizes_of(plan: Plan, smooth: SmoothMachine, s: Scalar, start: State) -> Stat
     s, start = stop_gradient((s, start))
     limit = 5 * jnp.asarray(machine.step_limit(s, start)) / (2 * jnp.pi)
     unit = stop_gradient(jnp.minimum(unit_of(machine), limit))
-    rate = smooth.field(s, start)
+    rate, signs = smooth.field(s, start), _signs(start)
+
+    def pushes(along: State) -> State:
+        """What the field makes of such changes of the state in a unit of time."""
+        changes = jax.jvp(smooth.field, (s, start), (jnp.ones_like(s) * unit, along))[1]
+        return jtu.tree_map(lambda a: jnp.where(jnp.isfinite(a), unit * jnp.abs(a), 0.0), changes)
+
     # Signs that differ keep what acts on a difference from cancelling.
-    along = jtu.tree_map(
-        lambda x, v, sign: unit * v + sign * jnp.abs(x), start, rate, _signs(start)
-    )
-    pushes = jax.jvp(smooth.field, (s, start), (jnp.ones_like(s) * unit, along))[1]
+    along = jtu.tree_map(lambda x, v, sign: unit * v + sign * jnp.abs(x), start, rate, signs)
     sizes = jtu.tree_map(
-        lambda x, v, a: jnp.maximum(jnp.abs(x), unit * jnp.maximum(jnp.abs(v), jnp.abs(a))),
-        start, rate, pushes,
+        lambda x, v, a: _of_all(jnp.maximum(jnp.abs(x), jnp.maximum(unit * jnp.abs(v), a))),
+        start, rate, pushes(along),
     )  # fmt: skip
     known = lambda size, x: jnp.where(jnp.isfinite(size), size, jnp.abs(x))
-    return stop_gradient(jtu.tree_map(known, sizes, start))
+    sizes = stop_gradient(jtu.tree_map(known, sizes, start))
+    leaves = len(jtu.tree_leaves(start))
+    if leaves <= 2:
+        return sizes
+
+    def reach(_, sizes: State) -> State:
+        """Sizes of those numbers, too, that only the others move."""
+        along = jtu.tree_map(jnp.multiply, sizes, signs)
+        more = lambda size, a: jnp.where(size > 0, size, _of_all(a))
+        return jtu.tree_map(more, sizes, pushes(along))
+
+    return stop_gradient(jax.lax.fori_loop(0, leaves, reach, sizes))
+
+
+def _of_all(sizes: Array) -> Array:
+    """The greatest of the sizes in an array, whose numbers have one unit."""
+    return jnp.full_like(sizes, jnp.max(sizes)) if sizes.ndim else sizes
 
 
 def known_at_once(plan: Plan, start: State, sizes: State) -> State:

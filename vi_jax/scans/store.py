@@ -184,7 +184,9 @@ class ZarrStore:
 
     def data(self) -> "xr.Dataset":
         """The data of the store, read as they are looked at."""
-        return xr.open_zarr(str(self.path), consolidated=False, chunks=None, mask_and_scale=False)
+        data = xr.open_zarr(str(self.path), consolidated=False, chunks=None, mask_and_scale=False)
+        # Not in the order in which a file system lists them.
+        return data[[*data["result"].dims, *sorted(map(str, data.data_vars))]]
 
     def _array(self, name: str) -> Any:
         return self.group[name]
