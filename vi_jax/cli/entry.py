@@ -74,6 +74,8 @@ def _run_file(options: argparse.Namespace) -> int:
 
 def _explore(options: argparse.Namespace) -> int:
     """Serve the page of a machine: that of the command, or the paper's scene."""
+    if not 0 <= options.port <= 65535:
+        return _error(f"argument --port: the port must be 0-65535, but is {options.port}", 2)
     problem = missing()
     if problem:
         return _error(problem, 1)
@@ -84,7 +86,7 @@ def _explore(options: argparse.Namespace) -> int:
         if options.machine is not None:
             name, make = options.machine, lambda: Subject(machine_of(options.machine, {}), ranges)
         serve(options.host, options.port, (name, make()), browser=options.browser, tell=_say)
-    except (ValueError, OverflowError) as error:  # the second of a port that is none
+    except ValueError as error:
         return _error(error, 2)
     except OSError as error:
         return _error(f"cannot serve {options.host} port {options.port}: {error.strerror}", 1)
