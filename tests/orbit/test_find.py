@@ -51,9 +51,9 @@ def test_an_orbit_is_the_motion_that_is_simulated():
     settled = vi.simulate(machine, start, 1, settle=40)
     orbit = vi.find_orbit(machine, settled.last)
     run = vi.simulate(machine, orbit.state, 1)
-    # Both meet the section to 1e-9 in the clock, which enters the period in second order. But steps
-    # by a tolerance fall otherwise, as it follows the size that a motion has had: 1.2e-10 was seen.
-    assert float(orbit.duration) == pytest.approx(float(run.duration[0]), abs=1e-9)
+    # Both meet the section to 1e-9 in the clock, which enters the period in second order. Steps by
+    # a tolerance fall otherwise where code is compiled otherwise: 3e-11 was seen.
+    assert float(orbit.duration) == pytest.approx(float(run.duration[0]), abs=1e-10)
     assert float(orbit.y_max) == pytest.approx(float(run.y_max[0]), abs=1e-12)
 
     def field(_, x):

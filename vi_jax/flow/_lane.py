@@ -1,13 +1,11 @@
 """What the flat loop carries: one trajectory on its way, and what is asked of it."""
 
 from collections.abc import Callable
-from math import pi
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jax.lax import stop_gradient
 from jaxtyping import Array, Float, UInt32
 
 from .._types import Flag, Scalar, Scalars, State
@@ -20,10 +18,6 @@ from ..machine import (
 )
 from .beside import Beside
 from .methods import AbstractMethod
-
-# A motion whose steps are this much shorter than a unit is faster than its cycle; likewise one that
-# was given so many steps in a cycle. Choices, far from what usual motions take.
-_STEPS_IN_A_UNIT, _MANY_STEPS = 10.0, 1000.0
 
 # What the next step aims at: nothing, or one of those below. Numbers, which the loop carries.
 FREE = 0.0
@@ -121,12 +115,6 @@ class Lane(eqx.Module):
     shaken: Scalar | None = None
     """The time of the interval at the last impulse of noise; absent where impulses come at times
     that are known beforehand."""
-    sizes: State | None = None
-    """Of each number of the state how large it has been, by which errors are judged; absent where
-    that is not asked for."""
-    extents: Scalars | None = None
-    """Of each coordinate a length by which others are judged, then of each of `Plan.others` a size
-    of its guard; absent where these are 1."""
 
 
 def ticks(machine: AbstractMachine, state: State) -> bool:
@@ -140,12 +128,6 @@ def has_fixed_cycle(machine: AbstractMachine, state: State) -> bool:
         ticks(machine, state)
         and machine.pace(jnp.zeros_like(machine.position(state)), state) is None
     )
-
-
-def unit_of(machine: AbstractMachine) -> Scalar | float:
-    """The 2π-th part of a cycle: where that is 2π, thresholds in `s` are what they are said to
-    be."""
-    return stop_gradient(machine.cycle) / (2 * pi)
 
 
 class Impulses(eqx.Module):
@@ -214,34 +196,6 @@ class Plan(eqx.Module):
     def intervals(self) -> Scalar:
         """Number of intervals to go through: whole cycles before those recorded."""
         return self.settle + self.kept
-
-    def unit(self, lane: Lane) -> Scalar | float:
-        """A length of `s` by which short ones are judged: 1 of a dimensionless machine; else the
-        2π-th part of a cycle, or less where the motion needs steps that are much shorter."""
-        if self.machine.dimensionless:
-            return 1.0
-        unit = unit_of(self.machine)
-        if self.method.adaptive:
-            return jnp.minimum(unit, _STEPS_IN_A_UNIT * stop_gradient(lane.length))
-        return unit * min(1.0, _MANY_STEPS / self.method.steps_per_cycle)
-
-    def in_units(self, lane: Lane, threshold: Any) -> Any:
-        """A threshold in `s`, given for a machine whose cycle is 2π."""
-        return threshold if self.machine.dimensionless else threshold * self.unit(lane)
-
-    def extent(self, lane: Lane, k: int) -> Scalar | float:
-        """A length by which those of coordinate number k are judged."""
-        return 1.0 if lane.extents is None else lane.extents[k]
-
-    def guard_extent(self, lane: Lane, number: int) -> Scalar | float | None:
-        """A size by which the guard of the event of this number is judged, that is no stop's;
-        `None` where a guard is another quantity in each mode, so that it has only its own size."""
-        others = self.others(lane.state)
-        if lane.extents is None or number not in others:
-            return 1.0
-        if events_of(self.machine)[number].holds_mode:
-            return None
-        return lane.extents[len(self.machine.coordinates) + others.index(number)]
 
     @property
     def instants(self) -> int:

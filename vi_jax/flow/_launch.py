@@ -11,7 +11,6 @@ from . import results
 from ._lane import Lane, Plan, to_event, total
 from ._own import check_field, check_laws
 from ._own_parts import check_events
-from ._sizes import extents_of, known_at_once, sizes_of
 from .events import Rates, force_rate, rates
 from .smooth import in_modes, rounding
 
@@ -24,9 +23,9 @@ def launched(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
     numbers = jtu.tree_leaves((start, eqx.filter(machine, eqx.is_inexact_array)))
     bad = ~jnp.isfinite(total(numbers, plan.settle)) | ~jnp.asarray(wanted)
     bad = bad | ~machine.in_range(start)
+    slack = rounding(machine, start)
     for stop in machine.stops:
-        position = machine.coordinates[stop.coordinate].position
-        bad = bad | (stop.beyond(position(start)) > rounding(machine, start, position))
+        bad = bad | (stop.beyond(machine.coordinates[stop.coordinate].position(start)) > slack)
     bad = jax.lax.stop_gradient(bad)
     zero = jnp.zeros_like(Y)
     s = zero if plan.begin is None else zero + plan.begin
@@ -42,7 +41,7 @@ def launched(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
     if plan.rests:
         growth = [force_rate(free, x.position, free, s, start) for x in machine.coordinates]
         both = enumerate(zip(here, growth, strict=True))
-        contact = tuple(_rests_on(plan, k, *x, start) for k, x in both)
+        contact = tuple(_rests_on(plan, k, *x, slack) for k, x in both)
         direction = tuple(
             jnp.where((x.v == 0) & (x.a == 0), jnp.sign(j), along)
             for x, j, along in zip(here, growth, direction, strict=True)
@@ -54,11 +53,6 @@ def launched(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
             start = jtu.tree_map(lambda a, b, rests=rests: jnp.where(rests, a, b), at, start)
         if rubs(machine):
             modes = struck_modes(machine, s, start, modes, contact=contact)
-    sizes = extents = None
-    if not machine.dimensionless:
-        found = sizes_of(plan, free, s, start)
-        extents = extents_of(plan, s, start, modes, found)
-        sizes = known_at_once(plan, start, found) if plan.method.follows_sizes else None
     length = zero + jax.lax.stop_gradient(machine.cycle) / plan.method.steps_per_cycle
     if plan.method.adaptive:
         length = length / 8
@@ -81,19 +75,16 @@ def launched(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
         spent=zero,
         rejected=zero,
         shaken=zero if plan.noise is not None and plan.noise.timed else None,
-        sizes=sizes,
-        extents=extents,
     )
 
 
-def _rests_on(plan: Plan, k: int, here: Rates, growth: Scalar, start: State) -> Scalar:
+def _rests_on(plan: Plan, k: int, here: Rates, growth: Scalar, slack: Scalar | float) -> Scalar:
     """The stop that coordinate number k rests on as the motion begins: pressed on, or about to
-    be by a force that grows; place and velocity are known to within rounding."""
-    contact, body = jnp.zeros_like(here.x), plan.machine.coordinates[k]
-    slack, slow = (rounding(plan.machine, start, x) for x in (body.position, body.velocity))
+    be by a force that grows; place and velocity are known to within `slack`."""
+    contact = jnp.zeros_like(here.x)
     for i, stop in enumerate(plan.machine.stops):
         if stop.coordinate == k:
             pressed = (stop.sign * here.a > 0) | (here.a == 0) & (stop.sign * growth > 0)
-            rests = (stop.beyond(here.x) >= -slack) & (jnp.abs(here.v) <= slow) & pressed
+            rests = (stop.beyond(here.x) >= -slack) & (jnp.abs(here.v) <= slack) & pressed
             contact = jnp.where(rests, to_event(i), contact)
     return contact

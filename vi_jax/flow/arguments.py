@@ -270,9 +270,10 @@ def check_start(machine: AbstractMachine, start: State) -> None:
             name = jtu.keystr(path).lstrip(".")
             raise ValueError(f"Argument `start` must be finite, but its {name} is {numbers}.")
     machine.check_start(start)
+    slack = concrete(rounding(machine, start))
     for i, stop in enumerate(machine.stops):
-        gap, position = concrete(stop.gap), machine.coordinates[stop.coordinate].position
-        Y, slack = concrete(position(start)), concrete(rounding(machine, start, position))
+        gap = concrete(stop.gap)
+        Y = concrete(machine.coordinates[stop.coordinate].position(start))
         if Y is None or gap is None or slack is None:
             continue
         depth = np.max(stop.sign * Y - gap)

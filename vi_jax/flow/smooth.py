@@ -23,8 +23,6 @@ class SmoothMachine(eqx.Module):
     modes: Scalars
     contact: Scalars
     """Of each coordinate, 1 + i while it rests on stop number i, else 0; or none at all."""
-    sizes: State | None = None
-    """As `Lane.sizes`."""
 
     def field(self, s: Scalar, state: State) -> State:
         """d(state)/ds, without motion of a body that is held."""
@@ -117,35 +115,19 @@ def is_affine(function: Callable[[State], Scalar], state: State) -> bool:
     return affine(jaxpr, [True] * len(jaxpr.invars)) is not None
 
 
-def rounding(
-    machine: AbstractMachine, state: State, part: Callable[[State], Scalar]
-) -> Scalar | float:
+def rounding(machine: AbstractMachine, state: State) -> Scalar | float:
     """How far a coordinate may be beyond its stop, or its velocity from zero, by rounding alone:
-    not at all where it is a number of the state itself.
-
-    **Arguments:** `part`, that coordinate or velocity as a function of the state.
-    """
+    not at all where it is a number of the state itself."""
     if exact(machine, state):
         return 0.0
-    if not machine.dimensionless:
-        state = stop_gradient(state)
-        return 16 * jnp.finfo(float).eps * spread(part, state, state)
     size = sum((jnp.sum(jnp.abs(x)) for x in jtu.tree_leaves(state)), start=jnp.asarray(1.0))
     return stop_gradient(16 * jnp.finfo(size.dtype).eps * size)
 
 
-def spread(part: Callable[[State], Scalar], state: State, sizes: State) -> Scalar:
-    """The size of what a function of the state adds up where its numbers have these sizes."""
-    slopes = jax.grad(lambda x: jnp.sum(part(x)))(state)
-    each = jtu.tree_map(lambda a, b: jnp.sum(jnp.abs(a * b)), slopes, sizes)
-    return stop_gradient(sum(jtu.tree_leaves(each), start=jnp.zeros(())))
-
-
 def beyond_a_stop(machine: AbstractMachine, state: State) -> Flag:
     """Whether a coordinate is beyond one of its stops by more than rounding."""
-    found = jnp.zeros((), bool)
+    found, slack = jnp.zeros((), bool), rounding(machine, state)
     for stop in machine.stops:
-        position = machine.coordinates[stop.coordinate].position
-        place, slack = position(state), rounding(machine, state, position)
+        place = machine.coordinates[stop.coordinate].position(state)
         found = found | (stop_gradient(stop.beyond(place)) > slack)
     return found

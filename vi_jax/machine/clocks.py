@@ -77,12 +77,6 @@ class Clocked(Shown):
         return self.cycle / 5
 
     @property
-    def dimensionless(self) -> bool:
-        """Whether lengths and times are of the order of one by their definition, and tolerances and
-        thresholds are in the same units; else they follow the motion's own size. Static."""
-        return False
-
-    @property
     def scales_known(self) -> bool:
         """Whether the usual number of fixed steps in a cycle is known to be enough; static."""
         return False

@@ -246,11 +246,6 @@ class Scene(ShaftMachine):
         return turn * speed if self.clock_name == "phase" else turn
 
     @property
-    def dimensionless(self) -> bool:
-        """True: lengths are in crank radii, times in those of the body's own motion."""
-        return True
-
-    @property
     def scales_known(self) -> bool:
         """Not with soft stops, whose contacts may be much briefer than a cycle."""
         return not self.soft_stops

@@ -76,8 +76,8 @@ class _Instant(NamedTuple):
     coupled: list[Flag]
     """Of each coordinate, whether one of those landed upon acts on it, through contacts that are
     closed."""
-    slack: list[Scalar | float]
-    """What of each velocity is rounding."""
+    slack: Scalar | float
+    """What of a velocity is rounding."""
 
 
 def strike_in_turn(
@@ -133,11 +133,7 @@ def _instant(
         at, here = limited.index(stop.coordinate), landed[number]
         met, coupled[at] = met | here, coupled[at] | here
         depth = stop_gradient(stop.beyond(bodies[at].position(there)))
-        if plan.machine.dimensionless:
-            eps = float(jnp.finfo(depth.dtype).eps)
-            slack = 256 * eps * (1 + jnp.abs(stop_gradient(stop.gap)))
-        else:
-            slack = 16 * rounding(plan.machine, there, bodies[at].position)
+        slack = 256 * float(jnp.finfo(depth.dtype).eps) * (1 + jnp.abs(stop_gradient(stop.gap)))
         closed = here | (jnp.abs(depth) <= slack)
         if arrival.contact is not None:
             closed = closed | (arrival.contact[stop.coordinate] == to_event(number))
@@ -146,8 +142,7 @@ def _instant(
     before = [body.velocity(there) for body in bodies]
     return _Instant(
         plan, taken, arrival.s, met, there, limited, bodies, before, gains_, landed, touches,
-        coupled,
-        [rounding(plan.machine, there, body.velocity) for body in bodies],
+        coupled, rounding(plan.machine, there),
     )  # fmt: skip
 
 
@@ -297,16 +292,13 @@ def _closing(instant: _Instant, x: _Round, velocities: list[Scalar]) -> dict[int
     instants to derivatives: only what a blow brought together, or acts on what is landed upon,
     takes part.
     """
-    found, machine = {}, instant.plan.machine
-    for number, stop in enumerate(machine.stops):
+    found = {}
+    for number, stop in enumerate(instant.plan.machine.stops):
         i = instant.limited.index(stop.coordinate)
-        slack = instant.slack[i]
-        if not machine.dimensionless:
-            slack = slack + 16 * float(jnp.finfo(x.most.dtype).eps) * x.most
         speed = stop.approach(velocities[i])
         size = stop_gradient(speed)
         changed = jnp.abs(stop_gradient(velocities[i] - instant.before[i])) > _NONE * x.most
-        mine = instant.landed[number] | ((changed | instant.coupled[i]) & (size > slack))
+        mine = instant.landed[number] | ((changed | instant.coupled[i]) & (size > instant.slack))
         found[number] = jnp.where(mine & instant.touches[number] & (size > 0), speed, -1.0)
     return found
 

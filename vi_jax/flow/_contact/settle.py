@@ -201,8 +201,7 @@ def _ends(
         growth = force_rate(free, body.position, free, s, rested)
     not_yet, hop, wait = _before_it_presses(speed, pressing, sign * growth)
     height = jnp.where(not_yet, speed * hop - 0.5 * pressing * hop * hop, height)
-    size = plan.extent(lane, k) + jnp.abs(gap)
-    flat = stop_gradient(height) <= 16 * float(jnp.finfo(s.dtype).eps) * size
+    flat = stop_gradient(height) <= 16 * float(jnp.finfo(s.dtype).eps) * (1 + jnp.abs(gap))
     left = jnp.where(not_yet, wait, left)
     brief = allowed(s).brief * limit
     ends = stop_gradient(left) <= jnp.where(flat, 0.1 * limit, brief)
@@ -236,14 +235,10 @@ def _broken(
     were to each coordinate.
     """
     assert arrival.contact is not None
-    contact = list(arrival.contact)
+    contact, slack = list(arrival.contact), rounding(plan.machine, there)
     for k, blow in blows.items():
         body = plan.machine.coordinates[k]
         V, old = (stop_gradient(body.velocity(x)) for x in (arrival.state, there))
-        slack = rounding(plan.machine, there, body.velocity)
-        if not plan.machine.dimensionless:
-            approaches = stop_gradient([blow.approach for blow in blows.values()])
-            slack = slack + 16 * float(jnp.finfo(V.dtype).eps) * sum(approaches)
         apart = met & ((blow.struck > 0) | (jnp.abs(V - old) > slack))
         contact[k] = jnp.where(apart, 0.0, contact[k])
     return tuple(contact)

@@ -17,7 +17,7 @@ from ..events import quintic, to_turn
 from ..methods import Foreseen
 from ..smooth import exact
 from .guards import Crossing, at_stops, beyond
-from .hidden import SHORTEST, crests, force_may_turn, hump, may_turn_twice
+from .hidden import crests, force_may_turn, hump, may_turn_twice
 from .search import Course, Passed, first_event, may_matter
 from .trial import Trial
 
@@ -69,7 +69,7 @@ def _foreseen(
         courses.append((turned, partial(path.over, h)))
         ends.append((begin, end))
     guards = []
-    for guard in at_stops(plan, lane, ends):
+    for guard in at_stops(machine, ends):
         stop = machine.stops[guard.number]
         curve = partial(paths[stop.coordinate].over, h, stop.sign, stop_gradient(stop.gap))
         over = guard.end.x > 0
@@ -208,7 +208,7 @@ def _seen(plan: Plan, lane: Lane, trial: Trial) -> _Seen:
     for c in trial.crossings:
         guards.append((c, good & beyond(c), partial(quintic, c.begin, c.end, h)))
         if c.event.holds_mode:
-            above, place = hump(c, h, plan.in_units(lane, SHORTEST))
+            above, place = hump(c, h)
             humps.append((good & above, place))
         for side in c.sides:
             slack = 0.0 if c.slack is None else c.slack
@@ -221,19 +221,19 @@ def _seen(plan: Plan, lane: Lane, trial: Trial) -> _Seen:
             sides.append(path.pull)
             same = (path.pull.end.x <= 0) | path.leaves.landed
             below.append(~path.leaves.left & same)
-        end, twice = path.end, twice | may_turn_twice(plan, lane, k, path, h)
+        end, twice = path.end, twice | may_turn_twice(lane.direction[k], path, h)
         turned = good & (lane.direction[k] * end.v < 0) & ~path.at_turn
         if not exactly:
             # One that is closer than the clock can tell, as of a body that a rounded difference
             # has all but stopped, has nothing before it that could be stepped to. Nor is it one if
             # all that moves is rounding, as between bodies that go on together.
-            now = 4 * eps * (plan.unit(lane) + stop_gradient(trial.s))
-            moves = jnp.abs(end.v) * h > eps * (plan.extent(lane, k) + jnp.abs(end.x))
+            now = 4 * eps * (1 + stop_gradient(trial.s))
+            moves = jnp.abs(end.v) * h > eps * (1 + jnp.abs(end.x))
             turned = turned & (jnp.abs(to_turn(end)) > now) & moves
         courses.append((turned, partial(quintic, path.begin, end, h)))
     rises = []
     if sides:
-        found = crests(sides, trial.seen.shares, h, plan.in_units(lane, SHORTEST))
+        found = crests(sides, trial.seen.shares, h)
         rises = [(good & x & y, at) for (x, at), y in zip(found, below, strict=True)]
     return _Seen(guards, courses, humps, rises, twice)
 

@@ -164,7 +164,7 @@ def _near(plan: Plan, lane: Lane, trial: Trial) -> dict[int, Flag]:
             for other in trial.crossings:
                 if other.number != c.number:
                     apart = jnp.where(other.landed, jnp.abs(c.offset - other.offset), apart)
-            slack = 64 * eps * (plan.unit(lane) + jnp.abs(trial.s))
+            slack = 64 * eps * (1 + jnp.abs(trial.s))
             found[c.number] = c.near & (stop_gradient(apart) <= slack)
     return found
 
@@ -225,7 +225,7 @@ def _offset(plan: Plan, lane: Lane, trial: Trial, way: FlowToEvent, c: Crossing)
     **Arguments:** `way`, the motion from the step's end on; `c`, the event.
     """
     # Of a motion so flat that the event's place is known worse than its surface, it is here.
-    near = c.landed & (jnp.abs(c.offset) <= furthest_landing(plan, lane, trial.h))
+    near = c.landed & (jnp.abs(c.offset) <= furthest_landing(trial.h))
     offset = stop_gradient(jnp.where(near, c.offset, 0.0))
     if plan.ticks(lane.state):
         # Met on the section it is not beyond it.

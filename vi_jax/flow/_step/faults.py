@@ -61,9 +61,7 @@ def faults(
     if not plan.method.adaptive:
         return [(rejected, float(broken)), *ends]
     eps = float(jnp.finfo(length.dtype).eps)
-    cycle = plan.machine.cycle
-    longest = jnp.maximum(1.0, cycle) if plan.machine.dimensionless else cycle
-    gone = rejected & (length < 4 * eps * longest)
+    gone = rejected & (length < 4 * eps * jnp.maximum(1.0, plan.machine.cycle))
     numeric = jnp.isfinite(total(trial.state, length))
     tiny = results.UNDERFLOW if broken == results.NOT_FINITE else broken
     return [(gone & ~numeric, float(broken)), (gone, float(tiny)), *ends]

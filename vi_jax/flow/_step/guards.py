@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from ..._types import Flag, Scalar, Scalars, State
 from ...lanes import pin_flag
-from ...machine import AbstractEvent, events_of, guard_of, section_number, sides_of
+from ...machine import AbstractEvent, AbstractMachine, events_of, guard_of, section_number, sides_of
 from .._lane import Lane, Plan, select, to_event
 from ..events import Rates, guard_rates, landing
 from ..smooth import SmoothMachine, exact
@@ -92,26 +92,22 @@ def crossings(
     """
     machine, (s1, h, new), (good, last) = plan.machine, there, ends
     others, below = _others(plan, lane, holding, (s1, new), seen)
-    stops = at_stops(plan, lane, [(path.begin, path.end) for path in paths])
+    stops = at_stops(machine, [(path.begin, path.end) for path in paths])
     guards = [*(_with_stages(lane, c, seen) for c in stops), *others]
     # The stops of one coordinate and a clock are never met together but on a section, where a step
     # ends; other events can be.
     if plan.others(lane.state) or not exact(machine, lane.state):
         eps = float(jnp.finfo(h.dtype).eps)
         guards = [guard._replace(slack=4 * eps * guard.scale) for guard in guards]
-        guards = [
-            guard if guard.coordinate is not None else _jumped(plan, lane, guard)
-            for guard in guards
-        ]
-    return tuple(_seen(plan, lane, good & last, good, h, each, guards) for each in guards), below
+        guards = [guard if guard.coordinate is not None else _jumped(guard) for guard in guards]
+    return tuple(_seen(lane, good & last, good, h, each, guards) for each in guards), below
 
 
-def _jumped(plan: Plan, lane: Lane, guard: Crossing) -> Crossing:
+def _jumped(guard: Crossing) -> Crossing:
     """The event, with whether its guard has jumped above zero as the step begins: by more than what
     `_from_below` takes for zero in a guard that falls."""
     x = stop_gradient(guard.begin.x)
-    size = 1 if plan.machine.dimensionless else guard.scale
-    return guard._replace(above=x > JUMPED * (size + jnp.abs(x)) + _rounding(guard.scale))
+    return guard._replace(above=x > JUMPED * (1 + jnp.abs(x)) + _rounding(guard.scale))
 
 
 def _rounding(scale: Scalar) -> Scalar:
@@ -119,13 +115,12 @@ def _rounding(scale: Scalar) -> Scalar:
     return float(jnp.finfo(scale.dtype).eps) ** 0.5 * scale
 
 
-def at_stops(plan: Plan, lane: Lane, ends: list[tuple[Rates, Rates]]) -> list[Crossing]:
+def at_stops(machine: AbstractMachine, ends: list[tuple[Rates, Rates]]) -> list[Crossing]:
     """The stops as a step sees them, from the rates of each coordinate where it begins and ends."""
     found = []
-    for i, stop in enumerate(plan.machine.stops):
-        k = stop.coordinate
-        begin, end = (x.scaled(stop.sign, stop.gap) for x in ends[k])
-        found.append(Crossing(stop, i, begin, end, plan.extent(lane, k) + jnp.abs(stop.gap), k))
+    for i, stop in enumerate(machine.stops):
+        begin, end = (x.scaled(stop.sign, stop.gap) for x in ends[stop.coordinate])
+        found.append(Crossing(stop, i, begin, end, 1 + jnp.abs(stop.gap), stop.coordinate))
     return found
 
 
@@ -167,12 +162,7 @@ def _others(
                 for j in range(len(values))
             ]
         sides = [Side(*x, y) for x, y in zip(both, values, strict=True)]
-        slope = stop_gradient(functools.reduce(jnp.maximum, [abs(x.end.v) for x in sides]))
-        size = plan.guard_extent(lane, number)
-        if size is None:
-            values = [abs(x) for side in sides for x in (side.begin.x, side.end.x)]
-            size = stop_gradient(functools.reduce(jnp.maximum, values))
-        scale = size + plan.in_units(lane, slope)
+        scale = 1 + stop_gradient(functools.reduce(jnp.maximum, [abs(x.end.v) for x in sides]))
         if event.from_below:
             (side,) = sides
             armed, risen = _from_below(lane.below[len(below)], side.begin, side.end, scale)
@@ -180,7 +170,7 @@ def _others(
             sides = [Side(begin, end, jnp.where(armed, side.within, -1.0))]
             below.append(risen)
         if event.holds_mode:
-            sides = [side._replace(begin=_falling(plan, lane, side.begin, scale)) for side in sides]
+            sides = [side._replace(begin=_falling(side.begin, scale)) for side in sides]
         begin, end = sides[0].begin, sides[0].end
         for side in sides[1:]:  # that which is the guard where the step ends
             greater = stop_gradient(side.end.x > end.x)
@@ -194,7 +184,7 @@ def _others(
     return found, tuple(below)
 
 
-def _falling(plan: Plan, lane: Lane, begin: Rates, scale: Scalar) -> Rates:
+def _falling(begin: Rates, scale: Scalar) -> Rates:
     """The rates of a guard where a step begins, without a rise that is rounding's: behind an event
     that has just been landed upon the guard may be zero with its slope, as the velocity of a body
     that begins to slip, and it is the second derivative by which it falls.
@@ -203,7 +193,7 @@ def _falling(plan: Plan, lane: Lane, begin: Rates, scale: Scalar) -> Rates:
     """
     x, v, a = stop_gradient(begin)
     near = jnp.abs(x) <= 4 * float(jnp.finfo(x.dtype).eps) * scale
-    risen = near & (v > 0) & (2 * v <= -plan.in_units(lane, _landing_tolerance(x)) * a)
+    risen = near & (v > 0) & (2 * v <= -_landing_tolerance(x) * a)
     return begin._replace(v=jnp.where(risen, 0.0, begin.v))
 
 
@@ -242,9 +232,8 @@ def beyond(event: Crossing) -> Flag:
 
 
 def _seen(
-    plan: Plan, lane: Lane, ends: Flag, good: Flag, h: Scalar, guard: Crossing,
-    all_of_them: list[Crossing],
-) -> Crossing:  # fmt: skip
+    lane: Lane, ends: Flag, good: Flag, h: Scalar, guard: Crossing, all_of_them: list[Crossing]
+) -> Crossing:
     """The event, with whether a step that was aimed at it landed on it, or has to be aimed again.
 
     A step that ends an interval as it meets a stop, to rounding, is aimed at it: an impact on the
@@ -272,7 +261,7 @@ def _seen(
     offset, square = landing(end)
     size = stop_gradient(jnp.abs(offset))
     # Two ways of being there to rounding: in place along the path, or, near grazing, in position.
-    close = size <= _landing_tolerance(h) * leniency(plan, lane)
+    close = size <= _landing_tolerance(h) * leniency(lane)
     there = (jnp.abs(end.x) <= 4 * eps * guard.scale) & (end.v >= 0)
     real = stop_gradient(square) > 0
     # One that is there may have no way left along a parabola: a body that is at rest on a surface.
@@ -284,8 +273,7 @@ def _seen(
     again = again | ends & there & close & rises
     sudden = None
     if guard.above is not None:
-        rounding = 4 * eps * (plan.unit(lane) + jnp.abs(stop_gradient(lane.s)))
-        shortest = jnp.maximum(plan.in_units(lane, _SUDDEN), rounding)
+        shortest = jnp.maximum(_SUDDEN, 4 * eps * (1 + jnp.abs(stop_gradient(lane.s))))
         sudden = pin_flag(aimed & ~near & (h <= shortest) & beyond(guard), h)
         landed, offset = landed | sudden, jnp.where(sudden, 0.0, offset)
         # What Newton's method does not come to is looked for by halves.
@@ -293,9 +281,9 @@ def _seen(
     return guard._replace(offset=offset, landed=landed, again=again, near=near, sudden=sudden)
 
 
-def leniency(plan: Plan, lane: Lane) -> Scalar:
-    """By what factor a lane's landing tolerance is larger: after so many aims, and in its units."""
-    return plan.in_units(lane, jnp.where(lane.aims >= _PATIENCE, 1e3, jnp.ones_like(lane.aims)))
+def leniency(lane: Lane) -> Scalar:
+    """By what factor a lane's landing tolerance is larger, after so many aims."""
+    return jnp.where(lane.aims >= _PATIENCE, 1e3, jnp.ones_like(lane.aims))
 
 
 def _landing_tolerance(x: Scalar) -> float:
@@ -304,9 +292,9 @@ def _landing_tolerance(x: Scalar) -> float:
     return 1e-9 if x.dtype == jnp.float64 else 1e-4
 
 
-def furthest_landing(plan: Plan, lane: Lane, x: Scalar) -> Any:
+def furthest_landing(x: Scalar) -> float:
     """Largest |δ| that is believed: one near grazing, or accepted after many aims."""
-    return plan.in_units(lane, max(turn_tolerance(x), 1e3 * _landing_tolerance(x)))
+    return max(turn_tolerance(x), 1e3 * _landing_tolerance(x))
 
 
 def turn_tolerance(x: Scalar) -> float:

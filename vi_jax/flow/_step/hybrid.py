@@ -24,7 +24,6 @@ from ..._types import Flag, Scalar, State
 from ...lanes import pin_flag
 from .._arrival import Onward
 from .._lane import FREE, Lane, Plan, Record, select, to_event
-from .._sizes import grown
 from ..smooth import holding
 from .aim import aim_ahead, aim_at
 from .arrive import arrive
@@ -52,8 +51,6 @@ def iterate(plan: Plan, lane: Lane) -> Step:
     """One step of one lane: advance, aim or land. A lane that has ended is left as it is."""
     active = (lane.done < plan.intervals) & (lane.fault == 0)
     smooth = holding(plan.machine, lane.modes, lane.contact)
-    if lane.sizes is not None:
-        smooth = dataclasses.replace(smooth, sizes=lane.sizes)
     motion = plan.method.foresee(smooth, lane.s, lane.state, timing(plan, lane))
     if motion is not None:
         lane = aim_ahead(plan, lane, motion)
@@ -92,7 +89,6 @@ def iterate(plan: Plan, lane: Lane) -> Step:
         steps=steps,
         spent=spent,
         rejected=lane.rejected + jnp.where(rejected, 1.0, 0.0),
-        sizes=None if lane.sizes is None else grown(lane.sizes, there.state),
     )
     return Step(new, completed, new.state, there.record)
 

@@ -35,16 +35,13 @@ def unheld(
     """
     if contact is None:
         return None
-    contacts = list(contact)
+    contacts, slack = list(contact), rounding(plan.machine, new)
     for k, coordinate in enumerate(plan.machine.coordinates):
         (place, before), (there, after) = (
             (coordinate.position(x), coordinate.velocity(x)) for x in (old, new)
         )
         if not (there is place and after is before):
-            slack, late = (
-                rounding(plan.machine, new, x) for x in (coordinate.position, coordinate.velocity)
-            )
-            moved = (jnp.abs(there - place) > slack) | (jnp.abs(after - before) > late)
+            moved = (jnp.abs(there - place) > slack) | (jnp.abs(after - before) > slack)
             contacts[k] = jnp.where(when & stop_gradient(moved), 0.0, contacts[k])
     return tuple(contacts)
 

@@ -156,7 +156,7 @@ def attempt(
     bodies = range(len(machine.coordinates))
     alone = tuple(holding(machine, lane.modes, lane.contact, but=k) for k in bodies)
     seen = within(plan, lane, alone, stages, h)
-    of_guards = guards_error(plan, lane, seen, stages, h, jnp.asarray(limit))
+    of_guards = guards_error(plan, seen, stages, h, jnp.asarray(limit))
     error = error if of_guards is None else jnp.maximum(error, of_guards)
     good = jnp.isfinite(total(new, jnp.zeros_like(h)))
     alive = machine.alive(new)
@@ -219,7 +219,7 @@ def _path(
             Rates(jnp.where(rests, place, r.x), jnp.where(rests, 0.0, r.v), r.a)
             for r in (begin, end)
         )
-    met = turns_within(turn_tolerance(h) * leniency(plan, lane), end)
+    met = turns_within(turn_tolerance(h) * leniency(lane), end)
     aimed = lane.target == to_turn_of(k)
     for j in range(len(plan.machine.coordinates)):  # several may turn at once
         aimed = aimed if j == k else aimed | (lane.target == to_turn_of(j))
@@ -230,7 +230,7 @@ def _path(
     leaves, surge, pull = None, None, None
     limited = any(stop.coordinate == k for stop in plan.machine.stops)
     if lane.contact is not None and limited:
-        leaves = release(plan, lane, k, begin, end, good, h)
+        leaves = release(lane, k, plan.machine.stops, begin, end, good, h)
         surge = (
             force_rate(free, position, smooth, lane.s, lane.state),
             force_rate(free, position, smooth, s1, new),

@@ -21,7 +21,7 @@ from ...machine import AbstractMachine, events_of, sides_of
 from .._lane import Lane, Plan, to_event
 from ..events import Rates, rates
 from ..methods import Foreseen, Stage
-from ..smooth import SmoothMachine, exact, is_affine, spread
+from ..smooth import SmoothMachine, exact, is_affine
 
 # Of a motion known beforehand, where guards are evaluated within a step, as shares of it.
 _SHARES = tuple(n / 8 for n in range(1, 8))
@@ -71,41 +71,17 @@ def foreseen_stages(motion: Foreseen, s: Scalar, h: Scalar) -> list[Stage]:
 
 
 def guards_error(
-    plan: Plan, lane: Lane, seen: Within, stages: list[Stage], h: Scalar, longest: Scalar
+    plan: Plan, seen: Within, stages: list[Stage], h: Scalar, longest: Scalar
 ) -> Scalar | None:
     """Return the largest error of the guards at the stages of a step, relative to the tolerance;
     `None` without guards, or of a method that estimates none."""
-    events, stops, guards = events_of(plan.machine), plan.machine.stops, []
-    for k, x in seen.forces.items():  # its integral is a velocity
-        guards.append((x, True, plan.extent(lane, k) / plan.unit(lane)))
+    events = events_of(plan.machine)
+    guards = [(x, True) for x in seen.forces.values()]
     for number, sides in seen.events.items():
-        if number < len(stops):
-            extent = plan.extent(lane, stops[number].coordinate)
-        else:
-            extent = plan.guard_extent(lane, number)
-        for j, x in enumerate(sides):
-            own = _size_of(plan, lane, number, j, x) if extent is None else extent
-            guards.append((x, events[number].holds_mode, own * plan.unit(lane)))
-    errors = [
-        plan.method.guard_error(
-            stages, x, h, longest, acts=acts, size=None if plan.machine.dimensionless else size
-        )
-        for x, acts, size in guards
-    ]
+        guards += [(x, events[number].holds_mode) for x in sides]
+    errors = [plan.method.guard_error(stages, x, h, longest, acts=acts) for x, acts in guards]
     known = [error for error in errors if error is not None]
     return functools.reduce(jnp.maximum, known) if known else None
-
-
-def _size_of(plan: Plan, lane: Lane, number: int, j: int, values: Array) -> Scalar:
-    """A size of one side of a guard in its present mode: of its values at the stages, and of what
-    the numbers of the state make of it."""
-    size = stop_gradient(jnp.max(jnp.abs(values)))
-    if lane.sizes is None:
-        return size
-    around = stop_gradient((lane.modes, lane.contact or ()))
-    s, state = stop_gradient((lane.s, lane.state))
-    part = lambda x: sides_of(plan.machine, number, s, x, *around)[j]
-    return size + spread(part, state, lane.sizes)
 
 
 def apart(stages: list[Stage]) -> list[Stage]:

@@ -66,12 +66,6 @@ class AbstractMethod(eqx.Module):
         to 1 + |state|; 0 where only by rounding, as the steps are the same in each period."""
         return 0.0
 
-    @property
-    def follows_sizes(self) -> bool:
-        """Whether errors are judged by how large each number of the state has been, where the
-        machine is not dimensionless; static. `SmoothMachine.sizes` has these then."""
-        return False
-
     def holds(self, machine: AbstractMachine) -> bool:
         """Whether a step holds the bodies that rest, as one does that evaluates the field; else the
         whole state stays as it is while a body rests."""
@@ -136,21 +130,14 @@ class AbstractMethod(eqx.Module):
         return new, beside, error, stages
 
     def guard_error(
-        self,
-        stages: list[Stage],
-        values: Array,
-        h: Scalar,
-        longest: Scalar,
-        *,
-        acts: bool,
-        size: Scalar | float | None = None,
+        self, stages: list[Stage], values: Array, h: Scalar, longest: Scalar, *, acts: bool
     ) -> Scalar | None:
         """Return the error of the integral of a guard over a step, relative to the tolerance, or
         `None` of a method that estimates none.
 
         **Arguments:** `values`, the guard at each of the `stages`; `h`, the length of the step;
         `longest`, that of the longest one; `acts`, whether the guard is a force on a body that is
-        held; `size`, that of the integral, `None` of a machine that is dimensionless.
+        held.
         """
         return None
 

@@ -62,10 +62,9 @@ class Adaptive(AbstractMethod):
     the rest moves, such as a strong motor: its steps need not follow what has faded.
 
     **Arguments:** `solver` (default `Verner9()`, the fastest measured from 1e-7 on); `rtol`
-    and `atol`, tolerances relative to each state component and absolute, in the machine's units.
-    Without `atol` the error of a component is relative to the largest value that it has had so far,
-    so that units do not matter; for a `Scene`, which is dimensionless, `atol` is `rtol` then.
-    `steps_per_cycle`, the fewest steps in a cycle (at least 5, the default).
+    and `atol`, tolerances relative to each state component and absolute (in the machine's
+    dimensionless units; `atol` defaults to `rtol`); `steps_per_cycle`, the fewest steps in a cycle
+    (at least 5, the default).
 
     **Raises:** `TypeError` if the solver is neither explicit nor diagonally implicit Runge–Kutta,
     `ValueError` for tolerances out of (0, 1], or fewer than 5 steps.
@@ -94,11 +93,6 @@ class Adaptive(AbstractMethod):
         return self.rtol if self.atol is None else jnp.maximum(self.rtol, self.atol)
 
     @property
-    def follows_sizes(self):
-        """Unless an absolute tolerance is given."""
-        return self.atol is None
-
-    @property
     def follows_fading(self):
         """Not with an implicit solver."""
         return not self.solver.implicit
@@ -122,20 +116,10 @@ class Adaptive(AbstractMethod):
             solver = Unrolled(solver.solver, tolerance=jnp.maximum(0.01 * rtol, floor))
         new, after, errors, stages = _runge_kutta(solver, smooth, s0, s1, state, beside)
         old, there, error = (_sized_by(*x) for x in ((state, beside), (new, after), errors))
-        if self.atol is None and smooth.sizes is not None:
-            # What integrals add up to is known by the step itself.
-            passed = jtu.tree_map(lambda a, b: jnp.abs(b - a), old[1], there[1])
-            tiny = float(jnp.finfo(s0.dtype).tiny)
-            sizes = smooth.sizes, passed
-            allowed = jtu.tree_map(
-                lambda x, a, b: rtol * jnp.maximum(x, jnp.maximum(jnp.abs(a), jnp.abs(b))) + tiny,
-                sizes, old, there,
-            )  # fmt: skip
-        else:
-            allowed = jtu.tree_map(
-                lambda a, b: atol + rtol * jnp.maximum(jnp.abs(a), jnp.abs(b)), old, there
-            )
-        scaled = jtu.tree_map(lambda e, most: (e / most) ** 2, error, allowed)
+        scaled = jtu.tree_map(
+            lambda e, a, b: (e / (atol + rtol * jnp.maximum(jnp.abs(a), jnp.abs(b)))) ** 2,
+            error, old, there,
+        )  # fmt: skip
         parts = jtu.tree_leaves(scaled)
         number = sum(x.size for x in parts)
         norm = jnp.sqrt(jax.lax.stop_gradient(sum(map(jnp.sum, parts)) / number))
@@ -149,7 +133,7 @@ class Adaptive(AbstractMethod):
         atol = rtol if self.atol is None else jnp.maximum(jnp.asarray(self.atol, like.dtype), floor)
         return rtol, atol, floor
 
-    def guard_error(self, stages, values, h, longest, *, acts, size=None):
+    def guard_error(self, stages, values, h, longest, *, acts):
         """As the error of a number of the state whose rate is the guard: the impulse of a force
         that holds a body, say. A guard that does not act needs to be known to 1e-6 only.
 
@@ -160,8 +144,6 @@ class Adaptive(AbstractMethod):
             rtol, atol = jnp.maximum(rtol, _VISIBLE), jnp.maximum(atol, _VISIBLE)
         values = jax.lax.stop_gradient(values)
         error = jnp.sum(np.asarray([x.weight for x in stages]) * values)
-        if size is not None and self.atol is None:
-            atol = rtol * size + float(jnp.finfo(values.dtype).tiny)
         return jnp.abs(h * error) / (atol + rtol * longest * jnp.max(jnp.abs(values)))
 
     def tighter(self):

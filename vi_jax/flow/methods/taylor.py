@@ -48,8 +48,6 @@ class Expansion(NamedTuple):
     series: list[Series]
     tolerance: np.ndarray | float
     """By which its reach is measured."""
-    sizes: State | None
-    """As in `SmoothMachine`."""
 
     def at(self, h: Scalar) -> tuple[State, Beside | None]:
         """State, and what is integrated beside it, a length h away."""
@@ -65,31 +63,14 @@ class Expansion(NamedTuple):
         """The length at which the last two terms are as small as the tolerance, relative to the
         state (Jorba and Zou, Experimental Mathematics 14, 2005), up to this limit."""
         floor = 8 * jnp.finfo(limit.dtype).eps
-        begin = [stop_gradient(x[0]) for x in self.series]
-        allowed = jnp.maximum(jnp.asarray(self.tolerance, limit.dtype), floor)
-        if self.sizes is None:
-            sizes: list[Any] = [None for _ in begin]
-            allowed = allowed * (1 + jnp.asarray(sum(jnp.sum(jnp.abs(x)) for x in begin)))
-        else:
-            known = jtu.tree_leaves(self.sizes)
-            known += [0.0 for _ in self.series[len(known) :]]  # integrals
-            sizes = []
-            for size, x in zip(known, self.series, strict=True):
-                # What has been zero so far is judged by how it begins to move.
-                moved = sum(
-                    limit**n * jnp.abs(stop_gradient(x[n])) for n in (1, 2, 3) if x[n] is not None
-                )
-                size = size + jnp.abs(stop_gradient(x[0]))
-                sizes.append(jnp.where(size > 0, size, moved + float(jnp.finfo(limit.dtype).tiny)))
-        both = list(zip(self.series, sizes, strict=True))
+        size = jnp.asarray(sum(jnp.sum(jnp.abs(stop_gradient(x[0]))) for x in self.series))
+        allowed = jnp.maximum(jnp.asarray(self.tolerance, limit.dtype), floor) * (1 + size)
         for n in (len(self.series[0]) - 2, len(self.series[0]) - 1):
-            terms = [
-                jnp.sum(jnp.abs(x if size is None else x / size))
-                for x, size in ((stop_gradient(x[n]), y) for x, y in both if x[n] is not None)
-            ]
+            there = [stop_gradient(x[n]) for x in self.series if x[n] is not None]
+            terms = [jnp.sum(jnp.abs(x)) for x in there]
             if not terms:
                 continue
-            term = jnp.maximum(sum(terms), jnp.finfo(limit.dtype).tiny)
+            term = jnp.maximum(sum(terms), jnp.finfo(size.dtype).tiny)
             limit = jnp.minimum(limit, jnp.exp(jnp.log(allowed / term) * (1.0 / n)))
         return limit
 
@@ -144,11 +125,6 @@ class Taylor(AbstractMethod):
                 )
 
     @property
-    def follows_sizes(self):
-        """True: steps are as long as the series reaches."""
-        return True
-
-    @property
     def follows_fading(self):
         """Where steps are fixed; else they are sized by their errors."""
         return self.rtol is None
@@ -165,7 +141,7 @@ class Taylor(AbstractMethod):
         with _in_words():
             treedef, series = power_series.expand(field, s, (state, beside), self.order)
         tolerance = self._coarsest if self.rtol is None else self.rtol
-        return Expansion(treedef, series, tolerance, smooth.sizes)
+        return Expansion(treedef, series, tolerance)
 
     @property
     def _coarsest(self) -> float:
