@@ -107,7 +107,9 @@ def _cumulated(t: Text, p: dict, avals, x: Held, how: Callable) -> Held:
 
 register_reductions(
     LARGE,
-    lambda t, p, avals, x, how, empty: _reduce(t, x, tuple(p["axes"]), avals[0], how, empty),
+    lambda t, p, avals, x, how, empty: _reduce(
+        t, x, tuple(map(int, p["axes"])), avals[0], how, empty
+    ),
     _cumulated,
 )
 
