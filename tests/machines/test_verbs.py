@@ -35,6 +35,10 @@ class Case(NamedTuple):
 
 
 CASES = {
+    "pair": Case(
+        M.ImpactPair(), {}, "place", "speed", "half_gap", (1.2, 3.0), ("symmetry-breaking",),
+        "symmetry-breaking", "restitution", (0.4, 0.6),
+    ),
     "valve": Case(
         M.ReliefValve(flow_rate=5.0), {}, "lift", "pressure", "flow_rate", (4.0, 8.0),
         ("period-doubling", "grazing"), "period-doubling", "restitution", (0.75, 0.85),

@@ -52,7 +52,11 @@ def _sized_by(state: State, beside: Beside | None) -> tuple[State, dict[str, Sca
 
 
 def _number(x: Any) -> Any:
-    return x if x is None or isinstance(x, Tracer) else np.asarray(x)
+    return x if isinstance(x, Tracer) else np.asarray(x)
+
+
+def _number_or_none(x: Any) -> Any:
+    return None if x is None else _number(x)
 
 
 class Adaptive(AbstractMethod):
@@ -73,7 +77,7 @@ class Adaptive(AbstractMethod):
     solver: Unrolled = eqx.field(default_factory=Verner9, converter=_unrolled)
     # Arrays, so that another tolerance is not another program.
     rtol: Any = eqx.field(kw_only=True, default=1e-9, converter=_number)
-    atol: Any = eqx.field(kw_only=True, default=None, converter=_number)
+    atol: Any = eqx.field(kw_only=True, default=None, converter=_number_or_none)
     steps_per_cycle: int = eqx.field(static=True, kw_only=True, default=5)  # pyright: ignore
 
     def __check_init__(self):
