@@ -1,6 +1,7 @@
 """All tests run in double precision; what takes most of their time, compiling, is kept short."""
 
 import gc
+import signal
 from pathlib import Path
 
 import jax
@@ -31,6 +32,10 @@ def pytest_configure(config):
         modules = [f"vi_jax.{name}" for name in sorted(names - _UNCHECKED) if name[:2] != "__"]
         config.checked = jaxtyping.install_import_hook(modules, "beartype.beartype")
 
+
+# A shell lets what it runs in the background ignore Ctrl-C, which some tests press.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # What JAX traces lives long, and collecting garbage among it takes a tenth of the time.
 gc.set_threshold(200_000, 20, 20)
