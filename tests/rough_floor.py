@@ -8,6 +8,8 @@ import numpy as np
 import vi_jax as vi
 from scipy.integrate import solve_ivp
 
+from rubbing import friction
+
 SINCE = 0.3  # of the drive's phase on the section
 
 
@@ -30,15 +32,7 @@ class Rough(vi.AbstractMachine):
 
     @property
     def switches(self):
-        return (
-            vi.DryFriction(
-                self.level,
-                velocity=lambda machine, x: x.V,
-                force=lambda machine, s, x: machine.pull(s, x),
-                stopped=lambda machine, x: vi.OscillatorState(x.Y, jnp.zeros_like(x.V)),
-                name="floor",
-            ),
-        )
+        return (friction(self.level, type(self).pull, name="floor"),)
 
     def field(self, s, x, mode):
         rate = self.pull(s, x) + self.switches[0].contribution(self, s, x, mode)

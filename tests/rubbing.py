@@ -9,6 +9,14 @@ import numpy as np
 import vi_jax as vi
 
 
+def friction(level, force, **options):
+    """Dry friction of a body with place Y and velocity V; its force acts on V."""
+    stopped = lambda machine, x: vi.OscillatorState(x.Y, jnp.zeros_like(x.V))
+    return vi.DryFriction(
+        level, velocity=lambda machine, x: x.V, force=force, stopped=stopped, **options
+    )
+
+
 class Rubbing(vi.AbstractMachine):
     """x'' = force(machine, s, x) - level · load(machine, s, x) · friction, with numbers of its own
     by name."""
@@ -22,15 +30,7 @@ class Rubbing(vi.AbstractMachine):
 
     @property
     def switches(self):
-        return (
-            vi.DryFriction(
-                self.level,
-                velocity=lambda machine, x: x.V,
-                force=self.force,
-                stopped=lambda machine, x: vi.OscillatorState(x.Y, jnp.zeros_like(x.V)),
-                load=self.load,
-            ),
-        )
+        return (friction(self.level, self.force, load=self.load),)
 
     def field(self, s, x, mode):
         rubs = self.switches[0].contribution(self, s, x, mode)

@@ -88,7 +88,7 @@ def test_a_body_may_rest_where_anything_may_press_it_on(machine, may):
 
 
 class Stopped(vi.machines.Structure):
-    """With a stop that is none of its contacts."""
+    """A structure with a stop besides its `contacts`."""
 
     @property
     def stops(self):

@@ -46,7 +46,7 @@ def test_a_bouncing_ball_rests_after_the_time_of_the_series():
     for i, k in enumerate(ks):
         times = np.asarray(found.impact_log.phase[i, 0])[found.impact_log.stop[i, 0] >= 0]
         fall = np.sqrt(2 * height / 2.0)
-        # What is left after the last impact is of the order of its own flight.
+        # The last impact is followed by a rest of the series that begins with this flight.
         last = 2 * fall * k ** len(times)
         assert times[-1] + last / (1 - k) == pytest.approx(fall * (1 + k) / (1 - k), abs=1e-9)
         assert len(times) <= 2 + np.log(1e-6) / np.log(max(k, 1e-6))

@@ -11,6 +11,8 @@ import vi_jax as vi
 from scipy.optimize import brentq
 from scipy.special import erf
 
+from rubbing import friction
+
 WAVES = (1, 2, 3, 5, 7)
 STILL = vi.OscillatorState(jnp.array(0.0), jnp.array(0.0))
 
@@ -132,14 +134,7 @@ class Block(Pushed):
 
     @property
     def switches(self):
-        return (
-            vi.DryFriction(
-                self.level,
-                velocity=lambda machine, x: x.V,
-                force=lambda machine, s, x: machine.pull(s, x),
-                stopped=lambda machine, x: vi.OscillatorState(x.Y, jnp.zeros_like(x.V)),
-            ),
-        )
+        return (friction(self.level, type(self).pull),)
 
     def field(self, s, x, mode):
         force = self.pull(s, x) + self.switches[0].contribution(self, s, x, mode)

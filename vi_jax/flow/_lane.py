@@ -11,10 +11,11 @@ from jaxtyping import Array, Float, UInt32
 from .._types import Flag, Scalar, Scalars, State
 from ..machine import (
     AbstractMachine,
-    HybridState,
     events_of,
     is_autonomous,
+    own_modes,
     section_number,
+    with_modes,
 )
 from .beside import Beside
 from .methods import AbstractMethod
@@ -266,8 +267,7 @@ class Plan(eqx.Module):
     def point(self, state: State, modes: Scalars) -> State:
         """What is kept of the end of an interval: the state, with the machine's own modes if it has
         some."""
-        held = sum(event.holds_mode for event in events_of(self.machine))
-        return HybridState(state, modes[held:]) if modes[held:] else state
+        return with_modes(state, own_modes(self.machine, modes))
 
     def fresh(self, state: State) -> Record:
         """The record of an interval that begins in `state`."""

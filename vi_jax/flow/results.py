@@ -13,7 +13,6 @@ from .._messages import so_many
 from .._types import Scalar, State, xr
 from ..machine import (
     PLAIN,
-    HybridState,
     Shown,
     Stated,
     Summarized,
@@ -21,6 +20,7 @@ from ..machine import (
     in_unit,
     name_in,
     state_in_words,
+    with_modes,
 )
 from ._listed import listed
 from .enumeration import NamedEnumeration
@@ -284,8 +284,7 @@ class Run(Summarized):
         # Batch axes are in front, those of an array in the state behind; how many there are in
         # front is shown by a number for each lane.
         place = (*[slice(None)] * self.steps.ndim, -1)
-        kept = HybridState(self.sections, self.modes) if self.modes else self.sections
-        return jtu.tree_map(lambda x: x[place], kept)
+        return jtu.tree_map(lambda x: x[place], with_modes(self.sections, self.modes))
 
     def mean_averages(self) -> dict[str, Scalar]:
         """The machine's own averages over the time of all cycles, of one lane."""

@@ -128,7 +128,7 @@ def _cumulated(t, p, avals, x, how):
 
 register_reductions(
     STRUCTURAL,
-    lambda t, p, avals, x, how, empty: _reduce(how, x, tuple(map(int, p["axes"])), empty),
+    lambda t, axes, avals, x, how, empty: _reduce(how, x, axes, empty),
     _cumulated,
 )
 

@@ -47,7 +47,7 @@ def compile_in_background(text: str, cpu: str | None) -> Future:
     **Returns:** the future of the engine, which holds the code in memory, and of the address of
     `kernel`. Its result **raises** `RuntimeError` where LLVM could not compile the text.
     """
-    return _worker().submit(_load_or_compile, llvm(), text, cpu, _cache_folder())
+    return _worker().submit(_load_or_compile, llvm(), text, cpu, _level(), _cache_folder())
 
 
 @functools.cache
@@ -57,15 +57,15 @@ def _worker() -> ThreadPoolExecutor:
 
 
 def _load_or_compile(
-    binding: Any, text: str, cpu: str | None, store: Path | None
+    binding: Any, text: str, cpu: str | None, level: int, store: Path | None
 ) -> tuple[Any, int]:
     """The engine with a text's code, from a file in the folder `store` if it has one, and the
     address of `kernel`."""
-    words = (text, cpu, _level(), *_host(binding), binding.llvm_version_info)
+    words = (text, cpu, level, *_host(binding), binding.llvm_version_info)
     name = f"{hashlib.blake2b(repr(words).encode(), digest_size=20).hexdigest()}.o"
     code = store and _read(store / name)
     if code is None:
-        code = object_code(binding, text, cpu)
+        code = object_code(binding, text, cpu, level)
         if store is not None:
             _write(store / name, code)
     engine = _engine(binding, code)
@@ -81,8 +81,9 @@ def _host(binding: Any) -> tuple[str, str]:
     return binding.get_host_cpu_name(), binding.get_host_cpu_features().flatten()
 
 
-def object_code(binding: Any, text: str, cpu: str | None) -> bytes:
-    """Object code of a text, for a processor in LLVM's words or for this one (`None`).
+def object_code(binding: Any, text: str, cpu: str | None, level: int = 1) -> bytes:
+    """Object code of a text, for a processor in LLVM's words or for this one (`None`), at a level
+    of optimisation.
 
     LLVM vectorises nothing here, since the text is vector code, and unrolls no loops.
 
@@ -90,7 +91,7 @@ def object_code(binding: Any, text: str, cpu: str | None) -> bytes:
     """
     name, features = _host(binding) if cpu is None else (cpu, "")
     target = binding.Target.from_default_triple()
-    machine = target.create_target_machine(cpu=name, features=features, opt=_level())
+    machine = target.create_target_machine(cpu=name, features=features, opt=level)
     try:
         module = binding.parse_assembly(text)
         module.verify()  # types, dominance: 0.1 to 1 ms, of the 100 to 600 ms that the rest takes
@@ -99,7 +100,7 @@ def object_code(binding: Any, text: str, cpu: str | None) -> bytes:
         raise RuntimeError(message) from None
     module.triple = binding.get_default_triple()
     module.data_layout = str(machine.target_data)
-    options = binding.create_pipeline_tuning_options(speed_level=_level())
+    options = binding.create_pipeline_tuning_options(speed_level=level)
     options.loop_vectorization = options.slp_vectorization = False
     options.loop_unrolling = False
     builder = binding.create_pass_builder(machine, options)

@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -260,21 +260,25 @@ def dependent_results(jaxpr: Jaxpr, sources: Sequence[bool], *, smooth: bool) ->
     """Which results of a jaxpr may depend on its arguments `sources`; if `smooth`, only dependence
     that can have a derivative counts."""
     found = {v for v, s in zip(jaxpr.invars, sources, strict=True) if s}
+    for _, _, outs in _dependent_equations(jaxpr, found, smooth=smooth):
+        found.update(outs)
+    return [not isinstance(a, Literal) and a in found for a in jaxpr.outvars]
 
-    def depends(atom: object) -> bool:
-        return not isinstance(atom, Literal) and atom in found
 
+def _dependent_equations(
+    jaxpr: Jaxpr, found: Set[Any], *, smooth: bool
+) -> Iterator[tuple[Any, list[bool], list[Any]]]:
+    """Yield the equations that depend on the variables `found`, to which the caller adds what each
+    gives: the equation, which of its arguments depend, and those of its results that do."""
     for eqn in jaxpr.eqns:
-        args = [depends(a) for a in eqn.invars]
+        args = [not isinstance(a, Literal) and a in found for a in eqn.invars]
         if not any(args) or (smooth and eqn.primitive.name in _ZERO_DERIVATIVE):
             continue
-        for var, here in zip(
-            eqn.outvars, dependent_of_equation(eqn, args, smooth=smooth), strict=True
-        ):
-            aval: Any = var.aval
-            if here and not (smooth and not jnp.issubdtype(aval.dtype, jnp.inexact)):
-                found.add(var)
-    return [depends(a) for a in jaxpr.outvars]
+        which = dependent_of_equation(eqn, args, smooth=smooth)
+        outs: list[Any] = [v for v, here in zip(eqn.outvars, which, strict=True) if here]
+        if smooth:
+            outs = [v for v in outs if jnp.issubdtype(v.aval.dtype, jnp.inexact)]
+        yield eqn, args, outs
 
 
 def dependent_of_equation(eqn: Any, args: list[bool], *, smooth: bool) -> list[bool]:
@@ -312,15 +316,9 @@ def loop_depends(jaxpr: Jaxpr, sources: Sequence[bool]) -> bool:
     """Whether a `while` of a jaxpr, or of one that it calls, has results with a derivative with
     respect to the arguments `sources`."""
     found = {v for v, s in zip(jaxpr.invars, sources, strict=True) if s}
-    for eqn in jaxpr.eqns:
-        args = [not isinstance(a, Literal) and a in found for a in eqn.invars]
-        if not any(args) or eqn.primitive.name in _ZERO_DERIVATIVE:
-            continue
-        outs = zip(eqn.outvars, dependent_of_equation(eqn, args, smooth=True), strict=True)
-        smooth: list[Any] = [v for v, here in outs if here]
-        smooth = [v for v in smooth if jnp.issubdtype(v.aval.dtype, jnp.inexact)]
-        found.update(smooth)
-        if eqn.primitive.name == "while" and smooth:
+    for eqn, args, outs in _dependent_equations(jaxpr, found, smooth=True):
+        found.update(outs)
+        if eqn.primitive.name == "while" and outs:
             return True
         body = called(eqn) if eqn.primitive.name not in OWN_DERIVATIVE else None
         bodies = [(body, args)] if body is not None else []

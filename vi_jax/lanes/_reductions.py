@@ -21,8 +21,9 @@ REDUCTIONS: dict[str, tuple[Callable[..., Value], int]] = {
 def register_reductions(table: dict[str, Rule], reduce: Rule, cumulate: Rule) -> None:
     """Put the rules for sums, products and extremes into a table.
 
-    **Arguments:** the table; functions of the text, the equation's parameters, its results' shapes
-    and types, an array, how two numbers become one, and, of `reduce`, what stands for none.
+    **Arguments:** the table; functions of the text, the axes that are reduced or the equation's
+    parameters, its results' shapes and types, an array, how two numbers become one, and, of
+    `reduce`, what stands for none.
     """
 
     def put_together(t: Text, how: Callable[..., Value], avals: Any) -> Callable[..., Value]:
@@ -30,7 +31,7 @@ def register_reductions(table: dict[str, Rule], reduce: Rule, cumulate: Rule) ->
 
     for name, (how, empty) in REDUCTIONS.items():
         table["reduce_" + name] = lambda t, p, avals, x, how=how, empty=empty: reduce(
-            t, p, avals, x, put_together(t, how, avals),
+            t, tuple(map(int, p["axes"])), avals, x, put_together(t, how, avals),
             t.constant(empty, kind_of(avals[0].dtype)),
         )  # fmt: skip
         if name not in ("and", "or"):

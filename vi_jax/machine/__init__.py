@@ -29,6 +29,7 @@ from .events import happens_at as happens_at
 from .events import is_autonomous as is_autonomous
 from .events import jump_of as jump_of
 from .events import mode_number as mode_number
+from .events import own_modes as own_modes
 from .events import rubbing_on as rubbing_on
 from .events import rubs as rubs
 from .events import section_number as section_number
@@ -42,6 +43,7 @@ from .hybrid_state import begun as begun
 from .hybrid_state import modes_of as modes_of
 from .hybrid_state import raveled as raveled
 from .hybrid_state import replaced as replaced
+from .hybrid_state import with_modes as with_modes
 from .law import AbstractContactLaw as AbstractContactLaw
 from .law import HuntCrossley as HuntCrossley
 from .law import PowerLaw as PowerLaw

@@ -118,6 +118,11 @@ def mode_number(machine: Machine, number: int) -> int:
     return sum(event.holds_mode for event in events_of(machine)[:number])
 
 
+def own_modes(machine: Machine, modes: Modes) -> Modes:
+    """Return those of a machine's modes that no event holds: its own."""
+    return modes[mode_number(machine, len(events_of(machine))) :]
+
+
 def event_of(
     machine: Machine, number: int, modes: Modes, contact: Scalars
 ) -> tuple[AbstractEvent, slice, dict[str, Around]]:

@@ -48,6 +48,11 @@ def modes_of(state: State) -> tuple[Any, ...] | None:
     return state.modes if isinstance(state, HybridState) else None
 
 
+def with_modes(state: State, modes: tuple[Any, ...]) -> State:
+    """Return the state in these modes of the machine's own; as it is if there are none."""
+    return HybridState(state, modes) if modes else state
+
+
 def replaced(state: State, new: State) -> State:
     """Another state in the same modes."""
     return HybridState(new, state.modes) if isinstance(state, HybridState) else new
@@ -68,8 +73,7 @@ def begun(machine: Machine, state: State, axes: int = 0) -> State:
 
     for _ in range(axes):
         begin = jax.vmap(begin)
-    modes = begin(state)
-    return HybridState(state, modes) if modes else state
+    return with_modes(state, begin(state))
 
 
 def raveled(state: State) -> tuple[Vector, Callable[[Vector], State]]:

@@ -77,5 +77,5 @@ class BouncingBall(PhaseMachine):
         return BallState(Y, V)
 
     def sketch(self, pen: Any, state: State, phase: float) -> None:
-        """See `plot_sketch`."""
+        """Draw the machine in a state with a `Pen`, for `plot_sketch` and `animate`."""
         draw_ball(self, pen, state, phase)

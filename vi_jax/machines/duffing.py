@@ -68,5 +68,5 @@ class Duffing(ForcedMachine):
         return OscillatorState(-state.Y, -state.V) if self.two_sided else None
 
     def sketch(self, pen: Any, state: State, phase: float) -> None:
-        """See `plot_sketch`."""
+        """Draw the machine in a state with a `Pen`, for `plot_sketch` and `animate`."""
         draw_duffing(self, pen, state, phase)

@@ -144,5 +144,5 @@ class ImpactPair(PhaseMachine):
         return type(state)(*(-x for x in vars(state).values()))
 
     def sketch(self, pen: Any, state: State, phase: float) -> None:
-        """See `plot_sketch`."""
+        """Draw the machine in a state with a `Pen`, for `plot_sketch` and `animate`."""
         draw_pair(self, pen, state, phase)

@@ -206,7 +206,7 @@ class UnbalancedRotor(ShaftMachine, PhaseMachine):
         return jnp.isfinite(state.P) if self.is_paced(state) else None
 
     def sketch(self, pen: Any, state: State, phase: float) -> None:
-        """See `plot_sketch`."""
+        """Draw the machine in a state with a `Pen`, for `plot_sketch` and `animate`."""
         draw_rotor(self, pen, state, phase)
 
 

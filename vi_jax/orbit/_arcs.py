@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._types import Flag, Scalar, State
 from ..flow import Run, simulate
-from ..machine import AbstractMachine, HybridState, bare, in_rows, is_autonomous, raveled
+from ..machine import AbstractMachine, bare, in_rows, is_autonomous, raveled, with_modes
 from ._cycle_map import CycleMap
 from ._forward_jacobian import forward_jacobian
 from ._neutral import neutral
@@ -62,8 +62,7 @@ def moved_from_impacts(
     phase = run.impact_log.phase.ravel() - step * jnp.arange(_PLACES)[:, None]
     apart = jnp.abs(jnp.mod(phase + half, machine.cycle) - half)
     place = jnp.argmax(jnp.min(jnp.where(jnp.isnan(apart), half, apart), axis=1))
-    kept, modes = run.samples.state, run.samples.modes
-    kept = HybridState(kept, modes) if modes else kept
+    kept = with_modes(run.samples.state, run.samples.modes)
     there = jtu.tree_map(lambda x: x[place], kept)
     lost = ~jnp.all(jnp.isfinite(in_rows(bare(there), 0)))
     place = jnp.where(lost, 0, place)

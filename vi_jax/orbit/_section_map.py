@@ -19,13 +19,13 @@ from .._types import Scalar, State, Vector
 from ..flow import MethodLike, Run, means, simulate
 from ..machine import (
     AbstractMachine,
-    HybridState,
     bare,
     in_rows,
     is_autonomous,
     leaf,
     modes_of,
     raveled,
+    with_modes,
 )
 from ._cycle_map import CycleMap
 from ._fixed_step_method import fixed_step_method
@@ -74,8 +74,7 @@ class SectionMap(Shooting):
             beyond = stop.beyond(body.position(state)) > 0
             there = body.placed(state, stop.place, body.velocity(state))
             state = jtu.tree_map(partial(jnp.where, beyond), there, state)
-        own = self.own_modes(0)
-        return HybridState(state, own) if own else state
+        return with_modes(state, self.own_modes(0))
 
     def flown(self, x: Vector, **options: Any) -> Run:
         """The motion of a period, simulated with these options."""

@@ -25,10 +25,10 @@ from ..flow import AbstractMethod, average_names, means
 from ..machine import (
     AbstractMachine,
     after_event,
-    events_of,
     is_autonomous,
     jump_of,
     mode_number,
+    own_modes,
     with_leaf,
 )
 from ._events import Event, guard_at
@@ -158,8 +158,7 @@ class Shooting(eqx.Module):
 
     def own_modes(self, leg: Leg) -> tuple[Array, ...]:
         """The machine's own modes in a leg: those that no event holds."""
-        held = sum(event.holds_mode for event in events_of(self.machine))
-        return self.modes_in(leg)[held:]
+        return own_modes(self.machine, self.modes_in(leg))
 
     def _each(self, leg: Leg, function: Callable[..., Any], *inputs: Any) -> Any:
         """`function(event, *inputs)` for the event that begins a leg, whose number may be

@@ -10,7 +10,7 @@ from jaxtyping import Array
 from .._checks import count
 from .._programs import compiled
 from .._types import Scalar, State
-from ..machine import HybridState
+from ..machine import with_modes
 from ._observed import Observed
 from ._shooting import Shooting
 from .curve import Step
@@ -90,7 +90,7 @@ def orbit_of(problem: Shooting, step: Step) -> Orbit:
     return Orbit(
         machine=machine,
         method=problem.method,
-        state=HybridState(state, own) if own else state,
+        state=with_modes(state, own),
         sections=sections,
         cycles=jnp.asarray(problem.cycles, jnp.int32),
         duration=duration,

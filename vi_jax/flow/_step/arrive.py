@@ -142,13 +142,13 @@ def _landed(
     for c in trial.crossings:
         if c.coordinate is None:
             arrival = arrival._replace(state=select(c.landed, there, arrival.state))
+            here = c.landed | off[c.number] if c.number in off else c.landed
             if c.number == section_number(machine):
                 # What begins anew with a cycle does so at its end.
-                ends = c.landed | off[c.number] if c.number in off else c.landed
-                arrival = arrival._replace(completed=arrival.completed | ends)
+                arrival = arrival._replace(completed=arrival.completed | here)
                 arrival = disarmed_itself(plan, arrival, c)
             else:
-                due[c.number] = c.landed | off[c.number] if c.number in off else c.landed
+                due[c.number] = here
     return happened(plan, taken, arrival, due, near) if due else arrival
 
 

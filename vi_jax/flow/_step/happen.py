@@ -36,7 +36,7 @@ class _Instant(NamedTuple):
 
     arrival: Arrival
     due: Scalars
-    """Of each of `_others`, 1 while it is still to happen."""
+    """Of each event that is no impact, 1 while it is still to happen."""
     near: Scalars
     """Of each of those that happen from below, 1 if its guard is at zero too, and it has not
     happened."""

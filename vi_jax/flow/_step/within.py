@@ -3,7 +3,7 @@
 The error of a step is that of its state. A guard that is another function of the state and of `s`
 is no part of it: the force that holds a body at rest, the pull on a body that sticks, the distance
 from a curved stop, a threshold that moves. These guards are evaluated at the stages as well. Their
-integral over the step counts in its error, and `hidden.crest` tells where they may be positive.
+integral over the step counts in its error, and `hidden.crests` tells where they may be positive.
 """
 
 import functools

@@ -107,9 +107,7 @@ def _cumulated(t: Text, p: dict, avals, x: Held, how: Callable) -> Held:
 
 register_reductions(
     LARGE,
-    lambda t, p, avals, x, how, empty: _reduce(
-        t, x, tuple(map(int, p["axes"])), avals[0], how, empty
-    ),
+    lambda t, axes, avals, x, how, empty: _reduce(t, x, axes, avals[0], how, empty),
     _cumulated,
 )
 
