@@ -172,24 +172,3 @@ def test_another_release_that_finishes_a_store_warns(whole, tmp_path):
     with pytest.warns(UserWarning, match=rf"begun by vi_jax 0\.0\.1, and this is {vi.__version__}"):
         found = scanned(path)
     np.testing.assert_array_equal(found.y_min, whole[1]["y_min"])
-
-
-def test_a_store_in_which_machines_are_called_scenes_is_resumed(whole, tmp_path):
-    """As earlier releases wrote them."""
-    path = tmp_path / "store"
-    shutil.copytree(whole[0], path)
-    head = json.loads((path / "zarr.json").read_text())
-    about = head["attributes"]["scan"]
-    about["scene"], about["code of"]["scene"] = (
-        about.pop("machine"),
-        about["code of"].pop("machine"),
-    )
-    (path / "zarr.json").write_text(json.dumps(head))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        found = scanned(path)
-    np.testing.assert_array_equal(found.y_min, whole[1]["y_min"])
-    with pytest.raises(ValueError, match=r"machine stops\.0\.gap is 2\.0, and now it is 2\.1"):
-        scanned(
-            path, vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.1, damping_ratio=0.01)
-        )

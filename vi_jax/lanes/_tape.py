@@ -12,9 +12,8 @@ writes the group's *frame*, and is written by the method of its name:
     step_back   the same through one iteration, and through the rows that were completed in it
     begin_back  the same through `begin`; stores the cotangents of the inputs
 
-Memory is bounded. A tape that is full is thinned: every other entry is dropped, and from then on
-only every second (fourth, …) iteration is kept. On the way back the iterations in between are
-taken again from the entry before them, by the same function, into a second tape, the *window*.
+A full tape is copied into twice the memory, up to `MOST_BYTES` a thread. Beyond that the call ends
+with an error.
 """
 
 from functools import partial

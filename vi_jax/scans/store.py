@@ -282,7 +282,6 @@ def _compare(
             f"Argument `store` must be a new folder or the store of a scan, but {path} is another "
             "Zarr group."
         )
-    there = _in_new_words(there)
     for key in dict.fromkeys([*wanted, *there]):
         old, now = there.get(key), wanted.get(key)
         if old == now:
@@ -300,13 +299,3 @@ def _compare(
                 f"Argument `store` must be new, since it cannot be told whether the {what} is the "
                 f"same as that in {path}: {code}."
             )
-
-
-def _in_new_words(description: Mapping[str, Any]) -> dict[str, Any]:
-    """The description in a store of an earlier release, in which machines were called scenes."""
-    found = {"machine" if key == "scene" else key: x for key, x in description.items()}
-    if isinstance(codes := found.get("code of"), dict):
-        found["code of"] = {"machine" if k == "scene" else k: x for k, x in codes.items()}
-    if found.get("start") == "the scene's own":
-        found["start"] = "the machine's own"
-    return found
