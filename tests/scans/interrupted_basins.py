@@ -30,7 +30,7 @@ def strike(delay, at):
 
 
 basins(1)  # compiles
-for settle, delay in ((4_000, 8.0), (10**8, 1.0)):  # many short blocks, and then one long one
+for settle, delay in ((20_000, 4.0), (10**8, 1.0)):  # many short blocks, and then one long one
     at = []
     threading.Thread(target=strike, args=(delay, at), daemon=True).start()
     try:

@@ -46,6 +46,10 @@ from .special import (
 # pole: a choice.
 _ZERO = 1e-6
 
+# An impact slower than so many times the root of a clearance is the turn that has it: a choice, for
+# accelerations of up to 50.
+_SAME_TURN = 10.0
+
 # Motions that graze are looked at over so many periods: a choice, as in `resonant_grazings`.
 _PERIODS = 3
 
@@ -104,7 +108,10 @@ def _symmetric(problem: Shooting, step: Step) -> bool:
 def _grazes(step: Step) -> int | None:
     """The impact that grazes at the end of a curve; `None` at a touch."""
     approach = np.asarray(step.seen.approach)
-    if approach.size and approach.min() < abs(float(step.seen.nearest.room)):
+    # An impact that is lost comes with a turn near the stop: of a speed v at a distance of about
+    # v². Where a stop is touched the impacts keep their speed.
+    touches = _SAME_TURN * np.sqrt(abs(float(step.seen.nearest.room)))
+    if approach.size and approach.min() < touches:
         return int(np.argmin(approach))
     return None
 
