@@ -1,10 +1,14 @@
 """Derivatives of loops: forward, of several directions with one motion, backward by columns."""
 
+import functools
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from vi_jax import lanes
+from vi_jax.lanes import _backward
 
 from lanes.toys import fall, logistic
 
@@ -72,6 +76,44 @@ def test_derivatives_of_a_step_that_holds(name):
     wanted = jax.jit(jax.jacfwd(plain, (0, 1)))(1.5, 2.5)
     for along in (jax.jacfwd, jax.jacrev):
         np.testing.assert_allclose(jax.jit(along(lane, (0, 1)))(1.5, 2.5), wanted, rtol=1e-15)
+
+
+@jax.custom_jvp
+def drifted(time, place, speed):
+    """Only its derivatives have moved."""
+    return place, speed
+
+
+@drifted.defjvp
+def _(primals, tangents):
+    time, _, speed = primals
+    along = drifted(time, *tangents[1:])  # the derivatives are carried along too
+    return drifted(*primals), (along[0] + tangents[0] * speed, along[1])
+
+
+@pytest.mark.parametrize("most_columns", [0, 9])
+def test_derivatives_of_a_branch_whose_value_has_less_to_do_with_others(monkeypatch, most_columns):
+    """place + time * speed: forward, over a tape, and over columns, up to the third order."""
+    monkeypatch.setattr(_backward, "_BY_COLUMNS", most_columns)
+
+    def lane(x):
+        def step(x, carry):
+            place, speed = jax.lax.cond(
+                x[1] > 0, lambda: drifted(x[0], jnp.ones_like(x[0]), x[1]), lambda: (x[0], x[1])
+            )
+            return place * speed, lanes.Emitted(False, False, None)
+
+        begin = lambda x: (x[0], lanes.Emitted(True, False, None))
+        return lanes.run(begin, step, lambda x, carry: carry, x, rows=0)[0]
+
+    x, weights = jnp.asarray([0.0, 1.5]), jnp.asarray([0.3, 0.7])
+    closed = lambda x: (1 + x[0] * x[1]) * x[1]
+    along = lambda order, f: functools.reduce(
+        lambda f, derivative: lambda x: derivative(f)(x) @ weights, order, f
+    )
+    orders = [*itertools.product((jax.jacfwd, jax.jacrev), repeat=2), (jax.jacfwd,) * 3]
+    for order in (*orders, (jax.jacrev,) * 3):
+        np.testing.assert_allclose(along(order, lane)(x), along(order, closed)(x), rtol=1e-14)
 
 
 @pytest.mark.slow

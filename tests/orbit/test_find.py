@@ -265,6 +265,19 @@ def test_gradients_by_the_implicit_function_theorem():
     np.testing.assert_allclose(slopes, (ahead - behind).T / 2e-5, atol=1e-6)
 
 
+@pytest.mark.slow
+def test_second_derivatives_where_a_body_may_rest():
+    """Its motion meets only the right one of two stops: beside a difference of first ones."""
+
+    def place(gap):
+        scene = vi.Scene.ideal(frequency_ratio=1.0, restitution=0.5, gap=gap, damping_ratio=0.05)
+        return vi.find_orbit(scene, scene.start(Y=0.4476, V=1.9642)).state.Y
+
+    slope, step = jax.jit(jax.grad(place)), 1e-4
+    wanted = (slope(0.5 + step) - slope(0.5 - step)) / (2 * step)
+    np.testing.assert_allclose(jax.grad(slope)(0.5), wanted, rtol=1e-6)
+
+
 def test_says_what_is_wrong():
     for arguments, message in (
         ({"cycles": 0}, "`cycles` must be at least 1"),

@@ -1,5 +1,6 @@
 """The program that carries a lane and its forward derivative along together."""
 
+import dataclasses
 import functools
 from itertools import pairwise
 from typing import Any
@@ -7,7 +8,7 @@ from typing import Any
 import jax
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
-from ._program import DependentParts, LaneProgram, dependent_parts
+from ._program import DependentParts, LaneProgram, Widening, dependent_parts
 from ._quotient import with_quotients
 
 
@@ -23,6 +24,8 @@ def forward(program: LaneProgram, varied: tuple[bool, ...]) -> tuple[LaneProgram
     **Returns:** the program of both; which results, and then which parts of a row, have a
     derivative.
     """
+    if program.widening is not None:
+        return _widened_forward(program, program.widening, varied)
     n = len(program.carry_avals)
     depend = dependent_parts(program, varied, smooth=True)
     both, rows = (*varied, *depend.carry), depend.rows
@@ -38,6 +41,31 @@ def forward(program: LaneProgram, varied: tuple[bool, ...]) -> tuple[LaneProgram
         base=program,
     )
     return derived, (*depend.outs, *rows)
+
+
+def _widened_forward(
+    program: LaneProgram, widening: Widening, varied: tuple[bool, ...]
+) -> tuple[LaneProgram, tuple[bool, ...]]:
+    """What `forward` returns for a widened program: its source is differentiated, then widened.
+
+    JAX cannot do it the other way round: under `jax.vmap` within a branch, a result with its own
+    derivative gets an axis if its value has one, even where its derivative has one too.
+    """
+    source, batched, number, wide = widening
+    derived, has = forward(source, varied)
+    more = (*batched, *(b for b, here in zip(batched, varied, strict=True) if here))
+    outs = len(wide.outs)
+    depend = dependent_parts(derived, more, smooth=False)._replace(
+        outs=_with_its_derivatives(wide.outs, has[:outs]),
+        rows=_with_its_derivatives(wide.rows, has[outs:]),
+    )
+    both = _widened(Widening(derived, more, number, depend))
+    return dataclasses.replace(both, varied=varied, base=program), has
+
+
+def _with_its_derivatives(wide: tuple[bool, ...], has: tuple[bool, ...]) -> tuple[bool, ...]:
+    """A derivative has the axis where its value has it."""
+    return (*wide, *(w for w, here in zip(wide, has, strict=True) if here))
 
 
 def _with_derivatives(
@@ -101,29 +129,30 @@ def widened(
     **Returns:** the widened program, and which of its parts have such an axis.
     """
     depend = dependent_parts(program, batched, smooth=False)
+    return _widened(Widening(program, batched, number, depend)), depend
 
-    def over(closed: ClosedJaxpr, axes: tuple[bool, ...], wide: tuple[bool, ...]) -> ClosedJaxpr:
-        def function(*args):
-            places = [0 if a else None for a in axes]
-            out = jax.vmap(jaxpr_as_fun(closed), places, axis_size=number)(*args)
-            return [x if w else x[0] for x, w in zip(out, wide, strict=True)]
 
+def _widened(widening: Widening) -> LaneProgram:
+    program, batched, number, _ = widening
+
+    def over(name: str) -> ClosedJaxpr:
+        closed, (inputs, results) = getattr(program, name), widening.axes(name)
         shapes = [
-            jax.ShapeDtypeStruct((number, *v.shape) if a else v.shape, v.dtype)
-            for v, a in zip(closed.in_avals, axes, strict=True)
+            jax.ShapeDtypeStruct((number, *v.shape) if wide else v.shape, v.dtype)
+            for v, wide in zip(closed.in_avals, inputs, strict=True)
         ]
-        return jax.make_jaxpr(function)(*shapes)
+        function = jaxpr_as_fun(closed)
+        return jax.make_jaxpr(lambda *args: widening.over(function, args, inputs, results))(*shapes)
 
-    flags = (*depend.carry, False, False, *depend.rows)
     base = program.base
     if base is not None and any(batched[: len(base.in_avals)]):
         base = None
-    wide = LaneProgram(
-        begin=over(program.begin, batched, flags),
-        step=over(program.step, (*batched, *depend.carry), flags),
-        end=over(program.end, (*batched, *depend.carry), depend.outs),
+    return LaneProgram(
+        begin=over("begin"),
+        step=over("step"),
+        end=over("end"),
         rows=program.rows,
         tangents=program.tangents,
         base=base,
+        widening=widening,
     )
-    return wide, depend

@@ -35,6 +35,9 @@ class LaneProgram(eqx.Module):
     base: "LaneProgram | None" = eqx.field(static=True, default=None)
     """Of a program of values and derivatives, that of the values alone. Its inputs come first."""
 
+    widening: "Widening | None" = eqx.field(static=True, default=None)
+    """Of a program that carries several values of some inputs, how it was made."""
+
     __hash__ = object.__hash__
     __eq__ = object.__eq__
 
@@ -107,6 +110,33 @@ class DependentParts(NamedTuple):
     """Whether how long a lane goes on, or which rows it completes, depends on them."""
     rows: tuple[bool, ...]
     outs: tuple[bool, ...]
+
+
+class Widening(NamedTuple):
+    """How a program is made to carry several values of some of its inputs."""
+
+    program: LaneProgram
+    batched: tuple[bool, ...]
+    """Which inputs get a leading axis."""
+    number: int
+    """The length of that axis."""
+    wide: "DependentParts"
+    """Which parts get that axis too."""
+
+    def axes(self, name: str) -> tuple[tuple[bool, ...], tuple[bool, ...]]:
+        """Return which arguments and which results of `begin`, `step` or `end` have the axis."""
+        emitted = (*self.wide.carry, False, False, *self.wide.rows)
+        if name == "begin":
+            return self.batched, emitted
+        return (*self.batched, *self.wide.carry), self.wide.outs if name == "end" else emitted
+
+    def over(
+        self, function: Callable, args: Sequence, inputs: Sequence[bool], results: Sequence[bool]
+    ) -> list[Any]:
+        """Return the results of a function that has the axis in some arguments and results."""
+        places = [0 if wide else None for wide in inputs]
+        out = jax.vmap(function, places, axis_size=self.number)(*args)
+        return [x if wide else x[0] for x, wide in zip(out, results, strict=True)]
 
 
 def dependent_parts(

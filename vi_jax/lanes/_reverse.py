@@ -7,7 +7,7 @@ the way back they are the same bits (`_fixed.py`).
 """
 
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -116,9 +116,9 @@ def reverse(
     try:
         found = ReverseProgram(
             program, varied, given, carried,
-            begin=_both_ways(program.begin, varied, emitted, len(carried) + 2),
-            step=_both_ways(program.step, (*varied, *carried), emitted, len(carried) + 2),
-            end=_both_ways(program.end, (*varied, *carried), outs, 0),
+            begin=_both_ways(program, "begin", varied, emitted, len(carried) + 2),
+            step=_both_ways(program, "step", (*varied, *carried), emitted, len(carried) + 2),
+            end=_both_ways(program, "end", (*varied, *carried), outs, 0),
         )  # fmt: skip
         for jaxpr in found.jaxprs:
             check(jaxpr.jaxpr)
@@ -149,36 +149,34 @@ def _carried(program: LaneProgram, varied, given) -> tuple[bool, ...]:
 
 
 def _both_ways(
-    closed: ClosedJaxpr, varied: Sequence[bool], weighted: Sequence[bool], kept: int
+    program: LaneProgram,
+    name: str,
+    varied: Sequence[bool],
+    weighted: Sequence[bool],
+    kept: int,
 ) -> BothWays:
     """A jaxpr and its transposed derivative.
 
-    **Arguments:** the jaxpr; which arguments are differentiated; which results have a cotangent;
-    how many results are needed on the way there.
+    **Arguments:** the program, and which of its functions; which arguments are differentiated;
+    which results have a cotangent; how many results are needed on the way there.
 
     **Raises:** `NotImplementedError` or `ValueError` if something has no transpose.
     """
-    function = functools.partial(evaluated, with_quotients(closed))
-    number = len(varied)
+    closed, number = getattr(program, name), len(varied)
+    along = _along(program, name, varied, weighted)
 
     def both(*args):
         primals, weights = args[:number], args[number:]
-
-        def of_varied(*changing):
-            some = iter(changing)
-            out = function(*_merged(varied, some, primals))
-            return [x for x, w in zip(out, weighted, strict=True) if w], out
-
         changing = [x for x, v in zip(primals, varied, strict=True) if v]
         values: list[Any] = []
 
-        def along(*tangents):
+        def slopes(*tangents):
             # Not by `jax.vjp`, whose rule for each primitive takes three times as long to trace.
-            _, slopes, out = jax.jvp(of_varied, changing, [*tangents], has_aux=True)
-            values[:] = out
-            return slopes
+            out = along(*primals, *tangents)
+            values[:] = out[: len(closed.out_avals)]
+            return out[len(closed.out_avals) :]
 
-        pullback = jax.linear_transpose(along, *changing)
+        pullback = jax.linear_transpose(slopes, *changing)
         return [*values[:kept], *pullback(list(weights))]
 
     shapes = [shape_of(a) for a in closed.in_avals]
@@ -188,6 +186,34 @@ def _both_ways(
     there = _pruned(whole, [True] * kept + [False] * cotangents)
     back = _pruned(whole, [False] * kept + [True] * cotangents)
     return BothWays(there, with_weights(back, [i >= number for i in range(len(shapes))]))
+
+
+def _along(
+    program: LaneProgram, name: str, varied: Sequence[bool], weighted: Sequence[bool]
+) -> Callable[..., list[Any]]:
+    """A function of a program's arguments and their tangents: its results, and the derivatives of
+    those that are `weighted`. What is widened is differentiated first (see `forward`)."""
+    widening, number = program.widening, len(varied)
+    source = program if widening is None else widening.program
+    function = functools.partial(evaluated, with_quotients(getattr(source, name)))
+
+    def along(*args):
+        primals, tangents = args[:number], args[number:]
+
+        def of_varied(*changing):
+            out = function(*_merged(varied, iter(changing), primals))
+            return [x for x, w in zip(out, weighted, strict=True) if w], out
+
+        changing = [x for x, v in zip(primals, varied, strict=True) if v]
+        _, slopes, out = jax.jvp(of_varied, changing, [*tangents], has_aux=True)
+        return [*out, *slopes]
+
+    if widening is None:
+        return along
+    inputs, results = widening.axes(name)
+    inputs = (*inputs, *(w for w, v in zip(inputs, varied, strict=True) if v))
+    results = (*results, *(w for w, v in zip(results, weighted, strict=True) if v))
+    return lambda *args: widening.over(along, args, inputs, results)
 
 
 def _merged(which: Sequence[bool], some: Iterator, others: Sequence) -> list[Any]:
