@@ -84,7 +84,7 @@ def exact(machine: AbstractMachine, state: State) -> bool:
 # Primitives that are linear in all of their operands together, and in each of them.
 _LINEAR = {
     "add", "add_any", "broadcast_in_dim", "concatenate", "convert_element_type", "copy", "neg",
-    "reduce_sum", "reshape", "slice", "squeeze", "sub", "transpose",
+    "reduce_sum", "reshape", "slice", "squeeze", "stack", "sub", "transpose", "unstack",
 }  # fmt: skip
 _BILINEAR = {"dot_general", "mul"}
 

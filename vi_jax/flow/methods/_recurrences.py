@@ -33,7 +33,7 @@ from ._coefficients import (
 _LINEAR = (
     "neg", "convert_element_type", "stop_gradient", "copy", "copy_p", "pin", "reshape",
     "broadcast_in_dim", "squeeze", "expand_dims", "transpose", "slice", "rev", "reduce_sum",
-    "cumsum", "split", "tile",
+    "cumsum", "split", "tile", "unstack",
 )  # fmt: skip
 
 # What is linear in several operands at once: those in these places, or all; the others are places
