@@ -1,9 +1,8 @@
 # %% [markdown]
 """# Basins of attraction: which start goes where
 
-With little damping (ξ = 0.004) several stable motions compete at one and the same point of the
-parameters. `basins` simulates a grid of starts, finds the motions on the way, without a list of
-them, and says which start settles on which.
+With little damping (ξ = 0.004) several stable motions compete at the same parameters. `basins`
+simulates a grid of starts and finds these motions without a list of them.
 """
 
 # %%

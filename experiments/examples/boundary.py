@@ -1,9 +1,8 @@
 # %% [markdown]
 """# Boundaries in two parameters
 
-Where does the 2π motion lose its stability, over frequency ratio ζ and restitution k? A period
-doubling found on a branch is followed in the second parameter, and so is the grazing at which the
-4π motion ends.
+A period doubling of the 2π motion is followed over frequency ratio ζ and restitution k, and so is
+the grazing at which the 4π motion ends.
 """
 
 # %%

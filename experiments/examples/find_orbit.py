@@ -2,8 +2,8 @@
 """# Find periodic motions, stable or not
 
 `find_orbit` solves for a motion that repeats. At the paper's point (ζ = 0.9, k = 0.5, no damping)
-there are two: the 2π motion, which no simulation keeps to because one of its Floquet multipliers
-lies outside the unit circle, and the stable 4π motion.
+there are two: the stable 4π motion, and the 2π motion with a Floquet multiplier outside the unit
+circle.
 """
 
 # %%

@@ -1,7 +1,7 @@
 # %% [markdown]
 """# Fit restitution, damping and gap to a noisy record
 
-Gauss and Newton's method, with derivatives through the impacts, which give standard errors too.
+The Gauss–Newton method, with derivatives through the impacts, gives estimates and standard errors.
 """
 
 # %%

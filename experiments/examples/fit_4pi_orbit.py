@@ -1,9 +1,8 @@
 # %% [markdown]
 """# Initial conditions without a transient, fitted with optax
 
-From rest the machine needs some thirty cycles to settle on the stable motion of period 4π. Started
-at the right state it is there at once. Adam minimises what is missing after two cycles, with
-gradients through the impacts; Newton's method needs five steps for the same state.
+Started at the right state, the machine moves in its stable 4π motion at once. Adam minimises the
+change over two cycles, with gradients through the impacts; Newton's method needs five steps.
 """
 
 # %%

@@ -1,9 +1,9 @@
 # %% [markdown]
 """# What a grazing leads to
 
-A strongly damped oscillator is shaken, x'' + 10.1 x' + x = cos ωt, and a stop comes nearer until it
-is just touched. Beyond, the slower multiplier of the motion without impact decides: here it is 0.5,
-and windows of motions with one impact in n cycles follow each other, with chaos between.
+A strongly damped oscillator, x'' + 10.1 x' + x = cos ωt, touches a stop that comes nearer. The
+slower multiplier of the motion without impact is 0.5. So windows of motions with one impact in n
+cycles follow, with chaos between.
 """
 
 # %%

@@ -1,10 +1,10 @@
 # %% [markdown]
 """# How safe is a motion: the erosion of basins
 
-A stable motion is of little use if small kicks end it. Over the frequency ratio ζ each motion is
-drawn with the share of the starts that settle on it, and with the largest ball of starts around it
-that all do: the kick that it survives. Where a motion without impact appears (ζ = 1.22) the other
-one still gets nearly all starts, but survives only half the kick; at ζ = 1.56 its basin is gone.
+Each motion is drawn over the frequency ratio ζ with its share of the starts, and with the radius of
+the largest ball of starts around it that all return. At ζ = 1.22 a motion without impact appears:
+the other one keeps nearly all starts, but survives only half the kick. At ζ = 1.56 its basin is
+gone.
 """
 
 # %%

@@ -1,10 +1,9 @@
 # %% [markdown]
 """# How hard may a motion be kicked?
 
-Two motions of period 4π are stable at one and the same point of the parameters. Their multipliers
-say how fast a small disturbance dies, `minimal_kick` how large one may be: the arrows are the
-smallest kicks after which the machine settles on the other motion. They end on the boundary of the
-basins, on which the motion goes to a saddle, the edge state.
+Two motions of period 4π are stable at the same parameters. Multipliers give the decay of a small
+perturbation, `minimal_kick` the size of the smallest one after which the machine settles on the
+other motion (arrows). It ends on the boundary of the basins.
 """
 
 # %%

@@ -1,9 +1,9 @@
 # %% [markdown]
 """# How long does a motion last where everything shakes?
 
-White noise ends the stable 4π motion with one impact sooner or later: the machine goes over to that
-with two impacts. To the left is where 1,024 runs are on sections, while one after the other leaves;
-to the right is how soon they do. A third less noise makes the motion last many times longer.
+White noise ends the stable 4π motion with one impact sooner or later, and the machine settles on
+that with two impacts. Left: 1,024 runs on sections. Right: the time until they leave. A third less
+noise makes the motion last many times longer.
 """
 
 # %%

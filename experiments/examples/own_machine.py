@@ -2,7 +2,7 @@
 """# Your own machine
 
 A pendulum leans against a wall, its pivot is shaken up and down, and a second wall limits its
-swing. The class below is all that is needed: stops, a cycle, a field and a start.
+swing. The class defines stops, a cycle, a field and a start.
 """
 
 # %%

@@ -1,8 +1,8 @@
 # %% [markdown]
 """# A map of the regimes of motion
 
-`scan` simulates every combination of values on the axes, here 96 × 64 machines from rest, and says
-of each on what it settled: a period, in drive cycles of 2π, or chaos.
+`scan` simulates all combinations of the values on the axes, here 96 × 64 machines from rest, and
+classifies each final motion: a period, in drive cycles of 2π, or chaos.
 """
 
 # %%

@@ -1,8 +1,8 @@
 # %% [markdown]
 """# Simulate a machine and look at its motion
 
-The machine of the paper's Table 1: a motor turns a crank, the crank shakes a body on a spring,
-and the body hits a stop. It starts at rest; after 200 drive cycles two of them are drawn.
+The machine of the paper's Table 1: a motor turns a crank, the crank shakes a body on a spring, and
+the body hits a stop. It starts at rest; the last two of 200 drive cycles are drawn.
 """
 
 # %%

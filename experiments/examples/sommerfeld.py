@@ -1,9 +1,9 @@
 # %% [markdown]
 """# A weak motor hangs at resonance: the Sommerfeld effect
 
-A motor of limited power shakes a body that is out of reach of its stop. Its control κ is raised
-little by little and lowered again. Near resonance (ζ = 1) the body takes up what the motor gives:
-the crank speed ζ hardly rises with κ, then jumps. On the way down it jumps elsewhere.
+A motor of limited power shakes a body that does not reach its stop. Near resonance (ζ = 1) the body
+takes up the motor's power: the speed ζ hardly rises with the control κ, then jumps. On the way down
+it jumps elsewhere.
 """
 
 # %%

@@ -18,21 +18,20 @@ SCRIPTS = sorted(path for path in HERE.glob("*.py") if not path.name.startswith(
 # In the order of the page: what most people know first.
 ORDER = (
     "siconos_balls", "matlab_balls", "contact_gradients", "heyoka_ramp", "heyoka_sensitivity",
-    "coco_grazing", "coco_stick_slip", "pwsdde_pair", "mpgos_valve", "siconos_woodpecker",
-    "siconos_friction", "bstab_belt", "duffing_basins", "walker", "siconos_chain", "siconos_bar",
+    "coco_grazing", "coco_stick_slip", "pwsdde_pair", "mpgos_valve", "siconos_friction",
+    "bstab_belt", "duffing_basins", "walker", "siconos_chain", "siconos_bar",
 )  # fmt: skip
 
 BEGIN = """# Validated against other codes
 
-What vi_jax gives for published examples of other codes and authors. Each section is a script of at
-most sixty lines in [`experiments/validated`](../experiments/validated). The tests run all of them
-and compare every number below with what comes out.
+This page compares vi_jax with published examples of other codes. Each section is a script of at
+most sixty lines in [`experiments/validated`](../experiments/validated); the tests run all of them
+and compare every number below.
 
-*Theirs* is written with the digits that were published. *How* says where these come from: printed
-in a documentation, a program or the reference file of a test, known in closed form, or computed
-from their equations by an independent integrator. Where they are not right to their last digit, it
-says how far off they are. The time is that of a processor (an Intel Xeon's core) for the script,
-compilation included.
+*Theirs* is written with the digits that were published. *How* is their origin: printed in a
+documentation, a program or the reference file of a test, known in closed form, or computed from
+their equations by an independent integrator. Times are those of a core of an Intel Xeon, with
+compilation. The [woodpecker toy](../experiments/studies/woodpecker.md) of Siconos is a study.
 """
 
 

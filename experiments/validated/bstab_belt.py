@@ -1,8 +1,8 @@
 # %% [markdown]
 """# A block on a belt, and how many starts come to rest
 
-A block on a spring rubs on a belt of speed v. Either it comes to rest on the sliding belt, or it
-sticks and slips for ever: which share of the starts in [-2, 2] × [0, 2] does the first?
+A block on a spring on a belt of speed v either comes to rest on the sliding belt, or sticks and
+slips for ever. The share of the starts in [-2, 2] × [0, 2] that come to rest:
 """
 
 # %%

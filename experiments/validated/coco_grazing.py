@@ -1,8 +1,8 @@
 # %% [markdown]
 """# An oscillator that grazes its wall
 
-x'' + 0.1 x' + x = A cos ωt before a wall at x = 1. The motion without impact just touches the wall
-where A² = (1 - ω²)² + (0.1 ω)²: at A = 0.1 for ω = 1.
+x'' + 0.1 x' + x = A cos ωt, with a wall at x = 1. The motion without impact touches the wall at
+A² = (1 - ω²)² + (0.1 ω)².
 """
 
 # %%

@@ -1,8 +1,8 @@
 # %% [markdown]
 """# An impactor that makes what it hits slide
 
-A body on a spring is drawn by a voltage and hits a base at q = 0.5. A blow makes the base slide, a
-mode with another field, until friction holds it.
+A voltage draws a body on a spring to a base at q = 0.5. An impact makes the base slide, until
+friction holds it.
 """
 
 # %%

@@ -1,9 +1,9 @@
 # %% [markdown]
 """# The derivative of a bounce
 
-A ball flies at a floor without gravity and bounces without loss: raised by 1 cm at the start, it
-ends 1 cm lower, since it arrives later. Simulators that step over the contact give +1, or a jump.
-With gravity and e = 0.8 the derivatives of the height at T = 1 s are known in closed form as well.
+Without gravity or loss, a ball raised by 1 cm at the start ends 1 cm lower, since it arrives later.
+Simulators that step over the contact give +1, or a jump. The second case has gravity, e = 0.8 and
+T = 1 s.
 """
 
 # %%
@@ -47,14 +47,14 @@ comparison = Comparison(
     "Brax, MuJoCo MJX, DiffTaichi",
     "https://github.com/google/brax/issues/317, https://github.com/google-deepmind/mujoco/issues/"
     "2841; Y. Hu and others, DiffTaichi, ICLR 2020 (time of impact)",
-    "in closed form, which is what the reports ask for",
+    "in closed form",
     [
-        ("no gravity, by the height: forward", "-1", jax.jacfwd(ends)(*flies)),
+        ("no gravity, with respect to the height: forward", "-1", jax.jacfwd(ends)(*flies)),
         ("backward", "-1", jax.grad(ends)(*flies)),
-        ("with gravity, by the height", f"{by_height:.12f}", jax.grad(ends)(*drops)),
+        ("with gravity", f"{by_height:.12f}", jax.grad(ends)(*drops)),
         ("the same by differences of runs", f"{by_height:.12f}", apart, 1e-8),  # h² and 1e-14/h
         ("second derivative", f"{again:.12f}", jax.jacfwd(jax.jacfwd(ends))(*drops)),
-        ("by the restitution", f"{v - v**2 / g:.12f}", jax.grad(ends, 1)(*drops)),
+        ("with respect to the restitution", f"{v - v**2 / g:.12f}", jax.grad(ends, 1)(*drops)),
     ],
 )
 print(comparison)

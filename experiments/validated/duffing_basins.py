@@ -2,7 +2,7 @@
 """# Two Duffing oscillators, and the shares of their basins
 
 x'' + 0.15 x' - x + x³ = 0.2 cos t has a motion in each of its two wells; x'' + 0.08 x' + x³ = 0.2
-cos t has five motions that compete. `vi.basins` finds them on the way, without a list of them.
+cos t has five competing motions. `vi.basins` finds them without a list.
 """
 
 # %%
@@ -41,8 +41,8 @@ comparison = Comparison(
     "Attractors.jl; bSTAB, pyBasin",
     "https://github.com/JuliaDynamics/Attractors.jl, `test/mapping/attractor_mapping.jl`; "
     "https://github.com/TUHH-DYN/bSTAB and https://github.com/adrianwix/pyBasin, `duffing`",
-    "printed in the test and in pyBasin's results, bSTAB's beside them; right to three standard "
-    "errors of their random starts: 0.05 of the first oscillator, 0.015 of the second",
+    "printed in the test, and in pyBasin's results with bSTAB's; right to three standard errors of "
+    "their random starts: 0.05 for the first oscillator, 0.015 for the second",
     [
         ("two wells: motions", "2", len(two)),
         ("share of the left one", "0.488", two[0][2], within(0.488, 1000)),

@@ -1,8 +1,8 @@
 # %% [markdown]
 """# A ball on a wavy ramp
 
-A ball bounces ten times down a ramp, y = 1 - x + 0.05 cos 11πx, and then along the ground, losing
-speed (e = 0.8), until two impacts follow each other within 1e-6.
+A ball (e = 0.8) bounces ten times down a ramp, y = 1 - x + 0.05 cos 11πx, and then along the
+ground, until two impacts follow within 1e-6.
 """
 
 # %%

@@ -1,8 +1,8 @@
 # %% [markdown]
 """# How the time of an event changes
 
-A mass on a spring of stiffness k is pushed off with speed 1. How does the time at which it first
-turns change with k, and how a misfit (x - 10.123)² of the place where it turns?
+A mass on a spring of stiffness k starts with speed 1. The derivatives of the time of its first turn
+and of a misfit (x - 10.123)² there.
 """
 
 # %%
@@ -43,15 +43,15 @@ def turn(stiffness):
 comparison = Comparison(
     "heyoka.py",
     "https://bluescarni.github.io/heyoka.py, Computing event sensitivity",
-    "printed in its documentation, where variational equations are written by hand",
+    "printed in its documentation",
     [
         (
-            "derivative of the time by k, k = 0.456",
+            "derivative of the time with respect to k, k = 0.456",
             "-2.5506015388296643",
             jax.grad(lambda k: turn(k)[0])(0.456),
         ),
         (
-            "derivative of the misfit by k, k = 7.23",
+            "derivative of the misfit with respect to k, k = 7.23",
             "0.5015866697490922",
             jax.grad(lambda k: turn(k)[1])(7.23),
         ),

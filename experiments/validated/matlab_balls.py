@@ -1,9 +1,8 @@
 # %% [markdown]
 """# Two bouncing balls
 
-`ballode` throws a ball up at 20 m/s and lists ten bounces (e = 0.9). Simulink's bouncing ball
-(15 m/s from 10 m, e = 0.8) has infinitely many impacts in a finite time, at which its solver may
-stop with an error; here the ball comes to rest.
+`ballode` throws a ball up at 20 m/s (e = 0.9). Simulink's ball (15 m/s from 10 m, e = 0.8) has
+infinitely many impacts in finite time, where its solver may stop; here it comes to rest.
 """
 
 # %%

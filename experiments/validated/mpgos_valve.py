@@ -1,9 +1,8 @@
 # %% [markdown]
 """# A relief valve
 
-The sixth tutorial of MPGOS scans a pressure relief valve over its flow rate q. Above a Hopf
-bifurcation the valve stands open; below it hums, and at less flow chatters on its seat. The whole
-picture is the study `relief_valve`, from which the bifurcation is taken.
+The valve stands open above a Hopf bifurcation of its flow rate q, hums below it, and chatters on
+its seat at small q. The bifurcation is taken from the study `relief_valve`.
 """
 
 # %%

@@ -1,8 +1,8 @@
 # %% [markdown]
 """# Two masses, cubic springs and two stops
 
-A mass on a cubic spring is shaken; a smaller one hangs on it by another and hits both ends of its
-play. At ω = 1.5 its motion is symmetric, with one impact on each side; it ends in other ways too.
+A forced mass on a cubic spring carries a smaller mass, which hits both ends of its play. At ω = 1.5
+the motion is symmetric, with one impact on each side.
 """
 
 # %%

@@ -1,8 +1,8 @@
 # %% [markdown]
 """# A ball that bounces, and one between floor and ceiling
 
-Two event-driven examples: a ball that drops on the floor (g = 9.81, e = 0.9), and one that is
-thrown at a ceiling (g = 10, e = 0.8) and comes to rest on the floor after infinitely many impacts.
+A ball drops on a floor (g = 9.81, e = 0.9). Another is thrown at a ceiling (g = 10, e = 0.8) and
+comes to rest on the floor after infinitely many impacts.
 """
 
 # %%

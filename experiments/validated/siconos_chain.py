@@ -1,8 +1,8 @@
 # %% [markdown]
 """# Ten balls in a row, by Hertz's law
 
-A ball at 1 m/s strikes nine equal ones that touch. No ball is rigid here: each pair pushes with
-K δ^(3/2). How they part does not depend on the stiffness of steel, so that it is 1 here.
+A ball at 1 m/s strikes nine equal ones that touch. Each pair pushes with K δ^(3/2). The final
+speeds do not depend on K, which is 1 here.
 """
 
 # %%

@@ -1,8 +1,8 @@
 # %% [markdown]
 """# A block that rubs and stops
 
-x'' = -x with Coulomb's friction of level 1, from x = 12 with x' = 6: it turns eight times, each
-time 2 nearer, and sticks where the spring no longer moves it.
+x'' = -x with Coulomb friction of level 1, from x = 12 with x' = 6. The block turns eight times,
+each time 2 nearer, and sticks.
 """
 
 # %%

@@ -1,8 +1,8 @@
 # %% [markdown]
 """# The simplest walking model
 
-Two rigid legs, a mass at the hip and feet without mass walk down a slope of 0.009 rad by their
-weight alone. There are two gaits, of which that with long steps is stable.
+Two rigid legs with a mass at the hip walk down a slope of 0.009 rad. There are two gaits; that with
+long steps is stable.
 """
 
 # %%

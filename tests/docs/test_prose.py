@@ -6,11 +6,7 @@ from pathlib import Path
 import pytest
 
 DOCS = Path(__file__).parents[2] / "docs"
-NAMES = """theory faq concepts limits capabilities performance index
-howto/orbits howto/robustness howto/noise howto/scans howto/large howto/methods howto/hardware
-howto/export howto/fit howto/cluster"""
-FOLDERS = sorted([*DOCS.glob("coming_from/*.md"), *DOCS.glob("internals/*.md")])
-PAGES = [DOCS / f"{name}.md" for name in NAMES.split()] + FOLDERS
+PAGES = sorted({*DOCS.rglob("*.md")} - {DOCS / "howto" / "own_machine.md"})
 WIDTH = 76
 CODE = re.compile(r"^```\w*\n(.*?)^```$", re.M | re.S)
 FORMULA = re.compile(r"\$\$.*?\$\$|\$[^$]*\$|`[^`]*`", re.S)

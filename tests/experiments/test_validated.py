@@ -13,7 +13,7 @@ from gallery_page import rows, sections
 # The quickest of them; the others run with the slow tests.
 QUICK = {
     "siconos_balls", "matlab_balls", "heyoka_ramp", "heyoka_sensitivity", "coco_stick_slip",
-    "siconos_friction", "siconos_chain", "siconos_woodpecker",
+    "siconos_friction", "siconos_chain",
 }  # fmt: skip
 
 
