@@ -2,6 +2,7 @@
 
 import functools
 import sys
+import threading
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -43,6 +44,55 @@ def silent(done: int) -> None:
     """Show nothing."""
 
 
+# Not empty: an interrupt was dropped in the package's call under way.
+_dropped: list[bool] = []
+
+
+@contextmanager
+def interrupts_heard() -> Iterator[None]:
+    """Raise an interrupt that Python drops within this context, at its end at the latest, or one
+    that it dropped before within an outer one.
+
+    An exception in a callback of the garbage collector is printed and dropped, and JAX has such a
+    callback. Others that Python drops are shown as before.
+    """
+    if threading.current_thread() is not threading.main_thread():  # no other gets interrupts
+        yield
+        return
+    raise_dropped()
+    before = sys.unraisablehook
+
+    def noted(unraisable: Any, /) -> None:
+        if issubclass(unraisable.exc_type, KeyboardInterrupt):
+            _dropped.append(True)
+        else:
+            before(unraisable)
+
+    sys.unraisablehook = noted
+    try:
+        yield
+        raise_dropped()
+    except Exception:  # such as that of lanes that were ended
+        raise_dropped()
+        raise
+    finally:
+        sys.unraisablehook = before
+        if getattr(before, "__module__", None) != __name__:  # the outermost context
+            _dropped.clear()
+
+
+def raise_dropped() -> None:
+    """Raise the `KeyboardInterrupt` that Python dropped, if there is one."""
+    if interrupt_dropped():
+        _dropped.clear()
+        raise KeyboardInterrupt
+
+
+def interrupt_dropped() -> bool:
+    """Whether Python dropped an interrupt that `raise_dropped` has not raised yet."""
+    return bool(_dropped)
+
+
 @contextmanager
 def at_work(
     what: str,
@@ -55,7 +105,8 @@ def at_work(
 ) -> Iterator[Tell]:
     """Show a progress bar during a long part of a function, and keep its results on Ctrl-C.
 
-    Gives a function that is called with the units that were done.
+    Gives a function that is called with the units that were done. It also raises an interrupt that
+    Python dropped.
 
     **Arguments:** `what`, the word before the bar; `kept`, called on Ctrl-C, returns an
     `Interrupted` with what was computed, or `None` if there is nothing to keep yet; `progress`,
@@ -64,12 +115,17 @@ def at_work(
 
     **Raises:** what `kept` returns, on Ctrl-C; else the `KeyboardInterrupt` itself.
     """
+
+    def tell(done: int) -> None:
+        bar.update(done)
+        raise_dropped()
+
     try:
-        with tqdm(
+        with interrupts_heard(), tqdm(
             desc=what, total=total, initial=done, unit=f" {unit}", unit_scale=True,
             disable=None if progress else True,
         ) as bar:  # fmt: skip
-            yield bar.update
+            yield tell
     except KeyboardInterrupt:
         interrupted = kept()
         if interrupted is None:
@@ -88,13 +144,15 @@ _SKIPPED = {
 
 
 def warning_once(function: Callable[P, R]) -> Callable[P, R]:
-    """Decorator: within one call each warning is given once, however often JAX traces."""
+    """Decorator: within one call each warning is given once, however often JAX traces, and no
+    interrupt is lost."""
 
     @functools.wraps(function)
     def called(*args: P.args, **kwargs: P.kwargs) -> R:
         token = _GIVEN.set(set()) if _GIVEN.get() is None else None
         try:
-            return function(*args, **kwargs)
+            with interrupts_heard():
+                return function(*args, **kwargs)
         finally:
             if token is not None:
                 _GIVEN.reset(token)

@@ -19,6 +19,7 @@ import jax
 import jax.tree_util as jtu
 from jax.core import Tracer
 
+from ._messages import interrupts_heard
 from .lanes import Unsupported, current_backend, vector_only
 
 # With these XLA compiles two to three times faster. What runs for long is in the lanes, whose code
@@ -138,7 +139,14 @@ class CompiledFunction:
                 getattr(cached, "clear_cache", jax.clear_caches)()
 
     def __call__(self, *arguments: Any, **keywords: Any) -> Any:
-        """What the function returns, by its compiled program."""
+        """What the function returns, by its compiled program.
+
+        **Raises:** `KeyboardInterrupt` also for an interrupt that Python dropped meanwhile.
+        """
+        with interrupts_heard():
+            return self._called(arguments, keywords)
+
+    def _called(self, arguments: tuple, keywords: dict[str, Any]) -> Any:
         _watch.called(self)
         kind = _kind_of(arguments, keywords)
         quick = kind not in self._never_quick and current_backend() != "xla"

@@ -1,5 +1,8 @@
 """Ctrl-C ends lanes wherever they run, and lanes that were not run are no success."""
 
+import functools
+import gc
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -9,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
+from vi_jax._messages import at_work
 from vi_jax.lanes import runtime
 
 SCENE = vi.Scene.ideal(frequency_ratio=0.9)
@@ -49,6 +53,54 @@ def test_lanes_that_were_not_run_are_no_success(monkeypatch):
     )
     with pytest.raises(Exception, match="interrupted before all of them had ended"):
         np.asarray(lanes(starts))
+
+
+class Collected(vi.AbstractMachine):
+    """The garbage collector runs where its field is asked."""
+
+    cycle: float = 1.0
+    stops: tuple = ()
+
+    def field(self, s, state):
+        gc.collect()
+        return vi.OscillatorState(state.V, -state.Y)
+
+    def start(self):
+        return vi.OscillatorState(jnp.asarray(1.0), jnp.asarray(0.0))
+
+
+@pytest.fixture
+def pressed():
+    """Ctrl-C within the next callback of the garbage collector, where Python drops it."""
+    waiting = []
+
+    def callback(phase, _):
+        if waiting:
+            waiting.clear()
+            signal.raise_signal(signal.SIGINT)
+
+    gc.callbacks.append(callback)
+    yield lambda: waiting.append(True)
+    gc.callbacks.remove(callback)
+
+
+def test_no_interrupt_within_the_garbage_collector_is_lost(pressed):
+    """It ends a function before its program runs, where it tells what was done, and lanes."""
+    hook = sys.unraisablehook
+    motion = jax.jit(lambda settle: vi.simulate(SCENE, SCENE.start(), 1, settle=settle).last.Y)
+    motion(1)
+    pressed()
+    with pytest.raises(KeyboardInterrupt):
+        vi.simulate(Collected(), Collected().start(), 1, settle=10**8)
+    for more in (None, lambda: motion(10**8).block_until_ready()):
+        kept = functools.partial(vi.Interrupted, "work", 7)
+        with pytest.raises(vi.Interrupted) as caught, at_work("", kept, progress=False) as tell:
+            tell(1)
+            pressed()
+            gc.collect()
+            (more or functools.partial(tell, 1))()
+        assert caught.value.partial == 7
+    assert sys.unraisablehook is hook
 
 
 def _printed(script, *arguments):

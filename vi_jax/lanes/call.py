@@ -17,6 +17,7 @@ from ctypes import POINTER, Structure, c_char_p, c_int, c_int32, c_int64, c_size
 import jax
 import numpy as np
 
+from .._messages import interrupt_dropped
 from ._driver import OUT_OF_MEMORY
 from ._interrupts import SUCCESS, HandlerResult, guard, interrupt_raises, watch
 from ._recent import made_once
@@ -146,12 +147,14 @@ def _handler(frame, out):
 def _answer_without_exceptions(frame: _Frame, out: HandlerResult) -> int | None:
     """What `_answer` gives, its exceptions as errors of XLA's, since none may pass through XLA."""
     try:
-        if out.lost:
+        if out.lost or interrupt_dropped():
             raise KeyboardInterrupt
         return _answer(frame)
     except KeyboardInterrupt:
         _abandon(frame)
-        if threading.current_thread() is threading.main_thread() and interrupt_raises():
+        in_main = threading.current_thread() is threading.main_thread()
+        # One that was dropped is raised by the call under way, when it gets XLA's error.
+        if in_main and interrupt_raises() and not interrupt_dropped():
             out.signal = signal.SIGINT
         return _error(frame, INTERRUPTED, _CANCELLED)
     except BaseException as error:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._checks import count, given_number
-from .._messages import Interrupted, so_many, warning_once
+from .._messages import Interrupted, at_work, so_many, warning_once
 from .._types import State, xr
 from ..flow import MethodLike, in_names, machine_of, tidy
 from ..machine import AbstractMachine, components, with_leaf, with_units
@@ -204,16 +204,15 @@ def all_orbits(
     def so_far() -> AllOrbits:
         return _sorted_out(machine, batches, tolerance, ranges)
 
-    try:
+    def kept() -> Interrupted | None:
+        return Interrupted("search for periodic motions", so_far()) if batches else None
+
+    with at_work("all orbits", kept, progress=False):
         for n, row in enumerate(rows, 1):
             options = {"root_finder": root_finder, "method": method}
             found = find_orbit(machine, _guesses(begin, row), n, **options)
             batches.append(jax.block_until_ready(found))
         return so_far()
-    except KeyboardInterrupt:
-        if not batches:
-            raise
-        raise Interrupted("search for periodic motions", so_far()) from None
 
 
 def _guesses(begin: State, row: Mapping[str, np.ndarray]) -> State:
