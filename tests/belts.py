@@ -1,6 +1,5 @@
 """A body on a belt whose friction falls with the speed of sliding, for several packages' tests."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,18 +15,10 @@ class Belt(vi.AbstractMachine):
     furthest back."""
 
     speed: jax.Array | float = 1.5
-    stops: tuple = ()
 
     @property
-    def switches(self):
-        return (
-            vi.DryFriction(
-                level,
-                velocity=lambda machine, x: x.V - machine.speed,
-                force=pull,
-                stopped=lambda machine, x: eqx.tree_at(lambda x: x.V, x, machine.speed),
-            ),
-        )
+    def contacts(self):
+        return vi.DryFriction(level, on="V", slip=lambda x: x.V - self.speed)
 
     @property
     def cycle(self):
@@ -36,14 +27,8 @@ class Belt(vi.AbstractMachine):
     def section(self, state):
         return state.V
 
-    def field(self, s, x, mode):
-        return vi.OscillatorState(
-            x.V, pull(self, s, x) + self.switches[0].contribution(self, s, x, mode)
-        )
-
-
-def pull(machine, s, x):
-    return -x.Y - 0.1 * x.V
+    def field(self, s, x):
+        return vi.OscillatorState(x.V, -x.Y - 0.1 * x.V)
 
 
 class Observed(Belt):

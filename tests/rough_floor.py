@@ -8,7 +8,6 @@ import numpy as np
 import vi_jax as vi
 from scipy.integrate import solve_ivp
 
-from rubbing import friction
 
 SINCE = 0.3  # of the drive's phase on the section
 
@@ -20,7 +19,6 @@ class Rough(vi.AbstractMachine):
     level: Any = 0.3
     second: Any = 0.0
     damping: Any = 0.0
-    stops: tuple = ()
 
     @property
     def cycle(self):
@@ -31,12 +29,11 @@ class Rough(vi.AbstractMachine):
         return drive - x.Y - self.damping * x.V
 
     @property
-    def switches(self):
-        return (friction(self.level, type(self).pull, name="floor"),)
+    def contacts(self):
+        return vi.DryFriction(self.level, on="V", mass=self.omega, name="floor")
 
-    def field(self, s, x, mode):
-        rate = self.pull(s, x) + self.switches[0].contribution(self, s, x, mode)
-        return vi.OscillatorState(x.V / self.omega, rate / self.omega)
+    def field(self, s, x):
+        return vi.OscillatorState(x.V / self.omega, self.pull(s, x) / self.omega)
 
     def step_limit(self, s, x):
         return 0.4 * np.pi * jnp.minimum(1.0, self.omega)

@@ -41,6 +41,7 @@ from .machine import DryFriction as DryFriction
 from .machine import HuntCrossley as HuntCrossley
 from .machine import HybridState as HybridState
 from .machine import IdealDrive as IdealDrive
+from .machine import Mechanical as Mechanical
 from .machine import Motor as Motor
 from .machine import MotorState as MotorState
 from .machine import Oscillator as Oscillator
@@ -52,6 +53,7 @@ from .machine import RigidStop as RigidStop
 from .machine import Scene as Scene
 from .machine import SliderCrank as SliderCrank
 from .machine import SoftStop as SoftStop
+from .machine import State as State
 from .machine import Switch as Switch
 from .machine import TimedDCMotorState as TimedDCMotorState
 from .machine import TimedMotorState as TimedMotorState

@@ -23,20 +23,15 @@ jax.config.update("jax_enable_x64", True)
 # %% x'' = -x - 0.1 x' + friction
 class Belt(vi.AbstractMachine):
     speed: jax.Array | float
-    stops: tuple = ()
-    cycle: float = 100.0
-    switches: tuple = (
-        vi.DryFriction(
-            lambda speed: 0.5 + 0.5 * jnp.exp(-2 * speed),
-            velocity=lambda belt, state: state.V - belt.speed,
-            force=lambda belt, s, state: -state.Y - 0.1 * state.V,
-            stopped=lambda belt, state: vi.OscillatorState(state.Y, belt.speed),
-        ),
-    )
+    cycle = 100.0
 
-    def field(self, s, state, mode):
-        friction = self.switches[0].contribution(self, s, state, mode)
-        return vi.OscillatorState(state.V, -state.Y - 0.1 * state.V + friction)
+    @property
+    def contacts(self):
+        level = lambda speed: 0.5 + 0.5 * jnp.exp(-2 * speed)
+        return vi.DryFriction(level, on="V", slip=lambda z: z.V - self.speed)
+
+    def field(self, s, z):
+        return dict(Y=z.V, V=-z.Y - 0.1 * z.V)
 
 
 def rests(speed, Y, V):  # as they judge it: it moves by less than ±0.2 from t = 400 to 500

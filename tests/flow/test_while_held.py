@@ -11,7 +11,6 @@ import vi_jax as vi
 from scipy.optimize import brentq
 from scipy.special import erf
 
-from rubbing import friction
 
 WAVES = (1, 2, 3, 5, 7)
 STILL = vi.OscillatorState(jnp.array(0.0), jnp.array(0.0))
@@ -107,7 +106,6 @@ class Pushed(vi.AbstractMachine):
     place: Any = 0.0
     width: Any = 1.0
     steady: Any = 0.0
-    stops: tuple = ()
 
     def push(self, s):
         waves = sum(
@@ -119,7 +117,7 @@ class Pushed(vi.AbstractMachine):
 
 
 class Floor(Pushed):
-    stops: tuple = (vi.RigidStop(0.0, 0.5, "left"),)
+    contacts = vi.RigidStop(0.0, 0.5, "left")
 
     def field(self, s, x):
         return vi.OscillatorState(x.V, self.push(s))
@@ -129,16 +127,12 @@ class Block(Pushed):
     level: float = 0.5
     stiffness: Any = 0.0
 
-    def pull(self, s, x):
-        return self.push(s) - self.stiffness * x.Y
-
     @property
-    def switches(self):
-        return (friction(self.level, type(self).pull),)
+    def contacts(self):
+        return vi.DryFriction(self.level, on="V")
 
-    def field(self, s, x, mode):
-        force = self.pull(s, x) + self.switches[0].contribution(self, s, x, mode)
-        return vi.OscillatorState(x.V, force)
+    def field(self, s, x):
+        return vi.OscillatorState(x.V, self.push(s) - self.stiffness * x.Y)
 
 
 def pushes(steady, count=20, seed=3):

@@ -26,13 +26,13 @@ class Books(eqx.Module):
 
 
 def on_a_belt(machine):
-    """Friction of a machine that has a `pull`, on a floor that moves at its `speed`."""
+    """Friction on a floor that moves at the machine's `speed`, by phase."""
     return vi.DryFriction(
         machine.level,
         static_ratio=machine.ratio,
-        velocity=lambda machine, x: x.V - machine.speed,
-        force=lambda machine, s, x: machine.pull(s, x),
-        stopped=lambda machine, x: eqx.tree_at(lambda x: x.V, x, machine.speed),
+        on="V",
+        mass=machine.frequency,
+        slip=lambda x: x.V - machine.speed,
     )
 
 
@@ -44,24 +44,20 @@ class Rubbing(vi.AbstractMachine):
     level: jax.Array
     ratio: jax.Array
     speed: jax.Array = eqx.field(default=0.0, converter=jnp.asarray)
-    stops: tuple = ()
+    books: bool = eqx.field(default=True, static=True)
 
     @property
-    def switches(self):
-        return (on_a_belt(self),)
+    def contacts(self):
+        return on_a_belt(self)
 
     @property
     def cycle(self):
         return 2 * np.pi
 
-    def pull(self, s, x):
-        return self.amplitude * jnp.cos(s) - x.Y
-
-    def field(self, s, x, mode):
-        pull = self.pull(s, x)
-        rub = self.switches[0].contribution(self, s, x, mode)
-        slides = jnp.where(mode == 0, 0.0, self.level * mode)
-        rates = Books(x.V, pull + rub, self.amplitude * jnp.cos(s) * x.V, slides * x.V)
+    def field(self, s, x):
+        drive = self.amplitude * jnp.cos(s)
+        heat = self.level * jnp.abs(x.V) if self.books else 0.0 * x.V
+        rates = Books(x.V, drive - x.Y, drive * x.V, heat)
         return jax.tree.map(lambda rate: rate / self.frequency, rates)
 
     def step_limit(self, s, x):
@@ -69,8 +65,9 @@ class Rubbing(vi.AbstractMachine):
 
 
 def rubbing(numbers, Y, cycles, **options):
-    zero = jnp.zeros_like(Y)
-    return vi.simulate(Rubbing(*numbers), Books(Y, zero, zero, zero), cycles, **options)
+    zero, smooth = jnp.zeros_like(Y), isinstance(options.get("method"), vi.Taylor)
+    machine = Rubbing(*numbers, books=not smooth)  # |x'| has no series
+    return vi.simulate(machine, Books(Y, zero, zero, zero), cycles, **options)
 
 
 def stops_in_a_cycle(V):
@@ -173,11 +170,11 @@ class OnABelt(vi.AbstractMachine):
     speed: jax.Array
     level: jax.Array
     ratio: jax.Array
-    stops: tuple = ()
+    frequency: float = 1.0
 
     @property
-    def switches(self):
-        return (on_a_belt(self),)
+    def contacts(self):
+        return on_a_belt(self)
 
     @property
     def cycle(self):
@@ -186,12 +183,9 @@ class OnABelt(vi.AbstractMachine):
     def section(self, state):
         return state.Y - self.level
 
-    def pull(self, s, x):
-        return -x.Y
-
-    def field(self, s, x, mode):
-        zero, pull = jnp.zeros_like(s), self.pull(s, x)
-        return Books(x.V, pull + self.switches[0].contribution(self, s, x, mode), zero, zero)
+    def field(self, s, x):
+        zero = jnp.zeros_like(s)
+        return Books(x.V, -x.Y, zero, zero)
 
 
 @pytest.mark.parametrize("method", [CLOSE, vi.FixedStep(steps_per_cycle=64), vi.Taylor()],
@@ -227,12 +221,7 @@ def test_derivatives_through_sticking():
 )  # fmt: skip
 def test_wrong_numbers_are_named(arguments, told):
     with pytest.raises(ValueError, match=told):
-        vi.DryFriction(
-            **{"level": 1.0, **arguments},
-            velocity=lambda machine, x: x.V,
-            force=lambda machine, s, x: -x.Y,
-            stopped=lambda machine, x: x,
-        )
+        vi.DryFriction(**{"level": 1.0, **arguments}, on="V")
 
 
 def falling(speed):

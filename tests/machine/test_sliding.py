@@ -113,15 +113,16 @@ class Driven(Rubbing):
     dry: bool = eqx.field(static=True, default=False)
 
     @property
-    def switches(self):
-        return super().switches if self.dry else (vi.Switch(speed, slides=True),)
+    def contacts(self):
+        return vi.DryFriction(self.level, on="V", mass=0.3) if self.dry else ()
 
-    def field(self, s, z, mode):
-        rates = super().field(s, z, mode) if self.dry else self.slid(s, z, mode)
-        return jax.tree.map(lambda rate: rate / 0.3, rates)
+    @property
+    def events(self):
+        return () if self.dry else vi.Switch(speed, slides=True)
 
-    def slid(self, s, z, mode):
-        return vi.OscillatorState(z.V, drive(self, s, z) - self.level * mode)
+    def field(self, s, z, mode=0.0):
+        pull = drive(self, s, z) - self.level * mode
+        return vi.OscillatorState(z.V / 0.3, pull / 0.3)
 
 
 @pytest.mark.slow

@@ -18,17 +18,8 @@ class Belted(Rough):
     belt: Any = 2.0
 
     @property
-    def switches(self):
-        return (
-            vi.DryFriction(
-                self.level,
-                velocity=lambda machine, x: x.V - machine.belt,
-                force=lambda machine, s, x: machine.pull(s, x),
-                stopped=lambda machine, x: vi.OscillatorState(
-                    x.Y, machine.belt * jnp.ones_like(x.V)
-                ),
-            ),
-        )
+    def contacts(self):
+        return vi.DryFriction(self.level, on="V", mass=self.omega, slip=lambda x: x.V - self.belt)
 
 
 def test_grazing_sliding_of_a_linear_motion():

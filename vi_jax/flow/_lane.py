@@ -260,7 +260,7 @@ class Plan(eqx.Module):
         """Whether steps end on every turning point, for extremes, and since switches and events may
         be there; or only on those close to a stop. A flag where that depends on how many intervals
         are done, else known while the program is traced."""
-        if self.machine.switches or self.machine.events:
+        if self.machine.switches or self.machine.others:
             return True
         return (done >= self.settle) if self.motion else False
 

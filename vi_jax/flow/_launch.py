@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 
 from .._types import Flag, Scalar, State
-from ..machine import begin_modes, rubs, struck_modes
+from ..machine import begin_modes, holds_anywhere, rubs, struck_modes
 from . import results
 from ._lane import Lane, Plan, to_event, total
 from ._own import check_field, check_laws
@@ -51,7 +51,7 @@ def launched(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
             at = machine.coordinates[stop.coordinate].placed(start, stop.place, zero)
             rests = contact[stop.coordinate] == to_event(i)
             start = jtu.tree_map(lambda a, b, rests=rests: jnp.where(rests, a, b), at, start)
-        if rubs(machine):
+        if rubs(machine) or (machine.stops and holds_anywhere(machine)):
             modes = struck_modes(machine, s, start, modes, contact=contact)
     length = zero + jax.lax.stop_gradient(machine.cycle) / plan.method.steps_per_cycle
     if plan.method.adaptive:

@@ -16,7 +16,14 @@ from jax.core import Tracer
 
 from .._messages import warn
 from .._types import Scalar, Scalars, State
-from ..machine import AbstractMachine, begin_modes, is_autonomous
+from ..machine import (
+    AbstractMachine,
+    begin_modes,
+    field_in,
+    is_autonomous,
+    like,
+    shown_modes,
+)
 from ._by_numpy import by_numpy
 
 _NO_NUMBERS = (
@@ -34,10 +41,16 @@ def check_field(machine: AbstractMachine, s: Scalar, state: State, modes: Scalar
     """**Raises:** `TypeError` for a field (or a section) that cannot be traced, takes other
     arguments or returns no state; while the loop is traced, and at no cost where it runs."""
     whose = f"`field` of a {type(machine).__name__}"
+    modes = shown_modes(machine, modes)
     _check_arguments(machine, whose, s, state, modes)
+
+    def asked(s, state, *modes):
+        found = machine.field(s, state, *modes)
+        return None if found is None else like(state, found, whose)
+
     try:
         with in_words_of(whose):
-            flow = jax.eval_shape(machine.field, s, state, *modes)
+            flow = jax.eval_shape(asked, s, state, *modes)
     except (AttributeError, TypeError, LookupError):
         if _runs(machine.field, state, s, *modes):
             raise TypeError(
@@ -84,7 +97,7 @@ def _check_arguments(
     try:
         inspect.signature(machine.field).bind(s, state, *modes)
     except TypeError as error:
-        more = f" and the mode of each of its {len(modes)} switches" if modes else ""
+        more = f" and {len(modes)} modes (of its switches, and its own)" if modes else ""
         raise TypeError(f"{whose} must take `s`, the state{more}: {error}.") from None
 
 
@@ -169,7 +182,7 @@ def _ends(machine: AbstractMachine, start: State) -> tuple[Scalar, list[Any], li
     zero = jnp.zeros_like(machine.position(start))
     modes = begin_modes(machine, zero, start)
     cycle = zero + machine.cycle
-    first, last = (machine.field(s, start, *modes) for s in (zero, cycle))
+    first, last = (field_in(machine, s, start, modes) for s in (zero, cycle))
     return cycle, jtu.tree_leaves(first), jtu.tree_leaves(last)
 
 

@@ -22,11 +22,11 @@ def check_guards(machine: AbstractMachine, start: State) -> None:
     tell; machines whose numbers are traced are not looked at, nor are ours."""
     kind, leaves = type(machine), jtu.tree_leaves((machine, start))
     ours = kind.__module__.partition(".")[0] == __name__.partition(".")[0]
-    if ours or not machine.events or any(isinstance(x, Tracer) for x in leaves):
+    if ours or not machine.others or any(isinstance(x, Tracer) for x in leaves):
         return
     try:
         cycle, *modes = by_numpy(_begins, machine, start)
-        risen = [True] * len(machine.events)
+        risen = [True] * len(machine.others)
         for s, state, now in _around(cycle, start, modes):
             values = by_numpy(_guards, machine, s, state, tuple(now))
             risen = [up and not x < 0 for up, x in zip(risen, values, strict=True)]
@@ -35,7 +35,7 @@ def check_guards(machine: AbstractMachine, start: State) -> None:
     except Exception:  # said in words where the guard is traced
         return
     for i in np.flatnonzero(risen):
-        _warn_of_guard(kind, int(i), machine.events[i].name or type(machine.events[i]).__name__)
+        _warn_of_guard(kind, int(i), machine.others[i].name or type(machine.others[i]).__name__)
 
 
 def _begins(machine: AbstractMachine, start: State) -> list[Scalar]:

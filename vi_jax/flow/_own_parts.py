@@ -21,13 +21,15 @@ from ..machine import (
     RigidStop,
     event_of,
     events_of,
+    listed,
 )
 from ._own import in_short, in_words_of, rows_of
 
 _KINDS = {
+    "contacts": (AbstractEvent, "contacts: `RigidStop`s, `SoftStop`s and `DryFriction`s"),
     "stops": (RigidStop, "`RigidStop`s"),
     "switches": (AbstractSwitch, "`AbstractSwitch`es, as `SoftStop` and `DryFriction` are"),
-    "events": (AbstractEvent, "`AbstractEvent`s, as `Reset` is"),
+    "events": (AbstractEvent, "`AbstractEvent`s, as `Reset` and `Switch` are"),
 }
 
 
@@ -36,7 +38,7 @@ def check_parts(machine: AbstractMachine) -> None:
     before anything is traced."""
     name = type(machine).__name__
     for what, (kind, words) in _KINDS.items():
-        parts = getattr(machine, what)
+        parts = listed(getattr(machine, what))
         if not isinstance(parts, tuple) or not all(isinstance(part, kind) for part in parts):
             raise TypeError(f"`{what}` of a {name} must be a tuple of {words}, but is {parts!r}.")
     if callable(machine.cycle):

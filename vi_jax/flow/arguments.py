@@ -24,7 +24,16 @@ from .._checks import (
 )
 from .._messages import warn
 from .._types import Machine, State
-from ..machine import AbstractMachine, Scene, bare, begin_modes, is_autonomous, modes_of
+from ..machine import (
+    AbstractMachine,
+    Scene,
+    bare,
+    begin_modes,
+    field_in,
+    is_autonomous,
+    mode_values,
+    modes_of,
+)
 from ._lane import Plan
 from ._own import check_period as check_period
 from ._own_guards import check_guards
@@ -105,7 +114,7 @@ def _own_modes(machine: AbstractMachine, start: State, own: Any, dtype: Any) -> 
     them. **Raises:** `ValueError` unless they are as many as the machine's."""
     if own is None:
         return None
-    wanted = jax.eval_shape(lambda x: machine.begin(jnp.zeros((), dtype), x), start)
+    wanted = jax.eval_shape(lambda x: mode_values(machine.begin(jnp.zeros((), dtype), x)), start)
     if len(own) != len(wanted) or any(jnp.shape(mode) for mode in own):
         raise ValueError(
             f"Argument `start` must have {len(wanted)} modes, one number each, as many as `begin` "
@@ -206,7 +215,7 @@ def _check_flow(argument: str, machine: AbstractMachine, state: State) -> None:
     """**Raises:** `TypeError` for what is no state, where only the field says what one is."""
     try:
         jax.eval_shape(
-            lambda s, x: machine.field(s, x, *begin_modes(machine, s, x)), jnp.zeros(()), state
+            lambda s, x: field_in(machine, s, x, begin_modes(machine, s, x)), jnp.zeros(()), state
         )
     except (AttributeError, TypeError, ValueError, LookupError) as error:
         raise TypeError(

@@ -176,7 +176,7 @@ def _check_machine(machine: AbstractMachine, start: State) -> None:
             "whose cycles end with its drive's; shake one that an event ends at equal intervals, "
             "as `machine.observed_every(interval)`"
         )
-    elif machine.events:
+    elif machine.others:
         what = "without resets and other events that its velocities may pass in a jump"
     if what is not None:
         raise ValueError(

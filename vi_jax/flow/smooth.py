@@ -12,7 +12,7 @@ from jax.lax import stop_gradient
 
 from .._types import Flag, Scalar, Scalars, State
 from ..lanes import called
-from ..machine import AbstractMachine, Coordinate, field_in, held_flow, rubs
+from ..machine import AbstractMachine, Coordinate, field_in, held_flow, holds_anywhere, rubs
 
 
 class SmoothMachine(eqx.Module):
@@ -27,13 +27,14 @@ class SmoothMachine(eqx.Module):
     def field(self, s: Scalar, state: State) -> State:
         """d(state)/ds, without motion of a body that is held."""
         machine = self.machine
-        flow = field_in(machine, s, state, self.modes)
-        if not self.contact:
+        flow, dry = field_in(machine, s, state, self.modes), holds_anywhere(machine)
+        if not self.contact and not dry:
             return flow
-        limited = sorted({stop.coordinate for stop in machine.stops})
-        if len(limited) > 1 or rubs(machine):
-            return held_flow(machine, flow, s, state, self.modes, self.contact)[0]
-        for k in limited:
+        limited = sorted({stop.coordinate for stop in machine.stops}) if self.contact else []
+        several = len(limited) > 1 or rubs(machine)
+        if several or dry:
+            flow = held_flow(machine, flow, s, state, self.modes, self.contact)[0]
+        for k in () if several else limited:  # without rounding where one body rests
             still, rests = _held_still(machine.coordinates[k], state, flow), self.contact[k] > 0
             flow = jtu.tree_map(lambda a, b, rests=rests: jnp.where(rests, a, b), still, flow)
         return flow

@@ -2,6 +2,7 @@
 
 from ._primitive import vector_only as vector_only
 from ._program import called as called
+from ._program import dependent_results as dependent_results
 from ._vector import Unsupported as Unsupported
 from .call import interruptible as interruptible
 from .elementary import horner as horner

@@ -1,8 +1,9 @@
 """What is modelled: parameters, crank, drive, stops, and the scene that composes them."""
 
 from .base import AbstractMachine as AbstractMachine
-from .base import Coordinate as Coordinate
 from .base import Prepared as Prepared
+from .base import has_own_modes as has_own_modes
+from .base import names_coordinates as names_coordinates
 from .base import renews as renews
 from .contact_friction import ContactFriction as ContactFriction
 from .contacts import added as added
@@ -12,6 +13,7 @@ from .contacts import held_flow as held_flow
 from .contacts import push_of as push_of
 from .contacts import rubbed as rubbed
 from .contacts import shares as shares
+from .coordinate import Coordinate as Coordinate
 from .crank import AbstractCrank as AbstractCrank
 from .crank import CosineCrank as CosineCrank
 from .crank import SliderCrank as SliderCrank
@@ -26,9 +28,11 @@ from .events import event_of as event_of
 from .events import events_of as events_of
 from .events import guard_of as guard_of
 from .events import happens_at as happens_at
+from .events import holds_anywhere as holds_anywhere
 from .events import is_autonomous as is_autonomous
 from .events import jump_of as jump_of
 from .events import mode_number as mode_number
+from .events import mode_values as mode_values
 from .events import own_modes as own_modes
 from .events import rubbing_on as rubbing_on
 from .events import rubs as rubs
@@ -36,6 +40,8 @@ from .events import section_number as section_number
 from .events import sides_of as sides_of
 from .events import struck_modes as struck_modes
 from .events import value_of as value_of
+from .field import field_in as field_in
+from .field import shown_modes as shown_modes
 from .friction import DryFriction as DryFriction
 from .hybrid_state import HybridState as HybridState
 from .hybrid_state import bare as bare
@@ -49,6 +55,7 @@ from .law import HuntCrossley as HuntCrossley
 from .law import PowerLaw as PowerLaw
 from .linear import LinearMachine as LinearMachine
 from .linear import StructureState as StructureState
+from .mechanical import Mechanical as Mechanical
 from .modal import ModalMachine as ModalMachine
 from .modal import Modes as Modes
 from .motor import Motor as Motor
@@ -68,6 +75,7 @@ from .own import by_default as by_default
 from .own import changed as changed
 from .own import is_own as is_own
 from .parameters import Parameters as Parameters
+from .parts import listed as listed
 from .reset import Reset as Reset
 from .scene import Oscillator as Oscillator
 from .scene import Scene as Scene
@@ -77,6 +85,8 @@ from .shown import Summarized as Summarized
 from .shown import number_in_words as number_in_words
 from .shown import summary_table as summary_table
 from .soft import SoftStop as SoftStop
+from .state import State as State
+from .state import like as like
 from .states import UNITS as UNITS
 from .states import DCMotorState as DCMotorState
 from .states import MotorState as MotorState
@@ -85,7 +95,6 @@ from .states import TimedDCMotorState as TimedDCMotorState
 from .states import TimedMotorState as TimedMotorState
 from .stop import RigidStop as RigidStop
 from .switch import Switch as Switch
-from .switch import field_in as field_in
 from .trig import horner as horner
 from .trig import sincos as sincos
 from .units import PLAIN as PLAIN

@@ -1,7 +1,7 @@
 """What every verb asks of a machine. A class of your own with these few methods runs like ours."""
 
 import abc
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -11,28 +11,20 @@ import jax.tree_util as jtu
 from .._checks import in_range
 from .._types import Flag, Scalar, State
 from .clocks import Clocked
+from .coordinate import Coordinate
 from .event import AbstractEvent, AbstractSwitch
 from .observing import Observed
-from .own import by_default, is_own
+from .own import by_default, derived, is_own, says
+from .parts import (
+    coordinate_by_name,
+    coordinates_in,
+    listed,
+    other_events,
+    stops_in,
+    switches_in,
+)
 from .stop import RigidStop
 from .words import Worded
-
-
-class Coordinate(NamedTuple):
-    """A coordinate that stops limit."""
-
-    position: Callable[[State], Scalar]
-    velocity: Callable[[State], Scalar]
-    """What an impact reverses; of the sign of d(position)/ds."""
-    placed: Callable[[State, Any, Any], State]
-    """A state with another position and velocity, and with all that an impact changes besides."""
-    mass: Any = 1.0
-    """What an impact acts on, in the machine's unit of mass: of two bodies the reduced mass. A
-    number, or a function `mass(s, state)`."""
-
-    def mass_at(self, s: Scalar, state: State) -> Any:
-        """The mass in a state."""
-        return self.mass(s, state) if callable(self.mass) else self.mass
 
 
 class Prepared(NamedTuple):
@@ -45,7 +37,6 @@ class Prepared(NamedTuple):
 
 # What a machine must say, and how.
 _MUST_SAY = {
-    "stops": "write `stops: tuple = ()` in the class, if there are none",
     "cycle": "write `cycle: float = …` in the class, its length in `s`, or a property",
     "field": "write `def field(self, s, state)`, which returns the rate of each part of the state",
 }
@@ -128,8 +119,6 @@ class AbstractMachine(Clocked, Observed, Worded):
     Ready machines, each written in this way, are in `vi_jax.machines`.
     """
 
-    stops: eqx.AbstractVar[tuple[RigidStop, ...]]
-
     def __new__(cls, *args: Any, **kwargs: Any):
         missing = {*cls.__abstractmethods__, *getattr(cls, "__abstractvars__", ())}
         if missing:
@@ -145,29 +134,50 @@ class AbstractMachine(Clocked, Observed, Worded):
         With `switches`, or modes of its own, it is `field(s, state, mode, ...)`, which gets them.
         """
 
-    @property
-    def switches(self) -> tuple[AbstractSwitch, ...]:
-        """Where the field changes without an impact."""
+    @derived
+    def contacts(self) -> Any:
+        """Rigid and soft stops, dry friction: a tuple, or one of them."""
         return ()
 
-    @property
-    def events(self) -> tuple[AbstractEvent, ...]:
-        """Events of other kinds: resets (`Reset`), and kinds of one's own."""
+    @derived
+    def events(self) -> Any:
+        """Switches, resets, and kinds of events of its own: a tuple, or one of them."""
         return ()
+
+    @derived
+    def modes(self) -> Mapping[str, float]:
+        """The modes of its own, by name, in which a motion begins; its field gets them behind the
+        state, and events change them."""
+        return {}
+
+    @derived
+    def stops(self) -> tuple[RigidStop, ...]:
+        """The rigid stops among the contacts."""
+        return stops_in(self)
+
+    @derived
+    def switches(self) -> tuple[AbstractSwitch, ...]:
+        """The contacts that are no rigid stops, and the switches among the events."""
+        return switches_in(self)
+
+    @property
+    def others(self) -> tuple[AbstractEvent, ...]:
+        """The events that are no switches."""
+        return other_events(self)
 
     @by_default
-    def begin(self, s: Scalar, state: State) -> tuple[Any, ...]:
+    def begin(self, s: Scalar, state: State) -> Any:
         """The machine's own modes in a motion that begins in `state`: numbers that its field gets
-        behind the state and behind the modes of its switches, and that events change. A start that
-        is a `HybridState`, as `Run.last` is, has its own instead."""
-        return ()
+        behind the state, and that events change; by default what `modes` of the class says. A start
+        that is a `HybridState`, as `Run.last` is, has its own instead."""
+        return tuple(self.modes.values())
 
     def observed_every(self, interval: Any) -> "AbstractMachine":
         """An autonomous machine observed at equal intervals of `s` instead of on its section."""
         name = type(self).__name__
         what = "a `section`"
         if not is_own(type(self).section):
-            if not any(x.ends_cycle for x in (*self.stops, *self.switches, *self.events)):
+            if not any(x.ends_cycle for x in (*self.stops, *self.switches, *self.others)):
                 raise ValueError(f"A {name} is driven: its cycle is its drive's.")
             what = "an event that ends its cycles"
         raise ValueError(
@@ -176,21 +186,30 @@ class AbstractMachine(Clocked, Observed, Worded):
             "that ends a cycle (and without a `renewed` that belongs to the section)."
         )
 
-    @property
-    @by_default
+    @derived
     def coordinates(self) -> tuple[Coordinate, ...]:
-        """The coordinates that stops limit, by number as `RigidStop.coordinate` names them;
-        extremes are recorded of the first. By default one, the machine's `position`, `velocity` and
-        `placed`."""
+        """The coordinates that contacts act on, by number as `RigidStop.coordinate` names them;
+        extremes are recorded of the first. By default those that contacts name by `on`, and where
+        none does one, the machine's `position`, `velocity` and `placed`."""
+        return coordinates_in(self)
+
+    def coordinate_on(self, on: Any, mass: Any = None) -> Coordinate:
+        """The coordinate that a contact names by its `on`; of a contact that names none the
+        machine's own.
+
+        **Arguments:** `mass`, what acts there, 1 if it is `None`.
+        """
+        if on is not None:
+            return coordinate_by_name(on, mass)
         methods = ("position", "velocity", "placed")
         own = {name: getattr(self, name) for name in methods if is_own(getattr(type(self), name))}
-        return (_plain(self)._replace(**own),)
+        return _plain(self)._replace(mass=1.0 if mass is None else mass, **own)
 
     @property
     def _first(self) -> Coordinate:
         """What `position`, `velocity` and `placed` are where the machine does not say it by them:
         the first of its own `coordinates`, if it has some."""
-        return self.coordinates[0] if is_own(type(self).coordinates) else _plain(self)
+        return self.coordinates[0] if names_coordinates(self) else _plain(self)
 
     @by_default
     def position(self, state: State) -> Scalar:
@@ -211,7 +230,7 @@ class AbstractMachine(Clocked, Observed, Worded):
 
     def has_velocity(self, state: State) -> bool:
         """Whether `velocity` is one; it need not be where there is nothing to meet."""
-        own = is_own(type(self).velocity) or is_own(type(self).coordinates)
+        own = is_own(type(self).velocity) or names_coordinates(self)
         return own or bool(self.stops) or hasattr(state, "V")
 
     def start(self) -> State:
@@ -251,6 +270,19 @@ class AbstractMachine(Clocked, Observed, Worded):
     def check_start(self, start: State) -> None:
         """Raise a `ValueError` if the concrete `start` cannot be simulated (stops apart)."""
         return None
+
+
+def names_coordinates(machine: AbstractMachine) -> bool:
+    """Whether a machine has coordinates of its own, or contacts that name some."""
+    if says(machine, "coordinates"):
+        return True
+    contacts = listed(machine.contacts)
+    return any(getattr(x, "on", None) is not None for x in contacts if not x.holds_mode or not x.is_dry)
+
+
+def has_own_modes(machine: AbstractMachine) -> bool:
+    """Whether a machine has modes of its own."""
+    return bool(machine.modes) or is_own(type(machine).begin)
 
 
 def renews(machine: AbstractMachine) -> bool:

@@ -11,8 +11,9 @@ from jaxtyping import Array, Float
 
 from .._checks import NOT_NEGATIVE, SHARE, count, real, require_ranges
 from .._types import Flag, Machine, Scalar, State
-from .contacts import added, forces, held_flow, push_of, shares
+from .contacts import added, forces, gained, held_flow, push_of, shares
 from .event import AbstractSwitch, Around
+from .field import field_in
 
 
 class ContactFriction(AbstractSwitch):
@@ -123,6 +124,29 @@ class ContactFriction(AbstractSwitch):
             return jnp.zeros((), bool)
         return around.contact[machine.stops[self.stop].coordinate] == 1.0 + self.stop
 
+    def way(self, machine: Machine, s: Scalar, state: State) -> Scalar:
+        """The sign of the velocity along the stop; zero where that is rounding."""
+        return self._slip(machine, state)
+
+    def slip_rate(self, machine: Machine, s: Scalar, state: State, flow: State) -> Scalar:
+        """d/ds of the velocity along the stop, along a flow."""
+        return gained(machine.coordinates[self.along], state, flow)
+
+    def held(self, machine, s, state, contact, found):
+        """The force that holds a body, the largest that can, the mass that it acts on, and whether
+        the body rests on the stop.
+
+        **Arguments:** `contact` as in `Around`; `found`, of `held_flow`.
+        """
+        force, pressing = found
+        here = contact[machine.stops[self.stop].coordinate] == 1.0 + self.stop
+        mass = machine.coordinates[self.along].mass_at(s, state)
+        return force, self.level * pressing, mass, here
+
+    def pushed(self, machine, s, state, mode, flow):
+        """The flow as it is: the force is found with that which presses on the stop."""
+        return flow
+
     def _slip(self, machine: Machine, state: State) -> Scalar:
         """The sign of the velocity along the stop; zero where that is rounding."""
         velocity = machine.coordinates[self.along].velocity(state)
@@ -155,5 +179,5 @@ class ContactFriction(AbstractSwitch):
         **Arguments:** `around`, the other modes and who rests where; `mode`, that of this friction.
         """
         modes = around.instead(mode)
-        flow = machine.field(s, state, *modes)
+        flow = field_in(machine, s, state, modes)
         return held_flow(machine, flow, s, state, modes, around.contact)[1][around.own]

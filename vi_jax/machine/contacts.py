@@ -133,7 +133,8 @@ def _slipping(gains: list[list[Scalar]], wanted: Scalar, ratio: Scalar) -> tuple
 
 class Held(NamedTuple):
     """What holds the bodies that rest: a row for each coordinate that stops limit, in their order,
-    then one for each friction on a stop, in the order of the switches."""
+    then one for each friction on a stop, then one for each other friction, in the order of the
+    switches."""
 
     coordinates: list[Any]
     """Whose velocity is held; of a friction that along the stop."""
@@ -142,8 +143,12 @@ class Held(NamedTuple):
     acts: list[Flag]
     """Whether it holds; a friction holds while the body sticks."""
     rubbing: list[tuple[int, Any, int, Scalar]]
-    """Of each friction its place among the switches, itself, the row of its stop, and how much of
-    its own push goes with one of the stop's."""
+    """Of each friction on a stop its place among the switches, itself, the row of its stop, and how
+    much of its own push goes with one of the stop's."""
+    first: int
+    """The row of the first friction."""
+    dry: list[tuple[int, Any, Scalar]]
+    """Of each other friction its place among the switches, itself, and the mass that it acts on."""
 
 
 def held_by(
@@ -151,19 +156,21 @@ def held_by(
 ) -> Held:
     """What holds the bodies that rest on stops.
 
-    **Arguments:** `modes`, those of the machine's switches first; `contact` as in `Around`.
+    **Arguments:** `modes`, those of the machine's switches first; `contact` as in `Around`, empty
+    where nothing is known to rest.
     """
-    limited = sorted({stop.coordinate for stop in machine.stops})
-    bodies = [machine.coordinates[k] for k in limited]
+    limited = sorted({stop.coordinate for stop in machine.stops}) if contact else []
+    coordinates = machine.coordinates if limited else ()
+    bodies = [coordinates[k] for k in limited]
     pushes, acts = [push_of(body, state) for body in bodies], [contact[k] > 0 for k in limited]
     rubbing = []
     for i, friction in enumerate(machine.switches):
-        if friction.rubs_on is None:
+        if friction.rubs_on is None or not contact:
             continue
         stop = machine.stops[friction.rubs_on]
         at = limited.index(stop.coordinate)
         here = contact[stop.coordinate] == 1.0 + friction.rubs_on
-        along, body = machine.coordinates[friction.along], bodies[at]
+        along, body = coordinates[friction.along], bodies[at]
         drag = push_of(along, state)
         # The stop pushes a body away from it, and friction against the way it slips.
         ratio = body.mass_at(s, state) / along.mass_at(s, state)
@@ -173,7 +180,25 @@ def held_by(
         bodies, pushes = [*bodies, along], [*pushes, drag]
         acts = [*acts, here & (modes[i] == 0)]
         rubbing.append((i, friction, at, slips))
-    return Held(bodies, pushes, acts, rubbing)
+    return Held(bodies, pushes, acts, rubbing, len(limited), [])
+
+
+def with_dry_friction(
+    held: Held, machine: Any, s: Scalar, state: State, modes: Sequence[Scalar]
+) -> Held:
+    """The same with a row for each friction that may hold a body wherever it is. It is no part of
+    an impact: its forces are finite.
+
+    **Arguments:** as `held_by`.
+    """
+    for i, friction in enumerate(machine.switches):
+        if friction.is_dry:
+            push, mass = friction.row(machine, s, state)
+            held.coordinates.append(friction.as_velocity(machine, s))
+            held.pushes.append(push)
+            held.acts.append(modes[i] == 0)
+            held.dry.append((i, friction, mass))
+    return held
 
 
 def held_flow(
@@ -186,14 +211,22 @@ def held_flow(
 
     **Arguments:** `modes`, those of the machine's switches first; `contact` as in `Around`.
 
-    **Returns:** the rate, and of each friction on a stop, by its place among the switches, the
-    force along the stop and that which presses on it.
+    **Returns:** the rate, and of each friction, by its place among the switches, the force along
+    the surface and that which presses on it, or the mass that it acts on.
     """
-    held = held_by(machine, s, state, modes, contact)
+    held = with_dry_friction(
+        held_by(machine, s, state, modes, contact), machine, s, state, modes
+    )
     wanted = [-gained(body, state, flow) for body in held.coordinates]
+    rows = len(held.coordinates) - len(held.dry)
+    for row, (_, friction, _) in enumerate(held.dry, start=rows):
+        wanted[row] = -friction.slip_rate(machine, s, state, flow)
     amounts = forces(shares(held.coordinates, state, held.pushes), held.acts, wanted)
-    found, first = {}, len(held.coordinates) - len(held.rubbing)
-    for row, (i, friction, at, _) in enumerate(held.rubbing, start=first):
+    pace, found = machine.pace(s, state), {}
+    for row, (i, _, mass) in enumerate(held.dry, start=rows):
+        force = amounts[row] * mass
+        found[i] = force if pace is None else force / pace, mass
+    for row, (i, friction, at, _) in enumerate(held.rubbing, start=held.first):
         along, body = held.coordinates[row], held.coordinates[at]
         pressing = -machine.stops[friction.rubs_on].sign * amounts[at] * body.mass_at(s, state)
         found[i] = amounts[row] * along.mass_at(s, state), pressing

@@ -131,10 +131,19 @@ class AbstractSwitch(AbstractEvent):
 
     word: ClassVar = "switch"
 
+    acts: bool = eqx.field(static=True, kw_only=True, default=False, repr=False)
+    """Whether it adds its own force to the machine's field, which gets no mode of it then: so does
+    each one that is listed in `contacts`; static."""
+
     @property
     def holds_mode(self) -> bool:
         """True: each switch has a mode of its own."""
         return True
+
+    @property
+    def is_dry(self) -> bool:
+        """Whether it is friction that may hold a body wherever that is."""
+        return False
 
     @property
     def from_below(self) -> bool:
@@ -181,6 +190,12 @@ class AbstractSwitch(AbstractEvent):
         """Whether in mode 0 the field is the mean of those of modes -1 and +1 that stays on the
         surface where they meet (see `Switch`)."""
         return False
+
+    def pushed(
+        self, machine: Machine, s: Scalar, state: State, mode: Scalar, flow: State
+    ) -> State:
+        """The machine's flow with what the switch adds to it, of one that `acts`."""
+        raise NotImplementedError(f"A {type(self).__name__} adds nothing by itself.")
 
     def contribution(self, machine: Machine, s: Scalar, state: State, mode: Scalar) -> Any:
         """What the switch adds to the machine's field in this mode, where it knows that: a soft

@@ -1,6 +1,6 @@
 """The events of a machine by their numbers: their guards, what happens then, and its modes."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -9,12 +9,13 @@ from jax.lax import stop_gradient
 from .._types import Machine, Scalar, Scalars, State
 from .contacts import rubbed
 from .event import AbstractEvent, Around, Modes, Section
+from .friction import chosen_together, frictions_in
 
 
 def events_of(machine: Machine) -> tuple[AbstractEvent, ...]:
     """All events of a machine, in the order in which they are numbered: its stops, its switches,
     its other events, its section."""
-    return (*machine.stops, *machine.switches, *machine.events, Section())
+    return (*machine.stops, *machine.switches, *machine.others, Section())
 
 
 def is_autonomous(machine: Machine, state: State) -> bool:
@@ -90,6 +91,9 @@ def after_event(
     new, changed = event.after(machine, s, state, *modes[own], **more)
     if event.holds_mode:
         changed = (*modes[: own.start], changed, *modes[own.stop :])
+        if getattr(event, "is_dry", False) and len(frictions_in(machine)) > 1:
+            changed, held = settled_modes(changed, s), modes[own.start] == 0
+            changed = chosen_together(machine, s, new, changed, contact, (own.start, held))
     return _rubbed(machine, number, s, state, new), settled_modes(changed, s)
 
 
@@ -142,7 +146,7 @@ def begin_modes(
     """The modes of a motion that begins in `state`: those that events hold, in their order, then
     the machine's own, which are `own` where that is given."""
     held = [event for event in events_of(machine) if event.holds_mode]
-    own = machine.begin(s, state) if own is None else own
+    own = mode_values(machine.begin(s, state)) if own is None else own
     modes = [*(event.begin(machine, s, state) for event in held), *own]
     modes = settled_modes(modes, s)
     if any(event.sees_around for event in held):  # which looks at the other modes
@@ -169,7 +173,22 @@ def struck_modes(
             _, place, more = event_of(machine, number, modes, contact)
             held.append(event.struck(machine, s, state, *modes[place], **more))
     kept = modes[len(held) :] if own is None else own
-    return settled_modes([*held, *kept], s)
+    modes = settled_modes([*held, *kept], s)
+    if holds_anywhere(machine) and len(frictions_in(machine)) > 1:
+        modes = settled_modes(chosen_together(machine, s, state, modes, contact), s)
+    return modes
+
+
+def holds_anywhere(machine: Machine) -> bool:
+    """Whether there is friction that may hold a body wherever that is."""
+    return any(x.is_dry for x in machine.switches)
+
+
+def mode_values(modes: Any) -> tuple[Any, ...]:
+    """Modes as a user gives them, one, several or by name, in a tuple."""
+    if isinstance(modes, Mapping):
+        return tuple(modes.values())
+    return tuple(modes) if isinstance(modes, tuple | list) else (modes,)
 
 
 def settled_modes(modes: Sequence[Any], s: Scalar) -> Modes:

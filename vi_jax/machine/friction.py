@@ -1,98 +1,321 @@
 """Dry friction, with sticking as a mode."""
 
-from collections.abc import Callable
+import inspect
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
-from .._checks import NOT_NEGATIVE, Range, real, real_or_law, require_ranges
-from .._types import Flag, Machine, Scalar, State
-from .event import AbstractSwitch
+from .._checks import NOT_NEGATIVE, POSITIVE, Range, optional_real, real, real_or_law, require_ranges
+from .._types import Flag, Machine, Scalar, Scalars, State
+from .contacts import added, gained, held_flow, push_of
+from .event import AbstractSwitch, Around
+from .field import field_in
+from .state import with_components
+
+# Of a set of modes that is looked for, a force may point the wrong way by this share of what
+# friction can hold: a choice, far above the accuracy of an event, at which a force is what friction
+# holds and the body does not accelerate yet.
+_STILL = 1e-6
 
 
 class DryFriction(AbstractSwitch):
-    """Coulomb friction on one body: it slides against a force, or sticks.
+    """Coulomb friction on a body: it slides against a force, or sticks.
 
-    While it slides forward (mode +1) or backward (-1) friction is `level` against the motion. Where
-    the velocity vanishes the body sticks (mode 0) as long as what else acts on it stays below
-    `static_ratio` times the level at no speed; there friction balances it. A body that is pulled
-    harder goes through, or off. In the machine's field, with everything else that acts on the body
-    as `force`:
-
-        acceleration = (force + friction.contribution(machine, s, state, mode)) / mass
+    While it slides forward or backward friction is `level` against the motion. Where the slip
+    vanishes the body sticks as long as the force that holds it is at most `static_ratio` times the
+    level at no speed. A body that is pulled harder goes through, or off. The machine's field says
+    nothing of it. Several frictions that stick at once are solved for together, and with what
+    holds bodies on rigid stops.
 
     **Arguments:**
 
     - `level`: μN in the machine's unit of force, not negative; or a function of the speed of
       sliding (Stribeck's curve), smooth from a little below zero on. One with numbers of its own is
       a pytree, an `equinox.Module` with `__call__`.
-    - `load(machine, s, state)`: what the level is multiplied by, not negative: the force N that
-      presses the surfaces together, where it varies, `level` then being μ. One if left out.
+    - `on`: the name of the velocity that it acts on, `"u"`; of a `Mechanical` a coordinate, or a
+      function of its coordinates: `on=lambda q: q.b - q.a` is friction between two bodies.
+    - `mass`: of that body, 1 by default; a `Mechanical` knows it.
+    - `slip(z)` or `slip(t, z)`: the velocity against what it rubs on, where that moves:
+      `slip=lambda z: z.u - belt`.
+    - `push`: in the place of `on` and `mass`, by how much a unit of force changes the rate of each
+      component, by name, where it changes several.
+    - `load(z)`, `load(t, z)` or `load(machine, t, z)`: what the level is multiplied by, not
+      negative: the force N that presses the surfaces together, where it varies, `level` then being
+      μ. One if left out.
     - `static_ratio`: μ_s/μ, at least 1.
-    - `velocity(machine, state)`: of the body against what it rubs on.
-    - `force(machine, s, state)`: what acts on it besides.
-    - `stopped(machine, state)`: the state with that velocity set to zero.
     """
 
     level: Any = eqx.field(converter=real_or_law("level"))
-    velocity: Callable[..., Any] = eqx.field(static=True, kw_only=True)
-    force: Callable[..., Any] = eqx.field(static=True, kw_only=True)
-    stopped: Callable[..., Any] = eqx.field(static=True, kw_only=True)
+    on: Any = eqx.field(static=True, kw_only=True, default=None)
+    mass: Float[Array, "..."] | None = eqx.field(
+        kw_only=True, default=None, converter=optional_real("mass")
+    )
+    slip: Callable[..., Any] | None = eqx.field(static=True, kw_only=True, default=None)
+    push: Mapping[str, Any] | None = eqx.field(kw_only=True, default=None)
     static_ratio: Float[Array, "..."] = eqx.field(
         kw_only=True, default=1.0, converter=real("static_ratio")
     )
     load: Callable[..., Any] | None = eqx.field(static=True, kw_only=True, default=None)
-    ranges: ClassVar = {"level": NOT_NEGATIVE, "static_ratio": Range(1.0, float("inf"))}
+    acts: bool = eqx.field(static=True, kw_only=True, default=True, repr=False)
+    ranges: ClassVar = {
+        "level": NOT_NEGATIVE, "mass": POSITIVE, "static_ratio": Range(1.0, float("inf")),
+    }  # fmt: skip
 
     def __check_init__(self):
         require_ranges(self)
+        if self.push is not None and self.slip is None:
+            raise ValueError("Argument `slip` must be given with `push`: what comes to rest.")
+
+    @property
+    def is_dry(self) -> bool:
+        """True: it may hold a body wherever that is."""
+        return True
+
+    @property
+    def sees_around(self) -> bool:
+        """True: the force that holds a body depends on all that holds others."""
+        return True
 
     @property
     def may_slide(self) -> bool:
         """Never along its own surface: where both sides point at it, the body sticks."""
         return False
 
+    def speed_of_slip(self, machine: Machine, s: Scalar, state: State) -> Scalar:
+        """The velocity against what it rubs on."""
+        if self.slip is not None:
+            return jnp.asarray(asked(self.slip, machine, s, state))
+        return machine.coordinate_on(self.on, self.mass).velocity(state)
+
+    def row(self, machine: Machine, s: Scalar, state: State) -> tuple[State, Any]:
+        """How the state changes by as much of the force as changes the slip by one, and the mass
+        that the force acts on."""
+        if self.push is None:
+            body = machine.coordinate_on(self.on, self.mass)
+            push, mass = push_of(body, state), body.mass_at(s, state)
+            if self.slip is None:
+                return push, mass
+            push = jtu.tree_map(lambda x: x / mass, push)
+        else:
+            none = jtu.tree_map(jnp.zeros_like, state)
+            push = with_components(none, self.push, "`push` of a DryFriction", all_of_them=False)
+        gain = gained(self.as_velocity(machine, s), state, push)
+        return jtu.tree_map(lambda x: x / gain, push), 1 / gain
+
+    def as_velocity(self, machine: Machine, s: Scalar) -> Any:
+        """The slip in the place of a coordinate's velocity."""
+
+        def velocity(state: State) -> Scalar:
+            return self.speed_of_slip(machine, s, state)
+
+        return _Slip(velocity)
+
+    def held(
+        self, machine: Machine, s: Scalar, state: State, contact: Scalars, found: Any
+    ) -> tuple[Any, Any, Any, Any]:
+        """The force that holds a body, the largest that can, the mass that it acts on, and whether
+        it acts at all.
+
+        **Arguments:** `contact` as in `Around`; `found`, of `held_flow`.
+        """
+        force, mass = found
+        return force, self.sticking(machine, s, state), mass, jnp.ones((), bool)
+
+    def slip_rate(self, machine: Machine, s: Scalar, state: State, flow: State) -> Scalar:
+        """d(slip)/ds along a flow."""
+        along = (s, state), (jnp.ones_like(s), flow)
+        return jax.jvp(lambda s, x: self.speed_of_slip(machine, s, x), *along)[1]
+
     def sliding(self, machine: Machine, s: Scalar, state: State, mode: Scalar) -> Any:
         """The size of friction on a body that slides forward or backward; in mode 0 on one that
         begins to."""
         level = self.level
         if callable(level):
-            level = level(mode * self.velocity(machine, state))
-        return level if self.load is None else level * self.load(machine, s, state)
+            level = level(mode * self.speed_of_slip(machine, s, state))
+        return level if self.load is None else level * asked(self.load, machine, s, state)
 
     def sticking(self, machine: Machine, s: Scalar, state: State) -> Any:
         """The largest force that friction can balance on a body at rest."""
         return self.sliding(machine, s, state, jnp.zeros_like(s)) * self.static_ratio
 
-    def contribution(self, machine, s, state, mode):
-        """What friction adds to the force on the body."""
-        slides = self.sliding(machine, s, state, mode) * mode
-        return -jnp.where(mode == 0, self.force(machine, s, state), slides)
+    def pushed(self, machine, s, state, mode, flow):
+        """The flow with the force against which a body slides."""
+        push, mass = self.row(machine, s, state)
+        amount = -mode * self.sliding(machine, s, state, mode) / mass
+        pace = machine.pace(s, state)
+        return added(flow, (amount if pace is None else amount * pace,), (push,))
 
     def begin(self, machine, s, state):
-        """Sliding, or sticking where the velocity is zero and the force too small."""
-        velocity, force = self.velocity(machine, state), self.force(machine, s, state)
-        sticks = jnp.abs(force) <= self.sticking(machine, s, state)
-        return jnp.where(velocity != 0, jnp.sign(velocity), self._from_rest(sticks, force))
+        """The mode of a motion that begins: the sign of the slip, sticking without any."""
+        return self.way(machine, s, state)
 
-    def guard(self, machine, s, state, mode):
-        """The velocity coming to zero; or the force coming to what friction can hold."""
-        excess = jnp.abs(self.force(machine, s, state)) - self.sticking(machine, s, state)
-        return jnp.where(mode == 0, excess, -mode * self.velocity(machine, state))
+    def way(self, machine: Machine, s: Scalar, state: State) -> Scalar:
+        """The sign of the slip; zero where that is rounding."""
+        slip = self.speed_of_slip(machine, s, state)
+        size = sum((jnp.sum(jnp.abs(x)) for x in jtu.tree_leaves(state)), start=jnp.asarray(0.0))
+        least = stop_gradient(4 * jnp.finfo(slip.dtype).eps * size)
+        return jnp.where(jnp.abs(slip) <= least, 0.0, jnp.sign(slip))
 
-    def sides(self, machine, s, state, mode):
-        """The guard for a force forward and for one backward."""
-        force, holds = self.force(machine, s, state), self.sticking(machine, s, state)
-        slows = -mode * self.velocity(machine, state)
-        return tuple(jnp.where(mode == 0, way * force - holds, slows) for way in (1.0, -1.0))
+    def struck(self, machine, s, state, mode, *, around: Around | None = None):
+        """The mode after an impact or another jump: the way that the body slips, or would begin to.
 
-    def after(self, machine, s, state, mode):
-        """Sticking, or sliding the way the force pulls."""
-        state, force = self.stopped(machine, state), self.force(machine, s, state)
-        sticks = (jnp.abs(force) <= self.sticking(machine, s, state)) & (mode != 0)
-        return state, self._from_rest(sticks, force)
+        **Arguments:** as every event's, and `around`, what else acts; `None` if that is not known
+        yet.
+        """
+        slips = self.way(machine, s, state)
+        if around is None:
+            return slips
+        rest = self._from_rest(machine, s, state, around, True)
+        return jnp.where(slips == 0, rest, slips)
 
-    def _from_rest(self, sticks: Flag, force: Scalar) -> Scalar:
-        return jnp.where(sticks, 0.0, jnp.where(force < 0, -1.0, 1.0))
+    def guard(self, machine, s, state, mode, *, around: Around | None = None):
+        """The slip coming to zero; or the force coming to what friction can hold.
+
+        **Arguments:** as every event's, and `around`, the other modes and who rests where.
+        """
+        slows = -mode * self.speed_of_slip(machine, s, state)
+        if around is None:
+            return jnp.where(mode == 0, -1.0, slows)
+        excess = jnp.abs(self._pull(machine, s, state, around, mode))
+        return jnp.where(mode == 0, excess - self.sticking(machine, s, state), slows)
+
+    def sides(self, machine, s, state, mode, *, around: Around | None = None):
+        """The guard for a force forward and for one backward.
+
+        **Arguments:** as `guard`.
+        """
+        if around is None:
+            return (self.guard(machine, s, state, mode),)
+        slows = -mode * self.speed_of_slip(machine, s, state)
+        pull = self._pull(machine, s, state, around, mode)
+        holds = self.sticking(machine, s, state)
+        return tuple(jnp.where(mode == 0, way * pull - holds, slows) for way in (1.0, -1.0))
+
+    def after(self, machine, s, state, mode, *, around: Around | None = None):
+        """Sticking, or sliding the way the force pulls.
+
+        **Arguments:** as every event's, and `around`, the other modes and who rests where.
+        """
+        new = self.stopped(machine, s, state)
+        if around is None:
+            return new, jnp.zeros_like(mode)
+        return new, self._from_rest(machine, s, new, around, mode != 0)
+
+    def stopped(self, machine: Machine, s: Scalar, state: State) -> State:
+        """The state without slip, which vanishes to rounding."""
+        if self.slip is None and self.push is None:
+            body = machine.coordinate_on(self.on, self.mass)
+            velocity = body.velocity(state)
+            return body.placed(state, body.position(state), jnp.zeros_like(velocity))
+        slip, (push, _) = self.speed_of_slip(machine, s, state), self.row(machine, s, state)
+        return added(state, (-slip,), (push,))
+
+    def _pull(
+        self, machine: Machine, s: Scalar, state: State, around: Around, mode: Scalar
+    ) -> Scalar:
+        """The force that friction balances on a body that sticks.
+
+        **Arguments:** `around`, the other modes and who rests where; `mode`, its own.
+        """
+        modes = around.instead(mode)
+        flow = field_in(machine, s, state, modes)
+        return -held_flow(machine, flow, s, state, modes, around.contact)[1][around.own][0]
+
+    def _from_rest(
+        self, machine: Machine, s: Scalar, state: State, around: Around, sticks: Flag | bool
+    ) -> Scalar:
+        """The mode of a body without slip: sticking where the force is not too large, else the way
+        that it pulls.
+
+        **Arguments:** `sticks`, whether the body may stick at all.
+        """
+        pull = self._pull(machine, s, state, around, jnp.zeros_like(s))
+        holds = sticks & (jnp.abs(pull) <= self.sticking(machine, s, state))
+        return jnp.where(holds, 0.0, jnp.where(pull < 0, -1.0, 1.0))
+
+
+class _Slip:
+    """A slip in the place of a coordinate's velocity."""
+
+    def __init__(self, velocity: Callable[[State], Scalar]):
+        self.velocity = velocity
+
+
+def asked(function: Callable[..., Any], machine: Machine, s: Scalar, state: State) -> Any:
+    """What a function of the state, of time and state, or of machine, time and state says."""
+    try:
+        known = inspect.signature(function).parameters.values()
+        many = sum(x.default is x.empty and x.kind < x.VAR_POSITIONAL for x in known)
+    except (TypeError, ValueError):  # of a function that is not Python's
+        many = 1
+    return function(*(machine, s, state)[3 - min(max(many, 1), 3) :])
+
+
+def chosen_together(
+    machine: Machine, s: Scalar, state: State, modes: Scalars, contact: Scalars,
+    released: tuple[int, Flag] | None = None,
+) -> Scalars:  # fmt: skip
+    """The modes of several frictions, one of which has changed: the first set that no force
+    contradicts, of those with as much sticking as can be.
+
+    What slips goes on as it does. Each of the others sticks, or slips one way or the other.
+
+    **Arguments:** `modes`, all of the machine; `contact` as in `Around`; `released`, the place of
+    one that does not stick again, with whether that is so.
+    """
+    places = frictions_in(machine)
+    switches = machine.switches
+    ways = [switches[i].way(machine, s, state) for i in places]
+    slips = [x != 0 for x in ways]
+
+    def tried(x: tuple[Any, ...]) -> tuple[Any, ...]:
+        _, number, _ = x
+        new, left = list(modes), number
+        for i, way, slip in zip(places, ways, slips, strict=True):
+            digit = left - 3 * jnp.floor(left / 3)
+            left = jnp.floor(left / 3)
+            chosen = jnp.where(digit == 0, 0.0, jnp.where(digit == 1, 1.0, -1.0))
+            new[i] = jnp.where(slip, way, chosen)
+        good = _consistent(machine, s, state, tuple(new), contact, places, slips, released)
+        return tuple(new), number + 1, jnp.where(good, 1.0, 0.0)
+
+    zero = jnp.zeros_like(s)
+    begin = tuple(modes), zero, zero
+    found, _, good = jax.lax.while_loop(
+        lambda x: (x[2] == 0) & (x[1] < 3.0 ** len(places)), tried, stop_gradient(begin)
+    )
+    return tuple(jnp.where(good > 0, new, old) for new, old in zip(found, modes, strict=True))
+
+
+def frictions_in(machine: Machine) -> list[int]:
+    """The places among a machine's switches of its frictions."""
+    return [i for i, x in enumerate(machine.switches) if x.is_dry or x.rubs_on is not None]
+
+
+def _consistent(
+    machine: Machine, s: Scalar, state: State, modes: Scalars, contact: Scalars,
+    places: list[int], slips: list[Flag], released: tuple[int, Flag] | None,
+) -> Flag:  # fmt: skip
+    """Whether no force contradicts these modes: what sticks is held, what begins to slip is
+    accelerated that way."""
+    flow = field_in(machine, s, state, modes)
+    total, forces = held_flow(machine, flow, s, state, modes, contact)
+    good = jnp.ones((), bool)
+    for i, slip in zip(places, slips, strict=True):
+        friction, mode = machine.switches[i], modes[i]
+        if i not in forces:  # on a stop where nothing is known to rest
+            continue
+        force, holds, mass, acts = friction.held(machine, s, state, contact, forces[i])
+        rate = friction.slip_rate(machine, s, state, total)
+        stays = jnp.abs(force) <= holds
+        if released is not None and released[0] == i:
+            stays = stays & ~released[1]
+        goes = mode * rate * mass >= -_STILL * holds
+        good = good & (slip | ~acts | jnp.where(mode == 0, stays, goes))
+    return good

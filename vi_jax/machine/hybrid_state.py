@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from .._types import Machine, State, Vector
-from .events import settled_modes
+from .events import mode_values, settled_modes
 from .own import is_own
 from .shown import Shown
 
@@ -64,12 +64,12 @@ def begun(machine: Machine, state: State, axes: int = 0) -> State:
 
     **Arguments:** `axes`, how many axes the state has in front.
     """
-    if isinstance(state, HybridState) or not is_own(type(machine).begin):
+    if isinstance(state, HybridState) or not (machine.modes or is_own(type(machine).begin)):
         return state
 
     def begin(state: State) -> Any:
         zero = jnp.zeros_like(machine.position(state))
-        return settled_modes(machine.begin(zero, state), zero)
+        return settled_modes(mode_values(machine.begin(zero, state)), zero)
 
     for _ in range(axes):
         begin = jax.vmap(begin)

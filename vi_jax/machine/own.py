@@ -22,3 +22,23 @@ def changed(part: object, base: type, names: Iterable[str]) -> str | None:
     `base`; `None` if it shares all."""
     kind = type(part)
     return next((x for x in names if getattr(kind, x, None) is not getattr(base, x)), None)
+
+
+class derived:  # noqa: N801 (used as `property` is)
+    """A property that a field of the same name in a subclass takes the place of, one without a
+    default too: of a class it is not there."""
+
+    by_default = True
+
+    def __init__(self, found: Callable[[Any], Any]):
+        self.found, self.__doc__ = found, found.__doc__
+
+    def __get__(self, part: Any, owner: type) -> Any:
+        if part is None:
+            raise AttributeError(f"`{owner.__name__}` does not say it by itself.")
+        return self.found(part)
+
+
+def says(part: object, name: str) -> bool:
+    """Whether a machine says by itself what is `derived` otherwise."""
+    return hasattr(type(part), name) or name in vars(part)

@@ -6,7 +6,9 @@ from typing import Any, ClassVar
 import equinox as eqx
 
 from .event import AbstractEvent
-from .events import struck_modes
+from .events import mode_values, struck_modes
+from .field import shown_modes
+from .state import changed
 
 
 class Reset(AbstractEvent):
@@ -29,10 +31,11 @@ class Reset(AbstractEvent):
     **Arguments:**
 
     - `guard`: what rises through zero: negative before the event, positive after it.
-    - `reset`: the state afterwards.
+    - `reset`: the state afterwards, or a dictionary of the components that change; the state stays
+      as it is if left out.
     - `when`: whether the reset happens where the guard has risen through zero, as a flag; where it
       does not hold the motion goes on. Always, if left out.
-    - `modes`: the machine's own modes afterwards, a tuple like that of its `begin`; they stay as
+    - `modes`: the machine's own modes afterwards, one number, a tuple or a dictionary; they stay as
       they are if left out. Switches are then in the modes that they have behind an impact.
     - `value`: a number that the log of events keeps of it, of the state before.
     - `ends_cycle`: whether a cycle ends with it.
@@ -40,7 +43,7 @@ class Reset(AbstractEvent):
     """
 
     _guard: Callable[..., Any] = eqx.field(static=True)
-    _reset: Callable[..., Any] = eqx.field(static=True)
+    _reset: Callable[..., Any] | None = eqx.field(static=True)
     _when: Callable[..., Any] | None = eqx.field(static=True)
     _modes: Callable[..., Any] | None = eqx.field(static=True)
     _value: Callable[..., Any] | None = eqx.field(static=True)
@@ -49,7 +52,7 @@ class Reset(AbstractEvent):
     def __init__(
         self,
         guard: Callable[..., Any],
-        reset: Callable[..., Any],
+        reset: Callable[..., Any] | None = None,
         *,
         when: Callable[..., Any] | None = None,
         modes: Callable[..., Any] | None = None,
@@ -63,24 +66,31 @@ class Reset(AbstractEvent):
 
     def guard(self, machine, s, state, *modes):
         """The function `guard` of this state."""
-        return self._guard(machine, s, state, *modes)
+        return self._guard(machine, s, state, *shown_modes(machine, modes))
 
     def after(self, machine, s, state, *modes):
         """As `reset` and `modes` say."""
-        own = None if self._modes is None else self._modes(machine, s, state, *modes)
-        new = self._reset(machine, s, state, *modes)
+        own = None
+        if self._modes is not None:
+            own = mode_values(self._modes(machine, s, state, *shown_modes(machine, modes)))
+        new = self.jump(machine, s, state, *modes)
         return new, struck_modes(machine, s, new, modes, own)
 
     def jump(self, machine, s, state, *modes):
         """The state that the function `reset` makes of this one."""
-        return self._reset(machine, s, state, *modes)
+        if self._reset is None:
+            return state
+        whose = f"`reset` of {self.name or 'a Reset'} of a {type(machine).__name__}"
+        return changed(state, self._reset(machine, s, state, *shown_modes(machine, modes)), whose)
 
     def happens(self, machine, s, state, *modes):
         """What the function `when` says of this state, `None` without one."""
-        return None if self._when is None else self._when(machine, s, state, *modes)
+        if self._when is None:
+            return None
+        return self._when(machine, s, state, *shown_modes(machine, modes))
 
     def value(self, machine, s, state, *modes):
         """The function `value` of this state, NaN without one."""
         if self._value is None:
             return super().value(machine, s, state, *modes)
-        return self._value(machine, s, state, *modes)
+        return self._value(machine, s, state, *shown_modes(machine, modes))

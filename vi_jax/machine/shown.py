@@ -98,9 +98,10 @@ def _parts(x: object) -> tuple[str, list[tuple[str, Any]], str]:
         left_out = (type(None), tuple, str)  # what is not there, and what is empty
         there = [(k, part) for k, part in values if not isinstance(part, left_out) or part]
         return name, there, ")"
-    fields = getattr(x, "_fields", None)
-    if isinstance(x, tuple) and fields is not None:
-        return name, list(zip(fields, x, strict=True)), ")"
+    if isinstance(x, tuple) and hasattr(x, "_fields"):
+        return name, list(zip(x._fields, x, strict=True)), ")"  # pyright: ignore
+    if name == "State(":
+        return name, list(vars(x).items()), ")"
     if isinstance(x, Mapping):
         return "{", [(str(key), part) for key, part in x.items()], "}"
     if isinstance(x, tuple | list):

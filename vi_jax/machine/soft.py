@@ -18,6 +18,7 @@ from .._checks import (
     require_ranges,
 )
 from .._types import Machine, Number, State
+from .contacts import added, push_of
 from .event import AbstractSwitch
 from .law import AbstractContactLaw, HuntCrossley, PowerLaw
 from .stop import Wall
@@ -58,7 +59,9 @@ class SoftStop(Wall, AbstractSwitch):
     - `prestress` F0: the force at first touch, not negative; none by default.
     - `adhesive`: whether the dashpot may pull at the end of its stroke; `False` lets the body go
       where the force falls to zero. Static.
-    - `side`: `"right"` or `"left"`; `coordinate`: index into the machine's `coordinates`.
+    - `side`: `"right"` or `"left"`.
+    - `on`: the coordinate that it limits, as of a `RigidStop`. In a `Mechanical` the stiffness is
+      a force by length, and the machine knows the mass.
 
     **Raises:** `ValueError` naming the argument that is out of range.
     """
@@ -70,6 +73,7 @@ class SoftStop(Wall, AbstractSwitch):
     law: AbstractContactLaw
     adhesive: bool = eqx.field(static=True)
     side: str = eqx.field(static=True)
+    on: Any = eqx.field(static=True)
     coordinate: int = eqx.field(static=True)
     ranges: ClassVar = {
         "gap": REAL, "stiffness": POSITIVE, "damping": NOT_NEGATIVE, "prestress": NOT_NEGATIVE,
@@ -87,6 +91,7 @@ class SoftStop(Wall, AbstractSwitch):
         prestress: Number | None = None,
         adhesive: bool = True,
         side: str = "right",
+        on: Any = None,
         coordinate: int = 0,
         ends_cycle: bool = False,
         name: str = "",
@@ -101,6 +106,7 @@ class SoftStop(Wall, AbstractSwitch):
         self.prestress = None if prestress is None else number("prestress", prestress)
         self.adhesive = bool(adhesive)
         self.side = one_of("side", side, ("right", "left"))
+        self.on, self.acts = on, False
         self.coordinate = count("coordinate", coordinate)
         self.ends_cycle, self.name = bool(ends_cycle), str(name)
         require_ranges(self)
@@ -135,6 +141,13 @@ class SoftStop(Wall, AbstractSwitch):
     def contribution(self, machine, s, state, mode):
         """What the stop adds to the coordinate's acceleration."""
         return jnp.where(mode > 0, -self.sign * self.force(*self.depth(machine, state)), 0.0)
+
+    def pushed(self, machine, s, state, mode, flow):
+        """The flow with the stop's force while the body touches."""
+        body, pace = machine.coordinates[self.coordinate], machine.pace(s, state)
+        amount = self.contribution(machine, s, state, mode)
+        amount = amount if pace is None else amount * pace
+        return added(flow, (amount,), (push_of(body, state),))
 
     def begin(self, machine, s, state):
         """The mode of a motion that begins: touching, unless the body is apart or has been let go

@@ -11,6 +11,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._checks import (
+    NOT_NEGATIVE,
+    POSITIVE,
     REAL,
     SHARE,
     concrete,
@@ -23,7 +25,8 @@ from .._checks import (
 )
 from .._types import Machine, Number, Scalar, State
 from .event import AbstractEvent, Modes
-from .events import struck_modes
+from .events import mode_values, struck_modes
+from .field import shown_modes
 from .own import by_default, is_own
 from .shown import Shown
 
@@ -76,8 +79,13 @@ class RigidStop(Wall, AbstractEvent):
     negative (a body pressed on); the restitution is in [0, 1], both ends included, or a function of
     the speed of approach with values there (a pytree, if it has numbers of its own).
 
-    What is hit is the machine's first coordinate unless another is named by its index; of a linear
-    machine (`vi.machines.Structure`) it is the sum `at`·x of its displacements.
+    What is hit is the machine's own coordinate, or the one that `on` names: the components of the
+    state that are position and velocity, `on=("x", "u")`; of a `Mechanical` one of its coordinates,
+    `on="y"`, or a function of them, `on=lambda q: q.left - q.right`; of a linear machine
+    (`vi.machines.Structure`) it is the sum `at`·x of its displacements.
+
+    With `friction` μ a body rubs where it hits the stop, or rests on it, along another coordinate,
+    which `along` names in the same way (see `ContactFriction`).
     """
 
     gap: Float[Array, "..."] = eqx.field(converter=real("gap"))
@@ -86,6 +94,20 @@ class RigidStop(Wall, AbstractEvent):
     """k, coefficient of restitution (dimensionless)."""
     side: str = eqx.field(static=True, default="right")
     """"right" or "left"."""
+    on: Any = eqx.field(static=True, default=None, kw_only=True)
+    """What names the coordinate."""
+    mass: Any = eqx.field(default=None, kw_only=True, converter=optional_real("mass"))
+    """What an impact acts on, for `Run.impact_energy`: 1 by default; a `Mechanical` knows it."""
+    friction: Float[Array, "..."] | None = eqx.field(
+        default=None, kw_only=True, converter=optional_real("friction")
+    )
+    """μ, Coulomb's coefficient of friction (dimensionless); none by default."""
+    along: Any = eqx.field(static=True, default=None, kw_only=True)
+    """What names the coordinate that the body slips along."""
+    tangential_restitution: Float[Array, "..."] = eqx.field(
+        default=0.0, kw_only=True, converter=real("tangential_restitution")
+    )
+    """Coefficient of restitution along the stop (dimensionless)."""
     coordinate: int = eqx.field(static=True, default=0, kw_only=True)
     """Index into the machine's `coordinates`."""
     modes: Callable[..., Any] | None = eqx.field(static=True, default=None, kw_only=True)
@@ -95,11 +117,19 @@ class RigidStop(Wall, AbstractEvent):
         default=None, kw_only=True, converter=optional_real("at")
     )
     """c, by how much each displacement of a linear machine enters; `None` for other machines."""
-    ranges: ClassVar = {"gap": REAL, "restitution": SHARE, "at": REAL}
+    ranges: ClassVar = {
+        "gap": REAL, "restitution": SHARE, "at": REAL, "mass": POSITIVE, "friction": NOT_NEGATIVE,
+        "tangential_restitution": SHARE,
+    }  # fmt: skip
     word: ClassVar = "impact"
 
     def __check_init__(self):
         require_ranges(self)
+        if (self.friction is None) != (self.along is None):
+            raise ValueError(
+                "Arguments `friction` and `along` of a stop must be given together: how large the "
+                "friction is, and along which coordinate the body slips."
+            )
         one_of("side", self.side, ("right", "left"))
         count("coordinate", self.coordinate)
 
@@ -120,7 +150,9 @@ class RigidStop(Wall, AbstractEvent):
 
         **Arguments:** `before` and `after`, the states; `modes`, those before.
         """
-        own = None if self.modes is None else self.modes(machine, s, before, *modes)
+        own = None
+        if self.modes is not None:
+            own = mode_values(self.modes(machine, s, before, *shown_modes(machine, modes)))
         return struck_modes(machine, s, after, modes, own)
 
     def jump(self, machine, s, state, *modes):

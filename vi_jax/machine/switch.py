@@ -4,13 +4,12 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 from jax.lax import stop_gradient
 
 from .._types import Machine, Scalar, Scalars, State
 from .event import AbstractSwitch, Around
+from .field import field_in, rate_of
 
 
 class Switch(AbstractSwitch):
@@ -107,36 +106,4 @@ class Switch(AbstractSwitch):
     def _rates(self, machine: Machine, s: Scalar, state: State, around: Around) -> Scalars:
         """d/ds of the function in the modes +1 and -1."""
         up, down = (field_in(machine, s, state, around.instead(mode)) for mode in (1.0, -1.0))
-        return _rate(self, machine, s, state, up), _rate(self, machine, s, state, down)
-
-
-def _rate(switch: Switch, machine: Machine, s: Scalar, state: State, flow: State) -> Scalar:
-    """d/ds of a switch's function along a flow.
-
-    **Arguments:** `flow`, d(state)/ds.
-    """
-    along = (s, state), (jnp.ones_like(s), flow)
-    return jax.jvp(lambda s, state: switch.function(machine, s, state), *along)[1]
-
-
-def field_in(machine: Any, s: Scalar, state: State, modes: Scalars, first: int = 0) -> State:
-    """The machine's field in these modes; on the surfaces along which it slides, the mean of those
-    on both sides.
-
-    **Arguments:** switches before number `first` are in mode +1 or -1.
-    """
-    found = [i for i, x in enumerate(machine.switches) if x.blends and i >= first]
-    if not found:
-        return machine.field(s, state, *modes)
-    i = found[0]
-    up, down = (
-        field_in(
-            machine, s, state, (*modes[:i], jnp.full_like(modes[i], m), *modes[i + 1 :]), i + 1
-        )
-        for m in (1.0, -1.0)
-    )
-    rises, falls = (_rate(machine.switches[i], machine, s, state, x) for x in (up, down))
-    apart = falls - rises
-    share = jnp.where(modes[i] == 0, falls / jnp.where(apart == 0, 1.0, apart), modes[i] > 0)
-    # Not kept within [0, 1]: a step ends where it leaves that, and sees a smooth field till then.
-    return jtu.tree_map(lambda a, b: b + share * (a - b), up, down)
+        return rate_of(self, machine, s, state, up), rate_of(self, machine, s, state, down)

@@ -4,12 +4,11 @@ from collections.abc import Mapping
 from math import pi
 from typing import Any, ClassVar
 
-import equinox as eqx
 import jax.numpy as jnp
 
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Range, number
 from .._types import Number, Scalar, State
-from ..machine import Coordinate, DryFriction, RigidStop, Shown
+from ..machine import DryFriction, RigidStop, Shown
 from ._base import ForcedMachine, number_field
 
 
@@ -68,26 +67,21 @@ class Capsule(ForcedMachine):
     }  # fmt: skip
 
     @property
-    def stops(self) -> tuple[RigidStop, ...]:  # pyright: ignore
-        """The stop in the capsule, on the right of the mass."""
-        return (RigidStop(self.gap, self.restitution),)
+    def contacts(self) -> tuple[RigidStop, DryFriction]:
+        """The stop in the capsule, on the right of the mass, and the ground under the capsule.
 
-    @property
-    def coordinates(self) -> tuple[Coordinate, ...]:
-        """The place of the mass; the mass that its impacts act on is the reduced one (unit: m)."""
+        Impacts act on the reduced mass (unit: m), and a force on the capsule moves it against the
+        mass as well.
+        """
         reduced = self.mass_ratio / (1 + self.mass_ratio)
-        return (Coordinate(self.position, self.velocity, self.placed, reduced),)
-
-    @property
-    def switches(self) -> tuple[DryFriction, ...]:
-        """The ground under the capsule."""
+        faster = 1 / self.mass_ratio
         return (
+            RigidStop(self.gap, self.restitution, mass=reduced),
             DryFriction(
                 self.friction,
                 static_ratio=self.static_ratio,
-                velocity=_speed_on_ground,
-                force=_force_on_capsule,
-                stopped=_stopped,
+                slip=_speed_on_ground,
+                push={"capsule_speed": faster, "speed": -faster},
             ),
         )
 
@@ -109,12 +103,10 @@ class Capsule(ForcedMachine):
         stiffness = jnp.sqrt(1 + 1 / self.mass_ratio)
         return 0.4 * pi * jnp.minimum(1.0, self.frequency / stiffness)
 
-    def field(self, s: Scalar, state: CapsuleState, mode: Scalar) -> CapsuleState:
-        """d(state)/d(ωt) between impacts; `mode` says whether the capsule sticks or slides."""
-        (ground,) = self.switches
+    def field(self, s: Scalar, state: CapsuleState) -> CapsuleState:
+        """d(state)/d(ωt) between impacts, but for friction."""
         pull = self.pull(state)
-        rubs = ground.contribution(self, s, state, mode)
-        capsule = (pull + rubs) / self.mass_ratio
+        capsule = pull / self.mass_ratio
         relative = self.amplitude * jnp.cos(s) - pull - capsule
         pace = 1 / self.frequency
         return CapsuleState(
@@ -157,17 +149,5 @@ class Capsule(ForcedMachine):
         return CapsuleState(Y, V, state.capsule_speed + gained, state.travel, state.progress)
 
 
-def _speed_on_ground(machine: Capsule, state: CapsuleState) -> Scalar:
+def _speed_on_ground(state: CapsuleState) -> Scalar:
     return state.capsule_speed
-
-
-def _force_on_capsule(machine: Capsule, s: Scalar, state: CapsuleState) -> Scalar:
-    """Of the spring; and of a mass that rests on the stop and is pressed on, so that what acts on
-    the mass acts on the capsule."""
-    pull = machine.pull(state)
-    rests = (state.place >= machine.gap) & (state.speed == 0)
-    return jnp.where(rests, jnp.maximum(pull, machine.amplitude * jnp.cos(s)), pull)
-
-
-def _stopped(machine: Capsule, state: CapsuleState) -> CapsuleState:
-    return eqx.tree_at(lambda x: x.capsule_speed, state, jnp.zeros_like(state.capsule_speed))

@@ -201,7 +201,7 @@ def events_in(orbit: Orbit) -> list[tuple[float, Event]]:
     stops = np.asarray(orbit.impact_stop)
     found = [(float(s), Event(int(i))) for s, i in zip(clock, stops, strict=True) if i >= 0]
     begins = float(machine.cycle) * np.arange(cycles)
-    others = bool(machine.switches or machine.events or any(e.ends_cycle for e in machine.stops))
+    others = bool(machine.switches or machine.others or any(e.ends_cycle for e in machine.stops))
     if others or (autonomous and cycles > 1):
         begins, listed = _listed_events(orbit)
         found = listed if others else found

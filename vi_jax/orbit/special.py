@@ -211,7 +211,7 @@ def _beyond_grazing(point: SpecialPoint, distance: float) -> Orbit:
         )
     if point.impact is None and not point.touches:
         return _otherwise(point, across_order, "its events in another order", distance)
-    if old.modes[0] or old.machine.events:
+    if old.modes[0] or old.machine.others:
         raise ValueError(
             "`switch` at a grazing needs a machine without soft stops, friction or other switches, "
             "modes of its own and `events`: find the motion beyond it with `find_orbit`."

@@ -14,7 +14,16 @@ from jax.lax import stop_gradient
 
 from ..._types import Flag, Scalar, Scalars, State
 from ...lanes import pin, pin_flag
-from ...machine import added, forces, held_by, push_of, rubs, shares, struck_modes
+from ...machine import (
+    added,
+    forces,
+    held_by,
+    holds_anywhere,
+    push_of,
+    rubs,
+    shares,
+    struck_modes,
+)
 from .._arrival import Arrival
 from .._flow_to_event import FlowToEvent
 from .._lane import RESTS, Lane, Plan, in_place, select
@@ -94,6 +103,8 @@ def _held(
         lost = lost + rubbed_away
     else:
         still, lost = stilled(plan, s, state, rests, walls)
+        if holds_anywhere(plan.machine):
+            modes = struck_modes(plan.machine, s, still, modes, contact=contact)
     resting = holding(plan.machine, modes, contact)
     way = FlowToEvent(plan, resting, lane.part, (s, still, time))
     later, still, passed = drifted(way.rate, pin(wait), way.moving, way.fixed, way.rest)

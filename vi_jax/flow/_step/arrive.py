@@ -44,7 +44,7 @@ def arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Fla
         direction.append(along)
     here = plan.machine.position(trial.state)
     arrival = Arrival(
-        trial.s, trial.state, trial.end.time, here, here if plan.machine.events else None,
+        trial.s, trial.state, trial.end.time, here, here if plan.machine.others else None,
         Onward(tuple(direction), lane.contact, lane.modes, trial.seen.below),
         Tally(old.impacts, old.speed, old.loss, old.rests, old.log, old.events),
         trial.ends_interval, lane.fault if may_end(plan.machine) else None,
@@ -131,7 +131,7 @@ def _landed(
         for number, stop in enumerate(machine.stops):
             if stop.ends_cycle:
                 arrival = arrival._replace(completed=arrival.completed | landed[number])
-    if machine.stops and machine.events:
+    if machine.stops and machine.others:
         met = jnp.zeros_like(taken)
         for number in range(len(machine.stops)):
             met = met | landed[number]
@@ -155,7 +155,7 @@ def _landed(
 def _near(plan: Plan, lane: Lane, trial: Trial) -> dict[int, Flag]:
     """Of each event that happens from below, whether its guard is at zero to rounding where the
     step landed on another event."""
-    numbers = plan.from_below(lane.state) if plan.machine.events else []
+    numbers = plan.from_below(lane.state) if plan.machine.others else []
     found = {}
     eps = float(jnp.finfo(trial.h.dtype).eps)
     for c in trial.crossings:

@@ -76,7 +76,7 @@ def _lost(plan: Plan, lane: Lane, target: Scalar) -> Scalar | float:
     if machine.switches:
         others = target >= to_event(first)
         reason = jnp.where(others, float(results.SWITCH_UNRESOLVED), reason)
-    if machine.events:
+    if machine.others:
         others = target >= to_event(first + len(machine.switches))
         reason = jnp.where(others, float(results.RESET_UNRESOLVED), reason)
     if not plan.ticks(lane.state):
@@ -89,8 +89,8 @@ def may_end(machine: AbstractMachine) -> bool:
     """Whether an event may end a lane; static."""
     laws = any(not stop.is_one_number for stop in machine.stops)
     slides = any(event.may_slide for event in events_of(machine))
-    several = bool(machine.stops) and (len(machine.coordinates) > 1 or bool(machine.events))
-    chain = len(machine.switches) + len(machine.events) > 1
+    several = bool(machine.stops) and (len(machine.coordinates) > 1 or bool(machine.others))
+    chain = len(machine.switches) + len(machine.others) > 1
     return laws or slides or several or chain
 
 

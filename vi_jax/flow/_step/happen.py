@@ -148,7 +148,7 @@ def _next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _Instant) -> _In
     arrival = _jumped(plan, arrival, happens, jumps, old, (new, modes))
     arrival = let_go(plan, arrival, taken, happens, (old, modes_before))
     off, near, before = {}, x.near, (old, modes_before)
-    if machine.events:
+    if machine.others:
         arrival, off, near = set_off(plan, arrival, happens, before, turns, near)
     due = [jnp.where(turns[n], 0.0, due) for n, due in zip(numbers, x.due, strict=True)]
     for i, number in enumerate(numbers):
@@ -238,13 +238,13 @@ def _jumped(
     """
     new, modes = behind
     arrival = arrival.going(modes=modes)
-    if plan.machine.stops and plan.machine.events:
+    if plan.machine.stops and plan.machine.others:
         beyond = beyond_a_stop(plan.machine, new)
         arrival = ended(arrival, jumps, beyond, results.BAD_RESET)
         arrival = arrival.going(contact=unheld(plan, arrival.contact, jumps, old, new))
     # A switch leaves velocities as they are; but of a state without them it changes the rate.
     when = jumps if plan.machine.has_velocity(new) else happens
-    if plan.machine.events or when is happens:
+    if plan.machine.others or when is happens:
         way = directions(plan, arrival.onward, when, old, new, arrival.s)
         arrival = arrival.going(direction=way)
     return arrival._replace(state=new)

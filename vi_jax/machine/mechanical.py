@@ -1,0 +1,266 @@
+"""Machines of masses: what acts on them is written down, and what follows from the masses is not.
+
+With coordinates q, velocities v and the mass matrix M(q), kinetic energy ½ vᵀMv, Lagrange's
+equations are M v' + h = f for the applied forces f, where h_i = Σ_k v_k (∂M/∂q_k v)_i - ½ vᵀ
+(∂M/∂q_i) v. A contact of gap g(q) has J = ∇g; its force acts along M⁻¹Jᵀ, and on the mass
+1/(J M⁻¹ Jᵀ).
+"""
+
+import abc
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+
+from .._types import Scalar, State
+from ..lanes import dependent_results
+from .base import AbstractMachine
+from .coordinate import Coordinate
+from .state import State as Named
+from .state import like
+
+# Entries of a mass matrix: rows of numbers, `None` where they are zero.
+Matrix = list[list[Any]]
+
+
+class Mechanical(AbstractMachine):
+    """A machine of masses, by its coordinates, its masses and the forces between contacts.
+
+    Its state has the coordinates by their names, and their velocities as `v`: `z.y`, `z.v.y`;
+    `machine.at(y=0.1, v=dict(y=1.0))` makes one.
+
+    | it says | |
+    |---|---|
+    | `q` | the names of its coordinates |
+    | `mass` | the mass of each, or a mass matrix: numbers, or a method `mass(q)` |
+    | `force(t, q, v)` | the applied force on each, by name |
+    | `cycle`, `contacts`, `events`, `modes` | as of every machine |
+
+    A contact is `on` a coordinate, `on="y"`, or a gap of several, `on=lambda q: q.left - q.right`.
+    The momentum of an impact, the mass that it acts on (`Run.impact_energy`) and inertial terms
+    follow from the masses.
+    """
+
+    q: ClassVar[tuple[str, ...]]
+    mass: ClassVar[Any]
+
+    @abc.abstractmethod
+    def force(self, *args: Any, **kwargs: Any) -> Any:
+        """`force(t, q, v)`: the applied force on each coordinate, by name; behind them it gets the
+        machine's own modes."""
+
+    def at(self, v: Any = None, **places: Any) -> Named:
+        """A state: each coordinate's place, and in `v` each velocity by name; 0 if not given."""
+        names = self.q_names
+        wrong = [x for x in (*places, *(v or {})) if x not in names]
+        if wrong:
+            raise ValueError(f"{wrong[0]!r} is none of the coordinates {', '.join(names)}.")
+        speeds = dict(v or {})
+        zeros = dict.fromkeys(names, 0.0)
+        return Named(**(zeros | places), v=Named(**(zeros | speeds)))
+
+    def start(self) -> Named:
+        """At rest with all coordinates zero."""
+        return self.at()
+
+    @property
+    def q_names(self) -> tuple[str, ...]:
+        """The names of the coordinates."""
+        return (self.q,) if isinstance(self.q, str) else tuple(self.q)
+
+    def field(self, t: Scalar, state: State, *modes: Scalar) -> Any:
+        """d(state)/dt between contacts."""
+        q, v = self.places(state), state.v
+        whose = f"`force` of a {type(self).__name__}"
+        applied = vars(like(v, self.force(t, q, v, *modes), whose))
+        left = [f - h for f, h in zip(applied.values(), self._inertial(q, v), strict=True)]
+        rates = solved(self.masses(q), left)
+        return Named(**vars(v), v=Named(**dict(zip(self.q_names, rates, strict=True))))
+
+    def places(self, state: State) -> Named:
+        """The coordinates in a state, without velocities."""
+        return Named(**{name: getattr(state, name) for name in self.q_names})
+
+    def masses(self, q: Named) -> Matrix:
+        """The mass matrix."""
+        given = self.mass
+        return matrix_of(given(q) if callable(given) else given, self.q_names, type(self).__name__)
+
+    def _inertial(self, q: Named, v: Named) -> list[Any]:
+        """h, what the applied forces are diminished by; 0 where the masses are constant."""
+        names, speeds = self.q_names, list(vars(v).values())
+        n = len(names)
+        h: list[Any] = [0.0] * n
+        if not callable(self.mass):
+            return h
+        turns = moving(self.masses, q)
+        for k, name in enumerate(names):
+            if not any(name in where for where in turns.values()):
+                continue
+            one = q.replace(**{x: jnp.full_like(q.__dict__[x], float(x == name)) for x in names})
+            slopes = jax.jvp(self.masses, (q,), (one,))[1]
+            moves = [
+                sum(slopes[i][j] * speeds[j] for j in range(n) if name in turns.get((i, j), ()))
+                for i in range(n)
+            ]
+            h = [x + speeds[k] * y for x, y in zip(h, moves, strict=True)]
+            h[k] = h[k] - 0.5 * sum(x * y for x, y in zip(speeds, moves, strict=True))
+        return h
+
+    def coordinate_on(self, on: Any, mass: Any = None) -> Coordinate:
+        """A coordinate by its name, or a gap, a function of the coordinates; by default the first
+        coordinate."""
+        return Coordinate(
+            functools.partial(_place, self, on),
+            functools.partial(_speed, self, on),
+            functools.partial(_placed, self, on),
+            functools.partial(_effective, self, on),
+        )
+
+
+def _named(machine: Mechanical, on: Any) -> str | None:
+    """The name of a coordinate, `None` of a gap."""
+    name = machine.q_names[0] if on is None else on
+    if not isinstance(name, str):
+        return None
+    if name not in machine.q_names:
+        raise ValueError(
+            f"Argument `on` of a contact must be one of the coordinates {machine.q_names}, or a "
+            f"function of them, but got {on!r}."
+        )
+    return name
+
+
+def _place(machine: Mechanical, on: Any, state: State) -> Any:
+    name = _named(machine, on)
+    return on(machine.places(state)) if name is None else getattr(state, name)
+
+
+def _speed(machine: Mechanical, on: Any, state: State) -> Any:
+    name = _named(machine, on)
+    if name is not None:
+        return getattr(state.v, name)
+    return jax.jvp(on, (machine.places(state),), (machine.places(state.v),))[1]
+
+
+def _slopes(machine: Mechanical, on: Any, q: Named) -> list[Any]:
+    """J, the slopes of a gap; plain numbers where they are constant ones."""
+    name, names = _named(machine, on), machine.q_names
+    if name is not None:
+        return [float(x == name) for x in names]
+    by = moving(on, q).get((), frozenset())
+    zero = {x: jnp.zeros_like(y) for x, y in vars(q).items()}
+    found = []
+    for name in names:
+        one = Named(**(zero | {name: jnp.ones_like(zero[name])}))
+        found.append(jax.jvp(on, (q,), (one,))[1] if name in by else 0.0)
+    return found
+
+
+def _push(machine: Mechanical, on: Any, q: Named) -> tuple[list[Any], Any]:
+    """M⁻¹Jᵀ/(J M⁻¹Jᵀ), how the velocities change where that of a gap changes by one, and
+    1/(J M⁻¹Jᵀ), the mass that its force acts on."""
+    slopes = _slopes(machine, on, q)
+    push = solved(machine.masses(q), slopes)
+    gain = sum(x * y for x, y in zip(slopes, push, strict=True) if not _is_zero(x))
+    return [0.0 if _is_zero(x) else x / gain for x in push], 1 / gain
+
+
+def _effective(machine: Mechanical, on: Any, s: Scalar, state: State) -> Any:
+    return _push(machine, on, machine.places(state))[1]
+
+
+def _placed(machine: Mechanical, on: Any, state: State, Y: Any, V: Any) -> Named:
+    """A gap's place and velocity changed by as little as can be, in the measure of the masses; a
+    coordinate by its name alone is put where it is to be."""
+    names, name = machine.q_names, _named(machine, on)
+    q = machine.places(state)
+    push, _ = _push(machine, on, q)
+    if name is not None:
+        q = q.replace(**{name: Y})
+    else:
+        q = _moved(q, push, Y - on(q))
+    if callable(machine.mass) or name is None:
+        push, _ = _push(machine, on, q)
+    gained = V - _speed(machine, on, Named(**vars(q), v=state.v))
+    v = _moved(state.v, push, gained)
+    if name is not None:
+        v = v.replace(**{name: V})
+    return Named(**{x: getattr(q, x) for x in names}, v=v)
+
+
+def _moved(x: Named, push: list[Any], amount: Any) -> Named:
+    both = zip(vars(x).items(), push, strict=True)
+    return Named(**{name: y if _is_zero(p) else y + p * amount for (name, y), p in both})
+
+
+def _is_zero(x: Any) -> bool:
+    """Whether a number is known to be zero while a program is traced."""
+    return isinstance(x, int | float) and x == 0
+
+
+def matrix_of(given: Any, names: Sequence[str], whose: str) -> Matrix:
+    """Masses as a matrix, from one for each coordinate, by name or in their order, or rows of
+    them. **Raises:** `ValueError` for another number of them."""
+    n = len(names)
+    if isinstance(given, Mapping):
+        given = [given[x] for x in names]
+    elif isinstance(given, Named):
+        given = [getattr(given, x) for x in names]
+    if n == 1 and _is_number(given):
+        return [[given]]
+    rows = list(given)
+    if len(rows) != n:
+        raise ValueError(
+            f"`mass` of a {whose} must be one for each of its {n} coordinates, or {n} rows, but "
+            f"has {len(rows)}."
+        )
+    if all(map(_is_number, rows)):
+        return [[rows[i] if i == j else 0.0 for j in range(n)] for i in range(n)]
+    return [[row[j] for j in range(n)] for row in rows]
+
+
+def _is_number(x: Any) -> bool:
+    return not isinstance(x, list | tuple) and jnp.ndim(x) == 0
+
+
+def solved(M: Matrix, right: Sequence[Any]) -> list[Any]:
+    """M⁻¹ right, of a symmetric matrix that is positive: elimination without pivots, which leaves
+    out what is known to be zero."""
+    n, rows = len(right), [[*row, x] for row, x in zip(M, right, strict=True)]
+    for i in range(n):
+        for k in range(i + 1, n):
+            if _is_zero(rows[k][i]):
+                continue
+            ratio = rows[k][i] / rows[i][i]
+            rows[k] = [
+                a if _is_zero(b) else a - ratio * b for a, b in zip(rows[k], rows[i], strict=True)
+            ]
+    found: list[Any] = [0.0] * n
+    for i in reversed(range(n)):
+        value = rows[i][n]
+        for j in range(i + 1, n):
+            if not _is_zero(rows[i][j]) and not _is_zero(found[j]):
+                value = value - rows[i][j] * found[j]
+        found[i] = 0.0 if _is_zero(value) else value / rows[i][i]
+    return found
+
+
+def moving(function: Callable[[Named], Any], q: Named) -> dict[Any, frozenset[str]]:
+    """By which coordinates each number that a function returns changes, by its place in what it
+    returns; found while a program is traced."""
+    leaves = {}
+    names = list(vars(q))
+    jaxpr, shape = jax.make_jaxpr(function, return_shape=True)(q)
+    places = [
+        tuple(getattr(key, "idx", key) for key in path)
+        for path, _ in jax.tree_util.tree_leaves_with_path(shape)
+    ]
+    for name in names:
+        moves = [x == name for x in names]
+        for place, changes in zip(places, dependent_results(jaxpr.jaxpr, moves, smooth=False), strict=True):
+            if changes:
+                leaves[place] = leaves.get(place, frozenset()) | {name}
+    return leaves

@@ -1,0 +1,139 @@
+"""A machine's contacts and events, sorted into what a step asks for.
+
+A user lists contacts (rigid and soft stops, dry friction) and events (switches, resets, kinds of
+one's own), each with the coordinate that it acts on. A step asks for the stops, for the switches,
+for the other events, and for the coordinates that stops limit, by number.
+"""
+
+import copy
+import functools
+import re
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+
+from .._types import Machine, Scalar, State
+from .contact_friction import ContactFriction
+from .coordinate import Coordinate
+from .event import AbstractEvent, AbstractSwitch
+from .friction import DryFriction
+from .soft import SoftStop
+from .stop import RigidStop
+
+
+def listed(parts: object) -> tuple[Any, ...]:
+    """Contacts or events as a tuple, of which one may be given without."""
+    single = isinstance(parts, AbstractEvent)
+    return (parts,) if single else tuple(parts) if isinstance(parts, list) else parts  # pyright: ignore
+
+
+def stops_in(machine: Machine) -> tuple[RigidStop, ...]:
+    """The rigid stops among a machine's contacts."""
+    contacts = listed(machine.contacts)
+    places = _places(contacts)
+    return tuple(_at(x, places) for x in contacts if isinstance(x, RigidStop))
+
+
+def switches_in(machine: Machine) -> tuple[AbstractSwitch, ...]:
+    """The soft stops and frictions among a machine's contacts, which act by themselves, and the
+    switches among its events."""
+    contacts, found, number = listed(machine.contacts), [], 0
+    places = _places(contacts)
+    for x in contacts:
+        if isinstance(x, RigidStop):
+            if x.friction is not None:
+                found.append(_acting(_friction_on(x, number, places)))
+            number += 1
+        elif isinstance(x, AbstractSwitch):
+            found.append(_acting(_at(x, places) if isinstance(x, SoftStop) else x))
+    return *found, *(x for x in listed(machine.events) if isinstance(x, AbstractSwitch))
+
+
+def other_events(machine: Machine) -> tuple[AbstractEvent, ...]:
+    """The events of a machine that are no switches."""
+    return tuple(x for x in listed(machine.events) if not isinstance(x, AbstractSwitch))
+
+
+def coordinates_in(machine: Machine) -> tuple[Coordinate, ...]:
+    """The coordinates on which a machine's contacts act, in the order of `_places`."""
+    contacts = listed(machine.contacts)
+    masses = {x.on: x.mass for x in reversed(contacts) if isinstance(x, RigidStop)}
+    return tuple(machine.coordinate_on(on, masses.get(on)) for on in _places(contacts))
+
+
+def _places(contacts: tuple[Any, ...]) -> dict[Any, int]:
+    """The number of each coordinate by what names it: those of rigid stops, of soft ones, then
+    those along which rigid ones rub."""
+    rigid = [x for x in contacts if isinstance(x, RigidStop)]
+    named = [x.on for x in rigid] + [x.on for x in contacts if isinstance(x, SoftStop)]
+    named += [x.along for x in rigid if x.friction is not None]
+    return {on: i for i, on in enumerate(dict.fromkeys(named or [None]))}
+
+
+def _at(stop: Any, places: dict[Any, int]) -> Any:
+    """A stop with the number of its coordinate."""
+    if stop.on is None and stop.coordinate:
+        return stop
+    return _with(stop, coordinate=places[stop.on])
+
+
+def _friction_on(stop: RigidStop, number: int, places: dict[Any, int]) -> ContactFriction:
+    return ContactFriction(
+        stop.friction,
+        stop=number,
+        along=places[stop.along],
+        restitution=stop.tangential_restitution,
+    )
+
+
+def _acting(switch: Any) -> Any:
+    return _with(switch, acts=True)
+
+
+def _with(part: Any, **static: Any) -> Any:
+    """A part with other values in fields that are no numbers, whose own `__init__` takes others."""
+    new = copy.copy(part)
+    for name, value in static.items():
+        object.__setattr__(new, name, value)
+    return new
+
+
+def coordinate_by_name(on: Any, mass: Any) -> Coordinate:
+    """The coordinate of a state's components.
+
+    **Arguments:** `on`, the names of position and velocity, or that of a velocity alone; `mass`,
+    as `Coordinate.mass`, 1 if it is `None`.
+    """
+    position, velocity = (on, on) if isinstance(on, str) else on
+    get = functools.partial(component, position), functools.partial(component, velocity)
+    placed = functools.partial(_placed, position, velocity)
+    return Coordinate(*get, placed, 1.0 if mass is None else mass)
+
+
+_INDEXED = re.compile(r"(.*)\[([\d, ]+)\]$")
+
+
+def component(name: str, state: State) -> Scalar:
+    """The number of a state by its name: `"x"`, `"v.x"`, `"x[3]"`."""
+    indexed = _INDEXED.match(name)
+    if indexed:
+        base, place = indexed.groups()
+        return component(base, state)[tuple(int(i) for i in place.split(","))]
+    return functools.reduce(getattr, name.split("."), state)
+
+
+def with_component(name: str, state: State, value: Any) -> State:
+    """The state with another number under this name."""
+    indexed = _INDEXED.match(name)
+    if indexed:
+        base, place = indexed.groups()
+        whole = component(base, state).at[tuple(int(i) for i in place.split(","))].set(value)
+        return with_component(base, state, whole)
+    return eqx.tree_at(functools.partial(component, name), state, value)
+
+
+def _placed(position: str, velocity: str, state: State, Y: Scalar, V: Scalar) -> State:
+    if position == velocity:
+        return with_component(velocity, state, V)
+    return with_component(velocity, with_component(position, state, Y), V)

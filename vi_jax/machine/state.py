@@ -1,0 +1,145 @@
+"""States by names, and what a user returns in the place of one."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+
+from .shown import in_words, known, number_in_words, table
+
+
+class State:
+    """A state with components of any names: `vi.State(x=0.0, u=1.0)`, then `z.x`.
+
+    A component is a number, an array, or a state of its own. It is a pytree.
+    """
+
+    def __init__(self, **components: Any):
+        for name in components:
+            if hasattr(State, name):
+                raise ValueError(f"A component of a state cannot be called {name!r}.")
+        self.__dict__.update(components)
+
+    def replace(self, **components: Any) -> "State":
+        """Return the state with other components under these names.
+
+        **Raises:** `TypeError` for a name that the state does not have.
+        """
+        unknown = [name for name in components if name not in vars(self)]
+        if unknown:
+            raise TypeError(
+                f"The state has no component {unknown[0]!r}; it has {', '.join(vars(self))}."
+            )
+        return _state(vars(self) | components)
+
+    def __setattr__(self, name: str, value: object) -> None:
+        raise AttributeError(f"A state is not changed: take `state.replace({name}=...)`.")
+
+    def __getattr__(self, name: str) -> Any:  # of names that are not there
+        known = ", ".join(vars(self))
+        raise AttributeError(f"The state has no component {name!r}; it has {known}.")
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, State) and vars(self) == vars(other)
+
+    __hash__ = None  # pyright: ignore[reportAssignmentType]
+
+    def __repr__(self) -> str:
+        return in_words(self) if known(self) else f"State({', '.join(vars(self))})"
+
+    def _repr_html_(self) -> str:
+        rows = [(name, number_in_words(x)) for name, x in vars(self).items() if known(x)]
+        return table("State", rows)
+
+
+def _state(components: Mapping[str, Any]) -> State:
+    """A state of components whatever they are, as JAX needs it."""
+    new = object.__new__(State)
+    vars(new).update(components)
+    return new
+
+
+def _parts_with_keys(state: State) -> tuple[list[tuple[Any, Any]], tuple[str, ...]]:
+    return [(jtu.GetAttrKey(k), x) for k, x in vars(state).items()], tuple(vars(state))
+
+
+def _parts(state: State) -> tuple[tuple[Any, ...], tuple[str, ...]]:
+    return tuple(vars(state).values()), tuple(vars(state))
+
+
+jtu.register_pytree_with_keys(
+    State,
+    _parts_with_keys,
+    lambda names, parts: _state(dict(zip(names, parts, strict=True))),
+    _parts,
+)
+
+
+def like(state: Any, found: Any, whose: str) -> Any:
+    """What a user returned, in the form of a state: a dictionary or a state by the names of its
+    components, plain numbers as arrays.
+
+    **Arguments:** `state`, of the form that is wanted; `whose`, what returned it, for messages.
+
+    **Raises:** `TypeError` that names a component which is missing, or which the state has not.
+    """
+    if isinstance(found, Mapping | State) and type(found) is not type(state):
+        return with_components(state, given_in(found), whose, all_of_them=True)
+    if isinstance(found, State):
+        return with_components(state, vars(found), whose, all_of_them=True)
+    if jtu.tree_structure(found) != jtu.tree_structure(state):
+        return found
+    return jtu.tree_map(_as_array, state, found)
+
+
+def changed(state: Any, found: Any, whose: str) -> Any:
+    """The state after a jump, of which a user returned the components that change.
+
+    **Arguments and raises:** as `like`.
+    """
+    if isinstance(found, Mapping):
+        return with_components(state, found, whose, all_of_them=False)
+    return like(state, found, whose)
+
+
+def given_in(found: Mapping | State) -> Mapping[str, Any]:
+    """The components of a dictionary or a state by their names."""
+    return found if isinstance(found, Mapping) else vars(found)
+
+
+def with_components(
+    state: Any, given: Mapping[str, Any], whose: str, *, all_of_them: bool
+) -> Any:
+    """A state with these components, each like the one that it has.
+
+    **Arguments:** `all_of_them`, whether each component must be given.
+
+    **Raises:** as `like`.
+    """
+    if not hasattr(state, "__dict__"):
+        raise TypeError(f"{whose} returned names, but its state has none: {type(state).__name__}.")
+    names = list(vars(state))
+    missing = [x for x in names if x not in given] if all_of_them else []
+    extra = [x for x in given if x not in names]
+    if missing or extra:
+        wrong = f"{missing[0]!r} is missing" if missing else f"there is no {extra[0]!r}"
+        raise TypeError(f"{whose} must return the components {', '.join(names)}, but {wrong}.")
+    new = {x: _component(vars(state)[x], given[x], whose) for x in names if x in given}
+    if isinstance(state, State):
+        return _state(vars(state) | new)
+    return eqx.tree_at(lambda z: [getattr(z, x) for x in new], state, list(new.values()))
+
+
+def _component(old: Any, new: Any, whose: str) -> Any:
+    if isinstance(old, State) or isinstance(new, Mapping):
+        return like(old, new, whose)
+    return jtu.tree_map(_as_array, old, new)
+
+
+def _as_array(old: Any, new: Any) -> Any:
+    """A plain number as an array like another one; all else as it is."""
+    if hasattr(new, "dtype") or not isinstance(new, int | float) or isinstance(new, bool):
+        return new
+    return jnp.full(jnp.shape(old), new, jnp.result_type(float, old))
