@@ -80,6 +80,9 @@ def test_mean_speed_of_a_motor_is_one_turn_in_a_cycle():
     run = vi.simulate(scene, scene.start(), 8)
     assert int(run.impacts.sum()) > 5
     np.testing.assert_allclose(run.averages["speed"], 2 * np.pi / run.duration, rtol=1e-14)
+    assert float(jnp.ptp(run.duration)) > 0.01  # so that the mean of the means is another number
+    mean = run.mean_averages()["speed"]
+    np.testing.assert_allclose(mean, 8 * 2 * np.pi / run.duration.sum(), rtol=1e-14)
 
 
 def test_beside_scipy_with_samples_between():

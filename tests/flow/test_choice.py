@@ -127,3 +127,19 @@ def test_known_numbers_stay_known_inside_of_jit():
     assert seen == {1.0: True, 2.0: False, "table": False}
     with pytest.raises(ValueError, match="restitution"):
         jax.jit(lambda z: vi.Scene.ideal(frequency_ratio=z, restitution=2.0).drive)(0.9)
+
+
+def test_an_absolute_tolerance_is_that_of_small_numbers():
+    """An oscillator from rest, its force a millionth: x = a (cos ωs - cos s)/(1 - ω²)."""
+    a, omega = 1e-6, 1.3
+    numbers = {"stiffness": 1.0, "cubic": 0.0, "damping": 0.0, "gap": 1.0}
+    small = vi.machines.Duffing(amplitude=a, frequency=omega, **numbers)
+    steps = []
+    for atol, error in ((1e-3, 1e-8), (1e-15, 1e-14)):
+        method = vi.Adaptive(rtol=1e-9, atol=atol)
+        run = vi.simulate(small, small.start(), 3, method=method)
+        end = 3 * 2 * np.pi / omega
+        truth = a * (1 - np.cos(end)) / (1 - omega**2)
+        assert abs(float(run.last.Y) - truth) < error
+        steps.append(int(run.steps))
+    assert steps[1] > steps[0]

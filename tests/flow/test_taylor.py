@@ -110,6 +110,22 @@ def test_a_method_of_ones_own_foresees():
     np.testing.assert_array_equal(mine.steps, other.steps)
 
 
+class Wave(vi.AbstractMachine):
+    """x' = 1 + cos 12πs: about s = 0 every other term of its series vanishes."""
+
+    stops: tuple = ()
+    cycle: float = 1.0
+
+    def field(self, s, x):
+        return 1 + jnp.cos(12 * np.pi * s)
+
+
+@pytest.mark.parametrize("order", [16, 17])
+def test_a_last_term_that_vanishes_shows_no_small_error(order):
+    run = vi.simulate(Wave(), jnp.zeros(()), 1, method=vi.Taylor(order, rtol=1e-12))
+    np.testing.assert_allclose(run.last, 1.0, rtol=0, atol=1e-11)
+
+
 def test_what_has_no_recursion_is_named():
     class Odd(vi.CosineCrank):
         def slide(self, phase):

@@ -22,7 +22,8 @@ def logistic(x, r, n, *, backend=None):
         x = jax.lax.cond(x > 0.9, lambda x: 0.9 + 0.1 * jnp.sin(x - 0.9), lambda x: x, x)
         done = done + 1
         row = {"x": x, "steps": done.astype(jnp.int32)}
-        return (x, done), lanes.Emitted(done < n, True, row)
+        # Not `done < n`, so that a lane that went on behind its end would be seen.
+        return (x, done), lanes.Emitted((done != n) & (done < 99), True, row)
 
     def end(inputs, carry):
         return carry[0], carry[1].astype(jnp.int32)

@@ -147,6 +147,9 @@ def test_both_sides_of_a_gap_are_one_coordinate():
     assert len(machine.coordinates) == 1
     state = machine.start(displacement=[0.1, 0.2])
     np.testing.assert_array_equal(machine.mirrored(state).displacement, [-0.1, -0.2])
+    for force, own_image in ([0.0, 0.0], True), ([0.0, 0.1], False):
+        pressed = dataclasses.replace(machine, static_force=jnp.asarray(force))
+        assert (pressed.mirrored(state) is not None) == own_image
     machine = vi.machines.Structure(mass=np.eye(2), stiffness=np.eye(2), contacts=stops)
     assert [stop.coordinate for stop in machine.stops] == [0, 0, 1]
     assert machine.mirrored(state) is None

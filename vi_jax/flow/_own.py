@@ -173,7 +173,7 @@ def check_period(machine: AbstractMachine, start: State) -> None:
     for (path, _), first, last in each:
         apart = np.max(abs(first - last) / (1e-3 + abs(first) + abs(last)))
         if apart > _APART:
-            _warn_of_period(kind, jtu.keystr(path).lstrip("."), cycle.item())
+            _warn_of_period(kind, jtu.keystr(path).lstrip(".") or "state", cycle.item())
             return
 
 
