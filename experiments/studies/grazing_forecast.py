@@ -17,17 +17,21 @@
 import sys
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 import vi_jax as vi
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
+from vi_jax.plot.colors import BLUE, GREEN, ORANGE, RED
 
 jax.config.update("jax_enable_x64", True)
 
 sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
 from studies.parts.grazing_machines import KINDS, machines, number
-from studies.parts.grazing_picture import picture
 from studies.parts.grazing_verdict import LANES, LONGEST, SETTLE, judged, name_of
+from tools.pictures import legend_below, open_frames
 from tools.study import QUICK, say, write
 from tools.tables import table
 
@@ -73,6 +77,42 @@ for seed, (kind, (draw, count)) in enumerate(KINDS.items(), SEED):
 # ## Table and picture
 
 # %%
+COLOURS = {1: BLUE, 2: GREEN, 3: ORANGE}
+
+
+def picture(shown: dict[str, Any]) -> Figure:
+    """Lanes of one machine for each verdict: how far from the motion that grazes, and which period
+    (1, 2, 3, more, none)."""
+    figure = Figure(figsize=(11.0, 6.2), layout="constrained")
+    axes = figure.subplots(2, 4).ravel()
+    for ax in axes[len(shown) :]:
+        ax.set_visible(False)
+    for ax, (verdict, (label, parameter, lanes)) in zip(axes, shown.items(), strict=False):
+        for word, color, part in by_period(lanes.period):
+            ax.loglog(lanes.offset[part], lanes.distance[part], ".", ms=3, color=color, label=word)
+        ax.set_title(f"{verdict}\n({label})", fontsize=9)
+        ax.set_xlabel(f"distance in {parameter}", fontsize=8)
+        ax.tick_params(labelsize=8)
+        for axis, values in ((ax.xaxis, lanes.offset), (ax.yaxis, lanes.distance)):
+            axis.set_minor_formatter(NullFormatter())  # else labels overlap within a decade
+            low, high = values.min(), values.max()
+            axis.set_view_interval(min(low / 1.3, 0.2 * high), max(high * 1.3, 5 * low))
+    axes[0].set_ylabel("distance of the motion", fontsize=8)
+    open_frames(axes)
+    handles = [
+        axes[0].plot([], [], "o", ms=4, color=color, label=word)[0]
+        for word, color, _ in by_period(np.zeros(1))
+    ]
+    legend_below(figure, handles, 5)
+    return figure
+
+
+def by_period(period: np.ndarray) -> list[tuple[str, str, np.ndarray]]:
+    """Words, colour and which lanes, by period."""
+    few = [(f"period {n}", color, period == n) for n, color in COLOURS.items()]
+    return [*few, ("longer", RED, period > 3), ("none", "0.6", period == 0)]
+
+
 heads = [
     *("machine", "parameter", "its value", "impacts", "largest multiplier", "forecast"),
     *("simulation", "same", "distance from the grazing", "without a period: forecast"),

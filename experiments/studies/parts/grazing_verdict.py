@@ -1,14 +1,7 @@
-"""What follows a grazing, by simulation alone: the judge of `grazing_forecast.py`.
+"""Classify by simulation what follows a grazing: the judge of `grazing_forecast.py`.
 
-It knows nothing of local maps. Many lanes, on both sides of the grazing and each with a value of
-the parameter of its own, begin at the state of the motion that grazes, and are followed through
-`SETTLE` cycles and `WATCHED` more. What a lane does is read from its sections there:
-
-- its distance from the motion that grazes;
-- its period, the least number of cycles after which sections and touches repeat, up to `LONGEST`;
-- its touches in a period beyond those of the motion that grazes.
-
-The name for all lanes together is given by `verdict`.
+It uses no local map. Lanes on both sides of the grazing begin at the state of the motion that
+grazes, each with another value of the parameter, and run for `SETTLE` cycles and `WATCHED` more.
 """
 
 import contextlib
@@ -28,8 +21,8 @@ METHOD = vi.FixedStep(vi.Verner9(), steps_per_cycle=48)
 # altogether, where rounding decides.
 _REPEATS, _ROUNDING = 1e-3, 1e-11
 
-# What grows from the grazing on has a size that rises with some power of the distance from it in
-# the parameter (1/2 where the stop is rigid), and what is far away does not: the limit between.
+# The size of a motion that begins at the grazing rises with a power of the distance from it in the
+# parameter (1/2 for a rigid stop): the least power that counts.
 _GROWS = 0.15
 
 # A lane so many times farther away than others, over the root of its offset, has left.
@@ -155,9 +148,8 @@ def _beside(point: vi.SpecialPoint, name: str, offsets: Any, rows: np.ndarray) -
 
 
 def folds(point: vi.SpecialPoint, name: str, lanes: Lanes, seed: int) -> bool:
-    """Whether the motion of one cycle with a touch more that begins at the grazing is on the calm
-    side. Wherever a candidate comes from, it is one if it repeats when it is simulated, and touches
-    once more."""
+    """Whether the motion of one cycle with a touch more is on the side without impacts. A candidate
+    has to repeat when it is simulated, and to touch once more."""
     offset, state = _impacting(point, name, lanes, seed)
     many, starts = _beside(point, name, offset, state[None])
     miss, hits = map(np.asarray, _cycled(many, starts))
@@ -169,9 +161,8 @@ def folds(point: vi.SpecialPoint, name: str, lanes: Lanes, seed: int) -> bool:
 def _impacting(
     point: vi.SpecialPoint, name: str, lanes: Lanes, seed: int
 ) -> tuple[float, np.ndarray]:
-    """A candidate for it, and where: by its own equations; or, of a soft stop, for which there are
-    none, by Newton's method on the calm side from those of many random starts that touch once more
-    and miss themselves least."""
+    """A candidate, and its offset: by its own equations; for a soft stop by Newton's method from
+    those of many random starts that touch once more and repeat best."""
     if not point.orbit.machine.switches:
         for distance in (1e-4, 1e-5, 1e-3):
             with contextlib.suppress(ValueError):
@@ -203,8 +194,8 @@ def name_of(found: vi.Grazing) -> str:
 def judged(
     point: vi.SpecialPoint, name: str, found: vi.Grazing, seed: int
 ) -> tuple[float, float, Lanes, str]:
-    """Lanes in the range over which a forecast was checked, or in all that it looked at, less what
-    rounding makes doubtful; that range, and the verdict."""
+    """The range over which a forecast was checked (without doubtful small offsets), lanes in it,
+    and the verdict."""
     looked = np.abs(found.forecast.offset)
     low, high = (looked.min(), looked.max()) if found.checked is None else found.checked
     low = min(max(low, 1e-9 * abs(point.parameter)), 0.03 * high)
@@ -215,13 +206,8 @@ def judged(
 def verdict(point: vi.SpecialPoint, name: str, lanes: Lanes, seed: int) -> str:
     """The name in `vi.SCENARIOS` of what the lanes do.
 
-    Distances are compared between the third of the lanes nearest to the grazing and the farthest
-    third: if they do not grow, nothing near attracts, and it is a fold if on the calm side a motion
-    with a touch more comes to the grazing, else a jump. Else the lanes that are near count. If
-    (nearly) all have period 1, the motion persists; if (nearly) none has a period, it is chaos.
-    Period adding is what most periodic lanes do if they have one touch in n > 1 cycles, of at least
-    two numbers n which rise towards the grazing; else there are other periodic motions. Both with
-    or without lanes that have no period.
+    The rules are on the study's page. Distances are compared between the third of the lanes nearest
+    to the grazing and the farthest third; of lanes that stay near, periods and touches count.
     """
     third = LANES // 3
     near, far = (np.median(lanes.distance[part]) for part in (slice(third), slice(-third, None)))
