@@ -8,7 +8,6 @@ import numpy as np
 import vi_jax as vi
 from scipy.integrate import solve_ivp
 
-
 SINCE = 0.3  # of the drive's phase on the section
 
 

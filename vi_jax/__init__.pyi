@@ -57,6 +57,9 @@ from .machine import State as State
 from .machine import Switch as Switch
 from .machine import TimedDCMotorState as TimedDCMotorState
 from .machine import TimedMotorState as TimedMotorState
+from .machine import falling as falling
+from .machine import rising as rising
+from .machine import turn_of as turn_of
 from .orbit import ORBIT_RESULTS as ORBIT_RESULTS
 from .orbit import SCENARIOS as SCENARIOS
 from .orbit import STABILITY as STABILITY

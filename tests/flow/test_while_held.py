@@ -11,7 +11,6 @@ import vi_jax as vi
 from scipy.optimize import brentq
 from scipy.special import erf
 
-
 WAVES = (1, 2, 3, 5, 7)
 STILL = vi.OscillatorState(jnp.array(0.0), jnp.array(0.0))
 

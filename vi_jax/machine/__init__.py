@@ -17,6 +17,11 @@ from .coordinate import Coordinate as Coordinate
 from .crank import AbstractCrank as AbstractCrank
 from .crank import CosineCrank as CosineCrank
 from .crank import SliderCrank as SliderCrank
+from .cycles import Turn as Turn
+from .cycles import counter_of as counter_of
+from .cycles import falling as falling
+from .cycles import rising as rising
+from .cycles import turn_of as turn_of
 from .dc_motor import DCMotor as DCMotor
 from .drive import AbstractDrive as AbstractDrive
 from .drive import IdealDrive as IdealDrive

@@ -3,26 +3,23 @@
 import abc
 from collections.abc import Callable, Mapping
 from functools import partial
+from math import pi
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.tree_util as jtu
+from jaxtyping import Array, Float
 
-from .._checks import in_range
+from .._checks import in_range, number, require
 from .._types import Flag, Scalar, State
 from .clocks import Clocked
 from .coordinate import Coordinate
+from .cycles import Passing, Turn, at_intervals, counter_of
 from .event import AbstractEvent, AbstractSwitch
+from .names import coordinate_by_name
 from .observing import Observed
 from .own import by_default, derived, is_own, says
-from .parts import (
-    coordinate_by_name,
-    coordinates_in,
-    listed,
-    other_events,
-    stops_in,
-    switches_in,
-)
+from .parts import coordinates_in, listed, other_events, stops_in, switches_in
 from .stop import RigidStop
 from .words import Worded
 
@@ -174,17 +171,28 @@ class AbstractMachine(Clocked, Observed, Worded):
 
     def observed_every(self, interval: Any) -> "AbstractMachine":
         """An autonomous machine observed at equal intervals of `s` instead of on its section."""
-        name = type(self).__name__
-        what = "a `section`"
-        if not is_own(type(self).section):
-            if not any(x.ends_cycle for x in (*self.stops, *self.switches, *self.others)):
-                raise ValueError(f"A {name} is driven: its cycle is its drive's.")
-            what = "an event that ends its cycles"
-        raise ValueError(
-            f"A {name} has {what} but no `observed_every`: give it this method, which returns "
-            "the same machine with `interval` as its cycle, `None` as its section and no event "
-            "that ends a cycle (and without a `renewed` that belongs to the section)."
-        )
+        ends = any(x.ends_cycle for x in (*self.stops, *self.switches, *self.others))
+        if not ends and not has_section(self):
+            raise ValueError(f"A {type(self).__name__} is driven: its cycle is its drive's.")
+        require("interval", number("interval", interval), low=0.0, open_low=True)
+        return at_intervals(self, interval)
+
+    @by_default
+    def section(self, state: State) -> Scalar | None:
+        """What rises through zero where a cycle ends; `None` where `s` or `clock` counts them, or
+        an event."""
+        counter = counter_of(self)
+        return counter.section(state) if isinstance(counter, Passing) else None
+
+    def step_limit(self, s: Scalar, state: State) -> Scalar | float:
+        """The longest step that holds at most one extremum of the motion; at most `cycle`/5."""
+        counter = counter_of(self)
+        limit = counter.longest_step(self, state) if isinstance(counter, Turn) else self.cycle / 5
+        return limit
+
+    def frequency_ratio(self, duration: Float[Array, "..."]) -> Float[Array, "..."] | None:
+        """Mean drive speed over cycles of these durations, or `None` where nothing is driven."""
+        return 2 * pi / duration if isinstance(counter_of(self), Turn) else None
 
     @derived
     def coordinates(self) -> tuple[Coordinate, ...]:
@@ -277,7 +285,14 @@ def names_coordinates(machine: AbstractMachine) -> bool:
     if says(machine, "coordinates"):
         return True
     contacts = listed(machine.contacts)
-    return any(getattr(x, "on", None) is not None for x in contacts if not x.holds_mode or not x.is_dry)
+    return any(
+        getattr(x, "on", None) is not None for x in contacts if not x.holds_mode or not x.is_dry
+    )
+
+
+def has_section(machine: AbstractMachine) -> bool:
+    """Whether a machine has a section, a function of its state that ends its cycles."""
+    return is_own(type(machine).section) or isinstance(counter_of(machine), Passing)
 
 
 def has_own_modes(machine: AbstractMachine) -> bool:

@@ -37,10 +37,6 @@ class Clocked(Shown):
         """Duration of a cycle, where it is fixed."""
         return self.cycle
 
-    def frequency_ratio(self, duration: Float[Array, "..."]) -> Float[Array, "..."] | None:
-        """Mean drive speed over cycles of these durations, or `None` where nothing is driven."""
-        return None
-
     def in_clock(self: Machine, clock: str) -> Machine:
         """The same machine with another independent variable, for one that has several."""
         raise ValueError(
@@ -71,10 +67,6 @@ class Clocked(Shown):
         """What an impact log says for a reading of what counts the cycles; by default the reading
         itself."""
         return clock
-
-    def step_limit(self, s: Scalar, state: State) -> Scalar | float:
-        """The longest step that holds at most one extremum of the motion; at most `cycle`/5."""
-        return self.cycle / 5
 
     @property
     def scales_known(self) -> bool:

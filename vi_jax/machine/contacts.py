@@ -214,9 +214,7 @@ def held_flow(
     **Returns:** the rate, and of each friction, by its place among the switches, the force along
     the surface and that which presses on it, or the mass that it acts on.
     """
-    held = with_dry_friction(
-        held_by(machine, s, state, modes, contact), machine, s, state, modes
-    )
+    held = with_dry_friction(held_by(machine, s, state, modes, contact), machine, s, state, modes)
     wanted = [-gained(body, state, flow) for body in held.coordinates]
     rows = len(held.coordinates) - len(held.dry)
     for row, (_, friction, _) in enumerate(held.dry, start=rows):

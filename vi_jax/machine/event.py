@@ -191,9 +191,7 @@ class AbstractSwitch(AbstractEvent):
         surface where they meet (see `Switch`)."""
         return False
 
-    def pushed(
-        self, machine: Machine, s: Scalar, state: State, mode: Scalar, flow: State
-    ) -> State:
+    def pushed(self, machine: Machine, s: Scalar, state: State, mode: Scalar, flow: State) -> State:
         """The machine's flow with what the switch adds to it, of one that `acts`."""
         raise NotImplementedError(f"A {type(self).__name__} adds nothing by itself.")
 

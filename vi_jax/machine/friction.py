@@ -11,7 +11,15 @@ import jax.tree_util as jtu
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
-from .._checks import NOT_NEGATIVE, POSITIVE, Range, optional_real, real, real_or_law, require_ranges
+from .._checks import (
+    NOT_NEGATIVE,
+    POSITIVE,
+    Range,
+    optional_real,
+    real,
+    real_or_law,
+    require_ranges,
+)
 from .._types import Flag, Machine, Scalar, Scalars, State
 from .contacts import added, gained, held_flow, push_of
 from .event import AbstractSwitch, Around

@@ -260,7 +260,9 @@ def moving(function: Callable[[Named], Any], q: Named) -> dict[Any, frozenset[st
     ]
     for name in names:
         moves = [x == name for x in names]
-        for place, changes in zip(places, dependent_results(jaxpr.jaxpr, moves, smooth=False), strict=True):
+        for place, changes in zip(
+            places, dependent_results(jaxpr.jaxpr, moves, smooth=False), strict=True
+        ):
             if changes:
                 leaves[place] = leaves.get(place, frozenset()) | {name}
     return leaves

@@ -2,7 +2,7 @@
 
 from typing import Any, TypeVar
 
-from .._types import Number, Scalar, State
+from .._types import Number, State
 from .own import by_default
 from .shown import Shown
 
@@ -12,11 +12,6 @@ Machine = TypeVar("Machine", bound="Observed")
 class Observed(Shown):
     """What is observed of a motion: where a cycle ends, what begins anew with it, means and
     quantities."""
-
-    @by_default
-    def section(self, state: State) -> Scalar | None:
-        """What rises through zero where a cycle ends; `None` where `s` or `clock` counts them."""
-        return None
 
     def at_section(self: Machine, phase: Number) -> Machine:
         """The same machine observed elsewhere in its cycle, for one that can be."""

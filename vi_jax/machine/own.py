@@ -24,7 +24,7 @@ def changed(part: object, base: type, names: Iterable[str]) -> str | None:
     return next((x for x in names if getattr(kind, x, None) is not getattr(base, x)), None)
 
 
-class derived:  # noqa: N801 (used as `property` is)
+class derived:
     """A property that a field of the same name in a subclass takes the place of, one without a
     default too: of a class it is not there."""
 

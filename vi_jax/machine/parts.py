@@ -6,18 +6,13 @@ for the other events, and for the coordinates that stops limit, by number.
 """
 
 import copy
-import functools
-import re
-from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
-
-from .._types import Machine, Scalar, State
+from .._types import Machine
 from .contact_friction import ContactFriction
 from .coordinate import Coordinate
+from .cycles import Turn, counter_of
 from .event import AbstractEvent, AbstractSwitch
-from .friction import DryFriction
 from .soft import SoftStop
 from .stop import RigidStop
 
@@ -51,8 +46,10 @@ def switches_in(machine: Machine) -> tuple[AbstractSwitch, ...]:
 
 
 def other_events(machine: Machine) -> tuple[AbstractEvent, ...]:
-    """The events of a machine that are no switches."""
-    return tuple(x for x in listed(machine.events) if not isinstance(x, AbstractSwitch))
+    """The events of a machine that are no switches, and the turn that ends its cycles."""
+    found = tuple(x for x in listed(machine.events) if not isinstance(x, AbstractSwitch))
+    counter = counter_of(machine)
+    return (*found, counter.event()) if isinstance(counter, Turn) else found
 
 
 def coordinates_in(machine: Machine) -> tuple[Coordinate, ...]:
@@ -97,43 +94,3 @@ def _with(part: Any, **static: Any) -> Any:
     for name, value in static.items():
         object.__setattr__(new, name, value)
     return new
-
-
-def coordinate_by_name(on: Any, mass: Any) -> Coordinate:
-    """The coordinate of a state's components.
-
-    **Arguments:** `on`, the names of position and velocity, or that of a velocity alone; `mass`,
-    as `Coordinate.mass`, 1 if it is `None`.
-    """
-    position, velocity = (on, on) if isinstance(on, str) else on
-    get = functools.partial(component, position), functools.partial(component, velocity)
-    placed = functools.partial(_placed, position, velocity)
-    return Coordinate(*get, placed, 1.0 if mass is None else mass)
-
-
-_INDEXED = re.compile(r"(.*)\[([\d, ]+)\]$")
-
-
-def component(name: str, state: State) -> Scalar:
-    """The number of a state by its name: `"x"`, `"v.x"`, `"x[3]"`."""
-    indexed = _INDEXED.match(name)
-    if indexed:
-        base, place = indexed.groups()
-        return component(base, state)[tuple(int(i) for i in place.split(","))]
-    return functools.reduce(getattr, name.split("."), state)
-
-
-def with_component(name: str, state: State, value: Any) -> State:
-    """The state with another number under this name."""
-    indexed = _INDEXED.match(name)
-    if indexed:
-        base, place = indexed.groups()
-        whole = component(base, state).at[tuple(int(i) for i in place.split(","))].set(value)
-        return with_component(base, state, whole)
-    return eqx.tree_at(functools.partial(component, name), state, value)
-
-
-def _placed(position: str, velocity: str, state: State, Y: Scalar, V: Scalar) -> State:
-    if position == velocity:
-        return with_component(velocity, state, V)
-    return with_component(velocity, with_component(position, state, Y), V)

@@ -109,9 +109,7 @@ def given_in(found: Mapping | State) -> Mapping[str, Any]:
     return found if isinstance(found, Mapping) else vars(found)
 
 
-def with_components(
-    state: Any, given: Mapping[str, Any], whose: str, *, all_of_them: bool
-) -> Any:
+def with_components(state: Any, given: Mapping[str, Any], whose: str, *, all_of_them: bool) -> Any:
     """A state with these components, each like the one that it has.
 
     **Arguments:** `all_of_them`, whether each component must be given.

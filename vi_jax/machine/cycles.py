@@ -1,0 +1,192 @@
+"""What ends a cycle where time does not: a turn of an angle, or a velocity that passes zero; and the
+same machine observed at equal intervals instead."""
+
+import copy
+import dataclasses
+import functools
+from math import pi
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from .._checks import concrete
+from .._types import Scalar, State
+from .event import AbstractEvent
+from .names import component, has_component, with_component
+from .reset import Reset
+
+
+class Counter:
+    """What counts the cycles of a machine, as its `cycle`: the class has it, an instance has the
+    usual length of a cycle instead."""
+
+    def __init__(self, name: str, usual: Any):
+        self.name, self.usual = name, usual
+
+    def __get__(self, machine: Any, owner: type) -> Any:
+        return self if machine is None else self.length(machine)
+
+    def length(self, machine: Any) -> Any:
+        """The usual length of a cycle, by which steps are sized."""
+        if self.usual is not None:
+            return self.usual
+        raise ValueError(
+            f"Argument `usual` must be given to what counts the cycles of a "
+            f"{type(machine).__name__}: about how long a cycle takes."
+        )
+
+
+class Turn(Counter):
+    """An angle whose full turns are the cycles."""
+
+    def __init__(self, name: str, start: Any = 0.0, usual: Any = None):
+        super().__init__(name, usual)
+        self.start = start
+
+    def length(self, machine: Any) -> Any:
+        """As long as a turn takes at the speed at which the machine starts."""
+        if self.usual is not None:
+            return self.usual
+        speed = self.speed(machine.start())
+        known = None if speed is None else concrete(speed)
+        if speed is None or (known is not None and not known.all()):
+            raise ValueError(
+                f"Argument `usual` must be given to `turn_of({self.name!r})` of a "
+                f"{type(machine).__name__}, about how long a turn takes: its own start does not "
+                "turn."
+            )
+        return 2 * pi / jnp.abs(speed)
+
+    def speed(self, state: State) -> Any:
+        """How fast the angle turns, where the state has that; `None` where it has not."""
+        name = f"v.{self.name}"
+        return component(name, state) if has_component(name, state) else None
+
+    def longest_step(self, machine: Any, state: State) -> Any:
+        """A fifth of the usual turn, or of one at the present speed."""
+        speed, usual = self.speed(state), self.length(machine)
+        if speed is None:
+            return usual / 5
+        return 0.2 * usual / jnp.maximum(1.0, usual * jnp.abs(speed) / (2 * pi))
+
+    def event(self) -> Reset:
+        """A full turn is taken off the angle, and a cycle ends."""
+
+        def guard(machine: Any, s: Scalar, state: State, *modes: Any) -> Any:
+            return component(self.name, state) - (self.start + 2 * pi)
+
+        def reset(machine: Any, s: Scalar, state: State, *modes: Any) -> State:
+            return with_component(self.name, state, component(self.name, state) - 2 * pi)
+
+        return Reset(guard, reset, ends_cycle=True, name="turn")
+
+
+class Passing(Counter):
+    """A number of the state whose passing through zero ends a cycle."""
+
+    def __init__(self, name: str, sign: float, usual: Any = None):
+        super().__init__(name, usual)
+        self.sign = sign
+
+    def section(self, state: State) -> Any:
+        """What rises through zero where a cycle ends."""
+        return self.sign * component(self.name, state)
+
+
+def turn_of(name: str, *, start: Any = 0.0, usual: Any = None) -> Any:
+    """Count the cycles of a machine by the turns of an angle, as its `cycle`:
+    `cycle = vi.turn_of("phi")`.
+
+    Where the angle comes to a full turn beyond `start`, a cycle ends and 2π is taken off. The
+    machine may start from rest in time; its orbits, branches and exponents are those of its turns.
+    An angle that turns backward ends no cycle.
+
+    **Arguments:** `name`, of the angle in the state, of a `Mechanical` a coordinate; `start`, the
+    angle (radians) at which a cycle begins; `usual`, about how long a turn takes, by default as
+    long as at the speed with which the machine's own `start` turns.
+    """
+    return Turn(name, start, usual)
+
+
+def rising(name: str, *, usual: Any) -> Any:
+    """End the cycles of a machine where a number of its state rises through zero, as its `cycle`:
+    `cycle = vi.rising("v", usual=6.3)`.
+
+    **Arguments:** `name`, of the number; `usual`, about how long a cycle takes, by which steps are
+    sized.
+    """
+    return Passing(name, 1.0, usual)
+
+
+def falling(name: str, *, usual: Any) -> Any:
+    """End the cycles of a machine where a number of its state falls through zero; as `rising`."""
+    return Passing(name, -1.0, usual)
+
+
+def counter_of(machine: Any) -> Counter | None:
+    """What counts the cycles of a machine, `None` where it says so in another way."""
+    found = getattr(type(machine), "cycle", None)
+    return found if isinstance(found, Counter) else None
+
+
+def at_intervals(machine: Any, interval: Any) -> Any:
+    """The same machine with cycles of equal length, which no event ends."""
+    kind = type(machine)
+    new = object.__new__(_observed_kind(kind))
+    for field in dataclasses.fields(kind):
+        object.__setattr__(new, field.name, getattr(machine, field.name))
+    object.__setattr__(new, "observed_usual", machine.cycle)
+    object.__setattr__(new, "observed_interval", interval)
+    if _has_cycle_field(kind):
+        object.__setattr__(new, "cycle", interval)
+    return new
+
+
+def _has_cycle_field(kind: type) -> bool:
+    return any(field.name == "cycle" for field in dataclasses.fields(kind))  # pyright: ignore
+
+
+@functools.lru_cache(maxsize=64)
+def _observed_kind(kind: type) -> type:
+    """The class of a machine observed at equal intervals."""
+
+    def original(self: Any) -> Any:
+        old = object.__new__(kind)
+        for field in dataclasses.fields(kind):  # pyright: ignore[reportArgumentType]
+            object.__setattr__(old, field.name, getattr(self, field.name))
+        if _has_cycle_field(kind):
+            object.__setattr__(old, "cycle", self.observed_usual)
+        return old
+
+    def step_limit(self: Any, s: Scalar, state: State) -> Any:
+        return jnp.minimum(original(self).step_limit(s, state), self.observed_interval / 5)
+
+    def section(self: Any, state: State) -> None:
+        return None
+
+    def parts(name: str) -> property:
+        return property(lambda self: tuple(map(_goes_on, getattr(original(self), name))))
+
+    body: dict[str, Any] = {
+        "__module__": kind.__module__,
+        "__qualname__": kind.__qualname__,
+        "__annotations__": {"observed_interval": Any, "observed_usual": Any},
+        "observed_interval": eqx.field(default=None, kw_only=True),
+        "observed_usual": eqx.field(default=None, kw_only=True),
+        "step_limit": step_limit,
+        "section": section,
+        **{name: parts(name) for name in ("stops", "switches", "others")},
+    }
+    if not _has_cycle_field(kind):
+        body["cycle"] = property(lambda self: self.observed_interval)
+    return type(kind)(kind.__name__, (kind,), body)
+
+
+def _goes_on(event: AbstractEvent) -> AbstractEvent:
+    """The same event, with which no cycle ends."""
+    if not event.ends_cycle:
+        return event
+    new = copy.copy(event)
+    object.__setattr__(new, "ends_cycle", False)
+    return new

@@ -1,0 +1,59 @@
+"""Numbers of a state by their names, and the coordinates that these are."""
+
+import functools
+import re
+from typing import Any
+
+import equinox as eqx
+
+from .._types import Scalar, State
+from .coordinate import Coordinate
+
+
+def coordinate_by_name(on: Any, mass: Any) -> Coordinate:
+    """The coordinate of a state's components.
+
+    **Arguments:** `on`, the names of position and velocity, or that of a velocity alone; `mass`,
+    as `Coordinate.mass`, 1 if it is `None`.
+    """
+    position, velocity = (on, on) if isinstance(on, str) else on
+    get = functools.partial(component, position), functools.partial(component, velocity)
+    placed = functools.partial(_placed, position, velocity)
+    return Coordinate(*get, placed, 1.0 if mass is None else mass)
+
+
+_INDEXED = re.compile(r"(.*)\[([\d, ]+)\]$")
+
+
+def component(name: str, state: State) -> Scalar:
+    """The number of a state by its name: `"x"`, `"v.x"`, `"x[3]"`."""
+    indexed = _INDEXED.match(name)
+    if indexed:
+        base, place = indexed.groups()
+        return component(base, state)[tuple(int(i) for i in place.split(","))]
+    return functools.reduce(getattr, name.split("."), state)
+
+
+def has_component(name: str, state: State) -> bool:
+    """Whether the state has a number of this name."""
+    try:
+        component(name, state)
+    except (AttributeError, LookupError):
+        return False
+    return True
+
+
+def with_component(name: str, state: State, value: Any) -> State:
+    """The state with another number under this name."""
+    indexed = _INDEXED.match(name)
+    if indexed:
+        base, place = indexed.groups()
+        whole = component(base, state).at[tuple(int(i) for i in place.split(","))].set(value)
+        return with_component(base, state, whole)
+    return eqx.tree_at(functools.partial(component, name), state, value)
+
+
+def _placed(position: str, velocity: str, state: State, Y: Scalar, V: Scalar) -> State:
+    if position == velocity:
+        return with_component(velocity, state, V)
+    return with_component(velocity, with_component(position, state, Y), V)
