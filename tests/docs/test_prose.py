@@ -1,9 +1,11 @@
 """Pages in plain English: sentences with a subject, the field's words, code that fits a column."""
 
+import inspect
 import re
 from pathlib import Path
 
 import pytest
+import vi_jax as vi
 
 DOCS = Path(__file__).parents[2] / "docs"
 PAGES = sorted({*DOCS.rglob("*.md")} - {DOCS / "howto" / "own_machine.md"})
@@ -36,6 +38,23 @@ def test_plain_english(page):
     assert not wide
     found = [x for x in paragraphs(text) if HEADLESS.search(x) or PHRASES.search(x)]
     assert not found
+
+
+VERBS = """Animate Compile Compute Draw Estimate Find Follow Label Predict Return Run Simulate Sweep
+Trace""".split()
+CLAUSES = "What Where When Which How Why".split()
+
+
+def test_first_lines_of_public_docstrings():
+    """A function's begins with a verb, a class's not with a clause."""
+    for module in (vi, vi.machines, vi.plot):
+        for name in dir(module):
+            public = getattr(module, name)
+            told = (inspect.getdoc(public) or "").split(maxsplit=1)[:1]
+            if name[0] != "_" and inspect.isfunction(public):
+                assert told[0] in VERBS, (name, told)
+            elif name[0] != "_" and inspect.isclass(public):
+                assert told[0] not in CLAUSES, (name, told)
 
 
 def test_the_patterns_find_what_they_are_for():

@@ -29,7 +29,7 @@ from .labelled import in_names, place_of, run_dataset
 
 
 class RESULTS(NamedEnumeration):
-    """Why a lane ended; `simulate` gives one to each."""
+    """The reason why a lane ended, one for each."""
 
     successful = ""
     bad_start = (
@@ -214,7 +214,7 @@ class Errors(Shown):
 
 
 class Run(Summarized):
-    """What `simulate` returns, cycle by cycle. After a failure the rest is NaN (counts: 0).
+    """The result of `simulate`, cycle by cycle. After a failure the rest is NaN (counts: 0).
 
     Under `vmap` every array has the batch axes in front. Numbers are in the machine's units (see
     `AbstractMachine.units`): those of a `Scene` in a, ω and m_C.

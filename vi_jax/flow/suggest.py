@@ -76,7 +76,7 @@ def suggest_method(
     cycles: int = 20,
     lanes: int = 256,
 ) -> Suggestion:
-    """The fastest method that keeps to an error, from a short calibration on the machine itself.
+    """Find the fastest method within an error, by a short calibration on the machine itself.
 
     Takes a few seconds, most of it compiling. Of a few methods of each kind it measures the
     error against `ExactFlight` where that applies and else against `Adaptive` at its tightest, and

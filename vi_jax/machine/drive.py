@@ -23,11 +23,11 @@ _WITHOUT = {
 
 
 class AbstractDrive(Shown):
-    """What turns the crank of a `Scene`.
+    """The drive of the crank of a `Scene`.
 
-    A drive of one's own is a subclass that says how body and shaft move (`field`) and of which
-    class its states are. Their components are `Y` and `V` of the body, then the drive's own: the
-    speed of the crank `W` is one of them, unless `fixed_speed` gives it.
+    A subclass defines the motion of body and shaft (`field`) and the class of its states. Their
+    components are `Y` and `V` of the body, then those of the drive: the crank speed `W` is one of
+    them, unless `fixed_speed` returns it.
     """
 
     state: ClassVar[type]

@@ -82,7 +82,7 @@ def cycle_map(
     method: MethodLike = None,
     section: Any = None,
 ) -> CycleMap:
-    """The Poincaré map of `machine` over a number of drive cycles.
+    """Return the Poincaré map of `machine` over a number of drive cycles.
 
     **Arguments:**
 

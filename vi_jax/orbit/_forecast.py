@@ -32,7 +32,7 @@ _ENTRIES = 24
 
 
 class SCENARIOS(NamedEnumeration):
-    """What follows a grazing, on the side of the parameter on which impacts appear."""
+    """Scenarios beyond a grazing, on the side of the parameter on which impacts appear."""
 
     persistence = "the motion goes on and stays stable, now with the impact"
     nonsmooth_fold = (

@@ -63,7 +63,7 @@ class ClosedFormOrbits(Shown):
 
 
 def closed_form_orbits(scene: Scene, *, cycles: int | Int[Array, ""] = 1) -> ClosedFormOrbits:
-    """All motions of an ideal scene with one impact per `cycles` drive cycles (Eq. 14 to 21).
+    """Return all motions of an ideal scene with one impact in `cycles` drive cycles (Eq. 14 to 21).
 
     **Arguments:** a `Scene` with an `IdealDrive`, a `CosineCrank` and one stop on the right,
     whose numbers are scalars, traced or not (for arrays of numbers use `jax.vmap`); the period of

@@ -30,7 +30,7 @@ def in_one_line(orbit: Orbit) -> str:
 
 
 def distinct_orbits(orbits: Orbit, *, tolerance: float = 1e-6) -> tuple[Orbits, np.ndarray]:
-    """The different motions among many searches.
+    """Return the different motions among many searches.
 
     Motions that differ only by the cycle on which they are observed count as one, and a motion
     found with a multiple of its period counts with its least period. Searches that found nothing

@@ -8,7 +8,7 @@ from ..flow import NamedEnumeration
 
 
 class STABILITY(NamedEnumeration):
-    """Whether a periodic motion is stable, or how it lost its stability."""
+    """The stability of a periodic motion, or the way in which it was lost."""
 
     stable = "stable"
     fold = "unstable: a real multiplier above 1 (past a fold or where branches cross)"

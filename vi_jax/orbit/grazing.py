@@ -36,8 +36,8 @@ _VANISHES = 1e-14
 
 
 class Grazing(Summarized):
-    """What a grazing leads to, from `grazing`. Arrays of the host, in the machine's units; of m
-    touches in a period, usually one, and n states."""
+    """The attractor beyond a grazing, from `grazing`. Arrays of the host, in the machine's units,
+    for m touches in a period (usually one) and n states."""
 
     parameter: str = eqx.field(static=True)
     """Name of the branch's parameter."""
@@ -149,15 +149,14 @@ class Grazing(Summarized):
 def grazing(
     point: SpecialPoint, *, check: bool = True, periods: int = 12, progress: bool = True
 ) -> Grazing:
-    """What a grazing of a branch leads to: its local map, and what that settles on.
+    """Predict the attractor beyond a grazing of a branch from its local map.
 
-    The motion that grazes has a smooth section map without the impact. A neighbour that would pass
-    beyond the stop is corrected by the discontinuity mapping (Nordmark 1991; di Bernardo, Budd,
-    Champneys and Kowalczyk 2008): by the root of the depth at a rigid stop. Both are derivatives of
-    what the machine says, whatever it is: rigid, soft and prestressed stops, bodies that meet, an
-    autonomous machine on its section. The map is iterated over decades of the parameter on the side
-    of the impacts, what it settles on is named, and the machine itself is simulated at the same
-    values, from the motion that grazes on, and on the other side. Host-side: not to be traced.
+    The motion that grazes has a smooth section map without the impact. The discontinuity mapping
+    corrects a neighbour that would pass the stop (Nordmark 1991; di Bernardo, Budd, Champneys and
+    Kowalczyk 2008), by the root of the depth at a rigid stop. Both are derivatives of the machine's
+    functions, for rigid, soft and prestressed stops and for autonomous machines. The map is
+    iterated over decades of the parameter and its attractor is named. The machine itself is
+    simulated at the same values, on both sides. Host-side: not to be traced.
 
     **Arguments:**
 

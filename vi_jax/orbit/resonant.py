@@ -23,7 +23,7 @@ class ResonantGrazing(NamedTuple):
 
 
 def resonant_grazings(curve: Boundary, *, periods: int = 3) -> list[ResonantGrazing]:
-    """The points of a curve of grazings at which the motions with one impact in n periods change.
+    """Return the points of a curve of grazings where motions with one impact in n periods change.
 
     The entry eₙ = ∂h·Nⁿ·kick of the local map (see `grazing`) is what an impact adds to the
     distance n periods later. Where it changes its sign, the motion with one impact in n periods

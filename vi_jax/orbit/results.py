@@ -42,7 +42,7 @@ from .floquet import STABILITY, STABILITY_NAMES, stability_of
 
 
 class ORBIT_RESULTS(NamedEnumeration):
-    """How a search for a periodic motion ended; `find_orbit` gives one to each guess."""
+    """The end of a search for a periodic motion, one for each guess of `find_orbit`."""
 
     successful = ""
     smaller_period = "The motion found has a smaller period than was asked for; see `Orbit.cycles`."

@@ -49,7 +49,7 @@ def animate(
     history: bool = True,
     figure: Figure | None = None,
 ) -> "MotionAnimation":
-    """A motion as an animation: the machine moves above its time history.
+    """Animate a motion: the machine moves above its time history.
 
     Shown in a notebook as it is; `animation.save("motion.gif")` writes a file.
 

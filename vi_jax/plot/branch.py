@@ -29,7 +29,7 @@ def plot_branch(
     legend: bool = True,
     **style: Any,
 ) -> Axes:
-    """A branch: stable parts solid, unstable ones dashed, special points marked.
+    """Draw a branch: stable parts solid, unstable ones dashed, special points marked.
 
     Its colour is that of its period, as in all pictures; a motion of two cycles with several
     impacts has another than one with a single impact.
@@ -119,7 +119,7 @@ def _stretches(stable: np.ndarray) -> list[tuple[int, int, bool]]:
 def plot_sweep(
     sweep: Sweep, *, ax: Axes | None = None, y: str | None = None, x: str = "values", **style: Any
 ) -> Axes:
-    """A sweep as dots, one for each value, above the branches in the same axes.
+    """Draw a sweep as dots, one for each value, above the branches in the same axes.
 
     **Arguments:** one sweep; `ax`; names of its arrays with a number for each value, as for
     `plot_branch`; options of `Axes.plot`.
@@ -144,7 +144,7 @@ def plot_boundary(
     curve: Boundary, *, ax: Axes | None = None, special: bool = True, legend: bool = True,
     **style: Any,
 ) -> Axes:  # fmt: skip
-    """A boundary curve in the plane of its two parameters, points of codimension two marked.
+    """Draw a boundary curve in its two parameters, with points of codimension two.
 
     Its colour is that of the motion's period, its dash shows what happens there: solid a grazing,
     dashed a period doubling, dash-dotted a fold, with two dots a Neimark–Sacker bifurcation, dotted
@@ -194,7 +194,7 @@ def extreme_name(
 
 
 def axis_name(name: str, units: Mapping[str, str]) -> str:
-    """The field's symbol for a number of a machine, with its unit unless it is a ratio."""
+    """Return the symbol of a parameter, with its unit unless it is a ratio."""
     symbols = {
         "frequency_ratio": "frequency ratio ζ",
         "restitution": "restitution k",

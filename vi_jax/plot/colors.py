@@ -75,7 +75,7 @@ DASHES = {
 
 
 def color_of(cycles: int, impacts: float | int | None = None) -> str:
-    """Colour of a motion of this period in drive cycles, or of a regime without one.
+    """Return the colour of a motion of this period in drive cycles, or of a regime without one.
 
     With the impacts in a period, a motion without any is paler, and one of two cycles with more
     than one has a colour of its own.
@@ -101,7 +101,7 @@ def shades(color: str) -> Iterator[str]:
 
 
 def paler(color: str, part: float | int = 0.45) -> str:
-    """The colour mixed with white; `part` is the share of the colour, from 0 to 1."""
+    """Return the colour mixed with white; `part` is the share of the colour, from 0 to 1."""
     return _hex(part * np.array(to_rgb(color)) + 1 - part)
 
 
@@ -111,7 +111,7 @@ def _hex(rgb: np.ndarray) -> str:
 
 
 def mark_of(kind: str, **style: Any) -> Line2D:
-    """How a special point of this kind looks in a legend."""
+    """Return the marker of a special point of this kind."""
     return Line2D([], [], **{**mark_style(kind), "label": kind, **style})
 
 

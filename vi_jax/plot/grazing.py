@@ -26,7 +26,7 @@ _NAMED = 8
 def plot_grazing(
     found: Grazing, *, ax: Axes | None = None, legend: bool = True, **style: Any
 ) -> Axes:
-    """What the local map of a grazing settles on, over what the machine does.
+    """Draw the attractor of a local map above the simulated motions of the machine.
 
     Along the axis is the parameter, less its value at the grazing, scaled by the square root, so
     that what grows as the root lies between straight lines; upwards the first coordinate on the

@@ -24,7 +24,7 @@ _NAMED = 8
 def plot_integrity(
     profile: IntegrityProfile, *, y: str = "share", ax: Axes | None = None, legend: bool = True
 ) -> Axes:
-    """An erosion profile: the share or the integrity of each motion over the parameter.
+    """Draw an erosion profile: the share or the integrity of each motion over the parameter.
 
     A line has the colour of its motion's period, as in all pictures; further motions of the same
     kind have other shades of it. Where a line falls off, the motion loses its basin although it

@@ -12,8 +12,9 @@ from .motion import new_axes
 
 
 def plot_manifold(found: Manifold, *, ax: Axes | None = None, **style: Any) -> Axes:
-    """A manifold of a saddle on the section, over position and velocity: a stable one in blue, an
-    unstable one in red, the saddle as a cross.
+    """Draw a manifold of a saddle over position and velocity: stable blue, unstable red.
+
+    The saddle is a cross.
 
     **Arguments:** what `manifold` found; `ax`, axes to draw into, as those of `plot_basins`, a new
     figure if left out; options of `Axes.plot`.

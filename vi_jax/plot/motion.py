@@ -41,7 +41,7 @@ def plot_history(
     coordinate: int = 0,
     **style: Any,
 ) -> Axes:
-    """Position over the drive's clock, with the stops of `machine` as green lines (dashed if soft).
+    """Draw position over the drive's clock, with the stops of `machine` as lines (dashed if soft).
 
     **Arguments:**
 
@@ -132,7 +132,7 @@ def plot_phase_portrait(
     coordinate: int = 0,
     **style: Any,
 ) -> Axes:
-    """Velocity over position, with the stops as green lines (dashed if soft), sections as dots.
+    """Draw velocity over position, with the stops as lines (dashed if soft) and sections as dots.
 
     **Arguments:** as for `plot_history`; `sections` marks the state after each whole cycle. An
     impact is the vertical line along the stop from V to -k V (if the run has an impact log).

@@ -15,7 +15,7 @@ from .motion import new_axes
 def plot_multipliers(
     orbits: Orbit | Sequence[Orbit], *, ax: Axes | None = None, **style: Any
 ) -> Axes:
-    """Floquet multipliers in the complex plane with the unit circle: stable if all lie inside.
+    """Draw Floquet multipliers in the complex plane with the unit circle: stable if all lie inside.
 
     **Arguments:** an `Orbit` (or a batch of them, or a list); `ax`, axes to draw into, a new
     figure if left out; options of `Axes.plot`.

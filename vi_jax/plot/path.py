@@ -41,7 +41,7 @@ def motion_path(
     window: tuple[float | int, float | int] | None = None,
     coordinate: int = 0,
 ) -> MotionPath:
-    """The path of one sampled motion.
+    """Return the path of one sampled motion.
 
     **Arguments:** a `Run` simulated with `samples=...` (or its `Samples`); with the `machine`, the
     impacts logged (`impact_log=...`) enter as two points each, before and after the impact, so

@@ -44,7 +44,7 @@ def plot_regimes(
     y: str | None = None,
     legend: bool = True,
 ) -> Axes:
-    """A map of the regimes of motion over two axes of a scan.
+    """Draw a map of the regimes of motion over two axes of a scan.
 
     Each cell has the colour of its period, up to 8 drive cycles and beyond; chaotic, transiently
     chaotic, unsettled and failed lanes have greys of their own. Where the data hold `impacts`,
@@ -118,7 +118,7 @@ def _word_of(data: xr.Dataset) -> Callable[[int], str]:
 
 
 def plot_basins(found: Basins, *, ax: Axes | None = None) -> Axes:
-    """Basins of attraction over two parts of the start, with the motions' section points.
+    """Draw basins of attraction over two components of the start, with the motions' section points.
 
     A grid of starts is drawn as an image, random starts as dots. The legend gives each motion's
     period, its impacts and its part of the starts. A basin has the colour of its motion's period,

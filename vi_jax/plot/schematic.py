@@ -25,7 +25,7 @@ def sketch(machine: AbstractMachine, pen: Pen, state: State, phase: float) -> No
 def plot_sketch(
     machine: AbstractMachine, state: State = None, *, phase: Any = None, ax: Axes | None = None
 ) -> Axes:
-    """A schematic of a machine with the names of its parts.
+    """Draw a schematic of a machine with the names of its parts.
 
     A machine of your own is drawn by its method `sketch(pen, state, phase)`, if it has one: `pen`
     (a `vi_jax.plot.Pen`) draws bodies, springs and walls. Otherwise its bodies are drawn between

@@ -32,7 +32,7 @@ _RECURS, _NEAR = 1e-3, 10.0
 
 
 class EdgeState(Summarized):
-    """What a motion on the boundary between two basins settles on."""
+    """The attractor of motions on the boundary between two basins."""
 
     orbit: Orbit | None
     """The periodic motion, unstable, by `find_orbit`; `None` where none was found."""
@@ -69,7 +69,7 @@ def edge_state(
     method: MethodLike = None,
     progress: bool = True,
 ) -> EdgeState:
-    """The edge state between two starts that settle on different motions.
+    """Find the edge state between two starts that settle on different motions.
 
     The line between the starts is bisected until two on both sides of the boundary are 1e-10 apart;
     these are followed until they are 1e-5 apart, and the line between them is bisected again. What

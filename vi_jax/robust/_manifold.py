@@ -76,7 +76,7 @@ def manifold(
     spacing: float = 0.05,
     progress: bool = True,
 ) -> Manifold:
-    """The stable or unstable manifold of a saddle of a driven machine with two states.
+    """Compute the stable or unstable manifold of a saddle of a driven machine with two states.
 
     The stable manifold, the states from which the machine goes to the saddle, is the boundary of
     basins near it. It is grown from the saddle point by point: on an arc ahead of the last one the

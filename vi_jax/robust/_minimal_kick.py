@@ -108,7 +108,7 @@ def minimal_kick(
     method: MethodLike = None,
     progress: bool = True,
 ) -> MinimalKick:
-    """The smallest kick, a sudden change of the state, after which a stable motion does not return.
+    """Find the smallest kick (jump of the state) after which a stable motion does not return.
 
     It leads onto the boundary of the basin, the stable manifold of an unstable motion. Rays of
     kicks in all directions are simulated, and where each first leaves the basin is bisected; from

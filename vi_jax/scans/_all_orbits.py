@@ -64,8 +64,8 @@ class Searched:
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class AllOrbits(InWords):
-    """The periodic motions that were found from a region of starts, stable and unstable, and what
-    was searched for them."""
+    """Periodic motions found from a region of starts, stable and unstable, and statistics of the
+    search."""
 
     orbits: Orbits
     """The motions, by period and then by least position; each with its multipliers."""

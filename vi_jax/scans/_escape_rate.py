@@ -16,7 +16,7 @@ def escape_rate(
     after: Any = 0.0,
     confidence: Any = 0.95,
 ) -> "xr.Dataset":
-    """The rate at which lanes escape, per cycle, and its interval of confidence.
+    """Estimate the rate at which lanes escape, per cycle, with its confidence interval.
 
     Lanes that do not escape count with the time for which they were watched: the rate is the
     number of escapes over the time of all lanes until then (maximum likelihood for escapes at a

@@ -44,8 +44,8 @@ class Attractor(NamedTuple):
 
 
 class Integrity(NamedTuple):
-    """How far the starts that settle on a motion reach: after Soliman and Thompson (1989), and
-    Lenci and Rega (2003). Distances are in the `scales` asked for."""
+    """Measures of the basin of a motion, after Soliman and Thompson (1989), and Lenci and Rega
+    (2003). Distances are in the given `scales`."""
 
     label: int
     """Which motion: `attractors[label]`."""

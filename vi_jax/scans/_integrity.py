@@ -141,8 +141,7 @@ def integrity_profile(
     progress: bool = True,
     **options: Any,
 ) -> IntegrityProfile:
-    """The basins at each value of one number of the machine, their shares and their integrity: how
-    safe each motion is, and where its basin erodes (the erosion profile).
+    """Compute basins, their shares and their integrity over one parameter (an erosion profile).
 
     All values are one scan, by one compiled program.
 

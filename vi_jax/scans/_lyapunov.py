@@ -53,7 +53,7 @@ def lyapunov(
     rests: bool | None = None,
     progress: bool = True,
 ) -> Lyapunov:
-    """The Lyapunov spectrum of the motion that `start` settles on.
+    """Compute the Lyapunov spectrum of the motion that `start` settles on.
 
     Tangent vectors are carried through the flow and its impacts (the saltation matrix) and made
     orthogonal after each drive cycle (Benettin's method). Rates are averaged with weights that

@@ -49,8 +49,9 @@ def scan(
     cluster: Any = None,
     progress: bool = True,
 ) -> "xr.Dataset":
-    """Simulate every combination of the axes' values and keep what is measured. Other numbers on
-    the axes, in the machine or in `settle` compile nothing again.
+    """Simulate every combination of the axes' values and keep measures of each motion.
+
+    Other values on the axes, in the machine or in `settle` compile nothing again.
 
     **Arguments:**
 

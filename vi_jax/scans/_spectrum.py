@@ -9,7 +9,7 @@ from ..machine import components
 
 
 def spectrum(run: Run, of: str, *, segment: int | None = None) -> "xr.Dataset":
-    """Power spectral density of a part of the state or a quantity of the machine, over frequency.
+    """Compute the power spectral density of a state component or a quantity of the machine.
 
     The samples of each lane are cut into segments one after the other, and the spectra of all
     segments are averaged (Welch 1967, with Hann's window and without overlap, so that the scatter
@@ -20,7 +20,7 @@ def spectrum(run: Run, of: str, *, segment: int | None = None) -> "xr.Dataset":
     **Arguments:**
 
     - `run`: from `simulate` with `samples`, or a batch of them under `vmap`.
-    - `of`: a part of the state (`"V"`) or one of the machine's quantities.
+    - `of`: a state component (`"V"`) or one of the machine's quantities.
     - `segment`: samples in a segment; by default an eighth of the run. Lines closer together than
       some four divisions of its length are not told apart.
 

@@ -56,11 +56,11 @@ def sweep(
     key: Any = None,
     progress: bool = True,
 ) -> Sweep:
-    """Quasi-static sweep: run-up with rising values, close-down with falling ones.
+    """Sweep one parameter slowly: run-up with rising values, close-down with falling ones.
 
-    At each value the motion goes on from where it was at the one before (what the paper calls the
-    continuation method), so that it keeps to its branch until that ends: up and down show
-    hysteresis. Clean under `jit` and `vmap` (over other parameters, starts, or values).
+    At each value the motion continues from its state at the previous one (the paper's continuation
+    method). It keeps to its branch until that ends, so up and down show hysteresis. Works under
+    `jit` and `vmap` (over other parameters, starts, or values).
 
     **Arguments:**
 

@@ -23,7 +23,7 @@ COLUMNS = "y_min", "y_max", "period", "impacts", "frequency_ratio", "impact_spee
 
 
 class Sweep(Summarized):
-    """What a sweep settled on at each value, in their order, in the machine's units (see
+    """The motion at each value of a sweep, in their order, in the machine's units (see
     `AbstractMachine.units`). Under `vmap` batch axes come first."""
 
     parameter: str = eqx.field(static=True)

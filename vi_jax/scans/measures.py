@@ -26,7 +26,7 @@ def _dtype(run: Run) -> Any:
 
 
 class AbstractMeasure(eqx.Module):
-    """What is computed of each lane from the cycles observed, before the next lanes are run."""
+    """A measure: a function of the observed cycles of each lane, computed before the next lanes."""
 
     attributes: ClassVar[About] = {}
     """Attributes of the variables by name, such as `units` and `long_name`; `dims` names the axes

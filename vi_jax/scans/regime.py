@@ -24,8 +24,8 @@ _WANDERS, _ROUNDINGS = 10.0, 64.0
 
 
 class REGIMES(IntEnum):
-    """What stands in `period` for a motion that has none, and in the `label` of basins for a start
-    that ends on none: numbers below zero, which are no periods and no motions."""
+    """Negative values of `period` for motions without one, and of the `label` of basins for starts
+    that settle on no motion."""
 
     chaotic = -1, "chaotic"
     unsettled = -2, "unsettled"

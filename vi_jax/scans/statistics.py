@@ -233,7 +233,7 @@ class Density(_Observed):
 
 
 class Escape(_Observed):
-    """When a quantity leaves an interval for the first time: `escape_cycle`, counted in cycles from
+    """The first time at which a quantity leaves an interval: `escape_cycle`, counted in cycles from
     where observation begins, and `escaped`, whether it does (1) or not (0).
 
     Of a lane that does not, `escape_cycle` is how long it was watched: its time of escape is

@@ -48,7 +48,7 @@ class Stage(NamedTuple):
 
 
 class AbstractMethod(eqx.Module):
-    """What the hybrid step asks of a method."""
+    """The interface of a method to the hybrid step."""
 
     @property
     @abc.abstractmethod

@@ -15,7 +15,7 @@ _PRESETS = {"draft": (6, 1e-6), "standard": (10, 1e-9), "reference": (30, 1e-13)
 
 
 def preset(machine: AbstractMachine | None, name: str = "standard") -> AbstractMethod:
-    """The method of this name for a machine; every argument `method` takes the name itself.
+    """Return the method of this name for a machine; every argument `method` takes the name itself.
 
     **Arguments:** the machine (`None` if it is not known yet), and `"draft"`, `"standard"` or
     `"reference"`.
