@@ -40,8 +40,8 @@ def test_plain_english(page):
     assert not found
 
 
-VERBS = """Animate Compile Compute Draw Estimate Find Follow Label Predict Return Run Simulate Sweep
-Trace""".split()
+VERBS = """Animate Compile Compute Count Draw End Estimate Find Follow Label Predict Return Run
+Simulate Sweep Trace""".split()
 CLAUSES = "What Where When Which How Why".split()
 
 

@@ -257,3 +257,22 @@ def test_a_cycle_that_is_none(cycle):
         ValueError, match=f"`cycle` of a Shaken must be positive .*, but is {cycle}"
     ):
         vi.simulate(machine, start, 1)
+
+
+class Neuron(vi.AbstractMachine):
+    """Leaky integration up to a threshold, of a state that is a dictionary."""
+
+    current: float = 1.5
+    cycle = 1.0
+    events = vi.Reset(
+        lambda m, s, z: z["v"] - 1, lambda m, s, z: {"v": 0.0, "n": z["n"] + 1}, ends_cycle=True
+    )
+
+    def field(self, s, z):
+        return {"v": self.current - z["v"], "n": 0.0}
+
+
+def test_a_reset_of_a_state_that_is_a_dictionary():
+    run = vi.simulate(Neuron(), {"v": 0.0, "n": 0.0}, 3)
+    np.testing.assert_allclose(run.duration, np.log(3), rtol=1e-8)
+    assert run.last["n"] == 3

@@ -116,17 +116,23 @@ def with_components(state: Any, given: Mapping[str, Any], whose: str, *, all_of_
 
     **Raises:** as `like`.
     """
-    if not hasattr(state, "__dict__"):
+    if isinstance(state, Mapping):
+        parts = state
+    elif hasattr(state, "__dict__"):
+        parts = vars(state)
+    else:
         raise TypeError(f"{whose} returned names, but its state has none: {type(state).__name__}.")
-    names = list(vars(state))
+    names = list(parts)
     missing = [x for x in names if x not in given] if all_of_them else []
     extra = [x for x in given if x not in names]
     if missing or extra:
         wrong = f"{missing[0]!r} is missing" if missing else f"there is no {extra[0]!r}"
         raise TypeError(f"{whose} must return the components {', '.join(names)}, but {wrong}.")
-    new = {x: _component(vars(state)[x], given[x], whose) for x in names if x in given}
+    new = {x: _component(parts[x], given[x], whose) for x in names if x in given}
     if isinstance(state, State):
-        return _state(vars(state) | new)
+        return _state({**parts, **new})
+    if isinstance(state, Mapping):
+        return type(state)({**parts, **new})
     return eqx.tree_at(lambda z: [getattr(z, x) for x in new], state, list(new.values()))
 
 
