@@ -20,7 +20,7 @@ from .names import coordinate_by_name
 from .observing import Observed
 from .own import by_default, derived, is_own, says
 from .parts import coordinates_in, listed, other_events, stops_in, switches_in
-from .stop import RigidStop
+from .stop import RigidStop, Wall
 from .words import Worded
 
 

@@ -1,4 +1,4 @@
-"""What ends a cycle where time does not: a turn of an angle, or a velocity that passes zero; and the
+"""What ends a cycle where time does not, a turn of an angle or a velocity that passes zero; and the
 same machine observed at equal intervals instead."""
 
 import copy

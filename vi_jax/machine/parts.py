@@ -76,11 +76,12 @@ def _at(stop: Any, places: dict[Any, int]) -> Any:
 
 
 def _friction_on(stop: RigidStop, number: int, places: dict[Any, int]) -> ContactFriction:
+    rebound = stop.tangential_restitution
     return ContactFriction(
         stop.friction,
         stop=number,
         along=places[stop.along],
-        restitution=stop.tangential_restitution,
+        restitution=0.0 if rebound is None else rebound,
     )
 
 

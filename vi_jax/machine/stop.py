@@ -104,10 +104,10 @@ class RigidStop(Wall, AbstractEvent):
     """μ, Coulomb's coefficient of friction (dimensionless); none by default."""
     along: Any = eqx.field(static=True, default=None, kw_only=True)
     """What names the coordinate that the body slips along."""
-    tangential_restitution: Float[Array, "..."] = eqx.field(
-        default=0.0, kw_only=True, converter=real("tangential_restitution")
+    tangential_restitution: Float[Array, "..."] | None = eqx.field(
+        default=None, kw_only=True, converter=optional_real("tangential_restitution")
     )
-    """Coefficient of restitution along the stop (dimensionless)."""
+    """Coefficient of restitution along the stop (dimensionless); 0 by default."""
     coordinate: int = eqx.field(static=True, default=0, kw_only=True)
     """Index into the machine's `coordinates`."""
     modes: Callable[..., Any] | None = eqx.field(static=True, default=None, kw_only=True)

@@ -1,0 +1,166 @@
+"""Contacts that act by themselves: machines in a few lines, beside numbers from SciPy, which was
+taken from event to event (rtol 1e-12), or in closed form."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+from scipy.integrate import solve_ivp
+
+
+class Oscillator(vi.AbstractMachine):
+    omega: float = 0.9
+    gap: float = 1.0
+    restitution: float = 0.7
+
+    @property
+    def cycle(self):
+        return 2 * jnp.pi / self.omega
+
+    @property
+    def contacts(self):
+        return vi.RigidStop(self.gap, self.restitution, on=("x", "u"))
+
+    def field(self, t, z):
+        return dict(x=z.u, u=jnp.cos(self.omega * t) - z.x - 0.1 * z.u)
+
+    def start(self):
+        return vi.State(x=0.0, u=0.0)
+
+
+class Block(vi.Mechanical):
+    """A block that is dropped on a floor and pushed to and fro."""
+
+    q = ("x", "y")
+    mass = (1.0, 1.0)
+    cycle = 2 * jnp.pi
+    contacts = vi.RigidStop(0.0, 0.4, "left", on="y", friction=0.3, along="x")
+
+    def force(self, t, q, v):
+        return dict(x=0.5 * jnp.cos(t), y=-1.0)
+
+
+class Stack(vi.Mechanical):
+    """A body on rough ground, with another one on it."""
+
+    q = ("a", "b")
+    mass = (1.0, 1.0)
+    cycle = 2 * jnp.pi / 0.3
+    contacts = (vi.DryFriction(0.4, on="a"), vi.DryFriction(0.1, on=lambda q: q.b - q.a))
+
+    def force(self, t, q, v):
+        return dict(a=jnp.cos(0.3 * t) - q.a, b=0.0)
+
+
+class Backlash(vi.AbstractMachine):
+    """A mass between two soft flanks."""
+
+    play: float = 0.2
+
+    @property
+    def contacts(self):
+        half = self.play / 2
+        return (
+            vi.SoftStop(half, 50.0, damping=0.5, on=("x", "u")),
+            vi.SoftStop(half, 50.0, damping=0.5, side="left", on=("x", "u")),
+        )
+
+    cycle = 2 * jnp.pi
+
+    def field(self, t, z):
+        return dict(x=z.u, u=0.5 * jnp.cos(t) + 0.2 - 0.1 * z.u)
+
+
+class Furnace(vi.AbstractMachine):
+    cycle = 1.0
+    modes = dict(on=0.0)
+    events = (
+        vi.Reset(lambda m, t, z, on: 294 - z.T, modes=lambda m, t, z, on: 1.0),
+        vi.Reset(lambda m, t, z, on: z.T - 296, modes=lambda m, t, z, on: 0.0),
+    )
+
+    def field(self, t, z, on):
+        return dict(T=25 * on - 2 * (z.T - 285))
+
+
+def numbers(state):
+    return np.array([float(x) for x in jax.tree.leaves(state)])
+
+
+def test_an_oscillator_with_a_stop():
+    machine = Oscillator()
+    run = vi.simulate(machine, machine.start(), 50)
+    np.testing.assert_allclose(numbers(run.last), [0.970046817, -1.215965305], atol=2e-9)
+    assert int(run.impacts.sum()) == 50
+    slope = jax.grad(lambda gap: vi.simulate(Oscillator(gap=gap), machine.start(), 3).last.x)
+    apart = [vi.simulate(Oscillator(gap=1 + h), machine.start(), 3).last.x for h in (1e-6, -1e-6)]
+    assert float(slope(1.0)) == pytest.approx(float(apart[0] - apart[1]) / 2e-6, abs=1e-6)
+
+
+def test_friction_on_a_floor_that_a_body_hits():
+    machine = Block()
+    run = vi.simulate(machine, machine.at(y=0.1, v=dict(x=0.5)), 10)
+    assert int(run.impacts.sum()) == 13
+    np.testing.assert_allclose(numbers(run.last), [0.952123292, 0, 0.121811435, 0], atol=2e-8)
+
+
+def test_two_frictions_that_stick_together():
+    """Which bodies stick is found together: one alone would be held by what the other exerts."""
+    machine = Stack()
+    run = vi.simulate(machine, machine.at(a=0.1), 2, event_log=16)
+    assert bool(run.successful) and int((run.event_log.kind >= 0).sum()) == 24
+    np.testing.assert_allclose([run.last.a, run.last.b], [0.940773005, 0.534904081], atol=1e-8)
+
+
+def test_soft_flanks_push_by_themselves():
+    """Beside SciPy, which steps across the kinks of the force."""
+
+    def pushed(depth, rate):
+        return 50.0 * depth + 0.5 * np.sqrt(50.0) * rate if depth > 0 else 0.0
+
+    def field(t, z):
+        x, u = z
+        push = pushed(-x - 0.1, -u) - pushed(x - 0.1, u)
+        return u, 0.5 * np.cos(t) + 0.2 - 0.1 * u + push
+
+    ours = vi.simulate(Backlash(), vi.State(x=0.0, u=0.0), 5, method=vi.Adaptive(rtol=1e-10))
+    theirs = solve_ivp(field, (0, 10 * np.pi), (0.0, 0.0), "DOP853", rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(numbers(ours.last), theirs.y[:, -1], atol=1e-8)
+
+
+def test_a_furnace_with_two_thresholds():
+    run = vi.simulate(Furnace(), vi.State(T=300.0), 4)
+    assert float(run.last.T) == pytest.approx(294.497730558, abs=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("field", "message"),
+    [
+        (lambda z: dict(x=z.u), "must return the components x, u, but 'u' is missing"),
+        (lambda z: dict(x=z.u, u=0.0, w=1.0), "but there is no 'w'"),
+        (lambda z: dict(x=z.u, u=z.w), "no component 'w'; it has x, u"),
+    ],
+)
+def test_names_that_are_wrong_are_named(field, message):
+    class Wrong(Oscillator):
+        def field(self, t, z):
+            return field(z)
+
+    with pytest.raises((TypeError, AttributeError), match=message):
+        vi.simulate(Wrong(), vi.State(x=0.0, u=0.0), 1)
+
+
+def test_a_state_is_a_pytree_of_names():
+    state = vi.State(x=1.0, v=vi.State(x=2.0))
+    assert jax.tree.map(lambda x: 2 * x, state) == vi.State(x=2.0, v=vi.State(x=4.0))
+    assert state.replace(x=3.0).x == 3.0 and state.x == 1.0
+    assert repr(state) == "State(x=1, v=State(x=2))"
+    for wrong, error in (
+        (lambda: state.replace(y=1.0), TypeError),
+        (lambda: state.y, AttributeError),
+        (lambda: setattr(state, "x", 2.0), AttributeError),
+        (lambda: vi.State(replace=1.0), ValueError),
+    ):
+        with pytest.raises(error):
+            wrong()

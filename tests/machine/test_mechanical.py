@@ -1,0 +1,239 @@
+"""Machines of masses beside SciPy from event to event, the paper's own, and closed forms."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+
+CLOSE = vi.Adaptive(rtol=1e-12)
+
+
+class Pair(vi.Mechanical):
+    """Two bodies that collide, and a wall."""
+
+    q = ("left", "right")
+    mass = (1.0, 2.0)
+    restitution: float = 0.7
+    cycle = 2 * jnp.pi
+
+    def force(self, t, q, v):
+        left = jnp.cos(t) - q.left - 0.5 - 0.1 * v.left
+        return dict(left=left, right=0.3 - q.right - 0.1 * v.right)
+
+    @property
+    def contacts(self):
+        return (
+            vi.RigidStop(0.0, self.restitution, on=lambda q: q.left - q.right),
+            vi.RigidStop(1.0, self.restitution, on="right"),
+        )
+
+
+class SliderCrank(vi.Mechanical):
+    """The machine of the paper in SI units, with its motor."""
+
+    q = ("y", "phi")
+    m_C: float = 0.35
+    m_B: float = 0.2
+    k0: float = 9 * jnp.pi**2
+    c: float = 0.5
+    a: float = 0.04
+    J: float = 0.06
+    T0: float = 10.0
+    kappa: float = 1.1
+    gap: float = 0.08
+    restitution: float = 0.5
+    cycle = vi.turn_of("phi")
+
+    def mass(self, q):
+        return self.m_C, self.J + self.m_B * (self.a * jnp.sin(q.phi)) ** 2
+
+    def force(self, t, q, v):
+        spring = self.k0 * (q.y - self.a * jnp.cos(q.phi))
+        speed = self.kappa * jnp.sqrt(self.k0 / self.m_C)
+        motor = self.kappa * self.T0 * (1 - v.phi / speed)
+        return dict(y=-spring - self.c * v.y, phi=motor - spring * self.a * jnp.sin(q.phi))
+
+    @property
+    def contacts(self):
+        return vi.RigidStop(self.gap, self.restitution, on="y")
+
+    def start(self):
+        return self.at(v=dict(phi=15.0))
+
+
+class Rotor(vi.Mechanical):
+    """An unbalanced motor on a structure with a stop."""
+
+    q = ("x", "phi")
+    unbalance: float = 0.1
+    cycle = 60 * jnp.pi
+    contacts = vi.RigidStop(0.3, 0.8, on="x")
+
+    def mass(self, q):
+        across = -self.unbalance * jnp.sin(q.phi)
+        return [[1.0, across], [across, 1.0]]
+
+    def force(self, t, q, v):
+        return dict(x=-q.x - 0.1 * v.x, phi=0.1 * (1.3 - v.phi))
+
+
+def test_two_bodies_and_a_wall():
+    machine = Pair()
+    run = vi.simulate(machine, machine.at(left=-0.5, right=0.3), 10)
+    assert int(run.impacts.sum()) == 29
+    z = run.last
+    wanted = [0.457113976, 0.698178941, 0.119586666, 1.344958219]
+    np.testing.assert_allclose([z.left, z.right, z.v.left, z.v.right], wanted, atol=2e-9)
+
+
+def test_an_unbalanced_motor_on_a_structure():
+    """Impacts jerk the shaft, since the masses say so; what they take is the energy lost."""
+    machine = Rotor()
+    run = vi.simulate(machine, machine.at(v=dict(phi=1.3)), 1)
+    z = run.last
+    wanted = [-0.26480944, 224.81444031, 0.26836301, 1.19184148]
+    np.testing.assert_allclose([z.x, z.phi, z.v.x, z.v.phi], wanted, atol=2e-8)
+    assert int(run.impacts.sum()) == 35
+
+
+def test_the_machine_of_the_paper():
+    """Beside `Scene` in its own units, in both clocks: states, energy of impacts, orbit."""
+    parameters, machine = vi.Parameters(control=1.1), SliderCrank()
+    scene, omega = parameters.scene(drive="motor"), float(parameters.natural_frequency)
+    start = scene.start(W=15.0 / omega)
+    ours = vi.simulate(machine, machine.start(), 60, method=CLOSE)
+    length, speed = 0.04, 0.04 * omega
+    for clock in ("phase", "time"):
+        theirs = vi.simulate(scene, start, 60, method=CLOSE, clock=clock)
+        assert int(theirs.impacts.sum()) == int(ours.impacts.sum()) > 50
+        z, w = ours.sections, theirs.sections
+        np.testing.assert_allclose(z.y, length * w.Y, atol=1e-11)
+        np.testing.assert_allclose(z.v.y, speed * w.V, atol=1e-10)
+        np.testing.assert_allclose(z.v.phi, omega * w.W, atol=1e-10)
+        lost = 0.35 * speed**2 * theirs.impact_energy
+        np.testing.assert_allclose(ours.impact_energy, lost, atol=1e-10)
+    np.testing.assert_allclose(ours.frequency_ratio, omega * theirs.frequency_ratio, rtol=1e-10)
+
+
+@pytest.mark.slow
+def test_a_motor_counts_its_turns_in_every_verb():
+    """From rest, and on its orbit, whose multipliers are those of the phase clock."""
+    parameters, machine = vi.Parameters(control=1.1), SliderCrank()
+    scene, omega = parameters.scene(drive="motor"), float(parameters.natural_frequency)
+    rest = vi.simulate(machine, machine.at(), 4)
+    np.testing.assert_allclose(rest.duration, [0.457, 0.363, 0.361, 0.361], atol=5e-4)
+    last = vi.simulate(machine, machine.start(), 1, settle=200).last
+    orbit = vi.find_orbit(machine, last, throw=True)
+    theirs = vi.simulate(scene, scene.start(W=15.0 / omega), 1, settle=200).last
+    wanted = vi.find_orbit(scene, theirs, throw=True)
+    assert float(orbit.duration) == pytest.approx(float(wanted.duration) / omega, rel=1e-9)
+    found, other = (np.sort(abs(x.multipliers))[::-1] for x in (orbit, wanted))
+    np.testing.assert_allclose(found[:3], other, atol=1e-8)
+    branch = vi.continue_orbit(
+        orbit, parameter="kappa", bounds=(1.09, 1.11), max_step=0.2, progress=False
+    )
+    assert branch.ends == ("bounds", "bounds") and bool(branch.stable.all())
+    exponents = vi.lyapunov(machine, orbit.state, 100, progress=False).exponents
+    decay = np.log(found[:3]) / float(orbit.duration)
+    np.testing.assert_allclose(exponents, [0, *decay], rtol=2e-2, atol=1e-2)
+
+
+class Pendulums(vi.Mechanical):
+    """A pendulum that hangs on another one, whose bob strikes a wall."""
+
+    q = ("a", "b")
+    m: float = 0.7
+    cycle = 2.0
+
+    def mass(self, q):
+        across = self.m * jnp.cos(q.a - q.b)
+        return [[1.0 + self.m, across], [across, self.m]]
+
+    def force(self, t, q, v):
+        return dict(a=-(1 + self.m) * jnp.sin(q.a), b=-self.m * jnp.sin(q.b))
+
+    @property
+    def contacts(self):
+        return vi.RigidStop(0.5, 1.0, on=lambda q: jnp.sin(q.a) + jnp.sin(q.b))
+
+
+def test_masses_that_depend_on_all_coordinates_and_a_curved_gap():
+    """Energy is kept in flight and by impacts that lose none, and what they lose is written down;
+    in an impact the velocity of the gap alone is reversed, in the measure of the masses."""
+    machine = Pendulums()
+
+    def energy(z):
+        kinetic = 0.5 * (1 + machine.m) * z.v.a**2 + 0.5 * machine.m * z.v.b**2
+        kinetic += machine.m * jnp.cos(z.a - z.b) * z.v.a * z.v.b
+        return kinetic - (1 + machine.m) * jnp.cos(z.a) - machine.m * jnp.cos(z.b)
+
+    start = machine.at(a=-0.9, b=-0.4)
+    run = vi.simulate(machine, start, 20, method=CLOSE)
+    assert int(run.impacts.sum()) > 6
+    np.testing.assert_allclose(jax.vmap(energy)(run.sections), energy(start), atol=1e-9)
+
+    class Loses(Pendulums):
+        @property
+        def contacts(self):
+            return vi.RigidStop(0.5, 0.6, on=lambda q: jnp.sin(q.a) + jnp.sin(q.b))
+
+    run = vi.simulate(Loses(), start, 5, method=CLOSE)
+    lost = energy(start) - jax.vmap(energy)(run.sections)
+    assert float(lost[-1]) > 0.1
+    np.testing.assert_allclose(jnp.cumsum(run.impact_energy), lost[1:], atol=1e-9)
+
+
+def test_a_mass_matrix_of_three():
+    """A row of three bodies by its matrix, and by the coordinates in which it is diagonal."""
+
+    class Row(vi.Mechanical):
+        q = ("x", "y", "z")
+        mass = (1.0, 2.0, 3.0)
+        cycle = 2 * jnp.pi
+        contacts = (vi.RigidStop(0.1, 0.5, on="z"), vi.DryFriction(0.2, on=lambda q: q.y - q.x))
+
+        def force(self, t, q, v):
+            return dict(x=jnp.cos(t) - q.x, y=-q.y, z=0.5 * jnp.sin(t) - q.z)
+
+    class Relative(vi.Mechanical):
+        """The same by x, y - x, z - y."""
+
+        q = ("x", "r", "s")
+        mass = ((6.0, 5.0, 3.0), (5.0, 5.0, 3.0), (3.0, 3.0, 3.0))
+        cycle = 2 * jnp.pi
+        contacts = (
+            vi.RigidStop(0.1, 0.5, on=lambda q: q.x + q.r + q.s),
+            vi.DryFriction(0.2, on="r"),
+        )
+
+        def force(self, t, q, v):
+            y, z = q.x + q.r, q.x + q.r + q.s
+            x, y, z = jnp.cos(t) - q.x, -y, 0.5 * jnp.sin(t) - z
+            return dict(x=x + y + z, r=y + z, s=z)
+
+    row, other = Row(), Relative()
+    one = vi.simulate(row, row.at(y=0.3, z=-0.2), 6, method=CLOSE)
+    two = vi.simulate(other, other.at(r=0.3, s=-0.5), 6, method=CLOSE)
+    z = two.sections
+    assert int(one.impacts.sum()) == int(two.impacts.sum()) > 5
+    np.testing.assert_allclose(one.sections.x, z.x, atol=1e-9)
+    np.testing.assert_allclose(one.sections.y, z.x + z.r, atol=1e-9)
+    np.testing.assert_allclose(one.sections.z, z.x + z.r + z.s, atol=1e-9)
+    np.testing.assert_allclose(one.impact_energy, two.impact_energy, atol=1e-9)
+
+
+def test_wrong_masses_and_names_are_told():
+    class Wrong(Pair):
+        mass = (1.0, 2.0, 3.0)
+
+    with pytest.raises(ValueError, match="`mass` of a Wrong must be one for each of its 2"):
+        vi.simulate(Wrong(), Wrong().at(), 1)
+    with pytest.raises(ValueError, match="'up' is none of the coordinates left, right"):
+        Pair().at(up=1.0)
+
+    class Named(Pair):
+        contacts = vi.RigidStop(0.0, 0.5, on="up")
+
+    with pytest.raises(ValueError, match="`on` of a contact must be one of the coordinates"):
+        vi.simulate(Named(), Named().at(), 1)
