@@ -26,6 +26,15 @@ def test_restitution_does_not_depend_on_the_speed(exponent, restitution):
     np.testing.assert_allclose(found, restitution, atol=1e-9)
 
 
+def test_a_body_that_leaves_where_its_motion_begins_does_not_touch():
+    """At the place of the stop: out it flies freely, in it is thrown back."""
+    stop = vi.SoftStop(0.0, 100.0, restitution=0.5)
+    run = jax.vmap(lambda v: thrown(stop, v, jnp.asarray(1.0), event_log=2))(jnp.array([-1.0, 1.0]))
+    np.testing.assert_allclose(run.last.Y[0], -1.0, rtol=1e-14)
+    assert float(run.last.V[1]) == pytest.approx(-0.5, abs=1e-9)
+    assert jnp.sum(run.event_log.kind >= 0, axis=(1, 2)).tolist() == [0, 1]
+
+
 LAWS = [
     {"damping": 1.2},
     {"damping": 1.2, "exponent": 1.5},
