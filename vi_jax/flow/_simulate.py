@@ -54,11 +54,10 @@ def simulate(
     """Simulate `machine` from `start` for a number of drive cycles.
 
     Works under `jit`, under `vmap` over any leaf of machine and start, and is differentiable
-    through impacts to any order, forward and in reverse. A gradient by more than four numbers keeps
-    the motion and goes back along it, for about five simulations however many numbers it is by; by
-    fewer, on XLA's backend, or where a step has no transpose (a loop of varying length within it)
-    it runs forward along each number. Outside of a transformation it compiles itself, once for each
-    structure.
+    through impacts to any order, forward and in reverse. A gradient with respect to more than four
+    numbers goes back along the kept motion and costs about five simulations. Otherwise, on XLA's
+    backend, or if a step has no transpose (a loop of varying length), it runs forward along each
+    number. Outside of a transformation it compiles itself, once for each structure.
 
     **Arguments:**
 

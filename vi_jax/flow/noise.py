@@ -22,31 +22,30 @@ from ._random import normal_pair, threefry
 class WhiteNoise(eqx.Module):
     """White noise on accelerations: dV = … dt + σ dW for the velocities that are named.
 
-    It acts as impulses. At `impulses` instants of each cycle, evenly spaced, the last at its end,
-    a velocity jumps by σ √h N(0, 1), with h the time between two instants and a number of its own
-    for each instant and component. Between them the motion is free of noise, so that impacts,
-    extremes and derivatives along the path hold as without it. The mean gain of energy by the noise
-    is exact; what is left of the finite number of impulses falls with h, so that results from two
-    numbers of impulses can be extrapolated.
+    It acts as impulses. At `impulses` instants of each cycle, evenly spaced, the last at its end, a
+    velocity jumps by σ √h N(0, 1), with h the time between two instants and an independent number
+    for each instant and component. The motion between impulses has no noise, so impacts, extremes
+    and derivatives along the path hold as without it. The mean gain of energy is exact. Other
+    errors fall with h, so results from two numbers of impulses can be extrapolated.
 
     For machines whose cycles end with their drive's: at equal readings of the clock that counts
-    them. Where these are not at equal times (a motor) h is the time that has passed since the last
-    impulse. A machine without a drive is shaken as `machine.observed_every(interval)`. Machines
-    with resets, and events of their own, are refused. An impulse may set a body free that rests or
-    sticks; the logs of events list no impulses.
+    them. If these are not at equal times (a motor), h is the time since the last impulse. A machine
+    without a drive is shaken as `machine.observed_every(interval)`. Machines with resets or
+    user-defined events are refused. An impulse may free a body that rests or sticks; the logs of
+    events list no impulses.
 
-    States on record points are those behind their impulses; `samples` of a run must divide
-    `impulses`. Each lane of a batch has a key of its own (`jax.random.split`). A lane's numbers
-    depend on its key and the cycle and instant alone, not on the batch, the method or `samples`;
-    cycles are counted from the start, those of `settle` too. A run that goes on from another's end
-    takes another key (`jax.random.fold_in`).
+    States on record points are those after their impulses; `samples` of a run must divide
+    `impulses`. Each lane of a batch has another key (`jax.random.split`). A lane's numbers depend
+    on its key and the cycle and instant alone, not on the batch, the method or `samples`; cycles
+    are counted from the start, those of `settle` too. A run that continues another one takes
+    another key (`jax.random.fold_in`).
 
     **Arguments:**
 
     - `amplitudes`: σ of each velocity by its name in the state, as `{"V": 0.5}`, in the units of
-      velocity over √time. An array that is part of a state gets numbers of its own for each entry.
-      In place of a number a function of the state gives σ where an impulse finds it: dV = … dt +
-      σ(state) dW in Itô's sense. It is a part of the program: define it once.
+      velocity over √time. Each entry of an array gets independent numbers. A function of the state
+      gives σ just before an impulse: dV = … dt + σ(state) dW in Itô's sense. It is part of the
+      program: define it once.
     - `impulses`: impulses in a cycle, at least 1; static.
 
     **Raises:** `TypeError` or `ValueError` for amplitudes that are not real, not finite or

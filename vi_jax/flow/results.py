@@ -199,7 +199,7 @@ class EventLog(Summarized):
 class Errors(Shown):
     """Estimated errors of a run: its differences to a run by the method's `tighter` one.
 
-    NaN where either run failed. Where a motion is chaotic they grow until they are as large as the
+    NaN where either run failed. In a chaotic motion they grow until they are as large as the
     motion. Under `vmap` batch axes come first.
     """
 
@@ -279,8 +279,8 @@ class Run(Summarized):
 
     @property
     def last(self) -> State:
-        """The state on the last section: a start to go on from, or a guess for `find_orbit`. Of a
-        machine with modes of its own it is a `HybridState`, which has them too."""
+        """The state on the last section: a start to continue from, or a guess for `find_orbit`. For
+        a machine with discrete modes it is a `HybridState`, which has them too."""
         # Batch axes are in front, those of an array in the state behind; how many there are in
         # front is shown by a number for each lane.
         place = (*[slice(None)] * self.steps.ndim, -1)

@@ -78,10 +78,10 @@ def suggest_method(
 ) -> Suggestion:
     """Find the fastest method within an error, by a short calibration on the machine itself.
 
-    Takes a few seconds, most of it compiling. Of a few methods of each kind it measures the
-    error against `ExactFlight` where that applies and else against `Adaptive` at its tightest, and
-    the time of those that keep to it, on lanes that differ in their first velocity. Where the
-    machine is stiff implicit ones are tried instead of those of fixed steps.
+    Takes a few seconds, most of it compiling. A few methods of each kind are compared with
+    `ExactFlight`, or else with `Adaptive` at its tightest, and those within the error are timed, on
+    lanes that differ in their first velocity. If the machine is stiff, implicit methods replace
+    those of fixed steps.
 
     **Arguments:**
 

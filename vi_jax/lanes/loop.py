@@ -33,7 +33,7 @@ class Emitted(NamedTuple):
 def backend(name: str) -> AbstractContextManager:
     """Trace lanes for `"xla"` within this context, or for what suits the machine (`"auto"`).
 
-    What is compiled already keeps its backend.
+    Programs that are already compiled keep their backend.
     """
     if name not in BACKENDS:
         raise ValueError(f"Argument `name` must be one of {BACKENDS}, but got {name!r}.")

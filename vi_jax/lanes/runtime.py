@@ -51,9 +51,9 @@ _cpu: ContextVar[str | None] = ContextVar("cpu", default=None)
 def threads(number: int) -> AbstractContextManager:
     """Run lanes on so many threads within this context (default: the cores of this process).
 
-    XLA runs larger programs on threads of its own, which belong to no context. Wait for what they
-    compute before you leave; if several of your threads have such a context, the one entered last
-    holds for all of them there.
+    XLA runs larger programs on its threads, which belong to no context. Wait for their results
+    before you leave; if several of your threads have such a context, the one entered last holds for
+    all of them there.
 
     **Arguments:** `number` of threads, from 1 to 1,024.
 

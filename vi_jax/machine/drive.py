@@ -125,7 +125,7 @@ class IdealDrive(AbstractDrive):
 
     @property
     def fixed_speed(self):
-        """ζ, the frequency ratio: an ideal drive turns at it whatever happens."""
+        """ζ, the frequency ratio, at which an ideal drive turns under any load."""
         return self.frequency_ratio
 
     def field(self, scene, s, state, pushes):

@@ -91,8 +91,8 @@ class AbstractEvent(Shown):
 
     def jump(self, *args: Any, **kwargs: Any) -> Any:
         """`jump(machine, s, state, *modes)`: the state after the event as a smooth function of that
-        before it, for derivatives. It has to hold for states beside the event too, and leaves out
-        what `after` only corrects to rounding."""
+        before it, for derivatives. It has to hold for states near the event too, and leaves out
+        corrections of `after` to rounding."""
         return self.after(*args, **kwargs)[0]
 
     def happens(self, machine: Machine, s: Scalar, state: State, *modes: Any) -> Any:
@@ -137,12 +137,12 @@ class AbstractSwitch(AbstractEvent):
 
     @property
     def holds_mode(self) -> bool:
-        """True: each switch has a mode of its own."""
+        """True: each switch has a mode."""
         return True
 
     @property
     def is_dry(self) -> bool:
-        """Whether it is friction that may hold a body wherever that is."""
+        """Whether it is friction that may hold a body anywhere."""
         return False
 
     @property
@@ -166,7 +166,7 @@ class AbstractSwitch(AbstractEvent):
 
     @abc.abstractmethod
     def guard(self, machine: Machine, s: Scalar, state: State, mode: Scalar) -> Scalar:
-        """What rises through zero where this mode ends."""
+        """The function that rises through zero at the end of this mode."""
 
     @abc.abstractmethod
     def after(
@@ -196,8 +196,8 @@ class AbstractSwitch(AbstractEvent):
         raise NotImplementedError(f"A {type(self).__name__} adds nothing by itself.")
 
     def contribution(self, machine: Machine, s: Scalar, state: State, mode: Scalar) -> Any:
-        """What the switch adds to the machine's field in this mode, where it knows that: a soft
-        stop the acceleration of its coordinate, dry friction the force on the body that rubs."""
+        """The term that the switch adds to the machine's field in this mode, if it has one: a soft
+        stop the acceleration of its coordinate, dry friction the force on the rubbing body."""
         raise NotImplementedError(f"A {type(self).__name__} has no `contribution`.")
 
 

@@ -35,16 +35,15 @@ _STILL = 1e-6
 class DryFriction(AbstractSwitch):
     """Coulomb friction on a body: it slides against a force, or sticks.
 
-    While it slides forward or backward friction is `level` against the motion. Where the slip
-    vanishes the body sticks as long as the force that holds it is at most `static_ratio` times the
-    level at no speed. A body that is pulled harder goes through, or off. The machine's field says
-    nothing of it. Several frictions that stick at once are solved for together, and with what
-    holds bodies on rigid stops.
+    While the body slides, friction is `level` against the motion. At zero slip the body sticks as
+    long as the force that holds it is at most `static_ratio` times the level at no speed; otherwise
+    it goes through, or off. The machine's field does not contain it. Several frictions that stick
+    at once are solved for together, also with bodies held on rigid stops.
 
     **Arguments:**
 
     - `level`: μN in the machine's unit of force, not negative; or a function of the speed of
-      sliding (Stribeck's curve), smooth from a little below zero on. One with numbers of its own is
+      sliding (Stribeck's curve), smooth from a little below zero on. A function with parameters is
       a pytree, an `equinox.Module` with `__call__`.
     - `on`: the name of the velocity that it acts on, `"u"`; of a `Mechanical` a coordinate, or a
       function of its coordinates: `on=lambda q: q.b - q.a` is friction between two bodies.
@@ -82,7 +81,7 @@ class DryFriction(AbstractSwitch):
 
     @property
     def is_dry(self) -> bool:
-        """True: it may hold a body wherever that is."""
+        """True: it may hold a body anywhere."""
         return True
 
     @property

@@ -16,8 +16,8 @@ from .shown import Shown
 class HybridState(Shown):
     """A state, and the machine's own modes in it: a start that goes on where another motion ended.
 
-    A machine with modes of its own (`AbstractMachine.begin`) is not determined by its state alone.
-    `Run.last` and `Orbit.state` of such a machine are of this kind. Its components are those of
+    A machine with discrete modes (`AbstractMachine.begin`) is not determined by its state alone.
+    `Run.last` and `Orbit.state` of such a machine are of this class. Its components are those of
     `state`: `run.last.Y` is `run.last.state.Y`.
 
     **Arguments:**

@@ -38,15 +38,15 @@ class AbstractContactLaw(Shown):
         """A function with the sign of the pull: positive where the stop would pull the body. It
         ends a contact that may not pull, and should be smooth at first touch.
 
-        **Arguments:** `stiffness` K and `damping` α; `prestress` F0, `None` where there is none;
-        `depth` δ and its `rate` δ' by time.
+        **Arguments:** `stiffness` K and `damping` α; `prestress` F0, or `None`; `depth` δ and its
+        `rate` δ' with respect to time.
         """
         force = self.force(stiffness, damping, depth, rate)
         return -force if prestress is None else -(prestress + force)
 
     def damping_of(self, restitution: Any) -> Any:
-        """α that gives this restitution whatever the speed; `None` for a law whose restitution
-        depends on it."""
+        """α that gives this restitution at every speed; `None` for a law whose restitution depends
+        on it."""
         return None
 
     def frequency(self, stiffness: Any, depth: Any, rate: Any) -> Any:

@@ -67,8 +67,8 @@ class Motor(AbstractDrive):
     def torque(
         self, state: State, pace: Number | None, paced: Callable[[Any], Any]
     ) -> tuple[Number, tuple[Number, ...]]:
-        """The motor's torque (per J ω²), and how the components of its own change behind W; by
-        crank angle divided by W, which `paced` does."""
+        """The motor's torque (per J ω²), and the rates of its components after W. By crank angle
+        they are divided by W, which `paced` does."""
         return self.line(state.W, pace), ()
 
     def usual(self, name, known):

@@ -139,7 +139,7 @@ class Parameters(Shown):
 
     @property
     def units(self) -> dict[str, str]:
-        """Of each number, in SI."""
+        """SI units of each parameter."""
         written = ((f.name, f.metadata["unit"]) for f in dataclasses.fields(self))
         return {name: unit.replace("**2", "²").replace("*", "·") for name, unit in written}
 

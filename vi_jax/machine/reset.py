@@ -84,7 +84,7 @@ class Reset(AbstractEvent):
         return changed(state, self._reset(machine, s, state, *shown_modes(machine, modes)), whose)
 
     def happens(self, machine, s, state, *modes):
-        """What the function `when` says of this state, `None` without one."""
+        """The result of the function `when` for this state, `None` without one."""
         if self._when is None:
             return None
         return self._when(machine, s, state, *shown_modes(machine, modes))

@@ -13,7 +13,7 @@ from .shown import in_words, known, number_in_words, table
 class State:
     """A state with components of any names: `vi.State(x=0.0, u=1.0)`, then `z.x`.
 
-    A component is a number, an array, or a state of its own. It is a pytree.
+    A component is a number, an array, or another state. It is a pytree.
     """
 
     def __init__(self, **components: Any):

@@ -18,11 +18,11 @@ class Switch(AbstractSwitch):
     At zero it is the sign that the function is about to take by `rate(machine, s, state)`, if that
     is given, else +1.
 
-    Where the fields of both modes point at the surface on which the function vanishes, the motion
+    If the fields of both modes point at the surface on which the function vanishes, the motion
     cannot leave it. With `slides=True` it slides along (mode 0) by Filippov's rule: its field is
-    that mean of the two, weighted between 0 and 1, which keeps the function at zero; it leaves
-    where one of the two points away. Without, such a lane ends as `RESULTS.sliding`. The machine's
-    field is never asked for mode 0.
+    the mean of the two, weighted between 0 and 1, that keeps the function at zero. It leaves when
+    one of the two points away. Otherwise such a lane ends as `RESULTS.sliding`. The machine's field
+    is never called with mode 0.
     """
 
     function: Callable[..., Any] = eqx.field(static=True)
@@ -31,7 +31,7 @@ class Switch(AbstractSwitch):
 
     @property
     def may_slide(self) -> bool:
-        """Where it has no mode for that."""
+        """True if it has no mode for that."""
         return not self.slides
 
     @property
@@ -41,7 +41,7 @@ class Switch(AbstractSwitch):
 
     @property
     def sees_around(self) -> bool:
-        """Where it slides: which way both fields point depends on the other modes."""
+        """True if it slides: the directions of both fields depend on the other modes."""
         return self.slides
 
     def begin(self, machine, s, state):

@@ -115,12 +115,12 @@ class Beam(LinearMachine):
 
     @property
     def stiffness(self) -> Float[Array, " modes"]:  # pyright: ignore
-        """Of each mode, ρA L ω²."""
+        """ρA L ω² of each mode."""
         return self.mass * self.natural_frequencies**2
 
     @property
     def damping(self) -> Float[Array, " modes"]:  # pyright: ignore
-        """Of each mode, 2ξω ρA L."""
+        """2ξω ρA L of each mode."""
         return 2 * self.damping_ratio * self.natural_frequencies * self.mass
 
     @property
@@ -133,7 +133,8 @@ class Beam(LinearMachine):
 
     @property
     def forces(self) -> tuple[None, Float[Array, " modes"], None]:
-        """What shakes each mode: the beam's inertia as its clamp moves, or the force on its tip."""
+        """The force on each mode: the beam's inertia as its clamp moves, or the force on its
+        tip."""
         if self.shaken == "tip":
             return None, self.amplitude * self.shape(1.0), None
         mean = jnp.asarray(2 * _tilt(self.modes)[0] / _roots(self.modes))

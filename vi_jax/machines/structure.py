@@ -20,27 +20,27 @@ class Structure(LinearMachine):
         M x'' + C x' + K x = f₀ + A (f₁ cos ωs + f₂ sin ωs)
 
     Its state is a `StructureState` of displacements x and velocities x', n numbers each. Each stop
-    limits a sum c·x, which is its `at`: `vi.RigidStop(0.5, 0.8, at=[0, 0, 1])` is met by the third
-    mass at 0.5, `at=[1, -1, 0]` where the first two approach each other. An impact with the
-    restitution k takes x' to x' - (1 + k) (c·x') M⁻¹c/(cᵀM⁻¹c), by an impulse along c
-    (B. Brogliato, Nonsmooth Mechanics, 2016). What comes to rest on a stop stays there, the rest of
-    the structure moving on, until the stop would have to pull.
+    limits a sum c·x, which is its `at`: the third mass meets `vi.RigidStop(0.5, 0.8, at=[0, 0, 1])`
+    at 0.5; with `at=[1, -1, 0]` the first two approach each other. An impact with the restitution k
+    takes x' to x' - (1 + k) (c·x') M⁻¹c/(cᵀM⁻¹c), by an impulse along c (B. Brogliato, Nonsmooth
+    Mechanics, 2016). A resting coordinate stays on its stop, while the rest of the structure moves,
+    until the stop would have to pull.
 
     Time is the independent variable, and a cycle is 2π/ω, also where nothing is shaken.
 
-    It is followed in its natural modes, by `ExactFlight` unless another method is asked for:
-    without any error of steps, however it is damped, as a rigid body and in resonance too.
-    Derivatives by each of its numbers exist where frequencies coincide.
+    It is followed in its natural modes, by default by `ExactFlight`: without any error of steps for
+    every damping, as a rigid body and in resonance too. Derivatives with respect to each of its
+    numbers exist at coincident frequencies.
 
     **Arguments:**
 
-    - `mass` M, symmetric and positive definite; `damping` C and `stiffness` K, symmetric: (n, n),
-      or (n,) for a diagonal matrix. Without `damping` there is none.
+    - `mass` M, symmetric and positive definite; `damping` C (0 by default) and `stiffness` K,
+      symmetric: (n, n), or (n,) for a diagonal matrix.
     - `contacts`, `vi.RigidStop`s with `at`; those with the same `at` are the two sides of a gap.
     - `force` f₁, `sine_force` f₂ and `static_force` f₀: (n,), or `None` for none.
     - `amplitude` A, any number; `frequency` ω, positive.
 
-    **Raises:** `ValueError` for numbers and shapes that are none of these.
+    **Raises:** `ValueError` for other numbers and shapes.
     """
 
     mass: jax.Array = eqx.field(kw_only=True, converter=matrix("mass"))
@@ -94,7 +94,7 @@ class Structure(LinearMachine):
           one for each mode.
         - The others are those of a `Structure`.
 
-        **Raises:** `ValueError` for numbers and shapes that are none of these.
+        **Raises:** `ValueError` for other numbers and shapes.
         """
         omega, xi = number("frequencies", frequencies), number("damping_ratios", damping_ratios)
         require("frequencies", omega, **NOT_NEGATIVE._asdict())

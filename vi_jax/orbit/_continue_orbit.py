@@ -53,8 +53,8 @@ def continue_orbit(
 
     Pseudo-arclength on the equations from impact to impact, which stay smooth at a grazing. Special
     points are located to rounding. A motion that rests on a stop for a part of its period is
-    followed as a fixed point of the section map, and ends where a rest is gained or lost. Where an
-    impact is lost or a stop is touched the branch ends too (`special[i].switch()` goes on with the
+    followed as a fixed point of the section map, and ends where a rest is gained or lost. The
+    branch also ends at a lost impact or a touched stop (`special[i].switch()` continues with the
     other impacts). Host-side: not to be traced; one compiled program for each number of impacts.
 
     **Arguments:**
@@ -78,16 +78,16 @@ def continue_orbit(
       hits its right stop, unless the gap is free). The special point `turn` is one where the
       parameter turns back; a `fold` is then where a multiplier passes 1. Hopf points are not
       sought.
-    - `method`: how the machine is carried, of fixed steps: by default that of the orbit if its
-      steps are, else `ExactFlight()` where it applies, else 20 steps of `Verner9` a cycle. Of an
-      implicit solver, as `Adaptive(diffrax.Kvaerno5())`, equal steps are taken.
+    - `method`: a method of fixed steps: by default that of the orbit if its steps are fixed, else
+      `ExactFlight()` if it applies, else 20 steps of `Verner9` a cycle. An implicit solver, as
+      `Adaptive(diffrax.Kvaerno5())`, takes equal steps.
     - `progress`: count the points found, in a terminal or a notebook.
 
     **Returns:** a `Branch`.
 
-    **Raises:** `ValueError` if the orbit is none, rests on a stop on its section, does not list all
-    its impacts, or lies outside the bounds, or if the name is unknown; on Ctrl-C `Interrupted`,
-    whose `partial` is the branch so far.
+    **Raises:** `ValueError` if the orbit was not found, rests on a stop on its section, does not
+    list all its impacts, or lies outside the bounds, or if the name is unknown; on Ctrl-C
+    `Interrupted`, whose `partial` is the branch so far.
     """
     settings = check_walk(step=step, max_step=max_step, max_points=max_points)
     progress = flag("progress", progress)

@@ -35,8 +35,8 @@ class CycleMap(eqx.Module):
     """The Poincaré map of a machine over `cycles` drive cycles, from a state on the section to the
     state there; made by `cycle_map`.
 
-    Differentiable in forward and in reverse mode, to any order, by the state and by every leaf of
-    the machine; can be used under `jit` and `vmap`. Where a run fails the values are NaN.
+    Differentiable in forward and in reverse mode, to any order, with respect to the state and every
+    leaf of the machine; works under `jit` and `vmap`. The values of a failed run are NaN.
     """
 
     machine: AbstractMachine
@@ -52,7 +52,7 @@ class CycleMap(eqx.Module):
         return _end(self, adopted(self.machine, state))
 
     def residual(self, state: State) -> State:
-        """What the motion from `state` lacks to be periodic: the mapped state less `state`."""
+        """The mapped state less `state`: zero for a periodic motion."""
         state = adopted(self.machine, state)
         return jtu.tree_map(lambda a, b: a - b, bare(_end(self, state)), bare(state))
 

@@ -147,11 +147,11 @@ class Branch(InWords):
         return self.sections[name.removeprefix("section_")]
 
     def table(self, function: Callable[[Orbit], Any]) -> "xr.Dataset":
-        """What a function makes of the orbit at each point, as an `xarray.Dataset` over the points
-        beside the parameter; `.to_dataframe()` makes it a table.
+        """Evaluate a function of the orbit at each point: an `xarray.Dataset` over the points with
+        the parameter; `.to_dataframe()` makes it a table.
 
         **Arguments:** a function of an `Orbit` that returns numbers by name; or one number or
-        array, which is called `value` then. An array has axes of its own.
+        array, which is called `value` then. An array adds axes.
 
         **Raises:** `TypeError` for a function that returns no numbers, or others at another point.
         """

@@ -69,12 +69,12 @@ def closed_form_orbits(scene: Scene, *, cycles: int | Int[Array, ""] = 1) -> Clo
     whose numbers are scalars, traced or not (for arrays of numbers use `jax.vmap`); the period of
     the motion in drive cycles.
 
-    **Returns:** `ClosedFormOrbits`, stable and unstable motions alike. Differentiable where a
-    motion exists; derivatives grow without bound towards a fold or a grazing. Resonance (ζ = 1,
-    ξ = 0) is not special. Where sin(nπ/ζ) = 0 with ξ = 0 the free motion is periodic itself and
-    every motion has shrunk to a grazing: nothing exists. Impacts slower than rounding can resolve
-    count as grazing too. Turning points are bracketed on 256 points per drive cycle and then
-    solved for, so ζ should be well above 1/256, or peaks between the points can be missed.
+    **Returns:** `ClosedFormOrbits`, stable and unstable motions alike. Differentiable if a motion
+    exists; derivatives grow without bound towards a fold or a grazing. Resonance (ζ = 1, ξ = 0) is
+    not special. If sin(nπ/ζ) = 0 with ξ = 0, the free motion is periodic itself and every motion
+    has shrunk to a grazing: nothing exists. Impacts slower than rounding can resolve count as
+    grazing too. Turning points are bracketed on 256 points per drive cycle and then solved for, so
+    ζ should be well above 1/256, or peaks between the points can be missed.
 
     An impact may fall on the section itself: on φ = 0 it does with ξ = 0 and k = 1 or ζ = 1. The
     state is that just after it, and the next impact is the last thing that happens in the period:

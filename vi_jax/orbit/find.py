@@ -61,9 +61,9 @@ def find_orbit(
 ) -> Orbit:
     """Find the periodic motion of `machine` near `guess`.
 
-    Works under `jit` and `vmap`. Everything in the orbit is differentiable by every leaf of the
-    machine, in either mode and to any order, by the implicit function theorem: the search is not
-    differentiated. Where no orbit was found the derivatives are NaN.
+    Works under `jit` and `vmap`. Everything in the orbit is differentiable with respect to every
+    leaf of the machine, in either mode and to any order, by the implicit function theorem: the
+    search is not differentiated. Derivatives of a failed search are NaN.
 
     **Arguments:**
 
@@ -83,12 +83,11 @@ def find_orbit(
     - `impact_log`: impacts of one cycle that the orbit can list.
     - `throw`: raise an error if no orbit is found, instead of only saying so in `result`.
 
-    **Returns:** an `Orbit`. Its `result` tells an orbit of a smaller period, a search that found
-    none, one that ended at a grazing or at an equilibrium, a motion that drifts and a guess that
-    cannot be simulated from each other. Where something in the state is neutral (a multiplier is
-    exactly 1), as the place of a body that slides freely or a number that is carried along, the
-    orbits are a family: the one nearest to the guess is found, and derivatives are those across
-    the family.
+    **Returns:** an `Orbit`. Its `result` distinguishes an orbit of a smaller period, a search that
+    found none, one that ended at a grazing or at an equilibrium, a motion that drifts and a guess
+    that cannot be simulated. If a component is neutral (a multiplier is exactly 1), as the place of
+    a body that slides freely, the orbits are a family: the one nearest to the guess is found, and
+    derivatives are those across the family.
 
     **Raises:** `ValueError` or `TypeError` for arguments that cannot be used, before any work.
     """

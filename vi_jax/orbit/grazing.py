@@ -93,7 +93,7 @@ class Grazing(Summarized):
     """In which units its quantities are, as the machine states it."""
 
     def summary(self) -> str:
-        """What is touched, the local map, what follows, and how far the machine agrees."""
+        """The stop, the local map, its attractor, and the agreement of the machine."""
         at = in_unit(f"{self.value:.10g}", dict(self.units), self.parameter)
         values = ", ".join(complex_in_words(z, 6, 1e-9) for z in self.multipliers)
         entries = ", ".join(f"{e:.4g}" for e in self.entries[:6])
@@ -122,7 +122,7 @@ class Grazing(Summarized):
 
     @property
     def afar(self) -> str:
-        """What the machine settles on where nothing near attracts, `far` in words; "" if `None`."""
+        """The motion of the machine where nothing near attracts, `far` in words; "" if `None`."""
         if self.far is None:
             return ""
         period, impacts = self.far
@@ -161,7 +161,7 @@ def grazing(
     **Arguments:**
 
     - `point`: a special point of a branch of the kind "grazing" (`Branch.special`).
-    - `check`: whether to simulate the machine beside it, which takes most of the time.
+    - `check`: whether to simulate the machine for comparison, which takes most of the time.
     - `periods`: motions with one impact in up to so many periods are listed.
     - `progress`: show a bar while the machine is simulated, in a terminal or a notebook.
 

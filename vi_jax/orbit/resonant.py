@@ -25,10 +25,10 @@ class ResonantGrazing(NamedTuple):
 def resonant_grazings(curve: Boundary, *, periods: int = 3) -> list[ResonantGrazing]:
     """Return the points of a curve of grazings where motions with one impact in n periods change.
 
-    The entry eₙ = ∂h·Nⁿ·kick of the local map (see `grazing`) is what an impact adds to the
-    distance n periods later. Where it changes its sign, the motion with one impact in n periods
-    changes the side of the grazing on which it exists, and is stable close by. Each is located
-    along the curve to rounding. Host-side: not to be traced.
+    The entry eₙ = ∂h·Nⁿ·kick of the local map (see `grazing`) is the change of the distance n
+    periods after an impact. At a change of its sign, the motion with one impact in n periods
+    changes the side of the grazing on which it exists, and is stable close by. Each point is
+    located along the curve to rounding. Host-side: not to be traced.
 
     **Arguments:** a `Boundary` of the kind "grazing"; `periods`, the greatest n.
 

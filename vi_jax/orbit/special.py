@@ -91,12 +91,12 @@ class SpecialPoint(InWords):
         """An orbit of the other branch that begins here, to be continued.
 
         At a period doubling, the motion of twice the period, or of half of it where the branch
-        springs from one; at a grazing, the motion with that impact less or one more, on the side on
+        begins at one; at a grazing, the motion with that impact less or one more, on the side on
         which it is admissible; where branches cross, a motion of the other one; at a sliding
-        bifurcation the motion that sticks once more or less; where two events fall together, as an
+        bifurcation the motion that sticks once more or less; where two events coincide, as an
         impact and the section of a machine with `renewed`, the motion with them in another order.
-        Another grazing of a machine with soft stops, friction, modes of its own or `events` is not
-        switched at: take `find_orbit` beyond it, from a simulated motion.
+        Other grazings of a machine with soft stops, friction, modes or `events` are not switched
+        at: take `find_orbit` beyond it, from a simulated motion.
 
         **Arguments:** how far from the point (in the norm of the scaled unknowns).
 

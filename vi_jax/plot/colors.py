@@ -78,7 +78,7 @@ def color_of(cycles: int, impacts: float | int | None = None) -> str:
     """Return the colour of a motion of this period in drive cycles, or of a regime without one.
 
     With the impacts in a period, a motion without any is paler, and one of two cycles with more
-    than one has a colour of its own.
+    than one has another colour.
     """
     if cycles <= 0:
         return IRREGULAR[REGIMES(cycles)]

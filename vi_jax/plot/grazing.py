@@ -28,11 +28,11 @@ def plot_grazing(
 ) -> Axes:
     """Draw the attractor of a local map above the simulated motions of the machine.
 
-    Along the axis is the parameter, less its value at the grazing, scaled by the square root, so
-    that what grows as the root lies between straight lines; upwards the first coordinate on the
-    section, less that of the motion without impact. The machine's attractor is in pale rings (where
-    it was simulated), the forecast's in dots of the colour of its period, chaos dark. Where nothing
-    near attracts, grey dots are what the machine settles on far away, `found.far`.
+    The axis is the parameter, less its value at the grazing, scaled by the square root, so motions
+    that grow as the root lie between straight lines; upwards the first coordinate on the section,
+    less that of the motion without impact. The machine's attractor is in pale rings (if it was
+    simulated), the forecast's in dots of the colour of its period, chaos dark. If nothing near
+    attracts, grey dots are the far motion of the machine, `found.far`.
 
     **Arguments:** the `Grazing`; `ax`, axes to draw into, a new figure if left out; `legend`,
     whether to draw one; options of `Axes.plot` for the forecast's dots.

@@ -27,9 +27,9 @@ def plot_integrity(
     """Draw an erosion profile: the share or the integrity of each motion over the parameter.
 
     A line has the colour of its motion's period, as in all pictures; further motions of the same
-    kind have other shades of it. Where a line falls off, the motion loses its basin although it
-    may still be stable. The band around a share is its standard error, that around a radius what
-    the grid leaves open. Open circles are radii that the edge of the region cuts short.
+    kind have other shades of it. At a fall of a line, the motion loses its basin although it may
+    still be stable. The band around a share is its standard error, that around a radius the
+    resolution of the grid. Open circles are radii limited by the edge of the region.
 
     **Arguments:** what `integrity_profile` found; `y`, `"share"`, `"local"` (local integrity
     measure) or `"factor"` (integrity factor); `ax`, axes to draw into, a new figure if left out;

@@ -22,7 +22,7 @@ def plot_multipliers(
 
     **Returns:** the axes.
 
-    **Raises:** `TypeError` for what is none.
+    **Raises:** `TypeError` for an argument without multipliers.
     """
     listed = [orbits] if isinstance(orbits, Orbit) else tuple_of("orbits", orbits, Orbit)
     for orbit in listed:

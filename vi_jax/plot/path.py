@@ -49,7 +49,7 @@ def motion_path(
     `coordinate`, the number of the machine's coordinate whose path it is, with its own impacts.
 
     **Raises:** `ValueError` if the run has no samples or is a batch, if its states lack `Y` and `V`
-    and no machine says what stands for them, or for a coordinate that there is not.
+    without a machine that replaces them, or for an unknown coordinate.
     """
     if isinstance(motion, Orbit):
         raise TypeError("Argument `motion` must be a `Run`: give `orbit.trajectory()` of an orbit.")

@@ -47,9 +47,9 @@ def plot_regimes(
     """Draw a map of the regimes of motion over two axes of a scan.
 
     Each cell has the colour of its period, up to 8 drive cycles and beyond; chaotic, transiently
-    chaotic, unsettled and failed lanes have greys of their own. Where the data hold `impacts`,
-    motions without any are paler, and motions of two cycles with one impact and with more have
-    different colours. The legend names what is there.
+    chaotic, unsettled and failed lanes have different greys. If the data hold `impacts`, motions
+    without any are paler, and motions of two cycles with one impact and with more have different
+    colours. The legend names the colours that occur.
 
     **Arguments:** the data of a scan that measured `"regime"`; `machine`, whose words name the
     periods (left out: 2π and so on for a `Scene`, cycles for any other machine); `ax`, axes to draw

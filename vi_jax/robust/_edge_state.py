@@ -72,16 +72,16 @@ def edge_state(
     """Find the edge state between two starts that settle on different motions.
 
     The line between the starts is bisected until two on both sides of the boundary are 1e-10 apart;
-    these are followed until they are 1e-5 apart, and the line between them is bisected again. What
-    lies between them stays on the boundary, and so goes to what attracts within it (edge tracking:
-    Skufca, Yorke and Eckhardt 2006). As soon as that comes near to where it was,
-    `find_orbit` makes it exact. Host-side: not to be traced.
+    these are followed until they are 1e-5 apart, and the line between them is bisected again. So
+    the motion stays on the boundary and converges to an attractor within it (edge tracking: Skufca,
+    Yorke and Eckhardt 2006). Once it comes near to an earlier state, `find_orbit` makes it exact.
+    Host-side: not to be traced.
 
     **Arguments:**
 
     - `machine`: the machine.
     - `inside`: a stable `Orbit`, or a state from which the machine settles on a motion that repeats
-      within `longest` cycles. Of a machine without a drive it may be an equilibrium.
+      within `longest` cycles; for a machine without a drive also an equilibrium.
     - `outside`: an `Orbit` or a state from which it settles on any other motion.
     - `settle`: cycles after which a start that has not come back to the motion of `inside` counts
       as being elsewhere.

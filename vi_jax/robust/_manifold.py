@@ -91,8 +91,8 @@ def manifold(
       inside.
     - `which`: `"stable"` or `"unstable"`.
     - `length`: of each branch, in the units of the state.
-    - `spacing`: the greatest distance of neighbouring points. Where the curve turns by more than
-      0.15 from one to the next they are closer, to a 64th of that.
+    - `spacing`: the greatest distance of neighbouring points. They are closer, to a 64th of that,
+      if the curve turns by more than 0.15 from one to the next.
 
     **Returns:** a `Manifold`. A branch of a stable manifold ends early at a stop, at a jump of
     the section map, or where its points take too long to come near the saddle; an unstable one goes

@@ -111,26 +111,26 @@ def minimal_kick(
     """Find the smallest kick (jump of the state) after which a stable motion does not return.
 
     It leads onto the boundary of the basin, the stable manifold of an unstable motion. Rays of
-    kicks in all directions are simulated, and where each first leaves the basin is bisected; from
-    the best, `edge_state` follows the boundary to a saddle, and Newton's method makes the kick
-    exact, through the impacts. Simulation from 1 ± 1e-6 of it confirms it. Where the boundary has
-    no saddle (a chaotic edge, a grazing) directions are narrowed by simulations. What leaves the
-    basin and comes back between two points or two rays may be missed. Host-side.
+    kicks in all directions are simulated, and the first exit of each is bisected; from the best,
+    `edge_state` follows the boundary to a saddle, and Newton's method makes the kick exact, through
+    the impacts. Simulation from 1 ± 1e-6 of it confirms it. If the boundary has no saddle (a
+    chaotic edge, a grazing), directions are narrowed by simulations. An exit and re-entry between
+    two points or two rays may be missed. Host-side.
 
     **Arguments:**
 
     - `machine`: the machine.
     - `orbit`: the motion that is kicked, on the section: a stable `Orbit`, or a state on a motion
-      that repeats. Of a machine without a drive it may be an equilibrium.
+      that repeats; for a machine without a drive also an equilibrium.
     - `components`: names of the numbers of the state that are kicked, such as `["V"]`; all of them
       by default.
     - `weights`: of some of them, by which they count in the norm, above 0; 1 by default. With
       velocities weighed by √(m/2) and no places the norm squared is an energy.
     - `bounds`: the range of the kicked state in some of them, such as `{"Y": (-3.0, 2.0)}`.
     - `cycle`: in which cycle of its period an orbit of several is kicked, from 0 on.
-    - `phase`: how long after the section of that cycle, in the machine's clock (a crank angle, or a
-      time); or `"worst"` for the moment of the whole period at which the least kick is smallest:
-      `phases` of each cycle are looked at, and the moment is refined beside the best of them.
+    - `phase`: the time after the section of that cycle, in the machine's clock (a crank angle, or a
+      time); or `"worst"` for the moment of the whole period with the smallest least kick: `phases`
+      of each cycle are searched, and the moment is refined near the best of them.
     - `largest`: norm up to which kicks are looked for; by default until one leads elsewhere.
     - `directions`, `points`: rays, and points on each that are simulated in a round; `candidates`:
       rays that leave sooner than their neighbours, from which kicks are made exact.

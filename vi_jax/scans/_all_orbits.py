@@ -167,11 +167,10 @@ def all_orbits(
     """Find the periodic motions of up to so many cycles, stable and unstable.
 
     For each period of 1 to `cycles` drive cycles `find_orbit` searches from random starts, all in
-    one compiled call. What is found is sorted into different motions, whatever the cycle on which
-    they are observed and by their least period. A random search proves nothing complete: the
-    result says what was searched, how many searches converged, and by Good and Turing's estimate
-    how much of what searches find has not been found. Host-side: not to be traced; one compiled
-    program for each period.
+    one compiled call. The results are sorted into different motions with their least periods. A
+    random search proves nothing complete: the result has the number of searches, how many
+    converged, and Good and Turing's estimate of the share that has not been found. Host-side: not
+    to be traced; one compiled program for each period.
 
     **Arguments:**
 

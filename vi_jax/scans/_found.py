@@ -90,17 +90,17 @@ class Basins(NamedTuple):
         """How far the starts of each motion reach: the largest ball of them around the motion, and
         anywhere.
 
-        What ends a ball is a cell whose start settles elsewhere, or nowhere, and the edge of the
-        region. A stop ends none, since no start lies beyond it: neither a start that would, nor an
-        edge that lies on a stop. Balls lie within what the region spans: of a motion whose other
-        states differ from those of the starts, sections count by their place in the region.
+        A ball ends at a cell whose start settles elsewhere, or nowhere, and at the edge of the
+        region. A stop ends no ball, since no start lies beyond it: neither a start that would, nor
+        an edge that lies on a stop. Balls lie within the region's components: if other states of a
+        motion differ from those of the starts, sections count by their place in the region.
 
         **Arguments:** `scales`, what counts as distance 1 along parts of the start, such as
         `{"start.V": 2.0}`; 1 where left out.
 
         **Returns:** an `Integrity` for each of `attractors`.
 
-        **Raises:** `ValueError` if the starts lie on no grid, or for scales that are none of it.
+        **Raises:** `ValueError` if the starts lie on no grid, or for scales of other components.
         """
         label, there, names = self._grid()
         given = {} if scales is None else dict(scales)
@@ -146,8 +146,8 @@ class Basins(NamedTuple):
         """Uncertainty exponent of the basins' boundaries: how slowly the part of uncertain starts
         shrinks as starts are known better. It is 1 for smooth boundaries.
 
-        It is measured between 1 cell and a sixteenth of the grid, 3 cells at least. Its interval
-        says what the grid is worth: some ±0.05 at 512 starts along each of two axes.
+        It is measured between 1 cell and a sixteenth of the grid, 3 cells at least. Its interval is
+        the uncertainty by the grid: some ±0.05 at 512 starts along each of two axes.
 
         **Arguments:** `confidence` of the intervals.
 

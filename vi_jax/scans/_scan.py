@@ -72,9 +72,10 @@ def scan(
       grid (the last axis is filled first) has the key `jax.random.fold_in(key, n)`. `"noise.V"` is
       an axis of amplitudes, `"noise.path"` of paths. Measures that look for a period are refused.
     - `paired`: a lane for each place in the rows (of one length), along `sample`, and no grid.
-    - `verify`: so many lanes, drawn at random, are run again by a tighter method. `data.attrs` then
-      says how many came out otherwise (`verified_changed_period`, of whole numbers) or what 95 of
-      100 are off by at most (`verified_error_y_min`; infinite where one failed).
+    - `verify`: the number of lanes, drawn at random, that are run again by a tighter method.
+      `data.attrs` then holds the number of different lanes (`verified_changed_period`, for
+      integers) or the error that 95 of 100 stay below (`verified_error_y_min`; infinite if one
+      failed).
     - `store`: folder of a Zarr store, written block by block. The same call resumes it and computes
       again what was lost; a changed one (or your functions' code) is refused with the difference.
     - `lanes`: lanes in a block (a multiple of 256); memory grows with it and with `cycles`.
@@ -86,8 +87,8 @@ def scan(
     **Returns:** an `xarray.Dataset` over the axes, with units; `result` says of each lane how it
     ended (0: well; -1: not computed). With a `store` it is read lazily from there.
 
-    **Raises:** `ValueError` or `TypeError` before any work for what cannot be run; on Ctrl-C
-    `ScanInterrupted`; `ConnectionError`, which says what is kept, if the cluster is lost.
+    **Raises:** `ValueError` or `TypeError` before any work for unusable arguments; on Ctrl-C
+    `ScanInterrupted`; `ConnectionError`, with the number of stored blocks, if the cluster is lost.
     """
     grid, verify = axes_of(axes), count("verify", verify)
     progress, paired = flag("progress", progress), flag("paired", paired)

@@ -73,8 +73,8 @@ def sweep(
     - `tolerance`: how closely sections must repeat for a period, as in `Regime`.
     - `max_steps`: steps at each value beyond which it counts as failed.
     - `noise`, `key`: a `WhiteNoise`, by default none, and with it one key of JAX's; value number n
-      has the key `jax.random.fold_in(key, n)`. What is shaken repeats no more: see how far it is
-      carried from its branch, and where it leaves it, by the extremes and sections.
+      has the key `jax.random.fold_in(key, n)`. Under noise there are no periods: use extremes and
+      sections.
     - `progress`: show a bar, in a terminal or a notebook; not within `jit` or `vmap`.
 
     **Returns:** a `Sweep`. A value that fails is NaN, and the next goes on from the one before it.

@@ -242,13 +242,12 @@ class Regime(AbstractMeasure):
 
     A motion has the least period p ≤ `longest` after which its sections repeat within `tolerance`
     (relative to 1 + |state|; by default 1e-6, or ten tolerances of a method that sizes its steps by
-    one) and as many impacts come in each cycle; see `least_period` for one that still spirals in.
-    One that does not repeat is looked at for another `observed` cycles. Unless its greatest
-    Lyapunov exponent exceeds `threshold` there (in the machine's own unit of rates), it is
-    unsettled or quasi-periodic. If it does, the motion is continued for `lasting` cycles and
-    observed once more: it is chaotic if its exponent exceeds `threshold` again, else transiently
-    chaotic: it has settled on something else meanwhile, or is about to. `REGIMES` has the numbers
-    that stand for these in `period`.
+    one) with as many impacts in each cycle; see `least_period` for one that still spirals in. Other
+    motions are observed for another `observed` cycles. Unless its greatest Lyapunov exponent
+    exceeds `threshold` there (in the machine's own unit of rates), a motion is unsettled or
+    quasi-periodic. If it does, the motion is continued for `lasting` cycles and observed once more:
+    it is chaotic if its exponent exceeds `threshold` again, else transiently chaotic: it has
+    settled meanwhile, or is about to. `REGIMES` has the numbers that stand for these in `period`.
 
     While a chaotic transient lasts, nothing tells it from chaos; what is called chaotic may leave
     off later still. The longer `lasting`, the fewer do, and the more the chaotic lanes cost; 0
@@ -307,7 +306,7 @@ class Regime(AbstractMeasure):
         }
 
     def needs_refinement(self, found, pass_number=0):
-        """Where it does not repeat; at the second pass, where it is chaotic."""
+        """True if it does not repeat; at the second pass, if it is chaotic."""
         return found["period"] == jnp.where(
             jnp.asarray(pass_number) == 0, REGIMES.unsettled, REGIMES.chaotic
         )

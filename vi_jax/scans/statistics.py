@@ -98,11 +98,11 @@ def _called(of: Of) -> str:
 class Statistics(_Observed):
     """Mean and spread of a quantity over the cycles observed, each with its standard error.
 
-    Of `"V"` they are `V_mean`, `V_error`, `V_spread` (the standard deviation) and `V_spread_error`.
-    Cycles beside each other are not independent, so that the errors are those of means over
-    `batches` parts of the row (batch means): right if a part is long beside the time in which the
-    motion forgets its past, too small if not. Lanes of their own paths give an error without this
-    condition, the scatter of their means.
+    For `"V"` they are `V_mean`, `V_error`, `V_spread` (the standard deviation) and
+    `V_spread_error`. Neighbouring cycles are not independent, so the errors are those of means over
+    `batches` parts of the row (batch means): right if a part is long compared with the memory of
+    the motion, too small if not. Lanes with other paths give an error without this condition, the
+    scatter of their means.
 
     **Arguments:**
 
@@ -236,11 +236,11 @@ class Escape(_Observed):
     """The first time at which a quantity leaves an interval: `escape_cycle`, counted in cycles from
     where observation begins, and `escaped`, whether it does (1) or not (0).
 
-    Of a lane that does not, `escape_cycle` is how long it was watched: its time of escape is
-    censored, known to be longer. Means of `escape_cycle` alone are too small; see `escape_rate`. A
-    lane that lies outside where observation begins has 0. A passage is seen at the instants looked
-    at only. Where the motion may return between them, the extremes `"y_min"` and `"y_max"` of each
-    cycle, which are exact, tell in which cycle it was.
+    For a lane without escape, `escape_cycle` is the observed time: its time of escape is censored,
+    known to be longer. Means of `escape_cycle` alone are too small; see `escape_rate`. A lane that
+    lies outside at the beginning has 0. A passage is detected at the observed instants only. If the
+    motion may return between them, use the extremes `"y_min"` and `"y_max"` of each cycle, which
+    are exact.
 
     **Arguments:**
 

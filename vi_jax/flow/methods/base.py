@@ -77,7 +77,8 @@ class AbstractMethod(eqx.Module):
 
     @property
     def follows_fading(self) -> bool:
-        """Whether a step must be short beside what fades, or it grows instead; static."""
+        """Whether steps must be short compared with fading components, or they grow instead;
+        static."""
         return True
 
     def longest(self, machine: AbstractMachine, s: Scalar, state: State) -> Scalar | float:
@@ -94,8 +95,8 @@ class AbstractMethod(eqx.Module):
         return limit * (5 / self.steps_per_cycle)
 
     def clear(self, machine: AbstractMachine, s: Scalar, state: State) -> Scalar | None:
-        """A length of motion from here in which no stop can be met, whatever the motion does
-        within; a step may be so long, and is not searched. `None` of a method that knows none."""
+        """A length of motion from here in which no stop can be met; a step may be as long, and is
+        not searched. `None` for a method that knows none."""
         return None
 
     @abc.abstractmethod

@@ -31,7 +31,7 @@ def preset(machine: AbstractMachine | None, name: str = "standard") -> AbstractM
     - `"reference"`: 30 steps, error 6e-14 (2e-15), 2.8 times the time of the one before.
       `Taylor(20, rtol=1e-13)` is as exact in 0.75 of that, for fields that have a series.
 
-    Of 1,024 settled motions none got a wrong regime under any of the first two.
+    No settled motion of 1,024 got a wrong regime under any of the first two.
 
     Shorter steps where damping is strong (ξ > 0.5) or the motor (τ0 > 1) keep the errors small
     there too. A machine of your own, whose time scales are not known, gets `Adaptive` with the

@@ -49,13 +49,12 @@ class ExactFlight(AbstractMethod):
     """The closed form of Y'' + 2ξY' + Y = cos φ between impacts, and of M x'' + C x' + K x = f of a
     linear machine (`vi.machines.Structure`); only impact times need a root.
 
-    Holds for every ξ ≥ 0 (under-, critically and over-damped) and every ζ > 0, ζ = 1 with ξ = 0
-    (the secular case) included. For ideal drives with a `CosineCrank`. The motion is followed in
-    arcs of at most a fifth of the shorter period, each ended at the next turning point, so that
-    an impact is missed only if it is shallower than rounding. Of a linear machine of several modes
-    arcs are a tenth of the period of the fastest one that moves a contact by more than rounding;
-    what modes coupled by damping do, or resonance, or a body at rest, is a matrix exponential by
-    its series.
+    Holds for every ξ ≥ 0 (under-, critically and over-damped) and every ζ > 0, including ζ = 1 with
+    ξ = 0 (the secular case), for ideal drives with a `CosineCrank`. The motion is followed in arcs
+    of at most a fifth of the shorter period, each ended at the next turning point, so an impact is
+    missed only if it is shallower than rounding. Arcs of a linear machine of several modes are a
+    tenth of the period of the fastest one that moves a contact by more than rounding. Modes coupled
+    by damping, resonance and bodies at rest use a matrix exponential by its series.
 
     **Arguments:** `steps_per_cycle`, arcs in a turn (default 5, the fewest). More of them change
     nothing but the rounding.
@@ -73,7 +72,8 @@ class ExactFlight(AbstractMethod):
         return ExactFlight(2 * self.steps_per_cycle)
 
     def holds(self, machine):
-        """Of a linear machine what rests is held; another one does not move as it rests."""
+        """A resting coordinate of a linear machine is held; another machine does not move while it
+        rests."""
         return isinstance(machine, LinearMachine | ModalMachine)
 
     def check(self, machine):

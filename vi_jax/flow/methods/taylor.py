@@ -126,13 +126,13 @@ class Taylor(AbstractMethod):
 
     @property
     def follows_fading(self):
-        """Where steps are fixed; else they are sized by their errors."""
+        """True for fixed steps; others are sized by their errors."""
         return self.rtol is None
 
     def foresee(
         self, smooth: SmoothMachine, s: Scalar, state: State, beside: Beside | None
     ) -> Expansion:
-        """The motion as a power series about (s, state), with what is integrated beside it."""
+        """The motion as a power series about (s, state), with the integrals."""
 
         def field(s, y):
             state, beside = y
