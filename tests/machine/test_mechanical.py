@@ -229,7 +229,7 @@ def test_wrong_masses_and_names_are_told():
 
     with pytest.raises(ValueError, match="`mass` of a Wrong must be one for each of its 2"):
         vi.simulate(Wrong(), Wrong().at(), 1)
-    with pytest.raises(ValueError, match="'up' is none of the coordinates left, right"):
+    with pytest.raises(ValueError, match="'up' is not one of the coordinates left, right"):
         Pair().at(up=1.0)
 
     class Named(Pair):

@@ -71,8 +71,8 @@ def test_flight_in_closed_form_is_asked_for_only_where_it_is_that():
     [
         (lambda: of(crank=Doubled()), "`scene`.*`CosineCrank`.*Doubled"),
         (lambda: of(Hardening), "`scene`.*Hardening` has another `field`"),
-        (lambda: of(stop=Softening(1.5, 0.9)), "`scene`.*a law of its own: Softening"),
-        (lambda: of(stop=vi.RigidStop(1.5, falling)), "`scene`.*a law of its own"),
+        (lambda: of(stop=Softening(1.5, 0.9)), "`scene`.*has a law: Softening"),
+        (lambda: of(stop=vi.RigidStop(1.5, falling)), "`scene`.*has a law"),
         (driven_by_a_motor, "`scene`.*IdealDrive.*Motor"),
         (lambda: ideal(crank=vi.SliderCrank(1 / 3)), "`scene`.*CosineCrank.*SliderCrank"),
         (stopped_on_the_left, r"`scene`.*on the right.*\['left'\]"),

@@ -158,7 +158,7 @@ def test_functions_that_differ_between_the_probed_lanes_are_refused(tmp_path, mo
     opaque = (x for x in "ab")
     shutil.rmtree(tmp_path / "measure")
     run("measure", hidden=opaque)
-    with pytest.raises(ValueError, match=r"must be new, since it cannot be told .* measure 1"):
+    with pytest.raises(ValueError, match=r"must be new, since it is unknown .* measure 1"):
         run("measure", hidden=opaque)
 
 

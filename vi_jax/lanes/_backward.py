@@ -239,7 +239,9 @@ def _transposed_back(cotangents, *args, program: ReverseProgram):
     base, second = derived, any(linear[:n])
     if second:
         if derived.base is None or not derived.varied:
-            raise NotImplementedError("A gradient by the numbers of a lane that is no tangent's.")
+            raise NotImplementedError(
+                "A gradient with respect to the numbers of a lane that is no tangent's."
+            )
         base = derived.base
     varied = program.varied[: len(base.in_avals)]
     along, _ = forward(base, varied)

@@ -56,7 +56,7 @@ class Mechanical(AbstractMachine):
         names = self.q_names
         wrong = [x for x in (*places, *(v or {})) if x not in names]
         if wrong:
-            raise ValueError(f"{wrong[0]!r} is none of the coordinates {', '.join(names)}.")
+            raise ValueError(f"{wrong[0]!r} is not one of the coordinates {', '.join(names)}.")
         speeds = dict(v or {})
         zeros = dict.fromkeys(names, 0.0)
         return Named(**(zeros | places), v=Named(**(zeros | speeds)))

@@ -84,7 +84,7 @@ def with_leaf(tree: Any, name: str, value: Any) -> Any:
         leaves[arrays[index]] = jnp.asarray(old, kind).at[place].set(value)
     elif jnp.ndim(old) and not jnp.ndim(value):
         raise ValueError(
-            f"What is named must be a number of the machine, but {name!r} is an array of shape "
+            f"A name must be that of one number of the machine, but {name!r} is an array of shape "
             f"{jnp.shape(old)}; name one of its numbers, as {name + str([0] * jnp.ndim(old))!r}."
         )
     else:

@@ -223,10 +223,9 @@ def _first_point(problem: Shooting, x: np.ndarray, scale: np.ndarray, orbit: Orb
         if bool(start.good):
             return start
         raise ValueError(
-            "Argument `fixed` must hold numbers near those of the orbit, that the free ones can "
-            "bring about at its parameter, but no such motion was found (last correction "
-            f"{float(start.size):.2g}). What the free ones do not change cannot be held, as an "
-            "extreme that lies on a stop."
+            "No motion with the values in `fixed` was found by varying `free` (last correction "
+            f"{float(start.size):.2g}). Choose values closer to the orbit's, or other free "
+            "parameters: an extreme on a stop, say, does not depend on any."
         )
     if moved > _SAME:
         start, moved = _refined(problem, x, tangent_at(problem, x, scale), scale)

@@ -161,7 +161,7 @@ def touch_at(
     else:
         called = Event(number).called(problem.machine)
         raise ValueError(
-            "Argument `point` must be the grazing of a stop or a switch, but what is touched is "
-            f"the {called}, whose jump does not fade with the speed."
+            "Argument `point` must be the grazing of a stop or a switch, but it touches the "
+            f"{called}, whose jump does not vanish with the speed."
         )
     return Touch(number, leg, clock, u, gradient, float(rate), float(slope), kick)

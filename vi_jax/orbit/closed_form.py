@@ -95,8 +95,8 @@ def closed_form_orbits(scene: Scene, *, cycles: int | Int[Array, ""] = 1) -> Clo
     assert isinstance(scene.drive, IdealDrive)
     if not stop.is_one_number:
         raise ValueError(
-            "Argument `scene` must have a stop with one number as its restitution, but has a law "
-            f"of its own: {stop!r}."
+            "Argument `scene` must have a stop with one number as its restitution, but has a law: "
+            f"{stop!r}."
         )
     numbers = (scene.drive.frequency_ratio, scene.damping_ratio, stop.restitution, stop.gap)
     shapes = [jnp.shape(number) for number in numbers]

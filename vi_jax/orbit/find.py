@@ -109,7 +109,7 @@ def find_orbit(
     _check_guess(the_map.machine, state)
     if modes_of(state) and root_finder.arcs > 1:
         raise ValueError(
-            "Argument `root_finder` must have one arc for a machine with modes of its own, but has "
+            "Argument `root_finder` must have one arc for a machine with discrete modes, but has "
             f"{root_finder.arcs}."
         )
     orbit = _find(the_map, state, root_finder, impact_log)

@@ -114,7 +114,7 @@ class SpecialPoint(InWords):
         raise ValueError(
             "`switch` needs a period doubling, a grazing, a sliding bifurcation or a point where "
             f"branches cross, but this special point is {one(self.kind)}."
-            " What comes beyond another one `find_orbit` finds, from a simulated motion."
+            " Beyond another one use `find_orbit`, from a simulated motion."
         )
 
     def __str__(self) -> str:
@@ -195,8 +195,8 @@ def _otherwise(
     found = across(point.problem, point.step, point.scale, distance)
     if found is None:
         raise ValueError(
-            f"Beside this {point.kind} no motion with {what} was found at distance {distance:g}; "
-            "try another."
+            f"No motion with {what} was found at distance {distance:g} from this {point.kind}. "
+            "Try another distance."
         )
     return found
 
@@ -214,7 +214,7 @@ def _beyond_grazing(point: SpecialPoint, distance: float) -> Orbit:
     if old.modes[0] or old.machine.others:
         raise ValueError(
             "`switch` at a grazing needs a machine without soft stops, friction or other switches, "
-            "modes of its own and `events`: find the motion beyond it with `find_orbit`."
+            "discrete modes and `events`: find the motion beyond it with `find_orbit`."
         )
     if point.impact is not None and old.events[point.impact].cycle is not None:
         raise ValueError(

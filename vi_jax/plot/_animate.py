@@ -83,7 +83,7 @@ def animate(
             )
         machine, motion = motion.machine, motion.trajectory(samples=_SAMPLES)
     if machine is None:
-        raise ValueError("Argument `machine` must be given for a `Run`: it says what to draw.")
+        raise ValueError("Argument `machine` must be given for a `Run`: it is drawn.")
     instance_of("machine", machine, AbstractMachine, "a `Scene` or an `AbstractMachine`")
     path = motion_path(motion, machine=machine, window=window)
     good = np.isfinite(path.Y)

@@ -73,8 +73,8 @@ def motion_path(
         )
     except AttributeError:
         raise ValueError(
-            "Argument `machine` must be given, which says what the position is in a state without "
-            "`Y` and `V`."
+            "Argument `machine` must be given for states without `Y` and `V`: it defines the "
+            "position."
         ) from None
     if isinstance(motion, Run) and motion.impact_log is not None and machine is not None:
         path = _with_impacts(path, motion, machine, coordinate)

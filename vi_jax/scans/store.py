@@ -296,6 +296,6 @@ def _compare(
     for what, code in wanted["code of"].items():
         if not new and code.startswith(UNVERIFIABLE):
             raise ValueError(
-                f"Argument `store` must be new, since it cannot be told whether the {what} is the "
+                f"Argument `store` must be new, since it is unknown whether the {what} is the "
                 f"same as that in {path}: {code}."
             )
