@@ -30,7 +30,7 @@ class Chain(vi.AbstractMachine):
     length: Any = 1.0
 
     @property
-    def stops(self):
+    def contacts(self):
         count = len(self.masses) - 1
         between = tuple(vi.RigidStop(0.0, self.restitution, coordinate=i) for i in range(count))
         if self.wall is None:

@@ -7,8 +7,6 @@ import vi_jax as vi
 class Free(vi.AbstractMachine):
     """x'' + 0.2 x' + x = σ dW, of temperature σ²/0.4."""
 
-    stops = ()
-
     @property
     def cycle(self):
         return 2 * jnp.pi

@@ -11,7 +11,7 @@ class Kicked(vi.AbstractMachine):
 
     a: jax.Array = eqx.field(converter=jnp.asarray)
     b: jax.Array = eqx.field(converter=jnp.asarray)
-    stops: tuple = eqx.field(default=(), kw_only=True)
+    contacts: tuple = eqx.field(default=(), kw_only=True)
 
     @property
     def cycle(self):

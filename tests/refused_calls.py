@@ -24,7 +24,6 @@ REGION = {"start.Y": (0.0, 1.0)}
 class Own(vi.AbstractMachine):
     """A body on a spring, alone."""
 
-    stops: tuple = ()
     cycle: float = 1.0
 
     def field(self, s, state):

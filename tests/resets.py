@@ -29,7 +29,6 @@ class Walker(vi.AbstractMachine):
 
     slope: jax.Array = eqx.field(converter=jnp.asarray)
     interval: float | None = eqx.field(static=True, default=None)
-    stops: tuple = ()
 
     @property
     def cycle(self):
@@ -79,7 +78,6 @@ class StickSlip(vi.AbstractMachine):
     it. The mode is 1 while it slides."""
 
     voltage: jax.Array = eqx.field(converter=jnp.asarray)
-    stops: tuple = ()
 
     @property
     def cycle(self):
@@ -130,7 +128,6 @@ class ThreeStates(vi.AbstractMachine):
     """x' = A x, and where x1 falls through 1 at the speed v: x2 -= b v, x3 -= 1.6 v."""
 
     b: jax.Array = eqx.field(converter=jnp.asarray)
-    stops: tuple = ()
 
     @property
     def cycle(self):
@@ -157,7 +154,7 @@ class Excited(vi.AbstractMachine):
     restitution: jax.Array = eqx.field(default=0.6, converter=jnp.asarray)
 
     @property
-    def stops(self):
+    def contacts(self):
         return (vi.RigidStop(1.0, self.restitution, ends_cycle=True),)
 
     @property
@@ -174,7 +171,7 @@ class Toggled(vi.AbstractMachine):
     restitution: jax.Array = eqx.field(default=0.8, converter=jnp.asarray)
 
     @property
-    def stops(self):
+    def contacts(self):
         def drawn_away(side):
             return lambda machine, s, x, pull: (side,)
 

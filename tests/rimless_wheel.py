@@ -15,7 +15,6 @@ class Wheel(vi.AbstractMachine):
     """An inverted pendulum; a step ends where the next spoke comes down."""
 
     slope: float = 0.08
-    stops: tuple = ()
 
     @property
     def cycle(self):

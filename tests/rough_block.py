@@ -42,16 +42,14 @@ class Block(vi.AbstractMachine):
         return ABOVE_AND_ALONG
 
     @property
-    def stops(self):
-        return (vi.RigidStop(0.0, self.restitution, "left"),)
-
-    @property
-    def switches(self):
-        return (vi.ContactFriction(self.friction, stop=0, along=1, restitution=self.along),)
+    def contacts(self):
+        floor = vi.RigidStop(0.0, self.restitution, "left")
+        rubs = vi.ContactFriction(self.friction, stop=0, along=1, restitution=self.along)
+        return floor, rubs
 
     @property
     def cycle(self):
         return 2 * jnp.pi
 
-    def field(self, s, z, mode):
+    def field(self, s, z):
         return Plane(z.u, z.v, self.pull * jnp.cos(s), -1 + self.lift * jnp.sin(2 * s))

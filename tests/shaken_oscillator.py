@@ -18,7 +18,7 @@ class Shaken(vi.AbstractMachine):
         return {"taken": "W", "energy": "J", "position": "m"}
 
     @property
-    def stops(self):
+    def contacts(self):
         return (vi.RigidStop(self.gap, self.restitution),)
 
     @property

@@ -20,7 +20,7 @@ class Machine(vi.AbstractMachine):
     """A driven oscillator with a stop, whose field is spoilt below."""
 
     omega: jax.Array | float = 0.9
-    stops: tuple = (vi.RigidStop(2.0, 0.5),)
+    contacts: tuple = (vi.RigidStop(2.0, 0.5),)
 
     @property
     def cycle(self):
@@ -149,16 +149,7 @@ def test_10_a_guess_of_no_stable_motion():
     assert "`orbit` must be a stable orbit" in refused(lambda: vi.minimal_kick(undamped, orbit))
 
 
-class NoStops(vi.AbstractMachine):
-    cycle: float = 1.0
-
-    def field(self, s, x):
-        return vi.OscillatorState(x.V, -x.Y)
-
-
 class NoCycle(vi.AbstractMachine):
-    stops: tuple = ()
-
     def field(self, s, x):
         return vi.OscillatorState(x.V, -x.Y)
 
@@ -182,7 +173,6 @@ class Assigns(Machine):
     [
         (lambda: NoType(stiffness=3.0), "in the class, `stiffness: float = 2.0`"),
         (lambda: simulate(Assigns()), "must return new numbers"),
-        (lambda: NoStops(), "`NoStops` has none: write `stops: tuple = ()` in the class"),
         (lambda: NoCycle(), "must have `cycle`, but `NoCycle` has none: write `cycle: float"),
         (lambda: simulate(Machine(omega=jnp.ones(3))), "with a row as omega, take `jax.vmap`"),
         (lambda: basins_of(resolutions=9), "`basins` has no argument `resolutions`; near names: r"),

@@ -62,7 +62,7 @@ class Table(vi.AbstractMachine):
     """A spring pushed by a table and by a little that has no vector form, or by a cosine."""
 
     looked_up: bool
-    stops: tuple = (vi.RigidStop(1.5, 0.7),)
+    contacts: tuple = (vi.RigidStop(1.5, 0.7),)
 
     @property
     def cycle(self):
@@ -126,7 +126,7 @@ def test_a_field_may_close_over_what_is_differentiated(derivative):
 
     def last(numbers):
         class Shaken(vi.AbstractMachine):
-            stops: tuple = (vi.RigidStop(0.8, 0.7),)
+            contacts: tuple = (vi.RigidStop(0.8, 0.7),)
 
             @property
             def cycle(self):

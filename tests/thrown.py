@@ -18,21 +18,17 @@ class Thrown(vi.AbstractMachine):
 
     stop: vi.SoftStop
     length: jax.Array
-    stops: tuple = ()
 
     @property
-    def switches(self):
-        return (self.stop,)
+    def contacts(self):
+        return self.stop
 
     @property
     def cycle(self):
         return self.length
 
-    def field(self, s, state, mode):
-        return Body(state.V, self.stop.contribution(self, s, state, mode))
-
-    def step_limit(self, s, state):
-        return jnp.minimum(self.length / 5, self.stop.longest_step(self, state))
+    def field(self, s, state):
+        return Body(state.V, 0 * state.V)
 
 
 def thrown(stop, speed, length, **options):

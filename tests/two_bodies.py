@@ -28,7 +28,7 @@ class TwoBodies(vi.AbstractMachine):
     """Of the first; that of the second is 0.05."""
 
     @property
-    def stops(self):
+    def contacts(self):
         return (
             vi.RigidStop(self.gap, self.restitution),
             vi.RigidStop(self.gap, self.restitution, "left", coordinate=1),

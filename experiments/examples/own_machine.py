@@ -17,7 +17,7 @@ import vi_jax as vi
 # %% Angle Y, positive towards the first wall (which lies beyond the vertical: its gap is negative)
 class Pendulum(vi.AbstractMachine):
     shaking: jax.Array | float = 1.0
-    stops: tuple[vi.RigidStop, ...] = (vi.RigidStop(-0.2, 0.8), vi.RigidStop(1.5, 0.8, "left"))
+    contacts: tuple[vi.RigidStop, ...] = (vi.RigidStop(-0.2, 0.8), vi.RigidStop(1.5, 0.8, "left"))
 
     @property
     def cycle(self):

@@ -65,7 +65,7 @@ class Oscillator(vi.AbstractMachine):
     amplitude: Any
 
     @property
-    def stops(self):  # pyright: ignore
+    def contacts(self):  # pyright: ignore
         return (vi.RigidStop(GAP, self.law),)
 
     @property

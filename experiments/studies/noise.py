@@ -72,7 +72,7 @@ class Harvester(vi.AbstractMachine):
         return CYCLE
 
     @property
-    def stops(self) -> tuple[vi.RigidStop, ...]:  # pyright: ignore
+    def contacts(self) -> tuple[vi.RigidStop, ...]:  # pyright: ignore
         return tuple(vi.RigidStop(self.gap, self.restitution, side) for side in ("right", "left"))
 
     def field(self, s: Any, x: Any) -> Any:
@@ -146,7 +146,7 @@ class Gears(vi.AbstractMachine):
         return CYCLE
 
     @property
-    def stops(self) -> tuple[vi.RigidStop, ...]:  # pyright: ignore
+    def contacts(self) -> tuple[vi.RigidStop, ...]:  # pyright: ignore
         flanks = ((0.0, "left"), (1.0, "right"))
         return tuple(vi.RigidStop(place, self.restitution, side) for place, side in flanks)
 

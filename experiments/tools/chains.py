@@ -32,7 +32,7 @@ class CubicChain(vi.AbstractMachine):
     size: int = eqx.field(static=True)
 
     @property
-    def stops(self):  # pyright: ignore
+    def contacts(self):  # pyright: ignore
         return (vi.RigidStop(GAP, RESTITUTION),)
 
     @property

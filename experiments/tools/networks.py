@@ -33,7 +33,7 @@ class Oscillator(vi.AbstractMachine):
     part: str = eqx.field(static=True)
 
     @property
-    def stops(self):  # pyright: ignore
+    def contacts(self):  # pyright: ignore
         if self.part == "without":
             return ()
         return (vi.RigidStop(GAP, Law(self.network) if self.part == "law" else RESTITUTION),)

@@ -22,7 +22,6 @@ jax.config.update("jax_enable_x64", True)
 
 # %% The state: place q and speed of the impactor, and how fast the base slides
 class Impactor(vi.AbstractMachine):
-    stops: tuple = ()
     cycle: float = 8 * np.pi / 0.92
     events: tuple = (
         vi.Reset(

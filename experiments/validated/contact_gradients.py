@@ -24,7 +24,7 @@ jax.config.update("jax_enable_x64", True)
 # %% Height Y (m) over a second
 class Ball(vi.AbstractMachine):
     gravity: jax.Array | float
-    stops: tuple[vi.RigidStop, ...]
+    contacts: tuple[vi.RigidStop, ...]
     cycle: float = 1.0
 
     def field(self, s, state):

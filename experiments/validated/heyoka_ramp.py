@@ -31,7 +31,7 @@ inside = lambda ramp, s, z: 1 - z[0] + 0.05 * jnp.cos(11 * jnp.pi * z[0]) - z[1]
 
 
 class Ramp(vi.AbstractMachine):
-    stops: tuple = (vi.RigidStop(0.0, 0.8, "left"),)
+    contacts: tuple = (vi.RigidStop(0.0, 0.8, "left"),)
     events: tuple = (vi.Reset(inside, bounced),)
     coordinates: tuple = (
         vi.Coordinate(lambda z: z[1], lambda z: z[3], lambda z, Y, V: (z[0], Y, z[2], V)),

@@ -22,7 +22,6 @@ jax.config.update("jax_enable_x64", True)
 # %% A cycle ends where the velocity falls through zero
 class Spring(vi.AbstractMachine):
     stiffness: jax.Array | float
-    stops: tuple = ()
     cycle: float = 2.0
 
     def section(self, state):

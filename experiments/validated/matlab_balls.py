@@ -23,7 +23,7 @@ jax.config.update("jax_enable_x64", True)
 # %% Height Y (m) over 50 s
 class Ball(vi.AbstractMachine):
     gravity: jax.Array | float
-    stops: tuple[vi.RigidStop, ...]
+    contacts: tuple[vi.RigidStop, ...]
     cycle: float = 50.0
 
     def field(self, s, state):

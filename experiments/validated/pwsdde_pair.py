@@ -27,7 +27,7 @@ def placed(z, Y, V):  # with the momentum of both, of which the second has 1/20 
 
 class Pair(vi.AbstractMachine):
     omega: jax.Array | float = 1.5
-    stops: tuple = (vi.RigidStop(1.0, 0.9), vi.RigidStop(1.0, 0.9, "left"))
+    contacts: tuple = (vi.RigidStop(1.0, 0.9), vi.RigidStop(1.0, 0.9, "left"))
     cycle: float = 2 * jnp.pi
     coordinates: tuple = (
         vi.Coordinate(lambda z: z[1] - z[0], lambda z: z[3] - z[2], placed, 0.05 / 1.05),

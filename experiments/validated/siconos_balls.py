@@ -23,7 +23,7 @@ jax.config.update("jax_enable_x64", True)
 # %% Height Y above the floor (m) over 10 s
 class Ball(vi.AbstractMachine):
     gravity: jax.Array | float
-    stops: tuple[vi.RigidStop, ...]
+    contacts: tuple[vi.RigidStop, ...]
     cycle: float = 10.0
 
     def field(self, s, state):

@@ -22,7 +22,6 @@ jax.config.update("jax_enable_x64", True)
 # %% The state: places, counted from where all touch, and velocities
 class Chain(vi.AbstractMachine):
     stiffness: jax.Array | float = 1.0
-    stops: tuple = ()
     cycle: float = 60.0
 
     def field(self, s, balls):

@@ -22,9 +22,8 @@ jax.config.update("jax_enable_x64", True)
 # %% The field of each sign of the velocity; between them the block sticks
 class Block(vi.AbstractMachine):
     friction: jax.Array | float = 1.0
-    stops: tuple = ()
-    switches: tuple = (vi.Switch(lambda block, s, state: state.V, slides=True),)
-    cycle: float = jnp.pi
+    events = vi.Switch(lambda block, s, state: state.V, slides=True)
+    cycle = jnp.pi
 
     def field(self, s, state, mode):
         return vi.OscillatorState(state.V, -state.Y - self.friction * mode)

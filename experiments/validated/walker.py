@@ -31,7 +31,6 @@ apart = lambda walker, s, x: x[2] < -0.05  # the foot scuffs the ground as the l
 
 class Walker(vi.AbstractMachine):
     slope: jax.Array | float = 0.009
-    stops: tuple = ()
     cycle: float = 4.0  # about how long a step takes
     events: tuple = (vi.Reset(strikes, changed, when=apart, ends_cycle=True),)
 

@@ -24,7 +24,7 @@ import vi_jax as vi
 
 class Body(vi.AbstractMachine):
     omega: float = 0.9
-    stops: tuple = (vi.RigidStop(1.0, 0.7),)
+    contacts: tuple = (vi.RigidStop(1.0, 0.7),)
 
     @property
     def cycle(self):
@@ -46,7 +46,7 @@ settle = 20
 picture = "new/m.png"
 output = "new/m.csv"
 [scan]
-axes = { omega = [0.8, 1], stops.0.gap = [0.9, 1] }
+axes = { omega = [0.8, 1], contacts.0.gap = [0.9, 1] }
 settle = 40
 picture = "s.png"
 """

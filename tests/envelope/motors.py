@@ -41,7 +41,7 @@ def stalling() -> Found:
     timed = scene.in_clock("time")
     # Swings last long: a scene of its own clock is observed as often as asked.
     for name, method in STEPPED.items():
-        watched = Watched(scene=timed, stops=timed.stops)
+        watched = Watched(scene=timed, contacts=timed.stops)
         run = vi.simulate(watched, timed.adopt(start), 40, method=method)
         turned_back = bool((run.sections.W < 0).any())
         change = energy(scene, run.last) / energy(scene, start) - 1
@@ -53,7 +53,7 @@ class Watched(vi.AbstractMachine):
     """A motor scene observed once in a time of 2π, wherever its crank is."""
 
     scene: vi.Scene
-    stops: tuple
+    contacts: tuple  # pyright: ignore
 
     @property
     def cycle(self):

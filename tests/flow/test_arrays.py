@@ -52,7 +52,7 @@ class Chain(vi.AbstractMachine):
         return self.made(Y, y, V, w)
 
     @property
-    def stops(self):
+    def contacts(self):
         return (vi.RigidStop(self.gap, 0.7),)
 
     @property
@@ -213,7 +213,7 @@ class Row(vi.AbstractMachine):
     written: str = eqx.field(static=True, default="slices")
 
     @property
-    def stops(self):
+    def contacts(self):
         return (vi.RigidStop(0.5, 0.8),)
 
     @property

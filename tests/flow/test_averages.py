@@ -130,8 +130,6 @@ class Rubbed(NamedTuple):
 class Switching(vi.AbstractMachine):
     """A clock with a mode: ±1, by the sign of a sawtooth, which a reset begins anew."""
 
-    stops = ()
-
     @property
     def cycle(self):
         return 3.0

@@ -34,7 +34,7 @@ class Ball(AbstractMachine):
         return 6.0
 
     @property
-    def stops(self):
+    def contacts(self):
         return (vi.RigidStop(1.0, self.restitution, ends_cycle=True),)
 
     def field(self, s, state):

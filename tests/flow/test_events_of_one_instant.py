@@ -38,7 +38,6 @@ class Cases(vi.AbstractMachine):
 
     case: Any
     p: Any = P
-    stops: tuple = ()
     cycle: float = 5.0
 
     @property
@@ -140,7 +139,6 @@ def test_events_that_set_each_other_off_for_ever_end_the_lane(cases):
 class Furnace(vi.AbstractMachine):
     """Off above 296, on below 294: T' = -2 (T - 285) + 25 if on."""
 
-    stops: tuple = ()
     cycle: float = 1.0
     events: tuple = (
         vi.Reset(lambda m, s, T, on: 294 - T[0], lambda m, s, T, on: T, modes=lambda *_: (1.0,)),
@@ -199,9 +197,8 @@ class Wave(vi.AbstractMachine):
     begin."""
 
     decay: Any = 0.0
-    stops: tuple = ()
     cycle: float = 10.0
-    switches: tuple = (vi.Switch(lambda m, s, x: s - 5),)
+    events = vi.Switch(lambda m, s, x: s - 5)
 
     def field(self, s, x, side):
         return (jnp.where(side > 0, 1.0, -1.0) - self.decay * x[0],)
@@ -228,7 +225,7 @@ class Pair(eqx.Module):
 class Bodies(vi.AbstractMachine):
     """Two bodies that nothing pulls, each before a stop."""
 
-    stops: tuple = (vi.RigidStop(1.0, 0.5), vi.RigidStop(1.0, 0.25, coordinate=1))
+    contacts: tuple = (vi.RigidStop(1.0, 0.5), vi.RigidStop(1.0, 0.25, coordinate=1))
     coordinates: tuple = (
         vi.Coordinate(lambda z: z.x, lambda z: z.u, lambda z, Y, V: Pair(Y, z.y, V, z.v)),
         vi.Coordinate(lambda z: z.y, lambda z: z.v, lambda z, Y, V: Pair(z.x, Y, z.u, V)),
@@ -254,7 +251,7 @@ class Watched(vi.AbstractMachine):
     events: tuple = (vi.Reset(lambda m, s, x: x.Y - 9, lambda m, s, x: x),)
 
     @property
-    def stops(self):
+    def contacts(self):
         return (vi.RigidStop(self.gap, 0.7),)
 
     def field(self, s, x):
@@ -276,7 +273,6 @@ def test_derivatives_of_extremes_beside_events():
 class Behind(vi.AbstractMachine):
     """y'' = 2 - y, from where a reset has its surface."""
 
-    stops: tuple = ()
     cycle: float = 9.0
     events: tuple = (
         vi.Reset(lambda m, s, x: x.Y - 1, lambda m, s, x: vi.OscillatorState(x.Y, x.V + 1)),
@@ -332,7 +328,7 @@ def test_a_blow_is_felt_along_any_path_of_contacts():
         ).all()
 
     class Row:
-        stops = tuple(vi.RigidStop(0.0, 0.5, coordinate=i) for i in range(6))
+        contacts = tuple(vi.RigidStop(0.0, 0.5, coordinate=i) for i in range(6))
 
     orders = jnp.array(list(itertools.permutations(range(6))))
     assert bool(jax.jit(jax.vmap(reached))(orders).all())

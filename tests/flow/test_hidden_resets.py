@@ -28,7 +28,6 @@ class Ramp(vi.AbstractMachine):
 
     wave: float
     number: float
-    stops: tuple = ()
     events: tuple = (vi.Reset(inside, bounced),)
     coordinates: tuple = (
         vi.Coordinate(lambda z: z[1], lambda z: z[3], lambda z, Y, V: (z[0], Y, z[2], V)),

@@ -39,7 +39,7 @@ class Shaken(vi.AbstractMachine):
     softening: bool = False
 
     @property
-    def stops(self):
+    def contacts(self):
         return (vi.RigidStop(1.5, self.law),)
 
     @property

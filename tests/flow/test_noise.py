@@ -25,7 +25,7 @@ class Walled(Free):
     place: jax.Array
 
     @property
-    def stops(self):
+    def contacts(self):
         return (vi.RigidStop(-self.place, self.restitution, "left"),)
 
     def averages(self, s, x):
@@ -36,17 +36,15 @@ class Cushioned(Free):
     """With a spring stop of stiffness 10 beyond 1."""
 
     @property
-    def switches(self):
-        return (vi.SoftStop(1.0, 10.0, damping=0.0),)
+    def contacts(self):
+        return vi.SoftStop(1.0, 10.0, damping=0.0)
 
-    def push(self, x, mode):
-        return jnp.where(mode > 0, 10.0 * (x.Y - 1.0), 0.0)
+    def field(self, s, x):
+        return vi.OscillatorState(x.V, -x.Y - 0.2 * x.V)
 
-    def field(self, s, x, mode):
-        return vi.OscillatorState(x.V, -x.Y - 0.2 * x.V - self.push(x, mode))
-
-    def averages(self, s, x, mode):
-        return {"contact": 0.5 * (mode + 1.0), "force": self.push(x, mode)}
+    def averages(self, s, x):
+        touches = x.Y > 1.0
+        return {"contact": 1.0 * touches, "force": jnp.where(touches, 10.0 * (x.Y - 1.0), 0.0)}
 
 
 def walled(restitution=0.7, place=0.0):
@@ -222,7 +220,6 @@ def test_a_spring_stop_is_touched_as_boltzmann_says():
 class Growing(vi.AbstractMachine):
     """x' = 0.3 x, a cycle of 1."""
 
-    stops = ()
     cycle = 1.0
 
     def field(self, s, x):

@@ -136,7 +136,7 @@ class Lifted(vi.AbstractMachine):
     cycle: float = 1.0
 
     @property
-    def stops(self):
+    def contacts(self):
         return (vi.RigidStop(0.0, self.rebound),)
 
     def field(self, s, x):

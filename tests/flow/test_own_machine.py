@@ -22,7 +22,7 @@ class BouncingBall(vi.AbstractMachine):
     """Free fall on a floor at Y = 0, looked at once a second: all that `simulate` has to know."""
 
     gravity: jax.Array
-    stops: tuple[vi.RigidStop, ...]
+    contacts: tuple[vi.RigidStop, ...]
 
     @property
     def cycle(self):
@@ -104,8 +104,7 @@ class Wrong(BouncingBall):
         ("cycle", (), "`cycle` of a Wrong must be a number"),
         ("shape", (), "`field` of a Wrong must return"),
         ("section", (), "`section` of a Wrong .* `jnp.where`, not `if`"),
-        ("", (0.5,), "`stops` of a Wrong must be a tuple"),
-        ("", vi.RigidStop(0.5, 0.5), "`stops` of a Wrong must be a tuple"),
+        ("", (0.5,), "`contacts` of a Wrong must be a tuple of contacts"),
         ("", (vi.RigidStop(0.5, 0.5, coordinate=1),), "limits coordinate 1, but there are 1"),
     ],
 )

@@ -18,7 +18,7 @@ class Bounce(vi.AbstractMachine):
     kind: Any = eqx.field(default=vi.RigidStop, static=True)
 
     @property
-    def stops(self):
+    def contacts(self):
         return (self.kind(0.0, self.law),)
 
     @property
@@ -97,11 +97,9 @@ def test_rest_and_losses_follow_a_rebound_of_ones_own():
 class Pushed(vi.AbstractMachine):
     """Forces on both sides of a line point at it."""
 
-    stops: tuple = ()
-
     @property
-    def switches(self):
-        return (vi.Switch(lambda machine, s, x: x.Y + x.V),)
+    def events(self):
+        return vi.Switch(lambda machine, s, x: x.Y + x.V)
 
     @property
     def cycle(self):
@@ -120,8 +118,6 @@ def test_a_sliding_mode_has_its_own_reason():
 
 class Turned(vi.AbstractMachine):
     """A spring whose body is turned round as each cycle begins."""
-
-    stops: tuple = ()
 
     @property
     def cycle(self):

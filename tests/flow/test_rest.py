@@ -24,7 +24,7 @@ class Ground(vi.AbstractMachine):
     """A ball on the ground."""
 
     gravity: jax.Array
-    stops: tuple[vi.RigidStop, ...]
+    contacts: tuple[vi.RigidStop, ...]
     cycle: float = 10.0
 
     def field(self, s, state):
@@ -217,23 +217,16 @@ class Body(vi.AbstractMachine):
     """A body of mass one under a force a + b s + c sin s, with drag."""
 
     force: Any = eqx.field(converter=lambda x: jnp.asarray(x, float))
-    stops: tuple[vi.RigidStop, ...] = ()
-    soft: tuple[vi.SoftStop, ...] = ()
+    contacts: tuple = ()
     drag: Any = eqx.field(default=0.0, converter=lambda x: jnp.asarray(x, float))
-
-    @property
-    def switches(self):
-        return self.soft
 
     @property
     def cycle(self):
         return 2 * jnp.pi
 
-    def field(self, s, state, *modes):
+    def field(self, s, state):
         a, b, c = self.force
         pull = a + b * s + c * jnp.sin(s) - self.drag * state.V
-        for stop, mode in zip(self.soft, modes, strict=True):
-            pull = pull + stop.contribution(self, s, state, mode)
         return vi.OscillatorState(state.V, pull)
 
 
@@ -248,7 +241,7 @@ def test_a_soft_stop_touched_at_rest():
 
     def one(force, gap):
         spring = vi.SoftStop(gap, 50.0, restitution=0.6)
-        return vi.simulate(Body(force, soft=(spring,), drag=0.1), at(0, 0), 1)
+        return vi.simulate(Body(force, contacts=(spring,), drag=0.1), at(0, 0), 1)
 
     run = jax.vmap(one)(jnp.asarray(forces), jnp.asarray(gaps))
     assert bool(run.successful.all())

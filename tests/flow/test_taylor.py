@@ -113,7 +113,6 @@ def test_a_method_of_ones_own_foresees():
 class Wave(vi.AbstractMachine):
     """x' = 1 + cos 12πs: about s = 0 every other term of its series vanishes."""
 
-    stops: tuple = ()
     cycle: float = 1.0
 
     def field(self, s, x):
@@ -141,7 +140,6 @@ class Pushed(vi.AbstractMachine):
     """With a force given as a function of s and Y."""
 
     force: Callable
-    stops: tuple = ()
     cycle: float = 1.0
 
     def field(self, s, state):

@@ -198,7 +198,7 @@ class Hill(vi.AbstractMachine):
     """A ball that flies free over y = exp(-100 (x - 4)²)."""
 
     cycle: float = 10.0
-    stops: tuple = (vi.RigidStop(0.0, 0.5, "left"),)
+    contacts: tuple = (vi.RigidStop(0.0, 0.5, "left"),)
 
     @property
     def coordinates(self):
@@ -232,7 +232,6 @@ def test_a_ball_hits_a_hill_that_is_narrower_than_a_step(method):
 class Dips(vi.AbstractMachine):
     """y' = 2 (s - 5), which is set back a hundred higher where y falls through zero."""
 
-    stops: tuple = ()
     cycle: float = 10.0
     events: tuple = (
         vi.Reset(lambda _, s, x: -x.Y, lambda _, s, x: vi.OscillatorState(x.Y + 100, x.V)),

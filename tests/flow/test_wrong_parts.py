@@ -21,7 +21,6 @@ def back(machine, s, state):
 class Swing(vi.AbstractMachine):
     """x'' = -x with a reset; its parts are replaced by wrong ones."""
 
-    stops: tuple = ()
     event: tuple = eqx.field(static=True, default=())
     parts: tuple = ()
     cycle = 6.0
@@ -31,7 +30,7 @@ class Swing(vi.AbstractMachine):
         return self.event
 
     @property
-    def switches(self):
+    def contacts(self):
         return self.parts
 
     def field(self, s, state, *modes):
@@ -76,8 +75,8 @@ def test_events(event, message):
 def test_parts_are_tuples_of_their_kind():
     with pytest.raises(TypeError, match="`events` of a Swing must be a tuple of `AbstractEvent`s"):
         vi.simulate(Swing(event=(guard,)), START, 1)
-    with pytest.raises(TypeError, match="`switches` of a Swing must be a tuple"):
-        vi.find_orbit(Swing(parts=(vi.RigidStop(1.0, 0.5),)), START)
+    with pytest.raises(TypeError, match="`contacts` of a Swing must be a tuple of contacts"):
+        vi.find_orbit(Swing(parts=(vi.Reset(guard, back),)), START)
 
 
 class Floor(vi.AbstractMachine):
@@ -87,7 +86,6 @@ class Floor(vi.AbstractMachine):
     along: int = 1
     tuples: bool = False
     cycle = 6.0
-    stops: tuple = (vi.RigidStop(0.0, 0.5, "left"),)
 
     @property
     def coordinates(self):
@@ -98,10 +96,11 @@ class Floor(vi.AbstractMachine):
         return one, one
 
     @property
-    def switches(self):
-        return (vi.ContactFriction(self.friction, stop=0, along=self.along),)
+    def contacts(self):
+        floor = vi.RigidStop(0.0, 0.5, "left")
+        return floor, vi.ContactFriction(self.friction, stop=0, along=self.along)
 
-    def field(self, s, state, mode):
+    def field(self, s, state):
         return vi.OscillatorState(state.V, -1.0 + 0 * state.V)
 
 
@@ -156,7 +155,7 @@ class Springs(vi.AbstractMachine):
     cycle: Any = 3.0
 
     @property
-    def stops(self):
+    def contacts(self):
         return (vi.RigidStop(self.gap, self.restitution),)
 
     def position(self, state):

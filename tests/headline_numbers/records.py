@@ -38,7 +38,7 @@ def learned_laws() -> Expected:
         amplitude: Any
 
         @property
-        def stops(self):
+        def contacts(self):
             return (vi.RigidStop(0.6, lambda v: 0.4 + 0.5 * jnp.exp(-v / 0.8)),)
 
         @property

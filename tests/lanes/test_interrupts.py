@@ -59,7 +59,6 @@ class Collected(vi.AbstractMachine):
     """The garbage collector runs where its field is asked."""
 
     cycle: float = 1.0
-    stops: tuple = ()
 
     def field(self, s, state):
         gc.collect()

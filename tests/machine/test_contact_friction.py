@@ -137,18 +137,15 @@ class Coupled(vi.AbstractMachine):
         )
 
     @property
-    def stops(self):
-        return (vi.RigidStop(0.0, self.restitution, "left"),)
-
-    @property
-    def switches(self):
-        return (vi.ContactFriction(self.friction, stop=0, along=1),)
+    def contacts(self):
+        floor = vi.RigidStop(0.0, self.restitution, "left")
+        return floor, vi.ContactFriction(self.friction, stop=0, along=1)
 
     @property
     def cycle(self):
         return 1.0
 
-    def field(self, s, z, mode):
+    def field(self, s, z):
         return Plane(z.u, z.v, 0 * z.u, 0 * z.v)
 
 
@@ -196,8 +193,8 @@ def test_a_law_that_would_gain_energy_is_refused():
 def test_numbers_of_what_is_not_there_are_refused():
     class Wrong(Block):
         @property
-        def switches(self):
-            return (vi.ContactFriction(0.3, stop=1, along=1),)
+        def contacts(self):
+            return vi.RigidStop(0.0, 0.5, "left"), vi.ContactFriction(0.3, stop=1, along=1)
 
     with pytest.raises(ValueError, match=r"`stop` of a ContactFriction .* has 1, but got 1"):
         vi.simulate(Wrong(), at(0, 1, 0, 0), 1)

@@ -74,7 +74,7 @@ class Backlash(vi.AbstractMachine):
 
 class Furnace(vi.AbstractMachine):
     cycle = 1.0
-    modes = dict(on=0.0)
+    modes = {"on": 0.0}  # noqa: RUF012
     events = (
         vi.Reset(lambda m, t, z, on: 294 - z.T, modes=lambda m, t, z, on: 1.0),
         vi.Reset(lambda m, t, z, on: z.T - 296, modes=lambda m, t, z, on: 0.0),

@@ -19,8 +19,7 @@ def speed(machine, s, z):
 class Oscillator(vi.AbstractMachine):
     """x'' = -x - sgn x'."""
 
-    stops: tuple = ()
-    switches: tuple = (vi.Switch(speed, slides=True),)
+    events = vi.Switch(speed, slides=True)
 
     @property
     def cycle(self):
@@ -54,8 +53,7 @@ class Relay(vi.AbstractMachine):
     """x' = a sin s - m, y' = m with m = sgn x: on x = 0 it slides while |a sin s| < 1."""
 
     amplitude: Any = 0.5
-    stops: tuple = ()
-    switches: tuple = (vi.Switch(place, slides=True),)
+    events = vi.Switch(place, slides=True)
 
     @property
     def cycle(self):

@@ -91,7 +91,7 @@ def test_a_machine_that_states_nothing_is_told_without_units():
         gap: float = 0.5
 
         @property
-        def stops(self):
+        def contacts(self):
             return (vi.RigidStop(self.gap, 0.6),)
 
         @property

@@ -192,7 +192,7 @@ class Rod(vi.AbstractMachine):
     places: Any
 
     @property
-    def stops(self):
+    def contacts(self):
         return tuple(vi.RigidStop(0.0, k, coordinate=i) for i, k in enumerate(self.restitution))
 
     @property

@@ -171,7 +171,7 @@ class Own(vi.AbstractMachine):
         return {"y": Y, "v": V}
 
     @property
-    def stops(self):
+    def contacts(self):
         return (vi.RigidStop(0.5, 0.6),)
 
     @property
@@ -258,7 +258,6 @@ class Tanks(NamedTuple):
 
 class Filter(vi.AbstractMachine):
     rate: jax.Array
-    stops = ()
 
     @property
     def cycle(self):
@@ -294,7 +293,7 @@ class Apart(TwoBodies):
     """Only the second has a stop."""
 
     @property
-    def stops(self):
+    def contacts(self):
         return (vi.RigidStop(0.05, self.restitution, "left", coordinate=1),)
 
 

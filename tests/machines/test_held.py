@@ -86,7 +86,7 @@ class Put(vi.AbstractMachine):
     kick: Any
 
     @property
-    def stops(self):
+    def contacts(self):
         return (vi.RigidStop(0.5, 0.0),)
 
     @property
@@ -126,7 +126,7 @@ class Point(eqx.Module):
 class Dome(vi.AbstractMachine):
     """A particle on a smooth dome of radius one, under gravity."""
 
-    stops: tuple = (vi.RigidStop(-1.0, 0.3, "left"),)
+    contacts: tuple = (vi.RigidStop(-1.0, 0.3, "left"),)
 
     def position(self, z):
         return jnp.hypot(z.x, z.y)
@@ -202,7 +202,7 @@ class Pressed(vi.AbstractMachine):
     radius: Any = number(0.25)
 
     @property
-    def stops(self):
+    def contacts(self):
         return (vi.RigidStop(0.0, 0.3),)
 
     @property
@@ -251,7 +251,7 @@ class Table(vi.AbstractMachine):
     strength: Any = number(0.9)
 
     @property
-    def stops(self):
+    def contacts(self):
         return (vi.RigidStop(0.0, 0.4, "left"),)
 
     def position(self, z):

@@ -20,8 +20,8 @@ def begins(Y, V):
 class Glider(vi.AbstractMachine):
     """A body that nothing pulls."""
 
-    stops: tuple = ()
     events: tuple = ()
+    contacts: tuple = ()
     cycle = 4.0
 
     def field(self, s, state):
@@ -38,7 +38,7 @@ def same(machine, s, state):
 
 def test_a_cycle_ends_at_the_instant_of_an_impact():
     ends = (vi.Reset(lambda m, s, x: s - 1.0, same, ends_cycle=True),)
-    machine = Glider(stops=(vi.RigidStop(1.0, 0.5),), events=ends)
+    machine = Glider(contacts=(vi.RigidStop(1.0, 0.5),), events=ends)
     run = vi.simulate(machine, begins(0, 1), 1)
     assert float(run.duration[0]) == pytest.approx(1.0, abs=1e-12)
     assert float(run.last.V) == pytest.approx(-0.5)
@@ -70,7 +70,7 @@ class Held(State):
 class Pressed(Glider):
     """A body on the left stop, whose force is part of its state."""
 
-    stops: tuple = (vi.RigidStop(0.0, 0.0, "left"),)
+    contacts: tuple = (vi.RigidStop(0.0, 0.0, "left"),)
     events: tuple = (vi.Reset(lambda m, s, x: s - 2.0, lambda m, s, x: Held(x.Y, x.V, -x.force)),)
 
     def placed(self, state, Y, V):
@@ -92,7 +92,7 @@ class Lever(vi.AbstractMachine):
     cycle = 4.0
 
     @property
-    def stops(self):
+    def contacts(self):
         hit = vi.RigidStop(1.0, 0.5, coordinate=1, modes=lambda m, s, z, way: (1.0,))
         return vi.RigidStop(0.0, 0.0, "left"), hit
 
@@ -120,19 +120,15 @@ class Pulled(vi.AbstractMachine):
     """A block on a floor that is pulled harder from s = 1 on."""
 
     slope: jax.Array | float = 0.0
-    stops: tuple = (vi.RigidStop(0.0, 0.0, "left"),)
+    contacts = (vi.RigidStop(0.0, 0.0, "left"), vi.ContactFriction(1.0, stop=0, along=1))
+    events = vi.Switch(lambda machine, s, state: s - 1.0)
     cycle = 3.0
 
     @property
     def coordinates(self):
         return ABOVE_AND_ALONG
 
-    @property
-    def switches(self):
-        later = vi.Switch(lambda machine, s, state: s - 1.0)
-        return vi.ContactFriction(1.0, stop=0, along=1), later
-
-    def field(self, s, z, slips, on):
+    def field(self, s, z, on):
         pull = jnp.where(on > 0, 2.0 + self.slope * (s - 1), 0.5)
         return Plane(z.u, z.v, pull + 0 * z.u, -1 + 0 * z.v)
 

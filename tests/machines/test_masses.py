@@ -29,7 +29,7 @@ def test_impacts_of_an_unbalanced_rotor_lose_what_its_energy_does():
 class Growing(vi.AbstractMachine):
     """A body that nothing pulls, whose mass changes: m(s) V is constant."""
 
-    stops: tuple = (vi.RigidStop(1.0, 0.5),)
+    contacts: tuple = (vi.RigidStop(1.0, 0.5),)
     cycle: float = 2 * np.pi
 
     @property
@@ -78,7 +78,7 @@ class Pair(vi.OscillatorState):
 class Bodies(vi.AbstractMachine):
     """Two bodies that nothing pulls, between stops of their own."""
 
-    stops: tuple = (vi.RigidStop(1.0, 0.5), vi.RigidStop(2.0, 0.5, "left", coordinate=1))
+    contacts: tuple = (vi.RigidStop(1.0, 0.5), vi.RigidStop(2.0, 0.5, "left", coordinate=1))
     coordinates: tuple = (
         vi.Coordinate(lambda z: z.Y, lambda z: z.V, lambda z, Y, V: Pair(Y, V, z.y, z.v)),
         vi.Coordinate(lambda z: z.y, lambda z: z.v, lambda z, Y, V: Pair(z.Y, z.V, Y, V)),

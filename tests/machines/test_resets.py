@@ -225,7 +225,7 @@ def test_backends_agree(name):
 class Thrown(vi.AbstractMachine):
     """A body that a reset moves beyond its stop."""
 
-    stops: tuple = (vi.RigidStop(2.0, 0.5),)
+    contacts: tuple = (vi.RigidStop(2.0, 0.5),)
 
     @property
     def events(self):
@@ -259,8 +259,6 @@ class Unnamed(eqx.Module):
 
 class Bounced(vi.AbstractMachine):
     """a'' = -a, thrown back at .5, in a state whose second number is no velocity."""
-
-    stops: tuple = ()
 
     @property
     def cycle(self):

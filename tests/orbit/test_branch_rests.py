@@ -232,7 +232,7 @@ class Uneven(vi.AbstractMachine):
     restitution: Any = 0.4
 
     @property
-    def stops(self):
+    def contacts(self):
         return vi.RigidStop(0.1, self.restitution), vi.RigidStop(1.9, 0.6, "left")
 
     @property

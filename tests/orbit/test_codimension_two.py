@@ -180,7 +180,6 @@ class Pitchfork(vi.AbstractMachine):
 
     a: jax.Array = eqx.field(converter=jnp.asarray)
     b: jax.Array = eqx.field(converter=jnp.asarray)
-    stops: tuple = ()
 
     @property
     def cycle(self):

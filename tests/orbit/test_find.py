@@ -31,7 +31,6 @@ class VanDerPol(vi.AbstractMachine):
     """Y'' - μ(1 - Y²)Y' + Y = 0, observed where Y and Y' have risen, by a guard with a kink."""
 
     mu: jax.Array
-    stops = ()
 
     @property
     def cycle(self):

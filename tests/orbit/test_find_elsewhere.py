@@ -23,7 +23,6 @@ class Coupled(vi.AbstractMachine):
 
     damping: jax.Array = eqx.field(default=0.3, converter=jnp.asarray)
     push: jax.Array = eqx.field(default=0.0, converter=jnp.asarray)
-    stops: tuple = ()
 
     @property
     def cycle(self):

@@ -157,7 +157,7 @@ class Limit(vi.AbstractMachine):
     gap: jax.Array | float = 2.2
 
     @property
-    def stops(self):
+    def contacts(self):
         return (vi.RigidStop(self.gap, K),)
 
     @property

@@ -16,7 +16,7 @@ class Shaken(vi.AbstractMachine):
     gap: jax.Array | float = 1.2
 
     @property
-    def stops(self):
+    def contacts(self):
         return (vi.RigidStop(self.gap, 0.76),)
 
     @property

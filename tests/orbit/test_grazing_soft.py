@@ -15,20 +15,15 @@ class Soft(vi.AbstractMachine):
     stop: vi.SoftStop
 
     @property
-    def stops(self):
-        return ()
-
-    @property
-    def switches(self):
-        return (self.stop,)
+    def contacts(self):
+        return self.stop
 
     @property
     def cycle(self):
         return 2 * jnp.pi
 
-    def field(self, s, x, mode):
-        push = jnp.cos(s) - 0.5 * x.Y - 0.4 * x.V + self.stop.contribution(self, s, x, mode)
-        return vi.OscillatorState(x.V, push)
+    def field(self, s, x):
+        return vi.OscillatorState(x.V, jnp.cos(s) - 0.5 * x.Y - 0.4 * x.V)
 
     def start(self):
         return vi.OscillatorState(jnp.asarray(0.0), jnp.asarray(0.0))

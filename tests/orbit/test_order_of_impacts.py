@@ -21,7 +21,7 @@ class TwoBodies(vi.AbstractMachine):
     """Two bodies joined by a spring, each with its own force and stop."""
 
     shift: jax.Array | float = 0.3
-    stops = (vi.RigidStop(0.3, 0.6, name="first"), vi.RigidStop(0.3, 0.6, name="second",
+    contacts = (vi.RigidStop(0.3, 0.6, name="first"), vi.RigidStop(0.3, 0.6, name="second",
                                                                coordinate=1))  # fmt: skip
     cycle = 2 * np.pi / 1.3
 

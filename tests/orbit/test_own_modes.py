@@ -13,7 +13,7 @@ class Flipped(vi.AbstractMachine):
     """x'' = -(1 + 0.3 m) x - 0.04 x' + cos 2.2 s before a stop; each impact turns m over."""
 
     depth: Any = 0.3
-    stops: tuple = (vi.RigidStop(0.1, 0.8, modes=lambda machine, s, x, m: (-m,)),)
+    contacts: tuple = (vi.RigidStop(0.1, 0.8, modes=lambda machine, s, x, m: (-m,)),)
     cycle: float = 2 * np.pi / 2.2
 
     def begin(self, s, x):

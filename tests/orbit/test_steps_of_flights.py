@@ -15,7 +15,7 @@ class Oscillator(vi.AbstractMachine):
     restitution: jax.Array | float = 0.7
 
     @property
-    def stops(self):
+    def contacts(self):
         return (vi.RigidStop(self.gap, self.restitution),)
 
     @property

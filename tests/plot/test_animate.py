@@ -38,7 +38,7 @@ MACHINES = {
 class Own(vi.AbstractMachine):
     """A body on a spring between two stops."""
 
-    stops: tuple = (vi.RigidStop(1.0, 0.5), vi.RigidStop(1.0, 0.5, "left"))
+    contacts: tuple = (vi.RigidStop(1.0, 0.5), vi.RigidStop(1.0, 0.5, "left"))
     cycle: float = 6.0
 
     def field(self, s, state):

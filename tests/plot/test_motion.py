@@ -88,15 +88,14 @@ def test_history_of_a_machine_counts_its_own_cycles():
 class Stated(vi.AbstractMachine):
     """A body on a spring between a stop and a soft one, in millimetres."""
 
-    stops: tuple = (vi.RigidStop(1.5, 0.5),)
-    switches: tuple = (vi.SoftStop(1.2, 50.0, side="left"),)
+    contacts = (vi.RigidStop(1.5, 0.5), vi.SoftStop(1.2, 50.0, side="left"))
     cycle: float = 6.0
 
     @property
     def units(self):
         return {"position": "mm", "velocity": "mm/s"}
 
-    def field(self, s, x, mode):
+    def field(self, s, x):
         return vi.OscillatorState(x.V, -x.Y)
 
 

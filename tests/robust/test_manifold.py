@@ -15,7 +15,6 @@ class Bent(vi.AbstractMachine):
 
     b: jax.Array | float = 0.0
     c: jax.Array | float = 0.0
-    stops: tuple = ()
 
     @property
     def cycle(self):

@@ -140,7 +140,6 @@ class Between(vi.AbstractMachine):
     pushed."""
 
     push: jax.Array | float = 1.0
-    stops: tuple = ()
 
     @property
     def cycle(self):

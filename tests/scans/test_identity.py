@@ -42,7 +42,6 @@ class Depth(vi.AbstractMeasure):
         return helper(x)
 
 class Ball(vi.AbstractMachine):
-    stops: tuple = ()
     cycle: float = 1.0
 
     def field(self, s, state):

@@ -90,7 +90,7 @@ class Reflected(Free):
     """The same with an elastic stop at 0."""
 
     @property
-    def stops(self):
+    def contacts(self):
         return (vi.RigidStop(0.0, 1.0, "left"),)
 
 
@@ -122,7 +122,6 @@ def test_impacts_on_an_elastic_stop_are_crossings_of_zero():
 class Relaxing(vi.AbstractMachine):
     """x' = -x + σ dW, with one impulse in a cycle of 0.5."""
 
-    stops = ()
     cycle = 0.5
 
     def field(self, s, x):
@@ -203,7 +202,6 @@ def test_a_lane_ends_once_it_has_escaped(of, samples, settle):
 class Bursting(vi.AbstractMachine):
     """x' = x², which has no x after 1/x(0)."""
 
-    stops: tuple = ()
     cycle: float = 0.25
 
     def field(self, s, x):

@@ -26,7 +26,10 @@ from ..machine import (
 from ._own import in_short, in_words_of, rows_of
 
 _KINDS = {
-    "contacts": (AbstractEvent, "contacts: `RigidStop`s, `SoftStop`s and `DryFriction`s"),
+    "contacts": (
+        (RigidStop, AbstractSwitch),
+        "contacts: `RigidStop`s, `SoftStop`s and `DryFriction`s",
+    ),
     "stops": (RigidStop, "`RigidStop`s"),
     "switches": (AbstractSwitch, "`AbstractSwitch`es, as `SoftStop` and `DryFriction` are"),
     "events": (AbstractEvent, "`AbstractEvent`s, as `Reset` and `Switch` are"),

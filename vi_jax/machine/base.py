@@ -4,9 +4,10 @@ import abc
 from collections.abc import Callable, Mapping
 from functools import partial
 from math import pi
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
@@ -18,8 +19,9 @@ from .cycles import Passing, Turn, at_intervals, counter_of
 from .event import AbstractEvent, AbstractSwitch
 from .names import coordinate_by_name
 from .observing import Observed
-from .own import by_default, derived, is_own, says
+from .own import by_default, declared_modes, derived, is_own, says
 from .parts import coordinates_in, listed, other_events, stops_in, switches_in
+from .soft import SoftStop
 from .stop import RigidStop, Wall
 from .words import Worded
 
@@ -131,31 +133,59 @@ class AbstractMachine(Clocked, Observed, Worded):
         With `switches`, or modes of its own, it is `field(s, state, mode, ...)`, which gets them.
         """
 
-    @derived
-    def contacts(self) -> Any:
-        """Rigid and soft stops, dry friction: a tuple, or one of them."""
-        return ()
+    if TYPE_CHECKING:  # a subclass has them as attributes, properties or fields
 
-    @derived
-    def events(self) -> Any:
-        """Switches, resets, and kinds of events of its own: a tuple, or one of them."""
-        return ()
+        @property
+        def contacts(self) -> Any: ...
 
-    @derived
-    def modes(self) -> Mapping[str, float]:
-        """The modes of its own, by name, in which a motion begins; its field gets them behind the
-        state, and events change them."""
-        return {}
+        @property
+        def events(self) -> Any: ...
 
-    @derived
-    def stops(self) -> tuple[RigidStop, ...]:
-        """The rigid stops among the contacts."""
-        return stops_in(self)
+        @property
+        def modes(self) -> Any: ...
 
-    @derived
-    def switches(self) -> tuple[AbstractSwitch, ...]:
-        """The contacts that are no rigid stops, and the switches among the events."""
-        return switches_in(self)
+        @property
+        def stops(self) -> Any: ...
+
+        @property
+        def switches(self) -> Any: ...
+
+        @property
+        def coordinates(self) -> Any: ...
+    else:
+
+        @derived
+        def contacts(self) -> Any:
+            """Rigid and soft stops, dry friction: a tuple, or one of them."""
+            return ()
+
+        @derived
+        def events(self) -> Any:
+            """Switches, resets, and kinds of events of its own: a tuple, or one of them."""
+            return ()
+
+        @derived
+        def modes(self) -> Mapping[str, float]:
+            """The modes of its own, by name, in which a motion begins; its field gets them behind
+            the state, and events change them."""
+            return {}
+
+        @derived
+        def stops(self) -> tuple[RigidStop, ...]:
+            """The rigid stops among the contacts."""
+            return stops_in(self)
+
+        @derived
+        def switches(self) -> tuple[AbstractSwitch, ...]:
+            """The contacts that are no rigid stops, and the switches among the events."""
+            return switches_in(self)
+
+        @derived
+        def coordinates(self) -> tuple[Coordinate, ...]:
+            """The coordinates that contacts act on, by number as `RigidStop.coordinate` names them;
+            extremes are recorded of the first. By default those that contacts name by `on`, and
+            where none does one, the machine's `position`, `velocity` and `placed`."""
+            return coordinates_in(self)
 
     @property
     def others(self) -> tuple[AbstractEvent, ...]:
@@ -167,7 +197,7 @@ class AbstractMachine(Clocked, Observed, Worded):
         """The machine's own modes in a motion that begins in `state`: numbers that its field gets
         behind the state, and that events change; by default what `modes` of the class says. A start
         that is a `HybridState`, as `Run.last` is, has its own instead."""
-        return tuple(self.modes.values())
+        return tuple(declared_modes(self).values())
 
     def observed_every(self, interval: Any) -> "AbstractMachine":
         """An autonomous machine observed at equal intervals of `s` instead of on its section."""
@@ -185,21 +215,19 @@ class AbstractMachine(Clocked, Observed, Worded):
         return counter.section(state) if isinstance(counter, Passing) else None
 
     def step_limit(self, s: Scalar, state: State) -> Scalar | float:
-        """The longest step that holds at most one extremum of the motion; at most `cycle`/5."""
+        """The longest step that holds at most one extremum of the motion: `cycle`/5, less beside a
+        soft stop."""
         counter = counter_of(self)
         limit = counter.longest_step(self, state) if isinstance(counter, Turn) else self.cycle / 5
+        for stop in self.switches:
+            if stop.acts and isinstance(stop, SoftStop):
+                pace, length = self.pace(s, state), stop.longest_step(self, state)
+                limit = jnp.minimum(limit, length if pace is None else length / pace)
         return limit
 
     def frequency_ratio(self, duration: Float[Array, "..."]) -> Float[Array, "..."] | None:
         """Mean drive speed over cycles of these durations, or `None` where nothing is driven."""
         return 2 * pi / duration if isinstance(counter_of(self), Turn) else None
-
-    @derived
-    def coordinates(self) -> tuple[Coordinate, ...]:
-        """The coordinates that contacts act on, by number as `RigidStop.coordinate` names them;
-        extremes are recorded of the first. By default those that contacts name by `on`, and where
-        none does one, the machine's `position`, `velocity` and `placed`."""
-        return coordinates_in(self)
 
     def coordinate_on(self, on: Any, mass: Any = None) -> Coordinate:
         """The coordinate that a contact names by its `on`; of a contact that names none the
@@ -284,10 +312,8 @@ def names_coordinates(machine: AbstractMachine) -> bool:
     """Whether a machine has coordinates of its own, or contacts that name some."""
     if says(machine, "coordinates"):
         return True
-    contacts = listed(machine.contacts)
-    return any(
-        getattr(x, "on", None) is not None for x in contacts if not x.holds_mode or not x.is_dry
-    )
+    walls = (x for x in listed(machine.contacts) if isinstance(x, Wall))
+    return any(x.on is not None for x in walls)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def has_section(machine: AbstractMachine) -> bool:
@@ -297,7 +323,7 @@ def has_section(machine: AbstractMachine) -> bool:
 
 def has_own_modes(machine: AbstractMachine) -> bool:
     """Whether a machine has modes of its own."""
-    return bool(machine.modes) or is_own(type(machine).begin)
+    return bool(declared_modes(machine)) or is_own(type(machine).begin)
 
 
 def renews(machine: AbstractMachine) -> bool:

@@ -160,7 +160,7 @@ def held_by(
     where nothing is known to rest.
     """
     limited = sorted({stop.coordinate for stop in machine.stops}) if contact else []
-    coordinates = machine.coordinates if limited else ()
+    coordinates: Any = machine.coordinates if limited else ()
     bodies = [coordinates[k] for k in limited]
     pushes, acts = [push_of(body, state) for body in bodies], [contact[k] > 0 for k in limited]
     rubbing = []

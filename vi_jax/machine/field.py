@@ -7,11 +7,10 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 
 from .._types import Machine, Scalar, Scalars, State
-from .event import AbstractEvent
 from .state import like
 
 
-def events_of_modes(machine: Machine) -> list[AbstractEvent]:
+def events_of_modes(machine: Machine) -> list[Any]:
     """The events that hold a mode, in the order of the modes."""
     return [x for x in (*machine.stops, *machine.switches, *machine.others) if x.holds_mode]
 

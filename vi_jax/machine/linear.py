@@ -67,7 +67,7 @@ class LinearMachine(AbstractMachine):
     damping: eqx.AbstractVar[Float[Array, "..."] | None]
     stiffness: eqx.AbstractVar[Float[Array, "..."]]
     frequency: eqx.AbstractVar[Scalar]
-    contacts: eqx.AbstractVar[tuple[RigidStop, ...]]
+    contacts: eqx.AbstractVar[tuple[RigidStop, ...]]  # pyright: ignore
     _known: _Known | None = eqx.field(default_factory=lambda: None, init=False, repr=False)
 
     @property

@@ -52,7 +52,7 @@ class Coupling(NamedTuple):
 class ModalMachine(AbstractMachine):
     """A linear machine in its modes. Its state is a `StructureState` of modal numbers."""
 
-    stops: tuple[RigidStop, ...]
+    stops: tuple[RigidStop, ...]  # pyright: ignore
     frequency: Scalar
     stiffness: Numbers
     """κ of each mode, per unit of its mass."""

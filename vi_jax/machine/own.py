@@ -1,6 +1,6 @@
 """What a machine or one of its parts says itself, and what is said in its place."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TypeVar
 
 Method = TypeVar("Method", bound=Callable[..., Any])
@@ -21,7 +21,7 @@ def changed(part: object, base: type, names: Iterable[str]) -> str | None:
     """The first of these methods and properties that the class of `part` does not share with
     `base`; `None` if it shares all."""
     kind = type(part)
-    return next((x for x in names if getattr(kind, x, None) is not getattr(base, x)), None)
+    return next((x for x in names if getattr(kind, x, None) is not getattr(base, x, None)), None)
 
 
 class derived:
@@ -42,3 +42,9 @@ class derived:
 def says(part: object, name: str) -> bool:
     """Whether a machine says by itself what is `derived` otherwise."""
     return hasattr(type(part), name) or name in vars(part)
+
+
+def declared_modes(machine: Any) -> Mapping[str, Any]:
+    """The modes of a machine's own, by name, in which a motion begins, as its class says them."""
+    modes = machine.modes
+    return modes if isinstance(modes, Mapping) else {}  # of a beam it is a number of modes

@@ -95,6 +95,7 @@ class SoftStop(Wall, AbstractSwitch):
         coordinate: int = 0,
         ends_cycle: bool = False,
         name: str = "",
+        acts: bool = False,
     ):
         self.law = _law(law, exponent)
         if restitution is not None:
@@ -106,7 +107,7 @@ class SoftStop(Wall, AbstractSwitch):
         self.prestress = None if prestress is None else number("prestress", prestress)
         self.adhesive = bool(adhesive)
         self.side = one_of("side", side, ("right", "left"))
-        self.on, self.acts = on, False
+        self.on, self.acts = on, acts
         self.coordinate = count("coordinate", coordinate)
         self.ends_cycle, self.name = bool(ends_cycle), str(name)
         require_ranges(self)

@@ -57,7 +57,7 @@ class State:
 def _state(components: Mapping[str, Any]) -> State:
     """A state of components whatever they are, as JAX needs it."""
     new = object.__new__(State)
-    vars(new).update(components)
+    new.__dict__.update(components)
     return new
 
 
@@ -132,7 +132,7 @@ def with_components(state: Any, given: Mapping[str, Any], whose: str, *, all_of_
     if isinstance(state, State):
         return _state({**parts, **new})
     if isinstance(state, Mapping):
-        return type(state)({**parts, **new})
+        return type(state)({**parts, **new})  # pyright: ignore
     return eqx.tree_at(lambda z: [getattr(z, x) for x in new], state, list(new.values()))
 
 

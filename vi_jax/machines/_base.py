@@ -61,7 +61,7 @@ class AutonomousMachine(AbstractMachine):
     `ranges`. A cycle ends where `event` rises through zero; if `interval` is given (positive), at
     equal times instead."""
 
-    interval: Scalar | None = number_field("interval", None)
+    interval: Any = number_field("interval", None)
     ranges: ClassVar[dict[str, Any]]
 
     def __check_init__(self):

@@ -73,16 +73,16 @@ class Beam(LinearMachine):
     - `length` L, `bending_stiffness` EI and `mass_per_length` ρA, positive, by default 1.
     """
 
-    modes: int = eqx.field(kw_only=True, static=True, default=3)
+    modes: int = eqx.field(kw_only=True, static=True, default=3)  # pyright: ignore
     gap: Scalar | None = eqx.field(kw_only=True, default=0.1, converter=optional_real("gap"))
-    restitution: Scalar = number_field("restitution", 0.8)
-    place: Scalar = number_field("place", 1.0)
+    restitution: Any = number_field("restitution", 0.8)
+    place: Any = number_field("place", 1.0)
     damping_ratio: Float[Array, "..."] = number_field("damping_ratio", 0.01)
-    amplitude: Scalar = number_field("amplitude", 0.1)
-    frequency: Scalar = number_field("frequency", 3.0)
-    length: Scalar = number_field("length", 1.0)
-    bending_stiffness: Scalar = number_field("bending_stiffness", 1.0)
-    mass_per_length: Scalar = number_field("mass_per_length", 1.0)
+    amplitude: Any = number_field("amplitude", 0.1)
+    frequency: Any = number_field("frequency", 3.0)
+    length: Any = number_field("length", 1.0)
+    bending_stiffness: Any = number_field("bending_stiffness", 1.0)
+    mass_per_length: Any = number_field("mass_per_length", 1.0)
     shaken: str = eqx.field(kw_only=True, static=True, default="base")
     two_sided: bool = eqx.field(kw_only=True, static=True, default=False)
     ranges: ClassVar[dict[str, Any]] = {

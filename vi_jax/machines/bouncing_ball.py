@@ -35,12 +35,12 @@ class BouncingBall(PhaseMachine):
     `restitution` e in [0, 1].
     """
 
-    acceleration: Scalar = number_field("acceleration", 1.2)
-    restitution: Scalar = number_field("restitution", 0.5)
+    acceleration: Any = number_field("acceleration", 1.2)
+    restitution: Any = number_field("restitution", 0.5)
     ranges: ClassVar[dict[str, Any]] = {"acceleration": NOT_NEGATIVE, "restitution": SHARE}
 
     @property
-    def stops(self) -> tuple[RigidStop, ...]:  # pyright: ignore
+    def contacts(self) -> tuple[RigidStop, ...]:
         """The table, below the ball."""
         return (RigidStop(0.0, self.restitution, "left"),)
 

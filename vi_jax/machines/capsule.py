@@ -52,14 +52,14 @@ class Capsule(ForcedMachine):
     how much more it can be while it sticks, at least 1.
     """
 
-    amplitude: Scalar = number_field("amplitude", 1.6)
-    frequency: Scalar = number_field("frequency", 1.0)
-    damping_ratio: Scalar = number_field("damping_ratio", 0.05)
-    mass_ratio: Scalar = number_field("mass_ratio", 5.0)
-    gap: Scalar = number_field("gap", 0.5)
-    restitution: Scalar = number_field("restitution", 0.6)
-    friction: Scalar = number_field("friction", 1.0)
-    static_ratio: Scalar = number_field("static_ratio", 1.0)
+    amplitude: Any = number_field("amplitude", 1.6)
+    frequency: Any = number_field("frequency", 1.0)
+    damping_ratio: Any = number_field("damping_ratio", 0.05)
+    mass_ratio: Any = number_field("mass_ratio", 5.0)
+    gap: Any = number_field("gap", 0.5)
+    restitution: Any = number_field("restitution", 0.6)
+    friction: Any = number_field("friction", 1.0)
+    static_ratio: Any = number_field("static_ratio", 1.0)
     ranges: ClassVar[dict[str, Any]] = {
         "amplitude": REAL, "frequency": POSITIVE, "damping_ratio": NOT_NEGATIVE,
         "mass_ratio": POSITIVE, "gap": REAL, "restitution": SHARE, "friction": NOT_NEGATIVE,

@@ -24,13 +24,13 @@ class Duffing(ForcedMachine):
     there is a stop on the left as well; static.
     """
 
-    amplitude: Scalar = number_field("amplitude", 0.3)
-    frequency: Scalar = number_field("frequency", 1.0)
-    damping: Scalar = number_field("damping", 0.1)
-    stiffness: Scalar = number_field("stiffness", 1.0)
-    cubic: Scalar = number_field("cubic", 0.0)
-    gap: Scalar = number_field("gap", 1.0)
-    restitution: Scalar = number_field("restitution", 0.8)
+    amplitude: Any = number_field("amplitude", 0.3)
+    frequency: Any = number_field("frequency", 1.0)
+    damping: Any = number_field("damping", 0.1)
+    stiffness: Any = number_field("stiffness", 1.0)
+    cubic: Any = number_field("cubic", 0.0)
+    gap: Any = number_field("gap", 1.0)
+    restitution: Any = number_field("restitution", 0.8)
     two_sided: bool = eqx.field(kw_only=True, static=True, default=True)
     ranges: ClassVar[dict[str, Any]] = {
         "amplitude": REAL, "frequency": POSITIVE, "damping": NOT_NEGATIVE, "stiffness": REAL,
@@ -38,7 +38,7 @@ class Duffing(ForcedMachine):
     }  # fmt: skip
 
     @property
-    def stops(self) -> tuple[RigidStop, ...]:  # pyright: ignore
+    def contacts(self) -> tuple[RigidStop, ...]:
         """One on the right, and one on the left of a two-sided machine."""
         return stops_at(self.gap, self.restitution, two_sided=self.two_sided)
 

@@ -61,19 +61,19 @@ class ImpactPair(PhaseMachine):
       and `force` F (unit: M a ω²), of a box that is free.
     """
 
-    half_gap: Scalar = number_field("half_gap", 1.6)
-    restitution: Scalar = number_field("restitution", 0.5)
-    mass_ratio: Scalar | None = number_field("mass_ratio", None)
-    damping_ratio: Scalar = number_field("damping_ratio", 0.05)
-    frequency: Scalar = number_field("frequency", 1.0)
-    force: Scalar = number_field("force", 0.5)
+    half_gap: Any = number_field("half_gap", 1.6)
+    restitution: Any = number_field("restitution", 0.5)
+    mass_ratio: Any = number_field("mass_ratio", None)
+    damping_ratio: Any = number_field("damping_ratio", 0.05)
+    frequency: Any = number_field("frequency", 1.0)
+    force: Any = number_field("force", 0.5)
     ranges: ClassVar[dict[str, Any]] = {
         "half_gap": POSITIVE, "restitution": SHARE, "mass_ratio": NOT_NEGATIVE,
         "damping_ratio": NOT_NEGATIVE, "frequency": NOT_NEGATIVE, "force": REAL,
     }  # fmt: skip
 
     @property
-    def stops(self) -> tuple[RigidStop, ...]:  # pyright: ignore
+    def contacts(self) -> tuple[RigidStop, ...]:
         """Both walls, the right one first."""
         return stops_at(self.half_gap, self.restitution)
 

@@ -40,18 +40,18 @@ class ReliefValve(AutonomousMachine):
     time between observations, positive, for one that is not observed where its lift is greatest.
     """
 
-    flow_rate: Scalar = number_field("flow_rate", 3.0)
-    damping: Scalar = number_field("damping", 1.25)
-    precompression: Scalar = number_field("precompression", 10.0)
-    compressibility: Scalar = number_field("compressibility", 20.0)
-    restitution: Scalar = number_field("restitution", 0.8)
+    flow_rate: Any = number_field("flow_rate", 3.0)
+    damping: Any = number_field("damping", 1.25)
+    precompression: Any = number_field("precompression", 10.0)
+    compressibility: Any = number_field("compressibility", 20.0)
+    restitution: Any = number_field("restitution", 0.8)
     ranges: ClassVar[dict[str, Any]] = {
         "flow_rate": POSITIVE, "damping": NOT_NEGATIVE, "precompression": NOT_NEGATIVE,
         "compressibility": POSITIVE, "restitution": SHARE, "interval": POSITIVE,
     }  # fmt: skip
 
     @property
-    def stops(self) -> tuple[RigidStop, ...]:  # pyright: ignore
+    def contacts(self) -> tuple[RigidStop, ...]:
         """The seat, below the body."""
         return (RigidStop(0.0, self.restitution, "left"),)
 

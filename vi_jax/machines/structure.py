@@ -54,8 +54,8 @@ class Structure(LinearMachine):
     static_force: jax.Array | None = eqx.field(
         kw_only=True, default=None, converter=vector("static_force")
     )
-    amplitude: Scalar = number_field("amplitude", 1.0)
-    frequency: Scalar = number_field("frequency", 1.0)
+    amplitude: Any = number_field("amplitude", 1.0)
+    frequency: Any = number_field("frequency", 1.0)
     ranges: ClassVar[dict[str, Any]] = {
         "amplitude": REAL, "frequency": POSITIVE,
     }  # fmt: skip

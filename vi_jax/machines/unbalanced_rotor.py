@@ -78,13 +78,13 @@ class UnbalancedRotor(ShaftMachine, PhaseMachine):
     - `clock_name`: `"phase"` or `"time"`; static.
     """
 
-    strength: Scalar = number_field("strength", 0.1)
-    control: Scalar = number_field("control", 0.9)
-    no_load_speed: Scalar = number_field("no_load_speed", 1.0)
-    coupling: Scalar = number_field("coupling", 0.01)
-    damping_ratio: Scalar = number_field("damping_ratio", 0.05)
-    gap: Scalar | None = number_field("gap", None)
-    restitution: Scalar = number_field("restitution", 0.5)
+    strength: Any = number_field("strength", 0.1)
+    control: Any = number_field("control", 0.9)
+    no_load_speed: Any = number_field("no_load_speed", 1.0)
+    coupling: Any = number_field("coupling", 0.01)
+    damping_ratio: Any = number_field("damping_ratio", 0.05)
+    gap: Any = number_field("gap", None)
+    restitution: Any = number_field("restitution", 0.5)
     two_sided: bool = eqx.field(kw_only=True, static=True, default=False)
     clock_name: str = eqx.field(kw_only=True, static=True, default="phase")
     ranges: ClassVar[dict[str, Any]] = {
@@ -94,7 +94,7 @@ class UnbalancedRotor(ShaftMachine, PhaseMachine):
     }  # fmt: skip
 
     @property
-    def stops(self) -> tuple[RigidStop, ...]:  # pyright: ignore
+    def contacts(self) -> tuple[RigidStop, ...]:
         """None without `gap`; else one on the right, and one on the left if two-sided."""
         if self.gap is None:
             return ()

@@ -77,23 +77,23 @@ class Woodpecker(AutonomousMachine):
     - `interval` of time between observations (s), positive, for one observed at equal times.
     """
 
-    friction: Scalar = number_field("friction", 0.3)
-    sleeve_restitution: Scalar = number_field("sleeve_restitution", 0.0)
-    beak_restitution: Scalar = number_field("beak_restitution", 0.5)
-    sleeve_mass: Scalar = number_field("sleeve_mass", 3e-4)
-    bird_mass: Scalar = number_field("bird_mass", 4.5e-3)
-    sleeve_inertia: Scalar = number_field("sleeve_inertia", 5e-9)
-    bird_inertia: Scalar = number_field("bird_inertia", 7e-7)
-    stiffness: Scalar = number_field("stiffness", 0.0056)
-    gravity: Scalar = number_field("gravity", 9.81)
-    sleeve_arm: Scalar = number_field("sleeve_arm", 0.010)
-    bird_arm: Scalar = number_field("bird_arm", 0.015)
-    beak_arm: Scalar = number_field("beak_arm", 0.0201)
-    sleeve_height: Scalar = number_field("sleeve_height", 0.0058)
-    beak_height: Scalar = number_field("beak_height", 0.02)
-    sleeve_radius: Scalar = number_field("sleeve_radius", 0.0031)
-    pole_radius: Scalar = number_field("pole_radius", 0.0025)
-    section_angle: Scalar = number_field("section_angle", -0.2788)
+    friction: Any = number_field("friction", 0.3)
+    sleeve_restitution: Any = number_field("sleeve_restitution", 0.0)
+    beak_restitution: Any = number_field("beak_restitution", 0.5)
+    sleeve_mass: Any = number_field("sleeve_mass", 3e-4)
+    bird_mass: Any = number_field("bird_mass", 4.5e-3)
+    sleeve_inertia: Any = number_field("sleeve_inertia", 5e-9)
+    bird_inertia: Any = number_field("bird_inertia", 7e-7)
+    stiffness: Any = number_field("stiffness", 0.0056)
+    gravity: Any = number_field("gravity", 9.81)
+    sleeve_arm: Any = number_field("sleeve_arm", 0.010)
+    bird_arm: Any = number_field("bird_arm", 0.015)
+    beak_arm: Any = number_field("beak_arm", 0.0201)
+    sleeve_height: Any = number_field("sleeve_height", 0.0058)
+    beak_height: Any = number_field("beak_height", 0.02)
+    sleeve_radius: Any = number_field("sleeve_radius", 0.0031)
+    pole_radius: Any = number_field("pole_radius", 0.0025)
+    section_angle: Any = number_field("section_angle", -0.2788)
     ranges: ClassVar[dict[str, Any]] = {
         "friction": NOT_NEGATIVE, "sleeve_restitution": SHARE, "beak_restitution": SHARE,
         "section_angle": REAL,
@@ -128,19 +128,16 @@ class Woodpecker(AutonomousMachine):
         return self.sleeve_arm + self.bird_arm - self.beak_arm - self.pole_radius
 
     @property
-    def stops(self) -> tuple[RigidStop, ...]:  # pyright: ignore
-        """The pole for the lower and the upper edge of the sleeve, and for the beak."""
+    def contacts(self) -> tuple[RigidStop | ContactFriction, ...]:
+        """The pole for the lower and the upper edge of the sleeve, and for the beak, and friction
+        on each."""
         lower, upper = (
             RigidStop(self.play, self.sleeve_restitution, side, coordinate=1)
             for side in ("left", "right")
         )
-        return lower, upper, RigidStop(self.reach, self.beak_restitution, "right")
-
-    @property
-    def switches(self) -> tuple[ContactFriction, ...]:
-        """Friction on each of the stops."""
-        along = enumerate((2, 2, 3))
-        return tuple(ContactFriction(self.friction, stop=i, along=k) for i, k in along)
+        beak, along = RigidStop(self.reach, self.beak_restitution, "right"), enumerate((2, 2, 3))
+        rubs = (ContactFriction(self.friction, stop=i, along=k) for i, k in along)
+        return lower, upper, beak, *rubs
 
     @property
     def coordinates(self) -> tuple[Coordinate, ...]:
@@ -166,9 +163,9 @@ class Woodpecker(AutonomousMachine):
         by = tuple(a / m for a, m in zip(levers, own, strict=True))
         return own, by, 1 / self.bird_mass + dot(levers, by)
 
-    def field(self, s: Scalar, state: WoodpeckerState, *modes: Scalar) -> WoodpeckerState:
-        """Free fall under the spring's moment, by time; what the pole does is said by stops and
-        switches."""
+    def field(self, s: Scalar, state: WoodpeckerState) -> WoodpeckerState:
+        """Free fall under the spring's moment, by time; what the pole does is said by
+        contacts."""
         moment = self.stiffness * (state.sleeve_angle - state.bird_angle)
         y, sleeve, bird = (moment * x for x in response((None, -1, 1), self._inertia()))
         rates = state.speed, state.sleeve_rate, state.bird_rate

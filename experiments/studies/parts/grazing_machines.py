@@ -41,7 +41,7 @@ class TwoBodies(vi.AbstractMachine):
     """Whether it is the second that meets the stop."""
 
     @property
-    def stops(self):  # pyright: ignore
+    def contacts(self):  # pyright: ignore
         return (vi.RigidStop(self.gap, self.restitution),)
 
     @property
@@ -78,20 +78,18 @@ class Compliant(vi.AbstractMachine):
     stop: vi.SoftStop
 
     @property
-    def stops(self):  # pyright: ignore
-        return ()
+    def contacts(self):
+        return self.stop
 
-    @property
-    def switches(self):
-        return (self.stop,)
+    def pace(self, s, state):
+        return 1 / self.frequency
 
     @property
     def cycle(self):
         return 2 * np.pi
 
-    def field(self, s, x, mode):
+    def field(self, s, x):
         push = jnp.cos(s) - x.Y - self.cubic * x.Y**3 - self.damping * x.V
-        push = push + self.stop.contribution(self, s, x, mode)
         return vi.OscillatorState(x.V / self.frequency, push / self.frequency)
 
     def start(self):
