@@ -57,6 +57,16 @@ def test_batch_means_give_the_scatter_of_lanes(shaken):
             assert abs(found / float(shaken[f"{name}_{what}"].std(ddof=1)) - 1) < 0.2
 
 
+def test_the_error_of_a_mean_is_that_of_the_means_of_parts():
+    def given(machine, run):
+        return jnp.array([9.0, 0.0, 2.0, 4.0, 10.0])
+
+    found = vi.Statistics(given, batches=2)(None, None)
+    assert float(found["given_mean"]) == 5.0
+    # Parts are of equal length, so that the first number is in none: their means are 1 and 7.
+    assert float(found["given_error"]) == pytest.approx(3.0, rel=1e-14)
+
+
 def test_the_density_is_gauss(shaken):
     shares = np.diff(norm.cdf(EDGES / COVARIANCE[0, 0] ** 0.5))
     density = shaken.density.mean("noise.path").values
