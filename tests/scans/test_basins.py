@@ -77,6 +77,9 @@ def test_fractions_add_up_and_random_starts_agree(found):
 def test_basins_as_data(found):
     motions = found.to_xarray(along="motion").to_dataframe()
     assert motions.motion_fraction.tolist() == [a.fraction for a in found.attractors]
+    share, starts = motions.motion_fraction, found.data.label.size
+    binomial = np.sqrt(share * (1 - share) / starts)
+    np.testing.assert_allclose([a.error for a in found.attractors], binomial, rtol=1e-12)
     orbits = found.to_xarray(along="cycle")
     for i, a in enumerate(found.attractors):
         np.testing.assert_array_equal(orbits.motion_Y[i, : a.period], a.sections["Y"])
