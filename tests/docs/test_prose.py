@@ -3,6 +3,7 @@
 import inspect
 import re
 from pathlib import Path
+from types import FunctionType
 
 import pytest
 import vi_jax as vi
@@ -45,16 +46,27 @@ Simulate Sweep Trace""".split()
 CLAUSES = "What Where When Which How Why".split()
 
 
-def test_first_lines_of_public_docstrings():
-    """A function's begins with a verb, a class's not with a clause."""
+def documented():
+    """The docstrings of public functions and classes, and of the public members of these."""
     for module in (vi, vi.machines, vi.plot):
-        for name in dir(module):
+        for name in (x for x in dir(module) if x[0] != "_"):
             public = getattr(module, name)
-            told = (inspect.getdoc(public) or "").split(maxsplit=1)[:1]
-            if name[0] != "_" and inspect.isfunction(public):
-                assert told[0] in VERBS, (name, told)
-            elif name[0] != "_" and inspect.isclass(public):
-                assert told[0] not in CLAUSES, (name, told)
+            if inspect.isfunction(public) or inspect.isclass(public):
+                yield name, public, inspect.getdoc(public) or ""
+            for member, value in vars(public).items() if inspect.isclass(public) else ():
+                if member[0] != "_" and isinstance(value, property | FunctionType):
+                    yield f"{name}.{member}", value, inspect.cleandoc(value.__doc__ or "")
+
+
+def test_docstrings_of_public_names():
+    """A function's begins with a verb, a class's not with a clause; plain English as on pages."""
+    for name, public, told in documented():
+        if "." not in name and inspect.isfunction(public):
+            assert told.split()[0] in VERBS, name
+        elif inspect.isclass(public):
+            assert told.split()[0] not in CLAUSES, name
+        found = [x for x in paragraphs(told) if HEADLESS.search(x) or PHRASES.search(x)]
+        assert not found, name
 
 
 def test_the_patterns_find_what_they_are_for():

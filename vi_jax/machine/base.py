@@ -69,51 +69,49 @@ class AbstractMachine(Clocked, Observed, Worded):
     """A machine: smooth motion between events, observed cycle by cycle.
 
     Its independent variable is called `s`. The machine is driven, and its field periodic in `s`
-    (`s` restarts from zero in each cycle); or it is autonomous, and a cycle ends where `section`
-    rises through zero.
+    (`s` restarts from zero in each cycle); or it is autonomous, and an event ends its cycles.
 
-    To write a machine of your own, give it `stops`, `cycle` and `field`, and `start` if there is a
-    state to begin from where none is given. All else has a default; those below suit a state with
-    the fields `Y` and `V` whose independent variable is time. A machine without stops needs
-    neither: extremes are those of the first number of its state then.
+    A subclass defines `cycle` and `field`, and lists its `contacts` and `events`. All else has a
+    default. Contacts name the components of the state that they act on. Without names they act on
+    the fields `Y` and `V`. Extremes of a machine without contacts are those of its first component.
 
-    | a machine must say | |
+    | definition | meaning |
     |---|---|
-    | `stops` | the rigid stops, `()` if there are none |
-    | `cycle` | the length of a cycle in `s` |
-    | `field` | how the state changes between events |
+    | `cycle` | the length of a cycle in `s`; or `turn_of`, `rising`, `falling` |
+    | `field` | d(state)/ds between contacts and events |
+    | `contacts` | rigid and soft stops, dry friction; `()` by default |
+    | `events` | switches, resets, other kinds of events; `()` by default |
+    | `modes` | discrete modes by name, which events change |
 
-    | how it moves and meets stops | |
+    | motion | meaning |
     |---|---|
-    | `start`, `adopt` | verbs without an explicit start; starts of other classes |
-    | `position`, `velocity`, `placed` | a state of any names; what else an impact changes |
-    | `coordinates` | stops on several coordinates (`RigidStop(..., coordinate=1)`) |
-    | `switches` | a field with modes, landed upon where they change: soft stops, dry friction |
-    | `events` | resets (`Reset`), cycles that any event ends, kinds of events of its own |
-    | `begin` | modes of its own, which any event may change |
+    | `start`, `adopt` | the default start; starts of other classes |
+    | `position`, `velocity`, `placed` | the coordinate of contacts that name none |
+    | `coordinates`, `coordinate_on` | several coordinates by number |
+    | `begin` | modes that depend on the start |
 
-    | what is observed of it (`Observed`) | |
+    | observation (`Observed`) | meaning |
     |---|---|
-    | `section` | an autonomous machine, whose cycles are counted by an event |
-    | `observed_every` | its Lyapunov exponents, and samples of its orbits |
-    | `averages` | means over a cycle, integrated beside its state: a power, a mean force |
-    | `quantities` | functions of its state, by name, where results show the state |
+    | `section` | a function of the state that ends a cycle where it rises through zero |
+    | `observed_every` | the same machine observed at equal intervals |
+    | `averages` | means over a cycle: a power, a mean force |
+    | `quantities` | functions of the state, by name, shown in results |
     | `renewed` | a drift, counted by the cycle |
-    | `mirrored` | branches that name a loss of symmetry |
+    | `mirrored` | the symmetry of the machine, for branches |
     | `at_section`, `observed_later` | another place of the section |
 
-    | its clocks and time scales (`Clocked`) | |
+    | clocks and time scales (`Clocked`) | meaning |
     |---|---|
     | `clock`, `rewound`, `pace` | another variable than `s` that counts cycles or measures time |
     | `in_clock`, `phase_at`, … | several clocks to choose from |
     | `step_limit`, `relaxation` | steps that fit time scales shorter than the cycle |
 
-    | its words (`Worded`) and its limits | |
+    | words (`Worded`) and limits | meaning |
     |---|---|
-    | `labels`, `units`, `period_of`, `place_of` | pictures and messages in its own words |
-    | `in_range`, `check_start`, `alive` | its own limits, checked before and while it runs |
-    | `may_rest` | programs without rest on a stop |
-    | `prepared` | what is worked out once for each run |
+    | `labels`, `units`, `period_of`, `place_of` | words of pictures and messages |
+    | `in_range`, `check_start`, `alive` | limits, checked before and during a run |
+    | `may_rest` | whether programs contain rest on a stop |
+    | `prepared` | values that are computed once for each run |
 
     Ready machines, each written in this way, are in `vi_jax.machines`.
     """
@@ -130,7 +128,7 @@ class AbstractMachine(Clocked, Observed, Worded):
     def field(self, *args: Any, **kwargs: Any) -> State:
         """`field(s, state)`: d(state)/ds between events, a pytree like `state`.
 
-        With `switches`, or modes of its own, it is `field(s, state, mode, ...)`, which gets them.
+        With switches or discrete `modes` it is `field(s, state, mode, ...)`.
         """
 
     if TYPE_CHECKING:  # a subclass has them as attributes, properties or fields
@@ -161,12 +159,12 @@ class AbstractMachine(Clocked, Observed, Worded):
 
         @derived
         def events(self) -> Any:
-            """Switches, resets, and kinds of events of its own: a tuple, or one of them."""
+            """Switches, resets, and other kinds of events: a tuple, or one of them."""
             return ()
 
         @derived
         def modes(self) -> Mapping[str, float]:
-            """The modes of its own, by name, in which a motion begins; its field gets them behind
+            """The discrete modes, by name, in which a motion begins. The field receives them after
             the state, and events change them."""
             return {}
 
@@ -194,9 +192,9 @@ class AbstractMachine(Clocked, Observed, Worded):
 
     @by_default
     def begin(self, s: Scalar, state: State) -> Any:
-        """The machine's own modes in a motion that begins in `state`: numbers that its field gets
-        behind the state, and that events change; by default what `modes` of the class says. A start
-        that is a `HybridState`, as `Run.last` is, has its own instead."""
+        """The discrete modes of a motion that begins in `state`, which the field receives after the
+        state and events change; by default `modes` of the class. A start that is a `HybridState`,
+        as `Run.last` is, has its own instead."""
         return tuple(declared_modes(self).values())
 
     def observed_every(self, interval: Any) -> "AbstractMachine":
@@ -209,13 +207,13 @@ class AbstractMachine(Clocked, Observed, Worded):
 
     @by_default
     def section(self, state: State) -> Scalar | None:
-        """What rises through zero where a cycle ends; `None` where `s` or `clock` counts them, or
-        an event."""
+        """The function that rises through zero at the end of a cycle; `None` if `s`, `clock` or an
+        event ends cycles."""
         counter = counter_of(self)
         return counter.section(state) if isinstance(counter, Passing) else None
 
     def step_limit(self, s: Scalar, state: State) -> Scalar | float:
-        """The longest step that holds at most one extremum of the motion: `cycle`/5, less beside a
+        """The longest step that holds at most one extremum of the motion: `cycle`/5, less near a
         soft stop."""
         counter = counter_of(self)
         limit = counter.longest_step(self, state) if isinstance(counter, Turn) else self.cycle / 5
@@ -249,14 +247,16 @@ class AbstractMachine(Clocked, Observed, Worded):
 
     @by_default
     def position(self, state: State) -> Scalar:
-        """The coordinate that stops limit: by default the first of `coordinates`, or `state.Y`; of
-        a machine without stops whose state has no `Y` what extremes are of, its first number."""
+        """The coordinate that stops limit: by default the first of `coordinates`, or `state.Y`; for
+        a machine without stops whose state has no `Y` the first component, of which extremes are
+        recorded."""
         return self._first.position(state)
 
     @by_default
     def velocity(self, state: State) -> Scalar:
-        """The velocity that an impact reverses; of the sign of d(position)/ds. Of a machine without
-        stops whose state has no `V`, what pictures draw over the position: its second number."""
+        """The velocity that an impact reverses; of the sign of d(position)/ds. For a machine
+        without stops whose state has no `V`, the second component, which pictures draw over the
+        position."""
         return self._first.velocity(state)
 
     @by_default
@@ -286,7 +286,8 @@ class AbstractMachine(Clocked, Observed, Worded):
         return Prepared(self, _as_it_is, _as_it_is)
 
     def adopt(self, start: State) -> State:
-        """A start as this machine needs it. **Raises:** `TypeError` if it is none."""
+        """A start in the form that this machine needs. **Raises:** `TypeError` for another
+        object."""
         return start
 
     def may_rest(self) -> bool:

@@ -90,7 +90,7 @@ class Passing(Counter):
         self.sign = sign
 
     def section(self, state: State) -> Any:
-        """What rises through zero where a cycle ends."""
+        """The function that rises through zero at the end of a cycle."""
         return self.sign * component(self.name, state)
 
 
@@ -98,9 +98,9 @@ def turn_of(name: str, *, start: Any = 0.0, usual: Any = None) -> Any:
     """Count the cycles of a machine by the turns of an angle, as its `cycle`:
     `cycle = vi.turn_of("phi")`.
 
-    Where the angle comes to a full turn beyond `start`, a cycle ends and 2π is taken off. The
-    machine may start from rest in time; its orbits, branches and exponents are those of its turns.
-    An angle that turns backward ends no cycle.
+    At a full turn of the angle beyond `start`, a cycle ends and 2π is taken off. The machine may
+    start from rest in time; its orbits, branches and exponents are those of its turns. An angle
+    that turns backward ends no cycle.
 
     **Arguments:** `name`, of the angle in the state, of a `Mechanical` a coordinate; `start`, the
     angle (radians) at which a cycle begins; `usual`, about how long a turn takes, by default as

@@ -44,8 +44,8 @@ class SoftStop(Wall, AbstractSwitch):
 
     With p > 1 the power law's force has a steep start and, where it may pull, a steep end, of the
     order δ^((p-1)/2); steps sized by their error (`Adaptive`) follow it, fixed ones lose their
-    order there. What a step's error does
-    not show is the derivative of such an end: through an adhesive stop with 1 < p < 3 derivatives,
+    order there. A step's error does
+    not show the derivative of such an end: through an adhesive stop with 1 < p < 3 derivatives,
     and with them multipliers and `find_orbit`, are right to 1e-2 only. Take `adhesive=False` there
     (1e-6 and better), or the Hunt–Crossley law.
 
@@ -126,7 +126,7 @@ class SoftStop(Wall, AbstractSwitch):
 
     @property
     def looked_at_within(self) -> bool:
-        """False: steps are short beside a contact (`longest_step`)."""
+        """False: steps are short compared with a contact (`longest_step`)."""
         return False
 
     def depth(self, machine: Machine, state: State) -> tuple[Any, Any]:
@@ -140,7 +140,7 @@ class SoftStop(Wall, AbstractSwitch):
         return force if self.prestress is None else self.prestress + force
 
     def contribution(self, machine, s, state, mode):
-        """What the stop adds to the coordinate's acceleration."""
+        """The acceleration that the stop adds to the coordinate."""
         return jnp.where(mode > 0, -self.sign * self.force(*self.depth(machine, state)), 0.0)
 
     def pushed(self, machine, s, state, mode, flow):

@@ -77,12 +77,12 @@ class RigidStop(Wall, AbstractEvent):
 
     A stop on the right keeps Y ≤ gap, one on the left keeps Y ≥ -gap. The gap may be zero or
     negative (a body pressed on); the restitution is in [0, 1], both ends included, or a function of
-    the speed of approach with values there (a pytree, if it has numbers of its own).
+    the speed of approach with values there (a pytree, if it has parameters).
 
-    What is hit is the machine's own coordinate, or the one that `on` names: the components of the
-    state that are position and velocity, `on=("x", "u")`; of a `Mechanical` one of its coordinates,
-    `on="y"`, or a function of them, `on=lambda q: q.left - q.right`; of a linear machine
-    (`vi.machines.Structure`) it is the sum `at`·x of its displacements.
+    It limits the coordinate that `on` names: the components of the state that are position and
+    velocity, `on=("x", "u")`; of a `Mechanical` one of its coordinates, `on="y"`, or a function of
+    them, `on=lambda q: q.left - q.right`; of a linear machine (`vi.machines.Structure`) the sum
+    `at`·x of its displacements. Without a name it is the machine's `position`.
 
     With `friction` μ a body rubs where it hits the stop, or rests on it, along another coordinate,
     which `along` names in the same way (see `ContactFriction`).
@@ -189,8 +189,8 @@ class RigidStop(Wall, AbstractEvent):
         return self.rebound(_unless_tiny(V))
 
     def rebound_and_share(self, approach: Any) -> tuple[Any, Any]:
-        """What an impact at this speed of approach leaves: the velocity (`leaving`) and the `share`
-        of the speed. The law is asked once for both, since it may be long (a network)."""
+        """The velocity (`leaving`) and the `share` of the speed after an impact at this speed of
+        approach. The law is evaluated once for both, since it may be long (a network)."""
         V = self.sign * approach
         if not is_own(type(self).rebound):
             k = self.coefficient(approach)

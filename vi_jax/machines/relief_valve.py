@@ -30,10 +30,10 @@ class ReliefValve(AutonomousMachine):
 
         lift'' = pressure - κ lift' - (lift + δ),    pressure' = β (q - lift √pressure)
 
-    and impacts on the seat at lift = 0 (Hős and Champneys, Physica D 241, 2012). Nothing drives it:
-    a cycle ends where the lift is greatest (the speed falls through zero), and takes a time of its
-    own. Above q = 8.491 (with the other numbers as they are by default) the open valve stands
-    still, and there is no next cycle: observe it at equal times by `observed_every`.
+    and impacts on the seat at lift = 0 (Hős and Champneys, Physica D 241, 2012). It has no drive: a
+    cycle ends at the greatest lift (the speed falls through zero), after a varying time. Above q =
+    8.491 (with the other defaults) the open valve stands still, and there is no next cycle: observe
+    it at equal times by `observed_every`.
 
     **Arguments:** `flow_rate` q, positive; `damping` κ, `precompression` δ of the spring, both not
     negative; `compressibility` β, positive; `restitution` r on the seat, in [0, 1]; `interval` of

@@ -52,17 +52,17 @@ class Woodpecker(AutonomousMachine):
         U = ½ c (φM - φS)² + m_M g y + m_S g (y + l_M φM + l_G φS)
 
     Three contacts, with Newton's restitution and Coulomb's friction μ in impacts and between them:
-    the lower and the upper edge of the sleeve, r_M - r_O ± h_M φM ≥ 0, which slip with
-    y' + r_M φM'; and the beak, l_M + l_G - l_S - r_O - h_S φS ≥ 0, which slips with
-    y' + l_M φM' + (l_G - l_S) φS' (Ch. Glocker, Dynamik von Starrkörpersystemen mit Reibung und
-    Stößen, 1995; F. Pfeiffer and Ch. Glocker, Multibody Dynamics with Unilateral Contacts, 1996;
-    numbers as in the example of the Siconos software). What slips sticks after an impact if the
-    cone of friction lets it.
+    the lower and the upper edge of the sleeve, r_M - r_O ± h_M φM ≥ 0, which slip with y' + r_M
+    φM'; and the beak, l_M + l_G - l_S - r_O - h_S φS ≥ 0, which slips with y' + l_M φM' + (l_G -
+    l_S) φS' (Ch. Glocker, Dynamik von Starrkörpersystemen mit Reibung und Stößen, 1995; F. Pfeiffer
+    and Ch. Glocker, Multibody Dynamics with Unilateral Contacts, 1996; numbers as in the example of
+    the Siconos software). A slipping contact sticks after an impact if the cone of friction lets
+    it.
 
-    Nothing drives it but its weight: a cycle ends where φS falls through `section_angle`, and takes
-    a time of its own; the component `drop` of the state is how far the toy came down in the last
-    one. Time is the independent variable. Numbers are in SI units. The stops are, in this order,
-    `LOWER` and `UPPER` edge of the sleeve and `BEAK`, and the switches the friction on each.
+    Only its weight drives it: a cycle ends where φS falls through `section_angle`, after a varying
+    time; the component `drop` of the state is the descent in the last one. Time is the independent
+    variable. Numbers are in SI units. The stops are, in this order, `LOWER` and `UPPER` edge of the
+    sleeve and `BEAK`, and the switches the friction on each.
 
     **Arguments:**
 
