@@ -17,7 +17,7 @@ class CoastingMachine(AbstractMachine):
     printed ones are one compiled program.
     """
 
-    stops: tuple[RigidStop, ...]
+    contacts: tuple[RigidStop, ...]  # pyright: ignore
     coupling: Float[Array, "..."]
     """Coefficient of the spring's reaction in the drive equation (dimensionless)."""
     slider_inertia: Float[Array, "..."]
@@ -58,7 +58,7 @@ def energy_drift(
     """
     coefficient = coupling if printed_coupling is None else printed_coupling
     machine = CoastingMachine(
-        stops=(RigidStop(2.0, 1.0),),
+        contacts=(RigidStop(2.0, 1.0),),
         coupling=jnp.asarray(coefficient, float),
         slider_inertia=jnp.asarray(slider_inertia, float),
         printed_inertia=jnp.asarray(printed_inertia, float),
