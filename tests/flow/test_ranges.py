@@ -1,5 +1,7 @@
 """Numbers that no check has seen, traced or put in by `eqx.tree_at`: such a lane is refused."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -72,6 +74,29 @@ def test_a_traced_settle_is_a_number_of_cycles_or_the_lane_is_refused():
     codes, again, _ = lanes(rows, jnp.asarray([0, -5, -1, 2, 2, 2, 2]))
     assert codes.tolist() == [0, BAD_START, BAD_START, 0, 0, 0, 0]
     np.testing.assert_array_equal(again[-1], Y[-1])
+
+
+class Limited(vi.AbstractMachine):
+    """A body that a force of limited strength pulls back."""
+
+    limit: Any
+    cycle: Any = 1.0
+    stops: tuple = ()
+
+    def field(self, s, state):
+        return vi.OscillatorState(state.V, -jnp.clip(state.Y, -self.limit, self.limit))
+
+
+def test_a_number_of_ones_own_may_be_infinite_but_the_cycle_may_not():
+    start = vi.OscillatorState(jnp.asarray(2.0), jnp.asarray(0.0))
+    limits, cycles = (
+        jnp.asarray([np.inf, np.inf, np.nan, 0.5]),
+        jnp.asarray([1.0, np.inf, 1.0, 1.0]),
+    )
+    run = jax.vmap(lambda *numbers: vi.simulate(Limited(*numbers), start, 1))(limits, cycles)
+    assert (run.result == vi.RESULTS.bad_start).tolist() == [False, True, True, False]
+    np.testing.assert_allclose(run.last.Y[::3], [2 * np.cos(1.0), 2 - 0.25], rtol=1e-9)
+    assert bool(vi.simulate(Limited(np.inf), start, 1).successful)
 
 
 def test_a_known_number_put_in_ends_as_bad_start():

@@ -20,9 +20,10 @@ def launched(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
     `wanted`, has ended already."""
     machine = plan.machine
     Y = machine.position(start)
-    numbers = jtu.tree_leaves((start, eqx.filter(machine, eqx.is_inexact_array)))
-    bad = ~jnp.isfinite(total(numbers, plan.settle)) | ~jnp.asarray(wanted)
+    bad = ~jnp.isfinite(total((start, machine.cycle), plan.settle)) | ~jnp.asarray(wanted)
     bad = bad | ~machine.in_range(start)
+    for number in jtu.tree_leaves(eqx.filter(machine, eqx.is_inexact_array)):
+        bad = bad | jnp.any(jnp.isnan(number))  # it may be infinite, as a limit that is none
     slack = rounding(machine, start)
     for stop in machine.stops:
         bad = bad | (stop.beyond(machine.coordinates[stop.coordinate].position(start)) > slack)
