@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -139,6 +140,33 @@ def test_a_velocity_that_is_turned_round_as_a_cycle_begins():
     np.testing.assert_allclose(run.sections.Y[::2], 1.0, atol=1e-9)
     np.testing.assert_allclose(run.y_max, top, atol=1e-9)
     np.testing.assert_allclose(run.y_min, places.min(), atol=1e-9)
+
+
+class Damped(vi.AbstractMachine):
+    """x'' + a x' + b x = cos s, and no word of how fast it fades."""
+
+    damping: Any
+    spring: Any
+    cycle: Any = 2 * np.pi
+    stops: tuple = ()
+
+    def field(self, s, state):
+        force = jnp.cos(s) - self.spring * state.Y - self.damping * state.V
+        return vi.OscillatorState(state.V, force)
+
+
+@pytest.mark.parametrize("solver", [vi.Verner9(), diffrax.Tsit5()])
+def test_a_fixed_step_that_is_too_long_is_no_success(solver):
+    """Ten in a cycle: by either solver stable up to damping near 5."""
+    dampings, springs = jnp.asarray([[0.5, 3, 5, 8, 10, 30, 1e4, 0], [1.0] * 7 + [1e4]])
+    start, method = vi.OscillatorState(jnp.asarray(1.0), jnp.asarray(0.0)), vi.FixedStep(solver)
+    run = jax.vmap(lambda a, b: vi.simulate(Damped(a, b), start, 12, method=method))(
+        dampings, springs
+    )
+    assert run.successful.tolist() == [True] * 3 + [False] * 5
+    assert (run.result == vi.RESULTS.unstable).tolist() == [False] * 3 + [True] * 5
+    by_error = jax.vmap(lambda a: vi.simulate(Damped(a, 1.0), start, 12).last.Y)(dampings[:3])
+    np.testing.assert_allclose(run.last.Y[:3], by_error, rtol=0, atol=2e-4)
 
 
 def test_a_traced_restitution_out_of_range_is_a_bad_start_wherever_its_stop_is_made():

@@ -73,6 +73,10 @@ class RESULTS(NamedEnumeration):
     )
     reset_unresolved = "The event of a reset could not be located within the step."
     bad_reset = "A reset put a body beyond a stop."
+    unstable = (
+        "The error of a fixed step was as large as the state, as under strong damping. Take more "
+        "steps, define the machine's `relaxation` or `step_limit`, or use `Adaptive`."
+    )
 
 
 # The loop carries reasons as numbers; this is their order.
@@ -93,6 +97,7 @@ REASON_NAMES = (
     "sliding",
     "reset_unresolved",
     "bad_reset",
+    "unstable",
 )
 REASONS = tuple(getattr(RESULTS, name) for name in REASON_NAMES)
 (
@@ -112,6 +117,7 @@ REASONS = tuple(getattr(RESULTS, name) for name in REASON_NAMES)
     SLIDING,
     RESET_UNRESOLVED,
     BAD_RESET,
+    UNSTABLE,
 ) = range(len(REASONS))
 
 

@@ -37,12 +37,18 @@ class Progress(NamedTuple):
 
 
 def faults(
-    plan: Plan, lane: Lane, trial: Trial, rejected: Flag, progress: Progress, target: Scalar
+    plan: Plan,
+    lane: Lane,
+    trial: Trial,
+    taken: Flag,
+    rejected: Flag,
+    progress: Progress,
+    target: Scalar,
 ) -> list[tuple[Flag, Scalar | float]]:
     """What ends a lane, the first that holds being the reason.
 
-    **Arguments:** `rejected`, whether the trial was; `progress` and `target`, how far the lane has
-    come and what it aims at, after the trial.
+    **Arguments:** `taken` and `rejected`, whether the trial was; `progress` and `target`, how far
+    the lane has come and what it aims at, after the trial.
 
     **Returns:** pairs of a condition and a reason, a code of `RESULTS`.
     """
@@ -58,6 +64,8 @@ def faults(
         (steps >= plan.max_steps, float(results.MAX_STEPS)),
         (spent >= _STUCK, float(results.MAX_STEPS)),
     ]
+    if plan.method.may_be_unstable(plan.machine, lane.s, lane.state):
+        ends = [(taken & (trial.error > 1), float(results.UNSTABLE)), *ends]
     if not plan.method.adaptive:
         return [(rejected, float(broken)), *ends]
     eps = float(jnp.finfo(length.dtype).eps)

@@ -75,7 +75,7 @@ def iterate(plan: Plan, lane: Lane) -> Step:
     fault = there.fault
     aims = jnp.where(aim, lane.aims + 1, 0.0)
     progress = Progress(length, new.record, steps, spent, aims)
-    for condition, code in faults(plan, lane, trial, rejected, progress, target):
+    for condition, code in faults(plan, lane, trial, taken, rejected, progress, target):
         stops_here = active & (fault == 0) & condition & (done < plan.intervals)
         fault = jnp.where(stops_here, code, fault)
     new = dataclasses.replace(

@@ -81,6 +81,10 @@ class AbstractMethod(eqx.Module):
         static."""
         return True
 
+    def may_be_unstable(self, machine: AbstractMachine, s: Scalar, state: State) -> bool:
+        """Whether a step may be so long that its error grows from step to step; static."""
+        return False
+
     def longest(self, machine: AbstractMachine, s: Scalar, state: State) -> Scalar | float:
         """The longest step from here.
 
@@ -106,8 +110,8 @@ class AbstractMethod(eqx.Module):
         """State, and what is integrated `beside` it, at `s1` from those at `s0`, and the step's
         error.
 
-        The error is relative to the tolerance (a step is accepted up to 1); it is 0 for methods
-        that are not adaptive.
+        The error is relative to the tolerance (a step is accepted up to 1). Methods that are not
+        adaptive return 0, or more than 1 where `may_be_unstable` and the step is.
 
         **Arguments:** `smooth`, the machine in its modes; `beside`, `None` unless averages, or the
         elapsed time of a machine with a `pace`, are asked for; its rate is `rate_beside`.

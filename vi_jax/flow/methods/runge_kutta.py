@@ -19,6 +19,11 @@ from .base import AbstractMethod, Stage
 from .unrolled import Unrolled
 from .verner import Verner9
 
+# A fixed step is unstable if its error is larger than this share of the state, before it or after
+# it. Of x' = -a x that of each of diffrax's explicit solvers is, from the limit of stability on: at
+# least 0.46 (`Tsit5`).
+_UNSTABLE = 0.4
+
 # How well a guard has to be known that acts on nothing. A choice: of 300 thresholds that move by
 # three harmonics none was stepped over with this, and steps are twice as long as with 1e-9.
 _VISIBLE = 1e-6
@@ -49,6 +54,11 @@ def _sized_by(state: State, beside: Beside | None) -> tuple[State, dict[str, Sca
     """What the size of a step is chosen by: the state and the integrals, but not the elapsed
     time."""
     return state, None if beside is None else beside.integrals
+
+
+def _size(state: State) -> Scalar:
+    leaves = jtu.tree_leaves(jax.lax.stop_gradient(state))
+    return jnp.asarray(sum(jnp.sum(jnp.abs(x)) for x in leaves))
 
 
 def _number(x: Any) -> Any:
@@ -170,7 +180,8 @@ class FixedStep(AbstractMethod):
     Under `vmap` this is the faster choice: no lane waits for another's rejected steps. A step that
     meets a stop is split there. There are as many steps in a natural period of the body, where that
     is shorter than the drive cycle, so that the error does not depend on ζ; and more where strong
-    damping or a strong motor makes something fade fast.
+    damping or a strong motor makes something fade fast. Of a machine that does not define its
+    `relaxation`, a lane ends as `unstable` at a step whose error is about as large as the state.
 
     **Arguments:** `solver` (default `Verner9()`), `steps_per_cycle` (at least 5; what the
     default, 10, was measured to err is said at `preset`).
@@ -194,8 +205,15 @@ class FixedStep(AbstractMethod):
                 f"but got {self.solver.solver!r}. Use `Adaptive`."
             )
 
+    def may_be_unstable(self, machine, s, state):
+        """Where it is not known how fast something fades.
+
+        **Arguments:** as `AbstractMethod.may_be_unstable`.
+        """
+        return self.follows_fading and machine.relaxation(s, state) is None
+
     def step(self, smooth, s0, s1, state, beside):
-        """One Runge–Kutta step; its error is not asked for.
+        """One Runge–Kutta step, and whether it is unstable.
 
         **Arguments:** as `AbstractMethod.step`.
         """
@@ -206,8 +224,12 @@ class FixedStep(AbstractMethod):
 
         **Arguments:** as `AbstractMethod.step`.
         """
-        new, beside, _, stages = _runge_kutta(self.solver, smooth, s0, s1, state, beside)
-        return new, beside, jnp.zeros_like(s0), stages
+        new, after, errors, stages = _runge_kutta(self.solver, smooth, s0, s1, state, beside)
+        error = jnp.zeros_like(s0)
+        if self.may_be_unstable(smooth.machine, s0, state):
+            old, there, apart = map(_size, (state, new, errors[0]))
+            error = jnp.where(apart > _UNSTABLE * jnp.maximum(old, there), 2.0, error)
+        return new, after, error, stages
 
     def tighter(self):
         """The same solver with twice as many steps a cycle."""
