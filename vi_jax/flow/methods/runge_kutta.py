@@ -227,8 +227,11 @@ class FixedStep(AbstractMethod):
         new, after, errors, stages = _runge_kutta(self.solver, smooth, s0, s1, state, beside)
         error = jnp.zeros_like(s0)
         if self.may_be_unstable(smooth.machine, s0, state):
+            # Of bodies at rest in zero all that is left is rounding.
+            rounding = float(jnp.finfo(s0.dtype).eps) ** 0.5
             old, there, apart = map(_size, (state, new, errors[0]))
-            error = jnp.where(apart > _UNSTABLE * jnp.maximum(old, there), 2.0, error)
+            size = jnp.maximum(jnp.maximum(old, there), rounding)
+            error = jnp.where(apart > _UNSTABLE * size, 2.0, error)
         return new, after, error, stages
 
     def tighter(self):
