@@ -176,6 +176,26 @@ def test_a_body_leaves_its_floor_whenever_it_is_pulled(method):
     assert np.abs(found - truth)[-4:].max() < close
 
 
+class Eased(vi.AbstractMachine):
+    """A body on a floor, pressed on by less and less; the pull that is left is small."""
+
+    cycle: float = 2 * np.pi
+    stops: tuple = (vi.RigidStop(0.0, 0.5, "left"),)
+
+    def field(self, s, x):
+        return vi.OscillatorState(x.V, 1e-5 - jnp.exp(-20 * s))
+
+
+@pytest.mark.parametrize("method", [None, vi.FixedStep()], ids=["a", "f"])
+def test_a_body_leaves_where_a_small_pull_begins_that_lasts(method):
+    """The chord of the force over a step says at each aim that it begins at the step's end."""
+    run, begin = vi.simulate(Eased(), STILL, 1, method=method), np.log(1e5) / 20
+    d, fall = 2 * np.pi - begin, 1e-5 / 20  # e^(-20 begin) is 1e-5
+    assert bool(run.successful)
+    np.testing.assert_allclose(run.last.V, 1e-5 * d - fall, rtol=1e-6)
+    np.testing.assert_allclose(run.last.Y, 0.5e-5 * d * d - fall * d + fall / 20, rtol=1e-6)
+
+
 @pytest.mark.parametrize("method", [None, vi.Taylor(rtol=1e-10)], ids=["a", "t"])
 def test_a_block_slips_whenever_it_is_pulled_hard_enough(method):
     forces = pushes(0.0)

@@ -34,6 +34,10 @@ _DOUBLE = _Precision(short=1e-3, straight=1e-5, close=1e-9, brief=8e-6)
 _SINGLE = _Precision(short=1e-2, straight=1e-3, close=1e-4, brief=8e-3)
 
 
+# After so many aims at a release in turn its place is halved: a choice, three or four are usual.
+_PATIENCE = 8.0
+
+
 def allowed(s: Scalar) -> _Precision:
     """The thresholds of rest and release for the precision of `s`."""
     return _DOUBLE if s.dtype == jnp.float64 else _SINGLE
@@ -81,7 +85,9 @@ def release(
     landed = met | aimed & (h <= known.close)
     left = rising & (after > 0) & ~landed
     place = stop_gradient(h + offset)
-    place = jnp.where(h > known.straight, (1 - known.short) * place, place)
+    # Over a force that is hardly positive, but for long, chords do not get on: half the way does.
+    share = jnp.where(lane.aims >= _PATIENCE, 0.5, 1 - known.short)
+    place = jnp.where(h > known.straight, share * place, place)
     # By rounding's measure late rather than early, when it would be pressed on again; and no step
     # towards it is so short that it would not move on.
     late = 8 * float(jnp.finfo(h.dtype).eps) * (1 + stop_gradient(lane.s + h))
