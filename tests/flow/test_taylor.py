@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
+from vi_jax.flow.events import rising_root, slope
 from vi_jax.flow.methods import AbstractMethod
 from vi_jax.flow.methods import _series as power_series
 
@@ -182,6 +183,23 @@ def test_strong_damping_shortens_steps():
     free = (1 - 1 / a) / root * np.exp(np.pi * (root - a))
     assert bool(run.successful.all()) and int(run.impacts.sum()) == 0
     np.testing.assert_allclose(run.last.Y, free, rtol=0, atol=1e-6)
+
+
+def test_what_rounding_moves_when_a_body_is_let_go_is_no_turn():
+    """v = -4e-33 - 1e-17 t + t²/2 - 10 t³ is zero at 2e-17, which no clock at s = 2 can tell,
+    and at 1/20."""
+    series = [jnp.asarray(x) for x in (0.0, -4e-33, -5e-18, 1 / 6, -2.5)]
+
+    def turn(path):
+        facing = tuple(-x for x in slope(path.over(jnp.asarray(0.1))))
+        return 0.1 * float(rising_root(facing, iterations=8))
+
+    assert turn(power_series.Along(series)) < 1e-15
+    assert abs(turn(power_series.Along(series).without_flutter(jnp.asarray(4e-14))) - 0.05) < 1e-9
+    moving = [*series[:2], jnp.asarray(-1e-3), *series[3:]]
+    assert turn(power_series.Along(moving).without_flutter(jnp.asarray(4e-14))) == turn(
+        power_series.Along(moving)
+    )
 
 
 @pytest.mark.parametrize(

@@ -61,6 +61,9 @@ def _foreseen(
     machine, courses, ends, paths = plan.machine, [], [], []
     if plan.motion or machine.stops:
         paths = [motion.of(coordinate.position) for coordinate in machine.coordinates]
+    if not exact(machine, lane.state):
+        shortest = 64 * float(jnp.finfo(h.dtype).eps) * (1 + stop_gradient(lane.s))
+        paths = [path.without_flutter(shortest) for path in paths]
     for k, path in enumerate(paths):
         begin, end = path.ends(h)
         turned = (lane.direction[k] * end.v < 0) & may_matter(plan, lane, k, begin, end, h)

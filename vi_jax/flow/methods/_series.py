@@ -79,6 +79,17 @@ class Along(NamedTuple):
 
     series: Series
 
+    def without_flutter(self, shortest: Scalar) -> "Along":
+        """The same, but for a body that has just been let go without the speed and acceleration
+        that rounding has left, if its jerk outweighs both within the time `shortest`."""
+        if len(self.series) < 4 or any(x is None for x in self.series[1:4]):
+            return self
+        x, v, a, j, *rest = self.series
+        jerk = 3 * jnp.abs(jnp.asarray(j)) * shortest
+        still = (2 * jnp.abs(jnp.asarray(a)) <= jerk) & (jnp.abs(jnp.asarray(v)) <= jerk * shortest)
+        v, a = (jnp.where(still, 0.0, c) for c in (v, a))
+        return Along([x, v, a, j, *rest])
+
     def ends(self, h: Scalar) -> tuple[Rates, Rates]:
         """Its rates at both ends of a step of this length."""
         slope, zero = _slope(self.series), jnp.zeros_like(h)
