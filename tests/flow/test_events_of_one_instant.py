@@ -328,7 +328,7 @@ def test_a_blow_is_felt_along_any_path_of_contacts():
         ).all()
 
     class Row:
-        contacts = tuple(vi.RigidStop(0.0, 0.5, coordinate=i) for i in range(6))
+        stops = tuple(vi.RigidStop(0.0, 0.5, coordinate=i) for i in range(6))
 
     orders = jnp.array(list(itertools.permutations(range(6))))
     assert bool(jax.jit(jax.vmap(reached))(orders).all())

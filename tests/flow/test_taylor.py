@@ -141,6 +141,7 @@ class Pushed(vi.AbstractMachine):
     """With a force given as a function of s and Y."""
 
     force: Callable
+    contacts: tuple = ()
     cycle: float = 1.0
 
     def field(self, s, state):

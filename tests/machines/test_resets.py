@@ -82,10 +82,12 @@ def test_a_kind_of_event_of_ones_own(walk):
     assert float(run.event_log.value[0, 0]) == pytest.approx(turning, abs=1e-9)
 
 
-def test_equal_times_are_asked_of_the_machine():
+def test_at_equal_times_exponents_are_those_of_the_multipliers():
     start = tuple(map(jnp.asarray, (1.0, 0.7955, 0.2343)))
-    with pytest.raises(ValueError, match="an event that ends its cycles but no `observed_every`"):
-        vi.lyapunov(ThreeStates(1.8).observed_every(1.0), start, 4)
+    orbit = vi.find_orbit(ThreeStates(1.8), start, throw=True)
+    found = vi.lyapunov(orbit.machine, orbit.state, 200, settle=50, progress=False).exponents
+    rates = np.log(np.sort(abs(orbit.multipliers))[::-1][:2]) / float(orbit.duration)
+    np.testing.assert_allclose(found, np.sort([0.0, *rates])[::-1], rtol=0.02, atol=3e-3)
 
 
 def slid(voltage, x, cycles):
