@@ -1,9 +1,8 @@
 # %% [markdown]
 """# Follow a motion and switch where it bifurcates
 
-The 2π motion is followed in the frequency ratio ζ, through folds and instability. At a period
-doubling a 4π motion with two impacts begins; it loses an impact and continues as the paper's 4π
-motion. All special points are located to rounding.
+The 2π motion is followed in the frequency ratio ζ. At a period doubling a 4π motion with two
+impacts begins; it loses an impact and continues as the paper's 4π motion.
 """
 
 # %%

@@ -1,9 +1,8 @@
 # %% [markdown]
 """# Find periodic motions, stable or not
 
-`find_orbit` solves for a motion that repeats. At the paper's point (ζ = 0.9, k = 0.5, no damping)
-there are two: the stable 4π motion, and the 2π motion with a Floquet multiplier outside the unit
-circle.
+`find_orbit` solves for a motion that repeats. Here it finds the stable 4π motion, and the 2π motion
+with a Floquet multiplier outside the unit circle.
 """
 
 # %%

@@ -1,9 +1,8 @@
 # %% [markdown]
 """# What a grazing leads to
 
-A strongly damped oscillator, x'' + 10.1 x' + x = cos ωt, touches a stop that comes nearer. The
-slower multiplier of the motion without impact is 0.5. So windows of motions with one impact in n
-cycles follow, with chaos between.
+A strongly damped oscillator, x'' + 10.1 x' + x = cos ωt, touches a stop that comes nearer. Windows
+of motions with one impact in n cycles follow, with chaos between.
 """
 
 # %%

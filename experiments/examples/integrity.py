@@ -2,9 +2,7 @@
 """# How safe is a motion: the erosion of basins
 
 Each motion is drawn over the frequency ratio ζ with its share of the starts, and with the radius of
-the largest ball of starts around it that all return. At ζ = 1.22 a motion without impact appears:
-the other one keeps nearly all starts, but survives only half the kick. At ζ = 1.56 its basin is
-gone.
+the largest ball of starts around it that all return. At ζ = 1.56 a basin is gone.
 """
 
 # %%

@@ -1,9 +1,8 @@
 # %% [markdown]
 """# How hard may a motion be kicked?
 
-Two motions of period 4π are stable at the same parameters. Multipliers give the decay of a small
-perturbation, `minimal_kick` the size of the smallest one after which the machine settles on the
-other motion (arrows). It ends on the boundary of the basins.
+Two motions of period 4π are stable. The arrows are the smallest kicks after which the machine
+settles on the other motion. They end on the boundary of the basins.
 """
 
 # %%

@@ -1,9 +1,8 @@
 # %% [markdown]
 """# How long does a motion last where everything shakes?
 
-White noise ends the stable 4π motion with one impact sooner or later, and the machine settles on
-that with two impacts. Left: 1,024 runs on sections. Right: the time until they leave. A third less
-noise makes the motion last many times longer.
+White noise ends the stable 4π motion sooner or later. Left: 1,024 runs on sections. Right: the time
+until they leave.
 """
 
 # %%

@@ -2,8 +2,7 @@
 """# The motion that two methods of the paper disagree about
 
 At ζ = 0.9 and k = 0.5 the paper computes a motion of period 2π by one method and of 4π by the
-other. Both exist. Without damping the 2π motion is unstable, and the body settles on the 4π motion.
-With the damping of Table 1 the 2π motion is stable.
+other. Both exist: without damping the 2π motion is unstable, with that of Table 1 it is stable.
 """
 
 # %%

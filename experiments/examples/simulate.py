@@ -2,7 +2,7 @@
 """# Simulate a machine and look at its motion
 
 The machine of the paper's Table 1: a motor turns a crank, the crank shakes a body on a spring, and
-the body hits a stop. It starts at rest; the last two of 200 drive cycles are drawn.
+the body hits a stop. The last two of 200 drive cycles are drawn.
 """
 
 # %%

@@ -1,9 +1,8 @@
 # %% [markdown]
 """# A weak motor hangs at resonance: the Sommerfeld effect
 
-A motor of limited power shakes a body that does not reach its stop. Near resonance (ζ = 1) the body
-takes up the motor's power: the speed ζ hardly rises with the control κ, then jumps. On the way down
-it jumps elsewhere.
+A weak motor shakes a body that does not reach its stop. Near resonance (ζ = 1) the body takes up
+the power: the speed ζ hardly rises with the control κ, then jumps.
 """
 
 # %%
