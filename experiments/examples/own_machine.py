@@ -2,7 +2,7 @@
 """# Your own machine
 
 A pendulum leans against a wall, its pivot is shaken up and down, and a second wall limits its
-swing. The class says its numbers, a cycle, contacts, a field and a start.
+swing. The class defines parameters, a cycle, contacts, a field and a start.
 """
 
 # %%
@@ -14,7 +14,7 @@ import matplotlib.pyplot as plt
 import vi_jax as vi
 
 
-# %% The angle is positive towards the first wall (which lies beyond the vertical: its gap is negative)
+# %% The angle is positive towards the first wall, which lies beyond the vertical (negative gap)
 class Pendulum(vi.AbstractMachine):
     shaking: float = 1.0
     cycle = jnp.pi
