@@ -178,10 +178,10 @@ class FixedStep(AbstractMethod):
     """An explicit diffrax Runge–Kutta solver with a fixed number of steps in a cycle.
 
     Under `vmap` this is the faster choice: no lane waits for another's rejected steps. A step that
-    meets a stop is split there. There are as many steps in a natural period of the body, where that
-    is shorter than the drive cycle, so that the error does not depend on ζ; and more where strong
-    damping or a strong motor makes something fade fast. Of a machine that does not define its
-    `relaxation`, a lane ends as `unstable` at a step whose error is about as large as the state.
+    meets a stop is split there. The step is the smaller of a share of the drive cycle and of a
+    natural period of the body, so the error does not depend on ζ. Strong damping or a strong motor
+    makes it shorter. Lanes of a machine that does not define its `relaxation` end as `unstable` at
+    a step whose error is about as large as the state.
 
     **Arguments:** `solver` (default `Verner9()`), `steps_per_cycle` (at least 5; what the
     default, 10, was measured to err is said at `preset`).
@@ -206,7 +206,7 @@ class FixedStep(AbstractMethod):
             )
 
     def may_be_unstable(self, machine, s, state):
-        """Where it is not known how fast something fades.
+        """True if the fastest decay of the machine is unknown.
 
         **Arguments:** as `AbstractMethod.may_be_unstable`.
         """
