@@ -164,3 +164,52 @@ def test_a_state_is_a_pytree_of_names():
     ):
         with pytest.raises(error):
             wrong()
+
+
+class Toppling(vi.AbstractMachine):
+    """A pencil on its tip, shaken, till it lies on one side or the other."""
+
+    amplitude: float = 0.5
+    cycle = 2 * jnp.pi / 3
+    events = (
+        vi.Reset(lambda m, t, z: z.x - 1.0, ends="right"),
+        vi.Reset(lambda m, t, z: z.x + 1.0, ends="left", direction="falling"),
+    )
+
+    def field(self, t, z):
+        return {"x": z.u, "u": z.x + self.amplitude * jnp.cos(3 * t)}
+
+    def start(self):
+        return vi.State(x=0.0, u=0.0)
+
+
+def test_an_event_ends_the_motion_with_an_outcome():
+    """Which side it is beside the closed form, x = A (eᵗ + e⁻ᵗ)/20 - A cos 3t/10 + u sinh t."""
+    machine, speeds = Toppling(), jnp.array([0.3, -0.3, 0.03, -0.1])
+    run = jax.vmap(lambda u: vi.simulate(machine, vi.State(x=0.0, u=u), 4))(speeds)
+    t = np.linspace(0, 8, 4001)
+    swing = 0.05 * np.cosh(t) - 0.05 * np.cos(3 * t)
+    places = swing + np.outer(speeds, np.sinh(t))
+    first = [x[np.argmax(abs(x) > 1)] for x in places]
+    assert machine.outcomes == ("right", "left")
+    np.testing.assert_array_equal(run.outcome, np.where(np.array(first) > 0, 0, 1))
+    assert bool((run.result == vi.RESULTS.ended).all())
+    axes = {"start.u": speeds, "amplitude": [0.5]}
+    data = vi.scan(machine, axes, measure="sections", cycles=16, progress=False)
+    np.testing.assert_array_equal(data["outcome"].values[:, 0], run.outcome)
+
+
+def test_an_event_in_both_directions():
+    """A wheel that is counted where a pendulum passes its lowest place, either way."""
+
+    class Counted(Toppling):
+        events = vi.Reset(
+            lambda m, t, z: z.x, lambda m, t, z: {"count": z.count + 1}, direction="both"
+        )
+        cycle = 2 * jnp.pi
+
+        def field(self, t, z):
+            return {"x": z.u, "u": -z.x, "count": 0.0}
+
+    run = vi.simulate(Counted(), vi.State(x=1.0, u=0.0, count=0.0), 5)
+    assert float(run.last.count) == 10.0

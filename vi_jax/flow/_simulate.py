@@ -25,7 +25,7 @@ from .methods import MethodLike
 from .named import has_quantities
 from .noise import with_noise
 from .options import RunOptions
-from .results import Errors, EventLog, ImpactLog, Run, Samples, reason
+from .results import Errors, EventLog, ImpactLog, Run, Samples, outcome_of, reason
 
 _FAILED = "A lane of the simulation failed; see `RESULTS` and `Run.result`."
 
@@ -223,6 +223,7 @@ def collect(plan: Plan, sampled: bool, lane: Ends, points: State, records: Recor
         labels=machine.labels,
         units=stated(machine),
         modes=tuple(x[::parts] for x in modes),
+        outcome=outcome_of(lane.fault) if machine.outcomes else None,
     )
 
 

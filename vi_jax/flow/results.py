@@ -77,6 +77,7 @@ class RESULTS(NamedEnumeration):
         "The error of a fixed step was as large as the state, as under strong damping. Take more "
         "steps, define the machine's `relaxation` or `step_limit`, or use `Adaptive`."
     )
+    ended = "An event of the machine ended the motion; `Run.outcome` says with which outcome."
 
 
 # The loop carries reasons as numbers; this is their order.
@@ -98,6 +99,7 @@ REASON_NAMES = (
     "reset_unresolved",
     "bad_reset",
     "unstable",
+    "ended",
 )
 REASONS = tuple(getattr(RESULTS, name) for name in REASON_NAMES)
 (
@@ -118,12 +120,28 @@ REASONS = tuple(getattr(RESULTS, name) for name in REASON_NAMES)
     RESET_UNRESOLVED,
     BAD_RESET,
     UNSTABLE,
+    ENDED,
 ) = range(len(REASONS))
+
+
+# Outcomes of a machine's events are told apart by what is added to their common reason.
+_OUTCOMES = 64
+
+
+def with_outcome(number: int) -> float:
+    """The reason of a lane that an event ended, as a number, with the number of its outcome."""
+    return ENDED + number / _OUTCOMES
+
+
+def outcome_of(code: Scalar) -> Int[Array, ""]:
+    """The number of the outcome among the machine's; -1 of a lane that no event of its ended."""
+    number = jnp.round((code - ENDED) * _OUTCOMES).astype(jnp.int32)
+    return jnp.where(jnp.floor(code) == ENDED, number, -1)
 
 
 def reason(code: Scalar) -> RESULTS:
     """The enumeration item for a reason carried as a number."""
-    result = REASONS[0]
+    result, code = REASONS[0], jnp.floor(code)
     for number, item in enumerate(REASONS[1:], start=1):
         result = RESULTS.where(code == number, item, result)
     return result
@@ -277,6 +295,9 @@ class Run(Summarized):
     """In which units its quantities are, as the machine states it."""
     modes: tuple[Float[Array, " sections"], ...] = ()
     """The machine's own modes on the sections (see `AbstractMachine.begin`), each (cycles + 1,)."""
+    outcome: Int[Array, ""] | None = None
+    """With which outcome an event ended the motion, an index into `machine.outcomes`; -1 if none
+    did, `None` for a machine without outcomes."""
 
     @property
     def successful(self) -> jax.Array:

@@ -190,6 +190,12 @@ class AbstractMachine(Clocked, Observed, Worded):
         """The events that are no switches."""
         return other_events(self)
 
+    @property
+    def outcomes(self) -> tuple[str, ...]:
+        """The names of the outcomes with which its events end a motion."""
+        names = (x.ends for x in (*self.switches, *self.others) if x.ends)
+        return tuple(dict.fromkeys(names))
+
     @by_default
     def begin(self, s: Scalar, state: State) -> Any:
         """The discrete modes of a motion that begins in `state`, which the field receives after the

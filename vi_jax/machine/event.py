@@ -46,6 +46,9 @@ class AbstractEvent(Shown):
     """Whether a cycle ends with it; static."""
     name: str = eqx.field(static=True, kw_only=True, default="")
     """What messages call it; static."""
+    ends: str = eqx.field(static=True, kw_only=True, default="")
+    """The outcome with which the motion ends there, by name; it goes on without one. Of an event
+    among the machine's `events`; static."""
 
     @property
     def holds_mode(self) -> bool:

@@ -13,6 +13,7 @@ from .contact_friction import ContactFriction
 from .coordinate import Coordinate
 from .cycles import Turn, counter_of
 from .event import AbstractEvent, AbstractSwitch
+from .reset import Reset
 from .soft import SoftStop
 from .stop import RigidStop
 
@@ -47,9 +48,12 @@ def switches_in(machine: Machine) -> tuple[AbstractSwitch, ...]:
 
 def other_events(machine: Machine) -> tuple[AbstractEvent, ...]:
     """The events of a machine that are no switches, and the turn that ends its cycles."""
-    found = tuple(x for x in listed(machine.events) if not isinstance(x, AbstractSwitch))
+    found = []
+    for event in listed(machine.events):
+        if not isinstance(event, AbstractSwitch):
+            found += event.one_way() if isinstance(event, Reset) else (event,)
     counter = counter_of(machine)
-    return (*found, counter.event()) if isinstance(counter, Turn) else found
+    return (*found, counter.event()) if isinstance(counter, Turn) else tuple(found)
 
 
 def coordinates_in(machine: Machine) -> tuple[Coordinate, ...]:

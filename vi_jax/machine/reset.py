@@ -1,10 +1,12 @@
 """Resets: where a state jumps by a rule of its own."""
 
+import copy
 from collections.abc import Callable
 from typing import Any, ClassVar
 
 import equinox as eqx
 
+from .._checks import one_of
 from .event import AbstractEvent
 from .events import mode_values, struck_modes
 from .field import shown_modes
@@ -39,6 +41,8 @@ class Reset(AbstractEvent):
       they are if left out. Switches are then in the modes that they have behind an impact.
     - `value`: a number that the log of events keeps of it, of the state before.
     - `ends_cycle`: whether a cycle ends with it.
+    - `ends`: the name of an outcome with which the motion ends there, `"overturned"` say.
+    - `direction`: `"rising"`, or `"falling"` for a guard that falls through zero, or `"both"`.
     - `name`: what messages call it.
     """
 
@@ -47,6 +51,7 @@ class Reset(AbstractEvent):
     _when: Callable[..., Any] | None = eqx.field(static=True)
     _modes: Callable[..., Any] | None = eqx.field(static=True)
     _value: Callable[..., Any] | None = eqx.field(static=True)
+    direction: str = eqx.field(static=True)
     word: ClassVar = "reset"
 
     def __init__(
@@ -58,15 +63,30 @@ class Reset(AbstractEvent):
         modes: Callable[..., Any] | None = None,
         value: Callable[..., Any] | None = None,
         ends_cycle: bool = False,
+        ends: str = "",
+        direction: str = "rising",
         name: str = "",
     ):
         self._guard, self._reset, self._when = guard, reset, when
         self._modes, self._value = modes, value
-        self.ends_cycle, self.name = bool(ends_cycle), str(name)
+        self.ends_cycle, self.ends, self.name = bool(ends_cycle), str(ends), str(name)
+        self.direction = one_of("direction", direction, ("rising", "falling", "both"))
 
     def guard(self, machine, s, state, *modes):
         """The function `guard` of this state."""
-        return self._guard(machine, s, state, *shown_modes(machine, modes))
+        found = self._guard(machine, s, state, *shown_modes(machine, modes))
+        return -found if self.direction == "falling" else found
+
+    def one_way(self) -> "tuple[Reset, ...]":
+        """The same event as one for each direction."""
+        if self.direction != "both":
+            return (self,)
+        both = []
+        for way in ("rising", "falling"):
+            one = copy.copy(self)
+            object.__setattr__(one, "direction", way)
+            both.append(one)
+        return tuple(both)
 
     def after(self, machine, s, state, *modes):
         """As `reset` and `modes` say."""

@@ -109,7 +109,7 @@ class SoftStop(Wall, AbstractSwitch):
         self.side = one_of("side", side, ("right", "left"))
         self.on, self.acts = on, acts
         self.coordinate = count("coordinate", coordinate)
-        self.ends_cycle, self.name = bool(ends_cycle), str(name)
+        self.ends_cycle, self.ends, self.name = bool(ends_cycle), "", str(name)
         require_ranges(self)
 
     @property

@@ -137,6 +137,12 @@ def variables_of(program: ScanProgram, blocks: Blocks) -> dict[str, Variable]:
         }
     }
     machine, start = program.first(blocks)
+    if machine.outcomes:
+        outcomes = {name: i for i, name in enumerate(machine.outcomes)}
+        known["outcome"] = {
+            "long_name": "outcome with which an event ended the motion",
+            **flags({"none": -1} | outcomes),
+        }
     for measure in program.measures:
         known |= measure.described(start)
     found = {}

@@ -172,7 +172,8 @@ def _verified(
 
 def _warn_of_failures(data: "xr.Dataset") -> None:
     codes, numbers = np.unique(np.asarray(data["result"]), return_counts=True)
-    failed = {int(c): int(n) for c, n in zip(codes, numbers, strict=True) if c != 0}
+    good = REASON_NAMES.index("successful"), REASON_NAMES.index("ended")  # an outcome is no failure
+    failed = {int(c): int(n) for c, n in zip(codes, numbers, strict=True) if c not in good}
     if not failed:
         return
     names = ["not_computed", *REASON_NAMES]

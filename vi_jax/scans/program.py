@@ -165,6 +165,8 @@ class ScanProgram(eqx.Module):
                 if jnp.issubdtype(x.dtype, jnp.floating):  # fast minima lose NaN
                     # Added, not chosen: the derivative of a failed lane stays NaN as well.
                     found[name] = x + jnp.where(run.successful, 0.0, jnp.nan)
+            if run.outcome is not None:
+                found["outcome"] = run.outcome.astype(jnp.int8)
             return {**found, "result": number_of(run.result).astype(jnp.int8)}
 
         return jax.vmap(measured)(values, run), jax.vmap(lambda run: run.last)(run)

@@ -99,7 +99,7 @@ def may_end(machine: AbstractMachine) -> bool:
     slides = any(event.may_slide for event in events_of(machine))
     several = bool(machine.stops) and (len(machine.coordinates) > 1 or bool(machine.others))
     chain = len(machine.switches) + len(machine.others) > 1
-    return laws or slides or several or chain
+    return laws or slides or several or chain or bool(machine.outcomes)
 
 
 def comes_back(

@@ -135,6 +135,9 @@ def _next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _Instant) -> _In
             its_number = its_number - len(machine.switches)
         if event.ends_cycle:
             arrival = arrival._replace(completed=arrival.completed | here)
+        if event.ends:
+            outcome = results.with_outcome(machine.outcomes.index(event.ends))
+            arrival = ended(arrival, here, jnp.ones_like(here), outcome)
         new, modes = select(here, (its_state, its_modes), (new, modes))
         its_own = its_kind, its_number, its_value
         if len(numbers) > 1:
