@@ -103,7 +103,8 @@ def test_no_slider_compiles_and_redraws_are_quick(ideal):
                 machine, _ = ideal.at(values)
                 png = picture.draw(ideal.seen(values), machine)
                 took.append(time.process_time() - since)
-                assert Image.open(BytesIO(png)).size == (1008, 594)
+                width, height = Image.open(BytesIO(png)).size
+                assert height == 594 and width in (1007, 1008)  # 7.2 inches, by Matplotlib 3.9 less
         ideal.diagram({**begin, GAP: 1.0}, K)
     assert not found and np.median(took) < 0.2
 

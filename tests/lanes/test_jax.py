@@ -12,9 +12,9 @@ from vi_jax.lanes import _primitive
 from vi_jax.lanes._arrays import STRUCTURAL
 from vi_jax.lanes._operations import ELEMENTWISE
 
-# Primitives of this package, and some that JAX has in no public module or had in earlier versions.
+# Primitives of this package, and some that JAX has in no public module, or not in all its versions.
 OWN = {"sincos", "pin", "quotient", "weighted", "weighted_quotient", "weighted_dot"}
-ELSEWHERE = {"copy_p", "pvary", "reshard", "expand_dims", "empty2"}
+ELSEWHERE = {"copy_p", "pvary", "reshard", "expand_dims", "empty2", "stack", "unstack"}
 
 
 def test_rules_are_written_for_primitives_that_there_are():
