@@ -30,7 +30,8 @@ and compare every number below.
 
 *Theirs* is written with the digits that were published. *How* is their origin: printed in a
 documentation, a program or the reference file of a test, known in closed form, or computed from
-their equations by an independent integrator. Times include compilation. The [woodpecker toy](../experiments/studies/woodpecker.md) of Siconos is a study.
+their equations by an independent integrator. Times include compilation. The [woodpecker
+toy](../experiments/studies/woodpecker.md) of Siconos is a study.
 """
 
 

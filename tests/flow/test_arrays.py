@@ -179,7 +179,7 @@ def test_verbs_take_arrays_as_numbers():
     ],
 )
 def test_names_of_numbers_in_arrays(call):
-    with pytest.raises(ValueError, match="must be .*number of the machine"):
+    with pytest.raises(ValueError, match=r"must be .*number of the machine"):
         call()
 
 

@@ -29,7 +29,8 @@ class SmoothMachine(eqx.Module):
     def field(self, s: Scalar, state: State) -> State:
         """d(state)/ds, without motion of a body that is held."""
         traced = any(isinstance(x, Tracer) for x in jtu.tree_leaves((self, s, state)))
-        return _traced_once(self, s, state) if traced else self.held_field(s, state)
+        once: Any = _traced_once
+        return once(self, s, state) if traced else self.held_field(s, state)
 
     def held_field(self, s: Scalar, state: State) -> State:
         """The same, traced anew."""
@@ -55,7 +56,7 @@ class SmoothMachine(eqx.Module):
         return self.machine.averages(s, state, *self.modes)
 
 
-@partial(eqx.filter_jit, inline=True)
+@partial(eqx.filter_jit, inline=True)  # pyright: ignore
 def _traced_once(smooth: SmoothMachine, s: Scalar, state: State) -> State:
     """The field of a machine, which a step asks for some sixty times: traced once for each order of
     derivative, which takes two fifths off the first call of two bodies that may rest."""

@@ -132,24 +132,12 @@ class AbstractMachine(Clocked, Observed, Worded):
         """
 
     if TYPE_CHECKING:  # a subclass has them as attributes, properties or fields
-
-        @property
-        def contacts(self) -> Any: ...
-
-        @property
-        def events(self) -> Any: ...
-
-        @property
-        def modes(self) -> Any: ...
-
-        @property
-        def stops(self) -> Any: ...
-
-        @property
-        def switches(self) -> Any: ...
-
-        @property
-        def coordinates(self) -> Any: ...
+        contacts: Any = eqx.field(init=False)
+        events: Any = eqx.field(init=False)
+        modes: Any = eqx.field(init=False)
+        stops: Any = eqx.field(init=False)
+        switches: Any = eqx.field(init=False)
+        coordinates: Any = eqx.field(init=False)
     else:
 
         @derived

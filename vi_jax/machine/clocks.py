@@ -1,8 +1,9 @@
 """What counts the cycles of a machine, and what measures time."""
 
 import abc
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
+import equinox as eqx
 from jaxtyping import Array, Float
 
 from .._types import Number, Scalar, State
@@ -14,11 +15,15 @@ Machine = TypeVar("Machine", bound="Clocked")
 class Clocked(Shown):
     """The clocks of a machine: the independent variable `s`, what counts its cycles, and time."""
 
-    @property
-    @abc.abstractmethod
-    def cycle(self) -> Scalar | float:
-        """Length of one cycle in `s` (or in `clock(state)`, where that is not `None`); where
-        `section` ends a cycle, its usual length, by which steps are sized."""
+    if TYPE_CHECKING:  # a subclass has it as an attribute, a property or a field
+        cycle: Any = eqx.field(init=False)
+    else:
+
+        @property
+        @abc.abstractmethod
+        def cycle(self) -> Scalar | float:
+            """Length of one cycle in `s` (or in `clock(state)`, where that is not `None`); where
+            `section` ends a cycle, its usual length, by which steps are sized."""
 
     def clock(self, state: State) -> Scalar | None:
         """The state component that counts cycles, or `None` where `s` itself does."""

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, number, require, require_ranges
-from .._types import Scalar
 from ..machine import LinearMachine, RigidStop
 from ._base import number_field
 from ._matrices import check_contacts, check_matrices, check_vector, matrix, numbered, vector
