@@ -6,6 +6,7 @@ from math import pi
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
@@ -45,6 +46,11 @@ class Stage(NamedTuple):
     state: State
     weight: float = 0.0
     """Of the stage in the error estimate of the step; static, 0 of a method that has none."""
+
+
+def fading_is_known(machine: AbstractMachine, s: Scalar, state: State) -> bool:
+    """Whether a machine defines how fast it fades (`relaxation`); static, without an equation."""
+    return jax.eval_shape(machine.relaxation, s, state) is not None
 
 
 class AbstractMethod(eqx.Module):

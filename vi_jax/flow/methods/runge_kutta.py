@@ -15,7 +15,7 @@ from ..._types import Scalar, State
 from ...lanes import pin
 from ..beside import Beside, rate_beside
 from ..smooth import SmoothMachine
-from .base import AbstractMethod, Stage
+from .base import AbstractMethod, Stage, fading_is_known
 from .unrolled import Unrolled
 from .verner import Verner9
 
@@ -210,7 +210,7 @@ class FixedStep(AbstractMethod):
 
         **Arguments:** as `AbstractMethod.may_be_unstable`.
         """
-        return self.follows_fading and machine.relaxation(s, state) is None
+        return self.follows_fading and not fading_is_known(machine, s, state)
 
     def step(self, smooth, s0, s1, state, beside):
         """One Runge–Kutta step, and whether it is unstable.

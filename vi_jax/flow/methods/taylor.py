@@ -6,6 +6,7 @@ from math import factorial, pi
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
@@ -18,7 +19,7 @@ from ..smooth import SmoothMachine
 from . import _series as power_series
 from ._coefficients import NoSeries, NotSmooth, Series
 from ._series import Along
-from .base import AbstractMethod
+from .base import AbstractMethod, fading_is_known
 
 
 @contextmanager
@@ -46,8 +47,10 @@ class Expansion(NamedTuple):
     treedef: Any
     """Of the state and what is integrated beside it."""
     series: list[Series]
-    tolerance: np.ndarray | float
-    """By which its reach is measured."""
+    tolerance: np.ndarray | float | None
+    """By which its reach is measured; `None` of one that reaches as far as it is asked to."""
+    rarely: bool = False
+    """Few steps are shortened by it; static."""
 
     def at(self, h: Scalar) -> tuple[State, Beside | None]:
         """State, and what is integrated beside it, a length h away."""
@@ -62,6 +65,8 @@ class Expansion(NamedTuple):
     def reach(self, limit: Scalar) -> Scalar:
         """The length at which the last two terms are as small as the tolerance, relative to the
         state (Jorba and Zou, Experimental Mathematics 14, 2005), up to this limit."""
+        if self.tolerance is None:
+            return limit
         floor = 8 * jnp.finfo(limit.dtype).eps
         size = jnp.asarray(sum(jnp.sum(jnp.abs(stop_gradient(x[0]))) for x in self.series))
         allowed = jnp.maximum(jnp.asarray(self.tolerance, limit.dtype), floor) * (1 + size)
@@ -71,7 +76,16 @@ class Expansion(NamedTuple):
             if not terms:
                 continue
             term = jnp.maximum(sum(terms), jnp.finfo(size.dtype).tiny)
-            limit = jnp.minimum(limit, jnp.exp(jnp.log(allowed / term) * (1.0 / n)))
+
+            def shortened(limit: Scalar, ratio: Scalar, n: int = n) -> Scalar:
+                return jnp.minimum(limit, jnp.exp(jnp.log(ratio) * (1.0 / n)))
+
+            ratio = allowed / term
+            if self.rarely:
+                long = limit**n > ratio
+                limit = jax.lax.cond(long, shortened, lambda x, _: x, limit, ratio)
+            else:
+                limit = shortened(limit, ratio)
         return limit
 
 
@@ -140,14 +154,16 @@ class Taylor(AbstractMethod):
 
         with _in_words():
             treedef, series = power_series.expand(field, s, (state, beside), self.order)
-        tolerance = self._coarsest if self.rtol is None else self.rtol
-        return Expansion(treedef, series, tolerance)
+        if self.rtol is not None:
+            return Expansion(treedef, series, self.rtol)
+        known = fading_is_known(smooth.machine, s, state)
+        return Expansion(treedef, series, None if known else self._coarsest, rarely=True)
 
     @property
     def _coarsest(self) -> float:
         """The last term, relative to the state, of a motion with four periods in a natural one or
-        a cycle: fixed steps are shortened where theirs is larger, as under strong damping, since
-        the series would diverge."""
+        a cycle: fixed steps are shortened where theirs is larger, as under strong damping that the
+        machine does not define (`relaxation`), since the series would diverge."""
         return min((8 * pi / self.steps_per_cycle) ** self.order / factorial(self.order), 0.1)
 
     def step(self, smooth, s0, s1, state, beside):
