@@ -35,7 +35,7 @@ def _unrolled(solver: object) -> Unrolled:
 
 def _runge_kutta(solver: Unrolled, smooth: SmoothMachine, s0, s1, state, beside):
     """Return what a step of the solver leads to: the state, what is integrated `beside` it, the
-    errors of both, and the stages.
+    errors of both, the slopes at the stages, and these.
 
     **Arguments:** as `AbstractMethod.step`.
     """
@@ -44,10 +44,10 @@ def _runge_kutta(solver: Unrolled, smooth: SmoothMachine, s0, s1, state, beside)
         state, beside = y
         return pin((smooth.field(s, state), rate_beside(smooth, s, state, beside)))
 
-    y1, error, _, places = solver.step_with_stages(
+    y1, error, slopes, places = solver.step_with_stages(
         diffrax.ODETerm(field), s0, s1, (state, beside), None
     )
-    return *y1, error, [Stage(c, s, y[0], weight) for c, s, y, weight in places]
+    return *y1, error, slopes, [Stage(c, s, y[0], weight) for c, s, y, weight in places]
 
 
 def _sized_by(state: State, beside: Beside | None) -> tuple[State, dict[str, Scalar] | None]:
@@ -128,7 +128,7 @@ class Adaptive(AbstractMethod):
         solver = self.solver
         if solver.implicit:
             solver = Unrolled(solver.solver, tolerance=jnp.maximum(0.01 * rtol, floor))
-        new, after, errors, stages = _runge_kutta(solver, smooth, s0, s1, state, beside)
+        new, after, errors, _, stages = _runge_kutta(solver, smooth, s0, s1, state, beside)
         old, there, error = (_sized_by(*x) for x in ((state, beside), (new, after), errors))
         scaled = jtu.tree_map(
             lambda e, a, b: (e / (atol + rtol * jnp.maximum(jnp.abs(a), jnp.abs(b)))) ** 2,
@@ -224,15 +224,30 @@ class FixedStep(AbstractMethod):
 
         **Arguments:** as `AbstractMethod.step`.
         """
-        new, after, errors, stages = _runge_kutta(self.solver, smooth, s0, s1, state, beside)
+        new, after, _, slopes, stages = _runge_kutta(self.solver, smooth, s0, s1, state, beside)
         error = jnp.zeros_like(s0)
         if self.may_be_unstable(smooth.machine, s0, state):
-            # Of bodies at rest in zero all that is left is rounding.
-            rounding = float(jnp.finfo(s0.dtype).eps) ** 0.5
-            old, there, apart = map(_size, (state, new, errors[0]))
-            size = jnp.maximum(jnp.maximum(old, there), rounding)
-            error = jnp.where(apart > _UNSTABLE * size, 2.0, error)
+            error = self._unstable((state, new), [slope for slope, _ in slopes], s1 - s0)
         return new, after, error, stages
+
+    def _unstable(self, ends: tuple[State, State], slopes: list[State], h: Scalar) -> Scalar:
+        """More than 1 if a step is unstable, else 0.
+
+        **Arguments:** the state at both `ends`; `slopes`, of the state at each stage; `h`, the
+        step's length.
+        """
+        # Of bodies at rest in zero all that is left is rounding.
+        rounding = float(jnp.finfo(h.dtype).eps) ** 0.5
+        before, after = (jnp.maximum(_size(x), rounding) for x in ends)
+
+        def judged(size, h, slopes):
+            apart = _size(self.solver.error(slopes, h))
+            return jnp.where(apart > _UNSTABLE * size, 2.0, jnp.zeros_like(h))
+
+        # A step over less than what changes the state by itself is stable, and its error not asked.
+        given = jax.lax.stop_gradient((jnp.maximum(before, after), h, slopes))
+        long = given[1] * _size(slopes[0]) > before
+        return jax.lax.cond(long, judged, lambda size, h, slopes: jnp.zeros_like(h), *given)
 
     def tighter(self):
         """The same solver with twice as many steps a cycle."""
@@ -257,7 +272,7 @@ class ImplicitSteps(FixedStep):
         **Arguments:** as `AbstractMethod.step`.
         """
         solver = Unrolled(self.solver.solver, tolerance=8 * jnp.finfo(s0.dtype).eps)
-        new, beside, errors, stages = _runge_kutta(solver, smooth, s0, s1, state, beside)
+        new, beside, errors, _, stages = _runge_kutta(solver, smooth, s0, s1, state, beside)
         solved = jnp.isfinite(sum(map(jnp.sum, jtu.tree_leaves(errors))))
         new = jtu.tree_map(lambda x: jnp.where(solved, x, jnp.nan), new)
         return new, beside, jnp.zeros_like(s0), stages

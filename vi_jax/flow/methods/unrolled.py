@@ -70,12 +70,14 @@ class Unrolled(diffrax.AbstractSolver):
 
         **Returns:** as `diffrax`'s `step`.
         """
-        y1, error, stages, _ = self.step_with_stages(terms, t0, t1, y0, args)
+        y1, error, slopes, _ = self.step_with_stages(terms, t0, t1, y0, args)
+        control = terms.contr(t0, t1)
+        stages = [terms.prod(slope, control) for slope in slopes]
         k = jtu.tree_map(lambda *leaves: jnp.stack(leaves), *stages)
         return y1, error, {"y0": y0, "y1": y1, "k": k}, None, diffrax.RESULTS.successful
 
     def step_with_stages(self, terms, t0, t1, y0, args):
-        """Return the end of a step over [t0, t1], its error, the increment of each stage, and share
+        """Return the end of a step over [t0, t1], its error, the slope of each stage, and share
         of the step, t, y and weight in the error of each.
 
         **Arguments:** as `step`.
@@ -99,8 +101,12 @@ class Unrolled(diffrax.AbstractSolver):
         if not tableau.ssal or y1 is None:
             y1 = reached(tableau.b_sol)
         error = terms.prod(weighted(tableau.b_error, slopes), control)
-        stages = [terms.prod(slope, control) for slope in slopes]
-        return y1, error, stages, _with_weights(tableau, places)
+        return y1, error, slopes, _with_weights(tableau, places)
+
+    def error(self, slopes: list[Any], control: Any) -> Any:
+        """The error of a step from the slopes of its stages and its length."""
+        change = weighted(_tableau(self.solver).b_error, slopes)
+        return jtu.tree_map(lambda x: control * x, change)
 
     def _implicit(self, terms, t0, t1, y0, args, control):
         """The step of an implicit solver; its error is infinite where a stage was not solved.
@@ -114,8 +120,8 @@ class Unrolled(diffrax.AbstractSolver):
         def field(t, y):
             return ravel_pytree(terms.vf(t, unravel(y), args))[0]
 
-        stages, left = implicit_stages(tableau, field, t0, control, flat, tolerance)
-        stages = [unravel(control * k) for k in stages]
+        slopes, left = implicit_stages(tableau, field, t0, control, flat, tolerance)
+        stages = [unravel(control * k) for k in slopes]
         error = jtu.tree_map(lambda e: jnp.abs(e) + left, weighted(tableau.b_error, stages))
         y1 = weighted(tableau.b_sol, stages, y0)
         assert tableau.a_diagonal is not None
@@ -123,7 +129,7 @@ class Unrolled(diffrax.AbstractSolver):
         for n, (a, c) in enumerate(zip(tableau.a_lower, tableau.c, strict=True), start=2):
             there = weighted(np.append(a, diagonal), stages[:n], y0)
             places.append((float(c), t0 + float(c) * (t1 - t0), there))
-        return y1, error, stages, _with_weights(tableau, places)
+        return y1, error, [unravel(k) for k in slopes], _with_weights(tableau, places)
 
 
 def _with_weights(tableau: diffrax.ButcherTableau, places: list[tuple]) -> list[tuple]:
