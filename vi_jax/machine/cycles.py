@@ -79,7 +79,21 @@ class Turn(Counter):
         def reset(machine: Any, s: Scalar, state: State, *modes: Any) -> State:
             return with_component(self.name, state, component(self.name, state) - 2 * pi)
 
-        return Reset(guard, reset, ends_cycle=True, name="turn")
+        return _TurnOver(guard, reset, ends_cycle=True, name="turn")
+
+
+class _TurnOver(Reset):
+    """The end of a turn. Its guard is an angle, which falls by a whole turn there."""
+
+    @property
+    def from_below(self) -> bool:
+        """False: the guard is far below zero behind the event."""
+        return False
+
+    @property
+    def looked_at_within(self) -> bool:
+        """False: a shaft does not turn to and fro within a step."""
+        return False
 
 
 class Passing(Counter):
