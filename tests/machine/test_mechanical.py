@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import vi_jax as vi
@@ -85,6 +86,23 @@ def test_two_bodies_and_a_wall():
     z = run.last
     wanted = [0.457113976, 0.698178941, 0.119586666, 1.344958219]
     np.testing.assert_allclose([z.left, z.right, z.v.left, z.v.right], wanted, atol=2e-9)
+
+
+def test_pictures_show_a_coordinate_by_its_name():
+    """With its own stops and impacts, or none; a component that no contact limits, too."""
+    machine = Pair()
+    run = vi.simulate(machine, machine.at(left=-0.5, right=0.3), 4, samples=8, impact_log=8)
+    figure, axes = plt.subplots(1, 3)
+    swing = run.samples.state.left.max()
+    for name, lines, highest, ax in (("right", 2, 1.0, axes[0]), ("left", 1, swing, axes[1])):
+        vi.plot_history(run, machine=machine, coordinate=name, ax=ax)
+        assert len(ax.lines) == lines and ax.get_ylabel() == name
+        assert ax.lines[0].get_ydata().max() == pytest.approx(float(highest))
+    vi.plot_phase_portrait(run, machine, coordinate="left", ax=axes[2])
+    assert axes[2].get_ylabel() == "v.left"
+    with pytest.raises(ValueError, match="`coordinate` must be a number or a component"):
+        vi.plot_history(run, machine=machine, coordinate="up")
+    plt.close(figure)
 
 
 def test_an_unbalanced_motor_on_a_structure():

@@ -64,6 +64,8 @@ from .mechanical import Mechanical as Mechanical
 from .modal import ModalMachine as ModalMachine
 from .modal import Modes as Modes
 from .motor import Motor as Motor
+from .names import component as component
+from .names import has_component as has_component
 from .numbers import by_name as by_name
 from .numbers import check_again as check_again
 from .numbers import check_leaf as check_leaf
@@ -81,6 +83,7 @@ from .own import changed as changed
 from .own import is_own as is_own
 from .parameters import Parameters as Parameters
 from .parts import listed as listed
+from .parts import number_on as number_on
 from .reset import Reset as Reset
 from .scene import Oscillator as Oscillator
 from .scene import Scene as Scene

@@ -79,7 +79,7 @@ class Turn(Counter):
         def reset(machine: Any, s: Scalar, state: State, *modes: Any) -> State:
             return with_component(self.name, state, component(self.name, state) - 2 * pi)
 
-        return _TurnOver(guard, reset, ends_cycle=True, name="turn")
+        return _TurnOver(guard, reset, ends_cycle=True, name="turn")  # pyright: ignore
 
 
 class _TurnOver(Reset):

@@ -72,6 +72,15 @@ def _places(contacts: tuple[Any, ...]) -> dict[Any, int]:
     return {on: i for i, on in enumerate(dict.fromkeys(named or [None]))}
 
 
+def number_on(machine: Machine, name: str) -> int | None:
+    """The number of the coordinate that contacts name so, as one or by its position; `None` if no
+    contact acts on it."""
+    for on, number in _places(listed(machine.contacts)).items():
+        if on == name or (isinstance(on, tuple) and on[0] == name):
+            return number
+    return None
+
+
 def _at(stop: Any, places: dict[Any, int]) -> Any:
     """A stop with the number of its coordinate."""
     if stop.on is None and stop.coordinate:

@@ -10,7 +10,7 @@ from .._checks import instance_of
 from ..flow import Run, Samples
 from ..machine import PLAIN, AbstractMachine, SoftStop, in_brackets, name_in, unit_of
 from .colors import BLUE, STOP, is_set, once, thick
-from .path import motion_path
+from .path import coordinate_of, motion_path
 
 
 def new_axes(ax: Axes | None) -> Axes:
@@ -38,7 +38,7 @@ def plot_history(
     shift: float | int = 0,
     unit: str | None = None,
     stops: bool = True,
-    coordinate: int = 0,
+    coordinate: int | str = 0,
     **style: Any,
 ) -> Axes:
     """Draw position over the drive's clock, with the stops of `machine` as lines (dashed if soft).
@@ -53,7 +53,7 @@ def plot_history(
     - `unit`: `"angle"` (crank angle φ in units of π) or `"cycles"`; by default the clock of the
       `machine`, which is the angle for the paper's machine and where no machine is given.
     - `stops`: whether to draw the stops.
-    - `coordinate`: the number of the machine's coordinate to draw, with its own stops and impacts.
+    - `coordinate`: the coordinate to draw, by number or by name, with its own stops and impacts.
     - `style`: options of `Axes.plot`.
 
     **Returns:** the axes.
@@ -68,7 +68,7 @@ def plot_history(
     factor = 2.0 if unit == "angle" else 1.0
     ax.plot(factor * (path.cycles + shift), path.Y, **{"color": BLUE, "lw": thick(1.3), **style})
     if stops and machine is not None:
-        _draw_stops(machine, coordinate, ax, ax.axhline)
+        _draw_stops(machine, coordinate_of(machine, coordinate), ax, ax.axhline)
     ax.set_ylabel(_labels(motion, machine, coordinate)[0])
     if unit == "cycles":
         ax.set_xlabel("drive cycles φ/(2π)" if turning else "cycles since the start")
@@ -78,7 +78,7 @@ def plot_history(
 
 
 def _draw_stops(
-    machine: AbstractMachine, coordinate: int, ax: Axes, line: Callable[..., Any]
+    machine: AbstractMachine, coordinate: int | str, ax: Axes, line: Callable[..., Any]
 ) -> None:
     """Of a coordinate the rigid stops as thick lines, and the soft ones, which the body goes into,
     as thin dashed ones."""
@@ -93,13 +93,19 @@ def _draw_stops(
 
 
 def _labels(
-    motion: Run | Samples, machine: AbstractMachine | None, coordinate: int
+    motion: Run | Samples, machine: AbstractMachine | None, coordinate: int | str
 ) -> tuple[str, str]:
     """What position and velocity of a coordinate are called, with their units; samples alone do not
     know their machine."""
     if machine is None:
         return motion.labels if isinstance(motion, Run) else ("Y", "V")
     labels = machine.labels
+    if isinstance(coordinate, str):
+        place, rate = (
+            in_brackets(name, unit_of(machine.units, name))
+            for name in (coordinate, f"v.{coordinate}")
+        )
+        return place, rate
     if coordinate:  # the machine's words are those of the first
         labels = tuple(f"{name} of coordinate {coordinate}" for name in PLAIN)
     named = zip(PLAIN, labels, strict=True)
@@ -129,7 +135,7 @@ def plot_phase_portrait(
     ax: Axes | None = None,
     window: tuple[float | int, float | int] | None = None,
     sections: bool = True,
-    coordinate: int = 0,
+    coordinate: int | str = 0,
     **style: Any,
 ) -> Axes:
     """Draw velocity over position, with the stops as lines (dashed if soft) and sections as dots.
@@ -150,7 +156,7 @@ def plot_phase_portrait(
         dots = {"ms": 4, "color": line.get_color(), "zorder": 3, "label": once(ax, "section")}
         ax.plot(samples.Y[whole], samples.V[whole], "o", **dots)
     if machine is not None:
-        _draw_stops(machine, coordinate, ax, ax.axvline)
+        _draw_stops(machine, coordinate_of(machine, coordinate), ax, ax.axvline)
     position, velocity = _labels(motion, machine, coordinate)
     ax.set_xlabel(position)
     ax.set_ylabel(velocity)

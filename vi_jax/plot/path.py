@@ -8,13 +8,18 @@ import numpy as np
 
 from .._checks import count, instance_of
 from ..flow import Run, Samples
-from ..machine import AbstractMachine, is_autonomous
+from ..machine import AbstractMachine, component, has_component, is_autonomous, number_on
 from ..orbit import Orbit
 
 
-def _coordinates(machine: AbstractMachine | None, k: int) -> tuple[Callable[[Any], Any], ...]:
-    """Position and velocity of states by coordinate number k; without a machine their components
-    `Y` and `V`."""
+def _coordinates(machine: AbstractMachine | None, k: int | str) -> tuple[Callable[[Any], Any], ...]:
+    """Position and velocity of states by coordinate number k, or the component of that name;
+    without a machine their components `Y` and `V`."""
+    if isinstance(k, str):
+        rate = f"v.{k}"  # of a `Mechanical`
+        return (lambda state: component(k, state)), (
+            lambda state: component(rate if has_component(rate, state) else k, state)
+        )
     if machine is not None:
         body = machine.coordinates[k]
         if k == 0:
@@ -39,14 +44,14 @@ def motion_path(
     *,
     machine: AbstractMachine | None = None,
     window: tuple[float | int, float | int] | None = None,
-    coordinate: int = 0,
+    coordinate: int | str = 0,
 ) -> MotionPath:
     """Return the path of one sampled motion.
 
     **Arguments:** a `Run` simulated with `samples=...` (or its `Samples`); with the `machine`, the
     impacts logged (`impact_log=...`) enter as two points each, before and after the impact, so
     that a corner at the stop is drawn where it is; `window`, the first and the last cycle to keep;
-    `coordinate`, the number of the machine's coordinate whose path it is, with its own impacts.
+    `coordinate`, the number or the name of the coordinate whose path it is, with its own impacts.
 
     **Raises:** `ValueError` if the run has no samples or is a batch, if its states lack `Y` and `V`
     without a machine that replaces them, or for an unknown coordinate.
@@ -56,8 +61,7 @@ def motion_path(
     instance_of("motion", motion, (Run, Samples), "a `Run`, from `simulate`, or its `samples`")
     if machine is not None:
         instance_of("machine", machine, AbstractMachine, "a `Scene` or an `AbstractMachine`")
-    most = 0 if machine is None else len(machine.coordinates) - 1
-    coordinate = count("coordinate", coordinate, most=most)
+    coordinate = coordinate_of(machine, coordinate)
     samples = motion.samples if isinstance(motion, Run) else motion
     if samples is None:
         raise ValueError("Argument `motion` must have samples: simulate with `samples=64`, say.")
@@ -75,6 +79,9 @@ def motion_path(
         raise ValueError(
             "Argument `machine` must be given for states without `Y` and `V`: it defines the "
             "position."
+            if not isinstance(coordinate, str)
+            else f"Argument `coordinate` must be a number or a component of the state, but got "
+            f"{coordinate!r}."
         ) from None
     if isinstance(motion, Run) and motion.impact_log is not None and machine is not None:
         path = _with_impacts(path, motion, machine, coordinate)
@@ -84,8 +91,20 @@ def motion_path(
     return path
 
 
+def coordinate_of(machine: AbstractMachine | None, coordinate: int | str) -> int | str:
+    """The number of a coordinate, by its name too; the name of one that no contact limits.
+
+    **Raises:** `ValueError` for a number that the machine has not.
+    """
+    if isinstance(coordinate, str):
+        number = None if machine is None else number_on(machine, coordinate)
+        return coordinate if number is None else number
+    most = 0 if machine is None else len(machine.coordinates) - 1
+    return count("coordinate", coordinate, most=most)
+
+
 def _with_impacts(
-    path: MotionPath, run: Run, machine: AbstractMachine, coordinate: int
+    path: MotionPath, run: Run, machine: AbstractMachine, coordinate: int | str
 ) -> MotionPath:
     log = run.impact_log
     assert log is not None
