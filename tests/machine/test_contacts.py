@@ -1,6 +1,7 @@
 """Contacts that act by themselves: machines in a few lines, beside numbers from SciPy, which was
 taken from event to event (rtol 1e-12), or in closed form."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -132,6 +133,34 @@ def test_soft_flanks_push_by_themselves():
 def test_a_furnace_with_two_thresholds():
     run = vi.simulate(Furnace(), vi.State(T=300.0), 4)
     assert float(run.last.T) == pytest.approx(294.497730558, abs=1e-8)
+
+
+class Counted(vi.AbstractMachine):
+    """A ball that counts its impacts on the floor, and turns of a clock, by name."""
+
+    wrong: str = eqx.field(static=True, default="hits")
+    cycle = 1.0
+    modes = {"hits": 0.0, "turns": 0.0}  # noqa: RUF012
+
+    @property
+    def contacts(self):
+        count = lambda m, t, z, hits, turns: {self.wrong: hits + 1}
+        return vi.RigidStop(0.0, 0.5, "left", on=("x", "u"), modes=count)
+
+    events = vi.Reset(
+        lambda m, t, z, *_: t - 0.5,
+        modes=lambda m, t, z, hits, turns: dict(turns=turns + 1, hits=hits),
+    )
+
+    def field(self, t, z, hits, turns):
+        return dict(x=z.u, u=-1.0)
+
+
+def test_modes_are_taken_by_name():
+    ball = vi.State(x=1.0, u=0.0)
+    assert vi.simulate(Counted(), ball, 2).last.modes == (1, 2)  # it falls √2 s
+    with pytest.raises(TypeError, match=r"the mode .hit., .* are hits, turns"):
+        vi.simulate(Counted(wrong="hit"), ball, 2)
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from .._types import Machine, Scalar, Scalars, State
 from .contacts import rubbed
 from .event import AbstractEvent, Around, Modes, Section
 from .friction import chosen_together, frictions_in
+from .own import declared_modes
 
 
 def events_of(machine: Machine) -> tuple[AbstractEvent, ...]:
@@ -189,6 +190,28 @@ def mode_values(modes: Any) -> tuple[Any, ...]:
     if isinstance(modes, Mapping):
         return tuple(modes.values())
     return tuple(modes) if isinstance(modes, tuple | list) else (modes,)
+
+
+def modes_after(machine: Machine, found: Any, modes: Modes, whose: str) -> tuple[Any, ...]:
+    """The machine's own modes after an event, of which a user returned all, or a dictionary of
+    those that change.
+
+    **Arguments:** `modes`, all of the machine before the event; `whose`, what returned them, for
+    messages.
+
+    **Raises:** `TypeError` for a name that the machine does not declare.
+    """
+    names = tuple(declared_modes(machine))
+    if not isinstance(found, Mapping) or not names:
+        return mode_values(found)
+    extra = [name for name in found if name not in names]
+    if extra:
+        raise TypeError(
+            f"{whose} returned the mode {extra[0]!r}, which the machine does not have. Its `modes` "
+            f"are {', '.join(names)}."
+        )
+    pairs = zip(names, own_modes(machine, modes), strict=True)
+    return tuple(found.get(name, old) for name, old in pairs)
 
 
 def settled_modes(modes: Sequence[Any], s: Scalar) -> Modes:

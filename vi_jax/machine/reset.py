@@ -8,7 +8,7 @@ import equinox as eqx
 
 from .._checks import one_of
 from .event import AbstractEvent
-from .events import mode_values, struck_modes
+from .events import modes_after, struck_modes
 from .field import shown_modes
 from .state import changed
 
@@ -36,9 +36,11 @@ class Reset(AbstractEvent):
     - `reset`: the state afterwards, or a dictionary of the components that change; the state stays
       as it is if left out.
     - `when`: whether the reset happens where the guard has risen through zero, as a flag; where it
-      does not hold the motion goes on. Always, if left out.
-    - `modes`: the machine's own modes afterwards, one number, a tuple or a dictionary; they stay as
-      they are if left out. Switches are then in the modes that they have behind an impact.
+      does not hold the motion goes on, and the guard must fall below zero before it can rise again.
+      Always, if left out.
+    - `modes`: the machine's own modes afterwards, one number, a tuple, or a dictionary of those
+      that change; they stay as they are if left out. Switches are then in the modes that they have
+      behind an impact.
     - `value`: a number that the log of events keeps of it, of the state before.
     - `ends_cycle`: whether a cycle ends with it.
     - `ends`: the name of an outcome with which the motion ends there, `"overturned"` say.
@@ -92,7 +94,8 @@ class Reset(AbstractEvent):
         """As `reset` and `modes` say."""
         own = None
         if self._modes is not None:
-            own = mode_values(self._modes(machine, s, state, *shown_modes(machine, modes)))
+            found = self._modes(machine, s, state, *shown_modes(machine, modes))
+            own = modes_after(machine, found, modes, self._whose("modes", machine))
         new = self.jump(machine, s, state, *modes)
         return new, struck_modes(machine, s, new, modes, own)
 
@@ -100,8 +103,11 @@ class Reset(AbstractEvent):
         """The state that the function `reset` makes of this one."""
         if self._reset is None:
             return state
-        whose = f"`reset` of {self.name or 'a Reset'} of a {type(machine).__name__}"
-        return changed(state, self._reset(machine, s, state, *shown_modes(machine, modes)), whose)
+        found = self._reset(machine, s, state, *shown_modes(machine, modes))
+        return changed(state, found, self._whose("reset", machine))
+
+    def _whose(self, part: str, machine: Any) -> str:
+        return f"`{part}` of {self.name or 'a Reset'} of a {type(machine).__name__}"
 
     def happens(self, machine, s, state, *modes):
         """The result of the function `when` for this state, `None` without one."""

@@ -25,7 +25,7 @@ from .._checks import (
 )
 from .._types import Machine, Number, Scalar, State
 from .event import AbstractEvent, Modes
-from .events import mode_values, struck_modes
+from .events import modes_after, struck_modes
 from .field import shown_modes
 from .own import by_default, is_own
 from .shown import Shown
@@ -111,8 +111,9 @@ class RigidStop(Wall, AbstractEvent):
     coordinate: int = eqx.field(static=True, default=0, kw_only=True)
     """Index into the machine's `coordinates`."""
     modes: Callable[..., Any] | None = eqx.field(static=True, default=None, kw_only=True)
-    """`modes(machine, s, state, *modes)`: the machine's own modes after an impact in this state, a
-    tuple like that of its `begin`; they stay as they are if left out."""
+    """`modes(machine, s, state, *modes)`: the machine's own modes after an impact in this state,
+    one number, a tuple, or a dictionary of those that change; they stay as they are if left
+    out."""
     at: Float[Array, "..."] | None = eqx.field(
         default=None, kw_only=True, converter=optional_real("at")
     )
@@ -152,7 +153,9 @@ class RigidStop(Wall, AbstractEvent):
         """
         own = None
         if self.modes is not None:
-            own = mode_values(self.modes(machine, s, before, *shown_modes(machine, modes)))
+            found = self.modes(machine, s, before, *shown_modes(machine, modes))
+            whose = f"`modes` of a stop of a {type(machine).__name__}"
+            own = modes_after(machine, found, modes, whose)
         return struck_modes(machine, s, after, modes, own)
 
     def jump(self, machine, s, state, *modes):

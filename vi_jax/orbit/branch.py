@@ -134,11 +134,13 @@ class Branch(InWords):
         return (*column_names(self.problem.machine, self.problem.like), *self.free)
 
     def column(self, name: str) -> np.ndarray:
-        """A number at each point: one of the branch's arrays, one of the machine's averages, or a
-        part of the state or a quantity on the section, as `section_Y`.
+        """A number at each point: one of the branch's arrays, one of the machine's averages, its
+        parameter by name, or a part of the state or a quantity on the section, as `section_Y`.
 
         **Raises:** `ValueError` that lists the names there are.
         """
+        if name == self.name and name not in self.column_names:
+            return self.parameter
         one_of("name", name, self.column_names)
         if name in self.averages or name in self.free:
             return (self.averages | self.free)[name]
