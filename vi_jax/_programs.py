@@ -19,8 +19,7 @@ import jax
 import jax.tree_util as jtu
 from jax.core import Tracer
 
-from ._messages import interrupts_heard
-from .lanes import Unsupported, current_backend, vector_only
+from .lanes import Unsupported, current_backend, interrupts_heard, vector_only
 
 # With these XLA compiles two to three times faster. What runs for long is in the lanes, whose code
 # is not XLA's. For programs that do much else, `PLAIN` alone saves half of that and costs nothing

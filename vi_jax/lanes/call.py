@@ -17,8 +17,8 @@ from ctypes import POINTER, Structure, c_char_p, c_int, c_int32, c_int64, c_size
 import jax
 import numpy as np
 
-from .._messages import interrupt_dropped
 from ._driver import OUT_OF_MEMORY
+from ._dropped import interrupt_dropped
 from ._interrupts import SUCCESS, HandlerResult, guard, interrupt_raises, watch
 from ._recent import made_once
 from ._vector import Unsupported
