@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 
 from ..._types import Flag, Scalar, State
-from ...machine import section_number, struck_modes
+from ...machine import holds_anywhere, section_number, struck_modes
 from .._arrival import Arrival, Onward, Tally
 from .._contact.impact import is_compound, strike
 from .._contact.rest import Release
@@ -277,6 +277,10 @@ def _impact(
         for number, here in landed.items():
             given = machine, arrival.s, there, arrival.state, modes
             modes = select(here, machine.stops[number].modes_after(*given), modes)
+        if arrival.contact is not None and holds_anywhere(machine):
+            # What friction has to hold depends on who rests now.
+            new = struck_modes(machine, arrival.s, arrival.state, modes, contact=arrival.contact)
+            modes = select(met, new, modes)
     arrival = arrival.going(direction=tuple(direction), modes=modes)
     before = there, lane.modes  # a stop may have changed them already
     # What rests on other stops may be let go of by it.
