@@ -75,6 +75,7 @@ class SoftStop(Wall, AbstractSwitch):
     side: str = eqx.field(static=True)
     on: Any = eqx.field(static=True)
     coordinate: int = eqx.field(static=True)
+    ends: str = eqx.field(static=True, init=False, default="")  # its touch ends no motion
     ranges: ClassVar = {
         "gap": REAL, "stiffness": POSITIVE, "damping": NOT_NEGATIVE, "prestress": NOT_NEGATIVE,
     }  # fmt: skip
@@ -109,7 +110,7 @@ class SoftStop(Wall, AbstractSwitch):
         self.side = one_of("side", side, ("right", "left"))
         self.on, self.acts = on, acts
         self.coordinate = count("coordinate", coordinate)
-        self.ends_cycle, self.ends, self.name = bool(ends_cycle), "", str(name)
+        self.ends_cycle, self.name = bool(ends_cycle), str(name)
         require_ranges(self)
 
     @property
