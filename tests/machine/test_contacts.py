@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import vi_jax as vi
 from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
 
 
 class Oscillator(vi.AbstractMachine):
@@ -112,6 +113,30 @@ def test_two_frictions_that_stick_together():
     run = vi.simulate(machine, machine.at(a=0.1), 2, event_log=16)
     assert bool(run.successful) and int((run.event_log.kind >= 0).sum()) == 24
     np.testing.assert_allclose([run.last.a, run.last.b], [0.940773005, 0.534904081], atol=1e-8)
+
+
+class Cart(vi.Mechanical):
+    """A cart that static friction holds on the ground, with a heavy load that is pulled off it."""
+
+    q = ("cart", "load")
+    mass = (1.0, 100.0)
+    cycle = 2 * jnp.pi
+    contacts = (
+        vi.DryFriction(0.1, on="cart", static_ratio=20.0),
+        vi.DryFriction(0.1, on=lambda q: q.cart - q.load),
+    )
+
+    def force(self, t, q, v):
+        return dict(cart=1.0, load=0.2 * jnp.sin(t))
+
+
+def test_as_much_sticks_as_can():
+    """A cart that slides contradicts no force either: kinetic friction does not hold it. The load
+    slides from π/6 on until its momentum is spent."""
+    run = vi.simulate(Cart(), Cart().at(), 1, event_log=4)
+    end = brentq(lambda t: 0.2 * (np.cos(np.pi / 6) - np.cos(t)) - 0.1 * (t - np.pi / 6), 2, 4)
+    assert abs(run.last.cart) < 1e-14 and abs(run.last.v.cart) < 1e-15
+    np.testing.assert_allclose(run.event_log.phase[0, :2], (np.pi / 6, end), rtol=1e-9)
 
 
 def test_soft_flanks_push_by_themselves():

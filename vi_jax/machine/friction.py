@@ -1,6 +1,7 @@
 """Dry friction, with sticking as a mode."""
 
 import inspect
+import itertools
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
@@ -280,22 +281,26 @@ def chosen_together(
     switches = machine.switches
     ways = [switches[i].way(machine, s, state) for i in places]
     slips = [x != 0 for x in ways]
+    if released is not None:  # what sticks has no slip but rounding
+        slips = [
+            x & (modes[i] != 0) & (i != released[0]) if switches[i].is_dry else x
+            for i, x in zip(places, slips, strict=True)
+        ]
+    sets = itertools.product((0.0, 1.0, -1.0), repeat=len(places))
+    ordered = jnp.asarray(sorted(sets, key=lambda x: sum(map(abs, x))), jnp.result_type(s))
 
     def tried(x: tuple[Any, ...]) -> tuple[Any, ...]:
         _, number, _ = x
-        new, left = list(modes), number
-        for i, way, slip in zip(places, ways, slips, strict=True):
-            digit = left - 3 * jnp.floor(left / 3)
-            left = jnp.floor(left / 3)
-            chosen = jnp.where(digit == 0, 0.0, jnp.where(digit == 1, 1.0, -1.0))
-            new[i] = jnp.where(slip, way, chosen)
+        new, chosen = list(modes), ordered[number]
+        for k, (i, way, slip) in enumerate(zip(places, ways, slips, strict=True)):
+            new[i] = jnp.where(slip, way, chosen[k])
         good = _consistent(machine, s, state, tuple(new), contact, places, slips, released)
         return tuple(new), number + 1, jnp.where(good, 1.0, 0.0)
 
     zero = jnp.zeros_like(s)
-    begin = tuple(modes), zero, zero
+    begin = tuple(modes), jnp.zeros((), int), zero
     found, _, good = jax.lax.while_loop(
-        lambda x: (x[2] == 0) & (x[1] < 3.0 ** len(places)), tried, stop_gradient(begin)
+        lambda x: (x[2] == 0) & (x[1] < len(ordered)), tried, stop_gradient(begin)
     )
     return tuple(jnp.where(good > 0, new, old) for new, old in zip(found, modes, strict=True))
 
