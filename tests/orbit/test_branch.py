@@ -249,7 +249,7 @@ def test_a_branch_in_files(short, tmp_path):
             assert file.load().identical(data)
     table = short.to_xarray(along="point").to_dataframe()
     table.to_csv(tmp_path / "branch.csv")
-    again = pd.read_csv(tmp_path / "branch.csv", index_col="point")
+    again = pd.read_csv(tmp_path / "branch.csv", index_col="point", float_precision="round_trip")
     pd.testing.assert_frame_equal(table, again, check_dtype=False, check_exact=True)
 
 
