@@ -53,8 +53,8 @@ class Turn(Counter):
         if speed is None or (known is not None and not known.all()):
             raise ValueError(
                 f"Argument `usual` must be given to `turn_of({self.name!r})` of a "
-                f"{type(machine).__name__}, about how long a turn takes: its own start does not "
-                "turn."
+                f"{type(machine).__name__}, about how long a turn takes, or a `start` that turns "
+                "must be defined: its own does not."
             )
         return 2 * pi / jnp.abs(speed)
 
