@@ -6,8 +6,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import equinox as eqx
+import jax.numpy as jnp
 import pytest
+import vi_jax as vi
 from vi_jax import _checks
+from vi_jax._messages import warn, warning_once
 
 
 def test_calls_that_cannot_be_run_are_refused_with_a_reason():
@@ -41,3 +45,22 @@ def test_no_more_than_the_memory_is_asked_for():
     _checks.fits_memory("cycles", 1e6)
     with pytest.raises(ValueError, match=r"`cycles` must ask for results that fit into the memory"):
         _checks.fits_memory("cycles", 1e18)
+
+
+def test_all_numbers_of_an_array_must_be_in_range():
+    stop = vi.RigidStop(1.0, 0.5)
+    for numbers, good in ([0.5, 1.0], True), ([0.5, 1.5], False):
+        put = eqx.tree_at(lambda x: x.restitution, stop, jnp.asarray(numbers))
+        assert bool(_checks.in_range(put)) == good
+
+
+def test_a_warning_is_given_once_in_a_call():
+    @warning_once
+    def call():
+        for words in ("one", "one", "other"):
+            warn(words)
+
+    with pytest.warns(UserWarning) as caught:
+        call()
+        call()
+    assert [str(x.message) for x in caught] == ["one", "other"] * 2
