@@ -241,6 +241,13 @@ def test_a_run_in_parts_is_the_same_run(monkeypatch):
     assert bool(parts.successful) and int(parts.steps) >= int(whole.steps)
 
 
+def test_a_run_in_parts_ends_with_the_part_that_fails(monkeypatch):
+    short(monkeypatch)
+    scene = vi.Parameters(control=-1.0).scene()  # its motor stalls
+    found = verbs.run_in_parts(scene, scene.start(W=0.1), 40)
+    assert not bool(found.successful) and found.impacts.size == 10
+
+
 @pytest.mark.parametrize("pressed, kept", [(1, None), (3, 81)])
 def test_ctrl_c_keeps_the_recorded_cycles_of_a_run(run, monkeypatch, capsys, pressed, kept):
     """Pressed while it settles and records its first part, or later; then again and again."""
