@@ -21,8 +21,7 @@ class Moments:
     **Arguments:** what judges starts, which knows the motion; a section state of it; the number of
     the cycle that begins there.
 
-    **Raises:** `ValueError` for a motion without sections, and where a state between two sections
-    cannot be asked for.
+    **Raises:** `ValueError` for a motion without sections.
     """
 
     def __init__(self, settling: Settling, start: Row, cycle: int):
@@ -33,13 +32,6 @@ class Moments:
         self.rows = np.roll(settling.motion, cycle - first, axis=0)
         lengths = [float(jnp.asarray(machine.cycle))] * len(self.rows)
         if self.autonomous:
-            try:
-                machine.observed_every(1.0)
-            except ValueError as error:
-                raise ValueError(
-                    "Argument `phase` must be 0 for a machine without a drive that cannot be "
-                    f"observed at equal intervals, but is not: {error}"
-                ) from None
             run = simulate(machine, settling.state(self.rows[0]), len(self.rows))
             lengths = [float(x) for x in np.asarray(run.duration)]
         self.lengths = np.array(lengths)
