@@ -75,7 +75,7 @@ class Arrival(NamedTuple):
         return self._replace(tally=self.tally._replace(**tally))
 
 
-def ended(arrival: Arrival, where: Flag, when: Flag | None, reason: float) -> Arrival:
+def ended(arrival: Arrival, where: Flag, when: Flag | None, reason: int | float) -> Arrival:
     """The arrival, with a reason for its lane to end there.
 
     **Arguments:** `where`, whether the event was met; `when`, whether it ends the lane, `None` if

@@ -10,7 +10,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array
 
 from .._types import State
-from ..machine import AbstractMachine, begin_modes, components, is_own, leaf_names
+from ..machine import AbstractMachine, begin_modes, components, is_own, leaf_names, shown_modes
 from ._own import in_words_of
 
 # What results have by these names already: columns of runs, orbits, branches and scans, and axes.
@@ -42,7 +42,7 @@ def average_names(machine: AbstractMachine, start: State) -> tuple[str, ...]:
     if not has_averages(machine):
         return ()
     zero = jnp.zeros((), jnp.result_type(machine.position(start)))
-    modes = begin_modes(machine, zero, start)
+    modes = shown_modes(machine, begin_modes(machine, zero, start))
     names = _names(machine, "averages", machine.averages, start, (zero, start, *modes))
     both = sorted(set(names) & set(quantity_names(machine, start)))
     if both:

@@ -14,7 +14,15 @@ from jax.lax import stop_gradient
 
 from .._types import Flag, Scalar, Scalars, State
 from ..lanes import called
-from ..machine import AbstractMachine, Coordinate, field_in, held_flow, holds_anywhere, rubs
+from ..machine import (
+    AbstractMachine,
+    Coordinate,
+    field_in,
+    held_flow,
+    holds_anywhere,
+    rubs,
+    shown_modes,
+)
 
 
 class SmoothMachine(eqx.Module):
@@ -53,7 +61,7 @@ class SmoothMachine(eqx.Module):
 
     def averages(self, s: Scalar, state: State) -> dict[str, Any]:
         """What is averaged over time, in these modes."""
-        return self.machine.averages(s, state, *self.modes)
+        return self.machine.averages(s, state, *shown_modes(self.machine, self.modes))
 
 
 @partial(eqx.filter_jit, inline=True)  # pyright: ignore
