@@ -30,15 +30,18 @@ def test_calls_that_cannot_be_run_are_refused_with_a_reason():
 
 
 def test_annotations_hold_for_one_machine_through_every_verb():
-    """In a process of its own, as annotations are checked where a module is imported."""
+    """And for contacts that act by themselves; in a process of its own, as annotations are checked
+    where a module is imported."""
     root = Path(__file__).parents[1]
-    options = ["--annotations", "-n", "0", "-q", "-p", "no:cacheprovider", "-m", "", "-k", "[pair]"]
+    options = ["--annotations", "-n", "0", "-q", "-p", "no:cacheprovider", "-m", ""]
+    options += ["-k", "[pair] or two_frictions or floor_that"]
+    files = ["tests/machines/test_verbs.py", "tests/machine/test_contacts.py"]
     process = subprocess.run(
-        [sys.executable, "-m", "pytest", *options, "tests/machines/test_verbs.py"],
+        [sys.executable, "-m", "pytest", *options, *files],
         capture_output=True, text=True, cwd=root, env={**os.environ, "PYTHONPATH": str(root)},
     )  # fmt: skip
     assert process.returncode == 0, process.stdout[-5000:]
-    assert "10 passed" in process.stdout
+    assert "12 passed" in process.stdout
 
 
 def test_no_more_than_the_memory_is_asked_for():

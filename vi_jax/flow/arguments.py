@@ -63,6 +63,7 @@ def planned(
         machine = machine.in_clock(options.clock)
     require_session("machine", machine)
     own, start = modes_of(start), machine.adopt(bare(start))
+    start = jtu.tree_map(strongly_typed, start)
     check_leaves("start", start)
     require_session("start", start)
     method.check(machine)

@@ -147,7 +147,7 @@ class Held(NamedTuple):
     much of its own push goes with one of the stop's."""
     first: int
     """The row of the first friction."""
-    dry: list[tuple[int, Any, Scalar]]
+    dry: list[tuple[int, Any, Any]]
     """Of each other friction its place among the switches, itself, and the mass that it acts on."""
 
 
@@ -204,7 +204,7 @@ def with_dry_friction(
 def held_flow(
     machine: Machine, flow: State, s: Scalar, state: State, modes: Sequence[Scalar],
     contact: Sequence[Scalar],
-) -> tuple[State, dict[int, tuple[Scalar, Scalar]]]:  # fmt: skip
+) -> tuple[State, dict[int, tuple[Any, Any]]]:  # fmt: skip
     """The rate at which a state changes along `flow` while those coordinates that rest keep their
     velocities, all at once: contacts that share a body are held by forces that depend on each
     other, and on the friction there.

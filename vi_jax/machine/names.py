@@ -25,7 +25,7 @@ def coordinate_by_name(on: Any, mass: Any) -> Coordinate:
 _INDEXED = re.compile(r"(.*)\[([\d, ]+)\]$")
 
 
-def component(name: str, state: State) -> Scalar:
+def component(name: str, state: State) -> Any:
     """The number of a state by its name: `"x"`, `"v.x"`, `"x[3]"`."""
     indexed = _INDEXED.match(name)
     if indexed:
