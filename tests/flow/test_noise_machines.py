@@ -35,7 +35,7 @@ def averaged(machine, name, impulses, cycles=100, lanes=512):
 class Rubbed(Rubbing):
     """v' = -μ sgn v + σ dW: the work of friction is what the noise brings, μ E|v| = σ²/2."""
 
-    def averages(self, s, x, mode):
+    def averages(self, s, x):
         return {"speed": jnp.abs(x.V)}
 
 
