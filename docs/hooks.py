@@ -29,31 +29,21 @@ BESIDE = re.compile(r"\]\(((?:\.\./)+)(experiments/|CHANGELOG\.md)")
 
 def on_files(files: Any, config: Any) -> Any:
     """Add the studies, the examples, their pictures and the changelog."""
-    outside = [
-        p
-        for p in (ROOT / "experiments").rglob("*")
-        if p.suffix in KINDS and p.is_file()
-    ]
+    outside = [p for p in (ROOT / "experiments").rglob("*") if p.suffix in KINDS and p.is_file()]
     for path in [*outside, ROOT / "CHANGELOG.md"]:
         name = path.relative_to(ROOT).as_posix()
         files.append(File.generated(config, name, abs_src_path=str(path)))
     return files
 
 
-def on_page_markdown(
-    markdown: str, page: Any, config: Any, files: Any
-) -> str:
+def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
     """Links that leave `docs/` go to the copies."""
     if page.file.src_uri.startswith("experiments/"):
         return markdown
-    return BESIDE.sub(
-        lambda m: f"]({m[1].removeprefix('../')}{m[2]}", markdown
-    )
+    return BESIDE.sub(lambda m: f"]({m[1].removeprefix('../')}{m[2]}", markdown)
 
 
-def on_page_content(
-    content: str, page: Any, config: Any, files: Any
-) -> str:
+def on_page_content(content: str, page: Any, config: Any, files: Any) -> str:
     """Formulas, as `pymdownx.arithmatex` marks them, are set."""
     if convert is None:
         if FORMULA.search(content):
