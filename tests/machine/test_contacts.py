@@ -205,6 +205,22 @@ def test_names_that_are_wrong_are_named(field, message):
         vi.simulate(Wrong(), vi.State(x=0.0, u=0.0), 1)
 
 
+@pytest.mark.parametrize(
+    ("contacts", "message"),
+    [
+        (vi.RigidStop(0.5, 0.8), r"no component 'Y'; it has x, u. Contacts name position and"),
+        (vi.RigidStop(0.5, 0.8, on=("x", "v")), "no component 'v'; it has x, u"),
+        (vi.RigidStop(0.5, 0.8, on="x"), "must be the names of position and velocity"),
+        (vi.DryFriction(0.5, on="w"), "no component 'w'; it has x, u"),
+        (lambda: vi.RigidStop(0.5, 0.8), "Write `@property` above its `def`"),
+    ],
+)
+def test_contacts_that_are_wrong_are_told(contacts, message):
+    machine = type("Wrong", (Oscillator,), {"contacts": contacts})()
+    with pytest.raises((TypeError, ValueError), match=message):
+        vi.simulate(machine, machine.start(), 1)
+
+
 def test_a_state_is_a_pytree_of_names():
     state = vi.State(x=1.0, v=vi.State(x=2.0))
     assert jax.tree.map(lambda x: 2 * x, state) == vi.State(x=2.0, v=vi.State(x=4.0))

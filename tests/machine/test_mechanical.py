@@ -251,6 +251,23 @@ def test_wrong_masses_and_names_are_told():
     with pytest.raises(ValueError, match="'up' is not one of the coordinates left, right"):
         Pair().at(up=1.0)
 
+    class Nameless(Pair):
+        def force(self, t, q, v):
+            return q.left
+
+    with pytest.raises(TypeError, match=r"must return forces by name, `dict\(left=..., right="):
+        vi.simulate(Nameless(), Nameless().at(), 1)
+
+    class Massless(vi.Mechanical):
+        q = ("left",)
+        cycle = 1.0
+
+        def force(self, t, q, v):
+            return {"left": 0.0}
+
+    with pytest.raises(TypeError, match="A Massless must have `mass`: one for each"):
+        vi.simulate(Massless(), Massless().at(), 1)
+
     class Named(Pair):
         contacts = vi.RigidStop(0.0, 0.5, on="up")
 

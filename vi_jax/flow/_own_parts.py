@@ -19,6 +19,7 @@ from ..machine import (
     LinearMachine,
     Reset,
     RigidStop,
+    SoftStop,
     event_of,
     events_of,
     listed,
@@ -43,7 +44,11 @@ def check_parts(machine: AbstractMachine) -> None:
     for what, (kind, words) in _KINDS.items():
         parts = listed(getattr(machine, what))
         if not isinstance(parts, tuple) or not all(isinstance(part, kind) for part in parts):
-            raise TypeError(f"`{what}` of a {name} must be a tuple of {words}, but is {parts!r}.")
+            hint = " Write `@property` above its `def`." if callable(parts) else ""
+            raise TypeError(
+                f"`{what}` of a {name} must be a tuple of {words}, but is {parts!r}.{hint}"
+            )
+    _check_names(machine)
     if callable(machine.cycle):
         raise TypeError(f"`cycle` of a {name} must be a number, or a property that gives one.")
     if jnp.shape(machine.cycle):
@@ -75,6 +80,23 @@ def check_parts(machine: AbstractMachine) -> None:
                 "`coordinates`, and stops its number in `coordinate`."
             )
     _check_frictions(machine)
+
+
+def _check_names(machine: AbstractMachine) -> None:
+    """**Raises:** `ValueError` for a stop that names no velocity."""
+    if type(machine).coordinate_on is not AbstractMachine.coordinate_on:
+        return
+    for stop in listed(machine.contacts):
+        on = getattr(stop, "on", None)
+        if isinstance(stop, RigidStop | SoftStop) and on is not None and not _is_pair(on):
+            raise ValueError(
+                f"Argument `on` of a stop of a {type(machine).__name__} must be the names of "
+                f'position and velocity, `on=("x", "u")`, but got {on!r}.'
+            )
+
+
+def _is_pair(on: Any) -> bool:
+    return isinstance(on, tuple) and len(on) == 2 and all(isinstance(x, str) for x in on)
 
 
 def _check_frictions(machine: AbstractMachine) -> None:

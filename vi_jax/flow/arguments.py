@@ -251,12 +251,11 @@ def shape_of(argument: str, machine: AbstractMachine, state: State) -> tuple[int
     check_reals(argument, state)
     try:
         shape = jnp.shape(machine.position(state)) or jnp.shape(machine.velocity(state))
-    except (AttributeError, TypeError, LookupError):
+    except (AttributeError, TypeError, LookupError) as error:
         raise TypeError(
-            f"Argument `{argument}` must be a state of this machine, but got {state!r}; one with "
-            "`Y` and `V` is `vi_jax.OscillatorState(Y, V)`. Of a state without them a machine of "
-            "your own with stops says by `position`, `velocity` and `placed`, or by `coordinates`, "
-            "what they limit."
+            f"Argument `{argument}` must be a state of this machine, but got {state!r}: {error} "
+            'Contacts name position and velocity by `on=("x", "u")`, and act on `Y` and `V` if '
+            "they name none; `position` and `velocity` of a machine pick other numbers."
         ) from None
     if not shape and not machine.has_velocity(state):
         _check_flow(argument, machine, state)

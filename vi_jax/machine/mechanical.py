@@ -68,13 +68,22 @@ class Mechanical(AbstractMachine):
     @property
     def q_names(self) -> tuple[str, ...]:
         """The names of the coordinates."""
+        if not hasattr(self, "q"):
+            raise TypeError(
+                f'A {type(self).__name__} must have `q`: write `q = ("x", "y")` in the class, the '
+                "names of its coordinates."
+            )
         return (self.q,) if isinstance(self.q, str) else tuple(self.q)
 
     def field(self, t: Scalar, state: State, *modes: Scalar) -> Any:
         """d(state)/dt between contacts."""
         q, v = self.places(state), state.v
         whose = f"`force` of a {type(self).__name__}"
-        applied = vars(like(v, self.force(t, q, v, *modes), whose))
+        applied = like(v, self.force(t, q, v, *modes), whose)
+        if not isinstance(applied, Named):
+            names = ", ".join(f"{name}=..." for name in self.q_names)
+            raise TypeError(f"{whose} must return forces by name, `dict({names})`.")
+        applied = vars(applied)
         left = [f - h for f, h in zip(applied.values(), self._inertial(q, v), strict=True)]
         rates = solved(self.masses(q), left)
         return Named(**vars(v), v=Named(**dict(zip(self.q_names, rates, strict=True))))
@@ -85,7 +94,12 @@ class Mechanical(AbstractMachine):
 
     def masses(self, q: Named) -> Matrix:
         """The mass matrix."""
-        given = self.mass
+        given = getattr(self, "mass", None)
+        if given is None:
+            raise TypeError(
+                f"A {type(self).__name__} must have `mass`: one for each of its coordinates, in "
+                "the class or by a method `mass(self, q)`."
+            )
         return matrix_of(given(q) if callable(given) else given, self.q_names, type(self).__name__)
 
     def _inertial(self, q: Named, v: Named) -> list[Any]:
@@ -93,7 +107,7 @@ class Mechanical(AbstractMachine):
         names, speeds = self.q_names, list(vars(v).values())
         n = len(names)
         h: list[Any] = [0.0] * n
-        if not callable(self.mass):
+        if not callable(getattr(self, "mass", None)):
             return h
         turns = moving(self.masses, q)
         for k, name in enumerate(names):
