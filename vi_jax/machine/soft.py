@@ -60,8 +60,8 @@ class SoftStop(Wall, AbstractSwitch):
     - `adhesive`: whether the dashpot may pull at the end of its stroke; `False` lets the body go
       where the force falls to zero. Static.
     - `side`: `"right"` or `"left"`.
-    - `on`: the coordinate that it limits, as of a `RigidStop`. In a `Mechanical` the stiffness is
-      a force by length, and the machine knows the mass.
+    - `on`: the coordinate that it limits, as of a `RigidStop`. In a `Mechanical` the mass is that
+      on which the coordinate's contacts act: divide a stiffness in N/m by it.
 
     **Raises:** `ValueError` naming the argument that is out of range.
     """
