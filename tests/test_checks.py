@@ -30,8 +30,8 @@ def test_calls_that_cannot_be_run_are_refused_with_a_reason():
 
 
 def test_annotations_hold_for_one_machine_through_every_verb():
-    """And for contacts that act by themselves; in a process of its own, as annotations are checked
-    where a module is imported."""
+    """The same holds for machines whose contacts act by themselves. Annotations are checked where
+    a module is imported, so this takes another process."""
     root = Path(__file__).parents[1]
     options = ["--annotations", "-n", "0", "-q", "-p", "no:cacheprovider", "-m", ""]
     options += ["-k", "[pair] or two_frictions or floor_that"]

@@ -23,7 +23,7 @@ def launched(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
     bad = ~jnp.isfinite(total((start, machine.cycle), plan.settle)) | ~jnp.asarray(wanted)
     bad = bad | ~machine.in_range(start)
     for number in jtu.tree_leaves(eqx.filter(machine, eqx.is_inexact_array)):
-        bad = bad | jnp.any(jnp.isnan(number))  # it may be infinite, as a limit that is none
+        bad = bad | jnp.any(jnp.isnan(number))  # infinite is allowed: no limit
     slack = rounding(machine, start)
     for stop in machine.stops:
         bad = bad | (stop.beyond(machine.coordinates[stop.coordinate].position(start)) > slack)

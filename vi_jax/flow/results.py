@@ -124,7 +124,7 @@ REASONS = tuple(getattr(RESULTS, name) for name in REASON_NAMES)
 ) = range(len(REASONS))
 
 
-# Outcomes of a machine's events are told apart by what is added to their common reason.
+# The number of an outcome is a fraction that is added to the common reason `ENDED`.
 _OUTCOMES = 64
 
 

@@ -2,7 +2,6 @@
 
 from .base import AbstractMachine as AbstractMachine
 from .base import Prepared as Prepared
-from .base import has_own_modes as has_own_modes
 from .base import names_coordinates as names_coordinates
 from .base import renews as renews
 from .contact_friction import ContactFriction as ContactFriction

@@ -304,7 +304,7 @@ class AbstractMachine(Clocked, Observed, Worded):
 
 
 def names_coordinates(machine: AbstractMachine) -> bool:
-    """Whether a machine has coordinates of its own, or contacts that name some."""
+    """Whether a machine defines coordinates, itself or by the names in its contacts."""
     if says(machine, "coordinates"):
         return True
     walls = (x for x in listed(machine.contacts) if isinstance(x, Wall))
@@ -314,11 +314,6 @@ def names_coordinates(machine: AbstractMachine) -> bool:
 def has_section(machine: AbstractMachine) -> bool:
     """Whether a machine has a section, a function of its state that ends its cycles."""
     return is_own(type(machine).section) or isinstance(counter_of(machine), Passing)
-
-
-def has_own_modes(machine: AbstractMachine) -> bool:
-    """Whether a machine has modes of its own."""
-    return bool(declared_modes(machine)) or is_own(type(machine).begin)
 
 
 def renews(machine: AbstractMachine) -> bool:

@@ -5,13 +5,11 @@ from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-import jax.tree_util as jtu
-from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
 from .._checks import NOT_NEGATIVE, SHARE, count, real, require_ranges
 from .._types import Flag, Machine, Scalar, State
-from .contacts import added, forces, gained, held_flow, push_of, shares
+from .contacts import added, forces, gained, held_flow, push_of, shares, way_of
 from .event import AbstractSwitch, Around
 from .field import field_in
 
@@ -70,7 +68,7 @@ class ContactFriction(AbstractSwitch):
 
     def begin(self, machine, s, state):
         """The mode of a motion that begins: the sign of the velocity along the stop."""
-        return self._slip(machine, state)
+        return self.way(machine, s, state)
 
     def struck(self, machine, s, state, mode, *, around: Around | None = None):
         """The mode after an impact or another jump: the way that the body slips, or would begin to.
@@ -78,7 +76,7 @@ class ContactFriction(AbstractSwitch):
         **Arguments:** as every event's, and `around`, what else acts; `None` if that is not known
         yet.
         """
-        slips = self._slip(machine, state)
+        slips = self.way(machine, s, state)
         return jnp.where(slips == 0, self._from_rest(machine, s, state, around), slips)
 
     def guard(self, machine, s, state, mode, *, around: Around | None = None):
@@ -126,7 +124,7 @@ class ContactFriction(AbstractSwitch):
 
     def way(self, machine: Machine, s: Scalar, state: State) -> Scalar:
         """The sign of the velocity along the stop; zero where that is rounding."""
-        return self._slip(machine, state)
+        return way_of(machine.coordinates[self.along].velocity(state), state, roundings=16)
 
     def slip_rate(self, machine: Machine, s: Scalar, state: State, flow: State) -> Scalar:
         """d/ds of the velocity along the stop, along a flow."""
@@ -143,16 +141,9 @@ class ContactFriction(AbstractSwitch):
         mass = machine.coordinates[self.along].mass_at(s, state)
         return force, self.level * pressing, mass, here
 
-    def pushed(self, machine, s, state, mode, flow):
-        """The flow as it is: the force is found with that which presses on the stop."""
-        return flow
-
-    def _slip(self, machine: Machine, state: State) -> Scalar:
-        """The sign of the velocity along the stop; zero where that is rounding."""
-        velocity = machine.coordinates[self.along].velocity(state)
-        size = sum((jnp.sum(jnp.abs(x)) for x in jtu.tree_leaves(state)), start=jnp.asarray(0.0))
-        least = stop_gradient(16 * jnp.finfo(velocity.dtype).eps * size)
-        return jnp.where(jnp.abs(velocity) <= least, 0.0, jnp.sign(velocity))
+    def push_in(self, machine, s, state, mode):
+        """`None`: the force is found with that which presses on the stop (`held_flow`)."""
+        return None
 
     def _from_rest(
         self, machine: Machine, s: Scalar, state: State, around: Around | None,

@@ -80,6 +80,13 @@ def added(state: State, amounts: Sequence[Scalar], changes: Sequence[State]) -> 
     return state
 
 
+def way_of(slip: Scalar, state: State, *, roundings: int) -> Scalar:
+    """The sign of a velocity; zero where it is no more than so many roundings of the state."""
+    size = sum((jnp.sum(jnp.abs(x)) for x in jtu.tree_leaves(state)), start=jnp.asarray(0.0))
+    least = stop_gradient(roundings * jnp.finfo(slip.dtype).eps * size)
+    return jnp.where(jnp.abs(slip) <= least, 0.0, jnp.sign(slip))
+
+
 class Rubbed(NamedTuple):
     """The state behind an impact with friction, and the impulses of it."""
 
@@ -143,8 +150,8 @@ class Held(NamedTuple):
     acts: list[Flag]
     """Whether it holds; a friction holds while the body sticks."""
     rubbing: list[tuple[int, Any, int, Scalar]]
-    """Of each friction on a stop its place among the switches, itself, the row of its stop, and how
-    much of its own push goes with one of the stop's."""
+    """For each friction on a stop: its place among the switches, the friction, the row of its stop,
+    and the share of the friction's push in the stop's."""
     first: int
     """The row of the first friction."""
     dry: list[tuple[int, Any, Any]]

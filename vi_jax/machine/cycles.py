@@ -1,7 +1,6 @@
 """What ends a cycle where time does not, a turn of an angle or a velocity that passes zero; and the
 same machine observed at equal intervals instead."""
 
-import copy
 import dataclasses
 import functools
 from math import pi
@@ -14,6 +13,7 @@ from .._checks import concrete
 from .._types import Scalar, State
 from .event import AbstractEvent
 from .names import component, has_component, with_component
+from .own import with_static
 from .reset import Reset
 
 
@@ -147,18 +147,21 @@ def counter_of(machine: Any) -> Counter | None:
 def at_intervals(machine: Any, interval: Any) -> Any:
     """The same machine with cycles of equal length, which no event ends."""
     kind = type(machine)
-    new = object.__new__(_observed_kind(kind))
-    for field in dataclasses.fields(kind):
-        object.__setattr__(new, field.name, getattr(machine, field.name))
-    object.__setattr__(new, "observed_usual", machine.cycle)
-    object.__setattr__(new, "observed_interval", interval)
-    if _has_cycle_field(kind):
-        object.__setattr__(new, "cycle", interval)
-    return new
+    observed = {"observed_usual": machine.cycle, "observed_interval": interval}
+    return _as_kind(_observed_kind(kind), kind, machine, interval, **observed)
 
 
-def _has_cycle_field(kind: type) -> bool:
-    return any(field.name == "cycle" for field in dataclasses.fields(kind))  # pyright: ignore
+def _as_kind(new_kind: type, kind: type, machine: Any, cycle: Any, **others: Any) -> Any:
+    """A machine of another class with the fields that `kind` has; `cycle` takes the place of a
+    field of that name."""
+    values = {name: getattr(machine, name) for name in _fields(kind)} | others
+    if "cycle" in values:
+        values["cycle"] = cycle
+    return with_static(object.__new__(new_kind), **values)
+
+
+def _fields(kind: Any) -> list[str]:
+    return [field.name for field in dataclasses.fields(kind)]
 
 
 @functools.lru_cache(maxsize=64)
@@ -166,12 +169,7 @@ def _observed_kind(kind: type) -> type:
     """The class of a machine observed at equal intervals."""
 
     def original(self: Any) -> Any:
-        old = object.__new__(kind)
-        for field in dataclasses.fields(kind):  # pyright: ignore[reportArgumentType]
-            object.__setattr__(old, field.name, getattr(self, field.name))
-        if _has_cycle_field(kind):
-            object.__setattr__(old, "cycle", self.observed_usual)
-        return old
+        return _as_kind(kind, kind, self, self.observed_usual)
 
     def step_limit(self: Any, s: Scalar, state: State) -> Any:
         return jnp.minimum(original(self).step_limit(s, state), self.observed_interval / 5)
@@ -192,15 +190,11 @@ def _observed_kind(kind: type) -> type:
         "section": section,
         **{name: parts(name) for name in ("stops", "switches", "others")},
     }
-    if not _has_cycle_field(kind):
+    if "cycle" not in _fields(kind):
         body["cycle"] = property(lambda self: self.observed_interval)
     return type(kind)(kind.__name__, (kind,), body)
 
 
 def _goes_on(event: AbstractEvent) -> AbstractEvent:
     """The same event, with which no cycle ends."""
-    if not event.ends_cycle:
-        return event
-    new = copy.copy(event)
-    object.__setattr__(new, "ends_cycle", False)
-    return new
+    return with_static(event, ends_cycle=False) if event.ends_cycle else event

@@ -56,6 +56,11 @@ class AbstractEvent(Shown):
         return False
 
     @property
+    def is_dry(self) -> bool:
+        """Whether it is friction that may hold a body anywhere."""
+        return False
+
+    @property
     def sees_around(self) -> bool:
         """Whether `guard`, `after` and `struck` of an event that holds a mode get a keyword
         argument `around` as well, an `Around`."""
@@ -144,11 +149,6 @@ class AbstractSwitch(AbstractEvent):
         return True
 
     @property
-    def is_dry(self) -> bool:
-        """Whether it is friction that may hold a body anywhere."""
-        return False
-
-    @property
     def from_below(self) -> bool:
         """False: behind the event the guard is that of another mode."""
         return False
@@ -194,8 +194,11 @@ class AbstractSwitch(AbstractEvent):
         surface where they meet (see `Switch`)."""
         return False
 
-    def pushed(self, machine: Machine, s: Scalar, state: State, mode: Scalar, flow: State) -> State:
-        """The machine's flow with what the switch adds to it, of one that `acts`."""
+    def push_in(
+        self, machine: Machine, s: Scalar, state: State, mode: Scalar
+    ) -> tuple[Any, State] | None:
+        """The push of a switch that `acts`, and how much of it there is, by time; `None` for a
+        force that is found with others."""
         raise NotImplementedError(f"A {type(self).__name__} adds nothing by itself.")
 
     def contribution(self, machine: Machine, s: Scalar, state: State, mode: Scalar) -> Any:

@@ -92,7 +92,7 @@ def after_event(
     new, changed = event.after(machine, s, state, *modes[own], **more)
     if event.holds_mode:
         changed = (*modes[: own.start], changed, *modes[own.stop :])
-        if getattr(event, "is_dry", False) and len(frictions_in(machine)) > 1:
+        if event.is_dry and len(frictions_in(machine)) > 1:
             changed, held = settled_modes(changed, s), modes[own.start] == 0
             changed = chosen_together(machine, s, new, changed, contact, (own.start, held))
     return _rubbed(machine, number, s, state, new), settled_modes(changed, s)

@@ -7,41 +7,28 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 
 from .._types import Machine, Scalar, Scalars, State
+from .contacts import added
 from .state import like
 
 
-def events_of_modes(machine: Machine) -> list[Any]:
-    """The events that hold a mode, in the order of the modes."""
-    return [x for x in (*machine.stops, *machine.switches, *machine.others) if x.holds_mode]
-
-
 def shown_modes(machine: Machine, modes: Scalars) -> Scalars:
-    """Those of a machine's modes that its own functions get: all but those of contacts that act by
-    themselves."""
-    if not any(x.acts for x in machine.switches):
-        return tuple(modes)
-    hides = [getattr(x, "acts", False) for x in events_of_modes(machine)]
-    hides += [False] * (len(modes) - len(hides))
-    return tuple(mode for mode, hide in zip(modes, hides, strict=True) if not hide)
-
-
-def all_modes(machine: Machine, shown: Any, modes: Scalars) -> Scalars:
-    """The machine's modes with others in the place of those that its own functions get."""
-    hides = [getattr(x, "acts", False) for x in events_of_modes(machine)]
-    left = iter(shown)
-    hides += [False] * (len(modes) - len(hides))
-    return tuple(m if hide else next(left) for m, hide in zip(modes, hides, strict=True))
+    """The modes that a machine's own functions get: all but those of contacts that act by
+    themselves. The modes of switches come first, in their order."""
+    hidden = {i for i, x in enumerate(machine.switches) if x.acts}
+    return tuple(mode for i, mode in enumerate(modes) if i not in hidden)
 
 
 def acting(machine: Machine, s: Scalar, state: State, modes: Scalars) -> State:
-    """What the machine's field says in these modes, and the forces of soft stops and of friction
-    against which something slides."""
+    """The machine's field in these modes, with the forces of soft stops and of friction on bodies
+    that slide."""
     flow = machine.field(s, state, *shown_modes(machine, modes))
     flow = like(state, flow, f"`field` of a {type(machine).__name__}")
-    held = events_of_modes(machine)
-    for switch, mode in zip(held, modes, strict=False):
-        if getattr(switch, "acts", False):
-            flow = switch.pushed(machine, s, state, mode, flow)
+    pace = machine.pace(s, state)
+    for switch, mode in zip(machine.switches, modes, strict=False):
+        pushed = switch.push_in(machine, s, state, mode) if switch.acts else None
+        if pushed is not None:
+            amount, push = pushed
+            flow = added(flow, (amount if pace is None else amount * pace,), (push,))
     return flow
 
 

@@ -22,7 +22,7 @@ from .._checks import (
     require_ranges,
 )
 from .._types import Flag, Machine, Scalar, Scalars, State
-from .contacts import added, gained, held_flow, push_of
+from .contacts import added, gained, held_flow, push_of, way_of
 from .event import AbstractSwitch, Around
 from .field import field_in
 from .state import with_components
@@ -136,7 +136,7 @@ class DryFriction(AbstractSwitch):
         return force, self.sticking(machine, s, state), mass, jnp.ones((), bool)
 
     def slip_rate(self, machine: Machine, s: Scalar, state: State, flow: State) -> Scalar:
-        """d(slip)/ds along a flow."""
+        """The rate by s at which the slip changes along a flow."""
         along = (s, state), (jnp.ones_like(s), flow)
         return jax.jvp(lambda s, x: self.speed_of_slip(machine, s, x), *along)[1]
 
@@ -152,12 +152,10 @@ class DryFriction(AbstractSwitch):
         """The largest force that friction can balance on a body at rest."""
         return self.sliding(machine, s, state, jnp.zeros_like(s)) * self.static_ratio
 
-    def pushed(self, machine, s, state, mode, flow):
-        """The flow with the force against which a body slides."""
+    def push_in(self, machine, s, state, mode):
+        """The change of the slip by the force on a body that slides, and its push."""
         push, mass = self.row(machine, s, state)
-        amount = -mode * self.sliding(machine, s, state, mode) / mass
-        pace = machine.pace(s, state)
-        return added(flow, (amount if pace is None else amount * pace,), (push,))
+        return -mode * self.sliding(machine, s, state, mode) / mass, push
 
     def begin(self, machine, s, state):
         """The mode of a motion that begins: the sign of the slip, sticking without any."""
@@ -165,10 +163,7 @@ class DryFriction(AbstractSwitch):
 
     def way(self, machine: Machine, s: Scalar, state: State) -> Scalar:
         """The sign of the slip; zero where that is rounding."""
-        slip = self.speed_of_slip(machine, s, state)
-        size = sum((jnp.sum(jnp.abs(x)) for x in jtu.tree_leaves(state)), start=jnp.asarray(0.0))
-        least = stop_gradient(4 * jnp.finfo(slip.dtype).eps * size)
-        return jnp.where(jnp.abs(slip) <= least, 0.0, jnp.sign(slip))
+        return way_of(self.speed_of_slip(machine, s, state), state, roundings=4)
 
     def struck(self, machine, s, state, mode, *, around: Around | None = None):
         """The mode after an impact or another jump: the way that the body slips, or would begin to.

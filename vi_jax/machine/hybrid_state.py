@@ -9,7 +9,7 @@ from jax.flatten_util import ravel_pytree
 
 from .._types import Machine, State, Vector
 from .events import mode_values, settled_modes
-from .own import declared_modes, is_own
+from .own import has_own_modes
 from .shown import Shown
 
 
@@ -64,9 +64,7 @@ def begun(machine: Machine, state: State, axes: int = 0) -> State:
 
     **Arguments:** `axes`, how many axes the state has in front.
     """
-    if isinstance(state, HybridState) or not (
-        declared_modes(machine) or is_own(type(machine).begin)
-    ):
+    if isinstance(state, HybridState) or not has_own_modes(machine):
         return state
 
     def begin(state: State) -> Any:

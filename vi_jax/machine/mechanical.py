@@ -76,7 +76,7 @@ class Mechanical(AbstractMachine):
         return (self.q,) if isinstance(self.q, str) else tuple(self.q)
 
     def field(self, t: Scalar, state: State, *modes: Scalar) -> Any:
-        """d(state)/dt between contacts."""
+        """The rate of the state: velocities, and accelerations by Lagrange's equations."""
         q, v = self.places(state), state.v
         whose = f"`force` of a {type(self).__name__}"
         applied = like(v, self.force(t, q, v, *modes), whose)
@@ -93,7 +93,7 @@ class Mechanical(AbstractMachine):
         return Named(**{name: getattr(state, name) for name in self.q_names})
 
     def masses(self, q: Named) -> Matrix:
-        """The mass matrix."""
+        """The mass matrix in these coordinates, as rows of numbers."""
         given = getattr(self, "mass", None)
         if given is None:
             raise TypeError(
@@ -113,8 +113,7 @@ class Mechanical(AbstractMachine):
         for k, name in enumerate(names):
             if not any(name in where for where in turns.values()):
                 continue
-            one = q.replace(**{x: jnp.full_like(q.__dict__[x], float(x == name)) for x in names})
-            slopes = jax.jvp(self.masses, (q,), (one,))[1]
+            slopes = _slope(self.masses, q, name)
             moves = [
                 sum(slopes[i][j] * speeds[j] for j in range(n) if name in turns.get((i, j), ()))
                 for i in range(n)
@@ -165,12 +164,13 @@ def _slopes(machine: Mechanical, on: Any, q: Named) -> list[Any]:
     if name is not None:
         return [float(x == name) for x in names]
     by = moving(on, q).get((), frozenset())
-    zero = {x: jnp.zeros_like(y) for x, y in vars(q).items()}
-    found = []
-    for name in names:
-        one = Named(**(zero | {name: jnp.ones_like(zero[name])}))
-        found.append(jax.jvp(on, (q,), (one,))[1] if name in by else 0.0)
-    return found
+    return [_slope(on, q, name) if name in by else 0.0 for name in names]
+
+
+def _slope(function: Callable[[Named], Any], q: Named, name: str) -> Any:
+    """The derivative of a function of the coordinates with respect to one of them."""
+    one = {x: jnp.full_like(y, float(x == name)) for x, y in vars(q).items()}
+    return jax.jvp(function, (q,), (Named(**one),))[1]
 
 
 def _push(machine: Mechanical, on: Any, q: Named) -> tuple[list[Any], Any]:
@@ -189,20 +189,14 @@ def _effective(machine: Mechanical, on: Any, s: Scalar, state: State) -> Any:
 def _placed(machine: Mechanical, on: Any, state: State, Y: Any, V: Any) -> Named:
     """A gap's place and velocity changed by as little as can be, in the measure of the masses; a
     coordinate by its name alone is put where it is to be."""
-    names, name = machine.q_names, _named(machine, on)
-    q = machine.places(state)
+    name, q = _named(machine, on), machine.places(state)
+    q = _moved(q, _push(machine, on, q)[0], Y - on(q)) if name is None else q.replace(**{name: Y})
     push, _ = _push(machine, on, q)
-    if name is not None:
-        q = q.replace(**{name: Y})
-    else:
-        q = _moved(q, push, Y - on(q))
-    if callable(machine.mass) or name is None:
-        push, _ = _push(machine, on, q)
     gained = V - _speed(machine, on, Named(**vars(q), v=state.v))
     v = _moved(state.v, push, gained)
     if name is not None:
         v = v.replace(**{name: V})
-    return Named(**{x: getattr(q, x) for x in names}, v=v)
+    return Named(**vars(q), v=v)
 
 
 def _moved(x: Named, push: list[Any], amount: Any) -> Named:

@@ -1,13 +1,13 @@
 """Numbers of a state by their names, and the coordinates that these are."""
 
 import functools
-import re
 from typing import Any
 
 import equinox as eqx
 
 from .._types import Scalar, State
 from .coordinate import Coordinate
+from .numbers import split_place
 
 
 def coordinate_by_name(on: Any, mass: Any) -> Coordinate:
@@ -22,16 +22,11 @@ def coordinate_by_name(on: Any, mass: Any) -> Coordinate:
     return Coordinate(*get, placed, 1.0 if mass is None else mass)
 
 
-_INDEXED = re.compile(r"(.*)\[([\d, ]+)\]$")
-
-
 def component(name: str, state: State) -> Any:
     """The number of a state by its name: `"x"`, `"v.x"`, `"x[3]"`."""
-    indexed = _INDEXED.match(name)
-    if indexed:
-        base, place = indexed.groups()
-        return component(base, state)[tuple(int(i) for i in place.split(","))]
-    return functools.reduce(getattr, name.split("."), state)
+    base, place = split_place(name)
+    found = functools.reduce(getattr, base.split("."), state)
+    return found[place] if place else found  # a leaf itself, so that a stop can set it exactly
 
 
 def has_component(name: str, state: State) -> bool:
@@ -45,12 +40,10 @@ def has_component(name: str, state: State) -> bool:
 
 def with_component(name: str, state: State, value: Any) -> State:
     """The state with another number under this name."""
-    indexed = _INDEXED.match(name)
-    if indexed:
-        base, place = indexed.groups()
-        whole = component(base, state).at[tuple(int(i) for i in place.split(","))].set(value)
-        return with_component(base, state, whole)
-    return eqx.tree_at(functools.partial(component, name), state, value)
+    base, place = split_place(name)
+    if place:
+        value = component(base, state).at[place].set(value)
+    return eqx.tree_at(functools.partial(component, base), state, value)
 
 
 def _placed(position: str, velocity: str, state: State, Y: Scalar, V: Scalar) -> State:

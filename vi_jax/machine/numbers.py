@@ -95,7 +95,12 @@ def with_leaf(tree: Any, name: str, value: Any) -> Any:
 def _place_in(tree: object, name: str) -> tuple[str, tuple[int, ...]]:
     """The array that a number's name begins with, and its place in it: none of the number itself or
     of a whole array."""
-    if name in by_name(tree):
+    return (name, ()) if name in by_name(tree) else split_place(name)
+
+
+def split_place(name: str) -> tuple[str, tuple[int, ...]]:
+    """An array's name and a place in it, of `"x[1, 2]"`; no place of a name without one."""
+    if not name.endswith("]"):
         return name, ()
     base, _, inner = name.removesuffix("]").rpartition("[")
     return base, tuple(int(i) for i in inner.split(","))

@@ -1,5 +1,6 @@
 """What a machine or one of its parts says itself, and what is said in its place."""
 
+import copy
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TypeVar
 
@@ -44,7 +45,22 @@ def says(part: object, name: str) -> bool:
     return hasattr(type(part), name) or name in vars(part)
 
 
+def with_static(part: Any, **values: Any) -> Any:
+    """A copy of a part with other values in fields that are not numbers. Its own `__init__` may
+    take other arguments."""
+    new = copy.copy(part)
+    for name, value in values.items():
+        object.__setattr__(new, name, value)
+    return new
+
+
 def declared_modes(machine: Any) -> Mapping[str, Any]:
-    """The modes of a machine's own, by name, in which a motion begins, as its class says them."""
+    """The discrete modes, by name, in which a motion begins, as the machine's class defines
+    them."""
     modes = machine.modes
     return modes if isinstance(modes, Mapping) else {}  # of a beam it is a number of modes
+
+
+def has_own_modes(machine: Any) -> bool:
+    """Whether a machine defines discrete modes, by `modes` or by `begin`."""
+    return bool(declared_modes(machine)) or is_own(type(machine).begin)

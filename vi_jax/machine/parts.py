@@ -5,7 +5,6 @@ one's own), each with the coordinate that it acts on. A step asks for the stops,
 for the other events, and for the coordinates that stops limit, by number.
 """
 
-import copy
 from typing import Any
 
 from .._types import Machine
@@ -13,6 +12,7 @@ from .contact_friction import ContactFriction
 from .coordinate import Coordinate
 from .cycles import Turn, counter_of
 from .event import AbstractEvent, AbstractSwitch
+from .own import with_static
 from .reset import Reset
 from .soft import SoftStop
 from .stop import RigidStop
@@ -39,10 +39,10 @@ def switches_in(machine: Machine) -> tuple[AbstractSwitch, ...]:
     for x in contacts:
         if isinstance(x, RigidStop):
             if x.friction is not None:
-                found.append(_acting(_friction_on(x, number, places)))
+                found.append(with_static(_friction_on(x, number, places), acts=True))
             number += 1
         elif isinstance(x, AbstractSwitch):
-            found.append(_acting(_at(x, places) if isinstance(x, SoftStop) else x))
+            found.append(with_static(_at(x, places) if isinstance(x, SoftStop) else x, acts=True))
     return *found, *(x for x in listed(machine.events) if isinstance(x, AbstractSwitch))
 
 
@@ -85,7 +85,7 @@ def _at(stop: Any, places: dict[Any, int]) -> Any:
     """A stop with the number of its coordinate."""
     if stop.on is None and stop.coordinate:
         return stop
-    return _with(stop, coordinate=places[stop.on])
+    return with_static(stop, coordinate=places[stop.on])
 
 
 def _friction_on(stop: RigidStop, number: int, places: dict[Any, int]) -> ContactFriction:
@@ -96,15 +96,3 @@ def _friction_on(stop: RigidStop, number: int, places: dict[Any, int]) -> Contac
         along=places[stop.along],
         restitution=0.0 if rebound is None else rebound,
     )
-
-
-def _acting(switch: Any) -> Any:
-    return _with(switch, acts=True)
-
-
-def _with(part: Any, **static: Any) -> Any:
-    """A part with other values in fields that are no numbers, whose own `__init__` takes others."""
-    new = copy.copy(part)
-    for name, value in static.items():
-        object.__setattr__(new, name, value)
-    return new

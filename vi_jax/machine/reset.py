@@ -1,6 +1,5 @@
 """Resets: where a state jumps by a rule of its own."""
 
-import copy
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -10,6 +9,7 @@ from .._checks import one_of
 from .event import AbstractEvent
 from .events import modes_after, struck_modes
 from .field import shown_modes
+from .own import with_static
 from .state import changed
 
 
@@ -83,12 +83,7 @@ class Reset(AbstractEvent):
         """The same event as one for each direction."""
         if self.direction != "both":
             return (self,)
-        both = []
-        for way in ("rising", "falling"):
-            one = copy.copy(self)
-            object.__setattr__(one, "direction", way)
-            both.append(one)
-        return tuple(both)
+        return tuple(with_static(self, direction=way) for way in ("rising", "falling"))
 
     def after(self, machine, s, state, *modes):
         """As `reset` and `modes` say."""

@@ -18,7 +18,7 @@ from .._checks import (
     require_ranges,
 )
 from .._types import Machine, Number, State
-from .contacts import added, push_of
+from .contacts import push_of
 from .event import AbstractSwitch
 from .law import AbstractContactLaw, HuntCrossley, PowerLaw
 from .stop import Wall
@@ -144,12 +144,10 @@ class SoftStop(Wall, AbstractSwitch):
         """The acceleration that the stop adds to the coordinate."""
         return jnp.where(mode > 0, -self.sign * self.force(*self.depth(machine, state)), 0.0)
 
-    def pushed(self, machine, s, state, mode, flow):
-        """The flow with the stop's force while the body touches."""
-        body, pace = machine.coordinates[self.coordinate], machine.pace(s, state)
-        amount = self.contribution(machine, s, state, mode)
-        amount = amount if pace is None else amount * pace
-        return added(flow, (amount,), (push_of(body, state),))
+    def push_in(self, machine, s, state, mode):
+        """The acceleration of the coordinate while the body touches, and its push."""
+        body = machine.coordinates[self.coordinate]
+        return self.contribution(machine, s, state, mode), push_of(body, state)
 
     def begin(self, machine, s, state):
         """The mode of a motion that begins: touching, unless the body is apart or has been let go

@@ -85,10 +85,10 @@ def like(state: Any, found: Any, whose: str) -> Any:
 
     **Raises:** `TypeError` that names a component which is missing, or which the state has not.
     """
-    if isinstance(found, Mapping | State) and type(found) is not type(state):
-        return with_components(state, given_in(found), whose, all_of_them=True)
     if isinstance(found, State):
         return with_components(state, vars(found), whose, all_of_them=True)
+    if isinstance(found, Mapping) and type(found) is not type(state):
+        return with_components(state, found, whose, all_of_them=True)
     if jtu.tree_structure(found) != jtu.tree_structure(state):
         return found
     return jtu.tree_map(_as_array, state, found)
@@ -102,11 +102,6 @@ def changed(state: Any, found: Any, whose: str) -> Any:
     if isinstance(found, Mapping):
         return with_components(state, found, whose, all_of_them=False)
     return like(state, found, whose)
-
-
-def given_in(found: Mapping | State) -> Mapping[str, Any]:
-    """The components of a dictionary or a state by their names."""
-    return found if isinstance(found, Mapping) else vars(found)
 
 
 def with_components(state: Any, given: Mapping[str, Any], whose: str, *, all_of_them: bool) -> Any:

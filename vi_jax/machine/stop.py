@@ -95,7 +95,7 @@ class RigidStop(Wall, AbstractEvent):
     side: str = eqx.field(static=True, default="right")
     """"right" or "left"."""
     on: Any = eqx.field(static=True, default=None, kw_only=True)
-    """What names the coordinate."""
+    """The names of position and velocity, or what a `Mechanical` takes for them."""
     mass: Any = eqx.field(default=None, kw_only=True, converter=optional_real("mass"))
     """What an impact acts on, for `Run.impact_energy`: 1 by default; a `Mechanical` knows it."""
     friction: Float[Array, "..."] | None = eqx.field(

@@ -164,8 +164,7 @@ class Woodpecker(AutonomousMachine):
         return own, by, 1 / self.bird_mass + dot(levers, by)
 
     def field(self, s: Scalar, state: WoodpeckerState) -> WoodpeckerState:
-        """Free fall under the spring's moment, by time; what the pole does is said by
-        contacts."""
+        """Free fall under the spring's moment, by time. The contacts add the pole's forces."""
         moment = self.stiffness * (state.sleeve_angle - state.bird_angle)
         y, sleeve, bird = (moment * x for x in response((None, -1, 1), self._inertia()))
         rates = state.speed, state.sleeve_rate, state.bird_rate
