@@ -315,3 +315,50 @@ def test_how_a_motion_changes_where_it_begins_to_graze(prestress, exponent):
 
     changes = vi.jit(jax.vmap(changed))(depth)
     assert np.polyfit(np.log(depth), np.log(changes), 1)[0] == pytest.approx(exponent, abs=0.005)
+
+
+class Buffers(vi.Mechanical):
+    """Two bodies with a buffer between them, in SI units: newtons by metre, and by metre a second.
+
+    Body `a` comes at 2 m/s, and what is left is the closed form of a damped swing of half a
+    period: the relative speed times exp(-πξ/√(1 - ξ²)), ξ = c/(2√(K m)) by the reduced mass m."""
+
+    q = ("a", "b")
+    light: float = 1.0
+    heavy: float = 3.0
+    stiffness: float = 900.0
+    dashpot: float = 9.0
+    share: float = 0.6
+    by_share: bool = False
+    cycle = 1.0
+
+    def mass(self, q):
+        return self.light, self.heavy
+
+    def force(self, t, q, v):
+        return {"a": 0.0, "b": 0.0}
+
+    @property
+    def contacts(self):
+        damping = {"restitution": self.share} if self.by_share else {"dashpot": self.dashpot}
+        return vi.SoftStop(0.1, self.stiffness, on=lambda q: q.a - q.b, **damping)
+
+
+@pytest.mark.parametrize("by_share", [False, True])
+def test_a_buffer_between_bodies_is_a_force(by_share):
+    masses = jnp.asarray([[1.0, 3.0], [0.2, 0.1], [40.0, 7.0], [1.0, 1.0]])
+
+    def left(pair):
+        machine = Buffers(light=pair[0], heavy=pair[1], by_share=by_share)
+        run = vi.simulate(machine, machine.at(v={"a": 2.0}), 3, method=vi.Adaptive(rtol=1e-10))
+        return run.last.v.a, run.last.v.b, run.successful
+
+    a, b, good = vi.jit(jax.vmap(left))(masses)
+    assert bool(good.all())
+    m, M = np.asarray(masses).T
+    xi = 9.0 / (2 * np.sqrt(900.0 * m * M / (m + M)))
+    kept = 0.6 if by_share else np.exp(-np.pi * xi / np.sqrt(1 - xi**2))
+    np.testing.assert_allclose(m * a + M * b, 2 * m, rtol=1e-12)
+    np.testing.assert_allclose(b - a, 2 * kept, rtol=1e-8)
+    with pytest.raises(ValueError, match="`dashpot` belongs to the law"):
+        vi.SoftStop(0.1, 900.0, dashpot=1.0, law="hunt-crossley")

@@ -213,7 +213,7 @@ class AbstractMachine(Clocked, Observed, Worded):
         limit = counter.longest_step(self, state) if isinstance(counter, Turn) else self.cycle / 5
         for stop in self.switches:
             if stop.acts and isinstance(stop, SoftStop):
-                pace, length = self.pace(s, state), stop.longest_step(self, state)
+                pace, length = self.pace(s, state), stop.longest_step(self, s, state)
                 limit = jnp.minimum(limit, length if pace is None else length / pace)
         return limit
 

@@ -12,7 +12,7 @@ from .shown import Shown
 
 
 class AbstractContactLaw(Shown):
-    """Force away from a `SoftStop`, per unit of mass, by the depth δ > 0 and its rate δ'.
+    """Force away from a `SoftStop` by the depth δ > 0 and its rate δ'.
 
     A law of one's own is a subclass with `force`. Its numbers may be those of the stop, stiffness K
     and damping α, or its own leaves.
@@ -31,8 +31,8 @@ class AbstractContactLaw(Shown):
 
     @abc.abstractmethod
     def force(self, stiffness: Any, damping: Any, depth: Any, rate: Any) -> Any:
-        """The force away from the stop, per unit of mass, on a body that touches, without
-        prestress; it may pull (be negative)."""
+        """The force away from the stop on a body that touches, without prestress; it may pull (be
+        negative)."""
 
     def pulls(self, stiffness: Any, damping: Any, prestress: Any, depth: Any, rate: Any) -> Any:
         """A function with the sign of the pull: positive where the stop would pull the body. It
@@ -51,7 +51,7 @@ class AbstractContactLaw(Shown):
 
     def frequency(self, stiffness: Any, depth: Any, rate: Any) -> Any:
         """The frequency with which a body oscillates on the stop, at the depth that it will
-        reach."""
+        reach; `stiffness` is that per unit of its mass."""
         p, deepest = self.exponent, jnp.maximum(depth, 1e-12)
         if p > 1:
             reach = (0.5 * (p + 1) * rate**2 / stiffness + 1e-30) ** (1 / (p + 1))
@@ -67,7 +67,8 @@ class PowerLaw(AbstractContactLaw):
     """
 
     def force(self, stiffness, damping, depth, rate):
-        """k δ^p of the spring and the damping of the dashpot, per unit of mass."""
+        """K δ^p of the spring and α √K δ^((p-1)/2) δ' of the dashpot; on a body of another mass
+        than 1 the stop gives α √m for α."""
         p = self.exponent
         resist = damping * jnp.sqrt(stiffness) * power(depth, 0.5 * (p - 1)) * rate
         return stiffness * power(depth, p) + resist

@@ -59,7 +59,8 @@ def other_events(machine: Machine) -> tuple[AbstractEvent, ...]:
 def coordinates_in(machine: Machine) -> tuple[Coordinate, ...]:
     """The coordinates on which a machine's contacts act, in the order of `_places`."""
     contacts = listed(machine.contacts)
-    masses = {x.on: x.mass for x in reversed(contacts) if isinstance(x, RigidStop)}
+    stops = [x for x in contacts if isinstance(x, RigidStop | SoftStop) and x.mass is not None]
+    masses = {x.on: x.mass for x in reversed(stops)}
     return tuple(machine.coordinate_on(on, masses.get(on)) for on in _places(contacts))
 
 

@@ -242,7 +242,7 @@ class Scene(ShaftMachine):
         speed = self.drive.speed(state)
         turn = 0.4 * pi / jnp.maximum(1.0, speed)
         for stop in self.soft_stops:
-            turn = jnp.minimum(turn, stop.longest_step(self, state))
+            turn = jnp.minimum(turn, stop.longest_step(self, s, state))
         return turn * speed if self.clock_name == "phase" else turn
 
     @property

@@ -15,9 +15,10 @@ from .._checks import (
     instance_of,
     number,
     one_of,
+    optional_real,
     require_ranges,
 )
-from .._types import Machine, Number, State
+from .._types import Machine, Number, Scalar, State
 from .contacts import push_of
 from .event import AbstractSwitch
 from .law import AbstractContactLaw, HuntCrossley, PowerLaw
@@ -37,7 +38,7 @@ _NEAR = 1e-6
 class SoftStop(Wall, AbstractSwitch):
     """A compliant stop: pushes the body back while it penetrates by δ > 0.
 
-    With unit mass the force is F0 plus that of its law, by default `PowerLaw`: K δᵖ + α √K
+    The force on a body of mass m is F0 plus that of its law, by default `PowerLaw`: K δᵖ + α √(K m)
     δ^((p-1)/2) δ', p = 1 being a spring with a dashpot, p = 3/2 Hertz's contact. Its coefficient of
     restitution does not depend on the speed, so that `restitution` may be given instead of
     `damping`. That of `HuntCrossley`, K δᵖ (1 + α δ'), falls with speed.
@@ -52,16 +53,20 @@ class SoftStop(Wall, AbstractSwitch):
     **Arguments:**
 
     - `gap`: distance of the stop from the coordinate's zero (its unit); the body touches beyond.
-    - `stiffness` K per unit of mass, positive (for a `Scene`: in units of the body's own spring).
-    - `restitution` e in (0, 1], or `damping` α, not negative; neither: no damping.
+    - `stiffness` K, a force by depthᵖ, N/m for a spring in SI units; positive (for a `Scene`: in
+      units of the body's own spring).
+    - `restitution` e in (0, 1], or `damping` α, not negative (no unit for a power law, s/m for
+      `HuntCrossley`); neither: no damping.
+    - `dashpot` c of a power law, not negative: a force by speed, N s/m for a spring in SI units.
+      The term c δ^((p-1)/2) δ' is added to the force.
     - `law`: `"power"` or `"hunt-crossley"`, and `exponent` p, at least 1 (1 by default); or any
       `AbstractContactLaw`, which has its own.
     - `prestress` F0: the force at first touch, not negative; none by default.
     - `adhesive`: whether the dashpot may pull at the end of its stroke; `False` lets the body go
       where the force falls to zero. Static.
     - `side`: `"right"` or `"left"`.
-    - `on`: the coordinate that it limits, as of a `RigidStop`. In a `Mechanical` the mass is that
-      on which the coordinate's contacts act: divide a stiffness in N/m by it.
+    - `on`: the coordinate that it limits, as of a `RigidStop`.
+    - `mass` on which the force acts: 1 by default; a `Mechanical` knows it.
 
     **Raises:** `ValueError` naming the argument that is out of range.
     """
@@ -69,15 +74,18 @@ class SoftStop(Wall, AbstractSwitch):
     gap: Float[Array, "..."]
     stiffness: Float[Array, "..."]
     damping: Float[Array, "..."]
+    dashpot: Float[Array, "..."] | None
     prestress: Float[Array, "..."] | None
     law: AbstractContactLaw
     adhesive: bool = eqx.field(static=True)
     side: str = eqx.field(static=True)
     on: Any = eqx.field(static=True)
+    mass: Float[Array, "..."] | None
     coordinate: int = eqx.field(static=True)
     ends: str = eqx.field(static=True, init=False, default="")  # its touch ends no motion
     ranges: ClassVar = {
-        "gap": REAL, "stiffness": POSITIVE, "damping": NOT_NEGATIVE, "prestress": NOT_NEGATIVE,
+        "gap": REAL, "stiffness": POSITIVE, "damping": NOT_NEGATIVE, "dashpot": NOT_NEGATIVE,
+        "prestress": NOT_NEGATIVE, "mass": POSITIVE,
     }  # fmt: skip
 
     def __init__(
@@ -87,12 +95,14 @@ class SoftStop(Wall, AbstractSwitch):
         *,
         restitution: Number | None = None,
         damping: Number | None = None,
+        dashpot: Number | None = None,
         exponent: float | None = None,
         law: str | AbstractContactLaw = "power",
         prestress: Number | None = None,
         adhesive: bool = True,
         side: str = "right",
         on: Any = None,
+        mass: Number | None = None,
         coordinate: int = 0,
         ends_cycle: bool = False,
         name: str = "",
@@ -105,7 +115,14 @@ class SoftStop(Wall, AbstractSwitch):
         self.gap = number("gap", gap)
         self.stiffness = number("stiffness", stiffness)
         self.damping = number("damping", 0.0 if damping is None else damping)
-        self.prestress = None if prestress is None else number("prestress", prestress)
+        if dashpot is not None and not isinstance(self.law, PowerLaw):
+            raise ValueError(
+                f'Argument `dashpot` belongs to the law "power", but got {dashpot!r} with '
+                f"law={law!r}. Give `damping` to other laws."
+            )
+        self.dashpot = optional_real("dashpot")(dashpot)
+        self.prestress = optional_real("prestress")(prestress)
+        self.mass = optional_real("mass")(mass)
         self.adhesive = bool(adhesive)
         self.side = one_of("side", side, ("right", "left"))
         self.on, self.acts = on, acts
@@ -135,14 +152,16 @@ class SoftStop(Wall, AbstractSwitch):
         body = machine.coordinates[self.coordinate]
         return self.beyond(body.position(state)), self.approach(body.velocity(state))
 
-    def force(self, depth: Number, rate: Number) -> Any:
-        """Force away from the stop, per unit of mass, of a body that touches."""
-        force = self.law.force(self.stiffness, self.damping, depth, rate)
+    def force(self, depth: Number, rate: Number, mass: Any = 1.0) -> Any:
+        """Force away from the stop on a body of this mass that touches."""
+        force = self.law.force(self.stiffness, self._damping(mass), depth, rate)
         return force if self.prestress is None else self.prestress + force
 
     def contribution(self, machine, s, state, mode):
         """The acceleration that the stop adds to the coordinate."""
-        return jnp.where(mode > 0, -self.sign * self.force(*self.depth(machine, state)), 0.0)
+        mass = self._mass(machine, s, state)
+        push = -self.sign * self.force(*self.depth(machine, state), mass)
+        return jnp.where(mode > 0, push if _is_one(mass) else push / mass, 0.0)
 
     def push_in(self, machine, s, state, mode):
         """The acceleration of the coordinate while the body touches, and its push."""
@@ -156,15 +175,15 @@ class SoftStop(Wall, AbstractSwitch):
         inside = (depth > 0) | ((depth == 0) & (rate > 0))
         holds = TOUCHING
         if not self.adhesive:
-            holds = jnp.where(self._pulls(depth, rate) < 0, TOUCHING, RELEASED)
+            holds = jnp.where(self._pulls(machine, s, state) < 0, TOUCHING, RELEASED)
         return jnp.where(inside, holds, APART)
 
     def guard(self, machine, s, state, mode):
         """Going in, coming out, or let go of."""
-        depth, rate = self.depth(machine, state)
+        depth, _ = self.depth(machine, state)
         if self.adhesive:
             return -mode * depth
-        pulls = self._pulls(depth, rate)
+        pulls = self._pulls(machine, s, state)
         ends = jnp.where(mode > 0, pulls, -pulls)
         return jnp.where(mode < 0, depth, jnp.maximum(ends, -depth))
 
@@ -172,21 +191,41 @@ class SoftStop(Wall, AbstractSwitch):
         """Touching, released or apart, by what has risen to zero."""
         if self.adhesive:
             return state, -mode
-        depth, rate = self.depth(machine, state)
-        pulls = self._pulls(depth, rate)
+        depth, _ = self.depth(machine, state)
+        pulls = self._pulls(machine, s, state)
         inside = depth > 0  # without damping the force falls to zero as the body comes out
         released = jnp.where(inside & (pulls >= -depth), RELEASED, APART)
         again = jnp.where(inside & (-pulls > -depth), TOUCHING, APART)
         return state, jnp.where(mode < 0, TOUCHING, jnp.where(mode > 0, released, again))
 
-    def longest_step(self, machine: Machine, state: State) -> Any:
+    def longest_step(self, machine: Machine, s: Scalar, state: State) -> Any:
         """A fifth of the period in which a body oscillates on the stop; infinite apart from it."""
         depth, rate = self.depth(machine, state)
-        frequency = self.law.frequency(self.stiffness, depth, rate)
+        mass = self._mass(machine, s, state)
+        stiffness = self.stiffness if _is_one(mass) else self.stiffness / mass
+        frequency = self.law.frequency(stiffness, depth, rate)
         return jnp.where(depth > -_NEAR, 0.4 * pi / frequency, jnp.inf)
 
-    def _pulls(self, depth: object, rate: object) -> Any:
-        return self.law.pulls(self.stiffness, self.damping, self.prestress, depth, rate)
+    def _mass(self, machine: Machine, s: Scalar, state: State) -> Any:
+        return machine.coordinates[self.coordinate].mass_at(s, state)
+
+    def _damping(self, mass: Any) -> Any:
+        """The damping that the law gets for a body of this mass."""
+        if not isinstance(self.law, PowerLaw):
+            return self.damping
+        damping = self.damping if _is_one(mass) else self.damping * jnp.sqrt(mass)
+        return (
+            damping if self.dashpot is None else damping + self.dashpot / jnp.sqrt(self.stiffness)
+        )
+
+    def _pulls(self, machine: Machine, s: Scalar, state: State) -> Any:
+        damping = self._damping(self._mass(machine, s, state))
+        return self.law.pulls(self.stiffness, damping, self.prestress, *self.depth(machine, state))
+
+
+def _is_one(mass: Any) -> bool:
+    """Whether a mass is known to be 1 while a program is traced: it costs nothing then."""
+    return isinstance(mass, float | int) and mass == 1
 
 
 def _law(law: str | AbstractContactLaw, exponent: float | None) -> AbstractContactLaw:

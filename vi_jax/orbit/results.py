@@ -56,8 +56,9 @@ class ORBIT_RESULTS(NamedEnumeration):
         "derivative."
     )
     drifts = (
-        "No orbit was found: something in the state is neutral (a multiplier is 1) and drifts from "
-        "cycle to cycle. What is counted by the cycle is set back by the machine's `renewed`."
+        "No orbit was found: the motion drifts. A component of the state changes as much in each "
+        "cycle (a multiplier is 1), as the place of a body that moves on. Set it back once a cycle "
+        "by the machine's method `renewed`, count an angle by `vi.turn_of`, or leave it out."
     )
     equilibrium = (
         "No orbit was found: the search ended at an equilibrium, where nothing moves; it meets the "
