@@ -1,5 +1,6 @@
 """A user's own scene: a ball bouncing on a floor under constant force, beside its closed form."""
 
+import dataclasses
 import warnings
 
 import equinox as eqx
@@ -8,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-from vi_jax.flow._by_numpy import by_numpy
 
 
 class Ball(eqx.Module):
@@ -155,23 +155,6 @@ class Shaken(BouncingBall):
         return Ball(state.V, shaken - state.Y - jax.nn.relu(state.V) ** 2)
 
 
-def test_a_function_of_jax_computed_by_numpy():
-    def function(x, y):
-        far = jnp.interp(y, jnp.arange(4.0), jnp.arange(4.0) ** 2) + jnp.floor_divide(x, 0.3)
-        bent = jax.nn.relu(x - 1) + jax.nn.sigmoid(x) + jnp.clip(y, 0, 1) + jnp.mod(x, 1.0)
-        powers = x**3 + jnp.abs(y) ** 2.5 + x**-2 + jnp.square(y) + 1 / jnp.sqrt(x)
-        waves = jnp.sinc(x) + jnp.atan2(y, x) + jnp.sign(y) * jnp.cos(x) + jnp.log1p(x)
-        row = jnp.array([1.0, 2.0]) @ jnp.stack([x, y])
-        loop = jax.lax.fori_loop(0, 3, lambda i, z: 0.5 * z + i, x)
-        return {"z": far + bent + powers, "w": (waves + jax.lax.stop_gradient(row), loop)}
-
-    for x, y in ((0.37, -0.9), (1.9, 2.6)):
-        wanted = function(jnp.asarray(x), jnp.asarray(y))
-        found = by_numpy(function, jnp.asarray(x), y)
-        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-14), found, wanted)
-        assert all(type(leaf) is np.ndarray for leaf in jax.tree.leaves(found))
-
-
 @pytest.mark.slow
 def test_a_field_of_another_period_than_its_cycle_is_warned_of_once():
     start, floor = Ball(*map(jnp.asarray, (1.0, 0.3))), ()
@@ -275,3 +258,31 @@ def test_a_reset_of_a_state_that_is_a_dictionary():
     run = vi.simulate(Neuron(), {"v": 0.0, "n": 0.0}, 3)
     np.testing.assert_allclose(run.duration, np.log(3), rtol=1e-8)
     assert run.last["n"] == 3
+
+
+@dataclasses.dataclass(frozen=True)
+class _Guard:
+    """A guard, above zero only or not."""
+
+    lowest: float
+
+    def __call__(self, machine, s, x):
+        return jnp.maximum(x.Y - 1, self.lowest)
+
+
+class Guarded(BouncingBall):
+    """With an event."""
+
+    events: tuple = ()
+
+
+@pytest.mark.parametrize(("lowest", "number"), [(0.0, 1), (-9.0, 0)])
+def test_a_guard_that_is_never_negative_is_warned_of_once(lowest, number):
+    event = vi.Reset(_Guard(lowest), lambda m, s, x: Ball(x.Y, -x.V), name="lid")
+    machine = type("Own", (Guarded,), {})(jnp.asarray(1.0), (), (event,))
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        for _ in range(2):
+            vi.simulate(machine, Ball(*map(jnp.asarray, (0.5, 0.0))), 1)
+    words = "guard of event 0 (lid) of a Own was not below zero"
+    assert sum(words in str(x.message) for x in told) == number

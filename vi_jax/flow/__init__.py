@@ -7,9 +7,9 @@ from ._simulate import simulate as simulate
 from ._simulate import simulate_pool as simulate_pool
 from .arguments import as_floats as as_floats
 from .arguments import check_leaves as check_leaves
-from .arguments import check_period as check_period
 from .arguments import check_reals as check_reals
 from .arguments import check_start as check_start
+from .arguments import check_values as check_values
 from .arguments import machine_of as machine_of
 from .arguments import planned as planned
 from .arguments import shape_of as shape_of

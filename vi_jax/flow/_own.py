@@ -13,18 +13,20 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax.core import Tracer
+from jaxtyping import Array
 
 from .._messages import warn
 from .._types import Scalar, Scalars, State
 from ..machine import (
     AbstractMachine,
     begin_modes,
+    events_of,
     field_in,
+    guard_of,
     is_autonomous,
     like,
     shown_modes,
 )
-from ._by_numpy import by_numpy
 
 _NO_NUMBERS = (
     jax.errors.ConcretizationTypeError,
@@ -153,37 +155,76 @@ def check_laws(machine: AbstractMachine, speed: Scalar) -> None:
             )
 
 
-def check_period(machine: AbstractMachine, start: State) -> None:
-    """Warn once of a field that is not the same at both ends of its cycle.
+# A guard is evaluated in so many states around the start, with modes among these beside the first
+# ones, and places at these distances (beside 1 + its size): choices.
+_TRIED, _MODES, _FAR = 48, (-1.0, 0.0, 1.0), (0.1, 1.0, 10.0)
 
-    Machines whose numbers are traced are not looked at, nor are ours, nor those whose cycles
-    something else than `s` counts.
+
+def check_values(machine: AbstractMachine, start: State) -> None:
+    """Warn once of a field that is not the same at both ends of its cycle, and of an event whose
+    guard is not below zero in any of many states around the start.
+
+    Machines of this package and machines with traced numbers are not checked.
     """
-    kind, numbers = type(machine), jtu.tree_leaves((machine, start))
+    kind, leaves = type(machine), jtu.tree_leaves((machine, start))
     ours = kind.__module__.partition(".")[0] == __name__.partition(".")[0]
-    if ours or any(isinstance(x, Tracer) for x in numbers):
+    if ours or any(isinstance(x, Tracer) for x in leaves):
         return
     try:
-        if machine.clock(start) is not None or is_autonomous(machine, start):
+        ticks = machine.clock(start) is None and not is_autonomous(machine, start)
+        if not (ticks or machine.others):
             return
-        cycle, *ends = by_numpy(_ends, machine, start)
-        each = list(zip(jtu.tree_leaves_with_path(start), *ends, strict=True))
-    except Exception:  # said in words where the field is traced
+        with jax.ensure_compile_time_eval():
+            found = jtu.tree_map(np.asarray, _values(machine, start, ticks))
+    except Exception:  # the error is raised in words where field and guards are traced
         return
-    for (path, _), first, last in each:
-        apart = np.max(abs(first - last) / (1e-3 + abs(first) + abs(last)))
-        if apart > _APART:
+    cycle, first, last, least = found
+    ends = zip(jtu.tree_leaves_with_path(start), first, last, strict=True) if ticks else ()
+    for (path, _), one, other in ends:
+        if np.max(abs(one - other) / (1e-3 + abs(one) + abs(other))) > _APART:
             _warn_of_period(kind, jtu.keystr(path).lstrip(".") or "state", cycle.item())
-            return
+            break
+    for i in np.flatnonzero(~(least < 0)):
+        event = machine.others[i]
+        _warn_of_guard(kind, int(i), event.name or type(event).__name__)
 
 
-def _ends(machine: AbstractMachine, start: State) -> tuple[Scalar, list[Any], list[Any]]:
-    """The cycle, and the field where it begins and where it ends, in one state."""
+@eqx.filter_jit(compiler_options={"xla_backend_optimization_level": "0"})  # pyright: ignore
+def _values(machine: AbstractMachine, start: State, ticks: bool) -> Any:
+    """The cycle; the field where it begins and where it ends, if `s` `ticks`; the least value of
+    each guard."""
     zero = jnp.zeros_like(machine.position(start))
-    modes = begin_modes(machine, zero, start)
-    cycle = zero + machine.cycle
-    first, last = (field_in(machine, s, start, modes) for s in (zero, cycle))
-    return cycle, jtu.tree_leaves(first), jtu.tree_leaves(last)
+    modes, cycle = begin_modes(machine, zero, start), zero + machine.cycle
+    ends = (zero, cycle) if ticks else ()
+    fields = [jtu.tree_leaves(field_in(machine, s, start, modes)) for s in ends] or [(), ()]
+    return cycle, *fields, _least_guards(machine, start, modes) if machine.others else jnp.zeros(0)
+
+
+def _least_guards(machine: AbstractMachine, start: State, modes: Scalars) -> Array:
+    """The least value of the guard of each of the machine's events in states around the start."""
+    first, last = len(machine.stops) + len(machine.switches), len(events_of(machine)) - 1
+    zero = jnp.zeros_like(machine.position(start))
+    random = np.random.default_rng(0)
+    far = np.resize(_FAR, _TRIED)
+    s = zero + machine.cycle * np.append(0.0, random.uniform(size=_TRIED))
+
+    def spread(x: Any) -> Array:
+        x = jnp.asarray(x)
+        shape = (_TRIED, *x.shape)
+        moved = random.standard_normal(shape) * far.reshape(-1, *(1 for _ in x.shape))
+        return jnp.concatenate([x[None], x + jnp.asarray(moved, x.dtype) * (1 + jnp.abs(x))])
+
+    def chosen(mode: Scalar) -> Array:
+        others = random.choice(len(_MODES) + 1, size=_TRIED)
+        values = jnp.append(jnp.asarray(_MODES, zero.dtype), mode)
+        return jnp.append(mode, values[others])
+
+    def guards(s: Scalar, state: State, modes: Scalars) -> Array:
+        found = [guard_of(machine, i, s, state, modes) for i in range(first, last)]
+        return jnp.stack([jnp.asarray(x, zero.dtype) for x in found])
+
+    around = s, jtu.tree_map(spread, start), tuple(map(chosen, modes))
+    return jnp.min(jax.vmap(guards)(*around), axis=0)
 
 
 @functools.lru_cache(maxsize=64)
@@ -192,4 +233,14 @@ def _warn_of_period(kind: type, name: str, cycle: float) -> None:
         f"The `field` of a {kind.__name__} is not the same at `s` = 0 and at `s` = `cycle` = "
         f"{cycle:.6g}: the rate of its {name} differs. `s` begins again from 0 with each cycle, so "
         "that `cycle` must be a period of the field, unless it is meant to jump there."
+    )
+
+
+@functools.lru_cache(maxsize=64)
+def _warn_of_guard(kind: type, i: int, name: str) -> None:
+    warn(
+        f"The guard of event {i} ({name}) of a {kind.__name__} was not below zero in any of "
+        f"{_TRIED + 1} states around the start, and an event whose guard is never negative never "
+        "happens. Return a number that is negative before the event and positive after it: "
+        "`x - 1`, not `jnp.maximum(x - 1, 0)`."
     )

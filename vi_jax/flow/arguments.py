@@ -35,8 +35,7 @@ from ..machine import (
     modes_of,
 )
 from ._lane import Plan
-from ._own import check_period as check_period
-from ._own_guards import check_guards
+from ._own import check_values as check_values
 from ._own_parts import check_parts
 from .methods import AbstractMethod
 from .named import average_names, quantity_names
@@ -263,8 +262,8 @@ def shape_of(argument: str, machine: AbstractMachine, state: State) -> tuple[int
 
 
 def check_start(machine: AbstractMachine, start: State) -> None:
-    """Warns of a field of another period. **Raises:** `ValueError` or `TypeError` if a concrete
-    start cannot be simulated."""
+    """Warn as `check_values` does. **Raises:** `ValueError` or `TypeError` if a concrete start
+    cannot be simulated."""
     shape = shape_of("start", machine, start)
     if shape:
         raise ValueError(
@@ -291,5 +290,4 @@ def check_start(machine: AbstractMachine, start: State) -> None:
                 f"Argument `start` must not lie beyond a stop, but lies {depth:g} beyond stop {i} "
                 f"({stop.side}, gap {gap})."
             )
-    check_period(machine, start)
-    check_guards(machine, start)
+    check_values(machine, start)

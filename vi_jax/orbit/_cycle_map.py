@@ -20,8 +20,8 @@ from ..flow import (
     FixedStep,
     MethodLike,
     as_floats,
-    check_period,
     check_reals,
+    check_values,
     chosen,
     machine_of,
     preset,
@@ -129,7 +129,7 @@ def adopted(machine: AbstractMachine, state: State, name: str = "state") -> Stat
             "Argument `machine` must count its cycles by its independent variable, but its state "
             "has a clock."
         )
-    check_period(machine, state)
+    check_values(machine, state)
     state = as_floats(machine, state)
     if modes is None:
         return begun(machine, state, axes_of(machine, state))

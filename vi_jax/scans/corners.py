@@ -6,7 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ..flow import check_noise, check_period, check_reals
+from ..flow import check_noise, check_reals, check_values
 from ..machine import check_again, with_leaf
 from ._shaken import MACHINE, part_of
 from .grid import Blocks
@@ -51,7 +51,7 @@ def check_corners(program: ScanProgram, blocks: Blocks) -> ScanProgram:
         program.method.check(machine)
         start = machine.adopt(start)
         check_reals("start", start)
-        check_period(machine, start)
+        check_values(machine, start)
         if program.shaken is not None:
             check_noise(machine, start, program.shaken.noise_of(lane))
     if program.build is not None:
