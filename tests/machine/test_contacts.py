@@ -264,6 +264,16 @@ def test_an_event_ends_the_motion_with_an_outcome():
     assert machine.outcomes == ("right", "left")
     np.testing.assert_array_equal(run.outcome, np.where(np.array(first) > 0, 0, 1))
     assert bool((run.result == vi.RESULTS.ended).all())
+
+    class Walled(Toppling):
+        """The same where the right side is a wall."""
+
+        contacts = vi.RigidStop(1.0, 0.5, on=("x", "u"), ends="right")
+        events = Toppling.events[1]
+
+    walled = jax.vmap(lambda u: vi.simulate(Walled(), vi.State(x=0.0, u=u), 4))(speeds)
+    assert Walled().outcomes == ("left", "right")
+    np.testing.assert_array_equal(walled.outcome, 1 - run.outcome)
     axes = {"start.u": speeds, "amplitude": [0.5]}
     data = vi.scan(machine, axes, measure="sections", cycles=16, progress=False)
     np.testing.assert_array_equal(data["outcome"].values[:, 0], run.outcome)

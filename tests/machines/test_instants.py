@@ -55,6 +55,40 @@ def test_an_event_that_does_not_happen_leaves_no_trace():
     assert float(slope) == pytest.approx(4.0, abs=1e-14)
 
 
+def test_a_reset_asks_when_its_guard_rises():
+    """A clock hand that passes 1 in each turn of four and is let through before 5 only: never
+    again within that turn, as soon as both hold, and once in each later turn."""
+
+    def counted(machine, s, state):
+        return {"count": state.count + 1}
+
+    class Hand(vi.AbstractMachine):
+        cycle = 10.0
+        events = (
+            vi.Reset(lambda m, s, x: x.place - 1, counted, when=lambda m, s, x: s > 1.5),
+            vi.Reset(
+                lambda m, s, x: jnp.minimum(x.place - 1, s - 1.5), lambda m, s, x: {"both": s}
+            ),
+            vi.Reset(
+                lambda m, s, x: x.place - 4,
+                lambda m, s, x: {"place": 0.0},
+                when=lambda m, s, x: x.turns > 0,
+            ),
+        )
+
+        def field(self, s, x):
+            return {"place": 1.0, "turns": 0.0, "count": 0.0, "both": 0.0}
+
+    def last(turns):
+        start = vi.State(place=0.0, turns=turns, count=0.0, both=0.0)
+        return vi.simulate(Hand(), start, 1).last
+
+    found = jax.vmap(last)(jnp.array([0.0, 1.0]))
+    np.testing.assert_array_equal(found.count, [0, 2])  # at 1 not, at 5 and 9
+    np.testing.assert_allclose(found.both, [1.5, 9.0], rtol=1e-12)
+    np.testing.assert_allclose(found.place, [10.0, 2.0], rtol=1e-12)
+
+
 def test_nor_does_it_end_a_cycle():
     third = vi.Reset(
         lambda m, s, x: jnp.sin(x.Y), same, when=lambda m, s, x: x.Y > 7, ends_cycle=True

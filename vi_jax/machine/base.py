@@ -180,8 +180,8 @@ class AbstractMachine(Clocked, Observed, Worded):
 
     @property
     def outcomes(self) -> tuple[str, ...]:
-        """The names of the outcomes with which its events end a motion."""
-        names = (x.ends for x in (*self.switches, *self.others) if x.ends)
+        """The names of the outcomes with which its events and its stops end a motion."""
+        names = (x.ends for x in (*self.switches, *self.others, *self.stops) if x.ends)
         return tuple(dict.fromkeys(names))
 
     @by_default

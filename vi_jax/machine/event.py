@@ -47,8 +47,7 @@ class AbstractEvent(Shown):
     name: str = eqx.field(static=True, kw_only=True, default="")
     """What messages call it; static."""
     ends: str = eqx.field(static=True, kw_only=True, default="")
-    """The outcome with which the motion ends there, by name; it goes on without one. Of an event
-    among the machine's `events`; static."""
+    """The outcome with which the motion ends there, by name; it goes on without one; static."""
 
     @property
     def holds_mode(self) -> bool:

@@ -169,13 +169,16 @@ def struck_modes(
     are if left out; `contact` as in `Around`.
     """
     held = []
+    together = holds_anywhere(machine) and len(frictions_in(machine)) > 1
     for number, event in enumerate(events_of(machine)):
-        if event.holds_mode:
+        if together and (event.is_dry or getattr(event, "rubs_on", None) is not None):
+            held.append(event.way(machine, s, state))  # pyright: ignore
+        elif event.holds_mode:
             _, place, more = event_of(machine, number, modes, contact)
             held.append(event.struck(machine, s, state, *modes[place], **more))
     kept = modes[len(held) :] if own is None else own
     modes = settled_modes([*held, *kept], s)
-    if holds_anywhere(machine) and len(frictions_in(machine)) > 1:
+    if together:
         modes = settled_modes(chosen_together(machine, s, state, modes, contact), s)
     return modes
 

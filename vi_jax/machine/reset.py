@@ -35,9 +35,10 @@ class Reset(AbstractEvent):
     - `guard`: what rises through zero: negative before the event, positive after it.
     - `reset`: the state afterwards, or a dictionary of the components that change; the state stays
       as it is if left out.
-    - `when`: whether the reset happens where the guard has risen through zero, as a flag; where it
-      does not hold the motion goes on, and the guard must fall below zero before it can rise again.
-      Always, if left out.
+    - `when`: a flag, asked for only at the instant at which the guard rises through zero. If it is
+      false the reset does not happen, and the guard must fall below zero before it can rise again.
+      For a reset as soon as two conditions hold take the smaller of two guards, or of a mode and a
+      guard: `jnp.where(on == 1, z.T - 296, -1.0)`.
     - `modes`: the machine's own modes afterwards, one number, a tuple, or a dictionary of those
       that change; they stay as they are if left out. Switches are then in the modes that they have
       behind an impact.

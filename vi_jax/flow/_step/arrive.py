@@ -20,7 +20,7 @@ from ..events import Rates, to_turn
 from ..smooth import exact, holding
 from .faults import may_end
 from .guards import Crossing, furthest_landing
-from .happen import happened, let_go, set_off
+from .happen import happened, let_go, set_off, with_outcome
 from .jump import disarmed_itself
 from .trial import Trial
 
@@ -131,6 +131,7 @@ def _landed(
         for number, stop in enumerate(machine.stops):
             if stop.ends_cycle:
                 arrival = arrival._replace(completed=arrival.completed | landed[number])
+            arrival = with_outcome(machine, stop, arrival, landed[number])
     if machine.stops and machine.others:
         met = jnp.zeros_like(taken)
         for number in range(len(machine.stops)):

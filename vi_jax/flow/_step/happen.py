@@ -8,6 +8,8 @@ from jax.lax import stop_gradient
 
 from ..._types import Flag, Scalar, Scalars, State
 from ...machine import (
+    AbstractEvent,
+    AbstractMachine,
     after_event,
     events_of,
     guard_of,
@@ -135,9 +137,7 @@ def _next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _Instant) -> _In
             its_number = its_number - len(machine.switches)
         if event.ends_cycle:
             arrival = arrival._replace(completed=arrival.completed | here)
-        if event.ends:
-            outcome = results.with_outcome(machine.outcomes.index(event.ends))
-            arrival = ended(arrival, here, jnp.ones_like(here), outcome)
+        arrival = with_outcome(machine, event, arrival, here)
         new, modes = select(here, (its_state, its_modes), (new, modes))
         its_own = its_kind, its_number, its_value
         if len(numbers) > 1:
@@ -162,6 +162,16 @@ def _next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _Instant) -> _In
     if last is not None:
         arrival = arrival._replace(completed=arrival.completed | last)
     return _Instant(arrival, tuple(due), near)
+
+
+def with_outcome(
+    machine: AbstractMachine, event: AbstractEvent, arrival: Arrival, here: Flag
+) -> Arrival:
+    """The arrival, its lane ended where an event happened that ends the motion."""
+    if not event.ends:
+        return arrival
+    outcome = results.with_outcome(machine.outcomes.index(event.ends))
+    return ended(arrival, here, jnp.ones_like(here), outcome)
 
 
 def _listed(
