@@ -51,7 +51,7 @@ def test_paths_depend_on_no_block_worker_or_thread(whole):
 
 
 def test_a_store_goes_on_to_the_same_numbers(whole, tmp_path, monkeypatch):
-    work = importlib.import_module("vi_jax.scans._work")
+    work = importlib.import_module("vi_jax.scans._computed")
     compute, left = work.compute, [2]
 
     def stopped(*arguments, **options):

@@ -1,6 +1,9 @@
 """Scans that were interrupted go on; a store refuses another scan."""
 
 import importlib
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -11,7 +14,7 @@ SCENE = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ra
 
 
 def test_a_store_is_resumed_and_guards_itself(tmp_path, monkeypatch):
-    work = importlib.import_module("vi_jax.scans._work")
+    work = importlib.import_module("vi_jax.scans._computed")
     axes = {"drive.frequency_ratio": np.linspace(0.6, 1.4, 40), "start.Y": np.linspace(-1, 1, 30)}
     options = {"settle": 20, "cycles": 128, "lanes": 256, "workers": 1}
     whole = vi.scan(SCENE, axes, **options)
@@ -97,19 +100,31 @@ def test_a_store_is_made_whole_or_not_at_all(tmp_path, monkeypatch):
 
 
 def test_an_interrupted_scan_in_memory_gives_what_it_has(monkeypatch):
-    work = importlib.import_module("vi_jax.scans._work")
-    done = []
-    compute = work.compute
+    """Also a block that ends on another thread after the interrupt."""
+    work = importlib.import_module("vi_jax.scans._computed")
+    begun, compute = threading.Barrier(2), work.compute
 
-    def interrupted(*arguments):
-        if done:
-            raise KeyboardInterrupt
-        done.append(1)
-        return compute(*arguments)
+    def interrupted(*arguments, dry=False):
+        if not dry:
+            if begun.wait() == 0:
+                raise KeyboardInterrupt
+            time.sleep(0.2)
+        return compute(*arguments, dry=dry)
 
     monkeypatch.setattr(work, "compute", interrupted)
     with pytest.raises(KeyboardInterrupt) as caught:
-        vi.scan(SCENE, {"start.Y": np.linspace(-1, 1, 600)}, settle=5, lanes=256, workers=1)
+        vi.scan(SCENE, {"start.Y": np.linspace(-1, 1, 600)}, settle=5, lanes=256, workers=2)
     assert isinstance(caught.value, vi.ScanInterrupted)
     codes = np.asarray(caught.value.data.result)
     assert (codes == 0).sum() == 256 and (codes == -1).sum() == 344
+
+
+def test_blocks_are_computed_by_any_executor():
+    axes = {"start.Y": np.linspace(-1, 1, 600)}
+    options = {"measure": "extremes", "settle": 5, "cycles": 4, "lanes": 256}
+    with ThreadPoolExecutor(2) as pool:
+        found = vi.scan(SCENE, axes, **options, cluster=pool)
+        assert pool.submit(int).result() == 0  # it is not shut down
+    xr.testing.assert_identical(found, vi.scan(SCENE, axes, **options))
+    with pytest.raises(ConnectionError, match=r"was lost, .* Nothing is kept"):
+        vi.scan(SCENE, axes, **options, cluster=pool)

@@ -1,13 +1,18 @@
 """What a scan is, in words and numbers: by it a store knows its own scan, and data their origin
 and their variables."""
 
+import functools
 import hashlib
+import inspect
 import json
 import re
-from collections.abc import Mapping
+import sys
+import types
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
@@ -15,7 +20,6 @@ import numpy as np
 from .._messages import installed_version
 from ..flow import REASON_NAMES
 from ..machine import AbstractMachine, attributes, leaf, leaf_names, unit_of
-from ._identity import Unverifiable, identity
 from ._shaken import NOISE, START, part_of
 from .grid import LANE, Blocks
 from .measures import Regime
@@ -97,13 +101,97 @@ def _codes(program: ScanProgram) -> dict[str, str]:
         parts["noise"] = program.shaken.noise.functions
     for i, measure in enumerate(program.measures):
         parts[f"measure {i + 1}"] = measure
-    found = {}
-    for name, part in parts.items():
-        try:
-            found[name] = identity(part)
-        except Unverifiable as error:
-            found[name] = f"{UNVERIFIABLE}{error}"
-    return found
+    return {name: identity(part) for name, part in parts.items()}
+
+
+# Code that does not change while a study goes on, and is known by its name.
+_LIBRARIES = {
+    "vi_jax", "jax", "jaxlib", "numpy", "scipy", "equinox", "diffrax", "optax", "optimistix",
+    "lineax", "jaxtyping", "beartype", "xarray", "matplotlib", *sys.stdlib_module_names,
+}  # fmt: skip
+
+# What a class holds besides what its author wrote.
+_MADE = (types.GetSetDescriptorType, types.MemberDescriptorType, types.WrapperDescriptorType)
+
+
+def identity(thing: object) -> str:
+    """Return a digest of a function, or of an object: the source of its code, and its content.
+
+    A function refers to its defaults, to the variables that it closes over and to the globals that
+    it names; functions and classes among them are part of the digest, unless they are a library's.
+    Of an object count its class and its attributes. If something has neither source nor content,
+    the answer begins with `UNVERIFIABLE` and names it.
+    """
+    digest = hashlib.sha256()
+    try:
+        for word in _words(thing, {}):
+            digest.update(word.encode("utf-8", "backslashreplace") + b"\0")
+    except (OSError, TypeError, RecursionError) as error:
+        return f"{UNVERIFIABLE}{error}"
+    return digest.hexdigest()[:16]
+
+
+def _words(thing: Any, seen: dict[int, Any]) -> Iterator[str]:
+    """The words that `thing` is made of. `seen` holds what was begun: things refer in rings."""
+    if thing is None or isinstance(thing, int | float | complex | str | bytes | np.dtype):
+        yield repr(thing)
+    elif isinstance(thing, np.ndarray | np.generic | jax.Array):
+        array = np.asarray(thing)
+        yield f"{array.dtype} {array.shape} {hashlib.sha256(array.tobytes()).hexdigest()}"
+    elif isinstance(thing, types.ModuleType):
+        yield thing.__name__
+    elif id(thing) in seen:
+        yield str(list(seen).index(id(thing)))
+    else:
+        seen[id(thing)] = thing
+        yield type(thing).__qualname__
+        for part in _parts(inspect.unwrap(thing) if callable(thing) else thing):
+            yield from _words(part, seen)
+
+
+def _parts(thing: Any) -> list[Any]:
+    """What `thing` consists of.
+
+    **Raises:** `OSError` or `TypeError` for what has neither source nor content.
+    """
+    if isinstance(thing, set | frozenset):
+        return sorted(map(identity, thing))
+    if isinstance(thing, list | tuple):
+        return list(thing)
+    if isinstance(thing, Mapping):
+        return [x for pair in thing.items() for x in pair]
+    if isinstance(thing, functools.partial):
+        return [thing.func, thing.args, thing.keywords]
+    if isinstance(thing, types.MethodType):
+        return [thing.__func__, thing.__self__]
+    if isinstance(thing, types.BuiltinFunctionType | np.ufunc):
+        return [thing.__name__]
+    if isinstance(thing, property):
+        return [thing.fget]
+    if isinstance(thing, type | types.FunctionType):
+        name, own = [thing.__module__, thing.__qualname__], _is_own(thing.__module__)
+        if isinstance(thing, type):
+            return [*name, *thing.__bases__, *_members(thing)] if own else name
+        used = inspect.getclosurevars(thing)
+        if not own:
+            return [*name, used.nonlocals]
+        source = inspect.getsource(thing)
+        return [source, thing.__defaults__, thing.__kwdefaults__, used.nonlocals, used.globals]
+    return [type(thing), *thing.__reduce_ex__(2)[1:3]]
+
+
+def _is_own(module: str | None) -> bool:
+    return (module or "").partition(".")[0] not in _LIBRARIES
+
+
+def _members(kind: type) -> Iterator[Any]:
+    """What the author of a class wrote in it: methods and plain values, with their names."""
+    for name, value in sorted(vars(kind).items()):
+        code = getattr(inspect.unwrap(value) if callable(value) else value, "__code__", None)
+        is_made = isinstance(value, _MADE) or (code and code.co_filename == "<string>")
+        is_plain = isinstance(value, int | float | complex | str | bytes) and name[:2] != "__"
+        if (hasattr(value, "__get__") and not is_made) or is_plain:
+            yield from (name, value)
 
 
 def _described(x: object) -> Any:

@@ -81,7 +81,8 @@ def scan(
     - `lanes`: lanes in a block (a multiple of 256); memory grows with it and with `cycles`.
     - `workers`, `devices`: blocks at work at once on a CPU (by default one a core), and local
       devices over which a block is spread (all by default).
-    - `cluster`: a `dask.distributed.Client`, to compute the blocks there.
+    - `cluster`: a `dask.distributed.Client`, or an `Executor` of `concurrent.futures`, to compute
+      the blocks there.
     - `progress`: show a bar, in a terminal or a notebook.
 
     **Returns:** an `xarray.Dataset` over the axes, with units; `result` says of each lane how it
@@ -92,7 +93,7 @@ def scan(
     """
     grid, verify = axes_of(axes), count("verify", verify)
     progress, paired = flag("progress", progress), flag("paired", paired)
-    _check_call(grid, paired, store, cluster)
+    _check_call(grid, paired, store)
     options = RunOptions(
         settle=settle, method=method, clock=clock, max_impacts=max_impacts, max_steps=max_steps
     )
@@ -109,14 +110,10 @@ def scan(
     return data
 
 
-def _check_call(grid: Mapping[str, np.ndarray], paired: bool, store: Any, cluster: Any) -> None:
+def _check_call(grid: Mapping[str, np.ndarray], paired: bool, store: Any) -> None:
     """**Raises:** `TypeError` or `ValueError` for arguments of `scan` that are none."""
     if store is not None:
         instance_of("store", store, (str, Path), "a path")
-    if cluster is not None and not (hasattr(cluster, "submit") and hasattr(cluster, "cancel")):
-        raise TypeError(
-            f"Argument `cluster` must be a `dask.distributed.Client`, but got {cluster!r}."
-        )
     if paired and len({x.size for x in grid.values()}) != 1:
         raise ValueError(
             "Argument `axes` must hold rows of one length if they are `paired`, but they have "

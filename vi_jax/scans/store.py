@@ -1,10 +1,10 @@
 """Where a scan's numbers go: arrays in memory, or a Zarr store that survives interruption."""
 
 import json
+import os
 import tempfile
 import warnings
-import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,21 +15,22 @@ from .._messages import installed_version, warn
 from .._types import xr, zarr
 from .grid import Blocks
 
+try:
+    import fcntl
+except ImportError:  # not on Windows
+    fcntl = None
+
 # What stands in whole numbers of lanes that were not computed, `result` among them.
 NOT_COMPUTED = -1
-
-UNVERIFIABLE = "it cannot be looked at: "
-
-# What lies in the store, not what it was made with: a file may have been lost since.
-_AS_IT_IS: dict[str, Any] = {"use_consolidated": False}
 
 # The attribute that says which release began a store.
 _RELEASE = "vi_jax"
 
-# Where the check sums lie: a row for each block, a column for each variable. They are written last,
-# and are in a group of their own, so that they are no variable of the data set.
-_CHECK = "check"
-_SUMS = f"{_CHECK}/sums"
+# What begins the digest of code that cannot be compared.
+UNVERIFIABLE = "it has no source: "
+
+Where = tuple[slice, ...]
+"""A block: where it lies on each axis of the grid."""
 
 
 class Variable(NamedTuple):
@@ -47,26 +48,30 @@ class Variable(NamedTuple):
 
 
 class MemoryStore:
-    """Arrays in memory, for a scan that nothing is to be kept of."""
+    """Arrays in memory, for a scan without a store."""
 
     def __init__(self, blocks: Blocks, variables: Mapping[str, Variable]):
-        self.arrays = {
+        self.arrays: Mapping[str, Any] = {
             name: np.full(blocks.shape + v.sizes, v.empty, v.dtype) for name, v in variables.items()
         }
-        self.blocks, self.variables = blocks, dict(variables)
+        self.blocks, self.variables = blocks, variables
 
-    def open_blocks(self) -> list[tuple[slice, ...]]:
-        """The blocks still to be computed: all."""
+    def open_blocks(self) -> list[Where]:
+        """Return the blocks still to be computed."""
         return list(self.blocks)
 
-    def write(self, where: tuple[slice, ...], numbers: Mapping[str, np.ndarray]) -> None:
-        """Put a block's numbers in their place in the arrays."""
-        for name, x in numbers.items():
+    def write(self, where: Where, numbers: Mapping[str, np.ndarray]) -> None:
+        """Write a block's numbers. Once its `result` is written, the block counts as computed."""
+        for name in sorted(self.variables, key=lambda name: name == "result"):
             array = self.arrays[name]
-            array[where] = x.reshape(array[where].shape)
+            lanes = tuple(part.stop - part.start for part in where)
+            array[where] = numbers[name].reshape(lanes + array.shape[len(where) :])
+
+    def close(self) -> None:
+        """Nothing is held."""
 
     def data(self) -> "xr.Dataset":
-        """The arrays with their axes and attributes."""
+        """Return the arrays with their axes and attributes."""
         return xr.Dataset(
             {
                 name: ((*self.blocks.dims, *v.dims), self.arrays[name], dict(v.attributes))
@@ -76,11 +81,13 @@ class MemoryStore:
         )
 
 
-class ZarrStore:
-    """A Zarr group on disk, one chunk for each block, with a check sum of each chunk.
+class ZarrStore(MemoryStore):
+    """A Zarr group on disk, one chunk for each block, with Zarr's check sum of each (CRC-32C).
 
-    The check sums of a block are written last, so that it counts as done only if all its numbers
-    are there, and are those that were computed. What was lost since is named and computed again.
+    Chunks of NaN are written too, so that a missing chunk of a computed block is a lost one. No
+    other process, and no other scan of this one, may write to the store until it is closed.
+
+    **Raises:** `ValueError` for a folder that is not the store of this scan, or is in use.
     """
 
     def __init__(
@@ -90,8 +97,7 @@ class ZarrStore:
         blocks: Blocks,
         variables: Mapping[str, Variable],
     ):
-        self.path, self.blocks, self.variables = Path(path), blocks, dict(variables)
-        self.names = sorted(variables)
+        self.path, self.blocks, self.variables = Path(path), blocks, variables
         self.lost: list[str] = []
         description = json.loads(json.dumps(description))
         new = not (self.path / "zarr.json").exists()
@@ -102,50 +108,45 @@ class ZarrStore:
                     "is neither."
                 )
             _make(self.path, description, blocks, variables)
+        self._lock = _locked(self.path)
         try:
-            self.group = zarr.open_group(str(self.path), mode="r+", zarr_format=3, **_AS_IT_IS)
-        except Exception as error:
-            raise ValueError(
-                f"Argument `store` must be the store of a scan, but {self.path / 'zarr.json'} "
-                f"cannot be read: {error}."
-            ) from None
-        _compare(self.path, dict(self.group.attrs), description, new=new)
-        self._warn_of_release()
-        self._complete()
+            self._open(description, new=new)
+        except BaseException:
+            self.close()
+            raise
 
-    def _warn_of_release(self) -> None:
-        begun, now = self.group.attrs.get(_RELEASE), installed_version()
+    def _open(self, description: Mapping[str, Any], *, new: bool) -> None:
+        with _chunks_of_nan():
+            try:
+                group = zarr.open_group(str(self.path), mode="r+", zarr_format=3)
+            except Exception as error:
+                raise ValueError(
+                    f"Argument `store` must be the store of a scan, but {self.path / 'zarr.json'} "
+                    f"cannot be read: {error}."
+                ) from None
+            _compare(self.path, dict(group.attrs), description, new=new)
+            self.arrays = {name: group[name] for name in (*self.variables, *self.blocks.axes)}
+        begun, now = group.attrs.get(_RELEASE), installed_version()
         if begun is not None and begun != now:
             warn(
                 f"{self.path} was begun by vi_jax {begun}, and this is {now}: the blocks that are "
                 "still missing come from another release than those that are there."
             )
-
-    def _complete(self) -> None:
-        """Make again what arrays are missing, or are not those of this scan."""
-        for name, v in self.variables.items():
-            array = _tried(lambda name=name: self.group[name])
-            if not isinstance(array, zarr.Array) or array.chunks != self.blocks.block + v.sizes:
-                self.lost.append(name)
-                _add_variable(self.group, name, v, self.blocks)
         for name, x in self.blocks.axes.items():
-            there = _tried(lambda name=name: np.asarray(self.group[name]))
-            if not isinstance(there, np.ndarray) or not np.array_equal(there, x):
+            found = _read(self.arrays[name], ...)
+            if found is None or not np.array_equal(found, x):
                 self.lost.append(name)
-                _add_axis(self.group, name, x, self.blocks)
-        if not isinstance(_tried(lambda: self.group[_CHECK]), zarr.Group):
-            # Only its head is made again: the sums below it may be whole.
-            self.lost.append(f"{_CHECK}/zarr.json")
-            (self.path / _CHECK / "zarr.json").unlink(missing_ok=True)
-            self.group.require_group(_CHECK)
-        shape = (len(self.blocks), len(self.names))
-        if getattr(_tried(lambda: self.group[_SUMS]), "shape", None) != shape:
-            self.lost.append(_SUMS)
-            _add_sums(self.group, shape)
+                self.arrays[name][:] = x
 
-    def open_blocks(self) -> list[tuple[slice, ...]]:
-        """The blocks still to be computed. Warns of those that were, and are not as they were."""
-        found = [where for i, where in enumerate(self.blocks) if not self._done(i, where)]
+    def close(self) -> None:
+        """Let others write."""
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
+
+    def open_blocks(self) -> list[Where]:
+        """Return the blocks still to be computed. Warns of damaged ones, which are among them."""
+        found = [where for where in self.blocks if not self._is_done(where)]
         if self.lost:
             more = f" and {len(self.lost) - 5:,} more" if len(self.lost) > 5 else ""
             warn(
@@ -154,76 +155,90 @@ class ZarrStore:
             )
         return found
 
-    def _done(self, index: int, where: tuple[slice, ...]) -> bool:
-        sums = _tried(lambda: self._array(_SUMS)[index])
-        if not isinstance(sums, np.ndarray):
-            self.lost.append(f"{_SUMS}/c/{index}/0")
+    def _is_done(self, where: Where) -> bool:
+        chunks = {name: self._chunk(name, where) for name in self.variables}
+        if not (self.path / chunks["result"]).exists():
             return False
-        if not sums.any():
-            return False  # not yet computed, or not to its end
-        lost = []
-        for name, wanted in zip(self.names, sums.tolist(), strict=True):
-            array = self._array(name)
-            numbers = _tried(lambda array=array: np.asarray(array[where]))
-            if not isinstance(numbers, np.ndarray) or _sum(numbers, array.dtype) != wanted:
-                corner = [part.start // n for part, n in zip(where, self.blocks.block, strict=True)]
-                corner += [0] * (array.ndim - len(corner))
-                lost.append("/".join([name, "c", *map(str, corner)]))
+        lost = [
+            chunk
+            for name, chunk in chunks.items()
+            if not (self.path / chunk).exists() or _read(self.arrays[name], where) is None
+        ]
         self.lost += lost
         return not lost
 
-    def write(self, where: tuple[slice, ...], numbers: Mapping[str, np.ndarray]) -> None:
-        """Write a block's numbers to its chunks, and then their check sums."""
-        sums = []
-        for name in self.names:
-            array = self._array(name)
-            shape = tuple(part.stop - part.start for part in where) + array.shape[len(where) :]
-            array[where] = numbers[name].reshape(shape)
-            sums.append(_sum(numbers[name], array.dtype))
-        self._array(_SUMS)[self.blocks.index(where)] = sums
+    def _chunk(self, name: str, where: Where) -> str:
+        """The file of a block's numbers."""
+        corner = [part.start // n for part, n in zip(where, self.blocks.block, strict=True)]
+        corner += [0] * len(self.variables[name].sizes)
+        return "/".join([name, "c", *map(str, corner)])
 
     def data(self) -> "xr.Dataset":
-        """The data of the store, read as they are looked at."""
-        data = xr.open_zarr(str(self.path), consolidated=False, chunks=None, mask_and_scale=False)
-        # Not in the order in which a file system lists them.
+        """Return the data of the store, which are read when they are used."""
+        data = xr.open_zarr(str(self.path), chunks=None, mask_and_scale=False)
         return data[[*data["result"].dims, *sorted(map(str, data.data_vars))]]
 
-    def _array(self, name: str) -> Any:
-        return self.group[name]
+
+def _chunks_of_nan() -> Any:
+    return zarr.config.set({"array.write_empty_chunks": True})
 
 
-def _tried(read: Callable[[], Any]) -> Any:
-    """What is read, or `None`: a file may be missing, cut short or hold anything."""
+def _read(array: Any, where: Any) -> np.ndarray | None:
+    """The numbers there, or `None`: a file may be cut short or hold anything."""
     try:
-        return read()
+        return np.asarray(array[where])
     except Exception:
         return None
 
 
-def _sum(numbers: np.ndarray, dtype: np.dtype) -> int:
-    """A check sum, never 0, of numbers of any shape; Zarr stores every NaN as the same one."""
-    numbers = np.ascontiguousarray(numbers, dtype)
-    if dtype.kind == "f":
-        numbers = np.where(np.isnan(numbers), dtype.type(np.nan), numbers)
-    return zlib.crc32(numbers.tobytes()) or 1
+def _locked(folder: Path) -> int | None:
+    """A descriptor that holds a lock until it is closed; `None` where there are no locks."""
+    if fcntl is None:
+        return None
+    lock = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return lock
+    except BlockingIOError:
+        os.close(lock)
+        raise ValueError(
+            f"Argument `store` must not be in use, but another scan writes to {folder}. Wait for "
+            "its end, or give another folder."
+        ) from None
+    except OSError:  # a file system without locks
+        os.close(lock)
+        return None
 
 
 def _make(
     path: Path, description: Mapping[str, Any], blocks: Blocks, variables: Mapping[str, Variable]
 ) -> None:
     """An empty store, made beside its place and then renamed: it is there whole or not at all."""
+    from zarr.codecs import Crc32cCodec, ZstdCodec
+
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as beside:
         made = Path(beside) / "store"
         about = {"scan": description, _RELEASE: installed_version()}
         group = zarr.create_group(str(made), zarr_format=3, attributes=about)
+        compressors = [ZstdCodec(), Crc32cCodec()]
         for name, x in blocks.axes.items():
-            _add_axis(group, name, x, blocks)
+            group.create_array(
+                name, data=x, dimension_names=blocks.dims_of(name), compressors=compressors
+            )
         for name, v in variables.items():
-            _add_variable(group, name, v, blocks)
-        _add_sums(group, (len(blocks), len(variables)))
+            group.create_array(
+                name,
+                shape=blocks.shape + v.sizes,
+                chunks=blocks.block + v.sizes,
+                dtype=v.dtype,
+                fill_value=v.empty,
+                dimension_names=(*blocks.dims, *v.dims),
+                attributes=dict(v.attributes),
+                compressors=compressors,
+            )
         with warnings.catch_warnings():
-            # By it others open the store at once, and without a warning that it is not there.
+            # With it one file describes all arrays, and others open the store without a warning.
             warnings.filterwarnings("ignore", "Consolidated metadata")
             zarr.consolidate_metadata(str(made), zarr_format=3)
         try:
@@ -231,32 +246,6 @@ def _make(
         except OSError:
             if not (path / "zarr.json").exists():
                 raise  # else another scan made it in the meantime
-
-
-def _add_axis(group: Any, name: str, x: np.ndarray, blocks: Blocks) -> None:
-    coordinate = group.create_array(
-        name, shape=x.shape, dtype=x.dtype, dimension_names=blocks.dims_of(name), overwrite=True
-    )
-    coordinate[:] = x
-
-
-def _add_variable(group: Any, name: str, v: Variable, blocks: Blocks) -> None:
-    group.create_array(
-        name,
-        shape=blocks.shape + v.sizes,
-        chunks=blocks.block + v.sizes,
-        dtype=v.dtype,
-        fill_value=v.empty,
-        dimension_names=(*blocks.dims, *v.dims),
-        attributes=dict(v.attributes),
-        overwrite=True,
-    )
-
-
-def _add_sums(group: Any, shape: tuple[int, int]) -> None:
-    group.create_array(
-        _SUMS, shape=shape, chunks=(1, shape[1]), dtype="uint32", fill_value=0, overwrite=True
-    )
 
 
 def check_writable(path: str | Path) -> None:
@@ -297,5 +286,5 @@ def _compare(
         if not new and code.startswith(UNVERIFIABLE):
             raise ValueError(
                 f"Argument `store` must be new, since it is unknown whether the {what} is the "
-                f"same as that in {path}: {code}."
+                f"same as that in {path}: {code}. Define its functions and classes in a file."
             )
