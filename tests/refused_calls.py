@@ -138,7 +138,6 @@ CALLS = {
     "boundary('x')": (lambda: vi.boundary("x", parameter="stops.0.gap", bounds=((0, 1), (0, 1))),
                       "`point` must be a `SpecialPoint`"),
     "grazing('x')": (lambda: vi.grazing("x"), "`point` must be a `SpecialPoint`"),
-    "resonant_grazings('x')": (lambda: vi.resonant_grazings("x"), "`curve` must be a `Boundary`"),
     "plot_grazing('x')": (lambda: vi.plot_grazing("x"), "`found` must be a `Grazing`"),
     "continue_orbit('x')": (lambda: vi.continue_orbit("x", parameter=ZETA, bounds=(0, 1)),
                             "`orbit` must be one `Orbit`"),
@@ -184,8 +183,7 @@ def work(*arguments, **options):
 
 if __name__ == "__main__":
     for module, name in (
-        ("scans._computed", "run_here"),
-        ("scans._computed", "run_on_cluster"),
+        ("scans._computed", "run_blocks"),
         ("scans._sweep", "_sweep"),
         ("orbit.find", "_find"),
         ("flow._simulate", "_simulate"),

@@ -73,7 +73,6 @@ from .orbit import Gradient as Gradient
 from .orbit import Grazing as Grazing
 from .orbit import Newton as Newton
 from .orbit import Orbit as Orbit
-from .orbit import ResonantGrazing as ResonantGrazing
 from .orbit import SpecialPoint as SpecialPoint
 from .orbit import boundary as boundary
 from .orbit import closed_form_orbits as closed_form_orbits
@@ -82,7 +81,6 @@ from .orbit import cycle_map as cycle_map
 from .orbit import distinct_orbits as distinct_orbits
 from .orbit import find_orbit as find_orbit
 from .orbit import grazing as grazing
-from .orbit import resonant_grazings as resonant_grazings
 from .plot import animate as animate
 from .plot import plot_basins as plot_basins
 from .plot import plot_boundary as plot_boundary
@@ -126,7 +124,6 @@ from .scans import escape_rate as escape_rate
 from .scans import integrity_profile as integrity_profile
 from .scans import lyapunov as lyapunov
 from .scans import scan as scan
-from .scans import spectrum as spectrum
 from .scans import sweep as sweep
 
 __version__: str

@@ -144,14 +144,14 @@ def test_interrupted_searches_for_kicks_and_edges(monkeypatch):
     scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.02)
     places = ((1.283, 1.007), (1.528, 1.314), (1.26, 1.086))
     one, two, saddle = (vi.find_orbit(scene, scene.start(Y=Y, V=V), 2) for Y, V in places)
-    look = importlib.import_module("vi_jax.robust._minimal_kick").Look
-    best = look.best
+    kicks = importlib.import_module("vi_jax.robust._minimal_kick")
+    best = kicks._best
     # A second ray to be interrupted at, whichever there are.
-    monkeypatch.setattr(look, "best", lambda *arguments: best(*arguments)[:1] * 2)
-    struck(monkeypatch, "robust._minimal_kick.exact", after=1)
+    monkeypatch.setattr(kicks, "_best", lambda *arguments: best(*arguments)[:1] * 2)
+    struck(monkeypatch, "robust._minimal_kick._exact", after=1)
     error = interrupted_by(vi.Interrupted, lambda: vi.minimal_kick(scene, one))
     assert error.partial.confirmed and error.partial.exact
-    struck(monkeypatch, "robust._edge_state.orbit_near", after=0)
+    struck(monkeypatch, "robust._settling.find_orbit", after=0)
     edge = interrupted_by(vi.Interrupted, lambda: vi.edge_state(scene, two, one)).partial
     assert edge.kind == "irregular" and edge.orbit is None and edge.sections.Y.size > 0
     struck(monkeypatch, "robust._manifold._ahead", after=3)

@@ -262,36 +262,6 @@ def test_extremes_tell_of_passages_between_sections():
     assert np.mean(soon.escape_cycle < late.escape_cycle) > 0.5
 
 
-def test_the_spectrum_of_a_linear_oscillator():
-    """That of the map from impulse to impulse, in closed form."""
-
-    def one(key):
-        options = {"settle": 20, "samples": IMPULSES, "record": "sections"}
-        return vi.simulate(Free(), START, 256, noise=NOISE, key=key, **options)
-
-    runs = jax.vmap(one)(jax.random.split(jax.random.key(1), 32))
-    found = vi.spectrum(runs, "Y", segment=512)
-    assert found.segments == 256
-
-    def exact(frequency):
-        turn = np.exp(-2j * np.pi * frequency * STEP)
-        inverse = np.linalg.inv(np.eye(2) - FLOW * turn)
-        return 2 * STEP * (inverse @ JUMP @ inverse.conj().T)[0, 0].real
-
-    # Without the ends, where the mean is taken off, and half of the last is meant.
-    inner = found.isel(frequency=slice(3, -2))
-    truth = np.array([exact(x) for x in inner.frequency.values])
-    # 256 numbers of exponential distribution have a mean within 1/16, and so its error.
-    score = (inner.density.values - truth) / (truth / 16)
-    assert np.max(np.abs(score)) < 5
-    assert abs(np.mean(score**2) - 1) < 0.4
-    assert abs(np.mean(inner.error.values / truth) * 16 - 1) < 0.1
-    whole = float(found.density.sum() * found.frequency[1])
-    assert runs.samples is not None
-    variance = np.var(np.asarray(runs.samples.state.Y)[:, 1:])
-    assert abs(whole / variance - 1) < 0.05
-
-
 @pytest.mark.parametrize(
     "make, message",
     [
@@ -308,8 +278,6 @@ def test_the_spectrum_of_a_linear_oscillator():
             lambda: scanned((vi.Statistics("V", samples=4), vi.Escape("Y", high=1.0, samples=2))),
             r"one number of samples, but asks for \[2, 4\]",
         ),
-        (lambda: vi.spectrum(vi.simulate(Free(), START, 2), "Y"), "must have samples"),
-        (lambda: vi.spectrum(vi.simulate(Free(), START, 2, samples=4), "W"), "one of Y, V"),
     ],
 )
 def test_what_does_not_fit_is_refused(make, message):

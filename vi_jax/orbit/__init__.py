@@ -17,6 +17,7 @@ from .closed_form import closed_form_orbits as closed_form_orbits
 from .codimension_two import CodimensionTwo as CodimensionTwo
 from .curve import check_walk as check_walk
 from .distinct import Orbits as Orbits
+from .distinct import distance as distance
 from .distinct import distinct_among as distinct_among
 from .distinct import distinct_orbits as distinct_orbits
 from .distinct import in_one_line as in_one_line
@@ -26,8 +27,6 @@ from .floquet import STABILITY_NAMES as STABILITY_NAMES
 from .floquet import stability_of as stability_of
 from .grazing import Grazing as Grazing
 from .grazing import grazing as grazing
-from .resonant import ResonantGrazing as ResonantGrazing
-from .resonant import resonant_grazings as resonant_grazings
 from .results import ORBIT_RESULTS as ORBIT_RESULTS
 from .results import InWords as InWords
 from .results import Orbit as Orbit

@@ -50,7 +50,7 @@ _ZERO = 1e-6
 # accelerations of up to 50.
 _SAME_TURN = 10.0
 
-# Motions that graze are looked at over so many periods: a choice, as in `resonant_grazings`.
+# Motions that graze are looked at over so many periods: a choice.
 _PERIODS = 3
 
 

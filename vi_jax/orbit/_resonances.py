@@ -20,7 +20,7 @@ _ZERO = 1e-4
 def resonances(
     problem: Shooting, impact: int | None, steps: list[Step], scale: np.ndarray, periods: int
 ) -> list[tuple[float, Step, np.ndarray]]:
-    """The resonant grazings of a curve (see `resonant_grazings`), in its order: after which step,
+    """The resonant grazings of a curve, at which an entry vanishes, in its order: after which step,
     with the fraction of the way to the next one, the point, and the entries up to that which
     vanishes.
 

@@ -49,8 +49,9 @@ class CodimensionTwo(InWords):
     -1, where a curve of Neimark–Sacker points begins), "resonance-1:3", "resonance-1:4" (the
     angle of a complex pair is 2π/3 or π/2), "grazing" (of a motion that is special by its
     multipliers); on a curve of grazings "fold" or "period-doubling" (of the motion that grazes),
-    "resonant-grazing" (see `resonant_grazings`); "symmetry-breaking" (the motions become
-    symmetric, and the curve ends; of grazings of symmetric motions, where these lose that)."""
+    "resonant-grazing" (an entry eₙ of the local map vanishes, see `grazing`);
+    "symmetry-breaking" (the motions become symmetric, and the curve ends; of grazings of
+    symmetric motions, where these lose that)."""
     parameters: np.ndarray
     """Both parameters of the curve."""
     orbit: Orbit

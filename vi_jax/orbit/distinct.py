@@ -1,6 +1,7 @@
 """Which of many found orbits are different motions."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -10,6 +11,15 @@ from .._checks import given_number, short
 from .._messages import so_many
 from ..machine import bare, in_rows, state_in_words
 from .results import InWords, Orbit, hits_in_words, span_in_words, trimmed
+
+
+def distance(here: Any, there: Any) -> Any:
+    """Return how far states lie from others, relative to 1 + |state| of the latter.
+
+    Of the components, the last axis, that counts which differs most. Everywhere in the package this
+    number says whether two states, or two motions, are the same.
+    """
+    return (abs(here - there) / (1 + abs(there))).max(axis=-1)
 
 
 class Orbits(InWords, list[Orbit]):
@@ -83,8 +93,6 @@ def _known(paths: list[np.ndarray], path: np.ndarray, tolerance: float) -> int:
     """Which of the known motions one is, by its sections from whichever of them on; else how many
     there are."""
     for j, other in enumerate(paths):
-        if len(other) == len(path):
-            apart = np.abs(other - path[0]) / (1 + np.abs(other))
-            if (apart.max(axis=1) <= tolerance).any():
-                return j
+        if len(other) == len(path) and distance(path[0], other).min() <= tolerance:
+            return j
     return len(paths)

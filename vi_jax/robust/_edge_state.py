@@ -10,9 +10,18 @@ from .._messages import Interrupted, Tell, at_work, silent
 from .._types import State
 from ..flow import MethodLike
 from ..machine import AbstractMachine, Summarized, bare, in_rows
-from ..orbit import Orbit, adopted
-from ._motion import distance_to, in_row, orbit_near, settling_on
-from ._settling import ELSEWHERE, INADMISSIBLE, RETURNS, TRAIL, Row, Rows, Settling
+from ..orbit import Orbit, adopted, distance
+from ._settling import (
+    ELSEWHERE,
+    INADMISSIBLE,
+    RETURNS,
+    TRAIL,
+    Row,
+    Rows,
+    Settling,
+    in_row,
+    settling_on,
+)
 
 # Two starts on both sides of the boundary are brought as close as this and followed until they are
 # as far apart as that, relative to 1 + |state|: choices. What lies between them is the edge's
@@ -146,10 +155,9 @@ def tracked(
         inside, outside = pair
         met = _met_again(np.concatenate(trail)[-4 * longest - 1 :], longest, recurs)
         if met is not None:
-            orbit = orbit_near(settling, *met)
-            if orbit is not None and distance_to(orbit, met[0]) <= _NEAR * recurs:
-                if not bool(orbit.stable):
-                    return _described(settling, trail, orbit)
+            orbit = settling.orbit_near(*met, _NEAR * recurs)
+            if orbit is not None and not bool(orbit.stable):
+                return _described(settling, trail, orbit)
             recurs *= 0.1
     return _described(settling, trail, None)
 
@@ -160,8 +168,7 @@ def _followed(settling: Settling, pair: Rows) -> tuple[Rows, Rows]:
     parts = []
     for _ in range(_PIECES):
         both = settling.trail(pair, TRAIL)
-        apart = np.max(np.abs(both[1] - both[0]) / (1 + np.abs(both[0])), axis=1)
-        far = np.flatnonzero(~(apart <= _APART))  # what is no number is far as well
+        far = np.flatnonzero(~(distance(both[1], both[0]) <= _APART))  # or no number
         end = far[0] if far.size else TRAIL
         end = end if np.isfinite(both[:, end]).all() else end - 1
         parts.append(both[:, 1 : end + 1].mean(axis=0))
@@ -174,8 +181,7 @@ def _followed(settling: Settling, pair: Rows) -> tuple[Rows, Rows]:
 def _met_again(trail: Rows, longest: int, recurs: float) -> tuple[Row, int] | None:
     """A state near to which the motion comes back, the latest, and after how many cycles."""
     last = trail[-1]
-    apart = np.max(np.abs(trail[:-1] - last) / (1 + np.abs(last)), axis=1)[::-1][:longest]
-    back = np.flatnonzero(apart <= recurs)
+    back = np.flatnonzero(distance(trail[:-1], last)[::-1][:longest] <= recurs)
     return (last, int(back[0]) + 1) if back.size else None
 
 

@@ -13,8 +13,7 @@ from .._messages import Interrupted, at_work
 from .._types import State
 from ..machine import AbstractMachine, Summarized, bare, in_rows, is_autonomous
 from ..orbit import Orbit, cycle_map
-from ._motion import in_row
-from ._settling import Row, Rows, Settling
+from ._settling import Row, Rows, Settling, in_row, one_orbit
 
 # How far from the saddle, relative to 1 + |state|, its manifolds are taken to be straight: they
 # part from their tangents by the square of it. A choice.
@@ -104,8 +103,7 @@ def manifold(
     which = one_of("which", which, ("stable", "unstable"))
     length = given_number("length", length, low=0.0, open_low=True)
     spacing = given_number("spacing", spacing, low=0.0, open_low=True)
-    if not isinstance(orbit, Orbit) or orbit.residual.ndim or not bool(orbit.successful):
-        raise ValueError("Argument `orbit` must be one orbit that was found, but is no such.")
+    orbit = one_orbit("orbit", orbit)
     sizes = np.abs(np.asarray(orbit.multipliers))
     if sizes.size != 2 or is_autonomous(orbit.machine, orbit.state):
         raise ValueError(

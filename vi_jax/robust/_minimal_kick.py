@@ -1,8 +1,8 @@
 """`minimal_kick`: the smallest change of the state after which a machine settles elsewhere."""
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -13,15 +13,30 @@ from .._types import State
 from ..flow import MethodLike
 from ..machine import AbstractMachine, Summarized, components, state_in_words
 from ..orbit import Orbit
-from ._edge_state import EdgeState
-from ._exact import ASIDE, Found, Here, Look, exact, worst
-from ._moments import Moments
-from ._motion import settled_orbit, settling_on, stands_still
-from ._rays import Kick
-from ._settling import ELSEWHERE, RETURNS, Row, Settling
+from ._edge_state import EdgeState, tracked
+from ._rays import NARROWER, Exits, Kick, Row, first_exits, narrowed, nearer, nearest_first
+from ._settling import ELSEWHERE, RETURNS, Settling, settling_on
+from ._shortest import shortest
+
+# Of the kick, relative to it: by how much more and less simulation confirms it.
+_ASIDE = 1e-6
 
 # Two kicks are the same within this, relative to their norm. A choice.
 _SAME = 1e-4
+
+# Rounds of looking more closely around the best rays: before Newton's method, and instead of it.
+# Choices: the latter narrow a turn of 1/128 to 1e-8.
+_LOOKS, _MORE_LOOKS = 2, 14
+
+# Rounds of bisection by eight that leave nothing between two numbers of double precision.
+_ROUNDING = 18
+
+# How much longer than what rays found Newton's may be, and how much shorter: else it is another
+# kick. A choice, for rays as dense as the default.
+_LONGER, _SHORTER = 1e-4, 0.05
+
+# Edges are tracked for so many rounds.
+_ROUNDS = 40
 
 
 class MinimalKick(Summarized):
@@ -95,8 +110,7 @@ def minimal_kick(
     weights: Mapping[str, float] | None = None,
     bounds: Mapping[str, tuple[float, float]] | None = None,
     cycle: int = 0,
-    phase: float | str = 0.0,
-    phases: int = 16,
+    phase: float = 0.0,
     largest: float | None = None,
     directions: int = 128,
     points: int = 32,
@@ -129,8 +143,7 @@ def minimal_kick(
     - `bounds`: the range of the kicked state in some of them, such as `{"Y": (-3.0, 2.0)}`.
     - `cycle`: in which cycle of its period an orbit of several is kicked, from 0 on.
     - `phase`: the time after the section of that cycle, in the machine's clock (a crank angle, or a
-      time); or `"worst"` for the moment of the whole period with the smallest least kick: `phases`
-      of each cycle are searched, and the moment is refined near the best of them.
+      time).
     - `largest`: norm up to which kicks are looked for; by default until one leads elsewhere.
     - `directions`, `points`: rays, and points on each that are simulated in a round; `candidates`:
       rays that leave sooner than their neighbours, from which kicks are made exact.
@@ -146,23 +159,28 @@ def minimal_kick(
     cycle, candidates = count("cycle", cycle), count("candidates", candidates, least=1)
     directions, points = count("directions", directions, least=4), count("points", points, least=2)
     longest, seed = count("longest", longest, least=1), count("seed", seed)
-    phases, progress = count("phases", phases, least=2), flag("progress", progress)
+    progress, phase = flag("progress", progress), given_number("phase", phase, low=0.0)
     if largest is not None:
         largest = given_number("largest", largest, low=0.0, open_low=True)
     settling, start = settling_on(
         machine, orbit, settle, tolerance, longest, method, "orbit", cycle
     )
-    kick = _kicks(settling, start, components, weights or {}, bounds or {})
-    when, since = _moments(settling, start, cycle, phase)
-    look = Look(directions, points, largest, candidates, longest, seed)
+    kick = _kick_of(settling, start, components, weights or {}, bounds or {})
     kicks: list[MinimalKick] = []
 
     def kept() -> Interrupted | None:
         return Interrupted("search for kicks", _smallest(kicks, settling)) if kicks else None
 
     with at_work("minimal kick", kept, progress=progress, unit="start") as settling.tell:
-        here = Here(settling, kick, cycle, 0.0)
-        for new in _each(*_at(when, since, here, look, phases)):
+        if phase > 0:
+            settling, start = settling.later(start, phase)
+            kick = dataclasses.replace(kick, start=start)
+        rays = first_exits(settling, kick, directions, points, largest, seed)
+        angle = 2 * np.pi / directions ** (1 / max(1, kick.size - 1))  # between neighbours
+        for ray in _best(rays, candidates):
+            unit, radius = rays.directions[ray], float(rays.outside[ray])
+            found = _exact(settling, kick, unit, radius, angle, longest, seed)
+            new = _described(settling, kick, found, longest, cycle, phase)
             if all(_apart(new, old) > _SAME for old in kicks):
                 kicks.append(new)
     return _smallest(kicks, settling)
@@ -174,59 +192,54 @@ def _smallest(kicks: list[MinimalKick], settling: Settling) -> MinimalKick:
     return dataclasses.replace(first, others=tuple(others), lanes=settling.lanes)
 
 
-def _at(
-    when: Moments | None, since: float | None, here: Here, look: Look, phases: int
-) -> tuple[Here, Look]:
-    """The moment at which the motion is kicked, and how kicks are looked for there.
+def _best(found: Exits, candidates: int) -> list[int]:
+    """Rays that leave sooner than their neighbours, the soonest first.
 
-    **Arguments:** moments and phase as from `_moments`; the kicks on the section.
+    **Raises:** `ValueError` if none leaves.
     """
-    if when is None:
-        return here, look
-    there = here.at(when, here.cycle, since or 0.0)
-    return worst(when, there, look, phases) if since is None else (there, look)
-
-
-def _each(here: Here, look: Look) -> Iterator[MinimalKick]:
-    """The kicks from the best rays at a moment, made exact one after the other."""
-    found = look.exits(here)
-    for ray in look.best(found):
-        new = exact(here, found.directions[ray], float(found.outside[ray]), look)
-        yield _described(here, new, look.longest)
-
-
-def _moments(
-    settling: Settling, start: Row, cycle: int, phase: float | str
-) -> tuple[Moments | None, float | None]:
-    """The moments of the motion, `None` where it is kicked on its section; and the phase, `None`
-    for the worst.
-
-    **Raises:** `ValueError` or `TypeError` that names the argument.
-    """
-    worst = isinstance(phase, str)
-    if worst and phase != "worst":
-        raise ValueError(f'Argument `phase` must be a number or "worst", but got {phase!r}.')
-    if worst and cycle:
+    best = nearest_first(found, candidates)
+    if not best or not np.isfinite(found.outside[best[0]]):
         raise ValueError(
-            'Argument `cycle` must be left out with `phase="worst"`, which looks at every cycle of '
-            f"the period, but got {cycle}."
+            "No kick leads elsewhere, of those that `components`, `bounds` and `largest` allow: "
+            "the motion came back from all of them."
         )
-    since = None if worst else given_number("phase", phase, low=0.0)
-    if since == 0:
-        return None, since
-    if stands_still(settling.the_map.machine, settling.state(start)):
-        raise ValueError("Argument `phase` must be 0 for an equilibrium, which is always the same.")
-    when = Moments(settling, start, cycle)
-    length = when.lengths[when.cycle(cycle)]
-    if since is not None and not since < length:
-        raise ValueError(
-            f"Argument `phase` must be less than the {length:.9g} that its cycle takes, but got "
-            f"{since:.9g}. See `cycle`."
-        )
-    return when, since
+    return best
 
 
-def _kicks(
+class _Found(NamedTuple):
+    """A kick onto the boundary."""
+
+    z: Row
+    residual: float
+    exact: bool
+    edge: EdgeState
+
+
+def _exact(
+    settling: Settling, kick: Kick, unit: Row, radius: float, angle: float, longest: int, seed: int
+) -> _Found:
+    """The shortest kick near a ray that leaves the basin at a radius."""
+    unit, inside, outside = nearer(settling, kick, unit, radius, angle, _LOOKS, seed)
+    line = narrowed(
+        settling, kick, Exits(unit[None], np.array([inside]), np.array([outside])), _ROUNDING
+    )
+    outside = float(line.outside[0])
+    ends = kick.rows(np.array([line.inside[0], outside * (1 + _ASIDE)])[:, None] * unit)
+    if settling.begin > 0:
+        ends = settling.carried(ends, 1)
+    edge = tracked(settling.starting(0.0), ends[0], ends[1], longest, _ROUNDS)
+    if edge.kind == "saddle" and edge.orbit is not None:
+        better = shortest(settling, kick, edge.orbit, unit * outside)
+        if better is not None:
+            change = np.linalg.norm(better.z) / np.linalg.norm(unit * outside) - 1
+            if -_SHORTER <= change <= _LONGER:
+                return _Found(better.z, better.residual, True, edge)
+    narrow = angle / NARROWER**_LOOKS
+    unit, inside, outside = nearer(settling, kick, unit, outside, narrow, _MORE_LOOKS, seed)
+    return _Found(unit * outside, (outside - inside) / outside, False, edge)
+
+
+def _kick_of(
     settling: Settling,
     start: Row,
     names: Sequence[str] | None,
@@ -265,10 +278,12 @@ def _kicks(
     return kick
 
 
-def _described(here: Here, found: Found, longest: int) -> MinimalKick:
+def _described(
+    settling: Settling, kick: Kick, found: _Found, longest: int, cycle: int, phase: float
+) -> MinimalKick:
     """A kick, with what simulation says of it."""
-    settling, kick, z = here.settling, here.kick, found.z
-    aside = kick.rows(np.array([1 - ASIDE, 1 + ASIDE])[:, None] * z)
+    z = found.z
+    aside = kick.rows(np.array([1 - _ASIDE, 1 + _ASIDE])[:, None] * z)
     verdicts = settling.judge(aside)
     row = kick.rows(z)
     changed = components(settling.state(row - kick.start))
@@ -277,9 +292,9 @@ def _described(here: Here, found: Found, longest: int) -> MinimalKick:
         kick={name: x for name, x in changed.items() if kicked[name] > 0},
         norm=float(np.linalg.norm(z)),
         start=settling.state(row),
-        settles=settled_orbit(settling, aside[1], longest),
-        cycle=here.cycle,
-        phase=here.phase,
+        settles=settling.settled_orbit(aside[1], longest),
+        cycle=cycle,
+        phase=phase,
         edge=found.edge,
         residual=float(found.residual),
         exact=found.exact,

@@ -2,6 +2,7 @@
 
 import copy
 import math
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -10,12 +11,13 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
+from .._checks import count, given_number
 from .._messages import Tell, silent
 from .._programs import compiled
 from .._types import State
-from ..flow import RESULTS, Run, RunOptions, simulate_pool
-from ..machine import in_rows, is_autonomous
-from ..orbit import CycleMap
+from ..flow import RESULTS, MethodLike, Run, RunOptions, simulate, simulate_pool
+from ..machine import AbstractMachine, bare, begin_modes, field_in, in_rows, is_autonomous
+from ..orbit import CycleMap, Orbit, adopted, cycle_map, distance, find_orbit
 
 Row = Float[np.ndarray, " _"]
 """The numbers of a state, or of a kick."""
@@ -30,9 +32,11 @@ outside of the bounds)."""
 # few starts cost few. A choice.
 _LANES = 1024
 
-# A motion whose sections change by less than this, relative to 1 + |state|, is where it will stay,
-# or nearer to an unstable one than starts are told apart. A choice.
-_STILL = 1e-11
+# All relative to 1 + |state|. A motion whose sections change by less than the first is where it
+# will stay, or nearer to an unstable one than starts are told apart; section states a period apart
+# are the same within the second; an orbit that is found from a state is its motion if it lies as
+# near as the third; the last is an equilibrium's rate of change. Choices.
+_STAYS, _SAME, _NEAR, _STILL = 1e-11, 1e-5, 1e-3, 1e-8
 
 # Sections of a motion that are recorded at once. A choice: longer ones are put together.
 TRAIL = 16
@@ -47,17 +51,14 @@ class Settling:
     has shrunk to rounding, where its sections would be noise.
 
     **Arguments:** the map of one cycle; a state, for its structure; the motion's section states;
-    cycles after which a start that has not come back is elsewhere; the tolerance; how long after
-    the section starts are, by the clock of a machine with a drive (a cycle ends on its section).
+    cycles after which a start that has not come back is elsewhere; the tolerance.
     """
 
-    def __init__(
-        self, the_map: CycleMap, like: State, motion: Rows, settle: int, tolerance: float,
-        begin: float = 0.0,
-    ):  # fmt: skip
+    def __init__(self, the_map: CycleMap, like: State, motion: Rows, settle: int, tolerance: float):
         self.the_map, self.like, self.motion = the_map, like, motion
-        self.begin = begin
         self.settle, self.tolerance = settle, tolerance
+        self.begin = 0.0
+        """How long after the section starts are, by the clock of a machine with a drive."""
         self._judged_so_far: list[int] = []
         self.tell: Tell = silent
         """Told of each start that is judged."""
@@ -77,27 +78,19 @@ class Settling:
         """A state from its numbers."""
         return ravel_pytree(self.like)[1](jnp.asarray(row))
 
-    def distances(self, rows: Rows) -> Float[np.ndarray, "lanes sections"]:
-        """How far section states lie from each of the motion's, relative to 1 + |state|."""
-        apart = np.abs(rows[:, None] - self.motion) / (1 + np.abs(self.motion))
-        return apart.max(axis=2)
-
     def distance(self, rows: Rows) -> Float[np.ndarray, " lanes"]:
-        """How far section states lie from the motion's nearest one."""
-        return self.distances(rows).min(axis=1)
+        """How far section states lie from the motion's nearest one, relative to 1 + |state|."""
+        return distance(rows[:, None], self.motion).min(axis=1)
 
     def judge(self, rows: Rows) -> Int[np.ndarray, " lanes"]:
         """`RETURNS`, `ELSEWHERE` or `INADMISSIBLE` for each start."""
-        found = [self._judged(rows[i : i + _LANES]) for i in range(0, len(rows), _LANES)]
-        return np.concatenate(found)
+        return np.concatenate([self._judged(*part) for part in _filled(rows)])
 
-    def _judged(self, rows: Rows) -> Int[np.ndarray, " lanes"]:
-        """The same for at most as many as the program has lanes."""
-        count = len(rows)
+    def _judged(self, here: Rows, goes_on: Bool[np.ndarray, " lanes"]) -> Int[np.ndarray, " _"]:
+        """The same for as many as the program has lanes, of those that count."""
+        count = int(goes_on.sum())
         self._judged_so_far.append(count)
         self.tell(count)
-        here = np.concatenate([rows, np.broadcast_to(rows[:1], (_LANES - count, rows.shape[1]))])
-        goes_on = np.arange(_LANES) < count
         # What is on the motion need not come back to it; an equilibrium meets no section at all.
         off = self.distance(here) > 0
         verdict = np.where(off | (self.begin > 0), ELSEWHERE, RETURNS)
@@ -106,12 +99,11 @@ class Settling:
         while done < self.settle and goes_on.any():
             step = min(max(1, done // 4), self.settle - done)
             begin = 0.0 if done else self.begin
-            there, good, bad_start = advanced(self.the_map, self.like, here, step, goes_on, begin)
+            there, good, bad_start = self._advanced(here, step, goes_on, begin)
             if not done:
                 verdict[goes_on & bad_start] = INADMISSIBLE
             # What repeats has settled: to go on would cost, and end an equilibrium in noise.
-            moves = np.max(np.abs(there - here) / (1 + np.abs(here)), axis=1) > _STILL
-            moves |= begin > 0
+            moves = (distance(there, here) > _STAYS) | (begin > 0)
             here = np.where((goes_on & good)[:, None], there, here)
             goes_on &= good
             returned = goes_on.copy()
@@ -121,16 +113,19 @@ class Settling:
             done += step
         return verdict[:count]
 
+    def _advanced(
+        self, rows: Rows, cycles: int, wanted: Bool[np.ndarray, " lanes"], begin: float
+    ) -> list[np.ndarray]:
+        """States so many cycles later, whether they got there, and whether they were no starts."""
+        numbers = (jnp.asarray(x) for x in (rows, cycles, wanted, begin))
+        return [np.asarray(x) for x in _advanced(self.the_map, self.like, *numbers)]
+
     def carried(self, rows: Rows, cycles: int) -> Rows:
         """States so many cycles later; NaN for a start that does not get there."""
         found = []
-        for i in range(0, len(rows), _LANES):
-            part, wanted = rows[i : i + _LANES], np.arange(_LANES) < len(rows) - i
-            filled = np.broadcast_to(part[:1], (_LANES - len(part), rows.shape[1]))
-            there, good, _ = advanced(
-                self.the_map, self.like, np.concatenate([part, filled]), cycles, wanted, self.begin
-            )
-            found.append(np.where(good[:, None], there, np.nan)[: len(part)])
+        for part, wanted in _filled(rows):
+            there, good, _ = self._advanced(part, cycles, wanted, self.begin)
+            found.append(np.where(good[:, None], there, np.nan)[wanted])
         return np.concatenate(found)
 
     def first_change(self, rows: Float[np.ndarray, "rays points states"]) -> tuple[Any, Any]:
@@ -159,7 +154,7 @@ class Settling:
         """Two starts on the line between two others, that comes back and that does not, so close
         to each other (relative to 1 + |state|). Fifteen points at once are judged between them."""
         parts = np.linspace(0, 1, 17)[1:-1, None]
-        while np.max(np.abs(outside - inside) / (1 + np.abs(inside))) > width:
+        while distance(outside, inside) > width:
             between = inside + parts * (outside - inside)
             (place,), _ = self.first_change(between[None])
             ends = np.concatenate([inside[None], between, outside[None]])
@@ -168,18 +163,135 @@ class Settling:
             inside, outside = ends[place], ends[place + 1]
         return inside, outside
 
+    def settled_rows(self, start: Row, longest: int) -> Rows | None:
+        """The section states of one period of the motion that a start settles on; `None` if it has
+        none of at most `longest` cycles, or comes to no end."""
+        last = self.carried(start[None], self.settle)
+        if not np.isfinite(last).all():
+            return None
+        rows = self.starting(0.0).trail(last, 2 * longest)[0]
+        for period in range(1, longest + 1):
+            if distance(rows[:-period], rows[period:]).max() <= _SAME:
+                return rows[:period]
+        return None
 
-def advanced(
-    the_map: CycleMap, like: State, rows: object, cycles: int, wanted: object, begin: float = 0.0
-) -> tuple[Rows, Bool[np.ndarray, " lanes"], Bool[np.ndarray, " lanes"]]:
-    """States so many cycles later, whether they got there, and whether they were no starts.
+    def settled_orbit(self, start: Row, longest: int) -> Orbit | None:
+        """The motion that a start settles on, made exact; `None` where none is found."""
+        rows = self.settled_rows(start, longest)
+        return None if rows is None else self.orbit_near(rows[0], len(rows), _NEAR)
 
-    **Arguments:** `begin`, the clock of the starts since the section.
+    def orbit_near(self, row: Row, cycles: int, near: float) -> Orbit | None:
+        """The periodic motion that a search from a state finds, if it lies near to that."""
+        the_map = self.the_map
+        orbit = find_orbit(the_map.machine, self.state(row), cycles, method=the_map.method)
+        if not bool(orbit.successful):
+            return None
+        sections = np.asarray(in_rows(orbit.sections))
+        return orbit if distance(row, sections).min() <= near else None
+
+    def later(self, start: Row, phase: float) -> tuple["Settling", Row]:
+        """What judges starts so long after a section state of the motion, and the state then.
+
+        **Raises:** `ValueError` for an equilibrium, and for a phase beyond the cycle.
+        """
+        machine, method = self.the_map.machine, self.the_map.method
+        if _stands_still(machine, self.state(start)):
+            raise ValueError(
+                "Argument `phase` must be 0 for an equilibrium, which is always the same."
+            )
+        row = self.motion[distance(start, self.motion).argmin()]
+        state, autonomous = self.state(row), is_autonomous(machine, self.like)
+        length = float(jnp.asarray(machine.cycle))
+        if autonomous:
+            run = simulate(machine, state, 1)
+            assert run.duration is not None
+            length = float(run.duration[0])
+        if not phase < length:
+            raise ValueError(
+                f"Argument `phase` must be less than the {length:.9g} that its cycle takes, but "
+                f"got {phase:.9g}. See `cycle`."
+            )
+        if autonomous:
+            # At equal intervals it meets no section, and needs no clock.
+            every = machine.observed_every(phase)
+            run = simulate(every, state, 1, method=method, record="sections")
+            return self, in_row(bare(run.last))
+        there = _until(self.the_map, self.like, jnp.asarray(row), jnp.asarray(phase))
+        return self.starting(phase), np.asarray(there)
+
+
+def in_row(state: State) -> Row:
+    """The numbers of a state."""
+    return np.asarray(in_rows(state, 0))
+
+
+def one_orbit(name: str, orbit: object) -> Orbit:
+    """**Raises:** `ValueError` unless this is one orbit that was found."""
+    if not isinstance(orbit, Orbit) or orbit.residual.ndim or not bool(orbit.successful):
+        raise ValueError(
+            f"Argument `{name}` must be one orbit that was found, but is a batch, a failed search "
+            "or something else. See `Orbit.result`."
+        )
+    return orbit
+
+
+def settling_on(
+    machine: AbstractMachine,
+    motion: Orbit | State,
+    settle: int,
+    tolerance: float,
+    longest: int,
+    method: MethodLike,
+    name: str,
+    cycle: int = 0,
+) -> tuple[Settling, Row]:
+    """What judges starts by whether they come back to a motion, and a state of the motion.
+
+    **Arguments:** those of `edge_state`; the name of the motion's argument; which of the section
+    states of an orbit is asked for.
+
+    **Raises:** `ValueError` or `TypeError` for arguments that cannot be used.
     """
-    numbers = (jnp.asarray(x) for x in (rows, cycles, wanted, begin))
-    found = _advanced(the_map, like, *numbers)
-    rows, good, bad = (np.asarray(x) for x in found)
-    return rows, good, bad
+    settle = count("settle", settle, least=1)
+    tolerance = given_number("tolerance", tolerance, low=0.0, open_low=True)
+    the_map = cycle_map(machine, method=method)
+    if isinstance(motion, Orbit):
+        if not bool(one_orbit(name, motion).stable):
+            raise ValueError(f"Argument `{name}` must be a stable orbit, but this one is not.")
+        like = bare(adopted(the_map.machine, motion.state, name))
+        rows = np.asarray(in_rows(motion.sections))[: int(motion.cycles)]
+        return Settling(the_map, like, rows, settle, tolerance), rows[cycle % len(rows)]
+    like = bare(adopted(the_map.machine, motion, name))
+    start = in_row(like)
+    settling = Settling(the_map, like, start[None], settle, tolerance)
+    if _stands_still(the_map.machine, like):
+        return settling, start
+    rows = settling.settled_rows(start, longest)
+    if rows is None:
+        raise ValueError(
+            f"Argument `{name}` must settle on a motion that repeats within {longest} cycles, but "
+            f"does not within {settle} cycles. See `settle` and `longest`."
+        )
+    return Settling(the_map, like, rows, settle, tolerance), start
+
+
+def _stands_still(machine: AbstractMachine, state: State) -> bool:
+    """Whether a state is an equilibrium of a machine without a drive, which meets no section."""
+    if not is_autonomous(machine, state):
+        return False
+    here = in_row(state)
+    s = jnp.zeros((), here.dtype)
+    rate = in_row(field_in(machine, s, state, begin_modes(machine, s, state)))
+    return bool(np.all(np.abs(rate) <= _STILL * (1 + np.abs(here))))
+
+
+def _filled(rows: Rows) -> Iterator[tuple[Rows, Bool[np.ndarray, " lanes"]]]:
+    """Rows in parts of as many as the program has lanes, the last one filled up; and which are
+    wanted."""
+    for i in range(0, len(rows), _LANES):
+        part = rows[i : i + _LANES]
+        more = np.broadcast_to(part[:1], (_LANES - len(part), rows.shape[1]))
+        yield np.concatenate([part, more]), np.arange(_LANES) < len(part)
 
 
 @compiled
@@ -212,7 +324,7 @@ def _trail(the_map: CycleMap, like: State, rows: Array, begin: Array) -> Array:
 
 
 @compiled
-def until(the_map: CycleMap, like: State, row: Array, clock: Array) -> Array:
+def _until(the_map: CycleMap, like: State, row: Array, clock: Array) -> Array:
     """The state of a machine with a drive at a clock within the cycle that begins in a state."""
     return in_rows(_runs(the_map, like, row[None], 1, 0, None, until=clock).sections, 2)[0, -1]
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from .._types import State
 from ..machine import in_rows
-from ..orbit import CycleMap, Orbit, cycle_map
+from ..orbit import CycleMap, Orbit, cycle_map, distance
 from ._rays import Kick, Kicks
 from ._settling import Row, Rows, Settling, images
 
@@ -75,9 +75,9 @@ def shortest(settling: Settling, kick: Kick, saddle: Orbit, z: Row) -> Shortest 
     rows, normals = _frame(settling, saddle)
     if not np.isfinite(normals).all():
         return None
-    period, scale = len(rows), 1 + np.abs(rows)
+    period = len(rows)
     trail = settling.trail(kick.rows(z)[None], _longest(saddle) * period)[0]
-    apart = np.max(np.abs(trail[1:, None] - rows) / scale, axis=2)
+    apart = distance(trail[1:, None], rows)
     near = np.flatnonzero(apart.min(axis=1) <= _BEGINS)
     if not near.size:
         return None
