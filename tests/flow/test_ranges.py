@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-from vi_jax.flow.results import BAD_START, number_of
+from vi_jax.flow.results import code as code_of
+from vi_jax.flow.results import number_of
 
 CYCLES = 3
 BASE = vi.Scene(
@@ -55,7 +56,7 @@ def test_a_traced_number_out_of_range_ends_its_lane_and_no_other():
         rows += [[*rows[0][:i], value, *rows[0][i + 1 :]], rows[0]]
     good = lanes(jnp.asarray(rows[:1] * len(rows)), jnp.full(len(rows), 1.0))
     codes, Y, steps = lanes(jnp.asarray(rows), jnp.full(len(rows), 1.0))
-    expected = np.where(np.arange(len(rows)) % 2 == 1, BAD_START, 0)
+    expected = np.where(np.arange(len(rows)) % 2 == 1, code_of("bad_start"), 0)
     by_place = dict(zip(["base", *np.repeat(list(PLACES), 2)], codes.tolist(), strict=True))
     assert codes.tolist() == expected.tolist(), by_place
     fine = expected == 0
@@ -68,11 +69,11 @@ def test_a_traced_settle_is_a_number_of_cycles_or_the_lane_is_refused():
     settle = jnp.asarray([0.0, -5.0, jnp.nan, 2.5, jnp.inf, 1e300, 2.0])
     rows = jnp.asarray([inside()] * len(settle))
     codes, Y, _ = lanes(rows, settle)
-    assert codes.tolist() == [0, *[BAD_START] * 5, 0]
+    assert codes.tolist() == [0, *[code_of("bad_start")] * 5, 0]
     assert np.isfinite(np.asarray(Y)[[0, -1]]).all()
     # The same with integers that are traced.
     codes, again, _ = lanes(rows, jnp.asarray([0, -5, -1, 2, 2, 2, 2]))
-    assert codes.tolist() == [0, BAD_START, BAD_START, 0, 0, 0, 0]
+    assert codes.tolist() == [0, code_of("bad_start"), code_of("bad_start"), 0, 0, 0, 0]
     np.testing.assert_array_equal(again[-1], Y[-1])
 
 
@@ -114,7 +115,7 @@ def test_parameters_out_of_range_make_no_scene_that_runs():
         scene = table.scene(drive="ideal")
         return number_of(vi.simulate(scene, scene.start(Y=-3.0), 1).result)
 
-    assert jax.jit(jax.vmap(code))(jnp.asarray([0.04, -0.04])).tolist() == [0, BAD_START]
+    assert jax.jit(jax.vmap(code))(jnp.asarray([0.04, -0.04])).tolist() == [0, code_of("bad_start")]
     with pytest.raises(ValueError, match="crank_radius"):
         code(jnp.asarray(-0.04))
 
@@ -136,5 +137,5 @@ def test_single_precision_counts_no_further_than_it_can():
         def code(settle):
             return number_of(vi.simulate(scene, start, 1, settle=settle).result)
 
-        assert jax.jit(code)(jnp.float32(2.0**24)) == BAD_START
+        assert jax.jit(code)(jnp.float32(2.0**24)) == code_of("bad_start")
         assert jax.jit(code)(jnp.float32(3.0)) == 0

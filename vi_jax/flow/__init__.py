@@ -13,14 +13,16 @@ from .arguments import check_values as check_values
 from .arguments import machine_of as machine_of
 from .arguments import planned as planned
 from .arguments import shape_of as shape_of
-from .beside import Beside as Beside
-from .beside import elapsed as elapsed
-from .beside import means as means
 from .enumeration import NamedEnumeration as NamedEnumeration
 from .events import Rates as Rates
 from .events import guard_rates as guard_rates
 from .fusion import compiling as compiling
 from .fusion import jit as jit
+from .integrals import TIME as TIME
+from .integrals import Integrals as Integrals
+from .integrals import carried as carried
+from .integrals import elapsed as elapsed
+from .integrals import means as means
 from .labelled import batch_names as batch_names
 from .labelled import in_names as in_names
 from .labelled import present as present
@@ -51,7 +53,6 @@ from .noise import words_of as words_of
 from .options import RunOptions as RunOptions
 from .results import EVENTS as EVENTS
 from .results import REASON_NAMES as REASON_NAMES
-from .results import REASONS as REASONS
 from .results import RESULTS as RESULTS
 from .results import Errors as Errors
 from .results import EventLog as EventLog

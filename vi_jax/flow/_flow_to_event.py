@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from .._types import Scalar
 from ..machine import guard_of, section_number
 from ._lane import Plan
-from .beside import rate_beside
 from .events import rates
+from .integrals import rate_of_integrals
 from .smooth import SmoothMachine, holding
 
 
@@ -19,8 +19,8 @@ class FlowToEvent:
     """The motion close to an event, as the functions that `drift` asks for: its rate, and guards,
     positions and forces along it.
 
-    Each is a function of `(moving, fixed, rest)`: `moving` is s, the state, and the time and
-    integrals beside it (or `None`), `fixed` what may have a derivative besides, `rest` the arrays
+    Each is a function of `(moving, fixed, rest)`: `moving` is s, the state, and the
+    integrals beside it, `fixed` what may have a derivative besides, `rest` the arrays
     that have none. The functions close over no number, so that JAX can differentiate them again.
 
     **Arguments:** `smooth`, the machine in its modes; `part`, the index of the interval within its
@@ -75,7 +75,7 @@ class FlowToEvent:
 
     def _rate(self, moving, fixed, rest):
         (smooth, _), (s, state, time) = self._whole(fixed, rest), moving
-        return jnp.ones_like(s), smooth.field(s, state), rate_beside(smooth, s, state, time)
+        return jnp.ones_like(s), smooth.field(s, state), rate_of_integrals(smooth, s, state, time)
 
     def _whole(self, fixed: object, rest: object) -> Any:
         return eqx.combine(fixed, rest, self._static)

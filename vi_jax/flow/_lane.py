@@ -1,7 +1,7 @@
 """What the flat loop carries: one trajectory on its way, and what is asked of it."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -17,8 +17,10 @@ from ..machine import (
     section_number,
     with_modes,
 )
-from .beside import Beside
+from .integrals import TIME, Integrals
+from .labelled import EventKind
 from .methods import AbstractMethod
+from .results import code
 
 # What the next step aims at: nothing, or one of those below. Numbers, which the loop carries.
 FREE = 0.0
@@ -40,10 +42,6 @@ def to_release(k: int) -> float:
     return -2.0 - 2 * k
 
 
-# Kinds of events as the log of all of them lists them: their places in `results.EVENTS`.
-HIT, RESTS, LEAVES, CHANGES, RESETS = 0.0, 1.0, 2.0, 3.0, 4.0
-
-
 def total(tree: object, start: Scalar) -> Scalar:
     """Sum of all numbers in a tree and of `start`: finite if all of them are."""
     for leaf in jtu.tree_leaves(tree):
@@ -61,11 +59,10 @@ def in_place(values: tuple, k: int, value: object) -> tuple:
     return (*values[:k], value, *values[k + 1 :])
 
 
-class Record(eqx.Module):
+class Record(NamedTuple):
     """What is kept of an interval between two record points; `None` where it was not asked for."""
 
-    time: Beside | None
-    """Elapsed time, and the integrals over it."""
+    integrals: Integrals
     y_max: Scalar | None
     y_min: Scalar | None
     impacts: Scalar
@@ -80,8 +77,11 @@ class Record(eqx.Module):
     """Clock, kind, number and value of each event, NaN where there was none."""
 
 
-class Lane(eqx.Module):
-    """One trajectory on its way. All floats: other types would keep the loop from fusing."""
+class Lane(NamedTuple):
+    """One trajectory on its way. All floats: other types would keep the loop from fusing.
+
+    A step makes another lane of it, and so does each event that is met there.
+    """
 
     s: Scalar
     state: State
@@ -116,6 +116,63 @@ class Lane(eqx.Module):
     shaken: Scalar | None = None
     """The time of the interval at the last impulse of noise; absent where impulses come at times
     that are known beforehand."""
+    completed: Flag | None = None
+    """Whether the interval is complete, while the events of a step are applied; absent between
+    steps."""
+
+    def ended(self, where: Flag, when: Flag | None, reason: str | float) -> "Lane":
+        """The lane with a reason to end.
+
+        **Arguments:** `where`, whether the event was met; `when`, whether it ends the lane, `None`
+        if it never can; `reason`, the name of one of `RESULTS`, or a number as the loop
+        carries it.
+        """
+        if when is None:
+            return self
+        number = code(reason) if isinstance(reason, str) else reason
+        return self._replace(fault=jnp.where(where & when, number, self.fault))
+
+    def completing(self, when: Flag) -> "Lane":
+        """The lane with its interval complete where `when` holds."""
+        assert self.completed is not None
+        return self._replace(completed=self.completed | when)
+
+    def recording(self, **changes: Any) -> "Lane":
+        """The lane with other fields of its record."""
+        return self._replace(record=self.record._replace(**changes))
+
+    def noting(
+        self, when: Flag, clock: Scalar, kind: EventKind | Scalar, number: Any, value: Any
+    ) -> "Lane":
+        """The lane with an event in the log of all events, behind those that it holds, if there is
+        room.
+
+        **Arguments:** `when`, whether the event happened; `clock`, the reading of `Plan.clock`;
+        `number` and `value`, as in `EventLog`.
+        """
+        events = self.record.events
+        if events is None:
+            return self
+        place = jnp.sum(jnp.where(jnp.isnan(events[1]), 0.0, 1.0))
+        return self.recording(events=_written(events, when, place, clock, kind, number, value))
+
+    def counting(self, when: Flag, clock: Scalar, speed: Scalar, number: Any) -> "Lane":
+        """The lane with an impact counted, and in the log of impacts, if there is room.
+
+        **Arguments:** `when`, whether the impact happened; `clock`, as for `noting`; `speed`, V⁻;
+        `number`, that of the stop.
+        """
+        log, impacts = self.record.log, self.record.impacts
+        if log is not None:
+            log = _written(log, when, impacts, clock, speed, number)
+        return self.recording(log=log, impacts=impacts + jnp.where(when, 1.0, 0.0))
+
+
+def _written(log: Array, when: Flag, place: Scalar, *entry: Any) -> Array:
+    """A log with an entry at this place, if it has one."""
+    here = when & (jnp.arange(log.shape[1], dtype=log.dtype) == place)
+    column = jnp.stack([jnp.asarray(x, log.dtype) for x in entry])
+    return jnp.where(here, column[:, None], log)
 
 
 def ticks(machine: AbstractMachine, state: State) -> bool:
@@ -249,6 +306,11 @@ class Plan(eqx.Module):
         """Whether `s` itself counts the cycles."""
         return ticks(self.machine, state)
 
+    def clock(self, s: Scalar, state: State) -> Scalar:
+        """The reading of what counts the cycles, `s` itself or the machine's clock."""
+        clock = self.machine.clock(state)
+        return s if clock is None else clock
+
     def timed(self, state: State) -> bool:
         """Whether the duration of a cycle is recorded, which only a fixed one need not be; or the
         time between impulses is measured."""
@@ -256,13 +318,21 @@ class Plan(eqx.Module):
             return True
         return self.motion and not has_fixed_cycle(self.machine, state)
 
-    def meets_turns(self, done: Scalar) -> Flag | bool:
-        """Whether steps end on every turning point, for extremes, and since switches and events may
-        be there; or only on those close to a stop. A flag where that depends on how many intervals
-        are done, else known while the program is traced."""
-        if self.machine.switches or self.machine.others:
-            return True
-        return (done >= self.settle) if self.motion else False
+    @property
+    def meets_every_turn(self) -> bool:
+        """Whether steps always end on every turning point, since switches and events may be
+        there."""
+        return bool(self.machine.switches or self.machine.others)
+
+    def meets_turns(self, done: Scalar) -> Flag:
+        """Whether steps end on every turning point, for extremes too, or only on those close to a
+        stop.
+
+        **Arguments:** `done`, how many intervals are complete.
+        """
+        if self.motion and not self.meets_every_turn:
+            return done >= self.settle
+        return jnp.full_like(done, self.meets_every_turn, bool)
 
     def point(self, state: State, modes: Scalars) -> State:
         """What is kept of the end of an interval: the state, with the machine's own modes if it has
@@ -273,8 +343,9 @@ class Plan(eqx.Module):
         """The record of an interval that begins in `state`."""
         Y = self.machine.position(state)
         zero = jnp.zeros_like(Y)
+        names = (TIME, *self.averages) if self.timed(state) else self.averages
         return Record(
-            time=self._beside(state, zero),
+            integrals=dict.fromkeys(names, zero),
             y_max=Y if self.motion else None,
             y_min=Y if self.motion else None,
             impacts=zero,
@@ -285,13 +356,6 @@ class Plan(eqx.Module):
             clearance=jnp.full_like(Y, jnp.inf) if self.motion and self.log else None,
             events=jnp.full((4, self.events), jnp.nan, Y.dtype) if self.events else None,
         )
-
-    def _beside(self, state: State, zero: Scalar) -> Beside | None:
-        """Time and integrals as an interval begins; `None` where neither is asked for."""
-        timed = self.timed(state)
-        if not timed and not self.averages:
-            return None
-        return Beside(zero if timed else None, {name: zero for name in self.averages})
 
     def place(self, k: int, contact: Scalar, otherwise: Scalar) -> Scalar:
         """The position of coordinate number k while it rests on the stop named by `contact` (see

@@ -7,11 +7,11 @@ import jax.tree_util as jtu
 
 from .._types import Flag, Scalar, State
 from ..machine import begin_modes, holds_anywhere, rubs, struck_modes
-from . import results
 from ._lane import Lane, Plan, to_event, total
 from ._own import check_field, check_laws
 from ._own_parts import check_events
 from .events import Rates, force_rate, rates
+from .results import code
 from .smooth import in_modes, rounding
 
 
@@ -71,7 +71,7 @@ def launched(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
         aims=zero,
         part=plan.first_part(zero) if plan.instants > 1 else zero,
         done=zero,
-        fault=jnp.where(bad, float(results.BAD_START), zero),
+        fault=jnp.where(bad, code("bad_start"), zero),
         steps=zero,
         spent=zero,
         rejected=zero,

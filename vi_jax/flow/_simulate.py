@@ -19,13 +19,13 @@ from ..machine import AbstractMachine, bare, modes_of, stated
 from ._failed_derivatives import failed_derivatives
 from ._lane import Plan, Record
 from .arguments import planned
-from .beside import means
+from .integrals import TIME, means
 from .loop import Ends, run_lane
 from .methods import MethodLike
 from .named import has_quantities
 from .noise import with_noise
 from .options import RunOptions
-from .results import Errors, EventLog, ImpactLog, Run, Samples, outcome_of, reason
+from .results import Errors, EventLog, ImpactLog, Run, Samples, outcome_of, reason_of
 
 _FAILED = "A lane of the simulation failed; see `RESULTS` and `Run.result`."
 
@@ -174,8 +174,8 @@ def collect(plan: Plan, sampled: bool, lane: Ends, points: State, records: Recor
     def per_cycle(values, reduce):
         return None if values is None else reduce(values.reshape(plan.cycles, parts), axis=1)
 
-    passed = records.time
-    times = None if passed is None else passed.time
+    integrals = dict(records.integrals)
+    times = integrals.pop(TIME, None)
 
     def whole(values):
         return jnp.where(jnp.isfinite(values), values, 0.0).astype(jnp.int32)
@@ -185,10 +185,10 @@ def collect(plan: Plan, sampled: bool, lane: Ends, points: State, records: Recor
     if plan.motion:
         duration = period if times is None else per_cycle(times, jnp.sum)
     averages = {}
-    if passed is not None and passed.integrals:
+    if integrals:
         # Where s does not measure time but is in proportion to it, the integrals are over s.
         length = jnp.asarray(machine.cycle, period.dtype) if times is None else duration
-        sums = {name: per_cycle(x, jnp.sum) for name, x in passed.integrals.items()}
+        sums = {name: per_cycle(x, jnp.sum) for name, x in integrals.items()}
         averages = means(sums, length)
     quantities = _quantities(plan, points)
     dense = None
@@ -215,7 +215,7 @@ def collect(plan: Plan, sampled: bool, lane: Ends, points: State, records: Recor
         impact_log=log,
         event_log=_events(plan, records.events) if plan.events else None,
         errors=None,
-        result=reason(lane.fault),
+        result=reason_of(lane.fault),
         steps=lane.steps.astype(jnp.int32),
         rejected=lane.rejected.astype(jnp.int32),
         averages=averages,

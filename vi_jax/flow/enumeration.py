@@ -79,3 +79,8 @@ else:
 
     # Equinox takes the name in a body for that of a member.
     NamedEnumeration.where = classmethod(_where)
+
+
+def names_of(kind: type) -> tuple[str, ...]:
+    """The names of the members of an enumeration, in their order."""
+    return tuple(kind._name_to_item)  # pyright: ignore[reportAttributeAccessIssue]

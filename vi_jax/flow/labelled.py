@@ -1,5 +1,6 @@
 """Results as labelled data sets, for what reads xarray: ArviZ, hvPlot, NetCDF, Zarr."""
 
+import enum
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -11,10 +12,26 @@ from .._checks import one_of
 from .._types import State, xr
 from ..machine import by_name, with_units
 
-EVENTS = ("impact", "rest", "release", "mode", "reset")
-"""What may happen to a motion, as `EventLog` lists it: an impact on a stop; a body that comes to
-rest on one; a body that leaves the stop on which it rested; a switch that changes its mode; one of
-the machine's `events`."""
+
+class EventKind(enum.IntEnum):
+    """What may happen to a motion, as `EventLog` lists it."""
+
+    impact = 0
+    """On a stop."""
+    rest = 1
+    """A body comes to rest on a stop."""
+    release = 2
+    """A body leaves the stop on which it rested."""
+    mode = 3
+    """A switch changes its mode."""
+    reset = 4
+    """One of the machine's `events`."""
+
+
+EVENTS = tuple(kind.name for kind in EventKind)
+"""The names of what may happen to a motion, as `EventLog` lists it: an impact on a stop; a body
+that comes to rest on one; a body that leaves the stop on which it rested; a switch that changes its
+mode; one of the machine's `events`."""
 
 Variables = dict[str, tuple[tuple[str, ...], np.ndarray]]
 

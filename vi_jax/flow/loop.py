@@ -76,15 +76,15 @@ def _begin(rest: Plan, inputs: _Inputs) -> tuple[Lane, lanes.Emitted]:
 
 def _step(rest: Plan, inputs: _Inputs, lane: Lane) -> tuple[Lane, lanes.Emitted]:
     plan = eqx.combine(inputs[0], rest)
-    new = iterate(plan, lane)
-    complete = new.completed & (new.lane.done >= plan.settle)
-    active = _active(plan, new.lane)
+    lane, completed, record = iterate(plan, lane)
+    complete = completed & (lane.done >= plan.settle)
+    active = _active(plan, lane)
     if plan.stop is not None:
-        first = new.lane.done <= plan.settle
-        left = plan.stop(plan.machine, new.state, new.record, first)
+        first = lane.done <= plan.settle
+        left = plan.stop(plan.machine, lane.state, record, first)
         active = active if left is None else active & ~(complete & left)
-    here = plan.point(new.state, new.lane.modes)
-    return new.lane, lanes.Emitted(active, complete, (here, new.record))
+    here = plan.point(lane.state, lane.modes)
+    return lane, lanes.Emitted(active, complete, (here, record))
 
 
 def _end(inputs: _Inputs, lane: Lane) -> Ends:

@@ -1,12 +1,13 @@
 """Why a simulation ended, and what it returns."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._messages import so_many
@@ -22,8 +23,7 @@ from ..machine import (
     state_in_words,
     with_modes,
 )
-from ._listed import listed
-from .enumeration import NamedEnumeration
+from .enumeration import NamedEnumeration, names_of
 from .labelled import EVENTS as EVENTS
 from .labelled import in_names, place_of, run_dataset
 
@@ -47,6 +47,10 @@ class RESULTS(NamedEnumeration):
     underflow = "The step size fell below what the precision resolves. Loosen the tolerance."
     not_finite = "The state ceased to be finite."
     unresolved = "An impact could not be located within the step."
+    max_steps = (
+        "The number of steps exceeded `max_steps` before the last cycle was complete, or 65,536 "
+        "within one, as where an autonomous machine comes to rest off its section."
+    )
     switch_unresolved = "The event of a switch could not be located within the step."
     section_unresolved = (
         "The end of a cycle, where the machine's section or clock says, could not be located "
@@ -54,10 +58,6 @@ class RESULTS(NamedEnumeration):
     )
     turn_unresolved = (
         "A turning point, or the release of a body from rest, could not be located within the step."
-    )
-    max_steps = (
-        "The number of steps exceeded `max_steps` before the last cycle was complete, or 65,536 "
-        "within one, as where an autonomous machine comes to rest off its section."
     )
     bad_impact = (
         "An impact left faster than it came, or further into its stop: a restitution law must have "
@@ -80,76 +80,43 @@ class RESULTS(NamedEnumeration):
     ended = "An event of the machine ended the motion; `Run.outcome` says with which outcome."
 
 
-# The loop carries reasons as numbers; this is their order.
-REASON_NAMES = (
-    "successful",
-    "bad_start",
-    "stalled",
-    "chatter",
-    "underflow",
-    "not_finite",
-    "unresolved",
-    "max_steps",
-    "switch_unresolved",
-    "section_unresolved",
-    "turn_unresolved",
-    "bad_impact",
-    "simultaneous",
-    "sliding",
-    "reset_unresolved",
-    "bad_reset",
-    "unstable",
-    "ended",
-)
-REASONS = tuple(getattr(RESULTS, name) for name in REASON_NAMES)
-(
-    SUCCESSFUL,
-    BAD_START,
-    STALLED,
-    CHATTER,
-    UNDERFLOW,
-    NOT_FINITE,
-    UNRESOLVED,
-    MAX_STEPS,
-    SWITCH_UNRESOLVED,
-    SECTION_UNRESOLVED,
-    TURN_UNRESOLVED,
-    BAD_IMPACT,
-    SIMULTANEOUS,
-    SLIDING,
-    RESET_UNRESOLVED,
-    BAD_RESET,
-    UNSTABLE,
-    ENDED,
-) = range(len(REASONS))
+REASON_NAMES = names_of(RESULTS)
+"""Their names, in the order of the numbers by which the loop carries them."""
+
+_REASONS = tuple(getattr(RESULTS, name) for name in REASON_NAMES)
 
 
-# The number of an outcome is a fraction that is added to the common reason `ENDED`.
+def code(name: str) -> float:
+    """The number by which the loop carries the reason of this name; 0 is success."""
+    return float(REASON_NAMES.index(name))
+
+
+# The number of an outcome is a fraction that is added to the common reason, `ended`.
 _OUTCOMES = 64
 
 
 def with_outcome(number: int) -> float:
     """The reason of a lane that an event ended, as a number, with the number of its outcome."""
-    return ENDED + number / _OUTCOMES
+    return code("ended") + number / _OUTCOMES
 
 
-def outcome_of(code: Scalar) -> Int[Array, ""]:
+def outcome_of(reason: Scalar) -> Int[Array, ""]:
     """The number of the outcome among the machine's; -1 of a lane that no event of its ended."""
-    number = jnp.round((code - ENDED) * _OUTCOMES).astype(jnp.int32)
-    return jnp.where(jnp.floor(code) == ENDED, number, -1)
+    number = jnp.round((reason - code("ended")) * _OUTCOMES).astype(jnp.int32)
+    return jnp.where(jnp.floor(reason) == code("ended"), number, -1)
 
 
-def reason(code: Scalar) -> RESULTS:
+def reason_of(reason: Scalar) -> RESULTS:
     """The enumeration item for a reason carried as a number."""
-    result, code = REASONS[0], jnp.floor(code)
-    for number, item in enumerate(REASONS[1:], start=1):
-        result = RESULTS.where(code == number, item, result)
+    result, number = _REASONS[0], jnp.floor(reason)
+    for n, item in enumerate(_REASONS[1:], start=1):
+        result = RESULTS.where(number == n, item, result)
     return result
 
 
 def number_of(result: RESULTS) -> Int[Array, "..."]:
-    """The place of a reason in `REASONS`; 0 is success."""
-    return place_of(result, REASONS)
+    """The place of a reason in `REASON_NAMES`; 0 is success."""
+    return place_of(result, _REASONS)
 
 
 class Samples(Shown):
@@ -165,6 +132,32 @@ class Samples(Shown):
     """The machine's own quantities there, by name (see `AbstractMachine.quantities`)."""
     modes: tuple[Float[Array, " points"], ...] = ()
     """The machine's own modes there (see `AbstractMachine.begin`)."""
+
+
+# Cycles of which a text tells, and events of each.
+_CYCLES, _EVENTS = 8, 6
+
+
+def _listed(what: str, used: object, word: Callable[[int, int], str]) -> str:
+    """How many there are, and those of the first cycles one by one.
+
+    **Arguments:** what is listed; which places of the log, (cycles, size) and batch axes before
+    them, are used; and what stands at such a place, in words.
+    """
+    used = np.asarray(used)
+    if used.ndim > 2:
+        return f"{int(used.sum())} {what}s in lanes of shape {used.shape[:-2]}"
+    many = so_many(int(used.sum()), what)
+    lines = [f"{many} listed in {so_many(len(used), 'cycle')}"]
+    some = np.flatnonzero(used.any(axis=1))
+    for i in some[:_CYCLES]:
+        places = np.flatnonzero(used[i])
+        words = [word(int(i), int(j)) for j in places[:_EVENTS]]
+        more = [f"and {len(places) - _EVENTS} more"] * (len(places) > _EVENTS)
+        lines.append(f"  cycle {i + 1}: {', '.join([*words, *more])}")
+    if len(some) > _CYCLES:
+        lines.append(f"  and {len(some) - _CYCLES} more cycles")
+    return "\n".join(lines)
 
 
 class ImpactLog(Summarized):
@@ -187,7 +180,7 @@ class ImpactLog(Summarized):
         def word(i: int, j: int) -> str:
             return f"stop {self.stop[i, j]} at {self.phase[i, j]:.6g} by {self.speed[i, j]:.4g}"
 
-        return listed("impact", self.stop >= 0, word)
+        return _listed("impact", self.stop >= 0, word)
 
 
 class EventLog(Summarized):
@@ -217,7 +210,7 @@ class EventLog(Summarized):
             of = {"mode": "switch", "reset": "event"}.get(kind, "stop")
             return f"{kind} ({of} {self.number[i, j]}{after}) at {self.phase[i, j]:.6g}"
 
-        return listed("event", self.number >= 0, word)
+        return _listed("event", self.number >= 0, word)
 
 
 class Errors(Shown):

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from .. import lanes
 from .._types import Scalar, Scalars, State, Vector
-from ..flow import AbstractMethod, Beside, SmoothMachine, elapsed, in_modes
+from ..flow import TIME, AbstractMethod, Integrals, SmoothMachine, carried, elapsed, in_modes
 from ..machine import AbstractMachine
 
 
@@ -35,13 +35,13 @@ class Flight(eqx.Module):
         """A state from its vector."""
         return ravel_pytree(self.like)[1](u)
 
-    def step(self, s0: Scalar, s1: Scalar, u: Vector, passed: Beside) -> tuple[Vector, Beside]:
+    def step(
+        self, s0: Scalar, s1: Scalar, u: Vector, passed: Integrals
+    ) -> tuple[Vector, Integrals]:
         """The state, and the time and integrals beside it, after one step of the method from `s0`
         to `s1`."""
         smooth, state = self.smooth, self.unravel(u)
-        paced, beside = smooth.pace(s0, state) is not None, None
-        if paced or passed.integrals:
-            beside = Beside(passed.time if paced else None, passed.integrals)
+        beside = carried(smooth, s0, state, passed)
         new, after, _ = self.method.step(smooth, s0, s1, state, beside)
         return ravel_pytree(new)[0], elapsed(passed, after, s1 - s0)
 
@@ -53,7 +53,7 @@ class Flight(eqx.Module):
 
     def fly(
         self, s0: Scalar, s1: Scalar, u: Vector, steps: int, averages: tuple[str, ...] = ()
-    ) -> tuple[Vector, Beside, tuple[Float[Array, " steps"], Float[Array, "steps states"]]]:
+    ) -> tuple[Vector, Integrals, tuple[Float[Array, " steps"], Float[Array, "steps states"]]]:
         """The flight from the state `u` at clock `s0` to clock `s1`, in equal steps.
 
         **Arguments:** `averages`, the names of the machine's averages to integrate.
@@ -86,9 +86,7 @@ def _of_flight(rest: Flight, function: Callable[[Flight, Any], Any], inputs: Any
 def _begin(averages: tuple[str, ...], inputs: Any) -> tuple[Any, lanes.Emitted]:
     _, s0, _, u = inputs
     zero = jnp.zeros_like(s0)
-    return (u, Beside(zero, {name: zero for name in averages}), zero), lanes.Emitted(
-        True, True, (s0, u)
-    )
+    return (u, {name: zero for name in (TIME, *averages)}, zero), lanes.Emitted(True, True, (s0, u))
 
 
 def _step(rest: Flight, steps: int, inputs: Any, carry: Any) -> tuple[Any, lanes.Emitted]:

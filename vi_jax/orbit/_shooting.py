@@ -21,7 +21,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from .._types import Scalar, State, Vector
-from ..flow import AbstractMethod, average_names, means
+from ..flow import TIME, AbstractMethod, average_names, means
 from ..machine import (
     AbstractMachine,
     after_event,
@@ -262,7 +262,8 @@ class Shooting(eqx.Module):
             monodromy = carried[leg] @ monodromy
         Y, before = jnp.concatenate(places), [self.unravel(u) for u in states]
         nearest = jnp.argmin(turns.nearest.room)
-        time, integrals = jax.tree.map(jnp.sum, passed)
+        integrals = jax.tree.map(jnp.sum, passed)
+        time = integrals.pop(TIME)
         timed = self.autonomous or machine.pace(clock[0], self.unravel(states[0])) is not None
         return Observed(
             multipliers=multipliers_of(monodromy),

@@ -14,7 +14,7 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
 from .._types import Flag, Scalar, State, Vector
-from ..flow import Beside, Rates, SmoothMachine, guard_rates
+from ..flow import Rates, SmoothMachine, guard_rates
 from ..machine import events_of, guard_of, happens_at, section_number
 from ._flight import Flight
 
@@ -198,7 +198,7 @@ def _stepped(flight: Flight, inputs: tuple[Scalar, Scalar, Vector]) -> Vector:
     """The state after one step; `inputs` are the clock, the length of the step, and the state
     before it."""
     s, h, u = inputs
-    return flight.step(s, s + h, u, Beside(jnp.zeros_like(s), {}))[0]
+    return flight.step(s, s + h, u, {})[0]
 
 
 def _turn(

@@ -1,29 +1,29 @@
 """The impacts of one instant: one blow on a stop, or a sequence between bodies that touch."""
 
+from typing import NamedTuple
+
 import jax.numpy as jnp
+from jax.lax import stop_gradient
 
-from ..._types import Flag, State
-from ...machine import AbstractMachine, rubs
-from .. import results
-from .._arrival import Arrival, ended
-from .._lane import Plan, select, to_event
-from .blow import Blow, gains_speed, listed
-from .sequence import strike_in_turn
+from ..._types import Flag, Scalar, State
+from ...machine import AbstractMachine, RigidStop, rubs
+from .._lane import Lane, Plan, select, to_event
+from ..labelled import EventKind
+
+# By so many roundings a rebound may be faster than the approach: a choice, a few more than the one
+# or two that a law's own arithmetic makes.
+_FASTER = 16.0
 
 
-def strike(
-    plan: Plan, taken: Flag, arrival: Arrival, landed: dict[int, Flag], there: State
-) -> tuple[Arrival, dict[int, Blow]]:
-    """The arrival after the impacts of one instant, and what they were to each coordinate, by its
-    number.
+class Blow(NamedTuple):
+    """What the impacts of one instant were to one coordinate."""
 
-    **Arguments:** `taken`, whether the step is taken; `landed`, of each stop, by its number,
-    whether the step landed on it; `there`, the state in which it did.
-    """
-    limited = sorted({stop.coordinate for stop in plan.machine.stops})
-    if not is_compound(plan.machine):
-        return _one_blow(plan, taken, arrival, landed, there, limited[0])
-    return strike_in_turn(plan, taken, arrival, landed, there, limited)
+    struck: Scalar
+    """1 + i if stop number i was struck last, 0 if none was."""
+    approach: Scalar
+    """The greatest speed of approach."""
+    share: Scalar
+    """What is left of that speed."""
 
 
 def is_compound(machine: AbstractMachine) -> bool:
@@ -31,30 +31,59 @@ def is_compound(machine: AbstractMachine) -> bool:
     return len({stop.coordinate for stop in machine.stops}) > 1 or rubs(machine)
 
 
-def _one_blow(
-    plan: Plan, taken: Flag, arrival: Arrival, landed: dict[int, Flag], there: State, k: int
-) -> tuple[Arrival, dict[int, Blow]]:
-    """As `strike`, where stops limit one coordinate and nothing rubs.
+def gains_speed(stop: RigidStop, approach: Scalar, rebound: Scalar) -> Flag | None:
+    """Whether an impact leaves faster than it came, or goes on into the stop; `None` where the law
+    is one number, whose range is known."""
+    if stop.is_one_number:
+        return None
+    leaves = stop_gradient(-stop.sign * rebound)
+    most = (1 + _FASTER * float(jnp.finfo(leaves.dtype).eps)) * stop_gradient(approach)
+    return ~((leaves >= 0) & (leaves <= most))
 
-    **Arguments:** as `strike`; `k`, the number of that coordinate.
+
+def recorded(
+    plan: Plan, lane: Lane, there: State, hit: Flag, number: int, approach: Scalar
+) -> Lane:
+    """The lane with an impact counted and logged.
+
+    **Arguments:** `there`, the state in which the stop is met; `hit`, whether it is, by a step that
+    is taken; `number`, the stop's; `approach`, V⁻.
     """
-    machine, body = plan.machine, plan.machine.coordinates[k]
-    blow = Blow(*(jnp.zeros_like(arrival.s) for _ in range(3)))
+    clock, speed = plan.clock(lane.s, there), lane.record.speed
+    if speed is not None:
+        lane = lane.recording(speed=jnp.where(hit, jnp.maximum(speed, approach), speed))
+    lane = lane.counting(hit, clock, approach, number)
+    return lane.noting(hit, clock, EventKind.impact, number, approach)
+
+
+def strike_once(
+    plan: Plan, taken: Flag, lane: Lane, landed: dict[int, Flag], there: State
+) -> tuple[Lane, dict[int, Blow]]:
+    """The lane after an impact, and what it was to the coordinate, by its number, where stops limit
+    one coordinate and nothing rubs.
+
+    **Arguments:** `taken`, whether the step is taken; `landed`, of each stop, by its number,
+    whether the step landed on it; `there`, the state in which it did.
+    """
+    machine, k = plan.machine, plan.machine.stops[0].coordinate
+    body = machine.coordinates[k]
+    blow = Blow(*(jnp.zeros_like(lane.s) for _ in range(3)))
     velocity = body.velocity(there)
     for number, met in landed.items():
         stop = machine.stops[number]
         approach = jnp.maximum(stop.approach(velocity), 0.0)
         rebound, share = stop.rebound_and_share(approach)
-        arrival = ended(arrival, met, gains_speed(stop, approach, rebound), results.BAD_IMPACT)
-        state = select(met, body.placed(there, stop.place, rebound), arrival.state)
-        arrival = listed(plan, arrival._replace(state=state), there, taken & met, number, approach)
-        if arrival.tally.loss is not None:
+        lane = lane.ended(met, gains_speed(stop, approach, rebound), "bad_impact")
+        state = select(met, body.placed(there, stop.place, rebound), lane.state)
+        lane = recorded(plan, lane._replace(state=state), there, taken & met, number, approach)
+        loss = lane.record.loss
+        if loss is not None:
             lost = stop.loss(approach, share)
-            lost = lost if _is_one(body.mass) else body.mass_at(arrival.s, there) * lost
-            arrival = arrival.counting(loss=arrival.tally.loss + jnp.where(taken & met, lost, 0.0))
+            lost = lost if _is_one(body.mass) else body.mass_at(lane.s, there) * lost
+            lane = lane.recording(loss=loss + jnp.where(taken & met, lost, 0.0))
         new = Blow(jnp.where(met, to_event(number), 0.0), approach, share)
         blow = new if len(landed) == 1 else select(met, new, blow)
-    return arrival, {k: blow}
+    return lane, {k: blow}
 
 
 def _is_one(mass: object) -> bool:

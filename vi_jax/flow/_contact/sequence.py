@@ -16,11 +16,9 @@ from jax.lax import stop_gradient
 
 from ..._types import Flag, Scalar, Scalars, State
 from ...machine import Coordinate, forces, push_of, rubbed, rubbing_on, rubs, shares
-from .. import results
-from .._arrival import Arrival, ended
-from .._lane import Plan, select, to_event
+from .._lane import Lane, Plan, select, to_event
 from ..smooth import rounding
-from .blow import Blow, gains_speed, listed
+from .impact import Blow, gains_speed, recorded
 
 # Shares of the greatest speed of approach so far. Below the first a contact does not close: it is
 # rounding of the blows before. At the second the sequence is replaced by its limit, in which those
@@ -42,7 +40,7 @@ _ROUNDS = 4096.0
 class _Round(NamedTuple):
     """A sequence of impacts between two of them."""
 
-    arrival: Arrival
+    lane: Lane
     struck: Scalars
     """Of each coordinate, as in `Blow`."""
     approach: Scalars
@@ -81,43 +79,43 @@ class _Instant(NamedTuple):
 
 
 def strike_in_turn(
-    plan: Plan, taken: Flag, arrival: Arrival, landed: dict[int, Flag], there: State,
-    limited: list[int],
-) -> tuple[Arrival, dict[int, Blow]]:  # fmt: skip
-    """As `strike`, where stops limit several coordinates, or something rubs.
+    plan: Plan, taken: Flag, lane: Lane, landed: dict[int, Flag], there: State
+) -> tuple[Lane, dict[int, Blow]]:
+    """As `strike_once`, where stops limit several coordinates, or something rubs.
 
-    **Arguments:** as `strike`; `limited`, the numbers of those coordinates.
+    **Arguments:** as `strike_once`.
     """
-    instant = _instant(plan, taken, arrival, landed, there, limited)
-    zero = jnp.zeros_like(arrival.s)
+    limited = sorted({stop.coordinate for stop in plan.machine.stops})
+    instant = _instant(plan, taken, lane, landed, there, limited)
+    zero = jnp.zeros_like(lane.s)
     nothing = tuple(zero for _ in limited)
     # One that is landed upon without any speed, as of bodies let go of together, may come to rest.
     touched = list(nothing)
     for number, stop in enumerate(plan.machine.stops):
         i = limited.index(stop.coordinate)
         touched[i] = jnp.where(landed[number], to_event(number), touched[i])
-    first = select(instant.met, there, arrival.state)
+    first = select(instant.met, there, lane.state)
     begin = _Round(
-        arrival._replace(state=first), tuple(touched), nothing, zero,
+        lane._replace(state=first), tuple(touched), nothing, zero,
         jnp.where(instant.met, 1.0, zero), zero,
     )  # fmt: skip
     end = jax.lax.while_loop(
         lambda x: (x.goes_on > 0) & (x.rounds < _ROUNDS), lambda x: _struck(instant, x), begin
     )
     endless = end.rounds >= _ROUNDS
-    arrival = ended(end.arrival, instant.met, endless, results.SIMULTANEOUS)
+    lane = end.lane.ended(instant.met, endless, "simultaneous")
     blows = {}
     for k, body, struck, fastest in zip(
         limited, instant.bodies, end.struck, end.approach, strict=True
     ):
-        leaves = -plan.wall(k, struck)[0] * body.velocity(arrival.state)
+        leaves = -plan.wall(k, struck)[0] * body.velocity(lane.state)
         share = leaves / jnp.where(fastest > 0, fastest, 1.0)
         blows[k] = Blow(struck, fastest, jnp.clip(share, 0.0, 1.0))
-    return arrival, blows
+    return lane, blows
 
 
 def _instant(
-    plan: Plan, taken: Flag, arrival: Arrival, landed: dict[int, Flag], there: State,
+    plan: Plan, taken: Flag, lane: Lane, landed: dict[int, Flag], there: State,
     limited: list[int],
 ) -> _Instant:  # fmt: skip
     """What is known of an instant before its impacts.
@@ -135,13 +133,13 @@ def _instant(
         depth = stop_gradient(stop.beyond(bodies[at].position(there)))
         slack = 256 * float(jnp.finfo(depth.dtype).eps) * (1 + jnp.abs(stop_gradient(stop.gap)))
         closed = here | (jnp.abs(depth) <= slack)
-        if arrival.contact is not None:
-            closed = closed | (arrival.contact[stop.coordinate] == to_event(number))
+        if lane.contact is not None:
+            closed = closed | (lane.contact[stop.coordinate] == to_event(number))
         touches[number] = closed
     coupled = _coupled(plan, limited, gains_, touches, coupled)
     before = [body.velocity(there) for body in bodies]
     return _Instant(
-        plan, taken, arrival.s, met, there, limited, bodies, before, gains_, landed, touches,
+        plan, taken, lane.s, met, there, limited, bodies, before, gains_, landed, touches,
         coupled, rounding(plan.machine, there),
     )  # fmt: skip
 
@@ -173,8 +171,8 @@ def _coupled(
 
 def _struck(instant: _Instant, x: _Round) -> _Round:
     """The sequence after its next impacts: those of the contacts that close fastest."""
-    plan, arrival = instant.plan, x.arrival
-    stops, state = plan.machine.stops, arrival.state
+    plan, lane = instant.plan, x.lane
+    stops, state = plan.machine.stops, lane.state
     velocities = [body.velocity(state) for body in instant.bodies]
     closing = _closing(instant, x, velocities)
     fastest = stop_gradient(jnp.max(jnp.stack(list(closing.values()))))
@@ -197,23 +195,20 @@ def _struck(instant: _Instant, x: _Round) -> _Round:
         for struck, V in zip(x.struck, velocities, strict=True)
     ]
     new, pushed = _thrown(instant, state, velocities, slow, hits, rebounds)
-    arrival = _accounted(instant, arrival._replace(state=new), state, pushed)
+    lane = _accounted(instant, lane._replace(state=new), state, pushed)
     struck, approaches = list(x.struck), list(x.approach)
     for number, hit in hits.items():
         stop, i = stops[number], instant.limited.index(stops[number].coordinate)
         speed = jnp.maximum(closing[number], 0.0)
-        arrival = ended(
-            arrival, hit, gains_speed(stop, speed, rebounds[number]), results.BAD_IMPACT
-        )
-        arrival = listed(plan, arrival, instant.there, instant.taken & hit, number, speed)
+        lane = lane.ended(hit, gains_speed(stop, speed, rebounds[number]), "bad_impact")
+        lane = recorded(plan, lane, instant.there, instant.taken & hit, number, speed)
         if stop.modes is not None:
-            given = plan.machine, arrival.s, state, new, arrival.modes
-            modes = select(hit, stop.modes_after(*given), arrival.modes)
-            arrival = arrival.going(modes=modes)
+            given = plan.machine, lane.s, state, new, lane.modes
+            lane = lane._replace(modes=select(hit, stop.modes_after(*given), lane.modes))
         struck[i] = jnp.where(hit, to_event(number), struck[i])
         approaches[i] = jnp.where(hit, jnp.maximum(approaches[i], speed), approaches[i])
     return _Round(
-        arrival, tuple(struck), tuple(approaches), most,
+        lane, tuple(struck), tuple(approaches), most,
         jnp.where(goes_on & ~weak, 1.0, 0.0), x.rounds + 1.0,
     )  # fmt: skip
 
@@ -304,18 +299,18 @@ def _closing(instant: _Instant, x: _Round, velocities: list[Scalar]) -> dict[int
 
 
 def _accounted(
-    instant: _Instant, arrival: Arrival, before: State, pushed: list[tuple[Coordinate, Scalar]]
-) -> Arrival:
+    instant: _Instant, lane: Lane, before: State, pushed: list[tuple[Coordinate, Scalar]]
+) -> Lane:
     """With the energy that the impacts have lost: the work of each force at the mean velocity of
     its contact. A law that gains some ends the lane."""
-    lost, size = jnp.zeros_like(arrival.s), jnp.zeros_like(arrival.s)
+    lost, size = jnp.zeros_like(lane.s), jnp.zeros_like(lane.s)
     for body, amount in pushed:
-        V, left = body.velocity(before), body.velocity(arrival.state)
+        V, left = body.velocity(before), body.velocity(lane.state)
         mass = body.mass_at(instant.s, before)
         lost = lost - mass * amount * 0.5 * (V + left)
         size = size + mass * jnp.abs(amount) * (jnp.abs(V) + jnp.abs(left))
-    if arrival.tally.loss is not None:
+    if lane.record.loss is not None:
         hit = instant.taken & instant.met
-        arrival = arrival.counting(loss=arrival.tally.loss + jnp.where(hit, lost, 0.0))
+        lane = lane.recording(loss=lane.record.loss + jnp.where(hit, lost, 0.0))
     wrong = stop_gradient(lost) < -1e-9 * stop_gradient(size)
-    return ended(arrival, instant.met, wrong, results.BAD_IMPACT)
+    return lane.ended(instant.met, wrong, "bad_impact")

@@ -6,8 +6,6 @@ faster, their speeds a geometric series in k, and end in rest after a finite tim
 brief.
 """
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
@@ -24,14 +22,14 @@ from ...machine import (
     shares,
     struck_modes,
 )
-from .._arrival import Arrival
 from .._flow_to_event import FlowToEvent
-from .._lane import RESTS, Lane, Plan, in_place, select
-from .._log import clock_at, noted
+from .._lane import Lane, Plan, in_place, select
+from .._step.trial import Situation
 from ..drift import drifted
 from ..events import force_rate, rates
+from ..labelled import EventKind
 from ..smooth import SmoothMachine, beyond_a_stop, holding, in_modes, rounding
-from .blow import Blow
+from .impact import Blow
 from .rest import allowed
 
 # A contact whose bodies leave each other with less than this share of the speed with which they
@@ -39,62 +37,47 @@ from .rest import allowed
 _CLOSED = 1e-9
 
 
-class Approach(NamedTuple):
-    """What a step knew of a coordinate when it met a stop."""
+def settle(at: Situation, lane: Lane, there: State, met: Flag, blows: dict[int, Blow]) -> Lane:
+    """The lane at rest on those stops whose impacts were the last ones.
 
-    speed: Scalar
-    """Rate of the coordinate by the clock."""
-    growth: Scalar | None
-    """That of the force on it; absent where nothing can rest."""
-    alone: SmoothMachine
-    """The machine in its modes with the other bodies held that rest."""
-
-
-def settle(
-    plan: Plan, lane: Lane, approaches: dict[int, Approach], taken: Flag, arrival: Arrival,
-    there: State, met: Flag, blows: dict[int, Blow],
-) -> Arrival:  # fmt: skip
-    """The arrival at rest on those stops whose impacts were the last ones.
-
-    **Arguments:** `approaches`, what the step knew of each coordinate; `taken`, whether the step is
-    taken; `arrival`, behind the impacts; `there`, the state before them; `met`, whether there were
-    any; `blows`, what they were to each coordinate.
+    **Arguments:** `lane`, behind the impacts; `there`, the state before them; `met`, whether there
+    were any; `blows`, what they were to each coordinate.
     """
-    contact = arrival.contact
-    if contact is None:
-        return arrival
+    if lane.contact is None:
+        return lane
     if len(blows) == 1:
         ((k, blow),) = blows.items()
-        sign, _ = plan.wall(k, blow.struck)
-        speed = blow.share * jnp.maximum(sign * approaches[k].speed, 0.0)
-        known = k, blow, speed, (arrival.s, there), approaches[k].growth
-        ends, left = _ends(plan, lane, approaches[k].alone, *known)
-        rests = {k: pin_flag((blow.struck > 0) & ends, arrival.s)}
+        sign, _ = at.plan.wall(k, blow.struck)
+        path, alone = at.trial.paths[k], at.trial.alone[k]
+        speed = blow.share * jnp.maximum(sign * path.end.v, 0.0)
+        growth = None if path.surge is None else path.surge[1]
+        known = k, blow, speed, lane._replace(state=there), growth
+        ends, left = _ends(at.plan, alone, *known)
+        rests = {k: pin_flag((blow.struck > 0) & ends, lane.s)}
         waits = {k: left}
     else:
-        contact = _broken(plan, arrival, there, met, blows)
-        rests, waits = _together(plan, lane, arrival, blows, contact)
-    return _held(plan, lane, taken, arrival.going(contact=contact), rests, blows, waits)
+        lane = lane._replace(contact=_broken(at.plan, lane, there, met, blows))
+        rests, waits = _together(at.plan, lane, blows)
+    return _held(at.plan, at.taken, lane, rests, blows, waits)
 
 
 def _held(
-    plan: Plan, lane: Lane, taken: Flag, arrival: Arrival, rests: dict[int, Flag],
-    blows: dict[int, Blow], waits: dict[int, Scalar],
-) -> Arrival:  # fmt: skip
-    """The arrival when the impacts that never end are over, with those bodies held that come to
-    rest.
+    plan: Plan, taken: Flag, lane: Lane, rests: dict[int, Flag], blows: dict[int, Blow],
+    waits: dict[int, Scalar],
+) -> Lane:  # fmt: skip
+    """The lane when the impacts that never end are over, with those bodies held that come to rest.
 
     **Arguments:** `taken`, whether the step is taken; of each coordinate in `rests` whether it
     comes to rest, in `blows` its impacts, in `waits` how long it takes (in s).
     """
-    s, state, time, contact = arrival.s, arrival.state, arrival.time, arrival.contact
+    s, state, contact = lane.s, lane.state, lane.contact
     assert contact is not None
     wait = jnp.zeros_like(s)
     for k, ends in rests.items():
         left = jnp.where(ends, waits[k], 0.0)
         wait = left if len(rests) == 1 else jnp.maximum(wait, left)
         contact = in_place(contact, k, jnp.where(ends, blows[k].struck, contact[k]))
-    walls, modes = {k: blow.struck for k, blow in blows.items()}, arrival.modes
+    walls, modes = {k: blow.struck for k, blow in blows.items()}, lane.modes
     if rubs(plan.machine):
         # Which way a body slips is known behind its impact.
         modes = struck_modes(plan.machine, s, state, modes, contact=contact)
@@ -105,26 +88,28 @@ def _held(
         still, lost = stilled(plan, s, state, rests, walls)
         if holds_anywhere(plan.machine):
             modes = struck_modes(plan.machine, s, still, modes, contact=contact)
-    resting = holding(plan.machine, modes, contact)
-    way = FlowToEvent(plan, resting, lane.part, (s, still, time))
+    resting, integrals = holding(plan.machine, modes, contact), lane.record.integrals
+    way = FlowToEvent(plan, resting, lane.part, (s, still, integrals))
     later, still, passed = drifted(way.rate, pin(wait), way.moving, way.fixed, way.rest)
     if len(rests) > 1:  # another body may come upon this one before its impacts are over
         clear = ~beyond_a_stop(plan.machine, still)
         rests = {k: ends & clear for k, ends in rests.items()}
-        contact = select(clear, contact, arrival.contact)
+        contact = select(clear, contact, lane.contact)
     any_rests = jnp.zeros_like(taken)
     for ends in rests.values():
         any_rests = any_rests | ends
-    s, state, time = select(any_rests, (later, still, passed), (s, state, time))
-    _, _, loss, count, _, events = arrival.tally
+    s, state, integrals = select(any_rests, (later, still, passed), (s, state, integrals))
+    lane = lane._replace(s=s, state=state, contact=contact).recording(integrals=integrals)
     for k, ends in rests.items():
-        here, blow, clock = taken & ends, blows[k], clock_at(plan, s, state)
-        events = noted(events, here, clock, RESTS, blow.struck - 1.0, blow.approach)
-        count = None if count is None else count + jnp.where(here, 1.0, 0.0)
+        here, blow, count = taken & ends, blows[k], lane.record.rests
+        number = blow.struck - 1.0
+        lane = lane.noting(here, plan.clock(s, state), EventKind.rest, number, blow.approach)
+        if count is not None:
+            lane = lane.recording(rests=count + jnp.where(here, 1.0, 0.0))
+    loss = lane.record.loss
     if loss is not None:
-        loss = loss + jnp.where(taken & any_rests, lost, 0.0)
-    arrival = arrival._replace(s=s, state=state, time=time).going(contact=contact)
-    return arrival.counting(events=events, rests=count, loss=loss)
+        lane = lane.recording(loss=loss + jnp.where(taken & any_rests, lost, 0.0))
+    return lane
 
 
 def _without_rebounds(
@@ -188,16 +173,16 @@ def stilled(
 
 
 def _ends(
-    plan: Plan, lane: Lane, free: SmoothMachine, k: int, blow: Blow, speed: Scalar,
-    at: tuple[Scalar, State], growth: Scalar | None = None,
+    plan: Plan, free: SmoothMachine, k: int, blow: Blow, speed: Scalar, lane: Lane,
+    growth: Scalar | None = None,
 ) -> tuple[Flag, Scalar]:  # fmt: skip
     """Whether an impact is one of the endless last ones before rest, and the time they take.
 
     **Arguments:** `free`, the machine with this body free; `k`, the number of its coordinate;
-    `speed`, by s, of its rebound; `at`, s and a state of the impact; `growth`, how fast the force
-    on the body grows, where that is known.
+    `speed`, by s, of its rebound; `lane`, at the impact; `growth`, how fast the force on the body
+    grows, where that is known.
     """
-    (s, state), body = at, plan.machine.coordinates[k]
+    s, state, body = lane.s, lane.state, plan.machine.coordinates[k]
     sign, gap = plan.wall(k, blow.struck)
     # What presses a body at rest on: with its velocity goes its damping.
     rested = body.placed(state, jnp.asarray(sign * gap), jnp.zeros_like(s))
@@ -237,38 +222,36 @@ def _before_it_presses(
     return not_yet, 3 * wait + jnp.sqrt(6 * jnp.where(not_yet, v, 0.0) / rate), wait
 
 
-def _broken(
-    plan: Plan, arrival: Arrival, there: State, met: Flag, blows: dict[int, Blow]
-) -> Scalars:
+def _broken(plan: Plan, lane: Lane, there: State, met: Flag, blows: dict[int, Blow]) -> Scalars:
     """`Lane.contact` without those contacts that were struck or pulled apart by the impacts.
 
     **Arguments:** `there`, the state before them; `met`, whether there were any; `blows`, what they
     were to each coordinate.
     """
-    assert arrival.contact is not None
-    contact, slack = list(arrival.contact), rounding(plan.machine, there)
+    assert lane.contact is not None
+    contact, slack = list(lane.contact), rounding(plan.machine, there)
     for k, blow in blows.items():
         body = plan.machine.coordinates[k]
-        V, old = (stop_gradient(body.velocity(x)) for x in (arrival.state, there))
+        V, old = (stop_gradient(body.velocity(x)) for x in (lane.state, there))
         apart = met & ((blow.struck > 0) | (jnp.abs(V - old) > slack))
         contact[k] = jnp.where(apart, 0.0, contact[k])
     return tuple(contact)
 
 
 def _together(
-    plan: Plan, lane: Lane, arrival: Arrival, blows: dict[int, Blow],
-    contact: Scalars,
-) -> tuple[dict[int, Flag], dict[int, Scalar]]:  # fmt: skip
+    plan: Plan, lane: Lane, blows: dict[int, Blow]
+) -> tuple[dict[int, Flag], dict[int, Scalar]]:
     """Of each coordinate that was struck, whether it comes to rest, and the time that takes.
 
     What presses on a body may be another one that comes to rest on it at the same instant: which of
     them do is found by trying, those that rest being held while the others are looked at.
 
-    **Arguments:** `arrival`, behind the impacts; `blows`, what they were to each coordinate;
-    `contact`, the contacts that they left closed.
+    **Arguments:** `lane`, behind the impacts, with the contacts that they left closed; `blows`,
+    what they were to each coordinate.
     """
-    s, state = arrival.s, arrival.state
-    free = in_modes(plan.machine, arrival.modes)
+    s, state, contact = lane.s, lane.state, lane.contact
+    assert contact is not None
+    free = in_modes(plan.machine, lane.modes)
     speeds = {}
     closed = list(contact)
     for k, blow in blows.items():
@@ -283,8 +266,8 @@ def _together(
         closed, _, _, count = found
         new, waits = list(contact), []
         for k, blow in blows.items():
-            alone = holding(plan.machine, arrival.modes, closed, but=k)
-            ends, left = _ends(plan, lane, alone, k, blow, speeds[k], (s, state))
+            alone = holding(plan.machine, lane.modes, closed, but=k)
+            ends, left = _ends(plan, alone, k, blow, speeds[k], lane)
             ends = (blow.struck > 0) & ends
             new[k] = jnp.where(ends, blow.struck, contact[k])
             waits.append(jnp.where(ends, left, 0.0))

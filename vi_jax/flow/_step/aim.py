@@ -1,7 +1,6 @@
 """Where the next step should end: at the first event that a tried step ran past, or that a motion
 known beforehand comes to."""
 
-import dataclasses
 from functools import partial
 from typing import NamedTuple
 
@@ -47,8 +46,7 @@ def aim_ahead(plan: Plan, lane: Lane, motion: Foreseen) -> Lane:
     nothing_to_meet = not guards and not courses
     length, target = whole if nothing_to_meet else jax.lax.cond(met, cut, lambda x: x, whole)
     free = lane.target == FREE
-    return dataclasses.replace(
-        lane,
+    return lane._replace(
         attempt=jnp.where(free, length, lane.attempt),
         target=jnp.where(free, target, lane.target),
     )

@@ -1,15 +1,13 @@
 """Why a lane ends before its time: by what its steps come to, or by an event that has no answer."""
 
-from typing import NamedTuple
-
 import jax.numpy as jnp
 from jax.lax import stop_gradient
 
 from ..._types import Flag, Scalar, State
 from ...machine import AbstractMachine, events_of, guard_of
-from .. import results
-from .._lane import FREE, Lane, Plan, Record, to_event, total
+from .._lane import FREE, Lane, Plan, to_event, total
 from ..events import guard_rates
+from ..results import code
 from ..smooth import in_modes
 from .trial import Trial
 
@@ -21,75 +19,53 @@ _LOST, _MANY = 64.0, 16.0
 _STUCK = 65536.0
 
 
-class Progress(NamedTuple):
-    """How far a lane has come, and how hard that was."""
-
-    length: Scalar
-    """Length proposed for its next ordinary step."""
-    record: Record
-    """Of the interval on its way."""
-    steps: Scalar
-    """Steps tried since the lane began."""
-    spent: Scalar
-    """Steps tried in this interval."""
-    aims: Scalar
-    """Times aimed since the last step taken."""
-
-
 def faults(
-    plan: Plan,
-    lane: Lane,
-    trial: Trial,
-    taken: Flag,
-    rejected: Flag,
-    progress: Progress,
-    target: Scalar,
+    plan: Plan, lane: Lane, trial: Trial, taken: Flag, rejected: Flag, new: Lane
 ) -> list[tuple[Flag, Scalar | float]]:
     """What ends a lane, the first that holds being the reason.
 
-    **Arguments:** `taken` and `rejected`, whether the trial was; `progress` and `target`, how far
-    the lane has come and what it aims at, after the trial.
+    **Arguments:** `taken` and `rejected`, whether the trial was; `new`, the lane after it.
 
     **Returns:** pairs of a condition and a reason, a code of `RESULTS`.
     """
-    length, record, steps, spent, aims = progress
-    broken = results.NOT_FINITE
+    impacts, broken = new.record.impacts, code("not_finite")
+    many = impacts > _MANY
     if plan.machine.alive(trial.state) is not None:
         # A clock that breaks down makes the steps shrink to nothing.
-        broken = results.STALLED
+        broken = code("stalled")
     ends = [
-        (record.impacts > plan.max_impacts, float(results.CHATTER)),
-        (((aims >= _LOST) | (spent >= _STUCK)) & (record.impacts > _MANY), float(results.CHATTER)),
-        (aims >= _LOST, _lost(plan, lane, target)),
-        (steps >= plan.max_steps, float(results.MAX_STEPS)),
-        (spent >= _STUCK, float(results.MAX_STEPS)),
+        (impacts > plan.max_impacts, code("chatter")),
+        (((new.aims >= _LOST) | (new.spent >= _STUCK)) & many, code("chatter")),
+        (new.aims >= _LOST, _lost(plan, lane, new.target)),
+        (new.steps >= plan.max_steps, code("max_steps")),
+        (new.spent >= _STUCK, code("max_steps")),
     ]
     if plan.method.may_be_unstable(plan.machine, lane.s, lane.state):
-        ends = [(taken & (trial.error > 1), float(results.UNSTABLE)), *ends]
+        ends = [(taken & (trial.error > 1), code("unstable")), *ends]
     if not plan.method.adaptive:
-        return [(rejected, float(broken)), *ends]
-    eps = float(jnp.finfo(length.dtype).eps)
-    gone = rejected & (length < 4 * eps * jnp.maximum(1.0, plan.machine.cycle))
-    numeric = jnp.isfinite(total(trial.state, length))
-    tiny = results.UNDERFLOW if broken == results.NOT_FINITE else broken
-    return [(gone & ~numeric, float(broken)), (gone, float(tiny)), *ends]
+        return [(rejected, broken), *ends]
+    eps = float(jnp.finfo(new.length.dtype).eps)
+    gone = rejected & (new.length < 4 * eps * jnp.maximum(1.0, plan.machine.cycle))
+    numeric = jnp.isfinite(total(trial.state, new.length))
+    tiny = code("underflow") if broken == code("not_finite") else broken
+    return [(gone & ~numeric, broken), (gone, tiny), *ends]
 
 
 def _lost(plan: Plan, lane: Lane, target: Scalar) -> Scalar | float:
     """The reason of a lane that has aimed too often, by what it aimed at."""
-    machine, reason = plan.machine, float(results.UNRESOLVED)
+    machine, reason = plan.machine, code("unresolved")
     if plan.motion or machine.stops:
-        reason = jnp.where(target < FREE, float(results.TURN_UNRESOLVED), reason)
+        reason = jnp.where(target < FREE, code("turn_unresolved"), reason)
     first = len(machine.stops)
     if machine.switches:
         others = target >= to_event(first)
-        reason = jnp.where(others, float(results.SWITCH_UNRESOLVED), reason)
+        reason = jnp.where(others, code("switch_unresolved"), reason)
     if machine.others:
         others = target >= to_event(first + len(machine.switches))
-        reason = jnp.where(others, float(results.RESET_UNRESOLVED), reason)
+        reason = jnp.where(others, code("reset_unresolved"), reason)
     if not plan.ticks(lane.state):
         ends = target == plan.to_section
-        reason = jnp.where(ends, float(results.SECTION_UNRESOLVED), reason)
+        reason = jnp.where(ends, code("section_unresolved"), reason)
     return reason
 
 

@@ -1,4 +1,5 @@
-"""What an event that is no impact makes of a lane, and what it sets off."""
+"""What an event that is no impact makes of a lane, what it sets off, and how a motion goes on
+behind a state that was put in place of another."""
 
 from typing import NamedTuple
 
@@ -19,14 +20,12 @@ from ...machine import (
     value_of,
 )
 from .. import results
-from .._arrival import Arrival, ended
-from .._lane import CHANGES, LEAVES, RESETS, Plan, select, to_event
-from .._log import clock_at, logged, noted
+from .._lane import Lane, Plan, in_place, select, to_event
 from ..events import rates
-from ..smooth import beyond_a_stop, holding
+from ..labelled import EventKind
+from ..smooth import beyond_a_stop, holding, rounding
 from .faults import comes_back
-from .guards import JUMPED
-from .jump import directions, unheld
+from .guards import JUMPED, Crossing
 
 # Events of one instant that set each other off for ever happen so often each, by choice, before the
 # lane ends.
@@ -36,7 +35,7 @@ _ROUNDS = 4
 class _Instant(NamedTuple):
     """What happens at one instant, between two of its events."""
 
-    arrival: Arrival
+    lane: Lane
     due: Scalars
     """Of each event that is no impact, 1 while it is still to happen."""
     near: Scalars
@@ -45,9 +44,9 @@ class _Instant(NamedTuple):
 
 
 def happened(
-    plan: Plan, taken: Flag, arrival: Arrival, due: dict[int, Flag], near: dict[int, Flag]
-) -> Arrival:
-    """The arrival after those events that are no impacts, and what they set off.
+    plan: Plan, taken: Flag, lane: Lane, due: dict[int, Flag], near: dict[int, Flag]
+) -> Lane:
+    """The lane after those events that are no impacts, and what they set off.
 
     Of events at one instant the first listed comes first. What a jump does to a guard decides what
     happens next: one that it takes from below zero to above happens, and so does one that was at
@@ -56,9 +55,9 @@ def happened(
     **Arguments:** `taken`, whether the step is taken; of the events by their numbers, which are
     `due`, and which are `near`: their guards are at zero to rounding.
     """
-    zero = jnp.zeros_like(arrival.s)
+    zero = jnp.zeros_like(lane.s)
     due_, near_ = (tuple(jnp.where(x, 1.0, zero) for x in y.values()) for y in (due, near))
-    begin = _Instant(arrival, due_, near_)
+    begin = _Instant(lane, due_, near_)
     if len(due) == 1:
         end = _next(plan, taken, tuple(due), begin)
     else:
@@ -72,33 +71,33 @@ def happened(
         # Not as many turns as there are to do: that has no transpose.
         end, _ = jax.lax.scan(turn, begin, None, length=_ROUNDS * len(due))
         endless = sum(end.due, start=zero) > 0
-        end = end._replace(arrival=ended(end.arrival, endless, endless, results.SIMULTANEOUS))
-    return end.arrival
+        return end.lane.ended(endless, endless, "simultaneous")
+    return end.lane
 
 
 def set_off(
-    plan: Plan, arrival: Arrival, when: Flag, before: tuple[State, Scalars],
+    plan: Plan, lane: Lane, when: Flag, before: tuple[State, Scalars],
     turns: dict[int, Flag], near: Scalars,
-) -> tuple[Arrival, dict[int, Flag], Scalars]:  # fmt: skip
-    """The arrival with those guards to come from below anew (see `Lane.below`) that a jump has put
+) -> tuple[Lane, dict[int, Flag], Scalars]:  # fmt: skip
+    """The lane with those guards to come from below anew (see `Lane.below`) that a jump has put
     on their surface or beyond, and of what happened; which events the jump sets off; and what is
     left of those near.
 
     **Arguments:** `when`, where state or modes jumped; state and modes `before`; `turns`, of each
     event whether it was its turn; `near`, as in `_Instant`.
     """
-    (old, modes), contact, machine = before, arrival.contact or (), plan.machine
+    (old, modes), contact, machine = before, lane.contact or (), plan.machine
     below, nearby, off = [], [], {}
-    moving = holding(machine, arrival.modes, arrival.contact)
-    along = jnp.ones_like(arrival.s), moving.field(arrival.s, arrival.state)
-    numbers = plan.from_below(arrival.state)
-    for number, armed, close in zip(numbers, arrival.onward.below, near, strict=True):
+    moving = holding(machine, lane.modes, lane.contact)
+    along = jnp.ones_like(lane.s), moving.field(lane.s, lane.state)
+    numbers = plan.from_below(lane.state)
+    for number, armed, close in zip(numbers, lane.below, near, strict=True):
 
         def guard(s: Scalar, state: State, number: int = number) -> Scalar:
-            return jnp.asarray(guard_of(machine, number, s, state, arrival.modes, contact))
+            return jnp.asarray(guard_of(machine, number, s, state, lane.modes, contact))
 
-        was = stop_gradient(guard_of(machine, number, arrival.s, old, modes, contact))
-        now, rate = jax.jvp(guard, *stop_gradient(((arrival.s, arrival.state), along)))
+        was = stop_gradient(guard_of(machine, number, lane.s, old, modes, contact))
+        now, rate = jax.jvp(guard, *stop_gradient(((lane.s, lane.state), along)))
         slack = float(jnp.finfo(now.dtype).eps) ** 0.5 * (1 + jnp.abs(now))
         moved, own = jnp.abs(now - was) > slack, turns.get(number, jnp.zeros_like(when))
         rises = when & (was < -slack) & (now > slack)
@@ -109,18 +108,18 @@ def set_off(
         off[number] = (rises | missed) & ~own
         nearby.append(jnp.where(own | missed, 0.0, close))
         below.append(jnp.where(own | (when & (now >= -slack) & moved), 0.0, armed))
-    return arrival.going(below=tuple(below)), off, tuple(nearby)
+    return lane._replace(below=tuple(below)), off, tuple(nearby)
 
 
 def _next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _Instant) -> _Instant:
     """The instant after the first listed of the events that are due."""
-    machine, arrival, old = plan.machine, x.arrival, x.arrival.state
-    modes_before, contact = arrival.modes, arrival.contact or ()
+    machine, lane, old = plan.machine, x.lane, x.lane.state
+    modes_before, contact = lane.modes, lane.contact or ()
     none = jnp.zeros_like(taken)
     new, modes, any_turn, happens, jumps = old, modes_before, none, none, none
-    kind, listed, value, turns = CHANGES, 0.0, jnp.nan, {}
+    kind, listed, value, turns = EventKind.mode, 0.0, jnp.nan, {}
     for number, due in zip(numbers, x.due, strict=True):
-        event, met = events_of(machine)[number], (machine, number, arrival.s, old, modes_before)
+        event, met = events_of(machine)[number], (machine, number, lane.s, old, modes_before)
         turns[number], any_turn = (due > 0) & ~any_turn, any_turn | (due > 0)
         when = happens_at(*met)
         here = turns[number] if when is None else turns[number] & when
@@ -128,68 +127,54 @@ def _next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _Instant) -> _In
         its_modes = select(here, its_modes, modes_before)
         its_number = number - len(machine.stops)
         if event.holds_mode:
-            slides = comes_back(machine, number, its_modes, arrival.s, its_state)
-            arrival = ended(arrival, turns[number], slides, results.SLIDING)
-            its_kind, its_value = CHANGES, its_modes[mode_number(machine, number)]
+            slides = comes_back(machine, number, its_modes, lane.s, its_state)
+            lane = lane.ended(turns[number], slides, "sliding")
+            its_kind, its_value = EventKind.mode, its_modes[mode_number(machine, number)]
         else:
             jumps = jumps | here
-            its_kind, its_value = RESETS, value_of(*met)
+            its_kind, its_value = EventKind.reset, value_of(*met)
             its_number = its_number - len(machine.switches)
         if event.ends_cycle:
-            arrival = arrival._replace(completed=arrival.completed | here)
-        arrival = with_outcome(machine, event, arrival, here)
+            lane = lane.completing(here)
+        lane = with_outcome(machine, event, lane, here)
         new, modes = select(here, (its_state, its_modes), (new, modes))
         its_own = its_kind, its_number, its_value
         if len(numbers) > 1:
             its_own = select(here, its_own, (kind, listed, value))
         (kind, listed, value), happens = its_own, happens | here
-    clock = clock_at(plan, arrival.s, old)
-    events = noted(arrival.tally.events, taken & happens, clock, kind, listed, value)
-    arrival = arrival.counting(events=events)
+    clock = plan.clock(lane.s, old)
+    lane = lane.noting(taken & happens, clock, kind, listed, value)
     if plan.log_switches:
-        arrival = _listed(plan, arrival, taken & happens, clock, turns)
-    arrival = _jumped(plan, arrival, happens, jumps, old, (new, modes))
-    arrival = let_go(plan, arrival, taken, happens, (old, modes_before))
+        zero = any_number = jnp.zeros_like(clock)
+        for number, turn in turns.items():
+            any_number = jnp.where(turn, float(number), any_number)
+        lane = lane.counting(taken & happens, clock, zero, any_number)
+    lane = _jumped(plan, lane._replace(state=new, modes=modes), happens, jumps, old)
+    lane = let_go(plan, lane, taken, happens, (old, modes_before))
     off, near, before = {}, x.near, (old, modes_before)
     if machine.others:
-        arrival, off, near = set_off(plan, arrival, happens, before, turns, near)
+        lane, off, near = set_off(plan, lane, happens, before, turns, near)
     due = [jnp.where(turns[n], 0.0, due) for n, due in zip(numbers, x.due, strict=True)]
     for i, number in enumerate(numbers):
         if events_of(machine)[number].holds_mode and len(numbers) > 1:
-            off[number] = _turned_over(plan, arrival, happens & ~turns[number], number, before)
+            off[number] = _turned_over(plan, lane, happens & ~turns[number], number, before)
         due[i] = jnp.where(off[number], 1.0, due[i]) if number in off else due[i]
     last = off.get(section_number(machine))
     if last is not None:
-        arrival = arrival._replace(completed=arrival.completed | last)
-    return _Instant(arrival, tuple(due), near)
+        lane = lane.completing(last)
+    return _Instant(lane, tuple(due), near)
 
 
-def with_outcome(
-    machine: AbstractMachine, event: AbstractEvent, arrival: Arrival, here: Flag
-) -> Arrival:
-    """The arrival, its lane ended where an event happened that ends the motion."""
+def with_outcome(machine: AbstractMachine, event: AbstractEvent, lane: Lane, here: Flag) -> Lane:
+    """The lane, its lane ended where an event happened that ends the motion."""
     if not event.ends:
-        return arrival
+        return lane
     outcome = results.with_outcome(machine.outcomes.index(event.ends))
-    return ended(arrival, here, jnp.ones_like(here), outcome)
-
-
-def _listed(
-    plan: Plan, arrival: Arrival, when: Flag, clock: Scalar, turns: dict[int, Flag]
-) -> Arrival:
-    """The arrival with an event listed as an impact is, and so counted.
-
-    **Arguments:** `when`, whether it happened; `turns`, of each event whether it was that one.
-    """
-    zero, before, number = jnp.zeros_like(clock), arrival.tally, jnp.zeros_like(clock)
-    for its_number, turn in turns.items():
-        number = jnp.where(turn, float(its_number), number)
-    log = logged(before.log, when, before.impacts, clock, zero, number)
-    return arrival.counting(log=log, impacts=before.impacts + jnp.where(when, 1.0, 0.0))
+    return lane.ended(here, jnp.ones_like(here), outcome)
 
 
 def _turned_over(
-    plan: Plan, arrival: Arrival, when: Flag, number: int, before: tuple[State, Scalars]
+    plan: Plan, lane: Lane, when: Flag, number: int, before: tuple[State, Scalars]
 ) -> Flag:
     """Whether the guard of a switch has jumped above zero, as that of friction does that held a
     pull which is another one now: it has no place where it passes zero.
@@ -197,67 +182,114 @@ def _turned_over(
     **Arguments:** `when`, where state or modes jumped; `number`, the switch's; state and modes
     `before`.
     """
-    contact, (old, modes_before) = arrival.contact or (), before
-    was = guard_of(plan.machine, number, arrival.s, old, modes_before, contact)
-    now = guard_of(plan.machine, number, arrival.s, arrival.state, arrival.modes, contact)
+    contact, (old, modes_before) = lane.contact or (), before
+    was = guard_of(plan.machine, number, lane.s, old, modes_before, contact)
+    now = guard_of(plan.machine, number, lane.s, lane.state, lane.modes, contact)
     was, now = stop_gradient((was, now))
     slack = JUMPED * (1 + jnp.abs(now))
     return when & (was <= slack) & (now > slack)
 
 
 def let_go(
-    plan: Plan, arrival: Arrival, taken: Flag, when: Flag,
+    plan: Plan, lane: Lane, taken: Flag, when: Flag,
     before: tuple[State, Scalars], resting: Scalars | None = None,
-) -> Arrival:  # fmt: skip
+) -> Lane:  # fmt: skip
     """With those bodies free that were pressed on their stops before an event, and are pulled away
     behind it: a force that jumps has no place where it passes zero.
 
     **Arguments:** whether the event happens; state and modes before it; what rested then, if that
     may be another than now (as in `Lane.contact`).
     """
-    machine, contact, modes = plan.machine, arrival.contact, arrival.modes
+    machine, contact, modes, s = plan.machine, lane.contact, lane.modes, lane.s
     if contact is None:
-        return arrival
+        return lane
     old, modes_before = before
-    freed, direction, events = list(contact), list(arrival.direction), arrival.tally.events
+    freed, direction = list(contact), list(lane.direction)
     for k in sorted({stop.coordinate for stop in machine.stops}):
 
         def pressing(modes: Scalars, state: State, k: int = k) -> Scalar:
             free = holding(machine, modes, contact, but=k)
-            return rates(free.field, machine.coordinates[k].position, arrival.s, state).a
+            return rates(free.field, machine.coordinates[k].position, s, state).a
 
         sign, _ = plan.wall(k, contact[k])
-        pressed, pulled = sign * pressing(modes_before, old), sign * pressing(modes, arrival.state)
+        pressed, pulled = sign * pressing(modes_before, old), sign * pressing(modes, lane.state)
         goes = when & (contact[k] > 0) & stop_gradient((pressed >= 0) & (pulled < 0))
         if resting is not None:
             goes = goes & (resting[k] == contact[k])
-        clock = clock_at(plan, arrival.s, arrival.state)
-        events = noted(events, taken & goes, clock, LEAVES, contact[k] - to_event(0), jnp.nan)
+        clock, stop = plan.clock(lane.s, lane.state), contact[k] - to_event(0)
+        lane = lane.noting(taken & goes, clock, EventKind.release, stop, jnp.nan)
         freed[k] = jnp.where(goes, 0.0, contact[k])
         direction[k] = jnp.where(goes, -sign, direction[k])
-    arrival = arrival.going(contact=tuple(freed), direction=tuple(direction))
-    return arrival.counting(events=events)
+    return lane._replace(contact=tuple(freed), direction=tuple(direction))
 
 
-def _jumped(
-    plan: Plan, arrival: Arrival, happens: Flag, jumps: Flag, old: State,
-    behind: tuple[State, Scalars],
-) -> Arrival:  # fmt: skip
-    """The arrival behind an event: which way the motion goes on, by the modes that it has then, and
+def _jumped(plan: Plan, lane: Lane, happens: Flag, jumps: Flag, old: State) -> Lane:
+    """The lane behind an event: which way the motion goes on, by the modes that it has then, and
     which bodies still rest. A lane whose body was put beyond a stop ends.
 
-    **Arguments:** whether an event `happens`, and whether one that may move the state, as it
-    `jumps`; `old`, the state before; state and modes `behind`.
+    **Arguments:** `lane`, with state and modes behind the event; whether an event `happens`, and
+    whether one that may move the state, as it `jumps`; `old`, the state before.
     """
-    new, modes = behind
-    arrival = arrival.going(modes=modes)
     if plan.machine.stops and plan.machine.others:
-        beyond = beyond_a_stop(plan.machine, new)
-        arrival = ended(arrival, jumps, beyond, results.BAD_RESET)
-        arrival = arrival.going(contact=unheld(plan, arrival.contact, jumps, old, new))
+        lane = lane.ended(jumps, beyond_a_stop(plan.machine, lane.state), "bad_reset")
+        lane = lane._replace(contact=unheld(plan, lane, jumps, old))
     # A switch leaves velocities as they are; but of a state without them it changes the rate.
-    when = jumps if plan.machine.has_velocity(new) else happens
+    when = jumps if plan.machine.has_velocity(lane.state) else happens
     if plan.machine.others or when is happens:
-        way = directions(plan, arrival.onward, when, old, new, arrival.s)
-        arrival = arrival.going(direction=way)
-    return arrival._replace(state=new)
+        lane = lane._replace(direction=_directions(plan, lane, when, old))
+    return lane
+
+
+def after_jump(plan: Plan, lane: Lane, when: Flag, old: State) -> Lane:
+    """The lane with the directions of all coordinates, and the stops rested on, after its state was
+    put in place of another one.
+
+    **Arguments:** `when`, where the state was replaced; `old`, the state before.
+    """
+    lane = lane._replace(contact=unheld(plan, lane, when, old))
+    return lane._replace(direction=_directions(plan, lane, when, old))
+
+
+def unheld(plan: Plan, lane: Lane, when: Flag, old: State) -> Scalars | None:
+    """The stops rested on after the state was replaced: what was moved rests no longer.
+
+    **Arguments:** as `after_jump`.
+    """
+    if lane.contact is None:
+        return None
+    contacts, slack = list(lane.contact), rounding(plan.machine, lane.state)
+    for k, coordinate in enumerate(plan.machine.coordinates):
+        (place, before), (there, after) = (
+            (coordinate.position(x), coordinate.velocity(x)) for x in (old, lane.state)
+        )
+        if not (there is place and after is before):
+            moved = (jnp.abs(there - place) > slack) | (jnp.abs(after - before) > slack)
+            contacts[k] = jnp.where(when & stop_gradient(moved), 0.0, contacts[k])
+    return tuple(contacts)
+
+
+def _directions(plan: Plan, lane: Lane, when: Flag, old: State) -> Scalars:
+    """The directions of all coordinates behind an event, in the modes that the lane has then.
+
+    **Arguments:** as `after_jump`.
+    """
+    found, new = list(lane.direction), lane.state
+    smooth = holding(plan.machine, lane.modes, lane.contact)
+    for k, coordinate in enumerate(plan.machine.coordinates):
+        after, known = coordinate.velocity(new), plan.machine.has_velocity(new)
+        if not known or after is not coordinate.velocity(old):
+            here = rates(smooth.field, coordinate.position, lane.s, new)
+            # The second number of a state without velocities may be anything.
+            after = after if known else here.v
+            after = stop_gradient(jnp.where(after == 0, here.a, after))
+            found[k] = jnp.where(when & (after != 0), jnp.sign(after), found[k])
+    return tuple(found)
+
+
+def disarmed_itself(plan: Plan, lane: Lane, c: Crossing) -> Lane:
+    """With the guard of an event that was met to come from below anew."""
+    numbers = plan.from_below(lane.state)
+    if c.number not in numbers:
+        return lane
+    i = numbers.index(c.number)
+    return lane._replace(below=in_place(lane.below, i, jnp.where(c.landed, 0.0, lane.below[i])))

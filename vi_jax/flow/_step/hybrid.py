@@ -13,45 +13,35 @@ forward and reverse derivatives through an impact are exact (the saltation matri
 they are those at a fixed reading of the clock, so that the steps to come carry none of the clock's.
 """
 
-import dataclasses
-from typing import NamedTuple
-
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.lax import stop_gradient
 
-from ..._types import Flag, Scalar, State
+from ..._types import Flag, Scalar
 from ...lanes import pin_flag
-from .._arrival import Onward
 from .._lane import FREE, Lane, Plan, Record, select, to_event
+from ..integrals import carried
 from ..smooth import holding
 from .aim import aim_ahead, aim_at
 from .arrive import arrive
-from .faults import Progress, faults
-from .impulse import Instant, shaken
-from .jump import after_jump
-from .trial import Trial, attempt, timing
+from .faults import faults
+from .happen import after_jump
+from .impulse import shaken
+from .trial import Trial, attempt
 
 # Of a cycle, a step that is long enough to tell by it whether anything moves. A choice.
 _LONG = 1e-3
 
 
-class Step(NamedTuple):
-    """A lane after one step, and the row that it completed."""
+def iterate(plan: Plan, lane: Lane) -> tuple[Lane, Flag, Record]:
+    """One step of one lane: advance, aim or land. A lane that has ended is left as it is.
 
-    lane: Lane
-    completed: Flag
-    """Whether an interval ended with it."""
-    state: State
-    record: Record
-    """What is recorded of the interval that ended."""
-
-
-def iterate(plan: Plan, lane: Lane) -> Step:
-    """One step of one lane: advance, aim or land. A lane that has ended is left as it is."""
+    **Returns:** the lane after it; whether an interval ended with it; what is recorded of that.
+    """
     active = (lane.done < plan.intervals) & (lane.fault == 0)
     smooth = holding(plan.machine, lane.modes, lane.contact)
-    motion = plan.method.foresee(smooth, lane.s, lane.state, timing(plan, lane))
+    beside = carried(smooth, lane.s, lane.state, lane.record.integrals)
+    motion = plan.method.foresee(smooth, lane.s, lane.state, beside)
     if motion is not None:
         lane = aim_ahead(plan, lane, motion)
     trial = attempt(plan, lane, active, smooth, motion)
@@ -67,30 +57,22 @@ def iterate(plan: Plan, lane: Lane) -> Step:
     if plan.noise is not None:
         completed = completed & plan.is_record_point(lane.part, lane.done)
     done = lane.done + jnp.where(completed, 1.0, 0.0)
-    new = _onward(plan, there, reached, completed, done)
-
-    steps = lane.steps + jnp.where(active, 1.0, 0.0)
-    # Counted anew in each interval: in single precision the sum of all stands still at 2²⁴.
-    spent = jnp.where(reached, 0.0, lane.spent + 1.0)
-    fault = there.fault
-    aims = jnp.where(aim, lane.aims + 1, 0.0)
-    progress = Progress(length, new.record, steps, spent, aims)
-    for condition, code in faults(plan, lane, trial, taken, rejected, progress, target):
-        stops_here = active & (fault == 0) & condition & (done < plan.intervals)
-        fault = jnp.where(stops_here, code, fault)
-    new = dataclasses.replace(
-        new,
+    new = _onward(plan, there, reached, completed, done)._replace(
         length=length,
         attempt=jnp.where(aim, goal, _next_attempt(plan, lane, trial, taken, length)),
         target=jnp.where(aim, target, FREE),
-        aims=aims,
+        aims=jnp.where(aim, lane.aims + 1, 0.0),
         done=done,
-        fault=fault,
-        steps=steps,
-        spent=spent,
+        steps=lane.steps + jnp.where(active, 1.0, 0.0),
+        # Counted anew in each interval: in single precision the sum of all stands still at 2²⁴.
+        spent=jnp.where(reached, 0.0, lane.spent + 1.0),
         rejected=lane.rejected + jnp.where(rejected, 1.0, 0.0),
     )
-    return Step(new, completed, new.state, there.record)
+    fault = new.fault
+    for condition, code in faults(plan, lane, trial, taken, rejected, new):
+        stops_here = active & (fault == 0) & condition & (done < plan.intervals)
+        fault = jnp.where(stops_here, code, fault)
+    return new._replace(fault=fault), completed, there.record
 
 
 def _next_attempt(plan: Plan, lane: Lane, trial: Trial, taken: Flag, length: Scalar) -> Scalar:
@@ -139,21 +121,17 @@ def _onward(plan: Plan, there: Lane, reached: Flag, completed: Flag, done: Scala
         part = part + jnp.where(reached, 1.0, 0.0)
         turned = reached & (part >= plan.instants)
         part = jnp.where(turned, plan.first_part(done), part)
-    s = jnp.where(turned, 0.0, there.s)
     if not plan.ticks(state):
         state = select(turned, plan.machine.rewound(state), state)
+    lane = there._replace(s=jnp.where(turned, 0.0, there.s), state=state)
     renewed = plan.machine.renewed(state)
     if renewed is not state:
-        onward = Onward(there.direction, there.contact, there.modes, there.below)
-        direction, contact = after_jump(plan, onward, turned, state, renewed, jnp.zeros_like(s))
-        there = dataclasses.replace(there, direction=direction, contact=contact)
-        state = select(turned, renewed, state)
+        lane = after_jump(plan, lane._replace(state=renewed), turned, state)
+        lane = lane._replace(state=select(turned, renewed, state))
     if plan.noise is not None:
-        before = done - jnp.where(completed, 1.0, 0.0)
-        here = Instant(reached, completed, before, there.part, s)
-        there, state = shaken(plan, there, state, here)
-    record = select(completed, plan.fresh(state), there.record)
-    return dataclasses.replace(there, s=s, state=state, part=part, record=record)
+        lane = shaken(plan, lane, reached, completed)
+    record = select(completed, plan.fresh(lane.state), lane.record)
+    return lane._replace(part=part, record=record)
 
 
 def _resized(plan: Plan, lane: Lane, trial: Trial, taken: Flag, rejected: Flag) -> Scalar:

@@ -65,11 +65,11 @@ def first_event(
             place = jnp.where(guard.above, -3.0, place)
         found.append((place, to_event(guard.number), curve(), guard.at_once))
         crossed = crossed | over
-    behind, everything = crossed | met, plan.meets_turns(lane.done)
+    behind = crossed | met
     paths = [curve() for _, curve in courses]
 
     def that_matter(k: int, turned: Flag, theta: Scalar, known: Flag | None) -> Flag:
-        if everything is True:
+        if plan.meets_every_turn:
             return turned
         height = horner(paths[k], theta)
         close = _has_to_be_met(plan, lane, k, lambda stop: stop.beyond(height), _MARGIN)
@@ -163,10 +163,9 @@ def _has_to_be_met(
     **Arguments:** `depth`, how far the turn is beyond a stop; `margin`, how far short of a stop is
     close.
     """
-    everything = plan.meets_turns(lane.done)
-    if everything is True:
-        return jnp.ones_like(lane.s, bool)
-    close = jnp.zeros_like(lane.s, bool) if everything is False else everything
+    close = plan.meets_turns(lane.done)
+    if plan.meets_every_turn:
+        return close
     for stop in plan.machine.stops:
         if stop.coordinate == k:
             close = close | (depth(stop) > -margin)

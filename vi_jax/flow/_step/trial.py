@@ -9,9 +9,10 @@ from jax.lax import stop_gradient
 from ..._types import Flag, Scalar, Scalars, State
 from ...lanes import pin, pin_flag
 from .._contact.rest import Release, release
+from .._flow_to_event import FlowToEvent
 from .._lane import FREE, Lane, Plan, to_event, to_turn_of, total
-from ..beside import Beside, elapsed
 from ..events import Rates, force_rate, rates, turns_within
+from ..integrals import Integrals, carried, elapsed
 from ..methods import Foreseen
 from ..smooth import SmoothMachine, exact, holding
 from .guards import Crossing, Side, crossings, leniency, turn_tolerance
@@ -40,12 +41,11 @@ class Path(NamedTuple):
 
 
 class End(NamedTuple):
-    """Independent variable, state and elapsed time where a step ends."""
+    """Independent variable, state and integrals where a step ends."""
 
     s: Scalar
     state: State
-    time: Beside | None
-    """Elapsed time and integrals, where they are recorded."""
+    integrals: Integrals
 
 
 class Seen(NamedTuple):
@@ -102,15 +102,17 @@ class Trial(NamedTuple):
         return self.seen.paths
 
 
-def timing(plan: Plan, lane: Lane) -> Beside | None:
-    """Elapsed time and integrals, where the method has to carry them along."""
-    passed = lane.record.time
-    if passed is None:
-        return None
-    paced = passed.time is not None and plan.machine.pace(lane.s, lane.state) is not None
-    if not (paced or passed.integrals):
-        return None
-    return Beside(passed.time if paced else None, passed.integrals)
+class Situation(NamedTuple):
+    """A step that was tried, as its events are applied."""
+
+    plan: Plan
+    old: Lane
+    """The lane before the step."""
+    trial: Trial
+    taken: Flag
+    """Whether the step is taken."""
+    way: FlowToEvent
+    """The motion from the step's end on."""
 
 
 def attempt(
@@ -137,7 +139,8 @@ def attempt(
     s1 = pin(s1)
     h = s1 - lane.s
 
-    beside = timing(plan, lane)
+    old = lane.record.integrals
+    beside = carried(smooth, lane.s, lane.state, old)
     stages, looks = [], looks_within(plan, lane.state)
     if motion is not None:
         (new, beside), error = motion.at(h), jnp.zeros_like(h)
@@ -148,7 +151,6 @@ def attempt(
         stages = stages if method.adaptive else apart(stages)
     else:
         new, beside, error = method.step(smooth, lane.s, s1, lane.state, beside)
-    time = None if lane.record.time is None else elapsed(lane.record.time, beside, h)
     if lane.contact is not None and not method.holds(machine):
         rests = lane.contact[0] > 0
         new = jtu.tree_map(lambda a, b: jnp.where(rests, a, b), lane.state, new)
@@ -174,14 +176,14 @@ def attempt(
         for k, one in enumerate(alone):
             paths.append(_path(plan, lane, k, one, smooth, (s1, new, h, limit), good, seen))
     met, below = crossings(plan, lane, smooth, paths, (s1, h, new), (good, last), seen)
-    end, found = End(s1, new, time), Seen(met, tuple(paths), below, shares)
+    end, found = End(s1, new, elapsed(old, beside, h)), Seen(met, tuple(paths), below, shares)
     return Trial(h, end, error, good, last, found, smooth, alone, nothing)
 
 
 def _clear(plan: Plan, lane: Lane) -> Scalar | None:
     """How long nothing can be met from here, in which only the end of a step counts; 0 where it is
     not so, `None` where that is never known."""
-    if plan.averages or plan.meets_turns(lane.done) is True:
+    if plan.averages or plan.meets_every_turn:
         return None
     clear = plan.method.clear(plan.machine, lane.s, lane.state)
     if clear is None:

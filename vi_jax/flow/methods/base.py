@@ -12,7 +12,7 @@ from jaxtyping import Array
 
 from ..._types import Scalar, State
 from ...machine import AbstractMachine
-from ..beside import Beside
+from ..integrals import Integrals
 from ..smooth import SmoothMachine
 from ._series import Along
 
@@ -24,7 +24,7 @@ QUARTERS = (0.25, 0.5, 0.75)
 class Foreseen(Protocol):
     """A motion that is known before a step is taken."""
 
-    def at(self, h: Scalar) -> tuple[State, Beside | None]:
+    def at(self, h: Scalar) -> tuple[State, Integrals]:
         """State, and what is integrated beside it, a length h away."""
         ...
 
@@ -111,21 +111,22 @@ class AbstractMethod(eqx.Module):
 
     @abc.abstractmethod
     def step(
-        self, smooth: SmoothMachine, s0: Scalar, s1: Scalar, state: State, beside: Beside | None
-    ) -> tuple[State, Beside | None, Scalar]:
+        self, smooth: SmoothMachine, s0: Scalar, s1: Scalar, state: State, beside: Integrals
+    ) -> tuple[State, Integrals, Scalar]:
         """State, and what is integrated `beside` it, at `s1` from those at `s0`, and the step's
         error.
 
         The error is relative to the tolerance (a step is accepted up to 1). Methods that are not
         adaptive return 0, or more than 1 where `may_be_unstable` and the step is.
 
-        **Arguments:** `smooth`, the machine in its modes; `beside`, `None` unless averages, or the
-        elapsed time of a machine with a `pace`, are asked for; its rate is `rate_beside`.
+        **Arguments:** `smooth`, the machine in its modes; `beside`, the integrals of averages, and
+        the elapsed time of a machine with a `pace`, where they are asked for; their rates are
+        `rate_of_integrals`.
         """
 
     def step_with_stages(
-        self, smooth: SmoothMachine, s0: Scalar, s1: Scalar, state: State, beside: Beside | None
-    ) -> tuple[State, Beside | None, Scalar, list[Stage]]:
+        self, smooth: SmoothMachine, s0: Scalar, s1: Scalar, state: State, beside: Integrals
+    ) -> tuple[State, Integrals, Scalar, list[Stage]]:
         """Return what `step` does, and the stages of the step: states within it, at which guards
         are evaluated that its ends do not resolve. By default they are steps to three places.
 
@@ -137,7 +138,7 @@ class AbstractMethod(eqx.Module):
         stages = []
         for share in QUARTERS:
             s = s0 + share * (s1 - s0)
-            stages.append(Stage(share, s, self.step(smooth, s0, s, state, None)[0]))
+            stages.append(Stage(share, s, self.step(smooth, s0, s, state, {})[0]))
         return new, beside, error, stages
 
     def guard_error(
@@ -153,7 +154,7 @@ class AbstractMethod(eqx.Module):
         return None
 
     def foresee(
-        self, smooth: SmoothMachine, s: Scalar, state: State, beside: Beside | None
+        self, smooth: SmoothMachine, s: Scalar, state: State, beside: Integrals
     ) -> Foreseen | None:
         """The motion from here, of a method that knows it before a step is taken (see `Taylor`): a
         step then ends at the first event on it, and is `Foreseen.at` instead of `step`."""

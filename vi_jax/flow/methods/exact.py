@@ -24,7 +24,7 @@ from ...machine import (
     horner,
     sincos,
 )
-from ..beside import Beside, rate_beside
+from ..integrals import Integrals, rate_of_integrals
 from ..smooth import SmoothMachine
 from ._linear import clear, flown, longest
 from .base import AbstractMethod
@@ -111,14 +111,14 @@ class ExactFlight(AbstractMethod):
             part = tau if share is None else share * tau
             return OscillatorState(*flight(zeta, xi, phase, state.Y, state.V, part))
 
-        if beside is not None:
+        if beside:
             beside = _integrated(smooth, s0, s1, state, along, beside)
         return along(None), beside, jnp.zeros_like(s0)
 
 
 def _linear(
-    smooth: SmoothMachine, s0: Scalar, s1: Scalar, state: State, beside: Beside | None
-) -> tuple[State, Beside | None, Scalar]:
+    smooth: SmoothMachine, s0: Scalar, s1: Scalar, state: State, beside: Integrals
+) -> tuple[State, Integrals, Scalar]:
     """The flight of a linear machine, in its modes or to be taken there; as `ExactFlight.step`."""
     machine, h = smooth.machine, s1 - s0
     if isinstance(machine, LinearMachine):
@@ -130,15 +130,15 @@ def _linear(
     def along(share: float) -> State:
         return way.outward(flown(way.machine, smooth.contact, s0, share * h, begin))
 
-    if beside is not None:
+    if beside:
         beside = _integrated(smooth, s0, s1, state, along, beside)
     new = way.outward(flown(way.machine, smooth.contact, s0, h, begin))
     return new, beside, jnp.zeros_like(s0)
 
 
 def _integrated(
-    smooth: SmoothMachine, s0: Scalar, s1: Scalar, state: State, along: Callable, beside: Beside
-) -> Beside:
+    smooth: SmoothMachine, s0: Scalar, s1: Scalar, state: State, along: Callable, beside: Integrals
+) -> Integrals:
     """Integrals beside a flight from `s0` to `s1`, by quadrature.
 
     **Arguments:** `smooth`, the machine in its modes; `state`, where the flight begins, and where a
@@ -151,7 +151,7 @@ def _integrated(
         if smooth.contact and not isinstance(smooth.machine, LinearMachine):
             rests = smooth.contact[0] > 0
             there = jtu.tree_map(lambda a, b, rests=rests: jnp.where(rests, a, b), state, there)
-        rate = rate_beside(smooth, s0 + float(node) * (s1 - s0), there, beside)
+        rate = rate_of_integrals(smooth, s0 + float(node) * (s1 - s0), there, beside)
         share = float(weight) * (s1 - s0)
         total = jtu.tree_map(lambda x, v, share=share: x + share * v, total, rate)
     return total

@@ -13,7 +13,7 @@ from jax.core import Tracer
 from ..._checks import count, require
 from ..._types import Scalar, State
 from ...lanes import pin
-from ..beside import Beside, rate_beside
+from ..integrals import TIME, Integrals, rate_of_integrals
 from ..smooth import SmoothMachine
 from .base import AbstractMethod, Stage, fading_is_known
 from .unrolled import Unrolled
@@ -42,7 +42,7 @@ def _runge_kutta(solver: Unrolled, smooth: SmoothMachine, s0, s1, state, beside)
 
     def field(s, y, args):
         state, beside = y
-        return pin((smooth.field(s, state), rate_beside(smooth, s, state, beside)))
+        return pin((smooth.field(s, state), rate_of_integrals(smooth, s, state, beside)))
 
     y1, error, slopes, places = solver.step_with_stages(
         diffrax.ODETerm(field), s0, s1, (state, beside), None
@@ -50,10 +50,10 @@ def _runge_kutta(solver: Unrolled, smooth: SmoothMachine, s0, s1, state, beside)
     return *y1, error, slopes, [Stage(c, s, y[0], weight) for c, s, y, weight in places]
 
 
-def _sized_by(state: State, beside: Beside | None) -> tuple[State, dict[str, Scalar] | None]:
+def _sized_by(state: State, beside: Integrals) -> tuple[State, Integrals]:
     """What the size of a step is chosen by: the state and the integrals, but not the elapsed
     time."""
-    return state, None if beside is None else beside.integrals
+    return state, {name: x for name, x in beside.items() if name != TIME}
 
 
 def _size(state: State) -> Scalar:

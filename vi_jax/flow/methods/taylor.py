@@ -14,7 +14,7 @@ from jax.lax import stop_gradient
 
 from ..._checks import count, require
 from ..._types import Scalar, State
-from ..beside import Beside, rate_beside
+from ..integrals import Integrals, rate_of_integrals
 from ..smooth import SmoothMachine
 from . import _series as power_series
 from ._coefficients import NoSeries, NotSmooth, Series
@@ -52,7 +52,7 @@ class Expansion(NamedTuple):
     rarely: bool = False
     """Few steps are shortened by it; static."""
 
-    def at(self, h: Scalar) -> tuple[State, Beside | None]:
+    def at(self, h: Scalar) -> tuple[State, Integrals]:
         """State, and what is integrated beside it, a length h away."""
         return jtu.tree_unflatten(self.treedef, [power_series.at(x, h) for x in self.series])
 
@@ -144,13 +144,13 @@ class Taylor(AbstractMethod):
         return self.rtol is None
 
     def foresee(
-        self, smooth: SmoothMachine, s: Scalar, state: State, beside: Beside | None
+        self, smooth: SmoothMachine, s: Scalar, state: State, beside: Integrals
     ) -> Expansion:
         """The motion as a power series about (s, state), with the integrals."""
 
         def field(s, y):
             state, beside = y
-            return smooth.field(s, state), rate_beside(smooth, s, state, beside)
+            return smooth.field(s, state), rate_of_integrals(smooth, s, state, beside)
 
         with _in_words():
             treedef, series = power_series.expand(field, s, (state, beside), self.order)
