@@ -3,7 +3,7 @@
 import functools
 import sys
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from importlib.metadata import PackageNotFoundError, version
@@ -82,6 +82,35 @@ def at_work(
         if interrupted is None:
             raise
         raise interrupted from None
+
+
+def in_parts(
+    what: str,
+    step: Callable[[Any, Any], tuple[Any, Any]],
+    carry: Any,
+    pieces: Iterable[tuple[int, Any]],
+    joined: Callable[[Any, list[Any]], R],
+    **options: Any,
+) -> R:
+    """Do a long computation piece by piece, so that an interrupt loses one of them.
+
+    **Arguments:** `what` it is, in words; `step(carry, piece)` returns the next carry and a part of
+    the result; `pieces` with their sizes; `joined(carry, parts)` makes the result, also the partial
+    one of an `Interrupted`; `options` as for `at_work`.
+    """
+    import jax
+
+    parts: list[Any] = []
+
+    def kept() -> Interrupted | None:
+        return Interrupted(what, joined(carry, parts)) if parts else None
+
+    with at_work(what, kept, **options) as tell:
+        for size, piece in pieces:
+            carry, part = jax.block_until_ready(step(carry, piece))
+            parts.append(part)
+            tell(size)
+    return joined(carry, parts)
 
 
 # The warnings that were given in the user's call under way.

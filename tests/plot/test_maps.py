@@ -64,16 +64,6 @@ def test_regimes_have_the_colours_of_the_legend():
     assert ax.get_xlabel() == "frequency ratio ζ" and ax.get_ylabel() == "restitution k"
 
 
-def test_other_numbers_of_a_store_are_drawn_as_its_attributes_say():
-    now = _data()
-    older = _data(np.select([PERIODS == -2, PERIODS < -2], [0, PERIODS + 1], PERIODS))
-    older.period.attrs = {
-        "flag_values": [-3, -2, -1, 0], "flag_meanings": "transient failed chaotic unsettled",
-    }  # fmt: skip
-    (cells, _), (others, _) = (_cells(vi.plot_regimes(x, ax=_axes())) for x in (now, older))
-    np.testing.assert_array_equal(cells, others)
-
-
 def test_regimes_lie_around_their_values():
     shuffled = _data(PERIODS[[2, 0, 3, 1]], x=(0.9, 0.5, 1.1, 0.7))
     (cells, mesh), (others, _) = (

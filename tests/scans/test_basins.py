@@ -3,9 +3,6 @@
 import numpy as np
 import pytest
 import vi_jax as vi
-from vi_jax.scans._describe import description_of
-from vi_jax.scans.grid import Blocks
-from vi_jax.scans.program import make_program
 
 from belts import Observed
 
@@ -93,16 +90,6 @@ def test_bad_regions():
         vi.basins(SCENE, {"drive.frequency_ratio": (0.5, 1.0)})
     with pytest.raises(ValueError, match="one number or 2"):
         vi.basins(SCENE, REGION, resolution=(3, 3, 3))
-
-
-def test_a_store_with_other_numbers_for_regimes_is_another_scan():
-    axes = {"start.Y": np.linspace(-1.0, 1.0, 4)}
-    blocks = Blocks(axes, 256, paired=False)
-    about = description_of(make_program(SCENE, tuple(axes), measure="regime"), blocks)
-    assert about["regimes"] == {regime.name: int(regime) for regime in vi.REGIMES}
-    assert "regimes" not in description_of(
-        make_program(SCENE, tuple(axes), measure="steps"), blocks
-    )
 
 
 @pytest.mark.slow

@@ -21,7 +21,7 @@ from ..flow import RESULTS, Run, RunOptions, planned, simulate
 from ..machine import AbstractMachine, is_autonomous
 from ..machines.named import InputError, check_keys, value_of
 from ..orbit import continue_orbit, find_orbit
-from ..scans import REGIMES, Sweep, basins, periods_of, scan, sweep
+from ..scans import REGIMES, Sweep, basins, scan, sweep
 from .files import errors_in, start_of
 
 _ENDINGS = {"output": (".csv", ".nc"), "picture": (".png", ".pdf", ".svg")}
@@ -258,7 +258,7 @@ def _scan(machine: AbstractMachine, options: dict[str, Any]) -> Found:
 
 def _regimes(data: xr.Dataset, machine: AbstractMachine) -> list[str]:
     """How many motions there are of each period, in the machine's words."""
-    period = periods_of(data["period"])[np.asarray(data["result"]) == 0]
+    period = np.asarray(data["period"]).astype(int)[np.asarray(data["result"]) == 0]
     names: dict[int, str] = {regime: regime.meaning for regime in REGIMES}
     kinds, counts = np.unique(period, return_counts=True)
     lines = []

@@ -15,7 +15,7 @@ from matplotlib.patches import Patch
 from .._checks import flag
 from .._messages import so_many
 from ..machine import AbstractMachine, by_name, in_brackets, unit_of
-from ..scans import NOT_COMPUTED, REGIMES, Basins, periods_of
+from ..scans import NOT_COMPUTED, REGIMES, Basins
 from . import colors as look
 from .branch import axis_name
 from .colors import IRREGULAR, PERIODS, color_of, shades
@@ -66,7 +66,7 @@ def plot_regimes(
     period = data["period"]
     x, y = _two_axes([str(name) for name in period.dims], x, y)
     period = period.transpose(y, x)
-    codes = np.clip(periods_of(period), _LEAST + 1, len(PERIODS))
+    codes = np.clip(np.asarray(period).astype(int), _LEAST + 1, len(PERIODS))
     if "impacts" in data:
         impacts = np.asarray(data["impacts"].transpose(y, x), float)
         free, two = (codes > 0) & (impacts < 0.5), (codes == 2) & (impacts >= 0.5)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._checks import count, given_number
-from .._messages import Interrupted, at_work, so_many, warning_once
+from .._messages import in_parts, so_many, warning_once
 from .._types import State, xr
 from ..flow import MethodLike, in_names, machine_of, tidy
 from ..machine import AbstractMachine, components, with_leaf, with_units
@@ -193,25 +193,22 @@ def all_orbits(
     starts, seed = count("starts", starts, least=1), count("seed", seed)
     tolerance = given_number("tolerance", tolerance, low=0.0)
     begin = machine.start() if start is None else start
-    batches: list[Orbit] = []
     # A draw for each period: longer ones do not change what shorter ones are searched from.
     rows = [starts_in(region, 1, starts, (seed, n)) for n in range(1, cycles + 1)]
     for name in rows[0]:
         check_leaf_name(machine, begin, name, "region", None)
     ranges = {name: (float(low), float(high)) for name, (low, high) in region.items()}
 
-    def so_far() -> AllOrbits:
+    def step(_, piece):
+        n, row = piece
+        options = {"root_finder": root_finder, "method": method}
+        return None, find_orbit(machine, _guesses(begin, row), n, **options)
+
+    def joined(_, batches: list[Orbit]) -> AllOrbits:
         return _sorted_out(machine, batches, tolerance, ranges)
 
-    def kept() -> Interrupted | None:
-        return Interrupted("search for periodic motions", so_far()) if batches else None
-
-    with at_work("all orbits", kept, progress=False):
-        for n, row in enumerate(rows, 1):
-            options = {"root_finder": root_finder, "method": method}
-            found = find_orbit(machine, _guesses(begin, row), n, **options)
-            batches.append(jax.block_until_ready(found))
-        return so_far()
+    pieces = ((1, piece) for piece in enumerate(rows, 1))
+    return in_parts("search for periodic motions", step, None, pieces, joined, progress=False)
 
 
 def _guesses(begin: State, row: Mapping[str, np.ndarray]) -> State:

@@ -22,9 +22,8 @@ from ..flow import REASON_NAMES
 from ..machine import AbstractMachine, attributes, leaf, leaf_names, unit_of
 from ._shaken import NOISE, START, part_of
 from .grid import LANE, Blocks
-from .measures import Regime
 from .program import ScanProgram
-from .regime import CODES, flags
+from .regime import flags
 from .store import NOT_COMPUTED, UNVERIFIABLE, Variable
 
 
@@ -78,9 +77,6 @@ def description_of(program: ScanProgram, blocks: Blocks) -> dict[str, Any]:
     }
     if program.shaken is not None:
         about["noise"] = program.shaken.described()
-    if any(isinstance(measure, Regime) for measure in program.measures):
-        # A store of an earlier release has other numbers for them, not to be mixed with these.
-        about["regimes"] = dict(CODES)
     return about
 
 

@@ -12,9 +12,8 @@ from .._messages import at_work, so_many, warning_once
 from .._types import State, xr
 from ..flow import MethodLike, chosen, machine_of, tidy
 from ..machine import AbstractMachine, attributes, check_leaf, summary_table, unit_of, with_leaf
-from ._basins import check_options, followed, sorted_out, starts_in
+from ._basins import Attractor, Basins, Integrity, check_options, followed, sorted_out, starts_in
 from ._computed import ScanInterrupted
-from ._found import Attractor, Basins, Integrity
 from ._shaken import START
 from .grid import axes_of
 

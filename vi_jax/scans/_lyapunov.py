@@ -1,40 +1,125 @@
 """Lyapunov exponents, through the impacts."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .._checks import count, flag
-from .._messages import Interrupted, at_work, warning_once
+from .._messages import in_parts, warning_once
 from .._programs import compiled, is_outermost
-from .._types import Scalar, State
+from .._types import Scalar, State, xr
 from ..flow import (
+    REASON_NAMES,
     RESULTS,
     MethodLike,
+    batch_names,
     chosen,
     has_averages,
     has_fixed_cycle,
+    in_names,
     means,
+    present,
     simulate,
+    states,
+    tidy,
 )
 from ..machine import (
     AbstractMachine,
     HybridState,
+    Stated,
+    Summarized,
+    attributes,
     bare,
+    in_unit,
     is_autonomous,
     modes_of,
+    number_in_words,
     raveled,
     renews,
     stated,
     unit_of,
+    with_unit,
+    with_units,
 )
 from ..orbit import CycleMap, adopted, cycle_map
-from ._exponents import Lyapunov
+
+
+class Lyapunov(Summarized):
+    """Lyapunov exponents of a motion. Under `vmap` batch axes come first."""
+
+    exponents: Float[Array, "... states"]
+    """The spectrum, greatest first: mean growth rates in time, as the machine counts it (`unit`;
+    for a `Scene` ω)."""
+    per_cycle: Float[Array, "... states"]
+    """The same per drive cycle (dimensionless): ln|multipliers|/n on an orbit of n cycles. Of an
+    autonomous machine per usual `cycle`, at which it is observed."""
+    spread: Float[Array, "..."]
+    """Difference of the greatest exponent between the two halves of the run."""
+    state: State
+    """Section state at the end."""
+    result: RESULTS
+    """Whether the run was simulated to its end; if not, the numbers are NaN."""
+    averages: dict[str, Float[Array, "..."]] = eqx.field(default_factory=dict)
+    """The machine's own averages over the time of the cycles observed, by name."""
+    units: Stated = eqx.field(static=True, default=())
+    """In which units they are, as the machine states it."""
+    unit: str = eqx.field(static=True, default="")
+    """Of the exponents, as the machine states it; "" if it does not."""
+
+    @property
+    def successful(self) -> Bool[Array, "..."]:
+        """Whether the run was simulated to its end."""
+        return self.result == RESULTS.successful
+
+    def to_xarray(
+        self, dims: Sequence[str] | None = None, *, along: str | None = None
+    ) -> "xr.Dataset":
+        """These exponents, or a batch of them, as an `xarray.Dataset`.
+
+        The state at the end becomes a variable for each component (`state_Y`), and `result` is the
+        reason's name. Host-side: not to be traced.
+
+        **Arguments:** names of the batch axes, by default `lane`; `along`, to keep only what is
+        given along one dimension: `"exponent"`, or a batch axis.
+
+        **Raises:** `ValueError` if these are not as many as there are batch axes, or there is no
+        such dimension.
+        """
+        batch = batch_names(dims, self.exponents.ndim - 1)
+        each = *batch, "exponent"
+        variables = present({"exponents": self.exponents, "per_cycle": self.per_cycle}, each)
+        variables |= states("state", self.state, batch)
+        variables |= present(self.averages, batch)
+        alone = {"spread": self.spread, "result": in_names(self.result, RESULTS, REASON_NAMES)}
+        data = xr.Dataset(variables | present(alone, batch))
+        for name in ("exponents", "spread"):
+            data[name].attrs |= attributes(self.unit)
+        own = {name: name for name in self.averages}
+        return tidy(with_units(data, dict(self.units), own) if own else data, along)
+
+    def summary(self) -> str:
+        """The exponents; of a batch the range of the greatest."""
+        if self.exponents.ndim > 1:
+            lanes, good = self.spread.shape, int(jnp.sum(self.successful))
+            greatest = number_in_words(self.exponents[..., 0].ravel(), self.unit)
+            return f"Lyapunov exponents of lanes {lanes}, {good} successful; greatest: {greatest}"
+        numbers = ", ".join(f"{x:.9g}" for x in self.exponents)
+        ended = "" if bool(self.successful) else f"; ended: {RESULTS[self.result]}"
+        numbers = with_unit(numbers, self.unit)
+        first = f"Lyapunov exponents {numbers} (halves differ by {self.spread:.1g}){ended}"
+        lines = (
+            f"  mean {name}: {in_unit(f'{float(x):.6g}', dict(self.units), name)}"
+            for name, x in self.averages.items()
+        )
+        return "\n".join([first, *lines])
+
 
 # Cycles of one call where more than twice as many are asked for: some tenths of a second. A choice,
 # even, as the windows of `_window` are.
@@ -105,7 +190,23 @@ def lyapunov(
             f"{number}."
         )
     if cycles > 2 * _AT_ONCE and is_outermost(carried, start, settle):
-        return _in_parts(carried, start, cycles, settle, number, progress)
+        window = _window(cycles) if number == 1 else 1
+        pieces = (min(_AT_ONCE, cycles - done) for done in range(0, cycles, _AT_ONCE))
+
+        def step(carry, windows):
+            carry, seen = _part(carried, start, carry, jnp.asarray(windows), window)
+            return carry, jtu.tree_map(lambda x: x[:windows], seen)
+
+        def joined(carry, parts) -> Lyapunov:
+            return _ended(
+                carried, start, carry, jtu.tree_map(lambda *x: jnp.concatenate(x), *parts)
+            )
+
+        return in_parts(
+            "observation of exponents", step, _begun(carried, start, settle, number),
+            ((size, size // window) for size in pieces), joined, progress=progress, unit="cycle",
+            total=cycles,
+        )  # fmt: skip
     return _lyapunov(carried, start, cycles, settle, number)
 
 
@@ -133,35 +234,6 @@ def _begun(the_map: CycleMap, start, settle, number: int) -> Any:
     x = raveled(before.last)[0]
     modes = modes_of(before.last)
     return (x, modes), jnp.eye(x.size, number, dtype=x.dtype), before.result
-
-
-def _in_parts(
-    the_map: CycleMap, start, cycles: int, settle, number: int, progress: bool
-) -> Lyapunov:
-    """The exponents by some cycles at a time, all by one program, so that an interrupt loses few of
-    them.
-
-    **Arguments:** as `_lyapunov`; `progress`, whether a bar is shown.
-    """
-    carry = _begun(the_map, start, settle, number)
-    window = _window(cycles) if number == 1 else 1
-    parts: list[Any] = []
-
-    def summed() -> Lyapunov:
-        seen = jtu.tree_map(lambda *x: jnp.concatenate(x), *parts)
-        return _ended(the_map, start, carry, seen)
-
-    def kept() -> Interrupted | None:
-        return Interrupted("observation of exponents", summed()) if parts else None
-
-    with at_work("lyapunov", kept, progress=progress, unit="cycle", total=cycles) as tell:
-        for done in range(0, cycles, _AT_ONCE):
-            here = min(_AT_ONCE, cycles - done)
-            new = _part(the_map, start, carry, jnp.asarray(here // window), window)
-            carry, seen = jax.block_until_ready(new)
-            parts.append(jtu.tree_map(lambda x, n=here // window: x[:n], seen))
-            tell(here)
-    return summed()
 
 
 @compiled

@@ -1,39 +1,192 @@
 """`sweep`: a parameter changed little by little, the motion carried from value to value."""
 
+from collections.abc import Sequence
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 from .._checks import concrete, count, fits_records, flag, number, require
-from .._messages import Interrupted, at_work, warning_once
+from .._messages import in_parts, so_many, warning_once
 from .._programs import compiled, is_outermost
-from .._types import State
+from .._types import State, xr
 from ..flow import (
+    REASON_NAMES,
+    RESULTS,
     MethodLike,
+    batch_names,
     check_noise,
     check_reals,
     check_start,
     chosen,
+    in_names,
     machine_of,
+    present,
     simulate,
+    states,
+    tidy,
 )
 from ..machine import (
+    PLAIN,
     AbstractMachine,
+    Stated,
+    Summarized,
     bare,
     begun,
     check_again,
     check_leaf,
+    name_in,
     replaced,
     stated,
+    unit_of,
     with_leaf,
+    with_unit,
+    with_units,
 )
 from ._shaken import Shaken, shaken_by
-from ._swept import Sweep
 from .grid import LANE
-from .regime import REGIMES, impacts_of, least_period
+from .regime import CODES, REGIMES, flags, impacts_of, least_period
+
+# A jump is so many times the change at the values beside it, and this part of 1 + |number|:
+# choices.
+_JUMP, _NOTED = 3.0, 0.01
+
+# What is a number at each value of every sweep.
+COLUMNS = "y_min", "y_max", "period", "impacts", "frequency_ratio", "impact_speed"
+
+
+class Sweep(Summarized):
+    """The motion at each value of a sweep, in their order, in the machine's units (see
+    `AbstractMachine.units`). Under `vmap` batch axes come first."""
+
+    parameter: str = eqx.field(static=True)
+    """Name of the number that was changed."""
+    values: Float[Array, "..."]
+    """Its values."""
+    y_min: Float[Array, "..."]
+    """Smallest position (of the first coordinate) over the cycles observed."""
+    y_max: Float[Array, "..."]
+    """Largest position over the cycles observed."""
+    period: Int[Array, "..."]
+    """Period in drive cycles, or `REGIMES.unsettled` if none was found, or `REGIMES.failed`."""
+    impacts: Float[Array, "..."]
+    """Impacts in a period; in a cycle, on average, where there is no period."""
+    frequency_ratio: Float[Array, "..."] | None
+    """ζ: mean speed of the drive; `None` for machines that are not driven."""
+    impact_speed: Float[Array, "..."]
+    """Greatest V⁻ over the cycles observed."""
+    sections: State
+    """Section states of the cycles observed; leaves (values, cycles)."""
+    result: RESULTS
+    """Whether each value was simulated to its end."""
+    averages: dict[str, Float[Array, "..."]] = eqx.field(default_factory=dict)
+    """The machine's own averages over the time of the cycles observed, by name (see
+    `AbstractMachine.averages`)."""
+    labels: tuple[str, str] = eqx.field(static=True, default=PLAIN)
+    """What pictures write beside position and velocity, in the machine's words."""
+    periods: tuple[str, ...] = eqx.field(static=True, default=())
+    """Names of the periods of 1, 2, ... cycles, in the machine's words."""
+    units: Stated = eqx.field(static=True, default=())
+    """In which units its quantities are, as the machine states it."""
+
+    @property
+    def successful(self) -> Bool[Array, "..."]:
+        """Whether each value was simulated to its end."""
+        return self.result == RESULTS.successful
+
+    def to_xarray(
+        self, dims: Sequence[str] | None = None, *, along: str | None = None
+    ) -> "xr.Dataset":
+        """This sweep, or a batch of them, as an `xarray.Dataset` over its values.
+
+        The values are the coordinate that has the parameter's name, section states a variable for
+        each component (`section_Y`), and `result` is the reason's name. Not to be traced.
+
+        **Arguments:** names of the batch axes, by default `lane`; `along`, to keep only what is
+        given along one dimension: `"value"`, or `"cycle"` (the sections).
+
+        **Raises:** `ValueError` if these are not as many as there are batch axes, or there is no
+        such dimension.
+        """
+        each = (*batch_names(dims, self.values.ndim - 1), "value")
+        variables = present({name: getattr(self, name) for name in COLUMNS} | self.averages, each)
+        variables |= states("section", self.sections, (*each, "cycle"))
+        variables["result"] = each, in_names(self.result, RESULTS, REASON_NAMES)
+        data = xr.Dataset(variables, {self.parameter: (each, np.asarray(self.values))})
+        data["period"].attrs |= flags(CODES)
+        own = {name: name for name in (*self.averages, self.parameter)}
+        return tidy(with_units(data, dict(self.units), own), along)
+
+    def drawn(self) -> Any:
+        """The smallest position at each value."""
+        return self.y_min if self.values.ndim == 1 else None
+
+    def summary(self) -> str:
+        """The motions in the order of the values, and where one gives way to another."""
+        if self.values.ndim != 1:
+            good = int(jnp.sum(self.successful))
+            return (
+                f"Sweeps of {self.parameter}, shape {self.values.shape} with the values last; "
+                f"{good} of {self.values.size} successful"
+            )
+        values, lines = np.asarray(self.values), []
+        kinds, jumps = self._kinds(), self._jumps()
+        for i, value in enumerate(values):
+            same = bool(i) and kinds[i] == kinds[i - 1]
+            if same and not jumps[i]:
+                continue
+            line = f"  {'still ' if same else ''}{kinds[i]} from {value:.6g}"
+            if jumps[i]:
+                line += f", jump since {values[i - 1]:.6g}: {', '.join(jumps[i])}"
+            lines.append(line)
+        if len(lines) > 12:
+            lines = [*lines[:12], f"  {len(lines) - 12} further changes"]
+        return "\n".join([f"Sweep of {self.parameter}, {values.size} values:", *lines])
+
+    def _kinds(self) -> list[str]:
+        """The motion at each value in words: its period and its impacts."""
+        names: dict[int, str] = {
+            REGIMES.unsettled: "no period",
+            REGIMES.failed: REGIMES.failed.meaning,
+        }
+        periods = dict(enumerate(self.periods, 1))
+        return [
+            names.get(int(p))
+            or f"{periods.get(int(p), f'{2 * int(p)}π')} with {so_many(round(float(n)), 'impact')}"
+            for p, n in zip(np.asarray(self.period), np.asarray(self.impacts), strict=True)
+        ]
+
+    def _jumps(self) -> list[list[str]]:
+        """What changes at each value by far more than at the values beside it.
+
+        Not looked for within motions without a period, whose extremes differ by chance.
+        """
+        name, units = name_in(self.labels[0]), dict(self.units)
+        numbers = {
+            f"min {name}": (self.y_min, unit_of(units, "position")),
+            f"max {name}": (self.y_max, unit_of(units, "position")),
+            "ζ": (self.frequency_ratio, unit_of(units, "frequency_ratio")),
+        }
+        period = np.asarray(self.period)
+        found: list[list[str]] = [[] for _ in period]
+        for name, (x, unit) in numbers.items():
+            if x is None:
+                continue
+            x = np.asarray(x)
+            steps = np.abs(np.diff(x))
+            beside = np.nan_to_num(np.concatenate([[0.0], steps, [0.0]]))
+            usual = np.maximum(beside[:-2], beside[2:])
+            scale = 1 + np.maximum(np.abs(x[1:]), np.abs(x[:-1]))
+            far = (steps > _JUMP * usual) & (steps > _NOTED * scale)
+            far &= (period[1:] > 0) | (period[:-1] > 0)
+            for i in np.flatnonzero(far) + 1:
+                found[i].append(with_unit(f"{name} {x[i - 1]:.6g} → {x[i]:.6g}", unit))
+        return found
+
 
 # Values of one call: few, so that an interrupt loses little, but more than a call costs.
 _AT_ONCE = 16
@@ -114,39 +267,29 @@ def sweep(
     options = (settle, cycles, method, rests, tolerance, max_steps, shaken)
     if not is_outermost(machine, values, start, tolerance, shaken):
         return _sweep(machine, parameter, values, _counted(start, shaken), *options)[1]
-    return _in_parts(progress, machine, parameter, values, _counted(start, shaken), *options)
+    if values.size <= _AT_ONCE:
+        return _sweep(machine, parameter, values, _counted(start, shaken), *options)[1]
+    # All by one program: the last part is filled up by what ends at once.
+    size, missing = values.size, -values.size % _AT_ONCE
+    rows = np.append(np.asarray(values), np.full(missing, np.nan)).reshape(-1, _AT_ONCE)
+    pieces = ((min(_AT_ONCE, size - _AT_ONCE * i), jnp.asarray(row)) for i, row in enumerate(rows))
+
+    def step(start, row):
+        return _sweep(machine, parameter, row, start, *options)
+
+    def joined(_, parts: list[Sweep]) -> Sweep:
+        # By NumPy: hundreds of arrays would be a program.
+        return jtu.tree_map(lambda *x: jnp.asarray(np.concatenate(x)[:size]), *parts)
+
+    return in_parts(
+        "sweep", step, _counted(start, shaken), pieces, joined, progress=progress, unit="value",
+        total=size,
+    )  # fmt: skip
 
 
 def _counted(start: State, shaken: Shaken | None) -> Any:
     """The start, with noise beside the number of the value, by which each has its own path."""
     return start if shaken is None else (start, jnp.uint32(0))
-
-
-def _in_parts(progress: bool, machine, parameter, values, start, *options) -> Sweep:
-    """Some values at a time, all by one program, so that an interrupt loses few of them.
-
-    **Arguments:** `progress`, whether a bar is shown; all else as `_sweep`.
-    """
-    if values.size <= _AT_ONCE:
-        return _sweep(machine, parameter, values, start, *options)[1]
-    missing = -values.size % _AT_ONCE  # filled up by what ends at once
-    rows = np.append(np.asarray(values), np.full(missing, np.nan)).reshape(-1, _AT_ONCE)
-    parts: list[Sweep] = []
-
-    def kept() -> Interrupted | None:
-        return Interrupted("sweep", _row(parts, values.size)) if parts else None
-
-    with at_work("sweep", kept, progress=progress, unit="value", total=values.size) as tell:
-        for row in rows:
-            start, part = _sweep(machine, parameter, jnp.asarray(row), start, *options)
-            parts.append(jax.block_until_ready(part))
-            tell(min(_AT_ONCE, values.size - _AT_ONCE * (len(parts) - 1)))
-    return _row(parts, values.size)
-
-
-def _row(parts: list[Sweep], size: int) -> Sweep:
-    """The first values of all parts, put together by NumPy: hundreds of them would be a program."""
-    return jtu.tree_map(lambda *x: jnp.asarray(np.concatenate(x)[:size]), *parts)
 
 
 def _values(values: Any) -> tuple[jax.Array, np.ndarray | None]:

@@ -1,11 +1,11 @@
 """What a scan computes of its lanes: a pytree that is compiled once and can be sent away."""
 
-import contextlib
 import dataclasses
+import difflib
 import functools
 import inspect
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -41,10 +41,21 @@ from ..machine import (
     replaced,
     with_leaf,
 )
-from ._asked import cycles_for, measures_of, samples_for
 from ._shaken import MACHINE, NOISE, START, Shaken, part_of, shaken_by
 from .grid import Blocks
-from .measures import AbstractMeasure, Numbers
+from .measures import (
+    AbstractMeasure,
+    Average,
+    Exponent,
+    Extremes,
+    FrequencyRatio,
+    ImpactRate,
+    Numbers,
+    Power,
+    Regime,
+    Sections,
+    Steps,
+)
 from .statistics import Escape
 
 _USUAL = RunOptions()
@@ -221,24 +232,25 @@ def make_program(
 
     **Raises:** `TypeError` or `ValueError`, as `scan`.
     """
-    measures = measures_of(measure, _averages_of(machine, names, start))
-    derivatives = tuple_of_names("derivatives", derivatives)
-    shaken = shaken_by(noise, key, names, derivatives, measures)
-    cycles = cycles_for(measures, cycles)
-    settle = count("settle", options.settle)
-    template, build, rests = None, None, True
-    if isinstance(machine, AbstractMachine):
-        template = machine_of(machine)
-        method = chosen(template, options.method)
+    build, own = None, [name for name in names if part_of(name) == MACHINE]
+    template = machine_of(machine) if isinstance(machine, AbstractMachine) else None
+    if template is not None:
+        # Its numbers on the axes may let a body rest: `check_corners` tells.
+        known = _known(template, options.method, start)._replace(rests=True)
     elif callable(machine):
-        build, own = machine, [name for name in names if part_of(name) == MACHINE]
-        _check_names_of(build, own)
-        method, rests = _suited(build, own, options.method)
+        build = machine
+        known = _known_of_made(build, own, options.method, start)
     else:
         raise TypeError(
             "Argument `machine` must be a `Scene`, an `AbstractMachine` or a function that makes "
             f"one, but got {machine!r}."
         )
+    method, rests, averages = known
+    measures = measures_of(measure, averages)
+    derivatives = tuple_of_names("derivatives", derivatives)
+    shaken = shaken_by(noise, key, names, derivatives, measures)
+    cycles = cycles_for(measures, cycles)
+    settle = count("settle", options.settle)
     first = start
     if template is not None and start is None:
         first = template.start()
@@ -272,47 +284,30 @@ def _stop_of(measures: tuple[AbstractMeasure, ...], derivatives: tuple[str, ...]
     return jtu.Partial(Escape.leaves, escape)
 
 
-def _averages_of(machine: Any, axes: Iterable[str], start: State) -> tuple[str, ...]:
-    """The names of the averages of a machine, or of those that a function makes."""
-    if isinstance(machine, AbstractMachine):
-        return _names_of(machine, start)
-    found: list[tuple[str, ...]] = []
+class _Known(NamedTuple):
+    """What is known of all machines of a scan: how they are carried, whether a body can come to
+    rest in them, and the names of their averages."""
 
-    def made(values):
-        found.append(_names_of(machine(**values), start))
-
-    # What cannot be made is reported where the method is looked for.
-    with contextlib.suppress(Exception):
-        jax.eval_shape(made, {x: jnp.zeros(()) for x in axes if part_of(x) == MACHINE})
-    return found[0] if found else ()
+    method: AbstractMethod
+    rests: bool
+    averages: tuple[str, ...]
 
 
-def _names_of(machine: AbstractMachine, start: State) -> tuple[str, ...]:
-    if not isinstance(machine, AbstractMachine) or not has_averages(machine):
-        return ()
-    return average_names(machine, machine.start() if start is None else machine.adopt(start))
+def _known(machine: AbstractMachine, method: MethodLike, start: State) -> _Known:
+    averages: tuple[str, ...] = ()
+    if has_averages(machine):
+        first = machine.start() if start is None else machine.adopt(start)
+        averages = average_names(machine, first)
+    return _Known(chosen(machine, method), machine.may_rest(), averages)
 
 
-def _suited(
-    build: Callable[..., Any], names: list[str], method: MethodLike
-) -> tuple[AbstractMethod, bool]:
-    """The method for the machines that a function makes, and whether a body can come to rest in
-    them, whatever its values."""
-    found: list[tuple[AbstractMethod, bool]] = []
+def _known_of_made(
+    build: Callable[..., Any], names: list[str], method: MethodLike, start: State
+) -> _Known:
+    """The same of the machines that a function makes, whatever its values.
 
-    def made(values):
-        machine = build(**values)
-        if isinstance(machine, AbstractMachine):
-            found.append((chosen(machine, method), machine.may_rest()))
-        else:  # refused once there are lanes
-            found.append((chosen(None, method), True))
-
-    jax.eval_shape(made, {name: jnp.zeros(()) for name in names})
-    return found[0]
-
-
-def _check_names_of(build: Callable[..., Any], names: list[str]) -> None:
-    """**Raises:** `ValueError` if the function that makes machines does not take these names."""
+    **Raises:** `ValueError` if the function does not take these names.
+    """
     try:
         inspect.signature(build).bind(**dict.fromkeys(names))
     except TypeError as error:
@@ -321,7 +316,18 @@ def _check_names_of(build: Callable[..., Any], names: list[str]) -> None:
             f"{error}."
         ) from None
     except ValueError:
-        return  # its arguments are not known
+        pass  # its arguments are not known
+    found: list[_Known] = []
+
+    def made(values):
+        machine = build(**values)
+        is_one = isinstance(machine, AbstractMachine)  # else it is refused once there are lanes
+        found.append(
+            _known(machine, method, start) if is_one else _Known(chosen(None, method), True, ())
+        )
+
+    jax.eval_shape(made, {name: jnp.zeros(()) for name in names})
+    return found[0]
 
 
 def _check_variables(measure: AbstractMeasure, new: Iterable[str], taken: list[str]) -> None:
@@ -403,3 +409,98 @@ def check_corners(program: ScanProgram, blocks: Blocks) -> ScanProgram:
     if program.build is not None:
         return program
     return dataclasses.replace(program, options=dataclasses.replace(program.options, rests=rests))
+
+
+class Custom(AbstractMeasure):
+    """A user's own function of one lane's machine and run."""
+
+    function: Callable[..., Any] = eqx.field(static=True)
+
+    def __call__(self, machine, run):
+        """What the function names of one lane, as arrays."""
+        found = self.function(machine, run)
+        if not isinstance(found, Mapping):
+            raise TypeError(
+                "A function in argument `measure` must return a mapping of names to numbers, but "
+                f"returned {type(found).__name__}."
+            )
+        numbers = {}
+        for name, value in found.items():
+            try:
+                numbers[name] = jnp.asarray(value)
+            except (TypeError, ValueError):
+                raise TypeError(
+                    "A function in argument `measure` must return numbers, but its "
+                    f"{name!r} is {value!r}."
+                ) from None
+        return numbers
+
+
+MEASURES: Mapping[str, Callable[[], AbstractMeasure]] = {
+    "extremes": Extremes,
+    "regime": Regime,
+    "frequency_ratio": FrequencyRatio,
+    "power": Power,
+    "impact_rate": ImpactRate,
+    "sections": Sections,
+    "exponent": Exponent,
+    "steps": Steps,
+}
+
+
+def measures_of(measure: object, averages: Sequence[str] = ()) -> tuple[AbstractMeasure, ...]:
+    """Measures by name, as objects, or functions of a machine and a run; one or several. A name may
+    be that of one of the machine's own `averages`, which comes first.
+
+    **Raises:** `ValueError` for an unknown name, `TypeError` for anything else.
+    """
+    if isinstance(measure, str | AbstractMeasure) or callable(measure):
+        measure = (measure,)
+    if not isinstance(measure, Iterable):
+        raise TypeError(f"Argument `measure` must be a name or a function, but got {measure!r}.")
+    found = tuple(_measure(one, averages) for one in measure)
+    if not found:
+        raise ValueError("Argument `measure` must name at least one measure, but is empty.")
+    return found
+
+
+def _measure(one: object, averages: Sequence[str]) -> AbstractMeasure:
+    if isinstance(one, AbstractMeasure):
+        return one
+    if isinstance(one, str):
+        if one in averages:
+            return Average(one)
+        if one in MEASURES:
+            return MEASURES[one]()
+        names = [*averages, *MEASURES]
+        near = difflib.get_close_matches(one, names, n=2, cutoff=0.6)
+        hint = f"near names: {', '.join(near)}" if near else f"there are: {', '.join(names)}"
+        raise ValueError(f"Argument `measure` must name a measure, but got {one!r}; {hint}.")
+    if callable(one):
+        return Custom(one)
+    raise TypeError(f"Argument `measure` must be a name or a function, but got {one!r}.")
+
+
+def cycles_for(measures: Iterable[AbstractMeasure], cycles: int | None) -> int:
+    """The cycles to observe: those asked for, or as many as these measures need.
+
+    **Raises:** `ValueError` if they are too few for one of them.
+    """
+    needed = max(m.cycles for m in measures)
+    cycles = max(32, needed) if cycles is None else count("cycles", cycles, least=1)
+    if cycles < needed:
+        who = next(type(m).__name__ for m in measures if m.cycles > cycles)
+        raise ValueError(
+            f"Argument `cycles` must be at least {needed} for the measure {who}, but got {cycles}."
+        )
+    return cycles
+
+
+def samples_for(measures: Iterable[AbstractMeasure]) -> int:
+    """Samples in a cycle. **Raises:** `ValueError` for measures that ask for different ones."""
+    asked = {m.instants for m in measures if m.instants}
+    if len(asked) > 1:
+        raise ValueError(
+            f"Argument `measure` must ask for one number of samples, but asks for {sorted(asked)}."
+        )
+    return max(asked, default=0)

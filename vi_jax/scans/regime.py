@@ -6,7 +6,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._types import Scalar, State
@@ -48,19 +47,6 @@ CODES = {regime.name: int(regime) for regime in sorted(REGIMES)}
 def flags(codes: Mapping[str, int]) -> dict[str, Any]:
     """Attributes of a variable that say what its special numbers mean."""
     return {"flag_values": list(codes.values()), "flag_meanings": " ".join(codes)}
-
-
-def periods_of(period: Any) -> np.ndarray:
-    """Periods in a data set, with the numbers of `REGIMES` for what has none: in a store of an
-    earlier release others may stand for them, as its attributes say."""
-    found = np.asarray(period).astype(int)
-    meanings = str(period.attrs.get("flag_meanings", "")).split()
-    values = np.atleast_1d(period.attrs.get("flag_values", ()))
-    stated = dict(zip(meanings, values.tolist(), strict=False))
-    places = [(found == stated[name], code) for name, code in CODES.items() if name in stated]
-    for place, code in places:
-        found[place] = code
-    return found
 
 
 def least_period(
