@@ -21,6 +21,7 @@ from .integrals import TIME, Integrals
 from .labelled import EventKind
 from .methods import AbstractMethod
 from .results import code
+from .smooth import unit_of
 
 # What the next step aims at: nothing, or one of those below. Numbers, which the loop carries.
 FREE = 0.0
@@ -245,6 +246,20 @@ class Plan(eqx.Module):
     stop: Any = None
     """What ends a lane early (see `RunOptions`); what it would have recorded then is no number."""
 
+    extents: Scalars | None = None
+    """Of each coordinate, then of the guard of each of `others`, how small it is, if it is much
+    less than 1; else 1, and of a machine whose numbers are about 1 absent."""
+
+    def extent(self, k: int) -> Scalar | float:
+        """A length by which those of coordinate number k are judged."""
+        return 1.0 if self.extents is None else self.extents[k]
+
+    def guard_extent(self, place: int) -> Scalar | float:
+        """A size by which the guard of one of `others` is judged, by its place among them."""
+        if self.extents is None:
+            return 1.0
+        return self.extents[len(self.machine.coordinates) + place]
+
     @property
     def kept(self) -> int:
         """Number of intervals to record."""
@@ -259,6 +274,16 @@ class Plan(eqx.Module):
     def instants(self) -> int:
         """Instants of a cycle that steps end on: record points and impulses of noise."""
         return self.parts if self.noise is None else self.noise.count
+
+    @property
+    def unit(self) -> Scalar | float:
+        """As `unit_of` its machine."""
+        return unit_of(self.machine)
+
+    def in_units(self, threshold: Any) -> Any:
+        """A threshold in `s`, given for a cycle of about 2π."""
+        unit = self.unit
+        return threshold if isinstance(unit, float) else threshold * unit
 
     def cycle_of(self, done: Scalar) -> Scalar:
         """The cycle on its way when so many intervals are done, counted from the start."""

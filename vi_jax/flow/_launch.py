@@ -8,8 +8,6 @@ import jax.tree_util as jtu
 from .._types import Flag, Scalar, State
 from ..machine import begin_modes, holds_anywhere, rubs, struck_modes
 from ._lane import Lane, Plan, to_event, total
-from ._own import check_field, check_laws
-from ._own_parts import check_events
 from .events import Rates, force_rate, rates
 from .results import code
 from .smooth import in_modes, rounding
@@ -31,9 +29,6 @@ def launched(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
     zero = jnp.zeros_like(Y)
     s = zero if plan.begin is None else zero + plan.begin
     modes = begin_modes(machine, s, start, plan.own)
-    check_field(machine, s, start, modes)
-    check_laws(machine, zero)
-    check_events(machine, s, start, modes)
     free = in_modes(machine, modes)
     here = [rates(free.field, x.position, s, start) for x in machine.coordinates]
     # At rest the acceleration says which way the motion goes.

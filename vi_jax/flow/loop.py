@@ -11,9 +11,12 @@ from jaxtyping import Array
 
 from .. import lanes
 from .._types import Flag, Scalar, State
-from ..machine import bare, replaced
+from ..machine import bare, begin_modes, replaced
 from ._lane import Lane, Plan, Record
 from ._launch import launched
+from ._own import check_field, check_laws
+from ._own_parts import check_events
+from ._sizes import extents_of, sizes_of
 from ._step.hybrid import iterate
 from .noise import in_modes_of
 
@@ -56,6 +59,16 @@ def run_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> tuple[Ends
         # What ends a lane early knows the machine's own state only.
         plan = dataclasses.replace(plan, machine=way.machine, stop=None)
         start = way.inward(start)
+    zero = jnp.zeros_like(plan.machine.position(start))
+    s = zero if plan.begin is None else zero + plan.begin
+    modes = begin_modes(plan.machine, s, start, plan.own)
+    check_field(plan.machine, s, start, modes)
+    check_laws(plan.machine, zero)
+    check_events(plan.machine, s, start, modes)
+    sizes = sizes_of(plan.machine, s, start, modes)
+    if sizes is not None:
+        extents = extents_of(plan, s, start, modes, sizes)
+        plan = dataclasses.replace(plan, method=plan.method.with_sizes(sizes), extents=extents)
     numbers, rest = eqx.partition(plan, eqx.is_array)
     ends, (states, records) = lanes.run(
         partial(_begin, rest), partial(_step, rest), _end, (numbers, start, jnp.asarray(wanted)),

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
+from math import pi
 from typing import Any
 
 import equinox as eqx
@@ -23,6 +24,19 @@ from ..machine import (
     rubs,
     shown_modes,
 )
+
+# Thresholds in `s` are for cycles of about 2π, up to so many times shorter or longer: a choice.
+_USUAL = 100.0
+
+
+def unit_of(machine: AbstractMachine) -> Scalar | float:
+    """A length of `s` by which short ones are judged: 1, or the 2π-th part of a cycle that is much
+    shorter or much longer than that."""
+    cycle = machine.cycle
+    if machine.scales_known or (isinstance(cycle, float | int) and 1 / _USUAL < cycle < _USUAL):
+        return 1.0
+    unit = stop_gradient(jnp.asarray(cycle)) / (2 * pi)
+    return jnp.where((unit > 1 / _USUAL) & (unit < _USUAL), 1.0, unit)
 
 
 class SmoothMachine(eqx.Module):

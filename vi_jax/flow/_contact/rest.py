@@ -11,7 +11,7 @@ from jax.lax import stop_gradient
 
 from ..._types import Flag, Scalar
 from ...lanes import pin, pin_flag
-from .._lane import Lane, to_event, to_release
+from .._lane import Lane, Plan, to_event, to_release
 from ..events import Rates
 
 
@@ -57,19 +57,20 @@ class Release(NamedTuple):
 
 
 def release(
-    lane: Lane, k: int, stops: tuple, begin: Rates, end: Rates, good: Flag, h: Scalar
+    plan: Plan, lane: Lane, k: int, begin: Rates, end: Rates, good: Flag, h: Scalar
 ) -> Release:
     """Where coordinate number k leaves the stop that it rests on, if it does.
 
     The force is the acceleration that a free body would have there.
 
-    **Arguments:** `stops`, the machine's; `begin` and `end`, the free coordinate's rates at the
-    ends of the step; `good`, whether the step was; `h`, its length.
+    **Arguments:** `begin` and `end`, the free coordinate's rates at the ends of the step; `good`,
+    whether the step was; `h`, its length.
     """
     assert lane.contact is not None
     known = allowed(h)
+    close, straight = plan.in_units(known.close), plan.in_units(known.straight)
     sign = jnp.zeros_like(h)
-    for i, stop in enumerate(stops):
+    for i, stop in enumerate(plan.machine.stops):
         if stop.coordinate == k:
             sign = jnp.where(lane.contact[k] == to_event(i), float(stop.sign), sign)
     before, after = pin((-sign * begin.a, -sign * end.a))
@@ -77,20 +78,20 @@ def release(
     held = good & (sign != 0)
     rising = held & (rise > 0)
     offset = -after * h / jnp.where(rising, rise, 1.0)
-    close = jnp.abs(stop_gradient(offset)) <= known.close
+    near = jnp.abs(stop_gradient(offset)) <= close
     aimed = held & (lane.target == to_release(k))
-    met = rising & aimed & (h <= 2 * known.straight) & close
+    met = rising & aimed & (h <= 2 * straight) & near
     # A step that short was aimed at a force that is all rounding where it begins, and may be still:
     # that of a stack let go of as one, say, whose bodies part by what comes later.
-    landed = met | aimed & (h <= known.close)
+    landed = met | aimed & (h <= close)
     left = rising & (after > 0) & ~landed
     place = stop_gradient(h + offset)
     # Over a force that is hardly positive, but for long, chords do not get on: half the way does.
     share = jnp.where(lane.aims >= _PATIENCE, 0.5, 1 - known.short)
-    place = jnp.where(h > known.straight, share * place, place)
+    place = jnp.where(h > straight, share * place, place)
     # By rounding's measure late rather than early, when it would be pressed on again; and no step
     # towards it is so short that it would not move on.
-    late = 8 * float(jnp.finfo(h.dtype).eps) * (1 + stop_gradient(lane.s + h))
+    late = 8 * float(jnp.finfo(h.dtype).eps) * (plan.unit + stop_gradient(lane.s + h))
     place = jnp.maximum(place, 2 * late)
     landed, offset = pin_flag(landed, h), jnp.where(met, offset, 0.0)
     return Release(pin_flag(left, h), landed, place, jnp.where(landed, offset + late, 0.0))

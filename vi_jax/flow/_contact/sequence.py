@@ -131,7 +131,11 @@ def _instant(
         at, here = limited.index(stop.coordinate), landed[number]
         met, coupled[at] = met | here, coupled[at] | here
         depth = stop_gradient(stop.beyond(bodies[at].position(there)))
-        slack = 256 * float(jnp.finfo(depth.dtype).eps) * (1 + jnp.abs(stop_gradient(stop.gap)))
+        slack = (
+            256
+            * float(jnp.finfo(depth.dtype).eps)
+            * (plan.extent(stop.coordinate) + jnp.abs(stop_gradient(stop.gap)))
+        )
         closed = here | (jnp.abs(depth) <= slack)
         if lane.contact is not None:
             closed = closed | (lane.contact[stop.coordinate] == to_event(number))

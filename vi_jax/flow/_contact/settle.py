@@ -197,7 +197,8 @@ def _ends(
         growth = force_rate(free, body.position, free, s, rested)
     not_yet, hop, wait = _before_it_presses(speed, pressing, sign * growth)
     height = jnp.where(not_yet, speed * hop - 0.5 * pressing * hop * hop, height)
-    flat = stop_gradient(height) <= 16 * float(jnp.finfo(s.dtype).eps) * (1 + jnp.abs(gap))
+    size = plan.extent(k) + jnp.abs(gap)
+    flat = stop_gradient(height) <= 16 * float(jnp.finfo(s.dtype).eps) * size
     left = jnp.where(not_yet, wait, left)
     brief = allowed(s).brief * limit
     ends = stop_gradient(left) <= jnp.where(flat, 0.1 * limit, brief)

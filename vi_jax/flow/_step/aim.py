@@ -60,7 +60,7 @@ def _foreseen(
     if plan.motion or machine.stops:
         paths = [motion.of(coordinate.position) for coordinate in machine.coordinates]
     if not exact(machine, lane.state):
-        shortest = 64 * float(jnp.finfo(h.dtype).eps) * (1 + stop_gradient(lane.s))
+        shortest = 64 * float(jnp.finfo(h.dtype).eps) * (plan.unit + stop_gradient(lane.s))
         paths = [path.without_flutter(shortest) for path in paths]
     for k, path in enumerate(paths):
         begin, end = path.ends(h)
@@ -70,7 +70,7 @@ def _foreseen(
         courses.append((turned, partial(path.over, h)))
         ends.append((begin, end))
     guards = []
-    for guard in at_stops(machine, ends):
+    for guard in at_stops(plan, ends):
         stop = machine.stops[guard.number]
         curve = partial(paths[stop.coordinate].over, h, stop.sign, stop_gradient(stop.gap))
         over = guard.end.x > 0
@@ -209,7 +209,7 @@ def _seen(plan: Plan, lane: Lane, trial: Trial) -> _Seen:
     for c in trial.crossings:
         guards.append((c, good & beyond(c), partial(quintic, c.begin, c.end, h)))
         if c.event.holds_mode:
-            above, place = hump(c, h)
+            above, place = hump(plan, c, h)
             humps.append((good & above, place))
         for side in c.sides:
             slack = 0.0 if c.slack is None else c.slack
@@ -222,19 +222,19 @@ def _seen(plan: Plan, lane: Lane, trial: Trial) -> _Seen:
             sides.append(path.pull)
             same = (path.pull.end.x <= 0) | path.leaves.landed
             below.append(~path.leaves.left & same)
-        end, twice = path.end, twice | may_turn_twice(lane.direction[k], path, h)
+        end, twice = path.end, twice | may_turn_twice(plan, lane.direction[k], path, h)
         turned = good & (lane.direction[k] * end.v < 0) & ~path.at_turn
         if not exactly:
             # One that is closer than the clock can tell, as of a body that a rounded difference
             # has all but stopped, has nothing before it that could be stepped to. Nor is it one if
             # all that moves is rounding, as between bodies that go on together.
-            now = 4 * eps * (1 + stop_gradient(trial.s))
-            moves = jnp.abs(end.v) * h > eps * (1 + jnp.abs(end.x))
+            now = 4 * eps * (plan.unit + stop_gradient(trial.s))
+            moves = jnp.abs(end.v) * h > eps * (plan.extent(k) + jnp.abs(end.x))
             turned = turned & (jnp.abs(to_turn(end)) > now) & moves
         courses.append((turned, partial(quintic, path.begin, end, h)))
     rises = []
     if sides:
-        found = crests(sides, trial.seen.shares, h)
+        found = crests(plan, sides, trial.seen.shares, h)
         rises = [(good & x & y, at) for (x, at), y in zip(found, below, strict=True)]
     return _Seen(guards, courses, humps, rises, twice)
 

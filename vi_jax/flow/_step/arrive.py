@@ -160,7 +160,7 @@ def _near(at: Situation) -> dict[int, Flag]:
             for other in trial.crossings:
                 if other.number != c.number:
                     apart = jnp.where(other.landed, jnp.abs(c.offset - other.offset), apart)
-            slack = 64 * eps * (1 + jnp.abs(trial.s))
+            slack = 64 * eps * (plan.unit + jnp.abs(trial.s))
             found[c.number] = c.near & (stop_gradient(apart) <= slack)
     return found
 
@@ -214,7 +214,7 @@ def _offset(at: Situation, c: Crossing) -> Scalar:
     met; 0 in value where the step landed on another."""
     plan, trial, way = at.plan, at.trial, at.way
     # Of a motion so flat that the event's place is known worse than its surface, it is here.
-    near = c.landed & (jnp.abs(c.offset) <= furthest_landing(trial.h))
+    near = c.landed & (jnp.abs(c.offset) <= plan.in_units(furthest_landing(trial.h)))
     offset = stop_gradient(jnp.where(near, c.offset, 0.0))
     if plan.ticks(trial.state):
         # Met on the section it is not beyond it.

@@ -45,7 +45,7 @@ def faults(
     if not plan.method.adaptive:
         return [(rejected, broken), *ends]
     eps = float(jnp.finfo(new.length.dtype).eps)
-    gone = rejected & (new.length < 4 * eps * jnp.maximum(1.0, plan.machine.cycle))
+    gone = rejected & (new.length < 4 * eps * jnp.maximum(plan.unit, plan.machine.cycle))
     numeric = jnp.isfinite(total(trial.state, new.length))
     tiny = code("underflow") if broken == code("not_finite") else broken
     return [(gone & ~numeric, broken), (gone, tiny), *ends]

@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from ..._types import Flag, Scalar, Scalars, State
 from ...lanes import pin_flag
-from ...machine import AbstractEvent, AbstractMachine, events_of, guard_of, section_number, sides_of
+from ...machine import AbstractEvent, events_of, guard_of, section_number, sides_of
 from .._lane import Lane, Plan, select, to_event
 from ..events import Rates, guard_rates, landing
 from ..smooth import SmoothMachine, exact
@@ -92,7 +92,7 @@ def crossings(
     """
     machine, (s1, h, new), (good, last) = plan.machine, there, ends
     others, below = _others(plan, lane, holding, (s1, new), seen)
-    stops = at_stops(machine, [(path.begin, path.end) for path in paths])
+    stops = at_stops(plan, [(path.begin, path.end) for path in paths])
     guards = [*(_with_stages(lane, c, seen) for c in stops), *others]
     # The stops of one coordinate and a clock are never met together but on a section, where a step
     # ends; other events can be.
@@ -100,7 +100,7 @@ def crossings(
         eps = float(jnp.finfo(h.dtype).eps)
         guards = [guard._replace(slack=4 * eps * guard.scale) for guard in guards]
         guards = [guard if guard.coordinate is not None else _jumped(guard) for guard in guards]
-    return tuple(_seen(lane, good & last, good, h, each, guards) for each in guards), below
+    return tuple(_seen(plan, lane, good & last, good, h, each, guards) for each in guards), below
 
 
 def _jumped(guard: Crossing) -> Crossing:
@@ -115,12 +115,13 @@ def _rounding(scale: Scalar) -> Scalar:
     return float(jnp.finfo(scale.dtype).eps) ** 0.5 * scale
 
 
-def at_stops(machine: AbstractMachine, ends: list[tuple[Rates, Rates]]) -> list[Crossing]:
+def at_stops(plan: Plan, ends: list[tuple[Rates, Rates]]) -> list[Crossing]:
     """The stops as a step sees them, from the rates of each coordinate where it begins and ends."""
     found = []
-    for i, stop in enumerate(machine.stops):
+    for i, stop in enumerate(plan.machine.stops):
         begin, end = (x.scaled(stop.sign, stop.gap) for x in ends[stop.coordinate])
-        found.append(Crossing(stop, i, begin, end, 1 + jnp.abs(stop.gap), stop.coordinate))
+        scale = plan.extent(stop.coordinate) + jnp.abs(stop.gap)
+        found.append(Crossing(stop, i, begin, end, scale, stop.coordinate))
     return found
 
 
@@ -152,7 +153,7 @@ def _others(
         return begin, guard_rates(moving.field, guard, *there)
 
     around = lane.modes, lane.contact or ()
-    for number in plan.others(lane.state):
+    for place, number in enumerate(plan.others(lane.state)):
         event, values = events_of(machine)[number], seen.events.get(number, (jnp.zeros(0),))
         if len(values) == 1:
             both = [ends(lambda s, x, i=number: jnp.asarray(guard_of(machine, i, s, x, *around)))]
@@ -162,7 +163,9 @@ def _others(
                 for j in range(len(values))
             ]
         sides = [Side(*x, y) for x, y in zip(both, values, strict=True)]
-        scale = 1 + stop_gradient(functools.reduce(jnp.maximum, [abs(x.end.v) for x in sides]))
+        scale = plan.guard_extent(place) + plan.in_units(
+            stop_gradient(functools.reduce(jnp.maximum, [abs(x.end.v) for x in sides]))
+        )
         if event.from_below:
             (side,) = sides
             armed, risen = _from_below(lane.below[len(below)], side.begin, side.end, scale)
@@ -170,7 +173,7 @@ def _others(
             sides = [Side(begin, end, jnp.where(armed, side.within, -1.0))]
             below.append(risen)
         if event.holds_mode:
-            sides = [side._replace(begin=_falling(side.begin, scale)) for side in sides]
+            sides = [side._replace(begin=_falling(plan, side.begin, scale)) for side in sides]
         begin, end = sides[0].begin, sides[0].end
         for side in sides[1:]:  # that which is the guard where the step ends
             greater = stop_gradient(side.end.x > end.x)
@@ -184,7 +187,7 @@ def _others(
     return found, tuple(below)
 
 
-def _falling(begin: Rates, scale: Scalar) -> Rates:
+def _falling(plan: Plan, begin: Rates, scale: Scalar) -> Rates:
     """The rates of a guard where a step begins, without a rise that is rounding's: behind an event
     that has just been landed upon the guard may be zero with its slope, as the velocity of a body
     that begins to slip, and it is the second derivative by which it falls.
@@ -193,7 +196,7 @@ def _falling(begin: Rates, scale: Scalar) -> Rates:
     """
     x, v, a = stop_gradient(begin)
     near = jnp.abs(x) <= 4 * float(jnp.finfo(x.dtype).eps) * scale
-    risen = near & (v > 0) & (2 * v <= -_landing_tolerance(x) * a)
+    risen = near & (v > 0) & (2 * v <= -plan.in_units(_landing_tolerance(x)) * a)
     return begin._replace(v=jnp.where(risen, 0.0, begin.v))
 
 
@@ -232,8 +235,9 @@ def beyond(event: Crossing) -> Flag:
 
 
 def _seen(
-    lane: Lane, ends: Flag, good: Flag, h: Scalar, guard: Crossing, all_of_them: list[Crossing]
-) -> Crossing:
+    plan: Plan, lane: Lane, ends: Flag, good: Flag, h: Scalar, guard: Crossing,
+    all_of_them: list[Crossing],
+) -> Crossing:  # fmt: skip
     """The event, with whether a step that was aimed at it landed on it, or has to be aimed again.
 
     A step that ends an interval as it meets a stop, to rounding, is aimed at it: an impact on the
@@ -261,7 +265,7 @@ def _seen(
     offset, square = landing(end)
     size = stop_gradient(jnp.abs(offset))
     # Two ways of being there to rounding: in place along the path, or, near grazing, in position.
-    close = size <= _landing_tolerance(h) * leniency(lane)
+    close = size <= _landing_tolerance(h) * leniency(plan, lane)
     there = (jnp.abs(end.x) <= 4 * eps * guard.scale) & (end.v >= 0)
     real = stop_gradient(square) > 0
     # One that is there may have no way left along a parabola: a body that is at rest on a surface.
@@ -273,7 +277,9 @@ def _seen(
     again = again | ends & there & close & rises
     sudden = None
     if guard.above is not None:
-        shortest = jnp.maximum(_SUDDEN, 4 * eps * (1 + jnp.abs(stop_gradient(lane.s))))
+        shortest = jnp.maximum(
+            plan.in_units(_SUDDEN), 4 * eps * (plan.unit + jnp.abs(stop_gradient(lane.s)))
+        )
         sudden = pin_flag(aimed & ~near & (h <= shortest) & beyond(guard), h)
         landed, offset = landed | sudden, jnp.where(sudden, 0.0, offset)
         # What Newton's method does not come to is looked for by halves.
@@ -281,9 +287,9 @@ def _seen(
     return guard._replace(offset=offset, landed=landed, again=again, near=near, sudden=sudden)
 
 
-def leniency(lane: Lane) -> Scalar:
-    """By what factor a lane's landing tolerance is larger, after so many aims."""
-    return jnp.where(lane.aims >= _PATIENCE, 1e3, jnp.ones_like(lane.aims))
+def leniency(plan: Plan, lane: Lane) -> Scalar:
+    """By what factor a lane's landing tolerance is larger: after so many aims, and in its unit."""
+    return plan.in_units(jnp.where(lane.aims >= _PATIENCE, 1e3, jnp.ones_like(lane.aims)))
 
 
 def _landing_tolerance(x: Scalar) -> float:

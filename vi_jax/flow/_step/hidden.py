@@ -10,7 +10,7 @@ from jax.lax import stop_gradient
 from jaxtyping import Array
 
 from ..._types import Flag, Scalar, Scalars
-from .._lane import Lane
+from .._lane import Lane, Plan
 from .guards import Crossing, Side
 from .trial import Path
 
@@ -22,8 +22,9 @@ _BRIEF = 1e-3
 _PARTS = 16
 _EDGE = 0.1
 
-# Steps shorter than this (in s) are not shortened any more.
-_SHORTEST = 1e-6
+# Steps shorter than this (in s, for a cycle of about 2π) are not shortened any more, and for a dip
+# of the velocity.
+_SHORTEST, _SHORTEST_DIP = 1e-6, 1e-3
 
 
 def _corner(
@@ -41,7 +42,7 @@ def _corner(
     return place, x0 + v0 * place, h * v0 / fall
 
 
-def hump(c: Crossing, h: Scalar) -> tuple[Flag, Scalar]:
+def hump(plan: Plan, c: Crossing, h: Scalar) -> tuple[Flag, Scalar]:
     """Whether a guard that is negative at both ends may have been positive in between, and where
     it was greatest; or where one that falls at both, as of a body that has just passed through its
     standstill, has begun to rise, from where its greatest value shows."""
@@ -52,11 +53,13 @@ def hump(c: Crossing, h: Scalar) -> tuple[Flag, Scalar]:
     seen = rises & (bound > 0) & (place > brief) & (h - place > brief)
     dips = (begin.x <= 0) & (end.x < 0) & (begin.v < 0) & (end.v < 0) & (begin.a > 0)
     least = -begin.v / jnp.where(dips, begin.a, 1.0)
-    dips = dips & (least < 0.5 * h) & (h > _SHORTEST)
+    dips = dips & (least < 0.5 * h) & (h > plan.in_units(_SHORTEST))
     return seen | dips, jnp.where(dips, jnp.maximum(1.5 * least, brief), place)
 
 
-def crests(sides: list[Side], shares: tuple[float, ...], h: Scalar) -> list[tuple[Flag, Scalar]]:
+def crests(
+    plan: Plan, sides: list[Side], shares: tuple[float, ...], h: Scalar
+) -> list[tuple[Flag, Scalar]]:
     """Return of functions that end a step below zero whether each may have been positive within
     it, and the first place where.
 
@@ -66,7 +69,7 @@ def crests(sides: list[Side], shares: tuple[float, ...], h: Scalar) -> list[tupl
     ends = [stop_gradient((x.begin.x, x.begin.v, x.end.x, x.end.v)) for x in sides]
     values = [stop_gradient(x.within) for x in sides]
     slack = [jnp.asarray(x.slack, h.dtype) for x in sides]
-    find = partial(_crest, shares, h)
+    find = partial(_crest, plan, shares, h)
     stacked = jtu.tree_map(lambda *x: jnp.stack(x), *zip(ends, values, slack, strict=True))
     doubtful = jnp.zeros_like(h, bool)
     for (x0, _, x1, _), inner, zero in zip(ends, values, slack, strict=True):
@@ -79,7 +82,7 @@ def crests(sides: list[Side], shares: tuple[float, ...], h: Scalar) -> list[tupl
 
 
 def _crest(
-    shares: tuple[float, ...], h: Scalar, ends: Scalars, values: Array, slack: Scalar
+    plan: Plan, shares: tuple[float, ...], h: Scalar, ends: Scalars, values: Array, slack: Scalar
 ) -> tuple[Flag, Scalar]:
     """As `crests` for one function.
 
@@ -112,7 +115,7 @@ def _crest(
     above, place = _first_top(heights, rises / _PARTS, falls / _PARTS)
     first = jnp.min(jnp.where(values > slack, np.asarray(shares), 2.0))
     place = jnp.maximum(jnp.minimum(place, first), _BRIEF)
-    return (above | (first < 1)) & (h > _SHORTEST), place * h
+    return (above | (first < 1)) & (h > plan.in_units(_SHORTEST)), place * h
 
 
 def _inner(shares: tuple[float, ...]) -> list[int]:
@@ -155,7 +158,7 @@ def _bump(share: np.ndarray) -> np.ndarray:
     return (4 * share * (1 - share)) ** 2
 
 
-def may_turn_twice(direction: Scalar, path: Path, h: Scalar) -> Flag:
+def may_turn_twice(plan: Plan, direction: Scalar, path: Path, h: Scalar) -> Flag:
     """Whether the velocity, of one sign at both ends, dips so deep that it may have been zero.
 
     Such a step is halved until the turns lie apart or the dip is too short to matter. Where the
@@ -163,7 +166,7 @@ def may_turn_twice(direction: Scalar, path: Path, h: Scalar) -> Flag:
     """
     begin, end = path.begin, path.end
     a0, a1 = direction * begin.a, direction * end.a
-    dips = (a0 < 0) & (a1 > 0) & (h > 1e-3)
+    dips = (a0 < 0) & (a1 > 0) & (h > plan.in_units(_SHORTEST_DIP))
     if path.surge is None:
         # lowest < 0.1 (v0 + v1), times a1 - a0: without a division in each step.
         room = direction * (begin.v - 0.1 * (begin.v + end.v))

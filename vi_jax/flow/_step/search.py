@@ -20,8 +20,8 @@ Curve = Scalars
 Passed = tuple[Crossing, Flag, Callable[[], Curve]]
 Course = tuple[Flag, Callable[[], Curve]]
 
-# Turning points this far inside the gap (unit: a) are passed by where only impacts matter. A
-# choice: the quintic through a step's ends has to be right to this.
+# Turning points this far inside the gap (in units of `Plan.extent`) are passed by where only
+# impacts matter. A choice: the quintic through a step's ends has to be right to this.
 _MARGIN = 0.02
 
 # By so much a bound is wider, for what rounding makes of it.
@@ -168,5 +168,5 @@ def _has_to_be_met(
         return close
     for stop in plan.machine.stops:
         if stop.coordinate == k:
-            close = close | (depth(stop) > -margin)
+            close = close | (depth(stop) > -margin * plan.extent(k))
     return close

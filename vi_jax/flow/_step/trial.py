@@ -221,7 +221,7 @@ def _path(
             Rates(jnp.where(rests, place, r.x), jnp.where(rests, 0.0, r.v), r.a)
             for r in (begin, end)
         )
-    met = turns_within(turn_tolerance(h) * leniency(lane), end)
+    met = turns_within(turn_tolerance(h) * leniency(plan, lane), end)
     aimed = lane.target == to_turn_of(k)
     for j in range(len(plan.machine.coordinates)):  # several may turn at once
         aimed = aimed if j == k else aimed | (lane.target == to_turn_of(j))
@@ -232,7 +232,7 @@ def _path(
     leaves, surge, pull = None, None, None
     limited = any(stop.coordinate == k for stop in plan.machine.stops)
     if lane.contact is not None and limited:
-        leaves = release(lane, k, plan.machine.stops, begin, end, good, h)
+        leaves = release(plan, lane, k, begin, end, good, h)
         surge = (
             force_rate(free, position, smooth, lane.s, lane.state),
             force_rate(free, position, smooth, s1, new),

@@ -76,10 +76,15 @@ def guards_error(
     """Return the largest error of the guards at the stages of a step, relative to the tolerance;
     `None` without guards, or of a method that estimates none."""
     events = events_of(plan.machine)
-    guards = [(x, True) for x in seen.forces.values()]
+    unit = plan.unit
+    # The integral of a force is a velocity.
+    guards = [(x, True, 1.0 if isinstance(unit, float) else 1 / unit) for x in seen.forces.values()]
     for number, sides in seen.events.items():
-        guards += [(x, events[number].holds_mode) for x in sides]
-    errors = [plan.method.guard_error(stages, x, h, longest, acts=acts) for x, acts in guards]
+        guards += [(x, events[number].holds_mode, unit) for x in sides]
+    errors = [
+        plan.method.guard_error(stages, x, h, longest, acts=acts, size=size)
+        for x, acts, size in guards
+    ]
     known = [error for error in errors if error is not None]
     return functools.reduce(jnp.maximum, known) if known else None
 

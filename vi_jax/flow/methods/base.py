@@ -72,6 +72,11 @@ class AbstractMethod(eqx.Module):
         to 1 + |state|; 0 where only by rounding, as the steps are the same in each period."""
         return 0.0
 
+    def with_sizes(self, sizes: State) -> "AbstractMethod":
+        """The method for a motion whose numbers are about so large, one size for each array of the
+        state."""
+        return self
+
     def holds(self, machine: AbstractMachine) -> bool:
         """Whether a step holds the bodies that rest, as one does that evaluates the field; else the
         whole state stays as it is while a body rests."""
@@ -142,14 +147,15 @@ class AbstractMethod(eqx.Module):
         return new, beside, error, stages
 
     def guard_error(
-        self, stages: list[Stage], values: Array, h: Scalar, longest: Scalar, *, acts: bool
-    ) -> Scalar | None:
+        self, stages: list[Stage], values: Array, h: Scalar, longest: Scalar, *, acts: bool,
+        size: Scalar | float,
+    ) -> Scalar | None:  # fmt: skip
         """Return the error of the integral of a guard over a step, relative to the tolerance, or
         `None` of a method that estimates none.
 
         **Arguments:** `values`, the guard at each of the `stages`; `h`, the length of the step;
         `longest`, that of the longest one; `acts`, whether the guard is a force on a body that is
-        held.
+        held; `size`, that of the integral.
         """
         return None
 

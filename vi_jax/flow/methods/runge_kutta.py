@@ -1,5 +1,7 @@
 """Steps by a diffrax Runge–Kutta solver, sized by its error or of fixed number."""
 
+import dataclasses
+import functools
 from typing import Any, ClassVar
 
 import diffrax
@@ -14,7 +16,7 @@ from ..._checks import count, require
 from ..._types import Scalar, State
 from ...lanes import pin
 from ..integrals import TIME, Integrals, rate_of_integrals
-from ..smooth import SmoothMachine
+from ..smooth import SmoothMachine, unit_of
 from .base import AbstractMethod, Stage, fading_is_known
 from .unrolled import Unrolled
 from .verner import Verner9
@@ -76,8 +78,9 @@ class Adaptive(AbstractMethod):
     the rest moves, such as a strong motor: its steps need not follow what has faded.
 
     **Arguments:** `solver` (default `Verner9()`, the fastest measured from 1e-7 on); `rtol`
-    and `atol`, tolerances relative to each state component and absolute (in the machine's
-    dimensionless units; `atol` defaults to `rtol`); `steps_per_cycle`, the fewest steps in a cycle
+    and `atol`, tolerances relative to each state component and absolute; `atol` defaults to `rtol`,
+    and for numbers of the state that are smaller than 0.01 where a motion begins to as much less
+    (a machine in SI units); `steps_per_cycle`, the fewest steps in a cycle
     (at least 5, the default).
 
     **Raises:** `TypeError` if the solver is neither explicit nor diagonally implicit Runge–Kutta,
@@ -89,6 +92,8 @@ class Adaptive(AbstractMethod):
     rtol: Any = eqx.field(kw_only=True, default=1e-9, converter=_number)
     atol: Any = eqx.field(kw_only=True, default=None, converter=_number_or_none)
     steps_per_cycle: int = eqx.field(static=True, kw_only=True, default=5)  # pyright: ignore
+    sizes: Any = eqx.field(kw_only=True, default=None, repr=False)
+    """As of `with_sizes`."""
 
     def __check_init__(self):
         count("steps_per_cycle", self.steps_per_cycle, least=5)
@@ -105,6 +110,13 @@ class Adaptive(AbstractMethod):
     def wander(self):
         """Within the tolerances, by which each step is sized anew."""
         return self.rtol if self.atol is None else jnp.maximum(self.rtol, self.atol)
+
+    def with_sizes(self, sizes):
+        """With errors judged by these sizes, unless an absolute tolerance is given.
+
+        **Arguments:** as `AbstractMethod.with_sizes`.
+        """
+        return self if self.atol is not None else dataclasses.replace(self, sizes=sizes)
 
     @property
     def follows_fading(self):
@@ -130,9 +142,12 @@ class Adaptive(AbstractMethod):
             solver = Unrolled(solver.solver, tolerance=jnp.maximum(0.01 * rtol, floor))
         new, after, errors, _, stages = _runge_kutta(solver, smooth, s0, s1, state, beside)
         old, there, error = (_sized_by(*x) for x in ((state, beside), (new, after), errors))
+        least = jtu.tree_map(lambda x: atol, old)
+        if self.sizes is not None:
+            least = jtu.tree_map(lambda size: atol * size, self.sizes), least[1]
         scaled = jtu.tree_map(
-            lambda e, a, b: (e / (atol + rtol * jnp.maximum(jnp.abs(a), jnp.abs(b)))) ** 2,
-            error, old, there,
+            lambda e, least, a, b: (e / (least + rtol * jnp.maximum(jnp.abs(a), jnp.abs(b)))) ** 2,
+            error, least, old, there,
         )  # fmt: skip
         parts = jtu.tree_leaves(scaled)
         number = sum(x.size for x in parts)
@@ -147,7 +162,7 @@ class Adaptive(AbstractMethod):
         atol = rtol if self.atol is None else jnp.maximum(jnp.asarray(self.atol, like.dtype), floor)
         return rtol, atol, floor
 
-    def guard_error(self, stages, values, h, longest, *, acts):
+    def guard_error(self, stages, values, h, longest, *, acts, size):
         """As the error of a number of the state whose rate is the guard: the impulse of a force
         that holds a body, say. A guard that does not act needs to be known to 1e-6 only.
 
@@ -158,6 +173,9 @@ class Adaptive(AbstractMethod):
             rtol, atol = jnp.maximum(rtol, _VISIBLE), jnp.maximum(atol, _VISIBLE)
         values = jax.lax.stop_gradient(values)
         error = jnp.sum(np.asarray([x.weight for x in stages]) * values)
+        atol = atol if isinstance(size, float) else atol * size
+        if self.sizes is not None:
+            atol = atol * functools.reduce(jnp.maximum, jtu.tree_leaves(self.sizes))
         return jnp.abs(h * error) / (atol + rtol * longest * jnp.max(jnp.abs(values)))
 
     def tighter(self):
@@ -227,18 +245,24 @@ class FixedStep(AbstractMethod):
         new, after, _, slopes, stages = _runge_kutta(self.solver, smooth, s0, s1, state, beside)
         error = jnp.zeros_like(s0)
         if self.may_be_unstable(smooth.machine, s0, state):
-            error = self._unstable((state, new), [slope for slope, _ in slopes], s1 - s0)
+            error = self._unstable(
+                (state, new), [slope for slope, _ in slopes], s1 - s0, unit_of(smooth.machine)
+            )
         return new, after, error, stages
 
-    def _unstable(self, ends: tuple[State, State], slopes: list[State], h: Scalar) -> Scalar:
+    def _unstable(
+        self, ends: tuple[State, State], slopes: list[State], h: Scalar, unit: Scalar | float
+    ) -> Scalar:
         """More than 1 if a step is unstable, else 0.
 
         **Arguments:** the state at both `ends`; `slopes`, of the state at each stage; `h`, the
-        step's length.
+        step's length; `unit`, as `unit_of` the machine.
         """
         # Of bodies at rest in zero all that is left is rounding.
         rounding = float(jnp.finfo(h.dtype).eps) ** 0.5
         before, after = (jnp.maximum(_size(x), rounding) for x in ends)
+        if not isinstance(unit, float):  # of other units of time rates are much larger, or smaller
+            after = jnp.maximum(after, jnp.where(unit == 1, 0.0, unit * _size(slopes[0])))
 
         def judged(size, h, slopes):
             apart = _size(self.solver.error(slopes, h))

@@ -1,0 +1,183 @@
+"""The same machine in other units of time and length gives the same numbers: the field, the stops
+and the start are converted, and the motion is converted back."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+
+# Units of time and of length; the first are those in which the numbers are given.
+UNITS = np.array(
+    [(1, 1), *((10.0**t, 1) for t in (-9, -5, -2, 3, 6, 9)),
+     *((1, 10.0**n) for n in (-9, -6, -3, 3, 6)), (1e-9, 1e-9), (1e9, 1e6), (1e-4, 1e-7),
+     (1e-3, 1e-6)]
+)  # fmt: skip
+# Where several bodies meet, or one sticks, speeds of 1e-9 are too close to what counts as none.
+USUAL = UNITS[:, 0] < 1e9
+
+
+class Body(vi.AbstractMachine):
+    """A body between two stops, with a force that is not linear; it may rub."""
+
+    unit: tuple
+    spring: Any
+    cubic: Any
+    damping: Any
+    weight: Any
+    drive: Any
+    frequency: Any
+    right: Any
+    left: Any
+    restitution: Any
+    level: Any = None
+
+    @property
+    def cycle(self):
+        return 2 * jnp.pi / self.frequency * self.unit[0]
+
+    @property
+    def contacts(self):
+        time, length = self.unit
+        sides = (("right", self.right), ("left", self.left))
+        on = ("x", "u")
+        stops = [vi.RigidStop(gap * length, self.restitution, side, on=on) for side, gap in sides]
+        rubs = [] if self.level is None else [vi.DryFriction(self.level * length / time**2, on="u")]
+        return (*stops, *rubs)
+
+    @property
+    def events(self):
+        if self.level is None:
+            return ()
+        return vi.Reset(lambda m, t, z: z.x, lambda m, t, z: {"count": z.count + 1})
+
+    def field(self, t, z):
+        time, length = self.unit
+        x, u = z.x / length, z.u * time / length
+        push = self.weight + self.drive * jnp.cos(self.frequency * t / time)
+        push = push - self.spring * x - self.cubic * x**3 - self.damping * u
+        rates = {"x": z.u, "u": push * length / time**2}
+        return rates if self.level is None else rates | {"count": 0.0}
+
+
+# Spring, cubic, damping, weight, drive, frequency, gaps right and left, restitution; x and u.
+BODIES = np.array([
+    (1, 0, 0.1, 0, 1, 0.9, 1.0, 9, 0.6, 0.1, 0.2),
+    (1, 0, 0.1, 0, 1, 0.5, 0.3, 9, 0.5, 0.1, 0.2),  # comes to rest in each cycle
+    (0, 0, 0, 1, 0, 1, 0, 9, 0.7, -1, 0),  # a ball that falls and stays
+    (0, 0, 0, 1, 2.5, 1, 0, 9, 0.5, 0, 0),  # one on a shaken floor, from rest
+    (0, 0, 0.05, 0, 1, 1, 0.5, 0.5, 0.8, 0, 0.3),
+    (-1, 1, 0.5, 0, 0.3, 1, 1.2, 9, 0.7, 0.5, 0),
+    (1, 0, 0.02, 0, 0.5, 1.3, 0, 1e9, 0.8, -0.3, 0),
+    (4, 1, 0.3, -0.2, 1, 0.7, 0.2, 0.3, 0.4, 0, 0.1),
+    (1, 0, 0.5, 0.8, 1.5, 0.4, 0.4, 9, 0.3, 0.1, 0),
+    (1, 0, 0.1, 0, 1, 2.2, 9, 0.1, 0.9, 0, 0.5),
+])  # fmt: skip
+
+
+def in_all_units(lane, numbers):
+    """`lane(number, unit)` of every number in every unit, but the first unit first."""
+    inner = jax.vmap(lane, (None, 0))
+    return jax.jit(jax.vmap(inner, (0, None)))(jnp.asarray(numbers), jnp.asarray(UNITS))
+
+
+def assert_alike(found, successful, tolerance):
+    """Of arrays (machines, units, …): the numbers of every unit beside those of the first."""
+    assert bool(jnp.all(successful))
+    for x in found:
+        np.testing.assert_allclose(x, np.broadcast_to(x[:, :1], x.shape), rtol=0, atol=tolerance)
+
+
+# Ten tolerances; fixed steps land on events to 1e-9 of their place along the path.
+@pytest.mark.parametrize("method", [vi.Adaptive(), vi.FixedStep()])
+def test_bodies_between_stops(method):
+    def lane(numbers, unit):
+        time, length = unit
+        machine = Body((time, length), *numbers[:9])
+        start = vi.State(x=numbers[9] * length, u=numbers[10] * length / time)
+        run = vi.simulate(machine, start, 5, method=method)
+        found = run.sections.x / length, run.sections.u * time / length, run.y_max / length
+        return found, run.impacts, run.successful
+
+    found, impacts, successful = in_all_units(lane, BODIES)
+    assert_alike(found, successful, 1e-8)
+    np.testing.assert_array_equal(impacts, np.broadcast_to(impacts[:, :1], impacts.shape))
+    assert np.all(impacts[:, 0].sum(axis=1) > 0)
+
+
+def test_a_body_that_rubs_and_counts():
+    def lane(numbers, unit):
+        time, length = unit
+        machine = Body((time, length), *numbers[:9], level=0.3)
+        start = vi.State(x=numbers[9] * length, u=numbers[10] * length / time, count=0.0)
+        run = vi.simulate(machine, start, 5, method=vi.Adaptive())
+        z = run.sections
+        return (z.x / length, z.u * time / length, z.count), run.successful
+
+    found, successful = in_all_units(lane, BODIES[[0, 1, 4, 9]])
+    assert_alike([x[:, USUAL] for x in found], successful[:, USUAL], 1e-8)
+    assert np.any(found[2][:, 0, -1] > 0)
+
+
+class Stack(vi.Mechanical):
+    """Two balls under a ceiling, which both come to rest."""
+
+    q = ("a", "b")
+    mass = (1.0, 2.0)
+    unit: Any
+    restitution: Any
+
+    @property
+    def cycle(self):
+        return 2 * jnp.pi * self.unit[0]
+
+    @property
+    def contacts(self):
+        return (
+            vi.RigidStop(1.0 * self.unit[1], self.restitution, on="b"),
+            vi.RigidStop(0.0, self.restitution, on=lambda q: q.a - q.b),
+        )
+
+    def force(self, t, q, v):
+        time, length = self.unit
+        push = (1 + 0.3 * jnp.sin(t / time)) * length / time**2
+        return {"a": push, "b": 2 * push}
+
+
+def test_bodies_that_meet():
+    def lane(restitution, unit):
+        time, length = unit
+        machine = Stack((time, length), restitution)
+        start = machine.at(a=0.1 * length, b=0.5 * length, v={"a": 0.2 * length / time})
+        run = vi.simulate(machine, start, 3, method=vi.Adaptive(), record="sections")
+        z = run.sections
+        places, speeds = (z.a / length, z.b / length), (z.v.a, z.v.b)
+        return (*places, *(x * time / length for x in speeds)), run.impacts, run.successful
+
+    found, impacts, successful = in_all_units(lane, np.array([0.0, 0.3, 0.5, 0.7]))
+    assert_alike([x[:, USUAL] for x in found], successful[:, USUAL], 1e-8)
+    assert np.all(impacts[:, 0].sum(axis=1) > 0)
+
+
+def test_a_structure():
+    """Two masses, in closed form."""
+
+    def lane(restitution, unit):
+        time, length = unit
+        K = jnp.array([[2.0, -1.0], [-1.0, 1.5]]) / time**2
+        machine = vi.machines.Structure(
+            mass=jnp.array([[1.0, 0.2], [0.2, 2.0]]), damping=0.1 * K * time, stiffness=K,
+            static_force=jnp.array([0.0, 0.3]) * length / time**2,
+            force=jnp.array([1.0, 0.0]) * length / time**2, frequency=0.7 / time,
+            contacts=(vi.RigidStop(0.3 * length, restitution, at=[0.0, 1.0]),),
+        )  # fmt: skip
+        run = vi.simulate(machine, machine.start(), 6, record="sections")
+        found = run.sections.displacement / length, run.sections.velocity * time / length
+        return found, run.impacts, run.successful
+
+    found, impacts, successful = in_all_units(lane, np.array([0.2, 0.5, 0.8]))
+    assert_alike(found, successful, 1e-9)
+    np.testing.assert_array_equal(impacts, np.broadcast_to(impacts[:, :1], impacts.shape))
+    assert np.all(impacts[:, 0].sum(axis=1) > 3)
