@@ -1,31 +1,28 @@
 """Conditions and loops: jaxprs that are skipped or repeated."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import jax
-import numpy as np
 from jax.extend.core import Jaxpr, Literal
 
-from ._arrays import any_in, each
-from ._large import (
-    LARGE,
+from ._arrays import (
     MOST_IN_REGISTERS,
+    STRUCTURAL,
+    Array,
     Formula,
-    Held,
     Index,
-    Large,
     Masked,
+    Registers,
     Strided,
-    as_large,
-    at,
+    addressable,
+    any_in,
     counted,
     fill,
     held,
     in_one,
     joined,
-    kind_in,
+    mapped,
     plus,
     replace,
     room,
@@ -98,13 +95,12 @@ def _branch_if_any(write: Write, t: Text, jaxpr, args, mask: Value, otherwise) -
     t.open(inside)
     found = write(t, jaxpr, args, mask)
     laid: list[Any] = []
-    others = [None] * len(found) if otherwise is None else otherwise
+    others: list[Any] = [None] * len(found) if otherwise is None else otherwise
     for x, y, r in zip(found, others, rooms, strict=True):
         if r is not None:
             laid.append(_laid(t, x, y, r, args, mask))
         else:
-            y = each(lambda a: t.zero(a.kind), x) if y is None else y
-            laid.append(x if otherwise is None else each(partial(t.select, mask), x, y))
+            laid.append(x if y is None else selected(t, mask, x, y))
     end = t.block
     t.line(f"br label %{after}")
     t.close()
@@ -118,17 +114,18 @@ def _branch_if_any(write: Write, t: Text, jaxpr, args, mask: Value, otherwise) -
         t.close()
     t.follow(after)
     if otherwise is None:
-        others = [x if isinstance(x, Large) else each(lambda a: t.zero(a.kind), x) for x in found]
+        others = [mapped(t, lambda a: t.zero(a.kind), x) for x in found]
 
     def either(a: Value, b: Value) -> Value:
         return a if a == b else t.phi(a.kind, (a.text, end), (b.text, before))
 
     return [
-        each(either, x, y) if r is None else x for x, y, r in zip(laid, others, rooms, strict=True)
+        mapped(t, either, x, y) if r is None else x
+        for x, y, r in zip(laid, others, rooms, strict=True)
     ]
 
 
-def _laid(t: Text, x: Large, y: Large | None, r: Strided, args: list[Any], mask: Value) -> Large:
+def _laid(t: Text, x: Array, y: Array | None, r: Strided, args: list[Any], mask: Value) -> Array:
     """A branch's large result in the lanes of `mask`, and that of the others in theirs. Nothing is
     copied that need not be: a derivative's branches hand on whole matrices, or zeros in their
     place.
@@ -150,9 +147,9 @@ def _laid(t: Text, x: Large, y: Large | None, r: Strided, args: list[Any], mask:
     return r
 
 
-def _opaque(t: Text, x: Held) -> Held:
+def _opaque(t: Text, x: Array) -> Array:
     """What comes out of a condition or a turn of a loop (see `Text.opaque`)."""
-    return x if isinstance(x, Large) else each(t.opaque, x)
+    return mapped(t, t.opaque, x) if isinstance(x, Registers) else x
 
 
 def _room_for(t: Text, aval: Any) -> Strided | None:
@@ -164,14 +161,15 @@ def _while(write: Write, t: Text, params: dict, args: list[Any], mask: Value) ->
     """Until no lane of `mask` goes on; a lane that has ended keeps its carry."""
     n, m = params["cond_nconsts"], params["body_nconsts"]
     cond_args, body_args, first = args[:n], args[n : n + m], args[n + m :]
-    first = [stored(t, x) if isinstance(x, Large) else x for x in first]
+    first = [x if isinstance(x, Registers) else stored(t, x) for x in first]
     head, inside, after = t.label(), t.label(), t.label()
     before = t.block
     t.line(f"br label %{head}")
     t.open(head)
     place = len(t.lines)
     carry = [
-        x if isinstance(x, Large) else each(lambda a: Value(t.fresh(), a.kind), x) for x in first
+        mapped(t, lambda a: Value(t.fresh(), a.kind), x) if isinstance(x, Registers) else x
+        for x in first
     ]
     live = Value(t.fresh(), "i1")
     # Under `vmap` within a lane several loops are one, as long as any of them goes on.
@@ -184,7 +182,7 @@ def _while(write: Write, t: Text, params: dict, args: list[Any], mask: Value) ->
         new = [_chosen_by(t, asked, x, y) for x, y in zip(new, carry, strict=True)]
     replace(t, carry, new, going)
     new = [
-        x if isinstance(x, Large) else each(partial(t.select, going), x, y)
+        selected(t, going, x, y) if isinstance(x, Registers) else x
         for x, y in zip(new, carry, strict=True)
     ]
     end = t.block
@@ -197,29 +195,21 @@ def _while(write: Write, t: Text, params: dict, args: list[Any], mask: Value) ->
     return carry
 
 
-def _chosen_by(t: Text, flags: Held, a: Held, b: Held) -> Held:
+def _chosen_by(t: Text, flags: Array, a: Array, b: Array) -> Array:
     """The first array where a flag of its leading axes holds, else the second."""
-    number = lambda i: t.select(at(t, flags, i[: flags.ndim]), at(t, a, i), at(t, b, i))
-    cuts = joined(*(x.cuts for x in (a, b) if isinstance(x, Large)))
-    return held(t, Formula(tuple(a.shape), kind_in(a), number, cuts=cuts))
+    number = lambda i: t.select(flags.at(t, i[: flags.ndim]), a.at(t, i), b.at(t, i))
+    return held(t, Formula(a.shape, a.kind, number, cuts=joined(a.cuts, b.cuts)))
 
 
 def _flat(arrays: list[Any]) -> list[Value]:
     """The numbers of those arrays that are in registers."""
-    return [v for x in arrays if not isinstance(x, Large) for v in x.ravel()]
+    return [v for x in arrays if isinstance(x, Registers) for v in x.values.flat]
 
 
-def _unflat(arrays: list[Any], values: list[Value]) -> list[Any]:
+def _unflat(t: Text, arrays: list[Any], values: list[Value]) -> list[Any]:
     """Arrays like those given, with other numbers in registers."""
-    left, out = iter(values), []
-    for x in arrays:
-        if not isinstance(x, Large):
-            y = np.empty(x.shape, object)
-            for i in np.ndindex(x.shape):
-                y[i] = next(left)
-            x = y
-        out.append(x)
-    return out
+    left = iter(values)
+    return [mapped(t, lambda _: next(left), x) if isinstance(x, Registers) else x for x in arrays]
 
 
 def _scan(write: Write, t: Text, params: dict, args: list[Any], mask: Value) -> list[Any]:
@@ -239,34 +229,26 @@ def _scan(write: Write, t: Text, params: dict, args: list[Any], mask: Value) -> 
     for j, var in enumerate(body.outvars[m:]):
         aval: Any = var.aval
         column = [kept[i][j] for i in range(length)]
-        columns.append(_stacked(t, column, jax.ShapeDtypeStruct((length, *aval.shape), aval.dtype)))
+        whole = jax.ShapeDtypeStruct((length, *aval.shape), aval.dtype)
+        columns.append(held(t, STRUCTURAL["stack"](t, {"axis": 0}, [whole], *column)))
     return [*carry, *columns]
 
 
-def _stacked(t: Text, xs: list[Any], aval: Any) -> Held:
-    if aval.size > MOST_IN_REGISTERS:
-        return LARGE["stack"](t, {"axis": 0}, [aval], *xs)
-    return np.stack(xs) if xs else np.empty(aval.shape, object)
-
-
-def _row(t: Text, x: Held, i: Index) -> Held:
+def _row(t: Text, x: Array, i: Index) -> Array:
     """Row number i of an array."""
-    if isinstance(i, int) and not isinstance(x, Large):
-        return np.asarray(x[i], object).reshape(x.shape[1:])
-    shape = tuple(x.shape[1:])
-    return held(t, Formula(shape, kind_in(x), lambda index: at(t, x, (i, *index)), cheap=True))
+    return held(t, Formula(x.shape[1:], x.kind, lambda j: x.at(t, (i, *j)), cheap=True))
 
 
 def _counted_loop(write: Write, t: Text, params: dict, args: list[Any], mask: Value) -> list[Any]:
     """A loop of known length with a scalar counter; its rows lie in memory."""
     (n, m), length = scan_counts(params), params["length"]
-    fixed, rows = args[:n], [as_large(t, in_one(t, x)) for x in args[n + m :]]
-    first = [stored(t, x) if isinstance(x, Large) else x for x in args[n : n + m]]
+    fixed, rows = args[:n], [addressable(t, in_one(t, x)) for x in args[n + m :]]
+    first = [x if isinstance(x, Registers) else stored(t, x) for x in args[n : n + m]]
     made: list[Any] = [v.aval for v in inner(params["jaxpr"]).outvars[m:]]
     columns = [room(t, (length, *a.shape), kind_of(a.dtype)) for a in made]
 
     def turn(i: Index, values: list[Value]) -> list[Value]:
-        carry = _unflat(first, values)
+        carry = _unflat(t, first, values)
         place = plus(t, length - 1, times(t, i, -1)) if params["reverse"] else i
         row = [_row(t, x, place) for x in rows]
         out = write(t, params["jaxpr"], [*fixed, *carry, *row], mask)
@@ -276,7 +258,7 @@ def _counted_loop(write: Write, t: Text, params: dict, args: list[Any], mask: Va
         replace(t, carry, out[:m])
         return _flat(out[:m])
 
-    carry = [_opaque(t, x) for x in _unflat(first, counted(t, length, turn, _flat(first)))]
+    carry = [_opaque(t, x) for x in _unflat(t, first, counted(t, length, turn, _flat(first)))]
     return [*carry, *(held(t, x) for x in columns)]
 
 

@@ -1,25 +1,18 @@
 """Whole arrays of a group of lanes: kept in memory and read again, chosen between, added."""
 
-from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-
-from ._arrays import each
-from ._large import (
-    MOST_IN_REGISTERS,
-    Formula,
-    Held,
-    Large,
+from ._arrays import (
+    Array,
     Masked,
     Memory,
+    Registers,
     Strided,
-    Values,
-    at,
     contiguous,
     fill,
-    joined,
-    kind_in,
+    held,
+    mapped,
+    selected,
     stored,
     uniform,
 )
@@ -32,117 +25,73 @@ def tape_size(avals: list[Any], width: int) -> int:
     return sum(a.size for a in avals) * 8 * width
 
 
-def tape_store(t: Text, pointer: str, offset: int, arrays: list[Held]) -> None:
+def _places(pointer: str, offset: int, width: int, avals: list[Any]) -> list[Strided]:
+    """Where arrays of these shapes and types lie one after the other, from so many bytes behind a
+    pointer on."""
+    found, n = [], 0
+    for aval in avals:
+        memory = Memory((pointer, offset + 8 * width * n))
+        kind = aval.kind if isinstance(aval, Array) else kind_of(aval.dtype)
+        found.append(Strided(tuple(aval.shape), kind, memory, contiguous(aval.shape)))
+        n += aval.size
+    return found
+
+
+def tape_store(t: Text, pointer: str, offset: int, arrays: list[Array]) -> None:
     """Write arrays one after the other, from so many bytes behind a pointer on."""
     # What is computed from what is overwritten is computed first.
-    arrays = [stored(t, x) if isinstance(x, Large) else x for x in arrays]
-    n = 0
-    for x in arrays:
-        begin = offset + 8 * t.width * n
-        if isinstance(x, Large):
-            fill(t, _at(pointer, begin, x.shape, x.kind), x)
-        else:
-            _store_numbers(t, pointer, begin, x)
-        n += x.size
-
-
-def tape_add(t: Text, pointer: str, offset: int, avals: list[Any], arrays: list[Held]) -> None:
-    """Add arrays to those that `tape_store` has written, of which they are no functions."""
-    old, n = tape_load(t, pointer, offset, avals), 0
-    rare: dict[Value, list[tuple[Strided, Held]]] = {}
-    for x, more, new in zip(old, arrays, add_all(t, old, arrays), strict=True):
-        if not isinstance(x, Strided):
-            _store_numbers(t, pointer, offset + 8 * t.width * n, new)
-        elif isinstance(more, Masked):
-            rare.setdefault(more.mask, []).append((x, new))
-        else:
-            fill(t, x, new)
-        n += x.size
-    for mask, pairs in rare.items():  # the weights of a law matter in the iterations with an impact
-        inside, after = t.label(), t.label()
-        t.fork(t.any(mask), inside, after, rare=True)
-        t.open(inside)
-        for x, new in pairs:
-            fill(t, x, new)
-        t.line(f"br label %{after}")
-        t.close()
-        t.follow(after)
-
-
-def _at(pointer: str, begin: int, shape: tuple[int, ...], kind: str) -> Strided:
-    """A large array in memory, from so many bytes behind a pointer on."""
-    return Strided(shape, kind, Memory((pointer, begin)), contiguous(shape))
-
-
-def _store_numbers(t: Text, pointer: str, begin: int, x: Values) -> None:
-    for n, value in enumerate(x.ravel()):
-        if value.kind == "i1":
-            value = t.cast("zext", value, "i8")
-        where = t.raw(f"getelementptr i8, ptr {pointer}, i64 {begin + 8 * t.width * n}")
-        t.store(f"store {t.vector(value.kind)} {value.text}, ptr {where}, align 8")
+    arrays = [x if isinstance(x, Registers) else stored(t, x) for x in arrays]
+    for place, x in zip(_places(pointer, offset, t.width, arrays), arrays, strict=True):
+        fill(t, place, x)
 
 
 def tape_load(t: Text, pointer: str, offset: int, avals: list[Any]) -> list[Any]:
     """Read arrays of these shapes and types that `tape_store` has written; large ones stay where
     they are."""
-    arrays, n = [], 0
-    for aval in avals:
-        kind, begin = kind_of(aval.dtype), offset + 8 * t.width * n
-        n += aval.size
-        if aval.size > MOST_IN_REGISTERS:
-            arrays.append(_at(pointer, begin, aval.shape, kind))
-            continue
-        x, stored_as = np.empty(aval.shape, object), "i8" if kind == "i1" else kind
-        for place, i in enumerate(np.ndindex(aval.shape)):
-            where = t.raw(f"getelementptr i8, ptr {pointer}, i64 {begin + 8 * t.width * place}")
-            value = Value(t.raw(f"load {t.vector(stored_as)}, ptr {where}, align 8"), stored_as)
-            x[i] = t.cast("trunc", value, "i1") if kind == "i1" else value
-        arrays.append(x)
-    return arrays
+    return [held(t, x) for x in _places(pointer, offset, t.width, avals)]
 
 
-def each_of(t: Text, function: Callable[..., Value], kind: str | None, *arrays: Held) -> Held:
-    """A function of numbers, number by number; `kind` is its result's type if another."""
-    if not any(isinstance(x, Large) for x in arrays):
-        return each(function, *arrays)
-    cuts = joined(*(x.cuts for x in arrays if isinstance(x, Large)))
-    own = kind or kind_in(arrays[0])
-    return Formula(
-        arrays[0].shape, own, lambda i: function(*(at(t, x, i) for x in arrays)), cuts=cuts
-    )
+def tape_add(t: Text, pointer: str, offset: int, avals: list[Any], arrays: list[Array]) -> None:
+    """Add arrays to those that `tape_store` has written, of which they are no functions."""
+    places = _places(pointer, offset, t.width, avals)
+    rare: dict[Value, list[tuple[Strided, Array]]] = {}
+    sums = add_all(t, [held(t, x) for x in places], arrays)
+    for place, more, new in zip(places, arrays, sums, strict=True):
+        if isinstance(more, Masked):
+            rare.setdefault(more.mask, []).append((place, new))
+        else:
+            fill(t, place, new)
+    for mask, pairs in rare.items():  # the weights of a law matter in the iterations with an impact
+        inside, after = t.label(), t.label()
+        t.fork(t.any(mask), inside, after, rare=True)
+        t.open(inside)
+        for place, new in pairs:
+            fill(t, place, new)
+        t.line(f"br label %{after}")
+        t.close()
+        t.follow(after)
 
 
-def only_in(t: Text, flag: Value, arrays: list[Held], avals: list[Any]) -> list[Held]:
+def only_in(t: Text, flag: Value, arrays: list[Array], avals: list[Any]) -> list[Array]:
     """The arrays in the lanes where the flag holds, else zeros; what is zero outside of some lanes
     must be so outside of these."""
     chosen = select_all(t, flag, arrays, zeros(t, avals))
     return [x if isinstance(x, Masked) else y for x, y in zip(arrays, chosen, strict=True)]
 
 
-def select_all(t: Text, flag: Value, a: list[Held], b: list[Held]) -> list[Held]:
+def select_all(t: Text, flag: Value, a: list[Array], b: list[Array]) -> list[Array]:
     """The arrays `a` in the lanes where the flag holds, else `b`."""
-    choose = lambda x, y: t.select(flag, x, y)
-    return [each_of(t, choose, None, x, y) for x, y in zip(a, b, strict=True)]
+    return [selected(t, flag, x, y) for x, y in zip(a, b, strict=True)]
 
 
-def add_all(t: Text, a: list[Held], b: list[Held]) -> list[Held]:
+def add_all(t: Text, a: list[Array], b: list[Array]) -> list[Array]:
     """The sums of two lists of arrays."""
-    total = lambda x, y: add(t, x, y)
-    return [each_of(t, total, None, x, y) for x, y in zip(a, b, strict=True)]
+    return [mapped(t, lambda x, y: add(t, x, y), x, y) for x, y in zip(a, b, strict=True)]
 
 
-def zeros(t: Text, avals: list[Any]) -> list[Any]:
-    """Zeros of the given shapes and kinds: in registers, or in memory where they are many."""
-    arrays = []
-    for aval in avals:
-        zero = t.zero(kind_of(aval.dtype))
-        large = aval.size > MOST_IN_REGISTERS
-        arrays.append(
-            uniform(aval.shape, zero)
-            if large
-            else each(lambda _, zero=zero: zero, np.zeros(aval.shape))
-        )
-    return arrays
+def zeros(t: Text, avals: list[Any]) -> list[Array]:
+    """Zeros of the given shapes and kinds."""
+    return [held(t, uniform(aval.shape, t.zero(kind_of(aval.dtype)))) for aval in avals]
 
 
 class Frame:
@@ -165,7 +114,7 @@ class Frame:
         """The arrays of a part."""
         return tape_load(t, "%frame", self.places[part], self._parts[part])
 
-    def store(self, t: Text, part: str, arrays: list[Held]) -> None:
+    def store(self, t: Text, part: str, arrays: list[Array]) -> None:
         """Write the arrays of a part."""
         tape_store(t, "%frame", self.places[part], arrays)
 
@@ -175,4 +124,4 @@ class Frame:
 
     def store_number(self, t: Text, part: str, value: Value) -> None:
         """Write the one number of a part."""
-        self.store(t, part, [np.array(value, object)])
+        self.store(t, part, [Registers.one(value)])

@@ -14,15 +14,25 @@ The blocks, each written by the method of its name (`docs/internals/lanes.md` ha
 
 from typing import Any, NamedTuple
 
-import numpy as np
 from jax.extend.core import ClosedJaxpr
 
-from ._arrays import each
-from ._large import MOST_IN_REGISTERS, Formula, Held, Large, Strided, replace, room, splat
+from ._arrays import (
+    MOST_IN_REGISTERS,
+    Array,
+    Registers,
+    Strided,
+    fill,
+    held,
+    mapped,
+    replace,
+    room,
+    selected,
+    splat,
+    uniform,
+)
 from ._memory import (
     claim,
-    gather,
-    gather_over,
+    gathering,
     load_pointer,
     load_stride,
     over_rows,
@@ -68,7 +78,7 @@ class _Group(NamedTuple):
 
     def values(self) -> list[Value]:
         """All numbers in one order."""
-        numbers = (v for x in self.arrays if not isinstance(x, Large) for v in x.ravel())
+        numbers = (v for x in self.arrays if isinstance(x, Registers) for v in x.values.flat)
         return [*numbers, self.lane, self.rows, self.active]
 
 
@@ -129,13 +139,9 @@ class _Writer:
         t, arrays = self.t, []
         avals = (*self.program.in_avals, *self.program.carry_avals)
         for aval, in_memory in zip(avals, self.large, strict=True):
-            if in_memory is not None:
-                arrays.append(in_memory)
-                continue
-            x = np.empty(aval.shape, object)
-            for i in np.ndindex(aval.shape):
-                x[i] = Value(t.fresh(), kind_of(aval.dtype))
-            arrays.append(x)
+            kind = kind_of(aval.dtype)
+            new = lambda _, kind=kind: Value(t.fresh(), kind)
+            arrays.append(in_memory or Registers.of(aval.shape, kind, new))
         index, filled = Value(t.fresh(), "i64"), Value(t.fresh(), "i64")
         return _Group(arrays, index, filled, Value(t.fresh(), "i1"))
 
@@ -239,17 +245,15 @@ class _Writer:
         block."""
         t = self.t
         t.open("begin")
-        n, read = (
-            len(self.inputs),
-            [self._read(i, x, old.lane, new) for i, x in enumerate(old.arrays[: len(self.inputs)])],
-        )
+        n = len(self.inputs)
+        read = [self._read(i, x, old.lane, new) for i, x in enumerate(old.arrays[:n])]
         carry, going, complete, row = self._run(self.program.begin, read, new)
         complete = t.both(new, complete)
         self._store_row(old.lane, complete, t.zero("i64"), row)
         rows = t.select(new, t.cast("zext", complete, "i64"), old.rows)
         replace(t, old.arrays[n:], carry, new)
         arrays = [
-            y if isinstance(y, Large) else each(lambda a, b: t.select(new, a, b), x, y)
+            selected(t, new, x, y) if isinstance(y, Registers) else y
             for x, y in zip([*read, *carry], old.arrays, strict=True)
         ]
         active = t.select(new, going, old.active)
@@ -258,14 +262,15 @@ class _Writer:
         t.close()
         return _Group(arrays, old.lane, rows, active), end
 
-    def _read(self, i: int, old: Held, lane: Value, new: Value) -> Held:
+    def _read(self, i: int, old: Array, lane: Value, new: Value) -> Array:
         """Input number i of the lanes in the slots `new`."""
-        t, pointer, stride = self.t, self.inputs[i], self.strides[i]
-        if not isinstance(old, Large):
-            return gather(t, pointer, stride, lane, old, new)
+        t, base = self.t, self.t.binary("mul", lane, self.strides[i])
+        read = gathering(t, self.inputs[i], base, self.program.in_avals[i], new)
+        if isinstance(old, Registers):
+            return held(t, read)
         if not self.one_for_all[i]:
             assert isinstance(old, Strided)
-            gather_over(t, pointer, stride, lane, old, new)
+            fill(t, old, selected(t, new, read, old))
         return old
 
     def _ready(self, old: _Group, begun: _Group, begin_end: str) -> _Group:
@@ -277,7 +282,7 @@ class _Writer:
             return t.phi(a.kind, (a.text, begin_end), (b.text, "refill"))
 
         arrays = [
-            b if isinstance(b, Large) else each(either, a, b)
+            mapped(t, either, a, b) if isinstance(b, Registers) else b
             for a, b in zip(begun.arrays, old.arrays, strict=True)
         ]
         rows, active = either(begun.rows, old.rows), either(begun.active, old.active)
@@ -291,7 +296,7 @@ class _Writer:
         """What `begin` or `step` gives: carry, whether the lane goes on, has a row, the row."""
         out: list[Any] = write(self.t, jaxpr, args, mask)
         n = len(self.program.carry_avals)
-        return out[:n], out[n][()], out[n + 1][()], out[n + 2 :]
+        return out[:n], out[n].item(), out[n + 1].item(), out[n + 2 :]
 
     # Rows
 
@@ -327,12 +332,7 @@ class _Writer:
         for aval in program.row_avals:
             kind = kind_of(aval.dtype)
             nothing = t.constant(float("nan") if is_float(kind) else 0, kind)
-            if aval.size > MOST_IN_REGISTERS:
-                empty.append(Formula(aval.shape, kind, lambda index, x=nothing: x))
-                continue
-            x = np.empty(aval.shape, object)
-            x.fill(nothing)
-            empty.append(x)
+            empty.append(held(t, uniform(aval.shape, nothing)))
         over_rows(
             t, filled, program.rows, ended, lambda n, mask: self._put_row(lane, mask, n, empty)
         )

@@ -3,23 +3,17 @@
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-
-from ._large import (
+from ._arrays import (
+    Array,
     Formula,
-    Held,
-    Large,
     Strided,
     Table,
-    Values,
     contiguous,
-    fill,
     gathered,
     in_lanes,
-    over,
+    over_all,
     place_of,
     scattered,
-    selected,
     splat,
 )
 from ._operations import kind_of
@@ -45,42 +39,19 @@ def _addresses(t: Text, pointer: str, offset: Value, kind: str) -> str:
     return t.raw(f"getelementptr {kind}, ptr {pointer}, {t.vector('i64')} {offset.text}")
 
 
-def gather(t: Text, pointer: str, stride: Value, lane: Value, old: Values, mask: Value) -> Values:
-    """One input of the lanes `lane`, read where `mask` holds; the other slots get zeros.
+def gathering(t: Text, pointer: str, base: Value, aval: Any, mask: Value) -> Formula:
+    """An array of each slot, read where it is asked for and `mask` holds, else zeros.
 
-    **Arguments:** where the input's array begins; its numbers per lane; each slot's lane; an array
-    of the input's shape and types; which slots read.
+    **Arguments:** where the arrays of all lanes begin; of each slot the number of its first number
+    in them; the array's shape and type; which slots read.
     """
-    base = t.binary("mul", lane, stride)
-    out = np.empty(old.shape, object)
-    for n, i in enumerate(np.ndindex(old.shape)):
-        kind: str = old[i].kind  # pyright: ignore[reportAttributeAccessIssue]
-        out[i] = _number(t, pointer, t.binary("add", base, t.constant(n, "i64")), kind, mask)
-    return out
-
-
-def gather_over(
-    t: Text, pointer: str, stride: Value, lane: Value, old: Strided, mask: Value
-) -> None:
-    """The same for an array in memory, where it replaces the numbers of the slots that read."""
-    new = gathering(t, pointer, t.binary("mul", lane, stride), old, mask)
-    fill(t, old, selected(t, mask, new, old))
-
-
-def gathering(t: Text, pointer: str, base: Value, like: Any, mask: Value) -> Formula:
-    """A large array of each slot, read where it is asked for and `mask` holds, else zeros.
-
-    **Arguments:** where the arrays of all lanes begin; the number of its first number in them; a
-    large array, or an aval, of its shape and type; which slots read.
-    """
-    steps = contiguous(like.shape)
-    kind = like.kind if isinstance(like, Large) else kind_of(like.dtype)
+    steps, kind = contiguous(aval.shape), kind_of(aval.dtype)
 
     def number(index) -> Value:
         place = t.binary("add", base, in_lanes(t, place_of(t, index, steps)))
         return _number(t, pointer, place, kind, mask)
 
-    return Formula(tuple(like.shape), kind, number)
+    return Formula(tuple(aval.shape), kind, number)
 
 
 def shared(pointer: str, shape: tuple[int, ...], kind: str) -> Strided:
@@ -95,7 +66,7 @@ def _number(t: Text, pointer: str, place: Value, kind: str, mask: Value) -> Valu
     return t.binary("icmp ne", value, t.zero("i8"), "i1") if kind == "i1" else value
 
 
-def scatter(t: Text, pointer: str, base: Value, x: Held, mask: Value) -> None:
+def scatter(t: Text, pointer: str, base: Value, x: Array, mask: Value) -> None:
     """Write `x` of the lanes in `mask`, the numbers of each from `base` on.
 
     **Arguments:** where the output's array begins; of each lane, the number of its first number in
@@ -108,12 +79,8 @@ def scatter(t: Text, pointer: str, base: Value, x: Held, mask: Value) -> None:
         number = t.binary("add", base, in_lanes(t, place))
         scattered(t, _addresses(t, pointer, number, value.kind), value, mask)
 
-    if isinstance(x, Large):
-        steps = contiguous(x.shape)
-        over(t, x.shape, lambda i: put(place_of(t, i, steps), x.at(t, i)), x.cuts)
-        return
-    for n, value in enumerate(x.ravel()):
-        put(n, value)
+    steps = contiguous(x.shape)
+    over_all(t, x, lambda i: put(place_of(t, i, steps), x.at(t, i)))
 
 
 def over_rows(

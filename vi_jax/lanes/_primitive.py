@@ -18,9 +18,9 @@ from jax.extend.core import Literal, Primitive
 from jax.interpreters import ad, batching, mlir, partial_eval
 
 from . import _xla as xla
+from ._arrays import MOST_IN_REGISTERS
 from ._context import within
 from ._derivative import forward, widened
-from ._large import MOST_IN_REGISTERS
 from ._program import LaneProgram, dependent_parts
 from ._vector import Unsupported
 from .call import header, registered

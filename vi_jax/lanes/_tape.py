@@ -22,13 +22,12 @@ from typing import Any
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
-from ._arrays import any_in
+from ._arrays import MOST_IN_REGISTERS, Array, Registers, any_in, held, mapped, splat
 from ._driver import DRIVER, OUT_OF_MEMORY
 from ._fixed import FixedText
 from ._group import (
     Frame,
     add_all,
-    each_of,
     only_in,
     select_all,
     tape_add,
@@ -37,8 +36,7 @@ from ._group import (
     tape_store,
     zeros,
 )
-from ._large import MOST_IN_REGISTERS, Held, Large, splat
-from ._memory import gather, gathering, load_pointer, load_stride, over_rows, scatter, shared
+from ._memory import gathering, load_pointer, load_stride, over_rows, scatter, shared
 from ._operations import compare, kind_of
 from ._reverse import ReverseProgram
 from ._text import RARE, Text, Value
@@ -75,11 +73,9 @@ def _is_no_number(t: Text, x: Value) -> Value:
     return compare(t, "ne", t.binary("fsub", x, x), t.zero(x.kind), False)
 
 
-def _read(t: Text, pointer: str, stride: Value, lane: Value, aval: Any, mask: Value) -> Held:
-    """An array of each lane, zeros where `mask` does not hold (see `_memory.gather`)."""
-    if aval.size > MOST_IN_REGISTERS:
-        return gathering(t, pointer, t.binary("mul", lane, stride), aval, mask)
-    return gather(t, pointer, stride, lane, zeros(t, [aval])[0], mask)
+def _read(t: Text, pointer: str, stride: Value, lane: Value, aval: Any, mask: Value) -> Array:
+    """An array of each lane, zeros where `mask` does not hold (see `gathering`)."""
+    return held(t, gathering(t, pointer, t.binary("mul", lane, stride), aval, mask))
 
 
 # The types of a lane's number, and of what is counted for a lane; of a truth value.
@@ -150,7 +146,7 @@ class _Writer:
         """Those inputs of which each lane has its own, or that are small."""
         return [x for x, shared in zip(inputs, self.shared, strict=True) if not shared]
 
-    def _load_inputs(self, t: Text) -> list[Held]:
+    def _load_inputs(self, t: Text) -> list[Array]:
         """The inputs: large ones that all lanes share where XLA keeps them."""
         own = iter(self.frame.load(t, "inputs"))
         return [
@@ -165,7 +161,7 @@ class _Writer:
 
     def _weights(
         self, t: Text, first: int, avals: list[Any], lane: Value, place: Value | None, mask: Value
-    ) -> list[Held]:
+    ) -> list[Array]:
         """Cotangents that were given, zero where `mask` does not hold.
 
         **Arguments:** the number of the first of them; shapes and types of them; each slot's lane;
@@ -181,7 +177,7 @@ class _Writer:
             arrays.append(_read(t, pointer, t.constant(1, "i64"), start, aval, mask))
         return arrays
 
-    def _row_weights(self, t: Text, lane: Value, place: Value, complete: Value) -> list[Held]:
+    def _row_weights(self, t: Text, lane: Value, place: Value, complete: Value) -> list[Array]:
         """The cotangents of the rows number `place`, of the lanes that have `complete`d one; not
         read if there are none."""
         avals = self.program.weight_avals[self.results :]
@@ -190,23 +186,23 @@ class _Writer:
             return none
         room = t.binary("icmp slt", place, t.constant(self.base.rows, "i64"), "i1")
         mask = t.both(complete, room)
-        if any(isinstance(x, Large) for x in none):
+        if not all(isinstance(x, Registers) for x in none):
             read = self._weights(t, self.results, avals, lane, place, mask)
-            self._spoil(t, [each_of(t, partial(_is_no_number, t), "i1", x) for x in read])
+            self._spoil(t, [mapped(t, partial(_is_no_number, t), x, kind="i1") for x in read])
             return read
         inside, after, before = t.label(), t.label(), t.block
         t.fork(t.any(mask), inside, after)
         t.open(inside)
         read = self._weights(t, self.results, avals, lane, place, mask)
-        self._spoil(t, [each_of(t, partial(_is_no_number, t), "i1", x) for x in read])
+        self._spoil(t, [mapped(t, partial(_is_no_number, t), x, kind="i1") for x in read])
         end = t.block
         t.line(f"br label %{after}")
         t.close()
         t.follow(after)
         either = lambda a, b: t.phi(a.kind, (a.text, end), (b.text, before))
-        return [each_of(t, either, None, a, b) for a, b in zip(read, none, strict=True)]
+        return [mapped(t, either, a, b) for a, b in zip(read, none, strict=True)]
 
-    def _spoil(self, t: Text, flags: list[Held]) -> None:
+    def _spoil(self, t: Text, flags: list[Array]) -> None:
         """The lanes in which one of these flags holds have no derivative."""
         spoilt = self.frame.number(t, "spoilt")
         for x in flags:
@@ -222,13 +218,13 @@ class _Writer:
         def weighs(place: Value, mask: Value) -> None:
             read = self._weights(t, self.results, avals, lane, place, mask)
             weighs = lambda x: compare(t, "ne", x, t.zero(x.kind), False)
-            self._spoil(t, [each_of(t, weighs, "i1", x) for x in read])
+            self._spoil(t, [mapped(t, weighs, x, kind="i1") for x in read])
 
         over_rows(t, rows, self.base.rows, present, weighs)
 
     def _back(
-        self, t: Text, jaxpr: ClosedJaxpr, args: list[Held], mask: Value
-    ) -> tuple[list[Held], list[Held]]:
+        self, t: Text, jaxpr: ClosedJaxpr, args: list[Array], mask: Value
+    ) -> tuple[list[Array], list[Array]]:
         """The cotangents of inputs and carry that the way back gives, zero where `mask` does not
         hold."""
         out = only_in(t, mask, write(t, jaxpr, args, mask), jaxpr.out_avals)
@@ -257,7 +253,7 @@ class _Writer:
         rows = t.cast("zext", t.both(present, complete.item()), "i64")
         count = t.select(going, t.constant(_NO_END, "i64"), t.zero("i64"))
         self.frame.store_number(t, "count", count)
-        self.frame.store(t, "now", [*carry, np.array(rows, object)])
+        self.frame.store(t, "now", [*carry, Registers.one(rows)])
         return self._function("i1", "begin", ", i64 %first, i64 %lanes", t, f"i1 {t.any(going)}")
 
     def _step(self) -> str:
@@ -272,7 +268,7 @@ class _Writer:
         out: list[Any] = write(t, self.program.step.forward, [*inputs, *carry, *given], mask)
         *new, active, complete = out
         more = t.binary("add", rows.item(), t.cast("zext", complete.item(), "i64"))
-        new = [*new, np.array(more, object)]
+        new = [*new, Registers.one(more)]
         self.frame.store(t, "now", select_all(t, mask, new, [*carry, rows]))
         over = t.both(mask, t.inverse(active.item()))
         following = t.binary("add", number, t.constant(1, "i64"))
@@ -290,7 +286,7 @@ class _Writer:
         avals = self.program.weight_avals[: self.results]
         weights = self._weights(t, 0, avals, lane, None, present)
         self.frame.store_number(t, "spoilt", t.constant(False, "i1"))
-        self._spoil(t, [each_of(t, partial(_is_no_number, t), "i1", x) for x in weights])
+        self._spoil(t, [mapped(t, partial(_is_no_number, t), x, kind="i1") for x in weights])
         self._spoil_by_missing_rows(t, lane, rows.item(), present)
         args = [*inputs, *carry, *weights]
         to_inputs, to_carry = self._back(t, self.program.end.backward, args, present)
@@ -314,7 +310,7 @@ class _Writer:
         more, new = self._back(t, self.program.step.backward, args, mask)
         tape_add(t, "%frame", self.frame.places["to_inputs"], self.varied, more)
         self.frame.store(t, "to_carry", select_all(t, mask, new, to_carry))
-        left = np.array(t.select(mask, rows.item(), after.item()), object)
+        left = Registers.one(t.select(mask, rows.item(), after.item()))
         tape_store(t, "%frame", self.rows_place, [left])
         return self._function("void", "step_back", ", ptr %before, i64 %number", t, "void")
 
@@ -332,7 +328,7 @@ class _Writer:
         total = add_all(t, self.frame.load(t, "to_inputs"), more)
         spoilt = self.frame.number(t, "spoilt")
         nan = lambda v: t.constant(float("nan"), v.kind)
-        nothing = [each_of(t, nan, None, x) for x in total]
+        nothing = [mapped(t, nan, x) for x in total]
         total = select_all(t, spoilt, nothing, total)
         for i, x in enumerate(total):
             start = t.binary("mul", lane, t.constant(x.size, "i64"))

@@ -5,18 +5,13 @@ from typing import Any
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
-from ._arrays import STRUCTURAL
-from ._control import CONTROL
-from ._derived import DERIVED, derived
-from ._large import (
-    LARGE,
+from ._arrays import (
     MOST_IN_REGISTERS,
     PLACED,
+    STRUCTURAL,
+    Array,
     Formula,
-    Held,
-    Large,
-    Values,
-    at,
+    Registers,
     chosen,
     held,
     joined,
@@ -27,6 +22,8 @@ from ._large import (
     table,
     uniform,
 )
+from ._control import CONTROL
+from ._derived import DERIVED, derived
 from ._operations import ELEMENTWISE, SAME, kind_of
 from ._program import called, inner
 from ._text import Text, Value
@@ -53,7 +50,7 @@ def check(jaxpr: Jaxpr) -> None:
 
 
 def _has_rule(name: str) -> bool:
-    return any(name in rules for rules in (ELEMENTWISE, STRUCTURAL, LARGE, PLACED, DERIVED))
+    return any(name in rules for rules in (ELEMENTWISE, STRUCTURAL, PLACED, DERIVED))
 
 
 def _bodies(eqn: Any) -> list[Jaxpr]:
@@ -70,22 +67,19 @@ def _bodies(eqn: Any) -> list[Jaxpr]:
     return [inner(params["jaxprs"].solve)] if name == "custom_linear_solve" else []
 
 
-def constants(t: Text, array: object) -> Held:
+def constants(t: Text, array: object) -> Array:
     """A known array, the same in every lane."""
     array = np.asarray(array)
     kind = kind_of(array.dtype)
     if array.size > MOST_IN_REGISTERS:
         return table(t, array, kind)
-    out = np.empty(array.shape, object)
-    for i in np.ndindex(array.shape):
-        out[i] = t.constant(array[i], kind)
-    return out
+    return Registers.of(array.shape, kind, lambda i: t.constant(array[i], kind))
 
 
 def write(t: Text, closed: ClosedJaxpr | Jaxpr, args: list[Any], mask: Value) -> list[Any]:
     """Append the operations of a jaxpr to a text, as LLVM code for one group of lanes.
 
-    **Arguments:** the text; the jaxpr; its arguments, as `Held` arrays of their shapes; which lanes
+    **Arguments:** the text; the jaxpr; its arguments, as `Array`s of their shapes; which lanes
     need the results: what none of them needs may be skipped, and the others get any numbers.
 
     **Returns:** its results, likewise.
@@ -94,7 +88,7 @@ def write(t: Text, closed: ClosedJaxpr | Jaxpr, args: list[Any], mask: Value) ->
     needed = _needed(jaxpr)
     uses, last = _uses(jaxpr, needed)
 
-    def read(atom: object) -> Held:
+    def read(atom: object) -> Array:
         if isinstance(atom, Literal):
             aval: Any = atom.aval
             return constants(t, np.asarray(atom.val, aval.dtype))
@@ -154,18 +148,14 @@ def _equation(t: Text, eqn: Any, args: list[Any], mask: Value) -> list[Any]:
     avals = [v.aval for v in eqn.outvars]
     if name in DERIVED:
         return write(t, derived(name, [a.aval for a in eqn.invars], params), args, mask)
-    large = any(isinstance(x, Large) for x in args) or any(
-        a.size > MOST_IN_REGISTERS for a in avals
-    )
     if name in ELEMENTWISE:
         dtypes = [a.aval.dtype for a in eqn.invars]
-        how = _formulas if large else _elementwise
-        return how(t, name, params, dtypes, args, avals)
+        return _elementwise(t, name, params, dtypes, args, avals)
     if name in PLACED:
         dtypes = [a.aval.dtype for a in eqn.invars[_PLACES.get(name, 1) :]]
         out = PLACED[name](t, params, avals, dtypes, *args)
     else:
-        out = (LARGE if large else STRUCTURAL)[name](t, params, avals, *args)
+        out = STRUCTURAL[name](t, params, avals, *args)
     return [held(t, x) for x in (out if eqn.primitive.multiple_results else [out])]
 
 
@@ -173,37 +163,36 @@ _PLACES = {"dynamic_update_slice": 2}
 """Where the places begin among the arguments of a primitive of `PLACED`."""
 
 
-def _elementwise(t: Text, name, params, dtypes, args, avals) -> list[Values]:
-    """A rule of `ELEMENTWISE`, number by number."""
-    args = np.broadcast_arrays(*args, subok=False)
-    outs = [np.empty(args[0].shape, object) for _ in avals]
-    for i in np.ndindex(args[0].shape):
-        out = ELEMENTWISE[name](t, params, dtypes, *(a[i] for a in args))
-        for array, value in zip(outs, out if len(avals) > 1 else (out,), strict=True):
-            array[i] = value
-    return outs
-
-
-def _formulas(t: Text, name, params, dtypes, args, avals) -> list[Held]:
-    """The same for arrays too large for registers, as formulas; those of several results, which
-    are computed together, are stored."""
+def _elementwise(t: Text, name, params, dtypes, args, avals) -> list[Array]:
+    """The results of a rule of `ELEMENTWISE`: number by number of arrays in registers. Of larger
+    ones they are formulas; several results, which are computed together, are stored."""
+    rule, shape, kinds = ELEMENTWISE[name], avals[0].shape, [kind_of(a.dtype) for a in avals]
+    if avals[0].size <= MOST_IN_REGISTERS and all(isinstance(x, Registers) for x in args):
+        values = [x.values for x in args]
+        if any(x.shape != values[0].shape for x in values):
+            values = np.broadcast_arrays(*values)
+        outs = [np.empty(values[0].shape, object) for _ in avals]
+        for i in np.ndindex(values[0].shape):
+            found = rule(t, params, dtypes, *(x[i] for x in values))
+            for out, value in zip(outs, found if len(avals) > 1 else (found,), strict=True):
+                out[i] = value
+        return [Registers(out, kind) for out, kind in zip(outs, kinds, strict=True)]
     if name in SAME:
         return args[:1]
-    shape, kinds = avals[0].shape, [kind_of(a.dtype) for a in avals]
 
     def numbers(index: tuple) -> Any:
         # JAX lets numbers, and axes of one number, stand for arrays.
         given = (
-            at(t, x, [i if n != 1 else 0 for i, n in zip(index, x.shape, strict=False)])
+            x.at(t, [i if n != 1 else 0 for i, n in zip(index, x.shape, strict=False)])
             for x in args
         )
-        found = ELEMENTWISE[name](t, params, dtypes, *given)
+        found = rule(t, params, dtypes, *given)
         # Whether it is stored before it is used must not decide how it is rounded.
         return t.opaque(found) if len(avals) == 1 else found
 
     values = [_one_number(x) for x in args]
     if all(v is not None for v in values):
-        found = ELEMENTWISE[name](t, params, dtypes, *values)
+        found = rule(t, params, dtypes, *values)
         return [uniform(shape, v) for v in (found if len(avals) > 1 else (found,))]
     if name == "select_n" and len(args) == 3 and values[0] is not None:
         if values[0].kind == "i1" and args[1].shape == args[2].shape:
@@ -211,7 +200,7 @@ def _formulas(t: Text, name, params, dtypes, args, avals) -> list[Held]:
             if found is not None:
                 return [found]
     if len(avals) == 1:
-        cuts = joined(*(x.cuts for x in args if isinstance(x, Large) and x.ndim))
+        cuts = joined(*(x.cuts for x in args if x.ndim))
         return [Formula(shape, kinds[0], numbers, cuts=cuts)]
     outs = [room(t, shape, kind) for kind in kinds]
 
@@ -219,12 +208,12 @@ def _formulas(t: Text, name, params, dtypes, args, avals) -> list[Held]:
         for out, value in zip(outs, numbers(index), strict=True):
             store_at(t, out, index, value)
 
-    over(t, shape, put, joined(*(x.cuts for x in args if isinstance(x, Large))))
+    over(t, shape, put, joined(*(x.cuts for x in args)))
     return list(outs)
 
 
-def _one_number(x: Held) -> Value | None:
+def _one_number(x: Array) -> Value | None:
     """The number of an array that has only one."""
-    if isinstance(x, Large):
-        return x.value if isinstance(x, Formula) else None
-    return x.item() if x.size == 1 else None
+    if isinstance(x, Registers):
+        return x.item() if x.size == 1 else None
+    return x.value if isinstance(x, Formula) else None

@@ -8,9 +8,9 @@ import numpy as np
 
 from .._operations import Rule, add, compare, convert, extreme, is_unsigned, mul, sub
 from .._text import Text, Value
-from .held import held, settled, stored
-from .index import Index, in_lanes, over, place_of, plus
-from .kinds import Formula, Held, Large, Pieces, Strided, Values, at, kind_in
+from .held import held, over_all, settled, stored
+from .index import Index, in_lanes, place_of, plus
+from .kinds import Array, Formula, Pieces, Registers, Strided
 from .moved import sliced
 from .sums import in_one
 
@@ -36,42 +36,44 @@ def _as_place(t: Text, value: Value, dtype) -> Value:
 def _starts(t: Text, starts, dtypes, sizes, shape) -> list[Index]:
     """Where a block of `sizes` begins, moved so that it lies within the array."""
     return [
-        _within(t, _as_place(t, at(t, s, ()), d), n - m)[0]
+        _within(t, _as_place(t, s.at(t, ()), d), n - m)[0]
         for s, d, m, n in zip(starts, dtypes, sizes, shape, strict=True)
     ]
 
 
-def dynamic_slice(t: Text, p: dict, avals, dtypes, x: Held, *starts: Held) -> Held:
+def dynamic_slice(t: Text, p: dict, avals, dtypes, x: Array, *starts: Array) -> Array:
     """A block of an array that begins at a place given by the data."""
     begin, x = _starts(t, starts, dtypes, p["slice_sizes"], x.shape), in_one(t, x)
     return Formula(
         tuple(avals[0].shape),
-        kind_in(x),
-        lambda index: at(t, x, [plus(t, i, j) for i, j in zip(index, begin, strict=True)]),
+        x.kind,
+        lambda index: x.at(t, [plus(t, i, j) for i, j in zip(index, begin, strict=True)]),
     )
 
 
-def dynamic_update_slice(t: Text, p: dict, avals, dtypes, x: Held, update: Held, *starts) -> Held:
+def dynamic_update_slice(
+    t: Text, p: dict, avals, dtypes, x: Array, update: Array, *starts
+) -> Array:
     """An array with a block of other numbers from a place given by the data."""
     begin = _starts(t, starts, dtypes, update.shape, x.shape)
     if all(isinstance(i, int) for i in begin):
         window = [(int(i), n) for i, n in zip(begin, update.shape, strict=True)]  # pyright: ignore[reportArgumentType]
         update = settled(t, update)
-        found = _patched(t, x, window, lambda index: at(t, update, index))
+        found = _patched(t, x, window, lambda index: update.at(t, index))
         if found is not None:
             return found
-    out = _copy(t, x, isinstance(update, Large))
+    out = _copy(t, x, not isinstance(update, Registers))
 
     def put(index: tuple[Index, ...]) -> None:
         place = [plus(t, i, j) for i, j in zip(index, begin, strict=True)]
-        value = at(t, update, index)
+        value = update.at(t, index)
         put_at(t, out, place, lambda old: value)
 
-    _over(t, update, put)
+    over_all(t, update, put)
     return out
 
 
-def _patched(t: Text, x: Held, window: Sequence[tuple[int, int]], new: Callable) -> Pieces | None:
+def _patched(t: Text, x: Array, window: Sequence[tuple[int, int]], new: Callable) -> Pieces | None:
     """A large array with other numbers in a window, without a copy; `None` unless the window
     leaves out something along one axis only.
 
@@ -79,40 +81,33 @@ def _patched(t: Text, x: Held, window: Sequence[tuple[int, int]], new: Callable)
     numbers by their index in it.
     """
     axes = [a for a, (_, n) in enumerate(window) if n != x.shape[a]]
-    if len(axes) != 1 or not isinstance(x, Large):
+    if len(axes) != 1 or isinstance(x, Registers):
         return None
     axis, shape = axes[0], tuple(n for _, n in window)
     begin, size = window[axis]
 
-    def part(first: int, end: int) -> Large:
+    def part(first: int, end: int) -> Array:
         corner = [first if a == axis else 0 for a in range(x.ndim)]
         return sliced(t, x, corner, [end - first if a == axis else n for a, n in enumerate(shape)])
 
-    parts: list[Held] = [part(0, begin)] if begin else []
+    parts: list[Array] = [part(0, begin)] if begin else []
     parts.append(held(t, Formula(shape, x.kind, new)))
     if begin + size < x.shape[axis]:
         parts.append(part(begin + size, x.shape[axis]))
     return Pieces(x.shape, x.kind, axis, tuple(parts))
 
 
-def _copy(t: Text, x: Held, in_memory: bool) -> Values | Strided:
+def _copy(t: Text, x: Array, in_memory: bool) -> Registers | Strided:
     """A copy of an array that may be changed, in memory if it is large or that is asked for."""
-    return stored(t, x) if in_memory or isinstance(x, Large) else x.copy()
-
-
-def _over(t: Text, x: Held, body: Callable) -> None:
-    """All elements of an array: in loops if it is large, else one after the other."""
-    if isinstance(x, Large):
-        over(t, x.shape, body)
-    else:
-        for index in np.ndindex(x.shape):
-            body(index)
+    if in_memory or not isinstance(x, Registers):
+        return stored(t, x)
+    return Registers(x.values.copy(), x.kind)
 
 
 class _Asked(NamedTuple):
     """Where the data name blocks of an array."""
 
-    indices: Held
+    indices: Array
     dtype: Any
     axes: Sequence[int]
     """The axes whose places the last axis of the indices names."""
@@ -129,16 +124,16 @@ class _Asked(NamedTuple):
             place[a] = batch[b]
         inside = t.constant(True, "i1")
         for k, a in enumerate(self.axes):
-            given = _as_place(t, at(t, self.indices, (*batch, k)), self.dtype)
+            given = _as_place(t, self.indices.at(t, (*batch, k)), self.dtype)
             place[a], here = _within(t, given, self.greatest[a])
             inside = t.both(inside, here)
         return place, inside
 
 
-def gather(t: Text, p: dict, avals, dtypes, x: Held, indices: Held) -> Held:
+def gather(t: Text, p: dict, avals, dtypes, x: Array, indices: Array) -> Array:
     """Blocks of an array from places given by the data."""
     d, aval, x, indices = p["dimension_numbers"], avals[0], in_one(t, x), in_one(t, indices)
-    kind, sizes = kind_in(x), p["slice_sizes"]
+    kind, sizes = x.kind, p["slice_sizes"]
     gone = (*d.collapsed_slice_dims, *d.operand_batching_dims)
     inner = [a for a in range(x.ndim) if a not in gone]
 
@@ -152,7 +147,7 @@ def gather(t: Text, p: dict, avals, dtypes, x: Held, indices: Held) -> Held:
         place, inside = asked.corner(t, [i for a, i in enumerate(index) if a not in d.offset_dims])
         for a, i in zip(inner, [index[o] for o in d.offset_dims], strict=True):
             place[a] = plus(t, place[a], i)
-        value = at(t, x, place)
+        value = x.at(t, place)
         if "FILL" not in str(p["mode"]):
             return value
         return t.select(inside, value, t.constant(_filling(p["fill_value"], aval.dtype), kind))
@@ -189,7 +184,7 @@ _COMBINED: dict[str, Callable] = {
 _COMBINED |= {name.replace("-", "_"): how for name, how in _COMBINED.items()}
 
 
-def scatter(t: Text, name: str, p: dict, avals, dtypes, x: Held, indices: Held, update: Held):
+def scatter(t: Text, name: str, p: dict, avals, dtypes, x: Array, indices: Array, update: Array):
     """An array with numbers put, added, … at places given by the data; what lies outside is left
     out, unless the mode says that places are moved inside."""
     d, unsigned = p["dimension_numbers"], is_unsigned(avals[0].dtype)
@@ -220,27 +215,27 @@ def scatter(t: Text, name: str, p: dict, avals, dtypes, x: Held, indices: Held, 
                 given: list[Index] = [0] * update.ndim
                 for a, o in zip(inner, d.update_window_dims, strict=True):
                     given[o] = index[a]
-                old = at(t, x, [plus(t, i, b) for i, (b, _) in zip(index, sizes, strict=True)])
-                return combined(t, old, at(t, update, given))
+                old = x.at(t, [plus(t, i, b) for i, (b, _) in zip(index, sizes, strict=True)])
+                return combined(t, old, update.at(t, given))
 
             found = _patched(t, x, sizes, changed)
             if found is not None:
                 return found
-    out = _copy(t, x, isinstance(update, Large))
+    out = _copy(t, x, not isinstance(update, Registers))
 
     def put(index: tuple[Index, ...]) -> None:
         place, inside = begin([i for a, i in enumerate(index) if a not in d.update_window_dims])
         for a, i in zip(inner, [index[o] for o in d.update_window_dims], strict=True):
             place[a] = plus(t, place[a], i)
-        value = at(t, update, index)
+        value = update.at(t, index)
         put_at(t, out, place, lambda old: t.select(inside, combined(t, old, value), old))
 
-    _over(t, update, put)
+    over_all(t, update, put)
     return out
 
 
-def put_at(t: Text, x: Values | Strided, place: Sequence[Index], new: Callable) -> None:
-    """Change the number of an array at a place: in memory, or in an object array at all places that
+def put_at(t: Text, x: Registers | Strided, place: Sequence[Index], new: Callable) -> None:
+    """Change the number of an array at a place: in memory, or in registers at all places that
     it may be.
 
     **Arguments:** the text; the array; the place; the new number as a function of the old one.
@@ -258,7 +253,7 @@ def put_at(t: Text, x: Values | Strided, place: Sequence[Index], new: Callable) 
                 asked = t.binary("icmp eq", in_lanes(t, i), t.constant(n, "i64"), "i1")
                 here = t.both(here, asked)
         if here.number is None or here.number:
-            x[way] = t.select(here, new(x[way]), x[way])
+            x.values[way] = t.select(here, new(x.values[way]), x.values[way])
 
 
 # Rules that ask for the types of their places too, which say whether those are signed.

@@ -1,8 +1,8 @@
-"""Large arrays computed, stored, chosen, replaced."""
+"""Arrays computed, stored, chosen, replaced."""
 
 import hashlib
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,39 +11,55 @@ from .._text import Text, Value, is_float
 from .index import Index, contiguous, over, place_of
 from .kinds import (
     MOST_IN_REGISTERS,
+    Array,
     Formula,
-    Held,
-    Large,
     Memory,
     Pieces,
+    Registers,
     Strided,
     Table,
-    at,
     joined,
-    kind_in,
     stored_kind,
     uniform,
 )
 
 
-def as_large(t: Text, x: Held) -> Large:
-    """An array as one that can be asked for numbers at places known only at run time."""
-    if isinstance(x, Large):
+def addressable(t: Text, x: Array) -> Array:
+    """An array that can be asked for numbers at places known only at run time."""
+    if not isinstance(x, Registers):
         return x
-    if x.size == 1:
-        value = x.reshape(-1)[0]
-        return uniform(x.shape, value)
-    return stored(t, x)
+    return uniform(x.shape, x.item()) if x.size == 1 else stored(t, x)
 
 
-def held(t: Text, x: Held) -> Held:
+def held(t: Text, x: Array) -> Any:
     """An array as a kernel holds one of its size."""
-    if not isinstance(x, Large) or x.size > MOST_IN_REGISTERS:
+    if isinstance(x, Registers) or x.size > MOST_IN_REGISTERS:
         return x
-    out = np.empty(x.shape, object)
-    for i in np.ndindex(x.shape):
-        out[i] = x.at(t, i)
-    return out
+    return Registers.of(x.shape, x.kind, lambda i: x.at(t, i))
+
+
+def mapped(t: Text, function: Callable[..., Value], *arrays: Array, kind: str | None = None) -> Any:
+    """A function of numbers, number by number, of arrays of one shape.
+
+    **Arguments:** `kind`, the type of its result, if another than that of the first array.
+    """
+    first, kind = arrays[0], kind or arrays[0].kind
+    if all(isinstance(x, Registers) for x in arrays):
+        numbers = zip(*(x.values.flat for x in arrays), strict=True)  # pyright: ignore
+        out: Any = np.empty(first.shape, object)
+        out.flat = [function(*each) for each in numbers]
+        return Registers(out, kind)
+    number = lambda i: function(*(x.at(t, i) for x in arrays))
+    return Formula(first.shape, kind, number, cuts=joined(*(x.cuts for x in arrays)))
+
+
+def over_all(t: Text, x: Array, body: Callable[[tuple[Index, ...]], None]) -> None:
+    """All elements of an array: one after the other if it is in registers, else in loops."""
+    if isinstance(x, Registers):
+        for i in np.ndindex(x.shape):
+            body(i)
+    else:
+        over(t, x.shape, body, x.cuts)
 
 
 def room(t: Text, shape: Sequence[int], kind: str) -> Strided:
@@ -54,7 +70,7 @@ def room(t: Text, shape: Sequence[int], kind: str) -> Strided:
 
 
 def fill(
-    t: Text, out: Strided, x: Held, *, offset: Index = 0, strides: Sequence[int] | None = None
+    t: Text, out: Strided, x: Array, *, offset: Index = 0, strides: Sequence[int] | None = None
 ) -> None:
     """Store the numbers of an array in room for them, by default in order.
 
@@ -64,26 +80,22 @@ def fill(
     steps = contiguous(x.shape) if strides is None else strides
     memory = out.source
     assert isinstance(memory, Memory)
-    if not isinstance(x, Large):
-        for i in np.ndindex(x.shape):
-            memory.store(t, place_of(t, i, steps, offset), x[i])
-        return
-    over(t, x.shape, lambda i: memory.store(t, place_of(t, i, steps, offset), x.at(t, i)), x.cuts)
+    over_all(t, x, lambda i: memory.store(t, place_of(t, i, steps, offset), x.at(t, i)))
 
 
-def stored(t: Text, x: Held) -> Strided:
+def stored(t: Text, x: Array) -> Strided:
     """A copy of an array in memory."""
-    out = room(t, x.shape, kind_in(x))
+    out = room(t, x.shape, x.kind)
     fill(t, out, x)
     return out
 
 
-def settled(t: Text, x: Held) -> Held:
+def settled(t: Text, x: Array) -> Array:
     """An array whose numbers are computed: what is a formula is stored."""
     return x if is_cheap(x) else stored(t, x)
 
 
-def is_cheap(x: Held) -> bool:
+def is_cheap(x: Array) -> bool:
     """Whether the numbers of an array need not be stored to be asked for again."""
     if isinstance(x, Pieces):
         return all(map(is_cheap, x.parts))
@@ -97,25 +109,20 @@ def store_at(t: Text, x: Strided, index: Sequence[Index], value: Value) -> None:
     memory.store(t, place_of(t, index, x.strides, x.offset), value)
 
 
-def selected(t: Text, mask: Value, a: Held, b: Held) -> Formula:
+def selected(t: Text, mask: Value, a: Array, b: Array) -> Any:
     """The first array where `mask` holds, else the second."""
-    cuts = joined(*(x.cuts for x in (a, b) if isinstance(x, Large)))
-    return Formula(
-        a.shape, kind_in(a), lambda i: t.select(mask, at(t, a, i), at(t, b, i)), cuts=cuts
-    )
+    return mapped(t, lambda x, y: t.select(mask, x, y), a, b)
 
 
-def replace(t: Text, old: Sequence[Held], new: Sequence[Held], mask: Value | None = None) -> None:
+def replace(t: Text, old: Sequence[Array], new: Sequence[Array], mask: Value | None = None) -> None:
     """Store large arrays over those that they replace, where `mask` holds. The new ones may depend
     on any of the old ones; arrays in registers are left out."""
     pairs = [
-        (a, b)
-        for a, b in zip(old, new, strict=True)
-        if isinstance(a, Strided) and isinstance(b, Large) and not same(a, b)
+        (a, b) for a, b in zip(old, new, strict=True) if isinstance(a, Strided) and not same(a, b)
     ]
     blocks = [a.source.block for a, _ in pairs if isinstance(a.source, Memory)]
 
-    def apart(x: Large) -> Large:
+    def apart(x: Array) -> Array:
         free = isinstance(x, Strided) and not (
             isinstance(x.source, Memory) and any(x.source.block is b for b in blocks)
         )
@@ -125,7 +132,7 @@ def replace(t: Text, old: Sequence[Held], new: Sequence[Held], mask: Value | Non
         fill(t, a, b if mask is None else selected(t, mask, b, a))
 
 
-def same(a: Held, b: Held) -> bool:
+def same(a: Array, b: Array) -> bool:
     """Whether two large arrays are the same numbers of the same memory."""
     if a is b:
         return True
@@ -136,7 +143,7 @@ def same(a: Held, b: Held) -> bool:
     return alike and (a.shape, a.strides, a.offset) == (b.shape, b.strides, b.offset)
 
 
-def table(t: Text, array: object, kind: str) -> Large:
+def table(t: Text, array: object, kind: str) -> Array:
     """A large array known while the code is written, as constants in the module's text."""
     array = np.asarray(array)
     numbers = array.reshape(-1)

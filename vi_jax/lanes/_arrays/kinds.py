@@ -1,4 +1,4 @@
-"""The kinds of large arrays: a formula, pieces of others, or regular places in memory."""
+"""The kinds of arrays: in registers, a formula, pieces of others, or regular places in memory."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -24,12 +24,9 @@ MOST_IN_REGISTERS = 16
 
 _BYTES = {"double": 8, "float": 4, "i1": 1, "i8": 1, "i16": 2, "i32": 4, "i64": 8}
 
-Values = Any
-"""An object array of `Value`s, of the shape of the JAX array."""
 
-
-class Large:
-    """An array of a lane that is no object array of values."""
+class Array:
+    """An array of a lane, as a kernel holds it."""
 
     shape: tuple[int, ...]
     kind: str
@@ -50,12 +47,48 @@ class Large:
         raise TypeError(type(self).__name__)
 
 
-Held = Values | Large
-"""An array of a lane, as a kernel holds it."""
+class Registers(Array):
+    """An array whose numbers are in registers: at most `MOST_IN_REGISTERS` of them.
+
+    **Arguments:** an object array of `Value`s; their type, by default that of the first.
+    """
+
+    def __init__(self, values: np.ndarray, kind: str | None = None):
+        self.values: Any = values
+        self.shape = values.shape
+        self.kind = next(values.flat).kind if kind is None else kind
+
+    @classmethod
+    def of(cls, shape: Sequence[int], kind: str, number: Callable[[tuple[int, ...]], Value]):
+        """An array of this shape with a number for each index."""
+        values = np.empty(tuple(shape), object)
+        for i in np.ndindex(values.shape):
+            values[i] = number(i)
+        return cls(values, kind)
+
+    @classmethod
+    def one(cls, value: Value) -> "Registers":
+        """An array without axes."""
+        return cls.of((), value.kind, lambda _: value)
+
+    def item(self) -> Value:
+        """The only number."""
+        return self.values.item()
+
+    def at(self, t: Text, index: Sequence[Index]) -> Value:
+        for axis, i in enumerate(index):
+            if not isinstance(i, int):
+                ways = [(*index[:axis], n, *index[axis + 1 :]) for n in range(self.shape[axis])]
+                found = self.at(t, ways[0])
+                for n, way in enumerate(ways[1:], start=1):
+                    here = t.binary("icmp eq", in_lanes(t, i), t.constant(n, "i64"), "i1")
+                    found = t.select(here, self.at(t, way), found)
+                return found
+        return self.values[tuple(index)]
 
 
 @dataclass(eq=False)
-class Formula(Large):
+class Formula(Array):
     """An array whose numbers are computed where they are asked for."""
 
     shape: tuple[int, ...]
@@ -77,19 +110,19 @@ def uniform(shape: Sequence[int], value: Value) -> Formula:
 
 
 @dataclass(eq=False)
-class Pieces(Large):
+class Pieces(Array):
     """Arrays one after the other along an axis."""
 
     shape: tuple[int, ...]
     kind: str
     axis: int
-    parts: tuple[Any, ...]
+    parts: tuple[Array, ...]
 
     def __post_init__(self) -> None:
         cuts: dict[int, set[int]] = {self.axis: set()}
         for begin, part in zip(self._begins(), self.parts, strict=True):
             cuts[self.axis].add(begin)
-            if not isinstance(part, Large):  # its numbers are asked for one by one
+            if isinstance(part, Registers):  # its numbers are asked for one by one
                 cuts[self.axis].update(range(begin, begin + part.shape[self.axis]))
                 continue
             for axis, places in part.cuts.items():
@@ -111,7 +144,7 @@ class Pieces(Large):
                 continue
             alone = begin <= low and high < begin + size
             place = plus(t, i, -begin) if alone else _clamped(t, plus(t, i, -begin), size - 1)
-            value = at(t, part, (*index[: self.axis], place, *index[self.axis + 1 :]))
+            value = part.at(t, (*index[: self.axis], place, *index[self.axis + 1 :]))
             if found is not None:
                 there = t.binary("icmp sge", in_lanes(t, i), t.constant(begin, "i64"), "i1")
                 value = t.select(there, value, found)
@@ -189,6 +222,10 @@ class Memory:
         return t.once(f"getelementptr i8, ptr {pointer}, i64 {begin}")
 
     def _address(self, t: Text, place: Index, kind: str) -> str:
+        if isinstance(place, int) and not isinstance(self.block, Block):
+            pointer, begin = self.block
+            place = begin + t.width * _BYTES[kind] * place
+            return t.once(f"getelementptr i8, ptr {pointer}, i64 {place}")
         return t.once(f"getelementptr {t.vector(kind)}, ptr {self._base(t)}, i64 {place}")
 
     def _alignment(self, t: Text, kind: str) -> int:
@@ -202,7 +239,7 @@ class Memory:
 
 
 @dataclass(eq=False)
-class Strided(Large):
+class Strided(Array):
     """An array whose numbers lie at regular places of a block or of a table."""
 
     shape: tuple[int, ...]
@@ -221,7 +258,7 @@ class Strided(Large):
 
 
 @dataclass(eq=False)
-class Masked(Large):
+class Masked(Array):
     """An array that is zero but in the lanes of a mask: numbers in memory to which nothing is
     written where the mask has no lane."""
 
@@ -263,23 +300,3 @@ def scattered(t: Text, where: str, value: Value, mask: Value) -> None:
     t.declared[name] = f"declare void {name}({v}, {p}, i32, {flags})"
     call = f"{v} {value.text}, {p} {where}, i32 {_BYTES[value.kind]}, {flags} {mask.text}"
     t.store(f"call void {name}({call})")
-
-
-def kind_in(x: Held) -> str:
-    """The type of an array's numbers; of one without any it is no matter."""
-    return x.kind if isinstance(x, Large) else next((v.kind for v in x.flat), "double")
-
-
-def at(t: Text, x: Held, index: Sequence[Index]) -> Value:
-    """The number of an array at a place of each axis, within the array in every slot."""
-    if isinstance(x, Large):
-        return x.at(t, index)
-    for axis, i in enumerate(index):
-        if not isinstance(i, int):
-            ways = [(*index[:axis], n, *index[axis + 1 :]) for n in range(x.shape[axis])]
-            found = at(t, x, ways[0])
-            for n, way in enumerate(ways[1:], start=1):
-                here = t.binary("icmp eq", in_lanes(t, i), t.constant(n, "i64"), "i1")
-                found = t.select(here, at(t, x, way), found)
-            return found
-    return x[tuple(index)]

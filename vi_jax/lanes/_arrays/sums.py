@@ -1,16 +1,17 @@
-"""Sums, extremes and products of large arrays, as loops."""
+"""Sums, extremes and products: number by number of arrays in registers, else as loops."""
 
+import functools
 from collections.abc import Callable, Sequence
 
+import jax
 import numpy as np
 
-from .._operations import add, kind_of
-from .._reductions import register_products, register_reductions
+from .._operations import Rule, add, extreme, is_unsigned, kind_of, mul, weighted
 from .._text import Text, Value
-from .held import as_large, room, settled, store_at, stored
+from .held import addressable, held, mapped, room, settled, store_at, stored
 from .index import Index, counted, over, plus, times
-from .kinds import Formula, Held, Large, at
-from .moved import LARGE, reshaped, transposed
+from .kinds import MOST_IN_REGISTERS, Array, Formula, Registers
+from .moved import STRUCTURAL, reshaped, structural, transposed
 
 # Sums at once of a long sum, each of which waits for itself: a fused multiply-add takes four cycles
 # and two begin in each.
@@ -20,12 +21,12 @@ _SUMS = 8
 # --- sums and the like
 
 
-def in_one(t: Text, x: Held) -> Held:
+def in_one(t: Text, x: Array) -> Array:
     """An array that is asked for at places of which no more is known than that they are in it."""
-    return stored(t, x) if isinstance(x, Large) and x.cuts else settled(t, x)
+    return stored(t, x) if x.cuts else settled(t, x)
 
 
-def _each_output(t: Text, shape: Sequence[int], kind: str, number: Callable) -> Large:
+def _each_output(t: Text, shape: Sequence[int], kind: str, number: Callable) -> Array:
     """An array each of whose numbers takes a loop of its own, which are written one after the other
     if they are few."""
     formula = Formula(tuple(shape), kind, number)
@@ -37,14 +38,18 @@ _FEW = 4
 
 
 def reduced(
-    t: Text, number: int, term: Callable[[Index], Value], how: Callable, empty: Value
-) -> Value:
+    t: Text, number: int, term: Callable[[Index], Value], how: Callable, empty: Value,
+    *, in_order: bool = False,
+) -> Value:  # fmt: skip
     """All terms put together, several chains at once.
 
-    **Arguments:** the text; how many terms; each by its number; of two values one; that of none.
+    **Arguments:** the text; how many terms; each by its number; of two values one; that of none;
+    whether the terms are written one after the other instead.
     """
     if number == 0:
         return empty
+    if in_order:
+        return functools.reduce(how, map(term, range(number)))
     chains = _SUMS if number >= 2 * _SUMS else 1
     turns, rest = divmod(number, chains)
     first = [term(j) for j in range(chains)]
@@ -61,30 +66,41 @@ def reduced(
     return found[0]
 
 
-def _reduce(t: Text, x: Held, axes: tuple[int, ...], aval, how: Callable, empty: Value) -> Held:
-    kept = [a for a in range(x.ndim) if a not in axes]
+def _reduce(t: Text, axes: tuple[int, ...], aval, x: Array, how: Callable, empty: Value) -> Array:
+    kept, in_order = [a for a in range(x.ndim) if a not in axes], isinstance(x, Registers)
     x = _grouped(t, x, (*([a] for a in kept), list(axes)))
 
     def number(index):
-        return reduced(t, x.shape[-1], lambda i: at(t, x, (*index, i)), how, empty)
+        term = lambda i: x.at(t, (*index, i))
+        return reduced(t, x.shape[-1], term, how, empty, in_order=in_order)
 
+    if in_order:
+        return Registers.of(aval.shape, kind_of(aval.dtype), number)
     return _each_output(t, aval.shape, kind_of(aval.dtype), number)
 
 
-def _grouped(t: Text, x: Held, groups: Sequence[Sequence[int]]) -> Large:
+def _grouped(t: Text, x: Array, groups: Sequence[Sequence[int]]) -> Array:
     """An array with its axes in another order, each group of them made one."""
-    x = as_large(t, stored(t, x) if isinstance(x, Large) and x.cuts else x)
+    x = stored(t, x) if x.cuts else x
     order = [a for group in groups for a in group]
     if order != list(range(x.ndim)):
-        x = transposed(t, x, order)
+        x = held(t, transposed(t, x, order))
     sizes = iter(x.shape)
     shape = tuple(int(np.prod([next(sizes) for _ in group], dtype=int)) for group in groups)
     return reshaped(t, x, shape)
 
 
-def _cumulated(t: Text, p: dict, avals, x: Held, how: Callable) -> Held:
+def _cumulated(t: Text, p: dict, x: Array, how: Callable) -> Array:
     """Each number put together with all before it along an axis."""
-    x = as_large(t, in_one(t, x))
+    if isinstance(x, Registers):
+        out = np.moveaxis(x.values, p["axis"], 0).copy()
+        out = out[::-1] if p["reverse"] else out
+        for i in range(1, len(out)):
+            before, here = (Registers(out[n : n + 1], x.kind) for n in (i - 1, i))
+            out[i : i + 1] = mapped(t, how, before, here).values
+        out = out[::-1] if p["reverse"] else out
+        return Registers(np.moveaxis(out, 0, p["axis"]), x.kind)
+    x = in_one(t, x)
     axis, out = p["axis"], room(t, x.shape, x.kind)
     length = x.shape[axis]
     others = [1 if a == axis else n for a, n in enumerate(x.shape)]
@@ -105,30 +121,77 @@ def _cumulated(t: Text, p: dict, avals, x: Held, how: Callable) -> Held:
     return out
 
 
-register_reductions(
-    LARGE,
-    lambda t, axes, avals, x, how, empty: _reduce(t, x, axes, avals[0], how, empty),
-    _cumulated,
-)
+_REDUCTIONS: dict[str, tuple[Callable[..., Value], int]] = {
+    "sum": (lambda t, a, b, unsigned: add(t, a, b), 0),
+    "prod": (lambda t, a, b, unsigned: mul(t, a, b), 1),
+    "max": (lambda t, a, b, unsigned: extreme(t, "gt", a, b, unsigned), 0),
+    "min": (lambda t, a, b, unsigned: extreme(t, "lt", a, b, unsigned), 0),
+    "and": (lambda t, a, b, unsigned: t.binary("and", a, b), 1),
+    "or": (lambda t, a, b, unsigned: t.binary("or", a, b), 0),
+}
+"""How two numbers become one, by whether they are unsigned, and what stands for none; after
+`reduce_` and `cum` in names."""
+
+
+def _reduction(name: str) -> Rule:
+    def rule(t, p, avals, x):
+        dtype, (how, empty) = avals[0].dtype, _REDUCTIONS[name]
+        both = lambda a, b: how(t, a, b, is_unsigned(dtype))
+        none = t.constant(empty, kind_of(dtype))
+        return _reduce(t, tuple(map(int, p["axes"])), avals[0], x, both, none)
+
+    return rule
+
+
+def _cumulation(name: str) -> Rule:
+    how = _REDUCTIONS[name][0]
+    return lambda t, p, avals, x: _cumulated(
+        t, p, x, lambda a, b: how(t, a, b, is_unsigned(avals[0].dtype))
+    )
+
+
+STRUCTURAL.update({"reduce_" + name: _reduction(name) for name in _REDUCTIONS})
+STRUCTURAL.update({"cum" + name: _cumulation(name) for name in ("sum", "prod", "max", "min")})
+
+
+def any_in(t: Text, x: Array) -> Value:
+    """Whether any flag of an array holds."""
+    if not x.ndim:
+        return x.at(t, ())
+    axes, flag = {"axes": tuple(range(x.ndim))}, jax.ShapeDtypeStruct((), bool)
+    return held(t, STRUCTURAL["reduce_or"](t, axes, [flag], x)).at(t, ())
 
 
 # --- products
 
 
-def _dot(t: Text, p: dict, avals, a: Held, b: Held, product: Callable) -> Large:
+def _dot(t: Text, p: dict, avals, a: Array, b: Array, product: Callable) -> Array:
     """A product of arrays; `product` says what that of two numbers is."""
     (over_a, over_b), (batch_a, batch_b) = p["dimension_numbers"]
     free_a = [i for i in range(a.ndim) if i not in (*over_a, *batch_a)]
     free_b = [i for i in range(b.ndim) if i not in (*over_b, *batch_b)]
+    kind, groups = kind_of(avals[0].dtype), ((batch_a, free_a, over_a), (batch_b, free_b, over_b))
+    small = avals[0].size <= MOST_IN_REGISTERS
+    if small and isinstance(a, Registers) and isinstance(b, Registers):
+        left, right = (_grouped(t, x, group) for x, group in zip((a, b), groups, strict=True))
+        zero, together = t.zero(kind), lambda x, y: add(t, x, y)
+
+        def element(i: tuple[int, ...]) -> Value:
+            term = lambda k: product(t, left.at(t, (i[0], i[1], k)), right.at(t, (i[0], i[2], k)))
+            return reduced(t, left.shape[2], term, together, zero, in_order=True)
+
+        whole = Registers.of((left.shape[0], left.shape[1], right.shape[1]), kind, element)
+        return reshaped(t, whole, avals[0].shape)
     # Of a product with a vector each number of the matrix is asked for once.
     once_a, once_b = (
         int(np.prod([x.shape[i] for i in free], dtype=int)) == 1
         for x, free in ((b, free_b), (a, free_a))
     )
-    left = _grouped(t, a if once_a else settled(t, a), (batch_a, free_a, over_a))
-    right = _grouped(t, b if once_b else settled(t, b), (batch_b, free_b, over_b))
+    left, right = (
+        _grouped(t, addressable(t, x if once else settled(t, x)), group)
+        for x, once, group in zip((a, b), (once_a, once_b), groups, strict=True)
+    )
     shape = (left.shape[0], left.shape[1], right.shape[1])
-    kind = kind_of(avals[0].dtype)
     if left.shape[2] == 1:  # nothing is added up
 
         def number(i: tuple[Index, ...]) -> Value:
@@ -140,7 +203,7 @@ def _dot(t: Text, p: dict, avals, a: Held, b: Held, product: Callable) -> Large:
     return reshaped(t, found, avals[0].shape)
 
 
-def _product(t: Text, left: Large, right: Large, shape, kind: str, product: Callable) -> Large:
+def _product(t: Text, left: Array, right: Array, shape, kind: str, product: Callable) -> Array:
     """(batch, n, k) times (batch, m, k): sums of several rows at once, so that none waits for
     itself and a number of the other side is read once for all of them."""
     batch, rows, columns = shape
@@ -198,4 +261,14 @@ def _product(t: Text, left: Large, right: Large, shape, kind: str, product: Call
     return out
 
 
-register_products(LARGE, _dot)
+structural("dot_general")(lambda t, p, avals, a, b: _dot(t, p, avals, a, b, mul))
+
+
+@structural("weighted_dot")
+def _(t, p, avals, weight, slope):
+    def product(t: Text, weight: Value, slope: Value) -> Value:
+        return weighted(t, weight, mul(t, weight, slope))
+
+    if p["weight_first"]:
+        return _dot(t, p, avals, weight, slope, product)
+    return _dot(t, p, avals, slope, weight, lambda t, a, b: product(t, b, a))

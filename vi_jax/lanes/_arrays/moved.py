@@ -1,4 +1,8 @@
-"""What moves the numbers of large arrays about: other places of the same numbers, arrays joined."""
+"""What moves the numbers of arrays about: other places of the same numbers, arrays joined.
+
+The rules return arrays of any kind. The caller puts few numbers into registers (`held`), which
+costs nothing: what moves them is done while the code is written.
+"""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -8,14 +12,15 @@ import numpy as np
 
 from .._operations import Rule, convert, kind_of, register
 from .._text import Text, Value
-from .held import as_large, fill, held, is_cheap, same, selected, settled, stored
+from .held import addressable, fill, held, is_cheap, same, selected, settled, stored
 from .index import Index, contiguous, in_lanes, plus, times
-from .kinds import Formula, Held, Large, Pieces, Strided, at, joined, kind_in, uniform
+from .kinds import MOST_IN_REGISTERS, Array, Formula, Pieces, Registers, Strided, joined, uniform
 
-LARGE: dict[str, Rule] = {}
-large = partial(register, LARGE)
-"""As `register`, of rules with the arguments of those in `_arrays.py`, for arrays of which some are
-too large for registers."""
+STRUCTURAL: dict[str, Rule] = {}
+"""Rules with the arguments `t`, the `Text`; `p`, the parameters of the equation; `avals`, the
+shapes and types of its results; an `Array` for each argument. They return an `Array`, or some."""
+
+structural = partial(register, STRUCTURAL)
 
 
 # --- the same numbers at other places
@@ -23,12 +28,12 @@ too large for registers."""
 
 def _moved(
     t: Text,
-    x: Large,
+    x: Array,
     shape: Sequence[int],
     places: Callable,
     strides: Callable,
     cut: Callable = lambda axis, place: None,
-) -> Large:
+) -> Array:
     """An array that shows the numbers of another one.
 
     **Arguments:** the text; the array; the new shape; from an index of it to that of the other;
@@ -55,14 +60,15 @@ def _moved(
     return Formula(tuple(shape), x.kind, lambda i: x.at(t, tuple(places(i))), cheap, cuts=known)
 
 
-@large("reshape")
+@structural("reshape")
 def _(t, p, avals, x):
     return reshaped(t, x, tuple(p["new_sizes"]))
 
 
-def reshaped(t: Text, x: Held, shape: tuple[int, ...]) -> Large:
+def reshaped(t: Text, x: Array, shape: tuple[int, ...]) -> Array:
     """The numbers of an array in another shape, in the same order."""
-    x = as_large(t, x)
+    if isinstance(x, Registers):
+        return Registers(x.values.reshape(shape), x.kind)
     mine, other = ([i for i, n in enumerate(s) if n != 1] for s in (x.shape, shape))
     if [x.shape[i] for i in mine] == [shape[i] for i in other]:
         there = dict(zip(other, mine, strict=True))
@@ -80,18 +86,17 @@ def reshaped(t: Text, x: Held, shape: tuple[int, ...]) -> Large:
     return x.viewed(shape, contiguous(shape))
 
 
-@large("squeeze", "expand_dims")
+@structural("squeeze", "expand_dims")
 def _(t, p, avals, x):
     return reshaped(t, x, avals[0].shape)
 
 
-@large("transpose")
+@structural("transpose")
 def _(t, p, avals, x):
-    order = p["permutation"]
-    return transposed(t, as_large(t, x), order)
+    return transposed(t, x, p["permutation"])
 
 
-def transposed(t: Text, x: Large, order: Sequence[int]) -> Large:
+def transposed(t: Text, x: Array, order: Sequence[int]) -> Array:
     """An array with its axes in another order."""
     order = list(order)
     return _moved(
@@ -102,7 +107,7 @@ def transposed(t: Text, x: Large, order: Sequence[int]) -> Large:
     )  # fmt: skip
 
 
-@large("rev")
+@structural("rev")
 def _(t, p, avals, x):
     shape, turned = avals[0].shape, p["dimensions"]
 
@@ -116,16 +121,16 @@ def _(t, p, avals, x):
         back = [-s if a in turned else s for a, s in enumerate(steps)]
         return back, sum(steps[a] * (shape[a] - 1) for a in turned)
 
-    return _moved(t, as_large(t, x), shape, places, strides)
+    return _moved(t, x, shape, places, strides)
 
 
-@large("slice")
+@structural("slice")
 def _(t, p, avals, x):
     begin = p["start_indices"]
-    return sliced(t, as_large(t, x), begin, avals[0].shape, p["strides"] or [1] * len(begin))
+    return sliced(t, x, begin, avals[0].shape, p["strides"] or [1] * len(begin))
 
 
-def sliced(t: Text, x: Large, begin: Sequence[int], shape: Sequence[int], by=()) -> Large:
+def sliced(t: Text, x: Array, begin: Sequence[int], shape: Sequence[int], by=()) -> Array:
     """A part of an array: from a place on, of a shape, every so many numbers along each axis."""
     # JAX's transposes have NumPy's integers.
     begin, by = [int(n) for n in begin], [int(n) for n in by] or [1] * len(begin)
@@ -143,9 +148,9 @@ def sliced(t: Text, x: Large, begin: Sequence[int], shape: Sequence[int], by=())
     return _moved(t, x, shape, places, strides, cut)
 
 
-@large("split")
+@structural("split")
 def _(t, p, avals, x):
-    x, axis, parts, first = as_large(t, settled(t, x)), p["axis"], [], 0
+    x, axis, parts, first = settled(t, x), p["axis"], [], 0
     for aval in avals:
         begin = [first if a == axis else 0 for a in range(x.ndim)]
         parts.append(sliced(t, x, begin, aval.shape))
@@ -153,25 +158,27 @@ def _(t, p, avals, x):
     return tuple(parts)
 
 
-@large("unstack")
+@structural("unstack")
 def _(t, p, avals, x):
-    x, axis = as_large(t, settled(t, x)), p["axis"]
+    x, axis = settled(t, x), p["axis"]
     shape = [1 if a == axis else n for a, n in enumerate(x.shape)]
     corners = ([i if a == axis else 0 for a in range(x.ndim)] for i in range(x.shape[axis]))
     return tuple(reshaped(t, sliced(t, x, c, shape), avals[0].shape) for c in corners)
 
 
-@large("empty2")
+@structural("empty2")
 def _(t, p, avals):
     return uniform(avals[0].shape, t.zero(kind_of(avals[0].dtype)))
 
 
-@large("broadcast_in_dim")
+@structural("broadcast_in_dim")
 def _(t, p, avals, x, *sizes):
     shape, where = tuple(p["shape"]), p["broadcast_dimensions"]
-    x = as_large(t, x)
-    if x.size < int(np.prod(shape)):  # else nothing would be computed twice
-        x = as_large(t, settled(t, x))
+    size = int(np.prod(shape, dtype=int))
+    if size > MOST_IN_REGISTERS:
+        x = addressable(t, x)
+    if x.size < size:  # else nothing would be computed twice
+        x = settled(t, x)
     return _moved(
         t, x, shape,
         lambda index: [index[a] if n != 1 else 0 for a, n in zip(where, x.shape, strict=True)],
@@ -187,10 +194,10 @@ def _broadcast_strides(strides, sizes, where, axes: int) -> list[int]:
     return out
 
 
-def chosen(t: Text, flag: Value, a: Held, b: Held) -> Large | None:
+def chosen(t: Text, flag: Value, a: Array, b: Array) -> Array | None:
     """The first array where a flag holds, else the second, where they differ in a few places only,
     as in a state of which one number was changed; else `None`."""
-    cuts = joined(*(x.cuts for x in (a, b) if isinstance(x, Large)))
+    cuts = joined(a.cuts, b.cuts)
     if len(cuts) != 1:
         return None
     ((axis, places),) = cuts.items()
@@ -199,10 +206,10 @@ def chosen(t: Text, flag: Value, a: Held, b: Held) -> Large | None:
         x, y = (_piece(t, z, axis, begin, end) for z in (a, b))
         part = x if same(x, y) else held(t, selected(t, flag, x, y))
         parts.append(part)
-    return Pieces(a.shape, kind_in(a), axis, tuple(parts))
+    return Pieces(a.shape, a.kind, axis, tuple(parts))
 
 
-def _piece(t: Text, x: Held, axis: int, begin: int, end: int) -> Large:
+def _piece(t: Text, x: Array, axis: int, begin: int, end: int) -> Array:
     """What lies between two places of an axis; the numbers that it was put together from, if it
     was."""
     first = 0
@@ -211,7 +218,7 @@ def _piece(t: Text, x: Held, axis: int, begin: int, end: int) -> Large:
         if first <= begin and end <= first + size:
             return _piece(t, part, axis, begin - first, end - first)
         first += size
-    x = as_large(t, x)
+    x = addressable(t, x)
     corner = [begin if a == axis else 0 for a in range(x.ndim)]
     return sliced(t, x, corner, [end - begin if a == axis else n for a, n in enumerate(x.shape)])
 
@@ -219,28 +226,28 @@ def _piece(t: Text, x: Held, axis: int, begin: int, end: int) -> Large:
 # --- arrays put together
 
 
-@large("concatenate")
+@structural("concatenate")
 def _(t, p, avals, *xs):
     return Pieces(avals[0].shape, kind_of(avals[0].dtype), p["dimension"], _filled(xs))
 
 
-@large("stack")
+@structural("stack")
 def _(t, p, avals, *xs):
     axis, aval = p["axis"], avals[0]
     shape = (*aval.shape[:axis], 1, *aval.shape[axis + 1 :])
-    parts = [reshaped(t, x, shape) if isinstance(x, Large) else x.reshape(shape) for x in xs]
+    parts = [reshaped(t, x, shape) for x in xs]
     return Pieces(aval.shape, kind_of(aval.dtype), axis, tuple(parts))
 
 
-def _filled(xs: Sequence[Held]) -> tuple[Held, ...]:
+def _filled(xs: Sequence[Array]) -> tuple[Array, ...]:
     return tuple(x for x in xs if x.size)
 
 
-@large("pad")
+@structural("pad")
 def _(t, p, avals, x, value):
-    number = at(t, value, ())
+    number = value.at(t, ())
     if any(inside for _, _, inside in p["padding_config"]):
-        x = _spread(t, p["padding_config"], as_large(t, x), number)
+        x = _spread(t, p["padding_config"], x, number)
     for axis, (low, high, _) in enumerate(p["padding_config"]):
         low, high = int(low), int(high)
         before, after = (
@@ -249,7 +256,7 @@ def _(t, p, avals, x, value):
         )
         size = max(0, low) + x.shape[axis] + max(0, high)
         shape = tuple(size if a == axis else m for a, m in enumerate(x.shape))
-        x = Pieces(shape, kind_in(value), axis, _filled([before, x, after]))
+        x = Pieces(shape, value.kind, axis, _filled([before, x, after]))
         if min(low, high) < 0:  # that much is cut off
             begin = [max(0, -low) if a == axis else 0 for a in range(x.ndim)]
             size += min(0, low) + min(0, high)
@@ -257,17 +264,22 @@ def _(t, p, avals, x, value):
     return x
 
 
-def _spread(t: Text, config: Sequence[tuple[int, int, int]], x: Large, number: Value) -> Strided:
+def _spread(t: Text, config: Sequence[tuple[int, int, int]], x: Array, number: Value) -> Array:
     """An array with so many other numbers between its own along each axis."""
     between = [int(inside) for _, _, inside in config]
     shape = [max(0, (n - 1) * (i + 1) + 1) for n, i in zip(x.shape, between, strict=True)]
-    out = stored(t, uniform(shape, number))
+    whole = uniform(shape, number)
+    if isinstance(x, Registers) and whole.size <= MOST_IN_REGISTERS:
+        out = held(t, whole)
+        out.values[tuple(slice(None, None, i + 1) for i in between)] = x.values
+        return out
+    out = stored(t, whole)
     steps = [(i + 1) * s for i, s in zip(between, out.strides, strict=True)]
     fill(t, out, x, strides=steps)
     return out
 
 
-@large("iota")
+@structural("iota")
 def _(t, p, avals, *sizes):
     kind, axis = kind_of(p["dtype"]), p["dimension"]
     return Formula(
