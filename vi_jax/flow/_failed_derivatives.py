@@ -10,9 +10,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jax.extend.core import Primitive
-from jax.interpreters import ad, batching, mlir
+from jax.interpreters import ad
 
+from ..lanes import elementwise_primitive
 from .results import Run
 
 
@@ -30,26 +30,16 @@ def _marked(good: object, numbers: object) -> Any:
 @_marked.defjvp
 def _(primals, tangents):
     (good, numbers), (_, rates) = primals, tangents
-    return numbers, jtu.tree_map(lambda rate: _fail.bind(good, rate, back=False), rates)
 
+    def marked(rate):
+        wide = jnp.reshape(good, good.shape + (1,) * (rate.ndim - good.ndim))
+        return _fail.bind(jnp.broadcast_to(wide, rate.shape), rate, back=False)
 
-# Linear as JAX understands it, with a transpose that arithmetic could not have: what asks for
-# nothing of a lane, as a loss that leaves failed ones out, gets nothing.
-_fail = Primitive("fail_derivatives")
+    return numbers, jtu.tree_map(marked, rates)
 
 
 def _value(good, x, *, back: bool):
-    good = jnp.reshape(good, good.shape + (1,) * (x.ndim - good.ndim))
     return jnp.where(good | (x == 0) if back else good, x, jnp.nan)
-
-
-def _batched(args, dims, *, back: bool):
-    size = next(x.shape[d] for x, d in zip(args, dims, strict=True) if d is not None)
-    good, x = (
-        jnp.broadcast_to(x, (size, *x.shape)) if d is None else jnp.moveaxis(x, d, 0)
-        for x, d in zip(args, dims, strict=True)
-    )
-    return _fail.bind(good, x, back=back), 0
 
 
 def _jvp(primals, tangents, *, back: bool):
@@ -62,9 +52,7 @@ def _transposed(weight, good, _, *, back: bool):
     return None, weight if type(weight) is ad.Zero else _fail.bind(good, weight, back=not back)
 
 
-_fail.def_abstract_eval(lambda good, x, *, back: x)
-_fail.def_impl(_value)
-batching.primitive_batchers[_fail] = _batched
-ad.primitive_jvps[_fail] = _jvp
+# Linear as JAX understands it, with a transpose that arithmetic could not have: what asks for
+# nothing of a lane, as a loss that leaves failed ones out, gets nothing.
+_fail = elementwise_primitive("fail_derivatives", _value, _jvp)
 ad.primitive_transposes[_fail] = _transposed
-mlir.register_lowering(_fail, mlir.lower_fun(_value, multiple_results=False))

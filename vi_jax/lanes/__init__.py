@@ -7,6 +7,7 @@ from ._program import called as called
 from ._program import dependent_results as dependent_results
 from ._vector import Unsupported as Unsupported
 from .call import interruptible as interruptible
+from .elementary import elementwise_primitive as elementwise_primitive
 from .elementary import horner as horner
 from .elementary import pin as pin
 from .elementary import pin_flag as pin_flag

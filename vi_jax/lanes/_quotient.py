@@ -8,14 +8,11 @@ take most of the time.
 from typing import Any
 
 import jax.numpy as jnp
-from jax.core import ShapedArray
-from jax.extend.core import ClosedJaxpr, Primitive
-from jax.interpreters import ad, batching
+from jax.extend.core import ClosedJaxpr
+from jax.interpreters import ad
 
 from ._program import rewritten
-from .elementary import jitted
-
-quotient_p = Primitive("quotient")
+from .elementary import elementwise_primitive
 
 
 def _divided(eqn: Any) -> Any:
@@ -30,11 +27,6 @@ def with_quotients(closed: ClosedJaxpr) -> ClosedJaxpr:
     return rewritten(closed, _divided)
 
 
-@quotient_p.def_abstract_eval
-def _(x, y):
-    return ShapedArray(x.shape, x.dtype, weak_type=x.weak_type and y.weak_type)
-
-
 def _jvp(primals, tangents):
     (x, y), (dx, dy) = primals, tangents
     ratio = quotient_p.bind(x, y)
@@ -47,13 +39,4 @@ def _jvp(primals, tangents):
     return ratio, sum(parts[1:], parts[0])
 
 
-def _batched(args, dims):
-    front = [
-        x[None] if d is None else jnp.moveaxis(x, d, 0) for x, d in zip(args, dims, strict=True)
-    ]
-    return quotient_p.bind(*jnp.broadcast_arrays(*front)), 0
-
-
-jitted(quotient_p, lambda x, y: x / y)
-ad.primitive_jvps[quotient_p] = _jvp
-batching.primitive_batchers[quotient_p] = _batched
+quotient_p = elementwise_primitive("quotient", lambda x, y: x / y, _jvp)

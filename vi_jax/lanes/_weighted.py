@@ -15,21 +15,15 @@ from jax.core import ShapedArray
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive
 
 from ._program import CALLS, dependent_in_scan, dependent_of_equation, inner
-from .elementary import jitted
+from .elementary import elementwise_primitive
 
-weighted_p = Primitive("weighted")
-weighted_quotient_p = Primitive("weighted_quotient")
+weighted_p = elementwise_primitive(
+    "weighted", lambda weight, slope: jnp.where(weight == 0, weight, weight * slope)
+)
+weighted_quotient_p = elementwise_primitive(
+    "weighted_quotient", lambda weight, x: jnp.where(weight == 0, weight, weight / x)
+)
 weighted_dot_p = Primitive("weighted_dot")
-
-
-@weighted_p.def_abstract_eval
-def _(weight, slope):
-    return ShapedArray(weight.shape, weight.dtype)
-
-
-@weighted_quotient_p.def_abstract_eval
-def _(weight, divisor):
-    return ShapedArray(weight.shape, weight.dtype)
 
 
 def _dot(weight, slope, *, weight_first: bool, **params):
@@ -44,10 +38,6 @@ def _(weight, slope, *, weight_first: bool, **params):
         lambda a, b: _dot(a, b, weight_first=weight_first, **params), weight, slope
     )
     return ShapedArray(out.shape, out.dtype)
-
-
-jitted(weighted_p, lambda weight, slope: jnp.where(weight == 0, weight, weight * slope))
-jitted(weighted_quotient_p, lambda weight, x: jnp.where(weight == 0, weight, weight / x))
 
 
 def with_weights(closed: ClosedJaxpr, weights: Sequence[bool]) -> ClosedJaxpr:

@@ -1,5 +1,6 @@
 """Functions that either backend has its own best form of."""
 
+import functools
 from collections.abc import Callable
 from math import factorial, pi
 from typing import Any
@@ -7,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Bool, Float
@@ -24,8 +26,41 @@ def horner(coefficients: tuple, x):
     return value
 
 
-sincos_p = Primitive("sincos")
-sincos_p.multiple_results = True
+def elementwise_primitive(
+    name: str, function: Callable[..., Any], jvp: Callable[..., Any] | None = None, results: int = 1
+) -> Primitive:
+    """A primitive of arrays of one shape, number by number, which runs outside of `jit` too.
+
+    **Arguments:** its name; a function that does the same; its rule of forward derivatives; the
+    number of its results, which have the type of the last array.
+    """
+    primitive = Primitive(name)
+    primitive.multiple_results = several = results > 1
+
+    @functools.cache
+    def compiled(**params):
+        return jax.jit(functools.partial(function, **params))
+
+    def shaped(*args, **params):
+        weak = all(x.weak_type for x in args)
+        shape = jnp.broadcast_shapes(*(x.shape for x in args))  # a number may stand for an array
+        aval = ShapedArray(shape, args[-1].dtype, weak_type=weak)
+        return [aval] * results if several else aval
+
+    def batched(args, dims, **params):
+        front = [
+            x[None] if d is None else jnp.moveaxis(x, d, 0) for x, d in zip(args, dims, strict=True)
+        ]
+        out = primitive.bind(*jnp.broadcast_arrays(*front), **params)
+        return out, [0] * results if several else 0
+
+    primitive.def_abstract_eval(shaped)
+    primitive.def_impl(lambda *args, **params: compiled(**params)(*args))
+    mlir.register_lowering(primitive, mlir.lower_fun(function, multiple_results=several))
+    batching.primitive_batchers[primitive] = batched
+    if jvp is not None:
+        ad.primitive_jvps[primitive] = jvp
+    return primitive
 
 
 def sincos(phase: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
@@ -36,11 +71,6 @@ def sincos(phase: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array
     """
     sine, cosine = sincos_p.bind(jnp.asarray(phase))
     return sine, cosine
-
-
-@sincos_p.def_abstract_eval
-def _(phase):
-    return [phase, phase]
 
 
 def _by_tangent(phase):
@@ -65,11 +95,7 @@ def _sincos_jvp(primals, tangents):
     return [sine, cosine], [cosine * rate, -sine * rate]
 
 
-def _sincos_batched(args, dims):
-    return sincos_p.bind(*args), [dims[0], dims[0]]
-
-
-pin_p = Primitive("pin")
+sincos_p = elementwise_primitive("sincos", _by_tangent, _sincos_jvp, results=2)
 
 
 def pin(tree: object) -> Any:
@@ -86,26 +112,10 @@ def pin_flag(flag: Bool[Array, ""], like: Float[Array, ""]) -> Bool[Array, ""]:
     return pin(jnp.where(flag, jnp.ones_like(like), 0.0)) > 0.5
 
 
-@pin_p.def_abstract_eval
-def _(x):
-    return x
-
-
 def _divided(x):
     # Not a number would stay one whatever it is divided by; the compiler cannot know that.
     return x / jnp.where(x == x, jnp.ones_like(x), jnp.nan)
 
 
-def jitted(primitive: Primitive, function: Callable) -> None:
-    """What a primitive with a lowering needs: that it runs outside of `jit` too."""
-    several = primitive.multiple_results
-    primitive.def_impl(jax.jit(function))
-    mlir.register_lowering(primitive, mlir.lower_fun(function, multiple_results=several))
-
-
-jitted(sincos_p, _by_tangent)
-jitted(pin_p, _divided)
-ad.primitive_jvps[sincos_p] = _sincos_jvp
-batching.primitive_batchers[sincos_p] = _sincos_batched
+pin_p = elementwise_primitive("pin", _divided)
 ad.deflinear2(pin_p, lambda t, x: [t])
-batching.defvectorized(pin_p)
