@@ -35,6 +35,7 @@ from ._arcs import (
 )
 from ._cycle_map import CycleMap, adopted, axes_of, cycle_map
 from ._root import root_of
+from .distinct import distance
 from .floquet import multipliers_of
 from .results import ORBIT_RESULTS, Orbit, trimmed
 from .root_finders import AbstractRootFinder, Newton
@@ -255,8 +256,7 @@ def _least_period(sections: Float[Array, "cycles states"], error: Array) -> Arra
     slack = jnp.maximum(_slack(sections.dtype), 100 * error)
     for m in range(cycles - 1, 0, -1):
         if cycles % m == 0:
-            apart = jnp.abs(sections - jnp.roll(sections, -m, axis=0))
-            same = jnp.all(apart <= slack * (1 + jnp.abs(sections)))
+            same = jnp.all(distance(jnp.roll(sections, -m, axis=0), sections) <= slack)
             least = jnp.where(same, m, least)
     return least
 

@@ -6,7 +6,7 @@ machine, is in `_root.py`.
 
 import abc
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -30,6 +30,14 @@ class AbstractRootFinder(eqx.Module):
     tolerance: eqx.AbstractVar[Any]
     max_steps: eqx.AbstractVar[int]
     arcs: eqx.AbstractVar[int]
+    usual_tolerance: eqx.AbstractClassVar[float]
+    """The tolerance in double precision, if none is given."""
+
+    def __check_init__(self):
+        if self.tolerance is not None:
+            require("tolerance", self.tolerance, low=0.0, open_low=True)
+        count("max_steps", self.max_steps, least=1)
+        count("arcs", self.arcs, least=1)
 
     @abc.abstractmethod
     def init(self, residual: Residual, x: Unknowns) -> Any:
@@ -45,21 +53,9 @@ class AbstractRootFinder(eqx.Module):
         largest component of that residual.
         """
 
-    @property
-    @abc.abstractmethod
-    def usual_tolerance(self) -> float:
-        """The tolerance in double precision, if none is given."""
-
 
 def _tolerance(value: Any) -> Any:
     return None if value is None else number("tolerance", value)
-
-
-def _check(root_finder: AbstractRootFinder) -> None:
-    if root_finder.tolerance is not None:
-        require("tolerance", root_finder.tolerance, low=0.0, open_low=True)
-    count("max_steps", root_finder.max_steps, least=1)
-    count("arcs", root_finder.arcs, least=1)
 
 
 class Newton(AbstractRootFinder):
@@ -78,9 +74,7 @@ class Newton(AbstractRootFinder):
     tolerance: Any = eqx.field(kw_only=True, default=None, converter=_tolerance)
     max_steps: int = eqx.field(kw_only=True, static=True, default=50)
     arcs: int = eqx.field(kw_only=True, static=True, default=1)
-
-    def __check_init__(self):
-        _check(self)
+    usual_tolerance: ClassVar[float] = 1e-10
 
     def _solver(self, dtype):
         # Where something is neutral, of all steps the smallest.
@@ -98,11 +92,6 @@ class Newton(AbstractRootFinder):
         solver, fn = self._solver(x.dtype), _with_aux(residual)
         x, memory, _ = solver.step(fn, x, None, {}, memory, frozenset())
         return x, memory, x, _largest(memory.f_info.residual)
-
-    @property
-    def usual_tolerance(self) -> float:
-        """1e-10, taken for a `tolerance` that is not given."""
-        return 1e-10
 
 
 def _with_aux(residual: Residual) -> Callable[[Unknowns, Any], tuple[Unknowns, None]]:
@@ -126,9 +115,9 @@ class Gradient(AbstractRootFinder):
     tolerance: Any = eqx.field(kw_only=True, default=None, converter=_tolerance)
     max_steps: int = eqx.field(kw_only=True, static=True, default=1000)
     arcs: int = eqx.field(kw_only=True, static=True, default=1)
+    usual_tolerance: ClassVar[float] = 1e-7
 
     def __check_init__(self):
-        _check(self)
         if self.optimiser is not None:
             wanted = "an `optax.GradientTransformation`, such as `optax.adam(0.01)`"
             instance_of("optimiser", self.optimiser, optax.GradientTransformation, wanted)
@@ -153,11 +142,6 @@ class Gradient(AbstractRootFinder):
         slope, missing = jax.grad(loss, has_aux=True)(x)
         update, memory = self._optimiser.update(slope, memory, x)
         return jnp.asarray(optax.apply_updates(x, update)), memory, x, _largest(missing)
-
-    @property
-    def usual_tolerance(self) -> float:
-        """1e-7, taken for a `tolerance` that is not given."""
-        return 1e-7
 
 
 def _largest(missing: Array) -> Array:

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -206,13 +206,8 @@ def _best(found: Exits, candidates: int) -> list[int]:
     return best
 
 
-class _Found(NamedTuple):
-    """A kick onto the boundary."""
-
-    z: Row
-    residual: float
-    exact: bool
-    edge: EdgeState
+_Found = tuple[Row, float, bool, EdgeState]
+"""A kick onto the boundary, its residual, whether it is exact, what a motion from it settles on."""
 
 
 def _exact(
@@ -231,12 +226,11 @@ def _exact(
     if edge.kind == "saddle" and edge.orbit is not None:
         better = shortest(settling, kick, edge.orbit, unit * outside)
         if better is not None:
-            change = np.linalg.norm(better.z) / np.linalg.norm(unit * outside) - 1
-            if -_SHORTER <= change <= _LONGER:
-                return _Found(better.z, better.residual, True, edge)
+            if -_SHORTER <= np.linalg.norm(better[0]) / outside - 1 <= _LONGER:
+                return *better, True, edge
     narrow = angle / NARROWER**_LOOKS
     unit, inside, outside = nearer(settling, kick, unit, outside, narrow, _MORE_LOOKS, seed)
-    return _Found(unit * outside, (outside - inside) / outside, False, edge)
+    return unit * outside, (outside - inside) / outside, False, edge
 
 
 def _kick_of(
@@ -282,7 +276,7 @@ def _described(
     settling: Settling, kick: Kick, found: _Found, longest: int, cycle: int, phase: float
 ) -> MinimalKick:
     """A kick, with what simulation says of it."""
-    z = found.z
+    z, residual, is_exact, edge = found
     aside = kick.rows(np.array([1 - _ASIDE, 1 + _ASIDE])[:, None] * z)
     verdicts = settling.judge(aside)
     row = kick.rows(z)
@@ -295,9 +289,9 @@ def _described(
         settles=settling.settled_orbit(aside[1], longest),
         cycle=cycle,
         phase=phase,
-        edge=found.edge,
-        residual=float(found.residual),
-        exact=found.exact,
+        edge=edge,
+        residual=float(residual),
+        exact=is_exact,
         confirmed=bool(verdicts[0] == RETURNS and verdicts[1] == ELSEWHERE),
         others=(),
         lanes=settling.lanes,
@@ -307,6 +301,5 @@ def _described(
 
 def _apart(a: MinimalKick, b: MinimalKick) -> float:
     """How different two kicks are, relative to the norm of one."""
-    change = np.array([float(a.kick[name]) - float(b.kick[name]) for name in a.kick])
-    size = np.array([float(x) for x in a.kick.values()])
-    return float(np.linalg.norm(change) / np.linalg.norm(size))
+    one, other = (np.array([float(x) for x in kick.kick.values()]) for kick in (a, b))
+    return float(np.linalg.norm(one - other) / np.linalg.norm(one))

@@ -11,14 +11,14 @@ equations z = λ∇g, g = 0, which Newton's method solves; ∇g is exact, throug
 own derivatives are differences of ∇g between lanes beside each other.
 """
 
-from typing import NamedTuple
+import functools
+from collections.abc import Callable
 
 import jax.numpy as jnp
 import numpy as np
 
-from .._types import State
 from ..machine import in_rows
-from ..orbit import CycleMap, Orbit, cycle_map, distance
+from ..orbit import Orbit, cycle_map, distance
 from ._rays import Kick, Kicks
 from ._settling import Row, Rows, Settling, images
 
@@ -40,38 +40,17 @@ _DIFFERENCE, _STEP = 1e-5, 0.2
 _STRAYS = 0.5
 
 
-class Shortest(NamedTuple):
-    """A kick onto the stable manifold of a saddle that none near it undercuts."""
-
-    z: Row
-    residual: float
-    """What it lacks: its distance from the manifold to first order and how far it is from standing
-    at a right angle on it, both relative to its norm; the larger."""
+Edge = Callable[[Kicks], tuple[Row, Kicks]]
+"""g and its gradient at some kicks."""
 
 
-class _Manifold(NamedTuple):
-    """g and its gradient for some number of cycles."""
-
-    the_map: CycleMap
-    like: State
-    kick: Kick
-    begin: float
-    cycles: int
-    saddle: Row
-    across: Row
-    """w, the left eigenvector."""
-
-    def at(self, z: Kicks) -> tuple[Row, Kicks]:
-        """g and ∇g of some kicks."""
-        numbers = (jnp.asarray(x) for x in (self.kick.rows(z), self.cycles, self.begin))
-        there, jacobian = images(self.the_map, self.like, *numbers)
-        slope = self.across @ np.asarray(jacobian)[:, :, list(self.kick.places)]
-        return (np.asarray(there) - self.saddle) @ self.across, slope / self.kick.weights
-
-
-def shortest(settling: Settling, kick: Kick, saddle: Orbit, z: Row) -> Shortest | None:
+def shortest(settling: Settling, kick: Kick, saddle: Orbit, z: Row) -> tuple[Row, float] | None:
     """The kick of least norm onto the stable manifold of a saddle, near a kick onto it that is
-    known to rounding; `None` where Newton's method finds none, as beside a grazing."""
+    known to rounding; `None` where Newton's method finds none, as beside a grazing.
+
+    **Returns:** the kick and what it lacks: its distance from the manifold to first order and how
+    far it is from standing at a right angle on it, both relative to its norm; the larger.
+    """
     rows, normals = _frame(settling, saddle)
     if not np.isfinite(normals).all():
         return None
@@ -81,19 +60,20 @@ def shortest(settling: Settling, kick: Kick, saddle: Orbit, z: Row) -> Shortest 
     near = np.flatnonzero(apart.min(axis=1) <= _BEGINS)
     if not near.size:
         return None
-    begin, first = int(near[0]) + 1, z
-    place, before = int(apart[begin - 1].argmin()), None
-    last = np.inf
+    place = int(apart[near[0]].argmin())
+
+    def edge(z: Kicks, cycles: int) -> tuple[Row, Kicks]:
+        numbers = (jnp.asarray(x) for x in (kick.rows(z), cycles, settling.begin))
+        there, jacobian = images(settling.the_map, settling.like, *numbers)
+        slope = normals[place] @ np.asarray(jacobian)[:, :, list(kick.places)]
+        return (np.asarray(there) - rows[place]) @ normals[place], slope / kick.weights
+
+    first, before, last = z, None, np.inf
     for more in range(_PERIODS):
-        cycles = begin + more * period
-        edge = _Manifold(
-            settling.the_map, settling.like, kick, settling.begin, cycles, rows[place],
-            normals[place],
-        )  # fmt: skip
-        found = _newton(edge, z)
-        if found is None or np.linalg.norm(found.z - first) > _STRAYS * np.linalg.norm(first):
+        found = _newton(functools.partial(edge, cycles=int(near[0]) + 1 + more * period), z)
+        if found is None or np.linalg.norm(found[0] - first) > _STRAYS * np.linalg.norm(first):
             return before
-        moved, z = float(np.linalg.norm(found.z - z) / np.linalg.norm(z)), found.z
+        moved, z = float(np.linalg.norm(found[0] - z) / np.linalg.norm(z)), found[0]
         if more and _stands(moved, last):
             return found
         before, last = found if more else None, moved
@@ -130,13 +110,13 @@ def _frame(settling: Settling, saddle: Orbit) -> tuple[Rows, Rows]:
     return rows, np.array(normals)
 
 
-def _newton(edge: _Manifold, z: Row) -> Shortest | None:
+def _newton(edge: Edge, z: Row) -> tuple[Row, float] | None:
     """A solution of Lagrange's equations near a kick, or `None`."""
     size, multiplier, last = z.size, None, np.inf
     for _ in range(_STEPS):
         step = _DIFFERENCE * np.linalg.norm(z)
         aside = step * np.eye(size)
-        values, slopes = edge.at(np.concatenate([z[None], z + aside, z - aside]))
+        values, slopes = edge(np.concatenate([z[None], z + aside, z - aside]))
         if not np.isfinite(slopes).all() or not np.any(slopes[0]):
             return None
         # In units in which the gradient has length one.
@@ -158,6 +138,6 @@ def _newton(edge: _Manifold, z: Row) -> Shortest | None:
         z = z + change[:size]
         multiplier = None if length > _STEP * norm else multiplier + float(change[size])
         if _stands(length / norm, last):
-            return Shortest(z, float(np.max(np.abs(lacks)) / norm))
+            return z, float(np.max(np.abs(lacks)) / norm)
         last = length / norm
     return None

@@ -35,6 +35,7 @@ from ..machine import (
     unit_of,
     with_leaf,
 )
+from ..orbit import distance
 from ._computed import ScanInterrupted
 from ._geometry import (
     BasinEntropy,
@@ -517,8 +518,7 @@ def _labelled(
     for i, lane in enumerate(settled[first]):
         p, state = int(period[lane]), states[lane]
         for j, motion in enumerate(motions):
-            distance = np.abs(motion - state) / (1 + np.abs(state))
-            if len(motion) == p and np.min(np.max(distance, axis=1)) <= apart:
+            if len(motion) == p and distance(motion, state).min() <= apart:
                 of_cell[i] = j
                 break
         else:
