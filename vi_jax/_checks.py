@@ -1,10 +1,11 @@
 """Checks and conversions of what a user passes in. Concrete numbers are checked; tracers pass."""
 
+import dataclasses
 import math
 import os
 import tempfile
 from collections.abc import Callable, Iterator
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -57,22 +58,29 @@ def require(name: str, value: object, **bounds: Any) -> None:
         raise ValueError(f"Argument `{name}` must be finite and in {range_}, but got {worst!s}.")
 
 
+@lru_cache(maxsize=256)
+def fields_with(kind: type, about: str) -> dict[str, Any]:
+    """What the fields of a class have in their metadata under this name: `"range"` or `"unit"`."""
+    found = {x.name: x.metadata[about] for x in dataclasses.fields(kind) if about in x.metadata}
+    return found | (getattr(kind, "ranges", {}) if about == "range" else {})
+
+
 def require_ranges(part: Any) -> None:
-    """`require` for every number of a module that says in `ranges` what it may be."""
-    for name, range_ in part.ranges.items():
+    """`require` for every number of a module whose field has a range."""
+    for name, range_ in fields_with(type(part), "range").items():
         value = getattr(part, name)
         if value is not None and not callable(value):
             require(name, value, **range_._asdict())
 
 
 def in_range(tree: object) -> Bool[Array, ""]:
-    """Whether all numbers of all modules in a tree are in their `ranges`, traced ones too.
+    """Whether all numbers of all modules in a tree are in their ranges, traced ones too.
 
     What is put into a module by `eqx.tree_at`, or is being traced, has passed no other check.
     """
     good = jnp.asarray(True)
     for part in {id(part): part for part in _modules(tree)}.values():
-        for name, range_ in getattr(part, "ranges", {}).items():
+        for name, range_ in fields_with(type(part), "range").items():
             value = getattr(part, name)
             if value is not None and not callable(value):
                 good = good & jnp.all(range_.holds(jnp.asarray(value)))

@@ -2,7 +2,7 @@
 
 import dataclasses
 from math import pi
-from typing import Any, ClassVar
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,6 +16,7 @@ from .._checks import (
     POSITIVE,
     REAL,
     SHARE,
+    Range,
     concrete,
     in_range,
     one_of,
@@ -40,14 +41,14 @@ _LONG = 1000.0
 Number = Float[Array, "..."] | float
 
 
-def _si(name: str, unit: str, default: float | None) -> Any:
+def _si(name: str, unit: str, default: float | None, allowed: Range = REAL) -> Any:
     """A field for a number in this unit, or for a quantity of `pint` that can be given in it."""
     convert = real(name) if default is not None else optional_real(name)
     return eqx.field(
         default=default,
         converter=lambda x: convert(_magnitude(name, unit, x)),
         kw_only=True,
-        metadata={"unit": unit},
+        metadata={"unit": unit, "range": allowed},
     )
 
 
@@ -73,50 +74,34 @@ class Parameters(Shown):
     τe = ωL/R. A motor of the constants K_t and K_e at the voltage u has κT0 = K_t u/R, κΩ0 = u/K_e.
     """
 
-    body_mass: Number = _si("body_mass", "kg", 0.35)
+    body_mass: Number = _si("body_mass", "kg", 0.35, POSITIVE)
     """m_C, mass of the impacting body, kg."""
-    slider_mass: Number = _si("slider_mass", "kg", 0.2)
+    slider_mass: Number = _si("slider_mass", "kg", 0.2, NOT_NEGATIVE)
     """m_B, mass of the slider, kg."""
-    stiffness: Number = _si("stiffness", "N/m", 9 * pi**2)
+    stiffness: Number = _si("stiffness", "N/m", 9 * pi**2, POSITIVE)
     """k0, stiffness of the spring, N/m."""
-    damping: Number = _si("damping", "N*s/m", 0.5)
+    damping: Number = _si("damping", "N*s/m", 0.5, NOT_NEGATIVE)
     """c, viscous damping of the body, N·s/m."""
-    crank_radius: Number = _si("crank_radius", "m", 0.04)
+    crank_radius: Number = _si("crank_radius", "m", 0.04, POSITIVE)
     """a, crank radius and unit of length, m."""
-    rod_length: Number = _si("rod_length", "m", 0.12)
+    rod_length: Number = _si("rod_length", "m", 0.12, POSITIVE)
     """l, length of the rod, m (exact kinematics only)."""
-    inertia: Number = _si("inertia", "kg*m**2", 0.06)
+    inertia: Number = _si("inertia", "kg*m**2", 0.06, POSITIVE)
     """J, moment of inertia of the disc, kg·m²."""
-    restitution: Number = _si("restitution", "", 0.5)
+    restitution: Number = _si("restitution", "", 0.5, SHARE)
     """k, coefficient of restitution, dimensionless."""
     gap: Number = _si("gap", "m", 0.08)
     """Δ, distance of the stop from the unstretched position, m."""
-    torque: Number = _si("torque", "N*m", 10.0)
+    torque: Number = _si("torque", "N*m", 10.0, NOT_NEGATIVE)
     """T0, stall torque of the motor at κ = 1, N·m."""
     control: Number = _si("control", "", 0.9)
     """κ, motor control, dimensionless; the frequency ratio ζ of an ideal drive."""
-    no_load_speed: Number | None = _si("no_load_speed", "rad/s", None)
+    no_load_speed: Number | None = _si("no_load_speed", "rad/s", None, POSITIVE)
     """Ω0, no-load speed of the motor at κ = 1, rad/s. `None` means ω, which makes the tabulated
     κ = 0.5…1.9 the tabulated range of ζ; the paper does not give Ω0."""
 
-    electrical_time: Number | None = _si("electrical_time", "s", None)
+    electrical_time: Number | None = _si("electrical_time", "s", None, POSITIVE)
     """L/R, the armature's inductance over its resistance, s. `None` leaves the armature out."""
-
-    ranges: ClassVar = {
-        "body_mass": POSITIVE,
-        "slider_mass": NOT_NEGATIVE,
-        "stiffness": POSITIVE,
-        "damping": NOT_NEGATIVE,
-        "crank_radius": POSITIVE,
-        "rod_length": POSITIVE,
-        "inertia": POSITIVE,
-        "restitution": SHARE,
-        "gap": REAL,
-        "torque": NOT_NEGATIVE,
-        "control": REAL,
-        "no_load_speed": POSITIVE,
-        "electrical_time": POSITIVE,
-    }
 
     def __check_init__(self):
         require_ranges(self)

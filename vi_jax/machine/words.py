@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 
+from .._checks import fields_with
 from .._messages import so_many
 from .shown import Shown
 from .units import PLAIN, unit_in
@@ -20,9 +21,11 @@ class Worded(Shown):
         """The units of its quantities by their names: `position`, `velocity`, `time`, `rate` (of
         what grows in time, as exponents do), `energy`, `power`, and each number and component of a
         state by its own name. "1" is without unit; the name "" stands for all that is not named,
-        and what is not stated is shown without. By default what the `labels` say in brackets."""
-        found = map(unit_in, self.labels)
-        return {x: unit for x, unit in zip(("position", "velocity"), found, strict=True) if unit}
+        and what is not stated is shown without. By default those of `labels`, in brackets, and of
+        fields."""
+        found = zip(("position", "velocity"), map(unit_in, self.labels), strict=True)
+        own = {**dict(found), **fields_with(type(self), "unit")}
+        return {x: unit for x, unit in own.items() if unit}
 
     def period_of(self, cycles: int) -> str:
         """A duration of so many cycles, in words."""

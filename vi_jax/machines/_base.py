@@ -1,22 +1,24 @@
 """What the ready machines share: their fields, pairs of stops, and kinds of drive."""
 
 import dataclasses
+from collections.abc import Mapping
 from math import pi
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 
-from .._checks import number, optional_real, real, require, require_ranges
+from .._checks import POSITIVE, REAL, Range, number, optional_real, real, require, require_ranges
 from .._types import Scalar, State
 from ..machine import AbstractMachine, RigidStop
 
 
-def number_field(name: str, default: float | None) -> Any:
-    """A field of a machine that holds a real number, given by keyword; where the default is `None`,
-    it may be left out."""
+def number_field(name: str, default: float | None, allowed: Range = REAL, unit: str = "") -> Any:
+    """A field of a machine that holds a real number in a range, given by keyword; where the default
+    is `None`, it may be left out."""
     converter = real(name) if default is not None else optional_real(name)
-    return eqx.field(kw_only=True, default=default, converter=converter)
+    about = {"range": allowed, "unit": unit}
+    return eqx.field(kw_only=True, default=default, converter=converter, metadata=about)
 
 
 def stops_at(gap: Scalar, restitution: Scalar, *, two_sided: bool = True) -> tuple[RigidStop, ...]:
@@ -25,14 +27,24 @@ def stops_at(gap: Scalar, restitution: Scalar, *, two_sided: bool = True) -> tup
     return tuple(RigidStop(gap, restitution, side) for side in sides)
 
 
-class PhaseMachine(AbstractMachine):
-    """A machine whose independent variable is the phase of its drive, and whose numbers are in
-    their `ranges`."""
+class ReadyMachine(AbstractMachine):
+    """A machine whose numbers are in their ranges; what is not in `quantity_units` and has no unit
+    in its field is without."""
 
-    ranges: ClassVar[dict[str, Any]]
+    quantity_units: ClassVar[Mapping[str, str]] = {}
+    """The units of components of the state and of time, rates, energy and power."""
 
     def __check_init__(self):
         require_ranges(self)
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """The units of its numbers and states."""
+        return {**super().units, **self.quantity_units, "": "1"}
+
+
+class PhaseMachine(ReadyMachine):
+    """A machine whose independent variable is the phase of its drive."""
 
     @property
     def cycle(self) -> float:
@@ -56,16 +68,12 @@ class ForcedMachine(PhaseMachine):
         return 1 / self.frequency
 
 
-class AutonomousMachine(AbstractMachine):
-    """A machine without a drive, whose independent variable is time, and whose numbers are in their
-    `ranges`. A cycle ends where `event` rises through zero; if `interval` is given (positive), at
+class AutonomousMachine(ReadyMachine):
+    """A machine without a drive, whose independent variable is time. A cycle ends where
+    `event` rises through zero; if `interval` is given (positive), at
     equal times instead."""
 
-    interval: Any = number_field("interval", None)
-    ranges: ClassVar[dict[str, Any]]
-
-    def __check_init__(self):
-        require_ranges(self)
+    interval: Any = number_field("interval", None, POSITIVE, "s")
 
     def event(self, state: State) -> Scalar:
         """A function of the state that rises through zero once in a cycle."""

@@ -2,7 +2,7 @@
 
 from functools import cache
 from math import pi
-from typing import Any, ClassVar
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -74,22 +74,19 @@ class Beam(LinearMachine):
     """
 
     modes: int = eqx.field(kw_only=True, static=True, default=3)  # pyright: ignore
-    gap: Scalar | None = eqx.field(kw_only=True, default=0.1, converter=optional_real("gap"))
-    restitution: Any = number_field("restitution", 0.8)
-    place: Any = number_field("place", 1.0)
-    damping_ratio: Float[Array, "..."] = number_field("damping_ratio", 0.01)
+    gap: Scalar | None = eqx.field(
+        kw_only=True, default=0.1, converter=optional_real("gap"), metadata={"range": REAL}
+    )
+    restitution: Any = number_field("restitution", 0.8, SHARE)
+    place: Any = number_field("place", 1.0, Range(0.0, 1.0, open_low=True))
+    damping_ratio: Float[Array, "..."] = number_field("damping_ratio", 0.01, NOT_NEGATIVE)
     amplitude: Any = number_field("amplitude", 0.1)
-    frequency: Any = number_field("frequency", 3.0)
-    length: Any = number_field("length", 1.0)
-    bending_stiffness: Any = number_field("bending_stiffness", 1.0)
-    mass_per_length: Any = number_field("mass_per_length", 1.0)
+    frequency: Any = number_field("frequency", 3.0, POSITIVE)
+    length: Any = number_field("length", 1.0, POSITIVE)
+    bending_stiffness: Any = number_field("bending_stiffness", 1.0, POSITIVE)
+    mass_per_length: Any = number_field("mass_per_length", 1.0, POSITIVE)
     shaken: str = eqx.field(kw_only=True, static=True, default="base")
     two_sided: bool = eqx.field(kw_only=True, static=True, default=False)
-    ranges: ClassVar[dict[str, Any]] = {
-        "gap": REAL, "restitution": SHARE, "place": Range(0.0, 1.0, open_low=True),
-        "damping_ratio": NOT_NEGATIVE, "amplitude": REAL,
-        **dict.fromkeys(("frequency", "length", "bending_stiffness", "mass_per_length"), POSITIVE),
-    }  # fmt: skip
 
     def __check_init__(self):
         count("modes", self.modes, least=1)

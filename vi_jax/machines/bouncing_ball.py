@@ -1,12 +1,11 @@
 """A ball that bounces on a shaken table."""
 
-from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
 
 from .._checks import NOT_NEGATIVE, SHARE, number
-from .._types import Number, Scalar, State
+from .._types import Number, Scalar
 from ..machine import RigidStop, Shown
 from ._base import PhaseMachine, number_field
 from ._drawn import draw_ball
@@ -35,26 +34,18 @@ class BouncingBall(PhaseMachine):
     `restitution` e in [0, 1].
     """
 
-    acceleration: Any = number_field("acceleration", 1.2)
-    restitution: Any = number_field("restitution", 0.5)
-    ranges: ClassVar[dict[str, Any]] = {"acceleration": NOT_NEGATIVE, "restitution": SHARE}
+    acceleration: Any = number_field("acceleration", 1.2, NOT_NEGATIVE, "g")
+    restitution: Any = number_field("restitution", 0.5, SHARE)
+    quantity_units: ClassVar = {
+        **BallState.units, "rate": "ω", "time": "1/ω", "energy": "m g²/ω²", "power": "m g²/ω",
+    }  # fmt: skip
+    labels: ClassVar = ("height (g/ω²)", "speed from the table (g/ω)")  # pyright: ignore
+    sketch = draw_ball
 
     @property
     def contacts(self) -> tuple[RigidStop, ...]:
         """The table, below the ball."""
-        return (RigidStop(0.0, self.restitution, "left"),)
-
-    @property
-    def labels(self) -> tuple[str, str]:
-        """Axis labels of position and velocity, with their units."""
-        return "height (g/ω²)", "speed from the table (g/ω)"
-
-    @property
-    def units(self) -> Mapping[str, str]:
-        """Accelerations in g, times in 1/ω."""
-        own = {**BallState.units, "acceleration": "g"}
-        rates = {"rate": "ω", "time": "1/ω", "energy": "m g²/ω²", "power": "m g²/ω"}
-        return {**super().units, **own, **rates, "": "1"}
+        return (RigidStop(0.0, self.restitution, "left", on=("height", "speed")),)
 
     def field(self, s: Scalar, state: BallState) -> BallState:
         """d(state)/d(ωt): free fall less the table's acceleration."""
@@ -63,19 +54,3 @@ class BouncingBall(PhaseMachine):
     def start(self, *, height: Number = 1.0, speed: Number = 0.0) -> BallState:
         """A ball above the table at ωt = 0, where the table is lowest."""
         return BallState(number("height", height), number("speed", speed))
-
-    def position(self, state: BallState) -> Scalar:
-        """Height of the ball above the table (unit: g/ω²)."""
-        return state.height
-
-    def velocity(self, state: BallState) -> Scalar:
-        """Upward speed relative to the table (unit: g/ω)."""
-        return state.speed
-
-    def placed(self, state: BallState, Y: Scalar, V: Scalar) -> BallState:
-        """A ball of this height and speed."""
-        return BallState(Y, V)
-
-    def sketch(self, pen: Any, state: State, phase: float) -> None:
-        """Draw the machine in a state with a `Pen`, for `plot_sketch` and `animate`."""
-        draw_ball(self, pen, state, phase)

@@ -1,6 +1,5 @@
 """A capsule that drives itself along the ground: dry friction, sticking, impacts and drift."""
 
-from collections.abc import Mapping
 from math import pi
 from typing import Any, ClassVar
 
@@ -52,19 +51,22 @@ class Capsule(ForcedMachine):
     how much more it can be while it sticks, at least 1.
     """
 
-    amplitude: Any = number_field("amplitude", 1.6)
-    frequency: Any = number_field("frequency", 1.0)
-    damping_ratio: Any = number_field("damping_ratio", 0.05)
-    mass_ratio: Any = number_field("mass_ratio", 5.0)
-    gap: Any = number_field("gap", 0.5)
-    restitution: Any = number_field("restitution", 0.6)
-    friction: Any = number_field("friction", 1.0)
-    static_ratio: Any = number_field("static_ratio", 1.0)
-    ranges: ClassVar[dict[str, Any]] = {
-        "amplitude": REAL, "frequency": POSITIVE, "damping_ratio": NOT_NEGATIVE,
-        "mass_ratio": POSITIVE, "gap": REAL, "restitution": SHARE, "friction": NOT_NEGATIVE,
-        "static_ratio": Range(1.0),
+    amplitude: Any = number_field("amplitude", 1.6, REAL, "F")
+    frequency: Any = number_field("frequency", 1.0, POSITIVE, "√(k/m)")
+    damping_ratio: Any = number_field("damping_ratio", 0.05, NOT_NEGATIVE)
+    mass_ratio: Any = number_field("mass_ratio", 5.0, POSITIVE)
+    gap: Any = number_field("gap", 0.5, REAL, "F/k")
+    restitution: Any = number_field("restitution", 0.6, SHARE)
+    friction: Any = number_field("friction", 1.0, NOT_NEGATIVE, "F")
+    static_ratio: Any = number_field("static_ratio", 1.0, Range(1.0))
+    quantity_units: ClassVar = {
+        **CapsuleState.units, "rate": "√(k/m)", "time": "√(m/k)", "energy": "F²/k",
+        "power": "F²/√(k m)",
     }  # fmt: skip
+    labels: ClassVar = (  # pyright: ignore
+        "place in the capsule (F/k)",
+        "speed in the capsule (F/√(k m))",
+    )
 
     @property
     def contacts(self) -> tuple[RigidStop, DryFriction]:
@@ -84,19 +86,6 @@ class Capsule(ForcedMachine):
                 push={"capsule_speed": faster, "speed": -faster},
             ),
         )
-
-    @property
-    def labels(self) -> tuple[str, str]:
-        """Axis labels of position and velocity, with their units."""
-        return "place in the capsule (F/k)", "speed in the capsule (F/√(k m))"
-
-    @property
-    def units(self) -> Mapping[str, str]:
-        """Lengths in F/k, times in √(m/k)."""
-        own = {"gap": "F/k", "amplitude": "F", "friction": "F", "frequency": "√(k/m)"}
-        own |= CapsuleState.units
-        rates = {"rate": "√(k/m)", "time": "√(m/k)", "energy": "F²/k", "power": "F²/√(k m)"}
-        return {**super().units, **own, **rates, "": "1"}
 
     def step_limit(self, s: Scalar, state: State) -> Scalar:
         """A fifth of the shorter of the drive's cycle and the period of the mass on its spring."""

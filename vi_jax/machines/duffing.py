@@ -1,13 +1,12 @@
 """A Duffing oscillator between two stops; with no cubic term the classic impact oscillator."""
 
-from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 
-from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, number
-from .._types import Number, Scalar, State
+from .._checks import NOT_NEGATIVE, POSITIVE, SHARE, number
+from .._types import Number, Scalar
 from ..machine import OscillatorState, RigidStop
 from ._base import ForcedMachine, number_field, stops_at
 from ._drawn import draw_duffing
@@ -25,32 +24,21 @@ class Duffing(ForcedMachine):
     """
 
     amplitude: Any = number_field("amplitude", 0.3)
-    frequency: Any = number_field("frequency", 1.0)
-    damping: Any = number_field("damping", 0.1)
+    frequency: Any = number_field("frequency", 1.0, POSITIVE)
+    damping: Any = number_field("damping", 0.1, NOT_NEGATIVE)
     stiffness: Any = number_field("stiffness", 1.0)
     cubic: Any = number_field("cubic", 0.0)
-    gap: Any = number_field("gap", 1.0)
-    restitution: Any = number_field("restitution", 0.8)
+    gap: Any = number_field("gap", 1.0, POSITIVE)
+    restitution: Any = number_field("restitution", 0.8, SHARE)
     two_sided: bool = eqx.field(kw_only=True, static=True, default=True)
-    ranges: ClassVar[dict[str, Any]] = {
-        "amplitude": REAL, "frequency": POSITIVE, "damping": NOT_NEGATIVE, "stiffness": REAL,
-        "cubic": REAL, "gap": POSITIVE, "restitution": SHARE,
-    }  # fmt: skip
+    labels: ClassVar = ("x", "dx/dt")  # pyright: ignore
+    units: ClassVar = {"": "1"}  # pyright: ignore
+    sketch = draw_duffing
 
     @property
     def contacts(self) -> tuple[RigidStop, ...]:
         """One on the right, and one on the left of a two-sided machine."""
         return stops_at(self.gap, self.restitution, two_sided=self.two_sided)
-
-    @property
-    def labels(self) -> tuple[str, str]:
-        """Axis labels of position and velocity, with their units."""
-        return "x", "dx/dt"
-
-    @property
-    def units(self) -> Mapping[str, str]:
-        """None: its numbers are the equation's."""
-        return {"": "1"}
 
     def field(self, s: Scalar, state: OscillatorState) -> OscillatorState:
         """d(state)/d(ωt) between impacts; the state's V is dx/dt."""
@@ -66,7 +54,3 @@ class Duffing(ForcedMachine):
     def mirrored(self, state: OscillatorState) -> OscillatorState | None:
         """x → -x half a cycle later, if there are two stops."""
         return OscillatorState(-state.Y, -state.V) if self.two_sided else None
-
-    def sketch(self, pen: Any, state: State, phase: float) -> None:
-        """Draw the machine in a state with a `Pen`, for `plot_sketch` and `animate`."""
-        draw_duffing(self, pen, state, phase)

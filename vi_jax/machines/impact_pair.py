@@ -61,16 +61,14 @@ class ImpactPair(PhaseMachine):
       and `force` F (unit: M a ω²), of a box that is free.
     """
 
-    half_gap: Any = number_field("half_gap", 1.6)
-    restitution: Any = number_field("restitution", 0.5)
-    mass_ratio: Any = number_field("mass_ratio", None)
-    damping_ratio: Any = number_field("damping_ratio", 0.05)
-    frequency: Any = number_field("frequency", 1.0)
-    force: Any = number_field("force", 0.5)
-    ranges: ClassVar[dict[str, Any]] = {
-        "half_gap": POSITIVE, "restitution": SHARE, "mass_ratio": NOT_NEGATIVE,
-        "damping_ratio": NOT_NEGATIVE, "frequency": NOT_NEGATIVE, "force": REAL,
-    }  # fmt: skip
+    half_gap: Any = number_field("half_gap", 1.6, POSITIVE, "a")
+    restitution: Any = number_field("restitution", 0.5, SHARE)
+    mass_ratio: Any = number_field("mass_ratio", None, NOT_NEGATIVE)
+    damping_ratio: Any = number_field("damping_ratio", 0.05, NOT_NEGATIVE)
+    frequency: Any = number_field("frequency", 1.0, NOT_NEGATIVE, "ω")
+    force: Any = number_field("force", 0.5, REAL, "M a ω²")
+    labels: ClassVar = ("place in the box (a)", "speed in the box (a ω)")  # pyright: ignore
+    sketch = draw_pair
 
     @property
     def contacts(self) -> tuple[RigidStop, ...]:
@@ -87,18 +85,11 @@ class ImpactPair(PhaseMachine):
         return (Coordinate(self.position, self.velocity, self.placed, reduced),)
 
     @property
-    def labels(self) -> tuple[str, str]:
-        """Axis labels of position and velocity, with their units."""
-        return "place in the box (a)", "speed in the box (a ω)"
-
-    @property
-    def units(self) -> Mapping[str, str]:
-        """Lengths in a, times in 1/ω, masses in that of the ball, or of a box that is free."""
+    def quantity_units(self) -> Mapping[str, str]:  # pyright: ignore
+        """Masses are in that of the ball, or of a box that is free."""
         mass = "m" if self.mass_ratio is None else "M"
-        own = {**FreePairState.units, "half_gap": "a"}
-        own |= {"force": "M a ω²", "frequency": "ω"}
         rates = {"rate": "ω", "time": "1/ω", "energy": f"{mass} a² ω²", "power": f"{mass} a² ω³"}
-        return {**super().units, **own, **rates, "": "1"}
+        return {**FreePairState.units, **rates}
 
     def field(self, s: Scalar, state: State) -> Any:
         """d(state)/ds between impacts: a ball on which nothing acts, seen from the box."""
@@ -142,7 +133,3 @@ class ImpactPair(PhaseMachine):
     def mirrored(self, state: State) -> Any:
         """Left and right exchanged, half a cycle later."""
         return type(state)(*(-x for x in vars(state).values()))
-
-    def sketch(self, pen: Any, state: State, phase: float) -> None:
-        """Draw the machine in a state with a `Pen`, for `plot_sketch` and `animate`."""
-        draw_pair(self, pen, state, phase)

@@ -1,6 +1,5 @@
 """A pressure relief valve that chatters on its seat, by itself."""
 
-from collections.abc import Mapping
 from math import pi
 from typing import Any, ClassVar
 
@@ -40,30 +39,18 @@ class ReliefValve(AutonomousMachine):
     time between observations, positive, for one that is not observed where its lift is greatest.
     """
 
-    flow_rate: Any = number_field("flow_rate", 3.0)
-    damping: Any = number_field("damping", 1.25)
-    precompression: Any = number_field("precompression", 10.0)
-    compressibility: Any = number_field("compressibility", 20.0)
-    restitution: Any = number_field("restitution", 0.8)
-    ranges: ClassVar[dict[str, Any]] = {
-        "flow_rate": POSITIVE, "damping": NOT_NEGATIVE, "precompression": NOT_NEGATIVE,
-        "compressibility": POSITIVE, "restitution": SHARE, "interval": POSITIVE,
-    }  # fmt: skip
+    flow_rate: Any = number_field("flow_rate", 3.0, POSITIVE)
+    damping: Any = number_field("damping", 1.25, NOT_NEGATIVE)
+    precompression: Any = number_field("precompression", 10.0, NOT_NEGATIVE)
+    compressibility: Any = number_field("compressibility", 20.0, POSITIVE)
+    restitution: Any = number_field("restitution", 0.8, SHARE)
+    labels: ClassVar = ("lift", "speed of opening")  # pyright: ignore
+    units: ClassVar = {"": "1"}  # pyright: ignore
 
     @property
     def contacts(self) -> tuple[RigidStop, ...]:
         """The seat, below the body."""
-        return (RigidStop(0.0, self.restitution, "left"),)
-
-    @property
-    def labels(self) -> tuple[str, str]:
-        """Axis labels of position and velocity, with their units."""
-        return "lift", "speed of opening"
-
-    @property
-    def units(self) -> Mapping[str, str]:
-        """None: its numbers are the equations'."""
-        return {"": "1"}
+        return (RigidStop(0.0, self.restitution, "left", on=("lift", "speed")),)
 
     @property
     def usual(self) -> float:
@@ -105,15 +92,3 @@ class ReliefValve(AutonomousMachine):
             raise ValueError(
                 f"Argument `start` must have a positive pressure, but has {pressure.min():g}."
             )
-
-    def position(self, state: ValveState) -> Scalar:
-        """Lift of the body from its seat."""
-        return state.lift
-
-    def velocity(self, state: ValveState) -> Scalar:
-        """Speed of the body, positive where the valve opens."""
-        return state.speed
-
-    def placed(self, state: ValveState, Y: Scalar, V: Scalar) -> ValveState:
-        """The body at this lift with this speed, the pressure as it was."""
-        return ValveState(Y, V, state.pressure)

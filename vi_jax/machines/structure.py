@@ -1,13 +1,13 @@
 """A structure of many degrees of freedom with rigid stops, given by its matrices or its modes."""
 
-from typing import Any, ClassVar
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import NOT_NEGATIVE, POSITIVE, REAL, number, require, require_ranges
+from .._checks import NOT_NEGATIVE, POSITIVE, number, require, require_ranges
 from ..machine import LinearMachine, RigidStop
 from ._base import number_field
 from ._matrices import check_contacts, check_matrices, check_vector, matrix, numbered, vector
@@ -54,10 +54,7 @@ class Structure(LinearMachine):
         kw_only=True, default=None, converter=vector("static_force")
     )
     amplitude: Any = number_field("amplitude", 1.0)
-    frequency: Any = number_field("frequency", 1.0)
-    ranges: ClassVar[dict[str, Any]] = {
-        "amplitude": REAL, "frequency": POSITIVE,
-    }  # fmt: skip
+    frequency: Any = number_field("frequency", 1.0, POSITIVE)
 
     def __check_init__(self):
         loss = jnp.zeros(self.mass.shape[-1:]) if self.damping is None else self.damping

@@ -1,7 +1,6 @@
 """A motor with an unbalanced rotor on an elastic support: the Sommerfeld effect."""
 
 import dataclasses
-from collections.abc import Mapping
 from math import pi
 from typing import Any, ClassVar
 
@@ -10,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Range, number, require
+from .._checks import NOT_NEGATIVE, POSITIVE, SHARE, Range, number, require
 from .._types import Number, Scalar, State
 from ..machine import Coordinate, RigidStop, ShaftMachine, Shown
 from ._base import PhaseMachine, number_field, stops_at
@@ -78,20 +77,21 @@ class UnbalancedRotor(ShaftMachine, PhaseMachine):
     - `clock_name`: `"phase"` or `"time"`; static.
     """
 
-    strength: Any = number_field("strength", 0.1)
+    strength: Any = number_field("strength", 0.1, NOT_NEGATIVE)
     control: Any = number_field("control", 0.9)
-    no_load_speed: Any = number_field("no_load_speed", 1.0)
-    coupling: Any = number_field("coupling", 0.01)
-    damping_ratio: Any = number_field("damping_ratio", 0.05)
-    gap: Any = number_field("gap", None)
-    restitution: Any = number_field("restitution", 0.5)
+    no_load_speed: Any = number_field("no_load_speed", 1.0, POSITIVE, "ω")
+    coupling: Any = number_field("coupling", 0.01, Range(0.0, 1.0, open_high=True))
+    damping_ratio: Any = number_field("damping_ratio", 0.05, NOT_NEGATIVE)
+    gap: Any = number_field("gap", None, POSITIVE, "m r/M")
+    restitution: Any = number_field("restitution", 0.5, SHARE)
     two_sided: bool = eqx.field(kw_only=True, static=True, default=False)
     clock_name: str = eqx.field(kw_only=True, static=True, default="phase")
-    ranges: ClassVar[dict[str, Any]] = {
-        "strength": NOT_NEGATIVE, "control": REAL, "no_load_speed": POSITIVE,
-        "coupling": Range(0.0, 1.0, open_high=True), "damping_ratio": NOT_NEGATIVE,
-        "gap": POSITIVE, "restitution": SHARE,
+    quantity_units: ClassVar = {
+        **RotorState.units, "frequency_ratio": "ω", "rate": "ω", "time": "1/ω",
+        "energy": "m² r² ω²/M", "power": "m² r² ω³/M",
     }  # fmt: skip
+    labels: ClassVar = ("Y (m r/M)", "dY/dτ (m r ω/M)")  # pyright: ignore
+    sketch = draw_rotor
 
     @property
     def contacts(self) -> tuple[RigidStop, ...]:
@@ -99,18 +99,6 @@ class UnbalancedRotor(ShaftMachine, PhaseMachine):
         if self.gap is None:
             return ()
         return stops_at(self.gap, self.restitution, two_sided=self.two_sided)
-
-    @property
-    def labels(self) -> tuple[str, str]:
-        """Axis labels of position and velocity, with their units."""
-        return "Y (m r/M)", "dY/dτ (m r ω/M)"
-
-    @property
-    def units(self) -> Mapping[str, str]:
-        """Lengths in m r/M, times in 1/ω."""
-        own = {**RotorState.units, "gap": "m r/M", "no_load_speed": "ω", "frequency_ratio": "ω"}
-        rates = {"rate": "ω", "time": "1/ω", "energy": "m² r² ω²/M", "power": "m² r² ω³/M"}
-        return {**super().units, **own, **rates, "": "1"}
 
     def speed(self, phase: Number, state: State) -> Scalar:
         """W = dφ/dτ of the rotor (unit: ω) at this angle."""
@@ -204,10 +192,6 @@ class UnbalancedRotor(ShaftMachine, PhaseMachine):
     def alive(self, state: State) -> jax.Array | None:
         """In the phase clock a rotor that does not turn forward has a state that is no number."""
         return jnp.isfinite(state.P) if self.is_paced(state) else None
-
-    def sketch(self, pen: Any, state: State, phase: float) -> None:
-        """Draw the machine in a state with a `Pen`, for `plot_sketch` and `animate`."""
-        draw_rotor(self, pen, state, phase)
 
 
 def _pace(W: Scalar) -> Scalar:

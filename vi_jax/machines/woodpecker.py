@@ -1,6 +1,5 @@
 """The woodpecker toy: a bird on a spring that pecks its way down a pole, jamming and slipping."""
 
-from collections.abc import Mapping
 from math import pi
 from typing import Any, ClassVar
 
@@ -77,33 +76,28 @@ class Woodpecker(AutonomousMachine):
     - `interval` of time between observations (s), positive, for one observed at equal times.
     """
 
-    friction: Any = number_field("friction", 0.3)
-    sleeve_restitution: Any = number_field("sleeve_restitution", 0.0)
-    beak_restitution: Any = number_field("beak_restitution", 0.5)
-    sleeve_mass: Any = number_field("sleeve_mass", 3e-4)
-    bird_mass: Any = number_field("bird_mass", 4.5e-3)
-    sleeve_inertia: Any = number_field("sleeve_inertia", 5e-9)
-    bird_inertia: Any = number_field("bird_inertia", 7e-7)
-    stiffness: Any = number_field("stiffness", 0.0056)
-    gravity: Any = number_field("gravity", 9.81)
-    sleeve_arm: Any = number_field("sleeve_arm", 0.010)
-    bird_arm: Any = number_field("bird_arm", 0.015)
-    beak_arm: Any = number_field("beak_arm", 0.0201)
-    sleeve_height: Any = number_field("sleeve_height", 0.0058)
-    beak_height: Any = number_field("beak_height", 0.02)
-    sleeve_radius: Any = number_field("sleeve_radius", 0.0031)
-    pole_radius: Any = number_field("pole_radius", 0.0025)
-    section_angle: Any = number_field("section_angle", -0.2788)
-    ranges: ClassVar[dict[str, Any]] = {
-        "friction": NOT_NEGATIVE, "sleeve_restitution": SHARE, "beak_restitution": SHARE,
-        "section_angle": REAL,
-        **dict.fromkeys(
-            ("sleeve_mass", "bird_mass", "sleeve_inertia", "bird_inertia", "stiffness", "gravity",
-             "sleeve_arm", "bird_arm", "beak_arm", "sleeve_height", "beak_height", "sleeve_radius",
-             "pole_radius", "interval"),
-            POSITIVE,
-        ),
+    friction: Any = number_field("friction", 0.3, NOT_NEGATIVE)
+    sleeve_restitution: Any = number_field("sleeve_restitution", 0.0, SHARE)
+    beak_restitution: Any = number_field("beak_restitution", 0.5, SHARE)
+    sleeve_mass: Any = number_field("sleeve_mass", 3e-4, POSITIVE, "kg")
+    bird_mass: Any = number_field("bird_mass", 4.5e-3, POSITIVE, "kg")
+    sleeve_inertia: Any = number_field("sleeve_inertia", 5e-9, POSITIVE, "kg m²")
+    bird_inertia: Any = number_field("bird_inertia", 7e-7, POSITIVE, "kg m²")
+    stiffness: Any = number_field("stiffness", 0.0056, POSITIVE, "N m/rad")
+    gravity: Any = number_field("gravity", 9.81, POSITIVE, "m/s²")
+    sleeve_arm: Any = number_field("sleeve_arm", 0.010, POSITIVE, "m")
+    bird_arm: Any = number_field("bird_arm", 0.015, POSITIVE, "m")
+    beak_arm: Any = number_field("beak_arm", 0.0201, POSITIVE, "m")
+    sleeve_height: Any = number_field("sleeve_height", 0.0058, POSITIVE, "m")
+    beak_height: Any = number_field("beak_height", 0.02, POSITIVE, "m")
+    sleeve_radius: Any = number_field("sleeve_radius", 0.0031, POSITIVE, "m")
+    pole_radius: Any = number_field("pole_radius", 0.0025, POSITIVE, "m")
+    section_angle: Any = number_field("section_angle", -0.2788, REAL, "rad")
+    quantity_units: ClassVar = {
+        **WoodpeckerState.units, **dict.fromkeys(("play", "reach", "gap"), "m"), "phase": "s",
+        "rate": "1/s", "time": "s", "energy": "J", "power": "W",
     }  # fmt: skip
+    labels: ClassVar = ("beak towards the pole (m)", "its speed (m/s)")  # pyright: ignore
     LOWER: ClassVar[int] = 0
     UPPER: ClassVar[int] = 1
     BEAK: ClassVar[int] = 2
@@ -169,25 +163,6 @@ class Woodpecker(AutonomousMachine):
         y, sleeve, bird = (moment * x for x in response((None, -1, 1), self._inertia()))
         rates = state.speed, state.sleeve_rate, state.bird_rate
         return WoodpeckerState(*rates, y - self.gravity, sleeve, bird, jnp.zeros_like(s))
-
-    @property
-    def labels(self) -> tuple[str, str]:
-        """Axis labels of position and velocity, with their units."""
-        return "beak towards the pole (m)", "its speed (m/s)"
-
-    @property
-    def units(self) -> Mapping[str, str]:
-        """SI units of its numbers and states."""
-        own = dict.fromkeys(
-            ("sleeve_arm", "bird_arm", "beak_arm", "sleeve_height", "beak_height", "sleeve_radius",
-             "pole_radius", "play", "reach", "gap"),
-            "m",
-        )  # fmt: skip
-        own |= {"sleeve_mass": "kg", "bird_mass": "kg", "sleeve_inertia": "kg m²"}
-        own |= {"bird_inertia": "kg m²", "stiffness": "N m/rad", "gravity": "m/s²"}
-        own |= {"section_angle": "rad", "interval": "s", "phase": "s"}
-        rates = {"rate": "1/s", "time": "s", "energy": "J", "power": "W"}
-        return {**super().units, **WoodpeckerState.units, **own, **rates, "": "1"}
 
     @property
     def usual(self) -> Scalar:
