@@ -10,7 +10,7 @@ import pytest
 import vi_jax as vi
 from jax.extend.random import threefry_2x32
 from scipy.linalg import expm
-from vi_jax.flow._random import normal_pair
+from vi_jax.flow.noise import normal_pair
 
 from free_oscillator import Free
 

@@ -1,7 +1,7 @@
 """How a machine moves: methods, the hybrid step, the closed-form flight, `simulate`, results."""
 
 from ._lane import has_fixed_cycle as has_fixed_cycle
-from ._own_parts import check_parts as check_parts
+from ._own import check_parts as check_parts
 from ._simulate import collect as collect
 from ._simulate import simulate as simulate
 from ._simulate import simulate_pool as simulate_pool

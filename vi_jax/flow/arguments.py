@@ -35,8 +35,8 @@ from ..machine import (
     modes_of,
 )
 from ._lane import Plan
+from ._own import check_parts
 from ._own import check_values as check_values
-from ._own_parts import check_parts
 from .methods import AbstractMethod
 from .named import average_names, quantity_names
 from .options import RunOptions, largest_count

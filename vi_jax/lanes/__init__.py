@@ -1,7 +1,7 @@
 """One lane's loop, run for any number of lanes: vector code by LLVM on a CPU, else XLA."""
 
-from ._dropped import interrupts_heard as interrupts_heard
-from ._dropped import raise_dropped as raise_dropped
+from ._interrupts import interrupts_heard as interrupts_heard
+from ._interrupts import raise_dropped as raise_dropped
 from ._primitive import vector_only as vector_only
 from ._program import called as called
 from ._program import dependent_results as dependent_results

@@ -24,7 +24,6 @@ from jax.extend.core import ClosedJaxpr
 
 from ._arrays import MOST_IN_REGISTERS, Array, Registers, any_in, held, mapped, splat
 from ._driver import DRIVER, OUT_OF_MEMORY
-from ._fixed import FixedText
 from ._group import (
     Frame,
     add_all,
@@ -39,7 +38,7 @@ from ._group import (
 from ._memory import gathering, load_pointer, load_stride, over_rows, scatter, shared
 from ._operations import compare, kind_of
 from ._reverse import ReverseProgram
-from ._text import RARE, Text, Value
+from ._text import RARE, FixedText, Text, Value
 from ._vector import write
 
 # Bytes of a thread's tape at most, and its entries at first. The paper's motor takes 1.1 kB an

@@ -2,12 +2,60 @@
 
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from ._arena import Arena
+
+class Arena:
+    """Which places of a kernel's memory are in use while its text is written.
+
+    Places are counted in vectors of eight-byte numbers, one for each lane of a group. What is let
+    go of is given out again, lowest first, so that a step's arrays stay near each other.
+    """
+
+    def __init__(self) -> None:
+        self.size = 0
+        """The places that the kernel needs in all."""
+        self._free: list[tuple[int, int]] = []  # from, to; in order, apart from each other
+
+    def take(self, numbers: int) -> "Block":
+        """Room for so many numbers of every lane, until nothing refers to the block any more."""
+        for i, (begin, end) in enumerate(self._free):
+            if end - begin >= numbers:
+                rest = [(begin + numbers, end)] if end - begin > numbers else []
+                self._free[i : i + 1] = rest
+                return Block(self, begin, numbers)
+        begin = self.size
+        if self._free and self._free[-1][1] == self.size:
+            begin = self._free.pop()[0]
+        self.size = begin + numbers
+        return Block(self, begin, numbers)
+
+    def give_back(self, begin: int, end: int) -> None:
+        """What `Block` calls as it goes."""
+        kept = []
+        for a, b in self._free:
+            if b == begin:
+                begin = a
+            elif a == end:
+                end = b
+            else:
+                kept.append((a, b))
+        self._free = sorted([*kept, (begin, end)])
+
+
+@dataclass(eq=False)
+class Block:
+    """Places of an arena, in use as long as this object is."""
+
+    arena: Arena = field(repr=False)
+    start: int
+    numbers: int
+
+    def __del__(self) -> None:
+        self.arena.give_back(self.start, self.start + self.numbers)
 
 
 @dataclass(frozen=True, slots=True)
@@ -258,3 +306,49 @@ class Text:
     def _phi(self, kind: str, ways: Sequence[tuple[str, str]]) -> str:
         pairs = ", ".join(f"[ {text}, %{block} ]" for text, block in ways)
         return f"phi {self.vector(kind)} {pairs}"
+
+
+# Text whose arithmetic has one meaning: equal operations give equal bits in any function.
+#
+# With the flag `contract` LLVM fuses a product with a sum where it sees fit, which depends on what
+# else is done with the product. A value that is computed again on the way back must decide about an
+# event as it did on the way there, so that there the fusing is done as the text is written.
+
+_CONTRACT = " contract"
+
+
+class FixedText(Text):
+    """A `Text` that fuses by a rule: the first operand of a sum or difference if that is a product,
+    else the second. (LLVM's `fmuladd` is one operation where the processor has it, else two.)"""
+
+    def __init__(self, width: int):
+        super().__init__(width)
+        self._products: dict[str, tuple[Value, Value]] = {}
+
+    def ordered(self, a: Value, b: Value) -> tuple[Value, Value]:
+        """As they stand: names, by which they would be ordered, are others in each function."""
+        return a, b
+
+    def opaque(self, a: Value) -> Value:
+        """The same number, of which it is not known that it is a product: a branch may be skipped
+        in one function and be computed for all lanes in another."""
+        return self.cast("bitcast", a, a.kind) if is_float(a.kind) else a
+
+    def binary(self, operation: str, a: Value, b: Value, kind: str | None = None) -> Value:
+        plain = operation.removesuffix(_CONTRACT)
+        if plain == operation:
+            return super().binary(operation, a, b, kind)
+        if plain == "fmul":
+            product = super().binary(plain, a, b)
+            self._products[product.text] = a, b
+            return product
+        if plain in ("fadd", "fsub") and a.text in self._products:
+            x, y = self._products[a.text]
+            return self.intrinsic("fmuladd", x, y, b if plain == "fadd" else self._negative(b))
+        if plain in ("fadd", "fsub") and b.text in self._products:
+            x, y = self._products[b.text]
+            return self.intrinsic("fmuladd", x if plain == "fadd" else self._negative(x), y, a)
+        return super().binary(plain, a, b)
+
+    def _negative(self, a: Value) -> Value:
+        return self.value(f"fneg {self.vector(a.kind)} {a.text}", a.kind)

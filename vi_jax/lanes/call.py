@@ -18,8 +18,7 @@ import jax
 import numpy as np
 
 from ._driver import OUT_OF_MEMORY
-from ._dropped import interrupt_dropped
-from ._interrupts import SUCCESS, HandlerResult, guard, interrupt_raises, watch
+from ._interrupts import SUCCESS, HandlerResult, guard, interrupt_dropped, interrupt_raises, watch
 from ._recent import made_once
 from ._vector import Unsupported
 from .runtime import KernelCall, kernel_by_key

@@ -16,8 +16,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 from ..._types import Scalar, Scalars, State
 from ...lanes import called
 from ..events import Rates
-from ._coefficients import Coefficient, NoSeries, NotSmooth, Series, nth, plus
-from ._recurrences import KINKS, RULES
+from ._recurrences import KINKS, RULES, Coefficient, NoSeries, NotSmooth, Series, nth, plus
 
 
 def expand(

@@ -17,7 +17,7 @@ from ..._types import Scalar, State
 from ..integrals import Integrals, rate_of_integrals
 from ..smooth import SmoothMachine
 from . import _series as power_series
-from ._coefficients import NoSeries, NotSmooth, Series
+from ._recurrences import NoSeries, NotSmooth, Series
 from ._series import Along
 from .base import AbstractMethod, fading_is_known
 

@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from .._arena import Block
-from .._text import Text, Value
+from .._text import Block, Text, Value
 from .index import (
     NO_CUTS,
     Cuts,
