@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-from vi_jax.machine.trig import sincos
+from vi_jax.lanes import sincos
 
 from envelope.independent import turned
 

@@ -13,17 +13,14 @@ from jaxtyping import Array, Float
 
 from .._checks import in_range, number, require
 from .._types import Flag, Scalar, State
-from .clocks import Clocked
-from .coordinate import Coordinate
+from .coordinates import Coordinate, coordinate_by_name
 from .cycles import Passing, Turn, at_intervals, counter_of
+from .described import Clocked, Observed, Worded
 from .event import AbstractEvent, AbstractSwitch
-from .names import coordinate_by_name
-from .observing import Observed
 from .own import by_default, declared_modes, derived, is_own, says
 from .parts import coordinates_in, listed, other_events, stops_in, switches_in
 from .soft import SoftStop
 from .stop import RigidStop, Wall
-from .words import Worded
 
 
 class Prepared(NamedTuple):

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 
 from .._checks import concrete
 from .._types import Scalar, State
+from .coordinates import component, has_component, with_component
 from .event import AbstractEvent
-from .names import component, has_component, with_component
 from .own import with_static
 from .reset import Reset
 

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from .._types import Scalar, State
 from ..lanes import dependent_results
 from .base import AbstractMachine
-from .coordinate import Coordinate
+from .coordinates import Coordinate
 from .state import State as Named
 from .state import like
 

@@ -25,10 +25,7 @@ from .._checks import (
     require_ranges,
 )
 from .._messages import warn
-from .crank import CosineCrank, SliderCrank
-from .dc_motor import DCMotor
-from .drive import IdealDrive
-from .motor import Motor
+from .drives import CosineCrank, DCMotor, IdealDrive, Motor, SliderCrank
 from .scene import Oscillator, Scene
 from .shown import Shown
 from .stop import RigidStop

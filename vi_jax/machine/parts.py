@@ -9,7 +9,7 @@ from typing import Any
 
 from .._types import Machine
 from .contact_friction import ContactFriction
-from .coordinate import Coordinate
+from .coordinates import Coordinate
 from .cycles import Turn, counter_of
 from .event import AbstractEvent, AbstractSwitch
 from .own import with_static

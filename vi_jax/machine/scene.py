@@ -24,14 +24,11 @@ from .._checks import (
 )
 from .._types import Flag, Number, Scalar, State
 from ._drawn import draw_scene
-from .crank import AbstractCrank, CosineCrank, SliderCrank
-from .drive import AbstractDrive, IdealDrive
-from .motor import Motor
+from .drives import UNITS, AbstractCrank, AbstractDrive, CosineCrank, IdealDrive, Motor, SliderCrank
 from .own import changed
 from .shaft import ShaftMachine
 from .shown import Shown
 from .soft import SoftStop
-from .states import UNITS
 from .stop import RigidStop
 
 

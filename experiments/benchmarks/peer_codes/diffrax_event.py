@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import vi_jax as vi
-from vi_jax.machine.trig import sincos
+from vi_jax.lanes import sincos
 
 from .task import Run, Task
 

@@ -1,13 +1,30 @@
-"""Numbers of a state by their names, and the coordinates that these are."""
+"""Coordinates that contacts act on, and numbers of a state by their names."""
 
 import functools
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 
 from .._types import Scalar, State
-from .coordinate import Coordinate
 from .numbers import split_place
+
+
+class Coordinate(NamedTuple):
+    """A coordinate that stops limit."""
+
+    position: Callable[[State], Scalar]
+    velocity: Callable[[State], Scalar]
+    """What an impact reverses; of the sign of d(position)/ds."""
+    placed: Callable[[State, Any, Any], State]
+    """A state with another position and velocity, and with all that an impact changes besides."""
+    mass: Any = 1.0
+    """What an impact acts on, in the machine's unit of mass: of two bodies the reduced mass. A
+    number, or a function `mass(s, state)`."""
+
+    def mass_at(self, s: Scalar, state: State) -> Any:
+        """The mass in a state."""
+        return self.mass(s, state) if callable(self.mass) else self.mass
 
 
 def coordinate_by_name(on: Any, mass: Any) -> Coordinate:

@@ -1,0 +1,391 @@
+"""What drives the paper's scene: cranks, drives of unlimited and of limited power, and states."""
+
+import abc
+import dataclasses
+from collections.abc import Callable, Iterable, Mapping
+from math import pi
+from types import MappingProxyType
+from typing import Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._checks import NOT_NEGATIVE, POSITIVE, REAL, Range, number, real, require, require_ranges
+from .._types import Scalar, State
+from ..lanes import sincos
+from .own import by_default, is_own
+from .shown import Shown
+
+# The units of the paper's scene, by names of quantities, of components of a state and of numbers.
+UNITS: Mapping[str, str] = MappingProxyType({
+    "position": "a", "velocity": "a ω", "time": "1/ω", "rate": "ω", "energy": "m_C a² ω²",
+    "power": "m_C a² ω³", "Y": "a", "V": "a ω", "W": "ω", "M": "J ω²", "phase": "rad",
+    "gap": "a", "frequency_ratio": "ω", "no_load_speed": "ω", "electrical_time": "1/ω",
+    "section_phase": "rad", "": "1",
+})  # fmt: skip
+
+Number = Float[Array, "..."]
+
+
+class OscillatorState(Shown):
+    """State of an ideally driven scene, or of another machine, whose units are its own."""
+
+    Y: Number
+    """Position of the body (unit: a)."""
+    V: Number
+    """dY/dτ (unit: a ω)."""
+
+
+class MotorState(OscillatorState):
+    """State of a motor scene whose independent variable is the crank angle."""
+
+    units: ClassVar = UNITS
+    W: Number
+    """Speed of the crank dφ/dτ (unit: ω)."""
+
+
+class TimedMotorState(MotorState):
+    """State of a motor scene whose independent variable is time."""
+
+    phase: Number
+    """Crank angle since the last section (radians)."""
+
+
+class DCMotorState(MotorState):
+    """State of a scene with a `DCMotor` whose independent variable is the crank angle."""
+
+    M: Number
+    """Torque of the motor, which its armature current gives (unit: J ω²)."""
+
+
+class TimedDCMotorState(DCMotorState):
+    """State of a scene with a `DCMotor` whose independent variable is time."""
+
+    phase: Number
+    """Crank angle since the last section (radians)."""
+
+
+class Slide(NamedTuple):
+    """The slider's displacement U and its first two derivatives by the crank angle (unit: a)."""
+
+    U: Float[Array, "..."]
+    U_phi: Float[Array, "..."]
+    U_phiphi: Float[Array, "..."]
+
+
+class AbstractCrank(Shown):
+    """A crank asks for one method, `slide(phase)`."""
+
+    @property
+    def is_odd(self) -> bool:
+        """Whether the slider half a turn later is where its image is: U(φ + π) = -U(φ)."""
+        return False
+
+    @property
+    def drawn_rod(self) -> Scalar | float:
+        """Length of the rod in pictures (unit: a)."""
+        return 3.0
+
+    @abc.abstractmethod
+    def slide(self, phase: Float[Array, "..."]) -> Slide:
+        """The slider's displacement at crank angle `phase` (radians), in units of the crank a."""
+
+
+class CosineCrank(AbstractCrank):
+    """The first approximation of the paper (Eq. 4): U = cos φ."""
+
+    @property
+    def is_odd(self):
+        """True, unless a subclass has another `slide`."""
+        return not is_own(type(self).slide)
+
+    @by_default
+    def slide(self, phase: Float[Array, "..."]) -> Slide:
+        """U = cos φ and its derivatives (dimensionless)."""
+        sine, cosine = sincos(phase)
+        return Slide(cosine, -sine, -cosine)
+
+
+class SliderCrank(AbstractCrank):
+    """The exact kinematics of crank a and rod l: U = cos φ + (√(1 - λ² sin² φ) - 1)/λ."""
+
+    ratio: Float[Array, "..."] = eqx.field(converter=real("ratio"))
+    """λ = a/l (dimensionless), in (0, 1)."""
+    ranges: ClassVar = {"ratio": Range(0.0, 1.0, open_low=True, open_high=True)}
+
+    def __check_init__(self):
+        require_ranges(self)
+
+    @property
+    def drawn_rod(self):
+        """Length of the rod in radii of the crank, 1/λ, for drawings."""
+        return 1 / self.ratio
+
+    def slide(self, phase: Float[Array, "..."]) -> Slide:
+        """Exact U and its derivatives (dimensionless)."""
+        sine, cosine = sincos(phase)
+        inverse = 1 / (1 - (self.ratio * sine) ** 2) ** 0.5
+        # (r - 1)/λ as -λ sin²/(1 + r): no cancellation for a long rod.
+        lag = self.ratio * sine * sine * inverse / (1 + inverse)
+        slope = self.ratio * sine * cosine * inverse
+        bend = self.ratio * (cosine**2 - sine**2) * inverse + self.ratio * slope**2 * inverse
+        return Slide(cosine - lag, -sine - slope, -cosine - bend)
+
+
+# Why a drive has no such component, where there is more to say than that it has none.
+_WITHOUT = {
+    "W": "an ideal drive turns at its frequency ratio",
+    "M": "only a `DCMotor` has a torque of its own",
+}
+
+
+class AbstractDrive(Shown):
+    """The drive of the crank of a `Scene`.
+
+    A subclass defines the motion of body and shaft (`field`) and the class of its states. Their
+    components are `Y` and `V` of the body, then those of the drive: the crank speed `W` is one of
+    them, unless `fixed_speed` returns it.
+    """
+
+    state: ClassVar[type]
+    """Of its states, by crank angle."""
+    timed_state: ClassVar[type | None] = None
+    """By time, with the crank angle `phase` as one more component at the end; `None` where time
+    itself tells the angle."""
+    caption: ClassVar[str] = "drive"
+    """What pictures write beside the crank."""
+
+    @property
+    def fixed_speed(self) -> Float[Array, "..."] | None:
+        """The speed of the crank (unit: ω) where it is no part of the state."""
+        return None
+
+    @abc.abstractmethod
+    def field(self, scene: Any, s: Any, state: State, pushes: Iterable[Any]) -> State:
+        """d(state)/ds, by crank angle or, if `scene.clock_name` is `"time"`, by time τ.
+
+        **Arguments:** the scene, for its `crank`, `phase_at` and `pull`; s, the state, and what
+        compliant stops add to the body's acceleration.
+        """
+
+    def rate(self) -> Float[Array, "..."] | None:
+        """The fastest rate, by τ, at which something in the drive fades; `None` if nothing does."""
+        return None
+
+    def usual(self, name: str, known: dict[str, Any]) -> Any:
+        """A component of the drive's own where a start leaves it out; `known` are the components
+        before it."""
+        raise ValueError(
+            f"Argument `{name}` of `start` must be given for a `{type(self).__name__}`, which has "
+            "no `usual` for it."
+        )
+
+    def check(self) -> None:
+        """**Raises:** `TypeError` for a drive that lacks what a scene asks of it."""
+        kind, state = type(self), getattr(self, "state", None)
+        if not isinstance(state, type):
+            raise TypeError(
+                f"Drive `{kind.__name__}` must say in `state` of which class its states are."
+            )
+        if self.fixed_speed is None and not isinstance(kind.timed_state, type):
+            raise TypeError(
+                f"Drive `{kind.__name__}` has the speed of the crank in its state, as it has no "
+                "`fixed_speed`: it must say in `timed_state` of which class its states are by "
+                "time, with the crank angle `phase` as their last component."
+            )
+
+    def begin(self, **given: Any) -> dict[str, Any]:
+        """The drive's own components of a start, by name; what is not given, or `None`, is the
+        `usual`.
+
+        **Raises:** `ValueError` if a number is not finite, or no component of its state.
+        """
+        names = [part.name for part in dataclasses.fields(self.state)][2:]
+        for name, value in given.items():
+            if value is not None and name not in names:
+                there = ["Y", "V", *names]
+                near = [x for x in there if x.lower() == name.lower()]
+                has = f"it is called `{near[0]}`" if near else f"a state has {', '.join(there)}"
+                why = _WITHOUT.get(name, has)
+                raise ValueError(
+                    f"Argument `{name}` must be left out: {why}, but got {name}={value!r}."
+                )
+        found: dict[str, Any] = {}
+        for name in names:
+            value = given.get(name)
+            found[name] = number(name, self.usual(name, found) if value is None else value)
+            require(name, found[name])
+        return found
+
+    def speed(self, state: State) -> Float[Array, "..."]:
+        """How fast the crank turns (unit: ω), without sign."""
+        fixed = self.fixed_speed
+        return jnp.abs(state.W) if fixed is None else fixed
+
+    def duration(self) -> Float[Array, "..."] | float | None:
+        """How long a turn takes (time τ), 2π/ζ; `None` where the speed is not fixed."""
+        fixed = self.fixed_speed
+        return None if fixed is None else 2 * pi / fixed
+
+
+class IdealDrive(AbstractDrive):
+    """A drive of unlimited power: the crank turns at a constant rate."""
+
+    frequency_ratio: Float[Array, "..."] = eqx.field(converter=real("frequency_ratio"))
+    """ζ = Ω/ω (dimensionless), positive."""
+    ranges: ClassVar = {"frequency_ratio": POSITIVE}
+    state: ClassVar = OscillatorState
+    caption: ClassVar = "$\\varphi' = \\Omega$"
+
+    def __check_init__(self):
+        require_ranges(self)
+
+    @property
+    def fixed_speed(self):
+        """ζ, the frequency ratio, at which an ideal drive turns under any load."""
+        return self.frequency_ratio
+
+    def field(self, scene, s, state, pushes):
+        """d(state)/ds of the body alone, by crank angle (Eq. 8 of the paper) or by time (Eq. 5)."""
+        zeta = self.frequency_ratio
+        timed = scene.clock_name == "time"
+        slide = scene.crank.slide(scene.phase_at(zeta * s if timed else s))
+        pull = scene.pull(slide.U - state.Y, state.V, pushes)
+        if timed:
+            return OscillatorState(state.V, pull)
+        return OscillatorState(state.V / zeta, pull / zeta)
+
+
+class Motor(AbstractDrive):
+    """A DC motor of limited power with a straight torque-speed line (Eq. 3 of the paper).
+
+    (1 + μ U_φ²) φ'' + μ U_φ U_φφ φ'² = τ0 (κ - φ'/w0) + ε U_φ (Y - U)
+    """
+
+    strength: Number = eqx.field(converter=real("strength"))
+    """τ0 = T0/(J ω²) (dimensionless), not negative; 0 lets the shaft coast."""
+    control: Number = eqx.field(converter=real("control"))
+    """κ, motor control (dimensionless)."""
+    coupling: Number = eqx.field(converter=real("coupling"))
+    """ε = k0 a²/(J ω²), the spring's reaction on the shaft (dimensionless), not negative."""
+    slider_inertia: Number = eqx.field(converter=real("slider_inertia"))
+    """μ = m_B a²/J (dimensionless), not negative."""
+    no_load_speed: Number = eqx.field(default=1.0, converter=real("no_load_speed"))
+    """w0 = Ω0/ω, the no-load speed at κ = 1 (dimensionless), positive."""
+    ranges: ClassVar = {
+        "strength": NOT_NEGATIVE,
+        "control": REAL,
+        "coupling": NOT_NEGATIVE,
+        "slider_inertia": NOT_NEGATIVE,
+        "no_load_speed": POSITIVE,
+    }
+    state: ClassVar = MotorState
+    timed_state: ClassVar = TimedMotorState
+    caption: ClassVar = "motor, $J$"
+
+    def __check_init__(self):
+        require_ranges(self)
+
+    def field(self, scene, s, state, pushes):
+        """d(state)/ds of body and shaft: by crank angle (Eq. 8 to 9 of the paper) or by time (Eq. 5
+        to 7)."""
+        by_angle = scene.clock_name == "phase"
+        slide = scene.crank.slide(scene.phase_at(s if by_angle else state.phase))
+        # By angle all is divided by W. Products with 1/W are shared: a power series pays for each.
+        pace = 1 / state.W if by_angle else None
+
+        def paced(x):
+            return x if pace is None else pace * x
+
+        speed, stretch = paced(state.V), paced(slide.U - state.Y)
+        pull = scene.pull(stretch, speed, map(paced, pushes))
+        torque, more = self.torque(state, pace, paced)
+        square = state.W if by_angle else state.W * state.W
+        shaft = self.shaft(slide, torque, stretch, square)
+        clock = () if by_angle else (state.W,)
+        return type(state)(speed, pull, shaft, *more, *clock)
+
+    def torque(
+        self, state: State, pace: Number | None, paced: Callable[[Any], Any]
+    ) -> tuple[Number, tuple[Number, ...]]:
+        """The motor's torque (per J ω²), and the rates of its components after W. By crank angle
+        they are divided by W, which `paced` does."""
+        return self.line(state.W, pace), ()
+
+    def usual(self, name, known):
+        """A speed that a start leaves out is the no-load speed κ w0."""
+        return self.control * self.no_load_speed
+
+    def rate(self):
+        """The rate, by τ, at which the shaft comes back to speed."""
+        return self.strength / self.no_load_speed
+
+    def line(self, W: Number, pace: Number | None = None) -> Number:
+        """The straight line: the motor's steady torque at speed `W`, per J ω²; with `pace` 1/W,
+        divided by W."""
+        slope = 1 / self.no_load_speed
+        if pace is None:
+            return self.strength * (self.control - W * slope)
+        return self.strength * (self.control * pace - slope)
+
+    def shaft(self, slide: Slide, torque: Number, stretch: Number, square: Number) -> Number:
+        """dW/dτ from the motor's torque (per J ω²), U - Y and W² at this place of the slider.
+
+        It is linear in these three: divided by W they give dW/dφ.
+        """
+        load = self.coupling * stretch + self.slider_inertia * slide.U_phiphi * square
+        return (torque - slide.U_phi * load) / self.inertia(slide)
+
+    def inertia(self, slide: Slide) -> Number:
+        """Inertia that the shaft feels, per J."""
+        return 1 + self.slider_inertia * slide.U_phi**2
+
+
+class DCMotor(Motor):
+    """A DC motor with the inductance of its armature, at a constant voltage.
+
+    With the armature's L i' + R i + K_e φ' = u and the torque K_t i (primes: d/dt), and the torque
+    M = K_t i/(J ω²) as one more component of the state, it has
+
+        τe dM/dτ = τ0 (κ - W/w0) - M
+
+    and `Motor`'s equation of the shaft with M in the line's place, where
+
+        τe = ω L/R,  κ τ0 = K_t u/(R J ω²),  κ w0 = u/(K_e ω).
+
+    Its steady torque is `Motor`'s line, which it approaches at first order in τe as τe → 0. In
+    units of J ω² (and J ω³) the source gives the power κ w0 M, the armature turns the power
+    M² w0/τ0 into heat and holds the energy τe M² w0/(2 τ0), and the shaft gets the power M W.
+
+    Explicit methods are kept to steps of about τe, so that a motor of small τe costs more the
+    smaller it is: below 0.05 use `Motor`, unless the current itself is asked for.
+    """
+
+    electrical_time: Float[Array, "..."] = eqx.field(
+        kw_only=True, converter=real("electrical_time")
+    )
+    """τe = ω L/R, the electrical time constant (dimensionless), positive."""
+    ranges: ClassVar = {**Motor.ranges, "electrical_time": POSITIVE}
+    state: ClassVar = DCMotorState
+    timed_state: ClassVar = TimedDCMotorState
+
+    def torque(self, state, pace, paced):
+        """The torque M of the state, and how fast it builds up."""
+        return paced(state.M), (paced(self.build_up(state.W, state.M)),)
+
+    def usual(self, name, known):
+        """A torque that a start leaves out is the steady one at its speed."""
+        return self.line(known["W"]) if name == "M" else super().usual(name, known)
+
+    def build_up(self, W: Float[Array, "..."], M: Float[Array, "..."]) -> Float[Array, "..."]:
+        """dM/dτ at this speed and torque."""
+        return (self.line(W) - M) / self.electrical_time
+
+    def rate(self) -> Float[Array, "..."]:
+        """The fastest rate of shaft and armature together, by τ.
+
+        1/τe of the current, or where that is slow √(τ0/(w0 τe)), at which speed and current swing.
+        """
+        own = 1 / self.electrical_time
+        return jnp.maximum(own, jnp.sqrt(own * self.strength / self.no_load_speed))
