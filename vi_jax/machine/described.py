@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import equinox as eqx
 from jaxtyping import Array, Float
@@ -13,6 +13,8 @@ from .._types import Number, Scalar, State
 from .own import by_default
 from .shown import Shown
 from .units import PLAIN, unit_in
+
+Machine = TypeVar("Machine", bound=Shown)
 
 
 class Clocked(Shown):
@@ -45,14 +47,14 @@ class Clocked(Shown):
         """Duration of a cycle, where it is fixed."""
         return self.cycle
 
-    def in_clock(self, clock: str) -> Self:
+    def in_clock(self: Machine, clock: str) -> Machine:
         """The same machine with another independent variable, for one that has several."""
         raise ValueError(
             f"Argument `clock` must be left out for a {type(self).__name__}, which has its own "
             f"clock, but got {clock!r}."
         )
 
-    def in_cycle_clock(self) -> Self:
+    def in_cycle_clock(self: Machine) -> Machine:
         """The same machine with what counts its cycles as its independent variable."""
         return self
 
@@ -93,14 +95,14 @@ class Observed(Shown):
     """What is observed of a motion: where a cycle ends, what begins anew with it, means and
     quantities."""
 
-    def at_section(self, phase: Number) -> Self:
+    def at_section(self: Machine, phase: Number) -> Machine:
         """The same machine observed elsewhere in its cycle, for one that can be."""
         raise ValueError(
             f"Argument `section` must be left out for a {type(self).__name__}, which has its own "
             f"section, but got {phase!r}."
         )
 
-    def observed_later(self, since_section: Number) -> Self | None:
+    def observed_later(self: Machine, since_section: Number) -> Machine | None:
         """The same machine with its section moved by so much of its clock; `None` for a machine
         whose section cannot be moved."""
         return None

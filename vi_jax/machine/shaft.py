@@ -2,7 +2,7 @@
 
 import dataclasses
 from math import pi
-from typing import Any, Self
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,6 +11,8 @@ from jaxtyping import Array, Float
 from .._checks import concrete, one_of, state_of_numbers
 from .._types import Flag, Scalar, State
 from .base import AbstractMachine
+
+Machine = TypeVar("Machine", bound="ShaftMachine")
 
 # A state that was carried to the section lies on it to rounding, in single precision too, where
 # that of a turn is 5e-7.
@@ -50,7 +52,7 @@ class ShaftMachine(AbstractMachine):
         state."""
         return type(state) in self.timed_states
 
-    def in_clock(self, clock: str) -> Self:
+    def in_clock(self: Machine, clock: str) -> Machine:
         """The same machine in the `"phase"` or the `"time"` clock."""
         one_of("clock", clock, ("phase", "time"))
         return dataclasses.replace(self, clock_name=clock)
@@ -66,7 +68,7 @@ class ShaftMachine(AbstractMachine):
         _require_state("start", start, wanted)
         return state_of_numbers("start", start)
 
-    def in_cycle_clock(self) -> Self:
+    def in_cycle_clock(self: Machine) -> Machine:
         """In the phase clock: by time the section would be an event of its own, and the angle of
         the shaft one more state."""
         return self.in_clock("phase")
