@@ -158,6 +158,57 @@ def test_a_motor_counts_its_turns_in_every_verb():
     np.testing.assert_allclose(exponents, [0, *decay], rtol=2e-2, atol=1e-2)
 
 
+class Table(vi.Mechanical):
+    """A ball on a shaken table, as `BouncingBall`, seen from the ground."""
+
+    q = ("table", "ball")
+    mass = (3.0,)
+    shaking: float = 1.2
+    restitution: float = 0.5
+    cycle = 2 * jnp.pi
+
+    def prescribed(self, t):
+        return dict(table=-self.shaking * jnp.cos(t))
+
+    def force(self, t, q, v):
+        return dict(ball=-3.0)
+
+    @property
+    def contacts(self):
+        return vi.RigidStop(0.0, self.restitution, "left", on=lambda q: q.ball - q.table)
+
+
+def test_a_ball_on_a_table_whose_motion_is_prescribed():
+    """Bounces, and rest on the table, which throws it up again; its orbit and multipliers."""
+
+    def both(shaking):
+        ours = Table(shaking=shaking)
+        theirs = vi.machines.BouncingBall(acceleration=shaking)
+        start = ours.at(ball=1.0 - shaking)
+        found = vi.simulate(ours, start, 12, method=CLOSE)
+        wanted = vi.simulate(theirs, theirs.start(height=1.0), 12, method=CLOSE)
+        z, y = found.sections, wanted.sections
+        apart = jnp.abs(z.ball - z.table - y.height) + jnp.abs(z.v.ball - z.v.table - y.speed)
+        lost = jnp.abs(found.impact_energy - 3.0 * wanted.impact_energy)
+        good = found.successful & jnp.all(found.impacts == wanted.impacts)
+        return apart.max(), lost.max(), good, found.rests.sum()
+
+    apart, lost, good, rests = vi.jit(jax.vmap(both))(jnp.array([0.9, 1.05, 1.2]))
+    assert bool(good.all()) and int(rests.max()) > 3
+    np.testing.assert_allclose(apart, 0, atol=1e-8)
+    np.testing.assert_allclose(lost, 0, atol=1e-8)
+    ours, theirs = Table(), vi.machines.BouncingBall()
+    orbit = vi.find_orbit(ours, ours.at(ball=6.15 - 1.2, v={"ball": -1.06}), throw=True)
+    wanted = vi.find_orbit(theirs, theirs.start(height=6.15, speed=-1.06), throw=True)
+    found, other = (np.sort(np.abs(x.multipliers))[::-1] for x in (orbit, wanted))
+    np.testing.assert_allclose(found[:2], other, atol=1e-7)
+    np.testing.assert_allclose(other.prod(), 0.5**2, rtol=1e-7)
+    # Errors in the place of the table fade so, by definition.
+    np.testing.assert_allclose(found[2:], np.exp(-4 * np.pi), rtol=1e-2)
+    with pytest.raises(ValueError, match="'table' is not one of the coordinates ball"):
+        ours.at(table=1.0)
+
+
 class Pendulums(vi.Mechanical):
     """A pendulum that hangs on another one, whose bob strikes a wall."""
 

@@ -9,6 +9,7 @@ equations are M v' + h = f for the applied forces f, where h_i = Σ_k v_k (∂M/
 import abc
 import functools
 from collections.abc import Callable, Mapping, Sequence
+from math import pi
 from typing import Any, ClassVar
 
 import jax
@@ -24,6 +25,10 @@ from .state import like
 # Entries of a mass matrix: rows of numbers, `None` where they are zero.
 Matrix = list[list[Any]]
 
+# Errors in the place of a prescribed coordinate fade by exp(-4π), 3e-6, in a cycle: a choice, slow
+# enough for the longest steps.
+_FADES = 4 * pi
+
 
 class Mechanical(AbstractMachine):
     """A machine of masses, by its coordinates, its masses and the forces between contacts.
@@ -36,11 +41,12 @@ class Mechanical(AbstractMachine):
     | `q` | the names of its coordinates |
     | `mass` | the mass of each, or a mass matrix: numbers, or a method `mass(q)` |
     | `force(t, q, v)` | the applied force on each, by name |
+    | `prescribed(t)` | by name, places of coordinates whose motion is given: moving walls |
     | `cycle`, `contacts`, `events`, `modes` | as of every machine |
 
     A contact is `on` a coordinate, `on="y"`, or a gap of several, `on=lambda q: q.left - q.right`.
     The momentum of an impact, the mass that it acts on (`Run.impact_energy`) and inertial terms
-    follow from the masses.
+    follow from the masses. `mass` and `force` are of those coordinates only whose motion is free.
     """
 
     q: ClassVar[tuple[str, ...]]
@@ -51,15 +57,23 @@ class Mechanical(AbstractMachine):
         """`force(t, q, v)`: the applied force on each coordinate, by name; behind them it gets the
         machine's own modes."""
 
+    def prescribed(self, t: Scalar) -> dict[str, Any]:
+        """The places of coordinates whose motion is given, as functions of time."""
+        return {}
+
     def at(self, v: Any = None, **places: Any) -> Named:
-        """A state: each coordinate's place, and in `v` each velocity by name; 0 if not given."""
-        names = self.q_names
+        """A state: each coordinate's place, and in `v` each velocity by name; 0 if not given, and
+        of those that are prescribed as at t = 0."""
+        names = self.free_names
         wrong = [x for x in (*places, *(v or {})) if x not in names]
         if wrong:
             raise ValueError(f"{wrong[0]!r} is not one of the coordinates {', '.join(names)}.")
-        speeds = dict(v or {})
-        zeros = dict.fromkeys(names, 0.0)
-        return Named(**(zeros | places), v=Named(**(zeros | speeds)))
+        zeros = dict.fromkeys(self.q_names, 0.0)
+        at, rate = zeros | places, zeros | dict(v or {})
+        if len(names) < len(zeros):
+            given = jax.jvp(self.prescribed, (jnp.asarray(0.0),), (jnp.asarray(1.0),))
+            at, rate = at | given[0], rate | given[1]
+        return Named(**at, v=Named(**rate))
 
     def start(self) -> Named:
         """At rest with all coordinates zero."""
@@ -75,18 +89,51 @@ class Mechanical(AbstractMachine):
             )
         return (self.q,) if isinstance(self.q, str) else tuple(self.q)
 
+    @property
+    def free_names(self) -> tuple[str, ...]:
+        """The names of the coordinates whose motion is not prescribed."""
+        if type(self).prescribed is Mechanical.prescribed:
+            return self.q_names
+        given = jax.eval_shape(self.prescribed, 0.0)
+        unknown = [x for x in given if x not in self.q_names]
+        if unknown:
+            raise ValueError(
+                f"`prescribed` of a {type(self).__name__} returned {unknown[0]!r}, which is not "
+                f"one of the coordinates {', '.join(self.q_names)}."
+            )
+        return tuple(x for x in self.q_names if x not in given)
+
     def field(self, t: Scalar, state: State, *modes: Scalar) -> Any:
         """The rate of the state: velocities, and accelerations by Lagrange's equations."""
-        q, v = self.places(state), state.v
+        q, v, names = self.places(state), state.v, self.free_names
         whose = f"`force` of a {type(self).__name__}"
-        applied = like(v, self.force(t, q, v, *modes), whose)
+        free = Named(**{name: getattr(v, name) for name in names})
+        applied = like(free, self.force(t, q, v, *modes), whose)
         if not isinstance(applied, Named):
-            names = ", ".join(f"{name}=..." for name in self.q_names)
-            raise TypeError(f"{whose} must return forces by name, `dict({names})`.")
+            by_name = ", ".join(f"{name}=..." for name in names)
+            raise TypeError(f"{whose} must return forces by name, `dict({by_name})`.")
         applied = vars(applied)
         left = [f - h for f, h in zip(applied.values(), self._inertial(q, v), strict=True)]
-        rates = solved(self.masses(q), left)
-        return Named(**vars(v), v=Named(**dict(zip(self.q_names, rates, strict=True))))
+        rates = dict(zip(names, solved(self.masses(q), left), strict=True))
+        if len(names) < len(self.q_names):
+            rates |= self._guided(t, q, v)
+        return Named(**vars(v), v=Named(**{name: rates[name] for name in self.q_names}))
+
+    def _guided(self, t: Scalar, q: Named, v: Named) -> dict[str, Any]:
+        """The accelerations of prescribed coordinates. What errors of steps leave fades: else it
+        would add up, and an orbit would be neutral in them."""
+        one, rate = jnp.ones_like(t), _FADES / self.cycle
+
+        def moves(t: Scalar) -> Any:
+            return jax.jvp(self.prescribed, (t,), (one,))
+
+        (places, speeds), (_, pulls) = jax.jvp(moves, (t,), (one,))
+        return {
+            name: pull
+            + 2 * rate * (speeds[name] - getattr(v, name))
+            + rate**2 * (places[name] - getattr(q, name))
+            for name, pull in pulls.items()
+        }
 
     def places(self, state: State) -> Named:
         """The coordinates in a state, without velocities."""
@@ -100,17 +147,19 @@ class Mechanical(AbstractMachine):
                 f"A {type(self).__name__} must have `mass`: one for each of its coordinates, in "
                 "the class or by a method `mass(self, q)`."
             )
-        return matrix_of(given(q) if callable(given) else given, self.q_names, type(self).__name__)
+        return matrix_of(
+            given(q) if callable(given) else given, self.free_names, type(self).__name__
+        )
 
     def _inertial(self, q: Named, v: Named) -> list[Any]:
         """h, what the applied forces are diminished by; 0 where the masses are constant."""
-        names, speeds = self.q_names, list(vars(v).values())
-        n = len(names)
+        names = self.free_names
+        speeds, n = [getattr(v, name) for name in names], len(names)
         h: list[Any] = [0.0] * n
         if not callable(getattr(self, "mass", None)):
             return h
         turns = moving(self.masses, q)
-        for k, name in enumerate(names):
+        for name in self.q_names:
             if not any(name in where for where in turns.values()):
                 continue
             slopes = _slope(self.masses, q, name)
@@ -118,8 +167,10 @@ class Mechanical(AbstractMachine):
                 sum(slopes[i][j] * speeds[j] for j in range(n) if name in turns.get((i, j), ()))
                 for i in range(n)
             ]
-            h = [x + speeds[k] * y for x, y in zip(h, moves, strict=True)]
-            h[k] = h[k] - 0.5 * sum(x * y for x, y in zip(speeds, moves, strict=True))
+            h = [x + getattr(v, name) * y for x, y in zip(h, moves, strict=True)]
+            if name in names:
+                k = names.index(name)
+                h[k] = h[k] - 0.5 * sum(x * y for x, y in zip(speeds, moves, strict=True))
         return h
 
     def coordinate_on(self, on: Any, mass: Any = None) -> Coordinate:
@@ -176,10 +227,18 @@ def _slope(function: Callable[[Named], Any], q: Named, name: str) -> Any:
 def _push(machine: Mechanical, on: Any, q: Named) -> tuple[list[Any], Any]:
     """M⁻¹Jᵀ/(J M⁻¹Jᵀ), how the velocities change where that of a gap changes by one, and
     1/(J M⁻¹Jᵀ), the mass that its force acts on."""
-    slopes = _slopes(machine, on, q)
+    names = machine.free_names
+    slopes = dict(zip(machine.q_names, _slopes(machine, on, q), strict=True))
+    slopes = [slopes[name] for name in names]
     push = solved(machine.masses(q), slopes)
     gain = sum(x * y for x, y in zip(slopes, push, strict=True) if not _is_zero(x))
-    return [0.0 if _is_zero(x) else x / gain for x in push], 1 / gain
+    if _is_zero(gain):
+        raise ValueError(
+            f"A contact of a {type(machine).__name__} is `on` nothing that it could move: its gap "
+            "must depend on a coordinate that is not prescribed."
+        )
+    by = {name: 0.0 if _is_zero(x) else x / gain for name, x in zip(names, push, strict=True)}
+    return [by.get(name, 0.0) for name in machine.q_names], 1 / gain
 
 
 def _effective(machine: Mechanical, on: Any, s: Scalar, state: State) -> Any:
