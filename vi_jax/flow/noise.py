@@ -14,6 +14,7 @@ from jaxtyping import Array, UInt32
 
 from .._checks import concrete, count, require_real
 from .._types import Flag, Scalar, State
+from ..lanes import dependent_results
 from ..machine import AbstractMachine, Prepared, is_autonomous, leaf_names
 from ._lane import Impulses, Plan, has_fixed_cycle, ticks
 from ._own import in_words_of
@@ -188,9 +189,7 @@ def _duration(machine: AbstractMachine, start: State) -> Scalar | float | None:
     # The independent variable is in proportion to time if its pace needs neither it nor the state.
     zero = jnp.zeros_like(machine.position(start))
     traced = jax.make_jaxpr(machine.pace)(zero, start).jaxpr
-    read = {id(x) for equation in traced.eqns for x in equation.invars}
-    read |= {id(x) for x in traced.outvars}
-    if any(id(x) in read for x in traced.invars):
+    if any(dependent_results(traced, [True] * len(traced.invars), smooth=False)):
         return None
     pace = machine.pace(zero, start)
     assert pace is not None

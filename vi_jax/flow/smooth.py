@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.core import Tracer
-from jax.extend.core import Jaxpr, Literal
+from jax.extend.core import Jaxpr
 from jax.lax import stop_gradient
 
 from .._types import Flag, Scalar, Scalars, State
-from ..lanes import called
+from ..lanes import called, walked
 from ..machine import (
     AbstractMachine,
     Coordinate,
@@ -131,26 +131,19 @@ def is_affine(function: Callable[[State], Scalar], state: State) -> bool:
     """Return whether a function of the state is a sum of its numbers with constant factors, so that
     it is known as well as they are; found while a step is traced."""
 
-    def affine(jaxpr: Jaxpr, moving: list[bool]) -> list[bool] | None:
-        found = {v for v, moves in zip(jaxpr.invars, moving, strict=True) if moves}
-        for eqn in jaxpr.eqns:
-            moves = [not isinstance(x, Literal) and x in found for x in eqn.invars]
-            if not any(moves):
-                continue
-            name, outs = eqn.primitive.name, [True] * len(eqn.outvars)
-            inner = called(eqn)
-            if inner is not None:
-                outs = affine(inner if isinstance(inner, Jaxpr) else inner.jaxpr, moves)
-            elif name not in _LINEAR and not (name in _BILINEAR and sum(moves) == 1):
-                if name != "div" or moves[1]:
-                    return None
-            if outs is None:
-                return None
-            found |= {v for v, out in zip(eqn.outvars, outs, strict=True) if out}
-        return [not isinstance(x, Literal) and x in found for x in jaxpr.outvars]
+    def moved(eqn: Any, moves: list[bool]) -> list[bool]:
+        name, body = eqn.primitive.name, called(eqn)
+        if body is not None:
+            return walked(body if isinstance(body, Jaxpr) else body.jaxpr, moves, moved)
+        linear = name in _LINEAR or (name in _BILINEAR and sum(moves) == 1)
+        if not linear and (name != "div" or moves[1]):
+            others.append(name)
+        return [True] * len(eqn.outvars)
 
+    others: list[str] = []
     jaxpr = jax.make_jaxpr(function)(state).jaxpr
-    return affine(jaxpr, [True] * len(jaxpr.invars)) is not None
+    walked(jaxpr, [True] * len(jaxpr.invars), moved)
+    return not others
 
 
 def rounding(machine: AbstractMachine, state: State) -> Scalar | float:

@@ -5,6 +5,7 @@ from ._interrupts import raise_dropped as raise_dropped
 from ._primitive import vector_only as vector_only
 from ._program import called as called
 from ._program import dependent_results as dependent_results
+from ._program import walked as walked
 from ._vector import Unsupported as Unsupported
 from .call import interruptible as interruptible
 from .elementary import elementwise_primitive as elementwise_primitive

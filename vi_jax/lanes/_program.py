@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -272,47 +272,61 @@ def _parameter(value: object, one: Callable[[Any], Any]) -> Any:
     return value
 
 
+def bodies(eqn: Any) -> list[Jaxpr]:
+    """The jaxprs in the parameters of an equation."""
+    values = [x for v in eqn.params.values() for x in (v if isinstance(v, tuple) else (v,))]
+    return [inner(x) for x in values if isinstance(x, Jaxpr | ClosedJaxpr)]
+
+
 def size_of(jaxpr: Jaxpr) -> int:
     """The number of operations, those of inner jaxprs once."""
-    total = 0
-    for eqn in jaxpr.eqns:
-        held = [x for v in eqn.params.values() for x in (v if isinstance(v, tuple) else (v,))]
-        held = [x for x in held if isinstance(x, Jaxpr | ClosedJaxpr)]
-        total += 1 + sum(size_of(inner(x)) for x in held)
-    return total
+    return sum(1 + sum(map(size_of, bodies(eqn))) for eqn in jaxpr.eqns)
 
 
 # Primitives with floating-point results whose derivative is zero, or is treated as zero.
 _ZERO_DERIVATIVE = ("stop_gradient", "sign", "round", "floor", "ceil")
 
 
+def walked(
+    jaxpr: Jaxpr,
+    marks: Sequence[bool],
+    rule: Callable[[Any, list[bool]], list[bool]],
+    visit: Callable[[Any, list[bool], list[bool]], None] = lambda *_: None,
+) -> list[bool]:
+    """Carry marks from the arguments of a jaxpr through its equations to its results.
+
+    **Arguments:** `marks`, which arguments are marked; `rule`, which results of an equation are, by
+    the equation and its marked arguments, if there are any; `visit`, called with each equation and
+    the marks of its arguments and results.
+    """
+    found = {v for v, mark in zip(jaxpr.invars, marks, strict=True) if mark}
+    marked = lambda atoms: [not isinstance(a, Literal) and a in found for a in atoms]
+    for eqn in jaxpr.eqns:
+        args = marked(eqn.invars)
+        outs = rule(eqn, args) if any(args) else [False] * len(eqn.outvars)
+        found.update(v for v, mark in zip(eqn.outvars, outs, strict=True) if mark)
+        visit(eqn, args, outs)
+    return marked(jaxpr.outvars)
+
+
 def dependent_results(jaxpr: Jaxpr, sources: Sequence[bool], *, smooth: bool) -> list[bool]:
     """Which results of a jaxpr may depend on its arguments `sources`; if `smooth`, only dependence
     that can have a derivative counts."""
-    found = {v for v, s in zip(jaxpr.invars, sources, strict=True) if s}
-    for _, _, outs in _dependent_equations(jaxpr, found, smooth=smooth):
-        found.update(outs)
-    return [not isinstance(a, Literal) and a in found for a in jaxpr.outvars]
-
-
-def _dependent_equations(
-    jaxpr: Jaxpr, found: Set[Any], *, smooth: bool
-) -> Iterator[tuple[Any, list[bool], list[Any]]]:
-    """Yield the equations that depend on the variables `found`, to which the caller adds what each
-    gives: the equation, which of its arguments depend, and those of its results that do."""
-    for eqn in jaxpr.eqns:
-        args = [not isinstance(a, Literal) and a in found for a in eqn.invars]
-        if not any(args) or (smooth and eqn.primitive.name in _ZERO_DERIVATIVE):
-            continue
-        which = dependent_of_equation(eqn, args, smooth=smooth)
-        outs: list[Any] = [v for v, here in zip(eqn.outvars, which, strict=True) if here]
-        if smooth:
-            outs = [v for v in outs if jnp.issubdtype(v.aval.dtype, jnp.inexact)]
-        yield eqn, args, outs
+    return walked(jaxpr, sources, functools.partial(dependent_of_equation, smooth=smooth))
 
 
 def dependent_of_equation(eqn: Any, args: list[bool], *, smooth: bool) -> list[bool]:
-    """Which results of an equation depend on the arguments `args`."""
+    """Which results of an equation depend on the arguments `args`, some of which hold."""
+    if not smooth:
+        return _dependent(eqn, args, smooth=False)
+    if eqn.primitive.name in _ZERO_DERIVATIVE:
+        return [False] * len(eqn.outvars)
+    inexact = [jnp.issubdtype(v.aval.dtype, jnp.inexact) for v in eqn.outvars]
+    found = _dependent(eqn, args, smooth=True)
+    return [a and b for a, b in zip(found, inexact, strict=True)]
+
+
+def _dependent(eqn: Any, args: list[bool], *, smooth: bool) -> list[bool]:
     name, params = eqn.primitive.name, eqn.params
     depends = functools.partial(dependent_results, smooth=smooth)
     if not (smooth and name in OWN_DERIVATIVE) and (body := called(eqn)) is not None:
@@ -345,18 +359,18 @@ def dependent_in_scan(eqn: Any, args: list[bool]) -> list[bool]:
 def loop_depends(jaxpr: Jaxpr, sources: Sequence[bool]) -> bool:
     """Whether a `while` of a jaxpr, or of one that it calls, has results with a derivative with
     respect to the arguments `sources`."""
-    found = {v for v, s in zip(jaxpr.invars, sources, strict=True) if s}
-    for eqn, args, outs in _dependent_equations(jaxpr, found, smooth=True):
-        found.update(outs)
-        if eqn.primitive.name == "while" and outs:
-            return True
-        body = called(eqn) if eqn.primitive.name not in OWN_DERIVATIVE else None
-        bodies = [(body, args)] if body is not None else []
-        if eqn.primitive.name == "cond":
-            bodies = [(branch, args[1:]) for branch in eqn.params["branches"]]
-        if any(loop_depends(inner(x), which) for x, which in bodies):
-            return True
-    return False
+    found = []
+
+    def visit(eqn: Any, args: list[bool], outs: list[bool]) -> None:
+        name = eqn.primitive.name
+        found.append(name == "while" and any(outs))
+        if name == "cond" and any(args):
+            found.extend(loop_depends(inner(x), args[1:]) for x in eqn.params["branches"])
+        elif any(args) and name not in OWN_DERIVATIVE and (body := called(eqn)) is not None:
+            found.append(loop_depends(inner(body), args))
+
+    walked(jaxpr, sources, functools.partial(dependent_of_equation, smooth=True), visit)
+    return any(found)
 
 
 def scan_counts(params: Mapping[str, Any]) -> tuple[int, int]:

@@ -30,6 +30,7 @@ from ._program import (
     evaluated,
     inner,
     loop_depends,
+    walked,
 )
 from ._trace import shape_of
 from ._vector import Unsupported, check
@@ -72,15 +73,12 @@ def with_weights(closed: ClosedJaxpr, weights: Sequence[bool]) -> ClosedJaxpr:
 
 
 def _rewritten(jaxpr: Jaxpr, weights: Sequence[bool]) -> Jaxpr:
-    found = {v for v, w in zip(jaxpr.invars, weights, strict=True) if w}
     eqns = []
-    for eqn in jaxpr.eqns:
-        args = [not isinstance(a, Literal) and a in found for a in eqn.invars]
-        if any(args):
-            outs = dependent_of_equation(eqn, args, smooth=False)
-            found.update(v for v, out in zip(eqn.outvars, outs, strict=True) if out)
-            eqn = _equation(eqn, args)
-        eqns.append(eqn)
+
+    def visit(eqn: Any, args: list[bool], _: list[bool]) -> None:
+        eqns.append(_equation(eqn, args) if any(args) else eqn)
+
+    walked(jaxpr, weights, functools.partial(dependent_of_equation, smooth=False), visit)
     return jaxpr.replace(eqns=eqns)
 
 

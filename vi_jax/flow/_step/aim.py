@@ -93,9 +93,7 @@ def aim_at(plan: Plan, lane: Lane, trial: Trial, foreseen: bool) -> tuple[Flag, 
     static.
     """
     # What is found out here is only where to look.
-    trial = trial._replace(
-        h=stop_gradient(trial.h), seen=trial.seen._replace(paths=stop_gradient(trial.paths))
-    )
+    trial = trial._replace(h=stop_gradient(trial.h), paths=stop_gradient(trial.paths))
     nothing = jnp.zeros_like(trial.good), trial.h, jnp.full_like(trial.h, FREE)
     if not trial.paths and not trial.crossings:
         return nothing
@@ -234,7 +232,7 @@ def _seen(plan: Plan, lane: Lane, trial: Trial) -> _Seen:
         courses.append((turned, partial(quintic, path.begin, end, h)))
     rises = []
     if sides:
-        found = crests(plan, sides, trial.seen.shares, h)
+        found = crests(plan, sides, trial.shares, h)
         rises = [(good & x & y, at) for (x, at), y in zip(found, below, strict=True)]
     return _Seen(guards, courses, humps, rises, twice)
 

@@ -25,15 +25,15 @@ from .trial import Situation, Trial
 def arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Flag]:
     """The lane after a step, with its event applied and recorded, and whether the interval is
     complete. If the step is not `taken`, the lane stays what it was."""
-    end, position = trial.end, plan.machine.position
+    position = plan.machine.position
     there = lane._replace(
-        s=end.s, state=end.state, direction=_along(plan, lane, trial), below=trial.seen.below,
+        s=trial.s, state=trial.state, direction=_along(plan, lane, trial), below=trial.below,
         completed=trial.ends_interval,
-    ).recording(integrals=end.integrals)  # fmt: skip
+    ).recording(integrals=trial.integrals)  # fmt: skip
     # Y where the step ends, and before the state jumps there, where something may move it.
-    here = position(end.state)
+    here = position(trial.state)
     places = (here, here) if plan.machine.others else (here,)
-    way = FlowToEvent(plan, trial.smooth, lane.part, (end.s, end.state, end.integrals))
+    way = FlowToEvent(plan, trial.smooth, lane.part, (trial.s, trial.state, trial.integrals))
     at = Situation(plan, lane, trial, taken, way)
     if trial.crossings:
         met = jnp.zeros_like(taken)

@@ -40,66 +40,35 @@ class Path(NamedTuple):
     it is slow; absent where it cannot rest."""
 
 
-class End(NamedTuple):
-    """Independent variable, state and integrals where a step ends."""
-
-    s: Scalar
-    state: State
-    integrals: Integrals
-
-
-class Seen(NamedTuple):
-    """What a step shows of events and coordinates."""
-
-    crossings: tuple[Crossing, ...]
-    """The machine's events."""
-    paths: tuple[Path, ...]
-    """Of each coordinate; none where nothing asks for it."""
-    below: Scalars
-    """As in `Lane`, at the step's end."""
-    shares: tuple[float, ...]
-    """The places within the step at which guards were evaluated, as shares of it; static."""
-
-
 class Trial(NamedTuple):
     """A step that was tried."""
 
     h: Scalar
     """The step's length in `s`."""
-    end: End
+    s: Scalar
+    """Independent variable, state and integrals where it ends."""
+    state: State
+    integrals: Integrals
     error: Scalar
     """Relative to the tolerance, as the method says."""
     good: Flag
     """Its end is a number, and its error small enough."""
     ends_interval: Flag
     """Its end is that of an interval of `s`."""
-    seen: Seen
+    crossings: tuple[Crossing, ...]
+    """The machine's events as it saw them."""
+    paths: tuple[Path, ...]
+    """What it saw of each coordinate; none where nothing asks for it."""
+    below: Scalars
+    """As in `Lane`, at the step's end."""
+    shares: tuple[float, ...]
+    """The places within the step at which guards were evaluated, as shares of it; static."""
     smooth: SmoothMachine
     """The machine as the step saw it: its bodies held where they rest."""
     alone: tuple[SmoothMachine, ...]
     """Of each coordinate, the machine in its modes with the other bodies held that rest."""
     clear: Flag | None
     """Nothing can have been met within it; absent where that is never known before."""
-
-    @property
-    def s(self) -> Scalar:
-        """The independent variable where the step ends."""
-        return self.end.s
-
-    @property
-    def state(self) -> State:
-        """The state where the step ends."""
-        return self.end.state
-
-    @property
-    def crossings(self) -> tuple[Crossing, ...]:
-        """The events that it came by."""
-        return self.seen.crossings
-
-    @property
-    def paths(self) -> tuple[Path, ...]:
-        """Of each coordinate, what the step saw of it."""
-        return self.seen.paths
 
 
 class Situation(NamedTuple):
@@ -176,8 +145,10 @@ def attempt(
         for k, one in enumerate(alone):
             paths.append(_path(plan, lane, k, one, smooth, (s1, new, h, limit), good, seen))
     met, below = crossings(plan, lane, smooth, paths, (s1, h, new), (good, last), seen)
-    end, found = End(s1, new, elapsed(old, beside, h)), Seen(met, tuple(paths), below, shares)
-    return Trial(h, end, error, good, last, found, smooth, alone, nothing)
+    return Trial(
+        h, s1, new, elapsed(old, beside, h), error, good, last, met, tuple(paths), below, shares,
+        smooth, alone, nothing,
+    )  # fmt: skip
 
 
 def _clear(plan: Plan, lane: Lane) -> Scalar | None:
