@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
+from vi_jax.flow import number_of
 from vi_jax.flow.results import code as code_of
-from vi_jax.flow.results import number_of
 
 CYCLES = 3
 BASE = vi.Scene(

@@ -81,11 +81,11 @@ def test_a_crowd(name):
 
     run, depth, size = vi.jit(jax.vmap(one))(drawn, starts)
     good = np.asarray(run.successful)
-    assert good.mean() > 0.95, np.unique(np.asarray(run.result._value), return_counts=True)
+    assert good.mean() > 0.95, np.unique(np.asarray(run.result.number), return_counts=True)
     for leaf in jax.tree.leaves((run.sections, run.y_max, run.y_min, run.impact_energy)):
         assert np.isfinite(np.asarray(leaf)[good]).all()
     assert (np.asarray(depth / size)[good] < 1e-12).all()
     assert (np.asarray(run.impact_energy)[good] >= 0).all()
     assert int(np.asarray(run.impacts)[good].sum()) > LANES
     # Each that failed has its reason, and what came before it.
-    assert (np.asarray(run.result._value)[~good] > 0).all()
+    assert (np.asarray(run.result.number)[~good] > 0).all()

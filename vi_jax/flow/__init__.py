@@ -14,6 +14,8 @@ from .arguments import machine_of as machine_of
 from .arguments import planned as planned
 from .arguments import shape_of as shape_of
 from .enumeration import NamedEnumeration as NamedEnumeration
+from .enumeration import in_names as in_names
+from .enumeration import number_of as number_of
 from .events import Rates as Rates
 from .events import guard_rates as guard_rates
 from .fusion import compiling as compiling
@@ -24,7 +26,6 @@ from .integrals import carried as carried
 from .integrals import elapsed as elapsed
 from .integrals import means as means
 from .labelled import batch_names as batch_names
-from .labelled import in_names as in_names
 from .labelled import present as present
 from .labelled import states as states
 from .labelled import tidy as tidy
@@ -59,7 +60,6 @@ from .results import EventLog as EventLog
 from .results import ImpactLog as ImpactLog
 from .results import Run as Run
 from .results import Samples as Samples
-from .results import number_of as number_of
 from .smooth import SmoothMachine as SmoothMachine
 from .smooth import in_modes as in_modes
 from .suggest import Suggestion as Suggestion

@@ -7,80 +7,93 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jaxtyping import Array, Int
 
 # Of a batch no more than so many are listed one by one: a choice, what fits a line.
 _LISTED = 8
 
-
-def _near(name: str, names: Any) -> str:
-    near = difflib.get_close_matches(name, names, n=3, cutoff=0.5)
-    return f"near names: {', '.join(near)}" if near else f"its members: {', '.join(names)}"
-
-
 if TYPE_CHECKING:
     from equinox import Enumeration as NamedEnumeration
+
+    _Member: Any = None
 else:
 
-    class _Plain(eqx.Enumeration):
-        """Only for its members, whose class Equinox does not name."""
+    class _Member(eqx.Module):
+        """A member of an enumeration, or one for each lane of a batch."""
 
-        member = ""
+        number: Any
+        kind: type = eqx.field(static=True)
 
-    class _Member(type(_Plain.member)):
-        """A member, or a batch of them, that prints by name."""
+        def __eq__(self, other):
+            if not isinstance(other, self.kind):
+                raise ValueError(f"A {self.kind.__name__} has no order with {other!r}.")
+            return jnp.equal(self.number, other.number)
+
+        def __ne__(self, other):
+            return ~(self == other)
 
         def __repr__(self) -> str:
-            kind = self._enumeration
-            place, names = self._value, np.asarray(list(kind._name_to_item))
-            if isinstance(place, Tracer):
-                return f"{kind.__name__}<traced>"
-            if not isinstance(place, jnp.ndarray | np.ndarray):
-                return f"{kind.__name__}<unknown>"
-            found = names[np.asarray(place)]
+            name, number = self.kind.__name__, self.number
+            if isinstance(number, Tracer):
+                return f"{name}<traced>"
+            if not isinstance(number, jnp.ndarray | np.ndarray):
+                return f"{name}<unknown>"
+            found = names_of(self.kind)[number]
             if not found.ndim:
-                return f"{kind.__name__}.{found}"
+                return f"{name}.{found}"
             if found.size <= _LISTED:
-                return f"{kind.__name__}{found.tolist()}".replace("'", "")
+                return f"{name}{found.tolist()}".replace("'", "")
             kinds, counts = np.unique(found, return_counts=True)
-            parts = (f"{count:,} {name}" for name, count in zip(kinds, counts, strict=True))
-            return f"{kind.__name__}[{', '.join(parts)}; shape {found.shape}]"
+            parts = (f"{count:,} {kind}" for kind, count in zip(kinds, counts, strict=True))
+            return f"{name}[{', '.join(parts)}; shape {found.shape}]"
 
-    class _Kind(type(eqx.Enumeration)):
-        """What makes the class, with members of that kind."""
-
+    class _Kind(type):
         def __new__(mcs, name, bases, namespace):
+            texts = {k: x for k, x in namespace.items() if isinstance(x, str) and k[0] != "_"}
             cls = super().__new__(mcs, name, bases, namespace)
-            for word, item in cls._name_to_item.items():
-                cls._name_to_item[word] = _Member(item._value, cls)
+            cls._texts = texts
+            for number, word in enumerate(texts):
+                setattr(cls, word, _Member(np.asarray(number, np.int32), cls))
             return cls
 
+        def __instancecheck__(cls, value):
+            return isinstance(value, _Member) and value.kind is cls
+
+        def __getitem__(cls, item):
+            return list(cls._texts.values())[int(item.number)]
+
         def __getattr__(cls, name: str) -> Any:
-            try:
-                return super().__getattr__(name)
-            except AttributeError:
-                if name.startswith("_"):
-                    raise
-                raise AttributeError(
-                    f"`{cls.__name__}` has no member {name!r}; {_near(name, cls._name_to_item)}."
-                ) from None
+            if name.startswith("_"):
+                raise AttributeError(name)
+            near = difflib.get_close_matches(name, cls._texts, n=3, cutoff=0.5)
+            words = f"{'near names' if near else 'its members'}: {', '.join(near or cls._texts)}"
+            raise AttributeError(f"`{cls.__name__}` has no member {name!r}; {words}.")
 
-        def __dir__(cls) -> list[str]:
-            return [*super().__dir__(), *cls._name_to_item]
+    class NamedEnumeration(metaclass=_Kind):
+        """Names with a text each, as class attributes. Members are pytrees, which may be traced and
+        batched, and `RESULTS[item]` is the text of one."""
 
-    class NamedEnumeration(eqx.Enumeration, metaclass=_Kind):
-        """An `equinox.Enumeration` whose members print by their names.
-
-        As there, `RESULTS[item]` is what an item means, in words.
-        """
-
-    def _where(cls, pred, a, b):
-        chosen = super(NamedEnumeration, cls).where(pred, a, b)
-        return _Member(chosen._value, cls)
-
-    # Equinox takes the name in a body for that of a member.
-    NamedEnumeration.where = classmethod(_where)
+        @classmethod
+        def where(cls, condition, a, b):
+            """`jnp.where` of two members."""
+            return _Member(jnp.where(condition, a.number, b.number), cls)
 
 
-def names_of(kind: type) -> tuple[str, ...]:
+def names_of(kind: Any) -> np.ndarray:
     """The names of the members of an enumeration, in their order."""
-    return tuple(kind._name_to_item)  # pyright: ignore[reportAttributeAccessIssue]
+    return np.asarray(list(kind._texts))
+
+
+def in_names(member: Any) -> np.ndarray:
+    """The names of members, one for each lane."""
+    return names_of(member.kind)[np.asarray(member.number)]
+
+
+def number_of(member: Any) -> Int[Array, "..."]:
+    """The place of a member in its enumeration; a number for each lane."""
+    return jnp.asarray(member.number)
+
+
+def member_of(kind: Any, number: Any) -> Any:
+    """The member of an enumeration at this place; one for each lane."""
+    return _Member(jnp.asarray(number, jnp.int32), kind)

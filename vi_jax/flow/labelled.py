@@ -4,9 +4,7 @@ import enum
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int
 
 from .._checks import one_of
 from .._types import State, xr
@@ -99,17 +97,6 @@ def _met(log: Any, number: str) -> Any:
     `number` is negative."""
     rows = log.stack(row=log[number].dims).reset_index("row")
     return rows.isel(row=np.flatnonzero(np.asarray(rows[number]) >= 0))
-
-
-def place_of(item: object, items: Sequence[Any]) -> Int[Array, "..."]:
-    """Which of these items of an enumeration it is; a number for each lane."""
-    return jnp.asarray(sum(jnp.where(item == other, i, 0) for i, other in enumerate(items)))
-
-
-def in_names(item: object, kind: object, names: Sequence[str]) -> np.ndarray:
-    """Of items of an enumeration their names, one for each lane."""
-    place = place_of(item, [getattr(kind, name) for name in names])
-    return np.asarray(np.asarray(names)[np.asarray(place)])
 
 
 def run_dataset(

@@ -23,9 +23,9 @@ from ..machine import (
     state_in_words,
     with_modes,
 )
-from .enumeration import NamedEnumeration, names_of
+from .enumeration import NamedEnumeration, in_names, member_of, names_of
 from .labelled import EVENTS as EVENTS
-from .labelled import in_names, place_of, run_dataset
+from .labelled import run_dataset
 
 
 class RESULTS(NamedEnumeration):
@@ -80,10 +80,8 @@ class RESULTS(NamedEnumeration):
     ended = "An event of the machine ended the motion; `Run.outcome` says with which outcome."
 
 
-REASON_NAMES = names_of(RESULTS)
+REASON_NAMES = tuple(names_of(RESULTS).tolist())
 """Their names, in the order of the numbers by which the loop carries them."""
-
-_REASONS = tuple(getattr(RESULTS, name) for name in REASON_NAMES)
 
 
 def code(name: str) -> float:
@@ -108,15 +106,7 @@ def outcome_of(reason: Scalar) -> Int[Array, ""]:
 
 def reason_of(reason: Scalar) -> RESULTS:
     """The enumeration item for a reason carried as a number."""
-    result, number = _REASONS[0], jnp.floor(reason)
-    for n, item in enumerate(_REASONS[1:], start=1):
-        result = RESULTS.where(number == n, item, result)
-    return result
-
-
-def number_of(result: RESULTS) -> Int[Array, "..."]:
-    """The place of a reason in `REASON_NAMES`; 0 is success."""
-    return place_of(result, _REASONS)
+    return member_of(RESULTS, jnp.floor(reason))
 
 
 class Samples(Shown):
@@ -335,7 +325,7 @@ class Run(Summarized):
         **Raises:** `ValueError` if these are not as many as there are batch axes, or there is no
         such dimension.
         """
-        return run_dataset(self, dims, in_names(self.result, RESULTS, REASON_NAMES), along)
+        return run_dataset(self, dims, in_names(self.result), along)
 
     def drawn(self) -> Any:
         """The smallest position in each cycle."""

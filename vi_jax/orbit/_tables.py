@@ -13,7 +13,7 @@ from ..machine import AbstractMachine, components, with_units
 from ._shooting import Shooting
 from ._solution import sections_of
 from .curve import Step
-from .floquet import STABILITY, STABILITY_NAMES, stability_of
+from .floquet import stability_of
 from .results import Orbit
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def on_sections(problem: Shooting, steps: list[Step]) -> dict[str, np.ndarray]:
 def stability_in_words(multipliers: np.ndarray) -> np.ndarray:
     """Of each point's multipliers, (points, states), the name of the verdict in `STABILITY`."""
     verdicts = jax.vmap(stability_of)(jnp.asarray(multipliers))
-    return in_names(verdicts, STABILITY, STABILITY_NAMES)
+    return in_names(verdicts)
 
 
 def point_of(special: "SpecialPoint", steps: list[Step]) -> int:

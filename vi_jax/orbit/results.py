@@ -38,7 +38,7 @@ from ..machine import (
     summary_table,
     with_units,
 )
-from .floquet import STABILITY, STABILITY_NAMES, stability_of
+from .floquet import STABILITY, stability_of
 
 
 class ORBIT_RESULTS(NamedEnumeration):
@@ -72,12 +72,6 @@ class ORBIT_RESULTS(NamedEnumeration):
         "No orbit was found: the motion comes back to its state in other modes of the machine. Its "
         "period is longer: ask for more `cycles`."
     )
-
-
-_RESULT_NAMES = (
-    "successful", "smaller_period", "inadmissible", "no_orbit", "grazing", "drifts",
-    "equilibrium", "not_simulated", "other_modes",
-)  # fmt: skip
 
 
 class Orbit(Summarized):
@@ -237,8 +231,8 @@ class Orbit(Summarized):
         variables |= present({"multipliers": self.multipliers}, (*batch, "multiplier"))
         variables |= present({"monodromy": self.monodromy}, (*batch, "row", "column"))
         words = {
-            "result": in_names(self.result, ORBIT_RESULTS, _RESULT_NAMES),
-            "stability": in_names(self.stability, STABILITY, STABILITY_NAMES),
+            "result": in_names(self.result),
+            "stability": in_names(self.stability),
         }
         data = xr.Dataset(variables | present(words, batch))
         own = {name: name for name in self.averages}

@@ -15,8 +15,6 @@ from ..flow import MethodLike, in_names, machine_of, tidy
 from ..machine import AbstractMachine, components, with_leaf, with_units
 from ..orbit import (
     ORBIT_RESULTS,
-    STABILITY,
-    STABILITY_NAMES,
     AbstractRootFinder,
     InWords,
     Orbit,
@@ -102,7 +100,7 @@ class AllOrbits(InWords):
         for name in ("impacts", "duration", "y_min", "y_max", "clearance", "slowest_impact"):
             values = [np.asarray(getattr(orbit, name)) for orbit in self.orbits]
             data[name] = "motion", np.array(values, int if name == "impacts" else float)
-        words = [str(in_names(o.stability, STABILITY, STABILITY_NAMES)) for o in self.orbits]
+        words = [str(in_names(o.stability)) for o in self.orbits]
         data["stability"] = "motion", np.array(words, str)
         states = [components(orbit.sections, 1) for orbit in self.orbits]
         longest = max(self.periods, default=0)

@@ -16,7 +16,6 @@ from .._messages import in_parts, warning_once
 from .._programs import compiled, is_outermost
 from .._types import Scalar, State, xr
 from ..flow import (
-    REASON_NAMES,
     RESULTS,
     MethodLike,
     batch_names,
@@ -97,7 +96,7 @@ class Lyapunov(Summarized):
         variables = present({"exponents": self.exponents, "per_cycle": self.per_cycle}, each)
         variables |= states("state", self.state, batch)
         variables |= present(self.averages, batch)
-        alone = {"spread": self.spread, "result": in_names(self.result, RESULTS, REASON_NAMES)}
+        alone = {"spread": self.spread, "result": in_names(self.result)}
         data = xr.Dataset(variables | present(alone, batch))
         for name in ("exponents", "spread"):
             data[name].attrs |= attributes(self.unit)

@@ -15,7 +15,6 @@ from .._messages import in_parts, so_many, warning_once
 from .._programs import compiled, is_outermost
 from .._types import State, xr
 from ..flow import (
-    REASON_NAMES,
     RESULTS,
     MethodLike,
     batch_names,
@@ -115,7 +114,7 @@ class Sweep(Summarized):
         each = (*batch_names(dims, self.values.ndim - 1), "value")
         variables = present({name: getattr(self, name) for name in COLUMNS} | self.averages, each)
         variables |= states("section", self.sections, (*each, "cycle"))
-        variables["result"] = each, in_names(self.result, RESULTS, REASON_NAMES)
+        variables["result"] = each, in_names(self.result)
         data = xr.Dataset(variables, {self.parameter: (each, np.asarray(self.values))})
         data["period"].attrs |= flags(CODES)
         own = {name: name for name in (*self.averages, self.parameter)}
