@@ -188,30 +188,30 @@ def check_values(machine: AbstractMachine, start: State) -> None:
             found = jtu.tree_map(np.asarray, _values(machine, start, ticks))
     except Exception:  # the error is raised in words where field and guards are traced
         return
-    cycle, first, last, least = found
+    cycle, first, last, below = found
     ends = zip(jtu.tree_leaves_with_path(start), first, last, strict=True) if ticks else ()
     for (path, _), one, other in ends:
         if np.max(abs(one - other) / (1e-3 + abs(one) + abs(other))) > _APART:
             _warn_of_period(kind, jtu.keystr(path).lstrip(".") or "state", cycle.item())
             break
-    for i in np.flatnonzero(~(least < 0)):
+    for i in np.flatnonzero(~np.asarray(below, bool)):
         event = machine.others[i]
         _warn_of_guard(kind, int(i), event.name or type(event).__name__)
 
 
 @eqx.filter_jit(compiler_options={"xla_backend_optimization_level": "0"})  # pyright: ignore
 def _values(machine: AbstractMachine, start: State, ticks: bool) -> Any:
-    """The cycle; the field where it begins and where it ends, if `s` `ticks`; the least value of
-    each guard."""
+    """The cycle; the field where it begins and where it ends, if `s` `ticks`; which guards are
+    below zero in any state around the start."""
     zero = jnp.zeros_like(machine.position(start))
     modes, cycle = begin_modes(machine, zero, start), zero + machine.cycle
     ends = (zero, cycle) if ticks else ()
     fields = [jtu.tree_leaves(field_in(machine, s, start, modes)) for s in ends] or [(), ()]
-    return cycle, *fields, _least_guards(machine, start, modes) if machine.others else jnp.zeros(0)
+    return cycle, *fields, _guards_below(machine, start, modes) if machine.others else ()
 
 
-def _least_guards(machine: AbstractMachine, start: State, modes: Scalars) -> Array:
-    """The least value of the guard of each of the machine's events in states around the start."""
+def _guards_below(machine: AbstractMachine, start: State, modes: Scalars) -> Array:
+    """Which guards of the machine's events are below zero in some state around the start."""
     first, last = len(machine.stops) + len(machine.switches), len(events_of(machine)) - 1
     zero = jnp.zeros_like(machine.position(start))
     random = np.random.default_rng(0)
@@ -234,7 +234,7 @@ def _least_guards(machine: AbstractMachine, start: State, modes: Scalars) -> Arr
         return jnp.stack([jnp.asarray(x, zero.dtype) for x in found])
 
     around = s, jtu.tree_map(spread, start), tuple(map(chosen, modes))
-    return jnp.min(jax.vmap(guards)(*around), axis=0)
+    return jnp.any(jax.vmap(guards)(*around) < 0, axis=0)
 
 
 @functools.lru_cache(maxsize=64)

@@ -5,12 +5,155 @@ units in the last place (`tests/lanes/test_library.py`). Subnormal results may b
 that run lanes take such numbers for zero.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from fractions import Fraction
 from math import factorial, inf, log, nan, pi
 
-from ._functions import LN2, parts_of
-from ._real import Real, fast_sum, significand, two_sum
+from ._functions import LN2, horner, mantissa, parts_of
 from ._text import Text, Value
+
+# Terms from which on a polynomial is split; with all in one chain erf and erfc take a fifth longer.
+_LONG = 9
+
+
+class Real:
+    """A number of every lane with Python's operators; products may be fused with sums.
+
+    `plus` and `minus` round as they stand, where a later operation recovers what was rounded off.
+    """
+
+    def __init__(self, t: Text, value: Value):
+        self.t, self.value = t, value
+
+    def of(self, other: "Real | float") -> "Real":
+        """A Python number as one of these."""
+        if isinstance(other, Real):
+            return other
+        return Real(self.t, self.t.constant(other, "double"))
+
+    def _two(self, what: str, other: "Real | float", kind: str = "double") -> "Real":
+        return Real(self.t, self.t.binary(what, self.value, self.of(other).value, kind))
+
+    def __add__(self, other):
+        return self._two("fadd contract", other)
+
+    def __sub__(self, other):
+        return self._two("fsub contract", other)
+
+    def __rsub__(self, other):
+        return self.of(other) - self
+
+    def __mul__(self, other):
+        return self._two("fmul contract", other)
+
+    __radd__, __rmul__ = __add__, __mul__
+
+    def __truediv__(self, other):
+        return self._two("fdiv", other)
+
+    def __rtruediv__(self, other):
+        return self.of(other) / self
+
+    def __neg__(self):
+        return Real(
+            self.t, self.t.value(f"fneg {self.t.vector('double')} {self.value.text}", "double")
+        )
+
+    def plus(self, other):
+        return self._two("fadd", other)
+
+    def minus(self, other):
+        return self._two("fsub", other)
+
+    # Comparisons are false where either is NaN. They return flags for `choose`.
+
+    def __lt__(self, other):
+        return self._two("fcmp olt", other, "i1").value
+
+    def __gt__(self, other):
+        return self._two("fcmp ogt", other, "i1").value
+
+    def equals(self, other) -> Value:
+        return self._two("fcmp oeq", other, "i1").value
+
+    def choose(self, flag: Value, other) -> "Real":
+        """This where the flag holds, else the other."""
+        return Real(self.t, self.t.select(flag, self.value, self.of(other).value))
+
+    def at_most(self, most: float) -> "Real":
+        """The smaller of this and `most`; NaN stays NaN."""
+        return self.of(most).choose(self > most, self)
+
+    def at_least(self, least: float) -> "Real":
+        return self.of(least).choose(self < least, self)
+
+    def call(self, name: str, *others) -> "Real":
+        """The intrinsic of LLVM of this name, of this and the others."""
+        return Real(self.t, self.t.intrinsic(name, self.value, *(self.of(o).value for o in others)))
+
+    def size(self) -> "Real":
+        return self.call("fabs")
+
+    def with_sign_of(self, other: "Real") -> "Real":
+        return self.call("copysign", other)
+
+    def negative(self) -> Value:
+        """Whether the sign bit is set, as that of -0 is."""
+        bits = self.t.cast("bitcast", self.value, "i64")
+        return self.t.binary("icmp slt", bits, self.t.zero("i64"), "i1")
+
+    def is_zero(self) -> Value:
+        """Whether this is zero without a sign; no subnormal number is, whatever the processor."""
+        bits = self.t.cast("bitcast", self.value, "i64")
+        return self.t.binary("icmp eq", bits, self.t.zero("i64"), "i1")
+
+    def split(self) -> "tuple[Real, Real]":
+        """For a normal positive number, m between √½ and √2 and a whole n: m 2^n."""
+        m, power = mantissa(self.t, self.value)
+        return Real(self.t, m), Real(self.t, self.t.cast("sitofp", power, "double"))
+
+    def polynomial(self, coefficients: Sequence[float], first: int = 2) -> "Real":
+        """With these coefficients, constant term first; of a long one all but the `first` terms as
+        two that do not wait for each other, of the even powers and of the odd."""
+        if len(coefficients) < _LONG:
+            return Real(self.t, horner(self.t, coefficients, self.value))
+        square, rest = self * self, coefficients[first:]
+        even, odd = (square.polynomial(rest[i::2]) for i in range(2))
+        total = self * odd + even
+        for coefficient in coefficients[first - 1 :: -1]:
+            total = total * self + coefficient
+        return total
+
+    def power_of_two(self) -> "Real":
+        """2 to this whole number, from -1022 to 1023; infinity at 1024."""
+        t = self.t
+        # The sum's last bits are the exponent with its bias.
+        biased = t.cast("bitcast", self.plus(1.5 * 2.0**52 + 1023).value, "i64")
+        bits = t.binary("shl", biased, t.constant(52, "i64"))
+        return Real(t, t.cast("bitcast", bits, "double"))
+
+
+def two_sum(a: Real, b: Real) -> tuple[Real, Real]:
+    """a + b rounded, and what was rounded off."""
+    total = a.plus(b)
+    part = total.minus(a)
+    return total, a.minus(total.minus(part)).plus(b.minus(part))
+
+
+def fast_sum(a: Real, b: Real) -> tuple[Real, Real]:
+    """The same where |a| >= |b| or a is zero."""
+    total = a.plus(b)
+    return total, b.minus(total.minus(a))
+
+
+def significand(a: Real) -> tuple[Real, Real]:
+    """`Real.split` for any finite a >= 0; anything at zero."""
+    small = a < 2.0**-1022
+    # The bits of a subnormal number are its multiple of 2^-1074.
+    whole = Real(a.t, a.t.cast("uitofp", a.t.cast("bitcast", a.value, "i64"), "double"))
+    m, n = whole.choose(small, a).split()
+    return m, (n - 1074.0).choose(small, n)
+
 
 # Polynomials of elementary functions, constant term first.
 #
@@ -376,3 +519,63 @@ LIBRARY = {
         exp2, expm1, log1p, cbrt, erf, erfc,
     )
 }  # fmt: skip
+
+
+_LN2 = parts_of(log(2), 3)
+# ln((1 + s) / (1 - s)) / s = 2 + s² (2/3 + s² p(s²)), by Taylor's series; s² <= 0.0295.
+_THIRD, _THIRD_LOW = 2 / 3, float(Fraction(2, 3) - Fraction(2 / 3))
+_LOG_TAIL = tuple(2 / (2 * n + 5) for n in range(11))
+
+
+def _product(a: Real, b: Real) -> tuple[Real, Real]:
+    """a b rounded, and what was rounded off."""
+    product = a * b
+    return product, a.call("fma", b, -product)
+
+
+def _logarithm(a: Real) -> tuple[Real, Real]:
+    """ln(a) for a finite a > 0, as a sum of two numbers."""
+    m, n = significand(a)
+    f = m.minus(1.0)
+    below, off = fast_sum(a.of(2.0), f)
+    s = f / below
+    s_low = ((-s).call("fma", below, f) - s * off) / below
+    square, square_low = _product(s, s)
+    square_low = square_low + 2.0 * s * s_low
+    third, third_low = fast_sum(a.of(_THIRD), square * square.polynomial(_LOG_TAIL))
+    third_low = third_low + _THIRD_LOW
+    cube, cube_low = _product(square, third)
+    cube_low = cube_low + square * third_low + square_low * third
+    rest, rest_low = _product(s, cube)
+    rest_low = rest_low + s * cube_low + s_low * cube
+    # n ln(2) + 2s + rest: the first two parts of ln(2) times n are exact.
+    high, off = fast_sum(n * _LN2[0], 2.0 * s)
+    high, more = two_sum(high, n * _LN2[1])
+    high, least = two_sum(high, rest)
+    low = off + more + least + (n * _LN2[2] + 2.0 * s_low + rest_low)
+    return fast_sum(high, low)
+
+
+@rule
+def power(x: Real, y: Real) -> Real:
+    """x to the y as the C library has it, with its corners."""
+    t, a = x.t, x.size()
+    high, low = _logarithm(a)
+    high = x.of(-inf).choose(a.is_zero(), high.choose(a < inf, a))
+    exponent = y * high
+    # Beyond the range of results, where also infinities are, only the sign of it matters.
+    off = (y.call("fma", high, -exponent) + y * low).choose(exponent.size() < 800.0, 0.0)
+    n, s = exp_parts(exponent.at_least(-800.0).at_most(800.0))
+    value = 1.0 + (s + (off + s * off))
+    half = (0.5 * n).call("roundeven")
+    value = value * half.power_of_two() * (n - half).power_of_two()
+    whole = y.call("trunc").equals(y)
+    halves = 0.5 * y
+    even = halves.call("trunc").equals(halves)
+    odd = t.both(whole, t.inverse(even))
+    value = (-value).choose(t.both(odd, x.negative()), value)
+    undefined = t.both(t.both(x < 0.0, x > -inf), t.inverse(whole))
+    value = x.of(nan).choose(undefined, value)
+    one = t.both(a.equals(1.0), y.size().equals(inf))
+    value = x.of(1.0).choose(one, value)
+    return x.of(1.0).choose(t.binary("or", x.equals(1.0), y.equals(0.0)), value)

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from . import _functions as functions
-from ._library import LIBRARY
-from ._power import power
+from ._library import LIBRARY, power
 from ._text import KINDS, Text, Value, is_float
 
 

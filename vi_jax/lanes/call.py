@@ -17,9 +17,9 @@ from ctypes import POINTER, Structure, c_char_p, c_int, c_int32, c_int64, c_size
 import jax
 import numpy as np
 
-from ._driver import OUT_OF_MEMORY
 from ._interrupts import SUCCESS, HandlerResult, guard, interrupt_dropped, interrupt_raises, watch
 from ._recent import made_once
+from ._tape import OUT_OF_MEMORY
 from ._vector import Unsupported
 from .runtime import KernelCall, kernel_by_key
 
