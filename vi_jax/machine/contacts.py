@@ -24,6 +24,8 @@ _REDUNDANT = 1e-9
 def push_of(coordinate: Any, state: State) -> State:
     """A contact's push: how the state changes by as much of its force as changes its velocity by
     one."""
+    if coordinate.push is not None:
+        return coordinate.push(state)
     place, velocity = coordinate.position(state), coordinate.velocity(state)
     one = jnp.ones_like(velocity)
     return jax.jvp(lambda V: coordinate.placed(state, place, V), (velocity,), (one,))[1]

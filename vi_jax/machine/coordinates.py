@@ -21,6 +21,9 @@ class Coordinate(NamedTuple):
     mass: Any = 1.0
     """What an impact acts on, in the machine's unit of mass: of two bodies the reduced mass. A
     number, or a function `mass(s, state)`."""
+    push: Callable[[State], State] | None = None
+    """How the state changes by as much of a force as changes the velocity by one; by default the
+    derivative of `placed` with respect to the velocity."""
 
     def mass_at(self, s: Scalar, state: State) -> Any:
         """The mass in a state."""

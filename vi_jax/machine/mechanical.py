@@ -181,6 +181,7 @@ class Mechanical(AbstractMachine):
             functools.partial(_speed, self, on),
             functools.partial(_placed, self, on),
             functools.partial(_effective, self, on),
+            functools.partial(_pushed, self, on),
         )
 
 
@@ -243,6 +244,15 @@ def _push(machine: Mechanical, on: Any, q: Named) -> tuple[list[Any], Any]:
 
 def _effective(machine: Mechanical, on: Any, s: Scalar, state: State) -> Any:
     return _push(machine, on, machine.places(state))[1]
+
+
+def _pushed(machine: Mechanical, on: Any, state: State) -> Named:
+    q, name = machine.places(state), _named(machine, on)
+    push = dict(zip(machine.q_names, _push(machine, on, q)[0], strict=True))
+    if name is not None:
+        push[name] = 1.0
+    v = {x: jnp.full_like(y, push[x]) for x, y in vars(state.v).items()}
+    return Named(**{x: jnp.zeros_like(y) for x, y in vars(q).items()}, v=Named(**v))
 
 
 def _placed(machine: Mechanical, on: Any, state: State, Y: Any, V: Any) -> Named:
