@@ -97,6 +97,20 @@ def test_one_component_and_weights(motions, two_impacts):
     assert float(result.norm) == pytest.approx(3.0 * abs(float(result.kick["V"])))
 
 
+@pytest.mark.slow
+def test_the_same_machine_in_micrometres(result):
+    """There was no kick: all starts counted as come back."""
+    size = 1e-6
+    machine = vi.machines.Duffing(
+        amplitude=size, frequency=0.9, damping=2 * 0.02, stiffness=1.0, cubic=0.0, gap=2 * size,
+        restitution=0.5, two_sided=False,
+    )  # fmt: skip
+    orbit = vi.find_orbit(machine, machine.start(Y=1.283 * size, V=1.007 * size), 2)
+    kick = vi.minimal_kick(machine, orbit, candidates=1, progress=False)
+    assert kick.exact and kick.confirmed and kick.edge.kind == "saddle"
+    assert float(kick.norm) / size == pytest.approx(float(result.norm), rel=1e-7)
+
+
 def test_what_cannot_be_asked(motions, result):
     ask = vi.minimal_kick
     with pytest.raises(ValueError, match="`orbit` must be a stable orbit"):

@@ -21,6 +21,7 @@ from .distinct import distance as distance
 from .distinct import distinct_among as distinct_among
 from .distinct import distinct_orbits as distinct_orbits
 from .distinct import in_one_line as in_one_line
+from .distinct import unit_of as unit_of
 from .find import find_orbit as find_orbit
 from .floquet import STABILITY as STABILITY
 from .floquet import STABILITY_NAMES as STABILITY_NAMES

@@ -13,13 +13,20 @@ from ..machine import bare, in_rows, state_in_words
 from .results import InWords, Orbit, hits_in_words, span_in_words, trimmed
 
 
-def distance(here: Any, there: Any) -> Any:
-    """Return how far states lie from others, relative to 1 + |state| of the latter.
+def unit_of(states: Any) -> Any:
+    """Return what counts as 1 where states of a motion are compared: the largest of their
+    components, but at most 1; and 1 if all are zero."""
+    size = abs(states).max()
+    return (size + (size == 0)).clip(None, 1)
+
+
+def distance(here: Any, there: Any, unit: Any = 1) -> Any:
+    """Return how far states lie from others, relative to `unit` + |state| of the latter.
 
     Of the components, the last axis, that counts which differs most. Everywhere in the package this
-    number says whether two states, or two motions, are the same.
+    number says whether two states, or two motions, are the same; `unit` is that of `unit_of`.
     """
-    return (abs(here - there) / (1 + abs(there))).max(axis=-1)
+    return (abs(here - there) / (unit + abs(there))).max(axis=-1)
 
 
 class Orbits(InWords, list[Orbit]):
@@ -47,7 +54,8 @@ def distinct_orbits(orbits: Orbit, *, tolerance: float = 1e-6) -> tuple[Orbits, 
     are left out. Host-side: not to be traced.
 
     **Arguments:** a batch of orbits from `find_orbit` (of any shape); two motions are the same if
-    their sections agree to `tolerance` (relative to 1 + |state|).
+    their sections agree to `tolerance` (relative to the size of the motion: u + |state|, u the
+    largest component, at most 1).
 
     **Returns:** the orbits, a list that prints one motion a line, by period and then by least Y,
     each on the section on which it was first found; and for each the number of searches that found
@@ -93,6 +101,7 @@ def _known(paths: list[np.ndarray], path: np.ndarray, tolerance: float) -> int:
     """Which of the known motions one is, by its sections from whichever of them on; else how many
     there are."""
     for j, other in enumerate(paths):
-        if len(other) == len(path) and distance(path[0], other).min() <= tolerance:
-            return j
+        if len(other) == len(path):
+            if distance(path[0], other, unit_of(other)).min() <= tolerance:
+                return j
     return len(paths)

@@ -180,7 +180,8 @@ def _judged(
     if seen.modes is not None:
         modes = jnp.roll(jnp.take(seen.modes, last - place, axis=1), 1, axis=0)
         told = jnp.concatenate([sections, modes], axis=1)
-    least = _least_period(told, error)
+    unit = jax.lax.stop_gradient(root.unit)
+    least = _least_period(told, error, unit)
     again = _comes_back(start, seen)
     monodromy = jacobians[least - 1]
     within = jnp.arange(cycles) < least
@@ -190,10 +191,12 @@ def _judged(
     sums = {name: jnp.sum(jnp.where(within, a, 0.0)) for name, a in seen.integrals.items()}
     clearance = jnp.min(jnp.where(within, seen.clearance, jnp.inf))
     state = _at_section(guess, sections[0], None if modes is None else modes[0])
-    still = _stands_still(machine, state, duration)
-    found = (root.converged > 0) & again & ~still & (error < jnp.sqrt(jnp.finfo(x.dtype).eps) * 100)
+    still = _stands_still(machine, state, duration, unit)
+    close = error < jnp.sqrt(jnp.finfo(x.dtype).eps) * 100 * unit
+    found = (root.converged > 0) & again & ~still & close
     slowest = jnp.min(jnp.where(hit, seen.listed.speed, jnp.inf))
-    near = jnp.minimum(slowest, jnp.sqrt(2 * jnp.maximum(clearance, 0))) < _SLOW
+    slow = jnp.sqrt(2 * unit * jnp.maximum(clearance, 0))
+    near = jnp.minimum(slowest, slow) < _SLOW * unit
     return Orbit(
         machine=machine,
         method=the_map.method,
@@ -249,19 +252,19 @@ def _at_section(guess: State, section: Array, modes: Array | None) -> State:
     return state if modes is None else HybridState(state, tuple(modes))
 
 
-def _least_period(sections: Float[Array, "cycles states"], error: Array) -> Array:
+def _least_period(sections: Float[Array, "cycles states"], error: Array, unit: Array) -> Array:
     """The fewest cycles after which the sections repeat."""
     cycles = sections.shape[0]
     least = jnp.asarray(cycles, jnp.int32)
-    slack = jnp.maximum(_slack(sections.dtype), 100 * error)
+    slack = jnp.maximum(_slack(sections.dtype), 100 * error / unit)
     for m in range(cycles - 1, 0, -1):
         if cycles % m == 0:
-            same = jnp.all(distance(jnp.roll(sections, -m, axis=0), sections) <= slack)
+            same = jnp.all(distance(jnp.roll(sections, -m, axis=0), sections, unit) <= slack)
             least = jnp.where(same, m, least)
     return least
 
 
-def _stands_still(machine: AbstractMachine, state: State, duration: Array) -> Flag:
+def _stands_still(machine: AbstractMachine, state: State, duration: Array, unit: Array) -> Flag:
     """Whether an autonomous machine stands still in a state, at an equilibrium: as fast as it
     leaves the section it would get nowhere in its period."""
     own, state = modes_of(state), bare(state)
@@ -271,11 +274,11 @@ def _stands_still(machine: AbstractMachine, state: State, duration: Array) -> Fl
     s = jnp.zeros((), x.dtype)
     field = in_modes(machine, begin_modes(machine, s, state, own)).field
     passed = jnp.abs(ravel_pytree(field(s, state))[0]) * duration
-    return jnp.all(passed <= _slack(x.dtype) * (1 + jnp.abs(x)))
+    return jnp.all(passed <= _slack(x.dtype) * (unit + jnp.abs(x)))
 
 
 def _slack(dtype: object) -> float:
-    """What tells states from each other, relative to 1 + their size."""
+    """What tells states from each other, see `distance`."""
     return 1e-6 if dtype == jnp.float64 else 1e-3
 
 

@@ -19,6 +19,10 @@ from jaxtyping import Array, Float
 from .._checks import count, instance_of, number, require
 from .._types import Scalar
 from ._neutral import rounding
+from .distinct import unit_of
+
+# A motion smaller than this part of the guess is at rest in the origin. A choice.
+_NOTHING = 1e-6
 
 Unknowns = Float[Array, "..."]
 Residual = Callable[[Unknowns], Unknowns]
@@ -30,7 +34,7 @@ class AbstractRootFinder(eqx.Module):
     tolerance: eqx.AbstractVar[Any]
     max_steps: eqx.AbstractVar[int]
     arcs: eqx.AbstractVar[int]
-    usual_tolerance: eqx.AbstractClassVar[float]
+    usual_tolerance: ClassVar[float]
     """The tolerance in double precision, if none is given."""
 
     def __check_init__(self):
@@ -63,8 +67,9 @@ class Newton(AbstractRootFinder):
 
     **Arguments:**
 
-    - `tolerance`: largest residual component of a found orbit; by default 1e-10 in double and
-      1e-4 in single precision. The search goes on below it while that still gains.
+    - `tolerance`: largest residual component of a found orbit, relative to the largest component of
+      its state where that is below 1; by default 1e-10 in double and 1e-4 in single precision. The
+      search goes on below it while that still gains.
     - `max_steps`: steps after which it gives up; static.
     - `arcs`: 1 for single shooting. With more, the period is cut into that many arcs, whose
       starting states are all unknowns (multiple shooting): for motions so unstable that a
@@ -105,8 +110,7 @@ class Gradient(AbstractRootFinder):
 
     - `optimiser`: an `optax.GradientTransformation`; by default Adam, its rate falling along a
       cosine from 0.02 to zero over `max_steps`.
-    - `tolerance`: largest residual component of a found orbit, 1e-7 by default in double and 1e-4
-      in single precision.
+    - `tolerance`: as for `Newton`; by default 1e-7 in double and 1e-4 in single precision.
     - `max_steps`: steps after which it gives up; static.
     - `arcs`: as for `Newton`.
     """
@@ -162,6 +166,8 @@ class Found(NamedTuple):
     """Steps that the search took."""
     history: Float[Array, " max_steps"]
     """Largest residual component after each step, NaN beyond the last."""
+    unit: Scalar
+    """What counts as 1 in the comparison with a tolerance (see `unit_of`)."""
 
 
 def find_root(root_finder: AbstractRootFinder, residual: Residual, x: Unknowns) -> Found:
@@ -172,16 +178,21 @@ def find_root(root_finder: AbstractRootFinder, residual: Residual, x: Unknowns) 
     tolerance = root_finder.tolerance
     if tolerance is None:
         tolerance = root_finder.usual_tolerance if x.dtype == jnp.float64 else 1e-4
-    nan = jnp.full((), jnp.nan, x.dtype)
+    nan, guess = jnp.full((), jnp.nan, x.dtype), x
+
+    def unit(place):
+        # Of a motion that comes to rest in the origin nothing is left to be relative to.
+        return unit_of(jnp.maximum(jnp.abs(place), _NOTHING * jnp.abs(guess)))
+
     memory, static = eqx.partition(root_finder.init(residual, x), eqx.is_array)
     history = jnp.full((root_finder.max_steps,), jnp.nan, x.dtype)
 
     def going(carry):
-        *_, size, last, steps, _ = carry
+        _, _, best, size, last, steps, _ = carry
         # Newton's last steps fall from below the tolerance to rounding: worth their cost.
         gaining = ~(size > 0.1 * last) & (size > 0)
         hopeless = (steps > 0) & jnp.isnan(size)
-        done = hopeless | ((size <= tolerance) & ~gaining)
+        done = hopeless | ((size <= tolerance * unit(best)) & ~gaining)
         return ~done & (steps < root_finder.max_steps)
 
     def body(carry):
@@ -194,4 +205,4 @@ def find_root(root_finder: AbstractRootFinder, residual: Residual, x: Unknowns) 
 
     carry = (x, memory, x, nan, nan, jnp.zeros((), jnp.int32), history)
     _, _, best, size, _, steps, history = jax.lax.while_loop(going, body, carry)
-    return Found(best, size, size <= tolerance, steps, history)
+    return Found(best, size, size <= tolerance * unit(best), steps, history, unit(best))

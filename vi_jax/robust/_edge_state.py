@@ -24,7 +24,7 @@ from ._settling import (
 )
 
 # Two starts on both sides of the boundary are brought as close as this and followed until they are
-# as far apart as that, relative to 1 + |state|: choices. What lies between them is the edge's
+# as far apart as that, relative to the motion's size: choices. What lies between them is the edge's
 # motion to within the latter.
 _CLOSE, _APART = 1e-10, 1e-5
 
@@ -51,8 +51,8 @@ class EdgeState(Summarized):
     none of these: a quasi-periodic edge, one of a longer period than `longest`, or one that settles
     more slowly than it was followed."""
     sections: State
-    """Section states along the edge, arrays of shape (cycles,), each within 1e-5 (relative to
-    1 + |state|) of the boundary."""
+    """Section states along the edge, arrays of shape (cycles,), each within 1e-5 (as
+    `tolerance` of `edge_state`) of the boundary."""
     machine: AbstractMachine
     """What moves."""
 
@@ -95,7 +95,8 @@ def edge_state(
     - `settle`: cycles after which a start that has not come back to the motion of `inside` counts
       as being elsewhere.
     - `tolerance`: a start has come back once a section state lies so near to one of the motion's,
-      relative to 1 + |state|. Less than the size of its basin.
+      relative to u + |state|, u the largest component of the motion, at most 1. Less than the size
+      of its basin.
     - `longest`: longest period of the edge state that is looked for, in cycles.
     - `rounds`: bisections after which the edge is called irregular.
     - `method`: as for `cycle_map`.
@@ -153,7 +154,7 @@ def tracked(
         trail.append(sections)
         tell(1)
         inside, outside = pair
-        met = _met_again(np.concatenate(trail)[-4 * longest - 1 :], longest, recurs)
+        met = _met_again(np.concatenate(trail)[-4 * longest - 1 :], longest, recurs, settling.unit)
         if met is not None:
             orbit = settling.orbit_near(*met, _NEAR * recurs)
             if orbit is not None and not bool(orbit.stable):
@@ -168,7 +169,7 @@ def _followed(settling: Settling, pair: Rows) -> tuple[Rows, Rows]:
     parts = []
     for _ in range(_PIECES):
         both = settling.trail(pair, TRAIL)
-        far = np.flatnonzero(~(distance(both[1], both[0]) <= _APART))  # or no number
+        far = np.flatnonzero(~(distance(both[1], both[0], settling.unit) <= _APART))  # or no number
         end = far[0] if far.size else TRAIL
         end = end if np.isfinite(both[:, end]).all() else end - 1
         parts.append(both[:, 1 : end + 1].mean(axis=0))
@@ -178,10 +179,10 @@ def _followed(settling: Settling, pair: Rows) -> tuple[Rows, Rows]:
     return pair, np.concatenate(parts)
 
 
-def _met_again(trail: Rows, longest: int, recurs: float) -> tuple[Row, int] | None:
+def _met_again(trail: Rows, longest: int, recurs: float, unit: float) -> tuple[Row, int] | None:
     """A state near to which the motion comes back, the latest, and after how many cycles."""
     last = trail[-1]
-    back = np.flatnonzero(distance(trail[:-1], last)[::-1][:longest] <= recurs)
+    back = np.flatnonzero(distance(trail[:-1], last, unit)[::-1][:longest] <= recurs)
     return (last, int(back[0]) + 1) if back.size else None
 
 

@@ -15,7 +15,7 @@ from ..machine import AbstractMachine, Summarized, bare, in_rows, is_autonomous
 from ..orbit import Orbit, cycle_map
 from ._settling import Row, Rows, Settling, in_row, one_orbit
 
-# How far from the saddle, relative to 1 + |state|, its manifolds are taken to be straight: they
+# How far from the saddle, relative to its size, its manifolds are taken to be straight: they
 # part from their tangents by the square of it. A choice.
 _BEGIN = 1e-5
 
@@ -218,14 +218,14 @@ def _ahead(
             scale = max(jump, np.finfo(float).tiny)
         elif round_ == _ROUNDS - 1 and jump > _CONTINUOUS * scale:
             return None
-    distance = np.max(np.abs(away[at]) / (1 + np.abs(saddle.place)))
+    distance = np.max(np.abs(away[at]) / (saddle.map.unit + np.abs(saddle.place)))
     return rows[at], float(distance)
 
 
 def _unstable(saddle: _Saddle, side: float, length: float, spacing: float) -> Pieces:
     """One branch of an unstable manifold, with rows of NaN at jumps."""
     unit = saddle.along["unstable"] / np.linalg.norm(saddle.along["unstable"])
-    begin = side * _BEGIN * unit
+    begin = side * _BEGIN * saddle.map.unit * unit
     grown, periods = 0.0, 0
     while grown < length and periods < 400:
         periods += 1

@@ -139,7 +139,10 @@ def first_exits(
     rays = spread(directions, kick.size, seed)
     reach = largest
     if reach is None:
-        reach = float(np.max(kick.weights * (1 + np.abs(kick.start[list(kick.places)])))) / 4
+        reach = (
+            float(np.max(kick.weights * (settling.unit + np.abs(kick.start[list(kick.places)]))))
+            / 4
+        )
     found = exits(settling, kick, rays, 0.0, reach, points)
     for _ in range(_DOUBLINGS if largest is None else 0):
         if np.isfinite(found.outside).any():

@@ -17,7 +17,7 @@ from .._programs import compiled
 from .._types import State
 from ..flow import RESULTS, MethodLike, Run, RunOptions, simulate, simulate_pool
 from ..machine import AbstractMachine, bare, begin_modes, field_in, in_rows, is_autonomous
-from ..orbit import CycleMap, Orbit, adopted, cycle_map, distance, find_orbit
+from ..orbit import CycleMap, Orbit, adopted, cycle_map, distance, find_orbit, unit_of
 
 Row = Float[np.ndarray, " _"]
 """The numbers of a state, or of a kick."""
@@ -32,10 +32,11 @@ outside of the bounds)."""
 # few starts cost few. A choice.
 _LANES = 1024
 
-# All relative to 1 + |state|. A motion whose sections change by less than the first is where it
-# will stay, or nearer to an unstable one than starts are told apart; section states a period apart
-# are the same within the second; an orbit that is found from a state is its motion if it lies as
-# near as the third; the last is an equilibrium's rate of change. Choices.
+# All relative to the motion's size (see `orbit.distance`). A motion whose sections change by less
+# than the first is where it will stay, or nearer to an unstable one than starts are told apart;
+# section states a period apart are the same within the second; an orbit that is found from a state
+# is its motion if it lies as near as the third; the last is an equilibrium's rate of change.
+# Choices.
 _STAYS, _SAME, _NEAR, _STILL = 1e-11, 1e-5, 1e-3, 1e-8
 
 # Sections of a motion that are recorded at once. A choice: longer ones are put together.
@@ -46,9 +47,9 @@ class Settling:
     """Judges starts by whether they come back to a motion.
 
     A start has come back once a section state of its motion lies within `tolerance` (relative to
-    1 + |state|) of one of the motion's. That is looked at after 1, 2, 3, 4, 5, 6, … cycles, each
-    time a quarter more: a motion that decays towards an equilibrium is found back long before it
-    has shrunk to rounding, where its sections would be noise.
+    the motion's size) of one of the motion's. That is looked at after 1, 2, 3, 4, 5, 6, … cycles,
+    each time a quarter more: a motion that decays towards an equilibrium is found back long before
+    it has shrunk to rounding, where its sections would be noise.
 
     **Arguments:** the map of one cycle; a state, for its structure; the motion's section states;
     cycles after which a start that has not come back is elsewhere; the tolerance.
@@ -57,6 +58,8 @@ class Settling:
     def __init__(self, the_map: CycleMap, like: State, motion: Rows, settle: int, tolerance: float):
         self.the_map, self.like, self.motion = the_map, like, motion
         self.settle, self.tolerance = settle, tolerance
+        self.unit = float(unit_of(motion))
+        """What counts as 1 in all comparisons of states."""
         self.begin = 0.0
         """How long after the section starts are, by the clock of a machine with a drive."""
         self._judged_so_far: list[int] = []
@@ -79,8 +82,8 @@ class Settling:
         return ravel_pytree(self.like)[1](jnp.asarray(row))
 
     def distance(self, rows: Rows) -> Float[np.ndarray, " lanes"]:
-        """How far section states lie from the motion's nearest one, relative to 1 + |state|."""
-        return distance(rows[:, None], self.motion).min(axis=1)
+        """How far section states lie from the motion's nearest one, see `orbit.distance`."""
+        return distance(rows[:, None], self.motion, self.unit).min(axis=1)
 
     def judge(self, rows: Rows) -> Int[np.ndarray, " lanes"]:
         """`RETURNS`, `ELSEWHERE` or `INADMISSIBLE` for each start."""
@@ -103,7 +106,7 @@ class Settling:
             if not done:
                 verdict[goes_on & bad_start] = INADMISSIBLE
             # What repeats has settled: to go on would cost, and end an equilibrium in noise.
-            moves = (distance(there, here) > _STAYS) | (begin > 0)
+            moves = (distance(there, here, self.unit) > _STAYS) | (begin > 0)
             here = np.where((goes_on & good)[:, None], there, here)
             goes_on &= good
             returned = goes_on.copy()
@@ -152,9 +155,10 @@ class Settling:
 
     def bisected(self, inside: Row, outside: Row, width: float) -> tuple[Row, Row]:
         """Two starts on the line between two others, that comes back and that does not, so close
-        to each other (relative to 1 + |state|). Fifteen points at once are judged between them."""
+        to each other (relative to the motion's size). Fifteen points at once are judged between
+        them."""
         parts = np.linspace(0, 1, 17)[1:-1, None]
-        while distance(outside, inside) > width:
+        while distance(outside, inside, self.unit) > width:
             between = inside + parts * (outside - inside)
             (place,), _ = self.first_change(between[None])
             ends = np.concatenate([inside[None], between, outside[None]])
@@ -171,7 +175,7 @@ class Settling:
             return None
         rows = self.starting(0.0).trail(last, 2 * longest)[0]
         for period in range(1, longest + 1):
-            if distance(rows[:-period], rows[period:]).max() <= _SAME:
+            if distance(rows[:-period], rows[period:], self.unit).max() <= _SAME:
                 return rows[:period]
         return None
 
@@ -187,7 +191,7 @@ class Settling:
         if not bool(orbit.successful):
             return None
         sections = np.asarray(in_rows(orbit.sections))
-        return orbit if distance(row, sections).min() <= near else None
+        return orbit if distance(row, sections, self.unit).min() <= near else None
 
     def later(self, start: Row, phase: float) -> tuple["Settling", Row]:
         """What judges starts so long after a section state of the motion, and the state then.
@@ -199,7 +203,7 @@ class Settling:
             raise ValueError(
                 "Argument `phase` must be 0 for an equilibrium, which is always the same."
             )
-        row = self.motion[distance(start, self.motion).argmin()]
+        row = self.motion[distance(start, self.motion, self.unit).argmin()]
         state, autonomous = self.state(row), is_autonomous(machine, self.like)
         length = float(jnp.asarray(machine.cycle))
         if autonomous:
@@ -282,7 +286,7 @@ def _stands_still(machine: AbstractMachine, state: State) -> bool:
     here = in_row(state)
     s = jnp.zeros((), here.dtype)
     rate = in_row(field_in(machine, s, state, begin_modes(machine, s, state)))
-    return bool(np.all(np.abs(rate) <= _STILL * (1 + np.abs(here))))
+    return bool(np.all(np.abs(rate) <= _STILL * (unit_of(here) + np.abs(here))))
 
 
 def _filled(rows: Rows) -> Iterator[tuple[Rows, Bool[np.ndarray, " lanes"]]]:

@@ -56,7 +56,7 @@ def shortest(settling: Settling, kick: Kick, saddle: Orbit, z: Row) -> tuple[Row
         return None
     period = len(rows)
     trail = settling.trail(kick.rows(z)[None], _longest(saddle) * period)[0]
-    apart = distance(trail[1:, None], rows)
+    apart = distance(trail[1:, None], rows, settling.unit)
     near = np.flatnonzero(apart.min(axis=1) <= _BEGINS)
     if not near.size:
         return None

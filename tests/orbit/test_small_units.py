@@ -1,0 +1,35 @@
+"""A machine written in micrometres has the same motions as one of size 1."""
+
+import numpy as np
+import vi_jax as vi
+
+SIZES = (1.0, 1e-6)
+
+
+def test_orbits_are_as_exact():
+    """One whose first steps are short: it was left off at 4e-6 of its size."""
+    found = []
+    for size in SIZES:
+        wells = vi.machines.Duffing(
+            amplitude=0.2 * size, damping=0.15, stiffness=-1.0, cubic=1 / size**2, gap=100.0 * size
+        )
+        orbit = vi.find_orbit(wells, wells.start(Y=size, V=0.2 * size), 1, throw=True)
+        assert bool(orbit.stable) and float(orbit.error) < 1e-10 * size
+        found.append([float(orbit.state.Y) / size, float(orbit.state.V) / size])
+    np.testing.assert_allclose(found[1], found[0], atol=1e-10)
+
+
+def test_all_orbits_are_told_apart():
+    """Those of one period were one motion."""
+    found = []
+    numbers = {"frequency": 0.9, "damping": 0.04, "stiffness": 1.0, "cubic": 0.0}
+    for size in SIZES:
+        machine = vi.machines.Duffing(
+            amplitude=size, gap=2.0 * size, restitution=0.5, two_sided=False, **numbers
+        )
+        region = {"start.Y": (-3 * size, 2 * size), "start.V": (-3 * size, 3 * size)}
+        all_of_them = vi.all_orbits(machine, 2, region=region, starts=64)
+        found.append([[int(orbit.impacts), *row] for orbit, row in zip(
+            all_of_them.orbits, all_of_them.found.tolist(), strict=True
+        )])  # fmt: skip
+    assert found[0] == found[1] and len(found[0]) == 4
