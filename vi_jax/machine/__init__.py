@@ -6,7 +6,6 @@ from .base import AbstractMachine as AbstractMachine
 from .base import Prepared as Prepared
 from .base import names_coordinates as names_coordinates
 from .base import renews as renews
-from .contact_friction import ContactFriction as ContactFriction
 from .contacts import added as added
 from .contacts import forces as forces
 from .contacts import held_by as held_by
@@ -57,6 +56,7 @@ from .events import struck_modes as struck_modes
 from .events import value_of as value_of
 from .field import field_in as field_in
 from .field import shown_modes as shown_modes
+from .friction import ContactFriction as ContactFriction
 from .friction import DryFriction as DryFriction
 from .hybrid_state import HybridState as HybridState
 from .hybrid_state import bare as bare

@@ -1,5 +1,7 @@
-"""Dry friction, with sticking as a mode."""
+"""Dry friction, anywhere and on stops, with sticking as a mode."""
 
+import abc
+import functools
 import inspect
 import itertools
 from collections.abc import Callable, Mapping
@@ -15,14 +17,16 @@ from jaxtyping import Array, Float
 from .._checks import (
     NOT_NEGATIVE,
     POSITIVE,
+    SHARE,
     Range,
+    count,
     optional_real,
     real,
     real_or_law,
     require_ranges,
 )
 from .._types import Flag, Machine, Scalar, Scalars, State
-from .contacts import added, gained, held_flow, push_of, way_of
+from .contacts import added, forces, gained, held_flow, push_of, shares, way_of
 from .event import AbstractSwitch, Around
 from .field import field_in
 from .state import with_components
@@ -33,7 +37,116 @@ from .state import with_components
 _STILL = 1e-6
 
 
-class DryFriction(AbstractSwitch):
+class Friction(AbstractSwitch):
+    """Coulomb friction: a body slides forward or backward (mode +1, -1), or sticks (mode 0)."""
+
+    roundings: ClassVar[int]
+    """So many roundings of the state count as no slip."""
+
+    @property
+    def sees_around(self) -> bool:
+        """True: the force that holds a body depends on all that holds others."""
+        return True
+
+    @property
+    def may_slide(self) -> bool:
+        """Never along its own surface: where both sides point at it, the body sticks."""
+        return False
+
+    @abc.abstractmethod
+    def speed_of_slip(self, machine: Machine, s: Scalar, state: State) -> Scalar:
+        """The velocity against what it rubs on."""
+
+    @abc.abstractmethod
+    def held(
+        self, machine: Machine, s: Scalar, state: State, contact: Scalars, found: Any
+    ) -> tuple[Any, Any, Any, Any]:
+        """The force that holds a body, the largest that can, the mass that it acts on, and whether
+        it acts at all.
+
+        **Arguments:** `contact` as in `Around`; `found`, of `held_flow`.
+        """
+
+    def is_known(self, around: Around | None) -> bool:
+        """Whether it is known what else acts on the body."""
+        return around is not None
+
+    def slip_rate(self, machine: Machine, s: Scalar, state: State, flow: State) -> Scalar:
+        """The rate by s at which the slip changes along a flow."""
+        along = (s, state), (jnp.ones_like(s), flow)
+        return jax.jvp(lambda s, x: self.speed_of_slip(machine, s, x), *along)[1]
+
+    def way(self, machine: Machine, s: Scalar, state: State) -> Scalar:
+        """The sign of the slip; zero where that is rounding."""
+        slip = self.speed_of_slip(machine, s, state)
+        return way_of(slip, state, roundings=self.roundings)
+
+    def begin(self, machine, s, state):
+        """The mode of a motion that begins: the sign of the slip, sticking without any."""
+        return self.way(machine, s, state)
+
+    def struck(self, machine, s, state, mode, *, around: Around | None = None):
+        """The mode after an impact or another jump: the way that the body slips, or would begin to.
+
+        **Arguments:** as every event's, and `around`, what else acts; `None` if that is not known
+        yet.
+        """
+        slips = self.way(machine, s, state)
+        if not self.is_known(around):
+            return slips
+        return jnp.where(slips == 0, self._from_rest(machine, s, state, around, True), slips)
+
+    def guard(self, machine, s, state, mode, *, around: Around | None = None):
+        """The slip coming to zero; or the force coming to what friction can hold. Nothing happens
+        where a body does not rest on the stop that it rubs on.
+
+        **Arguments:** as every event's, and `around`, the other modes and who rests where.
+        """
+        return functools.reduce(jnp.maximum, self.sides(machine, s, state, mode, around=around))
+
+    def sides(self, machine, s, state, mode, *, around: Around | None = None):
+        """The guard for a force forward and for one backward.
+
+        **Arguments:** as `guard`.
+        """
+        slows = -mode * self.speed_of_slip(machine, s, state)
+        if not self.is_known(around):
+            return (jnp.where((mode == 0) | (not self.is_dry), -1.0, slows),)
+        pull, most, acts = self._balance(machine, s, state, around, mode)
+        both = (jnp.where(mode == 0, way * pull - most, slows) for way in (1.0, -1.0))
+        return tuple(x if self.is_dry else jnp.where(acts, x, -1.0) for x in both)
+
+    def _balance(
+        self, machine: Machine, s: Scalar, state: State, around: Any, mode: Scalar
+    ) -> tuple[Any, Any, Any]:
+        """The force that friction balances on a body that sticks, the largest that it can, and
+        whether it acts.
+
+        **Arguments:** `around`, the other modes and who rests where; `mode`, its own.
+        """
+        modes = around.instead(mode)
+        flow = field_in(machine, s, state, modes)
+        found = held_flow(machine, flow, s, state, modes, around.contact)[1][around.own]
+        force, most, _, acts = self.held(machine, s, state, around.contact, found)
+        return -force, most, acts
+
+    def _from_rest(
+        self, machine: Machine, s: Scalar, state: State, around: Any, sticks: Flag | bool
+    ) -> Scalar:
+        """The mode of a body without slip: sticking where the force is not too large, else the way
+        that it pulls.
+
+        **Arguments:** `sticks`, whether the body may stick at all.
+        """
+        if not self.is_known(around):
+            return jnp.zeros_like(s)
+        pull, most, acts = self._balance(machine, s, state, around, jnp.zeros_like(s))
+        holds = sticks & (jnp.abs(pull) <= most)
+        holds = holds if self.is_dry else holds | ~acts
+        return jnp.where(holds, 0.0, jnp.where(pull < 0, -1.0, 1.0))
+
+
+class DryFriction(Friction):
     """Coulomb friction on a body: it slides against a force, or sticks.
 
     While the body slides, friction is `level` against the motion. At zero slip the body sticks as
@@ -75,6 +188,8 @@ class DryFriction(AbstractSwitch):
         "level": NOT_NEGATIVE, "mass": POSITIVE, "static_ratio": Range(1.0, float("inf")),
     }  # fmt: skip
 
+    roundings: ClassVar = 4
+
     def __check_init__(self):
         require_ranges(self)
         if self.push is not None and self.slip is None:
@@ -84,16 +199,6 @@ class DryFriction(AbstractSwitch):
     def is_dry(self) -> bool:
         """True: it may hold a body anywhere."""
         return True
-
-    @property
-    def sees_around(self) -> bool:
-        """True: the force that holds a body depends on all that holds others."""
-        return True
-
-    @property
-    def may_slide(self) -> bool:
-        """Never along its own surface: where both sides point at it, the body sticks."""
-        return False
 
     def speed_of_slip(self, machine: Machine, s: Scalar, state: State) -> Scalar:
         """The velocity against what it rubs on."""
@@ -135,11 +240,6 @@ class DryFriction(AbstractSwitch):
         force, mass = found
         return force, self.sticking(machine, s, state), mass, jnp.ones((), bool)
 
-    def slip_rate(self, machine: Machine, s: Scalar, state: State, flow: State) -> Scalar:
-        """The rate by s at which the slip changes along a flow."""
-        along = (s, state), (jnp.ones_like(s), flow)
-        return jax.jvp(lambda s, x: self.speed_of_slip(machine, s, x), *along)[1]
-
     def sliding(self, machine: Machine, s: Scalar, state: State, mode: Scalar) -> Any:
         """The size of friction on a body that slides forward or backward; in mode 0 on one that
         begins to."""
@@ -157,57 +257,12 @@ class DryFriction(AbstractSwitch):
         push, mass = self.row(machine, s, state)
         return -mode * self.sliding(machine, s, state, mode) / mass, push
 
-    def begin(self, machine, s, state):
-        """The mode of a motion that begins: the sign of the slip, sticking without any."""
-        return self.way(machine, s, state)
-
-    def way(self, machine: Machine, s: Scalar, state: State) -> Scalar:
-        """The sign of the slip; zero where that is rounding."""
-        return way_of(self.speed_of_slip(machine, s, state), state, roundings=4)
-
-    def struck(self, machine, s, state, mode, *, around: Around | None = None):
-        """The mode after an impact or another jump: the way that the body slips, or would begin to.
-
-        **Arguments:** as every event's, and `around`, what else acts; `None` if that is not known
-        yet.
-        """
-        slips = self.way(machine, s, state)
-        if around is None:
-            return slips
-        rest = self._from_rest(machine, s, state, around, True)
-        return jnp.where(slips == 0, rest, slips)
-
-    def guard(self, machine, s, state, mode, *, around: Around | None = None):
-        """The slip coming to zero; or the force coming to what friction can hold.
-
-        **Arguments:** as every event's, and `around`, the other modes and who rests where.
-        """
-        slows = -mode * self.speed_of_slip(machine, s, state)
-        if around is None:
-            return jnp.where(mode == 0, -1.0, slows)
-        excess = jnp.abs(self._pull(machine, s, state, around, mode))
-        return jnp.where(mode == 0, excess - self.sticking(machine, s, state), slows)
-
-    def sides(self, machine, s, state, mode, *, around: Around | None = None):
-        """The guard for a force forward and for one backward.
-
-        **Arguments:** as `guard`.
-        """
-        if around is None:
-            return (self.guard(machine, s, state, mode),)
-        slows = -mode * self.speed_of_slip(machine, s, state)
-        pull = self._pull(machine, s, state, around, mode)
-        holds = self.sticking(machine, s, state)
-        return tuple(jnp.where(mode == 0, way * pull - holds, slows) for way in (1.0, -1.0))
-
     def after(self, machine, s, state, mode, *, around: Around | None = None):
         """Sticking, or sliding the way the force pulls.
 
         **Arguments:** as every event's, and `around`, the other modes and who rests where.
         """
         new = self.stopped(machine, s, state)
-        if around is None:
-            return new, jnp.zeros_like(mode)
         return new, self._from_rest(machine, s, new, around, mode != 0)
 
     def stopped(self, machine: Machine, s: Scalar, state: State) -> State:
@@ -219,28 +274,93 @@ class DryFriction(AbstractSwitch):
         slip, (push, _) = self.speed_of_slip(machine, s, state), self.row(machine, s, state)
         return added(state, (-slip,), (push,))
 
-    def _pull(
-        self, machine: Machine, s: Scalar, state: State, around: Around, mode: Scalar
-    ) -> Scalar:
-        """The force that friction balances on a body that sticks.
 
-        **Arguments:** `around`, the other modes and who rests where; `mode`, its own.
+class ContactFriction(Friction):
+    """Coulomb friction between a body and a stop that it hits, or rests on.
+
+    In an impact the body sticks or slips along the stop: it sticks, with its velocity along the
+    stop reversed and scaled by `restitution`, if that takes an impulse of no more than `level`
+    times the stop's, and slips against that much else. While it rests on the stop it slips forward
+    or backward (mode +1, -1) against `level` times the force that presses it on, or sticks (mode
+    0), which may jam it. That force follows from what else acts, other contacts included; the
+    machine's field says nothing of it, and gets the mode like those of all switches.
+
+    Newton's and Coulomb's laws together may gain energy where the velocities across and along a
+    stop are coupled (T. R. Kane): an impact that would ends its lane as `RESULTS.bad_impact`.
+
+    **Arguments:**
+
+    - `level`: μ, not negative.
+    - `stop`: the number of the stop among the machine's.
+    - `along`: the number of the coordinate that the body slips along, with its `mass`: no stop need
+      limit it, and of its position nothing is asked.
+    - `restitution`: along the stop, in [0, 1].
+    """
+
+    level: Float[Array, "..."] = eqx.field(converter=real("level"))
+    """μ, Coulomb's coefficient of friction (dimensionless)."""
+    stop: int = eqx.field(static=True, kw_only=True)
+    along: int = eqx.field(static=True, kw_only=True)
+    restitution: Float[Array, "..."] = eqx.field(
+        kw_only=True, default=0.0, converter=real("restitution")
+    )
+    """Coefficient of restitution along the stop (dimensionless)."""
+    ranges: ClassVar = {"level": NOT_NEGATIVE, "restitution": SHARE}
+
+    roundings: ClassVar = 16
+
+    def __check_init__(self):
+        require_ranges(self)
+        count("stop", self.stop)
+        count("along", self.along)
+
+    @property
+    def rubs_on(self) -> int:
+        """The number of the stop that it is friction on."""
+        return self.stop
+
+    def is_known(self, around):
+        """Whether it is known who rests where."""
+        return around is not None and bool(around.contact)
+
+    def speed_of_slip(self, machine, s, state):
+        """The velocity along the stop."""
+        return machine.coordinates[self.along].velocity(state)
+
+    def after(self, machine, s, state, mode, *, around: Around | None = None):
+        """Sticking, or slipping the way the force pulls.
+
+        **Arguments:** as every event's, and `around`, the other modes and who rests where.
         """
-        modes = around.instead(mode)
-        flow = field_in(machine, s, state, modes)
-        return -held_flow(machine, flow, s, state, modes, around.contact)[1][around.own][0]
+        # It vanishes to rounding; and with it what that would give to the velocity on the stop.
+        stop, along = machine.stops[self.stop], machine.coordinates[self.along]
+        both = (machine.coordinates[stop.coordinate], along)
+        pushes = [push_of(body, state) for body in both]
+        stops = [jnp.zeros((), bool) if around is None else self._rests(machine, around), mode != 0]
+        wanted = [-body.velocity(state) for body in both]
+        amounts = forces(shares(both, state, pushes), stops, wanted)
+        state = added(state, amounts, pushes)
+        return state, self._from_rest(machine, s, state, around, mode != 0)
 
-    def _from_rest(
-        self, machine: Machine, s: Scalar, state: State, around: Around, sticks: Flag | bool
-    ) -> Scalar:
-        """The mode of a body without slip: sticking where the force is not too large, else the way
-        that it pulls.
+    def _rests(self, machine: Machine, around: Around) -> Flag:
+        if not around.contact:
+            return jnp.zeros((), bool)
+        return around.contact[machine.stops[self.stop].coordinate] == 1.0 + self.stop
 
-        **Arguments:** `sticks`, whether the body may stick at all.
+    def held(self, machine, s, state, contact, found):
+        """The force that holds a body, the largest that can, the mass that it acts on, and whether
+        the body rests on the stop.
+
+        **Arguments:** `contact` as in `Around`; `found`, of `held_flow`.
         """
-        pull = self._pull(machine, s, state, around, jnp.zeros_like(s))
-        holds = sticks & (jnp.abs(pull) <= self.sticking(machine, s, state))
-        return jnp.where(holds, 0.0, jnp.where(pull < 0, -1.0, 1.0))
+        force, pressing = found
+        here = contact[machine.stops[self.stop].coordinate] == 1.0 + self.stop
+        mass = machine.coordinates[self.along].mass_at(s, state)
+        return force, self.level * pressing, mass, here
+
+    def push_in(self, machine, s, state, mode):
+        """`None`: the force is found with that which presses on the stop (`held_flow`)."""
+        return None
 
 
 class _Slip:

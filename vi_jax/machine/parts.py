@@ -8,10 +8,10 @@ for the other events, and for the coordinates that stops limit, by number.
 from typing import Any
 
 from .._types import Machine
-from .contact_friction import ContactFriction
 from .coordinates import Coordinate
 from .cycles import Turn, counter_of
 from .event import AbstractEvent, AbstractSwitch
+from .friction import ContactFriction
 from .own import with_static
 from .reset import Reset
 from .soft import SoftStop
