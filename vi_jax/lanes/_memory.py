@@ -35,10 +35,6 @@ def load_stride(t: Text, i: int) -> Value:
     return splat(t, t.raw(f"load i64, ptr {place}"), "i64")
 
 
-def _addresses(t: Text, pointer: str, offset: Value, kind: str) -> str:
-    return t.raw(f"getelementptr {kind}, ptr {pointer}, {t.vector('i64')} {offset.text}")
-
-
 def gathering(t: Text, pointer: str, base: Value, aval: Any, mask: Value) -> Formula:
     """An array of each slot, read where it is asked for and `mask` holds, else zeros.
 
@@ -49,7 +45,7 @@ def gathering(t: Text, pointer: str, base: Value, aval: Any, mask: Value) -> For
 
     def number(index) -> Value:
         place = t.binary("add", base, in_lanes(t, place_of(t, index, steps)))
-        return _number(t, pointer, place, kind, mask)
+        return gathered(t, pointer, place, kind, mask)
 
     return Formula(tuple(aval.shape), kind, number)
 
@@ -59,13 +55,6 @@ def shared(pointer: str, shape: tuple[int, ...], kind: str) -> Strided:
     return Strided(shape, kind, Table(pointer), contiguous(shape))
 
 
-def _number(t: Text, pointer: str, place: Value, kind: str, mask: Value) -> Value:
-    """Each slot's number at a place of XLA's array, where `mask` holds."""
-    stored = "i8" if kind == "i1" else kind  # XLA keeps truth values in bytes
-    value = gathered(t, _addresses(t, pointer, place, stored), stored, mask)
-    return t.binary("icmp ne", value, t.zero("i8"), "i1") if kind == "i1" else value
-
-
 def scatter(t: Text, pointer: str, base: Value, x: Array, mask: Value) -> None:
     """Write `x` of the lanes in `mask`, the numbers of each from `base` on.
 
@@ -73,14 +62,14 @@ def scatter(t: Text, pointer: str, base: Value, x: Array, mask: Value) -> None:
     the array; the values; which slots write.
     """
 
-    def put(place, value: Value) -> None:
-        if value.kind == "i1":
-            value = t.cast("zext", value, "i8")
-        number = t.binary("add", base, in_lanes(t, place))
-        scattered(t, _addresses(t, pointer, number, value.kind), value, mask)
-
     steps = contiguous(x.shape)
-    over_all(t, x, lambda i: put(place_of(t, i, steps), x.at(t, i)))
+
+    def put(i) -> None:
+        value = x.at(t, i)
+        place = t.binary("add", base, in_lanes(t, place_of(t, i, steps)))
+        scattered(t, pointer, place, value, mask)
+
+    over_all(t, x, put)
 
 
 def over_rows(

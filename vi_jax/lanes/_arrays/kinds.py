@@ -175,7 +175,7 @@ class Table:
         """The number at a place, in every lane."""
         stored = stored_kind(kind)
         if isinstance(place, Value):
-            return _flag_if(t, _gathered(t, self.pointer, place, stored), kind)
+            return gathered(t, self.pointer, place, kind)
         where = t.once(f"getelementptr {stored}, ptr {self.pointer}, i64 {place}")
         number = t.once(f"load {stored}, ptr {where}")  # nothing is ever stored there
         return _flag_if(t, splat(t, number, stored), kind)
@@ -190,10 +190,9 @@ class Memory:
 
     def load(self, t: Text, place: Index, kind: str) -> Value:
         """Each lane's number at a place."""
-        stored = stored_kind(kind)
         if isinstance(place, Value):
-            where = self._of_slots(t, place)
-            return _flag_if(t, _gathered(t, self._base(t), where, stored), kind)
+            return gathered(t, self._base(t), self._of_slots(t, place), kind)
+        stored = stored_kind(kind)
         aligned = f"align {self._alignment(t, stored)}"
         where = self._address(t, place, stored)
         value = t.load(f"load {t.vector(stored)}, ptr {where}, {aligned}", stored)
@@ -201,18 +200,13 @@ class Memory:
 
     def store(self, t: Text, place: Index, value: Value, mask: Value | None = None) -> None:
         """Put each lane's number at a place; where `mask` holds, if a place is each lane's own."""
-        value = t.cast("zext", value, "i8") if value.kind == "i1" else value
-        kind = value.kind
-        if not isinstance(place, Value):
-            where = self._address(t, place, kind)
-            aligned = f"align {self._alignment(t, kind)}"
-            t.store(f"store {t.vector(kind)} {value.text}, ptr {where}, {aligned}")
+        if isinstance(place, Value):
+            scattered(t, self._base(t), self._of_slots(t, place), value, mask)
             return
-        where = t.raw(
-            f"getelementptr {kind}, ptr {self._base(t)}, "
-            f"{t.vector('i64')} {self._of_slots(t, place).text}"
-        )
-        scattered(t, where, value, t.constant(True, "i1") if mask is None else mask)
+        value = _as_stored(t, value)
+        kind = value.kind
+        where, aligned = self._address(t, place, kind), f"align {self._alignment(t, kind)}"
+        t.store(f"store {t.vector(kind)} {value.text}, ptr {where}, {aligned}")
 
     def _base(self, t: Text) -> str:
         if isinstance(self.block, Block):
@@ -274,26 +268,33 @@ def stored_kind(kind: str) -> str:
     return "i8" if kind == "i1" else kind  # XLA keeps truth values in bytes
 
 
+def _as_stored(t: Text, value: Value) -> Value:
+    return t.cast("zext", value, "i8") if value.kind == "i1" else value
+
+
 def _flag_if(t: Text, value: Value, kind: str) -> Value:
     return t.binary("icmp ne", value, t.zero("i8"), "i1") if kind == "i1" else value
 
 
-def _gathered(t: Text, base: str, place: Value, kind: str) -> Value:
-    where = t.raw(f"getelementptr {kind}, ptr {base}, {t.vector('i64')} {place.text}")
-    return gathered(t, where, kind, t.constant(True, "i1"))
+def _addresses(t: Text, pointer: str, place: Value, kind: str) -> str:
+    return t.raw(f"getelementptr {kind}, ptr {pointer}, {t.vector('i64')} {place.text}")
 
 
-def gathered(t: Text, where: str, kind: str, mask: Value) -> Value:
-    """Numbers from addresses of each slot, zeros where `mask` does not hold."""
-    v, p, flags = t.vector(kind), f"<{t.width} x ptr>", t.vector("i1")
-    name = f"@llvm.masked.gather.{t.suffix(kind)}.v{t.width}p0"
+def gathered(t: Text, pointer: str, place: Value, kind: str, mask: Value | None = None) -> Value:
+    """The number at a place of each slot behind a pointer, zero where `mask` does not hold."""
+    stored, mask = stored_kind(kind), t.constant(True, "i1") if mask is None else mask
+    where = _addresses(t, pointer, place, stored)
+    v, p, flags = t.vector(stored), f"<{t.width} x ptr>", t.vector("i1")
+    name = f"@llvm.masked.gather.{t.suffix(stored)}.v{t.width}p0"
     t.declared[name] = f"declare {v} {name}({p}, i32, {flags}, {v})"
-    call = f"{p} {where}, i32 {_BYTES[kind]}, {flags} {mask.text}, {v} zeroinitializer"
-    return Value(t.raw(f"call {v} {name}({call})"), kind)
+    call = f"{p} {where}, i32 {_BYTES[stored]}, {flags} {mask.text}, {v} zeroinitializer"
+    return _flag_if(t, Value(t.raw(f"call {v} {name}({call})"), stored), kind)
 
 
-def scattered(t: Text, where: str, value: Value, mask: Value) -> None:
-    """Numbers to addresses of each slot, where `mask` holds."""
+def scattered(t: Text, pointer: str, place: Value, value: Value, mask: Value | None = None) -> None:
+    """Store a number at a place of each slot behind a pointer, where `mask` holds."""
+    value, mask = _as_stored(t, value), t.constant(True, "i1") if mask is None else mask
+    where = _addresses(t, pointer, place, value.kind)
     v, p, flags = t.vector(value.kind), f"<{t.width} x ptr>", t.vector("i1")
     name = f"@llvm.masked.scatter.{t.suffix(value.kind)}.v{t.width}p0"
     t.declared[name] = f"declare void {name}({v}, {p}, i32, {flags})"
