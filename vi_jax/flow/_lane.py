@@ -1,6 +1,8 @@
 """What the flat loop carries: one trajectory on its way, and what is asked of it."""
 
-from collections.abc import Callable
+import functools
+import operator
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -48,6 +50,11 @@ def total(tree: object, start: Scalar) -> Scalar:
     for leaf in jtu.tree_leaves(tree):
         start = start + jnp.sum(leaf)
     return start
+
+
+def any_of(like: Flag, flags: Iterable[Flag]) -> Flag:
+    """Whether any of these flags holds, of the shape of `like`."""
+    return functools.reduce(operator.or_, flags, jnp.zeros_like(like))
 
 
 def select(condition: Flag, a: object, b: object) -> Any:
@@ -390,6 +397,15 @@ class Plan(eqx.Module):
             if stop.coordinate == k:
                 place = jnp.where(contact == to_event(i), stop.place, place)
         return place
+
+    def away(self, k: int, contact: Scalar) -> Scalar:
+        """The sign of the direction of coordinate number k away from the stop named by `contact`; 0
+        if it rests on none."""
+        away = jnp.zeros_like(contact)
+        for i, stop in enumerate(self.machine.stops):
+            if stop.coordinate == k:
+                away = jnp.where(contact == to_event(i), -float(stop.sign), away)
+        return away
 
     def wall(self, k: int, contact: Scalar) -> tuple[Scalar | float, Scalar]:
         """The sign (1 right, -1 left) and the gap of the stop of coordinate number k that is named

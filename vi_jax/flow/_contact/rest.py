@@ -11,7 +11,7 @@ from jax.lax import stop_gradient
 
 from ..._types import Flag, Scalar
 from ...lanes import pin, pin_flag
-from .._lane import Lane, Plan, to_event, to_release
+from .._lane import Lane, Plan, to_release
 from ..events import Rates
 
 
@@ -69,13 +69,10 @@ def release(
     assert lane.contact is not None
     known = allowed(h)
     close, straight = plan.in_units(known.close), plan.in_units(known.straight)
-    sign = jnp.zeros_like(h)
-    for i, stop in enumerate(plan.machine.stops):
-        if stop.coordinate == k:
-            sign = jnp.where(lane.contact[k] == to_event(i), float(stop.sign), sign)
-    before, after = pin((-sign * begin.a, -sign * end.a))
+    away = plan.away(k, lane.contact[k])
+    before, after = pin((away * begin.a, away * end.a))
     rise = stop_gradient(after - before)
-    held = good & (sign != 0)
+    held = good & (away != 0)
     rising = held & (rise > 0)
     offset = -after * h / jnp.where(rising, rise, 1.0)
     near = jnp.abs(stop_gradient(offset)) <= close

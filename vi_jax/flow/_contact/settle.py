@@ -23,7 +23,7 @@ from ...machine import (
     struck_modes,
 )
 from .._flow_to_event import FlowToEvent
-from .._lane import Lane, Plan, in_place, select
+from .._lane import Lane, Plan, any_of, in_place, select
 from .._step.trial import Situation
 from ..drift import drifted
 from ..events import force_rate, rates
@@ -95,9 +95,7 @@ def _held(
         clear = ~beyond_a_stop(plan.machine, still)
         rests = {k: ends & clear for k, ends in rests.items()}
         contact = select(clear, contact, lane.contact)
-    any_rests = jnp.zeros_like(taken)
-    for ends in rests.values():
-        any_rests = any_rests | ends
+    any_rests = any_of(taken, rests.values())
     s, state, integrals = select(any_rests, (later, still, passed), (s, state, integrals))
     lane = lane._replace(s=s, state=state, contact=contact).recording(integrals=integrals)
     for k, ends in rests.items():

@@ -11,7 +11,7 @@ from jax.lax import stop_gradient
 from ..._types import Flag, Scalar
 from ...lanes import pin
 from ...machine import events_of, section_number
-from .._lane import FREE, Lane, Plan, select, to_event, to_release, to_turn_of
+from .._lane import FREE, Lane, Plan, any_of, select, to_event, to_release, to_turn_of
 from ..events import quintic, to_turn
 from ..methods import Foreseen
 from ..smooth import exact
@@ -109,10 +109,7 @@ def aim_at(plan: Plan, lane: Lane, trial: Trial, foreseen: bool) -> tuple[Flag, 
 
 def at_a_turn(trial: Trial) -> Flag:
     """Whether the step met a turning point that it was aimed at."""
-    met = jnp.zeros_like(trial.good)
-    for path in trial.paths:
-        met = met | path.at_turn
-    return met
+    return any_of(trial.good, (path.at_turn for path in trial.paths))
 
 
 class _Seen(NamedTuple):
@@ -171,9 +168,7 @@ class _Goal(NamedTuple):
 
 def _aimed(plan: Plan, lane: Lane, trial: Trial, seen: _Seen) -> tuple[Flag, Scalar, Scalar]:
     """What `aim_at` returns for a step that may have met something."""
-    h, landed = trial.h, jnp.zeros_like(trial.good)
-    for c in trial.crossings:
-        landed = landed | c.landed
+    h, landed = trial.h, any_of(trial.good, (c.landed for c in trial.crossings))
     first = first_event(plan, lane, seen.guards, seen.courses, landed, corrections=0)
     met = landed | at_a_turn(trial)
     goal = _Goal(first.crossed & ~landed, first.turned, pin(first.theta) * h, first.target)

@@ -11,7 +11,7 @@ from .._contact.rest import Release
 from .._contact.sequence import strike_in_turn
 from .._contact.settle import settle, stilled
 from .._flow_to_event import FlowToEvent
-from .._lane import Lane, Plan, in_place, select, to_event, to_turn_of
+from .._lane import Lane, Plan, any_of, in_place, select, to_event, to_turn_of
 from ..drift import drifted, height_of_turn, met_after, unmoved
 from ..events import Rates, to_turn
 from ..labelled import EventKind
@@ -36,12 +36,8 @@ def arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Fla
     way = FlowToEvent(plan, trial.smooth, lane.part, (trial.s, trial.state, trial.integrals))
     at = Situation(plan, lane, trial, taken, way)
     if trial.crossings:
-        met = jnp.zeros_like(taken)
-        for c in trial.crossings:
-            met = met | c.landed
-        for path in trial.paths:
-            if path.leaves is not None:
-                met = met | path.leaves.landed
+        leaves = [path.leaves.landed for path in trial.paths if path.leaves is not None]
+        met = any_of(taken, [*(c.landed for c in trial.crossings), *leaves])
         # Rare: skipped where no lane of a group has met anything.
         there, places = jax.lax.cond(met, lambda x: _met(at, *x), lambda x: x, (there, places))
     there = there.recording(**_reached(at, places))
@@ -94,9 +90,7 @@ def _met(at: Situation, lane: Lane, places: Scalars) -> tuple[Lane, Scalars]:
         for c in trial.crossings:
             offset = jnp.where(c.landed, _offset(at, c), offset)
         _, there, passed = drifted(way.rate, offset, way.moving, way.fixed, way.rest)
-        met = jnp.zeros_like(at.taken)
-        for here in landed.values():
-            met = met | here
+        met = any_of(at.taken, landed.values())
         integrals = select(met, passed, lane.record.integrals)
         lane = lane._replace(s=lane.s + jnp.where(met, offset, 0.0))
         lane = lane.recording(integrals=integrals)
@@ -128,9 +122,7 @@ def _landed(at: Situation, lane: Lane, there: State) -> Lane:
                 lane = lane.completing(landed[number])
             lane = with_outcome(machine, stop, lane, landed[number])
     if machine.stops and machine.others:
-        met = jnp.zeros_like(at.taken)
-        for number in range(len(machine.stops)):
-            met = met | landed[number]
+        met = any_of(at.taken, (landed[n] for n in range(len(machine.stops))))
         close = tuple(jnp.where(near[n], 1.0, 0.0) for n in near)
         # A stop may have changed the modes already.
         lane, off, _ = set_off(plan, lane, met, (there, at.old.modes), {}, close)
@@ -235,9 +227,7 @@ def _impact(at: Situation, lane: Lane, landed: dict[int, Flag], there: State) ->
     landed = {number: landed[number] for number in range(len(machine.stops))}
     strike = strike_in_turn if is_compound(machine) else strike_once
     lane, blows = strike(plan, at.taken, lane, landed, there)
-    met = jnp.zeros_like(at.taken)
-    for here in landed.values():
-        met = met | here
+    met = any_of(at.taken, landed.values())
     lane = settle(at, lane, there, met, blows)
     direction = list(lane.direction)
     for k, body in enumerate(machine.coordinates):

@@ -16,7 +16,7 @@ from ..integrals import Integrals, carried, elapsed
 from ..methods import Foreseen
 from ..smooth import SmoothMachine, exact, holding
 from .guards import Crossing, Side, crossings, leniency, turn_tolerance
-from .within import Within, apart, at_rest, foreseen_stages, guards_error, looks_within, within
+from .within import Within, apart, foreseen_stages, guards_error, looks_within, within
 
 # A window of force shorter than this share of the longest step moves the body by its third power,
 # 1e-9 of what a whole step does.
@@ -210,7 +210,7 @@ def _path(
             stop_gradient(_SLIVER * limit + jnp.zeros_like(h)),
         )
         if k in seen.forces:
-            rests, away = at_rest(plan, lane, k)
+            rests, away = lane.contact[k] > 0, plan.away(k, lane.contact[k])
             slow, along = seen.slow[k], -lane.direction[k]
             first, last = (
                 Rates(

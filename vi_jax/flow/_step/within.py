@@ -7,7 +7,7 @@ integral over the step counts in its error, and `hidden.crests` tells where they
 """
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ from jaxtyping import Array
 
 from ..._types import Flag, Scalar, State
 from ...machine import AbstractMachine, events_of, sides_of
-from .._lane import Lane, Plan, to_event
+from .._lane import Lane, Plan
 from ..events import Rates, rates
 from ..methods import Foreseen, Stage
 from ..smooth import SmoothMachine, exact, is_affine
@@ -110,6 +110,7 @@ def within(
         return Within({}, {}, {})
     machine, around = plan.machine, (lane.modes, lane.contact or ())
     limited = sorted({stop.coordinate for stop in machine.stops}) if plan.rests else []
+    contacts: Any = lane.contact
     looked_at = events_looked_at(plan, lane.state)
 
     def moves(k: int, s: Scalar, state: State) -> Rates:
@@ -121,9 +122,9 @@ def within(
         s, state = place
         forces, events = {}, {}
         for k in limited:
-            (rests, away), here = at_rest(plan, lane, k), moves(k, s, state)
+            contact, here = contacts[k], moves(k, s, state)
             free = jnp.where(slow[k], -lane.direction[k] * here.v, -1.0)
-            forces[k] = jnp.where(rests, away * here.a, free)
+            forces[k] = jnp.where(contact > 0, plan.away(k, contact) * here.a, free)
         for number in looked_at:
             if number < len(machine.stops):
                 events[number] = (_distance(machine, lane, number, state),)
@@ -140,11 +141,8 @@ def within(
 
     if looked_at:
         return Within(*at_each(places), slow)
-    assert lane.contact is not None
     none = {k: jnp.full(len(stages), -1.0, lane.s.dtype) for k in limited}
-    any_of_them = functools.reduce(
-        jnp.logical_or, [(lane.contact[k] > 0) | slow[k] for k in limited]
-    )
+    any_of_them = functools.reduce(jnp.logical_or, [(contacts[k] > 0) | slow[k] for k in limited])
     forces, _ = jax.lax.cond(any_of_them, at_each, lambda _: (none, {}), places)
     return Within(forces, {}, slow)
 
@@ -152,16 +150,6 @@ def within(
 def _is_slow(begin: Rates, h: Scalar) -> Flag:
     """Whether a body may turn twice within a step, as one that has just left its stop."""
     return jnp.abs(begin.v) <= jnp.abs(begin.a) * h
-
-
-def at_rest(plan: Plan, lane: Lane, k: int) -> tuple[Flag, Scalar]:
-    """Whether coordinate number k rests on a stop, and the sign of the direction away from it."""
-    assert lane.contact is not None
-    rests, away = lane.contact[k] > 0, jnp.zeros_like(lane.s)
-    for i, stop in enumerate(plan.machine.stops):
-        if stop.coordinate == k:
-            away = jnp.where(lane.contact[k] == to_event(i), -float(stop.sign), away)
-    return rests, away
 
 
 def _distance(machine: AbstractMachine, lane: Lane, number: int, state: State) -> Scalar:
