@@ -41,7 +41,7 @@ from ._memory import (
 )
 from ._operations import kind_of
 from ._program import LaneProgram
-from ._text import RARE, Text, Value, is_float
+from ._text import RARE, Text, Value, attributes, is_float
 from ._vector import Unsupported, write
 
 # The most memory of a thread for arrays: a choice. What asks for more runs on XLA, with a warning.
@@ -108,12 +108,8 @@ class _Writer:
             raise Unsupported(f"{t.arena.size * t.width * 8 >> 30} GB for its arrays")
         claimed, released = claim(t)
         t.lines += ["exit:", *released, "  ret void", "}"]
-        attributes = (
-            f'attributes #0 = {{ nounwind "min-legal-vector-width"="{bits}" '
-            f'"prefer-vector-width"="{bits}" }}'
-        )
         declared = t.declared.values()
-        return "\n".join([*declared, _PREAMBLE, *claimed, *t.lines, attributes, RARE, ""])
+        return "\n".join([*declared, _PREAMBLE, *claimed, *t.lines, attributes(bits), RARE, ""])
 
     def _entry(self) -> None:
         """Once per thread: the addresses of all arrays, and the strides."""

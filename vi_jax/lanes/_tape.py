@@ -37,7 +37,7 @@ from ._group import (
 from ._memory import gathering, load_pointer, load_stride, over_rows, scatter, shared
 from ._operations import compare, kind_of
 from ._reverse import ReverseProgram
-from ._text import RARE, FixedText, Text, Value
+from ._text import RARE, FixedText, Text, Value, attributes
 from ._vector import write
 
 # The scalar code that drives a group of lanes forward and back (`_tape.py`), as LLVM's text.
@@ -248,11 +248,7 @@ class _Writer:
             width=self.width, frame=64 + self.frame.size + self.arena, entries=entries, most=most,
             entry=tape_size(self.entry, self.width), call=_ARGUMENTS, out_of_memory=OUT_OF_MEMORY,
         )  # fmt: skip
-        attributes = (
-            f'attributes #0 = {{ nounwind "min-legal-vector-width"="{bits}" '
-            f'"prefer-vector-width"="{bits}" }}'
-        )
-        return "\n".join([*self.declared.values(), *functions, driver, attributes, RARE, ""])
+        return "\n".join([*self.declared.values(), *functions, driver, attributes(bits), RARE, ""])
 
     def _function(self, kind: str, name: str, more: str, t: Text, result: str) -> str:
         """A function around what was written; `more` are arguments of its own."""

@@ -81,6 +81,12 @@ KINDS = {
 RARE = '!0 = !{!"branch_weights", i32 1, i32 200}'
 
 
+def attributes(bits: int) -> str:
+    """The attributes of a kernel's functions, for registers of so many bits."""
+    widths = f'"min-legal-vector-width"="{bits}" "prefer-vector-width"="{bits}"'
+    return f"attributes #0 = {{ nounwind {widths} }}"
+
+
 def is_float(kind: str) -> bool:
     return kind in ("double", "float")
 
