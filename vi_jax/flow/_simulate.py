@@ -181,7 +181,7 @@ def collect(plan: Plan, sampled: bool, lane: Ends, points: State, records: Recor
     def whole(values):
         return jnp.where(jnp.isfinite(values), values, 0.0).astype(jnp.int32)
 
-    period = jnp.broadcast_to(machine.period, (plan.cycles,)).astype(lane.done.dtype)
+    period = jnp.broadcast_to(machine.period, (plan.cycles,)).astype(lane.steps.dtype)
     duration = None
     if plan.motion:
         duration = period if times is None else per_cycle(times, jnp.sum)

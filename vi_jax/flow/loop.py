@@ -109,14 +109,9 @@ _Inputs = tuple[Plan, State, Array]
 class Ends(NamedTuple):
     """What is kept of a lane when it has ended."""
 
-    done: Scalar
     fault: Scalar
     steps: Scalar
     rejected: Scalar
-
-    @classmethod
-    def of(cls, lane: Lane) -> "Ends":
-        return cls(lane.done, lane.fault, lane.steps, lane.rejected)
 
 
 def run_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> tuple[Ends, State, Record]:
@@ -176,4 +171,4 @@ def _step(rest: Plan, inputs: _Inputs, lane: Lane) -> tuple[Lane, lanes.Emitted]
 
 
 def _end(inputs: _Inputs, lane: Lane) -> Ends:
-    return Ends.of(lane)
+    return Ends(lane.fault, lane.steps, lane.rejected)
