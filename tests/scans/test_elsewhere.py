@@ -1,5 +1,6 @@
 """Scans in other processes: killed, on several devices, on clusters."""
 
+import importlib
 import re
 import signal
 import subprocess
@@ -73,6 +74,21 @@ def test_two_devices_give_the_same_numbers(tmp_path, whole):
 @pytest.mark.slow
 def test_a_cluster_that_loses_a_worker_gives_the_same(tmp_path, whole):
     _same(_finished(tmp_path / "cluster", "--cluster"), whole)
+
+
+@pytest.mark.slow
+def test_a_cluster_without_workers_is_waited_for(monkeypatch):
+    distributed = pytest.importorskip("dask.distributed")
+    computed, said = importlib.import_module("vi_jax.scans._computed"), []
+    monkeypatch.setattr(computed, "_PATIENCE", 0.2)
+    monkeypatch.setattr(computed, "warn", lambda words: said.append(words) or cluster.scale(1))
+    scene, axes = vi.Scene.ideal(frequency_ratio=0.9), {"start.Y": np.linspace(-1.0, 1.0, 300)}
+    options: dict = {"measure": "extremes", "settle": 5, "cycles": 4, "lanes": 256}
+    with distributed.LocalCluster(0, processes=False, dashboard_address=None) as cluster:
+        with distributed.Client(cluster) as client:
+            found = vi.scan(scene, axes, **options, cluster=client)
+    assert said and "has no workers. The scan waits" in said[0]
+    xr.testing.assert_identical(found, vi.scan(scene, axes, **options))
 
 
 @pytest.mark.slow

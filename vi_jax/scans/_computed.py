@@ -28,7 +28,7 @@ from jaxtyping import Array
 
 from .. import lanes
 from .._checks import count, fits_memory, fits_records
-from .._messages import Interrupted, at_work
+from .._messages import Interrupted, at_work, warn
 from .._programs import PLAIN, CompiledFunction
 from .._types import xr
 from ..flow import compiling
@@ -48,6 +48,9 @@ _LEAST = 256
 
 # Blocks that a cluster has at a time: a choice, more than it has cores.
 _ON_CLUSTER = 4096
+
+# Seconds without a new block after which a cluster is asked for its workers. A choice.
+_PATIENCE = 10.0
 
 
 class ScanInterrupted(Interrupted):
@@ -259,7 +262,10 @@ def run_blocks(
                     begin(where)
                 if not running:
                     return
-                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                done, _ = wait(running, timeout=_PATIENCE, return_when=FIRST_COMPLETED)
+                if not done:
+                    _warn_without_workers(place.cluster)
+                for future in done:
                     finish(future)
         finally:
             wait([future for future in running if not future.cancel()])
@@ -274,6 +280,11 @@ def _executor_of(cluster: Any) -> Executor:
     if cluster.status != "running":
         raise ClusterLost
     return cluster.get_executor(pure=False, retries=3)
+
+
+def _warn_without_workers(cluster: Any) -> None:
+    if hasattr(cluster, "scheduler_info") and not cluster.scheduler_info()["workers"]:
+        warn("The Dask cluster has no workers. The scan waits for new ones, until Ctrl-C.")
 
 
 def _task(
