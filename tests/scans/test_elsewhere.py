@@ -84,7 +84,8 @@ def test_a_cluster_without_workers_is_waited_for(monkeypatch):
     monkeypatch.setattr(computed, "warn", lambda words: said.append(words) or cluster.scale(1))
     scene, axes = vi.Scene.ideal(frequency_ratio=0.9), {"start.Y": np.linspace(-1.0, 1.0, 300)}
     options: dict = {"measure": "extremes", "settle": 5, "cycles": 4, "lanes": 256}
-    with distributed.LocalCluster(0, processes=False, dashboard_address=None) as cluster:
+    empty = {"n_workers": 0, "processes": False, "dashboard_address": None}
+    with distributed.LocalCluster(**empty) as cluster:
         with distributed.Client(cluster) as client:
             found = vi.scan(scene, axes, **options, cluster=client)
     assert said and "has no workers. The scan waits" in said[0]
