@@ -1,8 +1,8 @@
 """What each JAX primitive becomes that works number by number: arithmetic, flags, conversions."""
 
+import functools
 import operator
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -68,6 +68,7 @@ Rule = Callable[..., Any]
 ELEMENTWISE: dict[str, Rule] = {}
 
 
+@functools.cache
 def kind_of(dtype: Any) -> str:
     """**Raises:** `KeyError` for types that lanes do not have (complex, half precision, keys)."""
     return KINDS[np.dtype(dtype).name]
@@ -93,7 +94,7 @@ def register(table: dict[str, Rule], *names: str) -> Callable[[Rule], Rule]:
     return put
 
 
-elementwise = partial(register, ELEMENTWISE)
+elementwise = functools.partial(register, ELEMENTWISE)
 
 
 # --- arithmetic

@@ -166,11 +166,15 @@ _PLACES = {"dynamic_update_slice": 2}
 def _elementwise(t: Text, name, params, dtypes, args, avals) -> list[Array]:
     """The results of a rule of `ELEMENTWISE`: number by number of arrays in registers. Of larger
     ones they are formulas; several results, which are computed together, are stored."""
-    rule, shape, kinds = ELEMENTWISE[name], avals[0].shape, [kind_of(a.dtype) for a in avals]
+    rule, shape = ELEMENTWISE[name], avals[0].shape
     if avals[0].size <= MOST_IN_REGISTERS and all(isinstance(x, Registers) for x in args):
         values = [x.values for x in args]
+        if not any(x.shape for x in values):
+            found = rule(t, params, dtypes, *(x[()] for x in values))
+            return [Registers.one(x) for x in (found if len(avals) > 1 else (found,))]
         if any(x.shape != values[0].shape for x in values):
             values = np.broadcast_arrays(*values)
+        kinds = [kind_of(a.dtype) for a in avals]
         outs = [np.empty(values[0].shape, object) for _ in avals]
         for i in np.ndindex(values[0].shape):
             found = rule(t, params, dtypes, *(x[i] for x in values))
@@ -179,6 +183,7 @@ def _elementwise(t: Text, name, params, dtypes, args, avals) -> list[Array]:
         return [Registers(out, kind) for out, kind in zip(outs, kinds, strict=True)]
     if name in SAME:
         return args[:1]
+    kinds = [kind_of(a.dtype) for a in avals]
 
     def numbers(index: tuple) -> Any:
         # JAX lets numbers, and axes of one number, stand for arrays.

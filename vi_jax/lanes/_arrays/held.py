@@ -44,6 +44,8 @@ def mapped(t: Text, function: Callable[..., Value], *arrays: Array, kind: str | 
     **Arguments:** `kind`, the type of its result, if another than that of the first array.
     """
     first, kind = arrays[0], kind or arrays[0].kind
+    if not first.shape:
+        return Registers.one(function(*(x.at(t, ()) for x in arrays)))
     if all(isinstance(x, Registers) for x in arrays):
         numbers = zip(*(x.values.flat for x in arrays), strict=True)  # pyright: ignore
         out: Any = np.empty(first.shape, object)

@@ -68,7 +68,9 @@ class Registers(Array):
     @classmethod
     def one(cls, value: Value) -> "Registers":
         """An array without axes."""
-        return cls.of((), value.kind, lambda _: value)
+        values = np.empty((), object)
+        values[()] = value
+        return cls(values, value.kind)
 
     def item(self) -> Value:
         """The only number."""
