@@ -158,6 +158,8 @@ class Held(NamedTuple):
     """The row of the first friction."""
     dry: list[tuple[int, Any, Any]]
     """Of each other friction its place among the switches, itself, and the mass that it acts on."""
+    masses: list[Any]
+    """What a force of each row acts on; empty without friction on stops."""
 
 
 def held_by(
@@ -170,26 +172,27 @@ def held_by(
     """
     limited = sorted({stop.coordinate for stop in machine.stops}) if contact else []
     coordinates: Any = machine.coordinates if limited else ()
-    bodies = [coordinates[k] for k in limited]
-    pushes, acts = [push_of(body, state) for body in bodies], [contact[k] > 0 for k in limited]
+    stops, switches = (machine.stops, machine.switches) if contact else ((), ())
+    frictions = [(i, x) for i, x in enumerate(switches) if x.rubs_on is not None]
+    numbers = [*limited, *(x.along for _, x in frictions)]
+    each = {k: push_of(coordinates[k], state) for k in numbers}
+    pushes, acts = [each[k] for k in numbers], [contact[k] > 0 for k in limited]
+    masses = {k: coordinates[k].mass_at(s, state) for k in numbers} if frictions else {}
     rubbing = []
-    for i, friction in enumerate(machine.switches):
-        if friction.rubs_on is None or not contact:
-            continue
-        stop = machine.stops[friction.rubs_on]
+    for i, friction in frictions:
+        stop = stops[friction.rubs_on]
         at = limited.index(stop.coordinate)
         here = contact[stop.coordinate] == 1.0 + friction.rubs_on
-        along, body = coordinates[friction.along], bodies[at]
-        drag = push_of(along, state)
         # The stop pushes a body away from it, and friction against the way it slips.
-        ratio = body.mass_at(s, state) / along.mass_at(s, state)
+        ratio = masses[stop.coordinate] / masses[friction.along]
         ratio = modes[i] * friction.level * stop.sign * ratio
         slips = jnp.where(here, ratio, 0.0)
-        pushes[at] = added(pushes[at], (slips,), (drag,))
-        bodies, pushes = [*bodies, along], [*pushes, drag]
+        pushes[at] = added(pushes[at], (slips,), (each[friction.along],))
         acts = [*acts, here & (modes[i] == 0)]
         rubbing.append((i, friction, at, slips))
-    return Held(bodies, pushes, acts, rubbing, len(limited), [])
+    bodies = [coordinates[k] for k in numbers]
+    of_rows = [masses[k] for k in numbers] if frictions else []
+    return Held(bodies, pushes, acts, rubbing, len(limited), [], of_rows)
 
 
 def with_dry_friction(
@@ -213,7 +216,7 @@ def with_dry_friction(
 def held_flow(
     machine: Machine, flow: State, s: Scalar, state: State, modes: Sequence[Scalar],
     contact: Sequence[Scalar],
-) -> tuple[State, dict[int, tuple[Any, Any]]]:  # fmt: skip
+) -> tuple[State, dict[int, tuple[Any, Any, Any]]]:  # fmt: skip
     """The rate at which a state changes along `flow` while those coordinates that rest keep their
     velocities, all at once: contacts that share a body are held by forces that depend on each
     other, and on the friction there.
@@ -221,7 +224,7 @@ def held_flow(
     **Arguments:** `modes`, those of the machine's switches first; `contact` as in `Around`.
 
     **Returns:** the rate, and of each friction, by its place among the switches, the force along
-    the surface and that which presses on it, or the mass that it acts on.
+    the surface, that which presses on it (of one on a stop), and the mass that it acts on.
     """
     held = with_dry_friction(held_by(machine, s, state, modes, contact), machine, s, state, modes)
     wanted = [-gained(body, state, flow) for body in held.coordinates]
@@ -232,9 +235,8 @@ def held_flow(
     pace, found = machine.pace(s, state), {}
     for row, (i, _, mass) in enumerate(held.dry, start=rows):
         force = amounts[row] * mass
-        found[i] = force if pace is None else force / pace, mass
+        found[i] = force if pace is None else force / pace, None, mass
     for row, (i, friction, at, _) in enumerate(held.rubbing, start=held.first):
-        along, body = held.coordinates[row], held.coordinates[at]
-        pressing = -machine.stops[friction.rubs_on].sign * amounts[at] * body.mass_at(s, state)
-        found[i] = amounts[row] * along.mass_at(s, state), pressing
+        sign, mass = machine.stops[friction.rubs_on].sign, held.masses[row]
+        found[i] = amounts[row] * mass, -sign * amounts[at] * held.masses[at], mass
     return added(flow, amounts, held.pushes), found

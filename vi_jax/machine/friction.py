@@ -237,7 +237,7 @@ class DryFriction(Friction):
 
         **Arguments:** `contact` as in `Around`; `found`, of `held_flow`.
         """
-        force, mass = found
+        force, _, mass = found
         return force, self.sticking(machine, s, state), mass, jnp.ones((), bool)
 
     def sliding(self, machine: Machine, s: Scalar, state: State, mode: Scalar) -> Any:
@@ -353,9 +353,8 @@ class ContactFriction(Friction):
 
         **Arguments:** `contact` as in `Around`; `found`, of `held_flow`.
         """
-        force, pressing = found
+        force, pressing, mass = found
         here = contact[machine.stops[self.stop].coordinate] == 1.0 + self.stop
-        mass = machine.coordinates[self.along].mass_at(s, state)
         return force, self.level * pressing, mass, here
 
     def push_in(self, machine, s, state, mode):
