@@ -7,6 +7,7 @@ from ._continue_orbit import continue_orbit as continue_orbit
 from ._cycle_map import CycleMap as CycleMap
 from ._cycle_map import adopted as adopted
 from ._cycle_map import cycle_map as cycle_map
+from ._follow import check_walk as check_walk
 from ._forecast import SCENARIOS as SCENARIOS
 from ._tables import point_of as point_of
 from .branch import Branch as Branch
@@ -15,7 +16,6 @@ from .branch import column_names as column_names
 from .closed_form import ClosedFormOrbits as ClosedFormOrbits
 from .closed_form import closed_form_orbits as closed_form_orbits
 from .codimension_two import CodimensionTwo as CodimensionTwo
-from .curve import check_walk as check_walk
 from .distinct import Orbits as Orbits
 from .distinct import distance as distance
 from .distinct import distinct_among as distinct_among

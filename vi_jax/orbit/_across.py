@@ -11,21 +11,21 @@ import numpy as np
 from .._types import State
 from ..flow import simulate
 from ..machine import after_event, with_leaf
+from ._corrector import Step, advance, tangent_at
 from ._events import Event
 from ._fewer_events import without_events
 from ._problem import events_in
 from ._shooting import Shooting
 from ._sliding import change_at
 from ._solution import sections_of
-from ._solve import advance, tangent_at
-from .curve import Step
 from .find import find_orbit
 from .results import Orbit
 
 # Periods after which a stable motion near the point has settled: a choice.
 _SETTLES = 100
 
-# Events that are closer than this fall together: a choice, above how close a place is located.
+# Events that are closer than this (a cycle is 2π) fall together: a choice, above how close a place
+# is located.
 _TOGETHER = 1e-6
 
 
@@ -44,7 +44,7 @@ def without_part(
     first = int(np.argmin(np.abs(np.asarray(problem.parts(jnp.asarray(step.x))[0]) - change.clock)))
     both = [first, (first + 1) % problem.legs]
     new, start = without_events(problem, np.asarray(step.x), both)
-    scale = np.concatenate([np.ones(len(start) - 1), scale[-1:]])
+    scale = new.scale(scale[-1:])
     tangent = tangent_at(new, start, scale)
     for sense in (1.0, -1.0):
         found = advance(new, start, sense * tangent, scale, distance)
@@ -131,11 +131,11 @@ def _swapped(problem: Shooting, step: Step) -> Iterator[State]:
     """The state on the section where an event that falls on it comes on the other side of it."""
     x = jnp.asarray(step.x)
     machine, clock, states = problem.at(x), *problem.parts(x)
-    ends = problem.ends(clock, problem.period(x))
+    lengths = np.abs(problem.ends(clock, problem.period(x)) - clock) / problem.radian
     for i, event in enumerate(problem.events):
         j = (i + 1) % problem.legs
         after = problem.events[j]
-        if 0 not in (event.cycle, after.cycle) or abs(float(ends[i] - clock[i])) > _TOGETHER:
+        if 0 not in (event.cycle, after.cycle) or lengths[i] > _TOGETHER:
             continue
         state, modes = problem.unravel(states[i]), problem.modes_in(i - 1)
         # The section's state is that behind it.

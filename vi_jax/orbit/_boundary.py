@@ -7,24 +7,22 @@ from typing import Any
 import numpy as np
 
 from .._checks import flag, instance_of, interval
-from .._messages import Interrupted, at_work, so_many
+from .._messages import so_many
 from .._types import xr
 from ..flow import tidy
 from ..machine import check_leaf, leaf, with_units
-from ._codimension import points_of
-from ._curve_monitor import CurveMonitor, Intervals, cosine_of
+from ._corrector import Step, advance, tangent_at
 from ._fixed_step_method import steps_of
+from ._follow import Followed, both_ways, check_walk
 from ._problem import check_parameter
 from ._shooting import Shooting
 from ._sliding import ADDING_SLIDING, GRAZING_SLIDING
 from ._solution import orbit_at
-from ._solve import tangent_at
 from ._special_condition import Special, symmetry_condition
+from ._special_table import Intervals, SpecialTable, cosine_of, points_of
 from ._symmetry import may_be_symmetric
 from ._tables import stability_in_words
-from ._walked import walked
 from .codimension_two import CodimensionTwo
-from .curve import INTERRUPTED, Step, check_walk
 from .results import InWords, Orbit
 from .special import DOUBLING, FOLD, SYMMETRY, TORUS, TOUCHING, SpecialPoint, one
 
@@ -166,34 +164,25 @@ def boundary(
     settings = check_walk(step=step, max_step=max_step, max_points=max_points)
     progress = flag("progress", progress)
     _check_point(point)
-    bounds = _checked_bounds(point, parameter, bounds)
-    problem, condition, x = _special_motion(point, parameter, bounds)
-    scale = np.ones(x.size)
-    scale[-2:] = [0.5 * (high - low) for low, high in bounds]
+    ranges = _checked_bounds(point, parameter, bounds)
+    problem, condition, x = _special_motion(point, parameter, ranges)
+    scale = problem.scale([0.5 * (high - low) for low, high in ranges])
 
-    ahead, back = (CurveMonitor(problem, condition, scale, bounds) for _ in range(2))
-    start = ahead.advance(x, tangent_at(problem, x, scale), 0.0)
+    tangent = tangent_at(problem, x, scale)
+    tangent = tangent * np.copysign(1.0, tangent[-2])  # ahead the second parameter rises
+    start = advance(problem, x, tangent, scale, 0.0)
     if not bool(start.good):
         raise ValueError(
             "Argument `point` could not be refined in two parameters (last correction "
             f"{float(start.size):.2g})."
         )
 
-    forward, backward = [start], [start._replace(tangent=-start.tangent)]
-    ends = [INTERRUPTED, INTERRUPTED]
-
-    def curve() -> Boundary:
-        path = [*reversed(backward[1:]), *forward]
-        finest = max(back.problem, ahead.problem, key=lambda p: p.steps)
-        return _curve(finest, condition, path, (ends[0], ends[1]), scale)
-
-    def kept() -> Interrupted:
-        return Interrupted("walk along the boundary", curve())
-
-    with at_work("boundary", kept, progress=progress, unit="point") as tell:
-        ends[1] = walked(ahead, forward, tell, settings)
-        ends[0] = ends[1] if ends[1] == "closed" else walked(back, backward, tell, settings)
-    return curve()
+    return both_ways(
+        lambda: SpecialTable(problem, condition, scale, ranges),
+        start,
+        lambda found: _curve(found, condition, scale),
+        what="boundary", progress=progress, settings=settings,
+    )  # fmt: skip
 
 
 def _check_point(point: SpecialPoint) -> None:
@@ -220,8 +209,8 @@ def _check_point(point: SpecialPoint) -> None:
 
 
 def _checked_bounds(point: SpecialPoint, parameter: str, bounds: Any) -> Intervals:
-    """The intervals of both parameters. **Raises:** `ValueError` for what is none, or does not hold
-    the point."""
+    """The intervals of the second parameter and of the point's own, in the order of the unknowns.
+    **Raises:** `ValueError` for what is none, or does not hold the point."""
     machine, name = point.problem.machine, point.problem.parameters[0]
     check_leaf(machine, parameter)
     if name == parameter:
@@ -236,7 +225,7 @@ def _checked_bounds(point: SpecialPoint, parameter: str, bounds: Any) -> Interva
     first, second = interval("bounds", first), interval("bounds", second)
     check_parameter(machine, name, point.parameter, first, "point")
     check_parameter(machine, parameter, float(leaf(machine, parameter)), second, "point")
-    return first, second
+    return second, first
 
 
 def _special_motion(
@@ -245,11 +234,11 @@ def _special_motion(
     """The equations of the curve, the condition among them that makes its motions special, and
     their unknowns at the point where it begins."""
     old = point.problem
-    two = dataclasses.replace(old, parameters=(*old.parameters, parameter))
+    two = dataclasses.replace(old, parameters=(parameter, *old.parameters))
     corners = two.corners(bounds)
     steps = max(old.steps, steps_of(old.method, corners, old.like, old.cycles))
     problem = dataclasses.replace(two, steps=steps)
-    values = point.parameter, float(leaf(old.machine, parameter))
+    values = float(leaf(old.machine, parameter)), point.parameter
     x = np.append(np.asarray(point.step.x)[:-1], values)
     symmetry = None
     if point.kind == SYMMETRY:
@@ -263,22 +252,19 @@ def _special_motion(
     return dataclasses.replace(problem, conditions=(condition,)), condition, x
 
 
-def _curve(
-    problem: Shooting, condition: Special, path: list[Step], ends: tuple[str, str],
-    scale: np.ndarray,
-) -> Boundary:  # fmt: skip
-    seen = [step.seen for step in path]
+def _curve(found: Followed, condition: Special, scale: np.ndarray) -> Boundary:
+    problem, seen = found.problem, [step.seen for step in found.steps]
     return Boundary(
         kind=condition.kind,
-        names=(problem.parameters[0], problem.parameters[1]),
-        parameters=np.stack([step.x[-2:] for step in path]),
+        names=(problem.parameters[1], problem.parameters[0]),
+        parameters=np.stack([step.x[:-3:-1] for step in found.steps]),
         y_min=np.array([at.y_min for at in seen]),
         multipliers=np.stack([at.multipliers for at in seen]),
         impact_speed=np.stack([at.approach[list(problem.impacts)] for at in seen]),
         clearance=np.array([at.nearest.room for at in seen]),
-        ends=ends,
+        ends=found.ends,
         problem=problem,
-        steps=path,
+        steps=found.steps,
         condition=condition,
         scale=scale,
     )

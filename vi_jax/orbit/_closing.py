@@ -1,15 +1,16 @@
 """Whether a curve of motions has come back to where it began."""
 
-from collections.abc import Callable
+from collections.abc import Iterator
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from ._corrector import Step
+from ._follow import CLOSED, Ending, Event, Table
 from ._shooting import Shooting
 from ._solution import sections_of
-from .curve import Step
 
 # The same motion is met again within this (scaled), in a direction that is the same within that:
 # choices, ten thousand times what the corrector leaves, and far less than two passages differ by.
@@ -23,67 +24,66 @@ _SHORT = 1e-6
 
 
 class Closing:
-    """Looks at each step of a walk whether the curve has come back to its first point.
+    """Looks at each step of a walk whether the curve has come back to where it was.
 
-    It has if it passes the plane across its beginning at the same motion in the same direction. A
-    curve that only comes close to itself passes that plane elsewhere. The motion may be met again
-    some cycles later, or with another of its events as the first one: that is the same motion.
+    It has if it passes the plane across one of its points, the first or a later one, at the same
+    motion in the same direction. A curve that only comes close to itself passes that plane
+    elsewhere. The motion may be met again some cycles later, or with another of its events as the
+    first one: that is the same motion.
 
-    **Arguments:** the equations of the motions, the parameters as their last unknowns; the size of
-    each unknown.
+    **Arguments:** the curve's table.
     """
 
-    def __init__(self, problem: Shooting, scale: np.ndarray):
-        self.problem, self.scale = problem, scale
-        self.first: Step | None = None
+    def __init__(self, table: Table):
+        self.table = table
         self.begins: list[tuple[np.ndarray, np.ndarray]] = []
-        self.away = False
+        self.points: list[Step] = []
 
-    def between(
-        self, here: Step, new: Step, where: Callable[[Callable[[Step], float]], Step | None]
-    ) -> Step | None:
-        """The first point, as the last one of a closed curve, if it is met between two points; of
-        the same motion observed otherwise that point as this curve has it.
-
-        **Arguments:** points that follow each other; `where`, the point between them at which a
-        test is zero.
-        """
-        if self.first is None:
-            self.first = here
+    def rows(self, here: Step, new: Step) -> Iterator[Event]:
+        """The rows of a table for a step between two points: one for each place close by at which
+        the curve was before."""
+        if not self.points:
             self.begins = self._beginnings(here)
-        near = _NEAR * float(np.linalg.norm((new.x - here.x) / self.scale))
-        self.away = self.away or self._apart(new, self.begins[0][0]) > near
-        if not self.away:
-            return None
-        for i, (begin, tangent) in enumerate(self.begins):
+        if not self.points or self.points[-1] is not here:
+            self.points.append(here)
+        near = _NEAR * float(np.linalg.norm((new.x - here.x) / self.table.scale))
+        xs = np.stack([step.x for step in self.points])
+        apart = np.linalg.norm((xs - new.x) / self.table.scale, axis=1)
+        if apart.max() <= near:
+            return
+        away = int(np.flatnonzero(apart > near)[-1])  # from the next one on it is near
+        met = [self.points[i] for i in np.flatnonzero(apart[: away + 1] <= near) if i]
+        places: list[tuple[np.ndarray, np.ndarray, Step | None]] = [
+            *((x, t, None if i else self.points[0]) for i, (x, t) in enumerate(self.begins)),
+            *((np.asarray(step.x), np.asarray(step.tangent), step) for step in met),
+        ]
+        for begin, tangent, known in places:
             begin = self._some_cycles_later(begin, here)
-
-            def beyond(step: Step, begin=begin, tangent=tangent) -> float:
-                return float(np.dot(tangent, (step.x - begin) / self.scale))
-
             if min(self._apart(step, begin) for step in (here, new)) > near:
                 continue
-            if not beyond(here) < 0 <= beyond(new):
-                continue
-            at = where(beyond)
-            if at is None or self._apart(at, begin) > _AGAIN:
-                continue
-            if np.linalg.norm(at.tangent - tangent) < _ALONG:
-                return at if i else self.first._replace(tangent=at.tangent)
-        return None
+
+            def before(step: Step, begin=begin, tangent=tangent) -> float:
+                return float(np.dot(tangent, (begin - step.x) / self.table.scale))
+
+            def ending(at: Step, begin=begin, tangent=tangent, known=known) -> Ending | None:
+                same = self._apart(at, begin) < _AGAIN
+                if not same or np.linalg.norm(at.tangent - tangent) >= _ALONG:
+                    return None
+                return Ending(at if known is None else known._replace(tangent=at.tangent), CLOSED)
+
+            yield Event(before, ending)
 
     def _apart(self, step: Step, begin: np.ndarray) -> float:
-        return float(np.linalg.norm((step.x - begin) / self.scale))
+        return float(np.linalg.norm((step.x - begin) / self.table.scale))
 
     def _beginnings(self, first: Step) -> list[tuple[np.ndarray, np.ndarray]]:
         """Unknowns and tangent of the first motion, and of the same one observed otherwise."""
-        x = np.asarray(first.x)
+        x, scale, problem = np.asarray(first.x), self.table.scale, self.table.problem
         ahead, behind = (
-            observed_otherwise(self.problem, x + sign * _SHORT * first.tangent * self.scale)
-            for sign in (1, -1)
+            observed_otherwise(problem, x + by * first.tangent * scale) for by in (_SHORT, -_SHORT)
         )
-        tangents = [(a - b) / (2 * _SHORT * self.scale) for a, b in zip(ahead, behind, strict=True)]
-        others = zip(observed_otherwise(self.problem, x), tangents, strict=True)
+        tangents = [(a - b) / (2 * _SHORT * scale) for a, b in zip(ahead, behind, strict=True)]
+        others = zip(observed_otherwise(problem, x), tangents, strict=True)
         return [
             (x, np.asarray(first.tangent)),
             *(found for found in others if self._apart(first, found[0]) > _AGAIN),
@@ -92,7 +92,7 @@ class Closing:
     def _some_cycles_later(self, begin: np.ndarray, here: Step) -> np.ndarray:
         """The motion counted from the cycle in which its first event is nearest to that of another
         one."""
-        problem = self.problem
+        problem = self.table.problem
         if not problem.events or problem.autonomous:
             return begin
         cycle = float(problem.at(jnp.asarray(begin)).cycle)

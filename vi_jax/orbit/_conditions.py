@@ -16,10 +16,10 @@ import numpy as np
 from .._types import Scalar, Vector
 from ..machine import in_unit, with_leaf
 from ..machine import quantity_of as measured
+from ._corrector import Step
 from ._observed import Observed
 from ._quantities import quantity_of
 from ._shooting import Shooting
-from .curve import Step
 from .floquet import compound
 
 
@@ -76,22 +76,17 @@ class HeldMultiplier(AbstractCondition):
         return float(max(others, np.real((values[i] - values[j]) ** 2)))
 
 
-def alone(
-    problem: Shooting, step: Step, scale: np.ndarray, kept: int = -1
-) -> tuple[Shooting, Step, np.ndarray]:
-    """The equations of a motion in one of their parameters only, without conditions, the others as
-    they are at a step; and the step and the sizes of the unknowns as theirs.
-
-    **Arguments:** `kept`, which parameter, from the last one back: -1 is that one.
-    """
+def alone(problem: Shooting, step: Step, scale: np.ndarray) -> tuple[Shooting, Step, np.ndarray]:
+    """The equations of a motion in the last of their parameters only, without conditions, the
+    others as they are at a step; and the step and the sizes of the unknowns as theirs."""
     count = len(problem.parameters)
     if not problem.conditions:
         return problem, step, scale
-    gone, machine = [i for i in range(-count, 0) if i != kept], problem.machine
+    gone, machine = list(range(-count, -1)), problem.machine
     for i in gone:
         machine = with_leaf(machine, problem.parameters[i], step.x[i])
     one = dataclasses.replace(
-        problem, machine=machine, parameters=(problem.parameters[kept],), conditions=()
+        problem, machine=machine, parameters=problem.parameters[-1:], conditions=()
     )
     x, tangent, sizes = (np.delete(np.asarray(a), gone) for a in (step.x, step.tangent, scale))
     size = float(np.linalg.norm(tangent)) or 1.0

@@ -9,25 +9,21 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._checks import flag, given_number, interval, one_of, short, tuple_of_names
-from .._messages import Interrupted, at_work
 from ..flow import MethodLike
 from ..machine import check_leaf, leaf
 from ._conditions import as_held
+from ._corrector import Step, advance, tangent_at
 from ._fixed_step_method import steps_of
-from ._monitor import BranchMonitor
+from ._follow import Followed, both_ways, check_walk
+from ._motion_table import MotionTable
 from ._observed import Observed
-from ._problem import check_parameter, problem_of
+from ._problem import check_parameter, problem_of, sized
 from ._quantities import names_of, rates_at
-from ._rest import rests
 from ._section_map import section_map_of
 from ._shooting import Shooting
-from ._solve import advance, tangent_at
-from ._walked import walked
 from .branch import Branch
-from .curve import INTERRUPTED, Step, check_walk
 from .floquet import NEUTRAL
-from .results import ORBIT_RESULTS, Orbit
-from .special import SpecialPoint
+from .results import ORBIT_RESULTS, Orbit, lies_on_a_stop
 
 _NONE: Mapping[str, Any] = MappingProxyType({})
 
@@ -44,6 +40,7 @@ def continue_orbit(
     max_step: float = 0.1,
     max_points: int = 1000,
     extrema: str | Sequence[str] = (),
+    watch: Mapping[str, Callable[[Orbit], float]] = _NONE,
     free: Mapping[str, tuple[float, float]] = _NONE,
     fixed: Mapping[str, float | None] = _NONE,
     method: MethodLike = None,
@@ -70,6 +67,9 @@ def continue_orbit(
       special points: `"y_min"`, `"y_max"`, `"clearance"`, `"duration"`, `"frequency_ratio"`,
       `"fastest_impact"`, `"slowest_impact"`, `"multiplier"` (the greatest modulus), an average of
       the machine's own, and of the section `"section_Y"` and the like. They cost a program more.
+    - `watch`: functions of the orbit, by names of one's own, whose zeros along the branch are
+      located, as special points of kind `"watched"`:
+      `{"limit": lambda orbit: orbit.impact_speed.max() - 2.0}`.
     - `free`: further numbers of the machine that are to vary, with the interval of each:
       `{"stops.0.gap": (1.0, 3.0)}`.
     - `fixed`: for each of them a number of the motion, of the names above, that is held instead:
@@ -96,43 +96,25 @@ def continue_orbit(
     bounds = interval("bounds", bounds)
     value = float(leaf(orbit.machine, parameter))
     check_parameter(orbit.machine, parameter, value, bounds, "orbit")
-    if rests(orbit):
+    if bool(orbit.rests > 0) or (orbit.machine.may_rest() and lies_on_a_stop(orbit)):
         problem, x = section_map_of(orbit, parameter, method)
     else:
         problem, x = problem_of(orbit, parameter, bounds, method)
-    sought = _names("extrema", extrema, problem)
+    sought, watched = _names("extrema", extrema, problem), _watched(watch, orbit)
     problem, x, ranges = _freed(problem, x, free, fixed, bounds, np.asarray(orbit.multipliers))
-    scale = np.ones(problem.size)
-    scale[-len(ranges) :] = [0.5 * (high - low) for low, high in ranges]
-    start = _first_point(problem, x, scale, orbit)
-    back, ahead = (BranchMonitor(problem, scale, ranges, sought) for _ in range(2))
-    return _both_ways(parameter, start, back, ahead, progress, settings)
-
-
-def _both_ways(
-    parameter: str, start: Step, back: BranchMonitor, ahead: BranchMonitor, progress: bool,
-    settings: dict[str, Any],
-) -> Branch:  # fmt: skip
-    """The branch through a point, with a monitor for each of the two walks.
-
-    **Arguments:** whether a bar is shown, and the settings of `walk`.
-    """
-    forward, backward = [start], [start._replace(tangent=-start.tangent)]
-    ends = [INTERRUPTED, INTERRUPTED]
-
-    def branch() -> Branch:
-        special = [*reversed(back.special), *ahead.special]
-        problem = max(back.problem, ahead.problem, key=lambda p: p.steps)
-        steps = [*reversed(back.path(backward[1:])), *ahead.path(forward)]
-        return _branch(problem, parameter, steps, special, (ends[0], ends[1]), ahead.scale)
-
-    def kept() -> Interrupted:
-        return Interrupted("walk along the branch", branch())
-
-    with at_work("branch", kept, progress=progress, unit="point") as tell:
-        ends[1] = walked(ahead, forward, tell, settings)
-        ends[0] = ends[1] if ends[1] == "closed" else walked(back, backward, tell, settings)
-    return branch()
+    widths = [0.5 * (high - low) for low, high in ranges]
+    start = _first_point(problem, x, problem.scale(widths), orbit)
+    before = problem.scale(widths)
+    problem = sized(problem, start.x, start.seen.largest)
+    scale = problem.scale(widths)
+    tangent = start.tangent * before / scale
+    start = advance(problem, start.x, tangent / np.linalg.norm(tangent), scale, 0.0)
+    return both_ways(
+        lambda: MotionTable(problem, scale, ranges, sought, watched),
+        start,
+        lambda found: _branch(found, parameter, scale),
+        what="branch", progress=progress, settings=settings,
+    )  # fmt: skip
 
 
 def _check_orbit(orbit: Orbit) -> None:
@@ -210,6 +192,22 @@ def _names(argument: str, names: str | Sequence[str], problem: Shooting) -> tupl
     return tuple(one_of(argument, name, known) for name in tuple_of_names(argument, names))
 
 
+def _watched(
+    watch: Mapping[str, Callable[[Orbit], float]], orbit: Orbit
+) -> Mapping[str, Callable[[Orbit], float]]:
+    """Functions by name. **Raises:** `TypeError` for what does not give a number of the orbit."""
+    if not isinstance(watch, Mapping) or not all(callable(f) for f in watch.values()):
+        raise TypeError(
+            "Argument `watch` must map names to functions of an `Orbit`, as "
+            f'{{"limit": lambda orbit: orbit.y_max - 2.0}}, but got {watch!r}.'
+        )
+    for name, function in watch.items():
+        value = np.asarray(function(orbit))
+        if value.ndim or value.dtype.kind not in "fiu":
+            raise TypeError(f"Argument `watch` must give numbers, but {name!r} gives {value!r}.")
+    return watch
+
+
 def _first_point(problem: Shooting, x: np.ndarray, scale: np.ndarray, orbit: Orbit) -> Step:
     """The orbit as a solution of its equations from event to event.
 
@@ -252,15 +250,12 @@ def _refined(
     return start, float(np.max(np.abs(start.x - x) / scale)) if bool(start.good) else np.inf
 
 
-def _branch(
-    problem: Shooting, name: str, steps: list[Step], special: list[SpecialPoint],
-    ends: tuple[str, str], scale: np.ndarray,
-) -> Branch:  # fmt: skip
+def _branch(found: Followed, name: str, scale: np.ndarray) -> Branch:
     """The branch as arrays, from its points.
 
-    **Arguments:** `name`, the parameter's; `steps`, the points in their order; `special` and `ends`
-    as in `Branch`; `scale`, the size of each unknown.
+    **Arguments:** what was followed; `name`, the parameter's; `scale`, the size of each unknown.
     """
+    problem, steps = found.problem, found.steps
     xs = np.stack([step.x for step in steps])
     impacts = np.asarray(problem.impacts, int)
 
@@ -288,8 +283,8 @@ def _branch(
             for name in steps[0].seen.averages
         },
         cycles=problem.cycles,
-        special=special,
-        ends=ends,
+        special=found.special,
+        ends=found.ends,
         problem=problem,
         steps=steps,
         scale=scale,

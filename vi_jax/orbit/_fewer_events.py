@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from ._corrector import state_at
 from ._shooting import Shooting
 from ._solution import sections_of
-from ._solve import state_at
 
 # Sections of one motion that differ by less than this (relative to 1 + |state|) are the same: a
 # choice, far above what a located point is off by, far below what tells motions apart.
@@ -48,7 +48,7 @@ def of_least_period(old: Shooting, x: np.ndarray) -> tuple[Shooting, np.ndarray]
     rows = np.stack([np.asarray(leaf) for leaf in leaves], axis=-1)
     for cycles in range(1, old.cycles):
         turns, rest = divmod(old.cycles, cycles)
-        apart = np.abs(np.roll(rows, -cycles, axis=0) - rows) / (1 + np.abs(rows))
+        apart = np.abs(np.roll(rows, -cycles, axis=0) - rows) / np.asarray(old.sizes)[1:]
         if not rest and apart.max() < _SAME and len(old.events) % turns == 0:
             break
     else:

@@ -17,10 +17,9 @@ from jaxtyping import Array
 from .._programs import compiled
 from .._types import Scalar, Vector
 from ..machine import AbstractMachine, renews
+from ._corrector import Step, observe
 from ._events import section_of
 from ._shooting import Shooting
-from ._solve import observe
-from .curve import Step
 
 # The motion that stands for the branch there has so much of the size of the one before it. This and
 # the numbers below are choices.
@@ -134,7 +133,7 @@ def _equilibrium(problem: Shooting, x: np.ndarray, turn: float) -> _Equilibrium 
             return None
         move = np.linalg.lstsq(jacobian, rate)[0]
         u = u - move
-        if np.abs(move).max() <= 1e-14 * (1 + np.abs(u).max()):
+        if np.abs(move).max() <= 1e-14 * np.abs(u).max():
             break
     _, jacobian, section, slope = _flow_at(problem, x, u)
     if not np.isfinite(jacobian).all():

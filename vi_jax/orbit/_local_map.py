@@ -17,9 +17,9 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from .._programs import compiled
+from ._corrector import tangent_at
 from ._fewer_events import of_least_period, without_events
 from ._shooting import Shooting
-from ._solve import tangent_at
 from ._touch import Touch, touch_at, touched
 from .special import SpecialPoint, one
 
@@ -93,7 +93,7 @@ def graze_at(point: SpecialPoint) -> Graze:
     """
     problem, x, number, clock = _without_touch(point)
     problem, x = of_least_period(problem, x)
-    scale = np.append(np.ones(problem.size - 1), point.scale[-1])
+    scale = problem.scale(point.scale[-1])
     tangent = tangent_at(problem, x, scale)
     if abs(tangent[-1]) < _STEEP:
         raise ValueError(

@@ -3,12 +3,17 @@
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
 from .._types import Scalar, State
 from ..machine import AbstractMachine, events_of, guard_of, section_number
 from ._events import Event
 from ._turns import Nearest
+
+# A distance or a speed is zero within this share of the largest of a motion: a choice, a hundred
+# times the corrector's tolerance.
+ROUNDING = 1e-9
 
 
 class Counted(NamedTuple):
@@ -49,8 +54,29 @@ class Observed(NamedTuple):
     """The period in time."""
     averages: dict[str, Scalar]
     """The machine's own, over the period."""
+    largest: Float[Array, " states"]
+    """The largest modulus of each number of the state over the period; NaN where not known."""
     counted: Counted | None = None
     """Of a motion that is a fixed point of the section map: its impacts and rests."""
+
+    @property
+    def length(self) -> float:
+        """How far the body goes: the scale by which distances are judged; host-side."""
+        y_min, y_max = float(self.y_min), float(self.y_max)
+        return max(y_max - y_min, abs(y_min), abs(y_max))
+
+    @property
+    def admissible(self) -> bool:
+        """Whether the motion stays inside its stops and approaches each event; host-side."""
+        inside = float(self.nearest.room) >= -ROUNDING * self.length
+        slowest = np.asarray(self.approach).min(initial=0.0)
+        return bool(inside and slowest >= -ROUNDING * self.fastest)
+
+    @property
+    def fastest(self) -> float:
+        """How fast events are approached: the scale by which that is judged; host-side."""
+        usual = 2 * np.pi * self.length / float(self.duration)
+        return max(usual, np.abs(np.asarray(self.approach)).max(initial=0.0))
 
 
 def apart(

@@ -7,10 +7,9 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
+from ._corrector import Step, advance, observe, state_at
 from ._events import Event
 from ._shooting import Shooting
-from ._solve import advance, observe, state_at
-from .curve import Step
 
 
 def halves(problem: Shooting, step: Step) -> np.ndarray:
@@ -66,7 +65,7 @@ def origin(problem: Shooting, at: Step, scale: np.ndarray) -> tuple[Step, Shooti
     else:
         states = states + 0.5 * halves(problem, at)
     mean = np.asarray(half.pack(clock, states, at.x[-count:], turn))
-    scale = np.append(np.ones(mean.size - count), scale[-count:])
+    scale = half.scale(scale[-count:])
     along = np.append(np.zeros(mean.size - 1), 1.0)
 
     def missing(shift: float) -> float:

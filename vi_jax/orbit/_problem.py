@@ -1,7 +1,7 @@
 """The equations of an orbit from impact to impact, made from one that was found."""
 
 import dataclasses
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -31,26 +31,32 @@ from ..machine import (
     renews,
     with_leaf,
 )
+from ._corrector import Unknowns, off_by
 from ._events import Event, guard_at, section_of
 from ._fixed_step_method import fixed_step_method, steps_of
 from ._flight import Flight
 from ._shooting import Shooting
-from ._solve import Unknowns, off_by
 from .results import Orbit
 
 # Events of a cycle that can be followed, of a machine with switches or a section of its own: a
 # choice.
 _LISTED = 32
 
-# Twice the steps of a flight change its end by less than this (relative to 1 + |state|); a motion
-# that asks for more of them than this is followed with so many. The first is the corrector's
-# tolerance (`curve.corrected`), the second a choice.
+# Twice the steps of a flight change its end by less than this (relative to the motion's size); a
+# motion that asks for more of them than this is followed with so many. The first is the tolerance
+# of `corrected`, the second a choice.
 _SETTLED, _MOST = 1e-11, 4096
 
 
 # Events so close (by the clock) are met at one instant, and a guard so far from zero there is not
 # met by the motion: choices.
 _SAME_INSTANT, _OFF_ZERO = 1e-9, 1e-6
+
+
+# A number of the state that is less than the first share of the largest one at events, or less than
+# the second in the whole course of a motion, is taken for as large: choices, the second one above
+# rounding in units of which one is a billion times another.
+_SMALL, _NOTHING = 1e-3, 1e-13
 
 
 class _Way(NamedTuple):
@@ -60,6 +66,9 @@ class _Way(NamedTuple):
     """Just before each event, and at the end of the period; (events + 1, states)."""
     modes: tuple[tuple[float, ...], ...]
     """The machine's modes in each flight."""
+
+
+Problem = TypeVar("Problem", bound=Shooting)
 
 
 def check_parameter(
@@ -112,7 +121,7 @@ def problem_of(
     while sized_by_motion(blank):
         doubled = dataclasses.replace(blank, steps=2 * blank.steps)
         again = _followed(doubled, orbit.state, found, period)
-        apart = np.max(np.abs(again.states - way.states) / (1 + np.abs(again.states)))
+        apart = np.max(np.abs(again.states - way.states) / _sizes(again.states))
         if doubled.steps > _MOST:
             break
         blank, way = doubled, again  # the finer one: along the branch flights may ask for more
@@ -121,7 +130,29 @@ def problem_of(
     problem = dataclasses.replace(blank, events=tuple(event for _, event in found), modes=way.modes)
     states = way.states[:-1] if found else way.states
     x = problem.pack([place for place, _ in found], states, [leaf(machine, parameter)], period)
-    return problem, np.asarray(x)
+    return sized(problem, x), np.asarray(x)
+
+
+def sized(problem: Problem, x: Unknowns, largest: np.ndarray | None = None) -> Problem:
+    """The equations with the sizes of the clock, for which a cycle is 2π, and of the numbers of the
+    state, half their largest moduli.
+
+    **Arguments:** the equations and a solution; the largest moduli in its course.
+    """
+    x = jnp.asarray(x)
+    if largest is None or not np.isfinite(largest).all():
+        sizes = _sizes(np.asarray(problem.parts(x)[1]))
+    else:
+        sizes = _sizes(largest, _NOTHING)
+    turn = float(problem.period(x)) / problem.cycles / (2 * np.pi)
+    return dataclasses.replace(problem, sizes=jnp.append(turn, sizes))
+
+
+def _sizes(states: np.ndarray, small: float = _SMALL) -> np.ndarray:
+    """Half the largest modulus of each number of some states, (…, states); of one that is a small
+    share of the others that of the largest of all, as it may be larger elsewhere."""
+    most = np.abs(np.atleast_2d(states)).max(axis=0)
+    return 0.5 * np.where(most > small * most.max(), most, most.max() or 1.0)
 
 
 def _check_instants(blank: Shooting, found: list[tuple[float, Event]], way: _Way) -> None:

@@ -22,9 +22,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._programs import compiled
+from ._corrector import Step
 from ._section_map import SectionMap
 from ._shooting import Shooting
-from .curve import Step
 
 # Impacts of a cycle among which a chatter is looked for: a choice; with restitution 0.8 some fifty
 # hops take it from the scale of a cycle to a thousandth.

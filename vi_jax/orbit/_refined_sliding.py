@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from ._corrector import Step, advance, observe, state_at
 from ._fewer_events import without_events
+from ._locate import NoValueError
 from ._shooting import Shooting
 from ._sliding import Change, holding_force
-from ._solve import NoValueError, advance, observe, state_at
-from .curve import Step
 
 # Events that are closer than this where they vanish are located well enough: a choice.
 _CLOSE = 1e-8
@@ -26,14 +26,15 @@ def refined(problem: Shooting, at: Step, change: Change) -> Step:
     **Arguments:** the equations of the motion with that part; what vanishes.
     """
     clock = np.asarray(problem.parts(jnp.asarray(at.x))[0])
-    if not change.there or problem.conditions or abs(float(at.seen.apart)) < _CLOSE:
+    close = abs(float(at.seen.apart)) < _CLOSE * problem.radian
+    if not change.there or problem.conditions or close:
         return at
     first = int(np.argmin(np.abs(clock - change.clock)))
     second, alike = (first + 1) % problem.legs, change.modes[0] == change.modes[2]
     if second <= first:  # the part lies across the begin of the period
         return at
     new, x = without_events(problem, np.asarray(at.x), [first, second] if alike else [first])
-    sizes = np.ones(x.size)
+    sizes = new.scale(1.0)
     fixed = np.eye(x.size)[-1]
     found: list[Step] = []
 

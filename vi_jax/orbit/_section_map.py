@@ -30,6 +30,7 @@ from ..machine import (
 from ._cycle_map import CycleMap
 from ._fixed_step_method import fixed_step_method
 from ._observed import Counted, Observed
+from ._problem import sized
 from ._shooting import Leg, Shooting
 from ._turns import Nearest
 from .floquet import multipliers_of
@@ -116,6 +117,7 @@ class SectionMap(Shooting):
             apart=jnp.inf * one,
             duration=time,
             averages=means(integrals, time),
+            largest=jnp.full((self.states,), jnp.nan, x.dtype),
             counted=listed,
         )
 
@@ -135,4 +137,5 @@ def section_map_of(
         machine, carried, bare(orbit.state), int(orbit.cycles), (),
         (tuple(float(mode) for mode in modes_of(orbit.state) or ()),), 1, (parameter,),
     )  # fmt: skip
-    return problem, np.append(raveled(orbit.state)[0], float(leaf(machine, parameter)))
+    x = np.append(raveled(orbit.state)[0], float(leaf(machine, parameter)))
+    return sized(problem, x), x

@@ -17,6 +17,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
@@ -71,6 +72,9 @@ class Shooting(eqx.Module):
     """Steps of the flight of a leg."""
     parameters: tuple[str, ...] = eqx.field(static=True)
     """Names of the machine's numbers that are unknowns."""
+    sizes: Array | None = None
+    """How large the clock and each number of the state are along the motion, (1 + states,): the
+    scales by which differences between motions are judged; 1 if not given."""
     conditions: tuple[Any, ...] = ()
     """Equations more (`AbstractCondition`), as many as there are parameters less one on a curve."""
 
@@ -144,6 +148,27 @@ class Shooting(eqx.Module):
         if self.autonomous:
             clock = clock.at[0].set(period)
         return jnp.concatenate([clock, jnp.ravel(states), jnp.ravel(jnp.asarray(parameters))])
+
+    def scale(self, parameters: Any) -> np.ndarray:
+        """The size of each unknown; host-side.
+
+        **Arguments:** the sizes of the parameters.
+        """
+        sizes = np.ones(1 + self.states) if self.sizes is None else np.asarray(self.sizes)
+        clocks = np.full(len(self.events), sizes[0])
+        return np.concatenate([clocks, np.tile(sizes[1:], self.legs), np.atleast_1d(parameters)])
+
+    @property
+    def radian(self) -> float:
+        """The size of the clock, a cycle through 2π; host-side."""
+        return 1.0 if self.sizes is None else float(self.sizes[0])
+
+    def half_scale(self) -> np.ndarray:
+        """The sizes of the clocks and states of half a period; host-side."""
+        half, scale = len(self.events) // 2, self.scale(())
+        if not half:
+            return scale
+        return np.concatenate([scale[:half], scale[len(self.events) :][: half * self.states]])
 
     def unravel(self, u: Vector) -> State:
         """A state from its vector."""
@@ -251,12 +276,13 @@ class Shooting(eqx.Module):
                 self.flight(machine, leg), path[0], path[1], (s1 - s0) / self.steps,
                 closed=not self.events,
             )  # fmt: skip
-            return carried, passed, approach, order, turns, places
+            largest = jnp.max(jnp.abs(path[1]), axis=0)
+            return carried, passed, approach, order, turns, places, largest
 
         legs = jnp.arange(len(states))
         ends = self.ends(clock, self.period(x))
         found = jax.vmap(follow)(legs, clock, ends, states)
-        carried, passed, approach, order, turns, places = found
+        carried, passed, approach, order, turns, places, largest = found
         monodromy = jnp.eye(self.states, dtype=x.dtype)
         for leg in range(len(states)):
             monodromy = carried[leg] @ monodromy
@@ -276,6 +302,7 @@ class Shooting(eqx.Module):
             apart=apart(machine, self.events, self.modes, clock, ends - clock, before),
             duration=time if timed else jnp.asarray(machine.period, x.dtype) * self.cycles,
             averages=means(integrals, time),
+            largest=jnp.max(largest, axis=0),
         )
 
     def saltation(

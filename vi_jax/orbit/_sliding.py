@@ -16,10 +16,10 @@ import numpy as np
 from .._programs import compiled
 from ..flow import guard_rates
 from ..machine import AbstractEvent, DryFriction, after_event, guard_of, mode_number
+from ._corrector import Step
 from ._events import Event
 from ._flight import Flight
 from ._shooting import Shooting
-from .curve import Step
 
 CROSSING_SLIDING, GRAZING_SLIDING = "crossing-sliding", "grazing-sliding"
 SWITCHING_SLIDING, ADDING_SLIDING = "switching-sliding", "adding-sliding"
@@ -121,7 +121,7 @@ def _touching(problem: Shooting, at: Step) -> Change | None:
     """A flight that just touches a switch's surface, or a body that is only just held."""
     nearest, machine = at.seen.nearest, problem.machine
     number = int(nearest.event)
-    if abs(float(nearest.room)) > _ZERO or not holds(Event(number).of(machine)):
+    if abs(float(nearest.room)) > _ZERO * at.seen.length or not holds(Event(number).of(machine)):
         return None
     clock, _, period = _clocks(problem, at)
     place = float(clock[0] + np.mod(float(nearest.clock) - clock[0], period))

@@ -11,9 +11,9 @@ from .._checks import count
 from .._programs import compiled
 from .._types import Scalar, State
 from ..machine import with_modes
+from ._corrector import Step
 from ._observed import Observed
 from ._shooting import Shooting
-from .curve import Step
 from .results import ORBIT_RESULTS, Orbit
 
 
@@ -79,7 +79,6 @@ def orbit_of(problem: Shooting, step: Step) -> Orbit:
     machine = problem.at(x)
     clock, period = _clock_of(problem, x)
     sections, residual = sections_of(problem, x)
-    admissible = seen.nearest.room >= -1e-9 and min(seen.approach, default=1.0) > -1e-9
     # Along a branch an impact may move past the section: an orbit's clocks lie within its period.
     within, speeds, stops, count = _impacts_of(problem, seen, clock, period)
     order = np.argsort(within)
@@ -109,6 +108,6 @@ def orbit_of(problem: Shooting, step: Step) -> Orbit:
         error=jnp.asarray(step.size),
         iterations=jnp.asarray(step.iterations, jnp.int32),
         history=jnp.zeros((0,)),
-        result=ORBIT_RESULTS.successful if admissible else ORBIT_RESULTS.inadmissible,
+        result=ORBIT_RESULTS.successful if seen.admissible else ORBIT_RESULTS.inadmissible,
         averages={name: jnp.asarray(x) for name, x in seen.averages.items()},
     )

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ._conditions import AbstractCondition
+from ._corrector import jacobian_at
 from ._shooting import Shooting
-from ._solve import jacobian_at
 from ._symmetry import images
 from .floquet import compound
 from .special import DOUBLING, TORUS, TOUCHING

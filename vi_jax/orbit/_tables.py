@@ -10,9 +10,9 @@ import numpy as np
 from .._types import State, xr
 from ..flow import average_names, in_names, quantities_on, quantity_names
 from ..machine import AbstractMachine, components, with_units
+from ._corrector import Step
 from ._shooting import Shooting
 from ._solution import sections_of
-from .curve import Step
 from .floquet import stability_of
 from .results import Orbit
 

@@ -4,9 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..machine import RigidStop, SoftStop
+from ._corrector import Step
 from ._events import Event
 from ._shooting import Shooting
-from .curve import Step
 from .special import (
     CROSSING,
     CUSP,
@@ -25,10 +25,11 @@ from .special import (
     TURN,
 )
 
-# Stand in the place of the number of an impact, for what grazes without being one.
-REORDERED, RESTS, ANEW = -1, -2, -3
+# What else a motion may end at than a lost event or a touch; and a turn that a branch makes where
+# it leaves another one to both sides.
+REORDERED, ANEW, TURNS = "reordered", "anew", "turns"
 
-# What is said of a special point, by its kind or by what stands for the impact.
+# What is said of a special point, by its kind or one of these.
 DETAILS = {
     FOLD: "a multiplier passes 1 and the branch turns back",
     DOUBLING: "a multiplier passes -1",
@@ -36,6 +37,7 @@ DETAILS = {
     SYMMETRY: "a multiplier passes 1 and the motion loses its symmetry",
     TORUS: "a complex pair of multipliers leaves the unit circle",
     TURN: "the parameter turns back where it is followed under conditions",
+    TURNS: "a multiplier touches 1: this branch leaves another one to both sides",
     REORDERED: "two of its events fall together, and come in another order beyond",
     ANEW: "a switch goes into another mode: the motion sticks or slips anew",
 }

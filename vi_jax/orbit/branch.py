@@ -13,12 +13,12 @@ from .._types import xr
 from ..flow import tidy
 from ..machine import in_unit, with_units
 from ._conditions import held_in_words
+from ._corrector import Step
+from ._locate import between
 from ._shooting import Shooting
 from ._solution import orbit_at, orbit_of
-from ._solve import between
 from ._tables import COLUMNS, on_sections, special_table, stability_in_words, table_of
 from ._tables import column_names as column_names
-from .curve import Step
 from .results import InWords, Orbit
 from .special import SpecialPoint
 
@@ -82,8 +82,7 @@ class Branch(InWords):
     @property
     def admissible(self) -> np.ndarray:
         """Whether the motion stays inside the gap and approaches each impact, at each point."""
-        slow = self.impact_speed.min(axis=1, initial=np.inf)
-        return (self.clearance > -1e-9) & (slow > -1e-9)
+        return np.array([step.seen.admissible for step in self.steps])
 
     @property
     def multiplier(self) -> np.ndarray:

@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 
 from ._conditions import alone
+from ._corrector import Step
 from ._shooting import Shooting
 from ._words import DETAILS, grazing_in_words
-from .curve import Step
 from .results import InWords, Orbit
 from .special import (
     DOUBLING,
@@ -83,7 +83,7 @@ class CodimensionTwo(InWords):
                 f"symmetry breaking that grazes, but this point on a curve of {self.curve} is a "
                 f"{self.kind}."
             )
-        problem, step, scale = alone(self.problem, self.step, self.scale, kept=-2)
+        problem, step, scale = alone(self.problem, self.step, self.scale)
         grazes = kind == GRAZING
         detail = grazing_in_words(problem, step, self.impact) if grazes else DETAILS[kind]
         impact = self.impact if grazes else None

@@ -9,19 +9,19 @@ from jax.flatten_util import ravel_pytree
 
 from .._checks import given_number
 from ._across import across_order, across_sliding, without_part
+from ._corrector import Step, advance, jacobian_at, state_at, tangent_at
 from ._events import Event
 from ._fewer_events import without_events
+from ._observed import ROUNDING
 from ._origin import repeated
 from ._shooting import Shooting
 from ._sliding import SLIDING
 from ._solution import orbit_of
-from ._solve import advance, jacobian_at, state_at, tangent_at
-from .curve import Step
 from .results import InWords, Orbit
 
 FOLD, DOUBLING, TORUS = "fold", "period-doubling", "neimark-sacker"
 GRAZING, CROSSING, SYMMETRY = "grazing", "branch-point", "symmetry-breaking"
-HOPF, REST, EXTREMUM, TURN = "hopf", "rest", "extremum", "turn"
+HOPF, REST, EXTREMUM, TURN, WATCHED = "hopf", "rest", "extremum", "turn", "watched"
 
 # Kinds of points of codimension two.
 CUSP, FLIP, RESONANT = "cusp", "fold-flip", "resonant-grazing"
@@ -32,11 +32,8 @@ RESONANCE_3, RESONANCE_4 = "resonance-1:3", "resonance-1:4"
 # Kinds at which something is touched: by a flight, or by a body that is only just held.
 TOUCHING = (GRAZING, *SLIDING)
 
-# Where something grazes it is touched to rounding, by choice within this.
+# Where something grazes it is touched to rounding, by choice within this share of the motion.
 _TOUCHES = 1e-6
-
-# Another impact as slow as this, where one is lost, is lost too: a choice, far above rounding.
-_TOGETHER = 1e-9
 
 
 def one(kind: str) -> str:
@@ -54,8 +51,9 @@ class SpecialPoint(InWords):
     "grazing", "hopf" (an autonomous machine's motion shrinks to rest), "rest" (a rest on a stop
     is gained or lost), "crossing-sliding", "grazing-sliding", "switching-sliding" or
     "adding-sliding" (a part in which a switch is held on its surface, as by dry friction, vanishes
-    or appears; see the `detail`), "extremum" (of a `quantity` that was asked for), or "turn" (the
-    parameter turns back where others are free; no multiplier need be 1)."""
+    or appears; see the `detail`), "extremum" (of a `quantity` that was asked for), "watched" (a
+    `quantity` that is watched passes zero), or "turn" (the parameter turns back where others are
+    free; no multiplier need be 1)."""
     parameter: float
     orbit: Orbit
     detail: str
@@ -68,14 +66,15 @@ class SpecialPoint(InWords):
     springs: bool = False
     """Whether the branch springs here from a motion of half its period, which `orbit` is then."""
     quantity: str | None = None
-    """Of an extremum, the name of what is largest or least here."""
+    """Of an extremum, or a number that is watched, its name."""
 
     @property
     def touches(self) -> bool:
         """Whether at a grazing an impact is lost or a stop is touched, to rounding; at a sliding
         bifurcation a surface, by a motion without the part that vanishes there."""
         lost = self.impact is not None and self.kind not in SLIDING
-        return lost or abs(float(self.step.seen.nearest.room)) <= _TOUCHES
+        seen = self.step.seen
+        return lost or abs(float(seen.nearest.room)) <= _TOUCHES * seen.length
 
     @property
     def lost(self) -> list[int]:
@@ -84,7 +83,8 @@ class SpecialPoint(InWords):
         if self.impact is None:
             return []
         speed = np.abs(np.asarray(self.step.seen.approach))
-        others = (i for i in self.problem.impacts if speed[i] < _TOGETHER)
+        slow = ROUNDING * self.step.seen.fastest
+        others = (i for i in self.problem.impacts if speed[i] < slow)
         return sorted({self.impact, *others})
 
     def switch(self, *, distance: float = 0.01) -> Orbit:
@@ -153,7 +153,7 @@ def _doubled(point: SpecialPoint, distance: float) -> Orbit:
     x = np.asarray(point.step.x)
     count = len(old.parameters)
     twice = repeated(old, x, new)
-    scale = np.concatenate([np.ones(len(twice) - count), point.scale[-count:]])
+    scale = new.scale(point.scale[-count:])
     jacobian = np.asarray(jacobian_at(new, jnp.asarray(twice))) * scale
     # Without the parameter's column the equations have one null vector here: that of -1.
     tangent = np.zeros(len(twice))
@@ -225,7 +225,7 @@ def _beyond_grazing(point: SpecialPoint, distance: float) -> Orbit:
         new, start = without_events(old, np.asarray(step.x), point.lost)
     else:
         new, start = _with_touch(old, step)
-    scale = np.concatenate([np.ones(len(start) - 1), point.scale[-1:]])
+    scale = new.scale(point.scale[-1:])
     tangent = tangent_at(new, start, scale)
     for sense in (1.0, -1.0):
         found = advance(new, start, sense * tangent, scale, distance)

@@ -1,21 +1,14 @@
-"""The equations of an orbit solved: their programs, and what they say."""
+"""The place on a curve at which a test is zero: where the curve is smooth, where the test jumps,
+and where the equations are singular."""
 
 import contextlib
-import dataclasses
 from collections.abc import Callable
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
-from .._programs import compiled
-from .._types import Vector
-from ._observed import Observed
+from ._corrector import Step, advance, observe, way
 from ._shooting import Shooting
-from ._symmetry import images
-from .curve import Step, array_of, corrected, first_tangent, way
 
 # How far short of a place that has no solution (as a share of the step) one is looked for: choices.
 _SHORT_OF = (1e-6, 1e-5, 1e-4, 1e-3)
@@ -24,9 +17,14 @@ _SHORT_OF = (1e-6, 1e-5, 1e-4, 1e-3)
 # equations are singular, what is left to be told is the rounding of the corrector. A choice.
 _TRIALS = 5
 
+# How far beside a point where branches cross (in the norm of the scaled unknowns) it is looked at:
+# a choice.
+BESIDE = 1e-3
 
-# Of an orbit, as numbers of the host or of a compiled call.
-Unknowns = np.ndarray | Array
+# At most so many times as far on each side.
+MOST = 8
+
+Advance = Callable[[Any, Any, float], Step]
 
 
 class NoValueError(ArithmeticError):
@@ -35,93 +33,6 @@ class NoValueError(ArithmeticError):
 
 class _CloseError(ArithmeticError):
     """The corrector has had no answer so often that no closer place is to be had."""
-
-
-@runtime_checkable
-class Equations(Protocol):
-    """What is solved here: an orbit's equations, or those with a condition beside them."""
-
-    def residual(self, x: Vector) -> Vector:
-        """What the unknowns `x` lack to be a solution."""
-        ...
-
-    def observe(self, x: Vector) -> Observed:
-        """What is observed of a solution."""
-        ...
-
-
-@compiled
-def _compiled_advance(equations, x, tangent, scale, length) -> Step:
-    """As `advance`, of arrays.
-
-    **Arguments:** as `advance`.
-    """
-
-    def observe(x, tangent):
-        return equations.observe(x)
-
-    return corrected(equations.residual, observe, x, tangent, scale, length)
-
-
-def advance(
-    equations: Equations, x: Unknowns, tangent: Unknowns, scale: Unknowns, length: float | Array
-) -> Step:
-    """The solution on the plane across a tangent (see `curve.corrected`).
-
-    **Arguments:** `x`, the unknowns from where; `tangent`, a unit vector, and `length`, how far
-    along it, both in unknowns divided by `scale`.
-    """
-    arguments = (jnp.asarray(a) for a in (x, tangent, scale, length))
-    return array_of(_compiled_advance(equations, *arguments))
-
-
-@compiled
-def _compiled_observe(problem, x):
-    return problem.observe(x)
-
-
-def observe(problem: Shooting, x: np.ndarray) -> Observed:
-    """What is observed of a solution: multipliers, extremes, clearance, speeds of approach."""
-    return array_of(_compiled_observe(problem, jnp.asarray(x)))
-
-
-@compiled
-def _compiled_off(problem, x):
-    finer = dataclasses.replace(problem, steps=2 * problem.steps)
-    return jnp.max(jnp.abs(finer.lacks(x) - problem.lacks(x)))
-
-
-def off_by(problem: Shooting, x: Unknowns) -> float:
-    """How much twice the steps change the states where each flight ends."""
-    return float(_compiled_off(problem, jnp.asarray(x)))
-
-
-@compiled
-def _compiled_tangent(equations, x, scale):
-    return first_tangent(equations.residual, x, scale)
-
-
-def tangent_at(equations: Equations, x: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """The unit tangent of the solutions through `x`, in scaled unknowns."""
-    return np.asarray(_compiled_tangent(equations, jnp.asarray(x), jnp.asarray(scale)))
-
-
-@compiled
-def state_at(problem: Shooting, x, leg, s):
-    """The state at clock `s` within the leg of this number."""
-    return problem.state_at(x, leg, s)
-
-
-@compiled
-def jacobian_at(problem: Shooting, x):
-    """The derivatives of the equations by all unknowns."""
-    return jax.jacfwd(problem.residual)(x)
-
-
-@compiled
-def images_at(problem: Shooting, x):
-    """How far a motion is from being its own image under the symmetry of its machine."""
-    return images(problem, x)
 
 
 def located(
@@ -197,3 +108,54 @@ def between(
     if way(here, new, scale) < 0:
         here, new = new, here
     return located(problem, here, new, scale, test)
+
+
+def crossing(
+    problem: Shooting, advance: Advance, here: Step, root: float, test: Callable[[Step], float],
+    admits: Callable[[Step, float], bool] = lambda step, length: True,
+) -> Step | None:  # fmt: skip
+    """The point of a curve at which a test is zero, where its equations are singular: where
+    branches cross, or where an impact grazes.
+
+    Close to it the equations cannot be solved, but the curve passes through it smoothly, so that a
+    polynomial through its neighbours tells where it is, and what the motion is there.
+
+    **Arguments:** the equations; `advance`, of unknowns, tangent and length, the curve's point; a
+    point of it, and about how far along its tangent the place is; the test; `admits`, of a point
+    and its length, whether it belongs to this curve.
+
+    Where the curve is found on the near side only, there are more neighbours of that one.
+
+    **Returns:** `None` if too few points were found, or no zero.
+    """
+    found: dict[float, Step] = {}
+
+    def along(length: float) -> Step | None:
+        step = advance(here.x, here.tangent, length)
+        return step if bool(step.good) and admits(step, length) else None
+
+    for side, wanted in ((-BESIDE, 3), (BESIDE, 6), (-BESIDE, 6)):
+        for n in range(1, MOST + 1):
+            if len(found) == wanted:
+                break
+            step = None if n * side in found else along(root + n * side)
+            if step is not None:
+                found[n * side] = step
+    if len(found) < 6:
+        return None
+    places, beside = np.array(list(found)), list(found.values())
+
+    def through(values: Any) -> np.polynomial.Polynomial:
+        return np.polynomial.Polynomial.fit(places, values, len(places) - 1)
+
+    zeros = through([np.asarray(test(step)) for step in beside]).roots()
+    zeros = zeros[np.abs(zeros.imag) < 1e-12].real
+    if not zeros.size or np.abs(zeros).min() > BESIDE:
+        return None
+    place = zeros[np.argmin(np.abs(zeros))]
+
+    def there(get: Callable[[Step], Any]) -> np.ndarray:
+        return np.stack([through(x)(place) for x in zip(*map(get, beside), strict=True)])
+
+    x, tangent = there(lambda step: step.x), there(lambda step: step.tangent)
+    return here._replace(x=x, tangent=tangent / np.linalg.norm(tangent), seen=observe(problem, x))

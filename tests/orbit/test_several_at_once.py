@@ -1,0 +1,144 @@
+"""Bifurcations that fall together, or nearly so; branches that begin at a special point.
+
+The numbers of the two Duffing oscillators were found by a shooting code of its own, and are checked
+here by their variational equations, integrated by SciPy.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+from scipy.integrate import solve_ivp
+
+OMEGA = 1.2
+
+
+class Twins(vi.AbstractMachine):
+    """Y'' + 0.15 Y' - Y + Y³ = f cos 1.2 s twice, coupled by κ (Y2 - Y1)."""
+
+    force: float = 0.15
+    coupling: float = 0.0
+    excess: float = 0.0
+
+    cycle = 2 * np.pi / OMEGA
+
+    def field(self, s, state):
+        """Both oscillators; the second one's force is larger by a share."""
+        y1, v1, y2, v2 = (state[name] for name in ("y1", "v1", "y2", "v2"))
+        push, pull = self.force * jnp.cos(OMEGA * s), self.coupling * (y2 - y1)
+        return {
+            "y1": v1, "v1": -0.15 * v1 + y1 - y1**3 + push + pull,
+            "y2": v2, "v2": -0.15 * v2 + y2 - y2**3 + (1 + self.excess) * push - pull,
+        }  # fmt: skip
+
+
+def branch_of(coupling, excess=0.0, **options):
+    """The branch of the motion in one well that both oscillators share."""
+    machine = Twins(coupling=coupling, excess=excess)
+    start = {"y1": 0.9, "v1": 0.2, "y2": 0.9, "v2": 0.2}
+    orbit = vi.find_orbit(machine, vi.simulate(machine, start, 200).last, 1, throw=True)
+    return vi.continue_orbit(
+        orbit, parameter="force", bounds=(0.05, 0.25), progress=False, **options
+    )
+
+
+def places(branch, kind):
+    """The parameters of the special points of a kind, in increasing order."""
+    return sorted(point.parameter for point in branch.special if point.kind == kind)
+
+
+def monodromy(point):
+    """The monodromy matrix at a special point, by SciPy."""
+    machine = point.orbit.machine
+    f, k, e = (float(x) for x in (machine.force, machine.coupling, machine.excess))
+
+    def rate(s, y):
+        (y1, v1, y2, v2), M = y[:4], y[4:].reshape(4, 4)
+        push, pull = f * np.cos(OMEGA * s), k * (y2 - y1)
+        J = np.array([
+            [0, 1, 0, 0], [1 - 3 * y1**2 - k, -0.15, k, 0],
+            [0, 0, 0, 1], [k, 0, 1 - 3 * y2**2 - k, -0.15],
+        ])  # fmt: skip
+        first = v1, -0.15 * v1 + y1 - y1**3 + push + pull
+        second = v2, -0.15 * v2 + y2 - y2**3 + (1 + e) * push - pull
+        return np.concatenate([first, second, (J @ M).ravel()])
+
+    state = point.orbit.state
+    begin = [float(state[name]) for name in ("y1", "v1", "y2", "v2")]
+    end = solve_ivp(
+        rate, (0, 2 * np.pi / OMEGA), [*begin, *np.eye(4).ravel()], method="DOP853", rtol=1e-12,
+        atol=1e-13,
+    ).y[:, -1]  # fmt: skip
+    np.testing.assert_allclose(end[:4], begin, atol=1e-9)
+    return end[4:].reshape(4, 4)
+
+
+@pytest.mark.slow
+def test_of_two_oscillators_each_bifurcation_is_seen():
+    """Uncoupled, slightly coupled and slightly different: within one step two multipliers pass 1,
+    or -1, and leave no sign in the determinants."""
+    one, weak, strong, unlike = (
+        branch_of(*at) for at in ((0.0,), (0.003,), (0.01,), (0.0, 0.001))
+    )
+    doublings = [places(branch, "period-doubling") for branch in (one, weak, strong, unlike)]
+    np.testing.assert_allclose(doublings[0], [0.19582944], atol=1e-8)
+    np.testing.assert_allclose(doublings[1], [0.19582944, 0.19916897], atol=1e-8)
+    np.testing.assert_allclose(doublings[2], [0.19582944, 0.2070924], atol=1e-8)
+    np.testing.assert_allclose(doublings[3], [0.19563381, 0.19582944], atol=1e-8)
+    assert all("twice" in point.detail for point in one.special)
+    assert len(places(one, "fold")) == len(places(weak, "fold")) == 2
+    np.testing.assert_allclose(places(weak, "branch-point")[0], 0.08000716, atol=1e-8)
+    for branch in (one, weak, strong, unlike):
+        for point in branch.special:
+            off = 1.0 if point.kind == "period-doubling" else -1.0
+            values = np.linalg.eigvals(monodromy(point))
+            assert np.abs(values + off).min() < 1e-6, (point, values)
+
+
+@pytest.mark.slow
+def test_a_branch_that_leaves_another_to_both_sides():
+    """The one on which both oscillators differ touches the other one where its own parameter turns
+    back: that is a branch point, and no fold, and a switch leads to the other one."""
+    branch = branch_of(0.1)
+    wanted = [0.1034185332, 0.1281540734]
+    np.testing.assert_allclose(places(branch, "branch-point"), wanted, atol=1e-10)
+    point = next(point for point in branch.special if point.kind == "branch-point")
+    off = vi.continue_orbit(
+        point.switch(), parameter="force", bounds=(0.05, 0.25), progress=False
+    )
+    assert off.ends == ("closed", "closed")
+    np.testing.assert_allclose(places(off, "branch-point"), wanted, atol=1e-10)
+    assert len(places(off, "fold")) == 6
+    again = next(point for point in off.special if point.kind == "branch-point").switch().state
+    assert abs(float(again["y1"] - again["y2"])) < 1e-9
+
+
+def test_a_branch_that_begins_at_a_grazing_goes_to_one_side():
+    """The motion that stays off the stop is the linear one, of the amplitude that grazes."""
+    zeta, xi = 0.31, 0.25
+    grazes = 1 / np.hypot(1 - zeta**2, 2 * xi * zeta)
+    scene = vi.Scene.ideal(frequency_ratio=zeta, restitution=0.76, gap=1.2, damping_ratio=xi)
+    orbit = vi.find_orbit(scene, vi.simulate(scene, scene.start(), 100).last, throw=True)
+    options = {"parameter": "stops.0.gap", "bounds": (1.0, 1.4), "progress": False}
+    (point,) = vi.continue_orbit(orbit, **options).special
+    assert point.kind == "grazing" and point.parameter == pytest.approx(grazes, abs=1e-10)
+    again = vi.continue_orbit(point.orbit, **options)
+    assert again.ends == ("grazing", "bounds") and again.admissible.all()
+    assert again.parameter.min() == pytest.approx(grazes, abs=1e-10)
+
+
+def test_numbers_that_a_user_watches():
+    """A function of the orbit is located where it is zero: here the greatest position at 1.3."""
+    scene = vi.Scene.ideal(frequency_ratio=0.31, restitution=0.76, gap=9.0, damping_ratio=0.25)
+    orbit = vi.find_orbit(scene, scene.start(), throw=True)
+    options = {"parameter": "drive.frequency_ratio", "bounds": (0.1, 0.9), "progress": False}
+    branch = vi.continue_orbit(
+        orbit, watch={"amplitude": lambda orbit: orbit.y_max - 1.3}, **options
+    )
+    (point,) = branch.special
+    amplitude = 1 / np.hypot(1 - point.parameter**2, 0.5 * point.parameter)
+    assert (point.kind, point.quantity) == ("watched", "amplitude")
+    assert amplitude == pytest.approx(1.3, abs=1e-12)
+    for wrong in ({"amplitude": 1.3}, {"amplitude": lambda orbit: orbit.state}, ["amplitude"]):
+        with pytest.raises(TypeError, match="`watch` must"):
+            vi.continue_orbit(orbit, watch=wrong, **options)

@@ -1,0 +1,330 @@
+"""The engine that follows curves: one way or both, step by step, until something ends them.
+
+What can happen on a curve stands in its table (`Table`). A row of it (`Event`) is a test that is
+positive until it happens. The engine finds the first of the rows that happen within a step; what
+lies beyond that place is no longer the curve, and does not count.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+
+from .._checks import count, given_number
+from .._messages import Interrupted, Tell, at_work, warn
+from ._corrector import Step, advance, off_by, way
+from ._locate import located
+from ._problem import finer, sized_by_motion
+from ._shooting import Shooting
+from .special import SpecialPoint
+
+# Reasons to end that a curve has of itself: Ctrl-C was pressed, or the corrector has no answer.
+INTERRUPTED, STALLED, CLOSED, BOUNDS = "interrupted", "stalled", "closed", "bounds"
+
+# Stands for the reason to end where a step has led to another curve: it is to be shorter.
+SHORTER = "shorter"
+
+# The numbers below are choices where no measurement is given.
+# The tangents of two points close to each other on one curve have at least this product.
+SAME_CURVE = 0.9
+
+# A walk whose steps have to be shorter than this share of the longest stalls. The shortest that the
+# branches of the tests need is 2e-3 of it.
+_SHORTEST = 1e-6
+
+# After a step that had to be cut so many have its length, before they grow again.
+_STEADY = 3
+
+# What changes within so much of the way to a place changes there, and so does a test that has
+# become so small a share of what it was: above what tests are off by where the equations are
+# singular.
+_SHORT, _NOISE = 1e-4, 1e-3
+
+# Twice the steps of the flights change the states of a point by less than the first: above the
+# corrector's tolerance and below that to which special points are promised. Points of which no more
+# steps than are allowed can bring them below the second are warned of: of a motor whose crank
+# slowed to a fifth it was 0.07, with the steps of its first motion.
+_COARSE, _WRONG = 1e-10, 1e-8
+
+# A curve begins at the zero of a test that has this share of what it has a step further on.
+_BEGINS = 1e-7
+
+# A walk that stalls this close to a bound (in the parameter's scale) is taken to it: a few times
+# what the shortest of its steps leave.
+_STALLED_AT = 1e-6
+
+
+class Ending(NamedTuple):
+    """Where a curve ends."""
+
+    last: Step
+    reason: str
+    point: SpecialPoint | None = None
+    """The special point that it ends at, if it is one."""
+    until: Step | None = None
+    """Up to where other things on the curve can be told, if not up to `last`."""
+
+
+class Event(NamedTuple):
+    """A row of a curve's table: what ends it."""
+
+    test: Callable[[Step], float]
+    """Positive as long as it has not happened."""
+    ending: Callable[[Step], Ending | None]
+    """How the curve ends at the place where the test is zero; `None` if it does not."""
+    locate: Callable[[Step, Step], Step | None] | None = None
+    """That place between two points; by default the zero of a smooth test (`located`)."""
+    noise: float = 0.0
+    """What lies below zero by no more than this is zero to rounding."""
+
+
+@runtime_checkable
+class Table(Protocol):
+    """The equations of a curve, and what can happen on it."""
+
+    problem: Shooting
+    scale: np.ndarray
+    """The size of each unknown."""
+    bounds: Any
+    """The intervals of its parameters, in their order."""
+
+    def advance(self, x: Any, tangent: Any, length: Any) -> Step:
+        """The point at this length along the tangent."""
+        ...
+
+    def ends(self, here: Step, new: Step) -> list[Event]:
+        """The rows for a step between two points."""
+        ...
+
+    def passed(self, here: Step, last: Step) -> list[tuple[SpecialPoint, Step]]:
+        """What happens between two points without ending the curve, in its order."""
+        ...
+
+    def beyond(self, last: Step) -> Step | None:
+        """A point of the curve beyond a place where the corrector has no answer, if there is."""
+        ...
+
+    def stalled(self, steps: list[Step]) -> Ending:
+        """How a curve ends that the corrector follows no further."""
+        ...
+
+
+class Followed(NamedTuple):
+    """A curve from end to end."""
+
+    problem: Shooting
+    """Its equations, with as many steps as were needed anywhere."""
+    steps: list[Step]
+    special: list[SpecialPoint]
+    ends: tuple[str, str]
+
+
+def check_walk(*, step: object, max_step: object, max_points: object) -> dict[str, Any]:
+    """The settings of a walk. **Raises:** `ValueError` or `TypeError` that names the wrong one."""
+    return {
+        "step": given_number("step", step, low=0.0, open_low=True),
+        "max_step": given_number("max_step", max_step, low=0.0, open_low=True),
+        "max_points": count("max_points", max_points, least=2),
+    }
+
+
+def both_ways(
+    table: Callable[[], Table],
+    start: Step,
+    result: Callable[[Followed], Any],
+    *,
+    what: str,
+    progress: bool,
+    settings: dict[str, Any],
+) -> Any:
+    """The curve through a point, followed ahead and back.
+
+    **Arguments:** a new table for each way; the point; what makes the result of what was followed;
+    what the curve is called; whether a bar is shown; the settings of the walk.
+
+    **Raises:** on Ctrl-C `Interrupted`, with the result so far.
+    """
+    ahead, back = _Walk(table(), start), _Walk(table(), start._replace(tangent=-start.tangent))
+
+    def found() -> Any:
+        problem = max(back.table.problem, ahead.table.problem, key=lambda p: p.steps)
+        steps = [*reversed(back.path()[1:]), *ahead.path()]
+        special = [*reversed(back.special), *ahead.special]
+        return result(Followed(problem, steps, special, (back.end, ahead.end)))
+
+    def kept() -> Interrupted:
+        return Interrupted(f"walk along the {what}", found())
+
+    with at_work(what, kept, progress=progress, unit="point") as tell:
+        ahead.end = ahead.follow(tell, **settings)
+        back.end = CLOSED if ahead.end == CLOSED else back.follow(tell, **settings)
+    return found()
+
+
+class _Walk:
+    """One of the two ways along a curve, from its first point."""
+
+    def __init__(self, table: Table, start: Step):
+        self.table, self.steps, self.end = table, [start], INTERRUPTED
+        self.special: list[SpecialPoint] = []
+        self._within: dict[int, list[Step]] = {}
+        self._vain, self._worst = 0.0, (0.0, 0.0)  # how far off the states are, and where
+
+    def path(self) -> list[Step]:
+        """The points, with what was located between them."""
+        return [step for new in self.steps for step in [*self._within.get(id(new), ()), new]]
+
+    def follow(self, tell: Tell, *, step: float, max_step: float, max_points: int) -> str:
+        """Walk on, in the sense of the first point's tangent; why it ended.
+
+        **Arguments:** `tell`, told of each point; `step` and `max_step`, the first and the longest
+        step length; `max_points`, the most points.
+        """
+        length, failed, steady, end = step, 0, 0, "max_points"
+        while len(self.steps) < max_points:
+            here = self.steps[-1]
+            new = self.table.advance(here.x, here.tangent, length)
+            turn = float(np.dot(np.asarray(new.tangent), np.asarray(here.tangent)))
+            good = bool(new.good) and turn >= SAME_CURVE
+            if good and self._made_finer(new):
+                length, failed, steady = step, 0, 0
+                continue
+            ending = self._looked(here, new) if good else Ending(here, SHORTER)
+            if ending is not None and ending.reason == SHORTER:
+                # The further off a solution is, the longer each trial takes.
+                length, failed, steady = length * (0.4 if failed < 2 else 0.1), failed + 1, _STEADY
+                if length >= _SHORTEST * max_step:
+                    continue
+                beyond = self.table.beyond(here)
+                if beyond is not None:
+                    self.steps.append(beyond)
+                    length, failed, steady = step, 0, 0
+                    continue
+                ending = self._stalled(here)
+            if ending is not None:
+                if ending.last is not here:
+                    self.steps.append(ending.last)
+                end = ending.reason
+                break
+            self.steps.append(new)
+            tell(1)
+            failed, steady = 0, max(0, steady - 1)
+            if turn > 0.99 and int(new.iterations) <= 6 and not steady:
+                length = min(1.4 * length, max_step)
+            elif turn < 0.97:
+                length *= 0.7
+        self._warn()
+        return end
+
+    def _looked(self, here: Step, new: Step) -> Ending | None:
+        """The end of the curve between two points, if it has one; what happens up to there, or up
+        to the second point, is noted."""
+        ending = self._first(here, new)
+        if ending is not None and ending.reason == SHORTER:
+            return ending
+        last = new if ending is None else ending.last
+        until = last if ending is None or ending.until is None else ending.until
+        found = [] if last is here else self.table.passed(here, until)
+        self._within[id(last)] = [step for _, step in found]
+        self.special += [point for point, _ in found]
+        if ending is not None and ending.point is not None:
+            self.special.append(ending.point)
+        return ending
+
+    def _first(self, here: Step, new: Step) -> Ending | None:
+        """The first of the rows that happen between two points.
+
+        One is looked for where its test has changed its sign, and then again on the way there: a
+        test may have changed it back, since beyond the first place the curve is no longer one of
+        the machine's.
+        """
+        rows = self.table.ends(here, new)
+        at_once = [row for row in rows if self._falls(row, here, new)]
+        for row in at_once:
+            ending = row.ending(here)
+            if ending is not None:
+                return ending
+        rows = [row for row in rows if row.test(here) > 0]
+        first, end = None, new
+        while True:
+            share = 0.0 if first is None else _NOISE
+            row = next((r for r in rows if r.test(end) <= -share * r.test(here) - r.noise), None)
+            if row is None:
+                return first
+            rows.remove(row)
+            at = self._place(row, here, end)
+            ending = None if at is None else row.ending(at)
+            if ending is None:
+                continue
+            # What falls together with the first one is not looked for, nor what comes later.
+            first = ending
+            end = self.table.advance(
+                here.x, here.tangent, (1 - _SHORT) * way(here, first.last, self.table.scale)
+            )
+            if first.reason == SHORTER or not bool(end.good):
+                return first
+
+    def _falls(self, row: Event, here: Step, new: Step) -> bool:
+        """Whether a test is zero at a point, to rounding, and falls from there."""
+        begin, end = row.test(here), row.test(new)
+        return begin <= row.noise and abs(begin) <= _BEGINS * abs(end) and end < -row.noise
+
+    def _place(self, row: Event, here: Step, end: Step) -> Step | None:
+        if row.locate is not None:
+            return row.locate(here, end)
+        return located(self.table.problem, here, end, self.table.scale, row.test)
+
+    def _stalled(self, last: Step) -> Ending:
+        """How the curve ends where the corrector has no answer: at a bound right ahead beyond which
+        its machine has another form, as with a restitution of 0 or 1, or as its table says."""
+        table, axes = self.table, np.eye(len(last.x))
+        for i, ends in enumerate(table.bounds, -len(table.bounds)):
+            for bound in ends:
+                length = (bound - float(last.x[i])) / table.scale[i]
+                if abs(length) < _STALLED_AT:
+                    at = advance(table.problem, last.x, axes[i], table.scale, length)
+                    if bool(at.good):
+                        return Ending(at, BOUNDS)
+        ending = table.stalled(self.steps)
+        if ending.point is not None:
+            self.special.append(ending.point)
+        return ending
+
+    def _made_finer(self, new: Step) -> bool:
+        """Whether the flights get more steps from here on, where only the motion tells how many
+        they need."""
+        table = self.table
+        if not (table.problem.follows_events and sized_by_motion(table.problem)):
+            return False
+        off = off_by(table.problem, new.x)
+        if off > max(_COARSE, 10 * self._vain):  # it is rounding what more steps do not change
+            better = finer(table.problem, new.x)
+            if better is not None:
+                table.problem = better
+                return True
+            self._vain = off
+        self._worst = max(self._worst, (off, float(new.x[-1])))
+        return False
+
+    def _warn(self) -> None:
+        off, value = self._worst
+        if off > _WRONG:
+            problem = self.table.problem
+            warn(
+                f"The flights of this curve have {problem.steps} steps each, but at "
+                f"{problem.parameters[-1]} = {value:.6g} twice as many change its states by "
+                f"{off:.1g}: follow it by a `method` of more steps a cycle."
+            )
+
+
+def bounds_of(table: Table) -> list[Event]:
+    """The rows of a table that end a curve at the bounds of its parameters."""
+
+    def row(i: int, bound: float, sense: float) -> Event:
+        return Event(
+            lambda step: sense * (float(step.x[i]) - bound) / float(table.scale[i]),
+            lambda at: Ending(at, BOUNDS),
+        )
+
+    places = enumerate(table.bounds, -len(table.bounds))
+    return [row(i, *at) for i, (low, high) in places for at in ((low, 1.0), (high, -1.0))]

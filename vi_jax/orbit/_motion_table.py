@@ -1,0 +1,472 @@
+"""The table of a branch: what can happen to a periodic motion that is followed in one number.
+
+| what | test, positive before it | ends the branch as |
+|---|---|---|
+| a bound is reached | distance of the parameter | `bounds` |
+| an autonomous motion gets long | four times its first duration less the duration | `long` |
+| another multiplier becomes the greatest | that held less the others | `multiplier` |
+| an impact or a switch is lost | V⁻, or how fast its guard rises | `grazing`, sliding |
+| a stop or a surface is touched | least distance at a turn | the same |
+| a switch goes into another mode | 1 or -1 | the same |
+| two events come together | time between them | `grazing` |
+| the cycle shrinks to rest | the rate of the section at the equilibrium | `hopf` |
+| a rest, or an impact between rests, is gained or lost | their numbers | `rest`, `grazing` |
+| two halves of the period become alike, or images | their difference | `period-doubling`, … |
+| it comes back to where it was | distance to the plane across it | `closed` |
+
+Folds, branch points, doublings, tori, extremes and numbers that a user watches are passed
+(`MotionTable.passed`).
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+
+import numpy as np
+
+from ._closing import Closing
+from ._conditions import alone, overtaken
+from ._corrector import Step, advance, apart_from_image, way
+from ._events import Event as MotionEvent
+from ._extrema import Extrema
+from ._follow import STALLED, Ending, Event, bounds_of
+from ._hopf import hopf_between, size_of
+from ._locate import BESIDE, crossing, located
+from ._observed import ROUNDING
+from ._origin import halves, origin
+from ._refined_sliding import refined
+from ._rest import BETWEEN_RESTS, Sequence, past_section, touched_beside
+from ._shooting import Shooting
+from ._sliding import SLIDING, change_at
+from ._solution import orbit_of
+from ._symmetry import ALIKE, ROUNDED, may_be_symmetric
+from ._words import (
+    ANEW,
+    DETAILS,
+    HELD_FOLD,
+    REORDERED,
+    TURNS,
+    grazing_in_words,
+    place_in_words,
+)
+from .floquet import NEUTRAL
+from .results import Orbit
+from .special import (
+    CROSSING,
+    DOUBLING,
+    EXTREMUM,
+    FOLD,
+    GRAZING,
+    HOPF,
+    SYMMETRY,
+    TORUS,
+    TURN,
+    WATCHED,
+    SpecialPoint,
+)
+
+# The thresholds here are choices, but for those of which a measurement is given.
+# What lies before the place where a branch springs is looked for on so much of the way there.
+_SHORT = 0.999
+
+# And what lies before an impact that is lost, where the monodromy matrix has a pole: on so much.
+_BEFORE_POLE = 1 - 1e-6
+
+# An autonomous motion of so much of the size of another is rest: what solves its equations there is
+# an equilibrium.
+_STILL = 1e-6
+
+# One of so much of the size of its neighbours is about to shrink to rest.
+_SHRINKS = 1e-2
+
+# A motion so many times as long as that from which a branch begins has steps as much longer. Of a
+# rimless wheel towards its homoclinic motion the multiplier is right to 2e-12 then.
+_LONG = 4.0
+
+# A step of a curve whose tangent turns by less than 26° (as the walk asks) lies within half that of
+# its first tangent: so far off, as the cosine, it is another curve, beyond a jump of the equations.
+# Steps no longer than the second are rounding.
+_ASIDE, _TINY = 0.9, 1e-6
+
+# A multiplier this close to where its test is zero passes there; else it is a pole of the
+# determinant, or a real pair μ, 1/μ.
+_PASSES = 1e-5
+
+# A step is halved so often to tell bifurcations in it apart: a 100,000th of it is left.
+_HALVES = 17
+
+# A number that is watched passes zero where it is less than this share of what it is beside; else
+# it has a pole or jumps.
+_ZERO = 1e-6
+
+Passed = list[tuple[SpecialPoint, Step]]
+
+
+class MotionTable:
+    """What can happen on a branch, for each of its steps (see `_follow.Table`).
+
+    **Arguments:** the equations of the motions, with the parameter as their last unknown; the size
+    of each unknown; the intervals of its parameters, in their order; names of the numbers whose
+    extremes are sought; functions of the orbit whose zeros are, by name.
+    """
+
+    def __init__(
+        self, problem: Shooting, scale: np.ndarray, bounds: list[tuple[float, float]],
+        extrema: tuple[str, ...], watched: Mapping[str, Callable[[Orbit], float]],
+    ):  # fmt: skip
+        self.problem, self.scale, self.bounds = problem, scale, bounds
+        self.extrema, self.watched = Extrema(extrema), watched
+        self.symmetric = may_be_symmetric(problem, [problem.machine, *problem.corners(bounds)])
+        self.closing = Closing(self)
+        self.size, self.duration = None, None
+
+    def advance(self, x, tangent, length) -> Step:
+        """The point at this length along the tangent."""
+        new = advance(self.problem, x, tangent, self.scale, length)
+        gone = float(np.linalg.norm((new.x - np.asarray(x)) / self.scale))
+        if gone > _TINY and not abs(length) >= _ASIDE * gone:
+            return new._replace(good=np.asarray(False))
+        if not self.problem.autonomous or not bool(new.good):
+            return new
+        if self.size is None:
+            self.size = size_of(self.problem, x)
+        return new._replace(good=np.asarray(size_of(self.problem, new.x) > _STILL * self.size))
+
+    def beyond(self, last: Step) -> Step | None:
+        """The motion beyond a place where one that rests meets a stop on its section."""
+        return past_section(self.problem, last, self.scale)
+
+    def stalled(self, steps: list[Step]) -> Ending:
+        """How a branch ends that the corrector follows no further: of motions that rest at a
+        grazing, perhaps, from which both of its branches lead back."""
+        last, problem = steps[-1], self.problem
+        touch = None if problem.follows_events else touched_beside(problem, last, self.scale)
+        if touch is None:
+            return Ending(last, STALLED)
+        return Ending(touch, GRAZING, self._point(GRAZING, touch, BETWEEN_RESTS))
+
+    def ends(self, here: Step, new: Step) -> list[Event]:
+        """The rows for a step between two points."""
+        rows = bounds_of(self)
+        if self.problem.autonomous:
+            rows.append(Event(self._not_too_long(here), lambda at: Ending(at, "long")))
+        if self.problem.conditions:
+            ahead = lambda step: -overtaken(self.problem, step)
+            rows.append(Event(ahead, lambda at: Ending(at, "multiplier")))
+        rows += self._lost(here)
+        if here.seen.counted is not None:
+            rows += Sequence(self.problem, here, self.scale, self._named).rows()
+        return [*rows, *self._springs_off(here), *self.closing.rows(here, new)]
+
+    def _where(self, here: Step, new: Step, test: Callable[[Step], float]) -> Step | None:
+        """The point between two at which a test is zero."""
+        return located(self.problem, here, new, self.scale, test)
+
+    def _on_the_way(self, here: Step, last: Step, share: float) -> Step:
+        """The point at this share of the way between two."""
+        return self.advance(here.x, here.tangent, share * way(here, last, self.scale))
+
+    def _point(self, kind: str, step: Step, detail: str, impact: int | None = None) -> SpecialPoint:
+        problem, step, scale = alone(self.problem, step, self.scale)
+        orbit = orbit_of(problem, step)
+        return SpecialPoint(
+            kind, float(step.x[-1]), orbit, detail, problem, step, scale, impact
+        )  # fmt: skip
+
+    def _named(self, kind: str, at: Step, detail: str, impact: int | None = None) -> Ending:
+        """The end of a branch at a special point."""
+        return Ending(at, kind, self._point(kind, at, detail, impact))
+
+    def _not_too_long(self, here: Step) -> Callable[[Step], float]:
+        """How far an autonomous motion is from being longer than its steps, as many as ever,
+        allow."""
+        if self.duration is None:
+            self.duration = float(here.seen.duration)
+        first = self.duration
+        return lambda step: _LONG - float(step.seen.duration) / first
+
+    def _lost(self, here: Step) -> Iterator[Event]:
+        """The rows of events that are lost, of touches, and of events that come otherwise."""
+        for i, event in enumerate(self.problem.events):
+            falls = lambda step, i=i: float(step.seen.approach[i])
+            if event.cycle is not None and not self.problem.conditions:
+                shrinks = lambda at: self._named(HOPF, at, "the motion shrinks to rest", 0)
+                yield Event(falls, shrinks, partial(hopf_between, self.problem))
+            yield Event(falls, partial(self._ended, here, impact=i))
+        # Of events that are together all along the rounding is left out.
+        together = ROUNDING * self.problem.radian
+        off = 0.0 if here.seen.apart > together else together
+        anew, reordered = (partial(self._ended, here, other=kind) for kind in (ANEW, REORDERED))
+        yield Event(room, partial(self._ended, here))
+        yield Event(lambda step: float(step.seen.order), anew)
+        yield Event(lambda step: float(step.seen.apart) + off, reordered)
+
+    def _ended(
+        self, here: Step, at: Step, *, impact: int | None = None, other: str | None = None
+    ) -> Ending:
+        """How a branch ends where an event is lost, something is touched, or events come otherwise.
+
+        **Arguments:** the point before, and the place; the number of the event that is lost; or
+        what else happens, by its name in `DETAILS`.
+        """
+        change = change_at(self.problem, at)
+        if change is not None:
+            at = refined(self.problem, at, change)
+        if change is not None and change.kind is not None:
+            name = MotionEvent(change.number).called(self.problem.machine)
+            place = place_in_words(self.problem, at, change.clock)
+            detail = SLIDING[change.kind][change.there].format(name=name, place=place)
+            return self._named(change.kind, at, detail, impact)
+        if other is not None:
+            return self._named(GRAZING, at, DETAILS[other])
+        detail = grazing_in_words(self.problem, at, impact)
+        if impact is None:
+            return self._named(GRAZING, at, detail)
+        # There a multiplier goes to infinity, and comes back from the other side: its sign is that
+        # of rounding, and the tests for bifurcations may have changed twice.
+        short = self._on_the_way(here, at, _BEFORE_POLE)
+        short = short if bool(short.good) else at
+        M, values = short.seen.monodromy, short.seen.multipliers
+        at = at._replace(seen=at.seen._replace(monodromy=M, multipliers=values))
+        return self._named(GRAZING, at, detail, impact)._replace(until=short)
+
+    def _springs_off(self, here: Step) -> Iterator[Event]:
+        """The rows of places where the two halves of the period become alike, or images of each
+        other: beyond, the same motions come again, observed half a period later or in the
+        mirror."""
+        for kind, apart in ((DOUBLING, self._halves), (SYMMETRY, self._images)):
+            begin = apart(here)
+            if np.linalg.norm(begin) < ROUNDED:
+                continue
+
+            def ending(at: Step, kind=kind, apart=apart) -> Ending | None:
+                if np.linalg.norm(apart(at)) > ALIKE:
+                    return None
+                if kind == DOUBLING:
+                    at, point = self._sprung(at)
+                else:
+                    at = self._crossing(here, at, FOLD)
+                    point = self._point(kind, at, "the branch springs from a symmetric motion")
+                # Beyond it the tests have changed twice: what lies before it shows short of it.
+                return Ending(at, kind, point, self._on_the_way(here, at, _SHORT))
+
+            along = lambda step, begin=begin, apart=apart: float(np.dot(begin, apart(step)))
+            yield Event(along, ending)
+
+    def _sprung(self, at: Step) -> tuple[Step, SpecialPoint]:
+        """Where the branch springs from a motion of half its period: as a step of the branch, and
+        as a special point of that motion."""
+        begins, half, step = origin(*alone(self.problem, at, self.scale))
+        at = at if self.problem.conditions else begins
+        detail = "the branch springs from a motion of half the period"
+        scale = half.scale(self.scale[-1])
+        return at, SpecialPoint(
+            DOUBLING, float(step.x[-1]), orbit_of(half, step), detail, half, step, scale,
+            springs=True,
+        )  # fmt: skip
+
+    def passed(self, here: Step, last: Step) -> Passed:
+        """The bifurcations between two points, the extremes and the zeros of what is watched, in
+        their order."""
+        found = self._bifurcations(here, last, _HALVES)
+        where = partial(self._where, here, last)
+        for at, name, detail in self.extrema.between(self, here, last, where):
+            point = self._point(EXTREMUM, at, detail)
+            found.append((dataclasses.replace(point, quantity=name), at))
+        found += self._zeros(here, last)
+        return sorted(found, key=lambda f: way(here, f[1], self.scale))
+
+    def _zeros(self, here: Step, last: Step) -> Iterator[tuple[SpecialPoint, Step]]:
+        """Where the functions that are watched pass zero."""
+        for name, function in self.watched.items():
+
+            def value(step: Step, function=function) -> float:
+                return float(function(orbit_of(*alone(self.problem, step, self.scale)[:2])))
+
+            before, after = value(here), value(last)
+            at = self._where(here, last, value) if before * after < 0 else None
+            if at is not None and abs(value(at)) <= _ZERO * max(abs(before), abs(after)):
+                point = self._point(WATCHED, at, f"{name} passes zero")
+                yield dataclasses.replace(point, quantity=name), at
+
+    def _bifurcations(self, here: Step, last: Step, halves_left: int) -> Passed:
+        """The bifurcations between two points, by the tests that change their signs.
+
+        The multipliers outside the unit circle are counted: where those that are found do not
+        explain how many there are more, or less, the step is halved, as two that cross together
+        leave no sign.
+        """
+        found, crossed = [], 0
+        for kind in _changed(here, last, held=bool(self.problem.conditions)):
+            at = self._bifurcation(kind, here, last)
+            found, crossed = [*found, *at], crossed + len(at) * _CROSS[kind]
+        before, after = _outside(here), _outside(last)
+        if before is None or after is None:
+            return found
+        more = abs(after - before)
+        if more <= crossed and (crossed - more) % 2 == 0:
+            return found
+        middle = self._on_the_way(here, last, 0.5) if halves_left else None
+        if middle is None or not bool(middle.good):
+            return self._twice(here, last) or found
+        return [
+            *self._bifurcations(here, middle, halves_left - 1),
+            *self._bifurcations(middle, last, halves_left - 1),
+        ]
+
+    def _twice(self, here: Step, last: Step) -> Passed:
+        """The place between two points close to each other where several multipliers cross the unit
+        circle together."""
+        outside = _outside(here)
+        at = self._where(here, last, lambda step: 1.0 if _outside(step) == outside else -1.0)
+        if at is None:
+            return []
+        if float(here.tangent[-1]) * float(last.tangent[-1]) < 0:  # other branches cross as well
+            at = self._crossing(here, at, FOLD)
+        for kind, off in _offs(at).items():
+            if np.sum(np.abs(off) < 10 * _PASSES) > (2 if kind == TORUS else 1):
+                return [(self._point(kind, at, f"{DETAILS[kind]}; twice, at once"), at)]
+        return []
+
+    def _bifurcation(self, kind: str, here: Step, last: Step) -> Passed:
+        """The bifurcation between two points of which a test has changed its sign; none if that is
+        a pole, or rounding."""
+        at = self._where(here, last, lambda step: tests_of(step)[kind])
+        if at is None:
+            return []
+        held = bool(self.problem.conditions)
+        if kind in (FOLD, TURNS) and not held and not _turns_back(here, at, last, self.scale):
+            return []  # rounding: the tangent is ill-defined close to where branches cross
+        if kind in (FOLD, TURNS, CROSSING) and self._shrinks(here, at, last):
+            return []  # it has a multiplier 1 to rounding
+        if kind in (FOLD, TURNS, CROSSING) and self._springs(here, at):
+            return []  # both are zero there
+        if held and kind == TURNS:
+            return [(self._point(TURN, at, DETAILS[TURN]), at)]
+        if kind == TURNS or (kind == CROSSING and (self.symmetric or not held)):
+            at = self._crossing(here, at, kind)
+        if np.abs(_offs(at)[kind]).min(initial=np.inf) >= _PASSES:
+            return []
+        detail = DETAILS[kind]
+        if kind == TURNS:
+            kind = CROSSING
+        elif kind == CROSSING and self.symmetric and self._apart(at) < ALIKE:
+            kind, detail = SYMMETRY, DETAILS[SYMMETRY]
+        elif kind == CROSSING and held:
+            kind, detail = FOLD, HELD_FOLD
+        return [(self._point(kind, at, detail), at)]
+
+    def _shrinks(self, here: Step, at: Step, last: Step) -> bool:
+        """Whether an autonomous motion is about to shrink to rest."""
+        if not self.problem.autonomous:
+            return False
+        size, *beside = (size_of(self.problem, step.x) for step in (at, here, last))
+        return size < _SHRINKS * max(beside)
+
+    def _springs(self, here: Step, at: Step) -> bool:
+        """Whether the branch springs there: halves of a period are alike, or images."""
+        apart, images = self._halves(at), self._images(at)
+        if apart.size and np.linalg.norm(apart) < ALIKE:
+            return True
+        before = np.linalg.norm(self._images(here))
+        close = np.linalg.norm(images) < min(ALIKE, 0.5 * before)
+        return bool(images.size and close and before > ROUNDED)
+
+    def _crossing(self, here: Step, at: Step, kind: str) -> Step:
+        """The point where branches cross (see `crossing`)."""
+
+        def admits(step: Step, length: float) -> bool:
+            # So close to where they cross the corrector may find the other branch.
+            return not self.symmetric or (kind == FOLD) != (self._apart(step) < ALIKE * BESIDE)
+
+        root = way(here, at, self.scale)
+        tested = lambda step: tests_of(step)[kind]
+        return crossing(self.problem, self.advance, here, root, tested, admits) or at
+
+    def _halves(self, step: Step) -> np.ndarray:
+        """How the second half of the period differs from the first, in the sizes of the unknowns;
+        empty if it cannot be alike."""
+        apart = halves(self.problem, step)
+        return apart / self.problem.half_scale() if apart.size else apart
+
+    def _images(self, step: Step) -> np.ndarray:
+        """How far the motion is from being its own image, in the sizes of the unknowns; empty if it
+        cannot be."""
+        if not self.symmetric:
+            return np.zeros(0)
+        return apart_from_image(self.problem, step)
+
+    def _apart(self, step: Step) -> float:
+        return float(np.linalg.norm(self._images(step)))
+
+
+def room(step: Step) -> float:
+    """The clearance, as a share of how far the body goes; of motions without a turn 1."""
+    return float(np.clip(step.seen.nearest.room / step.seen.length, -1.0, 1.0))
+
+
+# How many multipliers cross the unit circle where each test changes its sign.
+_CROSS = {FOLD: 1, TURNS: 0, DOUBLING: 1, CROSSING: 1, TORUS: 2}
+
+
+def tests_of(step: Step) -> dict[str, float]:
+    """Functions that change sign at the bifurcations."""
+    M, identity = step.seen.monodromy, np.eye(step.seen.monodromy.shape[0])
+    values = step.seen.multipliers
+    with np.errstate(invalid="ignore"):  # a step without an answer has none here either
+        doubling, crosses = np.linalg.det(M + identity), np.linalg.det(M - identity)
+    pairs = [1 - a * b for a, b in itertools.combinations(values, 2)]
+    turns = float(step.tangent[-1])
+    return {
+        FOLD: turns,
+        TURNS: turns,
+        DOUBLING: float(doubling),
+        CROSSING: float(crosses),
+        TORUS: float(np.real(np.prod(pairs))),
+    }
+
+
+def _changed(here: Step, last: Step, *, held: bool) -> list[str]:
+    """Which tests change their sign from one step to another.
+
+    At a fold the parameter turns back as a multiplier passes 1; where it turns back alone, the
+    multiplier only touches 1, and the branch is one that leaves another to both sides. Where
+    numbers of the motion are `held` the one has nothing to do with the other.
+    """
+    before, after = tests_of(here), tests_of(last)
+    changed = [kind for kind in before if before[kind] * after[kind] < 0]
+    # Without damping a pair stays on the unit circle, to rounding of either sign.
+    if TORUS in changed and max(abs(before[TORUS]), abs(after[TORUS])) < NEUTRAL:
+        changed.remove(TORUS)
+    if held and FOLD in changed:
+        changed.remove(FOLD)
+    elif FOLD in changed:
+        gone = (CROSSING, TURNS) if CROSSING in changed else (FOLD,)
+        changed = [kind for kind in changed if kind not in gone]
+    return changed
+
+
+def _offs(step: Step) -> dict[str, np.ndarray]:
+    """How far the multipliers are from where those of each kind cross the unit circle."""
+    values = step.seen.multipliers
+    one, complex_ones = values - 1, np.abs(values[np.abs(values.imag) > 1e-9])
+    return {
+        DOUBLING: values + 1, TORUS: complex_ones - 1, FOLD: one, TURNS: one, CROSSING: one,
+    }  # fmt: skip
+
+
+def _outside(step: Step) -> int | None:
+    """The number of multipliers outside the unit circle; `None` where one lies on it, to rounding,
+    or they are not known."""
+    sizes = np.abs(step.seen.multipliers)
+    if not np.isfinite(sizes).all() or (np.abs(sizes - 1) < NEUTRAL).any():
+        return None
+    return int(np.sum(sizes > 1))
+
+
+def _turns_back(here: Step, at: Step, last: Step, scale: np.ndarray) -> bool:
+    """Whether the parameter at a point between two lies beyond that at both, by more than
+    rounding."""
+    sides = [(float(at.x[-1]) - float(step.x[-1])) / scale[-1] for step in (here, last)]
+    return bool(sides[0] * sides[1] > 0 and min(map(abs, sides)) > 1e-12)

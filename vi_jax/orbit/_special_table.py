@@ -1,0 +1,451 @@
+"""The table of a curve of special motions in two parameters, and its points of codimension two.
+
+| what | test, positive before it | ends the curve as |
+|---|---|---|
+| a bound is reached | distance of the parameter | `bounds` |
+| another impact is lost, a stop touched | V⁻, least distance at a turn | `grazing` |
+| a pair of multipliers becomes real | 1 ∓ the cosine of its angle | `resonance-1:1`, `-1:2` |
+| the motion becomes its own image | its difference from that | `symmetry-breaking` |
+| it comes back to where it was | distance to the plane across it | `closed` |
+
+The points of codimension two that do not end it are looked for when the curve is finished
+(`points_of`).
+"""
+
+import contextlib
+import dataclasses
+import itertools
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._messages import so_many
+from .._programs import compiled
+from ._closing import Closing
+from ._conditions import alone
+from ._corrector import Step, advance, apart_from_image, jacobian_at, way
+from ._follow import SAME_CURVE, STALLED, Ending, Event, bounds_of
+from ._local_map import graze_at
+from ._locate import BESIDE, MOST, between, crossing
+from ._motion_table import room
+from ._observed import ROUNDING
+from ._origin import repeated
+from ._shooting import Shooting
+from ._solution import orbit_of
+from ._special_condition import Special
+from ._symmetry import ALIKE, ROUNDED, may_be_symmetric
+from ._words import AT_CODIMENSION_TWO, grazing_in_words
+from .codimension_two import CodimensionTwo
+from .special import (
+    CUSP,
+    DEGENERATE,
+    DEGENERATE_SYMMETRY,
+    DOUBLING,
+    FLIP,
+    FOLD,
+    GRAZING,
+    RESONANCE_1,
+    RESONANCE_2,
+    RESONANCE_3,
+    RESONANCE_4,
+    RESONANT,
+    SYMMETRY,
+    TORUS,
+    TOUCHING,
+    SpecialPoint,
+    doubled,
+)
+
+# The thresholds here are choices.
+# A test that changes its sign without coming this near to zero (as a share of its neighbours) has a
+# pole. The second for entries of the local map: one that is as small vanishes as well.
+_ZERO, _ENTRY = 1e-6, 1e-4
+
+# An impact slower than so many times the root of a clearance is the turn that has it: for
+# accelerations of up to 50.
+_SAME_TURN = 10.0
+
+# Motions that graze are looked at over so many periods.
+_PERIODS = 3
+
+# Of the first and of the second parameter.
+Intervals = tuple[tuple[float, float], tuple[float, float]]
+
+
+class SpecialTable:
+    """What can happen on a curve of special motions, for each of its steps (see `_follow.Table`).
+
+    **Arguments:** the equations of the motions, with two parameters as their last unknowns; the
+    condition that makes them special; the size of each unknown; the parameters' intervals.
+    """
+
+    def __init__(self, problem: Shooting, condition: Special, scale: np.ndarray, bounds: Intervals):
+        self.problem, self.condition, self.scale = problem, condition, scale
+        self.bounds = bounds
+        # Along a curve of symmetric motions the images are alike everywhere.
+        self.symmetric = condition.kind != SYMMETRY and may_be_symmetric(
+            problem, [problem.machine, *problem.corners(bounds)]
+        )
+        self.closing = Closing(self)
+
+    def advance(self, x, tangent, length) -> Step:
+        """The point at this length along the tangent."""
+        return advance(self.problem, x, tangent, self.scale, length)
+
+    def passed(self, here: Step, last: Step) -> list[tuple[SpecialPoint, Step]]:
+        """Nothing: points of codimension two are looked for on the finished curve."""
+        return []
+
+    def beyond(self, last: Step) -> Step | None:
+        """Nothing: these motions do not rest."""
+        return None
+
+    def stalled(self, steps: list[Step]) -> Ending:
+        """How a curve ends that the corrector follows no further: perhaps where the motion becomes
+        symmetric."""
+        last = steps[-1]
+        if self.symmetric and np.linalg.norm(self._images(last)) < ALIKE:
+            for here in reversed(steps):
+                root = way(here, last, self.scale)
+                if root > MOST * BESIDE:
+                    at = self._symmetric(here, root, beyond=False)
+                    return Ending(last, STALLED) if at is None else Ending(at, SYMMETRY)
+        return Ending(last, STALLED)
+
+    def ends(self, here: Step, new: Step) -> list[Event]:
+        """The rows for a step between two points."""
+        return [
+            *bounds_of(self), *self._grazings(here), *self._resonances(), *self._mirror(here),
+            *self.closing.rows(here, new),
+        ]  # fmt: skip
+
+    def _grazings(self, here: Step) -> Iterator[Event]:
+        """Where an impact beside the one that grazes is lost, or a stop is touched."""
+        kind, grazes = self.condition.kind, self.condition.impact
+        # At a grazing the body turns on the stop, to rounding.
+        if kind not in TOUCHING or grazes is not None:
+            yield Event(room, lambda at: Ending(at, GRAZING), noise=ROUNDING)
+        fastest = here.seen.fastest
+        for i in range(len(here.seen.approach)):
+            # In a symmetric motion another impact grazes as well, to rounding.
+            if i == grazes:
+                continue
+            test = lambda step, i=i: float(step.seen.approach[i]) / fastest
+            lost = partial(self._singular, here, test)
+            yield Event(test, lost, noise=ROUNDING)
+
+    def _singular(self, here: Step, test: Callable[[Step], float], at: Step) -> Ending:
+        """The end at a place at which an impact grazes, where the monodromy matrix has a pole."""
+        found = None
+        if self.condition.kind not in TOUCHING and at is not here:
+            root = way(here, at, self.scale)
+            found = crossing(self.problem, self.advance, here, root, test)
+        if found is None:
+            return Ending(at, GRAZING)
+        gone = {"monodromy": found.seen.monodromy, "multipliers": found.seen.multipliers}
+        gone = {name: np.nan * numbers for name, numbers in gone.items()}
+        return Ending(found._replace(seen=found.seen._replace(**gone)), GRAZING)
+
+    def _resonances(self) -> Iterator[Event]:
+        """Where a pair of multipliers on the unit circle becomes real: beyond, the product of two
+        is still 1, but none has the modulus 1."""
+        for kind, sign in ((RESONANCE_1, 1), (RESONANCE_2, -1)):
+            if self.condition.kind == TORUS:
+                left = lambda step, sign=sign: 1 - sign * cosine_of(step)
+                yield Event(left, lambda at, kind=kind: Ending(at, kind), noise=ROUNDING)
+
+    def _mirror(self, here: Step) -> Iterator[Event]:
+        """Where the motion becomes symmetric: beyond, the same ones come again in the mirror, and
+        what grazed on one side is passed through on the other."""
+        begin = self._images(here) if self.symmetric else np.zeros(0)
+        if np.linalg.norm(begin) < ROUNDED:
+            return
+
+        def ending(at: Step) -> Ending | None:
+            if np.linalg.norm(self._images(at)) >= ALIKE:
+                return None
+            return Ending(self._symmetric(here, way(here, at, self.scale)) or at, SYMMETRY)
+
+        yield Event(lambda step: float(np.dot(begin, self._images(step))), ending)
+
+    def _images(self, step: Step) -> np.ndarray:
+        """How far the motion is from being its own image."""
+        return apart_from_image(self.problem, step)
+
+    def _symmetric(self, here: Step, root: float, *, beyond: bool = True) -> Step | None:
+        """The point about so far ahead at which the motion is symmetric and the curve is crossed by
+        that of the symmetric motions; `beyond`, whether this one can be followed further."""
+        begin = self._images(here)
+
+        def admits(step: Step, length: float) -> bool:
+            other = np.linalg.norm(self._images(step)) < ALIKE * BESIDE
+            return not other and (beyond or length < root)
+
+        alike = lambda step: float(np.dot(begin, self._images(step)))
+        return crossing(self.problem, self.advance, here, root, alike, admits)
+
+
+def cosine_of(step: Step) -> float:
+    """The cosine of the angle of the two multipliers whose product is nearest to 1: half their sum,
+    beyond ±1 if they are real."""
+    values = step.seen.multipliers
+    first, second = np.triu_indices(len(values), 1)
+    pair = int(np.argmin(np.abs(values[first] * values[second] - 1)))
+    return float(0.5 * (values[first[pair]] + values[second[pair]]).real)
+
+
+class Vectors(NamedTuple):
+    """Left and right null vector of the Jacobian by all unknowns but the parameters."""
+
+    left: np.ndarray
+    right: np.ndarray
+
+
+# The value of a test at a step and the vectors that it used, given those of a point close by, whose
+# senses they keep.
+Test = Callable[[Step, Vectors | None], tuple[float, Vectors | None]]
+
+
+def points_of(
+    problem: Shooting, condition: Special, steps: list[Step], ends: tuple[str, str],
+    scale: np.ndarray,
+) -> tuple[CodimensionTwo, ...]:  # fmt: skip
+    """The points of codimension two on a curve, in its order."""
+
+    def point(kind: str, step: Step, impact: int | None = None, more: str = "") -> CodimensionTwo:
+        grazes = kind == GRAZING
+        detail = grazing_in_words(problem, step, impact) if grazes else AT_CODIMENSION_TWO[kind]
+        return CodimensionTwo(
+            kind, np.asarray(step.x)[:-3:-1], orbit_of(problem, step), detail + more,
+            condition.kind, problem, step, scale, impact,
+        )  # fmt: skip
+
+    found: list[tuple[float, CodimensionTwo]] = []
+    for place, end in ((0, ends[0]), (len(steps) - 1, ends[1])):
+        if end == GRAZING and condition.kind not in TOUCHING:
+            found.append((place, point(GRAZING, steps[place], _grazes(steps[place]))))
+        if end in (RESONANCE_1, RESONANCE_2, SYMMETRY):
+            found.append((place, point(end, steps[place])))
+    for kind, test in _tests_of(problem, condition, scale).items():
+        for place, step in _zeros(problem, steps, scale, test):
+            symmetric = kind == FOLD and condition.kind in TOUCHING and _symmetric(problem, step)
+            found.append((place, point(SYMMETRY if symmetric else kind, step)))
+    if condition.kind == GRAZING:
+        with contextlib.suppress(ValueError):  # the local map is not known
+            for place, step, n in _resonances(problem, condition, steps, scale):
+                more = f" of the motion with one impact in {so_many(n, 'period')}"
+                found.append((place, point(RESONANT, step, condition.impact, more)))
+    return tuple(point for _, point in sorted(found, key=lambda f: f[0]))
+
+
+def _symmetric(problem: Shooting, step: Step) -> bool:
+    x = jnp.asarray(step.x)
+    if not may_be_symmetric(problem, [problem.machine, problem.at(x)]):
+        return False
+    return bool(np.linalg.norm(apart_from_image(problem, step)) < ALIKE)
+
+
+def _grazes(step: Step) -> int | None:
+    """The impact that grazes at the end of a curve; `None` at a touch."""
+    approach = np.asarray(step.seen.approach)
+    # An impact that is lost comes with a turn near the stop: of a speed v at a distance of about
+    # v². Where a stop is touched the impacts keep their speed.
+    touches = _SAME_TURN * np.sqrt(abs(room(step)))
+    if approach.size and approach.min() < touches * step.seen.fastest:
+        return int(np.argmin(approach))
+    return None
+
+
+def _resonances(
+    problem: Shooting, condition: Special, steps: list[Step], scale: np.ndarray
+) -> list[tuple[float, Step, int]]:
+    """The resonant grazings of a curve, in its order: after which step, with the fraction of the
+    way to the next one, the point, and which entry of the local map vanishes there, those
+    before it being positive.
+
+    **Raises:** `ValueError` where the local map is not known (see `grazing`).
+    """
+    orbit = orbit_of(problem, steps[0])
+
+    def entries(step: Step, number: int) -> np.ndarray:
+        one, there, sizes = alone(problem, step, scale)
+        point = SpecialPoint(
+            GRAZING, float(there.x[-1]), orbit, "", one, there, sizes, condition.impact
+        )
+        return graze_at(point).map.entries(number)
+
+    found, known = [], [entries(step, _PERIODS) for step in steps]
+    for (i, (here, new)), n in itertools.product(
+        enumerate(itertools.pairwise(steps)), range(_PERIODS)
+    ):
+        before, after = known[i][n], known[i + 1][n]
+        if not before * after < 0:
+            continue
+        step = between(problem, here, new, scale, lambda s, n=n: float(entries(s, n + 1)[n]))
+        if step is None or not bool(step.good):
+            continue
+        at, size = entries(step, n + 1), max(abs(before), abs(after))
+        if abs(at[n]) <= _ENTRY * size and not (at[:n] < _ENTRY * size).any():
+            found.append((_place(i, here, step, new, scale), step, n + 1))
+    return found
+
+
+def _place(i: int, here: Step, at: Step, new: Step, scale: np.ndarray) -> float:
+    """Where on a curve a point is: the number of the step before it, and the share of the way."""
+    whole = (new.x - here.x) / scale
+    return i + float(whole @ ((at.x - here.x) / scale) / (whole @ whole))
+
+
+def _tests_of(problem: Shooting, condition: Special, scale: np.ndarray) -> dict[str, Test]:
+    """Functions that change their sign at the points of each kind, by the curve's kind."""
+
+    def plain(function: Callable[[Step], float]) -> Test:
+        return lambda step, like: (function(step), None)
+
+    fold, doubling = plain(lambda s: _product(s, -1)), plain(lambda s: _product(s, 1))
+    bare = dataclasses.replace(problem, conditions=())
+    if condition.kind == TORUS:
+        return {RESONANCE_3: plain(lambda s: cosine_of(s) + 0.5), RESONANCE_4: plain(cosine_of)}
+    double = plain(lambda s: _others(s, 1 if condition.kind == DOUBLING else -1))
+    if condition.kind == FOLD:
+        return {CUSP: _cusp(bare, scale), FLIP: doubling, RESONANCE_1: double}
+    if condition.kind == DOUBLING:
+        return {DEGENERATE: _cubic(bare, twice=True), FLIP: fold, RESONANCE_2: double}
+    if condition.kind == SYMMETRY:
+        return {DEGENERATE_SYMMETRY: _cubic(bare, twice=False), RESONANCE_1: double}
+    # Where an impact grazes M has a pole, but not where a stop is touched.
+    return {} if condition.impact is not None else {FOLD: fold, DOUBLING: doubling}
+
+
+def _product(step: Step, sign: int) -> float:
+    """det(M ± I)."""
+    M = step.seen.monodromy
+    return _determinant(M + sign * np.eye(len(M)))
+
+
+def _others(step: Step, sign: int) -> float:
+    """The product of all eigenvalues of M ± I but one, where that one is zero: the sum of the
+    principal minors of one row less, which unlike the eigenvalues is smooth."""
+    M = step.seen.monodromy + sign * np.eye(len(step.seen.monodromy))
+    minors = (np.delete(np.delete(M, i, 0), i, 1) for i in range(len(M)))
+    return sum(map(_determinant, minors))
+
+
+def _determinant(matrix: np.ndarray) -> float:
+    """NaN of what is not finite, as where an impact is lost."""
+    return float(np.linalg.det(matrix)) if np.isfinite(matrix).all() else np.nan
+
+
+def _nulls(matrix: np.ndarray, like: Vectors | None = None) -> Vectors:
+    """The null vectors l and r of a square matrix.
+
+    Their senses go together: the adjugate is r lᵀ times det U · det V and a positive number, and it
+    is continuous. Which of the two pairs it is the vectors of a point close by say.
+    """
+    left, _, right = np.linalg.svd(matrix)
+    found = Vectors(left[:, -1] * np.linalg.det(left) * np.linalg.det(right), right[-1])
+    if like is None:
+        return found
+    overlap = max((float(a @ b) for a, b in zip(found, like, strict=True)), key=abs)
+    return Vectors(*(np.sign(overlap) * a for a in found))
+
+
+def _cusp(bare: Shooting, scale: np.ndarray) -> Test:
+    """How fast the parameters move along a curve of folds, with a sign.
+
+    With the left null vector l of F_x both change so that l·F_p dp = 0: along the line across the
+    vector l·F_p, which turns slowly, while the sense in which they go is turned round at a cusp.
+    """
+
+    def test(step: Step, like: Vectors | None) -> tuple[float, Vectors]:
+        jacobian = np.asarray(jacobian_at(bare, jnp.asarray(step.x)))
+        nulls = _nulls(jacobian[:, :-2], like)
+        first, second = nulls.left @ jacobian[:, -2:] * scale[-2:]
+        moves = np.asarray(step.tangent)[-2:]
+        return float(moves @ [-second, first] / np.hypot(first, second)), nulls
+
+    return test
+
+
+@compiled
+def _bent(problem: Shooting, x, right, bend):
+    """Second and third derivative of the equations along x + t right + t² bend/2, at t = 0."""
+
+    def along(t):
+        return problem.lacks(x + t * right + 0.5 * t * t * bend)
+
+    def derivative(function):
+        return lambda t: jax.jvp(function, (t,), (jnp.ones_like(t),))[1]
+
+    second = derivative(derivative(along))
+    zero = jnp.zeros((), x.dtype)
+    return jax.jvp(second, (zero,), (jnp.ones_like(zero),))
+
+
+def _cubic(bare: Shooting, *, twice: bool) -> Test:
+    """The cubic coefficient of the motions that begin at a doubling, or where a symmetry is lost.
+
+    Of the equations F of the motion that is gone through twice, or those of the symmetric motion,
+    with null vectors l and r: l·(C(r, r, r) + 3 B(r, w))/6, F_x w = -B(r, r), where B and C are
+    their second and third derivatives (Kuznetsov, Elements of Applied Bifurcation Theory, 2004,
+    section 5.4). The quadratic coefficient l·B(r, r)/2 is zero by the symmetry of both halves.
+    """
+    whole = doubled(bare) if twice else bare
+
+    def test(step: Step, like: Vectors | None) -> tuple[float, None]:
+        x = repeated(bare, step.x, whole) if twice else np.asarray(step.x)
+        at = jnp.asarray(x)
+        matrix = np.asarray(jacobian_at(whole, at))[:, :-2]
+        nulls = _nulls(matrix)
+        right = jnp.asarray(np.append(nulls.right, [0.0, 0.0]))
+        second, _ = _bent(whole, at, right, jnp.zeros_like(at))
+        bend = np.linalg.lstsq(matrix, -np.asarray(second))[0]
+        _, third = _bent(whole, at, right, jnp.asarray(np.append(bend, [0.0, 0.0])))
+        return float(nulls.left @ np.asarray(third)) / 6, None
+
+    return test
+
+
+def _zeros(
+    problem: Shooting, steps: list[Step], scale: np.ndarray, test: Test
+) -> Iterator[tuple[float, Step]]:
+    """Where a test changes its sign along a curve: which step, with a fraction, and the point."""
+    seen: list[tuple[float, Vectors | None]] = []
+    for step in steps:
+        like = seen[-1][1] if seen else None
+        # At an end where an impact is lost the tests have poles.
+        regular = np.isfinite(step.seen.monodromy).all()
+        seen.append(test(step, like) if regular else (np.nan, like))
+    for i, (here, new) in enumerate(itertools.pairwise(steps)):
+        (before, like), (after, _) = seen[i], seen[i + 1]
+        if not (before * after < 0 or (after == 0 and before != 0)):
+            continue
+        most = max(abs(before), abs(after))
+        at = _zero(problem, here, new, scale, lambda s, like=like: test(s, like)[0], most)
+        if at is None:
+            continue
+        yield _place(i, here, at, new, scale), at
+
+
+def _zero(
+    problem: Shooting, here: Step, new: Step, scale: np.ndarray, test: Callable[[Step], float],
+    most: float,
+) -> Step | None:  # fmt: skip
+    """The point between two at which a test is zero; `None` where it has a pole. `most` is the
+    larger of its values at both."""
+    at = between(problem, here, new, scale, test)
+    if at is None or abs(test(at)) <= _ZERO * most:
+        return at
+    # Where another curve crosses this one the corrector has no answer.
+    if way(here, new, scale) < 0:
+        here = new
+
+    def admits(step: Step, length: float) -> bool:
+        return float(step.tangent @ here.tangent) >= SAME_CURVE and abs(test(step)) < most
+
+    ahead = lambda x, tangent, length: advance(problem, x, tangent, scale, length)
+    return crossing(problem, ahead, here, way(here, at, scale), test, admits)
