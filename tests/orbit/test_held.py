@@ -155,7 +155,7 @@ def test_a_pair_of_multipliers_is_held_until_it_turns_real():
     assert pair_held.pair
 
     def overtaken(*values):
-        rest = {name: None for name in Observed._fields[1:10]}
+        rest = dict.fromkeys(Observed._fields[1:])
         return pair_held.overtaken(Observed(multipliers=np.array(values), **rest))
 
     assert overtaken(*pair, 0.3) < 0

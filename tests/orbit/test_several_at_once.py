@@ -77,9 +77,7 @@ def monodromy(point):
 def test_of_two_oscillators_each_bifurcation_is_seen():
     """Uncoupled, slightly coupled and slightly different: within one step two multipliers pass 1,
     or -1, and leave no sign in the determinants."""
-    one, weak, strong, unlike = (
-        branch_of(*at) for at in ((0.0,), (0.003,), (0.01,), (0.0, 0.001))
-    )
+    one, weak, strong, unlike = (branch_of(*at) for at in ((0.0,), (0.003,), (0.01,), (0.0, 0.001)))
     doublings = [places(branch, "period-doubling") for branch in (one, weak, strong, unlike)]
     np.testing.assert_allclose(doublings[0], [0.19582944], atol=1e-8)
     np.testing.assert_allclose(doublings[1], [0.19582944, 0.19916897], atol=1e-8)
@@ -103,9 +101,7 @@ def test_a_branch_that_leaves_another_to_both_sides():
     wanted = [0.1034185332, 0.1281540734]
     np.testing.assert_allclose(places(branch, "branch-point"), wanted, atol=1e-10)
     point = next(point for point in branch.special if point.kind == "branch-point")
-    off = vi.continue_orbit(
-        point.switch(), parameter="force", bounds=(0.05, 0.25), progress=False
-    )
+    off = vi.continue_orbit(point.switch(), parameter="force", bounds=(0.05, 0.25), progress=False)
     assert off.ends == ("closed", "closed")
     np.testing.assert_allclose(places(off, "branch-point"), wanted, atol=1e-10)
     assert len(places(off, "fold")) == 6

@@ -180,7 +180,7 @@ def boundary(
     return both_ways(
         lambda: SpecialTable(problem, condition, scale, ranges),
         start,
-        lambda found: _curve(found, condition, scale),
+        lambda found: _curve(found, condition),
         what="boundary", progress=progress, settings=settings,
     )  # fmt: skip
 
@@ -252,7 +252,7 @@ def _special_motion(
     return dataclasses.replace(problem, conditions=(condition,)), condition, x
 
 
-def _curve(found: Followed, condition: Special, scale: np.ndarray) -> Boundary:
+def _curve(found: Followed, condition: Special) -> Boundary:
     problem, seen = found.problem, [step.seen for step in found.steps]
     return Boundary(
         kind=condition.kind,
@@ -266,5 +266,5 @@ def _curve(found: Followed, condition: Special, scale: np.ndarray) -> Boundary:
         problem=problem,
         steps=found.steps,
         condition=condition,
-        scale=scale,
+        scale=found.scale,
     )

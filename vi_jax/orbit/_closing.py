@@ -36,8 +36,12 @@ class Closing:
 
     def __init__(self, table: Table):
         self.table = table
-        self.begins: list[tuple[np.ndarray, np.ndarray]] = []
-        self.points: list[Step] = []
+        self.begin([])
+
+    def begin(self, points: list[Step]) -> None:
+        """Take these points of the curve as those it came by."""
+        self.points: list[Step] = list(points)
+        self.begins = self._beginnings(points[0]) if points else []
 
     def rows(self, here: Step, new: Step) -> Iterator[Event]:
         """The rows of a table for a step between two points: one for each place close by at which

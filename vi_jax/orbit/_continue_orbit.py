@@ -112,7 +112,7 @@ def continue_orbit(
     return both_ways(
         lambda: MotionTable(problem, scale, ranges, sought, watched),
         start,
-        lambda found: _branch(found, parameter, scale),
+        lambda found: _branch(found, parameter),
         what="branch", progress=progress, settings=settings,
     )  # fmt: skip
 
@@ -250,10 +250,10 @@ def _refined(
     return start, float(np.max(np.abs(start.x - x) / scale)) if bool(start.good) else np.inf
 
 
-def _branch(found: Followed, name: str, scale: np.ndarray) -> Branch:
+def _branch(found: Followed, name: str) -> Branch:
     """The branch as arrays, from its points.
 
-    **Arguments:** what was followed; `name`, the parameter's; `scale`, the size of each unknown.
+    **Arguments:** what was followed; `name`, the parameter's.
     """
     problem, steps = found.problem, found.steps
     xs = np.stack([step.x for step in steps])
@@ -287,6 +287,6 @@ def _branch(found: Followed, name: str, scale: np.ndarray) -> Branch:
         ends=found.ends,
         problem=problem,
         steps=steps,
-        scale=scale,
+        scale=found.scale,
         free={each: values for each, values in numbers.items() if each != name},
     )

@@ -14,7 +14,7 @@ from .._checks import count, given_number
 from .._messages import Interrupted, Tell, at_work, warn
 from ._corrector import Step, advance, off_by, way
 from ._locate import located
-from ._problem import finer, sized_by_motion
+from ._problem import finer, grown, sized_by_motion
 from ._shooting import Shooting
 from .special import SpecialPoint
 
@@ -87,6 +87,8 @@ class Table(Protocol):
     """The size of each unknown."""
     bounds: Any
     """The intervals of its parameters, in their order."""
+    closing: Any
+    """What looks whether the curve has come back (`Closing`)."""
 
     def advance(self, x: Any, tangent: Any, length: Any) -> Step:
         """The point at this length along the tangent."""
@@ -115,6 +117,8 @@ class Followed(NamedTuple):
     problem: Shooting
     """Its equations, with as many steps as were needed anywhere."""
     steps: list[Step]
+    scale: np.ndarray
+    """The size of each unknown, for the tangents of the steps."""
     special: list[SpecialPoint]
     ends: tuple[str, str]
 
@@ -148,9 +152,12 @@ def both_ways(
 
     def found() -> Any:
         problem = max(back.table.problem, ahead.table.problem, key=lambda p: p.steps)
-        steps = [*reversed(back.path()[1:]), *ahead.path()]
+        scale = np.maximum(back.table.scale, ahead.table.scale)
+        paths = (_rescaled(walk.path(), walk.table.scale, scale) for walk in (back, ahead))
+        behind, before = paths
         special = [*reversed(back.special), *ahead.special]
-        return result(Followed(problem, steps, special, (back.end, ahead.end)))
+        steps = [*reversed(behind[1:]), *before]
+        return result(Followed(problem, steps, scale, special, (back.end, ahead.end)))
 
     def kept() -> Interrupted:
         return Interrupted(f"walk along the {what}", found())
@@ -207,6 +214,7 @@ class _Walk:
                 end = ending.reason
                 break
             self.steps.append(new)
+            self._resize(new)
             tell(1)
             failed, steady = 0, max(0, steady - 1)
             if turn > 0.99 and int(new.iterations) <= 6 and not steady:
@@ -306,6 +314,23 @@ class _Walk:
         self._worst = max(self._worst, (off, float(new.x[-1])))
         return False
 
+    def _resize(self, new: Step) -> None:
+        """Take the sizes of a motion that has become twice as large as it was anywhere."""
+        table, before = self.table, self.table.scale
+        larger = grown(table.problem, new.seen.largest)
+        if larger is None:
+            return
+        table.problem = larger
+        table.scale = larger.scale(before[-len(larger.parameters) :])
+        steps = _rescaled(self.steps, before, table.scale)
+        self._within = {
+            id(again): _rescaled(self._within[id(step)], before, table.scale)
+            for step, again in zip(self.steps, steps, strict=True)
+            if id(step) in self._within
+        }
+        self.steps = steps
+        table.closing.begin(steps[:-1])
+
     def _warn(self) -> None:
         off, value = self._worst
         if off > _WRONG:
@@ -315,6 +340,18 @@ class _Walk:
                 f"{problem.parameters[-1]} = {value:.6g} twice as many change its states by "
                 f"{off:.1g}: follow it by a `method` of more steps a cycle."
             )
+
+
+def _rescaled(steps: list[Step], before: np.ndarray, after: np.ndarray) -> list[Step]:
+    """Points with their tangents in unknowns of other sizes."""
+
+    def tangent(step: Step) -> np.ndarray:
+        along = np.asarray(step.tangent) * before / after
+        return along / np.linalg.norm(along)
+
+    if np.array_equal(before, after):
+        return steps
+    return [step._replace(tangent=tangent(step)) for step in steps]
 
 
 def bounds_of(table: Table) -> list[Event]:

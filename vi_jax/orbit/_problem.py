@@ -55,8 +55,9 @@ _SAME_INSTANT, _OFF_ZERO = 1e-9, 1e-6
 
 # A number of the state that is less than the first share of the largest one at events, or less than
 # the second in the whole course of a motion, is taken for as large: choices, the second one above
-# rounding in units of which one is a billion times another.
-_SMALL, _NOTHING = 1e-3, 1e-13
+# what is left of a number that decays to zero. A motion of which all numbers are less than the third
+# is rest, which has no size of its own.
+_SMALL, _NOTHING, _REST = 1e-3, 1e-10, 1e-9
 
 
 class _Way(NamedTuple):
@@ -148,11 +149,25 @@ def sized(problem: Problem, x: Unknowns, largest: np.ndarray | None = None) -> P
     return dataclasses.replace(problem, sizes=jnp.append(turn, sizes))
 
 
+def grown(problem: Shooting, largest: np.ndarray) -> Shooting | None:
+    """The equations with the sizes of a motion that has become twice as large; `None` if it has
+    not.
+
+    **Arguments:** the equations; the largest moduli of the numbers of its state.
+    """
+    before, now = np.asarray(problem.sizes), 0.5 * np.asarray(largest)
+    if not (now > 2 * before[1:]).any():
+        return None
+    sizes = jnp.append(before[0], np.maximum(before[1:], now))
+    return dataclasses.replace(problem, sizes=sizes)
+
+
 def _sizes(states: np.ndarray, small: float = _SMALL) -> np.ndarray:
     """Half the largest modulus of each number of some states, (…, states); of one that is a small
     share of the others that of the largest of all, as it may be larger elsewhere."""
     most = np.abs(np.atleast_2d(states)).max(axis=0)
-    return 0.5 * np.where(most > small * most.max(), most, most.max() or 1.0)
+    largest = most.max() if most.max() > _REST else 1.0
+    return 0.5 * np.where(most > small * largest, most, largest)
 
 
 def _check_instants(blank: Shooting, found: list[tuple[float, Event]], way: _Way) -> None:

@@ -94,7 +94,7 @@ class Sequence:
             touch = touched_beside(self.problem, at, self.scale)
             if touch is not None:
                 return self.named(GRAZING, touch, BETWEEN_RESTS)
-            if not bool(here.good):
+            if not bool(here.good) or way(at, last, self.scale) < 0:
                 # There is none on the way there: the branch turns, and `last` is of another one.
                 return Ending(self.here, SHORTER)
         return None
