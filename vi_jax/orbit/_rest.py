@@ -94,7 +94,8 @@ class Sequence:
             touch = touched_beside(self.problem, at, self.scale)
             if touch is not None:
                 return self.named(GRAZING, touch, BETWEEN_RESTS)
-            if not bool(here.good) or way(at, last, self.scale) < 0:
+            turned = min(way(before, at, self.scale), way(at, last, self.scale)) < 0
+            if not bool(here.good) or turned:
                 # There is none on the way there: the branch turns, and `last` is of another one.
                 return Ending(self.here, SHORTER)
         return None
@@ -114,6 +115,8 @@ class Sequence:
             return None
         left = way(at, last, scale)
         beyond = last if left < _BEYOND else advance(problem, at.x, at.tangent, scale, _BEYOND)
+        if left >= _BEYOND and np.linalg.norm((beyond.x - at.x) / scale) > 2 * _BEYOND:
+            beyond = beyond._replace(good=np.asarray(False))  # it is of another branch
         return located(problem, at, beyond, scale, same) or at, beyond
 
 
