@@ -59,9 +59,9 @@ def continue_orbit(
     - `orbit`: from `find_orbit`, or from another branch.
     - `parameter`, `bounds`: a number of the machine, such as `"drive.frequency_ratio"` or
       `"stops.0.gap"`, and its interval.
-    - `step`, `max_step`: first and longest step along the branch, in the norm of the unknowns: the
-      state and the clock of each impact in the machine's own units (of a `Scene`: positions in a,
-      velocities in a ω, crank angles in radians), the parameter in half its interval.
+    - `step`, `max_step`: first and longest step along the branch, in the norm of the unknowns: each
+      number of the state in half its largest modulus along the motion, the clock of each impact in
+      1/2π of a cycle, the parameter in half its interval.
     - `max_points`: points in each direction at most.
     - `extrema`: names of numbers whose largest and least values along the branch are located, as
       special points: `"y_min"`, `"y_max"`, `"clearance"`, `"duration"`, `"frequency_ratio"`,

@@ -115,7 +115,7 @@ class Sequence:
             return None
         left = way(at, last, scale)
         beyond = last if left < _BEYOND else advance(problem, at.x, at.tangent, scale, _BEYOND)
-        if left >= _BEYOND and np.linalg.norm((beyond.x - at.x) / scale) > 2 * _BEYOND:
+        if np.linalg.norm((beyond.x - at.x) / scale) > 2 * _BEYOND:
             beyond = beyond._replace(good=np.asarray(False))  # it is of another branch
         return located(problem, at, beyond, scale, same) or at, beyond
 
