@@ -9,13 +9,12 @@ from ._cycle_map import adopted as adopted
 from ._cycle_map import cycle_map as cycle_map
 from ._follow import check_walk as check_walk
 from ._forecast import SCENARIOS as SCENARIOS
-from ._tables import point_of as point_of
 from .branch import Branch as Branch
 from .branch import branch_hits_in_words as branch_hits_in_words
 from .branch import column_names as column_names
+from .branch import point_of as point_of
 from .closed_form import ClosedFormOrbits as ClosedFormOrbits
 from .closed_form import closed_form_orbits as closed_form_orbits
-from .codimension_two import CodimensionTwo as CodimensionTwo
 from .distinct import Orbits as Orbits
 from .distinct import distance as distance
 from .distinct import distinct_among as distinct_among
@@ -36,4 +35,5 @@ from .results import trimmed as trimmed
 from .root_finders import AbstractRootFinder as AbstractRootFinder
 from .root_finders import Gradient as Gradient
 from .root_finders import Newton as Newton
+from .special import CodimensionTwo as CodimensionTwo
 from .special import SpecialPoint as SpecialPoint

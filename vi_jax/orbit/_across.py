@@ -12,12 +12,12 @@ from .._types import State
 from ..flow import simulate
 from ..machine import after_event, with_leaf
 from ._corrector import Step, advance, tangent_at
-from ._events import Event
-from ._fewer_events import without_events
+from ._flight import Event
 from ._problem import events_in
 from ._shooting import Shooting
 from ._sliding import change_at
 from ._solution import sections_of
+from ._surgery import without_events
 from .find import find_orbit
 from .results import Orbit
 

@@ -16,8 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .._types import Flag, Scalar, State
 from ..flow import Run, simulate
 from ..machine import AbstractMachine, bare, in_rows, is_autonomous, raveled, with_modes
-from ._cycle_map import CycleMap
-from ._forward_jacobian import forward_jacobian
+from ._cycle_map import CycleMap, forward_jacobian
 from ._neutral import neutral
 from ._root import shooting_matrix
 

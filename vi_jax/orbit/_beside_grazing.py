@@ -1,21 +1,122 @@
 """What a machine does beside a grazing, where the local map forecasts it."""
 
+import dataclasses
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Float, Int
 
 from .._programs import compiled
+from ..flow import AbstractMethod, FixedStep, simulate
+from ..machine import with_leaf
 from ._forecast import (
+    LOOKED,
     Settled,
+    impacts_in,
     is_local,
+    kick_sizes,
+    local_depths,
+    periods_in,
     settled,
+    settling,
 )
-from ._full_machine import Simulated, alike, simulated
 from ._local_map import Graze
 from ._shooting import Shooting
+
+# What differs by less is the same but for rounding: a choice.
+_ROUNDING = 1e-11
+
+# Far away a motion is periodic if it repeats within 1e-6 of how far it is: a choice.
+_FAR = 1e-3
+
+# A motion on the section farther off than so many kicks of the greatest depth could add up to has
+# left: a choice.
+_KICKS = 64
+
+
+class Simulated(NamedTuple):
+    """What the machine settles on, lane by lane."""
+
+    period: np.ndarray
+    """As `Settled.period`; -1 also for a lane that left the neighbourhood or failed."""
+    impacts: np.ndarray
+    """At the touches, as `Settled.impacts`; NaN where what is touched is no rigid stop."""
+    places: np.ndarray
+    """On the section, less the smooth motion; (lanes, LOOKED, states)."""
+    far: np.ndarray
+    """As `period`, of lanes that left; 0 for others."""
+    hits: np.ndarray
+    """All impacts in a period of these; in one of the motion that grazes where there is none."""
+
+
+@compiled
+def _lanes(problem, method, name: str, values, states, cycles: int, settle):
+    """Sections and impacts of the last cycles, (lanes, cycles)."""
+
+    def one(value, u):
+        machine = with_leaf(problem.machine, name, value)
+        run = simulate(
+            machine, problem.unravel(u), cycles, settle=settle, method=method, record="sections"
+        )
+        rows = jax.vmap(lambda state: ravel_pytree(state)[0])(run.sections)
+        return rows[1:], run.impacts, run.successful
+
+    return jax.vmap(one)(values, states)
+
+
+def simulated(graze: Graze, offsets: np.ndarray) -> Simulated:
+    """The machine at each offset of the parameter, from the smooth motion on."""
+    problem, section, local = graze.problem, graze.section, graze.map
+    value = float(graze.x[-1])
+    smooth = section.state + np.outer(offsets, section.slope)
+    found = _lanes(
+        problem, _method(problem), problem.parameters[0], jnp.asarray(value + offsets),
+        jnp.asarray(smooth), problem.cycles * LOOKED, settling(local) * problem.cycles,
+    )  # fmt: skip
+    rows, impacts, good = (np.asarray(a) for a in found)
+    last = rows[:, problem.cycles - 1 :: problem.cycles] - smooth[:, None]
+    hits = impacts.reshape(len(rows), LOOKED, problem.cycles).sum(axis=2) - len(problem.impacts)
+    size = kick_sizes(local, offsets)
+    u, added = local.kicks.T, np.zeros(len(section.state))
+    for _ in range(_KICKS):
+        added += np.abs(section.matrix @ u).max(axis=1)
+        u = local.matrix @ u
+    unit = np.abs(local.kicks).max()
+    reach = np.abs(section.matrix @ local.kicks.T).max() / unit * size
+    period = periods_in(last, hits, reach + _ROUNDING)
+    deepest = local_depths(local, offsets) ** (2 * local.orders.min())
+    away = np.abs(last).max(axis=(1, 2)) > added.max() * deepest + _ROUNDING
+    good = good & np.isfinite(last).all(axis=(1, 2))
+    span = np.abs(last).max(axis=(1, 2), initial=0.0, where=np.isfinite(last))
+    far = np.where(good & away, periods_in(last, hits, _FAR * span), 0)
+    period = np.where(good & ~away, period, -1)
+    rigid = all(touch.number < len(problem.machine.stops) for touch in graze.touches)
+    counted = impacts_in(hits, period) if rigid else np.full(len(period), np.nan)
+    whole = impacts_in(hits, np.where(far > 0, far, 1)) + np.maximum(far, 1) * len(problem.impacts)
+    return Simulated(period, counted, last, far, whole)
+
+
+def _method(problem: Shooting) -> AbstractMethod:
+    """As exact as the flights of the branch, whose number of steps may be larger than the
+    method's: its error has to be small beside the depth of a touch."""
+    if not isinstance(problem.method, FixedStep):
+        return problem.method
+    steps = max(problem.method.steps_per_cycle, problem.steps // problem.cycles)
+    return dataclasses.replace(problem.method, steps_per_cycle=steps)
+
+
+def alike(forecast: Settled, near: np.ndarray, machine: Simulated) -> np.ndarray:
+    """Whether forecast and machine settle on the same period, with the same impacts in it.
+
+    **Arguments:** the forecast, and which of its lanes stay near; the machine's motions.
+    """
+    period = np.where(near, forecast.period, -1)
+    counted = np.isnan(machine.impacts) | (period <= 0) | (forecast.impacts == machine.impacts)
+    return (period == machine.period) & counted
+
 
 # Decades below the greatest depth that are looked at: a choice.
 DECADES = 4

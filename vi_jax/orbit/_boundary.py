@@ -11,20 +11,19 @@ from .._messages import so_many
 from .._types import xr
 from ..flow import tidy
 from ..machine import check_leaf, leaf, with_units
+from ._conditions import Special, symmetry_condition
 from ._corrector import Step, advance, tangent_at
-from ._fixed_step_method import steps_of
 from ._follow import Followed, both_ways, check_walk
-from ._problem import check_parameter
+from ._problem import check_parameter, steps_of
 from ._shooting import Shooting
 from ._sliding import ADDING_SLIDING, GRAZING_SLIDING
 from ._solution import orbit_at
-from ._special_condition import Special, symmetry_condition
 from ._special_table import Intervals, SpecialTable, cosine_of, points_of
 from ._symmetry import may_be_symmetric
-from ._tables import stability_in_words
-from .codimension_two import CodimensionTwo
+from ._words import DOUBLING, FOLD, SYMMETRY, TORUS, TOUCHING, one
+from .branch import stability_in_words
 from .results import InWords, Orbit
-from .special import DOUBLING, FOLD, SYMMETRY, TORUS, TOUCHING, SpecialPoint, one
+from .special import CodimensionTwo, SpecialPoint
 
 # What to do instead at a point that is not followed: at others, and at one that is seen from the
 # side on which its motion has the part that vanishes.

@@ -2,7 +2,8 @@
 
 With as many of them as there are parameters less one, the motions are a curve again, which
 `curve.walk` follows: `boundary` asks that a motion be special, `continue_orbit` that a number of it
-be held.
+be held. Numbers of a motion have names; as functions of its unknowns they
+can be differentiated.
 """
 
 import abc
@@ -10,17 +11,97 @@ import dataclasses
 import itertools
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
-from .._types import Scalar, Vector
-from ..machine import in_unit, with_leaf
+from .._programs import compiled
+from .._types import Scalar, State, Vector
+from ..flow import average_names, quantities_on, quantity_names
+from ..machine import components, in_unit, with_leaf
 from ..machine import quantity_of as measured
-from ._corrector import Step
+from ._corrector import Step, jacobian_at
 from ._observed import Observed
-from ._quantities import quantity_of
 from ._shooting import Shooting
+from ._symmetry import images
+from ._words import DOUBLING, TORUS, TOUCHING
 from .floquet import compound
+
+_SECTION = "section_"
+
+
+def names_of(problem: Shooting) -> tuple[str, ...]:
+    """The numbers of a motion that these equations tell, those of the machine's own included."""
+    found = ["y_min", "y_max", "clearance", "duration", "multiplier"]
+    if problem.machine.frequency_ratio(jnp.ones(())) is not None:
+        found.append("frequency_ratio")
+    if problem.impacts or not problem.follows_events:
+        found += ["fastest_impact", "slowest_impact"]
+    found += average_names(problem.machine, problem.like)
+    own = (*components(problem.like), *quantity_names(problem.machine, problem.like))
+    return (*found, *(_SECTION + name for name in own))
+
+
+def quantity_of(problem: Shooting, x: Vector, seen: Observed, name: str) -> Scalar:
+    """A number of a motion, one of `names_of`.
+
+    **Arguments:** the equations; a solution, and what is observed of it; the name.
+    """
+    if name in seen.averages:
+        return seen.averages[name]
+    if name in ("y_min", "y_max", "duration"):
+        return getattr(seen, name)
+    if name == "clearance":
+        return seen.nearest.room
+    if name == "multiplier":
+        return jnp.abs(seen.multipliers[0])
+    if name == "frequency_ratio":
+        ratio = problem.at(x).frequency_ratio(seen.duration / problem.cycles)
+        return jnp.asarray(ratio, x.dtype)
+    if name in ("fastest_impact", "slowest_impact"):
+        speeds = _speeds(problem, seen)
+        return jnp.nanmax(speeds) if name == "fastest_impact" else jnp.nanmin(speeds)
+    state = _on_section(problem, x)
+    inner = name.removeprefix(_SECTION)
+    there = components(state)
+    if inner in there:
+        return jnp.asarray(there[inner])
+    row = jax.tree.map(lambda a: jnp.asarray(a)[None], state)
+    return quantities_on(problem.at(x), row)[inner][0]
+
+
+def _speeds(problem: Shooting, seen: Observed) -> Array:
+    """V⁻ of each impact; NaN where there is none."""
+    if seen.counted is not None:
+        return seen.counted.speed
+    return seen.approach[np.asarray(problem.impacts, int)]
+
+
+def _on_section(problem: Shooting, x: Vector) -> State:
+    """The state on the first section of a solution."""
+    clock, states = problem.parts(x)
+    if not problem.events:
+        return problem.unravel(states[0])
+    begins = [i for i, event in enumerate(problem.events) if event.cycle is not None]
+    if begins:
+        return problem.state_at(x, begins[0], clock[begins[0]])
+    place = clock[0] + jnp.mod(-clock[0], problem.period(x))
+    leg = jnp.searchsorted(clock, place, side="right") - 1
+    return problem.state_at(x, leg, place)
+
+
+@compiled
+def rates_at(
+    problem: Shooting, names: tuple[str, ...], x: Vector, direction: Vector
+) -> tuple[dict[str, Scalar], dict[str, Scalar]]:
+    """Numbers of a motion, and how they change where its unknowns go in a direction."""
+
+    def values(x):
+        seen = problem.observe(x)
+        return {name: quantity_of(problem, x, seen, name) for name in names}
+
+    return jax.jvp(values, (x,), (direction,))
 
 
 class AbstractCondition(eqx.Module):
@@ -127,3 +208,70 @@ def overtaken(problem: Shooting, step: Step) -> float:
     """Positive where another multiplier is greater than the one that is held."""
     held = (c for c in problem.conditions if isinstance(c, HeldMultiplier))
     return max((c.overtaken(step.seen) for c in held), default=-1.0)
+
+
+class SymmetryCondition(eqx.Module):
+    """The condition that a motion is its own image under the symmetry of its machine, in the place
+    of one of its equations.
+
+    The motions x of the equations F(x, p) = 0 from event to event are symmetric where D(x), their
+    difference from their own image (`images`), vanishes. Where they lose their symmetry F cannot be
+    solved for x: its Jacobian J = ∂F/∂x has a null vector r, along which the motion departs from
+    its image, and a left null vector l, so that l·F = 0 is met by every symmetric motion close by
+    to first order. That combination of the equations gives way to w·D = 0, where w picks out of D
+    how far the motion has gone along r:
+
+        F + l (w·D - l·F) = 0,   w = DD r/|DD r|²,   DD the derivative of D by x.
+
+    These equations are regular, and the curve's own condition det(M - I) = 0 is added to them.
+    """
+
+    left: Float[Array, " equations"]
+    """l, the left null vector of J where the symmetry is lost."""
+    weight: Float[Array, " differences"]
+    """w, which picks out of D how far the motion has gone along r."""
+
+    def instead(self, problem: Shooting, missing: Array, x: Array) -> Array:
+        """The equations' residual F, given as `missing`, with the combination l·F exchanged for
+        w·D."""
+        departs = self.weight @ images(problem, x)
+        return missing + self.left * (departs - self.left @ missing)
+
+
+def symmetry_condition(problem: Shooting, x: np.ndarray) -> SymmetryCondition:
+    """The condition at a motion that loses its symmetry, by the singular vectors of its Jacobian
+    without the columns of the parameters."""
+    count = len(problem.parameters)
+    left, _, right = np.linalg.svd(np.asarray(jacobian_at(problem, jnp.asarray(x)))[:, :-count])
+    direction = jnp.append(jnp.asarray(right[-1]), jnp.zeros(count))
+    change = jax.jvp(lambda x: images(problem, x), (jnp.asarray(x),), (direction,))[1]
+    return SymmetryCondition(jnp.asarray(left[:, -1]), change / (change @ change))
+
+
+class Special(AbstractCondition):
+    """The condition that a motion is special.
+
+    With the monodromy matrix M that is det(M - I) = 0 at a fold or where a symmetry is lost,
+    det(M + I) = 0 at a period doubling, and where a pair of multipliers leaves the unit circle that
+    the product of two is 1, det(M₂ - I) = 0 with the compound matrix M₂ (see `compound`). M has
+    poles where an impact grazes, which the speeds of approach take away. At a grazing the condition
+    is V⁻ = 0 of the impact that is lost, or a clearance of zero.
+    """
+
+    kind: str = eqx.field(static=True)
+    impact: int | None = eqx.field(static=True)
+    """The event that grazes; `None` at a touch, and where nothing grazes."""
+    symmetry: SymmetryCondition | None = None
+
+    def exchanged(self, problem, x, missing):
+        """Where a symmetry is lost, one of the equations is exchanged (see `SymmetryCondition`)."""
+        return missing if self.symmetry is None else self.symmetry.instead(problem, missing, x)
+
+    def missing(self, problem, x, seen):
+        """The determinant, V⁻ or the clearance."""
+        if self.kind in TOUCHING:
+            return seen.nearest.room if self.impact is None else seen.approach[self.impact]
+        matrix = compound(seen.monodromy) if self.kind == TORUS else seen.monodromy
+        sign = 1 if self.kind == DOUBLING else -1
+        identity = jnp.eye(matrix.shape[0], dtype=x.dtype)
+        return jnp.linalg.det(matrix + sign * identity) * jnp.prod(seen.approach)

@@ -11,15 +11,13 @@ import numpy as np
 from .._checks import flag, given_number, interval, one_of, short, tuple_of_names
 from ..flow import MethodLike
 from ..machine import check_leaf, leaf
-from ._conditions import as_held
+from ._conditions import as_held, names_of, rates_at
 from ._corrector import Step, advance, tangent_at
-from ._fixed_step_method import steps_of
 from ._follow import Followed, both_ways, check_walk
 from ._motion_table import MotionTable
 from ._observed import Observed
-from ._problem import check_parameter, problem_of, sized
-from ._quantities import names_of, rates_at
-from ._section_map import section_map_of
+from ._problem import check_parameter, problem_of, sized, steps_of
+from ._rest import section_map_of
 from ._shooting import Shooting
 from .branch import Branch
 from .floquet import NEUTRAL

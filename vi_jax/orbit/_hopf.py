@@ -18,7 +18,7 @@ from .._programs import compiled
 from .._types import Scalar, Vector
 from ..machine import AbstractMachine, renews
 from ._corrector import Step, observe
-from ._events import section_of
+from ._flight import section_of
 from ._shooting import Shooting
 
 # The motion that stands for the branch there has so much of the size of the one before it. This and

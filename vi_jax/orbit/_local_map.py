@@ -8,7 +8,8 @@ corrected by the discontinuity mapping. All numbers here are derivatives of what
 2008, chapters 6 to 8).
 """
 
-from typing import NamedTuple
+from math import log2
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,11 +18,290 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from .._programs import compiled
+from ..flow import guard_rates
+from ..machine import after_event, events_of, guard_of, jump_of
 from ._corrector import tangent_at
-from ._fewer_events import of_least_period, without_events
+from ._flight import Event, Flight
 from ._shooting import Shooting
-from ._touch import Touch, touch_at, touched
-from .special import SpecialPoint, one
+from ._surgery import of_least_period, without_events
+from ._turns import rooms_of
+from ._words import one
+from .special import SpecialPoint
+
+# A field that differs by less than this (relative to its own size) is continuous where a switch is
+# touched: a choice.
+_CONTINUOUS = 1e-9
+
+# The first contact lasts so much of a cycle, each further one a quarter of that, at most so many of
+# them. Measured powers that agree within this are settled. Steps of a flight. Choices.
+_SHARE, _TRIES, _AGREE, _STEPS = 0.02, 6, 0.03, 8
+
+
+class Kick(NamedTuple):
+    """By how much an impact changes the state: vector·(-h)^order, at a fixed reading of the
+    clock, h being the least distance that there would be without it."""
+
+    vector: np.ndarray
+    order: float
+
+
+def soft_kick(
+    problem: Shooting, x: np.ndarray, number: int, leg: int, clock: float, u: np.ndarray,
+    gradient: np.ndarray, fast: np.ndarray, rate: float,
+) -> Kick:  # fmt: skip
+    """The kick of a switch that a motion grazes.
+
+    **Arguments:** the equations of the motion and their solution; event, leg and clock of the
+    touch; the state there, the gradients of the distance h and of dh/ds, and d²h/ds².
+
+    **Raises:** `ValueError` if the field beyond the surface does not turn the motion back.
+    """
+    at = jnp.asarray(x)
+    jump = np.asarray(_jump_of_field(problem, at, number, leg, jnp.asarray(clock), jnp.asarray(u)))
+    size = np.abs(jump[0]).max()
+    change = jump[1] - jump[0]
+    if np.abs(change).max() > _CONTINUOUS * size:
+        back = rate + float(fast @ change)
+        if back <= 0:
+            raise ValueError(
+                "Argument `point` must be a grazing of something that lets the motion go again, "
+                "but beyond the surface it would stick or go on: d²h/ds² changes from "
+                f"{rate:.3g} to {back:.3g}."
+            )
+        return Kick(2 * np.sqrt(2 * rate) / back * change, 0.5)
+    length = _SHARE * float(problem.period(at)) / problem.cycles
+    measured: list[tuple[float, np.ndarray]] = []
+    orders: list[float] = []
+    for _ in range(_TRIES):
+        y = length * np.sqrt(rate / 8)
+        deep = u - gradient / (gradient @ gradient) * y * y
+        measured.append((y, _flown(problem, at, number, leg, clock, jnp.asarray(deep), length)))
+        if len(measured) > 1:
+            (y0, k0), (y1, k1) = measured[-2:]
+            order = log2(np.linalg.norm(k0) / np.linalg.norm(k1)) / log2(y0 / y1) / 2
+            orders.append(order)
+            if len(orders) > 1 and abs(orders[-1] - orders[-2]) < _AGREE:
+                break
+        length /= 4
+    order = round(2 * orders[-1]) / 2 if abs(orders[-1] % 0.5 - 0.25) > 0.2 else orders[-1]
+    (y0, k0), (y1, k1) = measured[-2:]
+    first, second = k0 / y0 ** (2 * order), k1 / y1 ** (2 * order)
+    # What is left of the first falls by four with the length, as its size does.
+    return Kick(second + (second - first) / 3, order)
+
+
+def _modes(problem: Shooting, machine, number, leg, s, u):
+    """The machine's modes before and after the switch."""
+    before = problem.modes_in(leg)
+    return before, after_event(machine, number, s, problem.unravel(u), before)[1]
+
+
+@compiled
+def _jump_of_field(problem: Shooting, x, number: int, leg, s, u):
+    """The field on either side of the surface."""
+    machine = problem.at(x)
+    modes = _modes(problem, machine, number, leg, s, u)
+    flights = [Flight(machine, m, problem.method, problem.like) for m in modes]
+    state = problem.unravel(u)
+    return jnp.stack([ravel_pytree(flight.smooth.field(s, state))[0] for flight in flights])
+
+
+@compiled
+def _fly(problem: Shooting, x, number: int, leg, touching: bool, s0, s1, u):
+    """The state at `s1` and the guard there, in contact or apart."""
+    machine = problem.at(x)
+    # A body that just comes in: which mode that is, no rounding is to decide.
+    modes = _modes(problem, machine, number, leg, s0, u)[int(touching)]
+    end = Flight(machine, modes, problem.method, problem.like).fly(s0, s1, u, _STEPS)[0]
+    return end, guard_of(machine, number, s1, problem.unravel(end), modes)
+
+
+def _flown(problem: Shooting, x, number, leg, s, deep, length) -> np.ndarray:
+    """The state after a contact, less what it would be without.
+
+    **Arguments:** as `soft_kick`; the state at the greatest depth of the free flight, and how long
+    that would be beyond the surface.
+    """
+    from scipy.optimize import brentq  # slow to load
+
+    def root(function: Any, low: float, high: float) -> float:
+        found: Any = brentq(lambda s1: float(function(s1)[1]), low, high, xtol=1e-15)
+        return float(found)
+
+    def apart(s1):
+        return _fly(problem, x, number, leg, False, jnp.asarray(s), jnp.asarray(s1), deep)
+
+    enters = root(apart, s - length, s)
+    begin = apart(enters)[0]
+
+    def inside(s1):
+        return _fly(problem, x, number, leg, True, jnp.asarray(enters), jnp.asarray(s1), begin)
+
+    places = enters + length * np.linspace(0, 1.5, 49)[1:]
+    values = [float(inside(place)[1]) for place in places]
+    below = [i for i, value in enumerate(values) if value < 0]
+    first = below[0] if below else 0
+    out = next((i for i in range(first, len(values)) if values[i] >= 0), None)
+    if out is None:
+        raise ValueError(
+            "Argument `point` must be a grazing of something that lets the motion go again, but "
+            "a brief contact does not end."
+        )
+    leaves = places[out]
+    if out > 0 and values[out - 1] < 0:
+        leaves = root(inside, places[out - 1], places[out])
+    free = _fly(problem, x, number, leg, False, jnp.asarray(enters), jnp.asarray(leaves), begin)[0]
+    return np.asarray(inside(leaves)[0]) - np.asarray(free)
+
+
+# A turn this near to a stop touches it: as for the special points.
+_TOUCHES = 1e-6
+
+# Touches that are closer than this share of a period are one: the depth of what is between them is
+# then of the order of `_TOUCHES`. A choice.
+_APART = 1e-3
+
+# How fast a body approaches a stop on which its rebound is differentiated: laws that depend on the
+# speed are taken at this one. A choice.
+_SLOW = 1e-8
+
+
+class Touch(NamedTuple):
+    """Where the motion grazes, and what an impact there would do."""
+
+    number: int
+    """The event's number among the machine's events."""
+    leg: int
+    """The flight in which it lies."""
+    clock: float
+    state: np.ndarray
+    gradient: np.ndarray
+    """∂h: of the distance by the state."""
+    rate: float
+    """a = d²h/ds², positive."""
+    slope: float
+    """Of the least distance by the parameter, along the motion."""
+    kick: Kick
+    """What the state loses by an impact, by the depth."""
+
+
+@compiled
+def _rooms(problem: Shooting, x):
+    """Distance and clock of each turn; (legs, events, steps) each."""
+    machine = problem.at(x)
+    clock, states = problem.parts(x)
+
+    def follow(leg, s0, s1, u):
+        after = problem.after(machine, leg, s0, u)
+        flight = problem.flight(machine, leg)
+        _, _, path = flight.fly(s0, s1, after, problem.steps)
+        rooms = rooms_of(
+            flight, path[0], path[1], (s1 - s0) / problem.steps, closed=not problem.events
+        )
+        return jnp.stack([r.room for r in rooms]), jnp.stack([r.clock for r in rooms])
+
+    ends = problem.ends(clock, problem.period(x))
+    return jax.vmap(follow)(jnp.arange(problem.legs), clock, ends, states)
+
+
+def touched(
+    problem: Shooting, x: np.ndarray, number: int, clock: float
+) -> list[tuple[int, int, float]]:
+    """Event, leg and clock of each touch, each once.
+
+    **Arguments:** the equations and their solution; event and clock of the touch that is known,
+    which may fall on the end of a flight, where no turn is seen.
+    """
+    at = jnp.asarray(x)
+    rooms, places = (np.asarray(a) for a in _rooms(problem, at))
+    begins, period = np.asarray(problem.parts(at)[0]), float(problem.period(at))
+    within = float(begins[0] + np.mod(clock - begins[0], period))
+    leg = max(0, int(np.searchsorted(begins, within, side="right")) - 1)
+    found = [(number, leg, within)]
+    for leg, other, step in np.argwhere(np.abs(rooms) <= _TOUCHES):
+        place = float(places[leg, other, step])
+        apart = [
+            abs((place - known + period / 2) % period - period / 2)
+            for event, _, known in found
+            if event == other
+        ]
+        if min(apart, default=period) > _APART * period:
+            found.append((int(other), int(leg), place))
+    return found
+
+
+@compiled
+def _at_touch(problem: Shooting, x, along, number: int, leg, s):
+    """What the machine says where its motion grazes: state, ∂h, a, d(h)/d(parameter), the gradient
+    of dh/ds, and the jump's derivative."""
+
+    def distance(machine, s, u):
+        return -guard_of(machine, number, s, problem.unravel(u), problem.modes_in(leg))
+
+    def there(x):
+        u = ravel_pytree(problem.state_at(x, leg, s))[0]
+        return distance(problem.at(x), s, u), u
+
+    (_, slope), u = jax.jvp(lambda x: there(x)[0], (x,), (along,)), there(x)[1]
+    machine = problem.at(x)
+    field = problem.flight(machine, leg).smooth.field
+
+    def rates(u):
+        def guard(s, state):
+            return distance(machine, s, ravel_pytree(state)[0])
+
+        return guard_rates(field, guard, s, problem.unravel(u))
+
+    gradient = jax.grad(lambda u: distance(machine, s, u))(u)
+    fast = jax.grad(lambda u: rates(u).v)(u)
+    return u, gradient, rates(u).a, slope, fast
+
+
+@compiled
+def _struck(problem: Shooting, x, number: int, leg, s, u, push):
+    """How fast the jump of an impact changes along a direction."""
+    machine = problem.at(x)
+
+    def jumped(u):
+        state = jump_of(machine, number, s, problem.unravel(u), problem.modes_in(leg))
+        return ravel_pytree(state)[0]
+
+    return jax.jvp(jumped, (u,), (push,))[1]
+
+
+def touch_at(
+    problem: Shooting, x: np.ndarray, along: np.ndarray, number: int, leg: int, clock: float
+) -> Touch:
+    """All about one touch.
+
+    **Arguments:** the equations of the motion and their solution, with its derivative `along` the
+    parameter; the event's number, the leg and the clock of the touch.
+    """
+    event = events_of(problem.machine)[number]
+    at, s = jnp.asarray(x), jnp.asarray(clock)
+    u, gradient, rate, slope, fast = (
+        np.asarray(a) for a in _at_touch(problem, at, jnp.asarray(along), number, leg, s)
+    )
+    if not rate > 0:
+        raise ValueError(
+            f"Argument `point` must be a grazing at which the motion turns, but the "
+            f"distance's second derivative is {float(rate):.3g} there."
+        )
+    if number < len(problem.machine.stops):
+        push = fast / (fast @ fast)
+        near = u - _SLOW * push
+        after = np.asarray(_struck(problem, at, number, leg, s, *map(jnp.asarray, (near, push))))
+        kick = Kick(-np.sqrt(2 * rate) * (after - push), 0.5)
+    elif event.holds_mode:
+        kick = soft_kick(problem, x, number, leg, clock, u, gradient, fast, float(rate))
+    else:
+        called = Event(number).called(problem.machine)
+        raise ValueError(
+            "Argument `point` must be the grazing of a stop or a switch, but it touches the "
+            f"{called}, whose jump does not vanish with the speed."
+        )
+    return Touch(number, leg, clock, u, gradient, float(rate), float(slope), kick)
+
 
 # A branch that is this steep in its parameter (share of a unit step in scaled unknowns) turns back.
 _STEEP = 1e-6

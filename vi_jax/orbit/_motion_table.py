@@ -22,49 +22,47 @@ import dataclasses
 import itertools
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
+from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 from ._closing import Closing
-from ._conditions import alone, overtaken
+from ._conditions import alone, overtaken, rates_at
 from ._corrector import Step, advance, apart_from_image, way
-from ._events import Event as MotionEvent
-from ._extrema import Extrema
-from ._follow import STALLED, Ending, Event, bounds_of
+from ._flight import Event as MotionEvent
+from ._follow import STALLED, Ending, Event, Table, bounds_of
 from ._hopf import hopf_between, size_of
 from ._locate import BESIDE, crossing, located
 from ._observed import ROUNDING
-from ._origin import halves, origin
-from ._refined_sliding import refined
 from ._rest import BETWEEN_RESTS, Sequence, past_section, touched_beside
 from ._shooting import Shooting
-from ._sliding import SLIDING, change_at
+from ._sliding import SLIDING, change_at, refined
 from ._solution import orbit_of
+from ._surgery import halves, origin
 from ._symmetry import ALIKE, ROUNDED, may_be_symmetric
 from ._words import (
     ANEW,
+    CROSSING,
     DETAILS,
+    DOUBLING,
+    EXTREMUM,
+    FOLD,
+    GRAZING,
     HELD_FOLD,
+    HOPF,
     REORDERED,
+    SYMMETRY,
+    TORUS,
+    TURN,
     TURNS,
+    WATCHED,
     grazing_in_words,
     place_in_words,
 )
 from .floquet import NEUTRAL
 from .results import Orbit
-from .special import (
-    CROSSING,
-    DOUBLING,
-    EXTREMUM,
-    FOLD,
-    GRAZING,
-    HOPF,
-    SYMMETRY,
-    TORUS,
-    TURN,
-    WATCHED,
-    SpecialPoint,
-)
+from .special import SpecialPoint
 
 # The thresholds here are choices, but for those of which a measurement is given.
 # What lies before the place where a branch springs is looked for on so much of the way there.
@@ -470,3 +468,79 @@ def _turns_back(here: Step, at: Step, last: Step, scale: np.ndarray) -> bool:
     rounding."""
     sides = [(float(at.x[-1]) - float(step.x[-1])) / scale[-1] for step in (here, last)]
     return bool(sides[0] * sides[1] > 0 and min(map(abs, sides)) > 1e-12)
+
+
+# A number that changes less than this along the branch (as a share of it, in the norm of the scaled
+# unknowns) does not change but for rounding: a choice. Of a body that hits a stop the greatest
+# position, which is that stop's place, changes by some 1e-16.
+_CHANGES = 1e-9
+
+# If it goes on changing faster than this share of its rates on both sides, there is a corner: a
+# choice, far above what is left at a place that is located to rounding.
+_CORNER = 1e-4
+
+Test = Callable[[Step], float]
+
+
+class Extremum(NamedTuple):
+    """A place at which a number is larger, or less, than at all others close by."""
+
+    step: Step
+    name: str
+    detail: str
+
+
+class Extrema:
+    """Looks for extremes along a walk, step by step.
+
+    **Arguments:** names of the numbers.
+    """
+
+    def __init__(self, names: tuple[str, ...]):
+        self.names = names
+        self._known: dict[int, tuple[Step, dict[str, float], dict[str, float]]] = {}
+
+    def between(
+        self, curve: Table, here: Step, last: Step, where: Callable[[Test], Step | None]
+    ) -> list[Extremum]:
+        """The extremes between two points that follow each other.
+
+        **Arguments:** the curve; the points; the place between them at which a test is zero.
+        """
+        if not self.names:
+            return []
+        self._known = {id(here): self._known[id(here)]} if id(here) in self._known else {}
+        values, before = self._at(curve, here)
+        others, after = self._at(curve, last)
+        found = []
+        for name in self.names:
+            least = _CHANGES * max(abs(values[name]), abs(others[name]))
+            changes = max(abs(before[name]), abs(after[name])) > least
+            if not (changes and before[name] * after[name] < 0):
+                continue
+            at = where(lambda step, name=name: self._at(curve, step)[1][name])
+            if at is None:
+                continue
+            value, rate = (numbers[name] for numbers in self._at(curve, at))
+            sense = 1 if before[name] > 0 else -1
+            if sense * value < max(sense * values[name], sense * others[name]) - least:
+                continue  # a pole, as of a multiplier at a grazing
+            kind = "largest" if sense > 0 else "least"
+            steep = max(abs(before[name]), abs(after[name]))
+            corner = ", with a corner" if abs(rate) > _CORNER * steep else ""
+            detail = f"{name} = {value:.10g} is {kind} of all close by{corner}"
+            found.append(Extremum(at, name, detail))
+        return found
+
+    def _at(self, curve: Table, step: Step) -> tuple[dict[str, float], dict[str, float]]:
+        """The numbers at a point, and how they change along the branch."""
+        if id(step) not in self._known:
+            direction = jnp.asarray(step.tangent * curve.scale)
+            values, rates = rates_at(curve.problem, self.names, jnp.asarray(step.x), direction)
+            # The step is kept, so that no other one gets its place in memory.
+            self._known[id(step)] = step, _as_floats(values), _as_floats(rates)
+        return self._known[id(step)][1:]
+
+
+def _as_floats(numbers: dict) -> dict[str, float]:
+    return {name: float(x) for name, x in numbers.items()}

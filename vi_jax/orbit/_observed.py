@@ -8,7 +8,7 @@ from jaxtyping import Array, Complex, Float, Int
 
 from .._types import Scalar, State
 from ..machine import AbstractMachine, events_of, guard_of, section_number
-from ._events import Event
+from ._flight import Event
 from ._turns import Nearest
 
 # A distance or a speed is zero within this share of the largest of a motion: a choice, a hundred

@@ -32,8 +32,7 @@ from ..machine import (
     own_modes,
     with_leaf,
 )
-from ._events import Event, guard_at
-from ._flight import Flight
+from ._flight import Event, Flight, guard_at
 from ._observed import Observed, apart
 from ._turns import turns_of
 from .floquet import multipliers_of

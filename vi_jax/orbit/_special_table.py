@@ -26,21 +26,19 @@ import numpy as np
 from .._messages import so_many
 from .._programs import compiled
 from ._closing import Closing
-from ._conditions import alone
+from ._conditions import Special, alone
 from ._corrector import Step, advance, apart_from_image, jacobian_at, way
 from ._follow import SAME_CURVE, STALLED, Ending, Event, bounds_of
 from ._local_map import graze_at
 from ._locate import BESIDE, MOST, between, crossing
 from ._motion_table import room
 from ._observed import ROUNDING
-from ._origin import repeated
 from ._shooting import Shooting
 from ._solution import orbit_of
-from ._special_condition import Special
+from ._surgery import repeated
 from ._symmetry import ALIKE, ROUNDED, may_be_symmetric
-from ._words import AT_CODIMENSION_TWO, grazing_in_words
-from .codimension_two import CodimensionTwo
-from .special import (
+from ._words import (
+    AT_CODIMENSION_TWO,
     CUSP,
     DEGENERATE,
     DEGENERATE_SYMMETRY,
@@ -56,9 +54,9 @@ from .special import (
     SYMMETRY,
     TORUS,
     TOUCHING,
-    SpecialPoint,
-    doubled,
+    grazing_in_words,
 )
+from .special import CodimensionTwo, SpecialPoint, doubled
 
 # The thresholds here are choices.
 # A test that changes its sign without coming this near to zero (as a share of its neighbours) has a

@@ -8,7 +8,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from ..machine import AbstractMachine
-from ._events import Event
+from ._flight import Event
 from ._shooting import Shooting
 
 # Halves of a period that differ by less than this are alike, or images of each other; and by less

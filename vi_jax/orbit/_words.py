@@ -1,29 +1,26 @@
-"""What is said of the special points of a branch, by their kinds."""
+"""The kinds of special points, and what is said of them."""
 
 import jax.numpy as jnp
 import numpy as np
 
 from ..machine import RigidStop, SoftStop
 from ._corrector import Step
-from ._events import Event
+from ._flight import Event
 from ._shooting import Shooting
-from .special import (
-    CROSSING,
-    CUSP,
-    DEGENERATE,
-    DEGENERATE_SYMMETRY,
-    DOUBLING,
-    FLIP,
-    FOLD,
-    RESONANCE_1,
-    RESONANCE_2,
-    RESONANCE_3,
-    RESONANCE_4,
-    RESONANT,
-    SYMMETRY,
-    TORUS,
-    TURN,
-)
+from ._sliding import SLIDING
+
+FOLD, DOUBLING, TORUS = "fold", "period-doubling", "neimark-sacker"
+GRAZING, CROSSING, SYMMETRY = "grazing", "branch-point", "symmetry-breaking"
+HOPF, REST, EXTREMUM, TURN, WATCHED = "hopf", "rest", "extremum", "turn", "watched"
+
+# Kinds of points of codimension two.
+CUSP, FLIP, RESONANT = "cusp", "fold-flip", "resonant-grazing"
+DEGENERATE, DEGENERATE_SYMMETRY = "degenerate-doubling", "degenerate-symmetry-breaking"
+RESONANCE_1, RESONANCE_2 = "resonance-1:1", "resonance-1:2"
+RESONANCE_3, RESONANCE_4 = "resonance-1:3", "resonance-1:4"
+
+# Kinds at which something is touched: by a flight, or by a body that is only just held.
+TOUCHING = (GRAZING, *SLIDING)
 
 # What else a motion may end at than a lost event or a touch; and a turn that a branch makes where
 # it leaves another one to both sides.
@@ -60,6 +57,11 @@ AT_CODIMENSION_TWO = {
 
 # The same of a fold where numbers are held: the parameter alone would turn back.
 HELD_FOLD = "a multiplier passes 1"
+
+
+def one(kind: str) -> str:
+    """A kind with its article, for messages."""
+    return f"{'an' if kind[0] in 'aeiou' else 'a'} {kind}"
 
 
 def place_in_words(problem: Shooting, at: Step, clock: float) -> str:

@@ -11,7 +11,7 @@ from .._checks import count, flag, instance_of
 from .._messages import Interrupted, at_work, so_many
 from ..machine import Stated, Summarized, in_unit, stated
 from ._beside_grazing import ASKED, DECADES, Motions, beside_grazing, positions, stretch
-from ._events import Event
+from ._flight import Event
 from ._forecast import (
     SCENARIOS,
     Settled,

@@ -1,4 +1,4 @@
-"""Special points of a branch, and the branches that begin there."""
+"""Special points of branches and of curves in two parameters, and what begins there."""
 
 import dataclasses
 from collections.abc import Callable
@@ -9,36 +9,32 @@ from jax.flatten_util import ravel_pytree
 
 from .._checks import given_number
 from ._across import across_order, across_sliding, without_part
+from ._conditions import alone
 from ._corrector import Step, advance, jacobian_at, state_at, tangent_at
-from ._events import Event
-from ._fewer_events import without_events
+from ._flight import Event
 from ._observed import ROUNDING
-from ._origin import repeated
 from ._shooting import Shooting
 from ._sliding import SLIDING
 from ._solution import orbit_of
+from ._surgery import repeated, without_events
+from ._words import (
+    CROSSING,
+    DETAILS,
+    DOUBLING,
+    FLIP,
+    FOLD,
+    GRAZING,
+    RESONANCE_1,
+    RESONANCE_2,
+    SYMMETRY,
+    TORUS,
+    grazing_in_words,
+    one,
+)
 from .results import InWords, Orbit
-
-FOLD, DOUBLING, TORUS = "fold", "period-doubling", "neimark-sacker"
-GRAZING, CROSSING, SYMMETRY = "grazing", "branch-point", "symmetry-breaking"
-HOPF, REST, EXTREMUM, TURN, WATCHED = "hopf", "rest", "extremum", "turn", "watched"
-
-# Kinds of points of codimension two.
-CUSP, FLIP, RESONANT = "cusp", "fold-flip", "resonant-grazing"
-DEGENERATE, DEGENERATE_SYMMETRY = "degenerate-doubling", "degenerate-symmetry-breaking"
-RESONANCE_1, RESONANCE_2 = "resonance-1:1", "resonance-1:2"
-RESONANCE_3, RESONANCE_4 = "resonance-1:3", "resonance-1:4"
-
-# Kinds at which something is touched: by a flight, or by a body that is only just held.
-TOUCHING = (GRAZING, *SLIDING)
 
 # Where something grazes it is touched to rounding, by choice within this share of the motion.
 _TOUCHES = 1e-6
-
-
-def one(kind: str) -> str:
-    """A kind with its article, for messages."""
-    return f"{'an' if kind[0] in 'aeiou' else 'a'} {kind}"
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -260,3 +256,78 @@ def _with_touch(old: Shooting, step: Step) -> tuple[Shooting, np.ndarray]:
         events = [[*events, hit][i] for i in order]
     new = dataclasses.replace(old, events=tuple(events), modes=((),) * len(events))
     return new, np.asarray(new.pack(clock, states, value, period))
+
+
+# What kind of curve leaves a point, by the kinds of the curve on which it lies and of the point.
+_LEADS = {
+    (FOLD, FLIP): DOUBLING,
+    (FOLD, RESONANCE_1): TORUS,
+    (FOLD, GRAZING): GRAZING,
+    (DOUBLING, FLIP): FOLD,
+    (DOUBLING, RESONANCE_2): TORUS,
+    (DOUBLING, GRAZING): GRAZING,
+    (TORUS, RESONANCE_1): FOLD,
+    (TORUS, RESONANCE_2): DOUBLING,
+    (TORUS, GRAZING): GRAZING,
+    (GRAZING, FOLD): FOLD,
+    (GRAZING, DOUBLING): DOUBLING,
+    (GRAZING, SYMMETRY): SYMMETRY,
+}
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class CodimensionTwo(InWords):
+    """A point of a `Boundary` at which something more happens."""
+
+    kind: str
+    """"cusp" (two curves of folds meet and end), "degenerate-doubling" or
+    "degenerate-symmetry-breaking" (the motions that begin there do so on the other side beyond),
+    "fold-flip" (multipliers 1 and -1), "resonance-1:1", "resonance-1:2" (a double multiplier 1 or
+    -1, where a curve of Neimark–Sacker points begins), "resonance-1:3", "resonance-1:4" (the
+    angle of a complex pair is 2π/3 or π/2), "grazing" (of a motion that is special by its
+    multipliers); on a curve of grazings "fold" or "period-doubling" (of the motion that grazes),
+    "resonant-grazing" (an entry eₙ of the local map vanishes, see `grazing`);
+    "symmetry-breaking" (the motions become symmetric, and the curve ends; of grazings of
+    symmetric motions, where these lose that)."""
+    parameters: np.ndarray
+    """Both parameters of the curve."""
+    orbit: Orbit
+    detail: str
+    """What happens there, in words."""
+    curve: str
+    """The kind of the curve on which it lies."""
+    problem: Shooting = dataclasses.field(repr=False)
+    step: Step = dataclasses.field(repr=False)
+    scale: np.ndarray = dataclasses.field(repr=False)
+    impact: int | None = None
+    """Of a grazing the impact that is lost; `None` where the body touches a stop."""
+
+    def switch(self) -> SpecialPoint:
+        """The same motion as a special point of another kind, of the curve that meets this one
+        here: `boundary` follows it in the same two parameters.
+
+        From a fold–flip that is the other curve; from a double multiplier 1 or -1 the curve of
+        Neimark–Sacker points, or from that the curve of folds or doublings; from a fold or a
+        doubling that grazes the curve of grazings, and back; where a motion that grazes becomes
+        symmetric, the curve of symmetry breakings.
+
+        **Raises:** `ValueError` for other kinds, from which none leaves, or none of this motion.
+        """
+        kind = _LEADS.get((self.curve, self.kind))
+        if kind is None:
+            raise ValueError(
+                "`switch` needs a fold–flip, a resonance 1:1 or 1:2, or a fold, a doubling or a "
+                f"symmetry breaking that grazes, but this point on a curve of {self.curve} is a "
+                f"{self.kind}."
+            )
+        problem, step, scale = alone(self.problem, self.step, self.scale)
+        grazes = kind == GRAZING
+        detail = grazing_in_words(problem, step, self.impact) if grazes else DETAILS[kind]
+        impact = self.impact if grazes else None
+        return SpecialPoint(
+            kind, float(step.x[-1]), self.orbit, detail, problem, step, scale, impact
+        )  # fmt: skip
+
+    def __str__(self) -> str:
+        first, second = self.parameters
+        return f"{self.kind} at ({first:.10g}, {second:.10g}): {self.detail}"

@@ -1,0 +1,101 @@
+"""The same machine in other units of length and time has the same special points."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+
+UNITS = ((1.0, 1.0), (1e-6, 1e-3), (1e6, 1e3), (1e-6, 1e6), (1e6, 1e-6))
+
+
+class Struck(vi.AbstractMachine):
+    """x'' + 0.1 x' + x + c x³ = f cos ws with a stop, in a unit of length and one of time."""
+
+    length: float
+    time: float
+    force: float = 1.0
+    frequency: float = 0.8
+    cubic: float = 0.0
+    gap: float = 1.0
+
+    @property
+    def cycle(self):
+        """2π/w, in the unit of time."""
+        return 2 * np.pi * self.time / self.frequency
+
+    def field(self, s, state):
+        """The rates of position and velocity."""
+        x = state["x"] / self.length
+        pull = self.force * jnp.cos(self.frequency * s / self.time) - x - self.cubic * x**3
+        v = state["v"]
+        return {"x": v, "v": pull * self.length / self.time**2 - 0.1 * v / self.time}
+
+    @property
+    def contacts(self):
+        """A stop on one side."""
+        return (vi.RigidStop(self.gap * self.length, restitution=0.7, on=("x", "v")),)
+
+    def start(self):
+        """At rest."""
+        return {"x": 0.0, "v": 0.0}
+
+
+class Rubbed(Struck):
+    """The same with dry friction in place of the stop: it sticks twice a cycle, or not at all."""
+
+    @property
+    def contacts(self):
+        """Friction of a third of the force's amplitude."""
+        return (vi.DryFriction(on=("x", "v"), level=self.length / self.time**2 / 3),)
+
+
+class Swinging(vi.AbstractMachine):
+    """The van der Pol oscillator."""
+
+    length: float
+    time: float
+    growth: float = 0.5
+
+    cycle = vi.rising("v")
+
+    def field(self, s, state):
+        """The rates of position and velocity."""
+        x, v = state["x"] / self.length, state["v"]
+        return {
+            "x": v,
+            "v": -x * self.length / self.time**2 + (self.growth - x * x) * v / self.time,
+        }
+
+    def start(self):
+        """Away from rest."""
+        return {"x": 1.0 * self.length, "v": 0.0}
+
+
+CASES = {
+    "impacts": (Struck, {"frequency": 0.6, "gap": 0.5}, "frequency", (0.5, 1.2)),
+    "bends": (Struck, {"cubic": 1.0, "gap": 9.0, "force": 0.4}, "frequency", (0.6, 2.0)),
+    "rubs": (Rubbed, {"frequency": 0.5}, "frequency", (0.2, 0.9)),
+    "swings": (Swinging, {}, "growth", (-0.5, 0.6)),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES)
+def test_a_branch_is_the_same_in_all_units(case):
+    kind, numbers, parameter, bounds = CASES[case]
+    found = []
+    for length, time in UNITS:
+        machine = kind(length=length, time=time, **numbers)
+        settled = vi.simulate(machine, machine.start(), 1, settle=60).last
+        orbit = vi.find_orbit(machine, settled, throw=True)
+        branch = vi.continue_orbit(orbit, parameter=parameter, bounds=bounds, progress=False)
+        assert branch.admissible.all()
+        found.append((branch.ends, [(p.kind, p.parameter) for p in branch.special], branch))
+    assert found[0][1], found[0][2]
+    for ends, special, branch in found[1:]:
+        assert ends == found[0][0] and [k for k, _ in special] == [k for k, _ in found[0][1]], (
+            str(found[0][2]), str(branch),
+        )  # fmt: skip
+        np.testing.assert_allclose(
+            [at for _, at in special], [at for _, at in found[0][1]], rtol=1e-9, atol=1e-9
+        )
