@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import machines
-from .._checks import interval
+from .._checks import fields_with, interval
 from .._programs import compiled
 from ..flow import simulate
 from ..machine import (
@@ -223,7 +223,7 @@ def _range_of(machine: object, name: str, value: float) -> tuple[float, float]:
     *path, last = name.partition("[")[0].split(".")
     for word in path:
         part = part[int(word)] if word.isdigit() else getattr(part, word, None)
-    legal = getattr(part, "ranges", {}).get(last)
+    legal = fields_with(type(part), "range").get(last)
     if legal is None:
         return low, high
     if np.isfinite(legal.low) and np.isfinite(legal.high):

@@ -189,8 +189,10 @@ def check_values(machine: AbstractMachine, start: State) -> None:
     except Exception:  # the error is raised in words where field and guards are traced
         return
     cycle, first, last, below = found
-    ends = zip(jtu.tree_leaves_with_path(start), first, last, strict=True) if ticks else ()
-    for (path, _), one, other in ends:
+    parts = jtu.tree_leaves_with_path(start) if ticks else []
+    if len(first) != len(parts):  # what the field returns is no state, which is said there as well
+        return
+    for (path, _), one, other in zip(parts, first, last, strict=True):
         if np.max(abs(one - other) / (1e-3 + abs(one) + abs(other))) > _APART:
             _warn_of_period(kind, jtu.keystr(path).lstrip(".") or "state", cycle.item())
             break

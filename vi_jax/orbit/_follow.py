@@ -87,8 +87,6 @@ class Table(Protocol):
     """The size of each unknown."""
     bounds: Any
     """The intervals of its parameters, in their order."""
-    closing: Any
-    """What looks whether the curve has come back (`Closing`)."""
 
     def advance(self, x: Any, tangent: Any, length: Any) -> Step:
         """The point at this length along the tangent."""
@@ -108,6 +106,10 @@ class Table(Protocol):
 
     def stalled(self, steps: list[Step]) -> Ending:
         """How a curve ends that the corrector follows no further."""
+        ...
+
+    def begin(self, points: list[Step]) -> None:
+        """Take these points of the curve as those it came by."""
         ...
 
 
@@ -329,7 +331,7 @@ class _Walk:
             if id(step) in self._within
         }
         self.steps = steps
-        table.closing.begin(steps[:-1])
+        table.begin(steps[:-1])
 
     def _warn(self) -> None:
         off, value = self._worst

@@ -135,6 +135,10 @@ class MotionTable:
         """The motion beyond a place where one that rests meets a stop on its section."""
         return past_section(self.problem, last, self.scale)
 
+    def begin(self, points: list[Step]) -> None:
+        """Take these points of the curve as those it came by."""
+        self.closing.begin(points)
+
     def stalled(self, steps: list[Step]) -> Ending:
         """How a branch ends that the corrector follows no further: of motions that rest at a
         grazing, perhaps, from which both of its branches lead back."""

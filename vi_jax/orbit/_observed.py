@@ -1,5 +1,6 @@
 """What is observed of a periodic motion beside its unknowns, at each point of a branch."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -65,11 +66,11 @@ class Observed(NamedTuple):
         y_min, y_max = float(self.y_min), float(self.y_max)
         return max(y_max - y_min, abs(y_min), abs(y_max))
 
-    @property
-    def admissible(self) -> bool:
-        """Whether the motion stays inside its stops and approaches each event; host-side."""
+    def admissible(self, events: Sequence[int]) -> bool:
+        """Whether the motion stays inside its stops and approaches each of these events;
+        host-side."""
         inside = float(self.nearest.room) >= -ROUNDING * self.length
-        slowest = np.asarray(self.approach).min(initial=0.0)
+        slowest = np.asarray(self.approach)[list(events)].min(initial=0.0)
         return bool(inside and slowest >= -ROUNDING * self.fastest)
 
     @property

@@ -102,6 +102,10 @@ class SpecialTable:
         """Nothing: these motions do not rest."""
         return None
 
+    def begin(self, points: list[Step]) -> None:
+        """Take these points of the curve as those it came by."""
+        self.closing.begin(points)
+
     def stalled(self, steps: list[Step]) -> Ending:
         """How a curve ends that the corrector follows no further: perhaps where the motion becomes
         symmetric."""

@@ -189,7 +189,7 @@ class Branch(InWords):
     @property
     def admissible(self) -> np.ndarray:
         """Whether the motion stays inside the gap and approaches each impact, at each point."""
-        return np.array([step.seen.admissible for step in self.steps])
+        return np.array([step.seen.admissible(self.problem.impacts) for step in self.steps])
 
     @property
     def multiplier(self) -> np.ndarray:

@@ -19,10 +19,10 @@ from jaxtyping import Array, Float
 from .._checks import count, instance_of, number, require
 from .._types import Scalar
 from ._neutral import rounding
-from .distinct import unit_of
 
-# A motion smaller than this part of the guess is at rest in the origin. A choice.
-_NOTHING = 1e-6
+# A motion smaller than the first part of the guess, or than the second, is at rest in the origin.
+# Choices.
+_NOTHING, _REST = 1e-6, 1e-9
 
 Unknowns = Float[Array, "..."]
 Residual = Callable[[Unknowns], Unknowns]
@@ -167,7 +167,7 @@ class Found(NamedTuple):
     history: Float[Array, " max_steps"]
     """Largest residual component after each step, NaN beyond the last."""
     unit: Scalar
-    """What counts as 1 in the comparison with a tolerance (see `unit_of`)."""
+    """What counts as 1 in the comparison with a tolerance: the largest unknown, of rest 1."""
 
 
 def find_root(root_finder: AbstractRootFinder, residual: Residual, x: Unknowns) -> Found:
@@ -182,7 +182,8 @@ def find_root(root_finder: AbstractRootFinder, residual: Residual, x: Unknowns) 
 
     def unit(place):
         # Of a motion that comes to rest in the origin nothing is left to be relative to.
-        return unit_of(jnp.maximum(jnp.abs(place), _NOTHING * jnp.abs(guess)))
+        size = jnp.max(jnp.maximum(jnp.abs(place), _NOTHING * jnp.abs(guess)))
+        return jnp.where(size > _REST, size, 1.0)
 
     memory, static = eqx.partition(root_finder.init(residual, x), eqx.is_array)
     history = jnp.full((root_finder.max_steps,), jnp.nan, x.dtype)
