@@ -79,6 +79,7 @@ def orbit_of(problem: Shooting, step: Step) -> Orbit:
     machine = problem.at(x)
     clock, period = _clock_of(problem, x)
     sections, residual = sections_of(problem, x)
+    admissible = seen.admissible(range(len(problem.events)))
     # Along a branch an impact may move past the section: an orbit's clocks lie within its period.
     within, speeds, stops, count = _impacts_of(problem, seen, clock, period)
     order = np.argsort(within)
