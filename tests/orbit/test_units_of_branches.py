@@ -89,7 +89,7 @@ CASES = {
 def test_a_branch_is_the_same_in_all_units(case):
     kind, numbers, parameter, bounds = CASES[case]
     found = []
-    # In the fourth units the body that rubs is slower than what counts as sticking (docs/limits.md).
+    # In the fourth units the body that rubs is slower than what counts as sticking.
     units = [at for at in UNITS if (kind, at) != (Rubbed, UNITS[3])]
     for length, time in units:
         machine = kind(length=length, time=time, **numbers)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import vi_jax as vi
 from matplotlib.figure import Figure
-from vi_jax.orbit import special
+from vi_jax.orbit import _sliding, _words
 from vi_jax.plot.colors import MARKS, color_of
 
 NAME = "drive.frequency_ratio"
@@ -81,12 +81,13 @@ def test_a_sweep_lies_above_branches_and_below_marks(branch):
 
 def test_every_special_point_has_a_mark_of_its_own():
     assert len({mark for mark, _ in MARKS.values()}) == len(MARKS)
-    assert set(special.SLIDING) <= set(MARKS)
-    assert set(MARKS) - set(special.SLIDING) == {
-        getattr(special, name)
+    assert set(_sliding.SLIDING) <= set(MARKS)
+    assert set(MARKS) - set(_sliding.SLIDING) == {
+        getattr(_words, name)
         for name in (
             "FOLD", "DOUBLING", "TORUS", "GRAZING", "CROSSING", "SYMMETRY", "HOPF", "REST",
-            "EXTREMUM", "TURN", "CUSP", "DEGENERATE", "DEGENERATE_SYMMETRY", "FLIP", "RESONANCE_1",
+            "EXTREMUM", "WATCHED", "TURN", "CUSP", "DEGENERATE",
+            "DEGENERATE_SYMMETRY", "FLIP", "RESONANCE_1",
             "RESONANCE_2", "RESONANCE_3", "RESONANCE_4", "RESONANT",
         )
     }  # fmt: skip

@@ -109,8 +109,6 @@ def orbit_of(problem: Shooting, step: Step) -> Orbit:
         error=jnp.asarray(step.size),
         iterations=jnp.asarray(step.iterations, jnp.int32),
         history=jnp.zeros((0,)),
-        result=ORBIT_RESULTS.successful
-        if seen.admissible(range(len(problem.events)))
-        else ORBIT_RESULTS.inadmissible,
+        result=ORBIT_RESULTS.successful if admissible else ORBIT_RESULTS.inadmissible,
         averages={name: jnp.asarray(x) for name, x in seen.averages.items()},
     )

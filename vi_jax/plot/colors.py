@@ -48,6 +48,7 @@ MARKS = {
     "hopf": ("*", "0.7"),
     "rest": ("h", "0.7"),
     "extremum": ("d", "w"),
+    "watched": ("$w$", "k"),
     "turn": ("<", "w"),
     "cusp": ("v", "k"),
     "degenerate-doubling": ("p", "w"),
