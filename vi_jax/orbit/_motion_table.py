@@ -372,8 +372,7 @@ class MotionTable:
         if apart.size and np.linalg.norm(apart) < ALIKE:
             return True
         before = np.linalg.norm(self._images(here))
-        close = np.linalg.norm(images) < min(ALIKE, 0.5 * before)
-        return bool(images.size and close and before > ROUNDED)
+        return bool(images.size and np.linalg.norm(images) < ALIKE and before > ROUNDED)
 
     def _crossing(self, here: Step, at: Step, kind: str) -> Step:
         """The point where branches cross (see `crossing`)."""
