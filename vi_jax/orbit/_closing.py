@@ -41,13 +41,15 @@ class Closing:
     def begin(self, points: list[Step]) -> None:
         """Take these points of the curve as those it came by."""
         self.points: list[Step] = list(points)
-        self.begins = self._beginnings(points[0]) if points else []
+        self.begins, self.cycle = [], 0.0
+        if points:
+            self._begin_at(points[0])
 
     def rows(self, here: Step, new: Step) -> Iterator[Event]:
         """The rows of a table for a step between two points: one for each place close by at which
         the curve was before."""
         if not self.points:
-            self.begins = self._beginnings(here)
+            self._begin_at(here)
         if not self.points or self.points[-1] is not here:
             self.points.append(here)
         near = _NEAR * float(np.linalg.norm((new.x - here.x) / self.table.scale))
@@ -57,12 +59,14 @@ class Closing:
             return
         away = int(np.flatnonzero(apart > near)[-1])  # from the next one on it is near
         met = [self.points[i] for i in np.flatnonzero(apart[: away + 1] <= near) if i]
-        places: list[tuple[np.ndarray, np.ndarray, Step | None]] = [
-            *((x, t, None if i else self.points[0]) for i, (x, t) in enumerate(self.begins)),
-            *((np.asarray(step.x), np.asarray(step.tangent), step) for step in met),
-        ]
-        for begin, tangent, known in places:
-            begin = self._some_cycles_later(begin, here)
+        places: list[tuple[np.ndarray, np.ndarray, float, Step | None]] = [
+            *((x, t, self.cycle, None if i else self.points[0])
+              for i, (x, t) in enumerate(self.begins)),
+            *((np.asarray(step.x), np.asarray(step.tangent), self._cycle(step), step)
+              for step in met),
+        ]  # fmt: skip
+        for begin, tangent, cycle, known in places:
+            begin = self._some_cycles_later(begin, cycle, here)
             if min(self._apart(step, begin) for step in (here, new)) > near:
                 continue
 
@@ -80,28 +84,35 @@ class Closing:
     def _apart(self, step: Step, begin: np.ndarray) -> float:
         return float(np.linalg.norm((step.x - begin) / self.table.scale))
 
-    def _beginnings(self, first: Step) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Unknowns and tangent of the first motion, and of the same one observed otherwise."""
+    def _begin_at(self, first: Step) -> None:
+        """Take unknowns and tangent of the first motion, and of the same one observed
+        otherwise."""
+        self.cycle = self._cycle(first)
         x, scale, problem = np.asarray(first.x), self.table.scale, self.table.problem
         ahead, behind = (
             observed_otherwise(problem, x + by * first.tangent * scale) for by in (_SHORT, -_SHORT)
         )
         tangents = [(a - b) / (2 * _SHORT * scale) for a, b in zip(ahead, behind, strict=True)]
         others = zip(observed_otherwise(problem, x), tangents, strict=True)
-        return [
+        self.begins = [
             (x, np.asarray(first.tangent)),
             *(found for found in others if self._apart(first, found[0]) > _AGAIN),
         ]
 
-    def _some_cycles_later(self, begin: np.ndarray, here: Step) -> np.ndarray:
-        """The motion counted from the cycle in which its first event is nearest to that of another
-        one."""
+    def _cycle(self, step: Step) -> float:
+        """The length of a cycle by the clock, where motions may be counted from any; else 0."""
         problem = self.table.problem
         if not problem.events or problem.autonomous:
+            return 0.0
+        return float(problem.at(jnp.asarray(step.x)).cycle)
+
+    def _some_cycles_later(self, begin: np.ndarray, cycle: float, here: Step) -> np.ndarray:
+        """The motion counted from the cycle in which its first event is nearest to that of another
+        one."""
+        if not cycle:
             return begin
-        cycle = float(problem.at(jnp.asarray(begin)).cycle)
         begin = begin.copy()
-        begin[: problem.legs] += cycle * np.round((here.x[0] - begin[0]) / cycle)
+        begin[: self.table.problem.legs] += cycle * np.round((here.x[0] - begin[0]) / cycle)
         return begin
 
 

@@ -248,20 +248,22 @@ class _Walk:
         test may have changed it back, since beyond the first place the curve is no longer one of
         the machine's.
         """
-        rows = self.table.ends(here, new)
-        at_once = [row for row in rows if self._falls(row, here, new)]
-        for row in at_once:
-            ending = row.ending(here)
+        rows = [(row, row.test(here)) for row in self.table.ends(here, new)]
+        for row, begin in rows:
+            ending = row.ending(here) if _falls(row, begin, new) else None
             if ending is not None:
                 return ending
-        rows = [row for row in rows if row.test(here) > 0]
+        rows = [(row, begin) for row, begin in rows if begin > 0]
         first, end = None, new
         while True:
             share = 0.0 if first is None else _NOISE
-            row = next((r for r in rows if r.test(end) <= -share * r.test(here) - r.noise), None)
-            if row is None:
+            found = (
+                i for i, (r, begin) in enumerate(rows) if r.test(end) <= -share * begin - r.noise
+            )
+            changed = next(found, None)
+            if changed is None:
                 return first
-            rows.remove(row)
+            row, _ = rows.pop(changed)
             at = self._place(row, here, end)
             ending = None if at is None else row.ending(at)
             if ending is None:
@@ -273,11 +275,6 @@ class _Walk:
             )
             if first.reason == SHORTER or not bool(end.good):
                 return first
-
-    def _falls(self, row: Event, here: Step, new: Step) -> bool:
-        """Whether a test is zero at a point, to rounding, and falls from there."""
-        begin, end = row.test(here), row.test(new)
-        return begin <= row.noise and abs(begin) <= _BEGINS * abs(end) and end < -row.noise
 
     def _place(self, row: Event, here: Step, end: Step) -> Step | None:
         if row.locate is not None:
@@ -342,6 +339,14 @@ class _Walk:
                 f"{problem.parameters[-1]} = {value:.6g} twice as many change its states by "
                 f"{off:.1g}: follow it by a `method` of more steps a cycle."
             )
+
+
+def _falls(row: Event, begin: float, new: Step) -> bool:
+    """Whether a test is zero at a point, to rounding, and falls from there."""
+    if begin > row.noise:
+        return False
+    end = row.test(new)
+    return abs(begin) <= _BEGINS * abs(end) and end < -row.noise
 
 
 def _rescaled(steps: list[Step], before: np.ndarray, after: np.ndarray) -> list[Step]:
