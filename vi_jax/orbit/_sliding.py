@@ -124,20 +124,30 @@ def _vanishing(problem: Shooting, at: Step, brief: float) -> Change | None:
     return change if length < brief * period else None
 
 
+def _unit(problem: Shooting, at: Step, *, held: bool) -> float:
+    """What counts as 1 of a switch's guard: of a velocity, or while it is held of a force."""
+    return at.seen.length / problem.radian ** (2 if held else 1)
+
+
 def _touching(problem: Shooting, at: Step) -> Change | None:
     """A flight that just touches a switch's surface, or a body that is only just held."""
-    nearest, machine = at.seen.nearest, problem.machine
-    number = int(nearest.event)
-    if abs(float(nearest.room)) > _ZERO * at.seen.length or not holds(Event(number).of(machine)):
+    nearest, number = at.seen.nearest, int(at.seen.nearest.event)
+    if not holds(Event(number).of(problem.machine)):
         return None
     clock, _, period = _clocks(problem, at)
     place = float(clock[0] + np.mod(float(nearest.clock) - clock[0], period))
     leg = max(0, int(np.searchsorted(clock, place, side="right")) - 1)
     mode = _mode(problem, leg, number)
+    if abs(float(nearest.room)) > _ZERO * _unit(problem, at, held=not mode):
+        return None
     if mode:
         force, _ = holding_force(problem, at, leg, number, place)
         # A surface that is touched from one side holds only what the other side's field drives on.
-        return Change(number, place, (mode, 0.0, mode), False) if force < _ZERO else None
+        return (
+            Change(number, place, (mode, 0.0, mode), False)
+            if force < _ZERO * _unit(problem, at, held=True)
+            else None
+        )
     return Change(number, place, (0.0, _away(problem, at, leg, number, place), 0.0), False)
 
 
@@ -155,7 +165,7 @@ def _beginning(problem: Shooting, at: Step) -> Change | None:
     if not found:
         return None
     force, rate, number, place, before, after = min(found)
-    if force > _ZERO:
+    if force > _ZERO * _unit(problem, at, held=True):
         return None
     if rate > 0:  # what holds it is about to let go of it
         return Change(number, place, (before, 0.0, after or -before), False)

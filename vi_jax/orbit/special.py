@@ -70,7 +70,10 @@ class SpecialPoint(InWords):
         bifurcation a surface, by a motion without the part that vanishes there."""
         lost = self.impact is not None and self.kind not in SLIDING
         seen = self.step.seen
-        return lost or abs(float(seen.nearest.room)) <= _TOUCHES * seen.length
+        # A stop's room is a length; that of a switch a velocity or, while it is held, a force.
+        orders = (0,) if self.kind == GRAZING else (1, 2)
+        unit = max(seen.length / self.problem.radian**order for order in orders)
+        return lost or abs(float(seen.nearest.room)) <= _TOUCHES * unit
 
     @property
     def lost(self) -> list[int]:
