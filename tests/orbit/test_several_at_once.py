@@ -1,7 +1,7 @@
 """Bifurcations that fall together, or nearly so; branches that begin at a special point.
 
-The numbers of the two Duffing oscillators were found by a shooting code of its own, and are checked
-here by their variational equations, integrated by SciPy.
+The numbers of the two Duffing oscillators were found by an independent shooting code, and are
+checked here by their variational equations, integrated by SciPy.
 """
 
 import jax.numpy as jnp

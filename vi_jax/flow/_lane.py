@@ -284,7 +284,7 @@ class Plan(eqx.Module):
 
     @property
     def unit(self) -> Scalar | float:
-        """As `unit_of` its machine."""
+        """The unit of `s` for the thresholds of the machine (see `unit_of`)."""
         return unit_of(self.machine)
 
     def in_units(self, threshold: Any) -> Any:

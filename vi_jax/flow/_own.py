@@ -190,7 +190,7 @@ def check_values(machine: AbstractMachine, start: State) -> None:
         return
     cycle, first, last, below = found
     parts = jtu.tree_leaves_with_path(start) if ticks else []
-    if len(first) != len(parts):  # what the field returns is no state, which is said there as well
+    if len(first) != len(parts):  # the field returns no state: it is refused where it is traced
         return
     for (path, _), one, other in zip(parts, first, last, strict=True):
         if np.max(abs(one - other) / (1e-3 + abs(one) + abs(other))) > _APART:

@@ -15,7 +15,7 @@ class EventKind(enum.IntEnum):
     """What may happen to a motion, as `EventLog` lists it."""
 
     impact = 0
-    """On a stop."""
+    """A body hits a rigid stop."""
     rest = 1
     """A body comes to rest on a stop."""
     release = 2

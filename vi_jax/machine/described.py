@@ -1,4 +1,4 @@
-"""What a machine says of itself besides its motion: clocks, what is observed of it, words."""
+"""The parts of a machine that do not move it: its clocks, its quantities, and their names."""
 
 import abc
 from collections.abc import Mapping
@@ -127,8 +127,8 @@ class Observed(Shown):
     @by_default
     def quantities(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
         """`quantities(s, state)`: functions of the state, by name, which results tell beside it: on
-        sections, in samples, along branches. `s` counts from the section; it is 0 where the state
-        has a clock of its own and for autonomous machines."""
+        sections, in samples, along branches. `s` counts from the section; it is 0 if the state
+        holds the clock, and for autonomous machines."""
         return {}
 
     def mirrored(self, state: State) -> State | None:

@@ -49,7 +49,7 @@ class Simulated(NamedTuple):
     far: np.ndarray
     """As `period`, of lanes that left; 0 for others."""
     hits: np.ndarray
-    """All impacts in a period of these; in one of the motion that grazes where there is none."""
+    """All impacts in `far` periods of the motion that grazes; in one of them if `far` is 0."""
 
 
 @compiled

@@ -116,8 +116,8 @@ _SAME_INSTANT, _OFF_ZERO = 1e-9, 1e-6
 
 # A number of the state that is less than the first share of the largest one at events, or less than
 # the second in the whole course of a motion, is taken for as large: choices, the second one above
-# what is left of a number that decays to zero. A motion whose numbers are all less than the third
-# is rest, which has no size of its own.
+# what is left of a number that decays to zero. If all numbers are less than the third, the motion
+# is rest, and 1 is its size.
 _SMALL, _NOTHING, _REST = 1e-3, 1e-10, 1e-9
 
 

@@ -93,7 +93,7 @@ class Adaptive(AbstractMethod):
     atol: Any = eqx.field(kw_only=True, default=None, converter=_number_or_none)
     steps_per_cycle: int = eqx.field(static=True, kw_only=True, default=5)  # pyright: ignore
     sizes: Any = eqx.field(kw_only=True, default=None, repr=False)
-    """As of `with_sizes`."""
+    """How large the numbers of the state are, as `with_sizes` sets it."""
 
     def __check_init__(self):
         count("steps_per_cycle", self.steps_per_cycle, least=5)

@@ -67,13 +67,13 @@ class Registers(Array):
 
     @classmethod
     def one(cls, value: Value) -> "Registers":
-        """An array without axes."""
+        """An array without axes that holds one value."""
         values = np.empty((), object)
         values[()] = value
         return cls(values, value.kind)
 
     def item(self) -> Value:
-        """The only number."""
+        """The value of an array without axes."""
         return self.values.item()
 
     def at(self, t: Text, index: Sequence[Index]) -> Value:
