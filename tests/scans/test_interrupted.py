@@ -79,7 +79,7 @@ def test_an_interrupted_branch_is_a_branch(monkeypatch):
     scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.0)
     orbit = vi.find_orbit(scene, scene.start(Y=1.6, V=-1.9), cycles=2)
 
-    struck(monkeypatch, "orbit._motion_table.advance", after=5)
+    struck(monkeypatch, "orbit._follow.advance", after=5)
     options = {"parameter": "stops.0.gap", "bounds": (1.5, 2.5)}
     part = interrupted_by(vi.Interrupted, lambda: vi.continue_orbit(orbit, **options)).partial
     assert isinstance(part, vi.Branch) and part.ends == ("interrupted", "interrupted")
@@ -159,7 +159,7 @@ def test_interrupted_boundaries_grazings_and_profiles(monkeypatch):
     struck(monkeypatch, "orbit._beside_grazing.simulated", after=0)
     found = interrupted_by(vi.Interrupted, lambda: vi.grazing(point)).partial
     assert found.machine is None and found.windows is not None
-    struck(monkeypatch, "orbit._special_table.advance", after=4)
+    struck(monkeypatch, "orbit._follow.advance", after=4)
     options = {"parameter": "amplitude", "bounds": ((0.05, 0.5), (0.5, 2.0))}
     curve = interrupted_by(vi.Interrupted, lambda: vi.boundary(point, **options)).partial
     assert curve.ends == ("interrupted", "interrupted") and len(curve.parameters) > 1

@@ -209,7 +209,7 @@ def _check_point(point: SpecialPoint) -> None:
 
 def _checked_bounds(point: SpecialPoint, parameter: str, bounds: Any) -> Intervals:
     """The intervals of the second parameter and of the point's own, in the order of the unknowns.
-    **Raises:** `ValueError` for what is none, or does not hold the point."""
+    **Raises:** `ValueError` unless both are intervals that hold the point."""
     machine, name = point.problem.machine, point.problem.parameters[0]
     check_leaf(machine, parameter)
     if name == parameter:

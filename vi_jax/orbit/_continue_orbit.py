@@ -13,7 +13,7 @@ from ..flow import MethodLike
 from ..machine import check_leaf, leaf
 from ._conditions import as_held, names_of, rates_at
 from ._corrector import Step, advance, tangent_at
-from ._follow import Followed, both_ways, check_walk
+from ._follow import Followed, both_ways, check_walk, rescaled
 from ._motion_table import MotionTable
 from ._observed import Observed
 from ._problem import check_parameter, problem_of, sized, steps_of
@@ -105,8 +105,8 @@ def continue_orbit(
     before = problem.scale(widths)
     problem = sized(problem, start.x, start.seen.largest)
     scale = problem.scale(widths)
-    tangent = start.tangent * before / scale
-    start = advance(problem, start.x, tangent / np.linalg.norm(tangent), scale, 0.0)
+    (start,) = rescaled([start], before, scale)
+    start = advance(problem, start.x, start.tangent, scale, 0.0)
     return both_ways(
         lambda: MotionTable(problem, scale, ranges, sought, watched),
         start,

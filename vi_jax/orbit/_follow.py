@@ -5,8 +5,10 @@ positive until it happens. The engine finds the first of the rows that happen wi
 lies beyond that place is no longer the curve, and does not count.
 """
 
-from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+import abc
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -78,39 +80,42 @@ class Event(NamedTuple):
     """What lies below zero by no more than this is zero to rounding."""
 
 
-@runtime_checkable
-class Table(Protocol):
-    """The equations of a curve, and what can happen on it."""
+class Table(abc.ABC):
+    """The equations of a curve, and what can happen on it.
 
-    problem: Shooting
-    scale: np.ndarray
-    """The size of each unknown."""
-    bounds: Any
-    """The intervals of its parameters, in their order."""
+    **Arguments:** the equations; the size of each unknown; the intervals of the parameters, which
+    are the last unknowns, in their order.
+    """
+
+    closing: Any
+    """What looks whether the curve has come back (`Closing`)."""
+
+    def __init__(self, problem: Shooting, scale: np.ndarray, bounds: Sequence[tuple[float, float]]):
+        self.problem, self.scale, self.bounds = problem, scale, bounds
+
+    @abc.abstractmethod
+    def ends(self, here: Step, new: Step) -> list[Event]:
+        """The rows for a step between two points."""
 
     def advance(self, x: Any, tangent: Any, length: Any) -> Step:
         """The point at this length along the tangent."""
-        ...
+        return advance(self.problem, x, tangent, self.scale, length)
 
-    def ends(self, here: Step, new: Step) -> list[Event]:
-        """The rows for a step between two points."""
-        ...
+    def where(self, here: Step, new: Step, test: Callable[[Step], float]) -> Step | None:
+        """The point between two at which a test is zero."""
+        return located(self.problem, here, new, self.scale, test)
 
     def passed(self, here: Step, last: Step) -> list[tuple[SpecialPoint, Step]]:
         """What happens between two points without ending the curve, in its order."""
-        ...
+        return []
 
     def beyond(self, last: Step) -> Step | None:
         """A point of the curve beyond a place where the corrector has no answer, if there is."""
-        ...
+        return None
 
     def stalled(self, steps: list[Step]) -> Ending:
         """How a curve ends that the corrector follows no further."""
-        ...
-
-    def begin(self, points: list[Step]) -> None:
-        """Take these points of the curve as those it came by."""
-        ...
+        return Ending(steps[-1], STALLED)
 
 
 class Followed(NamedTuple):
@@ -155,7 +160,7 @@ def both_ways(
     def found() -> Any:
         problem = max(back.table.problem, ahead.table.problem, key=lambda p: p.steps)
         scale = np.maximum(back.table.scale, ahead.table.scale)
-        paths = (_rescaled(walk.path(), walk.table.scale, scale) for walk in (back, ahead))
+        paths = (rescaled(walk.path(), walk.table.scale, scale) for walk in (back, ahead))
         behind, before = paths
         special = [*reversed(back.special), *ahead.special]
         steps = [*reversed(behind[1:]), *before]
@@ -264,7 +269,8 @@ class _Walk:
             if changed is None:
                 return first
             row, _ = rows.pop(changed)
-            at = self._place(row, here, end)
+            locate = row.locate or partial(self.table.where, test=row.test)
+            at = locate(here, end)
             ending = None if at is None else row.ending(at)
             if ending is None:
                 continue
@@ -275,11 +281,6 @@ class _Walk:
             )
             if first.reason == SHORTER or not bool(end.good):
                 return first
-
-    def _place(self, row: Event, here: Step, end: Step) -> Step | None:
-        if row.locate is not None:
-            return row.locate(here, end)
-        return located(self.table.problem, here, end, self.table.scale, row.test)
 
     def _stalled(self, last: Step) -> Ending:
         """How the curve ends where the corrector has no answer: at a bound right ahead beyond which
@@ -321,14 +322,14 @@ class _Walk:
             return
         table.problem = larger
         table.scale = larger.scale(before[-len(larger.parameters) :])
-        steps = _rescaled(self.steps, before, table.scale)
+        steps = rescaled(self.steps, before, table.scale)
         self._within = {
-            id(again): _rescaled(self._within[id(step)], before, table.scale)
+            id(again): rescaled(self._within[id(step)], before, table.scale)
             for step, again in zip(self.steps, steps, strict=True)
             if id(step) in self._within
         }
         self.steps = steps
-        table.begin(steps[:-1])
+        table.closing.begin(steps[:-1])
 
     def _warn(self) -> None:
         off, value = self._worst
@@ -349,7 +350,7 @@ def _falls(row: Event, begin: float, new: Step) -> bool:
     return abs(begin) <= _BEGINS * abs(end) and end < -row.noise
 
 
-def _rescaled(steps: list[Step], before: np.ndarray, after: np.ndarray) -> list[Step]:
+def rescaled(steps: list[Step], before: np.ndarray, after: np.ndarray) -> list[Step]:
     """Points with their tangents in unknowns of other sizes."""
 
     def tangent(step: Step) -> np.ndarray:

@@ -22,20 +22,20 @@ import dataclasses
 import itertools
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
 from ._closing import Closing
 from ._conditions import alone, overtaken, rates_at
-from ._corrector import Step, advance, apart_from_image, way
+from ._corrector import Step, apart_from_image, way
 from ._flight import Event as MotionEvent
-from ._follow import STALLED, Ending, Event, Table, bounds_of
+from ._follow import Ending, Event, Table, bounds_of
 from ._hopf import hopf_between, size_of
-from ._locate import BESIDE, crossing, located
+from ._locate import BESIDE, crossing
 from ._observed import ROUNDING
-from ._rest import BETWEEN_RESTS, Sequence, past_section, touched_beside
+from ._rest import BETWEEN_RESTS, past_section, sequence_rows, touched_beside
 from ._shooting import Shooting
 from ._sliding import SLIDING, change_at, refined
 from ._solution import orbit_of
@@ -64,7 +64,7 @@ from .floquet import NEUTRAL
 from .results import Orbit
 from .special import SpecialPoint
 
-# The thresholds here are choices, but for those of which a measurement is given.
+# These thresholds are choices; where one was measured, the comment gives the figure.
 # What lies before the place where a branch springs is looked for on so much of the way there.
 _SHORT = 0.999
 
@@ -101,7 +101,7 @@ _ZERO = 1e-6
 Passed = list[tuple[SpecialPoint, Step]]
 
 
-class MotionTable:
+class MotionTable(Table):
     """What can happen on a branch, for each of its steps (see `_follow.Table`).
 
     **Arguments:** the equations of the motions, with the parameter as their last unknown; the size
@@ -113,15 +113,16 @@ class MotionTable:
         self, problem: Shooting, scale: np.ndarray, bounds: list[tuple[float, float]],
         extrema: tuple[str, ...], watched: Mapping[str, Callable[[Orbit], float]],
     ):  # fmt: skip
-        self.problem, self.scale, self.bounds = problem, scale, bounds
+        super().__init__(problem, scale, bounds)
         self.extrema, self.watched = Extrema(extrema), watched
         self.symmetric = may_be_symmetric(problem, [problem.machine, *problem.corners(bounds)])
         self.closing = Closing(self)
         self.size, self.duration = None, None
+        self._known: tuple[Any, dict[str, float]] = None, {}
 
     def advance(self, x, tangent, length) -> Step:
         """The point at this length along the tangent."""
-        new = advance(self.problem, x, tangent, self.scale, length)
+        new = super().advance(x, tangent, length)
         gone = float(np.linalg.norm((new.x - np.asarray(x)) / self.scale))
         if gone > _TINY and not abs(length) >= _ASIDE * gone:
             return new._replace(good=np.asarray(False))
@@ -135,17 +136,13 @@ class MotionTable:
         """The motion beyond a place where one that rests meets a stop on its section."""
         return past_section(self.problem, last, self.scale)
 
-    def begin(self, points: list[Step]) -> None:
-        """Take these points of the curve as those it came by."""
-        self.closing.begin(points)
-
     def stalled(self, steps: list[Step]) -> Ending:
         """How a branch ends that the corrector follows no further: of motions that rest at a
         grazing, perhaps, from which both of its branches lead back."""
         last, problem = steps[-1], self.problem
         touch = None if problem.follows_events else touched_beside(problem, last, self.scale)
         if touch is None:
-            return Ending(last, STALLED)
+            return super().stalled(steps)
         return Ending(touch, GRAZING, self._point(GRAZING, touch, BETWEEN_RESTS))
 
     def ends(self, here: Step, new: Step) -> list[Event]:
@@ -158,12 +155,8 @@ class MotionTable:
             rows.append(Event(ahead, lambda at: Ending(at, "multiplier")))
         rows += self._lost(here)
         if here.seen.counted is not None:
-            rows += Sequence(self.problem, here, self.scale, self._named).rows()
+            rows += sequence_rows(self.problem, here, self.scale, self._named)
         return [*rows, *self._springs_off(here), *self.closing.rows(here, new)]
-
-    def _where(self, here: Step, new: Step, test: Callable[[Step], float]) -> Step | None:
-        """The point between two at which a test is zero."""
-        return located(self.problem, here, new, self.scale, test)
 
     def _on_the_way(self, here: Step, last: Step, share: float) -> Step:
         """The point at this share of the way between two."""
@@ -272,7 +265,7 @@ class MotionTable:
         """The bifurcations between two points, the extremes and the zeros of what is watched, in
         their order."""
         found = self._bifurcations(here, last, _HALVES)
-        where = partial(self._where, here, last)
+        where = partial(self.where, here, last)
         for at, name, detail in self.extrema.between(self, here, last, where):
             point = self._point(EXTREMUM, at, detail)
             found.append((dataclasses.replace(point, quantity=name), at))
@@ -281,16 +274,22 @@ class MotionTable:
 
     def _zeros(self, here: Step, last: Step) -> Iterator[tuple[SpecialPoint, Step]]:
         """Where the functions that are watched pass zero."""
-        for name, function in self.watched.items():
-
-            def value(step: Step, function=function) -> float:
-                return float(function(orbit_of(*alone(self.problem, step, self.scale)[:2])))
-
-            before, after = value(here), value(last)
-            at = self._where(here, last, value) if before * after < 0 else None
-            if at is not None and abs(value(at)) <= _ZERO * max(abs(before), abs(after)):
+        known, before = self._known
+        before = before if known is here.seen else self._values(here)
+        self._known = last.seen, self._values(last)
+        for name, after in self._known[1].items():
+            value = lambda step, name=name: self._values(step)[name]
+            at = self.where(here, last, value) if before[name] * after < 0 else None
+            if at is not None and abs(value(at)) <= _ZERO * max(abs(before[name]), abs(after)):
                 point = self._point(WATCHED, at, f"{name} passes zero")
                 yield dataclasses.replace(point, quantity=name), at
+
+    def _values(self, step: Step) -> dict[str, float]:
+        """The numbers that are watched, at a point."""
+        if not self.watched:
+            return {}
+        orbit = orbit_of(*alone(self.problem, step, self.scale)[:2])
+        return {name: float(function(orbit)) for name, function in self.watched.items()}
 
     def _bifurcations(self, here: Step, last: Step, halves_left: int) -> Passed:
         """The bifurcations between two points, by the tests that change their signs.
@@ -321,7 +320,7 @@ class MotionTable:
         """The place between two points close to each other where several multipliers cross the unit
         circle together."""
         outside = _outside(here)
-        at = self._where(here, last, lambda step: 1.0 if _outside(step) == outside else -1.0)
+        at = self.where(here, last, lambda step: 1.0 if _outside(step) == outside else -1.0)
         if at is None:
             return []
         if float(here.tangent[-1]) * float(last.tangent[-1]) < 0:  # other branches cross as well
@@ -334,7 +333,7 @@ class MotionTable:
     def _bifurcation(self, kind: str, here: Step, last: Step) -> Passed:
         """The bifurcation between two points of which a test has changed its sign; none if that is
         a pole, or rounding."""
-        at = self._where(here, last, lambda step: tests_of(step)[kind])
+        at = self.where(here, last, lambda step: tests_of(step)[kind])
         if at is None:
             return []
         held = bool(self.problem.conditions)

@@ -302,82 +302,82 @@ _SHARE, _TIMES = 0.99, 4
 _MEETS, _PAST = 1e-5, (1e-7, 1e-6, 1e-5, 1e-4, 1e-3)
 
 
-class Sequence:
-    """The rows of a table for motions that rest.
+def sequence_rows(
+    problem: Shooting, here: Step, scale: np.ndarray, named: Callable[[str, Step, str], Ending]
+) -> list[Event]:
+    """The rows of a table for motions that rest: where the number of rests changes, and where an
+    impact outside of a chatter is gained or lost by a graze.
 
     **Arguments:** the equations; the point from which a step is made; the size of each unknown;
     what makes an ending of a kind, a place and what is said of it.
     """
 
-    def __init__(
-        self, problem: Shooting, here: Step, scale: np.ndarray,
-        named: Callable[[str, Step, str], Ending],
-    ):  # fmt: skip
-        self.problem, self.here, self.scale, self.named = problem, here, scale, named
-
-    def rows(self) -> list[Event]:
-        """Where the number of rests changes, and where an impact outside of a chatter is gained or
-        lost by a graze."""
-        rests = Event(self._same(_rests), self._rest, self._at_rest)
-        return [rests, Event(self._same(_groups), self._graze, lambda here, last: last)]
-
-    def _same(self, number: Callable[[Step], object]) -> Callable[[Step], float]:
-        """1 for motions with as many rests or impacts as the first one, else -1.
-
-        Where there is no motion at all has another number: beyond a rest that is lost the hops of a
-        chatter end one by one in grazings.
-        """
-        wanted = number(self.here)
-        return lambda step: 1.0 if bool(step.good) and number(step) == wanted else -1.0
-
-    def _at_rest(self, here: Step, last: Step) -> Step | None:
-        found = self._changed(here, last, _rests)
-        return None if found is None else found[0]
-
-    def _rest(self, at: Step) -> Ending:
-        beyond = advance(self.problem, at.x, at.tangent, self.scale, _BEYOND)
-        gained = bool(beyond.good) and _rests(beyond) > _rests(self.here)
-        what = f"a rest on a stop is {'gained' if gained else 'lost'}"
-        return self.named(REST, refined_rest(self.problem, at, self.scale), what)
-
-    def _graze(self, last: Step) -> Ending | None:
-        """The first of the places up to a point at which the groups of impacts change by a graze;
-        a shorter step is asked for where a motion would have to be looked for within it."""
-        here = self.here
-        for _ in range(_PLACES):
-            if _groups(here) == _groups(last):
-                return None
-            found = self._changed(here, last, _groups)
-            if found is None:
-                return None
-            before, (at, here) = here, found
-            touch = touched_beside(self.problem, at, self.scale)
-            if touch is not None:
-                return self.named(GRAZING, touch, BETWEEN_RESTS)
-            turned = min(way(before, at, self.scale), way(at, last, self.scale)) < 0
-            if not bool(here.good) or turned:
-                # There is none on the way there: the branch turns, and `last` is of another one.
-                return Ending(self.here, SHORTER)
-        return None
-
-    def _changed(
-        self, here: Step, last: Step, number: Callable[[Step], object]
-    ) -> tuple[Step, Step] | None:
-        """The last point between two with as many rests or impacts as the first one, and one beyond
-        it."""
-        problem, scale, same = self.problem, self.scale, Sequence(
-            self.problem, here, self.scale, self.named
-        )._same(number)  # fmt: skip
-        # A test that jumps is met short of its place by a share of the step: the second step is a
-        # short one.
-        at = located(problem, here, last, scale, same)
-        if at is None:
+    def rest(last: Step) -> Ending | None:
+        found = _changed(problem, here, last, scale, _rests)
+        if found is None:
             return None
-        left = way(at, last, scale)
-        beyond = last if left < _BEYOND else advance(problem, at.x, at.tangent, scale, _BEYOND)
-        if np.linalg.norm((beyond.x - at.x) / scale) > 2 * _BEYOND:
-            beyond = beyond._replace(good=np.asarray(False))  # it is of another branch
-        return located(problem, at, beyond, scale, same) or at, beyond
+        what = f"a rest on a stop is {'gained' if _rests(last) > _rests(here) else 'lost'}"
+        return named(REST, refined_rest(problem, found[0], scale), what)
+
+    def graze(last: Step) -> Ending | None:
+        return _grazed(problem, here, last, scale, named)
+
+    # The endings look for the place themselves: a count jumps, and may do so several times.
+    whole = lambda here, last: last
+    rows = (_rests, rest), (_groups, graze)
+    return [Event(_same(here, number), ending, whole) for number, ending in rows]
+
+
+def _same(here: Step, number: Callable[[Step], object]) -> Callable[[Step], float]:
+    """1 for motions with as many rests or impacts as the first one, else -1.
+
+    Where there is no motion at all has another number: beyond a rest that is lost the hops of a
+    chatter end one by one in grazings.
+    """
+    wanted = number(here)
+    return lambda step: 1.0 if bool(step.good) and number(step) == wanted else -1.0
+
+
+def _grazed(
+    problem: Shooting, begin: Step, last: Step, scale: np.ndarray,
+    named: Callable[[str, Step, str], Ending],
+) -> Ending | None:  # fmt: skip
+    """The first of the places between two points at which the groups of impacts change by a graze;
+    a shorter step is asked for where a motion would have to be looked for within it."""
+    here = begin
+    for _ in range(_PLACES):
+        if _groups(here) == _groups(last):
+            return None
+        found = _changed(problem, here, last, scale, _groups)
+        if found is None:
+            return None
+        before, (at, here) = here, found
+        touch = touched_beside(problem, at, scale)
+        if touch is not None:
+            return named(GRAZING, touch, BETWEEN_RESTS)
+        turned = min(way(before, at, scale), way(at, last, scale)) < 0
+        if not bool(here.good) or turned:
+            # There is none on the way there: the branch turns, and `last` is of another one.
+            return Ending(begin, SHORTER)
+    return None
+
+
+def _changed(
+    problem: Shooting, here: Step, last: Step, scale: np.ndarray, number: Callable[[Step], object]
+) -> tuple[Step, Step] | None:
+    """The last point between two with as many rests or impacts as the first one, and one beyond
+    it."""
+    same = _same(here, number)
+    # A test that jumps is met short of its place by a share of the step: the second step is a short
+    # one.
+    at = located(problem, here, last, scale, same)
+    if at is None:
+        return None
+    left = way(at, last, scale)
+    beyond = last if left < _BEYOND else advance(problem, at.x, at.tangent, scale, _BEYOND)
+    if np.linalg.norm((beyond.x - at.x) / scale) > 2 * _BEYOND:
+        beyond = beyond._replace(good=np.asarray(False))  # it is of another branch
+    return located(problem, at, beyond, scale, same) or at, beyond
 
 
 def _rests(step: Step) -> int:

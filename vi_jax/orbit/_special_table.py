@@ -28,7 +28,7 @@ from .._programs import compiled
 from ._closing import Closing
 from ._conditions import Special, alone
 from ._corrector import Step, advance, apart_from_image, jacobian_at, way
-from ._follow import SAME_CURVE, STALLED, Ending, Event, bounds_of
+from ._follow import SAME_CURVE, Ending, Event, Table, bounds_of
 from ._local_map import graze_at
 from ._locate import BESIDE, MOST, between, crossing
 from ._motion_table import room
@@ -74,7 +74,7 @@ _PERIODS = 3
 Intervals = tuple[tuple[float, float], tuple[float, float]]
 
 
-class SpecialTable:
+class SpecialTable(Table):
     """What can happen on a curve of special motions, for each of its steps (see `_follow.Table`).
 
     **Arguments:** the equations of the motions, with two parameters as their last unknowns; the
@@ -82,29 +82,13 @@ class SpecialTable:
     """
 
     def __init__(self, problem: Shooting, condition: Special, scale: np.ndarray, bounds: Intervals):
-        self.problem, self.condition, self.scale = problem, condition, scale
-        self.bounds = bounds
+        super().__init__(problem, scale, bounds)
+        self.condition = condition
         # Along a curve of symmetric motions the images are alike everywhere.
         self.symmetric = condition.kind != SYMMETRY and may_be_symmetric(
             problem, [problem.machine, *problem.corners(bounds)]
         )
         self.closing = Closing(self)
-
-    def advance(self, x, tangent, length) -> Step:
-        """The point at this length along the tangent."""
-        return advance(self.problem, x, tangent, self.scale, length)
-
-    def passed(self, here: Step, last: Step) -> list[tuple[SpecialPoint, Step]]:
-        """Nothing: points of codimension two are looked for on the finished curve."""
-        return []
-
-    def beyond(self, last: Step) -> Step | None:
-        """Nothing: these motions do not rest."""
-        return None
-
-    def begin(self, points: list[Step]) -> None:
-        """Take these points of the curve as those it came by."""
-        self.closing.begin(points)
 
     def stalled(self, steps: list[Step]) -> Ending:
         """How a curve ends that the corrector follows no further: perhaps where the motion becomes
@@ -115,8 +99,8 @@ class SpecialTable:
                 root = way(here, last, self.scale)
                 if root > MOST * BESIDE:
                     at = self._symmetric(here, root, beyond=False)
-                    return Ending(last, STALLED) if at is None else Ending(at, SYMMETRY)
-        return Ending(last, STALLED)
+                    return super().stalled(steps) if at is None else Ending(at, SYMMETRY)
+        return super().stalled(steps)
 
     def ends(self, here: Step, new: Step) -> list[Event]:
         """The rows for a step between two points."""
