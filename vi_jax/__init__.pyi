@@ -67,13 +67,12 @@ from .orbit import AbstractRootFinder as AbstractRootFinder
 from .orbit import Boundary as Boundary
 from .orbit import Branch as Branch
 from .orbit import ClosedFormOrbits as ClosedFormOrbits
-from .orbit import CodimensionTwo as CodimensionTwo
 from .orbit import CycleMap as CycleMap
 from .orbit import Gradient as Gradient
 from .orbit import Grazing as Grazing
 from .orbit import Newton as Newton
 from .orbit import Orbit as Orbit
-from .orbit import SpecialPoint as SpecialPoint
+from .orbit import Point as Point
 from .orbit import boundary as boundary
 from .orbit import closed_form_orbits as closed_form_orbits
 from .orbit import continue_orbit as continue_orbit

@@ -15,7 +15,7 @@ from vi_jax.machine import Parameters, Scene
 from vi_jax.orbit import (
     Boundary,
     Branch,
-    SpecialPoint,
+    Point,
     boundary,
     closed_form_orbits,
     continue_orbit,
@@ -125,12 +125,12 @@ def _branch(cycles: int, k: float, known: Sequence[Branch]) -> Branch:
     return continue_orbit(orbit, parameter=RATIO, bounds=RANGE, max_step=MAX_STEP)
 
 
-def _special(branch: Branch, kind: str) -> SpecialPoint:
+def _special(branch: Branch, kind: str) -> Point:
     """The first special point of a kind, by ζ."""
     return min((p for p in branch.special if p.kind == kind), key=lambda p: p.parameter)
 
 
-def _follow(point: SpecialPoint, parameter: str) -> Boundary:
+def _follow(point: Point, parameter: str) -> Boundary:
     other = K_RANGE if parameter == K else (0.0, C_RANGE[1] * xi_per_c())
     return boundary(point, parameter=parameter, bounds=(RANGE, other), max_step=0.03)
 

@@ -157,7 +157,7 @@ def follow(orbit: vi.Orbit, max_step: float) -> vi.Branch:
     return found
 
 
-def of(branch: vi.Branch, kind: str) -> list[vi.SpecialPoint]:
+def of(branch: vi.Branch, kind: str) -> list[vi.Point]:
     """Return the special points of a kind, by ζ."""
     return sorted((p for p in branch.special if p.kind == kind), key=lambda p: p.parameter)
 

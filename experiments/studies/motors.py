@@ -113,7 +113,7 @@ for key, impacts in [(key, n) for n in (1, 0) for key in HIGHEST if n == 0 or ke
     say(f"T0 = {key[0]:g} N·m, gap {key[1]:g} m: {branches[key, impacts]}")
 
 
-def special(key: Key, way: str) -> vi.SpecialPoint:
+def special(key: Key, way: str) -> vi.Point:
     """Return where the continued branches end or turn, so that a sweep must jump."""
     up = way == WAYS[0]
     points = branches[key, 1 if up and key[1] == NEAR else 0].special

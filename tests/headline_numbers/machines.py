@@ -60,7 +60,7 @@ def relief_valve() -> Expected:
         jacobian = [[0, 1, 0], [-1, -1.25, 1], [-20 * root, 0, -10 * lift / root]]
         return float(np.linalg.eigvals(np.array(jacobian)).real.max())
 
-    def special(rate: float, bounds: tuple[float, float]) -> vi.SpecialPoint:
+    def special(rate: float, bounds: tuple[float, float]) -> vi.Point:
         valve = vi.machines.ReliefValve(flow_rate=rate)
         settled = vi.simulate(valve, valve.start(), 1, settle=400).last
         branch = vi.continue_orbit(

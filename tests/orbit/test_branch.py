@@ -1,6 +1,7 @@
 """Branches, what happens on them, and boundaries, beside closed forms and found orbits."""
 
 import dataclasses
+import pickle
 import re
 
 import jax
@@ -251,6 +252,17 @@ def test_a_branch_in_files(short, tmp_path):
     table.to_csv(tmp_path / "branch.csv")
     again = pd.read_csv(tmp_path / "branch.csv", index_col="point", float_precision="round_trip")
     pd.testing.assert_frame_equal(table, again, check_dtype=False, check_exact=True)
+
+
+def test_a_restored_branch_goes_on(short):
+    """Its special points are told by their number, also in reversed copies."""
+    again = pickle.loads(pickle.dumps(short))
+    turned = dataclasses.replace(again, steps=again.steps[::-1], ends=again.ends[::-1])
+    np.testing.assert_array_equal(turned.multipliers[::-1], short.multipliers)
+    for point in again.special:
+        assert again.parameter[point.index] == point.parameter
+    orbit, same = (the(branch, "period-doubling").switch() for branch in (short, again))
+    np.testing.assert_array_equal(orbit.impact_speed, same.impact_speed)
 
 
 @pytest.mark.parametrize(

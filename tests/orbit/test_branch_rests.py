@@ -95,7 +95,7 @@ def test_a_branch_says_that_its_motions_rest(branch):
     drawn, *_ = vi.plot_branch(branch).get_legend().get_texts()
     assert drawn.get_text() == "2π, rest on a stop"
     (lost,) = branch.special  # from which nothing goes on
-    with pytest.raises(ValueError, match="this special point is a rest"):
+    with pytest.raises(ValueError, match="at a rest of a branch"):
         lost.switch()
     with pytest.raises(ValueError, match=r"but is a rest\. Such a point is found value by value"):
         vi.boundary(lost, parameter="stops.0.gap", bounds=((0.6, 0.8), (0.2, 0.4)))

@@ -39,8 +39,8 @@ def test_branch_changes_its_line_where_it_changes_stability(branch):
 
 def test_branch_names_its_marks_and_begins_its_legend_solid(branch):
     for turn in (slice(None), slice(None, None, -1)):  # begins stable, begins unstable
-        rows = {name: getattr(branch, name)[turn] for name in ("parameter", "y_min", "multipliers")}
-        ax = vi.plot_branch(dataclasses.replace(branch, **rows), ax=_axes(), label="2π")
+        turned = dataclasses.replace(branch, steps=branch.steps[turn])
+        ax = vi.plot_branch(turned, ax=_axes(), label="2π")
         legend = ax.get_legend()
         named = [t.get_text() for t in legend.get_texts()]
         handles = dict(zip(named, legend.legend_handles, strict=True))
@@ -59,9 +59,12 @@ def test_branch_names_its_marks_and_begins_its_legend_solid(branch):
 
 def test_a_branch_along_which_nothing_moves_is_drawn_by_its_least_position(branch):
     """By rounding alone the other extreme varies, and a sweep would be drawn by another one."""
-    still = np.full_like(branch.y_min, -1.3)
-    noisy = np.where(np.arange(len(still)) % 2, 1.3, 1.3 + 1e-15)
-    drawn = vi.plot_branch(dataclasses.replace(branch, y_min=still, y_max=noisy), ax=_axes())
+    noisy = [{"y_min": -1.3, "y_max": 1.3 + i % 2 * 1e-15} for i in range(len(branch.steps))]
+    steps = [
+        step._replace(seen=step.seen._replace(**at))
+        for step, at in zip(branch.steps, noisy, strict=True)
+    ]
+    drawn = vi.plot_branch(dataclasses.replace(branch, steps=steps), ax=_axes())
     assert drawn.get_ylabel() == "min Y (a)"
 
 

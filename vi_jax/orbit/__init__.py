@@ -1,7 +1,6 @@
 """Periodic motion: the cycle map, closed-form solutions, finding orbits and judging them."""
 
 from ._beside_grazing import Motions as Motions
-from ._boundary import Boundary as Boundary
 from ._boundary import boundary as boundary
 from ._continue_orbit import continue_orbit as continue_orbit
 from ._cycle_map import CycleMap as CycleMap
@@ -9,12 +8,12 @@ from ._cycle_map import adopted as adopted
 from ._cycle_map import cycle_map as cycle_map
 from ._follow import check_walk as check_walk
 from ._forecast import SCENARIOS as SCENARIOS
-from .branch import Branch as Branch
-from .branch import branch_hits_in_words as branch_hits_in_words
-from .branch import column_names as column_names
-from .branch import point_of as point_of
 from .closed_form import ClosedFormOrbits as ClosedFormOrbits
 from .closed_form import closed_form_orbits as closed_form_orbits
+from .curve import Boundary as Boundary
+from .curve import Branch as Branch
+from .curve import branch_hits_in_words as branch_hits_in_words
+from .curve import column_names as column_names
 from .distinct import Orbits as Orbits
 from .distinct import distance as distance
 from .distinct import distinct_among as distinct_among
@@ -35,5 +34,4 @@ from .results import trimmed as trimmed
 from .root_finders import AbstractRootFinder as AbstractRootFinder
 from .root_finders import Gradient as Gradient
 from .root_finders import Newton as Newton
-from .special import CodimensionTwo as CodimensionTwo
-from .special import SpecialPoint as SpecialPoint
+from .special import Point as Point

@@ -13,13 +13,12 @@ from ..flow import MethodLike
 from ..machine import check_leaf, leaf
 from ._conditions import as_held, names_of, rates_at
 from ._corrector import Step, advance, tangent_at
-from ._follow import Followed, both_ways, check_walk, rescaled
+from ._follow import both_ways, check_walk, rescaled
 from ._motion_table import MotionTable
-from ._observed import Observed
 from ._problem import check_parameter, problem_of, sized, steps_of
 from ._rest import section_map_of
 from ._shooting import Shooting
-from .branch import Branch
+from .curve import Branch
 from .floquet import NEUTRAL
 from .results import ORBIT_RESULTS, Orbit, lies_on_a_stop
 
@@ -110,7 +109,7 @@ def continue_orbit(
     return both_ways(
         lambda: MotionTable(problem, scale, ranges, sought, watched),
         start,
-        lambda found: _branch(found, parameter),
+        Branch,
         what="branch", progress=progress, settings=settings,
     )  # fmt: skip
 
@@ -246,45 +245,3 @@ def _refined(
     """The solution in the plane across a tangent at `x`, and how far (scaled) it is from there."""
     start = advance(problem, x, tangent, scale, 0.0)
     return start, float(np.max(np.abs(start.x - x) / scale)) if bool(start.good) else np.inf
-
-
-def _branch(found: Followed, name: str) -> Branch:
-    """The branch as arrays, from its points.
-
-    **Arguments:** what was followed; `name`, the parameter's.
-    """
-    problem, steps = found.problem, found.steps
-    xs = np.stack([step.x for step in steps])
-    impacts = np.asarray(problem.impacts, int)
-
-    def column(get: Callable[[Observed], Any]) -> np.ndarray:
-        return np.stack([np.asarray(get(step.seen)) for step in steps])
-
-    duration = column(lambda seen: seen.duration)
-    ratio = problem.machine.frequency_ratio(jnp.asarray(duration / problem.cycles))
-    numbers = dict(zip(problem.parameters, xs[:, -len(problem.parameters) :].T, strict=True))
-    if ratio is not None:
-        ratio = numbers.get("drive.frequency_ratio", ratio)
-    return Branch(
-        name=name,
-        parameter=xs[:, -1],
-        y_min=column(lambda seen: seen.y_min),
-        y_max=column(lambda seen: seen.y_max),
-        multipliers=column(lambda seen: seen.multipliers),
-        impact_phase=xs[:, impacts],
-        impact_speed=column(lambda seen: np.asarray(seen.approach)[impacts]),
-        clearance=column(lambda seen: seen.nearest.room),
-        frequency_ratio=np.full(len(xs), np.nan) if ratio is None else np.asarray(ratio),
-        duration=duration,
-        averages={
-            name: column(lambda seen, name=name: seen.averages[name])
-            for name in steps[0].seen.averages
-        },
-        cycles=problem.cycles,
-        special=found.special,
-        ends=found.ends,
-        problem=problem,
-        steps=steps,
-        scale=found.scale,
-        free={each: values for each, values in numbers.items() if each != name},
-    )

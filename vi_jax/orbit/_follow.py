@@ -6,6 +6,7 @@ lies beyond that place is no longer the curve, and does not count.
 """
 
 import abc
+import dataclasses
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -18,7 +19,7 @@ from ._corrector import Step, advance, off_by, way
 from ._locate import located
 from ._problem import finer, grown, sized_by_motion
 from ._shooting import Shooting
-from .special import SpecialPoint
+from .special import Point
 
 # Reasons to end that a curve has of itself: Ctrl-C was pressed, or the corrector has no answer.
 INTERRUPTED, STALLED, CLOSED, BOUNDS = "interrupted", "stalled", "closed", "bounds"
@@ -61,7 +62,7 @@ class Ending(NamedTuple):
 
     last: Step
     reason: str
-    point: SpecialPoint | None = None
+    point: Point | None = None
     """The special point that it ends at, if it is one."""
     until: Step | None = None
     """Up to where other things on the curve can be told, if not up to `last`."""
@@ -105,7 +106,7 @@ class Table(abc.ABC):
         """The point between two at which a test is zero."""
         return located(self.problem, here, new, self.scale, test)
 
-    def passed(self, here: Step, last: Step) -> list[tuple[SpecialPoint, Step]]:
+    def passed(self, here: Step, last: Step) -> list[tuple[Point, Step]]:
         """What happens between two points without ending the curve, in its order."""
         return []
 
@@ -116,18 +117,6 @@ class Table(abc.ABC):
     def stalled(self, steps: list[Step]) -> Ending:
         """How a curve ends that the corrector follows no further."""
         return Ending(steps[-1], STALLED)
-
-
-class Followed(NamedTuple):
-    """A curve from end to end."""
-
-    problem: Shooting
-    """Its equations, with as many steps as were needed anywhere."""
-    steps: list[Step]
-    scale: np.ndarray
-    """The size of each unknown, for the tangents of the steps."""
-    special: list[SpecialPoint]
-    ends: tuple[str, str]
 
 
 def check_walk(*, step: object, max_step: object, max_points: object) -> dict[str, Any]:
@@ -142,7 +131,7 @@ def check_walk(*, step: object, max_step: object, max_points: object) -> dict[st
 def both_ways(
     table: Callable[[], Table],
     start: Step,
-    result: Callable[[Followed], Any],
+    result: Callable[..., Any],
     *,
     what: str,
     progress: bool,
@@ -150,8 +139,9 @@ def both_ways(
 ) -> Any:
     """The curve through a point, followed ahead and back.
 
-    **Arguments:** a new table for each way; the point; what makes the result of what was followed;
-    what the curve is called; whether a bar is shown; the settings of the walk.
+    **Arguments:** a new table for each way; the point; what makes the result, of the fields of a
+    `Curve` and its `special` points; what the curve is called; whether a bar is shown; the settings
+    of the walk.
 
     **Raises:** on Ctrl-C `Interrupted`, with the result so far.
     """
@@ -160,11 +150,16 @@ def both_ways(
     def found() -> Any:
         problem = max(back.table.problem, ahead.table.problem, key=lambda p: p.steps)
         scale = np.maximum(back.table.scale, ahead.table.scale)
-        paths = (rescaled(walk.path(), walk.table.scale, scale) for walk in (back, ahead))
-        behind, before = paths
-        special = [*reversed(back.special), *ahead.special]
-        steps = [*reversed(behind[1:]), *before]
-        return result(Followed(problem, steps, scale, special, (back.end, ahead.end)))
+        behind, before = (rescaled(w.steps, w.table.scale, scale) for w in (back, ahead))
+        first = len(behind) - 1
+        special = [
+            *(dataclasses.replace(p, index=first - p.index) for p in reversed(back.special)),
+            *(dataclasses.replace(p, index=first + p.index) for p in ahead.special),
+        ]
+        return result(
+            problem=problem, steps=[*reversed(behind[1:]), *before], scale=scale,
+            ends=(back.end, ahead.end), special=special,
+        )  # fmt: skip
 
     def kept() -> Interrupted:
         return Interrupted(f"walk along the {what}", found())
@@ -180,13 +175,8 @@ class _Walk:
 
     def __init__(self, table: Table, start: Step):
         self.table, self.steps, self.end = table, [start], INTERRUPTED
-        self.special: list[SpecialPoint] = []
-        self._within: dict[int, list[Step]] = {}
+        self.special: list[Point] = []
         self._vain, self._worst = 0.0, (0.0, 0.0)  # how far off the states are, and where
-
-    def path(self) -> list[Step]:
-        """The points, with what was located between them."""
-        return [step for new in self.steps for step in [*self._within.get(id(new), ()), new]]
 
     def follow(self, tell: Tell, *, step: float, max_step: float, max_points: int) -> str:
         """Walk on, in the sense of the first point's tangent; why it ended.
@@ -194,8 +184,8 @@ class _Walk:
         **Arguments:** `tell`, told of each point; `step` and `max_step`, the first and the longest
         step length; `max_points`, the most points.
         """
-        length, failed, steady, end = step, 0, 0, "max_points"
-        while len(self.steps) < max_points:
+        length, failed, steady, end, points = step, 0, 0, "max_points", 1
+        while points < max_points:
             here = self.steps[-1]
             new = self.table.advance(here.x, here.tangent, length)
             turn = float(np.dot(np.asarray(new.tangent), np.asarray(here.tangent)))
@@ -203,7 +193,7 @@ class _Walk:
             if good and self._made_finer(new):
                 length, failed, steady = step, 0, 0
                 continue
-            ending = self._looked(here, new) if good else Ending(here, SHORTER)
+            ending = self._first(here, new) if good else Ending(here, SHORTER)
             if ending is not None and ending.reason == SHORTER:
                 # The further off a solution is, the longer each trial takes.
                 length, failed, steady = length * (0.4 if failed < 2 else 0.1), failed + 1, _STEADY
@@ -212,18 +202,21 @@ class _Walk:
                 beyond = self.table.beyond(here)
                 if beyond is not None:
                     self.steps.append(beyond)
-                    length, failed, steady = step, 0, 0
+                    length, failed, steady, points = step, 0, 0, points + 1
                     continue
                 ending = self._stalled(here)
+            elif ending is None or ending.last is not here:
+                last = new if ending is None else ending.until or ending.last
+                for point, at in self.table.passed(here, last):
+                    self._note(at, point)
             if ending is not None:
-                if ending.last is not here:
-                    self.steps.append(ending.last)
+                self._note(None if ending.last is here else ending.last, ending.point)
                 end = ending.reason
                 break
-            self.steps.append(new)
+            self._note(new)
             self._resize(new)
             tell(1)
-            failed, steady = 0, max(0, steady - 1)
+            failed, steady, points = 0, max(0, steady - 1), points + 1
             if turn > 0.99 and int(new.iterations) <= 6 and not steady:
                 length = min(1.4 * length, max_step)
             elif turn < 0.97:
@@ -231,20 +224,11 @@ class _Walk:
         self._warn()
         return end
 
-    def _looked(self, here: Step, new: Step) -> Ending | None:
-        """The end of the curve between two points, if it has one; what happens up to there, or up
-        to the second point, is noted."""
-        ending = self._first(here, new)
-        if ending is not None and ending.reason == SHORTER:
-            return ending
-        last = new if ending is None else ending.last
-        until = last if ending is None or ending.until is None else ending.until
-        found = [] if last is here else self.table.passed(here, until)
-        self._within[id(last)] = [step for _, step in found]
-        self.special += [point for point, _ in found]
-        if ending is not None and ending.point is not None:
-            self.special.append(ending.point)
-        return ending
+    def _note(self, step: Step | None, point: Point | None = None) -> None:
+        """Add a point of the curve, and what is special there, if it is."""
+        self.steps += [] if step is None else [step]
+        if point is not None:
+            self.special.append(dataclasses.replace(point, index=len(self.steps) - 1))
 
     def _first(self, here: Step, new: Step) -> Ending | None:
         """The first of the rows that happen between two points.
@@ -293,10 +277,7 @@ class _Walk:
                     at = advance(table.problem, last.x, axes[i], table.scale, length)
                     if bool(at.good):
                         return Ending(at, BOUNDS)
-        ending = table.stalled(self.steps)
-        if ending.point is not None:
-            self.special.append(ending.point)
-        return ending
+        return table.stalled(self.steps)
 
     def _made_finer(self, new: Step) -> bool:
         """Whether the flights get more steps from here on, where only the motion tells how many
@@ -322,14 +303,8 @@ class _Walk:
             return
         table.problem = larger
         table.scale = larger.scale(before[-len(larger.parameters) :])
-        steps = rescaled(self.steps, before, table.scale)
-        self._within = {
-            id(again): rescaled(self._within[id(step)], before, table.scale)
-            for step, again in zip(self.steps, steps, strict=True)
-            if id(step) in self._within
-        }
-        self.steps = steps
-        table.closing.begin(steps[:-1])
+        self.steps = rescaled(self.steps, before, table.scale)
+        table.closing.begin(self.steps[:-1])
 
     def _warn(self) -> None:
         off, value = self._worst

@@ -26,7 +26,7 @@ from ._shooting import Shooting
 from ._surgery import of_least_period, without_events
 from ._turns import rooms_of
 from ._words import one
-from .special import SpecialPoint
+from .special import Point
 
 # A field that differs by less than this (relative to its own size) is continuous where a switch is
 # touched: a choice.
@@ -365,7 +365,7 @@ class Graze(NamedTuple):
     section: Section
 
 
-def graze_at(point: SpecialPoint) -> Graze:
+def graze_at(point: Point) -> Graze:
     """The local map of a special point that is a grazing.
 
     **Raises:** `ValueError` if nothing is touched there, if what is touched is no stop or switch,
@@ -404,7 +404,7 @@ def graze_at(point: SpecialPoint) -> Graze:
     return Graze(problem, x, touches, local, _section(problem, x, along, touches[0]))
 
 
-def _without_touch(point: SpecialPoint) -> tuple[Shooting, np.ndarray, int, float]:
+def _without_touch(point: Point) -> tuple[Shooting, np.ndarray, int, float]:
     """Equations and solution of the motion that grazes, without the impact that does; the event's
     number and the clock of the touch."""
     if point.kind != "grazing" or not point.touches:

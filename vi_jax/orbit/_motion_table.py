@@ -62,7 +62,7 @@ from ._words import (
 )
 from .floquet import NEUTRAL
 from .results import Orbit
-from .special import SpecialPoint
+from .special import Point, point_at
 
 # These thresholds are choices; where one was measured, the comment gives the figure.
 # What lies before the place where a branch springs is looked for on so much of the way there.
@@ -98,7 +98,7 @@ _HALVES = 17
 # it has a pole or jumps.
 _ZERO = 1e-6
 
-Passed = list[tuple[SpecialPoint, Step]]
+Passed = list[tuple[Point, Step]]
 
 
 class MotionTable(Table):
@@ -118,7 +118,7 @@ class MotionTable(Table):
         self.symmetric = may_be_symmetric(problem, [problem.machine, *problem.corners(bounds)])
         self.closing = Closing(self)
         self.size, self.duration = None, None
-        self._known: tuple[Any, dict[str, float]] = None, {}
+        self._known: tuple[Any, dict[str, float]] = np.zeros(0), {}
 
     def advance(self, x, tangent, length) -> Step:
         """The point at this length along the tangent."""
@@ -162,12 +162,8 @@ class MotionTable(Table):
         """The point at this share of the way between two."""
         return self.advance(here.x, here.tangent, share * way(here, last, self.scale))
 
-    def _point(self, kind: str, step: Step, detail: str, impact: int | None = None) -> SpecialPoint:
-        problem, step, scale = alone(self.problem, step, self.scale)
-        orbit = orbit_of(problem, step)
-        return SpecialPoint(
-            kind, float(step.x[-1]), orbit, detail, problem, step, scale, impact
-        )  # fmt: skip
+    def _point(self, kind: str, step: Step, *args: Any, **more: Any) -> Point:
+        return point_at(self.problem, step, self.scale, kind, *args, **more)
 
     def _named(self, kind: str, at: Step, detail: str, impact: int | None = None) -> Ending:
         """The end of a branch at a special point."""
@@ -249,17 +245,16 @@ class MotionTable(Table):
             along = lambda step, begin=begin, apart=apart: float(np.dot(begin, apart(step)))
             yield Event(along, ending)
 
-    def _sprung(self, at: Step) -> tuple[Step, SpecialPoint]:
+    def _sprung(self, at: Step) -> tuple[Step, Point]:
         """Where the branch springs from a motion of half its period: as a step of the branch, and
         as a special point of that motion."""
         begins, half, step = origin(*alone(self.problem, at, self.scale))
         at = at if self.problem.conditions else begins
         detail = "the branch springs from a motion of half the period"
         scale = half.scale(self.scale[-1])
-        return at, SpecialPoint(
-            DOUBLING, float(step.x[-1]), orbit_of(half, step), detail, half, step, scale,
-            springs=True,
-        )  # fmt: skip
+        point = point_at(half, step, scale, DOUBLING, detail, springs=True)
+        further = np.asarray(at.x)[-2 : -len(self.problem.parameters) - 1 : -1]
+        return at, dataclasses.replace(point, parameters=np.append(point.parameters, further))
 
     def passed(self, here: Step, last: Step) -> Passed:
         """The bifurcations between two points, the extremes and the zeros of what is watched, in
@@ -267,22 +262,20 @@ class MotionTable(Table):
         found = self._bifurcations(here, last, _HALVES)
         where = partial(self.where, here, last)
         for at, name, detail in self.extrema.between(self, here, last, where):
-            point = self._point(EXTREMUM, at, detail)
-            found.append((dataclasses.replace(point, quantity=name), at))
+            found.append((self._point(EXTREMUM, at, detail, quantity=name), at))
         found += self._zeros(here, last)
         return sorted(found, key=lambda f: way(here, f[1], self.scale))
 
-    def _zeros(self, here: Step, last: Step) -> Iterator[tuple[SpecialPoint, Step]]:
+    def _zeros(self, here: Step, last: Step) -> Iterator[tuple[Point, Step]]:
         """Where the functions that are watched pass zero."""
         known, before = self._known
-        before = before if known is here.seen else self._values(here)
-        self._known = last.seen, self._values(last)
+        before = before if np.array_equal(known, here.x) else self._values(here)
+        self._known = last.x, self._values(last)
         for name, after in self._known[1].items():
             value = lambda step, name=name: self._values(step)[name]
             at = self.where(here, last, value) if before[name] * after < 0 else None
             if at is not None and abs(value(at)) <= _ZERO * max(abs(before[name]), abs(after)):
-                point = self._point(WATCHED, at, f"{name} passes zero")
-                yield dataclasses.replace(point, quantity=name), at
+                yield self._point(WATCHED, at, f"{name} passes zero", quantity=name), at
 
     def _values(self, step: Step) -> dict[str, float]:
         """The numbers that are watched, at a point."""
@@ -500,7 +493,7 @@ class Extrema:
 
     def __init__(self, names: tuple[str, ...]):
         self.names = names
-        self._known: dict[int, tuple[Step, dict[str, float], dict[str, float]]] = {}
+        self._known: tuple[Any, Any] = np.zeros(0), ()
 
     def between(
         self, curve: Table, here: Step, last: Step, where: Callable[[Test], Step | None]
@@ -511,9 +504,10 @@ class Extrema:
         """
         if not self.names:
             return []
-        self._known = {id(here): self._known[id(here)]} if id(here) in self._known else {}
-        values, before = self._at(curve, here)
+        known, there = self._known
+        values, before = there if np.array_equal(known, here.x) else self._at(curve, here)
         others, after = self._at(curve, last)
+        self._known = last.x, (others, after)
         found = []
         for name in self.names:
             least = _CHANGES * max(abs(values[name]), abs(others[name]))
@@ -536,12 +530,9 @@ class Extrema:
 
     def _at(self, curve: Table, step: Step) -> tuple[dict[str, float], dict[str, float]]:
         """The numbers at a point, and how they change along the branch."""
-        if id(step) not in self._known:
-            direction = jnp.asarray(step.tangent * curve.scale)
-            values, rates = rates_at(curve.problem, self.names, jnp.asarray(step.x), direction)
-            # The step is kept, so that no other one gets its place in memory.
-            self._known[id(step)] = step, _as_floats(values), _as_floats(rates)
-        return self._known[id(step)][1:]
+        direction = jnp.asarray(step.tangent * curve.scale)
+        values, rates = rates_at(curve.problem, self.names, jnp.asarray(step.x), direction)
+        return _as_floats(values), _as_floats(rates)
 
 
 def _as_floats(numbers: dict) -> dict[str, float]:

@@ -17,7 +17,7 @@ import dataclasses
 import itertools
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +26,7 @@ import numpy as np
 from .._messages import so_many
 from .._programs import compiled
 from ._closing import Closing
-from ._conditions import Special, alone
+from ._conditions import Special
 from ._corrector import Step, advance, apart_from_image, jacobian_at, way
 from ._follow import SAME_CURVE, Ending, Event, Table, bounds_of
 from ._local_map import graze_at
@@ -34,7 +34,6 @@ from ._locate import BESIDE, MOST, between, crossing
 from ._motion_table import room
 from ._observed import ROUNDING
 from ._shooting import Shooting
-from ._solution import orbit_of
 from ._surgery import repeated
 from ._symmetry import ALIKE, ROUNDED, may_be_symmetric
 from ._words import (
@@ -54,9 +53,8 @@ from ._words import (
     SYMMETRY,
     TORUS,
     TOUCHING,
-    grazing_in_words,
 )
-from .special import CodimensionTwo, SpecialPoint, doubled
+from .special import Point, doubled, point_at
 
 # The thresholds here are choices.
 # A test that changes its sign without coming this near to zero (as a share of its neighbours) has a
@@ -199,23 +197,20 @@ Test = Callable[[Step, Vectors | None], tuple[float, Vectors | None]]
 def points_of(
     problem: Shooting, condition: Special, steps: list[Step], ends: tuple[str, str],
     scale: np.ndarray,
-) -> tuple[CodimensionTwo, ...]:  # fmt: skip
+) -> list[Point]:  # fmt: skip
     """The points of codimension two on a curve, in its order."""
 
-    def point(kind: str, step: Step, impact: int | None = None, more: str = "") -> CodimensionTwo:
-        grazes = kind == GRAZING
-        detail = grazing_in_words(problem, step, impact) if grazes else AT_CODIMENSION_TWO[kind]
-        return CodimensionTwo(
-            kind, np.asarray(step.x)[:-3:-1], orbit_of(problem, step), detail + more,
-            condition.kind, problem, step, scale, impact,
-        )  # fmt: skip
+    def point(kind: str, step: Step, more: str = "", **fields: Any) -> Point:
+        detail = None if kind == GRAZING else AT_CODIMENSION_TWO[kind] + more
+        return point_at(problem, step, scale, kind, detail, curve=condition.kind, **fields)
 
-    found: list[tuple[float, CodimensionTwo]] = []
+    found: list[tuple[float, Point]] = []
     for place, end in ((0, ends[0]), (len(steps) - 1, ends[1])):
         if end == GRAZING and condition.kind not in TOUCHING:
-            found.append((place, point(GRAZING, steps[place], _grazes(steps[place]))))
+            impact = _grazes(steps[place])
+            found.append((place, point(GRAZING, steps[place], impact=impact, index=place)))
         if end in (RESONANCE_1, RESONANCE_2, SYMMETRY):
-            found.append((place, point(end, steps[place])))
+            found.append((place, point(end, steps[place], index=place)))
     for kind, test in _tests_of(problem, condition, scale).items():
         for place, step in _zeros(problem, steps, scale, test):
             symmetric = kind == FOLD and condition.kind in TOUCHING and _symmetric(problem, step)
@@ -224,8 +219,8 @@ def points_of(
         with contextlib.suppress(ValueError):  # the local map is not known
             for place, step, n in _resonances(problem, condition, steps, scale):
                 more = f" of the motion with one impact in {so_many(n, 'period')}"
-                found.append((place, point(RESONANT, step, condition.impact, more)))
-    return tuple(point for _, point in sorted(found, key=lambda f: f[0]))
+                found.append((place, point(RESONANT, step, more, impact=condition.impact)))
+    return [point for _, point in sorted(found, key=lambda f: f[0])]
 
 
 def _symmetric(problem: Shooting, step: Step) -> bool:
@@ -255,13 +250,9 @@ def _resonances(
 
     **Raises:** `ValueError` where the local map is not known (see `grazing`).
     """
-    orbit = orbit_of(problem, steps[0])
 
     def entries(step: Step, number: int) -> np.ndarray:
-        one, there, sizes = alone(problem, step, scale)
-        point = SpecialPoint(
-            GRAZING, float(there.x[-1]), orbit, "", one, there, sizes, condition.impact
-        )
+        point = point_at(problem, step, scale, GRAZING, "", condition.impact)
         return graze_at(point).map.entries(number)
 
     found, known = [], [entries(step, _PERIODS) for step in steps]

@@ -24,7 +24,7 @@ from ._forecast import (
 )
 from ._local_map import Graze, graze_at
 from .results import complex_in_words
-from .special import SpecialPoint
+from .special import Point
 
 # Of the depth at which windows end, or of that which a touch of so much of a cycle has, the
 # greatest that is looked at; and values in each decade below it. Choices.
@@ -147,7 +147,7 @@ class Grazing(Summarized):
 
 
 def grazing(
-    point: SpecialPoint, *, check: bool = True, periods: int = 12, progress: bool = True
+    point: Point, *, check: bool = True, periods: int = 12, progress: bool = True
 ) -> Grazing:
     """Predict the attractor beyond a grazing of a branch from its local map.
 
@@ -172,7 +172,7 @@ def grazing(
     speed, or if the motion without the impact turns back there; on Ctrl-C while the machine is
     simulated `Interrupted`, whose `partial` is what `check=False` gives.
     """
-    instance_of("point", point, SpecialPoint, "a `SpecialPoint`, from `Branch.special`")
+    instance_of("point", point, Point, "a `Point`, from `Branch.special`")
     check, periods = flag("check", check), count("periods", periods, least=1)
     progress = flag("progress", progress)
     graze = graze_at(point)

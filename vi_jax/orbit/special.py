@@ -2,6 +2,8 @@
 
 import dataclasses
 from collections.abc import Callable
+from functools import cached_property
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -37,32 +39,59 @@ from .results import InWords, Orbit
 _TOUCHES = 1e-6
 
 
-@dataclasses.dataclass(frozen=True, repr=False)
-class SpecialPoint(InWords):
-    """A point of a branch at which something happens."""
+@dataclasses.dataclass(frozen=True, repr=False, eq=False)
+class Point(InWords):
+    """A special point: of a branch, or of codimension two on a `Boundary`."""
 
     kind: str
-    """"fold", "period-doubling", "neimark-sacker", "branch-point", "symmetry-breaking" (where
-    motions that are their own image under the symmetry of their machine meet some that are not),
-    "grazing", "hopf" (an autonomous machine's motion shrinks to rest), "rest" (a rest on a stop
-    is gained or lost), "crossing-sliding", "grazing-sliding", "switching-sliding" or
+    """On a branch "fold", "period-doubling", "neimark-sacker", "branch-point", "symmetry-breaking"
+    (where motions that are their own image under the symmetry of their machine meet some that are
+    not), "grazing", "hopf" (an autonomous machine's motion shrinks to rest), "rest" (a rest on a
+    stop is gained or lost), "crossing-sliding", "grazing-sliding", "switching-sliding" or
     "adding-sliding" (a part in which a switch is held on its surface, as by dry friction, vanishes
     or appears; see the `detail`), "extremum" (of a `quantity` that was asked for), "watched" (a
     `quantity` that is watched passes zero), or "turn" (the parameter turns back where others are
-    free; no multiplier need be 1)."""
-    parameter: float
-    orbit: Orbit
+    free; no multiplier need be 1).
+
+    On a boundary "cusp" (two curves of folds meet and end), "degenerate-doubling" or
+    "degenerate-symmetry-breaking" (the motions that begin there do so on the other side beyond),
+    "fold-flip" (multipliers 1 and -1), "resonance-1:1", "resonance-1:2" (a double multiplier 1 or
+    -1, where a curve of Neimark–Sacker points begins), "resonance-1:3", "resonance-1:4" (the angle
+    of a complex pair is 2π/3 or π/2), "grazing" (of a motion that is special by its multipliers);
+    on a curve of grazings "fold" or "period-doubling" (of the motion that grazes),
+    "resonant-grazing" (an entry eₙ of the local map vanishes, see `grazing`); "symmetry-breaking"
+    (the motions become symmetric, and the curve ends; of grazings of symmetric motions, where these
+    lose that)."""
+    parameters: np.ndarray
+    """Values of the curve's parameters, its own first."""
     detail: str
     """What happens there, in words."""
-    problem: Shooting = dataclasses.field(repr=False)
-    step: Step = dataclasses.field(repr=False)
-    scale: np.ndarray = dataclasses.field(repr=False)
+    problem: Shooting
+    """The equations of the motion in one parameter."""
+    step: Step
+    """Their solution."""
+    scale: np.ndarray
+    """The size of each unknown."""
     impact: int | None = None
     """The impact that grazes; `None` where the body touches a stop that it did not hit before."""
+    curve: str | None = None
+    """The kind of the boundary on which it lies; `None` on a branch."""
     springs: bool = False
     """Whether the branch springs here from a motion of half its period, which `orbit` is then."""
     quantity: str | None = None
     """Of an extremum, or a number that is watched, its name."""
+    index: int = -1
+    """Which of the curve's points it is; -1 if it lies between two of them."""
+
+    @property
+    def parameter(self) -> float:
+        """Value of the (first) parameter."""
+        return float(self.parameters[0])
+
+    @cached_property
+    def orbit(self) -> Orbit:
+        """The motion."""
+        return orbit_of(self.problem, self.step)
 
     @property
     def touches(self) -> bool:
@@ -86,41 +115,60 @@ class SpecialPoint(InWords):
         others = (i for i in self.problem.impacts if speed[i] < slow)
         return sorted({self.impact, *others})
 
-    def switch(self, *, distance: float = 0.01) -> Orbit:
-        """An orbit of the other branch that begins here, to be continued.
+    def switch(self, *, distance: float = 0.01) -> Any:
+        """Return the start of the other curve that begins here: on a branch an `Orbit` to be
+        continued; on a boundary a `Point` that `boundary` follows in the same two parameters.
 
-        At a period doubling, the motion of twice the period, or of half of it where the branch
-        begins at one; at a grazing, the motion with that impact less or one more, on the side on
-        which it is admissible; where branches cross, a motion of the other one; at a sliding
+        On a branch: at a period doubling the motion of twice the period, or of half of it where the
+        branch begins at one; at a grazing the motion with that impact less or one more, on the side
+        on which it is admissible; where branches cross a motion of the other one; at a sliding
         bifurcation the motion that sticks once more or less; where two events coincide, as an
         impact and the section of a machine with `renewed`, the motion with them in another order.
         Other grazings of a machine with soft stops, friction, modes or `events` are not switched
         at: take `find_orbit` beyond it, from a simulated motion.
 
-        **Arguments:** how far from the point (in the norm of the scaled unknowns).
+        On a boundary: at a fold–flip the other curve; at a double multiplier 1 or -1 the curve of
+        Neimark–Sacker points, or from that the curve of folds or doublings; at a fold or a doubling
+        that grazes the curve of grazings, and back; where a motion that grazes becomes symmetric
+        the curve of symmetry breakings.
+
+        **Arguments:** on a branch how far from the point (in the norm of the scaled unknowns).
 
         **Raises:** `ValueError` for other kinds, or if there is no admissible motion beyond.
         """
-        given_number("distance", distance, low=0.0, open_low=True)
-        if self.kind == DOUBLING:
-            return (_along if self.springs else _doubled)(self, distance)
-        if self.kind == GRAZING:
-            return _beyond_grazing(self, distance)
-        if self.kind in (CROSSING, SYMMETRY):
-            return _crossed(self, distance)
-        if self.kind in SLIDING:
-            return _held_otherwise(self, distance)
-        raise ValueError(
-            "`switch` needs a period doubling, a grazing, a sliding bifurcation or a point where "
-            f"branches cross, but this special point is {one(self.kind)}."
-            " Beyond another one use `find_orbit`, from a simulated motion."
-        )
+        distance = given_number("distance", distance, low=0.0, open_low=True)
+        begins = _BEGINS.get((self.curve, self.kind))
+        if begins is None:
+            known = ", ".join(kind for curve, kind in _BEGINS if curve == self.curve) or "none"
+            where = "a branch" if self.curve is None else f"a curve of {self.curve}"
+            raise ValueError(
+                f"`switch` has nothing to return at {one(self.kind)} of {where}. At these "
+                f"kinds it has: {known}. Elsewhere use `find_orbit`, from a simulated motion."
+            )
+        return begins(self, distance)
 
     def __str__(self) -> str:
-        return f"{self.kind} at {self.parameter:.10g}: {self.detail}"
+        shown = self.parameters[: 1 if self.curve is None else None]
+        place = ", ".join(f"{x:.10g}" for x in shown)
+        return f"{self.kind} at {f'({place})' if self.curve else place}: {self.detail}"
 
 
-def _along(point: SpecialPoint, distance: float) -> Orbit:
+def point_at(
+    problem: Shooting, step: Step, scale: np.ndarray, kind: str, detail: str | None = None,
+    impact: int | None = None, **more: Any,
+) -> Point:  # fmt: skip
+    """A special point of a curve.
+
+    **Arguments:** the curve's equations, their solution, the size of each unknown; further fields
+    of the point.
+    """
+    parameters = np.asarray(step.x)[: -len(problem.parameters) - 1 : -1]
+    if detail is None:
+        detail = grazing_in_words(problem, step, impact) if kind == GRAZING else DETAILS[kind]
+    return Point(kind, parameters, detail, *alone(problem, step, scale), impact, **more)
+
+
+def _along(point: Point, distance: float) -> Orbit:
     """A motion at this distance from a special point, on the branch that its own equations are
     of."""
     x = np.asarray(point.step.x)
@@ -146,8 +194,11 @@ def doubled(old: Shooting) -> Shooting:
     )
 
 
-def _doubled(point: SpecialPoint, distance: float) -> Orbit:
-    """A motion of twice the period, along what the multiplier -1 makes possible."""
+def _doubled(point: Point, distance: float) -> Orbit:
+    """A motion of twice the period, along what the multiplier -1 makes possible, or of half of it
+    where the branch springs from one."""
+    if point.springs:
+        return _along(point, distance)
     old, new = point.problem, doubled(point.problem)
     x = np.asarray(point.step.x)
     count = len(old.parameters)
@@ -161,7 +212,7 @@ def _doubled(point: SpecialPoint, distance: float) -> Orbit:
     return _found(new, step, "twice the period", distance)
 
 
-def _crossed(point: SpecialPoint, distance: float) -> Orbit:
+def _crossed(point: Point, distance: float) -> Orbit:
     """A motion of the branch that crosses here."""
     problem, x = point.problem, np.asarray(point.step.x)
     jacobian = np.asarray(jacobian_at(problem, jnp.asarray(x))) * point.scale
@@ -175,7 +226,7 @@ def _crossed(point: SpecialPoint, distance: float) -> Orbit:
     return _found(problem, step, "the other branch", distance)
 
 
-def _held_otherwise(point: SpecialPoint, distance: float) -> Orbit:
+def _held_otherwise(point: Point, distance: float) -> Orbit:
     """The motion on the other side of a sliding bifurcation."""
     found = without_part(point.problem, point.step, point.scale, distance)
     if found is not None:
@@ -185,7 +236,7 @@ def _held_otherwise(point: SpecialPoint, distance: float) -> Orbit:
 
 
 def _otherwise(
-    point: SpecialPoint, across: Callable[..., Orbit | None], what: str, distance: float
+    point: Point, across: Callable[..., Orbit | None], what: str, distance: float
 ) -> Orbit:
     """The motion that `across` finds. **Raises:** `ValueError` if it finds none.
 
@@ -200,7 +251,7 @@ def _otherwise(
     return found
 
 
-def _beyond_grazing(point: SpecialPoint, distance: float) -> Orbit:
+def _beyond_grazing(point: Point, distance: float) -> Orbit:
     """The motion with the grazing impact less, or with the touch as an impact more."""
     old, step = point.problem, point.step
     if not old.follows_events:
@@ -261,76 +312,35 @@ def _with_touch(old: Shooting, step: Step) -> tuple[Shooting, np.ndarray]:
     return new, np.asarray(new.pack(clock, states, value, period))
 
 
-# What kind of curve leaves a point, by the kinds of the curve on which it lies and of the point.
-_LEADS = {
-    (FOLD, FLIP): DOUBLING,
-    (FOLD, RESONANCE_1): TORUS,
-    (FOLD, GRAZING): GRAZING,
-    (DOUBLING, FLIP): FOLD,
-    (DOUBLING, RESONANCE_2): TORUS,
-    (DOUBLING, GRAZING): GRAZING,
-    (TORUS, RESONANCE_1): FOLD,
-    (TORUS, RESONANCE_2): DOUBLING,
-    (TORUS, GRAZING): GRAZING,
-    (GRAZING, FOLD): FOLD,
-    (GRAZING, DOUBLING): DOUBLING,
-    (GRAZING, SYMMETRY): SYMMETRY,
+def _of_kind(kind: str) -> Callable[[Point, float], Point]:
+    """The motion at a point of a boundary as a special point of this kind."""
+
+    def begins(point: Point, distance: float) -> Point:
+        impact = point.impact if kind == GRAZING else None
+        found = point_at(point.problem, point.step, point.scale, kind, impact=impact)
+        return dataclasses.replace(found, parameters=point.parameters)
+
+    return begins
+
+
+# What can be switched at, and what begins there: by the kind of the boundary (`None` of a branch)
+# and that of the point.
+_BEGINS: dict[tuple[str | None, str], Callable[[Point, float], Any]] = {
+    (None, DOUBLING): _doubled,
+    (None, GRAZING): _beyond_grazing,
+    (None, CROSSING): _crossed,
+    (None, SYMMETRY): _crossed,
+    **{(None, kind): _held_otherwise for kind in SLIDING},
+    (FOLD, FLIP): _of_kind(DOUBLING),
+    (FOLD, RESONANCE_1): _of_kind(TORUS),
+    (FOLD, GRAZING): _of_kind(GRAZING),
+    (DOUBLING, FLIP): _of_kind(FOLD),
+    (DOUBLING, RESONANCE_2): _of_kind(TORUS),
+    (DOUBLING, GRAZING): _of_kind(GRAZING),
+    (TORUS, RESONANCE_1): _of_kind(FOLD),
+    (TORUS, RESONANCE_2): _of_kind(DOUBLING),
+    (TORUS, GRAZING): _of_kind(GRAZING),
+    (GRAZING, FOLD): _of_kind(FOLD),
+    (GRAZING, DOUBLING): _of_kind(DOUBLING),
+    (GRAZING, SYMMETRY): _of_kind(SYMMETRY),
 }
-
-
-@dataclasses.dataclass(frozen=True, repr=False)
-class CodimensionTwo(InWords):
-    """A point of a `Boundary` at which something more happens."""
-
-    kind: str
-    """"cusp" (two curves of folds meet and end), "degenerate-doubling" or
-    "degenerate-symmetry-breaking" (the motions that begin there do so on the other side beyond),
-    "fold-flip" (multipliers 1 and -1), "resonance-1:1", "resonance-1:2" (a double multiplier 1 or
-    -1, where a curve of Neimark–Sacker points begins), "resonance-1:3", "resonance-1:4" (the
-    angle of a complex pair is 2π/3 or π/2), "grazing" (of a motion that is special by its
-    multipliers); on a curve of grazings "fold" or "period-doubling" (of the motion that grazes),
-    "resonant-grazing" (an entry eₙ of the local map vanishes, see `grazing`);
-    "symmetry-breaking" (the motions become symmetric, and the curve ends; of grazings of
-    symmetric motions, where these lose that)."""
-    parameters: np.ndarray
-    """Both parameters of the curve."""
-    orbit: Orbit
-    detail: str
-    """What happens there, in words."""
-    curve: str
-    """The kind of the curve on which it lies."""
-    problem: Shooting = dataclasses.field(repr=False)
-    step: Step = dataclasses.field(repr=False)
-    scale: np.ndarray = dataclasses.field(repr=False)
-    impact: int | None = None
-    """Of a grazing the impact that is lost; `None` where the body touches a stop."""
-
-    def switch(self) -> SpecialPoint:
-        """The same motion as a special point of another kind, of the curve that meets this one
-        here: `boundary` follows it in the same two parameters.
-
-        From a fold–flip that is the other curve; from a double multiplier 1 or -1 the curve of
-        Neimark–Sacker points, or from that the curve of folds or doublings; from a fold or a
-        doubling that grazes the curve of grazings, and back; where a motion that grazes becomes
-        symmetric, the curve of symmetry breakings.
-
-        **Raises:** `ValueError` for other kinds, from which none leaves, or none of this motion.
-        """
-        kind = _LEADS.get((self.curve, self.kind))
-        if kind is None:
-            raise ValueError(
-                "`switch` needs a fold–flip, a resonance 1:1 or 1:2, or a fold, a doubling or a "
-                f"symmetry breaking that grazes, but this point on a curve of {self.curve} is a "
-                f"{self.kind}."
-            )
-        problem, step, scale = alone(self.problem, self.step, self.scale)
-        grazes = kind == GRAZING
-        detail = grazing_in_words(problem, step, self.impact) if grazes else DETAILS[kind]
-        impact = self.impact if grazes else None
-        return SpecialPoint(
-            kind, float(step.x[-1]), self.orbit, detail, problem, step, scale, impact
-        )  # fmt: skip
-
-    def __str__(self) -> str:
-        first, second = self.parameters
-        return f"{self.kind} at ({first:.10g}, {second:.10g}): {self.detail}"

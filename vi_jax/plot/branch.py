@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 
 from .._checks import instance_of, one_of
 from ..machine import in_brackets, name_in, quantity_of, unit_of
-from ..orbit import Boundary, Branch, branch_hits_in_words, point_of
+from ..orbit import Boundary, Branch, branch_hits_in_words
 from ..scans import Sweep
 from .colors import DASHES, MARKS, color_of, mark_style, once, thick
 from .motion import new_axes
@@ -67,10 +67,8 @@ def plot_branch(
         if drawn:
             ax.plot([], [], line, color="0.3", lw=look["lw"], label=once(ax, word))
     for point in branch.special if special else ():
-        i = point_of(point, branch.steps)
         mark = {**mark_style(point.kind), "zorder": 4, "label": once(ax, point.kind)}
-        if i >= 0:
-            ax.plot(across[i], up[i], **mark)
+        ax.plot(across[point.index], up[point.index], **mark)
     if legend:
         _legend(ax)
     machine = branch.problem.machine

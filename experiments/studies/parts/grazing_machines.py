@@ -195,7 +195,7 @@ def _within_reach(rng: np.random.Generator, kind: str, machine: Any, gap: str) -
     return Drawn(kind, machine, gap, (0.05 * reach, 1.3 * reach))
 
 
-def grazing_of(drawn: Drawn) -> vi.SpecialPoint | None:
+def grazing_of(drawn: Drawn) -> vi.Point | None:
     """The first grazing at which the motion of one cycle that the machine settles on from rest (or
     where its branch leads) touches a stop and is stable until then; `None` without one."""
     machine = drawn.machine
@@ -227,7 +227,7 @@ KINDS = {
 """How machines of each kind are drawn, and how many of them."""
 
 
-def machines(draw: Any, count: int, seed: int) -> list[tuple[Drawn, vi.SpecialPoint]]:
+def machines(draw: Any, count: int, seed: int) -> list[tuple[Drawn, vi.Point]]:
     """So many machines of a kind that graze, each with its grazing."""
     rng, found = np.random.default_rng(seed), []
     while len(found) < count:

@@ -67,7 +67,7 @@ def _swept(machine: Any, name: str, values: Any, state: Any) -> tuple[Any, Any, 
     return jax.vmap(one)(values)
 
 
-def swept(point: vi.SpecialPoint, name: str, low: float, high: float, seed: int) -> Lanes:
+def swept(point: vi.Point, name: str, low: float, high: float, seed: int) -> Lanes:
     """Lanes on both sides of a grazing, their offsets at random between two sizes of it (evenly
     spread by their logarithm), told apart by where there are more touches."""
     rng = np.random.default_rng(seed)
@@ -88,7 +88,7 @@ def swept(point: vi.SpecialPoint, name: str, low: float, high: float, seed: int)
     return Lanes(size, distance, period, np.array(touches, float), side)
 
 
-def _goes_on(point: vi.SpecialPoint, name: str, offsets: np.ndarray) -> int:
+def _goes_on(point: vi.Point, name: str, offsets: np.ndarray) -> int:
     """At how many of some values there is, near the motion that grazes, one with its touches."""
     some = offsets[:: LANES // 8]
     many, starts = _beside(point, name, some, np.tile(_origin(point), (len(some), 1)))
@@ -130,16 +130,16 @@ def _searched(machine: Any, start: Any) -> tuple[Any, Any, Any]:
     return jnp.stack(jax.tree.leaves(orbit.state)), hits, good
 
 
-def _origin(point: vi.SpecialPoint) -> np.ndarray:
+def _origin(point: vi.Point) -> np.ndarray:
     return np.array([float(x) for x in jax.tree.leaves(point.orbit.state)])
 
 
-def _base(point: vi.SpecialPoint) -> int:
+def _base(point: vi.Point) -> int:
     """Touches in a cycle of the motion that grazes."""
     return 0 if point.orbit.machine.switches else int(np.asarray(point.orbit.impacts))
 
 
-def _beside(point: vi.SpecialPoint, name: str, offsets: Any, rows: np.ndarray) -> tuple[Any, Any]:
+def _beside(point: vi.Point, name: str, offsets: Any, rows: np.ndarray) -> tuple[Any, Any]:
     """Machines at these offsets of the parameter and states from rows, one for each lane."""
     machine, tree = point.orbit.machine, jax.tree.structure(point.orbit.state)
     many = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(rows), *jnp.shape(x))), machine)
@@ -147,7 +147,7 @@ def _beside(point: vi.SpecialPoint, name: str, offsets: Any, rows: np.ndarray) -
     return many, jax.tree.unflatten(tree, list(jnp.asarray(rows.T)))
 
 
-def folds(point: vi.SpecialPoint, name: str, lanes: Lanes, seed: int) -> bool:
+def folds(point: vi.Point, name: str, lanes: Lanes, seed: int) -> bool:
     """Whether the motion of one cycle with a touch more is on the side without impacts. A candidate
     has to repeat when it is simulated, and to touch once more."""
     offset, state = _impacting(point, name, lanes, seed)
@@ -158,9 +158,7 @@ def folds(point: vi.SpecialPoint, name: str, lanes: Lanes, seed: int) -> bool:
     return bool(found and np.sign(offset) == -lanes.side)
 
 
-def _impacting(
-    point: vi.SpecialPoint, name: str, lanes: Lanes, seed: int
-) -> tuple[float, np.ndarray]:
+def _impacting(point: vi.Point, name: str, lanes: Lanes, seed: int) -> tuple[float, np.ndarray]:
     """A candidate, and its offset: by its own equations; for a soft stop by Newton's method from
     those of many random starts that touch once more and repeat best."""
     if not point.orbit.machine.switches:
@@ -192,7 +190,7 @@ def name_of(found: vi.Grazing) -> str:
 
 
 def judged(
-    point: vi.SpecialPoint, name: str, found: vi.Grazing, seed: int
+    point: vi.Point, name: str, found: vi.Grazing, seed: int
 ) -> tuple[float, float, Lanes, str]:
     """The range over which a forecast was checked (without doubtful small offsets), lanes in it,
     and the verdict."""
@@ -203,7 +201,7 @@ def judged(
     return low, high, lanes, verdict(point, name, lanes, seed)
 
 
-def verdict(point: vi.SpecialPoint, name: str, lanes: Lanes, seed: int) -> str:
+def verdict(point: vi.Point, name: str, lanes: Lanes, seed: int) -> str:
     """The name in `vi.SCENARIOS` of what the lanes do.
 
     The rules are on the study's page. Distances are compared between the third of the lanes nearest

@@ -1,5 +1,6 @@
-"""A branch of periodic motions in one parameter, and the tables of its numbers."""
+"""Curves of periodic motions, branches and boundaries, and the tables of their numbers."""
 
+import abc
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property
@@ -14,16 +15,19 @@ from .._messages import so_many
 from .._types import State, xr
 from ..flow import average_names, in_names, quantities_on, quantity_names, tidy
 from ..machine import AbstractMachine, components, in_unit, with_units
-from ._conditions import held_in_words
+from ._conditions import Special, held_in_words
 from ._corrector import Step
 from ._locate import between
+from ._observed import Observed
 from ._shooting import Shooting
 from ._solution import orbit_at, orbit_of, sections_of
+from ._special_table import cosine_of, points_of
+from ._words import TORUS
 from .floquet import stability_of
 from .results import InWords, Orbit
-from .special import SpecialPoint
+from .special import Point
 
-# What is a number at each point of every branch.
+# What is a number at each point of every curve.
 COLUMNS = (
     "parameter", "y_min", "y_max", "clearance", "frequency_ratio", "duration", "impacts",
     "fastest_impact", "slowest_impact", "multiplier", "stable",
@@ -53,17 +57,7 @@ def stability_in_words(multipliers: np.ndarray) -> np.ndarray:
     return in_names(verdicts)
 
 
-def point_of(special: SpecialPoint, steps: list[Step]) -> int:
-    """Which of a branch's points a special point is; -1 if it is none of them."""
-    for i, step in enumerate(steps):
-        if step.seen is special.step.seen:  # what is observed stays where conditions are left out
-            return i
-    if special.springs:  # its motion has half the period, but it is the branch's end
-        return min((0, len(steps) - 1), key=lambda i: abs(steps[i].x[-1] - special.parameter))
-    return -1
-
-
-def special_table(special: list[SpecialPoint], steps: list[Step]) -> dict[str, Any]:
+def special_table(special: list[Point], names: tuple[str, ...]) -> dict[str, Any]:
     """Kind, place and extremes of each special point, as variables along `special`."""
     orbits = [point.orbit for point in special]
     # Without any the words are empty ones, whose type files can hold.
@@ -71,11 +65,13 @@ def special_table(special: list[SpecialPoint], steps: list[Step]) -> dict[str, A
         "kind": np.array([point.kind for point in special], str),
         "detail": np.array([point.detail for point in special], str),
         "parameter": np.array([point.parameter for point in special], float),
-        "point": np.array([point_of(point, steps) for point in special], int),
+        "point": np.array([point.index for point in special], int),
         "cycles": np.array([int(orbit.cycles) for orbit in orbits], int),
         "y_min": np.array([float(orbit.y_min) for orbit in orbits], float),
         "y_max": np.array([float(orbit.y_max) for orbit in orbits], float),
     }
+    for i, name in enumerate(names):
+        found.setdefault(name, np.array([point.parameters[i] for point in special], float))
     return {f"special_{name}": ("special", x) for name, x in found.items()}
 
 
@@ -133,53 +129,107 @@ def _numbers(found: object) -> dict[str, np.ndarray]:
 _ROUNDING = 1e-12
 
 
-@dataclasses.dataclass(frozen=True, repr=False)
-class Branch(InWords):
-    """A branch of periodic motions: host arrays with one row for each point, in their order, in
-    the machine's units (see `AbstractMachine.units`)."""
+@dataclasses.dataclass(frozen=True, repr=False, eq=False)
+class Curve(InWords, abc.ABC):
+    """A curve of periodic motions: host arrays with one row for each point, in their order, in the
+    machine's units (see `AbstractMachine.units`)."""
 
-    name: str
-    """Name of the parameter."""
-    parameter: np.ndarray
-    y_min: np.ndarray
-    """Smallest position (of the first coordinate), in the machine's unit (of a `Scene` a)."""
-    y_max: np.ndarray
-    """Largest position over the period, in the same unit."""
-    multipliers: np.ndarray
-    """Floquet multipliers over the period, the largest modulus first; (points, states)."""
-    impact_phase: np.ndarray
-    """Clock of each impact since the section, in the machine's units (of a `Scene` the crank angle
-    in radians); (points, impacts). Without columns for motions that rest on a stop, whose impacts
-    differ in number: `orbit(i)` lists them."""
-    impact_speed: np.ndarray
-    """V⁻ of each impact, in the machine's unit (of a `Scene` a ω); (points, impacts), or without
-    columns as `impact_phase`."""
-    clearance: np.ndarray
-    """Smallest distance to a stop at a turn that does not touch it, in the unit of positions."""
-    frequency_ratio: np.ndarray
-    """ζ: mean speed of the drive, NaN for machines that are not driven."""
-    duration: np.ndarray
-    """Least period in time."""
-    averages: dict[str, np.ndarray]
-    """The machine's own averages over the period, by name (see `AbstractMachine.averages`)."""
-    cycles: int
-    """Period in drive cycles."""
-    special: list[SpecialPoint]
+    problem: Shooting
+    """The equations of the motions."""
+    steps: list[Step]
+    """Their solutions, point by point."""
+    scale: np.ndarray
+    """The size of each unknown."""
     ends: tuple[str, str]
-    """Why the branch ends on each side: "bounds", "grazing" (an impact is lost or a stop touched),
-    one of the four sliding bifurcations ("crossing-sliding", …; see `SpecialPoint.kind`),
-    "period-doubling" (it springs there from a motion of half its period), "symmetry-breaking" (from
-    a symmetric one), "hopf" (it shrinks to rest), "rest" (a rest on a stop is gained or lost),
-    "closed" (it has come back to its first point, which is its last one as well: an isola),
-    "multiplier" (another becomes as large as the one that is held, or those of a held complex pair
-    turn real), "stalled" (the corrector finds no motion further on, however close), "max_points",
-    "interrupted", "long" (an autonomous motion takes four times as long as that from which the
-    branch began, for which its steps are: begin another one there)."""
-    problem: Shooting = dataclasses.field(repr=False)
-    steps: list[Step] = dataclasses.field(repr=False)
-    scale: np.ndarray = dataclasses.field(repr=False)
-    free: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
-    """Numbers of the machine that were freed beside the parameter, by name, at each point."""
+    """Why the curve ends on each side."""
+    special: list[Point] = dataclasses.field(init=False)
+    """Its special points, in its order."""
+
+    def _each(self, get: Callable[[Observed], Any]) -> np.ndarray:
+        return np.stack([np.asarray(get(step.seen)) for step in self.steps])
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return self.problem.parameters[::-1]
+
+    @cached_property
+    def parameters(self) -> np.ndarray:
+        """Values of the parameters; (points, parameters)."""
+        return np.stack([step.x[: -len(self.names) - 1 : -1] for step in self.steps])
+
+    @property
+    def parameter(self) -> np.ndarray:
+        """Values of the first parameter."""
+        return self.parameters[:, 0]
+
+    @property
+    def free(self) -> dict[str, np.ndarray]:
+        """Values of the further parameters, by name."""
+        return dict(zip(self.names[1:], self.parameters[:, 1:].T, strict=True))
+
+    @cached_property
+    def y_min(self) -> np.ndarray:
+        """Smallest position (of the first coordinate), in the machine's unit (of a `Scene` a)."""
+        return self._each(lambda seen: seen.y_min)
+
+    @cached_property
+    def y_max(self) -> np.ndarray:
+        """Largest position over the period, in the same unit."""
+        return self._each(lambda seen: seen.y_max)
+
+    @cached_property
+    def multipliers(self) -> np.ndarray:
+        """Floquet multipliers over the period, the largest modulus first; (points, states). NaN at
+        an end of a boundary where an impact is lost and some of them have no limit."""
+        return self._each(lambda seen: seen.multipliers)
+
+    @cached_property
+    def impact_phase(self) -> np.ndarray:
+        """Clock of each impact since the section, in the machine's units (of a `Scene` the crank
+        angle in radians); (points, impacts). Without columns for motions that rest on a stop, whose
+        impacts differ in number: `orbit(i)` lists them."""
+        return np.stack([step.x[list(self.problem.impacts)] for step in self.steps])
+
+    @cached_property
+    def impact_speed(self) -> np.ndarray:
+        """V⁻ of each impact, in the machine's unit (of a `Scene` a ω); (points, impacts), or
+        without columns as `impact_phase`."""
+        return self._each(lambda seen: seen.approach[list(self.problem.impacts)])
+
+    @cached_property
+    def clearance(self) -> np.ndarray:
+        """Smallest distance to a stop at a turn that does not touch it."""
+        return self._each(lambda seen: seen.nearest.room)
+
+    @cached_property
+    def duration(self) -> np.ndarray:
+        """Least period in time."""
+        return self._each(lambda seen: seen.duration)
+
+    @cached_property
+    def frequency_ratio(self) -> np.ndarray:
+        """ζ: mean speed of the drive, NaN for machines that are not driven."""
+        ratio = self.problem.machine.frequency_ratio(jnp.asarray(self.duration / self.cycles))
+        if ratio is None:
+            return np.full(len(self.steps), np.nan)
+        given = dict(zip(self.names, self.parameters.T, strict=True))
+        return np.asarray(given.get("drive.frequency_ratio", ratio))
+
+    @cached_property
+    def averages(self) -> dict[str, np.ndarray]:
+        """The machine's own averages over the period, by name (see `AbstractMachine.averages`)."""
+        names = self.steps[0].seen.averages
+        return {name: self._each(lambda seen, name=name: seen.averages[name]) for name in names}
+
+    @property
+    def cycles(self) -> int:
+        """Period in drive cycles."""
+        return self.problem.cycles
+
+    def _about(self) -> dict[str, Any]:
+        """What else is in `attrs` of the dataset."""
+        return {}
 
     @property
     def stable(self) -> np.ndarray:
@@ -220,7 +270,7 @@ class Branch(InWords):
         counted = [step.seen.counted for step in self.steps]
         if counted and counted[0] is not None:
             return np.array([int(c.impacts) for c in counted])
-        return np.full(len(self.parameter), self.impact_speed.shape[1])
+        return np.full(len(self.steps), self.impact_speed.shape[1])
 
     @property
     def rests(self) -> np.ndarray:
@@ -237,22 +287,21 @@ class Branch(InWords):
     @property
     def column_names(self) -> tuple[str, ...]:
         """Names of all that is a number at each point, as pictures and tables take them."""
-        return (*column_names(self.problem.machine, self.problem.like), *self.free)
+        return (*column_names(self.problem.machine, self.problem.like), *self.names[1:])
 
     def column(self, name: str) -> np.ndarray:
-        """A number at each point: one of the branch's arrays, one of the machine's averages, its
+        """A number at each point: one of the curve's arrays, one of the machine's averages, a
         parameter by name, or a part of the state or a quantity on the section, as `section_Y`.
 
         **Raises:** `ValueError` that lists the names there are.
         """
-        if name == self.name and name not in self.column_names:
+        if name == self.names[0] and name not in self.column_names:
             return self.parameter
         one_of("name", name, self.column_names)
         if name in self.averages or name in self.free:
             return (self.averages | self.free)[name]
-        if name in COLUMNS:
-            return getattr(self, name)
-        return self.sections[name.removeprefix("section_")]
+        inner = name.removeprefix("section_")
+        return getattr(self, name) if inner == name else self.sections[inner]
 
     def table(self, function: Callable[[Orbit], Any]) -> "xr.Dataset":
         """Evaluate a function of the orbit at each point: an `xarray.Dataset` over the points with
@@ -264,14 +313,14 @@ class Branch(InWords):
         **Raises:** `TypeError` for a function that returns no numbers, or others at another point.
         """
         orbits = (self.orbit(i) for i in range(len(self.steps)))
-        return table_of(function, orbits, self.name, self.parameter, self.problem.machine.units)
+        return table_of(function, orbits, self.names[0], self.parameter, self.problem.machine.units)
 
     def orbit(self, index: int) -> Orbit:
         """The motion at one point; a negative `index` counts from the end."""
         return orbit_at(self.problem, self.steps, index)
 
     def at(self, value: float) -> list[Orbit]:
-        """The branch's motions at a value of the parameter, solved for; in the branch's order."""
+        """The curve's motions at a value of its (first) parameter, solved for; in its order."""
         value = given_number("value", value)
 
         def apart(step: Step) -> float:
@@ -291,10 +340,10 @@ class Branch(InWords):
         return [orbit_of(self.problem, step) for step in found if step is not None]
 
     def to_xarray(self, *, along: str | None = None) -> "xr.Dataset":
-        """The branch as an `xarray.Dataset` over its points, with a word for the `stability` at
+        """The curve as an `xarray.Dataset` over its points, with a word for the `stability` at
         each, and its special points: `special_kind`, `special_detail`, `special_parameter`, which
-        `special_point` of the branch it is (-1 if none), and more. The parameter is there by its
-        own name too, where that is not the name of another column. The ends are in `attrs`.
+        `special_point` of the curve it is (-1 if none), and more. The parameters are there by their
+        own names too, where these are not the name of another column. The ends are in `attrs`.
 
         `.to_netcdf(path, engine="h5netcdf")` writes all of it, complex multipliers too.
 
@@ -304,7 +353,7 @@ class Branch(InWords):
 
         **Raises:** `ValueError` if there is no such dimension.
         """
-        data: dict[str, Any] = {self.name: ("point", self.parameter)}
+        data: dict[str, Any] = {self.names[0]: ("point", self.parameter)}
         data |= {name: ("point", self.column(name)) for name in self.column_names}
         data |= {
             "impact_phase": (("point", "impact"), self.impact_phase),
@@ -312,16 +361,38 @@ class Branch(InWords):
             "multipliers": (("point", "state"), self.multipliers),
             "stability": ("point", stability_in_words(self.multipliers)),
         }
-        data |= special_table(self.special, self.steps)
-        data.setdefault(f"special_{self.name}", data["special_parameter"])
-        about = {"parameter": self.name, "period_in_cycles": self.cycles, "ends": list(self.ends)}
-        found = xr.Dataset(data, attrs=about)
-        own = {name: name for name in (*self.averages, *self.free)}
-        named = ("parameter", "special_parameter", self.name, f"special_{self.name}")
-        own |= dict.fromkeys(named, self.name)
+        data |= special_table(self.special, self.names)
+        about = {"parameter": self.names[0], "period_in_cycles": self.cycles}
+        found = xr.Dataset(data, attrs={**about, "ends": list(self.ends), **self._about()})
+        own = {name: name for name in (*self.averages, *self.names)}
+        own |= {f"special_{name}": name for name in self.names}
+        own |= dict.fromkeys(("parameter", "special_parameter"), self.names[0])
         own |= dict.fromkeys(("special_y_min", "special_y_max"), "position")
-        found = with_units(found, self.problem.machine.units, own)
-        return tidy(found, along)
+        return tidy(with_units(found, self.problem.machine.units, own), along)
+
+
+@dataclasses.dataclass(frozen=True, repr=False, eq=False)
+class Branch(Curve):
+    """A branch of periodic motions in one parameter, with others that are free where something is
+    held: host arrays with one row for each point, in their order, in the machine's units (see
+    `AbstractMachine.units`).
+
+    It ends on each side at the "bounds", by "grazing" (an impact is lost or a stop touched), one of
+    the four sliding bifurcations ("crossing-sliding", …; see `Point.kind`), "period-doubling" (it
+    springs there from a motion of half its period), "symmetry-breaking" (from a symmetric one),
+    "hopf" (it shrinks to rest), "rest" (a rest on a stop is gained or lost), "closed" (it has come
+    back to its first point, which is its last one as well: an isola), "multiplier" (another becomes
+    as large as the one that is held, or those of a held complex pair turn real), "stalled" (the
+    corrector finds no motion further on, however close), "max_points", "interrupted", "long" (an
+    autonomous motion takes four times as long as that from which the branch began, for which its
+    steps are: begin another one there)."""
+
+    special: list[Point]
+
+    @property
+    def name(self) -> str:
+        """Name of the parameter."""
+        return self.names[0]
 
     def _freed_in_words(self) -> list[str]:
         """What was freed and what is held instead, if anything is."""
@@ -344,6 +415,60 @@ class Branch(InWords):
             f"{branch_hits_in_words(self)}, {self.name} in {span}, "
             f"{int(self.stable.sum())} of them stable; ends: {self.ends[0]}, {self.ends[1]}",
             *self._freed_in_words(),
+            *(f"  {point}" for point in self.special),
+        ]
+        return "\n".join(lines)
+
+
+@dataclasses.dataclass(frozen=True, repr=False, eq=False)
+class Boundary(Curve):
+    """A curve in two parameters along which an orbit bifurcates: host arrays with one row for each
+    point, in their order, in the machine's units (see `AbstractMachine.units`).
+
+    It ends on each side at the "bounds", by "grazing" (an impact more or less), "closed" (it has
+    come back to its first point, which is its last one as well), of a curve of Neimark–Sacker
+    points by "resonance-1:1" and "resonance-1:2" (the two multipliers become real), of a curve of
+    motions without symmetry by "symmetry-breaking" (they become symmetric), "stalled",
+    "max_points", "interrupted"."""
+
+    @property
+    def condition(self) -> Special:
+        """The condition that makes the motions special."""
+        return self.problem.conditions[0]
+
+    @property
+    def kind(self) -> str:
+        """ "fold", "period-doubling", "neimark-sacker", "symmetry-breaking" or "grazing"."""
+        return self.condition.kind
+
+    @cached_property
+    def special(self) -> list[Point]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The points of codimension two on the curve, in its order, each located to rounding; they
+        are looked for when they are first asked for."""
+        return points_of(self.problem, self.condition, self.steps, self.ends, self.scale)
+
+    @property
+    def angle(self) -> np.ndarray:
+        """The angle of the pair of multipliers that leaves the unit circle, in radians, at each
+        point; NaN on curves of other kinds."""
+        if self.kind != TORUS:
+            return np.full(len(self.steps), np.nan)
+        return np.arccos(np.clip([cosine_of(step) for step in self.steps], -1, 1))
+
+    @property
+    def column_names(self) -> tuple[str, ...]:
+        """As of any curve; of Neimark–Sacker points also the `angle`."""
+        return (*super().column_names, *(("angle",) if self.kind == TORUS else ()))
+
+    def _about(self) -> dict[str, Any]:
+        return {"kind": self.kind}
+
+    def __str__(self) -> str:
+        low, high = self.parameters.min(axis=0), self.parameters.max(axis=0)
+        lines = [
+            f"Curve of {so_many(len(self.parameters), 'point')} of {self.kind}: {self.names[0]} in "
+            f"[{low[0]:.6g}, {high[0]:.6g}], {self.names[1]} in [{low[1]:.6g}, {high[1]:.6g}]; "
+            f"ends: {self.ends[0]}, {self.ends[1]}",
             *(f"  {point}" for point in self.special),
         ]
         return "\n".join(lines)
