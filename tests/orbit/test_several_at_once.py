@@ -4,6 +4,8 @@ The numbers of the two Duffing oscillators were found by an independent shooting
 checked here by their variational equations, integrated by SciPy.
 """
 
+from types import SimpleNamespace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -107,6 +109,23 @@ def test_a_branch_that_leaves_another_to_both_sides():
     assert len(places(off, "fold")) == 6
     again = next(point for point in off.special if point.kind == "branch-point").switch().state
     assert abs(float(again["y1"] - again["y2"])) < 1e-9
+
+
+@pytest.mark.slow
+def test_curves_of_branch_points():
+    """Both end where the oscillators are uncoupled and fold, and one touches the curve of folds:
+    that is no resonance, since each multiplier 1 has its own eigenvector."""
+    points = [point for point in branch_of(0.1).special if point.kind == "branch-point"]
+    bounds = ((0.02, 0.25), (0.0, 0.3))
+    for point, fold in zip(points, (0.1082731067, 0.0799657809), strict=True):
+        curve = vi.boundary(point, parameter="coupling", bounds=bounds, progress=False)
+        assert (curve.kind, curve.ends, curve.special) == ("branch-point", ("bounds",) * 2, [])
+        np.testing.assert_allclose(curve.parameters[0], [fold, 0.0], atol=1e-7)
+        for i in range(0, len(curve.steps), 15):
+            values = np.linalg.eigvals(monodromy(SimpleNamespace(orbit=curve.orbit(i))))
+            assert np.abs(values - 1).min() < 1e-6
+    with pytest.raises(ValueError, match="but with another excess they come apart"):
+        vi.boundary(point, parameter="excess", bounds=((0.02, 0.25), (-0.1, 0.1)))
 
 
 def test_a_branch_that_begins_at_a_grazing_goes_to_one_side():

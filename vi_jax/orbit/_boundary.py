@@ -7,15 +7,14 @@ import numpy as np
 
 from .._checks import flag, instance_of, interval
 from ..machine import check_leaf, leaf
-from ._conditions import Special, symmetry_condition
+from ._conditions import Special, exchange_at
 from ._corrector import advance, tangent_at
 from ._follow import both_ways, check_walk
 from ._problem import check_parameter, steps_of
 from ._shooting import Shooting
 from ._sliding import ADDING_SLIDING, GRAZING_SLIDING
 from ._special_table import Intervals, SpecialTable
-from ._symmetry import may_be_symmetric
-from ._words import DOUBLING, FOLD, SYMMETRY, TORUS, TOUCHING, one
+from ._words import CROSSING, DOUBLING, FOLD, SYMMETRY, TORUS, TOUCHING, one
 from .curve import Boundary
 from .special import Point
 
@@ -44,9 +43,9 @@ def boundary(
     """Follow a bifurcation of a branch in a second parameter, both ways.
 
     Pseudo-arclength on the orbit's equations together with the condition that makes the point
-    special: det(M - I) = 0 for a fold or a symmetry breaking, det(M + I) = 0 for a period doubling,
-    two multipliers whose product is 1 for a Neimark–Sacker bifurcation, V⁻ = 0 or a clearance of
-    zero for a grazing. Host-side: not to be traced.
+    special: det(M - I) = 0 for a fold or where branches cross, det(M + I) = 0 for a period
+    doubling, two multipliers whose product is 1 for a Neimark–Sacker bifurcation, V⁻ = 0 or a
+    clearance of zero for a grazing. Host-side: not to be traced.
 
     **Arguments:**
 
@@ -90,11 +89,11 @@ def boundary(
 def _check_point(point: Point) -> None:
     """**Raises:** `TypeError` or `ValueError` unless this is a bifurcation that can be followed."""
     instance_of("point", point, Point, "a `Point`, from `Branch.special`")
-    if point.kind not in (FOLD, DOUBLING, TORUS, SYMMETRY, *TOUCHING):
+    if point.kind not in (FOLD, DOUBLING, TORUS, SYMMETRY, CROSSING, *TOUCHING):
         raise ValueError(
             "Argument `point` must be a fold, a period doubling, a Neimark–Sacker bifurcation, a "
-            "symmetry breaking, or a grazing or sliding bifurcation at which something is touched, "
-            f"but is {one(point.kind)}. {_INSTEAD}"
+            "symmetry breaking, a branch point, or a grazing or sliding bifurcation at which "
+            f"something is touched, but is {one(point.kind)}. {_INSTEAD}"
         )
     if not point.problem.follows_events:
         raise ValueError(
@@ -142,13 +141,13 @@ def _special_motion(
     problem = dataclasses.replace(two, steps=steps)
     values = float(leaf(old.machine, parameter)), point.parameter
     x = np.append(np.asarray(point.step.x)[:-1], values)
-    symmetry = None
-    if point.kind == SYMMETRY:
-        if not may_be_symmetric(problem, corners):
+    exchange = None
+    if point.kind in (SYMMETRY, CROSSING):
+        exchange = exchange_at(problem, x, problem.scale([0.5 * (b - a) for a, b in bounds]))
+        if exchange is None:
             raise ValueError(
-                "Argument `parameter` must leave the machine its symmetry, but with another "
-                f"{parameter} a motion is not its own image."
+                "Argument `parameter` must leave the machine its symmetry, or what else makes "
+                f"branches cross, but with another {parameter} they come apart."
             )
-        symmetry = symmetry_condition(problem, x)
-    condition = Special(point.kind, point.impact, symmetry)
+    condition = Special(point.kind, point.impact, exchange)
     return dataclasses.replace(problem, conditions=(condition,)), condition, x

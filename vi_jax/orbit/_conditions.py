@@ -24,11 +24,14 @@ from ..machine import quantity_of as measured
 from ._corrector import Step, jacobian_at
 from ._observed import Observed
 from ._shooting import Shooting
-from ._symmetry import images
 from ._words import DOUBLING, TORUS, TOUCHING
 from .floquet import compound
 
 _SECTION = "section_"
+
+# Branches cross for all values of a second parameter if its part of the derivative along the left
+# null vector is no more than this share of the largest: a choice, above what a point is off by.
+_APART = 1e-6
 
 
 def names_of(problem: Shooting) -> tuple[str, ...]:
@@ -210,48 +213,50 @@ def overtaken(problem: Shooting, step: Step) -> float:
     return max((c.overtaken(step.seen) for c in held), default=-1.0)
 
 
-class SymmetryCondition(eqx.Module):
-    """The condition that a motion is its own image under the symmetry of its machine, in the place
-    of one of its equations.
+class Exchange(eqx.Module):
+    """Another equation in the place of one of a motion's own, where branches of it cross.
 
-    The motions x of the equations F(x, p) = 0 from event to event are symmetric where D(x), their
-    difference from their own image (`images`), vanishes. Where they lose their symmetry F cannot be
-    solved for x: its Jacobian J = ∂F/∂x has a null vector r, along which the motion departs from
-    its image, and a left null vector l, so that l·F = 0 is met by every symmetric motion close by
-    to first order. That combination of the equations gives way to w·D = 0, where w picks out of D
-    how far the motion has gone along r:
+    There the equations F(x, p) = 0 from event to event cannot be solved for x: the Jacobian
+    J = ∂F/∂x has a null vector r and a left null vector l. Where branches cross for all values of a
+    second parameter, as those of symmetric and other motions do, l·F = 0 follows from the other
+    equations, and l(x)·∂F/∂p = 0, with the left null vector at x, gives way to it:
 
-        F + l (w·D - l·F) = 0,   w = DD r/|DD r|²,   DD the derivative of D by x.
+        F + l (l(x)·∂F/∂p - l·F) = 0.
 
     These equations are regular, and the curve's own condition det(M - I) = 0 is added to them.
     """
 
     left: Float[Array, " equations"]
-    """l, the left null vector of J where the symmetry is lost."""
-    weight: Float[Array, " differences"]
-    """w, which picks out of D how far the motion has gone along r."""
+    """l, where the curve begins."""
+    right: Float[Array, " equations"]
+    """r, there."""
 
     def instead(self, problem: Shooting, missing: Array, x: Array) -> Array:
-        """The equations' residual F, given as `missing`, with the combination l·F exchanged for
-        w·D."""
-        departs = self.weight @ images(problem, x)
-        return missing + self.left * (departs - self.left @ missing)
+        """The equations, given F as `missing`."""
+        jacobian, n = jax.jacfwd(problem.lacks)(x), self.left.size
+        corner = jnp.zeros((1, 1), x.dtype)
+        bordered = jnp.block([[jacobian[:, :n].T, self.right[:, None]], [self.left[None], corner]])
+        left = jnp.linalg.solve(bordered, jnp.eye(n + 1, dtype=x.dtype)[-1])[:n]
+        return missing + self.left * (left @ jacobian[:, -1] - self.left @ missing)
 
 
-def symmetry_condition(problem: Shooting, x: np.ndarray) -> SymmetryCondition:
-    """The condition at a motion that loses its symmetry, by the singular vectors of its Jacobian
-    without the columns of the parameters."""
-    count = len(problem.parameters)
-    left, _, right = np.linalg.svd(np.asarray(jacobian_at(problem, jnp.asarray(x)))[:, :-count])
-    direction = jnp.append(jnp.asarray(right[-1]), jnp.zeros(count))
-    change = jax.jvp(lambda x: images(problem, x), (jnp.asarray(x),), (direction,))[1]
-    return SymmetryCondition(jnp.asarray(left[:, -1]), change / (change @ change))
+def exchange_at(problem: Shooting, x: np.ndarray, scale: np.ndarray) -> Exchange | None:
+    """The exchange at a motion at which branches cross, by the singular vectors of its Jacobian
+    without the columns of the parameters; `None` if the second parameter takes them apart.
+
+    **Arguments:** the equations in two parameters; the motion; the size of each unknown.
+    """
+    jacobian = np.asarray(jacobian_at(problem, jnp.asarray(x))) * scale
+    left, sizes, right = np.linalg.svd(jacobian[:, :-2])
+    if abs(left[:, -1] @ jacobian[:, -2]) > _APART * sizes[0]:
+        return None
+    return Exchange(jnp.asarray(left[:, -1]), jnp.asarray(right[-1] * scale[:-2]))
 
 
 class Special(AbstractCondition):
     """The condition that a motion is special.
 
-    With the monodromy matrix M that is det(M - I) = 0 at a fold or where a symmetry is lost,
+    With the monodromy matrix M that is det(M - I) = 0 at a fold or where branches cross,
     det(M + I) = 0 at a period doubling, and where a pair of multipliers leaves the unit circle that
     the product of two is 1, det(M₂ - I) = 0 with the compound matrix M₂ (see `compound`). M has
     poles where an impact grazes, which the speeds of approach take away. At a grazing the condition
@@ -261,11 +266,11 @@ class Special(AbstractCondition):
     kind: str = eqx.field(static=True)
     impact: int | None = eqx.field(static=True)
     """The event that grazes; `None` at a touch, and where nothing grazes."""
-    symmetry: SymmetryCondition | None = None
+    exchange: Exchange | None = None
 
     def exchanged(self, problem, x, missing):
-        """Where a symmetry is lost, one of the equations is exchanged (see `SymmetryCondition`)."""
-        return missing if self.symmetry is None else self.symmetry.instead(problem, missing, x)
+        """Where branches cross, one of the equations is exchanged."""
+        return missing if self.exchange is None else self.exchange.instead(problem, missing, x)
 
     def missing(self, problem, x, seen):
         """The determinant, V⁻ or the clearance."""

@@ -38,6 +38,7 @@ from ._surgery import repeated
 from ._symmetry import ALIKE, ROUNDED, may_be_symmetric
 from ._words import (
     AT_CODIMENSION_TWO,
+    CROSSING,
     CUSP,
     DEGENERATE,
     DEGENERATE_SYMMETRY,
@@ -213,6 +214,8 @@ def points_of(
             found.append((place, point(end, steps[place], index=place)))
     for kind, test in _tests_of(problem, condition, scale).items():
         for place, step in _zeros(problem, steps, scale, test):
+            if kind in _DOUBLE and not _is_defective(problem, step, _DOUBLE[kind]):
+                continue
             symmetric = kind == FOLD and condition.kind in TOUCHING and _symmetric(problem, step)
             found.append((place, point(SYMMETRY if symmetric else kind, step)))
     if condition.kind == GRAZING:
@@ -221,6 +224,18 @@ def points_of(
                 more = f" of the motion with one impact in {so_many(n, 'period')}"
                 found.append((place, point(RESONANT, step, more, impact=condition.impact)))
     return [point for _, point in sorted(found, key=lambda f: f[0])]
+
+
+# The multiplier that is double at a resonance.
+_DOUBLE = {RESONANCE_1: 1.0, RESONANCE_2: -1.0}
+
+
+def _is_defective(problem: Shooting, step: Step, multiplier: float) -> bool:
+    """Whether a double multiplier has one eigenvector. With two of them, as where a motion folds
+    and loses a symmetry, no pair of it becomes complex."""
+    sizes, M = np.asarray(problem.scale(())[-problem.states :]), step.seen.monodromy
+    values = np.linalg.svd(M * sizes / sizes[:, None] - multiplier * np.eye(len(M)))[1]
+    return bool(values[-2] > _ENTRY * values[0])
 
 
 def _symmetric(problem: Shooting, step: Step) -> bool:
@@ -292,6 +307,8 @@ def _tests_of(problem: Shooting, condition: Special, scale: np.ndarray) -> dict[
         return {CUSP: _cusp(bare, scale), FLIP: doubling, RESONANCE_1: double}
     if condition.kind == DOUBLING:
         return {DEGENERATE: _cubic(bare, twice=True), FLIP: fold, RESONANCE_2: double}
+    if condition.kind == CROSSING:
+        return {RESONANCE_1: double}
     if condition.kind == SYMMETRY:
         return {DEGENERATE_SYMMETRY: _cubic(bare, twice=False), RESONANCE_1: double}
     # Where an impact grazes M has a pole, but not where a stop is touched.

@@ -438,7 +438,8 @@ class Boundary(Curve):
 
     @property
     def kind(self) -> str:
-        """ "fold", "period-doubling", "neimark-sacker", "symmetry-breaking" or "grazing"."""
+        """The kind of its points: "fold", "period-doubling", "neimark-sacker",
+        "symmetry-breaking", "branch-point", "grazing" or that of a sliding bifurcation."""
         return self.condition.kind
 
     @cached_property

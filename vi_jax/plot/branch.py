@@ -146,7 +146,7 @@ def plot_boundary(
 
     Its colour is that of the motion's period, its dash shows what happens there: solid a grazing,
     dashed a period doubling, dash-dotted a fold, with two dots a Neimark–Sacker bifurcation, dotted
-    a loss of symmetry.
+    a loss of symmetry or a branch point.
 
     **Arguments:** the curve; `ax`; `special`, whether to mark the points of codimension two;
     `legend`, whether to draw one: what the dash means (or the curve's `label`), and the marks;

@@ -71,6 +71,7 @@ DASHES = {
     "period-doubling": (0, (5, 2)),
     "fold": (0, (6, 1.5, 1.2, 1.5)),
     "symmetry-breaking": (0, (1.2, 1.2)),
+    "branch-point": (0, (1.2, 2.4)),
     "neimark-sacker": (0, (5, 1.5, 1.2, 1.5, 1.2, 1.5)),
 }
 
