@@ -84,7 +84,7 @@ def _rows(drive: str, method: Any, dtype: str) -> list[list[str]]:
     def one_step(kappa):
         machine, start = _machine(task, kappa)
         one = jnp.ones_like(kappa)
-        return method.step(in_modes(machine, ()), 0 * one, 0.5 * one, start, None)[0]
+        return method.step(in_modes(machine, ()), 0 * one, 0.5 * one, start, {})[0]
 
     stepped = jax.jit(one_step).lower(jnp.asarray(0.9, dtype)).compile().cost_analysis()
     operations = float(stepped["flops"]) if stepped else float("nan")

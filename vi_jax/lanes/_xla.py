@@ -10,6 +10,10 @@ from jax.extend.core import jaxpr_as_fun
 
 from ._program import LaneProgram
 
+# Steps between two questions whether any lane goes on: the answer travels from a GPU to the
+# processor, and asked at each step it took a sixth of the time of 10,000 lanes.
+_UNASKED = 8
+
 
 def run(program: LaneProgram, *args: Any) -> list[Any]:
     """Results and rows of a batch of lanes: what the primitive gives.
@@ -49,21 +53,20 @@ def _run_together(
     end = jax.vmap(jaxpr_as_fun(program.end), in_axes=(*axes, *carried), axis_size=lanes)
 
     def stored(rows: list, filled: jax.Array, complete: jax.Array, row: list) -> list:
-        at = jnp.where(complete & (filled < program.rows), index, lanes)
-        return [r.at[at, filled].set(x, mode="drop") for r, x in zip(rows, row, strict=True)]
+        # Every lane writes to a place of its own, outside where it has no row: `rows` changes in
+        # place. Within `lax.cond` all of it was copied at each step, two thirds of the time on a
+        # GPU (JAX 0.11.2).
+        at = jnp.where(complete, filled, program.rows)
+        own = {"mode": "drop", "unique_indices": True, "indices_are_sorted": True}
+        return [r.at[index, at].set(x, **own) for r, x in zip(rows, row, strict=True)]
 
-    def iteration(state: tuple) -> tuple:
+    def iteration(_: Any, state: tuple) -> tuple:
         carry, active, filled, rows = state
         out = step(*inputs, *carry)
         # A lane that has ended keeps what it had.
         carry = [_where(active, a, b) for a, b in zip(out[:n], carry, strict=True)]
         complete = active & out[n + 1]
-        rows = jax.lax.cond(
-            jnp.any(complete),
-            lambda rows: stored(rows, filled, complete, out[n + 2 :]),
-            lambda rows: rows,
-            rows,
-        )
+        rows = stored(rows, filled, complete, out[n + 2 :])
         return carry, active & out[n], filled + complete, rows
 
     rows = [
@@ -74,7 +77,11 @@ def _run_together(
     out = begin(*inputs)
     carry, active, complete, row = list(out[:n]), out[n], out[n + 1], out[n + 2 :]
     state = (carry, active, filled + complete, stored(rows, filled, complete, row))
-    carry, _, _, rows = jax.lax.while_loop(lambda state: jnp.any(state[1]), iteration, state)
+    carry, _, _, rows = jax.lax.while_loop(
+        lambda state: jnp.any(state[1]),
+        lambda state: jax.lax.fori_loop(0, _UNASKED, iteration, state),
+        state,
+    )
     return [*end(*inputs, *carry), *rows]
 
 

@@ -135,8 +135,11 @@ def within(
     places = stop_gradient([(x.s, x.state) for x in stages])
     places = jtu.tree_map(lambda *x: jnp.stack(x), *places)
 
-    # A loop, not written out: it is compiled once for all stages.
+    # A loop, not written out: it is compiled once for all stages. On a GPU a turn of it is a kernel
+    # of its own, and all stages side by side took 0.7 of the time (H200, 100,000 lanes).
     def at_each(places):
+        if jax.default_backend() != "cpu":
+            return jax.vmap(lambda x: stop_gradient(guards(x)))(places)
         return jax.lax.scan(lambda c, x: (c, stop_gradient(guards(x))), None, places)[1]
 
     if looked_at:
