@@ -126,7 +126,12 @@ def attempt(
     new = pin(new)
     bodies = range(len(machine.coordinates))
     alone = tuple(holding(machine, lane.modes, lane.contact, but=k) for k in bodies)
-    seen = within(plan, lane, alone, stages, h)
+    ends: list[tuple[Rates, Rates]] = []
+    if plan.motion or machine.stops:
+        for one, body in zip(alone, machine.coordinates, strict=True):
+            begin = rates(one.field, body.position, lane.s, lane.state)
+            ends.append((begin, rates(one.field, body.position, s1, new)))
+    seen = within(plan, lane, alone, ends, stages, h)
     of_guards = guards_error(plan, seen, stages, h, jnp.asarray(limit))
     error = error if of_guards is None else jnp.maximum(error, of_guards)
     good = jnp.isfinite(total(new, jnp.zeros_like(h)))
@@ -141,9 +146,8 @@ def attempt(
     inner = [n for n, stage in enumerate(stages) if 0 < stage.share < 1]
     seen, shares = seen.only(inner), tuple(stages[n].share for n in inner)
     paths = []
-    if plan.motion or machine.stops:
-        for k, one in enumerate(alone):
-            paths.append(_path(plan, lane, k, one, smooth, (s1, new, h, limit), good, seen))
+    for k, (one, both) in enumerate(zip(alone, ends, strict=False)):
+        paths.append(_path(plan, lane, k, one, smooth, both, (s1, new, h, limit), good, seen))
     met, below = crossings(plan, lane, smooth, paths, (s1, h, new), (good, last), seen)
     return Trial(
         h, s1, new, elapsed(old, beside, h), error, good, last, met, tuple(paths), below, shares,
@@ -170,6 +174,7 @@ def _path(
     k: int,
     free: SmoothMachine,
     smooth: SmoothMachine,
+    ends: tuple[Rates, Rates],
     there: tuple,
     good: Flag,
     seen: Within,
@@ -177,13 +182,12 @@ def _path(
     """What a step shows of coordinate number k.
 
     **Arguments:** `free`, the machine with this body free and the others held that rest; `smooth`,
-    the machine that the step was taken with; `there`, s and state at the step's end, its length and
-    the longest length; `good`, whether the step was; `seen`, guards at the stages.
+    the machine that the step was taken with; `ends`, the rates of the coordinate in the former at
+    both ends of the step; `there`, s and state at its end, its length and the longest length;
+    `good`, whether the step was; `seen`, guards at the stages.
     """
-    s1, new, h, limit = there
+    (begin, end), (s1, new, h, limit) = ends, there
     position = plan.machine.coordinates[k].position
-    begin = rates(free.field, position, lane.s, lane.state)
-    end = rates(free.field, position, s1, new)
     if lane.contact is not None and not exact(plan.machine, lane.state):
         # Of a body at rest place and velocity are known better than the state tells them, where
         # the coordinate is a difference. Its force is that on a free body.

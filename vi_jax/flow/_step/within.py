@@ -17,8 +17,8 @@ from jax.lax import stop_gradient
 from jaxtyping import Array
 
 from ..._types import Flag, Scalar, State
-from ...machine import AbstractMachine, events_of, sides_of
-from .._lane import Lane, Plan
+from ...machine import AbstractMachine, RigidStop, events_of, sides_of
+from .._lane import Lane, Plan, any_of
 from ..events import Rates, rates
 from ..methods import Foreseen, Stage
 from ..smooth import SmoothMachine, exact, is_affine
@@ -40,7 +40,8 @@ class Within(NamedTuple):
     events: dict[int, tuple[Array, ...]]
     """By event, the values of each side of its guard (see `AbstractEvent.sides`)."""
     slow: dict[int, Flag]
-    """By coordinate, whether it is so slow that it may turn twice within the step."""
+    """By coordinate, whether it is so slow, and so close to a stop, that it may turn twice within
+    the step and touch in between."""
 
     def only(self, places: list[int]) -> "Within":
         """The values at some of the stages."""
@@ -99,12 +100,13 @@ def apart(stages: list[Stage]) -> list[Stage]:
 
 
 def within(
-    plan: Plan, lane: Lane, alone: tuple[SmoothMachine, ...], stages: list[Stage], h: Scalar
-) -> Within:
+    plan: Plan, lane: Lane, alone: tuple[SmoothMachine, ...], ends: list[tuple[Rates, Rates]],
+    stages: list[Stage], h: Scalar,
+) -> Within:  # fmt: skip
     """Return the guards at the stages of a step.
 
     **Arguments:** `alone`, of each coordinate the machine with the other bodies held that rest;
-    `h`, the length of the step.
+    `ends`, its rates where the step begins and ends; `h`, the length of the step.
     """
     if not stages:
         return Within({}, {}, {})
@@ -116,7 +118,7 @@ def within(
     def moves(k: int, s: Scalar, state: State) -> Rates:
         return rates(alone[k].field, machine.coordinates[k].position, s, state)
 
-    slow = {k: _is_slow(stop_gradient(moves(k, lane.s, lane.state)), h) for k in limited}
+    slow = {k: _is_slow(plan, lane, k, stop_gradient(ends[k]), h) for k in limited}
 
     def guards(place):
         s, state = place
@@ -150,9 +152,19 @@ def within(
     return Within(forces, {}, slow)
 
 
-def _is_slow(begin: Rates, h: Scalar) -> Flag:
-    """Whether a body may turn twice within a step, as one that has just left its stop."""
-    return jnp.abs(begin.v) <= jnp.abs(begin.a) * h
+def _is_slow(plan: Plan, lane: Lane, k: int, ends: tuple[Rates, Rates], h: Scalar) -> Flag:
+    """Whether a body may turn twice within a step and touch a stop in between, as one that has just
+    left it: slow where the step begins, going the same way where it ends, and close to the stop at
+    both."""
+    begin, end = ends
+    slow = (jnp.abs(begin.v) <= jnp.abs(begin.a) * h) & (lane.direction[k] * end.v >= 0)
+    stops = [stop for stop in plan.machine.stops if stop.coordinate == k]
+    return slow & any_of(slow, (_reaches(x, begin, h) & _reaches(x, end, h) for x in stops))
+
+
+def _reaches(stop: RigidStop, here: Rates, h: Scalar) -> Flag:
+    """Whether a body may get to a stop in the time h, before or after."""
+    return -stop.beyond(here.x) <= (jnp.abs(here.v) + jnp.abs(here.a) * h) * h
 
 
 def _distance(machine: AbstractMachine, lane: Lane, number: int, state: State) -> Scalar:
